@@ -1,0 +1,85 @@
+"""Outputs that appear complete or not at all."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from stillmap.errors import InputError
+
+
+def require_new(path: Path, overwrite: bool = False) -> None:
+    """Refuse an output folder that already holds something, before any work is done.
+
+    Raises:
+        InputError: `path` is a file or a non-empty folder and `overwrite` is not given.
+    """
+    if not path.exists() and not path.is_symlink():
+        return
+    if not path.is_dir():
+        raise InputError("is in the way: not a folder", where=str(path))
+    if not overwrite and any(path.iterdir()):
+        raise InputError(
+            "already holds something", where=str(path), hint="choose another or give --overwrite"
+        )
+
+
+@contextmanager
+def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
+    """A temporary sibling folder that becomes `path` when the block ends without an exception.
+
+    Raises:
+        InputError: `path` is taken or its parent cannot be written to.
+    """
+    path = Path(os.path.abspath(path))
+    require_new(path, overwrite)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
+    try:
+        yield work
+        work.chmod(0o777 & ~_umask())
+        _move_into_place(work, path)
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """A temporary sibling file that becomes `path` when the block ends without an exception."""
+    path = Path(os.path.abspath(path))
+    work = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield work
+        os.replace(work, path)
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
+    finally:
+        work.unlink(missing_ok=True)
+
+
+def _move_into_place(work: Path, path: Path) -> None:
+    if not path.exists():
+        os.rename(work, path)
+        return
+    # a folder that is not empty cannot be replaced in one step: the old one steps aside first
+    aside = work.with_suffix(".old")
+    os.rename(path, aside)
+    try:
+        os.rename(work, path)
+    except OSError:
+        os.rename(aside, path)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,78 @@
+"""The one data shape of a recording, 2D and 3D alike: flat arrays."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """T scans with M beams in all, in D dimensions, taken by S sensors on one robot.
+
+    Attributes:
+        stamp_ns: (T,) int64, the recording's own stamps in nanoseconds, non-decreasing.
+        offset: (T+1,) int64, scan t owns the beams offset[t]:offset[t+1].
+        points: (M, D) float32, end points in the sensor frame in metres. NaN marks an unusable
+            beam; a maximum-range beam (not hit, finite) ends where free space is known to end.
+        hit: (M,) bool, True where something reflected the beam: zeta = 0 of (1), and usable.
+        T_base_sensor: (S, D+1, D+1) float64, where each sensor sits on the robot.
+        sensor: (T,) int32, the sensor that took each scan.
+        T_odom_base: (T, D+1, D+1) float64, odometry at each scan; None where there is none.
+        source: what the recording was read from and how, what was skipped: JSON-able.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    offset: NDArray[np.int64]
+    points: NDArray[np.float32]
+    hit: NDArray[np.bool_]
+    T_base_sensor: NDArray[np.float64]
+    sensor: NDArray[np.int32]
+    T_odom_base: NDArray[np.float64] | None
+    source: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        T, M, D = self.n_scans, self.n_beams, self.dimension
+        if D not in (2, 3) or self.points.shape != (M, D):
+            raise ValueError(f"points: expected (M, 2) or (M, 3), got {self.points.shape}")
+        _check("stamp_ns", self.stamp_ns, (T,), np.int64)
+        _check("offset", self.offset, (T + 1,), np.int64)
+        _check("points", self.points, (M, D), np.float32)
+        _check("hit", self.hit, (M,), np.bool_)
+        _check("sensor", self.sensor, (T,), np.int32)
+        S = len(self.T_base_sensor)
+        _check("T_base_sensor", self.T_base_sensor, (S, D + 1, D + 1), np.float64)
+        if self.T_odom_base is not None:
+            _check("T_odom_base", self.T_odom_base, (T, D + 1, D + 1), np.float64)
+        if self.offset[0] != 0 or self.offset[-1] != M or np.any(np.diff(self.offset) < 0):
+            raise ValueError(f"offset: must rise from 0 to {M}")
+        if T and (self.sensor.min() < 0 or self.sensor.max() >= S):
+            raise ValueError(f"sensor: indices must lie in [0, {S})")
+
+    @property
+    def n_scans(self) -> int:
+        return len(self.stamp_ns)
+
+    @property
+    def n_beams(self) -> int:
+        return len(self.points)
+
+    @property
+    def dimension(self) -> int:
+        return int(self.points.shape[-1])
+
+    def beams_of(self, scan: int) -> slice:
+        """The beams of one scan, as a slice into `points`, `hit` and results per beam."""
+        return slice(int(self.offset[scan]), int(self.offset[scan + 1]))
+
+    def T_map_sensor(self, T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sensor poses (T, D+1, D+1) that belong to robot poses (T, D+1, D+1)."""
+        return T_map_base @ self.T_base_sensor[self.sensor]
+
+
+def _check(name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: type) -> None:
+    if array.shape != shape or array.dtype != dtype:
+        raise ValueError(
+            f"{name}: expected {shape} {np.dtype(dtype)}, got {array.shape} {array.dtype}"
+        )

@@ -1,0 +1,39 @@
+"""Poses in the plane as homogeneous matrices, vectorised over leading axes."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float = NDArray[np.float64]
+
+
+def matrix(x: ArrayLike, y: ArrayLike, theta: ArrayLike) -> Float:
+    """(..., 3, 3) homogeneous matrices of poses x, y in metres and theta in radians."""
+    x, y, theta = np.broadcast_arrays(
+        np.asarray(x, float), np.asarray(y, float), np.asarray(theta, float)
+    )
+    T = np.zeros((*x.shape, 3, 3))
+    T[..., 0, 0] = T[..., 1, 1] = np.cos(theta)
+    T[..., 1, 0] = np.sin(theta)
+    T[..., 0, 1] = -T[..., 1, 0]
+    T[..., 0, 2], T[..., 1, 2], T[..., 2, 2] = x, y, 1.0
+    return T
+
+
+def parameters(T: Float) -> Float:
+    """(..., 3) poses x, y, theta of (..., 3, 3) matrices; theta in (-pi, pi]."""
+    return np.stack([T[..., 0, 2], T[..., 1, 2], np.arctan2(T[..., 1, 0], T[..., 0, 0])], axis=-1)
+
+
+def inverse(T: Float) -> Float:
+    """Inverses of rigid transforms (..., D+1, D+1), any D."""
+    R_t = np.swapaxes(T[..., :-1, :-1], -1, -2)
+    out = np.zeros_like(T)
+    out[..., :-1, :-1] = R_t
+    out[..., :-1, -1] = -(R_t @ T[..., :-1, -1:])[..., 0]
+    out[..., -1, -1] = 1.0
+    return out
+
+
+def wrap(angle: ArrayLike) -> Float:
+    """Angles mapped to [-pi, pi)."""
+    return (np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi
