@@ -1,0 +1,67 @@
+// Array types at the border and the checks between them.
+#pragma once
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include <stdexcept>
+#include <string>
+
+#include "stillmap/beams.hpp"
+
+namespace nb = nanobind;
+
+namespace stillmap::border {
+
+template <int D>
+using Points = nb::ndarray<const float, nb::numpy, nb::shape<-1, D>, nb::c_contig, nb::device::cpu>;
+template <int D>
+using Poses = nb::ndarray<const double, nb::numpy, nb::shape<-1, D + 1, D + 1>, nb::c_contig,
+                          nb::device::cpu>;
+template <int D>
+using OnePose =
+    nb::ndarray<const double, nb::numpy, nb::shape<D + 1, D + 1>, nb::c_contig, nb::device::cpu>;
+template <class T>
+using Flat = nb::ndarray<const T, nb::numpy, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+
+// A new array that owns its memory; the data is moved in.
+template <class T>
+nb::ndarray<nb::numpy, T> owned(std::vector<T>&& data, std::initializer_list<size_t> shape) {
+  auto* held = new std::vector<T>(std::move(data));
+  nb::capsule owner(held, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
+  return nb::ndarray<nb::numpy, T>(held->data(), shape, owner);
+}
+
+inline void require(bool ok, const std::string& message) {
+  if (!ok) throw std::invalid_argument(message);
+}
+
+template <int D>
+Scans<D> scans_from(const Points<D>& points, const Flat<bool>& hit, const Flat<int64_t>& offset,
+                    const Poses<D>& poses) {
+  const size_t n_beams = points.shape(0), n_scans = poses.shape(0);
+  require(hit.shape(0) == n_beams, "hit: expected " + std::to_string(n_beams) +
+                                       " entries as points has rows, got " +
+                                       std::to_string(hit.shape(0)));
+  require(offset.shape(0) == n_scans + 1, "offset: expected " + std::to_string(n_scans + 1) +
+                                              " entries, one more than T_map_sensor, got " +
+                                              std::to_string(offset.shape(0)));
+  const int64_t* o = offset.data();
+  require(o[0] == 0 && o[n_scans] == static_cast<int64_t>(n_beams),
+          "offset: expected to run from 0 to " + std::to_string(n_beams));
+  for (size_t t = 0; t < n_scans; ++t) require(o[t] <= o[t + 1], "offset: must not decrease");
+  return Scans<D>{points.data(), hit.data(), o, poses.data(), n_scans};
+}
+
+inline const float* per_beam(const Flat<float>& values, size_t n_beams, const char* name) {
+  require(values.shape(0) == n_beams, std::string(name) + ": expected " + std::to_string(n_beams) +
+                                          " entries as points has rows, got " +
+                                          std::to_string(values.shape(0)));
+  return values.data();
+}
+
+inline void require_probability(double p, const char* name) {
+  require(p >= 0.0 && p <= 1.0, std::string(name) + ": expected a probability in [0, 1]");
+}
+
+}  // namespace stillmap::border

@@ -1,0 +1,74 @@
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "stillmap/beams.hpp"
+
+namespace stillmap::border {
+namespace {
+
+template <int D>
+void add(Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit, const Flat<float>& e,
+         const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  const float* weights = per_beam(e, points.shape(0), "e");
+  nb::gil_scoped_release released;
+  add_beams<D>(grid, scans, weights, threads);
+}
+
+template <int D>
+auto expectations(const Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+                  const Flat<int64_t>& offset, const Poses<D>& poses, double prior, int threads) {
+  require_probability(prior, "prior");
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  std::vector<float> e(points.shape(0));
+  {
+    nb::gil_scoped_release released;
+    e_step<D>(grid, scans, prior, threads, e.data());
+  }
+  const size_t n = e.size();
+  return owned(std::move(e), {n});
+}
+
+template <int D>
+auto likelihood(const Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+                const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses,
+                double prior, int threads) {
+  require_probability(prior, "prior");
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  const float* weights = per_beam(e, points.shape(0), "e");
+  std::vector<LogLikelihood> terms(scans.n_scans);
+  {
+    nb::gil_scoped_release released;
+    log_likelihood<D>(grid, scans, weights, prior, threads, terms.data());
+  }
+  std::vector<double> out;
+  out.reserve(4 * terms.size());
+  for (const auto& t : terms) out.insert(out.end(), {t.end, t.traversed, t.gamma, t.entropy});
+  return owned(std::move(out), {scans.n_scans, 4});
+}
+
+template <int D>
+void bind(nb::module_& m) {
+  m.def("add_beams", &add<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::arg("threads") = 1,
+        "Adds the sums alpha, beta of (10) of all beams to the grid; e (M,) float32.");
+  m.def("e_step", &expectations<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::arg("prior"), nb::arg("threads") = 1,
+        "(6), (8): e (M,) float32. NaN: unusable; the prior at maximum range and where the end "
+        "cell was never looked at.");
+  m.def("log_likelihood", &likelihood<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::arg("prior"), nb::arg("threads") = 1,
+        "(T, 4) float64 per scan: end-point terms of (5), traversal terms of (5), gamma of (7), "
+        "entropy of e. Logarithms are floored at ln 1e-12.");
+}
+
+}  // namespace
+
+void bind_beams(nb::module_& m) {
+  bind<2>(m);
+  bind<3>(m);
+}
+
+}  // namespace stillmap::border

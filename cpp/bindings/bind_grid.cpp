@@ -1,0 +1,144 @@
+#include <nanobind/stl/pair.h>
+#include <nanobind/stl/tuple.h>
+
+#include <limits>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "stillmap/grid.hpp"
+
+namespace stillmap::border {
+namespace {
+
+template <int D>
+using Cells =
+    nb::ndarray<const int64_t, nb::numpy, nb::shape<-1, D>, nb::c_contig, nb::device::cpu>;
+
+template <int D>
+nb::ndarray<nb::numpy, double> alpha_beta(const Grid<D>& grid, const Cells<D>& cells) {
+  const size_t n = cells.shape(0);
+  std::vector<double> out(2 * n, 0.0);
+  Cursor<const Grid<D>> cursor(grid);
+  for (size_t k = 0; k < n; ++k) {
+    Cell<D> cell;
+    for (int d = 0; d < D; ++d) {
+      const int64_t c = cells.data()[k * D + static_cast<size_t>(d)];
+      require(std::abs(c) < Grid<D>::kMaxCell, "cells: out of range");
+      cell[d] = static_cast<int32_t>(c);
+    }
+    if (const Counts* c = cursor.seen(cell)) {
+      out[2 * k] = from_fixed(c->alpha);
+      out[2 * k + 1] = from_fixed(c->beta);
+    }
+  }
+  return owned(std::move(out), {n, 2});
+}
+
+// Bounding box of the cells somebody looked at; empty boxes have first > last.
+template <int D>
+std::pair<Cell<D>, Cell<D>> bounds(const Grid<D>& grid) {
+  Cell<D> first = Cell<D>::Constant(std::numeric_limits<int32_t>::max());
+  Cell<D> last = Cell<D>::Constant(std::numeric_limits<int32_t>::min());
+  for (const auto& block : grid.blocks())
+    for (int i = 0; i < Grid<D>::kCells; ++i) {
+      const Counts& c = block->counts[static_cast<size_t>(i)];
+      if (c.alpha + c.beta == 0) continue;
+      const Cell<D> cell = Grid<D>::cell_at(block->origin, i);
+      first = first.cwiseMin(cell);
+      last = last.cwiseMax(cell);
+    }
+  return {first, last};
+}
+
+template <int D>
+auto dense(const Grid<D>& grid) {
+  auto [first, last] = bounds(grid);
+  if (first[0] > last[0]) {
+    first.setZero();
+    last.setConstant(-1);
+  }
+  size_t shape[D], total = 1;  // slowest axis first: (z,) y, x
+  for (int d = 0; d < D; ++d) {
+    shape[D - 1 - d] = static_cast<size_t>(last[d] - first[d] + 1);
+    total *= static_cast<size_t>(last[d] - first[d] + 1);
+  }
+  std::vector<double> alpha(total, 0.0), beta(total, 0.0);
+  for (const auto& block : grid.blocks())
+    for (int i = 0; i < Grid<D>::kCells; ++i) {
+      const Counts& c = block->counts[static_cast<size_t>(i)];
+      if (c.alpha + c.beta == 0) continue;
+      const Cell<D> cell = Grid<D>::cell_at(block->origin, i);
+      size_t index = 0;
+      for (int d = D - 1; d >= 0; --d)
+        index = index * shape[D - 1 - d] + static_cast<size_t>(cell[d] - first[d]);
+      alpha[index] = from_fixed(c.alpha);
+      beta[index] = from_fixed(c.beta);
+    }
+  std::vector<int64_t> origin(first.data(), first.data() + D);
+  auto shaped = [&](std::vector<double>&& values) {
+    if constexpr (D == 2) return owned(std::move(values), {shape[0], shape[1]});
+    if constexpr (D == 3) return owned(std::move(values), {shape[0], shape[1], shape[2]});
+  };
+  return std::make_tuple(owned(std::move(origin), {static_cast<size_t>(D)}),
+                         shaped(std::move(alpha)), shaped(std::move(beta)));
+}
+
+template <int D>
+void bind(nb::module_& m, const char* name) {
+  using G = Grid<D>;
+  nb::class_<G>(m, name, "Block-sparse counts alpha, beta of (10); cell = floor(x / resolution).")
+      .def(nb::init<double>(), nb::arg("resolution"))
+      .def_prop_ro("resolution", &G::resolution, "metres")
+      .def_prop_ro("dimension", [](const G&) { return D; })
+      .def_prop_ro("memory_bytes", &G::memory_bytes)
+      .def("merge", &G::merge, nb::arg("other"), "Adds the sums of another grid.")
+      .def("alpha_beta", &alpha_beta<D>, nb::arg("cells").noconvert(),
+           "(K, 2) float64 sums of (K, D) int64 cells; 0, 0 where nobody looked.")
+      .def("dense", &dense<D>,
+           "first_cell (D,) int64 and alpha, beta over the box of cells that were looked at; axes "
+           "in reverse order, so that a 2D array is [row = y, column = x].");
+}
+
+template <int D>
+using Point = nb::ndarray<const double, nb::numpy, nb::shape<D>, nb::c_contig, nb::device::cpu>;
+
+template <int D>
+auto cells_along(const Point<D>& start, const Point<D>& end, double resolution) {
+  require(resolution > 0.0, "resolution: expected a positive length in metres");
+  const Vec<D> a = Eigen::Map<const Vec<D>>(start.data()) / resolution;
+  const Vec<D> b = Eigen::Map<const Vec<D>>(end.data()) / resolution;
+  require(
+      a.cwiseAbs().maxCoeff() < Grid<D>::kMaxCell && b.cwiseAbs().maxCoeff() < Grid<D>::kMaxCell,
+      "start, end: not finite or too far away");
+  std::vector<int64_t> cells;
+  std::vector<double> lengths;
+  auto add = [&](const Cell<D>& cell, double length) {
+    for (int d = 0; d < D; ++d) cells.push_back(cell[d]);
+    lengths.push_back(length);
+  };
+  double last_length = 0.0;
+  const Cell<D> last = traverse<D>(a, b, add, &last_length);
+  add(last, last_length);
+  const size_t n = lengths.size();
+  return std::make_tuple(owned(std::move(cells), {n, static_cast<size_t>(D)}),
+                         owned(std::move(lengths), {n}));
+}
+
+template <int D>
+void bind_traverse(nb::module_& m) {
+  m.def("traverse", &cells_along<D>, nb::arg("start").noconvert(), nb::arg("end").noconvert(),
+        nb::arg("resolution"),
+        "Cells (K, D) int64 of a segment in order, end cell last, and the chord lengths (K,) in "
+        "cells.");
+}
+
+}  // namespace
+
+void bind_grid(nb::module_& m) {
+  bind<2>(m, "Grid2D");
+  bind<3>(m, "Grid3D");
+  bind_traverse<2>(m);
+  bind_traverse<3>(m);
+}
+
+}  // namespace stillmap::border

@@ -1,0 +1,133 @@
+#include <nanobind/stl/tuple.h>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "stillmap/register.hpp"
+#include "stillmap/search.hpp"
+
+namespace stillmap::border {
+namespace {
+
+template <int D>
+using Square = nb::ndarray<const double, nb::numpy, nb::shape<Lie<D>::kDof, Lie<D>::kDof>,
+                           nb::c_contig, nb::device::cpu>;
+
+template <int D>
+WeightedBeams<D> beams_from(const Points<D>& points, const Flat<float>& weights) {
+  const float* w = per_beam(weights, points.shape(0), "weights");
+  WeightedBeams<D> beams;
+  for (size_t n = 0; n < points.shape(0); ++n) {
+    const float* p = points.data() + n * D;
+    if (!usable<D>(p) || !(w[n] > 0.0f)) continue;
+    require(w[n] <= 1.0f, "weights: expected values in [0, 1]");
+    beams.points.push_back(point_at<D>(p));
+    beams.weights.push_back(static_cast<double>(w[n]));
+  }
+  return beams;
+}
+
+template <int D>
+Pose<D> checked_pose(const OnePose<D>& T, const char* name) {
+  const Pose<D> pose = pose_from<D>(T.data());
+  require(pose.R.allFinite() && pose.t.allFinite(), std::string(name) + ": not finite");
+  return pose;
+}
+
+template <int D>
+auto matrix_of(const Pose<D>& pose) {
+  std::vector<double> T((D + 1) * (D + 1), 0.0);
+  for (size_t r = 0; r < D; ++r) {
+    for (size_t c = 0; c < D; ++c)
+      T[r * (D + 1) + c] = pose.R(static_cast<int>(r), static_cast<int>(c));
+    T[r * (D + 1) + D] = pose.t[static_cast<int>(r)];
+  }
+  T.back() = 1.0;
+  return owned(std::move(T), {D + 1, D + 1});
+}
+
+template <int D>
+auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
+                    const OnePose<D>& T_prior, const Square<D>& information, double sigma,
+                    int radius, double floor, double gain, int max_iterations,
+                    double window_translation, double window_rotation, double search_range) {
+  const RegisterOptions options{{sigma, radius}, floor, gain, max_iterations};
+  require(floor > 0.0 && gain > 0.0, "floor, gain: expected positive numbers");
+  require(window_translation >= 0.0 && window_rotation >= 0.0 && window_rotation <= 3.2,
+          "window: expected half widths, rotation at most pi");
+  const auto beams = beams_from<D>(points, weights);
+  Prior<D> prior{checked_pose<D>(T_prior, "T_prior"), {}};
+  for (int r = 0; r < Lie<D>::kDof; ++r)
+    for (int c = 0; c < Lie<D>::kDof; ++c) prior.information(r, c) = information(r, c);
+  require(prior.information.allFinite(), "information: not finite");
+  Registration<D> best;
+  size_t candidates = 0;
+  {
+    nb::gil_scoped_release released;
+    Field<D> field(grid, options.field);
+    const SearchWindow window{window_translation, window_rotation, search_range};
+    const auto found = CorrelativeSearch<D>(grid, beams, prior, window, options).best();
+    candidates = found.candidates;
+    best = climb<D>(field, beams, prior, found.pose, options);
+  }
+  constexpr size_t n = Lie<D>::kDof;
+  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof, Eigen::RowMajor> covariance =
+      best.information.ldlt().solve(decltype(best.information)::Identity());
+  return std::make_tuple(
+      matrix_of<D>(best.pose),
+      owned(std::vector<double>(covariance.data(), covariance.data() + n * n), {n, n}), best.cost,
+      best.inliers, best.iterations, candidates);
+}
+
+template <int D>
+double cost_at(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
+               const OnePose<D>& T, double sigma, int radius, double floor) {
+  Field<D> field(grid, {sigma, radius});
+  // without the constant ln(floor + 1) of every beam: the oracle's form
+  const auto beams = beams_from<D>(points, weights);
+  const RegisterOptions options{{sigma, radius}, floor, 1.0, 0};
+  double constant = 0.0;
+  for (const double w : beams.weights) constant += w * std::log(floor + 1.0);
+  return data_cost<D>(field, beams, checked_pose<D>(T, "T"), options) - constant;
+}
+
+template <int D>
+auto gradient_at(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
+                 const OnePose<D>& T, double sigma, int radius, double floor) {
+  Field<D> field(grid, {sigma, radius});
+  const RegisterOptions options{{sigma, radius}, floor, 1.0, 0};
+  const auto q =
+      linearise<D>(field, beams_from<D>(points, weights), checked_pose<D>(T, "T"), options);
+  const size_t n = Lie<D>::kDof;
+  return owned(std::vector<double>(q.gradient.data(), q.gradient.data() + n), {n});
+}
+
+template <int D>
+void bind(nb::module_& m) {
+  m.def(
+      "register_beams", &register_beams<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+      nb::arg("weights").noconvert(), nb::arg("T_prior").noconvert(),
+      nb::arg("information").noconvert(), nb::kw_only(), nb::arg("sigma"), nb::arg("radius"),
+      nb::arg("floor"), nb::arg("gain"), nb::arg("max_iterations"), nb::arg("window_translation"),
+      nb::arg("window_rotation"), nb::arg("search_range"),
+      "(9): the pose of one scan against the grid so far. points (N, D) float32 that were hit, in "
+      "the moving frame; weights (N,) float32 = e; T_prior (D+1, D+1) and its information "
+      "(dof, dof) of (translation, rotation about the moving frame's origin). Returns pose, "
+      "covariance, cost, the share of beams the map explains, Newton steps, lattice poses.");
+  m.def("registration_cost", &cost_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
+        nb::arg("radius"), nb::arg("floor"),
+        "-sum w ln(floor + F) at one pose, F being the smoothed field.");
+  m.def("registration_gradient", &gradient_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
+        nb::arg("radius"), nb::arg("floor"),
+        "Its derivative (dof,) by a small translation and a rotation about the sensor.");
+}
+
+}  // namespace
+
+void bind_register(nb::module_& m) {
+  bind<2>(m);
+  bind<3>(m);
+}
+
+}  // namespace stillmap::border

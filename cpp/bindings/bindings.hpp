@@ -1,0 +1,11 @@
+#pragma once
+
+#include <nanobind/nanobind.h>
+
+namespace stillmap::border {
+
+void bind_grid(nanobind::module_& m);
+void bind_beams(nanobind::module_& m);
+void bind_register(nanobind::module_& m);
+
+}  // namespace stillmap::border

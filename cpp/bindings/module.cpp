@@ -1,0 +1,12 @@
+#include "bindings.hpp"
+
+NB_MODULE(_core, m) {
+  m.doc() =
+      "Kernels on plain arrays. points (M, D) float32 in the sensor frame, hit (M,) bool, offset "
+      "(T+1,) int64, T_map_sensor (T, D+1, D+1) float64, D = 2 or 3; NaN points are unusable "
+      "beams, finite points that are not hits are maximum-range beams. Wrong types raise "
+      "TypeError, wrong lengths and values ValueError.";
+  stillmap::border::bind_grid(m);
+  stillmap::border::bind_beams(m);
+  stillmap::border::bind_register(m);
+}

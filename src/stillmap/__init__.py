@@ -1,0 +1,1 @@
+"""Clean maps of what stands still."""

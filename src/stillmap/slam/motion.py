@@ -1,0 +1,80 @@
+"""The motion prior p(x_t | u_{t-1}, x_{t-1}) of (9): where odometry says the robot went."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import se2
+from stillmap.options import field_with_doc
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """Standard deviations of one odometry increment."""
+
+    translation_floor: float = field_with_doc(0.01, "m, error of an increment without motion")
+    translation_per_metre: float = field_with_doc(0.10, "m of error per metre travelled")
+    translation_per_radian: float = field_with_doc(0.03, "m of error per radian turned")
+    rotation_floor: float = field_with_doc(0.005, "rad, error of an increment without motion")
+    rotation_per_metre: float = field_with_doc(0.03, "rad of error per metre travelled")
+    rotation_per_radian: float = field_with_doc(0.12, "rad of error per radian turned")
+    without_odometry_translation: float = field_with_doc(
+        0.15, "m, error of the constant-velocity guess where there is no odometry"
+    )
+    without_odometry_rotation: float = field_with_doc(
+        0.15, "rad, error of the constant-velocity guess where there is no odometry"
+    )
+
+
+@dataclass(frozen=True)
+class MotionPrior:
+    """A Gaussian on the next pose.
+
+    Attributes:
+        T_map_base: (3, 3) its mean.
+        information: (3, 3) inverse covariance of x, y (map frame) and heading.
+        sigma_translation: metres, the larger standard deviation of x, y.
+        sigma_rotation: radians.
+    """
+
+    T_map_base: Float
+    information: Float
+    sigma_translation: float
+    sigma_rotation: float
+
+
+def from_odometry(T_map_base: Float, increment: Float, options: MotionOptions) -> MotionPrior:
+    """The prior after moving by an odometry increment (3, 3) from a pose (3, 3)."""
+    x, y, theta = se2.parameters(increment)
+    distance, turn = float(np.hypot(x, y)), abs(float(theta))
+    sigma_xy = (
+        options.translation_floor
+        + options.translation_per_metre * distance
+        + options.translation_per_radian * turn
+    )
+    sigma_theta = (
+        options.rotation_floor
+        + options.rotation_per_metre * distance
+        + options.rotation_per_radian * turn
+    )
+    return _prior(T_map_base @ increment, sigma_xy, sigma_theta)
+
+
+def from_constant_velocity(
+    T_map_base: Float, T_map_base_before: Float, options: MotionOptions
+) -> MotionPrior:
+    """The prior without odometry: the last motion once more."""
+    increment = se2.inverse(T_map_base_before) @ T_map_base
+    return _prior(
+        T_map_base @ increment,
+        options.without_odometry_translation,
+        options.without_odometry_rotation,
+    )
+
+
+def _prior(mean: Float, sigma_xy: float, sigma_theta: float) -> MotionPrior:
+    information = np.diag([sigma_xy**-2, sigma_xy**-2, sigma_theta**-2])
+    return MotionPrior(mean, information, sigma_xy, sigma_theta)
