@@ -1,0 +1,22 @@
+"""`beams/`: the label of every beam, as flat arrays that can be memory-mapped."""
+
+from pathlib import Path
+
+import numpy as np
+
+from stillmap.output.protocols import ResultLike
+
+
+def write_beams(folder: Path, result: ResultLike) -> None:
+    """Write `stamp_ns` (T,), `offset` (T+1,), `p_static` (M,) and `hit` (M,) as .npy into `folder`.
+
+    `folder` is made. Scan t owns the beams offset[t]:offset[t+1], in the recording's order.
+    """
+    recording = result.recording
+    if result.p_static.shape != (recording.n_beams,):
+        raise ValueError(f"p_static: expected ({recording.n_beams},), got {result.p_static.shape}")
+    folder.mkdir()
+    np.save(folder / "stamp_ns.npy", np.asarray(recording.stamp_ns, np.int64))
+    np.save(folder / "offset.npy", np.asarray(recording.offset, np.int64))
+    np.save(folder / "p_static.npy", np.asarray(result.p_static, np.float32))
+    np.save(folder / "hit.npy", np.asarray(recording.hit, np.bool_))

@@ -1,0 +1,30 @@
+"""`map.npz`: the occupancy grid with the sums it is made from."""
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.output.protocols import OccupancyMapLike
+
+
+def write_map_npz(path: Path, occupancy: OccupancyMapLike) -> None:
+    """Write `p_occupied`, `alpha`, `beta` (H, W), `origin` (x, y, yaw) and `resolution` in metres.
+
+    Equal maps give equal bytes: the archive's dates are fixed.
+    """
+    arrays: dict[str, NDArray[Any]] = {
+        "p_occupied": np.asarray(occupancy.p_occupied, np.float32),
+        "alpha": np.asarray(occupancy.alpha, np.float64),
+        "beta": np.asarray(occupancy.beta, np.float64),
+        "origin": np.asarray(occupancy.origin, np.float64),
+        "resolution": np.asarray(occupancy.resolution, np.float64),
+    }
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            # np.savez leaves the date to zipfile's default, which is no promise
+            entry = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
+            with archive.open(entry, "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, array, allow_pickle=False)

@@ -1,0 +1,111 @@
+"""What the writers need of a result: the pipeline's dataclasses satisfy these by their shape."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.output.crops import Snapshot
+from stillmap.output.map_server import OutputOptions
+from stillmap.recording.model import Recording
+
+
+class OccupancyMapLike(Protocol):
+    """A grid map, row 0 at the lowest y.
+
+    Attributes:
+        p_occupied: (H, W) float32, NaN where no beam ever looked.
+        alpha: (H, W) float64, the sums of (10): beams that ended on something static here.
+        beta: (H, W) float64, the sums of (10): evidence that the cell is free.
+        origin: x, y in metres and yaw in radians of the lower-left cell's lower-left corner.
+        resolution: edge of a cell in metres.
+    """
+
+    @property
+    def p_occupied(self) -> NDArray[np.float32]: ...
+    @property
+    def alpha(self) -> NDArray[np.float64]: ...
+    @property
+    def beta(self) -> NDArray[np.float64]: ...
+    @property
+    def origin(self) -> tuple[float, float, float]: ...
+    @property
+    def resolution(self) -> float: ...
+
+
+class IterationRecordLike(Protocol):
+    """The numbers of one EM iteration.
+
+    Attributes:
+        number: counted from 1.
+        expected_log_likelihood: (5) with the constant of (7), the curve of Fig. 5.
+        bound: the above plus the entropy of e: what the loop watches.
+        held_out_log_likelihood: of beams kept out of the estimation, None where not computed.
+        changed_share: share of hits whose label or probability still moved.
+        seconds: wall-clock time of the iteration.
+    """
+
+    @property
+    def number(self) -> int: ...
+    @property
+    def expected_log_likelihood(self) -> float: ...
+    @property
+    def bound(self) -> float: ...
+    @property
+    def held_out_log_likelihood(self) -> float | None: ...
+    @property
+    def changed_share(self) -> float: ...
+    @property
+    def seconds(self) -> float: ...
+
+
+class OptionsLike(Protocol):
+    """The resolved options: a frozen dataclass with a section for the writers."""
+
+    @property
+    def output(self) -> OutputOptions: ...
+
+
+class ResultLike(Protocol):
+    """What `stillmap map` found out about T scans with M beams in D dimensions.
+
+    Attributes:
+        recording: what it was made from.
+        options: every option as resolved.
+        iterations: one record per EM iteration, in order.
+        snapshots: a small part of the map at the first, second and best iteration (Fig. 8).
+        poses: (T, D+1, D+1) float64, T_map_base.
+        p_static: (M,) float32, P(c = 1); NaN for unusable beams, the prior at maximum range.
+        map: the map of what stands still.
+        raw_map: the map with every hit counted in full, from the same poses.
+        best_iteration: number of the iteration that was kept.
+        converged: whether the loop stopped by itself.
+        warnings: one sentence each.
+        stages: name to `seconds` and `peak_memory_bytes`, in the order they ran.
+    """
+
+    @property
+    def recording(self) -> Recording: ...
+    @property
+    def options(self) -> OptionsLike: ...
+    @property
+    def iterations(self) -> Sequence[IterationRecordLike]: ...
+    @property
+    def snapshots(self) -> Sequence[Snapshot]: ...
+    @property
+    def poses(self) -> NDArray[np.float64]: ...
+    @property
+    def p_static(self) -> NDArray[np.float32]: ...
+    @property
+    def map(self) -> OccupancyMapLike: ...
+    @property
+    def raw_map(self) -> OccupancyMapLike: ...
+    @property
+    def best_iteration(self) -> int: ...
+    @property
+    def converged(self) -> bool: ...
+    @property
+    def warnings(self) -> Sequence[str]: ...
+    @property
+    def stages(self) -> Mapping[str, Mapping[str, Any]]: ...

@@ -1,0 +1,189 @@
+"""`report.html`: one page that shows what a run did, without a request to anywhere."""
+
+import itertools
+from html import escape
+from pathlib import Path
+
+from stillmap.output.points import beam_counts
+from stillmap.output.protocols import ResultLike
+from stillmap.output.report_curve import likelihood_svg
+from stillmap.output.report_maps import evolution_section, maps_section
+from stillmap.output.report_tables import (
+    bytes_text,
+    duration_text,
+    iterations_table,
+    name_value_table,
+    options_table,
+    share_text,
+    stages_table,
+)
+from stillmap.output.report_template import PAGE, STYLE
+from stillmap.output.run_json import jsonable, skipped_count, version
+
+
+def write_report(path: Path, result: ResultLike) -> None:
+    """Write the report as one HTML page of a few megabytes at most, whatever the map's size."""
+    path.write_text(report_html(result), encoding="utf-8")
+
+
+def report_html(result: ResultLike) -> str:
+    """The page. All pictures lie in it; it holds no script and reads without one."""
+    name = _name(result)
+    sections = [
+        _header(result, name),
+        _headline(result),
+        _warnings(result),
+        maps_section(result),
+        _estimate_section(result),
+        evolution_section(result),
+        _recording_section(result),
+        _stages_section(result),
+        _options_section(result),
+        f'<footer class="soft">Written by stillmap {escape(version())}.</footer>',
+    ]
+    body = "\n".join(section for section in sections if section)
+    return PAGE.substitute(title=escape(f"{name}: stillmap report"), style=STYLE, body=body)
+
+
+def likelihood_sentence(result: ResultLike) -> str:
+    """Whether and where the expected log likelihood fell from one iteration to the next."""
+    records = result.iterations
+    if len(records) < 2:
+        return "There was one iteration only."
+    falls = [
+        (after.number, before.expected_log_likelihood - after.expected_log_likelihood, before)
+        for before, after in itertools.pairwise(records)
+        if after.expected_log_likelihood < before.expected_log_likelihood
+    ]
+    if not falls:
+        return "The likelihood never fell from one iteration to the next."
+    where = ", ".join(str(number) for number, _, _ in falls)
+    number, amount, before = max(falls, key=lambda fall: fall[1])
+    relative = amount / max(abs(before.expected_log_likelihood), 1e-300)
+    most = f"by {share_text(relative)}" if len(falls) == 1 else f"most, by {share_text(relative)}"
+    most += "" if len(falls) == 1 else f", at iteration {number}"
+    plural = "s" if len(falls) > 1 else ""
+    return (
+        f"The likelihood fell at iteration{plural} {where} ({most}). That can happen: "
+        "the poses are estimated one after the other, and a small change in one may cost later "
+        "ones more than it gained."
+    )
+
+
+def _name(result: ResultLike) -> str:
+    path = str(result.recording.source.get("path", ""))
+    return Path(path).name or "recording"
+
+
+def _header(result: ResultLike, name: str) -> str:
+    source = result.recording.source
+    path, kind = str(source.get("path", "")), str(source.get("format", ""))
+    details = ", ".join(text for text in (path, kind) if text)
+    return (
+        f"<header><h1>What stands still in {escape(name)}</h1>"
+        f'<p class="soft">{escape(details)}</p></header>'
+    )
+
+
+def _headline(result: ResultLike) -> str:
+    recording = result.recording
+    counts = beam_counts(recording, result.p_static)
+    stamps = recording.stamp_ns
+    seconds = float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
+    took = sum(float(stage.get("seconds") or 0) for stage in result.stages.values())
+    memory = max(
+        (stage.get("peak_memory_bytes") or 0 for stage in result.stages.values()), default=0
+    )
+    cards = [
+        ("Scans", f"{recording.n_scans:,}", _skipped_note(result)),
+        ("Beams", f"{counts['beams']:,}", f"{counts['hits']:,} hit something"),
+        (
+            "Dynamic",
+            share_text(counts["dynamic"] / max(counts["hits"], 1)),
+            f"{counts['dynamic']:,} of the hits",
+        ),
+        ("Recorded", duration_text(seconds), "from first to last scan"),
+        ("Computed in", duration_text(took), f"{_per_scan(took, recording.n_scans)} per scan"),
+        ("Peak memory", bytes_text(memory), ""),
+        (
+            "Iterations",
+            f"{len(result.iterations)}",
+            f"number {result.best_iteration} kept; "
+            + ("converged" if result.converged else "stopped at the limit"),
+        ),
+    ]
+    items = "".join(
+        f"<div><dt>{escape(title)}</dt><dd>{escape(value)}<small>{escape(note)}</small></dd></div>"
+        for title, value, note in cards
+    )
+    return f'<dl class="cards">{items}</dl>'
+
+
+def _per_scan(seconds: float, scans: int) -> str:
+    return f"{1e3 * seconds / max(scans, 1):.2g} ms"
+
+
+def _skipped_note(result: ResultLike) -> str:
+    skipped = skipped_count(result.recording.source)
+    return f"{skipped:,} damaged, skipped" if skipped else "none skipped"
+
+
+def _warnings(result: ResultLike) -> str:
+    if not result.warnings:
+        return ""
+    items = "".join(f"<li>{escape(text)}</li>" for text in result.warnings)
+    return f'<section class="warnings"><h2>Warnings</h2><ul>{items}</ul></section>'
+
+
+def _estimate_section(result: ResultLike) -> str:
+    if not result.iterations:
+        return ""
+    end = (
+        "The loop stopped by itself."
+        if result.converged
+        else "The loop stopped at its limit, before it had converged."
+    )
+    return (
+        "<section><h2>How the estimate went</h2>"
+        f"<p>{escape(likelihood_sentence(result))} {end} "
+        f"The result is that of iteration {result.best_iteration}, circled.</p>"
+        f'<figure role="img" aria-label="Likelihood over {len(result.iterations)} iterations; '
+        f'the numbers are in the table below.">'
+        f"{likelihood_svg(result.iterations, result.best_iteration)}</figure>"
+        "<details><summary>The numbers</summary>"
+        f"{iterations_table(result.iterations, result.best_iteration)}</details></section>"
+    )
+
+
+def _recording_section(result: ResultLike) -> str:
+    source = jsonable(result.recording.source)
+    skipped = source.pop("skipped", None)
+    counts = beam_counts(result.recording, result.p_static)
+    beams = (
+        f"Of {counts['beams']:,} beams {counts['hits']:,} hit something, {counts['max_range']:,} "
+        f"met nothing within range and {counts['unusable']:,} are unusable."
+    )
+    text = (
+        "<section><h2>The recording, and what was guessed about it</h2>"
+        f"<p>{beams}</p>{name_value_table(source)}"
+    )
+    if skipped_count(result.recording.source):
+        text += f"<h2>What was skipped</h2>{name_value_table({'skipped': skipped})}"
+    return text + "</section>"
+
+
+def _stages_section(result: ResultLike) -> str:
+    if not result.stages:
+        return ""
+    return (
+        "<section><h2>Where time and memory went</h2>"
+        '<p class="soft">Writing these files comes on top.</p>'
+        f"{stages_table(result.stages)}</section>"
+    )
+
+
+def _options_section(result: ResultLike) -> str:
+    return (
+        "<section><h2>Options</h2><details><summary>Every option as this run used it</summary>"
+        f"{options_table(result.options)}</details></section>"
+    )

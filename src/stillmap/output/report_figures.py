@@ -1,0 +1,147 @@
+"""The report's pictures: maps as PNG, the likelihood as SVG, all inline."""
+
+import base64
+import io
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from stillmap.output.crops import Snapshot, Window, cut, extent
+from stillmap.output.map_server import OCCUPIED_THRESH
+from stillmap.output.protocols import OccupancyMapLike
+
+ORANGE = (240, 120, 0)
+UNKNOWN = (190, 196, 204)
+# enough for a large screen, and two maps of it stay within a few megabytes
+PIXEL_BUDGET = 1_500_000
+_SNAPSHOT_PIXELS = 480
+_SHOWN_WIDTH = 600
+_UNKNOWN_INDEX, _ORANGE_INDEX = 101, 102
+
+
+def known_window(maps: Sequence[OccupancyMapLike]) -> Window:
+    """The smallest window that holds every known cell of `maps`, with a small margin."""
+    boxes = [box for box in (_known_box(one) for one in maps) if box is not None]
+    if not boxes:
+        return extent(maps[0])
+    corners = np.array(boxes)
+    x0, y0 = corners[:, :2].min(axis=0).tolist()
+    x1, y1 = corners[:, 2:].max(axis=0).tolist()
+    return x0, y0, x1, y1
+
+
+def map_image(occupancy: OccupancyMapLike, window: Window) -> Image.Image:
+    """White free, grey unknown, black occupied; large maps are reduced to the pixel budget."""
+    cells, _ = cut(occupancy, window)
+    factor = max(1, math.ceil(math.sqrt(cells.size / PIXEL_BUDGET)))
+    return _with_palette(_levels(cells, factor)[::-1])
+
+
+def dots_image(points: NDArray[np.float32], window: Window, size: tuple[int, int]) -> Image.Image:
+    """Orange dots on nothing, to lie over a `map_image` of `size` (width, height) pixels."""
+    width, height = size
+    pixels = np.zeros((height, width), np.uint8)
+    column, row = pixel_positions(points, window, size).T
+    _put_dots(pixels, column, row, 1, max(1, round(width / _SHOWN_WIDTH)))
+    image = Image.fromarray(pixels)
+    image.putpalette([*UNKNOWN, *ORANGE])
+    image.info["transparency"] = 0
+    return image
+
+
+def snapshot_image(snapshot: Snapshot) -> Image.Image:
+    """The snapshot's part of the map with its dynamic end points in orange."""
+    longest = max(snapshot.p_occupied.shape)
+    levels = _levels(snapshot.p_occupied, max(1, math.ceil(longest / _SNAPSHOT_PIXELS)))[::-1]
+    larger = max(1, _SNAPSHOT_PIXELS // max(levels.shape))
+    pixels = levels.repeat(larger, axis=0).repeat(larger, axis=1)
+    h, w = snapshot.p_occupied.shape
+    x, y, _ = snapshot.origin
+    window = (x, y, x + w * snapshot.resolution, y + h * snapshot.resolution)
+    column, row = pixel_positions(snapshot.dynamic_points, window, pixels.shape[::-1]).T
+    _put_dots(pixels, column, row, _ORANGE_INDEX, 3)
+    return _with_palette(pixels)
+
+
+def pixel_positions(
+    points: NDArray[np.float32] | NDArray[np.float64], window: Window, size: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """(K, 2) column and row, as fractions of pixels from the top left, of (K, 2) map points."""
+    x0, y0, x1, y1 = window
+    width, height = size
+    column = (points[:, 0] - x0) * (width / (x1 - x0))
+    row = (y1 - points[:, 1]) * (height / (y1 - y0))
+    return np.stack([column, row], axis=1).astype(np.float64)
+
+
+def png_uri(image: Image.Image) -> str:
+    """The picture as a `data:` address."""
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def _known_box(occupancy: OccupancyMapLike) -> Window | None:
+    known = ~np.isnan(occupancy.p_occupied)
+    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    if not len(rows):
+        return None
+    x, y, _, _ = extent(occupancy)
+    margin = 4 + max(known.shape) // 100
+    return (
+        x + (int(columns[0]) - margin) * occupancy.resolution,
+        y + (int(rows[0]) - margin) * occupancy.resolution,
+        x + (int(columns[-1]) + 1 + margin) * occupancy.resolution,
+        y + (int(rows[-1]) + 1 + margin) * occupancy.resolution,
+    )
+
+
+def _levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
+    """Percent occupied of squares of `factor` cells, 101 where unknown.
+
+    A square with an occupied cell shows that cell, or thin walls would vanish from large maps;
+    any other shows the mean of what is known.
+    """
+    height, width = (-(-n // factor) for n in cells.shape)
+    levels = np.empty((height, width), np.uint8)
+    # by strips: the intermediate arrays of a whole large map would be many times its size
+    strip = max(1, (1 << 20) // (width * factor * factor))
+    for top in range(0, height, strip):
+        part = cells[top * factor : (top + strip) * factor]
+        rows = -(-len(part) // factor)
+        padded = np.full((rows * factor, width * factor), np.nan, np.float32)
+        padded[: len(part), : part.shape[1]] = part
+        squares = padded.reshape(rows, factor, width, factor)
+        known = ~np.isnan(squares)
+        count = known.sum(axis=(1, 3))
+        mean = np.where(known, squares, 0).sum(axis=(1, 3)) / np.maximum(count, 1)
+        most = np.where(known, squares, 0).max(axis=(1, 3))
+        p = np.where(most > OCCUPIED_THRESH, most, mean)
+        levels[top : top + strip] = np.where(count, np.rint(100 * p), _UNKNOWN_INDEX)
+    return levels
+
+
+def _with_palette(levels: NDArray[np.uint8]) -> Image.Image:
+    greys = [grey for percent in range(101) for grey in [round(255 * (1 - percent / 100))] * 3]
+    image = Image.fromarray(np.ascontiguousarray(levels))
+    image.putpalette([*greys, *UNKNOWN, *ORANGE])
+    return image
+
+
+def _put_dots(
+    pixels: NDArray[np.uint8],
+    column: NDArray[np.float64],
+    row: NDArray[np.float64],
+    value: int,
+    size: int,
+) -> None:
+    height, width = pixels.shape
+    i, j = np.floor(row).astype(np.int64), np.floor(column).astype(np.int64)
+    for di in range(size):
+        for dj in range(size):
+            y, x = i + di - size // 2, j + dj - size // 2
+            inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+            pixels[y[inside], x[inside]] = value

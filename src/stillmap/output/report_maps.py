@@ -1,0 +1,138 @@
+"""The report's maps: raw beside filtered (Figs. 4, 6, 7), and how a part evolved (Fig. 8)."""
+
+import math
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from stillmap.output.crops import Snapshot, Window
+from stillmap.output.points import dynamic_points
+from stillmap.output.protocols import ResultLike
+from stillmap.output.report_figures import (
+    dots_image,
+    known_window,
+    map_image,
+    pixel_positions,
+    png_uri,
+    snapshot_image,
+)
+
+_KEY = (
+    '<p class="soft"><span class="key" style="margin-left:0;background:#fff"></span>free'
+    '<span class="key" style="background:#bec4cc"></span>never looked at'
+    '<span class="key" style="background:#000"></span>occupied'
+    '<span class="key" style="background:#f07800"></span>end of a beam that met something '
+    "moving</p>"
+)
+_TOGGLES = (
+    '<input class="toggle" type="checkbox" id="show-dynamic" checked>'
+    '<label for="show-dynamic">moving things</label>'
+    '<input class="toggle" type="checkbox" id="show-path"><label for="show-path">trajectory</label>'
+    '<input class="toggle" type="checkbox" id="large"><label for="large">large</label>'
+)
+_PATH_POINTS = 3000
+
+
+def maps_section(result: ResultLike) -> str:
+    """The raw map beside the filtered one."""
+    window = known_window([result.raw_map, result.map])
+    raw, filtered = map_image(result.raw_map, window), map_image(result.map, window)
+    dots = dots_image(
+        dynamic_points(result.recording, result.poses, result.p_static)[:, :2],
+        window,
+        filtered.size,
+    )
+    path = _path(result.poses, window, filtered.size)
+    width, height = window[2] - window[0], window[3] - window[1]
+    reduced = filtered.size[0] < round(width / result.map.resolution)
+    size = f"{width:.0f} m by {height:.0f} m, cells of {100 * result.map.resolution:.3g} cm"
+    return (
+        f"<section><h2>The map</h2><p>{size}.</p>{_KEY}{_TOGGLES}"
+        '<div class="pair">'
+        + _figure("Raw", "every beam counted in full", [(raw, "")], path, window, reduced)
+        + _figure(
+            "Filtered",
+            "what stands still; what moved in orange",
+            [(filtered, ""), (dots, "dynamic")],
+            path,
+            window,
+            reduced,
+        )
+        + "</div></section>"
+    )
+
+
+def evolution_section(result: ResultLike) -> str:
+    """The part of the map with most movement at the first, second and best iteration."""
+    if not result.snapshots:
+        return ""
+    figures = "".join(_snapshot_figure(one, result.best_iteration) for one in result.snapshots)
+    h, w = result.snapshots[0].p_occupied.shape
+    step = result.snapshots[0].resolution
+    return (
+        "<section><h2>How the map evolved</h2>"
+        f"<p>The {w * step:.0f} m by {h * step:.0f} m where most movement was seen; in orange "
+        "the ends of beams taken for dynamic at that iteration.</p>"
+        f'<div class="row">{figures}</div></section>'
+    )
+
+
+def _snapshot_figure(snapshot: Snapshot, best: int) -> str:
+    h, w = snapshot.p_occupied.shape
+    x, y, _ = snapshot.origin
+    window = (x, y, x + w * snapshot.resolution, y + h * snapshot.resolution)
+    kept = ", kept" if snapshot.number == best else ""
+    return _figure(
+        f"Iteration {snapshot.number}{kept}",
+        f"{len(snapshot.dynamic_points):,} dynamic ends",
+        [(snapshot_image(snapshot), "")],
+        "",
+        window,
+        False,
+    )
+
+
+def _figure(
+    title: str,
+    caption: str,
+    layers: Sequence[tuple[Image.Image, str]],
+    overlay: str,
+    window: Window,
+    reduced: bool,
+) -> str:
+    width, height = layers[0][0].size
+    images = ""
+    for index, (image, kind) in enumerate(layers):
+        # what a layer above the first shows is in the first one's caption
+        alt = f"{title} map: {caption}" if index == 0 else ""
+        classes = f"{kind} {'reduced' if reduced else ''}".strip()
+        images += (
+            f'<img class="{classes}" src="{png_uri(image)}" alt="{escape(alt)}" '
+            f'width="{width}" height="{height}">'
+        )
+    return (
+        f"<figure><figcaption><b>{escape(title)}</b>: {escape(caption)}</figcaption>"
+        f'<div class="map" style="--ratio:{width / height:.5f}">{images}{overlay}'
+        f"{_scale_bar(window)}</div></figure>"
+    )
+
+
+def _scale_bar(window: Window) -> str:
+    width = window[2] - window[0]
+    power = 10.0 ** math.floor(math.log10(width / 4))
+    length = max(step * power for step in (1, 2, 5) if step * power <= width / 4)
+    return f'<span class="scale" style="width:{100 * length / width:.3f}%">{length:g}&nbsp;m</span>'
+
+
+def _path(poses: NDArray[np.float64], window: Window, size: tuple[int, int]) -> str:
+    """The trajectory as a line over a map picture of `size` pixels."""
+    every = max(1, math.ceil(len(poses) / _PATH_POINTS))
+    positions = pixel_positions(poses[::every, :2, -1], window, size)
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in positions.tolist())
+    return (
+        f'<svg class="path" aria-hidden="true" viewBox="0 0 {size[0]} {size[1]}" '
+        f'preserveAspectRatio="none"><polyline points="{points}"/></svg>'
+    )

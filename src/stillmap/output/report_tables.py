@@ -1,0 +1,154 @@
+"""The report's tables and the way it words numbers."""
+
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+from stillmap.options import to_dict
+from stillmap.output.protocols import IterationRecordLike
+from stillmap.output.run_json import jsonable
+
+# a damaged file can have a remark on every line; run.json names them all
+_MOST_ITEMS = 25
+
+
+def share_text(share: float) -> str:
+    """A share in percent, with two figures that say something."""
+    percent = 100 * share
+    if not math.isfinite(percent):
+        return "unknown"
+    return f"{percent:.1f} %" if percent >= 1 or percent == 0 else f"{percent:.2g} %"
+
+
+def duration_text(seconds: float) -> str:
+    """A time span as people say it."""
+    if seconds < 10:
+        return f"{seconds:.2g} s"
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s"
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def bytes_text(size: float) -> str:
+    """A number of bytes in MB or GB (powers of ten)."""
+    if not size:
+        return "unknown"
+    return f"{size / 1e6:,.0f} MB" if size < 1e9 else f"{size / 1e9:.2f} GB"
+
+
+def number_text(value: float | None) -> str:
+    """A number to seven figures, a dash where there is none."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:,.7g}"
+
+
+def iterations_table(iterations: Sequence[IterationRecordLike], best: int) -> str:
+    """One row per iteration, the best one marked."""
+    names = ("iteration", "expected log likelihood", "bound", "held out", "changed", "time")
+    rows = []
+    for it in iterations:
+        cells = [
+            number_text(it.expected_log_likelihood),
+            number_text(it.bound),
+            number_text(it.held_out_log_likelihood),
+            share_text(it.changed_share),
+            duration_text(it.seconds),
+        ]
+        kept = " (kept)" if it.number == best else ""
+        marked = ' class="best"' if kept else ""
+        rows.append(
+            f'<tr{marked}><th scope="row">{it.number}{kept}</th>'
+            + "".join(f'<td class="number">{escape(cell)}</td>' for cell in cells)
+            + "</tr>"
+        )
+    return _table(names, rows)
+
+
+def stages_table(stages: Mapping[str, Mapping[str, Any]]) -> str:
+    """Seconds and peak memory per stage."""
+    longest = max((float(stage.get("seconds") or 0) for stage in stages.values()), default=0) or 1.0
+    rows = []
+    for name, stage in stages.items():
+        seconds = float(stage.get("seconds") or 0)
+        rows.append(
+            f'<tr><th scope="row">{escape(name)}</th>'
+            f'<td class="number">{duration_text(seconds)}</td>'
+            f'<td><meter min="0" max="{longest:.6g}" value="{seconds:.6g}" '
+            f'aria-hidden="true"></meter></td>'
+            f'<td class="number">{bytes_text(stage.get("peak_memory_bytes") or 0)}</td></tr>'
+        )
+    return _table(("stage", "time", "", "peak memory"), rows)
+
+
+def options_table(options: Any) -> str:
+    """Every option by its full name, as `--set` takes it."""
+    rows = [
+        f'<tr><th scope="row"><code>{escape(name)}</code></th>'
+        f"<td><code>{escape(_scalar(value))}</code></td></tr>"
+        for name, value in _flat(jsonable(to_dict(options)), "")
+    ]
+    return _table(("option", "value"), rows)
+
+
+def name_value_table(values: Mapping[str, Any]) -> str:
+    """JSON-able values by name; inner names in words."""
+    rows = [
+        f'<tr><th scope="row">{escape(name.replace("_", " "))}</th><td>{_value(value)}</td></tr>'
+        for name, value in values.items()
+    ]
+    return _table(("", ""), rows) if rows else ""
+
+
+def _table(names: Sequence[str], rows: Sequence[str]) -> str:
+    # the first column names the row; numbers stand to the right
+    head = "".join(
+        f'<th scope="col"{" class=number" if i and "number" in rows[0] else ""}>{escape(name)}</th>'
+        for i, name in enumerate(names)
+    )
+    thead = f"<thead><tr>{head}</tr></thead>" if any(names) else ""
+    return f'<div class="wide"><table>{thead}<tbody>{"".join(rows)}</tbody></table></div>'
+
+
+def _flat(values: Mapping[str, Any], prefix: str) -> list[tuple[str, Any]]:
+    rows: list[tuple[str, Any]] = []
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            rows.extend(_flat(value, f"{prefix}{name}."))
+        else:
+            rows.append((f"{prefix}{name}", value))
+    return rows
+
+
+def _scalar(value: Any) -> str:
+    if value is None:
+        return "not set"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.7g}" if isinstance(value, float) else str(value)
+
+
+def _value(value: Any) -> str:
+    """A JSON-able value as HTML: a list for lists and for what has names inside."""
+    if isinstance(value, Mapping):
+        lines = [f"{escape(str(k).replace('_', ' '))}: {_line(v)}" for k, v in value.items()]
+    elif isinstance(value, list) and not all(isinstance(v, int | float) for v in value):
+        lines = [_line(item) for item in value]
+    else:
+        return _line(value)
+    more = len(lines) - _MOST_ITEMS
+    if more > 0:
+        lines = [*lines[:_MOST_ITEMS], f"and {more:,} more, see <code>run.json</code>"]
+    return "<ul>" + "".join(f"<li>{line}</li>" for line in lines) + "</ul>"
+
+
+def _line(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{escape(str(k))} {_line(v)}" for k, v in value.items())
+    if isinstance(value, list):
+        shown = ", ".join(_line(v) for v in value[:_MOST_ITEMS])
+        return shown + (", …" if len(value) > _MOST_ITEMS else "")
+    text = _scalar(value)
+    return escape(text if len(text) <= 500 else text[:500] + "…")

@@ -1,0 +1,89 @@
+"""`run.json`: what was run, on what, with which options, and how it went."""
+
+import importlib.metadata
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stillmap.options import to_dict
+from stillmap.output.points import beam_counts
+from stillmap.output.protocols import IterationRecordLike, ResultLike
+
+FORMAT_VERSION = 1
+
+
+def run_record(result: ResultLike) -> dict[str, Any]:
+    """The content of `run.json` as JSON-able values; numbers that are not finite become None."""
+    counts = beam_counts(result.recording, result.p_static)
+    counts = {
+        "scans": result.recording.n_scans,
+        **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
+        "skipped": skipped_count(result.recording.source),
+    }
+    record = {
+        "format_version": FORMAT_VERSION,
+        "version": version(),
+        "input": result.recording.source,
+        "options": to_dict(result.options),
+        "iterations": [_iteration(it) for it in result.iterations],
+        "converged": result.converged,
+        "best_iteration": result.best_iteration,
+        "seconds": {name: stage.get("seconds") for name, stage in result.stages.items()},
+        "peak_memory_bytes": {
+            name: stage.get("peak_memory_bytes") for name, stage in result.stages.items()
+        },
+        "counts": counts,
+        "warnings": list(result.warnings),
+    }
+    plain: dict[str, Any] = jsonable(record)
+    return plain
+
+
+def write_run_json(path: Path, result: ResultLike) -> None:
+    """Write `run_record` to `path`."""
+    text = json.dumps(run_record(result), indent=2, ensure_ascii=False, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def version() -> str:
+    """The installed stillmap's version, `unknown` when it runs from a bare source tree."""
+    try:
+        return importlib.metadata.version("stillmap")
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def skipped_count(source: Mapping[str, Any]) -> int:
+    """How many records the reader left out, whether it names each one or only counts them."""
+    skipped = source.get("skipped", 0)
+    if isinstance(skipped, Mapping):
+        return sum(skipped_count({"skipped": value}) for value in skipped.values())
+    return len(skipped) if isinstance(skipped, list | tuple) else int(skipped or 0)
+
+
+def jsonable(value: Any) -> Any:
+    """`value` in JSON's own types: arrays as lists, paths as text, NaN and infinity as None."""
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return jsonable(value.tolist())
+    if isinstance(value, list | tuple):
+        return [jsonable(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def _iteration(it: IterationRecordLike) -> dict[str, Any]:
+    return {
+        "number": it.number,
+        "bound": it.bound,
+        "expected_log_likelihood": it.expected_log_likelihood,
+        "held_out_log_likelihood": it.held_out_log_likelihood,
+        "changed_share": it.changed_share,
+        "seconds": it.seconds,
+    }

@@ -1,0 +1,32 @@
+"""The result folder: every file of a run, appearing together or not at all."""
+
+from pathlib import Path
+
+from stillmap.output.atomic import new_folder
+from stillmap.output.beams import write_beams
+from stillmap.output.map_npz import write_map_npz
+from stillmap.output.map_server import write_map_server
+from stillmap.output.protocols import ResultLike
+from stillmap.output.report import write_report
+from stillmap.output.run_json import write_run_json
+from stillmap.output.trajectory import write_tum
+
+
+def save(result: ResultLike, path: Path, overwrite: bool = False) -> None:
+    """Write `result` as the folder `path`: map, trajectory, labels, report and run record.
+
+    Args:
+        result: what the pipeline found.
+        path: the folder; it must not exist or be empty unless `overwrite` is given.
+        overwrite: replace what is there, once the new folder is whole.
+
+    Raises:
+        InputError: `path` is taken or cannot be written to.
+    """
+    with new_folder(path, overwrite) as folder:
+        write_map_server(folder, result.map, result.options.output.map_mode)
+        write_map_npz(folder / "map.npz", result.map)
+        write_tum(folder / "trajectory.tum", result.recording.stamp_ns, result.poses)
+        write_beams(folder / "beams", result)
+        write_report(folder / "report.html", result)
+        write_run_json(folder / "run.json", result)

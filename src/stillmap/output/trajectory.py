@@ -1,0 +1,102 @@
+"""TUM trajectories: `stamp x y z qx qy qz qw`, the stamp in seconds, exact to the nanosecond."""
+
+import decimal
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from stillmap.errors import InputError
+
+_COLUMNS = "stamp x y z qx qy qz qw"
+# a quaternion printed with three decimals still lies well within this of length one
+_UNIT_TOLERANCE = 0.02
+
+
+def write_tum(path: Path, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+    """Write one line per pose.
+
+    Args:
+        path: the file.
+        stamp_ns: (T,) int64 nanoseconds.
+        poses: (T, D+1, D+1) float64, T_map_base, D = 2 or 3.
+    """
+    # + 0.0 turns the negative zeros that rounding leaves into zeros
+    rows = np.round(_rows_of(poses), 9) + 0.0
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        for stamp, row in zip(stamp_ns.tolist(), rows.tolist(), strict=True):
+            file.write(f"{_seconds(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
+
+
+def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Stamps (T,) int64 in nanoseconds and poses (T, 4, 4) of a TUM file, in the file's order.
+
+    Stamps are parsed as decimals, never as floats; digits beyond nanoseconds are rounded.
+    Blank lines and lines that start with `#` are passed over.
+
+    Raises:
+        InputError: the file cannot be read, a line is no pose, or there is none at all.
+    """
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(_lines(path), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        stamp, row = _parsed(words, f"{path}:{number}")
+        stamps.append(stamp)
+        rows.append(row)
+    if not stamps:
+        raise InputError("holds no poses", where=str(path), hint=f"lines of '{_COLUMNS}'")
+    values = np.array(rows)
+    poses = np.tile(np.eye(4), (len(values), 1, 1))
+    poses[:, :3, 3] = values[:, :3]
+    poses[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
+    return np.array(stamps, np.int64), poses
+
+
+def _rows_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T, 7) x y z qx qy qz qw with qw >= 0."""
+    rows = np.zeros((len(poses), 7))
+    dimension = poses.shape[-1] - 1
+    rows[:, :dimension] = poses[:, :dimension, dimension]
+    if dimension == 2:
+        half = np.arctan2(poses[:, 1, 0], poses[:, 0, 0]) / 2
+        rows[:, 5], rows[:, 6] = np.sin(half), np.cos(half)
+    elif len(poses):
+        quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        rows[:, 3:] = np.where(quaternion[:, 3:] < 0, -quaternion, quaternion)
+    return rows
+
+
+def _seconds(stamp_ns: int) -> str:
+    whole, rest = divmod(abs(stamp_ns), 10**9)
+    return f"{'-' if stamp_ns < 0 else ''}{whole}.{rest:09d}"
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    except UnicodeDecodeError as error:
+        raise InputError("is not a text file", where=str(path)) from error
+
+
+def _parsed(words: list[str], where: str) -> tuple[int, list[float]]:
+    if len(words) != 8:
+        raise InputError(f"has {len(words)} columns, not 8", where=where, hint=_COLUMNS)
+    try:
+        row = [float(word) for word in words[1:]]
+        # a stamp of 19 digits at most leaves 9 beyond the nanosecond before anything is rounded
+        stamp = int(decimal.Decimal(words[0]).scaleb(9).to_integral_value())
+    except (ValueError, decimal.DecimalException, OverflowError) as error:
+        raise InputError("holds something that is no number", where=where, hint=_COLUMNS) from error
+    if not np.all(np.isfinite(row)):
+        raise InputError("holds a number that is not finite", where=where)
+    if abs(stamp) >= 2**63:
+        raise InputError("has a stamp beyond what 64 bit nanoseconds hold", where=where)
+    if abs(np.linalg.norm(row[3:]) - 1) > _UNIT_TOLERANCE:
+        raise InputError("has a quaternion that is not of length one", where=where, hint=_COLUMNS)
+    return stamp, row

@@ -1,0 +1,205 @@
+"""A made-up result: a fake hall with walkers, its maps counted by dense sampling along beams."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from stillmap.output.crops import choose_window, snapshot
+from stillmap.output.map_server import OutputOptions
+from stillmap.recording.model import Recording
+from stillmap.se2 import matrix
+
+RESOLUTION = 0.1
+ORIGIN = (-1.0, -2.0, 0.0)
+SHAPE = (140, 210)
+MAX_RANGE = 12.0
+WALLS = [
+    # x0, y0, x1, y1
+    (0, -1, 19, -1),
+    (19, -1, 19, 11),
+    (19, 11, 0, 11),
+    (0, 11, 0, -1),
+    (6, 4, 7, 4),
+    (7, 4, 7, 5),
+    (7, 5, 6, 5),
+    (6, 5, 6, 4),
+    (13, -1, 13, 3),
+]
+
+
+@dataclass(frozen=True)
+class EmOptions:
+    prior: float = 0.9
+    note: str = "a <b>bold</b> & 'quoted' note"
+    seed: int | None = None
+
+
+@dataclass(frozen=True)
+class FakeOptions:
+    em: EmOptions = field(default_factory=EmOptions)
+    output: OutputOptions = field(default_factory=OutputOptions)
+
+
+@dataclass(frozen=True, eq=False)
+class FakeMap:
+    p_occupied: np.ndarray
+    alpha: np.ndarray
+    beta: np.ndarray
+    origin: tuple[float, float, float]
+    resolution: float
+
+
+@dataclass(frozen=True)
+class FakeIteration:
+    number: int
+    expected_log_likelihood: float
+    bound: float
+    changed_share: float
+    seconds: float
+    held_out_log_likelihood: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FakeResult:
+    recording: Recording
+    options: FakeOptions
+    iterations: list
+    snapshots: list
+    poses: np.ndarray
+    p_static: np.ndarray
+    map: FakeMap
+    raw_map: FakeMap
+    best_iteration: int
+    converged: bool
+    warnings: list
+    stages: dict
+
+
+def _wall_range(origin, direction):
+    """(N,) range to the nearest wall along unit directions (N, 2)."""
+    best = np.full(len(direction), np.inf)
+    for x0, y0, x1, y1 in WALLS:
+        edge, to = np.array([x1 - x0, y1 - y0], float), np.array([x0, y0]) - origin
+        cross = direction[:, 0] * edge[1] - direction[:, 1] * edge[0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = (to[0] * edge[1] - to[1] * edge[0]) / cross
+            part = (to[0] * direction[:, 1] - to[1] * direction[:, 0]) / cross
+        best = np.where((along > 0) & (part >= 0) & (part <= 1), np.minimum(best, along), best)
+    return best
+
+
+def _walker_range(origin, direction, centres, radius=0.25):
+    best = np.full(len(direction), np.inf)
+    for centre in centres:
+        to = centre - origin
+        along = direction @ to
+        aside = (to**2).sum() - along**2
+        found = (along > 0) & (aside < radius**2)
+        reach = along - np.sqrt(np.maximum(radius**2 - aside, 0))
+        best = np.where(found, np.minimum(best, reach), best)
+    return best
+
+
+def _simulate(rng, scans=60, beams=181, walkers=8):
+    turn = np.linspace(0, 2 * np.pi, scans)
+    poses = matrix(8.5 - 5 * np.cos(turn), 2 + 2.2 * np.sin(turn), turn / 4)
+    bearing = np.linspace(-np.pi / 2, np.pi / 2, beams)
+    start, heading = rng.uniform([1, 0], [18, 10], (walkers, 2)), rng.uniform(0, 6.28, walkers)
+    ranges, moving = np.zeros((scans, beams)), np.zeros((scans, beams), bool)
+    for t in range(scans):
+        swing = 3 * np.sin(2 * turn[t] + heading)
+        centres = start + swing[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
+        theta = np.arctan2(poses[t, 1, 0], poses[t, 0, 0]) + bearing
+        direction = np.stack([np.cos(theta), np.sin(theta)], 1)
+        wall = _wall_range(poses[t, :2, 2], direction)
+        walker = _walker_range(poses[t, :2, 2], direction, centres)
+        moving[t] = walker < wall
+        ranges[t] = np.minimum(wall, walker) + rng.normal(0, 0.01, beams)
+    points = ranges[..., None] * np.stack([np.cos(bearing), np.sin(bearing)], 1)
+    hit = ranges < MAX_RANGE
+    points[~hit] *= (MAX_RANGE / ranges[~hit])[:, None]
+    return poses, points, hit, moving
+
+
+def _count(poses, points, hit, e):
+    """Counts over cells: alpha where beams end, beta along them, by sampling every half cell."""
+    alpha, beta = np.zeros(SHAPE), np.zeros(SHAPE)
+    share = np.linspace(0, 1, 240, endpoint=False)
+    for t in range(len(poses)):
+        ends = points[t] @ poses[t, :2, :2].T + poses[t, :2, 2]
+        along = poses[t, :2, 2] + share[:, None, None] * (ends - poses[t, :2, 2])
+        step = np.linalg.norm(points[t], axis=-1) / RESOLUTION / len(share)
+        j, i = np.floor((along - ORIGIN[:2]) / RESOLUTION).astype(int).T
+        np.add.at(beta, (i, j), np.broadcast_to(step[:, None], i.shape))
+        j, i = np.floor((ends - ORIGIN[:2]) / RESOLUTION).astype(int).T
+        np.add.at(alpha, (i[hit[t]], j[hit[t]]), e[t][hit[t]])
+        np.add.at(beta, (i[hit[t]], j[hit[t]]), 1 - e[t][hit[t]])
+    with np.errstate(invalid="ignore"):
+        p = (alpha / (alpha + beta)).astype(np.float32)
+    return FakeMap(p, alpha, beta, ORIGIN, RESOLUTION)
+
+
+SOURCE = {
+    "path": "logs/hall <1>.clf",
+    "format": "CARMEN FLASER",
+    "max_range": "12 m, guessed: the ranges pile up there",
+    "field_of_view": {"from": -1.5708, "to": 1.5708, "beams": 181},
+    "skipped": [
+        {"line": 17, "reason": "truncated record"},
+        {"line": 203, "reason": "<script>alert(1)</script>"},
+    ],
+}
+
+
+@pytest.fixture(scope="session")
+def result():
+    rng = np.random.default_rng(3)
+    poses, points, hit, moving = _simulate(rng)
+    T, N = hit.shape
+    e = np.where(moving, rng.beta(1, 12, (T, N)), rng.beta(12, 1, (T, N)))
+    first = np.where(rng.random((T, N)) < 0.5, e, 0.9)
+    e, first = np.where(hit, e, 0.9), np.where(hit, first, 0.9)
+    maps = {k: _count(poses, points, hit, v) for k, v in {"raw": 1 + 0 * e, 1: first, 3: e}.items()}
+
+    points = points.astype(np.float32)
+    points[5, 40:43], hit[5, 40:43], e[5, 40:43], first[5, 40:43] = np.nan, False, np.nan, np.nan
+    recording = Recording(
+        stamp_ns=1_300_000_000_123_456_789 + np.arange(T, dtype=np.int64) * 200_000_001,
+        offset=np.arange(T + 1, dtype=np.int64) * N,
+        points=points.reshape(-1, 2),
+        hit=hit.reshape(-1),
+        T_base_sensor=matrix([0.0], [0.0], [0.0]),
+        sensor=np.zeros(T, np.int32),
+        T_odom_base=None,
+        source=SOURCE,
+    )
+    world = points @ np.swapaxes(poses[:, :2, :2], 1, 2) + poses[:, None, :2, 2]
+    world = np.where(hit[..., None], world, np.nan).reshape(-1, 2)
+    labels = {number: v.reshape(-1).astype(np.float32) for number, v in ((1, first), (3, e))}
+    window = choose_window(maps[3], world, labels[3], 8.0)
+    return FakeResult(
+        recording=recording,
+        options=FakeOptions(),
+        iterations=[
+            FakeIteration(1, -41234.5, -40211.0, 1.0, 1.9),
+            FakeIteration(2, -32100.25, -31500.5, 0.08, 1.8),
+            FakeIteration(3, -30800.0, -30300.0, 0.01, 1.7),
+            FakeIteration(4, -30950.0, float("nan"), 0.002, 1.7),
+        ],
+        snapshots=[
+            snapshot(n, maps[k], world, labels[k], window) for n, k in ((1, 1), (2, 1), (3, 3))
+        ],
+        poses=poses,
+        p_static=labels[3],
+        map=maps[3],
+        raw_map=maps["raw"],
+        best_iteration=3,
+        converged=True,
+        warnings=["the odometry stalls at line 88 & <after>"],
+        stages={
+            "read": {"seconds": 0.21, "peak_memory_bytes": 41_000_000},
+            "em": {"seconds": 7.1, "peak_memory_bytes": 96_000_000},
+            "map": {"seconds": 0.02, "peak_memory_bytes": 97_000_000},
+        },
+    )
