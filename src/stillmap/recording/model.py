@@ -1,6 +1,6 @@
 """The one data shape of a recording, 2D and 3D alike: flat arrays."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -69,6 +69,10 @@ class Recording:
     def T_map_sensor(self, T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sensor poses (T, D+1, D+1) that belong to robot poses (T, D+1, D+1)."""
         return T_map_base @ self.T_base_sensor[self.sensor]
+
+    def without_odometry(self) -> "Recording":
+        """The same recording as if no odometry had been recorded."""
+        return replace(self, T_odom_base=None)
 
 
 def _check(name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: type) -> None:

@@ -1,0 +1,148 @@
+"""`stillmap info INPUT`: what is in a recording."""
+
+import argparse
+import json
+import math
+from collections.abc import Iterator
+from typing import Any
+
+from stillmap import options
+from stillmap.cli.reading import add_read_flags, read_changes
+from stillmap.recording import ReadOptions, read
+from stillmap.recording.facts import facts
+
+_LINES_SHOWN = 10
+
+
+def add_parser(subparsers: Any) -> None:
+    """Register the command with argparse's `subparsers`."""
+    parser = subparsers.add_parser(
+        "info", help="what is in a recording", description="Show what is in a recording."
+    )
+    parser.add_argument("input", metavar="INPUT", help="a log file or a recording folder")
+    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    add_read_flags(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the facts; 0 when the recording could be read.
+
+    Raises:
+        InputError: it could not.
+    """
+    read_options = options.replaced(ReadOptions(), read_changes(args).get("read", {}))
+    found = facts(read(args.input, read_options))
+    if args.json:
+        print(json.dumps(found, indent=2, allow_nan=False))
+    else:
+        print("\n".join(_text(found)))
+    return 0
+
+
+def _text(found: dict[str, Any]) -> Iterator[str]:
+    yield f"{found['path'] or 'recording'}: {_format(found)}"
+    beams = found["beams_per_scan"]
+    if beams is None:
+        yield _row("scans", "none")
+        return
+    per_scan = f"{beams['median']:g}"
+    if beams["min"] != beams["max"]:
+        per_scan += f" ({beams['min']:g} to {beams['max']:g})"
+    yield _row("scans", f"{found['scans']} with {per_scan} beams each, {found['beams']} beams")
+    shares = found["counts"]["shares"]
+    words = (("hits", "hits"), ("max_range", "maximum range"), ("unusable", "unusable"))
+    yield _row("beams", ", ".join(f"{100 * shares[key]:.2f} % {word}" for key, word in words))
+    spread = found["hit_ranges_m"]
+    if spread is not None:
+        yield _row(
+            "ranges of hits",
+            "min {min:.2f}, median {median:.2f}, 99 % {p99:.2f}, max {max:.2f} m".format(**spread),
+        )
+    yield from _time(found["time"])
+    yield from _odometry(found["odometry"])
+    for sensor in found["sensors"]:
+        yield from _sensor(sensor)
+    yield from _notes(found)
+
+
+def _format(found: dict[str, Any]) -> str:
+    return f"{found['format'] or 'stillmap recording'}, {found['dimension']}D"
+
+
+def _time(time: dict[str, Any]) -> Iterator[str]:
+    first, last = (_seconds(time[key]) for key in ("first_stamp_ns", "last_stamp_ns"))
+    rate = f", {time['rate_hz']:.2f} scans/s" if time["rate_hz"] else ""
+    gap = f", largest gap {time['largest_gap_s']:.2f} s" if time["largest_gap_s"] else ""
+    yield _row("duration", f"{time['duration_s']:.2f} s{rate}{gap}")
+    yield _row("stamps", f"{first} to {last}")
+
+
+def _odometry(odometry: dict[str, Any] | None) -> Iterator[str]:
+    if odometry is None:
+        yield _row("odometry", "none")
+        return
+    origin = f", from {odometry['from']}" if "from" in odometry else ""
+    yield _row(
+        "odometry",
+        f"path {odometry['path_length_m']:.2f} m, turned {odometry['turned_deg']:.0f} deg{origin}",
+    )
+    at = odometry["largest_step_at_ns"]
+    if at is not None:
+        yield _row(
+            "largest step",
+            f"{odometry['largest_step_m']:.3f} m (after {_seconds(at)}), "
+            f"{odometry['largest_step_deg']:.1f} deg",
+        )
+
+
+def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
+    yield _row("sensor", f"{sensor.get('name', 'unnamed')}, {sensor['scans']} scans")
+    view = sensor.get("field_of_view_deg")
+    if view is not None:
+        step = sensor.get("angle_step")
+        steps = f", {math.degrees(step):g} deg apart" if step else ""
+        yield _row("  field of view", f"{view[0]:.2f} to {view[1]:.2f} deg{steps}")
+    place = sensor.get("extrinsics")
+    if place is not None:
+        yield _row(
+            "  on the robot",
+            f"x {place['x']:.3f} m, y {place['y']:.3f} m, turned {place['theta_deg']:.2f} deg "
+            f"({place['how']})",
+        )
+    rule = sensor.get("ranges")
+    if rule is not None:
+        threshold = rule["threshold"]
+        limit = "none" if threshold is None else f"{threshold:g} m"
+        yield _row("  maximum range", f"{limit}: {rule['threshold_how']}")
+        if rule["free_range"] is not None:
+            yield _row(
+                "  shown free",
+                f"{rule['free_range']:g} m by a maximum-range beam: {rule['free_how']}",
+            )
+        yield _row("  zero means", f"{rule['zero_means']}: {rule['zero_how']}")
+
+
+def _notes(found: dict[str, Any]) -> Iterator[str]:
+    if found["params"]:
+        yield _row("PARAM", ", ".join(f"{k} {v}" for k, v in found["params"].items()))
+    if found["ignored"]:
+        yield _row("ignored lines", ", ".join(f"{v} {k}" for k, v in found["ignored"].items()))
+    for what in found["duplicates"]:
+        yield _row("left out", what)
+    for key, title in (("skipped", "skipped scans"), ("skipped_odometry", "skipped ODOM")):
+        for reason, damage in found[key].items():
+            shown = ", ".join(str(line) for line in damage["lines"][:_LINES_SHOWN])
+            more = ", ..." if damage["count"] > _LINES_SHOWN else ""
+            yield _row(title, f"{damage['count']} {reason} (line {shown}{more})")
+    for what in found["warnings"]:
+        yield _row("warning", what)
+
+
+def _row(title: str, text: str) -> str:
+    return f"{title:<16}  {text}"
+
+
+def _seconds(stamp_ns: int) -> str:
+    sign = "-" if stamp_ns < 0 else ""
+    return f"{sign}{abs(stamp_ns) // 10**9}.{abs(stamp_ns) % 10**9:09d}"

@@ -1,0 +1,139 @@
+"""What is in a recording, in numbers."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import se2
+from stillmap.recording.model import Recording
+
+_CHUNK = 1 << 20  # beams looked at together
+
+
+def facts(recording: Recording) -> dict[str, Any]:
+    """Everything that `stillmap info` shows, JSON-able: metres, seconds, degrees."""
+    source = recording.source
+    length = _lengths(recording)
+    beams = np.diff(recording.offset)
+    return {
+        "path": source.get("path"),
+        "format": source.get("format"),
+        "dimension": recording.dimension,
+        "scans": recording.n_scans,
+        "beams": recording.n_beams,
+        "beams_per_scan": _spread(beams, ("min", "median", "max")),
+        "counts": _counts(recording, length),
+        "hit_ranges_m": _spread(length[recording.hit], ("min", "median", "p99", "max")),
+        "time": _time(recording.stamp_ns),
+        "odometry": _odometry(recording),
+        "sensors": [_sensor(recording, i) for i in range(len(recording.T_base_sensor))],
+        **{
+            key: source.get(key, {} if key != "duplicates" else [])
+            for key in ("records", "ignored", "params", "duplicates")
+        },
+        "skipped": source.get("skipped", {}),
+        "skipped_odometry": source.get("skipped_odometry", {}),
+        "read_options": source.get("read_options", {}),
+        "warnings": source.get("warnings", []),
+    }
+
+
+def _lengths(recording: Recording) -> NDArray[np.float32]:
+    """(M,) ranges of all beams, NaN where unusable."""
+    out = np.empty(recording.n_beams, np.float32)
+    for start in range(0, len(out), _CHUNK):
+        chunk = slice(start, start + _CHUNK)
+        out[chunk] = np.linalg.norm(recording.points[chunk].astype(np.float64), axis=1)
+    return out
+
+
+def _spread(values: NDArray[Any], wanted: tuple[str, ...]) -> dict[str, float] | None:
+    """Quantiles by name; values that occur, so that 81.83 stays 81.83."""
+    if values.size == 0:
+        return None
+    share = {"min": 0.0, "median": 0.5, "p99": 0.99, "max": 1.0}
+    found = np.quantile(values, [share[name] for name in wanted], method="lower")
+    return {name: round(float(value), 4) for name, value in zip(wanted, found, strict=True)}
+
+
+def _counts(recording: Recording, length: NDArray[np.float32]) -> dict[str, Any]:
+    hits = int(np.count_nonzero(recording.hit))
+    unusable = int(np.count_nonzero(np.isnan(length)))
+    counts = {
+        "hits": hits,
+        "max_range": recording.n_beams - hits - unusable,
+        "unusable": unusable,
+    }
+    total = max(recording.n_beams, 1)
+    return {**counts, "shares": {name: count / total for name, count in counts.items()}}
+
+
+def _time(stamp_ns: NDArray[np.int64]) -> dict[str, Any] | None:
+    if len(stamp_ns) == 0:
+        return None
+    first, last = int(stamp_ns[0]), int(stamp_ns[-1])
+    duration = (last - first) / 1e9
+    gaps = np.diff(stamp_ns)
+    return {
+        "first_stamp_ns": first,
+        "last_stamp_ns": last,
+        "duration_s": duration,
+        "rate_hz": len(gaps) / duration if duration > 0 else None,
+        "largest_gap_s": float(gaps.max()) / 1e9 if len(gaps) else None,
+    }
+
+
+def _odometry(recording: Recording) -> dict[str, Any] | None:
+    T = recording.T_odom_base
+    if T is None:
+        return None
+    found = {k: v for k, v in recording.source.get("odometry", {}).items() if v is not None}
+    step = se2.inverse(T[:-1]) @ T[1:]
+    metres = np.linalg.norm(step[:, :-1, -1], axis=1)
+    # the angle of a rotation in any dimension follows from its trace
+    trace = np.trace(step[:, :-1, :-1], axis1=1, axis2=2)
+    cosine = trace / 2.0 if recording.dimension == 2 else (trace - 1.0) / 2.0
+    degrees = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    at = int(metres.argmax()) if len(metres) else 0
+    return {
+        **found,
+        "path_length_m": float(metres.sum()),
+        "turned_deg": float(degrees.sum()),
+        "largest_step_m": float(metres.max(initial=0.0)),
+        "largest_step_deg": float(degrees.max(initial=0.0)),
+        "largest_step_at_ns": int(recording.stamp_ns[at]) if len(metres) else None,
+    }
+
+
+def _sensor(recording: Recording, number: int) -> dict[str, Any]:
+    """One sensor: what its reader noted, else what shows in the arrays."""
+    scans = np.flatnonzero(recording.sensor == number)
+    noted = recording.source.get("sensors")
+    out: dict[str, Any] = {"scans": len(scans)}
+    if isinstance(noted, list) and number < len(noted):
+        out.update(noted[number])
+    if recording.dimension == 2:
+        x, y, theta = (float(v) for v in se2.parameters(recording.T_base_sensor[number]))
+        how = out.get("extrinsics", {}).get("how", "recording")
+        out["extrinsics"] = {"x": x, "y": y, "theta_deg": float(np.degrees(theta)), "how": how}
+        out["field_of_view_deg"] = _field_of_view(recording, scans, out)
+    return out
+
+
+def _field_of_view(
+    recording: Recording, scans: NDArray[np.intp], noted: dict[str, Any]
+) -> list[float] | None:
+    """First and last beam in degrees: as noted, else the extremes of all usable beams."""
+    if "start_angle" in noted:
+        first = noted["start_angle"]
+        last = first + (noted["beams_per_scan"] - 1) * noted["angle_step"]
+        return [float(np.degrees(first)), float(np.degrees(last))]
+    lowest, highest = np.inf, -np.inf
+    for scan in scans:
+        points = recording.points[recording.beams_of(scan)]
+        angle = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+        angle = angle[np.isfinite(angle)]
+        lowest = min(lowest, float(angle.min(initial=np.inf)))
+        highest = max(highest, float(angle.max(initial=-np.inf)))
+    return [lowest, highest] if lowest <= highest else None

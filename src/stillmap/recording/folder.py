@@ -1,0 +1,166 @@
+"""stillmap's own recording folder: `recording.json` and flat `.npy` arrays, read as they lie."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.errors import InputError
+from stillmap.output.atomic import new_folder
+from stillmap.recording.model import Recording
+
+HEADER = "recording.json"
+FORMAT = "stillmap-recording"
+FORMAT_VERSION = 1
+
+_CHUNK = 1 << 20  # beams looked at together: points need not fit in memory
+_MAX_HEADER = 64 << 20  # bytes
+
+
+def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a recording folder; it appears complete or not at all.
+
+    Raises:
+        InputError: `path` holds something already, or cannot be written to.
+    """
+    with new_folder(Path(path), overwrite) as work:
+        write_into(recording, work)
+
+
+def write_into(recording: Recording, folder: Path) -> None:
+    """The files of a recording into an existing folder, for writers that add files of their own."""
+    header = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "dimension": recording.dimension,
+        "scans": recording.n_scans,
+        "beams": recording.n_beams,
+        "sensors": len(recording.T_base_sensor),
+        "odometry": recording.T_odom_base is not None,
+        "source": recording.source,
+    }
+    text = json.dumps(header, indent=1, allow_nan=False)
+    for name in ("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"):
+        np.save(folder / f"{name}.npy", getattr(recording, name), allow_pickle=False)
+    if recording.T_odom_base is not None:
+        np.save(folder / "T_odom_base.npy", recording.T_odom_base, allow_pickle=False)
+    (folder / HEADER).write_text(text + "\n", encoding="utf-8")
+
+
+def read(path: Path) -> Recording:
+    """Read a recording folder; `points` and `hit` stay on disk until they are used.
+
+    Raises:
+        InputError: a file is missing, damaged, or does not fit the others.
+    """
+    header = _header(path / HEADER)
+    T, M = _size(path, header, "scans"), _size(path, header, "beams")
+    S, D = _size(path, header, "sensors"), _size(path, header, "dimension")
+    if D not in (2, 3):
+        raise InputError(f"dimension must be 2 or 3, got {D}", where=str(path / HEADER))
+    T_odom_base = None
+    if header.get("odometry"):
+        T_odom_base = _poses(path, "T_odom_base", T, D)
+    stamp_ns = np.array(_array(path, "stamp_ns", (T,), np.int64))
+    offset = np.array(_array(path, "offset", (T + 1,), np.int64))
+    points = _array(path, "points", (M, D), np.float32)
+    hit = _array(path, "hit", (M,), np.bool_)
+    sensor = np.array(_array(path, "sensor", (T,), np.int32))
+    if np.any(np.diff(stamp_ns) < 0):
+        raise _damaged(path, "stamp_ns", "time runs backwards")
+    _require_offsets(path, offset, M)
+    _require_finite_hits(path, points, hit)
+    source = header.get("source", {})
+    try:
+        return Recording(
+            stamp_ns=stamp_ns,
+            offset=offset,
+            points=points,
+            hit=hit,
+            T_base_sensor=_poses(path, "T_base_sensor", S, D),
+            sensor=sensor,
+            T_odom_base=T_odom_base,
+            source=source if isinstance(source, dict) else {},
+        )
+    except ValueError as error:
+        raise InputError(f"is damaged: {error}", where=str(path)) from error
+
+
+def _header(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > _MAX_HEADER:
+            raise InputError("is no header of a recording: too large", where=str(path))
+        header = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is not JSON: {error}", where=str(path)) from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise InputError(f"is not the header of a {FORMAT}", where=str(path))
+    if header.get("format_version") != FORMAT_VERSION:
+        raise InputError(
+            f"format_version {header.get('format_version')!r} is unknown here",
+            where=str(path),
+            hint=f"this version reads {FORMAT_VERSION}",
+        )
+    return header
+
+
+def _size(path: Path, header: dict[str, Any], key: str) -> int:
+    value = header.get(key)
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 60:
+        raise InputError(f"'{key}' must be a count, got {value!r}", where=str(path / HEADER))
+    return value
+
+
+def _array(path: Path, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
+    """One `.npy` file as it lies on disk, of exactly this shape and type."""
+    file = path / f"{name}.npy"
+    try:
+        loaded = np.load(file, mmap_mode="r", allow_pickle=False)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", where=str(file)) from error
+    except Exception as error:  # whatever NumPy's parser makes of damaged bytes
+        raise InputError(f"is damaged: {error}", where=str(file)) from error
+    if not isinstance(loaded, np.ndarray):
+        raise _damaged(path, name, "not an array")
+    if loaded.shape != shape or loaded.dtype != np.dtype(dtype):
+        raise _damaged(
+            path,
+            name,
+            f"expected {shape} {np.dtype(dtype)}, got {loaded.shape} {loaded.dtype}",
+        )
+    return np.ascontiguousarray(loaded)
+
+
+def _poses(path: Path, name: str, count: int, D: int) -> NDArray[np.float64]:
+    T = np.array(_array(path, name, (count, D + 1, D + 1), np.float64))
+    R = T[:, :D, :D]
+    last_row = np.eye(D + 1)[D]
+    if not (
+        np.all(np.abs(T) < 1e12)
+        and np.all(T[:, D] == last_row)
+        and np.allclose(R @ R.transpose(0, 2, 1), np.eye(D), atol=1e-6)
+    ):
+        raise _damaged(path, name, "not rigid transforms")
+    return T
+
+
+def _require_offsets(path: Path, offset: NDArray[np.int64], M: int) -> None:
+    # compared pairwise: a difference of wild numbers could wrap around
+    if offset[0] != 0 or offset[-1] != M or np.any(offset[1:] < offset[:-1]):
+        raise _damaged(path, "offset", f"must rise from 0 to {M}")
+
+
+def _require_finite_hits(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
+    for start in range(0, len(points), _CHUNK):
+        chunk = points[start : start + _CHUNK]
+        usable = np.isfinite(chunk).all(axis=1)
+        if np.any(hit[start : start + _CHUNK] & ~usable) or np.any(np.isinf(chunk)):
+            raise _damaged(path, "points", "a hit or a maximum-range beam ends nowhere")
+
+
+def _damaged(path: Path, name: str, what: str) -> InputError:
+    return InputError(f"is damaged: {what}", where=str(path / f"{name}.npy"))

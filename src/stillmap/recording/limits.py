@@ -1,0 +1,51 @@
+"""Reading options laid over a recording whose readings are understood already."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from stillmap import se2
+from stillmap.recording.model import Recording
+from stillmap.recording.options import ReadOptions
+
+
+def applied(recording: Recording, options: ReadOptions) -> Recording:
+    """`recording` narrowed by the options; itself where they are the defaults.
+
+    Nearer than `min_range`: unusable. From `max_range` on: maximum range, ending there. A
+    maximum-range beam shows at most `free_range`. `zero_means` has nothing left to say.
+    """
+    defaults = ReadOptions(zero_means=options.zero_means)
+    if options == defaults:
+        return recording
+    given = {key: value for key, value in vars(options).items() if value != getattr(defaults, key)}
+    changed = replace(recording, source={**recording.source, "read_options": given})
+    if options.min_range > 0 or options.max_range is not None or options.free_range is not None:
+        changed = _narrowed(changed, options)
+    if changed.dimension == 2 and len(changed.T_base_sensor):
+        changed = _with_laser(changed, options)
+    return changed
+
+
+def _narrowed(recording: Recording, options: ReadOptions) -> Recording:
+    points, hit = np.array(recording.points), np.array(recording.hit)
+    length = np.linalg.norm(points, axis=1)
+    if options.max_range is not None:
+        hit &= ~(length >= np.float32(options.max_range))
+    ends = [v for v in (options.max_range, options.free_range) if v is not None]
+    if ends:
+        too_far = ~hit & (length > np.float32(min(ends)))
+        points[too_far] *= (np.float32(min(ends)) / length[too_far])[:, None]
+    near = hit & (length < np.float32(options.min_range))
+    points[near], hit[near] = np.nan, False
+    return replace(recording, points=points, hit=hit)
+
+
+def _with_laser(recording: Recording, options: ReadOptions) -> Recording:
+    wanted = (options.laser_x, options.laser_y, options.laser_theta)
+    T = np.array(recording.T_base_sensor)
+    found = se2.parameters(T[0])
+    x, y, theta = (f if w is None else w for f, w in zip(found, wanted, strict=True))
+    if wanted != (None, None, None):
+        T[0] = se2.matrix(x, y, theta)
+    return replace(recording, T_base_sensor=T)

@@ -1,0 +1,89 @@
+"""Numbered lines of a text file, plain or gzip, whatever the state it is in."""
+
+import gzip
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, NamedTuple
+
+from stillmap.errors import InputError
+
+MAX_LINE = 1 << 20  # bytes: a scan of 3600 readings with remissions has a tenth of it
+_GZIP_MAGIC = b"\x1f\x8b"
+_DAMAGED = (EOFError, zlib.error, gzip.BadGzipFile)
+
+Progress = Callable[[float], None]
+
+
+class Line(NamedTuple):
+    """One line: its number from 1, its bytes, and what is wrong with it as a line.
+
+    `text` is cut at `MAX_LINE` where the line is longer. `ended` is False where the file stops
+    without a line end, `damaged` True on a last empty line that stands for a broken gzip stream.
+    """
+
+    number: int
+    text: bytes
+    ended: bool = True
+    too_long: bool = False
+    damaged: bool = False
+
+
+def is_gzip(path: Path) -> bool:
+    """Whether the file starts as gzip does; its name plays no part."""
+    with _opened(path) as file:
+        return file.read(2) == _GZIP_MAGIC
+
+
+def head(path: Path, size: int) -> bytes:
+    """The first `size` bytes of the text, unpacked where it is gzip, fewer where it is damaged."""
+    with _opened(path) as file:
+        packed = file.read(2) == _GZIP_MAGIC
+        file.seek(0)
+        if not packed:
+            return file.read(size)
+        # wbits 31: gzip container; a cut stream gives what it has
+        try:
+            return zlib.decompressobj(31).decompress(file.read(size), size)
+        except zlib.error:
+            return b""
+
+
+def numbered_lines(path: Path, progress: Progress | None = None) -> Iterator[Line]:
+    """Every line of the file, read as a stream.
+
+    Raises:
+        InputError: the file cannot be opened or read.
+    """
+    with _opened(path) as file:
+        size = max(path.stat().st_size, 1)
+        packed = file.read(2) == _GZIP_MAGIC
+        file.seek(0)
+        stream = gzip.GzipFile(fileobj=file, mode="rb") if packed else file
+        number = 0
+        try:
+            while text := stream.readline(MAX_LINE):
+                number += 1
+                ended = text.endswith(b"\n")
+                too_long = not ended and len(text) == MAX_LINE
+                if too_long:
+                    _skip_rest(stream)
+                yield Line(number, text, ended, too_long)
+                if progress is not None and number % 500 == 0:
+                    progress(min(file.tell() / size, 1.0))
+        except _DAMAGED:
+            yield Line(number + 1, b"", damaged=True)
+        except OSError as error:
+            raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+
+
+def _skip_rest(stream: IO[bytes] | gzip.GzipFile) -> None:
+    while (rest := stream.readline(MAX_LINE)) and not rest.endswith(b"\n"):
+        pass
+
+
+def _opened(path: Path) -> IO[bytes]:
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error

@@ -1,0 +1,58 @@
+"""Time stamps: exact nanoseconds from decimal text, and time that runs backwards."""
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
+
+import numpy as np
+from numpy.typing import NDArray
+
+_LARGEST_S = 9_000_000_000  # int64 holds 9.22e9 s in nanoseconds
+
+
+def parse_ns(text: str) -> int:
+    """Nanoseconds of a decimal number of seconds, without a detour through floating point.
+
+    Digits beyond the nanosecond are rounded, half to even.
+
+    Raises:
+        ValueError: not a number, not finite, or beyond what int64 nanoseconds hold.
+    """
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation as error:
+        raise ValueError(f"not a time stamp: {text!r}") from error
+    # the size is checked before any arithmetic: 1e999999999 must not be written out
+    if "_" in text or not seconds.is_finite() or seconds.adjusted() > 9:
+        raise ValueError(f"not a time stamp: {text!r}")
+    if seconds.adjusted() < -12:
+        return 0
+    if abs(seconds) > _LARGEST_S:
+        raise ValueError(f"not a time stamp: {text!r}")
+    return int(seconds.scaleb(9).to_integral_value(ROUND_HALF_EVEN))
+
+
+def longest_non_decreasing(values: Sequence[int]) -> NDArray[np.intp]:
+    """Indices of a longest non-decreasing subsequence, in O(n log n) (patience sorting).
+
+    One stamp that jumps ahead costs that one element, not all that follow it.
+    """
+    tails: list[int] = []  # smallest last value of a subsequence of each length
+    tail_index: list[int] = []
+    before = np.full(len(values), -1, np.intp)
+    for i, value in enumerate(values):
+        length = bisect_right(tails, value)
+        if length:
+            before[i] = tail_index[length - 1]
+        if length == len(tails):
+            tails.append(value)
+            tail_index.append(i)
+        else:
+            tails[length] = value
+            tail_index[length] = i
+    out = np.empty(len(tails), np.intp)
+    i = tail_index[-1] if tail_index else -1
+    for k in range(len(out) - 1, -1, -1):
+        out[k] = i
+        i = int(before[i])
+    return out
