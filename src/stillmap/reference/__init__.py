@@ -1,0 +1,34 @@
+"""Every kernel of stillmap._core once more in plain NumPy, slowly, for 2 or 3 dimensions.
+
+This is the oracle of the tests: same names and arguments as `stillmap._core`, written straight
+from the equations of the paper and without a thought for speed. Where beams are taken:
+
+- `points` (M, D) float32 are end points in the sensor frame, metres; a beam whose point is not
+  finite is unusable and takes part in nothing;
+- `hit` (M,) bool is False for maximum-range beams (zeta = 1), whose point is the free range;
+- scan t owns the beams `offset[t]:offset[t + 1]`, and `T_map_sensor[t]` (D+1, D+1) is its pose.
+"""
+
+from stillmap.reference.beams import add_beams, e_step, log_likelihood
+from stillmap.reference.em import EmStep, em_fixed_poses, m_step_map
+from stillmap.reference.field import field, registration_cost, registration_gradient
+from stillmap.reference.grid import Grid, Grid2D, Grid3D, occupancy
+from stillmap.reference.traverse import cell_of, traverse
+
+__all__ = [
+    "EmStep",
+    "Grid",
+    "Grid2D",
+    "Grid3D",
+    "add_beams",
+    "cell_of",
+    "e_step",
+    "em_fixed_poses",
+    "field",
+    "log_likelihood",
+    "m_step_map",
+    "occupancy",
+    "registration_cost",
+    "registration_gradient",
+    "traverse",
+]

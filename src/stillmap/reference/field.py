@@ -1,0 +1,110 @@
+"""The smoothed field that registration climbs: stillmap's practical form of (9)."""
+
+from itertools import product
+from math import exp, log, pi, sqrt
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stillmap.reference.grid import Grid
+from stillmap.reference.traverse import cell_of
+
+Float = NDArray[np.float64]
+
+
+def field(grid: Grid, y: ArrayLike, sigma: float, radius: int) -> float:
+    """F(y): occupancy around a point, smoothed; about 1 on a straight, fully occupied wall.
+
+    The sum over cells k within `radius` cells of that of y (largest coordinate difference) of
+    m_k exp(-|y - mu_k|^2 / (2 sigma^2)), with mu_k the mean of the end points in cell k weighted
+    with e, divided by (sqrt(2 pi) sigma / resolution)^(D-1).
+
+    Args:
+        grid: the map.
+        y: (D,) metres, map frame.
+        sigma: metres.
+        radius: cells.
+    """
+    point = np.asarray(y, float)
+    centre = cell_of(point, grid.resolution)
+    total = 0.0
+    for step in product(range(-radius, radius + 1), repeat=grid.dimension):
+        cell = tuple((centre + step).tolist())
+        alpha = grid.alpha.get(cell, 0.0)
+        if alpha > 0:
+            away = point - grid.moment[cell] / alpha
+            total += grid.occupancy_of(cell) * exp(-float(away @ away) / (2 * sigma**2))
+    return total / (sqrt(2 * pi) * sigma / grid.resolution) ** (grid.dimension - 1)
+
+
+def registration_cost(
+    grid: Grid,
+    points: ArrayLike,
+    weights: ArrayLike,
+    T: ArrayLike,
+    sigma: float,
+    radius: int,
+    floor: float,
+) -> float:
+    """- sum of w_n ln(floor + F(T p_n)) over the points that are finite.
+
+    Args:
+        grid: the map.
+        points: (N, D) metres, sensor frame.
+        weights: (N,).
+        T: (D+1, D+1) T_map_sensor.
+        sigma: metres.
+        radius: cells.
+        floor: keeps points far from everything at a finite cost.
+    """
+    pose, D = np.asarray(T, float), grid.dimension
+    cost = 0.0
+    for p, w in zip(np.asarray(points, float), np.asarray(weights, float), strict=True):
+        if np.isfinite(p).all():
+            y = pose[:D, :D] @ p + pose[:D, D]
+            cost -= w * log(floor + field(grid, y, sigma, radius))
+    return float(cost)
+
+
+def registration_gradient(
+    grid: Grid,
+    points: ArrayLike,
+    weights: ArrayLike,
+    T: ArrayLike,
+    sigma: float,
+    radius: int,
+    floor: float,
+    step: float = 1e-6,
+) -> Float:
+    """Gradient of `registration_cost` by central differences.
+
+    Returns:
+        (3,) with respect to x, y, theta, or (6,) to x, y, z and a rotation vector: metres and
+        radians along the axes of the map, the sensor turning about its own position.
+    """
+    pose = np.asarray(T, float)
+    gradient = []
+    for i in range(3 if grid.dimension == 2 else 6):
+        delta = np.zeros(3 if grid.dimension == 2 else 6)
+        delta[i] = step
+        above, below = (
+            registration_cost(grid, points, weights, moved(pose, d), sigma, radius, floor)
+            for d in (delta, -delta)
+        )
+        gradient.append((above - below) / (2 * step))
+    return np.array(gradient)
+
+
+def moved(T: Float, delta: Float) -> Float:
+    """T_map_sensor shifted by delta[:D] and turned by delta[D:] about its own position."""
+    D = len(T) - 1
+    axis = np.array([0.0, 0.0, delta[2]]) if D == 2 else delta[3:]
+    angle = float(np.linalg.norm(axis))
+    out = T.copy()
+    out[:D, D] += delta[:D]
+    if angle > 0:
+        x, y, z = axis / angle
+        K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)  # Rodrigues
+        out[:D, :D] = R[:D, :D] @ T[:D, :D]
+    return out
