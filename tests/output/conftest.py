@@ -143,12 +143,20 @@ def _count(poses, points, hit, e):
 SOURCE = {
     "path": "logs/hall <1>.clf",
     "format": "CARMEN FLASER",
-    "max_range": "12 m, guessed: the ranges pile up there",
-    "field_of_view": {"from": -1.5708, "to": 1.5708, "beams": 181},
-    "skipped": [
-        {"line": 17, "reason": "truncated record"},
-        {"line": 203, "reason": "<script>alert(1)</script>"},
+    "sensors": [
+        {
+            "name": "FLASER",
+            "beams_per_scan": 181,
+            "ranges": {"threshold": 12.0, "threshold_how": "12 m repeats (919 x)"},
+            "bearings": [-1.5708, 1.5708],
+        }
     ],
+    "ignored": {},
+    "skipped_odometry": {"stamp goes back": {"count": 2, "lines": [88, 91]}},
+    "skipped": {
+        "truncated record": {"count": 1, "lines": [1700]},
+        "<script>alert(1)</script>": {"count": 40, "lines": list(range(203, 243))},
+    },
 }
 
 

@@ -76,6 +76,8 @@ def write_map_server(
     name = "map.png" if mode == "scale" else "map.pgm"
     # the map's row 0 is its lowest y, the picture's row 0 its top
     upright = occupancy.p_occupied[::-1]
+    if not upright.size:
+        upright = np.full((1, 1), np.nan, np.float32)  # readers refuse a picture without pixels
     if mode == "scale":
         Image.fromarray(scale_pixels(upright)).save(folder / name)
     else:

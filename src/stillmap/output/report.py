@@ -1,6 +1,7 @@
 """`report.html`: one page that shows what a run did, without a request to anywhere."""
 
 import itertools
+import math
 from html import escape
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from stillmap.output.report_tables import (
     name_value_table,
     options_table,
     share_text,
+    skipped_list,
     stages_table,
 )
 from stillmap.output.report_template import PAGE, STYLE
@@ -36,8 +38,7 @@ def report_html(result: ResultLike) -> str:
         maps_section(result),
         _estimate_section(result),
         evolution_section(result),
-        _recording_section(result),
-        _stages_section(result),
+        f'<div class="columns">{_recording_section(result)}{_stages_section(result)}</div>',
         _options_section(result),
         f'<footer class="soft">Written by stillmap {escape(version())}.</footer>',
     ]
@@ -47,9 +48,9 @@ def report_html(result: ResultLike) -> str:
 
 def likelihood_sentence(result: ResultLike) -> str:
     """Whether and where the expected log likelihood fell from one iteration to the next."""
-    records = result.iterations
-    if len(records) < 2:
+    if len(result.iterations) < 2:
         return "There was one iteration only."
+    records = [it for it in result.iterations if math.isfinite(it.expected_log_likelihood)]
     falls = [
         (after.number, before.expected_log_likelihood - after.expected_log_likelihood, before)
         for before, after in itertools.pairwise(records)
@@ -120,7 +121,8 @@ def _headline(result: ResultLike) -> str:
 
 
 def _per_scan(seconds: float, scans: int) -> str:
-    return f"{1e3 * seconds / max(scans, 1):.2g} ms"
+    milliseconds = 1e3 * seconds / max(scans, 1)
+    return f"{milliseconds:.0f} ms" if milliseconds >= 10 else f"{milliseconds:.2g} ms"
 
 
 def _skipped_note(result: ResultLike) -> str:
@@ -157,7 +159,7 @@ def _estimate_section(result: ResultLike) -> str:
 
 def _recording_section(result: ResultLike) -> str:
     source = jsonable(result.recording.source)
-    skipped = source.pop("skipped", None)
+    skipped, odometry = source.pop("skipped", None), source.pop("skipped_odometry", None)
     counts = beam_counts(result.recording, result.p_static)
     beams = (
         f"Of {counts['beams']:,} beams {counts['hits']:,} hit something, {counts['max_range']:,} "
@@ -167,8 +169,10 @@ def _recording_section(result: ResultLike) -> str:
         "<section><h2>The recording, and what was guessed about it</h2>"
         f"<p>{beams}</p>{name_value_table(source)}"
     )
-    if skipped_count(result.recording.source):
-        text += f"<h2>What was skipped</h2>{name_value_table({'skipped': skipped})}"
+    if skipped:
+        text += f"<h2>Scans that were skipped</h2>{skipped_list(skipped)}"
+    if odometry:
+        text += f"<h2>Odometry that was skipped</h2>{skipped_list(odometry)}"
     return text + "</section>"
 
 

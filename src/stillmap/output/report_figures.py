@@ -125,7 +125,9 @@ def _levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
 
 
 def _with_palette(levels: NDArray[np.uint8]) -> Image.Image:
-    greys = [grey for percent in range(101) for grey in [round(255 * (1 - percent / 100))] * 3]
+    # a walker leaves a few percent in the raw map's cells: they are drawn darker, to be seen
+    shades = [round(255 * (1 - (percent / 100) ** 0.6)) for percent in range(101)]
+    greys = [grey for shade in shades for grey in (shade, shade, shade)]
     image = Image.fromarray(np.ascontiguousarray(levels))
     image.putpalette([*greys, *UNKNOWN, *ORANGE])
     return image

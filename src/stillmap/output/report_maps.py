@@ -38,6 +38,8 @@ _PATH_POINTS = 3000
 
 def maps_section(result: ResultLike) -> str:
     """The raw map beside the filtered one."""
+    if not result.map.p_occupied.size:
+        return "<section><h2>The map</h2><p>It is empty: no beam could be used.</p></section>"
     window = known_window([result.raw_map, result.map])
     raw, filtered = map_image(result.raw_map, window), map_image(result.map, window)
     dots = dots_image(
@@ -67,7 +69,7 @@ def maps_section(result: ResultLike) -> str:
 
 def evolution_section(result: ResultLike) -> str:
     """The part of the map with most movement at the first, second and best iteration."""
-    if not result.snapshots:
+    if not result.snapshots or not result.snapshots[0].p_occupied.size:
         return ""
     figures = "".join(_snapshot_figure(one, result.best_iteration) for one in result.snapshots)
     h, w = result.snapshots[0].p_occupied.shape

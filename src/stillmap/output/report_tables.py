@@ -25,7 +25,7 @@ def duration_text(seconds: float) -> str:
     """A time span as people say it."""
     if seconds < 10:
         return f"{seconds:.2g} s"
-    if seconds < 60:
+    if seconds < 59.5:
         return f"{seconds:.0f} s"
     minutes, rest = divmod(round(seconds), 60)
     if minutes < 60:
@@ -76,8 +76,7 @@ def stages_table(stages: Mapping[str, Mapping[str, Any]]) -> str:
         rows.append(
             f'<tr><th scope="row">{escape(name)}</th>'
             f'<td class="number">{duration_text(seconds)}</td>'
-            f'<td><meter min="0" max="{longest:.6g}" value="{seconds:.6g}" '
-            f'aria-hidden="true"></meter></td>'
+            f'<td class="bar"><span style="width:{100 * seconds / longest:.1f}%"></span></td>'
             f'<td class="number">{bytes_text(stage.get("peak_memory_bytes") or 0)}</td></tr>'
         )
     return _table(("stage", "time", "", "peak memory"), rows)
@@ -94,12 +93,27 @@ def options_table(options: Any) -> str:
 
 
 def name_value_table(values: Mapping[str, Any]) -> str:
-    """JSON-able values by name; inner names in words."""
+    """JSON-able values by name, what is empty left out."""
     rows = [
-        f'<tr><th scope="row">{escape(name.replace("_", " "))}</th><td>{_value(value)}</td></tr>'
+        f'<tr><th scope="row">{_words(name)}</th><td>{_value(value)}</td></tr>'
         for name, value in values.items()
+        if value not in ({}, [], None)
     ]
     return _table(("", ""), rows) if rows else ""
+
+
+def skipped_list(skipped: Mapping[str, Mapping[str, Any]]) -> str:
+    """Reasons with their counts and the first line numbers, the most frequent first."""
+    items = []
+    for reason, one in sorted(skipped.items(), key=lambda item: -int(item[1]["count"])):
+        lines, count = one["lines"], int(one["count"])
+        shown = ", ".join(str(line) for line in lines[:_MOST_ITEMS])
+        more = count - min(len(lines), _MOST_ITEMS)
+        rest = f" and {more:,} more, see run.json" if more and lines else ""
+        where = f": line{'s' if count > 1 else ''} {shown}{rest}" if lines else ""
+        times = "once" if count == 1 else f"{count:,} times"
+        items.append(f"<li>{escape(reason)}, {times}{where}</li>")
+    return f"<ul>{''.join(items)}</ul>"
 
 
 def _table(names: Sequence[str], rows: Sequence[str]) -> str:
@@ -133,9 +147,9 @@ def _scalar(value: Any) -> str:
 def _value(value: Any) -> str:
     """A JSON-able value as HTML: a list for lists and for what has names inside."""
     if isinstance(value, Mapping):
-        lines = [f"{escape(str(k).replace('_', ' '))}: {_line(v)}" for k, v in value.items()]
+        lines = [f"{_words(name)}: {_value(inner)}" for name, inner in value.items()]
     elif isinstance(value, list) and not all(isinstance(v, int | float) for v in value):
-        lines = [_line(item) for item in value]
+        lines = [_value(item) for item in value]
     else:
         return _line(value)
     more = len(lines) - _MOST_ITEMS
@@ -144,9 +158,11 @@ def _value(value: Any) -> str:
     return "<ul>" + "".join(f"<li>{line}</li>" for line in lines) + "</ul>"
 
 
+def _words(name: str) -> str:
+    return escape(name.replace("_", " "))
+
+
 def _line(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{escape(str(k))} {_line(v)}" for k, v in value.items())
     if isinstance(value, list):
         shown = ", ".join(_line(v) for v in value[:_MOST_ITEMS])
         return shown + (", …" if len(value) > _MOST_ITEMS else "")

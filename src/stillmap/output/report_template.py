@@ -77,7 +77,12 @@ td.number, th.number { text-align: right; }
 tr.best th, tr.best td { color: var(--orange); font-weight: 600; }
 .wide { overflow-x: auto; }
 td ul { margin: 0; padding-left: 1.1rem; }
-meter { width: 9rem; }
+td > ul { padding-left: 0; list-style: none; }
+.bar { width: 10rem; }
+.bar span { display: block; height: .55rem; margin-top: .5rem; border-radius: 3px;
+  background: var(--accent); min-width: 2px; }
+.columns { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(28rem, 100%), 1fr));
+  gap: 0 3rem; align-items: start; }
 details { margin-top: .6rem; }
 summary { cursor: pointer; color: var(--accent); }
 footer { margin-top: 3rem; border-top: 1px solid var(--rule); padding-top: .6rem;

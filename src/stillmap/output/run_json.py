@@ -1,6 +1,5 @@
 """`run.json`: what was run, on what, with which options, and how it went."""
 
-import importlib.metadata
 import json
 import math
 from collections.abc import Mapping
@@ -50,19 +49,17 @@ def write_run_json(path: Path, result: ResultLike) -> None:
 
 
 def version() -> str:
-    """The installed stillmap's version, `unknown` when it runs from a bare source tree."""
-    try:
-        return importlib.metadata.version("stillmap")
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"
+    """The version of stillmap that runs."""
+    # the package is still being imported when this module is
+    from stillmap import __version__
+
+    return __version__
 
 
 def skipped_count(source: Mapping[str, Any]) -> int:
-    """How many records the reader left out, whether it names each one or only counts them."""
-    skipped = source.get("skipped", 0)
-    if isinstance(skipped, Mapping):
-        return sum(skipped_count({"skipped": value}) for value in skipped.values())
-    return len(skipped) if isinstance(skipped, list | tuple) else int(skipped or 0)
+    """How many records the reader left out; `skipped` is `{reason: {"count", "lines"}}`."""
+    skipped: Mapping[str, Mapping[str, Any]] = source.get("skipped") or {}
+    return sum(int(one["count"]) for one in skipped.values())
 
 
 def jsonable(value: Any) -> Any:

@@ -1,0 +1,99 @@
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+
+from stillmap.output.run_json import jsonable, skipped_count, write_run_json
+
+
+def no_constant(name):
+    raise AssertionError(f"{name} is not JSON")
+
+
+def written(tmp_path, result):
+    write_run_json(tmp_path / "run.json", result)
+    text = (tmp_path / "run.json").read_text(encoding="utf-8")
+    return json.loads(text, parse_constant=no_constant)
+
+
+def test_the_keys_that_scripts_rely_on(tmp_path, result):
+    run = written(tmp_path, result)
+    assert list(run) == [
+        "format_version",
+        "version",
+        "input",
+        "options",
+        "iterations",
+        "converged",
+        "best_iteration",
+        "seconds",
+        "peak_memory_bytes",
+        "counts",
+        "warnings",
+    ]
+    assert run["format_version"] == 1
+    assert isinstance(run["version"], str)
+    assert run["input"]["path"] == "logs/hall <1>.clf"
+    assert run["options"]["em"] == {"prior": 0.9, "note": result.options.em.note, "seed": None}
+    assert run["options"]["output"] == {"map_mode": "trinary"}
+    assert (run["converged"], run["best_iteration"]) == (True, 3)
+    assert run["seconds"] == {"read": 0.21, "em": 7.1, "map": 0.02}
+    assert run["peak_memory_bytes"]["em"] == 96_000_000
+    assert run["warnings"] == result.warnings
+
+
+def test_iterations(tmp_path, result):
+    iterations = written(tmp_path, result)["iterations"]
+    assert iterations[1] == {
+        "number": 2,
+        "bound": -31500.5,
+        "expected_log_likelihood": -32100.25,
+        "held_out_log_likelihood": None,
+        "changed_share": 0.08,
+        "seconds": 1.8,
+    }
+    assert iterations[3]["bound"] is None  # not a number there
+
+
+def test_counts(tmp_path, result):
+    hit, points = result.recording.hit, result.recording.points
+    assert written(tmp_path, result)["counts"] == {
+        "scans": 60,
+        "beams": 60 * 181,
+        "hits": int(hit.sum()),
+        "max_range": int((~hit & np.isfinite(points[:, 0])).sum()),
+        "unusable": 3,
+        "skipped": 41,
+    }
+
+
+def test_values_of_every_kind_become_json(tmp_path, result):
+    source = {
+        "path": Path("a/b.bag"),
+        "odd": float("inf"),
+        "numpy": {"scalar": np.float32("nan"), "count": np.int64(3), "flag": np.bool_(True)},
+        "array": np.array([[1.0, np.nan]]),
+        "pair": (1, "ä"),
+        7: None,
+    }
+    recording = dataclasses.replace(result.recording, source=source)
+    assert written(tmp_path, dataclasses.replace(result, recording=recording))["input"] == {
+        "path": "a/b.bag",
+        "odd": None,
+        "numpy": {"scalar": None, "count": 3, "flag": True},
+        "array": [[1.0, None]],
+        "pair": [1, "ä"],
+        "7": None,
+    }
+
+
+def test_jsonable_keeps_the_kind_of_what_json_knows():
+    value = {"a": [True, 1, 1.5, "x", None]}
+    assert json.dumps(jsonable(value)) == json.dumps(value)
+
+
+def test_a_reader_that_skipped_nothing():
+    assert (
+        skipped_count({}) == skipped_count({"skipped": {}}) == skipped_count({"skipped": None}) == 0
+    )
