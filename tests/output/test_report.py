@@ -11,7 +11,14 @@ from PIL import Image
 from stillmap.output import report_tables
 from stillmap.output.report import likelihood_sentence, report_html
 from stillmap.output.report_curve import likelihood_svg
-from stillmap.output.report_figures import ORANGE, UNKNOWN, dots_image, map_image, snapshot_image
+from stillmap.output.report_figures import (
+    ORANGE,
+    UNKNOWN,
+    dots_image,
+    map_image,
+    shown_window,
+    snapshot_image,
+)
 
 VOID = {"meta", "img", "input", "br", "link", "hr"}
 
@@ -114,6 +121,20 @@ def test_map_colours(result):
     pixels = np.asarray(map_image(small_map(result, p), (0, 0, 3, 2)).convert("RGB"))
     white, black = (255, 255, 255), (0, 0, 0)
     np.testing.assert_array_equal(pixels, [[UNKNOWN, white, white], [white, black, UNKNOWN]])
+
+
+def test_the_window_holds_every_occupied_cell_of_both_maps(result):
+    p = np.zeros((100, 300), np.float32)
+    p[40, 50] = p[60, 90] = 0.7
+    other = np.zeros((50, 100), np.float32)
+    other[10, 20] = 0.7
+    b = dataclasses.replace(small_map(result, other), origin=(100.0, 30.0, 0.0))
+    assert shown_window([small_map(result, p), b]) == (44.0, 34.0, 125.0, 67.0)
+    # none occupied: what is known; nothing known: everything
+    p[:] = np.nan
+    assert shown_window([small_map(result, p)]) == (0.0, 0.0, 300.0, 100.0)
+    p[5, 6] = 0.1
+    assert shown_window([small_map(result, p)]) == (2.0, 1.0, 11.0, 10.0)
 
 
 def test_dots_lie_where_the_points_are():

@@ -72,7 +72,7 @@ def _draw(
     )
     axis.set_xlabel("iteration", color=_INK)
     axis.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
-    axis.ticklabel_format(axis="y", useOffset=False, useMathText=True, scilimits=(-4, 5))
+    axis.ticklabel_format(axis="y", useOffset=False, useMathText=True, scilimits=(-4, 7))
     axis.yaxis.get_offset_text().set_color(_INK)
     axis.tick_params(colors=_INK, which="both")
     axis.grid(color=_FAINT, linewidth=0.7)

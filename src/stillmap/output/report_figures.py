@@ -22,15 +22,20 @@ _SHOWN_WIDTH = 600
 _UNKNOWN_INDEX, _ORANGE_INDEX = 101, 102
 
 
-def known_window(maps: Sequence[OccupancyMapLike]) -> Window:
-    """The smallest window that holds every known cell of `maps`, with a small margin."""
-    boxes = [box for box in (_known_box(one) for one in maps) if box is not None]
-    if not boxes:
-        return extent(maps[0])
-    corners = np.array(boxes)
-    x0, y0 = corners[:, :2].min(axis=0).tolist()
-    x1, y1 = corners[:, 2:].max(axis=0).tolist()
-    return x0, y0, x1, y1
+def shown_window(maps: Sequence[OccupancyMapLike]) -> Window:
+    """The smallest window that holds every occupied cell of `maps`, with a margin.
+
+    Free space may reach far beyond, where beams met nothing. Without an occupied cell the window
+    holds every known one, and the whole map where none is known.
+    """
+    for chosen in (_occupied, _known):
+        boxes = [box for box in (_box(one, chosen(one)) for one in maps) if box is not None]
+        if boxes:
+            corners = np.array(boxes)
+            x0, y0 = corners[:, :2].min(axis=0).tolist()
+            x1, y1 = corners[:, 2:].max(axis=0).tolist()
+            return x0, y0, x1, y1
+    return extent(maps[0])
 
 
 def map_image(occupancy: OccupancyMapLike, window: Window) -> Image.Image:
@@ -80,22 +85,31 @@ def pixel_positions(
 def png_uri(image: Image.Image) -> str:
     """The picture as a `data:` address."""
     buffer = io.BytesIO()
-    image.save(buffer, "PNG", optimize=True)
+    image.save(buffer, "PNG")
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _known_box(occupancy: OccupancyMapLike) -> Window | None:
-    known = ~np.isnan(occupancy.p_occupied)
-    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+def _occupied(occupancy: OccupancyMapLike) -> NDArray[np.bool_]:
+    return occupancy.p_occupied > OCCUPIED_THRESH
+
+
+def _known(occupancy: OccupancyMapLike) -> NDArray[np.bool_]:
+    return ~np.isnan(occupancy.p_occupied)
+
+
+def _box(occupancy: OccupancyMapLike, cells: NDArray[np.bool_]) -> Window | None:
+    """The window around the chosen cells, a margin of a twentieth included."""
+    rows, columns = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
     if not len(rows):
         return None
     x, y, _, _ = extent(occupancy)
-    margin = 4 + max(known.shape) // 100
+    left, right, bottom, top = (int(n) for n in (*columns[[0, -1]], *rows[[0, -1]]))
+    margin = 4 + max(right - left, top - bottom) // 20
     return (
-        x + (int(columns[0]) - margin) * occupancy.resolution,
-        y + (int(rows[0]) - margin) * occupancy.resolution,
-        x + (int(columns[-1]) + 1 + margin) * occupancy.resolution,
-        y + (int(rows[-1]) + 1 + margin) * occupancy.resolution,
+        x + (left - margin) * occupancy.resolution,
+        y + (bottom - margin) * occupancy.resolution,
+        x + (right + 1 + margin) * occupancy.resolution,
+        y + (top + 1 + margin) * occupancy.resolution,
     )
 
 

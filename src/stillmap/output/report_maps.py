@@ -13,10 +13,10 @@ from stillmap.output.points import dynamic_points
 from stillmap.output.protocols import ResultLike
 from stillmap.output.report_figures import (
     dots_image,
-    known_window,
     map_image,
     pixel_positions,
     png_uri,
+    shown_window,
     snapshot_image,
 )
 
@@ -40,7 +40,7 @@ def maps_section(result: ResultLike) -> str:
     """The raw map beside the filtered one."""
     if not result.map.p_occupied.size:
         return "<section><h2>The map</h2><p>It is empty: no beam could be used.</p></section>"
-    window = known_window([result.raw_map, result.map])
+    window = shown_window([result.raw_map, result.map])
     raw, filtered = map_image(result.raw_map, window), map_image(result.map, window)
     dots = dots_image(
         dynamic_points(result.recording, result.poses, result.p_static)[:, :2],

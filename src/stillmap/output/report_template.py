@@ -72,7 +72,7 @@ table { border-collapse: collapse; font-size: .92rem; }
 th, td { text-align: left; padding: .22rem .9rem .22rem 0; border-bottom: 1px solid var(--rule);
   vertical-align: top; overflow-wrap: anywhere; }
 thead th { color: var(--soft); font-weight: 500; }
-tbody th { font-weight: 500; }
+tbody th { font-weight: 500; white-space: nowrap; }
 td.number, th.number { text-align: right; }
 tr.best th, tr.best td { color: var(--orange); font-weight: 600; }
 .wide { overflow-x: auto; }
