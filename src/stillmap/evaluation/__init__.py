@@ -1,0 +1,1 @@
+"""Scores of trajectories, labels and maps. Files are read in `files` and `folders` alone."""
