@@ -101,7 +101,7 @@ def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
     view = sensor.get("field_of_view_deg")
     if view is not None:
         step = sensor.get("angle_step")
-        steps = f", {math.degrees(step):g} deg apart" if step else ""
+        steps = f", {math.degrees(step):g} deg apart" if isinstance(step, float) else ""
         yield _row("  field of view", f"{view[0]:.2f} to {view[1]:.2f} deg{steps}")
     place = sensor.get("extrinsics")
     if place is not None:

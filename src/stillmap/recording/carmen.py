@@ -16,6 +16,7 @@ from stillmap.recording.extrinsics import Extrinsics
 from stillmap.recording.lines import Progress, is_gzip
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
+from stillmap.recording.skipped import Skipped
 from stillmap.recording.stamps import longest_non_decreasing
 
 TIME_BACKWARDS = "time running backwards"
@@ -59,8 +60,9 @@ def read(
 
 def _no_scan(path: Path, log: CarmenLog) -> InputError:
     kinds = ", ".join(name.decode() for name in SCAN_PARSERS)
-    if log.skipped.total:
-        what = f"holds no usable laser scan: {log.skipped.summary()}"
+    skipped = log.skipped.merged(*log.skipped_scans.values())
+    if skipped.total:
+        what = f"holds no usable laser scan: {skipped.summary()}"
     else:
         what = "holds no laser line" if log.n_lines else "is empty"
     return InputError(what, where=str(path), hint=f"a CARMEN log has lines of {kinds}")
@@ -94,12 +96,15 @@ def _usable(laser: LaserLog, log: CarmenLog) -> _Sensor:
     costs one scan. Each laser is looked at alone: two of them may well report out of turn.
     """
     count, line = np.asarray(laser.count), np.asarray(laser.line)
-    usual = count == laser.usual_count()
-    log.skipped.add_all(WRONG_COUNT, line[~usual])
+    shifted = np.asarray(laser.host_is_number, np.bool_)
+    # a number for a host where others have names: the fields before it are not what they seem
+    usual = (count == laser.usual_count()) & ~(shifted & (shifted.mean() < 0.5))
+    skipped = log.skipped_scans[laser.kind]
+    skipped.add_all(WRONG_COUNT, line[~usual])
     scans = np.flatnonzero(usual)
     stamp_ns = np.asarray(laser.stamp_ns, np.int64)[scans]
     forward = longest_non_decreasing(stamp_ns.tolist())
-    log.skipped.add_all(TIME_BACKWARDS, np.delete(line[scans], forward))
+    skipped.add_all(TIME_BACKWARDS, np.delete(line[scans], forward))
     scans = scans[forward]
     poses = np.asarray(laser.poses).reshape(-1, 6)[scans] if laser.has_poses else None
     return _Sensor(
@@ -109,7 +114,8 @@ def _usable(laser: LaserLog, log: CarmenLog) -> _Sensor:
 
 def _assembled(sensors: list[_Sensor], log: CarmenLog, options: ReadOptions) -> Recording:
     """One recording of all lasers' scans in the order of their stamps."""
-    warnings = _loss_warning(sensors, log)
+    skipped = log.skipped.merged(*(log.skipped_scans[s.laser.kind] for s in sensors))
+    warnings = _loss_warning(sensors, skipped)
     parts, places, infos = [], [], []
     for number, sensor in enumerate(sensors):
         place, more = extrinsics.find(sensor.laser, sensor.poses, log.params)
@@ -135,7 +141,11 @@ def _assembled(sensors: list[_Sensor], log: CarmenLog, options: ReadOptions) -> 
         T_base_sensor=np.stack([place.matrix() for place in places]),
         sensor=sensor_of[order].astype(np.int32),
         T_odom_base=None if poses is None else se2.matrix(*poses[order].T),
-        source=_source(log, infos, odometry_info, warnings),
+        source={
+            **_source(log, infos, odometry_info),
+            "skipped": skipped.to_dict(),
+            "warnings": warnings,
+        },
     )
 
 
@@ -145,6 +155,7 @@ def _points(
     """End points (T, n, 2) in the sensor frame, hits (T, n), and how readings were understood."""
     declared = extrinsics.declared_max_range(sensor.laser, log.params)
     rule, more = ranges.decide(sensor.ranges, declared, options)
+    more += _angle_warning(sensor)
     warnings += [f"{sensor.laser.kind}: {text}" for text in more]
     length, hit = ranges.apply(sensor.ranges, rule)
     configs = np.array([config[:2] for config in sensor.laser.configs])
@@ -153,6 +164,18 @@ def _points(
     points[..., 0] = length * np.cos(angle)[sensor.config]
     points[..., 1] = length * np.sin(angle)[sensor.config]
     return points, hit, rule
+
+
+def _angle_warning(sensor: _Sensor) -> list[str]:
+    n = sensor.ranges.shape[1]
+    for config in sensor.laser.configs:
+        fan = n * config.angle_step  # or one step less: both are in use
+        if config.field_of_view and abs(fan - config.field_of_view) > 3.0 * config.angle_step:
+            return [
+                f"{n} readings {np.degrees(config.angle_step):.3g} deg apart are not the stated "
+                f"field of view of {np.degrees(config.field_of_view):.4g} deg"
+            ]
+    return []
 
 
 def _interleaved(
@@ -213,12 +236,12 @@ def _moves(poses: NDArray[np.float64]) -> bool:
     return bool(np.any(poses != poses[0]))
 
 
-def _loss_warning(sensors: list[_Sensor], log: CarmenLog) -> list[str]:
+def _loss_warning(sensors: list[_Sensor], skipped: Skipped) -> list[str]:
     kept = sum(len(sensor.stamp_ns) for sensor in sensors)
-    lost = log.skipped.total
+    lost = skipped.total
     if lost <= _MANY * (kept + lost):
         return []
-    return [f"{lost} of {kept + lost} scans are damaged and were skipped: {log.skipped.summary()}"]
+    return [f"{lost} of {kept + lost} scans are damaged and were skipped: {skipped.summary()}"]
 
 
 def _sensor_info(sensor: _Sensor, place: Extrinsics, rule: ranges.RangeRule) -> dict[str, Any]:
@@ -239,7 +262,6 @@ def _source(
     log: CarmenLog,
     sensors: list[dict[str, Any]],
     odometry_info: dict[str, Any],
-    warnings: list[str],
 ) -> dict[str, Any]:
     used = {k: v for k, v in log.params.items() if k.startswith("robot_") and "laser" in k}
     return {
@@ -249,7 +271,5 @@ def _source(
         "sensors": sensors,
         "odometry": odometry_info,
         "params": used,
-        "skipped": log.skipped.to_dict(),
         "skipped_odometry": log.skipped_odometry.to_dict(),
-        "warnings": warnings,
     }

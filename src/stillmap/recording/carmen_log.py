@@ -32,6 +32,7 @@ class LaserLog:
         self.line = array("q")
         self.stamp_ns = array("q")
         self.count = array("q")  # readings per scan
+        self.host_is_number = array("b")
         self.ranges = array("f")  # readings of all scans, one after the other
         self.config = array("q")  # index into configs
         self.configs: dict[ScanConfig, int] = {}
@@ -42,6 +43,7 @@ class LaserLog:
         self.line.append(line)
         self.stamp_ns.append(scan.stamp_ns)
         self.count.append(len(scan.ranges))
+        self.host_is_number.append(scan.host_is_number)
         self.ranges.extend(scan.ranges)
         self.config.append(self.configs.setdefault(scan.config, len(self.configs)))
         if scan.laser_pose is not None and scan.robot_pose is not None:
@@ -73,7 +75,8 @@ class CarmenLog:
         self.params: dict[str, str] = {}
         self.records: Counter[str] = Counter()
         self.ignored: Counter[str] = Counter()
-        self.skipped = Skipped()  # laser lines, and lines that cannot be told
+        self.skipped = Skipped()  # lines of which it cannot be told what they were
+        self.skipped_scans: dict[str, Skipped] = {}  # by kind of line
         self.skipped_odometry = Skipped()
         self.n_lines = 0
         self._stamp_fields: dict[bytes, int] = {}
@@ -101,7 +104,10 @@ class CarmenLog:
         if name != b"ODOM" and name not in SCAN_PARSERS:
             self._ignore(line, name)
             return
-        skipped = self.skipped_odometry if name == b"ODOM" else self.skipped
+        if name == b"ODOM":
+            skipped = self.skipped_odometry
+        else:
+            skipped = self.skipped_scans.setdefault(_text(name), Skipped())
         try:
             stamp_fields = self._add_measured(line, name, fields)
         except BadRecord as bad:

@@ -44,6 +44,7 @@ class ScanConfig(NamedTuple):
     start_angle: float  # rad
     angle_step: float  # rad
     max_range: float | None  # m
+    field_of_view: float | None  # rad, as stated
 
 
 class ScanLine(NamedTuple):
@@ -55,6 +56,7 @@ class ScanLine(NamedTuple):
     laser_pose: tuple[float, float, float] | None
     robot_pose: tuple[float, float, float] | None
     stamp_fields: int  # 1 to 3, how much of `ipc_timestamp hostname logger_timestamp` is there
+    host_is_number: bool  # possible, but in a log with named hosts a sign of shifted fields
 
 
 class OdometryLine(NamedTuple):
@@ -71,7 +73,7 @@ def flaser_angles(n: int) -> ScanConfig:
     for odd n.
     """
     steps = n if n % 2 == 0 else max(n - 1, 1)
-    return ScanConfig(-math.pi / 2, math.pi / steps, None)
+    return ScanConfig(-math.pi / 2, math.pi / steps, None, None)
 
 
 def parse_flaser(fields: list[bytes]) -> ScanLine:
@@ -87,7 +89,7 @@ def parse_flaser(fields: list[bytes]) -> ScanLine:
     ranges = _numbers(fields[1 : 1 + n])
     stamp_ns = _stamp(tail[6])
     poses = _pose(tail[0:3]), _pose(tail[3:6])
-    return ScanLine(stamp_ns, ranges, flaser_angles(n), *poses, len(tail) - 6)
+    return ScanLine(stamp_ns, ranges, flaser_angles(n), *poses, *_stamp_form(tail[6:]))
 
 
 def parse_rawlaser(fields: list[bytes]) -> ScanLine:
@@ -96,7 +98,7 @@ def parse_rawlaser(fields: list[bytes]) -> ScanLine:
     tail = _after_remissions(fields[_HEADER_FIELDS + 1 + n :], 0)
     config = _config(fields[:_HEADER_FIELDS], n)
     ranges = _numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n])
-    return ScanLine(_stamp(tail[0]), ranges, config, None, None, len(tail))
+    return ScanLine(_stamp(tail[0]), ranges, config, None, None, *_stamp_form(tail))
 
 
 def parse_robotlaser(fields: list[bytes]) -> ScanLine:
@@ -106,7 +108,8 @@ def parse_robotlaser(fields: list[bytes]) -> ScanLine:
     config = _config(fields[:_HEADER_FIELDS], n)
     ranges = _numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n])
     stamp_ns = _stamp(tail[11])
-    return ScanLine(stamp_ns, ranges, config, _pose(tail[0:3]), _pose(tail[3:6]), len(tail) - 11)
+    poses = _pose(tail[0:3]), _pose(tail[3:6])
+    return ScanLine(stamp_ns, ranges, config, *poses, *_stamp_form(tail[11:]))
 
 
 def parse_odom(fields: list[bytes]) -> OdometryLine:
@@ -151,8 +154,6 @@ def _after_remissions(rest: list[bytes], fixed: int) -> list[bytes]:
         tail = rest[1 + int(rest[0]) :]
         if _is_stamp(tail[fixed:]):
             return tail
-    if _is_stamp(rest[fixed:]):  # lines from before there were remissions
-        return rest
     raise BadRecord(WRONG_COUNT)
 
 
@@ -160,7 +161,7 @@ def _is_stamp(fields: list[bytes]) -> bool:
     """Whether `fields` read as `ipc_timestamp [hostname [logger_timestamp]]`.
 
     A host name is no number, or a plain integer where the logger's stamp follows: so a line with
-    one reading too many or too few is seen even where the missing stamps would hide it.
+    a reading too many or too few is seen even where missing stamps would hide it.
     """
     if len(fields) == 1:
         return True
@@ -171,6 +172,10 @@ def _is_stamp(fields: list[bytes]) -> bool:
         and (fields[1].isdigit() or not _is_number(fields[1]))
         and _is_number(fields[2])
     )
+
+
+def _stamp_form(fields: list[bytes]) -> tuple[int, bool]:
+    return len(fields), len(fields) > 1 and _is_number(fields[1])
 
 
 def _is_number(field: bytes) -> bool:
@@ -212,8 +217,10 @@ def _config(header: list[bytes], n: int) -> ScanConfig:
     Only these four of its fields are read: the others matter to nobody here.
     """
     start, fov, step, max_range = _numbers(header[1:5])
-    if not 0.0 < step < math.pi and 0.0 < fov <= 2.1 * math.pi:
-        step = fov / max(n - 1, 1)
+    stated_fov = fov if 0.0 < fov <= 2.1 * math.pi else None
+    if not 0.0 < step < math.pi and stated_fov is not None:
+        step = stated_fov / max(n - 1, 1)
     if not (0.0 < step < math.pi and abs(start) <= 4.0 * math.pi):
         raise BadRecord(UNREADABLE)
-    return ScanConfig(start, step, max_range if 0.0 < max_range < math.inf else None)
+    stated_max = max_range if 0.0 < max_range < math.inf else None
+    return ScanConfig(start, step, stated_max, stated_fov)

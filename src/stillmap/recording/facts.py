@@ -1,5 +1,6 @@
 """What is in a recording, in numbers."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -7,13 +8,19 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.recording.model import Recording
+from stillmap.recording.ranges import RangeRule
 
 _CHUNK = 1 << 20  # beams looked at together
+_DAMAGE = ("skipped", "skipped_odometry")
+_TABLES = ("records", "ignored", "params", "read_options")
+_LISTS = ("duplicates", "warnings")
+_SENSOR_NOTES = ("name", "beams_per_scan", "start_angle", "angle_step", "extrinsics", "ranges")
+_RULE = {field.name for field in dataclasses.fields(RangeRule)}
 
 
 def facts(recording: Recording) -> dict[str, Any]:
     """Everything that `stillmap info` shows, JSON-able: metres, seconds, degrees."""
-    source = recording.source
+    source = _notes(recording.source)
     length = _lengths(recording)
     beams = np.diff(recording.offset)
     return {
@@ -26,17 +33,29 @@ def facts(recording: Recording) -> dict[str, Any]:
         "counts": _counts(recording, length),
         "hit_ranges_m": _spread(length[recording.hit], ("min", "median", "p99", "max")),
         "time": _time(recording.stamp_ns),
-        "odometry": _odometry(recording),
-        "sensors": [_sensor(recording, i) for i in range(len(recording.T_base_sensor))],
-        **{
-            key: source.get(key, {} if key != "duplicates" else [])
-            for key in ("records", "ignored", "params", "duplicates")
-        },
-        "skipped": source.get("skipped", {}),
-        "skipped_odometry": source.get("skipped_odometry", {}),
-        "read_options": source.get("read_options", {}),
-        "warnings": source.get("warnings", []),
+        "odometry": _odometry(recording, source["odometry"]),
+        "sensors": [
+            _sensor(recording, i, source["sensors"]) for i in range(len(recording.T_base_sensor))
+        ],
+        **{key: source[key] for key in (*_DAMAGE, *_TABLES, *_LISTS)},
     }
+
+
+def _notes(source: dict[str, Any]) -> dict[str, Any]:
+    """What the reader noted; notes of another shape than expected (other writers) are left out."""
+    tables = {key: source.get(key) for key in (*_DAMAGE, *_TABLES, "odometry")}
+    notes: dict[str, Any] = {k: v if isinstance(v, dict) else {} for k, v in tables.items()}
+    lists = {key: source.get(key) for key in (*_LISTS, "sensors")}
+    notes.update({k: v if isinstance(v, list) else [] for k, v in lists.items()})
+    for key in _DAMAGE:
+        notes[key] = {
+            reason: damage
+            for reason, damage in notes[key].items()
+            if isinstance(damage, dict)
+            and isinstance(damage.get("count"), int)
+            and isinstance(damage.get("lines"), list)
+        }
+    return {**notes, "path": source.get("path"), "format": source.get("format")}
 
 
 def _lengths(recording: Recording) -> NDArray[np.float32]:
@@ -84,11 +103,11 @@ def _time(stamp_ns: NDArray[np.int64]) -> dict[str, Any] | None:
     }
 
 
-def _odometry(recording: Recording) -> dict[str, Any] | None:
+def _odometry(recording: Recording, noted: dict[str, Any]) -> dict[str, Any] | None:
     T = recording.T_odom_base
     if T is None:
         return None
-    found = {k: v for k, v in recording.source.get("odometry", {}).items() if v is not None}
+    found = {key: noted[key] for key in ("from", "outside") if noted.get(key) is not None}
     step = se2.inverse(T[:-1]) @ T[1:]
     metres = np.linalg.norm(step[:, :-1, -1], axis=1)
     # the angle of a rotation in any dimension follows from its trace
@@ -106,28 +125,38 @@ def _odometry(recording: Recording) -> dict[str, Any] | None:
     }
 
 
-def _sensor(recording: Recording, number: int) -> dict[str, Any]:
+def _sensor(recording: Recording, number: int, noted: list[Any]) -> dict[str, Any]:
     """One sensor: what its reader noted, else what shows in the arrays."""
     scans = np.flatnonzero(recording.sensor == number)
-    noted = recording.source.get("sensors")
     out: dict[str, Any] = {"scans": len(scans)}
-    if isinstance(noted, list) and number < len(noted):
-        out.update(noted[number])
+    if number < len(noted) and isinstance(noted[number], dict):
+        out.update((key, noted[number][key]) for key in _SENSOR_NOTES if key in noted[number])
+    if not _is_rule(out.get("ranges")):
+        out.pop("ranges", None)
     if recording.dimension == 2:
         x, y, theta = (float(v) for v in se2.parameters(recording.T_base_sensor[number]))
-        how = out.get("extrinsics", {}).get("how", "recording")
+        place = out.get("extrinsics")
+        how = str(place.get("how", "")) if isinstance(place, dict) else "as recorded"
         out["extrinsics"] = {"x": x, "y": y, "theta_deg": float(np.degrees(theta)), "how": how}
         out["field_of_view_deg"] = _field_of_view(recording, scans, out)
     return out
+
+
+def _is_rule(noted: Any) -> bool:
+    return (
+        isinstance(noted, dict)
+        and set(noted) == _RULE
+        and all(isinstance(noted[k], float | int | None) for k in ("threshold", "free_range"))
+    )
 
 
 def _field_of_view(
     recording: Recording, scans: NDArray[np.intp], noted: dict[str, Any]
 ) -> list[float] | None:
     """First and last beam in degrees: as noted, else the extremes of all usable beams."""
-    if "start_angle" in noted:
-        first = noted["start_angle"]
-        last = first + (noted["beams_per_scan"] - 1) * noted["angle_step"]
+    first, step, n = (noted.get(k) for k in ("start_angle", "angle_step", "beams_per_scan"))
+    if isinstance(first, float) and isinstance(step, float) and isinstance(n, int):
+        last = first + (n - 1) * step
         return [float(np.degrees(first)), float(np.degrees(last))]
     lowest, highest = np.inf, -np.inf
     for scan in scans:

@@ -119,13 +119,12 @@ def _array(path: Path, name: str, shape: tuple[int, ...], dtype: type) -> NDArra
     """One `.npy` file as it lies on disk, of exactly this shape and type."""
     file = path / f"{name}.npy"
     try:
-        loaded = np.load(file, mmap_mode="r", allow_pickle=False)
+        # np.load would also open archives and pickles that bear the name
+        loaded = np.lib.format.open_memmap(file, mode="r")
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", where=str(file)) from error
     except Exception as error:  # whatever NumPy's parser makes of damaged bytes
         raise InputError(f"is damaged: {error}", where=str(file)) from error
-    if not isinstance(loaded, np.ndarray):
-        raise _damaged(path, name, "not an array")
     if loaded.shape != shape or loaded.dtype != np.dtype(dtype):
         raise _damaged(
             path,

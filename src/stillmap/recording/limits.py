@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from stillmap import se2
+from stillmap.errors import InputError
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
 
@@ -14,6 +15,9 @@ def applied(recording: Recording, options: ReadOptions) -> Recording:
 
     Nearer than `min_range`: unusable. From `max_range` on: maximum range, ending there. A
     maximum-range beam shows at most `free_range`. `zero_means` has nothing left to say.
+
+    Raises:
+        InputError: a laser's place on the robot is given, and the recording is 3D.
     """
     defaults = ReadOptions(zero_means=options.zero_means)
     if options == defaults:
@@ -22,7 +26,7 @@ def applied(recording: Recording, options: ReadOptions) -> Recording:
     changed = replace(recording, source={**recording.source, "read_options": given})
     if options.min_range > 0 or options.max_range is not None or options.free_range is not None:
         changed = _narrowed(changed, options)
-    if changed.dimension == 2 and len(changed.T_base_sensor):
+    if (options.laser_x, options.laser_y, options.laser_theta) != (None, None, None):
         changed = _with_laser(changed, options)
     return changed
 
@@ -42,10 +46,10 @@ def _narrowed(recording: Recording, options: ReadOptions) -> Recording:
 
 
 def _with_laser(recording: Recording, options: ReadOptions) -> Recording:
+    if recording.dimension != 2 or not len(recording.T_base_sensor):
+        raise InputError("the laser's place on the robot can be given for 2D recordings only")
     wanted = (options.laser_x, options.laser_y, options.laser_theta)
     T = np.array(recording.T_base_sensor)
     found = se2.parameters(T[0])
-    x, y, theta = (f if w is None else w for f, w in zip(found, wanted, strict=True))
-    if wanted != (None, None, None):
-        T[0] = se2.matrix(x, y, theta)
+    T[0] = se2.matrix(*(f if w is None else w for f, w in zip(found, wanted, strict=True)))
     return replace(recording, T_base_sensor=T)

@@ -23,6 +23,16 @@ class Skipped:
             if len(kept) < KEPT_LINES:
                 kept.append(int(line))
 
+    def merged(self, *others: "Skipped") -> "Skipped":
+        """These and the others' together; neither is changed."""
+        out = Skipped()
+        for part in (self, *others):
+            for reason, count in part._count.items():
+                out._count[reason] = out._count.get(reason, 0) + count
+                lines = sorted(out._lines.get(reason, []) + part._lines[reason])
+                out._lines[reason] = lines[:KEPT_LINES]
+        return out
+
     @property
     def total(self) -> int:
         return sum(self._count.values())
@@ -31,7 +41,7 @@ class Skipped:
         """`3 x unreadable number (lines 4, 8, 15)`, the most frequent reason first."""
         parts = []
         for reason, count in sorted(self._count.items(), key=lambda item: -item[1]):
-            shown = ", ".join(str(line) for line in self._lines[reason][:3])
+            shown = ", ".join(str(line) for line in sorted(self._lines[reason])[:3])
             parts.append(f"{count} x {reason} (line {shown}{', ...' if count > 3 else ''})")
         return "; ".join(parts)
 

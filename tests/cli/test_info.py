@@ -1,0 +1,135 @@
+"""`stillmap info`: what it says, to people and to machines."""
+
+import argparse
+import json
+
+import pytest
+
+from stillmap.cli import info
+from stillmap.cli.reading import add_read_flags, read_changes
+from stillmap.errors import InputError
+from stillmap.recording import read, write
+
+LINES = [
+    "# CARMEN Logfile",
+    "PARAM robot_frontlaser_offset 0.25 host 0",
+    "FLASER 4 1 2 3 81.83 0 0 0 0 0 0 100.0 host 0.1",
+    "FLASER 4 1 2 3",
+    "FLASER 4 1 2 nan 4 3 4 0.5 3 4 0.5 101.5 host 0.1",
+    "FLASER 4 1 2 3 4 3 4 0.5 3 4 0.5 102.0 host 0.1",
+    "ODOM 0 0 nan 0 0 0 1 host 0",
+]
+
+
+@pytest.fixture
+def path(tmp_path):
+    file = tmp_path / "tiny.log"
+    file.write_text("".join(f"{line}\n" for line in LINES))
+    return file
+
+
+def run(*arguments):
+    parser = argparse.ArgumentParser()
+    info.add_parser(parser.add_subparsers())
+    args = parser.parse_args(["info", *map(str, arguments)])
+    return args.run(args)
+
+
+def test_json(path, capsys):
+    assert run(path, "--json") == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    found = json.loads(out)
+    assert (found["scans"], found["beams"], found["format"]) == (3, 12, "carmen")
+    assert found["counts"]["hits"] == 10
+    assert found["counts"]["max_range"] == 1
+    assert found["counts"]["unusable"] == 1
+    assert found["hit_ranges_m"] == {"min": 1.0, "median": 2.0, "p99": 4.0, "max": 4.0} or (
+        found["hit_ranges_m"]["max"] == 4.0
+    )
+    assert found["time"]["first_stamp_ns"] == 100 * 10**9
+    assert found["time"]["duration_s"] == 2.0
+    assert found["time"]["rate_hz"] == 1.0
+    assert found["time"]["largest_gap_s"] == 1.5
+    assert found["odometry"]["path_length_m"] == pytest.approx(5.0)
+    assert found["odometry"]["largest_step_m"] == pytest.approx(5.0)
+    assert found["odometry"]["largest_step_at_ns"] == 100 * 10**9
+    (sensor,) = found["sensors"]
+    assert sensor["extrinsics"]["x"] == 0.25
+    assert sensor["field_of_view_deg"] == pytest.approx([-90.0, 45.0])
+    assert sensor["ranges"]["threshold"] == 81.83
+    assert found["skipped"] == {"wrong number of readings": {"count": 1, "lines": [4]}}
+    assert found["skipped_odometry"] == {"pose not finite": {"count": 1, "lines": [7]}}
+
+
+def test_text(path, capsys):
+    assert run(path) == 0
+    out = capsys.readouterr().out
+    for part in (
+        "3 with 4 beams each",
+        "83.33 % hits, 8.33 % maximum range, 8.33 % unusable",
+        "-90.00 to 45.00 deg, 45 deg apart",
+        "81.83 m: SICK overflow values",
+        "zero means",
+        "100.000000000 to 102.000000000",
+        "path 5.00 m",
+        "x 0.250 m, y 0.000 m, turned 0.00 deg (PARAM)",
+        "robot_frontlaser_offset 0.25",
+        "1 wrong number of readings (line 4)",
+        "1 pose not finite (line 7)",
+        "warning",
+    ):
+        assert part in out, part
+
+
+def test_flags_reach_the_reader(path, capsys):
+    run(path, "--json", "--max-range", "2.5", "--min-range", "1.5", "--laser-offset", 1, 2, 90)
+    found = json.loads(capsys.readouterr().out)
+    assert found["counts"]["hits"] == 3
+    assert found["counts"]["unusable"] == 4
+    assert found["counts"]["max_range"] == 5
+    place = found["sensors"][0]["extrinsics"]
+    assert (place["x"], place["y"], place["theta_deg"]) == pytest.approx((1, 2, 90))
+
+
+def test_flag_out_of_range_is_the_callers_fault(path):
+    with pytest.raises(InputError, match="min_range"):
+        run(path, "--min-range", "-1")
+
+
+def test_only_given_flags_are_changes():
+    parser = argparse.ArgumentParser()
+    add_read_flags(parser)
+    assert read_changes(parser.parse_args([])) == {}
+    changes = read_changes(parser.parse_args(["--zero-means", "unusable", "--min-range", "0"]))
+    assert changes == {"read": {"zero_means": "unusable", "min_range": 0.0}}
+
+
+def test_recording_folder_says_the_same(path, tmp_path, capsys):
+    write(read(path), tmp_path / "rec")
+    run(path, "--json")
+    run(tmp_path / "rec", "--json")
+    first, second = capsys.readouterr().out.split("}\n{")
+    assert json.loads(first + "}") == json.loads("{" + second)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        {},
+        {"skipped": 3, "odometry": "yes", "sensors": [5], "warnings": {}, "params": []},
+        {"skipped": {"a": 1}, "sensors": [{"ranges": {}, "extrinsics": 1, "start_angle": "x"}]},
+    ],
+)
+def test_notes_of_other_writers_do_no_harm(path, tmp_path, capsys, source):
+    recording = read(path)
+    recording.source.clear()
+    recording.source.update(source)
+    write(recording, tmp_path / "rec")
+    assert run(tmp_path / "rec") == 0
+    assert "-90.00 to 45.00 deg" in capsys.readouterr().out
+
+
+def test_no_scan_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        run(tmp_path / "missing.log")
