@@ -210,7 +210,7 @@ def _stats(e: trajectory.ErrorStats, unit: str) -> str:
 def _labels(args: argparse.Namespace) -> Output:
     labels, truth = folders.read_labels(args.result), folders.read_truth(args.truth)
     folders.require_same_beams(labels, truth, args.result)
-    scores = label_scores(labels.p_static, truth.static(), labels.hit & truth.hit())
+    scores = label_scores(labels.p_static, truth.static(), labels.hit & truth.recording.hit)
     return scores.to_dict(), _label_lines(scores)
 
 
@@ -243,7 +243,7 @@ def _alignment(result: Path, truth: folders.Truth) -> Float:
     """T_world_map of a result: the map frame is where its trajectory started, not the world's."""
     path = result / "trajectory.tum"
     estimated = files.read_trajectory(path)
-    i, j = _associated(estimated, files.seconds(truth.stamp_ns), _STAMP_TOLERANCE, path)
+    i, j = _associated(estimated, files.seconds(truth.recording.stamp_ns), _STAMP_TOLERANCE, path)
     return trajectory.align(trajectory.planar(estimated.poses[i]), truth.poses()[j])
 
 

@@ -1,1 +1,1 @@
-"""Scores of trajectories, labels and maps. Files are read in `files` and `folders` alone."""
+"""Scores of trajectories, labels and maps: they read arrays; `files` and `folders` read files."""

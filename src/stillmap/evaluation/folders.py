@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from stillmap.errors import InputError
 from stillmap.evaluation.map import Grid
+from stillmap.recording.folder import read as read_recording
+from stillmap.recording.model import Recording
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -29,24 +31,14 @@ class Labels:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A simulated recording folder with its truth, planar.
-
-    Attributes:
-        folder: where it was read from.
-        stamp_ns: (T,) int64. offset: (T+1,) int64.
-    """
+    """A simulated planar recording and its truth. Arrays of truth are read when asked for."""
 
     folder: Path
-    stamp_ns: NDArray[np.int64]
-    offset: NDArray[np.int64]
-
-    def hit(self) -> Bool:
-        """(M,) beams that something reflected."""
-        return _array(self.folder / "hit.npy", (self._beams,), "b")
+    recording: Recording
 
     def static(self) -> Bool:
-        """(M,) True where something static reflected the beam; meaningful where hit."""
-        return _array(self.folder / "truth/static.npy", (self._beams,), "b")
+        """(M,) True where something static reflected the beam; meaningful where it hit."""
+        return _array(self.folder / "truth/static.npy", (self.recording.n_beams,), "b")
 
     def walls(self) -> Float:
         """(W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1."""
@@ -59,42 +51,33 @@ class Truth:
     def poses(self) -> Float:
         """(T, 3, 3) T_world_base."""
         path = self.folder / "truth/T_world_base.npy"
-        return _finite(path, _array(path, (len(self.stamp_ns), 3, 3), "f"))
+        return _finite(path, _array(path, (self.recording.n_scans, 3, 3), "f"))
 
     def static_hits(self) -> Float:
-        """(N, 2) end points in the world frame, at true poses, of the static beams."""
-        use = np.flatnonzero(self.hit() & self.static())
-        points = _array(self.folder / "points.npy", (self._beams, 2), "f")[use].astype(np.float64)
-        scan = np.searchsorted(self.offset, use, side="right") - 1
-        T = self._sensor_poses()[scan]
+        """(N, 2) end points in the world frame, at true poses, of the static beams that hit."""
+        use = np.flatnonzero(self.recording.hit & self.static())
+        points = self.recording.points[use].astype(np.float64)
+        scan = np.searchsorted(self.recording.offset, use, side="right") - 1
+        T = self.recording.T_map_sensor(self.poses())[scan]
         world: Float = np.einsum("nij,nj->ni", T[:, :2, :2], points) + T[:, :2, 2]
-        return world[np.isfinite(world).all(axis=1)]
-
-    def _sensor_poses(self) -> Float:
-        extrinsics = _array(self.folder / "T_base_sensor.npy", (None, 3, 3), "f")
-        path = self.folder / "sensor.npy"
-        sensor = _array(path, (len(self.stamp_ns),), "iu")
-        if len(sensor) and not 0 <= sensor.min() <= sensor.max() < len(extrinsics):
-            raise InputError(f"names a sensor beyond the {len(extrinsics)} there", where=str(path))
-        return np.asarray(self.poses() @ extrinsics[sensor])
-
-    @property
-    def _beams(self) -> int:
-        return int(self.offset[-1])
+        return world
 
 
 def read_truth(path: Path) -> Truth:
     """A simulated recording, given by its folder or by the `truth` folder inside.
 
     Raises:
-        InputError: it is none. The arrays beyond stamps and offsets are read, and can fail, later.
+        InputError: it is none, or none in the plane. The arrays of truth can still fail later.
     """
     folder = path.parent if path.name == "truth" and not (path / "truth").exists() else path
     if not (folder / "truth").is_dir():
         raise InputError(
             "holds no truth", where=str(path), hint="a folder that 'stillmap simulate' wrote"
         )
-    return Truth(folder, *_scans(folder))
+    recording = read_recording(folder)
+    if recording.dimension != 2:
+        raise InputError("is no planar recording", where=str(folder))
+    return Truth(folder, recording)
 
 
 def read_labels(result: Path) -> Labels:
@@ -104,7 +87,8 @@ def read_labels(result: Path) -> Labels:
         InputError: they are missing, damaged, or of lengths that do not go together.
     """
     folder = result / "beams"
-    stamp_ns, offset = _scans(folder)
+    stamp_ns = _array(folder / "stamp_ns.npy", (None,), "i")
+    offset = _array(folder / "offset.npy", (len(stamp_ns) + 1,), "i")
     beams = int(offset[-1])
     path = folder / "p_static.npy"
     p_static = _array(path, (beams,), "f")
@@ -122,8 +106,8 @@ def require_same_beams(labels: Labels, truth: Truth, result: Path) -> None:
         InputError: scans, beams or stamps differ.
     """
     for name, got, wanted in (
-        ("scans", len(labels.stamp_ns), len(truth.stamp_ns)),
-        ("beams", int(labels.offset[-1]), int(truth.offset[-1])),
+        ("scans", len(labels.stamp_ns), truth.recording.n_scans),
+        ("beams", len(labels.p_static), truth.recording.n_beams),
     ):
         if got != wanted:
             raise InputError(
@@ -131,7 +115,8 @@ def require_same_beams(labels: Labels, truth: Truth, result: Path) -> None:
                 where=str(result / "beams"),
                 hint="is it the result of another recording?",
             )
-    differ = (labels.stamp_ns != truth.stamp_ns) | (labels.offset[1:] != truth.offset[1:])
+    differ = labels.stamp_ns != truth.recording.stamp_ns
+    differ |= labels.offset[1:] != truth.recording.offset[1:]
     if differ.any():
         raise InputError(
             f"scan {int(np.argmax(differ))} is another one than in {truth.folder}",
@@ -166,15 +151,6 @@ def read_grid(result: Path) -> Grid:
         raise InputError("origin or resolution is no usable number", where=str(path))
     x, y, yaw = (float(value) for value in origin)
     return Grid(p_occupied, (x, y, yaw), float(resolution))
-
-
-def _scans(folder: Path) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    stamp_ns = _array(folder / "stamp_ns.npy", (None,), "i")
-    path = folder / "offset.npy"
-    offset = _array(path, (len(stamp_ns) + 1,), "i")
-    if offset[0] != 0 or np.any(np.diff(offset) < 0):
-        raise InputError("offsets do not rise from 0", where=str(path))
-    return stamp_ns, offset
 
 
 def _array(path: Path, shape: tuple[int | None, ...], kinds: str) -> NDArray[Any]:
