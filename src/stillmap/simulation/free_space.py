@@ -1,0 +1,155 @@
+"""Where there is room between walls, and the shortest way through it."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+
+from stillmap.errors import InputError
+
+Float = NDArray[np.float64]
+
+_SPACING = 0.1  # m between nodes of the clearance grid
+_STRIDE = 2  # the planner uses every second node
+_MARGIN = 0.5  # m around the walls
+_LOOK_AHEAD = 80  # nodes that a shortcut may skip
+_NEAR_WALL_COST = 0.6  # how much longer a metre along a wall feels than one in the open
+
+
+def distance_to_segments(points: Float, segments: Float) -> Float:
+    """(N,) distances in metres of points (N, 2) from the nearest of the segments (W, 4)."""
+    out = np.empty(len(points))
+    ax, ay = segments[:, 0], segments[:, 1]
+    ux, uy = segments[:, 2] - ax, segments[:, 3] - ay
+    squared = np.maximum(ux * ux + uy * uy, 1e-12)
+    for first in range(0, len(points), 2048):
+        dx = points[first : first + 2048, :1] - ax
+        dy = points[first : first + 2048, 1:] - ay
+        s = np.clip((dx * ux + dy * uy) / squared, 0.0, 1.0)
+        nearest = ((dx - s * ux) ** 2 + (dy - s * uy) ** 2).min(axis=1)
+        out[first : first + 2048] = np.sqrt(nearest)
+    return out
+
+
+class FreeSpace:
+    """Distance from the nearest wall on a grid of nodes.
+
+    Args:
+        walls: (W, 4) segments x0, y0, x1, y1 in metres.
+    """
+
+    def __init__(self, walls: Float) -> None:
+        ends = walls.reshape(-1, 2)
+        self.origin = ends.min(axis=0) - _MARGIN
+        size = np.ceil((ends.max(axis=0) + _MARGIN - self.origin) / _SPACING).astype(int) + 1
+        nodes = np.stack(np.meshgrid(*(np.arange(n) for n in size)), axis=-1).reshape(-1, 2)
+        distances = distance_to_segments(self.origin + nodes * _SPACING, walls)
+        self.clearance: Float = distances.reshape(size[1], size[0])
+
+    def clearance_at(self, xy: Float) -> tuple[Float, Float]:
+        """Clearance (N,) in metres at points (N, 2), bilinear, and its gradient (N, 2)."""
+        H, W = self.clearance.shape
+        at = (xy - self.origin) / _SPACING
+        cell = np.clip(at.astype(np.int64), 0, (W - 2, H - 2))
+        u, v = (at - cell).T
+        column, row = cell.T
+        c00, c10 = self.clearance[row, column], self.clearance[row, column + 1]
+        c01, c11 = self.clearance[row + 1, column], self.clearance[row + 1, column + 1]
+        low, high = c00 + u * (c10 - c00), c01 + u * (c11 - c01)
+        dx = (1 - v) * (c10 - c00) + v * (c11 - c01)
+        return low + v * (high - low), np.stack([dx, high - low], axis=-1) / _SPACING
+
+
+class Planner:
+    """Shortest ways that keep clear of the walls, within the part that `inside` belongs to.
+
+    Args:
+        space: the clearance grid.
+        inside: (2,) a point of that part, metres.
+        clearance: m, the least distance from walls.
+
+    Raises:
+        InputError: there is no room at `inside`.
+    """
+
+    def __init__(self, space: FreeSpace, inside: Float, clearance: float) -> None:
+        self._space = space
+        self._clear = space.clearance >= clearance
+        coarse = self._clear[::_STRIDE, ::_STRIDE]
+        parts, _ = ndimage.label(coarse, structure=np.ones((3, 3)))
+        self._shape = coarse.shape
+        at = np.round((inside - space.origin) / (_SPACING * _STRIDE)).astype(int)
+        column, row = np.clip(at, 0, (self._shape[1] - 1, self._shape[0] - 1))
+        if not parts[row, column]:
+            raise InputError(
+                f"no room for a robot or a person at ({inside[0]:g}, {inside[1]:g})",
+                hint=f"points of a route lie at least {clearance:g} m from any wall",
+            )
+        part = parts == parts[row, column]
+        self._graph = _graph(part, space.clearance[::_STRIDE, ::_STRIDE], clearance)
+        _, nearest = ndimage.distance_transform_edt(~part, return_indices=True)
+        self._nearest = nearest[0] * self._shape[1] + nearest[1]
+        self.nodes = np.flatnonzero(part)
+        self._trees: dict[int, NDArray[np.int32]] = {}
+
+    def point(self, node: NDArray[np.int64]) -> Float:
+        """(..., 2) points in metres of the nodes (...)."""
+        grid = np.stack([node % self._shape[1], node // self._shape[1]], axis=-1)
+        return np.asarray(self._space.origin + grid * (_SPACING * _STRIDE))
+
+    def node(self, xy: Float) -> int:
+        """The reachable node nearest to a point (2,)."""
+        at = np.round((xy - self._space.origin) / (_SPACING * _STRIDE)).astype(int)
+        column, row = np.clip(at, 0, (self._shape[1] - 1, self._shape[0] - 1))
+        return int(self._nearest[row, column])
+
+    def path(self, start: Float, goal: int) -> Float:
+        """(K, 2) corner points of a short way from a point (2,) to a node, the start left out."""
+        if goal not in self._trees:
+            _, previous = csgraph.dijkstra(
+                self._graph, directed=False, indices=[goal], return_predecessors=True
+            )
+            self._trees[goal] = previous[0]
+        tree = self._trees[goal]
+        chain = [self.node(start)]
+        while chain[-1] != goal:
+            chain.append(int(tree[chain[-1]]))
+        return self._pulled_tight(start, self.point(np.array(chain)))
+
+    def sees(self, start: Float, ends: Float) -> NDArray[np.bool_]:
+        """Whether the straight ways from a point (2,) to points (K, 2) keep the clearance."""
+        delta = ends - start
+        steps = int(np.ceil(np.abs(delta).max(initial=0.0) / _SPACING)) + 1
+        along = start + delta[:, None, :] * np.linspace(0.0, 1.0, steps + 1)[1:, None]
+        cell = np.round((along - self._space.origin) / _SPACING).astype(np.int64)
+        H, W = self._clear.shape
+        cell = np.clip(cell, 0, (W - 1, H - 1))
+        return np.asarray(np.all(self._clear[cell[..., 1], cell[..., 0]], axis=1))
+
+    def _pulled_tight(self, start: Float, points: Float) -> Float:
+        corners, at, here = [], 0, start
+        while at < len(points) - 1:
+            ahead = points[at + 1 : at + 1 + _LOOK_AHEAD]
+            seen = np.flatnonzero(self.sees(here, ahead))
+            at += 1 + (int(seen[-1]) if len(seen) else 0)
+            here = points[at]
+            corners.append(here)
+        return np.array(corners or [points[-1]])
+
+
+def _graph(part: NDArray[np.bool_], clearance: Float, least: float) -> sparse.csr_array:
+    """Neighbouring nodes of `part`, eight around each; ways along walls cost a little more."""
+    H, W = part.shape
+    index = np.arange(H * W).reshape(H, W)
+    slow = 1.0 + _NEAR_WALL_COST * np.exp(-(clearance - least) / 0.3)
+    rows, columns, costs = [], [], []
+    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        here = (slice(0, H - dy), slice(max(0, -dx), W - max(0, dx)))
+        there = (slice(dy, H), slice(max(0, dx), W - max(0, -dx)))
+        both = part[here] & part[there]
+        rows.append(index[here][both])
+        columns.append(index[there][both])
+        length = _SPACING * _STRIDE * np.hypot(dx, dy)
+        costs.append(length * (slow[here][both] + slow[there][both]) / 2)
+    data = (np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns)))
+    return sparse.csr_array(data, shape=(H * W, H * W))

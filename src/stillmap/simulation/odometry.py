@@ -1,0 +1,40 @@
+"""Odometry of a differential drive: true motion, seen through imperfect wheels."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import se2
+from stillmap.simulation.scene import OdometryOptions
+
+Float = NDArray[np.float64]
+
+
+def drifting(T_world_base: Float, options: OdometryOptions, rng: np.random.Generator) -> Float:
+    """(T, 3, 3) T_odom_base for true poses (T, 3, 3); the first one is the identity.
+
+    Between two scans the left and right wheel roll d -+ b theta / 2. They are misread by their
+    own relative errors, turned back into d and theta with a wrong base b, and noise is added
+    whose variance grows with the way driven and turned, so that it does not depend on the scan
+    rate (Thrun, Burgard, Fox, Probabilistic Robotics, 5.4, with random-walk scaling).
+    """
+    x, y, turn = se2.parameters(se2.inverse(T_world_base[:-1]) @ T_world_base[1:]).T
+    # an arc as chord at half its angle
+    along = x * np.cos(turn / 2) + y * np.sin(turn / 2)
+    distance = along / np.maximum(np.sinc(turn / (2 * np.pi)), 1e-3)
+    left, right = 1.0 + options.wheel_radius_error * rng.standard_normal(2)
+    base = 1.0 + options.wheel_base_error * rng.standard_normal()
+    roll_left = left * (distance - options.wheel_base * turn / 2)
+    roll_right = right * (distance + options.wheel_base * turn / 2)
+    d = (roll_left + roll_right) / 2
+    theta = (roll_right - roll_left) / (options.wheel_base * base)
+    way, turned = np.abs(distance), np.abs(turn)
+    noise = rng.standard_normal((2, len(d)))
+    d = d + noise[0] * options.translation_noise * np.sqrt(way)
+    variance = options.rotation_noise**2 * turned + options.drift_noise**2 * way
+    theta = theta + noise[1] * np.sqrt(variance)
+    heading = np.concatenate([[0.0], np.cumsum(theta)])
+    middle = heading[:-1] + theta / 2
+    chord = d * np.sinc(theta / (2 * np.pi))
+    position = np.zeros((len(heading), 2))
+    position[1:] = np.cumsum(chord[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1), 0)
+    return se2.matrix(position[:, 0], position[:, 1], heading)

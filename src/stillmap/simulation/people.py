@@ -1,0 +1,208 @@
+"""People who walk from place to place, stop at times, and keep clear of walls and one another."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.errors import InputError
+from stillmap.simulation.free_space import FreeSpace, Planner
+from stillmap.simulation.scene import CrowdOptions
+
+Float = NDArray[np.float64]
+
+BODY_RADIUS = 0.26  # m, nobody comes nearer to a wall
+_PLACES = 40  # where people want to go
+_PERSONAL = 0.7  # m between two people passing
+_REACTION = 0.4  # s until somebody walks as he wants to
+_ARRIVED = 0.45  # m
+_STUCK_AFTER = 4.0  # s without half a metre of progress
+_TRIES = 200
+
+
+class Crowd:
+    """State of P people. Positions in metres, headings in radians, speeds in m/s.
+
+    Attributes:
+        xy: (P, 2) positions.
+        heading: (P,) where they face.
+        speed: (P,) how fast they walk now.
+    """
+
+    def __init__(
+        self,
+        options: CrowdOptions,
+        space: FreeSpace,
+        planner: Planner,
+        robot: Float,
+        rng: np.random.Generator,
+    ) -> None:
+        P = options.people
+        self._options, self._space, self._planner, self._rng = options, space, planner, rng
+        self._places = rng.choice(planner.nodes, min(_PLACES, len(planner.nodes)), replace=False)
+        self.xy = self._start(P, robot)
+        self.heading = rng.uniform(-np.pi, np.pi, P)
+        self._velocity = np.zeros((P, 2))
+        self._wanted_speed = rng.uniform(options.min_speed, options.max_speed, P)
+        # a fixed number of people who stop, so that a share means what it says in small crowds
+        self._stops = rng.permutation(P) < round(options.stopping_share * P)
+        self._stop_left = np.zeros(P)
+        self._routes: list[list[Float]] = [[] for _ in range(P)]
+        self._target = self.xy.copy()
+        self._last_seen, self._stuck_for = self.xy.copy(), np.zeros(P)
+        for person in range(P):
+            self._set_off(person)
+
+    @property
+    def speed(self) -> Float:
+        return np.asarray(np.hypot(*self._velocity.T))
+
+    def step(self, dt: float, robot: Float, contact: float, robot_waits: bool) -> None:
+        """Everybody goes on for dt seconds.
+
+        Args:
+            dt: seconds.
+            robot: (3,) its pose x, y, theta.
+            contact: m, no centre of a body comes nearer to the robot's centre.
+            robot_waits: it has lost patience: whoever stands in its way stops standing.
+        """
+        if not len(self.xy):
+            return
+        from_robot = self.xy - robot[:2]
+        distance = np.hypot(*from_robot.T)
+        if robot_waits:
+            self._stop_left[distance < contact + 1.0] = 0.0
+        self._stop_left = np.maximum(self._stop_left - dt, 0.0)
+        self._arrivals()
+        self._accelerate(dt, robot, from_robot, distance, contact)
+        self._move(dt, robot[:2], contact)
+        self._turn(dt)
+        self._free_the_stuck(dt)
+
+    def _start(self, P: int, robot: Float) -> Float:
+        nodes = self._planner.point(self._planner.nodes)
+        taken: list[Float] = []
+        for _ in range(P):
+            for _ in range(_TRIES):
+                here = nodes[self._rng.integers(len(nodes))]
+                others = [np.hypot(*(here - other)) for other in taken]
+                if np.hypot(*(here - robot)) > 1.5 and min(others, default=9.0) > _PERSONAL:
+                    taken.append(here)
+                    break
+            else:
+                raise InputError(f"no room for {P} people", hint="fewer people")
+        return np.array(taken).reshape(P, 2)
+
+    def _set_off(self, person: int) -> None:
+        """Choose a place to go to; those who stop do it anywhere on the way there."""
+        path = self._planner.path(self.xy[person], int(self._rng.choice(self._places)))
+        if self._stops[person]:
+            path = _first_part(self.xy[person], path, self._rng.uniform(0.2, 1.0))
+        # people keep to their own line, not all to the same one
+        shifted = path + self._rng.uniform(-0.5, 0.5, path.shape)
+        clear, _ = self._space.clearance_at(shifted)
+        path = np.where((clear > 2 * BODY_RADIUS)[:, None], shifted, path)
+        self._routes[person] = list(path)
+        self._target[person] = self._routes[person].pop(0)
+
+    def _arrivals(self) -> None:
+        near = np.hypot(*(self._target - self.xy).T) < _ARRIVED
+        for person in np.flatnonzero(near & (self._stop_left <= 0)).tolist():
+            if self._routes[person]:
+                self._target[person] = self._routes[person].pop(0)
+                continue
+            if self._stops[person]:
+                o = self._options
+                self._stop_left[person] = self._rng.uniform(o.min_stop, o.max_stop)
+            self._set_off(person)
+
+    def _accelerate(
+        self, dt: float, robot: Float, from_robot: Float, distance: Float, contact: float
+    ) -> None:
+        way = self._target - self.xy
+        way /= np.maximum(np.hypot(*way.T), 1e-6)[:, None]
+        stands = self._stop_left > 0
+        wanted = way * (self._wanted_speed * ~stands)[:, None]
+        push = self._push_of_others(way) + self._push_of_walls()
+        # those who stand only give way when somebody comes really close
+        push[stands & (np.hypot(*push.T) < 0.5)] = 0.0
+        push += _push_of_robot(robot, from_robot, distance, contact)
+        self._velocity += (wanted + push - self._velocity) * min(dt / _REACTION, 1.0)
+        limit = np.maximum(self._wanted_speed, 0.7)
+        speed = np.hypot(*self._velocity.T)
+        self._velocity *= np.minimum(1.0, limit / np.maximum(speed, 1e-9))[:, None]
+        self._velocity[stands & (speed < 0.05)] = 0.0
+
+    def _push_of_others(self, way: Float) -> Float:
+        delta = self.xy[:, None] - self.xy
+        distance = np.hypot(delta[..., 0], delta[..., 1])
+        np.fill_diagonal(distance, 9.0)
+        strength = np.exp((_PERSONAL - distance) / 0.25) * (distance < 2.0)
+        push = np.einsum("pq,pqd->pd", strength / np.maximum(distance, 0.05), delta)
+        # two who meet head-on both step to the right
+        facing = np.maximum(-np.einsum("pqd,pd->pq", delta, way), 0.0) / distance
+        right = np.stack([way[:, 1], -way[:, 0]], axis=-1)
+        push += right * (facing * strength).sum(axis=1)[:, None]
+        return np.asarray(push)
+
+    def _push_of_walls(self) -> Float:
+        clear, gradient = self._space.clearance_at(self.xy)
+        return gradient * np.exp((BODY_RADIUS - clear) / 0.08)[:, None]
+
+    def _move(self, dt: float, robot: Float, contact: float) -> None:
+        xy = self.xy + self._velocity * dt
+        xy = self._off_the_walls(xy)
+        delta = xy - robot
+        distance = np.hypot(*delta.T)
+        touching = distance < contact
+        xy[touching] = robot + delta[touching] * (1.001 * contact / distance[touching])[:, None]
+        clear, _ = self._space.clearance_at(xy)
+        # the robot has checked that nobody has to move for it: staying is always possible
+        blocked = (clear < BODY_RADIUS) | (np.hypot(*(xy - robot).T) < contact)
+        xy[blocked] = self.xy[blocked]
+        self._velocity = (xy - self.xy) / dt
+        self.xy = xy
+
+    def _off_the_walls(self, xy: Float) -> Float:
+        clear, gradient = self._space.clearance_at(xy)
+        missing = np.maximum(1.02 * BODY_RADIUS - clear, 0.0)
+        length = np.maximum(np.hypot(*gradient.T), 0.3)
+        return np.asarray(xy + gradient * (missing / length)[:, None])
+
+    def _turn(self, dt: float) -> None:
+        walks = self.speed > 0.15
+        direction = np.arctan2(self._velocity[:, 1], self._velocity[:, 0])
+        turn = (direction - self.heading + np.pi) % (2 * np.pi) - np.pi
+        self.heading = self.heading + np.where(walks, turn * min(dt / 0.3, 1.0), 0.0)
+
+    def _free_the_stuck(self, dt: float) -> None:
+        moved = np.hypot(*(self.xy - self._last_seen).T) > 0.5
+        self._stuck_for += dt
+        fresh = moved | (self._stop_left > 0)
+        self._stuck_for[fresh] = 0.0
+        self._last_seen[fresh] = self.xy[fresh]
+        for person in np.flatnonzero(self._stuck_for > _STUCK_AFTER).tolist():
+            self._stuck_for[person] = 0.0
+            self._set_off(person)
+
+
+def _push_of_robot(robot: Float, from_robot: Float, distance: Float, contact: float) -> Float:
+    """People keep away from the robot and step out of the lane ahead of it."""
+    away = from_robot / np.maximum(distance, 1e-6)[:, None]
+    push = away * np.exp((contact + 0.3 - distance) / 0.2)[:, None]
+    ahead = np.array([np.cos(robot[2]), np.sin(robot[2])])
+    left = np.array([-ahead[1], ahead[0]])
+    x, y = from_robot @ ahead, from_robot @ left
+    in_lane = (x > 0) & (x < contact + 1.2) & (np.abs(y) < contact + 0.1)
+    push += left * (np.where(y >= 0, 0.7, -0.7) * in_lane)[:, None]
+    return np.minimum(np.maximum(push, -2.0), 2.0)
+
+
+def _first_part(start: Float, path: Float, share: float) -> Float:
+    """The corners of the first `share` of a way, which ends between two of them."""
+    corners = np.concatenate([start[None], path])
+    lengths = np.hypot(*np.diff(corners, axis=0).T)
+    ends = np.cumsum(lengths)
+    k = int(np.searchsorted(ends, share * ends[-1]))
+    k = min(k, len(path) - 1)
+    within = (share * ends[-1] - (ends[k] - lengths[k])) / max(lengths[k], 1e-9)
+    end = corners[k] + min(within, 1.0) * (corners[k + 1] - corners[k])
+    return np.concatenate([path[:k], end[None]])

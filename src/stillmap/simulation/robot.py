@@ -1,0 +1,111 @@
+"""A robot that follows its route, waits for people in its way, and goes on when patience ends."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.simulation.free_space import FreeSpace, Planner
+from stillmap.simulation.scene import Point, RobotOptions
+
+Float = NDArray[np.float64]
+
+_SPACING = 0.05  # m between points of the route
+_CARROT = 7  # points ahead of the robot that it steers for
+_SEARCH = 14  # points ahead among which the nearest is looked for
+_SEES_AHEAD = 1.5  # m
+_CREEP = 0.12  # m/s
+_TURN_IN_PLACE = 0.4  # rad off the route
+
+
+class Robot:
+    """Pose and progress of the robot.
+
+    Attributes:
+        pose: (3,) x, y in metres, theta in radians.
+        impatient: it has waited long enough and creeps on.
+        arrived: it is at the end of its way (never, if that is closed).
+    """
+
+    def __init__(self, way: Float, space: FreeSpace, options: RobotOptions, closed: bool) -> None:
+        self._way, self._space, self._options, self._closed = way, space, options, closed
+        first = way[min(1, len(way) - 1)] - way[0]
+        self.pose: Float = np.array([*way[0], np.arctan2(first[1], first[0])])
+        self.impatient = False
+        self.arrived = False
+        self._at = 0
+        self._waited = 0.0
+
+    def step(self, dt: float, people: Float, contact: float) -> None:
+        """Drive for dt seconds.
+
+        Args:
+            dt: seconds.
+            people: (P, 2) where people are, metres.
+            contact: m, the nearest a person's centre may be to the robot's.
+        """
+        self._advance()
+        o = self._options
+        x, y, theta = self.pose
+        to = self._way[self._ahead(_CARROT)[-1]] - self.pose[:2]
+        error = np.arctan2(to[1], to[0]) - theta
+        error = (error + np.pi) % (2 * np.pi) - np.pi
+        turn = float(np.clip(2.0 * error, -o.turn_rate, o.turn_rate))
+        speed = o.speed * max(0.0, 1.0 - abs(error) / _TURN_IN_PLACE)
+        speed = self._careful(dt, min(speed, np.hypot(*to) / dt), people, contact)
+        middle = theta + turn * dt / 2
+        new = np.array([x + speed * dt * np.cos(middle), y + speed * dt * np.sin(middle)])
+        if not self._is_free(new, people, contact):
+            new = self.pose[:2]
+        self.pose = np.array([new[0], new[1], theta + turn * dt])
+
+    def undisturbed_time(self) -> float:
+        """Seconds that one lap takes at full speed."""
+        return len(self._way) * _SPACING / self._options.speed
+
+    def _ahead(self, count: int) -> NDArray[np.int64]:
+        ahead = np.arange(self._at, self._at + count + 1)
+        last = len(self._way) - 1
+        return ahead % len(self._way) if self._closed else np.minimum(ahead, last)
+
+    def _advance(self) -> None:
+        ahead = self._ahead(_SEARCH)
+        nearest = int(ahead[np.argmin(np.hypot(*(self._way[ahead] - self.pose[:2]).T))])
+        self.arrived = not self._closed and nearest == len(self._way) - 1
+        self._at = nearest
+
+    def _careful(self, dt: float, speed: float, people: Float, contact: float) -> float:
+        """The speed that people ahead allow."""
+        c, s = np.cos(self.pose[2]), np.sin(self.pose[2])
+        dx, dy = (people - self.pose[:2]).T
+        x, y = c * dx + s * dy, c * dy - s * dx
+        ahead = (x > 0) & (x < _SEES_AHEAD) & (np.abs(y) < contact)
+        gap = float(x[ahead].min(initial=_SEES_AHEAD)) - contact
+        allowed = max(0.0, gap - 0.1)
+        if speed > 0 and allowed < 0.1:
+            self._waited += dt
+        else:
+            self._waited = max(0.0, self._waited - dt)
+        self.impatient = self._waited > self._options.patience
+        return min(speed, max(allowed, _CREEP if self.impatient else 0.0))
+
+    def _is_free(self, xy: Float, people: Float, contact: float) -> bool:
+        clear, _ = self._space.clearance_at(np.stack([xy, self.pose[:2]]))
+        near = np.hypot(*(people - xy).T).min(initial=np.inf)
+        # a robot that has cut a corner may always go back to where there is more room
+        return bool(clear[0] >= min(self._options.radius, clear[1]) and near >= contact)
+
+
+def plan_way(route: tuple[Point, ...], planner: Planner, closed: bool) -> Float:
+    """(N, 2) points every few centimetres along the route, around walls; closed: and back."""
+    stops = [np.array(p, float) for p in route]
+    if closed:
+        stops.append(stops[0])
+    corners = [stops[0]]
+    for stop in stops[1:]:
+        if planner.sees(corners[-1], stop[None])[0]:
+            corners.append(stop)
+        else:
+            corners.extend(planner.path(corners[-1], planner.node(stop)))
+    line = np.array(corners)
+    lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    along = np.linspace(0.0, lengths[-1], max(2, int(lengths[-1] / _SPACING) + 1))
+    return np.stack([np.interp(along, lengths, line[:, k]) for k in (0, 1)], axis=-1)

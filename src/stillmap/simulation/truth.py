@@ -1,0 +1,69 @@
+"""What really happened in a simulation: read by evaluation, never by the mapping."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.errors import InputError
+from stillmap.output.trajectory import write_tum
+
+FOLDER = "truth"
+_SCENE = "scene.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The truth about T scans with M beams in all, among P movers and W walls.
+
+    Attributes:
+        static: (M,) bool, the beam was reflected by something that stands still for good.
+        mover: (M,) int32, the id of the mover that reflected the beam, -1: none did.
+        T_world_base: (T, 3, 3) float64 true poses.
+        walls: (W, 4) float64 segments x0, y0, x1, y1 in metres.
+        movers: (T, P, 3) float64, where each mover is at each scan: x, y in metres, heading in rad.
+        scene: name, seed and all parameters, JSON-able.
+    """
+
+    static: NDArray[np.bool_]
+    mover: NDArray[np.int32]
+    T_world_base: NDArray[np.float64]
+    walls: NDArray[np.float64]
+    movers: NDArray[np.float64]
+    scene: dict[str, Any]
+
+
+def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None:
+    """Write the `truth` folder into an existing folder."""
+    inside = folder / FOLDER
+    inside.mkdir()
+    for name in ("static", "mover", "T_world_base", "walls", "movers"):
+        np.save(inside / f"{name}.npy", getattr(truth, name), allow_pickle=False)
+    write_tum(inside / "trajectory.tum", stamp_ns, truth.T_world_base)
+    (inside / _SCENE).write_text(json.dumps(truth.scene, indent=1) + "\n", encoding="utf-8")
+
+
+def load_truth(path: str | Path) -> Truth:
+    """The truth of a simulation, given its folder or the `truth` folder inside.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
+    folder = Path(path)
+    if (folder / FOLDER).is_dir():
+        folder = folder / FOLDER
+    if not (folder / _SCENE).is_file():
+        raise InputError(
+            "holds no truth", where=str(path), hint="a folder that 'stillmap simulate' wrote"
+        )
+    try:
+        arrays = {
+            name: np.load(folder / f"{name}.npy", allow_pickle=False)
+            for name in ("static", "mover", "T_world_base", "walls", "movers")
+        }
+        return Truth(**arrays, scene=json.loads((folder / _SCENE).read_text(encoding="utf-8")))
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"is damaged: {error}", where=str(folder)) from error
