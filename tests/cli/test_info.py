@@ -3,12 +3,13 @@
 import argparse
 import json
 
+import numpy as np
 import pytest
 
 from stillmap.cli import info
 from stillmap.cli.reading import add_read_flags, read_changes
 from stillmap.errors import InputError
-from stillmap.recording import read, write
+from stillmap.recording import Recording, read, write
 
 LINES = [
     "# CARMEN Logfile",
@@ -44,9 +45,8 @@ def test_json(path, capsys):
     assert found["counts"]["hits"] == 10
     assert found["counts"]["max_range"] == 1
     assert found["counts"]["unusable"] == 1
-    assert found["hit_ranges_m"] == {"min": 1.0, "median": 2.0, "p99": 4.0, "max": 4.0} or (
-        found["hit_ranges_m"]["max"] == 4.0
-    )
+    # hits 1 2 3 1 2 4 1 2 3 4, the lower of two middle values
+    assert found["hit_ranges_m"] == {"min": 1.0, "median": 2.0, "p99": 4.0, "max": 4.0}
     assert found["time"]["first_stamp_ns"] == 100 * 10**9
     assert found["time"]["duration_s"] == 2.0
     assert found["time"]["rate_hz"] == 1.0
@@ -110,7 +110,12 @@ def test_recording_folder_says_the_same(path, tmp_path, capsys):
     run(path, "--json")
     run(tmp_path / "rec", "--json")
     first, second = capsys.readouterr().out.split("}\n{")
-    assert json.loads(first + "}") == json.loads("{" + second)
+    log, folder = json.loads(first + "}"), json.loads("{" + second)
+    assert log.pop("input") == str(path)
+    assert folder.pop("input") == str(tmp_path / "rec")
+    assert log == folder
+    run(tmp_path / "rec")
+    assert f"made from         {path}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -128,6 +133,26 @@ def test_notes_of_other_writers_do_no_harm(path, tmp_path, capsys, source):
     write(recording, tmp_path / "rec")
     assert run(tmp_path / "rec") == 0
     assert "-90.00 to 45.00 deg" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("scans", [0, 2])
+def test_recording_in_3d(tmp_path, capsys, scans):
+    points = np.tile(np.array([[3, 4, 0], [0, 0, 2]], np.float32), (scans, 1))
+    recording = Recording(
+        stamp_ns=np.arange(scans, dtype=np.int64),
+        offset=2 * np.arange(scans + 1, dtype=np.int64),
+        points=points,
+        hit=np.ones(len(points), bool),
+        T_base_sensor=np.eye(4)[None],
+        sensor=np.zeros(scans, np.int32),
+        T_odom_base=np.tile(np.eye(4), (scans, 1, 1)),
+    )
+    write(recording, tmp_path / "rec")
+    assert run(tmp_path / "rec") == 0
+    out = capsys.readouterr().out
+    assert "3D" in out
+    assert ("max 5.00 m" in out) == (scans > 0)
+    assert run(tmp_path / "rec", "--json") == 0
 
 
 def test_no_scan_is_an_input_error(tmp_path):

@@ -49,6 +49,26 @@ def test_far_wall_seen_by_three_beams_only():
     assert find_max_range(ranges.astype(np.float32)).threshold is None
 
 
+@pytest.mark.parametrize("noise", [0.01, 0.02, 0.03])
+def test_round_room_read_in_all_directions_is_no_code(noise):
+    ranges = np.round(9.8 + np.random.default_rng(10).normal(0, noise, (T, N)), 2)
+    assert find_max_range(ranges.astype(np.float32)).threshold is None
+
+
+@pytest.mark.parametrize(("repeats", "coded"), [(200, True), (5, True), (4, False)])
+def test_rare_code_among_dense_readings(repeats, coded):
+    # 4500 readings to the metre, no two alike: a value repeated in several directions is a code
+    ranges = np.linspace(2.0, 9.999, T * N).reshape(N, T).T.copy()
+    ranges.ravel()[: 40 * repeats : 40] = 10.0
+    assert find_max_range(ranges.astype(np.float32)).coded == coded
+
+
+def test_readings_in_millimetres_that_repeat_by_chance_are_no_code():
+    rng = np.random.default_rng(11)
+    ranges = np.round(rng.uniform(2.0, 10.0, (T, N)), 3)
+    assert not find_max_range(ranges.astype(np.float32)).coded
+
+
 @pytest.mark.parametrize("clip", [3.5, 5.0, 8.0])
 @pytest.mark.parametrize("noise", [0.005, 0.02])
 def test_clipped_sensor(clip, noise):

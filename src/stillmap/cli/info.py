@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
         InputError: it could not.
     """
     read_options = options.replaced(ReadOptions(), read_changes(args).get("read", {}))
-    found = facts(read(args.input, read_options))
+    found = {"input": args.input, **facts(read(args.input, read_options))}
     if args.json:
         print(json.dumps(found, indent=2, allow_nan=False))
     else:
@@ -41,7 +41,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _text(found: dict[str, Any]) -> Iterator[str]:
-    yield f"{found['path'] or 'recording'}: {_format(found)}"
+    yield f"{found['input']}: {found['format'] or 'stillmap recording'}, {found['dimension']}D"
+    if found["path"] not in (None, found["input"]):
+        yield _row("made from", str(found["path"]))
     beams = found["beams_per_scan"]
     if beams is None:
         yield _row("scans", "none")
@@ -64,10 +66,6 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
     for sensor in found["sensors"]:
         yield from _sensor(sensor)
     yield from _notes(found)
-
-
-def _format(found: dict[str, Any]) -> str:
-    return f"{found['format'] or 'stillmap recording'}, {found['dimension']}D"
 
 
 def _time(time: dict[str, Any]) -> Iterator[str]:

@@ -90,7 +90,7 @@ def _code(ranges: NDArray[np.float32], real: NDArray[np.float32]) -> tuple[float
     at_top = values >= top - _WINDOW
     mode = int(np.argmax(np.where(at_top, counts, 0)))
     per_cm = float(counts[~at_top].sum()) / (100.0 * _BELOW)
-    if not _is_code(ranges, values, counts, mode, per_cm):
+    if not _is_code(ranges, values, counts, mode):
         return None
     # values that smear around the code stand out from the real readings below as it does; with
     # nothing below, all are
@@ -112,7 +112,6 @@ def _is_code(
     values: NDArray[np.float32],
     counts: NDArray[np.intp],
     mode: int,
-    per_cm: float,
 ) -> bool:
     """Whether values[mode] is a code (see `find_max_range`).
 
@@ -120,7 +119,7 @@ def _is_code(
     rounded to cm; codes that smear (81.87, 81.89, 81.91) still repeat one value 5 times as often.
     """
     count, value = int(counts[mode]), values[mode]
-    if count < 5 or count < 20.0 * per_cm:
+    if count < 5:
         return False
     contrast = count / max(int(np.delete(counts, mode).max(initial=0)), 1)
     directions = np.any(ranges == value, axis=0)
