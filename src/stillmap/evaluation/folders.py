@@ -1,6 +1,5 @@
 """Folders that scores are computed from: results of `stillmap map`, simulated recordings."""
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,13 +9,12 @@ from numpy.typing import NDArray
 
 from stillmap.errors import InputError
 from stillmap.evaluation.map import Grid
-from stillmap.recording.folder import read as read_recording
+from stillmap.recording.folder import read as read_folder
+from stillmap.recording.formats import read as recording_of
 from stillmap.recording.model import Recording
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
-
-_UNREADABLE = (ValueError, EOFError, KeyError, zipfile.BadZipFile)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +72,8 @@ def read_truth(path: Path) -> Truth:
         raise InputError(
             "holds no truth", where=str(path), hint="a folder that 'stillmap simulate' wrote"
         )
-    recording = read_recording(folder)
+    log = folder / "recording.log"  # a simulation in CARMEN's format
+    recording = recording_of(log) if log.exists() else read_folder(folder)
     if recording.dimension != 2:
         raise InputError("is no planar recording", where=str(folder))
     return Truth(folder, recording)
@@ -133,36 +132,36 @@ def read_grid(result: Path) -> Grid:
     """
     path = result / "map.npz"
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            p_occupied, origin, resolution = (
-                archive[name] for name in ("p_occupied", "origin", "resolution")
-            )
+        # opened here: given a path, np.load leaves a damaged archive open
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            p_occupied = np.asarray(archive["p_occupied"])
+            x, y, yaw = (float(value) for value in archive["origin"])
+            resolution = float(archive["resolution"])
     except OSError as error:
         raise InputError(_reason(error), where=str(path)) from error
-    except (*_UNREADABLE, AttributeError, TypeError) as error:
-        raise InputError("is damaged or no map of stillmap", where=str(path)) from error
-    if p_occupied.ndim != 2 or p_occupied.dtype.kind != "f" or origin.shape != (3,):
+    except Exception as error:  # whatever NumPy, zip and zlib make of damaged bytes
+        raise InputError(f"is damaged: {error}", where=str(path)) from error
+    if p_occupied.ndim != 2 or p_occupied.dtype.kind != "f":
         raise InputError(
-            f"p_occupied {p_occupied.shape}, origin {origin.shape}: expected (H, W) and (3,)",
+            f"p_occupied is {_shown(p_occupied.shape)} {p_occupied.dtype}",
             where=str(path),
             hint="scores are for maps in the plane",
         )
-    if resolution.shape != () or not (np.isfinite(origin).all() and 0 < resolution < np.inf):
+    if not (np.isfinite((x, y, yaw)).all() and 0 < resolution < np.inf):
         raise InputError("origin or resolution is no usable number", where=str(path))
-    x, y, yaw = (float(value) for value in origin)
-    return Grid(p_occupied, (x, y, yaw), float(resolution))
+    return Grid(p_occupied, (x, y, yaw), resolution)
 
 
 def _array(path: Path, shape: tuple[int | None, ...], kinds: str) -> NDArray[Any]:
     """An .npy array of this shape (None: any length) and one of these kinds of dtype."""
     try:
-        array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+        # np.load would also open archives that bear the name
+        array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
     except OSError as error:
         raise InputError(_reason(error), where=str(path)) from error
-    except _UNREADABLE as error:
-        raise InputError("is damaged or no .npy file", where=str(path)) from error
-    fits = isinstance(array, np.ndarray) and len(array.shape) == len(shape)
-    if not fits or any(
+    except Exception as error:  # whatever NumPy's parser makes of damaged bytes
+        raise InputError(f"is damaged: {error}", where=str(path)) from error
+    if len(array.shape) != len(shape) or any(
         want not in (None, got) for got, want in zip(array.shape, shape, strict=True)
     ):
         raise InputError(f"is {_shown(array.shape)}, not {_shown(shape)}", where=str(path))

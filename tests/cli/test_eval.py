@@ -1,0 +1,304 @@
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from stillmap import se2
+from stillmap.cli import main
+from stillmap.evaluation.map import Grid
+from stillmap.output.map_npz import write_map_npz
+from stillmap.output.trajectory import write_tum
+from stillmap.recording import folder
+from stillmap.simulation import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
+from stillmap.simulation.walls import box
+from stillmap.simulation.writing import write_simulation
+
+RESOLUTION = 0.1
+SIZE = 140  # cells: the room from anywhere in it
+TRAJECTORY = "0 0 0 0\n1 1 0 0\n2 2 0 0.5\n"
+RELATIONS = "0 1 1.25 0 0 0 0 0\n1 2 1 0 0 0 0 0.5\n"
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory) -> Path:
+    """A small room with two people, 60 scans."""
+    scene = Scene(
+        "room",
+        walls=tuple(box(0, 0, 8, 6)),
+        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
+        crowd=CrowdOptions(people=2),
+        laser=LaserOptions(beams=120, range_noise=0.005),
+        robot=RobotOptions(scans=60),
+    )
+    path = tmp_path_factory.mktemp("simulated") / "room"
+    write_simulation(simulate(scene, np.random.default_rng(0)), path)
+    return path
+
+
+@pytest.fixture
+def result(simulated, tmp_path) -> Path:
+    """A result as good as the truth allows, in the frame of the first pose."""
+    out = tmp_path / "result"
+    (out / "beams").mkdir(parents=True)
+    recording = folder.read(simulated)
+    truth = simulated / "truth"
+    T_world_base, static = np.load(truth / "T_world_base.npy"), np.load(truth / "static.npy")
+    T_map_base = se2.inverse(T_world_base[0]) @ T_world_base
+    write_tum(out / "trajectory.tum", recording.stamp_ns, T_map_base)
+    p_static = np.where(recording.hit, np.where(static, 0.98, 0.03), 0.8).astype(np.float32)
+    p_static[~np.isfinite(recording.points).all(1)] = np.nan
+    np.save(out / "beams/p_static.npy", p_static)
+    np.save(out / "beams/hit.npy", recording.hit)
+    np.save(out / "beams/stamp_ns.npy", recording.stamp_ns)
+    np.save(out / "beams/offset.npy", recording.offset)
+    write_map(out, recording, T_map_base, static & recording.hit)
+    return out
+
+
+def write_map(out: Path, recording, T_map_base, beams) -> None:
+    """Cells that these beams hit are occupied, all others free."""
+    scan = np.repeat(np.arange(recording.n_scans), np.diff(recording.offset))[beams]
+    T = recording.T_map_sensor(T_map_base)[scan]
+    ends = np.einsum("nij,nj->ni", T[:, :2, :2], recording.points[beams]) + T[:, :2, 2]
+    p = np.full((SIZE, SIZE), 0.02, np.float32)
+    grid = Grid(p, (-SIZE / 2 * RESOLUTION, -SIZE / 2 * RESOLUTION, 0.0), RESOLUTION)
+    p[tuple(grid.cells(ends).T)] = 0.95
+    occupancy = SimpleNamespace(
+        p_occupied=p, alpha=p, beta=p, origin=grid.origin, resolution=RESOLUTION
+    )
+    write_map_npz(out / "map.npz", occupancy)
+
+
+def scores(capsys, *args: object) -> dict:
+    assert main(["eval", *(str(arg) for arg in args), "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    return json.loads(out)
+
+
+def refusal(capsys, *args: object) -> str:
+    assert main(["eval", *(str(arg) for arg in args)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    return err
+
+
+@pytest.fixture
+def texts(tmp_path) -> SimpleNamespace:
+    paths = SimpleNamespace(trajectory=tmp_path / "t.txt", relations=tmp_path / "r.relations")
+    paths.trajectory.write_text(TRAJECTORY)
+    paths.relations.write_text(RELATIONS)
+    return paths
+
+
+def test_relations(capsys, texts):
+    s = scores(capsys, "relations", texts.trajectory, texts.relations)
+    assert (s["relations"], s["used"]) == (2, 2)
+    assert s["translation"]["mean"] == pytest.approx(0.125)
+    assert s["rotation"]["max"] == pytest.approx(0.0)
+    assert main(["eval", "relations", str(texts.trajectory), str(texts.relations)]) == 0
+    assert "0.1250 +- 0.1768 m" in capsys.readouterr().out
+
+
+def test_relations_with_odometry(capsys, texts, tmp_path):
+    texts.trajectory.write_text("0 0 0 0\n")
+    log = tmp_path / "log"
+    log.write_text("".join(f"ODOM {k} 0 0 0 0 0 {k} host 0\n" for k in range(3)))
+    s = scores(capsys, "relations", texts.trajectory, texts.relations, "--odom", log)
+    assert (s["used"], s["stamps_by_odometry"]) == (2, 2)
+    s = scores(capsys, "relations", texts.trajectory, texts.relations, "--max-dt", "1.5")
+    assert s["used"] == 1
+
+
+def test_relations_that_none_can_be_used_of(capsys, texts):
+    texts.relations.write_text("50 60 1 0 0 0 0 0\n")
+    said = refusal(capsys, "relations", texts.trajectory, texts.relations)
+    assert str(texts.relations) in said
+    assert "--odom" in said
+
+
+def test_bad_lines_are_named(capsys, texts):
+    texts.relations.write_text(RELATIONS + "1 2 nan 0 0 0 0 0\n")
+    said = refusal(capsys, "relations", texts.trajectory, texts.relations)
+    assert f"{texts.relations}:3" in said
+
+
+@pytest.mark.parametrize(
+    "flags", [["--max-dt", "-1"], ["--max-dt", "nan"], ["--max-dt", "x"], ["--delta", "0"]]
+)
+def test_impossible_numbers_are_refused(capsys, texts, flags):
+    with pytest.raises(SystemExit) as caught:
+        main(["eval", "trajectory", str(texts.trajectory), str(texts.trajectory), *flags])
+    assert caught.value.code == 2
+    assert flags[0] in capsys.readouterr().err
+
+
+def test_trajectory(capsys, simulated, result):
+    reference = simulated / "truth" / "trajectory.tum"
+    s = scores(capsys, "trajectory", result / "trajectory.tum", reference)
+    assert (s["poses"], s["dimension"]) == (60, 2)
+    assert s["ate"]["max"] < 1e-6
+    assert s["rpe"]["pairs"] > 10
+    assert s["rpe"]["rotation"]["max"] < 1e-5
+    frames = ("--delta", "3", "--delta-unit", "frames")
+    s = scores(capsys, "trajectory", result / "trajectory.tum", reference, *frames)
+    assert s["rpe"]["pairs"] == 57
+    assert main(["eval", "trajectory", str(reference), str(reference)]) == 0
+    assert "rmse 0.0000 m" in capsys.readouterr().out
+
+
+def test_trajectories_without_a_common_time(capsys, texts, tmp_path):
+    other = tmp_path / "later.txt"
+    other.write_text("100 0 0 0\n")
+    said = refusal(capsys, "trajectory", texts.trajectory, other)
+    assert "no two stamps" in said
+    assert str(texts.trajectory) in said
+
+
+def test_labels(capsys, simulated, result):
+    recording = folder.read(simulated)
+    s = scores(capsys, "labels", result, simulated)
+    static = np.load(simulated / "truth/static.npy")
+    assert s["hits"] == recording.hit.sum()
+    assert s["dynamic"] == (recording.hit & ~static).sum() > 50
+    assert (s["average_precision"], s["f1"]) == (1.0, 1.0)
+    assert s["brier"] < 0.001
+    assert s == scores(capsys, "labels", result, simulated / "truth")
+    assert main(["eval", "labels", str(result), str(simulated)]) == 0
+    assert "F1 1.0000" in capsys.readouterr().out
+
+
+def test_labels_the_wrong_way_round_score_badly(capsys, simulated, result):
+    path = result / "beams/p_static.npy"
+    np.save(path, 1 - np.load(path))
+    s = scores(capsys, "labels", result, simulated)
+    assert s["f1"] == 0.0
+    assert s["average_precision"] < 0.2
+
+
+def test_map(capsys, simulated, result):
+    s = scores(capsys, "map", result, simulated)
+    assert s["ghost_cells"] == 0
+    assert s["walls_kept"] == 1.0
+    assert s["reference_wall_cells"] > 100
+    first = se2.parameters(np.load(simulated / "truth/T_world_base.npy")[0])
+    assert s["T_world_map"] == pytest.approx(first.tolist(), abs=1e-6)
+    assert main(["eval", "map", str(result), str(simulated)]) == 0
+    assert "walls kept   100.00 %" in capsys.readouterr().out
+
+
+def test_map_with_people_in_it_and_another_as_reference(capsys, simulated, result, tmp_path):
+    recording = folder.read(simulated)
+    T_world_base = np.load(simulated / "truth/T_world_base.npy")
+    other = tmp_path / "raw"
+    other.mkdir()
+    # this one's map frame is the world's
+    write_tum(other / "trajectory.tum", recording.stamp_ns, T_world_base)
+    write_map(other, recording, T_world_base, recording.hit)
+    s = scores(capsys, "map", other, simulated)
+    assert s["ghosts_per_100_m2"] > 10
+    assert s["walls_kept"] == 1.0
+    s = scores(capsys, "map", result, simulated, "--reference", other)
+    assert s["walls_kept"] > 0.97
+    again = ("--reference", other, "--reference-truth", simulated)
+    assert scores(capsys, "map", result, simulated, *again) == s
+
+
+def test_map_that_lost_its_walls(capsys, simulated, result):
+    with np.load(result / "map.npz") as archive:
+        arrays = dict(archive)
+    arrays["p_occupied"][: SIZE // 2] = np.nan
+    np.savez(result / "map.npz", **arrays)
+    assert 0.2 < scores(capsys, "map", result, simulated)["walls_kept"] < 0.8
+
+
+def test_a_carmen_simulation_carries_its_truth(capsys, result, tmp_path):
+    scene = Scene("room", tuple(box(0, 0, 8, 6)), ((-2, 0), (2, 0)), robot=RobotOptions(scans=5))
+    path = tmp_path / "carmen"
+    write_simulation(simulate(scene, np.random.default_rng(0)), path, format="carmen")
+    assert "has 60 scans, the truth" in refusal(capsys, "labels", result, path)
+
+
+def broken(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:60])
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, broken, lambda path: path.write_bytes(b"")])
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        ("labels", "result/beams/p_static.npy"),
+        ("labels", "result/beams/hit.npy"),
+        ("labels", "result/beams/offset.npy"),
+        ("labels", "result/beams/stamp_ns.npy"),
+        ("labels", "simulated/truth/static.npy"),
+        ("labels", "simulated/hit.npy"),
+        ("map", "result/map.npz"),
+        ("map", "result/trajectory.tum"),
+        ("map", "simulated/truth/walls.npy"),
+        ("map", "simulated/truth/T_world_base.npy"),
+    ],
+)
+def test_missing_and_damaged_files_are_named(
+    capsys, simulated, result, tmp_path, kind, name, damage
+):
+    shutil.copytree(simulated, tmp_path / "simulated")
+    damage(tmp_path / name)
+    said = refusal(capsys, kind, result, tmp_path / "simulated")
+    assert str(tmp_path / name) in said
+
+
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [
+        ("beams/p_static.npy", np.full(7, 0.5, np.float32)),
+        ("beams/p_static.npy", np.array(["a"])),
+        ("beams/offset.npy", np.zeros((2, 2), np.int64)),
+        ("beams/stamp_ns.npy", np.zeros(60)),
+    ],
+)
+def test_arrays_of_another_kind_are_refused(capsys, simulated, result, name, array):
+    np.save(result / name, array)
+    assert str(result / name) in refusal(capsys, "labels", result, simulated)
+
+
+def test_labels_beyond_probability_are_refused(capsys, simulated, result):
+    path = result / "beams/p_static.npy"
+    p = np.load(path)
+    p[17] = 1.5
+    np.save(path, p)
+    assert "beam 17" in refusal(capsys, "labels", result, simulated)
+
+
+def test_labels_of_another_recording_are_refused(capsys, simulated, result):
+    path = result / "beams/stamp_ns.npy"
+    stamps = np.load(path)
+    stamps[5] += 1
+    np.save(path, stamps)
+    assert "scan 5 is another one" in refusal(capsys, "labels", result, simulated)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"p_occupied": np.zeros((2, 3, 4), np.float32)},
+        {"origin": np.zeros(2)},
+        {"origin": np.array([0.0, np.nan, 0.0])},
+        {"resolution": np.array(0.0)},
+        {"resolution": np.array("wide")},
+    ],
+)
+def test_maps_of_another_kind_are_refused(capsys, simulated, result, change):
+    with np.load(result / "map.npz") as archive:
+        arrays = dict(archive)
+    np.savez(result / "map.npz", **arrays | change)
+    assert str(result / "map.npz") in refusal(capsys, "map", result, simulated)
+
+
+def test_folders_without_truth_are_refused(capsys, result, tmp_path):
+    for kind in ("labels", "map"):
+        assert "holds no truth" in refusal(capsys, kind, result, tmp_path)
