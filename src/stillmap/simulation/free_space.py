@@ -12,27 +12,22 @@ Float = NDArray[np.float64]
 _SPACING = 0.1  # m between nodes of the clearance grid
 _STRIDE = 2  # the planner uses every second node
 _MARGIN = 0.5  # m around the walls
+_FARTHEST = 1.5  # m: farther away nobody minds a wall
 _LOOK_AHEAD = 80  # nodes that a shortcut may skip
 _NEAR_WALL_COST = 0.6  # how much longer a metre along a wall feels than one in the open
 
 
-def distance_to_segments(points: Float, segments: Float) -> Float:
-    """(N,) distances in metres of points (N, 2) from the nearest of the segments (W, 4)."""
-    out = np.empty(len(points))
-    ax, ay = segments[:, 0], segments[:, 1]
-    ux, uy = segments[:, 2] - ax, segments[:, 3] - ay
-    squared = np.maximum(ux * ux + uy * uy, 1e-12)
-    for first in range(0, len(points), 2048):
-        dx = points[first : first + 2048, :1] - ax
-        dy = points[first : first + 2048, 1:] - ay
-        s = np.clip((dx * ux + dy * uy) / squared, 0.0, 1.0)
-        nearest = ((dx - s * ux) ** 2 + (dy - s * uy) ** 2).min(axis=1)
-        out[first : first + 2048] = np.sqrt(nearest)
-    return out
+def distance_to_segment(points: Float, segment: Float) -> Float:
+    """(...) distances in metres of points (..., 2) from a segment (4,)."""
+    start, along = segment[:2], segment[2:] - segment[:2]
+    delta = points - start
+    s = np.clip(delta @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+    rest = delta - s[..., None] * along
+    return np.asarray(np.hypot(rest[..., 0], rest[..., 1]))
 
 
 class FreeSpace:
-    """Distance from the nearest wall on a grid of nodes.
+    """Distance from the nearest wall on a grid of nodes, up to 1.5 m.
 
     Args:
         walls: (W, 4) segments x0, y0, x1, y1 in metres.
@@ -42,9 +37,19 @@ class FreeSpace:
         ends = walls.reshape(-1, 2)
         self.origin = ends.min(axis=0) - _MARGIN
         size = np.ceil((ends.max(axis=0) + _MARGIN - self.origin) / _SPACING).astype(int) + 1
-        nodes = np.stack(np.meshgrid(*(np.arange(n) for n in size)), axis=-1).reshape(-1, 2)
-        distances = distance_to_segments(self.origin + nodes * _SPACING, walls)
-        self.clearance: Float = distances.reshape(size[1], size[0])
+        self.clearance: Float = np.full((size[1], size[0]), _FARTHEST)
+        for wall in walls:
+            self._lower_around(wall)
+
+    def _lower_around(self, wall: Float) -> None:
+        ends = wall.reshape(2, 2)
+        low = (ends.min(axis=0) - _FARTHEST - self.origin) / _SPACING
+        high = (ends.max(axis=0) + _FARTHEST - self.origin) / _SPACING
+        (x0, y0), (x1, y1) = np.maximum(low, 0).astype(int), high.astype(int) + 2
+        window = self.clearance[y0:y1, x0:x1]
+        rows, columns = np.indices(window.shape)
+        nodes = self.origin + np.stack([columns + x0, rows + y0], axis=-1) * _SPACING
+        np.minimum(window, distance_to_segment(nodes, wall), out=window)
 
     def clearance_at(self, xy: Float) -> tuple[Float, Float]:
         """Clearance (N,) in metres at points (N, 2), bilinear, and its gradient (N, 2)."""

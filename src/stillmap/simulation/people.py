@@ -15,7 +15,7 @@ _PERSONAL = 0.7  # m between two people passing
 _REACTION = 0.4  # s until somebody walks as he wants to
 _ARRIVED = 0.45  # m
 _STUCK_AFTER = 4.0  # s without half a metre of progress
-_TRIES = 200
+_FIRST_GAP = 1.5  # m between the robot and anybody when it starts
 
 
 class Crowd:
@@ -79,17 +79,14 @@ class Crowd:
 
     def _start(self, P: int, robot: Float) -> Float:
         nodes = self._planner.point(self._planner.nodes)
-        taken: list[Float] = []
-        for _ in range(P):
-            for _ in range(_TRIES):
-                here = nodes[self._rng.integers(len(nodes))]
-                others = [np.hypot(*(here - other)) for other in taken]
-                if np.hypot(*(here - robot)) > 1.5 and min(others, default=9.0) > _PERSONAL:
-                    taken.append(here)
-                    break
-            else:
+        nodes = nodes[np.hypot(*(nodes - robot).T) > _FIRST_GAP]
+        taken = np.empty((P, 2))
+        for person in range(P):
+            if not len(nodes):
                 raise InputError(f"no room for {P} people", hint="fewer people")
-        return np.array(taken).reshape(P, 2)
+            taken[person] = nodes[self._rng.integers(len(nodes))]
+            nodes = nodes[np.hypot(*(nodes - taken[person]).T) > _PERSONAL]
+        return taken
 
     def _set_off(self, person: int) -> None:
         """Choose a place to go to; those who stop do it anywhere on the way there."""

@@ -8,7 +8,6 @@ from stillmap.options import field_with_doc
 
 Point = tuple[float, float]
 Segment = tuple[float, float, float, float]
-# RUF009 wants to see the Literal itself where the field is
 Shape = Literal["legs", "bodies", "mixed"]
 
 
@@ -17,6 +16,7 @@ class CrowdOptions:
     """The people who walk about."""
 
     people: int = field_with_doc(15, "how many people walk about")
+    # spelled out: ruff takes the default for mutable under an alias
     shape: Literal["legs", "bodies", "mixed"] = field_with_doc(
         "mixed", "what the laser sees of a person: legs, bodies, or one half of them each"
     )

@@ -1,0 +1,126 @@
+"""`stillmap simulate`: flags reach the scene, bad calls are one line, the folder is readable."""
+
+import argparse
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillmap import recording
+from stillmap.cli import simulate
+from stillmap.errors import InputError
+from stillmap.simulation import load_truth
+
+QUICK = ("--scans", "20", "--beams", "90", "--people", "3")
+
+
+def call(*words: str) -> int:
+    top = argparse.ArgumentParser()
+    simulate.add_parser(top.add_subparsers())
+    args = top.parse_args(["simulate", *words])
+    status: int = args.run(args)
+    return status
+
+
+def test_writes_a_recording_that_reads_back_with_its_truth(tmp_path: Path) -> None:
+    out = tmp_path / "sim"
+    assert call("hall", "-o", str(out), *QUICK, "--seed", "7") == 0
+    read = recording.read(out)
+    truth = load_truth(out)
+    assert read.n_scans == 20
+    assert read.n_beams == 20 * 90 == len(truth.static) == len(truth.mover)
+    assert truth.movers.shape == (20, 3, 3)
+    assert truth.scene["seed"] == 7
+    assert json.loads((out / "truth/scene.json").read_text())["name"] == "hall"
+
+
+def test_the_folder_has_every_file_of_the_format_and_nothing_else(tmp_path: Path) -> None:
+    call("corridor", "-o", str(tmp_path / "sim"), *QUICK)
+    names = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    arrays = ["stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor", "T_odom_base"]
+    truth = "static.npy mover.npy movers.npy T_world_base.npy walls.npy trajectory.tum scene.json"
+    assert names == {
+        "sim/recording.json",
+        *(f"sim/{name}.npy" for name in arrays),
+        *(f"sim/truth/{name}" for name in truth.split()),
+    }
+
+
+def test_flags_reach_the_scene(tmp_path: Path) -> None:
+    flags = "--fov 120 --max-range 12 --range-noise 0.05 --rate 10 --shape legs --stopping 1"
+    flags += " --min-stop 15 --max-stop 60 --odometry-noise 0"
+    call("hall", "-o", str(tmp_path / "sim"), *QUICK, *flags.split())
+    scene = load_truth(tmp_path / "sim").scene
+    assert scene["laser"]["fov"] == pytest.approx(math.radians(120))
+    assert (scene["laser"]["max_range"], scene["laser"]["range_noise"]) == (12.0, 0.05)
+    assert (scene["robot"]["scan_rate"], scene["robot"]["scans"]) == (10.0, 20)
+    crowd = scene["crowd"]
+    assert (crowd["shape"], crowd["stopping_share"]) == ("legs", 1.0)
+    assert (crowd["min_stop"], crowd["max_stop"]) == (15.0, 60.0)
+    assert scene["odometry"]["drift_noise"] == 0.0
+
+
+def test_carmen_log_says_the_same_as_the_recording_folder(tmp_path: Path) -> None:
+    call("hall", "-o", str(tmp_path / "a"), *QUICK)
+    call("hall", "-o", str(tmp_path / "b"), *QUICK, "--format", "carmen")
+    own, log = recording.read(tmp_path / "a"), recording.read(tmp_path / "b/recording.log")
+    np.testing.assert_array_equal(own.stamp_ns, log.stamp_ns)
+    np.testing.assert_array_equal(own.hit, log.hit)
+    np.testing.assert_allclose(own.points[own.hit], log.points[log.hit], atol=0.0051)
+    assert own.T_odom_base is not None
+    assert log.T_odom_base is not None
+    np.testing.assert_allclose(own.T_odom_base, log.T_odom_base, atol=2e-6)
+    np.testing.assert_allclose(own.T_base_sensor, log.T_base_sensor, atol=2e-5)
+    a, b = load_truth(tmp_path / "a"), load_truth(tmp_path / "b")
+    np.testing.assert_array_equal(a.mover, b.mover)
+
+
+def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"'hull'.*hall, corridor, hall-empty, corridor-empty"):
+        call("hull", "-o", str(tmp_path / "sim"))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--people", "-1"], "people must not be negative"),
+        (["--people", "100000"], "no room for 100000 people"),
+        (["--beams", "1"], "beams must be at least 2"),
+        (["--fov", "400"], "fov must lie"),
+        (["--seed", "-1"], "--seed must not be negative"),
+        (["--fov", "90", "--format", "carmen"], "half a circle"),
+        (["--max-range", "100", "--format", "carmen"], "ranges up to"),
+        (["--max-range", "nan"], "max_range must be positive"),
+        (["--odometry-noise", "-1"], "errors must be >= 0"),
+    ],
+)
+def test_values_out_of_range_are_refused(tmp_path: Path, flags: list[str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        call("hall", "-o", str(tmp_path / "sim"), *flags)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_output_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
+    out = tmp_path / "sim"
+    out.mkdir()
+    (out / "mine").write_text("x")
+    with pytest.raises(InputError, match="already holds something"):
+        call("hall", "-o", str(out), *QUICK)
+    assert (out / "mine").read_text() == "x"
+    assert call("hall", "-o", str(out), *QUICK, "--overwrite") == 0
+    assert (out / "recording.json").exists()
+    assert not (out / "mine").exists()
+
+
+def test_says_what_came_of_it_unless_quiet(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call("hall", "-o", str(tmp_path / "a"), *QUICK)
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "20 scans, 1800 beams" in said.err
+    call("hall", "-o", str(tmp_path / "b"), *QUICK, "--quiet")
+    assert capsys.readouterr() == ("", "")
