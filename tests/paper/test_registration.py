@@ -10,12 +10,12 @@ from stillmap.reference.field import moved
 FLOOR, SIGMA = 0.01, 0.5
 
 
-def cost_of(impl, grid, points, weights=None, sigma=SIGMA, radius=2, T=None):
+def cost_of(impl, grid, points, weights=None, sigma=SIGMA, radius=2, unknown=0.0):
     points = np.array(points, np.float32)
     weights = np.ones(len(points)) if weights is None else weights
-    T = np.eye(points.shape[1] + 1) if T is None else T
+    T = np.eye(points.shape[1] + 1)
     weights = np.array(weights, np.float32)
-    return impl.registration_cost(grid, points, weights, T, sigma, radius, FLOOR)
+    return impl.registration_cost(grid, points, weights, T, sigma, radius, FLOOR, unknown)
 
 
 def grid_of(impl, points, e, start):
@@ -60,6 +60,13 @@ def test_weights_and_unusable_points(impl):
     assert total == pytest.approx(0.75 * one - 0.5 * log(FLOOR), rel=1e-6)
 
 
+def test_unknown_is_not_free(impl):
+    # cell (0, 0) was looked at, the others not: there the floor is raised by 1/4
+    grid = grid_of(impl, [[0.5, 0.5]], [0], 0.5)  # m = 0: F = 0
+    assert cost_of(impl, grid, [[0.1, 0.9]], unknown=0.25) == pytest.approx(-log(FLOOR))
+    assert cost_of(impl, grid, [[1.1, 0.9]], unknown=0.25) == pytest.approx(-log(FLOOR + 0.25))
+
+
 def test_straight_wall_gives_about_one(impl):
     # every cell along y = 1/2 occupied: the Gaussians along the wall add up to sqrt(2 pi) sigma
     points = [[x + 0.5, 0.5] for x in range(-10, 10)]
@@ -82,7 +89,7 @@ def test_gradient_by_hand(impl):
     grid = grid_of(impl, [[0.25, 0.5]], [1], 0.5)
     T = np.array([[1, 0, 0.75], [0, 1, -0.5], [0, 0, 1]])
     points, weights = np.array([[0, 1]], np.float32), np.ones(1, np.float32)
-    gradient = impl.registration_gradient(grid, points, weights, T, SIGMA, 2, FLOOR)
+    gradient = impl.registration_gradient(grid, points, weights, T, SIGMA, 2, FLOOR, 0.0)
     F = exp(-0.5) / (sqrt(2 * pi) * SIGMA)
     assert gradient == pytest.approx(np.array([2, 0, -2]) * F / (FLOOR + F), abs=1e-6)
 

@@ -1,7 +1,7 @@
 """The smoothed field that registration climbs: stillmap's practical form of (9)."""
 
 from itertools import product
-from math import exp, log, pi, sqrt
+from math import exp, isnan, log, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,8 +45,11 @@ def registration_cost(
     sigma: float,
     radius: int,
     floor: float,
+    unknown: float,
 ) -> float:
-    """- sum of w_n ln(floor + F(T p_n)) over the points that are finite.
+    """- sum of w_n ln(floor + unknown U(T p_n) + F(T p_n)) over the points that are finite.
+
+    U is 1 in cells that nobody looked at, 0 elsewhere: unknown is not free.
 
     Args:
         grid: the map.
@@ -55,14 +58,17 @@ def registration_cost(
         T: (D+1, D+1) T_map_sensor.
         sigma: metres.
         radius: cells.
-        floor: keeps points far from everything at a finite cost.
+        floor: value of an end point in free space, where a wall has 1.
+        unknown: what is added to it where nobody looked.
     """
     pose, D = np.asarray(T, float), grid.dimension
     cost = 0.0
     for p, w in zip(np.asarray(points, float), np.asarray(weights, float), strict=True):
         if np.isfinite(p).all():
             y = pose[:D, :D] @ p + pose[:D, D]
-            cost -= w * log(floor + field(grid, y, sigma, radius))
+            unseen = isnan(grid.occupancy_of(tuple(cell_of(y, grid.resolution).tolist())))
+            base = floor + (unknown if unseen else 0.0)
+            cost -= w * log(base + field(grid, y, sigma, radius))
     return float(cost)
 
 
@@ -74,6 +80,7 @@ def registration_gradient(
     sigma: float,
     radius: int,
     floor: float,
+    unknown: float,
     step: float = 1e-6,
 ) -> Float:
     """Gradient of `registration_cost` by central differences.
@@ -88,7 +95,7 @@ def registration_gradient(
         delta = np.zeros(3 if grid.dimension == 2 else 6)
         delta[i] = step
         above, below = (
-            registration_cost(grid, points, weights, moved(pose, d), sigma, radius, floor)
+            registration_cost(grid, points, weights, moved(pose, d), sigma, radius, floor, unknown)
             for d in (delta, -delta)
         )
         gradient.append((above - below) / (2 * step))

@@ -19,7 +19,7 @@ class Grid:
     """
 
     def __init__(self, resolution: float, dimension: int) -> None:
-        if not resolution > 0:
+        if not 0 < resolution < np.inf:
             raise ValueError(f"resolution must be positive, got {resolution}")
         self.resolution = resolution
         self.dimension = dimension

@@ -1,0 +1,79 @@
+"""The registration field of the core against the plain twin."""
+
+import numpy as np
+import pytest
+
+from stillmap import _core, reference
+from stillmap.reference.field import moved
+
+FLOOR, UNKNOWN = 0.02, 0.3
+
+
+def scan(beams):
+    """The largest scan."""
+    t = int(np.argmax(np.diff(beams.offset)))
+    a, b = beams.offset[t], beams.offset[t + 1]
+    return np.ascontiguousarray(beams.points[a:b]), beams.e[a:b], beams.T_map_sensor[t]
+
+
+@pytest.fixture
+def grids(beams):
+    return beams.grid(_core), beams.grid(reference)
+
+
+@pytest.mark.parametrize(("sigma", "radius"), [(0.5, 2), (1.0, 3), (0.3, 1), (1.0, 0)])
+def test_cost(beams, grids, sigma, radius):
+    points, weights, T = scan(beams)
+    assert len(points) > 5
+    costs = []
+    for i in range(4):
+        delta = np.random.default_rng(i).normal(scale=0.2, size=3 if beams.dimension == 2 else 6)
+        pose = moved(T, delta)
+        options = sigma * beams.resolution, radius, FLOOR, UNKNOWN
+        core, plain = (
+            k.registration_cost(g, points, weights, pose, *options)
+            for k, g in zip((_core, reference), grids, strict=True)
+        )
+        assert core == pytest.approx(plain, rel=1e-6)
+        costs.append(plain)
+    assert np.ptp(costs) > 1e-2
+
+
+def test_field_is_the_cost_of_one_point(beams, grids):
+    rng = np.random.default_rng(2)
+    values = []
+    for y in rng.normal(size=(20, beams.dimension)).astype(np.float32):
+        cost = _core.registration_cost(
+            grids[0], y[None], np.ones(1, np.float32), np.eye(len(y) + 1), 0.2, 2, FLOOR, 0.0
+        )
+        values.append(reference.field(grids[1], y.astype(float), 0.2, 2))
+        assert np.exp(-cost) - FLOOR == pytest.approx(values[-1], rel=1e-5, abs=1e-6)
+    assert max(values) > 0.05
+
+
+def test_gradient(beams, grids):
+    points, weights, T = scan(beams)
+    for i in range(3):
+        delta = np.random.default_rng(i).normal(scale=0.1, size=3 if beams.dimension == 2 else 6)
+        pose = moved(T, delta)
+        options = 0.6 * beams.resolution, 3, FLOOR, UNKNOWN
+        core, plain = (
+            k.registration_gradient(g, points, weights, pose, *options)
+            for k, g in zip((_core, reference), grids, strict=True)
+        )
+        assert core.shape == delta.shape
+        assert np.abs(plain).max() > 1
+        assert core == pytest.approx(plain, rel=1e-4, abs=1e-3 * np.abs(plain).max())
+
+
+def test_far_from_everything(beams, grids):
+    points, weights, T = scan(beams)
+    T = T.copy()
+    T[0, -1] += 1000
+    usable = np.isfinite(points).all(axis=1)
+    for k, g in zip((_core, reference), grids, strict=True):
+        cost = k.registration_cost(g, points, weights, T, 0.2, 2, FLOOR, UNKNOWN)
+        assert cost == pytest.approx(
+            -weights[usable].sum(dtype=float) * np.log(FLOOR + UNKNOWN), rel=1e-6
+        )
+        assert not k.registration_gradient(g, points, weights, T, 0.2, 2, FLOOR, UNKNOWN).any()

@@ -1,0 +1,179 @@
+"""What the core refuses, and that it says which array is at fault."""
+
+import numpy as np
+import pytest
+
+from stillmap import _core
+
+KERNELS = ["add_beams", "e_step", "log_likelihood"]
+
+
+def arguments(kernel, dimension=2):
+    """Good arguments: 5 beams in 2 scans."""
+    out = {
+        "grid": (_core.Grid2D if dimension == 2 else _core.Grid3D)(0.5),
+        "points": np.ones((5, dimension), np.float32),
+        "hit": np.ones(5, bool),
+        "e": np.full(5, 0.5, np.float32),
+        "offset": np.array([0, 2, 5]),
+        "T_map_sensor": np.tile(np.eye(dimension + 1), (2, 1, 1)),
+        "prior": 0.5,
+    }
+    if kernel == "e_step":
+        del out["e"]
+    if kernel == "add_beams":
+        del out["prior"]
+    return out
+
+
+def refused(kernel, error, match, dimension=2, **changes):
+    good = arguments(kernel, dimension)
+    getattr(_core, kernel)(**good)
+    if not set(changes) <= set(good):
+        return
+    for threads in (1, 2):
+        with pytest.raises(error, match=match):
+            getattr(_core, kernel)(**{**good, **changes}, threads=threads)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("hit", np.ones(4, bool)),
+        ("hit", np.ones(6, bool)),
+        ("e", np.ones(4, np.float32)),
+        ("e", np.ones(6, np.float32)),
+        ("offset", np.array([0, 5])),
+        ("offset", np.array([0, 2, 3, 5])),
+        ("offset", np.array([], np.int64)),
+        ("offset", np.array([1, 2, 5])),
+        ("offset", np.array([0, 2, 4])),
+        ("offset", np.array([0, 2, 6])),
+        ("offset", np.array([0, 6, 5])),
+        ("offset", np.array([0, -1, 5])),
+        ("prior", -0.01),
+        ("prior", 1.01),
+        ("prior", float("nan")),
+    ],
+)
+def test_wrong_lengths_and_values(kernel, dimension, name, value):
+    refused(kernel, ValueError, name, dimension, **{name: value})
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_number_of_poses_against_scans(kernel):
+    for poses in (0, 1, 3):
+        T = np.tile(np.eye(3), (poses, 1, 1))
+        refused(kernel, ValueError, "T_map_sensor", T_map_sensor=T)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("points", np.ones((5, 2))),
+        ("points", np.ones((5, 3), np.float32)),
+        ("points", np.ones(10, np.float32)),
+        ("points", np.ones((2, 5), np.float32).T),
+        ("hit", np.ones(5, np.uint8)),
+        ("hit", np.ones((5, 1), bool)),
+        ("e", np.ones(5)),
+        ("offset", np.array([0, 2, 5], np.int32)),
+        ("offset", np.array([0.0, 2, 5])),
+        ("T_map_sensor", np.tile(np.eye(4), (2, 1, 1))),
+        ("T_map_sensor", np.tile(np.eye(3, dtype=np.float32), (2, 1, 1))),
+        ("T_map_sensor", np.eye(3)),
+        ("grid", _core.Grid3D(0.5)),
+        ("prior", "half"),
+    ],
+)
+def test_wrong_types_and_shapes(kernel, name, value):
+    refused(kernel, TypeError, name, **{name: value})
+
+
+@pytest.mark.parametrize("bad", [-0.01, 1.01, np.nan, np.inf])
+def test_expectations_of_hits_are_probabilities(bad):
+    e = np.full(5, 0.5, np.float32)
+    e[3] = bad
+    refused("add_beams", ValueError, "e: ", e=e)
+    good = arguments("add_beams")
+    good["hit"][3] = False  # the e of a maximum-range beam is not looked at
+    _core.add_beams(**{**good, "e": e})
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1e30])
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.usefixtures("bounded_memory")
+def test_poses_that_are_not_finite_or_far_away(kernel, bad, dimension):
+    for row in range(dimension):
+        for column in range(dimension + 1):
+            T = np.tile(np.eye(dimension + 1), (2, 1, 1))
+            T[1, row, column] = bad
+            refused(kernel, ValueError, "pose", dimension, T_map_sensor=T)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.usefixtures("bounded_memory")
+def test_end_points_far_away(kernel):
+    points = np.ones((5, 2), np.float32)
+    points[4, 1] = 1e30
+    refused(kernel, ValueError, "end point", points=points)
+
+
+@pytest.mark.parametrize("make", [_core.Grid2D, _core.Grid3D])
+@pytest.mark.parametrize("resolution", [0.0, -0.1, np.nan, np.inf])
+def test_grids_of_no_resolution(make, resolution):
+    with pytest.raises(ValueError, match="resolution"):
+        make(resolution)
+
+
+def test_merging_grids_that_differ():
+    with pytest.raises(ValueError, match="resolution"):
+        _core.Grid2D(0.1).merge(_core.Grid2D(0.2))
+    with pytest.raises(TypeError, match="merge"):
+        _core.Grid2D(0.1).merge(_core.Grid3D(0.1))
+
+
+def test_cells_of_wrong_type():
+    grid = _core.Grid2D(0.1)
+    for cells in (np.zeros((1, 3), np.int64), np.zeros((1, 2), np.int32), np.zeros(2, np.int64)):
+        with pytest.raises(TypeError, match="cells"):
+            grid.alpha_beta(cells)
+    with pytest.raises(ValueError, match="cells"):
+        grid.alpha_beta(np.array([[0, 2**40]]))
+
+
+@pytest.mark.parametrize("kernel", ["registration_cost", "registration_gradient"])
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("points", np.ones((5, 2)), TypeError),
+        ("weights", np.ones(5), TypeError),
+        ("weights", np.ones(4, np.float32), ValueError),
+        ("weights", np.full(5, 2, np.float32), ValueError),
+        ("T", np.eye(4), TypeError),
+        ("T", np.full((3, 3), np.nan), ValueError),
+        ("sigma", 0.0, ValueError),
+        ("floor", 0.0, ValueError),
+        ("unknown", -0.1, ValueError),
+        ("radius", -1, ValueError),
+        ("radius", 10**6, ValueError),
+    ],
+)
+def test_registration(kernel, name, value, error):
+    good = {
+        "grid": _core.Grid2D(0.5),
+        "points": np.ones((5, 2), np.float32),
+        "weights": np.ones(5, np.float32),
+        "T": np.eye(3),
+        "sigma": 0.1,
+        "radius": 2,
+        "floor": 0.01,
+        "unknown": 0.1,
+    }
+    getattr(_core, kernel)(**good)
+    with pytest.raises(error, match=name):
+        getattr(_core, kernel)(**{**good, name: value})
