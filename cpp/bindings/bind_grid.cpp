@@ -100,11 +100,7 @@ void bind(nb::module_& m, const char* name) {
 }
 
 template <int D>
-using Point = nb::ndarray<const double, nb::numpy, nb::shape<D>, nb::c_contig, nb::device::cpu>;
-
-template <int D>
-auto cells_along(const Point<D>& start, const Point<D>& end, double resolution) {
-  require(resolution > 0.0, "resolution: expected a positive length in metres");
+auto cells_along(const Flat<double>& start, const Flat<double>& end, double resolution) {
   const Vec<D> a = Eigen::Map<const Vec<D>>(start.data()) / resolution;
   const Vec<D> b = Eigen::Map<const Vec<D>>(end.data()) / resolution;
   require(
@@ -124,12 +120,12 @@ auto cells_along(const Point<D>& start, const Point<D>& end, double resolution) 
                          owned(std::move(lengths), {n}));
 }
 
-template <int D>
-void bind_traverse(nb::module_& m) {
-  m.def("traverse", &cells_along<D>, nb::arg("start").noconvert(), nb::arg("end").noconvert(),
-        nb::arg("resolution"),
-        "Cells (K, D) int64 of a segment in order, end cell last, and the chord lengths (K,) in "
-        "cells.");
+auto cells_along_any(const Flat<double>& start, const Flat<double>& end, double resolution) {
+  require(resolution > 0.0, "resolution: expected a positive length in metres");
+  require(start.shape(0) == end.shape(0), "start, end: expected the same dimension");
+  require(start.shape(0) == 2 || start.shape(0) == 3, "start: expected 2 or 3 coordinates");
+  return start.shape(0) == 2 ? cells_along<2>(start, end, resolution)
+                             : cells_along<3>(start, end, resolution);
 }
 
 }  // namespace
@@ -137,8 +133,10 @@ void bind_traverse(nb::module_& m) {
 void bind_grid(nb::module_& m) {
   bind<2>(m, "Grid2D");
   bind<3>(m, "Grid3D");
-  bind_traverse<2>(m);
-  bind_traverse<3>(m);
+  m.def("traverse", &cells_along_any, nb::arg("start").noconvert(), nb::arg("end").noconvert(),
+        nb::arg("resolution"),
+        "Cells (K, D) int64 of a segment (D,) to (D,) in order, end cell last, and the chord "
+        "lengths (K,) in cells.");
 }
 
 }  // namespace stillmap::border

@@ -48,10 +48,12 @@ auto matrix_of(const Pose<D>& pose) {
 template <int D>
 auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
                     const OnePose<D>& T_prior, const Square<D>& information, double sigma,
-                    int radius, double floor, double gain, int max_iterations,
-                    double window_translation, double window_rotation, double search_range) {
-  const RegisterOptions options{{sigma, radius}, floor, gain, max_iterations};
-  require(floor > 0.0 && gain > 0.0, "floor, gain: expected positive numbers");
+                    int radius, double floor, double unknown, double gain, int max_iterations,
+                    double window_translation, double window_rotation, double search_range,
+                    int starts) {
+  require(starts >= 1, "starts: expected at least one");
+  const RegisterOptions options{{sigma, radius, floor, unknown}, gain, max_iterations};
+  require(gain > 0.0, "gain: expected a positive number");
   require(window_translation >= 0.0 && window_rotation >= 0.0 && window_rotation <= 3.2,
           "window: expected half widths, rotation at most pi");
   const auto beams = beams_from<D>(points, weights);
@@ -60,14 +62,18 @@ auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<flo
     for (int c = 0; c < Lie<D>::kDof; ++c) prior.information(r, c) = information(r, c);
   require(prior.information.allFinite(), "information: not finite");
   Registration<D> best;
+  best.cost = std::numeric_limits<double>::infinity();
   size_t candidates = 0;
   {
     nb::gil_scoped_release released;
     Field<D> field(grid, options.field);
     const SearchWindow window{window_translation, window_rotation, search_range};
-    const auto found = CorrelativeSearch<D>(grid, beams, prior, window, options).best();
-    candidates = found.candidates;
-    best = climb<D>(field, beams, prior, found.pose, options);
+    CorrelativeSearch<D> search(grid, beams, prior, window, options);
+    for (const auto& start : search.best(static_cast<size_t>(starts))) {
+      const auto found = climb<D>(field, beams, prior, start.pose, options);
+      if (found.cost < best.cost) best = found;
+    }
+    candidates = search.poses_tried();
   }
   constexpr size_t n = Lie<D>::kDof;
   Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof, Eigen::RowMajor> covariance =
@@ -80,11 +86,11 @@ auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<flo
 
 template <int D>
 double cost_at(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
-               const OnePose<D>& T, double sigma, int radius, double floor) {
-  Field<D> field(grid, {sigma, radius});
+               const OnePose<D>& T, double sigma, int radius, double floor, double unknown) {
+  Field<D> field(grid, {sigma, radius, floor, unknown});
   // without the constant ln(floor + 1) of every beam: the oracle's form
   const auto beams = beams_from<D>(points, weights);
-  const RegisterOptions options{{sigma, radius}, floor, 1.0, 0};
+  const RegisterOptions options{{sigma, radius, floor, unknown}, 1.0, 0};
   double constant = 0.0;
   for (const double w : beams.weights) constant += w * std::log(floor + 1.0);
   return data_cost<D>(field, beams, checked_pose<D>(T, "T"), options) - constant;
@@ -92,9 +98,9 @@ double cost_at(const Grid<D>& grid, const Points<D>& points, const Flat<float>& 
 
 template <int D>
 auto gradient_at(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
-                 const OnePose<D>& T, double sigma, int radius, double floor) {
-  Field<D> field(grid, {sigma, radius});
-  const RegisterOptions options{{sigma, radius}, floor, 1.0, 0};
+                 const OnePose<D>& T, double sigma, int radius, double floor, double unknown) {
+  Field<D> field(grid, {sigma, radius, floor, unknown});
+  const RegisterOptions options{{sigma, radius, floor, unknown}, 1.0, 0};
   const auto q =
       linearise<D>(field, beams_from<D>(points, weights), checked_pose<D>(T, "T"), options);
   const size_t n = Lie<D>::kDof;
@@ -107,19 +113,22 @@ void bind(nb::module_& m) {
       "register_beams", &register_beams<D>, nb::arg("grid"), nb::arg("points").noconvert(),
       nb::arg("weights").noconvert(), nb::arg("T_prior").noconvert(),
       nb::arg("information").noconvert(), nb::kw_only(), nb::arg("sigma"), nb::arg("radius"),
-      nb::arg("floor"), nb::arg("gain"), nb::arg("max_iterations"), nb::arg("window_translation"),
-      nb::arg("window_rotation"), nb::arg("search_range"),
+      nb::arg("floor"), nb::arg("unknown"), nb::arg("gain"), nb::arg("max_iterations"),
+      nb::arg("window_translation"), nb::arg("window_rotation"), nb::arg("search_range"),
+      nb::arg("starts"),
       "(9): the pose of one scan against the grid so far. points (N, D) float32 that were hit, in "
       "the moving frame; weights (N,) float32 = e; T_prior (D+1, D+1) and its information "
       "(dof, dof) of (translation, rotation about the moving frame's origin). Returns pose, "
       "covariance, cost, the share of beams the map explains, Newton steps, lattice poses.");
   m.def("registration_cost", &cost_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
-        nb::arg("radius"), nb::arg("floor"),
-        "-sum w ln(floor + F) at one pose, F being the smoothed field.");
+        nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),
+        "-sum w ln(floor + unknown U + F) at one pose, F being the smoothed field, U = 1 where "
+        "nobody "
+        "looked.");
   m.def("registration_gradient", &gradient_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
-        nb::arg("radius"), nb::arg("floor"),
+        nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),
         "Its derivative (dof,) by a small translation and a rotation about the sensor.");
 }
 

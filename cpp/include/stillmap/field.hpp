@@ -10,13 +10,16 @@
 namespace stillmap {
 
 struct FieldOptions {
-  double sigma;  // metres, width of the Gaussians
-  int radius;    // cells, how far neighbours are looked at
+  double sigma;    // metres, width of the Gaussians
+  int radius;      // cells, how far neighbours are looked at
+  double floor;    // value of an end point in free space, relative to a wall's 1
+  double unknown;  // added where nobody looked: unknown is not free
 };
 
 template <int D>
 struct FieldValue {
-  double value = 0.0;            // F(y), about 1 on a wall
+  double value = 0.0;  // F(y), about 1 on a wall
+  double base = 0.0;   // what is expected without any end point near: floor, more where unknown
   Vec<D> pull = Vec<D>::Zero();  // mean of (mu_k - y) / sigma^2: the gradient of ln F, per metre
   // spread of the pulls: what sigma^-2 loses along a wall, where F does not change
   Eigen::Matrix<double, D, D> spread = Eigen::Matrix<double, D, D>::Zero();
@@ -27,24 +30,31 @@ class Field {
  public:
   Field(const Grid<D>& grid, const FieldOptions& options)
       : cursor_(grid),
+        floor_(options.floor),
+        unknown_(options.unknown),
         radius_(options.radius),
         scale_(1.0 / grid.resolution()),
         sigma_cells_(options.sigma / grid.resolution()) {
     if (!(options.sigma > 0.0)) throw std::invalid_argument("sigma: expected a positive length");
+    if (!(options.floor > 0.0)) throw std::invalid_argument("floor: expected a positive number");
+    if (!(options.unknown >= 0.0))
+      throw std::invalid_argument("unknown: expected a number that is not negative");
     if (options.radius < 0 || options.radius > 64)
       throw std::invalid_argument("radius: expected 0 to 64 cells");
     // a straight wall whose cells are all occupied gives F = 1
     norm_ = 1.0 / std::pow(std::sqrt(2.0 * 3.14159265358979323846) * sigma_cells_, D - 1);
   }
 
-  double value(const Vec<D>& y_metres) {
+  // floor + F(y), and more where nobody looked
+  double likelihood(const Vec<D>& y_metres) {
     double sum = 0.0;
     for_each_near(y_metres, [&](double weight, const Vec<D>&) { sum += weight; });
-    return sum * norm_;
+    return base(y_metres) + sum * norm_;
   }
 
   FieldValue<D> evaluate(const Vec<D>& y_metres) {
     FieldValue<D> out;
+    out.base = base(y_metres);
     double sum = 0.0;
     Vec<D> first = Vec<D>::Zero();
     Eigen::Matrix<double, D, D> second = Eigen::Matrix<double, D, D>::Zero();
@@ -64,6 +74,12 @@ class Field {
   }
 
  private:
+  double base(const Vec<D>& y_metres) {
+    const Vec<D> y = y_metres * scale_;
+    if (!(y.cwiseAbs().maxCoeff() < Grid<D>::kMaxCell)) return floor_;
+    return cursor_.seen(cell_of<D>(y)) ? floor_ : floor_ + unknown_;
+  }
+
   // visit(m_k exp(-|y - mu_k|^2 / (2 sigma^2)), mu_k - y in cells) for every hit cell near y
   template <class Visit>
   void for_each_near(const Vec<D>& y_metres, Visit&& visit) {
@@ -100,6 +116,8 @@ class Field {
   }
 
   Cursor<const Grid<D>> cursor_;
+  double floor_;
+  double unknown_;
   int radius_;
   double scale_;
   double sigma_cells_;

@@ -1,6 +1,7 @@
 // (9): one scan against the map so far, beams weighted by e, with a Gaussian motion prior.
-// Minimises  J(x) = - gain sum_n e_n ln((floor + F(y_n(x))) / (floor + 1)) + 1/2 |x - x_prior|^2
-// in the metric of the prior's information, by Newton steps on the smoothed field.
+// Minimises  J(x) = - gain sum_n e_n ln((base + F(y_n(x))) / (floor + 1)) + 1/2 |x - x_prior|^2
+// in the metric of the prior's information, by Newton steps on the smoothed field; base = floor in
+// seen space, floor + unknown elsewhere.
 #pragma once
 
 #include <Eigen/Eigenvalues>
@@ -20,8 +21,7 @@ struct WeightedBeams {
 
 struct RegisterOptions {
   FieldOptions field;
-  double floor;  // probability of an end point where the map has nothing, relative to a wall
-  double gain;   // how much one beam counts: neighbouring beams are not independent
+  double gain;  // how much one beam counts: neighbouring beams are not independent
   int max_iterations;
 };
 
@@ -46,7 +46,7 @@ inline double data_cost(Field<D>& field, const WeightedBeams<D>& beams, const Po
   double cost = 0.0;
   for (size_t n = 0; n < beams.points.size(); ++n)
     cost -= beams.weights[n] *
-            std::log((options.floor + field.value(pose * beams.points[n])) / (options.floor + 1.0));
+            std::log(field.likelihood(pose * beams.points[n]) / (options.field.floor + 1.0));
   return options.gain * cost;
 }
 
@@ -81,9 +81,9 @@ inline Quadratic<D> linearise(Field<D>& field, const WeightedBeams<D>& beams, co
     const Vec<D> arm = pose.R * beams.points[n];
     const FieldValue<D> f = field.evaluate(pose.t + arm);
     total += beams.weights[n];
-    q.cost -= w * std::log((options.floor + f.value) / (options.floor + 1.0));
+    q.cost -= w * std::log((f.base + f.value) / (options.field.floor + 1.0));
     if (f.value <= 0.0) continue;
-    const double explained = f.value / (options.floor + f.value);
+    const double explained = f.value / (f.base + f.value);
     const auto J = Lie<D>::jacobian(arm);
     q.inliers += beams.weights[n] * explained;
     q.gradient.noalias() -= w * explained * (J.transpose() * f.pull);

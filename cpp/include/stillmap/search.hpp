@@ -16,15 +16,17 @@ struct SearchWindow {
   double max_range;    // metres, beams beyond are left out of the search
 };
 
-// ln((floor + F) / floor) at the cells of a box, F being the largest single contribution.
+// ln((base + F) / floor) at the cells of a box, F being the largest single contribution.
 template <int D>
 class Raster {
  public:
-  Raster(const Grid<D>& grid, const Cell<D>& first, const Cell<D>& size, double sigma, double floor)
+  Raster(const Grid<D>& grid, const Cell<D>& first, const Cell<D>& size,
+         const FieldOptions& options)
       : first_(first),
         size_(size),
         values_(static_cast<size_t>(size.template cast<int64_t>().prod()), 0.0f) {
-    const double sigma_cells = sigma / grid.resolution();
+    // a little wider than the field that is climbed: cells stand for their whole area here
+    const double sigma_cells = 1.5 * options.sigma / grid.resolution();
     const int reach = static_cast<int>(std::ceil(2.0 * sigma_cells));
     make_kernel(sigma_cells, reach);
     const Cell<D> margin = Cell<D>::Constant(reach);
@@ -38,8 +40,22 @@ class Raster {
         if (c.alpha > 0) splat(Grid<D>::cell_at(block->origin, i), reach, occupancy(c));
       }
     });
-    for (float& v : values_)
-      if (v > 0.0f) v = static_cast<float>(std::log((floor + static_cast<double>(v)) / floor));
+    std::vector<float> base(values_.size(), static_cast<float>(options.floor + options.unknown));
+    for_each_in_box(Grid<D>::block_of(first), Grid<D>::block_of(first + size),
+                    [&](const Cell<D>& b) {
+                      const auto* block = grid.find(b);
+                      if (!block) return;
+                      for (int i = 0; i < Grid<D>::kCells; ++i) {
+                        const Counts& c = block->counts[static_cast<size_t>(i)];
+                        const Cell<D> cell = Grid<D>::cell_at(block->origin, i);
+                        if (c.alpha + c.beta > 0 && contains(cell))
+                          base[static_cast<size_t>(at(cell) - values_.data())] =
+                              static_cast<float>(options.floor);
+                      }
+                    });
+    const auto floor = static_cast<float>(options.floor);
+    for (size_t i = 0; i < values_.size(); ++i)
+      values_[i] = std::log((base[i] + values_[i]) / floor);
   }
 
   // x runs fastest; `cell` must lie in the box
@@ -62,6 +78,11 @@ class Raster {
       }
       if (d == D) return;
     }
+  }
+
+  bool contains(const Cell<D>& cell) const {
+    return (cell.array() >= first_.array()).all() &&
+           (cell.array() < (first_ + size_).array()).all();
   }
 
  private:
@@ -97,9 +118,9 @@ class Raster {
 };
 
 template <int D>
-struct SearchResult {
+struct Candidate {
   Pose<D> pose;
-  size_t candidates = 0;
+  double score;
 };
 
 template <int D>
@@ -128,17 +149,35 @@ class CorrelativeSearch {
     angles_ = static_cast<int>(std::ceil(window.rotation / angle_step_));
   }
 
-  SearchResult<D> best() {
-    SearchResult<D> out;
-    out.pose = prior_.pose;
-    if (beams_.points.empty() || (shifts_ == 0 && angles_ == 0)) return out;
+  // The best poses of the lattice, best first, no two of them neighbours; the prior's mean when
+  // there is nothing to search.
+  std::vector<Candidate<D>> best(size_t wanted) {
+    if (beams_.points.empty() || (shifts_ == 0 && angles_ == 0)) return {{prior_.pose, 0.0}};
     make_raster();
-    double best_score = -std::numeric_limits<double>::infinity();
-    for (int a = -angles_; a <= angles_; ++a) score_angle(a, best_score, out);
-    return out;
+    std::vector<Candidate<D>> found;
+    for (int a = -angles_; a <= angles_; ++a) found.push_back(best_shift(turned(a)));
+    std::stable_sort(found.begin(), found.end(),
+                     [](const auto& x, const auto& y) { return x.score > y.score; });
+    std::vector<Candidate<D>> kept;
+    for (const auto& candidate : found) {
+      if (kept.size() == wanted) break;
+      if (std::none_of(kept.begin(), kept.end(),
+                       [&](const auto& other) { return near(candidate.pose, other.pose); }))
+        kept.push_back(candidate);
+    }
+    return kept;
   }
 
+  size_t poses_tried() const { return poses_tried_; }
+
  private:
+  // within the basin of the Newton steps of each other
+  bool near(const Pose<D>& a, const Pose<D>& b) const {
+    const typename Lie<D>::Tangent d = a.minus(b);
+    return d.template head<D>().norm() < 3.0 * grid_.resolution() &&
+           d.template tail<Lie<D>::kRotation>().norm() < 3.0 * angle_step_;
+  }
+
   Pose<D> turned(int a) const {
     typename Lie<D>::Tangent delta = Lie<D>::Tangent::Zero();
     delta[Lie<D>::kDof - 1] = a * angle_step_;
@@ -158,12 +197,11 @@ class CorrelativeSearch {
     }
     const Cell<D> margin = Cell<D>::Constant(shifts_);
     raster_.emplace_back(grid_, low - margin, high - low + 2 * margin + Cell<D>::Ones(),
-                         1.5 * options_.field.sigma, options_.floor);
+                         options_.field);
   }
 
-  // every shift of one orientation: the beams add their windows of the raster
-  void score_angle(int a, double& best_score, SearchResult<D>& out) {
-    const Pose<D> pose = turned(a);
+  // the best shift of one orientation: the beams add up their windows of the raster
+  Candidate<D> best_shift(const Pose<D>& pose) {
     const int32_t edge = 2 * shifts_ + 1;
     scores_.assign(static_cast<size_t>(std::pow(edge, D)), 0.0f);
     const Cell<D> margin = Cell<D>::Constant(shifts_);
@@ -179,18 +217,17 @@ class CorrelativeSearch {
         to += edge;
       });
     }
+    Candidate<D> out{pose, -std::numeric_limits<double>::infinity()};
     size_t i = 0;
     Raster<D>::for_each_in_box(-margin, margin, [&](const Cell<D>& shift) {
       Pose<D> candidate = pose;
       candidate.t += shift.template cast<double>() * grid_.resolution();
       const typename Lie<D>::Tangent d = candidate.minus(prior_.pose);
       const double score = static_cast<double>(scores_[i++]) - 0.5 * d.dot(prior_.information * d);
-      if (score > best_score) {
-        best_score = score;
-        out.pose = candidate;
-      }
+      if (score > out.score) out = {candidate, score};
     });
-    out.candidates += i;
+    poses_tried_ += i;
+    return out;
   }
 
   const Grid<D>& grid_;
@@ -203,6 +240,7 @@ class CorrelativeSearch {
   int angles_ = 0;
   std::vector<Raster<D>> raster_;
   std::vector<float> scores_;
+  size_t poses_tried_ = 0;
 };
 
 }  // namespace stillmap

@@ -15,12 +15,12 @@ Float = NDArray[np.float64]
 class MotionOptions:
     """Standard deviations of one odometry increment."""
 
-    translation_floor: float = field_with_doc(0.01, "m, error of an increment without motion")
-    translation_per_metre: float = field_with_doc(0.10, "m of error per metre travelled")
-    translation_per_radian: float = field_with_doc(0.03, "m of error per radian turned")
-    rotation_floor: float = field_with_doc(0.005, "rad, error of an increment without motion")
-    rotation_per_metre: float = field_with_doc(0.03, "rad of error per metre travelled")
-    rotation_per_radian: float = field_with_doc(0.12, "rad of error per radian turned")
+    translation_floor: float = field_with_doc(0.02, "m, error of an increment without motion")
+    translation_per_metre: float = field_with_doc(0.1, "m of error per metre travelled")
+    translation_per_radian: float = field_with_doc(0.05, "m of error per radian turned")
+    rotation_floor: float = field_with_doc(0.02, "rad, error of an increment without motion")
+    rotation_per_metre: float = field_with_doc(0.1, "rad of error per metre travelled")
+    rotation_per_radian: float = field_with_doc(0.3, "rad of error per radian turned")
     without_odometry_translation: float = field_with_doc(
         0.15, "m, error of the constant-velocity guess where there is no odometry"
     )
@@ -72,6 +72,15 @@ def from_constant_velocity(
         T_map_base @ increment,
         options.without_odometry_translation,
         options.without_odometry_rotation,
+    )
+
+
+def widened(prior: MotionPrior, sigma_translation: float, sigma_rotation: float) -> MotionPrior:
+    """The same mean, trusted less: standard deviations of at least these."""
+    return _prior(
+        prior.T_map_base,
+        max(prior.sigma_translation, sigma_translation),
+        max(prior.sigma_rotation, sigma_rotation),
     )
 
 

@@ -1,0 +1,93 @@
+"""`stillmap map`: the main job, recording in, folder out."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from stillmap.cli.options import add_option_flags, resolved_options
+from stillmap.cli.progress import shown_progress
+from stillmap.cli.reading import add_read_flags, read_changes
+from stillmap.errors import InputError
+from stillmap.output.atomic import require_new
+from stillmap.output.points import beam_counts
+from stillmap.recording import Recording, read
+from stillmap.recording.poses import poses_from_tum
+from stillmap.result import Result, build
+from stillmap.stages import Stages
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the command."""
+    p = commands.add_parser("map", help="the main job: recording in, folder out")
+    p.add_argument(
+        "input",
+        metavar="INPUT",
+        help="a CARMEN log (.log, .clf, .gz) or a stillmap recording folder",
+    )
+    p.add_argument("-o", "--output", metavar="DIR", required=True, help="where the result goes")
+    p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
+    p.add_argument("--paper", action="store_true", help="the method exactly as printed")
+    p.add_argument("--estimator", choices=["paper"], help="what says which beams are static")
+    p.add_argument("--poses", metavar="FILE.tum", help="keep these poses, estimate the rest")
+    p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
+    p.add_argument("--resolution", metavar="M", type=float, help="edge of a map cell in metres")
+    p.add_argument("--map-mode", choices=["trinary", "scale", "raw"], help="pixels of map.pgm")
+    p.add_argument("--threads", metavar="N", type=int, help="0: one per processor")
+    p.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    add_read_flags(p)
+    add_option_flags(p)
+    p.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Reads, maps, writes, says what came of it."""
+    options = resolved_options(args, read_changes(args), _changes(args))
+    output = Path(args.output)
+    require_new(output, args.overwrite)
+    stages = Stages()
+    with stages.measure("read"):
+        recording = read(Path(args.input), options.read)
+    recording = _usable(recording, args)
+    poses = poses_from_tum(Path(args.poses), recording) if args.poses else None
+    with shown_progress(args.quiet, options.em.max_iterations) as progress:
+        result = build(recording, options, poses=poses, progress=progress, stages=stages)
+    result.save(output, overwrite=args.overwrite)
+    if not args.quiet:
+        _say(result, output)
+    return 0
+
+
+def _usable(recording: Recording, args: argparse.Namespace) -> Recording:
+    if recording.n_scans == 0:
+        raise InputError("holds no scan that can be used", where=args.input)
+    if recording.dimension != 2:
+        raise InputError("is 3D: only 2D recordings can be mapped so far", where=args.input)
+    return recording.without_odometry() if args.no_odometry else recording
+
+
+def _changes(args: argparse.Namespace) -> dict[str, Any]:
+    changes: dict[str, Any] = {}
+    if args.paper or args.estimator:
+        changes["estimator"] = "paper"
+    if args.threads is not None:
+        changes["threads"] = args.threads
+    if args.resolution is not None:
+        changes["slam"] = {"resolution": args.resolution}
+    if args.map_mode:
+        changes["output"] = {"map_mode": args.map_mode}
+    return changes
+
+
+def _say(result: Result, output: Path) -> None:
+    counts = beam_counts(result.recording, result.p_static)
+    end = "converged" if result.converged else "not converged"
+    lines = [
+        f"{result.recording.n_scans} scans, {counts['hits']} beams that hit something, "
+        f"{100.0 * counts['dynamic'] / max(counts['hits'], 1):.1f} % of them dynamic",
+        f"{len(result.iterations)} iterations, {end}, the best is {result.best_iteration}",
+        *(f"warning: {warning}" for warning in result.warnings),
+        f"wrote {output}: open {output / 'report.html'}",
+    ]
+    for line in lines:
+        print(f"stillmap: {line}", file=sys.stderr)

@@ -1,0 +1,85 @@
+"""Progress on stderr: a bar on a terminal, a line now and then elsewhere, nothing if quiet."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from stillmap.pipeline import Progress, silent
+
+_EVERY = 10.0  # s between lines where there is no terminal
+
+
+@contextmanager
+def shown_progress(quiet: bool, iterations: int) -> Iterator[Progress]:
+    """A Progress that shows iteration, scan, rate and time left."""
+    if quiet:
+        yield silent
+    elif sys.stderr.isatty():
+        with _bar(iterations) as progress:
+            yield progress
+    else:
+        yield _Lines(iterations)
+
+
+@contextmanager
+def _bar(iterations: int) -> Iterator[Progress]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("scans {task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        tasks = {}
+        rate = _Rate()
+
+        def progress(what: str, iteration: int, done: int, total: int) -> None:
+            if iteration not in tasks:
+                for old in tasks.values():
+                    bar.remove_task(old)
+                tasks.clear()
+                name = f"{what}, iteration {iteration} of at most {iterations}"
+                tasks[iteration] = bar.add_task(name, total=total, rate="")
+            bar.update(tasks[iteration], completed=done, rate=f"{rate(iteration, done):.0f}/s")
+
+        yield progress
+
+
+class _Rate:
+    """Scans per second within one iteration."""
+
+    def __init__(self) -> None:
+        self._iteration, self._started = 0, time.monotonic()
+
+    def __call__(self, iteration: int, done: int) -> float:
+        if iteration != self._iteration:
+            self._iteration, self._started = iteration, time.monotonic()
+        return done / max(time.monotonic() - self._started, 1e-3)
+
+
+class _Lines:
+    """A line every few seconds and at the end of an iteration."""
+
+    def __init__(self, iterations: int) -> None:
+        self._iterations = iterations
+        self._last = time.monotonic()
+        self._rate = _Rate()
+
+    def __call__(self, what: str, iteration: int, done: int, total: int) -> None:
+        rate = self._rate(iteration, done)
+        now = time.monotonic()
+        if done < total and now - self._last < _EVERY:
+            return
+        self._last = now
+        left = (total - done) / max(rate, 1e-3)
+        print(
+            f"stillmap: {what}, iteration {iteration} of at most {self._iterations}: "
+            f"{done} of {total} scans, {rate:.0f}/s, {left:.0f} s left in this iteration",
+            file=sys.stderr,
+        )

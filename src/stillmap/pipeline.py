@@ -1,0 +1,127 @@
+"""The loop of Fig. 2: M-step, E-step, bound, repeat."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import _core, em, slam
+from stillmap.em import EmOptions
+from stillmap.options import field_with_doc
+from stillmap.output.map_server import OutputOptions
+from stillmap.recording.model import Recording
+from stillmap.recording.options import ReadOptions
+from stillmap.slam import SlamOptions
+from stillmap.stages import Stages
+from stillmap.threads import resolved_threads
+
+Float = NDArray[np.float64]
+Progress = Callable[[str, int, int, int], None]  # what, iteration, done, total
+
+
+def silent(what: str, iteration: int, done: int, total: int) -> None:
+    """Reports progress to nobody."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Everything that can be chosen."""
+
+    threads: int = field_with_doc(0, "threads to use; 0: one per processor. Same result with any")
+    estimator: Literal["paper"] = field_with_doc(
+        "paper", "what says which beams are static: the printed E-step (8)"
+    )
+    read: ReadOptions = field(default=ReadOptions())
+    em: EmOptions = field(default=EmOptions())
+    slam: SlamOptions = field(default=SlamOptions())
+    output: OutputOptions = field(default=OutputOptions())
+
+    def __post_init__(self) -> None:
+        if self.threads < 0:
+            raise ValueError("'threads' wants 0 or a positive number")
+
+
+DEFAULTS = Options()
+
+
+@dataclass(frozen=True, eq=False)
+class Iteration:
+    """One M-step and one E-step.
+
+    Attributes:
+        number: from 1.
+        poses: (T, 3, 3) T_map_base.
+        covariance: (T, 3, 3) of x, y, heading against the map so far.
+        grid: the sums alpha, beta of (10).
+        p_static: (M,) float32, e after this iteration's E-step.
+        likelihood: (5) and the bound at this map and e.
+        changed_share: share of hits whose e moved by more than 0.1.
+        explained: (T,) share of each scan's beams that the map so far explained.
+        widened: scans that only a wider search than the motion prior's could place.
+        seconds: wall clock.
+    """
+
+    number: int
+    poses: Float
+    covariance: Float
+    grid: _core.Grid2D
+    p_static: NDArray[np.float32]
+    likelihood: em.Likelihood
+    changed_share: float
+    explained: Float
+    widened: list[int]
+    seconds: float
+
+
+def iterate(
+    recording: Recording,
+    options: Options = DEFAULTS,
+    *,
+    poses: Float | None = None,
+    progress: Progress = silent,
+    stages: Stages | None = None,
+) -> Iterator[Iteration]:
+    """Interleaves mapping and the estimation of what is static; the caller decides when to stop.
+
+    Args:
+        recording: 2D, at least one scan.
+        options: see Options.
+        poses: (T, 3, 3) T_map_base to keep instead of estimating them.
+        progress: called with what is done, the iteration, and how much of how much.
+        stages: where time and memory per stage are noted.
+
+    Yields:
+        one Iteration after the other, `options.em.max_iterations` of them at most.
+    """
+    stages = stages or Stages()
+    threads = resolved_threads(options.threads)
+    e = em.initial_expectations(recording, options.em)  # e := p(c = 1)
+    for number in range(1, options.em.max_iterations + 1):
+        started = time.perf_counter()
+        with stages.measure("m_step"):  # (9)-(15)
+            mapped = slam.m_step(recording, e, options.slam, poses, threads, _at(progress, number))
+        with stages.measure("e_step"):  # (6), (8)
+            before, e = e, em.e_step(recording, mapped.poses, mapped.grid, options.em, threads)
+        with stages.measure("likelihood"):  # (5)
+            likelihood = em.log_likelihood(
+                recording, mapped.poses, mapped.grid, e, options.em, threads
+            )
+        yield Iteration(
+            number=number,
+            poses=mapped.poses,
+            covariance=mapped.covariance,
+            grid=mapped.grid,
+            p_static=e,
+            likelihood=likelihood,
+            changed_share=em.changed_share(before, e, recording.hit),
+            explained=mapped.explained,
+            widened=mapped.widened,
+            seconds=time.perf_counter() - started,
+        )
+
+
+def _at(progress: Progress, number: int) -> Callable[[int, int], None]:
+    return lambda done, total: progress("mapping", number, done, total)

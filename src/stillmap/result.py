@@ -1,0 +1,205 @@
+"""Runs the loop to its end and keeps the best iterate."""
+
+import itertools
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import _core, em, pipeline
+from stillmap.output.crops import Snapshot, Window, choose_window, snapshot
+from stillmap.output.points import dynamic_points
+from stillmap.output.save import save
+from stillmap.pipeline import DEFAULTS, Iteration, Options, Progress
+from stillmap.recording.model import Recording
+from stillmap.stages import Stages
+from stillmap.threads import resolved_threads
+
+log = logging.getLogger(__name__)
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class IterationRecord:
+    """The numbers of one iteration; see Iteration."""
+
+    number: int
+    expected_log_likelihood: float
+    bound: float
+    changed_share: float
+    seconds: float
+    held_out_log_likelihood: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What stillmap found out about a recording of T scans with M beams.
+
+    Attributes:
+        recording: what it was made from.
+        options: every option as resolved.
+        iterations: the numbers of every iteration.
+        snapshots: a part of the map at the first, second and best iteration (Fig. 8).
+        poses: (T, 3, 3) T_map_base of the best iteration.
+        covariance: (T, 3, 3) of x, y, heading against the map so far.
+        p_static: (M,) float32, P(c = 1); it follows from `map` by a last E-step. NaN: unusable.
+        map: what stands still.
+        raw_map: every hit counted as static, from the same poses.
+        best_iteration: number of the iteration that was kept.
+        converged: whether the loop stopped by itself.
+        warnings: one sentence each.
+        stages: seconds and peak memory.
+    """
+
+    recording: Recording
+    options: Options
+    iterations: list[IterationRecord]
+    snapshots: list[Snapshot]
+    poses: Float
+    covariance: Float
+    p_static: NDArray[np.float32]
+    map: em.OccupancyMap
+    raw_map: em.OccupancyMap
+    best_iteration: int
+    converged: bool
+    warnings: list[str]
+    stages: Mapping[str, Mapping[str, Any]]
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Writes the result folder, complete or not at all."""
+        save(self, Path(path), overwrite)
+
+
+def build(
+    recording: Recording,
+    options: Options = DEFAULTS,
+    *,
+    poses: Float | None = None,
+    progress: Progress = pipeline.silent,
+    stages: Stages | None = None,
+) -> Result:
+    """The main job: iterates until the bound stops improving and keeps the best iterate.
+
+    Args: see `stillmap.iterate`.
+    """
+    if recording.dimension != 2:
+        raise ValueError(f"recording: expected 2 dimensions, got {recording.dimension}")
+    if recording.n_scans == 0:
+        raise ValueError("recording: expected at least one scan")
+    stages = stages or Stages()
+    run = _Run(options)
+    for iteration in pipeline.iterate(
+        recording, options, poses=poses, progress=progress, stages=stages
+    ):
+        run.take(iteration, recording)
+        log.info(
+            "iteration %d: bound %.6g, %.2f %% of the beams changed",
+            iteration.number,
+            iteration.likelihood.bound,
+            100.0 * iteration.changed_share,
+        )
+        if run.finished:
+            break
+    with stages.measure("maps"):
+        return run.result(recording, stages)
+
+
+@dataclass
+class _Run:
+    """What is kept while the loop runs: numbers of all iterations, arrays of the best alone."""
+
+    options: Options
+    records: list[IterationRecord] = field(default_factory=list)
+    snapshots: dict[int, Snapshot] = field(default_factory=dict)
+    window: Window | None = None
+    best: Iteration | None = None
+    finished: bool = False
+
+    def take(self, iteration: Iteration, recording: Recording) -> None:
+        bound = iteration.likelihood.bound
+        self.records.append(
+            IterationRecord(
+                iteration.number,
+                iteration.likelihood.expected,
+                bound,
+                iteration.changed_share,
+                iteration.seconds,
+            )
+        )
+        gain = np.inf if self.best is None else bound - self.best.likelihood.bound
+        if gain > 0.0:
+            self.best = iteration
+        if iteration.number <= 2 or gain > 0.0:
+            self._remember(iteration, recording)
+        settled = 0.0 <= gain < self.options.em.tolerance * recording.n_beams
+        stuck = iteration.number - self.kept.number >= self.options.em.patience
+        self.finished = settled or stuck
+
+    @property
+    def kept(self) -> Iteration:
+        if self.best is None:
+            raise RuntimeError("no iteration has been run")
+        return self.best
+
+    def _remember(self, iteration: Iteration, recording: Recording) -> None:
+        """A part of the map for Fig. 8: where the first iteration saw most movers."""
+        occupancy = em.occupancy_map(iteration.grid)
+        points = dynamic_points(recording, iteration.poses, iteration.p_static)
+        dynamic = np.zeros(len(points), dtype=np.float32)
+        if self.window is None:
+            self.window = choose_window(occupancy, points, dynamic)
+        self.snapshots = {n: s for n, s in self.snapshots.items() if n <= 2}
+        self.snapshots[iteration.number] = snapshot(
+            iteration.number, occupancy, points, dynamic, self.window
+        )
+
+    def result(self, recording: Recording, stages: Stages) -> Result:
+        kept = self.kept
+        filtered = em.occupancy_map(kept.grid)
+        raw = _core.Grid2D(kept.grid.resolution)
+        threads = resolved_threads(self.options.threads)
+        em.add_recording(raw, recording, kept.poses, None, threads)
+        return Result(
+            recording=recording,
+            options=self.options,
+            iterations=self.records,
+            snapshots=[self.snapshots[n] for n in sorted(self.snapshots)],
+            poses=kept.poses,
+            covariance=kept.covariance,
+            p_static=kept.p_static,
+            map=filtered,
+            raw_map=em.occupancy_map(raw),
+            best_iteration=kept.number,
+            converged=self.finished,
+            warnings=_warnings(self.records, kept, recording),
+            stages=stages.to_dict(),
+        )
+
+
+def _warnings(records: list[IterationRecord], kept: Iteration, recording: Recording) -> list[str]:
+    out = []
+    for before, after in itertools.pairwise(records):
+        if after.bound < before.bound:
+            out.append(
+                f"the likelihood dipped from iteration {before.number} to {after.number}, as the "
+                f"incremental poses allow; iteration {kept.number} is the best and was kept"
+            )
+    if recording.T_odom_base is None:
+        out.append("no odometry: a constant velocity was assumed between scans")
+    if kept.widened:
+        first, n = kept.widened[0], len(kept.widened)
+        out.append(
+            f"{n} scans lay outside what odometry allows and were found by a wider search, "
+            f"the first is scan {first}"
+        )
+    lost = np.flatnonzero(kept.explained < 0.2)
+    if len(lost):
+        out.append(
+            f"{len(lost)} scans fit the map badly (less than a fifth of their beams), the first "
+            f"is scan {lost[0]}: the map may be bent there"
+        )
+    return out

@@ -1,0 +1,129 @@
+"""(9) for one scan: the pose that the map so far and the motion prior make most likely."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import _core
+from stillmap.options import field_with_doc
+from stillmap.slam import motion
+from stillmap.slam.motion import MotionPrior
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RegistrationOptions:
+    """How one scan is registered; `docs/registration.md` says what is maximised."""
+
+    sigma: float = field_with_doc(0.06, "m, width of the smoothed field around end points")
+    floor: float = field_with_doc(0.05, "field value of an end point the map cannot explain")
+    unknown: float = field_with_doc(0.05, "what unknown space adds to it: unknown is not free")
+    gain: float = field_with_doc(0.2, "weight of one beam against the motion prior")
+    max_iterations: int = field_with_doc(20, "Newton steps at most")
+    window: float = field_with_doc(3.0, "standard deviations of the prior that are searched")
+    search_range: float = field_with_doc(20.0, "m, beams beyond are left out of the search")
+    starts: int = field_with_doc(3, "best poses of the search that are refined")
+    doubt_below: float = field_with_doc(
+        0.4, "share of beams the map explains below which a wider search is tried"
+    )
+    doubt_translation: float = field_with_doc(0.5, "m, half width of that search at least")
+    doubt_rotation: float = field_with_doc(0.5, "rad, half width of that search at least")
+    lost_translation: float = field_with_doc(
+        1.0, "m, half width of a last search over all headings, while doubt remains"
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("sigma", "floor", "gain", "search_range"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"'slam.registration.{name}' wants a positive number")
+        if self.max_iterations < 1 or self.starts < 1 or self.window < 0.0:
+            raise ValueError("'slam.registration' wants max_iterations, starts >= 1, window >= 0")
+
+
+@dataclass(frozen=True)
+class Registration:
+    """What came of one scan.
+
+    Attributes:
+        T_map_base: (3, 3) the pose.
+        covariance: (3, 3) of x, y (map frame) and heading: the inverse curvature of the cost.
+        explained: weighted share of the beams that the map explains, in [0, 1].
+        widened: whether a wider search than the prior asked for found the pose.
+    """
+
+    T_map_base: Float
+    covariance: Float
+    explained: float
+    widened: bool = False
+
+
+def register(
+    grid: _core.Grid2D,
+    points: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    prior: MotionPrior,
+    options: RegistrationOptions,
+) -> Registration:
+    """The most likely pose of a scan given the map so far and the motion prior, (9).
+
+    Args:
+        grid: the map so far.
+        points: (N, 2) end points of hits in the frame of the robot base.
+        weights: (N,) e, how probable it is that each was static.
+        prior: where odometry says the robot is.
+        options: see RegistrationOptions.
+    """
+    translation = options.window * prior.sigma_translation
+    rotation = options.window * prior.sigma_rotation
+    found = _search(grid, points, weights, prior, options, translation, rotation)
+    for least_translation, least_rotation in (
+        (options.doubt_translation, options.doubt_rotation),
+        (options.lost_translation, np.pi),
+    ):
+        if found.explained >= options.doubt_below or len(points) == 0:
+            break
+        wider = _search(
+            grid,
+            points,
+            weights,
+            motion.widened(prior, least_translation / 3.0, least_rotation / 3.0),
+            options,
+            max(translation, least_translation),
+            max(rotation, least_rotation),
+        )
+        # it has to explain clearly more: a wide search also finds look-alikes
+        if wider.explained > found.explained + 0.1:
+            found = dataclasses.replace(wider, widened=True)
+    return found
+
+
+def _search(
+    grid: _core.Grid2D,
+    points: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    prior: MotionPrior,
+    options: RegistrationOptions,
+    translation: float,
+    rotation: float,
+) -> Registration:
+    T, covariance, _, explained, _, _ = _core.register_beams(
+        grid,
+        points,
+        weights,
+        prior.T_map_base,
+        prior.information,
+        sigma=options.sigma,
+        radius=max(1, round(2.0 * options.sigma / grid.resolution)),
+        floor=options.floor,
+        unknown=options.unknown,
+        gain=options.gain,
+        max_iterations=options.max_iterations,
+        window_translation=translation,
+        window_rotation=min(rotation, float(np.pi)),
+        search_range=options.search_range,
+        starts=options.starts,
+    )
+    return Registration(T, covariance, explained)

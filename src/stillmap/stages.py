@@ -1,0 +1,36 @@
+"""Time and memory of the stages of a run."""
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+
+class Stages:
+    """Seconds per named stage, added up over calls, and the peak memory when it last ended."""
+
+    def __init__(self) -> None:
+        self._stages: dict[str, dict[str, Any]] = {}
+
+    @contextmanager
+    def measure(self, name: str) -> Iterator[None]:
+        """Adds the time of the block to stage `name`."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            stage = self._stages.setdefault(name, {"seconds": 0.0, "peak_memory_bytes": 0})
+            stage["seconds"] += time.perf_counter() - started
+            stage["peak_memory_bytes"] = peak_memory_bytes()
+
+    def to_dict(self) -> dict[str, dict[str, Any]]:
+        """Stage to `seconds` and `peak_memory_bytes` (of the process, up to the stage's end)."""
+        return {name: dict(stage) for name, stage in self._stages.items()}
+
+
+def peak_memory_bytes() -> int:
+    """Largest resident size of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
