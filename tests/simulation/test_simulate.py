@@ -9,9 +9,18 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.errors import InputError
-from stillmap.options import to_dict
-from stillmap.simulation import SCENES, Scene, Simulation, scene_by_name, simulate
-from stillmap.simulation.free_space import distance_to_segment
+from stillmap.options import replaced, to_dict
+from stillmap.simulation import (
+    SCENES,
+    CrowdOptions,
+    Scene,
+    Simulation,
+    scene_by_name,
+    simulate,
+)
+from stillmap.simulation.figures import Figures
+from stillmap.simulation.free_space import FreeSpace, Planner, distance_to_segment
+from stillmap.simulation.people import Crowd
 from stillmap.simulation.walls import box
 
 Float = NDArray[np.float64]
@@ -63,16 +72,18 @@ def test_a_generator_and_its_seed_give_the_same() -> None:
 
 def test_another_laser_and_odometry_leave_everybody_where_they_were() -> None:
     scene = short("hall")
+    laser = dataclasses.replace(scene.laser, beams=33, range_noise=0.0)
+    wheels = dataclasses.replace(scene.odometry, drift_noise=0.1)
     a = simulate(scene, 4)
-    changed = dataclasses.replace(
-        scene,
-        laser=dataclasses.replace(scene.laser, beams=33, range_noise=0.0),
-        odometry=dataclasses.replace(scene.odometry, drift_noise=0.1),
-    )
-    b = simulate(changed, 4)
-    np.testing.assert_array_equal(a.truth.movers, b.truth.movers)
-    np.testing.assert_array_equal(a.truth.T_world_base, b.truth.T_world_base)
+    b = simulate(dataclasses.replace(scene, laser=laser), 4)
+    c = simulate(dataclasses.replace(scene, odometry=wheels), 4)
+    for other in (b, c):
+        np.testing.assert_array_equal(a.truth.movers, other.truth.movers)
+        np.testing.assert_array_equal(a.truth.T_world_base, other.truth.T_world_base)
+    assert a.recording.T_odom_base is not None
     assert b.recording.n_beams == 150 * 33
+    np.testing.assert_array_equal(a.recording.T_odom_base, b.recording.T_odom_base)
+    np.testing.assert_array_equal(a.recording.points, c.recording.points)
 
 
 def test_static_hits_lie_on_walls(populated: Simulation) -> None:
@@ -130,6 +141,18 @@ def test_nobody_walks_through_walls_or_the_robot(any_run: Simulation) -> None:
     assert step.max() < 1.7 / any_run.scene.robot.scan_rate
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_where_there_is_no_room_to_pass_nobody_overlaps(seed: int) -> None:
+    scene = Scene(name="alley", walls=tuple(box(0, 0, 14, 1.3)), route=((-6.0, 0.0), (6.0, 0.0)))
+    changes = {"robot": {"scans": 400}, "laser": {"beams": 10}, "crowd": {"people": 7}}
+    truth = simulate(replaced(scene, changes), seed).truth
+    robot, people = truth.T_world_base[:, :2, 2], truth.movers[..., :2]
+    distance = np.hypot(*np.moveaxis(people - robot[:, None], -1, 0))
+    assert distance.min() >= 0.22 + 0.26
+    assert distance.min() < 0.22 + 0.26 + 0.1  # or the alley is no test
+    assert wall_distance(people.reshape(-1, 2), truth.walls).min() > 0.24
+
+
 def test_people_keep_apart(crowded: Simulation) -> None:
     xy = crowded.truth.movers[::5, :, :2]
     distance = np.hypot(*np.moveaxis(xy[:, :, None] - xy[:, None], -1, 0))
@@ -166,11 +189,6 @@ def test_nobody_stops_when_nobody_shall() -> None:
 
 def test_a_planted_foot_stands_still() -> None:
     """Of a walker's two feet one rests on the floor at any time."""
-    from stillmap.simulation.figures import Figures
-    from stillmap.simulation.free_space import FreeSpace, Planner
-    from stillmap.simulation.people import Crowd
-    from stillmap.simulation.scene import CrowdOptions
-
     space = FreeSpace(np.array(box(0, 0, 80, 80)))
     far = np.array([-38.0, -38.0, 0.0])
     planner = Planner(space, np.zeros(2), 0.5)
@@ -223,8 +241,6 @@ def test_more_scans_than_the_route_takes_go_round_again() -> None:
 def test_a_robot_that_stands_still_records_too() -> None:
     scene = Scene(name="standing", walls=tuple(box(0, 0, 8, 8)), route=((0.0, 1.0),))
     options = {"robot": {"scans": 40}, "crowd": {"people": 4}}
-    from stillmap.options import replaced
-
     truth = simulate(replaced(scene, options), 0).truth
     np.testing.assert_array_equal(truth.T_world_base, truth.T_world_base[:1].repeat(40, 0))
     assert (truth.mover >= 0).any()

@@ -10,7 +10,7 @@ from stillmap.simulation.scene import CrowdOptions
 Float = NDArray[np.float64]
 
 BODY_RADIUS = 0.26  # m, nobody comes nearer to a wall
-_PLACES = 40  # where people want to go
+_PLACES = 80  # where people want to go
 _PERSONAL = 0.7  # m between two people passing
 _REACTION = 0.4  # s until somebody walks as he wants to
 _ARRIVED = 0.45  # m
@@ -153,7 +153,7 @@ class Crowd:
         xy[touching] = robot + delta[touching] * (1.001 * contact / distance[touching])[:, None]
         clear, _ = self._space.clearance_at(xy)
         # the robot has checked that nobody has to move for it: staying is always possible
-        blocked = (clear < BODY_RADIUS) | (np.hypot(*(xy - robot).T) < contact)
+        blocked = clear < BODY_RADIUS
         xy[blocked] = self.xy[blocked]
         self._velocity = (xy - self.xy) / dt
         self.xy = xy
