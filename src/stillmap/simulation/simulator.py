@@ -71,32 +71,44 @@ def simulate(
     walls = np.array([*scene.walls, *scene.glass], float)
     tell = progress or _silent
     motion = _move(scene, walls, crowd_rng, lambda share: tell(_MOTION_SHARE * share))
-    o = scene.laser
     T_world_base = se2.matrix(*motion.robot.T)
+    T_odom_base = odometry.drifting(T_world_base, scene.odometry, odometry_rng)
+    recording, mover = _record(scene, walls, motion, T_odom_base, laser_rng, seed)
+    tell(1.0)
+    static = recording.hit & (mover < 0)
+    truth = Truth(static, mover, T_world_base, walls, motion.people, describe(scene, seed))
+    return Simulation(scene, recording, truth)
+
+
+def _record(
+    scene: Scene,
+    walls: Float,
+    motion: _Motion,
+    T_odom_base: Float,
+    rng: np.random.Generator,
+    seed: Any,
+) -> tuple[Recording, NDArray[np.int32]]:
+    """The recording, and the mover (M,) that each of its beams met."""
+    o, T = scene.laser, len(motion.robot)
     T_base_sensor = se2.matrix(o.x, o.y, o.yaw)[None]
     angles = laser.beam_angles(o.beams, o.fov)
-    poses = se2.parameters(T_world_base @ T_base_sensor)
+    poses = se2.parameters(se2.matrix(*motion.robot.T) @ T_base_sensor)
     exact = laser.cast(poses, angles, walls, motion.movers)
     is_glass = np.arange(len(walls)) >= len(scene.walls)
-    ranges, hit = laser.measure(exact, is_glass, o, laser_rng)
+    ranges, hit = laser.measure(exact, is_glass, o, rng)
     points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    T = len(motion.robot)
-    period_ns = 1e9 / scene.robot.scan_rate
+    times_ns = np.round(np.arange(T) * (1e9 / scene.robot.scan_rate)).astype(np.int64)
     recording = Recording(
-        stamp_ns=_FIRST_STAMP_NS + np.round(np.arange(T) * period_ns).astype(np.int64),
+        stamp_ns=_FIRST_STAMP_NS + times_ns,
         offset=np.arange(T + 1, dtype=np.int64) * o.beams,
         points=points.reshape(-1, 2).astype(np.float32),
         hit=hit.ravel(),
         T_base_sensor=T_base_sensor,
         sensor=np.zeros(T, np.int32),
-        T_odom_base=odometry.drifting(T_world_base, scene.odometry, odometry_rng),
+        T_odom_base=T_odom_base,
         source=_source(scene, seed, angles),
     )
-    mover = np.where(hit, exact.mover, np.int32(-1)).ravel()
-    static = hit.ravel() & (mover < 0)
-    tell(1.0)
-    truth = Truth(static, mover, T_world_base, walls, motion.people, describe(scene, seed))
-    return Simulation(scene, recording, truth)
+    return recording, np.where(hit, exact.mover, np.int32(-1)).ravel()
 
 
 def describe(scene: Scene, seed: Any) -> dict[str, Any]:
