@@ -38,6 +38,14 @@ def test_one_cell(impl):
     assert cost_of(impl, grid, [[11 / 12, 0.5]]) == pytest.approx(-log(FLOOR + F), rel=1e-5)
 
 
+def test_merged_grids_average_their_end_points(impl):
+    # the two end points of test_one_cell, each in a grid of its own
+    grid = grid_of(impl, [[0.25, 0.5]], [1], 0.5)
+    grid.merge(grid_of(impl, [[0.75, 0.5]], [0.5], 0.5))
+    F = 0.75 * exp(-0.5) / (sqrt(2 * pi) / 2)
+    assert cost_of(impl, grid, [[11 / 12, 0.5]]) == pytest.approx(-log(FLOOR + F), rel=1e-5)
+
+
 def test_one_cell_in_space(impl):
     # m = 1, mu = the point; at sigma away along z: F = exp(-1/2) / (sqrt(2 pi) / 2)^2
     grid = grid_of(impl, [[0.5, 0.5, 0.25]], [1], 0.5)
