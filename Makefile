@@ -1,0 +1,93 @@
+# Everything works in a fresh clone and lives in .venv:
+#   make demo    simulate a populated hall, map it, say where the result lies
+#   make test    build and test (about 5 minutes on 2 cores)
+#   make lint    style, types, formatting
+#   make check   lint and test, then what takes longer: slow tests and fuzzing, real recordings,
+#                packages, the kernels under sanitizers
+#   make clean   remove what was made
+# `make PYTHON=python3.12 ...` takes another Python, CXX another compiler.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
+SANITIZED := build/sanitized
+# directories too: a file that goes changes its folder
+SOURCES := pyproject.toml CMakeLists.txt $(shell find src cpp -not -name '_core*' \
+  -not -name '__pycache__' -not -name '*.pyc' -not -name '* *')
+
+export PYTHONNOUSERSITE := 1
+# what is tested is what was installed
+unexport PYTHONPATH PYTHONHOME
+
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-slow lint stub sanitize check format clean
+
+help:
+	@sed -n 's/^#  *//p' Makefile | sed -n '1,8p'
+
+# The user's way: an isolated build. `make test` installs over it.
+$(VENV)/installed: $(VENV)/created $(SOURCES)
+	@echo "installing stillmap into $(VENV)"
+	@$(PIP) install .
+	@touch $@
+
+$(VENV)/created:
+	@tools/require.sh "$(PYTHON)"
+	@echo "making $(VENV)"
+	@"$(PYTHON)" -m venv --clear $(VENV)
+	@touch $@
+
+# The developer's way: no isolation, so that a second build compiles only what changed.
+$(VENV)/tools: $(VENV)/created pyproject.toml
+	@echo "installing build and test tools into $(VENV)"
+	@$(BIN)/python tools/build_requirements.py | $(PIP) install -r /dev/stdin
+	@touch $@
+
+$(VENV)/tested: $(VENV)/tools $(SOURCES)
+	@echo "building stillmap, warnings are errors"
+	@$(PIP) install --no-build-isolation --config-settings=build-dir=build/tested \
+	  --config-settings=cmake.define.STILLMAP_WERROR=ON '.[dev]'
+	@touch $@ $(VENV)/installed
+
+demo: $(VENV)/installed
+	@$(BIN)/stillmap simulate hall -o demo/hall --overwrite
+	@$(BIN)/stillmap map demo/hall -o demo/map --overwrite
+	@echo
+	@echo "recording  demo/hall"
+	@echo "map        demo/map/map.pgm, demo/map/map.yaml"
+	@echo "report     demo/map/report.html (open it in a browser)"
+
+test: $(VENV)/tested
+	$(BIN)/python -m pytest -m "not slow"
+
+test-slow: $(VENV)/tested
+	$(BIN)/python -m pytest -m slow
+
+lint: $(VENV)/tested
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/python -m mypy
+	$(BIN)/python -m mypy.stubtest stillmap._core
+	find cpp -name '*.[ch]pp' -print0 | xargs -0 $(BIN)/clang-format --dry-run --Werror
+
+format: $(VENV)/tools
+	$(BIN)/python -m ruff check --fix .
+	$(BIN)/python -m ruff format .
+	find cpp -name '*.[ch]pp' -print0 | xargs -0 $(BIN)/clang-format -i
+
+# A second copy of the package, whose kernels stop at the first bad access or undefined step.
+sanitize: $(VENV)/tested
+	@echo "building the kernels with address and undefined-behaviour sanitizers"
+	@rm -rf $(SANITIZED)/site
+	@$(PIP) install --no-build-isolation --no-deps --target $(SANITIZED)/site \
+	  --config-settings=build-dir=$(SANITIZED)/cmake \
+	  --config-settings=cmake.define.STILLMAP_SANITIZE=ON .
+	PYTHONPATH=$(SANITIZED)/site ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+	  LD_PRELOAD="$$($${CXX:-g++} -print-file-name=libasan.so)" \
+	  $(BIN)/python -m pytest tests/agreement tests/paper tests/property
+
+check: lint test test-slow sanitize
+
+clean:
+	rm -rf $(VENV) build dist demo .mypy_cache .pytest_cache .ruff_cache .hypothesis
