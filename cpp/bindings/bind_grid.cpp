@@ -103,9 +103,8 @@ template <int D>
 auto cells_along(const Flat<double>& start, const Flat<double>& end, double resolution) {
   const Vec<D> a = Eigen::Map<const Vec<D>>(start.data()) / resolution;
   const Vec<D> b = Eigen::Map<const Vec<D>>(end.data()) / resolution;
-  require(
-      a.cwiseAbs().maxCoeff() < Grid<D>::kMaxCell && b.cwiseAbs().maxCoeff() < Grid<D>::kMaxCell,
-      "start, end: not finite or too far away");
+  require(all_below<D>(a, Grid<D>::kMaxCell) && all_below<D>(b, Grid<D>::kMaxCell),
+          "start, end: not finite or too far away");
   std::vector<int64_t> cells;
   std::vector<double> lengths;
   auto add = [&](const Cell<D>& cell, double length) {

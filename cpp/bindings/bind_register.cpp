@@ -56,7 +56,7 @@ auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<flo
   require(gain > 0.0, "gain: expected a positive number");
   require(window_translation >= 0.0 && window_rotation >= 0.0 && window_rotation <= 3.2,
           "window: expected half widths, rotation at most pi");
-  const auto beams = beams_from<D>(points, weights);
+  auto beams = beams_from<D>(points, weights);
   Prior<D> prior{checked_pose<D>(T_prior, "T_prior"), {}};
   for (int r = 0; r < Lie<D>::kDof; ++r)
     for (int c = 0; c < Lie<D>::kDof; ++c) prior.information(r, c) = information(r, c);
@@ -84,25 +84,29 @@ auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<flo
       best.inliers, best.iterations, candidates);
 }
 
+// The data term alone, as the tests' oracle has it: without the constant ln(floor + 1) of every
+// beam, without the prior.
+template <int D>
+Quadratic<D> data_term(const Grid<D>& grid, WeightedBeams<D> beams, const OnePose<D>& T,
+                       const FieldOptions& field_options) {
+  Field<D> field(grid, field_options);
+  auto q = linearise<D>(field, beams, checked_pose<D>(T, "T"), {field_options, 1.0, 0});
+  for (const double w : beams.weights) q.cost -= w * std::log(field_options.floor + 1.0);
+  return q;
+}
+
 template <int D>
 double cost_at(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
                const OnePose<D>& T, double sigma, int radius, double floor, double unknown) {
-  Field<D> field(grid, {sigma, radius, floor, unknown});
-  // without the constant ln(floor + 1) of every beam: the oracle's form
-  const auto beams = beams_from<D>(points, weights);
-  const RegisterOptions options{{sigma, radius, floor, unknown}, 1.0, 0};
-  double constant = 0.0;
-  for (const double w : beams.weights) constant += w * std::log(floor + 1.0);
-  return data_cost<D>(field, beams, checked_pose<D>(T, "T"), options) - constant;
+  return data_term<D>(grid, beams_from<D>(points, weights), T, {sigma, radius, floor, unknown})
+      .cost;
 }
 
 template <int D>
 auto gradient_at(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
                  const OnePose<D>& T, double sigma, int radius, double floor, double unknown) {
-  Field<D> field(grid, {sigma, radius, floor, unknown});
-  const RegisterOptions options{{sigma, radius, floor, unknown}, 1.0, 0};
   const auto q =
-      linearise<D>(field, beams_from<D>(points, weights), checked_pose<D>(T, "T"), options);
+      data_term<D>(grid, beams_from<D>(points, weights), T, {sigma, radius, floor, unknown});
   const size_t n = Lie<D>::kDof;
   return owned(std::vector<double>(q.gradient.data(), q.gradient.data() + n), {n});
 }

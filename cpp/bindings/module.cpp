@@ -1,6 +1,10 @@
 #include "bindings.hpp"
 
+namespace nb = nanobind;
+
 NB_MODULE(_core, m) {
+  // a grid held by a traceback at exit is no leak that a user could act on
+  nb::set_leak_warnings(false);
   m.doc() =
       "Kernels on plain arrays. points (M, D) float32 in the sensor frame, hit (M,) bool, offset "
       "(T+1,) int64, T_map_sensor (T, D+1, D+1) float64, D = 2 or 3; NaN points are unusable "

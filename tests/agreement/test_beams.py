@@ -177,8 +177,8 @@ def test_no_beams_and_no_scans(dimension):
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_cells_far_apart_stay_apart(dimension):
-    # one end point 2^23 cells out: none of its powers-of-two neighbours may be taken for it
-    far = 2**23 + 2**22 + 5
+    # one end point 2^22 cells out: none of its powers-of-two neighbours may be taken for it
+    far = 2**22 + 2**21 + 5
     points = np.zeros((1, dimension), np.float32)
     T = np.eye(dimension + 1)[None].copy()
     T[0, :dimension, dimension] = 0.5
@@ -186,9 +186,9 @@ def test_cells_far_apart_stay_apart(dimension):
     grid = (_core.Grid2D if dimension == 2 else _core.Grid3D)(1.0)
     one = np.ones(1, np.float32)
     _core.add_beams(grid, points, np.array([True]), one, np.array([0, 1]), T)
-    cells = np.zeros((25, dimension), np.int64)
+    cells = np.zeros((24, dimension), np.int64)
     cells[:, 0] = far
-    cells[1:, 0] -= 2 ** np.arange(1, 25)
-    expected = np.zeros((25, 2))
+    cells[1:, 0] -= 2 ** np.arange(1, 24)
+    expected = np.zeros((24, 2))
     expected[0, 0] = 1
     assert (grid.alpha_beta(cells) == expected).all()

@@ -41,14 +41,17 @@ template <int D>
 struct Segment {
   Vec<D> start, end;
 
-  Segment(const Pose<D>& T_map_sensor, const float* point, double cells_per_metre)
-      : start(T_map_sensor.t * cells_per_metre),
-        end((T_map_sensor * point_at<D>(point)) * cells_per_metre) {
-    constexpr double limit = Grid<D>::kMaxCell;
-    if (!(start.cwiseAbs().maxCoeff() < limit && end.cwiseAbs().maxCoeff() < limit))
+  Segment(const Pose<D>& T_map_sensor, const float* point, double resolution)
+      : start(T_map_sensor.t / resolution), end((T_map_sensor * point_at<D>(point)) / resolution) {
+    if (!all_below<D>(start, Grid<D>::kMaxCell) || !all_below<D>(end, Grid<D>::kMaxCell))
       throw std::invalid_argument("beam: a pose or end point is not finite or too far away");
   }
 };
+
+inline double probability(float e) {
+  if (!(e >= 0.0f && e <= 1.0f)) throw std::invalid_argument("e: expected probabilities in [0, 1]");
+  return static_cast<double>(e);
+}
 
 // Calls work(scan, beam, pose) for every usable beam of the scans [first, last).
 template <int D, class Work>
@@ -65,9 +68,8 @@ template <int D>
 inline void add_scans(Grid<D>& grid, const Scans<D>& scans, const float* e, size_t first,
                       size_t last) {
   Cursor<Grid<D>> cursor(grid);
-  const double scale = 1.0 / grid.resolution();
   for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
-    const Segment<D> beam(pose, scans.points + n * D, scale);
+    const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
     // second sum of beta_j: the length by which the beam covers j, whatever e is
     const Cell<D> end = traverse<D>(beam.start, beam.end, [&](const Cell<D>& j, double length) {
       cursor.counts(j).beta += to_fixed(length);
@@ -75,9 +77,7 @@ inline void add_scans(Grid<D>& grid, const Scans<D>& scans, const float* e, size
     if (!scans.hit[n]) return;  // (1 - zeta) = 0: the end cell of a maximum-range beam says nothing
     auto* block = cursor.block(end);
     const auto local = static_cast<size_t>(Grid<D>::local_of(end));
-    const double static_share = static_cast<double>(e[n]);
-    if (!(static_share >= 0.0 && static_share <= 1.0))
-      throw std::invalid_argument("e: expected probabilities in [0, 1]");
+    const double static_share = probability(e[n]);
     block->counts[local].alpha += to_fixed(static_share);       // alpha_j
     block->counts[local].beta += to_fixed(1.0 - static_share);  // first sum of beta_j
     auto& moment = Grid<D>::moments_of(*block)[local];
@@ -109,7 +109,6 @@ inline double expectation(double prior, double m) {
 template <int D>
 inline void e_step(const Grid<D>& grid, const Scans<D>& scans, double prior, int threads,
                    float* e) {
-  const double scale = 1.0 / grid.resolution();
   std::fill(e + scans.offset[0], e + scans.offset[scans.n_scans],
             std::numeric_limits<float>::quiet_NaN());
   const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
@@ -118,7 +117,7 @@ inline void e_step(const Grid<D>& grid, const Scans<D>& scans, double prior, int
     for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
       e[n] = static_cast<float>(prior);
       if (!scans.hit[n]) return;
-      const Segment<D> beam(pose, scans.points + n * D, scale);
+      const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
       if (const Counts* c = cursor.seen(cell_of<D>(beam.end)))
         e[n] = static_cast<float>(expectation(prior, occupancy(*c)));
     });
@@ -142,16 +141,15 @@ inline double x_log(double x, double p) { return x > 0.0 ? x * safe_log(p) : 0.0
 template <int D>
 inline void log_likelihood(const Grid<D>& grid, const Scans<D>& scans, const float* e, double prior,
                            int threads, LogLikelihood* terms) {
-  const double scale = 1.0 / grid.resolution();
   const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
   parallel_shares(bounds, [&](size_t, size_t first, size_t last) {
     Cursor<const Grid<D>> cursor(grid);
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
       LogLikelihood& sum = terms[t];
-      const double en = static_cast<double>(e[n]);
+      const double en = probability(e[n]);
       sum.gamma += x_log(en, prior) + x_log(1.0 - en, 1.0 - prior);
       sum.entropy -= x_log(en, en) + x_log(1.0 - en, 1.0 - en);
-      const Segment<D> beam(pose, scans.points + n * D, scale);
+      const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
       const Cell<D> end = traverse<D>(beam.start, beam.end, [&](const Cell<D>& j, double length) {
         if (const Counts* c = cursor.seen(j))
           if (c->alpha > 0) sum.traversed += length * safe_log(1.0 - occupancy(*c));

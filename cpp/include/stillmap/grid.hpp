@@ -38,8 +38,9 @@ class Grid {
   static constexpr int kShift = D == 2 ? 5 : 3;
   static constexpr int kEdge = 1 << kShift;
   static constexpr int kCells = D == 2 ? kEdge * kEdge : kEdge * kEdge * kEdge;
-  static constexpr int32_t kMaxCell = 1 << 24;  // coordinates beyond are refused
-  using Moment = std::array<Fixed, D>;          // sum of e * (end point - cell corner), in cells
+  // coordinates beyond are refused; block coordinates fit the 21 bits that a key has for each
+  static constexpr int32_t kMaxCell = D == 2 ? 1 << 24 : 1 << 23;
+  using Moment = std::array<Fixed, D>;  // sum of e * (end point - cell corner), in cells
 
   struct Block {
     Cell<D> origin;  // block coordinates

@@ -4,6 +4,7 @@
 // seen space, floor + unknown elsewhere.
 #pragma once
 
+#include <Eigen/Cholesky>
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <vector>
@@ -17,6 +18,7 @@ template <int D>
 struct WeightedBeams {
   std::vector<Vec<D>> points;  // in the moving frame, metres
   std::vector<double> weights;
+  std::vector<Neighbourhood<D>> near;  // what each saw of the field last
 };
 
 struct RegisterOptions {
@@ -41,16 +43,6 @@ struct Registration {
 };
 
 template <int D>
-inline double data_cost(Field<D>& field, const WeightedBeams<D>& beams, const Pose<D>& pose,
-                        const RegisterOptions& options) {
-  double cost = 0.0;
-  for (size_t n = 0; n < beams.points.size(); ++n)
-    cost -= beams.weights[n] *
-            std::log(field.likelihood(pose * beams.points[n]) / (options.field.floor + 1.0));
-  return options.gain * cost;
-}
-
-template <int D>
 struct Quadratic {
   typename Lie<D>::Tangent gradient = Lie<D>::Tangent::Zero();
   Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> hessian =
@@ -65,6 +57,7 @@ template <int D>
 inline Eigen::Matrix<double, D, D> curvature(const FieldValue<D>& f, double sigma) {
   Eigen::Matrix<double, D, D> A = -f.spread;
   A.diagonal().array() += 1.0 / (sigma * sigma);
+  if (A.llt().info() == Eigen::Success) return A;  // the usual case: nothing negative
   Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> eigen;
   eigen.computeDirect(A);
   const Vec<D> kept = eigen.eigenvalues().cwiseMax(0.0);
@@ -72,14 +65,15 @@ inline Eigen::Matrix<double, D, D> curvature(const FieldValue<D>& f, double sigm
 }
 
 template <int D>
-inline Quadratic<D> linearise(Field<D>& field, const WeightedBeams<D>& beams, const Pose<D>& pose,
+inline Quadratic<D> linearise(Field<D>& field, WeightedBeams<D>& beams, const Pose<D>& pose,
                               const RegisterOptions& options) {
   Quadratic<D> q;
+  beams.near.resize(beams.points.size());
   double total = 0.0;
   for (size_t n = 0; n < beams.points.size(); ++n) {
     const double w = options.gain * beams.weights[n];
     const Vec<D> arm = pose.R * beams.points[n];
-    const FieldValue<D> f = field.evaluate(pose.t + arm);
+    const FieldValue<D> f = field.evaluate(pose.t + arm, beams.near[n]);
     total += beams.weights[n];
     q.cost -= w * std::log((f.base + f.value) / (options.field.floor + 1.0));
     if (f.value <= 0.0) continue;
@@ -96,7 +90,7 @@ inline Quadratic<D> linearise(Field<D>& field, const WeightedBeams<D>& beams, co
 
 // Damped Newton steps from `start`; never ends at a higher cost than it began.
 template <int D>
-inline Registration<D> climb(Field<D>& field, const WeightedBeams<D>& beams, const Prior<D>& prior,
+inline Registration<D> climb(Field<D>& field, WeightedBeams<D>& beams, const Prior<D>& prior,
                              const Pose<D>& start, const RegisterOptions& options) {
   auto with_prior = [&](const Pose<D>& pose, double cost) {
     const typename Lie<D>::Tangent d = pose.minus(prior.pose);
@@ -117,8 +111,8 @@ inline Registration<D> climb(Field<D>& field, const WeightedBeams<D>& beams, con
     const Pose<D> trial = out.pose.moved(delta);
     Quadratic<D> at_trial = linearise<D>(field, beams, trial, options);
     const double cost = with_prior(trial, at_trial.cost);
-    const bool small = delta.template head<D>().norm() < 1e-4 &&
-                       delta.template tail<Lie<D>::kRotation>().norm() < 1e-5;
+    const bool small = delta.template head<D>().norm() < 2e-4 &&
+                       delta.template tail<Lie<D>::kRotation>().norm() < 5e-5;
     if (cost <= out.cost) {
       out.pose = trial;
       out.cost = cost;

@@ -13,6 +13,12 @@ using Vec = Eigen::Matrix<double, D, 1>;
 template <int D>
 using Cell = Eigen::Matrix<int32_t, D, 1>;
 
+// NaN compares false, so it is refused like a coordinate that is too far away
+template <int D>
+inline bool all_below(const Vec<D>& x, double limit) {
+  return (x.array().abs() < limit).all();
+}
+
 template <int D>
 inline Cell<D> cell_of(const Vec<D>& point_in_cells) {
   return point_in_cells.array().floor().template cast<int32_t>();

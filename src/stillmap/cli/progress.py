@@ -25,7 +25,13 @@ def shown_progress(quiet: bool, iterations: int) -> Iterator[Progress]:
 @contextmanager
 def _bar(iterations: int) -> Iterator[Progress]:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        TaskID,
+        TextColumn,
+        TimeRemainingColumn,
+    )
     from rich.progress import Progress as Bar
 
     columns = (
@@ -36,7 +42,7 @@ def _bar(iterations: int) -> Iterator[Progress]:
         TimeRemainingColumn(),
     )
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        tasks = {}
+        tasks: dict[int, TaskID] = {}
         rate = _Rate()
 
         def progress(what: str, iteration: int, done: int, total: int) -> None:
