@@ -56,6 +56,7 @@ class Iteration:
         poses: (T, 3, 3) T_map_base.
         covariance: (T, 3, 3) of x, y, heading against the map so far.
         grid: the sums alpha, beta of (10).
+        weights: (M,) float32, the e that this M-step used; with `poses` they make `grid` again.
         p_static: (M,) float32, e after this iteration's E-step.
         likelihood: (5) and the bound at this map and e.
         changed_share: share of hits whose e moved by more than 0.1.
@@ -68,6 +69,7 @@ class Iteration:
     poses: Float
     covariance: Float
     grid: _core.Grid2D
+    weights: NDArray[np.float32]
     p_static: NDArray[np.float32]
     likelihood: em.Likelihood
     changed_share: float
@@ -109,11 +111,12 @@ def iterate(
             likelihood = em.log_likelihood(
                 recording, mapped.poses, mapped.grid, e, options.em, threads
             )
-        yield Iteration(
+        iteration = Iteration(
             number=number,
             poses=mapped.poses,
             covariance=mapped.covariance,
             grid=mapped.grid,
+            weights=before,
             p_static=e,
             likelihood=likelihood,
             changed_share=em.changed_share(before, e, recording.hit),
@@ -121,6 +124,9 @@ def iterate(
             widened=mapped.widened,
             seconds=time.perf_counter() - started,
         )
+        del mapped  # grids are large: only the caller decides how long one lives
+        yield iteration
+        del iteration
 
 
 def _at(progress: Progress, number: int) -> Callable[[int, int], None]:

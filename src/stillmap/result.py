@@ -2,7 +2,7 @@
 
 import itertools
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,34 +92,42 @@ def build(
         raise ValueError("recording: expected at least one scan")
     stages = stages or Stages()
     run = _Run(options)
-    for iteration in pipeline.iterate(
-        recording, options, poses=poses, progress=progress, stages=stages
-    ):
-        run.take(iteration, recording)
-        log.info(
-            "iteration %d: bound %.6g, %.2f %% of the beams changed",
-            iteration.number,
-            iteration.likelihood.bound,
-            100.0 * iteration.changed_share,
-        )
-        if run.finished:
-            break
+    iterations = pipeline.iterate(recording, options, poses=poses, progress=progress, stages=stages)
+    while not run.finished and run.take_next(iterations, recording):
+        pass
     with stages.measure("maps"):
         return run.result(recording, stages)
 
 
 @dataclass
 class _Run:
-    """What is kept while the loop runs: numbers of all iterations, arrays of the best alone."""
+    """What is kept while the loop runs: numbers of all iterations, arrays of the best alone.
+
+    No grid is kept: poses and weights make it again, to the bit.
+    """
 
     options: Options
     records: list[IterationRecord] = field(default_factory=list)
     snapshots: dict[int, Snapshot] = field(default_factory=dict)
     window: Window | None = None
-    best: Iteration | None = None
+    best: "_Best | None" = None
     finished: bool = False
 
-    def take(self, iteration: Iteration, recording: Recording) -> None:
+    def take_next(self, iterations: Iterator[Iteration], recording: Recording) -> bool:
+        """Runs one iteration; False when there is none left."""
+        iteration = next(iterations, None)
+        if iteration is None:
+            return False
+        self._take(iteration, recording)
+        log.info(
+            "iteration %d: bound %.6g, %.2f %% of the beams changed",
+            iteration.number,
+            iteration.likelihood.bound,
+            100.0 * iteration.changed_share,
+        )
+        return True
+
+    def _take(self, iteration: Iteration, recording: Recording) -> None:
         bound = iteration.likelihood.bound
         self.records.append(
             IterationRecord(
@@ -130,9 +138,9 @@ class _Run:
                 iteration.seconds,
             )
         )
-        gain = np.inf if self.best is None else bound - self.best.likelihood.bound
+        gain = np.inf if self.best is None else bound - self.best.bound
         if gain > 0.0:
-            self.best = iteration
+            self.best = _Best.of(iteration)
         if iteration.number <= 2 or gain > 0.0:
             self._remember(iteration, recording)
         settled = 0.0 <= gain < self.options.em.tolerance * recording.n_beams
@@ -140,7 +148,7 @@ class _Run:
         self.finished = settled or stuck
 
     @property
-    def kept(self) -> Iteration:
+    def kept(self) -> "_Best":
         if self.best is None:
             raise RuntimeError("no iteration has been run")
         return self.best
@@ -159,10 +167,10 @@ class _Run:
 
     def result(self, recording: Recording, stages: Stages) -> Result:
         kept = self.kept
-        filtered = em.occupancy_map(kept.grid)
-        raw = _core.Grid2D(kept.grid.resolution)
         threads = resolved_threads(self.options.threads)
-        em.add_recording(raw, recording, kept.poses, None, threads)
+        resolution = self.options.slam.resolution
+        filtered = _map_of(recording, kept.poses, kept.weights, resolution, threads)
+        raw = _map_of(recording, kept.poses, None, resolution, threads)
         return Result(
             recording=recording,
             options=self.options,
@@ -172,7 +180,7 @@ class _Run:
             covariance=kept.covariance,
             p_static=kept.p_static,
             map=filtered,
-            raw_map=em.occupancy_map(raw),
+            raw_map=raw,
             best_iteration=kept.number,
             converged=self.finished,
             warnings=_warnings(self.records, kept, recording),
@@ -180,14 +188,55 @@ class _Run:
         )
 
 
-def _warnings(records: list[IterationRecord], kept: Iteration, recording: Recording) -> list[str]:
+@dataclass(frozen=True, eq=False)
+class _Best:
+    """The best iteration so far, without its grid; see Iteration."""
+
+    number: int
+    bound: float
+    poses: Float
+    covariance: Float
+    weights: NDArray[np.float32]
+    p_static: NDArray[np.float32]
+    explained: Float
+    widened: list[int]
+
+    @classmethod
+    def of(cls, iteration: Iteration) -> "_Best":
+        return cls(
+            iteration.number,
+            iteration.likelihood.bound,
+            iteration.poses,
+            iteration.covariance,
+            iteration.weights,
+            iteration.p_static,
+            iteration.explained,
+            iteration.widened,
+        )
+
+
+def _map_of(
+    recording: Recording,
+    poses: Float,
+    weights: NDArray[np.float32] | None,
+    resolution: float,
+    threads: int,
+) -> em.OccupancyMap:
+    grid = _core.Grid2D(resolution)
+    em.add_recording(grid, recording, poses, weights, threads)
+    return em.occupancy_map(grid)
+
+
+def _warnings(records: list[IterationRecord], kept: _Best, recording: Recording) -> list[str]:
     out = []
-    for before, after in itertools.pairwise(records):
-        if after.bound < before.bound:
-            out.append(
-                f"the likelihood dipped from iteration {before.number} to {after.number}, as the "
-                f"incremental poses allow; iteration {kept.number} is the best and was kept"
-            )
+    dips = [
+        after.number for before, after in itertools.pairwise(records) if after.bound < before.bound
+    ]
+    if dips:
+        out.append(
+            f"the likelihood dipped at iteration {', '.join(map(str, dips))}, as the incremental "
+            f"poses allow; iteration {kept.number} is the best and was kept"
+        )
     if recording.T_odom_base is None:
         out.append("no odometry: a constant velocity was assumed between scans")
     if kept.widened:

@@ -31,8 +31,9 @@ class OccupancyMap:
 def occupancy_map(grid: _core.Grid2D) -> OccupancyMap:
     """The closed-form maximum (15) of the counts in a grid."""
     first_cell, alpha, beta = grid.dense()
-    total = alpha + beta
     p_occupied = np.full(alpha.shape, np.nan, dtype=np.float32)
-    np.divide(alpha, total, out=p_occupied, where=total > 0.0, casting="same_kind")  # (15)
+    for a, b, p in zip(alpha, beta, p_occupied, strict=True):  # by rows: maps are large
+        total = a + b
+        np.divide(a, total, out=p, where=total > 0.0, casting="same_kind")  # (15)
     x, y = (float(c) * grid.resolution for c in first_cell)
     return OccupancyMap(p_occupied, alpha, beta, (x, y, 0.0), grid.resolution)
