@@ -29,6 +29,9 @@ class RegistrationOptions:
     doubt_below: float = field_with_doc(
         0.4, "share of beams the map explains below which a wider search is tried"
     )
+    accept_above: float = field_with_doc(
+        0.6, "share it must then explain: a wide search also finds look-alikes"
+    )
     doubt_translation: float = field_with_doc(0.5, "m, half width of that search at least")
     doubt_rotation: float = field_with_doc(0.5, "rad, half width of that search at least")
     lost_translation: float = field_with_doc(
@@ -79,12 +82,12 @@ def register(
     translation = options.window * prior.sigma_translation
     rotation = options.window * prior.sigma_rotation
     found = _search(grid, points, weights, prior, options, translation, rotation)
+    if found.explained >= options.doubt_below or len(points) == 0:
+        return found
     for least_translation, least_rotation in (
         (options.doubt_translation, options.doubt_rotation),
         (options.lost_translation, np.pi),
     ):
-        if found.explained >= options.doubt_below or len(points) == 0:
-            break
         wider = _search(
             grid,
             points,
@@ -94,9 +97,8 @@ def register(
             max(translation, least_translation),
             max(rotation, least_rotation),
         )
-        # it has to explain clearly more: a wide search also finds look-alikes
-        if wider.explained > found.explained + 0.1:
-            found = dataclasses.replace(wider, widened=True)
+        if wider.explained >= options.accept_above:
+            return dataclasses.replace(wider, widened=True)
     return found
 
 
