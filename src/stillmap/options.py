@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import json
+import sys
 import tomllib
 import types
 import typing
@@ -13,6 +14,8 @@ from typing import Any, TypeVar
 from stillmap.errors import InputError
 
 T = TypeVar("T")
+
+_INTEGERS_BELOW = 2**31  # the compiled core counts in 32 bits
 
 
 def field_with_doc(default: Any, doc: str) -> Any:
@@ -63,8 +66,12 @@ def _coerced(value: Any, hint: Any, name: str, where: str) -> Any:
         if typing.get_origin(choice) is typing.Literal and value in typing.get_args(choice):
             return value
         if choice is float and isinstance(value, int | float) and not isinstance(value, bool):
+            if not abs(value) <= sys.float_info.max:  # nan, inf, and integers beyond them
+                raise InputError(f"'{name}' wants a finite number, got {value}", where=where)
             return float(value)
         if choice in (int, bool, str) and type(value) is choice:
+            if choice is int and abs(value) >= _INTEGERS_BELOW:
+                raise InputError(f"'{name}' is too large: {value}", where=where)
             return value
         if choice is type(None) and value is None:
             return value
@@ -84,7 +91,7 @@ def load_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"is not TOML: {error}", where=str(path)) from error
 
 
@@ -95,7 +102,7 @@ def parse_assignment(text: str) -> dict[str, Any]:
         raise InputError(f"--set wants section.key=value, got '{text}'")
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         parsed = value.strip()
     nested: dict[str, Any] = {}
     inner = nested

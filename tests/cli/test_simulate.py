@@ -93,7 +93,8 @@ def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path: Path) -> None
         (["--seed", "-1"], "--seed must not be negative"),
         (["--fov", "90", "--format", "carmen"], "half a circle"),
         (["--max-range", "100", "--format", "carmen"], "ranges up to"),
-        (["--max-range", "nan"], "max_range must be positive"),
+        (["--max-range", "nan"], "max_range.* wants a finite number"),
+        (["--max-range", "0"], "max_range must be positive"),
         (["--odometry-noise", "-1"], "errors must be >= 0"),
     ],
 )

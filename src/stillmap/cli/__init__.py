@@ -9,6 +9,7 @@ from types import FrameType
 
 from stillmap import __version__
 from stillmap.cli import config, eval, info, map, simulate
+from stillmap.cli.progress import say
 from stillmap.errors import InputError
 
 EXIT_OURS, EXIT_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 2, 130, 143
@@ -26,6 +27,10 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> None:  # type: ignore[override]
         self.exit(EXIT_INPUT, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+    def exit(self, status: int = 0, message: str | None = None) -> None:  # type: ignore[override]
+        _flush_stdout()  # --help and --version may be going into a pipe that has closed
+        super().exit(status, message)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -46,25 +51,40 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one command; returns its exit status."""
-    args = parser().parse_args(argv)
-    logging.basicConfig(
-        level=logging.INFO if args.verbose else logging.WARNING, format="stillmap: %(message)s"
-    )
-    signal.signal(signal.SIGTERM, _terminated)
     try:
+        args = parser().parse_args(argv)
+        logging.basicConfig(
+            level=logging.INFO if args.verbose else logging.WARNING, format="stillmap: %(message)s"
+        )
+        signal.signal(signal.SIGTERM, _terminated)
         status: int = args.run(args)
-        sys.stdout.flush()
+        _flush_stdout()
         return status
     except InputError as error:
-        print(f"stillmap: {error}", file=sys.stderr)
+        say(str(error))
         return EXIT_INPUT
     except KeyboardInterrupt:
-        print("stillmap: interrupted, nothing was half-written", file=sys.stderr)
+        say("interrupted, nothing was half-written")
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         # the reader of our output has gone: nothing more can be said, and nothing is wrong
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_stdout()
         return 0
+    except OSError as error:
+        say(str(error))  # a full disk behind stdout, a file that vanished while it was read
+        _drop_stdout()
+        return EXIT_INPUT
+
+
+def _flush_stdout() -> None:
+    if sys.stdout is not None:  # None: it was closed before we began
+        sys.stdout.flush()
+
+
+def _drop_stdout() -> None:
+    """What is still buffered goes nowhere, instead of failing once more when Python ends."""
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _terminated(signum: int, frame: FrameType | None) -> None:  # noqa: ARG001

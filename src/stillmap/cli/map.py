@@ -1,12 +1,12 @@
 """`stillmap map`: the main job, recording in, folder out."""
 
 import argparse
-import sys
+import os
 from pathlib import Path
 from typing import Any
 
 from stillmap.cli.options import add_option_flags, resolved_options
-from stillmap.cli.progress import shown_progress
+from stillmap.cli.progress import say, shown_progress
 from stillmap.cli.reading import add_read_flags, read_changes
 from stillmap.errors import InputError
 from stillmap.output.atomic import require_new
@@ -45,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
     options = resolved_options(args, read_changes(args), _changes(args))
     output = Path(args.output)
     require_new(output, args.overwrite)
+    _require_writable(output)
     stages = Stages()
     with stages.measure("read"):
         recording = read(Path(args.input), options.read)
@@ -56,6 +57,15 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         _say(result, output)
     return 0
+
+
+def _require_writable(output: Path) -> None:
+    """Refuse a place that cannot be written to before the work is done, not after."""
+    parent = Path(os.path.abspath(output)).parent
+    while not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise InputError(f"cannot be written: {parent} lets nothing in", where=str(output))
 
 
 def _usable(recording: Recording, args: argparse.Namespace) -> Recording:
@@ -90,4 +100,4 @@ def _say(result: Result, output: Path) -> None:
         f"wrote {output}: open {output / 'report.html'}",
     ]
     for line in lines:
-        print(f"stillmap: {line}", file=sys.stderr)
+        say(line)

@@ -1,5 +1,6 @@
 """Progress on stderr: a bar on a terminal, a line now and then elsewhere, nothing if quiet."""
 
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -10,10 +11,20 @@ from stillmap.pipeline import Progress, silent
 _EVERY = 10.0  # s between lines where there is no terminal
 
 
+def say(line: str) -> None:
+    """One line on stderr. That nobody listens there any more is no reason to give up the work."""
+    if sys.stderr is None:
+        return
+    try:
+        print(f"stillmap: {line}", file=sys.stderr, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+
+
 @contextmanager
 def shown_progress(quiet: bool, iterations: int) -> Iterator[Progress]:
     """A Progress that shows iteration, scan, rate and time left."""
-    if quiet:
+    if quiet or sys.stderr is None:  # None: it was closed before we began
         yield silent
     elif sys.stderr.isatty():
         with _bar(iterations) as progress:
@@ -84,8 +95,7 @@ class _Lines:
             return
         self._last = now
         left = (total - done) / max(rate, 1e-3)
-        print(
-            f"stillmap: {what}, iteration {iteration} of at most {self._iterations}: "
-            f"{done} of {total} scans, {rate:.0f}/s, {left:.0f} s left in this iteration",
-            file=sys.stderr,
+        say(
+            f"{what}, iteration {iteration} of at most {self._iterations}: "
+            f"{done} of {total} scans, {rate:.0f}/s, {left:.0f} s left in this iteration"
         )

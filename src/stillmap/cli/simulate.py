@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from stillmap.cli.progress import say
 from stillmap.errors import InputError
 from stillmap.output.atomic import require_new
 from stillmap.simulation import SCENES, Simulation, scene_by_name, simulate, write_simulation
@@ -89,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
         simulation = simulate(scene, np.random.default_rng(args.seed), progress)
     write_simulation(simulation, output, format=args.format, overwrite=args.overwrite)
     if not args.quiet:
-        print(_summary(simulation, output), file=sys.stderr)
+        say(_summary(simulation, output))
     return 0
 
 
@@ -116,7 +117,7 @@ def _summary(simulation: Simulation, output: Path) -> str:
     hits = int(np.count_nonzero(recording.hit))
     dynamic = int(np.count_nonzero(truth.mover >= 0))
     return (
-        f"stillmap: {simulation.scene.name}: {recording.n_scans} scans, {recording.n_beams} beams, "
+        f"{simulation.scene.name}: {recording.n_scans} scans, {recording.n_beams} beams, "
         f"{100 * dynamic / max(hits, 1):.1f} % of the hits on people; in {output}"
     )
 
@@ -124,7 +125,7 @@ def _summary(simulation: Simulation, output: Path) -> str:
 @contextmanager
 def _shown_progress(quiet: bool) -> Iterator[Progress | None]:
     """A bar on a terminal; elsewhere the summary says enough about a job of seconds."""
-    if quiet or not sys.stderr.isatty():
+    if quiet or sys.stderr is None or not sys.stderr.isatty():
         yield None
         return
     from rich.console import Console

@@ -1,0 +1,263 @@
+"""Options: what is refused and how, what survives the way through TOML."""
+
+import dataclasses
+import math
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+
+from stillmap.errors import InputError
+from stillmap.options import (
+    field_with_doc,
+    load_toml,
+    merged,
+    parse_assignment,
+    replaced,
+    to_dict,
+    to_toml,
+)
+from stillmap.pipeline import Options
+
+
+@dataclass(frozen=True)
+class Inner:
+    width: float = field_with_doc(0.5, "m, how wide")
+    limit: float | None = field_with_doc(None, "m, unset: none")
+
+    def __post_init__(self) -> None:
+        if self.width <= 0.0:
+            raise ValueError("'inner.width' wants a positive number")
+
+
+@dataclass(frozen=True)
+class Outer:
+    count: int = field_with_doc(3, "how many")
+    on: bool = field_with_doc(False, "whether")
+    name: str = field_with_doc('it\'s "quoted" \\ here', "a name")
+    shape: Literal["round", "square"] = field_with_doc("round", "one of two")
+    inner: Inner = field(default=Inner())
+
+
+def refusal(changes: dict[str, Any], where: str = "file.toml") -> str:
+    with pytest.raises(InputError) as caught:
+        replaced(Outer(), changes, where)
+    return str(caught.value)
+
+
+def test_changes_reach_nested_sections_and_leave_the_rest() -> None:
+    before = Outer(count=7)
+    after = replaced(before, {"inner": {"limit": 4.0}, "on": True})
+    assert after == Outer(count=7, on=True, inner=Inner(limit=4.0))
+    assert before == Outer(count=7)
+
+
+@pytest.mark.parametrize(
+    ("changes", "wanted"),
+    [
+        ({"count": 2.0}, "'count' wants int, got 2.0"),
+        ({"count": True}, "'count' wants int, got True"),
+        ({"count": "2"}, "'count' wants int, got '2'"),
+        ({"count": None}, "'count' wants int, got None"),
+        ({"on": 1}, "'on' wants bool, got 1"),
+        ({"name": 1}, "'name' wants str, got 1"),
+        ({"shape": "oval"}, "'shape' wants 'round' | 'square', got 'oval'"),
+        ({"shape": ["round"]}, "'shape' wants 'round' | 'square', got ['round']"),
+        ({"inner": {"width": "1"}}, "'inner.width' wants float, got '1'"),
+        ({"inner": {"width": False}}, "'inner.width' wants float, got False"),
+        ({"inner": {"width": [1.0]}}, "'inner.width' wants float, got [1.0]"),
+        ({"inner": {"limit": "none"}}, "'inner.limit' wants float or nothing, got 'none'"),
+        ({"inner": {"width": {"a": 1}}}, "'inner.width' wants float"),
+        ({"inner": 3}, "'inner' is a section, not a value"),
+        ({"count": 2**31}, "'count' is too large: 2147483648"),
+        ({"inner": {"width": math.nan}}, "'inner.width' wants a finite number, got nan"),
+        ({"inner": {"width": -math.inf}}, "'inner.width' wants a finite number, got -inf"),
+        ({"inner": {"width": 10**400}}, "'inner.width' wants a finite number, got 1000"),
+        # a range that the section itself knows
+        ({"inner": {"width": -1.0}}, "'inner.width' wants a positive number"),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_place(changes: dict[str, Any], wanted: str) -> None:
+    message = refusal(changes)
+    assert message.startswith(f"file.toml: {wanted}")
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("changes", "unknown", "nearest"),
+    [
+        ({"counts": 1}, "counts", "count"),
+        ({"inner": {"widht": 1.0}}, "inner.widht", "inner.width"),
+        ({"iner": {"width": 1.0}}, "iner", "inner"),
+    ],
+)
+def test_an_unknown_key_names_the_nearest(
+    changes: dict[str, Any], unknown: str, nearest: str
+) -> None:
+    assert refusal(changes) == f"file.toml: unknown option '{unknown}' (nearest: '{nearest}')"
+
+
+def test_even_a_key_like_none_of_them_gets_an_answer() -> None:
+    assert "unknown option '#'" in refusal({"#": 1})
+    assert "unknown option ''" in refusal({"": 1})
+
+
+def test_whole_numbers_do_for_floats() -> None:
+    width = replaced(Outer(), {"inner": {"width": 2}}).inner.width
+    assert (type(width), width) == (float, 2.0)
+
+
+def test_none_stays_possible_where_it_is() -> None:
+    set_once = Outer(inner=Inner(limit=1.0))
+    assert replaced(set_once, {"inner": {"limit": None}}).inner.limit is None
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        Outer(),
+        Outer(4, True, "", "square", Inner(1e-300, 1e300)),
+        Outer(name="tab\t newline\n ünïcode #"),
+        Options(),
+        replaced(Options(), {"threads": 2, "read": {"max_range": 30.0}}),
+    ],
+)
+def test_toml_round_trip(options: Any) -> None:
+    text = to_toml(options)
+    assert replaced(type(options)(), tomllib.loads(text)) == options
+    assert to_toml(replaced(type(options)(), tomllib.loads(text))) == text
+
+
+def test_toml_tells_what_is_not_set_and_what_everything_means() -> None:
+    assert to_toml(Outer()).splitlines() == [
+        "count = 3  # how many",
+        "on = false  # whether",
+        'name = "it\'s \\"quoted\\" \\\\ here"  # a name',
+        'shape = "round"  # one of two',
+        "",
+        "[inner]",
+        "width = 0.5  # m, how wide",
+        "# limit is not set  # m, unset: none",
+    ]
+
+
+def leaves(options: Any, prefix: str = "") -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for f in dataclasses.fields(options):
+        value = getattr(options, f.name)
+        if dataclasses.is_dataclass(value):
+            out |= leaves(value, f"{prefix}{f.name}.")
+        else:
+            out[f"{prefix}{f.name}"] = (f, value)
+    return out
+
+
+def test_every_option_of_stillmap_says_what_it_means() -> None:
+    undocumented = [k for k, (f, _) in leaves(Options()).items() if not f.metadata.get("doc")]
+    assert undocumented == []
+
+
+def test_the_names_that_others_rely_on() -> None:
+    names = leaves(Options())
+    assert {"em.max_iterations", "em.prior", "threads"} <= set(names)
+
+
+def numbers() -> list[str]:
+    return [k for k, (_, value) in leaves(Options()).items() if type(value) in (int, float)]
+
+
+@pytest.mark.parametrize("name", numbers())
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "true", '"1"', "1e400", "[]"])
+def test_no_number_takes_what_is_no_number(name: str, value: str) -> None:
+    with pytest.raises(InputError, match=f"'{name}'"):
+        replaced(Options(), parse_assignment(f"{name}={value}"), "--set")
+
+
+@pytest.mark.parametrize(
+    "assignment",
+    [
+        "threads=-1",
+        "estimator=guess",
+        "em.prior=0",
+        "em.prior=1.0",
+        "em.max_iterations=0",
+        "em.patience=0",
+        "em.tolerance=-1e-9",
+        "slam.resolution=0",
+        "slam.resolution=0.001",
+        "slam.resolution=11",
+        "slam.registration.sigma=0",
+        "slam.registration.floor=-0.1",
+        "slam.registration.gain=0",
+        "read.min_range=-1",
+        "read.max_range=0",
+        "read.zero_means=maybe",
+        "output.map_mode=ternary",
+    ],
+)
+def test_a_value_out_of_range_becomes_an_input_error(assignment: str) -> None:
+    with pytest.raises(InputError) as caught:
+        replaced(Options(), parse_assignment(assignment), "here.toml")
+    assert str(caught.value).startswith("here.toml: ")
+    # it says which option, by its last name at least
+    assert assignment.split("=")[0].split(".")[-1] in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("threads=2", {"threads": 2}),
+        ("em.prior=0.8", {"em": {"prior": 0.8}}),
+        (" em.prior = 0.8 ", {"em": {"prior": 0.8}}),
+        ("slam.motion.rotation_floor=1e-2", {"slam": {"motion": {"rotation_floor": 0.01}}}),
+        ("output.map_mode=raw", {"output": {"map_mode": "raw"}}),
+        ('output.map_mode="raw"', {"output": {"map_mode": "raw"}}),
+        ("a=b=c", {"a": "b=c"}),
+        ("a=true", {"a": True}),
+        ("a=", {"a": ""}),
+        ("a=" + "[" * 5000, {"a": "[" * 5000}),
+    ],
+)
+def test_assignments(text: str, expected: dict[str, Any]) -> None:
+    assert parse_assignment(text) == expected
+
+
+@pytest.mark.parametrize("text", ["em.prior", "=3", " =3", ""])
+def test_what_is_no_assignment(text: str) -> None:
+    with pytest.raises(InputError, match=r"section\.key=value"):
+        parse_assignment(text)
+
+
+def test_later_changes_win_and_sections_merge() -> None:
+    first = {"em": {"prior": 0.5, "patience": 3}, "threads": 1}
+    second = {"em": {"prior": 0.6}, "slam": {"resolution": 0.1}}
+    assert merged(first, second) == {
+        "em": {"prior": 0.6, "patience": 3},
+        "threads": 1,
+        "slam": {"resolution": 0.1},
+    }
+    assert first == {"em": {"prior": 0.5, "patience": 3}, "threads": 1}
+    assert merged() == {}
+
+
+def test_to_dict_is_plain_and_nested() -> None:
+    assert to_dict(Outer())["inner"] == {"width": 0.5, "limit": None}
+
+
+def test_toml_files_that_cannot_be_used(tmp_path: Path) -> None:
+    broken, binary, deep = (tmp_path / name for name in ("broken", "binary", "deep"))
+    broken.write_text("[em\nprior = 1")
+    binary.write_bytes(b"\xff\xfe\x00")
+    deep.write_text("a = " + "[" * 100_000)
+    for path, said in (
+        (broken, "is not TOML"),
+        (binary, "is not TOML"),
+        (deep, "is not TOML"),
+        (tmp_path, "cannot be read"),
+        (tmp_path / "absent", "cannot be read"),
+    ):
+        with pytest.raises(InputError, match=said) as caught:
+            load_toml(path)
+        assert str(caught.value).startswith(str(path))
