@@ -1,0 +1,81 @@
+"""The command as a process of its own, and a small room to map."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillmap.simulation import (
+    CrowdOptions,
+    LaserOptions,
+    RobotOptions,
+    Scene,
+    simulate,
+    write_simulation,
+)
+from stillmap.simulation.walls import box
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="session")
+def command() -> list[str]:
+    """How to call stillmap."""
+    return [sys.executable, "-m", "stillmap"]
+
+
+@pytest.fixture(scope="session")
+def stillmap(command: list[str]) -> Run:
+    """Calls stillmap and waits for it."""
+
+    def run(*words: object, **options: object) -> subprocess.CompletedProcess[str]:
+        defaults = {"capture_output": True, "text": True, "timeout": 60}
+        return subprocess.run([*command, *map(str, words)], **(defaults | options))
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def start(command: list[str]) -> Callable[..., subprocess.Popen[str]]:
+    """Starts stillmap, which hears Ctrl-C even where the tests themselves do not."""
+
+    def popen(*words: object, **options: object) -> subprocess.Popen[str]:
+        before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # a child inherits it when ignored
+        try:
+            defaults = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+            return subprocess.Popen([*command, *map(str, words)], **(defaults | options))
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    return popen
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording folder: a room of 8 x 6 m with two people, 40 scans of 120 beams."""
+    path = tmp_path_factory.mktemp("recording") / "room"
+    scene = Scene(
+        "room",
+        walls=(*box(0, 0, 8, 6), *box(1.5, 1.5, 0.8, 0.6), *box(-2.0, 1.8, 1.0, 0.4)),
+        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
+        crowd=CrowdOptions(people=2),
+        laser=LaserOptions(beams=120, range_noise=0.01, max_range=7.0),
+        robot=RobotOptions(scans=40),
+    )
+    write_simulation(simulate(scene, np.random.default_rng(1)), path)
+    return path
+
+
+@pytest.fixture
+def nothing_left(tmp_path: Path) -> Callable[..., None]:
+    """Checks that tmp_path holds these names alone: no temporary folder stayed behind."""
+
+    def check(*names: str) -> None:
+        assert sorted(os.listdir(tmp_path)) == sorted(names)
+
+    return check

@@ -1,0 +1,125 @@
+"""`stillmap config`, and how options are chosen: default < file < --set < flag."""
+
+import json
+import tomllib
+
+import pytest
+
+from stillmap.cli import main
+from stillmap.options import to_dict
+from stillmap.pipeline import Options
+
+
+def config(capsys, *words: object) -> str:
+    assert main(["config", *map(str, words)]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    return out
+
+
+def refusal(capsys, *words: object) -> str:
+    assert main(["config", *map(str, words)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    return err
+
+
+def without_none(options: dict) -> dict:
+    return {
+        key: without_none(value) if isinstance(value, dict) else value
+        for key, value in options.items()
+        if value is not None
+    }
+
+
+def test_prints_every_option_with_its_default(capsys):
+    assert tomllib.loads(config(capsys)) == without_none(to_dict(Options()))
+
+
+def test_every_option_has_its_meaning_behind_it(capsys):
+    for line in config(capsys).splitlines():
+        if line and not line.startswith("["):
+            assert line.count("  # ") == 1
+            assert len(line.split("  # ")[1]) > 8, line
+
+
+def test_config_takes_its_own_output_unchanged(capsys, tmp_path):
+    chosen = ("--set", "em.prior=0.75", "--set", "read.max_range=20", "--set", "threads=3")
+    file = tmp_path / "options.toml"
+    file.write_text(config(capsys, *chosen))
+    assert config(capsys, "--config", file) == file.read_text()
+    assert tomllib.loads(file.read_text())["em"]["prior"] == 0.75
+
+
+def test_set_wins_over_the_file_and_the_last_set_wins(capsys, tmp_path):
+    file = tmp_path / "options.toml"
+    file.write_text("threads = 5\n[em]\nprior = 0.6\nmax_iterations = 9\n")
+    sets = ("--set", "em.prior=0.7", "--set", "em.prior=0.8")
+    for words in (("--config", file, *sets), (*sets, "--config", file)):
+        options = tomllib.loads(config(capsys, *words))
+        assert options["threads"] == 5
+        assert options["em"]["prior"] == 0.8
+        assert options["em"]["max_iterations"] == 9
+        assert options["em"]["patience"] == Options().em.patience
+
+
+def test_a_flag_wins_over_set_and_file(capsys, tmp_path, room):
+    file = tmp_path / "options.toml"
+    file.write_text(
+        "threads = 3\n[em]\nmax_iterations = 1\n[slam]\nresolution = 0.4\n[read]\nmin_range = 0.1\n"
+    )
+    words = ["map", room, "-o", tmp_path / "out", "--quiet", "--config", file]
+    words += ["--set", "slam.resolution=0.3", "--set", "read.min_range=0.2"]
+    words += ["--resolution", 0.2, "--min-range", 0.3, "--map-mode", "raw"]
+    assert main([*map(str, words)]) == 0
+    assert capsys.readouterr() == ("", "")
+    options = json.loads((tmp_path / "out/run.json").read_text())["options"]
+    assert options["threads"] == 3
+    assert options["slam"]["resolution"] == 0.2
+    assert options["read"]["min_range"] == 0.3
+    assert options["em"]["max_iterations"] == 1
+    assert options["output"]["map_mode"] == "raw"
+
+
+@pytest.mark.parametrize(
+    ("key", "nearest"),
+    [
+        ("em.priors", "em.prior"),
+        ("em.max_iteration", "em.max_iterations"),
+        ("slam.registration.sigm", "slam.registration.sigma"),
+        ("thread", "threads"),
+    ],
+)
+def test_an_unknown_option_names_the_nearest(capsys, tmp_path, key, nearest):
+    assert refusal(capsys, "--set", f"{key}=1") == (
+        f"stillmap: --set: unknown option '{key}' (nearest: '{nearest}')\n"
+    )
+    file = tmp_path / "options.toml"
+    *sections, name = key.split(".")
+    file.write_text((f"[{'.'.join(sections)}]\n" if sections else "") + f"{name} = 1\n")
+    assert refusal(capsys, "--config", file) == (
+        f"stillmap: {file}: unknown option '{key}' (nearest: '{nearest}')\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--set", "em.prior=2"), ("--set: ", "em.prior")),
+        (("--set", "em.prior=high"), ("--set: ", "em.prior", "'high'")),
+        (("--set", "em=1"), ("--set: ", "'em' is a section")),
+        (("--set", "em.prior"), ("section.key=value",)),
+        (("--config", "/nowhere/options.toml"), ("/nowhere/options.toml: cannot be read",)),
+    ],
+)
+def test_wrong_values_say_where(capsys, words, said):
+    message = refusal(capsys, *words)
+    for part in said:
+        assert part in message
+
+
+def test_a_file_that_is_no_toml(capsys, tmp_path):
+    file = tmp_path / "options.toml"
+    file.write_text("em.prior: 0.8\n")
+    assert f"{file}: is not TOML" in refusal(capsys, "--config", file)

@@ -1,0 +1,141 @@
+"""The command as others see it: exit status, one line of error, pipes that close."""
+
+import json
+import os
+import subprocess
+
+import pytest
+
+COMMANDS = [
+    (),
+    ("map",),
+    ("info",),
+    ("simulate",),
+    ("config",),
+    ("eval",),
+    ("eval", "relations"),
+    ("eval", "trajectory"),
+    ("eval", "labels"),
+    ("eval", "map"),
+]
+
+
+def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
+    """Exit status 2, one line on stderr with these words, nothing on stdout."""
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("stillmap")
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.endswith("\n")
+    for word in words:
+        assert word in done.stderr
+
+
+@pytest.mark.parametrize("names", COMMANDS, ids=" ".join)
+def test_help(names, capsys, monkeypatch):
+    from stillmap.cli import main
+
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit) as left:
+        main([*names, "--help"])
+    assert left.value.code == 0
+    out, err = capsys.readouterr()
+    assert out.startswith("usage: stillmap")
+    assert err == ""
+
+
+def test_version(stillmap):
+    import stillmap as package
+
+    done = stillmap("--version")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == f"stillmap {package.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "COMMAND"),
+        (("chart",), "'chart'"),
+        (("map",), "INPUT"),
+        (("map", "log"), "--output"),
+        (("map", "log", "-o"), "-o"),
+        (("map", "log", "-o", "out", "--resolution", "fine"), "--resolution"),
+        (("map", "log", "-o", "out", "--estimator", "guess"), "'guess'"),
+        (("info", "--frobnicate", "x"), "--frobnicate"),
+        (("eval",), "eval"),
+    ],
+)
+def test_a_bad_call_is_one_line(words, said, capsys):
+    from stillmap.cli import main
+
+    with pytest.raises(SystemExit) as left:
+        main(list(words))
+    out, err = capsys.readouterr()
+    assert (left.value.code, out) == (2, "")
+    assert err.startswith("stillmap")
+    assert err.count("\n") == 1
+    assert said in err
+    assert "--help" in err
+
+
+def test_a_bad_call_is_one_line_from_outside_too(stillmap, tmp_path):
+    refused(stillmap("info", tmp_path / "absent.log"), str(tmp_path / "absent.log"))
+    refused(stillmap("frobnicate"), "frobnicate")
+
+
+def test_json_stands_alone_on_stdout(stillmap, tmp_path):
+    # a damaged line is reported, but not there
+    log = tmp_path / "some.log"
+    scan = "FLASER 3 1.0 1.0 1.0 0 0 0 0 0 0 {} host {}\n"
+    log.write_text(scan.format(1.0, 1.0) + "FLASER 3 1.0\n" + scan.format(2.0, 2.0))
+    done = stillmap("info", log, "--json")
+    assert done.returncode == 0
+    assert done.stdout.startswith("{")
+    assert json.loads(done.stdout)["scans"] == 2
+
+
+def test_an_eager_reader_is_no_error(stillmap, room):
+    for words in (("info", room), ("info", room, "--json"), ("config",), ("--help",)):
+        reader, writer = os.pipe()
+        os.close(reader)  # as `| head -0`: gone before the first line
+        try:
+            done = stillmap(*words, capture_output=False, stdout=writer, stderr=subprocess.PIPE)
+        finally:
+            os.close(writer)
+        assert (done.returncode, done.stderr) == (0, ""), words
+
+
+def test_closed_streams_are_no_error(room, command):
+    quoted = " ".join(command)
+    for redirection in (">&-", "2>&-", ">&- 2>&-"):
+        done = subprocess.run(
+            ["sh", "-c", f'{quoted} info "$1" {redirection}', "sh", str(room)],
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+        assert (done.returncode, done.stderr) == (0, ""), redirection
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
+def test_a_full_disk_behind_stdout_is_one_line(stillmap):
+    with open("/dev/full", "w") as full:
+        done = stillmap("config", capture_output=False, stdout=full, stderr=subprocess.PIPE)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("stillmap: ")
+
+
+def test_a_defect_of_ours_exits_with_1(command):
+    # not caught: the trace is what we want to be sent
+    program = (
+        "import sys, stillmap.cli.config as c\n"
+        "def fail(args): raise RuntimeError('ours')\n"
+        "c.run = fail\n"
+        "from stillmap.cli import main\n"
+        "sys.exit(main(['config']))\n"
+    )
+    done = subprocess.run([command[0], "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert "RuntimeError: ours" in done.stderr
