@@ -68,7 +68,6 @@ lint: $(VENV)/tested
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
-	$(BIN)/python -m mypy.stubtest stillmap._core
 	find cpp -name '*.[ch]pp' -print0 | xargs -0 $(BIN)/clang-format --dry-run --Werror
 
 format: $(VENV)/tools
