@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stillmap.cli import main
 from stillmap.simulation import (
     CrowdOptions,
     LaserOptions,
@@ -36,6 +37,17 @@ def stillmap(command: list[str]) -> Run:
     def run(*words: object, **options: object) -> subprocess.CompletedProcess[str]:
         defaults = {"capture_output": True, "text": True, "timeout": 60}
         return subprocess.run([*command, *map(str, words)], **(defaults | options))
+
+    return run
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Run:
+    """The same without a process of its own: quicker."""
+
+    def run(*words: object) -> subprocess.CompletedProcess[str]:
+        arguments = [str(word) for word in words]
+        return subprocess.CompletedProcess(arguments, main(arguments), *capsys.readouterr())
 
     return run
 

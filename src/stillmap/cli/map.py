@@ -65,7 +65,7 @@ def _require_writable(output: Path) -> None:
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        raise InputError(f"cannot be written: {parent} lets nothing in", where=str(output))
+        raise InputError(f"cannot be written: nothing can be put into {parent}", where=str(output))
 
 
 def _usable(recording: Recording, args: argparse.Namespace) -> Recording:

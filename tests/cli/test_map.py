@@ -1,0 +1,374 @@
+"""`stillmap map` as a process: what it writes, what stops it, what is left behind."""
+
+import filecmp
+import json
+import os
+import re
+import select
+import signal
+import subprocess
+import time
+
+import numpy as np
+import pytest
+import yaml
+
+from stillmap.output.trajectory import read_tum
+
+QUICK = ("--set", "em.max_iterations=1")
+# goes on until it is stopped
+ENDLESS = ("--set", "em.max_iterations=100000", "--set", "em.patience=100000")
+ENDLESS += ("--set", "em.tolerance=0")
+FILES = {
+    "map.pgm",
+    "map.yaml",
+    "map.npz",
+    "trajectory.tum",
+    "report.html",
+    "run.json",
+    "beams/stamp_ns.npy",
+    "beams/offset.npy",
+    "beams/p_static.npy",
+    "beams/hit.npy",
+}
+
+
+def files_in(folder) -> set[str]:
+    return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+
+
+def refused(done, *words) -> None:
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1, done.stderr
+    for word in words:
+        assert str(word) in done.stderr
+
+
+@pytest.fixture(scope="module")
+def mapped(stillmap, room, tmp_path_factory):
+    """A finished run: its folder and what it said."""
+    out = tmp_path_factory.mktemp("mapped") / "out"
+    done = stillmap("map", room, "-o", out, "--set", "em.max_iterations=2")
+    assert done.returncode == 0, done.stderr
+    return out, done
+
+
+def test_writes_the_files_of_the_contract(mapped):
+    out, _ = mapped
+    assert files_in(out) >= FILES
+    T = len(np.load(out / "beams/stamp_ns.npy"))
+    p_static = np.load(out / "beams/p_static.npy", mmap_mode="r")
+    hit = np.load(out / "beams/hit.npy", mmap_mode="r")
+    assert T == 40
+    assert p_static.shape == hit.shape == (40 * 120,)
+    assert p_static.dtype == np.float32
+    assert hit.dtype == bool
+    stamp_ns, poses = read_tum(out / "trajectory.tum")
+    assert np.array_equal(stamp_ns, np.load(out / "beams/stamp_ns.npy"))
+    assert np.array_equal(poses[0], np.eye(4))
+    described = yaml.safe_load((out / "map.yaml").read_text())
+    arrays = np.load(out / "map.npz")
+    assert described["origin"] == arrays["origin"].tolist()
+    assert described["resolution"] == arrays["resolution"] == 0.05
+
+
+def test_run_json_tells_the_run(mapped):
+    run = json.loads((mapped[0] / "run.json").read_text())
+    assert [it["number"] for it in run["iterations"]] == list(range(1, len(run["iterations"]) + 1))
+    assert run["best_iteration"] in range(1, len(run["iterations"]) + 1)
+    counts = run["counts"]
+    assert (counts["scans"], counts["beams"]) == (40, 4800)
+    assert counts["hits"] + counts["max_range"] + counts["unusable"] == counts["beams"]
+    assert counts["hits"] == int(np.load(mapped[0] / "beams/hit.npy").sum())
+    assert {"read", "m_step", "e_step", "likelihood"} <= set(run["seconds"])
+    assert set(run["seconds"]) == set(run["peak_memory_bytes"])
+
+
+def test_progress_goes_to_stderr_as_lines_without_a_terminal(mapped):
+    _, done = mapped
+    assert done.stdout == ""
+    lines = done.stderr.splitlines()
+    assert all(line.startswith("stillmap: ") for line in lines)
+    assert sum("iteration 1 of at most 2" in line for line in lines) == 1
+    assert re.search(r"40 of 40 scans, \d+/s", done.stderr)
+    assert "\x1b" not in done.stderr
+    assert "\r" not in done.stderr
+    assert str(mapped[0] / "report.html") in lines[-1]
+
+
+def test_quiet_says_nothing(call, room, tmp_path, nothing_left):
+    done = call("map", room, "-o", tmp_path / "out", "--quiet", *QUICK)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    nothing_left("out")
+
+
+def same_result(a, b) -> None:
+    """Everything but times is the same to the byte."""
+    same = sorted(FILES - {"run.json", "report.html"})
+    assert filecmp.cmpfiles(a, b, same, shallow=False)[1:] == ([], [])
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_any_process_and_number_of_threads_gives_the_same_bytes(
+    call, room, mapped, tmp_path, threads
+):
+    words = ("--set", "em.max_iterations=2", "--threads", threads)
+    assert call("map", room, "-o", tmp_path / "out", *words).returncode == 0
+    same_result(mapped[0], tmp_path / "out")
+
+
+def test_any_number_of_threads_gives_the_same_bytes_with_given_poses(call, room, tmp_path):
+    outs = [tmp_path / name for name in ("a", "b", "c")]
+    for out, threads in zip(outs, (1, 1, 2), strict=True):
+        words = ("--poses", room / "truth/trajectory.tum", "--threads", threads)
+        assert call("map", room, "-o", out, *words).returncode == 0
+    same_result(outs[0], outs[1])
+    same_result(outs[0], outs[2])
+
+
+def test_a_folder_with_something_in_it_is_refused(call, room, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    refused(call("map", room, "-o", out, *QUICK), out, "--overwrite")
+    assert files_in(out) == {"mine.txt"}
+    done = call("map", room, "-o", out, "--overwrite", *QUICK)
+    assert done.returncode == 0
+    assert files_in(out) >= FILES
+    assert "mine.txt" not in files_in(out)
+
+
+def test_an_empty_folder_will_do(call, room, tmp_path, nothing_left):
+    (tmp_path / "out").mkdir()
+    assert call("map", room, "-o", tmp_path / "out", *QUICK).returncode == 0
+    assert files_in(tmp_path / "out") >= FILES
+    nothing_left("out")
+
+
+def test_a_file_in_the_way_is_refused(call, room, tmp_path):
+    (tmp_path / "out").write_text("mine")
+    refused(call("map", room, "-o", tmp_path / "out", "--overwrite"), tmp_path / "out")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(call, room, tmp_path):
+    (tmp_path / "file").write_text("")
+    places = [tmp_path / "file/out"]
+    if os.geteuid() != 0:  # root may write everywhere
+        (tmp_path / "closed").mkdir(mode=0o555)
+        places.append(tmp_path / "closed/out")
+    for place in places:
+        refused(call("map", room, "-o", place, *ENDLESS), place, "cannot be written")
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="no /proc here")
+def test_a_place_that_only_seems_to_be_writable_is_refused_after_it(call, room):
+    refused(call("map", room, "-o", "/proc/out", "--quiet", *QUICK), "/proc/out: cannot be written")
+
+
+@pytest.mark.parametrize("content", ["", "no recording\n"])
+def test_what_is_no_recording_is_refused(call, tmp_path, nothing_left, content):
+    (tmp_path / "input.log").write_text(content)
+    refused(call("map", tmp_path / "input.log", "-o", tmp_path / "out"), "input.log")
+    nothing_left("input.log")
+
+
+def test_no_odometry(call, room, tmp_path):
+    done = call("map", room, "-o", tmp_path / "out", "--no-odometry", *QUICK)
+    assert done.returncode == 0
+    run = json.loads((tmp_path / "out/run.json").read_text())
+    assert any("no odometry" in warning for warning in run["warnings"])
+    assert "warning: no odometry" in done.stderr
+    _, T = read_tum(tmp_path / "out/trajectory.tum")
+    truth = np.load(room / "truth/T_world_base.npy")
+    way = np.linalg.norm(truth[-1, :2, 2] - truth[0, :2, 2])
+    assert np.linalg.norm(T[-1, :2, 3]) == pytest.approx(way, abs=0.1)
+
+
+def test_given_poses_are_kept(call, room, tmp_path):
+    poses = room / "truth/trajectory.tum"
+    done = call("map", room, "-o", tmp_path / "out", "--poses", poses, *QUICK)
+    assert done.returncode == 0, done.stderr
+    given, kept = read_tum(poses), read_tum(tmp_path / "out/trajectory.tum")
+    np.testing.assert_array_equal(kept[0], given[0])
+    np.testing.assert_allclose(kept[1], given[1], atol=1e-8)
+
+
+def test_poses_of_another_tool_may_be_unsorted_more_and_rounded(call, room, tmp_path):
+    lines = (room / "truth/trajectory.tum").read_text().splitlines()
+    rounded = [re.sub(r"^(\d+\.\d\d)\d*", r"\1", line) for line in lines]
+    more = ["# a comment", "", "0 9 9 9 0 0 0 1", *rounded[::-1]]
+    (tmp_path / "poses.tum").write_text("\n".join(more))
+    words = ("map", room, "-o", tmp_path / "out", "--poses", tmp_path / "poses.tum", *QUICK)
+    assert call(*words).returncode == 0
+    np.testing.assert_allclose(
+        read_tum(tmp_path / "out/trajectory.tum")[1],
+        read_tum(room / "truth/trajectory.tum")[1],
+        atol=1e-8,
+    )
+
+
+def test_poses_that_do_not_fit_are_refused(call, room, tmp_path, nothing_left):
+    lines = (room / "truth/trajectory.tum").read_text().splitlines(keepends=True)
+    file = tmp_path / "poses.tum"
+    for text, said in (
+        ("".join(lines[:20] + lines[22:]), ("2 of 40 scans", "scan 20")),
+        ("".join(line.split(maxsplit=1)[1] for line in lines), (f"{file}:1", "7 columns")),
+        ("1 0 0 0 0 0 0 1\n", ("40 of 40 scans",)),
+        ("", ("no poses",)),
+    ):
+        file.write_text(text)
+        refused(call("map", room, "-o", tmp_path / "out", "--poses", file), file, *said)
+    refused(call("map", room, "-o", tmp_path / "out", "--poses", tmp_path / "absent"), "absent")
+    nothing_left("poses.tum")
+
+
+def test_who_listens_to_the_progress_may_leave(start, room, tmp_path):
+    # `stillmap map ... 2>&1 | head -1` still makes the map
+    process = start(
+        *("map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=3"),
+        stderr=subprocess.PIPE,
+    )
+    assert "iteration 1" in process.stderr.readline()
+    process.stderr.close()
+    assert process.wait(60) == 0
+    assert files_in(tmp_path / "out") >= FILES
+    process.stdout.close()
+
+
+def stopped_after_a_line(process, number) -> tuple[int, str]:
+    assert "iteration 1 of" in process.stderr.readline()
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    return process.returncode, err
+
+
+def test_ctrl_c_while_mapping(start, room, tmp_path, nothing_left):
+    process = start("map", room, "-o", tmp_path / "out", *ENDLESS)
+    status, err = stopped_after_a_line(process, signal.SIGINT)
+    assert status == 130
+    assert err.splitlines()[-1].startswith("stillmap: interrupted")
+    assert "Traceback" not in err
+    nothing_left()
+
+
+def test_sigterm_while_mapping(start, room, tmp_path, nothing_left):
+    process = start("map", room, "-o", tmp_path / "out", *ENDLESS)
+    status, err = stopped_after_a_line(process, signal.SIGTERM)
+    assert status == 143
+    assert "Traceback" not in err
+    nothing_left()
+
+
+def stopped_while_writing(process, folder, number, delay=0.0) -> int:
+    """Waits until the first file is being written, then sends the signal."""
+    deadline = time.monotonic() + 60
+    while not list(folder.glob(".*.part/*")):
+        assert process.poll() is None, "it was done before anything was seen of its writing"
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+    time.sleep(delay)
+    process.send_signal(number)
+    process.communicate(timeout=60)
+    return process.returncode
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_while_writing_nothing_stays_behind(
+    start, room, tmp_path, nothing_left, number, status
+):
+    process = start("map", room, "-o", tmp_path / "out", "--quiet", *QUICK)
+    assert stopped_while_writing(process, tmp_path, number) == status
+    nothing_left()
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.1, 0.4])
+def test_killed_while_writing_all_or_nothing_stands_there(start, room, tmp_path, delay):
+    out = tmp_path / "out"
+    process = start("map", room, "-o", out, "--quiet", *QUICK)
+    status = stopped_while_writing(process, tmp_path, signal.SIGKILL, delay)
+    assert status in (-signal.SIGKILL, 0)
+    assert not out.exists() or files_in(out) >= FILES
+
+
+def test_killed_while_overwriting_the_old_result_or_the_new_stands_there(start, room, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "old.txt").write_text("old")
+    process = start("map", room, "-o", out, "--overwrite", "--quiet", *QUICK)
+    assert stopped_while_writing(process, tmp_path, signal.SIGKILL) == -signal.SIGKILL
+    assert files_in(out) == {"old.txt"}
+
+
+def on_a_terminal(start, *words, send_at=None) -> tuple[int, str]:
+    """Runs with stderr on a terminal; Ctrl-C as soon as `send_at` shows."""
+    pty = pytest.importorskip("pty", reason="no terminals to be had here")
+    master, slave = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "100"}
+    process = start(*words, stderr=slave, env=environment)
+    os.close(slave)
+    seen = b""
+    try:
+        while select.select([master], [], [], 60)[0]:
+            try:
+                piece = os.read(master, 4096)
+            except OSError:  # Linux: the other end has been closed
+                break
+            if not piece:
+                break
+            seen += piece
+            if send_at is not None and send_at in seen:
+                process.send_signal(signal.SIGINT)
+                send_at = None
+        out, _ = process.communicate(timeout=60)
+    finally:
+        os.close(master)
+        process.kill()
+    assert out == ""
+    return process.returncode, seen.decode()
+
+
+def left_on_screen(written: str) -> list[str]:
+    """The lines that stay on a terminal: enough of one to follow a bar that is redrawn."""
+    lines, row = [""], 0
+    column = 0
+    for token in re.findall(r"\x1b\[[?\d;]*[A-Za-z]|.|\n", written, re.DOTALL):
+        if token == "\n":
+            row, column = row + 1, 0
+            lines += [""] * (row + 1 - len(lines))
+        elif token == "\r":
+            column = 0
+        elif token == "\x1b[2K":
+            lines[row] = ""
+        elif re.fullmatch(r"\x1b\[\d*A", token):
+            row -= int(token[2:-1] or 1)
+        elif not token.startswith("\x1b"):
+            lines[row] = lines[row][:column].ljust(column) + token + lines[row][column + 1 :]
+            column += 1
+    return [line for line in lines if line.strip()]
+
+
+def test_a_bar_on_a_terminal_and_no_garbage_after_it(start, room, tmp_path):
+    status, written = on_a_terminal(
+        start, "map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=2"
+    )
+    assert status == 0
+    assert "iteration 1 of at most 2" in written
+    assert "/40" in written
+    assert written.count("\x1b[?25l") == written.count("\x1b[?25h") > 0  # the cursor came back
+    lines = left_on_screen(written)
+    assert all(line.startswith("stillmap: ") for line in lines), lines
+    assert "report.html" in lines[-1]
+
+
+def test_ctrl_c_on_a_terminal_gives_the_cursor_back(start, room, tmp_path, nothing_left):
+    status, written = on_a_terminal(
+        start, "map", room, "-o", tmp_path / "out", *ENDLESS, send_at=b"iteration 2 of"
+    )
+    assert status == 130
+    assert written.count("\x1b[?25l") == written.count("\x1b[?25h") > 0
+    lines = left_on_screen(written)
+    assert len(lines) == 1
+    assert lines[0].startswith("stillmap: interrupted")
+    nothing_left()
