@@ -1,0 +1,77 @@
+"""Rooms, and scans taken in them."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stillmap import _core, se2
+from stillmap.simulation.laser import Movers, beam_angles, cast
+from stillmap.simulation.walls import box, pillar, polyline
+
+Float = NDArray[np.float64]
+Points = NDArray[np.float32]
+
+ROOMS = {
+    "hall with a case": (*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),
+    "L": polyline([(-3, -3), (5, -3), (5, 1), (1, 1), (1, 4), (-3, 4)], closed=True),
+    "columns": (*box(1, 0, 14, 10), *pillar(-3, 2, 0.3), *pillar(2, 3, 0.3), *pillar(4, -3, 0.4)),
+}
+
+
+@pytest.fixture(params=list(ROOMS))
+def room(request: pytest.FixtureRequest) -> Float:
+    """Walls (W, 4) of a room without symmetry, free within a metre of its origin."""
+    return np.array(ROOMS[request.param])
+
+
+@pytest.fixture
+def hall() -> Float:
+    """Walls (W, 4) of one such room."""
+    return np.array(ROOMS["hall with a case"])
+
+
+@pytest.fixture
+def scan() -> Callable[..., Points]:
+    """Takes one scan: (N, 2) end points in the sensor frame, all round."""
+
+    def take(walls: Float, pose: Float, seed: int = 0, noise: float = 0.01) -> Points:
+        angles = beam_angles(240, 2 * np.pi)
+        nobody = Movers(
+            np.zeros((1, 0, 2)), np.zeros((1, 0)), np.zeros((0, 2)), np.zeros(0, np.int32)
+        )
+        ranges = cast(np.array([pose], float), angles, walls, nobody).range[0]
+        ranges = ranges + noise * np.random.default_rng(seed).standard_normal(len(ranges))
+        back = ranges < 30.0
+        directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        return (ranges[back, None] * directions[back]).astype(np.float32)
+
+    return take
+
+
+@pytest.fixture
+def mapped(scan: Callable[..., Points]) -> Callable[..., _core.Grid2D]:
+    """A map of a room, from scans taken around its origin."""
+
+    def build(walls: Float, seed: int = 100, resolution: float = 0.05) -> _core.Grid2D:
+        grid = _core.Grid2D(resolution)
+        stands = [(0, 0, 0), (0.6, 0.3, 0.4), (-0.5, 0.5, -1), (0.2, -0.7, 2), (0.9, -0.4, 3)]
+        for k, stand in enumerate(stands):
+            add(grid, scan(walls, stand, seed + k), stand)
+        return grid
+
+    return build
+
+
+@pytest.fixture
+def put() -> Callable[..., None]:
+    """Adds one scan of hits at a pose to a map."""
+    return add
+
+
+def add(grid: _core.Grid2D, points: Points, pose: Float, e: float = 1.0) -> None:
+    n = len(points)
+    weights = np.full(n, e, np.float32)
+    T = se2.matrix(*pose)[None]
+    _core.add_beams(grid, points, np.ones(n, bool), weights, np.array([0, n]), T)

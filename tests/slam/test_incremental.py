@@ -1,0 +1,258 @@
+"""Incremental registration of whole recordings, from simulated ones to empty ones."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from stillmap import _core, em, se2
+from stillmap.evaluation.trajectory import absolute_errors
+from stillmap.recording.model import Recording
+from stillmap.simulation import RobotOptions, Scene, scene_by_name, simulate
+from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.simulation.walls import box
+from stillmap.slam import SlamOptions, incremental, m_step
+
+OPTIONS = SlamOptions()
+
+
+def silent(done, total):
+    pass
+
+
+def prior(recording):
+    return np.full(recording.n_beams, 0.9, np.float32)
+
+
+def build(recording, e=None):
+    return incremental.build(recording, prior(recording) if e is None else e, OPTIONS, silent)
+
+
+@functools.cache
+def run_through(scene, scans=200, seed=3):
+    return simulate(scene_by_name(scene, {"robot": {"scans": scans}}), seed)
+
+
+def small_room(laser=None, scans=60, people=0, seed=2):
+    scene = Scene(
+        "room",
+        walls=(*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),
+        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
+        crowd=CrowdOptions(people=people),
+        laser=laser or LaserOptions(range_noise=0.01, max_range=8.0),
+        robot=RobotOptions(scans=scans),
+        odometry=OdometryOptions(),
+    )
+    return simulate(scene, seed)
+
+
+def ate(mapped, simulation):
+    return absolute_errors(mapped.poses, simulation.truth.T_world_base).rmse
+
+
+def assert_poses(mapped):
+    R = mapped.poses[:, :2, :2]
+    np.testing.assert_allclose(
+        R @ R.transpose(0, 2, 1), np.broadcast_to(np.eye(2), R.shape), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(R), 1.0)
+    assert np.all(mapped.poses[:, 2] == [0, 0, 1])
+    assert np.all(np.isfinite(mapped.covariance))
+
+
+@pytest.mark.parametrize("scene", ["hall", "corridor"])
+@pytest.mark.parametrize("odometry", [True, False])
+def test_a_populated_place_is_followed(scene, odometry):
+    simulation = run_through(scene)
+    recording = simulation.recording
+    mapped = build(recording if odometry else recording.without_odometry())
+    assert_poses(mapped)
+    assert ate(mapped, simulation) < 0.06
+    truth = se2.inverse(simulation.truth.T_world_base[0]) @ simulation.truth.T_world_base
+    turn = se2.wrap(se2.parameters(mapped.poses)[:, 2] - se2.parameters(truth)[:, 2])
+    assert np.abs(turn).max() < np.radians(4.0)
+
+
+def test_it_is_better_than_odometry_alone():
+    simulation = run_through("hall")
+    odometry = absolute_errors(simulation.recording.T_odom_base, simulation.truth.T_world_base)
+    assert ate(build(simulation.recording), simulation) < 0.6 * odometry.rmse
+
+
+def test_the_map_frame_is_the_first_base():
+    simulation = small_room()
+    mapped = build(simulation.recording)
+    np.testing.assert_array_equal(mapped.poses[0], np.eye(3))
+    np.testing.assert_array_equal(mapped.covariance[0], np.zeros((3, 3)))
+    shift = se2.matrix(100.0, -50.0, 2.0)
+    moved = dataclasses.replace(
+        simulation.recording, T_odom_base=shift @ simulation.recording.T_odom_base
+    )
+    # rounding may decide between two starts of a search: the same to less than a cell
+    np.testing.assert_allclose(build(moved).poses, mapped.poses, atol=0.02)
+
+
+def test_the_grid_is_what_the_poses_make():
+    recording = small_room(people=2).recording
+    e = np.random.default_rng(0).random(recording.n_beams).astype(np.float32)
+    mapped = build(recording, e)
+    grid = _core.Grid2D(OPTIONS.resolution)
+    em.add_recording(grid, recording, mapped.poses, e)
+    for ours, theirs in zip(mapped.grid.dense(), grid.dense(), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
+
+
+def test_covariances_are_covariances():
+    C = build(small_room().recording).covariance[1:]
+    np.testing.assert_allclose(C, C.transpose(0, 2, 1), atol=1e-15)
+    assert np.linalg.eigvalsh(C).min() > 0
+    assert np.sqrt(C[:, 0, 0].max()) < 0.1
+
+
+def test_a_leap_of_the_odometry_is_survived():
+    # wheels slip: from scan 30 on odometry has turned by 80 degrees that nobody has turned
+    simulation = small_room()
+    T = simulation.recording.T_odom_base.copy()
+    T[30:] = T[29] @ se2.matrix(0, 0, np.radians(80)) @ se2.inverse(T[29]) @ T[30:]
+    mapped = build(dataclasses.replace(simulation.recording, T_odom_base=T))
+    assert ate(mapped, simulation) < 0.03
+
+
+def test_a_crowd_that_is_known_has_no_pull():
+    # everybody marches off with the robot: with e = 0 only walls count
+    simulation = small_room(people=3)
+    e = np.where(simulation.truth.mover >= 0, 0.0, 1.0).astype(np.float32)
+    recording = simulation.recording
+    ghosts = recording.points.copy()
+    of_movers = simulation.truth.mover >= 0
+    assert of_movers.sum() > 50
+    ghosts[of_movers] *= np.float32(0.5)  # wherever they are
+    a, b = build(recording, e), build(dataclasses.replace(recording, points=ghosts), e)
+    assert ate(a, simulation) < 0.03
+    # ghosts still cross cells: they may shift the last digits of a pose, no more
+    distance = np.linalg.norm(a.poses[:, :2, 2] - b.poses[:, :2, 2], axis=1)
+    assert distance.max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "yaw"),
+    [(-0.04, 0.0, np.pi), (0.3, 0.0, 0.0), (0.1, -0.2, -1.2)],
+    ids=["turned round", "ahead", "askew"],
+)
+def test_where_the_sensor_sits_is_honoured(x, y, yaw):
+    # all round: wherever the sensor looks, it sees the same world
+    plain = LaserOptions(beams=240, fov=2 * np.pi, range_noise=0.005, max_range=8.0, x=0.0)
+    there = dataclasses.replace(plain, x=x, y=y, yaw=yaw)
+    a, b = small_room(plain), small_room(there)
+    np.testing.assert_array_equal(a.truth.T_world_base, b.truth.T_world_base)
+    assert not np.array_equal(a.recording.points, b.recording.points)
+    of_a, of_b = build(a.recording), build(b.recording)
+    distance = np.linalg.norm(of_a.poses[:, :2, 2] - of_b.poses[:, :2, 2], axis=1)
+    assert distance.max() < 0.03
+    turn = se2.wrap(se2.parameters(of_a.poses)[:, 2] - se2.parameters(of_b.poses)[:, 2])
+    assert np.abs(turn).max() < np.radians(0.6)
+    truth = se2.inverse(b.truth.T_world_base[0]) @ b.truth.T_world_base
+    assert np.linalg.norm(of_b.poses[:, :2, 2] - truth[:, :2, 2], axis=1).max() < 0.03
+
+
+def test_two_sensors_on_one_robot():
+    # in turns, one turned round: each scan goes by its own sensor's place on the robot
+    ahead = LaserOptions(beams=240, fov=2 * np.pi, range_noise=0.005, max_range=8.0, x=0.2)
+    behind = dataclasses.replace(ahead, x=-0.25, yaw=np.pi)
+    one, other = small_room(ahead), small_room(behind)
+    sensor = (np.arange(60) % 2).astype(np.int32)
+    of_beam = np.repeat(sensor, np.diff(one.recording.offset))
+    both = dataclasses.replace(
+        one.recording,
+        points=np.where(of_beam[:, None] == 0, one.recording.points, other.recording.points),
+        hit=np.where(of_beam == 0, one.recording.hit, other.recording.hit),
+        T_base_sensor=np.concatenate([r.recording.T_base_sensor for r in (one, other)]),
+        sensor=sensor,
+    )
+    assert ate(build(both), one) < 0.03
+
+
+def blank(recording: Recording, scans, how: str) -> Recording:
+    """Some scans without a hit (all at maximum range), all unusable, or without any beam."""
+    points, hit = recording.points.copy(), recording.hit.copy()
+    gone = np.zeros(recording.n_beams, bool)
+    for t in scans:
+        gone[recording.beams_of(t)] = True
+    hit[gone] = False
+    if how == "unusable":
+        points[gone] = np.nan
+    if how != "no beams":
+        return dataclasses.replace(recording, points=points, hit=hit)
+    counts = np.diff(recording.offset)
+    counts[list(scans)] = 0
+    offset = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return dataclasses.replace(recording, points=points[~gone], hit=hit[~gone], offset=offset)
+
+
+@pytest.mark.parametrize("how", ["no hits", "unusable", "no beams"])
+@pytest.mark.parametrize("odometry", [True, False])
+def test_scans_that_say_nothing_are_bridged(how, odometry):
+    simulation = small_room()
+    recording = blank(simulation.recording, [0, 20, 21, 59], how)
+    mapped = build(recording if odometry else recording.without_odometry())
+    assert_poses(mapped)
+    assert ate(mapped, simulation) < (0.03 if odometry else 0.1)
+
+
+@pytest.mark.parametrize("how", ["no hits", "unusable", "no beams"])
+def test_nothing_but_such_scans_leaves_odometry(how):
+    recording = blank(small_room(scans=10).recording, range(10), how)
+    odometry = se2.inverse(recording.T_odom_base[0]) @ recording.T_odom_base
+    np.testing.assert_allclose(build(recording).poses, odometry, atol=1e-9)
+    still = build(recording.without_odometry()).poses
+    np.testing.assert_allclose(still, np.broadcast_to(np.eye(3), still.shape), atol=1e-12)
+
+
+def test_one_scan():
+    mapped = build(small_room(scans=1).recording)
+    np.testing.assert_array_equal(mapped.poses, np.eye(3)[None])
+    assert mapped.widened == []
+
+
+def test_progress_counts_every_scan():
+    recording = small_room(scans=10).recording
+    told = []
+    incremental.build(recording, prior(recording), OPTIONS, lambda *at: told.append(at))
+    assert told == [(t, 10) for t in range(1, 11)]
+
+
+def test_given_poses_are_not_touched():
+    simulation = small_room(people=2)
+    recording, poses = simulation.recording, simulation.truth.T_world_base
+    e = np.random.default_rng(0).random(recording.n_beams).astype(np.float32)
+    told = []
+    mapped = [
+        m_step(recording, e, OPTIONS, poses, threads, lambda *at: told.append(at))
+        for threads in (1, 2)
+    ]
+    assert told == [(60, 60), (60, 60)]
+    grid = _core.Grid2D(OPTIONS.resolution)
+    em.add_recording(grid, recording, poses, e)
+    for one in mapped:
+        assert one.poses is poses
+        assert one.widened == []
+        for ours, theirs in zip(one.grid.dense(), grid.dense(), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def test_resolutions_out_of_range():
+    for resolution in (0.0, 0.001, 11.0, float("nan"), -0.05):
+        with pytest.raises(ValueError, match=r"slam\.resolution"):
+            SlamOptions(resolution=resolution)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["hall", "corridor"])
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("odometry", [True, False])
+def test_a_long_run_stays_on_its_way(scene, seed, odometry):
+    simulation = run_through(scene, 1000, seed)
+    recording = simulation.recording
+    mapped = build(recording if odometry else recording.without_odometry())
+    assert ate(mapped, simulation) < 0.25

@@ -1,0 +1,201 @@
+"""Registration of one scan: does it find the pose that the scan was taken from?"""
+
+import numpy as np
+import pytest
+
+from stillmap import _core, se2
+from stillmap.slam.motion import MotionPrior
+from stillmap.slam.registration import RegistrationOptions, register
+
+OPTIONS = RegistrationOptions()
+
+
+def prior_at(pose, translation=0.1, rotation=0.1):
+    information = np.diag([translation**-2, translation**-2, rotation**-2])
+    return MotionPrior(se2.matrix(*pose), information, translation, rotation)
+
+
+def ones(points):
+    return np.ones(len(points), np.float32)
+
+
+def off(found, truth):
+    """Distance in metres and turn in radians between a registration and the true pose."""
+    x, y, theta = se2.parameters(se2.inverse(se2.matrix(*truth)) @ found.T_map_base)
+    return np.hypot(x, y), abs(theta)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_finds_a_pose_near_the_prior(room, mapped, scan, seed):
+    rng = np.random.default_rng(seed)
+    grid = mapped(room, seed=100 * seed)
+    truth = rng.uniform([-0.8, -0.8, -np.pi], [0.8, 0.8, np.pi])
+    points = scan(room, truth, seed=seed)
+    prior = prior_at(truth + rng.uniform(-1, 1, 3) * [0.1, 0.1, 0.1])
+    found = register(grid, points, ones(points), prior, OPTIONS)
+    distance, turn = off(found, truth)
+    assert distance < 0.02
+    assert turn < np.radians(0.4)
+    assert found.explained > 0.7
+    assert not found.widened
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_weak_prior_is_enough(room, mapped, scan, seed):
+    rng = np.random.default_rng(10 + seed)
+    grid = mapped(room)
+    truth = rng.uniform([-0.8, -0.8, -np.pi], [0.8, 0.8, np.pi])
+    points = scan(room, truth, seed=seed)
+    shift = rng.uniform(0.3, 0.6, 3) * rng.choice([-1, 1], 3)
+    found = register(grid, points, ones(points), prior_at(truth + shift, 0.4, 0.4), OPTIONS)
+    distance, turn = off(found, truth)
+    assert distance < 0.02
+    assert turn < np.radians(0.4)
+    assert not found.widened
+
+
+@pytest.mark.parametrize("degrees", [80, -80])
+def test_a_wrong_heading_is_found_by_a_wider_search(room, mapped, scan, degrees):
+    truth = np.array([0.3, -0.2, 0.7])
+    points = scan(room, truth)
+    wrong = prior_at(truth + np.array([0.05, 0.02, np.radians(degrees)]), 0.03, 0.05)
+    found = register(mapped(room), points, ones(points), wrong, OPTIONS)
+    distance, turn = off(found, truth)
+    assert found.widened
+    assert distance < 0.03
+    assert turn < np.radians(0.5)
+
+
+def test_a_wrong_place_is_found_by_a_wider_search(room, mapped, scan):
+    truth = np.array([0.3, -0.2, 0.7])
+    points = scan(room, truth)
+    wrong = prior_at(truth + np.array([-0.4, 0.35, 0.3]), 0.03, 0.03)
+    found = register(mapped(room), points, ones(points), wrong, OPTIONS)
+    distance, turn = off(found, truth)
+    assert found.widened
+    assert distance < 0.03
+    assert turn < np.radians(0.5)
+
+
+def test_a_place_that_was_never_seen_stays_where_odometry_says(hall, mapped, scan):
+    # nothing in the map explains the scan: no search may drag it anywhere
+    points = scan(hall, (0, 0, 0))
+    prior = prior_at((200.0, 100.0, 1.0), 0.05, 0.05)
+    found = register(mapped(hall), points, ones(points), prior, OPTIONS)
+    np.testing.assert_allclose(found.T_map_base, prior.T_map_base, atol=1e-9)
+    assert found.explained == 0.0
+    assert not found.widened
+
+
+def test_beams_of_weight_zero_are_as_if_absent(hall, mapped, scan):
+    grid, truth = mapped(hall), np.array([0.2, 0.1, 0.3])
+    points = scan(hall, truth)
+    absent = np.random.default_rng(0).random(len(points)) < 0.3
+    moved = points.copy()
+    moved[absent] += 1.7
+    prior = prior_at(truth + np.array([0.06, -0.05, 0.04]))
+    with_zeros = register(grid, moved, (~absent).astype(np.float32), prior, OPTIONS)
+    without = register(grid, points[~absent], ones(points[~absent]), prior, OPTIONS)
+    np.testing.assert_array_equal(with_zeros.T_map_base, without.T_map_base)
+    np.testing.assert_array_equal(with_zeros.covariance, without.covariance)
+    assert with_zeros.explained == without.explained
+
+
+def corridor(x_of_walker=None):
+    """Two walls along x, 40 m long: nothing but a walker tells where along them one is."""
+    walls = [(-20, -1.2, 20, -1.2), (-20, 1.2, 20, 1.2)]
+    if x_of_walker is not None:
+        x = x_of_walker
+        walls += [(x, -0.3, x, 0.3), (x, -0.3, x + 0.3, -0.3), (x, 0.3, x + 0.3, 0.3)]
+    return np.array(walls, float)
+
+
+def test_a_mover_that_is_known_as_one_has_no_pull(scan, put):
+    # the walker ahead of the robot has gone on by 0.25 m since the map was made
+    grid = _core.Grid2D(0.05)
+    for k, x in enumerate(np.linspace(-0.6, 0.6, 9)):
+        put(grid, scan(corridor(3.0), (x, 0, 0), k), (x, 0, 0))
+    there = scan(corridor(3.25), (0, 0, 0), 50)
+    walker = np.abs(there[:, 1]) < 0.6
+    walker &= there[:, 0] > 0
+    assert 5 < walker.sum() < 40
+    prior = prior_at((0, 0, 0), 0.3, 0.05)
+    e = ones(there)
+    pulled = register(grid, there, e, prior, OPTIONS)
+    e[walker] = 0.0
+    free = register(grid, there, e, prior, OPTIONS)
+    assert pulled.T_map_base[0, 2] == pytest.approx(-0.25, abs=0.05)
+    assert abs(free.T_map_base[0, 2]) < 0.05
+    assert abs(free.T_map_base[1, 2]) < 0.01
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.6, np.pi / 2])
+def test_covariance_is_long_along_a_corridor(scan, put, turned):
+    along, across = [np.cos(turned), np.sin(turned)], [-np.sin(turned), np.cos(turned)]
+    grid = _core.Grid2D(0.05)
+    for k, x in enumerate(np.linspace(0.0, 1.5, 40)):
+        put(grid, scan(corridor(), (x, 0, 0), k), (x * along[0], x * along[1], turned))
+    points = scan(corridor(), (0.7, 0, 0), 9)
+    prior = prior_at((0.7 * along[0], 0.7 * along[1], turned), 0.1, 0.1)
+    C = register(grid, points, ones(points), prior, OPTIONS).covariance
+    np.testing.assert_allclose(C, C.T, atol=1e-15)
+    assert np.all(np.linalg.eigvalsh(C) > 0)
+    sigma_along = np.sqrt(along @ C[:2, :2] @ along)
+    sigma_across = np.sqrt(across @ C[:2, :2] @ across)
+    assert sigma_along > 1.5 * sigma_across
+    assert sigma_along < 0.101  # the prior's own
+    assert C[2, 2] < 0.02**2
+
+
+def test_covariance_shrinks_with_what_is_seen(hall, mapped, scan):
+    grid, truth = mapped(hall), (0.1, 0.2, 0.3)
+    points, prior = scan(hall, truth), prior_at(truth, 0.2, 0.2)
+    all_of_them = register(grid, points, ones(points), prior, OPTIONS)
+    few = np.ascontiguousarray(points[::8])
+    some = register(grid, few, ones(few), prior, OPTIONS)
+    assert np.all(np.diag(all_of_them.covariance) < np.diag(some.covariance))
+    assert np.all(np.diag(some.covariance) < np.diag(np.linalg.inv(prior.information)))
+
+
+def test_without_a_beam_the_prior_is_the_answer(hall, mapped):
+    nothing = np.zeros((0, 2), np.float32)
+    prior = prior_at((1.0, -2.0, 2.5), 0.2, 0.1)
+    for grid in (mapped(hall), _core.Grid2D(0.05)):
+        found = register(grid, nothing, np.zeros(0, np.float32), prior, OPTIONS)
+        np.testing.assert_array_equal(found.T_map_base, prior.T_map_base)
+        np.testing.assert_allclose(found.covariance, np.linalg.inv(prior.information))
+        assert not found.widened
+
+
+def test_in_an_empty_map_the_prior_is_the_answer(hall, scan):
+    points, prior = scan(hall, (0, 0, 0)), prior_at((1.0, -2.0, 2.5), 0.2, 0.1)
+    found = register(_core.Grid2D(0.05), points, ones(points), prior, OPTIONS)
+    np.testing.assert_allclose(found.T_map_base, prior.T_map_base, atol=1e-12)
+
+
+def test_beams_beyond_the_search_range_still_count_in_the_refinement(hall, mapped, scan):
+    truth = np.array([0.2, 0.1, 0.3])
+    points = scan(hall, truth)
+    prior = prior_at(truth + np.array([0.03, -0.02, 0.02]))
+    found = register(
+        mapped(hall), points, ones(points), prior, RegistrationOptions(search_range=0.1)
+    )
+    distance, turn = off(found, truth)
+    assert distance < 0.02
+    assert turn < np.radians(0.4)
+
+
+def test_the_same_twice(hall, mapped, scan):
+    points, prior = scan(hall, (0.2, 0.1, 0.3)), prior_at((0.3, 0.1, 0.2))
+    a, b = (register(mapped(hall), points, ones(points), prior, OPTIONS) for _ in range(2))
+    np.testing.assert_array_equal(a.T_map_base, b.T_map_base)
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"sigma": 0.0}, {"floor": -1.0}, {"gain": 0.0}, {"search_range": 0.0}, {"window": -1.0}],
+)
+def test_options_out_of_range(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        RegistrationOptions(**wrong)
