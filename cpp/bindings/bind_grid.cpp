@@ -99,24 +99,36 @@ void bind(nb::module_& m, const char* name) {
            "in reverse order, so that a 2D array is [row = y, column = x].");
 }
 
+// writes down the cells and lengths of a walk
+template <int D>
+struct Recorder {
+  Cell<D> cell = Cell<D>::Zero();
+  std::vector<int64_t> cells;
+  std::vector<double> lengths;
+
+  void start(const Cell<D>& first) { cell = first; }
+  void visit(double length) {
+    for (int d = 0; d < D; ++d) cells.push_back(cell[d]);
+    lengths.push_back(length);
+  }
+  template <int Axis>
+  void step(int32_t direction) {
+    cell[Axis] += direction;
+  }
+};
+
 template <int D>
 auto cells_along(const Flat<double>& start, const Flat<double>& end, double resolution) {
   const Vec<D> a = Eigen::Map<const Vec<D>>(start.data()) / resolution;
   const Vec<D> b = Eigen::Map<const Vec<D>>(end.data()) / resolution;
   require(all_below<D>(a, Grid<D>::kMaxCell) && all_below<D>(b, Grid<D>::kMaxCell),
           "start, end: not finite or too far away");
-  std::vector<int64_t> cells;
-  std::vector<double> lengths;
-  auto add = [&](const Cell<D>& cell, double length) {
-    for (int d = 0; d < D; ++d) cells.push_back(cell[d]);
-    lengths.push_back(length);
-  };
-  double last_length = 0.0;
-  const Cell<D> last = traverse<D>(a, b, add, &last_length);
-  add(last, last_length);
-  const size_t n = lengths.size();
-  return std::make_tuple(owned(std::move(cells), {n, static_cast<size_t>(D)}),
-                         owned(std::move(lengths), {n}));
+  Recorder<D> recorder;
+  const double last_length = traverse<D>(a, b, recorder);
+  recorder.visit(last_length);
+  const size_t n = recorder.lengths.size();
+  return std::make_tuple(owned(std::move(recorder.cells), {n, static_cast<size_t>(D)}),
+                         owned(std::move(recorder.lengths), {n}));
 }
 
 auto cells_along_any(const Flat<double>& start, const Flat<double>& end, double resolution) {

@@ -68,19 +68,18 @@ template <int D>
 inline void add_scans(Grid<D>& grid, const Scans<D>& scans, const float* e, size_t first,
                       size_t last) {
   Cursor<Grid<D>> cursor(grid);
+  // second sum of beta_j: the length by which the beam covers j, whatever e is
+  Walker walker(cursor, [](Counts* j, double length) { j->beta += to_fixed(length); });
   for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
     const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
-    // second sum of beta_j: the length by which the beam covers j, whatever e is
-    const Cell<D> end = traverse<D>(beam.start, beam.end, [&](const Cell<D>& j, double length) {
-      cursor.counts(j).beta += to_fixed(length);
-    });
+    traverse<D>(beam.start, beam.end, walker);
     if (!scans.hit[n]) return;  // (1 - zeta) = 0: the end cell of a maximum-range beam says nothing
-    auto* block = cursor.block(end);
-    const auto local = static_cast<size_t>(Grid<D>::local_of(end));
+    const Cell<D>& end = walker.cell();
     const double static_share = probability(e[n]);
-    block->counts[local].alpha += to_fixed(static_share);       // alpha_j
-    block->counts[local].beta += to_fixed(1.0 - static_share);  // first sum of beta_j
-    auto& moment = Grid<D>::moments_of(*block)[local];
+    walker.counts()->alpha += to_fixed(static_share);       // alpha_j
+    walker.counts()->beta += to_fixed(1.0 - static_share);  // first sum of beta_j
+    auto& moment =
+        Grid<D>::moments_of(*walker.block())[static_cast<size_t>(Grid<D>::local_of(end))];
     for (int d = 0; d < D; ++d)
       moment[static_cast<size_t>(d)] += to_fixed(static_share * (beam.end[d] - end[d]));
   });
@@ -144,21 +143,23 @@ inline void log_likelihood(const Grid<D>& grid, const Scans<D>& scans, const flo
   const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
   parallel_shares(bounds, [&](size_t, size_t first, size_t last) {
     Cursor<const Grid<D>> cursor(grid);
+    double traversed = 0.0;
+    Walker walker(cursor, [&](const Counts* j, double length) {
+      if (j && j->alpha > 0) traversed += length * safe_log(1.0 - occupancy(*j));
+    });
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
       LogLikelihood& sum = terms[t];
       const double en = probability(e[n]);
       sum.gamma += x_log(en, prior) + x_log(1.0 - en, 1.0 - prior);
       sum.entropy -= x_log(en, en) + x_log(1.0 - en, 1.0 - en);
       const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
-      const Cell<D> end = traverse<D>(beam.start, beam.end, [&](const Cell<D>& j, double length) {
-        if (const Counts* c = cursor.seen(j))
-          if (c->alpha > 0) sum.traversed += length * safe_log(1.0 - occupancy(*c));
-      });
-      if (!scans.hit[n]) return;
-      if (const Counts* c = cursor.seen(end)) {
-        const double m = occupancy(*c);
-        sum.end += x_log(en, m) + x_log(1.0 - en, 1.0 - m);
-      }
+      traversed = 0.0;
+      traverse<D>(beam.start, beam.end, walker);
+      sum.traversed += traversed;
+      const Counts* c = walker.counts();
+      if (!scans.hit[n] || !c || c->alpha + c->beta == 0) return;
+      const double m = occupancy(*c);
+      sum.end += x_log(en, m) + x_log(1.0 - en, 1.0 - m);
     });
   });
 }

@@ -169,10 +169,6 @@ class Cursor {
     return block_;
   }
 
-  Counts& counts(const Cell<D>& cell) {
-    return block(cell)->counts[static_cast<size_t>(GridType::local_of(cell))];
-  }
-
   // nullptr where nobody looked
   const Counts* seen(const Cell<D>& cell) {
     const auto* found = block(cell);
@@ -186,6 +182,57 @@ class Cursor {
   Cell<D> at_ = Cell<D>::Zero();
   Block* block_ = nullptr;
   bool known_ = false;
+};
+
+// Follows a beam through a grid: `visit` gets the counts of each cell (nullptr where a const grid
+// has no block) and the length in it. Only a step out of a block looks anything up.
+template <class GridType, class Visit>
+class Walker {
+ public:
+  static constexpr int D = std::remove_const_t<GridType>::kDimension;
+  using G = std::remove_const_t<GridType>;
+  using Block = typename Cursor<GridType>::Block;
+  using CountsPointer = std::conditional_t<std::is_const_v<GridType>, const Counts*, Counts*>;
+
+  Walker(Cursor<GridType>& cursor, Visit visit) : cursor_(cursor), visit_(visit) {}
+
+  void start(const Cell<D>& cell) {
+    cell_ = cell;
+    enter();
+  }
+
+  void visit(double length) { visit_(counts_, length); }
+
+  template <int Axis>
+  void step(int32_t direction) {
+    constexpr int stride = 1 << (Axis * G::kShift);
+    cell_[Axis] += direction;
+    place_[Axis] += direction;
+    if (static_cast<uint32_t>(place_[Axis]) >= static_cast<uint32_t>(G::kEdge)) {
+      enter();
+    } else if (!std::is_const_v<GridType> || counts_) {
+      counts_ += direction * stride;
+    }
+  }
+
+  // the cell it has reached
+  const Cell<D>& cell() const { return cell_; }
+  Block* block() const { return block_; }
+  CountsPointer counts() const { return counts_; }
+
+ private:
+  void enter() {
+    block_ = cursor_.block(cell_);
+    counts_ = block_ ? block_->counts.data() + G::local_of(cell_) : nullptr;
+    for (int d = 0; d < D; ++d) place_[d] = cell_[d] & (G::kEdge - 1);
+  }
+
+  Cursor<GridType>& cursor_;
+  Visit visit_;
+  Cell<D> cell_ = Cell<D>::Zero();
+  Cell<D> place_ = Cell<D>::Zero();  // within the block
+  Block* block_ = nullptr;
+  CountsPointer counts_ = nullptr;
 };
 
 }  // namespace stillmap

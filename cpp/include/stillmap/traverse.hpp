@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <type_traits>
 
 namespace stillmap {
 
@@ -24,41 +25,57 @@ inline Cell<D> cell_of(const Vec<D>& point_in_cells) {
   return point_in_cells.array().floor().template cast<int32_t>();
 }
 
-// Calls visit(cell, length) for every cell of the segment before its end cell, in order.
-// Points are given in units of cells, and so are the lengths. Returns the end cell; its own chord
-// is written to *last_length. Crossing a corner passes through a cell of length zero, so that
-// exactly sum |end - start| borders are crossed and the walk always ends.
-template <int D, class Visit>
-inline Cell<D> traverse(const Vec<D>& start, const Vec<D>& end, Visit&& visit,
-                        double* last_length = nullptr) {
+// Walks the cells of a segment in order. Points are given in units of cells, and so are the
+// lengths. The walker hears start(first cell), then for every border visit(length in the cell it
+// leaves) and step<axis>(+1 or -1); it ends in the end cell, whose chord is returned. Crossing a
+// corner passes through a cell of length zero, so that exactly sum |end - start| borders are
+// crossed and the walk always ends.
+template <int D, class Walker>
+inline double traverse(const Vec<D>& start, const Vec<D>& end, Walker& walker) {
   constexpr double inf = std::numeric_limits<double>::infinity();
-  Cell<D> cell = cell_of<D>(start);
-  const Cell<D> last = cell_of<D>(end);
+  const Cell<D> first = cell_of<D>(start), last = cell_of<D>(end);
   const Vec<D> direction = end - start;
   const double length = direction.norm();
 
-  Vec<D> next, delta;  // arc length at the next border of each axis, and between its borders
-  Cell<D> step;
+  struct Axis {
+    double next;   // arc length at its next border
+    double delta;  // and between its borders
+    int32_t left;  // borders still to cross
+    int32_t step;
+  };
+  Axis axes[D];
   int64_t borders = 0;
   for (int d = 0; d < D; ++d) {
-    const int32_t cells = last[d] - cell[d];
-    borders += std::abs(cells);
-    step[d] = cells > 0 ? 1 : -1;
-    delta[d] = cells ? length / std::abs(direction[d]) : inf;
-    next[d] = cells ? (cell[d] + (cells > 0 ? 1 : 0) - start[d]) / direction[d] * length : inf;
+    const int32_t cells = last[d] - first[d];
+    const int32_t step = cells > 0 ? 1 : -1;
+    const double to_border = first[d] + (cells > 0 ? 1 : 0) - start[d];
+    axes[d] = {cells ? to_border / direction[d] * length : inf,
+               cells ? length / std::abs(direction[d]) : inf, std::abs(cells), step};
+    borders += axes[d].left;
   }
+  walker.start(first);
   double travelled = 0.0;
-  for (; borders > 0; --borders) {
-    int axis = next[1] < next[0] ? 1 : 0;
-    if constexpr (D == 3) axis = next[2] < next[axis] ? 2 : axis;
-    const double border = next[axis];
-    visit(cell, border > travelled ? border - travelled : 0.0);
+  auto cross = [&](Axis& axis, auto which) {
+    const double border = axis.next;
+    walker.visit(border > travelled ? border - travelled : 0.0);
     travelled = border > travelled ? border : travelled;
-    cell[axis] += step[axis];
-    next[axis] = cell[axis] == last[axis] ? inf : border + delta[axis];
+    axis.next = --axis.left ? border + axis.delta : inf;
+    walker.template step<decltype(which)::value>(axis.step);
+  };
+  using X = std::integral_constant<int, 0>;
+  using Y = std::integral_constant<int, 1>;
+  using Z = std::integral_constant<int, D - 1>;
+  for (; borders > 0; --borders) {
+    const bool y_first = axes[1].next < axes[0].next;
+    if (D == 3 && axes[D - 1].next < axes[y_first ? 1 : 0].next) {
+      cross(axes[D - 1], Z{});
+    } else if (y_first) {
+      cross(axes[1], Y{});
+    } else {
+      cross(axes[0], X{});
+    }
   }
-  if (last_length) *last_length = length > travelled ? length - travelled : 0.0;
-  return last;
+  return length > travelled ? length - travelled : 0.0;
 }
 
 }  // namespace stillmap

@@ -1,0 +1,75 @@
+"""`stillmap map` with defaults on recorded logs: relation errors, CPU per scan, peak memory.
+
+python benchmarks/real_logs.py FOLDER [LOG ...] [--keep DIR] [-- FLAGS FOR stillmap map]
+
+FOLDER holds NAME.clf.gz with NAME.relations or NAME.pseudo.relations. Results go to a temporary
+folder unless --keep names one.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    p.add_argument("folder", type=Path)
+    p.add_argument("logs", nargs="*")
+    p.add_argument("--keep", type=Path)
+    own, flags = split(sys.argv[1:])
+    args = p.parse_args(own)
+    logs = args.logs or sorted(f.name.removesuffix(".clf.gz") for f in args.folder.glob("*.clf.gz"))
+    print(
+        "log        | scans | trans m (median, max)   | rot deg | used | dynamic | it (best) |"
+        " CPU ms/scan: registration + rest | peak MB"
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        for log in logs:
+            out = (args.keep or Path(scratch)) / log
+            print(row(args.folder, log, out, flags), flush=True)
+
+
+def split(argv: list[str]) -> tuple[list[str], list[str]]:
+    at = argv.index("--") if "--" in argv else len(argv)
+    return argv[:at], argv[at + 1 :]
+
+
+def row(folder: Path, log: str, out: Path, flags: list[str]) -> str:
+    command = ["map", str(folder / f"{log}.clf.gz"), "-o", str(out), "--overwrite", "--quiet"]
+    before = os.times()
+    stillmap(*command, *flags)
+    after = os.times()
+    cpu = after.children_user + after.children_system
+    cpu -= before.children_user + before.children_system
+    run = json.loads((out / "run.json").read_text())
+    relations = folder / f"{log}.relations"
+    if not relations.exists():
+        relations = folder / f"{log}.pseudo.relations"
+    trajectory = str(out / "trajectory.tum")
+    o = json.loads(stillmap("eval", "relations", trajectory, str(relations), "--json"))
+    scans = run["counts"]["scans"]
+    registration = run["seconds"]["m_step"] / len(run["iterations"])
+    return (
+        f"{log:10} | {scans:5} | {o['translation']['mean']:.4f} "
+        f"({o['translation']['median']:.4f}, {o['translation']['max']:.3f}) | "
+        f"{o['rotation_deg']['mean']:.3f} | {o['used']:4} | "
+        f"{100 * run['counts']['dynamic'] / run['counts']['hits']:.1f} % | "
+        f"{len(run['iterations'])} ({run['best_iteration']}) | "
+        f"{1e3 * registration / scans:.2f} per iteration, {1e3 * cpu / scans:.2f} in all | "
+        f"{max(run['peak_memory_bytes'].values()) / 1e6:.0f}"
+    )
+
+
+def stillmap(*arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "stillmap", *arguments], check=True, stdout=subprocess.PIPE, text=True
+    )
+    return done.stdout
+
+
+if __name__ == "__main__":
+    main()
