@@ -1,0 +1,332 @@
+"""What `build` returns belongs together: map, labels, poses, numbers."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap import se2
+from stillmap.options import replaced
+from stillmap.output.trajectory import read_tum
+from stillmap.pipeline import Options
+from stillmap.recording.model import Recording
+
+RESOLUTION = 0.05
+
+
+def options(**em):
+    return replaced(Options(), {"em": em, "slam": {"resolution": RESOLUTION}, "threads": 1})
+
+
+def end_cells(recording, poses, origin, resolution, beams):
+    """(row, column) of the end points of these beams, straight from geometry."""
+    scan = np.repeat(np.arange(recording.n_scans), np.diff(recording.offset))[beams]
+    T = (poses @ recording.T_base_sensor[recording.sensor])[scan]
+    points = recording.points[beams].astype(float)
+    ends = np.einsum("nij,nj->ni", T[:, :2, :2], points) + T[:, :2, 2]
+    first = np.round(np.array(origin[:2]) / resolution)
+    column, row = (np.floor(ends / resolution) - first).astype(int).T
+    return row, column
+
+
+def expected_labels(recording, poses, alpha, beta, origin, resolution, prior):
+    """(6), (8) once more, from plain arrays."""
+    e = np.full(recording.n_beams, np.nan)
+    usable = np.isfinite(recording.points).all(axis=1)
+    e[usable] = prior
+    hit = recording.hit
+    cells = end_cells(recording, poses, origin, resolution, hit)
+    a, b = alpha[cells], beta[cells]
+    assert np.all(a + b > 0)  # every hit has been counted where it ends
+    m = a / (a + b)
+    e[hit] = prior * m / (prior * m + (1 - prior) * (1 - m))
+    return e
+
+
+def with_unusable(recording: Recording) -> Recording:
+    points, hit = recording.points.copy(), recording.hit.copy()
+    points[100:110], hit[100:110] = np.nan, False
+    return dataclasses.replace(recording, points=points, hit=hit)
+
+
+@pytest.mark.parametrize("prior", [0.9, 0.6])
+@pytest.mark.parametrize("fixed", [False, True])
+def test_the_labels_follow_from_the_map(room, prior, fixed):
+    recording = with_unusable(room.recording)
+    poses = room.truth.T_world_base if fixed else None
+    result = stillmap.build(recording, options(max_iterations=3, prior=prior), poses=poses)
+    m = result.map
+    expected = expected_labels(
+        recording, result.poses, m.alpha, m.beta, m.origin, m.resolution, prior
+    )
+    assert result.p_static.dtype == np.float32
+    np.testing.assert_allclose(result.p_static, expected, atol=1e-6)
+    assert np.isnan(result.p_static[100:110]).all()
+    assert np.ptp(result.p_static[recording.hit]) > 0.5
+
+
+def test_the_labels_written_follow_from_the_map_written(room, tmp_path):
+    result = stillmap.build(room.recording, options(max_iterations=2, prior=0.8))
+    result.save(tmp_path / "out")
+    arrays = np.load(tmp_path / "out/map.npz")
+    _, T = read_tum(tmp_path / "out/trajectory.tum")
+    poses = T[:, [0, 1, 3]][:, :, [0, 1, 3]]
+    expected = expected_labels(
+        room.recording,
+        poses,
+        arrays["alpha"],
+        arrays["beta"],
+        arrays["origin"],
+        float(arrays["resolution"]),
+        0.8,
+    )
+    written = np.load(tmp_path / "out/beams/p_static.npy")
+    # a trajectory of nine digits may move one end point in a thousand across an edge
+    off = np.abs(written - expected) > 1e-6
+    assert off.mean() < 1e-3
+    np.testing.assert_array_equal(np.load(tmp_path / "out/beams/hit.npy"), room.recording.hit)
+
+
+def test_unknown_stays_nan(room):
+    m = stillmap.build(room.recording, options(max_iterations=2)).map
+    unknown = m.alpha + m.beta == 0
+    assert unknown.any()
+    np.testing.assert_array_equal(np.isnan(m.p_occupied), unknown)
+    known = ~unknown
+    np.testing.assert_allclose(
+        m.p_occupied[known], (m.alpha / np.where(known, m.alpha + m.beta, 1))[known], atol=1e-6
+    )
+
+
+def test_unknown_is_what_no_beam_crossed(room):
+    # the case of 0.9 x 0.6 m in the room: its inside was never seen, the floor beside it was
+    poses = room.truth.T_world_base
+    m = stillmap.build(room.recording, options(max_iterations=1), poses=poses).map
+    cells = np.round((np.array([[1.5, 1.6], [0.0, 0.0]]) - m.origin[:2]) / RESOLUTION).astype(int)
+    inside, floor = (m.p_occupied[row, column] for column, row in cells)
+    assert np.isnan(inside)
+    assert floor < 0.1
+
+
+def test_the_raw_map_counts_every_hit_as_static(room):
+    result = stillmap.build(room.recording, options(max_iterations=2))
+    raw, hit = result.raw_map, room.recording.hit
+    counts = np.zeros(raw.alpha.shape)
+    cells = end_cells(room.recording, result.poses, raw.origin, raw.resolution, hit)
+    np.add.at(counts, cells, 1.0)
+    np.testing.assert_array_equal(raw.alpha, counts)
+    # its beta is the way that beams went through: no dynamic hit is in it
+    assert raw.beta.sum() < result.map.beta.sum()
+    assert raw.alpha.sum() == hit.sum()
+    total = raw.alpha + raw.beta
+    np.testing.assert_allclose(result.map.alpha + result.map.beta, total, atol=1e-4)
+
+
+def test_movers_are_told_from_walls(room):
+    result = stillmap.build(room.recording, options(max_iterations=4))
+    e = result.p_static
+    assert e[room.truth.mover >= 0].mean() < 0.4
+    assert e[room.truth.static].mean() > 0.8
+    of_raw = result.raw_map.p_occupied > 0.3
+    assert (result.map.p_occupied > 0.3).sum() < of_raw.sum()
+
+
+def test_the_history_is_complete(room):
+    result = stillmap.build(room.recording, options(max_iterations=3, tolerance=0.0, patience=9))
+    assert [it.number for it in result.iterations] == [1, 2, 3]
+    for it in result.iterations:
+        assert math.isfinite(it.bound)
+        assert math.isfinite(it.expected_log_likelihood)
+        assert it.bound >= it.expected_log_likelihood  # an entropy is not negative
+        assert 0.0 <= it.changed_share <= 1.0
+        assert it.seconds > 0.0
+    assert result.iterations[0].changed_share > result.iterations[-1].changed_share
+    assert {"m_step", "e_step", "likelihood", "maps"} <= set(result.stages)
+    assert all(stage["peak_memory_bytes"] > 1e6 for stage in result.stages.values())
+    assert result.options.em.max_iterations == 3
+    best = max(result.iterations, key=lambda it: it.bound)
+    assert result.best_iteration == best.number
+    assert [s.number for s in result.snapshots] == sorted({1, 2, result.best_iteration})
+
+
+def test_fixed_poses_are_kept_and_the_bound_never_falls(room):
+    poses = room.truth.T_world_base
+    previous = -np.inf
+    bounds = []
+    for it in stillmap.iterate(room.recording, options(max_iterations=8), poses=poses):
+        np.testing.assert_array_equal(it.poses, poses)
+        assert it.likelihood.bound >= previous - 1e-6 * abs(previous)
+        previous = it.likelihood.bound
+        bounds.append(previous)
+    assert len(bounds) == 8
+    assert bounds[-1] > bounds[0] + 10.0
+    gains = np.diff(bounds)
+    assert gains[-1] < 0.1 * gains[0]
+
+
+def test_one_e_step_of_all_ones_is_the_raw_map(room):
+    # a prior of almost 1 leaves nothing to be dynamic in the first iteration
+    first = next(
+        stillmap.iterate(room.recording, options(prior=1 - 1e-7), poses=room.truth.T_world_base)
+    )
+    result = stillmap.build(
+        room.recording, options(max_iterations=1), poses=room.truth.T_world_base
+    )
+    _, alpha, beta = first.grid.dense()
+    np.testing.assert_allclose(alpha, result.raw_map.alpha, atol=1e-4)
+    np.testing.assert_allclose(beta, result.raw_map.beta, atol=1e-4)
+
+
+def same(a, b):
+    for x, y in (
+        (a.poses, b.poses),
+        (a.covariance, b.covariance),
+        (a.p_static, b.p_static),
+        (a.map.alpha, b.map.alpha),
+        (a.map.beta, b.map.beta),
+        (a.map.p_occupied, b.map.p_occupied),
+        (a.raw_map.alpha, b.raw_map.alpha),
+        (a.raw_map.beta, b.raw_map.beta),
+    ):
+        assert x.tobytes() == y.tobytes()
+    assert [it.bound for it in a.iterations] == [it.bound for it in b.iterations]
+    assert a.best_iteration == b.best_iteration
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_the_same_to_the_bit_with_any_number_of_threads(room, fixed):
+    poses = room.truth.T_world_base if fixed else None
+    results = [
+        stillmap.build(
+            room.recording,
+            dataclasses.replace(options(max_iterations=2), threads=threads),
+            poses=poses,
+        )
+        for threads in (1, 1, 2, 3, 0)
+    ]
+    for other in results[1:]:
+        same(results[0], other)
+
+
+def test_the_order_of_memory_does_not_matter(room):
+    # as from a memory map: arrays that cannot be written to
+    frozen = {
+        name: getattr(room.recording, name).copy() for name in ("points", "hit", "offset", "sensor")
+    }
+    for array in frozen.values():
+        array.setflags(write=False)
+    chosen = options(max_iterations=2)
+    same(
+        stillmap.build(room.recording, chosen),
+        stillmap.build(dataclasses.replace(room.recording, **frozen), chosen),
+    )
+
+
+@pytest.mark.parametrize("how", ["one scan", "no hits", "all unusable", "no beams"])
+@pytest.mark.parametrize("odometry", [True, False])
+def test_recordings_of_next_to_nothing(short, tmp_path, how, odometry):
+    r = short.recording if odometry else short.recording.without_odometry()
+    nowhere = np.zeros(r.n_beams, bool)
+    if how == "one scan":
+        beams = r.beams_of(0)
+        r = dataclasses.replace(
+            r,
+            stamp_ns=r.stamp_ns[:1],
+            offset=r.offset[:2],
+            points=r.points[beams],
+            hit=r.hit[beams],
+            sensor=r.sensor[:1],
+            T_odom_base=None if r.T_odom_base is None else r.T_odom_base[:1],
+        )
+    elif how == "no hits":
+        r = dataclasses.replace(r, hit=nowhere)
+    elif how == "all unusable":
+        r = dataclasses.replace(r, hit=nowhere, points=np.full_like(r.points, np.nan))
+    else:
+        r = dataclasses.replace(
+            r, hit=nowhere[:0], points=r.points[:0], offset=np.zeros_like(r.offset)
+        )
+    result = stillmap.build(r, options(max_iterations=2))
+    assert result.poses.shape == (r.n_scans, 3, 3)
+    assert np.isfinite(result.poses).all()
+    assert result.p_static.shape == (r.n_beams,)
+    if how == "no hits":
+        np.testing.assert_array_equal(result.p_static, np.float32(Options().em.prior))
+        assert not (result.map.p_occupied > 0).any()
+    if how in ("all unusable", "no beams"):
+        assert np.isnan(result.map.p_occupied).all()
+    result.save(tmp_path / "out")
+    assert np.load(tmp_path / "out/map.npz")["p_occupied"].shape == result.map.p_occupied.shape
+
+
+def test_what_cannot_be_mapped_is_refused(short):
+    r = short.recording
+    in_space = dataclasses.replace(
+        r,
+        points=np.zeros((r.n_beams, 3), np.float32),
+        T_base_sensor=np.eye(4)[None],
+        T_odom_base=None,
+    )
+    with pytest.raises(ValueError, match="2 dimensions"):
+        stillmap.build(in_space)
+    empty = Recording(
+        stamp_ns=np.zeros(0, np.int64),
+        offset=np.zeros(1, np.int64),
+        points=np.zeros((0, 2), np.float32),
+        hit=np.zeros(0, bool),
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(0, np.int32),
+        T_odom_base=None,
+    )
+    with pytest.raises(ValueError, match="at least one scan"):
+        stillmap.build(empty)
+
+
+@pytest.mark.parametrize("length", [1, 5, 7])
+def test_poses_of_another_length_are_refused(short, length):
+    poses = np.tile(np.eye(3), (length, 1, 1))
+    with pytest.raises(ValueError):  # noqa: PT011  whichever layer notices first
+        stillmap.build(short.recording, options(max_iterations=1), poses=poses)
+
+
+def test_progress_is_told(short):
+    told = []
+    stillmap.build(short.recording, options(max_iterations=2), progress=lambda *at: told.append(at))
+    T = short.recording.n_scans
+    iterations = sorted({iteration for _, iteration, _, _ in told})
+    assert iterations == list(range(1, len(iterations) + 1))
+    for iteration in iterations:
+        mapping = [at for at in told if at[0] == "mapping" and at[1] == iteration]
+        assert mapping[-1][2:] == (T, T)
+
+
+@pytest.mark.parametrize(
+    ("leap", "said"),
+    [
+        ((0.0, 0.0, np.radians(170)), "found by a wider search, the first is scan 30"),
+        ((30.0, 0.0, 0.0), "scans fit the map badly"),
+    ],
+)
+def test_a_leap_of_the_odometry_is_reported(room, leap, said):
+    # 30 m are beyond every search: the map goes on elsewhere, and that is said
+    T = room.recording.T_odom_base.copy()
+    increment = se2.inverse(T[29]) @ T[30]
+    # the motion prior widens with the leap; sure wheels that are wrong are the hard case
+    sure = {"translation_per_metre": 0.0, "rotation_per_radian": 0.0, "rotation_per_metre": 0.0}
+    sure["translation_per_radian"] = 0.0
+    T[30:] = T[29] @ se2.matrix(*leap) @ increment @ se2.inverse(T[30]) @ T[30:]
+    r = dataclasses.replace(room.recording, T_odom_base=T)
+    chosen = replaced(options(max_iterations=1), {"slam": {"motion": sure}})
+    result = stillmap.build(r, chosen)
+    assert any(said in warning for warning in result.warnings), result.warnings
+    plain = stillmap.build(room.recording, chosen).warnings
+    assert not any(said[:20] in warning for warning in plain)
+
+
+def test_missing_odometry_is_reported(short):
+    with_it = stillmap.build(short.recording, options(max_iterations=1))
+    without = stillmap.build(short.recording.without_odometry(), options(max_iterations=1))
+    assert not any("no odometry" in warning for warning in with_it.warnings)
+    assert any("no odometry" in warning for warning in without.warnings)

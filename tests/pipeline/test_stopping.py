@@ -1,0 +1,190 @@
+"""When the loop stops and which iterate it keeps, with iterations made up for the purpose."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap import _core, em, pipeline, se2
+from stillmap.options import replaced
+from stillmap.pipeline import Iteration, Options
+
+
+def options(**changes):
+    wanted = {"max_iterations": 10, "tolerance": 0.0, "patience": 3} | changes
+    return replaced(Options(), {"em": wanted, "slam": {"resolution": 0.1}, "threads": 1})
+
+
+@pytest.fixture
+def build(monkeypatch, short):
+    """Runs the loop over iterations with these bounds per beam; says how many it asked for."""
+    recording = short.recording
+
+    def run(bounds, chosen):
+        asked = []
+
+        def fake(recording, options, **_):
+            for number, bound in enumerate(bounds[: options.em.max_iterations], start=1):
+                asked.append(number)
+                yield made_up(recording, number, bound * recording.n_beams)
+
+        monkeypatch.setattr(pipeline, "iterate", fake)
+        return stillmap.build(recording, chosen), len(asked)
+
+    return run
+
+
+def made_up(recording, number, bound) -> Iteration:
+    """Everything in it tells its number."""
+    T = recording.n_scans
+    poses = np.tile(se2.matrix(0.01 * number, 0, 0), (T, 1, 1))
+    e = np.full(recording.n_beams, number / 100, np.float32)
+    grid = _core.Grid2D(0.1)
+    em.add_recording(grid, recording, poses, e)
+    return Iteration(
+        number=number,
+        poses=poses,
+        covariance=np.full((T, 3, 3), float(number)),
+        grid=grid,
+        weights=e,
+        p_static=e,
+        likelihood=em.Likelihood(expected=bound - 1.0, bound=bound),
+        changed_share=0.5 / number,
+        explained=np.ones(T),
+        widened=[],
+        seconds=float(number),
+    )
+
+
+def assert_kept(result, number):
+    recording = result.recording
+    assert result.best_iteration == number
+    np.testing.assert_array_equal(result.p_static, np.float32(number / 100))
+    np.testing.assert_array_equal(result.poses[:, 0, 2], 0.01 * number)
+    np.testing.assert_array_equal(result.covariance, float(number))
+    alpha = result.map.alpha.sum()
+    assert alpha == pytest.approx(recording.hit.sum() * number / 100, rel=1e-5)
+    assert result.raw_map.alpha.sum() == recording.hit.sum()
+    grid = _core.Grid2D(0.1)
+    em.add_recording(grid, recording, result.poses, None)
+    np.testing.assert_array_equal(result.raw_map.alpha, grid.dense()[1])
+
+
+@pytest.mark.parametrize(
+    ("bounds", "best"),
+    [
+        ([-5.0, -4.0, -3.0], 3),
+        ([-5.0, -3.0, -4.0], 2),
+        ([-3.0, -4.0, -5.0], 1),
+        ([-5.0, -3.0, -4.0, -2.0, -2.5], 4),
+        ([-5.0, -2.0, -4.0, -3.0], 2),
+        ([-4.0], 1),
+    ],
+)
+def test_the_best_iterate_is_kept_whole(build, bounds, best):
+    result, asked = build(bounds, options())
+    assert asked == len(bounds)
+    assert_kept(result, best)
+    assert not result.converged
+
+
+def test_the_history_tells_every_iteration_and_not_only_the_best(build):
+    result, _ = build([-5.0, -3.0, -4.0], options())
+    M = result.recording.n_beams
+    assert [it.number for it in result.iterations] == [1, 2, 3]
+    assert [it.bound for it in result.iterations] == [-5.0 * M, -3.0 * M, -4.0 * M]
+    assert [it.expected_log_likelihood for it in result.iterations] == [
+        bound * M - 1.0 for bound in (-5.0, -3.0, -4.0)
+    ]
+    assert [it.changed_share for it in result.iterations] == [0.5, 0.25, 0.5 / 3]
+    assert [it.seconds for it in result.iterations] == [1.0, 2.0, 3.0]
+
+
+def test_a_dip_is_reported(build):
+    result, _ = build([-5.0, -3.0, -4.0, -2.0], options())
+    dips = [warning for warning in result.warnings if "dipped" in warning]
+    assert len(dips) == 1
+    assert "iteration 3," in dips[0]
+    smooth, _ = build([-5.0, -3.0, -2.0], options())
+    assert not any("dipped" in warning for warning in smooth.warnings)
+
+
+def test_a_gain_below_the_tolerance_ends_it(build):
+    result, asked = build([-5.0, -4.0, -3.995, -3.0], options(tolerance=0.01))
+    assert (asked, result.converged) == (3, True)
+    assert_kept(result, 3)
+
+
+def test_a_gain_above_the_tolerance_does_not(build):
+    result, asked = build([-5.0, -4.0, -3.98, -3.0], options(tolerance=0.01))
+    assert (asked, result.converged) == (4, False)
+
+
+def test_the_tolerance_is_per_beam(build, short):
+    # 0.01 nats in all are nothing, however many beams there are
+    bounds = [-5.0, -5.0 + 0.01 / short.recording.n_beams, -3.0]
+    result, asked = build(bounds, options(tolerance=0.001))
+    assert (asked, result.converged) == (2, True)
+
+
+def test_a_dip_alone_does_not_end_it(build):
+    result, asked = build([-5.0, -4.0, -4.001, -3.0], options(tolerance=0.01, patience=2))
+    assert asked == 4
+    assert_kept(result, 4)
+
+
+def test_patience_ends_it(build):
+    result, asked = build([-3.0, -4.0, -5.0, -6.0, -1.0], options(patience=2))
+    assert (asked, result.converged) == (3, True)
+    assert_kept(result, 1)
+
+
+def test_patience_starts_anew_with_every_best(build):
+    bounds = [-9.0, -9.5, -8.0, -8.5, -7.0, -7.5, -7.6, -1.0]
+    result, asked = build(bounds, options(patience=2))
+    assert asked == 7
+    assert_kept(result, 5)
+
+
+def test_the_limit_ends_it_unconverged(build):
+    result, asked = build([-9.0, -8.0, -7.0, -6.0], options(max_iterations=3))
+    assert (asked, result.converged) == (3, False)
+    assert len(result.iterations) == 3
+
+
+@pytest.mark.parametrize("bounds", [[-5.0, -3.0, -4.0, -2.0, -2.5], [-3.0, -4.0, -5.0], [-5.0]])
+def test_snapshots_show_first_second_and_best(build, bounds):
+    result, _ = build(bounds, options())
+    numbers = [s.number for s in result.snapshots]
+    assert numbers == sorted({1, 2, result.best_iteration} & set(range(1, len(bounds) + 1)))
+
+
+def test_iterate_ends_at_the_limit_and_leaves_stopping_to_the_caller(short):
+    # with tolerance infinite in effect, build stops at 2; iterate does not
+    chosen = options(max_iterations=3, tolerance=1e9)
+    assert [it.number for it in stillmap.iterate(short.recording, chosen)] == [1, 2, 3]
+    result = stillmap.build(short.recording, chosen)
+    assert result.converged
+    assert len(result.iterations) <= 3
+
+
+def test_iterate_does_no_work_ahead(short):
+    told = []
+    iterator = stillmap.iterate(short.recording, options(), progress=lambda *at: told.append(at[1]))
+    assert told == []
+    next(iterator)
+    assert set(told) == {1}
+
+
+def test_iterations_feed_on_the_labels_of_the_last(short):
+    # e enters as weight: with fixed poses the second map is that of the first labels
+    poses = short.truth.T_world_base
+    first, second = list(stillmap.iterate(short.recording, options(max_iterations=2), poses=poses))
+    grid = _core.Grid2D(0.1)
+    em.add_recording(grid, short.recording, poses, first.p_static)
+    for ours, theirs in zip(second.grid.dense(), grid.dense(), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    moved = np.abs(second.p_static - first.p_static)[short.recording.hit] > 0.1
+    assert second.changed_share == pytest.approx(moved.mean())
+    assert dataclasses.is_dataclass(second)
