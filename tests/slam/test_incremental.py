@@ -200,6 +200,17 @@ def test_scans_that_say_nothing_are_bridged(how, odometry):
     assert ate(mapped, simulation) < (0.03 if odometry else 0.1)
 
 
+def test_without_odometry_a_blind_robot_is_thought_to_drive_on():
+    # straight ahead, 0.1 m from scan to scan
+    simulation = small_room()
+    truth = se2.inverse(simulation.truth.T_world_base[0]) @ simulation.truth.T_world_base
+    np.testing.assert_allclose(truth[[10, 18], 0, 2], [1.0, 1.8], atol=0.01)
+    blind = blank(simulation.recording, range(10, 19), "unusable").without_odometry()
+    x = build(blind).poses[:, 0, 2]
+    assert x[18] == pytest.approx(1.8, abs=0.3)
+    assert x[19] == pytest.approx(1.9, abs=0.03)
+
+
 @pytest.mark.parametrize("how", ["no hits", "unusable", "no beams"])
 def test_nothing_but_such_scans_leaves_odometry(how):
     recording = blank(small_room(scans=10).recording, range(10), how)
