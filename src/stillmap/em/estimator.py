@@ -20,7 +20,7 @@ CHUNK_BEAMS = 1 << 20
 class EmOptions:
     """The loop of Fig. 2."""
 
-    prior: float = field_with_doc(0.95, "p(c = 1), share of beams thought static beforehand")
+    prior: float = field_with_doc(0.9, "p(c = 1), share of beams thought static beforehand")
     max_iterations: int = field_with_doc(6, "iterations at most")
     tolerance: float = field_with_doc(
         1e-3, "nats per beam of the bound: the loop stops when it gains less"
