@@ -40,8 +40,8 @@ class Options:
     output: OutputOptions = field(default=OutputOptions())
 
     def __post_init__(self) -> None:
-        if self.threads < 0:
-            raise ValueError("'threads' wants 0 or a positive number")
+        if not 0 <= self.threads <= 1024:
+            raise ValueError("'threads' wants 0 to 1024")
 
 
 DEFAULTS = Options()
@@ -98,6 +98,8 @@ def iterate(
     Yields:
         one Iteration after the other, `options.em.max_iterations` of them at most.
     """
+    if poses is not None and poses.shape != (recording.n_scans, 3, 3):
+        raise ValueError(f"poses: expected ({recording.n_scans}, 3, 3), got {poses.shape}")
     stages = stages or Stages()
     threads = resolved_threads(options.threads)
     e = em.initial_expectations(recording, options.em)  # e := p(c = 1)

@@ -95,8 +95,7 @@ def build(
     iterations = pipeline.iterate(recording, options, poses=poses, progress=progress, stages=stages)
     while not run.finished and run.take_next(iterations, recording):
         pass
-    with stages.measure("maps"):
-        return run.result(recording, stages)
+    return run.result(recording, stages)
 
 
 @dataclass
@@ -169,8 +168,9 @@ class _Run:
         kept = self.kept
         threads = resolved_threads(self.options.threads)
         resolution = self.options.slam.resolution
-        filtered = _map_of(recording, kept.poses, kept.weights, resolution, threads)
-        raw = _map_of(recording, kept.poses, None, resolution, threads)
+        with stages.measure("maps"):
+            filtered = _map_of(recording, kept.poses, kept.weights, resolution, threads)
+            raw = _map_of(recording, kept.poses, None, resolution, threads)
         return Result(
             recording=recording,
             options=self.options,

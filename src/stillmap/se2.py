@@ -35,5 +35,5 @@ def inverse(T: Float) -> Float:
 
 
 def wrap(angle: ArrayLike) -> Float:
-    """Angles mapped to [-pi, pi)."""
+    """Angles mapped to [-pi, pi]; which end pi itself goes to is left to rounding."""
     return (np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi

@@ -10,6 +10,8 @@
 
 namespace stillmap {
 
+constexpr double kPi = 3.14159265358979323846;
+
 struct FieldOptions {
   double sigma;    // metres, width of the Gaussians
   int radius;      // cells, how far neighbours are looked at
@@ -51,9 +53,14 @@ class Field {
     if (options.radius < 0 || options.radius > 64)
       throw std::invalid_argument("radius: expected 0 to 64 cells");
     const double sigma_cells = options.sigma / resolution_;
+    // a Gaussian cut off at the radius has less variance than sigma^2; along a uniform wall the
+    // spread has to make up for sigma^-2 exactly
+    const double cut = (options.radius + 0.5) / sigma_cells;
+    const double density = std::exp(-0.5 * cut * cut) / std::sqrt(2.0 * kPi);
+    kept_variance_ = 1.0 - 2.0 * cut * density / std::erf(cut / std::sqrt(2.0));
     exponent_ = -0.5 / (sigma_cells * sigma_cells);
     // a straight wall whose cells are all occupied gives F = 1
-    norm_ = 1.0 / std::pow(std::sqrt(2.0 * 3.14159265358979323846) * sigma_cells, D - 1);
+    norm_ = 1.0 / std::pow(std::sqrt(2.0 * kPi) * sigma_cells, D - 1);
   }
 
   FieldValue<D> evaluate(const Vec<D>& y_metres, Neighbourhood<D>& near) {
@@ -78,7 +85,8 @@ class Field {
     first /= sum;
     out.value = sum * norm_;
     out.pull = first * (per_metre2 * resolution_);
-    const double spread_scale = per_metre2 * per_metre2 * resolution_ * resolution_;
+    const double spread_scale =
+        per_metre2 * per_metre2 * resolution_ * resolution_ / kept_variance_;
     out.spread = (second / sum - first * first.transpose()) * spread_scale;
     return out;
   }
@@ -120,6 +128,7 @@ class Field {
   FieldOptions options_;
   double resolution_;
   double exponent_;
+  double kept_variance_;
   double norm_;
 };
 

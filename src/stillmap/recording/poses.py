@@ -28,8 +28,6 @@ def poses_from_tum(path: Path, recording: Recording) -> NDArray[np.float64]:
     poses = se2.matrix(planar[:, 0, 2], planar[:, 1, 2], yaw)
     if np.array_equal(stamp_ns, recording.stamp_ns):
         return poses
-    if len(stamp_ns) == 0:
-        raise InputError("holds no pose", where=str(path))
     order = np.argsort(stamp_ns, kind="stable")
     nearest = order[_nearest(stamp_ns[order], recording.stamp_ns)]
     missing = np.flatnonzero(np.abs(stamp_ns[nearest] - recording.stamp_ns) > _NEAR_NS)

@@ -1,5 +1,6 @@
 """The motion prior p(x_t | u_{t-1}, x_{t-1}) of (9): where odometry says the robot went."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,8 @@ from stillmap import se2
 from stillmap.options import field_with_doc
 
 Float = NDArray[np.float64]
+
+_PER_MOTION = ("_per_metre", "_per_radian")  # these may be zero, floors may not
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,12 @@ class MotionOptions:
     without_odometry_rotation: float = field_with_doc(
         0.15, "rad, error of the constant-velocity guess where there is no odometry"
     )
+
+    def __post_init__(self) -> None:
+        for name in (f.name for f in dataclasses.fields(self)):
+            value = getattr(self, name)
+            if not 0.0 <= value <= 100.0 or (value < 1e-6 and not name.endswith(_PER_MOTION)):
+                raise ValueError(f"'slam.motion.{name}' wants a positive number up to 100")
 
 
 @dataclass(frozen=True)
@@ -85,5 +94,6 @@ def widened(prior: MotionPrior, sigma_translation: float, sigma_rotation: float)
 
 
 def _prior(mean: Float, sigma_xy: float, sigma_theta: float) -> MotionPrior:
+    mean = se2.matrix(*se2.parameters(mean))  # a rotation again: chains of products drift away
     information = np.diag([sigma_xy**-2, sigma_xy**-2, sigma_theta**-2])
     return MotionPrior(mean, information, sigma_xy, sigma_theta)

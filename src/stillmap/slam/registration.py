@@ -21,7 +21,7 @@ class RegistrationOptions:
     sigma: float = field_with_doc(0.06, "m, width of the smoothed field around end points")
     floor: float = field_with_doc(0.05, "field value of an end point the map cannot explain")
     unknown: float = field_with_doc(0.05, "what unknown space adds to it: unknown is not free")
-    gain: float = field_with_doc(0.2, "weight of one beam against the motion prior")
+    gain: float = field_with_doc(0.5, "weight of one beam against the motion prior")
     max_iterations: int = field_with_doc(20, "Newton steps at most")
     window: float = field_with_doc(3.0, "standard deviations of the prior that are searched")
     search_range: float = field_with_doc(20.0, "m, beams beyond are left out of the search")
@@ -39,11 +39,26 @@ class RegistrationOptions:
     )
 
     def __post_init__(self) -> None:
-        for name in ("sigma", "floor", "gain", "search_range"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"'slam.registration.{name}' wants a positive number")
-        if self.max_iterations < 1 or self.starts < 1 or self.window < 0.0:
-            raise ValueError("'slam.registration' wants max_iterations, starts >= 1, window >= 0")
+        for name, low, high in _LIMITS:
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"'slam.registration.{name}' wants {low:g} to {high:g}")
+
+
+_LIMITS = (
+    ("sigma", 0.005, 1.0),
+    ("floor", 1e-6, 10.0),
+    ("unknown", 0.0, 10.0),
+    ("gain", 1e-6, 1e3),
+    ("max_iterations", 1, 1000),
+    ("window", 0.0, 10.0),
+    ("search_range", 0.1, 1000.0),
+    ("starts", 1, 100),
+    ("doubt_below", 0.0, 1.0),
+    ("accept_above", 0.0, 1.0),
+    ("doubt_translation", 0.0, 5.0),
+    ("doubt_rotation", 0.0, 3.2),
+    ("lost_translation", 0.0, 5.0),
+)
 
 
 @dataclass(frozen=True)
