@@ -16,7 +16,7 @@ import numpy as np
 from seeds import REPORTING, TUNING
 
 import stillmap
-from stillmap import _core, em, options, se2, slam
+from stillmap import _core, em, options
 from stillmap.evaluation.labels import label_scores
 from stillmap.evaluation.map import Grid, map_scores, wall_cells_of_map
 from stillmap.evaluation.trajectory import absolute_errors, align
@@ -105,11 +105,9 @@ def reference_walls(case: Case) -> np.ndarray:
     """Wall cells of the same run without people, every hit counted."""
     empty = simulate(scene_by_name(case.scene, {"crowd": {"people": 0}}), case.seed)
     recording, truth = empty.recording, empty.truth
-    e = np.ones(recording.n_beams, np.float32)
-    mapped = slam.m_step(
-        recording, e, slam.SlamOptions(), truth.T_world_base, 1, lambda done, total: None
-    )
-    return wall_cells_of_map(grid_of(mapped.grid), truth.walls, np.eye(3))
+    grid = _core.Grid2D(stillmap.Options().slam.resolution)
+    em.add_recording(grid, recording, truth.T_world_base, None)
+    return wall_cells_of_map(grid_of(grid), truth.walls, np.eye(3))
 
 
 def grid_of(grid: _core.Grid2D) -> Grid:

@@ -65,10 +65,8 @@ def row(folder: Path, log: str, out: Path, flags: list[str]) -> str:
 
 
 def stillmap(*arguments: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", "stillmap", *arguments], check=True, stdout=subprocess.PIPE, text=True
-    )
-    return done.stdout
+    command = [sys.executable, "-m", "stillmap", *arguments]
+    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
 if __name__ == "__main__":
