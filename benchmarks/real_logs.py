@@ -14,6 +14,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+import numpy as np
+
 
 def main() -> None:
     p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -51,13 +53,14 @@ def row(folder: Path, log: str, out: Path, flags: list[str]) -> str:
         relations = folder / f"{log}.pseudo.relations"
     trajectory = str(out / "trajectory.tum")
     o = json.loads(stillmap("eval", "relations", trajectory, str(relations), "--json"))
+    p_static, hit = (np.load(out / "beams" / f"{name}.npy") for name in ("p_static", "hit"))
     scans = run["counts"]["scans"]
     registration = run["seconds"]["m_step"] / len(run["iterations"])
     return (
         f"{log:10} | {scans:5} | {o['translation']['mean']:.4f} "
         f"({o['translation']['median']:.4f}, {o['translation']['max']:.3f}) | "
-        f"{o['rotation_deg']['mean']:.3f} | {o['used']:4} | "
-        f"{100 * run['counts']['dynamic'] / run['counts']['hits']:.1f} % | "
+        f"{o['rotation']['mean']:.3f} | {o['used']:4} | "
+        f"{100 * np.mean(p_static[hit] < 0.5):.1f} % | "
         f"{len(run['iterations'])} ({run['best_iteration']}) | "
         f"{1e3 * registration / scans:.2f} per iteration, {1e3 * cpu / scans:.2f} in all | "
         f"{max(run['peak_memory_bytes'].values()) / 1e6:.0f}"

@@ -92,7 +92,7 @@ class Grid {
   static Cell<D> cell_at(const Cell<D>& block, int local) {
     Cell<D> cell;
     for (int d = 0; d < D; ++d)
-      cell[d] = (block[d] << kShift) + ((local >> (d * kShift)) & (kEdge - 1));
+      cell[d] = block[d] * kEdge + ((local >> (d * kShift)) & (kEdge - 1));
     return cell;
   }
 

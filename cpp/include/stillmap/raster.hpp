@@ -99,7 +99,7 @@ class Raster {
     std::array<const float*, D> g;  // of each axis, at pixel low
     for (int d = 0; d < D; ++d)
       g[static_cast<size_t>(d)] =
-          table.data() + (cell[d] - (pixel[d] << shift_)) * edge + (low[d] - pixel[d] + reach);
+          table.data() + (cell[d] - pixel[d] * (1 << shift_)) * edge + (low[d] - pixel[d] + reach);
     const int32_t width = high[0] - low[0] + 1;
     high[0] = low[0];  // whole rows along x
     for_each_in_box<D>(low, high, [&](const Cell<D>& row) {
