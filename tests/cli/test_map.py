@@ -372,3 +372,9 @@ def test_ctrl_c_on_a_terminal_gives_the_cursor_back(start, room, tmp_path, nothi
     assert len(lines) == 1
     assert lines[0].startswith("stillmap: interrupted")
     nothing_left()
+
+
+def test_the_run_record_says_where_the_recording_is(call, room, tmp_path):
+    call("map", room, "-o", tmp_path / "out", *QUICK)
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert record["input"]["path"] == str(room)

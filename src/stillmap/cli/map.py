@@ -1,6 +1,7 @@
 """`stillmap map`: the main job, recording in, folder out."""
 
 import argparse
+import dataclasses
 import os
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,14 @@ def _usable(recording: Recording, args: argparse.Namespace) -> Recording:
         raise InputError("holds no scan that can be used", where=args.input)
     if recording.dimension != 2:
         raise InputError("is 3D: only 2D recordings can be mapped so far", where=args.input)
+    recording = dataclasses.replace(recording, source=_found_at(recording.source, args.input))
     return recording.without_odometry() if args.no_odometry else recording
+
+
+def _found_at(source: dict[str, Any], path: str) -> dict[str, Any]:
+    """The source as run.json tells it: where the recording is now, and what it was made from."""
+    made_from = source.get("path", path)
+    return {**source, "path": path} | ({} if made_from == path else {"made_from": made_from})
 
 
 def _changes(args: argparse.Namespace) -> dict[str, Any]:
