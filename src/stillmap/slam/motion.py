@@ -19,7 +19,7 @@ class MotionOptions:
     """Standard deviations of one odometry increment."""
 
     translation_floor: float = field_with_doc(0.02, "m, error of an increment without motion")
-    translation_per_metre: float = field_with_doc(0.1, "m of error per metre travelled")
+    translation_per_metre: float = field_with_doc(0.07, "m of error per metre travelled")
     translation_per_radian: float = field_with_doc(0.05, "m of error per radian turned")
     rotation_floor: float = field_with_doc(0.02, "rad, error of an increment without motion")
     rotation_per_metre: float = field_with_doc(0.1, "rad of error per metre travelled")

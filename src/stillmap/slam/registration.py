@@ -21,7 +21,7 @@ class RegistrationOptions:
     sigma: float = field_with_doc(0.06, "m, width of the smoothed field around end points")
     floor: float = field_with_doc(0.05, "field value of an end point the map cannot explain")
     unknown: float = field_with_doc(0.05, "what unknown space adds to it: unknown is not free")
-    gain: float = field_with_doc(0.25, "weight of one beam against the motion prior")
+    gain: float = field_with_doc(0.2, "weight of one beam against the motion prior")
     max_iterations: int = field_with_doc(20, "Newton steps at most")
     window: float = field_with_doc(3.0, "standard deviations of the prior that are searched")
     search_range: float = field_with_doc(20.0, "m, beams beyond are left out of the search")
