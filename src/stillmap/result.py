@@ -43,7 +43,7 @@ class Result:
         recording: what it was made from.
         options: every option as resolved.
         iterations: the numbers of every iteration.
-        snapshots: a part of the map at the first, second and best iteration (Fig. 8).
+        snapshots: a part of the map at the first, second, best and last iteration (Fig. 8).
         poses: (T, 3, 3) T_map_base of the best iteration.
         covariance: (T, 3, 3) of x, y, heading against the map so far.
         p_static: (M,) float32, P(c = 1); it follows from `map` by a last E-step. NaN: unusable.
@@ -140,8 +140,7 @@ class _Run:
         gain = np.inf if self.best is None else bound - self.best.bound
         if gain > 0.0:
             self.best = _Best.of(iteration)
-        if iteration.number <= 2 or gain > 0.0:
-            self._remember(iteration, recording)
+        self._remember(iteration, recording)
         settled = 0.0 <= gain < self.options.em.tolerance * recording.n_beams
         stuck = iteration.number - self.kept.number >= self.options.em.patience
         self.finished = settled or stuck
@@ -159,7 +158,8 @@ class _Run:
         dynamic = np.zeros(len(points), dtype=np.float32)
         if self.window is None:
             self.window = choose_window(occupancy, points, dynamic)
-        self.snapshots = {n: s for n, s in self.snapshots.items() if n <= 2}
+        shown = {1, 2, self.kept.number}  # and the last, whichever that will be
+        self.snapshots = {n: s for n, s in self.snapshots.items() if n in shown}
         self.snapshots[iteration.number] = snapshot(
             iteration.number, occupancy, points, dynamic, self.window
         )

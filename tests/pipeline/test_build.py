@@ -148,7 +148,8 @@ def test_the_history_is_complete(room):
     assert result.options.em.max_iterations == 3
     best = max(result.iterations, key=lambda it: it.bound)
     assert result.best_iteration == best.number
-    assert [s.number for s in result.snapshots] == sorted({1, 2, result.best_iteration})
+    last = len(result.iterations)
+    assert [s.number for s in result.snapshots] == sorted({1, 2, result.best_iteration, last})
 
 
 def test_fixed_poses_are_kept_and_the_bound_never_falls(room):

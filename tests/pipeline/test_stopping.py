@@ -154,10 +154,11 @@ def test_the_limit_ends_it_unconverged(build):
 
 
 @pytest.mark.parametrize("bounds", [[-5.0, -3.0, -4.0, -2.0, -2.5], [-3.0, -4.0, -5.0], [-5.0]])
-def test_snapshots_show_first_second_and_best(build, bounds):
+def test_snapshots_show_first_second_best_and_last(build, bounds):
     result, _ = build(bounds, options())
     numbers = [s.number for s in result.snapshots]
-    assert numbers == sorted({1, 2, result.best_iteration} & set(range(1, len(bounds) + 1)))
+    ran = len(result.iterations)
+    assert numbers == sorted({1, 2, result.best_iteration, ran} & set(range(1, ran + 1)))
 
 
 def test_iterate_ends_at_the_limit_and_leaves_stopping_to_the_caller(short):

@@ -74,7 +74,7 @@ class ResultLike(Protocol):
         recording: what it was made from.
         options: every option as resolved.
         iterations: one record per EM iteration, in order.
-        snapshots: a small part of the map at the first, second and best iteration (Fig. 8).
+        snapshots: a small part of the map at the first, second, best and last iteration (Fig. 8).
         poses: (T, D+1, D+1) float64, T_map_base.
         p_static: (M,) float32, P(c = 1); NaN for unusable beams, the prior at maximum range.
         map: the map of what stands still.

@@ -68,7 +68,7 @@ def maps_section(result: ResultLike) -> str:
 
 
 def evolution_section(result: ResultLike) -> str:
-    """The part of the map with most movement at the first, second and best iteration."""
+    """The part of the map with most movement at the first, second, best and last iteration."""
     if not result.snapshots or not result.snapshots[0].p_occupied.size:
         return ""
     figures = "".join(_snapshot_figure(one, result.best_iteration) for one in result.snapshots)
