@@ -125,8 +125,7 @@ def test_a_mover_that_is_known_as_one_has_no_pull(scan, put):
     e[walker] = 0.0
     free = register(grid, there, e, prior, OPTIONS)
     assert pulled.T_map_base[0, 2] == pytest.approx(-0.25, abs=0.05)
-    # nothing but the prior (0.3 m) knows where along the walls the robot is
-    assert abs(free.T_map_base[0, 2]) < 0.15
+    assert abs(free.T_map_base[0, 2]) < 0.05
     assert abs(free.T_map_base[1, 2]) < 0.01
 
 
