@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stillmap.simulation import LaserOptions
-from stillmap.simulation.laser import Movers, Returns, beam_angles, cast, measure
+from stillmap.simulation.laser import Movers, Outlines, Returns, beam_angles, cast, measure
 
 Float = NDArray[np.float64]
 
@@ -91,6 +91,30 @@ def test_agrees_with_brute_force(seed: int, beams: int, fov: float) -> None:
     np.testing.assert_allclose(fast.range, slow.range, rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(fast.mover, slow.mover)
     np.testing.assert_array_equal(fast.wall, slow.wall)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_moving_faces_agree_with_brute_force(seed: int) -> None:
+    """A face that moves is a wall that stands elsewhere in each scan."""
+    rng = np.random.default_rng(seed)
+    walls, poses, movers = random_world(rng)
+    faces, angles = rng.uniform(-6, 6, (len(poses), 7, 4)), beam_angles(60, 2 * np.pi)
+    outlines = Outlines(faces, np.arange(7, dtype=np.int32) // 2 + 20)
+    fast = cast(poses, angles, walls, movers, outlines)
+    for t in range(len(poses)):
+        now = Movers(movers.xy[t : t + 1], movers.heading[t : t + 1], *there(movers))
+        both = np.concatenate([walls, faces[t]])
+        slow = by_brute_force(poses[t : t + 1], angles, both, now)
+        face = slow.wall[0] - len(walls)
+        np.testing.assert_allclose(fast.range[t], slow.range[0], rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(fast.wall[t], np.where(face < 0, slow.wall[0], -1))
+        mover = np.where(face >= 0, outlines.mover[np.maximum(face, 0)], slow.mover[0])
+        np.testing.assert_array_equal(fast.mover[t], mover)
+    assert (fast.mover >= 20).mean() > 0.1
+
+
+def there(movers: Movers) -> tuple[Float, NDArray[np.int32]]:
+    return movers.semi_axes, movers.mover
 
 
 def test_no_ray_slips_through_the_corners_of_a_closed_polygon() -> None:

@@ -1,5 +1,7 @@
 """Where there is room between walls, and the shortest way through it."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
@@ -66,12 +68,17 @@ class FreeSpace:
 
 
 class Planner:
-    """Shortest ways that keep clear of the walls, within the part that `inside` belongs to.
+    """Shortest ways that keep clear of the walls, within the parts that `inside` belongs to.
 
     Args:
         space: the clearance grid.
-        inside: (2,) a point of that part, metres.
+        inside: (2,) a point of the part, metres, or (K, 2) points of several parts between which
+            there is no way.
         clearance: m, the least distance from walls.
+
+    Attributes:
+        nodes: those of all parts.
+        parts: how many parts there are.
 
     Raises:
         InputError: there is no room at `inside`.
@@ -83,19 +90,31 @@ class Planner:
         coarse = self._clear[::_STRIDE, ::_STRIDE]
         parts, _ = ndimage.label(coarse, structure=np.ones((3, 3)))
         self._shape = coarse.shape
-        at = np.round((inside - space.origin) / (_SPACING * _STRIDE)).astype(int)
-        column, row = np.clip(at, 0, (self._shape[1] - 1, self._shape[0] - 1))
-        if not parts[row, column]:
-            raise InputError(
-                f"no room for a robot or a person at ({inside[0]:g}, {inside[1]:g})",
-                hint=f"points of a route lie at least {clearance:g} m from any wall",
-            )
-        part = parts == parts[row, column]
+        labels = [self._label_at(parts, xy, clearance) for xy in np.atleast_2d(inside)]
+        rank = np.full(int(parts.max()) + 1, -1)
+        rank[labels] = np.arange(len(labels))
+        self._part = rank[parts].ravel()
+        self.parts = len(labels)
+        part = (self._part >= 0).reshape(self._shape)
         self._graph = _graph(part, space.clearance[::_STRIDE, ::_STRIDE], clearance)
         _, nearest = ndimage.distance_transform_edt(~part, return_indices=True)
         self._nearest = nearest[0] * self._shape[1] + nearest[1]
         self.nodes = np.flatnonzero(part)
         self._trees: dict[int, NDArray[np.int32]] = {}
+
+    def _label_at(self, parts: NDArray[Any], xy: Float, clearance: float) -> int:
+        at = np.round((xy - self._space.origin) / (_SPACING * _STRIDE)).astype(int)
+        column, row = np.clip(at, 0, (self._shape[1] - 1, self._shape[0] - 1))
+        if not parts[row, column]:
+            raise InputError(
+                f"no room for a robot or a person at ({xy[0]:g}, {xy[1]:g})",
+                hint=f"points of a route lie at least {clearance:g} m from any wall",
+            )
+        return int(parts[row, column])
+
+    def part_of(self, node: int | NDArray[np.int64]) -> NDArray[np.int64]:
+        """Which part the nodes belong to, as the points `inside` are numbered."""
+        return np.asarray(self._part[node])
 
     def point(self, node: NDArray[np.int64]) -> Float:
         """(..., 2) points in metres of the nodes (...)."""

@@ -21,7 +21,7 @@ _NEAREST = 1e-3  # m, the laser sees nothing nearer
 
 @dataclass(frozen=True, eq=False)
 class Movers:
-    """What the laser sees of everything that moves: upright cylinders with elliptic outline.
+    """What the laser sees of people: upright cylinders with elliptic outline.
 
     Attributes:
         xy: (T, Q, 2) centres in metres at each scan.
@@ -33,6 +33,19 @@ class Movers:
     xy: Float
     heading: Float
     semi_axes: Float
+    mover: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """What the laser sees of doors and vehicles: upright faces that move.
+
+    Attributes:
+        faces: (T, Q, 4) segments x0, y0, x1, y1 in metres at each scan.
+        mover: (Q,) whose face this is.
+    """
+
+    faces: Float
     mover: NDArray[np.int32]
 
 
@@ -62,7 +75,9 @@ def beam_angles(beams: int, fov: float) -> Float:
     return np.asarray(-fov / 2 + step * np.arange(beams), np.float64)
 
 
-def cast(poses: Float, angles: Float, walls: Float, movers: Movers) -> Returns:
+def cast(
+    poses: Float, angles: Float, walls: Float, movers: Movers, outlines: Outlines | None = None
+) -> Returns:
     """Exact ranges of T scans with n beams each.
 
     Args:
@@ -70,6 +85,7 @@ def cast(poses: Float, angles: Float, walls: Float, movers: Movers) -> Returns:
         angles: (n,) evenly spaced beam angles in the sensor frame, rising, at least 2.
         walls: (W, 4) segments in metres.
         movers: their parts at these T scans.
+        outlines: further movers at these T scans.
     """
     shape = (len(poses), len(angles))
     out = Returns(
@@ -80,6 +96,8 @@ def cast(poses: Float, angles: Float, walls: Float, movers: Movers) -> Returns:
         scans = _Scans(poses[part], angles)
         _cast_walls(scans, walls, out.range[part], out.wall[part])
         _cast_movers(scans, movers, part, out.range[part], out.mover[part])
+        if outlines is not None:
+            _cast_outlines(scans, outlines, part, out.range[part], out.mover[part])
     out.wall[out.mover >= 0] = -1
     return out
 
@@ -113,18 +131,32 @@ class _Scans:
 
 def _cast_walls(scans: _Scans, walls: Float, ranges: Float, which: NDArray[np.int32]) -> None:
     flat, flat_which = ranges.reshape(-1), which.reshape(-1)
-    for w, (x0, y0, x1, y1) in enumerate(walls):
-        bearing = np.arctan2(y0 - scans.y, x0 - scans.x)
-        other = np.arctan2(y1 - scans.y, x1 - scans.x)
-        turn = (other - bearing + np.pi) % (2 * np.pi) - np.pi
-        scan, beam = scans.covered(np.where(turn >= 0, bearing, other), np.abs(turn))
-        nx, ny = y0 - y1, x1 - x0
-        height = nx * (x0 - scans.x) + ny * (y0 - scans.y)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            r = height[scan] / (nx * scans.cos[beam] + ny * scans.sin[beam])
-        nearer = (r > _NEAREST) & (r < flat[beam])
-        flat[beam[nearer]] = r[nearer]
-        flat_which[beam[nearer]] = w
+    for w, wall in enumerate(walls):
+        flat_which[_lowered(scans, wall, flat)] = w
+
+
+def _cast_outlines(
+    scans: _Scans, outlines: Outlines, part: slice, ranges: Float, which: NDArray[np.int32]
+) -> None:
+    flat, flat_which = ranges.reshape(-1), which.reshape(-1)
+    for q, mover in enumerate(outlines.mover):
+        flat_which[_lowered(scans, outlines.faces[part, q].T, flat)] = mover
+
+
+def _lowered(scans: _Scans, face: Float, ranges: Float) -> Index:
+    """Lower flat ranges to a face (4,), or (4, T) if it moves; the beams that it is nearest on."""
+    x0, y0, x1, y1 = face
+    bearing = np.arctan2(y0 - scans.y, x0 - scans.x)
+    other = np.arctan2(y1 - scans.y, x1 - scans.x)
+    turn = (other - bearing + np.pi) % (2 * np.pi) - np.pi
+    scan, beam = scans.covered(np.where(turn >= 0, bearing, other), np.abs(turn))
+    nx, ny = np.broadcast_to(y0 - y1, turn.shape), np.broadcast_to(x1 - x0, turn.shape)
+    height = nx * (x0 - scans.x) + ny * (y0 - scans.y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r = height[scan] / (nx[scan] * scans.cos[beam] + ny[scan] * scans.sin[beam])
+    nearer = (r > _NEAREST) & (r < ranges[beam])
+    ranges[beam[nearer]] = r[nearer]
+    return np.asarray(beam[nearer])
 
 
 def _cast_movers(

@@ -15,7 +15,8 @@ def drifting(T_world_base: Float, options: OdometryOptions, rng: np.random.Gener
     Between two scans the left and right wheel roll d -+ b theta / 2. They are misread by their
     own relative errors, turned back into d and theta with a wrong base b, and noise is added
     whose variance grows with the way driven and turned, so that it does not depend on the scan
-    rate (Thrun, Burgard, Fox, Probabilistic Robotics, 5.4, with random-walk scaling).
+    rate (Thrun, Burgard, Fox, Probabilistic Robotics, 5.4, with random-walk scaling). Wheels that
+    slip roll farther than the robot gets, one at a time, on short pieces of the way.
     """
     x, y, turn = se2.parameters(se2.inverse(T_world_base[:-1]) @ T_world_base[1:]).T
     # an arc as chord at half its angle
@@ -32,9 +33,23 @@ def drifting(T_world_base: Float, options: OdometryOptions, rng: np.random.Gener
     d = d + noise[0] * options.translation_noise * np.sqrt(way)
     variance = options.rotation_noise**2 * turned + options.drift_noise**2 * way
     theta = theta + noise[1] * np.sqrt(variance)
+    if options.slip_rate > 0:
+        slipped = _slips(way, options, rng) * way
+        d = d + slipped.sum(axis=0) / 2
+        theta = theta + (slipped[1] - slipped[0]) / (options.wheel_base * base)
     heading = np.concatenate([[0.0], np.cumsum(theta)])
     middle = heading[:-1] + theta / 2
     chord = d * np.sinc(theta / (2 * np.pi))
     position = np.zeros((len(heading), 2))
     position[1:] = np.cumsum(chord[:, None] * np.stack([np.cos(middle), np.sin(middle)], -1), 0)
     return se2.matrix(position[:, 0], position[:, 1], heading)
+
+
+def _slips(way: Float, options: OdometryOptions, rng: np.random.Generator) -> Float:
+    """(2, T - 1) how much farther than the robot each wheel rolls, relative to the way (T - 1,)."""
+    extra = np.zeros((2, len(way)))
+    ends = np.cumsum(way)
+    for begin in np.flatnonzero(rng.random(len(way)) < options.slip_rate * way).tolist():
+        last = np.searchsorted(ends, ends[begin] + options.slip_length)
+        extra[rng.integers(2), begin:last] += options.slip * rng.uniform(0.5, 1.5)
+    return extra

@@ -37,7 +37,8 @@ class Crowd:
     ) -> None:
         P = options.people
         self._options, self._space, self._planner, self._rng = options, space, planner, rng
-        self._places = rng.choice(planner.nodes, min(_PLACES, len(planner.nodes)), replace=False)
+        places = rng.choice(planner.nodes, min(_PLACES, len(planner.nodes)), replace=False)
+        self._places = [_in_part(planner, places, k) for k in range(planner.parts)]
         self.xy = self._start(P, robot)
         self.heading = rng.uniform(-np.pi, np.pi, P)
         self._velocity = np.zeros((P, 2))
@@ -54,6 +55,21 @@ class Crowd:
     @property
     def speed(self) -> Float:
         return np.asarray(np.hypot(*self._velocity.T))
+
+    def ways(self, reach: float) -> Float:
+        """(P, 3, 2) where everybody is, and the next two corners of their ways, as far as `reach`.
+
+        Args:
+            reach: metres to go from where they are.
+        """
+        following = [r[0] if r else t for r, t in zip(self._routes, self._target, strict=True)]
+        corners = np.stack([self.xy, self._target, np.reshape(following, (-1, 2))], axis=1)
+        legs = np.diff(corners, axis=1)
+        length = np.hypot(legs[..., 0], legs[..., 1])
+        left = reach - np.cumsum(length, axis=1) + length
+        share = np.clip(left / np.maximum(length, 1e-9), 0.0, 1.0)
+        corners[:, 1:] = self.xy[:, None] + np.cumsum(legs * share[..., None], axis=1)
+        return corners
 
     def step(self, dt: float, robot: Float, contact: float, robot_waits: bool) -> None:
         """Everybody goes on for dt seconds.
@@ -90,7 +106,8 @@ class Crowd:
 
     def _set_off(self, person: int) -> None:
         """Choose a place to go to; those who stop do it anywhere on the way there."""
-        path = self._planner.path(self.xy[person], int(self._rng.choice(self._places)))
+        part = int(self._planner.part_of(self._planner.node(self.xy[person])))
+        path = self._planner.path(self.xy[person], int(self._rng.choice(self._places[part])))
         if self._stops[person]:
             path = _first_part(self.xy[person], path, self._rng.uniform(0.2, 1.0))
         # people keep to their own line, not all to the same one
@@ -179,6 +196,13 @@ class Crowd:
         for person in np.flatnonzero(self._stuck_for > _STUCK_AFTER).tolist():
             self._stuck_for[person] = 0.0
             self._set_off(person)
+
+
+def _in_part(planner: Planner, places: NDArray[np.int64], part: int) -> NDArray[np.int64]:
+    """The places in a part; a part too small for any has all of its nodes."""
+    inside = places[planner.part_of(places) == part]
+    every = planner.nodes
+    return inside if len(inside) else np.asarray(every[planner.part_of(every) == part])
 
 
 def _push_of_robot(robot: Float, from_robot: Float, distance: Float, contact: float) -> Float:

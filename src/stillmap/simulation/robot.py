@@ -9,9 +9,10 @@ from stillmap.simulation.scene import Point, RobotOptions
 Float = NDArray[np.float64]
 
 _SPACING = 0.05  # m between points of the route
-_CARROT = 7  # points ahead of the robot that it steers for
-_SEARCH = 14  # points ahead among which the nearest is looked for
+_CARROT = 0.35  # m ahead of the robot, the point of the route that it steers for
+_CARROT_TIME = 0.5  # s, the same for a fast one
 _SEES_AHEAD = 1.5  # m
+_SEES_AHEAD_TIME = 1.2  # s, the same for a fast one
 _CREEP = 0.12  # m/s
 _TURN_IN_PLACE = 0.4  # rad off the route
 
@@ -33,6 +34,7 @@ class Robot:
         self.arrived = False
         self._at = 0
         self._waited = 0.0
+        self._carrot = round(max(_CARROT, _CARROT_TIME * options.speed) / _SPACING)
 
     def step(self, dt: float, people: Float, contact: float) -> None:
         """Drive for dt seconds.
@@ -45,7 +47,7 @@ class Robot:
         self._advance()
         o = self._options
         x, y, theta = self.pose
-        to = self._way[self._ahead(_CARROT)[-1]] - self.pose[:2]
+        to = self._way[self._ahead(self._carrot)[-1]] - self.pose[:2]
         error = np.arctan2(to[1], to[0]) - theta
         error = (error + np.pi) % (2 * np.pi) - np.pi
         turn = float(np.clip(2.0 * error, -o.turn_rate, o.turn_rate))
@@ -61,13 +63,17 @@ class Robot:
         """Seconds that one lap takes at full speed."""
         return len(self._way) * _SPACING / self._options.speed
 
+    def way_ahead(self, reach: float) -> Float:
+        """(K, 2) the next `reach` metres of its route."""
+        return np.asarray(self._way[self._ahead(round(reach / _SPACING))])
+
     def _ahead(self, count: int) -> NDArray[np.int64]:
         ahead = np.arange(self._at, self._at + count + 1)
         last = len(self._way) - 1
         return ahead % len(self._way) if self._closed else np.minimum(ahead, last)
 
     def _advance(self) -> None:
-        ahead = self._ahead(_SEARCH)
+        ahead = self._ahead(2 * self._carrot)
         nearest = int(ahead[np.argmin(np.hypot(*(self._way[ahead] - self.pose[:2]).T))])
         self.arrived = not self._closed and nearest == len(self._way) - 1
         self._at = nearest
@@ -77,8 +83,9 @@ class Robot:
         c, s = np.cos(self.pose[2]), np.sin(self.pose[2])
         dx, dy = (people - self.pose[:2]).T
         x, y = c * dx + s * dy, c * dy - s * dx
-        ahead = (x > 0) & (x < _SEES_AHEAD) & (np.abs(y) < contact)
-        gap = float(x[ahead].min(initial=_SEES_AHEAD)) - contact
+        sees = max(_SEES_AHEAD, contact + 0.1 + _SEES_AHEAD_TIME * self._options.speed)
+        ahead = (x > 0) & (x < sees) & (np.abs(y) < contact)
+        gap = float(x[ahead].min(initial=sees)) - contact
         allowed = max(0.0, gap - 0.1)
         if speed > 0 and allowed < 0.1:
             self._waited += dt

@@ -9,6 +9,7 @@ from stillmap.options import field_with_doc
 Point = tuple[float, float]
 Segment = tuple[float, float, float, float]
 Shape = Literal["legs", "bodies", "mixed"]
+VehicleKind = Literal["car", "forklift"]
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,84 @@ class CrowdOptions:
         _require(0 < self.min_speed <= self.max_speed, "speeds want 0 < min_speed <= max_speed")
         _require(0 <= self.stopping_share <= 1, "stopping_share must lie in [0, 1]")
         _require(0 <= self.min_stop <= self.max_stop, "stops want 0 <= min_stop <= max_stop")
+
+
+@dataclass(frozen=True)
+class DoorOptions:
+    """How long doors stay as they are; durations are spread evenly in their logarithm."""
+
+    min_open: float = field_with_doc(4.0, "s, the shortest time that a door stays open")
+    max_open: float = field_with_doc(60.0, "s, the longest time that a door stays open")
+    min_closed: float = field_with_doc(5.0, "s, the shortest time that a door stays closed")
+    max_closed: float = field_with_doc(120.0, "s, the longest time that a door stays closed")
+    swing: float = field_with_doc(1.5, "s, from closed to open")
+
+    def __post_init__(self) -> None:
+        for low, high in ((self.min_open, self.max_open), (self.min_closed, self.max_closed)):
+            _require(0 < low <= high, "times of doors want 0 < min <= max")
+        _require(self.swing > 0, "swing must be positive")
+
+
+@dataclass(frozen=True)
+class TrafficOptions:
+    """The vehicles that drive about on a scene's lanes; queues are part of the lanes."""
+
+    vehicles: int = field_with_doc(10, "how many drive about, spread over the lanes")
+    min_speed: float = field_with_doc(7.0, "m/s, the slowest driver")
+    max_speed: float = field_with_doc(12.0, "m/s, the fastest driver")
+    van_share: float = field_with_doc(0.25, "share of vans among the cars")
+    stopping_share: float = field_with_doc(0.2, "share of the vehicles that stop now and then")
+    min_stop: float = field_with_doc(3.0, "s, the shortest stop")
+    max_stop: float = field_with_doc(12.0, "s, the longest stop")
+
+    def __post_init__(self) -> None:
+        _require(self.vehicles >= 0, "vehicles must not be negative")
+        _require(0 < self.min_speed <= self.max_speed, "speeds want 0 < min_speed <= max_speed")
+        for share in (self.van_share, self.stopping_share):
+            _require(0 <= share <= 1, "shares of vehicles must lie in [0, 1]")
+        _require(0 <= self.min_stop <= self.max_stop, "stops want 0 <= min_stop <= max_stop")
+
+
+@dataclass(frozen=True)
+class Door:
+    """A door leaf that swings about its hinge.
+
+    Attributes:
+        hinge: metres.
+        width: metres, of the leaf.
+        closed: rad, direction from the hinge along the closed leaf.
+        opened: rad, the same of the open leaf.
+    """
+
+    hinge: Point
+    width: float
+    closed: float
+    opened: float
+
+    def leaf(self, angle: float) -> Segment:
+        """The leaf that points to `angle`."""
+        x, y = self.hinge
+        return (x, y, x + self.width * math.cos(angle), y + self.width * math.sin(angle))
+
+
+@dataclass(frozen=True)
+class Lane:
+    """Where vehicles drive: from the first point to the last, then from the first again.
+
+    Attributes:
+        path: points in metres. If it comes back to where it began the lane is a circuit; else its
+            ends lie where the laser does not see a vehicle vanish and appear.
+        kind: what drives there.
+        waiting: vehicles that stand in a queue. A lane with a queue has no others.
+        stop: metres along the path, where the first of the queue stands.
+        go: metres, the queue drives on when the robot comes by here.
+    """
+
+    path: tuple[Point, ...]
+    kind: VehicleKind = "car"
+    waiting: int = 0
+    stop: float = 0.0
+    go: Point = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -93,11 +172,19 @@ class OdometryOptions:
     drift_noise: float = field_with_doc(
         0.008, "rad per sqrt(m) driven, standard deviation of the heading"
     )
+    slip_rate: float = field_with_doc(0.0, "per metre driven, how often a wheel begins to slip")
+    slip: float = field_with_doc(
+        0.3, "relative, a slipping wheel turns farther by half to one and a half times this much"
+    )
+    slip_length: float = field_with_doc(0.5, "m, the way on which it goes on slipping")
 
     def __post_init__(self) -> None:
         _require(self.wheel_base > 0, "wheel_base must be positive")
+        values: tuple[float, ...]
         values = (self.wheel_radius_error, self.wheel_base_error, self.translation_noise)
-        _require(min(*values, self.rotation_noise, self.drift_noise) >= 0, "errors must be >= 0")
+        values += (self.rotation_noise, self.drift_noise, self.slip_rate, self.slip)
+        _require(min(values) >= 0, "errors must be >= 0")
+        _require(self.slip_length > 0, "slip_length must be positive")
 
 
 @dataclass(frozen=True)
@@ -109,13 +196,24 @@ class Scene:
         walls: segments x0, y0, x1, y1 in metres: everything that stands still and is opaque.
         route: the robot's way, points in metres; the way between them is planned around walls.
         glass: further segments, on which beams get lost more often.
+        kerbs: segments that neither people nor the robot cross and that no laser sees.
+        people_at: a point in each part of the world where people walk about, if kerbs or walls
+            part it; not given: where the robot starts.
+        leaves: doors that swing.
+        lanes: where vehicles drive.
     """
 
     name: str
     walls: tuple[Segment, ...]
     route: tuple[Point, ...]
     glass: tuple[Segment, ...] = ()
+    kerbs: tuple[Segment, ...] = ()
+    people_at: tuple[Point, ...] = ()
+    leaves: tuple[Door, ...] = ()
+    lanes: tuple[Lane, ...] = ()
     crowd: CrowdOptions = field(default_factory=CrowdOptions)
+    doors: DoorOptions = field(default_factory=DoorOptions)
+    traffic: TrafficOptions = field(default_factory=TrafficOptions)
     laser: LaserOptions = field(default_factory=LaserOptions)
     robot: RobotOptions = field(default_factory=RobotOptions)
     odometry: OdometryOptions = field(default_factory=OdometryOptions)

@@ -24,8 +24,10 @@ class Truth:
         mover: (M,) int32, the id of the mover that reflected the beam, -1: none did.
         T_world_base: (T, 3, 3) float64 true poses.
         walls: (W, 4) float64 segments x0, y0, x1, y1 in metres.
-        movers: (T, P, 3) float64, where each mover is at each scan: x, y in metres, heading in rad.
-        scene: name, seed and all parameters, JSON-able.
+        movers: (T, P, 3) float64, where each mover is at each scan: x, y of its middle in metres,
+            heading in rad. First people, then doors (heading: from the hinge), then vehicles.
+        scene: name, seed and all parameters, JSON-able; under `mover_kinds` what each mover is:
+            "person", "door", "car" or "forklift".
     """
 
     static: NDArray[np.bool_]

@@ -1,0 +1,155 @@
+"""Everybody and everything moves, scan by scan: robot, people, doors and vehicles."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.errors import InputError
+from stillmap.simulation.doors import REACH, Doors, legs
+from stillmap.simulation.figures import Figures
+from stillmap.simulation.free_space import FreeSpace, Planner
+from stillmap.simulation.laser import Movers, Outlines
+from stillmap.simulation.people import BODY_RADIUS, Crowd
+from stillmap.simulation.robot import Robot, plan_way
+from stillmap.simulation.scene import Scene
+from stillmap.simulation.traffic import Traffic
+
+Float = NDArray[np.float64]
+Progress = Callable[[float], None]
+Rngs = tuple[np.random.Generator, np.random.Generator, np.random.Generator]
+
+_STEP = 0.1  # s, at most, between two positions of people and robot
+_ROBOT_MARGIN = 0.15  # m beyond its radius that the robot's way keeps from walls
+_PERSON_MARGIN = 0.1  # m
+_SLOWEST = 5.0  # times the time that the route takes undisturbed: then something holds the robot
+_STILL = 1e-6  # m
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Where everything is at each of T scans.
+
+    Attributes:
+        robot: (T, 3) x, y in metres, theta in radians.
+        poses: (T, P, 3) the same of all movers: people, doors, vehicles.
+        kinds: (P) what each mover is.
+        people: what the laser sees of people.
+        outlines: what it sees of the other movers.
+        still: (K, 4) faces of those among them that never moved.
+    """
+
+    robot: Float
+    poses: Float
+    kinds: list[str]
+    people: Movers
+    outlines: Outlines
+    still: Float
+
+
+def move(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
+    """Let everything move, and note where it is at each scan.
+
+    Args:
+        scene: the world and all parameters.
+        rngs: for people, doors and vehicles.
+        tell: called now and then with the share that is done.
+
+    Raises:
+        InputError: no room for the robot on its route or for the people, or the robot is held up.
+    """
+    world = _World(scene, rngs)
+    o = scene.robot
+    steps = max(1, math.ceil(1.0 / (o.scan_rate * _STEP) - 1e-9))
+    dt = 1.0 / (o.scan_rate * steps)
+    expected = o.scans or world.robot.undisturbed_time() * o.scan_rate
+    log = _Log()
+    while not _is_done(scene, world.robot, len(log.robot), expected):
+        log.note(world)
+        if len(log.robot) % 50 == 0:
+            tell(min(len(log.robot) / expected, 1.0))
+        for _ in range(steps):
+            world.step(dt)
+    return log.motion(world)
+
+
+class _World:
+    """Robot, people with what is seen of them, doors and vehicles of a scene."""
+
+    def __init__(self, scene: Scene, rngs: Rngs) -> None:
+        start, o = np.array(scene.route[0], float), scene.robot
+        # an open leaf is in the way, a closed one opens for whoever comes
+        leaves = [door.leaf(door.opened) for door in scene.leaves]
+        space = FreeSpace(np.array([*scene.walls, *scene.glass, *scene.kerbs, *leaves], float))
+        planner = Planner(space, start, o.radius + _ROBOT_MARGIN)
+        closed = o.scans is not None
+        self.robot = Robot(plan_way(scene.route, planner, closed), space, o, closed)
+        people_at = np.array(scene.people_at or scene.route[:1], float)
+        people_planner = Planner(space, people_at, BODY_RADIUS + _PERSON_MARGIN)
+        self.crowd = Crowd(scene.crowd, space, people_planner, start, rngs[0])
+        self.figures = Figures(scene.crowd.people, scene.crowd.shape, space, rngs[0])
+        self.doors = Doors(scene.leaves, scene.doors, rngs[1])
+        self.traffic = Traffic(scene.lanes, scene.traffic, rngs[2])
+        self._radius = o.radius
+
+    def step(self, dt: float) -> None:
+        """Everything goes on for dt seconds."""
+        robot, crowd, contact = self.robot, self.crowd, self._radius + BODY_RADIUS
+        robot.step(dt, crowd.xy, contact)
+        crowd.step(dt, robot.pose, contact, robot.impatient)
+        self.figures.step(dt, crowd, robot.pose[:2], self._radius)
+        if len(self.doors.share):
+            standing = np.concatenate([crowd.xy, robot.pose[None, :2]])
+            way = robot.way_ahead(REACH)[None]
+            ways = np.concatenate([legs(crowd.ways(REACH)), legs(way)])
+            self.doors.step(dt, standing, ways)
+        if self.traffic.kinds:
+            self.traffic.step(dt, robot.pose[:2], self._radius)
+
+
+def _is_done(scene: Scene, robot: Robot, scans: int, expected: float) -> bool:
+    if scene.robot.scans is not None:
+        return scans >= scene.robot.scans
+    if scans > _SLOWEST * expected + 100:
+        x, y, _ = robot.pose
+        raise InputError(
+            f"the robot gets stuck at ({x:.1f}, {y:.1f})",
+            hint="fewer people, or a number of scans",
+        )
+    return robot.arrived
+
+
+class _Log:
+    def __init__(self) -> None:
+        self.robot: list[Float] = []
+        self._poses: list[Float] = []
+        self._xy: list[Float] = []
+        self._heading: list[Float] = []
+        self._faces: list[Float] = []
+
+    def note(self, world: _World) -> None:
+        crowd, doors, traffic = world.crowd, world.doors, world.traffic
+        xy, heading = world.figures.parts(crowd)
+        people = np.column_stack([crowd.xy, crowd.heading])
+        self.robot.append(world.robot.pose)
+        self._poses.append(np.concatenate([people, doors.poses(), traffic.poses()]))
+        self._xy.append(xy)
+        self._heading.append(heading)
+        self._faces.append(np.concatenate([doors.faces(), traffic.faces()]))
+
+    def motion(self, world: _World) -> Motion:
+        figures, doors = world.figures, len(world.doors.share)
+        persons = len(world.crowd.xy)
+        kinds = ["person"] * persons + ["door"] * doors + world.traffic.kinds
+        people = Movers(
+            np.stack(self._xy), np.stack(self._heading), figures.semi_axes, figures.mover
+        )
+        poses, faces = np.stack(self._poses), np.stack(self._faces)
+        moved = np.any(np.ptp(poses, axis=0) > _STILL, axis=1)
+        others = np.arange(persons, len(kinds), dtype=np.int32)
+        mover = np.concatenate([others[:doors], np.repeat(others[doors:], 4)])
+        moving = moved[mover]
+        outlines = Outlines(faces[:, moving], mover[moving])
+        return Motion(np.stack(self.robot), poses, kinds, people, outlines, faces[0, ~moving])
