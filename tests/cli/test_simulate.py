@@ -78,7 +78,9 @@ def test_carmen_log_says_the_same_as_the_recording_folder(tmp_path: Path) -> Non
 
 
 def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"'hull'.*hall, corridor, hall-empty, corridor-empty"):
+    with pytest.raises(
+        InputError, match=r"'hull'.*hall, corridor, office, .*street-turn, .*hall-empty"
+    ):
         call("hull", "-o", str(tmp_path / "sim"))
     assert not list(tmp_path.iterdir())
 

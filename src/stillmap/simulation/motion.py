@@ -97,7 +97,11 @@ class _World:
     def step(self, dt: float) -> None:
         """Everything goes on for dt seconds."""
         robot, crowd, contact = self.robot, self.crowd, self._radius + BODY_RADIUS
-        robot.step(dt, crowd.xy, contact)
+        in_the_way = crowd.xy
+        if self.traffic.kinds:
+            corners = self.traffic.faces().reshape(-1, 2)
+            in_the_way = np.concatenate([crowd.xy, corners])
+        robot.step(dt, in_the_way, contact)
         crowd.step(dt, robot.pose, contact, robot.impatient)
         self.figures.step(dt, crowd, robot.pose[:2], self._radius)
         if len(self.doors.share):

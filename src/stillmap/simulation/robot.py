@@ -41,8 +41,8 @@ class Robot:
 
         Args:
             dt: seconds.
-            people: (P, 2) where people are, metres.
-            contact: m, the nearest a person's centre may be to the robot's.
+            people: (P, 2) where people and corners of vehicles are, metres.
+            contact: m, the nearest one of these may be to the robot's centre.
         """
         self._advance()
         o = self._options

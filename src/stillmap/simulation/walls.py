@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from stillmap.simulation.scene import Point, Segment
+from stillmap.simulation.scene import Door, Point, Segment
 
 Side = Literal["north", "south", "east", "west"]
 
@@ -112,3 +112,26 @@ def room(
         (door.start + door.width, near),
     ]
     return polyline([(start[0] + a * ux + o * ox, start[1] + a * uy + o * oy) for a, o in corners])
+
+
+def leaf(
+    start: Point, side: Side, opening: Opening, swing: float, hinged_at_end: bool = False
+) -> Door:
+    """A door in the doorway `opening` of a wall that begins at `start`; it opens outwards.
+
+    Args:
+        start: where the wall begins, as for `wall`.
+        side: the side of the wall on which the room lies.
+        opening: the doorway, an opening of that same wall.
+        swing: rad, how far it opens.
+        hinged_at_end: its hinge is where the opening ends, seen along the wall.
+    """
+    (ux, uy), (ox, oy) = _ALONG[side], _OUT[side]
+    gap = 0.02
+    at = opening.start + (opening.width - gap if hinged_at_end else gap)
+    hinge = (start[0] + at * ux + opening.depth * ox, start[1] + at * uy + opening.depth * oy)
+    if hinged_at_end:
+        ux, uy = -ux, -uy
+    closed = math.atan2(uy, ux)
+    turn = swing if ux * oy - uy * ox > 0 else -swing
+    return Door(hinge, opening.width - 2 * gap, closed, closed + turn)
