@@ -50,7 +50,7 @@ def test_the_folder_has_every_file_of_the_format_and_nothing_else(tmp_path: Path
 
 def test_flags_reach_the_scene(tmp_path: Path) -> None:
     flags = "--fov 120 --max-range 12 --range-noise 0.05 --rate 10 --shape legs --stopping 1"
-    flags += " --min-stop 15 --max-stop 60 --odometry-noise 0"
+    flags += " --min-stop 15 --max-stop 60 --odometry-noise 0 --slip-rate 0.2"
     call("hall", "-o", str(tmp_path / "sim"), *QUICK, *flags.split())
     scene = load_truth(tmp_path / "sim").scene
     assert scene["laser"]["fov"] == pytest.approx(math.radians(120))
@@ -60,6 +60,16 @@ def test_flags_reach_the_scene(tmp_path: Path) -> None:
     assert (crowd["shape"], crowd["stopping_share"]) == ("legs", 1.0)
     assert (crowd["min_stop"], crowd["max_stop"]) == (15.0, 60.0)
     assert scene["odometry"]["drift_noise"] == 0.0
+    assert scene["odometry"]["slip_rate"] == 0.2
+
+
+def test_scenes_with_more_than_people_say_what_moves(tmp_path: Path) -> None:
+    call("office", "-o", str(tmp_path / "sim"), *QUICK)
+    truth = load_truth(tmp_path / "sim")
+    doors = truth.scene["mover_kinds"].count("door")
+    assert truth.scene["mover_kinds"] == ["person"] * 3 + ["door"] * doors
+    assert doors == len(truth.scene["leaves"]) > 10
+    assert truth.movers.shape == (20, 3 + doors, 3)
 
 
 def test_carmen_log_says_the_same_as_the_recording_folder(tmp_path: Path) -> None:
@@ -97,6 +107,7 @@ def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path: Path) -> None
         (["--max-range", "100", "--format", "carmen"], "ranges up to"),
         (["--max-range", "nan"], "max_range.* wants a finite number"),
         (["--max-range", "0"], "max_range must be positive"),
+        (["--slip-rate", "-1"], "errors must be >= 0"),
         (["--odometry-noise", "-1"], "errors must be >= 0"),
     ],
 )
@@ -125,5 +136,9 @@ def test_says_what_came_of_it_unless_quiet(
     said = capsys.readouterr()
     assert said.out == ""
     assert "20 scans, 1800 beams" in said.err
+    truth = load_truth(tmp_path / "a")
+    share = 100 * np.mean(truth.mover[truth.static | (truth.mover >= 0)] >= 0)
+    assert share > 0
+    assert f" {share:.1f} % of the hits on movers" in said.err
     call("hall", "-o", str(tmp_path / "b"), *QUICK, "--quiet")
     assert capsys.readouterr() == ("", "")

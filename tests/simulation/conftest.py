@@ -1,14 +1,27 @@
 """Runs of populated worlds, shared by the tests."""
 
 import functools
+from collections.abc import Callable
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from stillmap.simulation import Simulation, scene_by_name, simulate
+from stillmap.simulation.free_space import distance_to_segment
+
+Float = NDArray[np.float64]
+
+# scans that show enough of a world; None: its whole route
+WORLDS = {"office": 500, "warehouse": 300, "street": 400, "street-turn": None}
 
 
 @functools.cache
 def _run(name: str) -> Simulation:
+    if name in WORLDS:
+        laser = {"beams": 91, "range_noise": 0.0, "no_return_share": 0.0}
+        robot = {"scans": WORLDS[name]}
+        return simulate(scene_by_name(name, {"laser": laser, "robot": robot}), 3)
     if name != "crowded":
         return simulate(scene_by_name(name), 3)
     people = {"people": 60, "stopping_share": 1.0, "max_stop": 60.0, "shape": "legs"}
@@ -31,3 +44,41 @@ def crowded() -> Simulation:
 def any_run(request: pytest.FixtureRequest) -> Simulation:
     """Each of them."""
     return _run(request.param)
+
+
+@pytest.fixture(params=list(WORLDS))
+def world(request: pytest.FixtureRequest) -> Simulation:
+    """The worlds in which not only people move, seen without noise."""
+    return _run(request.param)
+
+
+@pytest.fixture
+def run() -> Callable[[str], Simulation]:
+    """One of the runs by name."""
+    return _run
+
+
+@pytest.fixture
+def wall_distance() -> Callable[[Float, Float], Float]:
+    """Metres from points (N, 2) to the nearest of the walls (W, 4)."""
+
+    def distance(points: Float, walls: Float) -> Float:
+        nearest = np.full(len(points), np.inf)
+        for wall in walls:
+            np.minimum(nearest, distance_to_segment(points, wall), out=nearest)
+        return nearest
+
+    return distance
+
+
+@pytest.fixture
+def end_points() -> Callable[[Simulation], tuple[Float, NDArray[np.int64]]]:
+    """(M, 2) in the world at true poses, and the scan of each beam."""
+
+    def points(simulation: Simulation) -> tuple[Float, NDArray[np.int64]]:
+        recording = simulation.recording
+        scan = np.repeat(np.arange(recording.n_scans), np.diff(recording.offset))
+        T = recording.T_map_sensor(simulation.truth.T_world_base)[scan]
+        return np.einsum("nij,nj->ni", T[:, :2, :2], recording.points) + T[:, :2, 2], scan
+
+    return points

@@ -66,3 +66,27 @@ def test_raw_odometry_drifts_as_real_logs_do() -> None:
     assert 5.0 < np.median(degrees) < 60.0
     assert min(metres) > 0.3
     assert max(degrees) < 120.0
+
+
+def test_a_slipping_wheel_reads_too_far_on_short_pieces() -> None:
+    poses = se2.matrix(np.arange(0, 200.01, 0.1), 0.0, 0.0)
+    options = dataclasses.replace(PERFECT, slip_rate=0.1, slip=0.3, slip_length=0.5)
+    odometry = drifting(poses, options, np.random.default_rng(5))
+    x, y, turn = se2.parameters(se2.inverse(odometry[:-1]) @ odometry[1:]).T
+    ahead = np.hypot(x, y)
+    slips = np.abs(turn) > 1e-9
+    # 20 slips of half a metre on 200 m, less what overlaps
+    assert 0.5 * 0.05 < slips.mean() < 1.5 * 0.05
+    np.testing.assert_allclose(ahead[~slips], 0.1, atol=1e-9)
+    # one wheel 15 to 45 % too far, 0.4 m from the other; now and then both at once
+    one = (np.abs(turn) > 0.149 * 0.1 / 0.4) & (np.abs(turn) < 0.451 * 0.1 / 0.4)
+    assert one.sum() > 0.8 * slips.sum()
+    np.testing.assert_allclose(ahead[one], 0.1 + np.abs(turn[one]) * 0.4 / 2, rtol=1e-3)
+    assert (turn > 1e-9).any()
+    assert (turn < -1e-9).any()
+
+
+def test_without_slip_the_odometry_is_what_it_was() -> None:
+    a = drifting(arcs(), OdometryOptions(), np.random.default_rng(2))
+    b = drifting(arcs(), OdometryOptions(slip=0.9), np.random.default_rng(2))
+    np.testing.assert_array_equal(a, b)

@@ -14,7 +14,7 @@ from stillmap.cli.progress import say
 from stillmap.errors import InputError
 from stillmap.output.atomic import require_new
 from stillmap.simulation import SCENES, Simulation, scene_by_name, simulate, write_simulation
-from stillmap.simulation.simulator import Progress
+from stillmap.simulation.motion import Progress
 from stillmap.simulation.writing import require_carmen
 
 # flag, metavar, type, section and key of the option it sets, help
@@ -29,6 +29,7 @@ _FLAGS: tuple[tuple[str, str, type, str, str, str], ...] = (
     ("fov", "DEG", float, "laser", "fov", "field of view in degrees"),
     ("max-range", "M", float, "laser", "max_range", "range of the laser, metres"),
     ("range-noise", "M", float, "laser", "range_noise", "standard deviation of ranges, metres"),
+    ("slip-rate", "N", float, "odometry", "slip_rate", "how often wheels slip, per metre driven"),
 )
 _ODOMETRY_ERRORS = (
     "wheel_radius_error",
@@ -44,8 +45,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     p = subparsers.add_parser(
         "simulate",
         help="a recording with truth, for tests and demos",
-        description="Simulate a robot that records a place full of people, and write what it "
-        "recorded together with the truth.",
+        description="Simulate a robot that records a place where people, doors and cars move, and "
+        "write what it recorded together with the truth.",
     )
     p.add_argument("scene", metavar="SCENE", help=", ".join(SCENES))
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="where it goes")
@@ -106,9 +107,8 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
         changes.setdefault("crowd", {})["shape"] = args.shape
     if args.odometry_noise != 1.0:
         defaults = scene_by_name(args.scene).odometry
-        changes["odometry"] = {
-            key: args.odometry_noise * getattr(defaults, key) for key in _ODOMETRY_ERRORS
-        }
+        scaled = {key: args.odometry_noise * getattr(defaults, key) for key in _ODOMETRY_ERRORS}
+        changes.setdefault("odometry", {}).update(scaled)
     return changes
 
 
@@ -118,7 +118,7 @@ def _summary(simulation: Simulation, output: Path) -> str:
     dynamic = int(np.count_nonzero(truth.mover >= 0))
     return (
         f"{simulation.scene.name}: {recording.n_scans} scans, {recording.n_beams} beams, "
-        f"{100 * dynamic / max(hits, 1):.1f} % of the hits on people; in {output}"
+        f"{100 * dynamic / max(hits, 1):.1f} % of the hits on movers; in {output}"
     )
 
 

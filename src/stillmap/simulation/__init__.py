@@ -1,11 +1,15 @@
-"""Simulated recordings of places full of people, with the truth about every beam."""
+"""Simulated recordings of places where people, doors and cars move, with the truth of each beam."""
 
 from stillmap.simulation.scene import (
     CrowdOptions,
+    Door,
+    DoorOptions,
+    Lane,
     LaserOptions,
     OdometryOptions,
     RobotOptions,
     Scene,
+    TrafficOptions,
 )
 from stillmap.simulation.simulator import Simulation, simulate
 from stillmap.simulation.truth import Truth, load_truth
@@ -15,11 +19,15 @@ from stillmap.simulation.writing import write_simulation
 __all__ = [
     "SCENES",
     "CrowdOptions",
+    "Door",
+    "DoorOptions",
+    "Lane",
     "LaserOptions",
     "OdometryOptions",
     "RobotOptions",
     "Scene",
     "Simulation",
+    "TrafficOptions",
     "Truth",
     "load_truth",
     "scene_by_name",
