@@ -93,3 +93,11 @@ def test_a_queue_waits_for_the_robot_and_then_drives_off_one_by_one() -> None:
     begins = np.argmax(going[:, :, 0] > going[0, :, 0] + 0.1, axis=0)
     assert np.all(np.diff(begins) > 0)
     assert going[-1, -1, 0] > 110.0
+
+
+def test_whoever_cuts_in_is_not_run_over() -> None:
+    one = traffic(STRAIGHT, 1, vehicles=1, stopping_share=0.0, min_speed=12.0, max_speed=12.0)
+    start = driven(one, 5)[-1, 0, 0]
+    robot = np.array([start + 12.0, 0.0])  # too near to stop at any braking
+    front = driven(one, 100, robot)[:, 0, 0] + one.size[0, 0] / 2
+    assert front.max() < robot[0] - 0.9
