@@ -7,5 +7,6 @@ namespace stillmap::border {
 void bind_grid(nanobind::module_& m);
 void bind_beams(nanobind::module_& m);
 void bind_register(nanobind::module_& m);
+void bind_dwell(nanobind::module_& m);
 
 }  // namespace stillmap::border

@@ -13,4 +13,5 @@ NB_MODULE(_core, m) {
   stillmap::border::bind_grid(m);
   stillmap::border::bind_beams(m);
   stillmap::border::bind_register(m);
+  stillmap::border::bind_dwell(m);
 }

@@ -31,8 +31,9 @@ class Options:
     """Everything that can be chosen."""
 
     threads: int = field_with_doc(0, "threads to use; 0: one per processor. Same result with any")
-    estimator: Literal["paper"] = field_with_doc(
-        "paper", "what says which beams are static: the printed E-step (8)"
+    # spelled out: ruff takes the default for mutable under an alias
+    estimator: Literal["stillmap", "paper", "hit-ratio"] = field_with_doc(
+        "stillmap", "what says which beams are static; paper: (8) as printed, hit-ratio: counting"
     )
     read: ReadOptions = field(default=ReadOptions())
     em: EmOptions = field(default=EmOptions())
@@ -58,7 +59,9 @@ class Iteration:
         grid: the sums alpha, beta of (10).
         weights: (M,) float32, the e that this M-step used; with `poses` they make `grid` again.
         p_static: (M,) float32, e after this iteration's E-step.
-        likelihood: (5) and the bound at this map and e.
+        likelihood: of the recording after this E-step, for the printed method (5) and its bound.
+        occupied: what the estimator knows of cells beyond the sums, see CellProbabilities.
+        learned: what it learned from the recording.
         changed_share: share of hits whose e moved by more than 0.1.
         explained: (T,) share of each scan's beams that the map so far explained.
         widened: scans that only a wider search than the motion prior's could place.
@@ -72,10 +75,17 @@ class Iteration:
     weights: NDArray[np.float32]
     p_static: NDArray[np.float32]
     likelihood: em.Likelihood
+    occupied: em.CellProbabilities | None
+    learned: dict[str, object]
     changed_share: float
     explained: Float
     widened: list[int]
     seconds: float
+
+    @property
+    def occupancy(self) -> em.OccupancyMap:
+        """The map of this iteration, made anew at every call."""
+        return em.occupancy_map(self.grid, self.occupied)
 
 
 def iterate(
@@ -102,31 +112,32 @@ def iterate(
         raise ValueError(f"poses: expected ({recording.n_scans}, 3, 3), got {poses.shape}")
     stages = stages or Stages()
     threads = resolved_threads(options.threads)
-    e = em.initial_expectations(recording, options.em)  # e := p(c = 1)
-    for number in range(1, options.em.max_iterations + 1):
+    e = em.initial_expectations(recording, options.estimator, options.em)  # e := p(c = 1)
+    for number in range(1, em.iterations(options.estimator, options.em) + 1):
         started = time.perf_counter()
         with stages.measure("m_step"):  # (9)-(15)
             mapped = slam.m_step(recording, e, options.slam, poses, threads, _at(progress, number))
-        with stages.measure("e_step"):  # (6), (8)
-            before, e = e, em.e_step(recording, mapped.poses, mapped.grid, options.em, threads)
-        with stages.measure("likelihood"):  # (5)
-            likelihood = em.log_likelihood(
-                recording, mapped.poses, mapped.grid, e, options.em, threads
+        with stages.measure("e_step"):  # (6), (8) or its successor, and the bound
+            found = em.e_step(
+                recording, mapped.poses, mapped.grid, options.estimator, options.em, threads
             )
         iteration = Iteration(
             number=number,
             poses=mapped.poses,
             covariance=mapped.covariance,
             grid=mapped.grid,
-            weights=before,
-            p_static=e,
-            likelihood=likelihood,
-            changed_share=em.changed_share(before, e, recording.hit),
+            weights=e,
+            p_static=found.p_static,
+            likelihood=found.likelihood,
+            occupied=found.occupied,
+            learned=found.learned,
+            changed_share=em.changed_share(e, found.p_static, recording.hit),
             explained=mapped.explained,
             widened=mapped.widened,
             seconds=time.perf_counter() - started,
         )
-        del mapped  # grids are large: only the caller decides how long one lives
+        e = found.p_static
+        del mapped, found  # grids are large: only the caller decides how long one lives
         yield iteration
         del iteration
 

@@ -52,6 +52,7 @@ class Result:
         best_iteration: number of the iteration that was kept.
         converged: whether the loop stopped by itself.
         warnings: one sentence each.
+        learned: what the estimator learned from the recording, JSON-able.
         stages: seconds and peak memory.
     """
 
@@ -67,6 +68,7 @@ class Result:
     best_iteration: int
     converged: bool
     warnings: list[str]
+    learned: dict[str, object]
     stages: Mapping[str, Mapping[str, Any]]
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
@@ -143,7 +145,8 @@ class _Run:
         self._remember(iteration, recording)
         settled = 0.0 <= gain < self.options.em.tolerance * recording.n_beams
         stuck = iteration.number - self.kept.number >= self.options.em.patience
-        self.finished = settled or stuck
+        counted = self.options.estimator == "hit-ratio"  # nothing to iterate
+        self.finished = settled or stuck or counted
 
     @property
     def kept(self) -> "_Best":
@@ -153,7 +156,7 @@ class _Run:
 
     def _remember(self, iteration: Iteration, recording: Recording) -> None:
         """A part of the map for Fig. 8: where the first iteration saw most movers."""
-        occupancy = em.occupancy_map(iteration.grid)
+        occupancy = iteration.occupancy
         points = dynamic_points(recording, iteration.poses, iteration.p_static)
         dynamic = np.zeros(len(points), dtype=np.float32)
         if self.window is None:
@@ -169,8 +172,8 @@ class _Run:
         threads = resolved_threads(self.options.threads)
         resolution = self.options.slam.resolution
         with stages.measure("maps"):
-            filtered = _map_of(recording, kept.poses, kept.weights, resolution, threads)
-            raw = _map_of(recording, kept.poses, None, resolution, threads)
+            filtered = self._map(recording, threads)
+            raw = _raw_map(recording, kept.poses, resolution, threads)
         return Result(
             recording=recording,
             options=self.options,
@@ -184,8 +187,17 @@ class _Run:
             best_iteration=kept.number,
             converged=self.finished,
             warnings=_warnings(self.records, kept, recording),
+            learned=kept.learned,
             stages=stages.to_dict(),
         )
+
+    def _map(self, recording: Recording, threads: int) -> em.OccupancyMap:
+        """The printed labels follow from the sums they were made from, others make the sums."""
+        kept = self.kept
+        weights = kept.p_static if self.options.estimator == "stillmap" else kept.weights
+        grid = _core.Grid2D(self.options.slam.resolution)
+        em.add_recording(grid, recording, kept.poses, weights, threads)
+        return em.occupancy_map(grid, kept.occupied)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +210,8 @@ class _Best:
     covariance: Float
     weights: NDArray[np.float32]
     p_static: NDArray[np.float32]
+    occupied: em.CellProbabilities | None
+    learned: dict[str, object]
     explained: Float
     widened: list[int]
 
@@ -210,20 +224,18 @@ class _Best:
             iteration.covariance,
             iteration.weights,
             iteration.p_static,
+            iteration.occupied,
+            iteration.learned,
             iteration.explained,
             iteration.widened,
         )
 
 
-def _map_of(
-    recording: Recording,
-    poses: Float,
-    weights: NDArray[np.float32] | None,
-    resolution: float,
-    threads: int,
+def _raw_map(
+    recording: Recording, poses: Float, resolution: float, threads: int
 ) -> em.OccupancyMap:
     grid = _core.Grid2D(resolution)
-    em.add_recording(grid, recording, poses, weights, threads)
+    em.add_recording(grid, recording, poses, None, threads)
     return em.occupancy_map(grid)
 
 

@@ -9,6 +9,7 @@
 #include <memory>
 #include <stdexcept>
 #include <unordered_map>
+#include <utility>
 #include <vector>
 
 #include "stillmap/traverse.hpp"
@@ -124,7 +125,6 @@ class Grid {
     return bytes;
   }
 
- private:
   static uint64_t key(const Cell<D>& block) {
     uint64_t packed = 0;
     for (int d = 0; d < D; ++d)
@@ -139,6 +139,7 @@ class Grid {
     }
   };
 
+ private:
   double resolution_;
   std::vector<std::unique_ptr<Block>> blocks_;
   std::unordered_map<uint64_t, size_t, Hash> index_;
@@ -192,7 +193,7 @@ class Walker {
   static constexpr int D = std::remove_const_t<GridType>::kDimension;
   using G = std::remove_const_t<GridType>;
   using Block = typename Cursor<GridType>::Block;
-  using CountsPointer = std::conditional_t<std::is_const_v<GridType>, const Counts*, Counts*>;
+  using CountsPointer = decltype(std::declval<Block&>().counts.data());
 
   Walker(Cursor<GridType>& cursor, Visit visit) : cursor_(cursor), visit_(visit) {}
 

@@ -4,8 +4,9 @@ import argparse
 import dataclasses
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+from stillmap import em
 from stillmap.cli.options import add_option_flags, resolved_options
 from stillmap.cli.progress import say, shown_progress
 from stillmap.cli.reading import add_read_flags, read_changes
@@ -29,7 +30,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="where the result goes")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
     p.add_argument("--paper", action="store_true", help="the method exactly as printed")
-    p.add_argument("--estimator", choices=["paper"], help="what says which beams are static")
+    p.add_argument(
+        "--estimator", choices=get_args(em.Estimator), help="what says which beams are static"
+    )
     p.add_argument("--poses", metavar="FILE.tum", help="keep these poses, estimate the rest")
     p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
     p.add_argument("--resolution", metavar="M", type=float, help="edge of a map cell in metres")
@@ -52,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         recording = read(Path(args.input), options.read)
     recording = _usable(recording, args)
     poses = poses_from_tum(Path(args.poses), recording) if args.poses else None
-    with shown_progress(args.quiet, options.em.max_iterations) as progress:
+    with shown_progress(args.quiet, em.iterations(options.estimator, options.em)) as progress:
         result = build(recording, options, poses=poses, progress=progress, stages=stages)
     result.save(output, overwrite=args.overwrite)
     if not args.quiet:
@@ -86,8 +89,10 @@ def _found_at(source: dict[str, Any], path: str) -> dict[str, Any]:
 
 def _changes(args: argparse.Namespace) -> dict[str, Any]:
     changes: dict[str, Any] = {}
+    if args.paper and args.estimator not in (None, "paper"):
+        raise InputError(f"--paper and --estimator {args.estimator} exclude each other")
     if args.paper or args.estimator:
-        changes["estimator"] = "paper"
+        changes["estimator"] = "paper" if args.paper else args.estimator
     if args.threads is not None:
         changes["threads"] = args.threads
     if args.resolution is not None:

@@ -1,24 +1,29 @@
-"""What is static: the E-step, the map that follows from it, and the likelihood. No I/O."""
+"""What is static: the E-steps, the map that follows from them, and the likelihood. No I/O."""
 
 from stillmap.em.estimator import (
-    EmOptions,
-    Likelihood,
+    Estimator,
     add_recording,
     changed_share,
     e_step,
     initial_expectations,
-    log_likelihood,
+    iterations,
 )
+from stillmap.em.expectations import CellProbabilities, Expectations, Likelihood
 from stillmap.em.occupancy import OccupancyMap, occupancy_map
+from stillmap.em.options import DwellOptions, EmOptions
 
 __all__ = [
+    "CellProbabilities",
+    "DwellOptions",
     "EmOptions",
+    "Estimator",
+    "Expectations",
     "Likelihood",
     "OccupancyMap",
     "add_recording",
     "changed_share",
     "e_step",
     "initial_expectations",
-    "log_likelihood",
+    "iterations",
     "occupancy_map",
 ]

@@ -1,4 +1,4 @@
-"""The map of (15) as plain arrays."""
+"""The map as plain arrays: (15), or what the estimator knows better."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core
+from stillmap.em.expectations import CellProbabilities
 
 
 @dataclass(frozen=True, eq=False)
@@ -13,8 +14,8 @@ class OccupancyMap:
     """A 2D map.
 
     Attributes:
-        p_occupied: (H, W) float32, alpha / (alpha + beta) of (15); NaN where nobody looked:
-            unknown is not free. Row 0 has the lowest y.
+        p_occupied: (H, W) float32; NaN where nobody looked: unknown is not free. Row 0 has the
+            lowest y.
         alpha: (H, W) float64, expected number of static hits.
         beta: (H, W) float64, expected number of dynamic hits + beam length through the cell.
         origin: x, y (metres) and yaw of the lower-left corner of the lower-left cell.
@@ -28,12 +29,33 @@ class OccupancyMap:
     resolution: float
 
 
-def occupancy_map(grid: _core.Grid2D) -> OccupancyMap:
-    """The closed-form maximum (15) of the counts in a grid."""
+def occupancy_map(grid: _core.Grid2D, occupied: CellProbabilities | None = None) -> OccupancyMap:
+    """The closed-form maximum (15) of the counts in a grid, or an estimator's own probabilities.
+
+    Args:
+        grid: the sums of (10).
+        occupied: None for (15). Else the probabilities of cells in which beams ended; cells that
+            beams only passed are free for every cell length that was passed.
+    """
     first_cell, alpha, beta = grid.dense()
     p_occupied = np.full(alpha.shape, np.nan, dtype=np.float32)
     for a, b, p in zip(alpha, beta, p_occupied, strict=True):  # by rows: maps are large
-        total = a + b
-        np.divide(a, total, out=p, where=total > 0.0, casting="same_kind")  # (15)
+        seen = a + b > 0.0
+        if occupied is None:
+            np.divide(a, a + b, out=p, where=seen, casting="same_kind")  # (15)
+        else:
+            odds = occupied.free_prior / (1.0 - occupied.free_prior) * np.exp(-b)
+            np.copyto(p, odds / (1.0 + odds), where=seen, casting="same_kind")
+    if occupied is not None:
+        _lay_over(p_occupied, occupied, first_cell)
     x, y = (float(c) * grid.resolution for c in first_cell)
     return OccupancyMap(p_occupied, alpha, beta, (x, y, 0.0), grid.resolution)
+
+
+def _lay_over(
+    p_occupied: NDArray[np.float32], occupied: CellProbabilities, first_cell: NDArray[np.int64]
+) -> None:
+    """Either a static surface runs through the cell, or it is as free as it looks."""
+    column, row = (occupied.cells - first_cell).T
+    free = p_occupied[row, column]
+    p_occupied[row, column] = occupied.p_occupied + (1.0 - occupied.p_occupied) * free

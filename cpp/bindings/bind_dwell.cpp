@@ -1,0 +1,139 @@
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "stillmap/dwell.hpp"
+
+namespace stillmap::border {
+namespace {
+
+template <int D>
+void add_end_points(Surface<D>& surface, const Points<D>& points, const Flat<bool>& hit,
+                    const Flat<int64_t>& offset, const Poses<D>& poses) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  nb::gil_scoped_release released;
+  surface.add(scans);
+}
+
+template <int D>
+auto elements(const Surface<D>& surface, const Points<D>& points, const Flat<bool>& hit,
+              const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  std::vector<int32_t> out(points.shape(0));
+  {
+    nb::gil_scoped_release released;
+    elements_of<D>(surface, scans, threads, out.data());
+  }
+  const size_t n = out.size();
+  return owned(std::move(out), {n});
+}
+
+// cells, means and normals (E, D), distances from the plane and beams (E,)
+template <int D>
+auto describe(const Surface<D>& surface) {
+  const size_t n = surface.size(), d = static_cast<size_t>(D);
+  std::vector<int64_t> cells, beams;
+  std::vector<double> means, normals, off_plane;
+  for (size_t i = 0; i < n; ++i) {
+    const auto k = static_cast<int32_t>(i);
+    for (int a = 0; a < D; ++a) {
+      cells.push_back(surface.cell(k)[a]);
+      means.push_back(surface.element(k).mean[a] * surface.resolution());
+      normals.push_back(surface.element(k).normal[a]);
+    }
+    beams.push_back(surface.beams(k));
+    off_plane.push_back(surface.element(k).off_plane * surface.resolution());
+  }
+  return std::make_tuple(owned(std::move(cells), {n, d}), owned(std::move(means), {n, d}),
+                         owned(std::move(normals), {n, d}), owned(std::move(off_plane), {n}),
+                         owned(std::move(beams), {n}));
+}
+
+template <int D>
+void add_looks(Dwell<D>& dwell, const Points<D>& points, const Flat<bool>& hit,
+               const Flat<int64_t>& offset, const Poses<D>& poses, const Flat<int64_t>& look,
+               int threads) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  require(look.shape(0) == scans.n_scans, "look: expected one number per scan");
+  nb::gil_scoped_release released;
+  dwell.add(scans, look.data(), threads);
+}
+
+template <int D>
+auto likelihoods(const Dwell<D>& dwell) {
+  const size_t n = dwell.surface().size(), C = dwell.classes();
+  std::vector<float> relative(n * C);
+  std::vector<double> log_best(n);
+  {
+    nb::gil_scoped_release released;
+    dwell.likelihood(relative.data(), log_best.data());
+  }
+  return std::make_tuple(owned(std::move(relative), {n, C}), owned(std::move(log_best), {n}));
+}
+
+DwellClasses checked_classes(std::vector<double> rho, std::vector<double> tau, double detection) {
+  require(!rho.empty() && rho.size() == tau.size(), "rho, tau: expected one number per class");
+  for (const double r : rho) require(r > 0.0 && r < 1.0, "rho: expected shares between 0 and 1");
+  for (const double t : tau) require(t > 0.0, "tau: expected positive times");
+  require(detection > 0.0 && detection < 1.0, "detection: expected a probability below 1");
+  return {std::move(rho), std::move(tau), detection};
+}
+
+template <int D>
+void bind(nb::module_& m, const char* surface, const char* dwell) {
+  using S = Surface<D>;
+  nb::class_<S>(m, surface, "One element of surface per cell in which beams ended.")
+      .def(nb::init<double>(), nb::arg("resolution"))
+      .def_prop_ro("resolution", &S::resolution, "metres")
+      .def_prop_ro("dimension", [](const S&) { return D; })
+      .def_prop_ro("size", &S::size, "number of elements")
+      .def_prop_ro(
+          "scatter", [](const S& s) { return s.scatter() * s.resolution(); },
+          "metres: standard deviation of end points across surfaces; 0 before `fit`")
+      .def("add_end_points", &add_end_points<D>, nb::arg("points").noconvert(),
+           nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
+           nb::arg("T_map_sensor").noconvert(), "Notes where beams ended.")
+      .def(
+          "fit", [](S& s) { s.fit(); }, nb::call_guard<nb::gil_scoped_release>(),
+          "Means, normals and scatter from all end points so far.")
+      .def("elements", &describe<D>,
+           "cells (E, D) int64, means (E, D) in metres, normals (E, D) (zero: none), distance (E,) "
+           "of the cell's centre from the surface around it in metres (zero: none), beams (E,).")
+      .def("elements_of", &elements<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
+           nb::arg("threads") = 1, "(M,) int32: the element in which each beam ended, -1: none.");
+  using W = Dwell<D>;
+  nb::class_<W>(m, dwell, "Likelihood of what was seen of each element, per class of dwell.")
+      .def(
+          "__init__",
+          [](W* self, const S& s, std::vector<double> rho, std::vector<double> tau,
+             double detection, double seconds, double lateral, double margin, double reach,
+             double beyond, bool normals) {
+            for (const double x : {seconds, lateral, margin, reach, beyond})
+              require(x > 0.0 && std::isfinite(x), "looks: expected positive lengths and times");
+            const double r = s.resolution();
+            new (self) W(s, checked_classes(std::move(rho), std::move(tau), detection),
+                         {seconds, lateral / r, margin / r, reach / r, beyond / r, normals});
+          },
+          nb::arg("surface"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"), nb::arg("detection"),
+          nb::arg("seconds"), nb::arg("lateral"), nb::arg("margin"), nb::arg("reach"),
+          nb::arg("beyond"), nb::arg("normals") = true, nb::keep_alive<1, 2>())
+      .def("add", &add_looks<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
+           nb::arg("look").noconvert(), nb::arg("threads") = 1,
+           "Adds scans; look (T,) int64 numbers their looks and must not fall. All scans of one "
+           "look belong into one call.")
+      .def("likelihood", &likelihoods<D>,
+           "(E, C) float32 relative to the best class, (E,) logarithm of the best: of everything "
+           "else that was seen of the cell, given that a beam ended in it.");
+}
+
+}  // namespace
+
+void bind_dwell(nb::module_& m) {
+  bind<2>(m, "Surface2D", "Dwell2D");
+  bind<3>(m, "Surface3D", "Dwell3D");
+}
+
+}  // namespace stillmap::border

@@ -1,0 +1,353 @@
+// How probable what was seen of a cell is, for things that stay for different times.
+//
+// A cell is occupied or empty, a two-state Markov chain in time: occupied for a share rho of the
+// time, with correlation exp(-dt / tau). Each look at it sees something there, which something
+// occupying it must have caused; or sees through it, which an occupied cell lets happen with
+// probability 1 - detection * reliability. What stands still is the chain with rho near one.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <stdexcept>
+#include <vector>
+
+#include "stillmap/surface.hpp"
+
+namespace stillmap {
+
+struct DwellClasses {
+  std::vector<double> rho;  // share of time occupied, in (0, 1)
+  std::vector<double> tau;  // seconds
+  double detection;         // probability that an occupied cell is seen to be so
+};
+
+struct LookOptions {
+  double seconds;  // between successive looks
+  double lateral;  // cells: how far a beam may pass beside where it seems to
+  double margin;   // cells: how far behind an element a beam must end to have passed it
+  double reach;    // cells: hits so near to an element are hits of it
+  double beyond;   // cells before its end up to which a maximum-range beam is trusted
+  bool normals;    // whether surfaces face somewhere; else every element is round
+};
+
+// Gaussian distribution function from a table: the miss of every beam of every cell asks for it.
+class NormalCdf {
+ public:
+  NormalCdf() : table_(2 * kLimit * kPerUnit + 2) {
+    for (size_t i = 0; i < table_.size(); ++i) {
+      const double x = static_cast<double>(i) / kPerUnit - kLimit;
+      table_[i] = static_cast<float>(0.5 * std::erfc(-x / std::sqrt(2.0)));
+    }
+  }
+  float operator()(double x) const {
+    const double at = (std::clamp(x, -1.0 * kLimit, 1.0 * kLimit) + kLimit) * kPerUnit;
+    return table_[static_cast<size_t>(at + 0.5)];
+  }
+
+ private:
+  static constexpr int kLimit = 5, kPerUnit = 128;
+  std::vector<float> table_;
+};
+
+// What one look says about one element.
+struct Look {
+  static constexpr float kHit = -1.0f;
+  int32_t element;
+  float seen_through;  // reliability in (0, 1], or kHit
+};
+
+// Collects the beams of one look.
+template <int D>
+class LookCollector {
+ public:
+  LookCollector(const Surface<D>& surface, const LookOptions& options, const NormalCdf& cdf)
+      : surface_(surface),
+        options_(options),
+        cdf_(cdf),
+        log_missed_(surface.size(), kUntouched),
+        cursor_(surface) {}
+
+  void add(const Scans<D>& scans, size_t first, size_t last) {
+    for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
+      const Segment<D> beam(pose, scans.points + n * D, surface_.resolution());
+      hit_ = scans.hit[n];
+      pass(beam);
+      if (!hit_) return;
+      if (const auto* k = at(cell_of<D>(beam.end)); k && log_missed(*k) != kStruck) {
+        if (log_missed(*k) == kUntouched) touched_.push_back(*k);
+        log_missed(*k) = kStruck;
+        struck_.push_back(*k);
+      }
+    });
+  }
+
+  // What the look says, and a clean sheet for the next one.
+  void take(std::vector<Look>& out) {
+    out.clear();
+    spread_hits();
+    for (const int32_t k : touched_) {
+      const float l = log_missed(k);
+      log_missed(k) = kUntouched;
+      if (l == kStruck) {
+        out.push_back({k, Look::kHit});
+      } else if (const float seen = -std::expm1(l); seen > kLeast) {
+        out.push_back({k, seen});
+      }
+    }
+    touched_.clear();
+    struck_.clear();
+  }
+
+ private:
+  static constexpr float kUntouched = 1.0f;  // logarithms of probabilities are not positive
+  static constexpr float kStruck = 2.0f;
+  static constexpr float kSure = -5.0f;  // beyond which more beams of the same look change nothing
+  static constexpr float kLeast = 0.02f;
+
+  float& log_missed(int32_t k) { return log_missed_[static_cast<size_t>(k)]; }
+
+  const int32_t* at(const Cell<D>& cell) {
+    const auto* block = cursor_.block(cell);
+    if (!block) return nullptr;
+    const int32_t* k = &block->counts[static_cast<size_t>(Surface<D>::local_of(cell))];
+    return *k == kNoElement ? nullptr : k;
+  }
+
+  // Notes what the beam passed. The probability that it met the element is that of its crossing
+  // the surface within the element, as far as `lateral` lets one tell: small at grazing angles.
+  void pass(const Segment<D>& beam) {
+    const Vec<D> way = beam.end - beam.start;
+    const double length = way.norm();
+    const double usable = hit_ ? length : length - options_.beyond;
+    if (!(usable > 0.0)) return;
+    const Vec<D> direction = way / length;
+    const Vec<D> end = hit_ ? beam.end : Vec<D>(beam.start + direction * usable);
+    Walker walker(cursor_, [&](const int32_t* k, double) {
+      if (!k || *k == kNoElement) return;
+      float& l = log_missed(*k);
+      if (l == kStruck || l < kSure) return;
+      const float met = probability_met(surface_.element(*k), beam, direction);
+      if (met <= 0.0f) return;
+      if (l == kUntouched) {
+        touched_.push_back(*k);
+        l = 0.0f;
+      }
+      l += std::log1p(-met);
+    });
+    traverse<D>(beam.start, end, walker);
+    // the end cell is not visited: an end in it is a hit, and free range stops before it
+  }
+
+  float probability_met(const Element<D>& element, const Segment<D>& beam,
+                        const Vec<D>& direction) const {
+    const Vec<D> off = element.mean - beam.start;
+    const double along = off.dot(direction);
+    const bool flat = options_.normals && !element.normal.isZero(0.0);
+    const double facing = flat ? std::abs(element.normal.dot(direction)) : 1.0;
+    if (hit_) {
+      const Vec<D> behind = beam.end - element.mean;
+      const double distance = flat ? std::abs(element.normal.dot(behind)) : behind.norm();
+      if (distance < options_.margin) return 0.0f;
+    }
+    const double aside = std::sqrt(std::max(0.0, off.squaredNorm() - along * along));
+    const double half = 0.5 * facing;
+    const double met =
+        cdf_((half - aside) / options_.lateral) - cdf_((-half - aside) / options_.lateral);
+    return static_cast<float>(std::min(met, 0.999));
+  }
+
+  // Elements near one that was struck are struck: pose and range noise move end points about.
+  void spread_hits() {
+    const int radius = static_cast<int>(std::ceil(options_.reach));
+    const double limit = options_.reach * options_.reach;
+    for (const int32_t from : struck_) {
+      const Vec<D>& mean = surface_.element(from).mean;
+      for_each_near<D>(surface_.cell(from), radius, [&](const Cell<D>& cell) {
+        const auto* k = at(cell);
+        if (!k || log_missed(*k) == kStruck) return;
+        if ((surface_.element(*k).mean - mean).squaredNorm() > limit) return;
+        if (log_missed(*k) == kUntouched) touched_.push_back(*k);
+        log_missed(*k) = kStruck;
+      });
+    }
+  }
+
+  const Surface<D>& surface_;
+  LookOptions options_;
+  const NormalCdf& cdf_;
+  std::vector<float> log_missed_;
+  std::vector<int32_t> touched_, struck_;
+  Cursor<const Surface<D>> cursor_;
+  bool hit_ = false;
+};
+
+// The likelihood of everything seen of each element under each class, look after look. Memory is
+// that of the elements; looks come in the order of time.
+template <int D>
+class Dwell {
+ public:
+  Dwell(const Surface<D>& surface, DwellClasses classes, const LookOptions& options)
+      : surface_(surface), classes_(std::move(classes)), options_(options) {
+    const size_t C = classes_.rho.size();
+    if (!surface.fitted()) throw std::invalid_argument("surface: fit it first");
+    occupied_.resize(surface.size() * C);
+    weight_.assign(surface.size() * C, 1.0f);
+    log_scale_.assign(surface.size(), 0.0);
+    last_.assign(surface.size(), kNever);
+    for (size_t k = 0; k < surface.size(); ++k)
+      for (size_t c = 0; c < C; ++c) occupied_[k * C + c] = static_cast<float>(classes_.rho[c]);
+    for (int gap = 0; gap < kTable; ++gap) append_correlation(table_, gap);
+  }
+
+  size_t classes() const { return classes_.rho.size(); }
+  const Surface<D>& surface() const { return surface_; }
+
+  // look (T,): number of each scan's look, not falling, and not below those added before.
+  void add(const Scans<D>& scans, const int64_t* look, int threads) {
+    const size_t T = scans.n_scans;
+    for (size_t t = 0; t < T; ++t)
+      if (look[t] < (t ? look[t - 1] : newest_)) throw std::invalid_argument("look: must not fall");
+    std::vector<size_t> starts;  // of looks
+    for (size_t t = 0; t < T; ++t)
+      if (t == 0 || look[t] != look[t - 1]) starts.push_back(t);
+    starts.push_back(T);
+    const size_t looks = starts.size() - 1, n = static_cast<size_t>(std::max(threads, 1));
+    std::vector<std::unique_ptr<LookCollector<D>>> collectors;
+    for (size_t i = 0; i < n; ++i)
+      collectors.push_back(std::make_unique<LookCollector<D>>(surface_, options_, cdf_));
+    std::vector<std::vector<Look>> seen(kWindow);
+    for (size_t from = 0; from < looks; from += kWindow) {
+      const size_t to = std::min(from + kWindow, looks);
+      std::atomic<size_t> next{from};
+      parallel_shares(one_each(n), [&](size_t i, size_t, size_t) {
+        for (size_t l = next++; l < to; l = next++) {
+          collectors[i]->add(scans, starts[l], starts[l + 1]);
+          collectors[i]->take(seen[l - from]);
+        }
+      });
+      parallel_shares(one_each(n), [&](size_t i, size_t, size_t) {
+        for (size_t l = from; l < to; ++l) apply(seen[l - from], look[starts[l]], i, n);
+      });
+    }
+    if (T) newest_ = look[T - 1];
+  }
+
+  // (elements, classes): likelihood of everything else that was seen of a cell, given that a beam
+  // ended in it, relative to the best class; and the logarithm of the best.
+  void likelihood(float* relative, double* log_best) const {
+    const size_t C = classes();
+    for (size_t k = 0; k < surface_.size(); ++k) {
+      double best = 0.0;
+      auto value = [&](size_t c) {
+        return weight_[k * C + c] / (classes_.rho[c] * classes_.detection);
+      };
+      for (size_t c = 0; c < C; ++c) best = std::max(best, value(c));
+      for (size_t c = 0; c < C; ++c) relative[k * C + c] = static_cast<float>(value(c) / best);
+      log_best[k] = log_scale_[k] + std::log(best);
+    }
+  }
+
+ private:
+  static constexpr int64_t kNever = INT64_MIN;
+  static constexpr size_t kWindow = 64;  // looks held at once
+  static constexpr int kTable = 64;      // gaps whose correlations are kept
+  static constexpr float kSmall = 1e-12f, kLeast = 1e-36f;
+
+  static std::vector<size_t> one_each(size_t n) {
+    std::vector<size_t> bounds(n + 1);
+    for (size_t i = 0; i <= n; ++i) bounds[i] = i;
+    return bounds;
+  }
+
+  void append_correlation(std::vector<float>& to, int64_t gap) const {
+    for (const double tau : classes_.tau)
+      to.push_back(
+          static_cast<float>(std::exp(-static_cast<double>(gap) * options_.seconds / tau)));
+  }
+
+  // Elements are dealt to threads in runs, so that each is written by one thread alone.
+  void apply(const std::vector<Look>& seen, int64_t look, size_t share, size_t shares) {
+    std::vector<float> long_gap;
+    for (const Look& s : seen) {
+      const size_t k = static_cast<size_t>(s.element);
+      if ((k >> 6) % shares != share) continue;
+      const float* correlation = nullptr;
+      if (last_[k] != kNever) {
+        const int64_t gap = look - last_[k];
+        if (gap >= kTable) {
+          long_gap.clear();
+          append_correlation(long_gap, gap);
+        }
+        correlation =
+            gap < kTable ? table_.data() + static_cast<size_t>(gap) * classes() : long_gap.data();
+      }
+      last_[k] = look;
+      update(k, correlation, s.seen_through);
+    }
+  }
+
+  // One step of the filter of every class, forward in time.
+  void update(size_t k, const float* correlation, float seen_through) {
+    const size_t C = classes();
+    float* p = occupied_.data() + k * C;
+    float* w = weight_.data() + k * C;
+    const double* rho = classes_.rho.data();
+    const float a = static_cast<float>(classes_.detection);
+    if (correlation)
+      for (size_t c = 0; c < C; ++c) {
+        const float r = static_cast<float>(rho[c]);
+        p[c] = r + (p[c] - r) * correlation[c];
+      }
+    float best = 0.0f;
+    if (seen_through == Look::kHit) {
+      for (size_t c = 0; c < C; ++c) {
+        w[c] *= p[c] * a;
+        p[c] = 1.0f;
+        best = std::max(best, w[c]);
+      }
+    } else {
+      const float missed = 1.0f - a * seen_through;
+      for (size_t c = 0; c < C; ++c) {
+        const float through = 1.0f - p[c] + p[c] * missed;
+        w[c] *= through;
+        p[c] *= missed / through;
+        best = std::max(best, w[c]);
+      }
+    }
+    if (best >= kSmall) return;
+    const float up = 1.0f / best;
+    for (size_t c = 0; c < C; ++c) w[c] = std::max(w[c] * up, kLeast);
+    log_scale_[k] += std::log(best);
+  }
+
+  const Surface<D>& surface_;
+  DwellClasses classes_;
+  LookOptions options_;
+  NormalCdf cdf_;
+  std::vector<float> occupied_, weight_;  // (elements, classes)
+  std::vector<double> log_scale_;
+  std::vector<int64_t> last_;
+  std::vector<float> table_;
+  int64_t newest_ = INT64_MIN;
+};
+
+// The element each beam ended in: kNoElement for those that were not hit or ended elsewhere.
+template <int D>
+inline void elements_of(const Surface<D>& surface, const Scans<D>& scans, int threads,
+                        int32_t* element) {
+  std::fill(element + scans.offset[0], element + scans.offset[scans.n_scans], kNoElement);
+  const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
+  parallel_shares(bounds, [&](size_t, size_t first, size_t last) {
+    Cursor<const Surface<D>> cursor(surface);
+    for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
+      if (!scans.hit[n]) return;
+      const Segment<D> beam(pose, scans.points + n * D, surface.resolution());
+      const Cell<D> cell = cell_of<D>(beam.end);
+      if (const auto* block = cursor.block(cell))
+        element[n] = block->counts[static_cast<size_t>(Surface<D>::local_of(cell))];
+    });
+  });
+}
+
+}  // namespace stillmap

@@ -1,0 +1,230 @@
+// Where beams ended: one element of surface per cell, with the mean of its end points, the normal
+// of the surface around it, and how far end points scatter across surfaces.
+#pragma once
+
+#include <Eigen/Eigenvalues>
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <memory>
+#include <stdexcept>
+#include <unordered_map>
+#include <utility>
+#include <vector>
+
+#include "stillmap/beams.hpp"
+
+namespace stillmap {
+
+constexpr int32_t kNoElement = -1;
+
+// Calls visit(cell) for the cells of the cube of that radius around a cell.
+template <int D, class Visit>
+inline void for_each_near(const Cell<D>& centre, int radius, Visit&& visit) {
+  Cell<D> cell = centre.array() - radius;
+  for (;;) {
+    visit(static_cast<const Cell<D>&>(cell));
+    int d = 0;
+    while (d < D && ++cell[d] > centre[d] + radius) {
+      cell[d] = centre[d] - radius;
+      ++d;
+    }
+    if (d == D) return;
+  }
+}
+
+// Everything in units of cells.
+template <int D>
+struct Element {
+  Vec<D> mean = Vec<D>::Zero();    // of the end points in the cell
+  Vec<D> normal = Vec<D>::Zero();  // unit length; zero where the surroundings are no surface
+  double off_plane = 0.0;          // of the cell's centre from the surface around it
+};
+
+template <int D>
+class Surface {
+ public:
+  using G = Grid<D>;
+  static constexpr int kDimension = D;
+  static constexpr int kShift = G::kShift;
+  static constexpr int kEdge = G::kEdge;
+  static constexpr int kCells = G::kCells;
+  static constexpr int kProducts = D * (D + 1) / 2;
+
+  struct Block {
+    Cell<D> origin;                      // block coordinates
+    std::array<int32_t, kCells> counts;  // the element in each cell, or kNoElement
+  };
+
+  explicit Surface(double resolution) : resolution_(resolution) {
+    if (!(resolution > 0.0) || !std::isfinite(resolution))
+      throw std::invalid_argument("resolution: expected a positive length in metres");
+  }
+  Surface(const Surface&) = delete;
+  Surface& operator=(const Surface&) = delete;
+
+  double resolution() const { return resolution_; }
+  size_t size() const { return sums_.size(); }
+  // standard deviation of end points across surfaces, in cells
+  double scatter() const { return scatter_; }
+  const Element<D>& element(int32_t k) const { return elements_[static_cast<size_t>(k)]; }
+  int64_t beams(int32_t k) const { return sums_[static_cast<size_t>(k)].count; }
+  const Cell<D>& cell(int32_t k) const { return sums_[static_cast<size_t>(k)].cell; }
+
+  const Block* find(const Cell<D>& block) const {
+    const auto it = index_.find(G::key(block));
+    return it == index_.end() ? nullptr : blocks_[it->second].get();
+  }
+  static Cell<D> block_of(const Cell<D>& cell) { return G::block_of(cell); }
+  static int local_of(const Cell<D>& cell) { return G::local_of(cell); }
+
+  // Notes the end points of all beams that were hit.
+  void add(const Scans<D>& scans) {
+    fitted_ = false;
+    for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t, int64_t n, const Pose<D>& pose) {
+      if (!scans.hit[n]) return;
+      const Segment<D> beam(pose, scans.points + n * D, resolution_);
+      add_end_point(beam.end);
+    });
+  }
+
+  // Means, normals and scatter from all end points so far.
+  void fit() {
+    constexpr int narrow = 2, wide = 6;
+    elements_.assign(size(), {});
+    for (size_t k = 0; k < size(); ++k) elements_[k].mean = mean_of(sums_[k]);
+    fit_normals(narrow);
+    // noise as large as the window would hide every wall
+    const int radius = std::min(wide, static_cast<int>(std::ceil(1.0 + 3.0 * scatter_)));
+    if (radius > narrow) fit_normals(radius);
+    fitted_ = true;
+  }
+  bool fitted() const { return fitted_; }
+
+ private:
+  struct Sums {
+    Cell<D> cell;
+    int64_t count = 0;
+    std::array<Fixed, D> first{};           // of end point - cell corner
+    std::array<Fixed, kProducts> second{};  // of its products, by rows of the upper triangle
+  };
+
+  void add_end_point(const Vec<D>& end) {
+    const Cell<D> cell = cell_of<D>(end);
+    int32_t& at = find_or_add(block_of(cell))->counts[static_cast<size_t>(local_of(cell))];
+    if (at == kNoElement) {
+      at = static_cast<int32_t>(sums_.size());
+      sums_.emplace_back();
+      sums_.back().cell = cell;
+    }
+    Sums& sums = sums_[static_cast<size_t>(at)];
+    const Vec<D> x = end - cell.template cast<double>();
+    ++sums.count;
+    size_t product = 0;
+    for (int i = 0; i < D; ++i) {
+      sums.first[static_cast<size_t>(i)] += to_fixed(x[i]);
+      for (int j = i; j < D; ++j) sums.second[product++] += to_fixed(x[i] * x[j]);
+    }
+  }
+
+  Block* find_or_add(const Cell<D>& block) {
+    if (last_ && last_->origin == block) return last_;
+    const auto [it, added] = index_.try_emplace(G::key(block), blocks_.size());
+    if (added) {
+      blocks_.push_back(std::make_unique<Block>());
+      blocks_.back()->origin = block;
+      blocks_.back()->counts.fill(kNoElement);
+    }
+    last_ = blocks_[it->second].get();
+    return last_;
+  }
+
+  static Vec<D> mean_of(const Sums& s) {
+    Vec<D> mean;
+    for (int d = 0; d < D; ++d)
+      mean[d] =
+          s.cell[d] + from_fixed(s.first[static_cast<size_t>(d)]) / static_cast<double>(s.count);
+    return mean;
+  }
+
+  using Square = Eigen::Matrix<double, D, D>;
+
+  // Count, mean and covariance of the end points in the cells around one.
+  struct Spread {
+    double count = 0.0;
+    Vec<D> first = Vec<D>::Zero();
+    Square second = Square::Zero();
+
+    void add(const Sums& s, const Cell<D>& about) {
+      const Vec<D> corner = (s.cell - about).template cast<double>();
+      const double n = static_cast<double>(s.count);
+      Vec<D> sum;
+      for (int d = 0; d < D; ++d) sum[d] = from_fixed(s.first[static_cast<size_t>(d)]);
+      Square products;
+      size_t product = 0;
+      for (int i = 0; i < D; ++i)
+        for (int j = i; j < D; ++j)
+          products(i, j) = products(j, i) = from_fixed(s.second[product++]);
+      count += n;
+      first += sum + n * corner;
+      second += products + corner * sum.transpose() + sum * corner.transpose() +
+                n * corner * corner.transpose();
+    }
+    Vec<D> mean() const { return first / count; }
+    Square covariance() const { return second / count - mean() * mean().transpose(); }
+  };
+
+  // Principal axes of the end points within `radius` cells of each element.
+  void fit_normals(int radius) {
+    std::vector<std::pair<double, int64_t>> across;  // smallest deviation, weight
+    across.reserve(size());
+    Cursor<const Surface<D>> cursor(*this);
+    for (size_t k = 0; k < size(); ++k) {
+      const Spread spread = around(cursor, sums_[k].cell, radius);
+      const Eigen::SelfAdjointEigenSolver<Square> axes(spread.covariance());
+      const Vec<D> variance = axes.eigenvalues().cwiseMax(0.0);  // rising
+      const bool wide = variance[1] > 0.6;                       // over three cells at least
+      elements_[k].normal.setZero();
+      elements_[k].off_plane = 0.0;
+      if (!wide) continue;
+      across.emplace_back(std::sqrt(variance[0]), sums_[k].count);
+      if (variance[0] >= 0.25 * variance[1]) continue;
+      elements_[k].normal = axes.eigenvectors().col(0);
+      const Vec<D> centre = Vec<D>::Constant(0.5);  // as seen from the cell's corner
+      elements_[k].off_plane = elements_[k].normal.dot(centre - spread.mean());
+    }
+    scatter_ = weighted_median(across);
+  }
+
+  Spread around(Cursor<const Surface<D>>& cursor, const Cell<D>& centre, int radius) const {
+    Spread spread;
+    for_each_near<D>(centre, radius, [&](const Cell<D>& cell) {
+      const Block* block = cursor.block(cell);
+      if (!block) return;
+      const int32_t k = block->counts[static_cast<size_t>(local_of(cell))];
+      if (k != kNoElement) spread.add(sums_[static_cast<size_t>(k)], centre);
+    });
+    return spread;
+  }
+
+  static double weighted_median(std::vector<std::pair<double, int64_t>>& values) {
+    int64_t total = 0;
+    for (const auto& v : values) total += v.second;
+    std::sort(values.begin(), values.end());
+    int64_t so_far = 0;
+    for (const auto& v : values)
+      if (2 * (so_far += v.second) >= total) return v.first;
+    return 0.0;
+  }
+
+  double resolution_;
+  double scatter_ = 0.0;
+  bool fitted_ = false;
+  std::vector<Sums> sums_;
+  std::vector<Element<D>> elements_;
+  std::vector<std::unique_ptr<Block>> blocks_;
+  Block* last_ = nullptr;
+  std::unordered_map<uint64_t, size_t, typename G::Hash> index_;
+};
+
+}  // namespace stillmap

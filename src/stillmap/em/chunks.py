@@ -1,0 +1,40 @@
+"""Recordings piece by piece: what one kernel call sees is bounded, whatever the length."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.recording.model import Recording
+
+CHUNK_BEAMS = 1 << 20
+
+
+class Chunk(NamedTuple):
+    """Some scans in a row.
+
+    Attributes:
+        scans: which ones.
+        beams: their beams.
+        offset: (n + 1,) where each scan's beams begin within these.
+    """
+
+    scans: slice
+    beams: slice
+    offset: NDArray[np.int64]
+
+
+def chunks(recording: Recording, group: NDArray[np.int64] | None = None) -> Iterator[Chunk]:
+    """Chunks of about CHUNK_BEAMS beams; scans of equal `group` (T,), rising, stay together."""
+    offset, first = recording.offset, 0
+    while first < recording.n_scans:
+        end = int(np.searchsorted(offset, offset[first] + CHUNK_BEAMS, side="right")) - 1
+        end = min(max(end, first + 1), recording.n_scans)
+        if group is not None and end < recording.n_scans:
+            start = int(np.searchsorted(group, group[end]))  # of the group that would be cut
+            end = start if start > first else int(np.searchsorted(group, group[end], side="right"))
+        beams = slice(int(offset[first]), int(offset[end]))
+        within = np.ascontiguousarray(offset[first : end + 1] - offset[first])
+        yield Chunk(slice(first, end), beams, within)
+        first = end

@@ -1,0 +1,195 @@
+"""The default E-step: what stands still is what never leaves. `docs/estimator.md` derives it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from stillmap import _core
+from stillmap.em.chunks import chunks
+from stillmap.em.expectations import CellProbabilities, Expectations, Likelihood, per_beam
+from stillmap.em.mixture import Shares, fit_shares, posterior_static
+from stillmap.em.options import DwellOptions, EmOptions
+from stillmap.recording.model import Recording
+
+Float = NDArray[np.float64]
+Surface = _core.Surface2D | _core.Surface3D
+
+_LEAST = 0.3  # cells: no length is known better, whatever the scatter
+_UNSEEN = 0.2  # probability that a cell is occupied in which no beam ended and none passed
+_EDGE = 0.15  # cells: how sharply a surface ends
+
+
+@dataclass(frozen=True)
+class Classes:
+    """Grid over what a cell may hold: how much of the time it is occupied, and for how long.
+
+    The shares of these classes are learned; the grid itself only has to be wide and fine enough.
+
+    Attributes:
+        static_occupied, static_seconds: share of the time and correlation time in seconds of what
+            stands still: one, but for looks that miss it, which come in runs.
+        mover_occupied, mover_seconds: of what comes and goes.
+    """
+
+    static_occupied: tuple[float, ...] = (0.998, 0.9, 0.6)
+    static_seconds: tuple[float, ...] = (5.0, 25.0)
+    mover_occupied: tuple[float, ...] = (0.005, 0.02, 0.06, 0.15)
+    mover_seconds: tuple[float, ...] = (0.5, 3.0, 12.0, 45.0)
+
+    @property
+    def n_static(self) -> int:
+        return len(self.static_occupied) * len(self.static_seconds)
+
+    def grid(self) -> tuple[list[float], list[float]]:
+        """rho and tau of every class, static ones first."""
+        pairs = [(r, t) for t in self.static_seconds for r in self.static_occupied]
+        pairs += [(r, t) for t in self.mover_seconds for r in self.mover_occupied]
+        return [r for r, _ in pairs], [t for _, t in pairs]
+
+
+CLASSES = Classes()
+
+
+def e_step(
+    recording: Recording,
+    poses: Float,
+    resolution: float,
+    options: EmOptions,
+    threads: int = 1,
+    classes: Classes = CLASSES,
+) -> Expectations:
+    """P(c = 1) of every beam: of its end cell being occupied by something that stays.
+
+    Args:
+        recording: 2D or 3D.
+        poses: (T, D+1, D+1) T_map_base.
+        resolution: m, edge of a cell.
+        options: see EmOptions.
+        threads: same result with any number.
+        classes: see Classes.
+    """
+    T_map_sensor = recording.T_map_sensor(poses)
+    surface = surface_of(recording, T_map_sensor, resolution)
+    likelihood, log_best = _likelihood(
+        recording, T_map_sensor, surface, options.dwell, threads, classes
+    )
+    cells, _, normals, off_plane, beams = surface.elements()
+    shares = fit_shares(likelihood, beams, classes.n_static, options.prior)
+    static = posterior_static(likelihood, shares.classes, classes.n_static)
+    element = _elements_of(recording, T_map_sensor, surface, threads)
+    found = np.append(static, np.float32(shares.static))  # -1: no element
+    return Expectations(
+        p_static=per_beam(recording, found[element], shares.static),
+        likelihood=_bound(likelihood, log_best, beams, shares),
+        occupied=CellProbabilities(
+            cells, _coverage(static, normals, off_plane / resolution), _UNSEEN
+        ),
+        learned=_learned(surface, shares, classes),
+    )
+
+
+def surface_of(recording: Recording, T_map_sensor: Float, resolution: float) -> Surface:
+    """Mean, normal and scatter of the end points in every cell where beams ended."""
+    kind = _core.Surface2D if recording.dimension == 2 else _core.Surface3D
+    surface = kind(resolution)
+    for scans, beams, offset in chunks(recording):
+        surface.add_end_points(
+            recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans]
+        )
+    surface.fit()
+    return surface
+
+
+def look_numbers(recording: Recording, seconds: float) -> NDArray[np.int64]:
+    """(T,) the look of each scan: what was seen within it tells no more than a single glance."""
+    since = recording.stamp_ns - recording.stamp_ns[0]
+    return np.asarray(since // max(round(seconds * 1e9), 1), dtype=np.int64)
+
+
+def _likelihood(
+    recording: Recording,
+    T_map_sensor: Float,
+    surface: Surface,
+    options: DwellOptions,
+    threads: int,
+    classes: Classes,
+) -> tuple[NDArray[np.float32], Float]:
+    """(E, C) likelihood of all looks at each element relative to its best class, ln of the best."""
+    dwell = _dwell(surface, options, classes)
+    look = look_numbers(recording, options.look)
+    for scans, beams, offset in chunks(recording, look):
+        dwell.add(
+            recording.points[beams],
+            recording.hit[beams],
+            offset,
+            T_map_sensor[scans],
+            look[scans],
+            threads,
+        )
+    return dwell.likelihood()
+
+
+def _dwell(
+    surface: Surface, options: DwellOptions, classes: Classes
+) -> _core.Dwell2D | _core.Dwell3D:
+    rho, tau = classes.grid()
+    cell, scatter = surface.resolution, surface.scatter
+    lengths = {
+        "lateral": max(options.lateral * scatter, _LEAST * cell),
+        "margin": options.margin * scatter + 0.5 * cell,
+        "reach": options.reach * scatter + 0.7 * cell,  # half a cell's diagonal
+        "beyond": options.beyond,
+    }
+    chosen = {"detection": options.detection, "seconds": options.look, **lengths}
+    if isinstance(surface, _core.Surface2D):
+        return _core.Dwell2D(surface, rho=rho, tau=tau, normals=options.normals, **chosen)
+    return _core.Dwell3D(surface, rho=rho, tau=tau, normals=options.normals, **chosen)
+
+
+def _elements_of(
+    recording: Recording, T_map_sensor: Float, surface: Surface, threads: int
+) -> NDArray[np.int32]:
+    element = np.empty(recording.n_beams, dtype=np.int32)
+    for scans, beams, offset in chunks(recording):
+        element[beams] = surface.elements_of(
+            recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans], threads
+        )
+    return element
+
+
+def _bound(
+    likelihood: NDArray[np.float32], log_best: Float, beams: NDArray[np.int64], shares: Shares
+) -> Likelihood:
+    joint = likelihood * shares.classes.astype(np.float32)
+    evidence = joint.sum(axis=1, dtype=np.float64)
+    r = joint / evidence[:, None]
+    entropy = -np.sum(r * np.log(np.maximum(r, 1e-30)), axis=1)
+    bound = float(np.sum(beams * (np.log(evidence) + log_best)))
+    return Likelihood(expected=bound - float(np.sum(beams * entropy)), bound=bound)
+
+
+def _coverage(static: NDArray[np.float32], normals: Float, off_plane: Float) -> NDArray[np.float32]:
+    """P(the static surface runs through the cell itself): noise also fills cells beside it."""
+    half = 0.5 * np.abs(normals).sum(axis=1)  # of the cell, across the surface
+    covered = ndtr((half - np.abs(off_plane)) / _EDGE)
+    flat = normals.any(axis=1)
+    return np.asarray(static * np.where(flat, covered, 1.0), dtype=np.float32)
+
+
+def _learned(surface: Surface, shares: Shares, classes: Classes) -> dict[str, object]:
+    n = classes.n_static
+    movers = shares.classes[n:].reshape(len(classes.mover_seconds), -1) / shares.classes[n:].sum()
+    static = shares.classes[:n].reshape(len(classes.static_seconds), -1) / shares.static
+    return {
+        "scatter": surface.scatter,
+        "p_static": shares.static,
+        "static_occupied": _table(classes.static_occupied, static.sum(axis=0)),
+        "mover_occupied": _table(classes.mover_occupied, movers.sum(axis=0)),
+        "mover_seconds": _table(classes.mover_seconds, movers.sum(axis=1)),
+    }
+
+
+def _table(values: tuple[float, ...], shares: Float) -> list[dict[str, float]]:
+    return [{"value": v, "share": round(float(s), 6)} for v, s in zip(values, shares, strict=True)]

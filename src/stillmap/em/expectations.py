@@ -1,0 +1,64 @@
+"""What an E-step finds out, whichever estimator made it."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.recording.model import Recording
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Terms of the log likelihood, summed over all beams, in nats.
+
+    Attributes:
+        expected: the expected complete-data log likelihood, for the printed method (5) with gamma
+            (7): the curve of Fig. 5.
+        bound: expected + entropy of the posterior: what no EM iteration with fixed poses lowers.
+    """
+
+    expected: float
+    bound: float
+
+
+@dataclass(frozen=True, eq=False)
+class CellProbabilities:
+    """Occupancy of single cells, as an estimator knows it better than by counting.
+
+    Attributes:
+        cells: (K, D) int64 cells in which beams ended.
+        p_occupied: (K,) float32.
+        free_prior: probability that any other cell is occupied, before beams passed through it.
+    """
+
+    cells: NDArray[np.int64]
+    p_occupied: NDArray[np.float32]
+    free_prior: float
+
+
+@dataclass(frozen=True, eq=False)
+class Expectations:
+    """One E-step.
+
+    Attributes:
+        p_static: (M,) float32, e = P(c = 1); NaN: unusable, the prior at maximum range.
+        likelihood: at the map it was made from.
+        occupied: cells it knows more of than alpha / (alpha + beta) says.
+        learned: what was learned from the recording, JSON-able.
+    """
+
+    p_static: NDArray[np.float32]
+    likelihood: Likelihood
+    occupied: CellProbabilities | None = None
+    learned: dict[str, object] = field(default_factory=dict)
+
+
+def per_beam(
+    recording: Recording, values: NDArray[np.float32], prior: float
+) -> NDArray[np.float32]:
+    """(M,) `values` for the hits, the prior at maximum range, NaN for unusable beams."""
+    usable = np.isfinite(recording.points).all(axis=1)
+    e = np.where(recording.hit, values, np.float32(prior)).astype(np.float32)
+    e[~usable] = np.nan
+    return e

@@ -1,0 +1,61 @@
+"""Options of the loop and of its estimators."""
+
+from dataclasses import dataclass, field
+
+from stillmap.options import field_with_doc
+
+
+@dataclass(frozen=True)
+class DwellOptions:
+    """The default estimator; lengths follow from the scatter of end points in the recording."""
+
+    look: float = field_with_doc(1.0, "s, beams within it tell no more of a cell than one")
+    detection: float = field_with_doc(0.97, "probability that an occupied cell is seen to be so")
+    lateral: float = field_with_doc(1.0, "scatters by which a beam may pass beside its place")
+    margin: float = field_with_doc(3.0, "scatters behind a surface at which a beam has passed it")
+    reach: float = field_with_doc(4.0, "scatters within which hits are hits of the same thing")
+    beyond: float = field_with_doc(0.3, "m, end of a maximum-range beam that says nothing")
+    normals: bool = field_with_doc(True, "know a surface seen at a slant from one seen face on")
+
+    def __post_init__(self) -> None:
+        if not 0.01 <= self.look <= 3600.0:
+            raise ValueError("'em.dwell.look' wants 0.01 to 3600 seconds")
+        if not 0.5 <= self.detection <= 0.9999:
+            raise ValueError("'em.dwell.detection' wants a probability from 0.5 to 0.9999")
+        for name in ("lateral", "margin", "reach"):
+            if not 0.0 <= getattr(self, name) <= 100.0:
+                raise ValueError(f"'em.dwell.{name}' wants 0 to 100 scatters")
+        if not 1e-3 <= self.beyond <= 100.0:
+            raise ValueError("'em.dwell.beyond' wants 0.001 to 100 metres")
+
+
+@dataclass(frozen=True)
+class EmOptions:
+    """The loop of Fig. 2."""
+
+    prior: float = field_with_doc(
+        0.9, "p(c = 1), share of beams thought static before anything was learned"
+    )
+    max_iterations: int = field_with_doc(6, "iterations at most")
+    tolerance: float = field_with_doc(
+        1e-3, "nats per beam of the bound: the loop stops when it gains less"
+    )
+    patience: int = field_with_doc(2, "iterations without a better bound before the loop stops")
+    hit_ratio: float = field_with_doc(
+        0.25, "hits / (hits + passes) below which the hit-ratio estimator drops a cell"
+    )
+    held_out: int = field_with_doc(
+        20, "every that many scans one is left out of the map and scored by it; 0: none"
+    )
+    dwell: DwellOptions = field(default=DwellOptions())
+
+    def __post_init__(self) -> None:
+        for name in ("prior", "hit_ratio"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ValueError(f"'em.{name}' wants a probability between 0 and 1, both excluded")
+        if self.max_iterations < 1 or self.patience < 1:
+            raise ValueError("'em.max_iterations' and 'em.patience' want at least 1")
+        if not self.tolerance >= 0.0:
+            raise ValueError("'em.tolerance' wants a number that is not negative")
+        if self.held_out < 0 or self.held_out == 1:
+            raise ValueError("'em.held_out' wants 0, or 2 and more")
