@@ -141,9 +141,9 @@ class LookCollector {
 
   float probability_met(const Element<D>& element, const Segment<D>& beam,
                         const Vec<D>& direction) const {
-    const Vec<D> off = element.mean - beam.start;
-    const double along = off.dot(direction);
     const bool flat = options_.normals && !element.normal.isZero(0.0);
+    const Vec<D> off = (flat ? element.centre : element.mean) - beam.start;
+    const double along = off.dot(direction);
     const double facing = flat ? std::abs(element.normal.dot(direction)) : 1.0;
     if (hit_) {
       const Vec<D> behind = beam.end - element.mean;
@@ -151,7 +151,7 @@ class LookCollector {
       if (distance < options_.margin) return 0.0f;
     }
     const double aside = std::sqrt(std::max(0.0, off.squaredNorm() - along * along));
-    const double half = 0.5 * facing;
+    const double half = (flat ? element.half : 0.5) * facing;
     const double met =
         cdf_((half - aside) / options_.lateral) - cdf_((-half - aside) / options_.lateral);
     return static_cast<float>(std::min(met, 0.999));

@@ -39,6 +39,8 @@ struct Element {
   Vec<D> mean = Vec<D>::Zero();    // of the end points in the cell
   Vec<D> normal = Vec<D>::Zero();  // unit length; zero where the surroundings are no surface
   double off_plane = 0.0;          // of the cell's centre from the surface around it
+  Vec<D> centre = Vec<D>::Zero();  // of that surface, else the mean
+  double half = 0.5;               // how far it extends from there
 };
 
 template <int D>
@@ -90,13 +92,11 @@ class Surface {
 
   // Means, normals and scatter from all end points so far.
   void fit() {
-    constexpr int narrow = 2, wide = 6;
     elements_.assign(size(), {});
     for (size_t k = 0; k < size(); ++k) elements_[k].mean = mean_of(sums_[k]);
-    fit_normals(narrow);
-    // noise as large as the window would hide every wall
-    const int radius = std::min(wide, static_cast<int>(std::ceil(1.0 + 3.0 * scatter_)));
-    if (radius > narrow) fit_normals(radius);
+    // noise as large as the window would hide every wall: then a wider one
+    for (const int radius : {2, 4, 6})
+      if (fit_normals(radius) >= 0.5) break;
     fitted_ = true;
   }
   bool fitted() const { return fitted_; }
@@ -174,8 +174,10 @@ class Surface {
     Square covariance() const { return second / count - mean() * mean().transpose(); }
   };
 
-  // Principal axes of the end points within `radius` cells of each element.
-  void fit_normals(int radius) {
+  // Principal axes of the end points within `radius` cells of each element; returns the share of
+  // the beams that ended on surfaces.
+  double fit_normals(int radius) {
+    int64_t all = 0, flat = 0;
     std::vector<std::pair<double, int64_t>> across;  // smallest deviation, weight
     across.reserve(size());
     Cursor<const Surface<D>> cursor(*this);
@@ -183,17 +185,23 @@ class Surface {
       const Spread spread = around(cursor, sums_[k].cell, radius);
       const Eigen::SelfAdjointEigenSolver<Square> axes(spread.covariance());
       const Vec<D> variance = axes.eigenvalues().cwiseMax(0.0);  // rising
-      const bool wide = variance[1] > 0.6;                       // over three cells at least
+      const bool wide = variance[1] > 0.15 * radius * radius;    // over three cells of five
       elements_[k].normal.setZero();
       elements_[k].off_plane = 0.0;
-      if (!wide) continue;
+      elements_[k].centre = elements_[k].mean;
+      elements_[k].half = 0.5;
+      all += sums_[k].count;
+      if (!wide || variance[0] >= 0.25 * variance[1]) continue;
+      flat += sums_[k].count;
       across.emplace_back(std::sqrt(variance[0]), sums_[k].count);
-      if (variance[0] >= 0.25 * variance[1]) continue;
       elements_[k].normal = axes.eigenvectors().col(0);
+      elements_[k].centre = sums_[k].cell.template cast<double>() + spread.mean();
+      elements_[k].half = 0.5 * std::sqrt(3.0 * variance[1]);  // as of evenly spread points
       const Vec<D> centre = Vec<D>::Constant(0.5);  // as seen from the cell's corner
       elements_[k].off_plane = elements_[k].normal.dot(centre - spread.mean());
     }
     scatter_ = weighted_median(across);
+    return all ? static_cast<double>(flat) / static_cast<double>(all) : 1.0;
   }
 
   Spread around(Cursor<const Surface<D>>& cursor, const Cell<D>& centre, int radius) const {
