@@ -1,0 +1,244 @@
+"""Is P(static) the share that is static? By look counts, by time in sight, and by range.
+
+python benchmarks/calibration.py [--cases populated "everyone stops"] [--methods stillmap]
+    [--seeds tuning|reporting] [--n-seeds 1] [--set section.key=value ...] [--true-poses]
+    [--png FILE]
+
+A look is a second in which beams passed through, or ended in, the cell in which a beam ended.
+"""
+
+import argparse
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from cases import POPULATED, STOPS, Case, chosen
+from common import add_arguments, add_seed_arguments, built, options_of, outcomes, seeds_of
+from numpy.typing import NDArray
+from prepared import RESOLUTION, counts
+from tables import grouped, markdown
+
+from stillmap.evaluation.labels import UNSURE, calibration_error, equal_mass_bins
+from stillmap.recording.model import Recording
+from stillmap.simulation import simulate
+
+Float = NDArray[np.float64]
+
+# lower edges of the bins; the last one is open
+LOOKS = (1, 2, 3, 5, 9, 17, 33, 65)
+SPANS = (0, 1, 3, 10, 30, 100)  # s from the first look to the last
+RANGES = (0, 1, 2, 5, 10, 20)  # m
+FIXED = (0, 0.001, 0.01, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999)
+# title, column of Beams, lower edges
+SPLITS = (
+    ("looks", "looks", LOOKS),
+    ("seconds from first to last look", "span", SPANS),
+    ("range, m", "range", RANGES),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """What is known of (N,) beams that hit something and carry a label."""
+
+    p: Float
+    static: NDArray[np.bool_]
+    looks: NDArray[np.int32]
+    span: NDArray[np.int32]
+    range: Float
+
+    def of(self, which: NDArray[np.bool_]) -> "Beams":
+        return Beams(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run, mapped with one method."""
+
+    case: Case
+    seed: int
+    method: str
+    settings: tuple[str, ...]
+    true_poses: bool
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_arguments(p, ["stillmap"])
+    add_seed_arguments(p)
+    p.add_argument("--cases", nargs="+", default=[POPULATED, STOPS], help="names or groups")
+    p.add_argument("--true-poses", action="store_true")
+    p.add_argument("--png", type=Path, help="reliability diagrams; the method's name is added")
+    args = p.parse_args()
+    triples = itertools.product(chosen(args.cases), seeds_of(args), args.methods)
+    jobs = [Job(*triple, tuple(args.set), args.true_poses) for triple in triples]
+    done = list(outcomes(_beams_of, jobs, args.processes))
+    for method, some in grouped(done, lambda pair: pair[0].method).items():
+        beams = joined([beams for _, beams in some])
+        print(f"\n## {method}: {len(some)} runs, {len(beams.p)} beams that hit something\n")
+        print("\n\n".join(_tables(beams)))
+        if args.png:
+            _draw(beams, args.png.with_stem(f"{args.png.stem}-{method}"))
+
+
+def joined(parts: Sequence[Beams]) -> Beams:
+    names = Beams.__dataclass_fields__
+    return Beams(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def _beams_of(job: Job) -> Beams:
+    sim = simulate(job.case.build(), job.seed)
+    recording, truth = sim.recording, sim.truth
+    poses = truth.T_world_base if job.true_poses else None
+    result, _ = built(recording, options_of(job.method, job.settings), poses)
+    looks, span = looks_of(recording, result.poses)
+    ranges = np.hypot(*recording.points.T.astype(np.float64))
+    all_beams = Beams(result.p_static.astype(np.float64), truth.static, looks, span, ranges)
+    return all_beams.of(recording.hit & ~np.isnan(result.p_static))
+
+
+def looks_of(recording: Recording, poses: Float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Of the cell in which each beam (M,) ended: in how many seconds it was looked at, and how
+    many seconds lie between the first and the last of them."""
+    ones = np.ones(recording.n_beams, np.float32)
+    whole = counts(recording, recording.points, recording.hit, ones, poses)
+    corner, alpha, _ = whole.dense()
+    count, first, last = (np.zeros(alpha.shape, np.int32) for _ in range(3))
+    for second, scans in _seconds(recording):
+        seen_corner, alpha, beta = _looked_at(recording, poses, scans)
+        x, y = seen_corner - corner
+        part = np.s_[y : y + alpha.shape[0], x : x + alpha.shape[1]]
+        seen = alpha + beta > 0
+        first[part][seen & (count[part] == 0)] = second
+        last[part][seen] = second
+        count[part] += seen
+    cells = _end_cells(recording, poses) - corner
+    column, row = np.clip(cells, 0, np.array(count.shape)[::-1] - 1).T
+    return np.maximum(count[row, column], 1), (last - first)[row, column]
+
+
+def _seconds(recording: Recording) -> Iterator[tuple[int, slice]]:
+    """The scans of each second in which there are any."""
+    second = (recording.stamp_ns - recording.stamp_ns[0]) // 10**9
+    starts = np.flatnonzero(np.diff(second, prepend=-1))
+    for start, end in itertools.pairwise([*starts.tolist(), len(second)]):
+        yield int(second[start]), slice(start, end)
+
+
+def _looked_at(
+    recording: Recording, poses: Float, scans: slice
+) -> tuple[NDArray[np.int64], Float, Float]:
+    """The sums of (10) of some scans alone."""
+    offset = recording.offset[scans.start : scans.stop + 1]
+    beams = slice(int(offset[0]), int(offset[-1]))
+    part = Recording(
+        stamp_ns=recording.stamp_ns[scans],
+        offset=offset - offset[0],
+        points=recording.points[beams],
+        hit=recording.hit[beams],
+        T_base_sensor=recording.T_base_sensor,
+        sensor=recording.sensor[scans],
+        T_odom_base=None,
+    )
+    ones = np.ones(part.n_beams, np.float32)
+    return counts(part, part.points, part.hit, ones, poses[scans]).dense()
+
+
+def _end_cells(recording: Recording, poses: Float) -> NDArray[np.int64]:
+    """(M, 2) column and row; 0 for a beam that cannot be used."""
+    T = np.repeat(recording.T_map_sensor(poses), np.diff(recording.offset), axis=0)
+    points = np.nan_to_num(recording.points.astype(np.float64))
+    ends = np.einsum("mij,mj->mi", T[:, :2, :2], points) + T[:, :2, 2]
+    return np.floor(ends / RESOLUTION).astype(np.int64)
+
+
+def _tables(beams: Beams) -> Iterator[str]:
+    yield "Fixed bins of P(static):"
+    yield _split_table("P(static)", beams, beams.p, FIXED)
+    unsure = beams.of(_is_unsure(beams.p))
+    yield f"Equal-mass bins of the {len(unsure.p)} unsure beams, {UNSURE[0]} < P < {UNSURE[1]}:"
+    of_bin = equal_mass_bins(unsure.p) if len(unsure.p) else np.empty(0, np.intp)
+    lines = [_line(str(k + 1), unsure.of(of_bin == k)) for k in np.unique(of_bin).tolist()]
+    yield markdown(_HEADER, lines)
+    for title, name, edges in SPLITS:
+        yield f"By {title}:"
+        yield _split_table(title, beams, getattr(beams, name), edges)
+
+
+_HEADER = (
+    "bin",
+    "beams",
+    "mean P(static)",
+    "truly static",
+    "P - truth",
+    "Brier",
+    "ECE",
+    "unsure",
+    "ECE unsure",
+)
+
+
+def _split_table(title: str, beams: Beams, values: Float, edges: Sequence[float]) -> str:
+    of_bin = np.searchsorted(edges, values, side="right") - 1
+    names = [f"[{low:g}, {high:g})" for low, high in itertools.pairwise(edges)]
+    names.append(f"{edges[-1]:g} or more")
+    lines = [_line(name, beams.of(of_bin == k)) for k, name in enumerate(names)]
+    return markdown((title, *_HEADER[1:]), [*lines, _line("all", beams)])
+
+
+def _line(name: str, beams: Beams) -> list[str]:
+    n = len(beams.p)
+    if not n:
+        return [name, "0", *["-"] * (len(_HEADER) - 2)]
+    unsure = _is_unsure(beams.p)
+    return [
+        name,
+        str(n),
+        f"{beams.p.mean():.4f}",
+        f"{beams.static.mean():.4f}",
+        f"{(beams.p - beams.static).mean():+.4f}",
+        f"{((beams.p - beams.static) ** 2).mean():.4f}",
+        f"{_ece(beams):.4f}",
+        f"{100 * unsure.mean():.2f} %",
+        f"{_ece(beams.of(unsure)):.3f}" if unsure.any() else "-",
+    ]
+
+
+def _is_unsure(p: Float) -> NDArray[np.bool_]:
+    return (p > UNSURE[0]) & (p < UNSURE[1])
+
+
+def _ece(beams: Beams) -> float:
+    return calibration_error(beams.p, beams.static, equal_mass_bins(beams.p))
+
+
+def _draw(beams: Beams, path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, len(SPLITS), figsize=(15, 5), sharey=True)
+    for axis, (title, name, edges) in zip(axes, SPLITS, strict=True):
+        axis.plot([0, 1], [0, 1], color="grey", linewidth=1)
+        values = getattr(beams, name)
+        for low, high in itertools.pairwise([*edges, np.inf]):
+            some = beams.of((values >= low) & (values < high))
+            of_bin = np.searchsorted(FIXED, some.p, side="right") - 1
+            bins = [k for k in np.unique(of_bin) if np.sum(of_bin == k) >= 50]
+            x = [some.p[of_bin == k].mean() for k in bins]
+            y = [some.static[of_bin == k].mean() for k in bins]
+            axis.plot(x, y, marker="o", markersize=3, label=f"from {low:g}")
+        axis.set(xlabel="P(static)", title=title)
+        axis.legend()
+    axes[0].set(ylabel="truly static")
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""The simulated runs that benchmarks are made of: which world, which people, which sensor."""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from stillmap.simulation import OdometryOptions, Scene, scene_by_name
+
+POPULATED = "populated"
+STOPS = "everyone stops"
+EMPTY = "empty"
+SENSORS = "sensors"
+ODOMETRY = "odometry"
+ONCE = "passed once"  # nothing in the recording shows that these cars move: in no mean
+GROUPS = (POPULATED, STOPS, EMPTY, SENSORS, ODOMETRY, ONCE)
+
+Changes = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A world and what differs from its defaults."""
+
+    name: str
+    group: str
+    scene: str
+    changes: Changes = field(default_factory=dict)
+
+    def build(self) -> Scene:
+        return scene_by_name(self.scene, self.changes)
+
+
+def chosen(names: Iterable[str]) -> list[Case]:
+    """The cases of these names or groups, in the catalogue's order; no name: all of them."""
+    wanted = set(names)
+    unknown = wanted - {case.name for case in CASES} - set(GROUPS)
+    if unknown:
+        known = ", ".join(case.name for case in CASES)
+        raise SystemExit(f"no case {', '.join(sorted(unknown))}; cases: {known}; groups: {GROUPS}")
+    return [case for case in CASES if not wanted or wanted & {case.name, case.group}]
+
+
+def _crowd(people: int, shape: str = "mixed") -> dict[str, Any]:
+    return {"crowd": {"people": people, "shape": shape}}
+
+
+def _sensor(
+    beams: int, degrees: float, max_range: float, noise: float, scans: int
+) -> dict[str, Any]:
+    """A laser, on part of the route: many beams take as long as many scans."""
+    return {
+        "laser": {
+            "beams": beams,
+            "fov": math.radians(degrees),
+            "max_range": max_range,
+            "range_noise": noise,
+        },
+        "robot": {"scans": scans},
+    }
+
+
+def scaled_odometry(factor: float, **more: float) -> dict[str, Any]:
+    """Errors and noise of the wheels, times a factor."""
+    defaults = dataclasses.asdict(OdometryOptions())
+    scaled = {
+        name: factor * value
+        for name, value in defaults.items()
+        if name.endswith(("error", "noise"))
+    }
+    return {"odometry": {**scaled, **more}}
+
+
+_EVERYONE_STOPS = {"crowd": {"stopping_share": 1.0, "min_stop": 15.0, "max_stop": 60.0}}
+
+CASES = (
+    Case("hall-15", POPULATED, "hall"),
+    Case("hall-15-legs", POPULATED, "hall", _crowd(15, "legs")),
+    Case("hall-30-bodies", POPULATED, "hall", _crowd(30, "bodies")),
+    Case("hall-60", POPULATED, "hall-crowd"),
+    Case("hall-80", POPULATED, "hall-crowd", _crowd(80)),
+    Case("corridor-5", POPULATED, "corridor", _crowd(5, "legs")),
+    Case("corridor-20", POPULATED, "corridor"),
+    Case("corridor-40", POPULATED, "corridor-crowd"),
+    Case("office-10", POPULATED, "office"),
+    Case("office-25-bodies", POPULATED, "office", _crowd(25, "bodies")),
+    Case("warehouse-12", POPULATED, "warehouse"),
+    Case("warehouse-30-legs", POPULATED, "warehouse", _crowd(30, "legs")),
+    Case("street-16", POPULATED, "street"),
+    Case("hall-stops", STOPS, "hall", _EVERYONE_STOPS),
+    Case("corridor-stops", STOPS, "corridor", _EVERYONE_STOPS),
+    Case("office-stops", STOPS, "office", _EVERYONE_STOPS),
+    Case("hall-empty", EMPTY, "hall-empty"),
+    Case("corridor-empty", EMPTY, "corridor-empty"),
+    Case("office-empty", EMPTY, "office-empty"),
+    Case("warehouse-empty", EMPTY, "warehouse-empty"),
+    Case("street-empty", EMPTY, "street-empty"),
+    Case("street-turn-empty", EMPTY, "street-turn-empty"),
+    Case("hall-90deg", SENSORS, "hall", _sensor(181, 90, 30, 0.01, 1200)),
+    Case("corridor-270deg-1081", SENSORS, "corridor", _sensor(1081, 270, 30, 0.03, 500)),
+    Case("office-360deg-12m", SENSORS, "office", _sensor(360, 360, 12, 0.02, 900)),
+    Case("hall-360deg-1440-5cm", SENSORS, "hall", _sensor(1440, 360, 25, 0.05, 350)),
+    Case("corridor-270deg-5m", SENSORS, "corridor", _sensor(541, 270, 5, 0.01, 1000)),
+    Case("hall-361-80m-5cm", SENSORS, "hall", _sensor(361, 180, 80, 0.05, 800)),
+    Case("corridor-5cm", SENSORS, "corridor", _sensor(181, 180, 30, 0.05, 1200)),
+    Case("corridor-good-odometry", ODOMETRY, "corridor", scaled_odometry(0.3)),
+    Case("corridor-bad-odometry", ODOMETRY, "corridor", scaled_odometry(3.0)),
+    Case("hall-bad-odometry", ODOMETRY, "hall", scaled_odometry(3.0)),
+    Case("office-slips", ODOMETRY, "office", scaled_odometry(1.0, slip_rate=0.05)),
+    Case("warehouse-slips", ODOMETRY, "warehouse", scaled_odometry(1.0, slip_rate=0.05)),
+    Case("street-turn", ONCE, "street-turn"),
+)

@@ -1,0 +1,165 @@
+"""What benchmarks share: methods, one run's scores, command line, workers."""
+
+import argparse
+import multiprocessing
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from prepared import Prepared, grid_of
+from seeds import REPORTING, TUNING
+
+import stillmap
+from stillmap import em, options
+from stillmap.evaluation.labels import label_scores
+from stillmap.evaluation.map import map_scores
+from stillmap.evaluation.trajectory import absolute_errors, align
+
+METHODS: dict[str, dict[str, Any]] = {
+    "stillmap": {"estimator": "stillmap"},
+    "paper": {"estimator": "paper"},
+    # today's mappers: hits / (hits + passes) of the end cell against a threshold
+    "hit-ratio-0.1": {"estimator": "hit-ratio", "em": {"hit_ratio": 0.1}},
+    "hit-ratio-0.25": {"estimator": "hit-ratio", "em": {"hit_ratio": 0.25}},
+}
+
+Job = TypeVar("Job")
+Outcome = TypeVar("Outcome")
+Scores = dict[str, float]
+
+
+def add_arguments(p: argparse.ArgumentParser, methods: Iterable[str]) -> None:
+    """What to run and how, the same for all benchmarks of estimators."""
+    p.add_argument("--methods", nargs="+", choices=METHODS, default=list(methods))
+    p.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="on top of a method"
+    )
+    p.add_argument("--processes", type=int, default=2, help="runs at a time, one thread each")
+
+
+def add_seed_arguments(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--seeds", choices=["tuning", "reporting"], default="tuning")
+    p.add_argument("--n-seeds", type=int, default=len(TUNING), help="only the first so many")
+
+
+def seeds_of(args: argparse.Namespace) -> tuple[int, ...]:
+    return (REPORTING if args.seeds == "reporting" else TUNING)[: args.n_seeds]
+
+
+def options_of(method: str, settings: Iterable[str]) -> stillmap.Options:
+    """Options of a method with `section.key=value` laid over them, for one thread.
+
+    Raises:
+        InputError: an option that is not there or has another type.
+    """
+    changes = options.merged(METHODS[method], *(options.parse_assignment(s) for s in settings))
+    return options.replaced(stillmap.Options(), {"threads": 1, **changes})
+
+
+def built(
+    recording: stillmap.Recording,
+    chosen: stillmap.Options,
+    poses: NDArray[np.float64] | None = None,
+) -> tuple[stillmap.Result, float]:
+    """What a user gets, and the CPU time in ms per scan that it took."""
+    started = time.process_time()
+    result = stillmap.build(recording, chosen, poses=poses)
+    return result, 1e3 * (time.process_time() - started) / recording.n_scans
+
+
+def result_scores(result: stillmap.Result, cpu_ms: float, run: Prepared) -> Scores:
+    """Scores of what was kept, with what it cost and what the method itself says about it."""
+    kept = result.iterations[result.best_iteration - 1]
+    return {
+        **scores(result.p_static, result.poses, result.map, run),
+        "iterations": len(result.iterations),
+        "best": result.best_iteration,
+        "cpu": cpu_ms,
+        "bound": kept.bound / max(result.recording.n_beams, 1),
+        "held_out": _or_nan(kept.held_out_log_likelihood),
+    }
+
+
+def iteration_scores(iteration: stillmap.Iteration, run: Prepared) -> Scores:
+    """Scores of one iteration."""
+    return {
+        **scores(iteration.p_static, iteration.poses, iteration.occupancy, run),
+        "iteration": iteration.number,
+        "seconds": iteration.seconds,
+        "bound": iteration.likelihood.bound / max(len(iteration.p_static), 1),
+        "held_out": _or_nan(getattr(iteration, "held_out", None)),
+    }
+
+
+def scores(
+    p_static: NDArray[np.floating],
+    poses: NDArray[np.float64],
+    occupancy: em.OccupancyMap,
+    run: Prepared,
+) -> Scores:
+    """Labels against the truth, the map against the true walls, poses against the true ones."""
+    truth = run.simulation.truth
+    labels = label_scores(p_static, truth.static, run.simulation.recording.hit)
+    T_world_map, grid = align(poses, truth.T_world_base), grid_of(occupancy)
+    on_map = map_scores(grid, truth.walls, run.walls_without_people, T_world_map)
+    at_best = map_scores(grid, truth.walls, run.walls_at_best, T_world_map)
+    return {
+        "ap": labels.average_precision,
+        "f1": labels.f1,
+        "precision": labels.precision,
+        "recall": labels.recall,
+        "brier": labels.brier,
+        "ece": labels.ece,
+        "ece_unsure": labels.ece_unsure,
+        "log_loss": labels.log_loss,
+        "ghosts": on_map.ghosts_per_100_m2,
+        "walls": on_map.walls_kept,
+        "walls_at_best": at_best.walls_kept,
+        "ate": absolute_errors(poses, truth.T_world_base).rmse,
+        "called_dynamic": labels.share_called_dynamic,
+        "dynamic": labels.dynamic / max(labels.hits, 1),
+    }
+
+
+def outcomes(
+    work: Callable[[Job], Outcome], jobs: list[Job], processes: int
+) -> Iterator[tuple[Job, Outcome]]:
+    """Each job with what came of it, in the order in which they are done; progress on stderr."""
+    started = time.perf_counter()
+    with multiprocessing.Pool(processes) as pool:
+        waiting = pool.imap_unordered(_Numbered(work), list(enumerate(jobs)), chunksize=1)
+        for done, (index, outcome) in enumerate(waiting, start=1):
+            _tell(f"{done}/{len(jobs)}, {time.perf_counter() - started:.0f} s")
+            yield jobs[index], outcome
+    print(f"{len(jobs)} runs, {time.perf_counter() - started:.0f} s", file=sys.stderr)
+
+
+def _tell(progress: str) -> None:
+    if sys.stderr.isatty():
+        print(progress, end="\r", file=sys.stderr, flush=True)
+
+
+class _Numbered:
+    """Work on one of numbered jobs, as a worker gets it."""
+
+    def __init__(self, work: Callable[[Any], Any]) -> None:
+        self._work = work
+
+    def __call__(self, numbered: tuple[int, Any]) -> tuple[int, Any]:
+        index, job = numbered
+        try:
+            return index, self._work(job)
+        except Exception as error:
+            raise RuntimeError(f"{job}: {error}") from error
+
+
+def _or_nan(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def finite(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row as JSON can hold it: None for NaN."""
+    return {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in row.items()}

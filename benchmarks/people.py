@@ -1,0 +1,122 @@
+"""Recall of legs marked by hand in scans of a standing laser.
+
+python benchmarks/people.py DIR [--methods stillmap paper ...] [--set section.key=value ...]
+
+DIR holds people_N.npz: `ranges` (T, n) in metres, `label` (T, n) 1 = leg, `t` in seconds,
+`angle_min`, `angle_increment`, `range_max`. Only the walker inside a marked area is marked, so
+there is no fair precision: instead, the share of all beams that is called dynamic.
+"""
+
+import argparse
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from common import add_arguments, built, options_of, outcomes
+from numpy.typing import NDArray
+from tables import grouped, markdown
+
+from stillmap.recording.model import Recording
+from stillmap.recording.options import ReadOptions
+from stillmap.recording.ranges import apply, decide
+
+WANTED_RECALL = 0.95
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording, mapped with one method."""
+
+    path: Path
+    method: str
+    settings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a method made of a recording."""
+
+    scans: int
+    legs: int
+    recall: float
+    mean_p: float
+    called_dynamic: float
+    cpu_ms: float
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("folder", type=Path)
+    add_arguments(p, ["stillmap"])
+    args = p.parse_args()
+    files = sorted(args.folder.glob("people_*.npz"))
+    if not files:
+        raise SystemExit(f"{args.folder}: no people_*.npz")
+    jobs = [Job(*pair, tuple(args.set)) for pair in itertools.product(files, args.methods)]
+    done = sorted(outcomes(_found, jobs, args.processes), key=lambda pair: pair[0].path)
+    for method, some in grouped(done, lambda pair: pair[0].method).items():
+        print(f"\n## {method}\n\n{_table(some)}")
+
+
+def recording_of(path: Path) -> tuple[Recording, NDArray[np.bool_]]:
+    """The recording, and which of its beams (M,) are marked as leg."""
+    data = np.load(path)
+    ranges = data["ranges"].astype(np.float32)
+    T, n = ranges.shape
+    rule, _ = decide(ranges, float(data["range_max"]), ReadOptions())
+    length, hit = apply(ranges, rule)
+    angles = data["angle_min"] + data["angle_increment"] * np.arange(n)
+    points = length[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    recording = Recording(
+        stamp_ns=np.round(data["t"] * 1e9).astype(np.int64),
+        offset=np.arange(T + 1, dtype=np.int64) * n,
+        points=points.reshape(-1, 2).astype(np.float32),
+        hit=hit.ravel(),
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(T, np.int32),
+        T_odom_base=None,
+        source={"format": "people", "path": str(path)},
+    )
+    return recording, (data["label"] == 1).ravel()
+
+
+def _found(job: Job) -> Found:
+    recording, leg = recording_of(job.path)
+    stands = np.tile(np.eye(3), (recording.n_scans, 1, 1))
+    result, cpu_ms = built(recording, options_of(job.method, job.settings), stands)
+    p, leg = result.p_static[recording.hit], leg[recording.hit]
+    return Found(
+        scans=recording.n_scans,
+        legs=int(leg.sum()),
+        recall=float(np.mean(p[leg] < 0.5)),
+        mean_p=float(np.mean(p[leg])),
+        called_dynamic=float(np.mean(p < 0.5)),
+        cpu_ms=cpu_ms,
+    )
+
+
+def _table(some: list[tuple[Job, Found]]) -> str:
+    lines = [
+        [
+            job.path.stem,
+            str(f.scans),
+            str(f.legs),
+            f"{f.recall:.4f}",
+            f"{f.mean_p:.4f}",
+            f"{f.called_dynamic:.4f}",
+            f"{f.cpu_ms:.2f}",
+        ]
+        for job, f in some
+    ]
+    header = ["recording", "scans", "marked beams", "recall", "mean P(static) of them"]
+    table = markdown([*header, "called dynamic", "CPU ms per scan"], lines)
+    mean = float(np.mean([f.recall for _, f in some]))
+    verdict = "met" if mean >= WANTED_RECALL else "MISSED"
+    return f"{table}\n\nMean recall {mean:.4f}, wanted >= {WANTED_RECALL:g}: {verdict}."
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""A simulated run together with the walls that a map of it should show."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from cases import Case
+from numpy.typing import NDArray
+
+from stillmap import _core, em, se2
+from stillmap.evaluation.map import Grid, wall_cells_of_map
+from stillmap.recording.model import Recording
+from stillmap.simulation import Simulation, laser, simulate
+
+Float = NDArray[np.float64]
+
+RESOLUTION = 0.05  # m, of the maps that say which wall cells should be there
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A run and its references.
+
+    Attributes:
+        simulation: the run.
+        walls_without_people: (K, 2) wall cells that the same run shows without people and
+            vehicles: same poses, same doors.
+        walls_at_best: (L, 2) those that the run itself shows with true labels and true poses:
+            what somebody stood before all the time is in no one's reach.
+    """
+
+    simulation: Simulation
+    walls_without_people: Float
+    walls_at_best: Float
+
+
+def prepare(case: Case, seed: int) -> Prepared:
+    sim = simulate(case.build(), seed)
+    truth, recording = sim.truth, sim.recording
+    points, hit, static = without_people(sim, np.random.default_rng([seed, 1]))
+    return Prepared(
+        sim,
+        _wall_cells(sim, points, hit, static),
+        _wall_cells(sim, recording.points, recording.hit, truth.static),
+    )
+
+
+def without_people(
+    sim: Simulation, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+    """The same run, at the same poses, without people and vehicles: points (M, 2), hit, static."""
+    o, scene, truth = sim.scene.laser, sim.scene, sim.truth
+    angles = laser.beam_angles(o.beams, o.fov)
+    poses = se2.parameters(sim.recording.T_map_sensor(truth.T_world_base))
+    T = len(poses)
+    nobody = laser.Movers(
+        np.empty((T, 0, 2)), np.empty((T, 0)), np.empty((0, 2)), np.empty(0, np.int32)
+    )
+    exact = laser.cast(poses, angles, truth.walls, nobody, moving_doors(sim))
+    is_glass = np.zeros(len(truth.walls), bool)
+    is_glass[len(scene.walls) : len(scene.walls) + len(scene.glass)] = True
+    ranges, hit = laser.measure(exact, is_glass, o, rng)
+    points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    static = hit & (exact.mover < 0)
+    return points.reshape(-1, 2).astype(np.float32), hit.ravel(), static.ravel()
+
+
+def moving_doors(sim: Simulation) -> laser.Outlines:
+    """The leaves of the doors that moved, at each scan."""
+    movers, kinds = sim.truth.movers, sim.truth.scene["mover_kinds"]
+    doors = np.flatnonzero(np.array(kinds) == "door")
+    moved = np.any(np.ptp(movers[:, doors], axis=0) > 0, axis=1)
+    poses = movers[:, doors[moved]]
+    half = np.array([leaf.width / 2 for leaf in sim.scene.leaves])[moved, None]
+    ahead = half * np.stack([np.cos(poses[..., 2]), np.sin(poses[..., 2])], axis=-1)
+    faces = np.concatenate([poses[..., :2] - ahead, poses[..., :2] + ahead], axis=-1)
+    return laser.Outlines(faces, doors[moved].astype(np.int32))
+
+
+def grid_of(occupancy: em.OccupancyMap) -> Grid:
+    """As evaluation wants it."""
+    return Grid(occupancy.p_occupied, occupancy.origin, occupancy.resolution)
+
+
+def counts(
+    recording: Recording,
+    points: NDArray[np.float32],
+    hit: NDArray[np.bool_],
+    weights: NDArray[np.float32],
+    poses: Float,
+) -> _core.Grid2D:
+    """The sums of (10) of these beams, taken at the recording's scans."""
+    grid = _core.Grid2D(RESOLUTION)
+    _core.add_beams(grid, points, hit, weights, recording.offset, recording.T_map_sensor(poses), 1)
+    return grid
+
+
+def _wall_cells(
+    sim: Simulation,
+    points: NDArray[np.float32],
+    hit: NDArray[np.bool_],
+    static: NDArray[np.bool_],
+) -> Float:
+    truth = sim.truth
+    grid = counts(sim.recording, points, hit, static.astype(np.float32), truth.T_world_base)
+    return wall_cells_of_map(grid_of(em.occupancy_map(grid)), truth.walls, np.eye(3))
