@@ -118,6 +118,8 @@ def scores(
         "ghosts": on_map.ghosts_per_100_m2,
         "walls": on_map.walls_kept,
         "walls_at_best": at_best.walls_kept,
+        "ghosts_of_truth": run.of_truth.ghosts_per_100_m2,
+        "walls_of_truth": run.of_truth.walls_kept,
         "ate": absolute_errors(poses, truth.T_world_base).rmse,
         "called_dynamic": labels.share_called_dynamic,
         "dynamic": labels.dynamic / max(labels.hits, 1),

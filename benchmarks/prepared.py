@@ -7,7 +7,7 @@ from cases import Case
 from numpy.typing import NDArray
 
 from stillmap import _core, em, se2
-from stillmap.evaluation.map import Grid, wall_cells_of_map
+from stillmap.evaluation.map import Grid, MapScores, map_scores, wall_cells_of_map
 from stillmap.recording.model import Recording
 from stillmap.simulation import Simulation, laser, simulate
 
@@ -26,22 +26,23 @@ class Prepared:
             vehicles: same poses, same doors.
         walls_at_best: (L, 2) those that the run itself shows with true labels and true poses:
             what somebody stood before all the time is in no one's reach.
+        of_truth: scores of the map of (15) with true labels and true poses.
     """
 
     simulation: Simulation
     walls_without_people: Float
     walls_at_best: Float
+    of_truth: MapScores
 
 
 def prepare(case: Case, seed: int) -> Prepared:
     sim = simulate(case.build(), seed)
-    truth, recording = sim.truth, sim.recording
-    points, hit, static = without_people(sim, np.random.default_rng([seed, 1]))
-    return Prepared(
-        sim,
-        _wall_cells(sim, points, hit, static),
-        _wall_cells(sim, recording.points, recording.hit, truth.static),
-    )
+    walls, recording = sim.truth.walls, sim.recording
+    empty = _map_of(sim, *without_people(sim, np.random.default_rng([seed, 1])))
+    truth = _map_of(sim, recording.points, recording.hit, sim.truth.static)
+    without = wall_cells_of_map(empty, walls, np.eye(3))
+    at_best = wall_cells_of_map(truth, walls, np.eye(3))
+    return Prepared(sim, without, at_best, map_scores(truth, walls, without, np.eye(3)))
 
 
 def without_people(
@@ -94,12 +95,12 @@ def counts(
     return grid
 
 
-def _wall_cells(
+def _map_of(
     sim: Simulation,
     points: NDArray[np.float32],
     hit: NDArray[np.bool_],
     static: NDArray[np.bool_],
-) -> Float:
-    truth = sim.truth
-    grid = counts(sim.recording, points, hit, static.astype(np.float32), truth.T_world_base)
-    return wall_cells_of_map(grid_of(em.occupancy_map(grid)), truth.walls, np.eye(3))
+) -> Grid:
+    """The map of (15) at true poses."""
+    weights, poses = static.astype(np.float32), sim.truth.T_world_base
+    return grid_of(em.occupancy_map(counts(sim.recording, points, hit, weights, poses)))

@@ -47,8 +47,10 @@ LABELS = (
 )
 MAP = (
     Column("ghosts", "ghosts per 100 m2", ".2f"),
+    Column("ghosts_of_truth", "by true labels", ".2f"),
     Column("walls", "walls kept", ".4f", True),
     Column("walls_at_best", "of those in reach", ".4f", True),
+    Column("walls_of_truth", "by true labels", ".4f", True),
     Column("ate", "ATE m", ".3f"),
     Column("called_dynamic", "called dynamic", ".4f"),
 )

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+from calibration import looks_of
+from cases import Case
+from common import scores
+from prepared import Prepared, counts, prepare, without_people
+
+from stillmap import em
+from stillmap.recording.model import Recording
+
+
+@pytest.fixture(scope="module")
+def run() -> Prepared:
+    changes = {"robot": {"scans": 150}, "crowd": {"people": 25}}
+    return prepare(Case("office", "", "office", changes), 3)
+
+
+def test_true_labels_at_true_poses_score_full_marks(run: Prepared) -> None:
+    recording, truth = run.simulation.recording, run.simulation.truth
+    labels = truth.static.astype(np.float32)
+    grid = counts(recording, recording.points, recording.hit, labels, truth.T_world_base)
+    found = scores(labels, truth.T_world_base, em.occupancy_map(grid), run)
+    assert found["ap"] == found["f1"] == found["walls_at_best"] == 1.0
+    assert found["brier"] == found["ece"] == found["ghosts"] == 0.0
+    assert found["ate"] == pytest.approx(0.0, abs=1e-9)
+    assert 0.7 < found["walls"] < 1.0  # people hide some for as long as this takes
+    assert found["called_dynamic"] == found["dynamic"] > 0.01
+
+
+def test_without_people_only_what_they_hid_differs(run: Prepared) -> None:
+    sim = run.simulation
+    points, hit, static = without_people(sim, np.random.default_rng(0))
+    kinds = np.array([*sim.truth.scene["mover_kinds"], "none"])[sim.truth.mover]
+    both = hit & sim.recording.hit
+    off = np.hypot(*(points - sim.recording.points).T)
+    undisturbed = both & (kinds != "person")
+    noise = sim.scene.laser.range_noise
+    assert off[undisturbed].max() < 10 * noise
+    assert np.mean(off[both & (kinds == "person")] > 10 * noise) > 0.9
+    # doors are where they were
+    assert np.mean(static[undisturbed & (kinds == "door")]) < 0.01
+    assert np.mean(static[undisturbed & (kinds == "none")]) > 0.999
+
+
+def test_looks_count_seconds_in_which_a_cell_was_seen() -> None:
+    ends = [[2.02, 0.02], [2.02, 0.02], [3.02, 0.02], [1.02, 0.02]]
+    seconds = [0.0, 0.5, 7.2, 9.1]
+    recording = Recording(
+        stamp_ns=np.array([int(s * 1e9) for s in seconds]),
+        offset=np.arange(5),
+        points=np.array(ends, np.float32),
+        hit=np.ones(4, bool),
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(4, np.int32),
+        T_odom_base=None,
+    )
+    poses = np.tile(np.eye(3), (4, 1, 1))
+    poses[:, :2, 2] = 0.02
+    looks, span = looks_of(recording, poses)
+    # the cell 2 m off: hit in second 0, passed in second 7; that 1 m off: also hit in second 9
+    assert looks.tolist() == [2, 2, 1, 3]
+    assert span.tolist() == [7, 7, 0, 9]
