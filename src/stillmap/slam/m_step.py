@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from stillmap import _core, em
 from stillmap.recording.model import Recording
-from stillmap.slam import incremental
+from stillmap.slam import closing, incremental
 from stillmap.slam.incremental import Mapped, SlamOptions
 
 Float = NDArray[np.float64]
@@ -32,8 +32,12 @@ def m_step(
         progress: called with the number of scans done and their total.
     """
     if poses is None:
-        return incremental.build(recording, e, options, progress)
-    grid = _core.Grid2D(options.resolution)
+        memory = options.loops.memory if options.loops.enabled else np.inf
+        mapped = incremental.build(recording, e, options, progress, memory)
+        if not options.loops.enabled:
+            return mapped
+        return closing.closed(recording, e, options, mapped, threads)
+    grid = _core.Grid2D(options.resolution, options.registration.approach)
     em.add_recording(grid, recording, poses, e, threads)
     T = recording.n_scans
     progress(T, T)
