@@ -37,6 +37,8 @@ def spread(poses: Float, keyframes: Index, moved: Float) -> Float:
     A scan between two keyframes is carried along by both; how far it is from each, in travel and
     then in time, says how the two are blended.
     """
+    if len(keyframes) < 2:
+        return poses
     at = travel(poses) + 1e-6 * np.arange(len(poses))
     right = np.clip(np.searchsorted(keyframes, np.arange(len(poses))), 1, len(keyframes) - 1)
     left = right - 1

@@ -57,7 +57,9 @@ def optimised(
     options.setRelativeErrorTol(1e-7)
     found = gtsam.LevenbergMarquardtOptimizer(graph, start, options).optimize()
     at = [found.atPose2(k) for k in range(len(poses))]
-    return se2.matrix(*np.array([[p.x(), p.y(), p.theta()] for p in at]).T)
+    out = se2.matrix(*np.array([[p.x(), p.y(), p.theta()] for p in at]).T)
+    out[0] = poses[0]
+    return out
 
 
 def misfit(poses: Float, relation: Relation) -> float:
@@ -68,7 +70,7 @@ def misfit(poses: Float, relation: Relation) -> float:
 
 
 def _factor(relation: Relation, robust: float | None) -> Any:
-    noise = gtsam.noiseModel.Gaussian.Covariance(relation.covariance)
+    noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(relation.covariance)
     if robust is not None:
         loss = gtsam.noiseModel.mEstimator.Cauchy.Create(robust)
         noise = gtsam.noiseModel.Robust.Create(loss, noise)

@@ -146,7 +146,7 @@ def search(
         prior.T_map_base,
         prior.information,
         sigma=options.sigma,
-        radius=max(1, round(2.0 * options.sigma / grid.resolution)),
+        radius=radius(options, grid.resolution),
         floor=options.floor,
         unknown=options.unknown,
         gain=options.gain,
@@ -158,3 +158,8 @@ def search(
         T_start=start,
     )
     return Registration(T, covariance, explained)
+
+
+def radius(options: RegistrationOptions, resolution: float) -> int:
+    """Cells within which the field is summed up."""
+    return max(1, round(2.0 * options.sigma / resolution))

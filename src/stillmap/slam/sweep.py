@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core, se2
+from stillmap import se2
 from stillmap.recording.model import Recording
 from stillmap.slam import motion, registration
-from stillmap.slam.incremental import SlamOptions
+from stillmap.slam.incremental import Mapped, SlamOptions
 from stillmap.slam.motion import MotionPrior
 from stillmap.slam.scans import hits, put
 
@@ -14,22 +14,19 @@ Float = NDArray[np.float64]
 
 
 def sweep(
-    recording: Recording,
-    e: NDArray[np.float32],
-    options: SlamOptions,
-    grid: _core.Grid2D,
-    poses: Float,
-) -> tuple[Float, Float, Float]:
-    """Poses (T, 3, 3), covariances (T, 3, 3) and explained shares (T,) after a pass.
+    recording: Recording, e: NDArray[np.float32], options: SlamOptions, mapped: Mapped
+) -> Mapped:
+    """Poses, covariances and explained shares after a pass; the first pose stays.
+
+    The grid is changed in place. In the end it is what the new poses and e make, to the bit.
 
     Args:
         recording: 2D.
         e: (M,) probability that each beam was reflected by something static.
         options: see SlamOptions.
-        grid: what `poses` and e make; in the end what the new poses make, to the bit.
-        poses: (T, 3, 3) T_map_base to begin at; the first one stays.
+        mapped: where to begin; its grid is what its poses and e make.
     """
-    poses = poses.copy()
+    grid, poses = mapped.grid, mapped.poses.copy()
     T = len(poses)
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
     increments = _increments(recording, poses)
@@ -48,7 +45,7 @@ def sweep(
         poses[t] = se2.matrix(*se2.parameters(found.T_map_base))
         covariance[t], explained[t] = found.covariance, found.explained
         put(grid, recording, e, t, poses[t])
-    return poses, covariance, explained
+    return Mapped(poses, covariance, grid, explained, mapped.widened, mapped.loops)
 
 
 def _increments(recording: Recording, poses: Float) -> Float:
