@@ -77,7 +77,7 @@ _LIMITS = (
     ("agreeing", 0, 100),
     ("robust", 0.01, 100.0),
     ("misfit", 0.0, 1e9),
-    ("sweeps", 0, 100),
+    ("sweeps", 1, 100),
 )
 
 
