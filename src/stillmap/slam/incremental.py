@@ -38,9 +38,11 @@ class Mapped:
 
     Attributes:
         poses: (T, 3, 3) T_map_base; the map frame is the first scan's base.
-        covariance: (T, 3, 3) of each pose against the map so far: x, y, heading.
+        covariance: (T, 3, 3) of each pose against the map so far, or with loops closed against
+            the map of all others: x, y, heading.
         grid: the sums alpha, beta of (10) of all scans.
-        explained: (T,) share of each scan's beams that the map so far explained.
+        explained: (T,) share of each scan's beams that the map so far explained; the map of all
+            others where poses were swept only.
         widened: indices of the scans that a wider search had to find.
         loops: attempts at closing loops, accepted or refused.
     """

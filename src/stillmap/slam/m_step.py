@@ -10,7 +10,6 @@ from stillmap import _core, em
 from stillmap.recording.model import Recording
 from stillmap.slam import closing, incremental
 from stillmap.slam.incremental import Mapped, SlamOptions
-from stillmap.slam.loops import Closure
 from stillmap.slam.sweep import sweep
 
 Float = NDArray[np.float64]
@@ -43,16 +42,27 @@ def m_step(
         return mapped
     if not options.loops.enabled:
         return incremental.build(recording, e, options, progress)
-    widened, found = list[int](), list[Closure]()
-    if start is None:
-        local = incremental.build(recording, e, options, progress, options.loops.memory)
-        start, found = closing.closed(recording, e, options, local)
-        widened = local.widened
-    mapped = _mapped_at(recording, e, options, start, threads)
+    if start is not None:
+        mapped = _swept(recording, e, options, start, threads)
+        progress(recording.n_scans, recording.n_scans)
+        return mapped
+    local = incremental.build(recording, e, options, progress, options.loops.memory)
+    poses, found = closing.closed(recording, e, options, local)
+    mapped = _swept(recording, e, options, poses, threads)
+    # a scan that went astray explains itself in the map of all: the map so far tells
+    return dataclasses.replace(
+        mapped, explained=local.explained, widened=local.widened, loops=found
+    )
+
+
+def _swept(
+    recording: Recording, e: NDArray[np.float32], options: SlamOptions, poses: Float, threads: int
+) -> Mapped:
+    """Poses (T, 3, 3) whose loops are closed, registered once more against all others."""
+    mapped = _mapped_at(recording, e, options, poses, threads)
     for _ in range(options.loops.sweeps):
         mapped = sweep(recording, e, options, mapped)
-    progress(recording.n_scans, recording.n_scans)
-    return dataclasses.replace(mapped, widened=widened, loops=found)
+    return mapped
 
 
 def _mapped_at(
