@@ -36,7 +36,7 @@ class LoopOptions:
     gap: float = field_with_doc(15.0, "m of travel after which a place counts as seen again")
     reach: float = field_with_doc(6.0, "m, how near a keyframe must come to an earlier one")
     stretch: float = field_with_doc(8.0, "m of travel to either side that make a local map")
-    view: float = field_with_doc(1.0, "m of travel to either side whose scans are laid on it")
+    view: float = field_with_doc(1.0, "m of travel to a scan on either side laid on it too")
     drift_translation: float = field_with_doc(0.006, "m of drift per metre: how far to search")
     drift_rotation: float = field_with_doc(0.0003, "rad of drift per metre: how far to search")
     window: float = field_with_doc(2.0, "standard deviations of the drift that are searched")
@@ -171,11 +171,11 @@ def _local_map(track: Track, centre: float) -> _core.Grid2D:
 
 
 def _view(track: Track, t: int) -> tuple[Points, NDArray[np.float32]]:
-    """End points of a keyframe and of a few scans around it, in its frame, with their e."""
+    """End points of a keyframe and of a scan to either side, in its frame, with their e."""
     here, half = track.travelled[t], track.options.view
     first, last = np.searchsorted(track.travelled, [here - half, here + half], side="right")
     last = max(last - 1, t)
-    shown = sorted({t, min(first, t), (min(first, t) + t) // 2, (t + last) // 2, last})
+    shown = sorted({min(first, t), t, last})
     seen = [hits(track.recording, track.e, s) for s in shown]
     to_t = se2.inverse(track.poses[t]) @ track.poses[shown]
     points = [in_frame(p, T) for (p, _), T in zip(seen, to_t, strict=True)]
@@ -193,15 +193,18 @@ def _laid_on(track: Track, grid: _core.Grid2D, earlier: int, later: int) -> Clos
     found = registration.search(grid, *view, prior, track.registration, *window)
     least = [options.sigma_translation] * 2 + [options.sigma_rotation]
     covariance = found.covariance + np.diag(np.square(least))
-    covariance += _sliding(grid, *view, found.T_map_base, covariance, sigma, track.registration)
-    too_little = max(options.accept_above, options.compared * track.explained[later])
+    too_little = found.explained < max(
+        options.accept_above, options.compared * track.explained[later]
+    )
+    if not too_little:
+        covariance += _sliding(grid, *view, found.T_map_base, covariance, sigma, track.registration)
     return Closure(
         earlier,
         later,
         se2.inverse(track.poses[earlier]) @ found.T_map_base,
         se2.turned(covariance, se2.inverse(found.T_map_base)),
         found.explained,
-        "" if found.explained >= too_little else "explains too little",
+        "explains too little" if too_little else "",
     )
 
 
