@@ -7,11 +7,11 @@ namespace {
 
 template <int D>
 void add(Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit, const Flat<float>& e,
-         const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
+         const Flat<int64_t>& offset, const Poses<D>& poses, int threads, bool remove) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   const float* weights = per_beam(e, points.shape(0), "e");
   nb::gil_scoped_release released;
-  add_beams<D>(grid, scans, weights, threads);
+  add_beams<D>(grid, scans, weights, remove ? -1 : 1, threads);
 }
 
 template <int D>
@@ -50,8 +50,10 @@ template <int D>
 void bind(nb::module_& m) {
   m.def("add_beams", &add<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
-        nb::arg("T_map_sensor").noconvert(), nb::arg("threads") = 1,
-        "Adds the sums alpha, beta of (10) of all beams to the grid; e (M,) float32.");
+        nb::arg("T_map_sensor").noconvert(), nb::arg("threads") = 1, nb::kw_only(),
+        nb::arg("remove") = false,
+        "Adds the sums alpha, beta of (10) of all beams to the grid; e (M,) float32. With remove "
+        "it subtracts what was added before, to the bit.");
   m.def("e_step", &expectations<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::arg("prior"), nb::arg("threads") = 1,

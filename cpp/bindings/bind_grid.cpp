@@ -87,8 +87,11 @@ template <int D>
 void bind(nb::module_& m, const char* name) {
   using G = Grid<D>;
   nb::class_<G>(m, name, "Block-sparse counts alpha, beta of (10); cell = floor(x / resolution).")
-      .def(nb::init<double>(), nb::arg("resolution"))
+      .def(nb::init<double, double>(), nb::arg("resolution"), nb::arg("approach") = 0.0,
+           "approach: metres before its end in which a beam says nothing against the cells it "
+           "crosses when scans are registered; alpha, beta do not depend on it.")
       .def_prop_ro("resolution", &G::resolution, "metres")
+      .def_prop_ro("approach", &G::approach, "metres")
       .def_prop_ro("dimension", [](const G&) { return D; })
       .def_prop_ro("memory_bytes", &G::memory_bytes)
       .def("merge", &G::merge, nb::arg("other"), "Adds the sums of another grid.")

@@ -1,3 +1,4 @@
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
 #include "arrays.hpp"
@@ -50,7 +51,7 @@ auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<flo
                     const OnePose<D>& T_prior, const Square<D>& information, double sigma,
                     int radius, double floor, double unknown, double gain, int max_iterations,
                     double window_translation, double window_rotation, double search_range,
-                    int starts) {
+                    int starts, const std::optional<OnePose<D>>& T_start) {
   require(starts >= 1, "starts: expected at least one");
   const RegisterOptions options{{sigma, radius, floor, unknown}, gain, max_iterations};
   require(gain > 0.0, "gain: expected a positive number");
@@ -61,6 +62,8 @@ auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<flo
   for (int r = 0; r < Lie<D>::kDof; ++r)
     for (int c = 0; c < Lie<D>::kDof; ++c) prior.information(r, c) = information(r, c);
   require(prior.information.allFinite(), "information: not finite");
+  std::optional<Pose<D>> given;
+  if (T_start) given = checked_pose<D>(*T_start, "T_start");
   Registration<D> best;
   best.cost = std::numeric_limits<double>::infinity();
   size_t candidates = 0;
@@ -69,7 +72,9 @@ auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<flo
     Field<D> field(grid, options.field);
     const SearchWindow window{window_translation, window_rotation, search_range};
     CorrelativeSearch<D> search(grid, beams, prior, window, options);
-    for (const auto& start : search.best(static_cast<size_t>(starts))) {
+    const auto candidates_found =
+        given ? std::vector<Candidate<D>>{{*given, 0.0}} : search.best(static_cast<size_t>(starts));
+    for (const auto& start : candidates_found) {
       const auto found = climb<D>(field, beams, prior, start.pose, options);
       if (found.cost < best.cost) best = found;
     }
@@ -119,11 +124,12 @@ void bind(nb::module_& m) {
       nb::arg("information").noconvert(), nb::kw_only(), nb::arg("sigma"), nb::arg("radius"),
       nb::arg("floor"), nb::arg("unknown"), nb::arg("gain"), nb::arg("max_iterations"),
       nb::arg("window_translation"), nb::arg("window_rotation"), nb::arg("search_range"),
-      nb::arg("starts"),
+      nb::arg("starts"), nb::arg("T_start") = nb::none(),
       "(9): the pose of one scan against the grid so far. points (N, D) float32 that were hit, in "
       "the moving frame; weights (N,) float32 = e; T_prior (D+1, D+1) and its information "
       "(dof, dof) of (translation, rotation about the moving frame's origin). Returns pose, "
-      "covariance, cost, the share of beams the map explains, Newton steps, lattice poses.");
+      "covariance, cost, the share of beams the map explains, Newton steps, lattice poses. With "
+      "T_start nothing is searched: Newton steps begin there.");
   m.def("registration_cost", &cost_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
         nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),

@@ -37,3 +37,10 @@ def inverse(T: Float) -> Float:
 def wrap(angle: ArrayLike) -> Float:
     """Angles mapped to [-pi, pi]; which end pi itself goes to is left to rounding."""
     return (np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi
+
+
+def turned(covariance: Float, T: Float) -> Float:
+    """A covariance (3, 3) of x, y, heading along the axes that a pose (3, 3) turns it into."""
+    R = np.eye(3)
+    R[:2, :2] = T[:2, :2]
+    return R @ covariance @ R.T

@@ -63,35 +63,72 @@ inline void for_each_beam(const Scans<D>& scans, size_t first, size_t last, Work
   }
 }
 
-// alpha_j and beta_j of (10) for the scans [first, last).
+// Adds the lengths on the approach to an end point, without the end cell, as beta_j has them.
 template <int D>
-inline void add_scans(Grid<D>& grid, const Scans<D>& scans, const float* e, size_t first,
-                      size_t last) {
+class Approach {
+ public:
+  Approach(Grid<D>& grid, Fixed sign)
+      : cursor_(grid), cells_(grid.approach() / grid.resolution()), sign_(sign) {}
+
+  void add(const Segment<D>& beam) {
+    if (cells_ <= 0.0) return;
+    const Vec<D> back = beam.start - beam.end;
+    const double length = back.norm();
+    const Vec<D> start = length > cells_ ? beam.end + back * (cells_ / length) : beam.start;
+    traverse<D>(start, beam.end, *this);
+  }
+
+  void start(const Cell<D>& first) { cell_ = first; }
+  void visit(double length) {
+    auto& moments = Grid<D>::moments_of(*cursor_.block(cell_));
+    moments[static_cast<size_t>(Grid<D>::local_of(cell_))][D] += sign_ * to_fixed(length);
+  }
+  template <int Axis>
+  void step(int32_t direction) {
+    cell_[Axis] += direction;
+  }
+
+ private:
+  Cursor<Grid<D>> cursor_;
+  double cells_;
+  Fixed sign_;
+  Cell<D> cell_ = Cell<D>::Zero();
+};
+
+// alpha_j and beta_j of (10) for the scans [first, last). Sums are integers: with sign -1 scans
+// that were added before are taken out again without a trace.
+template <int D>
+inline void add_scans(Grid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign,
+                      size_t first, size_t last) {
   Cursor<Grid<D>> cursor(grid);
   // second sum of beta_j: the length by which the beam covers j, whatever e is
-  Walker walker(cursor, [](Counts* j, double length) { j->beta += to_fixed(length); });
+  Walker walker(cursor, [=](Counts* j, double length) { j->beta += sign * to_fixed(length); });
+  Approach<D> approach(grid, sign);
   for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
     const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
     traverse<D>(beam.start, beam.end, walker);
     if (!scans.hit[n]) return;  // (1 - zeta) = 0: the end cell of a maximum-range beam says nothing
+    approach.add(beam);
     const Cell<D>& end = walker.cell();
     const double static_share = probability(e[n]);
-    walker.counts()->alpha += to_fixed(static_share);       // alpha_j
-    walker.counts()->beta += to_fixed(1.0 - static_share);  // first sum of beta_j
+    walker.counts()->alpha += sign * to_fixed(static_share);       // alpha_j
+    walker.counts()->beta += sign * to_fixed(1.0 - static_share);  // first sum of beta_j
     auto& moment =
         Grid<D>::moments_of(*walker.block())[static_cast<size_t>(Grid<D>::local_of(end))];
     for (int d = 0; d < D; ++d)
-      moment[static_cast<size_t>(d)] += to_fixed(static_share * (beam.end[d] - end[d]));
+      moment[static_cast<size_t>(d)] += sign * to_fixed(static_share * (beam.end[d] - end[d]));
   });
 }
 
 template <int D>
-inline void add_beams(Grid<D>& grid, const Scans<D>& scans, const float* e, int threads) {
+inline void add_beams(Grid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign,
+                      int threads) {
   const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
   std::vector<Grid<D>> others;
-  for (size_t i = 2; i < bounds.size(); ++i) others.emplace_back(grid.resolution());
+  for (size_t i = 2; i < bounds.size(); ++i)
+    others.emplace_back(grid.resolution(), grid.approach());
   parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
-    add_scans<D>(i == 0 ? grid : others[i - 1], scans, e, first, last);
+    add_scans<D>(i == 0 ? grid : others[i - 1], scans, e, sign, first, last);
   });
   for (const auto& other : others) grid.merge(other);
 }

@@ -33,7 +33,7 @@ template <int D>
 struct Neighbourhood {
   struct Gaussian {
     Vec<D> mean;    // in cells
-    double weight;  // occupancy m_k
+    double weight;  // occupancy m_k, as Grid::presence has it
   };
   Cell<D> centre = Cell<D>::Zero();
   bool valid = false;
@@ -121,7 +121,7 @@ class Field {
     for (int d = 0; d < D; ++d)
       mean[d] = cell[d] + static_cast<double>((*block->moments)[local][static_cast<size_t>(d)]) /
                               static_cast<double>(counts.alpha);
-    gaussians.push_back({mean, occupancy(counts)});
+    gaussians.push_back({mean, Grid<D>::presence(*block, local)});
   }
 
   Cursor<const Grid<D>> cursor_;

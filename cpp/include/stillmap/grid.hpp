@@ -1,8 +1,10 @@
-// Block-sparse counts alpha, beta of (10) and the first moments of the end points.
+// Block-sparse counts alpha, beta of (10), and what registration wants to know besides: the first
+// moments of the end points, and what beams crossed just before they ended.
 // Sums are integers (fixed point), so they do not depend on the order of the terms: scans, chunks,
 // threads and whole grids merge to the same bits.
 #pragma once
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdint>
@@ -41,17 +43,24 @@ class Grid {
   static constexpr int kCells = D == 2 ? kEdge * kEdge : kEdge * kEdge * kEdge;
   // coordinates beyond are refused; block coordinates fit the 21 bits that a key has for each
   static constexpr int32_t kMaxCell = D == 2 ? 1 << 24 : 1 << 23;
-  using Moment = std::array<Fixed, D>;  // sum of e * (end point - cell corner), in cells
+  // sum of e * (end point - cell corner), in cells; last, the length by which beams covered the
+  // cell on the approach to their end points
+  using Moment = std::array<Fixed, D + 1>;
 
   struct Block {
     Cell<D> origin;  // block coordinates
     std::array<Counts, kCells> counts{};
-    std::unique_ptr<std::array<Moment, kCells>> moments;  // only where something was hit
+    std::unique_ptr<std::array<Moment, kCells>> moments;  // only where something was hit, or nearly
   };
 
-  explicit Grid(double resolution) : resolution_(resolution) {
+  // approach: metres before an end point in which a beam says nothing against what it crosses
+  // when scans are registered; (10) counts them all the same
+  explicit Grid(double resolution, double approach = 0.0)
+      : resolution_(resolution), approach_(approach) {
     if (!(resolution > 0.0) || !std::isfinite(resolution))
       throw std::invalid_argument("resolution: expected a positive length in metres");
+    if (!(approach >= 0.0) || !std::isfinite(approach))
+      throw std::invalid_argument("approach: expected a length in metres that is not negative");
   }
 
   Grid(Grid&&) noexcept = default;
@@ -60,6 +69,7 @@ class Grid {
   Grid& operator=(const Grid&) = delete;
 
   double resolution() const { return resolution_; }
+  double approach() const { return approach_; }
   const std::vector<std::unique_ptr<Block>>& blocks() const { return blocks_; }
 
   const Block* find(const Cell<D>& block) const {
@@ -98,8 +108,8 @@ class Grid {
   }
 
   void merge(const Grid& other) {
-    if (other.resolution_ != resolution_)
-      throw std::invalid_argument("merge: the grids differ in resolution");
+    if (other.resolution_ != resolution_ || other.approach_ != approach_)
+      throw std::invalid_argument("merge: the grids differ in resolution or approach");
     for (const auto& theirs : other.blocks_) {
       Block* mine = find_or_add(theirs->origin);
       for (size_t i = 0; i < kCells; ++i) {
@@ -109,8 +119,17 @@ class Grid {
       if (!theirs->moments) continue;
       auto& moments = moments_of(*mine);
       for (size_t i = 0; i < kCells; ++i)
-        for (size_t d = 0; d < D; ++d) moments[i][d] += (*theirs->moments)[i][d];
+        for (size_t d = 0; d <= D; ++d) moments[i][d] += (*theirs->moments)[i][d];
     }
+  }
+
+  // m_j of (15) without the lengths on the approach: beams that graze a wall cross its cells before
+  // they end on it, and that says nothing against the wall. The block must have moments.
+  static double presence(const Block& block, size_t local) {
+    const Counts& c = block.counts[local];
+    // the walk along the approach may differ from the whole walk by a rounding
+    const Fixed passed = std::max<Fixed>(c.beta - (*block.moments)[local][D], 0);
+    return static_cast<double>(c.alpha) / static_cast<double>(c.alpha + passed);
   }
 
   static std::array<Moment, kCells>& moments_of(Block& block) {
@@ -141,6 +160,7 @@ class Grid {
 
  private:
   double resolution_;
+  double approach_;
   std::vector<std::unique_ptr<Block>> blocks_;
   std::unordered_map<uint64_t, size_t, Hash> index_;
 };

@@ -70,7 +70,7 @@ class Raster {
       const Block* block = grid.find(b);
       if (!block || !block->moments) return;
       for (int i = 0; i < Grid<D>::kCells; i += Grid<D>::kEdge)
-        visit(block->counts.data() + i, Grid<D>::cell_at(block->origin, i));
+        visit(*block, static_cast<size_t>(i), Grid<D>::cell_at(block->origin, i));
     });
   }
 
@@ -84,10 +84,11 @@ class Raster {
         const double d = k + 0.5 - (place + 0.5) / (1 << shift_);
         table.push_back(static_cast<float>(std::exp(-0.5 * d * d / (sigma * sigma))));
       }
-    for_each_row(grid, reach, [&](const Counts* counts, const Cell<D>& row) {
+    for_each_row(grid, reach, [&](const Block& block, size_t first, const Cell<D>& row) {
       Cell<D> cell = row;
-      for (int x = 0; x < Grid<D>::kEdge; ++x, ++cell[0])
-        if (counts[x].alpha > 0) splat(cell, occupancy(counts[x]), table, reach, edge);
+      for (size_t x = 0; x < Grid<D>::kEdge; ++x, ++cell[0])
+        if (block.counts[first + x].alpha > 0)
+          splat(cell, Grid<D>::presence(block, first + x), table, reach, edge);
     });
   }
 

@@ -10,8 +10,10 @@ from stillmap import _core, se2
 from stillmap.options import field_with_doc
 from stillmap.recording.model import Recording
 from stillmap.slam import motion
+from stillmap.slam.loops import Closure, LoopOptions
 from stillmap.slam.motion import MotionOptions
 from stillmap.slam.registration import RegistrationOptions, register
+from stillmap.slam.scans import hits, put
 
 Float = NDArray[np.float64]
 
@@ -23,6 +25,7 @@ class SlamOptions:
     resolution: float = field_with_doc(0.05, "m, edge of a map cell")
     motion: MotionOptions = field(default=MotionOptions())
     registration: RegistrationOptions = field(default=RegistrationOptions())
+    loops: LoopOptions = field(default=LoopOptions())
 
     def __post_init__(self) -> None:
         if not 0.005 <= self.resolution <= 10.0:
@@ -35,10 +38,13 @@ class Mapped:
 
     Attributes:
         poses: (T, 3, 3) T_map_base; the map frame is the first scan's base.
-        covariance: (T, 3, 3) of each pose against the map so far: x, y, heading.
+        covariance: (T, 3, 3) of each pose against the map so far, or with loops closed against
+            the map of all others: x, y, heading.
         grid: the sums alpha, beta of (10) of all scans.
-        explained: (T,) share of each scan's beams that the map so far explained.
+        explained: (T,) share of each scan's beams that the map so far explained; the map of all
+            others where poses were swept only.
         widened: indices of the scans that a wider search had to find.
+        loops: attempts at closing loops, accepted or refused.
     """
 
     poses: Float
@@ -46,6 +52,7 @@ class Mapped:
     grid: _core.Grid2D
     explained: Float
     widened: list[int]
+    loops: list[Closure] = field(default_factory=list)
 
 
 def build(
@@ -53,6 +60,7 @@ def build(
     e: NDArray[np.float32],
     options: SlamOptions,
     progress: Callable[[int, int], None],
+    memory: float = np.inf,
 ) -> Mapped:
     """Incremental maximum likelihood: register each scan (9), then add it to the map (10).
 
@@ -61,34 +69,32 @@ def build(
         e: (M,) probability that each beam was reflected by something static.
         options: see SlamOptions.
         progress: called with the number of scans done and their total.
+        memory: metres of travel after which a scan is taken out of the map again.
     """
     T = recording.n_scans
-    grid = _core.Grid2D(options.resolution)
+    grid = _core.Grid2D(options.resolution, options.registration.approach)
     poses = np.tile(np.eye(3), (T, 1, 1))
     covariance = np.zeros((T, 3, 3))
     explained = np.ones(T)
     widened = []
+    travelled = np.zeros(T)
+    oldest = 0
     for t in range(T):
-        beams = recording.beams_of(t)
-        points, hit, e_t = recording.points[beams], recording.hit[beams], e[beams]
-        T_base_sensor = recording.T_base_sensor[recording.sensor[t]]
         if t > 0:
             prior = _motion_prior(recording, poses, t, options.motion)
-            in_base = in_frame(points[hit], T_base_sensor)
-            found = register(grid, in_base, e_t[hit], prior, options.registration)
+            found = register(grid, *hits(recording, e, t), prior, options.registration)
             poses[t], covariance[t] = found.T_map_base, found.covariance
             explained[t] = found.explained
             if found.widened:
                 widened.append(t)
-        T_map_sensor = poses[t] @ T_base_sensor
-        _core.add_beams(grid, points, hit, e_t, np.array([0, len(hit)]), T_map_sensor[None])
+        put(grid, recording, e, t, poses[t])
+        if t > 0:
+            travelled[t] = travelled[t - 1] + np.linalg.norm(poses[t, :2, 2] - poses[t - 1, :2, 2])
+        while travelled[oldest] < travelled[t] - memory:
+            put(grid, recording, e, oldest, poses[oldest], remove=True)
+            oldest += 1
         progress(t + 1, T)
     return Mapped(poses, covariance, grid, explained, widened)
-
-
-def in_frame(points: NDArray[np.float32], T: Float) -> NDArray[np.float32]:
-    """Points (N, D) float32 carried over by a transform (D+1, D+1)."""
-    return np.ascontiguousarray(points @ T[:-1, :-1].T + T[:-1, -1], dtype=np.float32)
 
 
 def _motion_prior(

@@ -1,5 +1,6 @@
-"""The M-step over poses and map. Loop closure will stand between its two lines of work."""
+"""The M-step over poses and map: incremental registration, loop closure, one more pass."""
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -7,8 +8,9 @@ from numpy.typing import NDArray
 
 from stillmap import _core, em
 from stillmap.recording.model import Recording
-from stillmap.slam import incremental
+from stillmap.slam import closing, incremental
 from stillmap.slam.incremental import Mapped, SlamOptions
+from stillmap.slam.sweep import sweep
 
 Float = NDArray[np.float64]
 
@@ -20,6 +22,8 @@ def m_step(
     poses: Float | None,
     threads: int,
     progress: Callable[[int, int], None],
+    *,
+    start: Float | None = None,
 ) -> Mapped:
     """The most likely poses and map given e: (9), (10)-(15).
 
@@ -28,13 +32,44 @@ def m_step(
         e: (M,) probability that each beam was reflected by something static.
         options: see SlamOptions.
         poses: (T, 3, 3) T_map_base when they are known: then only the map is made.
-        threads: for the map of known poses.
+        threads: for maps of poses that are known already; the result does not depend on it.
         progress: called with the number of scans done and their total.
+        start: (T, 3, 3) poses whose loops are closed already: they are only swept again.
     """
-    if poses is None:
+    if poses is not None:
+        mapped = _mapped_at(recording, e, options, poses, threads)
+        progress(recording.n_scans, recording.n_scans)
+        return mapped
+    if not options.loops.enabled:
         return incremental.build(recording, e, options, progress)
-    grid = _core.Grid2D(options.resolution)
+    if start is not None:
+        mapped = _swept(recording, e, options, start, threads)
+        progress(recording.n_scans, recording.n_scans)
+        return mapped
+    local = incremental.build(recording, e, options, progress, options.loops.memory)
+    poses, found = closing.closed(recording, e, options, local)
+    mapped = _swept(recording, e, options, poses, threads)
+    # a scan that went astray explains itself in the map of all: the map so far tells
+    return dataclasses.replace(
+        mapped, explained=local.explained, widened=local.widened, loops=found
+    )
+
+
+def _swept(
+    recording: Recording, e: NDArray[np.float32], options: SlamOptions, poses: Float, threads: int
+) -> Mapped:
+    """Poses (T, 3, 3) whose loops are closed, registered once more against all others."""
+    mapped = _mapped_at(recording, e, options, poses, threads)
+    for _ in range(options.loops.sweeps):
+        mapped = sweep(recording, e, options, mapped)
+    return mapped
+
+
+def _mapped_at(
+    recording: Recording, e: NDArray[np.float32], options: SlamOptions, poses: Float, threads: int
+) -> Mapped:
+    """The map of known poses (T, 3, 3)."""
+    grid = _core.Grid2D(options.resolution, options.registration.approach)
     em.add_recording(grid, recording, poses, e, threads)
     T = recording.n_scans
-    progress(T, T)
     return Mapped(poses, np.zeros((T, 3, 3)), grid, np.full(T, np.nan), [])

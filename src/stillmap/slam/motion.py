@@ -84,6 +84,30 @@ def from_constant_velocity(
     )
 
 
+def from_increment(
+    T_map_base: Float, increment: Float, options: MotionOptions, is_odometry: bool
+) -> MotionPrior:
+    """The prior one known or guessed increment (3, 3) from a pose (3, 3)."""
+    if is_odometry:
+        return from_odometry(T_map_base, increment, options)
+    return _prior(
+        T_map_base @ increment,
+        options.without_odometry_translation,
+        options.without_odometry_rotation,
+    )
+
+
+def combined(a: MotionPrior, b: MotionPrior) -> MotionPrior:
+    """The product of two Gaussians on one pose."""
+    information = a.information + b.information
+    difference = se2.parameters(b.T_map_base) - se2.parameters(a.T_map_base)
+    difference[2] = se2.wrap(difference[2])
+    shift = np.linalg.solve(information, b.information @ difference)
+    sigma = np.sqrt(1.0 / np.diag(information))
+    mean = se2.matrix(*(se2.parameters(a.T_map_base) + shift))
+    return MotionPrior(mean, information, float(sigma[:2].max()), float(sigma[2]))
+
+
 def widened(prior: MotionPrior, sigma_translation: float, sigma_rotation: float) -> MotionPrior:
     """The same mean, trusted less: standard deviations of at least these."""
     return _prior(

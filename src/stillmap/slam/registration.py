@@ -21,6 +21,9 @@ class RegistrationOptions:
     sigma: float = field_with_doc(0.06, "m, width of the smoothed field around end points")
     floor: float = field_with_doc(0.05, "field value of an end point the map cannot explain")
     unknown: float = field_with_doc(0.05, "what unknown space adds to it: unknown is not free")
+    approach: float = field_with_doc(
+        0.5, "m before its end in which a beam says nothing against what it crosses"
+    )
     gain: float = field_with_doc(0.2, "weight of one beam against the motion prior")
     max_iterations: int = field_with_doc(20, "Newton steps at most")
     window: float = field_with_doc(3.0, "standard deviations of the prior that are searched")
@@ -48,6 +51,7 @@ _LIMITS = (
     ("sigma", 0.005, 1.0),
     ("floor", 1e-6, 10.0),
     ("unknown", 0.0, 10.0),
+    ("approach", 0.0, 100.0),
     ("gain", 1e-6, 1e3),
     ("max_iterations", 1, 1000),
     ("window", 0.0, 10.0),
@@ -96,14 +100,14 @@ def register(
     """
     translation = options.window * prior.sigma_translation
     rotation = options.window * prior.sigma_rotation
-    found = _search(grid, points, weights, prior, options, translation, rotation)
+    found = search(grid, points, weights, prior, options, translation, rotation)
     if found.explained >= options.doubt_below or len(points) == 0:
         return found
     for least_translation, least_rotation in (
         (options.doubt_translation, options.doubt_rotation),
         (options.lost_translation, np.pi),
     ):
-        wider = _search(
+        wider = search(
             grid,
             points,
             weights,
@@ -117,7 +121,7 @@ def register(
     return found
 
 
-def _search(
+def search(
     grid: _core.Grid2D,
     points: NDArray[np.float32],
     weights: NDArray[np.float32],
@@ -125,7 +129,16 @@ def _search(
     options: RegistrationOptions,
     translation: float,
     rotation: float,
+    start: Float | None = None,
 ) -> Registration:
+    """The best pose in a window around the prior's mean; no doubts.
+
+    Args:
+        grid, points, weights, prior, options: as `register` has them.
+        translation: metres, half width of the window.
+        rotation: radians, half width of the window.
+        start: (3, 3) where Newton steps begin instead of searching the window.
+    """
     T, covariance, _, explained, _, _ = _core.register_beams(
         grid,
         points,
@@ -133,7 +146,7 @@ def _search(
         prior.T_map_base,
         prior.information,
         sigma=options.sigma,
-        radius=max(1, round(2.0 * options.sigma / grid.resolution)),
+        radius=radius(options, grid.resolution),
         floor=options.floor,
         unknown=options.unknown,
         gain=options.gain,
@@ -142,5 +155,11 @@ def _search(
         window_rotation=min(rotation, float(np.pi)),
         search_range=options.search_range,
         starts=options.starts,
+        T_start=start,
     )
     return Registration(T, covariance, explained)
+
+
+def radius(options: RegistrationOptions, resolution: float) -> int:
+    """Cells within which the field is summed up."""
+    return max(1, round(2.0 * options.sigma / resolution))

@@ -1,0 +1,52 @@
+"""Keyframes along the way, and how what is found out about them spreads to the other scans."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import se2
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+def travel(poses: Float) -> Float:
+    """(T,) metres travelled up to each of the poses (T, 3, 3)."""
+    steps = np.linalg.norm(np.diff(poses[:, :2, 2], axis=0), axis=1)
+    return np.concatenate([[0.0], steps.cumsum()])
+
+
+def chosen(poses: Float, distance: float, turn: float) -> Index:
+    """(K,) indices of scans about `distance` metres or `turn` radians apart; first and last too."""
+    x = se2.parameters(poses)
+    metres = np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1)
+    radians = np.abs(se2.wrap(np.diff(x[:, 2])))
+    kept, since = [0], 0.0
+    for t, step in enumerate(metres / distance + radians / turn, start=1):
+        since += step
+        if since >= 1.0:
+            kept.append(t)
+            since = 0.0
+    if kept[-1] != len(poses) - 1:
+        kept.append(len(poses) - 1)
+    return np.array(kept, np.intp)
+
+
+def spread(poses: Float, keyframes: Index, moved: Float) -> Float:
+    """(T, 3, 3) all poses when the keyframes among them moved to (K, 3, 3).
+
+    A scan between two keyframes is carried along by both; how far it is from each, in travel and
+    then in time, says how the two are blended.
+    """
+    if len(keyframes) < 2:
+        return poses
+    at = travel(poses) + 1e-6 * np.arange(len(poses))
+    right = np.clip(np.searchsorted(keyframes, np.arange(len(poses))), 1, len(keyframes) - 1)
+    left = right - 1
+    span = at[keyframes[right]] - at[keyframes[left]]
+    share = ((at - at[keyframes[left]]) / span)[:, None]
+    correction = moved @ se2.inverse(poses[keyframes])
+    one = se2.parameters(correction[left] @ poses)
+    other = se2.parameters(correction[right] @ poses)
+    difference = other - one
+    difference[:, 2] = se2.wrap(difference[:, 2])
+    return se2.matrix(*(one + share * difference).T)

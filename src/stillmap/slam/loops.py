@@ -1,0 +1,251 @@
+"""Loops: keyframes that see again what the robot saw much earlier, and where that puts them."""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import _core, se2
+from stillmap.options import field_with_doc
+from stillmap.recording.model import Recording
+from stillmap.slam import registration
+from stillmap.slam.keyframes import Index
+from stillmap.slam.motion import MotionPrior
+from stillmap.slam.registration import RegistrationOptions
+from stillmap.slam.scans import hits, in_frame, put
+
+Float = NDArray[np.float64]
+Points = NDArray[np.float32]
+
+# metres by which a view is shifted to see whether it could slide along a wall
+_SHIFTS = (-0.6, -0.45, -0.3, -0.15, 0.15, 0.3, 0.45, 0.6)
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """Loop closure; `docs/registration.md` says how."""
+
+    enabled: bool = field_with_doc(True, "close loops; without, poses are incremental only")
+    memory: float = field_with_doc(
+        25.0, "m of travel that scans are registered against before loops are closed"
+    )
+    distance: float = field_with_doc(1.0, "m between keyframes")
+    turn: float = field_with_doc(0.5, "rad between keyframes")
+    gap: float = field_with_doc(15.0, "m of travel after which a place counts as seen again")
+    reach: float = field_with_doc(6.0, "m, how near a keyframe must come to an earlier one")
+    stretch: float = field_with_doc(8.0, "m of travel to either side that make a local map")
+    view: float = field_with_doc(1.0, "m of travel to a scan on either side laid on it too")
+    drift_translation: float = field_with_doc(0.006, "m of drift per metre: how far to search")
+    drift_rotation: float = field_with_doc(0.0003, "rad of drift per metre: how far to search")
+    window: float = field_with_doc(2.0, "standard deviations of the drift that are searched")
+    step_translation: float = field_with_doc(0.03, "m of random error, per root of a metre")
+    step_rotation: float = field_with_doc(0.004, "rad of random error, per root of a metre")
+    sigma_translation: float = field_with_doc(0.03, "m, error of a closure at least")
+    sigma_rotation: float = field_with_doc(0.006, "rad, error of a closure at least")
+    accept_above: float = field_with_doc(0.5, "share of beams the earlier map must explain")
+    compared: float = field_with_doc(0.8, "of the share that the map so far explains, at least")
+    agreeing: int = field_with_doc(2, "closures around that must ask for the same correction")
+    robust: float = field_with_doc(1.5, "standard deviations where Cauchy's loss sets in")
+    misfit: float = field_with_doc(16.0, "chi-square above which the graph refuses a closure")
+    sweeps: int = field_with_doc(1, "times that all scans are registered against all others")
+
+    def __post_init__(self) -> None:
+        for name, low, high in _LIMITS:
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"'slam.loops.{name}' wants {low:g} to {high:g}")
+
+
+_LIMITS = (
+    ("memory", 1.0, 1e9),
+    ("distance", 0.05, 100.0),
+    ("turn", 0.05, 100.0),
+    ("gap", 1.0, 1e9),
+    ("reach", 0.0, 100.0),
+    ("stretch", 0.5, 1000.0),
+    ("view", 0.0, 100.0),
+    ("drift_translation", 0.0, 1.0),
+    ("drift_rotation", 0.0, 1.0),
+    ("window", 0.0, 10.0),
+    ("step_translation", 1e-4, 10.0),
+    ("step_rotation", 1e-5, 10.0),
+    ("sigma_translation", 1e-4, 10.0),
+    ("sigma_rotation", 1e-5, 10.0),
+    ("accept_above", 0.0, 1.0),
+    ("compared", 0.0, 1.0),
+    ("agreeing", 0, 100),
+    ("robust", 0.01, 100.0),
+    ("misfit", 0.0, 1e9),
+    ("sweeps", 1, 100),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """One attempt at closing a loop.
+
+    Attributes:
+        earlier, later: scans that see the same place.
+        T: (3, 3) pose of the later scan in the frame of the earlier one.
+        covariance: (3, 3) of x, y, heading in the frame of the later scan.
+        explained: share of the later beams that the earlier ones explain.
+        refused: why it was not accepted; empty when it was.
+    """
+
+    earlier: int
+    later: int
+    T: Float
+    covariance: Float
+    explained: float
+    refused: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """What loops are looked for in: a recording, its weights and the poses so far.
+
+    Attributes:
+        e: (M,) probability that each beam was reflected by something static.
+        poses: (T, 3, 3) T_map_base.
+        travelled: (T,) metres up to each scan.
+        explained: (T,) share of each scan that the map so far explained.
+        keyframes: (K,) indices of scans.
+    """
+
+    recording: Recording
+    e: NDArray[np.float32]
+    poses: Float
+    travelled: Float
+    explained: Float
+    keyframes: Index
+    resolution: float
+    registration: RegistrationOptions
+    options: LoopOptions
+
+
+def attempts(track: Track) -> list[Closure]:
+    """Every candidate laid on the map of an earlier stretch; ordered by the later scan."""
+    of_stretch: dict[int, list[tuple[int, int]]] = {}
+    for earlier, later in _candidates(track):
+        stretch = round(track.travelled[earlier] / track.options.stretch)
+        of_stretch.setdefault(stretch, []).append((earlier, later))
+    found = []
+    for stretch, pairs in sorted(of_stretch.items()):
+        grid = _local_map(track, stretch * track.options.stretch)
+        found += [_laid_on(track, grid, earlier, later) for earlier, later in pairs]
+    return sorted(found, key=lambda closure: closure.later)
+
+
+def _candidates(track: Track) -> Iterator[tuple[int, int]]:
+    """Keyframes with the nearest of much earlier travel, where that lies within reach."""
+    options, frames = track.options, track.keyframes
+    x, travelled = se2.parameters(track.poses[frames]), track.travelled[frames]
+    for k in range(len(frames)):
+        n = int(np.searchsorted(travelled, travelled[k] - options.gap))
+        if n == 0:
+            continue
+        distance = np.linalg.norm(x[:n, :2] - x[k, :2], axis=1)
+        turned = np.abs(se2.wrap(x[:n, 2] - x[k, 2]))
+        i = int(np.argmin(distance + turned))  # seen from the same side, where there is a choice
+        if distance[i] < options.reach + _drift(travelled[k] - travelled[i], options)[0]:
+            yield int(frames[i]), int(frames[k])
+
+
+def _drift(metres: float, options: LoopOptions) -> tuple[float, float]:
+    """Standard deviations of place and heading after a way, in metres and radians."""
+    return (
+        float(np.hypot(0.1, options.drift_translation * metres)),
+        float(np.hypot(0.02, options.drift_rotation * metres)),
+    )
+
+
+def _local_map(track: Track, centre: float) -> _core.Grid2D:
+    """The scans of one stretch of travel, and no others."""
+    half = track.options.stretch
+    first, last = np.searchsorted(track.travelled, [centre - half, centre + half])
+    grid = _core.Grid2D(track.resolution, track.registration.approach)
+    for t in range(first, last):
+        put(grid, track.recording, track.e, t, track.poses[t])
+    return grid
+
+
+def _view(track: Track, t: int) -> tuple[Points, NDArray[np.float32]]:
+    """End points of a keyframe and of a scan to either side, in its frame, with their e."""
+    here, half = track.travelled[t], track.options.view
+    first, last = np.searchsorted(track.travelled, [here - half, here + half], side="right")
+    last = max(last - 1, t)
+    shown = sorted({min(first, t), t, last})
+    seen = [hits(track.recording, track.e, s) for s in shown]
+    to_t = se2.inverse(track.poses[t]) @ track.poses[shown]
+    points = [in_frame(p, T) for (p, _), T in zip(seen, to_t, strict=True)]
+    return np.concatenate(points), np.concatenate([w for _, w in seen])
+
+
+def _laid_on(track: Track, grid: _core.Grid2D, earlier: int, later: int) -> Closure:
+    """The later view registered on the earlier map, as widely as the drift asks for."""
+    options = track.options
+    sigma, sigma_turn = _drift(track.travelled[later] - track.travelled[earlier], options)
+    information = np.diag([sigma**-2, sigma**-2, sigma_turn**-2])
+    prior = MotionPrior(track.poses[later], information, sigma, sigma_turn)
+    view = _view(track, later)
+    window = options.window * sigma, min(options.window * sigma_turn, np.pi)
+    found = registration.search(grid, *view, prior, track.registration, *window)
+    least = [options.sigma_translation] * 2 + [options.sigma_rotation]
+    covariance = found.covariance + np.diag(np.square(least))
+    too_little = found.explained < max(
+        options.accept_above, options.compared * track.explained[later]
+    )
+    if not too_little:
+        covariance += _sliding(grid, *view, found.T_map_base, covariance, sigma, track.registration)
+    return Closure(
+        earlier,
+        later,
+        se2.inverse(track.poses[earlier]) @ found.T_map_base,
+        se2.turned(covariance, se2.inverse(found.T_map_base)),
+        found.explained,
+        "explains too little" if too_little else "",
+    )
+
+
+def _sliding(
+    grid: _core.Grid2D,
+    points: Points,
+    weights: NDArray[np.float32],
+    T: Float,
+    covariance: Float,
+    sigma: float,
+    options: RegistrationOptions,
+) -> Float:
+    """Covariance (3, 3) to add where a view could slide along a wall and fit as well.
+
+    The curvature at the optimum takes the pattern of end points on a bare wall for information.
+    What the fit loses some way off cannot be taken in like that.
+    """
+    along = np.linalg.eigh(covariance[:2, :2])[1][:, 1]  # the direction that is known least
+
+    def cost(shift: float) -> float:
+        moved = T.copy()
+        moved[:2, 2] += shift * along
+        return options.gain * _core.registration_cost(
+            grid,
+            points,
+            weights,
+            moved,
+            sigma=options.sigma,
+            radius=registration.radius(options, grid.resolution),
+            floor=options.floor,
+            unknown=options.unknown,
+        )
+
+    best = cost(0.0)
+    # a Gaussian of this variance loses as much there
+    variances = [0.5 * shift**2 / max(cost(shift) - best, 1e-9) for shift in _SHIFTS]
+    added = np.zeros((3, 3))
+    added[:2, :2] = min(max(variances), sigma**2) * np.outer(along, along)
+    return added
+
+
+def refuse(closure: Closure, reason: str) -> Closure:
+    """The same, not accepted."""
+    return dataclasses.replace(closure, refused=reason)

@@ -1,0 +1,285 @@
+"""Loop closure on small worlds: loops that close, and loops that must not."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from stillmap import _core, em, se2
+from stillmap.evaluation.trajectory import absolute_errors
+from stillmap.simulation import RobotOptions, Scene, scene_by_name, simulate
+from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.simulation.walls import box
+from stillmap.slam import SlamOptions, incremental, keyframes, m_step
+from stillmap.slam.chain import agreeing, relations
+from stillmap.slam.closing import closed
+from stillmap.slam.incremental import Mapped
+from stillmap.slam.loops import Closure, LoopOptions, Track
+
+OPTIONS = SlamOptions()
+OPEN = dataclasses.replace(OPTIONS, loops=dataclasses.replace(OPTIONS.loops, enabled=False))
+REASONS = {"explains too little", "closures around disagree", "other loops disagree"}
+
+
+def silent(done, total):
+    pass
+
+
+def mapped(simulation, options=OPTIONS, threads=1, start=None):
+    recording = simulation.recording
+    e = np.full(recording.n_beams, 0.9, np.float32)
+    return m_step(recording, e, options, None, threads, silent, start=start)
+
+
+def ate(found, simulation):
+    return absolute_errors(found.poses, simulation.truth.T_world_base).rmse
+
+
+@functools.cache
+def square():
+    """A square of corridors with pillars along the walls; one lap and a bit, and drift."""
+    pillars = [
+        wall
+        for x in range(-5, 7, 2)
+        for at in ((x, -6.9), (6.9, x), (x + 1, 6.9), (-6.9, x))
+        for wall in box(*at, 0.2 + 0.03 * x, 0.3)
+    ]
+    scene = Scene(
+        "square",
+        walls=(*box(0, 0, 14, 14), *box(0, 0, 10, 10), *pillars),
+        route=((-3, -6), (6, -6), (6, 6), (-6, 6), (-6, -6), (3, -6)),
+        crowd=CrowdOptions(people=0),
+        laser=LaserOptions(beams=120, max_range=6.0),
+        robot=RobotOptions(),
+        odometry=OdometryOptions(drift_noise=0.02),
+    )
+    return simulate(scene, 1)
+
+
+@functools.cache
+def repetitive():
+    """A corridor with a niche every two metres; forth, back and forth again."""
+    niches = [wall for x in range(0, 40, 2) for wall in box(x, 1.15, 0.5, 0.3)]
+    scene = Scene(
+        "repetitive",
+        walls=(*box(19, 0, 44, 2.6), *niches),
+        route=((-1, -0.2), (30, -0.2), (1, -0.3), (20, -0.2)),
+        crowd=CrowdOptions(people=0),
+        laser=LaserOptions(beams=120, max_range=6.0),
+        robot=RobotOptions(),
+        odometry=OdometryOptions(drift_noise=0.01),
+    )
+    return simulate(scene, 2)
+
+
+def errors(found, simulation):
+    """(L, 2) by what the accepted closures miss the true relation: metres, and chi-square.
+
+    Metres may be many where a view can slide along a wall: then the covariance has to say so.
+    """
+    truth = simulation.truth.T_world_base
+    accepted = [c for c in found if not c.refused]
+    wanted = [se2.inverse(truth[c.earlier]) @ truth[c.later] for c in accepted]
+    missed = [se2.parameters(se2.inverse(T) @ c.T) for T, c in zip(wanted, accepted, strict=True)]
+    chi2 = [d @ np.linalg.solve(c.covariance, d) for d, c in zip(missed, accepted, strict=True)]
+    metres = [np.hypot(*d[:2]) for d in missed]
+    return np.array([metres, chi2]).T.reshape(-1, 2)
+
+
+def test_a_square_with_drift_closes():
+    simulation = square()
+    truth = se2.inverse(simulation.truth.T_world_base[0]) @ simulation.truth.T_world_base
+    steps = se2.inverse(truth[:-1]) @ truth[1:] @ se2.matrix(4e-4, 2e-4, 6e-5)
+    poses = [np.eye(3)]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    n = len(poses)
+    drifted = Mapped(np.array(poses), np.zeros((n, 3, 3)), _core.Grid2D(0.05), np.ones(n), [])
+    before = absolute_errors(drifted.poses, truth)
+    e = np.full(simulation.recording.n_beams, 0.9, np.float32)
+    closed_poses, found = closed(simulation.recording, e, OPTIONS, drifted)
+    metres, chi2 = errors(found, simulation).T
+    assert np.count_nonzero(metres < 0.1) >= 4
+    assert chi2.max() < 11.3  # 99 %
+    assert absolute_errors(closed_poses, truth).rmse < 0.5 * before.rmse
+    end = se2.parameters(se2.inverse(truth[-1]) @ closed_poses[-1])
+    assert np.hypot(*end[:2]) < 0.08
+    assert np.hypot(*se2.parameters(se2.inverse(truth[-1]) @ drifted.poses[-1])[:2]) > 0.2
+
+
+def test_a_square_is_mapped():
+    found = mapped(square())
+    metres, chi2 = errors(found.loops, square()).T
+    assert np.count_nonzero(metres < 0.1) >= 4
+    assert chi2.max() < 11.3
+    assert ate(found, square()) < 0.05
+
+
+def test_a_repetitive_corridor_makes_no_false_loop():
+    found = mapped(repetitive())
+    metres, chi2 = errors(found.loops, repetitive()).T
+    assert len(metres) >= 5
+    assert metres.max() < 0.5  # a niche further would be 2 m
+    assert chi2.max() < 25
+
+
+def test_a_straight_way_has_no_loops():
+    recording = repetitive().recording
+    n = 250  # 25 m
+    short = dataclasses.replace(
+        recording,
+        stamp_ns=recording.stamp_ns[:n],
+        offset=recording.offset[: n + 1],
+        points=recording.points[: recording.offset[n]],
+        hit=recording.hit[: recording.offset[n]],
+        sensor=recording.sensor[:n],
+        T_odom_base=recording.T_odom_base[:n],
+    )
+    assert mapped(dataclasses.replace(repetitive(), recording=short)).loops == []
+
+
+def test_refusals_carry_reasons():
+    found = mapped(square())
+    refused = {closure.refused for closure in found.loops} - {""}
+    assert refused <= REASONS
+    strict = dataclasses.replace(OPTIONS, loops=LoopOptions(accept_above=1.0))
+    assert {c.refused for c in mapped(square(), strict).loops} == {"explains too little"}
+    lonely = dataclasses.replace(OPTIONS, loops=LoopOptions(agreeing=100))
+    assert "" not in {c.refused for c in mapped(square(), lonely).loops}
+
+
+def straight_track(options=OPTIONS.loops):
+    """Twice along the same 20 m, keyframes a metre apart."""
+    x = np.concatenate([np.arange(21.0), np.arange(21.0)])
+    poses = se2.matrix(x, 0.0, 0.0)
+    n = len(poses)
+    recording = dataclasses.replace(square().recording, T_odom_base=None)
+    e = np.zeros(0, np.float32)
+    frames = np.arange(n)
+    travelled = np.arange(float(n))
+    return Track(
+        recording, e, poses, travelled, np.ones(n), frames, 0.05, OPTIONS.registration, options
+    )
+
+
+def closures(shifts):
+    """The second time at keyframe k is the first time there, moved by shift."""
+    covariance = np.diag([0.03**2, 0.03**2, 0.006**2])
+    return [
+        Closure(k, 21 + k, se2.matrix(shift, 0.0, 0.0), covariance, 1.0)
+        for k, shift in enumerate(shifts)
+    ]
+
+
+def test_one_closure_that_wants_something_else_is_refused():
+    track = straight_track()
+    way = relations(track, OPTIONS.motion)
+    shifts = [0.5] * 8
+    shifts[4] = -0.5
+    refused = [c.refused for c in agreeing(track, way, closures(shifts))]
+    assert refused == ["closures around disagree" if k == 4 else "" for k in range(8)]
+
+
+def test_a_closure_on_its_own_is_refused():
+    track = straight_track()
+    way = relations(track, OPTIONS.motion)
+    assert [bool(c.refused) for c in agreeing(track, way, closures([0.1]))] == [True]
+
+
+def test_a_way_that_odometry_contradicts_is_loose():
+    simulation = square()
+    recording, poses = simulation.recording, simulation.truth.T_world_base.copy()
+    frames = keyframes.chosen(poses, 1.0, 0.5)
+    at = int(frames[5]) + 1
+    poses[at:] = se2.matrix(0.0, 0.8, 0.0) @ poses[at:]  # a leap of 0.8 m in the map's y
+    n = len(poses)
+    e = np.zeros(recording.n_beams, np.float32)
+    travelled = keyframes.travel(poses)
+    track = Track(
+        recording,
+        e,
+        poses,
+        travelled,
+        np.ones(n),
+        frames,
+        0.05,
+        OPTIONS.registration,
+        OPTIONS.loops,
+    )
+    way = relations(track, OPTIONS.motion)
+    widths = np.array([np.sqrt(np.linalg.eigvalsh(r.covariance[:2, :2]).max()) for r in way])
+    assert widths[5] == pytest.approx(0.8, abs=0.1)
+    assert np.delete(widths, 5).max() < 0.1
+
+
+def test_corrections_spread_between_keyframes():
+    poses = se2.matrix(np.arange(11.0), 0.0, 0.0)
+    frames = np.array([0, 10])
+    moved = se2.matrix(np.array([0.0, 10.0]), np.array([0.0, 1.0]), 0.0)
+    spread = se2.parameters(keyframes.spread(poses, frames, moved))
+    np.testing.assert_allclose(spread[:, 1], np.arange(11) / 10, atol=1e-5)
+    np.testing.assert_allclose(spread[:, 0], np.arange(11), atol=1e-9)
+
+
+def test_keyframes_by_hand():
+    # a metre a scan, two scans turning by 0.3 rad each, one on the spot
+    x = se2.matrix([0, 1, 2, 2, 2, 2], 0.0, [0, 0, 0, 0.3, 0.6, 0.6])
+    assert keyframes.chosen(x, 1.0, 0.5).tolist() == [0, 1, 2, 4, 5]
+    assert keyframes.chosen(x[:1], 1.0, 0.5).tolist() == [0]
+    assert keyframes.travel(x).tolist() == [0, 1, 2, 2, 2, 2]
+
+
+def test_the_grid_is_what_the_poses_make():
+    found = mapped(square())
+    e = np.full(square().recording.n_beams, 0.9, np.float32)
+    grid = _core.Grid2D(OPTIONS.resolution)
+    em.add_recording(grid, square().recording, found.poses, e)
+    for ours, theirs in zip(found.grid.dense(), grid.dense(), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_array_equal(found.poses[0], np.eye(3))
+
+
+def test_any_number_of_threads_gives_the_same():
+    one, two = mapped(square(), threads=1), mapped(square(), threads=2)
+    np.testing.assert_array_equal(one.poses, two.poses)
+    for a, b in zip(one.loops, two.loops, strict=True):
+        np.testing.assert_array_equal(a.T, b.T)
+        assert a.refused == b.refused
+
+
+def test_without_loops_poses_are_incremental():
+    simulation = square()
+    e = np.full(simulation.recording.n_beams, 0.9, np.float32)
+    plain = incremental.build(simulation.recording, e, OPEN, silent)
+    found = mapped(simulation, OPEN)
+    np.testing.assert_array_equal(found.poses, plain.poses)
+    assert found.loops == []
+
+
+def test_a_start_is_only_swept():
+    first = mapped(square())
+    again = mapped(square(), start=first.poses)
+    assert again.loops == []
+    assert np.linalg.norm(again.poses[:, :2, 2] - first.poses[:, :2, 2], axis=1).max() < 0.03
+
+
+@pytest.mark.parametrize("scans", [1, 2, 3])
+def test_hardly_any_scans(scans):
+    simulation = simulate(scene_by_name("hall", {"robot": {"scans": scans}}), 0)
+    found = mapped(simulation)
+    assert len(found.poses) == scans
+    assert np.all(np.isfinite(found.poses))
+
+
+def test_limits():
+    for name, value in (("distance", 0.0), ("accept_above", 1.5), ("sigma_rotation", 0.0)):
+        with pytest.raises(ValueError, match=rf"slam\.loops\.{name}"):
+            LoopOptions(**{name: value})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_corridors_close(seed):
+    simulation = simulate(scene_by_name("corridor"), seed)
+    assert ate(mapped(simulation), simulation) < 0.05

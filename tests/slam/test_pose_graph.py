@@ -1,0 +1,113 @@
+"""The pose graph: graphs whose answer is known by hand."""
+
+import numpy as np
+import pytest
+
+from stillmap import se2
+from stillmap.slam.pose_graph import Relation, misfit, optimised
+
+SURE = np.diag([1e-4, 1e-4, 1e-6])
+STEP = np.diag([1e-2, 1e-2, 1e-4])
+
+
+def square(side=10):
+    """Keyframes a metre apart round a square, back to the start; the last one lies on the first."""
+    step, corner = se2.matrix(1.0, 0.0, 0.0), se2.matrix(1.0, 0.0, np.pi / 2)
+    T = [np.eye(3)]
+    for k in range(4 * side):
+        T.append(T[-1] @ (corner if k % side == side - 1 else step))
+    return np.array(T)
+
+
+def chain_of(poses, drift=None):
+    drift = np.eye(3) if drift is None else drift
+    steps = se2.inverse(poses[:-1]) @ poses[1:] @ drift
+    return [Relation(k, k + 1, T, STEP) for k, T in enumerate(steps)]
+
+
+def dead_reckoned(chain):
+    T = [np.eye(3)]
+    for relation in chain:
+        T.append(T[-1] @ relation.T)
+    return np.array(T)
+
+
+def apart(a, b):
+    return np.linalg.norm(a[:, :2, 2] - b[:, :2, 2], axis=1)
+
+
+def test_an_error_is_shared_evenly_along_the_way():
+    # four steps said to be 1.1 m long, yet the end is known to be at 4 m: 1 m each
+    chain = [Relation(k, k + 1, se2.matrix(1.1, 0, 0), STEP) for k in range(4)]
+    loop = Relation(0, 4, se2.matrix(4.0, 0, 0), 1e-6 * np.eye(3))
+    x = se2.parameters(optimised(dead_reckoned(chain), chain, [loop], None))
+    np.testing.assert_allclose(x[:, 0], [0, 1, 2, 3, 4], atol=1e-4)
+    np.testing.assert_allclose(x[:, 1:], 0, atol=1e-6)
+
+
+def test_a_looser_step_takes_more_of_it():
+    chain = [
+        Relation(0, 1, se2.matrix(1, 0, 0), STEP),
+        Relation(1, 2, se2.matrix(1, 0, 0), 3 * STEP),
+    ]
+    loop = Relation(0, 2, se2.matrix(2.4, 0, 0), 1e-8 * np.eye(3))
+    x = se2.parameters(optimised(dead_reckoned(chain), chain, [loop], None))
+    np.testing.assert_allclose(x[:, 0], [0, 1.1, 2.4], atol=1e-4)
+
+
+def test_covariances_hold_in_the_frame_of_the_second_pose():
+    # the robot has turned left; loose along its x, which is the map's y
+    chain = [
+        Relation(0, 1, se2.matrix(0, 0, np.pi / 2), 1e-8 * np.eye(3)),
+        Relation(1, 2, se2.matrix(1, 0, 0), np.diag([1.0, 1e-6, 1e-6])),
+    ]
+    loop = Relation(0, 2, se2.matrix(0.5, 1.5, np.pi / 2), np.diag([1e-4, 1.0, 1e-4]))
+    x = se2.parameters(optimised(dead_reckoned(chain), chain, [loop], None))
+    np.testing.assert_allclose(x[2, :2], [0.0, 1.5], atol=0.01)
+
+
+def test_a_square_with_drift_closes():
+    truth = square()
+    chain = chain_of(truth, drift=se2.matrix(0.01, 0.002, 0.004))
+    start = dead_reckoned(chain)
+    assert apart(start, truth)[-1] > 0.5
+    loop = Relation(0, len(truth) - 1, np.eye(3), SURE)
+    found = optimised(start, chain, [loop], None)
+    assert apart(found, truth)[-1] < 0.02
+    assert apart(found, truth).max() < 0.35 * apart(start, truth).max()
+    np.testing.assert_array_equal(found[0], np.eye(3))
+
+
+def test_one_false_loop_is_survived():
+    truth = square()
+    chain = chain_of(truth, drift=se2.matrix(0.01, 0.002, 0.004))
+    n = len(truth) - 1
+    true = [
+        Relation(k, n - 3 + k, se2.inverse(truth[k]) @ truth[n - 3 + k], SURE) for k in range(4)
+    ]
+    false = Relation(5, 25, np.eye(3), SURE)  # opposite sides of the square
+    plain = optimised(dead_reckoned(chain), chain, [*true, false], None)
+    robust = optimised(dead_reckoned(chain), chain, [*true, false], 1.5)
+    assert apart(plain, truth).max() > 1.0
+    assert apart(robust, truth).max() < 0.6
+    # and what is left of it tells it from the others
+    assert misfit(robust, false) > 1000
+    assert max(misfit(robust, relation) for relation in true) < 16
+
+
+def test_misfit_by_hand():
+    poses = np.array([np.eye(3), se2.matrix(2.0, 0.0, 0.0)])
+    relation = Relation(0, 1, se2.matrix(1.7, 0.4, 0.0), np.diag([0.01, 0.04, 1.0]))
+    assert misfit(poses, relation) == pytest.approx(0.3**2 / 0.01 + 0.4**2 / 0.04)
+
+
+def test_without_loops_nothing_moves():
+    truth = square()
+    np.testing.assert_allclose(optimised(truth, chain_of(truth), [], None), truth, atol=1e-9)
+
+
+def test_the_same_to_the_bit():
+    chain = chain_of(square(), drift=se2.matrix(0.01, 0.002, 0.004))
+    loop = Relation(0, 40, np.eye(3), SURE)
+    a, b = (optimised(dead_reckoned(chain), chain, [loop], 1.5) for _ in range(2))
+    np.testing.assert_array_equal(a, b)
