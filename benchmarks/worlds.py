@@ -5,7 +5,7 @@ python benchmarks/worlds.py [--cases NAME|GROUP ...] [--methods stillmap paper .
     [--set section.key=value ...] [--processes 2] [--json ROWS] [--read ROWS ...] [--list]
 
 Scores are those of the result that a user gets; --per-iteration scores every iteration instead.
-Walls are wanted that the same run shows without people; "in reach" are those that it shows with true
+Walls wanted are those of the same run without people; "in reach" those that it shows with true
 labels and true poses. What such a map of counts itself scores is "by true labels".
 `--json` appends one row per run to a file as it ends, `--read` prints such files once more.
 """
