@@ -1,7 +1,8 @@
 """Every kernel of stillmap._core once more in plain NumPy, slowly, for 2 or 3 dimensions.
 
 This is the oracle of the tests: same names and arguments as `stillmap._core`, written straight
-from the equations of the paper and without a thought for speed. Where beams are taken:
+from the equations of the paper, or of the chains in time that the default estimator fits, and
+without a thought for speed. Where beams are taken:
 
 - `points` (M, D) float32 are end points in the sensor frame, metres; a beam whose point is not
   finite is unusable and takes part in nothing;
@@ -10,22 +11,32 @@ from the equations of the paper and without a thought for speed. Where beams are
 """
 
 from stillmap.reference.beams import add_beams, e_step, log_likelihood
+from stillmap.reference.dwell import Dwell, Dwell2D, Dwell3D, Reading, look_at
 from stillmap.reference.em import EmStep, em_fixed_poses, m_step_map
 from stillmap.reference.field import field, registration_cost, registration_gradient
 from stillmap.reference.grid import Grid, Grid2D, Grid3D, occupancy
+from stillmap.reference.surface import Surface, Surface2D, Surface3D
 from stillmap.reference.traverse import cell_of, traverse
 
 __all__ = [
+    "Dwell",
+    "Dwell2D",
+    "Dwell3D",
     "EmStep",
     "Grid",
     "Grid2D",
     "Grid3D",
+    "Reading",
+    "Surface",
+    "Surface2D",
+    "Surface3D",
     "add_beams",
     "cell_of",
     "e_step",
     "em_fixed_poses",
     "field",
     "log_likelihood",
+    "look_at",
     "m_step_map",
     "occupancy",
     "registration_cost",

@@ -16,7 +16,9 @@ PROBABILITY_FLOOR = 1e-12  # m and 1 - m are floored here inside logarithms, in 
 
 
 @dataclass(frozen=True)
-class _Beam:
+class Beam:
+    """One usable beam in the map frame."""
+
     scan: int
     number: int
     hit: bool
@@ -24,12 +26,13 @@ class _Beam:
     end: Float
 
 
-def _usable_beams(
-    grid: Grid, points: ArrayLike, hit: ArrayLike, offset: ArrayLike, T_map_sensor: ArrayLike
-) -> Iterator[_Beam]:
+def usable_beams(
+    dimension: int, points: ArrayLike, hit: ArrayLike, offset: ArrayLike, T_map_sensor: ArrayLike
+) -> Iterator[Beam]:
+    """The beams whose points are finite, in order, with both ends in the map frame."""
     z, struck = np.asarray(points, float), np.asarray(hit, bool)
     bounds, T = np.asarray(offset, np.int64), np.asarray(T_map_sensor, float)
-    D = grid.dimension
+    D = dimension
     for name, shape, expected in (
         ("points", z.shape, (len(z), D)),
         ("hit", struck.shape, (len(z),)),
@@ -43,17 +46,17 @@ def _usable_beams(
         R, origin = T[t, :D, :D], T[t, :D, D]
         for n in range(bounds[t], bounds[t + 1]):
             if np.isfinite(z[n]).all():
-                yield _Beam(t, n, bool(struck[n]), origin, R @ z[n] + origin)
+                yield Beam(t, n, bool(struck[n]), origin, R @ z[n] + origin)
 
 
-def _passed(grid: Grid, beam: _Beam) -> Iterator[tuple[Cell, float]]:
+def _passed(grid: Grid, beam: Beam) -> Iterator[tuple[Cell, float]]:
     """Cells before the end cell with their l_j."""
     cells, lengths = traverse(beam.start, beam.end, grid.resolution)
     for cell, length in zip(cells[:-1], lengths[:-1], strict=True):
         yield tuple(cell.tolist()), float(length)
 
 
-def _end_cell(grid: Grid, beam: _Beam) -> Cell:
+def _end_cell(grid: Grid, beam: Beam) -> Cell:
     return tuple(cell_of(beam.end, grid.resolution).tolist())
 
 
@@ -95,7 +98,7 @@ def add_beams(
         threads: not used here.
     """
     expectation = _per_beam(e, points)
-    for beam in _usable_beams(grid, points, hit, offset, T_map_sensor):
+    for beam in usable_beams(grid.dimension, points, hit, offset, T_map_sensor):
         for cell, length in _passed(grid, beam):
             grid.add(cell, 0.0, length)
         if beam.hit:
@@ -122,7 +125,7 @@ def e_step(
     """
     p = _checked_prior(prior)
     e = np.full(len(np.asarray(points)), np.nan)
-    for beam in _usable_beams(grid, points, hit, offset, T_map_sensor):
+    for beam in usable_beams(grid.dimension, points, hit, offset, T_map_sensor):
         m = grid.occupancy_of(_end_cell(grid, beam)) if beam.hit else float("nan")
         evidence = p * m + (1 - p) * (1 - m)
         e[beam.number] = p * m / evidence if evidence > 0 else p
@@ -153,7 +156,7 @@ def log_likelihood(
     p = _checked_prior(prior)
     expectation = _per_beam(e, points)
     terms = np.zeros((len(np.asarray(offset)) - 1, 4))
-    for beam in _usable_beams(grid, points, hit, offset, T_map_sensor):
+    for beam in usable_beams(grid.dimension, points, hit, offset, T_map_sensor):
         static = float(expectation[beam.number])
         m_end = grid.occupancy_of(_end_cell(grid, beam))
         end = _expected_log(static, m_end) if beam.hit and isfinite(m_end) else 0.0

@@ -1,0 +1,221 @@
+"""The likelihood of what was seen of each element under a two-state Markov chain in time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import exp, log
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
+
+from stillmap.reference.beams import Beam, usable_beams
+from stillmap.reference.surface import Element, Surface
+from stillmap.reference.traverse import cell_of, traverse
+
+Float = NDArray[np.float64]
+
+HIT = -1.0  # instead of a reliability
+SUREST = 0.999  # no single beam is surer to have met what it passed
+LEAST = 0.02  # a look less reliable than this is none
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How beams are read; lengths in metres.
+
+    Attributes:
+        lateral: standard deviation of how far a beam passes beside where it seems to.
+        margin: how far behind an element a beam must end to have passed it.
+        reach: an element so near to one that was hit, mean from mean, is hit too.
+        beyond: how far before its end a maximum-range beam is no longer trusted.
+        normals: whether surfaces face somewhere; else every element is round.
+    """
+
+    lateral: float
+    margin: float
+    reach: float
+    beyond: float
+    normals: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("lateral", "margin", "reach", "beyond"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name}: expected a positive length")
+
+
+def look_at(surface: Surface, beams: Sequence[Beam], reading: Reading) -> dict[int, float]:
+    """What the beams of one look say of each element: HIT, or how surely they saw through it.
+
+    An element is hit where a beam ends in its cell or within `reach` of one in whose cell a beam
+    ends. The others whose cells beams cross before they end are seen through: R = 1 - the product
+    over these beams of 1 - P(the beam met the surface).
+    """
+    number = surface.numbers()
+    missed: dict[int, float] = {}
+    struck = set()
+    for beam in beams:
+        for k, met in _met(surface, number, beam, reading):
+            missed[k] = missed.get(k, 1.0) * (1.0 - met)
+        end = number.get(tuple(cell_of(beam.end, surface.resolution).tolist()))
+        if beam.hit and end is not None:
+            struck.add(end)
+    hit = {
+        k
+        for k, element in enumerate(surface.list)
+        if any(_apart(element, surface.list[s]) <= reading.reach for s in struck)
+    }
+    through = {k: 1.0 - m for k, m in missed.items() if k not in hit and 1.0 - m > LEAST}
+    return through | dict.fromkeys(hit | struck, HIT)
+
+
+def _apart(a: Element, b: Element) -> float:
+    return float(np.linalg.norm(a.mean - b.mean))
+
+
+def _met(
+    surface: Surface, number: dict[tuple[int, ...], int], beam: Beam, reading: Reading
+) -> list[tuple[int, float]]:
+    """(element, P(met)) of all elements whose cells the beam passes through before it ends."""
+    way = beam.end - beam.start
+    length = float(np.linalg.norm(way))
+    usable = length if beam.hit else length - reading.beyond
+    if usable <= 0:
+        return []
+    end = beam.start + way * (usable / length)
+    cells, _ = traverse(beam.start, end, surface.resolution)
+    passed = [number.get(tuple(cell)) for cell in cells[:-1].tolist()]
+    struck = beam.end if beam.hit else None
+    line = 0.5 * surface.resolution, beam.start, way / length, struck, reading
+    return [(k, _probability_met(surface.list[k], *line)) for k in passed if k is not None]
+
+
+def _probability_met(
+    element: Element,
+    half_round: float,
+    start: Float,
+    direction: Float,
+    end: Float | None,
+    reading: Reading,
+) -> float:
+    """P(a beam crosses the element within its extent), with Gaussian noise beside the beam.
+
+    `end` is that of a beam that was hit; what is no surface extends `half_round` from its mean.
+
+    The element is seen under the angle at which the beam meets it, so it looks |n . d| times as
+    wide as it is. A beam that is hit less than `margin` behind it may have been hit by it.
+    """
+    patch = element.patch if reading.normals else None
+    if end is not None:
+        behind = end - element.mean
+        distance = abs(patch.normal @ behind) if patch else np.linalg.norm(behind)
+        if distance < reading.margin:
+            return 0.0
+    off = (patch.centre if patch else element.mean) - start
+    aside = float(np.linalg.norm(off - (off @ direction) * direction))
+    half = patch.half * abs(float(patch.normal @ direction)) if patch else half_round
+    met = ndtr((half - aside) / reading.lateral) - ndtr((-half - aside) / reading.lateral)
+    return float(min(met, SUREST))
+
+
+def chain_log_likelihood(
+    seen: Sequence[tuple[float, float]], rho: float, tau: float, detection: float
+) -> float:
+    """ln P(all looks) by the forward algorithm over the two states (empty, occupied).
+
+    Args:
+        seen: (time in seconds, HIT or reliability) of each look, in the order of time.
+        rho: share of the time in which it is occupied.
+        tau: seconds, correlation exp(-dt / tau).
+        detection: probability that a sure look at an occupied cell sees that it is.
+    """
+    state = np.array([1.0 - rho, rho])
+    total, before = 0.0, None
+    for time, reliability in seen:
+        if before is not None:
+            kept = exp(-(time - before) / tau)
+            stay = kept * np.eye(2) + (1.0 - kept) * np.array([[1.0 - rho, rho]] * 2)
+            state = state @ stay
+        if reliability == HIT:
+            state = state * [0.0, detection]
+        else:
+            state = state * [1.0, 1.0 - detection * reliability]
+        total += log(state.sum())
+        state, before = state / state.sum(), time
+    return total
+
+
+class Dwell:
+    """Looks at the elements of a surface, and what they say under classes of chains.
+
+    Args:
+        surface: fitted.
+        rho, tau: (C,) of the classes.
+        detection: see `chain_log_likelihood`.
+        seconds: between successive looks.
+        lateral, margin, reach, beyond, normals: see Reading.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        *,
+        rho: Sequence[float],
+        tau: Sequence[float],
+        detection: float,
+        seconds: float,
+        lateral: float,
+        margin: float,
+        reach: float,
+        beyond: float,
+        normals: bool = True,
+    ) -> None:
+        if len(surface.list) != surface.size:
+            raise ValueError("surface: fit it first")
+        self.surface = surface
+        self.classes = list(zip(rho, tau, strict=True))
+        self.detection = detection
+        self.seconds = seconds
+        self.reading = Reading(lateral, margin, reach, beyond, normals)
+        self.seen: list[list[tuple[float, float]]] = [[] for _ in surface.list]
+
+    def add(
+        self,
+        points: ArrayLike,
+        hit: ArrayLike,
+        offset: ArrayLike,
+        T_map_sensor: ArrayLike,
+        look: ArrayLike,
+        threads: int = 1,  # noqa: ARG002  the core's signature
+    ) -> None:
+        """Adds scans with the numbers (T,) of their looks, which must not fall."""
+        number = np.asarray(look, np.int64)
+        if (np.diff(number) < 0).any():
+            raise ValueError("look: must not fall")
+        looks: dict[int, list[Beam]] = {int(n): [] for n in number}
+        for beam in usable_beams(self.surface.dimension, points, hit, offset, T_map_sensor):
+            looks[int(number[beam.scan])].append(beam)
+        for n, beams in looks.items():
+            for k, reliability in look_at(self.surface, beams, self.reading).items():
+                self.seen[k].append((n * self.seconds, reliability))
+
+    def likelihood(self) -> tuple[NDArray[np.float32], Float]:
+        """(E, C) relative to the best class, (E,) logarithm of the best.
+
+        Of everything else that was seen of the cell, given that a beam ended in it: divided by
+        rho * detection, the probability of that.
+        """
+        values = np.array(
+            [
+                [
+                    chain_log_likelihood(seen, rho, tau, self.detection) - log(rho * self.detection)
+                    for rho, tau in self.classes
+                ]
+                for seen in self.seen
+            ]
+        ).reshape(len(self.seen), len(self.classes))
+        best = values.max(axis=1)
+        return np.exp(values - best[:, None]).astype(np.float32), best
+
+
+Dwell2D = Dwell
+Dwell3D = Dwell

@@ -1,0 +1,158 @@
+"""Where beams ended: one element of surface per cell, and how it lies among its neighbours."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stillmap.reference.beams import Beam, usable_beams
+from stillmap.reference.traverse import cell_of
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Cell = tuple[int, ...]
+
+WINDOWS = (2, 4, 6)  # cells to each side: the first in which half of the beams lie on surfaces
+WIDE = 0.15  # a surface varies along itself by more than this times the window's radius squared
+FLAT = 0.25  # and across itself by less than this times that
+EXTENT = 0.5  # how much of the half width that evenly spread end points fill counts as surface
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """The piece of surface around an element, in metres.
+
+    Attributes:
+        normal: (D,) unit vector across it.
+        centre: (D,) mean of the end points in the window.
+        half: how far it extends from there.
+        off_plane: of the middle of the element's cell from it, signed along the normal.
+        across: standard deviation of the end points across it.
+    """
+
+    normal: Float
+    centre: Float
+    half: float
+    off_plane: float
+    across: float
+
+
+@dataclass(frozen=True, eq=False)
+class Element:
+    """What is known of a cell in which beams ended.
+
+    Attributes:
+        cell: its integer coordinates.
+        beams: number of beams that ended in it.
+        mean: (D,) of their end points, metres.
+        patch: None where the surroundings are no surface.
+    """
+
+    cell: Cell
+    beams: int
+    mean: Float
+    patch: Patch | None
+
+
+class Surface:
+    """The end points of all hits, by cells.
+
+    Args:
+        resolution: edge of a cell, metres.
+        dimension: 2 or 3.
+
+    Attributes:
+        list: (E,) the elements, after `fit`.
+        scatter: metres, median of `across` over all beams that end on surfaces.
+    """
+
+    def __init__(self, resolution: float, dimension: int) -> None:
+        if not 0 < resolution < np.inf:
+            raise ValueError(f"resolution: expected a positive length, got {resolution}")
+        self.resolution = resolution
+        self.dimension = dimension
+        self.ends: dict[Cell, list[Float]] = {}
+        self.list: list[Element] = []
+        self.scatter = 0.0
+
+    @property
+    def size(self) -> int:
+        return len(self.ends)
+
+    def add_end_points(
+        self, points: ArrayLike, hit: ArrayLike, offset: ArrayLike, T_map_sensor: ArrayLike
+    ) -> None:
+        """Notes where the beams that were hit ended."""
+        for beam in usable_beams(self.dimension, points, hit, offset, T_map_sensor):
+            if beam.hit:
+                self.ends.setdefault(self._end_cell(beam), []).append(beam.end)
+
+    def fit(self) -> None:
+        """Means, surfaces and scatter; the window widens until it sees walls for all the noise."""
+        for radius in WINDOWS:
+            self.list = [
+                Element(cell, len(ends), np.mean(ends, axis=0), self._patch(cell, radius))
+                for cell, ends in self.ends.items()
+            ]
+            across = [e.patch.across for e in self.list if e.patch for _ in range(e.beams)]
+            if 2 * len(across) >= sum(e.beams for e in self.list):
+                break
+        self.scatter = float(np.sort(across)[(len(across) - 1) // 2]) if across else 0.0
+
+    def elements(self) -> tuple[Int, Float, Float, Float, Int]:
+        """cells (E, D), means (E, D), normals (E, D), off_plane (E,), beams (E,)."""
+        D, nowhere = self.dimension, np.zeros(self.dimension)
+        return (
+            np.array([e.cell for e in self.list], np.int64).reshape(-1, D),
+            np.array([e.mean for e in self.list]).reshape(-1, D),
+            np.array([e.patch.normal if e.patch else nowhere for e in self.list]).reshape(-1, D),
+            np.array([e.patch.off_plane if e.patch else 0.0 for e in self.list]),
+            np.array([e.beams for e in self.list], np.int64),
+        )
+
+    def elements_of(
+        self,
+        points: ArrayLike,
+        hit: ArrayLike,
+        offset: ArrayLike,
+        T_map_sensor: ArrayLike,
+        threads: int = 1,  # noqa: ARG002  the core's signature
+    ) -> NDArray[np.int32]:
+        """(M,) the element in which each beam ended, -1: none."""
+        number = self.numbers()
+        out = np.full(len(np.asarray(points)), -1, np.int32)
+        for beam in usable_beams(self.dimension, points, hit, offset, T_map_sensor):
+            if beam.hit:
+                out[beam.number] = number.get(self._end_cell(beam), -1)
+        return out
+
+    def numbers(self) -> dict[Cell, int]:
+        """The element of each cell that has one."""
+        return {cell: k for k, cell in enumerate(self.ends)}
+
+    def _end_cell(self, beam: Beam) -> Cell:
+        return tuple(cell_of(beam.end, self.resolution).tolist())
+
+    def _patch(self, cell: Cell, radius: int) -> Patch | None:
+        D = self.dimension
+        shifts = np.stack(np.meshgrid(*[np.arange(-radius, radius + 1)] * D), -1).reshape(-1, D)
+        near = [tuple(c) for c in (np.array(cell) + shifts).tolist()]
+        around = np.array([end for c in near for end in self.ends.get(c, [])])
+        variance, axes = np.linalg.eigh(np.cov(around.T, bias=True))  # rising
+        wide = variance[1] > WIDE * (radius * self.resolution) ** 2
+        if not wide or variance[0] >= FLAT * variance[1]:
+            return None
+        normal, centre = axes[:, 0], around.mean(axis=0)
+        middle = (np.array(cell) + 0.5) * self.resolution
+        return Patch(
+            normal=normal,
+            centre=centre,
+            half=EXTENT * float(np.sqrt(3.0 * variance[1])),
+            off_plane=float(normal @ (middle - centre)),
+            across=float(np.sqrt(max(variance[0], 0.0))),
+        )
+
+
+Surface2D = partial(Surface, dimension=2)
+Surface3D = partial(Surface, dimension=3)
