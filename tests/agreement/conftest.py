@@ -1,7 +1,7 @@
 """Random beams on which the core and its plain twin must agree."""
 
 import resource
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -69,6 +69,110 @@ def random_beams(seed: int, dimension: int, scans: int = 12, beams: int = 240) -
         e=rng.uniform(0.01, 0.99, beams).astype(np.float32),
         resolution=float(rng.uniform(0.15, 0.4)),
     )
+
+
+def ranges(origins: Any, directions: Any, walls: Any, mover: Any, radius: float) -> Any:
+    """Along rays from inside a convex room (normals, distances) to its walls or to a ball."""
+    normals, distances = walls
+    with np.errstate(divide="ignore"):
+        to_walls = (distances - origins @ normals.T) / (directions @ normals.T)
+    found = np.where(to_walls > 0, to_walls, np.inf).min(axis=1)
+    off = mover - origins
+    along = np.einsum("nd,nd->n", off, directions)
+    depth = radius**2 - np.einsum("nd,nd->n", off, off) + along**2
+    near = along - np.sqrt(np.maximum(depth, 0))
+    return np.where((depth > 0) & (near > 0), np.minimum(near, found), found)
+
+
+@dataclass(frozen=True)
+class Room:
+    """Beams of some scans and the looks that these belong to."""
+
+    beams: Beams
+    look: Any
+    lengths: dict[str, float]
+
+    def surface(self, kernels: ModuleType) -> Any:
+        surface = (kernels.Surface2D, kernels.Surface3D)[self.beams.dimension - 2](
+            self.beams.resolution
+        )
+        surface.add_end_points(*self.beams.arguments)
+        surface.fit()
+        return surface
+
+    def dwell(
+        self,
+        kernels: ModuleType,
+        surface: Any,
+        rho: list[float],
+        tau: list[float],
+        detection: float = 0.8,
+        **changes: float,
+    ) -> Any:
+        return (kernels.Dwell2D, kernels.Dwell3D)[self.beams.dimension - 2](
+            surface,
+            rho=rho,
+            tau=tau,
+            detection=detection,
+            seconds=1.0,
+            **{**self.lengths, **changes},
+        )
+
+    def scans(self, first: int, last: int) -> tuple[Any, ...]:
+        b = self.beams
+        part = slice(b.offset[first], b.offset[last])
+        offset = b.offset[first : last + 1] - b.offset[first]
+        return b.points[part], b.hit[part], offset, b.T_map_sensor[first:last]
+
+
+def make_room(
+    seed: int, dimension: int, resolution: float, scans: int, beams: int, noise: float = 0.01
+) -> Room:
+    """A slanted box of walls with a ball that wanders, on both sides of the origin."""
+    rng = np.random.default_rng(seed)
+    R = random_rotation(rng, dimension)
+    walls = np.concatenate([R, -R]), rng.uniform(1.2, 2.2, 2 * dimension)
+    mover, speed = np.zeros(dimension), rng.normal(scale=0.15, size=dimension)
+    T = np.tile(np.eye(dimension + 1), (scans, 1, 1))
+    points, hit = [], []
+    for t in range(scans):
+        T[t, :dimension, :dimension] = random_rotation(rng, dimension)
+        T[t, :dimension, dimension] = rng.uniform(-0.5, 0.5, dimension)
+        mover = mover + speed
+        u = rng.normal(size=(beams, dimension))
+        u /= np.linalg.norm(u, axis=1, keepdims=True)
+        origins = np.tile(T[t, :dimension, dimension], (beams, 1))
+        r = ranges(origins, u @ T[t, :dimension, :dimension].T, walls, mover, 0.3)
+        struck = r < 2.2
+        r = np.where(struck, r + rng.normal(scale=noise, size=beams), 2.2)
+        points.append(u * r[:, None])
+        hit.append(struck)
+    points = np.concatenate(points).astype(np.float32)
+    points[rng.random(len(points)) < 0.05, rng.integers(dimension)] = np.nan
+    step = rng.choice([0, 0, 1, 1, 2, 70, 5000], scans)
+    return Room(
+        Beams(
+            points=points,
+            hit=np.concatenate(hit) & np.isfinite(points).all(axis=1),
+            offset=np.arange(scans + 1) * beams,
+            T_map_sensor=T,
+            e=np.ones(len(points), np.float32),
+            resolution=resolution,
+        ),
+        look=np.cumsum(step),
+        lengths={
+            "lateral": 0.4 * resolution,
+            "margin": 1.2 * resolution,
+            "reach": 0.9 * resolution,
+            "beyond": 0.35,
+        },
+    )
+
+
+@pytest.fixture(scope="session")
+def a_room() -> Callable[..., Room]:
+    """Makes rooms."""
+    return make_room
 
 
 @pytest.fixture(params=[(2, 1), (2, 2), (3, 3), (3, 4)], ids=lambda p: f"{p[0]}D-{p[1]}")

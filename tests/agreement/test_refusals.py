@@ -177,3 +177,132 @@ def test_registration(kernel, name, value, error):
     getattr(_core, kernel)(**good)
     with pytest.raises(error, match=name):
         getattr(_core, kernel)(**{**good, name: value})
+
+
+def surface_of(dimension=2, fitted=True):
+    surface = (_core.Surface2D if dimension == 2 else _core.Surface3D)(0.5)
+    good = arguments("add_beams", dimension)
+    surface.add_end_points(*(good[k] for k in ("points", "hit", "offset", "T_map_sensor")))
+    if fitted:
+        surface.fit()
+    return surface
+
+
+def dwell_of(surface, **changes):
+    chosen = {
+        "rho": [0.9, 0.1],
+        "tau": [1.0, 2.0],
+        "detection": 0.9,
+        "seconds": 1.0,
+        "lateral": 0.1,
+        "margin": 0.2,
+        "reach": 0.3,
+        "beyond": 0.4,
+    }
+    kind = _core.Dwell2D if surface.dimension == 2 else _core.Dwell3D
+    return kind(surface, **{**chosen, **changes})
+
+
+WRONG_BEAMS = [
+    ("points", np.ones((5, 2)), TypeError),
+    ("points", np.ones((5, 4), np.float32), TypeError),
+    ("hit", np.ones(4, bool), ValueError),
+    ("hit", np.ones(5, np.uint8), TypeError),
+    ("offset", np.array([0, 2, 6]), ValueError),
+    ("offset", np.array([1, 2, 5]), ValueError),
+    ("offset", np.array([0, 6, 5]), ValueError),
+    ("offset", np.array([0, 2, 5], np.int32), TypeError),
+    ("T_map_sensor", np.tile(np.eye(5), (2, 1, 1)), TypeError),
+    ("T_map_sensor", np.tile(np.eye(3), (1, 1, 1)), ValueError),
+]
+
+
+@pytest.mark.parametrize("call", ["add_end_points", "elements_of", "add"])
+@pytest.mark.parametrize(("name", "value", "error"), WRONG_BEAMS)
+def test_beams_of_looks(call, name, value, error):
+    surface = surface_of()
+    beams = arguments("add_beams")
+    beams = {k: beams[k] for k in ("points", "hit", "offset", "T_map_sensor")}
+    target = dwell_of(surface) if call == "add" else surface
+    more = {"look": np.arange(2)} if call == "add" else {}
+    getattr(target, call)(**beams, **more)
+    with pytest.raises(error, match=name):
+        getattr(target, call)(**{**beams, name: value}, **more)
+
+
+@pytest.mark.parametrize("call", ["add_end_points", "elements_of", "add"])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_looks_from_nowhere(call, dimension):
+    surface = surface_of(dimension)
+    beams = arguments("add_beams", dimension)
+    beams = {k: beams[k] for k in ("points", "hit", "offset", "T_map_sensor")}
+    target = dwell_of(surface) if call == "add" else surface
+    more = {"look": np.arange(2)} if call == "add" else {}
+    for bad in (np.nan, 1e30):
+        T = beams["T_map_sensor"].copy()
+        T[1, 0, -1] = bad
+        with pytest.raises(ValueError, match="pose"):
+            getattr(target, call)(**{**beams, "T_map_sensor": T}, **more)
+
+
+@pytest.mark.parametrize("make", [_core.Surface2D, _core.Surface3D])
+@pytest.mark.parametrize("resolution", [0.0, -0.1, np.nan, np.inf])
+def test_surfaces_of_no_resolution(make, resolution):
+    with pytest.raises(ValueError, match="resolution"):
+        make(resolution)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("rho", [0.0, 0.5]),
+        ("rho", [0.5, 1.0]),
+        ("rho", [0.5, -0.1]),
+        ("rho", [0.5, np.nan]),
+        ("rho", [0.5]),
+        ("rho", [0.5] * 3),
+        ("rho", []),
+        ("tau", [0.0, 1.0]),
+        ("tau", [1.0, -1.0]),
+        ("tau", [1.0, np.nan]),
+        ("tau", [1.0]),
+        ("detection", 0.0),
+        ("detection", 1.0),
+        ("detection", np.nan),
+        *((n, v) for n in ("seconds", "lateral", "margin", "reach", "beyond")
+          for v in (0.0, -1.0, np.nan, np.inf)),
+    ],
+)  # fmt: skip
+def test_chains_of_no_sense(dimension, name, value):
+    surface = surface_of(dimension)
+    dwell_of(surface)
+    lengths = ("seconds", "lateral", "margin", "reach", "beyond")
+    with pytest.raises(ValueError, match="looks" if name in lengths else name):
+        dwell_of(surface, **{name: value})
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_looks_that_fall(dimension):
+    dwell = dwell_of(surface_of(dimension))
+    good = arguments("add_beams", dimension)
+    beams = [good[k] for k in ("points", "hit", "offset", "T_map_sensor")]
+    dwell.add(*beams, np.array([3, 5]))
+    before = dwell.likelihood()
+    for look in ([6, 5], [4, 6], [2**40, -(2**40)]):
+        with pytest.raises(ValueError, match="look"):
+            dwell.add(*beams, np.array(look))
+    for a, b in zip(before, dwell.likelihood(), strict=True):
+        assert a.tobytes() == b.tobytes()  # what is refused changes nothing
+    for look in (np.array([6]), np.array([6, 7, 8])):
+        with pytest.raises(ValueError, match="look"):
+            dwell.add(*beams, look)
+    for look in (np.array([6, 7], np.int32), np.array([[6, 7]]), np.array([6.0, 7.0])):
+        with pytest.raises(TypeError, match="look"):
+            dwell.add(*beams, look)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_surface_that_was_not_fitted(dimension):
+    with pytest.raises(ValueError, match="fit"):
+        dwell_of(surface_of(dimension, fitted=False))

@@ -81,7 +81,7 @@ def test_run_json_tells_the_run(mapped):
     assert (counts["scans"], counts["beams"]) == (40, 4800)
     assert counts["hits"] + counts["max_range"] + counts["unusable"] == counts["beams"]
     assert counts["hits"] == int(np.load(mapped[0] / "beams/hit.npy").sum())
-    assert {"read", "m_step", "e_step", "likelihood"} <= set(run["seconds"])
+    assert {"read", "m_step", "e_step", "maps"} <= set(run["seconds"])
     assert set(run["seconds"]) == set(run["peak_memory_bytes"])
 
 

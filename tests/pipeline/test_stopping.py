@@ -11,9 +11,10 @@ from stillmap.options import replaced
 from stillmap.pipeline import Iteration, Options
 
 
-def options(**changes):
+def options(estimator="stillmap", **changes):
     wanted = {"max_iterations": 10, "tolerance": 0.0, "patience": 3} | changes
-    return replaced(Options(), {"em": wanted, "slam": {"resolution": 0.1}, "threads": 1})
+    chosen = {"estimator": estimator, "em": wanted, "slam": {"resolution": 0.1}, "threads": 1}
+    return replaced(Options(), chosen)
 
 
 @pytest.fixture
@@ -47,9 +48,11 @@ def made_up(recording, number, bound) -> Iteration:
         poses=poses,
         covariance=np.full((T, 3, 3), float(number)),
         grid=grid,
-        weights=e,
+        weights=e / 2,
         p_static=e,
         likelihood=em.Likelihood(expected=bound - 1.0, bound=bound),
+        occupied=None,
+        learned={"number": number},
         changed_share=0.5 / number,
         explained=np.ones(T),
         widened=[],
@@ -63,8 +66,10 @@ def assert_kept(result, number):
     np.testing.assert_array_equal(result.p_static, np.float32(number / 100))
     np.testing.assert_array_equal(result.poses[:, 0, 2], 0.01 * number)
     np.testing.assert_array_equal(result.covariance, float(number))
+    assert result.learned == {"number": number}
     alpha = result.map.alpha.sum()
-    assert alpha == pytest.approx(recording.hit.sum() * number / 100, rel=1e-5)
+    made_from = 200 if result.options.estimator == "paper" else 100  # weights, or labels
+    assert alpha == pytest.approx(recording.hit.sum() * number / made_from, rel=1e-5)
     assert result.raw_map.alpha.sum() == recording.hit.sum()
     grid = _core.Grid2D(0.1)
     em.add_recording(grid, recording, result.poses, None)
@@ -82,11 +87,17 @@ def assert_kept(result, number):
         ([-4.0], 1),
     ],
 )
-def test_the_best_iterate_is_kept_whole(build, bounds, best):
-    result, asked = build(bounds, options())
+@pytest.mark.parametrize("estimator", ["stillmap", "paper"])
+def test_the_best_iterate_is_kept_whole(build, bounds, best, estimator):
+    result, asked = build(bounds, options(estimator))
     assert asked == len(bounds)
     assert_kept(result, best)
     assert not result.converged
+
+
+def test_counting_has_nothing_to_iterate(build):
+    result, asked = build([-5.0, -4.0, -3.0], options("hit-ratio"))
+    assert (asked, result.converged) == (1, True)
 
 
 def test_the_history_tells_every_iteration_and_not_only_the_best(build):

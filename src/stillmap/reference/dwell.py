@@ -15,8 +15,8 @@ from stillmap.reference.traverse import cell_of, traverse
 Float = NDArray[np.float64]
 
 HIT = -1.0  # instead of a reliability
-SUREST = 0.999  # no single beam is surer to have met what it passed
-LEAST = 0.02  # a look less reliable than this is none
+SURE = 0.95  # what a beam met more probably than that it met
+LEAST = 0.02  # what no beam met more probably than that nobody looked at
 
 
 @dataclass(frozen=True)
@@ -47,29 +47,25 @@ def look_at(surface: Surface, beams: Sequence[Beam], reading: Reading) -> dict[i
     """What the beams of one look say of each element: HIT, or how surely they saw through it.
 
     An element is hit where a beam ends in its cell or within `reach` of one in whose cell a beam
-    ends. The others whose cells beams cross before they end are seen through: R = 1 - the product
-    over these beams of 1 - P(the beam met the surface).
+    ends. The others whose cells beams cross before they end are seen through, as reliably as the
+    beam did that most probably met the surface: beams of one look share the error of its pose.
     """
     number = surface.numbers()
-    missed: dict[int, float] = {}
+    through: dict[int, float] = {}
     struck = set()
     for beam in beams:
         for k, met in _met(surface, number, beam, reading):
-            missed[k] = missed.get(k, 1.0) * (1.0 - met)
+            through[k] = max(through.get(k, 0.0), met)
         end = number.get(tuple(cell_of(beam.end, surface.resolution).tolist()))
         if beam.hit and end is not None:
             struck.add(end)
-    hit = {
-        k
-        for k, element in enumerate(surface.list)
-        if any(_apart(element, surface.list[s]) <= reading.reach for s in struck)
-    }
-    through = {k: 1.0 - m for k, m in missed.items() if k not in hit and 1.0 - m > LEAST}
-    return through | dict.fromkeys(hit | struck, HIT)
-
-
-def _apart(a: Element, b: Element) -> float:
-    return float(np.linalg.norm(a.mean - b.mean))
+    means = np.array([element.mean for element in surface.list])
+    hit: set[int] = set()
+    for s in struck:
+        apart = np.linalg.norm(means - means[s], axis=1)
+        hit.update(np.flatnonzero(apart <= reading.reach).tolist())
+    reliable = {k: 1.0 if met > SURE else met for k, met in through.items() if met > LEAST}
+    return reliable | dict.fromkeys(hit, HIT)
 
 
 def _met(
@@ -114,7 +110,7 @@ def _probability_met(
     aside = float(np.linalg.norm(off - (off @ direction) * direction))
     half = patch.half * abs(float(patch.normal @ direction)) if patch else half_round
     met = ndtr((half - aside) / reading.lateral) - ndtr((-half - aside) / reading.lateral)
-    return float(min(met, SUREST))
+    return float(met)
 
 
 def chain_log_likelihood(

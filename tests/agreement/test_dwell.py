@@ -1,0 +1,277 @@
+"""Elements, looks and chains in time of the core against the plain twin on small rooms."""
+
+from dataclasses import replace
+from itertools import pairwise, product
+from math import log
+
+import numpy as np
+import pytest
+
+from stillmap import _core, reference
+from stillmap.em.dwell import Classes
+from stillmap.reference.dwell import HIT, SURE, chain_log_likelihood
+
+CLASSES = Classes().grid()
+
+
+@pytest.fixture(
+    scope="module",
+    params=[(2, 0, 0.1, 24, 70), (2, 1, 0.07, 24, 70), (3, 2, 0.4, 16, 150)],
+    ids=["2D-0", "2D-1", "3D"],
+)
+def room(request, a_room):
+    dimension, seed, resolution, scans, beams = request.param
+    return a_room(seed, dimension, resolution, scans, beams)
+
+
+def order(surface):
+    """The elements by cell, whatever order they are numbered in."""
+    return np.lexsort(surface.elements()[0].T)
+
+
+def assert_same_surface(core, plain):
+    of_core, of_plain = order(core), order(plain)
+    assert core.size == plain.size == len(of_core) > 50
+    cells, means, normals, off_plane, beams = (a[of_core] for a in core.elements())
+    expected = tuple(a[of_plain] for a in plain.elements())
+    np.testing.assert_array_equal(cells, expected[0])
+    np.testing.assert_array_equal(beams, expected[4])
+    np.testing.assert_allclose(means, expected[1], atol=1e-6)
+    flat = expected[2].any(axis=1)
+    assert 0.4 < flat.mean() < 1
+    np.testing.assert_array_equal(normals.any(axis=1), flat)
+    side = np.where(np.einsum("kd,kd->k", normals, expected[2]) < 0, -1.0, 1.0)
+    np.testing.assert_allclose(normals * side[:, None], expected[2], atol=1e-4)
+    np.testing.assert_allclose(off_plane * side, expected[3], atol=1e-4)
+    assert np.abs(expected[3]).max() > 0.2 * core.resolution
+    assert core.scatter == pytest.approx(plain.scatter, rel=1e-3)
+
+
+def test_elements(room):
+    core, plain = room.surface(_core), room.surface(reference)
+    assert_same_surface(core, plain)
+    assert 0.005 < plain.scatter < 0.6 * room.beams.resolution
+
+
+@pytest.mark.parametrize(("noise", "least"), [(0.07, 0.04), (0.1, 0.06)])
+def test_noise_widens_the_window(a_room, noise, least):
+    loud = a_room(5, 2, 0.05, 24, 120, noise=noise)
+    core, plain = loud.surface(_core), loud.surface(reference)
+    assert_same_surface(core, plain)
+    assert plain.scatter > least  # a window of two cells to each side would see less
+
+
+def test_elements_of(room, a_room):
+    core, plain = room.surface(_core), room.surface(reference)
+    other = a_room(9, room.beams.dimension, room.beams.resolution, 8, 60).beams
+    for beams in (room.beams, other):
+        found = core.elements_of(*beams.arguments)
+        expected = plain.elements_of(*beams.arguments)
+        cells = [s.elements()[0] for s in (core, plain)]
+        assert found.dtype == expected.dtype == np.int32
+        np.testing.assert_array_equal(found < 0, expected < 0)
+        some = found >= 0
+        np.testing.assert_array_equal(cells[0][found[some]], cells[1][expected[some]])
+        assert found.tobytes() == core.elements_of(*beams.arguments, 3).tobytes()
+    assert (expected >= 0).any()
+    assert (expected[other.hit] < 0).any()
+    np.testing.assert_array_equal(core.elements_of(*room.beams.arguments) >= 0, room.beams.hit)
+
+
+def reliability(dwell):
+    """What one look said of each element: HIT, 0 for nothing, else how surely it saw through.
+
+    One class with rho = a = 1/2: a hit has probability 1/4, seeing through 1 - R / 4.
+    """
+    _, log_best = dwell.likelihood()
+    p = np.exp(log_best) / 4
+    return np.where(p < 0.5, HIT, np.round(4 * (1 - p), 6))
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"normals": False}, {"margin": 0.25}, {"normals": False, "lateral": 0.01}]
+)
+def test_what_a_look_says(room, changes):
+    surfaces = room.surface(_core), room.surface(reference)
+    seen = hits = partly = silent = 0
+    for t in range(0, len(room.look), 2):
+        found = []
+        for kernels, surface in zip((_core, reference), surfaces, strict=True):
+            dwell = room.dwell(kernels, surface, [0.5], [1.0], 0.5, **changes)
+            dwell.add(*room.scans(t, t + 2), np.array([7, 7]))
+            found.append(reliability(dwell)[order(surface)])
+        core, plain = found
+        np.testing.assert_array_equal(core == HIT, plain == HIT)
+        # what nearly is sure or nearly nothing may be rounded to it or not
+        edge = (np.abs(plain - SURE) < 0.006) | (plain < 0.03) & (core < 0.03)
+        sure = (plain == 1.0) & (core > SURE - 0.006)
+        np.testing.assert_allclose(core[~(edge | sure)], plain[~(edge | sure)], atol=6e-3)
+        hits += (plain == HIT).sum()
+        seen += (plain == 1.0).sum()
+        partly += ((plain > 0.05) & (plain < 0.9)).sum()
+        silent += (plain == 0.0).sum()
+    assert min(hits, silent) > 20
+    assert partly + seen > 10
+    assert seen > 5 or "lateral" not in changes
+
+
+def test_likelihood(room):
+    rho, tau = [0.998, 0.6, 0.05, 0.15], [25.0, 5.0, 0.5, 45.0]
+    found = []
+    for kernels in (_core, reference):
+        surface = room.surface(kernels)
+        dwell = room.dwell(kernels, surface, rho, tau)
+        dwell.add(*room.beams.arguments, room.look)
+        relative, log_best = dwell.likelihood()
+        assert relative.dtype == np.float32
+        assert relative.max(axis=1) == pytest.approx(1.0)
+        values = np.log(np.maximum(relative, 1e-30)) + log_best[:, None]
+        found.append(values[order(surface)])
+    core, plain = found
+    error = np.abs(core - plain)
+    assert np.quantile(error, 0.9) < 0.03
+    assert error.max() < 0.3  # a few looks at the edge of being sure
+    assert np.abs(np.diff(plain, axis=1)).max() > 5
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("cuts", [[], [3], [1, 2, 7, 8, 15]])
+def test_threads_and_pieces_change_no_bit(room, threads, cuts):
+    surface = room.surface(_core)
+    whole = room.dwell(_core, surface, *CLASSES, 0.97)
+    whole.add(*room.beams.arguments, room.look)
+    pieces = room.dwell(_core, surface, *CLASSES, 0.97)
+    bounds = [0, *(int(np.searchsorted(room.look, room.look[c])) for c in cuts), len(room.look)]
+    for first, last in pairwise(bounds):  # looks stay whole
+        pieces.add(*room.scans(first, last), room.look[first:last], threads)
+    for a, b in zip(whole.likelihood(), pieces.likelihood(), strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_asking_on_the_way_changes_nothing_that_matters(room):
+    surface = room.surface(_core)
+    whole, asked = (room.dwell(_core, surface, *CLASSES, 0.97) for _ in range(2))
+    whole.add(*room.beams.arguments, np.arange(len(room.look)))
+    for t in range(len(room.look)):
+        asked.add(*room.scans(t, t + 1), np.array([t]))
+        first, again = asked.likelihood(), asked.likelihood()
+        for a, b in zip(first, again, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
+    for a, b in zip(whole.likelihood(), asked.likelihood(), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+
+
+def test_the_order_of_the_beams_of_a_look_does_not_matter(room):
+    surface = room.surface(_core)
+    values = []
+    for flip in (False, True):
+        dwell = room.dwell(_core, surface, *CLASSES, 0.97)
+        points, hit, offset, T = room.beams.arguments
+        if flip:
+            points, hit = points.copy(), hit.copy()
+            for a, b in pairwise(offset):
+                points[a:b], hit[a:b] = points[a:b][::-1].copy(), hit[a:b][::-1].copy()
+        dwell.add(points, hit, offset, T, room.look)
+        values.append(dwell.likelihood())
+    for a, b in zip(*values, strict=True):
+        np.testing.assert_allclose(a, b, rtol=2e-2, atol=2e-2)
+        assert (a == b).mean() > 0.9  # the first to be nearly sure stops the search
+
+
+def lane(seen, rho, tau, detection, seconds=1.0):
+    """Log likelihood per class of one element of which (look, hit or seen through) was seen."""
+    surface = _core.Surface2D(0.1)
+    T, offset = np.eye(3)[None].copy(), np.array([0, 1])
+    T[0, 1, 2] = 0.05
+    ends, none = np.array([[1.05, 0]], np.float32), np.array([[4, 0]], np.float32)
+    yes, no = np.ones(1, bool), np.zeros(1, bool)
+    surface.add_end_points(ends, yes, offset, T)
+    surface.fit()
+    dwell = _core.Dwell2D(
+        surface, rho=rho, tau=tau, detection=detection, seconds=seconds,
+        lateral=0.01, margin=0.1, reach=0.05, beyond=0.3,
+    )  # fmt: skip
+    for look, hit in seen:
+        dwell.add(ends if hit else none, yes if hit else no, offset, T, np.array([look]))
+    relative, log_best = dwell.likelihood()
+    return np.log(np.maximum(relative[0], 1e-37)) + log_best[0]
+
+
+def chain(seen, rho, tau, detection, seconds=1.0):
+    looks = [(look * seconds, HIT if hit else 1.0) for look, hit in seen]
+    return np.array(
+        [
+            chain_log_likelihood(looks, r, t, detection) - log(r * detection)
+            for r, t in zip(rho, tau, strict=True)
+        ]
+    )
+
+
+def random_looks(seed, n, stays):
+    """Runs of hits and of misses; gaps of one look mostly, some beyond any table."""
+    rng = np.random.default_rng(seed)
+    hit = np.logical_xor.accumulate(rng.random(n) > stays)
+    gaps = np.where(rng.random(n) < 0.9, 1, rng.choice([2, 5, 63, 64, 65, 300, 10**6], n))
+    return list(zip(np.cumsum(gaps).tolist(), hit.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize(("n", "stays"), [(1, 0.5), (12, 0.5), (60, 0.8), (300, 0.97)])
+@pytest.mark.parametrize("seconds", [1.0, 0.2])
+def test_a_chain(seed, n, stays, seconds):
+    seen = random_looks(seed, n, stays)
+    found = lane(seen, *CLASSES, 0.97, seconds)
+    expected = chain(seen, *CLASSES, 0.97, seconds)
+    likely = expected > expected.max() - 20  # further down it only has to stay there
+    np.testing.assert_allclose(found[likely], expected[likely], atol=0.1)
+    assert (found[~likely] < found.max() - 18).all()
+
+
+@pytest.mark.parametrize("detection", [0.6, 0.8, 0.9, 0.99])
+@pytest.mark.parametrize("misses", [3, 6, 20, 200])
+def test_seen_through_again_and_again(detection, misses):
+    seen = [(0, True), *((1 + i, False) for i in range(misses)), (1 + misses, True)]
+    found, expected = lane(seen, *CLASSES, detection), chain(seen, *CLASSES, detection)
+    likely = expected > expected.max() - 20
+    np.testing.assert_allclose(found[likely], expected[likely], atol=0.1)
+
+
+def test_chain_that_never_changes():
+    # tau beyond all measure: it is there or it is not, and one of the two has to have failed
+    seen = [(0, True), *((i, False) for i in range(1, 60)), (60, True)]
+    found = lane(seen, [0.5, 0.9], [1e12, 1e12], 0.97)
+    assert np.isfinite(found).all()
+
+
+def test_chain_by_all_its_histories():
+    # the forward algorithm against the sum over every sequence of empty and occupied
+    rng = np.random.default_rng(3)
+    for rho, tau, detection in ((0.3, 2.0, 0.9), (0.95, 10.0, 0.6)):
+        times = np.cumsum(rng.exponential(2.0, 8))
+        seen = [(t, HIT if rng.random() < 0.4 else rng.uniform()) for t in times]
+        total = 0.0
+        for states in product((0, 1), repeat=len(seen)):
+            p = (1 - rho, rho)[states[0]]
+            for i in range(1, len(seen)):
+                kept = np.exp(-(times[i] - times[i - 1]) / tau)
+                p *= kept * (states[i] == states[i - 1]) + (1 - kept) * (1 - rho, rho)[states[i]]
+            for state, (_, reliability) in zip(states, seen, strict=True):
+                hit = reliability == HIT
+                p *= (float(not hit), detection if hit else 1 - detection * reliability)[state]
+            total += p
+        assert chain_log_likelihood(seen, rho, tau, detection) == pytest.approx(log(total))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_nothing_was_ever_hit(a_room, dimension):
+    far = a_room(1, dimension, 0.2, 4, 20)
+    beams = far.beams.with_(hit=np.zeros(len(far.beams.hit), bool))
+    nothing = replace(far, beams=beams)
+    for kernels in (_core, reference):
+        surface = nothing.surface(kernels)
+        assert (surface.size, surface.scatter) == (0, 0.0)
+        dwell = nothing.dwell(kernels, surface, *CLASSES)
+        dwell.add(*beams.arguments, nothing.look)
+        relative, log_best = dwell.likelihood()
+        assert (relative.shape, log_best.shape) == ((0, len(CLASSES[0])), (0,))
+        assert (surface.elements_of(*beams.arguments) == -1).all()

@@ -1,0 +1,138 @@
+"""Recordings made up by hand: one look a second at a wall, with things in front of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from stillmap import _core, em
+from stillmap.recording.model import Recording
+
+RESOLUTION = 0.1
+FAR = 30.0  # metres: maximum range
+
+
+@dataclass(frozen=True)
+class Ball:
+    """Something round that stands in a place for a while."""
+
+    x: float
+    y: float
+    since: float  # seconds
+    until: float
+    radius: float = 0.25
+
+    def ranges(self, origin: Any, directions: Any) -> Any:
+        off = np.zeros_like(origin)
+        off[:2] = self.x, self.y
+        off = off - origin
+        along = directions @ off
+        depth = self.radius**2 - off @ off + along**2
+        near = along - np.sqrt(np.maximum(depth, 0.0))
+        return np.where((depth > 0) & (near > 0), near, np.inf)
+
+
+@dataclass(frozen=True)
+class Wall:
+    """The half space beyond normal . x = distance ends beams, within `width` of its foot."""
+
+    normal: Sequence[float]
+    distance: float
+    width: float = np.inf
+
+    def ranges(self, origin: Any, directions: Any) -> Any:
+        n = np.array(self.normal, float) / np.linalg.norm(self.normal)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            r = (self.distance - origin @ n) / (directions @ n)
+            beside = origin + directions * r[:, None] - n * self.distance
+        inside = np.linalg.norm(beside, axis=1) <= self.width
+        return np.where((r > 0) & inside, r, np.inf)
+
+
+def fan(beams: int = 181, width: float = 180.0) -> Any:
+    """(beams, 2) directions about the x axis."""
+    a = np.radians(np.linspace(-width / 2, width / 2, beams))
+    return np.column_stack([np.cos(a), np.sin(a)])
+
+
+def cone(side: int = 25, width: float = 90.0) -> Any:
+    """(side^2, 3) directions about the x axis."""
+    t = np.tan(np.radians(np.linspace(-width / 2, width / 2, side)))
+    y, z = np.meshgrid(t, t)
+    u = np.column_stack([np.ones(y.size), y.ravel(), z.ravel()])
+    return u / np.linalg.norm(u, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A recording of one look after the other from one place, and what reflected each beam."""
+
+    recording: Recording
+    what: Any  # (M,) number of the wall or ball, -1: nothing
+
+    @property
+    def poses(self) -> Any:
+        D = self.recording.dimension
+        return np.tile(np.eye(D + 1), (self.recording.n_scans, 1, 1))
+
+    def grid(self, e: Any = None, resolution: float = RESOLUTION) -> Any:
+        """The sums of (10); every hit counts as static without e."""
+        D = self.recording.dimension
+        grid = (_core.Grid2D, _core.Grid3D)[D - 2](resolution)
+        if D == 2:
+            em.add_recording(grid, self.recording, self.poses, e)
+        return grid
+
+    def e_step(
+        self, resolution: float = RESOLUTION, estimator: em.Estimator = "stillmap", **options: Any
+    ) -> em.Expectations:
+        grid = self.grid(None, resolution)
+        return em.e_step(self.recording, self.poses, grid, estimator, em.EmOptions(**options))
+
+    def of(self, values: Any, *what: int) -> Any:
+        """The values of the beams that these walls or balls reflected."""
+        return values[np.isin(self.what, what)]
+
+
+def watch(
+    things: Sequence[Wall | Ball],
+    seconds: float = 60.0,
+    directions: Any = None,  # (n, D), or what gives them at a time
+    *,
+    every: float = 1.0,
+    noise: float = 0.01,
+    most: float = FAR,
+    seed: int = 0,
+) -> Watched:
+    """Watches walls and balls from the origin."""
+    rng = np.random.default_rng(seed)
+    looking = directions if callable(directions) else lambda _: directions
+    directions = fan() if directions is None else directions
+    times = np.arange(0.0, seconds, every)
+    points, what = [], []
+    offset = [0]
+    for t in times:
+        u = looking(t)
+        offset.append(offset[-1] + len(u))
+        ranges = np.full((len(things) + 1, len(u)), np.inf)  # the last: nothing
+        for i, thing in enumerate(things):
+            if isinstance(thing, Wall) or thing.since <= t < thing.until:
+                ranges[i] = thing.ranges(np.zeros(u.shape[1]), u)
+        nearest = ranges.argmin(axis=0)
+        r = ranges.min(axis=0)
+        seen = r < most
+        what.append(np.where(seen, nearest, -1))
+        r = np.where(seen, r + rng.normal(scale=noise, size=len(u)), most)
+        points.append(u * r[:, None])
+    what_hit, D = np.concatenate(what), u.shape[1]
+    recording = Recording(
+        stamp_ns=np.round(times * 1e9).astype(np.int64),
+        offset=np.array(offset),
+        points=np.concatenate(points).astype(np.float32),
+        hit=what_hit >= 0,
+        T_base_sensor=np.eye(D + 1)[None],
+        sensor=np.zeros(len(times), np.int32),
+        T_odom_base=None,
+    )
+    return Watched(recording, what_hit)

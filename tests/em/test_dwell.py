@@ -1,0 +1,253 @@
+"""The default estimator on cases that can be judged by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_up import Ball, Wall, Watched, cone, fan, watch
+
+from stillmap import _core, em
+from stillmap.em import chunks, dwell
+from stillmap.em.dwell import CLASSES
+from stillmap.evaluation.labels import calibration_error, equal_width_bins
+from stillmap.simulation import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
+from stillmap.simulation.walls import box
+
+WALLS = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
+BALL = len(WALLS)  # the number of the first ball
+
+
+def passing(since, x=1.5, speed=1.0):
+    """Walks past along y, each look in another place."""
+    return [Ball(x, -2.4 + speed * k, since + k, since + k + 1) for k in range(int(4.8 / speed))]
+
+
+@pytest.fixture(scope="module")
+def busy() -> Watched:
+    """A room for a minute and a half: one walks past, one stands for 20 s and leaves."""
+    return watch([*WALLS, *passing(30), Ball(2.5, 1.0, 40, 60)], seconds=90)
+
+
+@pytest.fixture(scope="module")
+def known(busy):
+    return busy.e_step()
+
+
+def test_a_wall_that_always_stood_there_is_static(busy, known):
+    e = busy.of(known.p_static, 0, 1, 2)
+    assert np.median(e) > 0.99
+    assert np.quantile(e, 0.02) > 0.9
+
+
+def test_who_walks_past_is_not(busy, known):
+    e = busy.of(known.p_static, *range(BALL, BALL + 4))
+    assert len(e) > 30
+    assert e.max() < 0.1
+
+
+def test_who_stands_for_a_while_and_leaves_is_not(busy, known):
+    e = busy.of(known.p_static, BALL + 4)
+    assert len(e) > 100
+    assert np.median(e) < 0.05
+    assert np.quantile(e, 0.95) < 0.3
+
+
+@pytest.mark.parametrize(("since", "until"), [(0, 25), (65, 90)])
+def test_who_was_there_at_the_beginning_or_stays_to_the_end_is_not(since, until):
+    seen = watch([*WALLS, *passing(30), Ball(2.5, 1.0, since, until)], seconds=90)
+    e = seen.of(seen.e_step().p_static, BALL + 4)
+    assert np.median(e) < 0.2
+
+
+def test_what_it_learned(busy, known):
+    movers = (busy.what >= BALL).sum() / (busy.what >= 0).sum()
+    assert known.learned["p_static"] == pytest.approx(1 - movers, abs=0.02)
+    assert 0.005 < known.learned["scatter"] < 0.03
+    for name in ("static_occupied", "mover_occupied", "mover_seconds"):
+        assert sum(row["share"] for row in known.learned[name]) == pytest.approx(1, abs=1e-4)
+
+
+def test_who_was_seen_once_and_nothing_before_or_after_is_anybodys_guess():
+    # in the last look alone the sensor turns round, and sees another wall and somebody
+    u = fan()
+    behind = [Wall((-1, 0), 5.0), Ball(-2.0, 1.0, 0, 90)]
+    seen = watch([*WALLS, *passing(30), *behind], 60, lambda t: u if t < 59 else -u)
+    found = seen.e_step()
+    once = seen.of(found.p_static, BALL + 4, BALL + 5)
+    assert len(once) > 20
+    assert once == pytest.approx(found.learned["p_static"], abs=1e-6)
+    assert np.ptp(found.p_static) > 0.9
+
+
+def test_maximum_range_tells_the_prior_and_unusable_nothing(busy):
+    r = busy.recording
+    points, hit = r.points.copy(), r.hit.copy()
+    points[50:60], hit[50:60] = np.nan, False
+    hit[100:110] = False
+    changed = replace(busy, recording=replace(r, points=points, hit=hit))
+    found = changed.e_step()
+    assert found.p_static.dtype == np.float32
+    assert np.isnan(found.p_static[50:60]).all()
+    assert found.p_static[100:110] == pytest.approx(found.learned["p_static"])
+    assert np.isfinite(found.p_static).sum() == len(hit) - 10
+
+
+@pytest.mark.parametrize("slant", [70, 80, 85])
+def test_a_wall_at_a_slant_that_beams_graze_stays(slant):
+    # each beam passes close by all of the wall before the place where it ends
+    distance = 6 * np.cos(np.radians(slant))  # this far away under the slant
+    u = fan(161, width=2 * (90 - slant + 6))
+    walls = [Wall((0, 1), distance), Wall((1, 0), 14.0)]
+    movers = [Ball(3.0, -0.1, 30, 33)]
+    seen = watch([*walls, *movers], 60, u, noise=0.02)
+    e = seen.of(seen.e_step().p_static, 0)
+    assert len(e) > 500
+    assert np.quantile(e, 0.05) > 0.9
+
+
+def test_a_corner_that_beams_pass_closely_stays():
+    # the end of a wall: beside it beams go on, within a cell of its last end points
+    seen = watch([Wall((1, 0), 2.0, width=0.53), *WALLS, *passing(30)], 60, fan(361))
+    e = seen.of(seen.e_step().p_static, 0)
+    assert np.quantile(e, 0.05) > 0.8
+
+
+def rows(seen, x, y, radius):
+    """Cells near a place with the likelihood of every class."""
+    surface = dwell.surface_of(seen.recording, seen.poses, 0.1)
+    rho, tau = CLASSES.grid()
+    chains = _core.Dwell2D(
+        surface, rho=rho, tau=tau, detection=0.97, seconds=1.0,
+        lateral=0.03, margin=0.1, reach=0.1, beyond=0.3,
+    )  # fmt: skip
+    r = seen.recording
+    chains.add(r.points, r.hit, r.offset, seen.poses, np.arange(r.n_scans))
+    cells, means, *_ = surface.elements()
+    near = np.hypot(*(means - (x, y)).T) < radius
+    values = chains.likelihood()[0]
+    return {tuple(c): v for c, v in zip(cells[near].tolist(), values[near], strict=True)}
+
+
+def test_people_far_apart_do_not_help_each_other():
+    alone = Ball(2.0, 1.2, 10, 20)
+    other = Ball(2.0, -1.2, 20, 60)
+    one = rows(watch([*WALLS, alone], 60), 2.0, 1.2, 0.5)
+    both = rows(watch([*WALLS, alone, other], 60), 2.0, 1.2, 0.5)
+    assert one.keys() == both.keys()
+    assert len(one) > 3
+    for cell, row in one.items():
+        np.testing.assert_array_equal(row, both[cell])
+
+
+def test_companions_of_the_same_look_do_not_vote(busy, known):
+    r = busy.recording
+    twice = replace(
+        r, points=np.repeat(r.points, 2, axis=0), hit=np.repeat(r.hit, 2), offset=2 * r.offset
+    )
+    found = replace(busy, recording=twice).e_step()
+    np.testing.assert_allclose(found.p_static[::2], known.p_static, atol=0.005)
+    np.testing.assert_array_equal(found.p_static[::2], found.p_static[1::2])
+
+
+def test_a_look_may_be_many_scans(busy, known):
+    r = busy.recording
+    offset = np.unique(np.concatenate([r.offset, (r.offset[1:] + r.offset[:-1]) // 2]))
+    split = replace(
+        r,
+        offset=offset,
+        stamp_ns=np.repeat(r.stamp_ns, 2) + np.tile([0, 10**8], r.n_scans),
+        sensor=np.zeros(2 * r.n_scans, np.int32),
+    )
+    found = replace(busy, recording=split).e_step()
+    assert found.p_static.tobytes() == known.p_static.tobytes()
+    assert found.likelihood == known.likelihood
+
+
+@pytest.mark.parametrize("beams", [1, 1000, 5000])
+def test_pieces_and_threads_change_no_bit(busy, known, monkeypatch, beams):
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
+    for threads in (1, 3):
+        options = em.EmOptions()
+        grid = _core.Grid2D(0.1)
+        found = em.e_step(busy.recording, busy.poses, grid, "stillmap", options, threads)
+        assert found.p_static.tobytes() == known.p_static.tobytes()
+        assert found.likelihood == known.likelihood
+        assert found.learned == known.learned
+
+
+def test_where_it_begins_does_not_matter(busy, known):
+    # stamps and the place of the map are only conventions
+    r = busy.recording
+    later = replace(busy, recording=replace(r, stamp_ns=r.stamp_ns + 123 * 10**15))
+    assert later.e_step().p_static.tobytes() == known.p_static.tobytes()
+    moved = busy.poses
+    moved[:, :2, 2] = 800.0, -1600.0  # whole cells
+    found = dwell.e_step(r, moved, 0.1, em.EmOptions())
+    np.testing.assert_allclose(found.p_static, known.p_static, atol=0.02)
+
+
+def test_the_bound_is_above_the_expectation_and_prefers_true_poses(busy, known):
+    assert known.likelihood.bound > known.likelihood.expected
+    rng = np.random.default_rng(0)
+    shaken = busy.poses
+    shaken[:, :2, 2] += rng.normal(scale=0.15, size=(len(shaken), 2))
+    found = dwell.e_step(busy.recording, shaken, 0.1, em.EmOptions())
+    assert found.likelihood.bound < known.likelihood.bound
+
+
+@pytest.mark.parametrize("options", [{"normals": False}, {"look": 2.0}, {"detection": 0.9}])
+def test_options_reach_it(busy, known, options):
+    found = busy.e_step(dwell=em.DwellOptions(**options))
+    assert found.p_static.tobytes() != known.p_static.tobytes()
+    assert np.median(busy.of(found.p_static, 0, 1, 2)) > 0.9
+
+
+def test_the_same_in_space():
+    wall, ball = Wall((1, 0, 0), 4.1), Ball(2.0, 0.3, 15, 25, radius=0.5)
+    seen = watch([wall, ball], 40, cone())
+    found = seen.e_step(resolution=0.3)
+    assert np.quantile(seen.of(found.p_static, 0), 0.02) > 0.9
+    assert len(seen.of(found.p_static, 1)) > 200
+    assert np.quantile(seen.of(found.p_static, 1), 0.9) < 0.2
+    assert found.occupied.cells.shape[1] == 3
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_nothing_hit_is_as_static_as_the_prior_says(dimension):
+    seen = watch([], 10, fan() if dimension == 2 else cone(5))
+    found = seen.e_step(prior=0.8)
+    np.testing.assert_array_equal(found.p_static, np.float32(0.8))
+    assert np.isfinite([found.likelihood.bound, found.likelihood.expected]).all()
+    assert len(found.occupied.cells) == 0
+
+
+def test_one_hit():
+    seen = watch([Ball(2.0, 0.0, 0, 9, radius=0.01)], 1, fan(3, 40))
+    assert seen.recording.hit.sum() == 1
+    found = seen.e_step(prior=0.7)
+    # everything is as likely as before: not seen again
+    assert found.p_static[1] == pytest.approx(0.7, abs=1e-6)
+
+
+@pytest.fixture(scope="module")
+def crowd():
+    """Three minutes in a room with four people, at poses that are known."""
+    scene = Scene(
+        "room",
+        walls=(*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),
+        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5), (-2.5, -1.5)),
+        crowd=CrowdOptions(people=4),
+        laser=LaserOptions(beams=180, range_noise=0.01, max_range=12.0),
+        robot=RobotOptions(scans=500),
+    )
+    return simulate(scene, np.random.default_rng(7))
+
+
+def test_it_knows_how_sure_it_is(crowd):
+    r = crowd.recording
+    found = dwell.e_step(r, crowd.truth.T_world_base, 0.05, em.EmOptions())
+    p, static = found.p_static[r.hit].astype(float), crowd.truth.static[r.hit]
+    assert 0.01 < 1 - static.mean() < 0.4
+    assert calibration_error(p, static, equal_width_bins(p)) < 0.01
+    assert p[static].mean() > 0.97
+    assert p[~static].mean() < 0.15

@@ -1,0 +1,80 @@
+"""Counting: hits against passages, one half at the threshold."""
+
+import numpy as np
+import pytest
+from made_up import Ball, Wall, watch
+
+from stillmap import _core, em
+from stillmap.recording.model import Recording
+
+
+def lane(hits, passes):
+    """Hits in cell 3 of a lane of cells of one metre, and beams that pass through it."""
+    n = hits + passes
+    points = np.zeros((n, 2), np.float32)
+    points[:, 0] = [3.0] * hits + [6.0] * passes
+    return Recording(
+        stamp_ns=np.zeros(1, np.int64),
+        offset=np.array([0, n]),
+        points=points,
+        hit=np.arange(n) < hits,
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(1, np.int32),
+        T_odom_base=None,
+    )
+
+
+def counted(recording, threshold):
+    poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
+    poses[:, :2, 2] = 0.5
+    grid = _core.Grid2D(1.0)
+    em.add_recording(grid, recording, poses, None)
+    return grid, em.e_step(
+        recording, poses, grid, "hit-ratio", em.EmOptions(hit_ratio=threshold), threads=1
+    )
+
+
+@pytest.mark.parametrize(("hits", "passes"), [(1, 3), (2, 3), (5, 5), (1, 0), (1, 19)])
+@pytest.mark.parametrize("threshold", [0.1, 0.25, 0.4, 0.6])
+def test_a_half_is_at_the_threshold(hits, passes, threshold):
+    recording = lane(hits, passes)
+    grid, found = counted(recording, threshold)
+    ratio = hits / (hits + passes)
+    odds = ratio / max(1 - ratio, 1e-300) * (1 - threshold) / threshold
+    expected = odds / (1 + odds)
+    assert found.p_static[:hits] == pytest.approx(expected, abs=1e-6)
+    if abs(ratio - threshold) > 1e-9:
+        assert (found.p_static[:hits] > 0.5).all() == (ratio > threshold)
+    else:
+        assert found.p_static[:hits] == pytest.approx(0.5, abs=1e-6)
+    m = em.occupancy_map(grid, found.occupied)
+    row, column = -round(m.origin[1]), 3 - round(m.origin[0])
+    assert m.p_occupied[row, column] == float(ratio >= threshold)
+    assert found.occupied.cells.tolist() == [[3, 0]]
+
+
+def test_cells_that_were_only_passed_are_free():
+    grid, found = counted(lane(1, 1), 0.25)
+    m = em.occupancy_map(grid, found.occupied)
+    known = m.alpha + m.beta > 0
+    assert (m.p_occupied[known & (m.alpha == 0)] == 0).all()
+    assert np.isnan(m.p_occupied[~known]).all()
+
+
+def test_in_the_order_of_the_ratio():
+    seen = watch([Wall((1, 0), 4.05), Ball(2.0, 0.0, 3, 5), Ball(2.0, 1.0, 5, 15)], 20)
+    p = seen.e_step(estimator="hit-ratio").p_static
+    briefly, longer, always = (np.median(seen.of(p, k)) for k in (1, 2, 0))
+    assert briefly < 0.5 < longer < always
+    assert (p[~seen.recording.hit] == np.float32(0.75)).all()
+
+
+def test_one_iteration_and_all_believed():
+    options = em.EmOptions()
+    assert em.iterations("hit-ratio", options) == 1
+    assert em.iterations("stillmap", options) == em.iterations("paper", options) == 6
+    recording = lane(2, 1)
+    assert (em.initial_expectations(recording, "hit-ratio", options) == 1).all()
+    for estimator in ("stillmap", "paper"):
+        e = em.initial_expectations(recording, estimator, options)
+        assert (e == np.float32(options.prior)).all()

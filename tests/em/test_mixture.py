@@ -1,0 +1,105 @@
+"""Shares of classes: what expectation maximisation must do, and what it makes of nothing."""
+
+import numpy as np
+import pytest
+
+from stillmap.em.mixture import fit_shares, posterior_static
+
+N_STATIC = 2
+
+
+def members(rng, shares, n, spread=2.0):
+    """(n, C) likelihoods, relative to the best, of classes that are centres along a line."""
+    kind = rng.choice(len(shares), n, p=shares)
+    x = rng.normal(kind * spread, 1.0)
+    log_p = -0.5 * (x[:, None] - spread * np.arange(len(shares))) ** 2
+    return np.exp(log_p - log_p.max(axis=1, keepdims=True)).astype(np.float32), kind
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("start", [0.1, 0.5, 0.95])
+def test_no_iteration_lowers_the_likelihood(seed, start):
+    rng = np.random.default_rng(seed)
+    likelihood, _ = members(rng, [0.5, 0.2, 0.2, 0.1], 300)
+    count = rng.integers(1, 9, 300)
+
+    def objective(shares):
+        # one pseudo beam per class, shared within the static and within the moving classes
+        s, m = shares.classes[:N_STATIC], shares.classes[N_STATIC:]
+        pseudo = np.log(s / s.sum()).sum() + np.log(m / m.sum()).sum()
+        return float(count @ np.log(likelihood.astype(float) @ shares.classes)) + pseudo
+
+    values = [
+        objective(fit_shares(likelihood, count, N_STATIC, start, iterations=n, tolerance=-1.0))
+        for n in (1, 2, 3, 5, 8, 13, 50, 100)
+    ]
+    assert np.diff(values).min() > -1e-9 * abs(values[0])
+    assert values[-1] > values[0] + 0.1
+
+
+def test_known_shares_are_found():
+    true = np.array([0.45, 0.3, 0.2, 0.05])
+    likelihood, kind = members(np.random.default_rng(1), true, 40000, spread=2.5)
+    found = fit_shares(likelihood, np.ones(len(kind), np.int64), N_STATIC, 0.5)
+    assert found.classes == pytest.approx(true, abs=0.012)
+    assert found.static == pytest.approx(0.75, abs=0.01)
+    assert found.static == pytest.approx(found.classes[:N_STATIC].sum())
+    assert found.classes.sum() == pytest.approx(1.0)
+    p = posterior_static(likelihood, found.classes, N_STATIC)
+    assert p.dtype == np.float32
+    for low in np.arange(0.0, 1.0, 0.2):
+        these = (p >= low) & (p < low + 0.2)
+        assert p[these].mean() == pytest.approx((kind[these] < N_STATIC).mean(), abs=0.04)
+
+
+def test_a_count_is_so_many_members():
+    rng = np.random.default_rng(2)
+    likelihood, _ = members(rng, [0.5, 0.2, 0.2, 0.1], 200)
+    count = rng.integers(0, 5, 200)
+    counted = fit_shares(likelihood, count, N_STATIC, 0.5)
+    alone = fit_shares(
+        np.repeat(likelihood, count, axis=0), np.ones(count.sum(), np.int64), N_STATIC, 0.5
+    )
+    assert counted.classes == pytest.approx(alone.classes, rel=1e-9)
+    assert counted.log_likelihood == pytest.approx(alone.log_likelihood, rel=1e-9)
+
+
+def test_it_stops_when_nothing_is_gained():
+    likelihood, _ = members(np.random.default_rng(3), [0.5, 0.2, 0.2, 0.1], 500)
+    count = np.ones(500, np.int64)
+    enough, more = (
+        fit_shares(likelihood, count, N_STATIC, 0.5, iterations=n, tolerance=1e-4)
+        for n in (200, 400)
+    )
+    assert (enough.classes == more.classes).all()
+    longer = fit_shares(likelihood, count, N_STATIC, 0.5, iterations=400, tolerance=0.0)
+    assert (longer.classes != more.classes).any()
+    assert longer.log_likelihood >= more.log_likelihood
+
+
+@pytest.mark.parametrize("start", [0.3, 0.9])
+def test_without_members_it_knows_what_it_was_told(start):
+    found = fit_shares(np.zeros((0, 4), np.float32), np.zeros(0, np.int64), N_STATIC, start)
+    assert found.static == pytest.approx(start)
+    assert found.classes.sum() == pytest.approx(1.0)
+    assert np.isfinite(found.log_likelihood)
+    assert posterior_static(np.zeros((0, 4), np.float32), found.classes, N_STATIC).shape == (0,)
+
+
+@pytest.mark.parametrize("sure", range(4))
+def test_one_member(sure):
+    likelihood = np.full((1, 4), 1e-30, np.float32)
+    likelihood[0, sure] = 1.0
+    found = fit_shares(likelihood, np.array([50]), N_STATIC, 0.5)
+    assert (found.classes > 0).all()  # what was never seen is not impossible
+    assert found.classes.sum() == pytest.approx(1.0)
+    static = sure < N_STATIC
+    assert (found.static > 0.99) == static
+    assert (found.static < 0.01) == (not static)
+    assert (posterior_static(likelihood, found.classes, N_STATIC)[0] > 0.5) == static
+
+
+def test_a_member_that_says_nothing_keeps_the_start():
+    found = fit_shares(np.ones((1, 4), np.float32), np.array([7]), N_STATIC, 0.3)
+    assert found.static == pytest.approx(0.3, abs=1e-9)
+    assert found.log_likelihood == pytest.approx(0.0, abs=1e-9)

@@ -1,0 +1,93 @@
+"""The map that follows from an E-step: what is occupied, free, unknown."""
+
+import numpy as np
+import pytest
+from made_up import Ball, Wall, watch
+
+from stillmap import _core, em
+
+RESOLUTION = 0.1
+FREE = 0.2
+
+
+def laid_out(p_occupied, cells=((0, 0), (1, 0)), hits=1):
+    """A lane of five cells: hits end in cell 3, cell 4 and all beside it stay unknown."""
+    grid = _core.Grid2D(1.0)
+    T = np.eye(3)[None].copy()
+    T[0, :2, 2] = 0.5
+    points = np.tile(np.array([[3, 0]], np.float32), (hits, 1))
+    e = np.full(hits, 0.5, np.float32)
+    _core.add_beams(grid, points, np.ones(hits, bool), e, np.array([0, hits]), T)
+    occupied = em.CellProbabilities(
+        np.array(cells, np.int64).reshape(-1, 2), np.array(p_occupied, np.float32), FREE
+    )
+    return em.occupancy_map(grid, occupied)
+
+
+def odds_after(length):
+    odds = FREE / (1 - FREE) * np.exp(-length)
+    return odds / (1 + odds)
+
+
+@pytest.mark.parametrize("p", [0.0, 0.3, 1.0])
+def test_a_cell_is_occupied_by_what_stays_or_as_free_as_it_looks(p):
+    m = laid_out([p], [(3, 0)], hits=4)
+    row, column = -round(m.origin[1]), -round(m.origin[0])
+    lane = m.p_occupied[row, column : column + 5]
+    # the first cell was passed over half its length
+    assert lane[:3] == pytest.approx([odds_after(2), odds_after(4), odds_after(4)], abs=1e-6)
+    free = odds_after(2)  # four hits that are half believed not to be static
+    assert lane[3] == pytest.approx(p + (1 - p) * free, abs=1e-6)
+    known = np.zeros(m.p_occupied.shape, bool)
+    known[row, column : column + 4] = True
+    np.testing.assert_array_equal(np.isnan(m.p_occupied), ~known)
+
+
+def test_nothing_known_is_nothing_occupied():
+    m = em.occupancy_map(
+        _core.Grid2D(1.0), em.CellProbabilities(np.zeros((0, 2), np.int64), np.zeros(0, "f4"), 0.2)
+    )
+    assert m.p_occupied.shape == (0, 0)
+
+
+def at(m, points):
+    """p_occupied where these points lie; NaN outside."""
+    first = np.round(np.array(m.origin[:2]) / m.resolution).astype(int)
+    padded = np.pad(m.p_occupied, 1, constant_values=np.nan)
+    column, row = (np.floor(np.asarray(points) / m.resolution).astype(int) - first + 1).T
+    return padded[np.clip(row, 0, len(padded) - 1), np.clip(column, 0, padded.shape[1] - 1)]
+
+
+@pytest.mark.parametrize("inside", [0.2, 0.5, 0.8])
+def test_walls_are_crisp_and_movers_leave_the_floor_free(inside):
+    wall = 4.0 + inside * RESOLUTION
+    walls = [Wall((1, 0), wall), Wall((0, 1), 3.04), Wall((0, -1), 3.04)]
+    movers = [Ball(2.0, -1.4 + 0.4 * k, 20 + k, 21 + k) for k in range(8)]
+    seen = watch([*walls, *movers, Ball(2.5, 1.5, 5, 20)], 60, noise=0.015)
+    found = seen.e_step(RESOLUTION)
+    grid = seen.grid(found.p_static, RESOLUTION)
+    m = em.occupancy_map(grid, found.occupied)
+    y = np.arange(-2.0, 2.0, RESOLUTION) + RESOLUTION / 2
+    assert (at(m, np.column_stack([y * 0 + wall, y])) > 0.8).mean() > 0.95
+    for beside in (-1, 1):  # noise filled these cells too
+        column = np.column_stack([y * 0 + wall + beside * RESOLUTION, y])
+        p = at(m, column)
+        assert not (p > 0.35).any()  # NaN counts as neither
+    ends = seen.recording.points[(seen.what >= len(walls)) & seen.recording.hit]
+    assert (at(m, ends) < 0.3).mean() > 0.97
+    raw = em.occupancy_map(seen.grid(None, RESOLUTION))
+    assert np.median(at(m, ends)) < np.median(at(raw, ends))
+    floor = np.column_stack([np.full(20, 1.0), np.linspace(-1, 1, 20)])
+    assert (at(m, floor) < 0.05).all()
+    assert np.isnan(m.p_occupied[m.alpha + m.beta == 0]).all()
+    assert np.isfinite(m.p_occupied[m.alpha + m.beta > 0]).all()
+
+
+def test_without_more_knowledge_it_is_15():
+    seen = watch([Wall((1, 0), 4.05)], 5)
+    m = em.occupancy_map(seen.grid())
+    known = m.alpha + m.beta > 0
+    np.testing.assert_allclose(
+        m.p_occupied[known], m.alpha[known] / (m.alpha + m.beta)[known], 1e-6
+    )
+    assert np.isnan(m.p_occupied[~known]).all()
