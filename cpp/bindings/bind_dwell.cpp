@@ -61,7 +61,7 @@ void add_looks(Dwell<D>& dwell, const Points<D>& points, const Flat<bool>& hit,
 }
 
 template <int D>
-auto likelihoods(const Dwell<D>& dwell) {
+auto likelihoods(Dwell<D>& dwell) {
   const size_t n = dwell.surface().size(), C = dwell.classes();
   std::vector<float> relative(n * C);
   std::vector<double> log_best(n);
@@ -74,6 +74,7 @@ auto likelihoods(const Dwell<D>& dwell) {
 
 DwellClasses checked_classes(std::vector<double> rho, std::vector<double> tau, double detection) {
   require(!rho.empty() && rho.size() == tau.size(), "rho, tau: expected one number per class");
+  require(rho.size() <= kMaxClasses, "rho, tau: too many classes");
   for (const double r : rho) require(r > 0.0 && r < 1.0, "rho: expected shares between 0 and 1");
   for (const double t : tau) require(t > 0.0, "tau: expected positive times");
   require(detection > 0.0 && detection < 1.0, "detection: expected a probability below 1");

@@ -7,14 +7,18 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <atomic>
 #include <cmath>
+#include <limits>
 #include <stdexcept>
 #include <vector>
 
 #include "stillmap/surface.hpp"
 
 namespace stillmap {
+
+constexpr size_t kMaxClasses = 64;
 
 struct DwellClasses {
   std::vector<double> rho;  // share of time occupied, in (0, 1)
@@ -52,9 +56,9 @@ class NormalCdf {
 
 // What one look says about one element.
 struct Look {
-  static constexpr float kHit = -1.0f;
+  static constexpr float kHit = 2.0f;
   int32_t element;
-  float seen_through;  // reliability in (0, 1], or kHit
+  float seen_through;  // probability in (0, 1] that some beam met the element's place, or kHit
 };
 
 // Collects the beams of one look.
@@ -65,7 +69,7 @@ class LookCollector {
       : surface_(surface),
         options_(options),
         cdf_(cdf),
-        log_missed_(surface.size(), kUntouched),
+        missed_(surface.size(), kUntouched),
         cursor_(surface) {}
 
   void add(const Scans<D>& scans, size_t first, size_t last) {
@@ -74,11 +78,7 @@ class LookCollector {
       hit_ = scans.hit[n];
       pass(beam);
       if (!hit_) return;
-      if (const auto* k = at(cell_of<D>(beam.end)); k && log_missed(*k) != kStruck) {
-        if (log_missed(*k) == kUntouched) touched_.push_back(*k);
-        log_missed(*k) = kStruck;
-        struck_.push_back(*k);
-      }
+      if (const auto* k = at(cell_of<D>(beam.end)); k && strike(*k)) struck_.push_back(*k);
     });
   }
 
@@ -87,25 +87,33 @@ class LookCollector {
     out.clear();
     spread_hits();
     for (const int32_t k : touched_) {
-      const float l = log_missed(k);
-      log_missed(k) = kUntouched;
-      if (l == kStruck) {
+      float& missed = missed_[static_cast<size_t>(k)];
+      if (missed == kStruck) {
         out.push_back({k, Look::kHit});
-      } else if (const float seen = -std::expm1(l); seen > kLeast) {
-        out.push_back({k, seen});
+      } else if (missed < kSure) {
+        out.push_back({k, 1.0f});
+      } else if (missed < kLeast) {
+        out.push_back({k, 1.0f - missed});
       }
+      missed = kUntouched;
     }
     touched_.clear();
     struck_.clear();
   }
 
  private:
-  static constexpr float kUntouched = 1.0f;  // logarithms of probabilities are not positive
-  static constexpr float kStruck = 2.0f;
-  static constexpr float kSure = -5.0f;  // beyond which more beams of the same look change nothing
-  static constexpr float kLeast = 0.02f;
+  static constexpr float kStruck = -1.0f, kUntouched = 2.0f;
+  static constexpr float kSure = 0.05f;  // more beams of the same look would change nothing
+  static constexpr float kLeast = 0.98f;
 
-  float& log_missed(int32_t k) { return log_missed_[static_cast<size_t>(k)]; }
+  // Whether that is news.
+  bool strike(int32_t k) {
+    float& missed = missed_[static_cast<size_t>(k)];
+    if (missed == kStruck) return false;
+    if (missed == kUntouched) touched_.push_back(k);
+    missed = kStruck;
+    return true;
+  }
 
   const int32_t* at(const Cell<D>& cell) {
     const auto* block = cursor_.block(cell);
@@ -114,8 +122,7 @@ class LookCollector {
     return *k == kNoElement ? nullptr : k;
   }
 
-  // Notes what the beam passed. The probability that it met the element is that of its crossing
-  // the surface within the element, as far as `lateral` lets one tell: small at grazing angles.
+  // Notes what the beam passed.
   void pass(const Segment<D>& beam) {
     const Vec<D> way = beam.end - beam.start;
     const double length = way.norm();
@@ -125,24 +132,26 @@ class LookCollector {
     const Vec<D> end = hit_ ? beam.end : Vec<D>(beam.start + direction * usable);
     Walker walker(cursor_, [&](const int32_t* k, double) {
       if (!k || *k == kNoElement) return;
-      float& l = log_missed(*k);
-      if (l == kStruck || l < kSure) return;
+      float& missed = missed_[static_cast<size_t>(*k)];
+      if (missed < kSure) return;
       const float met = probability_met(surface_.element(*k), beam, direction);
       if (met <= 0.0f) return;
-      if (l == kUntouched) {
+      if (missed == kUntouched) {
         touched_.push_back(*k);
-        l = 0.0f;
+        missed = 1.0f;
       }
-      l += std::log1p(-met);
+      missed *= 1.0f - met;
     });
     traverse<D>(beam.start, end, walker);
     // the end cell is not visited: an end in it is a hit, and free range stops before it
   }
 
+  // Of the beam crossing the surface within the element, as far as `lateral` lets one tell: small
+  // at grazing angles.
   float probability_met(const Element<D>& element, const Segment<D>& beam,
                         const Vec<D>& direction) const {
     const bool flat = options_.normals && !element.normal.isZero(0.0);
-    const Vec<D> off = (flat ? element.centre : element.mean) - beam.start;
+    const Vec<D> off = element.centre - beam.start;
     const double along = off.dot(direction);
     const double facing = flat ? std::abs(element.normal.dot(direction)) : 1.0;
     if (hit_) {
@@ -151,10 +160,10 @@ class LookCollector {
       if (distance < options_.margin) return 0.0f;
     }
     const double aside = std::sqrt(std::max(0.0, off.squaredNorm() - along * along));
-    const double half = (flat ? element.half : 0.5) * facing;
-    const double met =
+    const double half = element.half * facing;
+    const float met =
         cdf_((half - aside) / options_.lateral) - cdf_((-half - aside) / options_.lateral);
-    return static_cast<float>(std::min(met, 0.999));
+    return met;
   }
 
   // Elements near one that was struck are struck: pose and range noise move end points about.
@@ -165,10 +174,7 @@ class LookCollector {
       const Vec<D>& mean = surface_.element(from).mean;
       for_each_near<D>(surface_.cell(from), radius, [&](const Cell<D>& cell) {
         const auto* k = at(cell);
-        if (!k || log_missed(*k) == kStruck) return;
-        if ((surface_.element(*k).mean - mean).squaredNorm() > limit) return;
-        if (log_missed(*k) == kUntouched) touched_.push_back(*k);
-        log_missed(*k) = kStruck;
+        if (k && (surface_.element(*k).mean - mean).squaredNorm() <= limit) strike(*k);
       });
     }
   }
@@ -176,7 +182,7 @@ class LookCollector {
   const Surface<D>& surface_;
   LookOptions options_;
   const NormalCdf& cdf_;
-  std::vector<float> log_missed_;
+  std::vector<float> missed_;  // probability that every beam of this look went past
   std::vector<int32_t> touched_, struck_;
   Cursor<const Surface<D>> cursor_;
   bool hit_ = false;
@@ -195,9 +201,11 @@ class Dwell {
     weight_.assign(surface.size() * C, 1.0f);
     log_scale_.assign(surface.size(), 0.0);
     last_.assign(surface.size(), kNever);
+    runs_.assign(surface.size(), {});
     for (size_t k = 0; k < surface.size(); ++k)
       for (size_t c = 0; c < C; ++c) occupied_[k * C + c] = static_cast<float>(classes_.rho[c]);
     for (int gap = 0; gap < kTable; ++gap) append_correlation(table_, gap);
+    prepare_runs();
   }
 
   size_t classes() const { return classes_.rho.size(); }
@@ -235,9 +243,10 @@ class Dwell {
 
   // (elements, classes): likelihood of everything else that was seen of a cell, given that a beam
   // ended in it, relative to the best class; and the logarithm of the best.
-  void likelihood(float* relative, double* log_best) const {
+  void likelihood(float* relative, double* log_best) {
     const size_t C = classes();
     for (size_t k = 0; k < surface_.size(); ++k) {
+      end_run(k);
       double best = 0.0;
       auto value = [&](size_t c) {
         return weight_[k * C + c] / (classes_.rho[c] * classes_.detection);
@@ -253,6 +262,47 @@ class Dwell {
   static constexpr size_t kWindow = 64;  // looks held at once
   static constexpr int kTable = 64;      // gaps whose correlations are kept
   static constexpr float kSmall = 1e-12f, kLeast = 1e-36f;
+  static constexpr int8_t kCalm = 4;  // misses in a row after which the filters stand still
+
+  // The same look again and again multiplies each class by the same factor, so a run of them is
+  // only counted until something else is seen.
+  struct Run {
+    int32_t length = 0;  // looks that are counted but not yet taken into account
+    int8_t misses = 0;   // sure misses in a row so far, at most kCalm
+    bool hits = false;   // the last look was a hit
+  };
+
+  void prepare_runs() {
+    for (size_t c = 0; c < classes(); ++c) {
+      const double rho = classes_.rho[c], a = classes_.detection, q = table_[classes() + c];
+      double p = rho, through = 1.0;
+      for (int i = 0; i < 200; ++i) {  // the fixed point of misses without end
+        p = rho + (p - rho) * q;
+        through = 1.0 - p * a;
+        p *= (1.0 - a) / through;
+      }
+      log_hit_.push_back(std::log(a * (rho + (1.0 - rho) * q)));
+      log_miss_.push_back(std::log(through));
+    }
+  }
+
+  void end_run(size_t k) {
+    Run& run = runs_[k];
+    if (run.length == 0) return;
+    const std::vector<double>& factor = run.hits ? log_hit_ : log_miss_;
+    const size_t C = classes();
+    float* w = weight_.data() + k * C;
+    double best = -std::numeric_limits<double>::infinity();
+    std::array<double, kMaxClasses> log_weight;
+    for (size_t c = 0; c < C; ++c) {
+      log_weight[c] = std::log(static_cast<double>(w[c])) + run.length * factor[c];
+      best = std::max(best, log_weight[c]);
+    }
+    for (size_t c = 0; c < C; ++c)
+      w[c] = std::max(static_cast<float>(std::exp(log_weight[c] - best)), kLeast);
+    log_scale_[k] += best;
+    run.length = 0;
+  }
 
   static std::vector<size_t> one_each(size_t n) {
     std::vector<size_t> bounds(n + 1);
@@ -266,23 +316,34 @@ class Dwell {
           static_cast<float>(std::exp(-static_cast<double>(gap) * options_.seconds / tau)));
   }
 
-  // Elements are dealt to threads in runs, so that each is written by one thread alone.
+  // Elements are dealt to threads by number, so that each is written by one thread alone.
   void apply(const std::vector<Look>& seen, int64_t look, size_t share, size_t shares) {
     std::vector<float> long_gap;
     for (const Look& s : seen) {
       const size_t k = static_cast<size_t>(s.element);
       if ((k >> 6) % shares != share) continue;
-      const float* correlation = nullptr;
-      if (last_[k] != kNever) {
-        const int64_t gap = look - last_[k];
-        if (gap >= kTable) {
-          long_gap.clear();
-          append_correlation(long_gap, gap);
-        }
-        correlation =
-            gap < kTable ? table_.data() + static_cast<size_t>(gap) * classes() : long_gap.data();
-      }
+      const bool first = last_[k] == kNever;
+      const int64_t gap = first ? 0 : look - last_[k];
+      const bool next = !first && gap == 1;
       last_[k] = look;
+      Run& run = runs_[k];
+      const bool hit = s.seen_through == Look::kHit, sure_miss = s.seen_through == 1.0f;
+      if (next && ((hit && run.hits) || (sure_miss && run.misses == kCalm))) {
+        ++run.length;
+        continue;
+      }
+      end_run(k);
+      run.hits = hit;
+      run.misses = sure_miss ? static_cast<int8_t>(next ? std::min<int>(run.misses + 1, kCalm) : 1)
+                             : int8_t{0};
+      const float* correlation = nullptr;
+      if (gap >= kTable) {
+        long_gap.clear();
+        append_correlation(long_gap, gap);
+        correlation = long_gap.data();
+      } else if (!first) {
+        correlation = table_.data() + static_cast<size_t>(gap) * classes();
+      }
       update(k, correlation, s.seen_through);
     }
   }
@@ -328,6 +389,8 @@ class Dwell {
   std::vector<float> occupied_, weight_;  // (elements, classes)
   std::vector<double> log_scale_;
   std::vector<int64_t> last_;
+  std::vector<Run> runs_;
+  std::vector<double> log_hit_, log_miss_;  // of one more look in a run, per class
   std::vector<float> table_;
   int64_t newest_ = INT64_MIN;
 };

@@ -39,8 +39,8 @@ struct Element {
   Vec<D> mean = Vec<D>::Zero();    // of the end points in the cell
   Vec<D> normal = Vec<D>::Zero();  // unit length; zero where the surroundings are no surface
   double off_plane = 0.0;          // of the cell's centre from the surface around it
-  Vec<D> centre = Vec<D>::Zero();  // of that surface, else the mean
-  double half = 0.5;               // how far it extends from there
+  Vec<D> centre = Vec<D>::Zero();  // of the surface around it, else the mean
+  double half = 0.5;               // how far it extends from there for sure
 };
 
 template <int D>
@@ -185,20 +185,22 @@ class Surface {
       const Spread spread = around(cursor, sums_[k].cell, radius);
       const Eigen::SelfAdjointEigenSolver<Square> axes(spread.covariance());
       const Vec<D> variance = axes.eigenvalues().cwiseMax(0.0);  // rising
-      const bool wide = variance[1] > 0.15 * radius * radius;    // over three cells of five
-      elements_[k].normal.setZero();
-      elements_[k].off_plane = 0.0;
-      elements_[k].centre = elements_[k].mean;
-      elements_[k].half = 0.5;
+      Element<D>& element = elements_[k];
+      element.normal.setZero();
+      element.off_plane = 0.0;
+      element.centre = element.mean;
+      element.half = 0.5;
       all += sums_[k].count;
+      const bool wide = variance[1] > 0.15 * radius * radius;  // over three cells of five
       if (!wide || variance[0] >= 0.25 * variance[1]) continue;
       flat += sums_[k].count;
       across.emplace_back(std::sqrt(variance[0]), sums_[k].count);
-      elements_[k].normal = axes.eigenvectors().col(0);
-      elements_[k].centre = sums_[k].cell.template cast<double>() + spread.mean();
-      elements_[k].half = 0.5 * std::sqrt(3.0 * variance[1]);  // as of evenly spread points
+      element.normal = axes.eigenvectors().col(0);
+      element.centre = sums_[k].cell.template cast<double>() + spread.mean();
+      // evenly spread points reach sqrt(3) deviations; the inner half is surely surface
+      element.half = 0.5 * std::sqrt(3.0 * variance[1]);
       const Vec<D> centre = Vec<D>::Constant(0.5);  // as seen from the cell's corner
-      elements_[k].off_plane = elements_[k].normal.dot(centre - spread.mean());
+      element.off_plane = element.normal.dot(centre - spread.mean());
     }
     scatter_ = weighted_median(across);
     return all ? static_cast<double>(flat) / static_cast<double>(all) : 1.0;
