@@ -24,10 +24,10 @@ LOGS = {
 QUICK = {"belgioioso", "seattle"}  # the others only in `make check`
 
 
-def mapped(folder, name, iterations=1):
+def mapped(folder, name, iterations=1, estimator="stillmap"):
     recording = stillmap.read(folder / f"{name}.clf.gz")
-    options = replaced(Options(), {"em": {"max_iterations": iterations}})
-    return stillmap.build(recording, options)
+    chosen = {"estimator": estimator, "em": {"max_iterations": iterations}}
+    return stillmap.build(recording, replaced(Options(), chosen))
 
 
 def errors(folder, name, result):
@@ -68,11 +68,23 @@ def test_a_log_is_mapped(laser2d, name):
         assert found.rotation.mean < degrees
 
 
-def test_a_second_iteration_finds_movers_and_keeps_the_place(laser2d):
+@pytest.mark.parametrize("estimator", ["stillmap", "paper"])
+def test_a_second_iteration_finds_movers_and_keeps_the_place(laser2d, estimator):
     # edmonton: a convention centre full of people
-    result = mapped(laser2d, "edmonton", iterations=2)
+    result = mapped(laser2d, "edmonton", iterations=2, estimator=estimator)
     assert errors(laser2d, "edmonton", result).translation.mean < 0.1
     hit = result.recording.hit
     dynamic = (result.p_static[hit] < 0.5).mean()
     assert 0.003 < dynamic < 0.3
-    assert (result.map.p_occupied > 0.3).sum() < 0.99 * (result.raw_map.p_occupied > 0.3).sum()
+    if estimator == "paper":
+        ours, raw = ((m.p_occupied > 0.3).sum() for m in (result.map, result.raw_map))
+        assert ours < 0.99 * raw
+        return
+    # cells in which only movers were seen are free, and walls are there
+    ours, raw = result.map, result.raw_map
+    gone = (raw.alpha >= 1) & (ours.alpha < 0.2 * raw.alpha)
+    walls = (raw.alpha >= 5) & (ours.alpha > 0.9 * raw.alpha)
+    assert gone.sum() > 100
+    assert (ours.p_occupied[gone] < 0.3).mean() > 0.95
+    assert (raw.p_occupied[gone] > 0.3).sum() > 20
+    assert (ours.p_occupied[walls] > 0.5).mean() > 0.7
