@@ -42,8 +42,13 @@ def chosen(names: Iterable[str]) -> list[Case]:
     return [case for case in CASES if not wanted or wanted & {case.name, case.group}]
 
 
-def _crowd(people: int, shape: str = "mixed") -> dict[str, Any]:
-    return {"crowd": {"people": people, "shape": shape}}
+def _crowd(people: int, shape: str = "mixed", scans: int | None = None) -> dict[str, Any]:
+    return {"crowd": {"people": people, "shape": shape}, "robot": {"scans": scans}}
+
+
+def _part(scans: int) -> dict[str, Any]:
+    """The first part of the route."""
+    return {"robot": {"scans": scans}}
 
 
 def _sensor(
@@ -57,7 +62,7 @@ def _sensor(
             "max_range": max_range,
             "range_noise": noise,
         },
-        "robot": {"scans": scans},
+        **_part(scans),
     }
 
 
@@ -72,29 +77,30 @@ def scaled_odometry(factor: float, **more: float) -> dict[str, Any]:
     return {"odometry": {**scaled, **more}}
 
 
+_SLIPS = scaled_odometry(1.0, slip_rate=0.05)
 _EVERYONE_STOPS = {"crowd": {"stopping_share": 1.0, "min_stop": 15.0, "max_stop": 60.0}}
 
 CASES = (
     Case("hall-15", POPULATED, "hall"),
-    Case("hall-15-legs", POPULATED, "hall", _crowd(15, "legs")),
-    Case("hall-30-bodies", POPULATED, "hall", _crowd(30, "bodies")),
+    Case("hall-15-legs", POPULATED, "hall", _crowd(15, "legs", 1200)),
+    Case("hall-30-bodies", POPULATED, "hall", _crowd(30, "bodies", 1200)),
     Case("hall-60", POPULATED, "hall-crowd"),
-    Case("hall-80", POPULATED, "hall-crowd", _crowd(80)),
+    Case("hall-80", POPULATED, "hall-crowd", _crowd(80, scans=1200)),
     Case("corridor-5", POPULATED, "corridor", _crowd(5, "legs")),
     Case("corridor-20", POPULATED, "corridor"),
     Case("corridor-40", POPULATED, "corridor-crowd"),
     Case("office-10", POPULATED, "office"),
     Case("office-25-bodies", POPULATED, "office", _crowd(25, "bodies")),
     Case("warehouse-12", POPULATED, "warehouse"),
-    Case("warehouse-30-legs", POPULATED, "warehouse", _crowd(30, "legs")),
+    Case("warehouse-30-legs", POPULATED, "warehouse", _crowd(30, "legs", 1200)),
     Case("street-16", POPULATED, "street"),
     Case("hall-stops", STOPS, "hall", _EVERYONE_STOPS),
     Case("corridor-stops", STOPS, "corridor", _EVERYONE_STOPS),
     Case("office-stops", STOPS, "office", _EVERYONE_STOPS),
-    Case("hall-empty", EMPTY, "hall-empty"),
-    Case("corridor-empty", EMPTY, "corridor-empty"),
+    Case("hall-empty", EMPTY, "hall-empty", _part(1200)),
+    Case("corridor-empty", EMPTY, "corridor-empty", _part(1200)),
     Case("office-empty", EMPTY, "office-empty"),
-    Case("warehouse-empty", EMPTY, "warehouse-empty"),
+    Case("warehouse-empty", EMPTY, "warehouse-empty", _part(1200)),
     Case("street-empty", EMPTY, "street-empty"),
     Case("street-turn-empty", EMPTY, "street-turn-empty"),
     Case("hall-90deg", SENSORS, "hall", _sensor(181, 90, 30, 0.01, 1200)),
@@ -106,8 +112,8 @@ CASES = (
     Case("corridor-5cm", SENSORS, "corridor", _sensor(181, 180, 30, 0.05, 1200)),
     Case("corridor-good-odometry", ODOMETRY, "corridor", scaled_odometry(0.3)),
     Case("corridor-bad-odometry", ODOMETRY, "corridor", scaled_odometry(3.0)),
-    Case("hall-bad-odometry", ODOMETRY, "hall", scaled_odometry(3.0)),
-    Case("office-slips", ODOMETRY, "office", scaled_odometry(1.0, slip_rate=0.05)),
-    Case("warehouse-slips", ODOMETRY, "warehouse", scaled_odometry(1.0, slip_rate=0.05)),
+    Case("hall-bad-odometry", ODOMETRY, "hall", {**scaled_odometry(3.0), **_part(1200)}),
+    Case("office-slips", ODOMETRY, "office", _SLIPS),
+    Case("warehouse-slips", ODOMETRY, "warehouse", {**_SLIPS, **_part(1200)}),
     Case("street-turn", ONCE, "street-turn"),
 )

@@ -26,6 +26,9 @@ METHODS: dict[str, dict[str, Any]] = {
     "hit-ratio-0.25": {"estimator": "hit-ratio", "em": {"hit_ratio": 0.25}},
 }
 
+_VEHICLES = ["car", "forklift"]
+_NAN = float("nan")
+
 Job = TypeVar("Job")
 Outcome = TypeVar("Outcome")
 Scores = dict[str, float]
@@ -101,12 +104,13 @@ def scores(
     run: Prepared,
 ) -> Scores:
     """Labels against the truth, the map against the true walls, poses against the true ones."""
-    truth = run.simulation.truth
-    labels = label_scores(p_static, truth.static, run.simulation.recording.hit)
+    truth, hit = run.simulation.truth, run.simulation.recording.hit
+    labels = label_scores(p_static, truth.static, hit)
     T_world_map, grid = align(poses, truth.T_world_base), grid_of(occupancy)
     on_map = map_scores(grid, truth.walls, run.walls_without_people, T_world_map)
     at_best = map_scores(grid, truth.walls, run.walls_at_best, T_world_map)
     return {
+        **_by_mover(p_static, run),
         "ap": labels.average_precision,
         "f1": labels.f1,
         "precision": labels.precision,
@@ -123,6 +127,24 @@ def scores(
         "ate": absolute_errors(poses, truth.T_world_base).rmse,
         "called_dynamic": labels.share_called_dynamic,
         "dynamic": labels.dynamic / max(labels.hits, 1),
+    }
+
+
+def _by_mover(p_static: NDArray[np.floating], run: Prepared) -> Scores:
+    """Recall by what moved, and scores without the beams on doors, which stand still for long."""
+    truth, hit = run.simulation.truth, run.simulation.recording.hit
+    kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
+    without = label_scores(p_static, truth.static, hit & (kinds != "door"))
+    found = p_static < 0.5
+    recall = {
+        f"recall_{name}": float(found[of].mean()) if (of := np.isin(kinds, some)).any() else _NAN
+        for name, some in (("people", ["person"]), ("doors", ["door"]), ("vehicles", _VEHICLES))
+    }
+    return {
+        **recall,
+        "ap_no_doors": without.average_precision,
+        "f1_no_doors": without.f1,
+        "brier_no_doors": without.brier,
     }
 
 
@@ -159,7 +181,7 @@ class _Numbered:
 
 
 def _or_nan(value: float | None) -> float:
-    return float("nan") if value is None else float(value)
+    return _NAN if value is None else float(value)
 
 
 def finite(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -54,13 +54,21 @@ MAP = (
     Column("ate", "ATE m", ".3f"),
     Column("called_dynamic", "called dynamic", ".4f"),
 )
+MOVERS = (
+    Column("recall_people", "recall of people", ".4f", True),
+    Column("recall_vehicles", "of vehicles", ".4f", True),
+    Column("recall_doors", "of doors", ".4f", True),
+    Column("ap_no_doors", "AP without doors", ".4f", True),
+    Column("f1_no_doors", "F1 without doors", ".4f", True),
+    Column("brier_no_doors", "Brier without doors", ".4f"),
+)
 COST = (Column("iterations", "iterations", ".1f"), Column("cpu", "CPU ms per scan", ".2f"))
 PER_ITERATION = (
     Column("bound", "bound per beam", ".5f", True),
     Column("held_out", "held out per beam", ".5f", True),
     Column("seconds", "s", ".2f"),
 )
-BY_KEY = {column.key: column for column in (*LABELS, *MAP, *COST, *PER_ITERATION)}
+BY_KEY = {column.key: column for column in (*LABELS, *MOVERS, *MAP, *COST, *PER_ITERATION)}
 
 
 @dataclass(frozen=True)
@@ -122,6 +130,7 @@ def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Ro
 
 def per_case(rows: Sequence[Row], columns: Sequence[Column]) -> str:
     """One line per case: mean over its seeds, the worst in brackets."""
+    columns = [column for column in columns if column.values(rows)]
     lines = [
         [name, *(column.mean_and_worst(of_case) for column in columns)]
         for name, of_case in grouped(rows, lambda row: row["case"]).items()

@@ -36,6 +36,7 @@ from tables import (
     COST,
     LABELS,
     MAP,
+    MOVERS,
     PER_ITERATION,
     Row,
     against_wanted,
@@ -136,7 +137,10 @@ def _about(rows: Sequence[Row]) -> str:
 def _results(rows: Sequence[Row]) -> str:
     parts = ["Means over seeds, in brackets the worst."]
     for group, of_group in grouped(rows, lambda row: row["group"]).items():
-        parts += [f"### {group}", per_case(of_group, LABELS), per_case(of_group, (*MAP, *COST))]
+        parts += [f"### {group}", per_case(of_group, LABELS)]
+        if BY_KEY["recall_doors"].values(of_group) or BY_KEY["recall_vehicles"].values(of_group):
+            parts.append(per_case(of_group, MOVERS))
+        parts.append(per_case(of_group, (*MAP, *COST)))
     return "\n\n".join([*parts, "### Against the wanted figures", against_wanted(rows)])
 
 
