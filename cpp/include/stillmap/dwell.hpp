@@ -65,9 +65,32 @@ struct Look {
 template <int D>
 class LookCollector {
  public:
-  LookCollector(const Surface<D>& surface, const LookOptions& options, const NormalCdf& cdf)
+  // What a beam has to know of an element, close together.
+  struct Patch {
+    Vec<D> centre;
+    Eigen::Matrix<float, D, 1> normal;
+    float half;
+    bool flat;
+  };
+
+  static std::vector<Patch> patches_of(const Surface<D>& surface, bool normals) {
+    std::vector<Patch> patches(surface.size());
+    for (size_t k = 0; k < patches.size(); ++k) {
+      const Element<D>& e = surface.element(static_cast<int32_t>(k));
+      const bool flat = normals && !e.normal.isZero(0.0);
+      patches[k] = {flat ? e.centre : e.mean, e.normal.template cast<float>(),
+                    flat ? static_cast<float>(e.half) : 0.5f, flat};
+    }
+    return patches;
+  }
+
+  LookCollector(const Surface<D>& surface, const std::vector<Patch>& patches,
+                const LookOptions& options, const NormalCdf& cdf)
       : surface_(surface),
+        patches_(patches),
         options_(options),
+        margin_squared_(options.margin * options.margin),
+        per_lateral_(1.0 / options.lateral),
         cdf_(cdf),
         missed_(surface.size(), kUntouched),
         cursor_(surface) {}
@@ -134,7 +157,7 @@ class LookCollector {
       if (!k || *k == kNoElement) return;
       float& missed = missed_[static_cast<size_t>(*k)];
       if (missed < kSure) return;
-      const float met = probability_met(surface_.element(*k), beam, direction);
+      const float met = probability_met(patches_[static_cast<size_t>(*k)], beam, direction);
       if (met <= 0.0f) return;
       if (missed == kUntouched) {
         touched_.push_back(*k);
@@ -148,22 +171,20 @@ class LookCollector {
 
   // Of the beam crossing the surface within the element, as far as `lateral` lets one tell: small
   // at grazing angles.
-  float probability_met(const Element<D>& element, const Segment<D>& beam,
-                        const Vec<D>& direction) const {
-    const bool flat = options_.normals && !element.normal.isZero(0.0);
-    const Vec<D> off = element.centre - beam.start;
-    const double along = off.dot(direction);
-    const double facing = flat ? std::abs(element.normal.dot(direction)) : 1.0;
-    if (hit_) {
-      const Vec<D> behind = beam.end - element.mean;
-      const double distance = flat ? std::abs(element.normal.dot(behind)) : behind.norm();
-      if (distance < options_.margin) return 0.0f;
+  float probability_met(const Patch& patch, const Segment<D>& beam, const Vec<D>& direction) const {
+    const Vec<D> off = patch.centre - beam.start;
+    double facing = 1.0;
+    if (patch.flat) {
+      const Vec<D> normal = patch.normal.template cast<double>();
+      facing = std::abs(normal.dot(direction));
+      if (hit_ && std::abs(normal.dot(beam.end - patch.centre)) < options_.margin) return 0.0f;
+    } else if (hit_ && (beam.end - patch.centre).squaredNorm() < margin_squared_) {
+      return 0.0f;
     }
+    const double along = off.dot(direction);
     const double aside = std::sqrt(std::max(0.0, off.squaredNorm() - along * along));
-    const double half = element.half * facing;
-    const float met =
-        cdf_((half - aside) / options_.lateral) - cdf_((-half - aside) / options_.lateral);
-    return met;
+    const double half = static_cast<double>(patch.half) * facing;
+    return cdf_((half - aside) * per_lateral_) - cdf_((-half - aside) * per_lateral_);
   }
 
   // Elements near one that was struck are struck: pose and range noise move end points about.
@@ -180,7 +201,9 @@ class LookCollector {
   }
 
   const Surface<D>& surface_;
+  const std::vector<Patch>& patches_;
   LookOptions options_;
+  double margin_squared_, per_lateral_;
   const NormalCdf& cdf_;
   std::vector<float> missed_;  // probability that every beam of this look went past
   std::vector<int32_t> touched_, struck_;
@@ -194,16 +217,17 @@ template <int D>
 class Dwell {
  public:
   Dwell(const Surface<D>& surface, DwellClasses classes, const LookOptions& options)
-      : surface_(surface), classes_(std::move(classes)), options_(options) {
+      : surface_(surface),
+        classes_(std::move(classes)),
+        options_(options),
+        patches_(LookCollector<D>::patches_of(surface, options.normals)) {
     const size_t C = classes_.rho.size();
     if (!surface.fitted()) throw std::invalid_argument("surface: fit it first");
-    occupied_.resize(surface.size() * C);
-    weight_.assign(surface.size() * C, 1.0f);
-    log_scale_.assign(surface.size(), 0.0);
-    last_.assign(surface.size(), kNever);
-    runs_.assign(surface.size(), {});
+    for (const double r : classes_.rho) rho_.push_back(static_cast<float>(r));
+    heads_.resize(surface.size());
+    state_.assign(surface.size() * 2 * C, 1.0f);
     for (size_t k = 0; k < surface.size(); ++k)
-      for (size_t c = 0; c < C; ++c) occupied_[k * C + c] = static_cast<float>(classes_.rho[c]);
+      for (size_t c = 0; c < C; ++c) occupied(k)[c] = static_cast<float>(classes_.rho[c]);
     for (int gap = 0; gap < kTable; ++gap) append_correlation(table_, gap);
     prepare_runs();
   }
@@ -223,7 +247,7 @@ class Dwell {
     const size_t looks = starts.size() - 1, n = static_cast<size_t>(std::max(threads, 1));
     std::vector<std::unique_ptr<LookCollector<D>>> collectors;
     for (size_t i = 0; i < n; ++i)
-      collectors.push_back(std::make_unique<LookCollector<D>>(surface_, options_, cdf_));
+      collectors.push_back(std::make_unique<LookCollector<D>>(surface_, patches_, options_, cdf_));
     std::vector<std::vector<Look>> seen(kWindow);
     for (size_t from = 0; from < looks; from += kWindow) {
       const size_t to = std::min(from + kWindow, looks);
@@ -248,18 +272,17 @@ class Dwell {
     for (size_t k = 0; k < surface_.size(); ++k) {
       end_run(k);
       double best = 0.0;
-      auto value = [&](size_t c) {
-        return weight_[k * C + c] / (classes_.rho[c] * classes_.detection);
-      };
+      auto value = [&](size_t c) { return weight(k)[c] / (classes_.rho[c] * classes_.detection); };
       for (size_t c = 0; c < C; ++c) best = std::max(best, value(c));
       for (size_t c = 0; c < C; ++c) relative[k * C + c] = static_cast<float>(value(c) / best);
-      log_best[k] = log_scale_[k] + std::log(best);
+      log_best[k] = heads_[k].log_scale + std::log(best);
     }
   }
 
  private:
   static constexpr int64_t kNever = INT64_MIN;
   static constexpr size_t kWindow = 64;  // looks held at once
+  static constexpr size_t kAhead = 8;    // elements
   static constexpr int kTable = 64;      // gaps whose correlations are kept
   static constexpr float kSmall = 1e-12f, kLeast = 1e-36f;
   static constexpr int8_t kCalm = 4;  // misses in a row after which the filters stand still
@@ -271,6 +294,16 @@ class Dwell {
     int8_t misses = 0;   // sure misses in a row so far, at most kCalm
     bool hits = false;   // the last look was a hit
   };
+
+  struct Head {
+    int64_t last = kNever;   // number of the last look
+    double log_scale = 0.0;  // logarithm of what the weights were divided by
+    Run run;
+  };
+
+  // Probability of being occupied now, and likelihood so far, under each class.
+  float* occupied(size_t k) { return state_.data() + k * 2 * classes(); }
+  float* weight(size_t k) { return occupied(k) + classes(); }
 
   void prepare_runs() {
     for (size_t c = 0; c < classes(); ++c) {
@@ -287,11 +320,11 @@ class Dwell {
   }
 
   void end_run(size_t k) {
-    Run& run = runs_[k];
+    Run& run = heads_[k].run;
     if (run.length == 0) return;
     const std::vector<double>& factor = run.hits ? log_hit_ : log_miss_;
     const size_t C = classes();
-    float* w = weight_.data() + k * C;
+    float* w = weight(k);
     double best = -std::numeric_limits<double>::infinity();
     std::array<double, kMaxClasses> log_weight;
     for (size_t c = 0; c < C; ++c) {
@@ -300,7 +333,7 @@ class Dwell {
     }
     for (size_t c = 0; c < C; ++c)
       w[c] = std::max(static_cast<float>(std::exp(log_weight[c] - best)), kLeast);
-    log_scale_[k] += best;
+    heads_[k].log_scale += best;
     run.length = 0;
   }
 
@@ -316,17 +349,26 @@ class Dwell {
           static_cast<float>(std::exp(-static_cast<double>(gap) * options_.seconds / tau)));
   }
 
+  // Elements lie far apart in memory: what is needed soon is asked for now.
+  void prefetch(size_t k) {
+    __builtin_prefetch(&heads_[k], 1);
+    for (size_t c = 0; c < 2 * classes(); c += 16) __builtin_prefetch(occupied(k) + c, 1);
+  }
+
   // Elements are dealt to threads by number, so that each is written by one thread alone.
   void apply(const std::vector<Look>& seen, int64_t look, size_t share, size_t shares) {
     std::vector<float> long_gap;
-    for (const Look& s : seen) {
+    for (size_t i = 0; i < seen.size(); ++i) {
+      if (i + kAhead < seen.size()) prefetch(static_cast<size_t>(seen[i + kAhead].element));
+      const Look& s = seen[i];
       const size_t k = static_cast<size_t>(s.element);
       if ((k >> 6) % shares != share) continue;
-      const bool first = last_[k] == kNever;
-      const int64_t gap = first ? 0 : look - last_[k];
+      Head& head = heads_[k];
+      const bool first = head.last == kNever;
+      const int64_t gap = first ? 0 : look - head.last;
       const bool next = !first && gap == 1;
-      last_[k] = look;
-      Run& run = runs_[k];
+      head.last = look;
+      Run& run = head.run;
       const bool hit = s.seen_through == Look::kHit, sure_miss = s.seen_through == 1.0f;
       if (next && ((hit && run.hits) || (sure_miss && run.misses == kCalm))) {
         ++run.length;
@@ -351,14 +393,13 @@ class Dwell {
   // One step of the filter of every class, forward in time.
   void update(size_t k, const float* correlation, float seen_through) {
     const size_t C = classes();
-    float* p = occupied_.data() + k * C;
-    float* w = weight_.data() + k * C;
-    const double* rho = classes_.rho.data();
+    float* p = occupied(k);
+    float* w = weight(k);
+    const float* rho = rho_.data();
     const float a = static_cast<float>(classes_.detection);
     if (correlation)
       for (size_t c = 0; c < C; ++c) {
-        const float r = static_cast<float>(rho[c]);
-        p[c] = r + (p[c] - r) * correlation[c];
+        p[c] = rho[c] + (p[c] - rho[c]) * correlation[c];
       }
     float best = 0.0f;
     if (seen_through == Look::kHit) {
@@ -379,17 +420,17 @@ class Dwell {
     if (best >= kSmall) return;
     const float up = 1.0f / best;
     for (size_t c = 0; c < C; ++c) w[c] = std::max(w[c] * up, kLeast);
-    log_scale_[k] += std::log(best);
+    heads_[k].log_scale += std::log(best);
   }
 
   const Surface<D>& surface_;
   DwellClasses classes_;
   LookOptions options_;
+  std::vector<typename LookCollector<D>::Patch> patches_;
   NormalCdf cdf_;
-  std::vector<float> occupied_, weight_;  // (elements, classes)
-  std::vector<double> log_scale_;
-  std::vector<int64_t> last_;
-  std::vector<Run> runs_;
+  std::vector<float> rho_;
+  std::vector<Head> heads_;
+  std::vector<float> state_;                // (elements, 2, classes)
   std::vector<double> log_hit_, log_miss_;  // of one more look in a run, per class
   std::vector<float> table_;
   int64_t newest_ = INT64_MIN;

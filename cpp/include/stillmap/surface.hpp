@@ -92,6 +92,7 @@ class Surface {
 
   // Means, normals and scatter from all end points so far.
   void fit() {
+    number_by_place();
     elements_.assign(size(), {});
     for (size_t k = 0; k < size(); ++k) elements_[k].mean = mean_of(sums_[k]);
     // noise as large as the window would hide every wall: then a wider one
@@ -108,6 +109,19 @@ class Surface {
     std::array<Fixed, D> first{};           // of end point - cell corner
     std::array<Fixed, kProducts> second{};  // of its products, by rows of the upper triangle
   };
+
+  // Neighbours get neighbouring numbers, so that a beam finds them close together in memory.
+  void number_by_place() {
+    std::vector<Sums> sorted;
+    sorted.reserve(sums_.size());
+    for (auto& block : blocks_)
+      for (int32_t& k : block->counts) {
+        if (k == kNoElement) continue;
+        sorted.push_back(sums_[static_cast<size_t>(k)]);
+        k = static_cast<int32_t>(sorted.size() - 1);
+      }
+    sums_.swap(sorted);
+  }
 
   void add_end_point(const Vec<D>& end) {
     const Cell<D> cell = cell_of<D>(end);

@@ -33,9 +33,9 @@ class Classes:
         mover_occupied, mover_seconds: of what comes and goes.
     """
 
-    static_occupied: tuple[float, ...] = (0.998, 0.9, 0.6)
-    static_seconds: tuple[float, ...] = (5.0, 25.0)
-    mover_occupied: tuple[float, ...] = (0.005, 0.02, 0.06, 0.15)
+    static_occupied: tuple[float, ...] = (0.998, 0.9)
+    static_seconds: tuple[float, ...] = (25.0, 100.0)
+    mover_occupied: tuple[float, ...] = (0.01, 0.04, 0.15)
     mover_seconds: tuple[float, ...] = (0.5, 3.0, 12.0, 45.0)
 
     @property

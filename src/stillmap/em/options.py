@@ -11,7 +11,7 @@ class DwellOptions:
 
     look: float = field_with_doc(1.0, "s, beams within it tell no more of a cell than one")
     detection: float = field_with_doc(0.97, "probability that an occupied cell is seen to be so")
-    lateral: float = field_with_doc(1.0, "scatters by which a beam may pass beside its place")
+    lateral: float = field_with_doc(0.7, "scatters by which a beam may pass beside its place")
     margin: float = field_with_doc(3.0, "scatters behind a surface at which a beam has passed it")
     reach: float = field_with_doc(4.0, "scatters within which hits are hits of the same thing")
     beyond: float = field_with_doc(0.3, "m, end of a maximum-range beam that says nothing")

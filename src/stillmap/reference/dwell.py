@@ -15,8 +15,8 @@ from stillmap.reference.traverse import cell_of, traverse
 Float = NDArray[np.float64]
 
 HIT = -1.0  # instead of a reliability
-SURE = 0.95  # what a beam met more probably than that it met
-LEAST = 0.02  # what no beam met more probably than that nobody looked at
+SURE = 0.95  # what was met more probably than that was met
+LEAST = 0.02  # what was met less probably than that nobody looked at
 
 
 @dataclass(frozen=True)
@@ -47,15 +47,15 @@ def look_at(surface: Surface, beams: Sequence[Beam], reading: Reading) -> dict[i
     """What the beams of one look say of each element: HIT, or how surely they saw through it.
 
     An element is hit where a beam ends in its cell or within `reach` of one in whose cell a beam
-    ends. The others whose cells beams cross before they end are seen through, as reliably as the
-    beam did that most probably met the surface: beams of one look share the error of its pose.
+    ends. The others whose cells beams cross before they end are seen through: R = 1 - the product
+    over these beams of 1 - P(the beam met the surface).
     """
     number = surface.numbers()
-    through: dict[int, float] = {}
+    missed: dict[int, float] = {}
     struck = set()
     for beam in beams:
         for k, met in _met(surface, number, beam, reading):
-            through[k] = max(through.get(k, 0.0), met)
+            missed[k] = missed.get(k, 1.0) * (1.0 - met)
         end = number.get(tuple(cell_of(beam.end, surface.resolution).tolist()))
         if beam.hit and end is not None:
             struck.add(end)
@@ -64,8 +64,9 @@ def look_at(surface: Surface, beams: Sequence[Beam], reading: Reading) -> dict[i
     for s in struck:
         apart = np.linalg.norm(means - means[s], axis=1)
         hit.update(np.flatnonzero(apart <= reading.reach).tolist())
-    reliable = {k: 1.0 if met > SURE else met for k, met in through.items() if met > LEAST}
-    return reliable | dict.fromkeys(hit, HIT)
+    seen = {k: 1.0 - m for k, m in missed.items() if 1.0 - m > LEAST}
+    through = {k: 1.0 if p > SURE else p for k, p in seen.items()}
+    return through | dict.fromkeys(hit, HIT)
 
 
 def _met(
@@ -102,7 +103,7 @@ def _probability_met(
     """
     patch = element.patch if reading.normals else None
     if end is not None:
-        behind = end - element.mean
+        behind = end - (patch.centre if patch else element.mean)
         distance = abs(patch.normal @ behind) if patch else np.linalg.norm(behind)
         if distance < reading.margin:
             return 0.0
