@@ -32,6 +32,7 @@ auto elements(const Surface<D>& surface, const Points<D>& points, const Flat<boo
 // cells, means and normals (E, D), distances from the plane and beams (E,)
 template <int D>
 auto describe(const Surface<D>& surface) {
+  require(surface.fitted(), "surface: fit it first");
   const size_t n = surface.size(), d = static_cast<size_t>(D);
   std::vector<int64_t> cells, beams;
   std::vector<double> means, normals, off_plane;

@@ -306,3 +306,24 @@ def test_looks_that_fall(dimension):
 def test_a_surface_that_was_not_fitted(dimension):
     with pytest.raises(ValueError, match="fit"):
         dwell_of(surface_of(dimension, fitted=False))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_elements_of_a_surface_that_was_not_fitted(dimension):
+    with pytest.raises(ValueError, match="fit"):
+        surface_of(dimension, fitted=False).elements()
+
+
+@pytest.mark.parametrize("fitted", [False, True])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_surface_that_grew_under_its_chains(dimension, fitted):
+    surface = surface_of(dimension)
+    dwell = dwell_of(surface)
+    points = np.zeros((400, dimension), np.float32)
+    points[:, 0] = np.linspace(-100, 100, 400)
+    beams = points, np.ones(400, bool), np.array([0, 400]), np.eye(dimension + 1)[None]
+    surface.add_end_points(*beams)
+    if fitted:
+        surface.fit()
+    with pytest.raises(ValueError, match="surface"):
+        dwell.add(*beams, np.array([0]))

@@ -74,6 +74,7 @@ class LookCollector {
   };
 
   static std::vector<Patch> patches_of(const Surface<D>& surface, bool normals) {
+    if (!surface.fitted()) throw std::invalid_argument("surface: fit it first");
     std::vector<Patch> patches(surface.size());
     for (size_t k = 0; k < patches.size(); ++k) {
       const Element<D>& e = surface.element(static_cast<int32_t>(k));
@@ -237,6 +238,8 @@ class Dwell {
 
   // look (T,): number of each scan's look, not falling, and not below those added before.
   void add(const Scans<D>& scans, const int64_t* look, int threads) {
+    if (!surface_.fitted() || heads_.size() != surface_.size())
+      throw std::invalid_argument("surface: has changed since");
     const size_t T = scans.n_scans;
     for (size_t t = 0; t < T; ++t)
       if (look[t] < (t ? look[t - 1] : newest_)) throw std::invalid_argument("look: must not fall");
@@ -285,13 +288,13 @@ class Dwell {
   static constexpr size_t kAhead = 8;    // elements
   static constexpr int kTable = 64;      // gaps whose correlations are kept
   static constexpr float kSmall = 1e-12f, kLeast = 1e-36f;
-  static constexpr int8_t kCalm = 4;  // misses in a row after which the filters stand still
+  static constexpr float kSeldom = 1e-20f;  // no filter is surer that a cell is empty
 
   // The same look again and again multiplies each class by the same factor, so a run of them is
   // only counted until something else is seen.
   struct Run {
     int32_t length = 0;  // looks that are counted but not yet taken into account
-    int8_t misses = 0;   // sure misses in a row so far, at most kCalm
+    int8_t misses = 0;   // sure misses in a row so far, at most calm_
     bool hits = false;   // the last look was a hit
   };
 
@@ -316,6 +319,12 @@ class Dwell {
       }
       log_hit_.push_back(std::log(a * (rho + (1.0 - rho) * q)));
       log_miss_.push_back(std::log(through));
+      double after_hit = 1.0;  // from there it takes longest
+      for (int8_t misses = 1; misses < 100; ++misses) {
+        after_hit = rho + (after_hit - rho) * q;
+        after_hit *= (1.0 - a) / (1.0 - after_hit * a);
+        if (after_hit > 1.01 * p) calm_ = std::max<int8_t>(calm_, static_cast<int8_t>(misses + 1));
+      }
     }
   }
 
@@ -370,13 +379,13 @@ class Dwell {
       head.last = look;
       Run& run = head.run;
       const bool hit = s.seen_through == Look::kHit, sure_miss = s.seen_through == 1.0f;
-      if (next && ((hit && run.hits) || (sure_miss && run.misses == kCalm))) {
+      if (next && ((hit && run.hits) || (sure_miss && run.misses == calm_))) {
         ++run.length;
         continue;
       }
       end_run(k);
       run.hits = hit;
-      run.misses = sure_miss ? static_cast<int8_t>(next ? std::min<int>(run.misses + 1, kCalm) : 1)
+      run.misses = sure_miss ? static_cast<int8_t>(next ? std::min<int>(run.misses + 1, calm_) : 1)
                              : int8_t{0};
       const float* correlation = nullptr;
       if (gap >= kTable) {
@@ -413,7 +422,7 @@ class Dwell {
       for (size_t c = 0; c < C; ++c) {
         const float through = 1.0f - p[c] + p[c] * missed;
         w[c] *= through;
-        p[c] *= missed / through;
+        p[c] = std::max(p[c] * missed / through, kSeldom);
         best = std::max(best, w[c]);
       }
     }
@@ -432,6 +441,7 @@ class Dwell {
   std::vector<Head> heads_;
   std::vector<float> state_;                // (elements, 2, classes)
   std::vector<double> log_hit_, log_miss_;  // of one more look in a run, per class
+  int8_t calm_ = 1;  // misses in a row after which the filters stand still
   std::vector<float> table_;
   int64_t newest_ = INT64_MIN;
 };

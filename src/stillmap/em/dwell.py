@@ -172,7 +172,8 @@ def _bound(
 
 def _coverage(static: NDArray[np.float32], normals: Float, off_plane: Float) -> NDArray[np.float32]:
     """P(the static surface runs through the cell itself): noise also fills cells beside it."""
-    half = 0.5 * np.abs(normals).sum(axis=1)  # of the cell, across the surface
+    # of the cell, across the surface; a wall on the border of two cells belongs to both
+    half = 0.5 * np.abs(normals).sum(axis=1) + _EDGE
     covered = ndtr((half - np.abs(off_plane)) / _EDGE)
     flat = normals.any(axis=1)
     return np.asarray(static * np.where(flat, covered, 1.0), dtype=np.float32)

@@ -59,17 +59,17 @@ def fit_shares(
         evidence = np.einsum("kc,c->k", rows, shares)
         now = float(np.sum(n * np.log(evidence))) / total
         counts = shares * np.einsum("kc,k->c", rows, n / evidence)  # expected beams per class
-        shares = _normalised(counts, n_static)
+        shares = _normalised(counts, n_static, start)
         if now - last < tolerance:
             break
         last = now
     return Shares(float(shares[:n_static].sum()), shares, now if len(count) else 0.0)
 
 
-def _normalised(counts: Float, n_static: int) -> Float:
+def _normalised(counts: Float, n_static: int, start: float) -> Float:
     static, movers = counts[:n_static] + _PSEUDO, counts[n_static:] + _PSEUDO
     total = counts.sum()
-    share = counts[:n_static].sum() / total if total > 0.0 else 0.5
+    share = counts[:n_static].sum() / total if total > 0.0 else start
     share = float(np.clip(share, 1.0 - _MOST_STATIC, _MOST_STATIC))
     return np.concatenate([share * static / static.sum(), (1.0 - share) * movers / movers.sum()])
 
