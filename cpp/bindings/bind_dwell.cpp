@@ -35,7 +35,7 @@ auto describe(const Surface<D>& surface) {
   require(surface.fitted(), "surface: fit it first");
   const size_t n = surface.size(), d = static_cast<size_t>(D);
   std::vector<int64_t> cells, beams;
-  std::vector<double> means, normals, off_plane;
+  std::vector<double> means, normals, off_plane, prominence;
   for (size_t i = 0; i < n; ++i) {
     const auto k = static_cast<int32_t>(i);
     for (int a = 0; a < D; ++a) {
@@ -44,11 +44,12 @@ auto describe(const Surface<D>& surface) {
       normals.push_back(surface.element(k).normal[a]);
     }
     beams.push_back(surface.beams(k));
+    prominence.push_back(surface.element(k).prominence);
     off_plane.push_back(surface.element(k).off_plane * surface.resolution());
   }
   return std::make_tuple(owned(std::move(cells), {n, d}), owned(std::move(means), {n, d}),
                          owned(std::move(normals), {n, d}), owned(std::move(off_plane), {n}),
-                         owned(std::move(beams), {n}));
+                         owned(std::move(prominence), {n}), owned(std::move(beams), {n}));
 }
 
 template <int D>
@@ -101,7 +102,8 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
           "Means, normals and scatter from all end points so far.")
       .def("elements", &describe<D>,
            "cells (E, D) int64, means (E, D) in metres, normals (E, D) (zero: none), distance (E,) "
-           "of the cell's centre from the surface around it in metres (zero: none), beams (E,).")
+           "of the cell's centre from the surface around it in metres (zero: none), prominence "
+           "(E,): its beams against those of the richest cell around, beams (E,).")
       .def("elements_of", &elements<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            nb::arg("threads") = 1, "(M,) int32: the element in which each beam ended, -1: none.");

@@ -143,8 +143,10 @@ class _Run:
         if gain > 0.0:
             self.best = _Best.of(iteration)
         self._remember(iteration, recording)
-        settled = 0.0 <= gain < self.options.em.tolerance * recording.n_beams
-        stuck = iteration.number - self.kept.number >= self.options.em.patience
+        options = self.options.em
+        settled = 0.0 <= gain < options.tolerance * recording.n_beams
+        settled |= iteration.number > 1 and iteration.changed_share < options.settled
+        stuck = iteration.number - self.kept.number >= options.patience
         counted = self.options.estimator == "hit-ratio"  # nothing to iterate
         self.finished = settled or stuck or counted
 

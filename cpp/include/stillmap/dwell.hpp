@@ -441,7 +441,7 @@ class Dwell {
   std::vector<Head> heads_;
   std::vector<float> state_;                // (elements, 2, classes)
   std::vector<double> log_hit_, log_miss_;  // of one more look in a run, per class
-  int8_t calm_ = 1;  // misses in a row after which the filters stand still
+  int8_t calm_ = 1;                         // misses in a row after which the filters stand still
   std::vector<float> table_;
   int64_t newest_ = INT64_MIN;
 };

@@ -39,6 +39,7 @@ struct Element {
   Vec<D> mean = Vec<D>::Zero();    // of the end points in the cell
   Vec<D> normal = Vec<D>::Zero();  // unit length; zero where the surroundings are no surface
   double off_plane = 0.0;          // of the cell's centre from the surface around it
+  double prominence = 1.0;         // its beams against those of the richest cell around
   Vec<D> centre = Vec<D>::Zero();  // of the surface around it, else the mean
   double half = 0.5;               // how far it extends from there for sure
 };
@@ -165,7 +166,7 @@ class Surface {
 
   // Count, mean and covariance of the end points in the cells around one.
   struct Spread {
-    double count = 0.0;
+    double count = 0.0, most = 0.0;  // in all cells, in one
     Vec<D> first = Vec<D>::Zero();
     Square second = Square::Zero();
 
@@ -180,6 +181,7 @@ class Surface {
         for (int j = i; j < D; ++j)
           products(i, j) = products(j, i) = from_fixed(s.second[product++]);
       count += n;
+      most = std::max(most, n);
       first += sum + n * corner;
       second += products + corner * sum.transpose() + sum * corner.transpose() +
                 n * corner * corner.transpose();
@@ -204,6 +206,7 @@ class Surface {
       element.off_plane = 0.0;
       element.centre = element.mean;
       element.half = 0.5;
+      element.prominence = static_cast<double>(sums_[k].count) / spread.most;
       all += sums_[k].count;
       const bool wide = variance[1] > 0.15 * radius * radius;  // over three cells of five
       if (!wide || variance[0] >= 0.25 * variance[1]) continue;

@@ -18,6 +18,7 @@ Surface = _core.Surface2D | _core.Surface3D
 
 _LEAST = 0.3  # cells: no length is known better, whatever the scatter
 _UNSEEN = 0.2  # probability that a cell is occupied in which no beam ended and none passed
+_PROMINENT = 0.1  # share of the richest cell's beams that noise alone hardly brings into another
 _EDGE = 0.15  # cells: how sharply a surface ends
 
 
@@ -75,7 +76,7 @@ def e_step(
     likelihood, log_best = _likelihood(
         recording, T_map_sensor, surface, options.dwell, threads, classes
     )
-    cells, _, normals, off_plane, beams = surface.elements()
+    cells, _, normals, off_plane, prominence, beams = surface.elements()
     shares = fit_shares(likelihood, beams, classes.n_static, options.prior)
     static = posterior_static(likelihood, shares.classes, classes.n_static)
     element = _elements_of(recording, T_map_sensor, surface, threads)
@@ -84,7 +85,7 @@ def e_step(
         p_static=per_beam(recording, found[element], shares.static),
         likelihood=_bound(likelihood, log_best, beams, shares),
         occupied=CellProbabilities(
-            cells, _coverage(static, normals, off_plane / resolution), _UNSEEN
+            cells, static * _coverage(normals, off_plane / resolution, prominence), _UNSEEN
         ),
         learned=_learned(surface, shares, classes),
     )
@@ -170,13 +171,13 @@ def _bound(
     return Likelihood(expected=bound - float(np.sum(beams * entropy)), bound=bound)
 
 
-def _coverage(static: NDArray[np.float32], normals: Float, off_plane: Float) -> NDArray[np.float32]:
-    """P(the static surface runs through the cell itself): noise also fills cells beside it."""
+def _coverage(normals: Float, off_plane: Float, prominence: Float) -> NDArray[np.float32]:
+    """P(what is there runs through the cell itself): noise also fills cells beside it."""
     # of the cell, across the surface; a wall on the border of two cells belongs to both
     half = 0.5 * np.abs(normals).sum(axis=1) + _EDGE
     covered = ndtr((half - np.abs(off_plane)) / _EDGE)
-    flat = normals.any(axis=1)
-    return np.asarray(static * np.where(flat, covered, 1.0), dtype=np.float32)
+    lone = np.minimum(prominence / _PROMINENT, 1.0)
+    return np.asarray(np.where(normals.any(axis=1), covered, lone), dtype=np.float32)
 
 
 def _learned(surface: Surface, shares: Shares, classes: Classes) -> dict[str, object]:

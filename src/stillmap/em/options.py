@@ -9,7 +9,7 @@ from stillmap.options import field_with_doc
 class DwellOptions:
     """The default estimator; lengths follow from the scatter of end points in the recording."""
 
-    look: float = field_with_doc(1.0, "s, beams within it tell no more of a cell than one")
+    look: float = field_with_doc(0.25, "s, beams within it tell no more of a cell than one")
     detection: float = field_with_doc(0.97, "probability that an occupied cell is seen to be so")
     lateral: float = field_with_doc(0.7, "scatters by which a beam may pass beside its place")
     margin: float = field_with_doc(3.0, "scatters behind a surface at which a beam has passed it")
@@ -40,6 +40,9 @@ class EmOptions:
     tolerance: float = field_with_doc(
         1e-3, "nats per beam of the bound: the loop stops when it gains less"
     )
+    settled: float = field_with_doc(
+        0.005, "share of the hits whose label moves by 0.1: the loop stops when fewer do"
+    )
     patience: int = field_with_doc(2, "iterations without a better bound before the loop stops")
     hit_ratio: float = field_with_doc(
         0.25, "hits / (hits + passes) below which the hit-ratio estimator drops a cell"
@@ -55,6 +58,8 @@ class EmOptions:
                 raise ValueError(f"'em.{name}' wants a probability between 0 and 1, both excluded")
         if self.max_iterations < 1 or self.patience < 1:
             raise ValueError("'em.max_iterations' and 'em.patience' want at least 1")
+        if not 0.0 <= self.settled <= 1.0:
+            raise ValueError("'em.settled' wants a share between 0 and 1")
         if not self.tolerance >= 0.0:
             raise ValueError("'em.tolerance' wants a number that is not negative")
         if self.held_out < 0 or self.held_out == 1:
