@@ -40,6 +40,9 @@ class CellIndex {
     return find_or_add(block_of(cell))->counts[static_cast<size_t>(local_of(cell))];
   }
 
+  // in the order in which they were added
+  const std::vector<std::unique_ptr<Block>>& blocks() const { return blocks_; }
+
  private:
   Block* find_or_add(const Cell<D>& block) {
     if (last_ && last_->origin == block) return last_;

@@ -98,7 +98,7 @@ class Surface : public CellIndex<D> {
   void number_by_place() {
     std::vector<Sums> sorted;
     sorted.reserve(sums_.size());
-    for (auto& block : blocks_)
+    for (const auto& block : this->blocks())
       for (int32_t& k : block->counts) {
         if (k == kNoElement) continue;
         sorted.push_back(sums_[static_cast<size_t>(k)]);
