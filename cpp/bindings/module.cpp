@@ -14,4 +14,5 @@ NB_MODULE(_core, m) {
   stillmap::border::bind_beams(m);
   stillmap::border::bind_register(m);
   stillmap::border::bind_dwell(m);
+  stillmap::border::bind_held_out(m);
 }

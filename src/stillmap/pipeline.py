@@ -65,6 +65,7 @@ class Iteration:
         changed_share: share of hits whose e moved by more than 0.1.
         explained: (T,) share of each scan's beams that the map so far explained.
         widened: scans that only a wider search than the motion prior's could place.
+        held_out: nats per beam, see `em.held_out_log_likelihood`; None where it is not computed.
         seconds: wall clock.
     """
 
@@ -80,6 +81,7 @@ class Iteration:
     changed_share: float
     explained: Float
     widened: list[int]
+    held_out: float | None
     seconds: float
 
     @property
@@ -121,6 +123,15 @@ def iterate(
             found = em.e_step(
                 recording, mapped.poses, mapped.grid, options.estimator, options.em, threads
             )
+        with stages.measure("held_out"):
+            held_out = em.held_out_log_likelihood(
+                recording,
+                mapped.poses,
+                found.p_static,
+                options.slam.resolution,
+                options.em.held_out,
+                threads,
+            )
         iteration = Iteration(
             number=number,
             poses=mapped.poses,
@@ -134,6 +145,7 @@ def iterate(
             changed_share=em.changed_share(e, found.p_static, recording.hit),
             explained=mapped.explained,
             widened=mapped.widened,
+            held_out=held_out,
             seconds=time.perf_counter() - started,
         )
         e = found.p_static

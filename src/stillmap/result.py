@@ -137,6 +137,7 @@ class _Run:
                 bound,
                 iteration.changed_share,
                 iteration.seconds,
+                iteration.held_out,
             )
         )
         gain = np.inf if self.best is None else bound - self.best.bound

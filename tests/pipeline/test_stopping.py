@@ -56,6 +56,7 @@ def made_up(recording, number, bound) -> Iteration:
         changed_share=0.5 / number,
         explained=np.ones(T),
         widened=[],
+        held_out=None,
         seconds=float(number),
     )
 

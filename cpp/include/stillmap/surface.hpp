@@ -6,17 +6,16 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <memory>
 #include <stdexcept>
-#include <unordered_map>
 #include <utility>
 #include <vector>
 
 #include "stillmap/beams.hpp"
+#include "stillmap/cell_index.hpp"
 
 namespace stillmap {
 
-constexpr int32_t kNoElement = -1;
+constexpr int32_t kNoElement = CellIndex<2>::kNone;
 
 // Calls visit(cell) for the cells of the cube of that radius around a cell.
 template <int D, class Visit>
@@ -45,19 +44,11 @@ struct Element {
 };
 
 template <int D>
-class Surface {
+class Surface : public CellIndex<D> {
  public:
-  using G = Grid<D>;
-  static constexpr int kDimension = D;
-  static constexpr int kShift = G::kShift;
-  static constexpr int kEdge = G::kEdge;
-  static constexpr int kCells = G::kCells;
   static constexpr int kProducts = D * (D + 1) / 2;
 
-  struct Block {
-    Cell<D> origin;                      // block coordinates
-    std::array<int32_t, kCells> counts;  // the element in each cell, or kNoElement
-  };
+  using Block = typename CellIndex<D>::Block;
 
   explicit Surface(double resolution) : resolution_(resolution) {
     if (!(resolution > 0.0) || !std::isfinite(resolution))
@@ -73,13 +64,6 @@ class Surface {
   const Element<D>& element(int32_t k) const { return elements_[static_cast<size_t>(k)]; }
   int64_t beams(int32_t k) const { return sums_[static_cast<size_t>(k)].count; }
   const Cell<D>& cell(int32_t k) const { return sums_[static_cast<size_t>(k)].cell; }
-
-  const Block* find(const Cell<D>& block) const {
-    const auto it = index_.find(G::key(block));
-    return it == index_.end() ? nullptr : blocks_[it->second].get();
-  }
-  static Cell<D> block_of(const Cell<D>& cell) { return G::block_of(cell); }
-  static int local_of(const Cell<D>& cell) { return G::local_of(cell); }
 
   // Notes the end points of all beams that were hit.
   void add(const Scans<D>& scans) {
@@ -115,7 +99,7 @@ class Surface {
   void number_by_place() {
     std::vector<Sums> sorted;
     sorted.reserve(sums_.size());
-    for (auto& block : blocks_)
+    for (const auto& block : this->blocks())
       for (int32_t& k : block->counts) {
         if (k == kNoElement) continue;
         sorted.push_back(sums_[static_cast<size_t>(k)]);
@@ -126,7 +110,7 @@ class Surface {
 
   void add_end_point(const Vec<D>& end) {
     const Cell<D> cell = cell_of<D>(end);
-    int32_t& at = find_or_add(block_of(cell))->counts[static_cast<size_t>(local_of(cell))];
+    int32_t& at = this->place_of(cell);
     if (at == kNoElement) {
       at = static_cast<int32_t>(sums_.size());
       sums_.emplace_back();
@@ -140,18 +124,6 @@ class Surface {
       sums.first[static_cast<size_t>(i)] += to_fixed(x[i]);
       for (int j = i; j < D; ++j) sums.second[product++] += to_fixed(x[i] * x[j]);
     }
-  }
-
-  Block* find_or_add(const Cell<D>& block) {
-    if (last_ && last_->origin == block) return last_;
-    const auto [it, added] = index_.try_emplace(G::key(block), blocks_.size());
-    if (added) {
-      blocks_.push_back(std::make_unique<Block>());
-      blocks_.back()->origin = block;
-      blocks_.back()->counts.fill(kNoElement);
-    }
-    last_ = blocks_[it->second].get();
-    return last_;
   }
 
   static Vec<D> mean_of(const Sums& s) {
@@ -228,7 +200,7 @@ class Surface {
     for_each_near<D>(centre, radius, [&](const Cell<D>& cell) {
       const Block* block = cursor.block(cell);
       if (!block) return;
-      const int32_t k = block->counts[static_cast<size_t>(local_of(cell))];
+      const int32_t k = block->counts[static_cast<size_t>(this->local_of(cell))];
       if (k != kNoElement) spread.add(sums_[static_cast<size_t>(k)], centre);
     });
     return spread;
@@ -249,9 +221,6 @@ class Surface {
   bool fitted_ = false;
   std::vector<Sums> sums_;
   std::vector<Element<D>> elements_;
-  std::vector<std::unique_ptr<Block>> blocks_;
-  Block* last_ = nullptr;
-  std::unordered_map<uint64_t, size_t, typename G::Hash> index_;
 };
 
 }  // namespace stillmap

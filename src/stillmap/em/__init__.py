@@ -9,6 +9,7 @@ from stillmap.em.estimator import (
     iterations,
 )
 from stillmap.em.expectations import CellProbabilities, Expectations, Likelihood
+from stillmap.em.held_out import held_out_log_likelihood
 from stillmap.em.occupancy import OccupancyMap, occupancy_map
 from stillmap.em.options import DwellOptions, EmOptions
 
@@ -23,6 +24,7 @@ __all__ = [
     "add_recording",
     "changed_share",
     "e_step",
+    "held_out_log_likelihood",
     "initial_expectations",
     "iterations",
     "occupancy_map",

@@ -71,6 +71,18 @@ def likelihood_sentence(result: ResultLike) -> str:
     )
 
 
+def held_out_sentence(result: ResultLike) -> str:
+    """How well the kept iteration foresees scans that were left out of its map."""
+    figures = {it.number: it.held_out_log_likelihood for it in result.iterations}
+    kept = figures.get(result.best_iteration)
+    if kept is None or not math.isfinite(kept):
+        return ""
+    return (
+        f"Scans that were left out of the map are foreseen with {kept:.3f} nats per beam more than "
+        "without a map: the higher the better, among maps of the same recording."
+    )
+
+
 def _name(result: ResultLike) -> str:
     path = str(result.recording.source.get("path", ""))
     return Path(path).name or "recording"
@@ -148,7 +160,8 @@ def _estimate_section(result: ResultLike) -> str:
     return (
         "<section><h2>How the estimate went</h2>"
         f"<p>{escape(likelihood_sentence(result))} {end} "
-        f"The result is that of iteration {result.best_iteration}, circled.</p>"
+        f"The result is that of iteration {result.best_iteration}, circled. "
+        f"{escape(held_out_sentence(result))}</p>"
         f'<figure role="img" aria-label="Likelihood over {len(result.iterations)} iterations; '
         f'the numbers are in the table below.">'
         f"{likelihood_svg(result.iterations, result.best_iteration)}</figure>"

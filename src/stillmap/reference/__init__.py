@@ -15,6 +15,7 @@ from stillmap.reference.dwell import Dwell, Dwell2D, Dwell3D, Reading, look_at
 from stillmap.reference.em import EmStep, em_fixed_poses, m_step_map
 from stillmap.reference.field import field, registration_cost, registration_gradient
 from stillmap.reference.grid import Grid, Grid2D, Grid3D, occupancy
+from stillmap.reference.held_out import StaticShares, StaticShares2D, StaticShares3D, held_out
 from stillmap.reference.surface import Surface, Surface2D, Surface3D
 from stillmap.reference.traverse import cell_of, traverse
 
@@ -27,6 +28,9 @@ __all__ = [
     "Grid2D",
     "Grid3D",
     "Reading",
+    "StaticShares",
+    "StaticShares2D",
+    "StaticShares3D",
     "Surface",
     "Surface2D",
     "Surface3D",
@@ -35,6 +39,7 @@ __all__ = [
     "e_step",
     "em_fixed_poses",
     "field",
+    "held_out",
     "log_likelihood",
     "look_at",
     "m_step_map",

@@ -1,0 +1,112 @@
+"""The figure of quality without truth: what it depends on, and which way."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stillmap import em, se2
+from stillmap.em import chunks as chunking
+from stillmap.em.held_out import held_out_scans
+from stillmap.recording.model import Recording
+from stillmap.simulation import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
+from stillmap.simulation.walls import box
+
+RESOLUTION, EVERY = 0.05, 10
+
+
+@pytest.fixture(scope="module")
+def room():
+    scene = Scene(
+        "room",
+        walls=(*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6)),
+        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
+        crowd=CrowdOptions(people=6),
+        laser=LaserOptions(beams=180, range_noise=0.01, max_range=8.0),
+        robot=RobotOptions(scans=120),
+    )
+    sim = simulate(scene, np.random.default_rng(4))
+    assert (sim.truth.mover >= 0).sum() > 500
+    return sim
+
+
+def figure(sim, e=None, poses=None, recording=None, every=EVERY, **more):
+    truth = sim.truth
+    e = truth.static.astype(np.float32) if e is None else e
+    poses = truth.T_world_base if poses is None else poses
+    recording = recording or sim.recording
+    return em.held_out_log_likelihood(recording, poses, e, RESOLUTION, every, **more)
+
+
+def test_true_labels_and_poses_foresee_best(room):
+    static, T = room.truth.static, room.truth.T_world_base
+    rng = np.random.default_rng(0)
+    e = static.astype(np.float32)
+    best = figure(room)
+    assert 0.5 < best < 6
+    assert best > figure(room, np.ones_like(e)) + 0.02  # movers left in the map
+    assert best > figure(room, np.full_like(e, 0.5)) + 0.1  # undecided
+    assert best > figure(room, 1 - e) + 1  # walls left out of it
+    wrong = rng.random(len(e)) < 0.2
+    assert best > figure(room, np.where(wrong, 0, e).astype(np.float32)) + 0.02
+    last = best
+    for off in (0.03, 0.1, 0.3):
+        moved = T @ se2.matrix(*(off * rng.standard_normal((3, len(T)))))
+        now = figure(room, poses=moved)
+        assert now < last - 0.05
+        last = now
+
+
+def test_held_out_beams_are_not_in_the_map(room):
+    held = held_out_scans(room.recording.n_scans, EVERY)
+    of_held = np.repeat(held, np.diff(room.recording.offset))
+    e = room.truth.static.astype(np.float32)
+    assert figure(room, np.where(of_held, 1 - e, e)) == figure(room, e)
+    assert figure(room, np.where(of_held, e, 1 - e)) != figure(room, e)
+
+
+@pytest.mark.parametrize("every", [2, 7, 20, 120])
+def test_which_scans(every):
+    held = held_out_scans(120, every)
+    assert held.sum() == 120 // every + (120 % every > every // 2)
+    assert set(np.diff(np.flatnonzero(held))) <= {every}
+    assert 0 < np.flatnonzero(held)[0] < every
+
+
+def test_no_figure_where_there_is_nothing_to_hold_out(room):
+    assert figure(room, every=0) is None
+    assert figure(room, every=121) is None
+    assert figure(room, every=120) is not None
+    r = room.recording
+    blind = dataclasses.replace(r, points=np.full_like(r.points, np.nan), hit=np.zeros_like(r.hit))
+    assert figure(room, recording=blind) is None
+
+
+def test_threads_and_chunks_change_nothing(room, monkeypatch):
+    one = figure(room)
+    assert figure(room, threads=3) == one
+    monkeypatch.setattr(chunking, "CHUNK_BEAMS", 1000)
+    assert figure(room) == pytest.approx(one, rel=1e-12)
+
+
+def test_in_three_dimensions():
+    # a sensor in a cube of 4 m: three scans, the one in the middle held out
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(3 * 4000, 3))
+    points = (2 * directions / np.abs(directions).max(axis=1, keepdims=True)).astype(np.float32)
+    recording = Recording(
+        stamp_ns=np.arange(3, dtype=np.int64),
+        offset=np.arange(4, dtype=np.int64) * 4000,
+        points=points,
+        hit=np.ones(len(points), bool),
+        T_base_sensor=np.eye(4)[None],
+        sensor=np.zeros(3, np.int32),
+        T_odom_base=None,
+    )
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    e = np.ones(len(points), np.float32)
+    good = em.held_out_log_likelihood(recording, poses, e, 0.2, 3)
+    turned = poses.copy()
+    turned[1, :3, :3] = [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]
+    assert good > em.held_out_log_likelihood(recording, turned, e, 0.2, 3) + 0.5
+    assert good > em.held_out_log_likelihood(recording, poses, 0 * e, 0.2, 3) + 0.5

@@ -1,0 +1,51 @@
+"""The figure of quality in every iteration, in run.json and in the report."""
+
+import json
+
+import pytest
+
+import stillmap
+from stillmap import em
+from stillmap.options import replaced
+from stillmap.pipeline import Options
+
+
+def options(estimator, **changes):
+    settings = {"max_iterations": 3, "held_out": 20, **changes}
+    return replaced(Options(), {"em": settings, "estimator": estimator, "threads": 1})
+
+
+@pytest.mark.parametrize("estimator", ["stillmap", "paper", "hit-ratio"])
+def test_every_iteration_has_its_figure(room, tmp_path, estimator):
+    chosen = options(estimator)
+    result = stillmap.build(room.recording, chosen)
+    figures = [it.held_out_log_likelihood for it in result.iterations]
+    assert all(0 < figure < 10 for figure in figures)
+    # it is that of the poses and labels which are written
+    expected = em.held_out_log_likelihood(
+        room.recording, result.poses, result.p_static, chosen.slam.resolution, 20
+    )
+    assert figures[result.best_iteration - 1] == expected
+    assert result.stages["held_out"]["seconds"] > 0
+    result.save(tmp_path / "out")
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert [it["held_out_log_likelihood"] for it in run["iterations"]] == figures
+    assert f"foreseen with {expected:.3f} nats" in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("every", [0, 61])
+def test_without_held_out_scans_there_is_none(room, tmp_path, every):
+    result = stillmap.build(room.recording, options("stillmap", held_out=every, max_iterations=1))
+    assert [it.held_out_log_likelihood for it in result.iterations] == [None]
+    result.save(tmp_path / "out")
+    assert "foreseen" not in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_what_is_mapped_does_not_depend_on_it(room):
+    one, other = (
+        stillmap.build(room.recording, options("stillmap", held_out=every, max_iterations=2))
+        for every in (0, 7)
+    )
+    assert one.poses.tobytes() == other.poses.tobytes()
+    assert one.p_static.tobytes() == other.p_static.tobytes()
+    assert one.map.p_occupied.tobytes() == other.map.p_occupied.tobytes()
