@@ -32,10 +32,13 @@ def order(surface):
 def assert_same_surface(core, plain):
     of_core, of_plain = order(core), order(plain)
     assert core.size == plain.size == len(of_core) > 50
-    cells, means, normals, off_plane, beams = (a[of_core] for a in core.elements())
+    cells, means, normals, off_plane, prominence, beams = (a[of_core] for a in core.elements())
     expected = tuple(a[of_plain] for a in plain.elements())
     np.testing.assert_array_equal(cells, expected[0])
-    np.testing.assert_array_equal(beams, expected[4])
+    np.testing.assert_array_equal(beams, expected[5])
+    np.testing.assert_allclose(prominence, expected[4], rtol=1e-12)
+    assert prominence.max() == 1  # the richest cell of its own window
+    assert prominence.min() < 0.5
     np.testing.assert_allclose(means, expected[1], atol=1e-6)
     flat = expected[2].any(axis=1)
     assert 0.4 < flat.mean() < 1

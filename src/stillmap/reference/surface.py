@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,12 +47,14 @@ class Element:
         cell: its integer coordinates.
         beams: number of beams that ended in it.
         mean: (D,) of their end points, metres.
+        prominence: `beams` against those of the richest cell in the window.
         patch: None where the surroundings are no surface.
     """
 
     cell: Cell
     beams: int
     mean: Float
+    prominence: float
     patch: Patch | None
 
 
@@ -92,22 +95,23 @@ class Surface:
         """Means, surfaces and scatter; the window widens until it sees walls for all the noise."""
         for radius in WINDOWS:
             self.list = [
-                Element(cell, len(ends), np.mean(ends, axis=0), self._patch(cell, radius))
-                for cell, ends in self.ends.items()
+                self._element(cell, [c for c in near(cell, radius) if c in self.ends], radius)
+                for cell in self.ends
             ]
             across = [e.patch.across for e in self.list if e.patch for _ in range(e.beams)]
             if 2 * len(across) >= sum(e.beams for e in self.list):
                 break
         self.scatter = float(np.sort(across)[(len(across) - 1) // 2]) if across else 0.0
 
-    def elements(self) -> tuple[Int, Float, Float, Float, Int]:
-        """cells (E, D), means (E, D), normals (E, D), off_plane (E,), beams (E,)."""
+    def elements(self) -> tuple[Int, Float, Float, Float, Float, Int]:
+        """cells, means, normals (E, D) each, off_plane, prominence, beams (E,) each."""
         D, nowhere = self.dimension, np.zeros(self.dimension)
         return (
             np.array([e.cell for e in self.list], np.int64).reshape(-1, D),
             np.array([e.mean for e in self.list]).reshape(-1, D),
             np.array([e.patch.normal if e.patch else nowhere for e in self.list]).reshape(-1, D),
             np.array([e.patch.off_plane if e.patch else 0.0 for e in self.list]),
+            np.array([e.prominence for e in self.list]),
             np.array([e.beams for e in self.list], np.int64),
         )
 
@@ -134,11 +138,19 @@ class Surface:
     def _end_cell(self, beam: Beam) -> Cell:
         return tuple(cell_of(beam.end, self.resolution).tolist())
 
-    def _patch(self, cell: Cell, radius: int) -> Patch | None:
-        D = self.dimension
-        shifts = np.stack(np.meshgrid(*[np.arange(-radius, radius + 1)] * D), -1).reshape(-1, D)
-        near = [tuple(c) for c in (np.array(cell) + shifts).tolist()]
-        around = np.array([end for c in near for end in self.ends.get(c, [])])
+    def _element(self, cell: Cell, window: list[Cell], radius: int) -> Element:
+        """What the cells with end points in a window around it, itself among them, say of one."""
+        ends = self.ends[cell]
+        return Element(
+            cell=cell,
+            beams=len(ends),
+            mean=np.mean(ends, axis=0),
+            prominence=len(ends) / max(len(self.ends[c]) for c in window),
+            patch=self._patch(cell, window, radius),
+        )
+
+    def _patch(self, cell: Cell, window: list[Cell], radius: int) -> Patch | None:
+        around = np.array([end for c in window for end in self.ends[c]])
         variance, axes = np.linalg.eigh(np.cov(around.T, bias=True))  # rising
         wide = variance[1] > WIDE * (radius * self.resolution) ** 2
         if not wide or variance[0] >= FLAT * variance[1]:
@@ -152,6 +164,11 @@ class Surface:
             off_plane=float(normal @ (middle - centre)),
             across=float(np.sqrt(max(variance[0], 0.0))),
         )
+
+
+def near(cell: Cell, radius: int) -> list[Cell]:
+    """The cells of the cube of that radius around a cell."""
+    return list(product(*(range(c - radius, c + radius + 1) for c in cell)))
 
 
 Surface2D = partial(Surface, dimension=2)
