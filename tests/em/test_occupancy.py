@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from made_up import Ball, Wall, watch
+from made_up import Ball, Wall, fan, watch
 
 from stillmap import _core, em
 
@@ -58,22 +58,80 @@ def at(m, points):
     return padded[np.clip(row, 0, len(padded) - 1), np.clip(column, 0, padded.shape[1] - 1)]
 
 
-@pytest.mark.parametrize("inside", [0.2, 0.5, 0.8])
-def test_walls_are_crisp_and_movers_leave_the_floor_free(inside):
-    wall = 4.0 + inside * RESOLUTION
+Y = np.arange(-2.0, 2.0, RESOLUTION) + RESOLUTION / 2  # of cells along a wall
+
+
+def a_room_with(wall):
+    """A wall at this x, people walking by and one who stood for a while: what became of it."""
     walls = [Wall((1, 0), wall), Wall((0, 1), 3.04), Wall((0, -1), 3.04)]
     movers = [Ball(2.0, -1.4 + 0.4 * k, 20 + k, 21 + k) for k in range(8)]
     seen = watch([*walls, *movers, Ball(2.5, 1.5, 5, 20)], 60, noise=0.015)
     found = seen.e_step(RESOLUTION)
-    grid = seen.grid(found.p_static, RESOLUTION)
-    m = em.occupancy_map(grid, found.occupied)
-    y = np.arange(-2.0, 2.0, RESOLUTION) + RESOLUTION / 2
-    assert (at(m, np.column_stack([y * 0 + wall, y])) > 0.8).mean() > 0.95
-    for beside in (-1, 1):  # noise filled these cells too
-        column = np.column_stack([y * 0 + wall + beside * RESOLUTION, y])
-        p = at(m, column)
-        assert not (p > 0.35).any()  # NaN counts as neither
-    ends = seen.recording.points[(seen.what >= len(walls)) & seen.recording.hit]
+    m = em.occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
+    return seen, seen.what >= len(walls), m
+
+
+def column(m, x):
+    return at(m, np.column_stack([Y * 0 + x, Y]))
+
+
+@pytest.mark.parametrize("inside", [0.35, 0.5, 0.65])
+def test_walls_are_crisp(inside):
+    *_, m = a_room_with(4.0 + inside * RESOLUTION)
+    assert (column(m, 4.05) > 0.8).mean() > 0.95
+    assert not (column(m, 3.95) > 0.35).any()  # noise filled these cells too
+    assert not (column(m, 4.15) > 0.35).any()  # NaN counts as neither
+
+
+@pytest.mark.parametrize(("inside", "other"), [(0.0, -1), (0.05, -1), (0.95, 1), (1.0, 1)])
+def test_a_wall_on_the_border_of_two_cells_belongs_to_both(inside, other):
+    *_, m = a_room_with(4.0 + inside * RESOLUTION)
+    assert (column(m, 4.05) > 0.6).mean() > 0.95
+    assert (column(m, 4.05 + other * RESOLUTION) > 0.6).mean() > 0.95
+    for beyond in (-other, 2 * other):
+        assert not (column(m, 4.05 + beyond * RESOLUTION) > 0.35).any()
+
+
+def around(m, x, y, cells=2):
+    """p_occupied of the cells around that of a place, which is in the middle."""
+    steps = np.arange(-cells, cells + 1) * RESOLUTION
+    return at(m, np.column_stack([g.ravel() for g in np.meshgrid(x + steps, y + steps)]))
+
+
+@pytest.mark.parametrize("y", [0.05, -1.25])
+def test_noise_beside_a_thing_is_not_the_thing(y):
+    post = Ball(2.08, y, 0, 60, radius=0.03)
+    seen = watch([Wall((1, 0), 4.05), post], 60, fan(721, 90), noise=0.025)
+    found = seen.e_step(RESOLUTION)
+    m = em.occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
+    near = around(m, 2.05, y)
+    hits = around(em.occupancy_map(seen.grid(None, RESOLUTION)), 2.05, y) > 0
+    assert hits.sum() >= 3
+    middle = np.arange(hits.size) == hits.size // 2
+    assert near[middle] > 0.8
+    assert not (near[~middle] > 0.5).any()
+    # and beams that ended there hit it nevertheless
+    assert seen.of(found.p_static, 1).min() > 0.9
+
+
+@pytest.mark.parametrize("radius", [0.01, 0.03, 0.08])
+@pytest.mark.parametrize(("x", "y"), [(2.05, 0.05), (2.0, 0.0), (3.03, 1.0), (1.5, -1.27)])
+def test_thin_posts_stay(x, y, radius):
+    # in the middle of a cell or on its border, before a wall that gets many more beams
+    post = Ball(x + radius, y, 0, 60, radius)
+    seen = watch([Wall((1, 0), x + 0.4), post, *[Ball(1.0, k, k, k + 1) for k in (-1, 1)]], 60,
+                 fan(721, 90), noise=0.01)  # fmt: skip
+    found = seen.e_step(RESOLUTION)
+    m = em.occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
+    there = np.unique(np.floor(seen.of(seen.recording.points, 1) / RESOLUTION), axis=0)
+    assert (at(m, (there + 0.5) * RESOLUTION) > 0.8).any()
+    ends = at(m, seen.of(seen.recording.points, 1))
+    assert np.median(ends) > 0.8
+
+
+def test_movers_leave_the_floor_free():
+    seen, moves, m = a_room_with(4.05)
+    ends = seen.recording.points[moves]
     assert (at(m, ends) < 0.3).mean() > 0.97
     raw = em.occupancy_map(seen.grid(None, RESOLUTION))
     assert np.median(at(m, ends)) < np.median(at(raw, ends))
