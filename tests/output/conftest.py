@@ -37,6 +37,7 @@ class EmOptions:
 
 @dataclass(frozen=True)
 class FakeOptions:
+    estimator: str = "stillmap"
     em: EmOptions = field(default_factory=EmOptions)
     output: OutputOptions = field(default_factory=OutputOptions)
 
@@ -73,6 +74,7 @@ class FakeResult:
     best_iteration: int
     converged: bool
     warnings: list
+    learned: dict
     stages: dict
 
 
@@ -159,6 +161,18 @@ SOURCE = {
     },
 }
 
+LEARNED = {
+    "scatter": 0.0167,
+    "p_static": 0.8731,
+    "static_occupied": [{"value": 0.998, "share": 0.75}, {"value": 0.9, "share": 0.25}],
+    "mover_occupied": [{"value": 0.01, "share": 0.9}, {"value": 0.15, "share": 0.1}],
+    "mover_seconds": [
+        {"value": 0.5, "share": 0.6},
+        {"value": 3.0, "share": 0.3},
+        {"value": 45.0, "share": 0.1},
+    ],
+}
+
 
 @pytest.fixture(scope="session")
 def result():
@@ -205,6 +219,7 @@ def result():
         best_iteration=3,
         converged=True,
         warnings=["the odometry stalls at line 88 & <after>"],
+        learned=LEARNED,
         stages={
             "read": {"seconds": 0.21, "peak_memory_bytes": 41_000_000},
             "em": {"seconds": 7.1, "peak_memory_bytes": 96_000_000},

@@ -19,6 +19,7 @@ from stillmap.output.report_figures import (
     shown_window,
     snapshot_image,
 )
+from stillmap.output.report_learned import learned_section
 
 VOID = {"meta", "img", "input", "br", "link", "hr"}
 
@@ -178,9 +179,11 @@ def test_a_report_of_a_large_map_stays_small(result):
 
 
 def test_curve_is_the_same_every_time_and_marks_the_best(result):
-    svg = likelihood_svg(result.iterations, 3)
-    assert svg == likelihood_svg(result.iterations, 3)
-    assert svg != likelihood_svg(result.iterations, 2)
+    titles = ("one curve", "the other")
+    svg = likelihood_svg(result.iterations, 3, titles)
+    assert svg == likelihood_svg(result.iterations, 3, titles)
+    assert svg != likelihood_svg(result.iterations, 2, titles)
+    assert all(title in svg for title in titles)
     assert "http" not in svg
     assert not re.search(r"#01020\d", svg)
     for colour in ("--ink", "--accent", "--orange"):
@@ -190,8 +193,7 @@ def test_curve_is_the_same_every_time_and_marks_the_best(result):
 def with_likelihoods(result, values):
     first = result.iterations[0]
     records = [
-        dataclasses.replace(first, number=n, expected_log_likelihood=value)
-        for n, value in enumerate(values, start=1)
+        dataclasses.replace(first, number=n, bound=value) for n, value in enumerate(values, start=1)
     ]
     return dataclasses.replace(result, iterations=records)
 
@@ -207,6 +209,50 @@ def test_the_report_says_where_the_likelihood_fell(result):
     )
     assert "one iteration only" in sentence([-5])
     assert "fell at iteration 3 (by 3.0 %)" in sentence([-100, float("nan"), -103])
+
+
+def estimated_by(result, estimator):
+    options = dataclasses.replace(result.options, estimator=estimator)
+    return dataclasses.replace(result, options=options)
+
+
+def test_the_curves_are_called_what_the_estimator_made_them(result):
+    default = report_html(result)
+    assert "Bound: composite log likelihood" in default
+    assert "(5)" not in default
+    for estimator in ("paper", "hit-ratio"):
+        printed = report_html(estimated_by(result, estimator))
+        assert "Expected log likelihood, (5)" in printed
+        assert "composite" not in printed
+
+
+def test_one_iteration_makes_no_curve(result):
+    one = report_html(dataclasses.replace(result, iterations=result.iterations[:1]))
+    assert 'class="curve"' not in one
+    assert "The numbers" in one
+
+
+def learned_text(result):
+    return re.sub(r"\s+", " ", " ".join(Page(learned_section(result)).text))
+
+
+def test_what_was_learned_in_words(result):
+    text = learned_text(result)
+    assert "87.3 % of the beams that hit something met what stands still" in text
+    assert "scatter by 1.7 cm" in text
+    assert "0.5 s or less 60.0 % 3 s 30.0 % 45 s or more 10.0 %" in text
+    assert "1 % or less 90.0 % 15 % or more 10.0 %" in text
+    assert "90 % or less 25.0 % 99.8 % or more 75.0 %" in text  # the least first
+    assert learned_section(result) in report_html(result)
+
+
+def test_nothing_is_told_that_was_not_learned(result):
+    assert learned_section(dataclasses.replace(result, learned={})) == ""
+    still = dataclasses.replace(result, p_static=np.ones_like(result.p_static))
+    assert "Only 0 beams met something moving" in learned_text(still)
+    assert "or less 60.0 %" not in learned_text(still)
+    uneven = dataclasses.replace(result, learned={**result.learned, "scatter": 0.0})
+    assert "scatter" not in learned_text(uneven)
 
 
 @pytest.mark.parametrize(
@@ -235,6 +281,7 @@ def test_likelihoods_that_are_no_numbers_are_drawn_as_gaps(result):
     [
         ("duration_text", 0.0123, "0.012 s"),
         ("duration_text", 42.4, "42 s"),
+        ("duration_text", 1.7e-5, "under 1 ms"),
         ("duration_text", 192.0, "3 min 12 s"),
         ("duration_text", 59.9, "1 min 0 s"),
         ("duration_text", 7260.0, "2 h 1 min"),

@@ -31,6 +31,7 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
         "peak_memory_bytes",
         "counts",
         "warnings",
+        "learned",
     ]
     assert run["format_version"] == 1
     assert isinstance(run["version"], str)
@@ -41,6 +42,7 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
     assert run["seconds"] == {"read": 0.21, "em": 7.1, "map": 0.02}
     assert run["peak_memory_bytes"]["em"] == 96_000_000
     assert run["warnings"] == result.warnings
+    assert run["learned"] == result.learned
 
 
 def test_iterations(tmp_path, result):

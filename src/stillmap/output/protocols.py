@@ -39,8 +39,9 @@ class IterationRecordLike(Protocol):
 
     Attributes:
         number: counted from 1.
-        expected_log_likelihood: (5) with the constant of (7), the curve of Fig. 5.
-        bound: the above plus the entropy of e: what the loop watches.
+        expected_log_likelihood: by the printed method (5) with the constant of (7), the curve of
+            Fig. 5; by the default, its like for what was seen of the cells.
+        bound: the above plus the entropy of what is hidden: what the loop watches.
         held_out_log_likelihood: of the ranges in scans left out of the map, in nats per beam above
             a world without a map; None where not computed.
         changed_share: share of hits whose label or probability still moved.
@@ -62,8 +63,15 @@ class IterationRecordLike(Protocol):
 
 
 class OptionsLike(Protocol):
-    """The resolved options: a frozen dataclass with a section for the writers."""
+    """The resolved options: a frozen dataclass with a section for the writers.
 
+    Attributes:
+        estimator: what said which beams are static: `stillmap`, `paper` or `hit-ratio`.
+        output: options of the writers.
+    """
+
+    @property
+    def estimator(self) -> str: ...
     @property
     def output(self) -> OutputOptions: ...
 
@@ -83,6 +91,7 @@ class ResultLike(Protocol):
         best_iteration: number of the iteration that was kept.
         converged: whether the loop stopped by itself.
         warnings: one sentence each.
+        learned: what the estimator learned: empty, or shares, scatter and tables of shares.
         stages: name to `seconds` and `peak_memory_bytes`, in the order they ran.
     """
 
@@ -108,5 +117,7 @@ class ResultLike(Protocol):
     def converged(self) -> bool: ...
     @property
     def warnings(self) -> Sequence[str]: ...
+    @property
+    def learned(self) -> Mapping[str, Any]: ...
     @property
     def stages(self) -> Mapping[str, Mapping[str, Any]]: ...

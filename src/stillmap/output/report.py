@@ -8,6 +8,7 @@ from pathlib import Path
 from stillmap.output.points import beam_counts
 from stillmap.output.protocols import ResultLike
 from stillmap.output.report_curve import likelihood_svg
+from stillmap.output.report_learned import learned_section
 from stillmap.output.report_maps import evolution_section, maps_section
 from stillmap.output.report_tables import (
     bytes_text,
@@ -21,6 +22,20 @@ from stillmap.output.report_tables import (
 )
 from stillmap.output.report_template import PAGE, STYLE
 from stillmap.output.run_json import jsonable, skipped_count, version
+
+# titles of the two curves and the words below them, for each likelihood
+_DEFAULT = (
+    ("Expected log likelihood", "Bound: composite log likelihood"),
+    "In nats, the kept iteration circled. Right, what the loop watches: how probable what was seen "
+    "of the cells is, every cell counted once for each beam that ended in it. Left: the same "
+    "without the entropy of what each cell holds.",
+)
+_PRINTED = (
+    ("Expected log likelihood, (5)", "Bound: with the entropy of the labels"),
+    "In nats, the kept iteration circled. Left: (5) of the paper, the curve of its Fig. 5. Right, "
+    "what the loop watches: the same and the entropy of the labels, the log likelihood of the "
+    "ranges.",
+)
 
 
 def write_report(path: Path, result: ResultLike) -> None:
@@ -36,6 +51,7 @@ def report_html(result: ResultLike) -> str:
         _headline(result),
         _warnings(result),
         maps_section(result),
+        learned_section(result),
         _estimate_section(result),
         evolution_section(result),
         f'<div class="columns">{_recording_section(result)}{_stages_section(result)}</div>',
@@ -47,27 +63,25 @@ def report_html(result: ResultLike) -> str:
 
 
 def likelihood_sentence(result: ResultLike) -> str:
-    """Whether and where the expected log likelihood fell from one iteration to the next."""
+    """Whether and where the bound fell from one iteration to the next."""
     if len(result.iterations) < 2:
         return "There was one iteration only."
-    records = [it for it in result.iterations if math.isfinite(it.expected_log_likelihood)]
+    records = [it for it in result.iterations if math.isfinite(it.bound)]
     falls = [
-        (after.number, before.expected_log_likelihood - after.expected_log_likelihood, before)
+        (after.number, (before.bound - after.bound) / max(abs(before.bound), 1e-300))
         for before, after in itertools.pairwise(records)
-        if after.expected_log_likelihood < before.expected_log_likelihood
+        if after.bound < before.bound
     ]
     if not falls:
         return "The likelihood never fell from one iteration to the next."
-    where = ", ".join(str(number) for number, _, _ in falls)
-    number, amount, before = max(falls, key=lambda fall: fall[1])
-    relative = amount / max(abs(before.expected_log_likelihood), 1e-300)
-    most = f"by {share_text(relative)}" if len(falls) == 1 else f"most, by {share_text(relative)}"
+    where = ", ".join(str(number) for number, _ in falls)
+    number, share = max(falls, key=lambda fall: fall[1])
+    most = f"by {share_text(share)}" if len(falls) == 1 else f"most, by {share_text(share)}"
     most += "" if len(falls) == 1 else f", at iteration {number}"
     plural = "s" if len(falls) > 1 else ""
     return (
-        f"The likelihood fell at iteration{plural} {where} ({most}). That can happen: "
-        "the poses are estimated one after the other, and a small change in one may cost later "
-        "ones more than it gained."
+        f"The likelihood fell at iteration{plural} {where} ({most}). That can happen: poses are "
+        "found scan by scan and by a measure of their own, so what helps one may cost another."
     )
 
 
@@ -160,13 +174,22 @@ def _estimate_section(result: ResultLike) -> str:
     return (
         "<section><h2>How the estimate went</h2>"
         f"<p>{escape(likelihood_sentence(result))} {end} "
-        f"The result is that of iteration {result.best_iteration}, circled. "
+        f"The result is that of iteration {result.best_iteration}. "
         f"{escape(held_out_sentence(result))}</p>"
+        f"{_curve(result)}<details><summary>The numbers</summary>"
+        f"{iterations_table(result.iterations, result.best_iteration)}</details></section>"
+    )
+
+
+def _curve(result: ResultLike) -> str:
+    if len(result.iterations) < 2:
+        return ""
+    titles, caption = _DEFAULT if result.options.estimator == "stillmap" else _PRINTED
+    return (
         f'<figure role="img" aria-label="Likelihood over {len(result.iterations)} iterations; '
         f'the numbers are in the table below.">'
-        f"{likelihood_svg(result.iterations, result.best_iteration)}</figure>"
-        "<details><summary>The numbers</summary>"
-        f"{iterations_table(result.iterations, result.best_iteration)}</details></section>"
+        f"{likelihood_svg(result.iterations, result.best_iteration, titles)}"
+        f'<figcaption class="below">{caption}</figcaption></figure>'
     )
 
 

@@ -22,7 +22,9 @@ _PAGE_COLOURS = {
 }
 
 
-def likelihood_svg(iterations: Sequence[IterationRecordLike], best: int) -> str:
+def likelihood_svg(
+    iterations: Sequence[IterationRecordLike], best: int, titles: tuple[str, str]
+) -> str:
     """`<svg>` with the expected log likelihood and the bound, the best iteration marked."""
     # matplotlib is slow to load and needed nowhere else
     import matplotlib
@@ -30,17 +32,14 @@ def likelihood_svg(iterations: Sequence[IterationRecordLike], best: int) -> str:
     from matplotlib.figure import Figure
 
     numbers = np.array([it.number for it in iterations], float)
-    curves = {
-        "Expected log likelihood, (5)": [it.expected_log_likelihood for it in iterations],
-        "Bound: with the entropy of the labels": [it.bound for it in iterations],
-    }
+    curves = ([it.expected_log_likelihood for it in iterations], [it.bound for it in iterations])
     # a fixed salt makes the element ids, and so the file, repeatable
     style: dict[Any, Any] = {"svg.hashsalt": "stillmap", "svg.fonttype": "none", "font.size": 9.0}
     with matplotlib.rc_context(style):
         figure = Figure(figsize=(9.0, 2.9), layout="constrained")
         FigureCanvasSVG(figure)
         axes = figure.subplots(1, 2)
-        for axis, (title, values) in zip(axes, curves.items(), strict=True):
+        for axis, title, values in zip(axes, titles, curves, strict=True):
             _draw(axis, title, numbers, np.array(values, float), best)
         buffer = io.StringIO()
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))

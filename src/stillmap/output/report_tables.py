@@ -23,6 +23,8 @@ def share_text(share: float) -> str:
 
 def duration_text(seconds: float) -> str:
     """A time span as people say it."""
+    if 0 < seconds < 0.001:
+        return "under 1 ms"
     if seconds < 10:
         return f"{seconds:.2g} s"
     if seconds < 59.5:
@@ -80,6 +82,16 @@ def stages_table(stages: Mapping[str, Mapping[str, Any]]) -> str:
             f'<td class="number">{bytes_text(stage.get("peak_memory_bytes") or 0)}</td></tr>'
         )
     return _table(("stage", "time", "", "peak memory"), rows)
+
+
+def shares_table(rows: Sequence[tuple[str, float]]) -> str:
+    """Names with shares in percent, and bars that are full where the share is one."""
+    lines = [
+        f'<tr><th scope="row">{escape(name)}</th><td class="number">{share_text(share)}</td>'
+        f'<td class="bar"><span style="width:{100 * share:.1f}%"></span></td></tr>'
+        for name, share in rows
+    ]
+    return _table(("", "", ""), lines)
 
 
 def options_table(options: Any) -> str:

@@ -66,6 +66,7 @@ figcaption b { color: var(--ink); }
   text-shadow: 0 0 3px #fff, 0 0 3px #fff, 0 0 3px #fff; }
 .key { display: inline-block; width: .75em; height: .75em; margin: 0 .3em 0 .9em;
   border: 1px solid var(--soft); border-radius: 2px; vertical-align: -.05em; }
+.below { max-width: 48rem; margin: .35rem 0 0; }
 .curve { display: block; width: 100%; height: auto; max-width: 62rem; }
 .curve text { fill: var(--ink); }
 table { border-collapse: collapse; font-size: .92rem; }
@@ -73,7 +74,7 @@ th, td { text-align: left; padding: .22rem .9rem .22rem 0; border-bottom: 1px so
   vertical-align: top; overflow-wrap: anywhere; }
 thead th { color: var(--soft); font-weight: 500; }
 tbody th { font-weight: 500; white-space: nowrap; }
-td.number, th.number { text-align: right; }
+td.number, th.number { text-align: right; white-space: nowrap; }
 tr.best th, tr.best td { color: var(--orange); font-weight: 600; }
 .wide { overflow-x: auto; }
 td ul { margin: 0; padding-left: 1.1rem; }

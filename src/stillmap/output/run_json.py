@@ -37,6 +37,7 @@ def run_record(result: ResultLike) -> dict[str, Any]:
         },
         "counts": counts,
         "warnings": list(result.warnings),
+        "learned": result.learned,
     }
     plain: dict[str, Any] = jsonable(record)
     return plain
