@@ -1,5 +1,6 @@
 """The loop of Fig. 2: M-step, E-step, bound, repeat."""
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -48,6 +49,17 @@ class Options:
 DEFAULTS = Options()
 
 
+def resolved(options: Options) -> Options:
+    """The options as they will be used: the printed method has poses by (9) alone, scan by scan."""
+    if options.estimator != "paper":
+        return options
+    loops = dataclasses.replace(options.slam.loops, enabled=False)
+    registration = dataclasses.replace(options.slam.registration, approach=0.0)
+    return dataclasses.replace(
+        options, slam=dataclasses.replace(options.slam, loops=loops, registration=registration)
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Iteration:
     """One M-step and one E-step.
@@ -65,6 +77,7 @@ class Iteration:
         changed_share: share of hits whose e moved by more than 0.1.
         explained: (T,) share of each scan's beams that the map so far explained.
         widened: scans that only a wider search than the motion prior's could place.
+        loops: attempts at closing loops, accepted or refused.
         held_out: nats per beam, see `em.held_out_log_likelihood`; None where it is not computed.
         seconds: wall clock.
     """
@@ -81,6 +94,7 @@ class Iteration:
     changed_share: float
     explained: Float
     widened: list[int]
+    loops: list[slam.Closure]
     held_out: float | None
     seconds: float
 
@@ -113,6 +127,7 @@ def iterate(
     if poses is not None and poses.shape != (recording.n_scans, 3, 3):
         raise ValueError(f"poses: expected ({recording.n_scans}, 3, 3), got {poses.shape}")
     stages = stages or Stages()
+    options = resolved(options)
     threads = resolved_threads(options.threads)
     e = em.initial_expectations(recording, options.estimator, options.em)  # e := p(c = 1)
     for number in range(1, em.iterations(options.estimator, options.em) + 1):
@@ -145,6 +160,7 @@ def iterate(
             changed_share=em.changed_share(e, found.p_static, recording.hit),
             explained=mapped.explained,
             widened=mapped.widened,
+            loops=mapped.loops,
             held_out=held_out,
             seconds=time.perf_counter() - started,
         )

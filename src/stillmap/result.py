@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core, em, pipeline
+from stillmap import _core, em, pipeline, slam
 from stillmap.output.crops import Snapshot, Window, choose_window, snapshot
 from stillmap.output.points import dynamic_points
 from stillmap.output.save import save
@@ -53,6 +53,7 @@ class Result:
         converged: whether the loop stopped by itself.
         warnings: one sentence each.
         learned: what the estimator learned from the recording, JSON-able.
+        loops: attempts at closing loops in the best iteration, accepted or refused.
         stages: seconds and peak memory.
     """
 
@@ -69,6 +70,7 @@ class Result:
     converged: bool
     warnings: list[str]
     learned: dict[str, object]
+    loops: list[slam.Closure]
     stages: Mapping[str, Mapping[str, Any]]
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
@@ -93,6 +95,7 @@ def build(
     if recording.n_scans == 0:
         raise ValueError("recording: expected at least one scan")
     stages = stages or Stages()
+    options = pipeline.resolved(options)
     run = _Run(options)
     iterations = pipeline.iterate(recording, options, poses=poses, progress=progress, stages=stages)
     while not run.finished and run.take_next(iterations, recording):
@@ -191,6 +194,7 @@ class _Run:
             converged=self.finished,
             warnings=_warnings(self.records, kept, recording),
             learned=kept.learned,
+            loops=kept.loops,
             stages=stages.to_dict(),
         )
 
@@ -217,6 +221,7 @@ class _Best:
     learned: dict[str, object]
     explained: Float
     widened: list[int]
+    loops: list[slam.Closure]
 
     @classmethod
     def of(cls, iteration: Iteration) -> "_Best":
@@ -231,6 +236,7 @@ class _Best:
             iteration.learned,
             iteration.explained,
             iteration.widened,
+            iteration.loops,
         )
 
 

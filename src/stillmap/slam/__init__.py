@@ -1,6 +1,7 @@
 """The M-step: poses and the map that they make. Uses e as weights, never changes it."""
 
 from stillmap.slam.incremental import Mapped, SlamOptions
+from stillmap.slam.loops import Closure
 from stillmap.slam.m_step import m_step
 
-__all__ = ["Mapped", "SlamOptions", "m_step"]
+__all__ = ["Closure", "Mapped", "SlamOptions", "m_step"]
