@@ -130,10 +130,13 @@ def iterate(
     options = resolved(options)
     threads = resolved_threads(options.threads)
     e = em.initial_expectations(recording, options.estimator, options.em)  # e := p(c = 1)
+    start: Float | None = None
     for number in range(1, em.iterations(options.estimator, options.em) + 1):
         started = time.perf_counter()
         with stages.measure("m_step"):  # (9)-(15)
-            mapped = slam.m_step(recording, e, options.slam, poses, threads, _at(progress, number))
+            mapped = slam.m_step(
+                recording, e, options.slam, poses, threads, _at(progress, number), start=start
+            )
         with stages.measure("e_step"):  # (6), (8) or its successor, and the bound
             found = em.e_step(
                 recording, mapped.poses, mapped.grid, options.estimator, options.em, threads
@@ -165,6 +168,8 @@ def iterate(
             seconds=time.perf_counter() - started,
         )
         e = found.p_static
+        # the first labels change most: from the second poses on, a sweep follows what is left
+        start = mapped.poses if number > 1 else None
         del mapped, found  # grids are large: only the caller decides how long one lives
         yield iteration
         del iteration

@@ -12,23 +12,26 @@ from stillmap.pipeline import Iteration, Options
 
 
 def options(estimator="stillmap", **changes):
-    wanted = {"max_iterations": 10, "tolerance": 0.0, "patience": 3} | changes
+    wanted = {"max_iterations": 10, "tolerance": 0.0, "settled": 0.0, "patience": 3} | changes
     chosen = {"estimator": estimator, "em": wanted, "slam": {"resolution": 0.1}, "threads": 1}
     return replaced(Options(), chosen)
 
 
 @pytest.fixture
 def build(monkeypatch, short):
-    """Runs the loop over iterations with these bounds per beam; says how many it asked for."""
+    """Runs the loop over iterations with these bounds per beam, and these shares of labels that
+    moved; says how many it asked for.
+    """
     recording = short.recording
 
-    def run(bounds, chosen):
+    def run(bounds, chosen, changed=None):
         asked = []
 
         def fake(recording, options, **_):
             for number, bound in enumerate(bounds[: options.em.max_iterations], start=1):
                 asked.append(number)
-                yield made_up(recording, number, bound * recording.n_beams)
+                share = changed[number - 1] if changed else 0.5 / number
+                yield made_up(recording, number, bound * recording.n_beams, share)
 
         monkeypatch.setattr(pipeline, "iterate", fake)
         return stillmap.build(recording, chosen), len(asked)
@@ -36,7 +39,7 @@ def build(monkeypatch, short):
     return run
 
 
-def made_up(recording, number, bound) -> Iteration:
+def made_up(recording, number, bound, changed_share) -> Iteration:
     """Everything in it tells its number."""
     T = recording.n_scans
     poses = np.tile(se2.matrix(0.01 * number, 0, 0), (T, 1, 1))
@@ -53,9 +56,10 @@ def made_up(recording, number, bound) -> Iteration:
         likelihood=em.Likelihood(expected=bound - 1.0, bound=bound),
         occupied=None,
         learned={"number": number},
-        changed_share=0.5 / number,
+        changed_share=changed_share,
         explained=np.ones(T),
         widened=[],
+        loops=[],
         held_out=None,
         seconds=float(number),
     )
@@ -144,6 +148,38 @@ def test_a_dip_alone_does_not_end_it(build):
     result, asked = build([-5.0, -4.0, -4.001, -3.0], options(tolerance=0.01, patience=2))
     assert asked == 4
     assert_kept(result, 4)
+
+
+RISING = [-5.0, -4.0, -3.0, -2.0]
+
+
+def test_labels_that_have_settled_end_it(build):
+    result, asked = build(RISING, options(settled=0.01), [0.5, 0.02, 0.009, 0.0])
+    assert (asked, result.converged) == (3, True)
+    assert_kept(result, 3)
+
+
+def test_labels_that_still_move_do_not(build):
+    for changed in ([0.5, 0.02, 0.011, 0.01], [0.01] * 4):  # the share itself is not below it
+        result, asked = build(RISING, options(settled=0.01), changed)
+        assert (asked, result.converged) == (4, False)
+
+
+def test_one_iteration_settles_nothing(build):
+    # the first may find all as static as the prior says
+    result, asked = build(RISING, options(settled=0.01), [0.0, 0.3, 0.0, 0.0])
+    assert (asked, result.converged) == (3, True)
+
+
+def test_without_a_share_labels_never_settle(build):
+    result, asked = build(RISING, options(settled=0.0), [0.0] * 4)
+    assert (asked, result.converged) == (4, False)
+
+
+def test_labels_that_settle_in_a_dip_leave_the_best(build):
+    result, asked = build([-5.0, -3.0, -4.0, -2.0], options(settled=0.01), [0.5, 0.1, 0.0, 0.0])
+    assert (asked, result.converged) == (3, True)
+    assert_kept(result, 2)
 
 
 def test_patience_ends_it(build):
