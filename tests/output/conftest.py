@@ -61,6 +61,14 @@ class FakeIteration:
     held_out_log_likelihood: float | None = None
 
 
+@dataclass(frozen=True)
+class FakeLoop:
+    earlier: int
+    later: int
+    explained: float
+    refused: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class FakeResult:
     recording: Recording
@@ -75,6 +83,7 @@ class FakeResult:
     converged: bool
     warnings: list
     learned: dict
+    loops: list
     stages: dict
 
 
@@ -220,6 +229,12 @@ def result():
         converged=True,
         warnings=["the odometry stalls at line 88 & <after>"],
         learned=LEARNED,
+        loops=[
+            FakeLoop(2, 40, 0.75),
+            FakeLoop(4, 42, 0.5, "explains too little"),
+            FakeLoop(5, 44, 0.9, "other loops disagree"),
+            FakeLoop(6, 46, 0.25, "explains too little"),
+        ],
         stages={
             "read": {"seconds": 0.21, "peak_memory_bytes": 41_000_000},
             "em": {"seconds": 7.1, "peak_memory_bytes": 96_000_000},

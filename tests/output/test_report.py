@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from stillmap.output import report_tables
-from stillmap.output.report import likelihood_sentence, report_html
+from stillmap.output.report import likelihood_sentence, loops_sentence, report_html
 from stillmap.output.report_curve import likelihood_svg
 from stillmap.output.report_figures import (
     ORANGE,
@@ -232,13 +232,32 @@ def test_one_iteration_makes_no_curve(result):
     assert "The numbers" in one
 
 
+def test_loops_in_words(result):
+    sentence = loops_sentence(result)
+    assert sentence == (
+        "Places seen again: 1 of 4 closed a loop; the rest was refused: explains too little (2), "
+        "other loops disagree (1)."
+    )
+    assert sentence in report_html(result)
+    closed = dataclasses.replace(result, loops=result.loops[:1])
+    assert loops_sentence(closed) == "Places seen again: 1 of 1 closed a loop."
+    assert loops_sentence(dataclasses.replace(result, loops=[])) == ""
+
+
+def test_one_snapshot_shows_no_evolution(result):
+    assert "How the map evolved" in report_html(result)
+    one = report_html(dataclasses.replace(result, snapshots=result.snapshots[:1]))
+    assert "How the map evolved" not in one
+    assert "Where most moved" in one
+
+
 def learned_text(result):
     return re.sub(r"\s+", " ", " ".join(Page(learned_section(result)).text))
 
 
 def test_what_was_learned_in_words(result):
     text = learned_text(result)
-    assert "87.3 % of the beams that hit something met what stands still" in text
+    assert "met what stands still with 87.3 % probability" in text
     assert "scatter by 1.7 cm" in text
     assert "0.5 s or less 60.0 % 3 s 30.0 % 45 s or more 10.0 %" in text
     assert "1 % or less 90.0 % 15 % or more 10.0 %" in text

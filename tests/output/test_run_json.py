@@ -32,6 +32,7 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
         "counts",
         "warnings",
         "learned",
+        "loops",
     ]
     assert run["format_version"] == 1
     assert isinstance(run["version"], str)
@@ -56,6 +57,22 @@ def test_iterations(tmp_path, result):
         "seconds": 1.8,
     }
     assert iterations[3]["bound"] is None  # not a number there
+
+
+def test_loops(tmp_path, result):
+    loops = written(tmp_path, result)["loops"]
+    assert loops["accepted"] == [{"earlier": 2, "later": 40, "explained": 0.75}]
+    assert [one["why"] for one in loops["refused"]] == [
+        "explains too little",
+        "other loops disagree",
+        "explains too little",
+    ]
+    assert loops["refused"][1] == {
+        "earlier": 5,
+        "later": 44,
+        "explained": 0.9,
+        "why": "other loops disagree",
+    }
 
 
 def test_counts(tmp_path, result):

@@ -62,6 +62,25 @@ class IterationRecordLike(Protocol):
     def seconds(self) -> float: ...
 
 
+class LoopLike(Protocol):
+    """One attempt at closing a loop.
+
+    Attributes:
+        earlier, later: numbers of two scans that may see the same place, from 0.
+        explained: share of the later beams that the earlier ones explain.
+        refused: why it was not accepted; empty when it was.
+    """
+
+    @property
+    def earlier(self) -> int: ...
+    @property
+    def later(self) -> int: ...
+    @property
+    def explained(self) -> float: ...
+    @property
+    def refused(self) -> str: ...
+
+
 class OptionsLike(Protocol):
     """The resolved options: a frozen dataclass with a section for the writers.
 
@@ -92,6 +111,7 @@ class ResultLike(Protocol):
         converged: whether the loop stopped by itself.
         warnings: one sentence each.
         learned: what the estimator learned: empty, or shares, scatter and tables of shares.
+        loops: attempts at closing loops, accepted or refused.
         stages: name to `seconds` and `peak_memory_bytes`, in the order they ran.
     """
 
@@ -119,5 +139,7 @@ class ResultLike(Protocol):
     def warnings(self) -> Sequence[str]: ...
     @property
     def learned(self) -> Mapping[str, Any]: ...
+    @property
+    def loops(self) -> Sequence[LoopLike]: ...
     @property
     def stages(self) -> Mapping[str, Mapping[str, Any]]: ...

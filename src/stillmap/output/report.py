@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections import Counter
 from html import escape
 from pathlib import Path
 
@@ -97,6 +98,19 @@ def held_out_sentence(result: ResultLike) -> str:
     )
 
 
+def loops_sentence(result: ResultLike) -> str:
+    """How many loops were closed, and why others were not."""
+    if not result.loops:
+        return ""
+    reasons = Counter(one.refused for one in result.loops if one.refused)
+    tried, refused = len(result.loops), reasons.total()
+    text = f"Places seen again: {tried - refused:,} of {tried:,} closed a loop"
+    if refused:
+        why = ", ".join(f"{reason} ({n:,})" for reason, n in reasons.most_common())
+        text += f"; the rest was refused: {why}"
+    return text + "."
+
+
 def _name(result: ResultLike) -> str:
     path = str(result.recording.source.get("path", ""))
     return Path(path).name or "recording"
@@ -175,7 +189,7 @@ def _estimate_section(result: ResultLike) -> str:
         "<section><h2>How the estimate went</h2>"
         f"<p>{escape(likelihood_sentence(result))} {end} "
         f"The result is that of iteration {result.best_iteration}. "
-        f"{escape(held_out_sentence(result))}</p>"
+        f"{escape(held_out_sentence(result))}</p><p>{escape(loops_sentence(result))}</p>"
         f"{_curve(result)}<details><summary>The numbers</summary>"
         f"{iterations_table(result.iterations, result.best_iteration)}</details></section>"
     )

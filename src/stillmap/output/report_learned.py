@@ -45,10 +45,13 @@ def learned_section(result: ResultLike) -> str:
 
 def _static_sentence(learned: Mapping[str, Any]) -> str:
     share, scatter = float(learned["p_static"]), float(learned["scatter"])
-    text = f"{share_text(share)} of the beams that hit something met what stands still."
+    text = (
+        f"On average, a beam that hit something met what stands still with {share_text(share)} "
+        "probability."
+    )
     if scatter > 0.0:
         text += (
-            f" Their end points scatter by {100 * scatter:.2g}\u00a0cm across flat surfaces: "
+            f" End points scatter by {100 * scatter:.2g}\u00a0cm across flat surfaces: "
             "errors of range and pose taken together."
         )
     return text

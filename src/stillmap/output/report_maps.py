@@ -74,8 +74,9 @@ def evolution_section(result: ResultLike) -> str:
     figures = "".join(_snapshot_figure(one, result.best_iteration) for one in result.snapshots)
     h, w = result.snapshots[0].p_occupied.shape
     step = result.snapshots[0].resolution
+    title = "How the map evolved" if len(result.snapshots) > 1 else "Where most moved"
     return (
-        "<section><h2>How the map evolved</h2>"
+        f"<section><h2>{title}</h2>"
         f"<p>The {w * step:.0f} m by {h * step:.0f} m where most movement was seen; in orange "
         "the ends of beams taken for dynamic at that iteration.</p>"
         f'<div class="row">{figures}</div></section>'

@@ -46,6 +46,7 @@ code { font-family: ui-monospace, "DejaVu Sans Mono", monospace; font-size: .88e
 .pair, .row { display: grid; gap: 1.1rem; margin-top: .8rem; align-items: start; }
 .pair { grid-template-columns: repeat(auto-fit, minmax(min(26rem, 100%), 1fr)); }
 .row { grid-template-columns: repeat(auto-fit, minmax(min(15rem, 100%), 1fr)); }
+.row figure { max-width: 38rem; }
 #large:checked ~ .pair { grid-template-columns: 1fr; }
 figure { margin: 0; }
 figcaption { font-size: .9rem; margin-bottom: .35rem; }

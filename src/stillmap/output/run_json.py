@@ -10,7 +10,7 @@ import numpy as np
 
 from stillmap.options import to_dict
 from stillmap.output.points import beam_counts
-from stillmap.output.protocols import IterationRecordLike, ResultLike
+from stillmap.output.protocols import IterationRecordLike, LoopLike, ResultLike
 
 FORMAT_VERSION = 1
 
@@ -38,6 +38,10 @@ def run_record(result: ResultLike) -> dict[str, Any]:
         "counts": counts,
         "warnings": list(result.warnings),
         "learned": result.learned,
+        "loops": {
+            "accepted": [_loop(one) for one in result.loops if not one.refused],
+            "refused": [_loop(one) | {"why": one.refused} for one in result.loops if one.refused],
+        },
     }
     plain: dict[str, Any] = jsonable(record)
     return plain
@@ -74,6 +78,10 @@ def jsonable(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def _loop(one: LoopLike) -> dict[str, Any]:
+    return {"earlier": one.earlier, "later": one.later, "explained": one.explained}
 
 
 def _iteration(it: IterationRecordLike) -> dict[str, Any]:
