@@ -68,23 +68,36 @@ def test_a_log_is_mapped(laser2d, name):
         assert found.rotation.mean < degrees
 
 
-@pytest.mark.parametrize("estimator", ["stillmap", "paper"])
-def test_a_second_iteration_finds_movers_and_keeps_the_place(laser2d, estimator):
-    # edmonton: a convention centre full of people
-    result = mapped(laser2d, "edmonton", iterations=2, estimator=estimator)
-    assert errors(laser2d, "edmonton", result).translation.mean < 0.1
-    hit = result.recording.hit
-    dynamic = (result.p_static[hit] < 0.5).mean()
-    assert 0.003 < dynamic < 0.3
-    if estimator == "paper":
-        ours, raw = ((m.p_occupied > 0.3).sum() for m in (result.map, result.raw_map))
-        assert ours < 0.99 * raw
-        return
+# edmonton: a convention centre full of people
+@pytest.fixture
+def crowded(laser2d):
+    def two_iterations(estimator):
+        result = mapped(laser2d, "edmonton", iterations=2, estimator=estimator)
+        assert errors(laser2d, "edmonton", result).translation.mean < 0.08
+        return result, result.p_static[result.recording.hit]
+
+    return two_iterations
+
+
+def test_the_printed_method_finds_movers_and_keeps_the_place(crowded):
+    result, e = crowded("paper")
+    assert 0.003 < (e < 0.5).mean() < 0.3
+    ours, raw = ((m.p_occupied > 0.3).sum() for m in (result.map, result.raw_map))
+    assert ours < 0.99 * raw
+
+
+def test_it_finds_movers_where_poses_are_loose_and_keeps_walls(crowded):
+    # end points scatter by most of a cell: what stands beside anything is believed to stand too
+    result, e = crowded("stillmap")
+    assert 0.03 < result.learned["scatter"] < 0.06
+    assert 0.001 < (e < 0.5).mean() < 0.02
+    assert (e < 0.1).sum() > 10
+    assert 0.95 < result.learned["p_static"] < 0.997
     # cells in which only movers were seen are free, and walls are there
     ours, raw = result.map, result.raw_map
     gone = (raw.alpha >= 1) & (ours.alpha < 0.2 * raw.alpha)
     walls = (raw.alpha >= 5) & (ours.alpha > 0.9 * raw.alpha)
-    assert gone.sum() > 100
+    assert gone.sum() > 20
     assert (ours.p_occupied[gone] < 0.3).mean() > 0.95
-    assert (raw.p_occupied[gone] > 0.3).sum() > 20
-    assert (ours.p_occupied[walls] > 0.5).mean() > 0.7
+    assert walls.sum() > 1000
+    assert (ours.p_occupied[walls] > 0.5).mean() > 0.85
