@@ -1,0 +1,64 @@
+"""From the third iteration on poses are swept: where they come from, and what is still told."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap import se2, slam
+from stillmap.options import replaced
+from stillmap.pipeline import Options
+
+# so short a way that there is something to close after a metre, and wheels that are believed
+CHOSEN = replaced(
+    Options(),
+    {
+        "threads": 1,
+        "em": {"max_iterations": 4, "held_out": 0},
+        "slam": {
+            "loops": {"gap": 1.0, "distance": 0.3},
+            "motion": {
+                f"{a}_per_{b}": 0.0
+                for a, b in (
+                    ("translation", "metre"),
+                    ("translation", "radian"),
+                    ("rotation", "metre"),
+                    ("rotation", "radian"),
+                )
+            },
+        },
+    },
+)
+
+
+@pytest.fixture
+def leaping(room):
+    """The wheels of scan 30 turned about."""
+    T = room.recording.T_odom_base.copy()
+    increment = se2.inverse(T[29]) @ T[30]
+    T[30:] = T[29] @ se2.matrix(0.0, 0.0, 3.0) @ increment @ se2.inverse(T[30]) @ T[30:]
+    return dataclasses.replace(room.recording, T_odom_base=T)
+
+
+def test_from_the_third_on_poses_are_those_of_the_one_before_swept(leaping):
+    before = None
+    for it in stillmap.iterate(leaping, CHOSEN):
+        start = before.poses if it.number > 2 else None
+        mapped = slam.m_step(
+            leaping, it.weights, CHOSEN.slam, None, 1, lambda *_: None, start=start
+        )
+        np.testing.assert_array_equal(it.poses, mapped.poses)
+        np.testing.assert_array_equal(it.covariance, mapped.covariance)
+        before = it
+
+
+def test_what_was_hard_to_place_is_still_told_after_a_sweep(leaping):
+    found = list(stillmap.iterate(leaping, CHOSEN))
+    assert len(found) == 4
+    assert 30 in found[1].widened
+    assert found[1].loops
+    for it in found[2:]:
+        assert it.widened == found[1].widened
+        assert it.loops == found[1].loops
+        np.testing.assert_array_equal(it.explained, found[1].explained)
