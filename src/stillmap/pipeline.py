@@ -130,7 +130,7 @@ def iterate(
     options = resolved(options)
     threads = resolved_threads(options.threads)
     e = em.initial_expectations(recording, options.estimator, options.em)  # e := p(c = 1)
-    start: Float | None = None
+    start: slam.Mapped | None = None
     for number in range(1, em.iterations(options.estimator, options.em) + 1):
         started = time.perf_counter()
         with stages.measure("m_step"):  # (9)-(15)
@@ -169,7 +169,7 @@ def iterate(
         )
         e = found.p_static
         # the first labels change most: from the second poses on, a sweep follows what is left
-        start = mapped.poses if number > 1 else None
+        start = mapped.without_grid() if number > 1 else None
         del mapped, found  # grids are large: only the caller decides how long one lives
         yield iteration
         del iteration

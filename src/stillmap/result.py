@@ -149,7 +149,8 @@ class _Run:
         self._remember(iteration, recording)
         options = self.options.em
         settled = 0.0 <= gain < options.tolerance * recording.n_beams
-        settled |= iteration.number > 1 and iteration.changed_share < options.settled
+        if self.options.estimator == "stillmap":  # the printed labels creep
+            settled |= iteration.number > 1 and iteration.changed_share < options.settled
         stuck = iteration.number - self.kept.number >= options.patience
         counted = self.options.estimator == "hit-ratio"  # nothing to iterate
         self.finished = settled or stuck or counted
@@ -192,7 +193,7 @@ class _Run:
             raw_map=raw,
             best_iteration=kept.number,
             converged=self.finished,
-            warnings=_warnings(self.records, kept, recording),
+            warnings=_warnings(self.records, kept, recording, self.options.em),
             learned=kept.learned,
             loops=kept.loops,
             stages=stages.to_dict(),
@@ -248,15 +249,20 @@ def _raw_map(
     return em.occupancy_map(grid)
 
 
-def _warnings(records: list[IterationRecord], kept: _Best, recording: Recording) -> list[str]:
+def _warnings(
+    records: list[IterationRecord], kept: _Best, recording: Recording, options: em.EmOptions
+) -> list[str]:
     out = []
+    noise = options.tolerance * recording.n_beams
     dips = [
-        after.number for before, after in itertools.pairwise(records) if after.bound < before.bound
+        after.number
+        for before, after in itertools.pairwise(records)
+        if after.bound < before.bound - noise
     ]
     if dips:
         out.append(
-            f"the likelihood dipped at iteration {', '.join(map(str, dips))}, as the incremental "
-            f"poses allow; iteration {kept.number} is the best and was kept"
+            f"the likelihood dipped at iteration {', '.join(map(str, dips))}: poses are estimated "
+            f"by matching, not by it; iteration {kept.number} is the best and was kept"
         )
     if recording.T_odom_base is None:
         out.append("no odometry: a constant velocity was assumed between scans")

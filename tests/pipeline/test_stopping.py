@@ -121,7 +121,7 @@ def test_a_dip_is_reported(build):
     result, _ = build([-5.0, -3.0, -4.0, -2.0], options())
     dips = [warning for warning in result.warnings if "dipped" in warning]
     assert len(dips) == 1
-    assert "iteration 3," in dips[0]
+    assert "iteration 3:" in dips[0]
     smooth, _ = build([-5.0, -3.0, -2.0], options())
     assert not any("dipped" in warning for warning in smooth.warnings)
 

@@ -44,7 +44,7 @@ def leaping(room):
 def test_from_the_third_on_poses_are_those_of_the_one_before_swept(leaping):
     before = None
     for it in stillmap.iterate(leaping, CHOSEN):
-        start = before.poses if it.number > 2 else None
+        start = before if it.number > 2 else None
         mapped = slam.m_step(
             leaping, it.weights, CHOSEN.slam, None, 1, lambda *_: None, start=start
         )

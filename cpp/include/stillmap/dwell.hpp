@@ -65,22 +65,33 @@ struct Look {
 template <int D>
 class LookCollector {
  public:
-  // What a beam has to know of an element, close together.
+  // What a beam has to know of an element, in few bytes: most of the time goes into fetching them.
   struct Patch {
-    Vec<D> centre;
-    Eigen::Matrix<float, D, 1> normal;
-    float half;
-    bool flat;
+    std::array<float, D> centre;    // seen from the cell's corner
+    std::array<int16_t, D> normal;  // in units of 1 / kUnit; zero where there is none
+    int16_t half;                   // likewise
+    static constexpr double kUnit = 4096.0;
+
+    static int16_t packed(double value) { return static_cast<int16_t>(std::lround(value * kUnit)); }
+    bool flat() const {
+      for (const int16_t n : normal)
+        if (n != 0) return true;
+      return false;
+    }
   };
 
   static std::vector<Patch> patches_of(const Surface<D>& surface, bool normals) {
-    if (!surface.fitted()) throw std::invalid_argument("surface: fit it first");
     std::vector<Patch> patches(surface.size());
-    for (size_t k = 0; k < patches.size(); ++k) {
-      const Element<D>& e = surface.element(static_cast<int32_t>(k));
+    for (size_t i = 0; i < patches.size(); ++i) {
+      const auto k = static_cast<int32_t>(i);
+      const Element<D>& e = surface.element(k);
       const bool flat = normals && !e.normal.isZero(0.0);
-      patches[k] = {flat ? e.centre : e.mean, e.normal.template cast<float>(),
-                    flat ? static_cast<float>(e.half) : 0.5f, flat};
+      const Vec<D> centre = (flat ? e.centre : e.mean) - surface.cell(k).template cast<double>();
+      for (int d = 0; d < D; ++d) {
+        patches[i].centre[static_cast<size_t>(d)] = static_cast<float>(centre[d]);
+        patches[i].normal[static_cast<size_t>(d)] = flat ? Patch::packed(e.normal[d]) : int16_t{0};
+      }
+      patches[i].half = Patch::packed(flat ? std::min(e.half, 7.0) : 0.5);
     }
     return patches;
   }
@@ -154,11 +165,11 @@ class LookCollector {
     if (!(usable > 0.0)) return;
     const Vec<D> direction = way / length;
     const Vec<D> end = hit_ ? beam.end : Vec<D>(beam.start + direction * usable);
-    Walker walker(cursor_, [&](const int32_t* k, double) {
+    Walker walker(cursor_, [&](const int32_t* k, const Cell<D>& cell) {
       if (!k || *k == kNoElement) return;
       float& missed = missed_[static_cast<size_t>(*k)];
       if (missed < kSure) return;
-      const float met = probability_met(patches_[static_cast<size_t>(*k)], beam, direction);
+      const float met = probability_met(patches_[static_cast<size_t>(*k)], cell, beam, direction);
       if (met <= 0.0f) return;
       if (missed == kUntouched) {
         touched_.push_back(*k);
@@ -172,19 +183,24 @@ class LookCollector {
 
   // Of the beam crossing the surface within the element, as far as `lateral` lets one tell: small
   // at grazing angles.
-  float probability_met(const Patch& patch, const Segment<D>& beam, const Vec<D>& direction) const {
-    const Vec<D> off = patch.centre - beam.start;
+  float probability_met(const Patch& patch, const Cell<D>& cell, const Segment<D>& beam,
+                        const Vec<D>& direction) const {
+    Vec<D> centre = cell.template cast<double>();
+    for (int d = 0; d < D; ++d)
+      centre[d] += static_cast<double>(patch.centre[static_cast<size_t>(d)]);
+    const Vec<D> off = centre - beam.start, behind = beam.end - centre;
     double facing = 1.0;
-    if (patch.flat) {
-      const Vec<D> normal = patch.normal.template cast<double>();
+    if (patch.flat()) {
+      Vec<D> normal;
+      for (int d = 0; d < D; ++d) normal[d] = patch.normal[static_cast<size_t>(d)] / Patch::kUnit;
       facing = std::abs(normal.dot(direction));
-      if (hit_ && std::abs(normal.dot(beam.end - patch.centre)) < options_.margin) return 0.0f;
-    } else if (hit_ && (beam.end - patch.centre).squaredNorm() < margin_squared_) {
+      if (hit_ && std::abs(normal.dot(behind)) < options_.margin) return 0.0f;
+    } else if (hit_ && behind.squaredNorm() < margin_squared_) {
       return 0.0f;
     }
     const double along = off.dot(direction);
     const double aside = std::sqrt(std::max(0.0, off.squaredNorm() - along * along));
-    const double half = static_cast<double>(patch.half) * facing;
+    const double half = patch.half / Patch::kUnit * facing;
     return cdf_((half - aside) * per_lateral_) - cdf_((-half - aside) * per_lateral_);
   }
 
@@ -218,12 +234,10 @@ template <int D>
 class Dwell {
  public:
   Dwell(const Surface<D>& surface, DwellClasses classes, const LookOptions& options)
-      : surface_(surface),
-        classes_(std::move(classes)),
-        options_(options),
-        patches_(LookCollector<D>::patches_of(surface, options.normals)) {
+      : surface_(surface), classes_(std::move(classes)), options_(options) {
     const size_t C = classes_.rho.size();
     if (!surface.fitted()) throw std::invalid_argument("surface: fit it first");
+    patches_ = LookCollector<D>::patches_of(surface, options.normals);
     for (const double r : classes_.rho) rho_.push_back(static_cast<float>(r));
     heads_.resize(surface.size());
     state_.assign(surface.size() * 2 * C, 1.0f);
@@ -247,7 +261,10 @@ class Dwell {
     for (size_t t = 0; t < T; ++t)
       if (t == 0 || look[t] != look[t - 1]) starts.push_back(t);
     starts.push_back(T);
-    const size_t looks = starts.size() - 1, n = static_cast<size_t>(std::max(threads, 1));
+    const size_t looks = starts.size() - 1;
+    // each has a sheet as large as the map
+    const size_t n = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1,
+                                        std::max<size_t>(looks, 1));
     std::vector<std::unique_ptr<LookCollector<D>>> collectors;
     for (size_t i = 0; i < n; ++i)
       collectors.push_back(std::make_unique<LookCollector<D>>(surface_, patches_, options_, cdf_));

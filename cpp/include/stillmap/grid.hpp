@@ -206,7 +206,8 @@ class Cursor {
 };
 
 // Follows a beam through a grid: `visit` gets the counts of each cell (nullptr where a const grid
-// has no block) and the length in it. Only a step out of a block looks anything up.
+// has no block) and the length in it, or which cell it is. Only a step out of a block looks
+// anything up.
 template <class GridType, class Visit>
 class Walker {
  public:
@@ -222,7 +223,13 @@ class Walker {
     enter();
   }
 
-  void visit(double length) { visit_(counts_, length); }
+  void visit(double length) {
+    if constexpr (std::is_invocable_v<Visit, CountsPointer, const Cell<D>&>) {
+      visit_(counts_, cell_);
+    } else {
+      visit_(counts_, length);
+    }
+  }
 
   template <int Axis>
   void step(int32_t direction) {

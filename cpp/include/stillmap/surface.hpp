@@ -95,17 +95,40 @@ class Surface : public CellIndex<D> {
     std::array<Fixed, kProducts> second{};  // of its products, by rows of the upper triangle
   };
 
-  // Neighbours get neighbouring numbers, so that a beam finds them close together in memory.
+  // Neighbours get neighbouring numbers, tile by tile, so that a beam in any direction finds them
+  // close together in memory.
   void number_by_place() {
     std::vector<Sums> sorted;
     sorted.reserve(sums_.size());
+    const std::vector<size_t> order = by_tiles();
     for (const auto& block : this->blocks())
-      for (int32_t& k : block->counts) {
+      for (const size_t local : order) {
+        int32_t& k = block->counts[local];
         if (k == kNoElement) continue;
         sorted.push_back(sums_[static_cast<size_t>(k)]);
         k = static_cast<int32_t>(sorted.size() - 1);
       }
     sums_.swap(sorted);
+  }
+
+  // The cells of a block in the order of tiles of four cells a side.
+  static std::vector<size_t> by_tiles() {
+    constexpr int tile = 4;
+    std::vector<std::pair<int64_t, size_t>> keyed;
+    for (size_t local = 0; local < static_cast<size_t>(CellIndex<D>::kCells); ++local) {
+      int64_t outer = 0, inner = 0;
+      for (int d = D - 1; d >= 0; --d) {
+        const auto at = static_cast<int>((local >> (d * CellIndex<D>::kShift)) &
+                                         static_cast<size_t>(CellIndex<D>::kEdge - 1));
+        outer = outer * CellIndex<D>::kEdge + at / tile;
+        inner = inner * tile + at % tile;
+      }
+      keyed.emplace_back(outer * 64 + inner, local);
+    }
+    std::sort(keyed.begin(), keyed.end());
+    std::vector<size_t> order;
+    for (const auto& entry : keyed) order.push_back(entry.second);
+    return order;
   }
 
   void add_end_point(const Vec<D>& end) {

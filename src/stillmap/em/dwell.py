@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from stillmap import _core
 from stillmap.em.chunks import chunks
@@ -173,6 +172,8 @@ def _bound(
 
 def _coverage(normals: Float, off_plane: Float, prominence: Float) -> NDArray[np.float32]:
     """P(what is there runs through the cell itself): noise also fills cells beside it."""
+    from scipy.special import ndtr  # takes long to load
+
     # of the cell, across the surface; a wall on the border of two cells belongs to both
     half = 0.5 * np.abs(normals).sum(axis=1) + _EDGE
     covered = ndtr((half - np.abs(off_plane)) / _EDGE)

@@ -41,7 +41,7 @@ class EmOptions:
         1e-3, "nats per beam of the bound: the loop stops when it gains less"
     )
     settled: float = field_with_doc(
-        0.005, "share of the hits whose label moves by 0.1: the loop stops when fewer do"
+        0.005, "share of the hits whose label moves by 0.1: the default loop stops when fewer do"
     )
     patience: int = field_with_doc(2, "iterations without a better bound before the loop stops")
     hit_ratio: float = field_with_doc(

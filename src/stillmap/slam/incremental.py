@@ -1,5 +1,6 @@
 """The M-step of the paper: poses one after the other (9), and the map they make (10)-(15)."""
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -53,6 +54,10 @@ class Mapped:
     explained: Float
     widened: list[int]
     loops: list[Closure] = field(default_factory=list)
+
+    def without_grid(self) -> "Mapped":
+        """Poses and what is known of them alone: grids are large."""
+        return dataclasses.replace(self, grid=_core.Grid2D(self.grid.resolution))
 
 
 def build(

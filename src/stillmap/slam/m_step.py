@@ -10,6 +10,7 @@ from stillmap import _core, em
 from stillmap.recording.model import Recording
 from stillmap.slam import closing, incremental
 from stillmap.slam.incremental import Mapped, SlamOptions
+from stillmap.slam.loops import Closure
 from stillmap.slam.sweep import sweep
 
 Float = NDArray[np.float64]
@@ -23,7 +24,7 @@ def m_step(
     threads: int,
     progress: Callable[[int, int], None],
     *,
-    start: Float | None = None,
+    start: Mapped | None = None,
 ) -> Mapped:
     """The most likely poses and map given e: (9), (10)-(15).
 
@@ -34,7 +35,7 @@ def m_step(
         poses: (T, 3, 3) T_map_base when they are known: then only the map is made.
         threads: for maps of poses that are known already; the result does not depend on it.
         progress: called with the number of scans done and their total.
-        start: (T, 3, 3) poses whose loops are closed already: they are only swept again.
+        start: an M-step whose loops are closed already: its poses are only swept again.
     """
     if poses is not None:
         mapped = _mapped_at(recording, e, options, poses, threads)
@@ -43,15 +44,19 @@ def m_step(
     if not options.loops.enabled:
         return incremental.build(recording, e, options, progress)
     if start is not None:
-        mapped = _swept(recording, e, options, start, threads)
+        mapped = _swept(recording, e, options, start.poses, threads)
         progress(recording.n_scans, recording.n_scans)
-        return mapped
+        return _with_history(mapped, start, start.loops)
     local = incremental.build(recording, e, options, progress, options.loops.memory)
     poses, found = closing.closed(recording, e, options, local)
     mapped = _swept(recording, e, options, poses, threads)
-    # a scan that went astray explains itself in the map of all: the map so far tells
+    return _with_history(mapped, local, found)
+
+
+def _with_history(mapped: Mapped, local: Mapped, loops: list[Closure]) -> Mapped:
+    """A scan that went astray explains itself in the map of all: the map so far tells."""
     return dataclasses.replace(
-        mapped, explained=local.explained, widened=local.widened, loops=found
+        mapped, explained=local.explained, widened=local.widened, loops=loops
     )
 
 

@@ -6,7 +6,6 @@ The only file that knows GTSAM. Its factors compare x, y, heading in the frame o
 from dataclasses import dataclass
 from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,6 +42,8 @@ def optimised(
         robust: standard deviations beyond which Cauchy's loss takes weight from a loop; None:
             plain least squares.
     """
+    import gtsam  # takes long to load
+
     graph = gtsam.NonlinearFactorGraph()
     start = gtsam.Values()
     for k, parameters in enumerate(se2.parameters(poses)):
@@ -70,6 +71,8 @@ def misfit(poses: Float, relation: Relation) -> float:
 
 
 def _factor(relation: Relation, robust: float | None) -> Any:
+    import gtsam
+
     noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(relation.covariance)
     if robust is not None:
         loss = gtsam.noiseModel.mEstimator.Cauchy.Create(robust)
