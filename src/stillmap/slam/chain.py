@@ -14,6 +14,7 @@ from stillmap.slam.pose_graph import Relation
 
 Float = NDArray[np.float64]
 
+_NEAR = np.array([8.0, 4.0])  # keyframes on the earlier and on the later side that count as nearby
 _LEAP = 3.0  # standard deviations of the motion prior beyond which an increment is a leap
 
 
@@ -69,7 +70,7 @@ def agreeing(track: Track, chain: list[Relation], found: list[Closure]) -> list[
     options, travelled = track.options, track.travelled
     candidates = [closure for closure in found if not closure.refused]
     at = np.array([[travelled[c.earlier], travelled[c.later]] for c in candidates]).reshape(-1, 2)
-    far = np.array([8.0, 4.0]) * options.distance
+    far = _NEAR * options.distance
     out = []
     for closure in found:
         if not closure.refused:
@@ -80,6 +81,24 @@ def agreeing(track: Track, chain: list[Relation], found: list[Closure]) -> list[
                 closure = refuse(closure, "closures around disagree")
         out.append(closure)
     return out
+
+
+def agreeing_since(
+    track: Track, chain: list[Relation], attempted: list[Closure], decided: list[Closure], k: int
+) -> list[Closure]:
+    """What `agreeing` makes of all attempts, when those from keyframe k on are new.
+
+    Args:
+        track, chain: as `agreeing` has them.
+        attempted: all, by the later scan.
+        decided: what it made of those before.
+        k: index into the keyframes.
+    """
+    later = [track.travelled[closure.later] for closure in attempted]
+    near = _NEAR[1] * track.options.distance
+    new, heard = np.searchsorted(later, track.travelled[track.keyframes[k]] - [near, 2 * near])
+    # their votes reach back one neighbourhood, and what is there hears one more
+    return decided[:new] + agreeing(track, chain, attempted[heard:])[new - heard :]
 
 
 def _agree(track: Track, chain: list[Relation], a: Closure, b: Closure) -> bool:

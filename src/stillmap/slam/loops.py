@@ -1,7 +1,7 @@
 """Loops: keyframes that see again what the robot saw much earlier, and where that puts them."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,10 @@ class LoopOptions:
     drift_translation: float = field_with_doc(0.006, "m of drift per metre: how far to search")
     drift_rotation: float = field_with_doc(0.0003, "rad of drift per metre: how far to search")
     window: float = field_with_doc(2.0, "standard deviations of the drift that are searched")
+    stage: float = field_with_doc(
+        40.0, "m of travel in which loops are looked for before the graph is solved, at least"
+    )
+    stage_share: float = field_with_doc(0.05, "of the travel so far, at least")
     step_translation: float = field_with_doc(0.03, "m of random error, per root of a metre")
     step_rotation: float = field_with_doc(0.004, "rad of random error, per root of a metre")
     sigma_translation: float = field_with_doc(0.03, "m, error of a closure at least")
@@ -68,6 +72,8 @@ _LIMITS = (
     ("drift_translation", 0.0, 1.0),
     ("drift_rotation", 0.0, 1.0),
     ("window", 0.0, 10.0),
+    ("stage", 0.1, 1e9),
+    ("stage_share", 0.0, 1e9),
     ("step_translation", 1e-4, 10.0),
     ("step_rotation", 1e-5, 10.0),
     ("sigma_translation", 1e-4, 10.0),
@@ -79,6 +85,22 @@ _LIMITS = (
     ("misfit", 0.0, 1e9),
     ("sweeps", 1, 100),
 )
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Two scans that may see the same place.
+
+    Attributes:
+        earlier, later: the scans.
+        T: (3, 3) pose of the later one in the frame of the earlier one, as the graph has it.
+        metres: of travel that the graph is as unsure of that as it is after.
+    """
+
+    earlier: int
+    later: int
+    T: Float
+    metres: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,35 +146,20 @@ class Track:
     options: LoopOptions
 
 
-def attempts(track: Track) -> list[Closure]:
+def attempts(track: Track, candidates: Iterable[Candidate]) -> list[Closure]:
     """Every candidate laid on the map of an earlier stretch; ordered by the later scan."""
-    of_stretch: dict[int, list[tuple[int, int]]] = {}
-    for earlier, later in _candidates(track):
-        stretch = round(track.travelled[earlier] / track.options.stretch)
-        of_stretch.setdefault(stretch, []).append((earlier, later))
+    of_stretch: dict[int, list[Candidate]] = {}
+    for candidate in candidates:
+        stretch = round(track.travelled[candidate.earlier] / track.options.stretch)
+        of_stretch.setdefault(stretch, []).append(candidate)
     found = []
-    for stretch, pairs in sorted(of_stretch.items()):
+    for stretch, those in sorted(of_stretch.items()):
         grid = _local_map(track, stretch * track.options.stretch)
-        found += [_laid_on(track, grid, earlier, later) for earlier, later in pairs]
+        found += [_laid_on(track, grid, candidate) for candidate in those]
     return sorted(found, key=lambda closure: closure.later)
 
 
-def _candidates(track: Track) -> Iterator[tuple[int, int]]:
-    """Keyframes with the nearest of much earlier travel, where that lies within reach."""
-    options, frames = track.options, track.keyframes
-    x, travelled = se2.parameters(track.poses[frames]), track.travelled[frames]
-    for k in range(len(frames)):
-        n = int(np.searchsorted(travelled, travelled[k] - options.gap))
-        if n == 0:
-            continue
-        distance = np.linalg.norm(x[:n, :2] - x[k, :2], axis=1)
-        turned = np.abs(se2.wrap(x[:n, 2] - x[k, 2]))
-        i = int(np.argmin(distance + turned))  # seen from the same side, where there is a choice
-        if distance[i] < options.reach + _drift(travelled[k] - travelled[i], options)[0]:
-            yield int(frames[i]), int(frames[k])
-
-
-def _drift(metres: float, options: LoopOptions) -> tuple[float, float]:
+def drift(metres: float, options: LoopOptions) -> tuple[float, float]:
     """Standard deviations of place and heading after a way, in metres and radians."""
     return (
         float(np.hypot(0.1, options.drift_translation * metres)),
@@ -182,12 +189,13 @@ def _view(track: Track, t: int) -> tuple[Points, NDArray[np.float32]]:
     return np.concatenate(points), np.concatenate([w for _, w in seen])
 
 
-def _laid_on(track: Track, grid: _core.Grid2D, earlier: int, later: int) -> Closure:
+def _laid_on(track: Track, grid: _core.Grid2D, candidate: Candidate) -> Closure:
     """The later view registered on the earlier map, as widely as the drift asks for."""
-    options = track.options
-    sigma, sigma_turn = _drift(track.travelled[later] - track.travelled[earlier], options)
+    options, earlier, later = track.options, candidate.earlier, candidate.later
+    sigma, sigma_turn = drift(candidate.metres, options)
     information = np.diag([sigma**-2, sigma**-2, sigma_turn**-2])
-    prior = MotionPrior(track.poses[later], information, sigma, sigma_turn)
+    predicted = track.poses[earlier] @ candidate.T
+    prior = MotionPrior(predicted, information, sigma, sigma_turn)
     view = _view(track, later)
     window = options.window * sigma, min(options.window * sigma_turn, np.pi)
     found = registration.search(grid, *view, prior, track.registration, *window)
@@ -197,7 +205,9 @@ def _laid_on(track: Track, grid: _core.Grid2D, earlier: int, later: int) -> Clos
         options.accept_above, options.compared * track.explained[later]
     )
     if not too_little:
-        covariance += _sliding(grid, *view, found.T_map_base, covariance, sigma, track.registration)
+        # what the graph knows of the place is no second witness: the whole way bounds it here
+        free = drift(track.travelled[later] - track.travelled[earlier], options)[0]
+        covariance += _sliding(grid, *view, found.T_map_base, covariance, free, track.registration)
     return Closure(
         earlier,
         later,

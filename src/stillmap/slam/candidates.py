@@ -1,0 +1,84 @@
+"""Which keyframes may see again what was seen much earlier, and how sure the graph is of where."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import se2
+from stillmap.slam.loops import Candidate, Closure, LoopOptions, Track, drift
+
+Float = NDArray[np.float64]
+
+
+def stages(track: Track) -> Iterator[tuple[int, int]]:
+    """Ranges first, last of keyframes: each a stage of travel, later ones longer."""
+    options, travelled = track.options, track.travelled[track.keyframes]
+    first = 0
+    while first < len(travelled):
+        here = travelled[first]
+        until = here + max(options.stage, options.stage_share * here)
+        last = max(first + 1, int(np.searchsorted(travelled, until)))
+        yield first, last
+        first = last
+
+
+def metres_to(track: Track, k: int, ties: list[Closure]) -> Float:
+    """(k + 1,) metres of drift between the keyframes up to k and keyframe k.
+
+    The shortest way through the graph: along the chain, or through a closure, which counts as the
+    metres that drift as much as it may be wrong. A loop closed elsewhere shortens no way here.
+    """
+    from scipy import sparse
+    from scipy.sparse import csgraph  # takes long to load
+
+    travelled = track.travelled[track.keyframes[: k + 1]]
+    if not ties:
+        along: Float = travelled[k] - travelled
+        return along
+    ends = [np.searchsorted(track.keyframes, [c.earlier, c.later]) for c in ties]
+    first, second = np.array(ends).T
+    steps = np.arange(k)
+    weights = np.concatenate([np.diff(travelled), [_metres(c, track.options) for c in ties]])
+    at = np.concatenate([steps, first]), np.concatenate([steps + 1, second])
+    order = np.lexsort((weights, *at))  # of two closures between the same keyframes the surer one
+    i, j, weights = at[0][order], at[1][order], weights[order]
+    kept = np.append(True, (np.diff(i) != 0) | (np.diff(j) != 0))
+    # a weight of zero would be no edge
+    graph = sparse.csr_array((np.maximum(weights[kept], 1e-9), (i[kept], j[kept])), (k + 1, k + 1))
+    metres: Float = csgraph.dijkstra(graph, directed=False, indices=[k])[0]
+    return metres
+
+
+def _metres(closure: Closure, options: LoopOptions) -> float:
+    sigma = np.sqrt(np.linalg.eigvalsh(closure.covariance[:2, :2])[1])
+    return float(sigma / max(options.drift_translation, 1e-9))
+
+
+def of_stage(
+    track: Track, poses: Float, first: int, last: int, ties: list[Closure]
+) -> Iterator[Candidate]:
+    """Keyframes of a stage with the nearest of much earlier travel, where that lies within reach.
+
+    Args:
+        track: where loops are looked for.
+        poses: (K, 3, 3) the keyframes as far as they are corrected.
+        first, last: the stage.
+        ties: closures of earlier stages that are taken for true.
+    """
+    options, frames = track.options, track.keyframes
+    x, travelled = se2.parameters(poses), track.travelled[frames]
+    metres = metres_to(track, first, ties)
+    for k in range(first, last):
+        n = int(np.searchsorted(travelled, travelled[k] - options.gap))
+        if n == 0:
+            continue
+        distance = np.linalg.norm(x[:n, :2] - x[k, :2], axis=1)
+        turned = np.abs(se2.wrap(x[:n, 2] - x[k, 2]))
+        i = int(np.argmin(distance + turned))  # seen from the same side, where there is a choice
+        way = travelled[k] - travelled[i]
+        if i < first:
+            way = min(way, travelled[k] - travelled[first] + metres[i])
+        if distance[i] < options.reach + drift(way, options)[0]:
+            T = se2.inverse(poses[i]) @ poses[k]
+            yield Candidate(int(frames[i]), int(frames[k]), T, float(way))
