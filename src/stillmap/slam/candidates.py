@@ -36,23 +36,21 @@ def metres_to(track: Track, k: int, ties: list[Closure]) -> Float:
     if not ties:
         along: Float = travelled[k] - travelled
         return along
-    ends = [np.searchsorted(track.keyframes, [c.earlier, c.later]) for c in ties]
-    first, second = np.array(ends).T
-    steps = np.arange(k)
-    weights = np.concatenate([np.diff(travelled), [_metres(c, track.options) for c in ties]])
-    at = np.concatenate([steps, first]), np.concatenate([steps + 1, second])
-    order = np.lexsort((weights, *at))  # of two closures between the same keyframes the surer one
-    i, j, weights = at[0][order], at[1][order], weights[order]
-    kept = np.append(True, (np.diff(i) != 0) | (np.diff(j) != 0))
-    # a weight of zero would be no edge
-    graph = sparse.csr_array((np.maximum(weights[kept], 1e-9), (i[kept], j[kept])), (k + 1, k + 1))
+    scans = np.array([[closure.earlier, closure.later] for closure in ties])
+    first, second = np.searchsorted(track.keyframes, scans).T
+    # no edge may weigh zero: that would be none
+    weights = np.concatenate([np.diff(travelled), _counted(ties, track.options)]).clip(1e-9)
+    ends = np.append(np.arange(k), first), np.append(np.arange(1, k + 1), second)
+    graph = sparse.csr_array((weights, ends), shape=(k + 1, k + 1))
     metres: Float = csgraph.dijkstra(graph, directed=False, indices=[k])[0]
     return metres
 
 
-def _metres(closure: Closure, options: LoopOptions) -> float:
-    sigma = np.sqrt(np.linalg.eigvalsh(closure.covariance[:2, :2])[1])
-    return float(sigma / max(options.drift_translation, 1e-9))
+def _counted(ties: list[Closure], options: LoopOptions) -> Float:
+    """(L,) metres of drift that closures count as."""
+    covariance = np.array([closure.covariance[:2, :2] for closure in ties])
+    sigma: Float = np.sqrt(np.linalg.eigvalsh(covariance)[:, 1])
+    return sigma / max(options.drift_translation, 1e-9)
 
 
 def of_stage(

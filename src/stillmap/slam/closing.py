@@ -1,5 +1,7 @@
 """Loop closure: find candidates, verify them, solve the graph, spread what it says."""
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -71,8 +73,8 @@ def _corrected(
         poses[:last], way[: last - 1], relations, track.options.robust
     )
     out[last:] = out[last - 1] @ se2.inverse(poses[last - 1]) @ poses[last:]
-    fit = [pose_graph.misfit(out, relation) <= track.options.misfit for relation in relations]
-    return out, [closure for closure, fits in zip(accepted, fit, strict=True) if fits]
+    fit = pose_graph.misfits(out, relations) <= track.options.misfit
+    return out, list(itertools.compress(accepted, fit))
 
 
 def _solved(
@@ -83,11 +85,12 @@ def _solved(
     if not accepted:
         return start, found
     robust = pose_graph.optimised(start, way, accepted, track.options.robust)
+    misfits = pose_graph.misfits(robust, [_relation(track, closure) for closure in found])
     found = [
-        refuse(c, "other loops disagree")
-        if not c.refused and pose_graph.misfit(robust, _relation(track, c)) > track.options.misfit
-        else c
-        for c in found
+        refuse(closure, "other loops disagree")
+        if not closure.refused and misfit > track.options.misfit
+        else closure
+        for closure, misfit in zip(found, misfits, strict=True)
     ]
     accepted = [_relation(track, c) for c in found if not c.refused]
     return pose_graph.optimised(robust, way, accepted, None), found

@@ -63,11 +63,16 @@ def optimised(
     return out
 
 
-def misfit(poses: Float, relation: Relation) -> float:
-    """Squared Mahalanobis distance between a relation and the poses: chi-square, 3 degrees."""
-    found = se2.inverse(poses[relation.first]) @ poses[relation.second]
-    d = se2.parameters(se2.inverse(relation.T) @ found)
-    return float(d @ np.linalg.solve(relation.covariance, d))
+def misfits(poses: Float, relations: list[Relation]) -> Float:
+    """(L,) squared Mahalanobis distances of relations to the poses: chi-square, 3 degrees."""
+    if not relations:
+        return np.zeros(0)
+    first, second = np.array([[r.first, r.second] for r in relations]).T
+    found = se2.inverse(poses[first]) @ poses[second]
+    d = se2.parameters(se2.inverse(np.array([r.T for r in relations])) @ found)
+    solved = np.linalg.solve(np.array([r.covariance for r in relations]), d[..., None])[..., 0]
+    out: Float = (d * solved).sum(axis=1)
+    return out
 
 
 def _factor(relation: Relation, robust: float | None) -> Any:
