@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stillmap import _core, se2
 from stillmap.options import field_with_doc
 from stillmap.recording.model import Recording
-from stillmap.slam import registration
+from stillmap.slam import keyframes, registration
 from stillmap.slam.keyframes import Index
 from stillmap.slam.motion import MotionPrior
 from stillmap.slam.registration import RegistrationOptions
@@ -19,6 +19,8 @@ from stillmap.slam.scans import hits, in_frame, put
 Float = NDArray[np.float64]
 Points = NDArray[np.float32]
 
+# of the way between keyframes: a local map of scans nearer than that takes longer, and says no more
+_DENSE = 0.25
 # metres by which a view is shifted to see whether it could slide along a wall
 _SHIFTS = (-0.6, -0.45, -0.3, -0.15, 0.15, 0.3, 0.45, 0.6)
 
@@ -168,11 +170,12 @@ def drift(metres: float, options: LoopOptions) -> tuple[float, float]:
 
 
 def _local_map(track: Track, centre: float) -> _core.Grid2D:
-    """The scans of one stretch of travel, and no others."""
+    """Scans of one stretch of travel, and no others."""
     half = track.options.stretch
     first, last = np.searchsorted(track.travelled, [centre - half, centre + half])
     grid = _core.Grid2D(track.resolution, track.registration.approach)
-    for t in range(first, last):
+    spacing = _DENSE * track.options.distance, _DENSE * track.options.turn
+    for t in first + keyframes.chosen(track.poses[first:last], *spacing):
         put(grid, track.recording, track.e, t, track.poses[t])
     return grid
 
