@@ -1,0 +1,197 @@
+"""Where loops are looked for, and how widely: what the graph knows, not what odometry fears."""
+
+import dataclasses
+from itertools import accumulate, pairwise
+
+import numpy as np
+import pytest
+
+from stillmap import _core, se2
+from stillmap.evaluation.trajectory import absolute_errors
+from stillmap.recording.model import Recording
+from stillmap.simulation import RobotOptions, Scene, simulate
+from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.simulation.walls import box
+from stillmap.slam import SlamOptions, registration
+from stillmap.slam.candidates import metres_to, of_stage, stages
+from stillmap.slam.chain import agreeing, agreeing_since, relations
+from stillmap.slam.closing import closed
+from stillmap.slam.incremental import Mapped
+from stillmap.slam.loops import Closure, LoopOptions, Track
+
+OPTIONS = SlamOptions()
+# as sure as 5 m of travel
+SURE = np.diag([0.03**2, 0.03**2, 0.006**2])
+
+
+def track_of(poses, options=OPTIONS.loops):
+    """Poses (K, 3, 3) a metre of travel apart, each a keyframe."""
+    n = len(poses)
+    recording = Recording(
+        stamp_ns=np.arange(n),
+        offset=np.zeros(n + 1, np.int64),
+        points=np.zeros((0, 2), np.float32),
+        hit=np.zeros(0, bool),
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(n, np.int32),
+        T_odom_base=None,
+        source={},
+    )
+    return Track(
+        recording,
+        np.zeros(0, np.float32),
+        poses,
+        np.arange(float(n)),
+        np.ones(n),
+        np.arange(n),
+        0.05,
+        OPTIONS.registration,
+        options,
+    )
+
+
+def straight(n):
+    return track_of(se2.matrix(np.arange(float(n)), 0.0, 0.0))
+
+
+def laps(n):
+    """n times along the same 20 m, each time from the start again."""
+    return track_of(se2.matrix(np.tile(np.arange(21.0), n), 0.0, 0.0))
+
+
+def tie(earlier, later, covariance=SURE, T=None):
+    return Closure(earlier, later, np.eye(3) if T is None else T, covariance, 1.0)
+
+
+def test_without_closures_metres_are_those_of_travel():
+    np.testing.assert_array_equal(metres_to(straight(50), 30, []), np.arange(30, -1, -1))
+
+
+def test_the_way_through_a_closure_counts_where_it_is_shorter():
+    metres = metres_to(straight(50), 41, [tie(10, 31)])
+    np.testing.assert_allclose(metres[[10, 0, 20, 31, 41]], [15, 25, 21, 10, 0])
+
+
+def test_loops_in_two_rooms_leave_the_way_between_as_it_is():
+    rooms = [tie(0, 20), tie(60, 80)]
+    metres = metres_to(straight(81), 80, rooms)
+    assert metres[60] == pytest.approx(5.0)  # the same room
+    assert metres[20] == pytest.approx(5.0 + 40.0)  # the other, and the way there
+    assert metres[0] == pytest.approx(5.0 + 40.0 + 5.0)
+
+
+def test_a_closure_that_may_slide_ties_less():
+    sliding = SURE + np.diag([0.6**2, 0.0, 0.0])
+    across = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    for covariance in (sliding, across @ sliding @ across.T):
+        metres = metres_to(straight(301), 300, [tie(50, 280, covariance)])
+        expected = 20.0 + np.hypot(0.6, 0.03) / OPTIONS.loops.drift_translation
+        assert metres[50] == pytest.approx(expected)
+
+
+def test_candidates_are_as_unsure_as_the_graph():
+    track = laps(3)
+    ties = [tie(k, 21 + k) for k in range(21)]
+    # the third time, as unsure as the way from the start of the lap
+    third = {c.later: c for c in of_stage(track, track.poses, 42, 63, ties)}
+    assert set(third) == set(range(42, 63))
+    for later, candidate in third.items():
+        assert candidate.metres <= later - 42 + 1 + 20 + 5
+        assert candidate.metres <= later - candidate.earlier
+    alone = {c.later: c for c in of_stage(track, track.poses, 42, 63, [])}
+    assert alone[50].metres == 50 - alone[50].earlier
+
+
+def test_candidates_are_found_where_the_graph_puts_them():
+    n = 60
+    drifted = track_of(se2.matrix(np.arange(float(n)), 0.0, 0.0))
+    there_and_back = np.concatenate([np.arange(30.0), np.arange(30.0)])
+    corrected = se2.matrix(there_and_back, 0.3, 0.0)
+    assert list(of_stage(drifted, drifted.poses, 30, 60, [])) == []
+    found = list(of_stage(drifted, corrected, 30, 60, []))
+    assert [(c.earlier, c.later) for c in found] == [(k, 30 + k) for k in range(30)]
+    np.testing.assert_allclose([c.T for c in found], np.tile(np.eye(3), (30, 1, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 41, 500])
+def test_stages_leave_out_nothing(n):
+    ranges = list(stages(straight(n)))
+    assert ranges[0][0] == 0
+    assert ranges[-1][1] == n
+    assert all(one[1] == other[0] for one, other in pairwise(ranges))
+    assert all(first < last for first, last in ranges)
+
+
+def test_stages_grow_with_the_way():
+    ranges = list(stages(straight(20000)))
+    length = np.diff(ranges, axis=1).ravel()
+    assert length[0] == OPTIONS.loops.stage
+    assert length[:-1].max() > 0.04 * 20000
+    assert len(ranges) < 110  # 500, were all as long as the first
+
+
+def test_stage_by_stage_agrees_like_all_at_once():
+    track = laps(2)
+    way = relations(track, OPTIONS.motion)
+    rng = np.random.default_rng(3)
+    shifts = rng.choice([0.2, 0.2, -0.3], 21)
+    found = [tie(k, 21 + k, T=se2.matrix(shift, 0.0, 0.0)) for k, shift in enumerate(shifts)]
+    at_once = [c.refused for c in agreeing(track, way, found)]
+    assert {bool(reason) for reason in at_once} == {True, False}
+    for stage in (1, 2, 3, 7):
+        decided: list[Closure] = []
+        for first in range(0, 21, stage):
+            new = found[: first + stage]
+            decided = agreeing_since(track, way, new, decided, 21 + first)
+        assert [c.refused for c in decided] == at_once
+
+
+def rounds():
+    """Four times round a square of corridors, 24 m each, in poses that drift."""
+    pillars = [
+        wall
+        for x in range(-4, 5, 2)
+        for at in ((x, -4.4), (4.4, x), (x + 1, 4.4), (-4.4, x))
+        for wall in box(*at, 0.2 + 0.03 * x, 0.3)
+    ]
+    scene = Scene(
+        "rounds",
+        walls=(*box(0, 0, 9, 9), *box(0, 0, 4, 4), *pillars),
+        route=((-3, -3), (3, -3), (3, 3), (-3, 3), (-3, -2.9)),
+        crowd=CrowdOptions(people=0),
+        laser=LaserOptions(beams=120, max_range=6.0),
+        robot=RobotOptions(scans=1100),
+        odometry=OdometryOptions(),
+    )
+    simulation = simulate(scene, 1)
+    truth = simulation.truth.T_world_base
+    truth = se2.inverse(truth[0]) @ truth
+    steps = se2.inverse(truth[:-1]) @ truth[1:] @ se2.matrix(8e-4, 4e-4, 1e-4)
+    return simulation.recording, truth, np.array([*accumulate(steps, np.matmul, initial=np.eye(3))])
+
+
+def test_a_round_passed_again_is_not_searched_more_widely(monkeypatch):
+    windows = []
+    search = registration.search
+
+    def recorded(grid, points, weights, prior, options, translation, rotation):
+        windows.append(translation)
+        return search(grid, points, weights, prior, options, translation, rotation)
+
+    monkeypatch.setattr(registration, "search", recorded)
+    recording, truth, poses = rounds()
+    n = len(poses)
+    local = Mapped(poses, np.zeros((n, 3, 3)), _core.Grid2D(0.05), np.ones(n), [])
+    e = np.full(recording.n_beams, 0.9, np.float32)
+
+    def searched(stage):
+        windows.clear()
+        loops = LoopOptions(drift_translation=0.012, stage=stage)
+        found, _ = closed(recording, e, dataclasses.replace(OPTIONS, loops=loops), local)
+        assert absolute_errors(found, truth).rmse < 0.4 * absolute_errors(poses, truth).rmse
+        return np.array(windows)
+
+    staged, at_once = searched(10.0), searched(1e9)
+    assert len(staged) > 100
+    assert staged.max() < 0.75 * at_once.max()
+    assert staged.mean() < 0.8 * at_once.mean()
