@@ -12,7 +12,7 @@ from stillmap.recording.model import Recording
 from stillmap.simulation import RobotOptions, Scene, simulate
 from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.simulation.walls import box
-from stillmap.slam import SlamOptions, registration
+from stillmap.slam import SlamOptions, keyframes, loops, registration
 from stillmap.slam.candidates import metres_to, of_stage, stages
 from stillmap.slam.chain import agreeing, agreeing_since, relations
 from stillmap.slam.closing import closed
@@ -146,7 +146,7 @@ def test_stage_by_stage_agrees_like_all_at_once():
         assert [c.refused for c in decided] == at_once
 
 
-def rounds():
+def rounds(drift=1.0):
     """Four times round a square of corridors, 24 m each, in poses that drift."""
     pillars = [
         wall
@@ -166,8 +166,58 @@ def rounds():
     simulation = simulate(scene, 1)
     truth = simulation.truth.T_world_base
     truth = se2.inverse(truth[0]) @ truth
-    steps = se2.inverse(truth[:-1]) @ truth[1:] @ se2.matrix(8e-4, 4e-4, 1e-4)
+    steps = (
+        se2.inverse(truth[:-1]) @ truth[1:] @ se2.matrix(*(drift * np.array([8e-4, 4e-4, 1e-4])))
+    )
     return simulation.recording, truth, np.array([*accumulate(steps, np.matmul, initial=np.eye(3))])
+
+
+def local(poses):
+    n = len(poses)
+    return Mapped(poses, np.zeros((n, 3, 3)), _core.Grid2D(0.05), np.ones(n), [])
+
+
+def missed(T, truth, candidate):
+    """Metres between the truth and a pose of a later scan in the frame of an earlier one."""
+    true = se2.inverse(truth[candidate.earlier]) @ truth[candidate.later]
+    return np.hypot(*se2.parameters(se2.inverse(true) @ T)[:2])
+
+
+def test_loops_are_looked_for_where_those_before_put_them(monkeypatch):
+    asked = []
+    attempts = loops.attempts
+
+    def recorded(track, candidates):
+        asked.append(list(candidates))
+        return attempts(track, asked[-1])
+
+    monkeypatch.setattr(loops, "attempts", recorded)
+    recording, truth, poses = rounds(drift=4.0)
+    e = np.full(recording.n_beams, 0.9, np.float32)
+    closed(recording, e, dataclasses.replace(OPTIONS, loops=LoopOptions(stage=8.0)), local(poses))
+    third = [c for stage in asked for c in stage if c.later > 600]
+    without = [missed(se2.inverse(poses[c.earlier]) @ poses[c.later], truth, c) for c in third]
+    assert len(third) > 40
+    assert min(without) > 0.3
+    assert max(missed(c.T, truth, c) for c in third) < 0.28
+
+
+def test_a_scan_is_laid_where_the_candidate_says():
+    recording, truth, poses = rounds(drift=4.0)
+    frames = keyframes.chosen(poses, 1.0, 0.5)
+    later = int(frames[np.searchsorted(keyframes.travel(poses)[frames], 60.0)])
+    earlier = min(range(200), key=lambda t: np.linalg.norm(truth[t] - truth[later]))
+    track = dataclasses.replace(
+        track_of(poses),
+        recording=recording,
+        e=np.full(recording.n_beams, 0.9, np.float32),
+        travelled=keyframes.travel(poses),
+        keyframes=frames,
+    )
+    T = se2.inverse(truth[earlier]) @ truth[later]
+    (found,) = loops.attempts(track, [loops.Candidate(earlier, later, T, 0.0)])
+    assert missed(se2.inverse(poses[earlier]) @ poses[later], truth, found) > 0.5
+    assert missed(found.T, truth, found) < 0.05  # though no more than 0.2 m are searched
 
 
 def test_a_round_passed_again_is_not_searched_more_widely(monkeypatch):
@@ -180,14 +230,13 @@ def test_a_round_passed_again_is_not_searched_more_widely(monkeypatch):
 
     monkeypatch.setattr(registration, "search", recorded)
     recording, truth, poses = rounds()
-    n = len(poses)
-    local = Mapped(poses, np.zeros((n, 3, 3)), _core.Grid2D(0.05), np.ones(n), [])
     e = np.full(recording.n_beams, 0.9, np.float32)
 
     def searched(stage):
         windows.clear()
-        loops = LoopOptions(drift_translation=0.012, stage=stage)
-        found, _ = closed(recording, e, dataclasses.replace(OPTIONS, loops=loops), local)
+        options = LoopOptions(drift_translation=0.012, stage=stage)
+        options = dataclasses.replace(OPTIONS, loops=options)
+        found, _ = closed(recording, e, options, local(poses))
         assert absolute_errors(found, truth).rmse < 0.4 * absolute_errors(poses, truth).rmse
         return np.array(windows)
 
