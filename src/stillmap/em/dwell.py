@@ -33,7 +33,7 @@ class Classes:
         mover_occupied, mover_seconds: of what comes and goes.
     """
 
-    static_occupied: tuple[float, ...] = (0.998, 0.9)
+    static_occupied: tuple[float, ...] = (0.998, 0.95)
     static_seconds: tuple[float, ...] = (25.0, 100.0)
     mover_occupied: tuple[float, ...] = (0.01, 0.04, 0.15)
     mover_seconds: tuple[float, ...] = (0.5, 3.0, 12.0, 45.0)

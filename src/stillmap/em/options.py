@@ -9,7 +9,7 @@ from stillmap.options import field_with_doc
 class DwellOptions:
     """The default estimator; lengths follow from the scatter of end points in the recording."""
 
-    look: float = field_with_doc(0.25, "s, beams within it tell no more of a cell than one")
+    look: float = field_with_doc(0.5, "s, beams within it tell no more of a cell than one")
     detection: float = field_with_doc(0.97, "probability that an occupied cell is seen to be so")
     lateral: float = field_with_doc(0.7, "scatters by which a beam may pass beside its place")
     margin: float = field_with_doc(3.0, "scatters behind a surface at which a beam has passed it")

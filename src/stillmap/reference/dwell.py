@@ -17,6 +17,7 @@ Float = NDArray[np.float64]
 HIT = -1.0  # instead of a reliability
 SURE = 0.95  # what was met more probably than that was met
 LEAST = 0.02  # what was met less probably than that nobody looked at
+IN_A_ROW = 3  # beams without a return that did not just get lost
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,10 @@ def look_at(surface: Surface, beams: Sequence[Beam], reading: Reading) -> dict[i
     number = surface.numbers()
     missed: dict[int, float] = {}
     struck = set()
+    open_beams = _open(beams)
     for beam in beams:
+        if not beam.hit and beam.number not in open_beams:
+            continue
         for k, met in _met(surface, number, beam, reading):
             missed[k] = missed.get(k, 1.0) * (1.0 - met)
         end = number.get(tuple(cell_of(beam.end, surface.resolution).tolist()))
@@ -67,6 +71,17 @@ def look_at(surface: Surface, beams: Sequence[Beam], reading: Reading) -> dict[i
     seen = {k: 1.0 - m for k, m in missed.items() if 1.0 - m > LEAST}
     through = {k: 1.0 if p > SURE else p for k, p in seen.items()}
     return through | dict.fromkeys(hit, HIT)
+
+
+def _open(beams: Sequence[Beam]) -> set[int]:
+    """Numbers of beams without a return that have others beside them, IN_A_ROW at least."""
+    scan_of = {beam.number: beam.scan for beam in beams if not beam.hit}
+    lost, found = sorted(scan_of), set()
+    for first in lost:
+        row = range(first, first + IN_A_ROW)
+        if all(scan_of.get(n) == scan_of[first] for n in row):
+            found.update(row)
+    return found
 
 
 def _met(

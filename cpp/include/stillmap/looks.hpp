@@ -1,0 +1,278 @@
+// What the beams of one look say about the elements of a surface: hit, or seen through.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <vector>
+
+#include "stillmap/surface.hpp"
+
+namespace stillmap {
+
+struct LookOptions {
+  double seconds;  // between successive looks
+  double lateral;  // cells: how far a beam may pass beside where it seems to
+  double margin;   // cells: how far behind an element a beam must end to have passed it
+  double reach;    // cells: hits so near to an element are hits of it
+  double beyond;   // cells before its end up to which a maximum-range beam is trusted
+  bool normals;    // whether surfaces face somewhere; else every element is round
+};
+
+// What one look says about one element.
+struct Look {
+  static constexpr float kHit = 2.0f, kNothing = 0.0f;
+  int32_t element;
+  float seen_through;  // probability that some beam met the element's place, or kHit, or kNothing
+};
+
+// What one look says, sorted by spans of elements: what is known of the elements of a span fits a
+// cache, and many looks are applied to one span before the next.
+struct Seen {
+  static constexpr int32_t kSpan = 2048;  // elements
+  std::vector<Look> looks;
+  std::vector<size_t> begin;  // of each span, and the end
+
+  static size_t span_of(int32_t element) { return static_cast<size_t>(element / kSpan); }
+  static size_t spans(size_t elements) { return (elements + kSpan - 1) / kSpan; }
+};
+
+// Probability that a beam meets what extends `half` to both sides and which it seems to pass at a
+// distance, known up to `lateral`; from tables, for every beam asks for it in every cell.
+class MeetingTables {
+ public:
+  explicit MeetingTables(double lateral) : per_lateral_(static_cast<float>(1.0 / lateral)) {
+    for (int i = 0; i < 2 * kLimit * kPerUnit + 2; ++i)
+      cdf_.push_back(phi(static_cast<double>(i) / kPerUnit - kLimit));
+    for (int i = 0; i < kSquares * kPerSquare; ++i) {
+      const double aside = std::sqrt((i + 0.5) / kPerSquare);
+      round_.push_back(phi((kRound - aside) / lateral) - phi((-kRound - aside) / lateral));
+    }
+  }
+
+  static constexpr double kRound = 0.5;  // half extent of what is no surface, in cells
+
+  float operator()(float half, float aside) const {
+    return cdf((half - aside) * per_lateral_) - cdf((-half - aside) * per_lateral_);
+  }
+  float round(float aside_squared) const {
+    const float at = aside_squared * kPerSquare;
+    return at < kSquares * kPerSquare ? round_[static_cast<size_t>(at)] : 0.0f;
+  }
+
+ private:
+  static constexpr int kLimit = 5, kPerUnit = 128, kSquares = 3, kPerSquare = 1024;
+
+  static float phi(double x) { return static_cast<float>(0.5 * std::erfc(-x / std::sqrt(2.0))); }
+  float cdf(float x) const {
+    constexpr float limit = kLimit;
+    return cdf_[static_cast<size_t>((std::clamp(x, -limit, limit) + limit) * kPerUnit + 0.5f)];
+  }
+
+  float per_lateral_;
+  std::vector<float> cdf_, round_;
+};
+
+// Collects the beams of one look.
+template <int D>
+class LookCollector {
+ public:
+  LookCollector(const Surface<D>& surface, const LookOptions& options, const MeetingTables& tables)
+      : surface_(surface),
+        options_(options),
+        margin_(static_cast<float>(options.margin)),
+        tables_(tables),
+        sheet_(surface.size()),
+        cursor_(surface) {
+    for (size_t k = 0; k < sheet_.size(); ++k)
+      sheet_[k] = row_of(surface, static_cast<int32_t>(k), options.normals);
+  }
+
+  void add(const Scans<D>& scans, size_t first, size_t last) {
+    for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
+      if (!scans.hit[n] && !nothing_there(scans, t, n)) return;
+      const Segment<D> beam(pose, scans.points + n * D, surface_.resolution());
+      pass(beam, scans.hit[n]);
+      if (!scans.hit[n]) return;
+      if (const auto* k = at(cell_of<D>(beam.end)); k && strike(*k)) struck_.push_back(*k);
+    });
+  }
+
+  // What the look says, and a clean sheet for the next one.
+  void take(Seen& out) {
+    spread_hits();
+    const size_t spans = Seen::spans(sheet_.size());
+    out.begin.assign(spans + 2, 0);
+    for (const int32_t k : touched_) ++out.begin[Seen::span_of(k) + 2];
+    for (size_t s = 2; s < spans + 2; ++s) out.begin[s] += out.begin[s - 1];
+    out.looks.resize(touched_.size());
+    for (const int32_t k : touched_) {
+      float& missed = sheet_[static_cast<size_t>(k)].missed;
+      out.looks[out.begin[Seen::span_of(k) + 1]++] = {k, seen_through(missed)};
+      missed = kUntouched;
+    }
+    out.begin.pop_back();
+    touched_.clear();
+    struck_.clear();
+  }
+
+ private:
+  using Vecf = Eigen::Matrix<float, D, 1>;
+  static constexpr float kStruck = -1.0f, kUntouched = 2.0f;
+  static constexpr float kSure = 0.05f;  // more beams of the same look would change nothing
+  static constexpr float kLeast = 0.98f;
+  static constexpr int kInARow = 3;
+
+  // What a beam has to know of an element, in few bytes: most of the time goes into fetching them.
+  struct Row {
+    float missed = kUntouched;      // probability that every beam of this look went past
+    std::array<int16_t, D> centre;  // seen from the cell's corner, in units of 1 / kUnit
+    std::array<int16_t, D> normal;  // likewise
+    int16_t half;                   // likewise; zero: no surface
+
+    static constexpr float kUnit = 4096.0f;
+    static int16_t packed(double value) { return static_cast<int16_t>(std::lround(value * kUnit)); }
+    static Vecf unpacked(const std::array<int16_t, D>& packed) {
+      Vecf v;
+      for (int d = 0; d < D; ++d) v[d] = packed[static_cast<size_t>(d)] * (1.0f / kUnit);
+      return v;
+    }
+  };
+
+  static Row row_of(const Surface<D>& surface, int32_t k, bool normals) {
+    const Element<D>& e = surface.element(k);
+    const bool flat = normals && !e.normal.isZero(0.0);
+    const Vec<D> centre = (flat ? e.centre : e.mean) - surface.cell(k).template cast<double>();
+    Row row;
+    for (int d = 0; d < D; ++d) {
+      row.centre[static_cast<size_t>(d)] = Row::packed(std::clamp(centre[d], -7.9, 7.9));
+      row.normal[static_cast<size_t>(d)] = flat ? Row::packed(e.normal[d]) : int16_t{0};
+    }
+    row.half = flat ? Row::packed(std::clamp(e.half, 1e-3, 7.0)) : int16_t{0};
+    return row;
+  }
+
+  // A single beam without a return got lost, whatever stands there; several in a row did not.
+  static bool nothing_there(const Scans<D>& scans, size_t t, int64_t n) {
+    auto lost = [&](int64_t m) {
+      return m >= scans.offset[t] && m < scans.offset[t + 1] && !scans.hit[m] &&
+             usable<D>(scans.points + m * D);
+    };
+    int in_a_row = 1;
+    for (int64_t m = n - 1; in_a_row < kInARow && lost(m); --m) ++in_a_row;
+    for (int64_t m = n + 1; in_a_row < kInARow && lost(m); ++m) ++in_a_row;
+    return in_a_row >= kInARow;
+  }
+
+  static float seen_through(float missed) {
+    if (missed == kStruck) return Look::kHit;
+    if (missed < kSure) return 1.0f;
+    return missed < kLeast ? 1.0f - missed : Look::kNothing;
+  }
+
+  // Whether that is news.
+  bool strike(int32_t k) {
+    float& missed = sheet_[static_cast<size_t>(k)].missed;
+    if (missed == kStruck) return false;
+    if (missed == kUntouched) touched_.push_back(k);
+    missed = kStruck;
+    return true;
+  }
+
+  const int32_t* at(const Cell<D>& cell) {
+    const auto* block = cursor_.block(cell);
+    if (!block) return nullptr;
+    const int32_t* k = &block->counts[static_cast<size_t>(Surface<D>::local_of(cell))];
+    return *k == kNoElement ? nullptr : k;
+  }
+
+  // An element whose cell a beam crosses.
+  struct Crossed {
+    int32_t element;
+    Cell<D> cell;
+  };
+
+  // A beam in single precision, from the corner of the cell in which it starts.
+  struct Line {
+    Cell<D> corner;
+    Vecf start, direction;
+    float length;
+    bool hit;
+  };
+
+  // Notes what the beam passed.
+  void pass(const Segment<D>& beam, bool hit) {
+    const Vec<D> way = beam.end - beam.start;
+    const double length = way.norm();
+    const double usable = hit ? length : length - options_.beyond;
+    if (!(usable > 0.0)) return;
+    const Vec<D> direction = way / length;
+    const Cell<D> corner = cell_of<D>(beam.start);
+    const Line line{corner, (beam.start - corner.template cast<double>()).template cast<float>(),
+                    direction.template cast<float>(), static_cast<float>(length), hit};
+    crossed_.clear();
+    Walker walker(cursor_, [&](const int32_t* k, const Cell<D>& cell) {
+      if (!k || *k == kNoElement) return;
+      __builtin_prefetch(&sheet_[static_cast<size_t>(*k)], 1);
+      crossed_.push_back({*k, cell});
+    });
+    traverse<D>(beam.start, hit ? beam.end : Vec<D>(beam.start + direction * usable), walker);
+    for (const Crossed& crossed : crossed_) meet(crossed, line);
+    // the end cell is not visited: an end in it is a hit, and free range stops before it
+  }
+
+  void meet(const Crossed& crossed, const Line& line) {
+    Row& row = sheet_[static_cast<size_t>(crossed.element)];
+    if (row.missed < kSure) return;
+    const float met = probability_met(row, crossed.cell, line);
+    if (met <= 0.0f) return;
+    if (row.missed == kUntouched) {
+      touched_.push_back(crossed.element);
+      row.missed = 1.0f;
+    }
+    row.missed *= 1.0f - met;
+  }
+
+  // Of the beam crossing the surface within the element, as far as `lateral` lets one tell: small
+  // at grazing angles.
+  float probability_met(const Row& row, const Cell<D>& cell, const Line& line) const {
+    const Vecf off =
+        (cell - line.corner).template cast<float>() + Row::unpacked(row.centre) - line.start;
+    const float along = off.dot(line.direction);
+    const float aside_squared = (off - along * line.direction).squaredNorm();
+    if (row.half == 0) {
+      const float behind = line.length - along;
+      if (line.hit && behind * behind + aside_squared < margin_ * margin_) return 0.0f;
+      return tables_.round(aside_squared);
+    }
+    const Vecf normal = Row::unpacked(row.normal);
+    const float facing = normal.dot(line.direction);
+    if (line.hit && std::abs(line.length * facing - normal.dot(off)) < margin_) return 0.0f;
+    const float half = row.half * (1.0f / Row::kUnit) * std::abs(facing);
+    return tables_(half, std::sqrt(aside_squared));
+  }
+
+  // Elements near one that was struck are struck: pose and range noise move end points about.
+  void spread_hits() {
+    const int radius = static_cast<int>(std::ceil(options_.reach));
+    const double limit = options_.reach * options_.reach;
+    for (const int32_t from : struck_) {
+      const Vec<D>& mean = surface_.element(from).mean;
+      for_each_near<D>(surface_.cell(from), radius, [&](const Cell<D>& cell) {
+        const auto* k = at(cell);
+        if (k && (surface_.element(*k).mean - mean).squaredNorm() <= limit) strike(*k);
+      });
+    }
+  }
+
+  const Surface<D>& surface_;
+  LookOptions options_;
+  float margin_;
+  const MeetingTables& tables_;
+  std::vector<Row> sheet_;
+  std::vector<int32_t> touched_, struck_;
+  std::vector<Crossed> crossed_;  // of one beam: fetched all at once, then looked at
+  Cursor<const Surface<D>> cursor_;
+};
+
+}  // namespace stillmap
