@@ -74,6 +74,14 @@ auto likelihoods(Dwell<D>& dwell) {
   return std::make_tuple(owned(std::move(relative), {n, C}), owned(std::move(log_best), {n}));
 }
 
+template <int D>
+auto look_counts(const Dwell<D>& dwell) {
+  const size_t n = dwell.surface().size();
+  std::vector<int64_t> counts(n);
+  dwell.looks(counts.data());
+  return owned(std::move(counts), {n});
+}
+
 DwellClasses checked_classes(std::vector<double> rho, std::vector<double> tau, double detection) {
   require(!rho.empty() && rho.size() == tau.size(), "rho, tau: expected one number per class");
   require(rho.size() <= kMaxClasses, "rho, tau: too many classes");
@@ -128,6 +136,7 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
            nb::arg("look").noconvert(), nb::arg("threads") = 1,
            "Adds scans; look (T,) int64 numbers their looks and must not fall. All scans of one "
            "look belong into one call.")
+      .def("looks", &look_counts<D>, "(E,) int64: looks that saw something of each element.")
       .def("likelihood", &likelihoods<D>,
            "(E, C) float32 relative to the best class, (E,) logarithm of the best: of everything "
            "else that was seen of the cell, given that a beam ended in it.");

@@ -56,6 +56,8 @@ class Chains {
     });
   }
 
+  int64_t looks(size_t k) const { return heads_[k].looks; }
+
   // Likelihood under each class of everything else that was seen of a member, given one hit,
   // relative to the best class; returns the logarithm of the best.
   double likelihood(size_t k, float* relative) const {
@@ -79,6 +81,7 @@ class Chains {
 
   struct Head {
     int64_t last = kNever;   // number of the last look
+    int64_t looks = 0;
     double log_scale = 0.0;  // logarithm of what the weights were divided by
   };
 
@@ -99,6 +102,7 @@ class Chains {
     const bool first = head.last == kNever;
     const int64_t gap = first ? 0 : look - head.last;
     head.last = look;
+    ++head.looks;
     std::vector<Packet> computed;
     const Packet* correlation = table_.data() + static_cast<size_t>(gap) * packets_;
     if (gap >= kTable) {

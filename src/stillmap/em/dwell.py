@@ -75,14 +75,14 @@ def e_step(
     likelihood, log_best = _likelihood(
         recording, T_map_sensor, surface, options.dwell, threads, classes
     )
-    cells, _, normals, off_plane, prominence, beams = surface.elements()
-    shares = fit_shares(likelihood, beams, classes.n_static, options.prior)
+    cells, _, normals, off_plane, prominence, _ = surface.elements()
+    shares = fit_shares(likelihood, classes.n_static, options.prior)
     static = posterior_static(likelihood, shares.classes, classes.n_static)
     element = _elements_of(recording, T_map_sensor, surface, threads)
     found = np.append(static, np.float32(shares.static))  # -1: no element
     return Expectations(
         p_static=per_beam(recording, found[element], shares.static),
-        likelihood=_bound(likelihood, log_best, beams, shares),
+        likelihood=_bound(likelihood, log_best, shares),
         occupied=CellProbabilities(
             cells, static * _coverage(normals, off_plane / resolution, prominence), _UNSEEN
         ),
@@ -159,15 +159,13 @@ def _elements_of(
     return element
 
 
-def _bound(
-    likelihood: NDArray[np.float32], log_best: Float, beams: NDArray[np.int64], shares: Shares
-) -> Likelihood:
+def _bound(likelihood: NDArray[np.float32], log_best: Float, shares: Shares) -> Likelihood:
     joint = likelihood * shares.classes.astype(np.float32)
     evidence = joint.sum(axis=1, dtype=np.float64)
     r = joint / evidence[:, None]
     entropy = -np.sum(r * np.log(np.maximum(r, 1e-30)), axis=1)
-    bound = float(np.sum(beams * (np.log(evidence) + log_best)))
-    return Likelihood(expected=bound - float(np.sum(beams * entropy)), bound=bound)
+    bound = float(np.sum(np.log(evidence) + log_best))
+    return Likelihood(expected=bound - float(np.sum(entropy)), bound=bound)
 
 
 def _coverage(normals: Float, off_plane: Float, prominence: Float) -> NDArray[np.float32]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 
 _LEARN_FROM = 100_000  # members that shares are learned from: more change no digit that matters
-_PSEUDO = 1.0  # beams that each class starts with, so that none is ever impossible
+_PSEUDO = 1.0  # members that each class starts with, so that none is ever impossible
 _MOST_STATIC = 0.998  # a recording cannot show that nothing ever moves
 
 
@@ -19,7 +19,7 @@ class Shares:
     Attributes:
         static: share of the static classes taken together.
         classes: (C,) shares of all classes, static ones first; they sum to one.
-        log_likelihood: mean over the members, in nats per unit of count.
+        log_likelihood: mean over the members, in nats.
     """
 
     static: float
@@ -29,41 +29,38 @@ class Shares:
 
 def fit_shares(
     likelihood: NDArray[np.float32],
-    count: NDArray[np.int64],
     n_static: int,
     start: float,
     iterations: int = 100,
     tolerance: float = 1e-6,
 ) -> Shares:
-    """Maximise sum_k count_k ln sum_c share_c likelihood_kc over the shares.
+    """Maximise sum_k ln sum_c share_c likelihood_kc over the shares.
 
     Args:
         likelihood: (K, C), each row relative to its best class.
-        count: (K,) how often each member counts.
         n_static: the first so many classes are static.
         start: share of the static classes to begin with.
         iterations: at most.
-        tolerance: nats per unit of count: stops when an iteration gains less.
+        tolerance: nats per member: stops when an iteration gains less.
 
     Sums are those of NumPy's own loops, not of a linear algebra library that would split them
     among threads: the result does not depend on the machine's number of processors.
     """
-    step = -(-len(count) // _LEARN_FROM) if len(count) else 1
-    rows, n = likelihood[::step].astype(np.float64), count[::step].astype(np.float64)
-    C, total = likelihood.shape[1], max(float(n.sum()), 1.0)
+    K, C = likelihood.shape
+    rows = likelihood[:: max(-(-K // _LEARN_FROM), 1)].astype(np.float64)
     shares = np.empty(C)
     shares[:n_static] = start / n_static
     shares[n_static:] = (1.0 - start) / (C - n_static)
     last = -np.inf
     for _ in range(iterations):
         evidence = np.einsum("kc,c->k", rows, shares)
-        now = float(np.sum(n * np.log(evidence))) / total
-        counts = shares * np.einsum("kc,k->c", rows, n / evidence)  # expected beams per class
+        now = float(np.sum(np.log(evidence))) / max(len(rows), 1)
+        counts = shares * np.einsum("kc,k->c", rows, 1.0 / evidence)  # expected members per class
         shares = _normalised(counts, n_static, start)
         if now - last < tolerance:
             break
         last = now
-    return Shares(float(shares[:n_static].sum()), shares, now if len(count) else 0.0)
+    return Shares(float(shares[:n_static].sum()), shares, now)
 
 
 def _normalised(counts: Float, n_static: int, start: float) -> Float:
