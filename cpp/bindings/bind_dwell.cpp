@@ -82,6 +82,15 @@ auto look_counts(const Dwell<D>& dwell) {
   return owned(std::move(counts), {n});
 }
 
+template <int D>
+auto lost_beams(const Dwell<D>& dwell, const Points<D>& points, const Flat<bool>& hit,
+                const Flat<int64_t>& offset, const Poses<D>& poses) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  nb::gil_scoped_release released;
+  const Lost lost = dwell.lost(scans);
+  return std::make_tuple(lost.beams, lost.through_solid);
+}
+
 DwellClasses checked_classes(std::vector<double> rho, std::vector<double> tau, double detection) {
   require(!rho.empty() && rho.size() == tau.size(), "rho, tau: expected one number per class");
   require(rho.size() <= kMaxClasses, "rho, tau: too many classes");
@@ -126,7 +135,7 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
               require(x > 0.0 && std::isfinite(x), "looks: expected positive lengths and times");
             const double r = s.resolution();
             new (self) W(s, checked_classes(std::move(rho), std::move(tau), detection),
-                         {seconds, lateral / r, margin / r, reach / r, beyond / r, normals});
+                         {seconds, lateral / r, margin / r, reach / r, beyond / r, 1.0, normals});
           },
           nb::arg("surface"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"), nb::arg("detection"),
           nb::arg("seconds"), nb::arg("lateral"), nb::arg("margin"), nb::arg("reach"),
@@ -136,6 +145,19 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
            nb::arg("look").noconvert(), nb::arg("threads") = 1,
            "Adds scans; look (T,) int64 numbers their looks and must not fall. All scans of one "
            "look belong into one call.")
+      .def("lost", &lost_beams<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
+           "Beams without a return that have such beams beside them, and how many of these cross "
+           "something solid.")
+      .def(
+          "trust",
+          [](W& w, double open) {
+            require(open >= 0.0 && open <= 1.0, "open: expected a share between 0 and 1");
+            w.trust(open);
+          },
+          nb::arg("open"),
+          "How far to trust beams without a return beyond the first solid thing in their way; all "
+          "the way at first.")
       .def("looks", &look_counts<D>, "(E,) int64: looks that saw something of each element.")
       .def("likelihood", &likelihoods<D>,
            "(E, C) float32 relative to the best class, (E,) logarithm of the best: of everything "

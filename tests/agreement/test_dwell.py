@@ -118,6 +118,62 @@ def test_what_a_look_says(room, changes):
     assert seen > 5 or "lateral" not in changes
 
 
+@pytest.fixture(scope="module")
+def swallowed(room):
+    """The room with some beams in a row without a return, through walls and past them."""
+    beams = room.beams
+    hit, points = beams.hit.copy(), beams.points.copy()
+    for start in beams.offset[:-1]:
+        row = slice(start + 20, start + 26)
+        hit[row] = False
+        points[row] *= 1.8
+    return replace(room, beams=beams.with_(hit=hit, points=points))
+
+
+def test_lost_beams_through_what_is_solid(room, swallowed):
+    counts = []
+    for kernels in (_core, reference):
+        dwell = room.dwell(kernels, room.surface(kernels), *CLASSES)
+        counts.append([dwell.lost(*some.beams.arguments) for some in (room, swallowed)])
+    assert counts[0] == counts[1]
+    (few, few_through), (more, through) = counts[0]
+    assert more >= few + 3 * len(room.look)
+    assert 20 < through - few_through < more
+
+
+@pytest.mark.parametrize("trusted", [0.0, 0.4, 1.0])
+def test_lost_beams_are_trusted_so_far(room, swallowed, trusted):
+    points, hit, offset, T = swallowed.scans(4, 14)
+    points = np.where(hit[:, None], np.float32(np.nan), points)  # no hit wins over them
+    found = {}
+    for kernels in (_core, reference):
+        surface = room.surface(kernels)
+        for how in (trusted, 1.0):
+            dwell = room.dwell(kernels, surface, [0.5], [1.0], 0.5)
+            dwell.trust(how)
+            dwell.add(points, hit, offset, T, np.full(10, 7))
+            found[kernels, how] = reliability(dwell)[order(surface)]
+    core, plain, all_the_way = found[_core, trusted], found[reference, trusted], found[_core, 1.0]
+    edge = (np.abs(plain - SURE) < 0.012) | (np.abs(plain) < 0.03) & (np.abs(core) < 0.03)
+    sure = (plain == 1.0) & (core > SURE - 0.012)
+    np.testing.assert_allclose(core[~(edge | sure)], plain[~(edge | sure)], atol=0.012)
+    assert (all_the_way - core >= -1e-9).all()
+    assert ((all_the_way - core).max() > 0.05) == (trusted < 1.0)
+
+
+def test_how_often_something_was_seen(room):
+    counts = []
+    for kernels in (_core, reference):
+        surface = room.surface(kernels)
+        dwell = room.dwell(kernels, surface, *CLASSES)
+        dwell.add(*room.beams.arguments, room.look)
+        counts.append(dwell.looks()[order(surface)])
+    assert counts[0].dtype == np.int64
+    assert np.abs(counts[0] - counts[1]).mean() < 0.05  # what is nearly nothing
+    assert counts[0].min() >= 1
+    assert counts[0].max() > 5
+
+
 def test_likelihood(room):
     rho, tau = [0.998, 0.6, 0.05, 0.15], [25.0, 5.0, 0.5, 45.0]
     found = []

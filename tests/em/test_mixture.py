@@ -54,8 +54,7 @@ def test_known_shares_are_found():
 def test_it_stops_when_nothing_is_gained():
     likelihood, _ = members(np.random.default_rng(3), [0.5, 0.2, 0.2, 0.1], 500)
     enough, more = (
-        fit_shares(likelihood, N_STATIC, 0.5, iterations=n, tolerance=1e-4)
-        for n in (200, 400)
+        fit_shares(likelihood, N_STATIC, 0.5, iterations=n, tolerance=1e-4) for n in (200, 400)
     )
     assert (enough.classes == more.classes).all()
     longer = fit_shares(likelihood, N_STATIC, 0.5, iterations=400, tolerance=0.0)

@@ -257,7 +257,7 @@ def learned_text(result):
 
 def test_what_was_learned_in_words(result):
     text = learned_text(result)
-    assert "met what stands still with 87.3 % probability" in text
+    assert "87.3 % hold something that stands still" in text
     assert "scatter by 1.7 cm" in text
     assert "0.5 s or less 60.0 % 3 s 30.0 % 45 s or more 10.0 %" in text
     assert "1 % or less 90.0 % 15 % or more 10.0 %" in text

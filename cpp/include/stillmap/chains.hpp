@@ -80,7 +80,7 @@ class Chains {
   static constexpr float kSeldom = 1e-20f;  // no filter is surer that a cell is empty
 
   struct Head {
-    int64_t last = kNever;   // number of the last look
+    int64_t last = kNever;  // number of the last look
     int64_t looks = 0;
     double log_scale = 0.0;  // logarithm of what the weights were divided by
   };

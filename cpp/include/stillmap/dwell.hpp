@@ -32,6 +32,13 @@ class Dwell {
   size_t classes() const { return chains_.size(); }
   const Surface<D>& surface() const { return surface_; }
 
+  // Beams without a return, and those of them that cross something solid.
+  Lost lost(const Scans<D>& scans) const {
+    return LookCollector<D>(surface_, options_, tables_).lost(scans);
+  }
+  // How far to trust them beyond the first solid element, from now on.
+  void trust(double open) { options_.open = open; }
+
   // look (T,): number of each scan's look, not falling, and not below those added before.
   void add(const Scans<D>& scans, const int64_t* look, int threads) {
     if (!surface_.fitted() || chains_.members() != surface_.size())

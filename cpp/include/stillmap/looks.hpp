@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <optional>
 #include <vector>
 
 #include "stillmap/surface.hpp"
@@ -16,7 +17,13 @@ struct LookOptions {
   double margin;   // cells: how far behind an element a beam must end to have passed it
   double reach;    // cells: hits so near to an element are hits of it
   double beyond;   // cells before its end up to which a maximum-range beam is trusted
+  double open;     // how far to trust a beam without a return beyond the first solid element
   bool normals;    // whether surfaces face somewhere; else every element is round
+};
+
+// Beams without a return that are not alone, and those of them that cross something solid.
+struct Lost {
+  int64_t beams = 0, through_solid = 0;
 };
 
 // What one look says about one element.
@@ -90,12 +97,28 @@ class LookCollector {
 
   void add(const Scans<D>& scans, size_t first, size_t last) {
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
-      if (!scans.hit[n] && !nothing_there(scans, t, n)) return;
+      if (!scans.hit[n] && !in_a_row(scans, t, n)) return;
       const Segment<D> beam(pose, scans.points + n * D, surface_.resolution());
       pass(beam, scans.hit[n]);
       if (!scans.hit[n]) return;
       if (const auto* k = at(cell_of<D>(beam.end)); k && strike(*k)) struck_.push_back(*k);
     });
+  }
+
+  // Of the beams without a return, what else is known of the surface.
+  Lost lost(const Scans<D>& scans) {
+    Lost lost;
+    for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t t, int64_t n, const Pose<D>& pose) {
+      if (scans.hit[n] || !in_a_row(scans, t, n)) return;
+      ++lost.beams;
+      cross(Segment<D>(pose, scans.points + n * D, surface_.resolution()), false);
+      for (const Crossed& crossed : crossed_)
+        if (sheet_[static_cast<size_t>(crossed.element)].solid) {
+          ++lost.through_solid;
+          break;
+        }
+    });
+    return lost;
   }
 
   // What the look says, and a clean sheet for the next one.
@@ -122,6 +145,7 @@ class LookCollector {
   static constexpr float kSure = 0.05f;  // more beams of the same look would change nothing
   static constexpr float kLeast = 0.98f;
   static constexpr int kInARow = 3;
+  static constexpr int64_t kSolid = 10;  // beams
 
   // What a beam has to know of an element, in few bytes: most of the time goes into fetching them.
   struct Row {
@@ -129,6 +153,7 @@ class LookCollector {
     std::array<int16_t, D> centre;  // seen from the cell's corner, in units of 1 / kUnit
     std::array<int16_t, D> normal;  // likewise
     int16_t half;                   // likewise; zero: no surface
+    bool solid;                     // a surface that many beams ended on
 
     static constexpr float kUnit = 4096.0f;
     static int16_t packed(double value) { return static_cast<int16_t>(std::lround(value * kUnit)); }
@@ -148,12 +173,13 @@ class LookCollector {
       row.centre[static_cast<size_t>(d)] = Row::packed(std::clamp(centre[d], -7.9, 7.9));
       row.normal[static_cast<size_t>(d)] = flat ? Row::packed(e.normal[d]) : int16_t{0};
     }
+    row.solid = flat && surface.beams(k) >= kSolid;
     row.half = flat ? Row::packed(std::clamp(e.half, 1e-3, 7.0)) : int16_t{0};
     return row;
   }
 
-  // A single beam without a return got lost, whatever stands there; several in a row did not.
-  static bool nothing_there(const Scans<D>& scans, size_t t, int64_t n) {
+  // A single beam without a return got lost, whatever stands there; several in a row may tell.
+  static bool in_a_row(const Scans<D>& scans, size_t t, int64_t n) {
     auto lost = [&](int64_t m) {
       return m >= scans.offset[t] && m < scans.offset[t + 1] && !scans.hit[m] &&
              usable<D>(scans.points + m * D);
@@ -200,37 +226,44 @@ class LookCollector {
     bool hit;
   };
 
-  // Notes what the beam passed.
-  void pass(const Segment<D>& beam, bool hit) {
+  // Lists the elements whose cells a beam crosses before it ends; returns whether it has a length.
+  // The end cell is not visited: an end in it is a hit, and free range stops before it.
+  std::optional<Line> cross(const Segment<D>& beam, bool hit) {
+    crossed_.clear();
     const Vec<D> way = beam.end - beam.start;
     const double length = way.norm();
     const double usable = hit ? length : length - options_.beyond;
-    if (!(usable > 0.0)) return;
+    if (!(usable > 0.0)) return std::nullopt;
     const Vec<D> direction = way / length;
-    const Cell<D> corner = cell_of<D>(beam.start);
-    const Line line{corner, (beam.start - corner.template cast<double>()).template cast<float>(),
-                    direction.template cast<float>(), static_cast<float>(length), hit};
-    crossed_.clear();
     Walker walker(cursor_, [&](const int32_t* k, const Cell<D>& cell) {
       if (!k || *k == kNoElement) return;
       __builtin_prefetch(&sheet_[static_cast<size_t>(*k)], 1);
       crossed_.push_back({*k, cell});
     });
     traverse<D>(beam.start, hit ? beam.end : Vec<D>(beam.start + direction * usable), walker);
-    for (const Crossed& crossed : crossed_) meet(crossed, line);
-    // the end cell is not visited: an end in it is a hit, and free range stops before it
+    const Cell<D> corner = cell_of<D>(beam.start);
+    return Line{corner, (beam.start - corner.template cast<double>()).template cast<float>(),
+                direction.template cast<float>(), static_cast<float>(length), hit};
   }
 
-  void meet(const Crossed& crossed, const Line& line) {
-    Row& row = sheet_[static_cast<size_t>(crossed.element)];
-    if (row.missed < kSure) return;
-    const float met = probability_met(row, crossed.cell, line);
-    if (met <= 0.0f) return;
-    if (row.missed == kUntouched) {
-      touched_.push_back(crossed.element);
-      row.missed = 1.0f;
+  // Notes what the beam passed. One without a return passed what lies before the first solid
+  // element in its way; that it did not end there without an echo is only so sure.
+  void pass(const Segment<D>& beam, bool hit) {
+    const std::optional<Line> line = cross(beam, hit);
+    if (!line) return;
+    float trust = 1.0f;
+    for (const Crossed& crossed : crossed_) {
+      Row& row = sheet_[static_cast<size_t>(crossed.element)];
+      if (!hit && row.solid) trust = static_cast<float>(options_.open);
+      if (row.missed < kSure) continue;
+      const float met = trust * probability_met(row, crossed.cell, *line);
+      if (met <= 0.0f) continue;
+      if (row.missed == kUntouched) {
+        touched_.push_back(crossed.element);
+        row.missed = 1.0f;
+      }
+      row.missed *= 1.0f - met;
     }
-    row.missed *= 1.0f - met;
   }
 
   // Of the beam crossing the surface within the element, as far as `lateral` lets one tell: small

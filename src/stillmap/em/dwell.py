@@ -18,6 +18,7 @@ Surface = _core.Surface2D | _core.Surface3D
 _LEAST = 0.3  # cells: no length is known better, whatever the scatter
 _UNSEEN = 0.2  # probability that a cell is occupied in which no beam ended and none passed
 _PROMINENT = 0.1  # share of the richest cell's beams that noise alone hardly brings into another
+_SWALLOWED = 4.0  # one in so many beams without a return through walls: none is trusted
 _EDGE = 0.15  # cells: how sharply a surface ends
 
 
@@ -118,6 +119,7 @@ def _likelihood(
 ) -> tuple[NDArray[np.float32], Float]:
     """(E, C) likelihood of all looks at each element relative to its best class, ln of the best."""
     dwell = _dwell(surface, options, classes)
+    dwell.trust(_open(recording, T_map_sensor, dwell))
     look = look_numbers(recording, options.look)
     for scans, beams, offset in chunks(recording, look):
         dwell.add(
@@ -146,6 +148,21 @@ def _dwell(
     if isinstance(surface, _core.Surface2D):
         return _core.Dwell2D(surface, rho=rho, tau=tau, normals=options.normals, **chosen)
     return _core.Dwell3D(surface, rho=rho, tau=tau, normals=options.normals, **chosen)
+
+
+def _open(recording: Recording, T_map_sensor: Float, dwell: _core.Dwell2D | _core.Dwell3D) -> float:
+    """How far beams without a return show that nothing is there, from 0 to 1.
+
+    Where there is open space they cross nothing solid. Where most of them seem to go through walls,
+    something swallows them.
+    """
+    lost = through = 0
+    for scans, beams, offset in chunks(recording):
+        counts = dwell.lost(
+            recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans]
+        )
+        lost, through = lost + counts[0], through + counts[1]
+    return max(0.0, 1.0 - _SWALLOWED * through / lost) if lost else 0.0
 
 
 def _elements_of(

@@ -38,7 +38,7 @@ def learned_section(result: ResultLike) -> str:
         f"<section><h2>What was learned</h2><p>{escape(_static_sentence(learned))}</p>"
         f"<p>{note} What never leaves while the robot looks is taken for standing still.</p>"
         f'<div class="row">{"".join(tables)}</div>'
-        '<p class="soft">Each bar: share of the beams that ended on such things, put down to the '
+        '<p class="soft">Each bar: share of the cells that hold such things, put down to the '
         "most fitting of a few steps.</p></section>"
     )
 
@@ -46,8 +46,7 @@ def learned_section(result: ResultLike) -> str:
 def _static_sentence(learned: Mapping[str, Any]) -> str:
     share, scatter = float(learned["p_static"]), float(learned["scatter"])
     text = (
-        f"On average, a beam that hit something met what stands still with {share_text(share)} "
-        "probability."
+        f"Of the cells in which beams ended, {share_text(share)} hold something that stands still."
     )
     if scatter > 0.0:
         text += (

@@ -1,7 +1,7 @@
 """The likelihood of what was seen of each element under a two-state Markov chain in time."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp, log
 
 import numpy as np
@@ -18,6 +18,7 @@ HIT = -1.0  # instead of a reliability
 SURE = 0.95  # what was met more probably than that was met
 LEAST = 0.02  # what was met less probably than that nobody looked at
 IN_A_ROW = 3  # beams without a return that did not just get lost
+SOLID = 10  # beams that end on an element of a surface that is there for sure, at least once
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Reading:
         reach: an element so near to one that was hit, mean from mean, is hit too.
         beyond: how far before its end a maximum-range beam is no longer trusted.
         normals: whether surfaces face somewhere; else every element is round.
+        open: how far to trust a beam without a return beyond the first solid element.
     """
 
     lateral: float
@@ -37,6 +39,7 @@ class Reading:
     reach: float
     beyond: float
     normals: bool = True
+    open: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("lateral", "margin", "reach", "beyond"):
@@ -49,17 +52,21 @@ def look_at(surface: Surface, beams: Sequence[Beam], reading: Reading) -> dict[i
 
     An element is hit where a beam ends in its cell or within `reach` of one in whose cell a beam
     ends. The others whose cells beams cross before they end are seen through: R = 1 - the product
-    over these beams of 1 - P(the beam met the surface).
+    over these beams of 1 - P(the beam met the surface). Beams without a return have to come in a
+    row, and are trusted less from the first solid element on.
     """
     number = surface.numbers()
     missed: dict[int, float] = {}
     struck = set()
-    open_beams = _open(beams)
+    in_a_row = _in_a_row(beams)
     for beam in beams:
-        if not beam.hit and beam.number not in open_beams:
+        if not beam.hit and beam.number not in in_a_row:
             continue
+        trust = 1.0
         for k, met in _met(surface, number, beam, reading):
-            missed[k] = missed.get(k, 1.0) * (1.0 - met)
+            if not beam.hit and is_solid(surface.list[k], reading):
+                trust = reading.open
+            missed[k] = missed.get(k, 1.0) * (1.0 - trust * met)
         end = number.get(tuple(cell_of(beam.end, surface.resolution).tolist()))
         if beam.hit and end is not None:
             struck.add(end)
@@ -73,11 +80,16 @@ def look_at(surface: Surface, beams: Sequence[Beam], reading: Reading) -> dict[i
     return through | dict.fromkeys(hit, HIT)
 
 
-def _open(beams: Sequence[Beam]) -> set[int]:
+def is_solid(element: Element, reading: Reading) -> bool:
+    """Whether an element is one of a surface on which many beams ended."""
+    return reading.normals and element.patch is not None and element.beams >= SOLID
+
+
+def _in_a_row(beams: Sequence[Beam]) -> set[int]:
     """Numbers of beams without a return that have others beside them, IN_A_ROW at least."""
     scan_of = {beam.number: beam.scan for beam in beams if not beam.hit}
-    lost, found = sorted(scan_of), set()
-    for first in lost:
+    found: set[int] = set()
+    for first in scan_of:
         row = range(first, first + IN_A_ROW)
         if all(scan_of.get(n) == scan_of[first] for n in row):
             found.update(row)
@@ -209,6 +221,31 @@ class Dwell:
         for n, beams in looks.items():
             for k, reliability in look_at(self.surface, beams, self.reading).items():
                 self.seen[k].append((n * self.seconds, reliability))
+
+    def lost(
+        self, points: ArrayLike, hit: ArrayLike, offset: ArrayLike, T_map_sensor: ArrayLike
+    ) -> tuple[int, int]:
+        """Beams without a return that come in a row, and those of them through something solid."""
+        number = self.surface.numbers()
+        beams = list(usable_beams(self.surface.dimension, points, hit, offset, T_map_sensor))
+        in_a_row = _in_a_row(beams)
+        through = [
+            any(
+                is_solid(self.surface.list[k], self.reading)
+                for k, _ in _met(self.surface, number, beam, self.reading)
+            )
+            for beam in beams
+            if beam.number in in_a_row
+        ]
+        return len(through), sum(through)
+
+    def trust(self, open_: float) -> None:
+        """How far to trust beams without a return beyond the first solid thing in their way."""
+        self.reading = replace(self.reading, open=open_)
+
+    def looks(self) -> NDArray[np.int64]:
+        """(E,) looks that saw something of each element."""
+        return np.array([len(seen) for seen in self.seen], np.int64)
 
     def likelihood(self) -> tuple[NDArray[np.float32], Float]:
         """(E, C) relative to the best class, (E,) logarithm of the best.
