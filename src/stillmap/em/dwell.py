@@ -14,6 +14,7 @@ from stillmap.recording.model import Recording
 
 Float = NDArray[np.float64]
 Surface = _core.Surface2D | _core.Surface3D
+Dwell = _core.Dwell2D | _core.Dwell3D
 
 _LEAST = 0.3  # cells: no length is known better, whatever the scatter
 _UNSEEN = 0.2  # probability that a cell is occupied in which no beam ended and none passed
@@ -73,9 +74,10 @@ def e_step(
     """
     T_map_sensor = recording.T_map_sensor(poses)
     surface = surface_of(recording, T_map_sensor, resolution)
-    likelihood, log_best = _likelihood(
-        recording, T_map_sensor, surface, options.dwell, threads, classes
-    )
+    dwell = _dwell(surface, options.dwell, classes)
+    trust = _open(recording, T_map_sensor, dwell)
+    dwell.trust(trust)
+    likelihood, log_best = _likelihood(recording, T_map_sensor, dwell, options.dwell.look, threads)
     cells, _, normals, off_plane, prominence, _ = surface.elements()
     shares = fit_shares(likelihood, classes.n_static, options.prior)
     static = posterior_static(likelihood, shares.classes, classes.n_static)
@@ -87,7 +89,7 @@ def e_step(
         occupied=CellProbabilities(
             cells, static * _coverage(normals, off_plane / resolution, prominence), _UNSEEN
         ),
-        learned=_learned(surface, shares, classes),
+        learned=_learned(surface, trust, shares, classes),
     )
 
 
@@ -112,15 +114,12 @@ def look_numbers(recording: Recording, seconds: float) -> NDArray[np.int64]:
 def _likelihood(
     recording: Recording,
     T_map_sensor: Float,
-    surface: Surface,
-    options: DwellOptions,
+    dwell: Dwell,
+    seconds: float,
     threads: int,
-    classes: Classes,
 ) -> tuple[NDArray[np.float32], Float]:
     """(E, C) likelihood of all looks at each element relative to its best class, ln of the best."""
-    dwell = _dwell(surface, options, classes)
-    dwell.trust(_open(recording, T_map_sensor, dwell))
-    look = look_numbers(recording, options.look)
+    look = look_numbers(recording, seconds)
     for scans, beams, offset in chunks(recording, look):
         dwell.add(
             recording.points[beams],
@@ -133,9 +132,7 @@ def _likelihood(
     return dwell.likelihood()
 
 
-def _dwell(
-    surface: Surface, options: DwellOptions, classes: Classes
-) -> _core.Dwell2D | _core.Dwell3D:
+def _dwell(surface: Surface, options: DwellOptions, classes: Classes) -> Dwell:
     rho, tau = classes.grid()
     cell, scatter = surface.resolution, surface.scatter
     lengths = {
@@ -150,7 +147,7 @@ def _dwell(
     return _core.Dwell3D(surface, rho=rho, tau=tau, normals=options.normals, **chosen)
 
 
-def _open(recording: Recording, T_map_sensor: Float, dwell: _core.Dwell2D | _core.Dwell3D) -> float:
+def _open(recording: Recording, T_map_sensor: Float, dwell: Dwell) -> float:
     """How far beams without a return show that nothing is there, from 0 to 1.
 
     Where there is open space they cross nothing solid. Where most of them seem to go through walls,
@@ -196,13 +193,14 @@ def _coverage(normals: Float, off_plane: Float, prominence: Float) -> NDArray[np
     return np.asarray(np.where(normals.any(axis=1), covered, lone), dtype=np.float32)
 
 
-def _learned(surface: Surface, shares: Shares, classes: Classes) -> dict[str, object]:
+def _learned(surface: Surface, trust: float, shares: Shares, classes: Classes) -> dict[str, object]:
     n = classes.n_static
     movers = shares.classes[n:].reshape(len(classes.mover_seconds), -1) / shares.classes[n:].sum()
     static = shares.classes[:n].reshape(len(classes.static_seconds), -1) / shares.static
     return {
         "scatter": surface.scatter,
         "p_static": shares.static,
+        "no_return_trusted": round(trust, 6),
         "static_occupied": _table(classes.static_occupied, static.sum(axis=0)),
         "mover_occupied": _table(classes.mover_occupied, movers.sum(axis=0)),
         "mover_seconds": _table(classes.mover_seconds, movers.sum(axis=1)),
