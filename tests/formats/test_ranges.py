@@ -133,6 +133,9 @@ def zeros_and_hits(share, code=None):
         (0.001, None, "auto", "unusable"),
         (0.05, 81.83, "auto", "unusable"),
         (0.05, np.inf, "auto", "unusable"),
+        (0.15, np.inf, "auto", "unusable"),  # seven times as many
+        (0.4, np.inf, "auto", "max-range"),
+        (0.4, 81.83, "auto", "max-range"),
         (0.05, None, "unusable", "unusable"),
         (0.05, 81.83, "max-range", "max-range"),
     ],

@@ -14,6 +14,9 @@ from stillmap.recording.options import BEYOND, ReadOptions
 
 ZERO_BELOW = 0.02  # m: a laser's housing is larger, so such a reading stands for something else
 FREQUENT_ZEROS = 0.005  # share of zero readings that is no accident
+MORE_ZEROS = (
+    10.0  # times as many as readings of a value of its own: drivers that have both use zero
+)
 FREE_QUANTILE = 0.999  # of the hits: as far as the laser really sees
 
 _WINDOW = 0.2  # m below the largest reading in which a code may smear
@@ -143,8 +146,9 @@ def decide(
                 f"({found.how}): those readings count as hits"
             )
     no_return = ranges >= np.float32(BEYOND if threshold is None else threshold)
-    coded = found.coded or bool(np.any(ranges >= BEYOND)) or no_return.mean() > FREQUENT_ZEROS
-    zero_means, zero_how = _zero_meaning(ranges, coded, options.zero_means)
+    own = found.coded or bool(np.any(ranges >= BEYOND)) or no_return.mean() > FREQUENT_ZEROS
+    share = float(no_return.mean()) if own and ranges.size else 0.0
+    zero_means, zero_how = _zero_meaning(ranges, share, options.zero_means)
     is_hit = (ranges >= np.float32(max(options.min_range, ZERO_BELOW))) & ~no_return
     free, free_how = _free_range(ranges[is_hit], threshold, options.free_range)
     rule = RangeRule(threshold, how, zero_means, zero_how, free, free_how, options.min_range)
@@ -154,16 +158,18 @@ def decide(
 
 
 def _zero_meaning(
-    ranges: NDArray[np.float32], coded: bool, wanted: Literal["auto", "unusable", "max-range"]
+    ranges: NDArray[np.float32], own: float, wanted: Literal["auto", "unusable", "max-range"]
 ) -> tuple[Literal["unusable", "max-range"], str]:
+    """What zero stands for where a share `own` of the readings is another value for no return."""
     if wanted != "auto":
         return wanted, "given"
     share = float(np.mean((ranges >= 0.0) & (ranges < ZERO_BELOW))) if ranges.size else 0.0
     text = f"{100.0 * share:.2f} % of the readings are zero"
-    if coded:
+    if own > 0.0 and share <= MORE_ZEROS * own:
         return "unusable", f"{text}; no return has its own value"
     if share > FREQUENT_ZEROS:
-        return "max-range", f"{text} and no other value stands for no return"
+        other = "hardly any other" if own > 0.0 else "no other"
+        return "max-range", f"{text} and {other} value stands for no return"
     return "unusable", text
 
 
