@@ -235,12 +235,19 @@ class LookCollector {
     const double usable = hit ? length : length - options_.beyond;
     if (!(usable > 0.0)) return std::nullopt;
     const Vec<D> direction = way / length;
+    const Vec<D> end = hit ? beam.end : Vec<D>(beam.start + direction * usable);
+    const auto cells = (cell_of<D>(end) - cell_of<D>(beam.start)).cwiseAbs().sum();
+    crossed_.resize(static_cast<size_t>(cells) + 1);
+    // no branch on whether there is an element: nobody could foresee it
+    Crossed* next = crossed_.data();
     Walker walker(cursor_, [&](const int32_t* k, const Cell<D>& cell) {
-      if (!k || *k == kNoElement) return;
-      __builtin_prefetch(&sheet_[static_cast<size_t>(*k)], 1);
-      crossed_.push_back({*k, cell});
+      const int32_t element = k ? *k : kNoElement;
+      __builtin_prefetch(sheet_.data() + element, 1);
+      *next = {element, cell};
+      next += element != kNoElement;
     });
-    traverse<D>(beam.start, hit ? beam.end : Vec<D>(beam.start + direction * usable), walker);
+    traverse<D>(beam.start, end, walker);
+    crossed_.resize(static_cast<size_t>(next - crossed_.data()));
     const Cell<D> corner = cell_of<D>(beam.start);
     return Line{corner, (beam.start - corner.template cast<double>()).template cast<float>(),
                 direction.template cast<float>(), static_cast<float>(length), hit};
