@@ -27,33 +27,23 @@ class Chains {
         packets_((classes_.rho.size() + kWidth - 1) / kWidth),
         rho_(packets_, Packet::Zero()),  // what fills the last packet stays at zero
         heads_(members) {
-    for (size_t c = 0; c < size(); ++c)
-      rho_[c / kWidth][static_cast<int>(c % kWidth)] = static_cast<float>(classes_.rho[c]);
+    for (size_t c = 0; c < size(); ++c) at(rho_, c) = static_cast<float>(classes_.rho[c]);
     state_.reserve(members * 2 * packets_);
     for (size_t k = 0; k < members; ++k) {
       state_.insert(state_.end(), rho_.begin(), rho_.end());
-      for (const Packet& rho : rho_) state_.push_back((rho > 0.0f).cast<float>());
+      for (const Packet& rho : rho_) state_.push_back((rho > 0.0f).select(1.0f - rho, 0.0f));
     }
-    for (int gap = 0; gap < kTable; ++gap) append_correlations(table_, gap);
+    for (int gap = 0; gap < kTable; ++gap) append_transitions(table_, gap);
   }
 
   size_t size() const { return classes_.rho.size(); }
   size_t members() const { return heads_.size(); }
 
-  // One step of the filter of every class, forward in time, to a look that saw a hit, or saw
-  // through the member with a reliability.
-  void hit(size_t k, int64_t look) {
-    step(k, look, [a = detection()](Packet& p, Packet& w) {
-      w *= p * a;
-      p.setOnes();
-    });
-  }
+  // One step of the forward algorithm in every class, to a look that saw a hit, or saw through the
+  // member with a reliability.
+  void hit(size_t k, int64_t look) { step(k, look, detection(), 0.0f); }
   void seen_through(size_t k, int64_t look, float reliability) {
-    step(k, look, [missed = 1.0f - detection() * reliability](Packet& p, Packet& w) {
-      const Packet through = 1.0f - p + p * missed;
-      w *= through;
-      p *= missed / through;
-    });
+    step(k, look, 1.0f - detection() * reliability, 1.0f);
   }
 
   int64_t looks(size_t k) const { return heads_[k].looks; }
@@ -61,9 +51,13 @@ class Chains {
   // Likelihood under each class of everything else that was seen of a member, given one hit,
   // relative to the best class; returns the logarithm of the best.
   double likelihood(size_t k, float* relative) const {
-    const Packet* w = state_.data() + (2 * k + 1) * packets_;
+    const Packet* occupied = state_.data() + 2 * k * packets_;
+    const Packet* empty = occupied + packets_;
     auto value = [&](size_t c) {
-      return w[c / kWidth][static_cast<int>(c % kWidth)] / (classes_.rho[c] * classes_.detection);
+      const size_t i = c / kWidth;
+      const int within = static_cast<int>(c % kWidth);
+      return static_cast<double>(occupied[i][within] + empty[i][within]) /
+             (classes_.rho[c] * classes_.detection);
     };
     double best = 0.0;
     for (size_t c = 0; c < size(); ++c) best = std::max(best, value(c));
@@ -76,8 +70,8 @@ class Chains {
   using Packet = Eigen::Array<float, kWidth, 1>;
   static constexpr int64_t kNever = INT64_MIN;
   static constexpr int kTable = 64;  // gaps whose correlations are kept
-  static constexpr float kSmall = 1e-12f, kLeast = 1e-36f;
-  static constexpr float kSeldom = 1e-20f;  // no filter is surer that a cell is empty
+  static constexpr float kSmall = 1e-12f;
+  static constexpr float kLeast = 1e-30f;  // no state is ever impossible
 
   struct Head {
     int64_t last = kNever;  // number of the last look
@@ -87,38 +81,50 @@ class Chains {
 
   float detection() const { return static_cast<float>(classes_.detection); }
 
-  void append_correlations(std::vector<Packet>& to, int64_t gap) const {
+  static float& at(std::vector<Packet>& packets, size_t c) {
+    return packets[c / kWidth][static_cast<int>(c % kWidth)];
+  }
+
+  // For each packet: what flows in from both states together, then what stays.
+  void append_transitions(std::vector<Packet>& to, int64_t gap) const {
     for (size_t i = 0; i < packets_; ++i) {
-      to.push_back(Packet::Zero());
-      for (size_t c = i * kWidth; c < std::min(size(), (i + 1) * kWidth); ++c)
-        to.back()[static_cast<int>(c - i * kWidth)] =
-            static_cast<float>(std::exp(-static_cast<double>(gap) * seconds_ / classes_.tau[c]));
+      Packet in = Packet::Zero(), stays = Packet::Zero();
+      for (size_t c = i * kWidth; c < std::min(size(), (i + 1) * kWidth); ++c) {
+        const double kept = std::exp(-static_cast<double>(gap) * seconds_ / classes_.tau[c]);
+        in[static_cast<int>(c - i * kWidth)] = static_cast<float>(classes_.rho[c] * (1.0 - kept));
+        stays[static_cast<int>(c - i * kWidth)] = static_cast<float>(kept);
+      }
+      to.push_back(in);
+      to.push_back(stays);
     }
   }
 
-  template <class See>
-  void step(size_t k, int64_t look, See see) {
+  // if_occupied, if_empty: probability of what was seen
+  void step(size_t k, int64_t look, float if_occupied, float if_empty) {
     Head& head = heads_[k];
-    const bool first = head.last == kNever;
-    const int64_t gap = first ? 0 : look - head.last;
+    const int64_t gap = head.last == kNever ? 0 : look - head.last;
     head.last = look;
     ++head.looks;
     std::vector<Packet> computed;
-    const Packet* correlation = table_.data() + static_cast<size_t>(gap) * packets_;
+    const Packet* transition = table_.data() + static_cast<size_t>(gap) * 2 * packets_;
     if (gap >= kTable) {
-      append_correlations(computed, gap);
-      correlation = computed.data();
+      append_transitions(computed, gap);
+      transition = computed.data();
     }
-    Packet* p = state_.data() + k * 2 * packets_;
-    Packet* w = p + packets_;
-    float best = 0.0f;
+    Packet* occupied = state_.data() + k * 2 * packets_;
+    Packet* empty = occupied + packets_;
+    Packet most = Packet::Zero();
     for (size_t i = 0; i < packets_; ++i) {
-      p[i] = (rho_[i] + (p[i] - rho_[i]) * correlation[i]).max(kSeldom);
-      see(p[i], w[i]);
-      best = std::max(best, w[i].maxCoeff());
+      const Packet both = occupied[i] + empty[i];
+      const Packet before =
+          (transition[2 * i] * both + transition[2 * i + 1] * occupied[i]).max(kLeast);
+      occupied[i] = before * if_occupied;
+      empty[i] = (both - before).max(0.0f) * if_empty;
+      most = most.max(occupied[i] + empty[i]);
     }
+    const float best = most.maxCoeff();
     if (best >= kSmall) return;
-    for (size_t i = 0; i < packets_; ++i) w[i] = (w[i] / best).max(kLeast);
+    for (size_t i = 0; i < 2 * packets_; ++i) occupied[i] = (occupied[i] / best).max(kLeast);
     head.log_scale += std::log(best);
   }
 
@@ -127,8 +133,8 @@ class Chains {
   size_t packets_;
   std::vector<Packet> rho_;
   std::vector<Head> heads_;
-  std::vector<Packet> state_;  // (members, 2, packets): occupied now, likelihood so far
-  std::vector<Packet> table_;  // (gaps, packets)
+  std::vector<Packet> state_;  // (members, 2, packets): P(all looks so far, occupied or empty)
+  std::vector<Packet> table_;  // (gaps, packets, 2)
 };
 
 }  // namespace stillmap
