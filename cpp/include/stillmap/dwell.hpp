@@ -27,6 +27,7 @@ class Dwell {
       : surface_(checked(surface)),
         options_(options),
         tables_(options.lateral),
+        neighbours_(surface, options.reach),
         chains_(surface.size(), std::move(classes), options.seconds) {}
 
   size_t classes() const { return chains_.size(); }
@@ -34,7 +35,7 @@ class Dwell {
 
   // Beams without a return, and those of them that cross something solid.
   Lost lost(const Scans<D>& scans) const {
-    return LookCollector<D>(surface_, options_, tables_).lost(scans);
+    return LookCollector<D>(surface_, neighbours_, options_, tables_).lost(scans);
   }
   // How far to trust them beyond the first solid element, from now on.
   void trust(double open) { options_.open = open; }
@@ -56,7 +57,8 @@ class Dwell {
                                         std::max<size_t>(looks, 1));
     std::vector<std::unique_ptr<LookCollector<D>>> collectors;
     for (size_t i = 0; i < n; ++i)
-      collectors.push_back(std::make_unique<LookCollector<D>>(surface_, options_, tables_));
+      collectors.push_back(
+          std::make_unique<LookCollector<D>>(surface_, neighbours_, options_, tables_));
     std::vector<Seen> seen(kWindow);
     for (size_t from = 0; from < looks; from += kWindow) {
       const size_t to = std::min(from + kWindow, looks);
@@ -117,6 +119,7 @@ class Dwell {
   const Surface<D>& surface_;
   LookOptions options_;
   MeetingTables tables_;
+  Neighbours<D> neighbours_;
   Chains chains_;
   int64_t newest_ = std::numeric_limits<int64_t>::min();
 };

@@ -80,12 +80,44 @@ class MeetingTables {
   std::vector<float> cdf_, round_;
 };
 
+// The elements near each, by the distance of their means: pose and range noise move end points
+// about, so that a hit of one is a hit of all.
+template <int D>
+class Neighbours {
+ public:
+  Neighbours(const Surface<D>& surface, double reach) {
+    const int radius = static_cast<int>(std::ceil(reach));
+    Cursor<const Surface<D>> cursor(surface);
+    for (size_t i = 0; i < surface.size(); ++i) {
+      const auto from = static_cast<int32_t>(i);
+      for_each_near<D>(surface.cell(from), radius, [&](const Cell<D>& cell) {
+        const auto* block = cursor.block(cell);
+        if (!block) return;
+        const int32_t k = block->counts[static_cast<size_t>(Surface<D>::local_of(cell))];
+        if (k == kNoElement || k == from) return;
+        const Vec<D> apart = surface.element(k).mean - surface.element(from).mean;
+        if (apart.squaredNorm() <= reach * reach) near_.push_back(k);
+      });
+      begin_.push_back(near_.size());
+    }
+  }
+
+  const int32_t* begin(int32_t k) const { return near_.data() + begin_[static_cast<size_t>(k)]; }
+  const int32_t* end(int32_t k) const { return near_.data() + begin_[static_cast<size_t>(k) + 1]; }
+
+ private:
+  std::vector<int32_t> near_;
+  std::vector<size_t> begin_{0};
+};
+
 // Collects the beams of one look.
 template <int D>
 class LookCollector {
  public:
-  LookCollector(const Surface<D>& surface, const LookOptions& options, const MeetingTables& tables)
+  LookCollector(const Surface<D>& surface, const Neighbours<D>& neighbours,
+                const LookOptions& options, const MeetingTables& tables)
       : surface_(surface),
+        neighbours_(neighbours),
         options_(options),
         margin_(static_cast<float>(options.margin)),
         tables_(tables),
@@ -292,20 +324,13 @@ class LookCollector {
     return tables_(half, std::sqrt(aside_squared));
   }
 
-  // Elements near one that was struck are struck: pose and range noise move end points about.
   void spread_hits() {
-    const int radius = static_cast<int>(std::ceil(options_.reach));
-    const double limit = options_.reach * options_.reach;
-    for (const int32_t from : struck_) {
-      const Vec<D>& mean = surface_.element(from).mean;
-      for_each_near<D>(surface_.cell(from), radius, [&](const Cell<D>& cell) {
-        const auto* k = at(cell);
-        if (k && (surface_.element(*k).mean - mean).squaredNorm() <= limit) strike(*k);
-      });
-    }
+    for (const int32_t from : struck_)
+      for (const int32_t* k = neighbours_.begin(from); k != neighbours_.end(from); ++k) strike(*k);
   }
 
   const Surface<D>& surface_;
+  const Neighbours<D>& neighbours_;
   LookOptions options_;
   float margin_;
   const MeetingTables& tables_;
