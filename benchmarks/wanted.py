@@ -119,14 +119,15 @@ def _against(want: Wanted, worlds: Sequence[Sequence[Row]]) -> list[str]:
         column.title,
         str(len(means)),
         format(mean, column.form),
-        *_judged(column, mean, want.mean),
+        *judged(column, mean, want.mean),
         format(worst, column.form),
-        *_judged(column, worst, want.worst),
+        *judged(column, worst, want.worst),
         format(worst_run, column.form),
     ]
 
 
-def _judged(column: Column, value: float, limit: float | None) -> list[str]:
+def judged(column: Column, value: float, limit: float | None) -> list[str]:
+    """The limit and whether it is met; nothing where there is none."""
     if limit is None:
         return ["", ""]
     met = value >= limit if column.more_is_better else value <= limit
