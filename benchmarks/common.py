@@ -145,6 +145,8 @@ def _by_mover(p_static: NDArray[np.floating], run: Prepared) -> Scores:
         "ap_no_doors": without.average_precision,
         "f1_no_doors": without.f1,
         "brier_no_doors": without.brier,
+        "ece_no_doors": without.ece,
+        "ece_unsure_no_doors": without.ece_unsure,
     }
 
 

@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 from calibration import looks_of
@@ -25,6 +27,27 @@ def test_true_labels_at_true_poses_score_full_marks(run: Prepared) -> None:
     assert found["ate"] == pytest.approx(0.0, abs=1e-9)
     assert 0.7 < found["walls"] < 1.0  # people hide some for as long as this takes
     assert found["called_dynamic"] == found["dynamic"] > 0.01
+
+
+def test_what_ended_on_doors_is_left_out_of_the_scores_without_them(run: Prepared) -> None:
+    recording, truth = run.simulation.recording, run.simulation.truth
+    kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
+    door = kinds == "door"
+    assert np.count_nonzero(door) > 100
+    doors_unsure = np.where(door, 0.9, truth.static).astype(np.float32)
+    people_unsure = np.where(kinds == "person", 0.9, truth.static).astype(np.float32)
+    grid = counts(recording, recording.points, recording.hit, people_unsure, truth.T_world_base)
+    scored = [
+        scores(labels, truth.T_world_base, em.occupancy_map(grid), run)
+        for labels in (doors_unsure, people_unsure)
+    ]
+    assert scored[0]["f1_no_doors"] == scored[0]["ap_no_doors"] == 1.0
+    assert scored[0]["brier_no_doors"] == scored[0]["ece_no_doors"] == 0.0
+    assert math.isnan(scored[0]["ece_unsure_no_doors"])  # no beam left to be unsure of
+    assert min(scored[0]["brier"], scored[0]["ece"], scored[0]["ece_unsure"]) > 0.0
+    for key in ("brier", "ece"):
+        assert scored[1][f"{key}_no_doors"] > scored[1][key] > 0.0  # the same, of fewer beams
+    assert scored[1]["ece_unsure_no_doors"] == scored[1]["ece_unsure"] == pytest.approx(0.9)
 
 
 def test_without_people_only_what_they_hid_differs(run: Prepared) -> None:
