@@ -1,0 +1,117 @@
+"""What each part of the default estimator brings: labels without it, at the same poses.
+
+python benchmarks/ablation.py [--cases NAME|GROUP ...] [--seeds tuning|reporting] [--n-seeds 1]
+    [--set section.key=value ...] [--true-poses] [--processes 2]
+
+Poses are those of the whole estimator's result, so that only the E-step differs.
+"""
+
+import argparse
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from cases import EMPTY, POPULATED, STOPS, Case, chosen
+from common import add_arguments, add_seed_arguments, built, options_of, outcomes, seeds_of
+from prepared import RESOLUTION
+from tables import markdown
+
+from stillmap.em import EmOptions, dwell
+from stillmap.em.dwell import CLASSES, Classes
+from stillmap.evaluation.labels import LabelScores, label_scores
+from stillmap.simulation import simulate
+
+_NONE = 1e-6  # scatters: as good as none; half a cell remains where noise is not the reason
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Options and classes that differ from the whole."""
+
+    without: str
+    dwell: dict[str, float]
+    classes: Classes = CLASSES
+
+    def options(self, options: EmOptions) -> EmOptions:
+        changed = dataclasses.replace(options.dwell, **self.dwell)  # type: ignore[arg-type]
+        return dataclasses.replace(options, dwell=changed)
+
+
+VARIANTS = (
+    Variant("nothing: the whole", {}),
+    Variant("surfaces: every element is round", {"normals": False}),
+    Variant("trust beside the beam: 3 scatters", {"lateral": 3.0}),
+    Variant("room behind the surface", {"margin": _NONE}),
+    Variant("hits of neighbours", {"reach": _NONE}),
+    Variant("looks: every scan counts for itself", {"look": 0.01}),
+    Variant("people who stay: tau 0.5 s only", {}, Classes(mover_seconds=(0.5,))),
+    Variant("crowded places: rho 0.01 only", {}, Classes(mover_occupied=(0.01,))),
+    Variant("walls that are missed: rho 0.998 only", {}, Classes(static_occupied=(0.998,))),
+    Variant("a share that is missed for seconds only", {}, Classes(static_seconds=(1.0,))),
+)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One simulated run."""
+
+    case: Case
+    seed: int
+    settings: tuple[str, ...]
+    true_poses: bool
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_arguments(p, ["stillmap"])
+    add_seed_arguments(p)
+    p.add_argument("--cases", nargs="+", default=[POPULATED, STOPS, EMPTY], help="names or groups")
+    p.add_argument("--true-poses", action="store_true")
+    args = p.parse_args()
+    pairs = itertools.product(chosen(args.cases), seeds_of(args))
+    jobs = [Job(*pair, tuple(args.set), args.true_poses) for pair in pairs]
+    print(table([scores for _, scores in outcomes(scores_of, jobs, args.processes)]))
+
+
+def scores_of(job: Job) -> list[LabelScores]:
+    """Of each variant, in the order of VARIANTS; beams on doors are left out."""
+    sim = simulate(job.case.build(), job.seed)
+    recording, truth = sim.recording, sim.truth
+    options = options_of("stillmap", job.settings)
+    poses = truth.T_world_base if job.true_poses else built(recording, options)[0].poses
+    kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
+    scored = recording.hit & (kinds != "door")
+    found = (
+        dwell.e_step(recording, poses, RESOLUTION, v.options(options.em), 1, v.classes)
+        for v in VARIANTS
+    )
+    return [label_scores(e.p_static, truth.static, scored) for e in found]
+
+
+def table(runs: Sequence[Sequence[LabelScores]]) -> str:
+    """Means over runs with movers, the worst F1, and what is called dynamic where nothing moves."""
+    lines = []
+    for variant, of_runs in zip(VARIANTS, zip(*runs, strict=True), strict=True):
+        moving = [s for s in of_runs if s.dynamic]
+        still = [s.share_called_dynamic for s in of_runs if not s.dynamic]
+        names = ("f1", "average_precision", "brier", "log_loss", "ece_unsure")
+        means = [float(np.mean([getattr(s, name) for s in moving])) for name in names]
+        lines.append(
+            [
+                variant.without,
+                f"{means[0]:.4f} ({min(s.f1 for s in moving):.4f})",
+                *(f"{mean:.4f}" for mean in means[1:4]),
+                f"{means[4]:.3f}",
+                f"{100 * max(still):.3f} %" if still else "-",
+            ]
+        )
+    header = ["without", "F1 (worst)", "AP", "Brier", "log loss", "ECE unsure"]
+    return markdown([*header, "called dynamic where nothing moves, worst"], lines)
+
+
+if __name__ == "__main__":
+    main()
