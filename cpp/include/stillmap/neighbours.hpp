@@ -1,0 +1,41 @@
+// Which elements of a surface lie near each other.
+#pragma once
+
+#include <cmath>
+#include <vector>
+
+#include "stillmap/surface.hpp"
+
+namespace stillmap {
+
+// The elements near each, by the distance of their means: pose and range noise move end points
+// about, so that a hit of one is a hit of all.
+template <int D>
+class Neighbours {
+ public:
+  Neighbours(const Surface<D>& surface, double reach) {
+    const int radius = static_cast<int>(std::ceil(reach));
+    Cursor<const Surface<D>> cursor(surface);
+    for (size_t i = 0; i < surface.size(); ++i) {
+      const auto from = static_cast<int32_t>(i);
+      for_each_near<D>(surface.cell(from), radius, [&](const Cell<D>& cell) {
+        const auto* block = cursor.block(cell);
+        if (!block) return;
+        const int32_t k = block->counts[static_cast<size_t>(Surface<D>::local_of(cell))];
+        if (k == kNoElement || k == from) return;
+        const Vec<D> apart = surface.element(k).mean - surface.element(from).mean;
+        if (apart.squaredNorm() <= reach * reach) near_.push_back(k);
+      });
+      begin_.push_back(near_.size());
+    }
+  }
+
+  const int32_t* begin(int32_t k) const { return near_.data() + begin_[static_cast<size_t>(k)]; }
+  const int32_t* end(int32_t k) const { return near_.data() + begin_[static_cast<size_t>(k) + 1]; }
+
+ private:
+  std::vector<int32_t> near_;
+  std::vector<size_t> begin_{0};
+};
+
+}  // namespace stillmap
