@@ -81,10 +81,8 @@ def e_step(
     cells, _, normals, off_plane, prominence, _ = surface.elements()
     shares = fit_shares(likelihood, classes.n_static, options.prior)
     static = posterior_static(likelihood, shares.classes, classes.n_static)
-    element = _elements_of(recording, T_map_sensor, surface, threads)
-    found = np.append(static, np.float32(shares.static))  # -1: no element
     return Expectations(
-        p_static=per_beam(recording, found[element], shares.static),
+        p_static=_of_beams(recording, T_map_sensor, surface, static, shares.static, threads),
         likelihood=_bound(likelihood, log_best, shares),
         occupied=CellProbabilities(
             cells, static * _coverage(normals, off_plane / resolution, prominence), _UNSEEN
@@ -162,15 +160,22 @@ def _open(recording: Recording, T_map_sensor: Float, dwell: Dwell) -> float:
     return max(0.0, 1.0 - _SWALLOWED * through / lost) if lost else 0.0
 
 
-def _elements_of(
-    recording: Recording, T_map_sensor: Float, surface: Surface, threads: int
-) -> NDArray[np.int32]:
-    element = np.empty(recording.n_beams, dtype=np.int32)
+def _of_beams(
+    recording: Recording,
+    T_map_sensor: Float,
+    surface: Surface,
+    static: NDArray[np.float32],
+    prior: float,
+    threads: int,
+) -> NDArray[np.float32]:
+    """(M,) what is known (E,) of the element that each beam ended in."""
+    found = np.append(static, np.float32(prior))  # -1: no element
+    e = np.empty(recording.n_beams, dtype=np.float32)
     for scans, beams, offset in chunks(recording):
-        element[beams] = surface.elements_of(
-            recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans], threads
-        )
-    return element
+        points, hit = recording.points[beams], recording.hit[beams]
+        element = surface.elements_of(points, hit, offset, T_map_sensor[scans], threads)
+        e[beams] = per_beam(points, hit, found[element], prior)
+    return e
 
 
 def _bound(likelihood: NDArray[np.float32], log_best: Float, shares: Shares) -> Likelihood:

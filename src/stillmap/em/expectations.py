@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.recording.model import Recording
-
 
 @dataclass(frozen=True)
 class Likelihood:
@@ -55,10 +53,13 @@ class Expectations:
 
 
 def per_beam(
-    recording: Recording, values: NDArray[np.float32], prior: float
+    points: NDArray[np.float32],
+    hit: NDArray[np.bool_],
+    values: NDArray[np.float32],
+    prior: float,
 ) -> NDArray[np.float32]:
     """(M,) `values` for the hits, the prior at maximum range, NaN for unusable beams."""
-    usable = np.isfinite(recording.points).all(axis=1)
-    e = np.where(recording.hit, values, np.float32(prior)).astype(np.float32)
+    usable = np.isfinite(points).all(axis=1)
+    e = np.where(hit, values, np.float32(prior)).astype(np.float32)
     e[~usable] = np.nan
     return e

@@ -34,5 +34,5 @@ def e_step(
     cells = np.ascontiguousarray(rows[:, ::-1] + first)
     keeps = ratio[tuple(rows.T)] >= threshold
     occupied = CellProbabilities(cells, keeps.astype(np.float32), 0.0)
-    p = per_beam(recording, found.p_static, 1.0 - threshold)
+    p = per_beam(recording.points, recording.hit, found.p_static, 1.0 - threshold)
     return Expectations(p, found.likelihood, occupied)
