@@ -218,12 +218,12 @@ def estimated_by(result, estimator):
 
 def test_the_curves_are_called_what_the_estimator_made_them(result):
     default = report_html(result)
-    assert "Bound: composite log likelihood" in default
+    assert "Bound: log likelihood of the cells" in default
     assert "(5)" not in default
     for estimator in ("paper", "hit-ratio"):
         printed = report_html(estimated_by(result, estimator))
         assert "Expected log likelihood, (5)" in printed
-        assert "composite" not in printed
+        assert "of the cells" not in printed
 
 
 def test_one_iteration_makes_no_curve(result):

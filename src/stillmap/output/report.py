@@ -26,10 +26,9 @@ from stillmap.output.run_json import jsonable, skipped_count, version
 
 # titles of the two curves and the words below them, for each likelihood
 _DEFAULT = (
-    ("Expected log likelihood", "Bound: composite log likelihood"),
+    ("Expected log likelihood", "Bound: log likelihood of the cells"),
     "In nats, the kept iteration circled. Right, what the loop watches: how probable what was seen "
-    "of the cells is, every cell counted once for each beam that ended in it. Left: the same "
-    "without the entropy of what each cell holds.",
+    "of the cells is in which beams ended. Left: the same without the entropy of what each holds.",
 )
 _PRINTED = (
     ("Expected log likelihood, (5)", "Bound: with the entropy of the labels"),
