@@ -223,7 +223,7 @@ def test_the_curves_are_called_what_the_estimator_made_them(result):
     for estimator in ("paper", "hit-ratio"):
         printed = report_html(estimated_by(result, estimator))
         assert "Expected log likelihood, (5)" in printed
-        assert "of the cells" not in printed
+        assert "log likelihood of the cells" not in printed
 
 
 def test_one_iteration_makes_no_curve(result):
