@@ -1,0 +1,138 @@
+"""What `build` makes of poor recordings, of wrong arguments, and of odometry that is off."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap import se2
+from stillmap.options import replaced
+from stillmap.pipeline import Options
+from stillmap.recording.model import Recording
+
+RESOLUTION = 0.05
+
+
+ESTIMATORS = ("stillmap", "paper", "hit-ratio")
+with_any_estimator = pytest.mark.parametrize("estimator", ESTIMATORS)
+
+
+def options(estimator="stillmap", **loop):
+    chosen = {"estimator": estimator, "em": loop, "threads": 1}
+    return replaced(Options(), chosen | {"slam": {"resolution": RESOLUTION}})
+
+
+@pytest.mark.parametrize("how", ["one scan", "no hits", "all unusable", "no beams"])
+@pytest.mark.parametrize("odometry", [True, False])
+@with_any_estimator
+def test_recordings_of_next_to_nothing(short, tmp_path, how, odometry, estimator):
+    r = short.recording if odometry else short.recording.without_odometry()
+    nowhere = np.zeros(r.n_beams, bool)
+    if how == "one scan":
+        beams = r.beams_of(0)
+        r = dataclasses.replace(
+            r,
+            stamp_ns=r.stamp_ns[:1],
+            offset=r.offset[:2],
+            points=r.points[beams],
+            hit=r.hit[beams],
+            sensor=r.sensor[:1],
+            T_odom_base=None if r.T_odom_base is None else r.T_odom_base[:1],
+        )
+    elif how == "no hits":
+        r = dataclasses.replace(r, hit=nowhere)
+    elif how == "all unusable":
+        r = dataclasses.replace(r, hit=nowhere, points=np.full_like(r.points, np.nan))
+    else:
+        r = dataclasses.replace(
+            r, hit=nowhere[:0], points=r.points[:0], offset=np.zeros_like(r.offset)
+        )
+    result = stillmap.build(r, options(estimator, max_iterations=2))
+    assert result.poses.shape == (r.n_scans, 3, 3)
+    assert np.isfinite(result.poses).all()
+    assert result.p_static.shape == (r.n_beams,)
+    if how == "no hits":
+        defaults = Options().em
+        prior = 1 - defaults.hit_ratio if estimator == "hit-ratio" else defaults.prior
+        np.testing.assert_array_equal(result.p_static, np.float32(prior))
+        assert not (result.map.p_occupied > 0.2).any()  # not seen to be anything
+        assert not (result.raw_map.p_occupied > 0).any()
+    if how == "one scan":
+        assert (result.p_static[r.hit] > 0.0).all()
+        assert (result.map.p_occupied > 0.3).any()
+    if how in ("all unusable", "no beams"):
+        assert np.isnan(result.map.p_occupied).all()
+    result.save(tmp_path / "out")
+    assert np.load(tmp_path / "out/map.npz")["p_occupied"].shape == result.map.p_occupied.shape
+
+
+def test_what_cannot_be_mapped_is_refused(short):
+    r = short.recording
+    in_space = dataclasses.replace(
+        r,
+        points=np.zeros((r.n_beams, 3), np.float32),
+        T_base_sensor=np.eye(4)[None],
+        T_odom_base=None,
+    )
+    with pytest.raises(ValueError, match="2 dimensions"):
+        stillmap.build(in_space)
+    empty = Recording(
+        stamp_ns=np.zeros(0, np.int64),
+        offset=np.zeros(1, np.int64),
+        points=np.zeros((0, 2), np.float32),
+        hit=np.zeros(0, bool),
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(0, np.int32),
+        T_odom_base=None,
+    )
+    with pytest.raises(ValueError, match="at least one scan"):
+        stillmap.build(empty)
+
+
+@pytest.mark.parametrize("length", [1, 5, 7])
+def test_poses_of_another_length_are_refused(short, length):
+    poses = np.tile(np.eye(3), (length, 1, 1))
+    with pytest.raises(ValueError):  # noqa: PT011  whichever layer notices first
+        stillmap.build(short.recording, options(max_iterations=1), poses=poses)
+
+
+def test_progress_is_told(short):
+    told = []
+    stillmap.build(short.recording, options(max_iterations=2), progress=lambda *at: told.append(at))
+    T = short.recording.n_scans
+    iterations = sorted({iteration for _, iteration, _, _ in told})
+    assert iterations == list(range(1, len(iterations) + 1))
+    for iteration in iterations:
+        mapping = [at for at in told if at[0] == "mapping" and at[1] == iteration]
+        assert mapping[-1][2:] == (T, T)
+
+
+@pytest.mark.parametrize(
+    ("leap", "said"),
+    [
+        ((0.0, 0.0, np.radians(170)), "found by a wider search, the first is scan 30"),
+        ((30.0, 0.0, 0.0), "scans fit the map badly"),
+    ],
+)
+def test_a_leap_of_the_odometry_is_reported(room, leap, said):
+    # 30 m are beyond every search: the map goes on elsewhere, and that is said
+    T = room.recording.T_odom_base.copy()
+    increment = se2.inverse(T[29]) @ T[30]
+    # the motion prior widens with the leap; sure wheels that are wrong are the hard case
+    sure = {"translation_per_metre": 0.0, "rotation_per_radian": 0.0, "rotation_per_metre": 0.0}
+    sure["translation_per_radian"] = 0.0
+    T[30:] = T[29] @ se2.matrix(*leap) @ increment @ se2.inverse(T[30]) @ T[30:]
+    r = dataclasses.replace(room.recording, T_odom_base=T)
+    chosen = replaced(options(max_iterations=1), {"slam": {"motion": sure}})
+    result = stillmap.build(r, chosen)
+    assert any(said in warning for warning in result.warnings), result.warnings
+    plain = stillmap.build(room.recording, chosen).warnings
+    assert not any(said[:20] in warning for warning in plain)
+
+
+def test_missing_odometry_is_reported(short):
+    with_it = stillmap.build(short.recording, options(max_iterations=1))
+    without = stillmap.build(short.recording.without_odometry(), options(max_iterations=1))
+    assert not any("no odometry" in warning for warning in with_it.warnings)
+    assert any("no odometry" in warning for warning in without.warnings)
