@@ -5,12 +5,14 @@ python benchmarks/calibration.py [--cases populated "everyone stops"] [--methods
     [--png FILE]
 
 A look is a second in which beams passed through, or ended in, the cell in which a beam ended.
+All beams of a cell share its fate, so few cells make many beams: what a perfectly calibrated answer
+would show in the same cells stands beside what was found.
 """
 
 import argparse
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +33,7 @@ LOOKS = (1, 2, 3, 5, 9, 17, 33, 65)
 SPANS = (0, 1, 3, 10, 30, 100)  # s from the first look to the last
 RANGES = (0, 1, 2, 5, 10, 20)  # m
 FIXED = (0, 0.001, 0.01, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999)
+_DRAWS = 30  # of labels, to see what chance makes of an error
 # title, column of Beams, lower edges
 SPLITS = (
     ("looks", "looks", LOOKS),
@@ -48,6 +51,7 @@ class Beams:
     looks: NDArray[np.int32]
     span: NDArray[np.int32]
     range: Float
+    cell: NDArray[np.intp]  # in which they ended, numbered
 
     def of(self, which: NDArray[np.bool_]) -> "Beams":
         return Beams(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
@@ -79,13 +83,17 @@ def main() -> None:
     done = list(outcomes(_beams_of, jobs, args.processes))
     for method, some in grouped(done, lambda pair: pair[0].method).items():
         beams = joined([beams for _, beams in some])
+        named = [(f"{job.case.name}, {job.seed}", one) for job, one in some]
         print(f"\n## {method}: {len(some)} runs, {len(beams.p)} beams that hit something\n")
-        print("\n\n".join(_tables(beams)))
+        print("\n\n".join([*_tables(beams), *_by_run([*named, ("all", beams)])]))
         if args.png:
             _draw(beams, args.png.with_stem(f"{args.png.stem}-{method}"))
 
 
 def joined(parts: Sequence[Beams]) -> Beams:
+    """All beams; cells of different runs keep different numbers."""
+    first = np.cumsum([0, *(int(part.cell.max(initial=-1)) + 1 for part in parts)])
+    parts = [replace(part, cell=part.cell + k) for part, k in zip(parts, first, strict=False)]
     names = Beams.__dataclass_fields__
     return Beams(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
@@ -97,7 +105,9 @@ def _beams_of(job: Job) -> Beams:
     result, _ = built(recording, options_of(job.method, job.settings), poses)
     looks, span = looks_of(recording, result.poses)
     ranges = np.hypot(*recording.points.T.astype(np.float64))
-    all_beams = Beams(result.p_static.astype(np.float64), truth.static, looks, span, ranges)
+    _, cell = np.unique(_end_cells(recording, result.poses), axis=0, return_inverse=True)
+    p = result.p_static.astype(np.float64)
+    all_beams = Beams(p, truth.static, looks, span, ranges, cell.ravel())
     return all_beams.of(recording.hit & ~np.isnan(result.p_static))
 
 
@@ -214,6 +224,27 @@ def _is_unsure(p: Float) -> NDArray[np.bool_]:
 
 def _ece(beams: Beams) -> float:
     return calibration_error(beams.p, beams.static, equal_mass_bins(beams.p))
+
+
+def if_calibrated(beams: Beams, rng: np.random.Generator) -> float:
+    """Mean ECE if each cell were static, as a whole, with its mean probability."""
+    cells, cell = np.unique(beams.cell, return_inverse=True)
+    mean = np.bincount(cell, beams.p) / np.bincount(cell)
+    drawn = (rng.random((_DRAWS, len(cells))) < mean)[:, cell]
+    of_bin = equal_mass_bins(beams.p)
+    return float(np.mean([calibration_error(beams.p, static, of_bin) for static in drawn]))
+
+
+def _by_run(runs: Sequence[tuple[str, Beams]]) -> Iterator[str]:
+    yield "Unsure beams by run; what a perfectly calibrated answer would show in these cells:"
+    rng, lines = np.random.default_rng(0), []
+    for name, beams in runs:
+        unsure = beams.of(_is_unsure(beams.p))
+        if len(unsure.p):
+            counted = [str(len(unsure.p)), str(len(np.unique(unsure.cell)))]
+            found = [f"{_ece(unsure):.3f}", f"{if_calibrated(unsure, rng):.3f}"]
+            lines.append([name, *counted, *found])
+    yield markdown(["run", "unsure beams", "their cells", "ECE", "if calibrated"], lines)
 
 
 def _draw(beams: Beams, path: Path) -> None:
