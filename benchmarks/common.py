@@ -1,10 +1,10 @@
 """What benchmarks share: methods, one run's scores, command line, workers."""
 
 import argparse
-import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import Any, TypeVar
 
 import numpy as np
@@ -155,11 +155,12 @@ def outcomes(
 ) -> Iterator[tuple[Job, Outcome]]:
     """Each job with what came of it, in the order in which they are done; progress on stderr."""
     started = time.perf_counter()
-    with multiprocessing.Pool(processes) as pool:
-        waiting = pool.imap_unordered(_Numbered(work), list(enumerate(jobs)), chunksize=1)
-        for done, (index, outcome) in enumerate(waiting, start=1):
+    # a worker that dies ends the whole: a pool of multiprocessing would wait for it for ever
+    with ProcessPoolExecutor(processes) as pool:
+        waiting = {pool.submit(_named, work, job): job for job in jobs}
+        for done, future in enumerate(as_completed(waiting), start=1):
             _tell(f"{done}/{len(jobs)}, {time.perf_counter() - started:.0f} s")
-            yield jobs[index], outcome
+            yield waiting[future], future.result()
     print(f"{len(jobs)} runs, {time.perf_counter() - started:.0f} s", file=sys.stderr)
 
 
@@ -168,18 +169,12 @@ def _tell(progress: str) -> None:
         print(progress, end="\r", file=sys.stderr, flush=True)
 
 
-class _Numbered:
-    """Work on one of numbered jobs, as a worker gets it."""
-
-    def __init__(self, work: Callable[[Any], Any]) -> None:
-        self._work = work
-
-    def __call__(self, numbered: tuple[int, Any]) -> tuple[int, Any]:
-        index, job = numbered
-        try:
-            return index, self._work(job)
-        except Exception as error:
-            raise RuntimeError(f"{job}: {error}") from error
+def _named(work: Callable[[Job], Outcome], job: Job) -> Outcome:
+    """Work on a job; an error names it."""
+    try:
+        return work(job)
+    except Exception as error:
+        raise RuntimeError(f"{job}: {error}") from error
 
 
 def _or_nan(value: float | None) -> float:
