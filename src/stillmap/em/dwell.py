@@ -20,6 +20,7 @@ _LEAST = 0.3  # cells: no length is known better, whatever the scatter
 _UNSEEN = 0.2  # probability that a cell is occupied in which no beam ended and none passed
 _PROMINENT = 0.1  # share of the richest cell's beams that noise alone hardly brings into another
 _SWALLOWED = 4.0  # one in so many beams without a return through walls: none is trusted
+_ROWS = 1 << 14
 _EDGE = 0.15  # cells: how sharply a surface ends
 
 
@@ -179,12 +180,15 @@ def _of_beams(
 
 
 def _bound(likelihood: NDArray[np.float32], log_best: Float, shares: Shares) -> Likelihood:
-    joint = likelihood * shares.classes.astype(np.float32)
-    evidence = joint.sum(axis=1, dtype=np.float64)
-    r = joint / evidence[:, None]
-    entropy = -np.sum(r * np.log(np.maximum(r, 1e-30)), axis=1)
-    bound = float(np.sum(np.log(evidence) + log_best))
-    return Likelihood(expected=bound - float(np.sum(entropy)), bound=bound)
+    bound = entropy = 0.0
+    for first in range(0, len(likelihood), _ROWS):  # whole tables in double precision are large
+        rows = slice(first, first + _ROWS)
+        joint = likelihood[rows] * shares.classes
+        evidence = joint.sum(axis=1)
+        r = joint / evidence[:, None]
+        entropy -= float(np.sum(r * np.log(np.maximum(r, 1e-30))))
+        bound += float(np.sum(np.log(evidence) + log_best[rows]))
+    return Likelihood(expected=bound - entropy, bound=bound)
 
 
 def _coverage(normals: Float, off_plane: Float, prominence: Float) -> NDArray[np.float32]:
