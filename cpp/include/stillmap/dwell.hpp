@@ -110,7 +110,7 @@ class Dwell {
       const float reliability = seen.looks[i].seen_through;
       if (reliability == Look::kHit) {
         chains_.hit(k, look);
-      } else if (reliability != Look::kNothing) {
+      } else {
         chains_.seen_through(k, look, reliability);
       }
     }

@@ -26,9 +26,9 @@ struct Lost {
 
 // What one look says about one element.
 struct Look {
-  static constexpr float kHit = 2.0f, kNothing = 0.0f;
+  static constexpr float kHit = 2.0f;
   int32_t element;
-  float seen_through;  // probability that some beam met the element's place, or kHit, or kNothing
+  float seen_through;  // probability in (0, 1] that some beam met the element's place, or kHit
 };
 
 // What one look says, sorted by spans of elements: what is known of the elements of a span fits a

@@ -25,6 +25,7 @@ class LookCollector {
         margin_(static_cast<float>(options.margin)),
         tables_(tables),
         sheet_(surface.size()),
+        touched_(Seen::spans(surface.size())),
         cursor_(surface) {
     for (size_t k = 0; k < sheet_.size(); ++k)
       sheet_[k] = row_of(surface, static_cast<int32_t>(k), options.normals);
@@ -59,18 +60,17 @@ class LookCollector {
   // What the look says, and a clean sheet for the next one.
   void take(Seen& out) {
     spread_hits();
-    const size_t spans = Seen::spans(sheet_.size());
-    out.begin.assign(spans + 2, 0);
-    for (const int32_t k : touched_) ++out.begin[Seen::span_of(k) + 2];
-    for (size_t s = 2; s < spans + 2; ++s) out.begin[s] += out.begin[s - 1];
-    out.looks.resize(touched_.size());
-    for (const int32_t k : touched_) {
-      float& missed = sheet_[static_cast<size_t>(k)].missed;
-      out.looks[out.begin[Seen::span_of(k) + 1]++] = {k, seen_through(missed)};
-      missed = kUntouched;
+    out.looks.clear();
+    out.begin.assign(1, 0);
+    for (auto& touched : touched_) {
+      for (const int32_t k : touched) {
+        float& missed = sheet_[static_cast<size_t>(k)].missed;
+        if (missed < kLeast) out.looks.push_back({k, seen_through(missed)});
+        missed = kUntouched;
+      }
+      touched.clear();
+      out.begin.push_back(out.looks.size());
     }
-    out.begin.pop_back();
-    touched_.clear();
     struck_.clear();
   }
 
@@ -127,15 +127,14 @@ class LookCollector {
 
   static float seen_through(float missed) {
     if (missed == kStruck) return Look::kHit;
-    if (missed < kSure) return 1.0f;
-    return missed < kLeast ? 1.0f - missed : Look::kNothing;
+    return missed < kSure ? 1.0f : 1.0f - missed;
   }
 
   // Whether that is news.
   bool strike(int32_t k) {
     float& missed = sheet_[static_cast<size_t>(k)].missed;
     if (missed == kStruck) return false;
-    if (missed == kUntouched) touched_.push_back(k);
+    if (missed == kUntouched) touched_[Seen::span_of(k)].push_back(k);
     missed = kStruck;
     return true;
   }
@@ -201,7 +200,7 @@ class LookCollector {
       const float met = trust * probability_met(row, crossed.cell, *line);
       if (met <= 0.0f) continue;
       if (row.missed == kUntouched) {
-        touched_.push_back(crossed.element);
+        touched_[Seen::span_of(crossed.element)].push_back(crossed.element);
         row.missed = 1.0f;
       }
       row.missed *= 1.0f - met;
@@ -238,7 +237,8 @@ class LookCollector {
   float margin_;
   const MeetingTables& tables_;
   std::vector<Row> sheet_;
-  std::vector<int32_t> touched_, struck_;
+  std::vector<std::vector<int32_t>> touched_;  // by spans
+  std::vector<int32_t> struck_;
   std::vector<Crossed> crossed_;  // of one beam: fetched all at once, then looked at
   Cursor<const Surface<D>> cursor_;
 };
