@@ -176,7 +176,7 @@ class LookCollector {
     Crossed* next = crossed_.data();
     Walker walker(cursor_, [&](const int32_t* k, const Cell<D>& cell) {
       const int32_t element = k ? *k : kNoElement;
-      __builtin_prefetch(sheet_.data() + element, 1);
+      __builtin_prefetch(sheet_.data() + std::max(element, 0), 1);
       *next = {element, cell};
       next += element != kNoElement;
     });
