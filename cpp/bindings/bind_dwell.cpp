@@ -75,14 +75,6 @@ auto likelihoods(Dwell<D>& dwell) {
 }
 
 template <int D>
-auto look_counts(const Dwell<D>& dwell) {
-  const size_t n = dwell.surface().size();
-  std::vector<int64_t> counts(n);
-  dwell.looks(counts.data());
-  return owned(std::move(counts), {n});
-}
-
-template <int D>
 auto lost_beams(const Dwell<D>& dwell, const Points<D>& points, const Flat<bool>& hit,
                 const Flat<int64_t>& offset, const Poses<D>& poses) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
@@ -158,7 +150,6 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
           nb::arg("open"),
           "How far to trust beams without a return beyond the first solid thing in their way; all "
           "the way at first.")
-      .def("looks", &look_counts<D>, "(E,) int64: looks that saw something of each element.")
       .def("likelihood", &likelihoods<D>,
            "(E, C) float32 relative to the best class, (E,) logarithm of the best: of everything "
            "else that was seen of the cell, given that a beam ended in it.");

@@ -161,19 +161,6 @@ def test_lost_beams_are_trusted_so_far(room, swallowed, trusted):
     assert ((all_the_way - core).max() > 0.05) == (trusted < 1.0)
 
 
-def test_how_often_something_was_seen(room):
-    counts = []
-    for kernels in (_core, reference):
-        surface = room.surface(kernels)
-        dwell = room.dwell(kernels, surface, *CLASSES)
-        dwell.add(*room.beams.arguments, room.look)
-        counts.append(dwell.looks()[order(surface)])
-    assert counts[0].dtype == np.int64
-    assert np.abs(counts[0] - counts[1]).mean() < 0.05  # what is nearly nothing
-    assert counts[0].min() >= 1
-    assert counts[0].max() > 5
-
-
 def test_likelihood(room):
     rho, tau = [0.998, 0.6, 0.05, 0.15], [25.0, 5.0, 0.5, 45.0]
     found = []

@@ -46,8 +46,6 @@ class Chains {
     step(k, look, 1.0f - detection() * reliability, 1.0f);
   }
 
-  int64_t looks(size_t k) const { return heads_[k].looks; }
-
   // Likelihood under each class of everything else that was seen of a member, given one hit,
   // relative to the best class; returns the logarithm of the best.
   double likelihood(size_t k, float* relative) const {
@@ -74,8 +72,7 @@ class Chains {
   static constexpr float kLeast = 1e-30f;  // no state is ever impossible
 
   struct Head {
-    int64_t last = kNever;  // number of the last look
-    int64_t looks = 0;
+    int64_t last = kNever;   // number of the last look
     double log_scale = 0.0;  // logarithm of what the weights were divided by
   };
 
@@ -104,7 +101,6 @@ class Chains {
     Head& head = heads_[k];
     const int64_t gap = head.last == kNever ? 0 : look - head.last;
     head.last = look;
-    ++head.looks;
     std::vector<Packet> computed;
     const Packet* transition = table_.data() + static_cast<size_t>(gap) * 2 * packets_;
     if (gap >= kTable) {

@@ -85,11 +85,6 @@ class Dwell {
       log_best[k] = chains_.likelihood(k, relative + k * classes());
   }
 
-  // (elements,): looks that saw something of each.
-  void looks(int64_t* counts) const {
-    for (size_t k = 0; k < surface_.size(); ++k) counts[k] = chains_.looks(k);
-  }
-
  private:
   static constexpr size_t kWindow = 64;  // looks held at once
 

@@ -243,10 +243,6 @@ class Dwell:
         """How far to trust beams without a return beyond the first solid thing in their way."""
         self.reading = replace(self.reading, open=open_)
 
-    def looks(self) -> NDArray[np.int64]:
-        """(E,) looks that saw something of each element."""
-        return np.array([len(seen) for seen in self.seen], np.int64)
-
     def likelihood(self) -> tuple[NDArray[np.float32], Float]:
         """(E, C) relative to the best class, (E,) logarithm of the best.
 
