@@ -8,13 +8,12 @@ Poses are those of the whole estimator's result, so that only the E-step differs
 
 import argparse
 import dataclasses
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from cases import EMPTY, POPULATED, STOPS, Case, chosen
-from common import add_arguments, add_seed_arguments, built, options_of, outcomes, seeds_of
+from cases import EMPTY, POPULATED, STOPS
+from common import Run, add_arguments, add_run_arguments, built, options_of, outcomes, runs_of
 from prepared import RESOLUTION
 from tables import markdown
 
@@ -53,36 +52,23 @@ VARIANTS = (
 )
 
 
-@dataclass(frozen=True)
-class Job:
-    """One simulated run."""
-
-    case: Case
-    seed: int
-    settings: tuple[str, ...]
-    true_poses: bool
-
-
 def main() -> None:
     p = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    add_arguments(p, ["stillmap"])
-    add_seed_arguments(p)
-    p.add_argument("--cases", nargs="+", default=[POPULATED, STOPS, EMPTY], help="names or groups")
-    p.add_argument("--true-poses", action="store_true")
+    add_arguments(p, [])
+    add_run_arguments(p, [POPULATED, STOPS, EMPTY])
     args = p.parse_args()
-    pairs = itertools.product(chosen(args.cases), seeds_of(args))
-    jobs = [Job(*pair, tuple(args.set), args.true_poses) for pair in pairs]
-    print(table([scores for _, scores in outcomes(scores_of, jobs, args.processes)]))
+    runs = runs_of(args, ["stillmap"])
+    print(table([scores for _, scores in outcomes(scores_of, runs, args.processes)]))
 
 
-def scores_of(job: Job) -> list[LabelScores]:
+def scores_of(run: Run) -> list[LabelScores]:
     """Of each variant, in the order of VARIANTS; beams on doors are left out."""
-    sim = simulate(job.case.build(), job.seed)
+    sim = simulate(run.case.build(), run.seed)
     recording, truth = sim.recording, sim.truth
-    options = options_of("stillmap", job.settings)
-    poses = truth.T_world_base if job.true_poses else built(recording, options)[0].poses
+    options = options_of(run.method, run.settings)
+    poses = truth.T_world_base if run.true_poses else built(recording, options)[0].poses
     kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
     scored = recording.hit & (kinds != "door")
     found = (

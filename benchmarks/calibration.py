@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from cases import POPULATED, STOPS, Case, chosen
-from common import add_arguments, add_seed_arguments, built, options_of, outcomes, seeds_of
+from cases import POPULATED, STOPS
+from common import Run, add_arguments, add_run_arguments, built, options_of, outcomes, runs_of
 from numpy.typing import NDArray
 from prepared import RESOLUTION, counts
 from tables import grouped, markdown
@@ -57,33 +57,18 @@ class Beams:
         return Beams(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
-@dataclass(frozen=True)
-class Job:
-    """One run, mapped with one method."""
-
-    case: Case
-    seed: int
-    method: str
-    settings: tuple[str, ...]
-    true_poses: bool
-
-
 def main() -> None:
     p = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add_arguments(p, ["stillmap"])
-    add_seed_arguments(p)
-    p.add_argument("--cases", nargs="+", default=[POPULATED, STOPS], help="names or groups")
-    p.add_argument("--true-poses", action="store_true")
+    add_run_arguments(p, [POPULATED, STOPS])
     p.add_argument("--png", type=Path, help="reliability diagrams; the method's name is added")
     args = p.parse_args()
-    triples = itertools.product(chosen(args.cases), seeds_of(args), args.methods)
-    jobs = [Job(*triple, tuple(args.set), args.true_poses) for triple in triples]
-    done = list(outcomes(_beams_of, jobs, args.processes))
+    done = list(outcomes(_beams_of, runs_of(args, args.methods), args.processes))
     for method, some in grouped(done, lambda pair: pair[0].method).items():
         beams = joined([beams for _, beams in some])
-        named = [(f"{job.case.name}, {job.seed}", one) for job, one in some]
+        named = [(f"{run.case.name}, {run.seed}", one) for run, one in some]
         print(f"\n## {method}: {len(some)} runs, {len(beams.p)} beams that hit something\n")
         print("\n\n".join([*_tables(beams), *_by_run([*named, ("all", beams)])]))
         if args.png:
@@ -98,11 +83,11 @@ def joined(parts: Sequence[Beams]) -> Beams:
     return Beams(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def _beams_of(job: Job) -> Beams:
-    sim = simulate(job.case.build(), job.seed)
+def _beams_of(run: Run) -> Beams:
+    sim = simulate(run.case.build(), run.seed)
     recording, truth = sim.recording, sim.truth
-    poses = truth.T_world_base if job.true_poses else None
-    result, _ = built(recording, options_of(job.method, job.settings), poses)
+    poses = truth.T_world_base if run.true_poses else None
+    result, _ = built(recording, options_of(run.method, run.settings), poses)
     looks, span = looks_of(recording, result.poses)
     ranges = np.hypot(*recording.points.T.astype(np.float64))
     _, cell = np.unique(_end_cells(recording, result.poses), axis=0, return_inverse=True)

@@ -1,13 +1,16 @@
 """What benchmarks share: methods, one run's scores, command line, workers."""
 
 import argparse
+import itertools
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+from cases import Case, chosen
 from numpy.typing import NDArray
 from prepared import Prepared, grid_of
 from seeds import REPORTING, TUNING
@@ -34,13 +37,38 @@ Outcome = TypeVar("Outcome")
 Scores = dict[str, float]
 
 
+@dataclass(frozen=True)
+class Run:
+    """One simulated run, mapped with one method."""
+
+    case: Case
+    seed: int
+    method: str
+    settings: tuple[str, ...]
+    true_poses: bool
+
+
 def add_arguments(p: argparse.ArgumentParser, methods: Iterable[str]) -> None:
-    """What to run and how, the same for all benchmarks of estimators."""
-    p.add_argument("--methods", nargs="+", choices=METHODS, default=list(methods))
+    """What to run and how, the same for all benchmarks of estimators; no methods: no choice."""
+    if methods := list(methods):
+        p.add_argument("--methods", nargs="+", choices=METHODS, default=methods)
     p.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="on top of a method"
     )
     p.add_argument("--processes", type=int, default=2, help="runs at a time, one thread each")
+
+
+def add_run_arguments(p: argparse.ArgumentParser, cases: Iterable[str]) -> None:
+    """Which simulated runs, for `runs_of`."""
+    add_seed_arguments(p)
+    p.add_argument("--cases", nargs="+", default=list(cases), help="names or groups")
+    p.add_argument("--true-poses", action="store_true")
+
+
+def runs_of(args: argparse.Namespace, methods: Iterable[str]) -> list[Run]:
+    """Every case with every seed and method."""
+    triples = itertools.product(chosen(args.cases), seeds_of(args), methods)
+    return [Run(*triple, tuple(args.set), args.true_poses) for triple in triples]
 
 
 def add_seed_arguments(p: argparse.ArgumentParser) -> None:

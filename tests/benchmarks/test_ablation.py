@@ -3,13 +3,17 @@
 import ablation
 import numpy as np
 from cases import Case
+from common import Run
 
-SHORT = {"robot": {"scans": 60}}
+
+def run(scene):
+    case = Case("short", "populated", scene, {"robot": {"scans": 60}})
+    return Run(case, 0, "stillmap", (), true_poses=True)
 
 
 def test_variants_differ_from_the_whole():
-    job = ablation.Job(Case("short", "populated", "hall", SHORT), 0, (), true_poses=True)
-    runs = ablation.scores_of(job)
+    short = run("hall")
+    runs = ablation.scores_of(short)
     assert len(runs) == len(ablation.VARIANTS)
     assert all(s.hits == runs[0].hits and s.dynamic > 50 for s in runs)
     assert runs[0].f1 > 0.9
@@ -19,10 +23,7 @@ def test_variants_differ_from_the_whole():
 
 
 def test_table():
-    moving, still = (
-        ablation.scores_of(ablation.Job(Case("short", "x", scene, SHORT), 0, (), true_poses=True))
-        for scene in ("hall", "hall-empty")
-    )
+    moving, still = (ablation.scores_of(run(scene)) for scene in ("hall", "hall-empty"))
     lines = ablation.table([moving, still]).splitlines()
     assert len(lines) == 2 + len(ablation.VARIANTS)
     assert "nothing: the whole" in lines[2]

@@ -1,6 +1,8 @@
-"""A small populated room that every test of the loop can afford."""
+"""A small populated room that every test of the loop can afford, and what they run it with."""
 
 import functools
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ from stillmap.simulation import (
     simulate,
 )
 from stillmap.simulation.walls import box
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 
 @functools.cache

@@ -5,24 +5,12 @@ import math
 
 import numpy as np
 import pytest
+from choices import RESOLUTION, options, with_any_estimator
 
 import stillmap
 from stillmap import _core, em
-from stillmap.options import replaced
 from stillmap.output.trajectory import read_tum
-from stillmap.pipeline import Options
 from stillmap.recording.model import Recording
-
-RESOLUTION = 0.05
-
-
-ESTIMATORS = ("stillmap", "paper", "hit-ratio")
-with_any_estimator = pytest.mark.parametrize("estimator", ESTIMATORS)
-
-
-def options(estimator="stillmap", **loop):
-    chosen = {"estimator": estimator, "em": loop, "threads": 1}
-    return replaced(Options(), chosen | {"slam": {"resolution": RESOLUTION}})
 
 
 def end_cells(recording, poses, origin, resolution, beams):

@@ -4,23 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from choices import options, with_any_estimator
 
 import stillmap
 from stillmap import se2
 from stillmap.options import replaced
-from stillmap.pipeline import Options
 from stillmap.recording.model import Recording
-
-RESOLUTION = 0.05
-
-
-ESTIMATORS = ("stillmap", "paper", "hit-ratio")
-with_any_estimator = pytest.mark.parametrize("estimator", ESTIMATORS)
-
-
-def options(estimator="stillmap", **loop):
-    chosen = {"estimator": estimator, "em": loop, "threads": 1}
-    return replaced(Options(), chosen | {"slam": {"resolution": RESOLUTION}})
 
 
 @pytest.mark.parametrize("how", ["one scan", "no hits", "all unusable", "no beams"])
@@ -53,7 +42,7 @@ def test_recordings_of_next_to_nothing(short, tmp_path, how, odometry, estimator
     assert np.isfinite(result.poses).all()
     assert result.p_static.shape == (r.n_beams,)
     if how == "no hits":
-        defaults = Options().em
+        defaults = stillmap.Options().em
         prior = 1 - defaults.hit_ratio if estimator == "hit-ratio" else defaults.prior
         np.testing.assert_array_equal(result.p_static, np.float32(prior))
         assert not (result.map.p_occupied > 0.2).any()  # not seen to be anything

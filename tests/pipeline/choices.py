@@ -1,0 +1,15 @@
+"""Options and estimators that tests of the loop run with."""
+
+import pytest
+
+from stillmap.options import replaced
+from stillmap.pipeline import Options
+
+RESOLUTION = 0.05
+ESTIMATORS = ("stillmap", "paper", "hit-ratio")
+with_any_estimator = pytest.mark.parametrize("estimator", ESTIMATORS)
+
+
+def options(estimator="stillmap", **loop):
+    chosen = {"estimator": estimator, "em": loop, "threads": 1}
+    return replaced(Options(), chosen | {"slam": {"resolution": RESOLUTION}})
