@@ -3,6 +3,7 @@
 // weighted by its occupancy (15), so a cell that beams also passed through counts less.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <vector>
 
@@ -99,29 +100,40 @@ class Field {
     near.base = options_.floor + (cursor_.seen(centre) ? 0.0 : options_.unknown);
     near.gaussians.clear();
     const int radius = options_.radius;
-    Cell<D> cell = centre.array() - radius;
+    Cell<D> row = centre.array() - radius;
     while (true) {
-      add(cell, near.gaussians);
-      int d = 0;
+      add_row(row, centre[0] + radius, near.gaussians);
+      int d = 1;
       for (; d < D; ++d) {
-        if (++cell[d] <= centre[d] + radius) break;
-        cell[d] = centre[d] - radius;
+        if (++row[d] <= centre[d] + radius) break;
+        row[d] = centre[d] - radius;
       }
       if (d == D) return;
     }
   }
 
-  void add(const Cell<D>& cell, std::vector<typename Neighbourhood<D>::Gaussian>& gaussians) {
-    const auto* block = cursor_.block(cell);
-    if (!block || !block->moments) return;
-    const auto local = static_cast<size_t>(Grid<D>::local_of(cell));
-    const Counts& counts = block->counts[local];
-    if (counts.alpha <= 0) return;
+  // the cells of a row along x up to `last`, block by block
+  void add_row(Cell<D> cell, int32_t last, std::vector<typename Neighbourhood<D>::Gaussian>& to) {
+    while (cell[0] <= last) {
+      const auto* block = cursor_.block(cell);
+      const int32_t until = std::min(last, cell[0] | (Grid<D>::kEdge - 1));
+      if (block && block->moments) {
+        auto local = static_cast<size_t>(Grid<D>::local_of(cell));
+        for (Cell<D> at = cell; at[0] <= until; ++at[0], ++local)
+          if (block->counts[local].alpha > 0) to.push_back(gaussian(*block, local, at));
+      }
+      cell[0] = until + 1;
+    }
+  }
+
+  static typename Neighbourhood<D>::Gaussian gaussian(const typename Grid<D>::Block& block,
+                                                      size_t local, const Cell<D>& cell) {
+    const double per_hit = 1.0 / static_cast<double>(block.counts[local].alpha);
     Vec<D> mean;
     for (int d = 0; d < D; ++d)
-      mean[d] = cell[d] + static_cast<double>((*block->moments)[local][static_cast<size_t>(d)]) /
-                              static_cast<double>(counts.alpha);
-    gaussians.push_back({mean, Grid<D>::presence(*block, local)});
+      mean[d] =
+          cell[d] + per_hit * static_cast<double>((*block.moments)[local][static_cast<size_t>(d)]);
+    return {mean, Grid<D>::presence(block, local)};
   }
 
   Cursor<const Grid<D>> cursor_;

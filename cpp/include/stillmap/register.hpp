@@ -51,17 +51,32 @@ struct Quadratic {
   double inliers = 0.0;
 };
 
+// A symmetric matrix without its negative part.
+template <int D>
+inline Eigen::Matrix<double, D, D> without_negative(const Eigen::Matrix<double, D, D>& A) {
+  if constexpr (D == 2) {
+    const double middle = 0.5 * (A(0, 0) + A(1, 1));
+    const double half = 0.5 * (A(0, 0) - A(1, 1));
+    const double apart = std::sqrt(half * half + A(0, 1) * A(0, 1));
+    const double low = middle - apart, high = middle + apart;
+    if (low >= 0.0) return A;
+    if (high <= 0.0) return Eigen::Matrix2d::Zero();
+    return (A - low * Eigen::Matrix2d::Identity()) * (high / (high - low));
+  } else {
+    Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> eigen;
+    eigen.computeDirect(A);
+    const Vec<D> kept = eigen.eigenvalues().cwiseMax(0.0);
+    return eigen.eigenvectors() * kept.asDiagonal() * eigen.eigenvectors().transpose();
+  }
+}
+
 // The curvature of ln F across a wall and none along it: sigma^-2 minus the spread of the means,
 // without its negative part.
 template <int D>
 inline Eigen::Matrix<double, D, D> curvature(const FieldValue<D>& f, double sigma) {
   Eigen::Matrix<double, D, D> A = -f.spread;
   A.diagonal().array() += 1.0 / (sigma * sigma);
-  if (A.llt().info() == Eigen::Success) return A;  // the usual case: nothing negative
-  Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> eigen;
-  eigen.computeDirect(A);
-  const Vec<D> kept = eigen.eigenvalues().cwiseMax(0.0);
-  return eigen.eigenvectors() * kept.asDiagonal() * eigen.eigenvectors().transpose();
+  return without_negative<D>(A);
 }
 
 template <int D>
