@@ -1,6 +1,7 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "stillmap/beams.hpp"
+#include "stillmap/fill.hpp"
 
 namespace stillmap::border {
 namespace {
@@ -12,6 +13,18 @@ void add(Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit, const Fl
   const float* weights = per_beam(e, points.shape(0), "e");
   nb::gil_scoped_release released;
   add_beams<D>(grid, scans, weights, remove ? -1 : 1, threads);
+}
+
+template <int D>
+void fill(Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit, const Flat<float>& e,
+          const Flat<int64_t>& offset, const Poses<D>& poses, double gap, double tolerance,
+          double growth, bool remove) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  const float* weights = per_beam(e, points.shape(0), "e");
+  require(gap >= 0.0 && tolerance >= 0.0 && growth >= 0.0,
+          "gap, tolerance, growth: expected numbers that are not negative");
+  nb::gil_scoped_release released;
+  Fill<D>(grid, scans, weights, remove ? -1 : 1, {gap, tolerance, growth}).add();
 }
 
 template <int D>
@@ -54,6 +67,14 @@ void bind(nb::module_& m) {
         nb::arg("remove") = false,
         "Adds the sums alpha, beta of (10) of all beams to the grid; e (M,) float32. With remove "
         "it subtracts what was added before, to the bit.");
+  m.def("fill_surfaces", &fill<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("gap"), nb::arg("tolerance"),
+        nb::arg("growth"), nb::arg("remove") = false,
+        "Adds end points a cell apart, with the smaller e of the two, between those of "
+        "neighbouring beams up to `gap` metres apart that go straight on, within `tolerance` "
+        "metres, from a third one at least 1 / `growth` of that gap away. Nothing passes through "
+        "cells for them. With remove it takes out what was added before, to the bit.");
   m.def("e_step", &expectations<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::arg("prior"), nb::arg("threads") = 1,

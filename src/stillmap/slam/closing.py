@@ -35,6 +35,7 @@ def closed(
         keyframes.chosen(mapped.poses, options.loops.distance, options.loops.turn),
         options.resolution,
         options.registration,
+        options.surface,
         options.loops,
     )
     way = chain.relations(track, options.motion)

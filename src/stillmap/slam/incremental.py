@@ -11,12 +11,15 @@ from stillmap import _core, se2
 from stillmap.options import field_with_doc
 from stillmap.recording.model import Recording
 from stillmap.slam import motion
+from stillmap.slam.local_map import LocalMap
 from stillmap.slam.loops import Closure, LoopOptions
 from stillmap.slam.motion import MotionOptions
 from stillmap.slam.registration import RegistrationOptions, register
-from stillmap.slam.scans import hits, put
+from stillmap.slam.scans import SurfaceOptions, hits
 
 Float = NDArray[np.float64]
+
+_LATELY = 0.1  # weight of one scan in what the map usually explains
 
 
 @dataclass(frozen=True)
@@ -24,13 +27,19 @@ class SlamOptions:
     """The M-step over poses and map."""
 
     resolution: float = field_with_doc(0.05, "m, edge of a map cell")
+    spacing: float = field_with_doc(
+        0.2, "m, rad or 5 s between scans that later ones are registered against"
+    )
     motion: MotionOptions = field(default=MotionOptions())
     registration: RegistrationOptions = field(default=RegistrationOptions())
+    surface: SurfaceOptions = field(default=SurfaceOptions())
     loops: LoopOptions = field(default=LoopOptions())
 
     def __post_init__(self) -> None:
         if not 0.005 <= self.resolution <= 10.0:
             raise ValueError("'slam.resolution' wants 0.005 to 10 metres")
+        if not 0.0 <= self.spacing <= 100.0:
+            raise ValueError("'slam.spacing' wants 0 to 100 metres")
 
 
 @dataclass(frozen=True)
@@ -45,6 +54,7 @@ class Mapped:
         explained: (T,) share of each scan's beams that the map so far explained; the map of all
             others where poses were swept only.
         widened: indices of the scans that a wider search had to find.
+        disagreeing: indices of the scans where odometry was disbelieved.
         loops: attempts at closing loops, accepted or refused.
     """
 
@@ -53,6 +63,7 @@ class Mapped:
     grid: _core.Grid2D
     explained: Float
     widened: list[int]
+    disagreeing: list[int] = field(default_factory=list)
     loops: list[Closure] = field(default_factory=list)
 
     def without_grid(self) -> "Mapped":
@@ -67,7 +78,10 @@ def build(
     progress: Callable[[int, int], None],
     memory: float = np.inf,
 ) -> Mapped:
-    """Incremental maximum likelihood: register each scan (9), then add it to the map (10).
+    """Incremental maximum likelihood: register each scan (9), then add it to the map so far (10).
+
+    The grid that comes back is empty: the map so far has no beams without a return, and of scans
+    that show the same only one.
 
     Args:
         recording: 2D.
@@ -78,35 +92,41 @@ def build(
     """
     T = recording.n_scans
     grid = _core.Grid2D(options.resolution, options.registration.approach)
+    so_far = LocalMap(grid, recording, e, options.spacing, options.surface)
     poses = np.tile(np.eye(3), (T, 1, 1))
-    covariance = np.zeros((T, 3, 3))
-    explained = np.ones(T)
-    widened = []
-    travelled = np.zeros(T)
-    oldest = 0
-    for t in range(T):
-        if t > 0:
-            prior = _motion_prior(recording, poses, t, options.motion)
-            found = register(grid, *hits(recording, e, t), prior, options.registration)
-            poses[t], covariance[t] = found.T_map_base, found.covariance
-            explained[t] = found.explained
-            if found.widened:
-                widened.append(t)
-        put(grid, recording, e, t, poses[t])
-        if t > 0:
-            travelled[t] = travelled[t - 1] + np.linalg.norm(poses[t, :2, 2] - poses[t - 1, :2, 2])
-        while travelled[oldest] < travelled[t] - memory:
-            put(grid, recording, e, oldest, poses[oldest], remove=True)
-            oldest += 1
+    covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
+    widened, disagreeing = list[int](), list[int]()
+    steadiness = motion.unknown_steadiness(options.motion)
+    seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns))) if T > 1 else 0.0
+    travelled, usual = 0.0, 1.0
+    so_far.add(0, poses[0], 0.0)
+    for t in range(1, T):
+        prior = _motion_prior(recording, poses, t, steadiness, options.motion)
+        found = register(grid, *hits(recording, e, t), prior, options.registration, usual)
+        poses[t], covariance[t], explained[t] = found.T_map_base, found.covariance, found.explained
+        if found.widened:
+            widened.append(t)
+        if found.disagrees:
+            disagreeing.append(t)
+        usual += _LATELY * (found.explained - usual)
+        steadiness = steadiness.after(prior.shift_to(poses[t]), seconds, options.motion)
+        travelled += float(np.linalg.norm(poses[t, :2, 2] - poses[t - 1, :2, 2]))
+        so_far.add(t, poses[t], travelled)
+        so_far.forget(travelled - memory)
         progress(t + 1, T)
-    return Mapped(poses, covariance, grid, explained, widened)
+    nothing = _core.Grid2D(options.resolution)
+    return Mapped(poses, covariance, nothing, explained, widened, disagreeing)
 
 
 def _motion_prior(
-    recording: Recording, poses: Float, t: int, options: MotionOptions
+    recording: Recording,
+    poses: Float,
+    t: int,
+    steadiness: motion.Steadiness,
+    options: MotionOptions,
 ) -> motion.MotionPrior:
     odometry = recording.T_odom_base
     if odometry is None:
-        return motion.from_constant_velocity(poses[t - 1], poses[max(t - 2, 0)], options)
+        return motion.from_constant_velocity(poses[t - 1], poses[max(t - 2, 0)], steadiness)
     increment = se2.inverse(odometry[t - 1]) @ odometry[t]
     return motion.from_odometry(poses[t - 1], increment, options)

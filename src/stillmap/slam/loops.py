@@ -14,7 +14,7 @@ from stillmap.slam import keyframes, registration
 from stillmap.slam.keyframes import Index
 from stillmap.slam.motion import MotionPrior
 from stillmap.slam.registration import RegistrationOptions
-from stillmap.slam.scans import hits, in_frame, put
+from stillmap.slam.scans import SurfaceOptions, hits, in_frame, put
 
 Float = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -145,6 +145,7 @@ class Track:
     keyframes: Index
     resolution: float
     registration: RegistrationOptions
+    surface: SurfaceOptions
     options: LoopOptions
 
 
@@ -176,7 +177,7 @@ def _local_map(track: Track, centre: float) -> _core.Grid2D:
     grid = _core.Grid2D(track.resolution, track.registration.approach)
     spacing = _DENSE * track.options.distance, _DENSE * track.options.turn
     for t in first + keyframes.chosen(track.poses[first:last], *spacing):
-        put(grid, track.recording, track.e, t, track.poses[t])
+        put(grid, track.recording, track.e, t, track.poses[t], track.surface)
     return grid
 
 

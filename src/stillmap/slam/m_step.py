@@ -10,7 +10,6 @@ from stillmap import _core, em
 from stillmap.recording.model import Recording
 from stillmap.slam import closing, incremental
 from stillmap.slam.incremental import Mapped, SlamOptions
-from stillmap.slam.loops import Closure
 from stillmap.slam.sweep import sweep
 
 Float = NDArray[np.float64]
@@ -42,32 +41,30 @@ def m_step(
         progress(recording.n_scans, recording.n_scans)
         return mapped
     if not options.loops.enabled:
-        return incremental.build(recording, e, options, progress)
+        local = incremental.build(recording, e, options, progress)
+        grid = _mapped_at(recording, e, options, local.poses, threads).grid
+        return dataclasses.replace(local, grid=grid)
     if start is not None:
-        mapped = _swept(recording, e, options, start.poses, threads)
+        mapped = _swept(recording, e, options, start, threads)
         progress(recording.n_scans, recording.n_scans)
-        return _with_history(mapped, start, start.loops)
+        return dataclasses.replace(mapped, explained=start.explained)
     local = incremental.build(recording, e, options, progress, options.loops.memory)
     poses, found = closing.closed(recording, e, options, local)
-    mapped = _swept(recording, e, options, poses, threads)
-    return _with_history(mapped, local, found)
-
-
-def _with_history(mapped: Mapped, local: Mapped, loops: list[Closure]) -> Mapped:
-    """A scan that went astray explains itself in the map of all: the map so far tells."""
-    return dataclasses.replace(
-        mapped, explained=local.explained, widened=local.widened, loops=loops
+    mapped = _swept(
+        recording, e, options, dataclasses.replace(local, poses=poses, loops=found), threads
     )
+    # a scan that went astray explains itself in the map of all: the map so far tells
+    return dataclasses.replace(mapped, explained=local.explained)
 
 
 def _swept(
-    recording: Recording, e: NDArray[np.float32], options: SlamOptions, poses: Float, threads: int
+    recording: Recording, e: NDArray[np.float32], options: SlamOptions, mapped: Mapped, threads: int
 ) -> Mapped:
-    """Poses (T, 3, 3) whose loops are closed, registered once more against all others."""
-    mapped = _mapped_at(recording, e, options, poses, threads)
+    """Poses whose loops are closed, registered once more against all others; with their map."""
     for _ in range(options.loops.sweeps):
         mapped = sweep(recording, e, options, mapped)
-    return mapped
+    grid = _mapped_at(recording, e, options, mapped.poses, threads).grid
+    return dataclasses.replace(mapped, grid=grid)
 
 
 def _mapped_at(

@@ -25,10 +25,20 @@ class MotionOptions:
     rotation_per_metre: float = field_with_doc(0.1, "rad of error per metre travelled")
     rotation_per_radian: float = field_with_doc(0.3, "rad of error per radian turned")
     without_odometry_translation: float = field_with_doc(
-        0.15, "m, error of the constant-velocity guess where there is no odometry"
+        0.5, "m, error of a guess without odometry, before anything was learned of it"
     )
     without_odometry_rotation: float = field_with_doc(
-        0.15, "rad, error of the constant-velocity guess where there is no odometry"
+        0.5, "rad, error of a guess without odometry, before anything was learned of it"
+    )
+    acceleration: float = field_with_doc(
+        2.0, "m/s^2, that may come unannounced between two scans where there is no odometry"
+    )
+    turn_acceleration: float = field_with_doc(4.0, "rad/s^2, likewise")
+    unannounced: float = field_with_doc(
+        0.15, "m and rad, how far that takes the robot until the next scan at most"
+    )
+    steady_rate: float = field_with_doc(
+        0.1, "weight of the last motion in what is known of how steady it is"
     )
 
     def __post_init__(self) -> None:
@@ -47,12 +57,25 @@ class MotionPrior:
         information: (3, 3) inverse covariance of x, y (map frame) and heading.
         sigma_translation: metres, the larger standard deviation of x, y.
         sigma_rotation: radians.
+        measured: whether odometry says so; else it is a guess.
     """
 
     T_map_base: Float
     information: Float
     sigma_translation: float
     sigma_rotation: float
+    measured: bool = False
+
+    def shift_to(self, T_map_base: Float) -> Float:
+        """(3,) x, y in metres and heading in radians from the mean to a pose (3, 3)."""
+        d = se2.parameters(T_map_base) - se2.parameters(self.T_map_base)
+        d[2] = se2.wrap(d[2])
+        return d
+
+    def penalty(self, T_map_base: Float) -> float:
+        """-ln of its density at a pose (3, 3), but for a constant."""
+        d = self.shift_to(T_map_base)
+        return 0.5 * float(d @ self.information @ d)
 
 
 def from_odometry(T_map_base: Float, increment: Float, options: MotionOptions) -> MotionPrior:
@@ -69,19 +92,53 @@ def from_odometry(T_map_base: Float, increment: Float, options: MotionOptions) -
         + options.rotation_per_metre * distance
         + options.rotation_per_radian * turn
     )
-    return _prior(T_map_base @ increment, sigma_xy, sigma_theta)
+    return _prior(T_map_base @ increment, sigma_xy, sigma_theta, measured=True)
+
+
+@dataclass(frozen=True)
+class Steadiness:
+    """How far guesses without odometry were off of late.
+
+    Attributes:
+        translation: metres, standard deviation along x and y.
+        rotation: radians.
+    """
+
+    translation: float
+    rotation: float
+
+    def after(self, d: Float, seconds: float, options: MotionOptions) -> "Steadiness":
+        """What is known of it once a guess was off by (3,) metres, metres, radians.
+
+        Args:
+            d: by how much the guess was off.
+            seconds: between scans.
+            options: see MotionOptions.
+        """
+        kept, new = 1.0 - options.steady_rate, options.steady_rate
+        translation = np.sqrt(kept * self.translation**2 + new * 0.5 * (d[0] ** 2 + d[1] ** 2))
+        rotation = np.sqrt(kept * self.rotation**2 + new * d[2] ** 2)
+        return Steadiness(
+            max(float(translation), _unannounced(options.acceleration, seconds, options)),
+            max(float(rotation), _unannounced(options.turn_acceleration, seconds, options)),
+        )
+
+
+def _unannounced(acceleration: float, seconds: float, options: MotionOptions) -> float:
+    return min(max(0.5 * acceleration * seconds**2, options.translation_floor), options.unannounced)
+
+
+def unknown_steadiness(options: MotionOptions) -> Steadiness:
+    """Before anything moved."""
+    return Steadiness(options.without_odometry_translation, options.without_odometry_rotation)
 
 
 def from_constant_velocity(
-    T_map_base: Float, T_map_base_before: Float, options: MotionOptions
+    T_map_base: Float, T_map_base_before: Float, steadiness: Steadiness
 ) -> MotionPrior:
     """The prior without odometry: the last motion once more."""
     increment = se2.inverse(T_map_base_before) @ T_map_base
-    return _prior(
-        T_map_base @ increment,
-        options.without_odometry_translation,
-        options.without_odometry_rotation,
-    )
+    return _prior(T_map_base @ increment, steadiness.translation, steadiness.rotation)
 
 
 def from_increment(
@@ -90,11 +147,7 @@ def from_increment(
     """The prior one known or guessed increment (3, 3) from a pose (3, 3)."""
     if is_odometry:
         return from_odometry(T_map_base, increment, options)
-    return _prior(
-        T_map_base @ increment,
-        options.without_odometry_translation,
-        options.without_odometry_rotation,
-    )
+    return _prior(T_map_base @ increment, options.translation_floor, options.rotation_floor)
 
 
 def combined(a: MotionPrior, b: MotionPrior) -> MotionPrior:
@@ -117,7 +170,7 @@ def widened(prior: MotionPrior, sigma_translation: float, sigma_rotation: float)
     )
 
 
-def _prior(mean: Float, sigma_xy: float, sigma_theta: float) -> MotionPrior:
+def _prior(mean: Float, sigma_xy: float, sigma_theta: float, measured: bool = False) -> MotionPrior:
     mean = se2.matrix(*se2.parameters(mean))  # a rotation again: chains of products drift away
     information = np.diag([sigma_xy**-2, sigma_xy**-2, sigma_theta**-2])
-    return MotionPrior(mean, information, sigma_xy, sigma_theta)
+    return MotionPrior(mean, information, sigma_xy, sigma_theta, measured)

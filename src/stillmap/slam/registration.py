@@ -18,7 +18,7 @@ Float = NDArray[np.float64]
 class RegistrationOptions:
     """How one scan is registered; `docs/registration.md` says what is maximised."""
 
-    sigma: float = field_with_doc(0.06, "m, width of the smoothed field around end points")
+    sigma: float = field_with_doc(0.04, "m, width of the smoothed field around end points")
     floor: float = field_with_doc(0.05, "field value of an end point the map cannot explain")
     unknown: float = field_with_doc(0.05, "what unknown space adds to it: unknown is not free")
     approach: float = field_with_doc(
@@ -29,11 +29,17 @@ class RegistrationOptions:
     window: float = field_with_doc(3.0, "standard deviations of the prior that are searched")
     search_range: float = field_with_doc(20.0, "m, beams beyond are left out of the search")
     starts: int = field_with_doc(3, "best poses of the search that are refined")
-    doubt_below: float = field_with_doc(
-        0.4, "share of beams the map explains below which a wider search is tried"
+    near: float = field_with_doc(
+        0.9, "of the usual share explained: then what lies downhill of odometry is taken"
     )
-    accept_above: float = field_with_doc(
-        0.6, "share it must then explain: a wide search also finds look-alikes"
+    doubt_below: float = field_with_doc(
+        0.7, "of the usual share explained, below which a wider search is tried"
+    )
+    lies: float = field_with_doc(
+        10.0, "nats by which a scan must fit better elsewhere before odometry is disbelieved"
+    )
+    disagree: float = field_with_doc(
+        3.0, "standard deviations off odometry from where on it says no more where a scan is"
     )
     doubt_translation: float = field_with_doc(0.5, "m, half width of that search at least")
     doubt_rotation: float = field_with_doc(0.5, "rad, half width of that search at least")
@@ -57,8 +63,10 @@ _LIMITS = (
     ("window", 0.0, 10.0),
     ("search_range", 0.1, 1000.0),
     ("starts", 1, 100),
+    ("near", 0.0, 10.0),
     ("doubt_below", 0.0, 1.0),
-    ("accept_above", 0.0, 1.0),
+    ("lies", 0.0, 1e6),
+    ("disagree", 0.1, 1e6),
     ("doubt_translation", 0.0, 5.0),
     ("doubt_rotation", 0.0, 3.2),
     ("lost_translation", 0.0, 5.0),
@@ -73,13 +81,17 @@ class Registration:
         T_map_base: (3, 3) the pose.
         covariance: (3, 3) of x, y (map frame) and heading: the inverse curvature of the cost.
         explained: weighted share of the beams that the map explains, in [0, 1].
+        misfit: nats, the cost of the beams alone.
         widened: whether a wider search than the prior asked for found the pose.
+        disagrees: whether odometry was disbelieved.
     """
 
     T_map_base: Float
     covariance: Float
     explained: float
+    misfit: float
     widened: bool = False
+    disagrees: bool = False
 
 
 def register(
@@ -88,6 +100,7 @@ def register(
     weights: NDArray[np.float32],
     prior: MotionPrior,
     options: RegistrationOptions,
+    usual: float,
 ) -> Registration:
     """The most likely pose of a scan given the map so far and the motion prior, (9).
 
@@ -97,28 +110,74 @@ def register(
         weights: (N,) e, how probable it is that each was static.
         prior: where odometry says the robot is.
         options: see RegistrationOptions.
+        usual: share of a scan that the map explained of late.
     """
+    found = _within_prior(grid, points, weights, prior, options, usual)
+    if len(points) == 0:
+        return found
+    doubtful = options.doubt_below * usual
+    if found.explained < doubtful:
+        found = _farther(grid, points, weights, prior, options, found, doubtful)
+    if prior.measured and _is_off(prior, found, options):
+        # a mean that far off is no mean: it would only draw the pose towards itself
+        looser = motion.widened(prior, *_off_by(prior, found))
+        again = search(grid, points, weights, looser, options, 0.0, 0.0, start=found.T_map_base)
+        if again.misfit <= found.misfit:
+            found = dataclasses.replace(again, widened=found.widened)
+        found = dataclasses.replace(found, disagrees=_is_off(prior, found, options))
+    return found
+
+
+def _within_prior(
+    grid: _core.Grid2D,
+    points: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    prior: MotionPrior,
+    options: RegistrationOptions,
+    usual: float,
+) -> Registration:
+    if prior.measured:
+        near = search(grid, points, weights, prior, options, 0.0, 0.0, start=prior.T_map_base)
+        if near.explained >= options.near * usual:
+            return near
     translation = options.window * prior.sigma_translation
     rotation = options.window * prior.sigma_rotation
-    found = search(grid, points, weights, prior, options, translation, rotation)
-    if found.explained >= options.doubt_below or len(points) == 0:
-        return found
+    return search(grid, points, weights, prior, options, translation, rotation)
+
+
+def _farther(
+    grid: _core.Grid2D,
+    points: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    prior: MotionPrior,
+    options: RegistrationOptions,
+    found: Registration,
+    doubtful: float,
+) -> Registration:
+    """What lies beyond the prior's window, where the scan fits much better there."""
     for least_translation, least_rotation in (
         (options.doubt_translation, options.doubt_rotation),
         (options.lost_translation, np.pi),
     ):
-        wider = search(
-            grid,
-            points,
-            weights,
-            motion.widened(prior, least_translation / 3.0, least_rotation / 3.0),
-            options,
-            max(translation, least_translation),
-            max(rotation, least_rotation),
-        )
-        if wider.explained >= options.accept_above:
-            return dataclasses.replace(wider, widened=True)
+        wide = motion.widened(prior, least_translation / 3.0, least_rotation / 3.0)
+        window = options.window * wide.sigma_translation, options.window * wide.sigma_rotation
+        wider = search(grid, points, weights, wide, options, *window)
+        if wider.misfit < found.misfit - options.lies:
+            found = dataclasses.replace(wider, widened=True)
+        if found.explained >= doubtful:
+            break
     return found
+
+
+def _off_by(prior: MotionPrior, found: Registration) -> tuple[float, float]:
+    d = prior.shift_to(found.T_map_base)
+    return float(np.hypot(d[0], d[1])), abs(float(d[2]))
+
+
+def _is_off(prior: MotionPrior, found: Registration, options: RegistrationOptions) -> bool:
+    metres, radians = _off_by(prior, found)
+    off = max(metres / prior.sigma_translation, radians / prior.sigma_rotation)
+    return off > options.disagree
 
 
 def search(
@@ -139,7 +198,7 @@ def search(
         rotation: radians, half width of the window.
         start: (3, 3) where Newton steps begin instead of searching the window.
     """
-    T, covariance, _, explained, _, _ = _core.register_beams(
+    T, covariance, cost, explained, _, _ = _core.register_beams(
         grid,
         points,
         weights,
@@ -157,7 +216,7 @@ def search(
         starts=options.starts,
         T_start=start,
     )
-    return Registration(T, covariance, explained)
+    return Registration(T, covariance, explained, cost - prior.penalty(T))
 
 
 def radius(options: RegistrationOptions, resolution: float) -> int:

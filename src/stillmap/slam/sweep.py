@@ -1,11 +1,13 @@
 """One pass over all scans: each registered against the map that all the others make."""
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import se2
+from stillmap import _core, se2
 from stillmap.recording.model import Recording
-from stillmap.slam import motion, registration
+from stillmap.slam import keyframes, motion, registration
 from stillmap.slam.incremental import Mapped, SlamOptions
 from stillmap.slam.motion import MotionPrior
 from stillmap.slam.scans import hits, put
@@ -18,34 +20,34 @@ def sweep(
 ) -> Mapped:
     """Poses, covariances and explained shares after a pass; the first pose stays.
 
-    The grid is changed in place. In the end it is what the new poses and e make, to the bit.
-
     Args:
         recording: 2D.
         e: (M,) probability that each beam was reflected by something static.
         options: see SlamOptions.
-        mapped: where to begin; its grid is what its poses and e make.
+        mapped: where to begin; its grid is not looked at.
     """
-    grid, poses = mapped.grid, mapped.poses.copy()
+    poses = mapped.poses.copy()
     T = len(poses)
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
     increments = _increments(recording, poses)
+    grid = _core.Grid2D(options.resolution, options.registration.approach)
+    kept = keyframes.chosen(poses, options.spacing, options.spacing)
+    for t in kept:
+        put(grid, recording, e, t, poses[t], options.surface)
+    is_in_map = np.zeros(T, np.bool_)
+    is_in_map[kept] = True
     for t in range(1, T):
-        put(grid, recording, e, t, poses[t], remove=True)
+        if is_in_map[t]:
+            put(grid, recording, e, t, poses[t], options.surface, remove=True)
         prior = _between_neighbours(recording, poses, increments, t, options)
         found = registration.search(
-            grid,
-            *hits(recording, e, t),
-            prior,
-            options.registration,
-            0.0,
-            0.0,
-            start=poses[t],
+            grid, *hits(recording, e, t), prior, options.registration, 0.0, 0.0, start=poses[t]
         )
         poses[t] = se2.matrix(*se2.parameters(found.T_map_base))
         covariance[t], explained[t] = found.covariance, found.explained
-        put(grid, recording, e, t, poses[t])
-    return Mapped(poses, covariance, grid, explained, mapped.widened, mapped.loops)
+        if is_in_map[t]:
+            put(grid, recording, e, t, poses[t], options.surface)
+    return dataclasses.replace(mapped, poses=poses, covariance=covariance, explained=explained)
 
 
 def _increments(recording: Recording, poses: Float) -> Float:
