@@ -9,7 +9,8 @@ from typing import Any
 
 
 class Stages:
-    """Seconds per named stage, added up over calls, and the peak memory when it last ended."""
+    """Wall clock and CPU seconds per named stage, added up over calls; the peak memory when it
+    last ended."""
 
     def __init__(self) -> None:
         self._stages: dict[str, dict[str, Any]] = {}
@@ -17,16 +18,17 @@ class Stages:
     @contextmanager
     def measure(self, name: str) -> Iterator[None]:
         """Adds the time of the block to stage `name`."""
-        started = time.perf_counter()
+        started, cpu = time.perf_counter(), time.process_time()
         try:
             yield
         finally:
-            stage = self._stages.setdefault(name, {"seconds": 0.0, "peak_memory_bytes": 0})
+            stage = self._stages.setdefault(name, {"seconds": 0.0, "cpu_seconds": 0.0})
             stage["seconds"] += time.perf_counter() - started
+            stage["cpu_seconds"] += time.process_time() - cpu  # of all threads
             stage["peak_memory_bytes"] = peak_memory_bytes()
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
-        """Stage to `seconds` and `peak_memory_bytes` (of the process, up to the stage's end)."""
+        """Stage to `seconds`, `cpu_seconds` and `peak_memory_bytes` (of the process, till then)."""
         return {name: dict(stage) for name, stage in self._stages.items()}
 
 

@@ -82,7 +82,7 @@ def test_run_json_tells_the_run(mapped):
     assert counts["hits"] + counts["max_range"] + counts["unusable"] == counts["beams"]
     assert counts["hits"] == int(np.load(mapped[0] / "beams/hit.npy").sum())
     assert {"read", "m_step", "e_step", "maps"} <= set(run["seconds"])
-    assert set(run["seconds"]) == set(run["peak_memory_bytes"])
+    assert set(run["seconds"]) == set(run["cpu_seconds"]) == set(run["peak_memory_bytes"])
 
 
 def test_progress_goes_to_stderr_as_lines_without_a_terminal(mapped):

@@ -236,8 +236,8 @@ def result():
             FakeLoop(6, 46, 0.25, "explains too little"),
         ],
         stages={
-            "read": {"seconds": 0.21, "peak_memory_bytes": 41_000_000},
-            "em": {"seconds": 7.1, "peak_memory_bytes": 96_000_000},
-            "map": {"seconds": 0.02, "peak_memory_bytes": 97_000_000},
+            "read": {"seconds": 0.21, "cpu_seconds": 0.2, "peak_memory_bytes": 41_000_000},
+            "em": {"seconds": 7.1, "cpu_seconds": 13.5, "peak_memory_bytes": 96_000_000},
+            "map": {"seconds": 0.02, "cpu_seconds": 0.02, "peak_memory_bytes": 97_000_000},
         },
     )

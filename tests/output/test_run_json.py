@@ -28,6 +28,7 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
         "converged",
         "best_iteration",
         "seconds",
+        "cpu_seconds",
         "peak_memory_bytes",
         "counts",
         "warnings",
@@ -41,6 +42,7 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
     assert run["options"]["output"] == {"map_mode": "trinary"}
     assert (run["converged"], run["best_iteration"]) == (True, 3)
     assert run["seconds"] == {"read": 0.21, "em": 7.1, "map": 0.02}
+    assert run["cpu_seconds"] == {"read": 0.2, "em": 13.5, "map": 0.02}
     assert run["peak_memory_bytes"]["em"] == 96_000_000
     assert run["warnings"] == result.warnings
     assert run["learned"] == result.learned

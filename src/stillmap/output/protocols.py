@@ -112,7 +112,7 @@ class ResultLike(Protocol):
         warnings: one sentence each.
         learned: what the estimator learned: empty, or shares, scatter and tables of shares.
         loops: attempts at closing loops, accepted or refused.
-        stages: name to `seconds` and `peak_memory_bytes`, in the order they ran.
+        stages: name to `seconds`, `cpu_seconds` and `peak_memory_bytes`, in the order they ran.
     """
 
     @property

@@ -31,9 +31,9 @@ def run_record(result: ResultLike) -> dict[str, Any]:
         "iterations": [_iteration(it) for it in result.iterations],
         "converged": result.converged,
         "best_iteration": result.best_iteration,
-        "seconds": {name: stage.get("seconds") for name, stage in result.stages.items()},
-        "peak_memory_bytes": {
-            name: stage.get("peak_memory_bytes") for name, stage in result.stages.items()
+        **{
+            key: {name: stage.get(key) for name, stage in result.stages.items()}
+            for key in ("seconds", "cpu_seconds", "peak_memory_bytes")
         },
         "counts": counts,
         "warnings": list(result.warnings),
