@@ -2,9 +2,11 @@
 
 import argparse
 import itertools
+import os
+import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -190,6 +192,19 @@ def outcomes(
             _tell(f"{done}/{len(jobs)}, {time.perf_counter() - started:.0f} s")
             yield waiting[future], future.result()
     print(f"{len(jobs)} runs, {time.perf_counter() - started:.0f} s", file=sys.stderr)
+
+
+def timed(command: Sequence[str], **how: Any) -> tuple[str, float]:
+    """What a command prints, and the CPU seconds of it and of what it starts.
+
+    Raises:
+        CalledProcessError: it did not end well.
+    """
+    before = os.times()
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, **how)
+    after = os.times()
+    cpu = after.children_user + after.children_system
+    return done.stdout, cpu - before.children_user - before.children_system
 
 
 def _tell(progress: str) -> None:

@@ -8,13 +8,13 @@ folder unless --keep names one.
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
+from common import timed
+from pairs import relations_beside
 
 
 def main() -> None:
@@ -41,21 +41,14 @@ def split(argv: list[str]) -> tuple[list[str], list[str]]:
 
 
 def row(folder: Path, log: str, out: Path, flags: list[str]) -> str:
-    command = ["map", str(folder / f"{log}.clf.gz"), "-o", str(out), "--overwrite", "--quiet"]
-    before = os.times()
-    stillmap(*command, *flags)
-    after = os.times()
-    cpu = after.children_user + after.children_system
-    cpu -= before.children_user + before.children_system
+    path = folder / f"{log}.clf.gz"
+    _, cpu = stillmap("map", str(path), "-o", str(out), "--overwrite", "--quiet", *flags)
     run = json.loads((out / "run.json").read_text())
-    relations = folder / f"{log}.relations"
-    if not relations.exists():
-        relations = folder / f"{log}.pseudo.relations"
-    trajectory = str(out / "trajectory.tum")
-    o = json.loads(stillmap("eval", "relations", trajectory, str(relations), "--json"))
+    trajectory, relations = str(out / "trajectory.tum"), str(relations_beside(path))
+    o = json.loads(stillmap("eval", "relations", trajectory, relations, "--json")[0])
     p_static, hit = (np.load(out / "beams" / f"{name}.npy") for name in ("p_static", "hit"))
     scans = run["counts"]["scans"]
-    registration = run["seconds"]["m_step"] / len(run["iterations"])
+    registration = run["cpu_seconds"]["m_step"] / len(run["iterations"])
     return (
         f"{log:10} | {scans:5} | {o['translation']['mean']:.4f} "
         f"({o['translation']['median']:.4f}, {o['translation']['max']:.3f}) | "
@@ -67,9 +60,9 @@ def row(folder: Path, log: str, out: Path, flags: list[str]) -> str:
     )
 
 
-def stillmap(*arguments: str) -> str:
-    command = [sys.executable, "-m", "stillmap", *arguments]
-    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+def stillmap(*arguments: str) -> tuple[str, float]:
+    """What a command prints, and its CPU seconds."""
+    return timed([sys.executable, "-m", "stillmap", *arguments])
 
 
 if __name__ == "__main__":

@@ -1,0 +1,75 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pairs import errors_of, known_relations, name_of, near_pairs, relations_beside, relations_of
+
+from stillmap import se2
+from stillmap.evaluation.files import read_relations
+from stillmap.simulation import scene_by_name, simulate, write_simulation
+
+
+def line(T: int) -> np.ndarray:
+    """A metre a second along x, and back."""
+    x = np.concatenate([np.arange(T), np.arange(T)[::-1]]).astype(float)
+    return se2.matrix(x, np.zeros(2 * T), np.repeat([0.0, np.pi], T))
+
+
+def test_pairs_are_near_in_space_and_anywhere_in_time() -> None:
+    positions = line(100)[:, :2, 2]
+    first, second = near_pairs(positions, np.random.default_rng(0), 3000, 5.0)
+    assert len(first) == 3000
+    assert np.all(first < second)
+    assert np.linalg.norm(positions[first] - positions[second], axis=1).max() <= 5.0
+    # half of the near scans are those of the way back
+    assert np.mean(second - first > 10) == pytest.approx(0.5, abs=0.06)
+    again = near_pairs(positions, np.random.default_rng(0), 3000, 5.0)
+    np.testing.assert_array_equal((first, second), again)
+
+
+def test_a_scan_with_no_other_near_it_is_in_no_pair() -> None:
+    positions = np.array([[0.0, 0], [1, 0], [50, 0]])
+    first, second = near_pairs(positions, np.random.default_rng(0), 50)
+    assert 0 < len(first) < 50
+    assert {*first, *second} == {0, 1}
+    assert len(near_pairs(positions[1:], np.random.default_rng(0), 50)[0]) == 0
+
+
+def test_errors_are_those_of_the_displacements() -> None:
+    truth, stamp_ns = line(50), 10**18 + np.arange(100) * 10**8
+    pairs = near_pairs(truth[:, :2, 2], np.random.default_rng(0), 200)
+    elsewhere = se2.matrix(3.0, -2.0, 1.0) @ truth
+    assert errors_of(stamp_ns, elsewhere, truth, *pairs).translation.max < 1e-9
+    poses = truth.copy()
+    poses[50:, 0, 2] += 0.25  # the way back lies off
+    errors = errors_of(stamp_ns, poses, truth, *pairs)
+    across = np.mean((pairs[0] < 50) & (pairs[1] >= 50))
+    assert (errors.used, errors.relations) == (200, 200)
+    assert errors.translation.max == pytest.approx(0.25)
+    assert errors.translation.mean == pytest.approx(0.25 * across)
+    assert errors.rotation.max < 1e-9
+
+
+def test_relations_of_a_log_lie_beside_it(tmp_path: Path) -> None:
+    log = tmp_path / "floor.3.clf.gz"
+    rows = relations_of(np.array([10**9, 2 * 10**9]), line(1), np.array([0]), np.array([1]))
+    np.savetxt(tmp_path / "floor.3.pseudo.relations", rows)
+    assert name_of(log) == "floor.3"
+    assert relations_beside(log).name == "floor.3.pseudo.relations"
+    found = known_relations(log, np.array([10**9]))
+    np.testing.assert_allclose(found, [[1, 2, 0, 0, 0, 0, 0, np.pi]], atol=1e-12)
+    np.savetxt(tmp_path / "floor.3.relations", rows)
+    assert relations_beside(log).name == "floor.3.relations"
+    np.testing.assert_array_equal(read_relations(relations_beside(log)), found)
+
+
+def test_relations_of_a_simulation_are_true(tmp_path: Path) -> None:
+    sim = simulate(scene_by_name("hall-empty", {"robot": {"scans": 30}}), 0)
+    write_simulation(sim, tmp_path / "hall")
+    relations = known_relations(tmp_path / "hall", sim.recording.stamp_ns)
+    assert len(relations) == 1000
+    times = (sim.recording.stamp_ns / 1e9).tolist()
+    k, row = 17, relations[17]
+    first, second = (int(np.argmin(np.abs(np.array(times) - row[c]))) for c in (0, 1))
+    T = se2.inverse(sim.truth.T_world_base[first]) @ sim.truth.T_world_base[second]
+    np.testing.assert_allclose(relations[k, [2, 3, 7]], se2.parameters(T), atol=1e-9)
