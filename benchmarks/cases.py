@@ -14,7 +14,8 @@ EMPTY = "empty"
 SENSORS = "sensors"
 ODOMETRY = "odometry"
 ONCE = "passed once"  # nothing in the recording shows that these cars move: in no mean
-GROUPS = (POPULATED, STOPS, EMPTY, SENSORS, ODOMETRY, ONCE)
+TRAJECTORY = "trajectory"  # hard for poses, long or both: run only where it is named
+GROUPS = (POPULATED, STOPS, EMPTY, SENSORS, ODOMETRY, ONCE, TRAJECTORY)
 
 Changes = Mapping[str, Any]
 
@@ -33,13 +34,15 @@ class Case:
 
 
 def chosen(names: Iterable[str]) -> list[Case]:
-    """The cases of these names or groups, in the catalogue's order; no name: all of them."""
+    """The cases of these names or groups, in the catalogue's order; no name: those for labels."""
     wanted = set(names)
     unknown = wanted - {case.name for case in CASES} - set(GROUPS)
     if unknown:
         known = ", ".join(case.name for case in CASES)
         raise SystemExit(f"no case {', '.join(sorted(unknown))}; cases: {known}; groups: {GROUPS}")
-    return [case for case in CASES if not wanted or wanted & {case.name, case.group}]
+    if not wanted:
+        return [case for case in CASES if case.group != TRAJECTORY]
+    return [case for case in CASES if wanted & {case.name, case.group}]
 
 
 def _crowd(people: int, shape: str = "mixed", scans: int | None = None) -> dict[str, Any]:
@@ -75,6 +78,11 @@ def scaled_odometry(factor: float, **more: float) -> dict[str, Any]:
         if name.endswith(("error", "noise"))
     }
     return {"odometry": {**scaled, **more}}
+
+
+def few_walls(people: int) -> dict[str, Any]:
+    """A hall whose laser sees hardly more than what stands about in it."""
+    return {"crowd": {"people": people}, "laser": {"max_range": 8.0}}
 
 
 _SLIPS = scaled_odometry(1.0, slip_rate=0.05)
@@ -116,4 +124,7 @@ CASES = (
     Case("office-slips", ODOMETRY, "office", _SLIPS),
     Case("warehouse-slips", ODOMETRY, "warehouse", {**_SLIPS, **_part(1200)}),
     Case("street-turn", ONCE, "street-turn"),
+    Case("hall-8m", TRAJECTORY, "hall", few_walls(20)),
+    Case("hall-8m-empty", TRAJECTORY, "hall", few_walls(0)),
+    Case("office-bad-odometry", TRAJECTORY, "office", scaled_odometry(3.0)),
 )

@@ -86,7 +86,9 @@ def _arguments() -> argparse.Namespace:
     )
     add_arguments(p, ["stillmap"])
     add_seed_arguments(p)
-    p.add_argument("--cases", nargs="+", default=[], help="names or groups; default: all")
+    p.add_argument(
+        "--cases", nargs="+", default=[], help="names or groups; default: those for labels"
+    )
     p.add_argument("--true-poses", action="store_true")
     p.add_argument("--per-iteration", action="store_true")
     p.add_argument("--json", type=Path, help="append rows to this file, one a line")

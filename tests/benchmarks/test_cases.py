@@ -1,7 +1,17 @@
 import math
 
 import pytest
-from cases import CASES, EMPTY, GROUPS, ONCE, POPULATED, STOPS, chosen, scaled_odometry
+from cases import (
+    CASES,
+    EMPTY,
+    GROUPS,
+    ONCE,
+    POPULATED,
+    STOPS,
+    TRAJECTORY,
+    chosen,
+    scaled_odometry,
+)
 
 from stillmap.simulation import OdometryOptions
 
@@ -26,11 +36,13 @@ def test_catalogue_covers_what_is_wanted() -> None:
         crowd = case.build().crowd
         if case.group == STOPS:
             assert (crowd.stopping_share, crowd.min_stop, crowd.max_stop) == (1.0, 15.0, 60.0)
-        assert (crowd.people == 0) == (case.group == EMPTY)
+        if case.group != TRAJECTORY:
+            assert (crowd.people == 0) == (case.group == EMPTY)
 
 
 def test_names_and_groups_choose_cases() -> None:
-    assert chosen([]) == list(CASES)
+    assert {case.group for case in chosen([])} == {*GROUPS} - {TRAJECTORY}
+    assert chosen(GROUPS) == list(CASES)
     assert {case.group for case in chosen([ONCE, "hall-15"])} == {ONCE, POPULATED}
     with pytest.raises(SystemExit, match="no case nowhere"):
         chosen(["nowhere"])

@@ -1,0 +1,243 @@
+"""Poses and loops in simulated worlds against the truth.
+
+python benchmarks/poses.py [--cases NAME|GROUP ...] [--seeds tuning|reporting] [--n-seeds 5]
+    [--no-odometry] [--ablation] [--set section.key=value ...] [--processes 2]
+
+Relations are the displacements between 1000 pairs of scans at most 5 m apart, whenever they were
+taken; "seen again" are those with more than 15 m of travel between the two. Drift is the error of
+the last pose seen from the first, in percent of the way. A false loop is an accepted one whose
+displacement is more than 0.5 m or 5 degrees off.
+
+Every run has a process of its own, which reads what another one simulated: memory and CPU are
+those of `stillmap.build` and of reading.
+"""
+
+import argparse
+import itertools
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cases import TRAJECTORY, Case, chosen
+from common import (
+    Scores,
+    add_arguments,
+    add_seed_arguments,
+    built,
+    options_of,
+    outcomes,
+    seeds_of,
+)
+from numpy.typing import NDArray
+from pairs import errors_of, near_pairs
+from sweep import in_fresh_process
+from tables import Column, Row, grouped, markdown
+
+import stillmap
+from stillmap import se2, slam
+from stillmap.evaluation.trajectory import absolute_errors
+from stillmap.simulation import load_truth, simulate, write_simulation
+from stillmap.stages import peak_memory_bytes
+
+Float = NDArray[np.float64]
+
+CASES = (
+    "corridor-empty",
+    "corridor-20",
+    "corridor-40",
+    "corridor-bad-odometry",
+    "hall-empty",
+    "hall-15",
+    "hall-60",
+    "office-empty",
+    "office-10",
+    "warehouse-empty",
+    "warehouse-12",
+    "street-empty",
+    "street-16",
+    TRAJECTORY,
+)
+AGAIN = 15.0  # m of travel after which a place is seen again
+FALSE_METRES = 0.5
+FALSE_DEGREES = 5.0
+
+RELATIONS = (
+    Column("translation", "relations, m: mean", ".4f"),
+    Column("translation_max", "max", ".3f"),
+    Column("again", "seen again", ".4f"),
+    Column("rotation", "deg: mean", ".3f"),
+    Column("rotation_max", "max", ".2f"),
+)
+ABSOLUTE = (Column("ate", "ATE, m", ".3f"), Column("drift", "drift, %", ".3f"))
+LOOPS = (
+    Column("accepted", "loops", ".0f"),
+    Column("refused", "refused", ".0f"),
+    Column("false", "false", ".0f"),
+)
+COST = (
+    Column("m_step", "CPU ms per scan: one M-step", ".2f"),
+    Column("cpu", "whole job", ".2f"),
+    Column("peak", "peak MB", ".0f"),
+)
+COLUMNS = (*RELATIONS, *ABSOLUTE, *LOOPS, *COST)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Options laid over the defaults."""
+
+    name: str
+    settings: tuple[str, ...] = ()
+    odometry: bool = True
+
+
+DEFAULTS = Variant("defaults")
+NO_ODOMETRY = Variant("no odometry", odometry=False)
+ABLATION = (
+    DEFAULTS,
+    Variant("no loops", ("slam.loops.enabled=false",)),
+    Variant("no e: the first M-step", ("em.max_iterations=1",)),
+    Variant("loops need no others that agree", ("slam.loops.agreeing=0",)),
+    Variant("every loop is believed", ("slam.loops.robust=100", "slam.loops.misfit=1e9")),
+    Variant("loops from single scans", ("slam.loops.view=0",)),
+    Variant("beams count up to their end", ("slam.registration.approach=0",)),
+)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One simulated run, mapped in several ways."""
+
+    case: Case
+    seed: int
+    variants: tuple[Variant, ...]
+    settings: tuple[str, ...]
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_arguments(p, [])
+    add_seed_arguments(p)
+    p.add_argument("--cases", nargs="+", default=list(CASES), help="names or groups")
+    p.add_argument("--no-odometry", action="store_true", help="also as if there was none")
+    p.add_argument("--ablation", action="store_true", help="also without parts of the M-step")
+    args = p.parse_args()
+    some = variants(args.ablation, args.no_odometry)
+    for variant in some:
+        options_of("stillmap", [*args.set, *variant.settings])  # refuses before hours have passed
+    pairs = itertools.product(chosen(args.cases), seeds_of(args))
+    jobs = [Job(*pair, some, tuple(args.set)) for pair in pairs]
+    done = sorted(outcomes(rows_of, jobs, args.processes), key=lambda pair: jobs.index(pair[0]))
+    print(report([row for _, rows in done for row in rows]))
+
+
+def variants(ablation: bool, no_odometry: bool) -> tuple[Variant, ...]:
+    return (*(ABLATION if ablation else (DEFAULTS,)), *((NO_ODOMETRY,) if no_odometry else ()))
+
+
+def rows_of(job: Job) -> list[Row]:
+    """A row of scores per variant."""
+    with tempfile.TemporaryDirectory() as work:
+        folder = Path(work, "recording")
+        in_fresh_process(write, folder, job.case, job.seed)
+        about = {"case": job.case.name, "seed": job.seed}
+        return [
+            {**about, "variant": variant.name, **in_fresh_process(scored, folder, variant, job)}
+            for variant in job.variants
+        ]
+
+
+def write(folder: Path, case: Case, seed: int) -> None:
+    """A recording folder with its truth."""
+    write_simulation(simulate(case.build(), seed), folder)
+
+
+def scored(folder: Path, variant: Variant, job: Job) -> Scores:
+    """Scores and cost of one way to map a simulated folder."""
+    options = options_of("stillmap", [*job.settings, *variant.settings])
+    recording = stillmap.read(folder, options.read)
+    if not variant.odometry:
+        recording = recording.without_odometry()
+    result, cpu = built(recording, options)
+    peak = peak_memory_bytes() / 1e6
+    m_steps = result.stages["m_step"]["cpu_seconds"]
+    truth = load_truth(folder).T_world_base
+    return {
+        **pose_scores(recording.stamp_ns, result.poses, truth),
+        **loop_scores(result.loops, truth),
+        "m_step": 1e3 * m_steps / recording.n_scans / len(result.iterations),
+        "cpu": cpu,
+        "peak": peak,
+    }
+
+
+def pose_scores(stamp_ns: NDArray[np.int64], poses: Float, truth: Float) -> Scores:
+    """Relation errors, ATE and drift of poses (T, 3, 3)."""
+    positions = truth[:, :2, 2]
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    travelled = np.concatenate([[0.0], steps.cumsum()])
+    first, second = near_pairs(positions, np.random.default_rng(0))
+    again = travelled[second] - travelled[first] > AGAIN
+    ends = np.array([0]), np.array([len(truth) - 1])
+
+    def errors(first: NDArray[np.intp], second: NDArray[np.intp]) -> Any:
+        return errors_of(stamp_ns, poses, truth, first, second)
+
+    near = errors(first, second)
+    return {
+        "translation": near.translation.mean,
+        "translation_max": near.translation.max,
+        "again": errors(first[again], second[again]).translation.mean,
+        "rotation": near.rotation.mean,
+        "rotation_max": near.rotation.max,
+        "ate": absolute_errors(poses, truth).rmse,
+        "drift": 100 * errors(*ends).translation.max / max(travelled[-1], 1e-9),
+    }
+
+
+def loop_scores(loops: Sequence[slam.Closure], truth: Float) -> Scores:
+    """How many were accepted, how many refused, and how many of the accepted are false."""
+    accepted = [loop for loop in loops if not loop.refused]
+    return {
+        "accepted": len(accepted),
+        "refused": len(loops) - len(accepted),
+        "false": sum(is_false(loop, truth) for loop in accepted),
+    }
+
+
+def is_false(loop: slam.Closure, truth: Float) -> bool:
+    true = se2.inverse(truth[loop.earlier]) @ truth[loop.later]
+    x, y, heading = se2.parameters(se2.inverse(true) @ loop.T)
+    return bool(np.hypot(x, y) > FALSE_METRES or abs(np.degrees(heading)) > FALSE_DEGREES)
+
+
+def report(rows: Sequence[Row]) -> str:
+    """By case and variant; and what the variants bring over all cases."""
+    parts = [
+        "Means over seeds, in brackets the worst.",
+        _table(rows, ("case", "variant"), lambda row: (row["case"], row["variant"])),
+    ]
+    cases, some = ({row[key] for row in rows} for key in ("case", "variant"))
+    if len(cases) > 1 and len(some) > 1:
+        over_all = _table(rows, ("all cases",), lambda row: (row["variant"],))
+        parts += ["Means over cases and seeds, in brackets the worst run.", over_all]
+    return "\n\n".join(parts)
+
+
+def _table(
+    rows: Sequence[Row], names: tuple[str, ...], key: Callable[[Row], tuple[str, ...]]
+) -> str:
+    lines = [
+        [*which, *(column.mean_and_worst(some) for column in COLUMNS)]
+        for which, some in grouped(rows, key).items()
+    ]
+    return markdown([*names, *(column.title for column in COLUMNS)], lines)
+
+
+if __name__ == "__main__":
+    main()
