@@ -40,6 +40,7 @@ import stillmap
 from stillmap import se2, slam
 from stillmap.evaluation.trajectory import absolute_errors
 from stillmap.simulation import load_truth, simulate, write_simulation
+from stillmap.slam.keyframes import travel
 from stillmap.stages import peak_memory_bytes
 
 Float = NDArray[np.float64]
@@ -163,14 +164,25 @@ def scored(folder: Path, variant: Variant, job: Job) -> Scores:
     recording = stillmap.read(folder, options.read)
     if not variant.odometry:
         recording = recording.without_odometry()
+    return scores_and_cost(recording, options, folder)
+
+
+def scores_and_cost(
+    recording: stillmap.Recording, options: stillmap.Options, folder: Path
+) -> Scores:
+    """Of the whole job on a recording whose truth lies in a folder."""
     result, cpu = built(recording, options)
-    peak = peak_memory_bytes() / 1e6
-    m_steps = result.stages["m_step"]["cpu_seconds"]
+    peak, T = peak_memory_bytes() / 1e6, recording.n_scans
+    steps = {
+        step: 1e3 * result.stages[step]["cpu_seconds"] / len(result.iterations) / T
+        for step in ("m_step", "e_step")
+    }
     truth = load_truth(folder).T_world_base
     return {
         **pose_scores(recording.stamp_ns, result.poses, truth),
         **loop_scores(result.loops, truth),
-        "m_step": 1e3 * m_steps / recording.n_scans / len(result.iterations),
+        **steps,
+        "iterations": len(result.iterations),
         "cpu": cpu,
         "peak": peak,
     }
@@ -178,9 +190,7 @@ def scored(folder: Path, variant: Variant, job: Job) -> Scores:
 
 def pose_scores(stamp_ns: NDArray[np.int64], poses: Float, truth: Float) -> Scores:
     """Relation errors, ATE and drift of poses (T, 3, 3)."""
-    positions = truth[:, :2, 2]
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    travelled = np.concatenate([[0.0], steps.cumsum()])
+    positions, travelled = truth[:, :2, 2], travel(truth)
     first, second = near_pairs(positions, np.random.default_rng(0))
     again = travelled[second] - travelled[first] > AGAIN
     ends = np.array([0]), np.array([len(truth) - 1])
@@ -197,6 +207,7 @@ def pose_scores(stamp_ns: NDArray[np.int64], poses: Float, truth: Float) -> Scor
         "rotation_max": near.rotation.max,
         "ate": absolute_errors(poses, truth).rmse,
         "drift": 100 * errors(*ends).translation.max / max(travelled[-1], 1e-9),
+        "metres": float(travelled[-1]),
     }
 
 
