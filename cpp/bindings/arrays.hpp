@@ -21,6 +21,9 @@ using Poses = nb::ndarray<const double, nb::numpy, nb::shape<-1, D + 1, D + 1>, 
 template <int D>
 using OnePose =
     nb::ndarray<const double, nb::numpy, nb::shape<D + 1, D + 1>, nb::c_contig, nb::device::cpu>;
+template <int D>
+using Cells =
+    nb::ndarray<const int64_t, nb::numpy, nb::shape<-1, D>, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Flat = nb::ndarray<const T, nb::numpy, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
@@ -51,6 +54,17 @@ Scans<D> scans_from(const Points<D>& points, const Flat<bool>& hit, const Flat<i
           "offset: expected to run from 0 to " + std::to_string(n_beams));
   for (size_t t = 0; t < n_scans; ++t) require(o[t] <= o[t + 1], "offset: must not decrease");
   return Scans<D>{points.data(), hit.data(), o, poses.data(), n_scans};
+}
+
+template <int D>
+Cell<D> cell_from(const Cells<D>& cells, size_t k) {
+  Cell<D> cell;
+  for (int d = 0; d < D; ++d) {
+    const int64_t c = cells.data()[k * D + static_cast<size_t>(d)];
+    require(std::abs(c) < Grid<D>::kMaxCell, "cells: out of range");
+    cell[d] = static_cast<int32_t>(c);
+  }
+  return cell;
 }
 
 inline const float* per_beam(const Flat<float>& values, size_t n_beams, const char* name) {

@@ -2,6 +2,7 @@
 #include "bindings.hpp"
 #include "stillmap/beams.hpp"
 #include "stillmap/fill.hpp"
+#include "stillmap/no_return.hpp"
 
 namespace stillmap::border {
 namespace {
@@ -25,6 +26,20 @@ void fill(Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit, const F
           "gap, tolerance, growth: expected numbers that are not negative");
   nb::gil_scoped_release released;
   Fill<D>(grid, scans, weights, remove ? -1 : 1, {gap, tolerance, growth}).add();
+}
+
+template <int D>
+void add_no_return(Grid<D>& grid, Grid<D>& rest, const Points<D>& points, const Flat<bool>& hit,
+                   const Flat<int64_t>& offset, const Poses<D>& poses, const Cells<D>& stops,
+                   double beyond, int threads) {
+  require(&grid != &rest && grid.resolution() == rest.resolution(),
+          "rest: expected another grid of the same resolution");
+  require(beyond >= 0.0, "beyond: expected a length in metres that is not negative");
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  std::vector<Cell<D>> cells;
+  for (size_t k = 0; k < stops.shape(0); ++k) cells.push_back(cell_from<D>(stops, k));
+  nb::gil_scoped_release released;
+  add_lost<D>(grid, rest, scans, {cells, beyond / grid.resolution()}, threads);
 }
 
 template <int D>
@@ -75,6 +90,14 @@ void bind(nb::module_& m) {
         "neighbouring beams up to `gap` metres apart that go straight on, within `tolerance` "
         "metres, from a third one at least 1 / `growth` of that gap away. Nothing passes through "
         "cells for them. With remove it takes out what was added before, to the bit.");
+  m.def("add_lost", &add_no_return<D>, nb::arg("grid"), nb::arg("rest"),
+        nb::arg("points").noconvert(), nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::arg("stops").noconvert(), nb::arg("beyond"),
+        nb::arg("threads") = 1,
+        "Adds what `add_beams` adds for beams without a return, to the bit: to the grid as far as "
+        "they are believed, the rest to another one. Fewer than three in a row are not believed; "
+        "the others up to the first of the cells stops (S, D) int64, but for the last `beyond` "
+        "metres, which may be infinite.");
   m.def("e_step", &expectations<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::arg("prior"), nb::arg("threads") = 1,

@@ -83,6 +83,14 @@ auto lost_beams(const Dwell<D>& dwell, const Points<D>& points, const Flat<bool>
   return std::make_tuple(lost.beams, lost.through_solid);
 }
 
+template <int D>
+auto solid_cells(const Dwell<D>& dwell) {
+  std::vector<int64_t> out;
+  for (const Cell<D>& cell : dwell.solid()) out.insert(out.end(), cell.data(), cell.data() + D);
+  const size_t n = out.size() / D;
+  return owned(std::move(out), {n, static_cast<size_t>(D)});
+}
+
 DwellClasses checked_classes(std::vector<double> rho, std::vector<double> tau, double detection) {
   require(!rho.empty() && rho.size() == tau.size(), "rho, tau: expected one number per class");
   require(rho.size() <= kMaxClasses, "rho, tau: too many classes");
@@ -141,6 +149,8 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            "Beams without a return that have such beams beside them, and how many of these cross "
            "something solid.")
+      .def("solid", &solid_cells<D>,
+           "(S, D) int64 cells of surfaces on which many beams ended: the solid things.")
       .def(
           "trust",
           [](W& w, double open) {

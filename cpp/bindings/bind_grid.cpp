@@ -1,6 +1,7 @@
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/tuple.h>
 
+#include <array>
 #include <limits>
 
 #include "arrays.hpp"
@@ -11,22 +12,12 @@ namespace stillmap::border {
 namespace {
 
 template <int D>
-using Cells =
-    nb::ndarray<const int64_t, nb::numpy, nb::shape<-1, D>, nb::c_contig, nb::device::cpu>;
-
-template <int D>
 nb::ndarray<nb::numpy, double> alpha_beta(const Grid<D>& grid, const Cells<D>& cells) {
   const size_t n = cells.shape(0);
   std::vector<double> out(2 * n, 0.0);
   Cursor<const Grid<D>> cursor(grid);
   for (size_t k = 0; k < n; ++k) {
-    Cell<D> cell;
-    for (int d = 0; d < D; ++d) {
-      const int64_t c = cells.data()[k * D + static_cast<size_t>(d)];
-      require(std::abs(c) < Grid<D>::kMaxCell, "cells: out of range");
-      cell[d] = static_cast<int32_t>(c);
-    }
-    if (const Counts* c = cursor.seen(cell)) {
+    if (const Counts* c = cursor.seen(cell_from<D>(cells, k))) {
       out[2 * k] = from_fixed(c->alpha);
       out[2 * k + 1] = from_fixed(c->beta);
     }
@@ -34,53 +25,78 @@ nb::ndarray<nb::numpy, double> alpha_beta(const Grid<D>& grid, const Cells<D>& c
   return owned(std::move(out), {n, 2});
 }
 
-// Bounding box of the cells somebody looked at; empty boxes have first > last.
-template <int D>
-std::pair<Cell<D>, Cell<D>> bounds(const Grid<D>& grid) {
-  Cell<D> first = Cell<D>::Constant(std::numeric_limits<int32_t>::max());
-  Cell<D> last = Cell<D>::Constant(std::numeric_limits<int32_t>::min());
+// visit(cell, counts) for the cells somebody looked at
+template <int D, class Visit>
+void for_each_seen(const Grid<D>& grid, Visit&& visit) {
   for (const auto& block : grid.blocks())
     for (int i = 0; i < Grid<D>::kCells; ++i) {
       const Counts& c = block->counts[static_cast<size_t>(i)];
-      if (c.alpha + c.beta == 0) continue;
-      const Cell<D> cell = Grid<D>::cell_at(block->origin, i);
+      if (c.alpha + c.beta != 0) visit(Grid<D>::cell_at(block->origin, i), c);
+    }
+}
+
+// Bounding box of the cells somebody looked at, to be laid out as [(z,) y, x].
+template <int D>
+struct Box {
+  Cell<D> first = Cell<D>::Constant(std::numeric_limits<int32_t>::max());
+  std::array<size_t, D> size{};  // along x, y(, z)
+
+  explicit Box(const Grid<D>& grid) {
+    Cell<D> last = Cell<D>::Constant(std::numeric_limits<int32_t>::min());
+    for_each_seen(grid, [&](const Cell<D>& cell, const Counts&) {
       first = first.cwiseMin(cell);
       last = last.cwiseMax(cell);
+    });
+    if (first[0] > last[0]) {
+      first.setZero();
+      return;
     }
-  return {first, last};
-}
+    for (int d = 0; d < D; ++d)
+      size[static_cast<size_t>(d)] = static_cast<size_t>(last[d] - first[d] + 1);
+  }
+
+  size_t total() const {
+    size_t cells = 1;
+    for (const size_t n : size) cells *= n;
+    return cells;
+  }
+
+  size_t index(const Cell<D>& cell) const {
+    size_t i = 0;
+    for (int d = D - 1; d >= 0; --d)
+      i = i * size[static_cast<size_t>(d)] + static_cast<size_t>(cell[d] - first[d]);
+    return i;
+  }
+
+  auto first_cell() const {
+    std::vector<int64_t> cell(first.data(), first.data() + D);
+    return owned(std::move(cell), {static_cast<size_t>(D)});
+  }
+  template <class T>
+  auto shaped(std::vector<T>&& values) const {
+    if constexpr (D == 2) return owned(std::move(values), {size[1], size[0]});
+    if constexpr (D == 3) return owned(std::move(values), {size[2], size[1], size[0]});
+  }
+};
 
 template <int D>
 auto dense(const Grid<D>& grid) {
-  auto [first, last] = bounds(grid);
-  if (first[0] > last[0]) {
-    first.setZero();
-    last.setConstant(-1);
-  }
-  size_t shape[D], total = 1;  // slowest axis first: (z,) y, x
-  for (int d = 0; d < D; ++d) {
-    shape[D - 1 - d] = static_cast<size_t>(last[d] - first[d] + 1);
-    total *= static_cast<size_t>(last[d] - first[d] + 1);
-  }
-  std::vector<double> alpha(total, 0.0), beta(total, 0.0);
-  for (const auto& block : grid.blocks())
-    for (int i = 0; i < Grid<D>::kCells; ++i) {
-      const Counts& c = block->counts[static_cast<size_t>(i)];
-      if (c.alpha + c.beta == 0) continue;
-      const Cell<D> cell = Grid<D>::cell_at(block->origin, i);
-      size_t index = 0;
-      for (int d = D - 1; d >= 0; --d)
-        index = index * shape[D - 1 - d] + static_cast<size_t>(cell[d] - first[d]);
-      alpha[index] = from_fixed(c.alpha);
-      beta[index] = from_fixed(c.beta);
-    }
-  std::vector<int64_t> origin(first.data(), first.data() + D);
-  auto shaped = [&](std::vector<double>&& values) {
-    if constexpr (D == 2) return owned(std::move(values), {shape[0], shape[1]});
-    if constexpr (D == 3) return owned(std::move(values), {shape[0], shape[1], shape[2]});
-  };
-  return std::make_tuple(owned(std::move(origin), {static_cast<size_t>(D)}),
-                         shaped(std::move(alpha)), shaped(std::move(beta)));
+  const Box<D> box(grid);
+  std::vector<double> alpha(box.total(), 0.0), beta(box.total(), 0.0);
+  for_each_seen(grid, [&](const Cell<D>& cell, const Counts& c) {
+    alpha[box.index(cell)] = from_fixed(c.alpha);
+    beta[box.index(cell)] = from_fixed(c.beta);
+  });
+  return std::make_tuple(box.first_cell(), box.shaped(std::move(alpha)),
+                         box.shaped(std::move(beta)));
+}
+
+template <int D>
+auto seen(const Grid<D>& grid) {
+  const Box<D> box(grid);
+  std::vector<uint8_t> cells(box.total(), 0);
+  for_each_seen(grid, [&](const Cell<D>& cell, const Counts&) { cells[box.index(cell)] = 1; });
+  return std::make_tuple(box.first_cell(), box.shaped(std::move(cells)));
 }
 
 template <int D>
@@ -99,7 +115,9 @@ void bind(nb::module_& m, const char* name) {
            "(K, 2) float64 sums of (K, D) int64 cells; 0, 0 where nobody looked.")
       .def("dense", &dense<D>,
            "first_cell (D,) int64 and alpha, beta over the box of cells that were looked at; axes "
-           "in reverse order, so that a 2D array is [row = y, column = x].");
+           "in reverse order, so that a 2D array is [row = y, column = x].")
+      .def("seen", &seen<D>,
+           "first_cell and uint8 over the same box: 1 where alpha + beta are not zero.");
 }
 
 // writes down the cells and lengths of a walk

@@ -80,6 +80,7 @@ class Iteration:
         loops: attempts at closing loops, accepted or refused.
         held_out: nats per beam, see `em.held_out_log_likelihood`; None where it is not computed.
         seconds: wall clock.
+        no_return: how far beams without a return are believed, see `em.Expectations`.
     """
 
     number: int
@@ -97,10 +98,11 @@ class Iteration:
     loops: list[slam.Closure]
     held_out: float | None
     seconds: float
+    no_return: em.NoReturn | None = None
 
     @property
     def occupancy(self) -> em.OccupancyMap:
-        """The map of this iteration, made anew at every call."""
+        """The map of this iteration, made anew at every call; every beam is believed."""
         return em.occupancy_map(self.grid, self.occupied)
 
 
@@ -166,6 +168,7 @@ def iterate(
             loops=mapped.loops,
             held_out=held_out,
             seconds=time.perf_counter() - started,
+            no_return=found.no_return,
         )
         e = found.p_static
         # the first labels change most: from the second poses on, a sweep follows what is left

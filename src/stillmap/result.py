@@ -204,8 +204,8 @@ class _Run:
         kept = self.kept
         weights = kept.p_static if self.options.estimator == "stillmap" else kept.weights
         grid = _core.Grid2D(self.options.slam.resolution)
-        em.add_recording(grid, recording, kept.poses, weights, threads)
-        return em.occupancy_map(grid, kept.occupied)
+        seen = em.add_believed_first(grid, recording, kept.poses, weights, kept.no_return, threads)
+        return em.occupancy_map(grid, kept.occupied, seen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,6 +223,7 @@ class _Best:
     explained: Float
     widened: list[int]
     loops: list[slam.Closure]
+    no_return: em.NoReturn | None
 
     @classmethod
     def of(cls, iteration: Iteration) -> "_Best":
@@ -238,6 +239,7 @@ class _Best:
             iteration.explained,
             iteration.widened,
             iteration.loops,
+            iteration.no_return,
         )
 
 

@@ -63,9 +63,24 @@ def test_dense_lays_the_same_sums_out(beams):
 
 def test_dense_of_an_empty_grid(beams):
     for kernels in (_core, reference):
-        first, alpha, beta = beams.empty_grid(kernels).dense()
+        grid = beams.empty_grid(kernels)
+        first, alpha, beta = grid.dense()
         assert first.tolist() == [0] * beams.dimension
         assert alpha.shape == beta.shape == (0,) * beams.dimension
+        first, seen = grid.seen()
+        assert first.tolist() == [0] * beams.dimension
+        assert seen.shape == alpha.shape
+
+
+def test_seen(beams):
+    for kernels in (_core, reference):
+        grid = beams.grid(kernels)
+        first, alpha, beta = grid.dense()
+        first_seen, seen = grid.seen()
+        assert first_seen.tolist() == first.tolist()
+        assert seen.dtype == np.uint8
+        np.testing.assert_array_equal(seen, alpha + beta > 0)
+        assert 0 < seen.mean() < 1
 
 
 @pytest.mark.parametrize("prior", [0.05, 0.5, 0.9, 0.0, 1.0])

@@ -83,7 +83,8 @@ def test_the_map_follows_from_the_labels(room, fixed):
     assert (m.p_occupied[cells] <= ceiling + 1e-6).all()
     assert (m.p_occupied[cells] >= free[cells] - 1e-6).all()
     assert (m.p_occupied[cells] > 0.45).mean() > 0.5  # walls may lie between two cells
-    passed = (alpha == 0) & (m.alpha + m.beta > 0)
+    passed = (alpha == 0) & ~np.isnan(m.p_occupied)
+    assert passed.mean() > 0.2
     np.testing.assert_allclose(m.p_occupied[passed], free[passed], atol=1e-6)
     again = em.e_step(
         recording, result.poses, result_grid(result), "stillmap", result.options.em, threads=2
@@ -124,20 +125,47 @@ def test_the_labels_written_follow_from_the_map_written(room, tmp_path):
 @with_any_estimator
 def test_unknown_stays_nan(room, estimator):
     m = stillmap.build(room.recording, options(estimator, max_iterations=2)).map
-    unknown = m.alpha + m.beta == 0
-    assert unknown.any()
-    np.testing.assert_array_equal(np.isnan(m.p_occupied), unknown)
+    unknown = np.isnan(m.p_occupied)
+    crossed = m.alpha + m.beta > 0
+    assert not crossed.all()
+    assert unknown[~crossed].all()
     known = ~unknown
     assert ((m.p_occupied[known] >= 0) & (m.p_occupied[known] <= 1)).all()
-    if estimator != "paper":
-        return
-    np.testing.assert_allclose(
-        m.p_occupied[known], (m.alpha / np.where(known, m.alpha + m.beta, 1))[known], atol=1e-6
+    if estimator != "stillmap":
+        np.testing.assert_array_equal(known, crossed)
+    if estimator == "paper":
+        expected = m.alpha[known] / (m.alpha + m.beta)[known]
+        np.testing.assert_allclose(m.p_occupied[known], expected, atol=1e-6)
+
+
+def test_what_a_lost_beam_alone_crossed_is_unknown(room):
+    # beams get lost one at a time, and seem to go on behind the walls
+    r, poses = room.recording, room.truth.T_world_base
+    rng = np.random.default_rng(0)
+    beams = np.arange(r.n_beams)
+    lost = r.hit & (rng.random(r.n_beams) < 0.3) & (beams % 2 == 0)
+    points, hit = r.points.copy(), r.hit & ~lost
+    points[lost] *= (7.0 / np.linalg.norm(points[lost], axis=1))[:, None]
+    points[~r.hit] = np.nan
+    lossy = dataclasses.replace(r, points=points, hit=hit)
+    points = np.where(hit[:, None], points, np.float32(np.nan))
+    without = dataclasses.replace(lossy, points=points)
+    m, bare = (
+        stillmap.build(recording, options(max_iterations=1), poses=poses).map
+        for recording in (lossy, without)
     )
+    known = ~np.isnan(m.p_occupied)
+    assert known.sum() == (~np.isnan(bare.p_occupied)).sum()
+    np.testing.assert_array_equal(m.alpha[m.alpha > 0], bare.alpha[bare.alpha > 0])
+    assert ((m.beta > 0) & ~known).sum() > 0.2 * known.sum()
+    # the sums are those of (10): all beams are in them
+    raw = stillmap.build(lossy, options("paper", max_iterations=1, prior=0.5), poses=poses).map
+    np.testing.assert_allclose(m.alpha + m.beta, raw.alpha + raw.beta, atol=1e-5)
+    assert (np.isnan(raw.p_occupied) == (raw.alpha + raw.beta == 0)).all()
 
 
 @with_any_estimator
-def test_unknown_is_what_no_beam_crossed(room, estimator):
+def test_unknown_is_what_no_beam_saw(room, estimator):
     # the case of 0.9 x 0.6 m in the room: its inside was never seen, the floor beside it was
     poses = room.truth.T_world_base
     m = stillmap.build(room.recording, options(estimator, max_iterations=1), poses=poses).map

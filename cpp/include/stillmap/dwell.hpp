@@ -37,6 +37,14 @@ class Dwell {
   Lost lost(const Scans<D>& scans) const {
     return LookCollector<D>(surface_, neighbours_, options_, tables_).lost(scans);
   }
+  // The cells in which beams without a return meet something solid.
+  std::vector<Cell<D>> solid() const {
+    std::vector<Cell<D>> cells;
+    for (size_t i = 0; i < surface_.size(); ++i)
+      if (const auto k = static_cast<int32_t>(i); is_solid(surface_, k, options_.normals))
+        cells.push_back(surface_.cell(k));
+    return cells;
+  }
   // How far to trust them beyond the first solid element, from now on.
   void trust(double open) { options_.open = open; }
 

@@ -9,9 +9,18 @@
 
 #include "stillmap/look.hpp"
 #include "stillmap/neighbours.hpp"
+#include "stillmap/no_return.hpp"
 #include "stillmap/surface.hpp"
 
 namespace stillmap {
+
+// Whether an element is one of a surface on which many beams ended: it is there for sure, at least
+// at times.
+template <int D>
+inline bool is_solid(const Surface<D>& surface, int32_t k, bool normals) {
+  constexpr int64_t many = 10;
+  return normals && !surface.element(k).normal.isZero(0.0) && surface.beams(k) >= many;
+}
 
 // Collects the beams of one look.
 template <int D>
@@ -79,8 +88,6 @@ class LookCollector {
   static constexpr float kStruck = -1.0f, kUntouched = 2.0f;
   static constexpr float kSure = 0.05f;  // more beams of the same look would change nothing
   static constexpr float kLeast = 0.98f;
-  static constexpr int kInARow = 3;
-  static constexpr int64_t kSolid = 10;  // beams
 
   // What a beam has to know of an element, in few bytes: most of the time goes into fetching them.
   struct Row {
@@ -108,21 +115,9 @@ class LookCollector {
       row.centre[static_cast<size_t>(d)] = Row::packed(std::clamp(centre[d], -7.9, 7.9));
       row.normal[static_cast<size_t>(d)] = flat ? Row::packed(e.normal[d]) : int16_t{0};
     }
-    row.solid = flat && surface.beams(k) >= kSolid;
+    row.solid = is_solid(surface, k, normals);
     row.half = flat ? Row::packed(std::clamp(e.half, 1e-3, 7.0)) : int16_t{0};
     return row;
-  }
-
-  // A single beam without a return got lost, whatever stands there; several in a row may tell.
-  static bool in_a_row(const Scans<D>& scans, size_t t, int64_t n) {
-    auto lost = [&](int64_t m) {
-      return m >= scans.offset[t] && m < scans.offset[t + 1] && !scans.hit[m] &&
-             usable<D>(scans.points + m * D);
-    };
-    int in_a_row = 1;
-    for (int64_t m = n - 1; in_a_row < kInARow && lost(m); --m) ++in_a_row;
-    for (int64_t m = n + 1; in_a_row < kInARow && lost(m); ++m) ++in_a_row;
-    return in_a_row >= kInARow;
   }
 
   static float seen_through(float missed) {

@@ -2,15 +2,16 @@
 
 from stillmap.em.estimator import (
     Estimator,
+    add_believed_first,
     add_recording,
     changed_share,
     e_step,
     initial_expectations,
     iterations,
 )
-from stillmap.em.expectations import CellProbabilities, Expectations, Likelihood
+from stillmap.em.expectations import CellProbabilities, Expectations, Likelihood, NoReturn
 from stillmap.em.held_out import held_out_log_likelihood
-from stillmap.em.occupancy import OccupancyMap, occupancy_map
+from stillmap.em.occupancy import OccupancyMap, Seen, occupancy_map
 from stillmap.em.options import DwellOptions, EmOptions
 
 __all__ = [
@@ -20,7 +21,10 @@ __all__ = [
     "Estimator",
     "Expectations",
     "Likelihood",
+    "NoReturn",
     "OccupancyMap",
+    "Seen",
+    "add_believed_first",
     "add_recording",
     "changed_share",
     "e_step",

@@ -7,7 +7,13 @@ from numpy.typing import NDArray
 
 from stillmap import _core
 from stillmap.em.chunks import chunks
-from stillmap.em.expectations import CellProbabilities, Expectations, Likelihood, per_beam
+from stillmap.em.expectations import (
+    CellProbabilities,
+    Expectations,
+    Likelihood,
+    NoReturn,
+    per_beam,
+)
 from stillmap.em.mixture import Shares, fit_shares, posterior_static
 from stillmap.em.options import DwellOptions, EmOptions
 from stillmap.recording.model import Recording
@@ -20,6 +26,7 @@ _LEAST = 0.3  # cells: no length is known better, whatever the scatter
 _UNSEEN = 0.2  # probability that a cell is occupied in which no beam ended and none passed
 _PROMINENT = 0.1  # share of the richest cell's beams that noise alone hardly brings into another
 _SWALLOWED = 4.0  # one in so many beams without a return through walls: none is trusted
+_BELIEVED = 0.5  # trust in beams without a return from which on they show free space
 _ROWS = 1 << 14
 _EDGE = 0.15  # cells: how sharply a surface ends
 
@@ -89,6 +96,9 @@ def e_step(
             cells, static * _coverage(normals, off_plane / resolution, prominence), _UNSEEN
         ),
         learned=_learned(surface, trust, shares, classes),
+        no_return=NoReturn(
+            dwell.solid(), options.dwell.beyond if trust >= _BELIEVED else float("inf")
+        ),
     )
 
 

@@ -1,5 +1,6 @@
 """The E-step by whichever estimator was chosen, and the sums of (10) over whole recordings."""
 
+import dataclasses
 from typing import Literal
 
 import numpy as np
@@ -8,7 +9,8 @@ from numpy.typing import NDArray
 from stillmap import _core
 from stillmap.em import dwell, hit_ratio, paper
 from stillmap.em.chunks import chunks
-from stillmap.em.expectations import Expectations
+from stillmap.em.expectations import Expectations, NoReturn
+from stillmap.em.occupancy import Seen
 from stillmap.em.options import EmOptions
 from stillmap.recording.model import Recording
 
@@ -58,6 +60,43 @@ def add_recording(
         points, hit = recording.points[beams], recording.hit[beams]
         weights = np.ones(len(hit), np.float32) if e is None else e[beams]
         _core.add_beams(grid, points, hit, weights, offset, T_map_sensor[scans], threads)
+
+
+def add_believed_first(
+    grid: _core.Grid2D,
+    recording: Recording,
+    poses: Float,
+    e: NDArray[np.float32],
+    no_return: NoReturn | None,
+    threads: int = 1,
+) -> Seen | None:
+    """Adds the same sums as `add_recording` to an empty grid; says which cells beams tell of.
+
+    Beams without a return only count as far as they are believed; None where all of them are.
+    """
+    if no_return is None:
+        add_recording(grid, recording, poses, e, threads)
+        return None
+    hits = np.where(recording.hit[:, None], recording.points, np.float32(np.nan))
+    add_recording(grid, dataclasses.replace(recording, points=hits), poses, e, threads)
+    del hits
+    rest = _core.Grid2D(grid.resolution, grid.approach)
+    T_map_sensor = recording.T_map_sensor(poses)
+    for scans, beams, offset in chunks(recording):
+        _core.add_lost(
+            grid,
+            rest,
+            recording.points[beams],
+            recording.hit[beams],
+            offset,
+            T_map_sensor[scans],
+            no_return.stops,
+            no_return.beyond,
+            threads,
+        )
+    first_cell, cells = grid.seen()
+    grid.merge(rest)
+    return Seen(first_cell, cells.view(np.bool_))
 
 
 def changed_share(

@@ -36,6 +36,19 @@ class CellProbabilities:
 
 
 @dataclass(frozen=True, eq=False)
+class NoReturn:
+    """How far beams without a return are believed; fewer than three in a row are not at all.
+
+    Attributes:
+        stops: (S, D) int64 cells from the first of which on they say nothing.
+        beyond: metres before their end from which on they say nothing; inf: all of their way.
+    """
+
+    stops: NDArray[np.int64]
+    beyond: float
+
+
+@dataclass(frozen=True, eq=False)
 class Expectations:
     """One E-step.
 
@@ -44,12 +57,14 @@ class Expectations:
         likelihood: at the map it was made from.
         occupied: cells it knows more of than alpha / (alpha + beta) says.
         learned: what was learned from the recording, JSON-able.
+        no_return: how far beams without a return are believed; None: all of their way.
     """
 
     p_static: NDArray[np.float32]
     likelihood: Likelihood
     occupied: CellProbabilities | None = None
     learned: dict[str, object] = field(default_factory=dict)
+    no_return: NoReturn | None = None
 
 
 def per_beam(

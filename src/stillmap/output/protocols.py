@@ -15,7 +15,7 @@ class OccupancyMapLike(Protocol):
     """A grid map, row 0 at the lowest y.
 
     Attributes:
-        p_occupied: (H, W) float32, NaN where no beam ever looked.
+        p_occupied: (H, W) float32, NaN where no beam tells anything.
         alpha: (H, W) float64, the sums of (10): beams that ended on something static here.
         beta: (H, W) float64, the sums of (10): evidence that the cell is free.
         origin: x, y in metres and yaw in radians of the lower-left cell's lower-left corner.

@@ -16,6 +16,7 @@ from stillmap.reference.em import EmStep, em_fixed_poses, m_step_map
 from stillmap.reference.field import field, registration_cost, registration_gradient
 from stillmap.reference.grid import Grid, Grid2D, Grid3D, occupancy
 from stillmap.reference.held_out import StaticShares, StaticShares2D, StaticShares3D, held_out
+from stillmap.reference.no_return import add_lost
 from stillmap.reference.surface import Surface, Surface2D, Surface3D
 from stillmap.reference.traverse import cell_of, traverse
 
@@ -35,6 +36,7 @@ __all__ = [
     "Surface2D",
     "Surface3D",
     "add_beams",
+    "add_lost",
     "cell_of",
     "e_step",
     "em_fixed_poses",

@@ -49,7 +49,7 @@ def usable_beams(
                 yield Beam(t, n, bool(struck[n]), origin, R @ z[n] + origin)
 
 
-def _passed(grid: Grid, beam: Beam) -> Iterator[tuple[Cell, float]]:
+def passed_cells(grid: Grid, beam: Beam) -> Iterator[tuple[Cell, float]]:
     """Cells before the end cell with their l_j."""
     cells, lengths = traverse(beam.start, beam.end, grid.resolution)
     for cell, length in zip(cells[:-1], lengths[:-1], strict=True):
@@ -99,7 +99,7 @@ def add_beams(
     """
     expectation = _per_beam(e, points)
     for beam in usable_beams(grid.dimension, points, hit, offset, T_map_sensor):
-        for cell, length in _passed(grid, beam):
+        for cell, length in passed_cells(grid, beam):
             grid.add(cell, 0.0, length)
         if beam.hit:
             static = float(expectation[beam.number])
@@ -161,7 +161,7 @@ def log_likelihood(
         m_end = grid.occupancy_of(_end_cell(grid, beam))
         end = _expected_log(static, m_end) if beam.hit and isfinite(m_end) else 0.0
         passed = 0.0
-        for cell, length in _passed(grid, beam):
+        for cell, length in passed_cells(grid, beam):
             m = grid.occupancy_of(cell)
             passed += 0.0 if isnan(m) else length * log(max(1.0 - m, PROBABILITY_FLOOR))
         entropy = -sum(x * log(x) for x in (static, 1.0 - static) if x > 0)

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
 from stillmap.reference.beams import Beam, usable_beams
+from stillmap.reference.no_return import in_a_row
 from stillmap.reference.surface import Element, Surface
 from stillmap.reference.traverse import cell_of, traverse
 
@@ -17,7 +18,6 @@ Float = NDArray[np.float64]
 HIT = -1.0  # instead of a reliability
 SURE = 0.95  # what was met more probably than that was met
 LEAST = 0.02  # what was met less probably than that nobody looked at
-IN_A_ROW = 3  # beams without a return that did not just get lost
 SOLID = 10  # beams that end on an element of a surface that is there for sure, at least once
 
 
@@ -58,9 +58,9 @@ def look_at(surface: Surface, beams: Sequence[Beam], reading: Reading) -> dict[i
     number = surface.numbers()
     missed: dict[int, float] = {}
     struck = set()
-    in_a_row = _in_a_row(beams)
+    told = in_a_row(beams)
     for beam in beams:
-        if not beam.hit and beam.number not in in_a_row:
+        if not beam.hit and beam.number not in told:
             continue
         trust = 1.0
         for k, met in _met(surface, number, beam, reading):
@@ -83,17 +83,6 @@ def look_at(surface: Surface, beams: Sequence[Beam], reading: Reading) -> dict[i
 def is_solid(element: Element, reading: Reading) -> bool:
     """Whether an element is one of a surface on which many beams ended."""
     return reading.normals and element.patch is not None and element.beams >= SOLID
-
-
-def _in_a_row(beams: Sequence[Beam]) -> set[int]:
-    """Numbers of beams without a return that have others beside them, IN_A_ROW at least."""
-    scan_of = {beam.number: beam.scan for beam in beams if not beam.hit}
-    found: set[int] = set()
-    for first in scan_of:
-        row = range(first, first + IN_A_ROW)
-        if all(scan_of.get(n) == scan_of[first] for n in row):
-            found.update(row)
-    return found
 
 
 def _met(
@@ -228,16 +217,21 @@ class Dwell:
         """Beams without a return that come in a row, and those of them through something solid."""
         number = self.surface.numbers()
         beams = list(usable_beams(self.surface.dimension, points, hit, offset, T_map_sensor))
-        in_a_row = _in_a_row(beams)
+        told = in_a_row(beams)
         through = [
             any(
                 is_solid(self.surface.list[k], self.reading)
                 for k, _ in _met(self.surface, number, beam, self.reading)
             )
             for beam in beams
-            if beam.number in in_a_row
+            if beam.number in told
         ]
         return len(through), sum(through)
+
+    def solid(self) -> NDArray[np.int64]:
+        """(S, D) cells of surfaces on which many beams ended."""
+        cells = [e.cell for e in self.surface.list if is_solid(e, self.reading)]
+        return np.array(cells, np.int64).reshape(-1, self.surface.dimension)
 
     def trust(self, open_: float) -> None:
         """How far to trust beams without a return beyond the first solid thing in their way."""

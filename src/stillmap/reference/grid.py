@@ -76,6 +76,11 @@ class Grid:
         alpha[index], beta[index] = list(self.alpha.values()), list(self.beta.values())
         return first, alpha, beta
 
+    def seen(self) -> tuple[Int, NDArray[np.uint8]]:
+        """first_cell, and over the same box 1 where alpha + beta are not zero."""
+        first, alpha, beta = self.dense()
+        return first, (alpha + beta > 0).astype(np.uint8)
+
 
 Grid2D = partial(Grid, dimension=2)
 Grid3D = partial(Grid, dimension=3)

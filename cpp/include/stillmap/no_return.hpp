@@ -1,0 +1,109 @@
+// Beams without a return: which of them tell something, and up to where.
+#pragma once
+
+#include <vector>
+
+#include "stillmap/beams.hpp"
+#include "stillmap/cell_index.hpp"
+
+namespace stillmap {
+
+// A single beam without a return got lost, whatever stands there; several in a row may tell.
+template <int D>
+inline bool in_a_row(const Scans<D>& scans, size_t t, int64_t n) {
+  constexpr int enough = 3;
+  auto lost = [&](int64_t m) {
+    return m >= scans.offset[t] && m < scans.offset[t + 1] && !scans.hit[m] &&
+           usable<D>(scans.points + m * D);
+  };
+  int in_a_row = 1;
+  for (int64_t m = n - 1; in_a_row < enough && lost(m); --m) ++in_a_row;
+  for (int64_t m = n + 1; in_a_row < enough && lost(m); ++m) ++in_a_row;
+  return in_a_row >= enough;
+}
+
+// How far beams without a return are believed.
+template <int D>
+struct NoReturn {
+  const std::vector<Cell<D>>& stops;  // cells from which on they say nothing
+  double beyond;                      // cells before their end from which on they say nothing
+};
+
+// Adds the lengths that beams without a return cover, as add_scans does: what they are believed
+// about to one grid, the rest to another. Both together are the sums of (10), to the bit.
+template <int D>
+class LostBeams : private CellIndex<D> {
+ public:
+  explicit LostBeams(const NoReturn<D>& no_return) : beyond_(no_return.beyond) {
+    for (const Cell<D>& cell : no_return.stops) this->place_of(cell) = 0;
+  }
+
+  void add(Grid<D>& grid, Grid<D>& rest, const Scans<D>& scans, size_t first, size_t last) const {
+    Way way(*this, grid, rest);
+    for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
+      if (scans.hit[n]) return;
+      const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
+      const double length = (beam.end - beam.start).norm();
+      way.follow(beam, in_a_row(scans, t, n) ? length - beyond_ : 0.0);
+    });
+  }
+
+ private:
+  // Walks along beams; a cell that is left later than that, in cells, is not believed in.
+  class Way {
+   public:
+    Way(const CellIndex<D>& stops, Grid<D>& grid, Grid<D>& rest)
+        : stops_(stops), grid_(grid), rest_(rest) {}
+
+    void follow(const Segment<D>& beam, double believed) {
+      believed_ = believed;
+      travelled_ = 0.0;
+      traverse<D>(beam.start, beam.end, *this);
+    }
+
+    void start(const Cell<D>& first) { cell_ = first; }
+    void visit(double length) {
+      travelled_ += length;
+      const auto local = static_cast<size_t>(Grid<D>::local_of(cell_));
+      if (travelled_ > believed_ || stopped(local)) believed_ = 0.0;
+      auto* block = (believed_ > 0.0 ? grid_ : rest_).block(cell_);
+      block->counts[local].beta += to_fixed(length);
+    }
+    template <int Axis>
+    void step(int32_t direction) {
+      cell_[Axis] += direction;
+    }
+
+   private:
+    bool stopped(size_t local) {
+      const auto* block = stops_.block(cell_);
+      return block && block->counts[local] != CellIndex<D>::kNone;
+    }
+
+    Cursor<const CellIndex<D>> stops_;
+    Cursor<Grid<D>> grid_, rest_;
+    Cell<D> cell_ = Cell<D>::Zero();
+    double believed_ = 0.0, travelled_ = 0.0;
+  };
+
+  double beyond_;
+};
+
+template <int D>
+inline void add_lost(Grid<D>& grid, Grid<D>& rest, const Scans<D>& scans,
+                     const NoReturn<D>& no_return, int threads) {
+  const LostBeams<D> lost(no_return);
+  const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
+  std::vector<Grid<D>> grids, rests;  // of the other threads
+  for (size_t i = 2; i < bounds.size(); ++i) {
+    grids.emplace_back(grid.resolution(), grid.approach());
+    rests.emplace_back(rest.resolution(), rest.approach());
+  }
+  parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
+    lost.add(i == 0 ? grid : grids[i - 1], i == 0 ? rest : rests[i - 1], scans, first, last);
+  });
+  for (const auto& other : grids) grid.merge(other);
+  for (const auto& other : rests) rest.merge(other);
+}
+
+}  // namespace stillmap

@@ -1,0 +1,108 @@
+"""Where the map has nothing but the word of beams without a return."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_up import FAR, RESOLUTION, Wall, fan, watch
+
+from stillmap import _core, em
+
+
+def with_lost(seen, lost, length=FAR):
+    """The same recording with these beams without a return."""
+    r = seen.recording
+    u = r.points / np.linalg.norm(r.points, axis=1)[:, None]
+    points = np.where(lost[:, None], length * u, r.points).astype(np.float32)
+    recording = replace(r, points=points, hit=r.hit & ~lost)
+    return replace(seen, recording=recording, what=np.where(lost, -1, seen.what))
+
+
+def room_with(beams=181, seconds=20):
+    """Three walls about the sensor, at 4 and 3 metres; the fourth side is open behind it."""
+    return watch([Wall((1, 0), 4.0), Wall((0, 1), 3.0), Wall((0, -1), 3.0)], seconds, fan(beams))
+
+
+def known(seen, threads=1):
+    """The map, what looks up its values at points, and how far rows of lost beams are trusted."""
+    found = seen.e_step()
+    grid = _core.Grid2D(RESOLUTION)
+    e, no_return = found.p_static, found.no_return
+    told = em.add_believed_first(grid, seen.recording, seen.poses, e, no_return, threads)
+    for a, b in zip(grid.dense(), seen.grid(e).dense(), strict=True):
+        np.testing.assert_array_equal(a, b)
+    m = em.occupancy_map(grid, found.occupied, told)
+    first = np.round(np.array(m.origin[:2]) / RESOLUTION)
+
+    def at(values, *points):
+        column, row = (np.floor(np.array(points) / RESOLUTION) - first).astype(int).T
+        return values[row, column]
+
+    return m, at, found.learned["no_return_trusted"]
+
+
+def test_a_lone_lost_beam_shows_nothing():
+    seen = room_with()
+    m, at, _ = known(with_lost(seen, np.arange(len(seen.what)) % 181 == 90))
+    assert np.isnan(at(m.p_occupied, (5.05, 0.05), (20.05, 0.05))).all()
+    assert (at(m.beta, (5.05, 0.05), (20.05, 0.05)) > 10).all()
+    assert at(m.p_occupied, (2.05, 0.05)) < 0.1  # its neighbours see these cells too
+    assert at(m.p_occupied, (4.05, 0.35)) > 0.8
+
+
+def test_a_row_into_the_open_shows_free_space():
+    # a wall on one side only: all else looks into the open
+    seen = watch([Wall((0, 1), 3.0)], 20)
+    m, at, trust = known(seen)
+    assert trust > 0.9
+    free = at(m.p_occupied, (2.05, -1.05), (20.05, 0.05), (5.05, -12.05))
+    assert (free < 0.1).all()
+    # the last 0.3 m say nothing
+    assert np.isnan(at(m.p_occupied, (29.85, 0.05)))
+    assert at(m.beta, (29.85, 0.05)) > 0
+
+
+def test_a_row_shows_nothing_behind_a_wall():
+    # a few rows get lost where a wall was seen, most look into the open
+    seen = watch([Wall((1, 0), 4.0, width=0.6), Wall((0, 1), 3.0)], 40)
+    scan, beam = np.divmod(np.arange(len(seen.what)), 181)
+    m, at, trust = known(with_lost(seen, (scan % 20 == 3) & (np.abs(beam - 90) < 4)))
+    assert trust > 0.9
+    assert np.isnan(at(m.p_occupied, (6.05, 0.05), (20.05, 0.05))).all()
+    assert (at(m.beta, (6.05, 0.05), (20.05, 0.05)) > 0).all()
+    assert at(m.p_occupied, (20.05, -5.05)) < 0.1
+
+
+def test_where_walls_swallow_beams_rows_show_nothing_at_all():
+    # glass: half of the looks at the wall ahead are lost in it, and those beside it in the gap too
+    seen = watch([Wall((1, 0), 4.0, width=2.0), Wall((0, 1), 3.0), Wall((0, -1), 3.0)], 40)
+    scan, beam = np.divmod(np.arange(len(seen.what)), 181)
+    m, at, trust = known(with_lost(seen, (scan % 2 == 0) & (np.abs(beam - 90) < 24)))
+    assert trust < 0.5
+    outside = (6.05, 0.05), (20.05, 0.05), (6.05, 3.35)
+    assert np.isnan(at(m.p_occupied, *outside)).all()
+    assert (at(m.beta, *outside[:2]) > 0).all()
+    inside = at(m.p_occupied, (1.05, 0.05), (3.55, 0.05), (2.05, -1.05))
+    assert (inside < 0.1).all()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("beams", [1, 500])
+def test_pieces_and_threads_change_no_bit(monkeypatch, threads, beams):
+    seen = room_with()
+    lost = np.random.default_rng(1).random(len(seen.what)) < 0.2
+    seen = with_lost(seen, lost)
+    once = known(seen)[0].p_occupied
+    monkeypatch.setattr(em.chunks, "CHUNK_BEAMS", beams)
+    np.testing.assert_array_equal(known(seen, threads)[0].p_occupied, once)
+
+
+@pytest.mark.parametrize("estimator", ["paper", "hit-ratio"])
+def test_others_believe_every_beam(estimator):
+    seen = room_with()
+    found = seen.e_step(estimator=estimator)
+    assert found.no_return is None
+    grid = _core.Grid2D(RESOLUTION)
+    e = found.p_static
+    assert em.add_believed_first(grid, seen.recording, seen.poses, e, None) is None
+    np.testing.assert_array_equal(grid.dense()[2], seen.grid(e).dense()[2])
