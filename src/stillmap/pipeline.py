@@ -80,6 +80,7 @@ class Iteration:
         loops: attempts at closing loops, accepted or refused.
         held_out: nats per beam, see `em.held_out_log_likelihood`; None where it is not computed.
         seconds: wall clock.
+        graph: the pose graph of these loops; None where poses were given or none were looked for.
         no_return: how far beams without a return are believed, see `em.Expectations`.
     """
 
@@ -98,6 +99,7 @@ class Iteration:
     loops: list[slam.Closure]
     held_out: float | None
     seconds: float
+    graph: slam.Graph | None = None
     no_return: em.NoReturn | None = None
 
     @property
@@ -168,6 +170,7 @@ def iterate(
             loops=mapped.loops,
             held_out=held_out,
             seconds=time.perf_counter() - started,
+            graph=getattr(mapped, "graph", None),
             no_return=found.no_return,
         )
         e = found.p_static

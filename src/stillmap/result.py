@@ -54,6 +54,7 @@ class Result:
         warnings: one sentence each.
         learned: what the estimator learned from the recording, JSON-able.
         loops: attempts at closing loops in the best iteration, accepted or refused.
+        graph: the pose graph of these loops; None where poses were given or none were looked for.
         stages: seconds and peak memory.
     """
 
@@ -71,6 +72,7 @@ class Result:
     warnings: list[str]
     learned: dict[str, object]
     loops: list[slam.Closure]
+    graph: slam.Graph | None
     stages: Mapping[str, Mapping[str, Any]]
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
@@ -196,6 +198,7 @@ class _Run:
             warnings=_warnings(self.records, kept, recording, self.options.em),
             learned=kept.learned,
             loops=kept.loops,
+            graph=kept.graph,
             stages=stages.to_dict(),
         )
 
@@ -223,6 +226,7 @@ class _Best:
     explained: Float
     widened: list[int]
     loops: list[slam.Closure]
+    graph: slam.Graph | None
     no_return: em.NoReturn | None
 
     @classmethod
@@ -239,6 +243,7 @@ class _Best:
             iteration.explained,
             iteration.widened,
             iteration.loops,
+            iteration.graph,
             iteration.no_return,
         )
 

@@ -8,7 +8,8 @@ import pytest
 from stillmap.output.crops import choose_window, snapshot
 from stillmap.output.map_server import OutputOptions
 from stillmap.recording.model import Recording
-from stillmap.se2 import matrix
+from stillmap.se2 import inverse, matrix
+from stillmap.slam.pose_graph import Graph, Relation
 
 RESOLUTION = 0.1
 ORIGIN = (-1.0, -2.0, 0.0)
@@ -85,6 +86,7 @@ class FakeResult:
     learned: dict
     loops: list
     stages: dict
+    graph: Graph | None = None
 
 
 def _wall_range(origin, direction):
@@ -183,6 +185,16 @@ LEARNED = {
 }
 
 
+def _graph(poses):
+    """Every tenth scan, and a loop from the last to the first."""
+    scans = np.append(np.arange(0, len(poses) - 1, 10), len(poses) - 1)
+    at = poses[scans]
+    pairs = [(k, k + 1) for k in range(len(scans) - 1)] + [(0, len(scans) - 1)]
+    spread = np.array([[4e-4, 1e-4, 2e-5], [1e-4, 2e-4, -1e-5], [2e-5, -1e-5, 1e-5]])
+    found = [Relation(i, j, inverse(at[i]) @ at[j], spread) for i, j in pairs]
+    return Graph(scans, at, found)
+
+
 @pytest.fixture(scope="session")
 def result():
     rng = np.random.default_rng(3)
@@ -235,6 +247,7 @@ def result():
             FakeLoop(5, 44, 0.9, "other loops disagree"),
             FakeLoop(6, 46, 0.25, "explains too little"),
         ],
+        graph=_graph(poses),
         stages={
             "read": {"seconds": 0.21, "cpu_seconds": 0.2, "peak_memory_bytes": 41_000_000},
             "em": {"seconds": 7.1, "cpu_seconds": 13.5, "peak_memory_bytes": 96_000_000},

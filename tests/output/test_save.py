@@ -15,6 +15,7 @@ FILES = {
     "map.yaml",
     "map.npz",
     "trajectory.tum",
+    "graph.g2o",
     "beams/stamp_ns.npy",
     "beams/offset.npy",
     "beams/p_static.npy",
@@ -42,6 +43,11 @@ def test_the_folder_is_complete_and_agrees_with_itself(tmp_path, result):
     assert run["counts"]["scans"] == len(stamps)
     assert run["counts"]["beams"] == len(np.load(tmp_path / "out/beams/hit.npy"))
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_no_graph_no_file(tmp_path, result):
+    save(dataclasses.replace(result, graph=None), tmp_path / "out")
+    assert set(contents(tmp_path / "out")) == FILES - {"graph.g2o"}
 
 
 def test_same_result_same_bytes_except_for_timings(tmp_path, result):

@@ -81,6 +81,39 @@ class LoopLike(Protocol):
     def refused(self) -> str: ...
 
 
+class RelationLike(Protocol):
+    """T_first_second as somebody measured it.
+
+    Attributes:
+        first, second: indices of keyframes.
+        T: (3, 3).
+        covariance: (3, 3) of x, y, heading in the frame of the second pose.
+    """
+
+    @property
+    def first(self) -> int: ...
+    @property
+    def second(self) -> int: ...
+    @property
+    def T(self) -> NDArray[np.float64]: ...
+    @property
+    def covariance(self) -> NDArray[np.float64]: ...
+
+
+class GraphLike(Protocol):
+    """The pose graph.
+
+    Attributes:
+        scans: (K,) numbers of the scans that are keyframes.
+        relations: between keyframes: along the way, and the loops that were accepted.
+    """
+
+    @property
+    def scans(self) -> NDArray[np.intp]: ...
+    @property
+    def relations(self) -> Sequence[RelationLike]: ...
+
+
 class OptionsLike(Protocol):
     """The resolved options: a frozen dataclass with a section for the writers.
 
@@ -112,6 +145,7 @@ class ResultLike(Protocol):
         warnings: one sentence each.
         learned: what the estimator learned: empty, or shares, scatter and tables of shares.
         loops: attempts at closing loops, accepted or refused.
+        graph: the pose graph; None where poses were given or no loops were looked for.
         stages: name to `seconds`, `cpu_seconds` and `peak_memory_bytes`, in the order they ran.
     """
 
@@ -141,5 +175,7 @@ class ResultLike(Protocol):
     def learned(self) -> Mapping[str, Any]: ...
     @property
     def loops(self) -> Sequence[LoopLike]: ...
+    @property
+    def graph(self) -> GraphLike | None: ...
     @property
     def stages(self) -> Mapping[str, Mapping[str, Any]]: ...

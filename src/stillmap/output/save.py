@@ -4,6 +4,7 @@ from pathlib import Path
 
 from stillmap.output.atomic import new_folder
 from stillmap.output.beams import write_beams
+from stillmap.output.graph_g2o import write_g2o
 from stillmap.output.map_npz import write_map_npz
 from stillmap.output.map_server import write_map_server
 from stillmap.output.protocols import ResultLike
@@ -13,7 +14,7 @@ from stillmap.output.trajectory import write_tum
 
 
 def save(result: ResultLike, path: Path, overwrite: bool = False) -> None:
-    """Write `result` as the folder `path`: map, trajectory, labels, report and run record.
+    """Write `result` as the folder `path`: map, trajectory, pose graph, labels, report, record.
 
     Args:
         result: what the pipeline found.
@@ -27,6 +28,8 @@ def save(result: ResultLike, path: Path, overwrite: bool = False) -> None:
         write_map_server(folder, result.map, result.options.output.map_mode)
         write_map_npz(folder / "map.npz", result.map)
         write_tum(folder / "trajectory.tum", result.recording.stamp_ns, result.poses)
+        if result.graph is not None:
+            write_g2o(folder / "graph.g2o", result.graph, result.poses)
         write_beams(folder / "beams", result)
         write_report(folder / "report.html", result)
         write_run_json(folder / "run.json", result)

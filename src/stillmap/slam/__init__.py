@@ -3,5 +3,6 @@
 from stillmap.slam.incremental import Mapped, SlamOptions
 from stillmap.slam.loops import Closure
 from stillmap.slam.m_step import m_step
+from stillmap.slam.pose_graph import Graph
 
-__all__ = ["Closure", "Mapped", "SlamOptions", "m_step"]
+__all__ = ["Closure", "Graph", "Mapped", "SlamOptions", "m_step"]

@@ -19,7 +19,7 @@ class Relation:
     """T_first_second as somebody measured it.
 
     Attributes:
-        first, second: indices of poses.
+        first, second: indices of poses, of keyframes in a Graph.
         T: (3, 3).
         covariance: (3, 3) of x, y, heading in the frame of the second pose.
     """
@@ -28,6 +28,21 @@ class Relation:
     second: int
     T: Float
     covariance: Float
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """What is known of the keyframes of a recording.
+
+    Attributes:
+        scans: (K,) numbers of the scans that are keyframes, rising.
+        poses: (K, 3, 3) T_map_base that fit the relations best.
+        relations: along the way first, then the loops that were accepted; between keyframes.
+    """
+
+    scans: NDArray[np.intp]
+    poses: Float
+    relations: list[Relation]
 
 
 def optimised(
