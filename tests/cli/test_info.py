@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -153,6 +154,19 @@ def test_recording_in_3d(tmp_path, capsys, scans):
     assert "3D" in out
     assert ("max 5.00 m" in out) == (scans > 0)
     assert run(tmp_path / "rec", "--json") == 0
+
+
+def test_beam_times_are_shown_where_there_are_any(path, tmp_path, capsys):
+    recording = read(path)
+    run(path)
+    assert "beam times" not in capsys.readouterr().out
+    times = np.linspace(-0.05, 0.1, recording.n_beams).astype(np.float32)
+    write(replace(recording, beam_time=times), tmp_path / "rec")
+    assert run(tmp_path / "rec") == 0
+    assert "-0.05 to 0.1 s after a scan's stamp" in capsys.readouterr().out
+    assert run(tmp_path / "rec", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["beam_times_s"] == pytest.approx([-0.05, 0.1])
 
 
 def test_no_scan_is_an_input_error(tmp_path):

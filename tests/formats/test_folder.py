@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,10 +13,19 @@ from stillmap import se2
 from stillmap.errors import InputError
 from stillmap.recording import ReadOptions, Recording, read, write
 
-ARRAYS = ("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor", "T_odom_base")
+ARRAYS = (
+    "stamp_ns",
+    "offset",
+    "points",
+    "hit",
+    "T_base_sensor",
+    "sensor",
+    "T_odom_base",
+    "beam_time",
+)
 
 
-def made(D=2, odometry=True, counts=(3, 0, 4)):
+def made(D=2, odometry=True, counts=(3, 0, 4), beam_times=True):
     rng = np.random.default_rng(4)
     T, M = len(counts), sum(counts)
     points = rng.normal(0, 5, (M, D)).astype(np.float32)
@@ -35,6 +45,7 @@ def made(D=2, odometry=True, counts=(3, 0, 4)):
         sensor=(np.arange(T) % 2).astype(np.int32),
         T_odom_base=odom if odometry else None,
         source={"path": "hall", "seed": 3, "nested": {"list": [1, 2.5, None, "ü"]}},
+        beam_time=rng.uniform(-0.1, 0.1, M).astype(np.float32) if beam_times else None,
     )
 
 
@@ -57,6 +68,37 @@ def test_round_trip(tmp_path, D, odometry, counts):
     write(recording, tmp_path / "rec")
     require_same(read(tmp_path / "rec"), recording)
     require_same(read(tmp_path / "rec" / "recording.json"), recording)
+
+
+def test_without_odometry_and_beam_times_their_files_are_absent(tmp_path):
+    recording = made(odometry=False, beam_times=False)
+    write(recording, tmp_path / "rec")
+    names = {p.name for p in (tmp_path / "rec").iterdir()}
+    assert names == {"recording.json", *(f"{name}.npy" for name in ARRAYS[:-2])}
+    require_same(read(tmp_path / "rec"), recording)
+
+
+def test_folders_from_before_there_were_beam_times_are_read(tmp_path):
+    recording = made(beam_times=False)
+    write(recording, tmp_path / "rec")
+    file = tmp_path / "rec" / "recording.json"
+    header = json.loads(file.read_text())
+    del header["beam_times"]
+    file.write_text(json.dumps(header))
+    require_same(read(tmp_path / "rec"), recording)
+
+
+def test_options_leave_the_beam_times(tmp_path):
+    write(made(), tmp_path / "rec")
+    narrowed = read(tmp_path / "rec", ReadOptions(min_range=0.5, laser_x=0.1))
+    np.testing.assert_array_equal(narrowed.beam_time, made().beam_time)
+
+
+@pytest.mark.parametrize("bad", [np.zeros(6, np.float32), np.zeros(7), [np.nan] * 7])
+def test_beam_times_that_do_not_fit_are_refused(bad):
+    times = np.float32(bad) if isinstance(bad, list) else bad
+    with pytest.raises(ValueError, match="beam_time"):
+        replace(made(), beam_time=times)
 
 
 def test_carmen_log_survives_the_round_trip(tmp_path, read_log, flaser):
@@ -127,6 +169,8 @@ def test_pickles_are_never_opened(tmp_path):
         ("points", lambda a: a * np.float32(np.inf), "ends nowhere"),
         ("T_base_sensor", lambda a: a * 2.0, "rigid"),
         ("T_odom_base", lambda a: a * np.nan, "rigid"),
+        ("beam_time", lambda a: a * np.float32(np.inf), "beam_time"),
+        ("beam_time", lambda a: a[:2], "expected"),
     ],
 )
 def test_arrays_that_do_not_fit(tmp_path, name, change, what):

@@ -62,6 +62,9 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
             "min {min:.2f}, median {median:.2f}, 99 % {p99:.2f}, max {max:.2f} m".format(**spread),
         )
     yield from _time(found["time"])
+    if found["beam_times_s"] is not None:
+        first, last = found["beam_times_s"]
+        yield _row("beam times", f"{first:g} to {last:g} s after a scan's stamp")
     yield from _odometry(found["odometry"])
     for sensor in found["sensors"]:
         yield from _sensor(sensor)

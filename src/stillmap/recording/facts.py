@@ -33,6 +33,7 @@ def facts(recording: Recording) -> dict[str, Any]:
         "counts": _counts(recording, length),
         "hit_ranges_m": _spread(length[recording.hit], ("min", "median", "p99", "max")),
         "time": _time(recording.stamp_ns),
+        "beam_times_s": _spread_of_times(recording.beam_time),
         "odometry": _odometry(recording, source["odometry"]),
         "sensors": [
             _sensor(recording, i, source["sensors"]) for i in range(len(recording.T_base_sensor))
@@ -101,6 +102,13 @@ def _time(stamp_ns: NDArray[np.int64]) -> dict[str, Any] | None:
         "rate_hz": len(gaps) / duration if duration > 0 else None,
         "largest_gap_s": float(gaps.max()) / 1e9 if len(gaps) else None,
     }
+
+
+def _spread_of_times(beam_time: NDArray[np.float32] | None) -> list[float] | None:
+    """When after its scan's stamp the first and the last beam of any scan was taken."""
+    if beam_time is None or not len(beam_time):
+        return None
+    return [float(beam_time.min()), float(beam_time.max())]
 
 
 def _odometry(recording: Recording, noted: dict[str, Any]) -> dict[str, Any] | None:

@@ -39,18 +39,20 @@ def write_into(recording: Recording, folder: Path) -> None:
         "beams": recording.n_beams,
         "sensors": len(recording.T_base_sensor),
         "odometry": recording.T_odom_base is not None,
+        "beam_times": recording.beam_time is not None,
         "source": recording.source,
     }
     text = json.dumps(header, indent=1, allow_nan=False)
     for name in ("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"):
         np.save(folder / f"{name}.npy", getattr(recording, name), allow_pickle=False)
-    if recording.T_odom_base is not None:
-        np.save(folder / "T_odom_base.npy", recording.T_odom_base, allow_pickle=False)
+    for name in ("T_odom_base", "beam_time"):
+        if getattr(recording, name) is not None:
+            np.save(folder / f"{name}.npy", getattr(recording, name), allow_pickle=False)
     (folder / HEADER).write_text(text + "\n", encoding="utf-8")
 
 
 def read(path: Path) -> Recording:
-    """Read a recording folder; `points` and `hit` stay on disk until they are used.
+    """Read a recording folder; what there is per beam stays on disk until it is used.
 
     Raises:
         InputError: a file is missing, damaged, or does not fit the others.
@@ -63,6 +65,9 @@ def read(path: Path) -> Recording:
     T_odom_base = None
     if header.get("odometry"):
         T_odom_base = _poses(path, "T_odom_base", T, D)
+    beam_time = None
+    if header.get("beam_times"):
+        beam_time = _array(path, "beam_time", (M,), np.float32)
     stamp_ns = np.array(_array(path, "stamp_ns", (T,), np.int64))
     offset = np.array(_array(path, "offset", (T + 1,), np.int64))
     points = _array(path, "points", (M, D), np.float32)
@@ -83,6 +88,7 @@ def read(path: Path) -> Recording:
             sensor=sensor,
             T_odom_base=T_odom_base,
             source=source if isinstance(source, dict) else {},
+            beam_time=beam_time,
         )
     except ValueError as error:
         raise InputError(f"is damaged: {error}", where=str(path)) from error

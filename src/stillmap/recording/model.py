@@ -20,6 +20,8 @@ class Recording:
         T_base_sensor: (S, D+1, D+1) float64, where each sensor sits on the robot.
         sensor: (T,) int32, the sensor that took each scan.
         T_odom_base: (T, D+1, D+1) float64, odometry at each scan; None where there is none.
+        beam_time: (M,) float32, seconds after its scan's stamp at which each beam was taken,
+            finite; None where the beams of a scan count as taken at once.
         source: what the recording was read from and how, what was skipped: JSON-able.
     """
 
@@ -31,6 +33,7 @@ class Recording:
     sensor: NDArray[np.int32]
     T_odom_base: NDArray[np.float64] | None
     source: dict[str, Any] = field(default_factory=dict)
+    beam_time: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         T, M, D = self.n_scans, self.n_beams, self.dimension
@@ -45,6 +48,10 @@ class Recording:
         _check("T_base_sensor", self.T_base_sensor, (S, D + 1, D + 1), np.float64)
         if self.T_odom_base is not None:
             _check("T_odom_base", self.T_odom_base, (T, D + 1, D + 1), np.float64)
+        if self.beam_time is not None:
+            _check("beam_time", self.beam_time, (M,), np.float32)
+            if not np.isfinite(self.beam_time).all():
+                raise ValueError("beam_time: a time is not finite")
         if self.offset[0] != 0 or self.offset[-1] != M or np.any(np.diff(self.offset) < 0):
             raise ValueError(f"offset: must rise from 0 to {M}")
         if T and (self.sensor.min() < 0 or self.sensor.max() >= S):
