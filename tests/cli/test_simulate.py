@@ -63,6 +63,21 @@ def test_flags_reach_the_scene(tmp_path: Path) -> None:
     assert scene["odometry"]["slip_rate"] == 0.2
 
 
+def test_any_option_can_be_set_and_flags_win(tmp_path: Path) -> None:
+    sets = "--set laser.yaw=0.5 --set laser.beams=7 --set odometry.slip_length=2"
+    call("hall", "-o", str(tmp_path / "sim"), *QUICK, *sets.split())
+    scene = load_truth(tmp_path / "sim").scene
+    assert (scene["laser"]["yaw"], scene["laser"]["beams"]) == (0.5, 90)
+    assert scene["odometry"]["slip_length"] == 2.0
+
+
+def test_a_scan_that_takes_time_says_when_its_beams_were_taken(tmp_path: Path) -> None:
+    call("hall", "-o", str(tmp_path / "sim"), *QUICK, "--sweep-time", "0.1")
+    times = recording.read(tmp_path / "sim").beam_time
+    assert times is not None
+    assert 0.09 < np.ptp(times) < 0.1
+
+
 def test_scenes_with_more_than_people_say_what_moves(tmp_path: Path) -> None:
     call("office", "-o", str(tmp_path / "sim"), *QUICK)
     truth = load_truth(tmp_path / "sim")
@@ -109,6 +124,9 @@ def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path: Path) -> None
         (["--max-range", "0"], "max_range must be positive"),
         (["--slip-rate", "-1"], "errors must be >= 0"),
         (["--odometry-noise", "-1"], "errors must be >= 0"),
+        (["--sweep-time", "1"], "sweep_time must not be longer"),
+        (["--set", "laser.beam=3"], "unknown option 'laser.beam'.*laser.beams"),
+        (["--set", "walls=3"], "'walls' wants"),
     ],
 )
 def test_values_out_of_range_are_refused(tmp_path: Path, flags: list[str], message: str) -> None:

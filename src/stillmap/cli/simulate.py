@@ -12,6 +12,7 @@ import numpy as np
 
 from stillmap.cli.progress import say
 from stillmap.errors import InputError
+from stillmap.options import merged, parse_assignment
 from stillmap.output.atomic import require_new
 from stillmap.simulation import SCENES, Simulation, scene_by_name, simulate, write_simulation
 from stillmap.simulation.motion import Progress
@@ -29,6 +30,7 @@ _FLAGS: tuple[tuple[str, str, type, str, str, str], ...] = (
     ("fov", "DEG", float, "laser", "fov", "field of view in degrees"),
     ("max-range", "M", float, "laser", "max_range", "range of the laser, metres"),
     ("range-noise", "M", float, "laser", "range_noise", "standard deviation of ranges, metres"),
+    ("sweep-time", "S", float, "laser", "sweep_time", "how long a scan takes, seconds"),
     ("slip-rate", "N", float, "odometry", "slip_rate", "how often wheels slip, per metre driven"),
 )
 _ODOMETRY_ERRORS = (
@@ -70,6 +72,14 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         default="stillmap",
         help="the recording folder, or recording.log with FLASER and ODOM lines",
     )
+    p.add_argument(
+        "--set",
+        dest="assignments",
+        metavar="SECTION.KEY=VALUE",
+        action="append",
+        default=[],
+        help="any other option of the scene, e.g. traffic.vehicles=3; can be given again",
+    )
     p.add_argument("--quiet", action="store_true", help="no progress, no summary")
     p.set_defaults(run=run)
 
@@ -109,7 +119,7 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
         defaults = scene_by_name(args.scene).odometry
         scaled = {key: args.odometry_noise * getattr(defaults, key) for key in _ODOMETRY_ERRORS}
         changes.setdefault("odometry", {}).update(scaled)
-    return changes
+    return merged(*map(parse_assignment, args.assignments), changes)
 
 
 def _summary(simulation: Simulation, output: Path) -> str:

@@ -5,6 +5,7 @@ it, for all scans at once, so the work grows with what is covered, not with beam
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +50,7 @@ class Outlines:
     mover: NDArray[np.int32]
 
 
-@dataclass(frozen=True, eq=False)
-class Returns:
+class Returns(NamedTuple):
     """The nearest thing on each beam.
 
     Attributes:
@@ -76,7 +76,12 @@ def beam_angles(beams: int, fov: float) -> Float:
 
 
 def cast(
-    poses: Float, angles: Float, walls: Float, movers: Movers, outlines: Outlines | None = None
+    poses: Float,
+    angles: Float,
+    walls: Float,
+    movers: Movers,
+    outlines: Outlines | None = None,
+    reach: float = np.inf,
 ) -> Returns:
     """Exact ranges of T scans with n beams each.
 
@@ -86,6 +91,7 @@ def cast(
         walls: (W, 4) segments in metres.
         movers: their parts at these T scans.
         outlines: further movers at these T scans.
+        reach: metres, walls farther away than this may be left out.
     """
     shape = (len(poses), len(angles))
     out = Returns(
@@ -94,7 +100,8 @@ def cast(
     for first in range(0, len(poses), _CHUNK):
         part = slice(first, first + _CHUNK)
         scans = _Scans(poses[part], angles)
-        _cast_walls(scans, walls, out.range[part], out.wall[part])
+        near = _within(reach, scans, walls)
+        _cast_walls(scans, walls, near, out.range[part], out.wall[part])
         _cast_movers(scans, movers, part, out.range[part], out.mover[part])
         if outlines is not None:
             _cast_outlines(scans, outlines, part, out.range[part], out.mover[part])
@@ -129,10 +136,20 @@ class _Scans:
         return np.concatenate(scans), np.concatenate(beams)
 
 
-def _cast_walls(scans: _Scans, walls: Float, ranges: Float, which: NDArray[np.int32]) -> None:
+def _within(reach: float, scans: _Scans, walls: Float) -> Index:
+    """The walls that come as near as `reach` to the box around all sensors."""
+    x, y = walls[:, ::2], walls[:, 1::2]
+    near = (x.max(axis=1) >= scans.x.min() - reach) & (x.min(axis=1) <= scans.x.max() + reach)
+    near &= (y.max(axis=1) >= scans.y.min() - reach) & (y.min(axis=1) <= scans.y.max() + reach)
+    return np.flatnonzero(near)
+
+
+def _cast_walls(
+    scans: _Scans, walls: Float, near: Index, ranges: Float, which: NDArray[np.int32]
+) -> None:
     flat, flat_which = ranges.reshape(-1), which.reshape(-1)
-    for w, wall in enumerate(walls):
-        flat_which[_lowered(scans, wall, flat)] = w
+    for w in near.tolist():
+        flat_which[_lowered(scans, walls[w], flat)] = w
 
 
 def _cast_outlines(

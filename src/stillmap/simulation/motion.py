@@ -33,6 +33,7 @@ class Motion:
     """Where everything is at each of T scans.
 
     Attributes:
+        period: seconds from one scan to the next.
         robot: (T, 3) x, y in metres, theta in radians.
         poses: (T, P, 3) the same of all movers: people, doors, vehicles.
         kinds: (P) what each mover is.
@@ -41,6 +42,7 @@ class Motion:
         still: (K, 4) faces of those among them that never moved.
     """
 
+    period: float
     robot: Float
     poses: Float
     kinds: list[str]
@@ -72,7 +74,7 @@ def move(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
             tell(min(len(log.robot) / expected, 1.0))
         for _ in range(steps):
             world.step(dt)
-    return log.motion(world)
+    return log.motion(world, 1.0 / o.scan_rate)
 
 
 class _World:
@@ -143,7 +145,7 @@ class _Log:
         self._heading.append(heading)
         self._faces.append(np.concatenate([doors.faces(), traffic.faces()]))
 
-    def motion(self, world: _World) -> Motion:
+    def motion(self, world: _World, period: float) -> Motion:
         figures, doors = world.figures, len(world.doors.share)
         persons = len(world.crowd.xy)
         kinds = ["person"] * persons + ["door"] * doors + world.traffic.kinds
@@ -156,4 +158,5 @@ class _Log:
         mover = np.concatenate([others[:doors], np.repeat(others[doors:], 4)])
         moving = moved[mover]
         outlines = Outlines(faces[:, moving], mover[moving])
-        return Motion(np.stack(self.robot), poses, kinds, people, outlines, faces[0, ~moving])
+        robot = np.stack(self.robot)
+        return Motion(period, robot, poses, kinds, people, outlines, faces[0, ~moving])

@@ -122,6 +122,9 @@ class LaserOptions:
     range_noise: float = field_with_doc(0.02, "m, standard deviation of a range")
     no_return_share: float = field_with_doc(0.002, "share of beams that get lost anywhere")
     glass_no_return_share: float = field_with_doc(0.3, "share of beams that get lost on glass")
+    sweep_time: float = field_with_doc(
+        0.0, "s, that it takes to look through its field of view; 0: all beams at once"
+    )
     x: float = field_with_doc(0.08, "m, sensor ahead of the base centre")
     y: float = field_with_doc(0.0, "m, sensor to the left of the base centre")
     yaw: float = field_with_doc(0.0, "rad, sensor against the base")
@@ -130,6 +133,7 @@ class LaserOptions:
         _require(self.beams >= 2, "beams must be at least 2")
         _require(0 < self.fov <= 2 * math.pi + 1e-9, "fov must lie in (0, 2 pi]")
         _require(self.max_range > 0, "max_range must be positive")
+        _require(self.sweep_time >= 0, "sweep_time must not be negative")
         _require(self.range_noise >= 0, "range_noise must not be negative")
         for share in (self.no_return_share, self.glass_no_return_share):
             _require(0 <= share <= 1, "shares of lost beams must lie in [0, 1]")
@@ -221,6 +225,8 @@ class Scene:
     def __post_init__(self) -> None:
         _require(len(self.walls) + len(self.glass) > 0, "a scene needs walls")
         _require(len(self.route) > 0, "a scene needs a route")
+        sweep_share = self.laser.sweep_time * self.robot.scan_rate
+        _require(sweep_share <= 1 + 1e-9, "sweep_time must not be longer than from scan to scan")
 
 
 def _require(condition: bool, message: str) -> None:

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.recording.model import Recording
-from stillmap.simulation import laser, odometry
+from stillmap.simulation import laser, odometry, sweep
 from stillmap.simulation.motion import Motion, Progress, move
 from stillmap.simulation.scene import Scene
+from stillmap.simulation.sweep import Sweep
 from stillmap.simulation.truth import Truth
 
 Float = NDArray[np.float64]
@@ -77,8 +78,7 @@ def _record(
     o, T = scene.laser, len(motion.robot)
     T_base_sensor = se2.matrix(o.x, o.y, o.yaw)[None]
     angles = laser.beam_angles(o.beams, o.fov)
-    poses = se2.parameters(se2.matrix(*motion.robot.T) @ T_base_sensor)
-    exact = laser.cast(poses, angles, walls, motion.people, motion.outlines)
+    exact = sweep.cast(motion, walls, T_base_sensor[0], o)
     is_glass = np.zeros(len(walls), bool)
     is_glass[len(scene.walls) : len(scene.walls) + len(scene.glass)] = True
     ranges, hit = laser.measure(exact, is_glass, o, rng)
@@ -93,6 +93,7 @@ def _record(
         sensor=np.zeros(T, np.int32),
         T_odom_base=T_odom_base,
         source=_source(scene, seed, angles),
+        beam_time=np.tile(Sweep.of(o).beam_times(o.beams), T) if o.sweep_time > 0 else None,
     )
     return recording, np.where(hit, exact.mover, np.int32(-1)).ravel()
 

@@ -1,0 +1,103 @@
+"""A scan takes time: its beams are taken one after the other, while robot and movers go on."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import se2
+from stillmap.simulation import laser
+from stillmap.simulation.laser import Movers, Outlines, Returns
+from stillmap.simulation.motion import Motion
+from stillmap.simulation.scene import LaserOptions
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_GROUPS = 64  # at most, in which the beams of a scan are taken; those of a group at once
+_TOGETHER = 1000  # groups of beams worked on together
+_SURELY = 10.0  # standard deviations of a range
+_FASTEST = 40.0  # m/s; what is farther away at the next scan has begun its lane again
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """When the beams of a scan are taken.
+
+    Attributes:
+        group: how many beams are taken at once; the last group may be smaller.
+        seconds: (G,) after the scan's stamp, of each group.
+    """
+
+    group: int
+    seconds: Float
+
+    @classmethod
+    def of(cls, options: LaserOptions) -> "Sweep":
+        """The sweep of a laser: times grow with the beams' angles, the field of view takes all."""
+        n = options.beams
+        if options.sweep_time == 0:
+            return cls(n, np.zeros(1))
+        group = max(2, math.ceil(n / _GROUPS))
+        first = np.arange(0, n, group)
+        middle = (first + np.minimum(first + group, n) - 1) / 2
+        angles = laser.beam_angles(n, options.fov)
+        share = middle * (angles[1] - angles[0]) / options.fov
+        return cls(group, options.sweep_time * share)
+
+    def beam_times(self, beams: int) -> NDArray[np.float32]:
+        """(n,) seconds after the stamp, of each beam of a scan."""
+        return np.repeat(self.seconds, self.group)[:beams].astype(np.float32)
+
+
+def cast(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOptions) -> Returns:
+    """The nearest thing on every beam of every scan.
+
+    Args:
+        motion: where everything is at T scans.
+        walls: (W, 4) segments in metres.
+        T_base_sensor: (3, 3) where the laser sits.
+        o: the laser.
+    """
+    sweep, angles = Sweep.of(o), laser.beam_angles(o.beams, o.fov)
+    T, G = len(motion.robot), len(sweep.seconds)
+    reach = o.max_range + _SURELY * o.range_noise
+    # a group of beams is a scan of its own, turned so that the first group's angles fit
+    turned = np.arange(G) * sweep.group * (angles[1] - angles[0])
+    block = max(1, _TOGETHER // G)
+    parts = []
+    for first in range(0, T, block):
+        scans = np.arange(first, min(first + block, T))
+        now = _Moment(motion, np.repeat(scans, G), np.tile(sweep.seconds, len(scans)))
+        poses = se2.parameters(se2.matrix(*now.robot.T) @ T_base_sensor)
+        poses[:, 2] += np.tile(turned, len(scans))
+        part = laser.cast(poses, angles[: sweep.group], walls, now.people, now.outlines, reach)
+        parts.append([values.reshape(-1, G * sweep.group)[:, : o.beams] for values in part])
+    return Returns(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+class _Moment:
+    """Where everything is at N times: `seconds` (N,) after the stamps of `scans` (N,).
+
+    Between two scans all goes on evenly; after the last as before it.
+    """
+
+    def __init__(self, motion: Motion, scans: Index, seconds: Float) -> None:
+        later = seconds / motion.period
+        last = len(motion.robot) - np.where(later > 0, 2, 1)
+        self._scan, self._leap = scans, _FASTEST * motion.period
+        self._before = np.maximum(np.minimum(scans + later.astype(np.int64), last), 0)
+        self._share = scans + later - self._before
+        people, outlines = motion.people, motion.outlines
+        self.robot = self._at(motion.robot)
+        xy, heading = self._at(people.xy), self._at(people.heading)
+        self.people = Movers(xy, heading, people.semi_axes, people.mover)
+        self.outlines = Outlines(self._at(outlines.faces), outlines.mover)
+
+    def _at(self, values: Float) -> Float:
+        before = values[self._before]
+        change = values[np.minimum(self._before + 1, len(values) - 1)] - before
+        share = self._share.reshape(-1, *[1] * (values.ndim - 1))
+        leaps = np.abs(change) > self._leap
+        return np.where(leaps, values[self._scan], before + share * change)
