@@ -136,7 +136,7 @@ def test_what_begins_its_lane_again_is_not_seen_on_the_way_back() -> None:
     assert np.isinf(returns.range[1]).all()
 
 
-def test_cars_are_seen_where_they_are(end_points: EndPoints) -> None:
+def test_cars_are_seen_where_they_are() -> None:
     """With cars at 10 m/s a sweep of 0.1 s shows them up to a metre on."""
     changes = {"robot": {"scans": 60}, "laser": {"beams": 91, "sweep_time": 0.1, **EXACT}}
     run = simulate(scene_by_name("street", changes), 3)

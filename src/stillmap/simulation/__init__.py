@@ -1,16 +1,14 @@
 """Simulated recordings of places where people, doors and cars move, with the truth of each beam."""
 
-from stillmap.simulation.scene import (
+from stillmap.simulation.options import (
     CrowdOptions,
-    Door,
     DoorOptions,
-    Lane,
     LaserOptions,
     OdometryOptions,
     RobotOptions,
-    Scene,
     TrafficOptions,
 )
+from stillmap.simulation.scene import Door, Lane, Scene
 from stillmap.simulation.simulator import Simulation, simulate
 from stillmap.simulation.truth import Truth, load_truth
 from stillmap.simulation.worlds import SCENES, scene_by_name

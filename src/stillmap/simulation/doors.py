@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.simulation.scene import Door, DoorOptions
+from stillmap.simulation.options import DoorOptions
+from stillmap.simulation.scene import Door
 
 Float = NDArray[np.float64]
 

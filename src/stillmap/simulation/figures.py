@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.simulation.free_space import FreeSpace
+from stillmap.simulation.options import Shape
 from stillmap.simulation.people import Crowd
-from stillmap.simulation.scene import Shape
 
 Float = NDArray[np.float64]
 

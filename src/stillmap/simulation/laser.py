@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.simulation.scene import LaserOptions
+from stillmap.simulation.options import LaserOptions
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import se2
-from stillmap.simulation.scene import OdometryOptions
+from stillmap.simulation.options import OdometryOptions
 
 Float = NDArray[np.float64]
 

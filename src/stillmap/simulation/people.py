@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from stillmap.errors import InputError
 from stillmap.simulation.free_space import FreeSpace, Planner
-from stillmap.simulation.scene import CrowdOptions
+from stillmap.simulation.options import CrowdOptions
 
 Float = NDArray[np.float64]
 

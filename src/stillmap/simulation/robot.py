@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.simulation.free_space import FreeSpace, Planner
-from stillmap.simulation.scene import Point, RobotOptions
+from stillmap.simulation.options import RobotOptions
+from stillmap.simulation.scene import Point
 
 Float = NDArray[np.float64]
 

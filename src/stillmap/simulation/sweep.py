@@ -10,7 +10,7 @@ from stillmap import se2
 from stillmap.simulation import laser
 from stillmap.simulation.laser import Movers, Outlines, Returns
 from stillmap.simulation.motion import Motion
-from stillmap.simulation.scene import LaserOptions
+from stillmap.simulation.options import LaserOptions
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]

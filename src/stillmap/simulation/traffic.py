@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.simulation.scene import Lane, TrafficOptions
+from stillmap.simulation.options import TrafficOptions
+from stillmap.simulation.scene import Lane
 
 Float = NDArray[np.float64]
 

@@ -1,6 +1,7 @@
 """A loop of corridors."""
 
-from stillmap.simulation.scene import CrowdOptions, Point, Scene, Segment
+from stillmap.simulation.options import CrowdOptions
+from stillmap.simulation.scene import Point, Scene, Segment
 from stillmap.simulation.walls import Opening, Side, box, pillar, polyline, room, wall
 
 

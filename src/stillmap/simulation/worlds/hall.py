@@ -1,6 +1,7 @@
 """An exhibition hall."""
 
-from stillmap.simulation.scene import CrowdOptions, Point, Scene
+from stillmap.simulation.options import CrowdOptions
+from stillmap.simulation.scene import Point, Scene
 from stillmap.simulation.walls import Opening, box, pillar, room, wall
 
 

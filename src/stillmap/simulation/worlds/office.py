@@ -3,7 +3,8 @@
 import math
 from dataclasses import dataclass
 
-from stillmap.simulation.scene import CrowdOptions, Door, Point, Scene, Segment
+from stillmap.simulation.options import CrowdOptions
+from stillmap.simulation.scene import Door, Point, Scene, Segment
 from stillmap.simulation.walls import Opening, Side, box, leaf, pillar, room, wall
 
 _THICK = 0.15  # m, of the walls between corridor and rooms

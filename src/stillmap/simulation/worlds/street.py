@@ -4,17 +4,14 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from stillmap.simulation.scene import (
+from stillmap.simulation.options import (
     CrowdOptions,
-    Lane,
     LaserOptions,
     OdometryOptions,
-    Point,
     RobotOptions,
-    Scene,
-    Segment,
     TrafficOptions,
 )
+from stillmap.simulation.scene import Lane, Point, Scene, Segment
 from stillmap.simulation.walls import Opening, Side, box, pillar, wall
 
 INNER, OUTER = 1.75, 5.25  # m from the middle of the road to the middles of the lanes

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from stillmap.simulation.scene import CrowdOptions, Lane, Point, Scene, Segment, TrafficOptions
+from stillmap.simulation.options import CrowdOptions, TrafficOptions
+from stillmap.simulation.scene import Lane, Point, Scene, Segment
 from stillmap.simulation.walls import polyline
 from stillmap.simulation.worlds.street import (
     FRONT,

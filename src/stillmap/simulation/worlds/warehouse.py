@@ -4,14 +4,8 @@ import math
 
 import numpy as np
 
-from stillmap.simulation.scene import (
-    CrowdOptions,
-    Lane,
-    Point,
-    Scene,
-    Segment,
-    TrafficOptions,
-)
+from stillmap.simulation.options import CrowdOptions, TrafficOptions
+from stillmap.simulation.scene import Lane, Point, Scene, Segment
 from stillmap.simulation.walls import Opening, box, pillar, wall
 
 _LAYOUT_SEED = 12  # what stands where is part of the world, not of the recording

@@ -1,0 +1,152 @@
+"""The parameters of a simulation, each default once."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from stillmap.options import field_with_doc
+
+Shape = Literal["legs", "bodies", "mixed"]
+
+
+@dataclass(frozen=True)
+class CrowdOptions:
+    """The people who walk about."""
+
+    people: int = field_with_doc(15, "how many people walk about")
+    # spelled out: ruff takes the default for mutable under an alias
+    shape: Literal["legs", "bodies", "mixed"] = field_with_doc(
+        "mixed", "what the laser sees of a person: legs, bodies, or one half of them each"
+    )
+    min_speed: float = field_with_doc(0.4, "m/s, the slowest walker")
+    max_speed: float = field_with_doc(1.6, "m/s, the fastest walker")
+    stopping_share: float = field_with_doc(0.33, "share of the people who stop now and then")
+    min_stop: float = field_with_doc(2.0, "s, the shortest stop")
+    max_stop: float = field_with_doc(20.0, "s, the longest stop")
+
+    def __post_init__(self) -> None:
+        require(self.people >= 0, "people must not be negative")
+        require(0 < self.min_speed <= self.max_speed, "speeds want 0 < min_speed <= max_speed")
+        require(0 <= self.stopping_share <= 1, "stopping_share must lie in [0, 1]")
+        require(0 <= self.min_stop <= self.max_stop, "stops want 0 <= min_stop <= max_stop")
+
+
+@dataclass(frozen=True)
+class DoorOptions:
+    """How long doors stay as they are; durations are spread evenly in their logarithm."""
+
+    min_open: float = field_with_doc(4.0, "s, the shortest time that a door stays open")
+    max_open: float = field_with_doc(60.0, "s, the longest time that a door stays open")
+    min_closed: float = field_with_doc(5.0, "s, the shortest time that a door stays closed")
+    max_closed: float = field_with_doc(120.0, "s, the longest time that a door stays closed")
+    swing: float = field_with_doc(1.5, "s, from closed to open")
+
+    def __post_init__(self) -> None:
+        for low, high in ((self.min_open, self.max_open), (self.min_closed, self.max_closed)):
+            require(0 < low <= high, "times of doors want 0 < min <= max")
+        require(self.swing > 0, "swing must be positive")
+
+
+@dataclass(frozen=True)
+class TrafficOptions:
+    """The vehicles that drive about on a scene's lanes; queues are part of the lanes."""
+
+    vehicles: int = field_with_doc(10, "how many drive about, spread over the lanes")
+    min_speed: float = field_with_doc(7.0, "m/s, the slowest driver")
+    max_speed: float = field_with_doc(12.0, "m/s, the fastest driver")
+    van_share: float = field_with_doc(0.25, "share of vans among the cars")
+    stopping_share: float = field_with_doc(0.2, "share of the vehicles that stop now and then")
+    min_stop: float = field_with_doc(3.0, "s, the shortest stop")
+    max_stop: float = field_with_doc(12.0, "s, the longest stop")
+
+    def __post_init__(self) -> None:
+        require(self.vehicles >= 0, "vehicles must not be negative")
+        require(0 < self.min_speed <= self.max_speed, "speeds want 0 < min_speed <= max_speed")
+        for share in (self.van_share, self.stopping_share):
+            require(0 <= share <= 1, "shares of vehicles must lie in [0, 1]")
+        require(0 <= self.min_stop <= self.max_stop, "stops want 0 <= min_stop <= max_stop")
+
+
+@dataclass(frozen=True)
+class LaserOptions:
+    """The laser scanner and where it sits on the robot."""
+
+    beams: int = field_with_doc(180, "beams per scan")
+    fov: float = field_with_doc(math.pi, "rad, field of view, centred on the sensor's x axis")
+    max_range: float = field_with_doc(30.0, "m, what lies farther off gives no return")
+    range_noise: float = field_with_doc(0.02, "m, standard deviation of a range")
+    no_return_share: float = field_with_doc(0.002, "share of beams that get lost anywhere")
+    glass_no_return_share: float = field_with_doc(0.3, "share of beams that get lost on glass")
+    sweep_time: float = field_with_doc(
+        0.0, "s, that it takes to look through its field of view; 0: all beams at once"
+    )
+    x: float = field_with_doc(0.08, "m, sensor ahead of the base centre")
+    y: float = field_with_doc(0.0, "m, sensor to the left of the base centre")
+    yaw: float = field_with_doc(0.0, "rad, sensor against the base")
+
+    def __post_init__(self) -> None:
+        require(self.beams >= 2, "beams must be at least 2")
+        require(0 < self.fov <= 2 * math.pi + 1e-9, "fov must lie in (0, 2 pi]")
+        require(self.max_range > 0, "max_range must be positive")
+        require(self.sweep_time >= 0, "sweep_time must not be negative")
+        require(self.range_noise >= 0, "range_noise must not be negative")
+        for share in (self.no_return_share, self.glass_no_return_share):
+            require(0 <= share <= 1, "shares of lost beams must lie in [0, 1]")
+
+
+@dataclass(frozen=True)
+class RobotOptions:
+    """How the robot drives and how often it scans."""
+
+    speed: float = field_with_doc(0.5, "m/s, on a free way")
+    turn_rate: float = field_with_doc(0.8, "rad/s, the fastest turn")
+    radius: float = field_with_doc(0.22, "m, the robot's footprint is a disc")
+    patience: float = field_with_doc(3.0, "s, wait for somebody in the way before creeping on")
+    scan_rate: float = field_with_doc(5.0, "Hz, scans per second")
+    scans: int | None = field_with_doc(
+        None, "scans to take, the route again and again; not set: the route once"
+    )
+
+    def __post_init__(self) -> None:
+        require(self.speed > 0 and self.turn_rate > 0, "speed and turn_rate must be positive")
+        require(self.scan_rate > 0, "scan_rate must be positive")
+        require(self.scans is None or self.scans >= 1, "scans must be at least 1")
+
+
+@dataclass(frozen=True)
+class OdometryOptions:
+    """Errors of a differential drive's odometry; 0 everywhere gives perfect odometry."""
+
+    wheel_radius_error: float = field_with_doc(
+        0.0005, "relative, standard deviation per wheel, drawn once"
+    )
+    wheel_base_error: float = field_with_doc(0.01, "relative, standard deviation, drawn once")
+    wheel_base: float = field_with_doc(0.4, "m, distance between the wheels")
+    translation_noise: float = field_with_doc(
+        0.01, "m per sqrt(m) driven, standard deviation along the way"
+    )
+    rotation_noise: float = field_with_doc(
+        0.02, "rad per sqrt(rad) turned, standard deviation of the heading"
+    )
+    drift_noise: float = field_with_doc(
+        0.008, "rad per sqrt(m) driven, standard deviation of the heading"
+    )
+    slip_rate: float = field_with_doc(0.0, "per metre driven, how often a wheel begins to slip")
+    slip: float = field_with_doc(
+        0.3, "relative, a slipping wheel turns farther by half to one and a half times this much"
+    )
+    slip_length: float = field_with_doc(0.5, "m, the way on which it goes on slipping")
+
+    def __post_init__(self) -> None:
+        require(self.wheel_base > 0, "wheel_base must be positive")
+        values: tuple[float, ...]
+        values = (self.wheel_radius_error, self.wheel_base_error, self.translation_noise)
+        values += (self.rotation_noise, self.drift_noise, self.slip_rate, self.slip)
+        require(min(values) >= 0, "errors must be >= 0")
+        require(self.slip_length > 0, "slip_length must be positive")
+
+
+def require(condition: bool, message: str) -> None:
+    """A ValueError that says what is wrong, unless `condition` holds."""
+    if not condition:
+        raise ValueError(message)
