@@ -12,16 +12,21 @@ from stillmap.simulation.free_space import distance_to_segment
 
 Float = NDArray[np.float64]
 
-# scans that show enough of a world; None: its whole route
-WORLDS = {"office": 500, "warehouse": 300, "street": 400, "street-turn": None}
+# scans that show enough of a world; none: its whole route
+WORLDS: dict[str, dict[str, float]] = {
+    "office": {"scans": 500},
+    "warehouse": {"scans": 300},
+    "street": {"scans": 400},
+    "street-turn": {},
+    "drive": {"scan_rate": 10.0},
+}
 
 
 @functools.cache
 def _run(name: str) -> Simulation:
     if name in WORLDS:
         laser = {"beams": 91, "range_noise": 0.0, "no_return_share": 0.0}
-        robot = {"scans": WORLDS[name]}
-        return simulate(scene_by_name(name, {"laser": laser, "robot": robot}), 3)
+        return simulate(scene_by_name(name, {"laser": laser, "robot": WORLDS[name]}), 3)
     if name != "crowded":
         return simulate(scene_by_name(name), 3)
     people = {"people": 60, "stopping_share": 1.0, "max_stop": 60.0, "shape": "legs"}

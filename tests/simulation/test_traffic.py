@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap.simulation import Lane, TrafficOptions
+from stillmap.simulation import Lane, Light, TrafficOptions
 from stillmap.simulation.traffic import Traffic
 
 Float = NDArray[np.float64]
@@ -93,6 +93,30 @@ def test_a_queue_waits_for_the_robot_and_then_drives_off_one_by_one() -> None:
     begins = np.argmax(going[:, :, 0] > going[0, :, 0] + 0.1, axis=0)
     assert np.all(np.diff(begins) > 0)
     assert going[-1, -1, 0] > 110.0
+
+
+def test_it_stops_at_a_red_light_and_goes_on_when_it_is_green() -> None:
+    lane = Lane(STRAIGHT.path, lights=(Light((150.0, 0.0), (0.0, 40.0), 200.0),))
+    two = traffic(lane, 1, vehicles=2, stopping_share=0.0, min_speed=9.0, max_speed=9.0)
+    poses = driven(two, 600)[..., 0]
+    rear, ahead = np.argsort(poses[0])
+    if poses[0, ahead] > 145:  # the one that is past the light already comes round to it last
+        rear, ahead = ahead, rear
+    front = poses[:, ahead] + two.size[ahead, 0] / 2
+    red = slice(250, 400)
+    np.testing.assert_allclose(front[red], front[300], atol=0.2)
+    assert 150.0 - 3.0 < front[300] < 150.0
+    assert front[401:600].max() > 200.0
+
+
+def test_whoever_is_too_near_to_the_light_drives_on() -> None:
+    lane = Lane(STRAIGHT.path, lights=(Light((150.0, 0.0), (0.0, 1e4), 1e5),))
+    one = traffic(lane, 1, vehicles=1, stopping_share=0.0, min_speed=12.0, max_speed=12.0)
+    reach = one.poses()[0, 0]
+    near = Light((reach + one.size[0, 0] / 2 + 6.0, 0.0), (0.0, 1e4), 1e5)
+    late = traffic(Lane(STRAIGHT.path, lights=(near,)), 1, vehicles=1, stopping_share=0.0,
+                   min_speed=12.0, max_speed=12.0)  # fmt: skip
+    assert driven(late, 20)[-1, 0, 0] > reach + 15.0
 
 
 def test_whoever_cuts_in_is_not_run_over() -> None:

@@ -109,6 +109,7 @@ def test_what_each_world_is_for(run: Callable[[str], Simulation]) -> None:
     shares = {}
     for name, kind in (
         ("office", "door"), ("warehouse", "forklift"), ("street", "car"), ("street-turn", "car"),
+        ("drive", "car"),
     ):  # fmt: skip
         world = run(name)
         met = world.truth.mover[world.recording.hit]
@@ -118,6 +119,7 @@ def test_what_each_world_is_for(run: Callable[[str], Simulation]) -> None:
     assert shares["warehouse"] > 0.0003  # its far end
     assert shares["street"] > 0.05
     assert shares["street-turn"] > 0.05
+    assert shares["drive"] > 0.05
 
 
 def test_waiting_cars_stand_still_while_in_view_and_drive_on_later(

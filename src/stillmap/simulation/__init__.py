@@ -8,7 +8,7 @@ from stillmap.simulation.options import (
     RobotOptions,
     TrafficOptions,
 )
-from stillmap.simulation.scene import Door, Lane, Scene
+from stillmap.simulation.scene import Door, Lane, Light, Scene
 from stillmap.simulation.simulator import Simulation, simulate
 from stillmap.simulation.truth import Truth, load_truth
 from stillmap.simulation.worlds import SCENES, scene_by_name
@@ -21,6 +21,7 @@ __all__ = [
     "DoorOptions",
     "Lane",
     "LaserOptions",
+    "Light",
     "OdometryOptions",
     "RobotOptions",
     "Scene",

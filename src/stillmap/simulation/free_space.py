@@ -1,5 +1,6 @@
 """Where there is room between walls, and the shortest way through it."""
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -95,12 +96,22 @@ class Planner:
         rank[labels] = np.arange(len(labels))
         self._part = rank[parts].ravel()
         self.parts = len(labels)
-        part = (self._part >= 0).reshape(self._shape)
-        self._graph = _graph(part, space.clearance[::_STRIDE, ::_STRIDE], clearance)
-        _, nearest = ndimage.distance_transform_edt(~part, return_indices=True)
-        self._nearest = nearest[0] * self._shape[1] + nearest[1]
-        self.nodes = np.flatnonzero(part)
+        self._least = clearance
+        self.nodes = np.flatnonzero(self._part >= 0)
         self._trees: dict[int, NDArray[np.int32]] = {}
+
+    # only built where a way has to be looked for: in a town that takes long
+
+    @cached_property
+    def _graph(self) -> sparse.csr_array:
+        part = (self._part >= 0).reshape(self._shape)
+        return _graph(part, self._space.clearance[::_STRIDE, ::_STRIDE], self._least)
+
+    @cached_property
+    def _nearest(self) -> NDArray[Any]:
+        part = (self._part >= 0).reshape(self._shape)
+        _, nearest = ndimage.distance_transform_edt(~part, return_indices=True)
+        return np.asarray(nearest[0] * self._shape[1] + nearest[1])
 
     def _label_at(self, parts: NDArray[Any], xy: Float, clearance: float) -> int:
         at = np.round((xy - self._space.origin) / (_SPACING * _STRIDE)).astype(int)
@@ -125,20 +136,22 @@ class Planner:
         """The reachable node nearest to a point (2,)."""
         at = np.round((xy - self._space.origin) / (_SPACING * _STRIDE)).astype(int)
         column, row = np.clip(at, 0, (self._shape[1] - 1, self._shape[0] - 1))
-        return int(self._nearest[row, column])
+        here = int(row) * self._shape[1] + int(column)
+        return here if self._part[here] >= 0 else int(self._nearest[row, column])
 
     def path(self, start: Float, goal: int) -> Float:
         """(K, 2) corner points of a short way from a point (2,) to a node, the start left out."""
         if goal not in self._trees:
+            end = int(np.searchsorted(self.nodes, goal))
             _, previous = csgraph.dijkstra(
-                self._graph, directed=False, indices=[goal], return_predecessors=True
+                self._graph, directed=False, indices=[end], return_predecessors=True
             )
             self._trees[goal] = previous[0]
         tree = self._trees[goal]
-        chain = [self.node(start)]
-        while chain[-1] != goal:
+        chain = [int(np.searchsorted(self.nodes, self.node(start)))]
+        while tree[chain[-1]] >= 0:
             chain.append(int(tree[chain[-1]]))
-        return self._pulled_tight(start, self.point(np.array(chain)))
+        return self._pulled_tight(start, self.point(self.nodes[chain]))
 
     def sees(self, start: Float, ends: Float) -> NDArray[np.bool_]:
         """Whether the straight ways from a point (2,) to points (K, 2) keep the clearance."""
@@ -162,9 +175,12 @@ class Planner:
 
 
 def _graph(part: NDArray[np.bool_], clearance: Float, least: float) -> sparse.csr_array:
-    """Neighbouring nodes of `part`, eight around each; ways along walls cost a little more."""
+    """Neighbouring nodes of `part`, eight around each; ways along walls cost a little more.
+
+    The nodes are numbered as they come in `part`, those outside left out.
+    """
     H, W = part.shape
-    index = np.arange(H * W).reshape(H, W)
+    index = np.cumsum(part).reshape(H, W) - 1
     slow = 1.0 + _NEAR_WALL_COST * np.exp(-(clearance - least) / 0.3)
     rows, columns, costs = [], [], []
     for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
@@ -176,4 +192,4 @@ def _graph(part: NDArray[np.bool_], clearance: Float, least: float) -> sparse.cs
         length = _SPACING * _STRIDE * np.hypot(dx, dy)
         costs.append(length * (slow[here][both] + slow[there][both]) / 2)
     data = (np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns)))
-    return sparse.csr_array(data, shape=(H * W, H * W))
+    return sparse.csr_array(data, shape=(np.count_nonzero(part),) * 2)

@@ -87,7 +87,8 @@ class _World:
         space = FreeSpace(np.array([*scene.walls, *scene.glass, *scene.kerbs, *leaves], float))
         planner = Planner(space, start, o.radius + _ROBOT_MARGIN)
         closed = o.scans is not None
-        self.robot = Robot(plan_way(scene.route, planner, closed), space, o, closed)
+        way = plan_way(scene.route, planner, closed)
+        self.robot = Robot(way, space, o, closed, scene.lights)
         people_at = np.array(scene.people_at or scene.route[:1], float)
         people_planner = Planner(space, people_at, BODY_RADIUS + _PERSON_MARGIN)
         self.crowd = Crowd(scene.crowd, space, people_planner, start, rngs[0])

@@ -99,6 +99,9 @@ class RobotOptions:
     """How the robot drives and how often it scans."""
 
     speed: float = field_with_doc(0.5, "m/s, on a free way")
+    acceleration: float | None = field_with_doc(
+        None, "m/s^2, at most, gaining speed, braking, and sideways in curves; not set: no limit"
+    )
     turn_rate: float = field_with_doc(0.8, "rad/s, the fastest turn")
     radius: float = field_with_doc(0.22, "m, the robot's footprint is a disc")
     patience: float = field_with_doc(3.0, "s, wait for somebody in the way before creeping on")
@@ -109,6 +112,7 @@ class RobotOptions:
 
     def __post_init__(self) -> None:
         require(self.speed > 0 and self.turn_rate > 0, "speed and turn_rate must be positive")
+        require(self.acceleration is None or self.acceleration > 0, "acceleration must be positive")
         require(self.scan_rate > 0, "scan_rate must be positive")
         require(self.scans is None or self.scans >= 1, "scans must be at least 1")
 

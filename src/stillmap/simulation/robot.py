@@ -5,7 +5,8 @@ from numpy.typing import NDArray
 
 from stillmap.simulation.free_space import FreeSpace, Planner
 from stillmap.simulation.options import RobotOptions
-from stillmap.simulation.scene import Point
+from stillmap.simulation.pace import Pace
+from stillmap.simulation.scene import Light, Point
 
 Float = NDArray[np.float64]
 
@@ -27,15 +28,23 @@ class Robot:
         arrived: it is at the end of its way (never, if that is closed).
     """
 
-    def __init__(self, way: Float, space: FreeSpace, options: RobotOptions, closed: bool) -> None:
+    def __init__(
+        self,
+        way: Float,
+        space: FreeSpace,
+        options: RobotOptions,
+        closed: bool,
+        lights: tuple[Light, ...] = (),
+    ) -> None:
         self._way, self._space, self._options, self._closed = way, space, options, closed
+        self._pace = Pace(way, closed, options, lights)
+        self._seconds, self._speed = 0.0, 0.0
         first = way[min(1, len(way) - 1)] - way[0]
         self.pose: Float = np.array([*way[0], np.arctan2(first[1], first[0])])
         self.impatient = False
         self.arrived = False
         self._at = 0
         self._waited = 0.0
-        self._carrot = round(max(_CARROT, _CARROT_TIME * options.speed) / _SPACING)
 
     def step(self, dt: float, people: Float, contact: float) -> None:
         """Drive for dt seconds.
@@ -48,16 +57,20 @@ class Robot:
         self._advance()
         o = self._options
         x, y, theta = self.pose
-        to = self._way[self._ahead(self._carrot)[-1]] - self.pose[:2]
+        to = self._way[self._ahead(self._carrot())[-1]] - self.pose[:2]
         error = np.arctan2(to[1], to[0]) - theta
         error = (error + np.pi) % (2 * np.pi) - np.pi
         turn = float(np.clip(2.0 * error, -o.turn_rate, o.turn_rate))
-        speed = o.speed * max(0.0, 1.0 - abs(error) / _TURN_IN_PLACE)
+        past = (x - self._way[self._at, 0]) * np.cos(theta)
+        past += (y - self._way[self._at, 1]) * np.sin(theta)
+        speed = self._pace.allowed(self._at, float(past), self._speed, self._seconds, dt)
+        speed = self._pace.gained(speed * self._facing(error), self._speed, dt)
         speed = self._careful(dt, min(speed, np.hypot(*to) / dt), people, contact)
         middle = theta + turn * dt / 2
         new = np.array([x + speed * dt * np.cos(middle), y + speed * dt * np.sin(middle)])
         if not self._is_free(new, people, contact):
-            new = self.pose[:2]
+            new, speed = self.pose[:2], 0.0
+        self._seconds, self._speed = self._seconds + dt, float(speed)
         self.pose = np.array([new[0], new[1], theta + turn * dt])
 
     def undisturbed_time(self) -> float:
@@ -73,8 +86,23 @@ class Robot:
         last = len(self._way) - 1
         return ahead % len(self._way) if self._closed else np.minimum(ahead, last)
 
+    def _facing(self, error: float) -> float:
+        """How much of its speed it drives so many rad off its way; what brakes slowly, later."""
+        share = 1.0 - abs(error) / _TURN_IN_PLACE
+        if self._options.acceleration is not None:
+            share = min(1.0, 1.0 + share)
+        return max(0.0, share)
+
+    def _fast(self) -> float:
+        """m/s, the speed that it looks ahead for: its own, if it takes time to change that."""
+        return self._options.speed if self._options.acceleration is None else self._speed
+
+    def _carrot(self) -> int:
+        """How many points of the way ahead the one is that it steers for."""
+        return round(max(_CARROT, _CARROT_TIME * self._fast()) / _SPACING)
+
     def _advance(self) -> None:
-        ahead = self._ahead(2 * self._carrot)
+        ahead = self._ahead(2 * self._carrot())
         nearest = int(ahead[np.argmin(np.hypot(*(self._way[ahead] - self.pose[:2]).T))])
         self.arrived = not self._closed and nearest == len(self._way) - 1
         self._at = nearest
@@ -84,9 +112,9 @@ class Robot:
         c, s = np.cos(self.pose[2]), np.sin(self.pose[2])
         dx, dy = (people - self.pose[:2]).T
         x, y = c * dx + s * dy, c * dy - s * dx
-        sees = max(_SEES_AHEAD, contact + 0.1 + _SEES_AHEAD_TIME * self._options.speed)
+        sees = max(_SEES_AHEAD, contact + 0.1 + _SEES_AHEAD_TIME * self._fast())
         ahead = (x > 0) & (x < sees) & (np.abs(y) < contact)
-        gap = float(x[ahead].min(initial=sees)) - contact
+        gap = float(x[ahead].min(initial=np.inf)) - contact
         allowed = max(0.0, gap - 0.1)
         if speed > 0 and allowed < 0.1:
             self._waited += dt

@@ -42,6 +42,25 @@ class Door:
 
 
 @dataclass(frozen=True)
+class Light:
+    """A traffic light.
+
+    Attributes:
+        at: metres, where the first one stops: a point of the robot's route or of a lane.
+        red: seconds from when to when it is red, for the first time.
+        cycle: seconds until it is red again.
+    """
+
+    at: Point
+    red: tuple[float, float]
+    cycle: float
+
+    def is_red(self, seconds: float) -> bool:
+        """Whether it is red so many seconds after the recording began."""
+        return (seconds - self.red[0]) % self.cycle < self.red[1] - self.red[0]
+
+
+@dataclass(frozen=True)
 class Lane:
     """Where vehicles drive: from the first point to the last, then from the first again.
 
@@ -52,6 +71,7 @@ class Lane:
         waiting: vehicles that stand in a queue. A lane with a queue has no others.
         stop: metres along the path, where the first of the queue stands.
         go: metres, the queue drives on when the robot comes by here.
+        lights: where vehicles stop while it is red.
     """
 
     path: tuple[Point, ...]
@@ -59,6 +79,7 @@ class Lane:
     waiting: int = 0
     stop: float = 0.0
     go: Point = (0.0, 0.0)
+    lights: tuple[Light, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -75,6 +96,7 @@ class Scene:
             part it; not given: where the robot starts.
         leaves: doors that swing.
         lanes: where vehicles drive.
+        lights: where the robot stops while it is red.
     """
 
     name: str
@@ -85,6 +107,7 @@ class Scene:
     people_at: tuple[Point, ...] = ()
     leaves: tuple[Door, ...] = ()
     lanes: tuple[Lane, ...] = ()
+    lights: tuple[Light, ...] = ()
     crowd: CrowdOptions = field(default_factory=CrowdOptions)
     doors: DoorOptions = field(default_factory=DoorOptions)
     traffic: TrafficOptions = field(default_factory=TrafficOptions)

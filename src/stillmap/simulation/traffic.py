@@ -30,6 +30,7 @@ class Traffic:
     def __init__(
         self, lanes: tuple[Lane, ...], options: TrafficOptions, rng: np.random.Generator
     ) -> None:
+        self._seconds = 0.0
         self._lanes = [_Track(lane) for lane in lanes]
         self._options, self._rng = options, rng
         self._lane = np.array(_spread(lanes, options.vehicles), np.int64)
@@ -74,6 +75,7 @@ class Traffic:
             radius: m, of the robot.
         """
         self._release(robot)
+        self._seconds += dt
         self._stop_left = np.maximum(self._stop_left - dt, 0.0)
         wanted = np.where(self._waits | (self._stop_left > 0), 0.0, self._wanted)
         gap = self._gaps(robot, radius)
@@ -113,9 +115,20 @@ class Traffic:
                 ahead = np.roll(on, -1)
                 between = (self._at[ahead] - self._at[on]) % track.length
                 gaps[on] = between - (self.size[on, 0] + self.size[ahead, 0]) / 2
+            gaps[on] = np.minimum(gaps[on], self._to_red_light(track, on))
             if track.distance(robot) < radius + _ASIDE + self.size[on, 1].max(initial=0.0) / 2:
                 between = (track.nearest(robot) - self._at[on]) % track.length
                 gaps[on] = np.minimum(gaps[on], between - self.size[on, 0] / 2 - radius)
+        return gaps
+
+    def _to_red_light(self, track: "_Track", on: NDArray[np.int64]) -> Float:
+        """(N,) metres from the vehicles `on` a lane to the next red light that they can stop at."""
+        gaps = np.full(len(on), np.inf)
+        for light, line in zip(track.lane.lights, track.lines, strict=True):
+            if light.is_red(self._seconds):
+                gap = (line - self._at[on]) % track.length - self.size[on, 0] / 2
+                stops = gap > self.speed[on] ** 2 / (2 * _BRAKING)
+                gaps = np.where(stops, np.minimum(gaps, gap), gaps)
         return gaps
 
     def _stop_now_and_then(self, way: Float) -> None:
@@ -139,6 +152,7 @@ class _Track:
         self._along, self._corners = along, corners
         self._dense = np.arange(0.0, self.length, _SPACING)
         self._points = self.points(self._dense)
+        self.lines = [self.nearest(np.array(light.at)) for light in lane.lights]
 
     def points(self, at: Float) -> Float:
         """(N, 2) the points at (N,) metres along the lane."""

@@ -8,6 +8,7 @@ from stillmap.errors import InputError
 from stillmap.options import replaced
 from stillmap.simulation.scene import Scene
 from stillmap.simulation.worlds.corridor import corridor
+from stillmap.simulation.worlds.drive import drive
 from stillmap.simulation.worlds.hall import hall
 from stillmap.simulation.worlds.office import office
 from stillmap.simulation.worlds.street import street
@@ -21,6 +22,7 @@ _WORLDS: dict[str, Callable[[], Scene]] = {
     "warehouse": warehouse,
     "street": street,
     "street-turn": street_turn,
+    "drive": drive,
 }
 
 
