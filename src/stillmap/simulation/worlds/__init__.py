@@ -7,6 +7,7 @@ from typing import Any
 from stillmap.errors import InputError
 from stillmap.options import replaced
 from stillmap.simulation.scene import Scene
+from stillmap.simulation.worlds.building import building
 from stillmap.simulation.worlds.corridor import corridor
 from stillmap.simulation.worlds.drive import drive
 from stillmap.simulation.worlds.hall import hall
@@ -14,6 +15,8 @@ from stillmap.simulation.worlds.office import office
 from stillmap.simulation.worlds.street import street
 from stillmap.simulation.worlds.street_turn import street_turn
 from stillmap.simulation.worlds.warehouse import warehouse
+
+_EMPTY = "-empty"
 
 _WORLDS: dict[str, Callable[[], Scene]] = {
     "hall": hall,
@@ -23,7 +26,9 @@ _WORLDS: dict[str, Callable[[], Scene]] = {
     "street": street,
     "street-turn": street_turn,
     "drive": drive,
+    "building": building,
 }
+_GROWING: dict[str, Callable[[int], Scene]] = {"building": building}  # given the number of scans
 
 
 def _crowded(scene: Scene, people: int) -> Scene:
@@ -31,38 +36,50 @@ def _crowded(scene: Scene, people: int) -> Scene:
     return dataclasses.replace(scene, name=f"{scene.name}-crowd", crowd=crowd)
 
 
-def _empty(world: Callable[[], Scene]) -> Callable[[], Scene]:
+def _empty(scene: Scene) -> Scene:
     """The world with nobody in it, all doors open for good, and no vehicles but the parked ones."""
+    return dataclasses.replace(
+        scene,
+        name=f"{scene.name}{_EMPTY}",
+        walls=(*scene.walls, *(door.leaf(door.opened) for door in scene.leaves)),
+        leaves=(),
+        lanes=(),
+        crowd=dataclasses.replace(scene.crowd, people=0),
+        traffic=dataclasses.replace(scene.traffic, vehicles=0),
+    )
 
-    def build() -> Scene:
-        scene = world()
-        return dataclasses.replace(
-            scene,
-            name=f"{scene.name}-empty",
-            walls=(*scene.walls, *(door.leaf(door.opened) for door in scene.leaves)),
-            leaves=(),
-            lanes=(),
-            crowd=dataclasses.replace(scene.crowd, people=0),
-            traffic=dataclasses.replace(scene.traffic, vehicles=0),
-        )
 
-    return build
+def _emptied(world: Callable[[], Scene]) -> Callable[[], Scene]:
+    return lambda: _empty(world())
+
+
+def _grown(name: str, scans: int) -> Scene | None:
+    """The world as large as a robot that takes so many scans needs it; None: it has one size."""
+    grow = _GROWING.get(name.removesuffix(_EMPTY))
+    if grow is None or scans < 1:
+        return None
+    return _empty(grow(scans)) if name.endswith(_EMPTY) else grow(scans)
 
 
 SCENES: dict[str, Callable[[], Scene]] = {
     **_WORLDS,
     "hall-crowd": lambda: _crowded(hall(), 60),
     "corridor-crowd": lambda: _crowded(corridor(), 40),
-    **{f"{name}-empty": _empty(world) for name, world in _WORLDS.items()},
+    **{f"{name}{_EMPTY}": _emptied(world) for name, world in _WORLDS.items()},
 }
 
 
 def scene_by_name(name: str, changes: Mapping[str, Any] | None = None) -> Scene:
     """The scene of that name, with `changes` such as `{"laser": {"beams": 360}}` applied.
 
+    A building grows with the number of scans in `changes`.
+
     Raises:
         InputError: there is no such scene or option, or a value is out of range.
     """
     if name not in SCENES:
         raise InputError(f"there is no scene '{name}'", hint=f"scenes: {', '.join(SCENES)}")
-    return replaced(SCENES[name](), changes or {})
+    robot = (changes or {}).get("robot")
+    scans = robot.get("scans") if isinstance(robot, Mapping) else None
+    scene = _grown(name, scans) if type(scans) is int else None
+    return replaced(scene or SCENES[name](), changes or {})
