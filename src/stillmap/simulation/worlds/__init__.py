@@ -14,6 +14,7 @@ from stillmap.simulation.worlds.hall import hall
 from stillmap.simulation.worlds.office import office
 from stillmap.simulation.worlds.street import street
 from stillmap.simulation.worlds.street_turn import street_turn
+from stillmap.simulation.worlds.ten_corridors import ten_corridors
 from stillmap.simulation.worlds.warehouse import warehouse
 
 _EMPTY = "-empty"
@@ -27,6 +28,7 @@ _WORLDS: dict[str, Callable[[], Scene]] = {
     "street-turn": street_turn,
     "drive": drive,
     "building": building,
+    "ten-corridors": ten_corridors,
 }
 _GROWING: dict[str, Callable[[int], Scene]] = {"building": building}  # given the number of scans
 
