@@ -12,6 +12,7 @@ from stillmap.simulation.worlds.corridor import corridor
 from stillmap.simulation.worlds.drive import drive
 from stillmap.simulation.worlds.hall import hall
 from stillmap.simulation.worlds.office import office
+from stillmap.simulation.worlds.rounds import rounds
 from stillmap.simulation.worlds.street import street
 from stillmap.simulation.worlds.street_turn import street_turn
 from stillmap.simulation.worlds.ten_corridors import ten_corridors
@@ -29,6 +30,7 @@ _WORLDS: dict[str, Callable[[], Scene]] = {
     "drive": drive,
     "building": building,
     "ten-corridors": ten_corridors,
+    "rounds": rounds,
 }
 _GROWING: dict[str, Callable[[int], Scene]] = {"building": building}  # given the number of scans
 
