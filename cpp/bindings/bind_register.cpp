@@ -5,6 +5,7 @@
 #include "bindings.hpp"
 #include "stillmap/register.hpp"
 #include "stillmap/search.hpp"
+#include "stillmap/through.hpp"
 
 namespace stillmap::border {
 namespace {
@@ -67,6 +68,7 @@ auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<flo
   Registration<D> best;
   best.cost = std::numeric_limits<double>::infinity();
   size_t candidates = 0;
+  std::vector<Registration<D>> found;
   {
     nb::gil_scoped_release released;
     Field<D> field(grid, options.field);
@@ -75,18 +77,34 @@ auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<flo
     const auto candidates_found =
         given ? std::vector<Candidate<D>>{{*given, 0.0}} : search.best(static_cast<size_t>(starts));
     for (const auto& start : candidates_found) {
-      const auto found = climb<D>(field, beams, prior, start.pose, options);
-      if (found.cost < best.cost) best = found;
+      found.push_back(climb<D>(field, beams, prior, start.pose, options));
+      if (found.back().cost < best.cost) best = found.back();
     }
     candidates = search.poses_tried();
   }
   constexpr size_t n = Lie<D>::kDof;
+  std::vector<double> rivals;
+  for (const auto& other : found) {
+    const typename Lie<D>::Tangent apart = other.pose.minus(best.pose);
+    rivals.insert(rivals.end(), apart.data(), apart.data() + n);
+    rivals.push_back(other.cost - best.cost);
+  }
   Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof, Eigen::RowMajor> covariance =
       best.information.ldlt().solve(decltype(best.information)::Identity());
   return std::make_tuple(
       matrix_of<D>(best.pose),
       owned(std::vector<double>(covariance.data(), covariance.data() + n * n), {n, n}), best.cost,
-      best.inliers, best.iterations, candidates);
+      best.inliers, best.iterations, candidates, owned(std::move(rivals), {found.size(), n + 1}));
+}
+
+template <int D>
+double through(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
+               const OnePose<D>& T, const OnePose<D>& T_sensor, double margin, double occupied) {
+  require(margin >= 0.0, "margin: expected a length in metres that is not negative");
+  require_probability(occupied, "occupied");
+  const auto beams = beams_from<D>(points, weights);
+  return share_through<D>(grid, beams.points, beams.weights, checked_pose<D>(T, "T"),
+                          checked_pose<D>(T_sensor, "T_sensor").t, margin, occupied);
 }
 
 // The data term alone, as the tests' oracle has it: without the constant ln(floor + 1) of every
@@ -128,8 +146,14 @@ void bind(nb::module_& m) {
       "(9): the pose of one scan against the grid so far. points (N, D) float32 that were hit, in "
       "the moving frame; weights (N,) float32 = e; T_prior (D+1, D+1) and its information "
       "(dof, dof) of (translation, rotation about the moving frame's origin). Returns pose, "
-      "covariance, cost, the share of beams the map explains, Newton steps, lattice poses. With "
+      "covariance, cost, the share of beams the map explains, Newton steps, lattice poses, and "
+      "(R, dof + 1) how far every start ended up from that pose and how much more it cost. With "
       "T_start nothing is searched: Newton steps begin there.");
+  m.def("share_through", &through<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("T_sensor").noconvert(),
+        nb::kw_only(), nb::arg("margin"), nb::arg("occupied"),
+        "Weighted share of beams, from a sensor at T T_sensor to the points at T, that cross a "
+        "cell of at least that occupancy more than `margin` metres before their end.");
   m.def("registration_cost", &cost_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
         nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),

@@ -170,7 +170,7 @@ def iterate(
             loops=mapped.loops,
             held_out=held_out,
             seconds=time.perf_counter() - started,
-            graph=getattr(mapped, "graph", None),
+            graph=mapped.graph,
             no_return=found.no_return,
         )
         e = found.p_static

@@ -15,14 +15,16 @@ from stillmap.slam.pose_graph import Relation
 Float = NDArray[np.float64]
 
 _NEAR = np.array([8.0, 4.0])  # keyframes on the earlier and on the later side that count as nearby
+_ANYWHERE = [1e3, 1e3, 10.0]  # m, m, rad: a step that nobody saw
 _LEAP = 3.0  # standard deviations of the motion prior beyond which an increment is a leap
 
 
-def relations(track: Track, options: MotionOptions) -> list[Relation]:
+def relations(track: Track, options: MotionOptions, breaks: list[int]) -> list[Relation]:
     """Relations between successive keyframes, indices into the keyframes.
 
     Their covariances allow for drift, half as much across as along the way. Where odometry
-    contradicts the poses by a leap, the way may be wrong by as much.
+    contradicts the poses by a leap, the way may be wrong by as much. A step across a break, from
+    the scan before it, says nothing.
     """
     frames, poses = track.keyframes, track.poses
     leaps = _leaps(track.recording, poses, options)
@@ -34,6 +36,8 @@ def relations(track: Track, options: MotionOptions) -> list[Relation]:
             if leaps[t].any():
                 to_j = se2.inverse(poses[j]) @ poses[t]
                 covariance += se2.turned(np.outer(leaps[t], leaps[t]), to_j)
+        if j in breaks:
+            covariance = np.diag(np.square(_ANYWHERE))
         chain.append(Relation(k, k + 1, T, covariance))
     return chain
 

@@ -1,5 +1,6 @@
 """Loop closure: find candidates, verify them, solve the graph, spread what it says."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -7,18 +8,18 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.recording.model import Recording
-from stillmap.slam import candidates, chain, keyframes, loops, pose_graph
+from stillmap.slam import candidates, chain, keyframes, loops, pieces, pose_graph
 from stillmap.slam.incremental import Mapped, SlamOptions
 from stillmap.slam.loops import Closure, Track, refuse
-from stillmap.slam.pose_graph import Relation
+from stillmap.slam.pose_graph import Graph, Relation, Robust
 
 Float = NDArray[np.float64]
 
 
 def closed(
     recording: Recording, e: NDArray[np.float32], options: SlamOptions, mapped: Mapped
-) -> tuple[Float, list[Closure]]:
-    """Poses (T, 3, 3) after loop closure, and all attempts at closing a loop.
+) -> Mapped:
+    """Poses after loop closure, all attempts at closing a loop, and the graph.
 
     Args:
         recording: 2D.
@@ -26,36 +27,58 @@ def closed(
         options: see SlamOptions.
         mapped: the incremental result; its grid is not looked at.
     """
+    track, ties, apart = _track(recording, e, options, mapped)
+    way = chain.relations(track, options.motion, mapped.breaks)
+    moved, found = track.poses[track.keyframes], ties
+    attempted, fitting = list[Closure](), ties
+    for first, last in candidates.stages(track):
+        new = loops.attempts(track, candidates.of_stage(track, moved, first, last, fitting))
+        attempted += new
+        if all(closure.refused for closure in new):
+            found = found + new
+            continue
+        found = ties + chain.agreeing_since(track, way, attempted, found[len(ties) :], first)
+        moved, fitting = _corrected(track, way, moved, last, found)
+    moved, found = _solved(track, way, moved, found)
+    accepted = [_relation(track, closure) for closure in found if not closure.refused]
+    return dataclasses.replace(
+        mapped,
+        poses=keyframes.spread(track.poses, track.keyframes, moved),
+        loops=found,
+        graph=Graph(track.keyframes, moved, [*way, *accepted]),
+        apart=apart,
+    )
+
+
+def _track(
+    recording: Recording, e: NDArray[np.float32], options: SlamOptions, mapped: Mapped
+) -> tuple[Track, list[Closure], list[int]]:
+    """What loops are looked for in, with all pieces in their places; see `pieces.placed`."""
+    poses, breaks = mapped.poses, mapped.breaks
+    travelled = keyframes.travel(poses)
+    distance = options.loops.gap + 2.0 * options.loops.stretch
     track = Track(
         recording,
         e,
-        mapped.poses,
-        keyframes.travel(mapped.poses),
+        poses,
+        pieces.separated(travelled, breaks, distance),
         mapped.explained,
-        keyframes.chosen(mapped.poses, options.loops.distance, options.loops.turn),
+        keyframes.chosen(poses, options.loops.distance, options.loops.turn, breaks),
         options.resolution,
         options.registration,
         options.surface,
         options.loops,
     )
-    way = chain.relations(track, options.motion)
-    moved, found = track.poses[track.keyframes], list[Closure]()
-    attempted, ties = list[Closure](), list[Closure]()
-    for first, last in candidates.stages(track):
-        new = loops.attempts(track, candidates.of_stage(track, moved, first, last, ties))
-        attempted += new
-        if all(closure.refused for closure in new):
-            found += new
-            continue
-        found = chain.agreeing_since(track, way, attempted, found, first)
-        moved, ties = _corrected(track, way, moved, last, found)
-    moved, found = _solved(track, way, moved, found)
-    return keyframes.spread(mapped.poses, track.keyframes, moved), found
+    return pieces.placed(track, breaks)
 
 
 def _relation(track: Track, closure: Closure) -> Relation:
     first, second = np.searchsorted(track.keyframes, [closure.earlier, closure.later])
     return Relation(int(first), int(second), closure.T, closure.covariance)
+
+
+def _robust(track: Track) -> Robust:
+    return Robust(track.options.misfit, track.options.annealing)
 
 
 def _corrected(
@@ -70,9 +93,8 @@ def _corrected(
         return poses, []
     relations = [_relation(track, closure) for closure in accepted]
     out = poses.copy()
-    out[:last] = pose_graph.optimised(
-        poses[:last], way[: last - 1], relations, track.options.robust
-    )
+    inside = [relation for relation in relations if relation.second < last]
+    out[:last] = pose_graph.optimised(poses[:last], way[: last - 1], inside, _robust(track))
     out[last:] = out[last - 1] @ se2.inverse(poses[last - 1]) @ poses[last:]
     fit = pose_graph.misfits(out, relations) <= track.options.misfit
     return out, list(itertools.compress(accepted, fit))
@@ -85,7 +107,7 @@ def _solved(
     accepted = [_relation(track, c) for c in found if not c.refused]
     if not accepted:
         return start, found
-    robust = pose_graph.optimised(start, way, accepted, track.options.robust)
+    robust = pose_graph.optimised(start, way, accepted, _robust(track))
     misfits = pose_graph.misfits(robust, [_relation(track, closure) for closure in found])
     found = [
         refuse(closure, "other loops disagree")

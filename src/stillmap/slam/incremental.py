@@ -14,7 +14,13 @@ from stillmap.slam import motion
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.loops import Closure, LoopOptions
 from stillmap.slam.motion import MotionOptions
-from stillmap.slam.registration import RegistrationOptions, register
+from stillmap.slam.pose_graph import Graph
+from stillmap.slam.registration import (
+    Registration,
+    RegistrationOptions,
+    register,
+    share_through,
+)
 from stillmap.slam.scans import SurfaceOptions, hits
 
 Float = NDArray[np.float64]
@@ -55,7 +61,10 @@ class Mapped:
             others where poses were swept only.
         widened: indices of the scans that a wider search had to find.
         disagreeing: indices of the scans where odometry was disbelieved.
+        breaks: first scans after the robot was carried elsewhere.
+        apart: those of them from which on no place was seen that is known from before.
         loops: attempts at closing loops, accepted or refused.
+        graph: the keyframes and what is known of them; None without loop closure.
     """
 
     poses: Float
@@ -64,7 +73,10 @@ class Mapped:
     explained: Float
     widened: list[int]
     disagreeing: list[int] = field(default_factory=list)
+    breaks: list[int] = field(default_factory=list)
+    apart: list[int] = field(default_factory=list)
     loops: list[Closure] = field(default_factory=list)
+    graph: Graph | None = None
 
     def without_grid(self) -> "Mapped":
         """Poses and what is known of them alone: grids are large."""
@@ -91,31 +103,61 @@ def build(
         memory: metres of travel after which a scan is taken out of the map again.
     """
     T = recording.n_scans
-    grid = _core.Grid2D(options.resolution, options.registration.approach)
-    so_far = LocalMap(grid, recording, e, options.spacing, options.surface)
+    so_far = _empty(recording, e, options)
     poses = np.tile(np.eye(3), (T, 1, 1))
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
-    widened, disagreeing = list[int](), list[int]()
+    widened, disagreeing, breaks = list[int](), list[int](), list[int]()
     steadiness = motion.unknown_steadiness(options.motion)
     seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns))) if T > 1 else 0.0
     travelled, usual = 0.0, 1.0
     so_far.add(0, poses[0], 0.0)
     for t in range(1, T):
         prior = _motion_prior(recording, poses, t, steadiness, options.motion)
-        found = register(grid, *hits(recording, e, t), prior, options.registration, usual)
+        beams = hits(recording, e, t)
+        found = register(so_far.grid, *beams, prior, options.registration, usual)
+        if _was_carried(so_far, recording, t, beams, found, usual, options.registration):
+            breaks.append(t)
+            so_far, usual = _empty(recording, e, options), 1.0
+            found = register(so_far.grid, *beams, prior, options.registration, 0.0)
         poses[t], covariance[t], explained[t] = found.T_map_base, found.covariance, found.explained
         if found.widened:
             widened.append(t)
         if found.disagrees:
             disagreeing.append(t)
-        usual += _LATELY * (found.explained - usual)
+        if t not in breaks[-1:]:
+            usual += _LATELY * (found.explained - usual)
         steadiness = steadiness.after(prior.shift_to(poses[t]), seconds, options.motion)
         travelled += float(np.linalg.norm(poses[t, :2, 2] - poses[t - 1, :2, 2]))
         so_far.add(t, poses[t], travelled)
         so_far.forget(travelled - memory)
         progress(t + 1, T)
     nothing = _core.Grid2D(options.resolution)
-    return Mapped(poses, covariance, nothing, explained, widened, disagreeing)
+    return Mapped(poses, covariance, nothing, explained, widened, disagreeing, breaks)
+
+
+def _empty(recording: Recording, e: NDArray[np.float32], options: SlamOptions) -> LocalMap:
+    grid = _core.Grid2D(options.resolution, options.registration.approach)
+    return LocalMap(grid, recording, e, options.spacing, options.surface)
+
+
+def _was_carried(
+    so_far: LocalMap,
+    recording: Recording,
+    t: int,
+    beams: tuple[NDArray[np.float32], NDArray[np.float32]],
+    found: Registration,
+    usual: float,
+    options: RegistrationOptions,
+) -> bool:
+    """Whether scan t contradicts the map, wherever the robot may have moved by itself.
+
+    A scan of a place that is new is explained as little, but it does not look through walls.
+    """
+    if found.explained >= options.carried_below * usual or len(beams[0]) == 0:
+        return False
+    T_base_sensor = recording.T_base_sensor[recording.sensor[t]]
+    through = share_through(so_far.grid, *beams, found.T_map_base, T_base_sensor)
+    return through > options.carried_through
 
 
 def _motion_prior(

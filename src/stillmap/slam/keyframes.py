@@ -1,5 +1,7 @@
 """Keyframes along the way, and how what is found out about them spreads to the other scans."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,8 +17,11 @@ def travel(poses: Float) -> Float:
     return np.concatenate([[0.0], steps.cumsum()])
 
 
-def chosen(poses: Float, distance: float, turn: float) -> Index:
-    """(K,) indices of scans about `distance` metres or `turn` radians apart; first and last too."""
+def chosen(poses: Float, distance: float, turn: float, breaks: Sequence[int] = ()) -> Index:
+    """(K,) indices of scans about `distance` metres or `turn` radians apart.
+
+    The first and the last one are among them, and those before and after each of the breaks.
+    """
     x = se2.parameters(poses)
     metres = np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1)
     radians = np.abs(se2.wrap(np.diff(x[:, 2])))
@@ -28,7 +33,8 @@ def chosen(poses: Float, distance: float, turn: float) -> Index:
             since = 0.0
     if kept[-1] != len(poses) - 1:
         kept.append(len(poses) - 1)
-    return np.array(kept, np.intp)
+    beside = [t + side for t in breaks for side in (-1, 0)]
+    return np.unique(np.array([*kept, *beside], np.intp))
 
 
 def spread(poses: Float, keyframes: Index, moved: Float) -> Float:

@@ -53,8 +53,10 @@ class LoopOptions:
     accept_above: float = field_with_doc(0.5, "share of beams the earlier map must explain")
     compared: float = field_with_doc(0.8, "of the share that the map so far explains, at least")
     agreeing: int = field_with_doc(2, "closures around that must ask for the same correction")
-    robust: float = field_with_doc(1.5, "standard deviations where Cauchy's loss sets in")
     misfit: float = field_with_doc(16.0, "chi-square above which the graph refuses a closure")
+    annealing: int = field_with_doc(
+        8, "solutions in which the weights of closures grow sharp; 1: sharp at once"
+    )
     sweeps: int = field_with_doc(1, "times that all scans are registered against all others")
 
     def __post_init__(self) -> None:
@@ -83,9 +85,9 @@ _LIMITS = (
     ("accept_above", 0.0, 1.0),
     ("compared", 0.0, 1.0),
     ("agreeing", 0, 100),
-    ("robust", 0.01, 100.0),
-    ("misfit", 0.0, 1e9),
-    ("sweeps", 1, 100),
+    ("misfit", 1e-3, 1e9),
+    ("annealing", 1, 1000),
+    ("sweeps", 0, 100),
 )
 
 
@@ -157,8 +159,9 @@ def attempts(track: Track, candidates: Iterable[Candidate]) -> list[Closure]:
         of_stretch.setdefault(stretch, []).append(candidate)
     found = []
     for stretch, those in sorted(of_stretch.items()):
-        grid = _local_map(track, stretch * track.options.stretch)
-        found += [_laid_on(track, grid, candidate) for candidate in those]
+        grid = local_map(track, stretch * track.options.stretch)
+        for candidate in those:
+            found.append(laid_on(track, grid, candidate, *drift(candidate.metres, track.options)))
     return sorted(found, key=lambda closure: closure.later)
 
 
@@ -170,7 +173,7 @@ def drift(metres: float, options: LoopOptions) -> tuple[float, float]:
     )
 
 
-def _local_map(track: Track, centre: float) -> _core.Grid2D:
+def local_map(track: Track, centre: float) -> _core.Grid2D:
     """Scans of one stretch of travel, and no others."""
     half = track.options.stretch
     first, last = np.searchsorted(track.travelled, [centre - half, centre + half])
@@ -193,10 +196,18 @@ def _view(track: Track, t: int) -> tuple[Points, NDArray[np.float32]]:
     return np.concatenate(points), np.concatenate([w for _, w in seen])
 
 
-def _laid_on(track: Track, grid: _core.Grid2D, candidate: Candidate) -> Closure:
-    """The later view registered on the earlier map, as widely as the drift asks for."""
+def laid_on(
+    track: Track, grid: _core.Grid2D, candidate: Candidate, sigma: float, sigma_turn: float
+) -> Closure:
+    """The later view registered on the earlier map, as widely as it may have drifted.
+
+    Args:
+        track: where loops are looked for.
+        grid: the map of an earlier stretch.
+        candidate: the scans, and where the later one is looked for.
+        sigma, sigma_turn: standard deviations of that, in metres and radians.
+    """
     options, earlier, later = track.options, candidate.earlier, candidate.later
-    sigma, sigma_turn = drift(candidate.metres, options)
     information = np.diag([sigma**-2, sigma**-2, sigma_turn**-2])
     predicted = track.poses[earlier] @ candidate.T
     prior = MotionPrior(predicted, information, sigma, sigma_turn)
@@ -212,6 +223,7 @@ def _laid_on(track: Track, grid: _core.Grid2D, candidate: Candidate) -> Closure:
         # what the graph knows of the place is no second witness: the whole way bounds it here
         free = drift(track.travelled[later] - track.travelled[earlier], options)[0]
         covariance += _sliding(grid, *view, found.T_map_base, covariance, free, track.registration)
+        covariance += _ambiguous(found.rivals)
     return Closure(
         earlier,
         later,
@@ -220,6 +232,18 @@ def _laid_on(track: Track, grid: _core.Grid2D, candidate: Candidate) -> Closure:
         found.explained,
         "explains too little" if too_little else "",
     )
+
+
+def _ambiguous(rivals: Float) -> Float:
+    """Covariance (3, 3) to add where the view fits somewhere else about as well.
+
+    That of a mixture about its best part, each part being as probable as its cost says.
+    """
+    p = np.exp(-rivals[:, 3])
+    p /= p.sum()
+    apart = rivals[:, :3]
+    spread: Float = np.einsum("r,ri,rj->ij", p, apart, apart)
+    return spread
 
 
 def _sliding(

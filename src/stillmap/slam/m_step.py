@@ -49,10 +49,8 @@ def m_step(
         progress(recording.n_scans, recording.n_scans)
         return dataclasses.replace(mapped, explained=start.explained)
     local = incremental.build(recording, e, options, progress, options.loops.memory)
-    poses, found = closing.closed(recording, e, options, local)
-    mapped = _swept(
-        recording, e, options, dataclasses.replace(local, poses=poses, loops=found), threads
-    )
+    closed = closing.closed(recording, e, options, local)
+    mapped = _swept(recording, e, options, closed, threads)
     # a scan that went astray explains itself in the map of all: the map so far tells
     return dataclasses.replace(mapped, explained=local.explained)
 

@@ -30,6 +30,19 @@ class Relation:
     covariance: Float
 
 
+@dataclass(frozen=True)
+class Robust:
+    """How loops that others contradict lose their weight.
+
+    Attributes:
+        misfit: chi-square at which a loop is left a quarter of it.
+        steps: solutions with ever sharper weights; 1: sharp at once.
+    """
+
+    misfit: float
+    steps: int
+
+
 @dataclass(frozen=True, eq=False)
 class Graph:
     """What is known of the keyframes of a recording.
@@ -46,17 +59,38 @@ class Graph:
 
 
 def optimised(
-    poses: Float, chain: list[Relation], loops: list[Relation], robust: float | None
+    poses: Float, chain: list[Relation], loops: list[Relation], robust: Robust | None
 ) -> Float:
     """(K, 3, 3) poses of least squares; the first one stays where it is.
+
+    With `robust`, loops that the others contradict lose their weight: Geman and McClure's loss,
+    which is made sharper from solution to solution (graduated non-convexity, Yang et al., RA-L
+    2020), so that the start does not decide which of them are believed.
 
     Args:
         poses: (K, 3, 3) the start.
         chain: relations that are trusted.
         loops: relations that may be false.
-        robust: standard deviations beyond which Cauchy's loss takes weight from a loop; None:
-            plain least squares.
+        robust: None: plain least squares.
     """
+    if robust is None or not loops:
+        return _least_squares(poses, chain, loops, np.ones(len(loops)))
+    out = _least_squares(poses, chain, loops, np.ones(len(loops)))
+    chi2 = misfits(out, loops)
+    if chi2.max() <= robust.misfit:
+        return out  # nothing contradicts anything
+    blunt = 2.0 * chi2.max() / robust.misfit
+    for step in range(robust.steps):
+        mu = max(blunt ** (1.0 - (step + 1) / robust.steps), 1.0)
+        weights = (mu * robust.misfit / (chi2 + mu * robust.misfit)) ** 2
+        out = _least_squares(out, chain, loops, weights)
+        chi2 = misfits(out, loops)
+    return out
+
+
+def _least_squares(
+    poses: Float, chain: list[Relation], loops: list[Relation], weights: Float
+) -> Float:
     import gtsam  # takes long to load
 
     graph = gtsam.NonlinearFactorGraph()
@@ -66,9 +100,9 @@ def optimised(
     fixed = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
     graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*se2.parameters(poses[0])), fixed))
     for relation in chain:
-        graph.add(_factor(relation, None))
-    for relation in loops:
-        graph.add(_factor(relation, robust))
+        graph.add(_factor(relation, 1.0))
+    for relation, weight in zip(loops, weights.tolist(), strict=True):
+        graph.add(_factor(relation, max(weight, 1e-9)))
     options = gtsam.LevenbergMarquardtParams()
     options.setRelativeErrorTol(1e-7)
     found = gtsam.LevenbergMarquardtOptimizer(graph, start, options).optimize()
@@ -90,12 +124,9 @@ def misfits(poses: Float, relations: list[Relation]) -> Float:
     return out
 
 
-def _factor(relation: Relation, robust: float | None) -> Any:
+def _factor(relation: Relation, weight: float) -> Any:
     import gtsam
 
-    noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(relation.covariance)
-    if robust is not None:
-        loss = gtsam.noiseModel.mEstimator.Cauchy.Create(robust)
-        noise = gtsam.noiseModel.Robust.Create(loss, noise)
+    noise = gtsam.noiseModel.Gaussian.Covariance(relation.covariance / weight)
     T = gtsam.Pose2(*se2.parameters(relation.T))
     return gtsam.BetweenFactorPose2(relation.first, relation.second, T, noise)

@@ -13,6 +13,9 @@ from stillmap.slam.motion import MotionPrior
 
 Float = NDArray[np.float64]
 
+# a wall between a beam and its end: so far before it, and so much of a cell occupied
+_MARGIN, _WALL = 0.5, 0.4
+
 
 @dataclass(frozen=True)
 class RegistrationOptions:
@@ -43,6 +46,12 @@ class RegistrationOptions:
     )
     doubt_translation: float = field_with_doc(0.5, "m, half width of that search at least")
     doubt_rotation: float = field_with_doc(0.5, "rad, half width of that search at least")
+    carried_below: float = field_with_doc(
+        0.5, "of the usual share explained, below which a robot may have been carried elsewhere"
+    )
+    carried_through: float = field_with_doc(
+        0.4, "share of the beams that then would have to go through walls"
+    )
     lost_translation: float = field_with_doc(
         1.0, "m, half width of a last search over all headings, while doubt remains"
     )
@@ -67,6 +76,8 @@ _LIMITS = (
     ("doubt_below", 0.0, 1.0),
     ("lies", 0.0, 1e6),
     ("disagree", 0.1, 1e6),
+    ("carried_below", 0.0, 1.0),
+    ("carried_through", 0.0, 1.0),
     ("doubt_translation", 0.0, 5.0),
     ("doubt_rotation", 0.0, 3.2),
     ("lost_translation", 0.0, 5.0),
@@ -82,6 +93,8 @@ class Registration:
         covariance: (3, 3) of x, y (map frame) and heading: the inverse curvature of the cost.
         explained: weighted share of the beams that the map explains, in [0, 1].
         misfit: nats, the cost of the beams alone.
+        rivals: (R, 4) where the other starts ended up: x, y, heading from the pose, and by how
+            many nats they cost more.
         widened: whether a wider search than the prior asked for found the pose.
         disagrees: whether odometry was disbelieved.
     """
@@ -90,6 +103,7 @@ class Registration:
     covariance: Float
     explained: float
     misfit: float
+    rivals: Float
     widened: bool = False
     disagrees: bool = False
 
@@ -198,7 +212,7 @@ def search(
         rotation: radians, half width of the window.
         start: (3, 3) where Newton steps begin instead of searching the window.
     """
-    T, covariance, cost, explained, _, _ = _core.register_beams(
+    T, covariance, cost, explained, _, _, rivals = _core.register_beams(
         grid,
         points,
         weights,
@@ -216,7 +230,20 @@ def search(
         starts=options.starts,
         T_start=start,
     )
-    return Registration(T, covariance, explained, cost - prior.penalty(T))
+    return Registration(T, covariance, explained, cost - prior.penalty(T), rivals)
+
+
+def share_through(
+    grid: _core.Grid2D,
+    points: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    T_map_base: Float,
+    T_base_sensor: Float,
+) -> float:
+    """Share of a scan's beams that would have to go through walls, at a pose (3, 3)."""
+    return _core.share_through(
+        grid, points, weights, T_map_base, T_base_sensor, margin=_MARGIN, occupied=_WALL
+    )
 
 
 def radius(options: RegistrationOptions, resolution: float) -> int:

@@ -39,7 +39,7 @@ def sweep(
     for t in range(1, T):
         if is_in_map[t]:
             put(grid, recording, e, t, poses[t], options.surface, remove=True)
-        prior = _between_neighbours(recording, poses, increments, t, options)
+        prior = _between_neighbours(recording, poses, increments, mapped.breaks, t, options)
         found = registration.search(
             grid, *hits(recording, e, t), prior, options.registration, 0.0, 0.0, start=poses[t]
         )
@@ -56,12 +56,19 @@ def _increments(recording: Recording, poses: Float) -> Float:
 
 
 def _between_neighbours(
-    recording: Recording, poses: Float, increments: Float, t: int, options: SlamOptions
+    recording: Recording,
+    poses: Float,
+    increments: Float,
+    breaks: list[int],
+    t: int,
+    options: SlamOptions,
 ) -> MotionPrior:
     """What the motion from the scan before and to the scan after says of a pose."""
     known = recording.T_odom_base is not None
     one = motion.from_increment(poses[t - 1], increments[t - 1], options.motion, known)
-    if t + 1 == len(poses):
+    if t in breaks:  # nobody knows how it came here
+        one = motion.from_increment(poses[t], np.eye(3), options.motion, is_odometry=False)
+    if t + 1 == len(poses) or t + 1 in breaks:
         return one
     back = se2.inverse(increments[t])
     return motion.combined(one, motion.from_increment(poses[t + 1], back, options.motion, known))
