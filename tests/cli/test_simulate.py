@@ -51,6 +51,7 @@ def test_the_folder_has_every_file_of_the_format_and_nothing_else(tmp_path: Path
 def test_flags_reach_the_scene(tmp_path: Path) -> None:
     flags = "--fov 120 --max-range 12 --range-noise 0.05 --rate 10 --shape legs --stopping 1"
     flags += " --min-stop 15 --max-stop 60 --odometry-noise 0 --slip-rate 0.2"
+    flags += " --stall-rate 2 --resets 1 --carried-at 0.5 --stamp-rounding 0.1"
     call("hall", "-o", str(tmp_path / "sim"), *QUICK, *flags.split())
     scene = load_truth(tmp_path / "sim").scene
     assert scene["laser"]["fov"] == pytest.approx(math.radians(120))
@@ -61,6 +62,9 @@ def test_flags_reach_the_scene(tmp_path: Path) -> None:
     assert (crowd["min_stop"], crowd["max_stop"]) == (15.0, 60.0)
     assert scene["odometry"]["drift_noise"] == 0.0
     assert scene["odometry"]["slip_rate"] == 0.2
+    assert (scene["odometry"]["stall_rate"], scene["odometry"]["resets"]) == (2.0, 1)
+    assert (scene["robot"]["carried_at"], scene["robot"]["stamp_rounding"]) == (0.5, 0.1)
+    assert scene["carried_at_scan"] == 10
 
 
 def test_any_option_can_be_set_and_flags_win(tmp_path: Path) -> None:

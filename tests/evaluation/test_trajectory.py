@@ -118,6 +118,13 @@ def test_no_common_time_is_an_error():
         associate(np.array([0.0, 1.0]), np.array([1.5]), 0.02)
 
 
+def test_the_same_stamps_belong_together_one_by_one_though_they_repeat():
+    stamps = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 2.0])
+    i, j = associate(stamps, stamps, 0.02)
+    np.testing.assert_array_equal(i, np.arange(6))
+    np.testing.assert_array_equal(j, np.arange(6))
+
+
 def test_absolute_error_by_hand():
     # a square whose corners are pushed outwards by 0.1 along x: nothing to align
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]], float)

@@ -108,13 +108,25 @@ def test_beam_times_grow_with_the_angle(beams: int, fov: float) -> None:
     assert times.mean() == pytest.approx(exact.mean(), abs=1e-6)
 
 
+def standing_before(faces: Float) -> Motion:
+    """A robot that stands still for two scans, 0.2 s apart, before faces (2, 1, 4)."""
+    return Motion(
+        period=0.2,
+        seconds=np.array([0.0, 0.2]),
+        carried=2,
+        robot=np.zeros((2, 3)),
+        poses=np.zeros((2, 1, 3)),
+        kinds=["car"],
+        people=NOTHING,
+        outlines=Outlines(faces, np.zeros(1, np.int32)),
+        still=np.empty((0, 4)),
+    )
+
+
 def test_beams_of_a_sweep_meet_what_comes_by_meanwhile() -> None:
     """A wall that comes nearer at 5 m/s, seen by a laser that stands still."""
     near = np.array([[[10.0, -50, 10, 50]], [[9.0, -50, 9, 50]]])
-    motion = Motion(
-        0.2, np.zeros((2, 3)), np.zeros((2, 1, 3)), ["car"], NOTHING,
-        Outlines(near, np.zeros(1, np.int32)), np.empty((0, 4)),
-    )  # fmt: skip
+    motion = standing_before(near)
     options = LaserOptions(beams=101, fov=1.0, sweep_time=0.2, range_noise=0.0)
     returns = cast(motion, np.empty((0, 4)), np.eye(3), options)
     along = returns.range * np.cos(np.linspace(-0.5, 0.5, 101))
@@ -126,10 +138,7 @@ def test_beams_of_a_sweep_meet_what_comes_by_meanwhile() -> None:
 
 def test_what_begins_its_lane_again_is_not_seen_on_the_way_back() -> None:
     leaping = np.array([[[10.0, -50, 10, 50]], [[-90.0, -50, -90, 50]]])
-    motion = Motion(
-        0.2, np.zeros((2, 3)), np.zeros((2, 1, 3)), ["car"], NOTHING,
-        Outlines(leaping, np.zeros(1, np.int32)), np.empty((0, 4)),
-    )  # fmt: skip
+    motion = standing_before(leaping)
     options = LaserOptions(beams=101, fov=1.0, sweep_time=0.2, range_noise=0.0)
     returns = cast(motion, np.empty((0, 4)), np.eye(3), options)
     np.testing.assert_allclose(returns.range[0] * np.cos(np.linspace(-0.5, 0.5, 101)), 10.0)
@@ -161,6 +170,27 @@ def test_a_sweep_longer_than_from_scan_to_scan_is_refused() -> None:
     with pytest.raises(InputError, match="sweep_time"):
         scene_by_name("hall", {"laser": {"sweep_time": -0.1}})
     scene_by_name("hall", {"laser": {"sweep_time": 0.3}, "robot": {"scan_rate": 3.0}})
+
+
+def test_a_robot_that_is_carried_away_is_not_seen_to_move() -> None:
+    """The last scan before goes on as it began, and so does the first one after."""
+    walls = tuple(box(0, 0, 40, 30))
+    scene = Scene(name="yard", walls=walls, route=((-15.0, -10.0), (15.0, -10.0), (15.0, 10.0)))
+    changes = {
+        "laser": {"beams": 90, "sweep_time": 0.2, **EXACT},
+        "robot": {"scans": 120, "speed": 1.0, "carried_at": 0.5},
+        "crowd": {"people": 0},
+    }
+    run = simulate(replaced(scene, changes), 2)
+    carried = run.truth.scene["carried_at_scan"]
+    assert carried == 60
+    ranges = np.hypot(*run.recording.points.T).reshape(120, 90)
+    change = np.abs(np.diff(ranges, axis=0)).max(axis=1)
+    assert change[carried - 1] > 5.0
+    # a beam that is of before and after would show in its own scan
+    jumps = np.abs(np.diff(ranges[[carried - 1, carried]], axis=1)).max(axis=1)
+    usual = np.abs(np.diff(ranges[carried - 20 : carried - 1], axis=1)).max()
+    assert jumps[0] < usual + 0.5
 
 
 def test_one_scan_alone_is_swept_too() -> None:

@@ -32,6 +32,10 @@ _FLAGS: tuple[tuple[str, str, type, str, str, str], ...] = (
     ("range-noise", "M", float, "laser", "range_noise", "standard deviation of ranges, metres"),
     ("sweep-time", "S", float, "laser", "sweep_time", "how long a scan takes, seconds"),
     ("slip-rate", "N", float, "odometry", "slip_rate", "how often wheels slip, per metre driven"),
+    ("stall-rate", "N", float, "odometry", "stall_rate", "how often odometry stalls, per minute"),
+    ("resets", "N", int, "odometry", "resets", "how often odometry begins again at its origin"),
+    ("carried-at", "SHARE", float, "robot", "carried_at", "when the robot is carried elsewhere"),
+    ("stamp-rounding", "S", float, "robot", "stamp_rounding", "how coarse stamps are, seconds"),
 )
 _ODOMETRY_ERRORS = (
     "wheel_radius_error",

@@ -48,8 +48,8 @@ def associate(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Indices of poses that belong together by their stamps.
 
-    Each pose of the trajectory with fewer of them takes the nearest of the other one, when it
-    lies within `max_dt` seconds.
+    The very same stamps belong together one by one. Else each pose of the trajectory with fewer of
+    them takes the nearest of the other one, when it lies within `max_dt` seconds.
 
     Args:
         estimated_s, reference_s: (N,) and (K,) seconds, sorted, N, K >= 1.
@@ -57,6 +57,8 @@ def associate(
     Raises:
         InputError: no two stamps lie that near.
     """
+    if np.array_equal(estimated_s, reference_s):  # stamps may repeat
+        return np.arange(len(estimated_s)), np.arange(len(estimated_s))
     swap = len(estimated_s) > len(reference_s)
     few, many = (reference_s, estimated_s) if swap else (estimated_s, reference_s)
     partner, distance = nearest(many, few)

@@ -19,13 +19,14 @@ from stillmap.simulation.traffic import Traffic
 
 Float = NDArray[np.float64]
 Progress = Callable[[float], None]
-Rngs = tuple[np.random.Generator, np.random.Generator, np.random.Generator]
+Rngs = tuple[np.random.Generator, np.random.Generator, np.random.Generator, np.random.Generator]
 
 _STEP = 0.1  # s, at most, between two positions of people and robot
 _ROBOT_MARGIN = 0.15  # m beyond its radius that the robot's way keeps from walls
 _PERSON_MARGIN = 0.1  # m
 _SLOWEST = 5.0  # times the time that the route takes undisturbed: then something holds the robot
 _STILL = 1e-6  # m
+_CARRIED = 20.0  # s, for which a robot that is carried elsewhere records nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,8 @@ class Motion:
 
     Attributes:
         period: seconds from one scan to the next.
+        seconds: (T,) since the recording began.
+        carried: the first scan after the robot was carried elsewhere; T if it never is.
         robot: (T, 3) x, y in metres, theta in radians.
         poses: (T, P, 3) the same of all movers: people, doors, vehicles.
         kinds: (P) what each mover is.
@@ -43,6 +46,8 @@ class Motion:
     """
 
     period: float
+    seconds: Float
+    carried: int
     robot: Float
     poses: Float
     kinds: list[str]
@@ -56,7 +61,7 @@ def move(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
 
     Args:
         scene: the world and all parameters.
-        rngs: for people, doors and vehicles.
+        rngs: for people, doors, vehicles, and the place that the robot is carried to.
         tell: called now and then with the share that is done.
 
     Raises:
@@ -67,14 +72,17 @@ def move(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
     steps = max(1, math.ceil(1.0 / (o.scan_rate * _STEP) - 1e-9))
     dt = 1.0 / (o.scan_rate * steps)
     expected = o.scans or world.robot.undisturbed_time() * o.scan_rate
+    carried = None if o.carried_at is None else max(1, round(o.carried_at * expected))
     log = _Log()
     while not _is_done(scene, world.robot, len(log.robot), expected):
+        if len(log.robot) == carried:
+            world.carry_robot(dt, rngs[3])
         log.note(world)
         if len(log.robot) % 50 == 0:
             tell(min(len(log.robot) / expected, 1.0))
         for _ in range(steps):
             world.step(dt)
-    return log.motion(world, 1.0 / o.scan_rate)
+    return log.motion(world, 1.0 / o.scan_rate, carried)
 
 
 class _World:
@@ -97,14 +105,26 @@ class _World:
         self.traffic = Traffic(scene.lanes, scene.traffic, rngs[2])
         self._radius = o.radius
 
+    def carry_robot(self, dt: float, rng: np.random.Generator) -> None:
+        """Take the robot to another place; everything else goes on, by steps of dt seconds."""
+        self.robot.put_down(rng, self._in_the_way())
+        for _ in range(round(_CARRIED / dt)):
+            self.robot.rest(dt)
+            self._others_step(dt)
+
     def step(self, dt: float) -> None:
         """Everything goes on for dt seconds."""
+        self.robot.step(dt, self._in_the_way(), self._radius + BODY_RADIUS)
+        self._others_step(dt)
+
+    def _in_the_way(self) -> Float:
+        """(N, 2) where people and corners of vehicles are."""
+        if not self.traffic.kinds:
+            return self.crowd.xy
+        return np.concatenate([self.crowd.xy, self.traffic.faces().reshape(-1, 2)])
+
+    def _others_step(self, dt: float) -> None:
         robot, crowd, contact = self.robot, self.crowd, self._radius + BODY_RADIUS
-        in_the_way = crowd.xy
-        if self.traffic.kinds:
-            corners = self.traffic.faces().reshape(-1, 2)
-            in_the_way = np.concatenate([crowd.xy, corners])
-        robot.step(dt, in_the_way, contact)
         crowd.step(dt, robot.pose, contact, robot.impatient)
         self.figures.step(dt, crowd, robot.pose[:2], self._radius)
         if len(self.doors.share):
@@ -146,7 +166,7 @@ class _Log:
         self._heading.append(heading)
         self._faces.append(np.concatenate([doors.faces(), traffic.faces()]))
 
-    def motion(self, world: _World, period: float) -> Motion:
+    def motion(self, world: _World, period: float, carried: int | None) -> Motion:
         figures, doors = world.figures, len(world.doors.share)
         persons = len(world.crowd.xy)
         kinds = ["person"] * persons + ["door"] * doors + world.traffic.kinds
@@ -159,5 +179,16 @@ class _Log:
         mover = np.concatenate([others[:doors], np.repeat(others[doors:], 4)])
         moving = moved[mover]
         outlines = Outlines(faces[:, moving], mover[moving])
-        robot = np.stack(self.robot)
-        return Motion(period, robot, poses, kinds, people, outlines, faces[0, ~moving])
+        T = len(self.robot)
+        carried = T if carried is None else min(carried, T)
+        return Motion(
+            period=period,
+            seconds=np.arange(T) * period + _CARRIED * (np.arange(T) >= carried),
+            carried=carried,
+            robot=np.stack(self.robot),
+            poses=poses,
+            kinds=kinds,
+            people=people,
+            outlines=outlines,
+            still=faces[0, ~moving],
+        )

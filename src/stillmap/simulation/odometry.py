@@ -45,6 +45,60 @@ def drifting(T_world_base: Float, options: OdometryOptions, rng: np.random.Gener
     return se2.matrix(position[:, 0], position[:, 1], heading)
 
 
+def reported(
+    T_odom_base: Float, seconds: Float, options: OdometryOptions, rng: np.random.Generator
+) -> Float:
+    """What a recorder gets of odometry (T, 3, 3) that stalls and resets at times.
+
+    While it stalls nothing moves; what the robot did meanwhile is not made up for. At a reset the
+    pose is the identity again, and what follows goes on from there.
+
+    Args:
+        T_odom_base: the odometry, gone wrong no other way yet.
+        seconds: (T,) when the scans were taken.
+        options: how often.
+        rng: when.
+    """
+    if options.stall_rate > 0:
+        moves = se2.parameters(se2.inverse(T_odom_base[:-1]) @ T_odom_base[1:])
+        moves[_stalls(seconds, options, rng)] = 0.0
+        T_odom_base = _chained(moves)
+    count = min(options.resets, len(T_odom_base) - 1)
+    for scan in np.sort(rng.choice(np.arange(1, len(seconds)), count, replace=False)).tolist():
+        again = se2.inverse(T_odom_base[scan]) @ T_odom_base[scan:]
+        T_odom_base = np.concatenate([T_odom_base[:scan], again])
+    return T_odom_base
+
+
+def without_jump(T_world_base: Float, scan: int) -> Float:
+    """Poses (T, 3, 3) as if nobody had moved the robot before `scan`, if there is such a scan."""
+    if scan >= len(T_world_base):
+        return T_world_base
+    back = T_world_base[scan - 1] @ se2.inverse(T_world_base[scan])
+    return np.concatenate([T_world_base[:scan], back @ T_world_base[scan:]])
+
+
+def _stalls(
+    seconds: Float, options: OdometryOptions, rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """(T - 1,) whether the odometry misses what the robot does between two scans."""
+    often = rng.poisson(options.stall_rate / 60 * (seconds[-1] - seconds[0]))
+    stalls = np.zeros(len(seconds) - 1, bool)
+    for begin in rng.uniform(seconds[0], seconds[-1], often).tolist():
+        stalls |= (seconds[:-1] >= begin) & (seconds[:-1] < begin + options.stall_time)
+    return stalls
+
+
+def _chained(moves: Float) -> Float:
+    """(T, 3, 3) poses from the identity on, for moves (T - 1, 3) each in the frame before it."""
+    heading = np.concatenate([[0.0], np.cumsum(moves[:, 2])])
+    c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
+    x, y = moves[:, 0], moves[:, 1]
+    steps = np.stack([c * x - s * y, s * x + c * y], axis=-1)
+    position = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    return se2.matrix(position[:, 0], position[:, 1], heading)
+
+
 def _slips(way: Float, options: OdometryOptions, rng: np.random.Generator) -> Float:
     """(2, T - 1) how much farther than the robot each wheel rolls, relative to the way (T - 1,)."""
     extra = np.zeros((2, len(way)))

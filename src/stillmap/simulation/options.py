@@ -109,12 +109,24 @@ class RobotOptions:
     scans: int | None = field_with_doc(
         None, "scans to take, the route again and again; not set: the route once"
     )
+    carried_at: float | None = field_with_doc(
+        None,
+        "share of the recording at which the robot is switched off, carried to another place of "
+        "its route and put down anyhow; not set: never",
+    )
+    stamp_rounding: float = field_with_doc(
+        0.0, "s, stamps are rounded to multiples of it; 0: to the nanosecond"
+    )
+    stamps_missing: bool = field_with_doc(False, "the scans' numbers stand for seconds")
 
     def __post_init__(self) -> None:
         require(self.speed > 0 and self.turn_rate > 0, "speed and turn_rate must be positive")
         require(self.acceleration is None or self.acceleration > 0, "acceleration must be positive")
         require(self.scan_rate > 0, "scan_rate must be positive")
         require(self.scans is None or self.scans >= 1, "scans must be at least 1")
+        at = self.carried_at
+        require(at is None or 0 < at < 1, "carried_at must lie between 0 and 1")
+        require(self.stamp_rounding >= 0, "stamp_rounding must not be negative")
 
 
 @dataclass(frozen=True)
@@ -140,6 +152,11 @@ class OdometryOptions:
         0.3, "relative, a slipping wheel turns farther by half to one and a half times this much"
     )
     slip_length: float = field_with_doc(0.5, "m, the way on which it goes on slipping")
+    stall_rate: float = field_with_doc(
+        0.0, "per minute, how often it begins to miss that the robot moves and turns"
+    )
+    stall_time: float = field_with_doc(5.0, "s, for which it misses that")
+    resets: int = field_with_doc(0, "how often it begins again at its origin, at any time")
 
     def __post_init__(self) -> None:
         require(self.wheel_base > 0, "wheel_base must be positive")
@@ -148,6 +165,9 @@ class OdometryOptions:
         values += (self.rotation_noise, self.drift_noise, self.slip_rate, self.slip)
         require(min(values) >= 0, "errors must be >= 0")
         require(self.slip_length > 0, "slip_length must be positive")
+        require(self.stall_rate >= 0, "stall_rate must not be negative")
+        require(self.stall_time > 0, "stall_time must be positive")
+        require(self.resets >= 0, "resets must not be negative")
 
 
 def require(condition: bool, message: str) -> None:

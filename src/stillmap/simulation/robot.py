@@ -16,6 +16,8 @@ _CARROT_TIME = 0.5  # s, the same for a fast one
 _SEES_AHEAD = 1.5  # m
 _SEES_AHEAD_TIME = 1.2  # s, the same for a fast one
 _CREEP = 0.12  # m/s
+_ELSEWHERE = 0.3  # of the way to the farthest place: nearer ones are not elsewhere
+_ROOM = 2.0  # m from anybody, where it is put down
 _TURN_IN_PLACE = 0.4  # rad off the route
 
 
@@ -72,6 +74,29 @@ class Robot:
             new, speed = self.pose[:2], 0.0
         self._seconds, self._speed = self._seconds + dt, float(speed)
         self.pose = np.array([new[0], new[1], theta + turn * dt])
+
+    def rest(self, dt: float) -> None:
+        """Stand for dt seconds."""
+        self._seconds, self._speed = self._seconds + dt, 0.0
+
+    def put_down(self, rng: np.random.Generator, others: Float) -> None:
+        """Go on from a place of its way far from here, facing anywhere.
+
+        Args:
+            rng: which one.
+            others: (N, 2) where people and corners of vehicles are, metres.
+        """
+        away = np.hypot(*(self._way - self.pose[:2]).T)
+        places = np.flatnonzero(away > _ELSEWHERE * away.max())
+        if not self._closed:  # or the recording would soon be over
+            places = places[places < (1.0 - _ELSEWHERE) * len(self._way)]
+        for at in rng.permutation(places).tolist():
+            near = np.hypot(*(others - self._way[at]).T).min(initial=np.inf)
+            if near > _ROOM:
+                self._at = at
+                break
+        self.pose = np.array([*self._way[self._at], rng.uniform(-np.pi, np.pi)])
+        self._speed, self._waited = 0.0, 0.0
 
     def undisturbed_time(self) -> float:
         """Seconds that one lap takes at full speed."""

@@ -11,6 +11,7 @@ from stillmap import se2
 from stillmap.recording.model import Recording
 from stillmap.simulation import laser, odometry, sweep
 from stillmap.simulation.motion import Motion, Progress, move
+from stillmap.simulation.options import RobotOptions
 from stillmap.simulation.scene import Scene
 from stillmap.simulation.sweep import Sweep
 from stillmap.simulation.truth import Truth
@@ -35,8 +36,8 @@ def simulate(
 ) -> Simulation:
     """Let a robot record a scene.
 
-    People, laser, odometry, doors and vehicles draw from generators of their own, spawned from
-    `rng`: another laser or odometry leaves the way everybody goes unchanged.
+    People, laser, odometry, doors, vehicles and mishaps draw from generators of their own, spawned
+    from `rng`: another laser or odometry leaves the way everybody goes unchanged.
 
     A door or a vehicle that does not move once while the robot records is a wall: no recording
     could tell it from one.
@@ -51,17 +52,21 @@ def simulate(
     """
     rng = np.random.default_rng(rng)
     seed = getattr(rng.bit_generator.seed_seq, "entropy", None)
-    crowd_rng, laser_rng, odometry_rng, door_rng, traffic_rng = rng.spawn(5)
+    crowd_rng, laser_rng, odometry_rng, door_rng, traffic_rng, *mishap_rngs = rng.spawn(7)
     tell = progress or _silent
-    rngs = (crowd_rng, door_rng, traffic_rng)
+    rngs = (crowd_rng, door_rng, traffic_rng, mishap_rngs[0])
     motion = move(scene, rngs, lambda share: tell(_MOTION_SHARE * share))
     walls = np.array([*scene.walls, *scene.glass, *motion.still], float)
     T_world_base = se2.matrix(*motion.robot.T)
-    T_odom_base = odometry.drifting(T_world_base, scene.odometry, odometry_rng)
+    driven = odometry.without_jump(T_world_base, motion.carried)
+    T_odom_base = odometry.drifting(driven, scene.odometry, odometry_rng)
+    T_odom_base = odometry.reported(T_odom_base, motion.seconds, scene.odometry, mishap_rngs[1])
     recording, mover = _record(scene, walls, motion, T_odom_base, laser_rng, seed)
     tell(1.0)
     static = recording.hit & (mover < 0)
-    about = {**describe(scene, seed), "mover_kinds": motion.kinds}
+    about = {**describe(scene, seed), "mover_kinds": motion.kinds, "carried_at_scan": None}
+    if motion.carried < len(T_world_base):
+        about["carried_at_scan"] = motion.carried
     truth = Truth(static, mover, T_world_base, walls, motion.poses, about)
     return Simulation(scene, recording, truth)
 
@@ -83,9 +88,8 @@ def _record(
     is_glass[len(scene.walls) : len(scene.walls) + len(scene.glass)] = True
     ranges, hit = laser.measure(exact, is_glass, o, rng)
     points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    times_ns = np.round(np.arange(T) * (1e9 / scene.robot.scan_rate)).astype(np.int64)
     recording = Recording(
-        stamp_ns=_FIRST_STAMP_NS + times_ns,
+        stamp_ns=_stamps(motion, scene.robot),
         offset=np.arange(T + 1, dtype=np.int64) * o.beams,
         points=points.reshape(-1, 2).astype(np.float32),
         hit=hit.ravel(),
@@ -96,6 +100,15 @@ def _record(
         beam_time=np.tile(Sweep.of(o).beam_times(o.beams), T) if o.sweep_time > 0 else None,
     )
     return recording, np.where(hit, exact.mover, np.int32(-1)).ravel()
+
+
+def _stamps(motion: Motion, o: RobotOptions) -> NDArray[np.int64]:
+    """(T,) nanoseconds, as well as the recorder knows them."""
+    if o.stamps_missing:
+        return np.arange(len(motion.seconds), dtype=np.int64) * 10**9
+    tick = max(1, round(o.stamp_rounding * 1e9))
+    exact = np.round(motion.seconds * 1e9).astype(np.int64)
+    return _FIRST_STAMP_NS + (exact + tick // 2) // tick * tick
 
 
 def describe(scene: Scene, seed: Any) -> dict[str, Any]:

@@ -80,14 +80,17 @@ def cast(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOptions) ->
 class _Moment:
     """Where everything is at N times: `seconds` (N,) after the stamps of `scans` (N,).
 
-    Between two scans all goes on evenly; after the last as before it.
+    Between two scans all goes on evenly; after the last one as before it.
     """
 
     def __init__(self, motion: Motion, scans: Index, seconds: Float) -> None:
         later = seconds / motion.period
-        last = len(motion.robot) - np.where(later > 0, 2, 1)
+        # nothing goes on evenly while the robot is carried elsewhere
+        is_after = scans >= motion.carried
+        self._last = np.where(is_after, len(motion.robot), motion.carried) - 1
+        first, last = np.where(is_after, motion.carried, 0), self._last - (later > 0)
         self._scan, self._leap = scans, _FASTEST * motion.period
-        self._before = np.maximum(np.minimum(scans + later.astype(np.int64), last), 0)
+        self._before = np.maximum(np.minimum(scans + later.astype(np.int64), last), first)
         self._share = scans + later - self._before
         people, outlines = motion.people, motion.outlines
         self.robot = self._at(motion.robot)
@@ -97,7 +100,7 @@ class _Moment:
 
     def _at(self, values: Float) -> Float:
         before = values[self._before]
-        change = values[np.minimum(self._before + 1, len(values) - 1)] - before
+        change = values[np.minimum(self._before + 1, self._last)] - before
         share = self._share.reshape(-1, *[1] * (values.ndim - 1))
         leaps = np.abs(change) > self._leap
         return np.where(leaps, values[self._scan], before + share * change)
