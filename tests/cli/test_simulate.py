@@ -82,6 +82,15 @@ def test_a_scan_that_takes_time_says_when_its_beams_were_taken(tmp_path: Path) -
     assert 0.09 < np.ptp(times) < 0.1
 
 
+def test_a_second_laser_and_one_upside_down(tmp_path: Path) -> None:
+    flags = ("--second-laser", "--set", "laser.upside_down=unknown")
+    call("hall", "-o", str(tmp_path / "sim"), *QUICK, *flags)
+    read = recording.read(tmp_path / "sim")
+    assert read.sensor.tolist() == [0, 1] * 10
+    assert len(read.T_base_sensor) == 2
+    assert load_truth(tmp_path / "sim").scene["laser"]["upside_down"] == "unknown"
+
+
 def test_scenes_with_more_than_people_say_what_moves(tmp_path: Path) -> None:
     call("office", "-o", str(tmp_path / "sim"), *QUICK)
     truth = load_truth(tmp_path / "sim")
@@ -131,6 +140,7 @@ def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path: Path) -> None
         (["--sweep-time", "1"], "sweep_time must not be longer"),
         (["--set", "laser.beam=3"], "unknown option 'laser.beam'.*laser.beams"),
         (["--set", "walls=3"], "'walls' wants"),
+        (["--set", "laser.upside_down=known", "--format", "carmen"], "upside down"),
     ],
 )
 def test_values_out_of_range_are_refused(tmp_path: Path, flags: list[str], message: str) -> None:

@@ -63,6 +63,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     p.add_argument(
         "--shape", choices=["legs", "bodies", "mixed"], help="what the laser sees of people"
     )
+    p.add_argument("--second-laser", action="store_true", help="another one, that looks backwards")
     p.add_argument(
         "--odometry-noise",
         metavar="FACTOR",
@@ -74,7 +75,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "--format",
         choices=["stillmap", "carmen"],
         default="stillmap",
-        help="the recording folder, or recording.log with FLASER and ODOM lines",
+        help="the recording folder, or recording.log with FLASER, RLASER and ODOM lines",
     )
     p.add_argument(
         "--set",
@@ -98,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise InputError(f"--seed must not be negative, got {args.seed}")
     if args.format == "carmen":
-        require_carmen(scene.laser.fov, scene.laser.max_range)
+        require_carmen(scene.laser)
     output = Path(args.output)
     require_new(output, args.overwrite)
     with _shown_progress(args.quiet) as progress:
@@ -119,6 +120,8 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
         changes["laser"]["fov"] = math.radians(args.fov)
     if args.shape is not None:
         changes.setdefault("crowd", {})["shape"] = args.shape
+    if args.second_laser:
+        changes.setdefault("laser", {})["second_laser"] = True
     if args.odometry_noise != 1.0:
         defaults = scene_by_name(args.scene).odometry
         scaled = {key: args.odometry_noise * getattr(defaults, key) for key in _ODOMETRY_ERRORS}

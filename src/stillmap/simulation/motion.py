@@ -68,10 +68,10 @@ def move(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
         InputError: no room for the robot on its route or for the people, or the robot is held up.
     """
     world = _World(scene, rngs)
-    o = scene.robot
-    steps = max(1, math.ceil(1.0 / (o.scan_rate * _STEP) - 1e-9))
-    dt = 1.0 / (o.scan_rate * steps)
-    expected = o.scans or world.robot.undisturbed_time() * o.scan_rate
+    o, rate = scene.robot, scene.robot.scan_rate * scene.laser.count
+    steps = max(1, math.ceil(1.0 / (rate * _STEP) - 1e-9))
+    dt = 1.0 / (rate * steps)
+    expected = o.scans or world.robot.undisturbed_time() * rate
     carried = None if o.carried_at is None else max(1, round(o.carried_at * expected))
     log = _Log()
     while not _is_done(scene, world.robot, len(log.robot), expected):
@@ -82,7 +82,7 @@ def move(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
             tell(min(len(log.robot) / expected, 1.0))
         for _ in range(steps):
             world.step(dt)
-    return log.motion(world, 1.0 / o.scan_rate, carried)
+    return log.motion(world, 1.0 / rate, carried)
 
 
 class _World:

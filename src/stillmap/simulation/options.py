@@ -83,6 +83,13 @@ class LaserOptions:
     x: float = field_with_doc(0.08, "m, sensor ahead of the base centre")
     y: float = field_with_doc(0.0, "m, sensor to the left of the base centre")
     yaw: float = field_with_doc(0.0, "rad, sensor against the base")
+    # spelled out: see CrowdOptions.shape
+    upside_down: Literal["no", "known", "unknown"] = field_with_doc(
+        "no", "it hangs upside down: no; known to the recorder; or unknown, which mirrors its scans"
+    )
+    second_laser: bool = field_with_doc(
+        False, "another one like it looks backwards from the other side of the base centre"
+    )
 
     def __post_init__(self) -> None:
         require(self.beams >= 2, "beams must be at least 2")
@@ -92,6 +99,11 @@ class LaserOptions:
         require(self.range_noise >= 0, "range_noise must not be negative")
         for share in (self.no_return_share, self.glass_no_return_share):
             require(0 <= share <= 1, "shares of lost beams must lie in [0, 1]")
+
+    @property
+    def count(self) -> int:
+        """How many lasers there are; they scan by turns."""
+        return 2 if self.second_laser else 1
 
 
 @dataclass(frozen=True)
@@ -105,7 +117,7 @@ class RobotOptions:
     turn_rate: float = field_with_doc(0.8, "rad/s, the fastest turn")
     radius: float = field_with_doc(0.22, "m, the robot's footprint is a disc")
     patience: float = field_with_doc(3.0, "s, wait for somebody in the way before creeping on")
-    scan_rate: float = field_with_doc(5.0, "Hz, scans per second")
+    scan_rate: float = field_with_doc(5.0, "Hz, scans per second of each laser")
     scans: int | None = field_with_doc(
         None, "scans to take, the route again and again; not set: the route once"
     )

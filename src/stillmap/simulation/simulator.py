@@ -11,7 +11,7 @@ from stillmap import se2
 from stillmap.recording.model import Recording
 from stillmap.simulation import laser, odometry, sweep
 from stillmap.simulation.motion import Motion, Progress, move
-from stillmap.simulation.options import RobotOptions
+from stillmap.simulation.options import LaserOptions, RobotOptions
 from stillmap.simulation.scene import Scene
 from stillmap.simulation.sweep import Sweep
 from stillmap.simulation.truth import Truth
@@ -81,12 +81,14 @@ def _record(
 ) -> tuple[Recording, NDArray[np.int32]]:
     """The recording, and the mover (M,) that each of its beams met."""
     o, T = scene.laser, len(motion.robot)
-    T_base_sensor = se2.matrix(o.x, o.y, o.yaw)[None]
-    angles = laser.beam_angles(o.beams, o.fov)
-    exact = sweep.cast(motion, walls, T_base_sensor[0], o)
+    T_base_sensor, sensor = _sensors(o), np.arange(T, dtype=np.int32) % o.count
+    exact = sweep.cast(motion, walls, T_base_sensor[sensor], o)
     is_glass = np.zeros(len(walls), bool)
     is_glass[len(scene.walls) : len(scene.walls) + len(scene.glass)] = True
     ranges, hit = laser.measure(exact, is_glass, o, rng)
+    angles = laser.beam_angles(o.beams, o.fov)
+    if o.upside_down == "known":
+        angles = -angles
     points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     recording = Recording(
         stamp_ns=_stamps(motion, scene.robot),
@@ -94,12 +96,18 @@ def _record(
         points=points.reshape(-1, 2).astype(np.float32),
         hit=hit.ravel(),
         T_base_sensor=T_base_sensor,
-        sensor=np.zeros(T, np.int32),
+        sensor=sensor,
         T_odom_base=T_odom_base,
         source=_source(scene, seed, angles),
         beam_time=np.tile(Sweep.of(o).beam_times(o.beams), T) if o.sweep_time > 0 else None,
     )
     return recording, np.where(hit, exact.mover, np.int32(-1)).ravel()
+
+
+def _sensors(o: LaserOptions) -> Float:
+    """(S, 3, 3) T_base_sensor."""
+    front = se2.matrix(o.x, o.y, o.yaw)
+    return np.stack([front, se2.matrix(0.0, 0.0, np.pi) @ front][: o.count])
 
 
 def _stamps(motion: Motion, o: RobotOptions) -> NDArray[np.int64]:
@@ -123,10 +131,13 @@ def _silent(share: float) -> None:
 
 
 def _source(scene: Scene, seed: Any, angles: Float) -> dict[str, Any]:
-    sensor = {
-        "name": "simulated laser",
-        "beams_per_scan": len(angles),
-        "start_angle": float(angles[0]),
-        "angle_step": float(angles[1] - angles[0]),
-    }
-    return {"format": "simulation", "scene": scene.name, "seed": seed, "sensors": [sensor]}
+    sensors = [
+        {
+            "name": name,
+            "beams_per_scan": len(angles),
+            "start_angle": float(angles[0]),
+            "angle_step": float(angles[1] - angles[0]),
+        }
+        for name in ("simulated laser", "simulated rear laser")[: scene.laser.count]
+    ]
+    return {"format": "simulation", "scene": scene.name, "seed": seed, "sensors": sensors}

@@ -57,23 +57,33 @@ def cast(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOptions) ->
     Args:
         motion: where everything is at T scans.
         walls: (W, 4) segments in metres.
-        T_base_sensor: (3, 3) where the laser sits.
-        o: the laser.
+        T_base_sensor: (T, 3, 3) where the laser sits that took each scan.
+        o: the lasers.
+
+    Returns:
+        Beams in the order in which a scan has them: from the last angle to the first if the laser
+        hangs upside down.
     """
     sweep, angles = Sweep.of(o), laser.beam_angles(o.beams, o.fov)
     T, G = len(motion.robot), len(sweep.seconds)
     reach = o.max_range + _SURELY * o.range_noise
     # a group of beams is a scan of its own, turned so that the first group's angles fit
-    turned = np.arange(G) * sweep.group * (angles[1] - angles[0])
+    turned, group = np.arange(G) * sweep.group * (angles[1] - angles[0]), angles[: sweep.group]
+    order = slice(None)
+    if o.upside_down != "no":
+        turned, group, order = -turned, -group[::-1], slice(None, None, -1)
     block = max(1, _TOGETHER // G)
     parts = []
     for first in range(0, T, block):
         scans = np.arange(first, min(first + block, T))
         now = _Moment(motion, np.repeat(scans, G), np.tile(sweep.seconds, len(scans)))
-        poses = se2.parameters(se2.matrix(*now.robot.T) @ T_base_sensor)
+        T_robot_sensor = np.repeat(T_base_sensor[scans], G, axis=0)
+        poses = se2.parameters(se2.matrix(*now.robot.T) @ T_robot_sensor)
         poses[:, 2] += np.tile(turned, len(scans))
-        part = laser.cast(poses, angles[: sweep.group], walls, now.people, now.outlines, reach)
-        parts.append([values.reshape(-1, G * sweep.group)[:, : o.beams] for values in part])
+        part = laser.cast(poses, group, walls, now.people, now.outlines, reach)
+        parts.append(
+            [values[:, order].reshape(-1, G * sweep.group)[:, : o.beams] for values in part]
+        )
     return Returns(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 

@@ -11,6 +11,7 @@ from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
 from stillmap.recording import folder
 from stillmap.recording.model import Recording
+from stillmap.simulation.options import LaserOptions
 from stillmap.simulation.simulator import Simulation
 from stillmap.simulation.truth import write_truth
 
@@ -33,7 +34,7 @@ def write_simulation(
         simulation: what `simulate` returned.
         path: the folder.
         format: "stillmap" writes the files of a recording folder, "carmen" a `recording.log`
-            with FLASER and ODOM lines, ranges in whole centimetres.
+            with FLASER, RLASER and ODOM lines, ranges in whole centimetres.
         overwrite: replace what is in the folder.
 
     Raises:
@@ -41,7 +42,7 @@ def write_simulation(
             cannot say what the laser measures.
     """
     if format == "carmen":
-        require_carmen(simulation.scene.laser.fov, simulation.scene.laser.max_range)
+        require_carmen(simulation.scene.laser)
     with new_folder(Path(path), overwrite) as work:
         if format == "carmen":
             _write_carmen(simulation, work / CARMEN_LOG)
@@ -50,15 +51,20 @@ def write_simulation(
         write_truth(simulation.truth, simulation.recording.stamp_ns, work)
 
 
-def require_carmen(fov: float, max_range: float) -> None:
+def require_carmen(laser: LaserOptions) -> None:
     """Whether FLASER lines can hold such scans: half a circle, ranges below the SICK's code.
 
     Raises:
         InputError: they cannot.
     """
-    if abs(fov - math.pi) > 1e-9:
+    if abs(laser.fov - math.pi) > 1e-9:
         raise InputError("FLASER lines hold half a circle", hint="a field of view of 180 degrees")
-    if max_range > _NO_RETURN:
+    if laser.upside_down == "known":
+        raise InputError(
+            "FLASER lines cannot say that the laser hangs upside down",
+            hint="laser.upside_down=unknown",
+        )
+    if laser.max_range > _NO_RETURN:
         raise InputError(f"CARMEN logs hold ranges up to {_NO_RETURN} m", hint="a lower max_range")
 
 
@@ -74,7 +80,8 @@ def _write_carmen(simulation: Simulation, path: Path) -> None:
             times = f"{_seconds(stamp)} simulated {_seconds(stamp - first)}\n"
             file.write(f"ODOM {_pose(base[t])} 0 0 0 {times}")
             readings = _readings(recording, t)
-            file.write(f"FLASER {readings} {_pose(laser[t])} {_pose(base[t])} {times}")
+            name = "RLASER" if recording.sensor[t] else "FLASER"
+            file.write(f"{name} {readings} {_pose(laser[t])} {_pose(base[t])} {times}")
 
 
 def _readings(recording: Recording, scan: int) -> str:
