@@ -7,21 +7,21 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core, se2
+from stillmap import _core
 from stillmap.options import field_with_doc
 from stillmap.recording.model import Recording
 from stillmap.slam import motion
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.loops import Closure, LoopOptions
-from stillmap.slam.motion import MotionOptions
+from stillmap.slam.motion import MotionOptions, MotionPrior
 from stillmap.slam.pose_graph import Graph
 from stillmap.slam.registration import (
     Registration,
     RegistrationOptions,
+    looks_through_walls,
     register,
-    share_through,
 )
-from stillmap.slam.scans import SurfaceOptions, hits
+from stillmap.slam.scans import Scan, SurfaceOptions, hits
 
 Float = NDArray[np.float64]
 
@@ -108,25 +108,27 @@ def build(
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
     widened, disagreeing, breaks = list[int](), list[int](), list[int]()
     steadiness = motion.unknown_steadiness(options.motion)
+    steps = motion.odometry_steps(recording.T_odom_base)
     seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns))) if T > 1 else 0.0
     travelled, usual = 0.0, 1.0
     so_far.add(0, poses[0], 0.0)
     for t in range(1, T):
-        prior = _motion_prior(recording, poses, t, steadiness, options.motion)
-        beams = hits(recording, e, t)
-        found = register(so_far.grid, *beams, prior, options.registration, usual)
-        if _was_carried(so_far, recording, t, beams, found, usual, options.registration):
+        guess = motion.from_constant_velocity(poses[t - 1], poses[max(t - 2, 0)], steadiness)
+        prior, other = _priors(poses[t - 1], steps, t, guess, options.motion)
+        scan = hits(recording, e, t)
+        found = register(so_far.grid, scan, prior, other, options.registration, usual)
+        if _was_carried(so_far, scan, found, usual, options.registration):
             breaks.append(t)
             so_far, usual = _empty(recording, e, options), 1.0
-            found = register(so_far.grid, *beams, prior, options.registration, 0.0)
+            found = register(so_far.grid, scan, prior, None, options.registration, 0.0)
         poses[t], covariance[t], explained[t] = found.T_map_base, found.covariance, found.explained
         if found.widened:
             widened.append(t)
-        if found.disagrees:
+        if found.disagrees or (steps is not None and not prior.measured):
             disagreeing.append(t)
         if t not in breaks[-1:]:
             usual += _LATELY * (found.explained - usual)
-        steadiness = steadiness.after(prior.shift_to(poses[t]), seconds, options.motion)
+        steadiness = steadiness.after(guess.shift_to(poses[t]), seconds, options.motion)
         travelled += float(np.linalg.norm(poses[t, :2, 2] - poses[t - 1, :2, 2]))
         so_far.add(t, poses[t], travelled)
         so_far.forget(travelled - memory)
@@ -142,33 +144,29 @@ def _empty(recording: Recording, e: NDArray[np.float32], options: SlamOptions) -
 
 def _was_carried(
     so_far: LocalMap,
-    recording: Recording,
-    t: int,
-    beams: tuple[NDArray[np.float32], NDArray[np.float32]],
+    scan: Scan,
     found: Registration,
     usual: float,
     options: RegistrationOptions,
 ) -> bool:
-    """Whether scan t contradicts the map, wherever the robot may have moved by itself.
+    """Whether a scan contradicts the map, wherever the robot may have moved by itself.
 
     A scan of a place that is new is explained as little, but it does not look through walls.
     """
-    if found.explained >= options.carried_below * usual or len(beams[0]) == 0:
+    if found.explained >= options.carried_below * usual or len(scan.points) == 0:
         return False
-    T_base_sensor = recording.T_base_sensor[recording.sensor[t]]
-    through = share_through(so_far.grid, *beams, found.T_map_base, T_base_sensor)
-    return through > options.carried_through
+    return looks_through_walls(so_far.grid, scan, found, options)
 
 
-def _motion_prior(
-    recording: Recording,
-    poses: Float,
+def _priors(
+    T_map_base: Float,
+    steps: motion.Steps | None,
     t: int,
-    steadiness: motion.Steadiness,
+    guess: MotionPrior,
     options: MotionOptions,
-) -> motion.MotionPrior:
-    odometry = recording.T_odom_base
-    if odometry is None:
-        return motion.from_constant_velocity(poses[t - 1], poses[max(t - 2, 0)], steadiness)
-    increment = se2.inverse(odometry[t - 1]) @ odometry[t]
-    return motion.from_odometry(poses[t - 1], increment, options)
+) -> tuple[MotionPrior, MotionPrior | None]:
+    """Where scan t ought to be after a pose (3, 3), and where else it may be."""
+    if steps is None:
+        return guess, None
+    measured = motion.from_odometry(T_map_base, steps.increments[t - 1], options)
+    return (measured, guess) if steps.plausible[t - 1] else (guess, measured)

@@ -14,10 +14,9 @@ from stillmap.slam import keyframes, registration
 from stillmap.slam.keyframes import Index
 from stillmap.slam.motion import MotionPrior
 from stillmap.slam.registration import RegistrationOptions
-from stillmap.slam.scans import SurfaceOptions, hits, in_frame, put
+from stillmap.slam.scans import Scan, SurfaceOptions, hits, in_frame, put
 
 Float = NDArray[np.float64]
-Points = NDArray[np.float32]
 
 # of the way between keyframes: a local map of scans nearer than that takes longer, and says no more
 _DENSE = 0.25
@@ -184,16 +183,17 @@ def local_map(track: Track, centre: float) -> _core.Grid2D:
     return grid
 
 
-def _view(track: Track, t: int) -> tuple[Points, NDArray[np.float32]]:
-    """End points of a keyframe and of a scan to either side, in its frame, with their e."""
+def _view(track: Track, t: int) -> Scan:
+    """What a keyframe and a scan to either side see, in its frame."""
     here, half = track.travelled[t], track.options.view
     first, last = np.searchsorted(track.travelled, [here - half, here + half], side="right")
     last = max(last - 1, t)
     shown = sorted({min(first, t), t, last})
     seen = [hits(track.recording, track.e, s) for s in shown]
     to_t = se2.inverse(track.poses[t]) @ track.poses[shown]
-    points = [in_frame(p, T) for (p, _), T in zip(seen, to_t, strict=True)]
-    return np.concatenate(points), np.concatenate([w for _, w in seen])
+    points = [in_frame(scan.points, T) for scan, T in zip(seen, to_t, strict=True)]
+    weights = np.concatenate([scan.weights for scan in seen])
+    return Scan(np.concatenate(points), weights, track.recording.T_base_sensor[0])
 
 
 def laid_on(
@@ -213,7 +213,7 @@ def laid_on(
     prior = MotionPrior(predicted, information, sigma, sigma_turn)
     view = _view(track, later)
     window = options.window * sigma, min(options.window * sigma_turn, np.pi)
-    found = registration.search(grid, *view, prior, track.registration, *window)
+    found = registration.search(grid, view, prior, track.registration, *window)
     least = [options.sigma_translation] * 2 + [options.sigma_rotation]
     covariance = found.covariance + np.diag(np.square(least))
     too_little = found.explained < max(
@@ -222,7 +222,7 @@ def laid_on(
     if not too_little:
         # what the graph knows of the place is no second witness: the whole way bounds it here
         free = drift(track.travelled[later] - track.travelled[earlier], options)[0]
-        covariance += _sliding(grid, *view, found.T_map_base, covariance, free, track.registration)
+        covariance += _sliding(grid, view, found.T_map_base, covariance, free, track.registration)
         covariance += _ambiguous(found.rivals)
     return Closure(
         earlier,
@@ -248,8 +248,7 @@ def _ambiguous(rivals: Float) -> Float:
 
 def _sliding(
     grid: _core.Grid2D,
-    points: Points,
-    weights: NDArray[np.float32],
+    view: Scan,
     T: Float,
     covariance: Float,
     sigma: float,
@@ -267,8 +266,8 @@ def _sliding(
         moved[:2, 2] += shift * along
         return options.gain * _core.registration_cost(
             grid,
-            points,
-            weights,
+            view.points,
+            view.weights,
             moved,
             sigma=options.sigma,
             radius=registration.radius(options, grid.resolution),

@@ -11,6 +11,7 @@ from stillmap.options import field_with_doc
 
 Float = NDArray[np.float64]
 
+_LEAST_LEAP, _FARTHER = 1.0, 5.0  # m, and times the usual step: what is farther is no step
 _PER_MOTION = ("_per_metre", "_per_radian")  # these may be zero, floors may not
 
 
@@ -93,6 +94,30 @@ def from_odometry(T_map_base: Float, increment: Float, options: MotionOptions) -
         + options.rotation_per_radian * turn
     )
     return _prior(T_map_base @ increment, sigma_xy, sigma_theta, measured=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What odometry says of the way from each scan to the next.
+
+    Attributes:
+        increments: (T - 1, 3, 3).
+        plausible: (T - 1,) whether the robot may have gone that far: odometry that begins again
+            somewhere else leaps much farther than it ever goes.
+    """
+
+    increments: Float
+    plausible: NDArray[np.bool_]
+
+
+def odometry_steps(T_odom_base: Float | None) -> Steps | None:
+    """The steps of poses (T, 3, 3); None where there is no odometry."""
+    if T_odom_base is None:
+        return None
+    increments = se2.inverse(T_odom_base[:-1]) @ T_odom_base[1:]
+    metres = np.linalg.norm(increments[:, :2, 2], axis=1)
+    usual = float(np.quantile(metres, 0.95)) if len(metres) else 0.0
+    return Steps(increments, metres <= max(_LEAST_LEAP, _FARTHER * usual))
 
 
 @dataclass(frozen=True)

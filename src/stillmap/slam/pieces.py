@@ -83,8 +83,9 @@ def _best_of_each(stretches: Float, unlike: Float) -> list[float]:
 
 def _signature(track: Track, t: int) -> Float:
     """(24,) share of a scan's beams up to each range: it does not change when the robot turns."""
-    points, weights = hits(track.recording, track.e, t)
-    reached = np.histogram(np.linalg.norm(points, axis=1), _BINS, weights=weights)[0].cumsum()
+    scan = hits(track.recording, track.e, t)
+    ranges = np.linalg.norm(scan.points, axis=1)
+    reached = np.histogram(ranges, _BINS, weights=scan.weights)[0].cumsum()
     shares: Float = reached / max(float(reached[-1]), 1e-9)
     return shares
 
@@ -119,7 +120,7 @@ def _beside(track: Track, first: int) -> Float:
     """(3, 3) that moves what comes from scan `first` on to the right of all that was before."""
     reach = np.array(
         [
-            np.linalg.norm(hits(track.recording, track.e, t)[0], axis=1).max(initial=0.0)
+            np.linalg.norm(hits(track.recording, track.e, t).points, axis=1).max(initial=0.0)
             for t in track.keyframes.tolist()
         ]
     )

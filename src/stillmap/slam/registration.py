@@ -10,6 +10,7 @@ from stillmap import _core
 from stillmap.options import field_with_doc
 from stillmap.slam import motion
 from stillmap.slam.motion import MotionPrior
+from stillmap.slam.scans import Scan
 
 Float = NDArray[np.float64]
 
@@ -49,8 +50,8 @@ class RegistrationOptions:
     carried_below: float = field_with_doc(
         0.5, "of the usual share explained, below which a robot may have been carried elsewhere"
     )
-    carried_through: float = field_with_doc(
-        0.4, "share of the beams that then would have to go through walls"
+    through: float = field_with_doc(
+        0.15, "share of a scan's beams that may seem to go through walls, unless it is elsewhere"
     )
     lost_translation: float = field_with_doc(
         1.0, "m, half width of a last search over all headings, while doubt remains"
@@ -77,7 +78,7 @@ _LIMITS = (
     ("lies", 0.0, 1e6),
     ("disagree", 0.1, 1e6),
     ("carried_below", 0.0, 1.0),
-    ("carried_through", 0.0, 1.0),
+    ("through", 0.0, 1.0),
     ("doubt_translation", 0.0, 5.0),
     ("doubt_rotation", 0.0, 3.2),
     ("lost_translation", 0.0, 5.0),
@@ -110,9 +111,9 @@ class Registration:
 
 def register(
     grid: _core.Grid2D,
-    points: NDArray[np.float32],
-    weights: NDArray[np.float32],
+    scan: Scan,
     prior: MotionPrior,
+    other: MotionPrior | None,
     options: RegistrationOptions,
     usual: float,
 ) -> Registration:
@@ -120,63 +121,68 @@ def register(
 
     Args:
         grid: the map so far.
-        points: (N, 2) end points of hits in the frame of the robot base.
-        weights: (N,) e, how probable it is that each was static.
-        prior: where odometry says the robot is.
+        scan: what was seen.
+        prior: where odometry says the robot is; or, without it, where it ought to be.
+        other: what else it may be, should the scan not fit there.
         options: see RegistrationOptions.
         usual: share of a scan that the map explained of late.
     """
-    found = _within_prior(grid, points, weights, prior, options, usual)
-    if len(points) == 0:
+    found = _within(grid, scan, prior, options, usual)
+    if len(scan.points) == 0:
         return found
     doubtful = options.doubt_below * usual
-    if found.explained < doubtful:
-        found = _farther(grid, points, weights, prior, options, found, doubtful)
+    for mean in (prior, other):
+        if mean is not None and found.explained < doubtful:
+            found = _farther(grid, scan, mean, options, found, doubtful)
     if prior.measured and _is_off(prior, found, options):
         # a mean that far off is no mean: it would only draw the pose towards itself
         looser = motion.widened(prior, *_off_by(prior, found))
-        again = search(grid, points, weights, looser, options, 0.0, 0.0, start=found.T_map_base)
+        again = search(grid, scan, looser, options, 0.0, 0.0, start=found.T_map_base)
         if again.misfit <= found.misfit:
             found = dataclasses.replace(again, widened=found.widened)
         found = dataclasses.replace(found, disagrees=_is_off(prior, found, options))
     return found
 
 
-def _within_prior(
+def _within(
     grid: _core.Grid2D,
-    points: NDArray[np.float32],
-    weights: NDArray[np.float32],
+    scan: Scan,
     prior: MotionPrior,
     options: RegistrationOptions,
     usual: float,
 ) -> Registration:
+    """The best pose that the prior allows."""
     if prior.measured:
-        near = search(grid, points, weights, prior, options, 0.0, 0.0, start=prior.T_map_base)
+        near = search(grid, scan, prior, options, 0.0, 0.0, start=prior.T_map_base)
         if near.explained >= options.near * usual:
             return near
     translation = options.window * prior.sigma_translation
     rotation = options.window * prior.sigma_rotation
-    return search(grid, points, weights, prior, options, translation, rotation)
+    return search(grid, scan, prior, options, translation, rotation)
 
 
 def _farther(
     grid: _core.Grid2D,
-    points: NDArray[np.float32],
-    weights: NDArray[np.float32],
+    scan: Scan,
     prior: MotionPrior,
     options: RegistrationOptions,
     found: Registration,
     doubtful: float,
 ) -> Registration:
-    """What lies beyond the prior's window, where the scan fits much better there."""
+    """What lies beyond the prior's window, where the scan fits much better there.
+
+    A place that only looks alike would have the robot look through walls.
+    """
     for least_translation, least_rotation in (
         (options.doubt_translation, options.doubt_rotation),
         (options.lost_translation, np.pi),
     ):
         wide = motion.widened(prior, least_translation / 3.0, least_rotation / 3.0)
         window = options.window * wide.sigma_translation, options.window * wide.sigma_rotation
-        wider = search(grid, points, weights, wide, options, *window)
-        if wider.misfit < found.misfit - options.lies:
+        wider = search(grid, scan, wide, options, *window)
+        if wider.misfit < found.misfit - options.lies and not looks_through_walls(
+            grid, scan, wider, options
+        ):
             found = dataclasses.replace(wider, widened=True)
         if found.explained >= doubtful:
             break
@@ -196,8 +202,7 @@ def _is_off(prior: MotionPrior, found: Registration, options: RegistrationOption
 
 def search(
     grid: _core.Grid2D,
-    points: NDArray[np.float32],
-    weights: NDArray[np.float32],
+    scan: Scan,
     prior: MotionPrior,
     options: RegistrationOptions,
     translation: float,
@@ -207,15 +212,15 @@ def search(
     """The best pose in a window around the prior's mean; no doubts.
 
     Args:
-        grid, points, weights, prior, options: as `register` has them.
+        grid, scan, prior, options: as `register` has them.
         translation: metres, half width of the window.
         rotation: radians, half width of the window.
         start: (3, 3) where Newton steps begin instead of searching the window.
     """
     T, covariance, cost, explained, _, _, rivals = _core.register_beams(
         grid,
-        points,
-        weights,
+        scan.points,
+        scan.weights,
         prior.T_map_base,
         prior.information,
         sigma=options.sigma,
@@ -233,17 +238,20 @@ def search(
     return Registration(T, covariance, explained, cost - prior.penalty(T), rivals)
 
 
-def share_through(
-    grid: _core.Grid2D,
-    points: NDArray[np.float32],
-    weights: NDArray[np.float32],
-    T_map_base: Float,
-    T_base_sensor: Float,
-) -> float:
-    """Share of a scan's beams that would have to go through walls, at a pose (3, 3)."""
-    return _core.share_through(
-        grid, points, weights, T_map_base, T_base_sensor, margin=_MARGIN, occupied=_WALL
+def looks_through_walls(
+    grid: _core.Grid2D, scan: Scan, found: Registration, options: RegistrationOptions
+) -> bool:
+    """Whether many beams would have to go through walls that the map knows."""
+    through: float = _core.share_through(
+        grid,
+        scan.points,
+        scan.weights,
+        found.T_map_base,
+        scan.T_base_sensor,
+        margin=_MARGIN,
+        occupied=_WALL,
     )
+    return through > options.through
 
 
 def radius(options: RegistrationOptions, resolution: float) -> int:

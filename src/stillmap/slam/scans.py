@@ -59,14 +59,28 @@ def put(
     )
 
 
-def hits(
-    recording: Recording, e: NDArray[np.float32], t: int
-) -> tuple[Points, NDArray[np.float32]]:
-    """End points (N, 2) of scan t in the frame of the robot base, and their e (N,)."""
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """The hits of a scan, or of several.
+
+    Attributes:
+        points: (N, 2) float32, end points in the frame of the robot base.
+        weights: (N,) float32, e: how probable it is that each was static.
+        T_base_sensor: (3, 3) where the beams begin.
+    """
+
+    points: Points
+    weights: NDArray[np.float32]
+    T_base_sensor: Float
+
+
+def hits(recording: Recording, e: NDArray[np.float32], t: int) -> Scan:
+    """The hits of scan t."""
     beams = recording.beams_of(t)
     hit = recording.hit[beams]
     T_base_sensor = recording.T_base_sensor[recording.sensor[t]]
-    return in_frame(recording.points[beams][hit], T_base_sensor), e[beams][hit]
+    points = in_frame(recording.points[beams][hit], T_base_sensor)
+    return Scan(points, e[beams][hit], T_base_sensor)
 
 
 def in_frame(points: Points, T: Float) -> Points:

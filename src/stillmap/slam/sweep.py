@@ -40,8 +40,9 @@ def sweep(
         if is_in_map[t]:
             put(grid, recording, e, t, poses[t], options.surface, remove=True)
         prior = _between_neighbours(recording, poses, increments, mapped.breaks, t, options)
+        scan = hits(recording, e, t)
         found = registration.search(
-            grid, *hits(recording, e, t), prior, options.registration, 0.0, 0.0, start=poses[t]
+            grid, scan, prior, options.registration, 0.0, 0.0, start=poses[t]
         )
         poses[t] = se2.matrix(*se2.parameters(found.T_map_base))
         covariance[t], explained[t] = found.covariance, found.explained
