@@ -93,6 +93,31 @@ def test_flags_reach_the_reader(path, capsys):
     assert (place["x"], place["y"], place["theta_deg"]) == pytest.approx((1, 2, 90))
 
 
+def test_a_laser_upside_down(path, capsys):
+    run(path)
+    assert "upside down" not in capsys.readouterr().out
+    run(path, "--laser-upside-down", "--laser-fov", "90")
+    out = capsys.readouterr().out
+    assert "beams turn clockwise (given)" in out
+    assert "-22.50 to 45.00 deg, 22.5 deg apart" in out
+    run(path, "--json", "--laser-upside-down")
+    (sensor,) = json.loads(capsys.readouterr().out)["sensors"]
+    assert (sensor["upside_down"], sensor["upside_down_how"]) == (True, "given")
+
+
+def test_flags_of_the_second_laser(path, capsys):
+    with pytest.raises(InputError, match="second laser"):
+        run(path, "--laser2-upside-down")
+    with path.open("a") as file:
+        file.write("RLASER 4 1 2 3 4 3 4 0.5 3 4 0.5 102.0 host 0.1\n")
+    run(path, "--json", "--laser2-offset", -1, 0, 90, "--laser2-upside-down", "--laser2-fov", 90)
+    first, second = json.loads(capsys.readouterr().out)["sensors"]
+    assert (first["upside_down"], second["upside_down"]) == (False, True)
+    place = second["extrinsics"]
+    assert (place["x"], place["y"], place["theta_deg"]) == pytest.approx((-1, 0, 90))
+    assert second["field_of_view_deg"] == pytest.approx([-22.5, 45.0])
+
+
 def test_flag_out_of_range_is_the_callers_fault(path):
     with pytest.raises(InputError, match="min_range"):
         run(path, "--min-range", "-1")

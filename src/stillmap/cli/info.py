@@ -102,7 +102,7 @@ def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
     view = sensor.get("field_of_view_deg")
     if view is not None:
         step = sensor.get("angle_step")
-        steps = f", {math.degrees(step):g} deg apart" if isinstance(step, float) else ""
+        steps = f", {math.degrees(abs(step)):g} deg apart" if isinstance(step, float) else ""
         yield _row("  field of view", f"{view[0]:.2f} to {view[1]:.2f} deg{steps}")
     place = sensor.get("extrinsics")
     if place is not None:
@@ -111,6 +111,8 @@ def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
             f"x {place['x']:.3f} m, y {place['y']:.3f} m, turned {place['theta_deg']:.2f} deg "
             f"({place['how']})",
         )
+    if sensor.get("upside_down"):
+        yield _row("  upside down", f"beams turn clockwise ({sensor.get('upside_down_how', '')})")
     rule = sensor.get("ranges")
     if rule is not None:
         threshold = rule["threshold"]

@@ -4,9 +4,11 @@ import argparse
 import math
 from typing import Any
 
+_LASERS = {"laser": "first", "laser2": "second"}  # flags and options begin with the name
+
 
 def add_read_flags(parser: argparse.ArgumentParser) -> None:
-    """Add --min-range, --max-range, --zero-means and --laser-offset to a command."""
+    """Add the flags of ranges and of where the lasers sit to a command."""
     group = parser.add_argument_group("reading the recording")
     group.add_argument(
         "--min-range", type=float, metavar="M", help="nearer readings are unusable (the robot)"
@@ -22,13 +24,25 @@ def add_read_flags(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "unusable", "max-range"),
         help="what a reading of zero stands for (default: auto)",
     )
-    group.add_argument(
-        "--laser-offset",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "DEG"),
-        help="where the first laser sits on the robot: m ahead, m left, degrees turned left",
-    )
+    for laser, which in _LASERS.items():
+        group.add_argument(
+            f"--{laser}-offset",
+            type=float,
+            nargs=3,
+            metavar=("X", "Y", "DEG"),
+            help=f"where the {which} laser sits on the robot: m ahead, m left, degrees turned left",
+        )
+        group.add_argument(
+            f"--{laser}-upside-down",
+            action="store_true",
+            help=f"the {which} laser hangs upside down: its beams turn clockwise",
+        )
+        group.add_argument(
+            f"--{laser}-fov",
+            type=float,
+            metavar="DEG",
+            help=f"field of view of the {which} laser, of FLASER and RLASER lines (default: 180)",
+        )
 
 
 def read_changes(args: argparse.Namespace) -> dict[str, Any]:
@@ -38,7 +52,13 @@ def read_changes(args: argparse.Namespace) -> dict[str, Any]:
         for name in ("min_range", "max_range", "zero_means")
         if (value := getattr(args, name)) is not None
     }
-    if args.laser_offset is not None:
-        x, y, degrees = args.laser_offset
-        changes.update(laser_x=x, laser_y=y, laser_theta=math.radians(degrees))
+    for laser in _LASERS:
+        offset, fov = getattr(args, f"{laser}_offset"), getattr(args, f"{laser}_fov")
+        if offset is not None:
+            place = (*offset[:2], math.radians(offset[2]))
+            changes.update(zip((f"{laser}_x", f"{laser}_y", f"{laser}_theta"), place, strict=True))
+        if getattr(args, f"{laser}_upside_down"):
+            changes[f"{laser}_upside_down"] = True
+        if fov is not None:
+            changes[f"{laser}_fov"] = math.radians(fov)
     return {"read": changes} if changes else {}

@@ -11,11 +11,11 @@ from stillmap import se2
 from stillmap.errors import InputError
 from stillmap.recording import extrinsics, odometry, ranges
 from stillmap.recording.carmen_log import CarmenLog, LaserLog, read_log
-from stillmap.recording.carmen_messages import SCAN_PARSERS, WRONG_COUNT
+from stillmap.recording.carmen_messages import SCAN_PARSERS, WRONG_COUNT, flaser_angles
 from stillmap.recording.extrinsics import Extrinsics
 from stillmap.recording.lines import Progress, is_gzip
 from stillmap.recording.model import Recording
-from stillmap.recording.options import ReadOptions
+from stillmap.recording.options import GivenLaser, ReadOptions
 from stillmap.recording.skipped import Skipped
 from stillmap.recording.stamps import longest_non_decreasing
 
@@ -114,16 +114,20 @@ def _usable(laser: LaserLog, log: CarmenLog) -> _Sensor:
 
 def _assembled(sensors: list[_Sensor], log: CarmenLog, options: ReadOptions) -> Recording:
     """One recording of all lasers' scans in the order of their stamps."""
+    options.require_lasers(len(sensors))
     skipped = log.skipped.merged(*(log.skipped_scans[s.laser.kind] for s in sensors))
     warnings = _loss_warning(sensors, skipped)
     parts, places, infos = [], [], []
     for number, sensor in enumerate(sensors):
         place, more = extrinsics.find(sensor.laser, sensor.poses, log.params)
-        place = extrinsics.overridden(place, options) if number == 0 else place
-        points, hit, rule = _points(sensor, log, options, more)
+        given = options.laser(number)
+        place = extrinsics.overridden(place, given)
+        upside_down = extrinsics.upside_down(sensor.laser.kind, log.params, given)
+        angles = _angles(sensor, log, given, upside_down[0], more)
+        points, hit, rule = _points(sensor, angles, log, options, more)
         parts.append((points, hit))
         places.append(place)
-        infos.append(_sensor_info(sensor, place, rule))
+        infos.append(_sensor_info(sensor, place, angles, upside_down, rule))
         warnings += more
     poses, odometry_info = _odometry(sensors, log)
     warnings += odometry_info.pop("warnings")
@@ -149,8 +153,27 @@ def _assembled(sensors: list[_Sensor], log: CarmenLog, options: ReadOptions) -> 
     )
 
 
+def _angles(
+    sensor: _Sensor, log: CarmenLog, given: GivenLaser, upside_down: bool, warnings: list[str]
+) -> NDArray[np.float64]:
+    """(C, 2) first angle and step in radians, counterclockwise, of each of the laser's configs."""
+    angles = np.array([config[:2] for config in sensor.laser.configs])
+    fov = extrinsics.field_of_view(sensor.laser.kind, log.params, given)
+    if sensor.laser.kind in ("FLASER", "RLASER"):
+        if fov is not None:
+            angles[:] = flaser_angles(sensor.ranges.shape[1], fov)[:2]
+    elif given.fov is not None:
+        text = "its lines state their angles: the given field of view is not used"
+        warnings.append(f"{sensor.laser.kind}: {text}")
+    return -angles if upside_down else angles
+
+
 def _points(
-    sensor: _Sensor, log: CarmenLog, options: ReadOptions, warnings: list[str]
+    sensor: _Sensor,
+    angles: NDArray[np.float64],
+    log: CarmenLog,
+    options: ReadOptions,
+    warnings: list[str],
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], ranges.RangeRule]:
     """End points (T, n, 2) in the sensor frame, hits (T, n), and how readings were understood."""
     declared = extrinsics.declared_max_range(sensor.laser, log.params)
@@ -158,8 +181,7 @@ def _points(
     more += _angle_warning(sensor)
     warnings += [f"{sensor.laser.kind}: {text}" for text in more]
     length, hit = ranges.apply(sensor.ranges, rule)
-    configs = np.array([config[:2] for config in sensor.laser.configs])
-    angle = configs[:, :1] + configs[:, 1:] * np.arange(length.shape[1])
+    angle = angles[:, :1] + angles[:, 1:] * np.arange(length.shape[1])
     points = np.empty((*length.shape, 2), np.float32)
     points[..., 0] = length * np.cos(angle)[sensor.config]
     points[..., 1] = length * np.sin(angle)[sensor.config]
@@ -244,15 +266,22 @@ def _loss_warning(sensors: list[_Sensor], skipped: Skipped) -> list[str]:
     return [f"{lost} of {kept + lost} scans are damaged and were skipped: {skipped.summary()}"]
 
 
-def _sensor_info(sensor: _Sensor, place: Extrinsics, rule: ranges.RangeRule) -> dict[str, Any]:
-    configs = list(sensor.laser.configs)
-    usual = configs[int(np.bincount(sensor.config).argmax())]
+def _sensor_info(
+    sensor: _Sensor,
+    place: Extrinsics,
+    angles: NDArray[np.float64],
+    upside_down: tuple[bool, str],
+    rule: ranges.RangeRule,
+) -> dict[str, Any]:
+    first, step = angles[int(np.bincount(sensor.config).argmax())]
     return {
         "name": sensor.laser.kind,
         "scans": len(sensor.stamp_ns),
         "beams_per_scan": sensor.ranges.shape[1],
-        "start_angle": usual.start_angle,
-        "angle_step": usual.angle_step,
+        "start_angle": float(first),
+        "angle_step": float(step),
+        "upside_down": upside_down[0],
+        "upside_down_how": upside_down[1],
         "extrinsics": place.to_dict(),
         "ranges": rule.to_dict(),
     }

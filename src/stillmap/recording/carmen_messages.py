@@ -65,15 +65,15 @@ class OdometryLine(NamedTuple):
     stamp_fields: int
 
 
-def flaser_angles(n: int) -> ScanConfig:
+def flaser_angles(n: int, fov: float = math.pi) -> ScanConfig:
     """Angles of a FLASER or RLASER line, which states none: half a circle from -90 degrees.
 
     180 and 181 readings are 1 degree apart, 360 and 361 half a degree: an even number leaves out
     the last beam of the half circle, so the step is 180 / n degrees for even and 180 / (n - 1)
-    for odd n.
+    for odd n. Likewise for another field of view `fov`, in radians.
     """
     steps = n if n % 2 == 0 else max(n - 1, 1)
-    return ScanConfig(-math.pi / 2, math.pi / steps, None, None)
+    return ScanConfig(-fov / 2, fov / steps, None, None)
 
 
 def parse_flaser(fields: list[bytes]) -> ScanLine:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.recording.carmen_log import LaserLog, param_number
-from stillmap.recording.options import ReadOptions
+from stillmap.recording.options import GivenLaser
 
 # differences between laser pose and robot pose that are one place on the robot: rounded to cm in
 # old logs; a corrected pose in the laser field differs by metres, and differently in each scan
@@ -68,13 +68,32 @@ def find(
     return Extrinsics(0.0, 0.0, 0.0, "robot centre assumed"), warnings
 
 
-def overridden(found: Extrinsics, options: ReadOptions) -> Extrinsics:
+def overridden(found: Extrinsics, given: GivenLaser) -> Extrinsics:
     """`found` with what the options name in its place."""
-    wanted = (options.laser_x, options.laser_y, options.laser_theta)
-    if wanted == (None, None, None):
+    if given.place == (None, None, None):
         return found
-    x, y, theta = (f if w is None else w for f, w in zip(found[:3], wanted, strict=True))
+    x, y, theta = (f if w is None else w for f, w in zip(found[:3], given.place, strict=True))
     return Extrinsics(x, y, theta, "given")
+
+
+def upside_down(kind: str, params: dict[str, str], given: GivenLaser) -> tuple[bool, str]:
+    """Whether a laser's beams turn clockwise, for it hangs upside down; and who says so.
+
+    CARMEN's own laser_..._flipped do not: its laser server turns such readings round before they
+    are logged.
+    """
+    if given.upside_down is not None:
+        return given.upside_down, "given"
+    stated = param_number(params, f"robot_{position(kind, params)}laser_flipped")
+    return (False, "assumed") if stated is None else (stated != 0.0, "PARAM")
+
+
+def field_of_view(kind: str, params: dict[str, str], given: GivenLaser) -> float | None:
+    """Of a laser whose lines state no angles, in radians; None: nobody says."""
+    if given.fov is not None:
+        return given.fov
+    degrees = param_number(params, f"laser_{position(kind, params)}_laser_fov")
+    return math.radians(degrees) if degrees is not None and 0.0 < degrees <= 360.0 else None
 
 
 def position(kind: str, params: dict[str, str]) -> str:

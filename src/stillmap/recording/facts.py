@@ -14,7 +14,10 @@ _CHUNK = 1 << 20  # beams looked at together
 _DAMAGE = ("skipped", "skipped_odometry")
 _TABLES = ("records", "ignored", "params", "read_options")
 _LISTS = ("duplicates", "warnings")
-_SENSOR_NOTES = ("name", "beams_per_scan", "start_angle", "angle_step", "extrinsics", "ranges")
+_SENSOR_NOTES = (
+    *("name", "beams_per_scan", "start_angle", "angle_step", "extrinsics", "ranges"),
+    *("upside_down", "upside_down_how"),
+)
 _RULE = {field.name for field in dataclasses.fields(RangeRule)}
 
 
@@ -165,7 +168,8 @@ def _field_of_view(
     first, step, n = (noted.get(k) for k in ("start_angle", "angle_step", "beams_per_scan"))
     if isinstance(first, float) and isinstance(step, float) and isinstance(n, int):
         last = first + (n - 1) * step
-        return [float(np.degrees(first)), float(np.degrees(last))]
+        lowest, highest = sorted([first, last])  # a laser upside down turns clockwise
+        return [float(np.degrees(lowest)), float(np.degrees(highest))]
     lowest, highest = np.inf, -np.inf
     for scan in scans:
         points = recording.points[recording.beams_of(scan)]

@@ -7,17 +7,19 @@ import numpy as np
 from stillmap import se2
 from stillmap.errors import InputError
 from stillmap.recording.model import Recording
-from stillmap.recording.options import ReadOptions
+from stillmap.recording.options import GivenLaser, ReadOptions
 
 
 def applied(recording: Recording, options: ReadOptions) -> Recording:
     """`recording` narrowed by the options; itself where they are the defaults.
 
     Nearer than `min_range`: unusable. From `max_range` on: maximum range, ending there. A
-    maximum-range beam shows at most `free_range`. `zero_means` has nothing left to say.
+    maximum-range beam shows at most `free_range`. A laser upside down is turned round from how it
+    was recorded. `zero_means` and fields of view have nothing left to say.
 
     Raises:
-        InputError: a laser's place on the robot is given, and the recording is 3D.
+        InputError: a laser's place on the robot is given, and the recording is 3D or has no such
+            laser.
     """
     defaults = ReadOptions(zero_means=options.zero_means)
     if options == defaults:
@@ -26,8 +28,9 @@ def applied(recording: Recording, options: ReadOptions) -> Recording:
     changed = replace(recording, source={**recording.source, "read_options": given})
     if options.min_range > 0 or options.max_range is not None or options.free_range is not None:
         changed = _narrowed(changed, options)
-    if (options.laser_x, options.laser_y, options.laser_theta) != (None, None, None):
-        changed = _with_laser(changed, options)
+    options.require_lasers(len(recording.T_base_sensor))
+    for number in range(min(len(recording.T_base_sensor), 2)):
+        changed = _with_laser(changed, number, options.laser(number))
     return changed
 
 
@@ -45,11 +48,22 @@ def _narrowed(recording: Recording, options: ReadOptions) -> Recording:
     return replace(recording, points=points, hit=hit)
 
 
-def _with_laser(recording: Recording, options: ReadOptions) -> Recording:
-    if recording.dimension != 2 or not len(recording.T_base_sensor):
+def _with_laser(recording: Recording, number: int, given: GivenLaser) -> Recording:
+    if given.place == (None, None, None) and not given.upside_down:
+        return recording
+    if recording.dimension != 2:
         raise InputError("the laser's place on the robot can be given for 2D recordings only")
-    wanted = (options.laser_x, options.laser_y, options.laser_theta)
     T = np.array(recording.T_base_sensor)
-    found = se2.parameters(T[0])
-    T[0] = se2.matrix(*(f if w is None else w for f, w in zip(found, wanted, strict=True)))
-    return replace(recording, T_base_sensor=T)
+    found = se2.parameters(T[number])
+    place = (f if w is None else w for f, w in zip(found, given.place, strict=True))
+    T[number] = se2.matrix(*place)
+    changed = replace(recording, T_base_sensor=T)
+    return _mirrored(changed, number) if given.upside_down else changed
+
+
+def _mirrored(recording: Recording, number: int) -> Recording:
+    """The beams of one laser turned the other way round."""
+    points = np.array(recording.points)
+    its = np.repeat(recording.sensor == number, np.diff(recording.offset))
+    points[its, 1] *= -1.0
+    return replace(recording, points=points)

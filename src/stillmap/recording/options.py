@@ -1,11 +1,34 @@
 """How a recording's readings are understood."""
 
+import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
+from stillmap.errors import InputError
 from stillmap.options import field_with_doc
 
 BEYOND = 1000.0  # m: no laser in the plane sees so far; drivers write 1e10 or FLT_MAX for +inf
+
+
+_LARGEST = {"x": 1e3, "y": 1e3, "theta": 1e3, "fov": 2.0 * math.pi + 1e-6}  # m, m, rad, rad
+
+
+class GivenLaser(NamedTuple):
+    """What the options say of one laser; None: found in the recording. Metres and radians."""
+
+    x: float | None
+    y: float | None
+    theta: float | None
+    upside_down: bool | None
+    fov: float | None
+
+    @property
+    def place(self) -> tuple[float | None, float | None, float | None]:
+        """Where it sits on the robot."""
+        return self.x, self.y, self.theta
+
+
+_NOTHING_GIVEN = GivenLaser(None, None, None, None, None)
 
 
 @dataclass(frozen=True)
@@ -31,6 +54,19 @@ class ReadOptions:
     laser_theta: float | None = field_with_doc(
         None, "rad: first laser turned on the robot; unset: found in the recording"
     )
+    laser_upside_down: bool | None = field_with_doc(
+        None, "first laser's beams turn the other way round; unset: found in the recording"
+    )
+    laser_fov: float | None = field_with_doc(
+        None, "rad: all beams of the first laser, of lines without angles; unset: half a circle"
+    )
+    laser2_x: float | None = field_with_doc(None, "m: second laser ahead of the robot's centre")
+    laser2_y: float | None = field_with_doc(None, "m: second laser left of the robot's centre")
+    laser2_theta: float | None = field_with_doc(None, "rad: second laser turned on the robot")
+    laser2_upside_down: bool | None = field_with_doc(
+        None, "second laser's beams turn the other way round"
+    )
+    laser2_fov: float | None = field_with_doc(None, "rad: all beams of the second laser")
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.min_range < BEYOND:
@@ -39,7 +75,27 @@ class ReadOptions:
             value = getattr(self, name)
             if value is not None and not self.min_range < value <= BEYOND:
                 raise ValueError(f"{name} must lie in min_range to {BEYOND:g} m, got {value}")
-        for name in ("laser_x", "laser_y", "laser_theta"):
-            value = getattr(self, name)
-            if value is not None and not abs(value) < 1e3:
-                raise ValueError(f"{name} must be a small finite number, got {value}")
+        for number, laser in enumerate(("laser", "laser2")):
+            for name, largest in _LARGEST.items():
+                value = getattr(self.laser(number), name)
+                if value is not None and not abs(value) < largest:
+                    raise ValueError(f"{laser}_{name} must be a small finite number, got {value}")
+            fov = self.laser(number).fov
+            if fov is not None and not fov > 0.0:
+                raise ValueError(f"{laser}_fov must be positive, got {fov}")
+
+    def laser(self, number: int) -> GivenLaser:
+        """What is said of a laser, from 0."""
+        if number > 1:
+            return _NOTHING_GIVEN
+        prefix = ("laser", "laser2")[number]
+        return GivenLaser(*(getattr(self, f"{prefix}_{name}") for name in GivenLaser._fields))
+
+    def require_lasers(self, number: int) -> None:
+        """Refuses options for a laser that is not there.
+
+        Raises:
+            InputError: there are only `number` lasers.
+        """
+        if number < 2 and self.laser(1) != _NOTHING_GIVEN:
+            raise InputError("options speak of a second laser, and there is none (laser2_...)")
