@@ -33,6 +33,7 @@ def metres_to(track: Track, k: int, ties: list[Closure]) -> Float:
     from scipy.sparse import csgraph  # takes long to load
 
     travelled = track.travelled[track.keyframes[: k + 1]]
+    ties = [closure for closure in ties if closure.later <= track.keyframes[k]]
     if not ties:
         along: Float = travelled[k] - travelled
         return along

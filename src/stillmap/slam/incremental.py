@@ -110,24 +110,26 @@ def build(
     steadiness = motion.unknown_steadiness(options.motion)
     steps = motion.odometry_steps(recording.T_odom_base)
     seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns))) if T > 1 else 0.0
-    travelled, usual = 0.0, 1.0
+    travelled = 0.0
+    usual = np.zeros(len(recording.T_base_sensor))  # each laser sees its own side
+    usual[recording.sensor[0]] = 1.0
     so_far.add(0, poses[0], 0.0)
     for t in range(1, T):
         guess = motion.from_constant_velocity(poses[t - 1], poses[max(t - 2, 0)], steadiness)
         prior, other = _priors(poses[t - 1], steps, t, guess, options.motion)
-        scan = hits(recording, e, t)
-        found = register(so_far.grid, scan, prior, other, options.registration, usual)
-        if _was_carried(so_far, scan, found, usual, options.registration):
+        scan, s = hits(recording, e, t), recording.sensor[t]
+        found = register(so_far.grid, scan, prior, other, options.registration, usual[s])
+        if _was_carried(so_far, scan, found, usual[s], options.registration):
             breaks.append(t)
-            so_far, usual = _empty(recording, e, options), 1.0
+            so_far, usual[:] = _empty(recording, e, options), 0.0
             found = register(so_far.grid, scan, prior, None, options.registration, 0.0)
         poses[t], covariance[t], explained[t] = found.T_map_base, found.covariance, found.explained
         if found.widened:
             widened.append(t)
         if found.disagrees or (steps is not None and not prior.measured):
             disagreeing.append(t)
-        if t not in breaks[-1:]:
-            usual += _LATELY * (found.explained - usual)
+        # nothing is usual yet after the first scan
+        usual[s] += (_LATELY if usual[s] > 0.0 else 1.0) * (found.explained - usual[s])
         steadiness = steadiness.after(guess.shift_to(poses[t]), seconds, options.motion)
         travelled += float(np.linalg.norm(poses[t, :2, 2] - poses[t - 1, :2, 2]))
         so_far.add(t, poses[t], travelled)

@@ -76,9 +76,9 @@ def _attempts(track: Track, first: int, last: int) -> Iterator[Closure]:
 
 
 def _best_of_each(stretches: Float, unlike: Float) -> list[float]:
-    """The stretches with the scans that look most alike, each once, the best first."""
+    """The stretches with the scans that look most alike, the best first, and the last one."""
     found = dict.fromkeys(stretches[np.argsort(unlike, kind="stable")].tolist())
-    return list(found)[:_ALIKE]
+    return list(dict.fromkeys([*list(found)[:_ALIKE], float(stretches[-1])]))
 
 
 def _signature(track: Track, t: int) -> Float:

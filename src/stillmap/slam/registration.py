@@ -24,7 +24,7 @@ class RegistrationOptions:
 
     sigma: float = field_with_doc(0.04, "m, width of the smoothed field around end points")
     floor: float = field_with_doc(0.05, "field value of an end point the map cannot explain")
-    unknown: float = field_with_doc(0.05, "what unknown space adds to it: unknown is not free")
+    unknown: float = field_with_doc(0.15, "what unknown space adds to it: unknown is not free")
     approach: float = field_with_doc(
         0.5, "m before its end in which a beam says nothing against what it crosses"
     )
@@ -48,7 +48,7 @@ class RegistrationOptions:
     doubt_translation: float = field_with_doc(0.5, "m, half width of that search at least")
     doubt_rotation: float = field_with_doc(0.5, "rad, half width of that search at least")
     carried_below: float = field_with_doc(
-        0.5, "of the usual share explained, below which a robot may have been carried elsewhere"
+        0.3, "of the usual share explained, below which a robot may have been carried elsewhere"
     )
     through: float = field_with_doc(
         0.15, "share of a scan's beams that may seem to go through walls, unless it is elsewhere"
