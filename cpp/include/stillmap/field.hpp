@@ -3,6 +3,7 @@
 // weighted by its occupancy (15), so a cell that beams also passed through counts less.
 #pragma once
 
+#include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -38,6 +39,11 @@ struct Neighbourhood {
   };
   Cell<D> centre = Cell<D>::Zero();
   bool valid = false;
+  bool seen = false;
+  bool is_flat = false;            // whether the Gaussians lie on a line or plane
+  Vec<D> across = Vec<D>::Zero();  // its normal
+  Vec<D> on = Vec<D>::Zero();      // a point on it, in cells
+  double height = 0.0;             // mean occupancy of its cells
   double base = 0.0;
   std::vector<Gaussian> gaussians;
 };
@@ -71,6 +77,7 @@ class Field {
     if (!all_below<D>(y, Grid<D>::kMaxCell - 64)) return out;
     gather(cell_of<D>(y), near);
     out.base = near.base;
+    if (!near.seen && near.is_flat) return beyond(y, near);
     double sum = 0.0;
     Vec<D> first = Vec<D>::Zero();
     Eigen::Matrix<double, D, D> second = Eigen::Matrix<double, D, D>::Zero();
@@ -93,11 +100,49 @@ class Field {
   }
 
  private:
+  // Where nobody looked a surface is taken to go on: its end, so far, says nothing of where a scan
+  // is along it.
+  FieldValue<D> beyond(const Vec<D>& y, const Neighbourhood<D>& near) const {
+    FieldValue<D> out;
+    out.base = near.base;
+    const double off = near.across.dot(near.on - y);
+    const double per_metre2 = 1.0 / (options_.sigma * options_.sigma);
+    out.value = near.height * std::exp(exponent_ * off * off);
+    out.pull = near.across * (off * resolution_ * per_metre2);
+    out.spread.setIdentity();
+    out.spread -= near.across * near.across.transpose();
+    out.spread *= per_metre2;
+    return out;
+  }
+
+  void fit_plane(Neighbourhood<D>& near) const {
+    near.is_flat = false;
+    if (near.gaussians.size() < D) return;
+    double total = 0.0;
+    Vec<D> mean = Vec<D>::Zero();
+    for (const auto& g : near.gaussians) {
+      total += g.weight;
+      mean += g.weight * g.mean;
+    }
+    if (!(total > 0.0)) return;
+    mean /= total;
+    Eigen::Matrix<double, D, D> spread = Eigen::Matrix<double, D, D>::Zero();
+    for (const auto& g : near.gaussians)
+      spread += (g.weight / total) * (g.mean - mean) * (g.mean - mean).transpose();
+    Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> axes;
+    axes.computeDirect(spread);
+    near.is_flat = axes.eigenvalues()[0] < 0.1 * axes.eigenvalues()[1];
+    near.across = axes.eigenvectors().col(0);
+    near.on = mean;
+    near.height = total / static_cast<double>(near.gaussians.size());
+  }
+
   void gather(const Cell<D>& centre, Neighbourhood<D>& near) {
     if (near.valid && near.centre == centre) return;
     near.centre = centre;
     near.valid = true;
-    near.base = options_.floor + (cursor_.seen(centre) ? 0.0 : options_.unknown);
+    near.seen = cursor_.seen(centre) != nullptr;
+    near.base = options_.floor + (near.seen ? 0.0 : options_.unknown);
     near.gaussians.clear();
     const int radius = options_.radius;
     Cell<D> row = centre.array() - radius;
@@ -108,8 +153,9 @@ class Field {
         if (++row[d] <= centre[d] + radius) break;
         row[d] = centre[d] - radius;
       }
-      if (d == D) return;
+      if (d == D) break;
     }
+    if (!near.seen) fit_plane(near);
   }
 
   // the cells of a row along x up to `last`, block by block

@@ -69,7 +69,7 @@ def _track(
         options.surface,
         options.loops,
     )
-    return pieces.placed(track, breaks)
+    return pieces.placed(track, breaks, mapped.apart)
 
 
 def _relation(track: Track, closure: Closure) -> Relation:

@@ -18,8 +18,8 @@ from stillmap.slam.pose_graph import Graph
 from stillmap.slam.registration import (
     Registration,
     RegistrationOptions,
-    looks_through_walls,
     register,
+    share_through_walls,
 )
 from stillmap.slam.scans import Scan, SurfaceOptions, hits
 
@@ -61,8 +61,9 @@ class Mapped:
             others where poses were swept only.
         widened: indices of the scans that a wider search had to find.
         disagreeing: indices of the scans where odometry was disbelieved.
-        breaks: first scans after the robot was carried elsewhere.
-        apart: those of them from which on no place was seen that is known from before.
+        breaks: scans before which the robot went astray, or was carried elsewhere.
+        apart: those of them from which on no place was seen that is known from before; until loops
+            are looked for, those that fit nowhere around.
         loops: attempts at closing loops, accepted or refused.
         graph: the keyframes and what is known of them; None without loop closure.
     """
@@ -106,7 +107,8 @@ def build(
     so_far = _empty(recording, e, options)
     poses = np.tile(np.eye(3), (T, 1, 1))
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
-    widened, disagreeing, breaks = list[int](), list[int](), list[int]()
+    widened, disagreeing = list[int](), list[int]()
+    breaks, nowhere = list[int](), list[int]()
     steadiness = motion.unknown_steadiness(options.motion)
     steps = motion.odometry_steps(recording.T_odom_base)
     seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns))) if T > 1 else 0.0
@@ -119,10 +121,11 @@ def build(
         prior, other = _priors(poses[t - 1], steps, t, guess, options.motion)
         scan, s = hits(recording, e, t), recording.sensor[t]
         found = register(so_far.grid, scan, prior, other, options.registration, usual[s])
-        if _was_carried(so_far, scan, found, usual[s], options.registration):
+        fits_nowhere = _was_carried(so_far, scan, found, usual[s], options.registration)
+        if fits_nowhere or (found.astray and steps is not None):
             breaks.append(t)
+            nowhere += [t] if fits_nowhere else []
             so_far, usual[:] = _empty(recording, e, options), 0.0
-            found = register(so_far.grid, scan, prior, None, options.registration, 0.0)
         poses[t], covariance[t], explained[t] = found.T_map_base, found.covariance, found.explained
         if found.widened:
             widened.append(t)
@@ -136,7 +139,7 @@ def build(
         so_far.forget(travelled - memory)
         progress(t + 1, T)
     nothing = _core.Grid2D(options.resolution)
-    return Mapped(poses, covariance, nothing, explained, widened, disagreeing, breaks)
+    return Mapped(poses, covariance, nothing, explained, widened, disagreeing, breaks, nowhere)
 
 
 def _empty(recording: Recording, e: NDArray[np.float32], options: SlamOptions) -> LocalMap:
@@ -157,7 +160,7 @@ def _was_carried(
     """
     if found.explained >= options.carried_below * usual or len(scan.points) == 0:
         return False
-    return looks_through_walls(so_far.grid, scan, found, options)
+    return share_through_walls(so_far.grid, scan, found) > options.through
 
 
 def _priors(

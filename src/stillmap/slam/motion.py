@@ -175,6 +175,11 @@ def from_increment(
     return _prior(T_map_base @ increment, options.translation_floor, options.rotation_floor)
 
 
+def guess_at(T_map_base: Float, sigma_translation: float, sigma_rotation: float) -> MotionPrior:
+    """A prior about a pose (3, 3) that nobody measured."""
+    return _prior(T_map_base, sigma_translation, sigma_rotation)
+
+
 def combined(a: MotionPrior, b: MotionPrior) -> MotionPrior:
     """The product of two Gaussians on one pose."""
     information = a.information + b.information

@@ -1,8 +1,8 @@
 """Pieces of the way: when a robot was carried elsewhere, where it was put down.
 
 What comes after is a piece by itself until places are seen again that were known before. Those are
-looked for everywhere and in all directions, among the scans that look most alike; several scans
-have to ask for the same place. A piece that nothing ties to the others is put beside them.
+looked for everywhere and in all directions, among the scans that look most alike; then the whole
+piece has to fit there. A piece that nothing ties to the others is put beside them.
 """
 
 import dataclasses
@@ -12,18 +12,20 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import se2
-from stillmap.slam import loops
+from stillmap import _core, se2
+from stillmap.slam import loops, motion, registration
 from stillmap.slam.loops import Candidate, Closure, Track
-from stillmap.slam.scans import hits
+from stillmap.slam.scans import hits, put
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_ASKED = 12  # keyframes of a piece that are looked for
+_ASKED = 20  # keyframes of a piece that are looked for
+_HEARD = 60  # keyframes of it that are asked whether they fit where it would be
+_OUTWEIGH = 4  # keyframes that fit, for each that contradicts
 _ALIKE = 8  # places that each of them is compared with
 _SAME_METRES, _SAME_RADIANS = 0.5, 0.1  # two answers are one within that
-_AGREEING = 3  # keyframes that have to give it
+_AGREEING = 3  # keyframes that have to fit
 _BINS = np.geomspace(0.3, 30.0, 25)  # m, of the ranges by which scans are compared
 _BESIDE = 10.0  # m between pieces that nothing ties
 
@@ -36,17 +38,26 @@ def separated(travelled: Float, breaks: list[int], metres: float) -> Float:
     return out
 
 
-def placed(track: Track, breaks: list[int]) -> tuple[Track, list[Closure], list[int]]:
-    """Pieces where they belong, the closures that say so, and breaks after which nothing did."""
+def placed(
+    track: Track, breaks: list[int], nowhere: list[int]
+) -> tuple[Track, list[Closure], list[int]]:
+    """Pieces where they belong, the closures that say so, and breaks after which nothing did.
+
+    Args:
+        track: where loops are looked for.
+        breaks: first scans of the pieces but for the first.
+        nowhere: those of them that fit nowhere around; the others stay where they fit if nothing
+            else is found.
+    """
     ties, apart = list[Closure](), list[int]()
     poses = track.poses.copy()
     for first, last in itertools.pairwise([*breaks, len(poses)]):
         track = dataclasses.replace(track, poses=poses)
-        agreed = _agreed(track, list(_attempts(track, first, last)))
+        agreed = _agreed(track, list(_attempts(track, first, last)), first, last)
         if agreed:
             poses[first:last] = _correction(track, agreed[0]) @ poses[first:last]
             ties += agreed
-        else:
+        elif first in nowhere:
             poses[first:last] = _beside(track, first) @ poses[first:last]
             apart.append(first)
     return dataclasses.replace(track, poses=poses), ties, apart
@@ -57,10 +68,9 @@ def _attempts(track: Track, first: int, last: int) -> Iterator[Closure]:
     frames, options = track.keyframes, track.options
     piece = frames[(frames >= first) & (frames < last)]
     before = frames[frames < first]
-    asked = piece[np.unique(np.linspace(0, len(piece) - 1, _ASKED).round().astype(int))]
     known = np.array([_signature(track, t) for t in before])
     grids = {}
-    for later in asked.tolist():
+    for later in _evenly(piece, _ASKED):
         unlike = np.abs(known - _signature(track, later)).sum(axis=1)
         stretches = np.round(track.travelled[before] / options.stretch)
         for stretch in _best_of_each(stretches, unlike):
@@ -97,17 +107,60 @@ def _correction(track: Track, closure: Closure) -> Float:
     return C
 
 
-def _agreed(track: Track, closures: list[Closure]) -> list[Closure]:
-    """The closures that put a piece to one place, the best one first; none if they do not agree."""
-    best = list[Closure]()
-    for closure in closures:
+def _agreed(track: Track, closures: list[Closure], first: int, last: int) -> list[Closure]:
+    """The closures that put a piece where most of it fits what was seen before; or none.
+
+    Rooms look alike: what a place says counts only if the rest of the piece does not contradict it.
+    """
+    best, most = list[Closure](), 0
+    before = _map_before(track, first)
+    for closure in _one_of_each(track, closures):
         C = _correction(track, closure)
-        same = [c for c in closures if _is_same(track, C, c)]
-        if len({c.later for c in same}) > len({c.later for c in best}):
-            best = [closure, *(c for c in same if c is not closure)]
-    asked = len({c.later for c in closures})
-    agreeing = len({c.later for c in best})
-    return best if agreeing >= max(_AGREEING, (asked + 1) // 2) else []
+        fitting, contradicting = _support(track, before, C, first, last)
+        if fitting >= max(_AGREEING, _OUTWEIGH * contradicting) and fitting > most:
+            best, most = [c for c in closures if _is_same(track, C, c)], fitting
+    return best
+
+
+def _one_of_each(track: Track, closures: list[Closure]) -> list[Closure]:
+    """One closure for each place that a piece may be at."""
+    kept = list[Closure]()
+    for closure in closures:
+        if not any(_is_same(track, _correction(track, other), closure) for other in kept):
+            kept.append(closure)
+    return kept
+
+
+def _map_before(track: Track, first: int) -> _core.Grid2D:
+    grid = _core.Grid2D(track.resolution, track.registration.approach)
+    for t in track.keyframes[track.keyframes < first].tolist():
+        put(grid, track.recording, track.e, t, track.poses[t], track.surface)
+    return grid
+
+
+def _support(
+    track: Track, before: _core.Grid2D, C: Float, first: int, last: int
+) -> tuple[int, int]:
+    """Keyframes of a piece that fit a map when it is moved by C (3, 3), and that contradict it."""
+    frames = track.keyframes[(track.keyframes >= first) & (track.keyframes < last)]
+    fitting = contradicting = 0
+    for t in _evenly(frames, _HEARD):
+        scan = hits(track.recording, track.e, t)
+        prior = motion.guess_at(C @ track.poses[t], _SAME_METRES, _SAME_RADIANS)
+        start = prior.T_map_base
+        found = registration.search(before, scan, prior, track.registration, 0.0, 0.0, start)
+        if registration.share_through_walls(before, scan, found) > track.registration.through:
+            contradicting += 1
+        elif found.explained >= track.options.accept_above:
+            fitting += 1
+    return fitting, contradicting
+
+
+def _evenly(frames: Index, most: int) -> list[int]:
+    """At most so many of them, evenly spread."""
+    which = np.unique(np.linspace(0, len(frames) - 1, most).round().astype(int))
+    out: list[int] = frames[which].tolist()
+    return out
 
 
 def _is_same(track: Track, correction: Float, closure: Closure) -> bool:

@@ -24,7 +24,7 @@ class RegistrationOptions:
 
     sigma: float = field_with_doc(0.04, "m, width of the smoothed field around end points")
     floor: float = field_with_doc(0.05, "field value of an end point the map cannot explain")
-    unknown: float = field_with_doc(0.15, "what unknown space adds to it: unknown is not free")
+    unknown: float = field_with_doc(0.2, "what unknown space adds to it: unknown is not free")
     approach: float = field_with_doc(
         0.5, "m before its end in which a beam says nothing against what it crosses"
     )
@@ -51,10 +51,10 @@ class RegistrationOptions:
         0.3, "of the usual share explained, below which a robot may have been carried elsewhere"
     )
     through: float = field_with_doc(
-        0.15, "share of a scan's beams that may seem to go through walls, unless it is elsewhere"
+        0.2, "share of a scan's beams that may seem to go through walls, unless it is elsewhere"
     )
     lost_translation: float = field_with_doc(
-        1.0, "m, half width of a last search over all headings, while doubt remains"
+        1.5, "m, half width of a last search over all headings, while doubt remains"
     )
 
     def __post_init__(self) -> None:
@@ -97,6 +97,7 @@ class Registration:
         rivals: (R, 4) where the other starts ended up: x, y, heading from the pose, and by how
             many nats they cost more.
         widened: whether a wider search than the prior asked for found the pose.
+        astray: whether only a search in all directions did.
         disagrees: whether odometry was disbelieved.
     """
 
@@ -106,6 +107,7 @@ class Registration:
     misfit: float
     rivals: Float
     widened: bool = False
+    astray: bool = False
     disagrees: bool = False
 
 
@@ -139,7 +141,7 @@ def register(
         looser = motion.widened(prior, *_off_by(prior, found))
         again = search(grid, scan, looser, options, 0.0, 0.0, start=found.T_map_base)
         if again.misfit <= found.misfit:
-            found = dataclasses.replace(again, widened=found.widened)
+            found = dataclasses.replace(again, widened=found.widened, astray=found.astray)
         found = dataclasses.replace(found, disagrees=_is_off(prior, found, options))
     return found
 
@@ -180,10 +182,9 @@ def _farther(
         wide = motion.widened(prior, least_translation / 3.0, least_rotation / 3.0)
         window = options.window * wide.sigma_translation, options.window * wide.sigma_rotation
         wider = search(grid, scan, wide, options, *window)
-        if wider.misfit < found.misfit - options.lies and not looks_through_walls(
-            grid, scan, wider, options
-        ):
-            found = dataclasses.replace(wider, widened=True)
+        fits = wider.misfit < found.misfit - options.lies
+        if fits and share_through_walls(grid, scan, wider) <= options.through:
+            found = dataclasses.replace(wider, widened=True, astray=least_rotation == np.pi)
         if found.explained >= doubtful:
             break
     return found
@@ -238,11 +239,9 @@ def search(
     return Registration(T, covariance, explained, cost - prior.penalty(T), rivals)
 
 
-def looks_through_walls(
-    grid: _core.Grid2D, scan: Scan, found: Registration, options: RegistrationOptions
-) -> bool:
-    """Whether many beams would have to go through walls that the map knows."""
-    through: float = _core.share_through(
+def share_through_walls(grid: _core.Grid2D, scan: Scan, found: Registration) -> float:
+    """Share of the beams that would have to go through walls that the map knows."""
+    return _core.share_through(
         grid,
         scan.points,
         scan.weights,
@@ -251,7 +250,6 @@ def looks_through_walls(
         margin=_MARGIN,
         occupied=_WALL,
     )
-    return through > options.through
 
 
 def radius(options: RegistrationOptions, resolution: float) -> int:
