@@ -17,7 +17,9 @@ def field(grid: Grid, y: ArrayLike, sigma: float, radius: int) -> float:
 
     The sum over cells k within `radius` cells of that of y (largest coordinate difference) of
     m_k exp(-|y - mu_k|^2 / (2 sigma^2)), with mu_k the mean of the end points in cell k weighted
-    with e, divided by (sqrt(2 pi) sigma / resolution)^(D-1).
+    with e, divided by (sqrt(2 pi) sigma / resolution)^(D-1). In a cell that nobody looked at, when
+    those means lie on a line or plane, this surface is taken to go on: the mean of the m_k, times
+    exp(-d^2 / (2 sigma^2)) at a distance d from it.
 
     Args:
         grid: the map.
@@ -27,14 +29,37 @@ def field(grid: Grid, y: ArrayLike, sigma: float, radius: int) -> float:
     """
     point = np.asarray(y, float)
     centre = cell_of(point, grid.resolution)
+    means, m = _around(grid, centre, radius)
+    if isnan(grid.occupancy_of(tuple(centre.tolist()))) and len(m) >= grid.dimension:
+        mean, normal, is_flat = _plane(means, m)
+        if is_flat:
+            return float(m.mean() * exp(-((normal @ (mean - point)) ** 2) / (2 * sigma**2)))
     total = 0.0
+    for mu, m_k in zip(means, m, strict=True):
+        away = point - mu
+        total += m_k * exp(-float(away @ away) / (2 * sigma**2))
+    return total / (sqrt(2 * pi) * sigma / grid.resolution) ** (grid.dimension - 1)
+
+
+def _around(grid: Grid, centre: NDArray[np.int64], radius: int) -> tuple[Float, Float]:
+    """Means (K, D) of the end points in the cells around, and their occupancies (K,)."""
+    means, m = [], []
     for step in product(range(-radius, radius + 1), repeat=grid.dimension):
         cell = tuple((centre + step).tolist())
         alpha = grid.alpha.get(cell, 0.0)
         if alpha > 0:
-            away = point - grid.moment[cell] / alpha
-            total += grid.occupancy_of(cell) * exp(-float(away @ away) / (2 * sigma**2))
-    return total / (sqrt(2 * pi) * sigma / grid.resolution) ** (grid.dimension - 1)
+            means.append(grid.moment[cell] / alpha)
+            m.append(grid.occupancy_of(cell))
+    return np.array(means).reshape(-1, grid.dimension), np.array(m)
+
+
+def _plane(means: Float, m: Float) -> tuple[Float, Float, bool]:
+    """A point (D,) and the normal (D,) of the plane through weighted points, and if it is one."""
+    weights = m / m.sum()
+    mean = weights @ means
+    apart = means - mean
+    variance, axes = np.linalg.eigh((weights[:, None] * apart).T @ apart)
+    return mean, axes[:, 0], bool(variance[0] < 0.1 * variance[1])
 
 
 def registration_cost(
