@@ -14,6 +14,7 @@ from stillmap.reference.beams import add_beams, e_step, log_likelihood
 from stillmap.reference.dwell import Dwell, Dwell2D, Dwell3D, Reading, look_at
 from stillmap.reference.em import EmStep, em_fixed_poses, m_step_map
 from stillmap.reference.field import field, registration_cost, registration_gradient
+from stillmap.reference.fill import fill_surfaces
 from stillmap.reference.grid import Grid, Grid2D, Grid3D, occupancy
 from stillmap.reference.held_out import StaticShares, StaticShares2D, StaticShares3D, held_out
 from stillmap.reference.no_return import add_lost
@@ -41,6 +42,7 @@ __all__ = [
     "e_step",
     "em_fixed_poses",
     "field",
+    "fill_surfaces",
     "held_out",
     "log_likelihood",
     "look_at",

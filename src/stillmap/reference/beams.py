@@ -66,7 +66,7 @@ def _checked_prior(prior: float) -> float:
     return prior
 
 
-def _per_beam(e: ArrayLike, points: ArrayLike) -> Float:
+def per_beam(e: ArrayLike, points: ArrayLike) -> Float:
     values = np.asarray(e, float)
     if values.shape != (len(np.asarray(points)),):
         raise ValueError(f"e: expected one value for each of points, got shape {values.shape}")
@@ -97,7 +97,7 @@ def add_beams(
         T_map_sensor: (T, D+1, D+1).
         threads: not used here.
     """
-    expectation = _per_beam(e, points)
+    expectation = per_beam(e, points)
     for beam in usable_beams(grid.dimension, points, hit, offset, T_map_sensor):
         for cell, length in passed_cells(grid, beam):
             grid.add(cell, 0.0, length)
@@ -154,7 +154,7 @@ def log_likelihood(
         that EM raises.
     """
     p = _checked_prior(prior)
-    expectation = _per_beam(e, points)
+    expectation = per_beam(e, points)
     terms = np.zeros((len(np.asarray(offset)) - 1, 4))
     for beam in usable_beams(grid.dimension, points, hit, offset, T_map_sensor):
         static = float(expectation[beam.number])
