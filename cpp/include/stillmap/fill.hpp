@@ -34,7 +34,7 @@ class Fill {
       for (int64_t n = first_; n < last_; ++n)
         if (is_hit(n) && is_hit(n + 1) &&
             (continues(n, n + 1, n - 1) || continues(n + 1, n, n + 2)))
-          between(point(n), point(n + 1), std::min(e_[n], e_[n + 1]));
+          between(point(n), point(n + 1), std::min(probability(e_[n]), probability(e_[n + 1])));
     }
   }
 
@@ -53,14 +53,14 @@ class Fill {
     return along > 0.0 && off < options_.tolerance;
   }
 
-  void between(const Vec<D>& from, const Vec<D>& to, float e) {
+  void between(const Vec<D>& from, const Vec<D>& to, double weight) {
+    for (const Vec<D>& end : {from, to})
+      if (!all_below<D>((pose_ * end) / resolution_, Grid<D>::kMaxCell))
+        throw std::invalid_argument("beam: a pose or end point is not finite or too far away");
     const auto steps = static_cast<int>(std::ceil((to - from).norm() / resolution_));
-    const double weight = probability(e);
     for (int i = 1; i < steps; ++i) {
       const Vec<D> at =
           (pose_ * (from + (to - from) * (static_cast<double>(i) / steps))) / resolution_;
-      if (!all_below<D>(at, Grid<D>::kMaxCell))
-        throw std::invalid_argument("beam: a pose or end point is not finite or too far away");
       const Cell<D> cell = cell_of<D>(at);
       auto* block = cursor_.block(cell);
       const auto local = static_cast<size_t>(Grid<D>::local_of(cell));
