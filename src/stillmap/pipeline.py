@@ -76,7 +76,7 @@ class Iteration:
         learned: what it learned from the recording.
         changed_share: share of hits whose e moved by more than 0.1.
         explained: (T,) share of each scan's beams that the map so far explained.
-        widened: scans that only a wider search than the motion prior's could place.
+        doubts: scans where odometry and the map so far do not agree.
         loops: attempts at closing loops, accepted or refused.
         held_out: nats per beam, see `em.held_out_log_likelihood`; None where it is not computed.
         seconds: wall clock.
@@ -95,7 +95,7 @@ class Iteration:
     learned: dict[str, object]
     changed_share: float
     explained: Float
-    widened: list[int]
+    doubts: slam.Doubts
     loops: list[slam.Closure]
     held_out: float | None
     seconds: float
@@ -166,7 +166,7 @@ def iterate(
             learned=found.learned,
             changed_share=em.changed_share(e, found.p_static, recording.hit),
             explained=mapped.explained,
-            widened=mapped.widened,
+            doubts=mapped.doubts,
             loops=mapped.loops,
             held_out=held_out,
             seconds=time.perf_counter() - started,

@@ -54,6 +54,7 @@ class Result:
         warnings: one sentence each.
         learned: what the estimator learned from the recording, JSON-able.
         loops: attempts at closing loops in the best iteration, accepted or refused.
+        doubts: where odometry and scans do not agree.
         graph: the pose graph of these loops; None where poses were given or none were looked for.
         stages: seconds and peak memory.
     """
@@ -72,6 +73,7 @@ class Result:
     warnings: list[str]
     learned: dict[str, object]
     loops: list[slam.Closure]
+    doubts: slam.Doubts
     graph: slam.Graph | None
     stages: Mapping[str, Mapping[str, Any]]
 
@@ -198,6 +200,7 @@ class _Run:
             warnings=_warnings(self.records, kept, recording, self.options.em),
             learned=kept.learned,
             loops=kept.loops,
+            doubts=kept.doubts,
             graph=kept.graph,
             stages=stages.to_dict(),
         )
@@ -224,7 +227,7 @@ class _Best:
     occupied: em.CellProbabilities | None
     learned: dict[str, object]
     explained: Float
-    widened: list[int]
+    doubts: slam.Doubts
     loops: list[slam.Closure]
     graph: slam.Graph | None
     no_return: em.NoReturn | None
@@ -241,7 +244,7 @@ class _Best:
             iteration.occupied,
             iteration.learned,
             iteration.explained,
-            iteration.widened,
+            iteration.doubts,
             iteration.loops,
             iteration.graph,
             iteration.no_return,
@@ -273,16 +276,37 @@ def _warnings(
         )
     if recording.T_odom_base is None:
         out.append("no odometry: a constant velocity was assumed between scans")
-    if kept.widened:
-        first, n = kept.widened[0], len(kept.widened)
-        out.append(
-            f"{n} scans lay outside what odometry allows and were found by a wider search, "
-            f"the first is scan {first}"
-        )
+    out += _doubtful(kept.doubts)
     lost = np.flatnonzero(kept.explained < 0.2)
     if len(lost):
         out.append(
             f"{len(lost)} scans fit the map badly (less than a fifth of their beams), the first "
             f"is scan {lost[0]}: the map may be bent there"
+        )
+    return out
+
+
+def _doubtful(doubts: slam.Doubts) -> list[str]:
+    out = []
+    if doubts.disagreeing:
+        n = len(doubts.disagreeing)
+        out.append(
+            f"odometry and scans disagree at {n} scan{'s' * (n > 1)} (wheels that slip or "
+            f"stall, odometry that begins again), first at scan {doubts.disagreeing[0]}: poses "
+            "follow the scans there"
+        )
+    if doubts.widened:
+        out.append(
+            f"{len(doubts.widened)} scans lay outside what odometry allows and were found by a "
+            f"wider search, the first is scan {doubts.widened[0]}"
+        )
+    for scan in doubts.breaks:
+        out.append(
+            f"before scan {scan} the robot lost its way or was carried elsewhere: "
+            + (
+                "nothing seen after it is known from before, so it stands beside the rest"
+                if scan in doubts.apart
+                else "where it went on was found among the places known from before"
+            )
         )
     return out

@@ -9,6 +9,7 @@ from stillmap.output.crops import choose_window, snapshot
 from stillmap.output.map_server import OutputOptions
 from stillmap.recording.model import Recording
 from stillmap.se2 import inverse, matrix
+from stillmap.slam import Doubts
 from stillmap.slam.pose_graph import Graph, Relation
 
 RESOLUTION = 0.1
@@ -87,6 +88,7 @@ class FakeResult:
     loops: list
     stages: dict
     graph: Graph | None = None
+    doubts: Doubts = field(default_factory=Doubts)
 
 
 def _wall_range(origin, direction):
@@ -248,6 +250,7 @@ def result():
             FakeLoop(6, 46, 0.25, "explains too little"),
         ],
         graph=_graph(poses),
+        doubts=Doubts(widened=[7], disagreeing=[7, 9], breaks=[20], apart=[20]),
         stages={
             "read": {"seconds": 0.21, "cpu_seconds": 0.2, "peak_memory_bytes": 41_000_000},
             "em": {"seconds": 7.1, "cpu_seconds": 13.5, "peak_memory_bytes": 96_000_000},

@@ -33,6 +33,7 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
         "counts",
         "warnings",
         "learned",
+        "doubts",
         "loops",
     ]
     assert run["format_version"] == 1
@@ -59,6 +60,15 @@ def test_iterations(tmp_path, result):
         "seconds": 1.8,
     }
     assert iterations[3]["bound"] is None  # not a number there
+
+
+def test_doubts(tmp_path, result):
+    assert written(tmp_path, result)["doubts"] == {
+        "odometry_disagrees": [7, 9],
+        "found_by_wider_search": [7],
+        "carried_before": [20],
+        "beside_the_map_from": [20],
+    }
 
 
 def test_loops(tmp_path, result):

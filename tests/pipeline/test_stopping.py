@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap import _core, em, pipeline, se2
+from stillmap import _core, em, pipeline, se2, slam
 from stillmap.options import replaced
 from stillmap.pipeline import Iteration, Options
 
@@ -58,7 +58,7 @@ def made_up(recording, number, bound, changed_share) -> Iteration:
         learned={"number": number},
         changed_share=changed_share,
         explained=np.ones(T),
-        widened=[],
+        doubts=slam.Doubts(),
         loops=[],
         held_out=None,
         seconds=float(number),

@@ -81,6 +81,26 @@ class LoopLike(Protocol):
     def refused(self) -> str: ...
 
 
+class DoubtsLike(Protocol):
+    """Where odometry and scans do not agree; numbers of scans, from 0.
+
+    Attributes:
+        widened: those that a wider search had to find.
+        disagreeing: those where odometry was disbelieved.
+        breaks: those before which the robot lost its way or was carried elsewhere.
+        apart: those of them from which on the map stands beside the rest.
+    """
+
+    @property
+    def widened(self) -> list[int]: ...
+    @property
+    def disagreeing(self) -> list[int]: ...
+    @property
+    def breaks(self) -> list[int]: ...
+    @property
+    def apart(self) -> list[int]: ...
+
+
 class RelationLike(Protocol):
     """T_first_second as somebody measured it.
 
@@ -145,6 +165,7 @@ class ResultLike(Protocol):
         warnings: one sentence each.
         learned: what the estimator learned: empty, or shares, scatter and tables of shares.
         loops: attempts at closing loops, accepted or refused.
+        doubts: where odometry and scans do not agree.
         graph: the pose graph; None where poses were given or no loops were looked for.
         stages: name to `seconds`, `cpu_seconds` and `peak_memory_bytes`, in the order they ran.
     """
@@ -175,6 +196,8 @@ class ResultLike(Protocol):
     def learned(self) -> Mapping[str, Any]: ...
     @property
     def loops(self) -> Sequence[LoopLike]: ...
+    @property
+    def doubts(self) -> DoubtsLike: ...
     @property
     def graph(self) -> GraphLike | None: ...
     @property

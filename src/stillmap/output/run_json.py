@@ -38,6 +38,12 @@ def run_record(result: ResultLike) -> dict[str, Any]:
         "counts": counts,
         "warnings": list(result.warnings),
         "learned": result.learned,
+        "doubts": {
+            "odometry_disagrees": result.doubts.disagreeing,
+            "found_by_wider_search": result.doubts.widened,
+            "carried_before": result.doubts.breaks,
+            "beside_the_map_from": result.doubts.apart,
+        },
         "loops": {
             "accepted": [_loop(one) for one in result.loops if not one.refused],
             "refused": [_loop(one) | {"why": one.refused} for one in result.loops if one.refused],

@@ -49,6 +49,16 @@ class SlamOptions:
 
 
 @dataclass(frozen=True)
+class Doubts:
+    """Where odometry and scans do not agree; numbers of scans, as Mapped has them."""
+
+    widened: list[int] = field(default_factory=list)
+    disagreeing: list[int] = field(default_factory=list)
+    breaks: list[int] = field(default_factory=list)
+    apart: list[int] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
 class Mapped:
     """What the M-step found.
 
@@ -78,6 +88,11 @@ class Mapped:
     apart: list[int] = field(default_factory=list)
     loops: list[Closure] = field(default_factory=list)
     graph: Graph | None = None
+
+    @property
+    def doubts(self) -> "Doubts":
+        """Where odometry and scans do not agree."""
+        return Doubts(self.widened, self.disagreeing, self.breaks, self.apart)
 
     def without_grid(self) -> "Mapped":
         """Poses and what is known of them alone: grids are large."""
