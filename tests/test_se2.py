@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
 from stillmap import se2
 
@@ -34,6 +35,20 @@ def test_inverse_of_a_product(a, b):
     A, B = se2.matrix(*a), se2.matrix(*b)
     np.testing.assert_allclose(se2.inverse(A) @ A, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(se2.inverse(A @ B), se2.inverse(B) @ se2.inverse(A), atol=1e-7)
+
+
+@given(lengths, lengths, st.floats(-3.1, 3.1))
+def test_log_undoes_the_exponential(x, y, theta):
+    twist = np.array([[0.0, -theta, x], [theta, 0.0, y], [0.0, 0.0, 0.0]])
+    got = se2.log(expm(twist))
+    np.testing.assert_allclose(got, [x, y, theta], rtol=1e-9, atol=1e-8)
+
+
+def test_log_of_what_hardly_turns():
+    T = se2.matrix([2.0, 2.0, 0.0], 1.0, [0.0, 1e-300, 1e-12])
+    np.testing.assert_allclose(se2.log(T), se2.parameters(T), atol=1e-11)
+    half_turn = se2.log(se2.matrix(0.0, 2.0, np.pi))
+    np.testing.assert_allclose(half_turn, [np.pi, 0.0, np.pi], atol=1e-12)
 
 
 @given(angles)

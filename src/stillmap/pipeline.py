@@ -50,13 +50,19 @@ DEFAULTS = Options()
 
 
 def resolved(options: Options) -> Options:
-    """The options as they will be used: the printed method has poses by (9) alone, scan by scan."""
+    """The options as they will be used.
+
+    The printed method has poses by (9) alone, scan by scan, and takes scans as taken at once.
+    """
     if options.estimator != "paper":
         return options
     loops = dataclasses.replace(options.slam.loops, enabled=False)
     registration = dataclasses.replace(options.slam.registration, approach=0.0)
     return dataclasses.replace(
-        options, slam=dataclasses.replace(options.slam, loops=loops, registration=registration)
+        options,
+        slam=dataclasses.replace(
+            options.slam, loops=loops, registration=registration, deskew=False
+        ),
     )
 
 
@@ -66,6 +72,7 @@ class Iteration:
 
     Attributes:
         number: from 1.
+        seen: the recording without the motion during its scans, as `poses` have it.
         poses: (T, 3, 3) T_map_base.
         covariance: (T, 3, 3) of x, y, heading against the map so far.
         grid: the sums alpha, beta of (10).
@@ -85,6 +92,7 @@ class Iteration:
     """
 
     number: int
+    seen: Recording
     poses: Float
     covariance: Float
     grid: _core.Grid2D
@@ -135,19 +143,28 @@ def iterate(
     threads = resolved_threads(options.threads)
     e = em.initial_expectations(recording, options.estimator, options.em)  # e := p(c = 1)
     start: slam.Mapped | None = None
+    before: Float | None = None
     for number in range(1, em.iterations(options.estimator, options.em) + 1):
         started = time.perf_counter()
         with stages.measure("m_step"):  # (9)-(15)
             mapped = slam.m_step(
-                recording, e, options.slam, poses, threads, _at(progress, number), start=start
+                recording,
+                e,
+                options.slam,
+                poses,
+                threads,
+                _at(progress, number),
+                start=start,
+                before=before,
             )
+            seen = slam.deskewed(recording, mapped.poses, options.slam)
         with stages.measure("e_step"):  # (6), (8) or its successor, and the bound
             found = em.e_step(
-                recording, mapped.poses, mapped.grid, options.estimator, options.em, threads
+                seen, mapped.poses, mapped.grid, options.estimator, options.em, threads
             )
         with stages.measure("held_out"):
             held_out = em.held_out_log_likelihood(
-                recording,
+                seen,
                 mapped.poses,
                 found.p_static,
                 options.slam.resolution,
@@ -156,6 +173,7 @@ def iterate(
             )
         iteration = Iteration(
             number=number,
+            seen=seen,
             poses=mapped.poses,
             covariance=mapped.covariance,
             grid=mapped.grid,
@@ -173,10 +191,10 @@ def iterate(
             graph=mapped.graph,
             no_return=found.no_return,
         )
-        e = found.p_static
+        e, before = found.p_static, mapped.poses
         # the first labels change most: from the second poses on, a sweep follows what is left
         start = mapped.without_grid() if number > 1 else None
-        del mapped, found  # grids are large: only the caller decides how long one lives
+        del mapped, found, seen  # grids are large: only the caller decides how long one lives
         yield iteration
         del iteration
 

@@ -77,6 +77,14 @@ class Result:
     graph: slam.Graph | None
     stages: Mapping[str, Mapping[str, Any]]
 
+    @property
+    def seen(self) -> Recording:
+        """The recording without the motion during its scans, made anew at every call.
+
+        Its points with `poses` make the map; where beams have no times it is `recording` itself.
+        """
+        return slam.deskewed(self.recording, self.poses, self.options.slam)
+
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Writes the result folder, complete or not at all."""
         save(self, Path(path), overwrite)
@@ -150,7 +158,7 @@ class _Run:
         gain = np.inf if self.best is None else bound - self.best.bound
         if gain > 0.0:
             self.best = _Best.of(iteration)
-        self._remember(iteration, recording)
+        self._remember(iteration)
         options = self.options.em
         settled = 0.0 <= gain < options.tolerance * recording.n_beams
         if self.options.estimator == "stillmap":  # the printed labels creep
@@ -165,10 +173,10 @@ class _Run:
             raise RuntimeError("no iteration has been run")
         return self.best
 
-    def _remember(self, iteration: Iteration, recording: Recording) -> None:
+    def _remember(self, iteration: Iteration) -> None:
         """A part of the map for Fig. 8: where the first iteration saw most movers."""
         occupancy = iteration.occupancy
-        points = dynamic_points(recording, iteration.poses, iteration.p_static)
+        points = dynamic_points(iteration.seen, iteration.poses, iteration.p_static)
         dynamic = np.zeros(len(points), dtype=np.float32)
         if self.window is None:
             self.window = choose_window(occupancy, points, dynamic)
@@ -183,8 +191,10 @@ class _Run:
         threads = resolved_threads(self.options.threads)
         resolution = self.options.slam.resolution
         with stages.measure("maps"):
-            filtered = self._map(recording, threads)
-            raw = _raw_map(recording, kept.poses, resolution, threads)
+            seen = slam.deskewed(recording, kept.poses, self.options.slam)
+            filtered = self._map(seen, threads)
+            raw = _raw_map(seen, kept.poses, resolution, threads)
+            del seen
         return Result(
             recording=recording,
             options=self.options,

@@ -34,6 +34,21 @@ def inverse(T: Float) -> Float:
     return out
 
 
+def log(T: Float) -> Float:
+    """(..., 3) twists x, y, theta whose exponentials are (..., 3, 3): even motion along an arc."""
+    x, y, theta = np.moveaxis(parameters(T), -1, 0)
+    half = 0.5 * theta
+    c, s = np.cos(half), np.sin(half)
+    # the chord points half the turn to the side and is shorter than the arc
+    arc = 1.0 / sine_over_angle(half, s)
+    return np.stack([arc * (c * x + s * y), arc * (c * y - s * x), theta], axis=-1)
+
+
+def sine_over_angle(angle: Float, sine: Float) -> Float:
+    """sin(angle) / angle, 1 at 0."""
+    return np.divide(sine, angle, out=np.ones_like(sine), where=angle != 0.0)
+
+
 def wrap(angle: ArrayLike) -> Float:
     """Angles mapped to [-pi, pi]; which end pi itself goes to is left to rounding."""
     return (np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi

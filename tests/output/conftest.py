@@ -90,6 +90,10 @@ class FakeResult:
     graph: Graph | None = None
     doubts: Doubts = field(default_factory=Doubts)
 
+    @property
+    def seen(self) -> Recording:
+        return self.recording
+
 
 def _wall_range(origin, direction):
     """(N,) range to the nearest wall along unit directions (N, 2)."""

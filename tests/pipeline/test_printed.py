@@ -72,7 +72,12 @@ def test_the_options_that_are_kept_are_those_that_were_used(printed):
     assert not printed.options.slam.loops.enabled
     assert printed.options.slam.registration.approach == 0.0
     # all else as it was asked for, and other estimators as they were
-    rest = {"loops": {"enabled": True}, "registration": {"approach": SLAM.registration.approach}}
+    assert not printed.options.slam.deskew
+    rest = {
+        "loops": {"enabled": True},
+        "registration": {"approach": SLAM.registration.approach},
+        "deskew": True,
+    }
     assert replaced(printed.options, {"slam": rest}) == options()
     for estimator in ("stillmap", "hit-ratio"):
         assert pipeline.resolved(options(estimator)) == options(estimator)

@@ -48,6 +48,7 @@ def made_up(recording, number, bound, changed_share) -> Iteration:
     em.add_recording(grid, recording, poses, e)
     return Iteration(
         number=number,
+        seen=recording,
         poses=poses,
         covariance=np.full((T, 3, 3), float(number)),
         grid=grid,

@@ -153,6 +153,7 @@ class ResultLike(Protocol):
 
     Attributes:
         recording: what it was made from.
+        seen: the same without the motion during its scans, as `poses` have it.
         options: every option as resolved.
         iterations: one record per EM iteration, in order.
         snapshots: a small part of the map at the first, second, best and last iteration (Fig. 8).
@@ -172,6 +173,8 @@ class ResultLike(Protocol):
 
     @property
     def recording(self) -> Recording: ...
+    @property
+    def seen(self) -> Recording: ...
     @property
     def options(self) -> OptionsLike: ...
     @property

@@ -43,7 +43,7 @@ def maps_section(result: ResultLike) -> str:
     window = shown_window([result.raw_map, result.map])
     raw, filtered = map_image(result.raw_map, window), map_image(result.map, window)
     dots = dots_image(
-        dynamic_points(result.recording, result.poses, result.p_static)[:, :2],
+        dynamic_points(result.seen, result.poses, result.p_static)[:, :2],
         window,
         filtered.size,
     )

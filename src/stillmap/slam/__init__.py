@@ -1,8 +1,9 @@
 """The M-step: poses and the map that they make. Uses e as weights, never changes it."""
 
+from stillmap.slam.deskew import deskewed
 from stillmap.slam.incremental import Doubts, Mapped, SlamOptions
 from stillmap.slam.loops import Closure
 from stillmap.slam.m_step import m_step
 from stillmap.slam.pose_graph import Graph
 
-__all__ = ["Closure", "Doubts", "Graph", "Mapped", "SlamOptions", "m_step"]
+__all__ = ["Closure", "Doubts", "Graph", "Mapped", "SlamOptions", "deskewed", "m_step"]

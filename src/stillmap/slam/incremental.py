@@ -36,6 +36,9 @@ class SlamOptions:
     spacing: float = field_with_doc(
         0.2, "m, rad or 5 s between scans that later ones are registered against"
     )
+    deskew: bool = field_with_doc(
+        True, "take the motion during a scan out of it, where beams have times"
+    )
     motion: MotionOptions = field(default=MotionOptions())
     registration: RegistrationOptions = field(default=RegistrationOptions())
     surface: SurfaceOptions = field(default=SurfaceOptions())

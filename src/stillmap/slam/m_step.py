@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from stillmap import _core, em
 from stillmap.recording.model import Recording
 from stillmap.slam import closing, incremental
+from stillmap.slam.deskew import deskewed
 from stillmap.slam.incremental import Mapped, SlamOptions
 from stillmap.slam.sweep import sweep
 
@@ -24,35 +25,55 @@ def m_step(
     progress: Callable[[int, int], None],
     *,
     start: Mapped | None = None,
+    before: Float | None = None,
 ) -> Mapped:
     """The most likely poses and map given e: (9), (10)-(15).
 
     Args:
-        recording: 2D.
+        recording: 2D, as it was taken: the motion during its scans is taken out of them here.
         e: (M,) probability that each beam was reflected by something static.
         options: see SlamOptions.
         poses: (T, 3, 3) T_map_base when they are known: then only the map is made.
         threads: for maps of poses that are known already; the result does not depend on it.
         progress: called with the number of scans done and their total.
         start: an M-step whose loops are closed already: its poses are only swept again.
+        before: (T, 3, 3) earlier poses, which tell how the robot moved during its scans better than
+            odometry does.
     """
     if poses is not None:
         mapped = _mapped_at(recording, e, options, poses, threads)
         progress(recording.n_scans, recording.n_scans)
         return mapped
     if not options.loops.enabled:
-        local = incremental.build(recording, e, options, progress)
+        local = _followed(recording, e, options, progress, before)
         grid = _mapped_at(recording, e, options, local.poses, threads).grid
         return dataclasses.replace(local, grid=grid)
     if start is not None:
         mapped = _swept(recording, e, options, start, threads)
         progress(recording.n_scans, recording.n_scans)
         return dataclasses.replace(mapped, explained=start.explained)
-    local = incremental.build(recording, e, options, progress, options.loops.memory)
-    closed = closing.closed(recording, e, options, local)
+    local = _followed(recording, e, options, progress, before)
+    closed = closing.closed(deskewed(recording, local.poses, options), e, options, local)
     mapped = _swept(recording, e, options, closed, threads)
     # a scan that went astray explains itself in the map of all: the map so far tells
     return dataclasses.replace(mapped, explained=local.explained)
+
+
+def _followed(
+    recording: Recording,
+    e: NDArray[np.float32],
+    options: SlamOptions,
+    progress: Callable[[int, int], None],
+    before: Float | None,
+) -> Mapped:
+    """Poses one after the other, of scans without the motion during them as far as it is known."""
+    memory = options.loops.memory if options.loops.enabled else np.inf
+    known = recording.T_odom_base if before is None else before
+    if known is None and options.deskew and recording.beam_time is not None:
+        # scans as they were taken are alike enough to tell how the robot went
+        known = incremental.build(recording, e, options, progress, memory).poses
+    seen = deskewed(recording, known, options)
+    return incremental.build(seen, e, options, progress, memory)
 
 
 def _swept(
@@ -60,7 +81,7 @@ def _swept(
 ) -> Mapped:
     """Poses whose loops are closed, registered once more against all others; with their map."""
     for _ in range(options.loops.sweeps):
-        mapped = sweep(recording, e, options, mapped)
+        mapped = sweep(deskewed(recording, mapped.poses, options), e, options, mapped)
     grid = _mapped_at(recording, e, options, mapped.poses, threads).grid
     return dataclasses.replace(mapped, grid=grid)
 
@@ -70,6 +91,6 @@ def _mapped_at(
 ) -> Mapped:
     """The map of known poses (T, 3, 3)."""
     grid = _core.Grid2D(options.resolution, options.registration.approach)
-    em.add_recording(grid, recording, poses, e, threads)
+    em.add_recording(grid, deskewed(recording, poses, options), poses, e, threads)
     T = recording.n_scans
     return Mapped(poses, np.zeros((T, 3, 3)), grid, np.full(T, np.nan), [])

@@ -1,0 +1,125 @@
+"""Motion while a scan was taken: its beams, each from where the laser was, as seen at its stamp."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import se2
+from stillmap.recording.model import Recording
+from stillmap.slam.incremental import SlamOptions
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_KNOWN = 0.5  # of the time that a scan takes: over less, poses tell of their own errors
+_FASTEST = 60.0  # m/s; what is faster is a leap, no motion
+_FASTEST_TURN = 12.0  # rad/s
+_BLOCK = 1 << 14  # beams worked on together
+
+
+def deskewed(recording: Recording, poses: Float | None, options: SlamOptions) -> Recording:
+    """The recording as if every scan had been taken at once, at its stamp.
+
+    During a scan the robot is taken to go on evenly, along an arc, as from this pose to the next;
+    after the last as before it. A beam that was taken before the stamp goes by the motion from the
+    pose before. Where one sensor soon follows another, the next pose is the first one that lies
+    half a scan away.
+
+    Args:
+        recording: 2D; it comes back as it is where beams have no times.
+        poses: (T, 3, 3) of the robot's base at the stamps, in any frame: T_map_base or T_odom_base.
+            None: nobody knows, and the recording comes back as it is.
+        options: see SlamOptions.
+    """
+    times = recording.beam_time
+    if times is None or not len(times) or poses is None or not options.deskew:
+        return recording
+    after, before = _pairs(recording.stamp_ns, float(times.max()), -float(times.min()))
+    later, earlier = (_twists(recording, poses, *pair) for pair in (after, before))
+    points = np.empty_like(recording.points)
+    scans = max(1, _BLOCK * recording.n_scans // len(times))
+    for first in range(0, recording.n_scans, scans):
+        offset = recording.offset[first : first + scans + 1]
+        beams, counts = slice(int(offset[0]), int(offset[-1])), np.diff(offset)
+        tau = times[beams].astype(np.float64)
+        twist = later[:, first : first + scans].repeat(counts, axis=1)
+        if before is not after:
+            back = earlier[:, first : first + scans].repeat(counts, axis=1)
+            twist = np.where(tau < 0.0, back, twist)
+        points[beams] = _carried(recording.points[beams], twist * tau)
+    return replace(recording, points=points, beam_time=None)
+
+
+def _pairs(
+    stamp_ns: NDArray[np.int64], longest: float, earliest: float
+) -> tuple[tuple[Index, Index], tuple[Index, Index]]:
+    """Two scans between which each scan's motion is taken: after its stamp, and before it.
+
+    Args:
+        stamp_ns: (T,).
+        longest: seconds after the stamp, of the last beam.
+        earliest: seconds before the stamp, of the first one; 0 or less where none is.
+    """
+    T = len(stamp_ns)
+    here = np.arange(T)
+
+    def following(seconds: float) -> Index:
+        return np.searchsorted(stamp_ns, stamp_ns + _span_ns(seconds))
+
+    def preceding(seconds: float) -> Index:
+        return np.searchsorted(stamp_ns, stamp_ns - _span_ns(seconds), side="right") - 1
+
+    next_, last = following(longest), preceding(longest)
+    ahead = next_ < T
+    after = (np.where(ahead, here, np.maximum(last, 0)), np.where(ahead, next_, here))
+    if earliest <= 0.0:
+        return after, after
+    next_, last = following(earliest), preceding(earliest)
+    behind = last >= 0
+    before = (np.where(behind, last, here), np.where(behind, here, np.minimum(next_, T - 1)))
+    return after, before
+
+
+def _span_ns(seconds: float) -> int:
+    return max(round(_KNOWN * seconds * 1e9), 1)
+
+
+def _twists(recording: Recording, poses: Float, first: Index, second: Index) -> Float:
+    """(3, T) m/s, m/s, rad/s of each scan's sensor, in its own frame, between two scans."""
+    seconds = 1e-9 * (recording.stamp_ns[second] - recording.stamp_ns[first])
+    moved = se2.log(se2.inverse(poses[first]) @ poses[second])
+    twists = moved / np.where(seconds > 0.0, seconds, np.inf)[:, None]
+    leaps = np.hypot(twists[:, 0], twists[:, 1]) > _FASTEST
+    twists[leaps | (np.abs(twists[:, 2]) > _FASTEST_TURN)] = 0.0
+    vx, vy, turn = _steadied(twists).T
+    # off the centre of a robot that turns, a sensor goes along with the turn
+    x, y, theta = se2.parameters(recording.T_base_sensor[recording.sensor]).T
+    vx, vy = vx - turn * y, vy + turn * x
+    c, s = np.cos(theta), np.sin(theta)
+    return np.stack([c * vx + s * vy, c * vy - s * vx, turn])
+
+
+def _steadied(twists: Float) -> Float:
+    """Twists (T, 3), each averaged with those beside it.
+
+    A pose that lies ahead of its neighbours shortens its own scan and stretches the one before by
+    as much: both would then be laid where the errors say, again and again. The average of 1/4, 1/2,
+    1/4 does not see errors that alternate.
+    """
+    padded = np.pad(twists, ((1, 1), (0, 0)), mode="edge")
+    return 0.25 * padded[:-2] + 0.5 * twists + 0.25 * padded[2:]
+
+
+def _carried(points: NDArray[np.float32], motion: Float) -> NDArray[np.float32]:
+    """Points (N, 2), each moved by the exponential of a motion (3, N): x, y, angle."""
+    dx, dy, angle = motion
+    half = 0.5 * angle
+    c, s = np.cos(half), np.sin(half)
+    chord = se2.sine_over_angle(half, s)
+    x, y = points.T.astype(np.float64)
+    turned_c, turned_s = 1.0 - 2.0 * s * s, 2.0 * s * c
+    out = np.empty_like(points)
+    out[:, 0] = turned_c * x - turned_s * y + chord * (c * dx - s * dy)
+    out[:, 1] = turned_s * x + turned_c * y + chord * (s * dx + c * dy)
+    return out

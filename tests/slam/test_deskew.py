@@ -1,0 +1,213 @@
+"""Points of a scan that took time, as if it had been taken at its stamp."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from stillmap import se2
+from stillmap.recording.model import Recording
+from stillmap.slam import SlamOptions, deskewed
+
+Float = NDArray[np.float64]
+
+PERIOD = 0.1
+OPTIONS = SlamOptions()
+PLACES = {"centre": (0.0, 0.0, 0.0), "askew": (0.4, -0.3, 2.0)}
+TWISTS = {
+    "straight": (1.5, 0.2, 0.0),
+    "turn": (0.0, 0.0, -2.5),
+    "arc": (5.0, -0.4, 1.2),
+    "stands": (0.0, 0.0, 0.0),
+}
+
+
+def moved(twist: tuple[float, float, float], seconds: Float) -> Float:
+    """(N, 3, 3) how far a robot in even motion comes in so many seconds (N,)."""
+    vx, vy, turn = twist
+    rate = np.array([[0.0, -turn, vx], [turn, 0.0, vy], [0.0, 0.0, 0.0]])
+    return np.asarray(expm(seconds[:, None, None] * rate))
+
+
+def made(
+    stamps: Float,
+    way: Float,
+    places: list[tuple[float, float, float]],
+    sensor: list[int],
+    times: Float,
+    beams: int = 12,
+) -> tuple[Recording, Float]:
+    """A recording of posts that stand around, and where they are: (M, 2) in the map.
+
+    Args:
+        stamps: (T,) seconds.
+        way: poses of the robot at the time of each beam (M, 3, 3).
+        places, sensor: where the sensors sit, and which took each scan.
+        times: (M,) seconds after the stamps.
+    """
+    T = len(stamps)
+    posts = np.random.default_rng(1).uniform(-9, 9, (T * beams, 2))
+    T_base_sensor = se2.matrix(*np.array(places).T)
+    T_map_sensor = way @ T_base_sensor[np.repeat(sensor, beams)]
+    seen = np.einsum("nij,nj->ni", se2.inverse(T_map_sensor), np.c_[posts, np.ones(T * beams)])
+    recording = Recording(
+        stamp_ns=np.round(1e9 * stamps).astype(np.int64) + 10**18,
+        offset=np.arange(T + 1, dtype=np.int64) * beams,
+        points=seen[:, :2].astype(np.float32),
+        hit=np.ones(T * beams, bool),
+        T_base_sensor=T_base_sensor,
+        sensor=np.array(sensor, np.int32),
+        T_odom_base=None,
+        beam_time=times.astype(np.float32),
+    )
+    return recording, posts
+
+
+def even(
+    twist: tuple[float, float, float],
+    times: Float,
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    T: int = 5,
+) -> tuple[Recording, Float, Float]:
+    """A robot in even motion; the poses at the stamps, and the posts."""
+    stamps = PERIOD * np.arange(T)
+    all_times = np.tile(times, T)
+    when = np.repeat(stamps, len(times)) + all_times
+    way = moved(twist, when)
+    recording, posts = made(stamps, way, [place], [0] * T, all_times, len(times))
+    return recording, moved(twist, stamps), posts
+
+
+def laid(recording: Recording, poses: Float) -> Float:
+    """(M, 2) points in the map, every scan taken at once."""
+    T = np.repeat(recording.T_map_sensor(poses), np.diff(recording.offset), axis=0)
+    return np.einsum("nij,nj->ni", T[:, :2, :2], recording.points) + T[:, :2, 2]
+
+
+@pytest.mark.parametrize("place", PLACES.values(), ids=PLACES)
+@pytest.mark.parametrize("twist", TWISTS.values(), ids=TWISTS)
+@pytest.mark.parametrize(("first", "last"), [(0.0, 0.1), (-0.1, 0.0), (-0.05, 0.05), (0.0, 0.03)])
+def test_what_stands_still_is_where_it_is(twist, place, first, last):
+    recording, poses, posts = even(twist, np.linspace(first, last, 12), place)
+    seen = deskewed(recording, poses, OPTIONS)
+    np.testing.assert_allclose(laid(seen, poses), posts, atol=2e-5)
+    if any(twist):
+        assert np.abs(laid(recording, poses) - posts).max() > 0.02
+    else:
+        np.testing.assert_array_equal(seen.points, recording.points)
+
+
+def test_numbers_by_hand():
+    # 2 m/s ahead: what lies 5 m ahead 0.1 s after the stamp was 5.2 m away at it
+    recording, poses, _ = even((2.0, 0.0, 0.0), np.array([0.0, 0.1]), T=3)
+    points = np.tile(np.array([[5.0, 1.0]], np.float32), (6, 1))
+    seen = deskewed(replace(recording, points=points), poses, OPTIONS)
+    np.testing.assert_allclose(seen.points, [[5.0, 1.0], [5.2, 1.0]] * 3, atol=1e-6)
+    # a quarter turn to the left in 0.1 s: what is ahead at its end was to the left
+    recording, poses, _ = even((0.0, 0.0, 5 * np.pi), np.array([0.0, 0.1]), T=3)
+    slower = replace(recording, stamp_ns=(recording.stamp_ns - 10**18) * 2)
+    times = slower.beam_time * 2
+    seen = deskewed(replace(slower, points=points, beam_time=times), poses, OPTIONS)
+    np.testing.assert_allclose(seen.points, [[5.0, 1.0], [-1.0, 5.0]] * 3, atol=1e-6)
+
+
+def test_nothing_else_changes():
+    recording, poses, _ = even((5.0, 0.0, 1.0), np.linspace(0.0, 0.1, 12))
+    points = recording.points.copy()
+    points[7] = np.nan
+    recording = replace(recording, points=points, T_odom_base=poses, source={"a": 1})
+    before = points.copy()
+    seen = deskewed(recording, poses, OPTIONS)
+    np.testing.assert_array_equal(recording.points, before)
+    assert np.isnan(seen.points[7]).all()
+    assert np.isfinite(np.delete(seen.points, 7, axis=0)).all()
+    assert seen.beam_time is None
+    for name in ("stamp_ns", "offset", "hit", "T_base_sensor", "sensor", "T_odom_base", "source"):
+        assert getattr(seen, name) is getattr(recording, name)
+    # the frame of the poses says nothing
+    elsewhere = deskewed(recording, se2.matrix(30.0, -7.0, 2.0) @ poses, OPTIONS)
+    np.testing.assert_allclose(elsewhere.points, seen.points, atol=1e-5)
+
+
+def test_it_is_left_as_it_is_where_nothing_is_known_or_wanted():
+    recording, poses, _ = even((5.0, 0.0, 1.0), np.linspace(0.0, 0.1, 12))
+    assert deskewed(recording, None, OPTIONS) is recording
+    assert deskewed(recording, poses, SlamOptions(deskew=False)) is recording
+    at_once = replace(recording, beam_time=None)
+    assert deskewed(at_once, poses, OPTIONS) is at_once
+
+
+def test_errors_that_alternate_do_not_feed_themselves():
+    """A pose that lies ahead must not pull its own scan back, and the one before ahead."""
+    recording, poses, posts = even((5.0, 0.0, 0.0), np.linspace(0.0, 0.1, 12), T=9)
+    off = poses @ se2.matrix(0.03 * (-1.0) ** np.arange(9), 0.0, 0.0)
+    seen = deskewed(recording, off, OPTIONS)
+    errors = np.abs(laid(seen, poses) - posts).reshape(9, -1)
+    assert errors[1:-2].max() < 1e-4  # the first and the last two have fewer neighbours
+
+
+@pytest.mark.parametrize("early", [False, True])
+def test_two_lasers_in_turns(early):
+    """2 ms apart: 1 cm between their poses is an error, not 5 m/s."""
+    twist, apart, T = (3.0, 0.0, 0.5), 0.002, 12
+    stamps = PERIOD * (np.arange(T) // 2) + apart * (np.arange(T) % 2)
+    times = np.tile(np.linspace(0.0, 0.09, 12) - (0.09 if early else 0.0), T)
+    when = np.repeat(stamps, 12) + times
+    way = moved(twist, when)
+    places = [(0.4, 0.2, 0.1), (-0.5, 0.0, 3.0)]
+    recording, posts = made(stamps, way, places, [0, 1] * (T // 2), times)
+    poses = moved(twist, stamps)
+    off = poses @ se2.matrix(0.005 * (-1.0) ** np.arange(T), 0.0, 0.0)
+    seen = deskewed(recording, off, OPTIONS)
+    assert np.abs(laid(seen, poses) - posts).max() < 0.012
+    assert np.abs(laid(recording, poses) - posts).max() > 0.25
+
+
+def test_a_leap_is_no_motion():
+    recording, poses, posts = even((1.0, 0.0, 0.0), np.linspace(0.0, 0.1, 12), T=9)
+    leaping = poses.copy()
+    leaping[4:] = se2.matrix(40.0, 0.0, 2.0) @ leaping[4:]
+    seen = deskewed(recording, leaping, OPTIONS)
+    errors = np.abs(laid(seen, poses) - posts).reshape(9, -1).max(axis=1)
+    np.testing.assert_allclose(errors[[0, 1, 5, 6, 7, 8]], 0.0, atol=1e-5)
+    # the scan before it stays as it was taken, half of its motion lends to those beside it
+    assert errors.max() < 0.06
+
+
+def test_scans_in_one_instant_one_scan_and_none():
+    recording, poses, _ = even((5.0, 0.0, 1.0), np.linspace(0.0, 0.1, 12))
+    together = replace(recording, stamp_ns=np.full(5, 10**18))
+    np.testing.assert_array_equal(deskewed(together, poses, OPTIONS).points, recording.points)
+    one, pose, _ = even((5.0, 0.0, 1.0), np.linspace(-0.1, 0.1, 12), T=1)
+    np.testing.assert_array_equal(deskewed(one, pose, OPTIONS).points, one.points)
+    empty = replace(
+        recording,
+        offset=np.zeros(6, np.int64),
+        points=recording.points[:0],
+        hit=recording.hit[:0],
+        beam_time=recording.beam_time[:0],
+    )
+    assert deskewed(empty, poses, OPTIONS).n_beams == 0
+
+
+def test_scans_without_beams_among_others():
+    recording, poses, posts = even((5.0, 0.0, 1.0), np.linspace(0.0, 0.1, 12))
+    kept = np.ones(60, bool)
+    kept[24:36] = kept[:12] = False
+    fewer = replace(
+        recording,
+        offset=np.array([0, 0, 12, 12, 24, 36]),
+        points=recording.points[kept],
+        hit=recording.hit[kept],
+        beam_time=recording.beam_time[kept],
+    )
+    seen = deskewed(fewer, poses, OPTIONS)
+    np.testing.assert_allclose(laid(seen, poses), posts[kept], atol=2e-5)
+
+
+def test_more_beams_than_are_worked_on_at_a_time():
+    recording, poses, posts = even((5.0, 0.3, 1.0), np.linspace(-0.02, 0.08, 500), T=40)
+    seen = deskewed(recording, poses, OPTIONS)
+    np.testing.assert_allclose(laid(seen, poses), posts, atol=5e-5)
