@@ -21,7 +21,7 @@ Float = NDArray[np.float64]
 # of the way between keyframes: a local map of scans nearer than that takes longer, and says no more
 _DENSE = 0.25
 # metres by which a view is shifted to see whether it could slide along a wall
-_SHIFTS = (-0.6, -0.45, -0.3, -0.15, 0.15, 0.3, 0.45, 0.6)
+_SHIFTS = (-0.6, -0.3, 0.3, 0.6)
 
 
 @dataclass(frozen=True)
