@@ -29,8 +29,10 @@ def there_and_back(T: int) -> np.ndarray:
     return se2.matrix(x, np.zeros(2 * T), np.zeros(2 * T))
 
 
-def loop(earlier: int, later: int, T: np.ndarray, refused: str = "") -> Closure:
-    return Closure(earlier, later, T, np.eye(3), 0.9, refused)
+def loop(
+    earlier: int, later: int, T: np.ndarray, refused: str = "", sigma: float = 0.03
+) -> Closure:
+    return Closure(earlier, later, T, sigma**2 * np.eye(3), 0.9, refused)
 
 
 def test_cases_and_variants_are_there() -> None:
@@ -68,8 +70,10 @@ def test_a_loop_is_false_by_its_displacement_and_only_when_accepted() -> None:
         loop(10, 109, true @ se2.matrix(0.3, 0.41, 0.0)),
         loop(10, 109, true @ se2.matrix(0.0, 0.0, np.radians(-5.1))),
         loop(10, 109, true @ se2.matrix(9.0, 0.0, 0.0), "other loops disagree"),
+        loop(10, 109, true @ se2.matrix(0.9, 0.0, 0.0), sigma=0.3),  # that is what it says
+        loop(10, 109, true @ se2.matrix(1.3, 0.0, 0.0), sigma=0.3),
     ]
-    assert loop_scores(loops, truth) == {"accepted": 4, "refused": 1, "false": 2}
+    assert loop_scores(loops, truth) == {"accepted": 6, "refused": 1, "false": 3}
 
 
 def test_runs_are_mapped_in_every_way_and_shown() -> None:
