@@ -66,6 +66,46 @@ def test_gradient(beams, grids):
         assert core == pytest.approx(plain, rel=1e-4, abs=1e-3 * np.abs(plain).max())
 
 
+def curvature_of(grid, points, weights, T, sigma, radius):
+    """The core's, out of the covariance at a pose that no step is made from."""
+    prior = np.eye(3 if len(T) == 3 else 6)
+    _, covariance, *_ = _core.register_beams(
+        grid, points, weights, T, prior, sigma=sigma, radius=radius, floor=FLOOR, unknown=UNKNOWN,
+        gain=1.0, max_iterations=0, window_translation=0.0, window_rotation=0.0, search_range=9.0,
+        starts=1, T_start=T,
+    )  # fmt: skip
+    return np.linalg.inv(covariance) - prior
+
+
+@pytest.mark.parametrize(("sigma", "radius"), [(0.5, 2), (1.0, 3), (0.3, 1)])
+def test_curvature(beams, grids, sigma, radius):
+    points, weights, T = scan(beams)
+    options = sigma * beams.resolution, radius
+    core = curvature_of(grids[0], points, weights, T, *options)
+    plain = reference.registration_curvature(grids[1], points, weights, T, *options, FLOOR, UNKNOWN)
+    assert core.shape == plain.shape
+    assert np.linalg.eigvalsh(plain).min() > 1
+    np.testing.assert_allclose(core, plain, rtol=0, atol=1e-6 * np.abs(plain).max())
+
+
+def test_curvature_has_no_negative_part(beams, grids):
+    # beam by beam: where means are spread wider than the Gaussians, F is convex there
+    D, sigma = beams.dimension, 0.5 * beams.resolution
+    rng = np.random.default_rng(3)
+    ends = beams.T_map_sensor[5, :D, D] + rng.normal(scale=0.7, size=(150, D))
+    kept, kinds = np.ones(1, np.float32), set()
+    for y in ends.astype(np.float32):
+        core = curvature_of(grids[0], y[None], kept, np.eye(D + 1), sigma, 2)
+        plain = reference.registration_curvature(
+            grids[1], y[None], kept, np.eye(D + 1), sigma, 2, FLOOR, UNKNOWN
+        )
+        np.testing.assert_allclose(core, plain, rtol=0, atol=1e-5 * sigma**-2)
+        values = np.linalg.eigvalsh(plain[:D, :D])
+        assert values.min() > -1e-6
+        kinds.add(int((values > 1e-3).sum()))
+    assert kinds == set(range(D + 1))  # from nowhere to everywhere
+
+
 def test_far_from_everything(beams, grids):
     points, weights, T = scan(beams)
     T = T.copy()

@@ -13,7 +13,12 @@ without a thought for speed. Where beams are taken:
 from stillmap.reference.beams import add_beams, e_step, log_likelihood
 from stillmap.reference.dwell import Dwell, Dwell2D, Dwell3D, Reading, look_at
 from stillmap.reference.em import EmStep, em_fixed_poses, m_step_map
-from stillmap.reference.field import field, registration_cost, registration_gradient
+from stillmap.reference.field import (
+    field,
+    registration_cost,
+    registration_curvature,
+    registration_gradient,
+)
 from stillmap.reference.fill import fill_surfaces
 from stillmap.reference.grid import Grid, Grid2D, Grid3D, occupancy
 from stillmap.reference.held_out import StaticShares, StaticShares2D, StaticShares3D, held_out
@@ -49,6 +54,7 @@ __all__ = [
     "m_step_map",
     "occupancy",
     "registration_cost",
+    "registration_curvature",
     "registration_gradient",
     "traverse",
 ]

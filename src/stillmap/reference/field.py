@@ -1,7 +1,7 @@
 """The smoothed field that registration climbs: stillmap's practical form of (9)."""
 
 from itertools import product
-from math import exp, isnan, log, pi, sqrt
+from math import erf, exp, isnan, log, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -91,10 +91,13 @@ def registration_cost(
     for p, w in zip(np.asarray(points, float), np.asarray(weights, float), strict=True):
         if np.isfinite(p).all():
             y = pose[:D, :D] @ p + pose[:D, D]
-            unseen = isnan(grid.occupancy_of(tuple(cell_of(y, grid.resolution).tolist())))
-            base = floor + (unknown if unseen else 0.0)
-            cost -= w * log(base + field(grid, y, sigma, radius))
+            cost -= w * log(_base(grid, y, floor, unknown) + field(grid, y, sigma, radius))
     return float(cost)
+
+
+def _base(grid: Grid, y: Float, floor: float, unknown: float) -> float:
+    unseen = isnan(grid.occupancy_of(tuple(cell_of(y, grid.resolution).tolist())))
+    return floor + (unknown if unseen else 0.0)
 
 
 def registration_gradient(
@@ -125,6 +128,63 @@ def registration_gradient(
         )
         gradient.append((above - below) / (2 * step))
     return np.array(gradient)
+
+
+def registration_curvature(
+    grid: Grid,
+    points: ArrayLike,
+    weights: ArrayLike,
+    T: ArrayLike,
+    sigma: float,
+    radius: int,
+    floor: float,
+    unknown: float,
+) -> Float:
+    """What the Newton steps take for the second derivative of `registration_cost`.
+
+    The sum of w_n s_n J_n^T A_n J_n: s = F / (base + F) is the share of a beam that the map
+    explains, J the derivative of T p_n by the pose, and A the curvature of -ln F, see
+    `_curvature`.
+
+    Returns:
+        (3, 3) or (6, 6), order and units as the gradient's.
+    """
+    pose, D = np.asarray(T, float), grid.dimension
+    H = np.zeros((3, 3) if D == 2 else (6, 6))
+    for p, w in zip(np.asarray(points, float), np.asarray(weights, float), strict=True):
+        if np.isfinite(p).all():
+            y = pose[:D, :D] @ p + pose[:D, D]
+            F = field(grid, y, sigma, radius)
+            arm = y - pose[:D, D]
+            turning = [[-arm[1]], [arm[0]]] if D == 2 else np.cross(np.eye(3), arm).T
+            J = np.hstack([np.eye(D), turning])
+            explained = F / (_base(grid, y, floor, unknown) + F)
+            if F > 0:
+                H += w * explained * J.T @ _curvature(grid, y, sigma, radius) @ J
+    return H
+
+
+def _curvature(grid: Grid, y: Float, sigma: float, radius: int) -> Float:
+    """(D, D) sigma^-2 I - sigma^-4 C / v without its negative part.
+
+    C is the spread of the means mu_k around y, each weighted with its part of F, and v the
+    variance that is left to a Gaussian of variance 1 cut off where the sum ends. Where a surface
+    is taken to go on, sigma^-2 across it and nothing along it.
+    """
+    centre = cell_of(y, grid.resolution)
+    means, m = _around(grid, centre, radius)
+    if isnan(grid.occupancy_of(tuple(centre.tolist()))) and len(m) >= grid.dimension:
+        _, normal, is_flat = _plane(means, m)
+        if is_flat:
+            return np.outer(normal, normal) / sigma**2
+    parts = m * np.exp(-((y - means) ** 2).sum(axis=1) / (2 * sigma**2))
+    apart = means - parts @ means / parts.sum()
+    spread = (parts[:, None] * apart).T @ apart / parts.sum()
+    cut = (radius + 0.5) * grid.resolution / sigma
+    v = 1.0 - sqrt(2 / pi) * cut * exp(-(cut**2) / 2) / erf(cut / sqrt(2))
+    values, axes = np.linalg.eigh(np.eye(grid.dimension) / sigma**2 - spread / (v * sigma**4))
+    kept: Float = axes @ np.diag(np.maximum(values, 0.0)) @ axes.T
+    return kept
 
 
 def moved(T: Float, delta: Float) -> Float:
