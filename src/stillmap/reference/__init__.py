@@ -23,6 +23,7 @@ from stillmap.reference.fill import fill_surfaces
 from stillmap.reference.grid import Grid, Grid2D, Grid3D, occupancy
 from stillmap.reference.held_out import StaticShares, StaticShares2D, StaticShares3D, held_out
 from stillmap.reference.no_return import add_lost
+from stillmap.reference.search import Lattice, search_lattice
 from stillmap.reference.surface import Surface, Surface2D, Surface3D
 from stillmap.reference.traverse import cell_of, traverse
 
@@ -34,6 +35,7 @@ __all__ = [
     "Grid",
     "Grid2D",
     "Grid3D",
+    "Lattice",
     "Reading",
     "StaticShares",
     "StaticShares2D",
@@ -56,5 +58,6 @@ __all__ = [
     "registration_cost",
     "registration_curvature",
     "registration_gradient",
+    "search_lattice",
     "traverse",
 ]
