@@ -66,6 +66,28 @@ def test_gradient(beams, grids):
         assert core == pytest.approx(plain, rel=1e-4, abs=1e-3 * np.abs(plain).max())
 
 
+def test_a_line_in_space_is_no_plane_that_goes_on():
+    # beams along x from x = 0: around the line nobody looked, and all sides of it are alike
+    points = np.zeros((12, 3), np.float32)
+    points[:, 0] = np.linspace(0.3, 1.4, 12)
+    T = np.eye(4)[None].copy()
+    T[0, :3, 3] = 0.0, 0.05, 0.05
+    hit, e, offset = np.ones(12, bool), np.ones(12, np.float32), np.array([0, 12])
+    sides = np.array([(1, 0), (0, 1), (-1, 0), (0, -1), (0.7, 0.7), (0.7, -0.7), (-0.7, 0.7)])
+    there = np.column_stack([np.full(len(sides), 0.85), 0.05 + 0.08 * sides]).astype(np.float32)
+    for kernels in (_core, reference):
+        grid = kernels.Grid3D(0.1)
+        kernels.add_beams(grid, points, hit, e, offset, T)
+        costs = [
+            kernels.registration_cost(
+                grid, y[None], np.ones(1, np.float32), np.eye(4), 0.05, 2, FLOOR, 0.0
+            )
+            for y in there
+        ]
+        assert np.ptp(costs) < 0.05
+        assert costs[0] < -np.log(FLOOR) - 0.2
+
+
 def curvature_of(grid, points, weights, T, sigma, radius):
     """The core's, out of the covariance at a pose that no step is made from."""
     prior = np.eye(3 if len(T) == 3 else 6)

@@ -131,7 +131,10 @@ class Field {
       spread += (g.weight / total) * (g.mean - mean) * (g.mean - mean).transpose();
     Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> axes;
     axes.computeDirect(spread);
-    near.is_flat = axes.eigenvalues()[0] < 0.1 * axes.eigenvalues()[1];
+    const Vec<D> variance = axes.eigenvalues();
+    // a line in space lies on many planes
+    near.is_flat =
+        variance[0] < 0.1 * variance[1] && (D == 2 || variance[1] > 0.1 * variance[D - 1]);
     near.across = axes.eigenvectors().col(0);
     near.on = mean;
     near.height = total / static_cast<double>(near.gaussians.size());

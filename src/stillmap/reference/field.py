@@ -59,7 +59,10 @@ def _plane(means: Float, m: Float) -> tuple[Float, Float, bool]:
     mean = weights @ means
     apart = means - mean
     variance, axes = np.linalg.eigh((weights[:, None] * apart).T @ apart)
-    return mean, axes[:, 0], bool(variance[0] < 0.1 * variance[1])
+    is_flat = variance[0] < 0.1 * variance[1] and (
+        len(mean) == 2 or variance[1] > 0.1 * variance[2]
+    )
+    return mean, axes[:, 0], bool(is_flat)
 
 
 def registration_cost(
