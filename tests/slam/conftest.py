@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from stillmap import _core, se2
 from stillmap.simulation.laser import Movers, beam_angles, cast
 from stillmap.simulation.walls import box, pillar, polyline
+from stillmap.slam.scans import SurfaceOptions
 
 Float = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -66,12 +67,14 @@ def mapped(scan: Callable[..., Points]) -> Callable[..., _core.Grid2D]:
 
 @pytest.fixture
 def put() -> Callable[..., None]:
-    """Adds one scan of hits at a pose to a map."""
+    """Adds one scan of hits at a pose to a map, gaps on surfaces filled."""
     return add
 
 
 def add(grid: _core.Grid2D, points: Points, pose: Float, e: float = 1.0) -> None:
     n = len(points)
     weights = np.full(n, e, np.float32)
-    T = se2.matrix(*pose)[None]
-    _core.add_beams(grid, points, np.ones(n, bool), weights, np.array([0, n]), T)
+    beams = points, np.ones(n, bool), weights, np.array([0, n]), se2.matrix(*pose)[None]
+    _core.add_beams(grid, *beams)
+    gaps = SurfaceOptions()
+    _core.fill_surfaces(grid, *beams, gap=gaps.gap, tolerance=gaps.straight, growth=gaps.growth)

@@ -7,7 +7,7 @@ import pytest
 
 from stillmap import se2
 from stillmap.slam import motion
-from stillmap.slam.motion import MotionOptions
+from stillmap.slam.motion import MotionOptions, Steadiness
 
 OPTIONS = MotionOptions()
 T0 = se2.matrix(3.0, -1.0, 2.0)
@@ -21,10 +21,44 @@ def test_odometry_moves_from_the_last_pose():
 
 def test_a_constant_velocity_repeats_the_last_motion():
     step = se2.matrix(0.3, 0.0, 0.1)
-    prior = motion.from_constant_velocity(T0 @ step, T0, OPTIONS)
+    prior = motion.from_constant_velocity(T0 @ step, T0, Steadiness(0.2, 0.3))
     np.testing.assert_allclose(prior.T_map_base, T0 @ step @ step, atol=1e-14)
-    assert prior.sigma_translation == OPTIONS.without_odometry_translation
-    assert prior.sigma_rotation == OPTIONS.without_odometry_rotation
+    assert prior.sigma_translation == 0.2
+    assert prior.sigma_rotation == 0.3
+    assert not prior.measured
+
+
+def test_how_steady_the_motion_is_by_hand():
+    # 0.75 * 0.4^2 + 0.25 * (0.2^2 + 0.4^2) / 2 = 0.145 m^2, 0.75 * 0.2^2 + 0.25 * 0.6^2 rad^2
+    options = MotionOptions(steady_rate=0.25)
+    after = Steadiness(0.4, 0.2).after(np.array([0.2, -0.4, 0.6]), 0.1, options)
+    assert after.translation == pytest.approx(np.sqrt(0.145))
+    assert after.rotation == pytest.approx(np.sqrt(0.12))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "metres", "radians"),
+    # 1/2 a t^2 of 2 m/s^2 and 4 rad/s^2: not below the floor of 0.02 m, not above 0.15
+    [(0.01, 0.02, 0.02), (0.2, 0.04, 0.08), (1.0, 0.15, 0.15)],
+)
+def test_a_robot_that_was_steady_may_still_turn(seconds, metres, radians):
+    found = motion.unknown_steadiness(OPTIONS)
+    assert found == Steadiness(
+        OPTIONS.without_odometry_translation, OPTIONS.without_odometry_rotation
+    )
+    for _ in range(200):
+        found = found.after(np.zeros(3), seconds, OPTIONS)
+    assert found.translation == pytest.approx(metres)
+    assert found.rotation == pytest.approx(radians)
+
+
+def test_steps_that_nobody_made_are_told_from_the_others():
+    x = np.cumsum([0.0, *[0.3] * 30, 40.0, *[0.3] * 30])
+    steps = motion.odometry_steps(se2.matrix(x, 0 * x, 0 * x))
+    np.testing.assert_array_equal(np.flatnonzero(~steps.plausible), [30])
+    np.testing.assert_allclose(steps.increments[:, 0, 2], np.diff(x))
+    assert motion.odometry_steps(None) is None
+    assert motion.odometry_steps(T0[None]).plausible.shape == (0,)
 
 
 def test_widths_by_hand():
@@ -57,8 +91,9 @@ def test_poses_stay_poses_however_long_the_chain():
     # R R'^T R multiplies what rounding leaves beside a rotation by 2.4 from scan to scan
     before, now = T0, T0 @ se2.matrix(0.1, 0.01, 0.3)
     by_odometry, step = T0, se2.matrix(0.1, 0.01, 0.3)
+    unsure = motion.unknown_steadiness(OPTIONS)
     for _ in range(300):
-        before, now = now, motion.from_constant_velocity(now, before, OPTIONS).T_map_base
+        before, now = now, motion.from_constant_velocity(now, before, unsure).T_map_base
         by_odometry = motion.from_odometry(by_odometry, step, OPTIONS).T_map_base
     for T in (now, by_odometry):
         np.testing.assert_allclose(T[:2, :2] @ T[:2, :2].T, np.eye(2), atol=1e-12)
@@ -67,13 +102,16 @@ def test_poses_stay_poses_however_long_the_chain():
 
 
 def test_every_width_can_be_chosen():
-    names = [f.name for f in dataclasses.fields(MotionOptions)]
-    assert len(names) == 8
     increment = se2.matrix(0.2, 0.1, 0.3)
-    for name in names:
+    for name in (f.name for f in dataclasses.fields(MotionOptions)):
+        if name in ("acceleration", "turn_acceleration", "unannounced", "steady_rate"):
+            continue  # of guesses without odometry, see above
         more = dataclasses.replace(OPTIONS, **{name: 2 * getattr(OPTIONS, name)})
         if name.startswith("without"):
-            a, b = (motion.from_constant_velocity(T0, T0, o) for o in (OPTIONS, more))
+            a, b = (
+                motion.from_constant_velocity(T0, T0, motion.unknown_steadiness(o))
+                for o in (OPTIONS, more)
+            )
         else:
             a, b = (motion.from_odometry(T0, increment, o) for o in (OPTIONS, more))
         rotation = "rotation" in name
