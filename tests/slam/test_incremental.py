@@ -13,6 +13,7 @@ from stillmap.simulation import RobotOptions, Scene, scene_by_name, simulate
 from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.simulation.walls import box
 from stillmap.slam import SlamOptions, incremental, m_step
+from stillmap.slam.loops import LoopOptions
 
 OPTIONS = SlamOptions()
 
@@ -96,7 +97,11 @@ def test_the_map_frame_is_the_first_base():
 def test_the_grid_is_what_the_poses_make():
     recording = small_room(people=2).recording
     e = np.random.default_rng(0).random(recording.n_beams).astype(np.float32)
-    mapped = build(recording, e)
+    so_far = build(recording, e)
+    assert so_far.grid.dense()[1].size == 0  # it is made once, at the end
+    open_ends = dataclasses.replace(OPTIONS, loops=LoopOptions(enabled=False))
+    mapped = m_step(recording, e, open_ends, None, 1, silent)
+    np.testing.assert_array_equal(mapped.poses, so_far.poses)
     grid = _core.Grid2D(OPTIONS.resolution)
     em.add_recording(grid, recording, mapped.poses, e)
     for ours, theirs in zip(mapped.grid.dense(), grid.dense(), strict=True):

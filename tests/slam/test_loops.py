@@ -98,12 +98,12 @@ def test_a_square_with_drift_closes():
     drifted = Mapped(np.array(poses), np.zeros((n, 3, 3)), _core.Grid2D(0.05), np.ones(n), [])
     before = absolute_errors(drifted.poses, truth)
     e = np.full(simulation.recording.n_beams, 0.9, np.float32)
-    closed_poses, found = closed(simulation.recording, e, OPTIONS, drifted)
-    metres, chi2 = errors(found, simulation).T
+    found = closed(simulation.recording, e, OPTIONS, drifted)
+    metres, chi2 = errors(found.loops, simulation).T
     assert np.count_nonzero(metres < 0.1) >= 4
     assert chi2.max() < 11.3  # 99 %
-    assert absolute_errors(closed_poses, truth).rmse < 0.5 * before.rmse
-    end = se2.parameters(se2.inverse(truth[-1]) @ closed_poses[-1])
+    assert absolute_errors(found.poses, truth).rmse < 0.5 * before.rmse
+    end = se2.parameters(se2.inverse(truth[-1]) @ found.poses[-1])
     assert np.hypot(*end[:2]) < 0.08
     assert np.hypot(*se2.parameters(se2.inverse(truth[-1]) @ drifted.poses[-1])[:2]) > 0.2
 
@@ -159,7 +159,16 @@ def straight_track(options=OPTIONS.loops):
     frames = np.arange(n)
     travelled = np.arange(float(n))
     return Track(
-        recording, e, poses, travelled, np.ones(n), frames, 0.05, OPTIONS.registration, options
+        recording,
+        e,
+        poses,
+        travelled,
+        np.ones(n),
+        frames,
+        0.05,
+        OPTIONS.registration,
+        OPTIONS.surface,
+        options,
     )
 
 
@@ -174,7 +183,7 @@ def closures(shifts):
 
 def test_one_closure_that_wants_something_else_is_refused():
     track = straight_track()
-    way = relations(track, OPTIONS.motion)
+    way = relations(track, OPTIONS.motion, [])
     shifts = [0.5] * 8
     shifts[4] = -0.5
     refused = [c.refused for c in agreeing(track, way, closures(shifts))]
@@ -183,7 +192,7 @@ def test_one_closure_that_wants_something_else_is_refused():
 
 def test_a_closure_on_its_own_is_refused():
     track = straight_track()
-    way = relations(track, OPTIONS.motion)
+    way = relations(track, OPTIONS.motion, [])
     assert [bool(c.refused) for c in agreeing(track, way, closures([0.1]))] == [True]
 
 
@@ -205,9 +214,10 @@ def test_a_way_that_odometry_contradicts_is_loose():
         frames,
         0.05,
         OPTIONS.registration,
+        OPTIONS.surface,
         OPTIONS.loops,
     )
-    way = relations(track, OPTIONS.motion)
+    way = relations(track, OPTIONS.motion, [])
     widths = np.array([np.sqrt(np.linalg.eigvalsh(r.covariance[:2, :2]).max()) for r in way])
     assert widths[5] == pytest.approx(0.8, abs=0.1)
     assert np.delete(widths, 5).max() < 0.1

@@ -134,6 +134,7 @@ def build(
     usual = np.zeros(len(recording.T_base_sensor))  # each laser sees its own side
     usual[recording.sensor[0]] = 1.0
     so_far.add(0, poses[0], 0.0)
+    progress(1, T)
     for t in range(1, T):
         guess = motion.from_constant_velocity(poses[t - 1], poses[max(t - 2, 0)], steadiness)
         prior, other = _priors(poses[t - 1], steps, t, guess, options.motion)

@@ -77,7 +77,8 @@ def optimised(
         return _least_squares(poses, chain, loops, np.ones(len(loops)))
     out = _least_squares(poses, chain, loops, np.ones(len(loops)))
     chi2 = misfits(out, loops)
-    if chi2.max() <= robust.misfit:
+    # a loop that is sure fits well even if it is false: then the way had to bend for it
+    if np.append(chi2, misfits(out, chain)).max() <= robust.misfit:
         return out  # nothing contradicts anything
     blunt = 2.0 * chi2.max() / robust.misfit
     for step in range(robust.steps):
