@@ -109,7 +109,7 @@ def test_what_tells_of_the_motion(swept, monkeypatch, odometry):
 @pytest.mark.parametrize("odometry", [True, False])
 @pytest.mark.parametrize("world", list(FAST))
 def test_poses_at_speed(world, odometry):
-    """Seeds 100 to 102: 4 to 9 mm instead of 21 to 45, and 8 to 28 instead of 221 to 355."""
+    """Seeds 100 to 102: 4 to 26 mm instead of 20 to 45, and 9 to 10 instead of 198 to 362."""
     simulation = fast(world)
     recording, truth = simulation.recording, simulation.truth.T_world_base
     if not odometry:
@@ -119,4 +119,4 @@ def test_poses_at_speed(world, odometry):
         result = stillmap.build(recording, replaced(options(max_iterations=4), changes))
         ate.append(absolute_errors(result.poses, truth).rmse)
     assert ate[0] < 0.4 * ate[1]
-    assert ate[0] < {"office": 0.015, "street": 0.05}[world]
+    assert ate[0] < {"office": 0.015, "street": 0.03}[world]

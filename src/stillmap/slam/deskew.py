@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.recording.model import Recording
+from stillmap.slam import motion
 from stillmap.slam.incremental import SlamOptions
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _KNOWN = 0.5  # of the time that a scan takes: over less, poses tell of their own errors
-_FASTEST = 60.0  # m/s; what is faster is a leap, no motion
-_FASTEST_TURN = 12.0  # rad/s
+_FASTEST_TURN = 12.0  # rad/s; what is faster is a leap, no motion
 _BLOCK = 1 << 14  # beams worked on together
 
 
@@ -90,14 +90,21 @@ def _twists(recording: Recording, poses: Float, first: Index, second: Index) -> 
     seconds = 1e-9 * (recording.stamp_ns[second] - recording.stamp_ns[first])
     moved = se2.log(se2.inverse(poses[first]) @ poses[second])
     twists = moved / np.where(seconds > 0.0, seconds, np.inf)[:, None]
-    leaps = np.hypot(twists[:, 0], twists[:, 1]) > _FASTEST
-    twists[leaps | (np.abs(twists[:, 2]) > _FASTEST_TURN)] = 0.0
+    twists[_leaps(poses, first, second) | (np.abs(twists[:, 2]) > _FASTEST_TURN)] = 0.0
     vx, vy, turn = _steadied(twists).T
     # off the centre of a robot that turns, a sensor goes along with the turn
     x, y, theta = se2.parameters(recording.T_base_sensor[recording.sensor]).T
     vx, vy = vx - turn * y, vy + turn * x
     c, s = np.cos(theta), np.sin(theta)
     return np.stack([c * vx + s * vy, c * vy - s * vx, turn])
+
+
+def _leaps(poses: Float, first: Index, second: Index) -> NDArray[np.bool_]:
+    """(T,) whether there is a step between two scans that no robot goes."""
+    steps = motion.odometry_steps(poses)
+    implausible = np.zeros(0, np.bool_) if steps is None else ~steps.plausible
+    so_far = np.concatenate([[0], np.cumsum(implausible)])
+    return np.asarray(so_far[second] > so_far[first])
 
 
 def _steadied(twists: Float) -> Float:
@@ -111,9 +118,9 @@ def _steadied(twists: Float) -> Float:
     return 0.25 * padded[:-2] + 0.5 * twists + 0.25 * padded[2:]
 
 
-def _carried(points: NDArray[np.float32], motion: Float) -> NDArray[np.float32]:
-    """Points (N, 2), each moved by the exponential of a motion (3, N): x, y, angle."""
-    dx, dy, angle = motion
+def _carried(points: NDArray[np.float32], log_T: Float) -> NDArray[np.float32]:
+    """Points (N, 2), each carried by the exponential of log_T (3, N): x, y, angle."""
+    dx, dy, angle = log_T
     half = 0.5 * angle
     c, s = np.cos(half), np.sin(half)
     chord = se2.sine_over_angle(half, s)
