@@ -30,7 +30,7 @@ def there_and_back(T: int) -> np.ndarray:
 
 
 def loop(
-    earlier: int, later: int, T: np.ndarray, refused: str = "", sigma: float = 0.03
+    earlier: int, later: int, T: np.ndarray, refused: str = "", sigma: float = 0.02
 ) -> Closure:
     return Closure(earlier, later, T, sigma**2 * np.eye(3), 0.9, refused)
 

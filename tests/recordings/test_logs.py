@@ -90,7 +90,7 @@ def test_it_finds_movers_where_poses_are_loose_and_keeps_walls(crowded):
     # end points scatter by most of a cell: what stands beside anything is believed to stand too
     result, e = crowded("stillmap")
     assert 0.03 < result.learned["scatter"] < 0.06
-    assert 0.001 < (e < 0.5).mean() < 0.02
+    assert 0.001 < (e < 0.5).mean() < 0.03
     assert (e < 0.1).sum() > 10
     assert 0.9 < result.learned["p_static"] < 0.997
     # cells in which only movers were seen are free, and walls are there
