@@ -18,6 +18,7 @@ from stillmap.slam.pose_graph import Graph
 from stillmap.slam.registration import (
     Registration,
     RegistrationOptions,
+    is_off,
     register,
     share_through_walls,
 )
@@ -141,7 +142,8 @@ def build(
         scan, s = hits(recording, e, t), recording.sensor[t]
         found = register(so_far.grid, scan, prior, other, options.registration, usual[s])
         fits_nowhere = _was_carried(so_far, scan, found, usual[s], options.registration)
-        if fits_nowhere or (found.astray and steps is not None):
+        leapt = _leapt(so_far, scan, found, (prior, guess), options.registration)
+        if fits_nowhere or (leapt and steps is not None):
             breaks.append(t)
             nowhere += [t] if fits_nowhere else []
             so_far, usual[:] = _empty(recording, e, options), 0.0
@@ -180,6 +182,25 @@ def _was_carried(
     if found.explained >= options.carried_below * usual or len(scan.points) == 0:
         return False
     return share_through_walls(so_far.grid, scan, found) > options.through
+
+
+def _leapt(
+    so_far: LocalMap,
+    scan: Scan,
+    found: Registration,
+    priors: tuple[MotionPrior, MotionPrior],
+    options: RegistrationOptions,
+) -> bool:
+    """Whether a scan fits only where neither odometry nor its motion so far takes the robot.
+
+    It may look alike there. A robot that was not carried would not look through walls without it.
+    """
+    if found.astray or not found.widened:
+        return found.astray
+    if not all(is_off(prior, found, options) for prior in priors):
+        return False
+    unmoved = dataclasses.replace(found, T_map_base=priors[0].T_map_base)
+    return share_through_walls(so_far.grid, scan, unmoved) > options.through
 
 
 def _priors(

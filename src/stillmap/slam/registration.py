@@ -136,13 +136,13 @@ def register(
     for mean in (prior, other):
         if mean is not None and found.explained < doubtful:
             found = _farther(grid, scan, mean, options, found, doubtful)
-    if prior.measured and _is_off(prior, found, options):
+    if prior.measured and is_off(prior, found, options):
         # a mean that far off is no mean: it would only draw the pose towards itself
         looser = motion.widened(prior, *_off_by(prior, found))
         again = search(grid, scan, looser, options, 0.0, 0.0, start=found.T_map_base)
         if again.misfit <= found.misfit:
             found = dataclasses.replace(again, widened=found.widened, astray=found.astray)
-        found = dataclasses.replace(found, disagrees=_is_off(prior, found, options))
+        found = dataclasses.replace(found, disagrees=is_off(prior, found, options))
     return found
 
 
@@ -195,7 +195,7 @@ def _off_by(prior: MotionPrior, found: Registration) -> tuple[float, float]:
     return float(np.hypot(d[0], d[1])), abs(float(d[2]))
 
 
-def _is_off(prior: MotionPrior, found: Registration, options: RegistrationOptions) -> bool:
+def is_off(prior: MotionPrior, found: Registration, options: RegistrationOptions) -> bool:
     metres, radians = _off_by(prior, found)
     off = max(metres / prior.sigma_translation, radians / prior.sigma_rotation)
     return off > options.disagree
