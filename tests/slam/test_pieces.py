@@ -1,0 +1,150 @@
+"""Robots that are carried elsewhere: noticed, and put where they belong or beside the rest."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stillmap import se2
+from stillmap.evaluation.trajectory import absolute_errors
+from stillmap.simulation import RobotOptions, Scene, scene_by_name, simulate
+from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.simulation.walls import box, pillar
+from stillmap.slam import SlamOptions, m_step
+from stillmap.slam.pieces import separated
+
+OPTIONS = SlamOptions()
+
+
+def mapped(recording, options=OPTIONS):
+    e = np.full(recording.n_beams, 0.9, np.float32)
+    return m_step(recording, e, options, None, 1, lambda *_: None)
+
+
+def carried(world, seed, beams, **robot):
+    chosen = {"robot": robot, "crowd": {"people": 2}, "laser": {"beams": beams}}
+    return simulate(scene_by_name(world, chosen), seed)
+
+
+def assert_noticed_and_placed(simulation):
+    found = mapped(simulation.recording)
+    assert found.breaks == [simulation.truth.scene["carried_at_scan"]]
+    assert found.apart == []
+    assert absolute_errors(found.poses, simulation.truth.T_world_base).rmse < 0.1
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_robot_that_was_carried_is_found_again(seed):
+    simulation = carried("office", seed, 90, scans=500, speed=1.5, carried_at=0.7)
+    truth = simulation.truth
+    before, at = np.array([-1, 0]) + truth.scene["carried_at_scan"]
+    assert np.linalg.norm(truth.T_world_base[at] - truth.T_world_base[before]) > 20.0
+    assert_noticed_and_placed(simulation)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+def test_wherever_it_was_put_down_in_an_office(seed):
+    assert_noticed_and_placed(carried("office", seed, 180, scans=1500, carried_at=0.6))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_wherever_it_was_put_down_in_a_warehouse(seed):
+    assert_noticed_and_placed(carried("warehouse", seed, 120, scans=900, speed=1.0, carried_at=0.6))
+
+
+def in_room(walls, route, seed):
+    scene = Scene(
+        "room",
+        walls=walls,
+        route=route,
+        crowd=CrowdOptions(people=0),
+        laser=LaserOptions(beams=120, range_noise=0.01, max_range=20.0),
+        robot=RobotOptions(scans=60),
+        odometry=OdometryOptions(),
+    )
+    return simulate(scene, seed)
+
+
+def one_after_the_other(a, b):
+    """One recording of both; odometry goes on as if nothing had happened."""
+    T = a.T_odom_base[-1] @ se2.inverse(b.T_odom_base[0]) @ b.T_odom_base
+    both = [(getattr(a, name), getattr(b, name)) for name in ("points", "hit", "sensor")]
+    points, hit, sensor = (np.concatenate(pair) for pair in both)
+    return dataclasses.replace(
+        a,
+        stamp_ns=np.concatenate([a.stamp_ns, b.stamp_ns + a.stamp_ns[-1] + 10**9 - b.stamp_ns[0]]),
+        offset=np.concatenate([a.offset, b.offset[1:] + a.offset[-1]]),
+        points=points,
+        hit=hit,
+        sensor=sensor,
+        T_odom_base=np.concatenate([a.T_odom_base, T]),
+    )
+
+
+def ends(recording, poses, scans):
+    """(N, 2) end points of scans in the map."""
+    out = []
+    for t in scans:
+        beams = recording.beams_of(t)
+        T = poses[t] @ recording.T_base_sensor[recording.sensor[t]]
+        points = recording.points[beams][recording.hit[beams]]
+        out.append(points @ T[:2, :2].T + T[:2, 2])
+    return np.concatenate(out)
+
+
+@pytest.fixture(scope="module")
+def rooms():
+    one = in_room(
+        (*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),
+        ((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
+        2,
+    )
+    other = in_room(
+        (*box(0, 0, 19, 14), *pillar(-1, 2.5, 0.3), *pillar(4, -3, 0.5), *box(5, 4.5, 1, 3)),
+        ((-5, -4), (0.5, -3), (1, 4)),
+        3,
+    )
+    return one, other, one_after_the_other(one.recording, other.recording)
+
+
+def test_a_place_that_has_nothing_in_common_is_put_beside(rooms):
+    one, other, recording = rooms
+    found = mapped(recording)
+    assert found.breaks == [60]
+    assert found.apart == [60]
+    # nobody knows how the robot came there: no loop says so, and the step itself says nothing
+    assert all(closure.refused for closure in found.loops if closure.later >= 60 > closure.earlier)
+    across = [r for r in found.graph.relations if found.graph.scans[r.second] == 60]
+    assert [np.linalg.eigvalsh(r.covariance).min() > 90.0 for r in across] == [True]
+    # each room is as good as alone, and the two maps have 10 m between them
+    assert absolute_errors(found.poses[:60], one.truth.T_world_base).rmse < 0.01
+    assert absolute_errors(found.poses[60:], other.truth.T_world_base).rmse < 0.01
+    left = ends(recording, found.poses, range(60))
+    right = ends(recording, found.poses, range(60, 120))
+    assert right[:, 0].min() > left[:, 0].max() + 5.0
+
+
+def test_pieces_beside_one_another_are_ever_the_same(rooms):
+    one, other = mapped(rooms[2]), mapped(rooms[2])
+    np.testing.assert_array_equal(one.poses, other.poses)
+    assert one.apart == other.apart
+
+
+def test_the_same_room_again_is_the_same_room(rooms):
+    # carried back to where it was, turned about: 5 m from where odometry goes on
+    one = rooms[0]
+    again = one_after_the_other(one.recording, one.recording)
+    found = mapped(again)
+    assert found.breaks == [60]
+    assert found.apart == []
+    truth = np.concatenate([one.truth.T_world_base] * 2)
+    assert absolute_errors(found.poses, truth).rmse < 0.02
+
+
+def test_nothing_reaches_across_a_break():
+    travelled = np.arange(6.0)
+    got = separated(travelled, [2, 5], 30.0)
+    np.testing.assert_array_equal(got, [0, 1, 32, 33, 34, 65])
+    np.testing.assert_array_equal(travelled, np.arange(6.0))
