@@ -52,18 +52,18 @@ DEFAULTS = Options()
 def resolved(options: Options) -> Options:
     """The options as they will be used.
 
-    The printed method has poses by (9) alone, scan by scan, against the end points as they are, and
-    takes scans as taken at once.
+    The printed method has poses by (9) alone, scan by scan, and takes scans as taken at once.
     """
     if options.estimator != "paper":
         return options
     loops = dataclasses.replace(options.slam.loops, enabled=False)
     registration = dataclasses.replace(options.slam.registration, approach=0.0)
-    surface = dataclasses.replace(options.slam.surface, gap=0.0)
-    slam_options = dataclasses.replace(
-        options.slam, loops=loops, registration=registration, surface=surface, deskew=False
+    return dataclasses.replace(
+        options,
+        slam=dataclasses.replace(
+            options.slam, loops=loops, registration=registration, deskew=False
+        ),
     )
-    return dataclasses.replace(options, slam=slam_options)
 
 
 @dataclass(frozen=True, eq=False)

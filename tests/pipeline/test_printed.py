@@ -51,9 +51,7 @@ def test_all_of_a_beam_speaks_of_what_it_crosses(room, printed):
 def test_it_is_the_loop_of_fig_2(room):
     # written out once more: register scan by scan, map, label, repeat
     r, chosen = room.recording, options()
-    registration, surface = {"approach": 0.0}, {"gap": 0.0}
-    changes = {"loops": {"enabled": False}, "registration": registration, "surface": surface}
-    plain = replaced(SLAM, changes)
+    plain = replaced(SLAM, {"loops": {"enabled": False}, "registration": {"approach": 0.0}})
     e = np.full(r.n_beams, chosen.em.prior, np.float32)
     n = 0
     for it in stillmap.iterate(r, chosen):
@@ -75,11 +73,9 @@ def test_the_options_that_are_kept_are_those_that_were_used(printed):
     assert printed.options.slam.registration.approach == 0.0
     # all else as it was asked for, and other estimators as they were
     assert not printed.options.slam.deskew
-    assert printed.options.slam.surface.gap == 0.0
     rest = {
         "loops": {"enabled": True},
         "registration": {"approach": SLAM.registration.approach},
-        "surface": {"gap": SLAM.surface.gap},
         "deskew": True,
     }
     assert replaced(printed.options, {"slam": rest}) == options()
