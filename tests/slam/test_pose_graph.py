@@ -1,6 +1,7 @@
 """The pose graph: graphs whose answer is known by hand."""
 
 import numpy as np
+import pytest
 
 from stillmap import se2
 from stillmap.slam.pose_graph import Relation, Robust, misfits, optimised
@@ -114,3 +115,89 @@ def test_the_same_to_the_bit():
     loop = Relation(0, 40, np.eye(3), SURE)
     a, b = (optimised(dead_reckoned(chain), chain, [loop], ROBUST) for _ in range(2))
     np.testing.assert_array_equal(a, b)
+
+
+STEP_ERROR = np.diag([0.03**2, 0.015**2, 0.004**2])
+LOOP_ERROR = np.diag([0.03**2, 0.03**2, 0.006**2])
+
+
+def rounds(rng, laps, false):
+    """Truth, chain and loops of 100 m a lap, all with the errors that they are said to have.
+
+    60 of the loops are true; the false ones tie any two poses to anywhere within 2 m.
+    """
+    step, corner = se2.matrix(1.0, 0.0, 0.0), se2.matrix(1.0, 0.0, np.pi / 2)
+    truth = [np.eye(3)]
+    for k in range(100 * laps):
+        truth.append(truth[-1] @ (corner if k % 25 == 24 else step))
+    truth = np.array(truth)
+
+    def seen(i, j, covariance):
+        noise = se2.matrix(*(np.sqrt(np.diag(covariance)) * rng.standard_normal(3)))
+        return Relation(i, j, se2.inverse(truth[i]) @ truth[j] @ noise, covariance)
+
+    chain = [seen(k, k + 1, STEP_ERROR) for k in range(len(truth) - 1)]
+    later = rng.integers(100, len(truth), 60).tolist()
+    loops = [seen(k - 100 * int(rng.integers(1, k // 100 + 1)), k, LOOP_ERROR) for k in later]
+    for _ in range(false):
+        i, j = sorted(rng.choice(len(truth), 2, replace=False).tolist())
+        anywhere = se2.matrix(*rng.uniform([-2, -2, -np.pi], [2, 2, np.pi]))
+        loops.append(Relation(i, j, anywhere, LOOP_ERROR))
+    return truth, chain, loops
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_one_false_loop_in_ten_is_survived_by_annealing(seed):
+    truth, chain, loops = rounds(np.random.default_rng(seed), laps=3, false=6)
+    found = optimised(dead_reckoned(chain), chain, loops, ROBUST)
+    misfit = misfits(found, loops)
+    assert misfit[:60].max() < ROBUST.misfit
+    assert misfit[60:].min() > ROBUST.misfit
+    # as good as without the false ones
+    clean = apart(optimised(dead_reckoned(chain), chain, loops[:60], None), truth).max()
+    assert apart(found, truth).max() < 1.1 * clean + 0.01
+    assert apart(optimised(dead_reckoned(chain), chain, loops, None), truth).max() > 5.0
+
+
+def false_alone():
+    """A lap closed by 4 sure loops, and one false one that no other crosses."""
+    truth = square(side=100)
+    rng = np.random.default_rng(0)
+    noise = np.sqrt(np.diag(STEP_ERROR)) * rng.standard_normal((400, 3))
+    moves = se2.inverse(truth[:-1]) @ truth[1:] @ se2.matrix(*noise.T)
+    chain = [Relation(k, k + 1, T, STEP_ERROR) for k, T in enumerate(moves)]
+    true = [
+        Relation(k, 396 + k, se2.inverse(truth[k]) @ truth[396 + k], LOOP_ERROR) for k in range(4)
+    ]
+    return truth, chain, [*true, Relation(50, 250, np.eye(3), LOOP_ERROR)]
+
+
+def test_steps_of_annealing_decide_less_by_the_start_than_one():
+    truth, chain, loops = false_alone()
+    start = dead_reckoned(chain)
+    annealed = apart(optimised(start, chain, loops, ROBUST), truth).max()
+    at_once = apart(optimised(start, chain, loops, Robust(16.0, 1)), truth).max()
+    assert annealed < 3.0
+    assert at_once > 3.0 * annealed
+
+
+def test_one_step_is_sharp_at_once():
+    # from the plain solution one more with the weights of Geman and McClure's loss there
+    truth, chain, loops = false_alone()
+    plain = optimised(dead_reckoned(chain), chain, loops, None)
+    weights = (16.0 / (misfits(plain, loops) + 16.0)) ** 2
+    weighted = [
+        Relation(r.first, r.second, r.T, r.covariance / w)
+        for r, w in zip(loops, weights, strict=True)
+    ]
+    expected = optimised(plain, chain, weighted, None)
+    found = optimised(dead_reckoned(chain), chain, loops, Robust(16.0, 1))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_loops_that_agree_keep_all_their_weight():
+    _, chain, loops = rounds(np.random.default_rng(1), laps=2, false=0)
+    plain = optimised(dead_reckoned(chain), chain, loops, None)
+    robust = optimised(dead_reckoned(chain), chain, loops, ROBUST)
+    assert misfits(plain, loops).max() < ROBUST.misfit
+    np.testing.assert_array_equal(robust, plain)

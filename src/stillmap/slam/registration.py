@@ -196,6 +196,7 @@ def _off_by(prior: MotionPrior, found: Registration) -> tuple[float, float]:
 
 
 def is_off(prior: MotionPrior, found: Registration, options: RegistrationOptions) -> bool:
+    """Whether a pose is so far off a prior's mean that the prior says no more where it is."""
     metres, radians = _off_by(prior, found)
     off = max(metres / prior.sigma_translation, radians / prior.sigma_rotation)
     return off > options.disagree
