@@ -1,0 +1,89 @@
+"""Views that fit elsewhere about as well: their closures have to say so."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from stillmap import se2
+from stillmap.simulation import RobotOptions, Scene, simulate
+from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.simulation.walls import box
+from stillmap.slam import SlamOptions, keyframes
+from stillmap.slam.loops import Candidate, Track, _ambiguous, laid_on, local_map
+
+OPTIONS = SlamOptions()
+
+
+@functools.cache
+def corridor(*landmarks):
+    """A corridor with a doorway every 2 m along one wall, and true poses along it."""
+    piers = [wall for x in range(1, 40, 2) for wall in box(x, 1.2, 0.9, 0.3)]
+    scene = Scene(
+        "doors",
+        walls=(*box(19, 0, 44, 2.6), *piers, *landmarks),
+        route=((0, -0.2), (25, -0.2)),
+        crowd=CrowdOptions(people=0),
+        laser=LaserOptions(beams=120, max_range=5.0),
+        robot=RobotOptions(),
+        odometry=OdometryOptions(),
+    )
+    simulation = simulate(scene, 0)
+    truth = simulation.truth.T_world_base
+    poses = se2.inverse(truth[0]) @ truth
+    return Track(
+        simulation.recording,
+        np.full(simulation.recording.n_beams, 0.9, np.float32),
+        poses,
+        keyframes.travel(poses),
+        np.ones(len(poses)),
+        keyframes.chosen(poses, 1.0, 0.5),
+        0.05,
+        OPTIONS.registration,
+        OPTIONS.surface,
+        OPTIONS.loops,
+    )
+
+
+def closed(track, sigma):
+    """Standard deviations of a closure halfway, and by how much it misses the truth along x."""
+    earlier = int(np.searchsorted(track.travelled, 13.0))
+    later = earlier + 3
+    T = se2.inverse(track.poses[earlier]) @ track.poses[later]
+    grid = local_map(track, float(track.travelled[earlier]))
+    closure = laid_on(track, grid, Candidate(earlier, later, T, 0.0), sigma, 0.05)
+    assert closure.refused == ""
+    off = se2.parameters(se2.inverse(T) @ closure.T)
+    return np.sqrt(np.diag(closure.covariance)), float(off[0])
+
+
+@pytest.mark.parametrize("sigma", [1.0, 1.5, 3.0])
+def test_a_wide_window_over_doors_that_look_alike_makes_unsure(sigma):
+    wide, off = closed(corridor(), sigma)
+    assert wide[0] > 0.8  # the next door is 2 m away
+    assert abs(off) < 2.0 * wide[0]
+    assert wide[1] < 0.04
+    assert wide[2] < 0.01
+
+
+def test_a_window_that_holds_one_door_does_not():
+    wide, off = closed(corridor(), 0.3)
+    assert wide[0] < 0.1
+    assert abs(off) < 0.02
+
+
+def test_one_thing_that_is_nowhere_else_settles_it():
+    wide, off = closed(corridor(*box(15.3, -1.1, 0.5, 0.5)), 3.0)
+    assert wide[0] < 0.1
+    assert abs(off) < 0.02
+
+
+def test_a_mixture_by_hand():
+    # 2 m ahead, ln 3 nats worse: a quarter of the probability, 0.25 * 2^2 of the variance
+    rivals = np.array([[0.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, np.log(3.0)]])
+    np.testing.assert_allclose(_ambiguous(rivals), np.diag([1.0, 0.0, 0.0]))
+    # as good as the best: half; a hopeless one: nothing
+    rivals = np.array([[0, 0, 0, 0], [0.0, 2.0, 0.2, 0.0], [9.0, 9.0, 3.0, 500.0]])
+    d = np.array([0.0, 2.0, 0.2])
+    np.testing.assert_allclose(_ambiguous(rivals), 0.5 * np.outer(d, d), atol=1e-12)
+    np.testing.assert_array_equal(_ambiguous(np.zeros((1, 4))), np.zeros((3, 3)))

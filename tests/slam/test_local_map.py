@@ -1,0 +1,99 @@
+"""The map of the last stretch: what is kept, and that it forgets to the bit."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from stillmap import _core, se2
+from stillmap.simulation import scene_by_name, simulate
+from stillmap.slam import SlamOptions
+from stillmap.slam.local_map import LocalMap
+
+OPTIONS = SlamOptions()
+
+
+@functools.cache
+def hall():
+    return simulate(scene_by_name("hall", {"robot": {"scans": 120}}), 1)
+
+
+def empty(e=None, spacing=OPTIONS.spacing):
+    recording = hall().recording
+    e = np.full(recording.n_beams, 0.9, np.float32) if e is None else e
+    grid = _core.Grid2D(OPTIONS.resolution, OPTIONS.registration.approach)
+    return LocalMap(grid, recording, e, spacing, OPTIONS.surface)
+
+
+def assert_same(one, other):
+    """Whatever a scan could be registered against."""
+    first, alpha, beta = one.dense()
+    rows, columns = np.indices(alpha.shape)
+    cells = np.stack([columns + first[0], rows + first[1]], axis=-1).reshape(-1, 2)
+    sums = np.stack([alpha, beta], axis=-1).reshape(-1, 2)
+    np.testing.assert_array_equal(sums, other.alpha_beta(cells))
+    points = hall().recording.points[hall().recording.hit][::7].copy()
+    for T in hall().truth.T_world_base[::10]:
+        costs, gradients = [], []
+        for grid in (one, other):
+            at = grid, points, np.ones(len(points), np.float32), T, 0.04, 2, 0.05, 0.2
+            costs.append(_core.registration_cost(*at))
+            gradients.append(_core.registration_gradient(*at))
+        assert costs[0] == costs[1]
+        np.testing.assert_array_equal(*gradients)
+
+
+def test_it_forgets_to_the_bit():
+    poses = hall().truth.T_world_base
+    e = np.random.default_rng(0).random(hall().recording.n_beams).astype(np.float32)
+    all_of_it, rest = empty(e), empty(e)
+    for t in range(0, 120, 4):
+        all_of_it.add(t, poses[t], 0.1 * t)
+        if t >= 60:
+            rest.add(t, poses[t], 0.1 * t)
+    all_of_it.forget(6.0)
+    assert_same(all_of_it.grid, rest.grid)
+    assert_same(rest.grid, all_of_it.grid)
+    all_of_it.forget(np.inf)
+    assert not any(sums.any() for sums in all_of_it.grid.dense()[1:])
+
+
+def test_it_forgets_nothing_too_early():
+    poses = hall().truth.T_world_base
+    one, other = empty(), empty()
+    for t in range(0, 120, 4):
+        one.add(t, poses[t], 0.1 * t)
+        other.add(t, poses[t], 0.1 * t)
+    one.forget(0.0)
+    one.forget(-np.inf)
+    assert_same(one.grid, other.grid)
+
+
+@pytest.mark.parametrize(
+    ("move", "kept"),
+    [
+        ((0.19, 0.0, 0.0), False),
+        ((0.21, 0.0, 0.0), True),
+        ((0.0, 0.0, -0.19), False),
+        ((0.0, 0.0, 0.21), True),
+        ((0.12, 0.0, 0.12), True),
+    ],
+)
+def test_scans_that_show_the_same_are_left_out(move, kept):
+    # scan 1 is taken 0.2 s later, which counts as 0.04 of the 5 s that make a scan worth keeping
+    so_far, first = empty(spacing=0.2 + 0.04), empty(spacing=0.2 + 0.04)
+    so_far.add(0, np.eye(3), 0.0)
+    first.add(0, np.eye(3), 0.0)
+    so_far.add(1, se2.matrix(*move), 0.2)
+    before, after = (one.grid.dense()[1].sum() for one in (first, so_far))
+    assert (after > before) == kept
+
+
+def test_who_stands_still_is_looked_at_again_after_a_while():
+    # 0.2 per second: 24 scans are 4.8 s, 26 are 5.2 s and count as much as 1.04 m
+    for t, kept in ((24, False), (26, True)):
+        so_far = empty(spacing=1.0)
+        so_far.add(0, np.eye(3), 0.0)
+        before = so_far.grid.dense()[1].sum()
+        so_far.add(t, np.eye(3), 0.0)
+        assert (so_far.grid.dense()[1].sum() > before) == kept
