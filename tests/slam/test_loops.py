@@ -250,12 +250,37 @@ def test_the_grid_is_what_the_poses_make():
     np.testing.assert_array_equal(found.poses[0], np.eye(3))
 
 
-def test_any_number_of_threads_gives_the_same():
-    one, two = mapped(square(), threads=1), mapped(square(), threads=2)
-    np.testing.assert_array_equal(one.poses, two.poses)
+@pytest.mark.parametrize("threads", [1, 2])
+def test_twice_and_with_any_number_of_threads_the_same(threads):
+    one, two = mapped(square()), mapped(square(), threads=threads)
+    for name in ("poses", "covariance", "explained"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert len(one.loops) == len(two.loops) > 0
     for a, b in zip(one.loops, two.loops, strict=True):
         np.testing.assert_array_equal(a.T, b.T)
-        assert a.refused == b.refused
+        np.testing.assert_array_equal(a.covariance, b.covariance)
+        assert (a.earlier, a.later, a.refused) == (b.earlier, b.later, b.refused)
+    np.testing.assert_array_equal(one.graph.scans, two.graph.scans)
+    np.testing.assert_array_equal(one.graph.poses, two.graph.poses)
+    for r, s in zip(one.graph.relations, two.graph.relations, strict=True):
+        assert (r.first, r.second) == (s.first, s.second)
+        np.testing.assert_array_equal(r.T, s.T)
+        np.testing.assert_array_equal(r.covariance, s.covariance)
+    for ours, theirs in zip(one.grid.dense(), two.grid.dense(), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_the_graph_is_what_was_found():
+    found = mapped(square())
+    graph, accepted = found.graph, [c for c in found.loops if not c.refused]
+    K = len(graph.scans)
+    assert len(graph.relations) == K - 1 + len(accepted)
+    along = [(r.first, r.second) for r in graph.relations[: K - 1]]
+    assert along == [(k, k + 1) for k in range(K - 1)]
+    for relation, closure in zip(graph.relations[K - 1 :], accepted, strict=True):
+        ends = graph.scans[[relation.first, relation.second]]
+        assert ends.tolist() == [closure.earlier, closure.later]
+        np.testing.assert_array_equal(relation.T, closure.T)
 
 
 def test_without_loops_poses_are_incremental():
