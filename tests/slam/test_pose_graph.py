@@ -183,7 +183,7 @@ def test_steps_of_annealing_decide_less_by_the_start_than_one():
 
 def test_one_step_is_sharp_at_once():
     # from the plain solution one more with the weights of Geman and McClure's loss there
-    truth, chain, loops = false_alone()
+    _, chain, loops = false_alone()
     plain = optimised(dead_reckoned(chain), chain, loops, None)
     weights = (16.0 / (misfits(plain, loops) + 16.0)) ** 2
     weighted = [
