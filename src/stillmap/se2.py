@@ -8,10 +8,7 @@ Float = NDArray[np.float64]
 
 def matrix(x: ArrayLike, y: ArrayLike, theta: ArrayLike) -> Float:
     """(..., 3, 3) homogeneous matrices of poses x, y in metres and theta in radians."""
-    x, y, theta = np.broadcast_arrays(
-        np.asarray(x, float), np.asarray(y, float), np.asarray(theta, float)
-    )
-    T = np.zeros((*x.shape, 3, 3))
+    T = np.zeros((*np.broadcast(x, y, theta).shape, 3, 3))
     T[..., 0, 0] = T[..., 1, 1] = np.cos(theta)
     T[..., 1, 0] = np.sin(theta)
     T[..., 0, 1] = -T[..., 1, 0]
@@ -21,7 +18,10 @@ def matrix(x: ArrayLike, y: ArrayLike, theta: ArrayLike) -> Float:
 
 def parameters(T: Float) -> Float:
     """(..., 3) poses x, y, theta of (..., 3, 3) matrices; theta in (-pi, pi]."""
-    return np.stack([T[..., 0, 2], T[..., 1, 2], np.arctan2(T[..., 1, 0], T[..., 0, 0])], axis=-1)
+    x = np.empty((*T.shape[:-2], 3))  # np.stack would take twice as long for a single pose
+    x[..., :2] = T[..., :2, 2]
+    x[..., 2] = np.arctan2(T[..., 1, 0], T[..., 0, 0])
+    return x
 
 
 def inverse(T: Float) -> Float:

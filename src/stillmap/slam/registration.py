@@ -133,9 +133,15 @@ def register(
     if len(scan.points) == 0:
         return found
     doubtful = options.doubt_below * usual
+    windows = [(options.doubt_translation, options.doubt_rotation)]
+    if found.explained < doubtful and (
+        # odometry that is right takes a robot to places that are new
+        not prior.measured or share_through_walls(grid, scan, found) > options.through
+    ):
+        windows.append((options.lost_translation, np.pi))
     for mean in (prior, other):
         if mean is not None and found.explained < doubtful:
-            found = _farther(grid, scan, mean, options, found, doubtful)
+            found = _farther(grid, scan, mean, options, found, doubtful, windows)
     if prior.measured and is_off(prior, found, options):
         # a mean that far off is no mean: it would only draw the pose towards itself
         looser = motion.widened(prior, *_off_by(prior, found))
@@ -170,15 +176,13 @@ def _farther(
     options: RegistrationOptions,
     found: Registration,
     doubtful: float,
+    windows: list[tuple[float, float]],
 ) -> Registration:
     """What lies beyond the prior's window, where the scan fits much better there.
 
     A place that only looks alike would have the robot look through walls.
     """
-    for least_translation, least_rotation in (
-        (options.doubt_translation, options.doubt_rotation),
-        (options.lost_translation, np.pi),
-    ):
+    for least_translation, least_rotation in windows:
         wide = motion.widened(prior, least_translation / 3.0, least_rotation / 3.0)
         window = options.window * wide.sigma_translation, options.window * wide.sigma_rotation
         wider = search(grid, scan, wide, options, *window)
