@@ -1,0 +1,139 @@
+"""Odometry that lies, or that there is none of; and a second laser, which makes up for little."""
+
+import dataclasses
+import functools
+from itertools import accumulate
+
+import numpy as np
+import pytest
+
+from stillmap import se2
+from stillmap.evaluation.trajectory import absolute_errors
+from stillmap.simulation import RobotOptions, Scene, scene_by_name, simulate
+from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.simulation.walls import box
+from stillmap.slam import SlamOptions, incremental, m_step
+
+OPTIONS = SlamOptions()
+
+
+def silent(done, total):
+    pass
+
+
+@functools.cache
+def room():
+    """Ahead, a quarter turn from scan 48 on, and ahead again."""
+    scene = Scene(
+        "room",
+        walls=(*box(0, 0, 9, 7), *box(1.5, 1.6, 0.9, 0.6), *box(-2.6, 1.9, 1.0, 0.4)),
+        route=((-2.5, -1.5), (2.5, -1.5), (2.5, 1.5)),
+        crowd=CrowdOptions(people=0),
+        laser=LaserOptions(range_noise=0.01, max_range=8.0),
+        robot=RobotOptions(scans=80),
+        odometry=OdometryOptions(),
+    )
+    return simulate(scene, 2)
+
+
+def survived(T_odom_base):
+    """The scans where odometry was disbelieved; poses are as good as ever."""
+    recording = dataclasses.replace(room().recording, T_odom_base=T_odom_base)
+    e = np.full(recording.n_beams, 0.9, np.float32)
+    found = incremental.build(recording, e, OPTIONS, silent)
+    assert absolute_errors(found.poses, room().truth.T_world_base).rmse < 0.01
+    assert found.breaks == []
+    return found.disagreeing
+
+
+def steps():
+    T = room().recording.T_odom_base
+    return se2.inverse(T[:-1]) @ T[1:]
+
+
+def chained(steps):
+    return np.array([*accumulate(steps, np.matmul, initial=np.eye(3))])
+
+
+def test_odometry_that_tells_the_truth_is_believed():
+    assert survived(room().recording.T_odom_base) == []
+
+
+@pytest.mark.parametrize(
+    "origin", [(0.0, 0.0, 0.0), (-25.0, 40.0, 2.0), (3000.0, -1000.0, -3.0)], ids=str
+)
+def test_odometry_that_begins_again(origin):
+    T = room().recording.T_odom_base.copy()
+    T[30:] = se2.matrix(*origin) @ se2.inverse(T[30]) @ T[30:]
+    assert survived(T) == [30]
+
+
+def test_odometry_that_stalls_while_the_robot_turns():
+    turn = room().truth.T_world_base[[44, 62]]
+    assert abs(se2.parameters(se2.inverse(turn[0]) @ turn[1])[2]) > np.radians(80)
+    moved = steps()
+    moved[44:62] = np.eye(3)
+    disagreeing = survived(chained(moved))
+    assert len(disagreeing) >= 10
+    assert set(disagreeing) <= set(range(45, 63))
+
+
+@pytest.mark.parametrize("times", [3.5, 0.0, -1.0], ids=["spinning", "blocked", "backwards"])
+def test_wheels_that_slip(times):
+    moved = se2.parameters(steps())
+    moved[20:30, 0] *= times
+    assert survived(chained(se2.matrix(*moved.T))) == list(range(21, 31))
+
+
+def every(recording, n):
+    """Each n-th scan of a recording, and which those are."""
+    kept = np.arange(0, recording.n_scans, n)
+    beams = np.concatenate([np.r_[recording.beams_of(t)] for t in kept])
+    counts = np.diff(recording.offset)[kept]
+    thinned = dataclasses.replace(
+        recording,
+        stamp_ns=recording.stamp_ns[kept],
+        offset=np.concatenate([[0], np.cumsum(counts)]),
+        points=recording.points[beams],
+        hit=recording.hit[beams],
+        sensor=recording.sensor[kept],
+        T_odom_base=recording.T_odom_base[kept],
+    )
+    return thinned, kept
+
+
+def error(recording, T_world_base):
+    e = np.full(recording.n_beams, 0.9, np.float32)
+    found = m_step(recording, e, OPTIONS, None, 1, silent)
+    return absolute_errors(found.poses, T_world_base).rmse
+
+
+@functools.cache
+def office(seed):
+    return simulate(scene_by_name("office", {"robot": {"scans": 500}}), seed)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("n", [1, 3])
+def test_scans_alone_are_hardly_worse(seed, n):
+    # a third of the scans: 0.3 m and up to 28 degrees from one to the next
+    recording, kept = every(office(seed).recording, n)
+    T = office(seed).truth.T_world_base[kept]
+    with_odometry = error(recording, T)
+    without = error(recording.without_odometry(), T)
+    assert with_odometry < 0.04
+    assert without < 1.5 * with_odometry + 0.01
+
+
+def two_lasers(seed, both):
+    options = {
+        "robot": {"scans": 200 * (1 + both), "speed": 1.0},
+        "laser": {"second_laser": both, "beams": 120},
+    }
+    simulation = simulate(scene_by_name("hall", options), seed)
+    return error(simulation.recording, simulation.truth.T_world_base)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_two_lasers_are_as_good_as_one(seed):
+    assert two_lasers(seed, both=True) < 1.2 * two_lasers(seed, both=False)
