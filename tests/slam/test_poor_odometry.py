@@ -78,6 +78,62 @@ def test_odometry_that_stalls_while_the_robot_turns():
     assert set(disagreeing) <= set(range(45, 63))
 
 
+def test_odometry_that_stalls_while_the_robot_drives_on():
+    way = room().truth.T_world_base[[15, 40]]
+    assert np.linalg.norm(way[1] - way[0]) > 2.0
+    moved = steps()
+    moved[15:40] = np.eye(3)
+    disagreeing = survived(chained(moved))
+    assert len(disagreeing) >= 20
+    assert set(disagreeing) <= set(range(16, 41))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_stalls_in_the_corridors_of_an_office(seed):
+    options = {"robot": {"scans": 500}, "odometry": {"stall_rate": 2.0}}
+    simulation = simulate(scene_by_name("office", options), seed)
+    recording, T = simulation.recording, simulation.truth.T_world_base
+    assert metres(T)[metres(recording.T_odom_base) == 0.0].sum() > 3.0
+    e = np.full(recording.n_beams, 0.9, np.float32)
+    found = incremental.build(recording, e, OPTIONS, silent)
+    assert absolute_errors(found.poses, T).rmse < 0.05
+
+
+def metres(T):
+    return np.linalg.norm((T[1:] - T[:-1])[:, :2, 2], axis=1)
+
+
+def test_a_robot_that_stops_between_bare_walls_has_stopped():
+    corridor = Scene(
+        "corridor",
+        walls=box(0, 0, 60, 2.4),
+        route=((-8.0, 0.3), (8.0, 0.3)),
+        crowd=CrowdOptions(people=0),
+        laser=LaserOptions(range_noise=0.02, max_range=8.0),
+        robot=RobotOptions(scans=150),
+        odometry=OdometryOptions(),
+    )
+    simulation = simulate(corridor, 3)
+    recording, T = simulation.recording, simulation.truth.T_world_base
+    # from scan 60 on it stands where it was
+    stood = np.r_[np.arange(60), np.full(40, 60)]
+    again = dataclasses.replace(
+        recording,
+        stamp_ns=recording.stamp_ns[:100],
+        offset=np.concatenate([[0], np.cumsum(np.diff(recording.offset)[stood])]),
+        points=np.concatenate([recording.points[np.r_[recording.beams_of(t)]] for t in stood]),
+        hit=np.concatenate([recording.hit[np.r_[recording.beams_of(t)]] for t in stood]),
+        sensor=recording.sensor[stood],
+        T_odom_base=recording.T_odom_base[stood],
+    )
+    noise = np.random.default_rng(0).normal(0.0, 0.01, again.points.shape).astype(np.float32)
+    again = dataclasses.replace(again, points=again.points + noise)
+    e = np.full(again.n_beams, 0.9, np.float32)
+    found = incremental.build(again, e, OPTIONS, silent)
+    assert found.disagreeing == []
+    assert absolute_errors(found.poses, T[stood]).rmse < 0.1
+
+
 @pytest.mark.parametrize("times", [3.5, 0.0, -1.0], ids=["spinning", "blocked", "backwards"])
 def test_wheels_that_slip(times):
     moved = se2.parameters(steps())

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stillmap import _core
 from stillmap.options import field_with_doc
 from stillmap.recording.model import Recording
-from stillmap.slam import motion
+from stillmap.slam import motion, stalls
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.loops import Closure, LoopOptions
 from stillmap.slam.motion import MotionOptions, MotionPrior
@@ -124,43 +124,81 @@ def build(
     """
     T = recording.n_scans
     so_far = _empty(recording, e, options)
-    poses = np.tile(np.eye(3), (T, 1, 1))
-    covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
-    widened, disagreeing = list[int](), list[int]()
-    breaks, nowhere = list[int](), list[int]()
+    way = _Way.of(T)
     steadiness = motion.unknown_steadiness(options.motion)
     steps = motion.odometry_steps(recording.T_odom_base)
     seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns))) if T > 1 else 0.0
+    watch = stalls.Watch(None if steps is None else steps.increments, options.registration)
     travelled = 0.0
     usual = np.zeros(len(recording.T_base_sensor))  # each laser sees its own side
     usual[recording.sensor[0]] = 1.0
-    so_far.add(0, poses[0], 0.0)
+    so_far.add(0, way.poses[0], 0.0)
     progress(1, T)
     for t in range(1, T):
-        guess = motion.from_constant_velocity(poses[t - 1], poses[max(t - 2, 0)], steadiness)
-        prior, other = _priors(poses[t - 1], steps, t, guess, options.motion)
+        last = way.poses[t - 1]
+        guess = motion.from_constant_velocity(last, way.poses[max(t - 2, 0)], steadiness)
+        prior, other = _priors(last, steps, t, guess, options.motion)
+        if prior.measured and watch.stalled(t, way.poses):
+            prior, other = guess, prior
         scan, s = hits(recording, e, t), recording.sensor[t]
         found = register(so_far.grid, scan, prior, other, options.registration, usual[s])
+        gone_on = watch.look(t, way.poses, steadiness, so_far.grid, scan, found)
+        if gone_on is not None:
+            so_far.forget_since(gone_on.first)
+            for since, found in enumerate(gone_on.found, gone_on.first):
+                way.take(since, found, doubted=True)
         fits_nowhere = _was_carried(so_far, scan, found, usual[s], options.registration)
         leapt = _leapt(so_far, scan, found, (prior, guess), options.registration)
         if fits_nowhere or (leapt and steps is not None):
-            breaks.append(t)
-            nowhere += [t] if fits_nowhere else []
+            way.breaks.append(t)
+            if fits_nowhere:
+                way.nowhere.append(t)
             so_far, usual[:] = _empty(recording, e, options), 0.0
-        poses[t], covariance[t], explained[t] = found.T_map_base, found.covariance, found.explained
-        if found.widened:
-            widened.append(t)
-        if found.disagrees or (steps is not None and not prior.measured):
-            disagreeing.append(t)
+        way.take(t, found, doubted=steps is not None and not prior.measured)
         # nothing is usual yet after the first scan
         usual[s] += (_LATELY if usual[s] > 0.0 else 1.0) * (found.explained - usual[s])
-        steadiness = steadiness.after(guess.shift_to(poses[t]), seconds, options.motion)
-        travelled += float(np.linalg.norm(poses[t, :2, 2] - poses[t - 1, :2, 2]))
-        so_far.add(t, poses[t], travelled)
+        steadiness = steadiness.after(guess.shift_to(found.T_map_base), seconds, options.motion)
+        travelled += float(np.linalg.norm(found.T_map_base[:2, 2] - way.poses[t - 1, :2, 2]))
+        so_far.add(t, found.T_map_base, travelled)
         so_far.forget(travelled - memory)
         progress(t + 1, T)
-    nothing = _core.Grid2D(options.resolution)
-    return Mapped(poses, covariance, nothing, explained, widened, disagreeing, breaks, nowhere)
+    return way.mapped(_core.Grid2D(options.resolution))
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """What was found of each scan so far; Mapped says what it is."""
+
+    poses: Float
+    covariance: Float
+    explained: Float
+    widened: NDArray[np.bool_]
+    disagreeing: NDArray[np.bool_]
+    breaks: list[int] = field(default_factory=list)
+    nowhere: list[int] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, T: int) -> "_Way":
+        poses = np.tile(np.eye(3), (T, 1, 1))
+        none = np.zeros((2, T), np.bool_)
+        return cls(poses, np.zeros((T, 3, 3)), np.ones(T), none[0], none[1])
+
+    def take(self, t: int, found: Registration, *, doubted: bool) -> None:
+        self.poses[t], self.covariance[t] = found.T_map_base, found.covariance
+        self.explained[t], self.widened[t] = found.explained, found.widened
+        self.disagreeing[t] |= found.disagrees or doubted
+
+    def mapped(self, grid: _core.Grid2D) -> Mapped:
+        return Mapped(
+            self.poses,
+            self.covariance,
+            grid,
+            self.explained,
+            np.flatnonzero(self.widened).tolist(),
+            np.flatnonzero(self.disagreeing).tolist(),
+            self.breaks,
+            self.nowhere,
+        )
 
 
 def _empty(recording: Recording, e: NDArray[np.float32], options: SlamOptions) -> LocalMap:

@@ -50,6 +50,12 @@ class LocalMap:
             t, T_map_base, _ = self._kept.popleft()
             put(self.grid, self._recording, self._e, t, T_map_base, self._surface, remove=True)
 
+    def forget_since(self, t: int) -> None:
+        """Takes out scan t and what came after it."""
+        while self._kept and self._kept[-1][0] >= t:
+            last, T_map_base, _ = self._kept.pop()
+            put(self.grid, self._recording, self._e, last, T_map_base, self._surface, remove=True)
+
     def _is_apart(self, t: int, T_map_base: Float) -> bool:
         last, T_last, _ = self._kept[-1]
         x, y, theta = se2.parameters(se2.inverse(T_last) @ T_map_base)
