@@ -192,7 +192,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             (line,) = axis.plot(people, [np.mean(e) for e in errors], marker="o", label=weights)
             low, high = [min(e) for e in errors], [max(e) for e in errors]
             axis.fill_between(people, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
-        axis.set(title=place, xlabel="people", ylabel="mean relation error, m", ylim=(0, None))
+        axis.set(title=place, xlabel="people", ylabel="mean relation error, m", yscale="log")
         axis.legend()
     figure.tight_layout()
     figure.savefig(path, dpi=120)

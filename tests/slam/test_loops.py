@@ -11,7 +11,7 @@ from stillmap.evaluation.trajectory import absolute_errors
 from stillmap.simulation import RobotOptions, Scene, scene_by_name, simulate
 from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.simulation.walls import box
-from stillmap.slam import SlamOptions, incremental, keyframes, m_step
+from stillmap.slam import SlamOptions, incremental, keyframes, loops, m_step
 from stillmap.slam.chain import agreeing, relations
 from stillmap.slam.closing import closed
 from stillmap.slam.incremental import Mapped
@@ -319,3 +319,10 @@ def test_limits():
 def test_corridors_close(seed):
     simulation = simulate(scene_by_name("corridor"), seed)
     assert ate(mapped(simulation), simulation) < 0.03
+
+
+def test_drift_grows_with_the_way_and_then_no_more():
+    options = LoopOptions(drift_until=500.0)
+    near, far, lost = (loops.drift(metres, options) for metres in (50.0, 500.0, 1e6))
+    assert near < far == lost
+    assert lost == pytest.approx((500 * 0.006, 500 * 0.0003), rel=0.03)

@@ -193,3 +193,11 @@ def two_lasers(seed, both):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_two_lasers_are_as_good_as_one(seed):
     assert two_lasers(seed, both=True) < 1.2 * two_lasers(seed, both=False)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_two_lasers_that_share_nothing_without_odometry(seed):
+    options = {"robot": {"scans": 800}, "laser": {"second_laser": True}}
+    simulation = simulate(scene_by_name("office", options), seed)
+    recording = simulation.recording.without_odometry()
+    assert error(recording, simulation.truth.T_world_base) < 0.04

@@ -21,6 +21,7 @@ from stillmap.slam.registration import (
     is_off,
     register,
     share_through_walls,
+    taken,
 )
 from stillmap.slam.scans import Scan, SurfaceOptions, hits
 
@@ -141,7 +142,10 @@ def build(
         if prior.measured and watch.stalled(t, way.poses):
             prior, other = guess, prior
         scan, s = hits(recording, e, t), recording.sensor[t]
-        found = register(so_far.grid, scan, prior, other, options.registration, usual[s])
+        if prior.measured or so_far.has(s):
+            found = register(so_far.grid, scan, prior, other, options.registration, usual[s])
+        else:  # what a laser sees on its own side has nothing to lie on yet
+            found = taken(prior)
         gone_on = watch.look(t, way.poses, steadiness, so_far.grid, scan, found)
         if gone_on is not None:
             so_far.forget_since(gone_on.first)

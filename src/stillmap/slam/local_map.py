@@ -44,6 +44,10 @@ class LocalMap:
         put(self.grid, self._recording, self._e, t, T_map_base, self._surface)
         self._kept.append((t, T_map_base, travelled))
 
+    def has(self, sensor: int) -> bool:
+        """Whether there is a scan of a sensor in it."""
+        return any(self._recording.sensor[t] == sensor for t, _, _ in reversed(self._kept))
+
     def forget(self, travelled: float) -> None:
         """Takes out what was seen before the robot had come that many metres."""
         while self._kept and self._kept[0][2] < travelled:

@@ -40,6 +40,9 @@ class LoopOptions:
     view: float = field_with_doc(1.0, "m of travel to a scan on either side laid on it too")
     drift_translation: float = field_with_doc(0.006, "m of drift per metre: how far to search")
     drift_rotation: float = field_with_doc(0.0003, "rad of drift per metre: how far to search")
+    drift_until: float = field_with_doc(
+        1000.0, "m after which it is searched no farther: who drifts so far is lost"
+    )
     window: float = field_with_doc(2.0, "standard deviations of the drift that are searched")
     stage: float = field_with_doc(
         40.0, "m of travel in which loops are looked for before the graph is solved, at least"
@@ -74,6 +77,7 @@ _LIMITS = (
     ("view", 0.0, 100.0),
     ("drift_translation", 0.0, 1.0),
     ("drift_rotation", 0.0, 1.0),
+    ("drift_until", 0.0, 1e9),
     ("window", 0.0, 10.0),
     ("stage", 0.1, 1e9),
     ("stage_share", 0.0, 1e9),
@@ -166,6 +170,7 @@ def attempts(track: Track, candidates: Iterable[Candidate]) -> list[Closure]:
 
 def drift(metres: float, options: LoopOptions) -> tuple[float, float]:
     """Standard deviations of place and heading after a way, in metres and radians."""
+    metres = min(metres, options.drift_until)
     return (
         float(np.hypot(0.1, options.drift_translation * metres)),
         float(np.hypot(0.02, options.drift_rotation * metres)),

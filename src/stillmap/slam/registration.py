@@ -152,6 +152,12 @@ def register(
     return found
 
 
+def taken(prior: MotionPrior) -> Registration:
+    """The pose where a prior has it, of a scan that says nothing."""
+    covariance = np.diag(1.0 / np.diag(prior.information))
+    return Registration(prior.T_map_base, covariance, 0.0, 0.0, np.zeros((0, 4)))
+
+
 def _within(
     grid: _core.Grid2D,
     scan: Scan,
