@@ -97,3 +97,30 @@ def test_who_stands_still_is_looked_at_again_after_a_while():
         before = so_far.grid.dense()[1].sum()
         so_far.add(t, np.eye(3), 0.0)
         assert (so_far.grid.dense()[1].sum() > before) == kept
+
+
+def test_scans_can_be_taken_back():
+    T = hall().truth.T_world_base
+    one, other = empty(), empty()
+    for t in range(0, 60, 5):
+        other.add(t, T[t], 0.1 * t)
+        if t < 30:
+            one.add(t, T[t], 0.1 * t)
+    other.forget_since(30)
+    assert_same(one.grid, other.grid)
+    other.forget_since(0)
+    assert not other.has(0)
+
+
+def test_each_laser_has_its_own_scans():
+    options = {"robot": {"scans": 80}, "laser": {"second_laser": True}}
+    simulation = simulate(scene_by_name("hall", options), 1)
+    recording, T = simulation.recording, simulation.truth.T_world_base
+    assert recording.sensor[:4].tolist() == [0, 1, 0, 1]
+    e = np.full(recording.n_beams, 0.9, np.float32)
+    so_far = LocalMap(_core.Grid2D(0.05, 0.5), recording, e, OPTIONS.spacing, OPTIONS.surface)
+    so_far.add(0, T[0], 0.0)
+    assert so_far.has(0)
+    assert not so_far.has(1)
+    so_far.add(1, T[1], 0.0)  # as near as that: but it looks to the other side
+    assert so_far.has(1)

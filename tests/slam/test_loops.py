@@ -240,6 +240,15 @@ def test_keyframes_by_hand():
     assert keyframes.travel(x).tolist() == [0, 1, 2, 2, 2, 2]
 
 
+def test_scans_of_each_laser_are_chosen_by_themselves():
+    x = np.tile(np.eye(3), (8, 1, 1))
+    x[:, 0, 2] = 0.3 * np.arange(8)
+    sensor = np.array([0, 1, 0, 1, 0, 1, 0, 1])
+    frames = keyframes.chosen_of_each(x, sensor, 1.0, 0.5)
+    assert frames.tolist() == [0, 1, 4, 5, 6, 7]
+    assert keyframes.chosen_of_each(x, 0 * sensor, 1.0, 0.5).tolist() == [0, 4, 7]
+
+
 def test_the_grid_is_what_the_poses_make():
     found = mapped(square())
     e = np.full(square().recording.n_beams, 0.9, np.float32)

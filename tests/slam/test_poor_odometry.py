@@ -21,6 +21,11 @@ def silent(done, total):
     pass
 
 
+def followed(recording):
+    e = np.full(recording.n_beams, 0.9, np.float32)
+    return incremental.build(recording, e, OPTIONS, silent)
+
+
 @functools.cache
 def room():
     """Ahead, a quarter turn from scan 48 on, and ahead again."""
@@ -39,8 +44,7 @@ def room():
 def survived(T_odom_base):
     """The scans where odometry was disbelieved; poses are as good as ever."""
     recording = dataclasses.replace(room().recording, T_odom_base=T_odom_base)
-    e = np.full(recording.n_beams, 0.9, np.float32)
-    found = incremental.build(recording, e, OPTIONS, silent)
+    found = followed(recording)
     assert absolute_errors(found.poses, room().truth.T_world_base).rmse < 0.01
     assert found.breaks == []
     return found.disagreeing
@@ -94,9 +98,7 @@ def test_stalls_in_the_corridors_of_an_office(seed):
     simulation = simulate(scene_by_name("office", options), seed)
     recording, T = simulation.recording, simulation.truth.T_world_base
     assert metres(T)[metres(recording.T_odom_base) == 0.0].sum() > 3.0
-    e = np.full(recording.n_beams, 0.9, np.float32)
-    found = incremental.build(recording, e, OPTIONS, silent)
-    assert absolute_errors(found.poses, T).rmse < 0.05
+    assert absolute_errors(followed(recording).poses, T).rmse < 0.05
 
 
 def metres(T):
@@ -115,23 +117,37 @@ def test_a_robot_that_stops_between_bare_walls_has_stopped():
     )
     simulation = simulate(corridor, 3)
     recording, T = simulation.recording, simulation.truth.T_world_base
-    # from scan 60 on it stands where it was
     stood = np.r_[np.arange(60), np.full(40, 60)]
-    again = dataclasses.replace(
-        recording,
-        stamp_ns=recording.stamp_ns[:100],
-        offset=np.concatenate([[0], np.cumsum(np.diff(recording.offset)[stood])]),
-        points=np.concatenate([recording.points[np.r_[recording.beams_of(t)]] for t in stood]),
-        hit=np.concatenate([recording.hit[np.r_[recording.beams_of(t)]] for t in stood]),
-        sensor=recording.sensor[stood],
-        T_odom_base=recording.T_odom_base[stood],
-    )
+    again = picked(recording, stood)
     noise = np.random.default_rng(0).normal(0.0, 0.01, again.points.shape).astype(np.float32)
     again = dataclasses.replace(again, points=again.points + noise)
-    e = np.full(again.n_beams, 0.9, np.float32)
-    found = incremental.build(again, e, OPTIONS, silent)
+    found = followed(again)
     assert found.disagreeing == []
     assert absolute_errors(found.poses, T[stood]).rmse < 0.1
+
+
+def test_a_robot_that_was_carried_and_put_down_stands():
+    office = simulate(scene_by_name("office", {"robot": {"scans": 300}}), 1)
+    scans = np.r_[70:100, 280, 280, 280, 280:300]
+    recording, T = picked(office.recording, scans), office.truth.T_world_base[scans]
+    odom = recording.T_odom_base.copy()
+    odom[30:] = (
+        odom[29] @ se2.inverse(odom[30]) @ odom[30:]
+    )  # wheels do not turn when it is carried
+    found = followed(dataclasses.replace(recording, T_odom_base=odom))
+    assert found.breaks == [30]
+    assert found.disagreeing == [30]
+    assert absolute_errors(found.poses[30:], T[30:]).rmse < 0.02
+
+
+def test_nothing_is_followed_by_scans_that_hit_nothing():
+    scans = np.r_[:20, np.full(30, 20)]
+    recording = picked(room().recording, scans)
+    hit = recording.hit.copy()
+    hit[recording.offset[20] :] = False
+    found = followed(dataclasses.replace(recording, hit=hit))
+    assert found.disagreeing == []
+    np.testing.assert_allclose(found.poses[20:], found.poses[20:21].repeat(30, axis=0), atol=1e-9)
 
 
 @pytest.mark.parametrize("times", [3.5, 0.0, -1.0], ids=["spinning", "blocked", "backwards"])
@@ -141,21 +157,19 @@ def test_wheels_that_slip(times):
     assert survived(chained(se2.matrix(*moved.T))) == list(range(21, 31))
 
 
-def every(recording, n):
-    """Each n-th scan of a recording, and which those are."""
-    kept = np.arange(0, recording.n_scans, n)
-    beams = np.concatenate([np.r_[recording.beams_of(t)] for t in kept])
-    counts = np.diff(recording.offset)[kept]
-    thinned = dataclasses.replace(
+def picked(recording, scans):
+    """Some of the scans of a recording, as often as they are named."""
+    beams = np.concatenate([np.r_[recording.beams_of(t)] for t in scans])
+    in_order = bool(np.all(np.diff(scans) > 0))
+    return dataclasses.replace(
         recording,
-        stamp_ns=recording.stamp_ns[kept],
-        offset=np.concatenate([[0], np.cumsum(counts)]),
+        stamp_ns=recording.stamp_ns[scans if in_order else slice(len(scans))],
+        offset=np.concatenate([[0], np.cumsum(np.diff(recording.offset)[scans])]),
         points=recording.points[beams],
         hit=recording.hit[beams],
-        sensor=recording.sensor[kept],
-        T_odom_base=recording.T_odom_base[kept],
+        sensor=recording.sensor[scans],
+        T_odom_base=recording.T_odom_base[scans],
     )
-    return thinned, kept
 
 
 def error(recording, T_world_base):
@@ -173,8 +187,8 @@ def office(seed):
 @pytest.mark.parametrize("n", [1, 3])
 def test_scans_alone_are_hardly_worse(seed, n):
     # a third of the scans: 0.3 m and up to 28 degrees from one to the next
-    recording, kept = every(office(seed).recording, n)
-    T = office(seed).truth.T_world_base[kept]
+    kept = np.arange(0, office(seed).recording.n_scans, n)
+    recording, T = picked(office(seed).recording, kept), office(seed).truth.T_world_base[kept]
     with_odometry = error(recording, T)
     without = error(recording.without_odometry(), T)
     assert with_odometry < 0.04

@@ -70,7 +70,7 @@ class Mapped:
     Attributes:
         poses: (T, 3, 3) T_map_base; the map frame is the first scan's base.
         covariance: (T, 3, 3) of each pose against the map so far, or with loops closed against
-            the map of all others: x, y, heading.
+            the map of all others: x, y, heading. That of the guess where there was no map yet.
         grid: the sums alpha, beta of (10) of all scans.
         explained: (T,) share of each scan's beams that the map so far explained; the map of all
             others where poses were swept only.
@@ -136,33 +136,38 @@ def build(
     so_far.add(0, way.poses[0], 0.0)
     progress(1, T)
     for t in range(1, T):
-        last = way.poses[t - 1]
-        guess = motion.from_constant_velocity(last, way.poses[max(t - 2, 0)], steadiness)
-        prior, other = _priors(last, steps, t, guess, options.motion)
+        guess = way.guess(t, steadiness)
+        prior, other = _priors(way.poses[t - 1], steps, t, guess, options.motion)
         if prior.measured and watch.stalled(t, way.poses):
             prior, other = guess, prior
         scan, s = hits(recording, e, t), recording.sensor[t]
-        if prior.measured or so_far.has(s):
+        # without odometry, what a laser sees on its own side at first has nothing to lie on
+        has_ground = prior.measured or so_far.has(s)
+        if has_ground:
             found = register(so_far.grid, scan, prior, other, options.registration, usual[s])
-        else:  # what a laser sees on its own side has nothing to lie on yet
+        else:
             found = taken(prior)
         gone_on = watch.look(t, way.poses, steadiness, so_far.grid, scan, found)
         if gone_on is not None:
-            so_far.forget_since(gone_on.first)
+            so_far.forget_since(gone_on.first)  # they are not put back: those to come show the same
             for since, found in enumerate(gone_on.found, gone_on.first):
                 way.take(since, found, doubted=True)
+            travelled += _metres(way.poses[gone_on.first - 1 : t])
+            guess = way.guess(t, steadiness)
         fits_nowhere = _was_carried(so_far, scan, found, usual[s], options.registration)
-        leapt = _leapt(so_far, scan, found, (prior, guess), options.registration)
+        leapt = _leapt(so_far, scan, found, (prior, other or guess), options.registration)
         if fits_nowhere or (leapt and steps is not None):
             way.breaks.append(t)
             if fits_nowhere:
                 way.nowhere.append(t)
             so_far, usual[:] = _empty(recording, e, options), 0.0
+            watch.forget()
         way.take(t, found, doubted=steps is not None and not prior.measured)
-        # nothing is usual yet after the first scan
-        usual[s] += (_LATELY if usual[s] > 0.0 else 1.0) * (found.explained - usual[s])
-        steadiness = steadiness.after(guess.shift_to(found.T_map_base), seconds, options.motion)
-        travelled += float(np.linalg.norm(found.T_map_base[:2, 2] - way.poses[t - 1, :2, 2]))
+        if has_ground:
+            # nothing is usual yet after the first scan
+            usual[s] += (_LATELY if usual[s] > 0.0 else 1.0) * (found.explained - usual[s])
+            steadiness = steadiness.after(guess.shift_to(found.T_map_base), seconds, options.motion)
+        travelled += _metres(way.poses[t - 1 : t + 1])
         so_far.add(t, found.T_map_base, travelled)
         so_far.forget(travelled - memory)
         progress(t + 1, T)
@@ -192,6 +197,11 @@ class _Way:
         self.explained[t], self.widened[t] = found.explained, found.widened
         self.disagreeing[t] |= found.disagrees or doubted
 
+    def guess(self, t: int, steadiness: motion.Steadiness) -> MotionPrior:
+        """The last motion once more; across a break there was none that is known."""
+        before = t - 1 if t < 2 or t - 1 in self.breaks[-1:] else t - 2
+        return motion.from_constant_velocity(self.poses[t - 1], self.poses[before], steadiness)
+
     def mapped(self, grid: _core.Grid2D) -> Mapped:
         return Mapped(
             self.poses,
@@ -203,6 +213,10 @@ class _Way:
             self.breaks,
             self.nowhere,
         )
+
+
+def _metres(poses: Float) -> float:
+    return float(np.linalg.norm(np.diff(poses[:, :2, 2], axis=0), axis=1).sum())
 
 
 def _empty(recording: Recording, e: NDArray[np.float32], options: SlamOptions) -> LocalMap:

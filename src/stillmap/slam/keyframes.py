@@ -37,6 +37,16 @@ def chosen(poses: Float, distance: float, turn: float, breaks: Sequence[int] = (
     return np.unique(np.array([*kept, *beside], np.intp))
 
 
+def chosen_of_each(
+    poses: Float, sensor: NDArray[np.integer], distance: float, turn: float
+) -> Index:
+    """(K,) indices of scans chosen from those of each sensor (T,): each may see its own side."""
+    of_each = [np.flatnonzero(sensor == s) for s in np.unique(sensor)]
+    return np.sort(
+        np.concatenate([scans[chosen(poses[scans], distance, turn)] for scans in of_each])
+    )
+
+
 def spread(poses: Float, keyframes: Index, moved: Float) -> Float:
     """(T, 3, 3) all poses when the keyframes among them moved to (K, 3, 3).
 

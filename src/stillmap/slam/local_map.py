@@ -38,15 +38,15 @@ class LocalMap:
         self._kept: deque[tuple[int, Float, float]] = deque()  # scan, pose, metres travelled
 
     def add(self, t: int, T_map_base: Float, travelled: float) -> None:
-        """Scan t at a pose (3, 3), unless the one before shows the same."""
-        if self._kept and not self._is_apart(t, T_map_base):
+        """Scan t at a pose (3, 3), unless the last one of its sensor shows the same."""
+        if not self._is_apart(t, T_map_base):
             return
         put(self.grid, self._recording, self._e, t, T_map_base, self._surface)
         self._kept.append((t, T_map_base, travelled))
 
     def has(self, sensor: int) -> bool:
         """Whether there is a scan of a sensor in it."""
-        return any(self._recording.sensor[t] == sensor for t, _, _ in reversed(self._kept))
+        return self._last_of(sensor) is not None
 
     def forget(self, travelled: float) -> None:
         """Takes out what was seen before the robot had come that many metres."""
@@ -61,7 +61,16 @@ class LocalMap:
             put(self.grid, self._recording, self._e, last, T_map_base, self._surface, remove=True)
 
     def _is_apart(self, t: int, T_map_base: Float) -> bool:
-        last, T_last, _ = self._kept[-1]
+        kept = self._last_of(self._recording.sensor[t])
+        if kept is None:
+            return True
+        last, T_last, _ = kept
         x, y, theta = se2.parameters(se2.inverse(T_last) @ T_map_base)
         seconds = 1e-9 * float(self._recording.stamp_ns[t] - self._recording.stamp_ns[last])
         return float(np.hypot(x, y) + abs(theta) + 0.2 * seconds) >= self._spacing
+
+    def _last_of(self, sensor: int) -> tuple[int, Float, float] | None:
+        of_sensor = (
+            kept for kept in reversed(self._kept) if self._recording.sensor[kept[0]] == sensor
+        )
+        return next(of_sensor, None)

@@ -183,7 +183,8 @@ def local_map(track: Track, centre: float) -> _core.Grid2D:
     first, last = np.searchsorted(track.travelled, [centre - half, centre + half])
     grid = _core.Grid2D(track.resolution, track.registration.approach)
     spacing = _DENSE * track.options.distance, _DENSE * track.options.turn
-    for t in first + keyframes.chosen(track.poses[first:last], *spacing):
+    sensor = track.recording.sensor[first:last]
+    for t in first + keyframes.chosen_of_each(track.poses[first:last], sensor, *spacing):
         put(grid, track.recording, track.e, t, track.poses[t], track.surface)
     return grid
 

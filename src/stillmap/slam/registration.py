@@ -54,7 +54,8 @@ class RegistrationOptions:
         0.2, "share of a scan's beams that may seem to go through walls, unless it is elsewhere"
     )
     lost_translation: float = field_with_doc(
-        1.5, "m, half width of a last search over all headings, while doubt remains"
+        1.5,
+        "m, half width of a last search over all headings; not where odometry has no walls in it",
     )
 
     def __post_init__(self) -> None:
@@ -153,9 +154,9 @@ def register(
 
 
 def taken(prior: MotionPrior) -> Registration:
-    """The pose where a prior has it, of a scan that says nothing."""
+    """The pose where a prior has it, of a scan that has nothing to lie on; its covariance too."""
     covariance = np.diag(1.0 / np.diag(prior.information))
-    return Registration(prior.T_map_base, covariance, 0.0, 0.0, np.zeros((0, 4)))
+    return Registration(prior.T_map_base, covariance, 1.0, 0.0, np.zeros((0, 4)))
 
 
 def _within(

@@ -4,6 +4,7 @@ Between two walls a scan fits well enough where odometry leaves it. So the robot
 if it had gone on, for as long as odometry stands still; what the scans say for that adds up.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ Float = NDArray[np.float64]
 
 _LEAST = 0.02  # m and rad, of a step: slower robots may as well have stopped
 _STILL = 0.2  # of the step before: what is shorter is none
+_LONGEST = 500  # scans in which it has to become clear
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +34,7 @@ class GoingOn:
     """
 
     first: int
-    found: tuple[Registration, ...]
+    found: list[Registration]
     gain: float
 
 
@@ -47,6 +49,10 @@ class Watch:
             options: see RegistrationOptions.
         """
         self._increments, self._options = increments, options
+        self.forget()
+
+    def forget(self) -> None:
+        """The robot is elsewhere: nothing of how it moved before tells how it goes on."""
         self._stalled = False
         self._going: GoingOn | None = None
 
@@ -72,7 +78,7 @@ class Watch:
             steadiness: how far guesses were off of late.
             grid: the map so far.
             scan: what was seen.
-            found: where it lies if odometry is right.
+            found: where it lies by the prior, which is odometry's unless that is implausible.
         """
         if self._stalled:
             return None
@@ -82,6 +88,8 @@ class Watch:
             return gone_on
         # a turn is seen at once
         self._stalled = found.disagrees and self._stands_still(t, poses[t - 1], found.T_map_base)
+        if self._stalled:
+            self._going = None
         return None
 
     def _followed(
@@ -95,6 +103,8 @@ class Watch:
     ) -> GoingOn | None:
         """What is known of a robot that goes on, with one more scan; None when it does not."""
         going = self._going
+        if len(scan.points) == 0 or (going is not None and len(going.found) == _LONGEST):
+            return None
         earlier = [poses[s] for s in range(max(t - 2, 0), t)]
         if going is not None:
             earlier = [poses[going.first - 1], *(f.T_map_base for f in going.found)][-2:]
@@ -108,11 +118,10 @@ class Watch:
         moved = registration.search(grid, scan, guess, self._options, 0.0, 0.0, start)
         gain = found.misfit - moved.misfit
         if going is None:
-            return GoingOn(t, (moved,), gain)
+            return GoingOn(t, [moved], gain)
+        going.found.append(moved)
         gain += going.gain
-        if gain < -self._options.lies:
-            return None
-        return GoingOn(going.first, (*going.found, moved), gain)
+        return None if gain < -self._options.lies else dataclasses.replace(going, gain=gain)
 
     def _stands_still(self, t: int, before: Float, after: Float) -> bool:
         """Whether odometry has no motion to scan t where that between two poses (3, 3) is some."""

@@ -31,7 +31,7 @@ def sweep(
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
     increments = _increments(recording, poses)
     grid = _core.Grid2D(options.resolution, options.registration.approach)
-    kept = keyframes.chosen(poses, options.spacing, options.spacing)
+    kept = keyframes.chosen_of_each(poses, recording.sensor, options.spacing, options.spacing)
     for t in kept:
         put(grid, recording, e, t, poses[t], options.surface)
     is_in_map = np.zeros(T, np.bool_)
