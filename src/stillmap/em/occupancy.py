@@ -1,7 +1,7 @@
 """The map as plain arrays: (15), or what the estimator knows better."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,8 @@ def occupancy_map(
         grid: the sums of (10).
         occupied: None for (15). Else the probabilities of cells in which beams ended; cells that
             beams only passed are free for every cell length that was passed.
-        seen: the cells of which beams tell something; None: all that beams crossed.
+        seen: the cells of which beams tell something: the map is as large as their box. None: all
+            that beams crossed.
     """
     first_cell, alpha, beta = grid.dense()
     p_occupied = np.full(alpha.shape, np.nan, dtype=np.float32)
@@ -65,7 +66,9 @@ def occupancy_map(
     if occupied is not None:
         _lay_over(p_occupied, occupied, first_cell)
     if seen is not None:
-        _forget_all_but(p_occupied, seen, first_cell)
+        p_occupied, alpha, beta = _seen_part(seen, first_cell, (p_occupied, alpha, beta))
+        p_occupied[~seen.cells] = np.nan
+        first_cell = seen.first_cell
     x, y = (float(c) * grid.resolution for c in first_cell)
     return OccupancyMap(p_occupied, alpha, beta, (x, y, 0.0), grid.resolution)
 
@@ -79,12 +82,10 @@ def _lay_over(
     p_occupied[row, column] = occupied.p_occupied + (1.0 - occupied.p_occupied) * free
 
 
-def _forget_all_but(
-    p_occupied: NDArray[np.float32], seen: Seen, first_cell: NDArray[np.int64]
-) -> None:
-    """Makes the cells unknown of which no beam tells anything."""
+def _seen_part(
+    seen: Seen, first_cell: NDArray[np.int64], arrays: tuple[NDArray[Any], ...]
+) -> tuple[NDArray[Any], ...]:
+    """The parts (h, w) of arrays (H, W) in the box of the cells that were seen."""
     column, row = seen.first_cell - first_cell
     height, width = seen.cells.shape
-    unknown = np.ones(p_occupied.shape, np.bool_)
-    unknown[row : row + height, column : column + width] = ~seen.cells
-    p_occupied[unknown] = np.nan
+    return tuple(a[row : row + height, column : column + width].copy() for a in arrays)
