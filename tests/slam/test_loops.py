@@ -335,3 +335,17 @@ def test_drift_grows_with_the_way_and_then_no_more():
     near, far, lost = (loops.drift(metres, options) for metres in (50.0, 500.0, 1e6))
     assert near < far == lost
     assert lost == pytest.approx((500 * 0.006, 500 * 0.0003), rel=0.03)
+
+
+def test_many_stages_are_as_good_as_few():
+    # the poses of a stage are carried on to the next: what is off a rotation must not add up
+    few, many = (
+        mapped(repetitive(), dataclasses.replace(OPTIONS, loops=loops))
+        for loops in (
+            dataclasses.replace(OPTIONS.loops, distance=0.4, stage=stage, stage_share=0.0)
+            for stage in (10.0, 0.1)
+        )
+    )
+    accepted = [sum(not c.refused for c in found.loops) for found in (few, many)]
+    assert accepted[1] > 0.9 * accepted[0] > 20
+    assert ate(many, repetitive()) < ate(few, repetitive()) + 0.01

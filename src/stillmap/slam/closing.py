@@ -95,7 +95,9 @@ def _corrected(
     out = poses.copy()
     inside = [relation for relation in relations if relation.second < last]
     out[:last] = pose_graph.optimised(poses[:last], way[: last - 1], inside, _robust(track))
-    out[last:] = out[last - 1] @ se2.inverse(poses[last - 1]) @ poses[last:]
+    carried = out[last - 1] @ se2.inverse(poses[last - 1]) @ poses[last:]
+    # rotations again: what products of many stages are off one would double with every stage
+    out[last:] = se2.matrix(*np.moveaxis(se2.parameters(carried), -1, 0))
     fit = pose_graph.misfits(out, relations) <= track.options.misfit
     return out, list(itertools.compress(accepted, fit))
 

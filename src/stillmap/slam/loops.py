@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from stillmap import _core, se2
 from stillmap.options import field_with_doc
 from stillmap.recording.model import Recording
-from stillmap.slam import keyframes, registration
+from stillmap.slam import keyframes, motion, registration
 from stillmap.slam.keyframes import Index
-from stillmap.slam.motion import MotionPrior
 from stillmap.slam.registration import RegistrationOptions
 from stillmap.slam.scans import Scan, SurfaceOptions, hits, in_frame, put
 
@@ -214,9 +213,7 @@ def laid_on(
         sigma, sigma_turn: standard deviations of that, in metres and radians.
     """
     options, earlier, later = track.options, candidate.earlier, candidate.later
-    information = np.diag([sigma**-2, sigma**-2, sigma_turn**-2])
-    predicted = track.poses[earlier] @ candidate.T
-    prior = MotionPrior(predicted, information, sigma, sigma_turn)
+    prior = motion.guess_at(track.poses[earlier] @ candidate.T, sigma, sigma_turn)
     view = _view(track, later)
     window = options.window * sigma, min(options.window * sigma_turn, np.pi)
     found = registration.search(grid, view, prior, track.registration, *window)
