@@ -24,6 +24,11 @@ def parameters(T: Float) -> Float:
     return x
 
 
+def normalised(T: Float) -> Float:
+    """(..., 3, 3) the same poses with exact rotations: chains of products drift away from them."""
+    return matrix(*np.moveaxis(parameters(T), -1, 0))
+
+
 def inverse(T: Float) -> Float:
     """Inverses of rigid transforms (..., D+1, D+1), any D."""
     R_t = np.swapaxes(T[..., :-1, :-1], -1, -2)

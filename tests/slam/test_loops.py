@@ -149,27 +149,19 @@ def test_refusals_carry_reasons():
     assert "" not in {c.refused for c in mapped(square(), lonely).loops}
 
 
-def straight_track(options=OPTIONS.loops):
+def track_of(recording, poses, travelled, frames):
+    """What loops are looked for in; all of it is explained, and no beam is believed."""
+    e, explained = np.zeros(recording.n_beams, np.float32), np.ones(len(poses))
+    steering = OPTIONS.registration, OPTIONS.surface, OPTIONS.loops
+    return Track(recording, e, poses, travelled, explained, frames, 0.05, *steering)
+
+
+def straight_track():
     """Twice along the same 20 m, keyframes a metre apart."""
     x = np.concatenate([np.arange(21.0), np.arange(21.0)])
-    poses = se2.matrix(x, 0.0, 0.0)
-    n = len(poses)
     recording = dataclasses.replace(square().recording, T_odom_base=None)
-    e = np.zeros(0, np.float32)
-    frames = np.arange(n)
-    travelled = np.arange(float(n))
-    return Track(
-        recording,
-        e,
-        poses,
-        travelled,
-        np.ones(n),
-        frames,
-        0.05,
-        OPTIONS.registration,
-        OPTIONS.surface,
-        options,
-    )
+    n = len(x)
+    return track_of(recording, se2.matrix(x, 0.0, 0.0), np.arange(float(n)), np.arange(n))
 
 
 def closures(shifts):
@@ -202,21 +194,7 @@ def test_a_way_that_odometry_contradicts_is_loose():
     frames = keyframes.chosen(poses, 1.0, 0.5)
     at = int(frames[5]) + 1
     poses[at:] = se2.matrix(0.0, 0.8, 0.0) @ poses[at:]  # a leap of 0.8 m in the map's y
-    n = len(poses)
-    e = np.zeros(recording.n_beams, np.float32)
-    travelled = keyframes.travel(poses)
-    track = Track(
-        recording,
-        e,
-        poses,
-        travelled,
-        np.ones(n),
-        frames,
-        0.05,
-        OPTIONS.registration,
-        OPTIONS.surface,
-        OPTIONS.loops,
-    )
+    track = track_of(recording, poses, keyframes.travel(poses), frames)
     way = relations(track, OPTIONS.motion, [])
     widths = np.array([np.sqrt(np.linalg.eigvalsh(r.covariance[:2, :2]).max()) for r in way])
     assert widths[5] == pytest.approx(0.8, abs=0.1)

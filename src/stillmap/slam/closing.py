@@ -96,8 +96,7 @@ def _corrected(
     inside = [relation for relation in relations if relation.second < last]
     out[:last] = pose_graph.optimised(poses[:last], way[: last - 1], inside, _robust(track))
     carried = out[last - 1] @ se2.inverse(poses[last - 1]) @ poses[last:]
-    # rotations again: what products of many stages are off one would double with every stage
-    out[last:] = se2.matrix(*np.moveaxis(se2.parameters(carried), -1, 0))
+    out[last:] = se2.normalised(carried)  # what they are off would double with every stage
     fit = pose_graph.misfits(out, relations) <= track.options.misfit
     return out, list(itertools.compress(accepted, fit))
 

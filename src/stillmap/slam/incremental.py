@@ -136,10 +136,9 @@ def build(
     so_far.add(0, way.poses[0], 0.0)
     progress(1, T)
     for t in range(1, T):
-        guess = way.guess(t, steadiness)
-        prior, other = _priors(way.poses[t - 1], steps, t, guess, options.motion)
-        if prior.measured and watch.stalled(t, way.poses):
-            prior, other = guess, prior
+        last, guess = way.poses[t - 1], way.guess(t, steadiness)
+        stalled = watch.stalled(t, last, guess)
+        prior, other = _priors(last, steps, t, guess, stalled, options.motion)
         scan, s = hits(recording, e, t), recording.sensor[t]
         # without odometry, what a laser sees on its own side at first has nothing to lie on
         has_ground = prior.measured or so_far.has(s)
@@ -147,7 +146,7 @@ def build(
             found = register(so_far.grid, scan, prior, other, options.registration, usual[s])
         else:
             found = taken(prior)
-        gone_on = watch.look(t, way.poses, steadiness, so_far.grid, scan, found)
+        gone_on = watch.look(t, last, guess, so_far.grid, scan, found)
         if gone_on is not None:
             so_far.forget_since(gone_on.first)  # they are not put back: those to come show the same
             for since, found in enumerate(gone_on.found, gone_on.first):
@@ -162,7 +161,9 @@ def build(
                 way.nowhere.append(t)
             so_far, usual[:] = _empty(recording, e, options), 0.0
             watch.forget()
-        way.take(t, found, doubted=steps is not None and not prior.measured)
+        disbelieved = None if prior.measured else other
+        is_doubted = disbelieved is not None and is_off(disbelieved, found, options.registration)
+        way.take(t, found, doubted=is_doubted)
         if has_ground:
             # nothing is usual yet after the first scan
             usual[s] += (_LATELY if usual[s] > 0.0 else 1.0) * (found.explained - usual[s])
@@ -264,10 +265,12 @@ def _priors(
     steps: motion.Steps | None,
     t: int,
     guess: MotionPrior,
+    stalled: bool,
     options: MotionOptions,
 ) -> tuple[MotionPrior, MotionPrior | None]:
     """Where scan t ought to be after a pose (3, 3), and where else it may be."""
     if steps is None:
         return guess, None
     measured = motion.from_odometry(T_map_base, steps.increments[t - 1], options)
-    return (measured, guess) if steps.plausible[t - 1] else (guess, measured)
+    is_true = steps.plausible[t - 1] and not stalled
+    return (measured, guess) if is_true else (guess, measured)

@@ -201,6 +201,6 @@ def widened(prior: MotionPrior, sigma_translation: float, sigma_rotation: float)
 
 
 def _prior(mean: Float, sigma_xy: float, sigma_theta: float, measured: bool = False) -> MotionPrior:
-    mean = se2.matrix(*se2.parameters(mean))  # a rotation again: chains of products drift away
+    mean = se2.normalised(mean)
     information = np.diag([sigma_xy**-2, sigma_xy**-2, sigma_theta**-2])
     return MotionPrior(mean, information, sigma_xy, sigma_theta, measured)

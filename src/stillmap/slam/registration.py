@@ -55,7 +55,8 @@ class RegistrationOptions:
     )
     lost_translation: float = field_with_doc(
         1.5,
-        "m, half width of a last search over all headings; not where odometry has no walls in it",
+        "m, half width of a last search over all headings, where odometry would lead through walls "
+        "or there is none",
     )
 
     def __post_init__(self) -> None:

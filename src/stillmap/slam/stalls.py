@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap import _core, se2
 from stillmap.slam import motion, registration
-from stillmap.slam.motion import Steadiness
+from stillmap.slam.motion import MotionPrior
 from stillmap.slam.registration import Registration, RegistrationOptions
 from stillmap.slam.scans import Scan
 
@@ -29,11 +29,13 @@ class GoingOn:
 
     Attributes:
         first: the scan at which odometry stopped.
-        found: where each scan from that one on lies then.
+        before: (3, 3) T_map_base of the scan before it.
+        found: where each scan from the first on lies then.
         gain: nats by which they fit better than where odometry leaves them.
     """
 
     first: int
+    before: Float
     found: list[Registration]
     gain: float
 
@@ -56,16 +58,24 @@ class Watch:
         self._stalled = False
         self._going: GoingOn | None = None
 
-    def stalled(self, t: int, poses: Float) -> bool:
-        """Whether odometry has been found to stall and still does on the way to scan t."""
-        self._stalled = self._stalled and self._stands_still(t, poses[t - 2], poses[t - 1])
+    def stalled(self, t: int, last: Float, guess: MotionPrior) -> bool:
+        """Whether odometry has been found to stall and still does on the way to scan t.
+
+        Args:
+            t: the scan.
+            last: (3, 3) T_map_base of the scan before.
+            guess: the last motion once more.
+        """
+        if self._stalled:  # a robot that stands meanwhile does not make its odometry true again
+            step = max(_size(se2.inverse(last) @ guess.T_map_base), _LEAST)
+            self._stalled = self._moved(t) < _STILL * step
         return self._stalled
 
     def look(
         self,
         t: int,
-        poses: Float,
-        steadiness: Steadiness,
+        last: Float,
+        guess: MotionPrior,
         grid: _core.Grid2D,
         scan: Scan,
         found: Registration,
@@ -73,62 +83,57 @@ class Watch:
         """How the robot went on, once the scans leave no doubt that it did.
 
         Args:
-            t: the scan.
-            poses: (T, 3, 3) T_map_base, known before it.
-            steadiness: how far guesses were off of late.
+            t, last, guess: as `stalled` has them.
             grid: the map so far.
             scan: what was seen.
             found: where it lies by the prior, which is odometry's unless that is implausible.
         """
         if self._stalled:
             return None
-        self._going = self._followed(t, poses, steadiness, grid, scan, found)
+        onwards = self._onwards(t, last, guess) if len(scan.points) else None
+        if onwards is None:
+            self._going = None
+        else:
+            start = onwards.T_map_base
+            moved = registration.search(grid, scan, onwards, self._options, 0.0, 0.0, start)
+            self._add(t, last, moved, found.misfit - moved.misfit)
         if self._going is not None and self._going.gain > self._options.lies:
             gone_on, self._going, self._stalled = self._going, None, True
             return gone_on
         # a turn is seen at once
-        self._stalled = found.disagrees and self._stands_still(t, poses[t - 1], found.T_map_base)
+        self._stalled = found.disagrees and self._stands_still(t, last, found.T_map_base)
         if self._stalled:
             self._going = None
         return None
 
-    def _followed(
-        self,
-        t: int,
-        poses: Float,
-        steadiness: Steadiness,
-        grid: _core.Grid2D,
-        scan: Scan,
-        found: Registration,
-    ) -> GoingOn | None:
-        """What is known of a robot that goes on, with one more scan; None when it does not."""
+    def _onwards(self, t: int, last: Float, guess: MotionPrior) -> MotionPrior | None:
+        """Where the robot is if it goes on; None where it moved as odometry says."""
         going = self._going
-        if len(scan.points) == 0 or (going is not None and len(going.found) == _LONGEST):
-            return None
-        earlier = [poses[s] for s in range(max(t - 2, 0), t)]
         if going is not None:
-            earlier = [poses[going.first - 1], *(f.T_map_base for f in going.found)][-2:]
-        if len(earlier) < 2 or not self._stands_still(t, *earlier):
-            return None
-        before, last = earlier
-        if going is None and steadiness.translation > _size(se2.inverse(before) @ last):
+            if len(going.found) == _LONGEST:
+                return None
+            before, last = [going.before, *(f.T_map_base for f in going.found[-2:])][-2:]
+            ahead = last @ se2.inverse(before) @ last
+            guess = motion.guess_at(ahead, guess.sigma_translation, guess.sigma_rotation)
+        elif guess.sigma_translation > _size(se2.inverse(last) @ guess.T_map_base):
             return None  # nobody can tell how it would go on
-        guess = motion.from_constant_velocity(last, before, steadiness)
-        start = guess.T_map_base
-        moved = registration.search(grid, scan, guess, self._options, 0.0, 0.0, start)
-        gain = found.misfit - moved.misfit
-        if going is None:
-            return GoingOn(t, [moved], gain)
-        going.found.append(moved)
-        gain += going.gain
-        return None if gain < -self._options.lies else dataclasses.replace(going, gain=gain)
+        return guess if self._stands_still(t, last, guess.T_map_base) else None
 
-    def _stands_still(self, t: int, before: Float, after: Float) -> bool:
-        """Whether odometry has no motion to scan t where that between two poses (3, 3) is some."""
-        if self._increments is None:
-            return False
-        step = _size(se2.inverse(before) @ after)
-        return step > _LEAST and _size(self._increments[t - 1]) < _STILL * step
+    def _add(self, t: int, last: Float, moved: Registration, gain: float) -> None:
+        going = self._going or GoingOn(t, last, [], 0.0)
+        gain += going.gain
+        going.found.append(moved)
+        stopped = gain < -self._options.lies
+        self._going = None if stopped else dataclasses.replace(going, gain=gain)
+
+    def _stands_still(self, t: int, last: Float, T_map_base: Float) -> bool:
+        """Whether odometry has no motion to scan t where a pose (3, 3) of it means some."""
+        step = _size(se2.inverse(last) @ T_map_base)
+        return step > _LEAST and self._moved(t) < _STILL * step
+
+    def _moved(self, t: int) -> float:
+        """How far odometry came on the way to scan t."""
+        return np.inf if self._increments is None else _size(self._increments[t - 1])
 
 
 def _size(increment: Float) -> float:

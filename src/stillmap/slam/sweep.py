@@ -44,7 +44,7 @@ def sweep(
         found = registration.search(
             grid, scan, prior, options.registration, 0.0, 0.0, start=poses[t]
         )
-        poses[t] = se2.matrix(*se2.parameters(found.T_map_base))
+        poses[t] = se2.normalised(found.T_map_base)
         covariance[t], explained[t] = found.covariance, found.explained
         if is_in_map[t]:
             put(grid, recording, e, t, poses[t], options.surface)
