@@ -10,7 +10,8 @@ from stillmap.simulation import RobotOptions, Scene, simulate
 from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.simulation.walls import box
 from stillmap.slam import SlamOptions, keyframes
-from stillmap.slam.loops import Candidate, Track, _ambiguous, laid_on, local_map
+from stillmap.slam.loops import Candidate, Track
+from stillmap.slam.verification import _ambiguous, laid_on, local_map
 
 OPTIONS = SlamOptions()
 

@@ -12,7 +12,7 @@ from stillmap.recording.model import Recording
 from stillmap.simulation import RobotOptions, Scene, simulate
 from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.simulation.walls import box
-from stillmap.slam import SlamOptions, keyframes, loops, registration
+from stillmap.slam import SlamOptions, keyframes, loops, registration, verification
 from stillmap.slam.candidates import metres_to, of_stage, stages
 from stillmap.slam.chain import agreeing, agreeing_since, relations
 from stillmap.slam.closing import closed
@@ -186,13 +186,13 @@ def missed(T, truth, candidate):
 
 def test_loops_are_looked_for_where_those_before_put_them(monkeypatch):
     asked = []
-    attempts = loops.attempts
+    attempts = verification.attempts
 
     def recorded(track, candidates):
         asked.append(list(candidates))
         return attempts(track, asked[-1])
 
-    monkeypatch.setattr(loops, "attempts", recorded)
+    monkeypatch.setattr(verification, "attempts", recorded)
     recording, truth, poses = rounds(drift=4.0)
     e = np.full(recording.n_beams, 0.9, np.float32)
     closed(recording, e, dataclasses.replace(OPTIONS, loops=LoopOptions(stage=8.0)), local(poses))
@@ -216,7 +216,7 @@ def test_a_scan_is_laid_where_the_candidate_says():
         keyframes=frames,
     )
     T = se2.inverse(truth[earlier]) @ truth[later]
-    (found,) = loops.attempts(track, [loops.Candidate(earlier, later, T, 0.0)])
+    (found,) = verification.attempts(track, [loops.Candidate(earlier, later, T, 0.0)])
     assert missed(se2.inverse(poses[earlier]) @ poses[later], truth, found) > 0.5
     assert missed(found.T, truth, found) < 0.05  # though no more than 0.2 m are searched
 

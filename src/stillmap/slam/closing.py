@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.recording.model import Recording
-from stillmap.slam import candidates, chain, keyframes, loops, pieces, pose_graph
+from stillmap.slam import candidates, chain, keyframes, pieces, pose_graph, verification
 from stillmap.slam.incremental import Mapped, SlamOptions
 from stillmap.slam.loops import Closure, Track, refuse
 from stillmap.slam.pose_graph import Graph, Relation, Robust
@@ -32,7 +32,7 @@ def closed(
     moved, found = track.poses[track.keyframes], ties
     attempted, fitting = list[Closure](), ties
     for first, last in candidates.stages(track):
-        new = loops.attempts(track, candidates.of_stage(track, moved, first, last, fitting))
+        new = verification.attempts(track, candidates.of_stage(track, moved, first, last, fitting))
         attempted += new
         if all(closure.refused for closure in new):
             found = found + new

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core, se2
-from stillmap.slam import loops, motion, registration
+from stillmap.slam import motion, registration, verification
 from stillmap.slam.loops import Candidate, Closure, Track
 from stillmap.slam.scans import hits, put
 
@@ -75,12 +75,12 @@ def _attempts(track: Track, first: int, last: int) -> Iterator[Closure]:
         stretches = np.round(track.travelled[before] / options.stretch)
         for stretch in _best_of_each(stretches, unlike):
             if stretch not in grids:
-                grids[stretch] = loops.local_map(track, stretch * options.stretch)
+                grids[stretch] = verification.local_map(track, stretch * options.stretch)
             same = np.flatnonzero(stretches == stretch)
             earlier = int(before[same[np.argmin(unlike[same])]])
             here = Candidate(earlier, later, np.eye(3), 0.0)
             sigma = options.reach / options.window, np.pi / options.window
-            closure = loops.laid_on(track, grids[stretch], here, *sigma)
+            closure = verification.laid_on(track, grids[stretch], here, *sigma)
             if not closure.refused:
                 yield closure
 
