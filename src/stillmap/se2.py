@@ -60,7 +60,8 @@ def wrap(angle: ArrayLike) -> Float:
 
 
 def turned(covariance: Float, T: Float) -> Float:
-    """A covariance (3, 3) of x, y, heading along the axes that a pose (3, 3) turns it into."""
-    R = np.eye(3)
-    R[:2, :2] = T[:2, :2]
-    return R @ covariance @ R.T
+    """Covariances (..., 3, 3) of x, y, heading along the axes that poses (..., 3, 3) turn into."""
+    R = np.zeros(T.shape)
+    R[..., :2, :2] = T[..., :2, :2]
+    R[..., 2, 2] = 1.0
+    return R @ covariance @ np.swapaxes(R, -1, -2)

@@ -13,7 +13,7 @@ from stillmap.simulation import RobotOptions, Scene, simulate
 from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.simulation.walls import box
 from stillmap.slam import SlamOptions, keyframes, loops, registration, verification
-from stillmap.slam.candidates import metres_to, of_stage, stages
+from stillmap.slam.candidates import looks, metres_to, of_stage, stages
 from stillmap.slam.chain import agreeing, agreeing_since, relations
 from stillmap.slam.closing import closed
 from stillmap.slam.incremental import Mapped
@@ -94,12 +94,12 @@ def test_candidates_are_as_unsure_as_the_graph():
     track = laps(3)
     ties = [tie(k, 21 + k) for k in range(21)]
     # the third time, as unsure as the way from the start of the lap
-    third = {c.later: c for c in of_stage(track, track.poses, 42, 63, ties)}
+    third = {c.later: c for c in of_stage(track, track.poses, looks(track), 42, 63, ties)}
     assert set(third) == set(range(42, 63))
     for later, candidate in third.items():
         assert candidate.metres <= later - 42 + 1 + 20 + 5
         assert candidate.metres <= later - candidate.earlier
-    alone = {c.later: c for c in of_stage(track, track.poses, 42, 63, [])}
+    alone = {c.later: c for c in of_stage(track, track.poses, looks(track), 42, 63, [])}
     assert alone[50].metres == 50 - alone[50].earlier
 
 
@@ -108,8 +108,8 @@ def test_candidates_are_found_where_the_graph_puts_them():
     drifted = track_of(se2.matrix(np.arange(float(n)), 0.0, 0.0))
     there_and_back = np.concatenate([np.arange(30.0), np.arange(30.0)])
     corrected = se2.matrix(there_and_back, 0.3, 0.0)
-    assert list(of_stage(drifted, drifted.poses, 30, 60, [])) == []
-    found = list(of_stage(drifted, corrected, 30, 60, []))
+    assert list(of_stage(drifted, drifted.poses, looks(drifted), 30, 60, [])) == []
+    found = list(of_stage(drifted, corrected, looks(drifted), 30, 60, []))
     assert [(c.earlier, c.later) for c in found] == [(k, 30 + k) for k in range(30)]
     np.testing.assert_allclose([c.T for c in found], np.tile(np.eye(3), (30, 1, 1)), atol=1e-12)
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.slam.loops import Candidate, Closure, LoopOptions, Track, drift
+from stillmap.slam.scans import hits
 
 Float = NDArray[np.float64]
 
@@ -54,30 +55,49 @@ def _counted(ties: list[Closure], options: LoopOptions) -> Float:
     return sigma / max(options.drift_translation, 1e-9)
 
 
+def looks(track: Track) -> Float:
+    """(K, 2) where the keyframes look: the mean of what each saw, in its frame."""
+    out = np.zeros((len(track.keyframes), 2))
+    for k, t in enumerate(track.keyframes.tolist()):
+        scan = hits(track.recording, track.e, t)
+        if scan.weights.sum() > 0.0:
+            out[k] = np.average(scan.points, axis=0, weights=scan.weights)
+    return out
+
+
 def of_stage(
-    track: Track, poses: Float, first: int, last: int, ties: list[Closure]
+    track: Track, poses: Float, looks: Float, first: int, last: int, ties: list[Closure]
 ) -> Iterator[Candidate]:
     """Keyframes of a stage with the nearest of much earlier travel, where that lies within reach.
+
+    If it does not, with the one that looked nearest to where it looks: who comes back on the other
+    side of a street is never near where it was.
 
     Args:
         track: where loops are looked for.
         poses: (K, 3, 3) the keyframes as far as they are corrected.
+        looks: (K, 2) where they look, in their frames.
         first, last: the stage.
         ties: closures of earlier stages that are taken for true.
     """
     options, frames = track.options, track.keyframes
     x, travelled = se2.parameters(poses), track.travelled[frames]
     metres = metres_to(track, first, ties)
+    looked_at = np.einsum("kij,kj->ki", poses[:, :2, :2], looks) + poses[:, :2, 2]
     for k in range(first, last):
         n = int(np.searchsorted(travelled, travelled[k] - options.gap))
         if n == 0:
             continue
         distance = np.linalg.norm(x[:n, :2] - x[k, :2], axis=1)
         turned = np.abs(se2.wrap(x[:n, 2] - x[k, 2]))
-        i = int(np.argmin(distance + turned))  # seen from the same side, where there is a choice
-        way = travelled[k] - travelled[i]
-        if i < first:
-            way = min(way, travelled[k] - travelled[first] + metres[i])
-        if distance[i] < options.reach + drift(way, options)[0]:
-            T = se2.inverse(poses[i]) @ poses[k]
-            yield Candidate(int(frames[i]), int(frames[k]), T, float(way))
+        across = np.linalg.norm(looked_at[:n] - looked_at[k], axis=1)
+        # seen from the same side, where there is a choice
+        for cost, metres_off in ((distance + turned, distance), (across, across)):
+            i = int(np.argmin(cost))
+            way = travelled[k] - travelled[i]
+            if i < first:
+                way = min(way, travelled[k] - travelled[first] + metres[i])
+            if metres_off[i] < options.reach + drift(way, options)[0]:
+                T = se2.inverse(poses[i]) @ poses[k]
+                yield Candidate(int(frames[i]), int(frames[k]), T, float(way))
+                break

@@ -75,12 +75,13 @@ def agreeing(track: Track, chain: list[Relation], found: list[Closure]) -> list[
     candidates = [closure for closure in found if not closure.refused]
     at = np.array([[travelled[c.earlier], travelled[c.later]] for c in candidates]).reshape(-1, 2)
     far = _NEAR * options.distance
+    drifted = _drifted(track, chain)
     out = []
     for closure in found:
         if not closure.refused:
             apart = np.abs(at - [travelled[closure.earlier], travelled[closure.later]])
             near = [candidates[n] for n in np.flatnonzero((apart < far).all(axis=1))]
-            votes = [_agree(track, chain, closure, c) for c in near if c is not closure]
+            votes = [_agree(track, drifted, closure, c) for c in near if c is not closure]
             if sum(votes) < max(options.agreeing, len(votes) / 2):
                 closure = refuse(closure, "closures around disagree")
         out.append(closure)
@@ -105,7 +106,16 @@ def agreeing_since(
     return decided[:new] + agreeing(track, chain, attempted[heard:])[new - heard :]
 
 
-def _agree(track: Track, chain: list[Relation], a: Closure, b: Closure) -> bool:
+def _drifted(track: Track, chain: list[Relation]) -> Float:
+    """(K, 3, 3) covariance that the steps to each keyframe add up to, along the axes of the map."""
+    poses = track.poses[track.keyframes[1:]]
+    steps = np.array([relation.covariance for relation in chain]).reshape(-1, 3, 3)
+    out = np.zeros((len(track.keyframes), 3, 3))
+    np.cumsum(se2.turned(steps, poses), axis=0, out=out[1:])
+    return out
+
+
+def _agree(track: Track, drifted: Float, a: Closure, b: Closure) -> bool:
     """Whether two closures put their later scans where the way between them allows."""
     a, b = (a, b) if a.later <= b.later else (b, a)
     P = track.poses
@@ -113,9 +123,7 @@ def _agree(track: Track, chain: list[Relation], a: Closure, b: Closure) -> bool:
     predicted = here @ se2.inverse(P[a.later]) @ P[b.later]
     d = se2.parameters(se2.inverse(predicted) @ P[b.earlier] @ b.T)
     back = se2.inverse(P[b.later])
-    covariance = b.covariance + se2.turned(a.covariance, back @ P[a.later])
     i, j = np.searchsorted(track.keyframes, [a.later, b.later])
-    for k in range(i, j):
-        of_step = P[track.keyframes[k + 1]]
-        covariance = covariance + se2.turned(chain[k].covariance, back @ of_step)
+    between = se2.turned(a.covariance, P[a.later]) + drifted[j] - drifted[i]
+    covariance = b.covariance + se2.turned(between, back)
     return float(d @ np.linalg.solve(covariance, d)) < 9.0

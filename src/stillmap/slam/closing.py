@@ -31,8 +31,10 @@ def closed(
     way = chain.relations(track, options.motion, mapped.breaks)
     moved, found = track.poses[track.keyframes], ties
     attempted, fitting = list[Closure](), ties
+    looks = candidates.looks(track)
     for first, last in candidates.stages(track):
-        new = verification.attempts(track, candidates.of_stage(track, moved, first, last, fitting))
+        asked = candidates.of_stage(track, moved, looks, first, last, fitting)
+        new = verification.attempts(track, asked)
         attempted += new
         if all(closure.refused for closure in new):
             found = found + new

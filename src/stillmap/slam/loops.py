@@ -26,7 +26,9 @@ class LoopOptions:
     distance: float = field_with_doc(1.0, "m between keyframes")
     turn: float = field_with_doc(0.5, "rad between keyframes")
     gap: float = field_with_doc(15.0, "m of travel after which a place counts as seen again")
-    reach: float = field_with_doc(6.0, "m, how near a keyframe must come to an earlier one")
+    reach: float = field_with_doc(
+        6.0, "m, how near a keyframe, or where it looks, must come to an earlier one"
+    )
     stretch: float = field_with_doc(8.0, "m of travel to either side that make a local map")
     view: float = field_with_doc(1.0, "m of travel to a scan on either side laid on it too")
     drift_translation: float = field_with_doc(0.006, "m of drift per metre: how far to search")
@@ -43,7 +45,11 @@ class LoopOptions:
     step_rotation: float = field_with_doc(0.004, "rad of random error, per root of a metre")
     sigma_translation: float = field_with_doc(0.03, "m, error of a closure at least")
     sigma_rotation: float = field_with_doc(0.006, "rad, error of a closure at least")
-    accept_above: float = field_with_doc(0.5, "share of beams the earlier map must explain")
+    before: float = field_with_doc(
+        1.0, "m before its end where the earlier map must have looked, or a beam is not comparable"
+    )
+    known: float = field_with_doc(0.4, "share of beams that must be comparable")
+    accept_above: float = field_with_doc(0.5, "share of those that the earlier map must explain")
     compared: float = field_with_doc(0.8, "of the share that the map so far explains, at least")
     agreeing: int = field_with_doc(2, "closures around that must ask for the same correction")
     misfit: float = field_with_doc(16.0, "chi-square above which the graph refuses a closure")
@@ -76,6 +82,8 @@ _LIMITS = (
     ("step_rotation", 1e-5, 10.0),
     ("sigma_translation", 1e-4, 10.0),
     ("sigma_rotation", 1e-5, 10.0),
+    ("before", 0.0, 100.0),
+    ("known", 0.0, 1.0),
     ("accept_above", 0.0, 1.0),
     ("compared", 0.0, 1.0),
     ("agreeing", 0, 100),
@@ -109,7 +117,8 @@ class Closure:
         earlier, later: scans that see the same place.
         T: (3, 3) pose of the later scan in the frame of the earlier one.
         covariance: (3, 3) of x, y, heading in the frame of the later scan.
-        explained: share of the later beams that the earlier ones explain.
+        explained: share of the later beams that the earlier ones explain, of those that are
+            comparable.
         refused: why it was not accepted; empty when it was.
     """
 

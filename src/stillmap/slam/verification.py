@@ -1,5 +1,6 @@
 """A keyframe laid on the map of an earlier stretch: whether it fits, and where that puts it."""
 
+import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
@@ -9,7 +10,7 @@ from stillmap import _core, se2
 from stillmap.slam import keyframes, motion, registration
 from stillmap.slam.loops import Candidate, Closure, Track, drift
 from stillmap.slam.registration import RegistrationOptions
-from stillmap.slam.scans import Scan, hits, in_frame, put
+from stillmap.slam.scans import Points, Scan, hits, in_frame, put
 
 Float = NDArray[np.float64]
 
@@ -17,6 +18,9 @@ Float = NDArray[np.float64]
 _DENSE = 0.25
 # metres by which a view is shifted to see whether it could slide along a wall
 _SHIFTS = (-0.6, -0.3, 0.3, 0.6)
+# times that a view is laid on a map, at most: again if, where it came to lie, other beams than
+# before are comparable; and the share of them that does not count
+_ROUNDS, _SAME = 3, 0.05
 
 
 def attempts(track: Track, candidates: Iterable[Candidate]) -> list[Closure]:
@@ -45,8 +49,12 @@ def local_map(track: Track, centre: float) -> _core.Grid2D:
     return grid
 
 
-def _view(track: Track, t: int) -> Scan:
-    """What a keyframe and a scan to either side see, in its frame."""
+def _view(track: Track, t: int) -> tuple[Scan, Points]:
+    """What a keyframe and a scan to either side see, in its frame; and where beams were before.
+
+    The latter are (N, 2): `LoopOptions.before` metres before their ends, or half way if that is
+    farther out.
+    """
     here, half = track.travelled[t], track.options.view
     first, last = np.searchsorted(track.travelled, [here - half, here + half], side="right")
     last = max(last - 1, t)
@@ -54,8 +62,34 @@ def _view(track: Track, t: int) -> Scan:
     seen = [hits(track.recording, track.e, s) for s in shown]
     to_t = se2.inverse(track.poses[t]) @ track.poses[shown]
     points = [in_frame(scan.points, T) for scan, T in zip(seen, to_t, strict=True)]
+    before = [
+        in_frame(_before(scan, track.options.before), T) for scan, T in zip(seen, to_t, strict=True)
+    ]
     weights = np.concatenate([scan.weights for scan in seen])
-    return Scan(np.concatenate(points), weights, track.recording.T_base_sensor[0])
+    view = Scan(np.concatenate(points), weights, track.recording.T_base_sensor[0])
+    return view, np.concatenate(before)
+
+
+def _before(scan: Scan, metres: float) -> Points:
+    """(N, 2) where the beams of a scan were so far before their ends, in its frame."""
+    origin = scan.T_base_sensor[:2, 2].astype(np.float32)
+    beams = scan.points - origin
+    length = np.linalg.norm(beams, axis=1, keepdims=True).clip(1e-6)
+    before: Points = origin + beams * np.maximum(0.5, 1.0 - metres / length)
+    return before
+
+
+def _comparable(grid: _core.Grid2D, view: Scan, before: Points, T: Float) -> tuple[Scan, float]:
+    """What of a view the map has looked at from the same side, and its share of the view.
+
+    The rest says nothing of whether the view fits, and draws it astray: the back of a wall is not
+    its front.
+    """
+    cells = np.floor(in_frame(before, T) / grid.resolution).astype(np.int64)
+    looked_at = grid.alpha_beta(cells).sum(axis=1) > 0.0
+    part = np.where(looked_at, view.weights, np.float32(0.0))
+    share = float(part.sum()) / max(float(view.weights.sum()), 1e-9)
+    return dataclasses.replace(view, weights=part), share
 
 
 def laid_on(
@@ -71,18 +105,24 @@ def laid_on(
     """
     options, earlier, later = track.options, candidate.earlier, candidate.later
     prior = motion.guess_at(track.poses[earlier] @ candidate.T, sigma, sigma_turn)
-    view = _view(track, later)
+    view, before = _view(track, later)
     window = options.window * sigma, min(options.window * sigma_turn, np.pi)
-    found = registration.search(grid, view, prior, track.registration, *window)
+    part, share = _comparable(grid, view, before, prior.T_map_base)
+    for _ in range(_ROUNDS):
+        found = registration.search(grid, part, prior, track.registration, *window)
+        here, share = _comparable(grid, view, before, found.T_map_base)
+        if np.abs(here.weights - part.weights).sum() < _SAME * view.weights.sum():
+            break
+        part = here
     least = [options.sigma_translation] * 2 + [options.sigma_rotation]
     covariance = found.covariance + np.diag(np.square(least))
-    too_little = found.explained < max(
+    too_little = share < options.known or found.explained < max(
         options.accept_above, options.compared * track.explained[later]
     )
     if not too_little:
         # what the graph knows of the place is no second witness: the whole way bounds it here
         free = drift(track.travelled[later] - track.travelled[earlier], options)[0]
-        covariance += _sliding(grid, view, found.T_map_base, covariance, free, track.registration)
+        covariance += _sliding(grid, part, found.T_map_base, covariance, free, track.registration)
         covariance += _ambiguous(found.rivals)
     return Closure(
         earlier,

@@ -1,0 +1,157 @@
+"""Views from the other side: the backs of walls say nothing, and who comes back looks alike."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from stillmap import _core, se2
+from stillmap.simulation import RobotOptions, Scene, simulate
+from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.simulation.walls import box
+from stillmap.slam import SlamOptions, candidates, keyframes
+from stillmap.slam.loops import Candidate, Track
+from stillmap.slam.scans import Scan
+from stillmap.slam.verification import _before, _comparable, attempts, laid_on, local_map
+
+OPTIONS = SlamOptions()
+
+
+def driven(walls, route, laser, speed=1.0):
+    """A recording of a robot that drives among walls, with true poses."""
+    scene = Scene(
+        "across",
+        walls=walls,
+        route=route,
+        crowd=CrowdOptions(people=0),
+        laser=laser,
+        robot=RobotOptions(speed=speed),
+        odometry=OdometryOptions(),
+    )
+    simulation = simulate(scene, 0)
+    truth = simulation.truth.T_world_base
+    poses = se2.inverse(truth[0]) @ truth
+    return Track(
+        simulation.recording,
+        np.full(simulation.recording.n_beams, 0.9, np.float32),
+        poses,
+        keyframes.travel(poses),
+        np.ones(len(poses)),
+        keyframes.chosen(poses, 1.0, 0.5),
+        0.05,
+        OPTIONS.registration,
+        OPTIONS.surface,
+        OPTIONS.loops,
+    )
+
+
+@functools.cache
+def divided(width):
+    """A room with a wall of 0.2 m across it, and a robot that drives around that."""
+    walls = (*box(0, 0, 24, 14), *box(0, 0, width, 0.2))
+    route = ((-8, -3.5), (9.5, -3.5), (9.5, 3.5), (-8, 3.5))
+    return driven(walls, route, LaserOptions(beams=180, max_range=30.0))
+
+
+def over_the_wall(track, before):
+    """(N, 3) by what closures over the wall miss the truth, and their chi-square (N,)."""
+    track = dataclasses.replace(track, options=dataclasses.replace(track.options, before=before))
+    x, off, chi = se2.parameters(track.poses), [], []
+    south = [k for k in track.keyframes if track.travelled[k] < 16.0]
+    north = [k for k in track.keyframes if track.travelled[k] > 28.0]
+    grid = local_map(track, 8.0)
+    for k in north:
+        i = min(south, key=lambda i: np.linalg.norm(x[i, :2] - x[k, :2]))
+        T = se2.inverse(track.poses[i]) @ track.poses[k]
+        closure = laid_on(track, grid, Candidate(i, k, T, 0.0), 0.2, 0.02)
+        if not closure.refused:
+            d = se2.parameters(se2.inverse(T) @ closure.T)
+            off.append(d)
+            chi.append(d @ np.linalg.solve(closure.covariance, d))
+    return np.array(off).reshape(-1, 3), np.array(chi)
+
+
+def test_the_back_of_a_wall_is_not_its_front():
+    # as far as what is seen goes, the room beyond a wall could begin where that on this side ends
+    off, _ = over_the_wall(divided(14), before=0.0)
+    np.testing.assert_allclose(off[:, 1], 0.2, atol=0.03)
+    off, _ = over_the_wall(divided(14), before=1.0)
+    assert len(off) == 0
+
+
+@pytest.mark.parametrize("width", [5, 7])
+def test_what_is_seen_beside_a_wall_puts_a_view_beyond_it(width):
+    off, chi = over_the_wall(divided(width), before=1.0)
+    assert len(off) >= 3
+    assert np.abs(off[:, 1]).max() < 0.02
+    assert np.abs(off[:, 2]).max() < 0.01
+    assert chi.max() < 9.0  # along the walls it may slide, and says so
+
+
+@functools.cache
+def street():
+    """Fronts of houses 24 m apart; up on one side, back on the other, looking the other way."""
+    rng = np.random.default_rng(1)
+    fronts = [
+        wall
+        for x in np.arange(0.0, 80.0, 8.0)
+        for y, sign in ((-12.0, -1.0), (12.0, 1.0))
+        for wall in box(x + 4.0, y + sign * (3.0 + rng.uniform(-2.0, 2.0)), 6.0, 6.0)
+    ]
+    route = ((2.0, -5.0), (78.0, -5.0), (78.0, 5.0), (2.0, 5.0))
+    return driven(tuple(fronts), route, LaserOptions(beams=361, max_range=80.0), speed=5.0)
+
+
+def test_who_comes_back_on_the_other_side_of_a_street_has_seen_it_before():
+    track = street()
+    looks = candidates.looks(track)
+    asked = list(candidates.of_stage(track, track.poses[track.keyframes], looks, 0, len(looks), []))
+    # never nearer than that
+    assert min(np.linalg.norm(c.T[:2, 2]) for c in asked if track.travelled[c.later] > 90.0) > 9.9
+    found = [c for c in attempts(track, asked) if not c.refused]
+    assert len(found) > 20
+    for closure in found:
+        T = se2.inverse(track.poses[closure.earlier]) @ track.poses[closure.later]
+        assert np.linalg.norm((se2.inverse(T) @ closure.T)[:2, 2]) < 0.2
+
+
+def test_where_a_keyframe_looks_by_hand():
+    track = street()
+    k = 3
+    t = int(track.keyframes[k])
+    beams = track.recording.beams_of(t)
+    hit = track.recording.hit[beams]
+    # weights are all alike; the laser sits 8 cm ahead of the middle of the robot
+    expected = track.recording.points[beams][hit].mean(axis=0)
+    np.testing.assert_allclose(candidates.looks(track)[k] - (0.08, 0.0), expected, atol=1e-4)
+
+
+def test_comparable_is_what_was_looked_at_from_the_same_side():
+    # one beam along x that ends at 5 m: the wall is seen from the left
+    grid = _core.Grid2D(0.1, 0.5)
+    T = np.eye(3)[None]
+    end = np.array([[5.05, 0.05]], np.float32)
+    one = np.array([True]), np.ones(1, np.float32), np.array([0, 1])
+    _core.add_beams(grid, end, one[0], one[1], one[2], T, remove=False)
+    ends = np.array([[5.05, 0.05], [5.05, 0.05], [5.05, 3.0]], np.float32)
+    weights = np.array([0.5, 0.3, 0.2], np.float32)
+    view = Scan(ends, weights, np.eye(3))
+    # from the left, from the right, and where nobody looked
+    before = ends + np.array([[-1, 0], [1, 0], [-1, 0]], np.float32)
+    part, share = _comparable(grid, view, before, np.eye(3))
+    np.testing.assert_array_equal(part.weights, np.array([0.5, 0.0, 0.0], np.float32))
+    assert share == pytest.approx(0.5)
+    assert part.points is view.points
+
+
+def test_where_beams_were_before_their_ends():
+    scan = Scan(
+        np.array([[5.0, 1.0], [1.0, 4.0], [1.0, 2.0]], np.float32),
+        np.ones(3, np.float32),
+        se2.matrix(1.0, 1.0, 0.3),
+    )
+    # 1 m back towards the sensor; half way where that would be farther
+    np.testing.assert_allclose(_before(scan, 1.0), [[4.0, 1.0], [1.0, 3.0], [1.0, 1.5]], atol=1e-6)
+    np.testing.assert_allclose(_before(scan, 3.0), [[3.0, 1.0], [1.0, 2.5], [1.0, 1.5]], atol=1e-6)
+    np.testing.assert_allclose(_before(scan, 0.0), scan.points)
