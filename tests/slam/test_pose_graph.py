@@ -192,7 +192,7 @@ def test_one_step_is_sharp_at_once():
     ]
     expected = optimised(plain, chain, weighted, None)
     found = optimised(dead_reckoned(chain), chain, loops, Robust(16.0, 1))
-    np.testing.assert_allclose(found, expected, atol=1e-9)
+    np.testing.assert_allclose(found, expected, atol=1e-7)  # it starts from there, to rounding
 
 
 def test_loops_that_agree_keep_all_their_weight():

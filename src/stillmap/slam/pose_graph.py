@@ -13,6 +13,9 @@ from stillmap import se2
 
 Float = NDArray[np.float64]
 
+# relative change of the cost at which a solution is one, and one is near enough to go on from
+_EXACT, _ROUGH = 1e-7, 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class Relation:
@@ -73,9 +76,11 @@ def optimised(
         loops: relations that may be false.
         robust: None: plain least squares.
     """
+    problem = _problem(poses, chain)
+    found = _least_squares(problem, problem.start, loops, np.ones(len(loops)), _EXACT)
+    out = _poses(found, poses[0])
     if robust is None or not loops:
-        return _least_squares(poses, chain, loops, np.ones(len(loops)))
-    out = _least_squares(poses, chain, loops, np.ones(len(loops)))
+        return out
     chi2 = misfits(out, loops)
     # a loop that is sure fits well even if it is false: then the way had to bend for it
     if np.append(chi2, misfits(out, chain)).max() <= robust.misfit:
@@ -84,32 +89,55 @@ def optimised(
     for step in range(robust.steps):
         mu = max(blunt ** (1.0 - (step + 1) / robust.steps), 1.0)
         weights = (mu * robust.misfit / (chi2 + mu * robust.misfit)) ** 2
-        out = _least_squares(out, chain, loops, weights)
+        tolerance = _EXACT if step + 1 == robust.steps else _ROUGH
+        found = _least_squares(problem, found, loops, weights, tolerance)
+        out = _poses(found, poses[0])
         chi2 = misfits(out, loops)
     return out
 
 
-def _least_squares(
-    poses: Float, chain: list[Relation], loops: list[Relation], weights: Float
-) -> Float:
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What stays from solution to solution, as GTSAM has it."""
+
+    chain: Any
+    start: Any
+
+
+def _problem(poses: Float, chain: list[Relation]) -> _Problem:
     import gtsam  # takes long to load
 
-    graph = gtsam.NonlinearFactorGraph()
     start = gtsam.Values()
     for k, parameters in enumerate(se2.parameters(poses)):
         start.insert(k, gtsam.Pose2(*parameters))
+    graph = gtsam.NonlinearFactorGraph()
     fixed = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
-    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*se2.parameters(poses[0])), fixed))
+    graph.add(gtsam.PriorFactorPose2(0, start.atPose2(0), fixed))
     for relation in chain:
         graph.add(_factor(relation, 1.0))
+    return _Problem(graph, start)
+
+
+def _least_squares(
+    problem: _Problem, start: Any, loops: list[Relation], weights: Float, tolerance: float
+) -> Any:
+    """The poses as GTSAM's values, to a relative tolerance of the cost."""
+    import gtsam
+
+    graph = problem.chain.clone()
     for relation, weight in zip(loops, weights.tolist(), strict=True):
         graph.add(_factor(relation, max(weight, 1e-9)))
     options = gtsam.LevenbergMarquardtParams()
-    options.setRelativeErrorTol(1e-7)
-    found = gtsam.LevenbergMarquardtOptimizer(graph, start, options).optimize()
-    at = [found.atPose2(k) for k in range(len(poses))]
-    out = se2.matrix(*np.array([[p.x(), p.y(), p.theta()] for p in at]).T)
-    out[0] = poses[0]
+    options.setRelativeErrorTol(tolerance)
+    return gtsam.LevenbergMarquardtOptimizer(graph, start, options).optimize()
+
+
+def _poses(found: Any, first: Float) -> Float:
+    """(K, 3, 3) of GTSAM's values; the first one is known."""
+    import gtsam
+
+    out = se2.matrix(*gtsam.utilities.extractPose2(found).T)
+    out[0] = first
     return out
 
 
