@@ -1,8 +1,11 @@
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/tuple.h>
 
 #include <array>
 #include <limits>
+#include <optional>
 
 #include "arrays.hpp"
 #include "bindings.hpp"
@@ -35,7 +38,13 @@ void for_each_seen(const Grid<D>& grid, Visit&& visit) {
     }
 }
 
-// Bounding box of the cells somebody looked at, to be laid out as [(z,) y, x].
+// what Python says of a box: its first cell, and its shape with the axes in reverse order
+template <int D>
+using FirstCell = std::optional<std::array<int64_t, D>>;
+template <int D>
+using Shape = std::optional<std::array<int64_t, D>>;
+
+// A box of cells, to be laid out as [(z,) y, x]: the one around those somebody looked at, or given.
 template <int D>
 struct Box {
   Cell<D> first = Cell<D>::Constant(std::numeric_limits<int32_t>::max());
@@ -53,6 +62,26 @@ struct Box {
     }
     for (int d = 0; d < D; ++d)
       size[static_cast<size_t>(d)] = static_cast<size_t>(last[d] - first[d] + 1);
+  }
+
+  Box(const std::array<int64_t, D>& first_cell, const std::array<int64_t, D>& shape) {
+    constexpr int64_t kFar = std::numeric_limits<int32_t>::max() / 2;
+    for (int d = 0; d < D; ++d) {
+      const int64_t from = first_cell[static_cast<size_t>(d)];
+      const int64_t n = shape[static_cast<size_t>(D - 1 - d)];
+      if (std::abs(from) > kFar || n < 0 || n > kFar)
+        throw std::invalid_argument("first_cell, shape: expected a box of cells that can exist");
+      first[d] = static_cast<int32_t>(from);
+      size[static_cast<size_t>(d)] = static_cast<size_t>(n);
+    }
+  }
+
+  bool holds(const Cell<D>& cell) const {
+    for (int d = 0; d < D; ++d) {
+      const int64_t n = int64_t{cell[d]} - first[d];
+      if (n < 0 || n >= static_cast<int64_t>(size[static_cast<size_t>(d)])) return false;
+    }
+    return true;
   }
 
   size_t total() const {
@@ -80,10 +109,21 @@ struct Box {
 };
 
 template <int D>
-auto dense(const Grid<D>& grid) {
+auto box_of(const Grid<D>& grid) {
   const Box<D> box(grid);
+  std::array<int64_t, D> shape;
+  for (size_t d = 0; d < D; ++d) shape[d] = static_cast<int64_t>(box.size[D - 1 - d]);
+  return std::make_pair(box.first_cell(), shape);
+}
+
+template <int D>
+auto dense(const Grid<D>& grid, const FirstCell<D>& first_cell, const Shape<D>& shape) {
+  if (first_cell.has_value() != shape.has_value())
+    throw std::invalid_argument("first_cell, shape: expected both or neither");
+  const Box<D> box = shape ? Box<D>(*first_cell, *shape) : Box<D>(grid);
   std::vector<double> alpha(box.total(), 0.0), beta(box.total(), 0.0);
   for_each_seen(grid, [&](const Cell<D>& cell, const Counts& c) {
+    if (!box.holds(cell)) return;
     alpha[box.index(cell)] = from_fixed(c.alpha);
     beta[box.index(cell)] = from_fixed(c.beta);
   });
@@ -113,9 +153,12 @@ void bind(nb::module_& m, const char* name) {
       .def("merge", &G::merge, nb::arg("other"), "Adds the sums of another grid.")
       .def("alpha_beta", &alpha_beta<D>, nb::arg("cells").noconvert(),
            "(K, 2) float64 sums of (K, D) int64 cells; 0, 0 where nobody looked.")
-      .def("dense", &dense<D>,
-           "first_cell (D,) int64 and alpha, beta over the box of cells that were looked at; axes "
-           "in reverse order, so that a 2D array is [row = y, column = x].")
+      .def("box", &box_of<D>,
+           "first_cell (D,) int64 and shape of the box of cells that were looked at, as `dense` "
+           "has them.")
+      .def("dense", &dense<D>, nb::arg("first_cell") = nb::none(), nb::arg("shape") = nb::none(),
+           "first_cell (D,) int64 and alpha, beta over a box of cells, or the one of those that "
+           "were looked at; axes in reverse order, so that a 2D array is [row = y, column = x].")
       .def("seen", &seen<D>,
            "first_cell and uint8 over the same box: 1 where alpha + beta are not zero.");
 }

@@ -115,6 +115,10 @@ class Iteration:
         """The map of this iteration, made anew at every call; every beam is believed."""
         return em.occupancy_map(self.grid, self.occupied)
 
+    def part(self, box: em.Box) -> em.OccupancyMap:
+        """The cells of a box of that map."""
+        return em.occupancy_map(self.grid, self.occupied, box=box)
+
 
 def iterate(
     recording: Recording,

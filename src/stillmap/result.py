@@ -48,7 +48,7 @@ class Result:
         covariance: (T, 3, 3) of x, y, heading against the map so far.
         p_static: (M,) float32, P(c = 1); it follows from `map` by a last E-step. NaN: unusable.
         map: what stands still.
-        raw_map: every hit counted as static, from the same poses.
+        raw_map: every hit counted as static, from the same poses; the same cells as `map`.
         best_iteration: number of the iteration that was kept.
         converged: whether the loop stopped by itself.
         warnings: one sentence each.
@@ -175,25 +175,25 @@ class _Run:
 
     def _remember(self, iteration: Iteration) -> None:
         """A part of the map for Fig. 8: where the first iteration saw most movers."""
-        occupancy = iteration.occupancy
         points = dynamic_points(iteration.seen, iteration.poses, iteration.p_static)
         dynamic = np.zeros(len(points), dtype=np.float32)
+        resolution = self.options.slam.resolution
         if self.window is None:
-            self.window = choose_window(occupancy, points, dynamic)
+            self.window = choose_window(_extent(iteration.grid), resolution, points, dynamic)
         shown = {1, 2, self.kept.number}  # and the last, whichever that will be
         self.snapshots = {n: s for n, s in self.snapshots.items() if n in shown}
+        part = iteration.part(_cells(self.window, resolution))
         self.snapshots[iteration.number] = snapshot(
-            iteration.number, occupancy, points, dynamic, self.window
+            iteration.number, part, points, dynamic, self.window
         )
 
     def result(self, recording: Recording, stages: Stages) -> Result:
         kept = self.kept
         threads = resolved_threads(self.options.threads)
-        resolution = self.options.slam.resolution
         with stages.measure("maps"):
             seen = slam.deskewed(recording, kept.poses, self.options.slam)
             filtered = self._map(seen, threads)
-            raw = _raw_map(seen, kept.poses, resolution, threads)
+            raw = _raw_map(seen, kept.poses, filtered, threads)
             del seen
         return Result(
             recording=recording,
@@ -261,12 +261,30 @@ class _Best:
         )
 
 
+def _extent(grid: _core.Grid2D) -> Window:
+    """x0, y0, x1, y1 in metres of all cells that beams crossed."""
+    first_cell, (height, width) = grid.box()
+    last = first_cell + np.array([width, height])
+    x0, y0, x1, y1 = (np.concatenate([first_cell, last]) * grid.resolution).tolist()
+    return x0, y0, x1, y1
+
+
+def _cells(window: Window, resolution: float) -> em.Box:
+    """The cells of a window whose edges lie between cells."""
+    x0, y0, x1, y1 = np.round(np.array(window) / resolution).astype(np.int64).tolist()
+    return em.Box(np.array([x0, y0], np.int64), (y1 - y0, x1 - x0))
+
+
 def _raw_map(
-    recording: Recording, poses: Float, resolution: float, threads: int
+    recording: Recording, poses: Float, filtered: em.OccupancyMap, threads: int
 ) -> em.OccupancyMap:
+    resolution = filtered.resolution
     grid = _core.Grid2D(resolution)
     em.add_recording(grid, recording, poses, None, threads)
-    return em.occupancy_map(grid)
+    x, y, _ = filtered.origin
+    first_cell = np.round(np.array([x, y]) / resolution).astype(np.int64)
+    height, width = filtered.p_occupied.shape
+    return em.occupancy_map(grid, box=em.Box(first_cell, (height, width)))
 
 
 def _warnings(

@@ -72,6 +72,35 @@ def test_dense_of_an_empty_grid(beams):
         assert seen.shape == alpha.shape
 
 
+def test_part_of_a_dense_grid(beams):
+    rng = np.random.default_rng(3)
+    for kernels in (_core, reference):
+        grid = beams.grid(kernels)
+        first, shape = grid.box()
+        whole_first, *whole = grid.dense()
+        assert first.tolist() == whole_first.tolist()
+        assert tuple(shape) == whole[0].shape
+        # boxes that hang over the edge, lie beside the cells, or hold nothing
+        for _ in range(20):
+            low = rng.integers(-20, np.array(shape[::-1]) + 20)
+            size = rng.integers(0, 30, len(shape))
+            found_first, *found = grid.dense((first + low).tolist(), size[::-1].tolist())
+            assert found_first.tolist() == (first + low).tolist()
+            for part, of in zip(found, whole, strict=True):
+                padded = np.pad(of, 60)
+                lowest = low[::-1] + 60
+                at = tuple(map(slice, lowest.tolist(), (lowest + size[::-1]).tolist()))
+                np.testing.assert_array_equal(part, padded[at])
+
+
+@pytest.mark.parametrize(
+    ("first", "shape"), [((0, 0), None), (None, (3, 3)), ((0, 2**40), (3, 3)), ((0, 0), (-1, 3))]
+)
+def test_boxes_that_cannot_be_are_refused(first, shape):
+    with pytest.raises(ValueError, match="first_cell, shape"):
+        _core.Grid2D(0.1).dense(first, shape)
+
+
 def test_seen(beams):
     for kernels in (_core, reference):
         grid = beams.grid(kernels)

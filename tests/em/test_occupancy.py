@@ -149,3 +149,24 @@ def test_without_more_knowledge_it_is_15():
         m.p_occupied[known], m.alpha[known] / (m.alpha + m.beta)[known], 1e-6
     )
     assert np.isnan(m.p_occupied[~known]).all()
+
+
+@pytest.mark.parametrize("printed", [False, True])
+def test_a_part_of_a_map_is_what_the_whole_has_there(printed, monkeypatch):
+    grid = watch([Wall([1.0, 0.0], 3.0)], 6.0, fan()).grid(None, RESOLUTION)
+    occupied = None
+    if not printed:
+        cells = np.array([[29, 0], [30, 1], [5, 0]])  # the last one outside the part
+        occupied = em.CellProbabilities(cells, np.array([0.5, 0.9, 0.4], np.float32), FREE)
+    whole = em.occupancy_map(grid, occupied)
+    first = np.round(np.array(whole.origin[:2]) / RESOLUTION).astype(int)
+    monkeypatch.setattr("stillmap.em.occupancy._TILE", 7)
+    again = em.occupancy_map(grid, occupied)
+    box = em.Box(first + np.array([20, -2]), (12, 15))
+    part = em.occupancy_map(grid, occupied, box=box)
+    assert part.origin == pytest.approx((*(box.first_cell * RESOLUTION), 0.0))
+    for name, nothing in (("p_occupied", np.nan), ("alpha", 0.0), ("beta", 0.0)):
+        all_of_it = getattr(whole, name)
+        np.testing.assert_array_equal(getattr(again, name), all_of_it)
+        padded = np.pad(all_of_it, 40, constant_values=nothing)
+        np.testing.assert_array_equal(getattr(part, name), padded[38:50, 60:75])

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from stillmap.output.crops import choose_window, snapshot
+from stillmap.output.crops import choose_window, extent, snapshot
 from stillmap.output.map_server import OutputOptions
 from stillmap.recording.model import Recording
 from stillmap.se2 import inverse, matrix
@@ -226,7 +226,7 @@ def result():
     world = points @ np.swapaxes(poses[:, :2, :2], 1, 2) + poses[:, None, :2, 2]
     world = np.where(hit[..., None], world, np.nan).reshape(-1, 2)
     labels = {number: v.reshape(-1).astype(np.float32) for number, v in ((1, first), (3, e))}
-    window = choose_window(maps[3], world, labels[3], 8.0)
+    window = choose_window(extent(maps[3]), maps[3].resolution, world, labels[3], 8.0)
     return FakeResult(
         recording=recording,
         options=FakeOptions(),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.output import crops
-from stillmap.output.crops import choose_window, cut, snapshot
+from stillmap.output.crops import choose_window, cut, extent, snapshot
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def test_window_lies_where_most_moves(grid):
         ]
     )
     p = np.concatenate([np.full(400, 0.1), np.full(900, 0.9), [0.1]]).astype(np.float32)
-    x0, y0, x1, y1 = choose_window(grid, points, p, 6.0)
+    x0, y0, x1, y1 = choose_window(extent(grid), grid.resolution, points, p, 6.0)
     assert (x1 - x0, y1 - y0) == (6.0, 6.0)
     assert abs((x0 + x1) / 2 - 20) < 1.5
     assert abs((y0 + y1) / 2 - 20) < 1.5
@@ -40,14 +40,21 @@ def test_window_stays_on_the_map(grid):
     rng = np.random.default_rng(0)
     points = cloud(rng, (-9.5, 34.5), 200, 0.3)
     p = np.zeros(200, np.float32)
-    assert choose_window(grid, points, p, 8.0) == (-10.0, 27.0, -2.0, 35.0)
+    assert choose_window(extent(grid), grid.resolution, points, p, 8.0) == (-10.0, 27.0, -2.0, 35.0)
     # a map smaller than the window is shown whole
-    assert choose_window(grid, points, p, 500.0) == (-10.0, 5.0, 40.0, 35.0)
+    assert choose_window(extent(grid), grid.resolution, points, p, 500.0) == (
+        -10.0,
+        5.0,
+        40.0,
+        35.0,
+    )
 
 
 @pytest.mark.parametrize("n", [0, 5])
 def test_without_dynamic_beams_the_middle(grid, n):
-    window = choose_window(grid, np.zeros((n, 2)), np.ones(n, np.float32), 10.0)
+    window = choose_window(
+        extent(grid), grid.resolution, np.zeros((n, 2)), np.ones(n, np.float32), 10.0
+    )
     assert window == (10.0, 15.0, 20.0, 25.0)
 
 

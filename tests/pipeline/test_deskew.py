@@ -82,8 +82,11 @@ def test_map_and_labels_are_made_of_the_same_points(room, swept, estimator, give
     assert result.recording is swept
     raw = _core.Grid2D(RESOLUTION)
     em.add_recording(raw, result.seen, result.poses, None)
-    np.testing.assert_array_equal(result.raw_map.alpha, raw.dense()[1])
-    np.testing.assert_array_equal(result.raw_map.beta, raw.dense()[2])
+    m = result.raw_map
+    first_cell = np.round(np.array(m.origin[:2]) / RESOLUTION).astype(int).tolist()
+    _, alpha, beta = raw.dense(first_cell, m.alpha.shape)
+    np.testing.assert_array_equal(m.alpha, alpha.astype(np.float32))
+    np.testing.assert_array_equal(m.beta, beta.astype(np.float32))
 
 
 @pytest.mark.parametrize("odometry", [True, False])

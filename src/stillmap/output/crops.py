@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stillmap.output.points import DYNAMIC_BELOW
 
 if TYPE_CHECKING:
-    from stillmap.output.protocols import OccupancyMapLike
+    from stillmap.output.protocols import MapLike
 
 Window = tuple[float, float, float, float]
 _MOST_POINTS = 50_000
@@ -34,7 +34,7 @@ class Snapshot:
     dynamic_points: NDArray[np.float32]
 
 
-def extent(occupancy: "OccupancyMapLike") -> Window:
+def extent(occupancy: "MapLike") -> Window:
     """x0, y0, x1, y1 of the whole map in metres, in the map frame."""
     x, y, yaw = occupancy.origin
     if yaw != 0:
@@ -44,7 +44,8 @@ def extent(occupancy: "OccupancyMapLike") -> Window:
 
 
 def choose_window(
-    occupancy: "OccupancyMapLike",
+    whole: Window,
+    resolution: float,
     points_world: NDArray[np.float64] | NDArray[np.float32],
     p_static: NDArray[np.float32],
     size_m: float = 12.0,
@@ -52,7 +53,8 @@ def choose_window(
     """The square of edge `size_m` that holds most dynamic end points, within the map's bounds.
 
     Args:
-        occupancy: the map.
+        whole: x0, y0, x1, y1 of the map in metres.
+        resolution: edge of its cells in metres.
         points_world: (M, 2) end points in the map frame; rows that are no hits are NaN.
         p_static: (M,) their probabilities of being static.
         size_m: edge in metres; smaller where the map is smaller.
@@ -60,7 +62,7 @@ def choose_window(
     Returns:
         x0, y0, x1, y1 in metres. Without dynamic beams: the middle of the map.
     """
-    x0, y0, x1, y1 = extent(occupancy)
+    x0, y0, x1, y1 = whole
     size = np.minimum(size_m, [x1 - x0, y1 - y0])
     low, high = np.array([x0, y0]), np.array([x1, y1]) - size
     points = points_world[_dynamic_within(points_world, p_static, (x0, y0, x1, y1))]
@@ -68,20 +70,19 @@ def choose_window(
     if len(points):
         corner = np.clip(_densest(points, low, size_m) - size_m / 2, low, high)
     # on the grid's own lines, so that every iteration shows the same cells
-    step = occupancy.resolution
-    corner = low + np.floor((corner - low) / step + 1e-6) * step
+    corner = low + np.floor((corner - low) / resolution + 1e-6) * resolution
     (left, bottom), (right, top) = corner.tolist(), (corner + size).tolist()
     return left, bottom, right, top
 
 
 def snapshot(
     number: int,
-    occupancy: "OccupancyMapLike",
+    occupancy: "MapLike",
     points_world: NDArray[np.float64] | NDArray[np.float32],
     p_static: NDArray[np.float32],
     window: Window,
 ) -> Snapshot:
-    """The part of iteration `number`'s map that lies in `window`; arguments as `choose_window`."""
+    """The part of iteration `number`'s map that lies in `window`; points as `choose_window`."""
     p_occupied, origin = cut(occupancy, window)
     inside = np.flatnonzero(_dynamic_within(points_world, p_static, window))
     if len(inside) > _MOST_POINTS:
@@ -96,7 +97,7 @@ def snapshot(
 
 
 def cut(
-    occupancy: "OccupancyMapLike", window: Window
+    occupancy: "MapLike", window: Window
 ) -> tuple[NDArray[np.float32], tuple[float, float, float]]:
     """The cells (h, w) in `window` and their origin; NaN where the window leaves the map."""
     x, y, _, _ = extent(occupancy)

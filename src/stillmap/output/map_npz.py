@@ -17,8 +17,8 @@ def write_map_npz(path: Path, occupancy: OccupancyMapLike) -> None:
     """
     arrays: dict[str, NDArray[Any]] = {
         "p_occupied": np.asarray(occupancy.p_occupied, np.float32),
-        "alpha": np.asarray(occupancy.alpha, np.float64),
-        "beta": np.asarray(occupancy.beta, np.float64),
+        "alpha": np.asarray(occupancy.alpha, np.float32),
+        "beta": np.asarray(occupancy.beta, np.float32),
         "origin": np.asarray(occupancy.origin, np.float64),
         "resolution": np.asarray(occupancy.resolution, np.float64),
     }

@@ -12,7 +12,7 @@ from PIL import Image
 from stillmap.options import field_with_doc
 
 if TYPE_CHECKING:
-    from stillmap.output.protocols import OccupancyMapLike
+    from stillmap.output.protocols import MapLike
 
 MapMode = Literal["trinary", "scale", "raw"]
 
@@ -66,9 +66,7 @@ def raw_pixels(p_occupied: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.where(known, np.rint(100 * np.where(known, p_occupied, 0)), 255).astype(np.uint8)
 
 
-def write_map_server(
-    folder: Path, occupancy: "OccupancyMapLike", mode: MapMode = "trinary"
-) -> None:
+def write_map_server(folder: Path, occupancy: "MapLike", mode: MapMode = "trinary") -> None:
     """Write `map.pgm` (`map.png` in scale mode) and `map.yaml` into `folder`.
 
     The picture's top row is the map's highest y; the origin is the lower-left pixel's pose.

@@ -11,13 +11,11 @@ from stillmap.output.map_server import OutputOptions
 from stillmap.recording.model import Recording
 
 
-class OccupancyMapLike(Protocol):
+class MapLike(Protocol):
     """A grid map, row 0 at the lowest y.
 
     Attributes:
         p_occupied: (H, W) float32, NaN where no beam tells anything.
-        alpha: (H, W) float64, the sums of (10): beams that ended on something static here.
-        beta: (H, W) float64, the sums of (10): evidence that the cell is free.
         origin: x, y in metres and yaw in radians of the lower-left cell's lower-left corner.
         resolution: edge of a cell in metres.
     """
@@ -25,13 +23,23 @@ class OccupancyMapLike(Protocol):
     @property
     def p_occupied(self) -> NDArray[np.float32]: ...
     @property
-    def alpha(self) -> NDArray[np.float64]: ...
-    @property
-    def beta(self) -> NDArray[np.float64]: ...
-    @property
     def origin(self) -> tuple[float, float, float]: ...
     @property
     def resolution(self) -> float: ...
+
+
+class OccupancyMapLike(MapLike, Protocol):
+    """A grid map with what it is made from.
+
+    Attributes:
+        alpha: (H, W) float32, the sums of (10): beams that ended on something static here.
+        beta: (H, W) float32, the sums of (10): evidence that the cell is free.
+    """
+
+    @property
+    def alpha(self) -> NDArray[np.float32]: ...
+    @property
+    def beta(self) -> NDArray[np.float32]: ...
 
 
 class IterationRecordLike(Protocol):
@@ -160,7 +168,7 @@ class ResultLike(Protocol):
         poses: (T, D+1, D+1) float64, T_map_base.
         p_static: (M,) float32, P(c = 1); NaN for unusable beams, the prior at maximum range.
         map: the map of what stands still.
-        raw_map: the map with every hit counted in full, from the same poses.
+        raw_map: the map with every hit counted in full, from the same poses, of the same cells.
         best_iteration: number of the iteration that was kept.
         converged: whether the loop stopped by itself.
         warnings: one sentence each.

@@ -11,7 +11,7 @@ from PIL import Image
 
 from stillmap.output.crops import Snapshot, Window, cut, extent
 from stillmap.output.map_server import OCCUPIED_THRESH
-from stillmap.output.protocols import OccupancyMapLike
+from stillmap.output.protocols import MapLike
 
 ORANGE = (240, 120, 0)
 UNKNOWN = (190, 196, 204)
@@ -22,7 +22,7 @@ _SHOWN_WIDTH = 600
 _UNKNOWN_INDEX, _ORANGE_INDEX = 101, 102
 
 
-def shown_window(maps: Sequence[OccupancyMapLike]) -> Window:
+def shown_window(maps: Sequence[MapLike]) -> Window:
     """The smallest window that holds every occupied cell of `maps`, with a margin.
 
     Free space may reach far beyond, where beams met nothing. Without an occupied cell the window
@@ -38,7 +38,7 @@ def shown_window(maps: Sequence[OccupancyMapLike]) -> Window:
     return extent(maps[0])
 
 
-def map_image(occupancy: OccupancyMapLike, window: Window) -> Image.Image:
+def map_image(occupancy: MapLike, window: Window) -> Image.Image:
     """White free, grey unknown, black occupied; large maps are reduced to the pixel budget."""
     cells, _ = cut(occupancy, window)
     factor = max(1, math.ceil(math.sqrt(cells.size / PIXEL_BUDGET)))
@@ -89,15 +89,15 @@ def png_uri(image: Image.Image) -> str:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _occupied(occupancy: OccupancyMapLike) -> NDArray[np.bool_]:
+def _occupied(occupancy: MapLike) -> NDArray[np.bool_]:
     return occupancy.p_occupied > OCCUPIED_THRESH
 
 
-def _known(occupancy: OccupancyMapLike) -> NDArray[np.bool_]:
+def _known(occupancy: MapLike) -> NDArray[np.bool_]:
     return ~np.isnan(occupancy.p_occupied)
 
 
-def _box(occupancy: OccupancyMapLike, cells: NDArray[np.bool_]) -> Window | None:
+def _box(occupancy: MapLike, cells: NDArray[np.bool_]) -> Window | None:
     """The window around the chosen cells, a margin of a twentieth included."""
     rows, columns = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
     if not len(rows):

@@ -58,22 +58,32 @@ class Grid:
         for cell, moment in other.moment.items():
             self.moment[cell] = self.moment.get(cell, np.zeros(self.dimension)) + moment
 
-    def dense(self) -> tuple[Int, Float, Float]:
-        """The bounding box of all touched cells.
+    def box(self) -> tuple[Int, tuple[int, ...]]:
+        """The bounding box of all touched cells: its first cell (D,), and its shape as `dense`."""
+        if not self.alpha:
+            return np.zeros(self.dimension, np.int64), (0,) * self.dimension
+        cells = np.array(list(self.alpha), np.int64)
+        first = cells.min(axis=0)
+        return first, tuple((cells.max(axis=0) - first + 1)[::-1].tolist())
+
+    def dense(
+        self, first_cell: ArrayLike | None = None, shape: tuple[int, ...] | None = None
+    ) -> tuple[Int, Float, Float]:
+        """A box of cells, or the one around all that were touched.
 
         Returns:
             first_cell (D,), the cell of the lowest corner; alpha and beta with the axes reversed,
             so that in 2D they are indexed [row = y, column = x].
         """
-        if not self.alpha:
-            empty = np.zeros((0,) * self.dimension)
-            return np.zeros(self.dimension, np.int64), empty, empty.copy()
-        cells = np.array(list(self.alpha), np.int64)
-        first = cells.min(axis=0)
-        index = tuple((cells - first).T[::-1])
-        shape = tuple((cells.max(axis=0) - first + 1)[::-1])
+        if first_cell is None or shape is None:
+            first, shape = self.box()
+        else:
+            first = np.asarray(first_cell, np.int64)
         alpha, beta = np.zeros(shape), np.zeros(shape)
-        alpha[index], beta[index] = list(self.alpha.values()), list(self.beta.values())
+        for cell in self.alpha:
+            index = tuple((np.array(cell) - first)[::-1].tolist())
+            if all(0 <= i < n for i, n in zip(index, shape, strict=True)):
+                alpha[index], beta[index] = self.alpha[cell], self.beta[cell]
         return first, alpha, beta
 
     def seen(self) -> tuple[Int, NDArray[np.uint8]]:
