@@ -1,0 +1,234 @@
+"""Moving things followed from scan to scan: which end point is of which thing."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.objects import kalman, separation
+from stillmap.objects.kalman import Motion
+from stillmap.objects.moving import MovingPoints
+from stillmap.objects.options import ObjectOptions
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+NOBODY = -1
+
+
+def followed(points: MovingPoints, options: ObjectOptions) -> Index:
+    """(N,) numbers of things, from 0 in the order in which they were first seen.
+
+    What a thing looked like of late, moved to where it is expected, claims the end points nearest
+    to it; what nothing claims begins a new thing, one for each cluster.
+
+    Args:
+        points: what moves.
+        options: see ObjectOptions.
+    """
+    following = _Following(points, options)
+    for scan in np.unique(points.scan).tolist():
+        following.take(scan)
+    return following.owner
+
+
+class _Following:
+    """Things as they are followed: their motion, and what was seen of them of late."""
+
+    def __init__(self, points: MovingPoints, options: ObjectOptions) -> None:
+        self.owner = np.full(len(points.scan), NOBODY)
+        self._points, self._options = points, options
+        self._now, self._count = 0.0, 0
+        self._motion = kalman.still(np.zeros((0, 2)), 1.0, 1.0)
+        self._id, self._last = np.zeros(0, np.intp), np.zeros(0)
+        # what was seen of them: offsets from where they were, of which thing, when
+        self._offset, self._of, self._when = np.zeros((0, 2)), np.zeros(0, np.intp), np.zeros(0)
+
+    def take(self, scan: int) -> None:
+        """Goes on to a scan, and says whose its points are."""
+        points, options = self._points, self._options
+        here = np.arange(points.first[scan], points.first[scan + 1])
+        dt, self._now = points.seconds[scan] - self._now, float(points.seconds[scan])
+        self._forget(self._now - self._last <= options.gap)
+        self._motion = kalman.predicted(self._motion, dt, options.acceleration)
+        claims = self._claims(here)
+        for thing, kept, gone in torn_apart(points, here, claims, options):
+            claims[gone] = NOBODY
+            self._tear(here, claims, thing, here[kept], here[gone])
+        self._update(here, claims)
+        self._begin(here, claims)
+        self.owner[here] = self._id[claims]
+
+    def _claims(self, here: Index) -> Index:
+        """Which thing claims each point."""
+        claims = np.full(len(here), NOBODY)
+        if len(self._motion) == 0:
+            return claims
+        options, xy = self._options, self._points.xy[here]
+        cluster = self._points.cluster[here] - self._points.cluster[here[0]]
+        squared = self._squared_distances(xy)
+        variance = options.sigma**2 + self._motion.P[:, 0]
+        cost = squared / variance + np.log(variance)  # -2 ln of a Gaussian on two axes, halved
+        sigma = self._motion.sigma
+        near = np.minimum(options.near + options.near_sigmas * sigma, options.farthest)
+        claims = _cheapest(cost, squared < near**2)
+        if (claims == NOBODY).any():
+            found = np.bincount(claims[claims >= 0], minlength=len(sigma)) > 0
+            taken = np.bincount(cluster[claims >= 0], minlength=cluster[-1] + 1) > 0
+            far = np.minimum(options.far + options.near_sigmas * sigma, options.farthest)
+            allowed = (squared < far**2) & ~found & ~taken[cluster][:, None]
+            claims = np.where(claims == NOBODY, _cheapest(cost, allowed), claims)
+            claims = _whole_clusters(claims, cluster, len(sigma))
+        return claims
+
+    def _squared_distances(self, xy: Float) -> Float:
+        """(n, K) of points to what was seen of each thing, where that is expected now."""
+        expected = self._motion.x[self._of] + self._offset
+        squared = np.square(xy[:, None] - expected).sum(axis=-1)
+        begin = np.searchsorted(self._of, np.arange(len(self._motion)))
+        return np.asarray(np.minimum.reduceat(squared, begin, axis=1))
+
+    def _tear(self, here: Index, claims: Index, thing: int, kept: Index, gone: Index) -> None:
+        """One thing turns out to be two: since when, and who of them was there before."""
+        owned = np.flatnonzero(self.owner[: here[0]] == self._id[thing])
+        torn = separation.torn(self._points, owned, kept, gone, self._options)
+        new = len(self._motion)
+        for k, now, before in (
+            (thing, torn.older_now, torn.older_before),
+            (new, torn.newer_now, torn.newer_before),
+        ):
+            claims[np.isin(here, now)] = k
+            self._set(k, now, separation.velocity(self._points, before, self._now))
+        self.owner[torn.newer_before] = self._id[new]
+
+    def _set(self, k: int, now: Index, velocity: Float) -> None:
+        """Thing k is where these points are; a new one if there is none of that number."""
+        xy = self._points.xy[now]
+        begun = kalman.still(xy.mean(axis=0)[None], self._options.sigma, self._options.sigma_speed)
+        begun = Motion(begun.x, velocity[None], begun.P)
+        if k == len(self._motion):
+            self._append(begun)
+        else:
+            for ours, theirs in zip(_arrays(self._motion), _arrays(begun), strict=True):
+                ours[k] = theirs[0]
+        self._forget_shape(self._of != k)
+        self._see(xy, np.full(len(now), k))
+
+    def _update(self, here: Index, claims: Index) -> None:
+        """Things are where their points are."""
+        got = claims >= 0
+        count = np.bincount(claims[got], minlength=len(self._motion))
+        seen, xy = count > 0, self._points.xy[here][got]
+        at = _means(xy, claims[got], count)
+        self._motion = kalman.updated(self._motion, seen, at, self._options.sigma)
+        self._last[seen] = self._now
+        # who is hidden keeps its shape
+        self._forget_shape((self._now - self._when < self._options.shape) | ~seen[self._of])
+        self._see(xy, claims[got])
+
+    def _begin(self, here: Index, claims: Index) -> None:
+        """What nobody claims: a new thing for each cluster."""
+        free = claims == NOBODY
+        if not free.any():
+            return
+        _, which = np.unique(self._points.cluster[here[free]], return_inverse=True)
+        xy, first = self._points.xy[here[free]], len(self._motion)
+        at = _means(xy, which, np.bincount(which))
+        self._append(kalman.still(at, self._options.sigma, self._options.sigma_speed))
+        claims[free] = first + which
+        self._see(xy, claims[free])
+
+    def _append(self, begun: Motion) -> None:
+        self._motion = kalman.joined(self._motion, begun)
+        numbers = self._count + np.arange(len(begun))
+        self._id, self._count = np.concatenate([self._id, numbers]), self._count + len(begun)
+        self._last = np.concatenate([self._last, np.full(len(begun), self._now)])
+
+    def _see(self, xy: Float, of: Index) -> None:
+        """Adds to the shapes; they lie in the order of things."""
+        of_all = np.concatenate([self._of, of])
+        order = np.argsort(of_all, kind="stable")
+        self._offset = np.concatenate([self._offset, xy - self._motion.x[of]])[order]
+        self._when = np.concatenate([self._when, np.full(len(of), self._now)])[order]
+        self._of = of_all[order]
+
+    def _forget(self, kept: NDArray[np.bool_]) -> None:
+        """Things that are gone."""
+        if kept.all():
+            return
+        self._forget_shape(kept[self._of])
+        self._of = (np.cumsum(kept) - 1)[self._of]
+        self._motion, self._id = self._motion.of(kept), self._id[kept]
+        self._last = self._last[kept]
+
+    def _forget_shape(self, kept: NDArray[np.bool_]) -> None:
+        self._offset, self._of, self._when = (
+            self._offset[kept],
+            self._of[kept],
+            self._when[kept],
+        )
+
+
+def torn_apart(
+    points: MovingPoints, here: Index, claims: Index, options: ObjectOptions
+) -> list[tuple[int, Index, Index]]:
+    """Things of which parts lie too far from one another to be one.
+
+    Args:
+        points: what moves.
+        here: (n,) the points of a scan.
+        claims: (n,) whose they are.
+        options: see ObjectOptions.
+
+    Returns:
+        The thing, and indices into `here` of the parts that hold together around its largest
+        cluster, and of those that do not, of which only the largest cluster.
+    """
+    cluster = points.cluster[here]
+    pairs = np.unique(np.column_stack([claims, cluster])[claims >= 0], axis=0)
+    repeated = np.unique(pairs[1:, 0][np.diff(pairs[:, 0]) == 0])
+    out = []
+    for thing in repeated.tolist():
+        own = np.flatnonzero(claims == thing)
+        parts = [own[cluster[own] == c] for c in np.unique(cluster[own])]
+        far = options.apart + options.link_slope * points.range[here[own]].min()
+        kept, gone = _held_together([points.xy[here[part]] for part in parts], far)
+        if gone:
+            largest = max(gone, key=lambda i: len(parts[i]))
+            out.append((thing, np.concatenate([parts[i] for i in kept]), parts[largest]))
+    return out
+
+
+def _held_together(parts: list[Float], far: float) -> tuple[list[int], list[int]]:
+    """Parts within `far` of the largest one, or of others that are; and the others."""
+    kept = [max(range(len(parts)), key=lambda i: len(parts[i]))]
+    gone = [i for i in range(len(parts)) if i not in kept]
+    for i in kept:  # grows as it goes
+        for j in list(gone):
+            if np.linalg.norm(parts[i][:, None] - parts[j], axis=-1).min() < far:
+                kept.append(j)
+                gone.remove(j)
+    return kept, gone
+
+
+def _cheapest(cost: Float, allowed: NDArray[np.bool_]) -> Index:
+    """(n,) columns with the least cost of those allowed; NOBODY where none is."""
+    cost = np.where(allowed, cost, np.inf)
+    best = cost.argmin(axis=1)
+    return np.where(np.isfinite(cost[np.arange(len(cost)), best]), best, NOBODY)
+
+
+def _whole_clusters(claims: Index, cluster: Index, things: int) -> Index:
+    """What nobody claims goes with who claims most of its cluster."""
+    votes = np.zeros((cluster[-1] + 1, things), np.intp)
+    got = claims >= 0
+    np.add.at(votes, (cluster[got], claims[got]), 1)
+    best = np.where(votes.max(axis=1) > 0, votes.argmax(axis=1), NOBODY)
+    return np.where(got, claims, best[cluster])
+
+
+def _means(xy: Float, of: Index, count: Index) -> Float:
+    """(K, 2) means of points by their numbers; 0 where there are none."""
+    sums = [np.bincount(of, xy[:, d], minlength=len(count)) for d in (0, 1)]
+    return np.asarray(np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None])
+
+
+def _arrays(motion: Motion) -> tuple[Float, Float, Float]:
+    return motion.x, motion.v, motion.P

@@ -1,0 +1,84 @@
+"""Kalman filters of many things that go on as they went: both axes alike, and all at once."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Where K things are, and how fast.
+
+    Attributes:
+        x: (K, 2) metres.
+        v: (K, 2) metres per second.
+        P: (K, 3) covariance on either axis: of place, of place with speed, of speed.
+    """
+
+    x: Float
+    v: Float
+    P: Float
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    @property
+    def sigma(self) -> Float:
+        """(K,) standard deviation of the place on either axis, metres."""
+        return np.asarray(np.sqrt(self.P[:, 0]))
+
+    def of(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "Motion":
+        """Some of them."""
+        return Motion(self.x[chosen], self.v[chosen], self.P[chosen])
+
+
+def still(x: Float, sigma: float, sigma_speed: float) -> Motion:
+    """Things at (K, 2) of which nothing is known but that; metres, and metres per second."""
+    return Motion(x, np.zeros_like(x), np.tile([sigma**2, 0.0, sigma_speed**2], (len(x), 1)))
+
+
+def joined(a: Motion, b: Motion) -> Motion:
+    """The things of both."""
+    return Motion(*(np.concatenate([p, q]) for p, q in ((a.x, b.x), (a.v, b.v), (a.P, b.P))))
+
+
+def predicted(motion: Motion, dt: float, acceleration: float) -> Motion:
+    """After so many seconds; back in time where they are negative.
+
+    Args:
+        motion: now.
+        dt: seconds.
+        acceleration: m2/s3, density of white acceleration.
+    """
+    xx, xv, vv = motion.P.T
+    q, t = acceleration, abs(dt)
+    P = np.stack(
+        [
+            xx + 2.0 * dt * xv + dt**2 * vv + q * t**3 / 3.0,
+            xv + dt * vv + q * dt * t / 2.0,
+            vv + q * t,
+        ],
+        axis=-1,
+    )
+    return Motion(motion.x + motion.v * dt, motion.v, P)
+
+
+def updated(motion: Motion, seen: NDArray[np.bool_], at: Float, sigma: float) -> Motion:
+    """After some things were seen.
+
+    Args:
+        motion: as predicted.
+        seen: (K,) which.
+        at: (K, 2) where; not looked at where a thing was not seen.
+        sigma: metres, of that.
+    """
+    xx, xv, vv = motion.P.T
+    innovation = np.where(seen, xx + sigma**2, np.inf)
+    gain_x, gain_v = xx / innovation, xv / innovation
+    residual = np.where(seen[:, None], at - motion.x, 0.0)
+    P = np.stack([xx * (1.0 - gain_x), xv * (1.0 - gain_x), vv - gain_v * xv], axis=-1)
+    x, v = motion.x + gain_x[:, None] * residual, motion.v + gain_v[:, None] * residual
+    return Motion(x, v, P)
