@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from stillmap import _core, em, slam
 from stillmap.em import EmOptions
+from stillmap.objects import ObjectOptions
 from stillmap.options import field_with_doc
 from stillmap.output.map_server import OutputOptions
 from stillmap.recording.model import Recording
@@ -39,6 +40,7 @@ class Options:
     read: ReadOptions = field(default=ReadOptions())
     em: EmOptions = field(default=EmOptions())
     slam: SlamOptions = field(default=SlamOptions())
+    objects: ObjectOptions = field(default=ObjectOptions())
     output: OutputOptions = field(default=OutputOptions())
 
     def __post_init__(self) -> None:

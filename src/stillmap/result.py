@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core, em, pipeline, slam
+from stillmap.objects import MovingObject, Traffic, moving_objects, traffic
 from stillmap.output.crops import Snapshot, Window, choose_window, snapshot
 from stillmap.output.points import dynamic_points
 from stillmap.output.save import save
@@ -56,6 +57,8 @@ class Result:
         loops: attempts at closing loops in the best iteration, accepted or refused.
         doubts: where odometry and scans do not agree.
         graph: the pose graph of these loops; None where poses were given or none were looked for.
+        objects: what moved, in the order in which it was first seen.
+        traffic: how often each square of the floor was crossed by them.
         stages: seconds and peak memory.
     """
 
@@ -75,6 +78,8 @@ class Result:
     loops: list[slam.Closure]
     doubts: slam.Doubts
     graph: slam.Graph | None
+    objects: list[MovingObject]
+    traffic: Traffic
     stages: Mapping[str, Mapping[str, Any]]
 
     @property
@@ -194,6 +199,9 @@ class _Run:
             seen = slam.deskewed(recording, kept.poses, self.options.slam)
             filtered = self._map(seen, threads)
             raw = _raw_map(seen, kept.poses, filtered, threads)
+        with stages.measure("objects"):
+            moving = moving_objects(seen, kept.poses, kept.p_static, self.options.objects)
+            crossed = traffic(moving)
             del seen
         return Result(
             recording=recording,
@@ -212,6 +220,8 @@ class _Run:
             loops=kept.loops,
             doubts=kept.doubts,
             graph=kept.graph,
+            objects=moving,
+            traffic=crossed,
             stages=stages.to_dict(),
         )
 

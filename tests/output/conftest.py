@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from stillmap.objects import MovingObject, ObjectOptions, Traffic, traffic
 from stillmap.output.crops import choose_window, extent, snapshot
 from stillmap.output.map_server import OutputOptions
 from stillmap.recording.model import Recording
@@ -41,6 +42,7 @@ class EmOptions:
 class FakeOptions:
     estimator: str = "stillmap"
     em: EmOptions = field(default_factory=EmOptions)
+    objects: ObjectOptions = field(default_factory=ObjectOptions)
     output: OutputOptions = field(default_factory=OutputOptions)
 
 
@@ -87,6 +89,8 @@ class FakeResult:
     learned: dict
     loops: list
     stages: dict
+    objects: list = field(default_factory=list)
+    traffic: Traffic = field(default_factory=lambda: traffic([]))
     graph: Graph | None = None
     doubts: Doubts = field(default_factory=Doubts)
 
@@ -201,6 +205,21 @@ def _graph(poses):
     return Graph(scans, at, found)
 
 
+def made_up_objects(recording, p_static, scan):
+    """Two things that go straight on, and the beams on moving things shared among them."""
+    beams = np.flatnonzero(p_static < 0.3)
+    out = []
+    for number, (xy, v) in enumerate((((2.0, 1.0), (0.5, 0.25)), ((9.0, 4.0), (-0.4, 0.0)))):
+        mine = beams[number::2]
+        scans = np.unique(scan[mine])
+        stamp_ns = recording.stamp_ns[scans]
+        seconds = 1e-9 * (stamp_ns - stamp_ns[0])
+        way = np.array(xy) + seconds[:, None] * np.array(v)
+        velocity = np.tile(v, (len(scans), 1))
+        out.append(MovingObject(number, scans, stamp_ns, way, velocity, (0.5, 0.3), mine, 0.9))
+    return out
+
+
 @pytest.fixture(scope="session")
 def result():
     rng = np.random.default_rng(3)
@@ -227,7 +246,10 @@ def result():
     world = np.where(hit[..., None], world, np.nan).reshape(-1, 2)
     labels = {number: v.reshape(-1).astype(np.float32) for number, v in ((1, first), (3, e))}
     window = choose_window(extent(maps[3]), maps[3].resolution, world, labels[3], 8.0)
+    objects = made_up_objects(recording, e.reshape(-1), np.repeat(np.arange(T), N))
     return FakeResult(
+        objects=objects,
+        traffic=traffic(objects),
         recording=recording,
         options=FakeOptions(),
         iterations=[

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from stillmap.errors import InputError
+from stillmap.objects import ObjectOptions
 from stillmap.output import save as save_module
 from stillmap.output.map_server import OutputOptions
 from stillmap.output.save import save
@@ -20,6 +21,10 @@ FILES = {
     "beams/offset.npy",
     "beams/p_static.npy",
     "beams/hit.npy",
+    "objects/objects.json",
+    "objects/0000.ply",
+    "objects/0001.ply",
+    "traffic.npz",
     "report.html",
     "run.json",
 }
@@ -48,6 +53,13 @@ def test_the_folder_is_complete_and_agrees_with_itself(tmp_path, result):
 def test_no_graph_no_file(tmp_path, result):
     save(dataclasses.replace(result, graph=None), tmp_path / "out")
     assert set(contents(tmp_path / "out")) == FILES - {"graph.g2o"}
+
+
+def test_objects_that_were_not_asked_for_have_no_files(tmp_path, result):
+    options = dataclasses.replace(result.options, objects=ObjectOptions(enabled=False))
+    save(dataclasses.replace(result, options=options), tmp_path / "out")
+    left_out = {name for name in FILES if name.startswith(("objects/", "traffic"))}
+    assert set(contents(tmp_path / "out")) == FILES - left_out
 
 
 def test_same_result_same_bytes_except_for_timings(tmp_path, result):

@@ -11,17 +11,21 @@ from stillmap.output.protocols import OccupancyMapLike
 
 
 def write_map_npz(path: Path, occupancy: OccupancyMapLike) -> None:
-    """Write `p_occupied`, `alpha`, `beta` (H, W), `origin` (x, y, yaw) and `resolution` in metres.
+    """Write `p_occupied`, `alpha`, `beta` (H, W), `origin` (x, y, yaw), `resolution` in metres."""
+    write_npz(
+        path,
+        {
+            "p_occupied": np.asarray(occupancy.p_occupied, np.float32),
+            "alpha": np.asarray(occupancy.alpha, np.float32),
+            "beta": np.asarray(occupancy.beta, np.float32),
+            "origin": np.asarray(occupancy.origin, np.float64),
+            "resolution": np.asarray(occupancy.resolution, np.float64),
+        },
+    )
 
-    Equal maps give equal bytes: the archive's dates are fixed.
-    """
-    arrays: dict[str, NDArray[Any]] = {
-        "p_occupied": np.asarray(occupancy.p_occupied, np.float32),
-        "alpha": np.asarray(occupancy.alpha, np.float32),
-        "beta": np.asarray(occupancy.beta, np.float32),
-        "origin": np.asarray(occupancy.origin, np.float64),
-        "resolution": np.asarray(occupancy.resolution, np.float64),
-    }
+
+def write_npz(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    """Write arrays by their names. Equal ones give equal bytes: the archive's dates are fixed."""
     # most cells of most maps are alike: a tenth of the size, and quicker than writing them all;
     # beyond level 1 it takes three times as long for a few percent
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:

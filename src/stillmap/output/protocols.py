@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.objects.options import ObjectOptions
 from stillmap.output.crops import Snapshot
 from stillmap.output.map_server import OutputOptions
 from stillmap.recording.model import Recording
@@ -142,16 +143,71 @@ class GraphLike(Protocol):
     def relations(self) -> Sequence[RelationLike]: ...
 
 
+class MovingObjectLike(Protocol):
+    """Something that moved.
+
+    Attributes:
+        id: its number.
+        scan: (L,) scans that saw it.
+        stamp_ns: (L,) their stamps.
+        xy: (L, 2) metres, its middle in the map frame.
+        velocity: (L, 2) metres per second.
+        size: metres along and across the way it went.
+        beams: (n,) beams of the recording that ended on it.
+        p_dynamic: mean probability of these beams to be dynamic.
+    """
+
+    @property
+    def id(self) -> int: ...
+    @property
+    def scan(self) -> NDArray[np.intp]: ...
+    @property
+    def stamp_ns(self) -> NDArray[np.int64]: ...
+    @property
+    def xy(self) -> NDArray[np.float64]: ...
+    @property
+    def velocity(self) -> NDArray[np.float64]: ...
+    @property
+    def size(self) -> tuple[float, float]: ...
+    @property
+    def beams(self) -> NDArray[np.intp]: ...
+    @property
+    def p_dynamic(self) -> float: ...
+
+
+class TrafficLike(Protocol):
+    """How often squares of the floor were crossed, row 0 at the lowest y.
+
+    Attributes:
+        crossings: (H, W) int32.
+        speed: (H, W) float32, metres per second, NaN where nothing crossed.
+        origin: x, y in metres and yaw of the lower-left square's lower-left corner.
+        resolution: edge of a square in metres.
+    """
+
+    @property
+    def crossings(self) -> NDArray[np.int32]: ...
+    @property
+    def speed(self) -> NDArray[np.float32]: ...
+    @property
+    def origin(self) -> tuple[float, float, float]: ...
+    @property
+    def resolution(self) -> float: ...
+
+
 class OptionsLike(Protocol):
     """The resolved options: a frozen dataclass with a section for the writers.
 
     Attributes:
         estimator: what said which beams are static: `stillmap`, `paper` or `hit-ratio`.
+        objects: how moving things were found.
         output: options of the writers.
     """
 
     @property
     def estimator(self) -> str: ...
+    @property
+    def objects(self) -> ObjectOptions: ...
     @property
     def output(self) -> OutputOptions: ...
 
@@ -176,6 +232,8 @@ class ResultLike(Protocol):
         loops: attempts at closing loops, accepted or refused.
         doubts: where odometry and scans do not agree.
         graph: the pose graph; None where poses were given or no loops were looked for.
+        objects: what moved.
+        traffic: how often squares of the floor were crossed by it.
         stages: name to `seconds`, `cpu_seconds` and `peak_memory_bytes`, in the order they ran.
     """
 
@@ -211,5 +269,9 @@ class ResultLike(Protocol):
     def doubts(self) -> DoubtsLike: ...
     @property
     def graph(self) -> GraphLike | None: ...
+    @property
+    def objects(self) -> Sequence[MovingObjectLike]: ...
+    @property
+    def traffic(self) -> TrafficLike: ...
     @property
     def stages(self) -> Mapping[str, Mapping[str, Any]]: ...

@@ -11,6 +11,7 @@ from stillmap.output.protocols import ResultLike
 from stillmap.output.report_curve import likelihood_svg
 from stillmap.output.report_learned import learned_section
 from stillmap.output.report_maps import evolution_section, maps_section
+from stillmap.output.report_objects import objects_section
 from stillmap.output.report_tables import (
     bytes_text,
     duration_text,
@@ -51,6 +52,7 @@ def report_html(result: ResultLike) -> str:
         _headline(result),
         _warnings(result),
         maps_section(result),
+        objects_section(result),
         learned_section(result),
         _estimate_section(result),
         evolution_section(result),

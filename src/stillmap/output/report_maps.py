@@ -54,8 +54,8 @@ def maps_section(result: ResultLike) -> str:
     return (
         f"<section><h2>The map</h2><p>{size}.</p>{_KEY}{_TOGGLES}"
         '<div class="pair">'
-        + _figure("Raw", "every beam counted in full", [(raw, "")], path, window, reduced)
-        + _figure(
+        + figure("Raw", "every beam counted in full", [(raw, "")], path, window, reduced)
+        + figure(
             "Filtered",
             "what stands still; what moved in orange",
             [(filtered, ""), (dots, "dynamic")],
@@ -88,7 +88,7 @@ def _snapshot_figure(snapshot: Snapshot, best: int) -> str:
     x, y, _ = snapshot.origin
     window = (x, y, x + w * snapshot.resolution, y + h * snapshot.resolution)
     kept = ", kept" if snapshot.number == best else ""
-    return _figure(
+    return figure(
         f"Iteration {snapshot.number}{kept}",
         f"{len(snapshot.dynamic_points):,} dynamic ends",
         [(snapshot_image(snapshot), "")],
@@ -98,7 +98,7 @@ def _snapshot_figure(snapshot: Snapshot, best: int) -> str:
     )
 
 
-def _figure(
+def figure(
     title: str,
     caption: str,
     layers: Sequence[tuple[Image.Image, str]],
@@ -106,6 +106,7 @@ def _figure(
     window: Window,
     reduced: bool,
 ) -> str:
+    """A picture of a window: layers with their classes, and what lies over them."""
     width, height = layers[0][0].size
     images = ""
     for index, (image, kind) in enumerate(layers):

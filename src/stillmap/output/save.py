@@ -7,6 +7,7 @@ from stillmap.output.beams import write_beams
 from stillmap.output.graph_g2o import write_g2o
 from stillmap.output.map_npz import write_map_npz
 from stillmap.output.map_server import write_map_server
+from stillmap.output.objects import write_objects, write_traffic
 from stillmap.output.protocols import ResultLike
 from stillmap.output.report import write_report
 from stillmap.output.run_json import write_run_json
@@ -14,7 +15,7 @@ from stillmap.output.trajectory import write_tum
 
 
 def save(result: ResultLike, path: Path, overwrite: bool = False) -> None:
-    """Write `result` as the folder `path`: map, trajectory, pose graph, labels, report, record.
+    """Write `result` as the folder `path`: map, trajectory, pose graph, labels, objects, report.
 
     Args:
         result: what the pipeline found.
@@ -31,5 +32,8 @@ def save(result: ResultLike, path: Path, overwrite: bool = False) -> None:
         if result.graph is not None:
             write_g2o(folder / "graph.g2o", result.graph, result.poses)
         write_beams(folder / "beams", result)
+        if result.options.objects.enabled:
+            write_objects(folder / "objects", result)
+            write_traffic(folder / "traffic.npz", result.traffic)
         write_report(folder / "report.html", result)
         write_run_json(folder / "run.json", result)

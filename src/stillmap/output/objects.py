@@ -1,0 +1,76 @@
+"""`objects/`: what moved, as JSON and as points; `traffic.npz`: where, and how fast."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.output.map_npz import write_npz
+from stillmap.output.protocols import MovingObjectLike, ResultLike, TrafficLike
+
+_MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
+
+
+def write_objects(folder: Path, result: ResultLike) -> None:
+    """Write `objects.json` and `NNNN.ply` of each object into a new folder."""
+    folder.mkdir()
+    # one object a line
+    lines = [json.dumps(object_record(one), allow_nan=False) for one in result.objects]
+    text = "[\n" + ",\n".join(lines) + "\n]\n" if lines else "[]\n"
+    (folder / "objects.json").write_text(text, encoding="utf-8")
+    recording = result.seen
+    T_map_sensor = recording.T_map_sensor(result.poses)
+    for one in result.objects:
+        scan = np.searchsorted(recording.offset, one.beams, side="right") - 1
+        T, points = T_map_sensor[scan], recording.points[one.beams].astype(np.float64)
+        xy = np.einsum("nij,nj->ni", T[:, :2, :2], points) + T[:, :2, 2]
+        seconds = 1e-9 * (recording.stamp_ns[scan] - one.stamp_ns[0])
+        write_ply(folder / f"{one.id:04d}.ply", xy, seconds, 1.0 - result.p_static[one.beams])
+
+
+def object_record(one: MovingObjectLike) -> dict[str, Any]:
+    """One entry of `objects.json`: metres, metres per second, nanoseconds."""
+    columns = zip(("x", "y", "vx", "vy"), np.hstack([one.xy, one.velocity]).T, strict=True)
+    return {
+        "id": one.id,
+        "first_stamp_ns": int(one.stamp_ns[0]),
+        "last_stamp_ns": int(one.stamp_ns[-1]),
+        "size": [round(metres, _MILLIMETRES) for metres in one.size],
+        "beams": len(one.beams),
+        "p_dynamic": round(one.p_dynamic, 6),
+        "track": {
+            "stamp_ns": one.stamp_ns.tolist(),
+            **{name: np.round(values, _MILLIMETRES).tolist() for name, values in columns},
+        },
+    }
+
+
+def write_ply(
+    path: Path,
+    xy: NDArray[np.float64],
+    seconds: NDArray[np.float64],
+    p_dynamic: NDArray[np.float32],
+) -> None:
+    """Points (n, 2) of an object at z = 0, when each was seen, and how probably it is dynamic."""
+    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("seconds", "<f4"), ("p_dynamic", "<f4")]
+    vertices = np.zeros(len(xy), fields)
+    vertices["x"], vertices["y"] = xy.T
+    vertices["seconds"], vertices["p_dynamic"] = seconds, p_dynamic
+    properties = "".join(f"property float {name}\n" for name, _ in fields)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(xy)}\n{properties}"
+    path.write_bytes(header.encode("ascii") + b"end_header\n" + vertices.tobytes())
+
+
+def write_traffic(path: Path, traffic: TrafficLike) -> None:
+    """Write `crossings`, `speed` (H, W), `origin` (x, y, yaw) and `resolution` in metres."""
+    write_npz(
+        path,
+        {
+            "crossings": np.asarray(traffic.crossings, np.int32),
+            "speed": np.asarray(traffic.speed, np.float32),
+            "origin": np.asarray(traffic.origin, np.float64),
+            "resolution": np.asarray(traffic.resolution, np.float64),
+        },
+    )
