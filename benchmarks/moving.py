@@ -1,0 +1,121 @@
+"""What moved, in simulated worlds: is every walker one object, are objects walkers, how fast?
+
+python benchmarks/moving.py [--cases NAME|GROUP ...] [--seeds tuning|reporting] [--n-seeds 5]
+    [--true-poses] [--set section.key=value ...] [--processes 2]
+
+A walker counts for each time that he is seen for more than 3 s, with no gap above 2 s. He is one
+object if it has more than half of his beams, no more than a fifth of them is with others, and no
+more than a fifth of its own beams then is somebody else's. A switch is a change of the object with
+most of his beams. False objects have most beams on what is static. Traffic: Spearman's correlation
+of how often squares of the known floor were crossed, with how often movers crossed them while they
+were seen. Cost is the share of all CPU time of the job.
+"""
+
+import argparse
+from collections.abc import Iterable
+from dataclasses import asdict
+
+import numpy as np
+from cases import POPULATED
+from common import Run, Scores, add_arguments, add_run_arguments, options_of, outcomes, runs_of
+from numpy.typing import NDArray
+from prepared import grid_of
+from tables import Column, Row, grouped, markdown
+
+import stillmap
+from stillmap import se2
+from stillmap.evaluation.objects import object_scores, rank_correlation, sightings, true_traffic
+from stillmap.evaluation.trajectory import align
+from stillmap.objects import traffic
+from stillmap.simulation import Simulation, simulate
+from stillmap.stages import Stages
+
+COLUMNS = (
+    Column("sightings", "seen > 3 s", ".0f"),
+    Column("whole", "one object, %", ".1f", True),
+    Column("lost", "lost", ".0f"),
+    Column("split", "split", ".0f"),
+    Column("merged", "merged", ".0f"),
+    Column("switches", "switches", ".0f"),
+    Column("objects", "objects", ".0f"),
+    Column("false_per_100_m", "false per 100 m", ".2f"),
+    Column("speed_error", "speed off, m/s", ".3f"),
+    Column("traffic", "traffic, 0.5 m", ".3f", True),
+    Column("traffic_1_m", "1 m", ".3f", True),
+    Column("cost", "cost, %", ".1f"),
+)
+_SEEN = 0.6  # s for which a mover must be seen to have crossed a square
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_run_arguments(p, [POPULATED])
+    add_arguments(p, [])
+    args = p.parse_args()
+    options_of("stillmap", args.set)  # refuses before hours have passed
+    runs = runs_of(args, ["stillmap"])
+    done = sorted(outcomes(_scored, runs, args.processes), key=lambda pair: runs.index(pair[0]))
+    rows: list[Row] = [{"case": run.case.name, **scores} for run, scores in done]
+    print("Means over seeds, in brackets the worst.\n")
+    print(table(rows))
+
+
+def table(rows: Iterable[Row]) -> str:
+    """A row for every case, and one for all of them."""
+    rows = list(rows)
+    lines = [
+        [name, *(column.mean_and_worst(some) for column in COLUMNS)]
+        for name, some in grouped(rows, lambda row: str(row["case"])).items()
+    ]
+    lines.append(["all", *(column.mean_and_worst(rows) for column in COLUMNS)])
+    return markdown(["case", *(column.title for column in COLUMNS)], lines)
+
+
+def _scored(run: Run) -> Scores:
+    simulation = simulate(run.case.build(), run.seed)
+    stages = Stages()
+    poses = simulation.truth.T_world_base if run.true_poses else None
+    options = options_of("stillmap", run.settings)
+    result = stillmap.build(simulation.recording, options, poses=poses, stages=stages)
+    spent = {name: float(stage["cpu_seconds"]) for name, stage in stages.to_dict().items()}
+    return {**scores_of(result, simulation), "cost": 100.0 * spent["objects"] / sum(spent.values())}
+
+
+def scores_of(result: stillmap.Result, simulation: Simulation) -> Scores:
+    """Scores of the objects and the traffic of one result."""
+    truth, recording = simulation.truth, simulation.recording
+    seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
+    kinds = np.array(truth.scene["mover_kinds"], dtype=object)
+    people = np.flatnonzero(kinds == "person").tolist()
+    found = object_scores(
+        result.objects, truth.mover, truth.movers, recording.offset, seconds, people
+    )
+    way = np.linalg.norm(np.diff(truth.T_world_base[:, :2, 2], axis=0), axis=1).sum()
+    whole = 100.0 * found.whole / found.sightings if found.sightings else float("nan")
+    return {
+        **asdict(found),
+        "whole": whole,
+        "false_per_100_m": 100.0 * found.false / way,
+        "traffic": _of_traffic(result, simulation, seconds, 0.5),
+        "traffic_1_m": _of_traffic(result, simulation, seconds, 1.0),
+    }
+
+
+def _of_traffic(
+    result: stillmap.Result, simulation: Simulation, seconds: NDArray[np.float64], size: float
+) -> float:
+    truth, recording = simulation.truth, simulation.recording
+    T_map_world = se2.inverse(align(result.poses, truth.T_world_base))
+    everyone = range(truth.movers.shape[1])
+    seen = sightings(truth.mover, recording.offset, seconds, everyone, _SEEN)
+    true = true_traffic(seen, truth.movers, recording.stamp_ns, T_map_world, size)
+    grid = grid_of(result.map)
+    return rank_correlation(
+        traffic(result.objects, size), true, grid.centres(np.argwhere(grid.free))
+    )
+
+
+if __name__ == "__main__":
+    main()
