@@ -25,10 +25,11 @@ _MANY = 0.05  # share of scans whose loss is worth a warning
 
 
 @dataclass(frozen=True, eq=False)
-class _Sensor:
+class Sensor:
     """The scans of one laser that are used; T of them with n beams each."""
 
     laser: LaserLog
+    line: NDArray[np.int64]  # (T,) numbers of their lines, from 1
     stamp_ns: NDArray[np.int64]  # (T,)
     ranges: NDArray[np.float32]  # (T, n)
     config: NDArray[np.int64]  # (T,) into laser.configs
@@ -48,14 +49,24 @@ def read(
     """
     options = options or ReadOptions()
     log = read_log(path, progress)
-    lasers, notes = _one_kind_per_laser(log)
-    sensors = [_usable(laser, log) for laser in lasers]
+    sensors, notes = used(log)
     if not sensors:
         raise _no_scan(path, log)
     recording = _assembled(sensors, log, options)
     recording.source.update(path=str(path), format="carmen", gzip=is_gzip(path))
     recording.source["duplicates"] = notes
     return recording
+
+
+def used(log: CarmenLog) -> tuple[list[Sensor], list[str]]:
+    """The scans of each laser that become a recording, and which others show the same laser."""
+    lasers, notes = _one_kind_per_laser(log)
+    return [_usable(laser, log) for laser in lasers], notes
+
+
+def in_order(sensors: list[Sensor]) -> NDArray[np.intp]:
+    """(T,) the order of a recording's scans, of all sensors' scans one after the other."""
+    return np.argsort(np.concatenate([s.stamp_ns for s in sensors]), kind="stable")
 
 
 def _no_scan(path: Path, log: CarmenLog) -> InputError:
@@ -89,7 +100,7 @@ def _one_kind_per_laser(log: CarmenLog) -> tuple[list[LaserLog], list[str]]:
     return sorted(used, key=lambda laser: list(SCAN_PARSERS).index(laser.kind.encode())), notes
 
 
-def _usable(laser: LaserLog, log: CarmenLog) -> _Sensor:
+def _usable(laser: LaserLog, log: CarmenLog) -> Sensor:
     """The scans with the usual number of readings whose time does not run backwards.
 
     Of a laser's stamps a longest non-decreasing subsequence is kept, so a stamp that jumps ahead
@@ -107,12 +118,17 @@ def _usable(laser: LaserLog, log: CarmenLog) -> _Sensor:
     skipped.add_all(TIME_BACKWARDS, np.delete(line[scans], forward))
     scans = scans[forward]
     poses = np.asarray(laser.poses).reshape(-1, 6)[scans] if laser.has_poses else None
-    return _Sensor(
-        laser, stamp_ns[forward], laser.readings(scans), np.asarray(laser.config)[scans], poses
+    return Sensor(
+        laser,
+        line[scans],
+        stamp_ns[forward],
+        laser.readings(scans),
+        np.asarray(laser.config)[scans],
+        poses,
     )
 
 
-def _assembled(sensors: list[_Sensor], log: CarmenLog, options: ReadOptions) -> Recording:
+def _assembled(sensors: list[Sensor], log: CarmenLog, options: ReadOptions) -> Recording:
     """One recording of all lasers' scans in the order of their stamps."""
     options.require_lasers(len(sensors))
     skipped = log.skipped.merged(*(log.skipped_scans[s.laser.kind] for s in sensors))
@@ -133,7 +149,7 @@ def _assembled(sensors: list[_Sensor], log: CarmenLog, options: ReadOptions) -> 
     warnings += odometry_info.pop("warnings")
     sensor_of = np.repeat(np.arange(len(sensors)), [len(s.stamp_ns) for s in sensors])
     stamp_ns = np.concatenate([s.stamp_ns for s in sensors])
-    order = np.argsort(stamp_ns, kind="stable")
+    order = in_order(sensors)
     beams = np.array([s.ranges.shape[1] for s in sensors], np.int64)[sensor_of[order]]
     offset = np.concatenate([[0], np.cumsum(beams)]).astype(np.int64)
     points, hit = _interleaved(parts, sensor_of[order], offset)
@@ -154,7 +170,7 @@ def _assembled(sensors: list[_Sensor], log: CarmenLog, options: ReadOptions) -> 
 
 
 def _angles(
-    sensor: _Sensor, log: CarmenLog, given: GivenLaser, upside_down: bool, warnings: list[str]
+    sensor: Sensor, log: CarmenLog, given: GivenLaser, upside_down: bool, warnings: list[str]
 ) -> NDArray[np.float64]:
     """(C, 2) first angle and step in radians, counterclockwise, of each of the laser's configs."""
     angles = np.array([config[:2] for config in sensor.laser.configs])
@@ -169,7 +185,7 @@ def _angles(
 
 
 def _points(
-    sensor: _Sensor,
+    sensor: Sensor,
     angles: NDArray[np.float64],
     log: CarmenLog,
     options: ReadOptions,
@@ -188,7 +204,7 @@ def _points(
     return points, hit, rule
 
 
-def _angle_warning(sensor: _Sensor) -> list[str]:
+def _angle_warning(sensor: Sensor) -> list[str]:
     n = sensor.ranges.shape[1]
     for config in sensor.laser.configs:
         fan = n * config.angle_step  # or one step less: both are in use
@@ -217,7 +233,7 @@ def _interleaved(
 
 
 def _odometry(
-    sensors: list[_Sensor], log: CarmenLog
+    sensors: list[Sensor], log: CarmenLog
 ) -> tuple[NDArray[np.float64] | None, dict[str, Any]]:
     """Robot poses (T, 3) at the scans of all sensors, one sensor after the other.
 
@@ -258,7 +274,7 @@ def _moves(poses: NDArray[np.float64]) -> bool:
     return bool(np.any(poses != poses[0]))
 
 
-def _loss_warning(sensors: list[_Sensor], skipped: Skipped) -> list[str]:
+def _loss_warning(sensors: list[Sensor], skipped: Skipped) -> list[str]:
     kept = sum(len(sensor.stamp_ns) for sensor in sensors)
     lost = skipped.total
     if lost <= _MANY * (kept + lost):
@@ -267,7 +283,7 @@ def _loss_warning(sensors: list[_Sensor], skipped: Skipped) -> list[str]:
 
 
 def _sensor_info(
-    sensor: _Sensor,
+    sensor: Sensor,
     place: Extrinsics,
     angles: NDArray[np.float64],
     upside_down: tuple[bool, str],

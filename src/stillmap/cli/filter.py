@@ -1,0 +1,123 @@
+"""`stillmap filter`: the recording again, without the beams that met something moving."""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import options
+from stillmap.cli.progress import say
+from stillmap.errors import InputError
+from stillmap.evaluation.folders import read_labels
+from stillmap.output.atomic import require_new
+from stillmap.recording import Recording, carmen_blanked, folder, read
+from stillmap.recording.options import ReadOptions
+
+_MAX_RUN = 256 << 20  # bytes of a run.json
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the command."""
+    p = commands.add_parser(
+        "filter", help="the recording again, without beams on what moves, for other mappers"
+    )
+    p.add_argument("result", metavar="DIR", help="what `stillmap map` wrote")
+    p.add_argument("-o", "--output", metavar="FILE", required=True, help="where the recording goes")
+    p.add_argument("--input", metavar="FILE", help="the recording, if it is not where it was")
+    p.add_argument(
+        "--below",
+        metavar="P",
+        type=float,
+        default=0.5,
+        help="blank beams that something static reflected with less than P (default: 0.5)",
+    )
+    p.add_argument("--overwrite", action="store_true", help="replace what is there")
+    p.add_argument("--quiet", action="store_true", help="no summary")
+    p.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Reads labels and recording, writes the recording without dynamic beams."""
+    if not 0.0 <= args.below <= 1.0:
+        raise InputError(f"--below wants 0 to 1, got {args.below:g}")
+    result, output = Path(args.result), Path(args.output)
+    record = _run_record(result / "run.json")
+    source = Path(args.input or str(record["input"].get("path", "")))
+    recording = read(source, _read_options(record, result))
+    labels = read_labels(result)
+    _require_same(recording, labels.stamp_ns, labels.offset, source)
+    # NaN: unusable anyway
+    blank = recording.hit & (labels.p_static < args.below)
+    _require_elsewhere(output, source, args.overwrite)
+    if source.is_dir() or source.name == folder.HEADER:
+        folder.write(_without(recording, blank), output, overwrite=args.overwrite)
+        left_out = 0
+    else:
+        left_out = carmen_blanked.write(source, output, recording, blank).left_out
+    if not args.quiet:
+        beams, hits = int(blank.sum()), int(recording.hit.sum())
+        say(f"{beams} beams blanked, {100.0 * beams / max(hits, 1):.1f} % of the hits; in {output}")
+        if left_out:
+            say(f"{left_out} lines left out: of scans that were not mapped")
+    return 0
+
+
+def _run_record(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > _MAX_RUN:
+            raise InputError("is no record of a run: too large", where=str(path))
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        hint = "DIR is what `stillmap map` wrote"
+        raise InputError(f"cannot be read: {error.strerror}", where=str(path), hint=hint) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is not JSON: {error}", where=str(path)) from error
+    if not isinstance(record, dict) or not isinstance(record.get("input"), dict):
+        raise InputError("is no record of a run: no input named", where=str(path))
+    return record
+
+
+def _read_options(record: dict[str, Any], result: Path) -> ReadOptions:
+    """As the recording was read: the same beams have the same numbers."""
+    chosen = record.get("options")
+    read_as = chosen.get("read") if isinstance(chosen, dict) else None
+    if not isinstance(read_as, dict):
+        raise InputError("names no options", where=str(result / "run.json"))
+    known = {key: value for key, value in read_as.items() if value is not None}
+    try:
+        return options.replaced(ReadOptions(), known)
+    except (ValueError, InputError) as error:
+        raise InputError(f"has options that cannot be: {error}", where=str(result)) from error
+
+
+def _require_same(
+    recording: Recording, stamp_ns: NDArray[Any], offset: NDArray[Any], source: Path
+) -> None:
+    if not np.array_equal(recording.stamp_ns, stamp_ns) or not np.array_equal(
+        recording.offset, offset
+    ):
+        raise InputError(
+            "is not the recording that was mapped: other scans or beams",
+            where=str(source),
+            hint="name it with --input",
+        )
+
+
+def _require_elsewhere(output: Path, source: Path, overwrite: bool) -> None:
+    if output.exists() and source.exists() and output.samefile(source):
+        raise InputError("is the recording itself", where=str(output))
+    if source.is_dir() or source.name == folder.HEADER:
+        require_new(output, overwrite)
+    elif output.is_dir() or (output.exists() and not overwrite):
+        raise InputError(
+            "is there already", where=str(output), hint="choose another or give --overwrite"
+        )
+
+
+def _without(recording: Recording, blank: NDArray[np.bool_]) -> Recording:
+    """Blanked beams went as far as they did, and met nothing."""
+    return dataclasses.replace(recording, hit=recording.hit & ~blank)

@@ -1,0 +1,133 @@
+"""A CARMEN log once more, with beams blanked: as if nothing had come back."""
+
+import gzip
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.errors import InputError
+from stillmap.output.atomic import new_file
+from stillmap.recording import carmen
+from stillmap.recording.carmen_log import read_log
+from stillmap.recording.carmen_messages import SCAN_PARSERS
+from stillmap.recording.lines import numbered_lines
+from stillmap.recording.model import Recording
+
+_OVERFLOW = 81.91  # m: what a SICK laser says where nothing comes back, for want of another code
+_FIRST = {b"FLASER": 2, b"RLASER": 2}  # field of the first reading, counted with the name
+_FIRST_OF_OTHERS = 9
+_FIELD = re.compile(rb"\S+")
+
+
+@dataclass(frozen=True)
+class Blanked:
+    """What was written.
+
+    Attributes:
+        scans: with their lines as they were but for blanked readings.
+        beams: readings that were blanked.
+        left_out: lines of scans that the recording does not have: damaged, or of a laser that
+            another kind of line shows, so that nothing is known of their beams.
+    """
+
+    scans: int
+    beams: int
+    left_out: int
+
+
+def write(source: Path, out: Path, recording: Recording, blank: NDArray[np.bool_]) -> Blanked:
+    """Write a log with some readings replaced; all other bytes stay.
+
+    Args:
+        source: the log.
+        out: where to; gzip where the name ends so. It appears whole or not at all.
+        recording: as it was read from `source`.
+        blank: (M,) which of its beams.
+
+    Raises:
+        InputError: the log is not the one that was read, or cannot be written.
+    """
+    sensors, _ = carmen.used(read_log(source))
+    scan_of = _scan_of_lines(source, sensors, recording)
+    rules = (sensor["ranges"] for sensor in recording.source["sensors"])
+    codes = [code(sensor.ranges, rule) for sensor, rule in zip(sensors, rules, strict=True)]
+    scans = left_out = 0
+    with new_file(out) as work, _opened(work, out.name.endswith(".gz")) as file:
+        for line in numbered_lines(source):
+            t = scan_of.get(line.number)
+            if t is not None:
+                beams = blank[recording.offset[t] : recording.offset[t + 1]]
+                file.write(_replaced(line.text, beams, codes[recording.sensor[t]]))
+                scans += 1
+            elif line.damaged or line.too_long or _is_scan(line.text):
+                left_out += 1
+            else:
+                file.write(line.text)
+    return Blanked(scans, int(np.count_nonzero(blank)), left_out)
+
+
+def code(readings: NDArray[np.float32], rule: dict[str, Any]) -> bytes:
+    """What stands for "nothing came back" among the readings of a laser.
+
+    Args:
+        readings: (T, n) metres.
+        rule: how they are understood, a RangeRule.
+    """
+    threshold = rule["threshold"]
+    if threshold is not None:
+        values, count = np.unique(readings[readings >= np.float32(threshold)], return_counts=True)
+        # the one in use: another would keep readers from seeing that it is a code
+        value = values[count.argmax()] if len(values) else np.float32(threshold)
+        return str(value).encode("ascii")
+    if rule["zero_means"] == "max-range":
+        return b"0.00"
+    return f"{max(_OVERFLOW, 10.0 * float(rule['free_range'] or 0.0)):.2f}".encode("ascii")
+
+
+def _scan_of_lines(
+    source: Path, sensors: list[carmen.Sensor], recording: Recording
+) -> dict[int, int]:
+    """Which scan of the recording each line is."""
+    if sensors:
+        order = carmen.in_order(sensors)
+        line = np.concatenate([sensor.line for sensor in sensors])[order]
+        stamp_ns = np.concatenate([sensor.stamp_ns for sensor in sensors])[order]
+        if np.array_equal(stamp_ns, recording.stamp_ns):
+            return {number: t for t, number in enumerate(line.tolist())}
+    raise InputError("is not the log that was mapped: other scans", where=str(source))
+
+
+def _is_scan(text: bytes) -> bool:
+    name = text.split(maxsplit=1)[:1]
+    return bool(name) and name[0] in SCAN_PARSERS
+
+
+def _replaced(text: bytes, blank: NDArray[np.bool_], code: bytes) -> bytes:
+    """A scan's line with the blanked readings replaced."""
+    if not blank.any():
+        return text
+    fields = list(_FIELD.finditer(text))
+    first = _FIRST.get(fields[0].group().removeprefix(b"\xef\xbb\xbf"), _FIRST_OF_OTHERS)
+    parts, at = [], 0
+    for k in np.flatnonzero(blank).tolist():
+        begin, end = fields[first + k].span()
+        parts += [text[at:begin], code]
+        at = end
+    return b"".join([*parts, text[at:]])
+
+
+@contextmanager
+def _opened(path: Path, packed: bool) -> Iterator[IO[bytes] | gzip.GzipFile]:
+    with path.open("wb") as file:
+        if not packed:
+            yield file
+            return
+        # neither name nor time: equal logs give equal bytes
+        with gzip.GzipFile("", "wb", fileobj=file, mtime=0) as stream:
+            yield stream

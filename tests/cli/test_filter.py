@@ -1,0 +1,124 @@
+"""`stillmap filter`: recordings without what moved."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from stillmap.recording import folder, read
+
+
+@pytest.fixture(scope="module")
+def mapped(stillmap, room, tmp_path_factory):
+    """The result of mapping the room."""
+    out = tmp_path_factory.mktemp("filtered") / "out"
+    done = stillmap("map", room, "-o", out, "--set", "em.max_iterations=1", "--quiet")
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def refused(done, *words):
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1, done.stderr
+    for word in words:
+        assert str(word) in done.stderr
+
+
+@pytest.mark.parametrize("below", [None, 0.9, 0.0])
+def test_dynamic_beams_met_nothing(call, room, mapped, tmp_path, below):
+    more = [] if below is None else ["--below", below]
+    done = call("filter", mapped, "-o", tmp_path / "clean", *more)
+    assert done.returncode == 0, done.stderr
+    before, after = folder.read(room), folder.read(tmp_path / "clean")
+    p = np.load(mapped / "beams/p_static.npy")
+    blank = before.hit & (p < (0.5 if below is None else below))
+    np.testing.assert_array_equal(after.hit, before.hit & ~blank)
+    np.testing.assert_array_equal(after.points, before.points)
+    np.testing.assert_array_equal(after.stamp_ns, before.stamp_ns)
+    assert blank.any() == (below != 0.0)
+    assert f"{np.count_nonzero(blank)} beams blanked" in done.stderr
+
+
+def test_a_log_stays_a_log(call, tmp_path):
+    """A walker in front of a wall, as a log: the same log comes out, without him."""
+    rng = np.random.default_rng(0)
+    lines = []
+    for t in range(80):
+        ranges = 6.0 / np.cos(np.linspace(-1.0, 1.0, 61)) + rng.normal(0.0, 0.01, 61)
+        ranges[(t // 2) % 50 : (t // 2) % 50 + 5] = 3.0
+        ranges[[0, 30, 60]] = 81.83
+        readings = " ".join(f"{r:.2f}" for r in ranges)
+        lines.append(f"FLASER 61 {readings} 0 0 0 0 0 0 {0.2 * t:.2f} host {0.2 * t:.2f}\n")
+    source, out = tmp_path / "walk.log", tmp_path / "out"
+    source.write_text("".join(lines))
+    quick = ["--set", "em.max_iterations=1", "--quiet"]
+    assert call("map", source, "-o", out, *quick).returncode == 0
+    done = call("filter", out, "-o", tmp_path / "clean.log.gz", "--quiet")
+    assert (done.returncode, done.stderr) == (0, "")
+    before, after = read(source), read(tmp_path / "clean.log.gz")
+    gone = before.hit & ~after.hit
+    walker = np.isclose(np.linalg.norm(before.points, axis=1), 3.0, atol=0.02) & before.hit
+    assert (gone & walker).sum() > 0.9 * walker.sum()
+    assert (gone & ~walker).sum() < 0.02 * before.hit.sum()
+
+
+def test_a_recording_that_was_moved(call, room, mapped, tmp_path):
+    elsewhere = tmp_path / "moved"
+    shutil.copytree(room, elsewhere)
+    result = tmp_path / "result"
+    shutil.copytree(mapped, result)
+    record = json.loads((result / "run.json").read_text())
+    record["input"]["path"] = str(tmp_path / "gone")
+    (result / "run.json").write_text(json.dumps(record))
+    refused(call("filter", result, "-o", tmp_path / "clean"), tmp_path / "gone", "does not exist")
+    done = call("filter", result, "-o", tmp_path / "clean", "--input", elsewhere)
+    assert done.returncode == 0, done.stderr
+
+
+def test_refusals(call, room, mapped, tmp_path):
+    refused(call("filter", tmp_path / "nothing", "-o", tmp_path / "c"), "nothing/run.json")
+    refused(call("filter", mapped, "-o", room, "--overwrite"), "the recording itself")
+    refused(call("filter", mapped, "-o", tmp_path / "c", "--below", "7"), "--below wants 0 to 1")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/file").write_text("")
+    refused(call("filter", mapped, "-o", tmp_path / "full"), "already holds something")
+    assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("{", "not JSON"),
+        ("[]", "no input named"),
+        ('{"input": {"path": "x"}}', "names no options"),
+        ('{"input": {"path": "x"}, "options": {"read": {"no_such": 1}}}', "options that cannot be"),
+    ],
+)
+def test_records_that_are_none(call, mapped, tmp_path, content, words):
+    result = tmp_path / "result"
+    shutil.copytree(mapped, result)
+    (result / "run.json").write_text(content)
+    refused(call("filter", result, "-o", tmp_path / "c"), words)
+
+
+def test_another_recording_is_refused(call, room, mapped, tmp_path):
+    shorter = folder.read(room)
+    path = tmp_path / "shorter"
+    n = int(shorter.offset[10])
+    folder.write(
+        type(shorter)(
+            stamp_ns=shorter.stamp_ns[:10],
+            offset=shorter.offset[:11],
+            points=np.array(shorter.points[:n]),
+            hit=np.array(shorter.hit[:n]),
+            T_base_sensor=shorter.T_base_sensor,
+            sensor=shorter.sensor[:10],
+            T_odom_base=None,
+            source={},
+        ),
+        path,
+    )
+    done = call("filter", mapped, "-o", tmp_path / "c", "--input", path)
+    refused(done, "is not the recording that was mapped", "--input")
