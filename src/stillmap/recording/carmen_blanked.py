@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from stillmap.errors import InputError
 from stillmap.output.atomic import new_file
-from stillmap.recording import carmen
 from stillmap.recording.carmen_log import read_log
 from stillmap.recording.carmen_messages import SCAN_PARSERS
+from stillmap.recording.carmen_scans import Sensor, in_order, used
 from stillmap.recording.lines import numbered_lines
 from stillmap.recording.model import Recording
 
@@ -53,7 +53,7 @@ def write(source: Path, out: Path, recording: Recording, blank: NDArray[np.bool_
     Raises:
         InputError: the log is not the one that was read, or cannot be written.
     """
-    sensors, _ = carmen.used(read_log(source))
+    sensors, _ = used(read_log(source))
     scan_of = _scan_of_lines(source, sensors, recording)
     rules = (sensor["ranges"] for sensor in recording.source["sensors"])
     codes = [code(sensor.ranges, rule) for sensor, rule in zip(sensors, rules, strict=True)]
@@ -90,12 +90,10 @@ def code(readings: NDArray[np.float32], rule: dict[str, Any]) -> bytes:
     return f"{max(_OVERFLOW, 10.0 * float(rule['free_range'] or 0.0)):.2f}".encode("ascii")
 
 
-def _scan_of_lines(
-    source: Path, sensors: list[carmen.Sensor], recording: Recording
-) -> dict[int, int]:
+def _scan_of_lines(source: Path, sensors: list[Sensor], recording: Recording) -> dict[int, int]:
     """Which scan of the recording each line is."""
     if sensors:
-        order = carmen.in_order(sensors)
+        order = in_order(sensors)
         line = np.concatenate([sensor.line for sensor in sensors])[order]
         stamp_ns = np.concatenate([sensor.stamp_ns for sensor in sensors])[order]
         if np.array_equal(stamp_ns, recording.stamp_ns):
