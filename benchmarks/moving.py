@@ -5,7 +5,7 @@ python benchmarks/moving.py [--cases NAME|GROUP ...] [--seeds tuning|reporting] 
 
 A walker counts for each time that he is seen for more than 3 s, with no gap above 2 s. He is one
 object if it has more than half of his beams, no more than a fifth of them is with others, and no
-more than a fifth of its own beams then is somebody else's. A switch is a change of the object with
+more than a fifth of its own beams then is of anything else. A switch is a change of the object with
 most of his beams. False objects have most beams on what is static. Traffic: Spearman's correlation
 of how often squares of the known floor were crossed, with how often movers crossed them while they
 were seen. Cost is the share of all CPU time of the job.

@@ -69,7 +69,7 @@ struct Box {
     for (int d = 0; d < D; ++d) {
       const int64_t from = first_cell[static_cast<size_t>(d)];
       const int64_t n = shape[static_cast<size_t>(D - 1 - d)];
-      if (std::abs(from) > kFar || n < 0 || n > kFar)
+      if (from < -kFar || from > kFar || n < 0 || n > kFar)
         throw std::invalid_argument("first_cell, shape: expected a box of cells that can exist");
       first[d] = static_cast<int32_t>(from);
       size[static_cast<size_t>(d)] = static_cast<size_t>(n);
@@ -86,7 +86,11 @@ struct Box {
 
   size_t total() const {
     size_t cells = 1;
-    for (const size_t n : size) cells *= n;
+    for (const size_t n : size) {
+      if (n != 0 && cells > std::numeric_limits<size_t>::max() / (16 * n))
+        throw std::invalid_argument("first_cell, shape: expected a box that fits into memory");
+      cells *= n;
+    }
     return cells;
   }
 

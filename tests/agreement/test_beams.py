@@ -94,7 +94,14 @@ def test_part_of_a_dense_grid(beams):
 
 
 @pytest.mark.parametrize(
-    ("first", "shape"), [((0, 0), None), (None, (3, 3)), ((0, 2**40), (3, 3)), ((0, 0), (-1, 3))]
+    ("first", "shape"),
+    [
+        ((0, 0), None),
+        (None, (3, 3)),
+        ((0, 2**40), (3, 3)),
+        ((0, 0), (-1, 3)),
+        ((-(2**63), 0), (1, 1)),
+    ],
 )
 def test_boxes_that_cannot_be_are_refused(first, shape):
     with pytest.raises(ValueError, match="first_cell, shape"):

@@ -83,8 +83,28 @@ def test_refusals(call, room, mapped, tmp_path):
     refused(call("filter", mapped, "-o", tmp_path / "c", "--below", "7"), "--below wants 0 to 1")
     (tmp_path / "full").mkdir()
     (tmp_path / "full/file").write_text("")
-    refused(call("filter", mapped, "-o", tmp_path / "full"), "already holds something")
+    for more in ((), ("--overwrite",)):  # only recordings are overwritten
+        done = call("filter", mapped, "-o", tmp_path / "full", *more)
+        refused(done, "already holds something")
+    assert (tmp_path / "full/file").exists()
     assert not (tmp_path / "c").exists()
+
+
+def test_what_is_read_is_never_overwritten(call, room, mapped, tmp_path):
+    shutil.copytree(room, tmp_path / "all/room")
+    (tmp_path / "all/precious").write_text("")
+    given = ("--input", tmp_path / "all/room/recording.json", "--overwrite")
+    for output, words in (("room", "the recording itself"), (".", "holds the recording")):
+        refused(call("filter", mapped, "-o", tmp_path / "all" / output, *given), words)
+    refused(call("filter", mapped, "-o", mapped, *given), "holds the recording or the result")
+    assert (tmp_path / "all/precious").exists()
+    before, after = folder.read(room), folder.read(tmp_path / "all/room")
+    np.testing.assert_array_equal(before.hit, after.hit)
+
+
+def test_a_recording_is_overwritten_when_asked(call, mapped, tmp_path):
+    for more, status in (((), 0), ((), 2), (("--overwrite",), 0)):
+        assert call("filter", mapped, "-o", tmp_path / "clean", *more).returncode == status
 
 
 @pytest.mark.parametrize(
@@ -92,6 +112,8 @@ def test_refusals(call, room, mapped, tmp_path):
     [
         ("{", "not JSON"),
         ("[]", "no input named"),
+        ('{"input": {}}', "names no recording"),
+        ('{"input": {"path": null}}', "names no recording"),
         ('{"input": {"path": "x"}}', "names no options"),
         ('{"input": {"path": "x"}, "options": {"read": {"no_such": 1}}}', "options that cannot be"),
     ],

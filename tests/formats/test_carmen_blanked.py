@@ -80,6 +80,16 @@ def test_gzip_goes_by_the_name(made, tmp_path, given, wanted):
     assert out.read_bytes() == packed
 
 
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf", b"\xef\xbb\xbf "])
+@pytest.mark.parametrize("end", [b"\n", b"\r\n"])
+def test_marks_tabs_and_line_ends_stay(log, flaser, tmp_path, mark, end):
+    lines = [flaser(k + 1, row).replace(" ", "\t").encode() for k, row in enumerate(READINGS)]
+    source, out = log(mark + end.join(lines), "odd.log"), tmp_path / "out.log"
+    blanked(source, out, [0])
+    expected = [lines[0].replace(b"1.5", b"81.83", 1), *lines[1:]]
+    assert out.read_bytes() == mark + end.join(expected)
+
+
 def test_newer_logs_keep_only_the_lines_that_were_read(log, tmp_path):
     header, host = "0 -1.57 3.14 1.57 80 0.01 0", "host 1"
     lines = []
@@ -111,11 +121,12 @@ def rule(threshold=None, zero="unusable", free=20.0):
 @pytest.mark.parametrize(
     ("readings", "said", "expected"),
     [
-        ([[1.0, 51.15, 51.15, 51.09]], rule(51.09), b"51.15"),  # the one that is in use
-        ([[1.0, 2.0]], rule(30.0), b"30.0"),
+        ([[1.0, 81.91, 81.83, 81.91]], rule(81.83), b"81.91"),  # the one that is in use
+        ([[1.0, 25.31, 25.31, 7.0]], rule(20.0), b"81.91"),  # given: what is beyond is no code
+        ([[1.0, np.inf]], rule(None), b"inf"),
         ([[1.0, 0.0]], rule(None, "max-range"), b"0.00"),
         ([[1.0, 2.0]], rule(None, free=None), b"81.91"),
-        ([[1.0, 50.0]], rule(None, free=50.0), b"500.00"),
+        ([[1.0, 90.0]], rule(None, free=90.0), b"900.00"),
     ],
 )
 def test_what_stands_for_nothing(readings, said, expected):

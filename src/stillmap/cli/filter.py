@@ -46,13 +46,13 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--below wants 0 to 1, got {args.below:g}")
     result, output = Path(args.result), Path(args.output)
     record = _run_record(result / "run.json")
-    source = Path(args.input or str(record["input"].get("path", "")))
-    recording = read(source, _read_options(record, result))
+    source = Path(args.input or _path_of(record, result))
+    _require_elsewhere(output, source, result, args.overwrite)
+    recording = _recording(source, _read_options(record, result), given=bool(args.input))
     labels = read_labels(result)
     _require_same(recording, labels.stamp_ns, labels.offset, source)
     # NaN: unusable anyway
     blank = recording.hit & (labels.p_static < args.below)
-    _require_elsewhere(output, source, args.overwrite)
     if source.is_dir() or source.name == folder.HEADER:
         folder.write(_without(recording, blank), output, overwrite=args.overwrite)
         left_out = 0
@@ -94,6 +94,21 @@ def _read_options(record: dict[str, Any], result: Path) -> ReadOptions:
         raise InputError(f"has options that cannot be: {error}", where=str(result)) from error
 
 
+def _path_of(record: dict[str, Any], result: Path) -> str:
+    path = record["input"].get("path")
+    if not isinstance(path, str) or not path:
+        where, hint = str(result / "run.json"), "name it with --input"
+        raise InputError("names no recording", where=where, hint=hint)
+    return path
+
+
+def _recording(source: Path, read_as: ReadOptions, *, given: bool) -> Recording:
+    if not given and not source.exists():
+        hint = "that is where it was when it was mapped: name it with --input"
+        raise InputError("does not exist", where=str(source), hint=hint)
+    return read(source, read_as)
+
+
 def _require_same(
     recording: Recording, stamp_ns: NDArray[Any], offset: NDArray[Any], source: Path
 ) -> None:
@@ -107,15 +122,23 @@ def _require_same(
         )
 
 
-def _require_elsewhere(output: Path, source: Path, overwrite: bool) -> None:
-    if output.exists() and source.exists() and output.samefile(source):
+def _require_elsewhere(output: Path, source: Path, result: Path, overwrite: bool) -> None:
+    """Refuse to write over anything but a recording that is not the one that is read."""
+    source = source.parent if source.name == folder.HEADER else source
+    there, kept = output.resolve(), [source.resolve(), result.resolve()]
+    if there == kept[0]:
         raise InputError("is the recording itself", where=str(output))
-    if source.is_dir() or source.name == folder.HEADER:
-        require_new(output, overwrite)
-    elif output.is_dir() or (output.exists() and not overwrite):
+    if any(there == one or there in one.parents for one in kept):
+        raise InputError("holds the recording or the result", where=str(output))
+    if source.is_dir():
+        is_recording = (output / folder.HEADER).is_file()
+        require_new(output, overwrite and is_recording)
+    elif output.exists() and not (overwrite and output.is_file()):
         raise InputError(
             "is there already", where=str(output), hint="choose another or give --overwrite"
         )
+    elif not there.parent.is_dir():
+        raise InputError("cannot be written: no such folder", where=str(output.parent))
 
 
 def _without(recording: Recording, blank: NDArray[np.bool_]) -> Recording:

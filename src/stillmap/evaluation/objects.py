@@ -14,7 +14,7 @@ Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _GAP = 2.0  # s without a beam on somebody, after which he is seen anew
-_TOO_MUCH = 0.2  # share of beams with another object, or of another mover
+_TOO_MUCH = 0.2  # share of beams with another object, or of something else
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class ObjectScores:
         sightings: of movers that were seen for long enough.
         whole: how many of them are one object: it has more than half of their beams, no more than
             a fifth of them is with other objects, and no more than a fifth of its beams then is of
-            other movers.
+            anything else.
         lost, split, merged: how many fail in the first, second, third of these; some in two.
         switches: times that the object with most beams of a sighting changed from scan to scan.
         objects: how many were found.
@@ -75,7 +75,8 @@ def sightings(
         chosen: numbers of movers.
         least: seconds that a mover must be seen for.
     """
-    period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+    times = np.unique(seconds)  # lasers may scan at once
+    period = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     out = []
     for number in chosen:
         beams = np.flatnonzero(mover == number)
@@ -83,7 +84,7 @@ def sightings(
         gaps = np.flatnonzero(np.diff(seconds[scan]) > _GAP) + 1
         for some in np.split(np.arange(len(beams)), gaps):
             scans = np.unique(scan[some])
-            if len(scans) * period > least:
+            if len(np.unique(seconds[scans])) * period > least:
                 out.append(Sighting(int(number), beams[some], scans))
     return out
 
@@ -166,7 +167,10 @@ def _speed_error(
     seconds: Float,
     chosen: set[int],
 ) -> float:
-    velocity = np.gradient(movers[:, :, :2], seconds, axis=0)
+    times, first, which = np.unique(seconds, return_index=True, return_inverse=True)
+    if len(times) < 2:
+        return float("nan")
+    velocity = np.gradient(movers[first][:, :, :2], times, axis=0)[which]
     off = [
         np.abs(
             np.linalg.norm(one.velocity, axis=1)

@@ -12,6 +12,9 @@ Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 NOBODY = -1
 
+_SHAPE = 100  # points that a shape has at most: more of them say no more
+_PAIRS = 1_000_000  # distances that are looked at together
+
 
 def followed(points: MovingPoints, options: ObjectOptions) -> Index:
     """(N,) numbers of things, from 0 in the order in which they were first seen.
@@ -81,9 +84,14 @@ class _Following:
     def _squared_distances(self, xy: Float) -> Float:
         """(n, K) of points to what was seen of each thing, where that is expected now."""
         expected = self._motion.x[self._of] + self._offset
-        squared = np.square(xy[:, None] - expected).sum(axis=-1)
         begin = np.searchsorted(self._of, np.arange(len(self._motion)))
-        return np.asarray(np.minimum.reduceat(squared, begin, axis=1))
+        out = np.empty((len(xy), len(begin)))
+        step = max(1, _PAIRS // len(expected))
+        for first in range(0, len(xy), step):  # a crowd right before the laser is large
+            part = xy[first : first + step, None]
+            squared = np.square(part - expected).sum(axis=-1)
+            out[first : first + step] = np.minimum.reduceat(squared, begin, axis=1)
+        return out
 
     def _tear(self, here: Index, claims: Index, thing: int, kept: Index, gone: Index) -> None:
         """One thing turns out to be two: since when, and who of them was there before."""
@@ -148,6 +156,11 @@ class _Following:
         self._offset = np.concatenate([self._offset, xy - self._motion.x[of]])[order]
         self._when = np.concatenate([self._when, np.full(len(of), self._now)])[order]
         self._of = of_all[order]
+        count = np.bincount(self._of, minlength=len(self._motion))
+        if count.max(initial=0) > _SHAPE:
+            first = np.cumsum(count) - count
+            every = -(-count // _SHAPE)
+            self._forget_shape((np.arange(len(self._of)) - first[self._of]) % every[self._of] == 0)
 
     def _forget(self, kept: NDArray[np.bool_]) -> None:
         """Things that are gone."""
@@ -198,11 +211,13 @@ def torn_apart(
 
 def _held_together(parts: list[Float], far: float) -> tuple[list[int], list[int]]:
     """Parts within `far` of the largest one, or of others that are; and the others."""
+    from scipy.spatial import KDTree  # takes long to load
+
     kept = [max(range(len(parts)), key=lambda i: len(parts[i]))]
     gone = [i for i in range(len(parts)) if i not in kept]
     for i in kept:  # grows as it goes
         for j in list(gone):
-            if np.linalg.norm(parts[i][:, None] - parts[j], axis=-1).min() < far:
+            if np.min(KDTree(parts[i]).query(parts[j])[0]) < far:
                 kept.append(j)
                 gone.remove(j)
     return kept, gone

@@ -87,7 +87,8 @@ def moving_objects(
         for here, part in zip(of_things, parts, strict=True)
         if len(here)
     )
-    large = (one for one in things if _extent(one) >= options.least_extent)
+    large = [one for one in things if _extent(one) >= options.least_extent]
+    large.sort(key=lambda one: (one.scan[0], one.beams[0]))
     return [dataclasses.replace(one, id=number) for number, one in enumerate(large)]
 
 
@@ -146,7 +147,7 @@ def behind(middle: Float, sensor: Float, xy: Float, at: Index) -> Float:
 
 
 def box_size(offset: Float, velocity: Float) -> tuple[float, float]:
-    """Metres along and across the way it went; across and along its longer side if it stood.
+    """Metres along and across the way it went; along and across its longer side if it stood.
 
     Args:
         offset: (n, 2) end points from the middle.

@@ -40,7 +40,7 @@ class MovingPoints:
 def moving_points(
     recording: Recording, poses: Float, p_static: NDArray[np.float32], options: ObjectOptions
 ) -> MovingPoints:
-    """The hits that are more probably dynamic than `options.dynamic`, and which belong together.
+    """The hits that are dynamic as probably as `options.dynamic`, and which belong together.
 
     Args:
         recording: 2D; M beams, without motion during scans.
@@ -50,7 +50,7 @@ def moving_points(
     """
     # a scan's stamps may go backwards where clocks jump; time does not
     seconds = np.maximum.accumulate(1e-9 * (recording.stamp_ns - recording.stamp_ns[:1]))
-    beam = np.flatnonzero(recording.hit & (p_static < 1.0 - options.dynamic))
+    beam = np.flatnonzero(recording.hit & (p_static <= 1.0 - options.dynamic))
     scan = np.searchsorted(recording.offset, beam, side="right") - 1
     points = recording.points[beam].astype(np.float64)
     T_map_sensor = recording.T_map_sensor(poses)

@@ -5,6 +5,8 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
+_AT_ONCE = 1e-3  # s: over less, differences of places say nothing of speeds
+
 
 def smoothed(seconds: Float, xy: Float, sigma: float, acceleration: float) -> tuple[Float, Float]:
     """(L, 2) places and (L, 2) velocities that are most probable, given all that was seen.
@@ -15,13 +17,14 @@ def smoothed(seconds: Float, xy: Float, sigma: float, acceleration: float) -> tu
     are banded: twenty times as fast as a spline with a free choice of knots.
 
     Args:
-        seconds: (L,) not falling, L >= 1; what was seen at the same time counts as its mean.
+        seconds: (L,) not falling, L >= 1; what was seen within 1 ms counts as its mean.
         xy: (L, 2) metres, where it was seen.
         sigma: metres.
         acceleration: m2/s3, density of the acceleration.
     """
-    t, which = np.unique(seconds, return_inverse=True)
+    which = np.cumsum(np.diff(seconds, prepend=seconds[:1]) > _AT_ONCE)
     count = np.bincount(which).astype(np.float64)
+    t = np.bincount(which, seconds) / count
     y = np.stack([np.bincount(which, xy[:, d]) for d in (0, 1)], axis=-1) / count[:, None]
     if len(t) == 1:
         return y[which], np.zeros_like(xy)

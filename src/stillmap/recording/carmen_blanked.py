@@ -18,10 +18,13 @@ from stillmap.recording.carmen_messages import SCAN_PARSERS
 from stillmap.recording.carmen_scans import Sensor, in_order, used
 from stillmap.recording.lines import numbered_lines
 from stillmap.recording.model import Recording
+from stillmap.recording.options import BEYOND
+from stillmap.recording.ranges import find_max_range
 
 _OVERFLOW = 81.91  # m: what a SICK laser says where nothing comes back, for want of another code
 _FIRST = {b"FLASER": 2, b"RLASER": 2}  # field of the first reading, counted with the name
 _FIRST_OF_OTHERS = 9
+_MARK = b"\xef\xbb\xbf"  # before the first line of some texts
 _FIELD = re.compile(rb"\S+")
 
 
@@ -33,7 +36,8 @@ class Blanked:
         scans: with their lines as they were but for blanked readings.
         beams: readings that were blanked.
         left_out: lines of scans that the recording does not have: damaged, or of a laser that
-            another kind of line shows, so that nothing is known of their beams.
+            another kind of line shows, so that nothing is known of their beams; and lines that
+            are too long to be read.
     """
 
     scans: int
@@ -79,15 +83,19 @@ def code(readings: NDArray[np.float32], rule: dict[str, Any]) -> bytes:
         readings: (T, n) metres.
         rule: how they are understood, a RangeRule.
     """
-    threshold = rule["threshold"]
-    if threshold is not None:
-        values, count = np.unique(readings[readings >= np.float32(threshold)], return_counts=True)
+    if np.any(readings >= BEYOND):
+        return b"inf"
+    found = find_max_range(readings)
+    if found.coded and found.threshold is not None:
+        values, count = np.unique(
+            readings[readings >= np.float32(found.threshold)], return_counts=True
+        )
         # the one in use: another would keep readers from seeing that it is a code
-        value = values[count.argmax()] if len(values) else np.float32(threshold)
-        return str(value).encode("ascii")
+        return str(values[count.argmax()]).encode("ascii")
     if rule["zero_means"] == "max-range":
         return b"0.00"
-    return f"{max(_OVERFLOW, 10.0 * float(rule['free_range'] or 0.0)):.2f}".encode("ascii")
+    farthest = max(float(rule["threshold"] or 0.0), float(readings.max(initial=0.0)))
+    return f"{_OVERFLOW if farthest < _OVERFLOW else 10.0 * farthest:.2f}".encode("ascii")
 
 
 def _scan_of_lines(source: Path, sensors: list[Sensor], recording: Recording) -> dict[int, int]:
@@ -102,7 +110,7 @@ def _scan_of_lines(source: Path, sensors: list[Sensor], recording: Recording) ->
 
 
 def _is_scan(text: bytes) -> bool:
-    name = text.split(maxsplit=1)[:1]
+    name = text.removeprefix(_MARK).split(maxsplit=1)[:1]
     return bool(name) and name[0] in SCAN_PARSERS
 
 
@@ -110,9 +118,9 @@ def _replaced(text: bytes, blank: NDArray[np.bool_], code: bytes) -> bytes:
     """A scan's line with the blanked readings replaced."""
     if not blank.any():
         return text
-    fields = list(_FIELD.finditer(text))
-    first = _FIRST.get(fields[0].group().removeprefix(b"\xef\xbb\xbf"), _FIRST_OF_OTHERS)
-    parts, at = [], 0
+    at = len(_MARK) if text.startswith(_MARK) else 0
+    fields, parts = list(_FIELD.finditer(text, at)), [text[:at]]
+    first = _FIRST.get(fields[0].group(), _FIRST_OF_OTHERS)
     for k in np.flatnonzero(blank).tolist():
         begin, end = fields[first + k].span()
         parts += [text[at:begin], code]

@@ -94,11 +94,15 @@ def read(path: Path) -> Recording:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
 
 
+def _no_number(text: str) -> float:
+    raise ValueError(f"{text} is none of its numbers")
+
+
 def _header(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > _MAX_HEADER:
             raise InputError("is no header of a recording: too large", where=str(path))
-        header = json.loads(path.read_text(encoding="utf-8"))
+        header = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_number)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
     except (ValueError, RecursionError) as error:
