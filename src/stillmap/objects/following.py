@@ -68,7 +68,8 @@ class _Following:
         cluster = self._points.cluster[here] - self._points.cluster[here[0]]
         squared = self._squared_distances(xy)
         variance = options.sigma**2 + self._motion.P[:, 0]
-        cost = squared / variance + np.log(variance)  # -2 ln of a Gaussian on two axes, halved
+        # a Gaussian on two axes has twice the logarithm: who was hidden would get too little back
+        cost = squared / variance + np.log(variance)
         sigma = self._motion.sigma
         near = np.minimum(options.near + options.near_sigmas * sigma, options.farthest)
         claims = _cheapest(cost, squared < near**2)
