@@ -28,21 +28,26 @@ nb::ndarray<nb::numpy, double> alpha_beta(const Grid<D>& grid, const Cells<D>& c
   return owned(std::move(out), {n, 2});
 }
 
-// visit(cell, counts) for the cells somebody looked at
-template <int D, class Visit>
-void for_each_seen(const Grid<D>& grid, Visit&& visit) {
-  for (const auto& block : grid.blocks())
+// visit(cell, counts) for the cells somebody looked at, in the blocks that wanted(block) says
+template <int D, class Wanted, class Visit>
+void for_each_seen(const Grid<D>& grid, Wanted&& wanted, Visit&& visit) {
+  for (const auto& block : grid.blocks()) {
+    if (!wanted(block->origin)) continue;
     for (int i = 0; i < Grid<D>::kCells; ++i) {
       const Counts& c = block->counts[static_cast<size_t>(i)];
       if (c.alpha + c.beta != 0) visit(Grid<D>::cell_at(block->origin, i), c);
     }
+  }
 }
 
-// what Python says of a box: its first cell, and its shape with the axes in reverse order
+template <int D, class Visit>
+void for_each_seen(const Grid<D>& grid, Visit&& visit) {
+  for_each_seen(grid, [](const Cell<D>&) { return true; }, visit);
+}
+
+// what Python says of a box: its first cell; its shape, with the axes in reverse order
 template <int D>
-using FirstCell = std::optional<std::array<int64_t, D>>;
-template <int D>
-using Shape = std::optional<std::array<int64_t, D>>;
+using Given = std::optional<std::array<int64_t, D>>;
 
 // A box of cells, to be laid out as [(z,) y, x]: the one around those somebody looked at, or given.
 template <int D>
@@ -76,10 +81,13 @@ struct Box {
     }
   }
 
-  bool holds(const Cell<D>& cell) const {
+  bool holds(const Cell<D>& cell) const { return meets(cell, 1); }
+
+  // whether any of the cells of a cube with this edge lies inside
+  bool meets(const Cell<D>& lowest, int edge) const {
     for (int d = 0; d < D; ++d) {
-      const int64_t n = int64_t{cell[d]} - first[d];
-      if (n < 0 || n >= static_cast<int64_t>(size[static_cast<size_t>(d)])) return false;
+      const int64_t n = int64_t{lowest[d]} - first[d];
+      if (n <= -edge || n >= static_cast<int64_t>(size[static_cast<size_t>(d)])) return false;
     }
     return true;
   }
@@ -121,12 +129,15 @@ auto box_of(const Grid<D>& grid) {
 }
 
 template <int D>
-auto dense(const Grid<D>& grid, const FirstCell<D>& first_cell, const Shape<D>& shape) {
+auto dense(const Grid<D>& grid, const Given<D>& first_cell, const Given<D>& shape) {
   if (first_cell.has_value() != shape.has_value())
     throw std::invalid_argument("first_cell, shape: expected both or neither");
   const Box<D> box = shape ? Box<D>(*first_cell, *shape) : Box<D>(grid);
   std::vector<double> alpha(box.total(), 0.0), beta(box.total(), 0.0);
-  for_each_seen(grid, [&](const Cell<D>& cell, const Counts& c) {
+  const auto meets = [&](const Cell<D>& block) {
+    return box.meets(Grid<D>::cell_at(block, 0), Grid<D>::kEdge);
+  };
+  for_each_seen(grid, meets, [&](const Cell<D>& cell, const Counts& c) {
     if (!box.holds(cell)) return;
     alpha[box.index(cell)] = from_fixed(c.alpha);
     beta[box.index(cell)] = from_fixed(c.beta);

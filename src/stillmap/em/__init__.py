@@ -11,12 +11,7 @@ from stillmap.em.estimator import (
 )
 from stillmap.em.expectations import CellProbabilities, Expectations, Likelihood, NoReturn
 from stillmap.em.held_out import held_out_log_likelihood
-from stillmap.em.occupancy import (
-    Box,
-    OccupancyMap,
-    Seen,
-    occupancy_map,
-)
+from stillmap.em.occupancy import Box, OccupancyMap, Seen, occupancy_map
 from stillmap.em.options import DwellOptions, EmOptions
 
 __all__ = [
