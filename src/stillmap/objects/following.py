@@ -96,15 +96,17 @@ class _Following:
 
     def _tear(self, here: Index, claims: Index, thing: int, kept: Index, gone: Index) -> None:
         """One thing turns out to be two: since when, and who of them was there before."""
-        owned = np.flatnonzero(self.owner[: here[0]] == self._id[thing])
-        torn = separation.torn(self._points, owned, kept, gone, self._options)
+        points = self._points
+        first = points.first[np.searchsorted(points.seconds, self._now - separation.BACK)]
+        owned = first + np.flatnonzero(self.owner[first : here[0]] == self._id[thing])
+        torn = separation.torn(points, owned, kept, gone, self._options)
         new = len(self._motion)
         for k, now, before in (
             (thing, torn.older_now, torn.older_before),
             (new, torn.newer_now, torn.newer_before),
         ):
             claims[np.isin(here, now)] = k
-            self._set(k, now, separation.velocity(self._points, before, self._now))
+            self._set(k, now, separation.velocity(points, before, self._now))
         self.owner[torn.newer_before] = self._id[new]
 
     def _set(self, k: int, now: Index, velocity: Float) -> None:

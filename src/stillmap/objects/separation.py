@@ -12,7 +12,7 @@ from stillmap.objects.options import ObjectOptions
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_BACK = 6.0  # s that it is gone back in time
+BACK = 6.0  # s that it is gone back in time
 _MISSED = 1.0  # s without any point after which one of them was not there yet
 _HORIZON = 1.0  # s of points that tell a velocity
 _STANDING = 0.3  # s by which few points are taken to stand still
@@ -46,7 +46,7 @@ def torn(
     motion = kalman.still(middles, options.sigma, options.sigma_speed)
     seen = np.array([at, at])
     shares: tuple[list[Index], list[Index]] = ([owned[:0]], [owned[:0]])
-    owned = owned[seconds[owned] > at - _BACK]
+    owned = owned[seconds[owned] > at - BACK]
     for here in np.split(owned, np.flatnonzero(np.diff(points.scan[owned])) + 1)[::-1]:
         if len(here) == 0 or (seen - seconds[here[0]] > _MISSED).any():
             break

@@ -14,7 +14,7 @@ def smoothed(seconds: Float, xy: Float, sigma: float, acceleration: float) -> tu
     A thing with white acceleration that is seen with white noise is most probably where a cubic
     smoothing spline is: it has the least sum of squared residuals over sigma^2 and of squared
     acceleration over its density. The spline by Reinsch's equations (Numer. Math. 10, 1967), which
-    are banded: twenty times as fast as a spline with a free choice of knots.
+    are banded: twenty times as fast as scipy's for the short ways of people.
 
     Args:
         seconds: (L,) not falling, L >= 1; what was seen within 1 ms counts as its mean.
