@@ -17,7 +17,7 @@ EXIT_OURS, EXIT_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 2, 130, 143
 _EPILOG = """examples:
   stillmap info log.clf.gz              what is in a recording
   stillmap map log.clf.gz -o out        map it; then open out/report.html
-  stillmap filter out -o clean.clf       the recording without what moved
+  stillmap filter out -o clean.clf      the recording without what moved
   stillmap simulate hall -o sim         a recording with truth
   stillmap eval labels out sim          how good the labels are
 """

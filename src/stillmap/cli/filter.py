@@ -33,7 +33,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         metavar="P",
         type=float,
         default=0.5,
-        help="blank beams that something static reflected with less than P (default: 0.5)",
+        help="blank beams that something static reflected with less than P (default: %(default)g)",
     )
     p.add_argument("--overwrite", action="store_true", help="replace what is there")
     p.add_argument("--quiet", action="store_true", help="no summary")
