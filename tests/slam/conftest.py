@@ -1,6 +1,8 @@
-"""Rooms, and scans taken in them."""
+"""Rooms, and scans taken in them; drives can be imported from here."""
 
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from stillmap import _core, se2
 from stillmap.simulation.laser import Movers, beam_angles, cast
 from stillmap.simulation.walls import box, pillar, polyline
 from stillmap.slam.scans import SurfaceOptions
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 Float = NDArray[np.float64]
 Points = NDArray[np.float32]

@@ -5,45 +5,15 @@ import functools
 
 import numpy as np
 import pytest
+from driven import driven
 
 from stillmap import _core, se2
-from stillmap.simulation import RobotOptions, Scene, simulate
-from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.simulation.scene import LaserOptions
 from stillmap.simulation.walls import box
-from stillmap.slam import SlamOptions, candidates, keyframes
-from stillmap.slam.loops import Candidate, Track
+from stillmap.slam import candidates
+from stillmap.slam.loops import Candidate
 from stillmap.slam.scans import Scan
 from stillmap.slam.verification import _before, _comparable, attempts, laid_on, local_map
-
-OPTIONS = SlamOptions()
-
-
-def driven(walls, route, laser, speed=1.0):
-    """A recording of a robot that drives among walls, with true poses."""
-    scene = Scene(
-        "across",
-        walls=walls,
-        route=route,
-        crowd=CrowdOptions(people=0),
-        laser=laser,
-        robot=RobotOptions(speed=speed),
-        odometry=OdometryOptions(),
-    )
-    simulation = simulate(scene, 0)
-    truth = simulation.truth.T_world_base
-    poses = se2.inverse(truth[0]) @ truth
-    return Track(
-        simulation.recording,
-        np.full(simulation.recording.n_beams, 0.9, np.float32),
-        poses,
-        keyframes.travel(poses),
-        np.ones(len(poses)),
-        keyframes.chosen(poses, 1.0, 0.5),
-        0.05,
-        OPTIONS.registration,
-        OPTIONS.surface,
-        OPTIONS.loops,
-    )
 
 
 @functools.cache

@@ -4,46 +4,22 @@ import functools
 
 import numpy as np
 import pytest
+from driven import driven
 
 from stillmap import se2
-from stillmap.simulation import RobotOptions, Scene, simulate
-from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.simulation.scene import LaserOptions
 from stillmap.simulation.walls import box
-from stillmap.slam import SlamOptions, keyframes
-from stillmap.slam.loops import Candidate, Track
+from stillmap.slam.loops import Candidate
 from stillmap.slam.verification import _ambiguous, laid_on, local_map
-
-OPTIONS = SlamOptions()
 
 
 @functools.cache
 def corridor(*landmarks):
     """A corridor with a doorway every 2 m along one wall, and true poses along it."""
     piers = [wall for x in range(1, 40, 2) for wall in box(x, 1.2, 0.9, 0.3)]
-    scene = Scene(
-        "doors",
-        walls=(*box(19, 0, 44, 2.6), *piers, *landmarks),
-        route=((0, -0.2), (25, -0.2)),
-        crowd=CrowdOptions(people=0),
-        laser=LaserOptions(beams=120, max_range=5.0),
-        robot=RobotOptions(),
-        odometry=OdometryOptions(),
-    )
-    simulation = simulate(scene, 0)
-    truth = simulation.truth.T_world_base
-    poses = se2.inverse(truth[0]) @ truth
-    return Track(
-        simulation.recording,
-        np.full(simulation.recording.n_beams, 0.9, np.float32),
-        poses,
-        keyframes.travel(poses),
-        np.ones(len(poses)),
-        keyframes.chosen(poses, 1.0, 0.5),
-        0.05,
-        OPTIONS.registration,
-        OPTIONS.surface,
-        OPTIONS.loops,
-    )
+    walls = (*box(19, 0, 44, 2.6), *piers, *landmarks)
+    laser = LaserOptions(beams=120, max_range=5.0)
+    return driven(walls, ((0, -0.2), (25, -0.2)), laser, speed=0.5)
 
 
 def closed(track, sigma):
