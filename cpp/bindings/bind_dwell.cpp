@@ -74,6 +74,36 @@ auto likelihoods(Dwell<D>& dwell) {
   return std::make_tuple(owned(std::move(relative), {n, C}), owned(std::move(log_best), {n}));
 }
 
+// Of every element, see the docstring of `changes` below.
+template <int D>
+auto describe_changes(const Dwell<D>& dwell) {
+  const Changes& changes = dwell.changes();
+  const size_t n = changes.members();
+  std::vector<double> log_likelihood(n);
+  std::vector<float> p_last(n * 2), share(n);
+  std::vector<int32_t> count(n * 2), looks(n * 8);
+  {
+    nb::gil_scoped_release released;
+    for (size_t k = 0; k < n; ++k) {
+      const Course& course = changes.course(k);
+      log_likelihood[k] = changes.log_likelihood(k);
+      share[k] = changes.occupied_share(k);
+      p_last[2 * k] = changes.p_at_last(k, Changes::kThing);
+      p_last[2 * k + 1] = 1.0f - changes.p_at_last(k, Changes::kNothing);
+      for (const auto& [turns, i] : {std::pair{&course.things, 2 * k}, {&course.any, 2 * k + 1}}) {
+        count[i] = turns->count;
+        looks[4 * i] = turns->first.before;
+        looks[4 * i + 1] = turns->first.after;
+        looks[4 * i + 2] = turns->last.before;
+        looks[4 * i + 3] = turns->last.after;
+      }
+    }
+  }
+  return std::make_tuple(owned(std::move(log_likelihood), {n}), owned(std::move(share), {n}),
+                         owned(std::move(p_last), {n, 2}), owned(std::move(count), {n, 2}),
+                         owned(std::move(looks), {n, 2, 2, 2}));
+}
+
 template <int D>
 auto lost_beams(const Dwell<D>& dwell, const Points<D>& points, const Flat<bool>& hit,
                 const Flat<int64_t>& offset, const Poses<D>& poses) {
@@ -160,6 +190,26 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
           nb::arg("open"),
           "How far to trust beams without a return beyond the first solid thing in their way; all "
           "the way at first.")
+      .def(
+          "watch",
+          [](W& w, double tau, double passing_occupied, double passing_tau, double detection) {
+            for (const double t : {tau, passing_tau})
+              require(t > 0.0 && std::isfinite(t), "tau: expected positive times");
+            for (const double p : {passing_occupied, detection})
+              require(p > 0.0 && p < 1.0, "expected probabilities between 0 and 1");
+            w.watch({tau, passing_occupied, passing_tau, detection});
+          },
+          nb::kw_only(), nb::arg("tau"), nb::arg("passing_occupied"), nb::arg("passing_tau"),
+          nb::arg("detection"),
+          "Asks, before the first look, which elements are of things that come to stay or leave: "
+          "correlation time in seconds; share of the time and correlation time of passers-by.")
+      .def(
+          "changes", &describe_changes<D>,
+          "Of each element: (E,) logarithm of the likelihood of everything else that was seen, if "
+          "things come to stay and leave; of the most probable course (E,) float32 share of the "
+          "time in which it was not empty. Then, for things alone and for anything that was there: "
+          "(E, 2) float32 probability of it at the last look; (E, 2) int32 how often it came or "
+          "left; (E, 2, 2, 2) int32 looks before and after the first and the last time, -1: none.")
       .def("likelihood", &likelihoods<D>,
            "(E, C) float32 relative to the best class, (E,) logarithm of the best: of everything "
            "else that was seen of the cell, given that a beam ended in it.");

@@ -1,5 +1,6 @@
 """Runs the loop to its end and keeps the best iterate."""
 
+import dataclasses
 import itertools
 import logging
 from collections.abc import Iterator, Mapping
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core, em, pipeline, slam
+from stillmap.changes import Change, changed_places, without_changes
 from stillmap.objects import MovingObject, Traffic, moving_objects, traffic
 from stillmap.output.crops import Snapshot, Window, choose_window, snapshot
 from stillmap.output.points import dynamic_points
@@ -59,6 +61,7 @@ class Result:
         graph: the pose graph of these loops; None where poses were given or none were looked for.
         objects: what moved, in the order in which it was first seen.
         traffic: how often each square of the floor was crossed by them.
+        changes: places where something came to stay, left, or comes and goes.
         stages: seconds and peak memory.
     """
 
@@ -80,6 +83,7 @@ class Result:
     graph: slam.Graph | None
     objects: list[MovingObject]
     traffic: Traffic
+    changes: list[Change]
     stages: Mapping[str, Mapping[str, Any]]
 
     @property
@@ -193,16 +197,19 @@ class _Run:
         )
 
     def result(self, recording: Recording, stages: Stages) -> Result:
-        kept = self.kept
         threads = resolved_threads(self.options.threads)
+        with stages.measure("changes"):
+            seen = slam.deskewed(recording, self.kept.poses, self.options.slam)
+            changes = self._settle(seen, threads)
+        kept = self.kept
         with stages.measure("maps"):
-            seen = slam.deskewed(recording, kept.poses, self.options.slam)
             filtered = self._map(seen, threads)
             raw = _raw_map(seen, kept.poses, filtered, threads)
         with stages.measure("objects"):
-            moving = moving_objects(seen, kept.poses, kept.p_static, self.options.objects)
+            movers = without_changes(seen, kept.poses, kept.p_static, changes, filtered.resolution)
+            moving = moving_objects(seen, kept.poses, movers, self.options.objects)
             crossed = traffic(moving)
-            del seen
+            del seen, movers
         return Result(
             recording=recording,
             options=self.options,
@@ -222,8 +229,25 @@ class _Run:
             graph=kept.graph,
             objects=moving,
             traffic=crossed,
+            changes=changes,
             stages=stages.to_dict(),
         )
+
+    def _settle(self, recording: Recording, threads: int) -> list[Change]:
+        """The last E-step: labels of the map as it is shown, and the places that changed."""
+        kept, options, cell = self.kept, self.options.em, self.options.slam.resolution
+        if self.options.estimator != "stillmap" or not options.changes.enabled:
+            return []
+        state = self.options.output.map_state
+        found, courses = em.last_e_step(recording, kept.poses, cell, options, state, threads)
+        self.best = dataclasses.replace(
+            kept,
+            p_static=found.p_static,
+            occupied=found.occupied,
+            learned=found.learned,
+            no_return=found.no_return,
+        )
+        return changed_places(courses, recording, cell, options.dwell.look, options.changes)
 
     def _map(self, recording: Recording, threads: int) -> em.OccupancyMap:
         """The printed labels follow from the sums they were made from, others make the sums."""

@@ -91,6 +91,7 @@ class FakeResult:
     stages: dict
     objects: list = field(default_factory=list)
     traffic: Traffic = field(default_factory=lambda: traffic([]))
+    changes: list = field(default_factory=list)
     graph: Graph | None = None
     doubts: Doubts = field(default_factory=Doubts)
 

@@ -10,10 +10,12 @@
 #include <atomic>
 #include <limits>
 #include <memory>
+#include <optional>
 #include <stdexcept>
 #include <vector>
 
 #include "stillmap/chains.hpp"
+#include "stillmap/changes.hpp"
 #include "stillmap/looks.hpp"
 
 namespace stillmap {
@@ -47,6 +49,15 @@ class Dwell {
   }
   // How far to trust them beyond the first solid element, from now on.
   void trust(double open) { options_.open = open; }
+  // From now on asks, too, which elements are of things that were put there or taken away.
+  void watch(const ChangeModel& model) {
+    if (newest_ != kNone) throw std::invalid_argument("watch: before the first look");
+    changes_.emplace(surface_.size(), model, options_.seconds);
+  }
+  const Changes& changes() const {
+    if (!changes_) throw std::invalid_argument("changes: nobody asked to watch for them");
+    return *changes_;
+  }
 
   // look (T,): number of each scan's look, not falling, and not below those added before.
   void add(const Scans<D>& scans, const int64_t* look, int threads) {
@@ -55,6 +66,8 @@ class Dwell {
     const size_t T = scans.n_scans;
     for (size_t t = 0; t < T; ++t)
       if (look[t] < (t ? look[t - 1] : newest_)) throw std::invalid_argument("look: must not fall");
+    if (changes_ && T && !(Changes::counts(look[0]) && Changes::counts(look[T - 1])))
+      throw std::invalid_argument("look: expected 0 to 2147483647");
     std::vector<size_t> starts;  // of looks
     for (size_t t = 0; t < T; ++t)
       if (t == 0 || look[t] != look[t - 1]) starts.push_back(t);
@@ -95,6 +108,7 @@ class Dwell {
 
  private:
   static constexpr size_t kWindow = 64;  // looks held at once
+  static constexpr int64_t kNone = std::numeric_limits<int64_t>::min();
 
   static const Surface<D>& checked(const Surface<D>& surface) {
     if (!surface.fitted()) throw std::invalid_argument("surface: fit it first");
@@ -113,8 +127,10 @@ class Dwell {
       const float reliability = seen.looks[i].seen_through;
       if (reliability == Look::kHit) {
         chains_.hit(k, look);
+        if (changes_) changes_->hit(k, look);
       } else {
         chains_.seen_through(k, look, reliability);
+        if (changes_) changes_->seen_through(k, look, reliability);
       }
     }
   }
@@ -124,7 +140,8 @@ class Dwell {
   MeetingTables tables_;
   Neighbours<D> neighbours_;
   Chains chains_;
-  int64_t newest_ = std::numeric_limits<int64_t>::min();
+  std::optional<Changes> changes_;
+  int64_t newest_ = kNone;
 };
 
 // The element each beam ended in: kNoElement for those that were not hit or ended elsewhere.

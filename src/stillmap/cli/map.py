@@ -37,6 +37,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
     p.add_argument("--resolution", metavar="M", type=float, help="edge of a map cell in metres")
     p.add_argument("--map-mode", choices=["trinary", "scale", "raw"], help="pixels of map.pgm")
+    p.add_argument(
+        "--map-state", choices=get_args(em.MapState), help="which state of places that changed"
+    )
     p.add_argument("--threads", metavar="N", type=int, help="0: one per processor")
     p.add_argument("--quiet", action="store_true", help="no progress, no summary")
     add_read_flags(p)
@@ -97,8 +100,9 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
         changes["threads"] = args.threads
     if args.resolution is not None:
         changes["slam"] = {"resolution": args.resolution}
-    if args.map_mode:
-        changes["output"] = {"map_mode": args.map_mode}
+    output = {"map_mode": args.map_mode, "map_state": args.map_state}
+    if chosen := {name: value for name, value in output.items() if value}:
+        changes["output"] = chosen
     return changes
 
 

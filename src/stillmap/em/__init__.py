@@ -1,5 +1,7 @@
 """What is static: the E-steps, the map that follows from them, and the likelihood. No I/O."""
 
+from stillmap.em.courses import Courses, MapState, last_e_step
+from stillmap.em.dwell import look_numbers
 from stillmap.em.estimator import (
     Estimator,
     add_believed_first,
@@ -12,16 +14,19 @@ from stillmap.em.estimator import (
 from stillmap.em.expectations import CellProbabilities, Expectations, Likelihood, NoReturn
 from stillmap.em.held_out import held_out_log_likelihood
 from stillmap.em.occupancy import Box, OccupancyMap, Seen, occupancy_map
-from stillmap.em.options import DwellOptions, EmOptions
+from stillmap.em.options import ChangeOptions, DwellOptions, EmOptions
 
 __all__ = [
     "Box",
     "CellProbabilities",
+    "ChangeOptions",
+    "Courses",
     "DwellOptions",
     "EmOptions",
     "Estimator",
     "Expectations",
     "Likelihood",
+    "MapState",
     "NoReturn",
     "OccupancyMap",
     "Seen",
@@ -32,5 +37,7 @@ __all__ = [
     "held_out_log_likelihood",
     "initial_expectations",
     "iterations",
+    "last_e_step",
+    "look_numbers",
     "occupancy_map",
 ]

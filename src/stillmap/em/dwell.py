@@ -1,5 +1,6 @@
 """The default E-step: what stands still is what never leaves. `docs/estimator.md` derives it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,24 +82,72 @@ def e_step(
         classes: see Classes.
     """
     T_map_sensor = recording.T_map_sensor(poses)
+    looks = looked_at(recording, T_map_sensor, resolution, options, threads, classes)
+    shares = fit_shares(looks.likelihood, classes.n_static, options.prior)
+    static = posterior_static(looks.likelihood, shares.classes, classes.n_static)
+    return expectations(recording, T_map_sensor, looks, shares, static, options, threads)
+
+
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """What all looks say of E elements.
+
+    Attributes:
+        surface: the elements.
+        dwell: what was seen of them.
+        trust: how far beams without a return are believed, from 0 to 1.
+        likelihood: (E, C) under each class, relative to the best; its logarithm is `log_best`.
+        classes: those of the first columns.
+    """
+
+    surface: Surface
+    dwell: Dwell
+    trust: float
+    likelihood: NDArray[np.float32]
+    log_best: Float
+    classes: Classes
+
+
+def looked_at(
+    recording: Recording,
+    T_map_sensor: Float,
+    resolution: float,
+    options: EmOptions,
+    threads: int,
+    classes: Classes = CLASSES,
+    prepare: Callable[[Dwell], None] | None = None,
+) -> Looks:
+    """Follows all beams; `prepare` is called before the first look. See `e_step`."""
     surface = surface_of(recording, T_map_sensor, resolution)
     dwell = _dwell(surface, options.dwell, classes)
     trust = _open(recording, T_map_sensor, dwell)
     dwell.trust(trust)
+    if prepare is not None:
+        prepare(dwell)
     likelihood, log_best = _likelihood(recording, T_map_sensor, dwell, options.dwell.look, threads)
+    return Looks(surface, dwell, trust, likelihood, log_best, classes)
+
+
+def expectations(
+    recording: Recording,
+    T_map_sensor: Float,
+    looks: Looks,
+    shares: Shares,
+    static: NDArray[np.float32],
+    options: EmOptions,
+    threads: int,
+) -> Expectations:
+    """What follows for beams and cells from what is known (E,) of the elements. See `e_step`."""
+    surface = looks.surface
     cells, _, normals, off_plane, prominence, _ = surface.elements()
-    shares = fit_shares(likelihood, classes.n_static, options.prior)
-    static = posterior_static(likelihood, shares.classes, classes.n_static)
+    covered = _coverage(normals, off_plane / surface.resolution, prominence)
+    beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
     return Expectations(
         p_static=_of_beams(recording, T_map_sensor, surface, static, shares.static, threads),
-        likelihood=_bound(likelihood, log_best, shares),
-        occupied=CellProbabilities(
-            cells, static * _coverage(normals, off_plane / resolution, prominence), _UNSEEN
-        ),
-        learned=_learned(surface, trust, shares, classes),
-        no_return=NoReturn(
-            dwell.solid(), options.dwell.beyond if trust >= _BELIEVED else float("inf")
-        ),
+        likelihood=_bound(looks.likelihood, looks.log_best, shares),
+        occupied=CellProbabilities(cells, static * covered, _UNSEEN),
+        learned=_learned(surface, looks.trust, shares, looks.classes),
+        no_return=NoReturn(looks.dwell.solid(), beyond),
     )
 
 
@@ -213,8 +262,9 @@ def _coverage(normals: Float, off_plane: Float, prominence: Float) -> NDArray[np
 
 
 def _learned(surface: Surface, trust: float, shares: Shares, classes: Classes) -> dict[str, object]:
-    n = classes.n_static
-    movers = shares.classes[n:].reshape(len(classes.mover_seconds), -1) / shares.classes[n:].sum()
+    n, last = classes.n_static, len(classes.grid()[0])
+    of_movers = shares.classes[n:last]
+    movers = of_movers.reshape(len(classes.mover_seconds), -1) / of_movers.sum()
     static = shares.classes[:n].reshape(len(classes.static_seconds), -1) / shares.static
     return {
         "scatter": surface.scatter,

@@ -30,6 +30,32 @@ class DwellOptions:
 
 
 @dataclass(frozen=True)
+class ChangeOptions:
+    """Things that are put somewhere, taken away, or moved once."""
+
+    enabled: bool = field_with_doc(True, "look for them, and show the map in one of its states")
+    stays: float = field_with_doc(1200.0, "s, for how long a thing stays, and its place stays free")
+    passing_occupied: float = field_with_doc(0.05, "share of the time in which others pass there")
+    passing_seconds: float = field_with_doc(12.0, "s, for how long they stay")
+    near: float = field_with_doc(0.5, "m, cells so near to each other that change are one place")
+    together: float = field_with_doc(2.0, "s, by which the cells of a place may change apart")
+    least: int = field_with_doc(4, "cells below which a place that changed is not listed")
+
+    def __post_init__(self) -> None:
+        for name in ("stays", "passing_seconds"):
+            if not 0.1 <= getattr(self, name) <= 1e7:
+                raise ValueError(f"'em.changes.{name}' wants 0.1 to 10000000 seconds")
+        if not 0.0 < self.passing_occupied < 1.0:
+            raise ValueError("'em.changes.passing_occupied' wants a share between 0 and 1")
+        if not 0.0 < self.near <= 100.0:
+            raise ValueError("'em.changes.near' wants more than 0 and at most 100 metres")
+        if not 0.0 <= self.together <= 3600.0:
+            raise ValueError("'em.changes.together' wants 0 to 3600 seconds")
+        if self.least < 1:
+            raise ValueError("'em.changes.least' wants at least 1")
+
+
+@dataclass(frozen=True)
 class EmOptions:
     """The loop of Fig. 2."""
 
@@ -51,6 +77,7 @@ class EmOptions:
         20, "every that many scans one is left out of the map and scored by it; 0: none"
     )
     dwell: DwellOptions = field(default=DwellOptions())
+    changes: ChangeOptions = field(default=ChangeOptions())
 
     def __post_init__(self) -> None:
         for name in ("prior", "hit_ratio"):

@@ -1,27 +1,49 @@
 """`map.npz`: the occupancy grid with the sums it is made from."""
 
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.output.protocols import OccupancyMapLike
+from stillmap.output.protocols import ChangeLike, MapLike, OccupancyMapLike
+
+# what `changed` says of a cell
+CHANGED = {"came": 1, "left": 2, "comes and goes": 3}
 
 
-def write_map_npz(path: Path, occupancy: OccupancyMapLike) -> None:
-    """Write `p_occupied`, `alpha`, `beta` (H, W), `origin` (x, y, yaw), `resolution` in metres."""
+def write_map_npz(
+    path: Path, occupancy: OccupancyMapLike, changes: Sequence[ChangeLike] = ()
+) -> None:
+    """Write `p_occupied`, `alpha`, `beta`, `changed` (H, W), `origin` (x, y, yaw), `resolution`.
+
+    Metres; `changed` uint8: 0, or how the place changed, see CHANGED.
+    """
     write_npz(
         path,
         {
             "p_occupied": np.asarray(occupancy.p_occupied, np.float32),
             "alpha": np.asarray(occupancy.alpha, np.float32),
             "beta": np.asarray(occupancy.beta, np.float32),
+            "changed": changed_cells(occupancy, changes),
             "origin": np.asarray(occupancy.origin, np.float64),
             "resolution": np.asarray(occupancy.resolution, np.float64),
         },
     )
+
+
+def changed_cells(occupancy: MapLike, changes: Sequence[ChangeLike]) -> NDArray[np.uint8]:
+    """(H, W) how each cell changed, 0: it did not. The last change of several is told."""
+    height, width = occupancy.p_occupied.shape
+    out = np.zeros((height, width), np.uint8)
+    first = np.round(np.array(occupancy.origin[:2]) / occupancy.resolution).astype(np.int64)
+    for change in sorted(changes, key=lambda one: one.last_ns):
+        column, row = (change.swept - first).T
+        inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
+        out[row[inside], column[inside]] = CHANGED[change.kind]
+    return out
 
 
 def write_npz(path: Path, arrays: dict[str, NDArray[Any]]) -> None:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from stillmap.output.protocols import MapLike
 
 MapMode = Literal["trinary", "scale", "raw"]
+MapState = Literal["last", "majority"]
 
 OCCUPIED_THRESH = 0.65
 # map_server reads pixel 205 as p = 50 / 255 = 0.19608: any larger threshold turns unknown into free
@@ -34,6 +35,9 @@ class OutputOptions:
         "trinary",
         "pixels of the map picture: trinary (occupied, unknown, free), scale (grey between the "
         "thresholds; a .png, as unknown needs transparency) or raw (percent occupied, 255 unknown)",
+    )
+    map_state: MapState = field_with_doc(
+        "last", "of places that changed the map shows the last state, or the one held for longest"
     )
 
 

@@ -212,6 +212,42 @@ class OptionsLike(Protocol):
     def output(self) -> OutputOptions: ...
 
 
+class ChangeLike(Protocol):
+    """A place that changed.
+
+    Attributes:
+        kind: "came", "left" or "comes and goes".
+        x, y: metres, its middle in the map frame.
+        size: metres along x and y.
+        cells: (K, 2) int64 cells that changed.
+        swept: (S, 2) int64 cells of the whole place: these and what lies between.
+        before_ns, stamp_ns: last scan that saw it as it was, first that saw it otherwise.
+        last_ns: first scan that saw the last change.
+        times: how often it changed.
+    """
+
+    @property
+    def kind(self) -> str: ...
+    @property
+    def x(self) -> float: ...
+    @property
+    def y(self) -> float: ...
+    @property
+    def size(self) -> tuple[float, float]: ...
+    @property
+    def cells(self) -> NDArray[np.int64]: ...
+    @property
+    def swept(self) -> NDArray[np.int64]: ...
+    @property
+    def before_ns(self) -> int: ...
+    @property
+    def stamp_ns(self) -> int: ...
+    @property
+    def last_ns(self) -> int: ...
+    @property
+    def times(self) -> int: ...
+
+
 class ResultLike(Protocol):
     """What `stillmap map` found out about T scans with M beams in D dimensions.
 
@@ -234,6 +270,7 @@ class ResultLike(Protocol):
         graph: the pose graph; None where poses were given or no loops were looked for.
         objects: what moved.
         traffic: how often squares of the floor were crossed by it.
+        changes: places where something came to stay, left, or comes and goes.
         stages: name to `seconds`, `cpu_seconds` and `peak_memory_bytes`, in the order they ran.
     """
 
@@ -273,5 +310,7 @@ class ResultLike(Protocol):
     def objects(self) -> Sequence[MovingObjectLike]: ...
     @property
     def traffic(self) -> TrafficLike: ...
+    @property
+    def changes(self) -> Sequence[ChangeLike]: ...
     @property
     def stages(self) -> Mapping[str, Mapping[str, Any]]: ...

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from stillmap.output.points import beam_counts
 from stillmap.output.protocols import ResultLike
+from stillmap.output.report_changes import changes_section
 from stillmap.output.report_curve import likelihood_svg
 from stillmap.output.report_learned import learned_section
 from stillmap.output.report_maps import evolution_section, maps_section
@@ -52,6 +53,7 @@ def report_html(result: ResultLike) -> str:
         _headline(result),
         _warnings(result),
         maps_section(result),
+        changes_section(result),
         objects_section(result),
         learned_section(result),
         _estimate_section(result),

@@ -59,6 +59,7 @@ figcaption b { color: var(--ink); }
 .map img.reduced { image-rendering: auto; }
 .map polyline { fill: none; stroke: #2463a8; stroke-width: 1.6; stroke-linejoin: round;
   vector-effect: non-scaling-stroke; }
+.map .numbers text { fill: #111; stroke: #fff; stroke-width: .25em; paint-order: stroke; }
 .map .ways polyline { stroke: #d96a00; stroke-width: 1.3; }
 .map .path { display: none; }
 #show-path:checked ~ .pair .path { display: block; }

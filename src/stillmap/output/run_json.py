@@ -10,9 +10,10 @@ import numpy as np
 
 from stillmap.options import to_dict
 from stillmap.output.points import beam_counts
-from stillmap.output.protocols import IterationRecordLike, LoopLike, ResultLike
+from stillmap.output.protocols import ChangeLike, IterationRecordLike, LoopLike, ResultLike
 
 FORMAT_VERSION = 1
+_MILLIMETRES = 3  # digits
 
 
 def run_record(result: ResultLike) -> dict[str, Any]:
@@ -44,6 +45,7 @@ def run_record(result: ResultLike) -> dict[str, Any]:
             "carried_before": result.doubts.breaks,
             "beside_the_map_from": result.doubts.apart,
         },
+        "changes": [_change(one) for one in result.changes],
         "loops": {
             "accepted": [_loop(one) for one in result.loops if not one.refused],
             "refused": [_loop(one) | {"why": one.refused} for one in result.loops if one.refused],
@@ -88,6 +90,20 @@ def jsonable(value: Any) -> Any:
 
 def _loop(one: LoopLike) -> dict[str, Any]:
     return {"earlier": one.earlier, "later": one.later, "explained": one.explained}
+
+
+def _change(one: ChangeLike) -> dict[str, Any]:
+    return {
+        "kind": one.kind,
+        "x": round(one.x, _MILLIMETRES),
+        "y": round(one.y, _MILLIMETRES),
+        "size": [round(metres, _MILLIMETRES) for metres in one.size],
+        "cells": len(one.cells),
+        "before_ns": one.before_ns,
+        "stamp_ns": one.stamp_ns,
+        "last_ns": one.last_ns,
+        "times": one.times,
+    }
 
 
 def _iteration(it: IterationRecordLike) -> dict[str, Any]:

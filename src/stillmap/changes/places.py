@@ -1,0 +1,291 @@
+"""Cells that changed near each other at the same time are one place."""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from stillmap.changes.swept import swept_cells
+from stillmap.em import ChangeOptions, Courses, look_numbers
+from stillmap.em.courses import OFTEN
+from stillmap.recording.model import Recording
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+Kind = Literal["came", "left", "comes and goes"]
+
+_SURE = 0.5  # probability above which a cell counts as one that changed
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A place that changed.
+
+    Attributes:
+        kind: something came, left, or comes and goes.
+        x, y: metres, the middle of its cells in the map frame.
+        size: metres, along x and y.
+        cells: (K, 2) int64, those that changed.
+        before_ns: stamp of the last scan that saw it as it was.
+        stamp_ns: of the first that saw it otherwise: the change lies between these two. For what
+            comes and goes, of the first change that was seen.
+        last_ns: the same of the last change that was seen; `stamp_ns` where there was one only.
+        times: how often it changed.
+    """
+
+    kind: Kind
+    x: float
+    y: float
+    size: tuple[float, float]
+    cells: NDArray[np.int64]
+    before_ns: int
+    stamp_ns: int
+    last_ns: int
+    times: int
+
+    @property
+    def swept(self) -> NDArray[np.int64]:
+        """(S, 2) cells of the whole place; of what comes and goes also those between its ends."""
+        return swept_cells(self.cells) if self.kind == "comes and goes" else self.cells
+
+    @property
+    def appeared(self) -> bool:
+        """Whether something is there now that was not there before."""
+        return self.kind == "came"
+
+
+def without_changes(
+    recording: Recording,
+    poses: Float,
+    p_static: NDArray[np.float32],
+    changes: list[Change],
+    resolution: float,
+) -> NDArray[np.float32]:
+    """(M,) p_static, but one for beams on what stood in a place while it stood there.
+
+    It is listed as a change, and no object on its way.
+    """
+    beam = np.flatnonzero(recording.hit & (p_static < 0.5))
+    if not changes or not len(beam):
+        return p_static
+    scan = np.searchsorted(recording.offset, beam, side="right") - 1
+    T = recording.T_map_sensor(poses)[scan]
+    ends = np.einsum("nij,nj->ni", T[:, :2, :2], recording.points[beam]) + T[:, :2, 2]
+    at, stamp = np.floor(ends / resolution).astype(np.int64), recording.stamp_ns[scan]
+    stood = np.zeros(len(beam), bool)
+    for change in changes:
+        during = np.ones(len(beam), bool)
+        if change.kind != "comes and goes":
+            during = (stamp > change.before_ns) == (change.kind == "came")
+        low, high = change.cells.min(axis=0) - 1, change.cells.max(axis=0) + 2
+        inside = np.flatnonzero(during & ((at >= low) & (at < high)).all(axis=1))
+        near = np.zeros(tuple((high - low).tolist()), bool)
+        near[tuple((change.cells - low).T)] = True
+        stood[inside] |= binary_dilation(near, np.ones((3, 3), bool))[tuple((at[inside] - low).T)]
+    out = p_static.copy()
+    out[beam[stood]] = 1.0
+    return out
+
+
+class _Events(NamedTuple):
+    """N changes of single cells: which cell, came or left, and between which stamps in ns."""
+
+    cell: Index
+    came: NDArray[np.bool_]
+    before: NDArray[np.int64]
+    after: NDArray[np.int64]
+
+    def of(self, chosen: Index) -> "_Events":
+        return _Events(
+            self.cell[chosen], self.came[chosen], self.before[chosen], self.after[chosen]
+        )
+
+
+def changed_places(
+    courses: Courses,
+    recording: Recording,
+    resolution: float,
+    look: float,
+    options: ChangeOptions,
+) -> list[Change]:
+    """Cells near each other that changed at the same time, in the order of time.
+
+    Args:
+        courses: of all cells in which beams ended.
+        recording: it knows when each look was.
+        resolution: m, edge of a cell.
+        look: s, length of a look.
+        options: see ChangeOptions.
+    """
+    changed = np.flatnonzero((courses.p_changing > _SURE) & (courses.count > 0))
+    often = courses.count[changed] >= OFTEN
+    stamps = _Stamps(recording, look)
+    events = _events(courses, changed[~often], stamps)
+    out = []
+    for group in _groups(events, courses, resolution, options):
+        out += _told_apart(group, courses, resolution, options)
+    out += _coming_and_going(courses, changed[often], stamps, resolution, options)
+    out = _merged(out, resolution, options.near / resolution)
+    return sorted(out, key=lambda change: (change.stamp_ns, change.x, change.y))
+
+
+class _Stamps:
+    """When looks were: their first and last scans."""
+
+    def __init__(self, recording: Recording, look: float) -> None:
+        number = look_numbers(recording, look)
+        begins = np.flatnonzero(np.diff(number, prepend=number[:1] - 1))
+        ends = np.append(begins[1:], len(number)) - 1
+        self._number = number[begins]
+        self._first, self._last = recording.stamp_ns[begins], recording.stamp_ns[ends]
+
+    def first(self, looks: NDArray[np.int32]) -> NDArray[np.int64]:
+        return np.asarray(self._first[np.searchsorted(self._number, looks)], np.int64)
+
+    def last(self, looks: NDArray[np.int32]) -> NDArray[np.int64]:
+        return np.asarray(self._last[np.searchsorted(self._number, looks)], np.int64)
+
+
+def _events(courses: Courses, cells: Index, stamps: _Stamps) -> _Events:
+    """The one or two changes of each of these cells."""
+    twice = np.flatnonzero(courses.count[cells] == 2)
+    cell = np.concatenate([cells, cells[twice]])
+    which = np.concatenate([np.ones(len(cells), np.intp), np.zeros(len(twice), np.intp)])
+    # the last change made it what it is, the first of two what it no longer is
+    came = (courses.p_thing[cell] > 0.5) == (which == 1)
+    looks = courses.between[cell, which]
+    return _Events(cell, came, stamps.last(looks[:, 0]), stamps.first(looks[:, 1]))
+
+
+def _groups(
+    events: _Events, courses: Courses, resolution: float, options: ChangeOptions
+) -> list[_Events]:
+    """Events of the same kind near each other, at times that may be the same."""
+    slack = round(options.together * 1e9)
+    pairs = _pairs(courses.cells[events.cell], options.near / resolution)
+    i, j = pairs.T
+    begin = np.maximum(events.before[i], events.before[j])
+    end = np.minimum(events.after[i], events.after[j])
+    fits = (events.came[i] == events.came[j]) & (begin < end + slack)
+    return [events.of(one) for one in _components(pairs[fits], len(events.cell))]
+
+
+def _pairs(cells: NDArray[np.int64], distance: float) -> Index:
+    """(P, 2) which of these cells lie so near to each other, in cells."""
+    if not len(cells):
+        return np.empty((0, 2), np.intp)
+    return np.asarray(cKDTree(cells).query_pairs(distance, output_type="ndarray"), np.intp)
+
+
+def _components(pairs: Index, n: int) -> list[Index]:
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    _, label = connected_components(graph, directed=False)
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if n else []
+
+
+def _told_apart(
+    events: _Events, courses: Courses, resolution: float, options: ChangeOptions
+) -> list[Change]:
+    """One change after the other, each at the time that fits most of the cells that are left."""
+    out = []
+    slack = round(options.together * 1e9)
+    while len(events.cell) >= options.least:
+        # the number of intervals over an instant only grows where one begins
+        starts, ends = np.sort(events.before), np.sort(events.after)
+        over = np.arange(1, len(starts) + 1) - np.searchsorted(ends, starts, side="right")
+        at = starts[np.argmax(over)]
+        fits = (events.before <= at) & (events.after > at)
+        before, stamp = int(events.before[fits].max()), int(events.after[fits].min())
+        mine = (events.before < stamp + slack) & (events.after > before - slack)
+        if np.count_nonzero(mine) < options.least:
+            break
+        cells = courses.cells[np.unique(events.cell[mine])]
+        kind: Kind = "came" if events.came[0] else "left"
+        out.append(_change(kind, cells, resolution, before, stamp, stamp, 1))
+        events = events.of(np.flatnonzero(~mine))
+    return out
+
+
+def _coming_and_going(
+    courses: Courses,
+    often: Index,
+    stamps: _Stamps,
+    resolution: float,
+    options: ChangeOptions,
+) -> list[Change]:
+    """Places that changed again and again: doors, gates, bays that are filled and emptied."""
+    out = []
+    pairs = _pairs(courses.cells[often], options.near / resolution)
+    for one in _components(pairs, len(often)):
+        if len(one) < options.least:
+            continue
+        chosen = often[one]
+        between = courses.between[chosen]
+        before, stamp = stamps.last(between[:, 0, 0]).max(), stamps.first(between[:, 0, 1]).min()
+        last = stamps.first(between[:, 1, 1]).max()
+        times = int(np.median(courses.count[chosen]))
+        cells = courses.cells[chosen]
+        out.append(
+            _change(
+                "comes and goes",
+                cells,
+                resolution,
+                min(int(before), int(stamp)),
+                int(stamp),
+                int(last),
+                times,
+            )
+        )
+    return out
+
+
+def _merged(changes: list[Change], resolution: float, near: float) -> list[Change]:
+    """Small parts beside a larger place of the same kind belong to it, and changed when it did.
+
+    Somebody may have stood where something came a little later, or where it had left.
+    """
+    out: list[Change] = []
+    for one in sorted(changes, key=lambda change: -len(change.cells)):
+        for k, larger in enumerate(out):
+            small = one.kind == larger.kind and 2 * len(one.cells) <= len(larger.cells)
+            if small and _apart(larger.cells, one.cells) <= near:
+                cells = np.unique(np.concatenate([larger.cells, one.cells]), axis=0)
+                out[k] = _change(
+                    one.kind,
+                    cells,
+                    resolution,
+                    larger.before_ns,
+                    larger.stamp_ns,
+                    larger.last_ns,
+                    larger.times,
+                )
+                break
+        else:
+            out.append(one)
+    return out
+
+
+def _apart(cells: NDArray[np.int64], others: NDArray[np.int64]) -> float:
+    distances, _ = cKDTree(cells).query(others)
+    return float(np.min(distances))
+
+
+def _change(
+    kind: Kind,
+    cells: NDArray[np.int64],
+    resolution: float,
+    before: int,
+    stamp: int,
+    last: int,
+    times: int,
+) -> Change:
+    low, high = cells.min(axis=0) * resolution, (cells.max(axis=0) + 1) * resolution
+    x, y = ((cells.mean(axis=0) + 0.5) * resolution).tolist()
+    width, height = (high - low).tolist()
+    return Change(kind, x, y, (width, height), cells, before, stamp, last, times)

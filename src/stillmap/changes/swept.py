@@ -1,0 +1,95 @@
+"""The area that something takes which is seen now here, now there: a door's, above all."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay, QhullError
+
+Cells = NDArray[np.int64]
+Float = NDArray[np.float64]
+
+_BESIDE = 2.0  # cells beside an end of its way at which a leaf may be seen
+_LEAF = 0.8  # share of the cells that must lie at the ends of its way
+_HINGES = 400  # cells at most that are tried
+_NARROW, _WIDE = math.radians(20.0), math.radians(200.0)  # how far doors swing
+_FROM_HINGE = 0.5  # of the leaf: nearer to the hinge, directions say little
+
+
+def swept_cells(cells: Cells) -> Cells:
+    """(S, 2) these cells (K, 2) and what lies between: a door's sector, else the convex hull."""
+    low, high = cells.min(axis=0), cells.max(axis=0)
+    try:
+        hull = Delaunay(cells.astype(np.float64))
+    except QhullError:  # all in one line
+        return cells
+    sector = _sector(cells)
+    reach = math.ceil(sector.length) if sector else 0
+    columns, rows = (np.arange(low[d] - reach, high[d] + reach + 1) for d in (0, 1))
+    around = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1).reshape(-1, 2)
+    inside = hull.find_simplex(around.astype(np.float64)) >= 0
+    if sector:
+        inside |= sector.holds(around)
+    return np.unique(np.concatenate([cells, around[inside]]), axis=0)
+
+
+class _Sector:
+    """Where a leaf of a length, in cells, swings about a hinge from one direction to another."""
+
+    def __init__(self, hinge: Cells, cells: Cells) -> None:
+        self.hinge = hinge
+        distance, angle = self._polar(cells)
+        self.length = float(distance.max())
+        far = distance > _FROM_HINGE * self.length
+        # directions seen from the middle one, so that none jumps by a whole turn
+        at = angle[far]
+        self._middle = float(np.angle(np.mean(np.exp(1j * at))))
+        turned = np.angle(np.exp(1j * (at - self._middle)))
+        half = 0.5 * (turned.min() + turned.max())
+        self._low = float(np.median(turned[turned <= half]))
+        self._high = float(np.median(turned[turned >= half]))
+
+    @property
+    def angle(self) -> float:
+        """Radians, by which the leaf swings."""
+        return self._high - self._low
+
+    def _polar(self, cells: Cells) -> tuple[Float, Float]:
+        x, y = (cells - self.hinge).T
+        return np.hypot(x, y), np.arctan2(y, x)
+
+    def _turned(self, cells: Cells) -> tuple[Float, Float]:
+        distance, angle = self._polar(cells)
+        return distance, np.asarray(np.angle(np.exp(1j * (angle - self._middle))))
+
+    def holds(self, cells: Cells) -> NDArray[np.bool_]:
+        """(N,) whether the leaf sweeps over cells (N, 2)."""
+        distance, turned = self._turned(cells)
+        between = (turned >= self._low) & (turned <= self._high)
+        return np.asarray((distance <= self.length) & between)
+
+    def at_its_ends(self, cells: Cells) -> float:
+        """Share of cells that lie along the leaf where it begins to swing, or stops."""
+        distance, turned = self._turned(cells)
+        aside = np.minimum(np.abs(turned - self._low), np.abs(turned - self._high))
+        return float(np.mean(distance * np.sin(np.minimum(aside, math.pi / 2)) <= _BESIDE))
+
+    def fills_both(self, cells: Cells) -> bool:
+        """Whether the leaf was seen at both ends, each along most of its length."""
+        distance, turned = self._turned(cells)
+        for end in (self._low, self._high):
+            along = distance[distance * np.abs(np.sin(turned - end)) <= _BESIDE]
+            if len(np.unique(np.round(along))) < 0.5 * self.length:
+                return False
+        return True
+
+
+def _sector(cells: Cells) -> _Sector | None:
+    """The door, if it is one: cells along two lines from one of them, the hinge."""
+    best, most = None, _LEAF
+    for hinge in cells[:: math.ceil(len(cells) / _HINGES)]:
+        sector = _Sector(hinge, cells)
+        share = sector.at_its_ends(cells)
+        if _NARROW < sector.angle < _WIDE and share >= most and sector.fills_both(cells):
+            best, most = sector, share
+    return best
