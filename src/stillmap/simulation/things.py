@@ -48,10 +48,11 @@ class Things:
         T, poses, still = len(seconds), [], [np.empty((0, 4))]
         moving, mover = [np.empty((T, 0, 4))], [np.empty(0, np.int32)]
         for number, thing in enumerate(self._things, start=first):
-            at, faces = np.full((T, 3), np.nan), np.zeros((T, len(thing.faces), 4))
+            at = np.full((T, 3), np.nan)
             for stay in thing.stays:
-                there = (seconds >= stay.since) & (seconds < _end(stay))
-                at[there], faces[there] = (stay.x, stay.y, stay.yaw), standing(thing, stay)
+                end = np.inf if stay.until is None else stay.until
+                at[(seconds >= stay.since) & (seconds < end)] = (stay.x, stay.y, stay.yaw)
+            faces = faces_at(thing, at)
             poses.append(at)
             if np.array_equal(at, np.broadcast_to(at[0], at.shape)):
                 still.append(faces[0])
@@ -64,10 +65,12 @@ class Things:
 
 def standing(thing: Thing, stay: Stay) -> Float:
     """(K, 4) the faces of a thing in the world, as it stands during a stay."""
-    T = se2.matrix(stay.x, stay.y, stay.yaw)
+    return np.asarray(faces_at(thing, np.array([[stay.x, stay.y, stay.yaw]]))[0])
+
+
+def faces_at(thing: Thing, poses: Float) -> Float:
+    """(T, K, 4) the faces of a thing at poses (T, 3); of no length where these are NaN."""
+    T = se2.matrix(*poses.T)[:, None]
     ends = np.reshape(thing.faces, (-1, 2)).astype(float)
-    return np.asarray((ends @ T[:2, :2].T + T[:2, 2]).reshape(-1, 4))
-
-
-def _end(stay: Stay) -> float:
-    return np.inf if stay.until is None else stay.until
+    moved = np.einsum("tkij,nj->tni", T[..., :2, :2], ends) + T[..., :2, 2]
+    return np.asarray(np.nan_to_num(moved.reshape(len(poses), -1, 4)), np.float64)
