@@ -13,7 +13,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from cases import EMPTY, POPULATED, STOPS
-from common import Run, add_arguments, add_run_arguments, built, options_of, outcomes, runs_of
+from common import (
+    LASTING,
+    Run,
+    add_arguments,
+    add_run_arguments,
+    built,
+    options_of,
+    outcomes,
+    runs_of,
+)
 from prepared import RESOLUTION
 from tables import markdown
 
@@ -64,13 +73,13 @@ def main() -> None:
 
 
 def scores_of(run: Run) -> list[LabelScores]:
-    """Of each variant, in the order of VARIANTS; beams on doors are left out."""
+    """Of each variant, in the order of VARIANTS; beams on doors and things are left out."""
     sim = simulate(run.case.build(), run.seed)
     recording, truth = sim.recording, sim.truth
     options = options_of(run.method, run.settings)
     poses = truth.T_world_base if run.true_poses else built(recording, options)[0].poses
     kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
-    scored = recording.hit & (kinds != "door")
+    scored = recording.hit & ~np.isin(kinds, LASTING)
     found = (
         dwell.e_step(recording, poses, RESOLUTION, v.options(options.em), 1, v.classes)
         for v in VARIANTS

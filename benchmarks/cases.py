@@ -14,8 +14,9 @@ EMPTY = "empty"
 SENSORS = "sensors"
 ODOMETRY = "odometry"
 ONCE = "passed once"  # nothing in the recording shows that these cars move: in no mean
+MOVED = "moved"  # things are moved between two visits: run only where it is named
 TRAJECTORY = "trajectory"  # hard for poses, long or both: run only where it is named
-GROUPS = (POPULATED, STOPS, EMPTY, SENSORS, ODOMETRY, ONCE, TRAJECTORY)
+GROUPS = (POPULATED, STOPS, EMPTY, SENSORS, ODOMETRY, ONCE, MOVED, TRAJECTORY)
 
 Changes = Mapping[str, Any]
 
@@ -41,7 +42,7 @@ def chosen(names: Iterable[str]) -> list[Case]:
         known = ", ".join(case.name for case in CASES)
         raise SystemExit(f"no case {', '.join(sorted(unknown))}; cases: {known}; groups: {GROUPS}")
     if not wanted:
-        return [case for case in CASES if case.group != TRAJECTORY]
+        return [case for case in CASES if case.group not in (MOVED, TRAJECTORY)]
     return [case for case in CASES if wanted & {case.name, case.group}]
 
 
@@ -124,6 +125,9 @@ CASES = (
     Case("office-slips", ODOMETRY, "office", _SLIPS),
     Case("warehouse-slips", ODOMETRY, "warehouse", {**_SLIPS, **_part(1200)}),
     Case("street-turn", ONCE, "street-turn"),
+    Case("office-moved", MOVED, "office-moved"),
+    Case("street-moved", MOVED, "street-moved"),
+    Case("warehouse-moved", MOVED, "warehouse-moved"),
     Case("hall-8m", TRAJECTORY, "hall", few_walls(20)),
     Case("hall-8m-empty", TRAJECTORY, "hall", few_walls(0)),
     Case("drive-75hz", TRAJECTORY, "drive", {}),

@@ -32,6 +32,7 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 
 _VEHICLES = ["car", "forklift"]
+LASTING = ["door", "thing"]  # stand still for so long that they may be seen in one state only
 _NAN = float("nan")
 
 Job = TypeVar("Job")
@@ -161,14 +162,15 @@ def scores(
 
 
 def _by_mover(p_static: NDArray[np.floating], run: Prepared) -> Scores:
-    """Recall by what moved, and scores without the beams on doors, which stand still for long."""
+    """Recall by what moved, and scores without the beams on what stands still for long."""
     truth, hit = run.simulation.truth, run.simulation.recording.hit
     kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
-    without = label_scores(p_static, truth.static, hit & (kinds != "door"))
+    without = label_scores(p_static, truth.static, hit & ~np.isin(kinds, LASTING))
     found = p_static < 0.5
+    named = {"people": ["person"], "doors": ["door"], "vehicles": _VEHICLES, "things": ["thing"]}
     recall = {
         f"recall_{name}": float(found[of].mean()) if (of := np.isin(kinds, some)).any() else _NAN
-        for name, some in (("people", ["person"]), ("doors", ["door"]), ("vehicles", _VEHICLES))
+        for name, some in named.items()
     }
     return {
         **recall,

@@ -108,7 +108,8 @@ def _of_traffic(
 ) -> float:
     truth, recording = simulation.truth, simulation.recording
     T_map_world = se2.inverse(align(result.poses, truth.T_world_base))
-    everyone = range(truth.movers.shape[1])
+    # things do not go anywhere
+    everyone = [k for k, kind in enumerate(truth.scene["mover_kinds"]) if kind != "thing"]
     seen = sightings(truth.mover, recording.offset, seconds, everyone, _SEEN)
     true = true_traffic(seen, truth.movers, recording.stamp_ns, T_map_world, size)
     grid = grid_of(result.map)

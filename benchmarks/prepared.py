@@ -10,6 +10,7 @@ from stillmap import _core, em, se2
 from stillmap.evaluation.map import Grid, MapScores, map_scores, wall_cells_of_map
 from stillmap.recording.model import Recording
 from stillmap.simulation import Simulation, laser, simulate
+from stillmap.simulation.things import faces_at
 
 Float = NDArray[np.float64]
 
@@ -23,7 +24,7 @@ class Prepared:
     Attributes:
         simulation: the run.
         walls_without_people: (K, 2) wall cells that the same run shows without people and
-            vehicles: same poses, same doors.
+            vehicles: same poses, same doors and things.
         walls_at_best: (L, 2) those that the run itself shows with true labels and true poses:
             what somebody stood before all the time is in no one's reach.
         of_truth: scores of the map of (15) with true labels and true poses.
@@ -56,13 +57,25 @@ def without_people(
     nobody = laser.Movers(
         np.empty((T, 0, 2)), np.empty((T, 0)), np.empty((0, 2)), np.empty(0, np.int32)
     )
-    exact = laser.cast(poses, angles, truth.walls, nobody, moving_doors(sim))
+    exact = laser.cast(poses, angles, truth.walls, nobody, doors_and_things(sim))
     is_glass = np.zeros(len(truth.walls), bool)
     is_glass[len(scene.walls) : len(scene.walls) + len(scene.glass)] = True
     ranges, hit = laser.measure(exact, is_glass, o, rng)
     points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     static = hit & (exact.mover < 0)
     return points.reshape(-1, 2).astype(np.float32), hit.ravel(), static.ravel()
+
+
+def doors_and_things(sim: Simulation) -> laser.Outlines:
+    """The leaves of the doors that moved, and the things that did, at each scan."""
+    doors, movers = moving_doors(sim), sim.truth.movers
+    faces, mover = [doors.faces], [doors.mover]
+    first = movers.shape[1] - len(sim.scene.things)
+    for number, thing in enumerate(sim.scene.things, start=first):
+        if np.isnan(movers[:, number]).any() or np.ptp(movers[:, number], axis=0).any():
+            faces.append(faces_at(thing, movers[:, number]))
+            mover.append(np.full(len(thing.faces), number, np.int32))
+    return laser.Outlines(np.concatenate(faces, axis=1), np.concatenate(mover))
 
 
 def moving_doors(sim: Simulation) -> laser.Outlines:

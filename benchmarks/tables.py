@@ -53,13 +53,14 @@ MAP = (
     Column("ate", "ATE m", ".3f"),
     Column("called_dynamic", "called dynamic", ".4f"),
 )
-# labels scored again where doors open and close: without the beams on doors
+# labels scored again where doors open and close: without the beams on doors, and on things
 OF_DOORS = tuple(c for c in LABELS if c.key in ("ap", "f1", "brier", "ece", "ece_unsure"))
 NO_DOORS = "_no_doors"
 MOVERS = (
     Column("recall_people", "recall of people", ".4f", True),
     Column("recall_vehicles", "of vehicles", ".4f", True),
     Column("recall_doors", "of doors", ".4f", True),
+    Column("recall_things", "of things", ".4f", True),
     *(replace(c, key=c.key + NO_DOORS, title=f"{c.title} without doors") for c in OF_DOORS),
 )
 COST = (Column("iterations", "iterations", ".1f"), Column("cpu", "CPU ms per scan", ".2f"))

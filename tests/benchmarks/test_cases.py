@@ -5,6 +5,7 @@ from cases import (
     CASES,
     EMPTY,
     GROUPS,
+    MOVED,
     ONCE,
     POPULATED,
     STOPS,
@@ -41,7 +42,7 @@ def test_catalogue_covers_what_is_wanted() -> None:
 
 
 def test_names_and_groups_choose_cases() -> None:
-    assert {case.group for case in chosen([])} == {*GROUPS} - {TRAJECTORY}
+    assert {case.group for case in chosen([])} == {*GROUPS} - {MOVED, TRAJECTORY}
     assert chosen(GROUPS) == list(CASES)
     assert {case.group for case in chosen([ONCE, "hall-15"])} == {ONCE, POPULATED}
     with pytest.raises(SystemExit, match="no case nowhere"):

@@ -29,10 +29,20 @@ def test_true_labels_at_true_poses_score_full_marks(run: Prepared) -> None:
     assert found["called_dynamic"] == found["dynamic"] > 0.01
 
 
-def test_what_ended_on_doors_is_left_out_of_the_scores_without_them(run: Prepared) -> None:
+@pytest.fixture(scope="module")
+def moved() -> Prepared:
+    """Until three cars that were parked have driven off."""
+    return prepare(Case("street", "", "street-moved", {"robot": {"scans": 570}}), 3)
+
+
+@pytest.mark.parametrize(("which", "kind"), [("run", "door"), ("moved", "thing")])
+def test_what_ended_on_doors_and_things_is_left_out_of_the_scores_without_them(
+    which: str, kind: str, request: pytest.FixtureRequest
+) -> None:
+    run = request.getfixturevalue(which)
     recording, truth = run.simulation.recording, run.simulation.truth
     kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
-    door = kinds == "door"
+    door = kinds == kind
     assert np.count_nonzero(door) > 100
     doors_unsure = np.where(door, 0.9, truth.static).astype(np.float32)
     people_unsure = np.where(kinds == "person", 0.9, truth.static).astype(np.float32)
@@ -48,6 +58,16 @@ def test_what_ended_on_doors_is_left_out_of_the_scores_without_them(run: Prepare
     for key in ("brier", "ece"):
         assert scored[1][f"{key}_no_doors"] > scored[1][key] > 0.0  # the same, of fewer beams
     assert scored[1]["ece_unsure_no_doors"] == scored[1]["ece_unsure"] == pytest.approx(0.9)
+
+
+def test_things_are_where_they_were_without_people(moved: Prepared) -> None:
+    sim = moved.simulation
+    thing = np.array([*sim.truth.scene["mover_kinds"], "none"])[sim.truth.mover] == "thing"
+    points, hit, static = without_people(sim, np.random.default_rng(0))
+    both = thing & hit
+    off = np.hypot(*(points - sim.recording.points).T)[both]
+    assert np.mean(off < 10 * sim.scene.laser.range_noise) > 0.99
+    assert np.mean(static[both]) < 0.01
 
 
 def test_without_people_only_what_they_hid_differs(run: Prepared) -> None:

@@ -114,11 +114,13 @@ def standing_before(faces: Float) -> Motion:
         period=0.2,
         seconds=np.array([0.0, 0.2]),
         carried=2,
+        paused=2,
         robot=np.zeros((2, 3)),
         poses=np.zeros((2, 1, 3)),
         kinds=["car"],
         people=NOTHING,
         outlines=Outlines(faces, np.zeros(1, np.int32)),
+        things=Outlines(np.empty((2, 0, 4)), np.empty(0, np.int32)),
         still=np.empty((0, 4)),
     )
 

@@ -44,13 +44,11 @@ class Grid:
     def cells(self, points: Float) -> NDArray[np.int64]:
         """(N, 2) row and column of the cells that hold (N, 2) points; may lie outside the map."""
         T_grid_map = se2.inverse(se2.matrix(*self.origin))
-        return np.floor(_moved(T_grid_map, points) / self.resolution).astype(np.int64)[:, ::-1]
+        return np.floor(moved(T_grid_map, points) / self.resolution).astype(np.int64)[:, ::-1]
 
     def centres(self, cells: NDArray[np.integer]) -> Float:
         """(N, 2) centres in the map frame of (N, 2) cells, row and column."""
-        return _moved(
-            se2.matrix(*self.origin), (cells[:, ::-1] + np.float64(0.5)) * self.resolution
-        )
+        return moved(se2.matrix(*self.origin), (cells[:, ::-1] + np.float64(0.5)) * self.resolution)
 
 
 @dataclass(frozen=True)
@@ -86,10 +84,10 @@ def map_scores(grid: Grid, walls: Float, reference: Float, T_world_map: Float) -
             `wall_cells_of_map` or `wall_cells_of_hits`.
         T_world_map: (3, 3), see `trajectory.align`.
     """
-    occupied = _moved(T_world_map, grid.centres(np.argwhere(grid.occupied)))
+    occupied = moved(T_world_map, grid.centres(np.argwhere(grid.occupied)))
     ghosts = int(np.sum(distance_to_walls(occupied, walls) > GHOST_DISTANCE * grid.resolution))
     free_area = float(np.count_nonzero(grid.free)) * grid.resolution**2
-    kept = _near_occupied(grid, _moved(se2.inverse(T_world_map), reference))
+    kept = near_occupied(grid, moved(se2.inverse(T_world_map), reference))
     x, y, theta = se2.parameters(T_world_map).tolist()
     return MapScores(
         resolution=grid.resolution,
@@ -105,7 +103,7 @@ def map_scores(grid: Grid, walls: Float, reference: Float, T_world_map: Float) -
 
 def wall_cells_of_map(grid: Grid, walls: Float, T_world_map: Float) -> Float:
     """(K, 2) centres, in the world frame, of a map's occupied cells within one cell of a wall."""
-    centres = _moved(T_world_map, grid.centres(np.argwhere(grid.occupied)))
+    centres = moved(T_world_map, grid.centres(np.argwhere(grid.occupied)))
     return centres[distance_to_walls(centres, walls) <= WALL_DISTANCE * grid.resolution]
 
 
@@ -118,9 +116,9 @@ def wall_cells_of_hits(hits: Float, walls: Float, grid: Grid, T_world_map: Float
         hits: (N, 2) end points in the world frame, at true poses, of static beams alone.
     """
     cells, count = np.unique(
-        grid.cells(_moved(se2.inverse(T_world_map), hits)), axis=0, return_counts=True
+        grid.cells(moved(se2.inverse(T_world_map), hits)), axis=0, return_counts=True
     )
-    centres = _moved(T_world_map, grid.centres(cells[count >= MIN_HITS]))
+    centres = moved(T_world_map, grid.centres(cells[count >= MIN_HITS]))
     return centres[distance_to_walls(centres, walls) <= WALL_DISTANCE * grid.resolution]
 
 
@@ -138,7 +136,7 @@ def distance_to_walls(points: Float, walls: Float, chunk: int = 1 << 20) -> Floa
     return out
 
 
-def _near_occupied(grid: Grid, points: Float) -> NDArray[np.bool_]:
+def near_occupied(grid: Grid, points: Float) -> NDArray[np.bool_]:
     """Whether the cell of each (N, 2) point of the map frame, or a neighbour of it, is occupied."""
     near = binary_dilation(np.pad(grid.occupied, 1), np.ones((3, 3), bool))
     cells = grid.cells(points) + 1
@@ -148,5 +146,5 @@ def _near_occupied(grid: Grid, points: Float) -> NDArray[np.bool_]:
     return out
 
 
-def _moved(T: Float, points: Float) -> Float:
+def moved(T: Float, points: Float) -> Float:
     return np.asarray(points @ T[:2, :2].T + T[:2, 2])

@@ -8,7 +8,7 @@ from stillmap.simulation.options import (
     RobotOptions,
     TrafficOptions,
 )
-from stillmap.simulation.scene import Door, Lane, Light, Scene
+from stillmap.simulation.scene import Door, Lane, Light, Scene, Stay, Thing
 from stillmap.simulation.simulator import Simulation, simulate
 from stillmap.simulation.truth import Truth, load_truth
 from stillmap.simulation.worlds import SCENES, scene_by_name
@@ -26,6 +26,8 @@ __all__ = [
     "RobotOptions",
     "Scene",
     "Simulation",
+    "Stay",
+    "Thing",
     "TrafficOptions",
     "Truth",
     "load_truth",

@@ -39,10 +39,11 @@ class Movers:
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """What the laser sees of doors and vehicles: upright faces that move.
+    """What the laser sees of doors, vehicles and things: upright faces that move.
 
     Attributes:
-        faces: (T, Q, 4) segments x0, y0, x1, y1 in metres at each scan.
+        faces: (T, Q, 4) segments x0, y0, x1, y1 in metres at each scan. No beam meets one that
+            has no length.
         mover: (Q,) whose face this is.
     """
 

@@ -1,8 +1,9 @@
-"""Everybody and everything moves, scan by scan: robot, people, doors and vehicles."""
+"""Everybody and everything moves, scan by scan: robot, people, doors, vehicles and things."""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from stillmap.simulation.laser import Movers, Outlines
 from stillmap.simulation.people import BODY_RADIUS, Crowd
 from stillmap.simulation.robot import Robot, plan_way
 from stillmap.simulation.scene import Scene
+from stillmap.simulation.things import Things
 from stillmap.simulation.traffic import Traffic
 
 Float = NDArray[np.float64]
@@ -27,6 +29,7 @@ _PERSON_MARGIN = 0.1  # m
 _SLOWEST = 5.0  # times the time that the route takes undisturbed: then something holds the robot
 _STILL = 1e-6  # m
 _CARRIED = 20.0  # s, for which a robot that is carried elsewhere records nothing
+_SETTLING = 30.0  # s of a pause after which nobody is where he was: the rest is not acted out
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,22 +40,27 @@ class Motion:
         period: seconds from one scan to the next.
         seconds: (T,) since the recording began.
         carried: the first scan after the robot was carried elsewhere; T if it never is.
+        paused: the first scan after the robot stood without recording; T if it never does.
         robot: (T, 3) x, y in metres, theta in radians.
-        poses: (T, P, 3) the same of all movers: people, doors, vehicles.
+        poses: (T, P, 3) the same of all movers: people, doors, vehicles, things; NaN where there
+            is no such thing.
         kinds: (P) what each mover is.
         people: what the laser sees of people.
-        outlines: what it sees of the other movers.
-        still: (K, 4) faces of those among them that never moved.
+        outlines: what it sees of doors and vehicles.
+        things: what it sees of things: from one scan to the next they are elsewhere, or nowhere.
+        still: (K, 4) faces of those among all these that never moved.
     """
 
     period: float
     seconds: Float
     carried: int
+    paused: int
     robot: Float
     poses: Float
     kinds: list[str]
     people: Movers
     outlines: Outlines
+    things: Outlines
     still: Float
 
 
@@ -73,26 +81,47 @@ def move(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
     dt = 1.0 / (rate * steps)
     expected = o.scans or world.robot.undisturbed_time() * rate
     carried = None if o.carried_at is None else max(1, round(o.carried_at * expected))
+    paused = None if o.pause_at is None else max(1, round(o.pause_at * rate))
     log = _Log()
     while not _is_done(scene, world.robot, len(log.robot), expected):
         if len(log.robot) == carried:
             world.carry_robot(dt, rngs[3])
+        if len(log.robot) == paused:
+            world.rest_robot(min(o.pause, _SETTLING), dt)
         log.note(world)
         if len(log.robot) % 50 == 0:
             tell(min(len(log.robot) / expected, 1.0))
         for _ in range(steps):
             world.step(dt)
-    return log.motion(world, 1.0 / rate, carried)
+    return log.motion(world, _clock(len(log.robot), 1.0 / rate, carried, paused, o.pause))
+
+
+class _Clock(NamedTuple):
+    """When T scans were taken; fields as in `Motion`."""
+
+    period: float
+    seconds: Float
+    carried: int
+    paused: int
+
+
+def _clock(T: int, period: float, carried: int | None, paused: int | None, pause: float) -> _Clock:
+    scan = np.arange(T)
+    first = [T if one is None else min(one, T) for one in (carried, paused)]
+    seconds = scan * period + _CARRIED * (scan >= first[0]) + pause * (scan >= first[1])
+    return _Clock(period, seconds, *first)
 
 
 class _World:
-    """Robot, people with what is seen of them, doors and vehicles of a scene."""
+    """Robot, people with what is seen of them, doors, vehicles and things of a scene."""
 
     def __init__(self, scene: Scene, rngs: Rngs) -> None:
         start, o = np.array(scene.route[0], float), scene.robot
         # an open leaf is in the way, a closed one opens for whoever comes
         leaves = [door.leaf(door.opened) for door in scene.leaves]
-        space = FreeSpace(np.array([*scene.walls, *scene.glass, *scene.kerbs, *leaves], float))
+        self.things = Things(scene.things)
+        solid = [*scene.walls, *scene.glass, *scene.kerbs, *leaves, *self.things.everywhere()]
+        space = FreeSpace(np.array(solid, float))
         planner = Planner(space, start, o.radius + _ROBOT_MARGIN)
         closed = o.scans is not None
         way = plan_way(scene.route, planner, closed)
@@ -108,7 +137,11 @@ class _World:
     def carry_robot(self, dt: float, rng: np.random.Generator) -> None:
         """Take the robot to another place; everything else goes on, by steps of dt seconds."""
         self.robot.put_down(rng, self._in_the_way())
-        for _ in range(round(_CARRIED / dt)):
+        self.rest_robot(_CARRIED, dt)
+
+    def rest_robot(self, seconds: float, dt: float) -> None:
+        """The robot stands for so long; everything else goes on, by steps of dt seconds."""
+        for _ in range(round(seconds / dt)):
             self.robot.rest(dt)
             self._others_step(dt)
 
@@ -166,10 +199,11 @@ class _Log:
         self._heading.append(heading)
         self._faces.append(np.concatenate([doors.faces(), traffic.faces()]))
 
-    def motion(self, world: _World, period: float, carried: int | None) -> Motion:
+    def motion(self, world: _World, clock: _Clock) -> Motion:
         figures, doors = world.figures, len(world.doors.share)
         persons = len(world.crowd.xy)
         kinds = ["person"] * persons + ["door"] * doors + world.traffic.kinds
+        placed = world.things.placed(clock.seconds, first=len(kinds))
         people = Movers(
             np.stack(self._xy), np.stack(self._heading), figures.semi_axes, figures.mover
         )
@@ -179,16 +213,13 @@ class _Log:
         mover = np.concatenate([others[:doors], np.repeat(others[doors:], 4)])
         moving = moved[mover]
         outlines = Outlines(faces[:, moving], mover[moving])
-        T = len(self.robot)
-        carried = T if carried is None else min(carried, T)
         return Motion(
-            period=period,
-            seconds=np.arange(T) * period + _CARRIED * (np.arange(T) >= carried),
-            carried=carried,
+            **clock._asdict(),
             robot=np.stack(self.robot),
-            poses=poses,
-            kinds=kinds,
+            poses=np.concatenate([poses, placed.poses], axis=1),
+            kinds=kinds + ["thing"] * placed.poses.shape[1],
             people=people,
             outlines=outlines,
-            still=faces[0, ~moving],
+            things=placed.outlines,
+            still=np.concatenate([faces[0, ~moving], placed.still]),
         )

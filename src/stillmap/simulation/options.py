@@ -126,6 +126,12 @@ class RobotOptions:
         "share of the recording at which the robot is switched off, carried to another place of "
         "its route and put down anyhow; not set: never",
     )
+    pause_at: float | None = field_with_doc(
+        None, "s of scanning, after which the robot stands for a while; not set: never"
+    )
+    pause: float = field_with_doc(
+        28_800.0, "s, for which it then stands and records nothing: overnight"
+    )
     stamp_rounding: float = field_with_doc(
         0.0, "s, stamps are rounded to multiples of it; 0: to the nanosecond"
     )
@@ -138,6 +144,9 @@ class RobotOptions:
         require(self.scans is None or self.scans >= 1, "scans must be at least 1")
         at = self.carried_at
         require(at is None or 0 < at < 1, "carried_at must lie between 0 and 1")
+        at = self.pause_at
+        require(at is None or at > 0, "pause_at must be positive")
+        require(self.pause >= 0, "pause must not be negative")
         require(self.stamp_rounding >= 0, "stamp_rounding must not be negative")
 
 

@@ -1,5 +1,6 @@
 """What a simulated world consists of: data only, so that a new world is a new value."""
 
+import itertools
 import math
 from dataclasses import dataclass, field
 from typing import Literal
@@ -83,6 +84,48 @@ class Lane:
 
 
 @dataclass(frozen=True)
+class Stay:
+    """Where a thing stands, and from when to when.
+
+    Attributes:
+        x, y: metres, of its middle.
+        yaw: rad.
+        since: seconds after the recording began.
+        until: the same; None: for good.
+    """
+
+    x: float
+    y: float
+    yaw: float = 0.0
+    since: float = 0.0
+    until: float | None = None
+
+    def __post_init__(self) -> None:
+        require(self.until is None or self.until > self.since, "a stay must end after it began")
+
+
+@dataclass(frozen=True)
+class Thing:
+    """What stands still, but not for good: moved, brought or taken away while nobody looks.
+
+    Attributes:
+        faces: segments in metres, about its middle.
+        stays: one after the other. Between them it is nowhere.
+    """
+
+    faces: tuple[Segment, ...]
+    stays: tuple[Stay, ...]
+
+    def __post_init__(self) -> None:
+        require(len(self.faces) > 0 and len(self.stays) > 0, "a thing needs faces and stays")
+        for one, other in itertools.pairwise(self.stays):
+            require(
+                one.until is not None and one.until <= other.since,
+                "stays of a thing must come one after the other",
+            )
+
+
+@dataclass(frozen=True)
 class Scene:
     """A world and what happens in it.
 
@@ -96,6 +139,8 @@ class Scene:
             part it; not given: where the robot starts.
         leaves: doors that swing.
         lanes: where vehicles drive.
+        things: what is moved, brought or taken away. People and the robot keep clear of every
+            place at which one ever stands.
         lights: where the robot stops while it is red.
     """
 
@@ -108,6 +153,7 @@ class Scene:
     leaves: tuple[Door, ...] = ()
     lanes: tuple[Lane, ...] = ()
     lights: tuple[Light, ...] = ()
+    things: tuple[Thing, ...] = ()
     crowd: CrowdOptions = field(default_factory=CrowdOptions)
     doors: DoorOptions = field(default_factory=DoorOptions)
     traffic: TrafficOptions = field(default_factory=TrafficOptions)

@@ -39,7 +39,7 @@ def simulate(
     People, laser, odometry, doors, vehicles and mishaps draw from generators of their own, spawned
     from `rng`: another laser or odometry leaves the way everybody goes unchanged.
 
-    A door or a vehicle that does not move once while the robot records is a wall: no recording
+    A door, vehicle or thing that does not move once while the robot records is a wall: no recording
     could tell it from one.
 
     Args:
@@ -64,9 +64,9 @@ def simulate(
     recording, mover = _record(scene, walls, motion, T_odom_base, laser_rng, seed)
     tell(1.0)
     static = recording.hit & (mover < 0)
-    about = {**describe(scene, seed), "mover_kinds": motion.kinds, "carried_at_scan": None}
-    if motion.carried < len(T_world_base):
-        about["carried_at_scan"] = motion.carried
+    about = {**describe(scene, seed), "mover_kinds": motion.kinds}
+    for name, scan in (("carried_at_scan", motion.carried), ("paused_at_scan", motion.paused)):
+        about[name] = scan if scan < len(T_world_base) else None
     truth = Truth(static, mover, T_world_base, walls, motion.poses, about)
     return Simulation(scene, recording, truth)
 

@@ -95,18 +95,21 @@ class _Moment:
 
     def __init__(self, motion: Motion, scans: Index, seconds: Float) -> None:
         later = seconds / motion.period
-        # nothing goes on evenly while the robot is carried elsewhere
-        is_after = scans >= motion.carried
-        self._last = np.where(is_after, len(motion.robot), motion.carried) - 1
-        first, last = np.where(is_after, motion.carried, 0), self._last - (later > 0)
+        # nothing goes on evenly while the robot is carried elsewhere, or stands overnight
+        breaks = np.unique([0, motion.carried, motion.paused, len(motion.robot)])
+        piece = np.searchsorted(breaks, scans, side="right")
+        self._last = breaks[piece] - 1
+        first, last = breaks[piece - 1], self._last - (later > 0)
         self._scan, self._leap = scans, _FASTEST * motion.period
         self._before = np.maximum(np.minimum(scans + later.astype(np.int64), last), first)
         self._share = scans + later - self._before
-        people, outlines = motion.people, motion.outlines
+        people, outlines, things = motion.people, motion.outlines, motion.things
         self.robot = self._at(motion.robot)
         xy, heading = self._at(people.xy), self._at(people.heading)
         self.people = Movers(xy, heading, people.semi_axes, people.mover)
-        self.outlines = Outlines(self._at(outlines.faces), outlines.mover)
+        # things do not fly from place to place
+        faces = np.concatenate([self._at(outlines.faces), things.faces[scans]], axis=1)
+        self.outlines = Outlines(faces, np.concatenate([outlines.mover, things.mover]))
 
     def _at(self, values: Float) -> Float:
         before = values[self._before]

@@ -25,9 +25,10 @@ class Truth:
         T_world_base: (T, 3, 3) float64 true poses.
         walls: (W, 4) float64 segments x0, y0, x1, y1 in metres.
         movers: (T, P, 3) float64, where each mover is at each scan: x, y of its middle in metres,
-            heading in rad. First people, then doors (heading: from the hinge), then vehicles.
+            heading in rad. First people, then doors (heading: from the hinge), then vehicles, then
+            things; NaN where there is no such thing at that scan.
         scene: name, seed and all parameters, JSON-able; under `mover_kinds` what each mover is:
-            "person", "door", "car" or "forklift".
+            "person", "door", "car", "forklift" or "thing".
     """
 
     static: NDArray[np.bool_]

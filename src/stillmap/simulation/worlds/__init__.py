@@ -11,6 +11,7 @@ from stillmap.simulation.worlds.building import building
 from stillmap.simulation.worlds.corridor import corridor
 from stillmap.simulation.worlds.drive import drive
 from stillmap.simulation.worlds.hall import hall
+from stillmap.simulation.worlds.moved import office_moved, street_moved, warehouse_moved
 from stillmap.simulation.worlds.office import office
 from stillmap.simulation.worlds.rounds import rounds
 from stillmap.simulation.worlds.street import street
@@ -31,6 +32,9 @@ _WORLDS: dict[str, Callable[[], Scene]] = {
     "building": building,
     "ten-corridors": ten_corridors,
     "rounds": rounds,
+    "office-moved": office_moved,
+    "street-moved": street_moved,
+    "warehouse-moved": warehouse_moved,
 }
 _GROWING: dict[str, Callable[[int], Scene]] = {"building": building}  # given the number of scans
 
@@ -41,7 +45,10 @@ def _crowded(scene: Scene, people: int) -> Scene:
 
 
 def _empty(scene: Scene) -> Scene:
-    """The world with nobody in it, all doors open for good, and no vehicles but the parked ones."""
+    """The world with nobody in it, all doors open for good, and no vehicles but the parked ones.
+
+    Things are moved all the same.
+    """
     return dataclasses.replace(
         scene,
         name=f"{scene.name}{_EMPTY}",

@@ -9,9 +9,9 @@ from stillmap.simulation.scene import Lane, Point, Scene, Segment
 from stillmap.simulation.walls import Opening, box, pillar, wall
 
 _LAYOUT_SEED = 12  # what stands where is part of the world, not of the recording
-_RACKS = (2.6, 6.0, 9.2, 12.6, 15.8)  # m, y of the middles of the rows
-_BLOCKS = ((5.0, 22.6), (25.4, 43.0))  # m, x from where to where racks stand
-_BAY = 2.2  # m between two posts of a rack
+RACKS = (2.6, 6.0, 9.2, 12.6, 15.8)  # m, y of the middles of the rows
+BLOCKS = ((5.0, 22.6), (25.4, 43.0))  # m, x from where to where racks stand
+BAY = 2.2  # m between two posts of a rack
 _DEPTH = 1.1  # m, of a rack
 
 
@@ -25,8 +25,8 @@ def warehouse(people: int = 12) -> Scene:
         *wall((0, 0), 30, "west", [Opening(12.0, 1.2), Opening(20.0, 2.0, 0.5)]),
         *wall((50, 0), 30, "east", [Opening(5.0, 1.2), Opening(18.5, 1.2)]),
     ]
-    for y in _RACKS:
-        for low, high in _BLOCKS:
+    for y in RACKS:
+        for low, high in BLOCKS:
             walls += _rack(low, high, y, rng)
     walls += _stacks(rng)
     for x in (12.5, 24.0, 36.0):
@@ -50,14 +50,14 @@ def warehouse(people: int = 12) -> Scene:
 def _rack(low: float, high: float, y: float, rng: np.random.Generator) -> list[Segment]:
     """Posts of 2 to 5 cm radius along both sides, and what the lowest shelf holds between them."""
     walls: list[Segment] = []
-    bays = round((high - low) / _BAY)
+    bays = round((high - low) / BAY)
     for k in range(bays + 1):
-        x = low + k * _BAY
+        x = low + k * BAY
         for side in (-1, 1):
             walls += pillar(x, y + side * _DEPTH / 2, rng.uniform(0.02, 0.05), 6)
         if k == bays or rng.random() < 0.15:
             continue
-        middle = x + _BAY / 2
+        middle = x + BAY / 2
         if rng.random() < 0.55:
             width, height = rng.uniform((1.0, 0.7), (1.8, 1.0)).tolist()
             shift, angle = rng.uniform(-0.05, 0.05, 2).tolist()

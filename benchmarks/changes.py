@@ -1,0 +1,130 @@
+"""Things that are moved, in simulated worlds: what does the map show, and when did it happen?
+
+python benchmarks/changes.py [--cases NAME|GROUP ...] [--seeds tuning|reporting] [--n-seeds 5]
+    [--true-poses] [--set section.key=value ...] [--processes 2]
+
+New cells were hit three times on things that were brought, or moved there, and are still there:
+kept if they or a neighbour are occupied. Old cells were hit three times on things that are gone,
+lie more than two cells from walls and from what is there at the end, and were seen through again in
+three scans: occupied if they are themselves. Of the changes whose place was looked at before and
+afterwards, with three beams of a scan, those are found that have a change of their kind within
+0.5 m of the thing; "off" is how far its time is from that between the change and the first look
+afterwards.
+"""
+
+import argparse
+from collections.abc import Iterable
+from dataclasses import asdict
+
+import numpy as np
+from cases import MOVED
+from common import Run, Scores, add_arguments, add_run_arguments, options_of, outcomes, runs_of
+from prepared import grid_of
+from tables import Column, Row, grouped, markdown
+
+import stillmap
+from stillmap.evaluation.changes import (
+    Beams,
+    Stay,
+    change_scores,
+    change_time_errors,
+    true_changes,
+)
+from stillmap.evaluation.trajectory import absolute_errors, align
+from stillmap.simulation import Simulation, simulate
+from stillmap.simulation.things import standing
+
+COLUMNS = (
+    Column("new_cells", "new cells", ".0f"),
+    Column("new_kept", "kept", ".3f", True),
+    Column("old_cells", "old cells", ".0f"),
+    Column("old_occupied", "occupied", ".3f"),
+    Column("seen", "changes seen", ".0f"),
+    Column("found", "found", ".0f", True),
+    Column("missed", "missed", ".0f"),
+    Column("false", "false", ".0f"),
+    Column("median_error", "off, median s", ".1f"),
+    Column("largest_error", "off, most s", ".1f"),
+    Column("ate", "ATE m", ".3f"),
+)
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_run_arguments(p, [MOVED])
+    add_arguments(p, [])
+    args = p.parse_args()
+    options_of("stillmap", args.set)  # refuses before hours have passed
+    runs = runs_of(args, ["stillmap"])
+    done = sorted(outcomes(_scored, runs, args.processes), key=lambda pair: runs.index(pair[0]))
+    rows: list[Row] = [{"case": run.case.name, **scores} for run, scores in done]
+    print("Means over seeds, in brackets the worst.\n")
+    print(table(rows))
+
+
+def table(rows: Iterable[Row]) -> str:
+    """A row for every case, and one for all of them."""
+    rows = list(rows)
+    lines = [
+        [name, *(column.mean_and_worst(some) for column in COLUMNS)]
+        for name, some in grouped(rows, lambda row: str(row["case"])).items()
+    ]
+    lines.append(["all", *(column.mean_and_worst(rows) for column in COLUMNS)])
+    return markdown(["case", *(column.title for column in COLUMNS)], lines)
+
+
+def _scored(run: Run) -> Scores:
+    simulation = simulate(run.case.build(), run.seed)
+    poses = simulation.truth.T_world_base if run.true_poses else None
+    options = options_of("stillmap", run.settings)
+    return scores_of(stillmap.build(simulation.recording, options, poses=poses), simulation)
+
+
+def scores_of(result: stillmap.Result, simulation: Simulation) -> Scores:
+    """Scores of the map and the changes of one result."""
+    truth, stays, beams = simulation.truth, stays_of(simulation), beams_of(simulation)
+    T_world_map = align(result.poses, truth.T_world_base)
+    of_map = change_scores(grid_of(result.map), stays, beams, truth.walls, T_world_map)
+    found = getattr(result, "changes", [])
+    times = change_time_errors(found, true_changes(stays, beams), T_world_map)
+    off = np.array(times.errors)
+    return {
+        **asdict(of_map),
+        **{name: getattr(times, name) for name in ("seen", "found", "missed", "false")},
+        "median_error": float(np.median(off)) if len(off) else float("nan"),
+        "largest_error": float(off.max()) if len(off) else float("nan"),
+        "ate": absolute_errors(result.poses, truth.T_world_base).rmse,
+    }
+
+
+def stays_of(simulation: Simulation) -> list[Stay]:
+    """The stays of all things. No beam is on those that are walls, or come too late."""
+    truth, things = simulation.truth, simulation.scene.things
+    begin = int(simulation.recording.stamp_ns[0])
+    first = truth.movers.shape[1] - len(things)
+    return [
+        Stay(
+            mover=number,
+            middle=np.array([stay.x, stay.y]),
+            faces=standing(thing, stay),
+            since_ns=None if stay.since <= 0 else begin + round(1e9 * stay.since),
+            until_ns=None if stay.until is None else begin + round(1e9 * stay.until),
+        )
+        for number, thing in enumerate(things, start=first)
+        for stay in thing.stays
+    ]
+
+
+def beams_of(simulation: Simulation) -> Beams:
+    """The beams at true poses."""
+    recording, truth = simulation.recording, simulation.truth
+    scan = np.repeat(np.arange(recording.n_scans), np.diff(recording.offset))
+    T = recording.T_map_sensor(truth.T_world_base)
+    end = np.einsum("nij,nj->ni", T[scan, :2, :2], recording.points) + T[scan, :2, 2]
+    return Beams(T[scan, :2, 2], end, truth.mover, scan, recording.stamp_ns)
+
+
+if __name__ == "__main__":
+    main()

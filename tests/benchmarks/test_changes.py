@@ -1,0 +1,81 @@
+"""What the benchmark of changes counts with: stays and beams of a world, scores of a result."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from cases import Case
+from changes import COLUMNS, _scored, beams_of, scores_of, stays_of, table
+from common import Run
+
+from stillmap.evaluation.changes import true_changes
+from stillmap.simulation import Simulation, scene_by_name, simulate
+
+SHORT = {"robot": {"scans": 1000}}
+
+
+@pytest.fixture(scope="module")
+def street() -> Simulation:
+    """Until all cars that leave or come have done so, and most of that was seen."""
+    return simulate(scene_by_name("street-moved", SHORT), 0)
+
+
+def test_stays_are_those_of_the_things(street: Simulation) -> None:
+    stays = stays_of(street)
+    kinds = street.truth.scene["mover_kinds"]
+    assert {kinds[stay.mover] for stay in stays} == {"thing"}
+    assert len(stays) == 5 + 1 + 2  # five cars leave, one of them for another place; two come
+    beams = beams_of(street)
+    for stay in stays:
+        ends = beams.end[beams.on(stay)]
+        assert np.hypot(*(ends - stay.middle).T).max(initial=0.0) < 2.7
+    early = simulate(scene_by_name("street-moved", {"robot": {"scans": 520}}), 0)
+    # two have driven off within 52 s; the others are walls, or not there yet
+    changes = true_changes(stays_of(early), beams_of(early))
+    assert [c.appeared for c in changes] == [False, False]
+    assert {c.appeared for c in true_changes(stays, beams)} == {False, True}
+
+
+def perfect(simulation: Simulation, state: str) -> SimpleNamespace:
+    """A result at true poses, with a map made by hand and changes that are all right."""
+    truth, beams, stays = simulation.truth, beams_of(simulation), stays_of(simulation)
+    resolution, low = 0.05, beams.end.min(axis=0) - 1.0
+    shape = np.ceil((beams.end.max(axis=0) + 1.0 - low) / resolution).astype(int)[::-1]
+    p = np.full(shape, 0.1, np.float32)
+    for stay in stays:
+        if stay.holds(simulation.recording.stamp_ns[-1:])[0] == (state == "last"):
+            cells = np.floor((beams.end[beams.on(stay)] - low) / resolution).astype(int)
+            p[cells[:, 1], cells[:, 0]] = 0.9
+    occupancy = SimpleNamespace(
+        p_occupied=p, origin=(float(low[0]), float(low[1]), 0.0), resolution=resolution
+    )
+    found = [
+        SimpleNamespace(
+            x=float(c.stay.middle[0]), y=float(c.stay.middle[1]), appeared=c.appeared,
+            stamp_ns=c.look_ns, cells=9,
+        )
+        for c in true_changes(stays, beams) if c.look_ns is not None
+    ]  # fmt: skip
+    return SimpleNamespace(poses=truth.T_world_base, map=occupancy, changes=found)
+
+
+def test_what_is_right_scores_full_marks(street: Simulation) -> None:
+    scores = scores_of(perfect(street, "last"), street)
+    assert {column.key for column in COLUMNS} == set(scores)
+    assert (scores["new_kept"], scores["old_occupied"]) == (1.0, 0.0)
+    assert scores["new_cells"] > 20
+    assert scores["old_cells"] > 50
+    assert scores["seen"] == scores["found"] >= 3
+    assert scores["missed"] == scores["false"] == scores["largest_error"] == 0
+    first = scores_of(perfect(street, "first"), street)
+    assert (first["new_kept"], first["old_occupied"]) == (0.0, 1.0)
+
+
+def test_a_run_is_scored_and_shown() -> None:
+    case = Case("street", "moved", "street-moved", SHORT)
+    scores = _scored(Run(case, 0, "stillmap", ("em.max_iterations=1",), True))
+    assert 0.0 <= scores["old_occupied"] <= 1.0
+    assert scores["ate"] == pytest.approx(0.0, abs=1e-9)
+    text = table([{"case": "a", **scores}, {"case": "b", **scores, "median_error": float("nan")}])
+    assert text.count("\n") == 4
+    assert "nan" not in text
