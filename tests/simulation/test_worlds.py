@@ -27,12 +27,14 @@ def test_there_is_an_empty_version_of_every_world() -> None:
 
 
 @pytest.mark.parametrize("name", BARE)
-def test_empty_worlds_have_no_movers(name: str) -> None:
+def test_empty_worlds_have_no_movers_but_things_whose_time_comes_later(name: str) -> None:
     changes = {"robot": {"scans": 60}, "laser": {"beams": 90}}
     run = simulate(scene_by_name(name, changes), 1)
     assert (run.truth.mover == -1).all()
-    assert run.truth.movers.shape == (60, 0, 3)
-    assert run.truth.scene["mover_kinds"] == []
+    things = len(run.scene.things)
+    assert (things > 0) == ("-moved" in name)
+    assert run.truth.movers.shape == (60, things, 3)
+    assert run.truth.scene["mover_kinds"] == ["thing"] * things
     np.testing.assert_array_equal(run.truth.static, run.recording.hit)
 
 
