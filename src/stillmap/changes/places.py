@@ -6,13 +6,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from stillmap.changes.swept import swept_cells
 from stillmap.em import ChangeOptions, Courses, look_numbers
 from stillmap.em.courses import OFTEN
+from stillmap.em.together import components, pairs_near
 from stillmap.recording.model import Recording
 
 Float = NDArray[np.float64]
@@ -167,26 +166,12 @@ def _groups(
 ) -> list[_Events]:
     """Events of the same kind near each other, at times that may be the same."""
     slack = round(options.together * 1e9)
-    pairs = _pairs(courses.cells[events.cell], options.near / resolution)
+    pairs = pairs_near(courses.cells[events.cell], options.near / resolution)
     i, j = pairs.T
     begin = np.maximum(events.before[i], events.before[j])
     end = np.minimum(events.after[i], events.after[j])
     fits = (events.came[i] == events.came[j]) & (begin < end + slack)
-    return [events.of(one) for one in _components(pairs[fits], len(events.cell))]
-
-
-def _pairs(cells: NDArray[np.int64], distance: float) -> Index:
-    """(P, 2) which of these cells lie so near to each other, in cells."""
-    if not len(cells):
-        return np.empty((0, 2), np.intp)
-    return np.asarray(cKDTree(cells).query_pairs(distance, output_type="ndarray"), np.intp)
-
-
-def _components(pairs: Index, n: int) -> list[Index]:
-    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    _, label = connected_components(graph, directed=False)
-    order = np.argsort(label, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if n else []
+    return [events.of(one) for one in components(pairs[fits], len(events.cell))]
 
 
 def _told_apart(
@@ -221,8 +206,8 @@ def _coming_and_going(
 ) -> list[Change]:
     """Places that changed again and again: doors, gates, bays that are filled and emptied."""
     out = []
-    pairs = _pairs(courses.cells[often], options.near / resolution)
-    for one in _components(pairs, len(often)):
+    pairs = pairs_near(courses.cells[often], options.near / resolution)
+    for one in components(pairs, len(often)):
         if len(one) < options.least:
             continue
         chosen = often[one]

@@ -1,5 +1,6 @@
 """The last E-step: things that came to stay, or left, while others passed."""
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,14 +11,19 @@ from stillmap.em.dwell import Classes, Dwell, Float, Looks, expectations, looked
 from stillmap.em.expectations import Expectations
 from stillmap.em.mixture import fit_shares, posterior_static
 from stillmap.em.options import ChangeOptions, EmOptions
+from stillmap.em.together import components, pairs_near
 from stillmap.recording.model import Recording
 
 MapState = Literal["last", "majority"]
 
-# who stays for longer than these came to stay: what is there for minutes is told by its course
-_CLASSES = Classes(mover_occupied=(0.01, 0.04, 0.15, 0.5), mover_seconds=(0.5, 3.0, 8.0, 24.0))
-_OFTEN_THERE = 0.5  # of these shares: what is there so often is a thing that comes and goes
+# who stays for longer than these came to stay
+_CLASSES = Classes(mover_seconds=(0.5, 3.0, 6.0, 12.0), often_seconds=(8.0, 24.0))
 _MOST_NATS = 60.0  # by which one likelihood may exceed another: more is the same
+_POSSIBLE = 0.02  # probability of having changed below which a cell has no say
+_BESIDE = 3.0  # cells
+_LOOKS_APART = 4  # looks by which the cells of one thing may seem to change apart
+_WHOLE = 4  # cells that make a thing
+_DECIDE = 1.0 / 3.0  # share of its cells that decide whether it changed
 OFTEN = 3  # changes from which on a place is one that comes and goes, as doors do
 
 
@@ -73,7 +79,7 @@ def last_e_step(
     T_map_sensor = recording.T_map_sensor(poses)
 
     def watch(dwell: Dwell) -> None:
-        dwell.watch(**_model(options))
+        dwell.watch(**_model(recording, options))
 
     looks = looked_at(recording, T_map_sensor, resolution, options, threads, _CLASSES, watch)
     log_changing, occupied_share, p_last, count, between = looks.dwell.changes()
@@ -81,7 +87,7 @@ def last_e_step(
     n = looks.classes.n_static
     shares = fit_shares(looks.likelihood, n, options.prior)
     weights = shares.classes.astype(np.float32)
-    often = [k for k, rho in enumerate(looks.classes.grid()[0]) if rho == _OFTEN_THERE]
+    often = slice(-1 - len(looks.classes.often_seconds), -1)
     stays = looks.likelihood[:, -1] * weights[-1]
     goes = np.einsum("kc,c->k", looks.likelihood[:, often], weights[often])
     of = (goes > stays).astype(np.intp)  # what comes and goes does not stay long enough for a thing
@@ -95,6 +101,7 @@ def last_e_step(
         count=count[each, of],
         between=between[each, of],
     )
+    courses = _as_wholes(courses)
     found = expectations(
         recording, T_map_sensor, looks, shares, courses.shown(state), options, threads
     )
@@ -102,11 +109,35 @@ def last_e_step(
     return found, courses
 
 
-def _model(options: EmOptions) -> dict[str, float]:
+def _as_wholes(courses: Courses) -> Courses:
+    """Cells side by side that changed alike are of one thing: a third of them decides for all."""
+    of = np.flatnonzero(
+        (courses.count > 0)
+        & (courses.count < OFTEN)
+        & (courses.p_changing > _POSSIBLE)
+        & (courses.p_static < 0.5)
+    )
+    pairs = pairs_near(courses.cells[of], _BESIDE)
+    i, j = pairs.T
+    before, after = courses.between[of, 1].T
+    came = courses.p_thing[of] > 0.5
+    at_once = np.maximum(before[i], before[j]) < np.minimum(after[i], after[j]) + _LOOKS_APART
+    p_changing = courses.p_changing.copy()
+    for one in components(pairs[at_once & (came[i] == came[j])], len(of)):
+        if len(one) >= _WHOLE:
+            cells = of[one]
+            decided = np.quantile(p_changing[cells], 1.0 - _DECIDE, method="lower")
+            p_changing[cells] = np.minimum(decided, 1.0 - courses.p_static[cells])
+    return dataclasses.replace(courses, p_changing=p_changing)
+
+
+def _model(recording: Recording, options: EmOptions) -> dict[str, float]:
     changes: ChangeOptions = options.changes
+    seconds = 1e-9 * float(np.ptp(recording.stamp_ns))
+    stays = float(np.clip(changes.stays * seconds, 1.0, changes.longest))
     return {
         # a thing stays for 2 tau on average, and its place is free as long
-        "tau": 0.5 * changes.stays,
+        "tau": 0.5 * stays,
         "passing_occupied": changes.passing_occupied,
         "passing_tau": changes.passing_seconds,
         "detection": options.dwell.detection,

@@ -42,21 +42,24 @@ class Classes:
         static_occupied, static_seconds: share of the time and correlation time in seconds of what
             stands still: one, but for looks that miss it, which come in runs.
         mover_occupied, mover_seconds: of what comes and goes.
+        often_seconds: of what comes and goes and is there for half of the time.
     """
 
     static_occupied: tuple[float, ...] = (0.998, 0.95)
     static_seconds: tuple[float, ...] = (25.0, 100.0)
     mover_occupied: tuple[float, ...] = (0.01, 0.04, 0.15)
     mover_seconds: tuple[float, ...] = (0.5, 3.0, 12.0, 45.0)
+    often_seconds: tuple[float, ...] = ()
 
     @property
     def n_static(self) -> int:
         return len(self.static_occupied) * len(self.static_seconds)
 
     def grid(self) -> tuple[list[float], list[float]]:
-        """rho and tau of every class, static ones first."""
+        """rho and tau of every class: static ones first, those of half of the time last."""
         pairs = [(r, t) for t in self.static_seconds for r in self.static_occupied]
         pairs += [(r, t) for t in self.mover_seconds for r in self.mover_occupied]
+        pairs += [(0.5, t) for t in self.often_seconds]
         return [r for r, _ in pairs], [t for _, t in pairs]
 
 
@@ -262,7 +265,8 @@ def _coverage(normals: Float, off_plane: Float, prominence: Float) -> NDArray[np
 
 
 def _learned(surface: Surface, trust: float, shares: Shares, classes: Classes) -> dict[str, object]:
-    n, last = classes.n_static, len(classes.grid()[0])
+    n = classes.n_static
+    last = n + len(classes.mover_occupied) * len(classes.mover_seconds)
     of_movers = shares.classes[n:last]
     movers = of_movers.reshape(len(classes.mover_seconds), -1) / of_movers.sum()
     static = shares.classes[:n].reshape(len(classes.static_seconds), -1) / shares.static

@@ -34,7 +34,10 @@ class ChangeOptions:
     """Things that are put somewhere, taken away, or moved once."""
 
     enabled: bool = field_with_doc(True, "look for them, and show the map in one of its states")
-    stays: float = field_with_doc(1200.0, "s, for how long a thing stays, and its place stays free")
+    stays: float = field_with_doc(
+        2.0, "lengths of the recording for which a thing stays, and its place stays free"
+    )
+    longest: float = field_with_doc(3600.0, "s, the same at most")
     passing_occupied: float = field_with_doc(0.05, "share of the time in which others pass there")
     passing_seconds: float = field_with_doc(12.0, "s, for how long they stay")
     near: float = field_with_doc(0.5, "m, cells so near to each other that change are one place")
@@ -42,9 +45,11 @@ class ChangeOptions:
     least: int = field_with_doc(4, "cells below which a place that changed is not listed")
 
     def __post_init__(self) -> None:
-        for name in ("stays", "passing_seconds"):
-            if not 0.1 <= getattr(self, name) <= 1e7:
-                raise ValueError(f"'em.changes.{name}' wants 0.1 to 10000000 seconds")
+        if not 0.01 <= self.stays <= 1000.0:
+            raise ValueError("'em.changes.stays' wants 0.01 to 1000 lengths of the recording")
+        for name in ("longest", "passing_seconds"):
+            if not 1.0 <= getattr(self, name) <= 1e7:
+                raise ValueError(f"'em.changes.{name}' wants 1 to 10000000 seconds")
         if not 0.0 < self.passing_occupied < 1.0:
             raise ValueError("'em.changes.passing_occupied' wants a share between 0 and 1")
         if not 0.0 < self.near <= 100.0:
