@@ -11,6 +11,7 @@ without a thought for speed. Where beams are taken:
 """
 
 from stillmap.reference.beams import add_beams, e_step, log_likelihood
+from stillmap.reference.changes import ChangeModel, Course, course
 from stillmap.reference.dwell import Dwell, Dwell2D, Dwell3D, Reading, look_at
 from stillmap.reference.em import EmStep, em_fixed_poses, m_step_map
 from stillmap.reference.field import (
@@ -28,6 +29,8 @@ from stillmap.reference.surface import Surface, Surface2D, Surface3D
 from stillmap.reference.traverse import cell_of, traverse
 
 __all__ = [
+    "ChangeModel",
+    "Course",
     "Dwell",
     "Dwell2D",
     "Dwell3D",
@@ -46,6 +49,7 @@ __all__ = [
     "add_beams",
     "add_lost",
     "cell_of",
+    "course",
     "e_step",
     "em_fixed_poses",
     "field",

@@ -9,11 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
 from stillmap.reference.beams import Beam, usable_beams
+from stillmap.reference.changes import ChangeModel, course
 from stillmap.reference.no_return import in_a_row
 from stillmap.reference.surface import Element, Surface
 from stillmap.reference.traverse import cell_of, traverse
 
 Float = NDArray[np.float64]
+Single = NDArray[np.float32]
+Number = NDArray[np.int32]
 
 HIT = -1.0  # instead of a reliability
 SURE = 0.95  # what was met more probably than that was met
@@ -190,6 +193,7 @@ class Dwell:
         self.seconds = seconds
         self.reading = Reading(lateral, margin, reach, beyond, normals)
         self.seen: list[list[tuple[float, float]]] = [[] for _ in surface.list]
+        self.model: ChangeModel | None = None
 
     def add(
         self,
@@ -236,6 +240,38 @@ class Dwell:
     def trust(self, open_: float) -> None:
         """How far to trust beams without a return beyond the first solid thing in their way."""
         self.reading = replace(self.reading, open=open_)
+
+    def watch(
+        self, *, tau: float, passing_occupied: float, passing_tau: float, detection: float
+    ) -> None:
+        """Asks which elements are of things that come to stay or leave; see ChangeModel."""
+        if any(self.seen):
+            raise ValueError("watch: before the first look")
+        self.model = ChangeModel(tau, passing_occupied, passing_tau, detection)
+
+    def changes(
+        self,
+    ) -> tuple[
+        Float, NDArray[np.float32], NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]
+    ]:
+        """(E,) log likelihood, (E,) occupied share, (E, 2), (E, 2), (E, 2, 2, 2); see Course."""
+        if self.model is None:
+            raise ValueError("changes: nobody asked to watch for them")
+        courses = [
+            course(
+                [(round(t / self.seconds), None if r == HIT else r) for t, r in seen],
+                self.seconds,
+                self.model,
+            )
+            for seen in self.seen
+        ]
+        return (
+            np.array([one.log_likelihood for one in courses]),
+            np.array([one.occupied_share for one in courses], np.float32),
+            np.array([one.p_last for one in courses], np.float32).reshape(-1, 2),
+            np.array([one.count for one in courses], np.int32).reshape(-1, 2),
+            np.array([one.between for one in courses], np.int32).reshape(-1, 2, 2, 2),
+        )
 
     def likelihood(self) -> tuple[NDArray[np.float32], Float]:
         """(E, C) relative to the best class, (E,) logarithm of the best.
