@@ -1,4 +1,4 @@
-"""`map.npz`: the occupancy grid with the sums it is made from."""
+"""`map.npz`: the occupancy grid with the sums it is made from and the looks it rests on."""
 
 import zipfile
 from pathlib import Path
@@ -7,21 +7,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.output.protocols import OccupancyMapLike
+from stillmap.output.protocols import EvidenceLike, OccupancyMapLike
 
 
-def write_map_npz(path: Path, occupancy: OccupancyMapLike) -> None:
-    """Write `p_occupied`, `alpha`, `beta` (H, W), `origin` (x, y, yaw), `resolution` in metres."""
-    write_npz(
-        path,
-        {
-            "p_occupied": np.asarray(occupancy.p_occupied, np.float32),
-            "alpha": np.asarray(occupancy.alpha, np.float32),
-            "beta": np.asarray(occupancy.beta, np.float32),
-            "origin": np.asarray(occupancy.origin, np.float64),
-            "resolution": np.asarray(occupancy.resolution, np.float64),
-        },
-    )
+def write_map_npz(
+    path: Path, occupancy: OccupancyMapLike, evidence: EvidenceLike | None = None
+) -> None:
+    """Write `p_occupied`, `alpha`, `beta` (H, W), `origin` (x, y, yaw), `resolution` in metres.
+
+    Where evidence is given: `looks`, `clear_looks`, `thin` (H, W).
+    """
+    arrays: dict[str, NDArray[Any]] = {
+        "p_occupied": np.asarray(occupancy.p_occupied, np.float32),
+        "alpha": np.asarray(occupancy.alpha, np.float32),
+        "beta": np.asarray(occupancy.beta, np.float32),
+    }
+    if evidence is not None:
+        arrays |= {
+            "looks": np.asarray(evidence.looks, np.uint16),
+            "clear_looks": np.asarray(evidence.clear, np.uint16),
+            "thin": np.asarray(evidence.thin, np.bool_),
+        }
+    arrays |= {
+        "origin": np.asarray(occupancy.origin, np.float64),
+        "resolution": np.asarray(occupancy.resolution, np.float64),
+    }
+    write_npz(path, arrays)
 
 
 def write_npz(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
