@@ -73,10 +73,10 @@ class LookCounts:
     ) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """Looks and clear ones over a box of cells, axes as those of `Grid.dense`."""
         looks, clear = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
-        for index in np.ndindex(shape):
-            cell = tuple((np.asarray(first_cell) + np.array(index)[::-1]).tolist())
-            looks[index] = min(self.looks[cell], MOST)
-            clear[index] = min(self.clear[cell], MOST)
+        for cell, count in self.looks.items():
+            index = tuple((np.array(cell) - np.asarray(first_cell))[::-1].tolist())
+            if all(0 <= i < n for i, n in zip(index, shape, strict=True)):
+                looks[index], clear[index] = min(count, MOST), min(self.clear[cell], MOST)
         return looks, clear
 
     def _told_of(self, beam: Beam, in_rows: set[int]) -> set[Cell]:
