@@ -146,6 +146,17 @@ def test_by_hand(kernels):
     assert row_of(kernels, [(4.0, False, False, 0)], stops=stops) == [[0] * 8] * 2
 
 
+@pytest.mark.parametrize("kernels", KERNELS, ids=["core", "reference"])
+def test_a_radius_of_whole_cells_reaches_so_many(kernels):
+    assert 0.3 / 0.1 < 3.0  # as doubles have it
+    counts = kernels.LookCounts2D(0.1, radius=0.3)
+    points, T = np.array([[0.75, 0.0]], np.float32), np.eye(3)[None].copy()
+    T[0, :2, 2] = 0.05
+    one = np.ones(1, bool)
+    counts.add(points, one, one, np.array([0, 1]), T, np.zeros(1, np.int64))
+    assert counts.dense([0, 0], (1, 9))[1].ravel().tolist() == [1] * 5 + [0] * 4
+
+
 def test_counts_stop_where_they_are_full():
     counts = _core.LookCounts2D(1.0, radius=0.4)
     n = 70_000

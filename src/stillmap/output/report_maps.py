@@ -28,7 +28,8 @@ _KEY = (
     '<span class="key" style="background:#bec4cc"></span>never looked at'
     '<span class="key" style="background:#000"></span>occupied'
     '<span class="key" style="background:#f07800"></span>end of a beam that met something '
-    'moving<span class="key" style="background:#dbc2f4"></span>thin&nbsp;evidence</p>'
+    'moving <span style="white-space:nowrap"><span class="key" style="background:#dbc2f4"></span>'
+    "thin evidence</span></p>"
 )
 _TOGGLES = (
     '<input class="toggle" type="checkbox" id="show-dynamic" checked>'
