@@ -9,6 +9,7 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
+#include "box.hpp"
 #include "stillmap/grid.hpp"
 
 namespace stillmap::border {
@@ -45,84 +46,26 @@ void for_each_seen(const Grid<D>& grid, Visit&& visit) {
   for_each_seen(grid, [](const Cell<D>&) { return true; }, visit);
 }
 
-// what Python says of a box: its first cell; its shape, with the axes in reverse order
+// The box around the cells somebody looked at.
 template <int D>
-using Given = std::optional<std::array<int64_t, D>>;
-
-// A box of cells, to be laid out as [(z,) y, x]: the one around those somebody looked at, or given.
-template <int D>
-struct Box {
+Box<D> box_around(const Grid<D>& grid) {
   Cell<D> first = Cell<D>::Constant(std::numeric_limits<int32_t>::max());
-  std::array<size_t, D> size{};  // along x, y(, z)
-
-  explicit Box(const Grid<D>& grid) {
-    Cell<D> last = Cell<D>::Constant(std::numeric_limits<int32_t>::min());
-    for_each_seen(grid, [&](const Cell<D>& cell, const Counts&) {
-      first = first.cwiseMin(cell);
-      last = last.cwiseMax(cell);
-    });
-    if (first[0] > last[0]) {
-      first.setZero();
-      return;
-    }
-    for (int d = 0; d < D; ++d)
-      size[static_cast<size_t>(d)] = static_cast<size_t>(last[d] - first[d] + 1);
-  }
-
-  Box(const std::array<int64_t, D>& first_cell, const std::array<int64_t, D>& shape) {
-    constexpr int64_t kFar = std::numeric_limits<int32_t>::max() / 2;
-    for (int d = 0; d < D; ++d) {
-      const int64_t from = first_cell[static_cast<size_t>(d)];
-      const int64_t n = shape[static_cast<size_t>(D - 1 - d)];
-      if (from < -kFar || from > kFar || n < 0 || n > kFar)
-        throw std::invalid_argument("first_cell, shape: expected a box of cells that can exist");
-      first[d] = static_cast<int32_t>(from);
-      size[static_cast<size_t>(d)] = static_cast<size_t>(n);
-    }
-  }
-
-  bool holds(const Cell<D>& cell) const { return meets(cell, 1); }
-
-  // whether any of the cells of a cube with this edge lies inside
-  bool meets(const Cell<D>& lowest, int edge) const {
-    for (int d = 0; d < D; ++d) {
-      const int64_t n = int64_t{lowest[d]} - first[d];
-      if (n <= -edge || n >= static_cast<int64_t>(size[static_cast<size_t>(d)])) return false;
-    }
-    return true;
-  }
-
-  size_t total() const {
-    size_t cells = 1;
-    for (const size_t n : size) {
-      if (n != 0 && cells > std::numeric_limits<size_t>::max() / (16 * n))
-        throw std::invalid_argument("first_cell, shape: expected a box that fits into memory");
-      cells *= n;
-    }
-    return cells;
-  }
-
-  size_t index(const Cell<D>& cell) const {
-    size_t i = 0;
-    for (int d = D - 1; d >= 0; --d)
-      i = i * size[static_cast<size_t>(d)] + static_cast<size_t>(cell[d] - first[d]);
-    return i;
-  }
-
-  auto first_cell() const {
-    std::vector<int64_t> cell(first.data(), first.data() + D);
-    return owned(std::move(cell), {static_cast<size_t>(D)});
-  }
-  template <class T>
-  auto shaped(std::vector<T>&& values) const {
-    if constexpr (D == 2) return owned(std::move(values), {size[1], size[0]});
-    if constexpr (D == 3) return owned(std::move(values), {size[2], size[1], size[0]});
-  }
-};
+  Cell<D> last = Cell<D>::Constant(std::numeric_limits<int32_t>::min());
+  for_each_seen(grid, [&](const Cell<D>& cell, const Counts&) {
+    first = first.cwiseMin(cell);
+    last = last.cwiseMax(cell);
+  });
+  Box<D> box;
+  if (first[0] > last[0]) return box;
+  box.first = first;
+  for (int d = 0; d < D; ++d)
+    box.size[static_cast<size_t>(d)] = static_cast<size_t>(last[d] - first[d] + 1);
+  return box;
+}
 
 template <int D>
 auto box_of(const Grid<D>& grid) {
-  const Box<D> box(grid);
+  const Box<D> box = box_around(grid);
   std::array<int64_t, D> shape;
   for (size_t d = 0; d < D; ++d) shape[d] = static_cast<int64_t>(box.size[D - 1 - d]);
   return std::make_pair(box.first_cell(), shape);
@@ -132,7 +75,7 @@ template <int D>
 auto dense(const Grid<D>& grid, const Given<D>& first_cell, const Given<D>& shape) {
   if (first_cell.has_value() != shape.has_value())
     throw std::invalid_argument("first_cell, shape: expected both or neither");
-  const Box<D> box = shape ? Box<D>(*first_cell, *shape) : Box<D>(grid);
+  const Box<D> box = shape ? Box<D>(*first_cell, *shape) : box_around(grid);
   std::vector<double> alpha(box.total(), 0.0), beta(box.total(), 0.0);
   const auto meets = [&](const Cell<D>& block) {
     return box.meets(Grid<D>::cell_at(block, 0), Grid<D>::kEdge);
@@ -148,7 +91,7 @@ auto dense(const Grid<D>& grid, const Given<D>& first_cell, const Given<D>& shap
 
 template <int D>
 auto seen(const Grid<D>& grid) {
-  const Box<D> box(grid);
+  const Box<D> box = box_around(grid);
   std::vector<uint8_t> cells(box.total(), 0);
   for_each_seen(grid, [&](const Cell<D>& cell, const Counts&) { cells[box.index(cell)] = 1; });
   return std::make_tuple(box.first_cell(), box.shaped(std::move(cells)));

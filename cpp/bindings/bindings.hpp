@@ -9,5 +9,6 @@ void bind_beams(nanobind::module_& m);
 void bind_register(nanobind::module_& m);
 void bind_dwell(nanobind::module_& m);
 void bind_held_out(nanobind::module_& m);
+void bind_look_counts(nanobind::module_& m);
 
 }  // namespace stillmap::border

@@ -15,4 +15,5 @@ NB_MODULE(_core, m) {
   stillmap::border::bind_register(m);
   stillmap::border::bind_dwell(m);
   stillmap::border::bind_held_out(m);
+  stillmap::border::bind_look_counts(m);
 }

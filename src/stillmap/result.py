@@ -52,6 +52,7 @@ class Result:
         p_static: (M,) float32, P(c = 1); it follows from `map` by a last E-step. NaN: unusable.
         map: what stands still.
         raw_map: every hit counted as static, from the same poses; the same cells as `map`.
+        evidence: the looks that each of these cells rests on.
         best_iteration: number of the iteration that was kept.
         converged: whether the loop stopped by itself.
         warnings: one sentence each.
@@ -74,6 +75,7 @@ class Result:
     p_static: NDArray[np.float32]
     map: em.OccupancyMap
     raw_map: em.OccupancyMap
+    evidence: em.Evidence
     best_iteration: int
     converged: bool
     warnings: list[str]
@@ -205,6 +207,16 @@ class _Run:
         with stages.measure("maps"):
             filtered = self._map(seen, threads)
             raw = _raw_map(seen, kept.poses, filtered, threads)
+        with stages.measure("evidence"):
+            evidence = em.evidence(
+                seen,
+                kept.poses,
+                kept.p_static,
+                filtered,
+                kept.no_return,
+                self.options.em,
+                threads,
+            )
         with stages.measure("objects"):
             movers = without_changes(seen, kept.poses, kept.p_static, changes, filtered.resolution)
             moving = moving_objects(seen, kept.poses, movers, self.options.objects)
@@ -220,6 +232,7 @@ class _Run:
             p_static=kept.p_static,
             map=filtered,
             raw_map=raw,
+            evidence=evidence,
             best_iteration=kept.number,
             converged=self.finished,
             warnings=_warnings(self.records, kept, recording, self.options.em),
@@ -312,13 +325,9 @@ def _cells(window: Window, resolution: float) -> em.Box:
 def _raw_map(
     recording: Recording, poses: Float, filtered: em.OccupancyMap, threads: int
 ) -> em.OccupancyMap:
-    resolution = filtered.resolution
-    grid = _core.Grid2D(resolution)
+    grid = _core.Grid2D(filtered.resolution)
     em.add_recording(grid, recording, poses, None, threads)
-    x, y, _ = filtered.origin
-    first_cell = np.round(np.array([x, y]) / resolution).astype(np.int64)
-    height, width = filtered.p_occupied.shape
-    return em.occupancy_map(grid, box=em.Box(first_cell, (height, width)))
+    return em.occupancy_map(grid, box=filtered.box)
 
 
 def _warnings(

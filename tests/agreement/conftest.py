@@ -175,6 +175,12 @@ def a_room() -> Callable[..., Room]:
     return make_room
 
 
+@pytest.fixture(scope="session")
+def some_beams() -> Callable[..., Beams]:
+    """Makes random beams of a seed and a dimension."""
+    return random_beams
+
+
 @pytest.fixture(params=[(2, 1), (2, 2), (3, 3), (3, 4)], ids=lambda p: f"{p[0]}D-{p[1]}")
 def beams(request: pytest.FixtureRequest) -> Beams:
     dimension, seed = request.param

@@ -108,6 +108,8 @@ def test_an_unknown_option_names_the_nearest(capsys, tmp_path, key, nearest):
     [
         (("--set", "em.prior=2"), ("--set: ", "em.prior")),
         (("--set", "em.prior=high"), ("--set: ", "em.prior", "'high'")),
+        (("--set", "em.evidence.least=-1"), ("--set: ", "em.evidence.least", "looks")),
+        (("--set", "em.evidence.near=-1"), ("--set: ", "em.evidence.near", "metres")),
         (("--set", "em.dwell.look=0"), ("--set: ", "em.dwell.look", "seconds")),
         (("--set", "em.dwell.look=nan"), ("--set: ", "em.dwell.look")),
         (("--set", "em.dwell.detection=1"), ("--set: ", "em.dwell.detection", "probability")),

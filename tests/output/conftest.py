@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from stillmap.em import Evidence
 from stillmap.objects import MovingObject, ObjectOptions, Traffic, traffic
 from stillmap.output.crops import choose_window, extent, snapshot
 from stillmap.output.map_server import OutputOptions
@@ -83,6 +84,7 @@ class FakeResult:
     p_static: np.ndarray
     map: FakeMap
     raw_map: FakeMap
+    evidence: Evidence
     best_iteration: int
     converged: bool
     warnings: list
@@ -221,6 +223,13 @@ def made_up_objects(recording, p_static, scan):
     return out
 
 
+def made_up_evidence(occupancy):
+    """Looks that lengths and hits would make, every second one clear."""
+    looks = np.ceil(occupancy.alpha + occupancy.beta).astype(np.uint16)
+    clear = looks // 2
+    return Evidence(looks, clear, (clear < 3) & ~np.isnan(occupancy.p_occupied), 3, 0.3)
+
+
 @pytest.fixture(scope="session")
 def result():
     rng = np.random.default_rng(3)
@@ -266,6 +275,7 @@ def result():
         p_static=labels[3],
         map=maps[3],
         raw_map=maps["raw"],
+        evidence=made_up_evidence(maps[3]),
         best_iteration=3,
         converged=True,
         warnings=["the odometry stalls at line 88 & <after>"],

@@ -21,6 +21,20 @@ def test_content(tmp_path, result):
         assert float(read["resolution"]) == result.map.resolution
 
 
+def test_the_looks_that_it_rests_on(tmp_path, result):
+    write_map_npz(tmp_path / "map.npz", result.map, (), result.evidence)
+    with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
+        more = {"looks": np.uint16, "clear_looks": np.uint16, "thin": np.bool_}
+        plain = {"p_occupied", "alpha", "beta", "origin", "resolution"}
+        assert set(read) == plain | set(more)
+        for name, dtype in more.items():
+            assert read[name].dtype == dtype
+            assert read[name].shape == result.map.p_occupied.shape
+        np.testing.assert_array_equal(read["looks"], result.evidence.looks)
+        np.testing.assert_array_equal(read["clear_looks"], result.evidence.clear)
+        np.testing.assert_array_equal(read["thin"], result.evidence.thin)
+
+
 def test_equal_maps_give_equal_bytes_whatever_their_layout(tmp_path, result):
     write_map_npz(tmp_path / "a.npz", result.map)
     other = dataclasses.replace(result.map, p_occupied=result.map.p_occupied.copy())

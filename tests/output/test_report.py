@@ -14,10 +14,13 @@ from stillmap.output.report_curve import likelihood_svg
 from stillmap.output.report_figures import (
     ORANGE,
     UNKNOWN,
+    VEIL,
+    VIOLET,
     dots_image,
     map_image,
     shown_window,
     snapshot_image,
+    thin_image,
 )
 from stillmap.output.report_learned import learned_section
 
@@ -101,15 +104,17 @@ def test_headline_figures(page):
 
 def test_pictures_have_words_and_show_the_maps(page, result):
     images = page.named("img")
-    # raw, filtered and the dots over it, ways, traffic, three iterations
-    assert [bool(image["alt"]) for image in images] == [True, True, False] + [True] * 5
+    # raw, filtered, a veil and the dots over it, ways, traffic, three iterations
+    assert [bool(image["alt"]) for image in images] == [True, True, False, False] + [True] * 5
     for image in images:
         assert picture(image).size == (int(image["width"]), int(image["height"]))
     raw, filtered = (np.asarray(picture(image).convert("RGB")) for image in images[:2])
     assert raw.shape == filtered.shape
     # the ghosts that the walkers leave are in the raw map alone
     assert (raw.astype(int) + 20 < filtered).all(axis=2).sum() > 500
-    dots = np.asarray(picture(images[2]).convert("RGBA"))
+    veil = np.asarray(picture(images[2]).convert("RGBA"))
+    assert set(map(tuple, veil.reshape(-1, 4))) == {(*VIOLET, VEIL), (*UNKNOWN, 0)}
+    dots = np.asarray(picture(images[3]).convert("RGBA"))
     assert set(map(tuple, dots.reshape(-1, 4))) == {(*ORANGE, 255), (*UNKNOWN, 0)}
     assert len(page.named("polyline")[0]["points"].split()) == result.recording.n_scans
 
@@ -145,6 +150,43 @@ def test_dots_lie_where_the_points_are():
     np.testing.assert_array_equal(dots, [[0, 0, 1], [1, 0, 0]])
 
 
+def test_the_veil_lies_over_thin_places(result):
+    p = np.array([[0, 1, np.nan], [np.nan, 0, 0]], np.float32)
+    thin = np.array([[0, 1, 0], [0, 0, 1]], bool)
+    veil = np.asarray(thin_image(small_map(result, p), thin, (-1, 0, 3, 2)))
+    np.testing.assert_array_equal(veil, [[0, 0, 0, 1], [0, 0, 1, 0]])
+
+
+def test_the_veil_is_reduced_as_the_map_is(result):
+    p, thin = np.zeros((4000, 4000), np.float32), np.zeros((4000, 4000), bool)
+    p[:2000] = np.nan  # of a square that is hardly known the known cells count
+    p[:2000, ::7] = 0.0
+    thin[:2000, 0:1000:7] = thin[2000:, 1000:2000] = True
+    thin[3000, 3000] = True
+    occupancy, window = small_map(result, p), (0, 0, 4000, 4000)
+    image = thin_image(occupancy, thin, window)
+    assert image.size == map_image(occupancy, window).size
+    veil = np.asarray(image)
+    middle = image.height // 2
+    quarter = image.width // 4
+    assert veil[: middle - 1, quarter + 1 : 2 * quarter - 1].all()
+    assert not veil[: middle - 1, 2 * quarter + 1 :].any()
+    columns = np.flatnonzero(veil[middle + 1 :].all(axis=0))
+    assert 0 < columns.max() <= quarter
+    assert not veil[middle + 1 :, :quarter][:, columns.max() + 1 :].any()
+
+
+def test_how_much_is_thin_is_said(page, result):
+    text = " ".join("".join(page.text).split())
+    thin, known = (np.count_nonzero(one) for one in (result.evidence.thin, result.map.beta > 0))
+    assert f"{0.01 * thin:,.1f} m² of the filtered map" in text
+    assert f"{100 * thin / known:.1f} % of what is known" in text
+    assert "fewer than 3 looks" in text
+    nothing = dataclasses.replace(result.evidence, thin=np.zeros_like(result.evidence.thin))
+    text = report_html(dataclasses.replace(result, evidence=nothing))
+    assert "No place that is known rests on thin evidence." in text
+
+
 def test_snapshot_shows_map_and_dots(result):
     shown = np.asarray(snapshot_image(result.snapshots[-1]).convert("RGB"))
     colours = set(map(tuple, shown.reshape(-1, 3).tolist()))
@@ -174,7 +216,8 @@ def test_a_report_of_a_large_map_stays_small(result):
     large = dataclasses.replace(
         result.map, p_occupied=rng.random((4000, 4000), np.float32), resolution=0.05
     )
-    text = report_html(dataclasses.replace(result, map=large, raw_map=large))
+    evidence = dataclasses.replace(result.evidence, thin=rng.random((4000, 4000)) < 0.5)
+    text = report_html(dataclasses.replace(result, map=large, raw_map=large, evidence=evidence))
     assert len(text.encode()) < 10_000_000
     Page(text)
 
@@ -289,7 +332,8 @@ def test_a_report_of_less(result, change):
 def test_a_map_that_nobody_looked_at_and_one_without_cells(result):
     for p in (np.full((5, 5), np.nan, np.float32), np.zeros((0, 0), np.float32)):
         empty = small_map(result, p)
-        Page(report_html(dataclasses.replace(result, map=empty, raw_map=empty)))
+        none = dataclasses.replace(result.evidence, thin=np.zeros(p.shape, bool))
+        Page(report_html(dataclasses.replace(result, map=empty, raw_map=empty, evidence=none)))
 
 
 def test_likelihoods_that_are_no_numbers_are_drawn_as_gaps(result):

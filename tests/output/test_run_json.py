@@ -31,6 +31,7 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
         "cpu_seconds",
         "peak_memory_bytes",
         "counts",
+        "area",
         "warnings",
         "learned",
         "doubts",
@@ -47,6 +48,14 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
     assert run["peak_memory_bytes"]["em"] == 96_000_000
     assert run["warnings"] == result.warnings
     assert run["learned"] == result.learned
+
+
+def test_areas(tmp_path, result):
+    area = written(tmp_path, result)["area"]
+    known = np.count_nonzero(~np.isnan(result.map.p_occupied))
+    assert area["known"] == round(0.01 * known, 6)
+    assert area["thin"] == round(0.01 * np.count_nonzero(result.evidence.thin), 6)
+    assert 0 < area["thin"] < area["known"]
 
 
 def test_iterations(tmp_path, result):

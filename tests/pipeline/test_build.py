@@ -132,6 +132,27 @@ def test_the_labels_written_follow_from_the_map_written(room, tmp_path):
 
 
 @with_any_estimator
+def test_the_looks_that_the_map_rests_on(room, estimator, tmp_path):
+    result = stillmap.build(room.recording, options(estimator, max_iterations=1))
+    found, known = result.evidence, ~np.isnan(result.map.p_occupied)
+    assert found.looks.shape == known.shape
+    # to the cell: what is known has been looked at, and nothing else has
+    np.testing.assert_array_equal(found.looks > 0, known)
+    np.testing.assert_array_equal(found.thin, known & (found.clear < 3))
+    assert (found.clear <= found.looks).all()
+    assert 0.01 < found.thin[known].mean() < 0.5
+    assert "evidence" in result.stages
+    if estimator == "stillmap":  # the others call too few of the beams dynamic at first
+        assert (found.clear < found.looks).any()
+    threaded = stillmap.build(
+        room.recording, dataclasses.replace(result.options, threads=3), poses=result.poses
+    )
+    np.testing.assert_array_equal(found.clear, threaded.evidence.clear)
+    result.save(tmp_path / "out")
+    np.testing.assert_array_equal(np.load(tmp_path / "out/map.npz")["clear_looks"], found.clear)
+
+
+@with_any_estimator
 def test_unknown_stays_nan(room, estimator):
     m = stillmap.build(room.recording, options(estimator, max_iterations=2)).map
     unknown = np.isnan(m.p_occupied)

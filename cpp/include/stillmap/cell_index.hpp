@@ -1,64 +1,22 @@
 // Numbers the cells of which something is known, sparsely: int32 places in blocks of cells.
 #pragma once
 
-#include <array>
-#include <memory>
-#include <unordered_map>
-#include <vector>
-
-#include "stillmap/grid.hpp"
+#include "stillmap/blocks.hpp"
 
 namespace stillmap {
 
-// A grid to walk through as Grid is, with places instead of counts.
+// A grid to walk through as Grid is, with the place of each cell, or kNone, instead of counts.
 template <int D>
-class CellIndex {
+class CellIndex : public Blocks<D, int32_t> {
  public:
-  using G = Grid<D>;
-  static constexpr int kDimension = D;
-  static constexpr int kShift = G::kShift;
-  static constexpr int kEdge = G::kEdge;
-  static constexpr int kCells = G::kCells;
   static constexpr int32_t kNone = -1;
-
-  struct Block {
-    Cell<D> origin;                      // block coordinates
-    std::array<int32_t, kCells> counts;  // the place of each cell, or kNone
-  };
-
-  static Cell<D> block_of(const Cell<D>& cell) { return G::block_of(cell); }
-  static int local_of(const Cell<D>& cell) { return G::local_of(cell); }
-
-  const Block* find(const Cell<D>& block) const {
-    const auto it = index_.find(G::key(block));
-    return it == index_.end() ? nullptr : blocks_[it->second].get();
-  }
 
  protected:
   // kNone at first
   int32_t& place_of(const Cell<D>& cell) {
-    return find_or_add(block_of(cell))->counts[static_cast<size_t>(local_of(cell))];
+    auto* block = this->find_or_add(Grid<D>::block_of(cell), kNone);
+    return block->counts[static_cast<size_t>(Grid<D>::local_of(cell))];
   }
-
-  // in the order in which they were added
-  const std::vector<std::unique_ptr<Block>>& blocks() const { return blocks_; }
-
- private:
-  Block* find_or_add(const Cell<D>& block) {
-    if (last_ && last_->origin == block) return last_;
-    const auto [it, added] = index_.try_emplace(G::key(block), blocks_.size());
-    if (added) {
-      blocks_.push_back(std::make_unique<Block>());
-      blocks_.back()->origin = block;
-      blocks_.back()->counts.fill(kNone);
-    }
-    last_ = blocks_[it->second].get();
-    return last_;
-  }
-
-  std::vector<std::unique_ptr<Block>> blocks_;
-  Block* last_ = nullptr;
-  std::unordered_map<uint64_t, size_t, typename G::Hash> index_;
 };
 
 }  // namespace stillmap

@@ -1,6 +1,7 @@
 // Beams without a return: which of them tell something, and up to where.
 #pragma once
 
+#include <utility>
 #include <vector>
 
 #include "stillmap/beams.hpp"
@@ -39,24 +40,28 @@ class LostBeams : private CellIndex<D> {
   }
 
   void add(Grid<D>& grid, Grid<D>& rest, const Scans<D>& scans, size_t first, size_t last) const {
-    Way way(*this, grid, rest);
+    Cursor<Grid<D>> believed_in(grid), not_in(rest);
+    Way way(*this, [&](const Cell<D>& cell, double length, bool believed) {
+      auto* block = (believed ? believed_in : not_in).block(cell);
+      block->counts[static_cast<size_t>(Grid<D>::local_of(cell))].beta += to_fixed(length);
+    });
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
       if (scans.hit[n]) return;
       const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
-      const double length = (beam.end - beam.start).norm();
-      way.follow(beam, in_a_row(scans, t, n) ? length - beyond_ : 0.0);
+      way.follow(beam, in_a_row(scans, t, n));
     });
   }
 
- private:
-  // Walks along beams; a cell that is left later than that, in cells, is not believed in.
+  // Walks along beams: visit(cell, length in it, whether it is believed in); a cell that is left
+  // too late, or behind a stop, is not. Lone beams are not believed at all.
+  template <class Visit>
   class Way {
    public:
-    Way(const CellIndex<D>& stops, Grid<D>& grid, Grid<D>& rest)
-        : stops_(stops), grid_(grid), rest_(rest) {}
+    Way(const LostBeams& lost, Visit visit)
+        : stops_(lost), beyond_(lost.beyond_), visit_(std::move(visit)) {}
 
-    void follow(const Segment<D>& beam, double believed) {
-      believed_ = believed;
+    void follow(const Segment<D>& beam, bool in_a_row) {
+      believed_ = in_a_row ? (beam.end - beam.start).norm() - beyond_ : 0.0;
       travelled_ = 0.0;
       traverse<D>(beam.start, beam.end, *this);
     }
@@ -64,10 +69,8 @@ class LostBeams : private CellIndex<D> {
     void start(const Cell<D>& first) { cell_ = first; }
     void visit(double length) {
       travelled_ += length;
-      const auto local = static_cast<size_t>(Grid<D>::local_of(cell_));
-      if (travelled_ > believed_ || stopped(local)) believed_ = 0.0;
-      auto* block = (believed_ > 0.0 ? grid_ : rest_).block(cell_);
-      block->counts[local].beta += to_fixed(length);
+      if (travelled_ > believed_ || stopped()) believed_ = 0.0;
+      visit_(cell_, length, believed_ > 0.0);
     }
     template <int Axis>
     void step(int32_t direction) {
@@ -75,17 +78,20 @@ class LostBeams : private CellIndex<D> {
     }
 
    private:
-    bool stopped(size_t local) {
+    bool stopped() {
       const auto* block = stops_.block(cell_);
-      return block && block->counts[local] != CellIndex<D>::kNone;
+      return block &&
+             block->counts[static_cast<size_t>(Grid<D>::local_of(cell_))] != CellIndex<D>::kNone;
     }
 
     Cursor<const CellIndex<D>> stops_;
-    Cursor<Grid<D>> grid_, rest_;
+    double beyond_;
+    Visit visit_;
     Cell<D> cell_ = Cell<D>::Zero();
     double believed_ = 0.0, travelled_ = 0.0;
   };
 
+ private:
   double beyond_;
 };
 

@@ -11,10 +11,11 @@ from stillmap.em.estimator import (
     initial_expectations,
     iterations,
 )
+from stillmap.em.evidence import Evidence, evidence
 from stillmap.em.expectations import CellProbabilities, Expectations, Likelihood, NoReturn
 from stillmap.em.held_out import held_out_log_likelihood
 from stillmap.em.occupancy import Box, OccupancyMap, Seen, occupancy_map
-from stillmap.em.options import ChangeOptions, DwellOptions, EmOptions
+from stillmap.em.options import ChangeOptions, DwellOptions, EmOptions, EvidenceOptions
 
 __all__ = [
     "Box",
@@ -24,6 +25,8 @@ __all__ = [
     "DwellOptions",
     "EmOptions",
     "Estimator",
+    "Evidence",
+    "EvidenceOptions",
     "Expectations",
     "Likelihood",
     "MapState",
@@ -34,6 +37,7 @@ __all__ = [
     "add_recording",
     "changed_share",
     "e_step",
+    "evidence",
     "held_out_log_likelihood",
     "initial_expectations",
     "iterations",

@@ -61,6 +61,13 @@ class OccupancyMap:
     origin: tuple[float, float, float]
     resolution: float
 
+    @property
+    def box(self) -> Box:
+        """Which cells these are."""
+        first_cell = np.round(np.array(self.origin[:2]) / self.resolution).astype(np.int64)
+        height, width = self.p_occupied.shape
+        return Box(first_cell, (height, width))
+
 
 def occupancy_map(
     grid: _core.Grid2D,

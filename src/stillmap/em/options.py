@@ -61,6 +61,24 @@ class ChangeOptions:
 
 
 @dataclass(frozen=True)
+class EvidenceOptions:
+    """What a place has to be seen by to be known; see em.evidence."""
+
+    least: int = field_with_doc(
+        3, "clear looks, each of em.dwell.look: what has fewer rests on thin evidence"
+    )
+    near: float = field_with_doc(
+        0.3, "m around the end of a beam on something that moves: no clear look at what is there"
+    )
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.least <= 65535:
+            raise ValueError("'em.evidence.least' wants 0 to 65535 looks")
+        if not 0.0 <= self.near <= 5.0:
+            raise ValueError("'em.evidence.near' wants 0 to 5 metres")
+
+
+@dataclass(frozen=True)
 class EmOptions:
     """The loop of Fig. 2."""
 
@@ -83,6 +101,7 @@ class EmOptions:
     )
     dwell: DwellOptions = field(default=DwellOptions())
     changes: ChangeOptions = field(default=ChangeOptions())
+    evidence: EvidenceOptions = field(default=EvidenceOptions())
 
     def __post_init__(self) -> None:
         for name in ("prior", "hit_ratio"):

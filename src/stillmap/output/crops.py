@@ -1,7 +1,7 @@
 """Small parts of a map, to show how it evolves (Fig. 8) without keeping every map."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from stillmap.output.protocols import MapLike
 
 Window = tuple[float, float, float, float]
+Value = TypeVar("Value", np.float32, np.bool_)
 _MOST_POINTS = 50_000
 
 
@@ -100,18 +101,25 @@ def cut(
     occupancy: "MapLike", window: Window
 ) -> tuple[NDArray[np.float32], tuple[float, float, float]]:
     """The cells (h, w) in `window` and their origin; NaN where the window leaves the map."""
+    return cut_layer(occupancy, occupancy.p_occupied, window, np.nan)
+
+
+def cut_layer(
+    occupancy: "MapLike", layer: NDArray[Value], window: Window, outside: float
+) -> tuple[NDArray[Value], tuple[float, float, float]]:
+    """The same of any (H, W) layer of a map; `outside` where the window leaves it."""
     x, y, _, _ = extent(occupancy)
     step = occupancy.resolution
     left, bottom = round((window[0] - x) / step), round((window[1] - y) / step)
     w, h = round((window[2] - window[0]) / step), round((window[3] - window[1]) / step)
-    height, width = occupancy.p_occupied.shape
+    height, width = layer.shape
     origin = (x + left * step, y + bottom * step, 0.0)
     if left >= 0 and bottom >= 0 and left + w <= width and bottom + h <= height:
-        return occupancy.p_occupied[bottom : bottom + h, left : left + w], origin
-    cells = np.full((h, w), np.nan, np.float32)
+        return layer[bottom : bottom + h, left : left + w], origin
+    cells = np.full((h, w), outside, layer.dtype)
     i0, i1 = np.clip([bottom, bottom + h], 0, height)
     j0, j1 = np.clip([left, left + w], 0, width)
-    cells[i0 - bottom : i1 - bottom, j0 - left : j1 - left] = occupancy.p_occupied[i0:i1, j0:j1]
+    cells[i0 - bottom : i1 - bottom, j0 - left : j1 - left] = layer[i0:i1, j0:j1]
     return cells, origin
 
 

@@ -1,4 +1,4 @@
-"""`map.npz`: the occupancy grid with the sums it is made from."""
+"""`map.npz`: the occupancy grid with the sums it is made from and the looks it rests on."""
 
 import zipfile
 from collections.abc import Sequence
@@ -8,30 +8,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.output.protocols import ChangeLike, MapLike, OccupancyMapLike
+from stillmap.output.protocols import ChangeLike, EvidenceLike, MapLike, OccupancyMapLike
 
 # what `changed` says of a cell
 CHANGED = {"came": 1, "left": 2, "comes and goes": 3}
 
 
 def write_map_npz(
-    path: Path, occupancy: OccupancyMapLike, changes: Sequence[ChangeLike] = ()
+    path: Path,
+    occupancy: OccupancyMapLike,
+    changes: Sequence[ChangeLike] = (),
+    evidence: EvidenceLike | None = None,
 ) -> None:
-    """Write `p_occupied`, `alpha`, `beta`, `changed` (H, W), `origin` (x, y, yaw), `resolution`.
+    """Write `p_occupied`, `alpha`, `beta` (H, W), `origin` (x, y, yaw), `resolution` in metres.
 
-    Metres; `changed` uint8: 0, or how the place changed, see CHANGED.
+    Also `changed` (H, W) uint8: 0, or how the place changed, see CHANGED; and where evidence is
+    given: `looks`, `clear_looks`, `thin` (H, W).
     """
-    write_npz(
-        path,
-        {
-            "p_occupied": np.asarray(occupancy.p_occupied, np.float32),
-            "alpha": np.asarray(occupancy.alpha, np.float32),
-            "beta": np.asarray(occupancy.beta, np.float32),
-            "changed": changed_cells(occupancy, changes),
-            "origin": np.asarray(occupancy.origin, np.float64),
-            "resolution": np.asarray(occupancy.resolution, np.float64),
-        },
-    )
+    arrays: dict[str, NDArray[Any]] = {
+        "p_occupied": np.asarray(occupancy.p_occupied, np.float32),
+        "alpha": np.asarray(occupancy.alpha, np.float32),
+        "beta": np.asarray(occupancy.beta, np.float32),
+        "changed": changed_cells(occupancy, changes),
+    }
+    if evidence is not None:
+        arrays |= {
+            "looks": np.asarray(evidence.looks, np.uint16),
+            "clear_looks": np.asarray(evidence.clear, np.uint16),
+            "thin": np.asarray(evidence.thin, np.bool_),
+        }
+    arrays |= {
+        "origin": np.asarray(occupancy.origin, np.float64),
+        "resolution": np.asarray(occupancy.resolution, np.float64),
+    }
+    write_npz(path, arrays)
 
 
 def changed_cells(occupancy: MapLike, changes: Sequence[ChangeLike]) -> NDArray[np.uint8]:

@@ -43,6 +43,29 @@ class OccupancyMapLike(MapLike, Protocol):
     def beta(self) -> NDArray[np.float32]: ...
 
 
+class EvidenceLike(Protocol):
+    """What the cells of a map rest on, laid out as the map is.
+
+    Attributes:
+        looks: (H, W) uint16, looks at each cell.
+        clear: (H, W) uint16, those of them in which nothing that moves was near.
+        thin: (H, W) bool, known cells with fewer than `least` clear looks.
+        least: clear looks that a cell should have.
+        near: metres within which something that moves spoils a look.
+    """
+
+    @property
+    def looks(self) -> NDArray[np.uint16]: ...
+    @property
+    def clear(self) -> NDArray[np.uint16]: ...
+    @property
+    def thin(self) -> NDArray[np.bool_]: ...
+    @property
+    def least(self) -> int: ...
+    @property
+    def near(self) -> float: ...
+
+
 class IterationRecordLike(Protocol):
     """The numbers of one EM iteration.
 
@@ -261,6 +284,7 @@ class ResultLike(Protocol):
         p_static: (M,) float32, P(c = 1); NaN for unusable beams, the prior at maximum range.
         map: the map of what stands still.
         raw_map: the map with every hit counted in full, from the same poses, of the same cells.
+        evidence: the looks that these cells rest on.
         best_iteration: number of the iteration that was kept.
         converged: whether the loop stopped by itself.
         warnings: one sentence each.
@@ -292,6 +316,8 @@ class ResultLike(Protocol):
     def map(self) -> OccupancyMapLike: ...
     @property
     def raw_map(self) -> OccupancyMapLike: ...
+    @property
+    def evidence(self) -> EvidenceLike: ...
     @property
     def best_iteration(self) -> int: ...
     @property

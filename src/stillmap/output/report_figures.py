@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from stillmap.output.crops import Snapshot, Window, cut, extent
+from stillmap.output.crops import Snapshot, Window, cut, cut_layer, extent
 from stillmap.output.map_server import OCCUPIED_THRESH
 from stillmap.output.protocols import MapLike
 
 ORANGE = (240, 120, 0)
 UNKNOWN = (190, 196, 204)
+VIOLET = (140, 60, 220)
+VEIL = 80  # of 255: walls and free space show through
 # enough for a large screen, and two maps of it stay within a few megabytes
 PIXEL_BUDGET = 1_500_000
 _SNAPSHOT_PIXELS = 480
@@ -41,8 +43,21 @@ def shown_window(maps: Sequence[MapLike]) -> Window:
 def map_image(occupancy: MapLike, window: Window) -> Image.Image:
     """White free, grey unknown, black occupied; large maps are reduced to the pixel budget."""
     cells, _ = cut(occupancy, window)
-    factor = max(1, math.ceil(math.sqrt(cells.size / PIXEL_BUDGET)))
+    factor = _reduction(window, occupancy.resolution)
     return _with_palette(_levels(cells, factor)[::-1])
+
+
+def thin_image(occupancy: MapLike, thin: NDArray[np.bool_], window: Window) -> Image.Image:
+    """A veil over the thin (H, W) cells, to lie over the `map_image` of that window."""
+    factor = _reduction(window, occupancy.resolution)
+    known, _ = cut_layer(occupancy, _known(occupancy), window, False)
+    veiled, _ = cut_layer(occupancy, thin, window, False)
+    count = _sums(veiled, factor)
+    half = (count > 0) & (2 * count >= _sums(known, factor))
+    image = Image.fromarray(np.ascontiguousarray(half[::-1].astype(np.uint8)))
+    image.putpalette([*UNKNOWN, *VIOLET])
+    image.info["transparency"] = bytes([0, VEIL])
+    return image
 
 
 def dots_image(points: NDArray[np.float32], window: Window, size: tuple[int, int]) -> Image.Image:
@@ -111,6 +126,20 @@ def _box(occupancy: MapLike, cells: NDArray[np.bool_]) -> Window | None:
         x + (right + 1 + margin) * occupancy.resolution,
         y + (top + 1 + margin) * occupancy.resolution,
     )
+
+
+def _reduction(window: Window, resolution: float) -> int:
+    """How many cells along each axis share a pixel."""
+    x0, y0, x1, y1 = window
+    cells = round((x1 - x0) / resolution) * round((y1 - y0) / resolution)
+    return max(1, math.ceil(math.sqrt(cells / PIXEL_BUDGET)))
+
+
+def _sums(cells: NDArray[np.bool_], factor: int) -> NDArray[np.int64]:
+    """How many cells are true in squares of `factor` cells."""
+    height, width = cells.shape
+    rows = np.add.reduceat(cells, np.arange(0, height, factor), axis=0, dtype=np.int64)
+    return np.asarray(np.add.reduceat(rows, np.arange(0, width, factor), axis=1))
 
 
 def _levels(cells: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.output.crops import Snapshot, Window
+from stillmap.output.known import known_area
 from stillmap.output.points import dynamic_points
 from stillmap.output.protocols import ResultLike
 from stillmap.output.report_figures import (
@@ -18,18 +19,23 @@ from stillmap.output.report_figures import (
     png_uri,
     shown_window,
     snapshot_image,
+    thin_image,
 )
+from stillmap.output.report_tables import share_text
 
 _KEY = (
     '<p class="soft"><span class="key" style="margin-left:0;background:#fff"></span>free'
     '<span class="key" style="background:#bec4cc"></span>never looked at'
     '<span class="key" style="background:#000"></span>occupied'
     '<span class="key" style="background:#f07800"></span>end of a beam that met something '
-    "moving</p>"
+    'moving <span style="white-space:nowrap"><span class="key" style="background:#dbc2f4"></span>'
+    "thin evidence</span></p>"
 )
 _TOGGLES = (
     '<input class="toggle" type="checkbox" id="show-dynamic" checked>'
     '<label for="show-dynamic">moving things</label>'
+    '<input class="toggle" type="checkbox" id="show-thin" checked>'
+    '<label for="show-thin">thin evidence</label>'
     '<input class="toggle" type="checkbox" id="show-path"><label for="show-path">trajectory</label>'
     '<input class="toggle" type="checkbox" id="large"><label for="large">large</label>'
 )
@@ -47,23 +53,37 @@ def maps_section(result: ResultLike) -> str:
         window,
         filtered.size,
     )
+    veil = thin_image(result.map, result.evidence.thin, window)
     path = _path(result.poses, window, filtered.size)
     width, height = window[2] - window[0], window[3] - window[1]
     reduced = filtered.size[0] < round(width / result.map.resolution)
     size = f"{width:.0f} m by {height:.0f} m, cells of {100 * result.map.resolution:.3g} cm"
     return (
-        f"<section><h2>The map</h2><p>{size}.</p>{_KEY}{_TOGGLES}"
+        f"<section><h2>The map</h2><p>{size}. {evidence_sentence(result)}</p>{_KEY}{_TOGGLES}"
         '<div class="pair">'
         + figure("Raw", "every beam counted in full", [(raw, "")], path, window, reduced)
         + figure(
             "Filtered",
-            "what stands still; what moved in orange",
-            [(filtered, ""), (dots, "dynamic")],
+            "what stands still; what moved in orange, what is hardly known in violet",
+            [(filtered, ""), (veil, "thin"), (dots, "dynamic")],
             path,
             window,
             reduced,
         )
         + "</div></section>"
+    )
+
+
+def evidence_sentence(result: ResultLike) -> str:
+    """How much of the known map few looks saw, or only while something moved there."""
+    area, evidence = known_area(result), result.evidence
+    if not area["thin"]:
+        return "No place that is known rests on thin evidence."
+    share = share_text(area["thin"] / area["known"])
+    return (
+        f"{area['thin']:,.1f} m² of the filtered map, {share} of what is known, rest on thin "
+        f"evidence: fewer than {evidence.least} looks saw these places while nothing that moves "
+        f"was within {evidence.near:g} m of them."
     )
 
 

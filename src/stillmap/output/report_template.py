@@ -64,6 +64,7 @@ figcaption b { color: var(--ink); }
 .map .path { display: none; }
 #show-path:checked ~ .pair .path { display: block; }
 #show-dynamic:not(:checked) ~ .pair .dynamic { display: none; }
+#show-thin:not(:checked) ~ .pair .thin { display: none; }
 .scale { position: absolute; left: 2%; bottom: 2%; border: solid #1d2329; border-width: 0 2px 2px;
   color: #1d2329; font-size: .75rem; line-height: 1.3; text-align: center;
   text-shadow: 0 0 3px #fff, 0 0 3px #fff, 0 0 3px #fff; }

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from stillmap.options import to_dict
+from stillmap.output.known import known_area
 from stillmap.output.points import beam_counts
 from stillmap.output.protocols import ChangeLike, IterationRecordLike, LoopLike, ResultLike
 
@@ -37,6 +38,7 @@ def run_record(result: ResultLike) -> dict[str, Any]:
             for key in ("seconds", "cpu_seconds", "peak_memory_bytes")
         },
         "counts": counts,
+        "area": known_area(result),
         "warnings": list(result.warnings),
         "learned": result.learned,
         "doubts": {

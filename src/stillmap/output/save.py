@@ -27,7 +27,7 @@ def save(result: ResultLike, path: Path, overwrite: bool = False) -> None:
     """
     with new_folder(path, overwrite) as folder:
         write_map_server(folder, result.map, result.options.output.map_mode)
-        write_map_npz(folder / "map.npz", result.map, result.changes)
+        write_map_npz(folder / "map.npz", result.map, result.changes, result.evidence)
         write_tum(folder / "trajectory.tum", result.recording.stamp_ns, result.poses)
         if result.graph is not None:
             write_g2o(folder / "graph.g2o", result.graph, result.poses)

@@ -23,6 +23,7 @@ from stillmap.reference.field import (
 from stillmap.reference.fill import fill_surfaces
 from stillmap.reference.grid import Grid, Grid2D, Grid3D, occupancy
 from stillmap.reference.held_out import StaticShares, StaticShares2D, StaticShares3D, held_out
+from stillmap.reference.look_counts import LookCounts, LookCounts2D, LookCounts3D
 from stillmap.reference.no_return import add_lost
 from stillmap.reference.search import Lattice, search_lattice
 from stillmap.reference.surface import Surface, Surface2D, Surface3D
@@ -39,6 +40,9 @@ __all__ = [
     "Grid2D",
     "Grid3D",
     "Lattice",
+    "LookCounts",
+    "LookCounts2D",
+    "LookCounts3D",
     "Reading",
     "StaticShares",
     "StaticShares2D",

@@ -51,12 +51,12 @@ def add_lost(
         way = list(passed_cells(grid, beam))
         length = float(np.linalg.norm(beam.end - beam.start))
         limit = (length - beyond) / grid.resolution if beam.number in told else 0.0
-        n = _cells_within(way, opaque, limit)
+        n = cells_within(way, opaque, limit)
         for k, (cell, chord) in enumerate(way):
             (grid if k < n else rest).add(cell, 0.0, chord)
 
 
-def _cells_within(way: Sequence[tuple[Cell, float]], opaque: set[Cell], limit: float) -> int:
+def cells_within(way: Sequence[tuple[Cell, float]], opaque: set[Cell], limit: float) -> int:
     """How many of the first cells are left within `limit` cell widths, with none of `opaque`."""
     left_at = accumulate(chord for _, chord in way)
     for k, ((cell, _), left) in enumerate(zip(way, left_at, strict=True)):

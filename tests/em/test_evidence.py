@@ -1,0 +1,135 @@
+"""Which places of a map are known well, in scenes made up by hand."""
+
+import numpy as np
+import pytest
+
+from stillmap import _core, em, se2
+from stillmap.em import chunks
+from stillmap.em.expectations import NoReturn
+from stillmap.recording.model import Recording
+
+RESOLUTION = 0.1
+SECOND = 1_000_000_000
+
+
+def recording_of(ranges, hit, seconds):
+    """Scans (T, N) of a fan ahead, taken from the origin at these times."""
+    T, N = ranges.shape
+    bearing = np.linspace(-0.5, 0.5, N)
+    points = ranges[..., None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+    return Recording(
+        stamp_ns=np.round(np.asarray(seconds) * SECOND).astype(np.int64),
+        offset=np.arange(T + 1, dtype=np.int64) * N,
+        points=points.reshape(-1, 2).astype(np.float32),
+        hit=hit.reshape(-1),
+        T_base_sensor=se2.matrix([0.0], [0.0], [0.0]),
+        sensor=np.zeros(T, np.int32),
+        T_odom_base=None,
+        source={},
+    )
+
+
+def evidence_of(recording, p_static, no_return=None, threads=1, **options):
+    """Of the map of (15)."""
+    poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
+    grid = _core.Grid2D(RESOLUTION)
+    known = np.nan_to_num(p_static, nan=0.5)
+    seen = em.add_believed_first(grid, recording, poses, known, no_return)
+    occupancy = em.occupancy_map(grid, seen=seen)
+    chosen = em.EmOptions(evidence=em.EvidenceOptions(**options))
+    found = em.evidence(recording, poses, p_static, occupancy, no_return, chosen, threads)
+    assert found.looks.shape == found.clear.shape == found.thin.shape == occupancy.p_occupied.shape
+    assert found.looks.dtype == found.clear.dtype == np.uint16
+    return occupancy, found
+
+
+def at(occupancy, layer, x, y):
+    row, column = np.floor((np.array([y, x]) - occupancy.origin[1::-1]) / RESOLUTION).astype(int)
+    return layer[row, column]
+
+
+@pytest.fixture(scope="module")
+def visitors():
+    """A wall 4 m ahead, twenty looks; to the left somebody stands 2 m ahead at each but two."""
+    T, N = 20, 201
+    ranges = np.full((T, N), 4.0) / np.cos(np.linspace(-0.5, 0.5, N))
+    e = np.ones((T, N), np.float32)
+    left = np.arange(N) > 140
+    ranges[2:, left], e[2:, left] = 2.0, 0.02
+    return recording_of(ranges, np.ones((T, N), bool), np.arange(T)), e.reshape(-1)
+
+
+def test_where_somebody_stood_the_place_is_not_known(visitors):
+    occupancy, found = evidence_of(*visitors)
+    told = {
+        (4.0, 0.0): (20, 20),  # the wall that everybody sees
+        (2.0, 0.0): (20, 20),
+        (4.0, 1.8): (2, 2),  # behind whoever stands there
+        (1.8, 0.8): (20, 2),  # where they stand, and before them
+        (1.2, 0.5): (20, 20),
+    }
+    for place, (looks, clear) in told.items():
+        assert at(occupancy, found.looks, *place) == looks
+        assert at(occupancy, found.clear, *place) == clear
+        assert at(occupancy, found.thin, *place) == (clear < 3)
+    assert (found.clear <= found.looks).all()
+    known = ~np.isnan(occupancy.p_occupied)
+    np.testing.assert_array_equal(found.looks > 0, known)
+    np.testing.assert_array_equal(found.thin, known & (found.clear < 3))
+
+
+def test_options(visitors):
+    occupancy, found = evidence_of(*visitors, least=2, near=1.0)
+    assert (found.least, found.near) == (2, 1.0)
+    assert not at(occupancy, found.thin, 4.0, 1.8)
+    assert at(occupancy, found.clear, 1.2, 0.5) == 2
+    assert not evidence_of(*visitors, least=0)[1].thin.any()
+
+
+def test_scans_of_half_a_second_are_one_look(visitors):
+    recording, e = visitors
+    T, N = recording.n_scans, recording.n_beams // recording.n_scans
+    ranges = np.linalg.norm(recording.points, axis=1).reshape(T, N)
+    at_once = recording_of(ranges, np.ones((T, N), bool), 0.02 * np.arange(T))
+    occupancy, found = evidence_of(at_once, e)
+    assert found.looks.max() == 1
+    assert found.thin.sum() == (~np.isnan(occupancy.p_occupied)).sum()
+
+
+def test_threads_and_chunks_do_not_matter(visitors, monkeypatch):
+    _, found = evidence_of(*visitors)
+    _, threaded = evidence_of(*visitors, threads=3)
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", 500)
+    _, chunked = evidence_of(*visitors, threads=2)
+    for name in ("looks", "clear", "thin"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(threaded, name))
+        np.testing.assert_array_equal(getattr(found, name), getattr(chunked, name))
+
+
+def test_beams_without_a_return_count_as_far_as_they_are_believed():
+    T, N = 5, 101
+    ranges, hit = np.full((T, N), 4.0), np.zeros((T, N), bool)
+    hit[:, :50] = True
+    ranges[:, -1], hit[:, -1] = np.nan, False
+    e = np.where(np.isnan(ranges), np.nan, 0.4 * ~hit + 0.95 * hit).astype(np.float32).reshape(-1)
+    recording = recording_of(ranges, hit, np.arange(T))
+    here = (3.0, 0.5), (3.85, 0.5)
+    for no_return, expected in (
+        (None, (5, 5)),
+        (NoReturn(np.zeros((0, 2), np.int64), 0.4), (5, 0)),
+        (NoReturn(np.zeros((0, 2), np.int64), np.inf), (0, 0)),
+    ):
+        occupancy, found = evidence_of(recording, e, no_return)
+        np.testing.assert_array_equal(found.looks > 0, ~np.isnan(occupancy.p_occupied))
+        np.testing.assert_array_equal(found.clear, found.looks)  # what got lost met nobody
+        # the map may end before
+        room = np.pad(found.looks, ((0, 40), (0, 40)))
+        assert tuple(int(at(occupancy, room, *place)) for place in here) == expected
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"least": -1}, {"least": 65536}, {"near": -0.1}, {"near": 5.1}, {"near": np.nan}]
+)
+def test_options_that_cannot_be(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        em.EvidenceOptions(**wrong)
