@@ -9,7 +9,7 @@ from stillmap.output.map_npz import write_map_npz
 def test_content(tmp_path, result):
     write_map_npz(tmp_path / "map.npz", result.map)
     with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
-        assert set(read) == {"p_occupied", "alpha", "beta", "origin", "resolution"}
+        assert set(read) == {"p_occupied", "alpha", "beta", "changed", "origin", "resolution"}
         np.testing.assert_array_equal(read["p_occupied"], result.map.p_occupied)
         assert read["p_occupied"].dtype == np.float32
         assert np.isnan(read["p_occupied"]).any()
@@ -25,7 +25,7 @@ def test_the_looks_that_it_rests_on(tmp_path, result):
     write_map_npz(tmp_path / "map.npz", result.map, (), result.evidence)
     with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
         more = {"looks": np.uint16, "clear_looks": np.uint16, "thin": np.bool_}
-        plain = {"p_occupied", "alpha", "beta", "origin", "resolution"}
+        plain = {"p_occupied", "alpha", "beta", "changed", "origin", "resolution"}
         assert set(read) == plain | set(more)
         for name, dtype in more.items():
             assert read[name].dtype == dtype
