@@ -9,7 +9,7 @@ from stillmap.output.map_npz import write_map_npz
 def test_content(tmp_path, result):
     write_map_npz(tmp_path / "map.npz", result.map)
     with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
-        assert set(read) == {"p_occupied", "alpha", "beta", "origin", "resolution"}
+        assert set(read) == {"p_occupied", "alpha", "beta", "changed", "origin", "resolution"}
         np.testing.assert_array_equal(read["p_occupied"], result.map.p_occupied)
         assert read["p_occupied"].dtype == np.float32
         assert np.isnan(read["p_occupied"]).any()

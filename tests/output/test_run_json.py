@@ -34,13 +34,14 @@ def test_the_keys_that_scripts_rely_on(tmp_path, result):
         "warnings",
         "learned",
         "doubts",
+        "changes",
         "loops",
     ]
     assert run["format_version"] == 1
     assert isinstance(run["version"], str)
     assert run["input"]["path"] == "logs/hall <1>.clf"
     assert run["options"]["em"] == {"prior": 0.9, "note": result.options.em.note, "seed": None}
-    assert run["options"]["output"] == {"map_mode": "trinary"}
+    assert run["options"]["output"] == {"map_mode": "trinary", "map_state": "last"}
     assert (run["converged"], run["best_iteration"]) == (True, 3)
     assert run["seconds"] == {"read": 0.21, "em": 7.1, "map": 0.02}
     assert run["cpu_seconds"] == {"read": 0.2, "em": 13.5, "map": 0.02}

@@ -13,6 +13,7 @@ from stillmap.pipeline import Iteration, Options
 
 def options(estimator="stillmap", **changes):
     wanted = {"max_iterations": 10, "tolerance": 0.0, "settled": 0.0, "patience": 3} | changes
+    wanted["changes"] = {"enabled": False}  # the labels are those of the iteration itself
     chosen = {"estimator": estimator, "em": wanted, "slam": {"resolution": 0.1}, "threads": 1}
     return replaced(Options(), chosen)
 
