@@ -188,11 +188,10 @@ def _told_apart(
         fits = (events.before <= at) & (events.after > at)
         before, stamp = int(events.before[fits].max()), int(events.after[fits].min())
         mine = (events.before < stamp + slack) & (events.after > before - slack)
-        if np.count_nonzero(mine) < options.least:
-            break
-        cells = courses.cells[np.unique(events.cell[mine])]
-        kind: Kind = "came" if events.came[0] else "left"
-        out.append(_change(kind, cells, resolution, before, stamp, stamp, 1))
+        if np.count_nonzero(mine) >= options.least:
+            cells = courses.cells[np.unique(events.cell[mine])]
+            kind: Kind = "came" if events.came[0] else "left"
+            out.append(_change(kind, cells, resolution, before, stamp, stamp, 1))
         events = events.of(np.flatnonzero(~mine))
     return out
 
