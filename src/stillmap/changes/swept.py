@@ -86,10 +86,11 @@ class _Sector:
 
 def _sector(cells: Cells) -> _Sector | None:
     """The door, if it is one: cells along two lines from one of them, the hinge."""
-    best, most = None, _LEAF
+    best, most = None, (_LEAF, -math.inf)
     for hinge in cells[:: math.ceil(len(cells) / _HINGES)]:
         sector = _Sector(hinge, cells)
-        share = sector.at_its_ends(cells)
-        if _NARROW < sector.angle < _WIDE and share >= most and sector.fills_both(cells):
-            best, most = sector, share
+        # beside the hinge of a door that swings far, others explain as much with longer leaves
+        now = (sector.at_its_ends(cells), -sector.length)
+        if _NARROW < sector.angle < _WIDE and now > most and sector.fills_both(cells):
+            best, most = sector, now
     return best
