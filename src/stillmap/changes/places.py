@@ -78,9 +78,8 @@ def without_changes(
     at, stamp = np.floor(ends / resolution).astype(np.int64), recording.stamp_ns[scan]
     stood = np.zeros(len(beam), bool)
     for change in changes:
-        during = np.ones(len(beam), bool)
-        if change.kind != "comes and goes":
-            during = (stamp > change.before_ns) == (change.kind == "came")
+        since, until = _stood(change, changes)
+        during = (stamp > since) & (stamp <= until)
         low, high = change.cells.min(axis=0) - 1, change.cells.max(axis=0) + 2
         inside = np.flatnonzero(during & ((at >= low) & (at < high)).all(axis=1))
         near = np.zeros(tuple((high - low).tolist()), bool)
@@ -89,6 +88,31 @@ def without_changes(
     out = p_static.copy()
     out[beam[stood]] = 1.0
     return out
+
+
+def _stood(change: Change, changes: list[Change]) -> tuple[int, int]:
+    """The stamps after which and until which something stood in a place, as far as is known."""
+    ever = np.iinfo(np.int64)
+    since, until = ever.min, ever.max
+    if change.kind == "came":
+        since = change.before_ns
+        left = [one.before_ns for one in changes if one.kind == "left" and _same(one, change)]
+        until = min((stamp for stamp in left if stamp > since), default=until)
+    elif change.kind == "left":
+        until = change.before_ns
+        came = [one.before_ns for one in changes if one.kind == "came" and _same(one, change)]
+        since = max((stamp for stamp in came if stamp < until), default=since)
+    return since, until
+
+
+def _same(one: Change, other: Change) -> bool:
+    """Whether the larger of two places holds more than half of the smaller."""
+    apart = np.abs([one.x - other.x, one.y - other.y])
+    if np.any(apart > np.array(one.size) + np.array(other.size)):
+        return False
+    smaller, larger = sorted((one.cells, other.cells), key=len)
+    distances, _ = cKDTree(larger).query(smaller)
+    return bool(np.mean(distances < 0.5) > 0.5)
 
 
 class _Events(NamedTuple):
@@ -188,11 +212,10 @@ def _told_apart(
         fits = (events.before <= at) & (events.after > at)
         before, stamp = int(events.before[fits].max()), int(events.after[fits].min())
         mine = (events.before < stamp + slack) & (events.after > before - slack)
-        if np.count_nonzero(mine) < options.least:
-            break
-        cells = courses.cells[np.unique(events.cell[mine])]
-        kind: Kind = "came" if events.came[0] else "left"
-        out.append(_change(kind, cells, resolution, before, stamp, stamp, 1))
+        if np.count_nonzero(mine) >= options.least:
+            cells = courses.cells[np.unique(events.cell[mine])]
+            kind: Kind = "came" if events.came[0] else "left"
+            out.append(_change(kind, cells, resolution, before, stamp, stamp, 1))
         events = events.of(np.flatnonzero(~mine))
     return out
 

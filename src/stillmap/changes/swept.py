@@ -86,10 +86,20 @@ class _Sector:
 
 def _sector(cells: Cells) -> _Sector | None:
     """The door, if it is one: cells along two lines from one of them, the hinge."""
-    best, most = None, _LEAF
+    if _breadth(cells) <= 2.0 * _BESIDE + 1.0:
+        return None  # straight: two leaves that point away from each other would look alike
+    best, most = None, (_LEAF, -math.inf)
     for hinge in cells[:: math.ceil(len(cells) / _HINGES)]:
         sector = _Sector(hinge, cells)
-        share = sector.at_its_ends(cells)
-        if _NARROW < sector.angle < _WIDE and share >= most and sector.fills_both(cells):
-            best, most = sector, share
+        # beside the hinge of a door that swings far, others explain as much with longer leaves
+        now = (sector.at_its_ends(cells), -sector.length)
+        if _NARROW < sector.angle < _WIDE and now > most and sector.fills_both(cells):
+            best, most = sector, now
     return best
+
+
+def _breadth(cells: Cells) -> float:
+    """Cells, across the direction in which they spread most."""
+    x, y = (cells - cells.mean(axis=0)).T
+    along = 0.5 * math.atan2(2.0 * float(np.sum(x * y)), float(np.sum(x * x - y * y)))
+    return float(np.ptp(y * math.cos(along) - x * math.sin(along)))

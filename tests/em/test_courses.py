@@ -1,0 +1,273 @@
+"""The last E-step: what came to stay, left, or comes and goes, and what the map shows of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_up import RESOLUTION, Ball, Wall, watch
+
+from stillmap import em
+from stillmap.changes import changed_places
+from stillmap.em import chunks
+from stillmap.em.courses import _as_wholes
+
+WALLS = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
+CAME, LEFT, STANDS, STOOD, PASSED = 3, 4, 5, 6, 7
+SECONDS = 200
+STATES = ("last", "majority")
+
+
+def courses(**changed):
+    """Four cells: static; came and shown; left; comes and goes."""
+    usual = {
+        "cells": np.array([[0, 0], [1, 0], [2, 0], [3, 0]]),
+        "p_static": np.array([0.9, 0.1, 0.2, 0.05], np.float32),
+        "p_changing": np.array([0.02, 0.8, 0.7, 0.9], np.float32),
+        "p_thing": np.array([0.5, 1.0, 0.0, 0.9], np.float32),
+        "occupied_share": np.array([1.0, 0.3, 0.6, 0.7], np.float32),
+        "count": np.array([0, 1, 1, 3], np.int32),
+        "between": np.full((4, 2, 2), -1, np.int32),
+    }
+    return em.Courses(**(usual | changed))
+
+
+def test_the_last_state():
+    # what comes and goes is not there, whatever was seen at last
+    shown = courses().shown("last")
+    np.testing.assert_allclose(shown, [0.91, 0.9, 0.2, 0.05], atol=1e-6)
+    assert shown.dtype == np.float32
+    twice = courses(count=np.array([0, 2, 2, 2], np.int32)).shown("last")
+    np.testing.assert_allclose(twice, [0.91, 0.9, 0.2, 0.05 + 0.9 * 0.9], atol=1e-6)
+
+
+def test_the_state_that_held_for_longest():
+    shown = courses().shown("majority")
+    np.testing.assert_allclose(shown, [0.92, 0.1, 0.9, 0.95], atol=1e-6)
+    half = courses(occupied_share=np.full(4, 0.5, np.float32)).shown("majority")
+    np.testing.assert_allclose(half, courses().p_static)
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_no_probability_exceeds_one(state):
+    p = np.full(4, 0.6, np.float32)
+    one = courses(p_static=p, p_changing=p, p_thing=np.ones(4, np.float32))
+    assert one.shown(state).max() == 1.0
+
+
+def row(p_changing, *, came=True, between=(10, 12), count=1, static=0.01, apart=1):
+    """Cells in a row that changed alike."""
+    n = len(p_changing)
+    return em.Courses(
+        cells=np.column_stack([apart * np.arange(n), np.zeros(n)]).astype(np.int64),
+        p_static=np.full(n, static, np.float32),
+        p_changing=np.array(p_changing, np.float32),
+        p_thing=np.full(n, 0.9 if came else 0.1, np.float32),
+        occupied_share=np.full(n, 0.5, np.float32),
+        count=np.full(n, count, np.int32),
+        between=np.tile(np.array([between, between], np.int32), (n, 1, 1)),
+    )
+
+
+def decided(courses):
+    return _as_wholes(courses).p_changing
+
+
+def same(courses):
+    return np.array_equal(decided(courses), courses.p_changing)
+
+
+THIRD = [*[0.9] * 5, 0.8, *[0.1] * 10]
+LESS = [*[0.9] * 5, *[0.1] * 11]
+
+
+def test_a_third_of_its_cells_decides_for_a_thing():
+    np.testing.assert_allclose(decided(row(THIRD)), 0.8)
+    np.testing.assert_allclose(decided(row(LESS)), 0.1)
+    np.testing.assert_allclose(decided(row([0.9, 0.8, 0.1, 0.1])), 0.8)
+    np.testing.assert_allclose(decided(row(THIRD, came=False)), 0.8)
+
+
+def test_what_is_not_one_thing_is_left_alone():
+    assert not same(row(THIRD))
+    assert same(row(THIRD[4:7]))  # too few cells
+    assert same(row(THIRD, apart=4))
+    assert not same(row(THIRD, apart=3))
+    assert same(row(THIRD, count=0))  # nothing changed
+    assert same(row(THIRD, count=3))  # it comes and goes
+    assert same(row(THIRD, static=0.5))
+    assert same(row([0.9, 0.9, 0.9, *[0.02] * 10]))  # most have no say
+
+
+def test_cells_that_came_beside_cells_that_left_are_another_thing():
+    one = row(THIRD)
+    p_thing = one.p_thing.copy()
+    p_thing[6:] = 0.1
+    np.testing.assert_allclose(decided(replace(one, p_thing=p_thing)), [0.9] * 6 + [0.1] * 10)
+
+
+@pytest.mark.parametrize(("looks", "apart"), [(5, False), (6, True)])
+def test_cells_that_changed_at_other_times_are_another_thing(looks, apart):
+    # 10 to 12, and `looks` later: within four looks it may have been the same
+    one = row(THIRD)
+    between = one.between.copy()
+    between[6:] += looks
+    expected = [0.9] * 6 + [0.1] * 10 if apart else 0.8
+    np.testing.assert_allclose(decided(replace(one, between=between)), expected)
+
+
+def test_nobody_becomes_more_than_certain():
+    one = row([0.99, 0.98, 0.1, 0.1], static=0.4)
+    np.testing.assert_allclose(decided(one), 0.6)
+
+
+def passing(since, x):
+    """Walks past along y, each second in another place."""
+    return [Ball(x, -2.4 + k, since + k, since + k + 1) for k in range(5)]
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """A box appears, one leaves and somebody walks over its place, one stands, one waits a bit."""
+    things = [
+        Ball(3.0, 1.5, 120, SECONDS, 0.5),
+        Ball(2.2, -1.4, 0, 140, 0.5),
+        Ball(3.2, 0.0, 0, SECONDS, 0.4),
+        Ball(1.5, 2.0, 20, 50, 0.3),
+    ]
+    return watch([*WALLS, *things, *passing(160, 2.0), *passing(180, 1.9)], SECONDS)
+
+
+def last_e_step(seen, state="last", threads=1, **options):
+    chosen = em.EmOptions(**options)
+    return em.last_e_step(seen.recording, seen.poses, RESOLUTION, chosen, state, threads)
+
+
+@pytest.fixture(scope="module")
+def last(seen):
+    return last_e_step(seen)
+
+
+@pytest.fixture(scope="module")
+def majority(seen):
+    return last_e_step(seen, "majority")
+
+
+def test_labels_say_what_the_last_map_shows(seen, last):
+    e = last[0].p_static
+    assert np.median(seen.of(e, CAME)) > 0.9
+    assert np.quantile(seen.of(e, LEFT), 0.95) < 0.1
+    assert np.quantile(seen.of(e, STANDS), 0.02) > 0.95
+    assert np.quantile(seen.of(e, *range(CAME)), 0.02) > 0.9
+    assert np.quantile(seen.of(e, STOOD), 0.95) < 0.1
+
+
+def test_labels_say_what_the_map_of_most_of_the_time_shows(seen, majority):
+    e = majority[0].p_static
+    assert np.quantile(seen.of(e, CAME), 0.9) < 0.1
+    assert np.median(seen.of(e, LEFT)) > 0.9
+    assert np.quantile(seen.of(e, STANDS), 0.02) > 0.95
+    assert np.quantile(seen.of(e, STOOD), 0.95) < 0.1
+
+
+def test_who_walks_over_the_place_it_left_leaves_no_trace(seen, last):
+    over = seen.of(last[0].p_static, *range(PASSED, PASSED + 10))
+    assert len(over) > 80
+    assert np.quantile(over, 0.95) < 0.1
+    _, found = last
+    changed = found.p_changing > 0.5
+    assert (found.count[changed] <= 1).all()  # and nothing came back
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_labels_follow_from_the_map(seen, last, majority, state):
+    expectations, found = last if state == "last" else majority
+    shown = {tuple(c): p for c, p in zip(found.cells.tolist(), found.shown(state), strict=True)}
+    hit = seen.recording.hit
+    ends = np.floor(seen.recording.points[hit].astype(float) / RESOLUTION).astype(int)
+    expected = np.array([shown[tuple(cell)] for cell in ends.tolist()], np.float32)
+    np.testing.assert_array_equal(expectations.p_static[hit], expected)
+    # and no cell is more occupied than what is shown of it
+    occupied = expectations.occupied
+    np.testing.assert_array_equal(occupied.cells, found.cells)
+    assert (occupied.p_occupied <= found.shown(state)).all()
+
+
+def test_both_maps_are_of_the_same_courses(last, majority):
+    for name in em.Courses.__dataclass_fields__:
+        one, other = getattr(last[1], name), getattr(majority[1], name)
+        np.testing.assert_array_equal(one, other)
+    assert last[0].likelihood == majority[0].likelihood
+    assert last[0].learned == majority[0].learned
+
+
+def test_every_probability_is_one(last, majority):
+    for expectations, found in (last, majority):
+        for p in (found.p_static, found.p_changing, found.p_thing, found.occupied_share):
+            assert p.dtype == np.float32
+            assert p.min() >= 0.0
+            assert p.max() <= 1.0
+        assert (found.p_static + found.p_changing).max() <= 1.0 + 1e-6
+        assert expectations.p_static.min() >= 0.0
+        assert expectations.p_static.max() <= 1.0
+        assert 0.0 < expectations.learned["changing"] < 1.0
+
+
+def test_when_it_was(seen, last):
+    found = changed_places(last[1], seen.recording, RESOLUTION, 0.5, em.ChangeOptions())
+    assert [one.kind for one in found] == ["came", "left"]
+    assert [(one.before_ns, one.stamp_ns) for one in found] == [
+        (119 * 10**9, 120 * 10**9),
+        (139 * 10**9, 140 * 10**9),
+    ]
+    # the side towards the sensor
+    assert (found[0].x, found[0].y) == pytest.approx((2.67, 1.31), abs=0.1)
+    assert (found[1].x, found[1].y) == pytest.approx((1.87, -1.16), abs=0.1)
+
+
+def test_how_much_of_the_time_it_was_there(last):
+    _, found = last
+    share = found.occupied_share[(found.p_changing > 0.5) & (found.p_thing > 0.5)]
+    assert np.median(share) == pytest.approx(80 / SECONDS, abs=0.01)
+    share = found.occupied_share[(found.p_changing > 0.5) & (found.p_thing < 0.5)]
+    assert np.median(share) == pytest.approx(140 / SECONDS, abs=0.03)
+
+
+def test_what_comes_and_goes_again_and_again():
+    times = [(t, t + 25) for t in range(0, 300, 50)]
+    gate = [Ball(2.2, 0.3, *time, 0.5) for time in times]
+    watched = watch([*WALLS, *gate, *passing(35, 1.2)], 300)
+    expectations, found = last_e_step(watched)
+    assert np.median(watched.of(expectations.p_static, *range(3, 3 + len(gate)))) < 0.1
+    (one,) = changed_places(found, watched.recording, RESOLUTION, 0.5, em.ChangeOptions())
+    assert one.kind == "comes and goes"
+    assert one.times == 11
+    assert (one.stamp_ns, one.last_ns) == (25 * 10**9, 275 * 10**9)
+
+
+@pytest.mark.parametrize("changed", [{"passing_seconds": 60.0}, {"stays": 0.2}, {"longest": 30.0}])
+def test_options_reach_it(seen, last, changed):
+    other, _ = last_e_step(seen, changes=em.ChangeOptions(**changed))
+    assert other.p_static.tobytes() != last[0].p_static.tobytes()
+
+
+@pytest.mark.parametrize("beams", [1000, 5000])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_pieces_and_threads_change_no_bit(seen, last, monkeypatch, beams, threads):
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
+    expectations, found = last_e_step(seen, threads=threads)
+    assert expectations.p_static.tobytes() == last[0].p_static.tobytes()
+    assert found.between.tobytes() == last[1].between.tobytes()
+
+
+@pytest.mark.parametrize("scans", [1, 2])
+def test_so_short_a_recording_shows_no_change(scans):
+    watched = watch([*WALLS, Ball(2.2, 0.3, 0, 9, 0.5)], scans)
+    expectations, found = last_e_step(watched)
+    assert changed_places(found, watched.recording, RESOLUTION, 0.5, em.ChangeOptions()) == []
+    assert np.isfinite(expectations.p_static).all()
+
+
+def test_nothing_hit():
+    expectations, found = last_e_step(watch([], 10), prior=0.8)
+    assert len(found.cells) == len(found.shown("last")) == 0
+    assert np.isfinite(expectations.p_static).all()
