@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core, em, pipeline, slam
-from stillmap.changes import Change, changed_places, without_changes
+from stillmap.changes import Change, changed_places, relabelled, without_changes
 from stillmap.objects import MovingObject, Traffic, moving_objects, traffic
 from stillmap.output.crops import Snapshot, Window, choose_window, snapshot
 from stillmap.output.points import dynamic_points
@@ -249,18 +249,17 @@ class _Run:
     def _settle(self, recording: Recording, threads: int) -> list[Change]:
         """The last E-step: labels of the map as it is shown, and the places that changed."""
         kept, options, cell = self.kept, self.options.em, self.options.slam.resolution
-        if self.options.estimator != "stillmap" or not options.changes.enabled:
-            return []
+        if kept.occupied is None or kept.no_return is None or not options.changes.enabled:
+            return []  # other estimators know of no courses
         state = self.options.output.map_state
         found, courses = em.last_e_step(recording, kept.poses, cell, options, state, threads)
-        self.best = dataclasses.replace(
-            kept,
-            p_static=found.p_static,
-            occupied=found.occupied,
-            learned=found.learned,
-            no_return=found.no_return,
+        changes = changed_places(courses, recording, cell, options.dwell.look, options.changes)
+        p_static, occupied = relabelled(
+            recording, kept.poses, kept.p_static, kept.occupied, found, courses, changes, threads
         )
-        return changed_places(courses, recording, cell, options.dwell.look, options.changes)
+        learned = {**kept.learned, "changing": found.learned["changing"]}
+        self.best = dataclasses.replace(kept, p_static=p_static, occupied=occupied, learned=learned)
+        return changes
 
     def _map(self, recording: Recording, threads: int) -> em.OccupancyMap:
         """The printed labels follow from the sums they were made from, others make the sums."""

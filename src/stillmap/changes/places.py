@@ -18,6 +18,7 @@ Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 Kind = Literal["came", "left", "comes and goes"]
 
+_NOISE = 2.0  # cells
 _SURE = 0.5  # probability above which a cell counts as one that changed
 
 
@@ -30,6 +31,7 @@ class Change:
         x, y: metres, the middle of its cells in the map frame.
         size: metres, along x and y.
         cells: (K, 2) int64, those that changed.
+        resolution: metres, of a cell.
         before_ns: stamp of the last scan that saw it as it was.
         stamp_ns: of the first that saw it otherwise: the change lies between these two. For what
             comes and goes, of the first change that was seen.
@@ -42,6 +44,7 @@ class Change:
     y: float
     size: tuple[float, float]
     cells: NDArray[np.int64]
+    resolution: float
     before_ns: int
     stamp_ns: int
     last_ns: int
@@ -49,8 +52,10 @@ class Change:
 
     @property
     def swept(self) -> NDArray[np.int64]:
-        """(S, 2) cells of the whole place; of what comes and goes also those between its ends."""
-        return swept_cells(self.cells) if self.kind == "comes and goes" else self.cells
+        """(S, 2) cells of the whole place: of a door all that it sweeps."""
+        if self.kind != "comes and goes":
+            return self.cells
+        return swept_cells(self.cells, self.resolution)
 
     @property
     def appeared(self) -> bool:
@@ -67,7 +72,8 @@ def without_changes(
 ) -> NDArray[np.float32]:
     """(M,) p_static, but one for beams on what stood in a place while it stood there.
 
-    It is listed as a change, and no object on its way.
+    It is listed as a change, and no object on its way. What comes and goes may be people who wait
+    there, unless it is a door.
     """
     beam = np.flatnonzero(recording.hit & (p_static < 0.5))
     if not changes or not len(beam):
@@ -78,6 +84,8 @@ def without_changes(
     at, stamp = np.floor(ends / resolution).astype(np.int64), recording.stamp_ns[scan]
     stood = np.zeros(len(beam), bool)
     for change in changes:
+        if change.kind == "comes and goes" and len(change.swept) == len(change.cells):
+            continue
         since, until = _stood(change, changes)
         during = (stamp > since) & (stamp <= until)
         low, high = change.cells.min(axis=0) - 1, change.cells.max(axis=0) + 2
@@ -153,8 +161,22 @@ def changed_places(
     for group in _groups(events, courses, resolution, options):
         out += _told_apart(group, courses, resolution, options)
     out += _coming_and_going(courses, changed[often], stamps, resolution, options)
-    out = _merged(out, resolution, options.near / resolution)
+    out = _without_noise(_merged(out, resolution, options.near / resolution), courses, options)
     return sorted(out, key=lambda change: (change.stamp_ns, change.x, change.y))
+
+
+def _without_noise(changes: list[Change], courses: Courses, options: ChangeOptions) -> list[Change]:
+    """The places that are more than noise: that of poses and ranges moves surfaces to and fro."""
+    stays = courses.cells[courses.p_static > _SURE]
+    if not len(stays):
+        return changes
+    tree = cKDTree(stays)
+    out = []
+    for one in changes:
+        distance, _ = tree.query(one.cells, distance_upper_bound=_NOISE + 1.0)
+        if np.count_nonzero(distance > _NOISE) >= options.least:
+            out.append(one)
+    return out
 
 
 class _Stamps:
@@ -296,4 +318,4 @@ def _change(
     low, high = cells.min(axis=0) * resolution, (cells.max(axis=0) + 1) * resolution
     x, y = ((cells.mean(axis=0) + 0.5) * resolution).tolist()
     width, height = (high - low).tolist()
-    return Change(kind, x, y, (width, height), cells, before, stamp, last, times)
+    return Change(kind, x, y, (width, height), cells, resolution, before, stamp, last, times)

@@ -1,10 +1,9 @@
-"""The area that something takes which is seen now here, now there: a door's, above all."""
+"""The area that a door takes."""
 
 import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay, QhullError
 
 Cells = NDArray[np.int64]
 Float = NDArray[np.float64]
@@ -12,25 +11,20 @@ Float = NDArray[np.float64]
 _BESIDE = 2.0  # cells beside an end of its way at which a leaf may be seen
 _LEAF = 0.8  # share of the cells that must lie at the ends of its way
 _HINGES = 400  # cells at most that are tried
+_SHORTEST, _LONGEST = 0.4, 2.0  # m, of leaves
 _NARROW, _WIDE = math.radians(20.0), math.radians(200.0)  # how far doors swing
 _FROM_HINGE = 0.5  # of the leaf: nearer to the hinge, directions say little
 
 
-def swept_cells(cells: Cells) -> Cells:
-    """(S, 2) these cells (K, 2) and what lies between: a door's sector, else the convex hull."""
-    low, high = cells.min(axis=0), cells.max(axis=0)
-    try:
-        hull = Delaunay(cells.astype(np.float64))
-    except QhullError:  # all in one line
-        return cells
+def swept_cells(cells: Cells, resolution: float) -> Cells:
+    """(S, 2) these cells (K, 2) and, if a door is seen there open and shut, all that it sweeps."""
     sector = _sector(cells)
-    reach = math.ceil(sector.length) if sector else 0
-    columns, rows = (np.arange(low[d] - reach, high[d] + reach + 1) for d in (0, 1))
-    around = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1).reshape(-1, 2)
-    inside = hull.find_simplex(around.astype(np.float64)) >= 0
-    if sector:
-        inside |= sector.holds(around)
-    return np.unique(np.concatenate([cells, around[inside]]), axis=0)
+    if sector is None or not _SHORTEST <= sector.length * resolution <= _LONGEST:
+        return cells
+    reach = math.ceil(sector.length)
+    square = np.arange(-reach, reach + 1)
+    around = sector.hinge + np.stack(np.meshgrid(square, square), axis=-1).reshape(-1, 2)
+    return np.unique(np.concatenate([cells, around[sector.holds(around)]]), axis=0)
 
 
 class _Sector:

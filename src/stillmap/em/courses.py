@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.em.dwell import Classes, Dwell, Float, Looks, expectations, looked_at
+from stillmap.em.dwell import Classes, Dwell, Float, Looks, Surface, expectations, looked_at
 from stillmap.em.expectations import Expectations
 from stillmap.em.mixture import fit_shares, posterior_static
 from stillmap.em.options import ChangeOptions, EmOptions
@@ -32,6 +32,7 @@ class Courses:
     """What became of E cells in which beams ended, each by its most probable course.
 
     Attributes:
+        surface: the cells as elements of surface.
         cells: (E, D) int64.
         p_static: (E,) float32, probability that what is there never left.
         p_changing: (E,) float32, that things came to stay, left, or come and go.
@@ -43,6 +44,7 @@ class Courses:
             -1: there was none.
     """
 
+    surface: Surface
     cells: NDArray[np.int64]
     p_static: NDArray[np.float32]
     p_changing: NDArray[np.float32]
@@ -71,8 +73,7 @@ def last_e_step(
 ) -> tuple[Expectations, Courses]:
     """The E-step once more, with one more class: what came to stay or left.
 
-    A beam's p_static is the probability that the map in this state shows what it met, so labels
-    follow from the map.
+    A beam's p_static is the probability that the map in this state shows what it met.
 
     Args: see `dwell.e_step`; `state` says which state of places that changed is the map's.
     """
@@ -93,6 +94,7 @@ def last_e_step(
     of = (goes > stays).astype(np.intp)  # what comes and goes does not stay long enough for a thing
     each = np.arange(len(of))
     courses = Courses(
+        surface=looks.surface,
         cells=looks.surface.elements()[0],
         p_static=posterior_static(looks.likelihood, shares.classes, n),
         p_changing=(stays + goes) / np.einsum("kc,c->k", looks.likelihood, weights),

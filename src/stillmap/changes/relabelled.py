@@ -1,0 +1,58 @@
+"""Labels and map where a place is known to have changed; elsewhere they stay what they were."""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import em
+from stillmap.changes.places import Change
+from stillmap.em.chunks import chunks
+from stillmap.recording.model import Recording
+
+Float = NDArray[np.float64]
+Labels = NDArray[np.float32]
+
+
+def relabelled(
+    recording: Recording,
+    poses: Float,
+    p_static: Labels,
+    occupied: em.CellProbabilities,
+    found: em.Expectations,
+    courses: em.Courses,
+    changes: list[Change],
+    threads: int = 1,
+) -> tuple[Labels, em.CellProbabilities]:
+    """(M,) labels and the cells of the map: in the cells of the changes those that were found.
+
+    Few cells change. In all others the last E-step says what the loop said, but for noise, and
+    what looks like a change without being listed as one is noise, too.
+
+    Args:
+        recording: M beams.
+        poses: (T, 3, 3) T_map_base.
+        p_static, occupied: what the loop ended with.
+        found, courses: from the last E-step at the same poses.
+        changes: from `changed_places`.
+        threads: same result with any number.
+    """
+    if not changes or found.occupied is None:
+        return p_static, occupied
+    listed = np.isin(_keys(courses.cells), _keys(np.concatenate([one.cells for one in changes])))
+    if not np.array_equal(occupied.cells, found.occupied.cells):
+        raise ValueError("occupied: expected the cells of the last E-step")
+    out, T_map_sensor = p_static.copy(), recording.T_map_sensor(poses)
+    for scans, beams, offset in chunks(recording):
+        element = courses.surface.elements_of(
+            recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans], threads
+        )
+        inside = (element >= 0) & listed[element]
+        out[beams][inside] = found.p_static[beams][inside]
+    p_occupied = np.where(listed, found.occupied.p_occupied, occupied.p_occupied)
+    return out, dataclasses.replace(occupied, p_occupied=p_occupied)
+
+
+def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N,) one number for each cell (N, 2); map coordinates stay far below 2 ** 31 cells."""
+    return np.asarray((cells[:, 0] << 32) + cells[:, 1], np.int64)
