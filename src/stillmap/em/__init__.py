@@ -6,6 +6,7 @@ from stillmap.em.estimator import (
     add_recording,
     changed_share,
     e_step,
+    fixed_iterations,
     initial_expectations,
     iterations,
 )
@@ -29,6 +30,7 @@ __all__ = [
     "add_recording",
     "changed_share",
     "e_step",
+    "fixed_iterations",
     "held_out_log_likelihood",
     "initial_expectations",
     "iterations",

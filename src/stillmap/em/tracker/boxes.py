@@ -1,0 +1,41 @@
+"""The beams that end in the boxes around people."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.em.tracker.features import features
+from stillmap.em.tracker.options import TrackerOptions
+from stillmap.em.tracker.tracks import Places, people
+from stillmap.recording.model import Recording
+
+Float = NDArray[np.float64]
+
+
+def on_people(recording: Recording, poses: Float, options: TrackerOptions) -> NDArray[np.bool_]:
+    """(M,) which hits lie in the box of somebody who is tracked.
+
+    Args:
+        recording: 2D.
+        poses: (T, 3, 3) T_map_base.
+        options: see TrackerOptions.
+    """
+    T_map_sensor = recording.T_map_sensor(poses)
+    seconds = np.asarray(1e-9 * (recording.stamp_ns - recording.stamp_ns[:1]), np.float64)
+    somebody = people(features(recording, T_map_sensor, options), seconds, options)
+    return in_boxes(recording, T_map_sensor, somebody, options)
+
+
+def in_boxes(
+    recording: Recording, T_map_sensor: Float, somebody: Places, options: TrackerOptions
+) -> NDArray[np.bool_]:
+    """(M,) which hits lie in boxes, along the axes of the map, around where somebody was."""
+    inside = np.zeros(recording.n_beams, bool)
+    half = options.box + options.box_sigmas * somebody.sigma
+    scans, first = np.unique(somebody.scan, return_index=True)
+    for t, begin, end in zip(scans, first, np.append(first[1:], len(half)), strict=True):
+        beams = recording.beams_of(t)
+        T = T_map_sensor[t]
+        xy = (T[:2, :2] * recording.points[beams][:, None]).sum(axis=-1) + T[:2, 2]
+        away = np.abs(xy[:, None] - somebody.xy[begin:end]).max(axis=-1)
+        inside[beams] = (away <= half[begin:end]).any(axis=1)
+    return inside & recording.hit
