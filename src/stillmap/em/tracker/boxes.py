@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.em.tracker.changes import changed
 from stillmap.em.tracker.features import features
 from stillmap.em.tracker.options import TrackerOptions
 from stillmap.em.tracker.tracks import Places, people
@@ -21,7 +22,9 @@ def on_people(recording: Recording, poses: Float, options: TrackerOptions) -> ND
     """
     T_map_sensor = recording.T_map_sensor(poses)
     seconds = np.asarray(1e-9 * (recording.stamp_ns - recording.stamp_ns[:1]), np.float64)
-    somebody = people(features(recording, T_map_sensor, options), seconds, options)
+    found = features(recording, T_map_sensor, options)
+    moving = changed(recording, T_map_sensor, found, options.look, options.jump)
+    somebody = people(found, moving, seconds, options)
     return in_boxes(recording, T_map_sensor, somebody, options)
 
 

@@ -55,13 +55,18 @@ def features(recording: Recording, T_map_sensor: Float, options: TrackerOptions)
 _FIELDS = ("scan", "xy", "width")
 
 
+def ranges(points: Float, hit: NDArray[np.bool_]) -> Float:
+    """(N,) metres to end points (N, 2); what met nothing is farther away than anything."""
+    return np.where(hit, np.hypot(*points.T), _NOTHING)
+
+
 def _of_chunk(recording: Recording, chunk: Chunk, options: TrackerOptions) -> Features:
     """The features of some scans, still in the frame of the sensor."""
     scan = np.repeat(np.arange(chunk.scans.start, chunk.scans.stop), np.diff(chunk.offset))
     points = recording.points[chunk.beams].astype(np.float64)
     usable = np.isfinite(points).all(axis=1)
     scan, points, hit = scan[usable], points[usable], recording.hit[chunk.beams][usable]
-    r = np.where(hit, np.hypot(*points.T), _NOTHING)
+    r = ranges(points, hit)
     first, last = _segments(scan, r, options.jump)
     inner = (first > 0) & (last < len(r) - 1) & hit[first]
     first, last = first[inner], last[inner]

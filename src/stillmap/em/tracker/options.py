@@ -20,6 +20,10 @@ class TrackerOptions:
     clutter: float = field_with_doc(0.05, "features per m2 that are of nobody tracked")
     lost: float = field_with_doc(1.0, "s without a feature after which a track ends")
     moved: float = field_with_doc(0.5, "m from where it began: such a track is a person's")
+    look: float = field_with_doc(1.0, "s between scans in which a person has left its place")
+    changed: float = field_with_doc(
+        0.3, "share of a person's features at least that stand where shortly there was nothing"
+    )
     least: int = field_with_doc(4, "scans with a feature that a person's track has at least")
     box: float = field_with_doc(0.4, "m to each side of a person, in which beams are dropped")
     box_sigmas: float = field_with_doc(1.0, "standard deviations of the place in addition")
@@ -42,6 +46,8 @@ _LIMITS = (
     ("clutter", 1e-9, 1e3),
     ("lost", 0.0, 1e6),
     ("moved", 0.0, 1000.0),
+    ("look", 0.0, 1e6),
+    ("changed", 0.0, 1.0),
     ("least", 1, 1_000_000),
     ("box", 0.0, 100.0),
     ("box_sigmas", 0.0, 100.0),

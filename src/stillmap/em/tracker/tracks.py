@@ -1,6 +1,6 @@
 """Tracks of whatever looks like a person, from one scan to the next."""
 
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,13 @@ from stillmap.objects.kalman import Motion
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 _SEEN = 0.5  # probability that one of the features was its own
+_CHANGED = 0.25  # the same of features that changed: of two legs, one stands
 
 
-@dataclass(frozen=True, eq=False)
-class Places:
+class Places(NamedTuple):
     """Where tracks were, in the order of the scans; L entries.
 
     Attributes:
@@ -27,39 +28,51 @@ class Places:
         xy: (L, 2) metres in the map frame.
         sigma: (L,) standard deviation of that on either axis, metres.
         seen: (L,) whether the scan showed it.
+        changed: (L,) whether it showed it where shortly there was nothing.
     """
 
     track: Index
     scan: Index
     xy: Float
     sigma: Float
-    seen: NDArray[np.bool_]
+    seen: Mask
+    changed: Mask
 
-    def of(self, chosen: NDArray[np.bool_]) -> "Places":
+    def of(self, chosen: Mask) -> "Places":
         """Some of them."""
-        return Places(*(getattr(self, name)[chosen] for name in _FIELDS))
+        c = chosen
+        rest = self.sigma[c], self.seen[c], self.changed[c]
+        return Places(self.track[c], self.scan[c], self.xy[c], *rest)
 
 
-_FIELDS = ("track", "scan", "xy", "sigma", "seen")
+class _Alive(NamedTuple):
+    """K tracks that go on.
 
-
-@dataclass(frozen=True, eq=False)
-class _Alive:
-    """K tracks that go on, with their numbers and the time in s when each was last seen."""
+    Attributes:
+        motion: where they are.
+        track: (K,) their numbers.
+        last: (K,) when each was last seen, seconds.
+        seen, changed: (K,) of the present scan, see Places.
+    """
 
     motion: Motion
     track: Index
     last: Float
+    seen: Mask
+    changed: Mask
 
-    def of(self, chosen: NDArray[np.bool_]) -> "_Alive":
-        return _Alive(self.motion.of(chosen), self.track[chosen], self.last[chosen])
+    def of(self, chosen: Mask) -> "_Alive":
+        motion, track, last, seen, changed = self
+        rest = track[chosen], last[chosen], seen[chosen], changed[chosen]
+        return _Alive(motion.of(chosen), *rest)
 
 
-def people(found: Features, seconds: Float, options: TrackerOptions) -> Places:
+def people(found: Features, changed: Mask, seconds: Float, options: TrackerOptions) -> Places:
     """The tracks that turned out to be of people, over all of their life.
 
     Args:
-        found: features in the map frame.
+        found: F features in the map frame.
+        changed: (F,) which of them stand where shortly there was nothing.
         seconds: (T,) when each scan was taken, not falling.
         options: see TrackerOptions.
 
@@ -67,68 +80,67 @@ def people(found: Features, seconds: Float, options: TrackerOptions) -> Places:
     an online filter drops only from then on is dropped from the start. A track ends where it was
     last seen.
     """
-    places = _followed(found, seconds, options)
+    places = _followed(found, changed, seconds, options)
     n = int(places.track.max(initial=-1)) + 1
-    start, way = np.zeros((n, 2)), np.zeros(n)
+    start, way, last = np.zeros((n, 2)), np.zeros(n), np.full(n, -1)
     start[places.track[::-1]] = places.xy[::-1]  # the first of each wins
     at = places.of(places.seen)
     np.maximum.at(way, at.track, np.hypot(*(at.xy - start[at.track]).T))
-    last = np.full(n, -1)
     np.maximum.at(last, at.track, at.scan)
-    person = (way >= options.moved) & (np.bincount(at.track, minlength=n) >= options.least)
+    scans = np.bincount(at.track, minlength=n)
+    moving = np.bincount(at.track, at.changed, n) >= options.changed * scans
+    person = (way >= options.moved) & (scans >= options.least) & moving
     return places.of(person[places.track] & (places.scan <= last[places.track]))
 
 
-def _followed(found: Features, seconds: Float, options: TrackerOptions) -> Places:
+def _followed(found: Features, changed: Mask, seconds: Float, options: TrackerOptions) -> Places:
     """All tracks, whatever they are of."""
-    nobody = np.zeros(0)
-    alive = _Alive(kalman.still(np.zeros((0, 2)), 1.0, 1.0), nobody.astype(np.intp), nobody)
     of_scan = np.searchsorted(found.scan, np.arange(len(seconds) + 1))
-    born, out = 0, []
-    for t, now in enumerate(seconds):
-        at = found.xy[of_scan[t] : of_scan[t + 1]]
-        alive, seen = _stepped(alive, at, seconds[t - 1] if t else now, now, options)
-        born_here = at[~seen.of_tracks]
-        alive = _joined(alive, born_here, born, now, options)
-        born += len(born_here)
-        if len(alive.track):
-            seen_now = np.append(seen.tracks, np.ones(len(born_here), bool))
-            scan = np.full(len(alive.track), t)
-            out.append(Places(alive.track, scan, alive.motion.x, alive.motion.sigma, seen_now))
-    if not out:
-        whole = np.zeros(0, np.intp)
-        return Places(whole, whole, np.zeros((0, 2)), nobody, np.zeros(0, bool))
-    return Places(*(np.concatenate([getattr(p, name) for p in out]) for name in _FIELDS))
+    alive = _new(np.zeros((0, 2)), np.zeros(0, bool), 0, 0.0, options)
+    born, before = 0, 0.0
+    out = [_places(alive, 0)]
+    for t, now in enumerate(seconds.tolist()):
+        here = slice(of_scan[t], of_scan[t + 1])
+        at, moving = found.xy[here], changed[here]
+        alive = alive.of(now - alive.last <= options.lost)
+        motion = kalman.predicted(alive.motion, now - before, options.acceleration)
+        others = ~pda.gated(motion, at, options).any(axis=0)
+        new = _new(at[others], moving[others], born, now, options)
+        alive = _joined(_seen(alive, motion, at, moving, now, options), new)
+        born, before = born + len(new.track), now
+        out.append(_places(alive, t))
+    return Places(*(np.concatenate(parts) for parts in zip(*out, strict=True)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """Which tracks (K,) a scan shows, and which features (F,) lie in the gate of any."""
-
-    tracks: NDArray[np.bool_]
-    of_tracks: NDArray[np.bool_]
-
-
-def _stepped(
-    alive: _Alive, at: Float, before: float, now: float, options: TrackerOptions
-) -> tuple[_Alive, _Seen]:
-    """Tracks after the features (F, 2) of a scan, without those that nobody has seen for long."""
-    alive = alive.of(now - alive.last <= options.lost)
-    motion = kalman.predicted(alive.motion, now - before, options.acceleration)
+def _seen(
+    alive: _Alive, motion: Motion, at: Float, changed: Mask, now: float, options: TrackerOptions
+) -> _Alive:
+    """Tracks as predicted, after the features (F, 2) of a scan."""
     beta = pda.weights(motion, at, options)
     seen = beta.sum(axis=1) >= _SEEN
-    after = pda.updated(motion, at, beta, options.sigma)
-    of_tracks = np.asarray(pda.gated(motion, at, options).any(axis=0))
-    last = np.where(seen, now, alive.last)
-    return replace(alive, motion=after, last=last), _Seen(seen, of_tracks)
-
-
-def _joined(alive: _Alive, at: Float, born: int, now: float, options: TrackerOptions) -> _Alive:
-    """With a new track at each (N, 2), numbered from `born`."""
-    new = kalman.still(at, options.sigma, options.sigma_speed)
-    numbers = born + np.arange(len(at))
     return _Alive(
-        kalman.joined(alive.motion, new),
-        np.append(alive.track, numbers),
-        np.append(alive.last, np.full(len(at), now)),
+        pda.updated(motion, at, beta, options.sigma),
+        alive.track,
+        np.where(seen, now, alive.last),
+        seen,
+        (beta * changed).sum(axis=1) >= _CHANGED,
     )
+
+
+def _new(at: Float, changed: Mask, born: int, now: float, options: TrackerOptions) -> _Alive:
+    """A track at each (N, 2), numbered from `born`."""
+    n = len(at)
+    motion = kalman.still(at, options.sigma, options.sigma_speed)
+    return _Alive(motion, born + np.arange(n), np.full(n, now), np.ones(n, bool), changed)
+
+
+def _joined(a: _Alive, b: _Alive) -> _Alive:
+    """The tracks of both."""
+    rest = (np.concatenate([p, q]) for p, q in zip(a[1:], b[1:], strict=True))
+    return _Alive(kalman.joined(a.motion, b.motion), *rest)
+
+
+def _places(alive: _Alive, scan: int) -> Places:
+    x, sigma = alive.motion.x, alive.motion.sigma
+    scans = np.full(len(x), scan)
+    return Places(alive.track, scans, x, sigma, alive.seen, alive.changed)
