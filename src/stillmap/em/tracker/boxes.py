@@ -25,20 +25,20 @@ def on_people(recording: Recording, poses: Float, options: TrackerOptions) -> ND
     found = features(recording, T_map_sensor, options)
     moving = changed(recording, T_map_sensor, found, options.look, options.jump)
     somebody = people(found, moving, seconds, options)
-    return in_boxes(recording, T_map_sensor, somebody, options)
+    return in_boxes(recording, T_map_sensor, somebody, options.box)
 
 
 def in_boxes(
-    recording: Recording, T_map_sensor: Float, somebody: Places, options: TrackerOptions
+    recording: Recording, T_map_sensor: Float, somebody: Places, half: float
 ) -> NDArray[np.bool_]:
-    """(M,) which hits lie in boxes, along the axes of the map, around where somebody was."""
+    """(M,) which hits lie in boxes, along the axes of the map, `half` m to each side of people."""
     inside = np.zeros(recording.n_beams, bool)
-    half = options.box + options.box_sigmas * somebody.sigma
     scans, first = np.unique(somebody.scan, return_index=True)
-    for t, begin, end in zip(scans, first, np.append(first[1:], len(half)), strict=True):
+    bounds = np.append(first, len(somebody.scan))
+    for t, begin, end in zip(scans, bounds, bounds[1:], strict=False):
         beams = recording.beams_of(t)
         T = T_map_sensor[t]
         xy = (T[:2, :2] * recording.points[beams][:, None]).sum(axis=-1) + T[:2, 2]
         away = np.abs(xy[:, None] - somebody.xy[begin:end]).max(axis=-1)
-        inside[beams] = (away <= half[begin:end]).any(axis=1)
+        inside[beams] = (away <= half).any(axis=1)
     return inside & recording.hit

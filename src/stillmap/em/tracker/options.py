@@ -11,22 +11,21 @@ class TrackerOptions:
 
     jump: float = field_with_doc(0.3, "m of range between neighbouring beams: a feature's edge")
     narrowest: float = field_with_doc(0.05, "m, width of a leg at least")
-    widest: float = field_with_doc(0.8, "m, width of a body at most")
-    sigma: float = field_with_doc(0.15, "m, a feature beside the middle of its person: legs swing")
+    widest: float = field_with_doc(0.65, "m, width of a body at most")
+    sigma: float = field_with_doc(0.1, "m, a feature beside the middle of its person: legs swing")
     sigma_speed: float = field_with_doc(1.0, "m/s, how fast people are when first seen")
-    acceleration: float = field_with_doc(1.0, "m2/s3, density of random acceleration")
-    gate: float = field_with_doc(3.0, "standard deviations within which features may be a person's")
+    acceleration: float = field_with_doc(0.5, "m2/s3, density of random acceleration")
+    gate: float = field_with_doc(2.5, "standard deviations within which features may be a person's")
     detection: float = field_with_doc(0.9, "probability that a person in sight shows a feature")
     clutter: float = field_with_doc(0.05, "features per m2 that are of nobody tracked")
     lost: float = field_with_doc(1.0, "s without a feature after which a track ends")
     moved: float = field_with_doc(0.5, "m from where it began: such a track is a person's")
-    look: float = field_with_doc(1.0, "s between scans in which a person has left its place")
+    look: float = field_with_doc(2.0, "s between scans in which a person has left its place")
     changed: float = field_with_doc(
-        0.3, "share of a person's features at least that stand where shortly there was nothing"
+        0.2, "share of a person's features at least that stand where shortly there was nothing"
     )
     least: int = field_with_doc(4, "scans with a feature that a person's track has at least")
     box: float = field_with_doc(0.4, "m to each side of a person, in which beams are dropped")
-    box_sigmas: float = field_with_doc(1.0, "standard deviations of the place in addition")
 
     def __post_init__(self) -> None:
         for name, low, high in _LIMITS:
@@ -50,5 +49,4 @@ _LIMITS = (
     ("changed", 0.0, 1.0),
     ("least", 1, 1_000_000),
     ("box", 0.0, 100.0),
-    ("box_sigmas", 0.0, 100.0),
 )

@@ -26,7 +26,6 @@ class Places(NamedTuple):
         track: (L,) numbers from 0.
         scan: (L,) when.
         xy: (L, 2) metres in the map frame.
-        sigma: (L,) standard deviation of that on either axis, metres.
         seen: (L,) whether the scan showed it.
         changed: (L,) whether it showed it where shortly there was nothing.
     """
@@ -34,15 +33,13 @@ class Places(NamedTuple):
     track: Index
     scan: Index
     xy: Float
-    sigma: Float
     seen: Mask
     changed: Mask
 
     def of(self, chosen: Mask) -> "Places":
         """Some of them."""
         c = chosen
-        rest = self.sigma[c], self.seen[c], self.changed[c]
-        return Places(self.track[c], self.scan[c], self.xy[c], *rest)
+        return Places(self.track[c], self.scan[c], self.xy[c], self.seen[c], self.changed[c])
 
 
 class _Alive(NamedTuple):
@@ -141,6 +138,5 @@ def _joined(a: _Alive, b: _Alive) -> _Alive:
 
 
 def _places(alive: _Alive, scan: int) -> Places:
-    x, sigma = alive.motion.x, alive.motion.sigma
-    scans = np.full(len(x), scan)
-    return Places(alive.track, scans, x, sigma, alive.seen, alive.changed)
+    scans = np.full(len(alive.track), scan)
+    return Places(alive.track, scans, alive.motion.x, alive.seen, alive.changed)
