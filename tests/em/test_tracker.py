@@ -8,8 +8,9 @@ from made_up_scans import before, crossing, poses, recording, wall
 
 from stillmap import _core, em
 from stillmap.em.tracker import TrackerOptions, on_people
+from stillmap.em.tracker.boxes import in_boxes
 from stillmap.em.tracker.features import features
-from stillmap.em.tracker.tracks import people
+from stillmap.em.tracker.tracks import Places, people
 
 OPTIONS = TrackerOptions()
 TIMES = np.arange(0.0, 3.4, 0.2)
@@ -62,6 +63,15 @@ def test_the_box_is_an_option():
         shares.append((off[on].mean(), off[~on].mean()))
     assert shares[0][0] < shares[1][0]
     assert shares[1][1] < shares[2][1]
+
+
+def test_only_hits_are_dropped():
+    ranges = np.full((1, 181), np.inf)
+    ranges[0, 90] = 20.0  # as far as the others, which end in the box with nothing
+    r = recording(ranges)
+    one = np.ones(1, bool)
+    somebody = Places(np.zeros(1, int), np.zeros(1, int), np.array([[20.0, 0.0]]), one, one)
+    assert in_boxes(r, poses(r), somebody, 1.0).nonzero()[0].tolist() == [90]
 
 
 def test_a_track_goes_on_while_somebody_is_hidden_and_ends_where_he_was_last_seen():

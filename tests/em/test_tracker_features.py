@@ -65,9 +65,11 @@ def test_what_a_scan_begins_or_ends_with_is_none():
     ranges = wall()
     ranges[:3] = ranges[-3:] = 2.0
     assert len(found(ranges).scan) == 0
-    assert len(found([ranges, ranges]).scan) == 0  # nor has it neighbours in the next scan
-    inside = wall()
-    inside[1:4] = 2.0
+    begins, ends = np.full((2, 11), 6.0)  # so few that either end of it is near the other
+    begins[:2] = ends[-2:] = 3.0
+    for scans in ([ends, begins], [begins, ends], [ends, ends], [begins, begins]):
+        assert len(found(scans).scan) == 0  # nor has it neighbours in the next scan
+    inside = np.roll(begins, 1)
     assert len(found(inside).scan) == 1
 
 
@@ -99,6 +101,31 @@ def test_a_place_that_was_seen_through(way):
     np.testing.assert_array_equal(moved, mover)
     assert not changed(r, poses(r), seen, 5.0, 0.3).any()  # no scan is so far away in time
     assert not changed(r, poses(r), seen, 1.0, 4.0).any()  # the wall is not so far behind
+
+
+def test_before_or_after_is_enough():
+    gone, there = wall(), before(wall(), (3.0, -1.0, 0.2))
+    for scans, said in (((gone, there, there), [1, 0]), ((there, there, gone), [0, 1])):
+        r = recording(scans, seconds=[0.0, 1.5, 3.0])
+        seen = features(r, poses(r), OPTIONS)
+        assert changed(r, poses(r), seen, 1.0, 0.3).tolist() == said
+
+
+def test_a_post_that_most_beams_miss_has_not_gone():
+    thick, thin = wall(), wall()
+    thick[90:92] = thin[91] = 3.0
+    for second, said in ((thin, [False]), (wall(), [True])):
+        r = recording([thick, second], seconds=[0.0, 1.5])
+        seen = features(r, poses(r), dataclasses.replace(OPTIONS, narrowest=0.08))
+        assert changed(r, poses(r), seen, 1.0, 0.3).tolist() == said
+
+
+def test_what_is_not_looked_at_has_not_gone():
+    r = recording([before(wall(), (3.0, 0.0, 0.2)), wall()], seconds=[0.0, 1.5])
+    for turned, said in ((0.0, True), (np.radians(80), True), (np.radians(120), False)):
+        T = np.stack([np.eye(3), se2.matrix(0.0, 0.0, turned)])
+        seen = features(r, T, OPTIONS)
+        assert changed(r, T, seen, 1.0, 0.3).tolist() == [said]
 
 
 def test_only_the_same_laser_says_so():

@@ -67,7 +67,7 @@ def _of_chunk(recording: Recording, chunk: Chunk, options: TrackerOptions) -> Fe
     usable = np.isfinite(points).all(axis=1)
     scan, points, hit = scan[usable], points[usable], recording.hit[chunk.beams][usable]
     r = ranges(points, hit)
-    first, last = _segments(scan, r, options.jump)
+    first, last = _segments(r, options.jump)
     inner = (first > 0) & (last < len(r) - 1) & hit[first]
     first, last = first[inner], last[inner]
     before, after = first - 1, last + 1
@@ -82,9 +82,9 @@ def _of_chunk(recording: Recording, chunk: Chunk, options: TrackerOptions) -> Fe
     return Features(scan[first], xy, width[chosen])
 
 
-def _segments(scan: Index, r: Float, jump: float) -> tuple[Index, Index]:
-    """First and last beam of every run without a jump of range; runs end with their scan."""
-    cut = np.flatnonzero((np.diff(scan) != 0) | (np.abs(np.diff(r)) > jump))
+def _segments(r: Float, jump: float) -> tuple[Index, Index]:
+    """First and last beam of every run without a jump of range, from scan to scan if need be."""
+    cut = np.flatnonzero(np.abs(np.diff(r)) > jump)
     ends = np.append(cut, np.arange(len(r))[-1:])  # none without beams
     return np.append(np.zeros(len(ends), np.intp)[:1], cut + 1), ends
 
