@@ -26,6 +26,8 @@ from stillmap.evaluation.trajectory import absolute_errors, align
 METHODS: dict[str, dict[str, Any]] = {
     "stillmap": {"estimator": "stillmap"},
     "paper": {"estimator": "paper"},
+    "tracker": {"estimator": "tracker"},
+    "tracker-0.1": {"estimator": "tracker", "em": {"hit_ratio": 0.1}},
     # today's mappers: hits / (hits + passes) of the end cell against a threshold
     "hit-ratio-0.1": {"estimator": "hit-ratio", "em": {"hit_ratio": 0.1}},
     "hit-ratio-0.25": {"estimator": "hit-ratio", "em": {"hit_ratio": 0.25}},

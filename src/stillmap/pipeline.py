@@ -34,8 +34,10 @@ class Options:
 
     threads: int = field_with_doc(0, "threads to use; 0: one per processor. Same result with any")
     # spelled out: ruff takes the default for mutable under an alias
-    estimator: Literal["stillmap", "paper", "hit-ratio"] = field_with_doc(
-        "stillmap", "what says which beams are static; paper: (8) as printed, hit-ratio: counting"
+    estimator: Literal["stillmap", "paper", "hit-ratio", "tracker"] = field_with_doc(
+        "stillmap",
+        "what says which beams are static; paper: (8) as printed, hit-ratio: counting, "
+        "tracker: all that are not on people who are tracked",
     )
     read: ReadOptions = field(default=ReadOptions())
     em: EmOptions = field(default=EmOptions())

@@ -167,7 +167,8 @@ class _Run:
             )
         )
         gain = np.inf if self.best is None else bound - self.best.bound
-        if gain > 0.0:
+        fixed = em.fixed_iterations(self.options.estimator)
+        if gain > 0.0 or fixed:
             self.best = _Best.of(iteration)
         self._remember(iteration)
         options = self.options.em
@@ -175,8 +176,7 @@ class _Run:
         if self.options.estimator == "stillmap":  # the printed labels creep
             settled |= iteration.number > 1 and iteration.changed_share < options.settled
         stuck = iteration.number - self.kept.number >= options.patience
-        counted = self.options.estimator == "hit-ratio"  # nothing to iterate
-        self.finished = settled or stuck or counted
+        self.finished = iteration.number == fixed if fixed else settled or stuck
 
     @property
     def kept(self) -> "_Best":
@@ -235,7 +235,7 @@ class _Run:
             evidence=evidence,
             best_iteration=kept.number,
             converged=self.finished,
-            warnings=_warnings(self.records, kept, recording, self.options.em),
+            warnings=_warnings(self.records, kept, recording, self.options),
             learned=kept.learned,
             loops=kept.loops,
             doubts=kept.doubts,
@@ -262,9 +262,10 @@ class _Run:
         return changes
 
     def _map(self, recording: Recording, threads: int) -> em.OccupancyMap:
-        """The printed labels follow from the sums they were made from, others make the sums."""
+        """Labels that follow from sums are beside those they were made from, others make them."""
         kept = self.kept
-        weights = kept.p_static if self.options.estimator == "stillmap" else kept.weights
+        makes = self.options.estimator in ("stillmap", "tracker")
+        weights = kept.p_static if makes else kept.weights
         grid = _core.Grid2D(self.options.slam.resolution)
         seen = em.add_believed_first(grid, recording, kept.poses, weights, kept.no_return, threads)
         return em.occupancy_map(grid, kept.occupied, seen)
@@ -330,16 +331,16 @@ def _raw_map(
 
 
 def _warnings(
-    records: list[IterationRecord], kept: _Best, recording: Recording, options: em.EmOptions
+    records: list[IterationRecord], kept: _Best, recording: Recording, options: Options
 ) -> list[str]:
     out = []
-    noise = options.tolerance * recording.n_beams
+    noise = options.em.tolerance * recording.n_beams
     dips = [
         after.number
         for before, after in itertools.pairwise(records)
         if after.bound < before.bound - noise
     ]
-    if dips:
+    if dips and not em.fixed_iterations(options.estimator):
         out.append(
             f"the likelihood dipped at iteration {', '.join(map(str, dips))}: poses are estimated "
             f"by matching, not by it; iteration {kept.number} is the best and was kept"

@@ -102,7 +102,7 @@ def test_pieces_and_threads_change_no_bit(monkeypatch, threads, beams):
     np.testing.assert_array_equal(known(seen, threads)[3].p_occupied, once)
 
 
-@pytest.mark.parametrize("estimator", ["paper", "hit-ratio"])
+@pytest.mark.parametrize("estimator", ["paper", "hit-ratio", "tracker"])
 def test_others_believe_every_beam(estimator):
     seen = room_with()
     found = seen.e_step(estimator=estimator)

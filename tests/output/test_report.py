@@ -264,7 +264,7 @@ def test_the_curves_are_called_what_the_estimator_made_them(result):
     default = report_html(result)
     assert "Bound: log likelihood of the cells" in default
     assert "(5)" not in default
-    for estimator in ("paper", "hit-ratio"):
+    for estimator in ("paper", "hit-ratio", "tracker"):
         printed = report_html(estimated_by(result, estimator))
         assert "Expected log likelihood, (5)" in printed
         assert "log likelihood of the cells" not in printed

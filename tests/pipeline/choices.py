@@ -6,7 +6,7 @@ from stillmap.options import replaced
 from stillmap.pipeline import Options
 
 RESOLUTION = 0.05
-ESTIMATORS = ("stillmap", "paper", "hit-ratio")
+ESTIMATORS = ("stillmap", "paper", "hit-ratio", "tracker")
 with_any_estimator = pytest.mark.parametrize("estimator", ESTIMATORS)
 
 

@@ -46,7 +46,7 @@ def outcome(result):
     return [it.bound for it in result.iterations], [a.tobytes() for a in (*arrays, *maps)]
 
 
-@pytest.mark.parametrize("estimator", ["stillmap", "hit-ratio", "paper"])
+@pytest.mark.parametrize("estimator", ["stillmap", "hit-ratio", "paper", "tracker"])
 def test_it_can_be_left_and_the_printed_method_leaves_it(room, swept, estimator):
     chosen = options(estimator, max_iterations=3)
     at_once = stillmap.build(room.recording, chosen)
@@ -62,7 +62,7 @@ def test_where_all_beams_come_at_once_nothing_is_made_anew(room):
         assert it.seen is room.recording
 
 
-@pytest.mark.parametrize("estimator", ["stillmap", "hit-ratio"])
+@pytest.mark.parametrize("estimator", ["stillmap", "hit-ratio", "tracker"])
 @pytest.mark.parametrize("given", [False, True])
 @pytest.mark.parametrize("loops", [False, True])
 def test_map_and_labels_are_made_of_the_same_points(room, swept, estimator, given, loops):

@@ -16,7 +16,7 @@ def options(estimator, **changes):
     return replaced(Options(), {"em": settings, "estimator": estimator, "threads": 1})
 
 
-@pytest.mark.parametrize("estimator", ["stillmap", "paper", "hit-ratio"])
+@pytest.mark.parametrize("estimator", ["stillmap", "paper", "hit-ratio", "tracker"])
 def test_every_iteration_has_its_figure(room, tmp_path, estimator):
     chosen = options(estimator)
     result = stillmap.build(room.recording, chosen)

@@ -79,5 +79,5 @@ def test_the_options_that_are_kept_are_those_that_were_used(printed):
         "deskew": True,
     }
     assert replaced(printed.options, {"slam": rest}) == options()
-    for estimator in ("stillmap", "hit-ratio"):
+    for estimator in ("stillmap", "hit-ratio", "tracker"):
         assert pipeline.resolved(options(estimator)) == options(estimator)

@@ -108,6 +108,15 @@ def test_counting_has_nothing_to_iterate(build):
     assert (asked, result.converged) == (1, True)
 
 
+def test_tracking_is_done_twice_and_the_second_time_counts(build):
+    result, asked = build([-3.0, -4.0, -5.0], options("tracker"))
+    assert (asked, result.converged) == (2, True)
+    assert_kept(result, 2)
+    assert not any("dipped" in warning for warning in result.warnings)
+    once, asked = build([-3.0, -4.0], options("tracker", max_iterations=1))
+    assert (asked, once.converged) == (1, False)
+
+
 def test_the_history_tells_every_iteration_and_not_only_the_best(build):
     result, _ = build([-5.0, -3.0, -4.0], options())
     M = result.recording.n_beams

@@ -8,6 +8,7 @@ from stillmap.em.estimator import (
     add_recording,
     changed_share,
     e_step,
+    fixed_iterations,
     initial_expectations,
     iterations,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "changed_share",
     "e_step",
     "evidence",
+    "fixed_iterations",
     "held_out_log_likelihood",
     "initial_expectations",
     "iterations",

@@ -9,26 +9,36 @@ from numpy.typing import NDArray
 from stillmap import _core
 from stillmap.em import dwell, hit_ratio, paper
 from stillmap.em.chunks import chunks
-from stillmap.em.expectations import Expectations, NoReturn
+from stillmap.em.expectations import Expectations, NoReturn, per_beam
 from stillmap.em.occupancy import Seen
 from stillmap.em.options import EmOptions
+from stillmap.em.tracker import on_people
 from stillmap.recording.model import Recording
 
 Float = NDArray[np.float64]
-Estimator = Literal["stillmap", "paper", "hit-ratio"]
+Estimator = Literal["stillmap", "paper", "hit-ratio", "tracker"]
+
+# iterations of those that do not follow a likelihood upwards: counting has nothing to iterate,
+# tracking is done once to register without people, and once more on those better poses
+_FIXED: dict[Estimator, int] = {"hit-ratio": 1, "tracker": 2}
 
 
 def initial_expectations(
     recording: Recording, estimator: Estimator, options: EmOptions
 ) -> NDArray[np.float32]:
     """(M,) e := p(c = 1) for every beam: the start of Fig. 2. Mappers that count believe all."""
-    prior = 1.0 if estimator == "hit-ratio" else options.prior
+    prior = 1.0 if estimator in _FIXED else options.prior
     return np.full(recording.n_beams, prior, dtype=np.float32)
 
 
 def iterations(estimator: Estimator, options: EmOptions) -> int:
-    """How often to iterate at most; counting has nothing to iterate."""
-    return 1 if estimator == "hit-ratio" else options.max_iterations
+    """How often to iterate at most."""
+    return min(fixed_iterations(estimator) or options.max_iterations, options.max_iterations)
+
+
+def fixed_iterations(estimator: Estimator) -> int | None:
+    """How often estimators iterate of which the last iterate counts; None: the likelihood tells."""
+    return _FIXED.get(estimator)
 
 
 def e_step(
@@ -44,7 +54,21 @@ def e_step(
         return paper.e_step(recording, poses, grid, options.prior, threads)
     if estimator == "hit-ratio":
         return hit_ratio.e_step(recording, poses, grid, options.hit_ratio, threads)
+    if estimator == "tracker":
+        return _tracked(recording, poses, grid.resolution, options, threads)
     return dwell.e_step(recording, poses, grid.resolution, options, threads)
+
+
+def _tracked(
+    recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int
+) -> Expectations:
+    """Hits on people who are tracked are dynamic, all others static; the map counts the others."""
+    kept = ~on_people(recording, poses, options.tracker)
+    e = per_beam(recording.points, recording.hit, kept.astype(np.float32), options.prior)
+    grid = _core.Grid2D(resolution)
+    add_recording(grid, recording, poses, e, threads)
+    likelihood = paper.log_likelihood(recording, poses, grid, e, options.prior, threads)
+    return Expectations(e, likelihood, hit_ratio.kept_cells(grid, options.hit_ratio))
 
 
 def add_recording(

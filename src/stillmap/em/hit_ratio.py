@@ -28,11 +28,15 @@ def e_step(
     """
     # (8) with prior 1 - threshold is exactly r (1 - threshold) / (r (1 - threshold) + ...)
     found = paper.e_step(recording, poses, grid, 1.0 - threshold, threads)
+    p = per_beam(recording.points, recording.hit, found.p_static, 1.0 - threshold)
+    return Expectations(p, found.likelihood, kept_cells(grid, threshold))
+
+
+def kept_cells(grid: _core.Grid2D, threshold: float) -> CellProbabilities:
+    """One where alpha / (alpha + beta) reaches the threshold, else zero."""
     first, alpha, beta = grid.dense()
     ratio = np.divide(alpha, alpha + beta, out=np.zeros_like(alpha), where=alpha + beta > 0.0)
     rows = np.argwhere(alpha > 0.0)
     cells = np.ascontiguousarray(rows[:, ::-1] + first)
     keeps = ratio[tuple(rows.T)] >= threshold
-    occupied = CellProbabilities(cells, keeps.astype(np.float32), 0.0)
-    p = per_beam(recording.points, recording.hit, found.p_static, 1.0 - threshold)
-    return Expectations(p, found.likelihood, occupied)
+    return CellProbabilities(cells, keeps.astype(np.float32), 0.0)

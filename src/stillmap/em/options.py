@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from stillmap.em.tracker.options import TrackerOptions
 from stillmap.options import field_with_doc
 
 
@@ -94,7 +95,7 @@ class EmOptions:
     )
     patience: int = field_with_doc(2, "iterations without a better bound before the loop stops")
     hit_ratio: float = field_with_doc(
-        0.25, "hits / (hits + passes) below which the hit-ratio estimator drops a cell"
+        0.25, "hits / (hits + passes) below which mappers that count drop a cell"
     )
     held_out: int = field_with_doc(
         20, "every that many scans one is left out of the map and scored by it; 0: none"
@@ -102,6 +103,7 @@ class EmOptions:
     dwell: DwellOptions = field(default=DwellOptions())
     changes: ChangeOptions = field(default=ChangeOptions())
     evidence: EvidenceOptions = field(default=EvidenceOptions())
+    tracker: TrackerOptions = field(default=TrackerOptions())
 
     def __post_init__(self) -> None:
         for name in ("prior", "hit_ratio"):

@@ -222,7 +222,8 @@ class OptionsLike(Protocol):
     """The resolved options: a frozen dataclass with a section for the writers.
 
     Attributes:
-        estimator: what said which beams are static: `stillmap`, `paper` or `hit-ratio`.
+        estimator: what said which beams are static: `stillmap`, `paper`, `hit-ratio` or
+            `tracker`.
         objects: how moving things were found.
         output: options of the writers.
     """

@@ -1,0 +1,185 @@
+"""Who walks across is dropped, what stands is not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from made_up_scans import before, crossing, poses, recording, wall
+
+from stillmap import _core, em
+from stillmap.em.tracker import TrackerOptions, on_people
+from stillmap.em.tracker.boxes import in_boxes
+from stillmap.em.tracker.features import features
+from stillmap.em.tracker.tracks import Places, people
+
+OPTIONS = TrackerOptions()
+TIMES = np.arange(0.0, 3.4, 0.2)
+PILLAR = (2.0, 2.6, 0.15)
+
+
+def dropped(r, options=OPTIONS):
+    return on_people(r, poses(r), options).reshape(r.n_scans, -1)
+
+
+def of(r, options=OPTIONS):
+    """The tracks of people."""
+    found = features(r, poses(r), options)
+    seconds = 1e-9 * (r.stamp_ns - r.stamp_ns[0])
+    return people(found, np.ones(len(found.scan), bool), seconds, options)
+
+
+def test_a_walker_is_dropped_from_the_first_scan_and_walls_stay():
+    ranges, on = crossing(TIMES, pillar=PILLAR)
+    off = dropped(recording(ranges))
+    assert off[on].mean() > 0.95
+    assert off[0][on[0]].all()  # looking back
+    assert not off[~on].any()  # wall and pillar are far from him
+
+
+def test_what_stands_is_never_dropped():
+    ranges = np.tile(before(wall(), PILLAR, (3.0, 0.0, 0.2)), (20, 1))
+    rng = np.random.default_rng(0)
+    assert not dropped(recording(ranges + rng.normal(scale=0.02, size=ranges.shape))).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("moved", 10.0), ("least", 100), ("changed", 1.0), ("lost", 0.05)]
+)
+def test_who_counts_as_a_person_is_an_option(name, value):
+    ranges, on = crossing(TIMES)
+    if name == "changed":  # he stands, then goes
+        ranges[:8] = crossing(TIMES[:8], speed=0.0)[0]
+    r = recording(ranges)
+    assert not dropped(r, dataclasses.replace(OPTIONS, **{name: value})).any()
+    if name != "changed":
+        assert dropped(r)[on].any()
+
+
+def test_the_box_is_an_option():
+    ranges, on = crossing(TIMES, x=5.7)  # close to the wall
+    shares = []
+    for box in (0.0, 0.4, 1.0):
+        off = dropped(recording(ranges), dataclasses.replace(OPTIONS, box=box))
+        shares.append((off[on].mean(), off[~on].mean()))
+    assert shares[0][0] < shares[1][0]
+    assert shares[1][1] < shares[2][1]
+
+
+def test_only_hits_are_dropped():
+    ranges = np.full((1, 181), np.inf)
+    ranges[0, 90] = 20.0  # as far as the others, which end in the box with nothing
+    r = recording(ranges)
+    one = np.ones(1, bool)
+    somebody = Places(np.zeros(1, int), np.zeros(1, int), np.array([[20.0, 0.0]]), one, one)
+    assert in_boxes(r, poses(r), somebody, 1.0).nonzero()[0].tolist() == [90]
+
+
+def test_a_track_goes_on_while_somebody_is_hidden_and_ends_where_he_was_last_seen():
+    ranges, _ = crossing(TIMES)
+    hidden = ranges.copy()
+    hidden[7:10] = wall()
+    hidden[14:] = wall()
+    tracks = of(recording(hidden))
+    assert len(np.unique(tracks.track)) == 1
+    assert tracks.scan.tolist() == list(range(14))
+    assert (~tracks.seen).nonzero()[0].tolist() == [7, 8, 9]
+    y = -2.0 + 1.2 * TIMES[:14]
+    assert np.abs(tracks.xy[:, 1] - y).max() < 0.35
+
+
+def test_two_who_cross():
+    one, on_one = crossing(TIMES, x=3.0)
+    two, on_two = crossing(TIMES, speed=-1.2, x=4.0, start=2.0)
+    off = dropped(recording(np.minimum(one, two)))
+    assert off[on_one].mean() > 0.9
+    assert off[on_two & ~on_one].mean() > 0.85
+
+
+@pytest.mark.parametrize("gap", [3.0, 1e5])
+def test_a_large_gap_ends_all_tracks(gap):
+    ranges, on = crossing(TIMES)
+    seconds = TIMES + np.where(np.arange(len(TIMES)) < 9, 0.0, gap)
+    off = dropped(recording(ranges, seconds))
+    assert len(np.unique(of(recording(ranges, seconds)).track)) == 2
+    assert off[on].mean() > 0.9
+
+
+def test_stamps_that_repeat_or_come_at_random():
+    ranges, on = crossing(TIMES)
+    twice = recording(np.repeat(ranges, 2, axis=0), np.repeat(TIMES, 2))
+    assert dropped(twice)[np.repeat(on, 2, axis=0)].mean() > 0.9
+    times = np.sort(np.random.default_rng(3).uniform(0.0, 3.4, 25))
+    ranges, on = crossing(times)
+    assert dropped(recording(ranges, times))[on].mean() > 0.9
+
+
+def test_next_to_nothing():
+    ranges, _ = crossing(TIMES)
+    one = recording(ranges[:1])
+    assert not dropped(one).any()
+    nothing = recording(np.full(ranges.shape, np.inf))
+    assert not dropped(nothing).any()
+    unusable = recording(np.full(ranges.shape, np.nan))
+    assert not dropped(unusable).any()
+    r = recording(ranges)
+    none = dataclasses.replace(
+        r, points=r.points[:0], hit=r.hit[:0], offset=np.zeros_like(r.offset)
+    )
+    assert on_people(none, poses(none), OPTIONS).shape == (0,)
+    few = dataclasses.replace(
+        r, points=r.points[: 2 * 17], hit=r.hit[: 2 * 17], offset=2 * np.arange(18)
+    )
+    assert not on_people(few, poses(few), OPTIONS).any()
+
+
+def e_step(r, threads=1, **options):
+    grid = _core.Grid2D(0.1)
+    em.add_recording(grid, r, poses(r), None)
+    chosen = em.EmOptions(**options)
+    return em.e_step(r, poses(r), grid, "tracker", chosen, threads=threads)
+
+
+def test_labels_are_hard_and_the_map_counts_the_rest():
+    ranges, _ = crossing(TIMES, pillar=PILLAR)
+    ranges[:, 170] = np.inf
+    ranges[:, 175] = np.nan
+    r = recording(ranges)
+    found = e_step(r)
+    e = found.p_static.reshape(ranges.shape)
+    off = dropped(r)
+    hit = np.isfinite(ranges)
+    np.testing.assert_array_equal(e[hit], np.where(off, 0.0, 1.0)[hit])
+    assert (e[:, 170] == np.float32(em.EmOptions().prior)).all()
+    assert np.isnan(e[:, 175]).all()
+    assert not (off & ~hit).any()
+    # only cells that something else was hit in are known, and its ratio decides
+    grid = _core.Grid2D(0.1)
+    em.add_recording(grid, r, poses(r), found.p_static)
+    m = em.occupancy_map(grid, found.occupied)
+    x, y, _ = m.origin
+    points = r.points[r.hit & (found.p_static == 0.0)]
+    cells = np.floor((points - [x, y]) / 0.1).astype(int)[:, ::-1]
+    assert (m.p_occupied[tuple(cells.T)] == 0.0).all()
+    kept = r.points[r.hit & (found.p_static == 1.0)]
+    cells = np.floor((kept - [x, y]) / 0.1).astype(int)[:, ::-1]
+    assert (m.p_occupied[tuple(cells.T)] == 1.0).mean() > 0.9
+    assert found.likelihood.expected <= found.likelihood.bound < 0.0
+
+
+def test_the_same_to_the_bit_with_any_number_of_threads():
+    ranges, _ = crossing(TIMES, pillar=PILLAR)
+    r = recording(ranges)
+    first = e_step(r)
+    for threads in (1, 2, 3):
+        again = e_step(r, threads)
+        assert again.p_static.tobytes() == first.p_static.tobytes()
+        assert again.likelihood == first.likelihood
+        assert again.occupied.p_occupied.tobytes() == first.occupied.p_occupied.tobytes()
+
+
+def test_two_iterations_that_begin_with_all_believed():
+    r = recording(wall())
+    assert em.iterations("tracker", em.EmOptions()) == 2
+    assert em.iterations("tracker", em.EmOptions(max_iterations=1)) == 1
+    assert em.fixed_iterations("stillmap") is em.fixed_iterations("paper") is None
+    assert (em.initial_expectations(r, "tracker", em.EmOptions()) == 1).all()

@@ -1,0 +1,136 @@
+"""Legs and bodies in single scans, and whether they have changed places."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from made_up_scans import ANGLES, before, poses, recording, wall
+
+from stillmap import se2
+from stillmap.em.tracker import TrackerOptions
+from stillmap.em.tracker.changes import changed
+from stillmap.em.tracker.features import features
+
+OPTIONS = TrackerOptions()
+
+
+def found(ranges, options=OPTIONS):
+    r = recording(ranges)
+    return features(r, poses(r), options)
+
+
+def test_two_legs_before_a_wall():
+    legs = ((3.0, 0.3, 0.07), (3.0, -0.2, 0.07))
+    seen = found(before(wall(), *legs))
+    assert seen.scan.tolist() == [0, 0]
+    np.testing.assert_allclose(seen.xy, [(2.94, -0.2), (2.94, 0.3)], atol=0.03)
+    np.testing.assert_allclose(seen.width, 0.14, atol=0.06)
+
+
+def test_in_the_frame_of_the_map():
+    r = recording([wall(), before(wall(), (3.0, 0.0, 0.2))])
+    T = np.stack([np.eye(3), se2.matrix(1.0, 2.0, np.pi / 2)])
+    seen = features(r, T, OPTIONS)
+    assert seen.scan.tolist() == [1]
+    np.testing.assert_allclose(seen.xy, [(1.0, 4.85)], atol=0.05)
+
+
+@pytest.mark.parametrize(
+    "things",
+    [
+        (),
+        ((3.0, 0.0, 0.6),),  # too wide
+        ((0.4, 0.0, 0.012),),  # too narrow
+        ((3.0, 0.0, 0.2), (1.5, 0.12, 0.1)),  # half behind something, which is a feature itself
+    ],
+)
+def test_what_is_no_leg(things):
+    seen = found(before(wall(), *things))
+    hidden = len(things) == 2
+    assert len(seen.scan) == int(hidden)
+    if hidden:
+        np.testing.assert_allclose(seen.xy, [(1.42, 0.12)], atol=0.05)
+
+
+def test_corners_and_edges_are_none():
+    wide = wall()
+    corner = np.minimum(wide, 2.0 / np.maximum(np.sin(np.abs(ANGLES)), 1e-9))  # a corridor's end
+    outer = np.where(ANGLES > 0.1, 3.0 / np.cos(ANGLES - 0.1), wide)  # a wall that ends
+    niche = np.where(np.abs(ANGLES) < 0.05, 9.0, wide)  # something narrow and farther away
+    for ranges in (corner, outer, niche):
+        assert len(found(ranges).scan) == 0
+
+
+def test_what_a_scan_begins_or_ends_with_is_none():
+    ranges = wall()
+    ranges[:3] = ranges[-3:] = 2.0
+    assert len(found(ranges).scan) == 0
+    begins, ends = np.full((2, 11), 6.0)  # so few that either end of it is near the other
+    begins[:2] = ends[-2:] = 3.0
+    for scans in ([ends, begins], [begins, ends], [ends, ends], [begins, begins]):
+        assert len(found(scans).scan) == 0  # nor has it neighbours in the next scan
+    inside = np.roll(begins, 1)
+    assert len(found(inside).scan) == 1
+
+
+def test_before_nothing_and_beside_unusable_beams():
+    ranges = np.full(len(ANGLES), np.inf)
+    ranges[90:94] = 3.0
+    assert len(found(ranges).scan) == 1
+    ranges[89] = ranges[94] = np.nan
+    assert len(found(ranges).scan) == 1
+    assert len(found(np.full(len(ANGLES), np.inf)).scan) == 0
+    assert len(found(np.full(len(ANGLES), np.nan)).scan) == 0
+
+
+def test_the_limits_are_the_options():
+    ranges = before(wall(), (3.0, 0.0, 0.2))
+    for name, value in (("narrowest", 0.5), ("widest", 0.3), ("jump", 4.0)):
+        assert len(found(ranges, dataclasses.replace(OPTIONS, **{name: value})).scan) == 0
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_place_that_was_seen_through(way):
+    pillar = (3.0, 1.0, 0.2)
+    scans = [before(wall(), pillar, (3.0, -1.0, 0.2))] + 9 * [before(wall(), pillar)]
+    r = recording(scans[::way])
+    seen = features(r, poses(r), OPTIONS)
+    moved = changed(r, poses(r), seen, 1.0, 0.3)
+    mover = seen.xy[:, 1] < 0
+    assert mover.sum() == 1
+    np.testing.assert_array_equal(moved, mover)
+    assert not changed(r, poses(r), seen, 5.0, 0.3).any()  # no scan is so far away in time
+    assert not changed(r, poses(r), seen, 1.0, 4.0).any()  # the wall is not so far behind
+
+
+def test_before_or_after_is_enough():
+    gone, there = wall(), before(wall(), (3.0, -1.0, 0.2))
+    for scans, said in (((gone, there, there), [1, 0]), ((there, there, gone), [0, 1])):
+        r = recording(scans, seconds=[0.0, 1.5, 3.0])
+        seen = features(r, poses(r), OPTIONS)
+        assert changed(r, poses(r), seen, 1.0, 0.3).tolist() == said
+
+
+def test_a_post_that_most_beams_miss_has_not_gone():
+    thick, thin = wall(), wall()
+    thick[90:92] = thin[91] = 3.0
+    for second, said in ((thin, [False]), (wall(), [True])):
+        r = recording([thick, second], seconds=[0.0, 1.5])
+        seen = features(r, poses(r), dataclasses.replace(OPTIONS, narrowest=0.08))
+        assert changed(r, poses(r), seen, 1.0, 0.3).tolist() == said
+
+
+def test_what_is_not_looked_at_has_not_gone():
+    r = recording([before(wall(), (3.0, 0.0, 0.2)), wall()], seconds=[0.0, 1.5])
+    for turned, said in ((0.0, True), (np.radians(80), True), (np.radians(120), False)):
+        T = np.stack([np.eye(3), se2.matrix(0.0, 0.0, turned)])
+        seen = features(r, T, OPTIONS)
+        assert changed(r, T, seen, 1.0, 0.3).tolist() == [said]
+
+
+def test_only_the_same_laser_says_so():
+    scans = [before(wall(), (3.0, -1.0, 0.2)), wall()]
+    for sensors, said in (((0, 0), True), ((0, 1), False)):
+        r = recording(scans, seconds=[0.0, 1.5], sensor=sensors)
+        seen = features(r, poses(r), OPTIONS)
+        assert changed(r, poses(r), seen, 1.0, 0.3).tolist() == [said]
