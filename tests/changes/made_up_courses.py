@@ -50,6 +50,7 @@ def together(*parts: em.Courses) -> em.Courses:
         **{
             name: np.concatenate([getattr(part, name) for part in parts])
             for name in em.Courses.__dataclass_fields__
+            if name != "surface"
         }
     )
 

@@ -44,6 +44,21 @@ def test_every_option_has_its_meaning_behind_it(capsys):
             assert len(line.split("  # ")[1]) > 8, line
 
 
+def test_places_that_change_have_their_options(capsys):
+    options = tomllib.loads(config(capsys, "--set", "output.map_state=majority"))
+    assert options["output"]["map_state"] == "majority"
+    assert options["em"]["changes"] == {
+        "enabled": True,
+        "stays": 2.0,
+        "longest": 3600.0,
+        "passing_occupied": 0.05,
+        "passing_seconds": 12.0,
+        "near": 0.5,
+        "together": 2.0,
+        "least": 4,
+    }
+
+
 def test_config_takes_its_own_output_unchanged(capsys, tmp_path):
     chosen = ("--set", "em.prior=0.75", "--set", "read.max_range=20", "--set", "threads=3")
     file = tmp_path / "options.toml"
@@ -120,6 +135,15 @@ def test_an_unknown_option_names_the_nearest(capsys, tmp_path, key, nearest):
         (("--set", "em.tracker.gate=0"), ("--set: ", "em.tracker.gate")),
         (("--set", "em.tracker.detection=1"), ("--set: ", "em.tracker.detection")),
         (("--set", "em.tracker.least=0"), ("--set: ", "em.tracker.least")),
+        (("--set", "em.changes.stays=0"), ("--set: ", "em.changes.stays", "lengths")),
+        (("--set", "em.changes.longest=nan"), ("--set: ", "em.changes.longest")),
+        (("--set", "em.changes.passing_seconds=0.5"), ("em.changes.passing_seconds", "seconds")),
+        (("--set", "em.changes.passing_occupied=1"), ("em.changes.passing_occupied", "share")),
+        (("--set", "em.changes.near=0"), ("--set: ", "em.changes.near", "metres")),
+        (("--set", "em.changes.together=-1"), ("--set: ", "em.changes.together", "seconds")),
+        (("--set", "em.changes.least=0"), ("--set: ", "em.changes.least", "at least 1")),
+        (("--set", "em.changes.enabled=perhaps"), ("--set: ", "em.changes.enabled")),
+        (("--set", "output.map_state=first"), ("--set: ", "output.map_state", "majority")),
         (("--set", "em.hit_ratio=0"), ("--set: ", "em.hit_ratio")),
         (("--set", "estimator=guess"), ("--set: ", "estimator", "hit-ratio")),
         (("--set", "em=1"), ("--set: ", "'em' is a section")),

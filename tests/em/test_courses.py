@@ -9,6 +9,7 @@ from made_up import RESOLUTION, Ball, Wall, watch
 from stillmap import em
 from stillmap.changes import changed_places
 from stillmap.em import chunks
+from stillmap.em import courses as module
 from stillmap.em.courses import _as_wholes
 
 WALLS = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
@@ -248,6 +249,16 @@ def test_what_comes_and_goes_again_and_again():
 def test_options_reach_it(seen, last, changed):
     other, _ = last_e_step(seen, changes=em.ChangeOptions(**changed))
     assert other.p_static.tobytes() != last[0].p_static.tobytes()
+
+
+def test_cells_decide_together_before_anything_is_shown(seen, monkeypatch):
+    def nothing_changed(found):
+        return replace(found, p_changing=np.zeros_like(found.p_changing))
+
+    monkeypatch.setattr(module, "_as_wholes", nothing_changed)
+    expectations, found = last_e_step(seen)
+    assert not found.p_changing.any()
+    assert np.quantile(seen.of(expectations.p_static, CAME), 0.9) < 0.1
 
 
 @pytest.mark.parametrize("beams", [1000, 5000])

@@ -37,7 +37,7 @@ def relabelled(
         changes: from `changed_places`.
         threads: same result with any number.
     """
-    if not changes or found.occupied is None:
+    if not changes or found.occupied is None or courses.surface is None:
         return p_static, occupied
     listed = np.isin(_keys(courses.cells), _keys(np.concatenate([one.cells for one in changes])))
     if not np.array_equal(occupied.cells, found.occupied.cells):

@@ -32,7 +32,6 @@ class Courses:
     """What became of E cells in which beams ended, each by its most probable course.
 
     Attributes:
-        surface: the cells as elements of surface.
         cells: (E, D) int64.
         p_static: (E,) float32, probability that what is there never left.
         p_changing: (E,) float32, that things came to stay, left, or come and go.
@@ -42,9 +41,9 @@ class Courses:
         count: (E,) int32, how often a thing came or left.
         between: (E, 2, 2) int32, looks before and after the first and the last of these changes;
             -1: there was none.
+        surface: the cells as elements of surface, which beams can be asked for.
     """
 
-    surface: Surface
     cells: NDArray[np.int64]
     p_static: NDArray[np.float32]
     p_changing: NDArray[np.float32]
@@ -52,6 +51,7 @@ class Courses:
     occupied_share: NDArray[np.float32]
     count: NDArray[np.int32]
     between: NDArray[np.int32]
+    surface: Surface | None = None
 
     def shown(self, state: MapState) -> NDArray[np.float32]:
         """(E,) probability that the map has something there.
@@ -94,7 +94,6 @@ def last_e_step(
     of = (goes > stays).astype(np.intp)  # what comes and goes does not stay long enough for a thing
     each = np.arange(len(of))
     courses = Courses(
-        surface=looks.surface,
         cells=looks.surface.elements()[0],
         p_static=posterior_static(looks.likelihood, shares.classes, n),
         p_changing=(stays + goes) / np.einsum("kc,c->k", looks.likelihood, weights),
@@ -102,6 +101,7 @@ def last_e_step(
         occupied_share=occupied_share,
         count=count[each, of],
         between=between[each, of],
+        surface=looks.surface,
     )
     courses = _as_wholes(courses)
     found = expectations(
