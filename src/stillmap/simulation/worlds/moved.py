@@ -81,9 +81,10 @@ def street_moved() -> Scene:
     west: list[Point] = [(170.5, 4.2), (166.0, OUTER), (8.0, OUTER)]
     turn: list[Point] = [(3.5, 4.2), (0.6, 0.0), (3.5, -4.2)]
     scene = _lift(street(), lifted, [Thing(_CAR, (stay,)) for stay in coming])
-    return dataclasses.replace(
-        scene, name="street-moved", route=(*east, *west, *turn, *east, *west)
-    )
+    # who stands in its way holds it up: it records for so long, however far it comes
+    robot = dataclasses.replace(scene.robot, scans=1500)
+    lap = (*east, *west, *turn)
+    return dataclasses.replace(scene, name="street-moved", route=(*lap, *lap), robot=robot)
 
 
 def warehouse_moved() -> Scene:
