@@ -153,6 +153,8 @@ def scores(
         "ece_unsure": labels.ece_unsure,
         "log_loss": labels.log_loss,
         "ghosts": on_map.ghosts_per_100_m2,
+        "ghost_cells": on_map.ghost_cells,
+        "free_area": on_map.free_area,
         "walls": on_map.walls_kept,
         "walls_at_best": at_best.walls_kept,
         "ghosts_of_truth": run.of_truth.ghosts_per_100_m2,

@@ -46,6 +46,8 @@ LABELS = (
 )
 MAP = (
     Column("ghosts", "ghosts per 100 m2", ".2f"),
+    Column("ghost_cells", "ghost cells", ".0f"),
+    Column("free_area", "free m2", ".0f"),
     Column("ghosts_of_truth", "by true labels", ".2f"),
     Column("walls", "walls kept", ".4f", True),
     Column("walls_at_best", "of those in reach", ".4f", True),
