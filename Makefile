@@ -58,8 +58,11 @@ demo: $(VENV)/installed
 	@echo "map        demo/map/map.pgm, demo/map/map.yaml"
 	@echo "report     demo/map/report.html (open it in a browser)"
 
+# files side by side: what a file makes once for all its tests is made once
+SIDE_BY_SIDE := --numprocesses=auto --maxprocesses=4 --dist=loadfile
+
 test: $(VENV)/tested
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" $(SIDE_BY_SIDE)
 
 test-slow: $(VENV)/tested
 	$(BIN)/python -m pytest -m slow

@@ -1,7 +1,6 @@
 """Runs the loop to its end and keeps the best iterate."""
 
 import dataclasses
-import itertools
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core, em, pipeline, slam
+from stillmap.cautions import cautions
 from stillmap.changes import Change, changed_places, relabelled, without_changes
 from stillmap.objects import MovingObject, Traffic, moving_objects, traffic
 from stillmap.output.crops import Snapshot, Window, choose_window, snapshot
@@ -235,7 +235,14 @@ class _Run:
             evidence=evidence,
             best_iteration=kept.number,
             converged=self.finished,
-            warnings=_warnings(self.records, kept, recording, self.options),
+            warnings=cautions(
+                self.records,
+                kept.number,
+                kept.explained,
+                kept.doubts,
+                recording,
+                self.options,
+            ),
             learned=kept.learned,
             loops=kept.loops,
             doubts=kept.doubts,
@@ -328,56 +335,3 @@ def _raw_map(
     grid = _core.Grid2D(filtered.resolution)
     em.add_recording(grid, recording, poses, None, threads)
     return em.occupancy_map(grid, box=filtered.box)
-
-
-def _warnings(
-    records: list[IterationRecord], kept: _Best, recording: Recording, options: Options
-) -> list[str]:
-    out = []
-    noise = options.em.tolerance * recording.n_beams
-    dips = [
-        after.number
-        for before, after in itertools.pairwise(records)
-        if after.bound < before.bound - noise
-    ]
-    if dips and not em.fixed_iterations(options.estimator):
-        out.append(
-            f"the likelihood dipped at iteration {', '.join(map(str, dips))}: poses are estimated "
-            f"by matching, not by it; iteration {kept.number} is the best and was kept"
-        )
-    if recording.T_odom_base is None:
-        out.append("no odometry: a constant velocity was assumed between scans")
-    out += _doubtful(kept.doubts)
-    lost = np.flatnonzero(kept.explained < 0.2)
-    if len(lost):
-        out.append(
-            f"{len(lost)} scans fit the map badly (less than a fifth of their beams), the first "
-            f"is scan {lost[0]}: the map may be bent there"
-        )
-    return out
-
-
-def _doubtful(doubts: slam.Doubts) -> list[str]:
-    out = []
-    if doubts.disagreeing:
-        n = len(doubts.disagreeing)
-        out.append(
-            f"odometry and scans disagree at {n} scan{'s' * (n > 1)} (wheels that slip or "
-            f"stall, odometry that begins again), first at scan {doubts.disagreeing[0]}: poses "
-            "follow the scans there"
-        )
-    if doubts.widened:
-        out.append(
-            f"{len(doubts.widened)} scans lay outside what odometry allows and were found by a "
-            f"wider search, the first is scan {doubts.widened[0]}"
-        )
-    for scan in doubts.breaks:
-        out.append(
-            f"before scan {scan} the robot lost its way or was carried elsewhere: "
-            + (
-                "nothing seen after it is known from before, so it stands beside the rest"
-                if scan in doubts.apart
-                else "where it went on was found among the places known from before"
-            )
-        )
-    return out
