@@ -5,10 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from cases import Case
-from changes import COLUMNS, _scored, beams_of, scores_of, stays_of, table
+from changes import COLUMNS, _of_things, _scored, beams_of, scores_of, stays_of, table
 from common import Run
 
 from stillmap.evaluation.changes import true_changes
+from stillmap.se2 import inverse, matrix
 from stillmap.simulation import Simulation, scene_by_name, simulate
 
 SHORT = {"robot": {"scans": 1000}}
@@ -51,8 +52,8 @@ def perfect(simulation: Simulation, state: str) -> SimpleNamespace:
     )
     found = [
         SimpleNamespace(
-            x=float(c.stay.middle[0]), y=float(c.stay.middle[1]), appeared=c.appeared,
-            stamp_ns=c.look_ns, cells=9,
+            kind="came" if c.appeared else "left", appeared=c.appeared, stamp_ns=c.look_ns,
+            x=float(c.stay.middle[0]), y=float(c.stay.middle[1]),
         )
         for c in true_changes(stays, beams) if c.look_ns is not None
     ]  # fmt: skip
@@ -69,6 +70,26 @@ def test_what_is_right_scores_full_marks(street: Simulation) -> None:
     assert scores["missed"] == scores["false"] == scores["largest_error"] == 0
     first = scores_of(perfect(street, "first"), street)
     assert (first["new_kept"], first["old_occupied"]) == (0.0, 1.0)
+
+
+def test_doors_and_what_comes_and_goes_are_no_things() -> None:
+    hinge, width = (3.0, -1.0), 0.9
+    scene = SimpleNamespace(leaves=[SimpleNamespace(hinge=hinge, width=width)])
+    T_world_map = matrix(10.0, -5.0, np.pi / 2)
+
+    def change(kind: str, off: float) -> SimpleNamespace:
+        """So far from the hinge, in the frame of the map."""
+        x, y, _ = inverse(T_world_map) @ [hinge[0] + 0.6 * off, hinge[1] - 0.8 * off, 1.0]
+        return SimpleNamespace(kind=kind, x=float(x), y=float(y))
+
+    on_leaf = [change(kind, off) for kind in ("came", "left") for off in (0.0, 0.5, 1.09)]
+    apart = [change(kind, off) for kind in ("came", "left") for off in (1.11, 4.0)]
+    often = [change("comes and goes", off) for off in (0.5, 4.0)]
+    simulation = SimpleNamespace(scene=scene)
+    assert _of_things([*often, *on_leaf, *apart], simulation, T_world_map) == apart
+    assert _of_things(often, simulation, T_world_map) == []
+    scene.leaves = []
+    assert _of_things([*on_leaf, *apart], simulation, T_world_map) == [*on_leaf, *apart]
 
 
 def test_a_run_is_scored_and_shown() -> None:

@@ -236,6 +236,44 @@ def test_one_change_of_a_cell_alone():
     assert one.size == pytest.approx((0.1, 0.1))
 
 
+def wall(y, x=0, width=40):
+    """What stands still along a row."""
+    return course(block(x, y, width, 1), True, count=0, p=0.02, static=0.95)
+
+
+@pytest.mark.parametrize("count", [1, 4])
+@pytest.mark.parametrize(
+    ("y", "far"),  # how many of the cells of the box in rows 20 to 22 are farther than two from it
+    [(25, 12), (24, 8), (23, 4), (22, 0), (21, 0), (18, 8)],
+)
+def test_what_moves_to_and_fro_beside_a_wall_is_noise(y, far, count):
+    box = course(BOX, True, (40, 43), count=count)
+    for least in (4, 5, 8, 9, 12):
+        assert len(found(box, wall(y), least=least)) == (far >= least)
+
+
+def test_two_cells_are_as_the_crow_flies():
+    # of 12 cells 3 are two or less from a static one at their corner, those aslant are farther
+    box, one = course(BOX, True, (40, 43)), wall(20, 9, 1)
+    assert [len(found(box, one, least=least)) for least in (9, 10)] == [1, 0]
+
+
+def test_only_what_is_static_makes_noise():
+    likely = [course(block(0, 22, 40, 1), True, count=0, p=0.02, static=p) for p in (0.5, 0.51)]
+    assert len(found(course(BOX, True, (40, 43)), likely[0])) == 1
+    assert found(course(BOX, True, (40, 43)), likely[1]) == []
+
+
+def test_a_place_that_reaches_to_a_wall_keeps_all_its_cells():
+    (one,) = found(course(BOX, True, (40, 43)), wall(23))
+    assert len(one.cells) == len(BOX)
+    # a part that is noise alone belongs to the larger place beside it
+    large, part = course(BOX, False, (40, 43)), course(block(14, 23, 6, 1), False, (60, 63))
+    assert len(found(large, part, wall(24, 14, 6))) == 1
+    assert len(found(large, part, wall(24, 14, 6))[0].cells) == len(BOX) + 6
+    assert found(part, wall(24, 14, 6)) == []
+
+
 def test_the_order_of_cells_changes_nothing():
     parts = course(BOX, True, (20, 22)), course(beside(4), True, (40, 43))
     here, there = found(*parts), found(*parts[::-1])

@@ -1,14 +1,15 @@
-"""The area of a door from cells where its leaf was seen; of anything else the hull."""
+"""The area of a door from cells where its leaf was seen; of anything else the cells alone."""
 
 import numpy as np
 import pytest
-from made_up_courses import block, course, found
+from made_up_courses import RESOLUTION, block, course, found
 
 from stillmap.changes import swept_cells
 from stillmap.changes.swept import _sector
 
 LENGTH = 18.0  # cells
 HINGE = np.array([-7, 12])
+LEAF = 1.0 / LENGTH  # metres of a cell, so that the leaf is one of a metre
 
 
 def leaf(angle, length=LENGTH, hinge=HINGE, thick=2):
@@ -46,7 +47,7 @@ def inside(first, swing, margin, length=LENGTH):
 def test_a_door_sweeps_a_sector(first, swing):
     first, swing = np.radians([first, swing])
     cells = door(first, swing)
-    got = held(swept_cells(cells))
+    got = held(swept_cells(cells, LEAF))
     assert got >= held(cells)
     within, without = inside(first, swing, 2.0)
     assert len(within) > 50
@@ -58,59 +59,65 @@ def test_a_door_sweeps_a_sector(first, swing):
 def test_the_bow_is_swept_and_not_only_the_triangle(first):
     # also where directions jump by a whole turn
     first, swing = np.radians([first, 90])
-    u = first + swing / 2
-    bow = np.round(HINGE + (LENGTH - 2) * np.array([np.cos(u), np.sin(u)])).astype(int)
+    middle = first + swing / 2
+    u = np.array([np.cos(middle), np.sin(middle)])
+    bow = np.round(HINGE + (LENGTH - 2) * u).astype(int)
     cells = door(first, swing)
-    assert tuple(bow) in held(swept_cells(cells))
-    assert tuple(bow) not in hull(cells)
+    assert tuple(bow) in held(swept_cells(cells, LEAF))
+    assert bow @ u > (cells @ u).max()  # beyond the line from tip to tip
 
 
 def test_where_the_cells_lie_and_their_order_change_nothing():
     cells = door(0.3, 1.4)
-    one = swept_cells(cells)
+    one = swept_cells(cells, LEAF)
     far = np.array([1000, -3000])
-    assert held(swept_cells(cells[::-1] + far)) == held(one + far)
+    assert held(swept_cells(cells[::-1] + far, LEAF)) == held(one + far)
     assert len(held(one)) == len(one)  # none twice
 
 
 def test_a_leaf_that_is_seen_on_its_way_now_and_then_is_still_a_door():
     cells = np.concatenate([door(0.0, np.pi / 2), leaf(0.7)[::5]])
     within, _ = inside(0.0, np.pi / 2, 2.0)
-    assert len(within - held(swept_cells(cells))) <= 0.03 * len(within)
+    assert len(within - held(swept_cells(cells, LEAF))) <= 0.03 * len(within)
 
 
-def hull(cells):
-    """Cells whose middle lies in the convex hull, by half planes."""
-    low, high = cells.min(axis=0), cells.max(axis=0)
-    around = block(*low, *(high - low + 1))
-    keep = np.ones(len(around), bool)
-    for angle in np.linspace(0, 2 * np.pi, 720, endpoint=False):
-        u = np.array([np.cos(angle), np.sin(angle)])
-        keep &= around @ u <= (cells @ u).max() + 1e-9
-    return held(around[keep])
+@pytest.mark.parametrize("length", [10.0, 18.0, 40.0])
+def test_a_leaf_is_as_long_as_those_of_doors(length):
+    cells = door(0.0, np.pi / 2, length=length)
+    assert _sector(cells).length == pytest.approx(length, abs=1.0)
+
+    def sweeps(metres):
+        return len(swept_cells(cells, metres / length)) > len(cells)
+
+    assert [sweeps(metres) for metres in (0.3, 0.5, 1.8, 2.3)] == [False, True, True, False]
 
 
-def test_a_blob_gives_its_hull():
+def alone(cells):
+    """Nothing beside the cells, and they in their order."""
+    np.testing.assert_array_equal(swept_cells(cells, LEAF), cells)
+    return True
+
+
+def test_a_blob_is_its_cells():
     x, y = block(-8, -8, 17, 17).T
     disc = np.column_stack([x, y])[np.hypot(x, y) < 8]
     ring = disc[np.hypot(*disc.T) > 5]
     assert _sector(ring) is None
-    assert held(swept_cells(ring)) == hull(ring) == held(disc)
+    assert alone(disc)
+    assert alone(ring)  # and not what it goes round
 
 
-def test_two_bays_beside_each_other_give_their_hull():
+def test_two_bays_beside_each_other_are_their_cells():
     bays = np.concatenate([block(0, 0, 6, 3), block(12, 0, 6, 3)])
     assert _sector(bays) is None
-    assert held(swept_cells(bays)) == held(block(0, 0, 18, 3))
+    assert alone(bays)
 
 
-def test_a_wide_shelf_round_a_corner_gives_its_hull():
+def test_a_wide_shelf_round_a_corner_is_its_cells():
     # thicker than a leaf
     shelf = np.concatenate([block(0, 0, 20, 7), block(0, 7, 7, 13)])
     assert _sector(shelf) is None
-    got = held(swept_cells(shelf))
-    assert got == hull(shelf)
-    assert (19, 19) not in got
+    assert alone(shelf)
 
 
 @pytest.mark.parametrize("thick", [2, 3, 4])
@@ -118,8 +125,7 @@ def test_a_wide_shelf_round_a_corner_gives_its_hull():
 @pytest.mark.parametrize("angle", [0.0, 0.4, 2.0])
 def test_one_leaf_alone_is_no_door(angle, length, thick):
     # a gate that slides, a bay: not two leaves that point away from each other
-    straight = leaf(angle, length, thick=thick)
-    assert held(swept_cells(straight)) == hull(straight)
+    assert alone(leaf(angle, length, thick=thick))
 
 
 @pytest.mark.parametrize(
@@ -133,13 +139,13 @@ def test_one_leaf_alone_is_no_door(angle, length, thick):
     ],
 )
 def test_cells_in_a_line_are_all_there_is(cells):
-    cells = np.array(cells, np.int64)
-    np.testing.assert_array_equal(swept_cells(cells), cells)
+    assert alone(np.array(cells, np.int64))
 
 
 def test_only_what_comes_and_goes_sweeps():
-    cells = door(0.0, np.pi / 2)
+    cells = door(0.0, np.pi / 2, length=9.0)
     (often,) = found(course(cells, True, (10, 12), (80, 82), count=5))
-    assert held(often.swept) == held(swept_cells(cells)) > held(cells)
+    assert often.resolution == RESOLUTION
+    assert held(often.swept) == held(swept_cells(cells, RESOLUTION)) > held(cells)
     (once,) = found(course(cells, True, (10, 12)))
     assert held(once.swept) == held(cells)

@@ -44,8 +44,23 @@ def test_what_left_stood_there_until_then():
     assert left_out(course(BOX, False, (40, 43))) == [*range(41)]
 
 
-def test_what_comes_and_goes_is_no_object_at_any_time():
-    assert left_out(course(BOX, False, (10, 12), (80, 82), count=5)) == [*range(100)]
+def test_a_door_is_no_object_at_any_time():
+    leaves = np.concatenate([block(10, 20, 9, 2), block(10, 20, 2, 9)])
+    door = course(leaves, False, (10, 12), (80, 82), count=5)
+    assert left_out(door, at=[1.75, 2.05]) == [*range(100)]
+    # who walks where it sweeps over is none of its leaf
+    assert left_out(door, at=[1.45, 2.55]) == []
+
+
+def test_what_comes_and_goes_without_being_a_door_may_be_people():
+    assert left_out(course(BOX, False, (10, 12), (80, 82), count=5)) == []
+
+
+def test_something_that_came_beside_them_takes_none_of_them_along():
+    wait = course(beside(6), False, (10, 12), (80, 82), count=5)
+    came = course(BOX, True, (40, 43))
+    assert left_out(came, wait, at=[1.85, 2.15]) == []
+    assert left_out(came, wait) == [*range(41, 100)]
 
 
 def test_who_walks_there_before_it_came_and_after_it_left_stays_an_object():

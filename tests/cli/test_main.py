@@ -6,6 +6,8 @@ import subprocess
 
 import pytest
 
+from stillmap.cli import main
+
 COMMANDS = [
     (),
     ("map",),
@@ -139,3 +141,28 @@ def test_a_defect_of_ours_exits_with_1(command):
     done = subprocess.run([command[0], "-c", program], capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     assert "RuntimeError: ours" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("stop", "status", "said"),
+    [
+        (KeyboardInterrupt(), 130, "stillmap: interrupted, nothing was half-written\n"),
+        (SystemExit(143), 143, ""),
+    ],
+)
+@pytest.mark.parametrize("cause", [True, False])
+def test_what_stopped_it_counts_and_not_the_error_made_of_it(
+    monkeypatch, capsys, stop, status, said, cause
+):
+    # as Python does where a class is made: its names are set within a module that is imported
+    def fail(_):
+        try:
+            raise stop
+        except BaseException as error:
+            if cause:
+                raise RuntimeError("while a class was made") from error
+            raise ValueError("while a file was closed")  # noqa: B904
+
+    monkeypatch.setattr("stillmap.cli.config.run", fail)
+    assert main(["config"]) == status
+    assert capsys.readouterr() == ("", said)

@@ -194,7 +194,7 @@ def test_labels_follow_from_the_map(seen, last, majority, state):
 
 
 def test_both_maps_are_of_the_same_courses(last, majority):
-    for name in em.Courses.__dataclass_fields__:
+    for name in set(em.Courses.__dataclass_fields__) - {"surface"}:
         one, other = getattr(last[1], name), getattr(majority[1], name)
         np.testing.assert_array_equal(one, other)
     assert last[0].likelihood == majority[0].likelihood

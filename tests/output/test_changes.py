@@ -19,6 +19,7 @@ from stillmap.output.report_changes import changes_section
 from stillmap.output.run_json import run_record
 
 S = 10**9
+RESOLUTION = 0.1
 COLOURS = {1: (20, 120, 60), 2: (190, 40, 120), 3: (40, 90, 200)}
 
 
@@ -28,11 +29,11 @@ def block(x, y, width, height):
 
 
 def change(result, kind, cells, *seconds, times=1):
-    x, y = ((cells.mean(axis=0) + 0.5) * 0.1).tolist()
-    width, height = ((np.ptp(cells, axis=0) + 1) * 0.1).tolist()
+    x, y = ((cells.mean(axis=0) + 0.5) * RESOLUTION).tolist()
+    width, height = ((np.ptp(cells, axis=0) + 1) * RESOLUTION).tolist()
     start = int(result.recording.stamp_ns[0])
     before, stamp, last = (start + round(s * S) for s in seconds)
-    return Change(kind, x, y, (width, height), cells, before, stamp, last, times)
+    return Change(kind, x, y, (width, height), cells, RESOLUTION, before, stamp, last, times)
 
 
 @pytest.fixture(scope="module")
@@ -57,10 +58,21 @@ def layer(result, cells):
 
 def test_the_layer_says_how_a_place_changed(changed):
     assert layer(changed, block(10, 20, 2, 3)) == {1}
-    assert layer(changed, block(60, 30, 18, 3)) == {3}  # also what lies between
+    assert layer(changed, block(60, 30, 6, 3)) == layer(changed, block(72, 30, 6, 3)) == {3}
+    assert layer(changed, block(66, 30, 6, 3)) == {0}  # what lies between may be anything
     assert layer(changed, block(9, 20, 1, 3)) == layer(changed, block(16, 20, 1, 3)) == {0}
     counts = np.bincount(changed_cells(changed.map, changed.changes).ravel())
-    assert counts[1:].tolist() == [6, 12, 54]
+    assert counts[1:].tolist() == [6, 12, 36]
+
+
+def test_the_layer_holds_all_that_a_door_sweeps_over(result):
+    leaves = np.concatenate([block(60, 30, 10, 2), block(60, 32, 2, 8)])
+    one = change(result, "comes and goes", leaves, 4.0, 5.25, 4000.0, times=7)
+    swung = dataclasses.replace(result, changes=[one])
+    assert layer(swung, leaves) == layer(swung, block(61, 31, 6, 6)) == {3}
+    assert layer(swung, block(69, 39, 3, 3)) == {0}
+    (listed,) = run_record(swung)["changes"]
+    assert listed["cells"] == len(leaves)  # those that changed
 
 
 def test_the_last_of_several_changes_is_told(changed):
@@ -108,7 +120,7 @@ def test_run_json_lists_every_change(changed):
     assert [one["kind"] for one in listed] == ["came", "comes and goes", "left"]
     assert listed[1]["times"] == 7
     assert listed[1]["last_ns"] == start + 4000 * S
-    assert listed[1]["cells"] == 36  # those that changed, not what lies between
+    assert listed[1]["cells"] == 36
 
 
 def test_run_json_of_a_place_that_did_not_change(result):
@@ -192,7 +204,7 @@ def test_the_picture_has_the_cells_in_their_colours(changed):
     colours, counts = np.unique(solid, axis=0, return_counts=True)
     found = dict(zip(map(tuple, colours.tolist()), counts.tolist(), strict=True))
     # a pixel is a cell: the map is small
-    assert found == {COLOURS[1]: 6, COLOURS[2]: 12, COLOURS[3]: 54}
+    assert found == {COLOURS[1]: 6, COLOURS[2]: 12, COLOURS[3]: 36}
 
 
 def test_every_number_stands_beside_its_place(changed):

@@ -2,8 +2,9 @@ import dataclasses
 import zipfile
 
 import numpy as np
+import pytest
 
-from stillmap.output.map_npz import write_map_npz
+from stillmap.output.map_npz import write_map_npz, write_npz
 
 
 def test_content(tmp_path, result):
@@ -42,3 +43,20 @@ def test_equal_maps_give_equal_bytes_whatever_their_layout(tmp_path, result):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     with zipfile.ZipFile(tmp_path / "a.npz") as archive:
         assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+
+
+@pytest.mark.parametrize("stopped", [KeyboardInterrupt, SystemExit, OSError("disk full")])
+@pytest.mark.parametrize("within", ["_get_compressor", "_ZipWriteFile.write"])
+def test_whatever_stops_it_is_what_is_said(tmp_path, monkeypatch, stopped, within):
+    # Ctrl-C while an array is half open must not turn into an error about that
+    done = []
+
+    def stop(*_):
+        done.append(True)
+        raise stopped
+
+    monkeypatch.setattr(f"zipfile.{within}", stop)
+    with pytest.raises(BaseException) as caught:  # noqa: PT011
+        write_npz(tmp_path / "a.npz", {"a": np.zeros(3), "b": np.zeros(3)})
+    assert caught.type is (stopped if isinstance(stopped, type) else type(stopped))
+    assert done == [True]

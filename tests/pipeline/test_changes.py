@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import stillmap
+from stillmap import em
 from stillmap.options import replaced
 from stillmap.output.map_npz import CHANGED, changed_cells
 from stillmap.pipeline import Options
@@ -51,8 +52,9 @@ def world():
 
 
 @functools.cache
-def built(state="last", threads=1):
-    chosen = {"threads": threads, "output": {"map_state": state}, "em": {"max_iterations": 2}}
+def built(state="last", threads=1, changes=True):
+    loop = {"max_iterations": 2, "changes": {"enabled": changes}}
+    chosen = {"threads": threads, "output": {"map_state": state}, "em": loop}
     options = replaced(Options(), chosen)
     return stillmap.build(world().recording, options, poses=world().truth.T_world_base)
 
@@ -110,6 +112,24 @@ def test_labels_are_those_of_the_map_shown():
         p = built(state).p_static
         assert np.median(p[crate & (when < 90)]) == pytest.approx(before, abs=0.2)
         assert np.median(p[crate & (when > 90)]) == pytest.approx(after, abs=0.2)
+
+
+def test_what_is_not_listed_stays_what_the_loop_said():
+    result, loop = built(), built(changes=False)
+    last, courses = em.last_e_step(
+        result.seen, result.poses, result.map.resolution, result.options.em, "last"
+    )
+    cells = {tuple(cell) for one in result.changes for cell in one.cells.tolist()}
+    element = courses.surface.elements_of(
+        result.seen.points, result.seen.hit, result.seen.offset,
+        result.seen.T_map_sensor(result.poses),
+    )  # fmt: skip
+    of_cells = np.array([tuple(cell) in cells for cell in courses.cells.tolist()])
+    there = (element >= 0) & of_cells[element]
+    assert 0.01 < there.mean() < 0.3
+    np.testing.assert_array_equal(result.p_static, np.where(there, last.p_static, loop.p_static))
+    assert (result.p_static != loop.p_static).mean() > 0.01
+    assert result.learned == {**loop.learned, "changing": last.learned["changing"]}
 
 
 def test_a_crate_is_no_object_on_its_way_and_people_are():
@@ -172,8 +192,6 @@ def test_it_takes_its_time_in_a_stage_of_its_own():
 
 
 def test_they_may_be_left_alone():
-    chosen = {"threads": 1, "em": {"max_iterations": 1, "changes": {"enabled": False}}}
-    options = replaced(Options(), chosen)
-    result = stillmap.build(world().recording, options, poses=world().truth.T_world_base)
+    result = built(changes=False)
     assert result.changes == []
     assert "changing" not in result.learned

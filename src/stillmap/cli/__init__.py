@@ -65,8 +65,7 @@ def main(argv: list[str] | None = None) -> int:
         say(str(error))
         return EXIT_INPUT
     except KeyboardInterrupt:
-        say("interrupted, nothing was half-written")
-        return EXIT_INTERRUPTED
+        return _interrupted()
     except BrokenPipeError:
         # the reader of our output has gone: nothing more can be said, and nothing is wrong
         _drop_stdout()
@@ -75,6 +74,23 @@ def main(argv: list[str] | None = None) -> int:
         say(str(error))  # a full disk behind stdout, a file that vanished while it was read
         _drop_stdout()
         return EXIT_INPUT
+    except Exception as error:
+        behind = _stopped_by(error)
+        if behind is None:
+            raise
+        return EXIT_TERMINATED if isinstance(behind, SystemExit) else _interrupted()
+
+
+def _stopped_by(error: BaseException | None) -> BaseException | None:
+    """The Ctrl-C or SIGTERM behind an error: a module that is just being imported hides them."""
+    while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
+        error = error.__cause__ or error.__context__
+    return error
+
+
+def _interrupted() -> int:
+    say("interrupted, nothing was half-written")
+    return EXIT_INTERRUPTED
 
 
 def _flush_stdout() -> None:

@@ -60,7 +60,14 @@ def write_npz(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     """Write arrays by their names. Equal ones give equal bytes: the archive's dates are fixed."""
     # most cells of most maps are alike: a tenth of the size, and quicker than writing them all;
     # beyond level 1 it takes three times as long for a few percent
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, array, allow_pickle=False)
+    with path.open("wb") as whole:
+        archive = zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+        try:
+            for name, array in arrays.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                    np.lib.format.write_array(file, array, allow_pickle=False)
+        except BaseException:
+            # closing an archive fails while an array is half open, and would hide why
+            archive.fp = None
+            raise
+        archive.close()
