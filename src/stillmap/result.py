@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap import _core, em, pipeline, slam
 from stillmap.cautions import cautions
-from stillmap.changes import Change, changed_places, relabelled, without_changes
+from stillmap.changes import Change, beams_on_things, changed_places, relabelled
 from stillmap.objects import MovingObject, Traffic, moving_objects, traffic
 from stillmap.output.crops import Snapshot, Window, choose_window, snapshot
 from stillmap.output.points import dynamic_points
@@ -218,10 +218,11 @@ class _Run:
                 threads,
             )
         with stages.measure("objects"):
-            movers = without_changes(seen, kept.poses, kept.p_static, changes, filtered.resolution)
-            moving = moving_objects(seen, kept.poses, movers, self.options.objects)
+            moving = moving_objects(seen, kept.poses, kept.p_static, self.options.objects)
+            things = beams_on_things(seen, kept.poses, kept.p_static, changes, filtered.resolution)
+            moving = _without(moving, things)
             crossed = traffic(moving)
-            del seen, movers
+            del seen
         return Result(
             recording=recording,
             options=self.options,
@@ -313,6 +314,12 @@ class _Best:
             iteration.graph,
             iteration.no_return,
         )
+
+
+def _without(objects: list[MovingObject], things: NDArray[np.intp]) -> list[MovingObject]:
+    """The objects that are more than what stood somewhere, which is listed as a change."""
+    moved = [one for one in objects if 2 * np.isin(one.beams, things).sum() <= len(one.beams)]
+    return [dataclasses.replace(one, id=k) for k, one in enumerate(moved)]
 
 
 def _extent(grid: _core.Grid2D) -> Window:

@@ -63,21 +63,20 @@ class Change:
         return self.kind == "came"
 
 
-def without_changes(
+def beams_on_things(
     recording: Recording,
     poses: Float,
     p_static: NDArray[np.float32],
     changes: list[Change],
     resolution: float,
-) -> NDArray[np.float32]:
-    """(M,) p_static, but one for beams on what stood in a place while it stood there.
+) -> Index:
+    """(n,) the dynamic beams, rising, that ended where something stood that came or left.
 
-    It is listed as a change, and no object on its way. What comes and goes may be people who wait
-    there, unless it is a door.
+    What comes and goes may be people who wait there, unless it is a door.
     """
     beam = np.flatnonzero(recording.hit & (p_static < 0.5))
     if not changes or not len(beam):
-        return p_static
+        return np.empty(0, np.intp)
     scan = np.searchsorted(recording.offset, beam, side="right") - 1
     T = recording.T_map_sensor(poses)[scan]
     ends = np.einsum("nij,nj->ni", T[:, :2, :2], recording.points[beam]) + T[:, :2, 2]
@@ -93,9 +92,7 @@ def without_changes(
         near = np.zeros(tuple((high - low).tolist()), bool)
         near[tuple((change.cells - low).T)] = True
         stood[inside] |= binary_dilation(near, np.ones((3, 3), bool))[tuple((at[inside] - low).T)]
-    out = p_static.copy()
-    out[beam[stood]] = 1.0
-    return out
+    return beam[stood]
 
 
 def _stood(change: Change, changes: list[Change]) -> tuple[int, int]:
