@@ -282,3 +282,13 @@ def test_nothing_hit():
     expectations, found = last_e_step(watch([], 10), prior=0.8)
     assert len(found.cells) == len(found.shown("last")) == 0
     assert np.isfinite(expectations.p_static).all()
+
+
+def test_a_clock_that_leaps_by_decades_ends_nothing(seen):
+    stamps = seen.recording.stamp_ns - seen.recording.stamp_ns[0]
+    stamps[1:] += 17 * 10**17  # from 1970 on
+    leaping = replace(seen.recording, stamp_ns=stamps)
+    assert em.look_numbers(leaping, 0.5).max() < 2**31
+    found, courses = em.last_e_step(leaping, seen.poses, RESOLUTION, em.EmOptions(), "last")
+    assert np.isfinite(found.p_static[leaping.hit]).all()
+    assert (courses.count >= 0).all()

@@ -29,6 +29,7 @@ _PROMINENT = 0.1  # share of the richest cell's beams that noise alone hardly br
 _SWALLOWED = 4.0  # one in so many beams without a return through walls: none is trusted
 _BELIEVED = 0.5  # trust in beams without a return from which on they show free space
 _ROWS = 1 << 14
+_LAST_LOOK = 2**31 - 1  # as far as the core counts
 _EDGE = 0.15  # cells: how sharply a surface ends
 
 
@@ -167,9 +168,13 @@ def surface_of(recording: Recording, T_map_sensor: Float, resolution: float) -> 
 
 
 def look_numbers(recording: Recording, seconds: float) -> NDArray[np.int64]:
-    """(T,) the look of each scan: what was seen within it tells no more than a single glance."""
+    """(T,) the look of each scan: what was seen within it tells no more than a single glance.
+
+    A clock that leaps by decades makes one look of what comes after.
+    """
     since = recording.stamp_ns - recording.stamp_ns[0]
-    return np.asarray(since // max(round(seconds * 1e9), 1), dtype=np.int64)
+    number = since // max(round(seconds * 1e9), 1)
+    return np.asarray(np.minimum(number, _LAST_LOOK), dtype=np.int64)
 
 
 def _likelihood(
