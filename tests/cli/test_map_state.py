@@ -103,3 +103,18 @@ def test_another_state_is_refused(stillmap, moved, tmp_path):
     assert "'last'" in done.stderr or "last" in done.stderr
     assert "--map-state" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("state", "seen"), [("last", "as it was last seen"), ("majority", "as it was most")]
+)
+def test_it_says_how_many_places_changed(moved, tmp_path, capsys, state, seen):
+    words = ["map", moved, "-o", tmp_path / "out", "--map-state", state]
+    words += ["--poses", moved / "truth/trajectory.tum"]
+    assert main([str(word) for word in words]) == 0
+    n = len(json.loads((tmp_path / "out/run.json").read_text())["changes"])
+    assert n >= 1
+    places = "1 place changed meanwhile, the map shows it" if n == 1 else f"{n} places changed"
+    said = capsys.readouterr().err
+    assert places in said
+    assert seen in said

@@ -113,8 +113,18 @@ def _say(result: Result, output: Path) -> None:
         f"{result.recording.n_scans} scans, {counts['hits']} beams that hit something, "
         f"{100.0 * counts['dynamic'] / max(counts['hits'], 1):.1f} % of them dynamic",
         f"{len(result.iterations)} iterations, {end}, the best is {result.best_iteration}",
+        *_changed(result),
         *(f"warning: {warning}" for warning in result.warnings),
         f"wrote {output}: open {output / 'report.html'}",
     ]
     for line in lines:
         say(line)
+
+
+def _changed(result: Result) -> list[str]:
+    n = len(result.changes)
+    if not n:
+        return []
+    state = "as it was last seen" if result.options.output.map_state == "last" else "as it was most"
+    each = "it" if n == 1 else "each"
+    return [f"{n} place{'s' * (n > 1)} changed meanwhile, the map shows {each} {state}"]
