@@ -208,6 +208,22 @@ def test_map_with_people_in_it_and_another_as_reference(capsys, simulated, resul
     assert scores(capsys, "map", result, simulated, *again) == s
 
 
+def test_what_was_brought_and_is_still_there_is_no_ghost(capsys, simulated, tmp_path):
+    recording, there = folder.read(simulated), tmp_path / "there"
+    shutil.copytree(simulated, there)
+    T_world_base = np.load(there / "truth/T_world_base.npy")
+    out = tmp_path / "raw"
+    out.mkdir()
+    write_tum(out / "trajectory.tum", recording.stamp_ns, T_world_base)
+    write_map(out, recording, T_world_base, recording.hit)
+    everywhere = [(-4.0, y, 4.0, y) for y in np.arange(-3, 3, 0.05)]
+    np.save(there / "truth/lasting.npy", np.array(everywhere))
+    assert scores(capsys, "map", out, simulated)["ghost_cells"] > 10
+    assert scores(capsys, "map", out, there)["ghost_cells"] == 0
+    (there / "truth/lasting.npy").unlink()  # written before there were things
+    assert scores(capsys, "map", out, there)["ghost_cells"] > 10
+
+
 def test_map_that_lost_its_walls(capsys, simulated, result):
     with np.load(result / "map.npz") as archive:
         arrays = dict(archive)

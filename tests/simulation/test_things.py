@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,16 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.options import replaced
-from stillmap.simulation import Scene, Simulation, Stay, Thing, scene_by_name, simulate
+from stillmap.simulation import (
+    Scene,
+    Simulation,
+    Stay,
+    Thing,
+    load_truth,
+    scene_by_name,
+    simulate,
+    write_simulation,
+)
 from stillmap.simulation.free_space import distance_to_segment
 from stillmap.simulation.things import Things, standing
 from stillmap.simulation.walls import box
@@ -80,6 +90,17 @@ def test_beams_meet_a_thing_only_where_it_stands(end_points: EndPoints, sweep_ti
             inside = np.abs(gone - (stay.x, stay.y)) < (0.2, 0.2)
             assert not inside.all(axis=1).any()
     assert not truth.static[truth.mover >= 0].any()
+
+
+def test_what_is_there_at_the_end_lasts(tmp_path: Path) -> None:
+    run = yard()
+    faces = [standing(thing, thing.stays[-1]) for thing in (MOVED, BROUGHT)]
+    np.testing.assert_allclose(run.truth.lasting, np.concatenate(faces))
+    assert not len(yard(robot={"scans": 1}).truth.lasting)  # nothing has changed yet
+    write_simulation(run, tmp_path / "run")
+    np.testing.assert_array_equal(load_truth(tmp_path / "run").lasting, run.truth.lasting)
+    (tmp_path / "run/truth/lasting.npy").unlink()  # written before there were things
+    assert load_truth(tmp_path / "run").lasting.shape == (0, 4)
 
 
 def test_a_thing_that_never_changes_is_a_wall() -> None:

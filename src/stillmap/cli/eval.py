@@ -235,7 +235,9 @@ def _map(args: argparse.Namespace) -> Output:
         wanted = wall_cells_of_map(
             folders.read_grid(args.reference), walls, _alignment(args.reference, other)
         )
-    scores = map_scores(grid, walls, wanted, T_world_map)
+    # what was brought and is still there is no ghost
+    solid = np.concatenate([walls, truth.lasting()])
+    scores = map_scores(grid, solid, wanted, T_world_map)
     return scores.to_dict(), _map_lines(scores)
 
 

@@ -46,6 +46,13 @@ class Truth:
             raise InputError("holds no walls", where=str(path))
         return walls
 
+    def lasting(self) -> Float:
+        """(K, 4) the same of things that were moved or brought and are there at the end."""
+        path = self.folder / "truth/lasting.npy"
+        if not path.exists():  # of an earlier version
+            return np.empty((0, 4))
+        return _finite(path, _array(path, (None, 4), "f"))
+
     def poses(self) -> Float:
         """(T, 3, 3) T_world_base."""
         path = self.folder / "truth/T_world_base.npy"

@@ -79,7 +79,7 @@ def map_scores(grid: Grid, walls: Float, reference: Float, T_world_map: Float) -
 
     Args:
         grid: the map.
-        walls: (W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1.
+        walls: (W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1: all that the map may show.
         reference: (K, 2) centres, in the world frame, of wall cells that should be there: from
             `wall_cells_of_map` or `wall_cells_of_hits`.
         T_world_map: (3, 3), see `trajectory.align`.

@@ -67,7 +67,9 @@ def simulate(
     about = {**describe(scene, seed), "mover_kinds": motion.kinds}
     for name, scan in (("carried_at_scan", motion.carried), ("paused_at_scan", motion.paused)):
         about[name] = scan if scan < len(T_world_base) else None
-    truth = Truth(static, mover, T_world_base, walls, motion.poses, about)
+    faces = motion.things.faces[-1]
+    lasting = faces[np.any(faces[:, :2] != faces[:, 2:], axis=1)]
+    truth = Truth(static, mover, T_world_base, walls, motion.poses, about, lasting)
     return Simulation(scene, recording, truth)
 
 

@@ -1,7 +1,7 @@
 """What really happened in a simulation: read by evaluation, never by the mapping."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from stillmap.output.trajectory import write_tum
 
 FOLDER = "truth"
 _SCENE = "scene.json"
+_ARRAYS = ("static", "mover", "T_world_base", "walls", "movers")
+_LASTING = "lasting"  # not in folders of earlier versions
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +31,7 @@ class Truth:
             things; NaN where there is no such thing at that scan.
         scene: name, seed and all parameters, JSON-able; under `mover_kinds` what each mover is:
             "person", "door", "car", "forklift" or "thing".
+        lasting: (K, 4) faces of things that were moved or brought, where they stand at the end.
     """
 
     static: NDArray[np.bool_]
@@ -37,13 +40,14 @@ class Truth:
     walls: NDArray[np.float64]
     movers: NDArray[np.float64]
     scene: dict[str, Any]
+    lasting: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4)))
 
 
 def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None:
     """Write the `truth` folder into an existing folder."""
     inside = folder / FOLDER
     inside.mkdir()
-    for name in ("static", "mover", "T_world_base", "walls", "movers"):
+    for name in (*_ARRAYS, _LASTING):
         np.save(inside / f"{name}.npy", getattr(truth, name), allow_pickle=False)
     write_tum(inside / "trajectory.tum", stamp_ns, truth.T_world_base)
     (inside / _SCENE).write_text(json.dumps(truth.scene, indent=1) + "\n", encoding="utf-8")
@@ -65,7 +69,7 @@ def load_truth(path: str | Path) -> Truth:
     try:
         arrays = {
             name: np.load(folder / f"{name}.npy", allow_pickle=False)
-            for name in ("static", "mover", "T_world_base", "walls", "movers")
+            for name in (*_ARRAYS, *([_LASTING] if (folder / f"{_LASTING}.npy").exists() else []))
         }
         return Truth(**arrays, scene=json.loads((folder / _SCENE).read_text(encoding="utf-8")))
     except (OSError, ValueError, EOFError) as error:
