@@ -12,16 +12,15 @@ afterwards, with three beams of a scan, those are found that have a change of th
 afterwards. Changes where doors swing are true ones and are not counted.
 """
 
-import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 
 import numpy as np
 from cases import MOVED
-from common import Run, Scores, add_arguments, add_run_arguments, options_of, outcomes, runs_of
+from common import Run, Scores, options_of, rows_of
 from numpy.typing import NDArray
 from prepared import grid_of
-from tables import Column, Row, grouped, markdown
+from tables import Column, means_and_worst
 
 import stillmap
 from stillmap.changes import Change
@@ -56,29 +55,9 @@ COLUMNS = (
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    add_run_arguments(p, [MOVED])
-    add_arguments(p, [])
-    args = p.parse_args()
-    options_of("stillmap", args.set)  # refuses before hours have passed
-    runs = runs_of(args, ["stillmap"])
-    done = sorted(outcomes(_scored, runs, args.processes), key=lambda pair: runs.index(pair[0]))
-    rows: list[Row] = [{"case": run.case.name, **scores} for run, scores in done]
+    rows = rows_of(__doc__ or "", [MOVED], _scored)
     print("Means over seeds, in brackets the worst.\n")
-    print(table(rows))
-
-
-def table(rows: Iterable[Row]) -> str:
-    """A row for every case, and one for all of them."""
-    rows = list(rows)
-    lines = [
-        [name, *(column.mean_and_worst(some) for column in COLUMNS)]
-        for name, some in grouped(rows, lambda row: str(row["case"])).items()
-    ]
-    lines.append(["all", *(column.mean_and_worst(rows) for column in COLUMNS)])
-    return markdown(["case", *(column.title for column in COLUMNS)], lines)
+    print(means_and_worst(rows, COLUMNS))
 
 
 def _scored(run: Run) -> Scores:

@@ -76,6 +76,28 @@ def runs_of(args: argparse.Namespace, methods: Iterable[str]) -> list[Run]:
     return [Run(*triple, tuple(args.set), args.true_poses) for triple in triples]
 
 
+def rows_of(
+    doc: str, cases: Iterable[str], scored: Callable[[Run], Scores]
+) -> list[dict[str, Any]]:
+    """The scores of the default estimator in the runs that the command line wants.
+
+    Args:
+        doc: what the program is about, for its help.
+        cases: of these names or groups, if the command line names none.
+        scored: of one run; a function of a module, as other processes call it.
+    """
+    p = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_run_arguments(p, cases)
+    add_arguments(p, [])
+    args = p.parse_args()
+    options_of("stillmap", args.set)  # refuses before hours have passed
+    runs = runs_of(args, ["stillmap"])
+    done = sorted(outcomes(scored, runs, args.processes), key=lambda pair: runs.index(pair[0]))
+    return [{"case": run.case.name, **scores} for run, scores in done]
+
+
 def add_seed_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--seeds", choices=["tuning", "reporting"], default="tuning")
     p.add_argument("--n-seeds", type=int, default=len(TUNING), help="only the first so many")

@@ -9,12 +9,11 @@ not itself is occupied, while all the same it is known. Lift is the share of the
 of the known cells. Cost is the share of all CPU time of the job.
 """
 
-import argparse
 from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from common import Run, Scores, add_arguments, add_run_arguments, options_of, outcomes, runs_of
+from common import Run, Scores, options_of, rows_of
 from numpy.typing import NDArray
 from prepared import Prepared, grid_of, prepare
 from scipy.ndimage import binary_dilation
@@ -34,16 +33,7 @@ Bool = NDArray[np.bool_]
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    add_run_arguments(p, CASES)
-    add_arguments(p, [])
-    args = p.parse_args()
-    options_of("stillmap", args.set)  # refuses before hours have passed
-    runs = runs_of(args, ["stillmap"])
-    done = sorted(outcomes(_scored, runs, args.processes), key=lambda pair: runs.index(pair[0]))
-    rows: list[Row] = [{"case": run.case.name, **scores} for run, scores in done]
+    rows = rows_of(__doc__ or "", CASES, _scored)
     print(f"{by_case(rows)}\n\n{by_looks(rows)}")
 
 

@@ -11,16 +11,14 @@ of how often squares of the known floor were crossed, with how often movers cros
 were seen. Cost is the share of all CPU time of the job.
 """
 
-import argparse
-from collections.abc import Iterable
 from dataclasses import asdict
 
 import numpy as np
 from cases import POPULATED
-from common import Run, Scores, add_arguments, add_run_arguments, options_of, outcomes, runs_of
+from common import Run, Scores, options_of, rows_of
 from numpy.typing import NDArray
 from prepared import grid_of
-from tables import Column, Row, grouped, markdown
+from tables import Column, means_and_worst
 
 import stillmap
 from stillmap import se2
@@ -48,29 +46,9 @@ _SEEN = 0.6  # s for which a mover must be seen to have crossed a square
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    add_run_arguments(p, [POPULATED])
-    add_arguments(p, [])
-    args = p.parse_args()
-    options_of("stillmap", args.set)  # refuses before hours have passed
-    runs = runs_of(args, ["stillmap"])
-    done = sorted(outcomes(_scored, runs, args.processes), key=lambda pair: runs.index(pair[0]))
-    rows: list[Row] = [{"case": run.case.name, **scores} for run, scores in done]
+    rows = rows_of(__doc__ or "", [POPULATED], _scored)
     print("Means over seeds, in brackets the worst.\n")
-    print(table(rows))
-
-
-def table(rows: Iterable[Row]) -> str:
-    """A row for every case, and one for all of them."""
-    rows = list(rows)
-    lines = [
-        [name, *(column.mean_and_worst(some) for column in COLUMNS)]
-        for name, some in grouped(rows, lambda row: str(row["case"])).items()
-    ]
-    lines.append(["all", *(column.mean_and_worst(rows) for column in COLUMNS)])
-    return markdown(["case", *(column.title for column in COLUMNS)], lines)
+    print(means_and_worst(rows, COLUMNS))
 
 
 def _scored(run: Run) -> Scores:

@@ -101,3 +101,14 @@ def per_case(rows: Sequence[Row], columns: Sequence[Column]) -> str:
         for name, of_case in grouped(rows, lambda row: row["case"]).items()
     ]
     return markdown(["case", *(column.title for column in columns)], lines)
+
+
+def means_and_worst(rows: Iterable[Row], columns: Sequence[Column]) -> str:
+    """A line for every case, and one for all of them: means, and in brackets the worst."""
+    rows = list(rows)
+    groups = {**grouped(rows, lambda row: str(row["case"])), "all": rows}
+    lines = [
+        [name, *(column.mean_and_worst(some) for column in columns)]
+        for name, some in groups.items()
+    ]
+    return markdown(["case", *(column.title for column in columns)], lines)

@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from cases import Case
-from changes import COLUMNS, _of_things, _scored, beams_of, scores_of, stays_of, table
+from changes import COLUMNS, _of_things, _scored, beams_of, scores_of, stays_of
 from common import Run
+from tables import means_and_worst
 
 from stillmap.evaluation.changes import true_changes
 from stillmap.se2 import inverse, matrix
@@ -97,6 +98,8 @@ def test_a_run_is_scored_and_shown() -> None:
     scores = _scored(Run(case, 0, "stillmap", ("em.max_iterations=1",), True))
     assert 0.0 <= scores["old_occupied"] <= 1.0
     assert scores["ate"] == pytest.approx(0.0, abs=1e-9)
-    text = table([{"case": "a", **scores}, {"case": "b", **scores, "median_error": float("nan")}])
+    text = means_and_worst(
+        [{"case": "a", **scores}, {"case": "b", **scores, "median_error": float("nan")}], COLUMNS
+    )
     assert text.count("\n") == 4
     assert "nan" not in text
