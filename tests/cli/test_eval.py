@@ -220,7 +220,7 @@ def test_what_was_brought_and_is_still_there_is_no_ghost(capsys, simulated, tmp_
     np.save(there / "truth/lasting.npy", np.array(everywhere))
     assert scores(capsys, "map", out, simulated)["ghost_cells"] > 10
     assert scores(capsys, "map", out, there)["ghost_cells"] == 0
-    (there / "truth/lasting.npy").unlink()  # written before there were things
+    (there / "truth/lasting.npy").unlink()  # as where there are none
     assert scores(capsys, "map", out, there)["ghost_cells"] > 10
 
 

@@ -99,7 +99,7 @@ def test_what_is_there_at_the_end_lasts(tmp_path: Path) -> None:
     assert not len(yard(robot={"scans": 1}).truth.lasting)  # nothing has changed yet
     write_simulation(run, tmp_path / "run")
     np.testing.assert_array_equal(load_truth(tmp_path / "run").lasting, run.truth.lasting)
-    (tmp_path / "run/truth/lasting.npy").unlink()  # written before there were things
+    (tmp_path / "run/truth/lasting.npy").unlink()  # as where there are none
     assert load_truth(tmp_path / "run").lasting.shape == (0, 4)
 
 

@@ -49,7 +49,7 @@ class Truth:
     def lasting(self) -> Float:
         """(K, 4) the same of things that were moved or brought and are there at the end."""
         path = self.folder / "truth/lasting.npy"
-        if not path.exists():  # of an earlier version
+        if not path.exists():
             return np.empty((0, 4))
         return _finite(path, _array(path, (None, 4), "f"))
 

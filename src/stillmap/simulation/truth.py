@@ -14,7 +14,7 @@ from stillmap.output.trajectory import write_tum
 FOLDER = "truth"
 _SCENE = "scene.json"
 _ARRAYS = ("static", "mover", "T_world_base", "walls", "movers")
-_LASTING = "lasting"  # not in folders of earlier versions
+_LASTING = "lasting"  # only where there are any
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None
     """Write the `truth` folder into an existing folder."""
     inside = folder / FOLDER
     inside.mkdir()
-    for name in (*_ARRAYS, _LASTING):
+    for name in (*_ARRAYS, *([_LASTING] if len(truth.lasting) else [])):
         np.save(inside / f"{name}.npy", getattr(truth, name), allow_pickle=False)
     write_tum(inside / "trajectory.tum", stamp_ns, truth.T_world_base)
     (inside / _SCENE).write_text(json.dumps(truth.scene, indent=1) + "\n", encoding="utf-8")
