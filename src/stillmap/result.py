@@ -257,15 +257,23 @@ class _Run:
     def _settle(self, recording: Recording, threads: int) -> list[Change]:
         """The last E-step: labels of the map as it is shown, and the places that changed."""
         kept, options, cell = self.kept, self.options.em, self.options.slam.resolution
-        if kept.occupied is None or kept.no_return is None or not options.changes.enabled:
-            return []  # other estimators know of no courses
-        state = self.options.output.map_state
-        found, courses = em.last_e_step(recording, kept.poses, cell, options, state, threads)
+        if self.options.estimator != "stillmap" or not options.changes.enabled:
+            return []
+        if kept.occupied is None:
+            raise RuntimeError("the default estimator knows its cells")
+        courses = em.last_e_step(recording, kept.poses, cell, options, threads)
         changes = changed_places(courses, recording, cell, options.dwell.look, options.changes)
         p_static, occupied = relabelled(
-            recording, kept.poses, kept.p_static, kept.occupied, found, courses, changes, threads
+            recording,
+            kept.poses,
+            kept.p_static,
+            kept.occupied,
+            courses,
+            changes,
+            self.options.output.map_state,
+            threads,
         )
-        learned = {**kept.learned, "changing": found.learned["changing"]}
+        learned = {**kept.learned, "changing": round(courses.share, 6)}
         self.best = dataclasses.replace(kept, p_static=p_static, occupied=occupied, learned=learned)
         return changes
 

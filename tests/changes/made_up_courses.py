@@ -41,6 +41,9 @@ def course(
         occupied_share=np.full(n, share, np.float32),
         count=np.full(n, len(between) if count is None else count, np.int32),
         between=np.tile(np.array(ends, np.int32), (n, 1, 1)),
+        covered=np.ones(n, np.float32),
+        share=0.1,
+        surface=None,
     )
 
 
@@ -50,8 +53,10 @@ def together(*parts: em.Courses) -> em.Courses:
         **{
             name: np.concatenate([getattr(part, name) for part in parts])
             for name in em.Courses.__dataclass_fields__
-            if name != "surface"
-        }
+            if name not in ("share", "surface")
+        },
+        share=0.1,
+        surface=None,
     )
 
 

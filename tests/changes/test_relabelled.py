@@ -26,20 +26,25 @@ CHANGES = [change(cells) for cells in LISTED]
 
 @dataclass(frozen=True)
 class Known:
-    """A recording, the cells in which its beams end, and what two E-steps said of them."""
+    """A recording, the cells in which its beams end, what the loop said of them, and courses."""
 
     seen: Recording
     poses: np.ndarray
     ends: np.ndarray  # (M, 2) cells
     p_static: np.ndarray
     occupied: em.CellProbabilities
-    found: em.Expectations
     courses: em.Courses
 
-    def relabelled(self, changes=CHANGES, threads=1, **other):
-        said = {"occupied": self.occupied, "found": self.found, "courses": self.courses} | other
+    def relabelled(self, changes=CHANGES, state="last", threads=1, **other):
+        said = {"occupied": self.occupied, "courses": self.courses} | other
         return relabelled(
-            self.seen, self.poses, self.p_static, **said, changes=changes, threads=threads
+            self.seen,
+            self.poses,
+            self.p_static,
+            **said,
+            changes=changes,
+            state=state,
+            threads=threads,
         )
 
 
@@ -58,19 +63,22 @@ def known():
     seen = replace(recording(range(SCANS), BEAMS), points=points, hit=hit & usable)
     surface = surface_of(seen, seen.T_map_sensor(poses), RESOLUTION)
     cells = surface.elements()[0]
-    loop, last = rng.random((2, M)).astype(np.float32)
-    loop[~usable] = last[~usable] = np.nan
-    of_cells, of_last = rng.random((2, len(cells))).astype(np.float32)
+    loop = rng.random(M).astype(np.float32)
+    loop[~usable] = np.nan
+    of_cells, thing, share, covered = rng.random((4, len(cells))).astype(np.float32)
     return Known(
         seen,
         poses,
         ends,
         loop,
         em.CellProbabilities(cells, of_cells, 0.2),
-        em.Expectations(
-            last, em.Likelihood(0.0, 0.0), em.CellProbabilities(cells.copy(), of_last, 0.3)
+        replace(
+            course(cells, True, (10, 12)),
+            p_thing=thing,
+            occupied_share=share,
+            covered=covered,
+            surface=surface,
         ),
-        replace(course(cells, True, (10, 12)), surface=surface),
     )
 
 
@@ -80,22 +88,30 @@ def listed(cells):
     return np.array([tuple(cell) in those for cell in cells.tolist()])
 
 
-def test_labels_of_beams_that_end_there_are_those_of_the_last_e_step(known):
-    p_static, _ = known.relabelled()
+@pytest.mark.parametrize("state", ["last", "majority"])
+def test_labels_of_beams_that_end_there_are_what_is_shown(known, state):
+    p_static, _ = known.relabelled(state=state)
     there = listed(known.ends) & known.seen.hit
     assert 50 < there.sum() < 400
+    of_cell = dict(
+        zip(map(tuple, known.courses.cells.tolist()), known.courses.shown(state), strict=True)
+    )
+    shown = np.array([of_cell.get(tuple(cell), np.nan) for cell in known.ends.tolist()], np.float32)
     assert p_static.dtype == np.float32
-    np.testing.assert_array_equal(p_static, np.where(there, known.found.p_static, known.p_static))
+    np.testing.assert_array_equal(p_static, np.where(there, shown, known.p_static))
     assert np.isnan(p_static).sum() > 20
 
 
-def test_the_map_says_there_what_the_last_e_step_says(known):
-    _, occupied = known.relabelled()
+@pytest.mark.parametrize("state", ["last", "majority"])
+def test_the_map_says_there_what_is_shown_as_far_as_it_covers_the_cell(known, state):
+    _, occupied = known.relabelled(state=state)
     there = listed(known.occupied.cells)
     assert 15 < there.sum() < 30
-    expected = np.where(there, known.found.occupied.p_occupied, known.occupied.p_occupied)
+    shown = known.courses.shown(state) * known.courses.covered
     assert occupied.p_occupied.dtype == np.float32
-    np.testing.assert_array_equal(occupied.p_occupied, expected)
+    np.testing.assert_array_equal(
+        occupied.p_occupied, np.where(there, shown, known.occupied.p_occupied)
+    )
     np.testing.assert_array_equal(occupied.cells, known.occupied.cells)
     assert occupied.free_prior == known.occupied.free_prior
 
@@ -125,17 +141,6 @@ def test_the_order_of_the_changes_does_not_matter(known):
 
 def test_where_nothing_is_listed_nothing_is_touched(known):
     p_static, occupied = known.relabelled([])
-    assert p_static is known.p_static
-    assert occupied is known.occupied
-
-
-@pytest.mark.parametrize("without", ["occupied", "surface"])
-def test_where_the_last_e_step_knows_no_cells_nothing_is_touched(known, without):
-    other = {
-        "occupied": {"found": replace(known.found, occupied=None)},
-        "surface": {"courses": replace(known.courses, surface=None)},
-    }
-    p_static, occupied = known.relabelled(**other[without])
     assert p_static is known.p_static
     assert occupied is known.occupied
 

@@ -19,37 +19,40 @@ def relabelled(
     poses: Float,
     p_static: Labels,
     occupied: em.CellProbabilities,
-    found: em.Expectations,
     courses: em.Courses,
     changes: list[Change],
+    state: em.MapState,
     threads: int = 1,
 ) -> tuple[Labels, em.CellProbabilities]:
-    """(M,) labels and the cells of the map: in the cells of the changes those that were found.
+    """(M,) labels and the cells of the map: in the cells of the changes those of their courses.
 
-    Few cells change. In all others the last E-step says what the loop said, but for noise, and
-    what looks like a change without being listed as one is noise, too.
+    A beam's p_static is the probability that the map in this state shows what it met. Few cells
+    change. In all others the last E-step says what the loop said, but for noise, and what looks
+    like a change without being listed as one is noise, too.
 
     Args:
         recording: M beams.
         poses: (T, 3, 3) T_map_base.
         p_static, occupied: what the loop ended with.
-        found, courses: from the last E-step at the same poses.
+        courses: from the last E-step at the same poses.
         changes: from `changed_places`.
+        state: which state of places that changed is the map's.
         threads: same result with any number.
     """
-    if not changes or found.occupied is None or courses.surface is None:
+    if not changes:
         return p_static, occupied
-    listed = np.isin(_keys(courses.cells), _keys(np.concatenate([one.cells for one in changes])))
-    if not np.array_equal(occupied.cells, found.occupied.cells):
+    if not np.array_equal(occupied.cells, courses.cells):
         raise ValueError("occupied: expected the cells of the last E-step")
-    out, T_map_sensor = p_static.copy(), recording.T_map_sensor(poses)
+    listed = np.isin(_keys(courses.cells), _keys(np.concatenate([one.cells for one in changes])))
+    shown, out, T_map_sensor = courses.shown(state), p_static.copy(), recording.T_map_sensor(poses)
     for scans, beams, offset in chunks(recording):
         element = courses.surface.elements_of(
             recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans], threads
         )
-        inside = (element >= 0) & listed[element]
-        out[beams][inside] = found.p_static[beams][inside]
-    p_occupied = np.where(listed, found.occupied.p_occupied, occupied.p_occupied)
+        ended = np.flatnonzero(element >= 0)
+        ended = ended[listed[element[ended]]]
+        out[beams][ended] = shown[element[ended]]
+    p_occupied = np.where(listed, shown * courses.covered, occupied.p_occupied)
     return out, dataclasses.replace(occupied, p_occupied=p_occupied)
 
 

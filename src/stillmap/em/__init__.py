@@ -1,6 +1,6 @@
 """What is static: the E-steps, the map that follows from them, and the likelihood. No I/O."""
 
-from stillmap.em.courses import Courses, MapState, last_e_step
+from stillmap.em.courses import Courses, last_e_step
 from stillmap.em.dwell import look_numbers
 from stillmap.em.estimator import (
     Estimator,
@@ -16,7 +16,7 @@ from stillmap.em.evidence import Evidence, evidence
 from stillmap.em.expectations import CellProbabilities, Expectations, Likelihood, NoReturn
 from stillmap.em.held_out import held_out_log_likelihood
 from stillmap.em.occupancy import Box, OccupancyMap, Seen, occupancy_map
-from stillmap.em.options import ChangeOptions, DwellOptions, EmOptions, EvidenceOptions
+from stillmap.em.options import ChangeOptions, DwellOptions, EmOptions, EvidenceOptions, MapState
 
 __all__ = [
     "Box",

@@ -2,19 +2,15 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.em.dwell import Classes, Dwell, Float, Looks, Surface, expectations, looked_at
-from stillmap.em.expectations import Expectations
+from stillmap.em.dwell import Classes, Dwell, Float, Looks, Surface, coverage, looked_at
 from stillmap.em.mixture import fit_shares, posterior_static
-from stillmap.em.options import ChangeOptions, EmOptions
+from stillmap.em.options import ChangeOptions, EmOptions, MapState
 from stillmap.em.together import components, pairs_near
 from stillmap.recording.model import Recording
-
-MapState = Literal["last", "majority"]
 
 # who stays for longer than these came to stay
 _CLASSES = Classes(mover_seconds=(0.5, 3.0, 6.0, 12.0), often_seconds=(8.0, 24.0))
@@ -41,7 +37,9 @@ class Courses:
         count: (E,) int32, how often a thing came or left.
         between: (E, 2, 2) int32, looks before and after the first and the last of these changes;
             -1: there was none.
-        surface: the cells as elements of surface, which beams can be asked for.
+        covered: (E,) float32, probability that what is there runs through the cell itself.
+        share: of the cells, in which things came to stay or left.
+        surface: the cells as elements, for beams to be asked which they ended in.
     """
 
     cells: NDArray[np.int64]
@@ -51,7 +49,9 @@ class Courses:
     occupied_share: NDArray[np.float32]
     count: NDArray[np.int32]
     between: NDArray[np.int32]
-    surface: Surface | None = None
+    covered: NDArray[np.float32]
+    share: float
+    surface: Surface
 
     def shown(self, state: MapState) -> NDArray[np.float32]:
         """(E,) probability that the map has something there.
@@ -64,51 +64,48 @@ class Courses:
 
 
 def last_e_step(
-    recording: Recording,
-    poses: Float,
-    resolution: float,
-    options: EmOptions,
-    state: MapState,
-    threads: int = 1,
-) -> tuple[Expectations, Courses]:
+    recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int = 1
+) -> Courses:
     """The E-step once more, with one more class: what came to stay or left.
 
-    A beam's p_static is the probability that the map in this state shows what it met.
-
-    Args: see `dwell.e_step`; `state` says which state of places that changed is the map's.
+    Args: see `dwell.e_step`.
     """
-    T_map_sensor = recording.T_map_sensor(poses)
 
     def watch(dwell: Dwell) -> None:
         dwell.watch(**_model(recording, options))
 
-    looks = looked_at(recording, T_map_sensor, resolution, options, threads, _CLASSES, watch)
+    looks = looked_at(
+        recording,
+        recording.T_map_sensor(poses),
+        resolution,
+        options,
+        threads,
+        _CLASSES,
+        watch,
+    )
     log_changing, occupied_share, p_last, count, between = looks.dwell.changes()
-    looks = _with_changing(looks, log_changing)
-    n = looks.classes.n_static
-    shares = fit_shares(looks.likelihood, n, options.prior)
+    likelihood = _with_changing(looks, log_changing)
+    shares = fit_shares(likelihood, _CLASSES.n_static, options.prior)
     weights = shares.classes.astype(np.float32)
-    often = slice(-1 - len(looks.classes.often_seconds), -1)
-    stays = looks.likelihood[:, -1] * weights[-1]
-    goes = np.einsum("kc,c->k", looks.likelihood[:, often], weights[often])
+    often = slice(-1 - len(_CLASSES.often_seconds), -1)
+    stays = likelihood[:, -1] * weights[-1]
+    goes = np.einsum("kc,c->k", likelihood[:, often], weights[often])
     of = (goes > stays).astype(np.intp)  # what comes and goes does not stay long enough for a thing
     each = np.arange(len(of))
-    courses = Courses(
-        cells=looks.surface.elements()[0],
-        p_static=posterior_static(looks.likelihood, shares.classes, n),
-        p_changing=(stays + goes) / np.einsum("kc,c->k", looks.likelihood, weights),
-        p_thing=p_last[each, of],
-        occupied_share=occupied_share,
-        count=count[each, of],
-        between=between[each, of],
-        surface=looks.surface,
+    return _as_wholes(
+        Courses(
+            cells=looks.surface.elements()[0],
+            p_static=posterior_static(likelihood, shares.classes, _CLASSES.n_static),
+            p_changing=(stays + goes) / np.einsum("kc,c->k", likelihood, weights),
+            p_thing=p_last[each, of],
+            occupied_share=occupied_share,
+            count=count[each, of],
+            between=between[each, of],
+            covered=coverage(looks.surface),
+            share=float(shares.classes[-1]),
+            surface=looks.surface,
+        )
     )
-    courses = _as_wholes(courses)
-    found = expectations(
-        recording, T_map_sensor, looks, shares, courses.shown(state), options, threads
-    )
-    found.learned["changing"] = round(float(shares.classes[-1]), 6)
-    return found, courses
 
 
 def _as_wholes(courses: Courses) -> Courses:
@@ -146,12 +143,9 @@ def _model(recording: Recording, options: EmOptions) -> dict[str, float]:
     }
 
 
-def _with_changing(looks: Looks, log_changing: Float) -> Looks:
-    """The likelihoods with that of the changing class as their last column, relative as before."""
+def _with_changing(looks: Looks, log_changing: Float) -> NDArray[np.float32]:
+    """(E, C + 1) the likelihoods with that of the changing class last, relative as before."""
     above = np.minimum(log_changing - looks.log_best, _MOST_NATS)
-    best = np.maximum(above, 0.0)
     table = np.column_stack([looks.likelihood, np.exp(above).astype(np.float32)])
-    table /= np.exp(best).astype(np.float32)[:, None]
-    return Looks(
-        looks.surface, looks.dwell, looks.trust, table, looks.log_best + best, looks.classes
-    )
+    table /= np.exp(np.maximum(above, 0.0)).astype(np.float32)[:, None]
+    return table

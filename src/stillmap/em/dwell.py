@@ -89,7 +89,15 @@ def e_step(
     looks = looked_at(recording, T_map_sensor, resolution, options, threads, classes)
     shares = fit_shares(looks.likelihood, classes.n_static, options.prior)
     static = posterior_static(looks.likelihood, shares.classes, classes.n_static)
-    return expectations(recording, T_map_sensor, looks, shares, static, options, threads)
+    surface = looks.surface
+    beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
+    return Expectations(
+        p_static=_of_beams(recording, T_map_sensor, surface, static, shares.static, threads),
+        likelihood=_bound(looks.likelihood, looks.log_best, shares),
+        occupied=CellProbabilities(surface.elements()[0], static * coverage(surface), _UNSEEN),
+        learned=_learned(surface, looks.trust, shares, classes),
+        no_return=NoReturn(looks.dwell.solid(), beyond),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +109,6 @@ class Looks:
         dwell: what was seen of them.
         trust: how far beams without a return are believed, from 0 to 1.
         likelihood: (E, C) under each class, relative to the best; its logarithm is `log_best`.
-        classes: those of the first columns.
     """
 
     surface: Surface
@@ -109,7 +116,6 @@ class Looks:
     trust: float
     likelihood: NDArray[np.float32]
     log_best: Float
-    classes: Classes
 
 
 def looked_at(
@@ -129,30 +135,19 @@ def looked_at(
     if prepare is not None:
         prepare(dwell)
     likelihood, log_best = _likelihood(recording, T_map_sensor, dwell, options.dwell.look, threads)
-    return Looks(surface, dwell, trust, likelihood, log_best, classes)
+    return Looks(surface, dwell, trust, likelihood, log_best)
 
 
-def expectations(
-    recording: Recording,
-    T_map_sensor: Float,
-    looks: Looks,
-    shares: Shares,
-    static: NDArray[np.float32],
-    options: EmOptions,
-    threads: int,
-) -> Expectations:
-    """What follows for beams and cells from what is known (E,) of the elements. See `e_step`."""
-    surface = looks.surface
-    cells, _, normals, off_plane, prominence, _ = surface.elements()
-    covered = _coverage(normals, off_plane / surface.resolution, prominence)
-    beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
-    return Expectations(
-        p_static=_of_beams(recording, T_map_sensor, surface, static, shares.static, threads),
-        likelihood=_bound(looks.likelihood, looks.log_best, shares),
-        occupied=CellProbabilities(cells, static * covered, _UNSEEN),
-        learned=_learned(surface, looks.trust, shares, looks.classes),
-        no_return=NoReturn(looks.dwell.solid(), beyond),
-    )
+def coverage(surface: Surface) -> NDArray[np.float32]:
+    """(E,) P(what is there runs through the cell itself): noise also fills cells beside it."""
+    from scipy.special import ndtr  # takes long to load
+
+    _, _, normals, off_plane, prominence, _ = surface.elements()
+    # of the cell, across the surface; a wall on the border of two cells belongs to both
+    half = 0.5 * np.abs(normals).sum(axis=1) + _EDGE
+    covered = ndtr((half - np.abs(off_plane / surface.resolution)) / _EDGE)
+    lone = np.minimum(prominence / _PROMINENT, 1.0)
+    return np.asarray(np.where(normals.any(axis=1), covered, lone), dtype=np.float32)
 
 
 def surface_of(recording: Recording, T_map_sensor: Float, resolution: float) -> Surface:
@@ -258,22 +253,9 @@ def _bound(likelihood: NDArray[np.float32], log_best: Float, shares: Shares) -> 
     return Likelihood(expected=bound - entropy, bound=bound)
 
 
-def _coverage(normals: Float, off_plane: Float, prominence: Float) -> NDArray[np.float32]:
-    """P(what is there runs through the cell itself): noise also fills cells beside it."""
-    from scipy.special import ndtr  # takes long to load
-
-    # of the cell, across the surface; a wall on the border of two cells belongs to both
-    half = 0.5 * np.abs(normals).sum(axis=1) + _EDGE
-    covered = ndtr((half - np.abs(off_plane)) / _EDGE)
-    lone = np.minimum(prominence / _PROMINENT, 1.0)
-    return np.asarray(np.where(normals.any(axis=1), covered, lone), dtype=np.float32)
-
-
 def _learned(surface: Surface, trust: float, shares: Shares, classes: Classes) -> dict[str, object]:
     n = classes.n_static
-    last = n + len(classes.mover_occupied) * len(classes.mover_seconds)
-    of_movers = shares.classes[n:last]
-    movers = of_movers.reshape(len(classes.mover_seconds), -1) / of_movers.sum()
+    movers = shares.classes[n:].reshape(len(classes.mover_seconds), -1) / shares.classes[n:].sum()
     static = shares.classes[:n].reshape(len(classes.static_seconds), -1) / shares.static
     return {
         "scatter": surface.scatter,

@@ -1,9 +1,13 @@
 """Options of the loop and of its estimators."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from stillmap.em.tracker.options import TrackerOptions
 from stillmap.options import field_with_doc
+
+# of places that changed: as they were last, or as they were for most of the time
+MapState = Literal["last", "majority"]
 
 
 @dataclass(frozen=True)

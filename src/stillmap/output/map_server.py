@@ -9,13 +9,13 @@ import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.em.options import MapState
 from stillmap.options import field_with_doc
 
 if TYPE_CHECKING:
     from stillmap.output.protocols import MapLike
 
 MapMode = Literal["trinary", "scale", "raw"]
-MapState = Literal["last", "majority"]
 
 OCCUPIED_THRESH = 0.65
 # map_server reads pixel 205 as p = 50 / 255 = 0.19608: any larger threshold turns unknown into free

@@ -244,7 +244,7 @@ class ChangeLike(Protocol):
         x, y: metres, its middle in the map frame.
         size: metres along x and y.
         cells: (K, 2) int64 cells that changed.
-        swept: (S, 2) int64 cells of the whole place: these and what lies between.
+        swept: (S, 2) int64 cells of the whole place: of a door all that it sweeps.
         before_ns, stamp_ns: last scan that saw it as it was, first that saw it otherwise.
         last_ns: first scan that saw the last change.
         times: how often it changed.
