@@ -77,9 +77,7 @@ def beams_on_things(
     beam = np.flatnonzero(recording.hit & (p_static < 0.5))
     if not changes or not len(beam):
         return np.empty(0, np.intp)
-    scan = np.searchsorted(recording.offset, beam, side="right") - 1
-    T = recording.T_map_sensor(poses)[scan]
-    ends = np.einsum("nij,nj->ni", T[:, :2, :2], recording.points[beam]) + T[:, :2, 2]
+    ends, scan = recording.end_points(beam, poses), recording.scans_of(beam)
     at, stamp = np.floor(ends / resolution).astype(np.int64), recording.stamp_ns[scan]
     stood = np.zeros(len(beam), bool)
     for change in changes:

@@ -61,11 +61,7 @@ class Truth:
     def static_hits(self) -> Float:
         """(N, 2) end points in the world frame, at true poses, of the static beams that hit."""
         use = np.flatnonzero(self.recording.hit & self.static())
-        points = self.recording.points[use].astype(np.float64)
-        scan = np.searchsorted(self.recording.offset, use, side="right") - 1
-        T = self.recording.T_map_sensor(self.poses())[scan]
-        world: Float = np.einsum("nij,nj->ni", T[:, :2, :2], points) + T[:, :2, 2]
-        return world
+        return self.recording.end_points(use, self.poses())
 
 
 def read_truth(path: Path) -> Truth:

@@ -51,19 +51,15 @@ def moving_points(
     # a scan's stamps may go backwards where clocks jump; time does not
     seconds = np.maximum.accumulate(1e-9 * (recording.stamp_ns - recording.stamp_ns[:1]))
     beam = np.flatnonzero(recording.hit & (p_static <= 1.0 - options.dynamic))
-    scan = np.searchsorted(recording.offset, beam, side="right") - 1
-    points = recording.points[beam].astype(np.float64)
-    T_map_sensor = recording.T_map_sensor(poses)
-    T = T_map_sensor[scan]
-    xy = np.einsum("nij,nj->ni", T[:, :2, :2], points) + T[:, :2, 2]
-    distance = np.linalg.norm(points, axis=1)
+    scan, xy = recording.scans_of(beam), recording.end_points(beam, poses)
+    distance = np.linalg.norm(recording.points[beam].astype(np.float64), axis=1)
     return MovingPoints(
         seconds,
         scan,
         beam,
         xy,
         distance,
-        T_map_sensor[:, :2, 2],
+        recording.T_map_sensor(poses)[:, :2, 2],
         _clusters(scan, xy, distance, options),
         np.searchsorted(scan, np.arange(recording.n_scans + 1)),
     )

@@ -21,12 +21,10 @@ def write_objects(folder: Path, result: ResultLike) -> None:
     text = "[\n" + ",\n".join(lines) + "\n]\n" if lines else "[]\n"
     (folder / "objects.json").write_text(text, encoding="utf-8")
     recording = result.seen
-    T_map_sensor = recording.T_map_sensor(result.poses)
     for one in result.objects:
-        scan = np.searchsorted(recording.offset, one.beams, side="right") - 1
-        T, points = T_map_sensor[scan], recording.points[one.beams].astype(np.float64)
-        xy = np.einsum("nij,nj->ni", T[:, :2, :2], points) + T[:, :2, 2]
-        seconds = 1e-9 * (recording.stamp_ns[scan] - one.stamp_ns[0])
+        xy = recording.end_points(one.beams, result.poses)
+        stamps = recording.stamp_ns[recording.scans_of(one.beams)]
+        seconds = 1e-9 * (stamps - one.stamp_ns[0])
         write_ply(folder / f"{one.id:04d}.ply", xy, seconds, 1.0 - result.p_static[one.beams])
 
 

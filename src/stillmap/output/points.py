@@ -49,13 +49,7 @@ def dynamic_points(
         (K, D) float32 in metres, in the recording's order, K <= limit.
     """
     beams = _dynamic_beams(recording, p_static, threshold, limit)
-    scan = np.searchsorted(recording.offset, beams, side="right") - 1
-    T_map_sensor = recording.T_map_sensor(poses)
-    D = recording.dimension
-    points = recording.points[beams].astype(np.float64)
-    R, t = T_map_sensor[scan, :D, :D], T_map_sensor[scan, :D, D]
-    world: NDArray[np.float64] = np.einsum("kij,kj->ki", R, points) + t
-    return world.astype(np.float32)
+    return recording.end_points(beams, poses).astype(np.float32)
 
 
 def _dynamic_beams(

@@ -77,6 +77,21 @@ class Recording:
         """Sensor poses (T, D+1, D+1) that belong to robot poses (T, D+1, D+1)."""
         return T_map_base @ self.T_base_sensor[self.sensor]
 
+    def scans_of(self, beams: NDArray[np.intp]) -> NDArray[np.intp]:
+        """(n,) the scans that beams (n,) belong to."""
+        return np.searchsorted(self.offset, beams, side="right") - 1
+
+    def end_points(
+        self, beams: NDArray[np.intp], T_map_base: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(n, D) where beams (n,) ended, metres in the map frame, at robot poses (T, D+1, D+1)."""
+        D, scan = self.dimension, self.scans_of(beams)
+        # beams may be few: only the scans that they are of
+        T = T_map_base[scan] @ self.T_base_sensor[self.sensor[scan]]
+        points = self.points[beams].astype(np.float64)
+        ends: NDArray[np.float64] = np.einsum("nij,nj->ni", T[:, :D, :D], points) + T[:, :D, D]
+        return ends
+
     def without_odometry(self) -> "Recording":
         """The same recording as if no odometry had been recorded."""
         return replace(self, T_odom_base=None)
