@@ -13,83 +13,112 @@ from stillmap.recording.options import ReadOptions
 
 _HEAD = 1 << 16  # bytes looked at to tell what a file is
 
+Reader = Callable[[Path, ReadOptions, Progress | None, Path | None], Recording]
+
 
 class Format(NamedTuple):
-    """A format: suffixes of its files, whether first bytes look like it, its reader."""
+    """A format.
+
+    Attributes:
+        name: for people.
+        endings: of names of such files or folders, for people and where the content does not tell.
+        is_one: whether a file with these first bytes, or a folder (None), is of the format.
+        read: of a path, options, progress and the folder for what does not fit into memory.
+    """
 
     name: str
-    suffixes: tuple[str, ...]
-    sniff: Callable[[bytes], bool]
-    read: Callable[[Path, ReadOptions, Progress | None], Recording]
+    endings: tuple[str, ...]
+    is_one: Callable[[Path, bytes | None], bool]
+    read: Reader
 
 
-def _looks_like_carmen(text: bytes) -> bool:
+def _is_carmen(path: Path, text: bytes | None) -> bool:  # noqa: ARG001
     words = {*SCAN_PARSERS, b"ODOM", b"PARAM"}
-    first_words = (line.split(maxsplit=1)[:1] for line in text.splitlines())
+    first_words = (line.split(maxsplit=1)[:1] for line in (text or b"").splitlines())
     return any(word in words for first in first_words for word in first)
 
 
+def _is_folder_of_ours(path: Path, text: bytes | None) -> bool:
+    return path.name == folder.HEADER if text is not None else (path / folder.HEADER).is_file()
+
+
+def _read_folder_of_ours(
+    path: Path,
+    options: ReadOptions,
+    progress: Progress | None,  # noqa: ARG001
+    scratch: Path | None,  # noqa: ARG001
+) -> Recording:
+    return limits.applied(folder.read(path if path.is_dir() else path.parent), options)
+
+
 FORMATS = (
+    Format("stillmap recording", (folder.HEADER,), _is_folder_of_ours, _read_folder_of_ours),
     Format(
         "CARMEN log",
         (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz"),
-        _looks_like_carmen,
-        carmen.read,
+        _is_carmen,
+        lambda path, options, progress, _: carmen.read(path, options, progress),
     ),
 )
 
 
 def read(
-    path: str | Path, options: ReadOptions | None = None, *, progress: Progress | None = None
+    path: str | Path,
+    options: ReadOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    scratch: Path | None = None,
 ) -> Recording:
     """Read a recording, whatever its format.
 
     Args:
-        path: a file (see `FORMATS`) or a folder with `recording.json`.
+        path: a file or a folder, see `FORMATS`.
         options: how readings are understood, None for the defaults. Of a recording folder, whose
             readings are understood already, they narrow what is there.
         progress: called now and then with the share of the file that is read, 0 to 1.
+        scratch: folder for what does not fit into memory; None: the system's temporary folder.
 
     Raises:
         InputError: nothing there, or no recording that can be read.
     """
     path = Path(path)
-    options = options or ReadOptions()
+    return format_of(path).read(path, options or ReadOptions(), progress, scratch)
+
+
+def format_of(path: Path) -> Format:
+    """The format of a file or folder: by content where it tells, else by name.
+
+    Raises:
+        InputError: nothing there, or no recording.
+    """
     try:
         is_folder, is_file = path.is_dir(), path.is_file()
     except (OSError, ValueError) as error:
         raise InputError(f"is no usable path: {error}", where=repr(str(path))) from error
-    if is_folder and (path / folder.HEADER).is_file():
-        return limits.applied(folder.read(path), options)
-    if is_file and path.name == folder.HEADER:
-        return limits.applied(folder.read(path.parent), options)
-    if is_file:
-        return _reader_of(path)(path, options, progress)
-    if is_folder:
-        raise InputError(f"is a folder without {folder.HEADER}", where=str(path), hint=_known())
-    what = "is no regular file" if path.exists() else "does not exist"
-    raise InputError(what, where=str(path), hint=_known())
-
-
-def _reader_of(path: Path) -> Callable[[Path, ReadOptions, Progress | None], Recording]:
-    """The reader for a file: by suffix, unless its content is plainly not text; else by content."""
-    start = head(path, _HEAD)
+    if not is_folder and not is_file:
+        what = "is no regular file" if path.exists() else "does not exist"
+        raise InputError(what, where=str(path), hint=_known())
+    start = head(path, _HEAD) if is_file else None
     for known in FORMATS:
-        if known.sniff(start):
-            return known.read
+        if known.is_one(path, start):
+            return known
+    if start is None:
+        raise InputError("is a folder without a recording", where=str(path), hint=_known())
+    return _by_name(path, start)
+
+
+def _by_name(path: Path, start: bytes) -> Format:
     if path.stat().st_size == 0:
         raise InputError("is empty", where=str(path), hint=_known())
     if b"\0" in start:
         raise InputError(
             "is binary, no recording that stillmap reads", where=str(path), hint=_known()
         )
-    name = path.name.lower()
     for known in FORMATS:
-        if name.endswith(known.suffixes):
-            return known.read
+        if path.name.lower().endswith(known.endings):
+            return known
     raise InputError("is no recording that stillmap reads", where=str(path), hint=_known())
 
 
 def _known() -> str:
-    files = "; ".join(f"{f.name} ({', '.join(f.suffixes)})" for f in FORMATS)
-    return f"stillmap reads: {files}; folders with {folder.HEADER}"
+    return "stillmap reads: " + "; ".join(f"{f.name} ({', '.join(f.endings)})" for f in FORMATS)

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.recording.images import Images
+
 
 @dataclass(frozen=True, eq=False)
 class Recording:
@@ -23,6 +25,9 @@ class Recording:
         beam_time: (M,) float32, seconds after its scan's stamp at which each beam was taken,
             finite; None where the beams of a scan count as taken at once.
         source: what the recording was read from and how, what was skipped: JSON-able.
+        T_recorded_base: (T, D+1, D+1) float64, poses that the recording itself states, of a survey
+            or another program; used only when asked for. None where there are none.
+        images: pictures taken meanwhile; None where there are none.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -34,6 +39,8 @@ class Recording:
     T_odom_base: NDArray[np.float64] | None
     source: dict[str, Any] = field(default_factory=dict)
     beam_time: NDArray[np.float32] | None = None
+    T_recorded_base: NDArray[np.float64] | None = None
+    images: Images | None = None
 
     def __post_init__(self) -> None:
         T, M, D = self.n_scans, self.n_beams, self.dimension
@@ -46,8 +53,9 @@ class Recording:
         _check("sensor", self.sensor, (T,), np.int32)
         S = len(self.T_base_sensor)
         _check("T_base_sensor", self.T_base_sensor, (S, D + 1, D + 1), np.float64)
-        if self.T_odom_base is not None:
-            _check("T_odom_base", self.T_odom_base, (T, D + 1, D + 1), np.float64)
+        for name in ("T_odom_base", "T_recorded_base"):
+            if getattr(self, name) is not None:
+                _check(name, getattr(self, name), (T, D + 1, D + 1), np.float64)
         if self.beam_time is not None:
             _check("beam_time", self.beam_time, (M,), np.float32)
             if not np.isfinite(self.beam_time).all():

@@ -1,0 +1,142 @@
+"""Scans gathered one by one into a recording, whatever their number."""
+
+from array import array
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.recording.model import Recording
+from stillmap.recording.options import ReadOptions
+from stillmap.recording.spool import Column, empty
+
+
+class Gathered:
+    """Scans of point clouds, in any order; what does not fit into memory goes to files.
+
+    Args:
+        dimension: 2 or 3.
+        options: readings nearer than `min_range` are unusable, those from `max_range` on are
+            taken for maximum range, at that range.
+        beam_times: whether `add` will be told when beams were taken.
+        folder: for the files; None: the system's temporary folder.
+    """
+
+    def __init__(
+        self,
+        dimension: int,
+        options: ReadOptions,
+        *,
+        beam_times: bool = False,
+        folder: Path | None = None,
+    ) -> None:
+        self._options, self._folder = options, folder
+        self._stamp_ns, self._length, self._sensor = array("q"), array("q"), array("i")
+        self._points = Column(np.float32, (dimension,), folder)
+        self._hit = Column(np.bool_, (), folder)
+        self._times = Column(np.float32, (), folder) if beam_times else None
+
+    def __len__(self) -> int:
+        return len(self._stamp_ns)
+
+    def add(
+        self,
+        stamp_ns: int,
+        points: NDArray[Any],
+        *,
+        sensor: int = 0,
+        beam_time: NDArray[Any] | None = None,
+    ) -> None:
+        """One scan.
+
+        Args:
+            stamp_ns: when it was taken.
+            points: (n, D) metres in the sensor's frame; not finite: unusable.
+            sensor: which sensor took it.
+            beam_time: (n,) seconds after the stamp; not finite counts as 0.
+        """
+        points, hit = _understood(np.asarray(points, np.float32), self._options)
+        self._points.append(points)
+        self._hit.append(hit)
+        if self._times is not None:
+            times = np.zeros(len(points)) if beam_time is None else beam_time
+            self._times.append(np.where(np.isfinite(times), times, 0.0))
+        self._stamp_ns.append(stamp_ns)
+        self._length.append(len(points))
+        self._sensor.append(sensor)
+
+    def recording(
+        self,
+        T_base_sensor: NDArray[np.float64],
+        *,
+        source: dict[str, Any],
+        T_odom_base: NDArray[np.float64] | None = None,
+        T_recorded_base: NDArray[np.float64] | None = None,
+        **more: Any,
+    ) -> Recording:
+        """The recording of all scans by their stamps; nothing can be added any more.
+
+        Args:
+            T_base_sensor: (S, D+1, D+1).
+            source: see Recording.
+            T_odom_base, T_recorded_base: (T, D+1, D+1) in the order in which scans were added.
+            more: other fields of the Recording.
+        """
+        stamp_ns = np.asarray(self._stamp_ns, np.int64)
+        length = np.asarray(self._length, np.int64)
+        order = np.argsort(stamp_ns, kind="stable")
+        start = np.cumsum(length) - length
+        columns = [
+            _ordered(column.finished(), start, length, order, self._folder)
+            for column in (self._points, self._hit, self._times)
+            if column is not None
+        ]
+        return Recording(
+            stamp_ns=stamp_ns[order],
+            offset=np.concatenate([[0], np.cumsum(length[order])]).astype(np.int64),
+            points=columns[0],
+            hit=columns[1],
+            T_base_sensor=T_base_sensor,
+            sensor=np.asarray(self._sensor, np.int32)[order],
+            T_odom_base=None if T_odom_base is None else T_odom_base[order],
+            source=source,
+            beam_time=columns[2] if self._times is not None else None,
+            T_recorded_base=None if T_recorded_base is None else T_recorded_base[order],
+            **more,
+        )
+
+
+def _understood(
+    points: NDArray[np.float32], options: ReadOptions
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Points (n, D), NaN where unusable, and which of them something reflected."""
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(points.astype(np.float64), axis=1)
+    usable = np.isfinite(length) & (length >= options.min_range) & (length > 0.0)
+    out = np.where(usable[:, None], points, np.float32(np.nan))
+    if options.max_range is None:
+        return out, usable
+    far = usable & (length >= options.max_range)
+    end = options.max_range if options.free_range is None else options.free_range
+    out[far] *= (end / length[far])[:, None].astype(np.float32)
+    return out, usable & ~far
+
+
+def _ordered(
+    values: NDArray[Any],
+    start: NDArray[np.int64],
+    length: NDArray[np.int64],
+    order: NDArray[np.intp],
+    folder: Path | None,
+) -> NDArray[Any]:
+    """Values per beam with the scans in another order."""
+    if np.array_equal(order, np.arange(len(order))):
+        return values
+    out = empty(values.shape, values.dtype, folder)
+    at = 0
+    for scan in order:
+        first, n = int(start[scan]), int(length[scan])
+        out[at : at + n] = values[first : first + n]
+        at += n
+    return out

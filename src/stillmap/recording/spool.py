@@ -1,0 +1,109 @@
+"""Arrays that may be larger than memory: in memory while small, else in a file without a name.
+
+Such a file has no entry in any folder: it is gone when the last array on it is, even if the
+process is killed. What is written to it is written, not mapped, so that a full disk is an error
+and no crash.
+"""
+
+import mmap
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+IN_MEMORY = 64 << 20  # bytes of one array that are kept in memory
+
+
+class Column:
+    """An array that grows at its end.
+
+    Args:
+        dtype: of its elements.
+        row: shape of what stands at one index, () for numbers.
+        folder: where the file goes; None: the system's temporary folder.
+    """
+
+    def __init__(
+        self, dtype: DTypeLike, row: tuple[int, ...] = (), folder: Path | None = None
+    ) -> None:
+        self._dtype, self._row, self._folder = np.dtype(dtype), row, folder
+        self._parts: list[NDArray[Any]] = []
+        self._bytes = 0
+        self._length = 0
+        self._file: Any = None
+
+    def __len__(self) -> int:
+        return self._length
+
+    def append(self, rows: NDArray[Any]) -> None:
+        """Add rows (n, *row); they are copied.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        rows = np.array(rows, self._dtype, order="C", ndmin=1)
+        if rows.shape[1:] != self._row:
+            raise ValueError(f"rows: expected (n, *{self._row}), got {rows.shape}")
+        self._length += len(rows)
+        self._parts.append(rows)
+        self._bytes += rows.nbytes
+        if self._bytes > IN_MEMORY:
+            self._write()
+
+    def _write(self) -> None:
+        if self._file is None:
+            self._file = _nameless(self._folder)
+        for part in self._parts:
+            self._file.write(part.reshape(-1).view(np.uint8).data)
+        self._parts, self._bytes = [], 0
+
+    def finished(self) -> NDArray[Any]:
+        """The whole array (N, *row), read-only where it lies in a file. Nothing can be added."""
+        shape = (self._length, *self._row)
+        if self._file is None:
+            parts, self._parts = self._parts, []
+            return np.concatenate(parts) if parts else np.empty(shape, self._dtype)
+        self._write()
+        self._file.flush()
+        with self._file as file:
+            return _mapped(file, shape, self._dtype, writable=False)
+
+
+def empty(shape: tuple[int, ...], dtype: DTypeLike, folder: Path | None = None) -> NDArray[Any]:
+    """A new array to write to, its content not defined; in a file where it is large.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    dtype = np.dtype(dtype)
+    size = int(np.prod(shape, dtype=object)) * dtype.itemsize
+    if size <= IN_MEMORY:
+        return np.empty(shape, dtype)
+    with _nameless(folder) as file:
+        # all of it now: a hole that no longer fits on the disk would kill the process
+        os.posix_fallocate(file.fileno(), 0, size)
+        return _mapped(file, shape, dtype, writable=True)
+
+
+def let_go(array: NDArray[Any]) -> None:
+    """What of a mapped array lies in memory may go; it is read again where it is used again."""
+    base: object = array
+    while isinstance(base, np.ndarray):
+        base = base.base
+    if isinstance(base, mmap.mmap):
+        base.madvise(mmap.MADV_DONTNEED)
+
+
+def _nameless(folder: Path | None) -> Any:
+    return tempfile.TemporaryFile(prefix="stillmap-", dir=folder)
+
+
+def _mapped(
+    file: Any, shape: tuple[int, ...], dtype: np.dtype[Any], writable: bool
+) -> NDArray[Any]:
+    access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
+    mapped: NDArray[Any] = np.frombuffer(mmap.mmap(file.fileno(), 0, access=access), dtype)
+    return mapped.reshape(shape)

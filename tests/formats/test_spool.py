@@ -1,0 +1,84 @@
+"""Arrays that are in memory or in a file without anybody noticing."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillmap.recording import spool
+from stillmap.recording.gathering import Gathered
+from stillmap.recording.options import ReadOptions
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+@pytest.fixture(params=[0, 1 << 20], ids=["in files", "in memory"])
+def limit(request, monkeypatch):
+    monkeypatch.setattr(spool, "IN_MEMORY", request.param)
+    return request.param
+
+
+def test_a_column_is_what_was_added(limit, tmp_path, rng):
+    column, parts = spool.Column(np.float32, (3,), tmp_path), []
+    for n in (5, 0, 1, 70):
+        parts.append(rng.normal(size=(n, 3)).astype(np.float32))
+        column.append(parts[-1])
+        parts[-1] = parts[-1].copy()
+    got = column.finished()
+    np.testing.assert_array_equal(got, np.concatenate(parts))
+    assert got.dtype == np.float32
+    assert got.flags.writeable == (limit > 0)
+    spool.let_go(got)
+    np.testing.assert_array_equal(got, np.concatenate(parts))
+    assert list(tmp_path.iterdir()) == []  # a file without a name leaves nothing behind
+
+
+def test_an_empty_column(limit, tmp_path):  # noqa: ARG001
+    assert spool.Column(np.int32, (), tmp_path).finished().shape == (0,)
+
+
+def test_wrong_rows_are_refused():
+    with pytest.raises(ValueError, match=r"expected \(n, \*\(2,\)\)"):
+        spool.Column(np.float32, (2,)).append(np.zeros((4, 3)))
+
+
+def test_new_arrays_keep_what_is_written(limit, tmp_path):  # noqa: ARG001
+    values = spool.empty((40, 2), np.float32, tmp_path)
+    values[:] = np.arange(80).reshape(40, 2)
+    spool.let_go(values)
+    np.testing.assert_array_equal(values, np.arange(80).reshape(40, 2))
+
+
+def test_a_full_disk_is_an_error(monkeypatch):
+    monkeypatch.setattr(spool, "IN_MEMORY", 0)
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("no /dev/full here")
+    with full.open("r+b", buffering=0) as file:
+        monkeypatch.setattr(spool, "_nameless", lambda _: file)
+        with pytest.raises(OSError, match="No space left"):
+            spool.Column(np.float32).append(np.ones(3))
+
+
+def test_scans_are_put_in_order(limit, tmp_path, rng):  # noqa: ARG001
+    scans = [rng.normal(size=(n, 3)).astype(np.float32) for n in (4, 0, 9)]
+    gathered = Gathered(3, ReadOptions(), beam_times=True, folder=tmp_path)
+    for stamp, points in zip((30, 10, 20), scans, strict=True):
+        gathered.add(stamp, points, beam_time=np.full(len(points), stamp / 100.0))
+    found = gathered.recording(np.eye(4)[None], source={})
+    np.testing.assert_array_equal(found.stamp_ns, [10, 20, 30])
+    np.testing.assert_array_equal(found.offset, [0, 0, 9, 13])
+    np.testing.assert_array_equal(found.points, np.concatenate([scans[2], scans[0]]))
+    np.testing.assert_allclose(found.beam_time, [0.2] * 9 + [0.3] * 4)
+
+
+def test_ranges_of_clouds():
+    gathered = Gathered(2, ReadOptions(min_range=1.0, max_range=4.0))
+    x = [0.5, 2.0, 8.0, np.nan, np.inf, 0.0]
+    gathered.add(0, np.stack([x, np.zeros(6)], axis=1))
+    found = gathered.recording(np.eye(3)[None], source={})
+    np.testing.assert_array_equal(found.hit, [False, True, False, False, False, False])
+    np.testing.assert_array_equal(found.points[:, 0], [np.nan, 2.0, 4.0, np.nan, np.nan, np.nan])
