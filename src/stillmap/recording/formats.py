@@ -10,6 +10,7 @@ from stillmap.recording.carmen_messages import SCAN_PARSERS
 from stillmap.recording.lines import Progress, head
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
+from stillmap.recording.ros import bags
 
 _HEAD = 1 << 16  # bytes looked at to tell what a file is
 
@@ -51,8 +52,18 @@ def _read_folder_of_ours(
     return limits.applied(folder.read(path if path.is_dir() else path.parent), options)
 
 
+def _read_bag(
+    path: Path, options: ReadOptions, progress: Progress | None, scratch: Path | None
+) -> Recording:
+    # message types take a moment to load: only for those who have a bag
+    from stillmap.recording.ros.reading import read as read_bag
+
+    return read_bag(path, options, progress, scratch)
+
+
 FORMATS = (
     Format("stillmap recording", (folder.HEADER,), _is_folder_of_ours, _read_folder_of_ours),
+    Format("ROS bag", bags.ENDINGS, bags.is_bag, _read_bag),
     Format(
         "CARMEN log",
         (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz"),

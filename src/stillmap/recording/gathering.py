@@ -73,19 +73,22 @@ class Gathered:
         source: dict[str, Any],
         T_odom_base: NDArray[np.float64] | None = None,
         T_recorded_base: NDArray[np.float64] | None = None,
+        chosen: NDArray[np.intp] | None = None,
         **more: Any,
     ) -> Recording:
-        """The recording of all scans by their stamps; nothing can be added any more.
+        """The recording of scans by their stamps; nothing can be added any more.
 
         Args:
             T_base_sensor: (S, D+1, D+1).
             source: see Recording.
             T_odom_base, T_recorded_base: (T, D+1, D+1) in the order in which scans were added.
+            chosen: which of the scans; None: all.
             more: other fields of the Recording.
         """
         stamp_ns = np.asarray(self._stamp_ns, np.int64)
         length = np.asarray(self._length, np.int64)
-        order = np.argsort(stamp_ns, kind="stable")
+        chosen = np.arange(len(stamp_ns)) if chosen is None else np.sort(chosen)
+        order = chosen[np.argsort(stamp_ns[chosen], kind="stable")]
         start = np.cumsum(length) - length
         columns = [
             _ordered(column.finished(), start, length, order, self._folder)
@@ -130,10 +133,10 @@ def _ordered(
     order: NDArray[np.intp],
     folder: Path | None,
 ) -> NDArray[Any]:
-    """Values per beam with the scans in another order."""
-    if np.array_equal(order, np.arange(len(order))):
+    """Values per beam of the scans in `order`."""
+    if np.array_equal(order, np.arange(len(start))):
         return values
-    out = empty(values.shape, values.dtype, folder)
+    out = empty((int(length[order].sum()), *values.shape[1:]), values.dtype, folder)
     at = 0
     for scan in order:
         first, n = int(start[scan]), int(length[scan])

@@ -67,6 +67,15 @@ class ReadOptions:
         None, "second laser's beams turn the other way round"
     )
     laser2_fov: float | None = field_with_doc(None, "rad: all beams of the second laser")
+    topic: str | None = field_with_doc(
+        None, "of a bag: topics of the scans to use, with commas; unset: found by type and rate"
+    )
+    base_frame: str | None = field_with_doc(
+        None, "of a bag: the robot's own frame; unset: found in the transforms"
+    )
+    odom_frame: str | None = field_with_doc(
+        None, "of a bag: the frame in which odometry moves the robot; unset: found"
+    )
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.min_range < BEYOND:
@@ -75,6 +84,9 @@ class ReadOptions:
             value = getattr(self, name)
             if value is not None and not self.min_range < value <= BEYOND:
                 raise ValueError(f"{name} must lie in min_range to {BEYOND:g} m, got {value}")
+        for name in ("topic", "base_frame", "odom_frame"):
+            if getattr(self, name) is not None and not getattr(self, name).strip():
+                raise ValueError(f"{name} must name something")
         for number, laser in enumerate(("laser", "laser2")):
             for name, largest in _LARGEST.items():
                 value = getattr(self.laser(number), name)

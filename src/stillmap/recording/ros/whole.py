@@ -1,0 +1,103 @@
+"""Bags that are whole, read by the library with their index."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from rosbags.interfaces import ConnectionExtRosbag2
+from rosbags.rosbag1 import reader as rosbag1
+from rosbags.rosbag2 import storage_mcap
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+from stillmap.errors import InputError
+from stillmap.recording.ros import unpacking
+from stillmap.recording.ros.channels import Channel, DamagedError, Message
+from stillmap.recording.skipped import Skipped
+
+# the library unpacks whatever comes; its table is where it can be told to stop
+storage_mcap.DECOMPRESSORS["lz4"] = lambda data, _: unpacking.lz4_unpacked(data)
+storage_mcap.DECOMPRESSORS["zstd"] = lambda data, _: unpacking.zstd_unpacked(data)
+
+_BOUNDED = {
+    rosbag1.decompressors["bz2"]: unpacking.bz2_unpacked,
+    rosbag1.decompressors["lz4"]: unpacking.lz4_unpacked,
+}
+
+
+class _Bag1Reader(rosbag1.Reader):
+    def read_chunk(self) -> rosbag1.Chunk:
+        chunk = super().read_chunk()
+        unpacked = _BOUNDED.get(chunk.decompressor, chunk.decompressor)
+        return chunk._replace(decompressor=unpacked)
+
+
+@dataclasses.dataclass
+class WholeBag:
+    """See `Bag`."""
+
+    kind: str
+    reader: Any
+    channels: list[Channel] = dataclasses.field(default_factory=list)
+    damage: Skipped = dataclasses.field(default_factory=Skipped)
+
+    def __post_init__(self) -> None:
+        self.channels = [_channel(connection) for connection in self.reader.connections]
+
+    def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
+        """See `Bag`."""
+        chosen = [c for c in self.reader.connections if c.topic in topics]
+        if not chosen:
+            return
+        channels = {c.id: c for c in self.channels}
+        source = self.reader.messages(chosen, start=since_ns)
+        while True:
+            try:
+                connection, log_ns, raw = next(source)
+            except StopIteration:
+                return
+            except InputError:
+                raise
+            except Exception as error:  # whatever the library makes of damaged bytes
+                raise DamagedError(str(error) or type(error).__name__) from error
+            yield Message(channels[connection.id], log_ns, raw)
+
+    def close(self) -> None:
+        """See `Bag`."""
+        self.reader.close()
+
+
+def open_bag1(path: Path) -> WholeBag:
+    """A ROS 1 bag with its index. Raises whatever the library says of one that is damaged."""
+    reader = _Bag1Reader(path)
+    reader.open()
+    return WholeBag("ROS 1 bag", reader)
+
+
+def open_mcap(path: Path) -> WholeBag:
+    """An MCAP file of ROS 2. Raises whatever the library says of one that is damaged."""
+    reader = storage_mcap.McapReader(path)
+    reader.open()
+    return WholeBag("MCAP", reader)
+
+
+def open_db3(path: Path) -> WholeBag:
+    """A SQLite file of ROS 2. Raises whatever the library says of one that is damaged."""
+    # the library makes an address of the path: ?, # and % in it would be read as its parts
+    reader = Sqlite3Reader(Path(quote(str(path.resolve()))))
+    reader.open()
+    return WholeBag("SQLite bag", reader)
+
+
+def _channel(connection: Any) -> Channel:
+    of_ros2 = isinstance(connection.ext, ConnectionExtRosbag2)
+    encoding = connection.ext.serialization_format if of_ros2 else "ros1"
+    return Channel(
+        connection.id,
+        connection.topic,
+        connection.msgtype,
+        encoding,
+        connection.msgcount,
+        connection.digest,
+    )
