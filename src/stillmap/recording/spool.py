@@ -16,6 +16,8 @@ from numpy.typing import DTypeLike, NDArray
 
 IN_MEMORY = 64 << 20  # bytes of one array that are kept in memory
 
+_BUFFER = 1 << 20  # bytes: parts may be as small as one scan
+
 
 class Column:
     """An array that grows at its end.
@@ -98,7 +100,7 @@ def let_go(array: NDArray[Any]) -> None:
 
 
 def _nameless(folder: Path | None) -> Any:
-    return tempfile.TemporaryFile(prefix="stillmap-", dir=folder)
+    return tempfile.TemporaryFile(buffering=_BUFFER, prefix="stillmap-", dir=folder)
 
 
 def _mapped(

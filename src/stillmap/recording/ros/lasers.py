@@ -24,6 +24,7 @@ REPEATED = "scan that was recorded twice"
 
 _TURN = 2.0 * math.pi
 _MAX_READINGS = 1 << 20
+_TOGETHER = 256  # scans
 
 
 class Shape(NamedTuple):
@@ -71,6 +72,7 @@ class LaserScans:
         self.shape = array("i")
         self.shapes: dict[Shape, int] = {}
         self._ranges = Column(np.float32, (), scratch)
+        self._waiting: list[NDArray[np.float32]] = []
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -97,11 +99,19 @@ class LaserScans:
         self.stamp_ns.append(stamp_ns(message.header))
         self.log_ns.append(log_ns)
         self.number.append(number)
-        self._ranges.append(ranges)
+        self._waiting.append(ranges)
+        if len(self._waiting) >= _TOGETHER:
+            self._pass_on()
         return None
+
+    def _pass_on(self) -> None:
+        if self._waiting:
+            self._ranges.append(np.concatenate(self._waiting))
+            self._waiting = []
 
     def finished(self, skipped: Skipped) -> "Scans":
         """All of them with time that does not run backwards; what falls out is counted."""
+        self._pass_on()
         ranges = self._ranges.finished()
         shapes = list(self.shapes)
         shape = np.asarray(self.shape, np.int32)
