@@ -66,6 +66,8 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
         first, last = found["beam_times_s"]
         yield _row("beam times", f"{first:g} to {last:g} s after a scan's stamp")
     yield from _odometry(found["odometry"])
+    if found["base_frame"] is not None:
+        yield _row("robot's frame", f"{found['base_frame']} ({found['base_frame_how']})")
     for sensor in found["sensors"]:
         yield from _sensor(sensor)
     yield from _notes(found)
@@ -98,7 +100,8 @@ def _odometry(odometry: dict[str, Any] | None) -> Iterator[str]:
 
 
 def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
-    yield _row("sensor", f"{sensor.get('name', 'unnamed')}, {sensor['scans']} scans")
+    frame = f", frame {sensor['frame']}" if sensor.get("frame") else ""
+    yield _row("sensor", f"{sensor.get('name', 'unnamed')}, {sensor['scans']} scans{frame}")
     view = sensor.get("field_of_view_deg")
     if view is not None:
         step = sensor.get("angle_step")
@@ -131,13 +134,24 @@ def _notes(found: dict[str, Any]) -> Iterator[str]:
         yield _row("PARAM", ", ".join(f"{k} {v}" for k, v in found["params"].items()))
     if found["ignored"]:
         yield _row("ignored lines", ", ".join(f"{v} {k}" for k, v in found["ignored"].items()))
+    for topic in found["topics"]:
+        if isinstance(topic, dict) and {"topic", "type", "messages", "why"} <= set(topic):
+            kind = str(topic["type"]).rpartition("/")[2]
+            text = f"{topic['topic']} ({kind}, {topic['messages']}): {topic['why']}"
+            yield _row("topic", text)
     for what in found["duplicates"]:
         yield _row("left out", what)
-    for key, title in (("skipped", "skipped scans"), ("skipped_odometry", "skipped ODOM")):
+    numbered = found["numbered_by"] or "line"
+    kinds = (
+        ("skipped", "skipped scans", numbered),
+        ("skipped_odometry", "skipped odometry", numbered),
+        ("damage", "damage", "at byte"),
+    )
+    for key, title, what in kinds:
         for reason, damage in found[key].items():
             shown = ", ".join(str(line) for line in damage["lines"][:_LINES_SHOWN])
             more = ", ..." if damage["count"] > _LINES_SHOWN else ""
-            yield _row(title, f"{damage['count']} {reason} (line {shown}{more})")
+            yield _row(title, f"{damage['count']} {reason} ({what} {shown}{more})")
     for what in found["warnings"]:
         yield _row("warning", what)
 

@@ -24,6 +24,18 @@ def add_read_flags(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "unusable", "max-range"),
         help="what a reading of zero stands for (default: auto)",
     )
+    group.add_argument(
+        "--topic",
+        action="append",
+        metavar="TOPIC",
+        help="of a bag: take the scans from here; can be given again (default: by type and rate)",
+    )
+    group.add_argument(
+        "--base-frame", metavar="FRAME", help="of a bag: the robot's own frame (default: found)"
+    )
+    group.add_argument(
+        "--odom-frame", metavar="FRAME", help="of a bag: where odometry moves it (default: found)"
+    )
     for laser, which in _LASERS.items():
         group.add_argument(
             f"--{laser}-offset",
@@ -49,9 +61,11 @@ def read_changes(args: argparse.Namespace) -> dict[str, Any]:
     """The flags that were given, as changes to the options: `{"read": {...}}`, `{}` for none."""
     changes: dict[str, Any] = {
         name: value
-        for name in ("min_range", "max_range", "zero_means")
+        for name in ("min_range", "max_range", "zero_means", "base_frame", "odom_frame")
         if (value := getattr(args, name)) is not None
     }
+    if args.topic:
+        changes["topic"] = ",".join(args.topic)
     for laser in _LASERS:
         offset, fov = getattr(args, f"{laser}_offset"), getattr(args, f"{laser}_fov")
         if offset is not None:

@@ -11,12 +11,13 @@ from stillmap.recording.model import Recording
 from stillmap.recording.ranges import RangeRule
 
 _CHUNK = 1 << 20  # beams looked at together
-_DAMAGE = ("skipped", "skipped_odometry")
+_DAMAGE = ("skipped", "skipped_odometry", "damage")
 _TABLES = ("records", "ignored", "params", "read_options")
-_LISTS = ("duplicates", "warnings")
+_LISTS = ("duplicates", "warnings", "topics")
+_WORDS = ("numbered_by", "base_frame", "base_frame_how")
 _SENSOR_NOTES = (
     *("name", "beams_per_scan", "start_angle", "angle_step", "extrinsics", "ranges"),
-    *("upside_down", "upside_down_how"),
+    *("upside_down", "upside_down_how", "frame"),
 )
 _RULE = {field.name for field in dataclasses.fields(RangeRule)}
 
@@ -38,10 +39,8 @@ def facts(recording: Recording) -> dict[str, Any]:
         "time": _time(recording.stamp_ns),
         "beam_times_s": _spread_of_times(recording.beam_time),
         "odometry": _odometry(recording, source["odometry"]),
-        "sensors": [
-            _sensor(recording, i, source["sensors"]) for i in range(len(recording.T_base_sensor))
-        ],
-        **{key: source[key] for key in (*_DAMAGE, *_TABLES, *_LISTS)},
+        "sensors": _sensors(recording, source["sensors"]),
+        **{key: source[key] for key in (*_DAMAGE, *_TABLES, *_LISTS, *_WORDS)},
     }
 
 
@@ -59,7 +58,8 @@ def _notes(source: dict[str, Any]) -> dict[str, Any]:
             and isinstance(damage.get("count"), int)
             and isinstance(damage.get("lines"), list)
         }
-    return {**notes, "path": source.get("path"), "format": source.get("format")}
+    words = {key: source.get(key) for key in ("path", "format", *_WORDS)}
+    return {**notes, **{k: v if isinstance(v, str) else None for k, v in words.items()}}
 
 
 def _lengths(recording: Recording) -> NDArray[np.float32]:
@@ -136,16 +136,28 @@ def _odometry(recording: Recording, noted: dict[str, Any]) -> dict[str, Any] | N
     }
 
 
-def _sensor(recording: Recording, number: int, noted: list[Any]) -> dict[str, Any]:
+def _sensors(recording: Recording, noted: list[Any]) -> list[dict[str, Any]]:
+    """Every sensor; one that moves on its robot has many places in the arrays and one note."""
+    out, first, number = [], 0, 0
+    while first < len(recording.T_base_sensor):
+        notes = noted[number] if number < len(noted) and isinstance(noted[number], dict) else {}
+        places = notes.get("places", 1)
+        places = places if isinstance(places, int) and places > 0 else 1
+        out.append(_sensor(recording, range(first, first + places), notes))
+        first, number = first + places, number + 1
+    return out
+
+
+def _sensor(recording: Recording, numbers: range, noted: dict[str, Any]) -> dict[str, Any]:
     """One sensor: what its reader noted, else what shows in the arrays."""
-    scans = np.flatnonzero(recording.sensor == number)
+    its = (recording.sensor >= numbers.start) & (recording.sensor < numbers.stop)
+    scans = np.flatnonzero(its)
     out: dict[str, Any] = {"scans": len(scans)}
-    if number < len(noted) and isinstance(noted[number], dict):
-        out.update((key, noted[number][key]) for key in _SENSOR_NOTES if key in noted[number])
+    out.update((key, noted[key]) for key in _SENSOR_NOTES if key in noted)
     if not _is_rule(out.get("ranges")):
         out.pop("ranges", None)
     if recording.dimension == 2:
-        x, y, theta = (float(v) for v in se2.parameters(recording.T_base_sensor[number]))
+        x, y, theta = (float(v) for v in se2.parameters(recording.T_base_sensor[numbers.start]))
         place = out.get("extrinsics")
         how = str(place.get("how", "")) if isinstance(place, dict) else "as recorded"
         out["extrinsics"] = {"x": x, "y": y, "theta_deg": float(np.degrees(theta)), "how": how}

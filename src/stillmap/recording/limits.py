@@ -19,12 +19,15 @@ def applied(recording: Recording, options: ReadOptions) -> Recording:
 
     Raises:
         InputError: a laser's place on the robot is given, and the recording is 3D or has no such
-            laser.
+            laser; a topic or frame is named.
     """
     defaults = ReadOptions(zero_means=options.zero_means)
     if options == defaults:
         return recording
     given = {key: value for key, value in vars(options).items() if value != getattr(defaults, key)}
+    named = next((key for key in ("topic", "base_frame", "odom_frame") if key in given), None)
+    if named is not None:
+        raise InputError(f"read.{named} is for bags: this recording has no topics and frames")
     changed = replace(recording, source={**recording.source, "read_options": given})
     if options.min_range > 0 or options.max_range is not None or options.free_range is not None:
         changed = _narrowed(changed, options)
