@@ -14,6 +14,8 @@ from stillmap.recording.ros.messages import stamp_ns
 from stillmap.recording.ros.transforms import BAD_TRANSFORM, Transforms
 from stillmap.recording.skipped import Skipped
 
+TAKEN = "the sensor is taken for the robot: nothing says where it sits on one"
+
 _NAMES = ("base_link", "base_footprint", "base")
 _GAP = 1.0  # s without odometry that is worth a word
 _TILTED = 0.9  # cosine of the largest tilt of a laser whose scans are taken for level
@@ -90,7 +92,7 @@ def base_frame(
             return below, f"it moves in {transforms.parent(below)}"
     if len(path) > 1 and not any(map(transforms.changes, path)):
         return path[-1], "all frames hang on it"
-    return sensors[0], "the sensor: nothing says where it sits on a robot"
+    return sensors[0], TAKEN
 
 
 def places(
@@ -103,6 +105,13 @@ def places(
         found.append(None if located is None else located.T)
         moves.append(located is not None and located.moves)
     return Places(*base, found, moves)
+
+
+def words(placed: Places) -> list[str]:
+    """A warning where the robot's frame is a makeshift."""
+    if placed.how != TAKEN:
+        return []
+    return [f"no transform says where {placed.base!r} sits on a robot: took the laser as the base"]
 
 
 def planar(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool, bool]:

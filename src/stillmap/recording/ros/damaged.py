@@ -99,8 +99,9 @@ def _bag1_records(
     while file.tell() < end:
         at = file.tell()
         header = Header.read(file)  # type: ignore[arg-type]
-        data = _exactly(file, _number(file, 4), end)
-        kind = header.get_uint8("op")
+        kind, size = header.get_uint8("op"), _number(file, 4)
+        # of a chunk that is cut the beginning can be unpacked
+        data = file.read(size) if kind == RecordType.CHUNK else _exactly(file, size, end)
         if kind == RecordType.CHUNK:
             try:
                 inner = BytesIO(_unpacked(header.get_string("compression"), data))
@@ -141,7 +142,9 @@ def _mcap_records(
         kind = _number(file, 1)
         if kind == 0x89:  # the magic at the end
             return
-        data = _exactly(file, _number(file, 8), end)
+        size = min(_number(file, 8), end)
+        # of a chunk that is cut the beginning can be unpacked
+        data = file.read(size) if kind == 0x06 else _exactly(file, size, end)
         record = BytesIO(data)
         if kind == 0x03:
             number = _number(record, 2)
@@ -158,7 +161,8 @@ def _mcap_records(
             try:
                 record.seek(28)
                 packing = _text(record)
-                inner = BytesIO(_unpacked(packing, _exactly(record, _number(record, 8), len(data))))
+                size = min(_number(record, 8), len(data))
+                inner = BytesIO(_unpacked(packing, record.read(size)))
             except Exception:  # whatever a library makes of damaged bytes
                 damage.add(BAD_CHUNK, at)
                 continue

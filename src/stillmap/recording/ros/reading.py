@@ -108,7 +108,7 @@ def _of_lasers(found: Content, options: ReadOptions, scratch: Path | None) -> Re
     used, T, more = _connected(used, placed, given=options.base_frame is not None)
     left_out += more
     options.require_lasers(len(used))
-    warnings = [w for s in used for w in s.warnings]
+    warnings = [w for s in used for w in s.warnings] + base.words(placed)
     T_base_sensor, sensor, mirrored, infos, more = _sensors(used, T, placed, options)
     warnings += more
     rules = []
@@ -213,7 +213,7 @@ def _moves(flat: NDArray[np.float64]) -> bool:
 
 def _how(scans: Scans, placed: base.Places) -> str:
     if scans.frame == placed.base:
-        return f"the laser is the base: {placed.how}"
+        return "the laser is the robot's frame"
     return f"TF from {placed.base} to {scans.frame}"
 
 

@@ -1,5 +1,6 @@
 """The clouds of a bag as a 3D recording."""
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -36,7 +37,7 @@ def recording(found: Content, options: ReadOptions, images_of: ImagesOf) -> Reco
     where = base.base_frame(found.transforms, [names[k][1] for k in used], found.odometry, options)
     asked = [(names[k][1], stamps[its]) for k, its in zip(used, scans, strict=True)]
     placed = base.places(found.transforms, where, asked)
-    warnings: list[str] = []
+    warnings = base.words(placed)
     T = np.tile(np.eye(4), (len(names), 1, 1))
     kept: list[NDArray[np.intp]] = []
     for k, its, on_robot in zip(used, scans, placed.T_base_sensor, strict=True):
@@ -56,7 +57,7 @@ def recording(found: Content, options: ReadOptions, images_of: ImagesOf) -> Reco
         found.transforms, placed.base, found.odometry, stamps, options
     )
     skipped = Skipped().merged(*topics.skipped.values())
-    return topics.scans.recording(
+    made = topics.scans.recording(
         T,
         chosen=chosen,
         T_odom_base=odom,
@@ -78,6 +79,8 @@ def recording(found: Content, options: ReadOptions, images_of: ImagesOf) -> Reco
             "warnings": warnings + more,
         },
     )
+    timed = topics.timed.intersection(used)
+    return made if timed else dataclasses.replace(made, beam_time=None)
 
 
 def _forward(
