@@ -126,6 +126,9 @@ def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
                 "  shown free",
                 f"{rule['free_range']:g} m by a maximum-range beam: {rule['free_how']}",
             )
+        for first, last, limit in rule.get("own_body", ()):
+            text = f"beams {first} to {last} end on it: unusable up to {limit:g} m"
+            yield _row("  robot itself", text)
         yield _row("  zero means", f"{rule['zero_means']}: {rule['zero_how']}")
 
 

@@ -168,9 +168,15 @@ def _sensor(recording: Recording, numbers: range, noted: dict[str, Any]) -> dict
 def _is_rule(noted: Any) -> bool:
     return (
         isinstance(noted, dict)
-        and set(noted) == _RULE
+        and set(noted) | {"own_body"} == _RULE  # older recordings do not have it
         and all(isinstance(noted[k], float | int | None) for k in ("threshold", "free_range"))
+        and all(_is_part(part) for part in noted.get("own_body", ()))
     )
+
+
+def _is_part(noted: Any) -> bool:
+    numbers = list(noted) if isinstance(noted, list | tuple) else []
+    return len(numbers) == 3 and all(isinstance(number, float | int) for number in numbers)
 
 
 def _field_of_view(

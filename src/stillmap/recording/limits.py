@@ -15,13 +15,13 @@ def applied(recording: Recording, options: ReadOptions) -> Recording:
 
     Nearer than `min_range`: unusable. From `max_range` on: maximum range, ending there. A
     maximum-range beam shows at most `free_range`. A laser upside down is turned round from how it
-    was recorded. `zero_means` and fields of view have nothing left to say.
+    was recorded. `zero_means`, `own_body` and fields of view have nothing left to say.
 
     Raises:
         InputError: a laser's place on the robot is given, and the recording is 3D or has no such
             laser; a topic or frame is named.
     """
-    defaults = ReadOptions(zero_means=options.zero_means)
+    defaults = ReadOptions(zero_means=options.zero_means, own_body=options.own_body)
     if options == defaults:
         return recording
     given = {key: value for key, value in vars(options).items() if value != getattr(defaults, key)}

@@ -45,6 +45,10 @@ class ReadOptions:
     free_range: float | None = field_with_doc(
         None, "m: how much free space a maximum-range beam shows; unset: what the laser really sees"
     )
+    own_body: bool = field_with_doc(
+        True,
+        "leave out readings of the robot itself: beams that end at the same place wherever it is",
+    )
     laser_x: float | None = field_with_doc(
         None, "m: first laser ahead of the robot's centre; unset: found in the recording"
     )

@@ -10,7 +10,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.recording import own_body
 from stillmap.recording.options import BEYOND, ReadOptions
+from stillmap.recording.own_body import Part
 
 ZERO_BELOW = 0.02  # m: a laser's housing is larger, so such a reading stands for something else
 FREQUENT_ZEROS = 0.005  # share of zero readings that is no accident
@@ -50,6 +52,8 @@ class RangeRule:
     free_range: float | None  # None: nothing in the recording bounds what such a beam shows
     free_how: str
     min_range: float
+    # first and last beam, and up to where their readings are of the robot itself
+    own_body: tuple[Part, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -146,12 +150,14 @@ def decide(
                 f"({found.how}): those readings count as hits"
             )
     no_return = ranges >= np.float32(BEYOND if threshold is None else threshold)
-    own = found.coded or bool(np.any(ranges >= BEYOND)) or no_return.mean() > FREQUENT_ZEROS
-    share = float(no_return.mean()) if own and ranges.size else 0.0
+    coded = found.coded or bool(np.any(ranges >= BEYOND)) or no_return.mean() > FREQUENT_ZEROS
+    share = float(no_return.mean()) if coded and ranges.size else 0.0
     zero_means, zero_how = _zero_meaning(ranges, share, options.zero_means)
     is_hit = (ranges >= np.float32(max(options.min_range, ZERO_BELOW))) & ~no_return
     free, free_how = _free_range(ranges[is_hit], threshold, options.free_range)
-    rule = RangeRule(threshold, how, zero_means, zero_how, free, free_how, options.min_range)
+    shortest = max(options.min_range, ZERO_BELOW)
+    own = own_body.find(np.atleast_2d(ranges), shortest) if options.own_body else ()
+    rule = RangeRule(threshold, how, zero_means, zero_how, free, free_how, options.min_range, own)
     if free is None:
         warnings.append("no reading shows how far the laser sees: maximum-range beams are unusable")
     return rule, warnings
@@ -199,7 +205,10 @@ def apply(
     threshold = np.float32(BEYOND if rule.threshold is None else rule.threshold)
     zero = (ranges >= 0.0) & (ranges < ZERO_BELOW)
     no_return = (ranges >= threshold) | (zero & (rule.zero_means == "max-range"))
-    hit = (ranges >= np.float32(max(rule.min_range, ZERO_BELOW))) & (ranges < threshold)
+    nearest: Any = np.float32(max(rule.min_range, ZERO_BELOW))
+    if rule.own_body:
+        nearest = np.maximum(nearest, own_body.limits(rule.own_body, ranges.shape[-1]))
+    hit = (ranges >= nearest) & (ranges < threshold)
     free = np.nan if rule.free_range is None else rule.free_range
     length = np.where(no_return, np.float32(free), np.where(hit, ranges, np.float32(np.nan)))
     return length.astype(np.float32, copy=False), hit

@@ -139,6 +139,9 @@ class _Maker:
 
     def __init__(self, scans: Scans, rule: ranges.RangeRule, mirror: bool) -> None:
         self._scans, self._rule, self._mirror = scans, rule, mirror
+        self._usual = scans.usual.n
+        # which beams meet the robot is known of scans as most are
+        self._other = dataclasses.replace(rule, own_body=())
         self.steps = _steps(scans)
         self._shape = -1
         self._directions = np.empty((0, 2), np.float32)
@@ -148,7 +151,7 @@ class _Maker:
         n = self._turned_to(its)
         at = int(self._scans.start[its.start])
         readings = self._scans.ranges[at : at + (its.stop - its.start) * n].reshape(-1, n)
-        length, hit = ranges.apply(readings, self._rule)
+        length, hit = ranges.apply(readings, self._rule if n == self._usual else self._other)
         points = np.empty((*length.shape, 2), np.float32)
         for axis in range(2):  # several times faster than one product of all
             np.multiply(length, self._directions[:, axis], out=points[..., axis])
