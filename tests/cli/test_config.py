@@ -1,6 +1,7 @@
 """`stillmap config`, and how options are chosen: default < file < --set < flag."""
 
 import json
+import re
 import tomllib
 
 import pytest
@@ -38,8 +39,12 @@ def test_prints_every_option_with_its_default(capsys):
 
 
 def test_every_option_has_its_meaning_behind_it(capsys):
-    for line in config(capsys).splitlines():
-        if line and not line.startswith("["):
+    lines = config(capsys).splitlines()
+    headings = {i - 1 for i, line in enumerate(lines) if line.startswith("[")}
+    for i, line in enumerate(lines):
+        if i in headings:
+            assert re.match("# [A-Z].{10,}", line)
+        elif line and not line.startswith("["):
             assert line.count("  # ") == 1
             assert len(line.split("  # ")[1]) > 8, line
 
@@ -159,5 +164,5 @@ def test_wrong_values_say_where(capsys, words, said):
 
 def test_a_file_that_is_no_toml(capsys, tmp_path):
     file = tmp_path / "options.toml"
-    file.write_text("em.prior: 0.8\n")
-    assert f"{file}: is not TOML" in refusal(capsys, "--config", file)
+    file.write_text("threads = 2\nem.prior: 0.8\n")
+    assert f"{file}:2: is not TOML" in refusal(capsys, "--config", file)
