@@ -6,6 +6,7 @@ import subprocess
 import pytest
 
 from stillmap.cli import main
+from stillmap.cli.commands import COMMANDS
 from stillmap.errors import InputError, nearest
 
 
@@ -83,6 +84,26 @@ def test_a_file_with_nearly_that_name_is_named(capsys, tmp_path):
     assert f"did you mean '{tmp_path / 'options.toml'}'?" in config
     assert "recording.json" in refusal(capsys, "info", tmp_path / "quite-another")
     assert "did you mean" not in refusal(capsys, "info", tmp_path / "no/such/walk.log")
+    # names that stillmap gives are no slips of the pen
+    (tmp_path / "ran.json").write_text("")
+    message = refusal(capsys, "filter", tmp_path, "-o", tmp_path / "out")
+    assert "did you mean" not in message
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("map", "log", "--overwrite", "-o", ""),
+        ("map", "log", "--overwrite", "--output="),
+        ("info", ""),
+        ("config", "--config", ""),
+    ],
+)
+def test_a_variable_that_is_not_set_does_no_harm(capsys, tmp_path, monkeypatch, words):
+    (tmp_path / "mine").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    assert "an argument is empty" in refusal(capsys, *words)
+    assert (tmp_path / "mine").read_text() == "mine"
 
 
 def test_nearest():
@@ -169,3 +190,29 @@ def test_verbose_says_more_on_stderr(monkeypatch, capsys):
     assert capsys.readouterr() == ("", "")
     main(["-v", "config"])
     assert capsys.readouterr() == ("", "stillmap: iteration 3\n")
+
+
+CALLS = [
+    ("map", "in", "-o", "out"),
+    ("info", "in"),
+    ("view", "out"),
+    ("filter", "out", "-o", "clean"),
+    ("simulate", "hall", "-o", "out"),
+    ("eval", "labels", "out", "sim"),
+    ("config",),
+    ("completion", "bash"),
+]
+
+
+@pytest.mark.parametrize("words", CALLS, ids=lambda words: words[0])
+def test_ctrl_c_in_any_command(monkeypatch, capsys, words):
+    def run(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"stillmap.cli.{words[0]}.run", run)
+    assert main(list(words)) == 130
+    assert capsys.readouterr() == ("", "stillmap: interrupted, nothing was half-written\n")
+
+
+def test_there_is_a_call_of_every_command():
+    assert {words[0] for words in CALLS} == set(COMMANDS)

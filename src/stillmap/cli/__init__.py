@@ -24,6 +24,7 @@ def main(argv: list[str] | None = None) -> int:
     """Runs one command; returns its exit status."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # file names need not be text
         sys.stdout.reconfigure(errors="backslashreplace")
+    args = argparse.Namespace()
     try:
         if "_ARGCOMPLETE" in os.environ:
             _complete()
@@ -34,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
         _flush_stdout()
         return status
     except InputError as error:
-        fail(str(_with_similar_name(error)))
+        fail(str(_with_similar_name(error, args)))
         return EXIT_INPUT
     except KeyboardInterrupt:
         return _interrupted()
@@ -95,10 +96,11 @@ def _log(args: argparse.Namespace) -> None:
         root.addHandler(_Said())
 
 
-def _with_similar_name(error: InputError) -> InputError:
-    """A file that is not there: one beside it with nearly that name was meant, perhaps."""
+def _with_similar_name(error: InputError, args: argparse.Namespace) -> InputError:
+    """A file that was named but is not there: one beside it with nearly that name was meant?"""
     path = Path(error.where)
-    if not error.what.startswith(("does not exist", "cannot be read")) or not error.where:
+    given = {Path(word) for word in vars(args).values() if isinstance(word, str | Path)}
+    if not error.what.startswith(("does not exist", "cannot be read")) or path not in given:
         return error
     try:
         if os.path.lexists(path) or not path.parent.is_dir():

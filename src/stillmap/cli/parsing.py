@@ -1,6 +1,7 @@
 """argparse as people expect it: one line per error, with a hint; help as wide as the terminal."""
 
 import argparse
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
@@ -31,6 +32,9 @@ class Parser(argparse.ArgumentParser):
     ) -> tuple[argparse.Namespace, list[str]]:
         """Refuses unknown flags before it misses arguments that may be behind them."""
         words = list(sys.argv[1:] if args is None else args)
+        # as a path it would be the folder one is in, which --overwrite would replace
+        if any(re.fullmatch(r"(--[^=]+=)?", word) for word in words):
+            self.error("an argument is empty", "a variable that is not set?")
         if self.subcommands() is None:
             self._refuse([word for word in _flags(words) if not self._knows(word)])
         found, unknown = super().parse_known_args(words, namespace)
