@@ -40,3 +40,13 @@ def test_the_package_gives_its_names_when_they_are_used(command):
     )
     done = subprocess.run([command[0], "-c", program], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_parts_of_scipy_load_when_they_are_called(command):
+    program = (
+        "import sys, stillmap.result, stillmap.simulation, stillmap.cli.scores\n"
+        "late = {'scipy.sparse', 'scipy.spatial', 'scipy.ndimage', 'matplotlib', 'gtsam'}\n"
+        "assert not late & set(sys.modules), late & set(sys.modules)\n"
+    )
+    done = subprocess.run([command[0], "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
