@@ -61,7 +61,7 @@ def _completer(action: argparse.Action) -> "Callable[..., Iterable[str]] | None"
     from argcomplete.completers import DirectoriesCompleter, FilesCompleter
 
     shown: Any = action.metavar
-    if action.type not in (None, str, Path):  # numbers
+    if action.type not in (None, str, Path) or shown in ("TOPIC", "FRAME"):  # no files
         return lambda **_: ()
     if isinstance(shown, str) and shown.endswith("DIR"):
         return DirectoriesCompleter()

@@ -26,7 +26,7 @@ def add_parser(subparsers: Any) -> None:
         "odometry, and what is damaged. What was found out from the readings is marked so.",
         epilog=_EPILOG,
     )
-    parser.add_argument("input", metavar="INPUT", help="a log file or a recording folder")
+    parser.add_argument("input", metavar="INPUT", help="a log file, a bag or a recording folder")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     add_read_flags(parser)
     parser.set_defaults(run=run)

@@ -41,7 +41,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     p.add_argument(
         "input",
         metavar="INPUT",
-        help="a CARMEN log (.log, .clf, .gz) or a stillmap recording folder",
+        help="a CARMEN log, a ROS bag or a stillmap recording folder, see docs/input.md",
     )
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="where the result goes")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
