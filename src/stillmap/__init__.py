@@ -6,17 +6,16 @@ result = stillmap.build(recording)
 result.save("out")
 """
 
-from importlib.metadata import PackageNotFoundError, version
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from stillmap.errors import InputError
-from stillmap.pipeline import Iteration, Options, iterate
-from stillmap.recording import Recording, read
-from stillmap.result import Result, build
+if TYPE_CHECKING:
+    from stillmap.errors import InputError
+    from stillmap.pipeline import Iteration, Options, iterate
+    from stillmap.recording import Recording, read
+    from stillmap.result import Result, build
 
-try:
-    __version__ = version("stillmap")
-except PackageNotFoundError:  # run from a source tree that is not installed
-    __version__ = "0+unknown"
+    __version__: str
 
 __all__ = [
     "InputError",
@@ -29,3 +28,42 @@ __all__ = [
     "iterate",
     "read",
 ]
+
+# loaded when they are first used: `stillmap --help` has no use for them, and they take long
+_MODULES = {
+    "InputError": "errors",
+    "Iteration": "pipeline",
+    "Options": "pipeline",
+    "Recording": "recording",
+    "Result": "result",
+    "build": "result",
+    "iterate": "pipeline",
+    "read": "recording",
+}
+_ROOMS = ("changes", "em", "evaluation", "objects", "output", "recording", "simulation", "slam")
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        value = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    elif name == "__version__":
+        value = _version()
+    elif name in _ROOMS:
+        return importlib.import_module(f"{__name__}.{name}")
+    else:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *_ROOMS})
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("stillmap")
+    except PackageNotFoundError:  # run from a source tree that is not installed
+        return "0+unknown"

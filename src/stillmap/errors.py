@@ -1,5 +1,7 @@
 """The one exception that stands for bad input or a bad call."""
 
+from collections.abc import Iterable
+
 
 class InputError(Exception):
     """Input or call at fault: says what is wrong, where, and what to do.
@@ -22,3 +24,18 @@ class InputError(Exception):
         place = f"{self.where}: " if self.where else ""
         advice = f" ({self.hint})" if self.hint else ""
         return f"{place}{self.what}{advice}".replace("\n", " ")
+
+
+def nearest(word: str, known: Iterable[str], least: float = 0.6) -> str | None:
+    """The known word most like `word`, for hints; None where none is like it.
+
+    Args:
+        word: what was written.
+        known: what could have been meant.
+        least: how much alike they have to be, 0 (anything is) to 1 (the same).
+    """
+    from difflib import get_close_matches  # only where something went wrong
+
+    originals = {one.lower(): one for one in known}
+    found = get_close_matches(word.lower(), originals, n=1, cutoff=least)
+    return originals[found[0]] if found else None

@@ -1,17 +1,17 @@
 """Options as frozen dataclasses: one default each, unknown keys refused, TOML in and out."""
 
 import dataclasses
-import difflib
 import json
+import re
 import sys
 import tomllib
 import types
 import typing
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-from stillmap.errors import InputError
+from stillmap.errors import InputError, nearest
 
 T = TypeVar("T")
 
@@ -34,25 +34,26 @@ def replaced(options: T, changes: Mapping[str, Any], where: str = "") -> T:
     Raises:
         InputError: an unknown key (the nearest one is named) or a value of the wrong type.
     """
-    return _replaced(options, changes, where, "")
+    return _replaced(options, changes, where, "", options)
 
 
-def _replaced(options: T, changes: Mapping[str, Any], where: str, prefix: str) -> T:
+def _replaced(options: T, changes: Mapping[str, Any], where: str, prefix: str, top: Any) -> T:
     fields = {f.name: f for f in dataclasses.fields(options)}  # type: ignore[arg-type]
     hints = typing.get_type_hints(type(options))
     values: dict[str, Any] = {}
     for key, value in changes.items():
         if key not in fields:
-            near = difflib.get_close_matches(key, fields, n=1, cutoff=0.0)
-            raise InputError(
-                f"unknown option '{prefix}{key}'", where=where, hint=f"nearest: '{prefix}{near[0]}'"
-            )
+            name = f"{prefix}{key}"
+            near = nearest(name, names(top), least=0.0)
+            raise InputError(f"unknown option '{name}'", where=where, hint=f"nearest: '{near}'")
         current = getattr(options, key)
         if dataclasses.is_dataclass(current):
             if not isinstance(value, Mapping):
                 raise InputError(f"'{prefix}{key}' is a section, not a value", where=where)
-            values[key] = _replaced(current, value, where, f"{prefix}{key}.")
+            values[key] = _replaced(current, value, where, f"{prefix}{key}.", top)
         else:
+            if isinstance(value, Mapping):
+                raise InputError(f"'{prefix}{key}' is a value, not a section", where=where)
             values[key] = _coerced(value, hints[key], f"{prefix}{key}", where)
     try:
         return dataclasses.replace(options, **values)  # type: ignore[type-var]
@@ -61,8 +62,7 @@ def _replaced(options: T, changes: Mapping[str, Any], where: str, prefix: str) -
 
 
 def _coerced(value: Any, hint: Any, name: str, where: str) -> Any:
-    choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    for choice in choices:
+    for choice in _alternatives(hint):
         if typing.get_origin(choice) is typing.Literal and value in typing.get_args(choice):
             return value
         if choice is float and isinstance(value, int | float) and not isinstance(value, bool):
@@ -75,11 +75,16 @@ def _coerced(value: Any, hint: Any, name: str, where: str) -> Any:
             return value
         if choice is type(None) and value is None:
             return value
-    wanted = " or ".join(_type_name(choice) for choice in choices)
-    raise InputError(f"'{name}' wants {wanted}, got {value!r}", where=where)
+    raise InputError(f"'{name}' wants {_type_name(hint)}, got {value!r}", where=where)
+
+
+def _alternatives(hint: Any) -> tuple[Any, ...]:
+    return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
 
 
 def _type_name(hint: Any) -> str:
+    if isinstance(hint, types.UnionType):
+        return " or ".join(map(_type_name, _alternatives(hint)))
     if typing.get_origin(hint) is typing.Literal:
         return " | ".join(repr(value) for value in typing.get_args(hint))
     return "nothing" if hint is type(None) else str(getattr(hint, "__name__", hint))
@@ -92,7 +97,10 @@ def load_toml(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"is not TOML: {error}", where=str(path)) from error
+        line = re.search(r" \(at line (\d+), column \d+\)$", str(error))
+        what = str(error)[: line.start()] if line else str(error)
+        where = f"{path}:{line[1]}" if line else str(path)
+        raise InputError(f"is not TOML: {what}", where=where) from error
 
 
 def parse_assignment(text: str) -> dict[str, Any]:
@@ -101,9 +109,11 @@ def parse_assignment(text: str) -> dict[str, Any]:
     if not equals or not key.strip():
         raise InputError(f"--set wants section.key=value, got '{text}'")
     try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
+        read = tomllib.loads(f"value = {value}")
     except (tomllib.TOMLDecodeError, RecursionError):
-        parsed = value.strip()
+        read = {}
+    # more than one key: the value had several lines, and only looked like TOML
+    parsed = read["value"] if len(read) == 1 else value.strip()
     nested: dict[str, Any] = {}
     inner = nested
     *sections, last = key.strip().split(".")
@@ -130,26 +140,105 @@ def to_dict(options: Any) -> dict[str, Any]:
     return dataclasses.asdict(options)
 
 
-def to_toml(options: Any) -> str:
-    """Every option with its value, unit and meaning, as TOML that `--config` reads back."""
-    return "\n".join(_toml_lines(options, "")) + "\n"
+class Described(NamedTuple):
+    """One option; `name` as in `em.prior`, `doc` with its unit and meaning."""
+
+    name: str
+    value: Any
+    default: Any
+    kind: str
+    choices: tuple[Any, ...]
+    doc: str
 
 
-def _toml_lines(options: Any, section: str) -> Iterator[str]:
-    if section:
-        yield f"\n[{section}]"
-    fields = dataclasses.fields(options)
-    nested = [f for f in fields if dataclasses.is_dataclass(getattr(options, f.name))]
+def described(options: Any, prefix: str = "") -> Iterator[Described]:
+    """Every option of `options`, section by section, the sections' own last."""
+    hints = typing.get_type_hints(type(options))
+    fields, sections = _fields(options)
     for f in fields:
-        if f in nested:
+        hint = hints[f.name]
+        choices = [c for one in _alternatives(hint) for c in _choices(one)]
+        kind = " or ".join(
+            "str" if _choices(one) else _type_name(one) for one in _alternatives(hint)
+        )
+        value, doc = getattr(options, f.name), f.metadata.get("doc", "")
+        yield Described(f"{prefix}{f.name}", value, f.default, kind, tuple(choices), doc)
+    for f in sections:
+        yield from described(getattr(options, f.name), f"{prefix}{f.name}.")
+
+
+def names(options: Any, prefix: str = "") -> Iterator[str]:
+    """The names of all options and sections."""
+    fields, sections = _fields(options)
+    yield from (f"{prefix}{f.name}" for f in fields)
+    for f in sections:
+        yield f"{prefix}{f.name}"
+        yield from names(getattr(options, f.name), f"{prefix}{f.name}.")
+
+
+def is_within(name: str, section: str) -> bool:
+    """Whether an option is of that section, or is the one of that name; "": all are."""
+    return not section or name == section or name.startswith(f"{section}.")
+
+
+def _fields(options: Any) -> tuple[list[Any], list[Any]]:
+    """Its fields that are values, and those that are sections."""
+    fields = dataclasses.fields(options)
+    sections = [f for f in fields if dataclasses.is_dataclass(getattr(options, f.name))]
+    return [f for f in fields if f not in sections], sections
+
+
+def _choices(hint: Any) -> tuple[Any, ...]:
+    return typing.get_args(hint) if typing.get_origin(hint) is typing.Literal else ()
+
+
+def to_toml(options: Any, only: str = "") -> str:
+    """Every option with its value, unit and meaning, as TOML that `--config` reads back.
+
+    Args:
+        options: see `replaced`.
+        only: name of the section or of the option that is wanted; "": all.
+
+    Raises:
+        InputError: there is neither section nor option of that name.
+    """
+    if only and only not in (known := list(names(options))):
+        raise InputError(
+            f"there is no option or section '{only}'",
+            hint=f"nearest: '{nearest(only, known, least=0.0)}'",
+        )
+    return "\n".join(_toml_lines(options, only)).lstrip("\n") + "\n"
+
+
+def _toml_lines(options: Any, only: str) -> Iterator[str]:
+    section = ""
+    for one in described(options):
+        if not is_within(one.name, only):
             continue
-        value = getattr(options, f.name)
-        doc = f.metadata.get("doc", "")
+        before, (section, _, key) = section, one.name.rpartition(".")
+        if section != before:
+            yield from _heading(options, section)
+        # what may be chosen stands in the meaning already where that says what each choice does
+        listed = any(str(choice) not in one.doc for choice in one.choices)
+        doc = one.doc + (f" ({' | '.join(map(str, one.choices))})" if listed else "")
         # TOML has no null: an option that is unset stands as a comment
         yield (
-            f"# {f.name} is not set  # {doc}"
-            if value is None
-            else (f"{f.name} = {json.dumps(value)}  # {doc}")
+            f"# {key} is not set  # {doc}"
+            if one.value is None
+            else f"{key} = {_toml_value(one.value)}  # {doc}"
         )
-    for f in nested:
-        yield from _toml_lines(getattr(options, f.name), f"{section}.{f.name}".lstrip("."))
+
+
+def _toml_value(value: Any) -> str:
+    # TOML has neither JSON's pairs of escapes for one character nor a bare DEL
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _heading(options: Any, section: str) -> Iterator[str]:
+    for name in section.split("."):
+        options = getattr(options, name)
+    yield ""
+    said = (type(options).__doc__ or "").partition("\n")[0]
+    if not said.startswith(f"{type(options).__name__}("):  # what dataclasses say by themselves
+        yield f"# {said}"
+    yield f"[{section}]"

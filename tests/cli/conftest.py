@@ -1,6 +1,7 @@
 """The command as a process of its own, and a small room to map."""
 
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -65,6 +66,43 @@ def start(command: list[str]) -> Callable[..., subprocess.Popen[str]]:
             signal.signal(signal.SIGINT, before)
 
     return popen
+
+
+@pytest.fixture(scope="session")
+def on_a_terminal(start: Callable[..., subprocess.Popen[str]]) -> Callable[..., tuple[int, str]]:
+    """Runs stillmap with stderr on a terminal; Ctrl-C as soon as `send_at` shows.
+
+    Gives the exit status and what was written there.
+    """
+    pty = pytest.importorskip("pty", reason="no terminals to be had here")
+
+    def run(*words: object, send_at: bytes | None = None, **environment: str) -> tuple[int, str]:
+        master, slave = pty.openpty()
+        plain = {k: v for k, v in os.environ.items() if "COLOR" not in k}
+        terminal = {"TERM": "xterm-256color", "COLUMNS": "100"}
+        process = start(*words, stderr=slave, env=plain | terminal | environment)
+        os.close(slave)
+        seen = b""
+        try:
+            while select.select([master], [], [], 60)[0]:
+                try:
+                    piece = os.read(master, 4096)
+                except OSError:  # Linux: the other end has been closed
+                    break
+                if not piece:
+                    break
+                seen += piece
+                if send_at is not None and send_at in seen:
+                    process.send_signal(signal.SIGINT)
+                    send_at = None
+            out, _ = process.communicate(timeout=60)
+        finally:
+            os.close(master)
+            process.kill()
+        assert out == ""
+        return process.returncode, seen.decode()
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -1,12 +1,13 @@
 """`stillmap config`, and how options are chosen: default < file < --set < flag."""
 
 import json
+import re
 import tomllib
 
 import pytest
 
 from stillmap.cli import main
-from stillmap.options import to_dict
+from stillmap.options import described, names, to_dict
 from stillmap.pipeline import Options
 
 
@@ -38,8 +39,12 @@ def test_prints_every_option_with_its_default(capsys):
 
 
 def test_every_option_has_its_meaning_behind_it(capsys):
-    for line in config(capsys).splitlines():
-        if line and not line.startswith("["):
+    lines = config(capsys).splitlines()
+    headings = {i - 1 for i, line in enumerate(lines) if line.startswith("[")}
+    for i, line in enumerate(lines):
+        if i in headings:
+            assert re.match("# [A-Z].{10,}", line)
+        elif line and not line.startswith("["):
             assert line.count("  # ") == 1
             assert len(line.split("  # ")[1]) > 8, line
 
@@ -95,6 +100,59 @@ def test_a_flag_wins_over_set_and_file(capsys, tmp_path, room):
     assert options["read"]["min_range"] == 0.3
     assert options["em"]["max_iterations"] == 1
     assert options["output"]["map_mode"] == "raw"
+
+
+def test_each_step_wins_over_the_one_before(capsys, tmp_path, room):
+    """Default < file < --set < flag, one step at a time."""
+    file = tmp_path / "options.toml"
+    file.write_text("[slam]\nresolution = 0.4\n")
+    steps = ["--config", file], ["--set", "slam.resolution=0.3"], ["--resolution", 0.2]
+    for n, wanted in enumerate((0.05, 0.4, 0.3, 0.2)):
+        out = tmp_path / f"out{n}"
+        given = [word for step in steps[:n] for word in step]
+        words = ["map", room, "-o", out, "--quiet", "--set", "em.max_iterations=1", *given]
+        assert main([*map(str, words)]) == 0
+        options = json.loads((out / "run.json").read_text())["options"]
+        assert options["slam"]["resolution"] == wanted
+    assert capsys.readouterr() == ("", "")
+
+
+SECTIONS = [name for name in names(Options()) if name not in {d.name for d in described(Options())}]
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+def test_a_section_alone_can_be_read_back(capsys, tmp_path, section):
+    whole = tomllib.loads(config(capsys))
+    text = config(capsys, section)
+    alone = whole
+    for name in section.split("."):
+        alone = alone[name]
+    found = tomllib.loads(text)
+    for name in section.split("."):
+        assert list(found) == [name]
+        found = found[name]
+    assert found == alone
+    assert re.match(r"# [A-Z].*\n\[[\w.]+\]\n", text)
+    file = tmp_path / "options.toml"
+    file.write_text(text)
+    assert config(capsys, "--config", file) == config(capsys)
+
+
+def test_one_option_alone(capsys):
+    assert config(capsys, "em.prior", "--set", "em.prior=0.75").splitlines()[1:] == [
+        "[em]",
+        "prior = 0.75  # p(c = 1), share of beams thought static before anything was learned",
+    ]
+    assert config(capsys, "threads").startswith("threads = 0  # ")
+    assert "# max_range is not set" in config(capsys, "read.max_range")
+
+
+def test_choices_stand_in_the_comment(capsys):
+    for one in described(Options()):
+        if one.choices:
+            comment = config(capsys, one.name).partition("  # ")[2]
+            for choice in one.choices:
+                assert str(choice) in comment
 
 
 @pytest.mark.parametrize(
@@ -159,5 +217,5 @@ def test_wrong_values_say_where(capsys, words, said):
 
 def test_a_file_that_is_no_toml(capsys, tmp_path):
     file = tmp_path / "options.toml"
-    file.write_text("em.prior: 0.8\n")
-    assert f"{file}: is not TOML" in refusal(capsys, "--config", file)
+    file.write_text("threads = 2\nem.prior: 0.8\n")
+    assert f"{file}:2: is not TOML" in refusal(capsys, "--config", file)

@@ -57,7 +57,7 @@ def test_version(stillmap):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), "COMMAND"),
+        (("--quiet", "--frob"), "--frob"),
         (("chart",), "'chart'"),
         (("map",), "INPUT"),
         (("map", "log"), "--output"),

@@ -4,7 +4,6 @@ import filecmp
 import json
 import os
 import re
-import select
 import shutil
 import signal
 import subprocess
@@ -317,34 +316,6 @@ def test_killed_while_overwriting_the_old_result_or_the_new_stands_there(start, 
     assert files_in(out) == {"old.txt"} or files_in(out) >= FILES
 
 
-def on_a_terminal(start, *words, send_at=None) -> tuple[int, str]:
-    """Runs with stderr on a terminal; Ctrl-C as soon as `send_at` shows."""
-    pty = pytest.importorskip("pty", reason="no terminals to be had here")
-    master, slave = pty.openpty()
-    environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "100"}
-    process = start(*words, stderr=slave, env=environment)
-    os.close(slave)
-    seen = b""
-    try:
-        while select.select([master], [], [], 60)[0]:
-            try:
-                piece = os.read(master, 4096)
-            except OSError:  # Linux: the other end has been closed
-                break
-            if not piece:
-                break
-            seen += piece
-            if send_at is not None and send_at in seen:
-                process.send_signal(signal.SIGINT)
-                send_at = None
-        out, _ = process.communicate(timeout=60)
-    finally:
-        os.close(master)
-        process.kill()
-    assert out == ""
-    return process.returncode, seen.decode()
-
-
 def left_on_screen(written: str) -> list[str]:
     """The lines that stay on a terminal: enough of one to follow a bar that is redrawn."""
     lines, row = [""], 0
@@ -365,9 +336,9 @@ def left_on_screen(written: str) -> list[str]:
     return [line for line in lines if line.strip()]
 
 
-def test_a_bar_on_a_terminal_and_no_garbage_after_it(start, room, tmp_path):
+def test_a_bar_on_a_terminal_and_no_garbage_after_it(on_a_terminal, room, tmp_path):
     status, written = on_a_terminal(
-        start, "map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=2"
+        "map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=2"
     )
     assert status == 0
     assert "iteration 1 of at most 2" in written
@@ -378,9 +349,9 @@ def test_a_bar_on_a_terminal_and_no_garbage_after_it(start, room, tmp_path):
     assert "report.html" in lines[-1]
 
 
-def test_ctrl_c_on_a_terminal_gives_the_cursor_back(start, room, tmp_path, nothing_left):
+def test_ctrl_c_on_a_terminal_gives_the_cursor_back(on_a_terminal, room, tmp_path, nothing_left):
     status, written = on_a_terminal(
-        start, "map", room, "-o", tmp_path / "out", *ENDLESS, send_at=b"iteration 2 of"
+        "map", room, "-o", tmp_path / "out", *ENDLESS, send_at=b"iteration 2 of"
     )
     assert status == 130
     assert written.count("\x1b[?25l") == written.count("\x1b[?25h") > 0

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
-from scipy.spatial import cKDTree
 
 from stillmap.changes.swept import swept_cells
 from stillmap.em import ChangeOptions, Courses, look_numbers
@@ -89,7 +88,9 @@ def beams_on_things(
         inside = np.flatnonzero(during & ((at >= low) & (at < high)).all(axis=1))
         near = np.zeros(tuple((high - low).tolist()), bool)
         near[tuple((change.cells - low).T)] = True
-        stood[inside] |= binary_dilation(near, np.ones((3, 3), bool))[tuple((at[inside] - low).T)]
+        stood[inside] |= scipy.ndimage.binary_dilation(near, np.ones((3, 3), bool))[
+            tuple((at[inside] - low).T)
+        ]
     return beam[stood]
 
 
@@ -114,7 +115,7 @@ def _same(one: Change, other: Change) -> bool:
     if np.any(apart > np.array(one.size) + np.array(other.size)):
         return False
     smaller, larger = sorted((one.cells, other.cells), key=len)
-    distances, _ = cKDTree(larger).query(smaller)
+    distances, _ = scipy.spatial.cKDTree(larger).query(smaller)
     return bool(np.mean(distances < 0.5) > 0.5)
 
 
@@ -165,7 +166,7 @@ def _without_noise(changes: list[Change], courses: Courses, options: ChangeOptio
     stays = courses.cells[courses.p_static > _SURE]
     if not len(stays):
         return changes
-    tree = cKDTree(stays)
+    tree = scipy.spatial.cKDTree(stays)
     out = []
     for one in changes:
         distance, _ = tree.query(one.cells, distance_upper_bound=_NOISE + 1.0)
@@ -297,7 +298,7 @@ def _merged(changes: list[Change], resolution: float, near: float) -> list[Chang
 
 
 def _apart(cells: NDArray[np.int64], others: NDArray[np.int64]) -> float:
-    distances, _ = cKDTree(cells).query(others)
+    distances, _ = scipy.spatial.cKDTree(cells).query(others)
     return float(np.min(distances))
 
 

@@ -1,68 +1,41 @@
 """The command line: one file per command. Only this package prints and exits."""
 
 import argparse
+import io
 import logging
 import os
 import signal
 import sys
+from pathlib import Path
 from types import FrameType
+from typing import NoReturn
 
-from stillmap import __version__
-from stillmap.cli import config, eval, filter, info, map, simulate
-from stillmap.cli.progress import say
-from stillmap.errors import InputError
+from stillmap.cli.commands import COMMANDS, parser
+from stillmap.cli.parsing import EXIT_INPUT
+from stillmap.cli.progress import fail, say
+from stillmap.errors import InputError, nearest
 
-EXIT_OURS, EXIT_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 2, 130, 143
+EXIT_OURS, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 130, 143
 
-_EPILOG = """examples:
-  stillmap info log.clf.gz              what is in a recording
-  stillmap map log.clf.gz -o out        map it; then open out/report.html
-  stillmap filter out -o clean.clf      the recording without what moved
-  stillmap simulate hall -o sim         a recording with truth
-  stillmap eval labels out sim          how good the labels are
-"""
-
-
-class _Parser(argparse.ArgumentParser):
-    """Errors are one line and exit with status 2, like every other bad call."""
-
-    def error(self, message: str) -> None:  # type: ignore[override]
-        self.exit(EXIT_INPUT, f"{self.prog}: {message} (see {self.prog} --help)\n")
-
-    def exit(self, status: int = 0, message: str | None = None) -> None:  # type: ignore[override]
-        _flush_stdout()  # --help and --version may be going into a pipe that has closed
-        super().exit(status, message)
-
-
-def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
-    top = _Parser(
-        prog="stillmap",
-        description="Clean maps of what stands still, from recordings of places full of movers.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    top.add_argument("--version", action="version", version=f"stillmap {__version__}")
-    top.add_argument("-v", "--verbose", action="store_true", help="say more while working")
-    commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (map, info, filter, simulate, eval, config):
-        command.add_parser(commands)
-    return top
+_MANY = 10_000  # names of a folder in which one like a missing one is looked for
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one command; returns its exit status."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # file names need not be text
+        sys.stdout.reconfigure(errors="backslashreplace")
+    args = argparse.Namespace()
     try:
-        args = parser().parse_args(argv)
-        logging.basicConfig(
-            level=logging.INFO if args.verbose else logging.WARNING, format="stillmap: %(message)s"
-        )
+        if "_ARGCOMPLETE" in os.environ:
+            _complete()
+        args = _parsed(sys.argv[1:] if argv is None else argv)
+        _log(args)
         signal.signal(signal.SIGTERM, _terminated)
         status: int = args.run(args)
         _flush_stdout()
         return status
     except InputError as error:
-        say(str(error))
+        fail(str(_with_similar_name(error, args)))
         return EXIT_INPUT
     except KeyboardInterrupt:
         return _interrupted()
@@ -71,14 +44,85 @@ def main(argv: list[str] | None = None) -> int:
         _drop_stdout()
         return 0
     except OSError as error:
-        say(str(error))  # a full disk behind stdout, a file that vanished while it was read
+        # a full disk behind stdout, a file that vanished while it was read
+        fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
         _drop_stdout()
+        return EXIT_INPUT
+    except MemoryError as error:
+        fail(f"not enough memory{': ' if str(error) else ''}{error}")
         return EXIT_INPUT
     except Exception as error:
         behind = _stopped_by(error)
-        if behind is None:
-            raise
-        return EXIT_TERMINATED if isinstance(behind, SystemExit) else _interrupted()
+        if behind is not None:
+            return EXIT_TERMINATED if isinstance(behind, SystemExit) else _interrupted()
+        _report_defect(error)
+        return EXIT_OURS
+
+
+def _parsed(words: list[str]) -> argparse.Namespace:
+    command = next((word for word in words if not word.startswith("-")), "")
+    top = parser([command])
+    args = top.parse_args(words)
+    if args.command is None:
+        _show_commands(top)
+    return args
+
+
+def _show_commands(top: argparse.ArgumentParser) -> NoReturn:
+    """What to do with a call without a command."""
+    listed = "".join(f"  {name:<12} {about}\n" for name, about in COMMANDS.items())
+    usage = f"{top.format_usage()}\ncommands:\n{listed}\nsee stillmap --help\n"
+    top.exit(EXIT_INPUT, usage)
+
+
+def _complete() -> NoReturn:
+    """Answers the shell that asks how a line may go on."""
+    from stillmap.cli.completion import answer
+
+    answer(parser(os.environ.get("COMP_LINE", "").split()))
+
+
+class _Said(logging.Handler):
+    """What the package has to say goes where everything is said, above a bar that is shown."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        say(record.getMessage())
+
+
+def _log(args: argparse.Namespace) -> None:
+    root = logging.getLogger()
+    root.setLevel(logging.INFO if args.verbose else logging.WARNING)
+    if not any(isinstance(handler, _Said) for handler in root.handlers):
+        root.addHandler(_Said())
+
+
+def _with_similar_name(error: InputError, args: argparse.Namespace) -> InputError:
+    """A file that was named but is not there: one beside it with nearly that name was meant?"""
+    path = Path(error.where)
+    given = {Path(word) for word in vars(args).values() if isinstance(word, str | Path)}
+    if not error.what.startswith(("does not exist", "cannot be read")) or path not in given:
+        return error
+    try:
+        if os.path.lexists(path) or not path.parent.is_dir():
+            return error
+        with os.scandir(path.parent) as entries:
+            names = [entry.name for entry, _ in zip(entries, range(_MANY), strict=False)]
+    except (OSError, ValueError):
+        return error
+    similar = nearest(path.name, names)
+    if similar is None:
+        return error
+    hint = f"did you mean '{path.with_name(similar)}'?"
+    return InputError(error.what, where=error.where, hint=hint)
+
+
+def _report_defect(error: Exception) -> None:
+    """The trace is what we want to be sent: without it a report says little."""
+    import traceback
+
+    if sys.stderr is not None:
+        traceback.print_exception(error)
+    fail("this is a defect of stillmap: please report it, with the lines above")
 
 
 def _stopped_by(error: BaseException | None) -> BaseException | None:

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import options
+from stillmap.cli.commands import COMMANDS
+from stillmap.cli.printing import print_json
 from stillmap.cli.progress import say
 from stillmap.errors import InputError
 from stillmap.evaluation.folders import read_labels
@@ -17,13 +19,22 @@ from stillmap.output.atomic import require_new
 from stillmap.recording import Recording, carmen_blanked, folder, read
 from stillmap.recording.options import ReadOptions
 
+_EPILOG = """examples:
+  stillmap filter out -o clean.clf.gz
+  stillmap filter out -o clean.log --below 0.3 --input moved/log.log
+"""
 _MAX_RUN = 256 << 20  # bytes of a run.json
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Adds the command."""
     p = commands.add_parser(
-        "filter", help="the recording again, without beams on what moves, for other mappers"
+        "filter",
+        help=COMMANDS["filter"],
+        description="Write the recording again, in its own format, with the beams blanked that met "
+        "something moving: for mappers and localisers that take all they see for static. Nothing "
+        "else is changed.",
+        epilog=_EPILOG,
     )
     p.add_argument("result", metavar="DIR", help="what `stillmap map` wrote")
     p.add_argument("-o", "--output", metavar="FILE", required=True, help="where the recording goes")
@@ -36,6 +47,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         help="blank beams that something static reflected with less than P (default: %(default)g)",
     )
     p.add_argument("--overwrite", action="store_true", help="replace what is there")
+    p.add_argument("--json", action="store_true", help="the summary as one JSON object on stdout")
     p.add_argument("--quiet", action="store_true", help="no summary")
     p.set_defaults(run=run)
 
@@ -58,8 +70,11 @@ def run(args: argparse.Namespace) -> int:
         left_out = 0
     else:
         left_out = carmen_blanked.write(source, output, recording, blank).left_out
+    beams, hits = int(blank.sum()), int(recording.hit.sum())
+    if args.json:
+        counts = {"hits": hits, "blanked": beams, "lines_left_out": left_out}
+        print_json({"output": str(output), "input": str(source), **counts})
     if not args.quiet:
-        beams, hits = int(blank.sum()), int(recording.hit.sum())
         say(f"{beams} beams blanked, {100.0 * beams / max(hits, 1):.1f} % of the hits; in {output}")
         if left_out:
             say(f"{left_out} lines left out: of scans that were not mapped")

@@ -6,20 +6,27 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from stillmap import options
+from stillmap.cli.commands import COMMANDS
 from stillmap.cli.reading import add_read_flags, read_changes
-from stillmap.recording import ReadOptions, read
-from stillmap.recording.facts import facts
 
 _LINES_SHOWN = 10
+_EPILOG = """examples:
+  stillmap info log.clf.gz
+  stillmap info sim --json
+  stillmap info log.log --max-range 30 --laser-offset 0.2 0 0
+"""
 
 
 def add_parser(subparsers: Any) -> None:
     """Register the command with argparse's `subparsers`."""
     parser = subparsers.add_parser(
-        "info", help="what is in a recording", description="Show what is in a recording."
+        "info",
+        help=COMMANDS["info"],
+        description="Show what is in a recording: scans, beams, field of view, ranges, duration, "
+        "odometry, and what is damaged. What was found out from the readings is marked so.",
+        epilog=_EPILOG,
     )
-    parser.add_argument("input", metavar="INPUT", help="a log file or a recording folder")
+    parser.add_argument("input", metavar="INPUT", help="a log file, a bag or a recording folder")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     add_read_flags(parser)
     parser.set_defaults(run=run)
@@ -31,6 +38,11 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: it could not.
     """
+    # these take long to load
+    from stillmap import options
+    from stillmap.recording import ReadOptions, read
+    from stillmap.recording.facts import facts
+
     read_options = options.replaced(ReadOptions(), read_changes(args).get("read", {}))
     found = {"input": args.input, **facts(read(args.input, read_options))}
     if args.json:

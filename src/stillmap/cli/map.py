@@ -2,53 +2,98 @@
 
 import argparse
 import dataclasses
+import json
 import os
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any
 
-from stillmap import em
+from stillmap.cli.commands import COMMANDS
 from stillmap.cli.options import add_option_flags, resolved_options
+from stillmap.cli.printing import files_in, print_json
 from stillmap.cli.progress import say, shown_progress
 from stillmap.cli.reading import add_read_flags, read_changes
 from stillmap.errors import InputError
-from stillmap.output.atomic import require_new
-from stillmap.output.points import beam_counts
-from stillmap.recording import Recording, read
-from stillmap.recording.poses import poses_from_tum
-from stillmap.result import Result, build
-from stillmap.stages import Stages
+
+if TYPE_CHECKING:
+    from stillmap.recording import Recording
+    from stillmap.result import Result
+
+_EPILOG = """examples:
+  stillmap map log.clf.gz -o out
+  stillmap map sim -o out --overwrite --resolution 0.1
+  stillmap map log.clf.gz -o out --min-range 0.3 --set em.max_iterations=3
+  stillmap map log.clf.gz -o out --poses poses.tum --config options.toml
+  stillmap map log.clf.gz -o out --quiet --json
+"""
+_IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seconds", "warnings")
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Adds the command."""
-    p = commands.add_parser("map", help="the main job: recording in, folder out")
+    p = commands.add_parser(
+        "map",
+        help=COMMANDS["map"],
+        description="Map a recording: find out for every beam how likely it hit something that "
+        "stands still, where the robot was at every scan, and what the map is without what moves. "
+        "The result is a folder; open it with `stillmap view`.",
+        epilog=_EPILOG,
+    )
     p.add_argument(
         "input",
         metavar="INPUT",
-        help="a CARMEN log (.log, .clf, .gz) or a stillmap recording folder",
+        help="a CARMEN log, a ROS bag or a stillmap recording folder, see docs/input.md",
     )
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="where the result goes")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
-    p.add_argument("--paper", action="store_true", help="the method exactly as printed")
     p.add_argument(
-        "--estimator", choices=get_args(em.Estimator), help="what says which beams are static"
+        "--threads", metavar="N", type=int, help="0: one per processor; same result (default: 0)"
     )
-    p.add_argument("--poses", metavar="FILE.tum", help="keep these poses, estimate the rest")
-    p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
-    p.add_argument("--resolution", metavar="M", type=float, help="edge of a map cell in metres")
-    p.add_argument("--map-mode", choices=["trinary", "scale", "raw"], help="pixels of map.pgm")
-    p.add_argument(
-        "--map-state", choices=get_args(em.MapState), help="which state of places that changed"
-    )
-    p.add_argument("--threads", metavar="N", type=int, help="0: one per processor")
+    p.add_argument("--json", action="store_true", help="a summary as one JSON object on stdout")
     p.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    _add_method_flags(p.add_argument_group("method"))
+    _add_map_flags(p.add_argument_group("map"))
     add_read_flags(p)
     add_option_flags(p)
     p.set_defaults(run=run)
 
 
+def _add_method_flags(p: argparse._ArgumentGroup) -> None:
+    p.add_argument("--paper", action="store_true", help="the method exactly as printed")
+    p.add_argument(
+        "--estimator",
+        choices=("stillmap", "paper", "hit-ratio", "tracker"),
+        help="what says which beams are static (default: stillmap)",
+    )
+    p.add_argument("--poses", metavar="FILE.tum", help="keep these poses, estimate the rest")
+    p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
+
+
+def _add_map_flags(p: argparse._ArgumentGroup) -> None:
+    p.add_argument(
+        "--resolution", metavar="M", type=float, help="edge of a map cell in metres (default: 0.05)"
+    )
+    p.add_argument(
+        "--map-mode",
+        choices=("trinary", "scale", "raw"),
+        help="pixels of map.pgm (default: trinary)",
+    )
+    p.add_argument(
+        "--map-state",
+        choices=("last", "majority"),
+        help="which state of places that changed (default: last)",
+    )
+
+
 def run(args: argparse.Namespace) -> int:
     """Reads, maps, writes, says what came of it."""
+    # these take long to load
+    from stillmap import em
+    from stillmap.output.atomic import require_new
+    from stillmap.recording import read
+    from stillmap.recording.poses import poses_from_tum
+    from stillmap.result import build
+    from stillmap.stages import Stages
+
     options = resolved_options(args, read_changes(args), _changes(args))
     output = Path(args.output)
     require_new(output, args.overwrite)
@@ -63,6 +108,8 @@ def run(args: argparse.Namespace) -> int:
     result.save(output, overwrite=args.overwrite)
     if not args.quiet:
         _say(result, output)
+    if args.json:
+        print_json(_summary(output))
     return 0
 
 
@@ -75,7 +122,7 @@ def _require_writable(output: Path) -> None:
         raise InputError(f"cannot be written: nothing can be put into {parent}", where=str(output))
 
 
-def _usable(recording: Recording, args: argparse.Namespace) -> Recording:
+def _usable(recording: "Recording", args: argparse.Namespace) -> "Recording":
     if recording.n_scans == 0:
         raise InputError("holds no scan that can be used", where=args.input)
     if recording.dimension != 2:
@@ -106,7 +153,20 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
     return changes
 
 
-def _say(result: Result, output: Path) -> None:
+def _summary(output: Path) -> dict[str, Any]:
+    """What `run.json` says of the run, shorter, and which files there are."""
+    record = json.loads((output / "run.json").read_text(encoding="utf-8"))
+    return {
+        "output": str(output),
+        "files": files_in(output),
+        "iterations": len(record["iterations"]),
+        **{key: record[key] for key in _IN_SUMMARY},
+    }
+
+
+def _say(result: "Result", output: Path) -> None:
+    from stillmap.output.points import beam_counts
+
     counts = beam_counts(result.recording, result.p_static)
     end = "converged" if result.converged else "not converged"
     lines = [
@@ -121,7 +181,7 @@ def _say(result: Result, output: Path) -> None:
         say(line)
 
 
-def _changed(result: Result) -> list[str]:
+def _changed(result: "Result") -> list[str]:
     n = len(result.changes)
     if not n:
         return []

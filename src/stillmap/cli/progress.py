@@ -1,32 +1,50 @@
-"""Progress on stderr: a bar on a terminal, a line now and then elsewhere, nothing if quiet."""
+"""What is said, on stderr: a bar on a terminal, a line now and then elsewhere, nothing if quiet."""
 
 import os
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-from stillmap.pipeline import Progress, silent
+from stillmap.cli.terminal import is_terminal, painted
+
+if TYPE_CHECKING:
+    from stillmap.pipeline import Progress
 
 _EVERY = 10.0  # s between lines where there is no terminal
 
 
 def say(line: str) -> None:
     """One line on stderr. That nobody listens there any more is no reason to give up the work."""
+    marked = "warning:"
+    if line.startswith(marked):
+        line = painted(marked, "warning", sys.stderr) + line[len(marked) :]
+    _write(f"stillmap: {line}")
+
+
+def fail(line: str) -> None:
+    """The one line that says why nothing came of it."""
+    _write(f"{painted('stillmap:', 'error', sys.stderr)} {line}")
+
+
+def _write(line: str) -> None:
     if sys.stderr is None:
         return
     try:
-        print(f"stillmap: {line}", file=sys.stderr, flush=True)
+        print(line, file=sys.stderr, flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 @contextmanager
-def shown_progress(quiet: bool, iterations: int) -> Iterator[Progress]:
+def shown_progress(quiet: bool, iterations: int) -> "Iterator[Progress]":
     """A Progress that shows iteration, scan, rate and time left."""
     if quiet or sys.stderr is None:  # None: it was closed before we began
+        from stillmap.pipeline import silent
+
         yield silent
-    elif sys.stderr.isatty():
+    elif is_terminal(sys.stderr):
         with _bar(iterations) as progress:
             yield progress
     else:
@@ -34,7 +52,7 @@ def shown_progress(quiet: bool, iterations: int) -> Iterator[Progress]:
 
 
 @contextmanager
-def _bar(iterations: int) -> Iterator[Progress]:
+def _bar(iterations: int) -> "Iterator[Progress]":
     from rich.console import Console
     from rich.progress import (
         BarColumn,

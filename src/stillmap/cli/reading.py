@@ -11,7 +11,10 @@ def add_read_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of ranges and of where the lasers sit to a command."""
     group = parser.add_argument_group("reading the recording")
     group.add_argument(
-        "--min-range", type=float, metavar="M", help="nearer readings are unusable (the robot)"
+        "--min-range",
+        type=float,
+        metavar="M",
+        help="nearer readings are unusable (the robot) (default: 0)",
     )
     group.add_argument(
         "--max-range",

@@ -6,21 +6,52 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from stillmap.cli.commands import COMMANDS
+from stillmap.cli.options import add_set, assignments
+from stillmap.cli.printing import files_in, print_json
 from stillmap.cli.progress import say
+from stillmap.cli.terminal import is_terminal
 from stillmap.errors import InputError
-from stillmap.options import merged, parse_assignment
-from stillmap.output.atomic import require_new
-from stillmap.simulation import SCENES, Simulation, scene_by_name, simulate, write_simulation
-from stillmap.simulation.motion import Progress
-from stillmap.simulation.writing import require_carmen
+
+if TYPE_CHECKING:
+    from stillmap.simulation import Simulation
+    from stillmap.simulation.motion import Progress
+
+_SCENES = {
+    "hall": "45 x 30 m, 15 people",
+    "hall-crowd": "the same with 60 people",
+    "corridor": "a loop of 36 x 22 m, 20 people",
+    "corridor-crowd": "the same with 40 people",
+    "office": "40 x 25 m, 22 doors, 10 people",
+    "office-moved": "things stand elsewhere the second time",
+    "warehouse": "50 x 30 m, 12 people, 2 forklifts",
+    "warehouse-moved": "racks are emptied and filled overnight",
+    "street": "180 m, there and back, 14 cars, 16 pedestrians",
+    "street-moved": "parked cars drive off, others park",
+    "street-turn": "185 m, once, cars that wait and cars that drive",
+    "drive": "970 m by car, with a red light",
+    "building": "grows with --scans, wing by wing",
+    "ten-corridors": "56 x 37 m, corridors that all look the same",
+    "rounds": "197 x 82 m, corridors around six courtyards, 40 people",
+}
+
+_LISTED = "".join(f"  {name:<16} {what}\n" for name, what in _SCENES.items())
+_EPILOG = f"""scenes:
+{_LISTED}\
+  NAME-empty       any of them but the -crowd ones, without people and vehicles
+
+examples:
+  stillmap simulate hall -o sim
+  stillmap simulate corridor -o sim --people 40 --scans 500 --seed 7
+  stillmap simulate office-empty -o sim --format carmen
+  stillmap simulate street -o sim --set traffic.vehicles=3 --json
+"""
 
 # flag, metavar, type, section and key of the option it sets, help
 _FLAGS: tuple[tuple[str, str, type, str, str, str], ...] = (
-    ("people", "N", int, "crowd", "people", "how many people walk about"),
+    ("people", "N", int, "crowd", "people", "how many walk about"),
     ("stopping", "SHARE", float, "crowd", "stopping_share", "share of people who stop at times"),
     ("min-stop", "S", float, "crowd", "min_stop", "the shortest stop, seconds"),
     ("max-stop", "S", float, "crowd", "max_stop", "the longest stop, seconds"),
@@ -37,6 +68,7 @@ _FLAGS: tuple[tuple[str, str, type, str, str, str], ...] = (
     ("carried-at", "SHARE", float, "robot", "carried_at", "when the robot is carried elsewhere"),
     ("stamp-rounding", "S", float, "robot", "stamp_rounding", "how coarse stamps are, seconds"),
 )
+_GROUPS = {"crowd": "people", "robot": "robot", "laser": "laser", "odometry": "odometry"}
 _ODOMETRY_ERRORS = (
     "wheel_radius_error",
     "wheel_base_error",
@@ -50,43 +82,62 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     """Register the command with argparse's `subparsers`."""
     p = subparsers.add_parser(
         "simulate",
-        help="a recording with truth, for tests and demos",
+        help=COMMANDS["simulate"],
         description="Simulate a robot that records a place where people, doors and cars move, and "
-        "write what it recorded together with the truth.",
+        "write what it recorded together with the truth. What is not given is as the scene has it.",
+        epilog=_EPILOG,
     )
-    p.add_argument("scene", metavar="SCENE", help=", ".join(SCENES))
-    p.add_argument("-o", "--output", metavar="DIR", required=True, help="where it goes")
-    p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
-    p.add_argument("--seed", metavar="N", type=int, default=0, help="another one, another run")
-    for flag, metavar, kind, _, _, text in _FLAGS:
-        p.add_argument(f"--{flag}", metavar=metavar, type=kind, help=text)
-    p.add_argument(
-        "--shape", choices=["legs", "bodies", "mixed"], help="what the laser sees of people"
+    scene = p.add_argument("scene", metavar="SCENE", help="one of those listed below")
+    scene.completer = _scene_names  # type: ignore[attr-defined]
+    _add_output_flags(p)
+    groups = {section: p.add_argument_group(title) for section, title in _GROUPS.items()}
+    for flag, metavar, kind, section, _, text in _FLAGS:
+        groups[section].add_argument(f"--{flag}", metavar=metavar, type=kind, help=text)
+    groups["crowd"].add_argument(
+        "--shape", choices=("legs", "bodies", "mixed"), help="what the laser sees of people"
     )
-    p.add_argument("--second-laser", action="store_true", help="another one, that looks backwards")
-    p.add_argument(
+    groups["laser"].add_argument(
+        "--second-laser", action="store_true", help="another one, that looks backwards"
+    )
+    groups["odometry"].add_argument(
         "--odometry-noise",
         metavar="FACTOR",
         type=float,
         default=1.0,
-        help="errors of the odometry against their defaults; 0: perfect odometry",
+        help="errors of the odometry against their defaults; 0: perfect (default: %(default)g)",
     )
+    others = p.add_argument_group("any other option of the scene, see docs/simulation.md")
+    add_set(others, "e.g. traffic.vehicles=3; can be given again").completer = _assignments  # type: ignore[attr-defined]
+    p.set_defaults(run=run)
+
+
+def _add_output_flags(p: argparse.ArgumentParser) -> None:
+    p.add_argument("-o", "--output", metavar="DIR", required=True, help="where it goes")
+    p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
     p.add_argument(
         "--format",
-        choices=["stillmap", "carmen"],
+        choices=("stillmap", "carmen"),
         default="stillmap",
-        help="the recording folder, or recording.log with FLASER, RLASER and ODOM lines",
+        help="the recording folder, or recording.log with FLASER, RLASER and ODOM lines "
+        "(default: %(default)s)",
     )
     p.add_argument(
-        "--set",
-        dest="assignments",
-        metavar="SECTION.KEY=VALUE",
-        action="append",
-        default=[],
-        help="any other option of the scene, e.g. traffic.vehicles=3; can be given again",
+        "--seed", metavar="N", type=int, default=0, help="another one, another run (default: 0)"
     )
+    p.add_argument("--json", action="store_true", help="the summary as one JSON object on stdout")
     p.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    p.set_defaults(run=run)
+
+
+def _scene_names(**_: Any) -> Iterator[str]:
+    yield from _SCENES
+    yield from (f"{name}-empty" for name in _SCENES if not name.endswith("-crowd"))
+
+
+def _assignments(prefix: str, **_: Any) -> Iterator[str]:
+    from stillmap.simulation import scene_by_name
+
+    found = assignments(scene_by_name("hall"), prefix)
+    return (text for text in found if "." in text)  # what is no section is the scene's geometry
 
 
 def run(args: argparse.Namespace) -> int:
@@ -95,6 +146,12 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: unknown scene, a value out of range, or a folder that is in the way.
     """
+    import numpy as np  # this and what follows takes long to load
+
+    from stillmap.output.atomic import require_new
+    from stillmap.simulation import scene_by_name, simulate, write_simulation
+    from stillmap.simulation.writing import require_carmen
+
     scene = scene_by_name(args.scene, _changes(args))
     if args.seed < 0:
         raise InputError(f"--seed must not be negative, got {args.seed}")
@@ -105,12 +162,22 @@ def run(args: argparse.Namespace) -> int:
     with _shown_progress(args.quiet) as progress:
         simulation = simulate(scene, np.random.default_rng(args.seed), progress)
     write_simulation(simulation, output, format=args.format, overwrite=args.overwrite)
+    summary = _summary(simulation, output)
     if not args.quiet:
-        say(_summary(simulation, output))
+        share = 100 * summary["dynamic"] / max(summary["hits"], 1)
+        say(
+            f"{summary['scene']}: {summary['scans']} scans, {summary['beams']} beams, "
+            f"{share:.1f} % of the hits on movers; in {output}"
+        )
+    if args.json:
+        print_json(summary)
     return 0
 
 
 def _changes(args: argparse.Namespace) -> dict[str, Any]:
+    from stillmap.options import merged, parse_assignment
+    from stillmap.simulation import scene_by_name
+
     changes: dict[str, dict[str, Any]] = {}
     for flag, _, _, section, key, _ in _FLAGS:
         value = getattr(args, flag.replace("-", "_"))
@@ -129,20 +196,23 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
     return merged(*map(parse_assignment, args.assignments), changes)
 
 
-def _summary(simulation: Simulation, output: Path) -> str:
-    recording, truth = simulation.recording, simulation.truth
-    hits = int(np.count_nonzero(recording.hit))
-    dynamic = int(np.count_nonzero(truth.mover >= 0))
-    return (
-        f"{simulation.scene.name}: {recording.n_scans} scans, {recording.n_beams} beams, "
-        f"{100 * dynamic / max(hits, 1):.1f} % of the hits on movers; in {output}"
-    )
+def _summary(simulation: "Simulation", output: Path) -> dict[str, Any]:
+    recording = simulation.recording
+    return {
+        "output": str(output),
+        "files": files_in(output),
+        "scene": simulation.scene.name,
+        "scans": recording.n_scans,
+        "beams": recording.n_beams,
+        "hits": int(recording.hit.sum()),
+        "dynamic": int((simulation.truth.mover >= 0).sum()),
+    }
 
 
 @contextmanager
-def _shown_progress(quiet: bool) -> Iterator[Progress | None]:
+def _shown_progress(quiet: bool) -> "Iterator[Progress | None]":
     """A bar on a terminal; elsewhere the summary says enough about a job of seconds."""
-    if quiet or sys.stderr is None or not sys.stderr.isatty():
+    if quiet or not is_terminal(sys.stderr):
         yield None
         return
     from rich.console import Console

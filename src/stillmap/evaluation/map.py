@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
 
 from stillmap import se2
 from stillmap.evaluation.scores import Scores
@@ -138,7 +138,7 @@ def distance_to_walls(points: Float, walls: Float, chunk: int = 1 << 20) -> Floa
 
 def near_occupied(grid: Grid, points: Float) -> NDArray[np.bool_]:
     """Whether the cell of each (N, 2) point of the map frame, or a neighbour of it, is occupied."""
-    near = binary_dilation(np.pad(grid.occupied, 1), np.ones((3, 3), bool))
+    near = scipy.ndimage.binary_dilation(np.pad(grid.occupied, 1), np.ones((3, 3), bool))
     cells = grid.cells(points) + 1
     inside = np.all((cells >= 0) & (cells < near.shape), axis=1)
     out = np.zeros(len(points), bool)

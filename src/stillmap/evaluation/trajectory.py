@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from stillmap import se2
 from stillmap.errors import InputError
@@ -175,7 +175,11 @@ def _angle(R: Float) -> Float:
     if R.shape[-1] == 2:
         return np.abs(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
     # scipy < 1.15 refuses an empty stack
-    return np.asarray(Rotation.from_matrix(R).magnitude()) if len(R) else np.zeros(0)
+    return (
+        np.asarray(scipy.spatial.transform.Rotation.from_matrix(R).magnitude())
+        if len(R)
+        else np.zeros(0)
+    )
 
 
 def error_stats(error: Float) -> ErrorStats:

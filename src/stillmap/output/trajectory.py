@@ -4,8 +4,8 @@ import decimal
 from pathlib import Path
 
 import numpy as np
+import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from stillmap.errors import InputError
 
@@ -52,7 +52,7 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     values = np.array(rows)
     poses = np.tile(np.eye(4), (len(values), 1, 1))
     poses[:, :3, 3] = values[:, :3]
-    poses[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
+    poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(values[:, 3:]).as_matrix()
     return np.array(stamps, np.int64), poses
 
 
@@ -65,7 +65,7 @@ def _rows_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
         half = np.arctan2(poses[:, 1, 0], poses[:, 0, 0]) / 2
         rows[:, 5], rows[:, 6] = np.sin(half), np.cos(half)
     elif len(poses):
-        quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        quaternion = scipy.spatial.transform.Rotation.from_matrix(poses[:, :3, :3]).as_quat()
         rows[:, 3:] = np.where(quaternion[:, 3:] < 0, -quaternion, quaternion)
     return rows
 

@@ -4,9 +4,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
-from scipy.sparse import csgraph
 
 from stillmap.errors import InputError
 
@@ -89,7 +88,7 @@ class Planner:
         self._space = space
         self._clear = space.clearance >= clearance
         coarse = self._clear[::_STRIDE, ::_STRIDE]
-        parts, _ = ndimage.label(coarse, structure=np.ones((3, 3)))
+        parts, _ = scipy.ndimage.label(coarse, structure=np.ones((3, 3)))
         self._shape = coarse.shape
         labels = [self._label_at(parts, xy, clearance) for xy in np.atleast_2d(inside)]
         rank = np.full(int(parts.max()) + 1, -1)
@@ -103,14 +102,14 @@ class Planner:
     # only built where a way has to be looked for: in a town that takes long
 
     @cached_property
-    def _graph(self) -> sparse.csr_array:
+    def _graph(self) -> "scipy.sparse.csr_array":
         part = (self._part >= 0).reshape(self._shape)
         return _graph(part, self._space.clearance[::_STRIDE, ::_STRIDE], self._least)
 
     @cached_property
     def _nearest(self) -> NDArray[Any]:
         part = (self._part >= 0).reshape(self._shape)
-        _, nearest = ndimage.distance_transform_edt(~part, return_indices=True)
+        _, nearest = scipy.ndimage.distance_transform_edt(~part, return_indices=True)
         return np.asarray(nearest[0] * self._shape[1] + nearest[1])
 
     def _label_at(self, parts: NDArray[Any], xy: Float, clearance: float) -> int:
@@ -143,7 +142,7 @@ class Planner:
         """(K, 2) corner points of a short way from a point (2,) to a node, the start left out."""
         if goal not in self._trees:
             end = int(np.searchsorted(self.nodes, goal))
-            _, previous = csgraph.dijkstra(
+            _, previous = scipy.sparse.csgraph.dijkstra(
                 self._graph, directed=False, indices=[end], return_predecessors=True
             )
             self._trees[goal] = previous[0]
@@ -174,7 +173,7 @@ class Planner:
         return np.array(corners or [points[-1]])
 
 
-def _graph(part: NDArray[np.bool_], clearance: Float, least: float) -> sparse.csr_array:
+def _graph(part: NDArray[np.bool_], clearance: Float, least: float) -> "scipy.sparse.csr_array":
     """Neighbouring nodes of `part`, eight around each; ways along walls cost a little more.
 
     The nodes are numbered as they come in `part`, those outside left out.
@@ -192,4 +191,4 @@ def _graph(part: NDArray[np.bool_], clearance: Float, least: float) -> sparse.cs
         length = _SPACING * _STRIDE * np.hypot(dx, dy)
         costs.append(length * (slow[here][both] + slow[there][both]) / 2)
     data = (np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns)))
-    return sparse.csr_array(data, shape=(np.count_nonzero(part),) * 2)
+    return scipy.sparse.csr_array(data, shape=(np.count_nonzero(part),) * 2)

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from stillmap.errors import InputError
+from stillmap.errors import InputError, nearest
 from stillmap.options import replaced
 from stillmap.simulation.scene import Scene
 from stillmap.simulation.worlds.building import building
@@ -89,7 +89,10 @@ def scene_by_name(name: str, changes: Mapping[str, Any] | None = None) -> Scene:
         InputError: there is no such scene or option, or a value is out of range.
     """
     if name not in SCENES:
-        raise InputError(f"there is no scene '{name}'", hint=f"scenes: {', '.join(SCENES)}")
+        known = f"scenes: {', '.join(SCENES)}"
+        meant = nearest(name, SCENES)
+        hint = f"did you mean '{meant}'? {known}" if meant else known
+        raise InputError(f"there is no scene '{name}'", hint=hint)
     robot = (changes or {}).get("robot")
     scans = robot.get("scans") if isinstance(robot, Mapping) else None
     scene = _grown(name, scans) if type(scans) is int else None

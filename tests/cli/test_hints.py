@@ -1,0 +1,218 @@
+"""Bad calls say what was meant; our own defects say that they are ours."""
+
+import logging
+import subprocess
+
+import pytest
+
+from stillmap.cli import main
+from stillmap.cli.commands import COMMANDS
+from stillmap.errors import InputError, nearest
+
+
+def refusal(capsys, *words: object) -> str:
+    try:
+        status = main([str(word) for word in words])
+    except SystemExit as left:
+        status = left.code
+    out, err = capsys.readouterr()
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert err.startswith("stillmap")
+    return err
+
+
+@pytest.mark.parametrize(
+    ("words", "said", "meant"),
+    [
+        (("mpa",), "unknown command 'mpa'", "'map'"),
+        (("MAP",), "unknown command 'MAP'", "'map'"),
+        (("eval", "lables"), "unknown score 'lables'", "'labels'"),
+        (("--verison",), "--verison", "'--version'"),
+        (("map", "log", "-o", "out", "--resoluton", "1"), "--resoluton", "'--resolution'"),
+        (("map", "--resoluton=1"), "--resoluton=1", "'--resolution'"),
+        (("map", "log", "-o", "out", "--estimator", "trakcer"), "'trakcer'", "'tracker'"),
+        (("simulate", "hal", "-o", "out"), "'hal'", "'hall'"),
+        (("config", "em.dwel"), "'em.dwel'", "'em.dwell'"),
+        (("config", "--set", "resolution=1"), "'resolution'", "'slam.resolution'"),
+        (("config", "--set", "loops.enabled=false"), "'loops'", "'slam.loops'"),
+        (("completion", "bsh"), "'bsh'", "'bash'"),
+    ],
+)
+def test_what_was_meant(capsys, words, said, meant):
+    message = refusal(capsys, *words)
+    assert said in message
+    assert meant in message
+
+
+@pytest.mark.parametrize(
+    "words", [("zzzz",), ("map", "log", "-o", "out", "--zzzz"), ("map", "a", "b", "-o", "out")]
+)
+def test_nothing_is_made_up(capsys, words):
+    assert "did you mean" not in refusal(capsys, *words)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "said"),
+    [
+        ("em.prior.x=1", "'em.prior' is a value, not a section"),
+        ("em=1", "'em' is a section, not a value"),
+        ("em.dwell=1", "'em.dwell' is a section, not a value"),
+        ("em.prior=[1]", "'em.prior' wants float, got [1]"),
+        ("em.prior=2020-01-01", "'em.prior' wants float"),
+        ("threads=1.5", "'threads' wants int, got 1.5"),
+        ("em..prior=1", "unknown option 'em.'"),
+        ("em.prior=1\nthreads=2", "'em.prior' wants float"),
+    ],
+)
+def test_options_that_cannot_be(capsys, assignment, said):
+    assert said in refusal(capsys, "config", "--set", assignment)
+
+
+def test_a_flag_on_several_lines_is_still_one_line(capsys):
+    refusal(capsys, "map", "log", "-o", "out", "--a\nb")
+    refusal(capsys, "info", "no\nsuch\nfile")
+
+
+def test_a_file_with_nearly_that_name_is_named(capsys, tmp_path):
+    (tmp_path / "walk.log").write_text("")
+    (tmp_path / "options.toml").write_text("")
+    meant = f"did you mean '{tmp_path / 'walk.log'}'?"
+    for words in (("info",), ("map", "-o", tmp_path / "out")):
+        assert meant in refusal(capsys, *words, tmp_path / "walk.lgo")
+    config = refusal(capsys, "config", "--config", tmp_path / "option.toml")
+    assert f"did you mean '{tmp_path / 'options.toml'}'?" in config
+    assert "recording.json" in refusal(capsys, "info", tmp_path / "quite-another")
+    assert "did you mean" not in refusal(capsys, "info", tmp_path / "no/such/walk.log")
+    # names that stillmap gives are no slips of the pen
+    (tmp_path / "ran.json").write_text("")
+    message = refusal(capsys, "filter", tmp_path, "-o", tmp_path / "out")
+    assert "did you mean" not in message
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("map", "log", "--overwrite", "-o", ""),
+        ("map", "log", "--overwrite", "--output="),
+        ("info", ""),
+        ("config", "--config", ""),
+    ],
+)
+def test_a_variable_that_is_not_set_does_no_harm(capsys, tmp_path, monkeypatch, words):
+    (tmp_path / "mine").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    assert "an argument is empty" in refusal(capsys, *words)
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_nearest():
+    assert nearest("resoluton", ["paper", "resolution"]) == "resolution"
+    assert nearest("PAPER", ["paper"]) == "paper"
+    assert nearest("xyz", ["paper"]) is None
+    assert nearest("xyz", ["paper"], least=0.0) == "paper"
+    assert nearest("x", []) is None
+
+
+def test_without_a_command_it_lists_them(stillmap):
+    done = stillmap()
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("usage: stillmap ")
+    assert "the main job" in done.stderr
+    assert len(done.stderr.splitlines()) < 20
+
+
+def test_a_defect_says_so_after_its_trace(command):
+    program = (
+        "import sys, stillmap.cli.config as c\n"
+        "def fail(args): raise RuntimeError('ours')\n"
+        "c.run = fail\n"
+        "from stillmap.cli import main\n"
+        "sys.exit(main(['config']))\n"
+    )
+    done = subprocess.run([command[0], "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (1, "")
+    *trace, last = done.stderr.splitlines()
+    assert trace[0].startswith("Traceback")
+    assert trace[-1] == "RuntimeError: ours"
+    assert last.startswith("stillmap: this is a defect of stillmap")
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (MemoryError("Unable to allocate 7 GiB"), 2, "not enough memory: Unable to allocate 7 GiB"),
+        (MemoryError(), 2, "not enough memory"),
+        (FileNotFoundError(2, "No such file", "/some/file"), 2, "/some/file: No such file"),
+        (InputError("is odd", where="log:3", hint="mend it"), 2, "log:3: is odd (mend it)"),
+    ],
+)
+def test_what_goes_wrong_is_one_line(monkeypatch, capsys, error, status, said):
+    def fail(_):
+        raise error
+
+    monkeypatch.setattr("stillmap.cli.config.run", fail)
+    monkeypatch.setattr("stillmap.cli._drop_stdout", lambda: None)
+    assert main(["config"]) == status
+    assert capsys.readouterr() == ("", f"stillmap: {said}\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "verbose", "quiet"),
+    [
+        (("config",), False, False),
+        (("-v", "config"), True, False),
+        (("config", "-v"), True, False),
+        (("--quiet", "config", "--verbose"), True, True),
+        (("config", "--quiet"), False, True),
+        (("--quiet", "map", "in", "-o", "out"), False, True),
+        (("map", "in", "-o", "out", "--quiet"), False, True),
+        (("-v", "eval", "labels", "a", "b"), True, False),
+        (("eval", "-v", "labels", "a", "b"), True, False),
+        (("eval", "labels", "a", "b", "-v"), True, False),
+    ],
+)
+def test_verbose_and_quiet_stand_anywhere(monkeypatch, words, verbose, quiet):
+    got = []
+    for name in ("config", "map", "eval"):
+        monkeypatch.setattr(f"stillmap.cli.{name}.run", lambda args: got.append(args) or 0)
+    assert main(list(words)) == 0
+    assert (got[0].verbose, got[0].quiet) == (verbose, quiet)
+
+
+def test_verbose_says_more_on_stderr(monkeypatch, capsys):
+    def run(_):
+        logging.getLogger("stillmap.result").info("iteration %d", 3)
+        return 0
+
+    monkeypatch.setattr("stillmap.cli.config.run", run)
+    main(["config"])
+    assert capsys.readouterr() == ("", "")
+    main(["-v", "config"])
+    assert capsys.readouterr() == ("", "stillmap: iteration 3\n")
+
+
+CALLS = [
+    ("map", "in", "-o", "out"),
+    ("info", "in"),
+    ("view", "out"),
+    ("filter", "out", "-o", "clean"),
+    ("simulate", "hall", "-o", "out"),
+    ("eval", "labels", "out", "sim"),
+    ("config",),
+    ("completion", "bash"),
+]
+
+
+@pytest.mark.parametrize("words", CALLS, ids=lambda words: words[0])
+def test_ctrl_c_in_any_command(monkeypatch, capsys, words):
+    def run(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"stillmap.cli.{words[0]}.run", run)
+    assert main(list(words)) == 130
+    assert capsys.readouterr() == ("", "stillmap: interrupted, nothing was half-written\n")
+
+
+def test_there_is_a_call_of_every_command():
+    assert {words[0] for words in CALLS} == set(COMMANDS)

@@ -1,0 +1,116 @@
+"""`--json`: one object on stdout, alone and strict; nothing there where something went wrong."""
+
+import json
+import math
+
+import pytest
+
+from stillmap.cli.printing import print_json
+from stillmap.options import described
+from stillmap.pipeline import Options
+
+
+def no_constant(text: str) -> None:
+    raise AssertionError(f"{text} is no JSON")
+
+
+def parsed(done) -> dict:
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout, parse_constant=no_constant)
+    assert isinstance(found, dict)
+    return found
+
+
+@pytest.fixture(scope="module")
+def mapped(stillmap, room, tmp_path_factory):
+    out = tmp_path_factory.mktemp("mapped") / "out"
+    words = ("--set", "em.max_iterations=1", "--no-odometry", "--json")
+    return out, stillmap("map", room, "-o", out, *words)
+
+
+def test_map(mapped):
+    out, done = mapped
+    found = parsed(done)
+    record = json.loads((out / "run.json").read_text())
+    assert found["output"] == str(out)
+    assert {"map.pgm", "run.json", "report.html", "beams/p_static.npy"} <= set(found["files"])
+    assert all((out / name).is_file() for name in found["files"])
+    assert found["iterations"] == len(record["iterations"]) == 1
+    for key in ("counts", "converged", "best_iteration", "warnings", "seconds", "area"):
+        assert found[key] == record[key], key
+    assert any("no odometry" in warning for warning in found["warnings"])
+    # what people read goes on on stderr
+    assert "iteration 1 of at most 1" in done.stderr
+    assert "report.html" in done.stderr
+
+
+def test_filter(call, mapped, room, tmp_path):
+    done = call("filter", mapped[0], "-o", tmp_path / "clean", "--json", "--quiet")
+    found = parsed(done)
+    assert done.stderr == ""
+    assert (found["output"], found["input"]) == (str(tmp_path / "clean"), str(room))
+    assert 0 < found["blanked"] < found["hits"]
+
+
+def test_simulate(call, tmp_path):
+    out = tmp_path / "sim"
+    words = ("--scans", 5, "--beams", 20, "--people", 2, "--json", "--quiet")
+    done = call("simulate", "hall", "-o", out, *words)
+    found = parsed(done)
+    assert done.stderr == ""
+    assert (found["scene"], found["scans"], found["beams"]) == ("hall", 5, 100)
+    assert found["output"] == str(out)
+    assert {"recording.json", "truth/mover.npy"} <= set(found["files"])
+    assert 0 <= found["dynamic"] <= found["hits"] <= 100
+
+
+def test_config(call):
+    found = parsed(call("config", "--json", "--set", "em.prior=0.75"))
+    assert list(found) == [one.name for one in described(Options())]
+    assert found["em.prior"] == {
+        "value": 0.75,
+        "default": Options().em.prior,
+        "type": "float",
+        "choices": None,
+        "doc": "p(c = 1), share of beams thought static before anything was learned",
+    }
+    assert found["read.max_range"]["type"] == "float or nothing"
+    assert found["output.map_state"]["choices"] == ["last", "majority"]
+    assert all(one["doc"] for one in found.values())
+    assert set(parsed(call("config", "em.evidence", "--json"))) == {
+        "em.evidence.least",
+        "em.evidence.near",
+    }
+
+
+def test_scores_without_a_number(call, tmp_path):
+    """Two poses, too near to each other for any relative error."""
+    file = tmp_path / "t.tum"
+    file.write_text("1 0 0 0 0 0 0 1\n2 0.1 0 0 0 0 0 1\n")
+    found = parsed(call("eval", "trajectory", file, file, "--json"))
+    assert found["rpe"]["translation"]["rmse"] is None
+
+
+def test_what_is_not_finite_becomes_null(capsys):
+    print_json({"a": [math.nan, math.inf, 1.5], "b": {"c": -math.inf}})
+    assert capsys.readouterr().out == '{"a": [null, null, 1.5], "b": {"c": null}}\n'
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("info", "nowhere"),
+        ("map", "nowhere", "-o", "out"),
+        ("filter", "nowhere", "-o", "out"),
+        ("simulate", "nowhere", "-o", "out"),
+        ("eval", "labels", "nowhere", "nowhere"),
+        ("eval", "relations", "nowhere", "nowhere"),
+        ("config", "nowhere"),
+        ("config", "--set", "no.where=1"),
+    ],
+)
+def test_errors_leave_stdout_empty(call, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = call(*words, "--json")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1
