@@ -8,7 +8,7 @@ import sys
 from types import FrameType
 
 from stillmap import __version__
-from stillmap.cli import config, eval, filter, info, map, simulate
+from stillmap.cli import config, convert, eval, filter, info, map, simulate
 from stillmap.cli.progress import say
 from stillmap.errors import InputError
 
@@ -18,6 +18,7 @@ _EPILOG = """examples:
   stillmap info log.clf.gz              what is in a recording
   stillmap map log.clf.gz -o out        map it; then open out/report.html
   stillmap filter out -o clean.clf      the recording without what moved
+  stillmap convert log.bag -o log.mcap  one format to another
   stillmap simulate hall -o sim         a recording with truth
   stillmap eval labels out sim          how good the labels are
 """
@@ -45,7 +46,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"stillmap {__version__}")
     top.add_argument("-v", "--verbose", action="store_true", help="say more while working")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (map, info, filter, simulate, eval, config):
+    for command in (map, info, filter, convert, simulate, eval, config):
         command.add_parser(commands)
     return top
 

@@ -54,7 +54,7 @@ def _ros(kind: ros_writing.Kind) -> Write:
 
 WRITERS = (
     Writer("stillmap", "a recording folder", (), folder.HEADER, _write_folder),
-    Writer("ros2", "a ROS 2 bag, as a folder", (), "metadata.yaml", _ros("ros2")),
+    Writer("ros2", "a ROS 2 bag folder", (), "metadata.yaml", _ros("ros2")),
     Writer(
         "carmen",
         "a CARMEN log",
@@ -63,8 +63,8 @@ WRITERS = (
         _write_carmen,
     ),
     Writer("bag", "a ROS 1 bag", (".bag",), "", _ros("bag")),
-    Writer("db3", "a ROS 2 bag, as its file alone", (".db3",), "", _ros("db3")),
-    Writer("mcap", "the same, for Foxglove too", (".mcap",), "", _ros("mcap")),
+    Writer("db3", "a ROS 2 bag file", (".db3",), "", _ros("db3")),
+    Writer("mcap", "an MCAP file", (".mcap",), "", _ros("mcap")),
 )
 
 

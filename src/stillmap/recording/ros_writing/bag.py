@@ -67,7 +67,7 @@ class Bag:
             return self._topic1(self._writer, name, type, latched)
         return self._topic2(self._writer, name, type, latched)
 
-    def make(self, type: str, **fields: Any) -> Any:
+    def make(self, type: str, /, **fields: Any) -> Any:
         """A message or a part of one."""
         return self._store.types[type](**fields)
 

@@ -37,7 +37,7 @@ def write(recording: Recording, path: Path, kind: Kind, *, overwrite: bool = Fal
     with new_bag(path, kind, overwrite=overwrite) as bag:
         frames = place_sensors(bag, recording)
         name, type = ("scan", messages.SCAN) if planar_scans else ("points", messages.POINTS)
-        sends = [bag.topic(f"/{numbered}", type) for numbered in _numbered(name, len(frames))]
+        sends = [bag.topic(f"/{numbered}", type) for numbered in numbered(name, len(frames))]
         drive = _driver(bag, recording)
         for t, stamp in enumerate(stamps.tolist()):
             drive(t)
@@ -92,7 +92,7 @@ class Lasers:
 def place_sensors(bag: Bag, recording: Recording) -> list[str]:
     """Says once where the sensors sit on the robot; returns their S frames."""
     S = len(recording.T_base_sensor)
-    frames = _numbered("laser" if recording.dimension == 2 else "lidar", S)
+    frames = numbered("laser" if recording.dimension == 2 else "lidar", S)
     send = bag.topic("/tf_static", messages.TRANSFORMS, latched=True)
     if recording.n_scans:
         first = int(recording.stamp_ns[0])
@@ -101,7 +101,7 @@ def place_sensors(bag: Bag, recording: Recording) -> list[str]:
     return frames
 
 
-def _numbered(name: str, count: int) -> list[str]:
+def numbered(name: str, count: int) -> list[str]:
     return [name, *(f"{name}{k}" for k in range(2, count + 1))][:count]
 
 
