@@ -145,10 +145,10 @@ def _form(recording: Recording) -> Form:
     lasers = len(recording.T_base_sensor)
     if lasers > 2:
         raise InputError(f"CARMEN logs hold two lasers, here are {lasers}", hint=_ANOTHER)
-    fans = planar.fans(recording)
     counts = np.diff(recording.offset)
     for number in range(lasers):
         _require_one_count(counts[recording.sensor == number])
+    fans = planar.fans(recording)
     params = {}
     for number, place in enumerate(_PLACES[:lasers]):
         its = recording.sensor == number

@@ -120,6 +120,7 @@ def new_bag(path: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Bag]
         else:
             work = stack.enter_context(new_file(path))
         if kind == "bag":
+            work.unlink(missing_ok=True)  # of one that was killed: the writer refuses what is there
             with _told(path), rosbag1.Writer(work) as writer1:
                 yield Bag(kind, writer1)
             return
