@@ -48,8 +48,8 @@ def opened_to_write(path: Path, *, packed: bool) -> Iterator[IO[bytes] | gzip.Gz
         if not packed:
             yield file
             return
-        # neither name nor time
-        with gzip.GzipFile("", "wb", fileobj=file, mtime=0) as stream:
+        # neither name nor time; a tenth larger than at Python's level 9, in a fraction of the time
+        with gzip.GzipFile("", "wb", 6, fileobj=file, mtime=0) as stream:
             yield stream
 
 
