@@ -76,7 +76,7 @@ def ask(tmp_path, place):
 
 
 def test_bash(ask):
-    names = {"map", "info", "view", "filter", "simulate", "eval", "config", "completion"}
+    names = {"map", "info", "view", "filter", "convert", "simulate", "eval", "config", "completion"}
     wanted = {
         "stillmap ": names,
         "stillmap ma": {"map"},

@@ -197,6 +197,7 @@ CALLS = [
     ("info", "in"),
     ("view", "out"),
     ("filter", "out", "-o", "clean"),
+    ("convert", "in", "-o", "out"),
     ("simulate", "hall", "-o", "out"),
     ("eval", "labels", "out", "sim"),
     ("config",),

@@ -11,6 +11,7 @@ COMMANDS = {
     "info": "what is in a recording",
     "view": "look at a result",
     "filter": "the recording again, without beams on what moves, for other mappers",
+    "convert": "one recording format to another; results for other programs",
     "simulate": "a recording with truth, for tests and demos",
     "eval": "score a trajectory, labels or a map",
     "config": "every option with its default, unit and meaning, as TOML",
@@ -22,6 +23,7 @@ _EPILOG = """examples:
   stillmap map log.clf.gz -o out        map it
   stillmap view out                     look at the map and the report
   stillmap filter out -o clean.clf      the recording without what moved
+  stillmap convert log.bag -o log.mcap  one format to another
   stillmap simulate hall -o sim         a recording with truth
   stillmap eval labels out sim          how good the labels are
 

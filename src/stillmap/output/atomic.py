@@ -26,6 +26,20 @@ def require_new(path: Path, overwrite: bool = False) -> None:
         )
 
 
+def require_new_file(path: Path, overwrite: bool = False) -> None:
+    """Refuse an output file that is there already, before any work is done.
+
+    Raises:
+        InputError: something is there that is not to be replaced, or there is no such folder.
+    """
+    if path.exists() and not (overwrite and path.is_file()):
+        raise InputError(
+            "is there already", where=str(path), hint="choose another or give --overwrite"
+        )
+    if not path.absolute().parent.is_dir():
+        raise InputError("cannot be written: no such folder", where=str(path.parent))
+
+
 @contextmanager
 def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
     """A temporary sibling folder that becomes `path` when the block ends without an exception.

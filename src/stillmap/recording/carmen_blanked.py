@@ -1,12 +1,9 @@
 """A CARMEN log once more, with beams blanked: as if nothing had come back."""
 
-import gzip
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +13,7 @@ from stillmap.output.atomic import new_file
 from stillmap.recording.carmen_log import read_log
 from stillmap.recording.carmen_messages import SCAN_PARSERS
 from stillmap.recording.carmen_scans import Sensor, in_order, used
-from stillmap.recording.lines import numbered_lines
+from stillmap.recording.lines import is_gzip_name, numbered_lines, opened_to_write
 from stillmap.recording.model import Recording
 from stillmap.recording.options import BEYOND
 from stillmap.recording.ranges import find_max_range
@@ -62,7 +59,7 @@ def write(source: Path, out: Path, recording: Recording, blank: NDArray[np.bool_
     rules = (sensor["ranges"] for sensor in recording.source["sensors"])
     codes = [code(sensor.ranges, rule) for sensor, rule in zip(sensors, rules, strict=True)]
     scans = left_out = 0
-    with new_file(out) as work, _opened(work, out.name.endswith(".gz")) as file:
+    with new_file(out) as work, opened_to_write(work, packed=is_gzip_name(out)) as file:
         for line in numbered_lines(source):
             t = scan_of.get(line.number)
             if t is not None:
@@ -126,14 +123,3 @@ def _replaced(text: bytes, blank: NDArray[np.bool_], code: bytes) -> bytes:
         parts += [text[at:begin], code]
         at = end
     return b"".join([*parts, text[at:]])
-
-
-@contextmanager
-def _opened(path: Path, packed: bool) -> Iterator[IO[bytes] | gzip.GzipFile]:
-    with path.open("wb") as file:
-        if not packed:
-            yield file
-            return
-        # neither name nor time: equal logs give equal bytes
-        with gzip.GzipFile("", "wb", fileobj=file, mtime=0) as stream:
-            yield stream

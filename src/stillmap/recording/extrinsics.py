@@ -50,8 +50,8 @@ def find(
     warnings: list[str] = []
     if poses is not None:
         offset, alike = _offset(poses)
-        if alike and max(np.hypot(*offset[:2]), abs(offset[2])) > _SMALLEST:
-            x, y, theta = (round(float(value), 6) for value in offset)
+        x, y, theta = (round(float(value), 6) for value in offset)
+        if alike and is_told_by_lines(x, y, theta):
             return Extrinsics(x, y, theta, "scan lines"), warnings
         if not alike:
             warnings.append(
@@ -66,6 +66,12 @@ def find(
     if laser.kind in ("RAWLASER2", "RAWLASER3", "RAWLASER4"):
         warnings.append(f"{laser.kind}: the log does not say where it sits: robot centre assumed")
     return Extrinsics(0.0, 0.0, 0.0, "robot centre assumed"), warnings
+
+
+def is_told_by_lines(x: float, y: float, theta: float) -> bool:
+    """Whether poses on scan lines tell a laser's place: on the robot, and not at its centre."""
+    away = math.hypot(x, y)
+    return away < _LARGEST_OFFSET and max(away, abs(theta)) > _SMALLEST
 
 
 def overridden(found: Extrinsics, given: GivenLaser) -> Extrinsics:
@@ -130,7 +136,7 @@ def _offset(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
     middle = np.median(offsets, axis=0)
     off = np.abs(offsets - middle)
     alike = np.mean((off[:, :2].max(axis=1) < _SAME_M) & (off[:, 2] < _SAME_RAD)) > 0.9
-    return middle, bool(alike) and np.hypot(*middle[:2]) < _LARGEST_OFFSET
+    return middle, bool(alike) and bool(np.hypot(*middle[:2]) < _LARGEST_OFFSET)
 
 
 def _from_params(kind: str, params: dict[str, str]) -> Extrinsics | None:

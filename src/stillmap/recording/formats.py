@@ -10,7 +10,7 @@ from stillmap.recording.carmen_messages import SCAN_PARSERS
 from stillmap.recording.lines import Progress, head
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
-from stillmap.recording.ros import bags
+from stillmap.recording.ros import kinds
 
 _HEAD = 1 << 16  # bytes looked at to tell what a file is
 
@@ -63,7 +63,7 @@ def _read_bag(
 
 FORMATS = (
     Format("stillmap recording", (folder.HEADER,), _is_folder_of_ours, _read_folder_of_ours),
-    Format("ROS bag", bags.ENDINGS, bags.is_bag, _read_bag),
+    Format("ROS bag", kinds.ENDINGS, kinds.is_bag, _read_bag),
     Format(
         "CARMEN log",
         (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz"),

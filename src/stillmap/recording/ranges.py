@@ -56,7 +56,7 @@ class RangeRule:
     own_body: tuple[Part, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
+        return {**asdict(self), "own_body": [list(part) for part in self.own_body]}
 
 
 def find_max_range(ranges: NDArray[np.float32], declared: float | None = None) -> MaxRange:

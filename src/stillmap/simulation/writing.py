@@ -4,13 +4,9 @@ import math
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
-from stillmap import se2
 from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
-from stillmap.recording import folder
-from stillmap.recording.model import Recording
+from stillmap.recording import carmen_writing, folder
 from stillmap.simulation.options import LaserOptions
 from stillmap.simulation.simulator import Simulation
 from stillmap.simulation.truth import write_truth
@@ -18,7 +14,6 @@ from stillmap.simulation.truth import write_truth
 Format = Literal["stillmap", "carmen"]
 
 CARMEN_LOG = "recording.log"
-_NO_RETURN = 81.83  # m, what a SICK LMS reports when nothing comes back
 
 
 def write_simulation(
@@ -64,37 +59,19 @@ def require_carmen(laser: LaserOptions) -> None:
             "FLASER lines cannot say that the laser hangs upside down",
             hint="laser.upside_down=unknown",
         )
-    if laser.max_range > _NO_RETURN:
-        raise InputError(f"CARMEN logs hold ranges up to {_NO_RETURN} m", hint="a lower max_range")
+    if laser.max_range > carmen_writing.NO_RETURN:
+        what = f"CARMEN logs hold ranges up to {carmen_writing.NO_RETURN} m"
+        raise InputError(what, hint="a lower max_range")
 
 
 def _write_carmen(simulation: Simulation, path: Path) -> None:
-    recording = simulation.recording
-    assert recording.T_odom_base is not None
-    base = se2.parameters(recording.T_odom_base)
-    laser = se2.parameters(recording.T_map_sensor(recording.T_odom_base))
-    first = int(recording.stamp_ns[0])
+    form = carmen_writing.Form(
+        lasers=(carmen_writing.Laser("FLASER"), carmen_writing.Laser("RLASER")),
+        fans=None,
+        params={},
+        comment=f"stillmap simulate {simulation.scene.name}",
+        host="simulated",
+        digits=2,
+    )
     with path.open("w", encoding="ascii", newline="\n") as file:
-        file.write(f"# stillmap simulate {simulation.scene.name}\n")
-        for t, stamp in enumerate(recording.stamp_ns.tolist()):
-            times = f"{_seconds(stamp)} simulated {_seconds(stamp - first)}\n"
-            file.write(f"ODOM {_pose(base[t])} 0 0 0 {times}")
-            readings = _readings(recording, t)
-            name = "RLASER" if recording.sensor[t] else "FLASER"
-            file.write(f"{name} {readings} {_pose(laser[t])} {_pose(base[t])} {times}")
-
-
-def _readings(recording: Recording, scan: int) -> str:
-    beams = recording.beams_of(scan)
-    ranges = np.hypot(*recording.points[beams].astype(np.float64).T)
-    ranges = np.where(recording.hit[beams], ranges, _NO_RETURN)
-    return f"{len(ranges)} " + " ".join(f"{r:.2f}" for r in ranges.tolist())
-
-
-def _pose(pose: np.ndarray) -> str:
-    return " ".join(f"{value:.6f}" for value in pose.tolist())
-
-
-def _seconds(stamp_ns: int) -> str:
-    # CARMEN writes microseconds; beyond them the stamp would not be the same as in the truth
-    return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
+        file.writelines(carmen_writing.lines(simulation.recording, form))

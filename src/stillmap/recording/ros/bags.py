@@ -9,24 +9,19 @@ import yaml
 from stillmap.errors import InputError
 from stillmap.recording.ros import damaged, whole
 from stillmap.recording.ros.channels import Bag, Channel, DamagedError, Message
-from stillmap.recording.ros.unpacking import ZSTD_MAGIC, ZstdError, zstd_stream
+from stillmap.recording.ros.kinds import (
+    BAG1_MAGIC,
+    DB3_MAGIC,
+    MCAP_MAGIC,
+    is_packed,
+    storage_files,
+)
+from stillmap.recording.ros.unpacking import ZstdError, zstd_stream
 from stillmap.recording.skipped import Skipped
-
-BAG1_MAGIC = b"#ROSBAG V"
-MCAP_MAGIC = b"\x89MCAP0\r\n"
-DB3_MAGIC = b"SQLite format 3\0"
-ENDINGS = (".bag", ".db3", ".mcap")
 
 _MAX_GROWTH, _SURELY_FINE = 100, 1 << 30  # of a packed file: times its size, bytes
 _MAX_METADATA = 16 << 20  # bytes
 _PIECE = 1 << 20
-
-
-def is_bag(path: Path, start: bytes | None) -> bool:
-    """Whether a file with these first bytes, or a folder (None), is a bag."""
-    if start is None:
-        return bool(_storage_files(path))
-    return start.startswith((BAG1_MAGIC, MCAP_MAGIC, DB3_MAGIC)) or _is_packed(path, start)
 
 
 def open_bag(path: Path, scratch: Path | None, *, trusted: bool) -> Bag:
@@ -61,7 +56,7 @@ def _opened_file(path: Path, scratch: Path | None, trusted: bool) -> Bag:
             start = file.read(32)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    if _is_packed(path, start):
+    if is_packed(path, start):
         return _Unpacked(path, scratch, trusted)
     reader = whole if trusted else damaged
     openers: dict[bytes, Callable[[Path], Bag]] = {
@@ -90,23 +85,9 @@ def _opened(opener: Callable[[Path], Bag], path: Path) -> Bag:
         raise DamagedError(str(error) or type(error).__name__) from error
 
 
-def _storage_files(folder: Path) -> list[Path]:
-    try:
-        names = sorted(folder.iterdir(), key=_natural)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(folder)) from error
-    return [f for f in names if f.name.removesuffix(".zstd").endswith((".db3", ".mcap"))]
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """bag_2 before bag_10."""
-    digits = "".join(c if c.isdigit() else " " for c in path.name).split()
-    return [(int(d[:18]), "") for d in digits] + [(0, path.name)]
-
-
 def _listed(folder: Path) -> list[Path]:
     """The files of a ROS 2 folder in their order; `metadata.yaml` need not be there."""
-    there = _storage_files(folder)
+    there = storage_files(folder)
     try:
         file = folder / "metadata.yaml"
         text = file.read_text("utf-8") if file.stat().st_size <= _MAX_METADATA else ""
@@ -122,10 +103,6 @@ def _listed(folder: Path) -> list[Path]:
             hint="without metadata.yaml the files that are there are read",
         )
     return paths or there
-
-
-def _is_packed(path: Path, start: bytes) -> bool:
-    return path.name.endswith((".db3.zstd", ".mcap.zstd")) and start.startswith(ZSTD_MAGIC)
 
 
 class _Joined:

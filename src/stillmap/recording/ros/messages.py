@@ -11,7 +11,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from stillmap.recording.ros.channels import Channel, Message
-from stillmap.recording.ros.unpacking import ZSTD_MAGIC, zstd_unpacked
+from stillmap.recording.ros.kinds import ZSTD_MAGIC
+from stillmap.recording.ros.unpacking import zstd_unpacked
 
 LASER, MULTI_ECHO = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan"
 CLOUD = "sensor_msgs/msg/PointCloud2"

@@ -16,7 +16,6 @@ else:
 
 LIMIT = 256 << 20  # bytes of one chunk or message; recorders write chunks of about one megabyte
 
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 ZstdError = zstd.ZstdError
 
 

@@ -1,0 +1,132 @@
+"""Which writer writes what: the one table of formats that recordings are written in."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from stillmap.errors import InputError
+from stillmap.output.atomic import require_new, require_new_file
+from stillmap.recording import carmen_writing, folder, ros_writing
+from stillmap.recording.model import Recording
+
+# of a recording, to a path, whether what is there is replaced: what could not be said
+Write = Callable[[Recording, Path, bool], list[str]]
+
+# fields of a recording that hardly any format has room for, in words
+_OPTIONAL = {"images": "pictures", "T_recorded_base": "poses that the recording states"}
+
+
+class Writer(NamedTuple):
+    """A format.
+
+    Attributes:
+        name: what it is called on the command line.
+        about: for people.
+        endings: of names of such files, in small letters; () for folders.
+        mark: a file that every such folder holds; "" for files.
+        write: writes a recording; it appears whole or not at all.
+        holds: which of `_OPTIONAL` it writes.
+    """
+
+    name: str
+    about: str
+    endings: tuple[str, ...]
+    mark: str
+    write: Write
+    holds: tuple[str, ...] = ()
+
+
+def _write_folder(recording: Recording, path: Path, overwrite: bool) -> list[str]:
+    folder.write(recording, path, overwrite=overwrite)
+    return []
+
+
+def _write_carmen(recording: Recording, path: Path, overwrite: bool) -> list[str]:  # noqa: ARG001
+    return carmen_writing.write(recording, path)
+
+
+def _ros(kind: ros_writing.Kind) -> Write:
+    def write(recording: Recording, path: Path, overwrite: bool) -> list[str]:
+        return ros_writing.write(recording, path, kind, overwrite=overwrite)
+
+    return write
+
+
+WRITERS = (
+    Writer("stillmap", "a recording folder", (), folder.HEADER, _write_folder),
+    Writer("ros2", "a ROS 2 bag folder", (), "metadata.yaml", _ros("ros2")),
+    Writer(
+        "carmen",
+        "a CARMEN log",
+        (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz"),
+        "",
+        _write_carmen,
+    ),
+    Writer("bag", "a ROS 1 bag", (".bag",), "", _ros("bag")),
+    Writer("db3", "a ROS 2 bag file", (".db3",), "", _ros("db3")),
+    Writer("mcap", "an MCAP file", (".mcap",), "", _ros("mcap")),
+)
+
+
+def writer_for(path: Path, name: str | None = None) -> Writer:
+    """The writer of a format given by its name, else by the ending of the path.
+
+    Raises:
+        InputError: no format has such an ending.
+    """
+    for writer in WRITERS:
+        if writer.name == name if name else path.name.lower().endswith(writer.endings):
+            return writer
+    if name or path.suffix:
+        known = ", ".join(end for writer in WRITERS for end in writer.endings)
+        raise InputError(
+            f"no format is called or ends in {name or path.suffix!r}",
+            where=str(path),
+            hint=f"{known}, or a folder without an ending",
+        )
+    return WRITERS[0]
+
+
+def write(
+    recording: Recording, path: Path, *, name: str | None = None, overwrite: bool = False
+) -> list[str]:
+    """Write a recording in the format that the name of the path says, or that is named.
+
+    Args:
+        recording: T >= 1 scans.
+        path: where to.
+        name: of the format; None: by the ending of the path, a recording folder where it has none.
+        overwrite: replace a file, or a folder of the same format.
+
+    Returns:
+        What of the recording could not be written, a sentence each.
+
+    Raises:
+        InputError: the path is taken or cannot be written to, or the format cannot hold such a
+            recording.
+    """
+    writer = writer_for(path, name)
+    require_free(path, writer, overwrite)
+    if not recording.n_scans:
+        raise InputError("holds no scan: there is nothing to write")
+    return [*_left_out(recording, writer), *writer.write(recording, path, overwrite)]
+
+
+def require_free(path: Path, writer: Writer, overwrite: bool) -> None:
+    """Refuses to write over anything but what was asked to be replaced.
+
+    Raises:
+        InputError: there is something, of another kind or not to be replaced.
+    """
+    if writer.mark:
+        require_new(path, overwrite and (path / writer.mark).is_file())
+    else:
+        require_new_file(path, overwrite)
+
+
+def _left_out(recording: Recording, writer: Writer) -> list[str]:
+    return [
+        f"its {words} are left out"
+        for field, words in _OPTIONAL.items()
+        if getattr(recording, field) is not None and field not in writer.holds
+    ]

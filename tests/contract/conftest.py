@@ -1,0 +1,34 @@
+"""A small populated place, mapped: the files that other people's programs read."""
+
+from pathlib import Path
+
+import pytest
+
+from stillmap.cli import main
+from stillmap.recording import Recording, folder
+from stillmap.simulation import scene_by_name, simulate, write_simulation
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording folder: a hall with people, 240 scans of two lasers that take their time."""
+    path = tmp_path_factory.mktemp("contract") / "recording"
+    laser = {"beams": 90, "second_laser": True, "sweep_time": 0.05, "x": 0.2}
+    changes = {"robot": {"scans": 240}, "laser": laser, "crowd": {"people": 12}}
+    write_simulation(simulate(scene_by_name("hall", changes), 5), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def recording(recorded: Path) -> Recording:
+    """The same as arrays."""
+    return folder.read(recorded)
+
+
+@pytest.fixture(scope="session")
+def result(recorded: Path) -> Path:
+    """What `stillmap map` made of it."""
+    out = recorded.parent / "result"
+    words = ["map", recorded, "-o", out, "--quiet", "--set", "em.max_iterations=2"]
+    assert main([*map(str, words)]) == 0
+    return out

@@ -1,0 +1,176 @@
+"""Results converted: the MCAP by its makers' library, as Foxglove reads it, and Parquet."""
+
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stillmap.cli import main
+from stillmap.recording.poses import poses_from_tum
+
+
+@pytest.fixture(scope="module")
+def decoded(result):
+    """Summary and messages by topic, decoded by the schemas in the file alone."""
+    reader_of = pytest.importorskip("mcap.reader").make_reader
+    decoder = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
+    path = result.parent / "result.mcap"
+    assert main(["convert", str(result), "-o", str(path), "--quiet"]) == 0
+    topics = defaultdict(list)
+    with path.open("rb") as file:
+        reader = reader_of(file, validate_crcs=True, decoder_factories=[decoder])
+        summary = reader.get_summary()
+        for _, channel, message, ros in reader.iter_decoded_messages():
+            topics[channel.topic].append((message.log_time, ros))
+    return summary, topics
+
+
+def nanoseconds(header):
+    return header.stamp.sec * 10**9 + header.stamp.nanosec
+
+
+def matrix(translation, q):
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    T[:3, 3] = translation.x, translation.y, translation.z
+    return T[np.ix_([0, 1, 3], [0, 1, 3])]
+
+
+def test_every_schema_says_what_its_parts_are(decoded):
+    summary, _ = decoded
+    for schema in summary.schemas.values():
+        assert schema.encoding == "ros2msg"
+        text = schema.data.decode()
+        defined = {line[5:] for line in text.splitlines() if line.startswith("MSG: ")}
+        for line in text.splitlines():
+            kind = line.split("#")[0].split("[")[0].split()
+            if kind and "/" in kind[0] and not line.startswith("MSG:"):
+                assert kind[0] in defined, f"{schema.name}: {kind[0]}"
+    channels = {c.topic: (summary.schemas[c.schema_id].name, c) for c in summary.channels.values()}
+    assert {topic: name for topic, (name, _) in channels.items()} == {
+        "/scan": "sensor_msgs/msg/LaserScan",
+        "/scan2": "sensor_msgs/msg/LaserScan",
+        "/scan_dynamic": "sensor_msgs/msg/LaserScan",
+        "/scan2_dynamic": "sensor_msgs/msg/LaserScan",
+        "/map": "nav_msgs/msg/OccupancyGrid",
+        "/trajectory": "nav_msgs/msg/Path",
+        "/objects": "visualization_msgs/msg/MarkerArray",
+        "/tf": "tf2_msgs/msg/TFMessage",
+        "/tf_static": "tf2_msgs/msg/TFMessage",
+    }
+    for topic, (_, channel) in channels.items():
+        assert channel.message_encoding == "cdr"
+        latched = "durability: 1" in channel.metadata["offered_qos_profiles"]
+        assert latched == (topic in ("/map", "/trajectory", "/tf_static"))
+
+
+def test_frames_are_one_tree(decoded):
+    _, topics = decoded
+    parents = defaultdict(set)
+    for topic in ("/tf", "/tf_static"):
+        for _, message in topics[topic]:
+            for one in message.transforms:
+                parents[one.child_frame_id].add(one.header.frame_id)
+    assert parents == {"base_link": {"map"}, "laser": {"base_link"}, "laser2": {"base_link"}}
+    for topic, messages in topics.items():
+        for time, message in messages:
+            parts = getattr(message, "transforms", getattr(message, "markers", [message]))
+            for part in parts:
+                assert part.header.frame_id in {"map", *parents}, topic
+                assert nanoseconds(part.header) == time
+
+
+def test_beams_are_in_one_of_two_scans(decoded, result, recording):
+    _, topics = decoded
+    p_static = np.load(result / "beams/p_static.npy")
+    length = np.linalg.norm(recording.points.astype(float), axis=1)
+    taken = dict.fromkeys(("/scan", "/scan2", "/scan_dynamic", "/scan2_dynamic"), 0)
+    dynamic = 0
+    for t in range(recording.n_scans):
+        beams, number = recording.beams_of(t), "2" * int(recording.sensor[t])
+        scans = []
+        for topic in (f"/scan{number}", f"/scan{number}_dynamic"):
+            time, scan = topics[topic][taken[topic]]
+            taken[topic] += 1
+            assert time == recording.stamp_ns[t]
+            assert scan.time_increment > 0
+            scans.append(np.array(scan.ranges))
+        hit, moves = recording.hit[beams], recording.hit[beams] & (p_static[beams] < 0.5)
+        expected = np.where(hit, length[beams], np.inf)
+        np.testing.assert_allclose(scans[0], np.where(moves, np.nan, expected), rtol=1e-6)
+        np.testing.assert_allclose(scans[1], np.where(moves, expected, np.nan), rtol=1e-6)
+        dynamic += moves.sum()
+    assert dynamic > 100
+
+
+def test_the_way_is_the_trajectory(decoded, result, recording):
+    _, topics = decoded
+    poses = poses_from_tum(result / "trajectory.tum", recording)
+    [(_, path)] = topics["/trajectory"]
+    found = [matrix(p.pose.position, p.pose.orientation) for p in path.poses]
+    np.testing.assert_allclose(found, poses, atol=1e-12)
+    assert [nanoseconds(p.header) for p in path.poses] == recording.stamp_ns.tolist()
+    for (time, tf), stamp, T in zip(topics["/tf"], recording.stamp_ns, poses, strict=True):
+        [one] = tf.transforms
+        assert time == stamp
+        moved = matrix(one.transform.translation, one.transform.rotation)
+        np.testing.assert_allclose(moved, T, atol=1e-12)
+
+
+def test_the_map_is_the_map(decoded, result):
+    _, topics = decoded
+    [(_, grid)] = topics["/map"]
+    with np.load(result / "map.npz") as archive:
+        p, origin, resolution = (archive[n] for n in ("p_occupied", "origin", "resolution"))
+    cells = np.array(grid.data).reshape(grid.info.height, grid.info.width)
+    np.testing.assert_array_equal(cells == -1, np.isnan(p))
+    assert np.abs(cells - 100 * p)[cells >= 0].max() <= 0.501
+    assert grid.info.resolution == np.float32(resolution)
+    place = grid.info.origin.position
+    np.testing.assert_allclose([place.x, place.y], origin[:2])
+
+
+def test_things_are_shown_where_they_are_while_they_are_seen(decoded, result):
+    import json
+
+    _, topics = decoded
+    objects = {o["id"]: o for o in json.loads((result / "objects/objects.json").read_text())}
+    shown = defaultdict(list)
+    for time, message in topics["/objects"]:
+        first, *boxes = message.markers
+        assert first.action == 3  # what was there before goes
+        for box in boxes:
+            shown[box.id].append((time, box))
+    assert set(shown) == set(objects)
+    for number, boxes in shown.items():
+        one = objects[number]
+        assert boxes[0][0] == one["first_stamp_ns"]
+        assert boxes[-1][0] == one["last_stamp_ns"]
+        at = dict(boxes)
+        track = one["track"]
+        for stamp, x, y in zip(track["stamp_ns"], track["x"], track["y"], strict=True):
+            place = at[stamp].pose.position
+            np.testing.assert_allclose([place.x, place.y], [x, y], atol=1e-9)
+    gone = [len(message.markers) == 1 for _, message in topics["/objects"]]
+    assert any(gone) or topics["/objects"][-1][0] == topics["/tf"][-1][0]
+
+
+def test_the_table_says_where_beams_ended(result, recording):
+    """In the map frame: what is static lies on the walls of the map."""
+    parquet = pytest.importorskip("pyarrow.parquet")
+    path = result.parent / "beams.parquet"
+    assert main(["convert", str(result), "-o", str(path), "--quiet", "--overwrite"]) == 0
+    read = parquet.read_table(path)
+    table = {name: read[name].to_numpy() for name in read.column_names}
+    assert len(table["scan"]) == recording.n_beams
+    with np.load(result / "map.npz") as archive:
+        p, origin, resolution = (archive[n] for n in ("p_occupied", "origin", "resolution"))
+    use = table["hit"] & (table["p_static"] > 0.9)
+    column, row = (
+        ((table[axis][use] - origin[k]) // resolution).astype(int) for k, axis in enumerate("xy")
+    )
+    assert use.sum() > 10_000
+    # some of the cells were unknown if the motion during the scans were in it
+    assert not np.isnan(p[row, column]).any()
+    assert np.mean(p[row, column] > 0.5) > 0.9

@@ -1,0 +1,121 @@
+"""The files of a result, read by other people's programs.
+
+Clouds as LAS will be read by laspy here once they are written.
+"""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from stillmap.output.trajectory import read_tum
+from stillmap.recording import poses as given_poses
+
+
+def planar(T):
+    return T[:, [0, 1, 3]][:, :, [0, 1, 3]]
+
+
+@pytest.fixture(scope="module")
+def stamps_and_poses(result, recording):
+    """What stillmap itself reads of the trajectory."""
+    path = result / "trajectory.tum"
+    return recording.stamp_ns, given_poses.poses_from_tum(path, recording)
+
+
+def test_evo_reads_the_trajectory(result, stamps_and_poses, tmp_path, monkeypatch):
+    import warnings
+
+    monkeypatch.setenv("HOME", str(tmp_path))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        file_interface = pytest.importorskip("evo.tools.file_interface")
+    found = file_interface.read_tum_trajectory_file(str(result / "trajectory.tum"))
+    stamp_ns, T = stamps_and_poses
+    valid, why = found.check()
+    assert valid, why
+    np.testing.assert_allclose(found.timestamps, stamp_ns / 1e9, rtol=1e-15)
+    np.testing.assert_allclose(planar(np.array(found.poses_se3)), T, atol=1e-8)
+
+
+def test_gtsam_reads_the_graph_and_leaves_the_poses_where_they_are(result, stamps_and_poses):
+    gtsam = pytest.importorskip("gtsam")
+    factors, values = gtsam.readG2o(str(result / "graph.g2o"), False)
+    lines = (result / "graph.g2o").read_text().splitlines()
+    ids = [int(line.split()[1]) for line in lines if line.startswith("VERTEX_SE2")]
+    edges = sum(line.startswith("EDGE_SE2") for line in lines)
+    assert (values.size(), factors.size()) == (len(ids), edges)
+    assert edges >= len(ids) - 1 > 10
+
+    def poses(of):
+        found = [of.atPose2(k) for k in ids]
+        return np.array([[pose.x(), pose.y(), pose.theta()] for pose in found])
+
+    _, T = stamps_and_poses
+    np.testing.assert_allclose(poses(values)[:, :2], T[ids, :2, 2], atol=1e-8)
+    held = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
+    factors.add(gtsam.PriorFactorPose2(ids[0], values.atPose2(ids[0]), held))
+    optimum = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
+    # every scan was registered once more after the graph was solved
+    moved = np.abs(poses(optimum) - poses(values))
+    assert np.median(moved[:, :2]) < 0.01
+    assert moved[:, :2].max() < 0.05
+
+
+def test_trimesh_reads_the_points_of_what_moved(result):
+    trimesh = pytest.importorskip("trimesh")
+    objects = json.loads((result / "objects/objects.json").read_text())
+    assert objects
+    for one in objects:
+        cloud = trimesh.load(result / f"objects/{one['id']:04d}.ply")
+        assert cloud.vertices.shape == (one["beams"], 3)
+        assert np.all(cloud.vertices[:, 2] == 0)
+        # around its way, as near as it is large
+        way = np.array([one["track"]["x"], one["track"]["y"]]).T
+        apart = np.linalg.norm(cloud.vertices[:, None, :2] - way, axis=-1).min(axis=1)
+        assert np.median(apart) < 0.5
+        extra = cloud.metadata["_ply_raw"]["vertex"]["data"]
+        assert set(extra.dtype.names) >= {"seconds", "p_dynamic"}
+        np.testing.assert_allclose(extra["p_dynamic"].mean(), one["p_dynamic"], atol=1e-5)
+
+
+class Links(HTMLParser):
+    """What a page would fetch, and whether every element that opens closes."""
+
+    VOID = ("meta", "link", "img", "br", "hr", "input", "col", "source", "area", "base")
+
+    def __init__(self):
+        super().__init__()
+        self.fetched, self.open, self.wrong = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        if tag not in self.VOID:
+            self.open.append(tag)
+        names = ("src", "href", "srcset", "data", "action", "poster", "xlink:href")
+        self.fetched += [value for name, value in attributes if name in names]
+        self.fetched += ["script"] * (tag in ("script", "iframe", "object", "embed"))
+
+    def handle_endtag(self, tag):
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append(tag)
+
+
+def test_the_report_is_whole_and_fetches_nothing(result):
+    page, text = Links(), (result / "report.html").read_text(encoding="utf-8")
+    page.feed(text)
+    assert (page.open, page.wrong) == ([], [])
+    assert page.fetched
+    inside = ("data:image/png;base64,", "#")
+    assert [value for value in page.fetched if not value.startswith(inside)] == []
+    assert re.findall(r"url\((?!#)", text) == []
+    assert "@import" not in text
+
+
+def test_numpy_reads_the_labels_without_loading_them(result, recording):
+    p_static, hit = (np.load(result / f"beams/{n}.npy", mmap_mode="r") for n in ("p_static", "hit"))
+    assert isinstance(p_static, np.memmap)
+    np.testing.assert_array_equal(hit, recording.hit)
+    stamp_ns, _ = read_tum(result / "trajectory.tum")
+    np.testing.assert_array_equal(np.load(result / "beams/stamp_ns.npy"), stamp_ns)
