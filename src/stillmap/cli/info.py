@@ -10,6 +10,7 @@ from stillmap import options
 from stillmap.cli.reading import add_read_flags, read_changes
 from stillmap.recording import ReadOptions, read
 from stillmap.recording.facts import facts
+from stillmap.recording.stamps import seconds_text
 
 _LINES_SHOWN = 10
 
@@ -72,7 +73,7 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
 
 
 def _time(time: dict[str, Any]) -> Iterator[str]:
-    first, last = (_seconds(time[key]) for key in ("first_stamp_ns", "last_stamp_ns"))
+    first, last = (seconds_text(time[key]) for key in ("first_stamp_ns", "last_stamp_ns"))
     rate = f", {time['rate_hz']:.2f} scans/s" if time["rate_hz"] else ""
     gap = f", largest gap {time['largest_gap_s']:.2f} s" if time["largest_gap_s"] else ""
     yield _row("duration", f"{time['duration_s']:.2f} s{rate}{gap}")
@@ -92,7 +93,7 @@ def _odometry(odometry: dict[str, Any] | None) -> Iterator[str]:
     if at is not None:
         yield _row(
             "largest step",
-            f"{odometry['largest_step_m']:.3f} m (after {_seconds(at)}), "
+            f"{odometry['largest_step_m']:.3f} m (after {seconds_text(at)}), "
             f"{odometry['largest_step_deg']:.1f} deg",
         )
 
@@ -144,8 +145,3 @@ def _notes(found: dict[str, Any]) -> Iterator[str]:
 
 def _row(title: str, text: str) -> str:
     return f"{title:<16}  {text}"
-
-
-def _seconds(stamp_ns: int) -> str:
-    sign = "-" if stamp_ns < 0 else ""
-    return f"{sign}{abs(stamp_ns) // 10**9}.{abs(stamp_ns) % 10**9:09d}"

@@ -26,6 +26,20 @@ def require_new(path: Path, overwrite: bool = False) -> None:
         )
 
 
+def require_new_file(path: Path, overwrite: bool = False) -> None:
+    """Refuse an output file that is there already, before any work is done.
+
+    Raises:
+        InputError: `path` is a folder, or a file and `overwrite` is not given.
+    """
+    if path.is_dir():
+        raise InputError("is in the way: a folder", where=str(path))
+    if path.exists() and not overwrite:
+        raise InputError(
+            "is there already", where=str(path), hint="choose another or give --overwrite"
+        )
+
+
 @contextmanager
 def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
     """A temporary sibling folder that becomes `path` when the block ends without an exception.

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stillmap.errors import InputError
+from stillmap.recording.stamps import seconds_text
 
 _COLUMNS = "stamp x y z qx qy qz qw"
 # a quaternion printed with three decimals still lies well within this of length one
@@ -26,7 +27,7 @@ def write_tum(path: Path, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64
     rows = np.round(_rows_of(poses), 9) + 0.0
     with path.open("w", encoding="ascii", newline="\n") as file:
         for stamp, row in zip(stamp_ns.tolist(), rows.tolist(), strict=True):
-            file.write(f"{_seconds(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
+            file.write(f"{seconds_text(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
 
 
 def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -68,11 +69,6 @@ def _rows_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
         quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
         rows[:, 3:] = np.where(quaternion[:, 3:] < 0, -quaternion, quaternion)
     return rows
-
-
-def _seconds(stamp_ns: int) -> str:
-    whole, rest = divmod(abs(stamp_ns), 10**9)
-    return f"{'-' if stamp_ns < 0 else ''}{whole}.{rest:09d}"
 
 
 def _lines(path: Path) -> list[str]:

@@ -32,6 +32,12 @@ def parse_ns(text: str) -> int:
     return int(seconds.scaleb(9).to_integral_value(ROUND_HALF_EVEN))
 
 
+def seconds_text(stamp_ns: int) -> str:
+    """Seconds with nine decimals, exact."""
+    whole, rest = divmod(abs(stamp_ns), 10**9)
+    return f"{'-' if stamp_ns < 0 else ''}{whole}.{rest:09d}"
+
+
 def longest_non_decreasing(values: Sequence[int]) -> NDArray[np.intp]:
     """Indices of a longest non-decreasing subsequence, in O(n log n) (patience sorting).
 
