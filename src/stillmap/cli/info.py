@@ -20,7 +20,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "info", help="what is in a recording", description="Show what is in a recording."
     )
-    parser.add_argument("input", metavar="INPUT", help="a log file or a recording folder")
+    parser.add_argument("input", metavar="INPUT", help="a file or folder with a recording")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     add_read_flags(parser)
     parser.set_defaults(run=run)
@@ -67,6 +67,7 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
         first, last = found["beam_times_s"]
         yield _row("beam times", f"{first:g} to {last:g} s after a scan's stamp")
     yield from _odometry(found["odometry"])
+    yield from _more(found)
     for sensor in found["sensors"]:
         yield from _sensor(sensor)
     yield from _notes(found)
@@ -96,6 +97,21 @@ def _odometry(odometry: dict[str, Any] | None) -> Iterator[str]:
             f"{odometry['largest_step_m']:.3f} m (after {seconds_text(at)}), "
             f"{odometry['largest_step_deg']:.1f} deg",
         )
+
+
+def _more(found: dict[str, Any]) -> Iterator[str]:
+    """Poses and pictures, where there are any."""
+    way, images = found["recorded_poses"], found["images"]
+    if way is not None:
+        text = f"path {way['path_length_m']:.2f} m, turned {way['turned_deg']:.0f} deg"
+        yield _row("recorded poses", f"{text}: used with --poses recording")
+    if images is None:
+        return
+    yield _row("pictures", str(images["count"]))
+    for camera in images["cameras"]:
+        known = [word for word in ("calibrated", "placed") if camera[word]]
+        size = f"{camera['count']} of {camera['width']} x {camera['height']} pixels"
+        yield _row("  camera", f"{camera['name']}, {size}, {' and '.join(known) or 'uncalibrated'}")
 
 
 def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
@@ -138,7 +154,8 @@ def _notes(found: dict[str, Any]) -> Iterator[str]:
         for reason, damage in found[key].items():
             shown = ", ".join(str(line) for line in damage["lines"][:_LINES_SHOWN])
             more = ", ..." if damage["count"] > _LINES_SHOWN else ""
-            yield _row(title, f"{damage['count']} {reason} (line {shown}{more})")
+            unit = found["skipped_unit"] if key == "skipped" else "line"
+            yield _row(title, f"{damage['count']} {reason} ({unit} {shown}{more})")
     for what in found["warnings"]:
         yield _row("warning", what)
 

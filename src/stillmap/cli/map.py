@@ -6,6 +6,9 @@ import os
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stillmap import em
 from stillmap.cli.options import add_option_flags, resolved_options
 from stillmap.cli.progress import say, shown_progress
@@ -25,7 +28,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     p.add_argument(
         "input",
         metavar="INPUT",
-        help="a CARMEN log (.log, .clf, .gz) or a stillmap recording folder",
+        help="a file or folder with a recording: a CARMEN log, stillmap's own folder, ...",
     )
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="where the result goes")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
@@ -33,7 +36,11 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     p.add_argument(
         "--estimator", choices=get_args(em.Estimator), help="what says which beams are static"
     )
-    p.add_argument("--poses", metavar="FILE.tum", help="keep these poses, estimate the rest")
+    p.add_argument(
+        "--poses",
+        metavar="FILE.tum",
+        help="keep these poses, estimate the rest; `recording`: those that the recording states",
+    )
     p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
     p.add_argument("--resolution", metavar="M", type=float, help="edge of a map cell in metres")
     p.add_argument("--map-mode", choices=["trinary", "scale", "raw"], help="pixels of map.pgm")
@@ -57,13 +64,27 @@ def run(args: argparse.Namespace) -> int:
     with stages.measure("read"):
         recording = read(Path(args.input), options.read)
     recording = _usable(recording, args)
-    poses = poses_from_tum(Path(args.poses), recording) if args.poses else None
+    poses = _given_poses(recording, args)
     with shown_progress(args.quiet, em.iterations(options.estimator, options.em)) as progress:
         result = build(recording, options, poses=poses, progress=progress, stages=stages)
     result.save(output, overwrite=args.overwrite)
     if not args.quiet:
         _say(result, output)
     return 0
+
+
+def _given_poses(recording: Recording, args: argparse.Namespace) -> NDArray[np.float64] | None:
+    if not args.poses:
+        return None
+    if args.poses != "recording":
+        return poses_from_tum(Path(args.poses), recording)
+    if recording.T_recorded_base is None:
+        raise InputError(
+            "states no poses",
+            where=args.input,
+            hint="--poses FILE.tum gives them; a file of the name `recording` is ./recording",
+        )
+    return recording.T_recorded_base
 
 
 def _require_writable(output: Path) -> None:

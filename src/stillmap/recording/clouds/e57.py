@@ -3,6 +3,7 @@
 libe57 does the reading (by pye57). Counts in a file are believed as far as its size goes.
 """
 
+import re
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -107,8 +108,10 @@ def _refuse_entities(path: Path) -> None:
         pages = file.read((length // (_PAGE - _CHECKSUM) + 2) * _PAGE)
     kept = (pages[at : at + _PAGE - _CHECKSUM] for at in range(0, len(pages), _PAGE))
     text = b"".join(kept)[start - first :][:length]
-    # UTF-16 has zeros between the letters
-    if b"<!DOCTYPE" in text.replace(b"\0", b""):
+    # another encoding could hide them; the standard has this one
+    if re.match(rb"(\xef\xbb\xbf)?\s*<\?xml[^>]*encoding=.utf-8", text, re.IGNORECASE) is None:
+        raise InputError("is damaged: its description is no XML in UTF-8", where=str(path))
+    if b"<!DOCTYPE" in text:
         raise InputError("is refused: its description defines entities", where=str(path))
 
 
@@ -123,9 +126,8 @@ def _cloud(path: Path, scan: int, origin: Origin, scratch: Path | None) -> Cloud
     with opened as file:
         node = file.root()["data3D"][scan]
         T = _pose(node)
-        if T is not None:
-            origin = Origin()
-            origin.at = np.zeros(3)
+        if T is not None and not np.array_equal(T, np.eye(4)):
+            origin = Origin(np.zeros(3))
         growing = Growing(origin, scratch)
         points, fields = node["points"], _fields(opened.library, node, path)
         promised, found = points.childCount(), 0

@@ -1,10 +1,11 @@
 """LAS and LAZ files: one cloud, or a folder of them; read by laspy."""
 
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,11 @@ from stillmap.recording.options import ReadOptions
 ENDINGS = (".las", ".laz")
 MAGIC = b"LASF"
 
-_BLOCK = 1 << 18  # points read together
+_BLOCK = 1 << 16  # points read together
+_HEADER = 227  # bytes that every header has
+_EXTRA = 54  # bytes that a record after the header has at least
+_PACKED = 0xC0  # bits of the format of points
+_SMALLEST_CHUNK = 20  # bytes: its first point is not packed
 _SCALE = 0.0001  # m, of what is written
 
 
@@ -46,11 +51,16 @@ def read(
 
 def _cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
     require_content(path)
+    _require_sound(path)
     laspy = extra("laspy", path)
     points, promised, found = Growing(origin, scratch), 0, 0
-    with _refused(path), laspy.open(path, read_evlrs=False) as reader:
+    # one thread: the others believe the sizes of chunks
+    backend = laspy.LazBackend.Lazrs
+    with _refused(path), laspy.open(path, read_evlrs=False, laz_backend=backend) as reader:
         promised = reader.header.point_count
         for block in reader.chunk_iterator(_BLOCK):
+            if len(block) > _BLOCK:
+                raise InputError("is damaged: the size of its points", where=str(path))
             points.add(np.stack([block.x, block.y, block.z], axis=1))
             found += len(block)
     if found < promised:
@@ -58,14 +68,49 @@ def _cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
     return Cloud(points.finished())
 
 
+def _require_sound(path: Path) -> None:
+    """Refuse counts that the libraries would believe, and run out of time or memory over.
+
+    Raises:
+        InputError: see there.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(_HEADER)
+        if len(head) < _HEADER or head[:4] != MAGIC:
+            raise InputError("is no LAS file", where=str(path))
+        header_size, start, extras, kind = struct.unpack_from("<HIIB", head, 94)
+        if not header_size + _EXTRA * extras <= start <= size:
+            raise InputError("is damaged: its header", where=str(path))
+        if kind & _PACKED and _chunks(file, start, size) > size // _SMALLEST_CHUNK:
+            raise InputError("is damaged: its table of chunks", where=str(path))
+
+
+def _chunks(file: IO[bytes], start: int, size: int) -> int:
+    """How many chunks a packed file says it has."""
+    file.seek(start)
+    table = int.from_bytes(file.read(8), "little", signed=True)
+    if table == -1:  # its place was not known when the points were written
+        file.seek(size - 8)
+        table = int.from_bytes(file.read(8), "little", signed=True)
+    if not start <= table <= size - 8:
+        return size  # none at all
+    file.seek(table + 4)
+    return int.from_bytes(file.read(4), "little")
+
+
 @contextmanager
 def _refused(path: Path) -> Iterator[None]:
     """Whatever the library makes of damaged bytes is an InputError."""
     try:
-        yield
+        with np.errstate(all="ignore"):
+            yield
     except (InputError, MemoryError):
         raise
-    except Exception as error:
+    except BaseException as error:
+        # Rust's panics are no Exception
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
         what = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"is damaged: {what}", where=str(path)) from error
 

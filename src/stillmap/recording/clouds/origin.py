@@ -16,11 +16,11 @@ class Origin:
     """Where points are counted from, the same for all clouds of a recording.
 
     Points near the origin of their coordinates stay where they are. Others are moved by whole
-    metres, found from the first block of points that is seen.
+    metres, found from the first block of points that is seen, unless `at` (3,) is given.
     """
 
-    def __init__(self) -> None:
-        self.at: NDArray[np.float64] | None = None
+    def __init__(self, at: NDArray[np.float64] | None = None) -> None:
+        self.at = at
 
     def moved(self, points: NDArray[Any]) -> NDArray[np.float32]:
         """(n, 3) as seen from here, of points (n, 3) in metres as recorded."""

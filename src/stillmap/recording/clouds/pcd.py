@@ -12,6 +12,7 @@ from stillmap.output.atomic import new_folder
 from stillmap.recording.clouds import pcd_file
 from stillmap.recording.clouds.assembling import Cloud, Known, Source, assembled
 from stillmap.recording.clouds.files import files_in, stamps_in, stem_of
+from stillmap.recording.clouds.origin import Origin
 from stillmap.recording.clouds.placing import hits_of, one_sensor, sensor_poses
 from stillmap.recording.clouds.point_times import column_of
 from stillmap.recording.clouds.rigid import quaternion
@@ -44,19 +45,26 @@ def read(
     in_world = _lie_around_viewpoints(files)
     if in_world:
         known.warnings.append("points lie around their VIEWPOINT: taken back to the sensor's frame")
+    origin = Origin()
     sources = [
-        Source(file.name, partial(_cloud, file, in_world), stamps[i] if stamps else None)
+        Source(file.name, partial(_cloud, file, in_world, origin), stamps[i] if stamps else None)
         for i, file in enumerate(files)
     ]
-    return assembled(sources, known, options, progress, scratch)
+    recording = assembled(sources, known, options, progress, scratch)
+    if notes := origin.notes():
+        recording.source.update(notes)
+        recording.source["warnings"] += origin.warnings()
+    return recording
 
 
-def _cloud(path: Path, in_world: bool) -> Cloud:
+def _cloud(path: Path, in_world: bool, origin: Origin) -> Cloud:
     head = pcd_file.header(path)
     time = column_of(field.name for field in head.layout.fields)
     found = pcd_file.values(head, ["x", "y", "z", *([time] if time else [])])
     points = np.stack(found[:3], axis=1)
-    if in_world and head.T is not None:
+    if head.T is None or np.array_equal(head.T, np.eye(4)):
+        points = origin.moved(points)
+    elif in_world:
         T = se2.inverse(head.T)
         points = points.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
     return Cloud(points, head.T, found[3] if time else None)
@@ -79,7 +87,7 @@ def _lie_around_viewpoints(files: list[Path]) -> bool:
     if farthest is None:
         return False
     try:
-        cloud = _cloud(farthest, in_world=False)
+        cloud = _cloud(farthest, False, Origin())
     except (InputError, OSError, MemoryError):
         return False
     points = cloud.points[np.isfinite(cloud.points).all(axis=1)].astype(np.float64)

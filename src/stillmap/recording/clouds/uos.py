@@ -4,6 +4,7 @@ Centimetres, x right, y up, z ahead, left-handed; stillmap has metres, x ahead, 
 is a position and three angles in degrees, about x, then the turned y, then the turned z.
 """
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from stillmap.errors import InputError
 from stillmap.recording.clouds.assembling import Cloud, Known, Source, assembled
 from stillmap.recording.clouds.files import files_in, require_content, stem_of
 from stillmap.recording.clouds.records import numbers_in, text_lines
@@ -25,6 +27,8 @@ _LARGEST_UNPACKED = 1 << 30  # bytes
 _LARGEST_POSE = 1 << 12  # bytes
 _BLOCK = 1 << 18  # lines read together
 _METRES = 0.01
+# what tells codes for "nothing came back": so near to each other, so far from the rest (m), so many
+_CODES, _GAP, _FEW = 0.012, 0.3, 0.001
 # of the axes of 3DTK to ours
 _AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
@@ -42,8 +46,32 @@ def read(
     """
     files = [path] if path.is_file() else files_in(path, ENDINGS)
     known = Known(path, "3DTK", [], single=path.is_file())
+    code = _code(files) if options.max_range is None else None
+    if code is not None:
+        known.warnings.append(f"nothing came back from {code:.2f} m on: a code of the laser")
+        options = replace(options, max_range=code)
     sources = [Source(file.name, partial(_cloud, file)) for file in files]
     return assembled(sources, known, options, progress, scratch)
+
+
+def _code(files: list[Path]) -> float | None:
+    """Metres from which on ranges of the first scan are codes for "nothing came back", or None.
+
+    A 2D laser on a tilting mount writes one range, or a few beside each other, where it sees
+    nothing; they stand off from what it does see.
+    """
+    for file in files:
+        try:
+            length = np.linalg.norm(_cloud(file).points, axis=1)
+        except (InputError, OSError):
+            continue
+        length = length[np.isfinite(length)]
+        top = length.max(initial=0.0)
+        codes = int(np.count_nonzero(length > top - _CODES))
+        below = int(np.count_nonzero(length > top - _CODES - _GAP)) - codes
+        found = codes > _FEW * len(length) and codes >= 20 and 20 * below < codes
+        return float(np.floor(100.0 * (top - _CODES)) / 100.0) if found else None
+    return None
 
 
 def _cloud(path: Path) -> Cloud:
