@@ -170,7 +170,7 @@ class _Scans:
         stamp_ns = cloud.stamp_ns if stamp_ns is None else stamp_ns
         beam_time = None
         if self._clock is not None and cloud.times is not None:
-            stamp_ns, beam_time = since(cloud.times, self._clock, stamp_ns)
+            stamp_ns, beam_time = since(cloud.times, _usable(points), self._clock, stamp_ns)
         if stamp_ns is None:
             stamp_ns = number * 10**9
             self._counted += 1
@@ -180,8 +180,7 @@ class _Scans:
     def _first_clock(self, cloud: Cloud) -> Clock | None:
         if cloud.times is None:
             return None
-        usable = np.isfinite(cloud.points).all(axis=1) & np.any(cloud.points != 0, axis=1)
-        clock = clock_of(cloud.times[usable], self._period)
+        clock = clock_of(cloud.times[_usable(cloud.points)], self._period)
         if clock is None:
             what = "the times of points are not used: no unit makes a sweep of them"
             self._known.warnings.append(what)
@@ -223,6 +222,11 @@ def _period(sources: Sequence[Source]) -> float | None:
     if len(stamps) < 2:
         return None
     return float(np.median(np.diff(np.sort(np.array(stamps, np.int64))))) / 1e9
+
+
+def _usable(points: NDArray[Any]) -> NDArray[np.bool_]:
+    usable: NDArray[np.bool_] = np.isfinite(points).all(axis=1) & np.any(points != 0, axis=1)
+    return usable
 
 
 def _sound(points: NDArray[Any]) -> NDArray[Any]:

@@ -65,26 +65,28 @@ def _within(length: float, limits: tuple[float, float]) -> set[int]:
 
 
 def since(
-    values: NDArray[Any], clock: Clock, stamp_ns: int | None
+    values: NDArray[Any], usable: NDArray[np.bool_], clock: Clock, stamp_ns: int | None
 ) -> tuple[int | None, NDArray[np.float64]]:
     """A scan's stamp, and seconds from it to each point, NaN where unknown.
 
     Args:
         values: (n,) as they are recorded.
+        usable: (n,) whether there is a point.
         clock: how they are read.
         stamp_ns: the scan's stamp; None: its first point's, where times are absolute.
     """
     if not clock.absolute:
         return stamp_ns, _short(values.astype(np.float64) / clock.per_second)
     unit = 10**9 // clock.per_second  # ns
-    known = np.isfinite(values) & (values > 0) & (values < _LARGEST_NS / unit)
+    known = usable & np.isfinite(values) & (values > 0) & (values < _LARGEST_NS / unit)
     after = np.full(len(values), np.nan)
     if not known.any():
         return stamp_ns, after
     kept = values[known]
     # whole numbers stay exact
     ns = kept.astype(np.int64) * unit if kept.dtype.kind != "f" else _rounded(kept * float(unit))
-    first = int(ns.min())
+    middle = np.partition(ns, len(ns) // 2)[len(ns) // 2]
+    first = int(ns[np.abs(ns - middle) < int(_LONGEST * 1e9)].min())
     if stamp_ns is None:
         stamp_ns = first
     same_clock = abs(stamp_ns - first) < _SAME_CLOCK_NS
