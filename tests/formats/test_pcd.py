@@ -191,6 +191,19 @@ def test_absolute_times_are_stamps_where_names_are_not(tmp_path):
     np.testing.assert_allclose(found.beam_time, [0, 0.03, 0.06] * 2, atol=1e-7)
 
 
+def test_times_that_lie_far_off_are_passed_over(tmp_path):
+    ns = 1_700_000_000 * 10**9 + np.arange(9, dtype="<u8") * 10**7
+    rows = made(np.ones((9, 3)), [("t", "<u8")], t=ns)
+    write(tmp_path / "0.pcd", rows)
+    rows["t"][[2, 5]] = 3, 2 * ns[5]
+    write(tmp_path / "1.pcd", rows)
+    found = read(tmp_path)
+    assert found.stamp_ns.tolist() == [int(ns[0])] * 2
+    wanted = np.tile(np.arange(9) * 0.01, 2)
+    wanted[[11, 14]] = 0.0
+    np.testing.assert_allclose(found.beam_time, wanted, atol=1e-6)
+
+
 @pytest.mark.parametrize("spread", [0.0, 3.0, 3000.0 * 1.1])
 def test_times_of_no_known_unit_are_not_used(tmp_path, spread):
     rows = made(np.ones((3, 3)), [("time", "<f4")], time=[0, spread / 2, spread])
@@ -263,8 +276,9 @@ def test_the_library_that_unpacks_is_an_extra(tmp_path, monkeypatch):
         raise ImportError(name)
 
     monkeypatch.setattr("stillmap.recording.extras.import_module", missing)
-    with pytest.raises(InputError, match=r"needs lzf.*pip install 'stillmap\[io\]'"):
-        read(tmp_path / "a.pcd")
+    for path in (tmp_path / "a.pcd", tmp_path):
+        with pytest.raises(InputError, match=r"needs lzf.*pip install 'stillmap\[io\]'"):
+            read(path)
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))

@@ -6,6 +6,10 @@ from typing import Any
 from stillmap.errors import InputError
 
 
+class MissingExtra(InputError):
+    """A library is not there: no file at fault, and none that could be skipped for it."""
+
+
 def extra(module: str, path: object) -> Any:
     """A module that comes with stillmap's extra `io`.
 
@@ -14,11 +18,11 @@ def extra(module: str, path: object) -> Any:
         path: what it is wanted for.
 
     Raises:
-        InputError: it is not installed.
+        MissingExtra: it is not installed.
     """
     try:
         return import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]
         hint = "pip install 'stillmap[io]'"
-        raise InputError(f"needs {package} to be read", where=str(path), hint=hint) from error
+        raise MissingExtra(f"needs {package} to be read", where=str(path), hint=hint) from error

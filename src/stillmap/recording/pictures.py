@@ -51,6 +51,8 @@ def write_picture(picture: NDArray[Any], path: Path) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
+    if not path.is_file():
+        raise InputError("is no file", where=str(path))
     try:
         with warnings.catch_warnings():
             # more pixels than any camera has: a picture that unpacks to more than memory

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.errors import InputError
 from stillmap.recording.clouds.point_times import Clock, clock_of, since
+from stillmap.recording.extras import MissingExtra
 from stillmap.recording.gathering import Gathered
 from stillmap.recording.lines import Progress
 from stillmap.recording.model import Recording
@@ -51,14 +52,12 @@ class Known(NamedTuple):
         format: for people.
         warnings: to begin with; more are added.
         single: one file: what is wrong with it is an error, nothing is skipped.
-        more: for Recording.source.
     """
 
     path: Path
     format: str
     warnings: list[str]
     single: bool = False
-    more: dict[str, Any] = {}  # noqa: RUF012
 
 
 def assembled(
@@ -82,7 +81,7 @@ def assembled(
         more: other fields of the Recording.
 
     Raises:
-        InputError: not one can be read.
+        InputError: not one can be read, or a library is missing.
     """
     refuse_places(options)
     skipped, scans = Skipped(), _Scans(sources, known, options, scratch)
@@ -93,7 +92,7 @@ def assembled(
             if known.single and not len(cloud.points):
                 raise InputError("holds no points", where=str(known.path))
         except InputError as error:
-            if known.single:
+            if known.single or isinstance(error, MissingExtra):
                 raise
             skipped.add(error.what.partition(":")[0], number + 1)
             lost.append(source.name)
@@ -198,7 +197,6 @@ class _Scans:
             "skipped": skipped.to_dict(),
             "skipped_unit": "file",
             "warnings": warnings,
-            **known.more,
             **narrowing(self._options),
         }
         return self._gathered.recording(

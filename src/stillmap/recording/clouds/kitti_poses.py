@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stillmap import se2
 from stillmap.errors import InputError
-from stillmap.recording.clouds.files import files_in
+from stillmap.recording.clouds.files import files_in, require_content
 from stillmap.recording.clouds.kitti_calibration import Calibration
 from stillmap.recording.clouds.records import numbers_in, text_lines
 from stillmap.recording.clouds.rigid import from_row, transform
@@ -78,6 +78,7 @@ def _inertial(folder: Path) -> Poses:
     out: Poses = []
     scale = first = None
     for path in files_in(folder, (".txt",)):
+        require_content(path)
         numbers = numbers_in(text_lines(path), 1, range(6), path)
         if not len(numbers):
             raise InputError("is empty", where=str(path))

@@ -72,7 +72,7 @@ def _require_sound(path: Path) -> None:
     """Refuse counts that the libraries would believe, and run out of time or memory over.
 
     Raises:
-        InputError: see there.
+        InputError: see there; or lazrs is missing.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -82,6 +82,8 @@ def _require_sound(path: Path) -> None:
         header_size, start, extras, kind = struct.unpack_from("<HIIB", head, 94)
         if not header_size + _EXTRA * extras <= start <= size:
             raise InputError("is damaged: its header", where=str(path))
+        if kind & _PACKED:
+            extra("lazrs", path)
         if kind & _PACKED and _chunks(file, start, size) > size // _SMALLEST_CHUNK:
             raise InputError("is damaged: its table of chunks", where=str(path))
 

@@ -17,7 +17,7 @@ from stillmap.recording.clouds.records import Field, Layout, columns, cut_short,
 from stillmap.recording.clouds.rigid import from_quaternion
 from stillmap.recording.extras import extra
 
-_HEADER = 1 << 16  # bytes in which it must end
+_HEADER = 1 << 14  # bytes in which it must end
 _TYPES = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _LARGEST_UNPACKED = 1 << 30  # bytes
