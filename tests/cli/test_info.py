@@ -11,6 +11,8 @@ from stillmap.cli import info
 from stillmap.cli.reading import add_read_flags, read_changes
 from stillmap.errors import InputError
 from stillmap.recording import Recording, read, write
+from stillmap.recording import facts as module
+from stillmap.recording.images import Camera, Images
 
 LINES = [
     "# CARMEN Logfile",
@@ -197,3 +199,68 @@ def test_beam_times_are_shown_where_there_are_any(path, tmp_path, capsys):
 def test_no_scan_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         run(tmp_path / "missing.log")
+
+
+def test_poses_and_pictures_are_shown_where_there_are_any(path, tmp_path, capsys):
+    recording = read(path)
+    run(path)
+    out = capsys.readouterr().out
+    assert "recorded poses" not in out
+    assert "  camera" not in out
+    T = np.tile(np.eye(3), (3, 1, 1))
+    T[:, 0, 2] = 0, 3, 7
+    cameras = (
+        Camera("front", 8, 6, np.eye(3), "", np.zeros(0), np.eye(4)),
+        Camera("rear", 80, 60, None, "", np.zeros(0), None),
+    )
+    stamp_ns, camera = np.arange(5, dtype=np.int64), np.array([0, 1, 0, 0, 1], np.int32)
+    images = Images(stamp_ns, camera, cameras, lambda _: np.zeros((6, 8), np.uint8))
+    write(replace(recording, T_recorded_base=T, images=images), tmp_path / "rec")
+    run(tmp_path / "rec")
+    out = capsys.readouterr().out
+    assert "path 7.00 m, turned 0 deg: used with --poses recording" in out
+    assert "pictures          5" in out
+    assert "front, 3 of 8 x 6 pixels, calibrated and placed" in out
+    assert "rear, 2 of 80 x 60 pixels, uncalibrated" in out
+    run(tmp_path / "rec", "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert found["recorded_poses"]["path_length_m"] == pytest.approx(7.0)
+    assert (found["images"]["count"], found["images"]["cameras"][1]["count"]) == (5, 2)
+
+
+def test_skipped_files_are_called_so(tmp_path, capsys):
+    (tmp_path / "velodyne").mkdir()
+    (tmp_path / "velodyne" / "0.bin").write_bytes(np.ones(8, "<f4").tobytes())
+    (tmp_path / "velodyne" / "1.bin").write_bytes(b"cut")
+    (tmp_path / "times.txt").write_text("0\n1\n")
+    run(tmp_path)
+    out = capsys.readouterr().out
+    assert "KITTI, 3D" in out
+    assert "1 is cut short (file 2)" in out
+    run(tmp_path, "--json")
+    assert json.loads(capsys.readouterr().out)["skipped_unit"] == "file"
+
+
+@pytest.mark.parametrize("few", [1, 100])
+def test_ranges_of_huge_recordings_are_those_of_a_sample(monkeypatch, few):
+    counts = np.full(400, 50)
+    rng = np.random.default_rng(0)
+    points = np.zeros((20_000, 2), np.float32)
+    points[:, 0] = rng.uniform(1, 11, 20_000)
+    recording = Recording(
+        stamp_ns=np.arange(400, dtype=np.int64),
+        offset=np.concatenate([[0], np.cumsum(counts)]),
+        points=points,
+        hit=np.ones(20_000, bool),
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(400, np.int32),
+        T_odom_base=None,
+    )
+    exact = module.facts(recording)
+    assert exact["hit_ranges_m"]["max"] == pytest.approx(points.max(), abs=1e-4)
+    monkeypatch.setattr(module, "_SAMPLED", 2000)
+    monkeypatch.setattr(module, "_FEW", few)
+    assert len(module._hit_ranges(recording)) <= 2000
+    sampled = module.facts(recording)
+    assert sampled["hit_ranges_m"]["median"] == pytest.approx(6.0, abs=0.3)
+    assert sampled["counts"] == exact["counts"]

@@ -8,12 +8,14 @@ import shutil
 import signal
 import subprocess
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
 
 from stillmap.output.trajectory import read_tum
+from stillmap.recording import read, write
 
 QUICK = ("--set", "em.max_iterations=1")
 # goes on until it is stopped
@@ -193,6 +195,22 @@ def test_given_poses_are_kept(call, room, tmp_path):
     given, kept = read_tum(poses), read_tum(tmp_path / "out/trajectory.tum")
     np.testing.assert_array_equal(kept[0], given[0])
     np.testing.assert_allclose(kept[1], given[1], atol=1e-8)
+
+
+def test_poses_of_the_recording_are_kept_when_asked_for(call, room, tmp_path):
+    truth = np.load(room / "truth/T_world_base.npy")
+    write(replace(read(room), T_recorded_base=truth), tmp_path / "rec")
+    words = ("map", tmp_path / "rec", "-o", tmp_path / "out", "--poses", "recording", *QUICK)
+    done = call(*words)
+    assert done.returncode == 0, done.stderr
+    _, kept = read_tum(tmp_path / "out/trajectory.tum")
+    np.testing.assert_allclose(kept[:, [0, 1]][:, :, [0, 1, 3]], truth[:, :2], atol=1e-8)
+
+
+def test_a_recording_without_poses_is_refused_where_they_are_asked_for(call, room, tmp_path):
+    done = call("map", room, "-o", tmp_path / "out", "--poses", "recording")
+    refused(done, room, "states no poses", "--poses FILE.tum")
+    assert not (tmp_path / "out").exists()
 
 
 def test_poses_of_another_tool_may_be_unsorted_more_and_rounded(call, room, tmp_path):

@@ -3,7 +3,9 @@
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stillmap.recording import Recording, read
 from stillmap.recording.options import ReadOptions
@@ -48,3 +50,23 @@ def flaser() -> Callable[..., str]:
         return " ".join(str(field) for field in fields)
 
     return line
+
+
+@pytest.fixture
+def space() -> Recording:
+    """A short recording in 3D: four scans of other sizes, with poses that the recording states."""
+    rng = np.random.default_rng(11)
+    counts = np.array([40, 1, 25, 60])
+    T = np.tile(np.eye(4), (4, 1, 1))
+    T[:, :3, :3] = Rotation.random(4, rng=rng).as_matrix()
+    T[:, :3, 3] = rng.normal(0, 3, (4, 3))
+    return Recording(
+        stamp_ns=1_700_000_000_123_456_789 + np.array([0, 1, 100_000_007, 2**33], np.int64),
+        offset=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        points=rng.normal(0, 20, (counts.sum(), 3)).astype(np.float32),
+        hit=np.ones(counts.sum(), bool),
+        T_base_sensor=np.eye(4)[None],
+        sensor=np.zeros(4, np.int32),
+        T_odom_base=None,
+        T_recorded_base=T,
+    )

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from stillmap import se2
 from stillmap.errors import InputError
 from stillmap.recording import ReadOptions, Recording, read, write
+from stillmap.recording.images import Camera, Images
 
 ARRAYS = (
     "stamp_ns",
@@ -22,10 +23,11 @@ ARRAYS = (
     "sensor",
     "T_odom_base",
     "beam_time",
+    "T_recorded_base",
 )
 
 
-def made(D=2, odometry=True, counts=(3, 0, 4), beam_times=True):
+def made(D=2, odometry=True, counts=(3, 0, 4), beam_times=True, recorded=True):
     rng = np.random.default_rng(4)
     T, M = len(counts), sum(counts)
     points = rng.normal(0, 5, (M, D)).astype(np.float32)
@@ -46,6 +48,7 @@ def made(D=2, odometry=True, counts=(3, 0, 4), beam_times=True):
         T_odom_base=odom if odometry else None,
         source={"path": "hall", "seed": 3, "nested": {"list": [1, 2.5, None, "ü"]}},
         beam_time=rng.uniform(-0.1, 0.1, M).astype(np.float32) if beam_times else None,
+        T_recorded_base=odom + np.eye(D + 1, k=D) if recorded else None,
     )
 
 
@@ -70,20 +73,20 @@ def test_round_trip(tmp_path, D, odometry, counts):
     require_same(read(tmp_path / "rec" / "recording.json"), recording)
 
 
-def test_without_odometry_and_beam_times_their_files_are_absent(tmp_path):
-    recording = made(odometry=False, beam_times=False)
+def test_without_odometry_beam_times_and_poses_their_files_are_absent(tmp_path):
+    recording = made(odometry=False, beam_times=False, recorded=False)
     write(recording, tmp_path / "rec")
     names = {p.name for p in (tmp_path / "rec").iterdir()}
-    assert names == {"recording.json", *(f"{name}.npy" for name in ARRAYS[:-2])}
+    assert names == {"recording.json", *(f"{name}.npy" for name in ARRAYS[:-3])}
     require_same(read(tmp_path / "rec"), recording)
 
 
 def test_folders_from_before_there_were_beam_times_are_read(tmp_path):
-    recording = made(beam_times=False)
+    recording = made(beam_times=False, recorded=False)
     write(recording, tmp_path / "rec")
     file = tmp_path / "rec" / "recording.json"
     header = json.loads(file.read_text())
-    del header["beam_times"]
+    del header["beam_times"], header["recorded_poses"]
     file.write_text(json.dumps(header))
     require_same(read(tmp_path / "rec"), recording)
 
@@ -249,3 +252,80 @@ def test_options_narrow_a_folder(tmp_path):
     np.testing.assert_allclose(narrowed.points, expected, rtol=1e-6)
     np.testing.assert_allclose(se2.parameters(narrowed.T_base_sensor[0]), [0.3, 0, 0])
     assert narrowed.source["read_options"] == {"min_range": 0.5, "max_range": 5.0, "laser_x": 0.3}
+
+
+def with_images():
+    """A recording with three pictures of two cameras: colour, depth in mm, depth in m."""
+    rng = np.random.default_rng(1)
+    pictures = [
+        rng.integers(0, 256, (6, 8, 3), np.uint8),
+        rng.integers(0, 65536, (4, 5), np.uint16),
+        rng.random((4, 5), np.float32),
+    ]
+    K, T = np.diag([500.0, 500, 1]), np.eye(4)
+    T[0, 3] = 0.1
+    cameras = (
+        Camera("front", 8, 6, K, "plumb_bob", np.array([0.1, 0.2]), T),
+        Camera("depth", 5, 4, None, "", np.zeros(0), None),
+    )
+    stamp_ns = np.array([5, 6, 2**60], np.int64)
+    images = Images(stamp_ns, np.array([0, 1, 1], np.int32), cameras, pictures.__getitem__)
+    return replace(made(3), images=images), pictures
+
+
+def test_pictures(tmp_path):
+    recording, pictures = with_images()
+    write(recording, tmp_path / "rec")
+    found = read(tmp_path / "rec")
+    require_same(found, recording)
+    np.testing.assert_array_equal(found.images.stamp_ns, recording.images.stamp_ns)
+    np.testing.assert_array_equal(found.images.camera, recording.images.camera)
+    for i, picture in enumerate(pictures):
+        again = found.images.read(i)
+        assert again.dtype == picture.dtype
+        np.testing.assert_array_equal(again, picture)
+    for camera, wanted in zip(found.images.cameras, recording.images.cameras, strict=True):
+        assert str(camera) == str(wanted)
+    write(found, tmp_path / "again")
+    for file in (tmp_path / "rec" / "images").iterdir():
+        assert (tmp_path / "again" / "images" / file.name).read_bytes() == file.read_bytes()
+    (tmp_path / "rec/images/000000.png").write_bytes(b"nothing")
+    (tmp_path / "rec/images/000002.npy").write_bytes(b"nothing")
+    for i in (0, 2):
+        with pytest.raises(InputError, match=f"00000{i}"):
+            read(tmp_path / "rec").images.read(i)
+
+
+def test_pictures_that_cannot_be_read_are_left_out(tmp_path):
+    recording, pictures = with_images()
+
+    def load(image):
+        if image == 1:
+            raise InputError("is no picture", where="1.png")
+        return pictures[image]
+
+    write(replace(recording, images=replace(recording.images, load=load)), tmp_path / "rec")
+    found = read(tmp_path / "rec")
+    assert found.images.stamp_ns.tolist() == [5, 2**60]
+    np.testing.assert_array_equal(found.images.read(1), pictures[2])
+    assert found.source["warnings"] == ["1 pictures left out: 1.png: is no picture"]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"images": 2},
+        {"images": -1},
+        {"images": "x"},
+        {"cameras": None},
+        {"cameras": []},
+        {"cameras": [5, 6]},
+        {"cameras": [{"name": "a"}] * 2},
+    ],
+)
+def test_headers_that_lie_about_pictures(tmp_path, changed):
+    write(with_images()[0], tmp_path / "rec")
+    file = tmp_path / "rec" / "recording.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changed))
+    with pytest.raises(InputError):
+        read(tmp_path / "rec")

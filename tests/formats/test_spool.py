@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillmap.recording import spool
+from stillmap.recording import gathering, spool
 from stillmap.recording.gathering import Gathered
 from stillmap.recording.options import ReadOptions
 
@@ -63,7 +63,9 @@ def test_a_full_disk_is_an_error(monkeypatch):
             spool.Column(np.float32).append(np.ones(3))
 
 
-def test_scans_are_put_in_order(limit, tmp_path, rng):  # noqa: ARG001
+@pytest.mark.parametrize("block", [4, 1 << 20])
+def test_scans_are_put_in_order(limit, tmp_path, rng, monkeypatch, block):  # noqa: ARG001
+    monkeypatch.setattr(gathering, "_BLOCK", block)
     scans = [rng.normal(size=(n, 3)).astype(np.float32) for n in (4, 0, 9)]
     gathered = Gathered(3, ReadOptions(), beam_times=True, folder=tmp_path)
     for stamp, points in zip((30, 10, 20), scans, strict=True):

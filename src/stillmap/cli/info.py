@@ -26,7 +26,7 @@ def add_parser(subparsers: Any) -> None:
         "odometry, and what is damaged. What was found out from the readings is marked so.",
         epilog=_EPILOG,
     )
-    parser.add_argument("input", metavar="INPUT", help="a log file, a bag or a recording folder")
+    parser.add_argument("input", metavar="INPUT", help="a file or folder with a recording")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     add_read_flags(parser)
     parser.set_defaults(run=run)
@@ -78,6 +78,7 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
         first, last = found["beam_times_s"]
         yield _row("beam times", f"{first:g} to {last:g} s after a scan's stamp")
     yield from _odometry(found["odometry"])
+    yield from _more(found)
     if found["base_frame"] is not None:
         yield _row("robot's frame", f"{found['base_frame']} ({found['base_frame_how']})")
     for sensor in found["sensors"]:
@@ -86,7 +87,9 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
 
 
 def _time(time: dict[str, Any]) -> Iterator[str]:
-    first, last = (_seconds(time[key]) for key in ("first_stamp_ns", "last_stamp_ns"))
+    from stillmap.recording.stamps import seconds_text
+
+    first, last = (seconds_text(time[key]) for key in ("first_stamp_ns", "last_stamp_ns"))
     rate = f", {time['rate_hz']:.2f} scans/s" if time["rate_hz"] else ""
     gap = f", largest gap {time['largest_gap_s']:.2f} s" if time["largest_gap_s"] else ""
     yield _row("duration", f"{time['duration_s']:.2f} s{rate}{gap}")
@@ -102,13 +105,30 @@ def _odometry(odometry: dict[str, Any] | None) -> Iterator[str]:
         "odometry",
         f"path {odometry['path_length_m']:.2f} m, turned {odometry['turned_deg']:.0f} deg{origin}",
     )
+    from stillmap.recording.stamps import seconds_text
+
     at = odometry["largest_step_at_ns"]
     if at is not None:
         yield _row(
             "largest step",
-            f"{odometry['largest_step_m']:.3f} m (after {_seconds(at)}), "
+            f"{odometry['largest_step_m']:.3f} m (after {seconds_text(at)}), "
             f"{odometry['largest_step_deg']:.1f} deg",
         )
+
+
+def _more(found: dict[str, Any]) -> Iterator[str]:
+    """Poses and pictures, where there are any."""
+    way, images = found["recorded_poses"], found["images"]
+    if way is not None:
+        text = f"path {way['path_length_m']:.2f} m, turned {way['turned_deg']:.0f} deg"
+        yield _row("recorded poses", f"{text}: used with --poses recording")
+    if images is None:
+        return
+    yield _row("pictures", str(images["count"]))
+    for camera in images["cameras"]:
+        known = [word for word in ("calibrated", "placed") if camera[word]]
+        size = f"{camera['count']} of {camera['width']} x {camera['height']} pixels"
+        yield _row("  camera", f"{camera['name']}, {size}, {' and '.join(known) or 'uncalibrated'}")
 
 
 def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
@@ -156,7 +176,7 @@ def _notes(found: dict[str, Any]) -> Iterator[str]:
             yield _row("topic", text)
     for what in found["duplicates"]:
         yield _row("left out", what)
-    numbered = found["numbered_by"] or "line"
+    numbered = found["skipped_unit"]
     kinds = (
         ("skipped", "skipped scans", numbered),
         ("skipped_odometry", "skipped odometry", numbered),
@@ -173,8 +193,3 @@ def _notes(found: dict[str, Any]) -> Iterator[str]:
 
 def _row(title: str, text: str) -> str:
     return f"{title:<16}  {text}"
-
-
-def _seconds(stamp_ns: int) -> str:
-    sign = "-" if stamp_ns < 0 else ""
-    return f"{sign}{abs(stamp_ns) // 10**9}.{abs(stamp_ns) % 10**9:09d}"

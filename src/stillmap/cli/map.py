@@ -15,6 +15,9 @@ from stillmap.cli.reading import add_read_flags, read_changes
 from stillmap.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from stillmap.recording import Recording
     from stillmap.result import Result
 
@@ -41,7 +44,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     p.add_argument(
         "input",
         metavar="INPUT",
-        help="a CARMEN log, a ROS bag or a stillmap recording folder, see docs/input.md",
+        help="a CARMEN log, a ROS bag, a stillmap recording folder, ...: see docs/input.md",
     )
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="where the result goes")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
@@ -64,7 +67,11 @@ def _add_method_flags(p: argparse._ArgumentGroup) -> None:
         choices=("stillmap", "paper", "hit-ratio", "tracker"),
         help="what says which beams are static (default: stillmap)",
     )
-    p.add_argument("--poses", metavar="FILE.tum", help="keep these poses, estimate the rest")
+    p.add_argument(
+        "--poses",
+        metavar="FILE.tum",
+        help="keep these poses, estimate the rest; `recording`: those that the recording states",
+    )
     p.add_argument("--no-odometry", action="store_true", help="ignore odometry in the recording")
 
 
@@ -90,7 +97,6 @@ def run(args: argparse.Namespace) -> int:
     from stillmap import em
     from stillmap.output.atomic import require_new
     from stillmap.recording import read
-    from stillmap.recording.poses import poses_from_tum
     from stillmap.result import build
     from stillmap.stages import Stages
 
@@ -102,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
     with stages.measure("read"):
         recording = read(Path(args.input), options.read)
     recording = _usable(recording, args)
-    poses = poses_from_tum(Path(args.poses), recording) if args.poses else None
+    poses = _given_poses(recording, args)
     with shown_progress(args.quiet, em.iterations(options.estimator, options.em)) as progress:
         result = build(recording, options, poses=poses, progress=progress, stages=stages)
     result.save(output, overwrite=args.overwrite)
@@ -111,6 +117,22 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(_summary(output))
     return 0
+
+
+def _given_poses(recording: "Recording", args: argparse.Namespace) -> "NDArray[np.float64] | None":
+    from stillmap.recording.poses import poses_from_tum
+
+    if not args.poses:
+        return None
+    if args.poses != "recording":
+        return poses_from_tum(Path(args.poses), recording)
+    if recording.T_recorded_base is None:
+        raise InputError(
+            "states no poses",
+            where=args.input,
+            hint="--poses FILE.tum gives them; a file of the name `recording` is ./recording",
+        )
+    return recording.T_recorded_base
 
 
 def _require_writable(output: Path) -> None:

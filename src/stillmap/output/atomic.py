@@ -32,7 +32,9 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
     Raises:
         InputError: something is there that is not to be replaced, or there is no such folder.
     """
-    if path.exists() and not (overwrite and path.is_file()):
+    if path.is_dir():
+        raise InputError("is in the way: a folder", where=str(path))
+    if path.exists() and not overwrite:
         raise InputError(
             "is there already", where=str(path), hint="choose another or give --overwrite"
         )

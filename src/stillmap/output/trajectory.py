@@ -8,7 +8,7 @@ import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.errors import InputError
-from stillmap.recording.stamps import seconds
+from stillmap.recording.stamps import seconds_text
 
 _COLUMNS = "stamp x y z qx qy qz qw"
 # a quaternion printed with three decimals still lies well within this of length one
@@ -27,7 +27,7 @@ def write_tum(path: Path, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64
     rows = np.round(_rows_of(poses), 9) + 0.0
     with path.open("w", encoding="ascii", newline="\n") as file:
         for stamp, row in zip(stamp_ns.tolist(), rows.tolist(), strict=True):
-            file.write(f"{seconds(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
+            file.write(f"{seconds_text(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
 
 
 def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -17,7 +17,7 @@ from stillmap.recording.extrinsics import is_told_by_lines
 from stillmap.recording.lines import is_gzip_name, opened_to_write
 from stillmap.recording.model import Recording
 from stillmap.recording.ranges import FREQUENT_ZEROS
-from stillmap.recording.stamps import seconds
+from stillmap.recording.stamps import seconds_text
 
 NO_RETURN = 81.83  # m, what a SICK LMS reports when nothing comes back
 # line of the first and the second laser: over half a circle; with angles; with angles, no poses
@@ -100,10 +100,10 @@ def lines(recording: Recording, form: Form) -> Iterator[str]:
         return
     first = int(recording.stamp_ns[0])
     for name, value in form.params.items():
-        yield f"PARAM {name} {value} {seconds(first)} {form.host} {seconds(0)}\n"
+        yield f"PARAM {name} {value} {seconds_text(first)} {form.host} {seconds_text(0)}\n"
     base, laser = _poses(recording)
     for t, stamp in enumerate(recording.stamp_ns.tolist()):
-        times = f"{seconds(stamp)} {form.host} {seconds(stamp - first)}\n"
+        times = f"{seconds_text(stamp)} {form.host} {seconds_text(stamp - first)}\n"
         if base is not None:
             yield f"ODOM {_pose(base[t])} 0 0 0 {times}"
         its = form.lasers[recording.sensor[t]]

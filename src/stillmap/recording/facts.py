@@ -1,20 +1,24 @@
 """What is in a recording, in numbers."""
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import se2
+from stillmap.recording.images import Images
 from stillmap.recording.model import Recording
 from stillmap.recording.ranges import RangeRule
 
 _CHUNK = 1 << 20  # beams looked at together
+_SAMPLED = 1 << 24  # beams of which quantiles are taken; of more than that, of as many
+_FEW = 100  # scans that a sample needs
 _DAMAGE = ("skipped", "skipped_odometry", "damage")
 _TABLES = ("records", "ignored", "params", "read_options")
 _LISTS = ("duplicates", "warnings", "topics")
-_WORDS = ("numbered_by", "base_frame", "base_frame_how")
+_WORDS = ("base_frame", "base_frame_how")
 _SENSOR_NOTES = (
     *("name", "beams_per_scan", "start_angle", "angle_step", "extrinsics", "ranges"),
     *("upside_down", "upside_down_how", "frame"),
@@ -25,7 +29,6 @@ _RULE = {field.name for field in dataclasses.fields(RangeRule)}
 def facts(recording: Recording) -> dict[str, Any]:
     """Everything that `stillmap info` shows, JSON-able: metres, seconds, degrees."""
     source = _notes(recording.source)
-    length = _lengths(recording)
     beams = np.diff(recording.offset)
     return {
         "path": source.get("path"),
@@ -34,13 +37,15 @@ def facts(recording: Recording) -> dict[str, Any]:
         "scans": recording.n_scans,
         "beams": recording.n_beams,
         "beams_per_scan": _spread(beams, ("min", "median", "max")),
-        "counts": _counts(recording, length),
-        "hit_ranges_m": _spread(length[recording.hit], ("min", "median", "p99", "max")),
+        "counts": _counts(recording),
+        "hit_ranges_m": _spread(_hit_ranges(recording), ("min", "median", "p99", "max")),
         "time": _time(recording.stamp_ns),
         "beam_times_s": _spread_of_times(recording.beam_time),
         "odometry": _odometry(recording, source["odometry"]),
+        "recorded_poses": _way(recording.T_recorded_base),
+        "images": _pictures(recording.images),
         "sensors": _sensors(recording, source["sensors"]),
-        **{key: source[key] for key in (*_DAMAGE, *_TABLES, *_LISTS, *_WORDS)},
+        **{key: source[key] for key in (*_DAMAGE, "skipped_unit", *_TABLES, *_LISTS, *_WORDS)},
     }
 
 
@@ -58,17 +63,33 @@ def _notes(source: dict[str, Any]) -> dict[str, Any]:
             and isinstance(damage.get("count"), int)
             and isinstance(damage.get("lines"), list)
         }
-    words = {key: source.get(key) for key in ("path", "format", *_WORDS)}
-    return {**notes, **{k: v if isinstance(v, str) else None for k, v in words.items()}}
+    words = {key: source.get(key) for key in ("path", "format", "skipped_unit", *_WORDS)}
+    notes.update({k: v if isinstance(v, str) else None for k, v in words.items()})
+    notes["skipped_unit"] = notes["skipped_unit"] or "line"
+    return notes
 
 
-def _lengths(recording: Recording) -> NDArray[np.float32]:
-    """(M,) ranges of all beams, NaN where unusable."""
-    out = np.empty(recording.n_beams, np.float32)
-    for start in range(0, len(out), _CHUNK):
-        chunk = slice(start, start + _CHUNK)
-        out[chunk] = np.linalg.norm(recording.points[chunk].astype(np.float64), axis=1)
-    return out
+def _hit_ranges(recording: Recording) -> NDArray[np.float32]:
+    """Ranges of the hits; of huge recordings, of evenly spaced scans only."""
+    step = -(-recording.n_beams // _SAMPLED)
+    parts = [np.empty(0, np.float32)]
+    for beams in _chunks(recording) if step <= 1 else _scans(recording, step):
+        points = recording.points[beams][recording.hit[beams]]
+        parts.append(np.linalg.norm(points.astype(np.float64), axis=1).astype(np.float32))
+    return np.concatenate(parts)
+
+
+def _chunks(recording: Recording) -> Iterator[slice]:
+    for start in range(0, recording.n_beams, _CHUNK):
+        yield slice(start, start + _CHUNK)
+
+
+def _scans(recording: Recording, step: int) -> Iterator[slice]:
+    """Every so many scans; of the scans every so many beams where they are few and large."""
+    every = step if recording.n_scans >= _FEW * step else 1
+    for scan in range(0, recording.n_scans, every):
+        beams = recording.beams_of(scan)
+        yield slice(beams.start, beams.stop, step // every)
 
 
 def _spread(values: NDArray[Any], wanted: tuple[str, ...]) -> dict[str, float] | None:
@@ -80,9 +101,12 @@ def _spread(values: NDArray[Any], wanted: tuple[str, ...]) -> dict[str, float] |
     return {name: round(float(value), 4) for name, value in zip(wanted, found, strict=True)}
 
 
-def _counts(recording: Recording, length: NDArray[np.float32]) -> dict[str, Any]:
+def _counts(recording: Recording) -> dict[str, Any]:
     hits = int(np.count_nonzero(recording.hit))
-    unusable = int(np.count_nonzero(np.isnan(length)))
+    unusable = sum(
+        int(np.count_nonzero(np.isnan(recording.points[chunk]).any(axis=1)))
+        for chunk in _chunks(recording)
+    )
     counts = {
         "hits": hits,
         "max_range": recording.n_beams - hits - unusable,
@@ -119,12 +143,7 @@ def _odometry(recording: Recording, noted: dict[str, Any]) -> dict[str, Any] | N
     if T is None:
         return None
     found = {key: noted[key] for key in ("from", "outside") if noted.get(key) is not None}
-    step = se2.inverse(T[:-1]) @ T[1:]
-    metres = np.linalg.norm(step[:, :-1, -1], axis=1)
-    # the angle of a rotation in any dimension follows from its trace
-    trace = np.trace(step[:, :-1, :-1], axis1=1, axis2=2)
-    cosine = trace / 2.0 if recording.dimension == 2 else (trace - 1.0) / 2.0
-    degrees = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    metres, degrees = _steps(T)
     at = int(metres.argmax()) if len(metres) else 0
     return {
         **found,
@@ -133,6 +152,43 @@ def _odometry(recording: Recording, noted: dict[str, Any]) -> dict[str, Any] | N
         "largest_step_m": float(metres.max(initial=0.0)),
         "largest_step_deg": float(degrees.max(initial=0.0)),
         "largest_step_at_ns": int(recording.stamp_ns[at]) if len(metres) else None,
+    }
+
+
+def _steps(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(T-1,) metres and degrees from pose to pose."""
+    step = se2.inverse(T[:-1]) @ T[1:]
+    # the angle of a rotation in any dimension follows from its trace
+    trace = np.trace(step[:, :-1, :-1], axis1=1, axis2=2)
+    cosine = trace / 2.0 if T.shape[-1] == 3 else (trace - 1.0) / 2.0
+    metres = np.linalg.norm(step[:, :-1, -1], axis=1)
+    return metres, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def _way(T: NDArray[np.float64] | None) -> dict[str, Any] | None:
+    if T is None:
+        return None
+    metres, degrees = _steps(T)
+    return {"path_length_m": float(metres.sum()), "turned_deg": float(degrees.sum())}
+
+
+def _pictures(images: Images | None) -> dict[str, Any] | None:
+    if images is None:
+        return None
+    taken = np.bincount(images.camera, minlength=len(images.cameras))
+    return {
+        "count": len(images),
+        "cameras": [
+            {
+                "name": camera.name,
+                "count": int(n),
+                "width": camera.width,
+                "height": camera.height,
+                "calibrated": camera.K is not None,
+                "placed": camera.T_base_camera is not None,
+            }
+            for camera, n in zip(images.cameras, taken, strict=True)
+        ],
     }
 
 

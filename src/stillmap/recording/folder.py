@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
+from stillmap.recording import folder_images
+from stillmap.recording.images import Images
 from stillmap.recording.model import Recording
 
 HEADER = "recording.json"
@@ -31,6 +33,10 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
 
 def write_into(recording: Recording, folder: Path) -> None:
     """The files of a recording into an existing folder, for writers that add files of their own."""
+    pictures: dict[str, Any] = {}
+    warnings: list[str] = []
+    if recording.images is not None:
+        pictures, warnings = folder_images.write(recording.images, folder)
     header = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -40,15 +46,21 @@ def write_into(recording: Recording, folder: Path) -> None:
         "sensors": len(recording.T_base_sensor),
         "odometry": recording.T_odom_base is not None,
         "beam_times": recording.beam_time is not None,
-        "source": recording.source,
+        "recorded_poses": recording.T_recorded_base is not None,
+        **pictures,
+        "source": _with_warnings(recording.source, warnings),
     }
     text = json.dumps(header, indent=1, allow_nan=False)
     for name in ("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"):
         np.save(folder / f"{name}.npy", getattr(recording, name), allow_pickle=False)
-    for name in ("T_odom_base", "beam_time"):
+    for name in ("T_odom_base", "beam_time", "T_recorded_base"):
         if getattr(recording, name) is not None:
             np.save(folder / f"{name}.npy", getattr(recording, name), allow_pickle=False)
     (folder / HEADER).write_text(text + "\n", encoding="utf-8")
+
+
+def _with_warnings(source: dict[str, Any], warnings: list[str]) -> dict[str, Any]:
+    return {**source, "warnings": [*source.get("warnings", []), *warnings]} if warnings else source
 
 
 def read(path: Path) -> Recording:
@@ -62,10 +74,11 @@ def read(path: Path) -> Recording:
     S, D = _size(path, header, "sensors"), _size(path, header, "dimension")
     if D not in (2, 3):
         raise InputError(f"dimension must be 2 or 3, got {D}", where=str(path / HEADER))
-    T_odom_base = None
+    T_odom_base = T_recorded_base = beam_time = None
     if header.get("odometry"):
         T_odom_base = _poses(path, "T_odom_base", T, D)
-    beam_time = None
+    if header.get("recorded_poses"):
+        T_recorded_base = _poses(path, "T_recorded_base", T, D)
     if header.get("beam_times"):
         beam_time = _array(path, "beam_time", (M,), np.float32)
     stamp_ns = np.array(_array(path, "stamp_ns", (T,), np.int64))
@@ -89,9 +102,20 @@ def read(path: Path) -> Recording:
             T_odom_base=T_odom_base,
             source=source if isinstance(source, dict) else {},
             beam_time=beam_time,
+            T_recorded_base=T_recorded_base,
+            images=_images(path, header),
         )
     except ValueError as error:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
+
+
+def _images(path: Path, header: dict[str, Any]) -> Images | None:
+    if "images" not in header:
+        return None
+    N = _size(path, header, "images")
+    stamp_ns = np.array(_array(path, "image_stamp_ns", (N,), np.int64))
+    camera = np.array(_array(path, "image_camera", (N,), np.int32))
+    return folder_images.read(path, header.get("cameras"), stamp_ns, camera)
 
 
 def _no_number(text: str) -> float:

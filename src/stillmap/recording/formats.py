@@ -7,6 +7,8 @@ from typing import NamedTuple
 from stillmap.errors import InputError
 from stillmap.recording import carmen, folder, limits
 from stillmap.recording.carmen_messages import SCAN_PARSERS
+from stillmap.recording.clouds import e57, kitti, las, pcd, pcd_file, ply, uos
+from stillmap.recording.clouds.files import holds_any, is_named
 from stillmap.recording.lines import Progress, head
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
@@ -61,9 +63,32 @@ def _read_bag(
     return read_bag(path, options, progress, scratch)
 
 
+def _is_kitti(path: Path, head: bytes | None) -> bool:
+    return head is None and kitti.is_one(path)
+
+
+def _clouds(
+    name: str, endings: tuple[str, ...], is_one: Callable[[bytes], bool] | None, read: Reader
+) -> Format:
+    """A format of single files, known by their first bytes or by name, and of folders of them."""
+
+    def found(path: Path, head: bytes | None) -> bool:
+        if head is None:
+            return holds_any(path, endings)
+        return is_named(path, endings) and len(head) > 0 if is_one is None else is_one(head)
+
+    return Format(name, endings, found, read)
+
+
 FORMATS = (
     Format("stillmap recording", (folder.HEADER,), _is_folder_of_ours, _read_folder_of_ours),
     Format("ROS bag", kinds.ENDINGS, kinds.is_bag, _read_bag),
+    Format("KITTI folder", ("velodyne/", "velodyne_points/"), _is_kitti, kitti.read),
+    _clouds("PCD", pcd.ENDINGS, pcd_file.is_pcd, pcd.read),
+    _clouds("3DTK", uos.ENDINGS, None, uos.read),
+    _clouds("E57", e57.ENDINGS, lambda head: head.startswith(e57.MAGIC), e57.read),
+    _clouds("LAS", las.ENDINGS, lambda head: head.startswith(las.MAGIC), las.read),
+    _clouds("PLY", ply.ENDINGS, lambda head: head.startswith((b"ply\n", b"ply\r")), ply.read),
     Format(
         "CARMEN log",
         (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz"),

@@ -37,16 +37,16 @@ class Skipped:
     def total(self) -> int:
         return sum(self._count.values())
 
-    def summary(self, numbered: str = "line") -> str:
+    def summary(self, unit: str = "line") -> str:
         """`3 x unreadable number (line 4, 8, 15)`, the most frequent reason first.
 
         Args:
-            numbered: what the numbers count.
+            unit: what the numbers count.
         """
         parts = []
         for reason, count in sorted(self._count.items(), key=lambda item: -item[1]):
             shown = ", ".join(str(line) for line in sorted(self._lines[reason])[:3])
-            parts.append(f"{count} x {reason} ({numbered} {shown}{', ...' if count > 3 else ''})")
+            parts.append(f"{count} x {reason} ({unit} {shown}{', ...' if count > 3 else ''})")
         return "; ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:

@@ -32,8 +32,8 @@ def parse_ns(text: str) -> int:
     return int(seconds.scaleb(9).to_integral_value(ROUND_HALF_EVEN))
 
 
-def seconds(stamp_ns: int) -> str:
-    """Nanoseconds as a decimal number of seconds, exactly: what `parse_ns` reads back."""
+def seconds_text(stamp_ns: int) -> str:
+    """Seconds with nine decimals, exact."""
     whole, rest = divmod(abs(stamp_ns), 10**9)
     return f"{'-' if stamp_ns < 0 else ''}{whole}.{rest:09d}"
 

@@ -8,7 +8,6 @@ from PIL import Image
 
 from stillmap.errors import InputError
 from stillmap.recording import read
-from stillmap.recording.point_fields import beam_times
 from stillmap.recording.ros import clouds
 
 START = 1_700_000_000_000_000_000
@@ -114,11 +113,6 @@ def test_when_points_were_taken(bag, messages, rng):
         content = [("/points", START, cloud_message(messages, START, columns))]
         recording = read(bag(content, f"{name}{kind}{values[-1]:.0f}"))
         np.testing.assert_allclose(recording.beam_time, after, atol=2e-6)
-
-
-@pytest.mark.parametrize("values", [np.zeros(4), np.full(4, np.nan), np.array([0.0, 1e300, 1, 2])])
-def test_times_that_say_nothing(values):
-    assert beam_times(values, START) is None
 
 
 def test_damaged_clouds_are_counted(bag, messages, rng):

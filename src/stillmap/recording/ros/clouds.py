@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.recording.clouds import point_times
 from stillmap.recording.gathering import Gathered
 from stillmap.recording.options import ReadOptions
-from stillmap.recording.point_fields import TIME_FIELDS, beam_times
 from stillmap.recording.ros.channels import Message
 from stillmap.recording.ros.lasers import UNREADABLE
 from stillmap.recording.ros.messages import decoded, frame, stamp_ns
@@ -45,7 +45,8 @@ def cloud(message: Any) -> Cloud | str:
     end = (height - 1) * row + width * step if width and height else 0
     if end > len(message.data):
         return WRONG_SIZE
-    kept = [name for name in ("x", "y", "z", *TIME_FIELDS) if name in fields]
+    time = point_times.column_of(fields)
+    kept = [name for name in ("x", "y", "z", time) if name in fields]
     layout = {name: _layout(fields[name], bool(message.is_bigendian), step) for name in kept}
     if any(layout.get(name) is None for name in "xyz"):
         return NO_PLACES
@@ -62,9 +63,18 @@ def cloud(message: Any) -> Cloud | str:
         return Cloud(np.empty((0, 3), np.float32), None)
     values = np.ndarray((height, width), dtype, message.data, strides=(row, step)).reshape(-1)
     points = np.stack([values[name].astype(np.float32) for name in "xyz"], axis=1)
-    named = [name for name in known if name in TIME_FIELDS]
-    times = beam_times(values[named[0]], stamp_ns(message.header)) if named else None
+    times = _times(values[time], points, stamp_ns(message.header)) if time in known else None
     return Cloud(points, times)
+
+
+def _times(
+    values: NDArray[Any], points: NDArray[np.float32], stamp: int
+) -> NDArray[np.float64] | None:
+    clock = point_times.clock_of(values, None)
+    if clock is None:
+        return None
+    usable = np.asarray(np.isfinite(points).all(axis=1))
+    return point_times.since(values, usable, clock, stamp)[1]
 
 
 def _layout(field: Any, bigendian: bool, step: int) -> tuple[str, int] | None:

@@ -89,7 +89,7 @@ def _recording(
         recording = _of_lasers(found, options, scratch)
     recording.source.update(
         topics=chosen.notes,
-        numbered_by="message",
+        skipped_unit="message",
         damage=bag.damage.to_dict(),
         skipped_odometry=found.skipped_odometry.to_dict(),
     )

@@ -1,0 +1,1 @@
+"""Point clouds, in folders of many or in single files, as recordings."""

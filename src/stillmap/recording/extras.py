@@ -1,0 +1,28 @@
+"""Libraries that only some formats need."""
+
+from importlib import import_module
+from typing import Any
+
+from stillmap.errors import InputError
+
+
+class MissingExtra(InputError):
+    """A library is not there: no file at fault, and none that could be skipped for it."""
+
+
+def extra(module: str, path: object) -> Any:
+    """A module that comes with stillmap's extra `io`.
+
+    Args:
+        module: what to import.
+        path: what it is wanted for.
+
+    Raises:
+        MissingExtra: it is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        hint = "pip install 'stillmap[io]'"
+        raise MissingExtra(f"needs {package} to be read", where=str(path), hint=hint) from error
