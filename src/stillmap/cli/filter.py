@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from stillmap.cli.commands import COMMANDS
 from stillmap.cli.printing import print_json
 from stillmap.cli.progress import say
-from stillmap.cli.results import found, require_apart
+from stillmap.cli.results import Mapped, found, require_apart
 from stillmap.errors import InputError
 from stillmap.output.atomic import require_new, require_new_file
 from stillmap.recording import Recording, carmen_blanked, folder
+from stillmap.recording.formats import format_of
 
 _EPILOG = """examples:
   stillmap filter out -o clean.clf.gz
@@ -52,29 +53,49 @@ def run(args: argparse.Namespace) -> int:
     if not 0.0 <= args.below <= 1.0:
         raise InputError(f"--below wants 0 to 1, got {args.below:g}")
     mapped, output = found(Path(args.result), args.input), Path(args.output)
-    is_folder = mapped.source.is_dir() or mapped.source.name == folder.HEADER
+    form = format_of(mapped.source) if mapped.source.exists() else None
     require_apart(output, mapped.source, mapped.folder)
-    if is_folder:
-        require_new(output, args.overwrite and (output / folder.HEADER).is_file())
+    in_folder = mapped.source.is_dir() or mapped.source.name == folder.HEADER
+    if in_folder:
+        mark = "metadata.yaml" if form is not None and form.name == "ROS bag" else folder.HEADER
+        require_new(output, args.overwrite and (output / mark).is_file())
     else:
         require_new_file(output, args.overwrite)
     recording, labels = mapped.read()
     # NaN: unusable anyway
     blank = recording.hit & (labels.p_static < args.below)
-    if is_folder:
-        folder.write(_without(recording, blank), output, overwrite=args.overwrite)
-        left_out = 0
-    else:
-        left_out = carmen_blanked.write(mapped.source, output, recording, blank).left_out
+    left_out, topics = _write(mapped, output, recording, blank, args.overwrite)
     beams, hits = int(blank.sum()), int(recording.hit.sum())
     if args.json:
-        counts = {"hits": hits, "blanked": beams, "lines_left_out": left_out}
+        counts = {"hits": hits, "blanked": beams, "scans_left_out": left_out}
         print_json({"output": str(output), "input": str(mapped.source), **counts})
     if not args.quiet:
         say(f"{beams} beams blanked, {100.0 * beams / max(hits, 1):.1f} % of the hits; in {output}")
         if left_out:
-            say(f"{left_out} lines left out: of scans that were not mapped")
+            say(f"{left_out} scans left out that were not mapped")
+        for topic in topics:
+            say(f"warning: {topic} left out: the bag does not say what its messages are made of")
     return 0
+
+
+def _write(
+    mapped: Mapped, output: Path, recording: Recording, blank: NDArray[np.bool_], overwrite: bool
+) -> tuple[int, list[str]]:
+    """How many scans, and which topics, are not in what was written."""
+    form = format_of(mapped.source)
+    if form.name == "ROS bag":
+        from stillmap.recording.ros import blanked
+
+        options = mapped.read_options
+        done = blanked.write(mapped.source, output, recording, blank, options, overwrite=overwrite)
+        return done.left_out, done.topics
+    if form.name == "stillmap recording":
+        folder.write(_without(recording, blank), output, overwrite=overwrite)
+        return 0, []
+    if form.name == "CARMEN log":
+        return carmen_blanked.write(mapped.source, output, recording, blank).left_out, []
+    hint = "`stillmap convert` makes a recording of another form that can be"
+    raise InputError(f"a {form.name} cannot be written again", where=str(mapped.source), hint=hint)
 
 
 def _without(recording: Recording, blank: NDArray[np.bool_]) -> Recording:

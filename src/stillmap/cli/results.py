@@ -33,13 +33,22 @@ class Mapped:
     source: Path
     given: bool
 
+    @property
+    def read_options(self) -> ReadOptions:
+        """How its recording was read.
+
+        Raises:
+            InputError: the record does not say so.
+        """
+        return _read_options(self.record, self.folder)
+
     def read(self) -> tuple[Recording, Labels]:
         """The recording, as it was read when it was mapped, and its labels.
 
         Raises:
             InputError: one of them is not there, or they do not belong together.
         """
-        read_as = _read_options(self.record, self.folder)
+        read_as = self.read_options
         if not self.given and not self.source.exists():
             hint = "that is where it was when it was mapped: name it with --input"
             raise InputError("does not exist", where=str(self.source), hint=hint)

@@ -4,9 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from stillmap.errors import InputError
 from stillmap.output.atomic import require_new, require_new_file
 from stillmap.recording import carmen_writing, folder, ros_writing
+from stillmap.recording.clouds import kitti, las, pcd, ply
 from stillmap.recording.model import Recording
 
 # of a recording, to a path, whether what is there is replaced: what could not be said
@@ -16,6 +19,9 @@ Write = Callable[[Recording, Path, bool], list[str]]
 _OPTIONAL = {"images": "pictures", "T_recorded_base": "poses that the recording states"}
 
 
+_POSES = ("T_recorded_base",)
+
+
 class Writer(NamedTuple):
     """A format.
 
@@ -23,7 +29,7 @@ class Writer(NamedTuple):
         name: what it is called on the command line.
         about: for people.
         endings: of names of such files, in small letters; () for folders.
-        mark: a file that every such folder holds; "" for files.
+        mark: name, or pattern of names, of a file that every such folder holds; "" for files.
         write: writes a recording; it appears whole or not at all.
         holds: which of `_OPTIONAL` it writes.
     """
@@ -52,8 +58,45 @@ def _ros(kind: ros_writing.Kind) -> Write:
     return write
 
 
+def _in_folder(write: Callable[..., None]) -> Write:
+    def written(recording: Recording, path: Path, overwrite: bool) -> list[str]:
+        write(recording, path, overwrite=overwrite)
+        return _not_hits(recording)
+
+    return written
+
+
+def _as_cloud(write: Callable[..., None]) -> Write:
+    """All scans as one cloud, by the poses that the recording has."""
+
+    def written(recording: Recording, path: Path, overwrite: bool) -> list[str]:
+        T, lost = recording.T_recorded_base, []
+        if T is None:
+            T, lost = recording.T_odom_base, ["the cloud is placed by odometry: maps are better"]
+        if T is None:
+            D = recording.dimension
+            T = np.tile(np.eye(D + 1), (recording.n_scans, 1, 1))
+            lost = ["there are no poses: all scans lie at one place"] if len(T) > 1 else []
+        write(recording, path, T, overwrite=overwrite)
+        return [*lost, *_not_hits(recording)]
+
+    return written
+
+
+def _not_hits(recording: Recording) -> list[str]:
+    n = recording.n_beams - int(np.count_nonzero(recording.hit))
+    return [f"{n} beams that hit nothing are left out"] if n else []
+
+
 WRITERS = (
-    Writer("stillmap", "a recording folder", (), folder.HEADER, _write_folder),
+    Writer(
+        "stillmap",
+        "a recording folder",
+        (),
+        folder.HEADER,
+        _write_folder,
+        ("images", "T_recorded_base"),
+    ),
     Writer("ros2", "a ROS 2 bag folder", (), "metadata.yaml", _ros("ros2")),
     Writer(
         "carmen",
@@ -65,6 +108,10 @@ WRITERS = (
     Writer("bag", "a ROS 1 bag", (".bag",), "", _ros("bag")),
     Writer("db3", "a ROS 2 bag file", (".db3",), "", _ros("db3")),
     Writer("mcap", "an MCAP file", (".mcap",), "", _ros("mcap")),
+    Writer("kitti", "a KITTI folder", (), "times.txt", _in_folder(kitti.write), _POSES),
+    Writer("pcd", "a folder of PCD files", (), "*.pcd", _in_folder(pcd.write), _POSES),
+    Writer("ply", "a PLY file", (".ply",), "", _as_cloud(ply.write), _POSES),
+    Writer("las", "a LAS file", (".las", ".laz"), "", _as_cloud(las.write), _POSES),
 )
 
 
@@ -119,7 +166,7 @@ def require_free(path: Path, writer: Writer, overwrite: bool) -> None:
         InputError: there is something, of another kind or not to be replaced.
     """
     if writer.mark:
-        require_new(path, overwrite and (path / writer.mark).is_file())
+        require_new(path, overwrite and any(path.glob(writer.mark)))
     else:
         require_new_file(path, overwrite)
 

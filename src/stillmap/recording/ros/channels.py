@@ -20,6 +20,8 @@ class Channel(NamedTuple):
         encoding: `ros1` or `cdr`.
         n_messages: how many there are.
         digest: of the type's definition, "" where the bag has none.
+        definition: of the type in words, "" where the bag has none.
+        latched: whether who listens late still gets the last message.
     """
 
     id: int
@@ -28,6 +30,8 @@ class Channel(NamedTuple):
     encoding: str
     n_messages: int
     digest: str
+    definition: str = ""
+    latched: bool = False
 
 
 class Message(NamedTuple):

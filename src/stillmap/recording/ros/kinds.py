@@ -1,8 +1,11 @@
 """Which files and folders are bags: shown by their first bytes and names, without reading them."""
 
 from pathlib import Path
+from typing import Literal
 
 from stillmap.errors import InputError
+
+Kind = Literal["bag", "ros2", "db3", "mcap"]
 
 BAG1_MAGIC = b"#ROSBAG V"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -16,6 +19,19 @@ def is_bag(path: Path, start: bytes | None) -> bool:
     if start is None:
         return bool(storage_files(path))
     return start.startswith((BAG1_MAGIC, MCAP_MAGIC, DB3_MAGIC)) or is_packed(path, start)
+
+
+def own_form(path: Path) -> tuple[Kind, bool]:
+    """What kind of bag a path is, and whether MCAP files are in it."""
+    if path.is_dir():
+        return "ros2", any(".mcap" in file.name for file in storage_files(path))
+    with path.open("rb") as file:
+        start = file.read(len(DB3_MAGIC))
+    if start.startswith(BAG1_MAGIC):
+        return "bag", False
+    return (
+        ("mcap", True) if ".mcap" in path.name or start.startswith(MCAP_MAGIC) else ("db3", False)
+    )
 
 
 def storage_files(folder: Path) -> list[Path]:

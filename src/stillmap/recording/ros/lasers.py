@@ -129,6 +129,7 @@ class LaserScans:
             self.frame,
             self.kind,
             stamps[keep],
+            number[keep],
             start[keep],
             shape[keep],
             shapes,
@@ -149,6 +150,7 @@ class Scans(NamedTuple):
     Attributes:
         topic, frame, kind: see LaserScans.
         stamp_ns: (T,) int64.
+        number: (T,) int64, which message on the topic each was, from 1.
         start: (T,) int64, where the readings of each begin in `ranges`.
         shape: (T,) int32 into `shapes`.
         shapes: what scans share.
@@ -160,6 +162,7 @@ class Scans(NamedTuple):
     frame: str
     kind: str
     stamp_ns: NDArray[np.int64]
+    number: NDArray[np.int64]
     start: NDArray[np.int64]
     shape: NDArray[np.int32]
     shapes: list[Shape]

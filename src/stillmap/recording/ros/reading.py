@@ -70,6 +70,23 @@ def read(
     raise InputError(f"is damaged: {damaged}", where=str(path))
 
 
+def origins(bag: Bag, options: ReadOptions, scratch: Path | None) -> list[tuple[str, int]]:
+    """(T,) the topic and the number of the message, from 1, that each scan of a bag is.
+
+    Raises:
+        DamagedError: the bag is not whole.
+        InputError: it holds no usable scan.
+    """
+    chosen = chosen_topics(bag, options)
+    if chosen.clouds:
+        raise InputError("holds point clouds: beams of laser scans alone can be blanked")
+    found = content(bag, chosen, options, None, scratch)
+    used = _used(found, options)[0]
+    stamps = np.concatenate([scans.stamp_ns for scans in used])
+    all_of_them = [(scans.topic, int(number)) for scans in used for number in scans.number]
+    return [all_of_them[scan] for scan in np.argsort(stamps, kind="stable")]
+
+
 def _recording(
     bag: Bag,
     options: ReadOptions,
@@ -97,16 +114,7 @@ def _recording(
 
 
 def _of_lasers(found: Content, options: ReadOptions, scratch: Path | None) -> Recording:
-    lasers, skipped = found.lasers.finished()
-    if not lasers:
-        total = Skipped().merged(*skipped.values())
-        raise InputError(f"holds no usable laser scan: {total.summary('message')}")
-    used, left_out = chosen_lasers(lasers, options.topic is not None)
-    where = base.base_frame(found.transforms, [s.frame for s in used], found.odometry, options)
-    asked = [(s.frame, s.stamp_ns) for s in used]
-    placed = base.places(found.transforms, where, asked)
-    used, T, more = _connected(used, placed, given=options.base_frame is not None)
-    left_out += more
+    used, T, placed, skipped, left_out = _used(found, options)
     options.require_lasers(len(used))
     warnings = [w for s in used for w in s.warnings] + base.words(placed)
     T_base_sensor, sensor, mirrored, infos, more = _sensors(used, T, placed, options)
@@ -143,6 +151,24 @@ def _of_lasers(found: Content, options: ReadOptions, scratch: Path | None) -> Re
             "warnings": warnings,
         },
     )
+
+
+def _used(
+    found: Content, options: ReadOptions
+) -> tuple[list[Scans], list[NDArray[np.float64]], base.Places, dict[str, Skipped], list[str]]:
+    """The lasers to use, T_base_sensor at their scans, the robot's frame, what was skipped by
+    topic, and words on the lasers that are left out."""
+    lasers, skipped = found.lasers.finished()
+    if not lasers:
+        total = Skipped().merged(*skipped.values())
+        raise InputError(f"holds no usable laser scan: {total.summary('message')}")
+    used, left_out = chosen_lasers(lasers, options.topic is not None)
+    where = base.base_frame(found.transforms, [s.frame for s in used], found.odometry, options)
+    asked = [(s.frame, s.stamp_ns) for s in used]
+    placed = base.places(found.transforms, where, asked)
+    used, T, more = _connected(used, placed, given=options.base_frame is not None)
+    left_out += more
+    return used, T, placed, skipped, left_out
 
 
 def _connected(

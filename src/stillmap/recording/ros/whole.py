@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from rosbags.interfaces import ConnectionExtRosbag2
+from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinitionFormat, QosDurability
 from rosbags.rosbag1 import reader as rosbag1
 from rosbags.rosbag2 import storage_mcap
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
@@ -91,8 +91,15 @@ def open_db3(path: Path) -> WholeBag:
 
 
 def _channel(connection: Any) -> Channel:
-    of_ros2 = isinstance(connection.ext, ConnectionExtRosbag2)
-    encoding = connection.ext.serialization_format if of_ros2 else "ros1"
+    ext = connection.ext
+    if isinstance(ext, ConnectionExtRosbag2):
+        encoding = ext.serialization_format
+        latched = any(
+            q.durability == QosDurability.TRANSIENT_LOCAL for q in ext.offered_qos_profiles
+        )
+    else:
+        encoding, latched = "ros1", bool(ext.latching)
+    in_words = connection.msgdef.format == MessageDefinitionFormat.MSG
     return Channel(
         connection.id,
         connection.topic,
@@ -100,4 +107,6 @@ def _channel(connection: Any) -> Channel:
         encoding,
         connection.msgcount,
         connection.digest,
+        connection.msgdef.data if in_words else "",
+        latched,
     )

@@ -22,8 +22,9 @@ from rosbags.typesys.store import Typestore
 
 from stillmap.errors import InputError
 from stillmap.output.atomic import new_file, new_folder
+from stillmap.recording.ros.channels import Channel
+from stillmap.recording.ros.kinds import Kind
 
-Kind = Literal["bag", "ros2", "db3", "mcap"]
 Send = Callable[[int, Any], None]
 
 # the oldest form that says what its messages are made of: ROS 2 before Jazzy reads no newer one
@@ -67,6 +68,33 @@ class Bag:
             return self._topic1(self._writer, name, type, latched)
         return self._topic2(self._writer, name, type, latched)
 
+    def copied_topic(self, channel: Channel) -> Callable[[int, bytes], None] | None:
+        """A topic like one of another bag: a function that sends bytes at a time in nanoseconds.
+
+        None where nobody knows what its messages are made of.
+        """
+        digest = channel.digest or _digest(channel)
+        if not (channel.definition and digest) and channel.type not in self._store.fielddefs:
+            return None
+        hashed = "md5sum" if isinstance(self._writer, rosbag1.Writer) else "rihs01"
+        about: dict[str, Any] = (
+            {"msgdef": channel.definition, hashed: digest}
+            if channel.definition and digest
+            else {"typestore": self._store}
+        )
+        if isinstance(self._writer, rosbag1.Writer):
+            about |= {"callerid": "/stillmap", "latching": int(channel.latched)}
+        else:
+            about |= {"offered_qos_profiles": [_TRANSIENT] if channel.latched else []}
+        connection = self._writer.add_connection(channel.topic, channel.type, **about)
+        writer = self._writer
+        return lambda stamp, raw: writer.write(connection, stamp, raw)
+
+    def serialized(self, message: Any, type: str) -> bytes:
+        """A message as the bytes of this kind of bag."""
+        pack = self._store.serialize_ros1 if self.is_ros1 else self._store.serialize_cdr
+        return bytes(pack(message, type))
+
     def make(self, type: str, /, **fields: Any) -> Any:
         """A message or a part of one."""
         return self._store.types[type](**fields)
@@ -102,14 +130,29 @@ class Bag:
         return lambda stamp, message: writer.write(connection, stamp, serialize(message, type))
 
 
+def _digest(channel: Channel) -> str:
+    """The hash of a ROS 2 type from its definition; "" where that cannot be understood."""
+    if channel.encoding == "ros1" or not channel.definition:
+        return ""
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(channel.definition, channel.type))
+        return store.hash_rihs01(channel.type)
+    except Exception:  # whatever the library makes of a text that is no definition
+        return ""
+
+
 @contextmanager
-def new_bag(path: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Bag]:
+def new_bag(
+    path: Path, kind: Kind, *, overwrite: bool = False, mcap: bool = False
+) -> Iterator[Bag]:
     """A bag that lies at `path` once the block ends without an exception.
 
     Args:
         path: a file, or the folder of kind "ros2".
         kind: ROS 1 `bag`; `ros2`, a folder with `metadata.yaml`; its file alone: `db3` or `mcap`.
         overwrite: replace the folder that is there; a file is replaced in any case.
+        mcap: the file in a folder of kind "ros2" is an MCAP file.
 
     Raises:
         InputError: it cannot be written.
@@ -126,10 +169,11 @@ def new_bag(path: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Bag]
             return
         # a ROS 2 writer makes a folder of its own, and names its files after it
         inside = stack.enter_context(_scratch(path))
-        plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
+        mcap |= kind == "mcap"
+        plugin = rosbag2.StoragePlugin.MCAP if mcap else rosbag2.StoragePlugin.SQLITE3
         named = inside / (path.stem if kind != "ros2" else path.name)
         writer2 = rosbag2.Writer(named, version=_VERSION, storage_plugin=plugin)
-        if kind == "mcap":
+        if mcap:
             compression = rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
             writer2.set_compression(*compression)
         with _told(path), writer2:

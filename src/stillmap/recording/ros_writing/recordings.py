@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from stillmap.recording import planar
 from stillmap.recording.model import Recording
+from stillmap.recording.ros.kinds import Kind
 from stillmap.recording.ros_writing import messages
-from stillmap.recording.ros_writing.bag import Bag, Kind, new_bag, require_stamps
+from stillmap.recording.ros_writing.bag import Bag, new_bag, require_stamps
 from stillmap.recording.ros_writing.messages import BASE, ODOM
 
 Scan = Callable[[int], Any]  # the message of a scan, by its number
