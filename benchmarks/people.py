@@ -2,11 +2,11 @@
 
 python benchmarks/people.py DIR [--methods stillmap paper ...] [--set section.key=value ...]
 
-DIR holds people_N.npz: `ranges` (T, n) in metres, `label` (T, n) 1 = leg, `t` in seconds,
-`angle_min`, `angle_increment`, `range_max`. Only the walker inside a marked area is marked, so
-there is no fair precision: instead, the share of all beams that is called dynamic. "With objects":
-the share of marked beams that ended on an object, and of the scans with marks in which half of them
-did; by default 9 of 10 scans are wanted. Objects counts those that any marked beam is with.
+DIR holds people_N.bag and people_N.npz: the same scans, with `label` (T, n) 1 = leg. Only the
+walker inside a marked area is marked, so there is no fair precision: instead, the share of all beams
+that is called dynamic. "With objects": the share of marked beams that ended on an object, and of the
+scans with marks in which half of them did; by default 9 of 10 scans are wanted. Objects counts those
+that any marked beam is with.
 """
 
 import argparse
@@ -19,9 +19,7 @@ from common import add_arguments, built, options_of, outcomes
 from numpy.typing import NDArray
 from tables import grouped, markdown
 
-from stillmap.recording.model import Recording
-from stillmap.recording.options import ReadOptions
-from stillmap.recording.ranges import apply, decide
+from stillmap.recording import Recording, read
 
 WANTED_RECALL, WANTED_COVERED = 0.95, 0.9
 
@@ -68,24 +66,11 @@ def main() -> None:
 
 def recording_of(path: Path) -> tuple[Recording, NDArray[np.bool_]]:
     """The recording, and which of its beams (M,) are marked as leg."""
-    data = np.load(path)
-    ranges = data["ranges"].astype(np.float32)
-    T, n = ranges.shape
-    rule, _ = decide(ranges, float(data["range_max"]), ReadOptions())
-    length, hit = apply(ranges, rule)
-    angles = data["angle_min"] + data["angle_increment"] * np.arange(n)
-    points = length[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    recording = Recording(
-        stamp_ns=np.round(data["t"] * 1e9).astype(np.int64),
-        offset=np.arange(T + 1, dtype=np.int64) * n,
-        points=points.reshape(-1, 2).astype(np.float32),
-        hit=hit.ravel(),
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(T, np.int32),
-        T_odom_base=None,
-        source={"format": "people", "path": str(path)},
-    )
-    return recording, (data["label"] == 1).ravel()
+    leg = np.load(path)["label"] == 1
+    recording = read(path.with_suffix(".bag"))
+    if np.any(np.diff(recording.offset) != leg.shape[1]) or recording.n_scans != len(leg):
+        raise SystemExit(f"{path}: marks of other scans than those in the bag")
+    return recording, leg.ravel()
 
 
 def _found(job: Job) -> Found:
