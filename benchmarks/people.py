@@ -3,10 +3,10 @@
 python benchmarks/people.py DIR [--methods stillmap paper ...] [--set section.key=value ...]
 
 DIR holds people_N.bag and people_N.npz: the same scans, with `label` (T, n) 1 = leg. Only the
-walker inside a marked area is marked, so there is no fair precision: instead, the share of all beams
-that is called dynamic. "With objects": the share of marked beams that ended on an object, and of the
-scans with marks in which half of them did; by default 9 of 10 scans are wanted. Objects counts those
-that any marked beam is with.
+walker inside a marked area is marked, so there is no fair precision: instead, the share of all
+beams that is called dynamic. "With objects": the share of marked beams that ended on an object,
+and of the scans with marks in which half of them did; by default 9 of 10 scans are wanted.
+Objects counts those that any marked beam is with.
 """
 
 import argparse
