@@ -195,3 +195,11 @@ def test_damaged_objects(call, mapped, tmp_path, text, words):
     refused(call("convert", result, "-o", tmp_path / "a.mcap"), words)
     shutil.rmtree(result / "objects")  # --set objects.enabled=false
     assert call("convert", result, "-o", tmp_path / "a.mcap").returncode == 0
+
+
+def test_the_help_knows_every_format():
+    from stillmap.cli import convert
+    from stillmap.recording.writers import WRITERS
+
+    assert [writer.name for writer in WRITERS] == list(convert.NAMES)
+    assert sorted(e for writer in WRITERS for e in writer.endings) == sorted(convert.ENDINGS)

@@ -18,7 +18,7 @@ for words in {calls!r}:
 def test_help_version_and_completion_load_nothing_heavy(command):
     calls = [["--version"], ["--help"], ["completion", "bash"], ["map", "--help"]]
     calls += [["info", "--help"], ["simulate", "--help"], ["eval", "map", "--help"]]
-    calls += [["config", "--help"], ["view", "--help"]]
+    calls += [["config", "--help"], ["view", "--help"], ["filter", "--help"], ["convert", "--help"]]
     program = PROGRAM.format(calls=calls, heavy=HEAVY)
     done = subprocess.run([command[0], "-c", program], capture_output=True, text=True, timeout=60)
     assert done.stderr == ""

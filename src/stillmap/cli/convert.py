@@ -1,20 +1,17 @@
 """`stillmap convert`: a recording in another format, a result in the forms of other programs."""
 
 import argparse
-from pathlib import Path
-from typing import get_args
 
-from stillmap import options, slam
 from stillmap.cli.commands import COMMANDS
 from stillmap.cli.progress import say
-from stillmap.cli.reading import add_read_flags, read_changes
-from stillmap.cli.results import Mapped, found, is_result, require_apart
-from stillmap.errors import InputError
-from stillmap.export import bag, beam_table, result
-from stillmap.output.atomic import require_new_file
-from stillmap.recording import ReadOptions, Recording, read, ros_writing, writers
+from stillmap.cli.reading import add_read_flags
 
-_PARQUET = ".parquet"
+# stillmap.recording.writers has them too, and takes long to load
+ENDINGS = (
+    *(".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz"),
+    *(".bag", ".db3", ".mcap", ".ply", ".las", ".laz"),
+)
+NAMES = ("stillmap", "ros2", "carmen", "bag", "db3", "mcap", "kitti", "pcd", "ply", "las")
 _EPILOG = """examples:
   stillmap convert log.clf.gz -o log.bag      for ROS 1
   stillmap convert log.bag -o log --to ros2   a folder for ROS 2
@@ -25,20 +22,17 @@ _EPILOG = """examples:
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Adds the command."""
-    endings = ", ".join(end for writer in writers.WRITERS for end in writer.endings)
     p = commands.add_parser(
         "convert",
         help=COMMANDS["convert"],
         description="Write a recording in another format, which the ending of FILE names: "
-        f"{endings}; a folder otherwise. A result of `stillmap map` becomes a bag that shows it "
-        f"(.mcap for Foxglove) or a table of its beams ({_PARQUET}).",
+        f"{', '.join(ENDINGS)}; a folder otherwise. A result of `stillmap map` becomes a bag "
+        "that shows it (.mcap for Foxglove) or a table of its beams (.parquet).",
         epilog=_EPILOG,
     )
     p.add_argument("input", metavar="INPUT", help="a recording, or what `stillmap map` wrote")
     p.add_argument("-o", "--output", metavar="FILE", required=True, help="where it goes")
-    p.add_argument(
-        "--to", choices=[writer.name for writer in writers.WRITERS], help="the format by its name"
-    )
+    p.add_argument("--to", metavar="FORMAT", choices=NAMES, help=f"the format: {', '.join(NAMES)}")
     p.add_argument(
         "--input", dest="recording", metavar="FILE", help="a result's recording, if it was moved"
     )
@@ -54,69 +48,11 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: it cannot be read, or FILE cannot hold it.
     """
-    source, output = Path(args.input), Path(args.output)
-    if is_result(source):
-        lost, what = _convert_result(args, source, output)
-    else:
-        lost, what = _convert_recording(args, source, output)
+    from stillmap.cli.converting import converted  # takes long to load
+
+    lost, what = converted(args)
     if not args.quiet:
         for sentence in lost:
             say(f"warning: {sentence}")
-        say(f"{what}; in {output}")
+        say(f"{what}; in {args.output}")
     return 0
-
-
-def _convert_recording(
-    args: argparse.Namespace, source: Path, output: Path
-) -> tuple[list[str], str]:
-    if args.recording:
-        raise InputError("--input is for results", where=str(source))
-    read_options = options.replaced(ReadOptions(), read_changes(args).get("read", {}))
-    require_apart(output, source)
-    writer = writers.writer_for(output, args.to)
-    writers.require_free(output, writer, args.overwrite)
-    recording = read(source, read_options)
-    if not recording.n_scans:
-        raise InputError("holds no scan", where=str(source))
-    lost = writers.write(recording, output, name=args.to, overwrite=args.overwrite)
-    return lost, f"{recording.n_scans} scans, {recording.n_beams} beams as {writer.about}"
-
-
-def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tuple[list[str], str]:
-    if read_changes(args):
-        text = "a result's recording is read as it was when it was mapped: no flags for reading it"
-        raise InputError(text, where=str(folder))
-    mapped = found(folder, args.recording)
-    require_apart(output, mapped.source, folder)
-    if output.suffix.lower() == _PARQUET and args.to is None:
-        require_new_file(output, args.overwrite)
-        beam_table.require_pyarrow()
-        exported = _exported(mapped)
-        beam_table.write(exported, _seen(mapped, exported), output)
-        return [], f"{exported.recording.n_beams} beams"
-    writer = writers.writer_for(output, args.to)
-    kind = next((kind for kind in get_args(ros_writing.Kind) if kind == writer.name), None)
-    if kind is None:
-        raise InputError(
-            f"a result cannot be written as {writer.about}",
-            where=str(output),
-            hint=f"a bag, .mcap for Foxglove, or {_PARQUET}; recordings come of `stillmap filter`",
-        )
-    writers.require_free(output, writer, args.overwrite)
-    exported = _exported(mapped)
-    lost = bag.write(exported, output, kind, overwrite=args.overwrite)
-    return lost, f"{exported.recording.n_scans} scans, map, way and {len(exported.tracks)} objects"
-
-
-def _exported(mapped: Mapped) -> result.Exported:
-    recording, labels = mapped.read()
-    return result.read(mapped.folder, recording, labels.p_static)
-
-
-def _seen(mapped: Mapped, exported: result.Exported) -> Recording:
-    """The recording without the motion during its scans, as it was mapped."""
-    chosen = mapped.record.get("options")
-    section = chosen.get("slam") if isinstance(chosen, dict) else None
-    deskew = section.get("deskew") if isinstance(section, dict) else None
-    how = slam.SlamOptions(deskew=deskew is not False)
-    return slam.deskewed(exported.recording, exported.poses, how)

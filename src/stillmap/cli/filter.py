@@ -1,20 +1,12 @@
 """`stillmap filter`: the recording again, without the beams that met something moving."""
 
 import argparse
-import dataclasses
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.cli.commands import COMMANDS
 from stillmap.cli.printing import print_json
 from stillmap.cli.progress import say
-from stillmap.cli.results import Mapped, found, require_apart
 from stillmap.errors import InputError
-from stillmap.output.atomic import require_new, require_new_file
-from stillmap.recording import Recording, carmen_blanked, folder
-from stillmap.recording.formats import format_of
 
 _EPILOG = """examples:
   stillmap filter out -o clean.clf.gz
@@ -52,52 +44,18 @@ def run(args: argparse.Namespace) -> int:
     """Reads labels and recording, writes the recording without dynamic beams."""
     if not 0.0 <= args.below <= 1.0:
         raise InputError(f"--below wants 0 to 1, got {args.below:g}")
-    mapped, output = found(Path(args.result), args.input), Path(args.output)
-    form = format_of(mapped.source) if mapped.source.exists() else None
-    require_apart(output, mapped.source, mapped.folder)
-    in_folder = mapped.source.is_dir() or mapped.source.name == folder.HEADER
-    if in_folder:
-        mark = "metadata.yaml" if form is not None and form.name == "ROS bag" else folder.HEADER
-        require_new(output, args.overwrite and (output / mark).is_file())
-    else:
-        require_new_file(output, args.overwrite)
-    recording, labels = mapped.read()
-    # NaN: unusable anyway
-    blank = recording.hit & (labels.p_static < args.below)
-    left_out, topics = _write(mapped, output, recording, blank, args.overwrite)
-    beams, hits = int(blank.sum()), int(recording.hit.sum())
+    from stillmap.cli.filtering import filtered  # takes long to load
+
+    output = Path(args.output)
+    done = filtered(Path(args.result), output, args.input, args.below, args.overwrite)
     if args.json:
-        counts = {"hits": hits, "blanked": beams, "scans_left_out": left_out}
-        print_json({"output": str(output), "input": str(mapped.source), **counts})
+        counts = {"hits": done.hits, "blanked": done.blanked, "scans_left_out": done.left_out}
+        print_json({"output": str(output), "input": str(done.source), **counts})
     if not args.quiet:
-        say(f"{beams} beams blanked, {100.0 * beams / max(hits, 1):.1f} % of the hits; in {output}")
-        if left_out:
-            say(f"{left_out} scans left out that were not mapped")
-        for topic in topics:
+        share = 100.0 * done.blanked / max(done.hits, 1)
+        say(f"{done.blanked} beams blanked, {share:.1f} % of the hits; in {output}")
+        if done.left_out:
+            say(f"{done.left_out} scans left out that were not mapped")
+        for topic in done.topics:
             say(f"warning: {topic} left out: the bag does not say what its messages are made of")
     return 0
-
-
-def _write(
-    mapped: Mapped, output: Path, recording: Recording, blank: NDArray[np.bool_], overwrite: bool
-) -> tuple[int, list[str]]:
-    """How many scans, and which topics, are not in what was written."""
-    form = format_of(mapped.source)
-    if form.name == "ROS bag":
-        from stillmap.recording.ros import blanked
-
-        options = mapped.read_options
-        done = blanked.write(mapped.source, output, recording, blank, options, overwrite=overwrite)
-        return done.left_out, done.topics
-    if form.name == "stillmap recording":
-        folder.write(_without(recording, blank), output, overwrite=overwrite)
-        return 0, []
-    if form.name == "CARMEN log":
-        return carmen_blanked.write(mapped.source, output, recording, blank).left_out, []
-    hint = "`stillmap convert` makes a recording of another form that can be"
-    raise InputError(f"a {form.name} cannot be written again", where=str(mapped.source), hint=hint)
-
-
-def _without(recording: Recording, blank: NDArray[np.bool_]) -> Recording:
-    """Blanked beams went as far as they did, and met nothing."""
-    return dataclasses.replace(recording, hit=recording.hit & ~blank)

@@ -1,0 +1,83 @@
+"""What `stillmap convert` does once it is known what is wanted."""
+
+import argparse
+from pathlib import Path
+from typing import get_args
+
+from stillmap import options, slam
+from stillmap.cli.reading import read_changes
+from stillmap.cli.results import Mapped, found, is_result, require_apart
+from stillmap.errors import InputError
+from stillmap.export import bag, beam_table, result
+from stillmap.output.atomic import require_new_file
+from stillmap.recording import ReadOptions, Recording, read, ros_writing, writers
+
+_PARQUET = ".parquet"
+
+
+def converted(args: argparse.Namespace) -> tuple[list[str], str]:
+    """What could not be written, a sentence each, and what was.
+
+    Raises:
+        InputError: it cannot be read, or the output cannot hold it.
+    """
+    source, output = Path(args.input), Path(args.output)
+    if is_result(source):
+        return _convert_result(args, source, output)
+    return _convert_recording(args, source, output)
+
+
+def _convert_recording(
+    args: argparse.Namespace, source: Path, output: Path
+) -> tuple[list[str], str]:
+    if args.recording:
+        raise InputError("--input is for results", where=str(source))
+    read_options = options.replaced(ReadOptions(), read_changes(args).get("read", {}))
+    require_apart(output, source)
+    writer = writers.writer_for(output, args.to)
+    writers.require_free(output, writer, args.overwrite)
+    recording = read(source, read_options)
+    if not recording.n_scans:
+        raise InputError("holds no scan", where=str(source))
+    lost = writers.write(recording, output, name=args.to, overwrite=args.overwrite)
+    return lost, f"{recording.n_scans} scans, {recording.n_beams} beams as {writer.about}"
+
+
+def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tuple[list[str], str]:
+    if read_changes(args):
+        text = "a result's recording is read as it was when it was mapped: no flags for reading it"
+        raise InputError(text, where=str(folder))
+    mapped = found(folder, args.recording)
+    require_apart(output, mapped.source, folder)
+    if output.suffix.lower() == _PARQUET and args.to is None:
+        require_new_file(output, args.overwrite)
+        beam_table.require_pyarrow()
+        exported = _exported(mapped)
+        beam_table.write(exported, _seen(mapped, exported), output)
+        return [], f"{exported.recording.n_beams} beams"
+    writer = writers.writer_for(output, args.to)
+    kind = next((kind for kind in get_args(ros_writing.Kind) if kind == writer.name), None)
+    if kind is None:
+        raise InputError(
+            f"a result cannot be written as {writer.about}",
+            where=str(output),
+            hint=f"a bag, .mcap for Foxglove, or {_PARQUET}; recordings come of `stillmap filter`",
+        )
+    writers.require_free(output, writer, args.overwrite)
+    exported = _exported(mapped)
+    lost = bag.write(exported, output, kind, overwrite=args.overwrite)
+    return lost, f"{exported.recording.n_scans} scans, map, way and {len(exported.tracks)} objects"
+
+
+def _exported(mapped: Mapped) -> result.Exported:
+    recording, labels = mapped.read()
+    return result.read(mapped.folder, recording, labels.p_static)
+
+
+def _seen(mapped: Mapped, exported: result.Exported) -> Recording:
+    """The recording without the motion during its scans, as it was mapped."""
+    chosen = mapped.record.get("options")
+    section = chosen.get("slam") if isinstance(chosen, dict) else None
+    deskew = section.get("deskew") if isinstance(section, dict) else None
+    how = slam.SlamOptions(deskew=deskew is not False)
+    return slam.deskewed(exported.recording, exported.poses, how)

@@ -1,0 +1,82 @@
+"""What `stillmap filter` does once it is known what is wanted."""
+
+import dataclasses
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.cli.results import Mapped, found, require_apart
+from stillmap.errors import InputError
+from stillmap.output.atomic import require_new, require_new_file
+from stillmap.recording import Recording, carmen_blanked, folder
+from stillmap.recording.formats import format_of
+
+
+class Filtered(NamedTuple):
+    """What was written.
+
+    Attributes:
+        source: the recording that it was made from.
+        hits: beams of it that hit something.
+        blanked: of these.
+        left_out: scans that are not in it.
+        topics: of a bag, that are not in it.
+    """
+
+    source: Path
+    hits: int
+    blanked: int
+    left_out: int
+    topics: list[str]
+
+
+def filtered(
+    result: Path, output: Path, given: str | None, below: float, overwrite: bool
+) -> Filtered:
+    """Write the recording of a result without the beams that are static with less than `below`.
+
+    Raises:
+        InputError: the result or its recording is not there, or the output is taken.
+    """
+    mapped = found(result, given)
+    form = format_of(mapped.source) if mapped.source.exists() else None
+    require_apart(output, mapped.source, mapped.folder)
+    in_folder = mapped.source.is_dir() or mapped.source.name == folder.HEADER
+    if in_folder:
+        mark = "metadata.yaml" if form is not None and form.name == "ROS bag" else folder.HEADER
+        require_new(output, overwrite and (output / mark).is_file())
+    else:
+        require_new_file(output, overwrite)
+    recording, labels = mapped.read()
+    # NaN: unusable anyway
+    blank = recording.hit & (labels.p_static < below)
+    left_out, topics = _write(mapped, output, recording, blank, overwrite)
+    beams, hits = int(np.count_nonzero(blank)), int(np.count_nonzero(recording.hit))
+    return Filtered(mapped.source, hits, beams, left_out, topics)
+
+
+def _write(
+    mapped: Mapped, output: Path, recording: Recording, blank: NDArray[np.bool_], overwrite: bool
+) -> tuple[int, list[str]]:
+    """How many scans, and which topics, are not in what was written."""
+    form = format_of(mapped.source)
+    if form.name == "ROS bag":
+        from stillmap.recording.ros import blanked
+
+        options = mapped.read_options
+        done = blanked.write(mapped.source, output, recording, blank, options, overwrite=overwrite)
+        return done.left_out, done.topics
+    if form.name == "stillmap recording":
+        folder.write(_without(recording, blank), output, overwrite=overwrite)
+        return 0, []
+    if form.name == "CARMEN log":
+        return carmen_blanked.write(mapped.source, output, recording, blank).left_out, []
+    hint = "`stillmap convert` makes a recording of another form that can be"
+    raise InputError(f"a {form.name} cannot be written again", where=str(mapped.source), hint=hint)
+
+
+def _without(recording: Recording, blank: NDArray[np.bool_]) -> Recording:
+    """Blanked beams went as far as they did, and met nothing."""
+    return dataclasses.replace(recording, hit=recording.hit & ~blank)
