@@ -4,6 +4,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -131,6 +132,7 @@ def iterate(
     poses: Float | None = None,
     progress: Progress = silent,
     stages: Stages | None = None,
+    scratch: Path | None = None,
 ) -> Iterator[Iteration]:
     """Interleaves mapping and the estimation of what is static; the caller decides when to stop.
 
@@ -140,12 +142,16 @@ def iterate(
         poses: (T, 3, 3) T_map_base to keep instead of estimating them.
         progress: called with what is done, the iteration, and how much of how much.
         stages: where time and memory per stage are noted.
+        scratch: folder for what is known of each beam where that is too large for memory; such
+            files have no name and are gone with the process. None: the system's temporary folder.
 
     Yields:
         one Iteration after the other, `options.em.max_iterations` of them at most.
     """
     if poses is not None and poses.shape != (recording.n_scans, 3, 3):
         raise ValueError(f"poses: expected ({recording.n_scans}, 3, 3), got {poses.shape}")
+    if scratch is not None:
+        recording = dataclasses.replace(recording, scratch=scratch)
     stages = stages or Stages()
     options = resolved(options)
     threads = resolved_threads(options.threads)

@@ -108,15 +108,21 @@ def build(
     poses: Float | None = None,
     progress: Progress = pipeline.silent,
     stages: Stages | None = None,
+    scratch: Path | None = None,
 ) -> Result:
     """The main job: iterates until the bound stops improving and keeps the best iterate.
 
     Args: see `stillmap.iterate`.
+
+    Raises:
+        OSError: the disk of `scratch` is full.
     """
     if recording.dimension != 2:
         raise ValueError(f"recording: expected 2 dimensions, got {recording.dimension}")
     if recording.n_scans == 0:
         raise ValueError("recording: expected at least one scan")
+    if scratch is not None:
+        recording = dataclasses.replace(recording, scratch=scratch)
     stages = stages or Stages()
     options = pipeline.resolved(options)
     run = _Run(options)
@@ -326,8 +332,14 @@ class _Best:
 
 def _without(objects: list[MovingObject], things: NDArray[np.intp]) -> list[MovingObject]:
     """The objects that are more than what stood somewhere, which is listed as a change."""
-    moved = [one for one in objects if 2 * np.isin(one.beams, things).sum() <= len(one.beams)]
+    moved = [one for one in objects if 2 * _common(one.beams, things) <= len(one.beams)]
     return [dataclasses.replace(one, id=k) for k, one in enumerate(moved)]
+
+
+def _common(one: NDArray[np.intp], other: NDArray[np.intp]) -> int:
+    """How many numbers two rising arrays have in common."""
+    at = np.searchsorted(other, one)
+    return int(np.count_nonzero(one[at < len(other)] == other[at[at < len(other)]]))
 
 
 def _extent(grid: _core.Grid2D) -> Window:

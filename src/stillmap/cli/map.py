@@ -52,27 +52,33 @@ def run(args: argparse.Namespace) -> int:
     options = resolved_options(args, read_changes(args), _changes(args))
     output = Path(args.output)
     require_new(output, args.overwrite)
-    _require_writable(output)
+    scratch = _writable_parent(output)
     stages = Stages()
     with stages.measure("read"):
         recording = read(Path(args.input), options.read)
     recording = _usable(recording, args)
     poses = poses_from_tum(Path(args.poses), recording) if args.poses else None
     with shown_progress(args.quiet, em.iterations(options.estimator, options.em)) as progress:
-        result = build(recording, options, poses=poses, progress=progress, stages=stages)
+        result = build(
+            recording, options, poses=poses, progress=progress, stages=stages, scratch=scratch
+        )
     result.save(output, overwrite=args.overwrite)
     if not args.quiet:
         _say(result, output)
     return 0
 
 
-def _require_writable(output: Path) -> None:
-    """Refuse a place that cannot be written to before the work is done, not after."""
+def _writable_parent(output: Path) -> Path:
+    """The folder in which the result will appear, or the first of those above it that there is.
+
+    A place that cannot be written to is refused before the work is done, not after.
+    """
     parent = Path(os.path.abspath(output)).parent
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise InputError(f"cannot be written: nothing can be put into {parent}", where=str(output))
+    return parent
 
 
 def _usable(recording: Recording, args: argparse.Namespace) -> Recording:

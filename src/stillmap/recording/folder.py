@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
 from stillmap.recording.model import Recording
+from stillmap.recording.spool import blocks
 
 HEADER = "recording.json"
 FORMAT = "stillmap-recording"
 FORMAT_VERSION = 1
 
-_CHUNK = 1 << 20  # beams looked at together: points need not fit in memory
 _MAX_HEADER = 64 << 20  # bytes
 
 
@@ -164,10 +164,10 @@ def _require_offsets(path: Path, offset: NDArray[np.int64], M: int) -> None:
 
 
 def _require_finite_hits(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
-    for start in range(0, len(points), _CHUNK):
-        chunk = points[start : start + _CHUNK]
+    for block in blocks(points, hit):
+        chunk = points[block]
         usable = np.isfinite(chunk).all(axis=1)
-        if np.any(hit[start : start + _CHUNK] & ~usable) or np.any(np.isinf(chunk)):
+        if np.any(hit[block] & ~usable) or np.any(np.isinf(chunk)):
             raise _damaged(path, "points", "a hit or a maximum-range beam ends nowhere")
 
 
