@@ -2,21 +2,28 @@
 
 import argparse
 import dataclasses
+import errno
 import os
 from pathlib import Path
 from typing import Any, get_args
 
 from stillmap import em
+from stillmap.checkpoint import Damaged, Place, held, identity
 from stillmap.cli.options import add_option_flags, resolved_options
 from stillmap.cli.progress import say, shown_progress
 from stillmap.cli.reading import add_read_flags, read_changes
 from stillmap.errors import InputError
+from stillmap.loop import Loop
 from stillmap.output.atomic import require_new
 from stillmap.output.points import beam_counts
+from stillmap.output.save import save
+from stillmap.pipeline import Options, resolved
 from stillmap.recording import Recording, read
 from stillmap.recording.poses import poses_from_tum
 from stillmap.result import Result, build
 from stillmap.stages import Stages
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -29,6 +36,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="where the result goes")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
+    p.add_argument(
+        "--resume", action="store_true", help="go on where an interrupted run of the same stopped"
+    )
     p.add_argument("--paper", action="store_true", help="the method exactly as printed")
     p.add_argument(
         "--estimator", choices=get_args(em.Estimator), help="what says which beams are static"
@@ -49,36 +59,86 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 def run(args: argparse.Namespace) -> int:
     """Reads, maps, writes, says what came of it."""
-    options = resolved_options(args, read_changes(args), _changes(args))
-    output = Path(args.output)
-    require_new(output, args.overwrite)
-    scratch = _writable_parent(output)
-    stages = Stages()
-    with stages.measure("read"):
-        recording = read(Path(args.input), options.read)
-    recording = _usable(recording, args)
-    poses = poses_from_tum(Path(args.poses), recording) if args.poses else None
-    with shown_progress(args.quiet, em.iterations(options.estimator, options.em)) as progress:
-        result = build(
-            recording, options, poses=poses, progress=progress, stages=stages, scratch=scratch
-        )
-    result.save(output, overwrite=args.overwrite)
+    options = resolved(resolved_options(args, read_changes(args), _changes(args)))
+    output, replace = Path(args.output), args.overwrite or args.resume
+    require_new(output, replace)
+    _require_writable(output)
+    with held(output) as place:
+        try:
+            result = _mapped(args, options, place)
+            save(result, output, replace, within=place.folder)
+            place.forget()
+        except OSError as error:
+            if error.errno not in _FULL:
+                raise
+            raise InputError(f"cannot go on: {error.strerror}", where=str(place.folder)) from error
+        except (KeyboardInterrupt, SystemExit):
+            if place.present is not None:
+                _tell(args, f"{place.folder} keeps how far it came: --resume goes on from there")
+            raise
     if not args.quiet:
         _say(result, output)
     return 0
 
 
-def _writable_parent(output: Path) -> Path:
-    """The folder in which the result will appear, or the first of those above it that there is.
+def _mapped(args: argparse.Namespace, options: Options, place: Place) -> Result:
+    """The whole job but for writing; how far it has come is kept after every iteration."""
+    stages = Stages()
+    with stages.measure("read"):
+        recording = _usable(read(Path(args.input), options.read), args)
+        poses = poses_from_tum(Path(args.poses), recording) if args.poses else None
+        same = identity(recording, options, poses)
+    loop = _resumed(args, place, same, options, stages)
+    with shown_progress(args.quiet, em.iterations(options.estimator, options.em)) as progress:
+        return build(
+            recording,
+            options,
+            poses=poses,
+            progress=progress,
+            stages=stages,
+            scratch=place.folder,
+            go_on=loop,
+            keep=lambda loop: place.save(loop, same, stages),
+        )
 
-    A place that cannot be written to is refused before the work is done, not after.
-    """
+
+def _resumed(
+    args: argparse.Namespace,
+    place: Place,
+    same: dict[str, Any],
+    options: Options,
+    stages: Stages,
+) -> Loop | None:
+    """How far an interrupted run came, if it is to be gone on from."""
+    if place.present is None:
+        return None
+    if not args.resume:
+        _tell(args, "an earlier run was interrupted: begins anew, --resume would go on from it")
+        place.forget()
+        return None
+    try:
+        loop = place.load(same, options, stages)
+    except Damaged as error:
+        say(f"warning: {error}; begins anew")
+        place.forget()
+        return None
+    if loop is not None:
+        _tell(args, f"goes on after iteration {len(loop.records)}")
+    return loop
+
+
+def _tell(args: argparse.Namespace, line: str) -> None:
+    if not args.quiet:
+        say(line)
+
+
+def _require_writable(output: Path) -> None:
+    """Refuse a place that cannot be written to before the work is done, not after."""
     parent = Path(os.path.abspath(output)).parent
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise InputError(f"cannot be written: nothing can be put into {parent}", where=str(output))
-    return parent
 
 
 def _usable(recording: Recording, args: argparse.Namespace) -> Recording:

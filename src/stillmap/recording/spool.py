@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-IN_MEMORY = 64 << 20  # bytes of one array that are kept in memory
+IN_MEMORY = 32 << 20  # bytes of one array that are kept in memory
+_BUFFER = 1 << 20  # bytes that are written to a file together
 BLOCK = 1 << 20  # rows that are looked at together
 
 
@@ -52,7 +53,7 @@ class Column:
         self._length += len(rows)
         self._parts.append(rows)
         self._bytes += rows.nbytes
-        if self._bytes > IN_MEMORY:
+        if self._bytes > (IN_MEMORY if self._file is None else min(IN_MEMORY, _BUFFER)):
             self._write()
 
     def _write(self) -> None:
