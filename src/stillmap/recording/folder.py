@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
+from stillmap.output.npy import write_npy
 from stillmap.recording.model import Recording
 from stillmap.recording.spool import blocks
 
@@ -44,10 +45,10 @@ def write_into(recording: Recording, folder: Path) -> None:
     }
     text = json.dumps(header, indent=1, allow_nan=False)
     for name in ("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"):
-        np.save(folder / f"{name}.npy", getattr(recording, name), allow_pickle=False)
+        write_npy(folder / f"{name}.npy", getattr(recording, name))
     for name in ("T_odom_base", "beam_time"):
         if getattr(recording, name) is not None:
-            np.save(folder / f"{name}.npy", getattr(recording, name), allow_pickle=False)
+            write_npy(folder / f"{name}.npy", getattr(recording, name))
     (folder / HEADER).write_text(text + "\n", encoding="utf-8")
 
 
