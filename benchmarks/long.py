@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sweep import in_fresh_process
 from tables import markdown
 
 from stillmap import se2
@@ -50,9 +51,13 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as work:
         whole = args.keep or Path(work, "whole")
         if not whole.exists():
-            folder.write(simulated(args.world, max(args.scans), args.seed, Path(work)), whole)
+            in_fresh_process(write, whole, args.world, max(args.scans), args.seed, Path(work))
         rows = [row_of(whole, scans, args.set, Path(work)) for scans in args.scans]
     print(table(rows))
+
+
+def write(whole: Path, world: str, scans: int, seed: int, work: Path) -> None:
+    folder.write(simulated(world, scans, seed, work), whole)
 
 
 def simulated(world: str, scans: int, seed: int, work: Path) -> Recording:
@@ -114,7 +119,8 @@ def looked(
 def row_of(whole: Path, scans: int, settings: list[str], work: Path) -> dict[str, Any]:
     """What mapping the first so many scans takes."""
     beginning, out = work / f"first-{scans}", work / f"out-{scans}"
-    folder.write(first_scans(folder.read(whole), scans), beginning)
+    # a process begins with the peak of the one that starts it: this one has to stay small
+    in_fresh_process(write_beginning, whole, scans, beginning)
     chosen = [word for setting in settings for word in ("--set", setting)]
     command = [sys.executable, "-m", "stillmap", "map", str(beginning), "-o", str(out), *chosen]
     process = subprocess.Popen([*command, "--quiet"])
@@ -133,6 +139,10 @@ def row_of(whole: Path, scans: int, settings: list[str], work: Path) -> dict[str
     }
     print(json.dumps(row), file=sys.stderr, flush=True)
     return row
+
+
+def write_beginning(whole: Path, scans: int, beginning: Path) -> None:
+    folder.write(first_scans(folder.read(whole), scans), beginning)
 
 
 def first_scans(recording: Recording, scans: int) -> Recording:
