@@ -4,6 +4,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -71,6 +72,21 @@ def resolved(options: Options) -> Options:
 
 
 @dataclass(frozen=True, eq=False)
+class Reached:
+    """What an iteration leaves to the next one.
+
+    Attributes:
+        number: of the iteration, 0 before the first.
+        p_static: (M,) float32, e.
+        mapped: its M-step without the grid; None before the first.
+    """
+
+    number: int
+    p_static: NDArray[np.float32]
+    mapped: slam.Mapped | None
+
+
+@dataclass(frozen=True, eq=False)
 class Iteration:
     """One M-step and one E-step.
 
@@ -115,6 +131,24 @@ class Iteration:
     no_return: em.NoReturn | None = None
 
     @property
+    def reached(self) -> Reached:
+        """What the next one begins with."""
+        doubts = self.doubts
+        mapped = slam.Mapped(
+            self.poses,
+            self.covariance,
+            _core.Grid2D(self.grid.resolution),  # grids are large
+            self.explained,
+            doubts.widened,
+            doubts.disagreeing,
+            doubts.breaks,
+            doubts.apart,
+            self.loops,
+            self.graph,
+        )
+        return Reached(self.number, self.p_static, mapped)
+
+    @property
     def occupancy(self) -> em.OccupancyMap:
         """The map of this iteration, made anew at every call; every beam is believed."""
         return em.occupancy_map(self.grid, self.occupied)
@@ -131,6 +165,8 @@ def iterate(
     poses: Float | None = None,
     progress: Progress = silent,
     stages: Stages | None = None,
+    scratch: Path | None = None,
+    after: Reached | None = None,
 ) -> Iterator[Iteration]:
     """Interleaves mapping and the estimation of what is static; the caller decides when to stop.
 
@@ -140,20 +176,28 @@ def iterate(
         poses: (T, 3, 3) T_map_base to keep instead of estimating them.
         progress: called with what is done, the iteration, and how much of how much.
         stages: where time and memory per stage are noted.
+        scratch: folder for what is known of each beam where that is too large for memory; such
+            files have no name and are gone with the process. None: the system's temporary folder.
+        after: an iteration of the same recording, options and poses, to go on from.
 
     Yields:
         one Iteration after the other, `options.em.max_iterations` of them at most.
     """
     if poses is not None and poses.shape != (recording.n_scans, 3, 3):
         raise ValueError(f"poses: expected ({recording.n_scans}, 3, 3), got {poses.shape}")
+    if scratch is not None:
+        recording = dataclasses.replace(recording, scratch=scratch)
     stages = stages or Stages()
     options = resolved(options)
     threads = resolved_threads(options.threads)
-    e = em.initial_expectations(recording, options.estimator, options.em)  # e := p(c = 1)
-    start: slam.Mapped | None = None
-    before: Float | None = None
-    for number in range(1, em.iterations(options.estimator, options.em) + 1):
+    if after is None:  # e := p(c = 1)
+        e = em.initial_expectations(recording, options.estimator, options.em)
+        after = Reached(0, e, None)
+    for number in range(after.number + 1, em.iterations(options.estimator, options.em) + 1):
         started = time.perf_counter()
+        e, before = after.p_static, after.mapped
+        # the first labels change most: from the second poses on, a sweep follows what is left
+        start = before if after.number > 1 else None
         with stages.measure("m_step"):  # (9)-(15)
             mapped = slam.m_step(
                 recording,
@@ -163,7 +207,7 @@ def iterate(
                 threads,
                 _at(progress, number),
                 start=start,
-                before=before,
+                before=None if before is None else before.poses,
             )
             seen = slam.deskewed(recording, mapped.poses, options.slam)
         with stages.measure("e_step"):  # (6), (8) or its successor, and the bound
@@ -199,9 +243,7 @@ def iterate(
             graph=mapped.graph,
             no_return=found.no_return,
         )
-        e, before = found.p_static, mapped.poses
-        # the first labels change most: from the second poses on, a sweep follows what is left
-        start = mapped.without_grid() if number > 1 else None
+        after = iteration.reached
         del mapped, found, seen  # grids are large: only the caller decides how long one lives
         yield iteration
         del iteration

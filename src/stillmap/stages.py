@@ -3,7 +3,7 @@
 import resource
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -26,6 +26,15 @@ class Stages:
             stage["seconds"] += time.perf_counter() - started
             stage["cpu_seconds"] += time.process_time() - cpu  # of all threads
             stage["peak_memory_bytes"] = peak_memory_bytes()
+
+    def add(self, earlier: Mapping[str, Mapping[str, Any]]) -> None:
+        """Stages of a run that this one goes on from, as `to_dict` gave them."""
+        for name, one in earlier.items():
+            stage = self._stages.setdefault(name, {"seconds": 0.0, "cpu_seconds": 0.0})
+            stage["seconds"] += one["seconds"]
+            stage["cpu_seconds"] += one["cpu_seconds"]
+            known = stage.get("peak_memory_bytes", 0)
+            stage["peak_memory_bytes"] = max(known, one["peak_memory_bytes"])
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
         """Stage to `seconds`, `cpu_seconds` and `peak_memory_bytes` (of the process, till then)."""

@@ -262,21 +262,28 @@ def stopped_after_a_line(process, number) -> tuple[int, str]:
     return process.returncode, err
 
 
-def test_ctrl_c_while_mapping(start, room, tmp_path, nothing_left):
+def only_a_checkpoint_left(folder) -> None:
+    """None, too, where the signal came before the first iteration had ended."""
+    for path in folder.iterdir():
+        assert path.name == ".out.resume"
+        assert {one.name.partition("-")[0] for one in path.iterdir()} == {"lock", "iteration"}
+
+
+def test_ctrl_c_while_mapping(start, room, tmp_path):
     process = start("map", room, "-o", tmp_path / "out", *ENDLESS)
     status, err = stopped_after_a_line(process, signal.SIGINT)
     assert status == 130
     assert err.splitlines()[-1].startswith("stillmap: interrupted")
     assert "Traceback" not in err
-    nothing_left()
+    only_a_checkpoint_left(tmp_path)
 
 
-def test_sigterm_while_mapping(start, room, tmp_path, nothing_left):
+def test_sigterm_while_mapping(start, room, tmp_path):
     process = start("map", room, "-o", tmp_path / "out", *ENDLESS)
     status, err = stopped_after_a_line(process, signal.SIGTERM)
     assert status == 143
     assert "Traceback" not in err
-    nothing_left()
+    only_a_checkpoint_left(tmp_path)
 
 
 def stopped_while_writing(process, folder, number, delay=0.0) -> int:
@@ -285,7 +292,7 @@ def stopped_while_writing(process, folder, number, delay=0.0) -> int:
     Writing takes a few hundredths of a second: on a busy machine all may be over by then.
     """
     deadline = time.monotonic() + 60
-    while process.poll() is None and not list(folder.glob(".*.part/*")):
+    while process.poll() is None and not list(folder.glob(".out.resume/.out.*.part/*")):
         assert time.monotonic() < deadline
         time.sleep(0.001)
     time.sleep(delay)
@@ -312,7 +319,9 @@ def test_stopped_while_writing_nothing_stays_behind(
         pytest.skip("this machine is too busy to send a signal in time")
     # Python dies of SIGINT after all where it came while a module was imported
     assert got in (status, -signal.SIGINT)
-    nothing_left()
+    nothing_left(".out.resume")
+    assert files_in(tmp_path / ".out.resume") >= {"lock", "iteration-1/state.json"}
+    assert list((tmp_path / ".out.resume").glob(".out.*")) == []
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.1, 0.4])
@@ -374,9 +383,10 @@ def test_ctrl_c_on_a_terminal_gives_the_cursor_back(on_a_terminal, room, tmp_pat
     assert status == 130
     assert written.count("\x1b[?25l") == written.count("\x1b[?25h") > 0
     lines = left_on_screen(written)
-    assert len(lines) == 1
-    assert lines[0].startswith("stillmap: interrupted")
-    nothing_left()
+    assert len(lines) == 2
+    assert "--resume" in lines[0]
+    assert lines[1].startswith("stillmap: interrupted")
+    nothing_left(".out.resume")
 
 
 def test_the_run_record_says_where_the_recording_is(call, room, tmp_path):

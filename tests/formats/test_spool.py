@@ -1,5 +1,6 @@
 """Arrays that are in memory or in a file without anybody noticing."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -84,3 +85,36 @@ def test_ranges_of_clouds():
     found = gathered.recording(np.eye(3)[None], source={})
     np.testing.assert_array_equal(found.hit, [False, True, False, False, False, False])
     np.testing.assert_array_equal(found.points[:, 0], [np.nan, 2.0, 4.0, np.nan, np.nan, np.nan])
+
+
+def resident() -> int:
+    """Bytes of this process that lie in memory."""
+    statm = Path("/proc/self/statm")
+    if not statm.exists():
+        pytest.skip("no /proc here")
+    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def test_what_is_let_go_takes_no_memory(monkeypatch, tmp_path):
+    monkeypatch.setattr(spool, "IN_MEMORY", 0)
+    values = spool.empty((64 << 20,), np.uint8, tmp_path)
+    values[:] = 1
+    held = resident()
+    spool.let_go(values[100:].reshape(-1, 4))  # the whole file, whatever is made of it
+    assert resident() < held - (48 << 20)
+    assert (values == 1).all()
+
+
+def test_blocks_are_all_rows_once(limit, tmp_path):  # noqa: ARG001
+    values = spool.empty((10, 2), np.int64, tmp_path)
+    for block in spool.blocks(values, rows=4):
+        values[block] = block.start
+    assert values[:, 0].tolist() == [0] * 4 + [4] * 4 + [8] * 2
+
+
+def test_copies_are_apart(limit, tmp_path):  # noqa: ARG001
+    values = np.arange(12.0).reshape(6, 2)
+    copy = spool.copied(values, tmp_path)
+    copy[0] = 7.0
+    np.testing.assert_array_equal(copy[1:], values[1:])
+    assert values[0, 0] == 0.0

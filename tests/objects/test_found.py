@@ -6,8 +6,9 @@ import functools
 import numpy as np
 import pytest
 
-from stillmap.objects import ObjectOptions, moving_objects, traffic
+from stillmap.objects import ObjectOptions, linking, moving_objects, traffic
 from stillmap.objects.found import behind, box_size
+from stillmap.recording import spool
 from stillmap.simulation import RobotOptions, Scene, simulate
 from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.simulation.walls import box
@@ -60,6 +61,24 @@ def test_people_are_found_and_followed(shape):
         speed.append(np.abs(np.linalg.norm(one.velocity, axis=1) - true))
     assert np.median(np.concatenate(off)) < 0.1
     assert np.median(np.concatenate(speed)) < 0.1
+
+
+@pytest.mark.parametrize("shape", ["bodies", "legs"])
+@pytest.mark.parametrize("block", [300, 5000])
+def test_pieces_of_any_size_and_files_make_no_difference(monkeypatch, tmp_path, shape, block):
+    simulation = room(shape=shape)
+    whole = found(simulation)
+    monkeypatch.setattr(spool, "IN_MEMORY", 0)
+    monkeypatch.setattr(spool, "BLOCK", block)
+    monkeypatch.setattr(linking, "_TOGETHER_ENDS", 7)
+    recording = dataclasses.replace(simulation.recording, scratch=tmp_path)
+    pieces = found(dataclasses.replace(simulation, recording=recording))
+    assert len(pieces) == len(whole) > 3
+    for one, other in zip(pieces, whole, strict=True):
+        assert (one.id, one.size, one.p_dynamic) == (other.id, other.size, other.p_dynamic)
+        for name in ("scan", "stamp_ns", "xy", "velocity", "beams"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_an_object_says_of_itself():

@@ -8,6 +8,7 @@ import pytest
 from stillmap import se2
 from stillmap.objects.moving import moving_points
 from stillmap.objects.options import ObjectOptions
+from stillmap.recording import spool
 from stillmap.recording.model import Recording
 
 OPTIONS = ObjectOptions()
@@ -46,6 +47,18 @@ def test_by_hand():
     np.testing.assert_allclose(found.xy[3], [1.0 - ahead[1], 3.0 + ahead[0]], atol=1e-6)
     # 3 m behind one another, in another scan, 0.6 m beside one another
     assert found.cluster.tolist() == [0, 0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("block", [1, 2, 3, 7])
+def test_pieces_of_any_size_make_no_difference(monkeypatch, block):
+    rng = np.random.default_rng(5)
+    r = recording(rng.choice([2.0, 2.1, 5.0], (6, 5)), rng.random((6, 5)) < 0.9)
+    p, poses = rng.choice([0.1, 0.9], 30).astype(np.float32), np.tile(np.eye(3), (6, 1, 1))
+    whole = moving_points(r, poses, p, OPTIONS)
+    monkeypatch.setattr(spool, "BLOCK", block)
+    pieces = moving_points(r, poses, p, OPTIONS)
+    for name in ("scan", "beam", "xy", "range", "cluster", "first"):
+        np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
 
 
 def test_farther_off_neighbours_lie_farther_apart():

@@ -3,15 +3,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from stillmap.output import points
 from stillmap.output.points import beam_counts, dynamic_points
+from stillmap.recording import spool
 from stillmap.recording.model import Recording
 from stillmap.se2 import matrix
 
 
 @pytest.fixture(params=[7, 1000, 1 << 20])
 def block(request, monkeypatch):
-    monkeypatch.setattr(points, "_BLOCK", request.param)
+    monkeypatch.setattr(spool, "BLOCK", request.param)
 
 
 def expected_points(recording, poses, p_static):

@@ -12,6 +12,7 @@ from stillmap.em import ChangeOptions, Courses, look_numbers
 from stillmap.em.courses import OFTEN
 from stillmap.em.together import components, pairs_near
 from stillmap.recording.model import Recording
+from stillmap.recording.spool import Column, blocks
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -73,25 +74,44 @@ def beams_on_things(
 
     What comes and goes may be people who wait there, unless it is a door.
     """
-    beam = np.flatnonzero(recording.hit & (p_static < 0.5))
-    if not changes or not len(beam):
-        return np.empty(0, np.intp)
-    ends, scan = recording.end_points(beam, poses), recording.scans_of(beam)
-    at, stamp = np.floor(ends / resolution).astype(np.int64), recording.stamp_ns[scan]
-    stood = np.zeros(len(beam), bool)
-    for change in changes:
-        if change.kind == "comes and goes" and len(change.swept) == len(change.cells):
-            continue
-        since, until = _stood(change, changes)
-        during = (stamp > since) & (stamp <= until)
+    things = [
+        _Thing.of(one, changes)
+        for one in changes
+        if one.kind != "comes and goes" or len(one.swept) != len(one.cells)
+    ]
+    found = Column(np.intp, (), recording.scratch)
+    for block in blocks(recording.hit, p_static) if things else ():
+        beam = block.start + np.flatnonzero(recording.hit[block] & (p_static[block] < 0.5))
+        ends, scan = recording.end_points(beam, poses), recording.scans_of(beam)
+        at, stamp = np.floor(ends / resolution).astype(np.int64), recording.stamp_ns[scan]
+        stood = np.zeros(len(beam), bool)
+        for thing in things:
+            inside = np.flatnonzero(thing.holds(at, stamp))
+            stood[inside] |= thing.near[tuple((at[inside] - thing.low).T)]
+        found.append(beam[stood])
+    return found.finished()
+
+
+class _Thing(NamedTuple):
+    """What stood somewhere: after which stamp and until which; lowest cell, and cells near it."""
+
+    since: int
+    until: int
+    low: NDArray[np.int64]
+    near: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, change: Change, changes: list[Change]) -> "_Thing":
         low, high = change.cells.min(axis=0) - 1, change.cells.max(axis=0) + 2
-        inside = np.flatnonzero(during & ((at >= low) & (at < high)).all(axis=1))
         near = np.zeros(tuple((high - low).tolist()), bool)
         near[tuple((change.cells - low).T)] = True
-        stood[inside] |= scipy.ndimage.binary_dilation(near, np.ones((3, 3), bool))[
-            tuple((at[inside] - low).T)
-        ]
-    return beam[stood]
+        grown = scipy.ndimage.binary_dilation(near, np.ones((3, 3), bool))
+        return cls(*_stood(change, changes), low, grown)
+
+    def holds(self, at: NDArray[np.int64], stamp: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(n,) whether cells (n, 2) lie in its box while it stood there."""
+        inside = ((at >= self.low) & (at < self.low + self.near.shape)).all(axis=1)
+        return np.asarray(inside & (stamp > self.since) & (stamp <= self.until))
 
 
 def _stood(change: Change, changes: list[Change]) -> tuple[int, int]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from stillmap import em
 from stillmap.changes.places import Change
 from stillmap.em.chunks import chunks
+from stillmap.recording import spool
 from stillmap.recording.model import Recording
 
 Float = NDArray[np.float64]
@@ -44,8 +45,12 @@ def relabelled(
     if not np.array_equal(occupied.cells, courses.cells):
         raise ValueError("occupied: expected the cells of the last E-step")
     listed = np.isin(_keys(courses.cells), _keys(np.concatenate([one.cells for one in changes])))
-    shown, out, T_map_sensor = courses.shown(state), p_static.copy(), recording.T_map_sensor(poses)
-    for scans, beams, offset in chunks(recording):
+    shown, out, T_map_sensor = (
+        courses.shown(state),
+        spool.copied(p_static, recording.scratch),
+        recording.T_map_sensor(poses),
+    )
+    for scans, beams, offset in chunks(recording, beside=[out]):
         element = courses.surface.elements_of(
             recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans], threads
         )

@@ -1,7 +1,7 @@
 """Recordings piece by piece: what one kernel call sees is bounded, whatever the length."""
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,16 @@ class Chunk(NamedTuple):
     offset: NDArray[np.int64]
 
 
-def chunks(recording: Recording, group: NDArray[np.int64] | None = None) -> Iterator[Chunk]:
-    """Chunks of about CHUNK_BEAMS beams; scans of equal `group` (T,), rising, stay together."""
+def chunks(
+    recording: Recording,
+    group: NDArray[np.int64] | None = None,
+    *,
+    beside: Sequence[NDArray[Any]] = (),
+) -> Iterator[Chunk]:
+    """Chunks of about CHUNK_BEAMS beams; scans of equal `group` (T,), rising, stay together.
+
+    What of the recording, and of arrays `beside` it, lies in files is let go after each chunk.
+    """
     offset, first = recording.offset, 0
     while first < recording.n_scans:
         end = int(np.searchsorted(offset, offset[first] + CHUNK_BEAMS, side="right")) - 1
@@ -37,4 +45,5 @@ def chunks(recording: Recording, group: NDArray[np.int64] | None = None) -> Iter
         beams = slice(int(offset[first]), int(offset[end]))
         within = np.ascontiguousarray(offset[first : end + 1] - offset[first])
         yield Chunk(slice(first, end), beams, within)
+        recording.let_go(*beside)
         first = end

@@ -233,8 +233,8 @@ def _of_beams(
 ) -> NDArray[np.float32]:
     """(M,) what is known (E,) of the element that each beam ended in."""
     found = np.append(static, np.float32(prior))  # -1: no element
-    e = np.empty(recording.n_beams, dtype=np.float32)
-    for scans, beams, offset in chunks(recording):
+    e = recording.per_beam(np.float32)
+    for scans, beams, offset in chunks(recording, beside=[e]):
         points, hit = recording.points[beams], recording.hit[beams]
         element = surface.elements_of(points, hit, offset, T_map_sensor[scans], threads)
         e[beams] = per_beam(points, hit, found[element], prior)

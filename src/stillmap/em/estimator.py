@@ -1,6 +1,5 @@
 """The E-step by whichever estimator was chosen, and the sums of (10) over whole recordings."""
 
-import dataclasses
 from typing import Literal
 
 import numpy as np
@@ -14,6 +13,7 @@ from stillmap.em.occupancy import Seen
 from stillmap.em.options import EmOptions
 from stillmap.em.tracker import on_people
 from stillmap.recording.model import Recording
+from stillmap.recording.spool import blocks
 
 Float = NDArray[np.float64]
 Estimator = Literal["stillmap", "paper", "hit-ratio", "tracker"]
@@ -28,7 +28,10 @@ def initial_expectations(
 ) -> NDArray[np.float32]:
     """(M,) e := p(c = 1) for every beam: the start of Fig. 2. Mappers that count believe all."""
     prior = 1.0 if estimator in _FIXED else options.prior
-    return np.full(recording.n_beams, prior, dtype=np.float32)
+    e = recording.per_beam(np.float32)
+    for block in blocks(e):
+        e[block] = prior
+    return e
 
 
 def iterations(estimator: Estimator, options: EmOptions) -> int:
@@ -63,8 +66,10 @@ def _tracked(
     recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int
 ) -> Expectations:
     """Hits on people who are tracked are dynamic, all others static; the map counts the others."""
-    kept = ~on_people(recording, poses, options.tracker)
-    e = per_beam(recording.points, recording.hit, kept.astype(np.float32), options.prior)
+    people, e = on_people(recording, poses, options.tracker), recording.per_beam(np.float32)
+    for _, beams, _ in chunks(recording, beside=[people, e]):
+        kept = (~people[beams]).astype(np.float32)
+        e[beams] = per_beam(recording.points[beams], recording.hit[beams], kept, options.prior)
     grid = _core.Grid2D(resolution)
     add_recording(grid, recording, poses, e, threads)
     likelihood = paper.log_likelihood(recording, poses, grid, e, options.prior, threads)
@@ -77,11 +82,18 @@ def add_recording(
     poses: Float,
     e: NDArray[np.float32] | None,
     threads: int = 1,
+    *,
+    hits_alone: bool = False,
 ) -> None:
-    """Adds the sums of (10) of all scans at given poses; e = None counts every hit as static."""
+    """Adds the sums of (10) of all scans at given poses; e = None counts every hit as static.
+
+    With `hits_alone` beams without a return are left out.
+    """
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in chunks(recording):
+    for scans, beams, offset in chunks(recording, beside=[] if e is None else [e]):
         points, hit = recording.points[beams], recording.hit[beams]
+        if hits_alone:
+            points = np.where(hit[:, None], points, np.float32(np.nan))
         weights = np.ones(len(hit), np.float32) if e is None else e[beams]
         _core.add_beams(grid, points, hit, weights, offset, T_map_sensor[scans], threads)
 
@@ -101,9 +113,7 @@ def add_believed_first(
     if no_return is None:
         add_recording(grid, recording, poses, e, threads)
         return None
-    hits = np.where(recording.hit[:, None], recording.points, np.float32(np.nan))
-    add_recording(grid, dataclasses.replace(recording, points=hits), poses, e, threads)
-    del hits
+    add_recording(grid, recording, poses, e, threads, hits_alone=True)
     rest = _core.Grid2D(grid.resolution, grid.approach)
     T_map_sensor = recording.T_map_sensor(poses)
     for scans, beams, offset in chunks(recording):
@@ -127,5 +137,9 @@ def changed_share(
     before: NDArray[np.float32], after: NDArray[np.float32], hit: NDArray[np.bool_]
 ) -> float:
     """Share of the hits whose e moved by more than 0.1 between two iterations."""
-    changed = int(np.count_nonzero(np.abs(after - before)[hit] > 0.1))
-    return changed / max(int(np.count_nonzero(hit)), 1)
+    changed = hits = 0
+    for block in blocks(before, after, hit):
+        moved = np.abs(after[block] - before[block])[hit[block]] > 0.1
+        changed += int(np.count_nonzero(moved))
+        hits += int(np.count_nonzero(hit[block]))
+    return changed / max(hits, 1)

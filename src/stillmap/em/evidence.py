@@ -66,7 +66,7 @@ def evidence(
     )
     look = look_numbers(recording, options.dwell.look)
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in chunks(recording, look):
+    for scans, beams, offset in chunks(recording, look, beside=[p_static]):
         counts.add(
             recording.points[beams],
             recording.hit[beams],

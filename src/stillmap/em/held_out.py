@@ -65,7 +65,7 @@ def held_out_log_likelihood(
     T_map_sensor = recording.T_map_sensor(poses)
     kind = _core.StaticShares2D if recording.dimension == 2 else _core.StaticShares3D
     shares = kind(resolution)
-    for scans, beams, offset in chunks(recording):
+    for scans, beams, offset in chunks(recording, beside=[e]):
         points, hit = recording.points[beams], recording.hit[beams]
         shares.add(points, hit, e[beams], offset, T_map_sensor[scans], held[scans])
     gain, count = 0.0, 0.0

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from stillmap import _core
 from stillmap.em import paper
+from stillmap.em.chunks import chunks
 from stillmap.em.expectations import CellProbabilities, Expectations, per_beam
 from stillmap.recording.model import Recording
 
@@ -28,7 +29,11 @@ def e_step(
     """
     # (8) with prior 1 - threshold is exactly r (1 - threshold) / (r (1 - threshold) + ...)
     found = paper.e_step(recording, poses, grid, 1.0 - threshold, threads)
-    p = per_beam(recording.points, recording.hit, found.p_static, 1.0 - threshold)
+    p = found.p_static
+    for _, beams, _ in chunks(recording, beside=[p]):
+        p[beams] = per_beam(
+            recording.points[beams], recording.hit[beams], p[beams], 1.0 - threshold
+        )
     return Expectations(p, found.likelihood, kept_cells(grid, threshold))
 
 

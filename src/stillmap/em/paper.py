@@ -15,9 +15,9 @@ def e_step(
     recording: Recording, poses: Float, grid: _core.Grid2D, prior: float, threads: int = 1
 ) -> Expectations:
     """e of (6), (8) for every beam, and (5) at the map of `grid`."""
-    e = np.empty(recording.n_beams, dtype=np.float32)
+    e = recording.per_beam(np.float32)
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in chunks(recording):
+    for scans, beams, offset in chunks(recording, beside=[e]):
         e[beams] = _core.e_step(
             grid,
             recording.points[beams],
@@ -41,7 +41,7 @@ def log_likelihood(
     """(5) and the bound of EM, at the map of `grid`."""
     total = np.zeros(4)
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in chunks(recording):
+    for scans, beams, offset in chunks(recording, beside=[e]):
         per_scan = _core.log_likelihood(
             grid,
             recording.points[beams],

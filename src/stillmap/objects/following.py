@@ -7,6 +7,8 @@ from stillmap.objects import kalman, separation
 from stillmap.objects.kalman import Motion
 from stillmap.objects.moving import MovingPoints
 from stillmap.objects.options import ObjectOptions
+from stillmap.recording import spool
+from stillmap.recording.model import TOGETHER
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -27,8 +29,10 @@ def followed(points: MovingPoints, options: ObjectOptions) -> Index:
         options: see ObjectOptions.
     """
     following = _Following(points, options)
-    for scan in np.unique(points.scan).tolist():
+    for n, scan in enumerate(np.flatnonzero(np.diff(points.first)).tolist()):
         following.take(scan)
+        if n % TOGETHER == 0:
+            points.let_go(following.owner)
     return following.owner
 
 
@@ -36,7 +40,7 @@ class _Following:
     """Things as they are followed: their motion, and what was seen of them of late."""
 
     def __init__(self, points: MovingPoints, options: ObjectOptions) -> None:
-        self.owner = np.full(len(points.scan), NOBODY)
+        self.owner = spool.empty((len(points.scan),), np.intp, points.scratch)
         self._points, self._options = points, options
         self._now, self._count = 0.0, 0
         self._motion = kalman.still(np.zeros((0, 2)), 1.0, 1.0)

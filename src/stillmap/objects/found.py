@@ -2,15 +2,18 @@
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.objects.following import followed
-from stillmap.objects.linking import linked, middles
+from stillmap.objects.linking import linked, middles, of_things
 from stillmap.objects.moving import MovingPoints, moving_points
 from stillmap.objects.options import ObjectOptions
 from stillmap.objects.smoothing import smoothed
+from stillmap.recording import spool
 from stillmap.recording.model import Recording
 
 Float = NDArray[np.float64]
@@ -77,19 +80,48 @@ def moving_objects(
     if len(points.scan) == 0:
         return []
     owner = linked(points, followed(points, options), options)
-    found = middles(points, owner)
-    own = np.flatnonzero(owner >= 0)
-    order = own[np.argsort(owner[own], kind="stable")]
-    of_things = np.split(order, np.flatnonzero(np.diff(owner[order])) + 1)
-    parts = np.split(np.arange(len(found.thing)), np.flatnonzero(np.diff(found.thing)) + 1)
-    things = (
-        _object(points, here, found.scan[part], found.xy[part], recording, p_static, options)
-        for here, part in zip(of_things, parts, strict=True)
-        if len(here)
-    )
-    large = [one for one in things if _extent(one) >= options.least_extent]
-    large.sort(key=lambda one: (one.scan[0], one.beams[0]))
-    return [dataclasses.replace(one, id=number) for number, one in enumerate(large)]
+    large = _Kept(recording.scratch)
+    for _, here in of_things(points, owner):
+        found = middles(points, owner, here)
+        one = _object(points, here, found.scan, found.xy, recording, p_static, options)
+        if _extent(one) >= options.least_extent:
+            large.add(one)
+        spool.let_go(p_static)
+    objects = large.objects()
+    objects.sort(key=lambda one: (one.scan[0], one.beams[0]))
+    return [dataclasses.replace(one, id=number) for number, one in enumerate(objects)]
+
+
+class _Kept:
+    """Objects whose arrays lie together, as parts of a few large ones."""
+
+    _OF_SCANS: ClassVar = {"scan": np.intp, "stamp_ns": np.int64, "xy": float, "velocity": float}
+
+    def __init__(self, scratch: Path | None) -> None:
+        self._beams = spool.Column(np.intp, (), scratch)
+        self._columns = {
+            name: spool.Column(dtype, (2,) if dtype is float else (), scratch)
+            for name, dtype in self._OF_SCANS.items()
+        }
+        self._rows: list[tuple[int, int, tuple[float, float], float]] = []
+
+    def add(self, one: MovingObject) -> None:
+        self._rows.append((len(one.scan), len(one.beams), one.size, one.p_dynamic))
+        self._beams.append(one.beams)
+        for name, column in self._columns.items():
+            column.append(getattr(one, name))
+
+    def objects(self) -> list[MovingObject]:
+        """All of them, without numbers; nothing can be added any more."""
+        beams = self._beams.finished()
+        columns = {name: column.finished() for name, column in self._columns.items()}
+        out, scan, beam = [], 0, 0
+        for n_scans, n_beams, size, p_dynamic in self._rows:
+            part = {name: column[scan : scan + n_scans] for name, column in columns.items()}
+            mine = beams[beam : beam + n_beams]
+            out.append(MovingObject(0, size=size, beams=mine, p_dynamic=p_dynamic, **part))
+            scan, beam = scan + n_scans, beam + n_beams
+        return out
 
 
 def _extent(one: MovingObject) -> float:

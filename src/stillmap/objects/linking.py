@@ -1,5 +1,6 @@
 """Pieces of tracks put together: parts of one thing, and a thing before and after it was hidden."""
 
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.objects.moving import MovingPoints
 from stillmap.objects.options import ObjectOptions
+from stillmap.recording import spool
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -16,6 +18,7 @@ _CHI2 = 9.0  # two ways fit together below
 _SIGMA, _SIGMA_SPEED = 0.2, 0.3  # m and m/s, of the ends of tracks
 _TOGETHER = 0.7  # share of the shorter one's scans that two things go together: one thing
 _NEVER = 1e6  # cost of what does not fit at all
+_TOGETHER_ENDS = 1 << 12  # ends of tracks that are looked at together
 _STANDING = 0.15  # s by which few points are taken to stand still
 
 
@@ -35,15 +38,64 @@ class Middles(NamedTuple):
     ends: Index
 
 
-def middles(points: MovingPoints, owner: Index) -> Middles:
-    """Where things are; points of nobody (-1) are left out."""
-    own = np.flatnonzero(owner >= 0)
-    order = own[np.lexsort((points.scan[own], owner[own]))]
-    thing, scan = owner[order], points.scan[order]
+def middles(points: MovingPoints, owner: Index, here: slice | Index) -> Middles:
+    """Where things are by some points, all or none of a scan; those of nobody (-1) are left out."""
+    thing, scan, xy = owner[here], points.scan[here], points.xy[here]
+    own = np.flatnonzero(thing >= 0)
+    order = own[np.lexsort((scan[own], thing[own]))]
+    thing, scan = thing[order], scan[order]
     begins = np.flatnonzero(np.diff(thing, prepend=-1) | np.diff(scan, prepend=-1))
     count = np.diff(begins, append=len(order))
-    sums = np.add.reduceat(points.xy[order], begins) if len(begins) else np.zeros((0, 2))
+    sums = np.add.reduceat(xy[order], begins) if len(begins) else np.zeros((0, 2))
     return Middles(thing[begins], scan[begins], sums / count[:, None], count)
+
+
+def of_things(points: MovingPoints, owner: Index) -> Iterator[tuple[int, Index]]:
+    """Each thing's number, rising, and its points, rising."""
+    count = np.zeros(0, np.intp)
+    for block in spool.blocks(owner):
+        here = np.bincount(owner[block][owner[block] >= 0], minlength=len(count))
+        here[: len(count)] += count
+        count = here
+    first = np.cumsum(count) - count
+    order = spool.empty((int(count.sum()),), np.intp, points.scratch)
+    free = first.copy()
+    for block in spool.blocks(owner, order):
+        own = np.flatnonzero(owner[block] >= 0)
+        own = own[np.argsort(owner[block][own], kind="stable")]
+        thing = owner[block][own]
+        begins = np.flatnonzero(np.diff(thing, prepend=-1))
+        runs = np.diff(begins, append=len(thing))
+        at = np.repeat(free[thing[begins]] - begins, runs) + np.arange(len(thing))
+        order[at] = block.start + own
+        free[thing[begins]] += runs
+    seen = 0
+    for k in np.flatnonzero(count).tolist():
+        yield k, np.array(order[first[k] : first[k] + count[k]])
+        seen += count[k]
+        if seen > spool.BLOCK:
+            points.let_go(owner, order)
+            seen = 0
+
+
+def _blocks(points: MovingPoints, *beside: Index) -> Iterator[slice]:
+    """Slices of points, of whole scans; what was looked at is let go."""
+    first, at = points.first, 0
+    while at < len(points.scan):
+        end = first[np.searchsorted(first, at + spool.BLOCK, side="right") - 1]
+        if end <= at:  # one scan alone
+            end = first[np.searchsorted(first, at, side="right")]
+        yield slice(at, int(end))
+        points.let_go(*beside)
+        at = int(end)
+
+
+def _renamed(points: MovingPoints, owner: Index, name: Callable[[Index], Index]) -> Index:
+    """(N,) other numbers for the things."""
+    out = spool.empty(owner.shape, np.intp, points.scratch)
+    for block in spool.blocks(owner, out):
+        out[block] = name(owner[block])
+    return out
 
 
 def linked(points: MovingPoints, owner: Index, options: ObjectOptions) -> Index:
@@ -63,24 +115,40 @@ def _side_by_side(points: MovingPoints, owner: Index, options: ObjectOptions) ->
     """Things that always go together, nearer than people do: legs that were taken for two."""
     from scipy.spatial import KDTree  # takes long to load
 
-    found = middles(points, owner)
-    # one more axis keeps scans apart
-    apart = np.column_stack([found.xy, 100.0 * max(options.beside, 1.0) * found.scan])
-    pairs = KDTree(apart).query_pairs(options.beside, output_type="ndarray")
-    if len(pairs) == 0:
+    parts, scans = list[tuple[Index, Index]](), np.zeros(0, np.intp)
+    for here in _blocks(points, owner):
+        found = middles(points, owner, here)
+        # one more axis keeps scans apart
+        apart = np.column_stack([found.xy, 100.0 * max(options.beside, 1.0) * found.scan])
+        pairs = KDTree(apart).query_pairs(options.beside, output_type="ndarray")
+        pairs = np.sort(found.thing[pairs], axis=1)
+        parts.append(np.unique(pairs, axis=0, return_counts=True))
+        scans = _added(scans, np.bincount(found.thing))
+    things, which = np.unique(
+        np.concatenate([pairs for pairs, _ in parts]), axis=0, return_inverse=True
+    )
+    if len(things) == 0:
         return owner
-    things, count = np.unique(np.sort(found.thing[pairs], axis=1), axis=0, return_counts=True)
-    scans = np.bincount(found.thing)
+    count = np.zeros(len(things), np.intp)
+    np.add.at(count, which.reshape(-1), np.concatenate([count for _, count in parts]))
     one = count >= _TOGETHER * scans[things].min(axis=1)
-    return _first_of_each(_components(things[one], len(scans)))[owner]
+    first = _first_of_each(_components(things[one], len(scans)))
+    return _renamed(points, owner, lambda old: first[old])
+
+
+def _added(one: Index, other: Index) -> Index:
+    """Sums of counts, of which the shorter ones end in zeros."""
+    out = np.zeros(max(len(one), len(other)), np.intp)
+    out[: len(one)] += one
+    out[: len(other)] += other
+    return out
 
 
 def _one_after_the_other(points: MovingPoints, owner: Index, options: ObjectOptions) -> Index:
     """Things that were hidden for a while, and seen again where they were going."""
     from scipy.optimize import linear_sum_assignment  # takes long to load
 
-    found = middles(points, owner)
-    things, ends = _ends(found, points.seconds)
+    things, ends = _ends(points, owner)
     before, after, cost = _candidates(ends, options)
     if len(before) == 0:
         return owner
@@ -97,7 +165,11 @@ def _one_after_the_other(points: MovingPoints, owner: Index, options: ObjectOpti
                 follows[columns[c]] = rows[r]
     for k in np.argsort(ends.first, kind="stable").tolist():
         follows[k] = k if follows[k] == k else follows[follows[k]]
-    return np.where(owner >= 0, things[follows[np.searchsorted(things, owner)]], -1)
+    return _renamed(
+        points,
+        owner,
+        lambda old: np.where(old >= 0, things[follows[np.searchsorted(things, old)]], -1),
+    )
 
 
 class _Ends(NamedTuple):
@@ -111,18 +183,18 @@ class _Ends(NamedTuple):
     last_v: Float
 
 
-def _ends(found: Middles, seconds: Float) -> tuple[Index, _Ends]:
+def _ends(points: MovingPoints, owner: Index) -> tuple[Index, _Ends]:
     """Numbers of the things (K,), and their ends."""
-    things, begin = np.unique(found.thing, return_index=True)
-    at = seconds[found.scan]
-    rows = []
-    for here in np.split(np.arange(len(at)), begin[1:]):
-        t, xy = at[here], found.xy[here]
+    things, rows = [], []
+    for thing, here in of_things(points, owner):
+        found = middles(points, owner, here)
+        t, xy = points.seconds[found.scan], found.xy
+        things.append(thing)
         first, last = t <= t[0] + _HORIZON, t >= t[-1] - _HORIZON
         rows.append((t[0], *_line(t[first] - t[0], xy[first])))
         rows.append((t[-1], *_line(t[last] - t[-1], xy[last])))
     t, x, v = (np.array(column) for column in zip(*rows, strict=True))
-    return things, _Ends(t[::2], x[::2], v[::2], t[1::2], x[1::2], v[1::2])
+    return np.array(things), _Ends(t[::2], x[::2], v[::2], t[1::2], x[1::2], v[1::2])
 
 
 def _line(t: Float, xy: Float) -> tuple[Float, Float]:
@@ -135,10 +207,22 @@ def _line(t: Float, xy: Float) -> tuple[Float, Float]:
 def _candidates(ends: _Ends, options: ObjectOptions) -> tuple[Index, Index, Float]:
     """Tracks that one may be the other's end, and what it costs: -2 ln of how well they fit."""
     order = np.argsort(ends.first, kind="stable")
-    low = np.searchsorted(ends.first[order], ends.last, side="right")
-    high = np.searchsorted(ends.first[order], ends.last + options.gap_between, side="right")
-    before = np.repeat(np.arange(len(order)), high - low)
-    after = order[np.concatenate([np.arange(a, b) for a, b in zip(low, high, strict=True)])]
+    parts = []
+    for some in range(0, len(order), _TOGETHER_ENDS):
+        k = np.arange(some, min(some + _TOGETHER_ENDS, len(order)))
+        until = ends.last[k] + options.gap_between
+        low = np.searchsorted(ends.first[order], ends.last[k], side="right")
+        high = np.searchsorted(ends.first[order], until, side="right")
+        after = order[np.concatenate([np.arange(a, b) for a, b in zip(low, high, strict=True)])]
+        parts.append(_fitting(ends, np.repeat(k, high - low), after, options))
+    before, after, cost = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return before, after, cost
+
+
+def _fitting(
+    ends: _Ends, before: Index, after: Index, options: ObjectOptions
+) -> tuple[Index, Index, Float]:
+    """Those of the pairs that fit, and what they cost."""
     hidden = ends.first[after] - ends.last[before]
     half = 0.5 * hidden[:, None]
     d = ends.last_xy[before] + half * ends.last_v[before]
@@ -155,16 +239,21 @@ def _candidates(ends: _Ends, options: ObjectOptions) -> tuple[Index, Index, Floa
 
 def _confirmed(points: MovingPoints, owner: Index, options: ObjectOptions) -> Index:
     """Things that were seen for long enough; -1 for all others."""
-    found = middles(points, owner)
-    if len(found.thing) == 0:
+    scans = np.zeros(0, np.intp)
+    first, last = np.full(0, np.inf), np.full(0, -np.inf)
+    for here in _blocks(points, owner):
+        found = middles(points, owner, here)
+        scans = _added(scans, np.bincount(found.thing))
+        more = len(scans) - len(first)
+        first = np.concatenate([first, np.full(more, np.inf)])
+        last = np.concatenate([last, np.full(more, -np.inf)])
+        np.minimum.at(first, found.thing, points.seconds[found.scan])
+        np.maximum.at(last, found.thing, points.seconds[found.scan])
+    if len(scans) == 0:
         return owner
-    scans = np.bincount(found.thing)
-    first, last = np.full(len(scans), np.inf), np.full(len(scans), -np.inf)
-    np.minimum.at(first, found.thing, points.seconds[found.scan])
-    np.maximum.at(last, found.thing, points.seconds[found.scan])
     lasted = np.subtract(last, first, out=np.zeros(len(scans)), where=scans > 0)
     enough = (scans >= options.least_scans) & (lasted >= options.least_seconds)
-    return np.where((owner >= 0) & enough[owner], owner, -1)
+    return _renamed(points, owner, lambda old: np.where((old >= 0) & enough[old], old, -1))
 
 
 def _components(pairs: Index, n: int) -> Index:

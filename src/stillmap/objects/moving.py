@@ -1,15 +1,22 @@
 """End points of beams that something moving reflected."""
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.objects.options import ObjectOptions
+from stillmap.recording import spool
 from stillmap.recording.model import Recording
+from stillmap.recording.spool import Column
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+_Last = tuple[Index, Float, Float, int]
+_NOTHING: _Last = np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros(0), -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +32,7 @@ class MovingPoints:
         sensor: (T, 2) where the sensor was at each scan, in the map frame.
         cluster: (N,) numbers of runs of neighbours in a scan that lie on one thing, rising.
         first: (T + 1,) scan t has the points first[t]:first[t + 1].
+        scratch: folder for what becomes known of them, where it is large, see Recording.
     """
 
     seconds: Float
@@ -35,6 +43,12 @@ class MovingPoints:
     sensor: Float
     cluster: Index
     first: Index
+    scratch: Path | None = None
+
+    def let_go(self, *more: NDArray[Any]) -> None:
+        """What lies in memory of the points, and of other arrays, only because it was looked at."""
+        for array in (self.scan, self.beam, self.xy, self.range, self.cluster, *more):
+            spool.let_go(array)
 
 
 def moving_points(
@@ -50,24 +64,55 @@ def moving_points(
     """
     # a scan's stamps may go backwards where clocks jump; time does not
     seconds = np.maximum.accumulate(1e-9 * (recording.stamp_ns - recording.stamp_ns[:1]))
-    beam = np.flatnonzero(recording.hit & (p_static <= 1.0 - options.dynamic))
-    scan, xy = recording.scans_of(beam), recording.end_points(beam, poses)
-    distance = np.linalg.norm(recording.points[beam].astype(np.float64), axis=1)
+    scratch = recording.scratch
+    scans, beams = Column(np.intp, (), scratch), Column(np.intp, (), scratch)
+    ends, distances = Column(np.float64, (2,), scratch), Column(np.float64, (), scratch)
+    clusters, count = Column(np.intp, (), scratch), np.zeros(recording.n_scans + 1, np.intp)
+    last = _NOTHING
+    for block in spool.blocks(recording.hit, p_static):
+        dynamic = recording.hit[block] & (p_static[block] <= 1.0 - options.dynamic)
+        beam = block.start + np.flatnonzero(dynamic)
+        if len(beam) == 0:
+            continue
+        scan, xy = recording.scans_of(beam), recording.end_points(beam, poses)
+        distance = np.linalg.norm(recording.points[beam].astype(np.float64), axis=1)
+        cluster = _clusters(scan, xy, distance, options, last)
+        last = scan[-1:], xy[-1:], distance[-1:], int(cluster[-1])
+        for column, part in (
+            (scans, scan), (beams, beam), (ends, xy), (distances, distance), (clusters, cluster)
+        ):  # fmt: skip
+            column.append(part)
+        count[scan[0] + 1 : scan[-1] + 2] += np.bincount(scan - scan[0])
     return MovingPoints(
         seconds,
-        scan,
-        beam,
-        xy,
-        distance,
+        scans.finished(),
+        beams.finished(),
+        ends.finished(),
+        distances.finished(),
         recording.T_map_sensor(poses)[:, :2, 2],
-        _clusters(scan, xy, distance, options),
-        np.searchsorted(scan, np.arange(recording.n_scans + 1)),
+        clusters.finished(),
+        np.cumsum(count),
+        scratch,
     )
 
 
-def _clusters(scan: Index, xy: Float, distance: Float, options: ObjectOptions) -> Index:
-    """(N,) a new number where the next end point is of another scan, or too far off."""
+def _clusters(
+    scan: Index,
+    xy: Float,
+    distance: Float,
+    options: ObjectOptions,
+    last: _Last = _NOTHING,
+) -> Index:
+    """(N,) a new number where the next end point is of another scan, or too far off.
+
+    `last` are scan, place, distance and number of the point before these, if there is one.
+    """
+    new = len(scan)
+    scan = np.concatenate([last[0], scan])
+    xy, distance = np.concatenate([last[1], xy]), np.concatenate([last[2], distance])
     step = np.linalg.norm(np.diff(xy, axis=0), axis=1)
     wide = options.link + options.link_slope * np.minimum(distance[1:], distance[:-1])
     begins = (np.diff(scan) > 0) | (step > wide)
-    return np.concatenate([np.zeros(min(len(scan), 1), np.intp), np.cumsum(begins)])
+    if len(scan) == new:  # the first of all
+        begins = np.concatenate([[True], begins])
+    return last[-1] + np.cumsum(begins)

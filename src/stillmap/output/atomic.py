@@ -43,8 +43,15 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
 
 
 @contextmanager
-def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
+def new_folder(
+    path: Path, overwrite: bool = False, *, within: Path | None = None
+) -> Iterator[Path]:
     """A temporary sibling folder that becomes `path` when the block ends without an exception.
+
+    Args:
+        path: the folder to be.
+        overwrite: replace what is there.
+        within: a folder on the same file system that the temporary one is put into instead.
 
     Raises:
         InputError: `path` is taken or its parent cannot be written to.
@@ -53,7 +60,9 @@ def new_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
     require_new(path, overwrite)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
+        work = Path(
+            tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=within or path.parent)
+        )
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
     try:

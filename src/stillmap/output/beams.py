@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stillmap.output.npy import write_npy
 from stillmap.output.protocols import ResultLike
 
 
@@ -16,7 +17,7 @@ def write_beams(folder: Path, result: ResultLike) -> None:
     if result.p_static.shape != (recording.n_beams,):
         raise ValueError(f"p_static: expected ({recording.n_beams},), got {result.p_static.shape}")
     folder.mkdir()
-    np.save(folder / "stamp_ns.npy", np.asarray(recording.stamp_ns, np.int64))
-    np.save(folder / "offset.npy", np.asarray(recording.offset, np.int64))
-    np.save(folder / "p_static.npy", np.asarray(result.p_static, np.float32))
-    np.save(folder / "hit.npy", np.asarray(recording.hit, np.bool_))
+    write_npy(folder / "stamp_ns.npy", np.asarray(recording.stamp_ns, np.int64))
+    write_npy(folder / "offset.npy", np.asarray(recording.offset, np.int64))
+    write_npy(folder / "p_static.npy", np.asarray(result.p_static, np.float32))
+    write_npy(folder / "hit.npy", np.asarray(recording.hit, np.bool_))

@@ -16,16 +16,19 @@ _MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
 def write_objects(folder: Path, result: ResultLike) -> None:
     """Write `objects.json` and `NNNN.ply` of each object into a new folder."""
     folder.mkdir()
-    # one object a line
-    lines = [json.dumps(object_record(one), allow_nan=False) for one in result.objects]
-    text = "[\n" + ",\n".join(lines) + "\n]\n" if lines else "[]\n"
-    (folder / "objects.json").write_text(text, encoding="utf-8")
+    with (folder / "objects.json").open("w", encoding="utf-8", newline="\n") as file:
+        file.write("[")
+        for number, one in enumerate(result.objects):  # one object a line
+            file.write(",\n" if number else "\n")
+            file.write(json.dumps(object_record(one), allow_nan=False))
+        file.write("\n]\n" if result.objects else "]\n")
     recording = result.seen
     for one in result.objects:
         xy = recording.end_points(one.beams, result.poses)
         stamps = recording.stamp_ns[recording.scans_of(one.beams)]
         seconds = 1e-9 * (stamps - one.stamp_ns[0])
         write_ply(folder / f"{one.id:04d}.ply", xy, seconds, 1.0 - result.p_static[one.beams])
+        recording.let_go(result.p_static, one.beams)
 
 
 def object_record(one: MovingObjectLike) -> dict[str, Any]:

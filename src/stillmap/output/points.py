@@ -1,20 +1,18 @@
 """Counts and end points over all beams, a block at a time: a recording may be long."""
 
-from collections.abc import Iterator
-
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.recording.model import Recording
+from stillmap.recording.spool import blocks
 
 DYNAMIC_BELOW = 0.5
-_BLOCK = 1 << 20
 
 
 def beam_counts(recording: Recording, p_static: NDArray[np.float32]) -> dict[str, int]:
     """Numbers of `beams`, `hits`, `max_range`, `unusable`, `dynamic` (hits below 0.5)."""
     hits = unusable = dynamic = 0
-    for block in _blocks(recording.n_beams):
+    for block in blocks(recording.points, recording.hit, p_static):
         hit = recording.hit[block]
         hits += int(np.count_nonzero(hit))
         unusable += int(np.count_nonzero(np.isnan(recording.points[block]).any(axis=1)))
@@ -60,21 +58,16 @@ def _dynamic_beams(
     def of_block(block: slice) -> NDArray[np.bool_]:
         return recording.hit[block] & (p_static[block] < threshold)
 
-    blocks = list(_blocks(recording.n_beams))
-    counts = [int(np.count_nonzero(of_block(block))) for block in blocks]
+    arrays = recording.hit, p_static
+    counts = [int(np.count_nonzero(of_block(block))) for block in blocks(*arrays)]
     total = sum(counts)
     kept = min(total, limit)
     # which of the dynamic beams are taken, counted over the whole recording
     wanted = np.arange(kept, dtype=np.int64) * total // max(kept, 1)
     before = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     parts = [np.zeros(0, np.int64)]
-    for block, start, end in zip(blocks, before[:-1], before[1:], strict=True):
+    for block, start, end in zip(blocks(*arrays), before[:-1], before[1:], strict=True):
         low, high = np.searchsorted(wanted, [start, end])
         found = np.flatnonzero(of_block(block))
         parts.append(block.start + found[wanted[low:high] - start])
     return np.concatenate(parts)
-
-
-def _blocks(n: int) -> Iterator[slice]:
-    for start in range(0, n, _BLOCK):
-        yield slice(start, min(start + _BLOCK, n))

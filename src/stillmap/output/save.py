@@ -14,18 +14,21 @@ from stillmap.output.run_json import write_run_json
 from stillmap.output.trajectory import write_tum
 
 
-def save(result: ResultLike, path: Path, overwrite: bool = False) -> None:
+def save(
+    result: ResultLike, path: Path, overwrite: bool = False, *, within: Path | None = None
+) -> None:
     """Write `result` as the folder `path`: map, trajectory, pose graph, labels, objects, report.
 
     Args:
         result: what the pipeline found.
         path: the folder; it must not exist or be empty unless `overwrite` is given.
         overwrite: replace what is there, once the new folder is whole.
+        within: where the new folder is made until then; None: beside `path`.
 
     Raises:
         InputError: `path` is taken or cannot be written to.
     """
-    with new_folder(path, overwrite) as folder:
+    with new_folder(path, overwrite, within=within) as folder:
         write_map_server(folder, result.map, result.options.output.map_mode)
         write_map_npz(folder / "map.npz", result.map, result.changes, result.evidence)
         write_tum(folder / "trajectory.tum", result.recording.stamp_ns, result.poses)

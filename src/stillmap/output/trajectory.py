@@ -8,9 +8,11 @@ import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.errors import InputError
+from stillmap.recording.spool import blocks
 from stillmap.recording.stamps import seconds_text
 
 _COLUMNS = "stamp x y z qx qy qz qw"
+_TOGETHER = 1 << 14  # poses that are written together: as numbers of Python they are large
 # a quaternion printed with three decimals still lies well within this of length one
 _UNIT_TOLERANCE = 0.02
 
@@ -23,11 +25,14 @@ def write_tum(path: Path, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64
         stamp_ns: (T,) int64 nanoseconds.
         poses: (T, D+1, D+1) float64, T_map_base, D = 2 or 3.
     """
-    # + 0.0 turns the negative zeros that rounding leaves into zeros
-    rows = np.round(_rows_of(poses), 9) + 0.0
+    if len(stamp_ns) != len(poses):
+        raise ValueError(f"poses: expected {len(stamp_ns)}, got {len(poses)}")
     with path.open("w", encoding="ascii", newline="\n") as file:
-        for stamp, row in zip(stamp_ns.tolist(), rows.tolist(), strict=True):
-            file.write(f"{seconds_text(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
+        for part in blocks(poses, rows=_TOGETHER):
+            # + 0.0 turns the negative zeros that rounding leaves into zeros
+            rows = np.round(_rows_of(poses[part]), 9) + 0.0
+            for stamp, row in zip(stamp_ns[part].tolist(), rows.tolist(), strict=True):
+                file.write(f"{seconds_text(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
 
 
 def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

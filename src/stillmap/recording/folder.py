@@ -9,15 +9,16 @@ from numpy.typing import NDArray
 
 from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
+from stillmap.output.npy import write_npy
 from stillmap.recording import folder_images
 from stillmap.recording.images import Images
 from stillmap.recording.model import Recording
+from stillmap.recording.spool import blocks
 
 HEADER = "recording.json"
 FORMAT = "stillmap-recording"
 FORMAT_VERSION = 1
 
-_CHUNK = 1 << 20  # beams looked at together: points need not fit in memory
 _MAX_HEADER = 64 << 20  # bytes
 
 
@@ -52,10 +53,10 @@ def write_into(recording: Recording, folder: Path) -> None:
     }
     text = json.dumps(header, indent=1, allow_nan=False)
     for name in ("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"):
-        np.save(folder / f"{name}.npy", getattr(recording, name), allow_pickle=False)
+        write_npy(folder / f"{name}.npy", getattr(recording, name))
     for name in ("T_odom_base", "beam_time", "T_recorded_base"):
         if getattr(recording, name) is not None:
-            np.save(folder / f"{name}.npy", getattr(recording, name), allow_pickle=False)
+            write_npy(folder / f"{name}.npy", getattr(recording, name))
     (folder / HEADER).write_text(text + "\n", encoding="utf-8")
 
 
@@ -188,10 +189,10 @@ def _require_offsets(path: Path, offset: NDArray[np.int64], M: int) -> None:
 
 
 def _require_finite_hits(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
-    for start in range(0, len(points), _CHUNK):
-        chunk = points[start : start + _CHUNK]
+    for block in blocks(points, hit):
+        chunk = points[block]
         usable = np.isfinite(chunk).all(axis=1)
-        if np.any(hit[start : start + _CHUNK] & ~usable) or np.any(np.isinf(chunk)):
+        if np.any(hit[block] & ~usable) or np.any(np.isinf(chunk)):
             raise _damaged(path, "points", "a hit or a maximum-range beam ends nowhere")
 
 

@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.errors import InputError
-from stillmap.recording.model import Recording
+from stillmap.recording import spool
+from stillmap.recording.model import TOGETHER, Recording
 from stillmap.recording.options import GivenLaser, ReadOptions
 
 
@@ -38,7 +40,14 @@ def applied(recording: Recording, options: ReadOptions) -> Recording:
 
 
 def _narrowed(recording: Recording, options: ReadOptions) -> Recording:
-    points, hit = np.array(recording.points), np.array(recording.hit)
+    points = spool.copied(recording.points, recording.scratch)
+    hit = spool.copied(recording.hit, recording.scratch)
+    for block in spool.blocks(points, hit):
+        _narrow(points[block], hit[block], options)
+    return replace(recording, points=points, hit=hit)
+
+
+def _narrow(points: NDArray[np.float32], hit: NDArray[np.bool_], options: ReadOptions) -> None:
     length = np.linalg.norm(points, axis=1)
     if options.max_range is not None:
         hit &= ~(length >= np.float32(options.max_range))
@@ -48,7 +57,6 @@ def _narrowed(recording: Recording, options: ReadOptions) -> Recording:
         points[too_far] *= (np.float32(min(ends)) / length[too_far])[:, None]
     near = hit & (length < np.float32(options.min_range))
     points[near], hit[near] = np.nan, False
-    return replace(recording, points=points, hit=hit)
 
 
 def _with_laser(recording: Recording, number: int, given: GivenLaser) -> Recording:
@@ -66,7 +74,9 @@ def _with_laser(recording: Recording, number: int, given: GivenLaser) -> Recordi
 
 def _mirrored(recording: Recording, number: int) -> Recording:
     """The beams of one laser turned the other way round."""
-    points = np.array(recording.points)
-    its = np.repeat(recording.sensor == number, np.diff(recording.offset))
-    points[its, 1] *= -1.0
+    points = spool.copied(recording.points, recording.scratch)
+    for n, t in enumerate(np.flatnonzero(recording.sensor == number).tolist()):
+        points[recording.beams_of(t), 1] *= -1.0
+        if n % TOGETHER == 0:
+            spool.let_go(points)
     return replace(recording, points=points)

@@ -1,12 +1,17 @@
 """The one data shape of a recording, 2D and 3D alike: flat arrays."""
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
+from stillmap.recording import spool
 from stillmap.recording.images import Images
+
+_ENDS = 1 << 14  # beams that are asked for their ends together
+TOGETHER = 500  # scans that are looked at one by one before what lies in files is let go
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +33,8 @@ class Recording:
         T_recorded_base: (T, D+1, D+1) float64, poses that the recording itself states, of a survey
             or another program; used only when asked for. None where there are none.
         images: pictures taken meanwhile; None where there are none.
+        scratch: folder for what becomes known of each beam, where that is too large for memory;
+            None: the system's temporary folder.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -41,6 +48,7 @@ class Recording:
     beam_time: NDArray[np.float32] | None = None
     T_recorded_base: NDArray[np.float64] | None = None
     images: Images | None = None
+    scratch: Path | None = None
 
     def __post_init__(self) -> None:
         T, M, D = self.n_scans, self.n_beams, self.dimension
@@ -58,8 +66,9 @@ class Recording:
                 _check(name, getattr(self, name), (T, D + 1, D + 1), np.float64)
         if self.beam_time is not None:
             _check("beam_time", self.beam_time, (M,), np.float32)
-            if not np.isfinite(self.beam_time).all():
-                raise ValueError("beam_time: a time is not finite")
+            for block in spool.blocks(self.beam_time):
+                if not np.isfinite(self.beam_time[block]).all():
+                    raise ValueError("beam_time: a time is not finite")
         if self.offset[0] != 0 or self.offset[-1] != M or np.any(np.diff(self.offset) < 0):
             raise ValueError(f"offset: must rise from 0 to {M}")
         if T and (self.sensor.min() < 0 or self.sensor.max() >= S):
@@ -81,6 +90,20 @@ class Recording:
         """The beams of one scan, as a slice into `points`, `hit` and results per beam."""
         return slice(int(self.offset[scan]), int(self.offset[scan + 1]))
 
+    def per_beam(self, dtype: DTypeLike, row: tuple[int, ...] = ()) -> NDArray[Any]:
+        """A new array (M, *row), its content not defined; in a file where it is large.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        return spool.empty((self.n_beams, *row), dtype, self.scratch)
+
+    def let_go(self, *more: NDArray[Any]) -> None:
+        """What lies in memory of the beams, and of other arrays, only because it was looked at."""
+        for array in (self.points, self.hit, self.beam_time, *more):
+            if array is not None:
+                spool.let_go(array)
+
     def T_map_sensor(self, T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sensor poses (T, D+1, D+1) that belong to robot poses (T, D+1, D+1)."""
         return T_map_base @ self.T_base_sensor[self.sensor]
@@ -93,11 +116,14 @@ class Recording:
         self, beams: NDArray[np.intp], T_map_base: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """(n, D) where beams (n,) ended, metres in the map frame, at robot poses (T, D+1, D+1)."""
-        D, scan = self.dimension, self.scans_of(beams)
-        # beams may be few: only the scans that they are of
-        T = T_map_base[scan] @ self.T_base_sensor[self.sensor[scan]]
-        points = self.points[beams].astype(np.float64)
-        ends: NDArray[np.float64] = np.einsum("nij,nj->ni", T[:, :D, :D], points) + T[:, :D, D]
+        D, ends = self.dimension, np.empty((len(beams), self.dimension))
+        for part in spool.blocks(beams, rows=_ENDS):
+            scan = self.scans_of(beams[part])
+            # beams may be few: only the scans that they are of
+            T = T_map_base[scan] @ self.T_base_sensor[self.sensor[scan]]
+            points = self.points[beams[part]].astype(np.float64)
+            ends[part] = np.einsum("nij,nj->ni", T[:, :D, :D], points) + T[:, :D, D]
+            self.let_go()  # they may lie anywhere in it
         return ends
 
     def without_odometry(self) -> "Recording":

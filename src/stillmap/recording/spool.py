@@ -8,13 +8,16 @@ and no crash.
 import mmap
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-IN_MEMORY = 64 << 20  # bytes of one array that are kept in memory
+IN_MEMORY = 32 << 20  # bytes of one array that are kept in memory
+_BUFFER = 1 << 20  # bytes that are written to a file together
+BLOCK = 1 << 20  # rows that are looked at together
 
 _BUFFER = 1 << 20  # bytes: parts may be as small as one scan
 
@@ -52,7 +55,7 @@ class Column:
         self._length += len(rows)
         self._parts.append(rows)
         self._bytes += rows.nbytes
-        if self._bytes > IN_MEMORY:
+        if self._bytes > (IN_MEMORY if self._file is None else min(IN_MEMORY, _BUFFER)):
             self._write()
 
     def _write(self) -> None:
@@ -93,10 +96,27 @@ def empty(shape: tuple[int, ...], dtype: DTypeLike, folder: Path | None = None) 
 def let_go(array: NDArray[Any]) -> None:
     """What of a mapped array lies in memory may go; it is read again where it is used again."""
     base: object = array
-    while isinstance(base, np.ndarray):
-        base = base.base
+    while isinstance(base, np.ndarray | memoryview):
+        base = base.base if isinstance(base, np.ndarray) else base.obj
     if isinstance(base, mmap.mmap):
         base.madvise(mmap.MADV_DONTNEED)
+
+
+def blocks(*arrays: NDArray[Any], rows: int | None = None) -> Iterator[slice]:
+    """Slices of so many rows (BLOCK), of arrays of one length; what was looked at is let go."""
+    rows = rows or BLOCK
+    for first in range(0, len(arrays[0]), rows):
+        yield slice(first, min(first + rows, len(arrays[0])))
+        for array in arrays:
+            let_go(array)
+
+
+def copied(array: NDArray[Any], folder: Path | None = None) -> NDArray[Any]:
+    """A copy to write to, in a file where it is large."""
+    out = empty(array.shape, array.dtype, folder)
+    for block in blocks(array, out):
+        out[block] = array[block]
+    return out
 
 
 def _nameless(folder: Path | None) -> Any:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.recording.model import Recording
+from stillmap.recording.spool import blocks
 from stillmap.slam import motion
 from stillmap.slam.incremental import SlamOptions
 
@@ -35,9 +36,9 @@ def deskewed(recording: Recording, poses: Float | None, options: SlamOptions) ->
     times = recording.beam_time
     if times is None or not len(times) or poses is None or not options.deskew:
         return recording
-    after, before = _pairs(recording.stamp_ns, float(times.max()), -float(times.min()))
+    after, before = _pairs(recording.stamp_ns, *_span(times))
     later, earlier = (_twists(recording, poses, *pair) for pair in (after, before))
-    points = np.empty_like(recording.points)
+    points = recording.per_beam(np.float32, (recording.dimension,))
     scans = max(1, _BLOCK * recording.n_scans // len(times))
     for first in range(0, recording.n_scans, scans):
         offset = recording.offset[first : first + scans + 1]
@@ -48,7 +49,15 @@ def deskewed(recording: Recording, poses: Float | None, options: SlamOptions) ->
             back = earlier[:, first : first + scans].repeat(counts, axis=1)
             twist = np.where(tau < 0.0, back, twist)
         points[beams] = _carried(recording.points[beams], twist * tau)
+        recording.let_go(points)
     return replace(recording, points=points, beam_time=None)
+
+
+def _span(times: NDArray[np.float32]) -> tuple[float, float]:
+    """Seconds after the stamp of the last beam of all, and before it of the first."""
+    parts = [(float(times[b].max()), -float(times[b].min())) for b in blocks(times)]
+    longest, earliest = zip(*parts, strict=True)
+    return max(longest), max(earliest)
 
 
 def _pairs(

@@ -34,6 +34,7 @@ def attempts(track: Track, candidates: Iterable[Candidate]) -> list[Closure]:
         grid = local_map(track, stretch * track.options.stretch)
         for candidate in those:
             found.append(laid_on(track, grid, candidate, *drift(candidate.metres, track.options)))
+        track.recording.let_go(track.e)
     return sorted(found, key=lambda closure: closure.later)
 
 

@@ -7,7 +7,8 @@ from stillmap.em.tracker.changes import changed
 from stillmap.em.tracker.features import features
 from stillmap.em.tracker.options import TrackerOptions
 from stillmap.em.tracker.tracks import Places, people
-from stillmap.recording.model import Recording
+from stillmap.recording.model import TOGETHER, Recording
+from stillmap.recording.spool import blocks
 
 Float = NDArray[np.float64]
 
@@ -32,13 +33,17 @@ def in_boxes(
     recording: Recording, T_map_sensor: Float, somebody: Places, half: float
 ) -> NDArray[np.bool_]:
     """(M,) which hits lie in boxes, along the axes of the map, `half` m to each side of people."""
-    inside = np.zeros(recording.n_beams, bool)
+    inside = recording.per_beam(np.bool_)
+    for block in blocks(inside):
+        inside[block] = False
     scans, first = np.unique(somebody.scan, return_index=True)
     bounds = np.append(first, len(somebody.scan))
-    for t, begin, end in zip(scans, bounds, bounds[1:], strict=False):
+    for n, (t, begin, end) in enumerate(zip(scans, bounds, bounds[1:], strict=False)):
+        if n % TOGETHER == 0:
+            recording.let_go(inside)
         beams = recording.beams_of(t)
         T = T_map_sensor[t]
         xy = (T[:2, :2] * recording.points[beams][:, None]).sum(axis=-1) + T[:2, 2]
         away = np.abs(xy[:, None] - somebody.xy[begin:end]).max(axis=-1)
-        inside[beams] = (away <= half).any(axis=1)
-    return inside & recording.hit
+        inside[beams] = (away <= half).any(axis=1) & recording.hit[beams]
+    return inside

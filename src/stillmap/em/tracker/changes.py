@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.em.tracker.features import Features, ranges
-from stillmap.recording.model import Recording
+from stillmap.recording.model import TOGETHER, Recording
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -29,6 +29,8 @@ def changed(
     of_scan = np.searchsorted(found.scan, np.arange(recording.n_scans + 1))
     for t, others in enumerate(_compared(recording, look)):
         here = slice(of_scan[t], of_scan[t + 1])
+        if t % TOGETHER == 0:
+            recording.let_go()
         if here.start == here.stop:
             continue
         for other in others:

@@ -1,0 +1,289 @@
+"""`stillmap map --resume`: an interrupted run goes on, and nobody sees that it was interrupted."""
+
+import errno
+import fcntl
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import time
+
+import numpy as np
+import pytest
+
+from stillmap import result
+from stillmap.checkpoint import place
+from stillmap.output import beams
+from stillmap.pipeline import iterate
+
+WORDS = ("--set", "em.max_iterations=4", "--set", "em.patience=9", "--set", "em.tolerance=0")
+WORDS += ("--set", "em.settled=0", "--threads", "1")
+ALL = 4  # iterations
+
+
+def contents(folder) -> dict[str, bytes]:
+    """All files, without what tells of time and memory in them."""
+    out = {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    run = json.loads(out["run.json"])
+    for name in ("seconds", "cpu_seconds", "peak_memory_bytes"):
+        del run[name]
+    for iteration in run["iterations"]:
+        del iteration["seconds"]
+    report = re.sub(
+        rb"Where time and memory went.*?</section>", b"", out["report.html"], flags=re.S
+    )
+    report = re.sub(rb"<div><dt>(Computed in|Peak memory)</dt>.*?</div>", b"", report)
+    report = re.sub(rb"<td[^<>]*>[0-9.,]+ (ms|s|min)</td>", b"", report)
+    return {**out, "run.json": json.dumps(run).encode(), "report.html": report}
+
+
+@pytest.fixture(scope="module")
+def whole(stillmap, room, tmp_path_factory) -> dict[str, bytes]:
+    """What a run writes that nobody interrupts."""
+    out = tmp_path_factory.mktemp("whole") / "out"
+    done = stillmap("map", room, "-o", out, *WORDS)
+    assert done.returncode == 0, done.stderr
+    assert os.listdir(out.parent) == ["out"]
+    assert len(json.loads((out / "run.json").read_text())["iterations"]) == ALL
+    return contents(out)
+
+
+@pytest.fixture
+def stop_after(monkeypatch):
+    """Ctrl-C after so many iterations of this process."""
+
+    def stop(number: int) -> None:
+        def stopped(*args, **how):
+            for n, iteration in enumerate(iterate(*args, **how)):
+                if n == number:
+                    raise KeyboardInterrupt
+                yield iteration
+
+        monkeypatch.setattr(result.pipeline, "iterate", stopped if number < ALL else iterate)
+
+    return stop
+
+
+@pytest.fixture
+def interrupted(call, room, tmp_path, stop_after):
+    """The place of a run that was stopped after two iterations."""
+    stop_after(2)
+    done = call("map", room, "-o", tmp_path / "out", *WORDS)
+    assert done.returncode == 130
+    assert "--resume" in done.stderr
+    assert os.listdir(tmp_path) == [".out.resume"]
+    stop_after(ALL)
+    return tmp_path / ".out.resume"
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_the_result_is_that_of_a_run_nobody_stopped(
+    call, room, tmp_path, stop_after, whole, number
+):
+    stop_after(number)
+    assert call("map", room, "-o", tmp_path / "out", *WORDS).returncode == 130
+    stop_after(ALL)
+    done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
+    assert done.returncode == 0, done.stderr
+    assert f"goes on after iteration {number}" in done.stderr
+    assert contents(tmp_path / "out") == whole
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_it_may_be_stopped_again_and_again(call, room, tmp_path, stop_after, whole):
+    stop_after(1)
+    for _ in range(ALL - 1):
+        done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
+        assert done.returncode == 130
+    stop_after(ALL)
+    assert call("map", room, "-o", tmp_path / "out", "--resume", *WORDS).returncode == 0
+    assert contents(tmp_path / "out") == whole
+
+
+@pytest.mark.parametrize("estimator", ["paper", "tracker", "hit-ratio"])
+def test_other_estimators(call, room, tmp_path, stop_after, estimator):
+    words = ("--estimator", estimator, *WORDS)
+    assert call("map", room, "-o", tmp_path / "whole", *words).returncode == 0
+    stop_after(1)
+    call("map", room, "-o", tmp_path / "out", *words)
+    stop_after(ALL)
+    assert call("map", room, "-o", tmp_path / "out", "--resume", *words).returncode == 0
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+def test_given_poses(call, room, tmp_path, stop_after):
+    words = ("--poses", room / "truth/trajectory.tum", *WORDS)
+    assert call("map", room, "-o", tmp_path / "whole", *words).returncode == 0
+    stop_after(1)
+    assert call("map", room, "-o", tmp_path / "out", *words).returncode == 130
+    stop_after(ALL)
+    done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
+    assert done.returncode == 2
+    assert "given poses" in done.stderr
+    assert call("map", room, "-o", tmp_path / "out", "--resume", *words).returncode == 0
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+def test_nothing_to_resume_simply_starts(call, room, tmp_path, whole):
+    assert call("map", room, "-o", tmp_path / "out", "--resume", *WORDS).returncode == 0
+    assert contents(tmp_path / "out") == whole
+    # and once more over its own result
+    assert call("map", room, "-o", tmp_path / "out", "--resume", *WORDS).returncode == 0
+    assert contents(tmp_path / "out") == whole
+
+
+def test_without_resume_it_begins_anew_and_says_so(call, room, tmp_path, interrupted, whole):
+    done = call("map", room, "-o", tmp_path / "out", *WORDS)
+    assert done.returncode == 0
+    assert "begins anew" in done.stderr
+    assert not interrupted.exists()
+    assert contents(tmp_path / "out") == whole
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--set", "em.prior=0.8"), "em.prior was 0.9, is 0.8"),
+        (("--resolution", "0.1"), "slam.resolution was 0.05, is 0.1"),
+        (("--no-odometry",), "odometry"),
+    ],
+)
+def test_other_options_are_refused_by_name(call, room, tmp_path, interrupted, words, named):
+    done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS, *words)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert named in done.stderr
+    assert (interrupted / "iteration-2/state.json").exists()
+
+
+def test_another_recording_is_refused(call, room, tmp_path, interrupted):
+    other = tmp_path / "other"
+    shutil.copytree(room, other)
+    points = np.load(other / "points.npy")
+    points[77] += 0.01
+    np.save(other / "points.npy", points)
+    done = call("map", other, "-o", tmp_path / "out", "--resume", *WORDS)
+    assert done.returncode == 2
+    assert "another recording: beams differ" in done.stderr
+    assert interrupted.exists()
+
+
+def test_the_same_recording_elsewhere_will_do(call, room, tmp_path, interrupted):
+    shutil.copytree(room, tmp_path / "moved")
+    done = call("map", tmp_path / "moved", "-o", tmp_path / "out", "--resume", *WORDS)
+    assert done.returncode == 0
+    assert "goes on after iteration 2" in done.stderr
+    assert not interrupted.exists()
+
+
+def test_threads_make_no_difference(call, room, tmp_path, interrupted, whole):
+    words = (*WORDS[:-1], "2")
+    assert call("map", room, "-o", tmp_path / "out", "--resume", *words).returncode == 0
+    assert not interrupted.exists()
+    mine = contents(tmp_path / "out")
+    differ = {name for name in whole if mine[name] != whole[name]}
+    assert differ <= {"run.json", "report.html"}  # they tell the number of threads
+
+
+def flip(path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+
+
+def cut(path) -> None:
+    path.write_bytes(path.read_bytes()[:-7])
+
+
+@pytest.mark.parametrize("damage", [flip, cut, os.remove])
+@pytest.mark.parametrize("name", ["state.json", "best.poses.npy", "e-2.npy"])
+def test_a_damaged_checkpoint_is_named_and_begun_anew(
+    call, room, tmp_path, interrupted, whole, damage, name
+):
+    damage(interrupted / "iteration-2" / name)
+    done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
+    assert done.returncode == 0
+    assert f"iteration-2/{name}" in done.stderr
+    assert "begins anew" in done.stderr
+    assert contents(tmp_path / "out") == whole
+
+
+def test_two_runs_into_one_folder(call, room, tmp_path, interrupted):
+    with (interrupted / "lock").open("ab") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "another run" in done.stderr
+    assert (interrupted / "iteration-2").exists()
+
+
+def test_bad_input_leaves_nothing(call, tmp_path):
+    done = call("map", tmp_path / "none.log", "-o", tmp_path / "a/b/out", *WORDS)
+    assert done.returncode == 2
+    assert os.listdir(tmp_path) == []
+
+
+class _Full:
+    """Writes until the disk is full."""
+
+    def __init__(self, write, after: int) -> None:
+        self._write, self._left = write, after
+
+    def __call__(self, path, array) -> None:
+        self._left -= 1
+        if self._left < 0:
+            path.write_bytes(b"half of it")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        self._write(path, array)
+
+
+@pytest.mark.parametrize("after", [0, 5, 12])
+def test_a_full_disk_leaves_the_checkpoint_before(
+    call, room, tmp_path, interrupted, whole, monkeypatch, after
+):
+    with monkeypatch.context() as here:
+        here.setattr(place, "write_npy", _Full(place.write_npy, after))
+        done = call("map", room, "-o", tmp_path / "out", "--resume", "--quiet", *WORDS)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "No space left" in done.stderr
+    assert sorted(os.listdir(interrupted)) == ["iteration-2", "lock"]
+    assert call("map", room, "-o", tmp_path / "out", "--resume", *WORDS).returncode == 0
+    assert contents(tmp_path / "out") == whole
+
+
+def test_a_full_disk_leaves_the_earlier_result(call, room, tmp_path, whole, monkeypatch):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "old.txt").write_text("old")
+    with monkeypatch.context() as here:
+        here.setattr(beams, "write_npy", _Full(beams.write_npy, 2))
+        done = call("map", room, "-o", out, "--overwrite", "--quiet", *WORDS)
+    assert done.returncode == 2
+    assert "No space left" in done.stderr
+    assert os.listdir(out) == ["old.txt"]
+    assert sorted(os.listdir(tmp_path / ".out.resume")) == [f"iteration-{ALL}", "lock"]
+    assert call("map", room, "-o", out, "--resume", *WORDS).returncode == 0
+    assert contents(out) == whole
+
+
+@pytest.mark.slow
+def test_killed_at_any_moment_it_goes_on(start, room, tmp_path, whole):
+    rng = random.Random(3)
+    for _ in range(6):
+        process = start("map", room, "-o", tmp_path / "out", "--resume", "--quiet", *WORDS)
+        try:
+            process.wait(rng.uniform(0.3, 4.0))
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+        process.communicate()
+    process = start("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
+    begun = time.monotonic()
+    _, err = process.communicate()
+    assert process.returncode == 0, (err, time.monotonic() - begun)
+    assert contents(tmp_path / "out") == whole
+    assert os.listdir(tmp_path) == ["out"]
