@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import get_args
 
 from stillmap import options, slam
+from stillmap.cli.progress import shown_share
 from stillmap.cli.reading import read_changes
 from stillmap.cli.results import Mapped, found, is_result, require_apart
 from stillmap.errors import InputError
@@ -36,7 +37,8 @@ def _convert_recording(
     require_apart(output, source)
     writer = writers.writer_for(output, args.to)
     writers.require_free(output, writer, args.overwrite)
-    recording = read(source, read_options)
+    with shown_share(args.quiet, "reading") as tell:
+        recording = read(source, read_options, progress=tell, scratch=output.absolute().parent)
     if not recording.n_scans:
         raise InputError("holds no scan", where=str(source))
     lost = writers.write(recording, output, name=args.to, overwrite=args.overwrite)

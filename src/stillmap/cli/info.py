@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from stillmap.cli.commands import COMMANDS
+from stillmap.cli.progress import shown_share
 from stillmap.cli.reading import add_read_flags, read_changes
 
 _LINES_SHOWN = 10
@@ -28,6 +29,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("input", metavar="INPUT", help="a file or folder with a recording")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    parser.add_argument("--quiet", action="store_true", help="no progress")
     add_read_flags(parser)
     parser.set_defaults(run=run)
 
@@ -44,7 +46,9 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.recording.facts import facts
 
     read_options = options.replaced(ReadOptions(), read_changes(args).get("read", {}))
-    found = {"input": args.input, **facts(read(args.input, read_options))}
+    with shown_share(args.quiet, "reading") as tell:
+        recording = read(args.input, read_options, progress=tell)
+    found = {"input": args.input, **facts(recording)}
     if args.json:
         print(json.dumps(found, indent=2, allow_nan=False))
     else:

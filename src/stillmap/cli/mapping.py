@@ -15,7 +15,7 @@ from stillmap import em
 from stillmap.checkpoint import Damaged, Place, held, identity
 from stillmap.cli.options import resolved_options
 from stillmap.cli.printing import files_in, print_json
-from stillmap.cli.progress import say, shown_progress
+from stillmap.cli.progress import say, shown_progress, shown_share
 from stillmap.cli.reading import read_changes
 from stillmap.errors import InputError
 from stillmap.loop import Loop
@@ -67,7 +67,9 @@ def _mapped(args: argparse.Namespace, options: Options, place: Place) -> Result:
     """The whole job but for writing; how far it has come is kept after every iteration."""
     stages = Stages()
     with stages.measure("read"):
-        recording = _usable(read(Path(args.input), options.read, scratch=place.folder), args)
+        with shown_share(args.quiet, "reading") as tell:
+            found = read(Path(args.input), options.read, progress=tell, scratch=place.folder)
+        recording = _usable(found, args)
         poses = _given_poses(recording, args)
         same = identity(recording, options, poses)
     loop = _resumed(args, place, same, options, stages)

@@ -3,7 +3,7 @@
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -49,6 +49,43 @@ def shown_progress(quiet: bool, iterations: int) -> "Iterator[Progress]":
             yield progress
     else:
         yield _Lines(iterations)
+
+
+@contextmanager
+def shown_share(quiet: bool, what: str) -> "Iterator[Callable[[float], None] | None]":
+    """What shows the share of a job that is done, from 0 to 1; None where nobody looks."""
+    if quiet or sys.stderr is None:
+        yield None
+    elif is_terminal(sys.stderr):
+        from rich.console import Console
+        from rich.progress import Progress as Bar
+
+        bar = Bar(console=Console(stderr=True), transient=True)
+        task = bar.add_task(what, total=1.0)
+
+        def update(share: float) -> None:
+            bar.start()  # not before there is something to show
+            bar.update(task, completed=share)
+
+        try:
+            yield update
+        finally:
+            bar.stop()
+    else:
+        yield _Shares(what)
+
+
+class _Shares:
+    """A line every few seconds: none of what takes no longer."""
+
+    def __init__(self, what: str) -> None:
+        self._what, self._last = what, time.monotonic()
+
+    def __call__(self, share: float) -> None:
+        now = time.monotonic()
+        if now - self._last >= _EVERY:
+            self._last = now
+            say(f"{self._what}: {100.0 * share:.0f} %")
 
 
 @contextmanager

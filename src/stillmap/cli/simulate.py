@@ -2,22 +2,18 @@
 
 import argparse
 import math
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.commands import COMMANDS
 from stillmap.cli.options import add_set, assignments
 from stillmap.cli.printing import files_in, print_json
-from stillmap.cli.progress import say
-from stillmap.cli.terminal import is_terminal
+from stillmap.cli.progress import say, shown_share
 from stillmap.errors import InputError
 
 if TYPE_CHECKING:
     from stillmap.simulation import Simulation
-    from stillmap.simulation.motion import Progress
 
 _SCENES = {
     "hall": "45 x 30 m, 15 people",
@@ -159,7 +155,7 @@ def run(args: argparse.Namespace) -> int:
         require_carmen(scene.laser)
     output = Path(args.output)
     require_new(output, args.overwrite)
-    with _shown_progress(args.quiet) as progress:
+    with shown_share(args.quiet, "simulating") as progress:
         simulation = simulate(scene, np.random.default_rng(args.seed), progress)
     write_simulation(simulation, output, format=args.format, overwrite=args.overwrite)
     summary = _summary(simulation, output)
@@ -207,17 +203,3 @@ def _summary(simulation: "Simulation", output: Path) -> dict[str, Any]:
         "hits": int(recording.hit.sum()),
         "dynamic": int((simulation.truth.mover >= 0).sum()),
     }
-
-
-@contextmanager
-def _shown_progress(quiet: bool) -> "Iterator[Progress | None]":
-    """A bar on a terminal; elsewhere the summary says enough about a job of seconds."""
-    if quiet or not is_terminal(sys.stderr):
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import Progress as Bar
-
-    with Bar(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("simulating", total=1.0)
-        yield lambda share: bar.update(task, completed=share)
