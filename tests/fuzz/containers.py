@@ -218,7 +218,7 @@ def changed_db3(data: bytes, change: Change, chance: random.Random) -> bytes:
             rows = [row[0] for row in base.execute(f"SELECT rowid FROM {table} LIMIT 100")]
             column, row = chance.choice(columns), chance.choice(rows)
             query = f"SELECT {column} FROM {table} WHERE rowid = ?"
-            (old,) = base.execute(query, (row,)).fetchone()
+            (old,) = base.execute(query, (row,)).fetchone() or (None,)
             if isinstance(old, bytes) and chance.random() < 0.8:
                 new = change(old)
             elif isinstance(old, str) and chance.random() < 0.5:
@@ -228,7 +228,7 @@ def changed_db3(data: bytes, change: Change, chance: random.Random) -> bytes:
             base.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", (new, row))
         base.commit()
         return bytes(base.serialize())
-    except (sqlite3.Error, LookupError, OverflowError):
+    except (sqlite3.Error, LookupError, ValueError, OverflowError):
         return change(data)
 
 

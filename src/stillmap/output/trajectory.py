@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from stillmap.errors import InputError
 from stillmap.recording.stamps import seconds_text
+from stillmap.texts import read_text
 
+LARGEST = 128 << 20  # bytes: four hours at 100 Hz
 _COLUMNS = "stamp x y z qx qy qz qw"
 # a quaternion printed with three decimals still lies well within this of length one
 _UNIT_TOLERANCE = 0.02
@@ -73,9 +75,7 @@ def _rows_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+        return read_text(path, LARGEST).splitlines()
     except UnicodeDecodeError as error:
         raise InputError("is not a text file", where=str(path)) from error
 

@@ -12,13 +12,14 @@ from stillmap.output.atomic import new_folder
 from stillmap.recording import folder_images
 from stillmap.recording.images import Images
 from stillmap.recording.model import Recording
+from stillmap.texts import read_text, require_regular
 
 HEADER = "recording.json"
 FORMAT = "stillmap-recording"
 FORMAT_VERSION = 1
 
 _CHUNK = 1 << 20  # beams looked at together: points need not fit in memory
-_MAX_HEADER = 64 << 20  # bytes
+_MAX_HEADER = 16 << 20  # bytes: a JSON of empty lists takes thirty times as many
 
 
 def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:
@@ -124,11 +125,8 @@ def _no_number(text: str) -> float:
 
 def _header(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > _MAX_HEADER:
-            raise InputError("is no header of a recording: too large", where=str(path))
-        header = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_number)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+        require_regular(path)
+        header = json.loads(read_text(path, _MAX_HEADER), parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
         raise InputError(f"is not JSON: {error}", where=str(path)) from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
@@ -152,6 +150,7 @@ def _size(path: Path, header: dict[str, Any], key: str) -> int:
 def _array(path: Path, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
     """One `.npy` file as it lies on disk, of exactly this shape and type."""
     file = path / f"{name}.npy"
+    require_regular(file)
     try:
         # np.load would also open archives and pickles that bear the name
         loaded = np.lib.format.open_memmap(file, mode="r")

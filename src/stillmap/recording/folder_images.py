@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stillmap.errors import InputError
 from stillmap.recording.images import Camera, Images
 from stillmap.recording.pictures import read_picture, write_picture
+from stillmap.texts import require_regular
 
 FOLDER = "images"
 
@@ -100,6 +101,7 @@ def _load(folder: Path, image: int) -> NDArray[Any]:
     if path.exists():
         return read_picture(path)
     path = path.with_suffix(".npy")
+    require_regular(path)
     try:
         # np.load would also open archives and pickles that bear the name
         picture = np.array(np.lib.format.open_memmap(path, mode="r"))

@@ -20,7 +20,7 @@ from stillmap.recording.ros.unpacking import ZstdError, zstd_stream
 from stillmap.recording.skipped import Skipped
 
 _MAX_GROWTH, _SURELY_FINE = 100, 1 << 30  # of a packed file: times its size, bytes
-_MAX_METADATA = 1 << 20  # bytes: YAML takes ten seconds for them
+_MAX_METADATA = 256 << 10  # bytes: YAML takes two seconds for them
 _PIECE = 1 << 20
 
 

@@ -99,6 +99,7 @@ def _bag1_records(
     end = _size(file)
     while file.tell() < end:
         at = file.tell()
+        unpacking.charge(unpacking.RECORD)
         header = Header.read(file)  # type: ignore[arg-type]
         kind, size = header.get_uint8("op"), _number(file, 4)
         if kind == RecordType.CHUNK and not chunks:
@@ -152,9 +153,12 @@ def _mcap_records(
     end = _size(file)
     while file.tell() < end:
         at = file.tell()
+        unpacking.charge(unpacking.RECORD)
         kind = _number(file, 1)
         if kind == 0x89:  # the magic at the end
             return
+        if kind == 0:
+            raise _CutError
         size = min(_number(file, 8), end)
         # of a chunk that is cut the beginning can be unpacked
         data = file.read(size) if kind == 0x06 else _exactly(file, size, end)

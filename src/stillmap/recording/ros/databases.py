@@ -17,9 +17,9 @@ from stillmap.errors import InputError
 from stillmap.recording.ros.unpacking import LIMIT
 
 _TABLES = ("topics", "messages", "schema", "message_definitions")
-_STEP = 10_000  # of SQLite's machine: so often it is looked at
-_STEPS_PER_BYTE = 100  # a row takes some 20, and has as many bytes
-_SURELY_FINE = 10_000_000  # steps, a fraction of a second
+_STEP = 1000  # of SQLite's machine: so often it is looked at
+_STEPS_PER_BYTE = 30  # a row takes some 20, and has as many bytes and more
+_SURELY_FINE = 1_000_000  # steps: a hundredth of a second
 
 
 def address(path: Path, more: str = "") -> str:

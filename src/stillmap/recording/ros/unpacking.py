@@ -20,7 +20,8 @@ LIMIT = 256 << 20  # bytes of one chunk or message; recorders write chunks of ab
 
 ZstdError = zstd.ZstdError
 
-_MAX_GROWTH, _SURELY_FINE = 300, 2 << 30  # of a bag: times its size, bytes
+_MAX_GROWTH, _SURELY_FINE = 300, 512 << 20  # of a bag: times its size, bytes
+RECORD = 64  # bytes that a record counts for, though nothing be in it
 
 
 class TooMuchError(InputError):

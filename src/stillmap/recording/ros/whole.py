@@ -5,10 +5,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinitionFormat, QosDurability
+from rosbags.interfaces import (
+    ConnectionExtRosbag2,
+    MessageDefinitionFormat,
+    Qos,
+    QosDurability,
+)
 from rosbags.rosbag1 import reader as rosbag1
-from rosbags.rosbag2 import storage_mcap
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+from rosbags.rosbag2 import storage_mcap, storage_sqlite3
+from rosbags.rosbag2.metadata import parse_qos
 
 from stillmap.errors import InputError
 from stillmap.recording.ros import databases, unpacking
@@ -18,6 +23,17 @@ from stillmap.recording.skipped import Skipped
 # the library unpacks whatever comes; its table is where it can be told to stop
 storage_mcap.DECOMPRESSORS["lz4"] = lambda data, _: unpacking.lz4_unpacked(data)
 storage_mcap.DECOMPRESSORS["zstd"] = lambda data, _: unpacking.zstd_unpacked(data)
+
+_MAX_PROFILES = 16 << 10  # bytes of YAML about how a topic was sent
+
+
+def _profiles(said: Any) -> list[Qos]:
+    return [] if isinstance(said, str) and len(said) > _MAX_PROFILES else parse_qos(said)
+
+
+# a megabyte of YAML takes the library half a minute
+for _module in (storage_mcap, storage_sqlite3):
+    vars(_module).update(parse_qos=_profiles)
 
 _BOUNDED = {
     rosbag1.decompressors["bz2"]: unpacking.bz2_unpacked,
@@ -101,7 +117,7 @@ def open_mcap(path: Path) -> WholeBag:
 def open_db3(path: Path) -> WholeBag:
     """A SQLite file of ROS 2. Raises whatever the library says of one that is damaged."""
     # the library makes an address of the path
-    reader = Sqlite3Reader(Path(databases.address(path)))
+    reader = storage_sqlite3.Sqlite3Reader(Path(databases.address(path)))
     with databases.bounded(path):
         reader.open()
     return WholeBag("SQLite bag", reader)
