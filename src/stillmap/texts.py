@@ -25,10 +25,10 @@ def read_text(path: Path, largest: int) -> str:
 def require_regular(path: Path) -> None:
     """Refuse pipes and devices that lie where a file should: reading may wait for ever.
 
-    What is not there at all is left to who opens it.
+    A folder, or what is not there at all, is left to who opens it.
 
     Raises:
         InputError: there is something else than a file.
     """
-    if path.exists() and not path.is_file():
+    if path.exists() and not path.is_file() and not path.is_dir():
         raise InputError("is no regular file", where=str(path))

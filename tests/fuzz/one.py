@@ -31,8 +31,7 @@ def main(words: list[str]) -> None:
     # a wild count shall be an error here, and not bring the machine down
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESSES, ADDRESSES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    shm = Path("/dev/shm")
-    work = Path(tempfile.mkdtemp(prefix="stillmap-fuzz-", dir=shm if shm.is_dir() else None))
+    work = Path(tempfile.mkdtemp(prefix="stillmap-fuzz-"))
     corpus = work / "corpus"
     corpus.mkdir()
     for number, seed in enumerate(target.seeds(_new(work / "seeds"))):

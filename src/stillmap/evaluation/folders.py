@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.arrays import open_npy
 from stillmap.errors import InputError
 from stillmap.evaluation.map import Grid
 from stillmap.recording.folder import read as read_folder
@@ -166,14 +167,7 @@ def read_grid(result: Path) -> Grid:
 
 def _array(path: Path, shape: tuple[int | None, ...], kinds: str) -> NDArray[Any]:
     """An .npy array of this shape (None: any length) and one of these kinds of dtype."""
-    require_regular(path)
-    try:
-        # np.load would also open archives that bear the name
-        array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
-    except OSError as error:
-        raise InputError(_reason(error), where=str(path)) from error
-    except Exception as error:  # whatever NumPy's parser makes of damaged bytes
-        raise InputError(f"is damaged: {error}", where=str(path)) from error
+    array = open_npy(path)
     if len(array.shape) != len(shape) or any(
         want not in (None, got) for got, want in zip(array.shape, shape, strict=True)
     ):

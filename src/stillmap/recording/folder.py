@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.arrays import open_npy
 from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
 from stillmap.recording import folder_images
@@ -149,15 +150,7 @@ def _size(path: Path, header: dict[str, Any], key: str) -> int:
 
 def _array(path: Path, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
     """One `.npy` file as it lies on disk, of exactly this shape and type."""
-    file = path / f"{name}.npy"
-    require_regular(file)
-    try:
-        # np.load would also open archives and pickles that bear the name
-        loaded = np.lib.format.open_memmap(file, mode="r")
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", where=str(file)) from error
-    except Exception as error:  # whatever NumPy's parser makes of damaged bytes
-        raise InputError(f"is damaged: {error}", where=str(file)) from error
+    loaded = open_npy(path / f"{name}.npy")
     if loaded.shape != shape or loaded.dtype != np.dtype(dtype):
         raise _damaged(
             path,

@@ -11,8 +11,8 @@ from typing import IO, NamedTuple
 from stillmap.errors import InputError
 
 MAX_LINE = 1 << 20  # bytes: a scan of 3600 readings with remissions has a tenth of it
-# of a packed text: times its size, bytes. Logs pack 20:1; scans that never change 200:1
-_MAX_GROWTH, _SURELY_FINE = 200, 256 << 20
+# of a packed text: times its size, bytes; logs pack 20:1. A line counts for more than its bytes
+_MAX_GROWTH, _SURELY_FINE, _LINE = 100, 64 << 20, 32
 _GZIP_MAGIC = b"\x1f\x8b"
 _DAMAGED = (EOFError, zlib.error, gzip.BadGzipFile)
 
@@ -86,14 +86,15 @@ def numbered_lines(path: Path, progress: Progress | None = None) -> Iterator[Lin
         try:
             while text := stream.readline(MAX_LINE):
                 number += 1
-                unpacked += len(text)
+                unpacked += len(text) + _LINE
                 ended = text.endswith(b"\n")
                 too_long = not ended and len(text) == MAX_LINE
                 if too_long:
                     unpacked += _skip_rest(stream, most - unpacked)
                 if unpacked > most:
                     what = f"is too large: it unpacks to more than {_MAX_GROWTH} times its size"
-                    raise InputError(what, where=str(path))
+                    hint = "it can be read if it is unpacked before"
+                    raise InputError(what, where=str(path), hint=hint)
                 yield Line(number, text, ended, too_long)
                 if progress is not None and number % 500 == 0:
                     progress(min(file.tell() / size, 1.0))

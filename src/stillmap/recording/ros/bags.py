@@ -18,6 +18,7 @@ from stillmap.recording.ros.kinds import (
 )
 from stillmap.recording.ros.unpacking import ZstdError, zstd_stream
 from stillmap.recording.skipped import Skipped
+from stillmap.texts import require_regular
 
 _MAX_GROWTH, _SURELY_FINE = 100, 1 << 30  # of a packed file: times its size, bytes
 _MAX_METADATA = 256 << 10  # bytes: YAML takes two seconds for them
@@ -57,8 +58,7 @@ def size_of(path: Path) -> int:
 
 
 def _opened_file(path: Path, scratch: Path | None, trusted: bool) -> Bag:
-    if path.exists() and not path.is_file():  # a pipe would be waited for
-        raise InputError("is no regular file", where=str(path))
+    require_regular(path)
     try:
         with path.open("rb") as file:
             start = file.read(32)
