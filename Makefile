@@ -2,8 +2,9 @@
 #   make demo    simulate a populated hall, map it, say where the result lies
 #   make test    build and test (about 5 minutes on 2 cores)
 #   make lint    style, types, formatting
-#   make check   lint and test, then what takes longer: slow tests and fuzzing, real recordings,
-#                packages, the kernels under sanitizers
+#   make fuzz    files changed for every reader, a minute each (FUZZ_SECONDS)
+#   make check   lint and test, then what takes longer: slow tests, real recordings, packages,
+#                the kernels under sanitizers, fuzzing
 #   make clean   remove what was made
 # `make PYTHON=python3.12 ...` takes another Python, CXX another compiler.
 
@@ -16,15 +17,18 @@ SANITIZED := build/sanitized
 SOURCES := pyproject.toml CMakeLists.txt $(shell find src cpp -not -name '_core*' \
   -not -name '__pycache__' -not -name '*.pyc' -not -name '* *')
 
+# for each reader
+FUZZ_SECONDS ?= 60
+
 export PYTHONNOUSERSITE := 1
 # what is tested is what was installed
 unexport PYTHONPATH PYTHONHOME
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint stub sanitize check format clean
+.PHONY: help demo test test-slow lint stub sanitize fuzz check format clean
 
 help:
-	@sed -n 's/^#  *//p' Makefile | sed -n '1,8p'
+	@sed -n 's/^#  *//p' Makefile | sed -n '1,9p'
 
 # The user's way: an isolated build. `make test` installs over it.
 $(VENV)/installed: $(VENV)/created $(SOURCES)
@@ -90,7 +94,16 @@ sanitize: $(VENV)/tested
 	PYTHONPATH=$(SANITIZED)/site ASAN_OPTIONS=detect_leaks=0 LD_PRELOAD="$(RUNTIMES)" \
 	  $(BIN)/python -m pytest --capture=sys tests/agreement tests/paper tests/property
 
-check: lint test test-slow sanitize
+$(VENV)/fuzzed: $(VENV)/tested
+	@echo "installing the fuzzer into $(VENV)"
+	@$(PIP) install --no-build-isolation --config-settings=build-dir=build/tested '.[fuzz]'
+	@touch $@
+
+# Files for every reader, changed until something comes out that nobody expects.
+fuzz: $(VENV)/fuzzed
+	$(BIN)/python tests/fuzz/run.py $(FUZZ_SECONDS)
+
+check: lint test test-slow sanitize fuzz
 
 clean:
 	rm -rf $(VENV) build dist demo .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,6 +1,10 @@
 """The one exception that stands for bad input or a bad call."""
 
+import re
 from collections.abc import Iterable
+
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f]")
+_LONGEST = 1000  # letters of a line: what a damaged file holds is no reading matter
 
 
 class InputError(Exception):
@@ -15,15 +19,21 @@ class InputError(Exception):
     """
 
     def __init__(self, what: str, *, where: str = "", hint: str = "") -> None:
-        self.what = what
+        self.what = _short(what)
         self.where = where
-        self.hint = hint
+        self.hint = _short(hint)
         super().__init__(str(self))
 
     def __str__(self) -> str:
         place = f"{self.where}: " if self.where else ""
         advice = f" ({self.hint})" if self.hint else ""
-        return f"{place}{self.what}{advice}".replace("\n", " ")
+        line = f"{place}{self.what}{advice}".replace("\n", " ")
+        # names in files and of files may hold what a terminal obeys
+        return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", line)
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
 def nearest(word: str, known: Iterable[str], least: float = 0.6) -> str | None:

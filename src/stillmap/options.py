@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from stillmap.errors import InputError, nearest
+from stillmap.texts import read_text
 
 T = TypeVar("T")
 
 _INTEGERS_BELOW = 2**31  # the compiled core counts in 32 bits
+_LARGEST = 64 << 10  # bytes of a file: of nested keys, more take Python minutes
 
 
 def field_with_doc(default: Any, doc: str) -> Any:
@@ -67,15 +69,23 @@ def _coerced(value: Any, hint: Any, name: str, where: str) -> Any:
             return value
         if choice is float and isinstance(value, int | float) and not isinstance(value, bool):
             if not abs(value) <= sys.float_info.max:  # nan, inf, and integers beyond them
-                raise InputError(f"'{name}' wants a finite number, got {value}", where=where)
+                what = f"'{name}' wants a finite number, got {_shown(value)}"
+                raise InputError(what, where=where)
             return float(value)
         if choice in (int, bool, str) and type(value) is choice:
             if choice is int and abs(value) >= _INTEGERS_BELOW:
-                raise InputError(f"'{name}' is too large: {value}", where=where)
+                raise InputError(f"'{name}' is too large: {_shown(value)}", where=where)
             return value
         if choice is type(None) and value is None:
             return value
-    raise InputError(f"'{name}' wants {_type_name(hint)}, got {value!r}", where=where)
+    raise InputError(f"'{name}' wants {_type_name(hint)}, got {_shown(value)}", where=where)
+
+
+def _shown(value: Any) -> str:
+    try:
+        return repr(value)
+    except ValueError:  # Python writes no number of thousands of digits
+        return "a huge number"
 
 
 def _alternatives(hint: Any) -> tuple[Any, ...]:
@@ -91,12 +101,14 @@ def _type_name(hint: Any) -> str:
 
 
 def load_toml(path: Path) -> dict[str, Any]:
-    """The nested dictionary of a TOML file."""
+    """The nested dictionary of a TOML file.
+
+    Raises:
+        InputError: it cannot be read, is no TOML, or is too large for a file of options.
+    """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        return tomllib.loads(read_text(path, _LARGEST))
+    except (ValueError, RecursionError) as error:  # ValueError: numbers of thousands of digits too
         line = re.search(r" \(at line (\d+), column \d+\)$", str(error))
         what = str(error)[: line.start()] if line else str(error)
         where = f"{path}:{line[1]}" if line else str(path)
@@ -110,7 +122,7 @@ def parse_assignment(text: str) -> dict[str, Any]:
         raise InputError(f"--set wants section.key=value, got '{text}'")
     try:
         read = tomllib.loads(f"value = {value}")
-    except (tomllib.TOMLDecodeError, RecursionError):
+    except (ValueError, RecursionError):
         read = {}
     # more than one key: the value had several lines, and only looked like TOML
     parsed = read["value"] if len(read) == 1 else value.strip()

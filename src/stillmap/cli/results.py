@@ -12,9 +12,10 @@ from stillmap.errors import InputError
 from stillmap.evaluation.folders import Labels, read_labels
 from stillmap.recording import Recording, folder, read
 from stillmap.recording.options import ReadOptions
+from stillmap.texts import read_text, require_regular
 
 _RECORD = "run.json"
-_MAX_RUN = 256 << 20  # bytes of a run.json
+_MAX_RUN = 32 << 20  # bytes of a run.json
 
 
 @dataclass(frozen=True)
@@ -99,12 +100,11 @@ def require_apart(output: Path, recording: Path, result: Path | None = None) -> 
 
 def _run_record(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > _MAX_RUN:
-            raise InputError("is no record of a run: too large", where=str(path))
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
+        require_regular(path)
+        record = json.loads(read_text(path, _MAX_RUN))
+    except InputError as error:
         hint = "DIR is what `stillmap map` wrote"
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path), hint=hint) from error
+        raise InputError(error.what, where=error.where, hint=hint) from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"is not JSON: {error}", where=str(path)) from error
     if not isinstance(record, dict) or not isinstance(record.get("input"), dict):

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.errors import InputError
-from stillmap.output.trajectory import read_tum
+from stillmap.output.trajectory import LARGEST, read_tum
 from stillmap.recording.carmen_log import CarmenLog, read_log
 from stillmap.recording.lines import head
+from stillmap.texts import read_text, require_regular
 
 Float = NDArray[np.float64]
 
@@ -113,6 +114,7 @@ class _FirstRow:
 
 def _first_row(path: Path, wanted: str) -> _FirstRow:
     """What the first row looks like: how many columns, and whether it starts with a word."""
+    require_regular(path)
     text = head(path, _HEAD).decode("utf-8", "replace")
     for line in text.splitlines():
         words = line.split("#")[0].split()
@@ -132,9 +134,7 @@ def _is_number(word: str) -> bool:
 def _rows(path: Path, columns: int, names: str) -> Float:
     """(N, columns) finite numbers; what follows a # is a comment."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+        lines = read_text(path, LARGEST).splitlines()
     except UnicodeDecodeError as error:
         raise InputError("is not a text file", where=str(path)) from error
     rows = [

@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.arrays import open_npy
 from stillmap.errors import InputError
 from stillmap.evaluation.map import Grid
 from stillmap.recording.folder import read as read_folder
 from stillmap.recording.formats import read as recording_of
 from stillmap.recording.model import Recording
+from stillmap.texts import require_regular
+
+_MAX_MAP = 1 << 29  # bytes of a map when it is unpacked: a thousand times what they take packed
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -134,12 +138,18 @@ def read_grid(result: Path) -> Grid:
         InputError: it is missing or damaged.
     """
     path = result / "map.npz"
+    require_regular(path)
     try:
         # opened here: given a path, np.load leaves a damaged archive open
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            size = archive.zip.getinfo("p_occupied.npy").file_size
+            if size > _MAX_MAP:
+                raise InputError(f"is too large: {size >> 20} MiB when unpacked", where=str(path))
             p_occupied = np.asarray(archive["p_occupied"])
             x, y, yaw = (float(value) for value in archive["origin"])
             resolution = float(archive["resolution"])
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(_reason(error), where=str(path)) from error
     except Exception as error:  # whatever NumPy, zip and zlib make of damaged bytes
@@ -157,13 +167,7 @@ def read_grid(result: Path) -> Grid:
 
 def _array(path: Path, shape: tuple[int | None, ...], kinds: str) -> NDArray[Any]:
     """An .npy array of this shape (None: any length) and one of these kinds of dtype."""
-    try:
-        # np.load would also open archives that bear the name
-        array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
-    except OSError as error:
-        raise InputError(_reason(error), where=str(path)) from error
-    except Exception as error:  # whatever NumPy's parser makes of damaged bytes
-        raise InputError(f"is damaged: {error}", where=str(path)) from error
+    array = open_npy(path)
     if len(array.shape) != len(shape) or any(
         want not in (None, got) for got, want in zip(array.shape, shape, strict=True)
     ):

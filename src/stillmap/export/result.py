@@ -13,9 +13,10 @@ from stillmap.evaluation.folders import read_grid
 from stillmap.evaluation.map import Grid
 from stillmap.recording.model import Recording
 from stillmap.recording.poses import poses_from_tum
+from stillmap.texts import require_regular
 
 _NUMBERS = ("x", "y", "vx", "vy")
-_MAX_OBJECTS = 1 << 30  # bytes of an objects.json
+_MAX_OBJECTS = 256 << 20  # bytes of an objects.json
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +81,7 @@ def read_tracks(path: Path) -> list[Track]:
         InputError: the file is damaged.
     """
     try:
+        require_regular(path)
         if path.stat().st_size > _MAX_OBJECTS:
             raise InputError("is no list of objects: too large", where=str(path))
         return [_track(one) for one in json.loads(path.read_text(encoding="utf-8"))]

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from stillmap.errors import InputError
 from stillmap.recording.spool import blocks
 from stillmap.recording.stamps import seconds_text
+from stillmap.texts import read_text
 
+LARGEST = 128 << 20  # bytes: four hours at 100 Hz
 _COLUMNS = "stamp x y z qx qy qz qw"
 _TOGETHER = 1 << 14  # poses that are written together: as numbers of Python they are large
 # a quaternion printed with three decimals still lies well within this of length one
@@ -78,9 +80,7 @@ def _rows_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+        return read_text(path, LARGEST).splitlines()
     except UnicodeDecodeError as error:
         raise InputError("is not a text file", where=str(path)) from error
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.errors import InputError
 from stillmap.recording.carmen_messages import (
     SCAN_PARSERS,
     BadRecord,
@@ -21,6 +22,7 @@ CUT_LINE = "cut last line"
 DAMAGED_STREAM = "damaged gzip stream"
 LONG_LINE = "over-long line"
 _COMMENT = (b"#", b"//")
+_MOST_OTHER = 5_000_000  # lines: a log has a scan or a pose among ten
 _KINDS_NAMED = 50  # unknown kinds counted one by one; a text that is no log has thousands
 
 
@@ -147,11 +149,17 @@ def read_log(path: Path, progress: Progress | None = None) -> CarmenLog:
     """The content of a CARMEN log, plain or gzip.
 
     Raises:
-        InputError: the file cannot be opened or read.
+        InputError: the file cannot be opened or read, or goes on and on without a record.
     """
     log = CarmenLog()
+    known = 0
     for line in numbered_lines(path, progress):
         log.add(line)
+        if line.number % _MOST_OTHER == 0:
+            before, known = known, log.records.total()
+            if known == before:
+                what = f"has {_MOST_OTHER} lines in a row that are no records"
+                raise InputError(what, where=f"{path}:{line.number}")
     return log
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.arrays import open_npy
 from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
 from stillmap.output.npy import write_npy
@@ -14,12 +15,13 @@ from stillmap.recording import folder_images
 from stillmap.recording.images import Images
 from stillmap.recording.model import Recording
 from stillmap.recording.spool import blocks
+from stillmap.texts import read_text, require_regular
 
 HEADER = "recording.json"
 FORMAT = "stillmap-recording"
 FORMAT_VERSION = 1
 
-_MAX_HEADER = 64 << 20  # bytes
+_MAX_HEADER = 16 << 20  # bytes: a JSON of empty lists takes thirty times as many
 
 
 def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:
@@ -125,11 +127,8 @@ def _no_number(text: str) -> float:
 
 def _header(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > _MAX_HEADER:
-            raise InputError("is no header of a recording: too large", where=str(path))
-        header = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_number)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+        require_regular(path)
+        header = json.loads(read_text(path, _MAX_HEADER), parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
         raise InputError(f"is not JSON: {error}", where=str(path)) from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
@@ -152,14 +151,7 @@ def _size(path: Path, header: dict[str, Any], key: str) -> int:
 
 def _array(path: Path, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
     """One `.npy` file as it lies on disk, of exactly this shape and type."""
-    file = path / f"{name}.npy"
-    try:
-        # np.load would also open archives and pickles that bear the name
-        loaded = np.lib.format.open_memmap(file, mode="r")
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", where=str(file)) from error
-    except Exception as error:  # whatever NumPy's parser makes of damaged bytes
-        raise InputError(f"is damaged: {error}", where=str(file)) from error
+    loaded = open_npy(path / f"{name}.npy")
     if loaded.shape != shape or loaded.dtype != np.dtype(dtype):
         raise _damaged(
             path,

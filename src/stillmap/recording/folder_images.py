@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.arrays import open_npy
 from stillmap.errors import InputError
 from stillmap.recording.images import Camera, Images
 from stillmap.recording.pictures import read_picture, write_picture
@@ -100,13 +101,7 @@ def _load(folder: Path, image: int) -> NDArray[Any]:
     if path.exists():
         return read_picture(path)
     path = path.with_suffix(".npy")
-    try:
-        # np.load would also open archives and pickles that bear the name
-        picture = np.array(np.lib.format.open_memmap(path, mode="r"))
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", where=str(path)) from error
-    except Exception as error:  # whatever NumPy's parser makes of damaged bytes
-        raise InputError(f"is damaged: {error}", where=str(path)) from error
+    picture = open_npy(path)
     if picture.dtype != np.float32 or picture.ndim != 2:
         raise InputError(f"is damaged: {picture.shape} {picture.dtype}", where=str(path))
-    return picture
+    return np.array(picture)

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from stillmap.errors import InputError
 from stillmap.recording import carmen, folder, limits
 from stillmap.recording.carmen_messages import SCAN_PARSERS
@@ -118,7 +120,16 @@ def read(
         InputError: nothing there, or no recording that can be read.
     """
     path = Path(path)
-    return format_of(path).read(path, options or ReadOptions(), progress, scratch)
+    try:
+        # what damaged numbers give is looked at: NumPy need not speak of them as well
+        with np.errstate(over="ignore", invalid="ignore"):
+            return format_of(path).read(path, options or ReadOptions(), progress, scratch)
+    except OSError as error:
+        # files may go, and disks fill up, at any moment
+        what = f"cannot be read: {error.strerror or error}"
+        raise InputError(what, where=str(error.filename or path)) from error
+    except MemoryError as error:
+        raise InputError("does not fit into memory", where=str(path)) from error
 
 
 def format_of(path: Path) -> Format:

@@ -1,6 +1,7 @@
 """Numbered lines of a text file, plain or gzip, whatever the state it is in."""
 
 import gzip
+import sys
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,6 +11,8 @@ from typing import IO, NamedTuple
 from stillmap.errors import InputError
 
 MAX_LINE = 1 << 20  # bytes: a scan of 3600 readings with remissions has a tenth of it
+# of a packed text: times its size, bytes; logs pack 20:1. A line counts for more than its bytes
+_MAX_GROWTH, _SURELY_FINE, _LINE = 100, 64 << 20, 32
 _GZIP_MAGIC = b"\x1f\x8b"
 _DAMAGED = (EOFError, zlib.error, gzip.BadGzipFile)
 
@@ -78,14 +81,20 @@ def numbered_lines(path: Path, progress: Progress | None = None) -> Iterator[Lin
         packed = file.read(2) == _GZIP_MAGIC
         file.seek(0)
         stream = gzip.GzipFile(fileobj=file, mode="rb") if packed else file
-        number = 0
+        number = unpacked = 0
+        most = max(_MAX_GROWTH * size, _SURELY_FINE) if packed else sys.maxsize
         try:
             while text := stream.readline(MAX_LINE):
                 number += 1
+                unpacked += len(text) + _LINE
                 ended = text.endswith(b"\n")
                 too_long = not ended and len(text) == MAX_LINE
                 if too_long:
-                    _skip_rest(stream)
+                    unpacked += _skip_rest(stream, most - unpacked)
+                if unpacked > most:
+                    what = f"is too large: it unpacks to more than {_MAX_GROWTH} times its size"
+                    hint = "it can be read if it is unpacked before"
+                    raise InputError(what, where=str(path), hint=hint)
                 yield Line(number, text, ended, too_long)
                 if progress is not None and number % 500 == 0:
                     progress(min(file.tell() / size, 1.0))
@@ -95,9 +104,14 @@ def numbered_lines(path: Path, progress: Progress | None = None) -> Iterator[Lin
             raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
 
 
-def _skip_rest(stream: IO[bytes] | gzip.GzipFile) -> None:
-    while (rest := stream.readline(MAX_LINE)) and not rest.endswith(b"\n"):
-        pass
+def _skip_rest(stream: IO[bytes] | gzip.GzipFile, most: int) -> int:
+    """Reads to the end of the line, or a little more than `most` bytes; how many it read."""
+    skipped = 0
+    while skipped <= most and (rest := stream.readline(MAX_LINE)):
+        skipped += len(rest)
+        if rest.endswith(b"\n"):
+            break
+    return skipped
 
 
 def _opened(path: Path) -> IO[bytes]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.arrays import open_npy
 from stillmap.errors import InputError
 from stillmap.output.trajectory import write_tum
 
@@ -68,7 +69,7 @@ def load_truth(path: str | Path) -> Truth:
         )
     try:
         arrays = {
-            name: np.load(folder / f"{name}.npy", allow_pickle=False)
+            name: np.array(open_npy(folder / f"{name}.npy"))
             for name in (*_ARRAYS, *([_LASTING] if (folder / f"{_LASTING}.npy").exists() else []))
         }
         return Truth(**arrays, scene=json.loads((folder / _SCENE).read_text(encoding="utf-8")))

@@ -27,7 +27,9 @@ MAGIC = b"ASTM-E57"
 
 _BLOCK = 1 << 18  # points read together
 _PAGE, _CHECKSUM = 1024, 4  # bytes
-_LARGEST_XML = 64 << 20  # bytes
+_LARGEST_XML = 16 << 20  # bytes: what libe57 makes of them takes fifty times as many
+_DEEPEST = 100  # elements within each other: libe57 takes their number squared to read them
+_NO_TAGS = re.compile(rb"<!\[CDATA\[.*?\]\]>|<!--.*?-->|<\?.*?\?>", re.DOTALL)
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _GPS_EPOCH_S = 315_964_800  # 6 January 1980, since 1970; leap seconds stay out
@@ -74,6 +76,8 @@ class _Opened:
 
     def __enter__(self) -> Any:
         require_content(self._path)
+        if not str(self._path).isprintable():
+            raise InputError("has a name that its library cannot open", where=str(self._path))
         _refuse_entities(self._path)
         try:
             self._file = self.library.ImageFile(str(self._path), "r")
@@ -113,6 +117,20 @@ def _refuse_entities(path: Path) -> None:
         raise InputError("is damaged: its description is no XML in UTF-8", where=str(path))
     if b"<!DOCTYPE" in text:
         raise InputError("is refused: its description defines entities", where=str(path))
+    if _depth(text) > _DEEPEST:
+        raise InputError("is refused: its description is nested too deeply", where=str(path))
+
+
+def _depth(xml: bytes) -> int:
+    """How many elements lie within each other, at most."""
+    depth = deepest = 0
+    for tag in re.finditer(rb"<(/?)[^<>]*?(/?)>", _NO_TAGS.sub(b"", xml)):
+        if tag[1]:
+            depth -= 1
+        elif not tag[2]:
+            depth += 1
+            deepest = max(deepest, depth)
+    return deepest
 
 
 def _scan_count(path: Path) -> int:

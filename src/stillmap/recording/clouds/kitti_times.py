@@ -35,7 +35,8 @@ def _stamp(text: str) -> int | None:
         if date is None:
             return parse_ns(text)
         at = datetime.fromisoformat(date[1]).replace(tzinfo=UTC)
-        return int(at.timestamp()) * 10**9 + parse_ns(f"0{date[2] or '.0'}")
+        whole = parse_ns(str(int(at.timestamp())))  # the year 9999 is beyond what it holds
+        return whole + parse_ns(f"0{date[2] or '.0'}")
     except (ValueError, OverflowError):
         return None
 

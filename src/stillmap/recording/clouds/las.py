@@ -26,7 +26,8 @@ from stillmap.recording.options import ReadOptions
 ENDINGS = (".las", ".laz")
 MAGIC = b"LASF"
 
-_BLOCK = 1 << 16  # points read together
+_BLOCK, _BLOCK_BYTES = 1 << 16, 8 << 20  # points read together, bytes of them
+_POINTS_PER_BYTE, _SURELY_FINE = 20, 10_000_000  # packed points take a byte each, and more
 _HEADER = 227  # bytes that every header has
 _EXTRA = 54  # bytes that a record after the header has at least
 _PACKED = 0xC0  # bits of the format of points
@@ -58,8 +59,11 @@ def _cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
     backend = laspy.LazBackend.Lazrs
     with _refused(path), laspy.open(path, read_evlrs=False, laz_backend=backend) as reader:
         promised = reader.header.point_count
-        for block in reader.chunk_iterator(_BLOCK):
-            if len(block) > _BLOCK:
+        if promised > max(_POINTS_PER_BYTE * path.stat().st_size, _SURELY_FINE):
+            raise cut_short(path, 0, promised)
+        rows = max(1, min(_BLOCK, _BLOCK_BYTES // reader.header.point_format.size))
+        for block in reader.chunk_iterator(rows):
+            if len(block) > rows:
                 raise InputError("is damaged: the size of its points", where=str(path))
             points.add(np.stack([block.x, block.y, block.z], axis=1))
             found += len(block)

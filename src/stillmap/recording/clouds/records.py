@@ -157,7 +157,8 @@ def text_lines(path: Path, skip: int = 0, limit: int | None = None) -> Iterator[
         if limit is not None and size > limit:
             what = f"is too large: more than {limit >> 20} MiB when unpacked"
             raise InputError(what, where=str(path))
-        if line.number > skip and not line.text.isspace():
+        # as NumPy will see it: more than ASCII's spaces are spaces to it
+        if line.number > skip and not line.text.decode("latin1").isspace():
             yield line.text
 
 

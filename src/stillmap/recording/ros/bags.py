@@ -18,9 +18,10 @@ from stillmap.recording.ros.kinds import (
 )
 from stillmap.recording.ros.unpacking import ZstdError, zstd_stream
 from stillmap.recording.skipped import Skipped
+from stillmap.texts import require_regular
 
 _MAX_GROWTH, _SURELY_FINE = 100, 1 << 30  # of a packed file: times its size, bytes
-_MAX_METADATA = 16 << 20  # bytes
+_MAX_METADATA = 256 << 10  # bytes: YAML takes two seconds for them
 _PIECE = 1 << 20
 
 
@@ -50,7 +51,14 @@ def open_bag(path: Path, scratch: Path | None, *, trusted: bool) -> Bag:
     return _Joined(bags)
 
 
+def size_of(path: Path) -> int:
+    """Bytes of a bag, or of all files of a folder."""
+    files = _listed(path) if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files)
+
+
 def _opened_file(path: Path, scratch: Path | None, trusted: bool) -> Bag:
+    require_regular(path)
     try:
         with path.open("rb") as file:
             start = file.read(32)
@@ -90,9 +98,11 @@ def _listed(folder: Path) -> list[Path]:
     there = storage_files(folder)
     try:
         file = folder / "metadata.yaml"
-        text = file.read_text("utf-8") if file.stat().st_size <= _MAX_METADATA else ""
+        fine = file.is_file() and file.stat().st_size <= _MAX_METADATA
+        text = file.read_text("utf-8") if fine else ""
         named = yaml.safe_load(text)["rosbag2_bagfile_information"]["relative_file_paths"]
-        paths = [folder / Path(str(name)).name for name in named]
+        # a list in a list in a list is short as YAML, and has no end as text
+        paths = [folder / Path(name).name for name in named if isinstance(name, str)]
     except (OSError, ValueError, LookupError, TypeError, RecursionError, yaml.YAMLError):
         return there
     missing = [path.name for path in paths if path not in there]

@@ -11,7 +11,7 @@ from stillmap.errors import InputError
 from stillmap.recording.options import ReadOptions
 from stillmap.recording.ros.messages import frame as frame_name
 from stillmap.recording.ros.messages import stamp_ns
-from stillmap.recording.ros.transforms import BAD_TRANSFORM, Transforms
+from stillmap.recording.ros.transforms import BAD_TRANSFORM, Transforms, is_pose
 from stillmap.recording.skipped import Skipped
 
 TAKEN = "the sensor is taken for the robot: nothing says where it sits on one"
@@ -37,7 +37,7 @@ class Odometry:
         self._number += 1
         p, q = message.pose.pose.position, message.pose.pose.orientation
         values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-        if not abs(float(np.linalg.norm(values[3:])) - 1.0) < 0.05 or not np.isfinite(values).all():
+        if not is_pose(values):
             self.skipped.add(BAD_TRANSFORM, self._number)
             return
         self.frame = frame_name(message.header.frame_id)

@@ -59,7 +59,9 @@ def understood(scans: Scans, options: ReadOptions) -> tuple[ranges.RangeRule, li
 def _sample(scans: Scans) -> NDArray[np.float32]:
     """(K, n) readings of scans evenly spread over the recording; short ones end in NaN."""
     lengths = scans.lengths
-    step = max(1, -(-int(lengths.sum()) // _SAMPLE))
+    # one long scan among many short ones makes all rows long
+    wide = int(lengths.max(initial=1)) * scans.n_scans
+    step = max(1, -(-int(lengths.sum()) // _SAMPLE), -(-wide // (4 * _SAMPLE)))
     chosen = np.arange(0, scans.n_scans, step)
     out = np.full((len(chosen), int(lengths[chosen].max(initial=1))), np.nan, np.float32)
     for row, t in zip(out, chosen, strict=True):

@@ -5,6 +5,8 @@ from typing import NamedTuple, Protocol
 
 from stillmap.recording.skipped import Skipped
 
+LAST_NS = 2**63 - 1  # times of recording are counted in 64 bits
+
 
 class DamagedError(Exception):
     """A bag turned out not to be whole."""

@@ -9,16 +9,16 @@ import os
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
-from urllib.parse import quote
 
 from rosbags.rosbag1.reader import Header, RecordType, normalize
 from rosbags.typesys.msg import normalize_msgtype
 
-from stillmap.recording.ros import unpacking
-from stillmap.recording.ros.channels import Channel, Message
+from stillmap.recording.ros import databases, unpacking
+from stillmap.recording.ros.channels import LAST_NS, Channel, Message
 from stillmap.recording.skipped import Skipped
 
 CUT = "bytes at the end that are no records"
@@ -89,26 +89,33 @@ def _scan_bag1(
 ) -> Iterator[tuple[int, int, bytes]]:
     with path.open("rb") as file:
         file.readline(64)  # #ROSBAG V2.0
-        yield from _until_cut(file, damage, _bag1_records(file, found, damage))
+        yield from _until_cut(file, damage, _bag1_records(file, found, damage, chunks=True))
 
 
 def _bag1_records(
-    file: IO[bytes], found: dict[int, Channel], damage: Skipped
+    file: IO[bytes], found: dict[int, Channel], damage: Skipped, *, chunks: bool
 ) -> Iterator[tuple[int, int, bytes]]:
+    """Records of a file, or of a chunk: none of these are `chunks` again."""
     end = _size(file)
     while file.tell() < end:
         at = file.tell()
+        unpacking.charge(unpacking.RECORD)
         header = Header.read(file)  # type: ignore[arg-type]
         kind, size = header.get_uint8("op"), _number(file, 4)
+        if kind == RecordType.CHUNK and not chunks:
+            raise _CutError
         # of a chunk that is cut the beginning can be unpacked
         data = file.read(size) if kind == RecordType.CHUNK else _exactly(file, size, end)
         if kind == RecordType.CHUNK:
             try:
                 inner = BytesIO(_unpacked(header.get_string("compression"), data))
+            except unpacking.TooMuchError:
+                raise
             except Exception:  # whatever a library makes of damaged bytes
                 damage.add(BAD_CHUNK, at)
                 continue
-            yield from _until_cut(inner, damage, _bag1_records(inner, found, damage), at)
+            records = _bag1_records(inner, found, damage, chunks=False)
+            yield from _until_cut(inner, damage, records, at)
         elif kind == RecordType.CONNECTION:
             channel = _bag1_channel(header, data)
             found.setdefault(channel.id, channel)
@@ -130,18 +137,28 @@ def _scan_mcap(
     schemas: dict[int, str] = {}
     with path.open("rb") as file:
         file.read(8)  # magic
-        yield from _until_cut(file, damage, _mcap_records(file, schemas, found, damage))
+        records = _mcap_records(file, schemas, found, damage, chunks=True)
+        yield from _until_cut(file, damage, records)
 
 
 def _mcap_records(
-    file: IO[bytes], schemas: dict[int, str], found: dict[int, Channel], damage: Skipped
+    file: IO[bytes],
+    schemas: dict[int, str],
+    found: dict[int, Channel],
+    damage: Skipped,
+    *,
+    chunks: bool,
 ) -> Iterator[tuple[int, int, bytes]]:
+    """See `_bag1_records`."""
     end = _size(file)
     while file.tell() < end:
         at = file.tell()
+        unpacking.charge(unpacking.RECORD)
         kind = _number(file, 1)
         if kind == 0x89:  # the magic at the end
             return
+        if kind == 0:
+            raise _CutError
         size = min(_number(file, 8), end)
         # of a chunk that is cut the beginning can be unpacked
         data = file.read(size) if kind == 0x06 else _exactly(file, size, end)
@@ -156,37 +173,42 @@ def _mcap_records(
             found.setdefault(number, Channel(number, topic, name, encoding, 0, ""))
         elif kind == 0x05:
             number, _, log_ns, _ = struct.unpack("<HIQQ", _exactly(record, 22, len(data)))
-            yield number, log_ns, data[22:]
+            yield number, min(log_ns, LAST_NS), data[22:]
         elif kind == 0x06:
+            if not chunks:
+                raise _CutError
             try:
                 record.seek(28)
                 packing = _text(record)
                 size = min(_number(record, 8), len(data))
                 inner = BytesIO(_unpacked(packing, record.read(size)))
+            except unpacking.TooMuchError:
+                raise
             except Exception:  # whatever a library makes of damaged bytes
                 damage.add(BAD_CHUNK, at)
                 continue
-            yield from _until_cut(inner, damage, _mcap_records(inner, schemas, found, damage), at)
+            records = _mcap_records(inner, schemas, found, damage, chunks=False)
+            yield from _until_cut(inner, damage, records, at)
 
 
 def _scan_db3(
     path: Path, found: dict[int, Channel], damage: Skipped
 ) -> Iterator[tuple[int, int, bytes]]:
-    address = f"file:{quote(str(path.resolve()))}?immutable=1&mode=ro"
     rows = 0
     try:
-        with sqlite3.connect(address, uri=True) as database:
+        with closing(databases.opened(path)) as database:
             for number, topic, kind, encoding in database.execute(
                 "SELECT id, name, type, serialization_format FROM topics"
             ):
-                found.setdefault(int(number), Channel(int(number), topic, kind, encoding, 0, ""))
+                if all(isinstance(word, str) for word in (topic, kind, encoding)):
+                    found.setdefault(number, Channel(number, topic, kind, encoding, 0, ""))
             for number, log_ns, raw in database.execute(
                 "SELECT topic_id, timestamp, data FROM messages"
             ):
                 rows += 1
                 if isinstance(raw, bytes) and isinstance(log_ns, int) and number in found:
                     yield number, log_ns, raw
-    except (sqlite3.Error, OverflowError, ValueError, TypeError):
+    except sqlite3.Error:
         damage.add(BAD_ROWS, rows + 1)
 
 
@@ -199,6 +221,8 @@ def _until_cut(
     """Records up to the first that makes no sense; `at` is where an outer chunk begins."""
     try:
         yield from records
+    except unpacking.TooMuchError:
+        raise
     except Exception:  # whatever a library makes of damaged bytes
         damage.add(CUT, file.tell() if at is None else at)
 

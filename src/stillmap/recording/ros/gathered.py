@@ -13,6 +13,7 @@ from stillmap.recording.ros.lasers import LaserTopics
 from stillmap.recording.ros.messages import decoded
 from stillmap.recording.ros.pictures import Pictures
 from stillmap.recording.ros.transforms import Transforms
+from stillmap.recording.ros.unpacking import charge
 from stillmap.recording.skipped import Skipped
 
 _UNREADABLE = "message that cannot be decoded"
@@ -59,6 +60,7 @@ def content(
     total = sum(c.n_messages for c in bag.channels if c.topic in chosen.all)
     for number, message in enumerate(bag.messages(chosen.all), start=1):
         topic = message.channel.topic
+        charge(len(message.raw))
         if topic in chosen.lasers:
             found.lasers.add(message)
         elif topic in chosen.clouds:

@@ -1,6 +1,7 @@
 """ROS bags as recordings, without ROS."""
 
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,12 @@ from stillmap.recording.lines import Progress
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
 from stillmap.recording.ros import base, beams, reading_clouds
-from stillmap.recording.ros.bags import open_bag
+from stillmap.recording.ros.bags import open_bag, size_of
 from stillmap.recording.ros.channels import Bag, DamagedError
 from stillmap.recording.ros.choosing import chosen_lasers, chosen_topics
 from stillmap.recording.ros.gathered import Content, content
 from stillmap.recording.ros.lasers import Scans
+from stillmap.recording.ros.unpacking import bounded
 from stillmap.recording.skipped import Skipped
 
 _MANY = 0.05  # share of scans whose loss is worth a warning
@@ -38,11 +40,10 @@ def read(
     Raises:
         InputError: it cannot be read, or holds no usable scan.
     """
-    damaged = ""
+    damaged, size = "", size_of(path)
     for trusted in (True, False):
         try:
-            bag = open_bag(path, scratch, trusted=trusted)
-            try:
+            with bounded(size), closing(open_bag(path, scratch, trusted=trusted)) as bag:
                 recording = _recording(
                     bag,
                     options,
@@ -50,8 +51,6 @@ def read(
                     scratch,
                     partial(open_bag, path, scratch, trusted=trusted),
                 )
-            finally:
-                bag.close()
         except DamagedError as error:
             damaged = str(error)
         except InputError as error:

@@ -1,5 +1,6 @@
 """Frames and the transforms between them, from TF messages."""
 
+import math
 from array import array
 from typing import Any, NamedTuple
 
@@ -15,6 +16,13 @@ BAD_TRANSFORM = "transform that is none"
 
 _UNIT = 0.05  # a quaternion's length may be off by this much
 _LARGEST = 1e9  # m
+
+
+def is_pose(values: tuple[float, ...]) -> bool:
+    """Whether x y z in metres and a quaternion x y z w can be where something is."""
+    # each number by itself: the largest of a few, NaN among them, may be any of them
+    near = all(abs(value) < _LARGEST for value in values[:3])
+    return near and abs(math.hypot(*values[3:]) - 1.0) < _UNIT
 
 
 class _Edge:
@@ -63,14 +71,7 @@ class Transforms:
         self, parent: str, child: str, stamp: int, values: tuple[float, ...], *, static: bool
     ) -> None:
         """One transform: x y z in metres and a quaternion x y z w."""
-        size = float(np.linalg.norm(values[3:]))
-        if not (
-            max(map(abs, values[:3])) < _LARGEST
-            and abs(size - 1.0) < _UNIT
-            and child
-            and parent
-            and child != parent
-        ):
+        if not (is_pose(values) and child and parent and child != parent):
             self.skipped.add(BAD_TRANSFORM, self._number)
             return
         edge = self._edges.setdefault(child, {}).setdefault(parent, _Edge(parent))

@@ -2,7 +2,9 @@
 
 import bz2
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import IO, Any
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -17,6 +19,50 @@ else:
 LIMIT = 256 << 20  # bytes of one chunk or message; recorders write chunks of about one megabyte
 
 ZstdError = zstd.ZstdError
+
+_MAX_GROWTH, _SURELY_FINE = 300, 512 << 20  # of a bag: times its size, bytes
+RECORD = 64  # bytes that a record counts for, though nothing be in it
+
+
+class TooMuchError(InputError):
+    """More comes out of a file than can have been put in."""
+
+
+class _Left:
+    """How many bytes may still come out."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+
+_left: ContextVar[_Left | None] = ContextVar("left", default=None)
+
+
+@contextmanager
+def bounded(size: int) -> Iterator[None]:
+    """While this lasts, a bag of `size` bytes gives no more than a bag of that size can hold.
+
+    Its index may name one message a million times, and parts that are small each may be many.
+    """
+    token = _left.set(_Left(max(_MAX_GROWTH * size, _SURELY_FINE)))
+    try:
+        yield
+    finally:
+        _left.reset(token)
+
+
+def charge(count: int) -> None:
+    """Says that so many bytes came out.
+
+    Raises:
+        TooMuchError: that is more than there can be.
+    """
+    left = _left.get()
+    if left is None:
+        return
+    left.count -= count
+    if left.count < 0:
+        raise TooMuchError(f"is damaged: more than {_MAX_GROWTH} times its size comes out of it")
 
 
 def bz2_unpacked(data: bytes) -> bytes:
@@ -46,7 +92,9 @@ def _bounded(decompress: Callable[..., Any], data: bytes) -> bytes:
         InputError: there is more.
         Exception: whatever the library says of damaged data.
     """
+    charge(0)
     out = bytes(decompress(data, LIMIT + 1))
+    charge(len(out))
     if len(out) > LIMIT:
         raise InputError(
             f"a packed part is larger than {LIMIT >> 20} MiB",

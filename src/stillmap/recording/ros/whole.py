@@ -4,21 +4,36 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
-from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinitionFormat, QosDurability
+from rosbags.interfaces import (
+    ConnectionExtRosbag2,
+    MessageDefinitionFormat,
+    Qos,
+    QosDurability,
+)
 from rosbags.rosbag1 import reader as rosbag1
-from rosbags.rosbag2 import storage_mcap
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+from rosbags.rosbag2 import storage_mcap, storage_sqlite3
+from rosbags.rosbag2.metadata import parse_qos
 
 from stillmap.errors import InputError
-from stillmap.recording.ros import unpacking
-from stillmap.recording.ros.channels import Channel, DamagedError, Message
+from stillmap.recording.ros import databases, unpacking
+from stillmap.recording.ros.channels import LAST_NS, Channel, DamagedError, Message
 from stillmap.recording.skipped import Skipped
 
 # the library unpacks whatever comes; its table is where it can be told to stop
 storage_mcap.DECOMPRESSORS["lz4"] = lambda data, _: unpacking.lz4_unpacked(data)
 storage_mcap.DECOMPRESSORS["zstd"] = lambda data, _: unpacking.zstd_unpacked(data)
+
+_MAX_PROFILES = 16 << 10  # bytes of YAML about how a topic was sent
+
+
+def _profiles(said: Any) -> list[Qos]:
+    return [] if isinstance(said, str) and len(said) > _MAX_PROFILES else parse_qos(said)
+
+
+# a megabyte of YAML takes the library half a minute
+for _module in (storage_mcap, storage_sqlite3):
+    vars(_module).update(parse_qos=_profiles)
 
 _BOUNDED = {
     rosbag1.decompressors["bz2"]: unpacking.bz2_unpacked,
@@ -27,6 +42,20 @@ _BOUNDED = {
 
 
 class _Bag1Reader(rosbag1.Reader):
+    """The library's, with limits on what is unpacked, and on an index that repeats itself."""
+
+    def open(self) -> None:
+        self._index_left = self.path.stat().st_size
+        super().open()
+
+    def read_index_data(self, pos: int, indexes: dict[int, list[rosbag1.IndexData]]) -> None:
+        assert self.bio is not None
+        at = self.bio.tell()
+        super().read_index_data(pos, indexes)
+        self._index_left -= self.bio.tell() - at
+        if self._index_left < 0:
+            raise rosbag1.ReaderError("Index is larger than the bag.")
+
     def read_chunk(self) -> rosbag1.Chunk:
         chunk = super().read_chunk()
         unpacked = _BOUNDED.get(chunk.decompressor, chunk.decompressor)
@@ -61,6 +90,9 @@ class WholeBag:
                 raise
             except Exception as error:  # whatever the library makes of damaged bytes
                 raise DamagedError(str(error) or type(error).__name__) from error
+            # a column of SQLite holds anything
+            if not (isinstance(log_ns, int) and log_ns <= LAST_NS and isinstance(raw, bytes)):
+                raise DamagedError("a message without time or content")
             yield Message(channels[connection.id], log_ns, raw)
 
     def close(self) -> None:
@@ -84,9 +116,10 @@ def open_mcap(path: Path) -> WholeBag:
 
 def open_db3(path: Path) -> WholeBag:
     """A SQLite file of ROS 2. Raises whatever the library says of one that is damaged."""
-    # the library makes an address of the path: ?, # and % in it would be read as its parts
-    reader = Sqlite3Reader(Path(quote(str(path.resolve()))))
-    reader.open()
+    # the library makes an address of the path
+    reader = storage_sqlite3.Sqlite3Reader(Path(databases.address(path)))
+    with databases.bounded(path):
+        reader.open()
     return WholeBag("SQLite bag", reader)
 
 
@@ -100,6 +133,9 @@ def _channel(connection: Any) -> Channel:
     else:
         encoding, latched = "ros1", bool(ext.latching)
     in_words = connection.msgdef.format == MessageDefinitionFormat.MSG
+    words = connection.topic, connection.msgtype, encoding, connection.digest
+    if not all(isinstance(word, str) for word in words):
+        raise DamagedError("a topic whose name or type is no text")
     return Channel(
         connection.id,
         connection.topic,

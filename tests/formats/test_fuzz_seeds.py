@@ -1,0 +1,52 @@
+"""What fuzzing begins with is sound, and what is changed inside stays a file of its format."""
+
+import random
+import sys
+from pathlib import Path
+
+import pytest
+
+for needed in ("pye57", "laspy", "lazrs", "lzf"):
+    pytest.importorskip(needed)
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "fuzz"))
+
+import targets  # noqa: E402
+from run import NAMES  # noqa: E402
+
+READ = sorted(set(targets.TARGETS) - {"toml", "rows", "result"})
+
+
+def test_every_target_is_run():
+    assert sorted(NAMES) == sorted(targets.TARGETS)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_seeds(tmp_path, monkeypatch, name):
+    read = []
+    walk = targets._walk
+    monkeypatch.setattr(targets, "_walk", lambda found: read.append(walk(found)))
+    (tmp_path / "made").mkdir()
+    target = targets.TARGETS[name]
+    seeds = list(target.seeds(tmp_path / "made"))
+    for number, seed in enumerate(seeds):
+        (tmp_path / f"{number}").mkdir()
+        target.run(seed, tmp_path / f"{number}")
+    assert seeds
+    assert len(read) == (len(seeds) if name in READ else 0) or name == "result"
+
+
+@pytest.mark.parametrize("name", ["bag", "mcap", "db3", "pcd", "e57"])
+def test_containers_put_together_again(tmp_path, monkeypatch, name):
+    read = []
+    walk = targets._walk
+    monkeypatch.setattr(targets, "_walk", lambda found: read.append(walk(found)))
+    monkeypatch.setattr(targets.containers, "_ODD", (1,))
+    monkeypatch.setattr(targets.containers, "_HOSTILE", ("PRAGMA user_version = 1",))
+    target = targets.TARGETS[name]
+    (tmp_path / "made").mkdir()
+    for number, seed in enumerate(target.seeds(tmp_path / "made")):
+        for chance in range(3):
+            place = tmp_path / f"{number} {chance}"
+            place.mkdir()
+            target.run(target.change(seed, bytes, random.Random(chance)), place)
+    assert len(read) >= 3
