@@ -224,6 +224,14 @@ def test_e57_with_entities_is_refused(scanned):
         read(path)
 
 
+def test_e57_nested_without_end(scanned):
+    path, *_ = scanned
+    inner = b'<a type="Structure">' * 2000 + b"</a>" * 2000
+    described(path, lambda xml: xml.replace(b"</e57Root>", inner + b"</e57Root>"))
+    with pytest.raises(InputError, match="nested too deeply"):
+        read(path)
+
+
 @pytest.mark.parametrize("kept", [10, 48, 1024, 5000])
 def test_e57_that_is_cut(scanned, kept):
     path, *_ = scanned
