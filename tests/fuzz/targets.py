@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import containers
+import corpus
 import numpy as np
 import parts
-import seeds
 
 from stillmap.cli import results
 from stillmap.errors import InputError
@@ -173,8 +173,8 @@ def _rows(data: bytes, folder: Path) -> None:
 
 def _result(data: bytes, folder: Path) -> None:
     place = folder / "result"
-    _write(data, place, seeds.RESULT)
-    _write(parts.joined(_OURS), place, seeds.OURS)
+    _write(data, place, corpus.RESULT)
+    _write(parts.joined(_OURS), place, corpus.OURS)
     for reader in (
         lambda: results.found(place, None).read_options,
         lambda: results.found(place, str(place)).read(),
@@ -197,26 +197,26 @@ _OURS: list[bytes] = []
 
 def _results(work: Path) -> Iterator[bytes]:
     """The recording that results are of is made with them, and lies in their folder."""
-    _OURS[:] = parts.split(next(seeds.ours(work / "of")))
-    yield from seeds.result(work)
+    _OURS[:] = parts.split(next(corpus.ours(work / "of")))
+    yield from corpus.result(work)
 
 
 TARGETS = {
-    "carmen": Target(_file("in.log"), seeds.carmen),
-    "ours": Target(_folder(seeds.OURS), seeds.ours, parts.changed),
-    "bag": Target(_file("in.bag"), seeds.bag1, containers.changed_bag),
-    "mcap": Target(_file("in.mcap"), seeds.mcap, containers.changed_mcap),
-    "db3": Target(_file("in.db3"), seeds.db3, containers.changed_db3),
-    "ros1": Target(_messages("ros1"), lambda _: seeds.messages_of("ros1"), parts.changed),
-    "cdr": Target(_messages("cdr"), lambda _: seeds.messages_of("cdr"), parts.changed),
-    "kitti": Target(_folder(seeds.KITTI), seeds.kitti, parts.changed),
-    "drive": Target(_folder(seeds.DRIVE), seeds.drive, parts.changed),
-    "pcd": Target(_file("in.pcd"), seeds.pcd, containers.changed_pcd),
-    "ply": Target(_file("in.ply"), seeds.ply),
-    "las": Target(_file("in.las"), seeds.las),
-    "e57": Target(_file("in.e57"), seeds.e57, containers.changed_e57),
-    "3dtk": Target(_folder(seeds.UOS), seeds.uos, parts.changed),
-    "toml": Target(_toml, seeds.toml),
-    "rows": Target(_rows, seeds.rows),
+    "carmen": Target(_file("in.log"), corpus.carmen),
+    "ours": Target(_folder(corpus.OURS), corpus.ours, parts.changed),
+    "bag": Target(_file("in.bag"), corpus.bag1, containers.changed_bag),
+    "mcap": Target(_file("in.mcap"), corpus.mcap, containers.changed_mcap),
+    "db3": Target(_file("in.db3"), corpus.db3, containers.changed_db3),
+    "ros1": Target(_messages("ros1"), lambda _: corpus.messages_of("ros1"), parts.changed),
+    "cdr": Target(_messages("cdr"), lambda _: corpus.messages_of("cdr"), parts.changed),
+    "kitti": Target(_folder(corpus.KITTI), corpus.kitti, parts.changed),
+    "drive": Target(_folder(corpus.DRIVE), corpus.drive, parts.changed),
+    "pcd": Target(_file("in.pcd"), corpus.pcd, containers.changed_pcd),
+    "ply": Target(_file("in.ply"), corpus.ply),
+    "las": Target(_file("in.las"), corpus.las),
+    "e57": Target(_file("in.e57"), corpus.e57, containers.changed_e57),
+    "3dtk": Target(_folder(corpus.UOS), corpus.uos, parts.changed),
+    "toml": Target(_toml, corpus.toml),
+    "rows": Target(_rows, corpus.rows),
     "result": Target(_result, _results, parts.changed),
 }
