@@ -51,7 +51,7 @@ class Classes:
 
     static_occupied: tuple[float, ...] = (0.998, 0.95)
     static_seconds: tuple[float, ...] = (25.0, 100.0)
-    views_occupied: tuple[float, ...] = (0.8, 0.5)
+    views_occupied: tuple[float, ...] = (0.65,)
     views_turn: float = 0.4
     mover_occupied: tuple[float, ...] = (0.01, 0.04)
     mover_seconds: tuple[float, ...] = (0.5, 3.0, 12.0, 45.0)
