@@ -1,6 +1,8 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <limits>
+
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "stillmap/dwell.hpp"
@@ -121,13 +123,17 @@ auto solid_cells(const Dwell<D>& dwell) {
   return owned(std::move(out), {n, static_cast<size_t>(D)});
 }
 
-DwellClasses checked_classes(std::vector<double> rho, std::vector<double> tau, double detection) {
-  require(!rho.empty() && rho.size() == tau.size(), "rho, tau: expected one number per class");
-  require(rho.size() <= kMaxClasses, "rho, tau: too many classes");
+DwellClasses checked_classes(std::vector<double> rho, std::vector<double> tau,
+                             std::vector<double> turn, double detection) {
+  if (turn.empty()) turn.assign(rho.size(), std::numeric_limits<double>::infinity());
+  require(!rho.empty() && rho.size() == tau.size() && rho.size() == turn.size(),
+          "rho, tau, turn: expected one number per class");
+  require(rho.size() <= kMaxClasses, "rho, tau, turn: too many classes");
   for (const double r : rho) require(r > 0.0 && r < 1.0, "rho: expected shares between 0 and 1");
   for (const double t : tau) require(t > 0.0, "tau: expected positive times");
+  for (const double v : turn) require(v > 0.0, "turn: expected positive angles");
   require(detection > 0.0 && detection < 1.0, "detection: expected a probability below 1");
-  return {std::move(rho), std::move(tau), detection};
+  return {std::move(rho), std::move(tau), std::move(turn), detection};
 }
 
 template <int D>
@@ -155,21 +161,26 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            nb::arg("threads") = 1, "(M,) int32: the element in which each beam ended, -1: none.");
   using W = Dwell<D>;
-  nb::class_<W>(m, dwell, "Likelihood of what was seen of each element, per class of dwell.")
+  nb::class_<W>(m, dwell,
+                "Likelihood of what was seen of each element, per class: occupied for a share rho, "
+                "correlated over tau seconds and over turn radians of the view (inf or none given: "
+                "however it turns).")
       .def(
           "__init__",
           [](W* self, const S& s, std::vector<double> rho, std::vector<double> tau,
-             double detection, double seconds, double lateral, double margin, double reach,
-             double beyond, bool normals) {
+             std::vector<double> turn, double detection, double seconds, double lateral,
+             double margin, double reach, double beyond, bool normals) {
             for (const double x : {seconds, lateral, margin, reach, beyond})
               require(x > 0.0 && std::isfinite(x), "looks: expected positive lengths and times");
             const double r = s.resolution();
-            new (self) W(s, checked_classes(std::move(rho), std::move(tau), detection),
-                         {seconds, lateral / r, margin / r, reach / r, beyond / r, 1.0, normals});
+            new (self)
+                W(s, checked_classes(std::move(rho), std::move(tau), std::move(turn), detection),
+                  {seconds, lateral / r, margin / r, reach / r, beyond / r, 1.0, normals});
           },
-          nb::arg("surface"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"), nb::arg("detection"),
-          nb::arg("seconds"), nb::arg("lateral"), nb::arg("margin"), nb::arg("reach"),
-          nb::arg("beyond"), nb::arg("normals") = true, nb::keep_alive<1, 2>())
+          nb::arg("surface"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"),
+          nb::arg("turn") = std::vector<double>{}, nb::arg("detection"), nb::arg("seconds"),
+          nb::arg("lateral"), nb::arg("margin"), nb::arg("reach"), nb::arg("beyond"),
+          nb::arg("normals") = true, nb::keep_alive<1, 2>())
       .def("add", &add_looks<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            nb::arg("look").noconvert(), nb::arg("threads") = 1,

@@ -106,6 +106,7 @@ class Room:
         surface: Any,
         rho: list[float],
         tau: list[float],
+        turn: list[float] | None = None,
         detection: float = 0.8,
         **changes: float,
     ) -> Any:
@@ -113,6 +114,7 @@ class Room:
             surface,
             rho=rho,
             tau=tau,
+            turn=turn or [],
             detection=detection,
             seconds=1.0,
             **{**self.lengths, **changes},

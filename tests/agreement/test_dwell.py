@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise, product
-from math import log
+from math import inf, log
 
 import numpy as np
 import pytest
@@ -100,7 +100,7 @@ def test_what_a_look_says(room, changes):
     for t in range(0, len(room.look), 2):
         found = []
         for kernels, surface in zip((_core, reference), surfaces, strict=True):
-            dwell = room.dwell(kernels, surface, [0.5], [1.0], 0.5, **changes)
+            dwell = room.dwell(kernels, surface, [0.5], [1.0], detection=0.5, **changes)
             dwell.add(*room.scans(t, t + 2), np.array([7, 7]))
             found.append(reliability(dwell)[order(surface)])
         core, plain = found
@@ -149,7 +149,7 @@ def test_lost_beams_are_trusted_so_far(room, swallowed, trusted):
     for kernels in (_core, reference):
         surface = room.surface(kernels)
         for how in (trusted, 1.0):
-            dwell = room.dwell(kernels, surface, [0.5], [1.0], 0.5)
+            dwell = room.dwell(kernels, surface, [0.5], [1.0], detection=0.5)
             dwell.trust(how)
             dwell.add(points, hit, offset, T, np.full(10, 7))
             found[kernels, how] = reliability(dwell)[order(surface)]
@@ -162,11 +162,12 @@ def test_lost_beams_are_trusted_so_far(room, swallowed, trusted):
 
 
 def test_likelihood(room):
-    rho, tau = [0.998, 0.6, 0.05, 0.15], [25.0, 5.0, 0.5, 45.0]
+    rho, tau = [0.998, 0.6, 0.05, 0.15, 0.5, 0.8], [25.0, 5.0, 0.5, 45.0, inf, 9.0]
+    turn = [inf] * 4 + [0.1, 0.7]
     found = []
     for kernels in (_core, reference):
         surface = room.surface(kernels)
-        dwell = room.dwell(kernels, surface, rho, tau)
+        dwell = room.dwell(kernels, surface, rho, tau, turn)
         dwell.add(*room.beams.arguments, room.look)
         relative, log_best = dwell.likelihood()
         assert relative.dtype == np.float32
@@ -222,21 +223,30 @@ def test_the_order_of_the_beams_of_a_look_does_not_matter(room):
         assert (a == b).mean() > 0.9  # the first to be nearly sure stops the search
 
 
-def lane(seen, rho, tau, detection, seconds=1.0):
-    """Log likelihood per class of one element of which (look, hit or seen through) was seen."""
+def lane(seen, rho, tau, turn, detection, seconds=1.0, at=None):
+    """Log likelihood per class of one element of which (look, hit or seen through) was seen.
+
+    The sensor looks from x = `at` of each look, along x.
+    """
     surface = _core.Surface2D(0.1)
-    T, offset = np.eye(3)[None].copy(), np.array([0, 3])  # fewer without return would be lost
-    T[0, 1, 2] = 0.05
-    ends, none = (np.array([[x, 0]] * 3, np.float32) for x in (1.05, 4))
+    offset = np.array([0, 3])  # fewer without return would be lost
     yes, no = np.ones(3, bool), np.zeros(3, bool)
+
+    def beams(x, end):
+        T = np.eye(3)[None].copy()
+        T[0, :2, 2] = x, 0.05
+        return np.array([[end - x, 0]] * 3, np.float32), T
+
+    ends, T = beams(0.0, 1.05)
     surface.add_end_points(ends, yes, offset, T)
     surface.fit()
     dwell = _core.Dwell2D(
-        surface, rho=rho, tau=tau, detection=detection, seconds=seconds,
+        surface, rho=rho, tau=tau, turn=turn, detection=detection, seconds=seconds,
         lateral=0.01, margin=0.1, reach=0.05, beyond=0.3,
     )  # fmt: skip
-    for look, hit in seen:
-        dwell.add(ends if hit else none, yes if hit else no, offset, T, np.array([look]))
+    for (look, hit), x in zip(seen, [0.0] * len(seen) if at is None else at, strict=True):
+        points, T = beams(x, 1.05 if hit else 4)
+        dwell.add(points, yes if hit else no, offset, T, np.array([look]))
     relative, log_best = dwell.likelihood()
     return np.log(np.maximum(relative[0], 1e-37)) + log_best[0]
 
@@ -273,12 +283,16 @@ def test_lost_beams_say_nothing():
     assert seen == {name: [says, says] for name, says in expected.items()}
 
 
-def chain(seen, rho, tau, detection, seconds=1.0):
-    looks = [(look * seconds, HIT if hit else 1.0) for look, hit in seen]
+def chain(seen, rho, tau, turn, detection, seconds=1.0, at=None):
+    at = [0.0] * len(seen) if at is None else at
+    turned = [0.0, *(abs(b - a) / max(abs(1.05 - b), 0.1) for a, b in pairwise(at))]
+    looks = [
+        (n * seconds, HIT if hit else 1.0, v) for (n, hit), v in zip(seen, turned, strict=True)
+    ]
     return np.array(
         [
-            chain_log_likelihood(looks, r, t, detection) - log(r * detection)
-            for r, t in zip(rho, tau, strict=True)
+            chain_log_likelihood(looks, r, t, detection, v) - log(r * detection)
+            for r, t, v in zip(rho, tau, turn, strict=True)
         ]
     )
 
@@ -303,6 +317,23 @@ def test_a_chain(seed, n, stays, seconds):
     assert (found[~likely] < found.max() - 18).all()
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("step", [0.0, 0.02, 0.3])
+def test_a_chain_over_the_view(seed, step):
+    seen = random_looks(seed, 100, 0.8)
+    at = np.random.default_rng(seed).uniform(-step, step, len(seen)).cumsum().clip(-3, 0.6)
+    found, expected = (f(seen, *CLASSES, 0.97, at=at) for f in (lane, chain))
+    likely = expected > expected.max() - 20
+    np.testing.assert_allclose(found[likely], expected[likely], atol=0.1)
+    views = np.isfinite(CLASSES[2])
+    assert views.sum() == 1
+    # what is met or not depends on nothing but the view, so it is one or the other while that stays
+    still = chain(seen, *CLASSES, 0.97)
+    assert (still[views] < still.max() - 10).all()
+    assert (expected[views] > still[views] + 10).all() == (step > 0.0)
+    assert (expected[~views] == still[~views]).all()
+
+
 @pytest.mark.parametrize("seconds", [1.0, 3.0])
 def test_a_chain_that_flickers(seconds):
     for gap in (1, 2):
@@ -325,7 +356,7 @@ def test_seen_through_again_and_again(detection, misses):
 def test_chain_that_never_changes():
     # tau beyond all measure: it is there or it is not, and one of the two has to have failed
     seen = [(0, True), *((i, False) for i in range(1, 60)), (60, True)]
-    found = lane(seen, [0.5, 0.9], [1e12, 1e12], 0.97)
+    found = lane(seen, [0.5, 0.9], [1e12, 1e12], [inf, inf], 0.97)
     assert np.isfinite(found).all()
 
 
@@ -334,14 +365,14 @@ def test_chain_by_all_its_histories():
     rng = np.random.default_rng(3)
     for rho, tau, detection in ((0.3, 2.0, 0.9), (0.95, 10.0, 0.6)):
         times = np.cumsum(rng.exponential(2.0, 8))
-        seen = [(t, HIT if rng.random() < 0.4 else rng.uniform()) for t in times]
+        seen = [(t, HIT if rng.random() < 0.4 else rng.uniform(), 0.0) for t in times]
         total = 0.0
         for states in product((0, 1), repeat=len(seen)):
             p = (1 - rho, rho)[states[0]]
             for i in range(1, len(seen)):
                 kept = np.exp(-(times[i] - times[i - 1]) / tau)
                 p *= kept * (states[i] == states[i - 1]) + (1 - kept) * (1 - rho, rho)[states[i]]
-            for state, (_, reliability) in zip(states, seen, strict=True):
+            for state, (_, reliability, _) in zip(states, seen, strict=True):
                 hit = reliability == HIT
                 p *= (float(not hit), detection if hit else 1 - detection * reliability)[state]
             total += p

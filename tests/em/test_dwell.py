@@ -118,9 +118,9 @@ def test_a_corner_that_beams_pass_closely_stays():
 def rows(seen, x, y, radius):
     """Cells near a place with the likelihood of every class."""
     surface = dwell.surface_of(seen.recording, seen.poses, 0.1)
-    rho, tau = CLASSES.grid()
+    rho, tau, turn = CLASSES.grid()
     chains = _core.Dwell2D(
-        surface, rho=rho, tau=tau, detection=0.97, seconds=1.0,
+        surface, rho=rho, tau=tau, turn=turn, detection=0.97, seconds=1.0,
         lateral=0.03, margin=0.1, reach=0.1, beyond=0.3,
     )  # fmt: skip
     r = seen.recording

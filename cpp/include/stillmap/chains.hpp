@@ -1,5 +1,7 @@
-// Two-state Markov chains in time, many at once: how probable what was seen of each member is under
-// each class of chains, look after look.
+// Two-state Markov chains, many at once: how probable what was seen of each member is under each
+// class of chains, look after look. States are kept with correlation exp(-dt / tau - dv / turn)
+// from one look to the next: dt is the time between them, dv how far the sensor moved against its
+// distance from the member: the angle by which the view turned, but for moves to and fro.
 #pragma once
 
 #include <Eigen/Core>
@@ -13,23 +15,31 @@ namespace stillmap {
 constexpr size_t kMaxClasses = 64;
 
 struct DwellClasses {
-  std::vector<double> rho;  // share of time occupied, in (0, 1)
-  std::vector<double> tau;  // seconds
-  double detection;         // probability that an occupied cell is seen to be so
+  std::vector<double> rho;   // share of time occupied, in (0, 1)
+  std::vector<double> tau;   // seconds
+  std::vector<double> turn;  // of the view, radians
+  double detection;          // probability that an occupied cell is seen to be so
 };
 
 class Chains {
  public:
-  // seconds: between successive looks
-  Chains(size_t members, DwellClasses classes, double seconds)
+  // places: of the members, in cells; seconds: between successive looks
+  Chains(std::vector<Eigen::Vector3f> places, DwellClasses classes, double seconds)
       : classes_(std::move(classes)),
         seconds_(seconds),
         packets_((classes_.rho.size() + kWidth - 1) / kWidth),
         rho_(packets_, Packet::Zero()),  // what fills the last packet stays at zero
-        heads_(members) {
-    for (size_t c = 0; c < size(); ++c) at(rho_, c) = static_cast<float>(classes_.rho[c]);
-    state_.reserve(members * 2 * packets_);
-    for (size_t k = 0; k < members; ++k) {
+        per_turn_(packets_, Packet::Zero()),
+        turns_(packets_, false),
+        places_(std::move(places)),
+        heads_(places_.size()) {
+    for (size_t c = 0; c < size(); ++c) {
+      at(rho_, c) = static_cast<float>(classes_.rho[c]);
+      at(per_turn_, c) = static_cast<float>(1.0 / classes_.turn[c]);
+      if (std::isfinite(classes_.turn[c])) turns_[c / kWidth] = true;
+    }
+    state_.reserve(members() * 2 * packets_);
+    for (size_t k = 0; k < members(); ++k) {
       state_.insert(state_.end(), rho_.begin(), rho_.end());
       for (const Packet& rho : rho_) state_.push_back((rho > 0.0f).select(1.0f - rho, 0.0f));
     }
@@ -39,10 +49,17 @@ class Chains {
   size_t size() const { return classes_.rho.size(); }
   size_t members() const { return heads_.size(); }
 
+  // Notes the next look: its number, and the place in cells from which it was taken. Returns which
+  // of the looks it is: what `hit` and `seen_through` want.
+  int32_t begin(int64_t number, const Eigen::Vector3d& from) {
+    looks_.push_back({number, from});
+    return static_cast<int32_t>(looks_.size() - 1);
+  }
+
   // One step of the forward algorithm in every class, to a look that saw a hit, or saw through the
   // member with a reliability.
-  void hit(size_t k, int64_t look) { step(k, look, detection(), 0.0f); }
-  void seen_through(size_t k, int64_t look, float reliability) {
+  void hit(size_t k, int32_t look) { step(k, look, detection(), 0.0f); }
+  void seen_through(size_t k, int32_t look, float reliability) {
     step(k, look, 1.0f - detection() * reliability, 1.0f);
   }
 
@@ -66,13 +83,17 @@ class Chains {
  private:
   static constexpr size_t kWidth = 8;
   using Packet = Eigen::Array<float, kWidth, 1>;
-  static constexpr int64_t kNever = INT64_MIN;
+  static constexpr int32_t kNever = -1;
   static constexpr int kTable = 64;  // gaps whose correlations are kept
   static constexpr float kSmall = 1e-12f;
   static constexpr float kLeast = 1e-30f;  // no state is ever impossible
 
+  struct Taken {
+    int64_t number;
+    Eigen::Vector3d from;
+  };
   struct Head {
-    int64_t last = kNever;   // number of the last look
+    int32_t last = kNever;   // the last look
     double log_scale = 0.0;  // logarithm of what the weights were divided by
   };
 
@@ -96,10 +117,19 @@ class Chains {
     }
   }
 
+  // Whoever stands in the place itself sees nothing of it.
+  static float view_turned(const Taken& before, const Taken& now, const Eigen::Vector3f& place) {
+    const double moved = (now.from - before.from).norm();
+    return static_cast<float>(moved / std::max(1.0, (now.from - place.cast<double>()).norm()));
+  }
+
   // if_occupied, if_empty: probability of what was seen
-  void step(size_t k, int64_t look, float if_occupied, float if_empty) {
+  void step(size_t k, int32_t look, float if_occupied, float if_empty) {
     Head& head = heads_[k];
-    const int64_t gap = head.last == kNever ? 0 : look - head.last;
+    const Taken& now = looks_[static_cast<size_t>(look)];
+    const Taken& before = looks_[static_cast<size_t>(head.last == kNever ? look : head.last)];
+    const int64_t gap = now.number - before.number;
+    const float turned = view_turned(before, now, places_[k]);
     head.last = look;
     std::vector<Packet> computed;
     const Packet* transition = table_.data() + static_cast<size_t>(gap) * 2 * packets_;
@@ -112,8 +142,12 @@ class Chains {
     Packet most = Packet::Zero();
     for (size_t i = 0; i < packets_; ++i) {
       const Packet both = occupied[i] + empty[i];
-      const Packet before =
-          (transition[2 * i] * both + transition[2 * i + 1] * occupied[i]).max(kLeast);
+      Packet in = transition[2 * i], stays = transition[2 * i + 1];
+      if (turns_[i] && turned > 0.0f) {
+        stays *= (-turned * per_turn_[i]).exp();
+        in = rho_[i] * (1.0f - stays);
+      }
+      const Packet before = (in * both + stays * occupied[i]).max(kLeast);
       occupied[i] = before * if_occupied;
       empty[i] = (both - before).max(0.0f) * if_empty;
       most = most.max(occupied[i] + empty[i]);
@@ -128,9 +162,13 @@ class Chains {
   double seconds_;
   size_t packets_;
   std::vector<Packet> rho_;
+  std::vector<Packet> per_turn_;
+  std::vector<bool> turns_;  // packets in which some class knows from where it is seen
+  std::vector<Eigen::Vector3f> places_;
   std::vector<Head> heads_;
   std::vector<Packet> state_;  // (members, 2, packets): P(all looks so far, occupied or empty)
   std::vector<Packet> table_;  // (gaps, packets, 2)
+  std::vector<Taken> looks_;
 };
 
 }  // namespace stillmap

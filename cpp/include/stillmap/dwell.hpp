@@ -1,9 +1,11 @@
 // How probable what was seen of a cell is, for things that stay for different times.
 //
-// A cell is occupied or empty, a two-state Markov chain in time: occupied for a share rho of the
-// time, with correlation exp(-dt / tau). Each look at it sees something there, which something
-// occupying it must have caused; or sees through it, which an occupied cell lets happen with
-// probability 1 - detection * reliability. What stands still is the chain with rho near one.
+// A cell is occupied or empty, a two-state Markov chain: occupied for a share rho of the time, with
+// correlation exp(-dt / tau); or, of what can be seen from some places only, from a share rho of
+// them, with a correlation over the view instead of the time. Each look at it sees something there,
+// which something occupying it must have caused; or sees through it, which an occupied cell lets
+// happen with probability 1 - detection * reliability. What stands still is the chain with rho near
+// one.
 #pragma once
 
 #include <algorithm>
@@ -30,7 +32,7 @@ class Dwell {
         options_(options),
         tables_(options.lateral),
         neighbours_(surface, options.reach),
-        chains_(surface.size(), std::move(classes), options.seconds) {}
+        chains_(places_of(surface), std::move(classes), options.seconds) {}
 
   size_t classes() const { return chains_.size(); }
   const Surface<D>& surface() const { return surface_; }
@@ -83,6 +85,10 @@ class Dwell {
     std::vector<Seen> seen(kWindow);
     for (size_t from = 0; from < looks; from += kWindow) {
       const size_t to = std::min(from + kWindow, looks);
+      std::vector<int32_t> taken;
+      for (size_t l = from; l < to; ++l)
+        taken.push_back(
+            chains_.begin(look[starts[l]], taken_from(scans, starts[l], starts[l + 1])));
       std::atomic<size_t> next{from};
       parallel_shares(one_each(n), [&](size_t i, size_t, size_t) {
         for (size_t l = next++; l < to; l = next++) {
@@ -93,7 +99,8 @@ class Dwell {
       std::atomic<size_t> next_span{0};
       parallel_shares(one_each(n), [&](size_t, size_t, size_t) {
         for (size_t s = next_span++; s < Seen::spans(surface_.size()); s = next_span++)
-          for (size_t l = from; l < to; ++l) apply(seen[l - from], s, look[starts[l]]);
+          for (size_t l = from; l < to; ++l)
+            apply(seen[l - from], s, look[starts[l]], taken[l - from]);
       });
     }
     if (T) newest_ = look[T - 1];
@@ -121,15 +128,32 @@ class Dwell {
     return bounds;
   }
 
-  void apply(const Seen& seen, size_t span, int64_t look) {
+  static std::vector<Eigen::Vector3f> places_of(const Surface<D>& surface) {
+    std::vector<Eigen::Vector3f> places(surface.size(), Eigen::Vector3f::Zero());
+    for (size_t k = 0; k < places.size(); ++k)
+      places[k].template head<D>() =
+          surface.element(static_cast<int32_t>(k)).mean.template cast<float>();
+    return places;
+  }
+
+  // Mean place of the sensors in those scans, in cells.
+  Eigen::Vector3d taken_from(const Scans<D>& scans, size_t first, size_t last) const {
+    Eigen::Vector3d sum = Eigen::Vector3d::Zero();
+    for (size_t t = first; t < last; ++t)
+      sum.template head<D>() += pose_from<D>(scans.poses + t * (D + 1) * (D + 1)).t;
+    if (!sum.allFinite()) throw std::invalid_argument("T_map_sensor: expected finite poses");
+    return sum / (static_cast<double>(last - first) * surface_.resolution());
+  }
+
+  void apply(const Seen& seen, size_t span, int64_t look, int32_t taken) {
     for (size_t i = seen.begin[span]; i < seen.begin[span + 1]; ++i) {
       const auto k = static_cast<size_t>(seen.looks[i].element);
       const float reliability = seen.looks[i].seen_through;
       if (reliability == Look::kHit) {
-        chains_.hit(k, look);
+        chains_.hit(k, taken);
         if (changes_) changes_->hit(k, look);
       } else {
-        chains_.seen_through(k, look, reliability);
+        chains_.seen_through(k, taken, reliability);
         if (changes_) changes_->seen_through(k, look, reliability);
       }
     }

@@ -12,8 +12,9 @@ from stillmap.em.options import ChangeOptions, EmOptions, MapState
 from stillmap.em.together import components, pairs_near
 from stillmap.recording.model import Recording
 
-# who stays for longer than these came to stay
-_CLASSES = Classes(mover_seconds=(0.5, 3.0, 6.0, 12.0), often_seconds=(8.0, 24.0))
+# s, who stays for longer than these came to stay
+_SECONDS = (0.5, 3.0, 6.0, 12.0)
+_CLASSES = Classes(mover_seconds=_SECONDS, crowded_seconds=_SECONDS, often_seconds=(8.0, 24.0))
 _MOST_NATS = 60.0  # by which one likelihood may exceed another: more is the same
 _POSSIBLE = 0.02  # probability of having changed below which a cell has no say
 _BESIDE = 3.0  # cells

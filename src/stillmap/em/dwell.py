@@ -42,26 +42,36 @@ class Classes:
     Attributes:
         static_occupied, static_seconds: share of the time and correlation time in seconds of what
             stands still: one, but for looks that miss it, which come in runs.
+        views_occupied, views_turn: of what stands still and is met from some places only: the share
+            of them, and by how many radians the view turns until it is met or not anew.
         mover_occupied, mover_seconds: of what comes and goes.
+        crowded_occupied, crowded_seconds: of what comes and goes where many do.
         often_seconds: of what comes and goes and is there for half of the time.
     """
 
     static_occupied: tuple[float, ...] = (0.998, 0.95)
     static_seconds: tuple[float, ...] = (25.0, 100.0)
-    mover_occupied: tuple[float, ...] = (0.01, 0.04, 0.15)
+    views_occupied: tuple[float, ...] = (0.65,)
+    views_turn: float = 0.4
+    mover_occupied: tuple[float, ...] = (0.01, 0.04)
     mover_seconds: tuple[float, ...] = (0.5, 3.0, 12.0, 45.0)
+    crowded_occupied: float = 0.15
+    crowded_seconds: tuple[float, ...] = (0.5, 12.0, 45.0)
     often_seconds: tuple[float, ...] = ()
 
     @property
     def n_static(self) -> int:
-        return len(self.static_occupied) * len(self.static_seconds)
+        return len(self.static_occupied) * len(self.static_seconds) + len(self.views_occupied)
 
-    def grid(self) -> tuple[list[float], list[float]]:
-        """rho and tau of every class: static ones first, those of half of the time last."""
-        pairs = [(r, t) for t in self.static_seconds for r in self.static_occupied]
-        pairs += [(r, t) for t in self.mover_seconds for r in self.mover_occupied]
-        pairs += [(0.5, t) for t in self.often_seconds]
-        return [r for r, _ in pairs], [t for _, t in pairs]
+    def grid(self) -> tuple[list[float], list[float], list[float]]:
+        """rho, tau, turn of each: static ones first, those of half of the time last."""
+        never = float("inf")
+        of = [(r, t, never) for t in self.static_seconds for r in self.static_occupied]
+        of += [(r, never, self.views_turn) for r in self.views_occupied]
+        of += [(r, t, never) for t in self.mover_seconds for r in self.mover_occupied]
+        of += [(self.crowded_occupied, t, never) for t in self.crowded_seconds]
+        of += [(0.5, t, never) for t in self.often_seconds]
+        return [r for r, _, _ in of], [t for _, t, _ in of], [v for _, _, v in of]
 
 
 CLASSES = Classes()
@@ -194,7 +204,7 @@ def _likelihood(
 
 
 def _dwell(surface: Surface, options: DwellOptions, classes: Classes) -> Dwell:
-    rho, tau = classes.grid()
+    rho, tau, turn = classes.grid()
     cell, scatter = surface.resolution, surface.scatter
     lengths = {
         "lateral": max(options.lateral * scatter, _LEAST * cell),
@@ -204,8 +214,10 @@ def _dwell(surface: Surface, options: DwellOptions, classes: Classes) -> Dwell:
     }
     chosen = {"detection": options.detection, "seconds": options.look, **lengths}
     if isinstance(surface, _core.Surface2D):
-        return _core.Dwell2D(surface, rho=rho, tau=tau, normals=options.normals, **chosen)
-    return _core.Dwell3D(surface, rho=rho, tau=tau, normals=options.normals, **chosen)
+        return _core.Dwell2D(
+            surface, rho=rho, tau=tau, turn=turn, normals=options.normals, **chosen
+        )
+    return _core.Dwell3D(surface, rho=rho, tau=tau, turn=turn, normals=options.normals, **chosen)
 
 
 def _open(recording: Recording, T_map_sensor: Float, dwell: Dwell) -> float:
@@ -254,18 +266,20 @@ def _bound(likelihood: NDArray[np.float32], log_best: Float, shares: Shares) -> 
 
 
 def _learned(surface: Surface, trust: float, shares: Shares, classes: Classes) -> dict[str, object]:
-    n = classes.n_static
-    movers = shares.classes[n:].reshape(len(classes.mover_seconds), -1) / shares.classes[n:].sum()
-    static = shares.classes[:n].reshape(len(classes.static_seconds), -1) / shares.static
+    rho, tau, _ = classes.grid()
+    static, movers = slice(None, classes.n_static), slice(classes.n_static, None)
     return {
         "scatter": surface.scatter,
         "p_static": shares.static,
         "no_return_trusted": round(trust, 6),
-        "static_occupied": _table(classes.static_occupied, static.sum(axis=0)),
-        "mover_occupied": _table(classes.mover_occupied, movers.sum(axis=0)),
-        "mover_seconds": _table(classes.mover_seconds, movers.sum(axis=1)),
+        "static_occupied": _table(rho[static], shares.classes[static]),
+        "mover_occupied": _table(rho[movers], shares.classes[movers]),
+        "mover_seconds": _table(tau[movers], shares.classes[movers]),
     }
 
 
-def _table(values: tuple[float, ...], shares: Float) -> list[dict[str, float]]:
-    return [{"value": v, "share": round(float(s), 6)} for v, s in zip(values, shares, strict=True)]
+def _table(values: list[float], shares: Float) -> list[dict[str, float]]:
+    """The share of each value among these classes."""
+    total = float(shares.sum())
+    of = {v: sum(s for w, s in zip(values, shares, strict=True) if w == v) for v in values}
+    return [{"value": v, "share": round(float(s) / total, 6)} for v, s in of.items()]

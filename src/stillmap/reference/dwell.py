@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import exp, log
+from math import exp, inf, log
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -133,22 +133,37 @@ def _probability_met(
     return float(met)
 
 
+def view_turned(before: Float, now: Float, place: Float, resolution: float) -> float:
+    """How far a sensor moved (D,) against its distance from a place (D,): about an angle.
+
+    Nearer than a cell nothing is seen of it.
+    """
+    moved, away = float(np.linalg.norm(now - before)), float(np.linalg.norm(now - place))
+    return moved / max(resolution, away)
+
+
 def chain_log_likelihood(
-    seen: Sequence[tuple[float, float]], rho: float, tau: float, detection: float
+    seen: Sequence[tuple[float, float, float]],
+    rho: float,
+    tau: float,
+    detection: float,
+    turn: float = inf,
 ) -> float:
     """ln P(all looks) by the forward algorithm over the two states (empty, occupied).
 
     Args:
-        seen: (time in seconds, HIT or reliability) of each look, in the order of time.
-        rho: share of the time in which it is occupied.
-        tau: seconds, correlation exp(-dt / tau).
+        seen: (time in seconds, HIT or reliability, turn of the view in radians since the look
+            before) of each look, in the order of time.
+        rho: share of the time, or of the views, in which it is occupied.
+        tau: seconds, correlation exp(-dt / tau - dv / turn).
         detection: probability that a sure look at an occupied cell sees that it is.
+        turn: radians.
     """
     state = np.array([1.0 - rho, rho])
     total, before = 0.0, None
-    for time, reliability in seen:
+    for time, reliability, turned in seen:
         if before is not None:
-            kept = exp(-(time - before) / tau)
+            kept = exp(-(time - before) / tau - turned / turn)
             stay = kept * np.eye(2) + (1.0 - kept) * np.array([[1.0 - rho, rho]] * 2)
             state = state @ stay
         if reliability == HIT:
@@ -165,7 +180,7 @@ class Dwell:
 
     Args:
         surface: fitted.
-        rho, tau: (C,) of the classes.
+        rho, tau, turn: (C,) of the classes; no turn: inf for all.
         detection: see `chain_log_likelihood`.
         seconds: between successive looks.
         lateral, margin, reach, beyond, normals: see Reading.
@@ -177,6 +192,7 @@ class Dwell:
         *,
         rho: Sequence[float],
         tau: Sequence[float],
+        turn: Sequence[float] = (),
         detection: float,
         seconds: float,
         lateral: float,
@@ -188,11 +204,12 @@ class Dwell:
         if len(surface.list) != surface.size:
             raise ValueError("surface: fit it first")
         self.surface = surface
-        self.classes = list(zip(rho, tau, strict=True))
+        self.classes = list(zip(rho, tau, turn or [inf] * len(rho), strict=True))
         self.detection = detection
         self.seconds = seconds
         self.reading = Reading(lateral, margin, reach, beyond, normals)
-        self.seen: list[list[tuple[float, float]]] = [[] for _ in surface.list]
+        # time, HIT or reliability, mean place of the sensors
+        self.seen: list[list[tuple[float, float, Float]]] = [[] for _ in surface.list]
         self.model: ChangeModel | None = None
 
     def add(
@@ -211,9 +228,11 @@ class Dwell:
         looks: dict[int, list[Beam]] = {int(n): [] for n in number}
         for beam in usable_beams(self.surface.dimension, points, hit, offset, T_map_sensor):
             looks[int(number[beam.scan])].append(beam)
+        places = np.asarray(T_map_sensor, float)[:, :-1, -1]
         for n, beams in looks.items():
+            place = places[number == n].mean(axis=0)
             for k, reliability in look_at(self.surface, beams, self.reading).items():
-                self.seen[k].append((n * self.seconds, reliability))
+                self.seen[k].append((n * self.seconds, reliability, place))
 
     def lost(
         self, points: ArrayLike, hit: ArrayLike, offset: ArrayLike, T_map_sensor: ArrayLike
@@ -259,7 +278,7 @@ class Dwell:
             raise ValueError("changes: nobody asked to watch for them")
         courses = [
             course(
-                [(round(t / self.seconds), None if r == HIT else r) for t, r in seen],
+                [(round(t / self.seconds), None if r == HIT else r) for t, r, _ in seen],
                 self.seconds,
                 self.model,
             )
@@ -282,14 +301,25 @@ class Dwell:
         values = np.array(
             [
                 [
-                    chain_log_likelihood(seen, rho, tau, self.detection) - log(rho * self.detection)
-                    for rho, tau in self.classes
+                    chain_log_likelihood(seen, rho, tau, self.detection, turn)
+                    - log(rho * self.detection)
+                    for rho, tau, turn in self.classes
                 ]
-                for seen in self.seen
+                for seen in map(self._with_turns, self.surface.list, self.seen)
             ]
         ).reshape(len(self.seen), len(self.classes))
         best = values.max(axis=1)
         return np.exp(values - best[:, None]).astype(np.float32), best
+
+    def _with_turns(
+        self, element: Element, seen: list[tuple[float, float, Float]]
+    ) -> list[tuple[float, float, float]]:
+        """The looks at an element, each with the turn of the view since the one before."""
+        before = [place for _, _, place in seen[:1] + seen[:-1]]
+        return [
+            (time, reliability, view_turned(b, place, element.mean, self.surface.resolution))
+            for b, (time, reliability, place) in zip(before, seen, strict=True)
+        ]
 
 
 Dwell2D = Dwell
