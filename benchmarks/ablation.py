@@ -54,15 +54,8 @@ VARIANTS = (
     Variant("room behind the surface", {"margin": _NONE}),
     Variant("hits of neighbours", {"reach": _NONE}),
     Variant("looks: every scan counts for itself", {"look": 0.01}),
-    Variant(
-        "people who stay: tau 0.5 s only",
-        {},
-        Classes(mover_seconds=(0.5,), crowded_seconds=(0.5,)),
-    ),
-    Variant(
-        "crowded places: rho 0.01 only", {}, Classes(mover_occupied=(0.01,), crowded_seconds=())
-    ),
-    Variant("things that are met from some places only", {}, Classes(views_occupied=())),
+    Variant("people who stay: tau 0.5 s only", {}, Classes(mover_seconds=(0.5,))),
+    Variant("crowded places: rho 0.01 only", {}, Classes(mover_occupied=(0.01,))),
     Variant("walls that are missed: rho 0.998 only", {}, Classes(static_occupied=(0.998,))),
     Variant("a share that is missed for seconds only", {}, Classes(static_seconds=(1.0,))),
 )

@@ -180,11 +180,19 @@ def _settled(
 ) -> tuple[Best, list[Change]]:
     """The last E-step: labels of the map as it is shown, and the places that changed."""
     cell = options.slam.resolution
-    if options.estimator != "stillmap" or not options.em.changes.enabled:
+    if options.estimator != "stillmap" or not (
+        options.em.dwell.views or options.em.changes.enabled
+    ):
+        return kept, []
+    found, courses = em.last_e_step(recording, kept.poses, cell, options.em, threads)
+    if found is not None:
+        kept = dataclasses.replace(
+            kept, p_static=found.p_static, occupied=found.occupied, learned=found.learned
+        )
+    if courses is None:
         return kept, []
     if kept.occupied is None:
         raise RuntimeError("the default estimator knows its cells")
-    courses = em.last_e_step(recording, kept.poses, cell, options.em, threads)
     look = options.em.dwell.look
     changes = changed_places(courses, recording, cell, look, options.em.changes)
     p_static, occupied = relabelled(

@@ -11,7 +11,7 @@ from stillmap import _core, reference
 from stillmap.em.dwell import Classes
 from stillmap.reference.dwell import HIT, SURE, chain_log_likelihood
 
-CLASSES = Classes().grid()
+CLASSES = Classes(views_occupied=(0.65,)).grid()
 
 
 @pytest.fixture(

@@ -154,7 +154,7 @@ class Everywhere(NamedTuple):
 def last_e_step(seen, state="last", threads=1, **options):
     """(p_static, occupied) of a map that shows it everywhere, and the courses."""
     chosen = em.EmOptions(**options)
-    found = em.last_e_step(seen.recording, seen.poses, RESOLUTION, chosen, threads)
+    _, found = em.last_e_step(seen.recording, seen.poses, RESOLUTION, chosen, threads)
     nobody = np.ones(seen.recording.n_beams, np.float32)
     before = em.CellProbabilities(found.cells, np.zeros(len(found.cells), np.float32), 0.2)
     places = [Everywhere(found.cells)]
@@ -305,6 +305,6 @@ def test_a_clock_that_leaps_by_decades_ends_nothing(seen):
     stamps[1:] += 17 * 10**17  # from 1970 on
     leaping = replace(seen.recording, stamp_ns=stamps)
     assert em.look_numbers(leaping, 0.5).max() < 2**31
-    found = em.last_e_step(leaping, seen.poses, RESOLUTION, em.EmOptions())
+    _, found = em.last_e_step(leaping, seen.poses, RESOLUTION, em.EmOptions())
     assert np.isfinite(found.shown("last")).all()
     assert (found.count >= 0).all()

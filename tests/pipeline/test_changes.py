@@ -114,9 +114,9 @@ def test_labels_are_those_of_the_map_shown():
         assert np.median(p[crate & (when > 90)]) == pytest.approx(after, abs=0.2)
 
 
-def test_what_is_not_listed_stays_what_the_loop_said():
-    result, loop = built(), built(changes=False)
-    courses = em.last_e_step(result.seen, result.poses, result.map.resolution, result.options.em)
+def test_what_is_not_listed_stays_what_it_is_without_changes():
+    result, without = built(), built(changes=False)
+    _, courses = em.last_e_step(result.seen, result.poses, result.map.resolution, result.options.em)
     cells = {tuple(cell) for one in result.changes for cell in one.cells.tolist()}
     element = courses.surface.elements_of(
         result.seen.points, result.seen.hit, result.seen.offset,
@@ -126,9 +126,9 @@ def test_what_is_not_listed_stays_what_the_loop_said():
     there = (element >= 0) & of_cells[element]
     assert 0.01 < there.mean() < 0.3
     shown = courses.shown("last")[element]
-    np.testing.assert_array_equal(result.p_static, np.where(there, shown, loop.p_static))
-    assert (result.p_static != loop.p_static).mean() > 0.01
-    assert result.learned == {**loop.learned, "changing": round(courses.share, 6)}
+    np.testing.assert_array_equal(result.p_static, np.where(there, shown, without.p_static))
+    assert (result.p_static != without.p_static).mean() > 0.01
+    assert result.learned == {**without.learned, "changing": round(courses.share, 6)}
 
 
 def test_a_crate_is_no_object_on_its_way_and_people_are():

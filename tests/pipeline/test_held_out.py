@@ -9,10 +9,12 @@ from stillmap import em
 from stillmap.options import replaced
 from stillmap.pipeline import Options
 
+WITHOUT_LAST = {"changes": {"enabled": False}, "dwell": {"views": False}}
+
 
 def options(estimator, **changes):
     # the figure is of the loop's labels: the last E-step comes after it
-    settings = {"max_iterations": 3, "held_out": 20, "changes": {"enabled": False}, **changes}
+    settings = {"max_iterations": 3, "held_out": 20, **WITHOUT_LAST, **changes}
     return replaced(Options(), {"em": settings, "estimator": estimator, "threads": 1})
 
 

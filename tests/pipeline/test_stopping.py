@@ -14,7 +14,7 @@ from stillmap.pipeline import Iteration, Options
 def options(estimator="stillmap", **changes):
     """Without the last E-step, which asks the recording once more."""
     wanted = {"max_iterations": 10, "tolerance": 0.0, "settled": 0.0, "patience": 3} | changes
-    wanted["changes"] = {"enabled": False}
+    wanted |= {"changes": {"enabled": False}, "dwell": {"views": False}}
     chosen = {"estimator": estimator, "em": wanted, "slam": {"resolution": 0.1}, "threads": 1}
     return replaced(Options(), chosen)
 

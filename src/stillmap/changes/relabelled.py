@@ -28,14 +28,12 @@ def relabelled(
     """(M,) labels and the cells of the map: in the cells of the changes those of their courses.
 
     A beam's p_static is the probability that the map in this state shows what it met. Few cells
-    change. In all others the last E-step says what the loop said, but for noise, and what looks
-    like a change without being listed as one is noise, too.
+    change. What looks like a change without being listed as one is noise.
 
     Args:
         recording: M beams.
         poses: (T, 3, 3) T_map_base.
-        p_static, occupied: what the loop ended with.
-        courses: from the last E-step at the same poses.
+        p_static, occupied, courses: from the last E-step at these poses.
         changes: from `changed_places`.
         state: which state of places that changed is the map's.
         threads: same result with any number.

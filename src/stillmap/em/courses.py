@@ -1,4 +1,4 @@
-"""The last E-step: things that came to stay, or left, while others passed."""
+"""Things that came to stay, or left, while others passed: from the looks of the last E-step."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -6,15 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.em.dwell import Classes, Dwell, Float, Looks, Surface, coverage, looked_at
+from stillmap.em.dwell import OFTEN_OCCUPIED, Dwell, Float, Looks, Surface, coverage
 from stillmap.em.mixture import fit_shares, posterior_static
 from stillmap.em.options import ChangeOptions, EmOptions, MapState
 from stillmap.em.together import components, pairs_near
 from stillmap.recording.model import Recording
 
-# s, who stays for longer than these came to stay
-_SECONDS = (0.5, 3.0, 6.0, 12.0)
-_CLASSES = Classes(mover_seconds=_SECONDS, crowded_seconds=_SECONDS, often_seconds=(8.0, 24.0))
+_STAY = 12.0  # s, who stays for longer came to stay
 _MOST_NATS = 60.0  # by which one likelihood may exceed another: more is the same
 _POSSIBLE = 0.02  # probability of having changed below which a cell has no say
 _BESIDE = 3.0  # cells
@@ -64,31 +62,21 @@ class Courses:
         return np.asarray(np.minimum(self.p_static + self.p_changing * there, 1.0), np.float32)
 
 
-def last_e_step(
-    recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int = 1
-) -> Courses:
-    """The E-step once more, with one more class: what came to stay or left.
+def watch(dwell: Dwell, recording: Recording, options: EmOptions) -> None:
+    """Asks, before the first look, for things that come to stay or leave."""
+    dwell.watch(**_model(recording, options))
 
-    Args: see `dwell.e_step`.
-    """
 
-    def watch(dwell: Dwell) -> None:
-        dwell.watch(**_model(recording, options))
-
-    looks = looked_at(
-        recording,
-        recording.T_map_sensor(poses),
-        resolution,
-        options,
-        threads,
-        _CLASSES,
-        watch,
-    )
+def courses_of(looks: Looks, options: EmOptions) -> Courses:
+    """What became of each cell; `watch` was called before the looks."""
+    kept = (looks.tau <= _STAY) | (looks.rho == OFTEN_OCCUPIED)
+    kept[: looks.n_static] = True
+    looks = looks.among(kept)
     log_changing, occupied_share, p_last, count, between = looks.dwell.changes()
     likelihood = _with_changing(looks, log_changing)
-    shares = fit_shares(likelihood, _CLASSES.n_static, options.prior)
+    shares = fit_shares(likelihood, looks.n_static, options.prior)
     weights = shares.classes.astype(np.float32)
-    often = slice(-1 - len(_CLASSES.often_seconds), -1)
+    often = np.append(looks.rho == OFTEN_OCCUPIED, False)
     stays = likelihood[:, -1] * weights[-1]
     goes = np.einsum("kc,c->k", likelihood[:, often], weights[often])
     of = (goes > stays).astype(np.intp)  # what comes and goes does not stay long enough for a thing
@@ -96,7 +84,7 @@ def last_e_step(
     return _as_wholes(
         Courses(
             cells=looks.surface.elements()[0],
-            p_static=posterior_static(likelihood, shares.classes, _CLASSES.n_static),
+            p_static=posterior_static(likelihood, shares.classes, looks.n_static),
             p_changing=(stays + goes) / np.einsum("kc,c->k", likelihood, weights),
             p_thing=p_last[each, of],
             occupied_share=occupied_share,

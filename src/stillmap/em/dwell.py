@@ -1,5 +1,6 @@
 """The default E-step: what stands still is what never leaves. `docs/estimator.md` derives it."""
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -23,6 +24,8 @@ Float = NDArray[np.float64]
 Surface = _core.Surface2D | _core.Surface3D
 Dwell = _core.Dwell2D | _core.Dwell3D
 
+OFTEN_OCCUPIED = 0.5  # share of the time in which something is there that comes and goes often
+
 _LEAST = 0.3  # cells: no length is known better, whatever the scatter
 _UNSEEN = 0.2  # probability that a cell is occupied in which no beam ended and none passed
 _PROMINENT = 0.1  # share of the richest cell's beams that noise alone hardly brings into another
@@ -45,18 +48,15 @@ class Classes:
         views_occupied, views_turn: of what stands still and is met from some places only: the share
             of them, and by how many radians the view turns until it is met or not anew.
         mover_occupied, mover_seconds: of what comes and goes.
-        crowded_occupied, crowded_seconds: of what comes and goes where many do.
         often_seconds: of what comes and goes and is there for half of the time.
     """
 
     static_occupied: tuple[float, ...] = (0.998, 0.95)
     static_seconds: tuple[float, ...] = (25.0, 100.0)
-    views_occupied: tuple[float, ...] = (0.65,)
+    views_occupied: tuple[float, ...] = ()
     views_turn: float = 0.4
-    mover_occupied: tuple[float, ...] = (0.01, 0.04)
+    mover_occupied: tuple[float, ...] = (0.01, 0.04, 0.15)
     mover_seconds: tuple[float, ...] = (0.5, 3.0, 12.0, 45.0)
-    crowded_occupied: float = 0.15
-    crowded_seconds: tuple[float, ...] = (0.5, 12.0, 45.0)
     often_seconds: tuple[float, ...] = ()
 
     @property
@@ -69,8 +69,7 @@ class Classes:
         of = [(r, t, never) for t in self.static_seconds for r in self.static_occupied]
         of += [(r, never, self.views_turn) for r in self.views_occupied]
         of += [(r, t, never) for t in self.mover_seconds for r in self.mover_occupied]
-        of += [(self.crowded_occupied, t, never) for t in self.crowded_seconds]
-        of += [(0.5, t, never) for t in self.often_seconds]
+        of += [(OFTEN_OCCUPIED, t, never) for t in self.often_seconds]
         return [r for r, _, _ in of], [t for _, t, _ in of], [v for _, _, v in of]
 
 
@@ -97,17 +96,7 @@ def e_step(
     """
     T_map_sensor = recording.T_map_sensor(poses)
     looks = looked_at(recording, T_map_sensor, resolution, options, threads, classes)
-    shares = fit_shares(looks.likelihood, classes.n_static, options.prior)
-    static = posterior_static(looks.likelihood, shares.classes, classes.n_static)
-    surface = looks.surface
-    beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
-    return Expectations(
-        p_static=_of_beams(recording, T_map_sensor, surface, static, shares.static, threads),
-        likelihood=_bound(looks.likelihood, looks.log_best, shares),
-        occupied=CellProbabilities(surface.elements()[0], static * coverage(surface), _UNSEEN),
-        learned=_learned(surface, looks.trust, shares, classes),
-        no_return=NoReturn(looks.dwell.solid(), beyond),
-    )
+    return expectations_of(looks, recording, T_map_sensor, options, threads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,14 +107,30 @@ class Looks:
         surface: the elements.
         dwell: what was seen of them.
         trust: how far beams without a return are believed, from 0 to 1.
+        rho, tau: (C,) of the classes; the first `n_static` are static.
         likelihood: (E, C) under each class, relative to the best; its logarithm is `log_best`.
     """
 
     surface: Surface
     dwell: Dwell
     trust: float
+    rho: Float
+    tau: Float
+    n_static: int
     likelihood: NDArray[np.float32]
     log_best: Float
+
+    def among(self, kept: NDArray[np.bool_]) -> "Looks":
+        """The same under some (C,) of the classes, all static ones among them."""
+        likelihood = self.likelihood[:, kept]
+        best = likelihood.max(axis=1, initial=0.0)  # the core lets no class be impossible
+        return dataclasses.replace(
+            self,
+            rho=self.rho[kept],
+            tau=self.tau[kept],
+            likelihood=likelihood / best[:, None],
+            log_best=self.log_best + np.log(best),
+        )
 
 
 def looked_at(
@@ -145,7 +150,30 @@ def looked_at(
     if prepare is not None:
         prepare(dwell)
     likelihood, log_best = _likelihood(recording, T_map_sensor, dwell, options.dwell.look, threads)
-    return Looks(surface, dwell, trust, likelihood, log_best)
+    rho, tau, _ = classes.grid()
+    found = classes.n_static, likelihood, log_best
+    return Looks(surface, dwell, trust, np.array(rho), np.array(tau), *found)
+
+
+def expectations_of(
+    looks: Looks,
+    recording: Recording,
+    T_map_sensor: Float,
+    options: EmOptions,
+    threads: int,
+) -> Expectations:
+    """What the looks say of every cell, and with that of every beam that ended in it."""
+    shares = fit_shares(looks.likelihood, looks.n_static, options.prior)
+    static = posterior_static(looks.likelihood, shares.classes, looks.n_static)
+    surface = looks.surface
+    beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
+    return Expectations(
+        p_static=_of_beams(recording, T_map_sensor, surface, static, shares.static, threads),
+        likelihood=_bound(looks.likelihood, looks.log_best, shares),
+        occupied=CellProbabilities(surface.elements()[0], static * coverage(surface), _UNSEEN),
+        learned=_learned(looks, shares),
+        no_return=NoReturn(looks.dwell.solid(), beyond),
+    )
 
 
 def coverage(surface: Surface) -> NDArray[np.float32]:
@@ -265,21 +293,22 @@ def _bound(likelihood: NDArray[np.float32], log_best: Float, shares: Shares) -> 
     return Likelihood(expected=bound - entropy, bound=bound)
 
 
-def _learned(surface: Surface, trust: float, shares: Shares, classes: Classes) -> dict[str, object]:
-    rho, tau, _ = classes.grid()
-    static, movers = slice(None, classes.n_static), slice(classes.n_static, None)
+def _learned(looks: Looks, shares: Shares) -> dict[str, object]:
+    static, movers = slice(None, looks.n_static), slice(looks.n_static, None)
     return {
-        "scatter": surface.scatter,
+        "scatter": looks.surface.scatter,
         "p_static": shares.static,
-        "no_return_trusted": round(trust, 6),
-        "static_occupied": _table(rho[static], shares.classes[static]),
-        "mover_occupied": _table(rho[movers], shares.classes[movers]),
-        "mover_seconds": _table(tau[movers], shares.classes[movers]),
+        "no_return_trusted": round(looks.trust, 6),
+        "static_occupied": _table(looks.rho[static], shares.classes[static]),
+        "mover_occupied": _table(looks.rho[movers], shares.classes[movers]),
+        "mover_seconds": _table(looks.tau[movers], shares.classes[movers]),
     }
 
 
-def _table(values: list[float], shares: Float) -> list[dict[str, float]]:
+def _table(values: Float, shares: Float) -> list[dict[str, float]]:
     """The share of each value among these classes."""
-    total = float(shares.sum())
-    of = {v: sum(s for w, s in zip(values, shares, strict=True) if w == v) for v in values}
-    return [{"value": v, "share": round(float(s) / total, 6)} for v, s in of.items()]
+    of = shares / shares.sum()
+    return [
+        {"value": float(v), "share": round(float(of[values == v].sum()), 6)}
+        for v in dict.fromkeys(values.tolist())
+    ]

@@ -21,6 +21,9 @@ class DwellOptions:
     reach: float = field_with_doc(4.0, "scatters within which hits are hits of the same thing")
     beyond: float = field_with_doc(0.3, "m, end of a maximum-range beam that says nothing")
     normals: bool = field_with_doc(True, "know a surface seen at a slant from one seen face on")
+    views: bool = field_with_doc(
+        True, "after the loop, know things that are met from some places only from passers-by"
+    )
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.look <= 3600.0:

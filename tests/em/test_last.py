@@ -1,0 +1,86 @@
+"""The last E-step: what is met from some places only is no passer-by."""
+
+import numpy as np
+import pytest
+from made_up_scans import ANGLES
+
+from stillmap import _core, em
+from stillmap.recording.model import Recording
+
+POST, RADIUS, WALL = (5.0, 3.0), 0.15, 5.0
+LOOKS, SECONDS = 80, 0.5
+
+
+def seen(at, met):
+    """A sensor at x = `at` of each look before a wall, and a post that it meets or sees through.
+
+    Returns the recording, its poses, and which beams end on the post (T, 181).
+    """
+    directions = np.column_stack([-np.sin(ANGLES), np.cos(ANGLES)])  # a half circle to the left
+    far = np.where(directions[:, 1] > 0.5, WALL / np.maximum(directions[:, 1], 0.5), np.nan)
+    ranges = np.tile(far, (len(at), 1))
+    off = np.array(POST) - np.column_stack([at, np.zeros(len(at))])
+    along = off @ directions.T
+    depth = RADIUS**2 - ((off**2).sum(axis=1)[:, None] - along**2)
+    on = (depth > 0) & (along > 0) & np.asarray(met)[:, None]
+    ranges = np.where(on, along - np.sqrt(np.maximum(depth, 0)), ranges)
+    T = np.tile(np.eye(3), (len(at), 1, 1))
+    T[:, 0, 2] = at
+    points = ranges[..., None] * directions
+    recording = Recording(
+        stamp_ns=np.round(1e9 * SECONDS * np.arange(len(at))).astype(np.int64),
+        offset=len(ANGLES) * np.arange(len(at) + 1),
+        points=points.reshape(-1, 2).astype(np.float32),
+        hit=np.isfinite(ranges).ravel(),
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(len(at), np.int32),
+        T_odom_base=None,
+    )
+    return recording, T, on.ravel()
+
+
+def labels(at, met, **dwell):
+    """(M,) p_static in the loop and in the last E-step, and which beams end on the post."""
+    recording, T, on = seen(at, met)
+    loop = em.e_step(recording, T, _core.Grid2D(0.05), "stillmap", em.EmOptions(), 1)
+    last, courses = em.last_e_step(recording, T, 0.05, em.EmOptions(dwell=em.DwellOptions(**dwell)))
+    assert on.sum() > 5
+    assert courses is not None
+    return loop.p_static, last and last.p_static, on
+
+
+def by_views(at, turn=0.25):
+    """From half of the views something is met: pieces of the angle under which it is seen."""
+    angle = np.arctan2(POST[1], POST[0] - np.asarray(at))
+    return np.floor(angle / turn) % 2 == 1
+
+
+ROUNDS = 5.0 + 4.0 * np.sin(np.linspace(0, 6 * np.pi, LOOKS))
+
+
+@pytest.mark.parametrize("turn", [0.25, 0.4, 0.6])
+def test_a_thing_that_is_met_from_some_places_stands_still(turn):
+    loop, last, on = labels(ROUNDS, by_views(ROUNDS, turn))
+    assert np.median(last[on]) > 0.9
+    assert np.median(loop[on]) < 0.1
+    wall = ~on & np.isfinite(last)
+    assert np.quantile(last[wall], 0.05) > 0.9
+
+
+@pytest.mark.parametrize("at", [np.full(LOOKS, 2.0), ROUNDS], ids=["stands", "moves"])
+def test_who_passes_is_a_passer_by(at):
+    met = (np.arange(LOOKS) >= 30) & (np.arange(LOOKS) < 34)
+    _, last, on = labels(at, met)
+    assert np.median(last[on]) < 0.1
+
+
+def test_what_comes_and_goes_before_a_sensor_that_stands_moves():
+    at = np.full(LOOKS, 2.0)
+    met = np.random.default_rng(1).random(LOOKS) < 0.5
+    loop, last, on = labels(at, met)
+    assert np.median(loop[on]) < 0.1
+    assert np.median(last[on]) < 0.1
+
+
+def test_without_views_labels_are_left_to_the_loop():
+    assert labels(ROUNDS, by_views(ROUNDS), views=False)[1] is None
