@@ -36,6 +36,7 @@ def course(
     return em.Courses(
         cells=np.asarray(cells, np.int64),
         p_static=np.full(n, static, np.float32),
+        p_views=np.zeros(n, np.float32),
         p_changing=np.full(n, p, np.float32),
         p_thing=np.full(n, 0.97 if there else 0.02, np.float32),
         occupied_share=np.full(n, share, np.float32),

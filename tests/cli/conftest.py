@@ -22,6 +22,8 @@ from stillmap.simulation import (
 )
 from stillmap.simulation.walls import box
 
+sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
+
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 

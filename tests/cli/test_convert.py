@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from refusals import refused
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
@@ -20,14 +21,6 @@ def mapped(stillmap, room, tmp_path_factory):
     done = stillmap("map", room, "-o", out, "--set", "em.max_iterations=2", "--quiet")
     assert done.returncode == 0, done.stderr
     return out
-
-
-def refused(done, *words):
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.count("\n") == 1, done.stderr
-    for word in words:
-        assert str(word) in done.stderr
 
 
 def topics_of(path):

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from stillmap.recording import folder, read
 
@@ -16,14 +17,6 @@ def mapped(stillmap, room, tmp_path_factory):
     done = stillmap("map", room, "-o", out, "--set", "em.max_iterations=1", "--quiet")
     assert done.returncode == 0, done.stderr
     return out
-
-
-def refused(done, *words):
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.count("\n") == 1, done.stderr
-    for word in words:
-        assert str(word) in done.stderr
 
 
 @pytest.mark.parametrize("below", [None, 0.9, 0.0])

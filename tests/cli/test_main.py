@@ -5,6 +5,7 @@ import os
 import subprocess
 
 import pytest
+from refusals import refused
 
 from stillmap.cli import main
 
@@ -20,17 +21,6 @@ COMMANDS = [
     ("eval", "labels"),
     ("eval", "map"),
 ]
-
-
-def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
-    """Exit status 2, one line on stderr with these words, nothing on stdout."""
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.startswith("stillmap")
-    assert done.stderr.count("\n") == 1
-    assert done.stderr.endswith("\n")
-    for word in words:
-        assert word in done.stderr
 
 
 @pytest.mark.parametrize("names", COMMANDS, ids=" ".join)

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from refusals import refused
 
 from stillmap.output.trajectory import read_tum
 from stillmap.recording import read, write
@@ -37,14 +38,6 @@ FILES = {
 
 def files_in(folder) -> set[str]:
     return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
-
-
-def refused(done, *words) -> None:
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.count("\n") == 1, done.stderr
-    for word in words:
-        assert str(word) in done.stderr
 
 
 @pytest.fixture(scope="module")

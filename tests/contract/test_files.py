@@ -1,7 +1,4 @@
-"""The files of a result, read by other people's programs.
-
-Clouds as LAS will be read by laspy here once they are written.
-"""
+"""The files of a result, and recordings as clouds, read by other people's programs."""
 
 import json
 import re
@@ -10,6 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from stillmap.cli import main
 from stillmap.output.trajectory import read_tum
 from stillmap.recording import poses as given_poses
 
@@ -119,3 +117,18 @@ def test_numpy_reads_the_labels_without_loading_them(result, recording):
     np.testing.assert_array_equal(hit, recording.hit)
     stamp_ns, _ = read_tum(result / "trajectory.tum")
     np.testing.assert_array_equal(np.load(result / "beams/stamp_ns.npy"), stamp_ns)
+
+
+@pytest.mark.parametrize("ending", ["las", "laz"])
+def test_laspy_reads_the_cloud(recorded, recording, tmp_path, ending):
+    laspy = pytest.importorskip("laspy")
+    path = tmp_path / f"cloud.{ending}"
+    assert main(["convert", str(recorded), "-o", str(path), "--quiet"]) == 0
+    found = laspy.read(path)
+    hits = np.flatnonzero(recording.hit)
+    assert len(found) == found.header.point_count == len(hits)
+    placed = recording.end_points(hits, recording.T_odom_base)
+    np.testing.assert_allclose(np.array(found.xyz)[:, :2], placed, atol=1e-4)
+    assert not np.any(found.z)
+    np.testing.assert_allclose(found.header.mins[:2], placed.min(axis=0), atol=1e-4)
+    np.testing.assert_allclose(found.header.maxs[:2], placed.max(axis=0), atol=1e-4)

@@ -24,6 +24,7 @@ def courses(**changed):
     usual = {
         "cells": np.array([[0, 0], [1, 0], [2, 0], [3, 0]]),
         "p_static": np.array([0.9, 0.1, 0.2, 0.05], np.float32),
+        "p_views": np.zeros(4, np.float32),
         "p_changing": np.array([0.02, 0.8, 0.7, 0.9], np.float32),
         "p_thing": np.array([0.5, 1.0, 0.0, 0.9], np.float32),
         "occupied_share": np.array([1.0, 0.3, 0.6, 0.7], np.float32),
@@ -53,6 +54,16 @@ def test_the_state_that_held_for_longest():
 
 
 @pytest.mark.parametrize("state", STATES)
+def test_what_changed_is_not_what_the_view_hides(state):
+    # where both may be, what is listed as a change is shown as one
+    shown = courses().shown(state)
+    half = {name: 0.5 * getattr(courses(), name) for name in ("p_static", "p_changing")}
+    np.testing.assert_allclose(
+        courses(**half, p_views=np.full(4, 0.5, np.float32)).shown(state), shown, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("state", STATES)
 def test_no_probability_exceeds_one(state):
     p = np.full(4, 0.6, np.float32)
     one = courses(p_static=p, p_changing=p, p_thing=np.ones(4, np.float32))
@@ -65,6 +76,7 @@ def row(p_changing, *, came=True, between=(10, 12), count=1, static=0.01, apart=
     return em.Courses(
         cells=np.column_stack([apart * np.arange(n), np.zeros(n)]).astype(np.int64),
         p_static=np.full(n, static, np.float32),
+        p_views=np.zeros(n, np.float32),
         p_changing=np.array(p_changing, np.float32),
         p_thing=np.full(n, 0.9 if came else 0.1, np.float32),
         occupied_share=np.full(n, 0.5, np.float32),

@@ -28,7 +28,8 @@ class Courses:
 
     Attributes:
         cells: (E, D) int64.
-        p_static: (E,) float32, probability that what is there never left.
+        p_static: (E,) float32, probability that what is there never left and is met all around.
+        p_views: (E,) float32, that it never left and is met from some places only.
         p_changing: (E,) float32, that things came to stay, left, or come and go.
         p_thing: (E,) float32, that one stood there at the last look, if so.
         occupied_share: (E,) float32, share of the time in which the cell was not empty, from its
@@ -43,6 +44,7 @@ class Courses:
 
     cells: NDArray[np.int64]
     p_static: NDArray[np.float32]
+    p_views: NDArray[np.float32]
     p_changing: NDArray[np.float32]
     p_thing: NDArray[np.float32]
     occupied_share: NDArray[np.float32]
@@ -55,11 +57,13 @@ class Courses:
     def shown(self, state: MapState) -> NDArray[np.float32]:
         """(E,) probability that the map has something there.
 
-        In its last state, what comes and goes is not there: nobody knows for how long.
+        In its last state, what comes and goes is not there: nobody knows for how long. It is asked
+        of places that are known to have changed, where it was not the view that did.
         """
         last = np.where(self.count < OFTEN, self.p_thing, np.float32(0.0))
         there = last if state == "last" else (self.occupied_share > 0.5).astype(np.float32)
-        return np.asarray(np.minimum(self.p_static + self.p_changing * there, 1.0), np.float32)
+        p = (self.p_static + self.p_changing * there) / np.maximum(1.0 - self.p_views, _POSSIBLE)
+        return np.asarray(np.minimum(p, 1.0), np.float32)
 
 
 def watch(dwell: Dwell, recording: Recording, options: EmOptions) -> None:
@@ -81,11 +85,15 @@ def courses_of(looks: Looks, options: EmOptions) -> Courses:
     goes = np.einsum("kc,c->k", likelihood[:, often], weights[often])
     of = (goes > stays).astype(np.intp)  # what comes and goes does not stay long enough for a thing
     each = np.arange(len(of))
+    evidence = np.einsum("kc,c->k", likelihood, weights)
+    views = np.append(np.isfinite(looks.turn), False)
+    p_views = np.einsum("kc,c->k", likelihood[:, views], weights[views]) / evidence
     return _as_wholes(
         Courses(
             cells=looks.surface.elements()[0],
-            p_static=posterior_static(likelihood, shares.classes, looks.n_static),
-            p_changing=(stays + goes) / np.einsum("kc,c->k", likelihood, weights),
+            p_static=posterior_static(likelihood, shares.classes, looks.n_static) - p_views,
+            p_views=p_views,
+            p_changing=(stays + goes) / evidence,
             p_thing=p_last[each, of],
             occupied_share=occupied_share,
             count=count[each, of],
@@ -110,12 +118,13 @@ def _as_wholes(courses: Courses) -> Courses:
     before, after = courses.between[of, 1].T
     came = courses.p_thing[of] > 0.5
     at_once = np.maximum(before[i], before[j]) < np.minimum(after[i], after[j]) + _LOOKS_APART
+    stands = courses.p_static + courses.p_views
     p_changing = courses.p_changing.copy()
     for one in components(pairs[at_once & (came[i] == came[j])], len(of)):
         if len(one) >= _WHOLE:
             cells = of[one]
             decided = np.quantile(p_changing[cells], 1.0 - _DECIDE, method="lower")
-            p_changing[cells] = np.minimum(decided, 1.0 - courses.p_static[cells])
+            p_changing[cells] = np.minimum(decided, 1.0 - stands[cells])
     return dataclasses.replace(courses, p_changing=p_changing)
 
 

@@ -107,7 +107,7 @@ class Looks:
         surface: the elements.
         dwell: what was seen of them.
         trust: how far beams without a return are believed, from 0 to 1.
-        rho, tau: (C,) of the classes; the first `n_static` are static.
+        rho, tau, turn: (C,) of the classes; the first `n_static` are static.
         likelihood: (E, C) under each class, relative to the best; its logarithm is `log_best`.
     """
 
@@ -116,6 +116,7 @@ class Looks:
     trust: float
     rho: Float
     tau: Float
+    turn: Float
     n_static: int
     likelihood: NDArray[np.float32]
     log_best: Float
@@ -128,6 +129,7 @@ class Looks:
             self,
             rho=self.rho[kept],
             tau=self.tau[kept],
+            turn=self.turn[kept],
             likelihood=likelihood / best[:, None],
             log_best=self.log_best + np.log(best),
         )
@@ -150,9 +152,9 @@ def looked_at(
     if prepare is not None:
         prepare(dwell)
     likelihood, log_best = _likelihood(recording, T_map_sensor, dwell, options.dwell.look, threads)
-    rho, tau, _ = classes.grid()
+    rho, tau, turn = (np.array(values) for values in classes.grid())
     found = classes.n_static, likelihood, log_best
-    return Looks(surface, dwell, trust, np.array(rho), np.array(tau), *found)
+    return Looks(surface, dwell, trust, rho, tau, turn, *found)
 
 
 def expectations_of(
