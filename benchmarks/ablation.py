@@ -27,7 +27,7 @@ from prepared import RESOLUTION
 from tables import markdown
 
 from stillmap.em import EmOptions, dwell
-from stillmap.em.dwell import CLASSES, Classes
+from stillmap.em.looks import CLASSES, Classes
 from stillmap.evaluation.labels import LabelScores, label_scores
 from stillmap.simulation import simulate
 

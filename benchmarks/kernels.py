@@ -19,8 +19,8 @@ from tables import Column, markdown
 from wanted import judged
 
 import stillmap
-from stillmap import _core, em
-from stillmap.em import dwell
+from stillmap import _core
+from stillmap.em import dwell, looks
 from stillmap.simulation import Scene, scene_by_name, simulate
 
 RESOLUTION = 0.05  # m
@@ -66,17 +66,17 @@ def kernels_of(recording: stillmap.Recording, poses: NDArray[np.float64]) -> dic
     scans = (recording.points, recording.hit, e, recording.offset, T_map_sensor)
     grid = _core.Grid2D(RESOLUTION)
     _core.add_beams(grid, *scans, 1)
-    surface = dwell.surface_of(recording, T_map_sensor, RESOLUTION)
+    surface = looks.surface_of(recording, T_map_sensor, RESOLUTION)
 
     def elements(threads: int) -> object:
-        seen = dwell._dwell(surface, options.dwell, dwell.CLASSES)
-        return dwell._likelihood(recording, T_map_sensor, seen, options.dwell.look, threads)
+        seen = looks._dwell(surface, options.dwell, looks.CLASSES)
+        return looks._likelihood(recording, T_map_sensor, seen, options.dwell.look, threads)
 
     return {
         "M-step: sums of (10)": lambda n: _core.add_beams(_core.Grid2D(RESOLUTION), *scans, n),
         "likelihood (5)": lambda n: _core.log_likelihood(grid, *scans, options.prior, n),
         "E-step: element pass": elements,
-        "E-step": lambda n: em.dwell.e_step(recording, poses, RESOLUTION, options, n),
+        "E-step": lambda n: dwell.e_step(recording, poses, RESOLUTION, options, n),
     }
 
 

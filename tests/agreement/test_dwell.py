@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stillmap import _core, reference
-from stillmap.em.dwell import Classes
+from stillmap.em.looks import Classes
 from stillmap.reference.dwell import HIT, SURE, chain_log_likelihood
 
 CLASSES = Classes(views_occupied=(0.65,)).grid()

@@ -9,7 +9,7 @@ from made_up_courses import RESOLUTION, block, course, recording
 from stillmap import em, se2
 from stillmap.changes import Change, relabelled
 from stillmap.em import chunks
-from stillmap.em.dwell import surface_of
+from stillmap.em.looks import surface_of
 from stillmap.recording.model import Recording
 
 SCANS, BEAMS = 60, 20

@@ -8,7 +8,7 @@ from made_up import RESOLUTION, Ball, Wall, Watched, cone, fan, watch
 
 from stillmap import _core, em
 from stillmap.em import chunks, dwell
-from stillmap.em.dwell import CLASSES
+from stillmap.em.looks import CLASSES, surface_of
 from stillmap.evaluation.labels import calibration_error, equal_width_bins
 from stillmap.simulation import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.simulation.walls import box
@@ -117,7 +117,7 @@ def test_a_corner_that_beams_pass_closely_stays():
 
 def rows(seen, x, y, radius):
     """Cells near a place with the likelihood of every class."""
-    surface = dwell.surface_of(seen.recording, seen.poses, 0.1)
+    surface = surface_of(seen.recording, seen.poses, 0.1)
     rho, tau, turn = CLASSES.grid()
     chains = _core.Dwell2D(
         surface, rho=rho, tau=tau, turn=turn, detection=0.97, seconds=1.0,

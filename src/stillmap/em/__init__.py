@@ -1,7 +1,6 @@
 """What is static: the E-steps, the map that follows from them, and the likelihood. No I/O."""
 
 from stillmap.em.courses import Courses
-from stillmap.em.dwell import look_numbers
 from stillmap.em.estimator import (
     Estimator,
     add_believed_first,
@@ -16,6 +15,7 @@ from stillmap.em.evidence import Evidence, evidence
 from stillmap.em.expectations import CellProbabilities, Expectations, Likelihood, NoReturn
 from stillmap.em.held_out import held_out_log_likelihood
 from stillmap.em.last import last_e_step
+from stillmap.em.looks import look_numbers
 from stillmap.em.occupancy import Box, OccupancyMap, Seen, occupancy_map
 from stillmap.em.options import ChangeOptions, DwellOptions, EmOptions, EvidenceOptions, MapState
 

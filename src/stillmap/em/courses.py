@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.em.dwell import OFTEN_OCCUPIED, Dwell, Float, Looks, Surface, coverage
+from stillmap.em.dwell import coverage
+from stillmap.em.looks import OFTEN_OCCUPIED, Dwell, Float, Looks, Surface
 from stillmap.em.mixture import fit_shares, posterior_static
 from stillmap.em.options import ChangeOptions, EmOptions, MapState
 from stillmap.em.together import components, pairs_near

@@ -1,13 +1,8 @@
 """The default E-step: what stands still is what never leaves. `docs/estimator.md` derives it."""
 
-import dataclasses
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core
 from stillmap.em.chunks import chunks
 from stillmap.em.expectations import (
     CellProbabilities,
@@ -16,64 +11,16 @@ from stillmap.em.expectations import (
     NoReturn,
     per_beam,
 )
+from stillmap.em.looks import CLASSES, Classes, Float, Looks, Surface, looked_at
 from stillmap.em.mixture import Shares, fit_shares, posterior_static
-from stillmap.em.options import DwellOptions, EmOptions
+from stillmap.em.options import EmOptions
 from stillmap.recording.model import Recording
 
-Float = NDArray[np.float64]
-Surface = _core.Surface2D | _core.Surface3D
-Dwell = _core.Dwell2D | _core.Dwell3D
-
-OFTEN_OCCUPIED = 0.5  # share of the time in which something is there that comes and goes often
-
-_LEAST = 0.3  # cells: no length is known better, whatever the scatter
 _UNSEEN = 0.2  # probability that a cell is occupied in which no beam ended and none passed
 _PROMINENT = 0.1  # share of the richest cell's beams that noise alone hardly brings into another
-_SWALLOWED = 4.0  # one in so many beams without a return through walls: none is trusted
 _BELIEVED = 0.5  # trust in beams without a return from which on they show free space
 _ROWS = 1 << 14
-_LAST_LOOK = 2**31 - 1  # as far as the core counts
 _EDGE = 0.15  # cells: how sharply a surface ends
-
-
-@dataclass(frozen=True)
-class Classes:
-    """Grid over what a cell may hold: how much of the time it is occupied, and for how long.
-
-    The shares of these classes are learned; the grid itself only has to be wide and fine enough.
-
-    Attributes:
-        static_occupied, static_seconds: share of the time and correlation time in seconds of what
-            stands still: one, but for looks that miss it, which come in runs.
-        views_occupied, views_turn: of what stands still and is met from some places only: the share
-            of them, and by how many radians the view turns until it is met or not anew.
-        mover_occupied, mover_seconds: of what comes and goes.
-        often_seconds: of what comes and goes and is there for half of the time.
-    """
-
-    static_occupied: tuple[float, ...] = (0.998, 0.95)
-    static_seconds: tuple[float, ...] = (25.0, 100.0)
-    views_occupied: tuple[float, ...] = ()
-    views_turn: float = 0.4
-    mover_occupied: tuple[float, ...] = (0.01, 0.04, 0.15)
-    mover_seconds: tuple[float, ...] = (0.5, 3.0, 12.0, 45.0)
-    often_seconds: tuple[float, ...] = ()
-
-    @property
-    def n_static(self) -> int:
-        return len(self.static_occupied) * len(self.static_seconds) + len(self.views_occupied)
-
-    def grid(self) -> tuple[list[float], list[float], list[float]]:
-        """rho, tau, turn of each: static ones first, those of half of the time last."""
-        never = float("inf")
-        of = [(r, t, never) for t in self.static_seconds for r in self.static_occupied]
-        of += [(r, never, self.views_turn) for r in self.views_occupied]
-        of += [(r, t, never) for t in self.mover_seconds for r in self.mover_occupied]
-        of += [(OFTEN_OCCUPIED, t, never) for t in self.often_seconds]
-        return [r for r, _, _ in of], [t for _, t, _ in of], [v for _, _, v in of]
-
-
-CLASSES = Classes()
 
 
 def e_step(
@@ -97,64 +44,6 @@ def e_step(
     T_map_sensor = recording.T_map_sensor(poses)
     looks = looked_at(recording, T_map_sensor, resolution, options, threads, classes)
     return expectations_of(looks, recording, T_map_sensor, options, threads)
-
-
-@dataclass(frozen=True, eq=False)
-class Looks:
-    """What all looks say of E elements.
-
-    Attributes:
-        surface: the elements.
-        dwell: what was seen of them.
-        trust: how far beams without a return are believed, from 0 to 1.
-        rho, tau, turn: (C,) of the classes; the first `n_static` are static.
-        likelihood: (E, C) under each class, relative to the best; its logarithm is `log_best`.
-    """
-
-    surface: Surface
-    dwell: Dwell
-    trust: float
-    rho: Float
-    tau: Float
-    turn: Float
-    n_static: int
-    likelihood: NDArray[np.float32]
-    log_best: Float
-
-    def among(self, kept: NDArray[np.bool_]) -> "Looks":
-        """The same under some (C,) of the classes, all static ones among them."""
-        likelihood = self.likelihood[:, kept]
-        best = likelihood.max(axis=1, initial=0.0)  # the core lets no class be impossible
-        return dataclasses.replace(
-            self,
-            rho=self.rho[kept],
-            tau=self.tau[kept],
-            turn=self.turn[kept],
-            likelihood=likelihood / best[:, None],
-            log_best=self.log_best + np.log(best),
-        )
-
-
-def looked_at(
-    recording: Recording,
-    T_map_sensor: Float,
-    resolution: float,
-    options: EmOptions,
-    threads: int,
-    classes: Classes = CLASSES,
-    prepare: Callable[[Dwell], None] | None = None,
-) -> Looks:
-    """Follows all beams; `prepare` is called before the first look. See `e_step`."""
-    surface = surface_of(recording, T_map_sensor, resolution)
-    dwell = _dwell(surface, options.dwell, classes)
-    trust = _open(recording, T_map_sensor, dwell)
-    dwell.trust(trust)
-    if prepare is not None:
-        prepare(dwell)
-    likelihood, log_best = _likelihood(recording, T_map_sensor, dwell, options.dwell.look, threads)
-    rho, tau, turn = (np.array(values) for values in classes.grid())
-    found = classes.n_static, likelihood, log_best
-    return Looks(surface, dwell, trust, rho, tau, turn, *found)
 
 
 def expectations_of(
@@ -188,81 +77,6 @@ def coverage(surface: Surface) -> NDArray[np.float32]:
     covered = ndtr((half - np.abs(off_plane / surface.resolution)) / _EDGE)
     lone = np.minimum(prominence / _PROMINENT, 1.0)
     return np.asarray(np.where(normals.any(axis=1), covered, lone), dtype=np.float32)
-
-
-def surface_of(recording: Recording, T_map_sensor: Float, resolution: float) -> Surface:
-    """Mean, normal and scatter of the end points in every cell where beams ended."""
-    kind = _core.Surface2D if recording.dimension == 2 else _core.Surface3D
-    surface = kind(resolution)
-    for scans, beams, offset in chunks(recording):
-        surface.add_end_points(
-            recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans]
-        )
-    surface.fit()
-    return surface
-
-
-def look_numbers(recording: Recording, seconds: float) -> NDArray[np.int64]:
-    """(T,) the look of each scan: what was seen within it tells no more than a single glance.
-
-    A clock that leaps by decades makes one look of what comes after.
-    """
-    since = recording.stamp_ns - recording.stamp_ns[0]
-    number = since // max(round(seconds * 1e9), 1)
-    return np.asarray(np.minimum(number, _LAST_LOOK), dtype=np.int64)
-
-
-def _likelihood(
-    recording: Recording,
-    T_map_sensor: Float,
-    dwell: Dwell,
-    seconds: float,
-    threads: int,
-) -> tuple[NDArray[np.float32], Float]:
-    """(E, C) likelihood of all looks at each element relative to its best class, ln of the best."""
-    look = look_numbers(recording, seconds)
-    for scans, beams, offset in chunks(recording, look):
-        dwell.add(
-            recording.points[beams],
-            recording.hit[beams],
-            offset,
-            T_map_sensor[scans],
-            look[scans],
-            threads,
-        )
-    return dwell.likelihood()
-
-
-def _dwell(surface: Surface, options: DwellOptions, classes: Classes) -> Dwell:
-    rho, tau, turn = classes.grid()
-    cell, scatter = surface.resolution, surface.scatter
-    lengths = {
-        "lateral": max(options.lateral * scatter, _LEAST * cell),
-        "margin": options.margin * scatter + 0.5 * cell,
-        "reach": options.reach * scatter + 0.7 * cell,  # half a cell's diagonal
-        "beyond": options.beyond,
-    }
-    chosen = {"detection": options.detection, "seconds": options.look, **lengths}
-    if isinstance(surface, _core.Surface2D):
-        return _core.Dwell2D(
-            surface, rho=rho, tau=tau, turn=turn, normals=options.normals, **chosen
-        )
-    return _core.Dwell3D(surface, rho=rho, tau=tau, turn=turn, normals=options.normals, **chosen)
-
-
-def _open(recording: Recording, T_map_sensor: Float, dwell: Dwell) -> float:
-    """How far beams without a return show that nothing is there, from 0 to 1.
-
-    Where there is open space they cross nothing solid. Where most of them seem to go through walls,
-    something swallows them.
-    """
-    lost = through = 0
-    for scans, beams, offset in chunks(recording):
-        counts = dwell.lost(
-            recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans]
-        )
-        lost, through = lost + counts[0], through + counts[1]
-    return max(0.0, 1.0 - _SWALLOWED * through / lost) if lost else 0.0
 
 
 def _of_beams(

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from stillmap import _core
 from stillmap.em.chunks import chunks
-from stillmap.em.dwell import look_numbers
 from stillmap.em.expectations import NoReturn
+from stillmap.em.looks import look_numbers
 from stillmap.em.occupancy import OccupancyMap
 from stillmap.em.options import EmOptions
 from stillmap.recording.model import Recording

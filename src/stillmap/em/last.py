@@ -9,19 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.em.courses import Courses, courses_of, watch
-from stillmap.em.dwell import (
-    OFTEN_OCCUPIED,
-    Classes,
-    Dwell,
-    Looks,
-    expectations_of,
-    looked_at,
-)
+from stillmap.em.dwell import expectations_of
 from stillmap.em.expectations import Expectations
+from stillmap.em.looks import OFTEN_OCCUPIED, Classes, Dwell, Float, Looks, looked_at
 from stillmap.em.options import EmOptions
 from stillmap.recording.model import Recording
-
-Float = NDArray[np.float64]
 
 _CROWDED = 0.15  # share of the time in which somebody is where many pass
 _SECONDS = 3.0
