@@ -183,7 +183,7 @@ def changed_places(
 
 def _without_noise(changes: list[Change], courses: Courses, options: ChangeOptions) -> list[Change]:
     """The places that are more than noise: that of poses and ranges moves surfaces to and fro."""
-    stays = courses.cells[courses.p_static > _SURE]
+    stays = courses.cells[courses.stands > _SURE]
     if not len(stays):
         return changes
     tree = scipy.spatial.cKDTree(stays)

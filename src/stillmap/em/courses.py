@@ -55,6 +55,11 @@ class Courses:
     share: float
     surface: Surface
 
+    @property
+    def stands(self) -> NDArray[np.float32]:
+        """(E,) probability that what is there never left."""
+        return self.p_static + self.p_views
+
     def shown(self, state: MapState) -> NDArray[np.float32]:
         """(E,) probability that the map has something there.
 
@@ -112,20 +117,19 @@ def _as_wholes(courses: Courses) -> Courses:
         (courses.count > 0)
         & (courses.count < OFTEN)
         & (courses.p_changing > _POSSIBLE)
-        & (courses.p_static < 0.5)
+        & (courses.stands < 0.5)
     )
     pairs = pairs_near(courses.cells[of], _BESIDE)
     i, j = pairs.T
     before, after = courses.between[of, 1].T
     came = courses.p_thing[of] > 0.5
     at_once = np.maximum(before[i], before[j]) < np.minimum(after[i], after[j]) + _LOOKS_APART
-    stands = courses.p_static + courses.p_views
     p_changing = courses.p_changing.copy()
     for one in components(pairs[at_once & (came[i] == came[j])], len(of)):
         if len(one) >= _WHOLE:
             cells = of[one]
             decided = np.quantile(p_changing[cells], 1.0 - _DECIDE, method="lower")
-            p_changing[cells] = np.minimum(decided, 1.0 - stands[cells])
+            p_changing[cells] = np.minimum(decided, 1.0 - courses.stands[cells])
     return dataclasses.replace(courses, p_changing=p_changing)
 
 

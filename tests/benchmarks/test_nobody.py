@@ -1,0 +1,33 @@
+from pathlib import Path
+
+import pytest
+from nobody import Job, found, table
+
+from stillmap.recording import writers
+from stillmap.simulation import scene_by_name, simulate
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short way through a hall with nobody in it."""
+    path = tmp_path_factory.mktemp("nobody") / "empty.bag"
+    scene = scene_by_name("hall", {"crowd": {"people": 0}, "robot": {"scans": 60}})
+    writers.write(simulate(scene, 0).recording, path)
+    return path
+
+
+def test_an_empty_hall_is_still(bag: Path) -> None:
+    job = Job(bag, None, "stillmap", ("em.max_iterations=1",))
+    of = found(job)
+    assert of.scans == 60
+    assert 0 <= of.of_beams <= of.of_hits < 0.03
+    (line,) = table([(job, of)]).splitlines()[2:]
+    assert "as chosen" in line
+    assert "| met " in line
+
+
+def test_what_is_not_met_is_said(bag: Path) -> None:
+    job = Job(bag, "/scan", "hit-ratio-0.25", ())
+    of = found(Job(bag, "/scan", "hit-ratio-0.25", ("em.hit_ratio=0.999",)))
+    assert of.of_beams > 0.03
+    assert "MISSED" in table([(job, of)])
