@@ -215,6 +215,10 @@ def test_a_value_out_of_range_becomes_an_input_error(assignment: str) -> None:
     [
         ("threads=2", {"threads": 2}),
         ("em.prior=0.8", {"em": {"prior": 0.8}}),
+        ("em.prior=.8", {"em": {"prior": 0.8}}),
+        ("em.prior=-.8E-1", {"em": {"prior": -0.08}}),
+        ("em.prior=2.", {"em": {"prior": 2.0}}),
+        ("em.prior=.", {"em": {"prior": "."}}),
         (" em.prior = 0.8 ", {"em": {"prior": 0.8}}),
         ("slam.motion.rotation_floor=1e-2", {"slam": {"motion": {"rotation_floor": 0.01}}}),
         ("output.map_mode=raw", {"output": {"map_mode": "raw"}}),

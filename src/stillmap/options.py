@@ -116,7 +116,10 @@ def load_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_assignment(text: str) -> dict[str, Any]:
-    """`section.key=value` as a nested dictionary; the value as TOML, else as a string."""
+    """`section.key=value` as a nested dictionary; the value as TOML, else as a string.
+
+    Numbers may lack a zero that TOML wants, as in `.5`.
+    """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise InputError(f"--set wants section.key=value, got '{text}'")
@@ -125,7 +128,7 @@ def parse_assignment(text: str) -> dict[str, Any]:
     except (ValueError, RecursionError):
         read = {}
     # more than one key: the value had several lines, and only looked like TOML
-    parsed = read["value"] if len(read) == 1 else value.strip()
+    parsed = read["value"] if len(read) == 1 else _number_or_text(value.strip())
     nested: dict[str, Any] = {}
     inner = nested
     *sections, last = key.strip().split(".")
@@ -133,6 +136,10 @@ def parse_assignment(text: str) -> dict[str, Any]:
         inner = inner.setdefault(section, {})
     inner[last] = parsed
     return nested
+
+
+def _number_or_text(value: str) -> float | str:
+    return float(value) if re.fullmatch(r"[+-]?(\d+\.|\.\d+)(e[+-]?\d+)?", value, re.I) else value
 
 
 def merged(*changes: Mapping[str, Any]) -> dict[str, Any]:
