@@ -1,6 +1,7 @@
 """The last E-step: what came to stay, left, or comes and goes, and what the map shows of it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -138,6 +139,40 @@ def test_cells_that_changed_at_other_times_are_another_thing(looks, apart):
 def test_nobody_becomes_more_than_certain():
     one = row([0.99, 0.98, 0.1, 0.1], static=0.4)
     np.testing.assert_allclose(decided(one), 0.6)
+
+
+def test_rounding_makes_nothing_impossible(monkeypatch):
+    """Cells of which one class is certain, each in its turn."""
+    rng = np.random.default_rng(0)
+    rho, turn = [0.99, 0.65, 0.1, em.looks.OFTEN_OCCUPIED], [np.inf, 0.2, np.inf, np.inf]
+    likelihood = 10.0 ** rng.uniform(-9.0, -6.0, (20_000, 4))
+    likelihood[np.arange(20_000), rng.integers(0, 4, 20_000)] = 1.0
+    grid = np.column_stack([np.arange(20_000) * 9, np.zeros(20_000)]).astype(np.int64)
+    changes = (
+        np.log(10.0 ** rng.uniform(-9.0, 1.0, 20_000)),
+        np.ones(20_000, np.float32),
+        np.ones((20_000, 2), np.float32),
+        np.zeros((20_000, 2), np.int32),
+        np.zeros((20_000, 2, 2, 2), np.int32),
+    )
+    looks = em.looks.Looks(
+        surface=SimpleNamespace(elements=lambda: (grid,)),
+        dwell=SimpleNamespace(changes=lambda: changes),
+        trust=1.0,
+        rho=np.array(rho),
+        tau=np.array([np.inf, np.inf, 3.0, 8.0]),
+        turn=np.array(turn),
+        n_static=2,
+        likelihood=likelihood.astype(np.float32),
+        log_best=np.zeros(20_000),
+    )
+    monkeypatch.setattr(module, "coverage", lambda _: np.ones(20_000, np.float32))
+    found = module.courses_of(looks, em.EmOptions())
+    for p in (found.p_static, found.p_views, found.p_changing):
+        assert p.dtype == np.float32
+        assert p.min() >= 0.0
+        assert p.max() <= 1.0
+        assert p.max() > 0.99
 
 
 def passing(since, x):

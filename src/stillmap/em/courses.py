@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.em.dwell import coverage
 from stillmap.em.looks import OFTEN_OCCUPIED, Dwell, Float, Looks, Surface
-from stillmap.em.mixture import fit_shares, posterior_static
+from stillmap.em.mixture import fit_shares
 from stillmap.em.options import ChangeOptions, EmOptions, MapState
 from stillmap.em.together import components, pairs_near
 from stillmap.recording.model import Recording
@@ -85,21 +85,19 @@ def courses_of(looks: Looks, options: EmOptions) -> Courses:
     log_changing, occupied_share, p_last, count, between = looks.dwell.changes()
     likelihood = _with_changing(looks, log_changing)
     shares = fit_shares(likelihood, looks.n_static, options.prior)
-    weights = shares.classes.astype(np.float32)
+    views = np.append(np.isfinite(looks.turn), False)
+    static = np.arange(len(views)) < looks.n_static
     often = np.append(looks.rho == OFTEN_OCCUPIED, False)
-    stays = likelihood[:, -1] * weights[-1]
-    goes = np.einsum("kc,c->k", likelihood[:, often], weights[often])
+    stays = _posterior(likelihood, shares.classes, np.arange(len(views)) == len(views) - 1)
+    goes = _posterior(likelihood, shares.classes, often)
     of = (goes > stays).astype(np.intp)  # what comes and goes does not stay long enough for a thing
     each = np.arange(len(of))
-    evidence = np.einsum("kc,c->k", likelihood, weights)
-    views = np.append(np.isfinite(looks.turn), False)
-    p_views = np.einsum("kc,c->k", likelihood[:, views], weights[views]) / evidence
     return _as_wholes(
         Courses(
             cells=looks.surface.elements()[0],
-            p_static=posterior_static(likelihood, shares.classes, looks.n_static) - p_views,
-            p_views=p_views,
-            p_changing=(stays + goes) / evidence,
+            p_static=_posterior(likelihood, shares.classes, static & ~views),
+            p_views=_posterior(likelihood, shares.classes, views),
+            p_changing=np.minimum(stays + goes, np.float32(1.0)),
             p_thing=p_last[each, of],
             occupied_share=occupied_share,
             count=count[each, of],
@@ -109,6 +107,18 @@ def courses_of(looks: Looks, options: EmOptions) -> Courses:
             surface=looks.surface,
         )
     )
+
+
+def _posterior(
+    likelihood: NDArray[np.float32], shares: Float, among: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """(K,) probability that each member belongs to one of some classes (C,)."""
+    weights = shares.astype(np.float32)
+    found, others = (
+        np.einsum("kc,c->k", likelihood, np.where(some, weights, np.float32(0.0)))
+        for some in (among, ~among)
+    )
+    return np.asarray(found / (found + others), np.float32)
 
 
 def _as_wholes(courses: Courses) -> Courses:
