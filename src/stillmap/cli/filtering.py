@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stillmap.cli.results import Mapped, found, require_apart
 from stillmap.errors import InputError
 from stillmap.output.atomic import require_new, require_new_file
-from stillmap.recording import Recording, carmen_blanked, folder
+from stillmap.recording import Recording, carmen_blanked, folder, spool
 from stillmap.recording.formats import format_of
 
 
@@ -50,11 +50,15 @@ def filtered(
     else:
         require_new_file(output, overwrite)
     recording, labels = mapped.read()
-    # NaN: unusable anyway
-    blank = recording.hit & (labels.p_static < below)
+    blank, hits, blanked = spool.empty(recording.hit.shape, np.bool_), 0, 0
+    for block in spool.blocks(recording.hit, labels.p_static, blank):
+        hit = recording.hit[block]
+        # NaN: unusable anyway
+        blank[block] = hit & (labels.p_static[block] < below)
+        hits += int(np.count_nonzero(hit))
+        blanked += int(np.count_nonzero(blank[block]))
     left_out, topics = _write(mapped, output, recording, blank, overwrite)
-    beams, hits = int(np.count_nonzero(blank)), int(np.count_nonzero(recording.hit))
-    return Filtered(mapped.source, hits, beams, left_out, topics)
+    return Filtered(mapped.source, hits, blanked, left_out, topics)
 
 
 def _write(
@@ -79,4 +83,7 @@ def _write(
 
 def _without(recording: Recording, blank: NDArray[np.bool_]) -> Recording:
     """Blanked beams went as far as they did, and met nothing."""
-    return dataclasses.replace(recording, hit=recording.hit & ~blank)
+    hit = spool.copied(recording.hit)
+    for block in spool.blocks(hit, blank):
+        hit[block] &= ~blank[block]
+    return dataclasses.replace(recording, hit=hit)

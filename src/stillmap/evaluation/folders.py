@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from stillmap.arrays import open_npy
 from stillmap.errors import InputError
 from stillmap.evaluation.map import Grid
+from stillmap.recording import spool
 from stillmap.recording.folder import read as read_folder
 from stillmap.recording.formats import read as recording_of
 from stillmap.recording.model import Recording
@@ -98,10 +99,11 @@ def read_labels(result: Path) -> Labels:
     beams = int(offset[-1])
     path = folder / "p_static.npy"
     p_static = _array(path, (beams,), "f")
-    with np.errstate(invalid="ignore"):
-        wrong = np.flatnonzero((p_static < 0) | (p_static > 1))
-    if len(wrong):
-        raise InputError(f"beam {wrong[0]} has no probability in [0, 1]", where=str(path))
+    for block in spool.blocks(p_static):
+        wrong = np.flatnonzero((p_static[block] < 0) | (p_static[block] > 1))
+        if len(wrong):
+            beam = block.start + int(wrong[0])
+            raise InputError(f"beam {beam} has no probability in [0, 1]", where=str(path))
     return Labels(stamp_ns, offset, p_static, _array(folder / "hit.npy", (beams,), "b"))
 
 

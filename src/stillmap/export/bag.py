@@ -43,7 +43,8 @@ def write(result: Exported, path: Path, kind: Kind, *, overwrite: bool = False) 
         dynamic = [bag.topic(f"{name}_dynamic", messages.SCAN) for name in names]
         send_tf = bag.topic("/tf", messages.TRANSFORMS)
         show_objects = _shown_objects(bag, result)
-        for t, stamp in enumerate(stamps):
+        for t in recording.in_turn(range(recording.n_scans), result.p_static):
+            stamp = stamps[t]
             send_tf(stamp, messages.transforms(bag, stamp, [(MAP, BASE, result.poses[t])]))
             s = int(recording.sensor[t])
             beams, ranges = recording.beams_of(t), lasers.ranges(t)

@@ -8,7 +8,6 @@ from stillmap.objects.kalman import Motion
 from stillmap.objects.moving import MovingPoints
 from stillmap.objects.options import ObjectOptions
 from stillmap.recording import spool
-from stillmap.recording.model import TOGETHER
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -29,10 +28,9 @@ def followed(points: MovingPoints, options: ObjectOptions) -> Index:
         options: see ObjectOptions.
     """
     following = _Following(points, options)
-    for n, scan in enumerate(np.flatnonzero(np.diff(points.first)).tolist()):
+    scans = np.flatnonzero(np.diff(points.first)).tolist()
+    for scan in spool.in_turn(scans, lambda: points.let_go(following.owner)):
         following.take(scan)
-        if n % TOGETHER == 0:
-            points.let_go(following.owner)
     return following.owner
 
 

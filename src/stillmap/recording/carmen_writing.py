@@ -102,7 +102,8 @@ def lines(recording: Recording, form: Form) -> Iterator[str]:
     for name, value in form.params.items():
         yield f"PARAM {name} {value} {seconds_text(first)} {form.host} {seconds_text(0)}\n"
     base, laser = _poses(recording)
-    for t, stamp in enumerate(recording.stamp_ns.tolist()):
+    for t in recording.in_turn(range(recording.n_scans)):
+        stamp = int(recording.stamp_ns[t])
         times = f"{seconds_text(stamp)} {form.host} {seconds_text(stamp - first)}\n"
         if base is not None:
             yield f"ODOM {_pose(base[t])} 0 0 0 {times}"
@@ -208,7 +209,7 @@ def _declared(reach: planar.Reach) -> float:
 def _unusable(recording: Recording, number: int) -> float:
     """Zero, as lasers say it; not a number where frequent zeros would mean maximum range."""
     beams = unusable = 0
-    for t in np.flatnonzero(recording.sensor == number).tolist():
+    for t in recording.in_turn(np.flatnonzero(recording.sensor == number).tolist()):
         points = recording.points[recording.beams_of(t)]
         beams += len(points)
         unusable += int(np.count_nonzero(np.isnan(points[:, 0])))

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import se2
+from stillmap.recording import spool
 from stillmap.recording.images import Images
 from stillmap.recording.model import Recording
 from stillmap.recording.ranges import RangeRule
 
-_CHUNK = 1 << 20  # beams looked at together
 _SAMPLED = 1 << 24  # beams of which quantiles are taken; of more than that, of as many
 _FEW = 100  # scans that a sample needs
 _DAMAGE = ("skipped", "skipped_odometry", "damage")
@@ -73,21 +73,18 @@ def _hit_ranges(recording: Recording) -> NDArray[np.float32]:
     """Ranges of the hits; of huge recordings, of evenly spaced scans only."""
     step = -(-recording.n_beams // _SAMPLED)
     parts = [np.empty(0, np.float32)]
-    for beams in _chunks(recording) if step <= 1 else _scans(recording, step):
+    for beams in (
+        spool.blocks(recording.points, recording.hit) if step <= 1 else _scans(recording, step)
+    ):
         points = recording.points[beams][recording.hit[beams]]
         parts.append(np.linalg.norm(points.astype(np.float64), axis=1).astype(np.float32))
     return np.concatenate(parts)
 
 
-def _chunks(recording: Recording) -> Iterator[slice]:
-    for start in range(0, recording.n_beams, _CHUNK):
-        yield slice(start, start + _CHUNK)
-
-
 def _scans(recording: Recording, step: int) -> Iterator[slice]:
     """Every so many scans; of the scans every so many beams where they are few and large."""
     every = step if recording.n_scans >= _FEW * step else 1
-    for scan in range(0, recording.n_scans, every):
+    for scan in recording.in_turn(range(0, recording.n_scans, every)):
         beams = recording.beams_of(scan)
         yield slice(beams.start, beams.stop, step // every)
 
@@ -102,11 +99,10 @@ def _spread(values: NDArray[Any], wanted: tuple[str, ...]) -> dict[str, float] |
 
 
 def _counts(recording: Recording) -> dict[str, Any]:
-    hits = int(np.count_nonzero(recording.hit))
-    unusable = sum(
-        int(np.count_nonzero(np.isnan(recording.points[chunk]).any(axis=1)))
-        for chunk in _chunks(recording)
-    )
+    hits = unusable = 0
+    for block in spool.blocks(recording.points, recording.hit):
+        hits += int(np.count_nonzero(recording.hit[block]))
+        unusable += int(np.count_nonzero(np.isnan(recording.points[block]).any(axis=1)))
     counts = {
         "hits": hits,
         "max_range": recording.n_beams - hits - unusable,
@@ -135,7 +131,9 @@ def _spread_of_times(beam_time: NDArray[np.float32] | None) -> list[float] | Non
     """When after its scan's stamp the first and the last beam of any scan was taken."""
     if beam_time is None or not len(beam_time):
         return None
-    return [float(beam_time.min()), float(beam_time.max())]
+    blocks = spool.blocks(beam_time)
+    first, last = zip(*((beam_time[b].min(), beam_time[b].max()) for b in blocks), strict=True)
+    return [float(min(first)), float(max(last))]
 
 
 def _odometry(recording: Recording, noted: dict[str, Any]) -> dict[str, Any] | None:
@@ -245,7 +243,7 @@ def _field_of_view(
         lowest, highest = sorted([first, last])  # a laser upside down turns clockwise
         return [float(np.degrees(lowest)), float(np.degrees(highest))]
     lowest, highest = np.inf, -np.inf
-    for scan in scans:
+    for scan in recording.in_turn(scans.tolist()):
         points = recording.points[recording.beams_of(scan)]
         angle = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
         angle = angle[np.isfinite(angle)]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from stillmap import se2
 from stillmap.errors import InputError
 from stillmap.recording import spool
-from stillmap.recording.model import TOGETHER, Recording
+from stillmap.recording.model import Recording
 from stillmap.recording.options import GivenLaser, ReadOptions
 
 
@@ -75,8 +75,7 @@ def _with_laser(recording: Recording, number: int, given: GivenLaser) -> Recordi
 def _mirrored(recording: Recording, number: int) -> Recording:
     """The beams of one laser turned the other way round."""
     points = spool.copied(recording.points, recording.scratch)
-    for n, t in enumerate(np.flatnonzero(recording.sensor == number).tolist()):
+    scans = np.flatnonzero(recording.sensor == number).tolist()
+    for t in spool.in_turn(scans, lambda: spool.let_go(points)):
         points[recording.beams_of(t), 1] *= -1.0
-        if n % TOGETHER == 0:
-            spool.let_go(points)
     return replace(recording, points=points)

@@ -1,5 +1,6 @@
 """The one data shape of a recording, 2D and 3D alike: flat arrays."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,6 @@ from stillmap.recording import spool
 from stillmap.recording.images import Images
 
 _ENDS = 1 << 14  # beams that are asked for their ends together
-TOGETHER = 500  # scans that are looked at one by one before what lies in files is let go
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +103,11 @@ class Recording:
         for array in (self.points, self.hit, self.beam_time, *more):
             if array is not None:
                 spool.let_go(array)
+
+    def in_turn(self, scans: Iterable[int], *more: NDArray[Any]) -> Iterator[int]:
+        """The same numbers of scans; what was looked at of the beams, and of other arrays, leaves
+        memory on the way."""
+        return spool.in_turn(scans, lambda: self.let_go(*more))
 
     def T_map_sensor(self, T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sensor poses (T, D+1, D+1) that belong to robot poses (T, D+1, D+1)."""

@@ -56,7 +56,7 @@ def fans(recording: Recording) -> Float:
         for number, noted in enumerate(map(_noted, _sensors(recording)))
     }
     unclear = []
-    for t in range(recording.n_scans):
+    for t in recording.in_turn(range(recording.n_scans)):
         points = recording.points[recording.beams_of(t)].astype(np.float64)
         of_laser, n = known.setdefault(int(recording.sensor[t]), {}), len(points)
         usable = np.flatnonzero(np.isfinite(points[:, 0]))
@@ -89,7 +89,7 @@ def ranges(recording: Recording, scan: int, no_return: float) -> Float:
 def reaches(recording: Recording) -> list[Reach]:
     """How far each of the S lasers sees."""
     hit, far = np.zeros((2, len(recording.T_base_sensor)))
-    for t in range(recording.n_scans):
+    for t in recording.in_turn(range(recording.n_scans)):
         beams, s = recording.beams_of(t), recording.sensor[t]
         x, y = recording.points[beams].astype(np.float64).T
         length, is_hit = np.hypot(x, y), recording.hit[beams]
@@ -108,7 +108,7 @@ def time_increments(recording: Recording) -> tuple[Float, int]:
     out, uneven = np.zeros(recording.n_scans), 0
     if recording.beam_time is None:
         return out, 0
-    for t in range(recording.n_scans):
+    for t in recording.in_turn(range(recording.n_scans)):
         times = recording.beam_time[recording.beams_of(t)].astype(np.float64)
         number = np.arange(len(times))
         step = float(times @ number) / max(float(number @ number), 1.0)

@@ -8,9 +8,9 @@ and no crash.
 import mmap
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -18,6 +18,9 @@ from numpy.typing import DTypeLike, NDArray
 IN_MEMORY = 32 << 20  # bytes of one array that are kept in memory
 _BUFFER = 1 << 20  # bytes that are written to a file together
 BLOCK = 1 << 20  # rows that are looked at together
+TOGETHER = 500  # items, as large as a scan, that are looked at before they are let go
+
+_Item = TypeVar("_Item")
 
 _BUFFER = 1 << 20  # bytes: parts may be as small as one scan
 
@@ -109,6 +112,15 @@ def blocks(*arrays: NDArray[Any], rows: int | None = None) -> Iterator[slice]:
         yield slice(first, min(first + rows, len(arrays[0])))
         for array in arrays:
             let_go(array)
+
+
+def in_turn(items: Iterable[_Item], let_go: Callable[[], None]) -> Iterator[_Item]:
+    """The same items; on the way what was looked at for them is let go now and then."""
+    for n, item in enumerate(items):
+        if n % TOGETHER == 0:
+            let_go()
+        yield item
+    let_go()
 
 
 def copied(array: NDArray[Any], folder: Path | None = None) -> NDArray[Any]:

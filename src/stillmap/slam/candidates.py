@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import se2
-from stillmap.recording.model import TOGETHER
 from stillmap.slam.loops import Candidate, Closure, LoopOptions, Track, drift
 from stillmap.slam.scans import hits
 
@@ -59,9 +58,8 @@ def _counted(ties: list[Closure], options: LoopOptions) -> Float:
 def looks(track: Track) -> Float:
     """(K, 2) where the keyframes look: the mean of what each saw, in its frame."""
     out = np.zeros((len(track.keyframes), 2))
-    for k, t in enumerate(track.keyframes.tolist()):
-        if k % TOGETHER == 0:
-            track.recording.let_go(track.e)
+    keyframes = track.recording.in_turn(track.keyframes.tolist(), track.e)
+    for k, t in enumerate(keyframes):
         scan = hits(track.recording, track.e, t)
         if scan.weights.sum() > 0.0:
             out[k] = np.average(scan.points, axis=0, weights=scan.weights)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap import _core
 from stillmap.options import field_with_doc
-from stillmap.recording.model import TOGETHER, Recording
+from stillmap.recording.model import Recording
 from stillmap.slam import motion, stalls
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.loops import Closure, LoopOptions
@@ -135,9 +135,7 @@ def build(
     usual[recording.sensor[0]] = 1.0
     so_far.add(0, way.poses[0], 0.0)
     progress(1, T)
-    for t in range(1, T):
-        if t % TOGETHER == 0:
-            recording.let_go(e)
+    for t in recording.in_turn(range(1, T), e):
         last, guess = way.poses[t - 1], way.guess(t, steadiness)
         stalled = watch.stalled(t, last, guess)
         prior, other = _priors(last, steps, t, guess, stalled, options.motion)

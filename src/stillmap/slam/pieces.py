@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core, se2
-from stillmap.recording.model import TOGETHER
 from stillmap.slam import motion, registration, verification
 from stillmap.slam.loops import Candidate, Closure, Track
 from stillmap.slam.scans import hits, put
@@ -134,9 +133,8 @@ def _one_of_each(track: Track, closures: list[Closure]) -> list[Closure]:
 
 def _map_before(track: Track, first: int) -> _core.Grid2D:
     grid = _core.Grid2D(track.resolution, track.registration.approach)
-    for n, t in enumerate(track.keyframes[track.keyframes < first].tolist()):
-        if n % TOGETHER == 0:
-            track.recording.let_go(track.e)
+    before = track.keyframes[track.keyframes < first].tolist()
+    for t in track.recording.in_turn(before, track.e):
         put(grid, track.recording, track.e, t, track.poses[t], track.surface)
     return grid
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core, se2
-from stillmap.recording.model import TOGETHER, Recording
+from stillmap.recording.model import Recording
 from stillmap.slam import keyframes, motion, registration
 from stillmap.slam.incremental import Mapped, SlamOptions
 from stillmap.slam.motion import MotionPrior
@@ -32,15 +32,11 @@ def sweep(
     increments = _increments(recording, poses)
     grid = _core.Grid2D(options.resolution, options.registration.approach)
     kept = keyframes.chosen_of_each(poses, recording.sensor, options.spacing, options.spacing)
-    for n, t in enumerate(kept):
-        if n % TOGETHER == 0:
-            recording.let_go(e)
+    for t in recording.in_turn(kept, e):
         put(grid, recording, e, t, poses[t], options.surface)
     is_in_map = np.zeros(T, np.bool_)
     is_in_map[kept] = True
-    for t in range(1, T):
-        if t % TOGETHER == 0:
-            recording.let_go(e)
+    for t in recording.in_turn(range(1, T), e):
         if is_in_map[t]:
             put(grid, recording, e, t, poses[t], options.surface, remove=True)
         prior = _between_neighbours(recording, poses, increments, mapped.breaks, t, options)

@@ -7,7 +7,7 @@ from stillmap.em.tracker.changes import changed
 from stillmap.em.tracker.features import features
 from stillmap.em.tracker.options import TrackerOptions
 from stillmap.em.tracker.tracks import Places, people
-from stillmap.recording.model import TOGETHER, Recording
+from stillmap.recording.model import Recording
 from stillmap.recording.spool import blocks
 
 Float = NDArray[np.float64]
@@ -38,9 +38,8 @@ def in_boxes(
         inside[block] = False
     scans, first = np.unique(somebody.scan, return_index=True)
     bounds = np.append(first, len(somebody.scan))
-    for n, (t, begin, end) in enumerate(zip(scans, bounds, bounds[1:], strict=False)):
-        if n % TOGETHER == 0:
-            recording.let_go(inside)
+    for n, t in enumerate(recording.in_turn(scans.tolist(), inside)):
+        begin, end = bounds[n : n + 2]
         beams = recording.beams_of(t)
         T = T_map_sensor[t]
         xy = (T[:2, :2] * recording.points[beams][:, None]).sum(axis=-1) + T[:2, 2]

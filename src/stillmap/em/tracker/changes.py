@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.em.tracker.features import Features, ranges
-from stillmap.recording.model import TOGETHER, Recording
+from stillmap.recording.model import Recording
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -27,13 +27,12 @@ def changed(
     """
     out = np.zeros(len(found.scan), bool)
     of_scan = np.searchsorted(found.scan, np.arange(recording.n_scans + 1))
-    for t, others in enumerate(_compared(recording, look)):
+    compared = _compared(recording, look)
+    for t in recording.in_turn(range(recording.n_scans)):
         here = slice(of_scan[t], of_scan[t + 1])
-        if t % TOGETHER == 0:
-            recording.let_go()
         if here.start == here.stop:
             continue
-        for other in others:
+        for other in compared[t]:
             out[here] |= _seen_through(
                 recording, other, T_map_sensor[other], found.xy[here], behind
             )

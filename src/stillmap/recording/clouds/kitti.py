@@ -93,7 +93,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     digits = max(6, len(str(recording.n_scans)))
     with new_folder(Path(path), overwrite) as folder:
         (folder / "velodyne").mkdir()
-        for scan in range(recording.n_scans):
+        for scan in recording.in_turn(range(recording.n_scans)):
             points, _ = hits_of(recording, scan)
             rows = np.zeros((len(points), 4), "<f4")
             rows[:, :3] = points

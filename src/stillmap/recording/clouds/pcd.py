@@ -111,7 +111,8 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     T = sensor_poses(recording, recording.T_recorded_base)
     with new_folder(Path(path), overwrite) as folder:
         repeats = 0
-        for scan, stamp in enumerate(recording.stamp_ns.tolist()):
+        for scan in recording.in_turn(range(recording.n_scans)):
+            stamp = int(recording.stamp_ns[scan])
             before = scan > 0 and stamp == recording.stamp_ns[scan - 1]
             repeats = repeats + 1 if before else 0
             name = f"{stamp:0{20 if stamp < 0 else 19}d}" + (f"_{repeats}" if repeats else "")

@@ -40,9 +40,9 @@ def write(recording: Recording, path: Path, kind: Kind, *, overwrite: bool = Fal
         name, type = ("scan", messages.SCAN) if planar_scans else ("points", messages.POINTS)
         sends = [bag.topic(f"/{numbered}", type) for numbered in numbered(name, len(frames))]
         drive = _driver(bag, recording)
-        for t, stamp in enumerate(stamps.tolist()):
+        for t in recording.in_turn(range(recording.n_scans)):
             drive(t)
-            sensor = int(recording.sensor[t])
+            stamp, sensor = int(stamps[t]), int(recording.sensor[t])
             if lasers is None:
                 message = _cloud(bag, recording, t, frames[sensor])
             else:
@@ -134,7 +134,7 @@ def _cloud(bag: Bag, recording: Recording, t: int, frame: str) -> Any:
 
 def _cloud_losses(recording: Recording) -> Iterator[str]:
     free = 0
-    for t in range(recording.n_scans):
+    for t in recording.in_turn(range(recording.n_scans)):
         beams = recording.beams_of(t)
         seen = recording.points[beams][~recording.hit[beams]]
         free += int(np.count_nonzero(~np.isnan(seen).any(axis=1)))
