@@ -118,3 +118,14 @@ def test_copies_are_apart(limit, tmp_path):  # noqa: ARG001
     copy[0] = 7.0
     np.testing.assert_array_equal(copy[1:], values[1:])
     assert values[0, 0] == 0.0
+
+
+@pytest.mark.parametrize("items", [0, 1, 7])
+def test_items_in_turn_are_the_same(items, monkeypatch):
+    monkeypatch.setattr(spool, "TOGETHER", 3)
+    got, let_go_after = [], []
+    for item in spool.in_turn(range(items), lambda: let_go_after.append(len(got))):
+        got.append(item)
+    assert got == list(range(items))
+    # at first for what was looked at before, and what is left at the end
+    assert let_go_after == [*range(0, items, 3), items]

@@ -10,7 +10,6 @@ import stillmap
 from stillmap.em import chunks
 from stillmap.output.save import save
 from stillmap.recording import spool
-from stillmap.slam import incremental, sweep
 
 ESTIMATORS = ("stillmap", "paper", "hit-ratio", "tracker")
 
@@ -52,6 +51,5 @@ def test_pieces_of_any_size_give_the_same_bytes(swept, estimator, tmp_path, monk
     monkeypatch.setattr(spool, "IN_MEMORY", 0)
     monkeypatch.setattr(spool, "BLOCK", 1000)
     monkeypatch.setattr(chunks, "CHUNK_BEAMS", 700)
-    for module in (incremental, sweep):
-        monkeypatch.setattr(module, "TOGETHER", 3)
+    monkeypatch.setattr(spool, "TOGETHER", 3)
     assert files_of(swept, estimator, tmp_path / "pieces") == whole
