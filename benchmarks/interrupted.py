@@ -3,8 +3,9 @@
 python benchmarks/interrupted.py [--recording FILE] [--kills 50] [--full 20] [--seed 0]
     [--set section.key=value ...]
 
-Kills: `stillmap map --resume` is killed (SIGKILL) after a random time, again and again; every run
-that ends is compared, file by file, with one that nobody stopped. Full: the same on a file system
+Kills: `stillmap map --resume` is killed (SIGKILL) after a random time, again and again, five times
+at most until it is left to itself; every result is compared, file by file, with one of a run that
+nobody stopped. Full: the same on a file system
 of its own (a tmpfs, which takes root to mount) of ever another size, too small for the job; then
 the disk is made large enough, and the run goes on.
 """
@@ -25,6 +26,7 @@ from pathlib import Path
 
 from tables import markdown
 
+_KILLS_EACH = 5  # of one result
 _LARGE = 1 << 30  # bytes, more than any of these results
 
 
@@ -93,21 +95,22 @@ def killed(
     rng: random.Random,
 ) -> list[str]:
     """Kills until there were so many; each time a run ends, its result is looked at and goes."""
-    out, ended, same, done = work / "killed", 0, 0, 0
-    while done < kills or not ended:
+    out, ended, same, done, of_this = work / "killed", 0, 0, 0, 0
+    while done < kills or of_this:
+        spared = done == kills or of_this == _KILLS_EACH
         process = subprocess.Popen(
             command(out, words, "--resume"), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
         )
         try:
-            process.wait(rng.uniform(0.3, seconds) if done < kills else None)
+            process.wait(None if spared else rng.uniform(0.3, seconds))
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
-            done += 1
+            done, of_this = done + 1, of_this + 1
         _, err = process.communicate()
         if process.returncode not in (0, -signal.SIGKILL):
             raise RuntimeError(err.decode())
         if process.returncode == 0:
-            ended += 1
+            ended, of_this = ended + 1, 0
             same += contents(out) == whole
             left = sorted(path.name for path in work.iterdir() if "killed" in path.name)
             if left != ["killed"]:

@@ -170,6 +170,7 @@ def test_pickles_are_never_opened(tmp_path):
         ("sensor", lambda a: a[:2], "expected"),
         ("points", lambda a: a * np.float32(np.nan), "ends nowhere"),
         ("points", lambda a: a * np.float32(np.inf), "ends nowhere"),
+        ("points", lambda a: np.full_like(a, 3e38), "farther than 100000 m"),
         ("T_base_sensor", lambda a: a * 2.0, "rigid"),
         ("T_odom_base", lambda a: a * np.nan, "rigid"),
         ("beam_time", lambda a: a * np.float32(np.inf), "beam_time"),

@@ -14,6 +14,7 @@ from stillmap.output.npy import write_npy
 from stillmap.recording import folder_images
 from stillmap.recording.images import Images
 from stillmap.recording.model import Recording
+from stillmap.recording.options import FARTHEST
 from stillmap.recording.spool import blocks
 from stillmap.texts import read_text, require_regular
 
@@ -92,7 +93,7 @@ def read(path: Path) -> Recording:
     if np.any(np.diff(stamp_ns) < 0):
         raise _damaged(path, "stamp_ns", "time runs backwards")
     _require_offsets(path, offset, M)
-    _require_finite_hits(path, points, hit)
+    _require_sound_ends(path, points, hit)
     source = header.get("source", {})
     try:
         return Recording(
@@ -180,12 +181,14 @@ def _require_offsets(path: Path, offset: NDArray[np.int64], M: int) -> None:
         raise _damaged(path, "offset", f"must rise from 0 to {M}")
 
 
-def _require_finite_hits(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
+def _require_sound_ends(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
     for block in blocks(points, hit):
         chunk = points[block]
         usable = np.isfinite(chunk).all(axis=1)
         if np.any(hit[block] & ~usable) or np.any(np.isinf(chunk)):
             raise _damaged(path, "points", "a hit or a maximum-range beam ends nowhere")
+        if np.any(np.abs(chunk) > FARTHEST):
+            raise _damaged(path, "points", f"a beam ends farther than {FARTHEST:.0f} m away")
 
 
 def _damaged(path: Path, name: str, what: str) -> InputError:

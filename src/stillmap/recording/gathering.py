@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.recording.model import Recording
-from stillmap.recording.options import ReadOptions
+from stillmap.recording.options import FARTHEST, ReadOptions
 from stillmap.recording.spool import Column, empty
 
 _BLOCK = 1 << 20  # points of a scan looked at together
@@ -54,8 +54,8 @@ class Gathered:
 
         Args:
             stamp_ns: when it was taken.
-            points: (n, D) metres in the sensor's frame; not finite: unusable. It may be larger
-                than memory.
+            points: (n, D) metres in the sensor's frame; not finite, or not to be believed:
+                unusable. It may be larger than memory.
             sensor: which sensor took it.
             beam_time: (n,) seconds after the stamp; not finite counts as 0.
         """
@@ -121,7 +121,7 @@ def _understood(
     """Points (n, D), NaN where unusable, and which of them something reflected."""
     # column by column: along rows of two or three numbers NumPy is slow
     length = np.sqrt(sum(column * column for column in points.T.astype(np.float64)))
-    usable = np.isfinite(length) & (length >= options.min_range) & (length > 0.0)
+    usable = (length <= FARTHEST) & (length >= options.min_range) & (length > 0.0)
     if options.max_range is None and usable.all():
         return points, usable
     out = np.where(usable[:, None], points, np.float32(np.nan))

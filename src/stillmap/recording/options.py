@@ -8,7 +8,7 @@ from stillmap.errors import InputError
 from stillmap.options import field_with_doc
 
 BEYOND = 1000.0  # m: no laser in the plane sees so far; drivers write 1e10 or FLT_MAX for +inf
-
+FARTHEST = 1e5  # m: nothing at all sees so far; damaged numbers do
 
 _LARGEST = {"x": 1e3, "y": 1e3, "theta": 1e3, "fov": 2.0 * math.pi + 1e-6}  # m, m, rad, rad
 

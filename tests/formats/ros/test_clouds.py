@@ -8,6 +8,7 @@ from PIL import Image
 
 from stillmap.errors import InputError
 from stillmap.recording import read
+from stillmap.recording.facts import facts
 from stillmap.recording.ros import clouds
 
 START = 1_700_000_000_000_000_000
@@ -135,6 +136,19 @@ def test_damaged_clouds_are_counted(bag, messages, rng):
     assert recording.n_scans == 1
     found = {reason: one["count"] for reason, one in recording.source["skipped"].items()}
     assert found == {clouds.WRONG_SIZE: 5, clouds.NO_PLACES: 1}
+
+
+def test_points_that_nothing_can_see(bag, messages, rng):
+    x, y, z = xyz(rng)
+    x[3], y[4], z[5] = 1e30, -3e38, 2e5
+    x[6] = y[6] = z[6] = 3e38  # its distance is no float32
+    columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
+    recording = read(bag([("/points", START, cloud_message(messages, START, columns))]))
+    wild = np.isin(np.arange(12), [3, 4, 5, 6])
+    np.testing.assert_array_equal(recording.hit, ~wild)
+    assert np.isnan(recording.points[wild]).all()
+    with np.errstate(all="raise"):
+        assert facts(recording)["counts"]["unusable"] == 4
 
 
 def test_places_of_lidars_and_odometry(bag, messages, rng):

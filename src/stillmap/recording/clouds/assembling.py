@@ -13,10 +13,9 @@ from stillmap.recording.extras import MissingExtra
 from stillmap.recording.gathering import Gathered
 from stillmap.recording.lines import Progress
 from stillmap.recording.model import Recording
-from stillmap.recording.options import ReadOptions
+from stillmap.recording.options import FARTHEST, ReadOptions
 from stillmap.recording.skipped import Skipped
 
-_FARTHEST = 1e5  # m: no sensor sees so far; damaged numbers do
 _NAMED = 5  # skipped files that are named
 
 
@@ -160,7 +159,7 @@ class _Scans:
         return len(self._poses)
 
     def add(self, number: int, stamp_ns: int | None, cloud: Cloud) -> None:
-        points = _sound(cloud.points)
+        points = cloud.points
         if self._gathered is None:
             self._clock = self._first_clock(cloud)
             self._gathered = Gathered(
@@ -223,13 +222,5 @@ def _period(sources: Sequence[Source]) -> float | None:
 
 
 def _usable(points: NDArray[Any]) -> NDArray[np.bool_]:
-    usable: NDArray[np.bool_] = np.isfinite(points).all(axis=1) & np.any(points != 0, axis=1)
-    return usable
-
-
-def _sound(points: NDArray[Any]) -> NDArray[Any]:
-    """Points, NaN where the numbers cannot be meant."""
-    wild = np.abs(points) > _FARTHEST
-    if not wild.any():
-        return points
-    return np.where(wild.any(axis=1)[:, None], np.float32(np.nan), points)
+    meant = (np.abs(points) <= FARTHEST).all(axis=1)
+    return np.asarray(meant & np.any(points != 0, axis=1))
