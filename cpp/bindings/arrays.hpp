@@ -19,6 +19,9 @@ template <int D>
 using Poses = nb::ndarray<const double, nb::numpy, nb::shape<-1, D + 1, D + 1>, nb::c_contig,
                           nb::device::cpu>;
 template <int D>
+using Places =
+    nb::ndarray<const double, nb::numpy, nb::shape<-1, D>, nb::c_contig, nb::device::cpu>;
+template <int D>
 using OnePose =
     nb::ndarray<const double, nb::numpy, nb::shape<D + 1, D + 1>, nb::c_contig, nb::device::cpu>;
 template <int D>

@@ -1,7 +1,9 @@
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <limits>
+#include <optional>
 
 #include "arrays.hpp"
 #include "bindings.hpp"
@@ -57,21 +59,27 @@ auto describe(const Surface<D>& surface) {
 template <int D>
 void add_looks(Dwell<D>& dwell, const Points<D>& points, const Flat<bool>& hit,
                const Flat<int64_t>& offset, const Poses<D>& poses, const Flat<int64_t>& look,
-               int threads) {
+               int threads, const std::optional<Places<D>>& place) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   require(look.shape(0) == scans.n_scans, "look: expected one number per scan");
+  require(!place || place->shape(0) == scans.n_scans, "place: expected one per scan");
   nb::gil_scoped_release released;
-  dwell.add(scans, look.data(), threads);
+  dwell.add(scans, look.data(), place ? place->data() : nullptr, threads);
 }
 
 template <int D>
-auto likelihoods(Dwell<D>& dwell) {
-  const size_t n = dwell.surface().size(), C = dwell.classes();
+auto likelihoods(Dwell<D>& dwell, const std::optional<Flat<bool>>& among) {
+  std::vector<size_t> classes;
+  require(!among || among->shape(0) == dwell.classes(), "among: expected one per class");
+  for (size_t c = 0; c < dwell.classes(); ++c)
+    if (!among || among->data()[c]) classes.push_back(c);
+  require(!classes.empty(), "among: expected a class");
+  const size_t n = dwell.surface().size(), C = classes.size();
   std::vector<float> relative(n * C);
   std::vector<double> log_best(n);
   {
     nb::gil_scoped_release released;
-    dwell.likelihood(relative.data(), log_best.data());
+    dwell.likelihood(classes, relative.data(), log_best.data());
   }
   return std::make_tuple(owned(std::move(relative), {n, C}), owned(std::move(log_best), {n}));
 }
@@ -184,8 +192,10 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
       .def("add", &add_looks<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            nb::arg("look").noconvert(), nb::arg("threads") = 1,
+           nb::arg("place").noconvert() = nb::none(),
            "Adds scans; look (T,) int64 numbers their looks and must not fall. All scans of one "
-           "look belong into one call.")
+           "look belong into one call. place (T, D): where the robot stood, metres; without, the "
+           "sensors' places are asked how far the view turned.")
       .def("lost", &lost_beams<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            "Beams without a return that have such beams beside them, and how many of these cross "
@@ -221,9 +231,10 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
           "time in which it was not empty. Then, for things alone and for anything that was there: "
           "(E, 2) float32 probability of it at the last look; (E, 2) int32 how often it came or "
           "left; (E, 2, 2, 2) int32 looks before and after the first and the last time, -1: none.")
-      .def("likelihood", &likelihoods<D>,
+      .def("likelihood", &likelihoods<D>, nb::arg("among") = nb::none(),
            "(E, C) float32 relative to the best class, (E,) logarithm of the best: of everything "
-           "else that was seen of the cell, given that a beam ended in it.");
+           "else that was seen of the cell, given that a beam ended in it; under those of the "
+           "classes (bool, one per class) alone, as if there were no others.");
 }
 
 }  // namespace

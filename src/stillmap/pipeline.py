@@ -22,7 +22,8 @@ from stillmap.stages import Stages
 from stillmap.threads import resolved_threads
 
 Float = NDArray[np.float64]
-Progress = Callable[[str, int, int, int], None]  # what, iteration, done, total
+# what, iteration (0: after the last), scans done, of how many (0: not counted)
+Progress = Callable[[str, int, int, int], None]
 
 
 def silent(what: str, iteration: int, done: int, total: int) -> None:
@@ -174,7 +175,8 @@ def iterate(
         recording: 2D, at least one scan.
         options: see Options.
         poses: (T, 3, 3) T_map_base to keep instead of estimating them.
-        progress: called with what is done, the iteration, and how much of how much.
+        progress: called with what is done, the iteration, scans done, and of how many; these are 0
+            for what is not counted.
         stages: where time and memory per stage are noted.
         scratch: folder for what is known of each beam where that is too large for memory; such
             files have no name and are gone with the process. None: the system's temporary folder.
@@ -210,6 +212,7 @@ def iterate(
                 before=None if before is None else before.poses,
             )
             seen = slam.deskewed(recording, mapped.poses, options.slam)
+        progress("labelling beams", number, 0, 0)
         with stages.measure("e_step"):  # (6), (8) or its successor, and the bound
             found = em.e_step(
                 seen, mapped.poses, mapped.grid, options.estimator, options.em, threads
@@ -249,5 +252,5 @@ def iterate(
         del iteration
 
 
-def _at(progress: Progress, number: int) -> Callable[[int, int], None]:
-    return lambda done, total: progress("mapping", number, done, total)
+def _at(progress: Progress, number: int) -> slam.Told:
+    return lambda what, done, total: progress(what, number, done, total)

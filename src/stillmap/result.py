@@ -126,15 +126,17 @@ def build(
     while not loop.finished and loop.take_next(iterations, recording):
         if keep is not None:
             keep(loop)
-    return _result(loop, recording, stages)
+    return _result(loop, recording, progress, stages)
 
 
-def _result(loop: Loop, recording: Recording, stages: Stages) -> Result:
+def _result(loop: Loop, recording: Recording, progress: Progress, stages: Stages) -> Result:
     """What follows from the best iteration."""
     options, threads = loop.options, resolved_threads(loop.options.threads)
+    progress("labelling beams", 0, 0, 0)
     with stages.measure("changes"):
         seen = slam.deskewed(recording, loop.kept.poses, options.slam)
         kept, changes = _settled(loop.kept, seen, options, threads)
+    progress("making the map", 0, 0, 0)
     with stages.measure("maps"):
         filtered = _map(kept, seen, options, threads)
         raw = _raw_map(seen, kept.poses, filtered, threads)
@@ -142,6 +144,7 @@ def _result(loop: Loop, recording: Recording, stages: Stages) -> Result:
         evidence = em.evidence(
             seen, kept.poses, kept.p_static, filtered, kept.no_return, options.em, threads
         )
+    progress("following what moves", 0, 0, 0)
     with stages.measure("objects"):
         moving = moving_objects(seen, kept.poses, kept.p_static, options.objects)
         things = beams_on_things(seen, kept.poses, kept.p_static, changes, filtered.resolution)

@@ -161,14 +161,19 @@ def test_lost_beams_are_trusted_so_far(room, swallowed, trusted):
     assert ((all_the_way - core).max() > 0.05) == (trusted < 1.0)
 
 
-def test_likelihood(room):
+@pytest.mark.parametrize("moves", [None, 0.2, 0.7])
+def test_likelihood(room, moves):
     rho, tau = [0.998, 0.6, 0.05, 0.15, 0.5, 0.8], [25.0, 5.0, 0.5, 45.0, inf, 9.0]
     turn = [inf] * 4 + [0.1, 0.7]
     found = []
     for kernels in (_core, reference):
         surface = room.surface(kernels)
         dwell = room.dwell(kernels, surface, rho, tau, turn)
-        dwell.add(*room.beams.arguments, room.look)
+        place = None
+        if moves is not None:  # the robot, of which the sensors sit anywhere
+            steps = np.random.default_rng(1).normal(size=(len(room.look), surface.dimension))
+            place = moves * surface.resolution * steps.cumsum(axis=0)
+        dwell.add(*room.beams.arguments, room.look, place=place)
         relative, log_best = dwell.likelihood()
         assert relative.dtype == np.float32
         assert relative.max(axis=1) == pytest.approx(1.0)
@@ -247,8 +252,7 @@ def lane(seen, rho, tau, turn, detection, seconds=1.0, at=None):
     for (look, hit), x in zip(seen, [0.0] * len(seen) if at is None else at, strict=True):
         points, T = beams(x, 1.05 if hit else 4)
         dwell.add(points, yes if hit else no, offset, T, np.array([look]))
-    relative, log_best = dwell.likelihood()
-    return np.log(np.maximum(relative[0], 1e-37)) + log_best[0]
+    return np.array([dwell.likelihood(one)[1][0] for one in np.eye(len(rho), dtype=bool)])
 
 
 def test_lost_beams_say_nothing():
@@ -283,8 +287,16 @@ def test_lost_beams_say_nothing():
     assert seen == {name: [says, says] for name, says in expected.items()}
 
 
+def stays_for_half_a_cell(at):
+    """Places of a robot that stands while it moves less."""
+    out = list(at[:1])
+    for x in at[1:]:
+        out.append(x if abs(x - out[-1]) >= 0.05 else out[-1])
+    return out
+
+
 def chain(seen, rho, tau, turn, detection, seconds=1.0, at=None):
-    at = [0.0] * len(seen) if at is None else at
+    at = stays_for_half_a_cell([0.0] * len(seen) if at is None else at)
     turned = [0.0, *(abs(b - a) / max(abs(1.05 - b), 0.1) for a, b in pairwise(at))]
     looks = [
         (n * seconds, HIT if hit else 1.0, v) for (n, hit), v in zip(seen, turned, strict=True)
@@ -312,13 +324,15 @@ def test_a_chain(seed, n, stays, seconds):
     seen = random_looks(seed, n, stays)
     found = lane(seen, *CLASSES, 0.97, seconds)
     expected = chain(seen, *CLASSES, 0.97, seconds)
+    over_time = np.isinf(CLASSES[2])  # each as exact as the best, however unlikely it is
+    np.testing.assert_allclose(found[over_time], expected[over_time], rtol=1e-5, atol=0.1)
     likely = expected > expected.max() - 20  # further down it only has to stay there
     np.testing.assert_allclose(found[likely], expected[likely], atol=0.1)
     assert (found[~likely] < found.max() - 18).all()
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("step", [0.0, 0.02, 0.3])
+@pytest.mark.parametrize("step", [0.0, 0.08, 0.3])
 def test_a_chain_over_the_view(seed, step):
     seen = random_looks(seed, 100, 0.8)
     at = np.random.default_rng(seed).uniform(-step, step, len(seen)).cumsum().clip(-3, 0.6)
@@ -332,6 +346,19 @@ def test_a_chain_over_the_view(seed, step):
     assert (still[views] < still.max() - 10).all()
     assert (expected[views] > still[views] + 10).all() == (step > 0.0)
     assert (expected[~views] == still[~views]).all()
+
+
+def test_classes_among_others_that_are_far_better():
+    """Hundreds of nats worse than what it is, and still as exact as if there were no others."""
+    seen = random_looks(3, 4000, 0.9)
+    turn = CLASSES[2]
+    all_of_them = lane(seen, *CLASSES, 0.97)
+    poor = np.flatnonzero(np.isinf(turn) & (all_of_them < all_of_them.max() - 200))
+    assert len(poor) >= 5
+    alone = lane(seen, *(np.array(values)[poor].tolist() for values in CLASSES), 0.97)
+    assert np.ptp(alone) > 20
+    np.testing.assert_allclose(all_of_them[poor], alone, rtol=1e-9)
+    np.testing.assert_allclose(alone, chain(seen, *CLASSES, 0.97)[poor], rtol=1e-4)
 
 
 @pytest.mark.parametrize("seconds", [1.0, 3.0])

@@ -230,6 +230,25 @@ def test_beams_of_looks(call, name, value, error):
         getattr(target, call)(**{**beams, name: value}, **more)
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_places_and_classes_of_looks(dimension):
+    dwell, scans = dwell_of(surface_of(dimension)), arguments("add_beams", dimension)
+    beams = {k: scans[k] for k in ("points", "hit", "offset", "T_map_sensor")}
+    beams["look"] = np.arange(2)
+    for wrong in (np.zeros((3, dimension)), np.full((2, dimension), np.nan)):
+        with pytest.raises(ValueError, match="place"):
+            dwell.add(**beams, place=wrong)
+    for wrong in (np.zeros((2, dimension), np.float32), np.zeros((2, dimension + 1))):
+        with pytest.raises(TypeError, match="place"):
+            dwell.add(**beams, place=wrong)
+    dwell.add(**beams, place=np.zeros((2, dimension)))
+    for wrong in (np.ones(3, bool), np.zeros(2, bool)):
+        with pytest.raises(ValueError, match="among"):
+            dwell.likelihood(wrong)
+    with pytest.raises(TypeError):
+        dwell.likelihood("all")
+
+
 @pytest.mark.parametrize("call", ["add_end_points", "elements_of", "add"])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_looks_from_nowhere(call, dimension):

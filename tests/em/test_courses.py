@@ -157,14 +157,15 @@ def test_rounding_makes_nothing_impossible(monkeypatch):
     )
     looks = em.looks.Looks(
         surface=SimpleNamespace(elements=lambda: (grid,)),
-        dwell=SimpleNamespace(changes=lambda: changes),
+        dwell=SimpleNamespace(
+            changes=lambda: changes,
+            likelihood=lambda kept: (likelihood[:, kept].astype(np.float32), np.zeros(20_000)),
+        ),
         trust=1.0,
         rho=np.array(rho),
         tau=np.array([np.inf, np.inf, 3.0, 8.0]),
         turn=np.array(turn),
         n_static=2,
-        likelihood=likelihood.astype(np.float32),
-        log_best=np.zeros(20_000),
     )
     monkeypatch.setattr(module, "coverage", lambda _: np.ones(20_000, np.float32))
     found = module.courses_of(looks, em.EmOptions())

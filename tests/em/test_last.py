@@ -1,10 +1,14 @@
 """The last E-step: what is met from some places only is no passer-by."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from made_up_scans import ANGLES
 
 from stillmap import _core, em
+from stillmap.em import last as module
 from stillmap.recording.model import Recording
 
 POST, RADIUS, WALL = (5.0, 3.0), 0.15, 5.0
@@ -84,3 +88,48 @@ def test_what_comes_and_goes_before_a_sensor_that_stands_moves():
 
 def test_without_views_labels_are_left_to_the_loop():
     assert labels(ROUNDS, by_views(ROUNDS), views=False)[1] is None
+
+
+@pytest.mark.parametrize("views", [True, False])
+def test_without_views_no_course_knows_of_them(views):
+    recording, T, _ = seen(ROUNDS, by_views(ROUNDS))
+    options = em.EmOptions(dwell=em.DwellOptions(views=views))
+    _, courses = em.last_e_step(recording, T, 0.05, options)
+    assert (courses.p_views.max() > 0.9) == views
+    assert (courses.p_views > 0.0).any() == views
+
+
+APART = 1.2  # m, of two lasers
+# for seconds, half of the time
+COMES_AND_GOES = np.logical_xor.accumulate(np.random.default_rng(2).random(4 * LOOKS) < 0.15)
+
+
+def test_who_stands_with_two_lasers_stands():
+    """They look in turn, three scans to a look: once or twice from the second laser."""
+    at = np.full(3 * len(COMES_AND_GOES), 2.0)
+    second = np.arange(len(at)) % 2 == 1
+    recording, _, on = seen(at + APART * second, np.repeat(COMES_AND_GOES, 3))
+    T_base_sensor = np.tile(np.eye(3), (2, 1, 1))
+    T_base_sensor[1, 0, 2] = APART
+    recording = replace(
+        recording,
+        T_base_sensor=T_base_sensor,
+        sensor=second.astype(np.int32),
+        stamp_ns=recording.stamp_ns // 3,
+    )
+    T = np.tile(np.eye(3), (len(at), 1, 1))
+    T[:, 0, 2] = at
+    last, _ = em.last_e_step(recording, T, 0.05, em.EmOptions())
+    assert np.median(last.p_static[on]) < 0.1
+
+
+def test_labels_know_neither_crowds_nor_who_waits_nor_what_comes_often():
+    """A chair that a robot passes looks like them."""
+    rho, tau, _ = (np.array(values) for values in module._CLASSES.grid())
+    n_static = module._CLASSES.n_static
+    kept = module._for_labels(SimpleNamespace(rho=rho, tau=tau, n_static=n_static))
+    assert kept[:n_static].all()
+    movers = {(r, t) for r, t in zip(rho[n_static:], tau[n_static:], strict=True)}
+    left = set(zip(rho[kept][n_static:], tau[kept][n_static:], strict=True))
+    of_labels = {(r, t) for r in (0.01, 0.04, 0.15) for t in (0.5, 3.0, 12.0, 45.0)}
+    assert left == of_labels - {(0.15, 3.0)} < movers

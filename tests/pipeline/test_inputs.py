@@ -90,11 +90,18 @@ def test_progress_is_told(short):
     told = []
     stillmap.build(short.recording, options(max_iterations=2), progress=lambda *at: told.append(at))
     T = short.recording.n_scans
-    iterations = sorted({iteration for _, iteration, _, _ in told})
+    iterations = sorted({iteration for _, iteration, _, _ in told if iteration})
     assert iterations == list(range(1, len(iterations) + 1))
     for iteration in iterations:
         mapping = [at for at in told if at[0] == "mapping" and at[1] == iteration]
         assert mapping[-1][2:] == (T, T)
+    first = [what for what, iteration, _, _ in told if iteration == 1]
+    steps = ["mapping", "closing loops", "mapping again", "labelling beams"]
+    assert list(dict.fromkeys(first)) == steps
+    assert all(done <= total for _, _, done, total in told)
+    after = [at for at in told if at[1] == 0]
+    steps = ["labelling beams", "making the map", "following what moves"]
+    assert after == [(step, 0, 0, 0) for step in steps] == told[-3:]
 
 
 @pytest.mark.parametrize(

@@ -61,8 +61,9 @@ class Dwell {
     return *changes_;
   }
 
-  // look (T,): number of each scan's look, not falling, and not below those added before.
-  void add(const Scans<D>& scans, const int64_t* look, int threads) {
+  // look (T,): number of each scan's look, not falling, and not below those added before. place
+  // (T, D): in metres, where the robot stood; null: where the sensors did.
+  void add(const Scans<D>& scans, const int64_t* look, const double* place, int threads) {
     if (!surface_.fitted() || chains_.members() != surface_.size())
       throw std::invalid_argument("surface: has changed since");
     const size_t T = scans.n_scans;
@@ -88,7 +89,7 @@ class Dwell {
       std::vector<int32_t> taken;
       for (size_t l = from; l < to; ++l)
         taken.push_back(
-            chains_.begin(look[starts[l]], taken_from(scans, starts[l], starts[l + 1])));
+            chains_.begin(look[starts[l]], taken_from(scans, place, starts[l], starts[l + 1])));
       std::atomic<size_t> next{from};
       parallel_shares(one_each(n), [&](size_t i, size_t, size_t) {
         for (size_t l = next++; l < to; l = next++) {
@@ -106,11 +107,12 @@ class Dwell {
     if (T) newest_ = look[T - 1];
   }
 
-  // (elements, classes): likelihood of everything else that was seen of a cell, given that a beam
-  // ended in it, relative to the best class; and the logarithm of the best.
-  void likelihood(float* relative, double* log_best) const {
+  // (elements, among): likelihood of everything else that was seen of a cell, given that a beam
+  // ended in it, under some of the classes, relative to the best of them; and the logarithm of the
+  // best.
+  void likelihood(const std::vector<size_t>& among, float* relative, double* log_best) const {
     for (size_t k = 0; k < surface_.size(); ++k)
-      log_best[k] = chains_.likelihood(k, relative + k * classes());
+      log_best[k] = chains_.likelihood(k, among, relative + k * among.size());
   }
 
  private:
@@ -136,12 +138,15 @@ class Dwell {
     return places;
   }
 
-  // Mean place of the sensors in those scans, in cells.
-  Eigen::Vector3d taken_from(const Scans<D>& scans, size_t first, size_t last) const {
+  // Mean place in those scans, in cells. Of several sensors in turn it would go to and fro.
+  Eigen::Vector3d taken_from(const Scans<D>& scans, const double* place, size_t first,
+                             size_t last) const {
+    using Place = Eigen::Matrix<double, D, 1>;
     Eigen::Vector3d sum = Eigen::Vector3d::Zero();
     for (size_t t = first; t < last; ++t)
-      sum.template head<D>() += pose_from<D>(scans.poses + t * (D + 1) * (D + 1)).t;
-    if (!sum.allFinite()) throw std::invalid_argument("T_map_sensor: expected finite poses");
+      sum.template head<D>() += place ? Place(Eigen::Map<const Place>(place + t * D))
+                                      : pose_from<D>(scans.poses + t * (D + 1) * (D + 1)).t;
+    if (!sum.allFinite()) throw std::invalid_argument("T_map_sensor, place: expected finite poses");
     return sum / (static_cast<double>(last - first) * surface_.resolution());
   }
 

@@ -45,8 +45,7 @@ def mapped(args: argparse.Namespace, changes: dict[str, Any]) -> int:
     _require_writable(output)
     with held(output) as place:
         try:
-            result = _mapped(args, options, place)
-            save(result, output, replace, within=place.folder)
+            result = _mapped_and_saved(args, options, place)
             place.forget()
         except OSError as error:
             if error.errno not in _FULL:
@@ -63,8 +62,8 @@ def mapped(args: argparse.Namespace, changes: dict[str, Any]) -> int:
     return 0
 
 
-def _mapped(args: argparse.Namespace, options: Options, place: Place) -> Result:
-    """The whole job but for writing; how far it has come is kept after every iteration."""
+def _mapped_and_saved(args: argparse.Namespace, options: Options, place: Place) -> Result:
+    """The whole job; how far it has come is kept after every iteration."""
     stages = Stages()
     with stages.measure("read"):
         with shown_share(args.quiet, "reading") as tell:
@@ -74,7 +73,7 @@ def _mapped(args: argparse.Namespace, options: Options, place: Place) -> Result:
         same = identity(recording, options, poses)
     loop = _resumed(args, place, same, options, stages)
     with shown_progress(args.quiet, em.iterations(options.estimator, options.em)) as progress:
-        return build(
+        result = build(
             recording,
             options,
             poses=poses,
@@ -84,6 +83,10 @@ def _mapped(args: argparse.Namespace, options: Options, place: Place) -> Result:
             go_on=loop,
             keep=lambda loop: place.save(loop, same, stages),
         )
+        progress("writing", 0, 0, 0)
+        replace = args.overwrite or args.resume
+        save(result, Path(args.output), replace, within=place.folder)
+    return result
 
 
 def _resumed(

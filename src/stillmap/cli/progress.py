@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -39,7 +40,7 @@ def _write(line: str) -> None:
 
 @contextmanager
 def shown_progress(quiet: bool, iterations: int) -> "Iterator[Progress]":
-    """A Progress that shows iteration, scan, rate and time left."""
+    """A Progress that shows step, iteration, scans, rate and time left."""
     if quiet or sys.stderr is None:  # None: it was closed before we began
         from stillmap.pipeline import silent
 
@@ -48,7 +49,8 @@ def shown_progress(quiet: bool, iterations: int) -> "Iterator[Progress]":
         with _bar(iterations) as progress:
             yield progress
     else:
-        yield _Lines(iterations)
+        with _Lines(iterations) as lines:
+            yield lines
 
 
 @contextmanager
@@ -91,66 +93,85 @@ class _Shares:
 @contextmanager
 def _bar(iterations: int) -> "Iterator[Progress]":
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        TaskID,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("scans {task.fields[rate]}"),
+        TextColumn("{task.fields[counted]}"),
         TimeRemainingColumn(),
     )
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        tasks: dict[int, TaskID] = {}
-        rate = _Rate()
+        shown: _Step | None = None
+        task = bar.add_task("", total=None, counted="")
 
         def progress(what: str, iteration: int, done: int, total: int) -> None:
-            if iteration not in tasks:
-                for old in tasks.values():
-                    bar.remove_task(old)
-                tasks.clear()
-                name = f"{what}, iteration {iteration} of at most {iterations}"
-                tasks[iteration] = bar.add_task(name, total=total, rate="")
-            bar.update(tasks[iteration], completed=done, rate=f"{rate(iteration, done):.0f}/s")
+            nonlocal shown, task
+            if shown is None or not shown.is_same(what, iteration):
+                shown = _Step(what, iteration, iterations)
+                bar.remove_task(task)
+                task = bar.add_task(shown.name, total=total or None, counted="")
+            if total:
+                counted = f"{done}/{total} scans {shown.rate(done):.0f}/s"
+                bar.update(task, completed=done, counted=counted)
 
         yield progress
 
 
-class _Rate:
-    """Scans per second within one iteration."""
+class _Step:
+    """What is being done, since when."""
 
-    def __init__(self) -> None:
-        self._iteration, self._started = 0, time.monotonic()
+    def __init__(self, what: str, iteration: int, iterations: int) -> None:
+        self.name = f"{what}, iteration {iteration} of at most {iterations}" if iteration else what
+        self._which, self._started = (what, iteration), time.monotonic()
 
-    def __call__(self, iteration: int, done: int) -> float:
-        if iteration != self._iteration:
-            self._iteration, self._started = iteration, time.monotonic()
-        return done / max(time.monotonic() - self._started, 1e-3)
+    def is_same(self, what: str, iteration: int) -> bool:
+        return self._which == (what, iteration)
+
+    def seconds(self) -> float:
+        return time.monotonic() - self._started
+
+    def rate(self, done: int) -> float:
+        """Scans per second."""
+        return done / max(self.seconds(), 1e-3)
 
 
 class _Lines:
-    """A line every few seconds and at the end of an iteration."""
+    """A line every few seconds, and when an iteration has looked at all scans."""
 
     def __init__(self, iterations: int) -> None:
-        self._iterations = iterations
-        self._last = time.monotonic()
-        self._rate = _Rate()
+        self._iterations, self._said = iterations, 0
+        self._now = _Step("preparing", 0, iterations), 0, 0
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._now_and_then, daemon=True)
+
+    def __enter__(self) -> "_Lines":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
 
     def __call__(self, what: str, iteration: int, done: int, total: int) -> None:
-        rate = self._rate(iteration, done)
-        now = time.monotonic()
-        if done < total and now - self._last < _EVERY:
+        step = self._now[0]
+        if not step.is_same(what, iteration):
+            step = _Step(what, iteration, self._iterations)
+        self._now = step, done, total
+        if 0 < total == done and iteration > self._said:
+            self._said = iteration
+            self._say()
+
+    def _now_and_then(self) -> None:
+        while not self._ended.wait(_EVERY):
+            self._say()
+
+    def _say(self) -> None:
+        step, done, total = self._now
+        if not total:
+            say(f"{step.name}: {step.seconds():.0f} s so far")
             return
-        self._last = now
-        left = (total - done) / max(rate, 1e-3)
-        say(
-            f"{what}, iteration {iteration} of at most {self._iterations}: "
-            f"{done} of {total} scans, {rate:.0f}/s, {left:.0f} s left in this iteration"
-        )
+        rate = step.rate(done)
+        left = f", {(total - done) / max(rate, 1e-3):.0f} s left" if done < total else ""
+        say(f"{step.name}: {done} of {total} scans, {rate:.0f}/s{left}")

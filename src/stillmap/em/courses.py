@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.em.dwell import coverage
-from stillmap.em.looks import OFTEN_OCCUPIED, Dwell, Float, Looks, Surface
+from stillmap.em.looks import OFTEN_OCCUPIED, Dwell, Float, Looks, Surface, Table
 from stillmap.em.mixture import fit_shares
 from stillmap.em.options import ChangeOptions, EmOptions, MapState
 from stillmap.em.together import components, pairs_near
@@ -81,13 +81,13 @@ def courses_of(looks: Looks, options: EmOptions) -> Courses:
     """What became of each cell; `watch` was called before the looks."""
     kept = (looks.tau <= _STAY) | (looks.rho == OFTEN_OCCUPIED)
     kept[: looks.n_static] = True
-    looks = looks.among(kept)
+    table = looks.under(kept)
     log_changing, occupied_share, p_last, count, between = looks.dwell.changes()
-    likelihood = _with_changing(looks, log_changing)
+    likelihood = _with_changing(table, log_changing)
     shares = fit_shares(likelihood, looks.n_static, options.prior)
-    views = np.append(np.isfinite(looks.turn), False)
+    views = np.append(np.isfinite(table.turn), False)
     static = np.arange(len(views)) < looks.n_static
-    often = np.append(looks.rho == OFTEN_OCCUPIED, False)
+    often = np.append(table.rho == OFTEN_OCCUPIED, False)
     stays = _posterior(likelihood, shares.classes, np.arange(len(views)) == len(views) - 1)
     goes = _posterior(likelihood, shares.classes, often)
     of = (goes > stays).astype(np.intp)  # what comes and goes does not stay long enough for a thing
@@ -156,9 +156,9 @@ def _model(recording: Recording, options: EmOptions) -> dict[str, float]:
     }
 
 
-def _with_changing(looks: Looks, log_changing: Float) -> NDArray[np.float32]:
+def _with_changing(seen: Table, log_changing: Float) -> NDArray[np.float32]:
     """(E, C + 1) the likelihoods with that of the changing class last, relative as before."""
-    above = np.minimum(log_changing - looks.log_best, _MOST_NATS)
-    table = np.column_stack([looks.likelihood, np.exp(above).astype(np.float32)])
+    above = np.minimum(log_changing - seen.log_best, _MOST_NATS)
+    table = np.column_stack([seen.likelihood, np.exp(above).astype(np.float32)])
     table /= np.exp(np.maximum(above, 0.0)).astype(np.float32)[:, None]
     return table

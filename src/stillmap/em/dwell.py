@@ -11,7 +11,7 @@ from stillmap.em.expectations import (
     NoReturn,
     per_beam,
 )
-from stillmap.em.looks import CLASSES, Classes, Float, Looks, Surface, looked_at
+from stillmap.em.looks import CLASSES, Classes, Float, Looks, Surface, Table, looked_at
 from stillmap.em.mixture import Shares, fit_shares, posterior_static
 from stillmap.em.options import EmOptions
 from stillmap.recording.model import Recording
@@ -41,28 +41,28 @@ def e_step(
         threads: same result with any number.
         classes: see Classes.
     """
-    T_map_sensor = recording.T_map_sensor(poses)
-    looks = looked_at(recording, T_map_sensor, resolution, options, threads, classes)
-    return expectations_of(looks, recording, T_map_sensor, options, threads)
+    looks = looked_at(recording, poses, resolution, options, threads, classes)
+    return expectations_of(looks, looks.under(), recording, poses, options, threads)
 
 
 def expectations_of(
     looks: Looks,
+    table: Table,
     recording: Recording,
-    T_map_sensor: Float,
+    poses: Float,
     options: EmOptions,
     threads: int,
 ) -> Expectations:
     """What the looks say of every cell, and with that of every beam that ended in it."""
-    shares = fit_shares(looks.likelihood, looks.n_static, options.prior)
-    static = posterior_static(looks.likelihood, shares.classes, looks.n_static)
-    surface = looks.surface
+    shares = fit_shares(table.likelihood, table.n_static, options.prior)
+    static = posterior_static(table.likelihood, shares.classes, table.n_static)
+    surface, T_map_sensor = looks.surface, recording.T_map_sensor(poses)
     beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
     return Expectations(
         p_static=_of_beams(recording, T_map_sensor, surface, static, shares.static, threads),
-        likelihood=_bound(looks.likelihood, looks.log_best, shares),
+        likelihood=_bound(table, shares),
         occupied=CellProbabilities(surface.elements()[0], static * coverage(surface), _UNSEEN),
-        learned=_learned(looks, shares),
+        learned=_learned(looks, table, shares),
         no_return=NoReturn(looks.dwell.solid(), beyond),
     )
 
@@ -97,31 +97,33 @@ def _of_beams(
     return e
 
 
-def _bound(likelihood: NDArray[np.float32], log_best: Float, shares: Shares) -> Likelihood:
+def _bound(table: Table, shares: Shares) -> Likelihood:
     bound = entropy = 0.0
-    for first in range(0, len(likelihood), _ROWS):  # whole tables in double precision are large
+    for first in range(
+        0, len(table.likelihood), _ROWS
+    ):  # whole tables in double precision are large
         rows = slice(first, first + _ROWS)
-        joint = likelihood[rows] * shares.classes
+        joint = table.likelihood[rows] * shares.classes
         evidence = joint.sum(axis=1)
         r = joint / evidence[:, None]
         entropy -= float(np.sum(r * np.log(np.maximum(r, 1e-30))))
-        bound += float(np.sum(np.log(evidence) + log_best[rows]))
+        bound += float(np.sum(np.log(evidence) + table.log_best[rows]))
     return Likelihood(expected=bound - entropy, bound=bound)
 
 
-def _learned(looks: Looks, shares: Shares) -> dict[str, object]:
-    static, movers = slice(None, looks.n_static), slice(looks.n_static, None)
+def _learned(looks: Looks, table: Table, shares: Shares) -> dict[str, object]:
+    static, movers = slice(None, table.n_static), slice(table.n_static, None)
     return {
         "scatter": looks.surface.scatter,
         "p_static": shares.static,
         "no_return_trusted": round(looks.trust, 6),
-        "static_occupied": _table(looks.rho[static], shares.classes[static]),
-        "mover_occupied": _table(looks.rho[movers], shares.classes[movers]),
-        "mover_seconds": _table(looks.tau[movers], shares.classes[movers]),
+        "static_occupied": _shares_of(table.rho[static], shares.classes[static]),
+        "mover_occupied": _shares_of(table.rho[movers], shares.classes[movers]),
+        "mover_seconds": _shares_of(table.tau[movers], shares.classes[movers]),
     }
 
 
-def _table(values: Float, shares: Float) -> list[dict[str, float]]:
+def _shares_of(values: Float, shares: Float) -> list[dict[str, float]]:
     """The share of each value among these classes."""
     of = shares / shares.sum()
     return [

@@ -5,6 +5,8 @@ In the loop, what is met from some places only would explain walls that are draw
 the scans to them.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,12 +44,14 @@ def last_e_step(
         if options.changes.enabled:
             watch(dwell, recording, options)
 
-    T_map_sensor = recording.T_map_sensor(poses)
-    looks = looked_at(recording, T_map_sensor, resolution, options, threads, _CLASSES, prepare)
+    views = options.dwell.views
+    classes = _CLASSES if views else replace(_CLASSES, views_occupied=())
+    looks = looked_at(recording, poses, resolution, options, threads, classes, prepare)
     found = None
-    if options.dwell.views:
-        kept = looks.among(_for_labels(looks))
-        found = expectations_of(kept, recording, T_map_sensor, options, threads)
+    if views:
+        table = looks.under(_for_labels(looks))
+        found = expectations_of(looks, table, recording, poses, options, threads)
+        del table
     return found, courses_of(looks, options) if options.changes.enabled else None
 
 

@@ -1,6 +1,5 @@
 """What beams see of the cells in which any of them ended, look by look, under classes of chains."""
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -64,6 +63,23 @@ CLASSES = Classes()
 
 
 @dataclass(frozen=True, eq=False)
+class Table:
+    """How likely what was seen of E elements is under each of C classes.
+
+    Attributes:
+        rho, tau, turn: (C,) of the classes; the first `n_static` are static.
+        likelihood: (E, C) under each class, relative to the best; its logarithm is `log_best`.
+    """
+
+    rho: Float
+    tau: Float
+    turn: Float
+    n_static: int
+    likelihood: NDArray[np.float32]
+    log_best: Float
+
+
+@dataclass(frozen=True, eq=False)
 class Looks:
     """What all looks say of E elements.
 
@@ -72,7 +88,6 @@ class Looks:
         dwell: what was seen of them.
         trust: how far beams without a return are believed, from 0 to 1.
         rho, tau, turn: (C,) of the classes; the first `n_static` are static.
-        likelihood: (E, C) under each class, relative to the best; its logarithm is `log_best`.
     """
 
     surface: Surface
@@ -82,26 +97,17 @@ class Looks:
     tau: Float
     turn: Float
     n_static: int
-    likelihood: NDArray[np.float32]
-    log_best: Float
 
-    def among(self, kept: NDArray[np.bool_]) -> "Looks":
-        """The same under some (C,) of the classes, all static ones among them."""
-        likelihood = self.likelihood[:, kept]
-        best = likelihood.max(axis=1, initial=0.0)  # the core lets no class be impossible
-        return dataclasses.replace(
-            self,
-            rho=self.rho[kept],
-            tau=self.tau[kept],
-            turn=self.turn[kept],
-            likelihood=likelihood / best[:, None],
-            log_best=self.log_best + np.log(best),
-        )
+    def under(self, kept: NDArray[np.bool_] | None = None) -> Table:
+        """Of some of the classes (C,), all static ones among them, as if there were no others."""
+        some = slice(None) if kept is None else kept
+        found = self.dwell.likelihood(kept)
+        return Table(self.rho[some], self.tau[some], self.turn[some], self.n_static, *found)
 
 
 def looked_at(
     recording: Recording,
-    T_map_sensor: Float,
+    poses: Float,
     resolution: float,
     options: EmOptions,
     threads: int,
@@ -109,16 +115,16 @@ def looked_at(
     prepare: Callable[[Dwell], None] | None = None,
 ) -> Looks:
     """Follows all beams; `prepare` is called before the first look. See `e_step`."""
+    T_map_sensor = recording.T_map_sensor(poses)
     surface = surface_of(recording, T_map_sensor, resolution)
     dwell = _dwell(surface, options.dwell, classes)
     trust = _open(recording, T_map_sensor, dwell)
     dwell.trust(trust)
     if prepare is not None:
         prepare(dwell)
-    likelihood, log_best = _likelihood(recording, T_map_sensor, dwell, options.dwell.look, threads)
+    _look(recording, poses, dwell, options.dwell.look, threads)
     rho, tau, turn = (np.array(values) for values in classes.grid())
-    found = classes.n_static, likelihood, log_best
-    return Looks(surface, dwell, trust, rho, tau, turn, *found)
+    return Looks(surface, dwell, trust, rho, tau, turn, classes.n_static)
 
 
 def surface_of(recording: Recording, T_map_sensor: Float, resolution: float) -> Surface:
@@ -143,15 +149,11 @@ def look_numbers(recording: Recording, seconds: float) -> NDArray[np.int64]:
     return np.asarray(np.minimum(number, _LAST_LOOK), dtype=np.int64)
 
 
-def _likelihood(
-    recording: Recording,
-    T_map_sensor: Float,
-    dwell: Dwell,
-    seconds: float,
-    threads: int,
-) -> tuple[NDArray[np.float32], Float]:
-    """(E, C) likelihood of all looks at each element relative to its best class, ln of the best."""
-    look = look_numbers(recording, seconds)
+def _look(recording: Recording, poses: Float, dwell: Dwell, seconds: float, threads: int) -> None:
+    """All looks at each element, one after the other."""
+    look, D = look_numbers(recording, seconds), recording.dimension
+    T_map_sensor = recording.T_map_sensor(poses)
+    place = np.ascontiguousarray(poses[:, :D, D])
     for scans, beams, offset in chunks(recording, look):
         dwell.add(
             recording.points[beams],
@@ -160,8 +162,8 @@ def _likelihood(
             T_map_sensor[scans],
             look[scans],
             threads,
+            place[scans],
         )
-    return dwell.likelihood()
 
 
 def _dwell(surface: Surface, options: DwellOptions, classes: Classes) -> Dwell:

@@ -17,7 +17,11 @@ def learned_section(result: ResultLike) -> str:
     if not learned:
         return ""
     tables = [
-        _bars("Share of the looks that see standing things", learned["static_occupied"], _percent)
+        _bars(
+            "Share of the looks, or of the views, that meet standing things",
+            learned["static_occupied"],
+            _percent,
+        )
     ]
     moving = beam_counts(result.recording, result.p_static)["dynamic"]
     if moving < _FEW:

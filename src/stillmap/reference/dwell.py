@@ -21,6 +21,7 @@ Number = NDArray[np.int32]
 HIT = -1.0  # instead of a reliability
 SURE = 0.95  # what was met more probably than that was met
 LEAST = 0.02  # what was met less probably than that nobody looked at
+STEP = 0.5  # cells: who moves less stands, for it is never quite at the same place
 SOLID = 10  # beams that end on an element of a surface that is there for sure, at least once
 
 
@@ -208,7 +209,8 @@ class Dwell:
         self.detection = detection
         self.seconds = seconds
         self.reading = Reading(lateral, margin, reach, beyond, normals)
-        # time, HIT or reliability, mean place of the sensors
+        self.place: Float | None = None  # from where the last look was taken
+        # time, HIT or reliability, place
         self.seen: list[list[tuple[float, float, Float]]] = [[] for _ in surface.list]
         self.model: ChangeModel | None = None
 
@@ -220,19 +222,30 @@ class Dwell:
         T_map_sensor: ArrayLike,
         look: ArrayLike,
         threads: int = 1,  # noqa: ARG002  the core's signature
+        place: ArrayLike | None = None,
     ) -> None:
-        """Adds scans with the numbers (T,) of their looks, which must not fall."""
+        """Adds scans with the numbers (T,) of their looks, which must not fall.
+
+        place (T, D) says where the robot stood; None: the sensors' places count.
+        """
         number = np.asarray(look, np.int64)
         if (np.diff(number) < 0).any():
             raise ValueError("look: must not fall")
         looks: dict[int, list[Beam]] = {int(n): [] for n in number}
         for beam in usable_beams(self.surface.dimension, points, hit, offset, T_map_sensor):
             looks[int(number[beam.scan])].append(beam)
-        places = np.asarray(T_map_sensor, float)[:, :-1, -1]
+        places = np.asarray(T_map_sensor, float)[:, :-1, -1] if place is None else place
         for n, beams in looks.items():
-            place = places[number == n].mean(axis=0)
+            at = self._moved_to(np.asarray(places, float)[number == n].mean(axis=0))
             for k, reliability in look_at(self.surface, beams, self.reading).items():
-                self.seen[k].append((n * self.seconds, reliability, place))
+                self.seen[k].append((n * self.seconds, reliability, at))
+
+    def _moved_to(self, place: Float) -> Float:
+        if self.place is None or (
+            np.linalg.norm(place - self.place) >= STEP * self.surface.resolution
+        ):
+            self.place = place
+        return self.place
 
     def lost(
         self, points: ArrayLike, hit: ArrayLike, offset: ArrayLike, T_map_sensor: ArrayLike
@@ -292,22 +305,25 @@ class Dwell:
             np.array([one.between for one in courses], np.int32).reshape(-1, 2, 2, 2),
         )
 
-    def likelihood(self) -> tuple[NDArray[np.float32], Float]:
-        """(E, C) relative to the best class, (E,) logarithm of the best.
+    def likelihood(self, among: ArrayLike | None = None) -> tuple[NDArray[np.float32], Float]:
+        """(E, C) relative to the best class, (E,) logarithm of the best; of some classes (bool).
 
         Of everything else that was seen of the cell, given that a beam ended in it: divided by
         rho * detection, the probability of that.
         """
+        classes = self.classes
+        if among is not None:
+            classes = [one for one, asked in zip(classes, np.asarray(among), strict=True) if asked]
         values = np.array(
             [
                 [
                     chain_log_likelihood(seen, rho, tau, self.detection, turn)
                     - log(rho * self.detection)
-                    for rho, tau, turn in self.classes
+                    for rho, tau, turn in classes
                 ]
                 for seen in map(self._with_turns, self.surface.list, self.seen)
             ]
-        ).reshape(len(self.seen), len(self.classes))
+        ).reshape(len(self.seen), len(classes))
         best = values.max(axis=1)
         return np.exp(values - best[:, None]).astype(np.float32), best
 

@@ -3,7 +3,7 @@
 from stillmap.slam.deskew import deskewed
 from stillmap.slam.incremental import Doubts, Mapped, SlamOptions
 from stillmap.slam.loops import Closure
-from stillmap.slam.m_step import m_step
+from stillmap.slam.m_step import Told, m_step
 from stillmap.slam.pose_graph import Graph
 
-__all__ = ["Closure", "Doubts", "Graph", "Mapped", "SlamOptions", "deskewed", "m_step"]
+__all__ = ["Closure", "Doubts", "Graph", "Mapped", "SlamOptions", "Told", "deskewed", "m_step"]

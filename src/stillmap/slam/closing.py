@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,11 @@ Float = NDArray[np.float64]
 
 
 def closed(
-    recording: Recording, e: NDArray[np.float32], options: SlamOptions, mapped: Mapped
+    recording: Recording,
+    e: NDArray[np.float32],
+    options: SlamOptions,
+    mapped: Mapped,
+    progress: Callable[[int, int], None],
 ) -> Mapped:
     """Poses after loop closure, all attempts at closing a loop, and the graph.
 
@@ -26,6 +31,7 @@ def closed(
         e: (M,) probability that each beam was reflected by something static.
         options: see SlamOptions.
         mapped: the incremental result; its grid is not looked at.
+        progress: called with the number of scans done and their total.
     """
     track, ties, apart = _track(recording, e, options, mapped)
     way = chain.relations(track, options.motion, mapped.breaks)
@@ -33,6 +39,7 @@ def closed(
     attempted, fitting = list[Closure](), ties
     looks = candidates.looks(track)
     for first, last in candidates.stages(track):
+        progress(int(track.keyframes[first]), recording.n_scans)
         asked = candidates.of_stage(track, moved, looks, first, last, fitting)
         new = verification.attempts(track, asked)
         attempted += new

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from stillmap.slam.incremental import Mapped, SlamOptions
 from stillmap.slam.sweep import sweep
 
 Float = NDArray[np.float64]
+Told = Callable[[str, int, int], None]  # what, scans done, of how many
 
 
 def m_step(
@@ -22,7 +24,7 @@ def m_step(
     options: SlamOptions,
     poses: Float | None,
     threads: int,
-    progress: Callable[[int, int], None],
+    progress: Told,
     *,
     start: Mapped | None = None,
     before: Float | None = None,
@@ -35,26 +37,26 @@ def m_step(
         options: see SlamOptions.
         poses: (T, 3, 3) T_map_base when they are known: then only the map is made.
         threads: for maps of poses that are known already; the result does not depend on it.
-        progress: called with the number of scans done and their total.
+        progress: called with what is done, the number of scans done and their total.
         start: an M-step whose loops are closed already: its poses are only swept again.
         before: (T, 3, 3) earlier poses, which tell how the robot moved during its scans better than
             odometry does.
     """
     if poses is not None:
         mapped = _mapped_at(recording, e, options, poses, threads)
-        progress(recording.n_scans, recording.n_scans)
+        progress("mapping", recording.n_scans, recording.n_scans)
         return mapped
     if not options.loops.enabled:
-        local = _followed(recording, e, options, progress, before)
+        local = _followed(recording, e, options, partial(progress, "mapping"), before)
         grid = _mapped_at(recording, e, options, local.poses, threads).grid
         return dataclasses.replace(local, grid=grid)
     if start is not None:
-        mapped = _swept(recording, e, options, start, threads)
-        progress(recording.n_scans, recording.n_scans)
+        mapped = _swept(recording, e, options, start, threads, partial(progress, "mapping"))
         return dataclasses.replace(mapped, explained=start.explained)
-    local = _followed(recording, e, options, progress, before)
-    closed = closing.closed(deskewed(recording, local.poses, options), e, options, local)
-    mapped = _swept(recording, e, options, closed, threads)
+    local = _followed(recording, e, options, partial(progress, "mapping"), before)
+    seen = deskewed(recording, local.poses, options)
+    closed = closing.closed(seen, e, options, local, partial(progress, "closing loops"))
+    mapped = _swept(recording, e, options, closed, threads, partial(progress, "mapping again"))
     # a scan that went astray explains itself in the map of all: the map so far tells
     return dataclasses.replace(mapped, explained=local.explained)
 
@@ -77,11 +79,17 @@ def _followed(
 
 
 def _swept(
-    recording: Recording, e: NDArray[np.float32], options: SlamOptions, mapped: Mapped, threads: int
+    recording: Recording,
+    e: NDArray[np.float32],
+    options: SlamOptions,
+    mapped: Mapped,
+    threads: int,
+    progress: Callable[[int, int], None],
 ) -> Mapped:
     """Poses whose loops are closed, registered once more against all others; with their map."""
     for _ in range(options.loops.sweeps):
-        mapped = sweep(deskewed(recording, mapped.poses, options), e, options, mapped)
+        seen = deskewed(recording, mapped.poses, options)
+        mapped = sweep(seen, e, options, mapped, progress)
     grid = _mapped_at(recording, e, options, mapped.poses, threads).grid
     return dataclasses.replace(mapped, grid=grid)
 

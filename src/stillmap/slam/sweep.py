@@ -1,6 +1,7 @@
 """One pass over all scans: each registered against the map that all the others make."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,11 @@ Float = NDArray[np.float64]
 
 
 def sweep(
-    recording: Recording, e: NDArray[np.float32], options: SlamOptions, mapped: Mapped
+    recording: Recording,
+    e: NDArray[np.float32],
+    options: SlamOptions,
+    mapped: Mapped,
+    progress: Callable[[int, int], None],
 ) -> Mapped:
     """Poses, covariances and explained shares after a pass; the first pose stays.
 
@@ -25,6 +30,7 @@ def sweep(
         e: (M,) probability that each beam was reflected by something static.
         options: see SlamOptions.
         mapped: where to begin; its grid is not looked at.
+        progress: called with the number of scans done and their total.
     """
     poses = mapped.poses.copy()
     T = len(poses)
@@ -48,6 +54,7 @@ def sweep(
         covariance[t], explained[t] = found.covariance, found.explained
         if is_in_map[t]:
             put(grid, recording, e, t, poses[t], options.surface)
+        progress(t + 1, T)
     return dataclasses.replace(mapped, poses=poses, covariance=covariance, explained=explained)
 
 
