@@ -89,10 +89,12 @@ def test_refusals(call, room, tmp_path, nothing_left):
     refused(call("convert", room, "-o", tmp_path / "no/a.log"), "no such folder")
     refused(call("convert", room, "-o", room, "--overwrite"), "is the recording itself")
     refused(call("convert", room, "-o", room.parent, "--overwrite"), "holds the recording")
+    refused(call("convert", room, "-o", "/dev/null", "--to", "carmen", "--overwrite"), "no regular")
     refused(call("convert", room, "-o", out, "--input", room), "--input is for results")
     refused(call("convert", room, "-o", tmp_path / "a.parquet"), "'.parquet'")
     for to in ("stillmap", "ros2"):  # only folders of the same kind are overwritten
-        refused(call("convert", room, "-o", precious, "--overwrite", "--to", to), "already holds")
+        done = call("convert", room, "-o", precious, "--overwrite", "--to", to)
+        refused(done, "holds other things")
     nothing_left("precious", "a.log")
     assert (precious / "file").exists()
 

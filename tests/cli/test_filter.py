@@ -76,9 +76,9 @@ def test_refusals(call, room, mapped, tmp_path):
     refused(call("filter", mapped, "-o", tmp_path / "c", "--below", "7"), "--below wants 0 to 1")
     (tmp_path / "full").mkdir()
     (tmp_path / "full/file").write_text("")
-    for more in ((), ("--overwrite",)):  # only recordings are overwritten
-        done = call("filter", mapped, "-o", tmp_path / "full", *more)
-        refused(done, "already holds something")
+    # only recordings are overwritten
+    for more, said in ((), "already holds something"), (("--overwrite",), "holds other things"):
+        refused(call("filter", mapped, "-o", tmp_path / "full", *more), said)
     assert (tmp_path / "full/file").exists()
     assert not (tmp_path / "c").exists()
 

@@ -127,11 +127,28 @@ def test_a_folder_with_something_in_it_is_refused(call, room, tmp_path):
     out.mkdir()
     (out / "mine.txt").write_text("mine")
     refused(call("map", room, "-o", out, *QUICK), out, "--overwrite")
+    for more in ("--overwrite", "--resume"):  # only results are replaced
+        refused(call("map", room, "-o", out, more, *QUICK), out, "run.json")
     assert files_in(out) == {"mine.txt"}
+    (out / "run.json").write_text("")
     done = call("map", room, "-o", out, "--overwrite", *QUICK)
     assert done.returncode == 0
     assert files_in(out) >= FILES
     assert "mine.txt" not in files_in(out)
+
+
+def test_the_recording_is_not_written_over(call, room, tmp_path):
+    recording = tmp_path / "in" / "room"
+    shutil.copytree(room, recording)
+    (tmp_path / "in" / "run.json").write_text("")
+    (recording / "run.json").write_text("")  # as if they were results, too
+    before = files_in(recording)
+    for given in (recording, recording / "recording.json"):
+        done = call("map", given, "-o", recording, "--overwrite", *QUICK)
+        refused(done, "is the recording itself")
+    for more in ("--overwrite", "--resume"):
+        refused(call("map", recording, "-o", tmp_path / "in", more, *QUICK), "holds the recording")
+    assert files_in(recording) == before
 
 
 def test_an_empty_folder_will_do(call, room, tmp_path, nothing_left):
@@ -329,11 +346,11 @@ def test_killed_while_writing_all_or_nothing_stands_there(start, room, tmp_path,
 def test_killed_while_overwriting_the_old_result_or_the_new_stands_there(start, room, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
-    (out / "old.txt").write_text("old")
+    (out / "run.json").write_text("old")
     process = start("map", room, "-o", out, "--overwrite", "--quiet", *QUICK)
     status = stopped_while_writing(process, tmp_path, signal.SIGKILL)
     assert status in (-signal.SIGKILL, 0)
-    assert files_in(out) == {"old.txt"} or files_in(out) >= FILES
+    assert files_in(out) == {"run.json"} or files_in(out) >= FILES
 
 
 def left_on_screen(written: str) -> list[str]:

@@ -259,13 +259,13 @@ def test_a_full_disk_leaves_the_checkpoint_before(
 def test_a_full_disk_leaves_the_earlier_result(call, room, tmp_path, whole, monkeypatch):
     out = tmp_path / "out"
     out.mkdir()
-    (out / "old.txt").write_text("old")
+    (out / "run.json").write_text("old")
     with monkeypatch.context() as here:
         here.setattr(beams, "write_npy", _Full(beams.write_npy, 2))
         done = call("map", room, "-o", out, "--overwrite", "--quiet", *WORDS)
     assert done.returncode == 2
     assert "No space left" in done.stderr
-    assert os.listdir(out) == ["old.txt"]
+    assert os.listdir(out) == ["run.json"]
     assert sorted(os.listdir(tmp_path / ".out.resume")) == [f"iteration-{ALL}", "lock"]
     assert call("map", room, "-o", out, "--resume", *WORDS).returncode == 0
     assert contents(out) == whole

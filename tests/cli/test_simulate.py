@@ -155,7 +155,10 @@ def test_an_output_folder_that_holds_something_is_left_alone(tmp_path: Path) -> 
     (out / "mine").write_text("x")
     with pytest.raises(InputError, match="already holds something"):
         call("hall", "-o", str(out), *QUICK)
+    with pytest.raises(InputError, match="holds other things"):
+        call("hall", "-o", str(out), *QUICK, "--overwrite")
     assert (out / "mine").read_text() == "x"
+    (out / "truth").mkdir()
     assert call("hall", "-o", str(out), *QUICK, "--overwrite") == 0
     assert (out / "recording.json").exists()
     assert not (out / "mine").exists()

@@ -107,6 +107,11 @@ def test_overwriting_must_be_asked_for(tmp_path, result):
     (tmp_path / "out").mkdir()
     save(result, tmp_path / "out")  # an empty folder is as good as none
     (tmp_path / "out" / "mine.txt").write_text("kept")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "mine.txt").write_text("kept")
+    with pytest.raises(InputError, match=r"other things: only a folder with run\.json"):
+        save(result, tmp_path / "mine", overwrite=True)
+    assert (tmp_path / "mine" / "mine.txt").read_text() == "kept"
     with pytest.raises(InputError, match="already holds"):
         save(result, tmp_path / "out")
     assert (tmp_path / "out" / "mine.txt").read_text() == "kept"

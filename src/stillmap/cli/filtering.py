@@ -46,7 +46,7 @@ def filtered(
     in_folder = mapped.source.is_dir() or mapped.source.name == folder.HEADER
     if in_folder:
         mark = "metadata.yaml" if form is not None and form.name == "ROS bag" else folder.HEADER
-        require_new(output, overwrite and (output / mark).is_file())
+        require_new(output, mark, overwrite)
     else:
         require_new_file(output, overwrite)
     recording, labels = mapped.read()

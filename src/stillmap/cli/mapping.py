@@ -17,10 +17,12 @@ from stillmap.cli.options import resolved_options
 from stillmap.cli.printing import files_in, print_json
 from stillmap.cli.progress import say, shown_progress, shown_share
 from stillmap.cli.reading import read_changes
+from stillmap.cli.results import require_apart
 from stillmap.errors import InputError
 from stillmap.loop import Loop
 from stillmap.output.atomic import require_new
 from stillmap.output.points import beam_counts
+from stillmap.output.run_json import RECORD
 from stillmap.output.save import save
 from stillmap.pipeline import Options, resolved
 from stillmap.recording import Recording, read
@@ -41,7 +43,8 @@ def mapped(args: argparse.Namespace, changes: dict[str, Any]) -> int:
     """
     options = resolved(resolved_options(args, read_changes(args), changes))
     output, replace = Path(args.output), args.overwrite or args.resume
-    require_new(output, replace)
+    require_new(output, RECORD, replace)
+    require_apart(output, Path(args.input))
     _require_writable(output)
     with held(output) as place:
         try:

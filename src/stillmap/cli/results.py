@@ -10,11 +10,11 @@ import numpy as np
 from stillmap import options
 from stillmap.errors import InputError
 from stillmap.evaluation.folders import Labels, read_labels
+from stillmap.output.run_json import RECORD
 from stillmap.recording import Recording, folder, read
 from stillmap.recording.options import ReadOptions
 from stillmap.texts import read_text, require_regular
 
-_RECORD = "run.json"
 _MAX_RUN = 32 << 20  # bytes of a run.json
 
 
@@ -68,7 +68,7 @@ class Mapped:
 
 def is_result(path: Path) -> bool:
     """Whether a folder is a result."""
-    return (path / _RECORD).is_file()
+    return (path / RECORD).is_file()
 
 
 def found(result: Path, given: str | None) -> Mapped:
@@ -77,7 +77,7 @@ def found(result: Path, given: str | None) -> Mapped:
     Raises:
         InputError: it is none, or names no recording.
     """
-    record = _run_record(result / _RECORD)
+    record = _run_record(result / RECORD)
     return Mapped(result, record, Path(given or _path_of(record, result)), bool(given))
 
 
@@ -117,7 +117,7 @@ def _read_options(record: dict[str, Any], result: Path) -> ReadOptions:
     chosen = record.get("options")
     read_as = chosen.get("read") if isinstance(chosen, dict) else None
     if not isinstance(read_as, dict):
-        raise InputError("names no options", where=str(result / _RECORD))
+        raise InputError("names no options", where=str(result / RECORD))
     known = {key: value for key, value in read_as.items() if value is not None}
     try:
         return options.replaced(ReadOptions(), known)
@@ -128,6 +128,6 @@ def _read_options(record: dict[str, Any], result: Path) -> ReadOptions:
 def _path_of(record: dict[str, Any], result: Path) -> str:
     path = record["input"].get("path")
     if not isinstance(path, str) or not path:
-        where, hint = str(result / _RECORD), "name it with --input"
+        where, hint = str(result / RECORD), "name it with --input"
         raise InputError("names no recording", where=where, hint=hint)
     return path

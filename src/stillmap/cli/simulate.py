@@ -146,7 +146,7 @@ def run(args: argparse.Namespace) -> int:
 
     from stillmap.output.atomic import require_new
     from stillmap.simulation import scene_by_name, simulate, write_simulation
-    from stillmap.simulation.writing import require_carmen
+    from stillmap.simulation.writing import MARK, require_carmen
 
     scene = scene_by_name(args.scene, _changes(args))
     if args.seed < 0:
@@ -154,7 +154,7 @@ def run(args: argparse.Namespace) -> int:
     if args.format == "carmen":
         require_carmen(scene.laser)
     output = Path(args.output)
-    require_new(output, args.overwrite)
+    require_new(output, MARK, args.overwrite)
     with shown_share(args.quiet, "simulating") as progress:
         simulation = simulate(scene, np.random.default_rng(args.seed), progress)
     write_simulation(simulation, output, format=args.format, overwrite=args.overwrite)

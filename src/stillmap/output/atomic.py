@@ -10,20 +10,30 @@ from pathlib import Path
 from stillmap.errors import InputError
 
 
-def require_new(path: Path, overwrite: bool = False) -> None:
+def require_new(path: Path, mark: str, overwrite: bool = False) -> None:
     """Refuse an output folder that already holds something, before any work is done.
 
+    Args:
+        path: the folder to be.
+        mark: name, or pattern of names, of what every such folder holds. Others are not replaced.
+        overwrite: whether it may be replaced.
+
     Raises:
-        InputError: `path` is a file or a non-empty folder and `overwrite` is not given.
+        InputError: `path` is a file, or a folder that is not empty and not to be replaced.
     """
     if not path.exists() and not path.is_symlink():
         return
     if not path.is_dir():
         raise InputError("is in the way: not a folder", where=str(path))
-    if not overwrite and any(path.iterdir()):
+    if not any(path.iterdir()):
+        return
+    if not overwrite:
         raise InputError(
             "already holds something", where=str(path), hint="choose another or give --overwrite"
         )
+    if not any(path.glob(mark)):
+        what = f"holds other things: only a folder with {mark} is replaced"
+        raise InputError(what, where=str(path), hint="choose another")
 
 
 def require_new_file(path: Path, overwrite: bool = False) -> None:
@@ -34,6 +44,8 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
     """
     if path.is_dir():
         raise InputError("is in the way: a folder", where=str(path))
+    if path.exists() and not path.is_file():
+        raise InputError("is in the way: no regular file", where=str(path))
     if path.exists() and not overwrite:
         raise InputError(
             "is there already", where=str(path), hint="choose another or give --overwrite"
@@ -44,20 +56,20 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
 
 @contextmanager
 def new_folder(
-    path: Path, overwrite: bool = False, *, within: Path | None = None
+    path: Path, mark: str, overwrite: bool = False, *, within: Path | None = None
 ) -> Iterator[Path]:
     """A temporary sibling folder that becomes `path` when the block ends without an exception.
 
     Args:
         path: the folder to be.
-        overwrite: replace what is there.
+        mark, overwrite: see `require_new`.
         within: a folder on the same file system that the temporary one is put into instead.
 
     Raises:
         InputError: `path` is taken or its parent cannot be written to.
     """
     path = Path(os.path.abspath(path))
-    require_new(path, overwrite)
+    require_new(path, mark, overwrite)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         work = Path(
@@ -68,6 +80,7 @@ def new_folder(
     try:
         yield work
         work.chmod(0o777 & ~_umask())
+        require_new(path, mark, overwrite)  # it may have appeared meanwhile
         _move_into_place(work, path)
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
@@ -79,9 +92,11 @@ def new_folder(
 def new_file(path: Path) -> Iterator[Path]:
     """A temporary sibling file that becomes `path` when the block ends without an exception."""
     path = Path(os.path.abspath(path))
-    work = path.with_name(f".{path.name}.{os.getpid()}.part")
+    work, free = path.with_name(f".{path.name}.{os.getpid()}.part"), not path.exists()
     try:
         yield work
+        if free and path.exists():
+            raise InputError("has appeared meanwhile", where=str(path), hint="choose another")
         os.replace(work, path)
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error

@@ -57,6 +57,9 @@ def run_record(result: ResultLike) -> dict[str, Any]:
     return plain
 
 
+RECORD = "run.json"  # every result has it
+
+
 def write_run_json(path: Path, result: ResultLike) -> None:
     """Write `run_record` to `path`."""
     text = json.dumps(run_record(result), indent=2, ensure_ascii=False, allow_nan=False)

@@ -10,7 +10,7 @@ from stillmap.output.map_server import write_map_server
 from stillmap.output.objects import write_objects, write_traffic
 from stillmap.output.protocols import ResultLike
 from stillmap.output.report import write_report
-from stillmap.output.run_json import write_run_json
+from stillmap.output.run_json import RECORD, write_run_json
 from stillmap.output.trajectory import write_tum
 
 
@@ -22,13 +22,13 @@ def save(
     Args:
         result: what the pipeline found.
         path: the folder; it must not exist or be empty unless `overwrite` is given.
-        overwrite: replace what is there, once the new folder is whole.
+        overwrite: replace an earlier result, once the new folder is whole.
         within: where the new folder is made until then; None: beside `path`.
 
     Raises:
         InputError: `path` is taken or cannot be written to.
     """
-    with new_folder(path, overwrite, within=within) as folder:
+    with new_folder(path, RECORD, overwrite, within=within) as folder:
         write_map_server(folder, result.map, result.options.output.map_mode)
         write_map_npz(folder / "map.npz", result.map, result.changes, result.evidence)
         write_tum(folder / "trajectory.tum", result.recording.stamp_ns, result.poses)
@@ -39,4 +39,4 @@ def save(
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)
         write_report(folder / "report.html", result)
-        write_run_json(folder / "run.json", result)
+        write_run_json(folder / RECORD, result)

@@ -31,7 +31,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     Raises:
         InputError: `path` holds something already, or cannot be written to.
     """
-    with new_folder(Path(path), overwrite) as work:
+    with new_folder(Path(path), HEADER, overwrite) as work:
         write_into(recording, work)
 
 

@@ -108,8 +108,8 @@ WRITERS = (
     Writer("bag", "a ROS 1 bag", (".bag",), "", _ros("bag")),
     Writer("db3", "a ROS 2 bag file", (".db3",), "", _ros("db3")),
     Writer("mcap", "an MCAP file", (".mcap",), "", _ros("mcap")),
-    Writer("kitti", "a KITTI folder", (), "times.txt", _in_folder(kitti.write), _POSES),
-    Writer("pcd", "a folder of PCD files", (), "*.pcd", _in_folder(pcd.write), _POSES),
+    Writer("kitti", "a KITTI folder", (), kitti.MARK, _in_folder(kitti.write), _POSES),
+    Writer("pcd", "a folder of PCD files", (), pcd.MARK, _in_folder(pcd.write), _POSES),
     Writer("ply", "a PLY file", (".ply",), "", _as_cloud(ply.write), _POSES),
     Writer("las", "a LAS file", (".las", ".laz"), "", _as_cloud(las.write), _POSES),
 )
@@ -166,7 +166,7 @@ def require_free(path: Path, writer: Writer, overwrite: bool) -> None:
         InputError: there is something, of another kind or not to be replaced.
     """
     if writer.mark:
-        require_new(path, overwrite and any(path.glob(writer.mark)))
+        require_new(path, writer.mark, overwrite)
     else:
         require_new_file(path, overwrite)
 

@@ -14,6 +14,7 @@ from stillmap.simulation.truth import write_truth
 Format = Literal["stillmap", "carmen"]
 
 CARMEN_LOG = "recording.log"
+MARK = "truth"  # every simulation has it
 
 
 def write_simulation(
@@ -30,7 +31,7 @@ def write_simulation(
         path: the folder.
         format: "stillmap" writes the files of a recording folder, "carmen" a `recording.log`
             with FLASER, RLASER and ODOM lines, ranges in whole centimetres.
-        overwrite: replace what is in the folder.
+        overwrite: replace an earlier simulation.
 
     Raises:
         InputError: the folder holds something already or cannot be written to, or the format
@@ -38,7 +39,7 @@ def write_simulation(
     """
     if format == "carmen":
         require_carmen(simulation.scene.laser)
-    with new_folder(Path(path), overwrite) as work:
+    with new_folder(Path(path), MARK, overwrite) as work:
         if format == "carmen":
             _write_carmen(simulation, work / CARMEN_LOG)
         else:

@@ -19,6 +19,7 @@ from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
 from stillmap.recording.stamps import seconds_text
 
+MARK = "times.txt"  # every such folder has it
 _RECORD = 16  # bytes of a point: float32 x y z and reflectance
 _LAYOUTS = (  # sweeps, their times
     (Path("velodyne"), Path("times.txt")),
@@ -91,7 +92,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     T = recording.T_odom_base if recording.T_recorded_base is None else recording.T_recorded_base
     T = sensor_poses(recording, T)
     digits = max(6, len(str(recording.n_scans)))
-    with new_folder(Path(path), overwrite) as folder:
+    with new_folder(Path(path), MARK, overwrite) as folder:
         (folder / "velodyne").mkdir()
         for scan in recording.in_turn(range(recording.n_scans)):
             points, _ = hits_of(recording, scan)

@@ -22,6 +22,7 @@ from stillmap.recording.options import ReadOptions
 
 ENDINGS = (".pcd",)
 
+MARK = "*.pcd"  # every such folder has one
 _FAR_ENOUGH = 5.0  # m from the origin: a viewpoint there tells in whose frame points are
 
 
@@ -109,7 +110,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     """
     one_sensor(recording, str(path))
     T = sensor_poses(recording, recording.T_recorded_base)
-    with new_folder(Path(path), overwrite) as folder:
+    with new_folder(Path(path), MARK, overwrite) as folder:
         repeats = 0
         for scan in recording.in_turn(range(recording.n_scans)):
             stamp = int(recording.stamp_ns[scan])

@@ -159,7 +159,7 @@ def new_bag(
     """
     with ExitStack() as stack:
         if kind == "ros2":
-            work = stack.enter_context(new_folder(path, overwrite))
+            work = stack.enter_context(new_folder(path, "metadata.yaml", overwrite))
         else:
             work = stack.enter_context(new_file(path))
         if kind == "bag":
