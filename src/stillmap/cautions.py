@@ -1,13 +1,15 @@
 """What somebody should know before he trusts a result."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em, slam
 from stillmap.output.protocols import IterationRecordLike
+from stillmap.output.run_json import skipped_count
 from stillmap.pipeline import Options
 from stillmap.recording.model import Recording
 
@@ -20,7 +22,7 @@ def cautions(
     recording: Recording,
     options: Options,
 ) -> list[str]:
-    """A sentence each.
+    """A sentence each, those of the reader first.
 
     Args:
         records: the numbers of every iteration.
@@ -30,7 +32,7 @@ def cautions(
         recording: what all of it is about.
         options: as resolved.
     """
-    out = []
+    out = _of_reading(recording.source)
     noise = options.em.tolerance * recording.n_beams
     dips = [
         after.number
@@ -51,6 +53,16 @@ def cautions(
             f"{len(lost)} scans fit the map badly (less than a fifth of their beams), the first "
             f"is scan {lost[0]}: the map may be bent there"
         )
+    return out
+
+
+def _of_reading(source: Mapping[str, Any]) -> list[str]:
+    """What the reader noted; of strange folders anything may stand there."""
+    noted = source.get("warnings")
+    out = [text for text in noted if isinstance(text, str)] if isinstance(noted, list) else []
+    skipped = skipped_count(source)
+    if skipped:
+        out.append(f"{skipped} scans were damaged and are left out: `stillmap info` says which")
     return out
 
 

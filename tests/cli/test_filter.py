@@ -9,6 +9,8 @@ from refusals import refused
 
 from stillmap.recording import folder, read
 
+QUICK = ("--set", "em.max_iterations=1", "--quiet")
+
 
 @pytest.fixture(scope="module")
 def mapped(stillmap, room, tmp_path_factory):
@@ -55,6 +57,23 @@ def test_a_log_stays_a_log(call, tmp_path):
     walker = np.isclose(np.linalg.norm(before.points, axis=1), 3.0, atol=0.02) & before.hit
     assert (gone & walker).sum() > 0.9 * walker.sum()
     assert (gone & ~walker).sum() < 0.02 * before.hit.sum()
+
+
+def test_a_bag_stays_a_bag(call, room, tmp_path):
+    """Its ending has to say so; scans that were not mapped are named."""
+    assert call("convert", room, "-o", tmp_path / "a.bag", "--quiet").returncode == 0
+    done = call("map", tmp_path / "a.bag", "-o", tmp_path / "out", *QUICK)
+    assert done.returncode == 0, done.stderr
+    for name in ("clean.clf.gz", "clean.log", "clean.mcap"):
+        done = call("filter", tmp_path / "out", "-o", tmp_path / name)
+        refused(done, name, "a.bag", "stillmap convert")
+    done = call("filter", tmp_path / "out", "-o", tmp_path / "clean.bag")
+    assert done.returncode == 0, done.stderr
+    # what was filtered is another recording than what was mapped
+    done = call("filter", tmp_path / "out", "-o", tmp_path / "b", "--input", tmp_path / "clean.bag")
+    refused(done, "clean.bag", "other beams hit something")
+    same = ["--input", tmp_path / "a.bag", "--overwrite"]
+    assert call("filter", tmp_path / "out", "-o", tmp_path / "clean.bag", *same).returncode == 0
 
 
 def test_a_recording_that_was_moved(call, room, mapped, tmp_path):

@@ -137,6 +137,18 @@ def test_a_folder_with_something_in_it_is_refused(call, room, tmp_path):
     assert "mine.txt" not in files_in(out)
 
 
+def test_what_the_reader_warns_of_is_said_and_kept(call, room, tmp_path):
+    assert call("convert", room, "-o", tmp_path / "a.bag", "--quiet").returncode == 0
+    content = (tmp_path / "a.bag").read_bytes()
+    (tmp_path / "a.bag").write_bytes(content[: int(0.8 * len(content))])
+    done = call("map", tmp_path / "a.bag", "-o", tmp_path / "out", *QUICK)
+    assert done.returncode == 0, done.stderr
+    assert "warning: the bag is cut or damaged" in done.stderr
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert run["warnings"][0].startswith("the bag is cut or damaged")
+    assert "the bag is cut or damaged" in (tmp_path / "out" / "report.html").read_text()
+
+
 def test_the_recording_is_not_written_over(call, room, tmp_path):
     recording = tmp_path / "in" / "room"
     shutil.copytree(room, recording)

@@ -33,7 +33,7 @@ def moved(tmp_path_factory):
         things=(Thing(CRATE, (Stay(1.0, 1.0, since=120.0),)),),
         crowd=CrowdOptions(people=1),
         laser=LaserOptions(beams=120, range_noise=0.01, fov=2 * np.pi),
-        robot=RobotOptions(scans=200, scan_rate=1.0, speed=0.001),
+        robot=RobotOptions(scans=200, scan_rate=1.0, speed=0.05),
     )
     write_simulation(simulate(scene, np.random.default_rng(1)), path)
     return path

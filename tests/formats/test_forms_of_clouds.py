@@ -25,11 +25,17 @@ def recording():
     )
 
 
+SAID = {
+    "kitti": ["its odometry stands for poses"],
+    "pcd": ["its readings of odometry are left out"],
+}
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_scans_come_back(recording, tmp_path, form):
     path = tmp_path / f"form{FORMS[form]}"
     lost = writers.write(recording, path, name=form)
-    assert lost == []
+    assert lost == SAID.get(form, [])
     again = read(path)
     np.testing.assert_array_equal(again.stamp_ns, recording.stamp_ns)
     np.testing.assert_array_equal(again.offset, recording.offset)

@@ -56,6 +56,8 @@ def run(args: argparse.Namespace) -> int:
         say(f"{done.blanked} beams blanked, {share:.1f} % of the hits; in {output}")
         if done.left_out:
             say(f"{done.left_out} scans left out that were not mapped")
+        for topic in done.unfiltered:
+            say(f"warning: {topic} is as it was: it was not mapped")
         for topic in done.topics:
             say(f"warning: {topic} left out: the bag does not say what its messages are made of")
     return 0

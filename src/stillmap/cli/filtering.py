@@ -13,6 +13,12 @@ from stillmap.output.atomic import require_new, require_new_file
 from stillmap.recording import Recording, carmen_blanked, folder, spool
 from stillmap.recording.formats import format_of
 
+# endings of files, and what each says
+_ENDINGS = {
+    **dict.fromkeys((".log", ".clf", ".txt", ".gz"), "carmen"),
+    **{ending: ending for ending in (".bag", ".db3", ".mcap")},
+}
+
 
 class Filtered(NamedTuple):
     """What was written.
@@ -23,6 +29,7 @@ class Filtered(NamedTuple):
         blanked: of these.
         left_out: scans that are not in it.
         topics: of a bag, that are not in it.
+        unfiltered: of a bag, with scans of other lasers, as they were.
     """
 
     source: Path
@@ -30,6 +37,7 @@ class Filtered(NamedTuple):
     blanked: int
     left_out: int
     topics: list[str]
+    unfiltered: list[str]
 
 
 def filtered(
@@ -42,6 +50,7 @@ def filtered(
     """
     mapped = found(result, given)
     form = format_of(mapped.source) if mapped.source.exists() else None
+    _require_ending(output, mapped.source)
     require_apart(output, mapped.source, mapped.folder)
     in_folder = mapped.source.is_dir() or mapped.source.name == folder.HEADER
     if in_folder:
@@ -57,26 +66,39 @@ def filtered(
         blank[block] = hit & (labels.p_static[block] < below)
         hits += int(np.count_nonzero(hit))
         blanked += int(np.count_nonzero(blank[block]))
-    left_out, topics = _write(mapped, output, recording, blank, overwrite)
-    return Filtered(mapped.source, hits, blanked, left_out, topics)
+    written = _write(mapped, output, recording, blank, overwrite)
+    return Filtered(mapped.source, hits, blanked, *written)
+
+
+def _require_ending(output: Path, source: Path) -> None:
+    """The form stays what it was: no other one is to be named.
+
+    Raises:
+        InputError: the ending is that of another form.
+    """
+    ending = output.suffix.lower()
+    same = _ENDINGS.get(ending, ending) == _ENDINGS.get(source.suffix.lower())
+    if ending in _ENDINGS and (source.is_dir() or not same):
+        what = f"would be a recording like {source.name}, which its ending does not say"
+        raise InputError(what, where=str(output), hint="`stillmap convert` makes another form")
 
 
 def _write(
     mapped: Mapped, output: Path, recording: Recording, blank: NDArray[np.bool_], overwrite: bool
-) -> tuple[int, list[str]]:
-    """How many scans, and which topics, are not in what was written."""
+) -> tuple[int, list[str], list[str]]:
+    """How many scans, and which topics, are not in what was written; which are not filtered."""
     form = format_of(mapped.source)
     if form.name == "ROS bag":
         from stillmap.recording.ros import blanked
 
         options = mapped.read_options
         done = blanked.write(mapped.source, output, recording, blank, options, overwrite=overwrite)
-        return done.left_out, done.topics
+        return done.left_out, done.topics, done.unfiltered
     if form.name == "stillmap recording":
         folder.write(_without(recording, blank), output, overwrite=overwrite)
-        return 0, []
+        return 0, [], []
     if form.name == "CARMEN log":
-        return carmen_blanked.write(mapped.source, output, recording, blank).left_out, []
+        return carmen_blanked.write(mapped.source, output, recording, blank).left_out, [], []
     hint = "`stillmap convert` makes a recording of another form that can be"
     raise InputError(f"a {form.name} cannot be written again", where=str(mapped.source), hint=hint)
 

@@ -11,7 +11,7 @@ from stillmap import options
 from stillmap.errors import InputError
 from stillmap.evaluation.folders import Labels, read_labels
 from stillmap.output.run_json import RECORD
-from stillmap.recording import Recording, folder, read
+from stillmap.recording import Recording, folder, read, spool
 from stillmap.recording.options import ReadOptions
 from stillmap.texts import read_text, require_regular
 
@@ -60,6 +60,12 @@ class Mapped:
         ):
             raise InputError(
                 "is not the recording that was mapped: other scans or beams",
+                where=str(self.source),
+                hint="name it with --input",
+            )
+        if any((recording.hit[b] != labels.hit[b]).any() for b in spool.blocks(recording.hit)):
+            raise InputError(
+                "is not the recording that was mapped: other beams hit something",
                 where=str(self.source),
                 hint="name it with --input",
             )

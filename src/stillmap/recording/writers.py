@@ -16,10 +16,13 @@ from stillmap.recording.model import Recording
 Write = Callable[[Recording, Path, bool], list[str]]
 
 # fields of a recording that hardly any format has room for, in words
-_OPTIONAL = {"images": "pictures", "T_recorded_base": "poses that the recording states"}
+_OPTIONAL = {
+    "images": "pictures",
+    "T_recorded_base": "poses that the recording states",
+    "T_odom_base": "readings of odometry",
+}
 
-
-_POSES = ("T_recorded_base",)
+_POSES, _ODOMETRY = ("T_recorded_base",), ("T_odom_base",)
 
 
 class Writer(NamedTuple):
@@ -66,6 +69,17 @@ def _in_folder(write: Callable[..., None]) -> Write:
     return written
 
 
+def _write_kitti(recording: Recording, path: Path, overwrite: bool) -> list[str]:
+    lost = _in_folder(kitti.write)(recording, path, overwrite)
+    if recording.T_odom_base is None:
+        return lost
+    stands = recording.T_recorded_base is None
+    return [
+        "its odometry stands for poses" if stands else "its readings of odometry are left out",
+        *lost,
+    ]
+
+
 def _as_cloud(write: Callable[..., None]) -> Write:
     """All scans as one cloud, by the poses that the recording has."""
 
@@ -95,23 +109,24 @@ WRITERS = (
         (),
         folder.HEADER,
         _write_folder,
-        ("images", "T_recorded_base"),
+        ("images", *_POSES, *_ODOMETRY),
     ),
-    Writer("ros2", "a ROS 2 bag folder", (), "metadata.yaml", _ros("ros2")),
+    Writer("ros2", "a ROS 2 bag folder", (), "metadata.yaml", _ros("ros2"), _ODOMETRY),
     Writer(
         "carmen",
         "a CARMEN log",
         (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz"),
         "",
         _write_carmen,
+        _ODOMETRY,
     ),
-    Writer("bag", "a ROS 1 bag", (".bag",), "", _ros("bag")),
-    Writer("db3", "a ROS 2 bag file", (".db3",), "", _ros("db3")),
-    Writer("mcap", "an MCAP file", (".mcap",), "", _ros("mcap")),
-    Writer("kitti", "a KITTI folder", (), kitti.MARK, _in_folder(kitti.write), _POSES),
+    Writer("bag", "a ROS 1 bag", (".bag",), "", _ros("bag"), _ODOMETRY),
+    Writer("db3", "a ROS 2 bag file", (".db3",), "", _ros("db3"), _ODOMETRY),
+    Writer("mcap", "an MCAP file", (".mcap",), "", _ros("mcap"), _ODOMETRY),
+    Writer("kitti", "a KITTI folder", (), kitti.MARK, _write_kitti, (*_POSES, *_ODOMETRY)),
     Writer("pcd", "a folder of PCD files", (), pcd.MARK, _in_folder(pcd.write), _POSES),
-    Writer("ply", "a PLY file", (".ply",), "", _as_cloud(ply.write), _POSES),
-    Writer("las", "a LAS file", (".las", ".laz"), "", _as_cloud(las.write), _POSES),
+    Writer("ply", "a PLY file", (".ply",), "", _as_cloud(ply.write), (*_POSES, *_ODOMETRY)),
+    Writer("las", "a LAS file", (".las", ".laz"), "", _as_cloud(las.write), (*_POSES, *_ODOMETRY)),
 )
 
 

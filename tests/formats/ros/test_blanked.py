@@ -55,6 +55,30 @@ def test_all_else_stays(bag, messages, tmp_path):
     np.testing.assert_array_equal(again.T_odom_base, recording.T_odom_base)
 
 
+@pytest.mark.parametrize("zeros", [20, 0])
+def test_nothing_came_back_is_said_as_the_laser_says_it(bag, messages, tmp_path, zeros):
+    """Zeros are frequent: infinities of ours must not make them unusable."""
+    rng = np.random.default_rng(0)
+    content = []
+    for k in range(8):
+        ranges = rng.uniform(2.0, 9.0, 100)
+        ranges[rng.permutation(100)[:zeros]] = 0.0
+        stamp = START + k * SECOND
+        content.append(("/scan", stamp, messages.scan(stamp, ranges)))
+    source = bag(content)
+    recording = read(source)
+    blank = recording.hit & (rng.random(recording.n_beams) < 0.3)
+    out = tmp_path / f"out{source.suffix}"
+    blanked.write(source, out, recording, blank, ReadOptions())
+    got = np.concatenate([m.ranges for _, _, m in contents(out, messages)])
+    assert (got[blank] == (0.0 if zeros else np.inf)).all()
+    again = read(out)
+    rules = [one.source["sensors"][0]["ranges"]["zero_means"] for one in (recording, again)]
+    assert rules == ["max-range" if zeros else "unusable"] * 2
+    np.testing.assert_array_equal(again.hit, recording.hit & ~blank)
+    assert np.isfinite(again.points).all()
+
+
 def test_two_lasers_and_one_that_is_not_used(bag, messages, tmp_path):
     mounts = [messages.transform(0, "base_link", name, (0, 0, 0)) for name in ("a", "b")]
     content = [("/tf_static", START, messages.tf(*mounts))]
@@ -69,7 +93,8 @@ def test_two_lasers_and_one_that_is_not_used(bag, messages, tmp_path):
     blank = np.zeros(recording.n_beams, np.bool_)
     blank[recording.beams_of(3)] = True  # of the second laser
     out = tmp_path / f"out{source.suffix}"
-    blanked.write(source, out, recording, blank, ReadOptions())
+    done = blanked.write(source, out, recording, blank, ReadOptions())
+    assert done.unfiltered == ["/elsewhere"]
     infinite = [
         (topic, log_ns)
         for topic, log_ns, m in contents(out, messages)

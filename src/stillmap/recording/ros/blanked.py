@@ -1,5 +1,6 @@
 """A bag once more, with beams blanked: as if nothing had come back."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from stillmap.recording.options import ReadOptions
 from stillmap.recording.ros.bags import open_bag
 from stillmap.recording.ros.channels import Bag, Channel, DamagedError, Message
 from stillmap.recording.ros.kinds import ZSTD_MAGIC, own_form
-from stillmap.recording.ros.messages import MULTI_ECHO, decoded
+from stillmap.recording.ros.messages import CLOUD, LASER, MULTI_ECHO, decoded, frame
 from stillmap.recording.ros.reading import origins
 from stillmap.recording.ros.unpacking import zstd_unpacked
 from stillmap.recording.ros_writing import bag as writing
@@ -31,11 +32,13 @@ class Blanked:
         left_out: messages of scans that the recording does not have, so that nothing is known of
             their beams.
         topics: those that could not be copied, as nobody knows what their messages are made of.
+        unfiltered: those of scans that were not mapped; they are as they were.
     """
 
     scans: int
     left_out: int
     topics: list[str]
+    unfiltered: list[str]
 
 
 def write(
@@ -47,7 +50,10 @@ def write(
     *,
     overwrite: bool = False,
 ) -> Blanked:
-    """Write a bag with some readings of its scans replaced by +inf (REP 117: nothing in range).
+    """Write a bag with some readings of its scans replaced by what says that nothing came back.
+
+    That is +inf (REP 117), zero for lasers that say it with zeros: more infinities would make
+    readers take these for unusable.
 
     Args:
         source: the bag.
@@ -86,6 +92,7 @@ def _write(
     if len(scan_of) != recording.n_scans:
         raise InputError("is not the bag that was mapped: other scans", where=str(source))
     of_lasers = {topic for topic, _ in scan_of}
+    nothing = _no_return(recording)
     seen: dict[str, int] = {}
     scans = left_out = 0
     with writing.new_bag(out, kind, overwrite=overwrite, mcap=mcap) as copy:
@@ -102,11 +109,21 @@ def _write(
                 left_out += 1
                 continue
             beams = blank[recording.beams_of(t)]
-            raw = _replaced(message, beams, copy) if beams.any() else _unpacked(message)
+            raw = _replaced(message, beams, nothing, copy) if beams.any() else _unpacked(message)
             if to is not None:
                 to(message.log_ns, raw)
             scans += 1
-    return Blanked(scans, left_out, _lost(bag.channels, send))
+    unfiltered = {c.topic for c in bag.channels if c.type in (LASER, MULTI_ECHO, CLOUD)} - of_lasers
+    return Blanked(scans, left_out, _lost(bag.channels, send), sorted(unfiltered))
+
+
+def _no_return(recording: Recording) -> dict[tuple[str, str], float]:
+    """The reading of each laser, by topic and frame, where nothing came back."""
+    out = {}
+    for laser in recording.source["sensors"]:
+        is_zero = laser["ranges"]["zero_means"] == "max-range"
+        out[laser["name"], laser["frame"]] = 0.0 if is_zero else math.inf
+    return out
 
 
 def _pass_on(message: Message, to: _Send | None) -> None:
@@ -123,12 +140,18 @@ def _unpacked(message: Message) -> bytes:
     return zstd_unpacked(message.raw) if packed else message.raw
 
 
-def _replaced(message: Message, blank: NDArray[np.bool_], copy: writing.Bag) -> bytes:
+def _replaced(
+    message: Message,
+    blank: NDArray[np.bool_],
+    no_return: dict[tuple[str, str], float],
+    copy: writing.Bag,
+) -> bytes:
     """A scan's message with the blanked readings replaced."""
     scan: Any = decoded(message)
+    nothing = np.float32(no_return[message.channel.topic, frame(scan.header.frame_id)])
     if message.channel.type == MULTI_ECHO:
         for k in np.flatnonzero(blank):
-            scan.ranges[k].echoes = np.array([np.inf], np.float32)
+            scan.ranges[k].echoes = np.array([nothing])
     else:
-        scan.ranges = np.where(blank, np.float32(np.inf), scan.ranges)
+        scan.ranges = np.where(blank, nothing, scan.ranges)
     return copy.serialized(scan, message.channel.type)

@@ -21,7 +21,7 @@ from stillmap.recording.ros import databases, unpacking
 from stillmap.recording.ros.channels import LAST_NS, Channel, Message
 from stillmap.recording.skipped import Skipped
 
-CUT = "bytes at the end that are no records"
+CUT = "end that is no record"
 BAD_CHUNK = "chunk that cannot be unpacked"
 BAD_ROWS = "rows that cannot be read"
 
