@@ -4,6 +4,7 @@ libe57 does the reading (by pye57). Counts in a file are believed as far as its 
 """
 
 import re
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from stillmap.recording.options import ReadOptions
 ENDINGS = (".e57",)
 MAGIC = b"ASTM-E57"
 
-_BLOCK = 1 << 18  # points read together
+_BLOCK = 1 << 14  # points read together; libe57 keeps the space for them where packets are bad
 _PAGE, _CHECKSUM = 1024, 4  # bytes
 _LARGEST_XML = 16 << 20  # bytes: what libe57 makes of them takes fifty times as many
 _DEEPEST = 100  # elements within each other: libe57 takes their number squared to read them
@@ -155,11 +156,10 @@ def _cloud(path: Path, scan: int, origin: Origin, scratch: Path | None) -> Cloud
         buffers = opened.library.VectorSourceDestBuffer()
         for name, array in values.items():
             buffers.append(opened.library.SourceDestBuffer(file, name, array, _BLOCK, True, True))
-        reader = points.reader(buffers)
-        while n := reader.read():
-            growing.add(_xyz(values, n))
-            found += n
-        reader.close()
+        with closing(points.reader(buffers)) as reader:
+            while n := reader.read():
+                growing.add(_xyz(values, n))
+                found += n
         stamp_ns = _stamp_ns(node)
     if found < promised:
         raise cut_short(path, found, promised)
