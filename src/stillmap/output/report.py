@@ -77,15 +77,15 @@ def likelihood_sentence(result: ResultLike) -> str:
         if after.bound < before.bound
     ]
     if not falls:
-        return "The likelihood never fell from one iteration to the next."
+        return "The likelihood (its bound) never fell from one iteration to the next."
     where = ", ".join(str(number) for number, _ in falls)
     number, share = max(falls, key=lambda fall: fall[1])
     most = f"by {share_text(share)}" if len(falls) == 1 else f"most, by {share_text(share)}"
     most += "" if len(falls) == 1 else f", at iteration {number}"
     plural = "s" if len(falls) > 1 else ""
     return (
-        f"The likelihood fell at iteration{plural} {where} ({most}). That can happen: poses are "
-        "found scan by scan and by a measure of their own, so what helps one may cost another."
+        f"The likelihood (its bound) fell at iteration{plural} {where} ({most}). That can "
+        "happen: poses are found scan by scan and by a measure of their own, so what helps one may cost another."
     )
 
 

@@ -25,7 +25,7 @@ from stillmap.output.report_tables import share_text
 
 _KEY = (
     '<p class="soft"><span class="key" style="margin-left:0;background:#fff"></span>free'
-    '<span class="key" style="background:#bec4cc"></span>never looked at'
+    '<span class="key" style="background:#bec4cc"></span>unknown'
     '<span class="key" style="background:#000"></span>occupied'
     '<span class="key" style="background:#f07800"></span>end of a beam that met something '
     'moving <span style="white-space:nowrap"><span class="key" style="background:#dbc2f4"></span>'
@@ -87,6 +87,9 @@ def evidence_sentence(result: ResultLike) -> str:
     )
 
 
+_LATER = " What is taken for dynamic in the end, after one more E-step, is in the map above."
+
+
 def evolution_section(result: ResultLike) -> str:
     """The part of the map with most movement at the first, second, best and last iteration."""
     if not result.snapshots or not result.snapshots[0].p_occupied.size:
@@ -95,10 +98,11 @@ def evolution_section(result: ResultLike) -> str:
     h, w = result.snapshots[0].p_occupied.shape
     step = result.snapshots[0].resolution
     title = "How the map evolved" if len(result.snapshots) > 1 else "Where most moved"
+    later = _LATER if result.options.estimator == "stillmap" else ""
     return (
         f"<section><h2>{title}</h2>"
         f"<p>The {w * step:.0f} m by {h * step:.0f} m where most movement was seen; in orange "
-        "the ends of beams taken for dynamic at that iteration.</p>"
+        f"the ends of beams taken for dynamic at that iteration.{later}</p>"
         f'<div class="row">{figures}</div></section>'
     )
 
