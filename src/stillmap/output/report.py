@@ -85,7 +85,8 @@ def likelihood_sentence(result: ResultLike) -> str:
     plural = "s" if len(falls) > 1 else ""
     return (
         f"The likelihood (its bound) fell at iteration{plural} {where} ({most}). That can "
-        "happen: poses are found scan by scan and by a measure of their own, so what helps one may cost another."
+        "happen: poses are found scan by scan and by a measure of their own, so what helps one "
+        "may cost another."
     )
 
 
