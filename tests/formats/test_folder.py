@@ -163,6 +163,7 @@ def test_pickles_are_never_opened(tmp_path):
     ("name", "change", "what"),
     [
         ("stamp_ns", lambda a: a[::-1].copy(), "backwards"),
+        ("stamp_ns", lambda a: np.where(a == a[1], np.iinfo(np.int64).max, -(2**62)), "backwards"),
         ("offset", lambda a: a + 1, "rise"),
         ("offset", lambda a: a[[0, 3, 1, 3]], "rise"),
         ("offset", lambda a: np.where(a == 3, np.iinfo(np.int64).min, a), "rise"),

@@ -51,7 +51,7 @@ class Images:
         N = len(self.stamp_ns)
         if self.stamp_ns.dtype != np.int64 or self.camera.dtype != np.int32:
             raise ValueError("images: expected int64 stamps and int32 cameras")
-        if self.camera.shape != (N,) or np.any(np.diff(self.stamp_ns) < 0):
+        if self.camera.shape != (N,) or np.any(self.stamp_ns[1:] < self.stamp_ns[:-1]):
             raise ValueError(f"images: expected ({N},) cameras and stamps that do not fall")
         if N and (self.camera.min() < 0 or self.camera.max() >= len(self.cameras)):
             raise ValueError("images: a camera that is not there")

@@ -69,7 +69,11 @@ class Recording:
             for block in spool.blocks(self.beam_time):
                 if not np.isfinite(self.beam_time[block]).all():
                     raise ValueError("beam_time: a time is not finite")
-        if self.offset[0] != 0 or self.offset[-1] != M or np.any(np.diff(self.offset) < 0):
+        if (
+            self.offset[0] != 0
+            or self.offset[-1] != M
+            or np.any(self.offset[1:] < self.offset[:-1])
+        ):
             raise ValueError(f"offset: must rise from 0 to {M}")
         if T and (self.sensor.min() < 0 or self.sensor.max() >= S):
             raise ValueError(f"sensor: indices must lie in [0, {S})")

@@ -6,16 +6,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from stillmap import se2
 from stillmap.recording.ros.messages import frame, stamp_ns
 from stillmap.recording.skipped import Skipped
+from stillmap.recording.spool import blocks
 
 BAD_TRANSFORM = "transform that is none"
 
 _UNIT = 0.05  # a quaternion's length may be off by this much
 _LARGEST = 1e9  # m
+_TOGETHER = 1 << 14  # poses that are interpolated together
 
 
 def is_pose(values: tuple[float, ...]) -> bool:
@@ -157,6 +159,17 @@ def _in_order(edge: _Edge) -> _Edge:
     return out
 
 
+def _turned(
+    known: NDArray[np.float64], quaternions: NDArray[np.float64], wanted: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Rotations (n, 3, 3) at times (n,) between those that are known, by the shortest turn."""
+    k = np.clip(np.searchsorted(known, wanted, side="right"), 1, len(known) - 1)
+    share = (wanted - known[k - 1]) / (known[k] - known[k - 1])
+    before, after = Rotation.from_quat(quaternions[k - 1]), Rotation.from_quat(quaternions[k])
+    turn = Rotation.from_rotvec(share[:, None] * (before.inv() * after).as_rotvec())
+    return np.asarray((before * turn).as_matrix(), np.float64)
+
+
 def _at(edge: _Edge, at_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], int]:
     """Transforms (N, 4, 4) at times (N,), and how many of these are outside the edge's own."""
     stamps, values = np.asarray(edge.stamp_ns), np.asarray(edge.values).reshape(-1, 7)
@@ -167,8 +180,8 @@ def _at(edge: _Edge, at_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], int
     # seconds since the first: nanoseconds since 1970 are no exact floating point numbers
     known, wanted = (stamps - stamps[0]) / 1e9, (inside - stamps[0]) / 1e9
     T = np.tile(np.eye(4), (len(at_ns), 1, 1))
-    if len(at_ns):
-        T[:, :3, :3] = Slerp(known, Rotation.from_quat(values[:, 3:]))(wanted).as_matrix()
+    for block in blocks(wanted, rows=_TOGETHER):
+        T[block, :3, :3] = _turned(known, values[:, 3:], wanted[block])
     for axis in range(3):
         T[:, axis, 3] = np.interp(wanted, known, values[:, axis])
     return T, int(np.count_nonzero(inside != at_ns))
