@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stillmap.recording import ranges
 from stillmap.recording.options import BEYOND, ReadOptions
 from stillmap.recording.ros.lasers import Scans, Shape
-from stillmap.recording.spool import Column, let_go
+from stillmap.recording.spool import Column, in_turn, let_go
 
 _SAMPLE = 1 << 22  # readings that tell how readings are to be understood
 _PIECE = 1 << 18  # beams at a time: what they need stays in the caches
@@ -64,9 +64,9 @@ def _sample(scans: Scans) -> NDArray[np.float32]:
     step = max(1, -(-int(lengths.sum()) // _SAMPLE), -(-wide // (4 * _SAMPLE)))
     chosen = np.arange(0, scans.n_scans, step)
     out = np.full((len(chosen), int(lengths[chosen].max(initial=1))), np.nan, np.float32)
-    for row, t in zip(out, chosen, strict=True):
-        row[: lengths[t]] = scans.ranges[scans.start[t] : scans.start[t] + lengths[t]]
-    let_go(scans.ranges)
+    # a few of many: around each that is looked at the system maps a good deal more
+    for k, t in enumerate(in_turn(chosen.tolist(), lambda: let_go(scans.ranges))):
+        out[k, : lengths[t]] = scans.ranges[scans.start[t] : scans.start[t] + lengths[t]]
     return out
 
 
