@@ -45,7 +45,7 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     except OSError as error:
         # a full disk behind stdout, a file that vanished while it was read
-        fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        fail(f"{error.filename or 'the output'}: {error.strerror or error}")
         _drop_stdout()
         return EXIT_INPUT
     except MemoryError as error:

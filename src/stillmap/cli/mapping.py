@@ -173,11 +173,11 @@ def _summary(output: Path) -> dict[str, Any]:
 
 def _say(result: Result, output: Path) -> None:
     counts = beam_counts(result.recording, result.p_static)
-    end = "converged" if result.converged else "not converged"
+    end, n = "converged" if result.converged else "not converged", len(result.iterations)
     lines = [
         f"{result.recording.n_scans} scans, {counts['hits']} beams that hit something, "
         f"{100.0 * counts['dynamic'] / max(counts['hits'], 1):.1f} % of them dynamic",
-        f"{len(result.iterations)} iterations, {end}, the best is {result.best_iteration}",
+        f"{n} iteration{'s' if n > 1 else ''}, {end}, the best is {result.best_iteration}",
         *_changed(result),
         *(f"warning: {warning}" for warning in result.warnings),
         f"wrote {output}: open {output / 'report.html'}",

@@ -13,6 +13,7 @@ from stillmap.cli.terminal import is_terminal, painted
 if TYPE_CHECKING:
     from stillmap.pipeline import Progress
 
+_AT_ONCE = 0.01  # s: what takes no longer has no rate
 _EVERY = 10.0  # s between lines where there is no terminal
 
 
@@ -34,7 +35,7 @@ def _write(line: str) -> None:
         return
     try:
         print(line, file=sys.stderr, flush=True)
-    except BrokenPipeError:
+    except OSError:  # nobody listens any more, or a full disk does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
@@ -172,6 +173,9 @@ class _Lines:
         if not total:
             say(f"{step.name}: {step.seconds():.0f} s so far")
             return
-        rate = step.rate(done)
-        left = f", {(total - done) / max(rate, 1e-3):.0f} s left" if done < total else ""
-        say(f"{step.name}: {done} of {total} scans, {rate:.0f}/s{left}")
+        text, rate = f"{step.name}: {done} of {total} scans", step.rate(done)
+        if step.seconds() > _AT_ONCE:
+            text += f", {rate:.0f}/s"
+        if done < total:
+            text += f", {(total - done) / max(rate, 1e-3):.0f} s left"
+        say(text)

@@ -4,7 +4,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from stillmap.errors import InputError
@@ -101,7 +101,8 @@ def new_file(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
     finally:
-        work.unlink(missing_ok=True)
+        with suppress(OSError):  # where nothing can be written, nothing can be removed
+            work.unlink()
 
 
 def _move_into_place(work: Path, path: Path) -> None:

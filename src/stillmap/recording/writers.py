@@ -171,7 +171,10 @@ def write(
     require_free(path, writer, overwrite)
     if not recording.n_scans:
         raise InputError("holds no scan: there is nothing to write")
-    return [*_left_out(recording, writer), *writer.write(recording, path, overwrite)]
+    try:
+        return [*_left_out(recording, writer), *writer.write(recording, path, overwrite)]
+    except InputError as error:
+        raise InputError(error.what, where=error.where or str(path), hint=error.hint) from error
 
 
 def require_free(path: Path, writer: Writer, overwrite: bool) -> None:
