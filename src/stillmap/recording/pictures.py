@@ -64,3 +64,5 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise InputError(f"is no picture: {error}", where=str(path)) from error
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise InputError("is too large a picture", where=str(path)) from error
+    except MemoryError as error:  # a length in it promises more than there is
+        raise InputError("is no picture: it wants more than the memory", where=str(path)) from error
