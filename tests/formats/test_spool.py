@@ -105,6 +105,14 @@ def test_what_is_let_go_takes_no_memory(monkeypatch, tmp_path):
     assert (values == 1).all()
 
 
+def test_changes_of_a_copy_on_write_stay(tmp_path):
+    np.arange(1 << 16).tofile(tmp_path / "values")
+    values = np.memmap(tmp_path / "values", np.int64, mode="c")
+    values[:] = 7
+    spool.let_go(values[100:].reshape(-1, 4))
+    assert (values == 7).all()
+
+
 def test_blocks_are_all_rows_once(limit, tmp_path):  # noqa: ARG001
     values = spool.empty((10, 2), np.int64, tmp_path)
     for block in spool.blocks(values, rows=4):

@@ -59,7 +59,9 @@ def filtered(
     else:
         require_new_file(output, overwrite)
     recording, labels = mapped.read()
-    blank, hits, blanked = spool.empty(recording.hit.shape, np.bool_), 0, 0
+    hits = blanked = 0
+    scratch = output.absolute().parent
+    blank = spool.empty(recording.hit.shape, np.bool_, scratch)
     for block in spool.blocks(recording.hit, labels.p_static, blank):
         hit = recording.hit[block]
         # NaN: unusable anyway
@@ -95,7 +97,9 @@ def _write(
         done = blanked.write(mapped.source, output, recording, blank, options, overwrite=overwrite)
         return done.left_out, done.topics, done.unfiltered
     if form.name == "stillmap recording":
-        folder.write(_without(recording, blank), output, overwrite=overwrite)
+        folder.write(
+            _without(recording, blank, output.absolute().parent), output, overwrite=overwrite
+        )
         return 0, [], []
     if form.name == "CARMEN log":
         return carmen_blanked.write(mapped.source, output, recording, blank).left_out, [], []
@@ -103,9 +107,9 @@ def _write(
     raise InputError(f"a {form.name} cannot be written again", where=str(mapped.source), hint=hint)
 
 
-def _without(recording: Recording, blank: NDArray[np.bool_]) -> Recording:
+def _without(recording: Recording, blank: NDArray[np.bool_], scratch: Path) -> Recording:
     """Blanked beams went as far as they did, and met nothing."""
-    hit = spool.copied(recording.hit)
+    hit = spool.copied(recording.hit, scratch)
     for block in spool.blocks(hit, blank):
         hit[block] &= ~blank[block]
     return dataclasses.replace(recording, hit=hit)

@@ -31,7 +31,7 @@ p { margin: .4rem 0; max-width: 48rem; }
 .soft, figcaption { color: var(--soft); }
 code, .number { font-variant-numeric: tabular-nums; }
 code { font-family: ui-monospace, "DejaVu Sans Mono", monospace; font-size: .88em; }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(10rem, 1fr)); gap: .75rem;
+.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(8.6rem, 1fr)); gap: .75rem;
   margin: 1.25rem 0 0; }
 .cards div { background: var(--card); border-radius: .5rem; padding: .7rem .9rem; }
 .cards dt { color: var(--soft); font-size: .85rem; }
@@ -44,7 +44,7 @@ code { font-family: ui-monospace, "DejaVu Sans Mono", monospace; font-size: .88e
 .toggle { margin-right: .35rem; accent-color: var(--accent); }
 .toggle + label { margin-right: 1.4rem; cursor: pointer; }
 .pair, .row { display: grid; gap: 1.1rem; margin-top: .8rem; align-items: start; }
-.pair { grid-template-columns: repeat(auto-fit, minmax(min(26rem, 100%), 1fr)); }
+.pair { align-items: end; grid-template-columns: repeat(auto-fit, minmax(min(26rem, 100%), 1fr)); }
 .row { grid-template-columns: repeat(auto-fit, minmax(min(15rem, 100%), 1fr)); }
 .row figure { max-width: 38rem; }
 #large:checked ~ .pair { grid-template-columns: 1fr; }

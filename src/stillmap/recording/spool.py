@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 IN_MEMORY = 32 << 20  # bytes of one array that are kept in memory
-_BUFFER = 1 << 20  # bytes that are written to a file together
 BLOCK = 1 << 20  # rows that are looked at together
 TOGETHER = 500  # items, as large as a scan, that are looked at before they are let go
 
 _Item = TypeVar("_Item")
 
-_BUFFER = 1 << 20  # bytes: parts may be as small as one scan
+_BUFFER = 1 << 20  # bytes that are written to a file together: parts may be as small as one scan
 
 
 class Column:
@@ -100,6 +99,8 @@ def let_go(array: NDArray[Any]) -> None:
     """What of a mapped array lies in memory may go; it is read again where it is used again."""
     base: object = array
     while isinstance(base, np.ndarray | memoryview):
+        if isinstance(base, np.memmap) and base.mode == "c":
+            return  # changes that are in memory alone would be lost
         base = base.base if isinstance(base, np.ndarray) else base.obj
     if isinstance(base, mmap.mmap):
         base.madvise(mmap.MADV_DONTNEED)
