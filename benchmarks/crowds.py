@@ -159,8 +159,8 @@ def poses_with(recording: stillmap.Recording, options: stillmap.Options, e: Weig
     return mapped.poses
 
 
-def _silent(done: int, total: int) -> None:
-    pipeline.silent("", 0, done, total)
+def _silent(what: str, done: int, total: int) -> None:
+    pipeline.silent(what, 0, done, total)
 
 
 def table(rows: Sequence[Row]) -> str:

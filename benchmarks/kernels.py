@@ -70,7 +70,8 @@ def kernels_of(recording: stillmap.Recording, poses: NDArray[np.float64]) -> dic
 
     def elements(threads: int) -> object:
         seen = looks._dwell(surface, options.dwell, looks.CLASSES)
-        return looks._likelihood(recording, T_map_sensor, seen, options.dwell.look, threads)
+        looks._look(recording, poses, seen, options.dwell.look, threads)
+        return seen.likelihood()
 
     return {
         "M-step: sums of (10)": lambda n: _core.add_beams(_core.Grid2D(RESOLUTION), *scans, n),

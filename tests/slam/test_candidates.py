@@ -195,7 +195,12 @@ def test_loops_are_looked_for_where_those_before_put_them(monkeypatch):
     monkeypatch.setattr(verification, "attempts", recorded)
     recording, truth, poses = rounds(drift=4.0)
     e = np.full(recording.n_beams, 0.9, np.float32)
-    closed(recording, e, dataclasses.replace(OPTIONS, loops=LoopOptions(stage=8.0)), local(poses))
+    told = []
+    options = dataclasses.replace(OPTIONS, loops=LoopOptions(stage=8.0))
+    closed(recording, e, options, local(poses), lambda *at: told.append(at))
+    assert len(told) > 3
+    assert told == sorted(told)
+    assert {total for _, total in told} == {recording.n_scans}
     third = [c for stage in asked for c in stage if c.later > 600]
     without = [missed(se2.inverse(poses[c.earlier]) @ poses[c.later], truth, c) for c in third]
     assert len(third) > 40
@@ -237,7 +242,7 @@ def test_a_round_passed_again_is_not_searched_more_widely(monkeypatch):
         windows.clear()
         options = LoopOptions(drift_translation=0.012, stage=stage)
         options = dataclasses.replace(OPTIONS, loops=options)
-        found = closed(recording, e, options, local(poses))
+        found = closed(recording, e, options, local(poses), lambda *_: None)
         assert absolute_errors(found.poses, truth).rmse < 0.4 * absolute_errors(poses, truth).rmse
         return np.array(windows)
 
