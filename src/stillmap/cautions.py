@@ -62,7 +62,7 @@ def _of_reading(source: Mapping[str, Any]) -> list[str]:
     out = [text for text in noted if isinstance(text, str)] if isinstance(noted, list) else []
     skipped = skipped_count(source)
     if skipped:
-        out.append(f"{skipped} scans were damaged and are left out: `stillmap info` says which")
+        out.append(f"scans left out while reading: {skipped} (`stillmap info` says why)")
     return out
 
 

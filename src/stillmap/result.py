@@ -140,6 +140,7 @@ def _result(loop: Loop, recording: Recording, progress: Progress, stages: Stages
     with stages.measure("maps"):
         filtered = _map(kept, seen, options, threads)
         raw = _raw_map(seen, kept.poses, filtered, threads)
+    progress("counting looks", 0, 0, 0)
     with stages.measure("evidence"):
         evidence = em.evidence(
             seen, kept.poses, kept.p_static, filtered, kept.no_return, options.em, threads

@@ -76,6 +76,18 @@ def test_a_bag_stays_a_bag(call, room, tmp_path):
     assert call("filter", tmp_path / "out", "-o", tmp_path / "clean.bag", *same).returncode == 0
 
 
+def test_logs_of_any_name_stay_logs(call, room, tmp_path):
+    assert call("convert", room, "-o", tmp_path / "a.clf", "--quiet").returncode == 0
+    (tmp_path / "a.clf").rename(tmp_path / "log of the hall")
+    done = call("map", tmp_path / "log of the hall", "-o", tmp_path / "out", *QUICK)
+    assert done.returncode == 0, done.stderr
+    for name in ("clean.log", "clean.txt.gz", "clean", "clean.of-the-hall"):
+        done = call("filter", tmp_path / "out", "-o", tmp_path / name)
+        assert done.returncode == 0, done.stderr
+        assert read(tmp_path / name).n_scans == read(room).n_scans
+    refused(call("filter", tmp_path / "out", "-o", tmp_path / "clean.ply"), "clean.ply")
+
+
 def test_a_recording_that_was_moved(call, room, mapped, tmp_path):
     elsewhere = tmp_path / "moved"
     shutil.copytree(room, elsewhere)

@@ -100,8 +100,8 @@ def test_progress_is_told(short):
     assert list(dict.fromkeys(first)) == steps
     assert all(done <= total for _, _, done, total in told)
     after = [at for at in told if at[1] == 0]
-    steps = ["labelling beams", "making the map", "following what moves"]
-    assert after == [(step, 0, 0, 0) for step in steps] == told[-3:]
+    steps = ["labelling beams", "making the map", "counting looks", "following what moves"]
+    assert after == [(step, 0, 0, 0) for step in steps] == told[-4:]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 // Two-state Markov chains, many at once: how probable what was seen of each member is under each
 // class of chains, look after look. States are kept with correlation exp(-dt / tau - dv / turn)
-// from one look to the next: dt is the time between them, dv how far the sensor moved against its
+// from one look to the next: dt is the time between them, dv how far the robot moved against its
 // distance from the member: the angle by which the view turned, but for moves to and fro.
 #pragma once
 

@@ -10,14 +10,9 @@ from numpy.typing import NDArray
 from stillmap.cli.results import Mapped, found, require_apart
 from stillmap.errors import InputError
 from stillmap.output.atomic import require_new, require_new_file
-from stillmap.recording import Recording, carmen_blanked, folder, spool
+from stillmap.recording import Recording, carmen_blanked, folder, spool, writers
 from stillmap.recording.formats import format_of
-
-# endings of files, and what each says
-_ENDINGS = {
-    **dict.fromkeys((".log", ".clf", ".txt", ".gz"), "carmen"),
-    **{ending: ending for ending in (".bag", ".db3", ".mcap")},
-}
+from stillmap.recording.ros.kinds import own_form
 
 
 class Filtered(NamedTuple):
@@ -50,7 +45,8 @@ def filtered(
     """
     mapped = found(result, given)
     form = format_of(mapped.source) if mapped.source.exists() else None
-    _require_ending(output, mapped.source)
+    if form is not None:
+        _require_ending(output, mapped.source, form.name)
     require_apart(output, mapped.source, mapped.folder)
     in_folder = mapped.source.is_dir() or mapped.source.name == folder.HEADER
     if in_folder:
@@ -72,16 +68,16 @@ def filtered(
     return Filtered(mapped.source, hits, blanked, *written)
 
 
-def _require_ending(output: Path, source: Path) -> None:
-    """The form stays what it was: no other one is to be named.
+def _require_ending(output: Path, source: Path, form: str) -> None:
+    """What is written has the form of the source: no other one is to be named.
 
     Raises:
         InputError: the ending is that of another form.
     """
-    ending = output.suffix.lower()
-    same = _ENDINGS.get(ending, ending) == _ENDINGS.get(source.suffix.lower())
-    if ending in _ENDINGS and (source.is_dir() or not same):
-        what = f"would be a recording like {source.name}, which its ending does not say"
+    own = {"CARMEN log": "carmen", "ROS bag": ""}.get(form, form)
+    said = writers.said_by_ending(output)
+    if said is not None and said != (own or own_form(source)[0]):
+        what = f"would be a {form} like {source.name}, which its ending does not say"
         raise InputError(what, where=str(output), hint="`stillmap convert` makes another form")
 
 

@@ -63,7 +63,10 @@ class Mapped:
                 where=str(self.source),
                 hint="name it with --input",
             )
-        if any((recording.hit[b] != labels.hit[b]).any() for b in spool.blocks(recording.hit)):
+        if any(
+            (recording.hit[b] != labels.hit[b]).any()
+            for b in spool.blocks(recording.hit, labels.hit)
+        ):
             raise InputError(
                 "is not the recording that was mapped: other beams hit something",
                 where=str(self.source),

@@ -99,9 +99,8 @@ def _of_beams(
 
 def _bound(table: Table, shares: Shares) -> Likelihood:
     bound = entropy = 0.0
-    for first in range(
-        0, len(table.likelihood), _ROWS
-    ):  # whole tables in double precision are large
+    # whole tables in double precision are large
+    for first in range(0, len(table.likelihood), _ROWS):
         rows = slice(first, first + _ROWS)
         joint = table.likelihood[rows] * shares.classes
         evidence = joint.sum(axis=1)

@@ -130,14 +130,21 @@ WRITERS = (
 )
 
 
+def said_by_ending(path: Path) -> str | None:
+    """The name of the format that files with such an ending have; None: none in particular."""
+    name = path.name.lower()
+    return next((writer.name for writer in WRITERS if name.endswith(writer.endings)), None)
+
+
 def writer_for(path: Path, name: str | None = None) -> Writer:
     """The writer of a format given by its name, else by the ending of the path.
 
     Raises:
         InputError: no format has such an ending.
     """
+    wanted = name or said_by_ending(path)
     for writer in WRITERS:
-        if writer.name == name if name else path.name.lower().endswith(writer.endings):
+        if writer.name == wanted:
             return writer
     if name or path.suffix:
         known = ", ".join(end for writer in WRITERS for end in writer.endings)

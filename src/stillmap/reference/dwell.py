@@ -135,7 +135,7 @@ def _probability_met(
 
 
 def view_turned(before: Float, now: Float, place: Float, resolution: float) -> float:
-    """How far a sensor moved (D,) against its distance from a place (D,): about an angle.
+    """How far a robot moved (D,) against its distance from a place (D,): about an angle.
 
     Nearer than a cell nothing is seen of it.
     """
