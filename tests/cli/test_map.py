@@ -2,42 +2,17 @@
 
 import filecmp
 import json
-import os
 import re
-import shutil
-import signal
-import subprocess
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
+from maps import FILES, QUICK, files_in
 from refusals import refused
 
 from stillmap.output.trajectory import read_tum
 from stillmap.recording import read, write
-
-QUICK = ("--set", "em.max_iterations=1")
-# goes on until it is stopped
-ENDLESS = ("--set", "em.max_iterations=100000", "--set", "em.patience=100000")
-ENDLESS += ("--set", "em.tolerance=0")
-FILES = {
-    "map.pgm",
-    "map.yaml",
-    "map.npz",
-    "trajectory.tum",
-    "report.html",
-    "run.json",
-    "beams/stamp_ns.npy",
-    "beams/offset.npy",
-    "beams/p_static.npy",
-    "beams/hit.npy",
-}
-
-
-def files_in(folder) -> set[str]:
-    return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
 
 
 @pytest.fixture(scope="module")
@@ -122,21 +97,6 @@ def test_any_number_of_threads_gives_the_same_bytes_with_given_poses(call, room,
     same_result(outs[0], outs[2])
 
 
-def test_a_folder_with_something_in_it_is_refused(call, room, tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "mine.txt").write_text("mine")
-    refused(call("map", room, "-o", out, *QUICK), out, "--overwrite")
-    for more in ("--overwrite", "--resume"):  # only results are replaced
-        refused(call("map", room, "-o", out, more, *QUICK), out, "run.json")
-    assert files_in(out) == {"mine.txt"}
-    (out / "run.json").write_text("")
-    done = call("map", room, "-o", out, "--overwrite", *QUICK)
-    assert done.returncode == 0
-    assert files_in(out) >= FILES
-    assert "mine.txt" not in files_in(out)
-
-
 def test_what_the_reader_warns_of_is_said_and_kept(call, room, tmp_path):
     assert call("convert", room, "-o", tmp_path / "a.bag", "--quiet").returncode == 0
     content = (tmp_path / "a.bag").read_bytes()
@@ -147,48 +107,6 @@ def test_what_the_reader_warns_of_is_said_and_kept(call, room, tmp_path):
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert run["warnings"][0].startswith("the bag is cut or damaged")
     assert "the bag is cut or damaged" in (tmp_path / "out" / "report.html").read_text()
-
-
-def test_the_recording_is_not_written_over(call, room, tmp_path):
-    recording = tmp_path / "in" / "room"
-    shutil.copytree(room, recording)
-    (tmp_path / "in" / "run.json").write_text("")
-    (recording / "run.json").write_text("")  # as if they were results, too
-    before = files_in(recording)
-    for given in (recording, recording / "recording.json"):
-        done = call("map", given, "-o", recording, "--overwrite", *QUICK)
-        refused(done, "is the recording itself")
-    for more in ("--overwrite", "--resume"):
-        refused(call("map", recording, "-o", tmp_path / "in", more, *QUICK), "holds the recording")
-    assert files_in(recording) == before
-
-
-def test_an_empty_folder_will_do(call, room, tmp_path, nothing_left):
-    (tmp_path / "out").mkdir()
-    assert call("map", room, "-o", tmp_path / "out", *QUICK).returncode == 0
-    assert files_in(tmp_path / "out") >= FILES
-    nothing_left("out")
-
-
-def test_a_file_in_the_way_is_refused(call, room, tmp_path):
-    (tmp_path / "out").write_text("mine")
-    refused(call("map", room, "-o", tmp_path / "out", "--overwrite"), tmp_path / "out")
-    assert (tmp_path / "out").read_text() == "mine"
-
-
-def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(call, room, tmp_path):
-    (tmp_path / "file").write_text("")
-    places = [tmp_path / "file/out"]
-    if os.geteuid() != 0:  # root may write everywhere
-        (tmp_path / "closed").mkdir(mode=0o555)
-        places.append(tmp_path / "closed/out")
-    for place in places:
-        refused(call("map", room, "-o", place, *ENDLESS), place, "cannot be written")
-
-
-@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="no /proc here")
-def test_a_place_that_only_seems_to_be_writable_is_refused_after_it(call, room):
-    refused(call("map", room, "-o", "/proc/out", "--quiet", *QUICK), "/proc/out: cannot be written")
 
 
 @pytest.mark.parametrize("content", ["", "no recording\n"])
@@ -262,153 +180,6 @@ def test_poses_that_do_not_fit_are_refused(call, room, tmp_path, nothing_left):
         refused(call("map", room, "-o", tmp_path / "out", "--poses", file), file, *said)
     refused(call("map", room, "-o", tmp_path / "out", "--poses", tmp_path / "absent"), "absent")
     nothing_left("poses.tum")
-
-
-def test_who_listens_to_the_progress_may_leave(start, room, tmp_path):
-    # `stillmap map ... 2>&1 | head -1` still makes the map
-    process = start(
-        *("map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=3"),
-        stderr=subprocess.PIPE,
-    )
-    assert "iteration 1" in process.stderr.readline()
-    process.stderr.close()
-    assert process.wait(60) == 0
-    assert files_in(tmp_path / "out") >= FILES
-    process.stdout.close()
-
-
-def stopped_after_a_line(process, number) -> tuple[int, str]:
-    assert "iteration 1 of" in process.stderr.readline()
-    process.send_signal(number)
-    _, err = process.communicate(timeout=60)
-    return process.returncode, err
-
-
-def only_a_checkpoint_left(folder) -> None:
-    """None, too, where the signal came before the first iteration had ended."""
-    for path in folder.iterdir():
-        assert path.name == ".out.resume"
-        assert {one.name.partition("-")[0] for one in path.iterdir()} == {"lock", "iteration"}
-
-
-def test_ctrl_c_while_mapping(start, room, tmp_path):
-    process = start("map", room, "-o", tmp_path / "out", *ENDLESS)
-    status, err = stopped_after_a_line(process, signal.SIGINT)
-    assert status == 130
-    assert err.splitlines()[-1].startswith("stillmap: interrupted")
-    assert "Traceback" not in err
-    only_a_checkpoint_left(tmp_path)
-
-
-def test_sigterm_while_mapping(start, room, tmp_path):
-    process = start("map", room, "-o", tmp_path / "out", *ENDLESS)
-    status, err = stopped_after_a_line(process, signal.SIGTERM)
-    assert status == 143
-    assert "Traceback" not in err
-    only_a_checkpoint_left(tmp_path)
-
-
-def stopped_while_writing(process, folder, number, delay=0.0) -> int:
-    """Waits until the first file is being written, then sends the signal.
-
-    Writing takes a few hundredths of a second: on a busy machine all may be over by then.
-    """
-    deadline = time.monotonic() + 60
-    while process.poll() is None and not list(folder.glob(".out.resume/.out.*.part/*")):
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
-    time.sleep(delay)
-    process.send_signal(number)
-    process.communicate(timeout=60)
-    return process.returncode
-
-
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_stopped_while_writing_nothing_stays_behind(
-    start, room, tmp_path, nothing_left, number, status
-):
-    for _ in range(20):
-        process = start("map", room, "-o", tmp_path / "out", "--quiet", *QUICK)
-        got = stopped_while_writing(process, tmp_path, number)
-        if not (tmp_path / "out").exists():
-            break
-        # the signal came when everything had been written: all of it stands there
-        assert got in (0, status, -number)
-        assert files_in(tmp_path / "out") >= FILES
-        nothing_left("out")
-        shutil.rmtree(tmp_path / "out")
-    else:
-        pytest.skip("this machine is too busy to send a signal in time")
-    # Python dies of SIGINT after all where it came while a module was imported
-    assert got in (status, -signal.SIGINT)
-    nothing_left(".out.resume")
-    assert files_in(tmp_path / ".out.resume") >= {"lock", "iteration-1/state.json"}
-    assert list((tmp_path / ".out.resume").glob(".out.*")) == []
-
-
-@pytest.mark.parametrize("delay", [0.0, 0.1, 0.4])
-def test_killed_while_writing_all_or_nothing_stands_there(start, room, tmp_path, delay):
-    out = tmp_path / "out"
-    process = start("map", room, "-o", out, "--quiet", *QUICK)
-    status = stopped_while_writing(process, tmp_path, signal.SIGKILL, delay)
-    assert status in (-signal.SIGKILL, 0)
-    assert not out.exists() or files_in(out) >= FILES
-
-
-def test_killed_while_overwriting_the_old_result_or_the_new_stands_there(start, room, tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "run.json").write_text("old")
-    process = start("map", room, "-o", out, "--overwrite", "--quiet", *QUICK)
-    status = stopped_while_writing(process, tmp_path, signal.SIGKILL)
-    assert status in (-signal.SIGKILL, 0)
-    assert files_in(out) == {"run.json"} or files_in(out) >= FILES
-
-
-def left_on_screen(written: str) -> list[str]:
-    """The lines that stay on a terminal: enough of one to follow a bar that is redrawn."""
-    lines, row = [""], 0
-    column = 0
-    for token in re.findall(r"\x1b\[[?\d;]*[A-Za-z]|.|\n", written, re.DOTALL):
-        if token == "\n":
-            row, column = row + 1, 0
-            lines += [""] * (row + 1 - len(lines))
-        elif token == "\r":
-            column = 0
-        elif token == "\x1b[2K":
-            lines[row] = ""
-        elif re.fullmatch(r"\x1b\[\d*A", token):
-            row -= int(token[2:-1] or 1)
-        elif not token.startswith("\x1b"):
-            lines[row] = lines[row][:column].ljust(column) + token + lines[row][column + 1 :]
-            column += 1
-    return [line for line in lines if line.strip()]
-
-
-def test_a_bar_on_a_terminal_and_no_garbage_after_it(on_a_terminal, room, tmp_path):
-    status, written = on_a_terminal(
-        "map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=2"
-    )
-    assert status == 0
-    assert "iteration 1 of at most 2" in written
-    assert "/40" in written
-    assert written.count("\x1b[?25l") == written.count("\x1b[?25h") > 0  # the cursor came back
-    lines = left_on_screen(written)
-    assert all(line.startswith("stillmap: ") for line in lines), lines
-    assert "report.html" in lines[-1]
-
-
-def test_ctrl_c_on_a_terminal_gives_the_cursor_back(on_a_terminal, room, tmp_path, nothing_left):
-    status, written = on_a_terminal(
-        "map", room, "-o", tmp_path / "out", *ENDLESS, send_at=b"iteration 2 of"
-    )
-    assert status == 130
-    assert written.count("\x1b[?25l") == written.count("\x1b[?25h") > 0
-    lines = left_on_screen(written)
-    assert len(lines) == 2
-    assert "--resume" in lines[0]
-    assert lines[1].startswith("stillmap: interrupted")
-    nothing_left(".out.resume")
 
 
 def test_the_run_record_says_where_the_recording_is(call, room, tmp_path):

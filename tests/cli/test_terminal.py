@@ -1,8 +1,10 @@
-"""Colours: on terminals that want them, nowhere else; the words are the same."""
+"""A terminal: colours where it wants them, a bar, and the cursor back when it ends."""
 
 import io
+import re
 
 import pytest
+from maps import ENDLESS
 
 from stillmap.cli.terminal import coloured, is_terminal, painted
 
@@ -78,3 +80,49 @@ def test_what_is_logged_stands_above_the_bar(on_a_terminal, room, tmp_path):
     assert status == 0
     lines = [line.rpartition("\x1b[2K")[2] for line in written.splitlines()]
     assert any(line.startswith("stillmap: iteration 1: bound") for line in lines), lines
+
+
+def left_on_screen(written: str) -> list[str]:
+    """The lines that stay on a terminal: enough of one to follow a bar that is redrawn."""
+    lines, row = [""], 0
+    column = 0
+    for token in re.findall(r"\x1b\[[?\d;]*[A-Za-z]|.|\n", written, re.DOTALL):
+        if token == "\n":
+            row, column = row + 1, 0
+            lines += [""] * (row + 1 - len(lines))
+        elif token == "\r":
+            column = 0
+        elif token == "\x1b[2K":
+            lines[row] = ""
+        elif re.fullmatch(r"\x1b\[\d*A", token):
+            row -= int(token[2:-1] or 1)
+        elif not token.startswith("\x1b"):
+            lines[row] = lines[row][:column].ljust(column) + token + lines[row][column + 1 :]
+            column += 1
+    return [line for line in lines if line.strip()]
+
+
+def test_a_bar_on_a_terminal_and_no_garbage_after_it(on_a_terminal, room, tmp_path):
+    status, written = on_a_terminal(
+        "map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=2"
+    )
+    assert status == 0
+    assert "iteration 1 of at most 2" in written
+    assert "/40" in written
+    assert written.count("\x1b[?25l") == written.count("\x1b[?25h") > 0  # the cursor came back
+    lines = left_on_screen(written)
+    assert all(line.startswith("stillmap: ") for line in lines), lines
+    assert "report.html" in lines[-1]
+
+
+def test_ctrl_c_on_a_terminal_gives_the_cursor_back(on_a_terminal, hall, tmp_path, nothing_left):
+    status, written = on_a_terminal(
+        "map", hall, "-o", tmp_path / "out", *ENDLESS, send_at=b"iteration 2 of"
+    )
+    assert status == 130
+    assert written.count("\x1b[?25l") == written.count("\x1b[?25h") > 0
+    lines = left_on_screen(written)
+    assert len(lines) == 2
+    assert "--resume" in lines[0]
+    assert lines[1].startswith("stillmap: interrupted")
+    nothing_left(".out.resume")

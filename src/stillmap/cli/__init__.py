@@ -4,18 +4,17 @@ import argparse
 import io
 import logging
 import os
-import signal
 import sys
 from pathlib import Path
-from types import FrameType
 from typing import NoReturn
 
 from stillmap.cli.commands import COMMANDS, parser
 from stillmap.cli.parsing import EXIT_INPUT
 from stillmap.cli.progress import fail, say
+from stillmap.cli.stopping import EXIT_INTERRUPTED, hear_signals
 from stillmap.errors import InputError, nearest
 
-EXIT_OURS, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 130, 143
+EXIT_OURS = 1
 
 _MANY = 10_000  # names of a folder in which one like a missing one is looked for
 
@@ -30,7 +29,7 @@ def main(argv: list[str] | None = None) -> int:
             _complete()
         args = _parsed(sys.argv[1:] if argv is None else argv)
         _log(args)
-        signal.signal(signal.SIGTERM, _terminated)
+        hear_signals(main.__code__)
         status: int = args.run(args)
         _flush_stdout()
         return status
@@ -38,7 +37,8 @@ def main(argv: list[str] | None = None) -> int:
         fail(str(_with_similar_name(error, args)))
         return EXIT_INPUT
     except KeyboardInterrupt:
-        return _interrupted()
+        say("interrupted, nothing was half-written")
+        return EXIT_INTERRUPTED
     except BrokenPipeError:
         # the reader of our output has gone: nothing more can be said, and nothing is wrong
         _drop_stdout()
@@ -52,9 +52,6 @@ def main(argv: list[str] | None = None) -> int:
         fail(f"not enough memory{': ' if str(error) else ''}{error}")
         return EXIT_INPUT
     except Exception as error:
-        behind = _stopped_by(error)
-        if behind is not None:
-            return EXIT_TERMINATED if isinstance(behind, SystemExit) else _interrupted()
         _report_defect(error)
         return EXIT_OURS
 
@@ -125,18 +122,6 @@ def _report_defect(error: Exception) -> None:
     fail("this is a defect of stillmap: please report it, with the lines above")
 
 
-def _stopped_by(error: BaseException | None) -> BaseException | None:
-    """The Ctrl-C or SIGTERM behind an error: a module that is just being imported hides them."""
-    while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
-        error = error.__cause__ or error.__context__
-    return error
-
-
-def _interrupted() -> int:
-    say("interrupted, nothing was half-written")
-    return EXIT_INTERRUPTED
-
-
 def _flush_stdout() -> None:
     if sys.stdout is not None:  # None: it was closed before we began
         sys.stdout.flush()
@@ -146,8 +131,3 @@ def _drop_stdout() -> None:
     """What is still buffered goes nowhere, instead of failing once more when Python ends."""
     if sys.stdout is not None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _terminated(signum: int, frame: FrameType | None) -> None:  # noqa: ARG001
-    # leaves through the same clean-up as any exception: temporary folders go
-    sys.exit(EXIT_TERMINATED)

@@ -1,0 +1,24 @@
+"""What `stillmap map` is called with and what it writes."""
+
+from pathlib import Path
+
+QUICK = ("--set", "em.max_iterations=1")
+# goes on for long
+ENDLESS = ("--set", "em.max_iterations=100000", "--set", "em.patience=100000")
+ENDLESS += ("--set", "em.tolerance=0")
+FILES = {
+    "map.pgm",
+    "map.yaml",
+    "map.npz",
+    "trajectory.tum",
+    "report.html",
+    "run.json",
+    "beams/stamp_ns.npy",
+    "beams/offset.npy",
+    "beams/p_static.npy",
+    "beams/hit.npy",
+}
+
+
+def files_in(folder: Path) -> set[str]:
+    return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}

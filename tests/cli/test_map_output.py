@@ -1,0 +1,65 @@
+"""The folder that `stillmap map` writes to: what it replaces and what it leaves alone."""
+
+import os
+import shutil
+
+import pytest
+from maps import ENDLESS, FILES, QUICK, files_in
+from refusals import refused
+
+
+def test_a_folder_with_something_in_it_is_refused(call, room, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    refused(call("map", room, "-o", out, *QUICK), out, "--overwrite")
+    for more in ("--overwrite", "--resume"):  # only results are replaced
+        refused(call("map", room, "-o", out, more, *QUICK), out, "run.json")
+    assert files_in(out) == {"mine.txt"}
+    (out / "run.json").write_text("")
+    done = call("map", room, "-o", out, "--overwrite", *QUICK)
+    assert done.returncode == 0
+    assert files_in(out) >= FILES
+    assert "mine.txt" not in files_in(out)
+
+
+def test_the_recording_is_not_written_over(call, room, tmp_path):
+    recording = tmp_path / "in" / "room"
+    shutil.copytree(room, recording)
+    (tmp_path / "in" / "run.json").write_text("")
+    (recording / "run.json").write_text("")  # as if they were results, too
+    before = files_in(recording)
+    for given in (recording, recording / "recording.json"):
+        done = call("map", given, "-o", recording, "--overwrite", *QUICK)
+        refused(done, "is the recording itself")
+    for more in ("--overwrite", "--resume"):
+        refused(call("map", recording, "-o", tmp_path / "in", more, *QUICK), "holds the recording")
+    assert files_in(recording) == before
+
+
+def test_an_empty_folder_will_do(call, room, tmp_path, nothing_left):
+    (tmp_path / "out").mkdir()
+    assert call("map", room, "-o", tmp_path / "out", *QUICK).returncode == 0
+    assert files_in(tmp_path / "out") >= FILES
+    nothing_left("out")
+
+
+def test_a_file_in_the_way_is_refused(call, room, tmp_path):
+    (tmp_path / "out").write_text("mine")
+    refused(call("map", room, "-o", tmp_path / "out", "--overwrite"), tmp_path / "out")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(call, room, tmp_path):
+    (tmp_path / "file").write_text("")
+    places = [tmp_path / "file/out"]
+    if os.geteuid() != 0:  # root may write everywhere
+        (tmp_path / "closed").mkdir(mode=0o555)
+        places.append(tmp_path / "closed/out")
+    for place in places:
+        refused(call("map", room, "-o", place, *ENDLESS), place, "cannot be written")
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="no /proc here")
+def test_a_place_that_only_seems_to_be_writable_is_refused_after_it(call, room):
+    refused(call("map", room, "-o", "/proc/out", "--quiet", *QUICK), "/proc/out: cannot be written")

@@ -1,0 +1,143 @@
+"""What stops `stillmap map` on its way, and what is left behind then."""
+
+import shutil
+import signal
+import subprocess
+import time
+
+import pytest
+from maps import ENDLESS, FILES, QUICK, files_in
+
+
+def test_who_listens_to_the_progress_may_leave(start, room, tmp_path):
+    # `stillmap map ... 2>&1 | head -1` still makes the map
+    process = start(
+        *("map", room, "-o", tmp_path / "out", "--set", "em.max_iterations=3"),
+        stderr=subprocess.PIPE,
+    )
+    assert "iteration 1" in process.stderr.readline()
+    process.stderr.close()
+    assert process.wait(60) == 0
+    assert files_in(tmp_path / "out") >= FILES
+    process.stdout.close()
+
+
+def stopped_after_a_line(process, number) -> tuple[int, str]:
+    assert "iteration 1 of" in process.stderr.readline()
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    return process.returncode, err
+
+
+def only_a_checkpoint_left(folder) -> None:
+    """None, too, where the signal came before the first iteration had ended."""
+    for path in folder.iterdir():
+        assert path.name == ".out.resume"
+        assert {one.name.partition("-")[0] for one in path.iterdir()} == {"lock", "iteration"}
+
+
+@pytest.mark.parametrize(("number", "expected"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_while_mapping(start, hall, tmp_path, number, expected):
+    process = start("map", hall, "-o", tmp_path / "out", *ENDLESS)
+    status, err = stopped_after_a_line(process, number)
+    assert status == expected
+    last = (err.splitlines() or [""])[-1]
+    assert last.startswith("stillmap: interrupted") == (number == signal.SIGINT)
+    assert "Traceback" not in err
+    only_a_checkpoint_left(tmp_path)
+
+
+def stopped_while_writing(process, folder, number, delay=0.0) -> int:
+    """Waits until the first file is being written, then sends the signal.
+
+    Writing takes a few hundredths of a second: on a busy machine all may be over by then.
+    """
+    deadline = time.monotonic() + 60
+    while process.poll() is None and not list(folder.glob(".out.resume/.out.*.part/*")):
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+    time.sleep(delay)
+    process.send_signal(number)
+    process.communicate(timeout=60)
+    return process.returncode
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_while_writing_nothing_stays_behind(
+    start, room, tmp_path, nothing_left, number, status
+):
+    for _ in range(20):
+        process = start("map", room, "-o", tmp_path / "out", "--quiet", *QUICK)
+        got = stopped_while_writing(process, tmp_path, number)
+        if not (tmp_path / "out").exists():
+            break
+        # the signal came when everything had been written: all of it stands there
+        assert got in (0, status)
+        assert files_in(tmp_path / "out") >= FILES
+        nothing_left("out")
+        shutil.rmtree(tmp_path / "out")
+    else:
+        pytest.skip("this machine is too busy to send a signal in time")
+    assert got == status
+    nothing_left(".out.resume")
+    assert files_in(tmp_path / ".out.resume") >= {"lock", "iteration-1/state.json"}
+    assert list((tmp_path / ".out.resume").glob(".out.*")) == []
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.1, 0.4])
+def test_killed_while_writing_all_or_nothing_stands_there(start, room, tmp_path, delay):
+    out = tmp_path / "out"
+    process = start("map", room, "-o", out, "--quiet", *QUICK)
+    status = stopped_while_writing(process, tmp_path, signal.SIGKILL, delay)
+    assert status in (-signal.SIGKILL, 0)
+    assert not out.exists() or files_in(out) >= FILES
+
+
+def test_killed_while_overwriting_the_old_result_or_the_new_stands_there(start, room, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "run.json").write_text("old")
+    process = start("map", room, "-o", out, "--overwrite", "--quiet", *QUICK)
+    status = stopped_while_writing(process, tmp_path, signal.SIGKILL)
+    assert status in (-signal.SIGKILL, 0)
+    assert files_in(out) == {"run.json"} or files_in(out) >= FILES
+
+
+GREEDY = """
+import signal, time
+try:
+    signal.raise_signal({number})
+    time.sleep(0.1)
+except BaseException:
+    print("taken for a missing module")
+"""
+PROGRAM = """
+import sys, time
+from stillmap.cli.stopping import hear_signals
+def command():
+    hear_signals(command.__code__)
+    exec("import greedy")
+    print("imported")
+    time.sleep(60)
+try:
+    command()
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_waits_for_the_end_of_an_import(tmp_path, command, number, status):
+    (tmp_path / "greedy.py").write_text(GREEDY.format(number=int(number)))
+    words = [command[0], "-c", PROGRAM]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=50)
+    assert (done.returncode, done.stdout, done.stderr) == (status, "imported\n", "")
+
+
+def test_ctrl_c_stays_ignored_in_the_background_of_a_script(command):
+    program = (
+        "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        "from stillmap.cli.stopping import hear_signals\n"
+        "hear_signals(hear_signals.__code__); signal.raise_signal(signal.SIGINT)\n"
+    )
+    assert subprocess.run([command[0], "-c", program], timeout=50).returncode == 0
