@@ -3,7 +3,8 @@
 python benchmarks/ablation.py [--cases NAME|GROUP ...] [--seeds tuning|reporting] [--n-seeds 1]
     [--set section.key=value ...] [--true-poses] [--processes 2]
 
-Poses are those of the whole estimator's result, so that only the E-step differs.
+Poses are those of the whole estimator's result, so that only the E-step differs: that of the loop,
+not the last one after it (`stillmap/em/last.py`), which knows more classes.
 """
 
 import argparse
