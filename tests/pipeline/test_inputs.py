@@ -96,7 +96,7 @@ def test_progress_is_told(short):
         mapping = [at for at in told if at[0] == "mapping" and at[1] == iteration]
         assert mapping[-1][2:] == (T, T)
     first = [what for what, iteration, _, _ in told if iteration == 1]
-    steps = ["mapping", "closing loops", "mapping again", "labelling beams"]
+    steps = ["mapping", "closing loops", "mapping again", "drawing the map", "labelling beams"]
     assert list(dict.fromkeys(first)) == steps
     assert all(done <= total for _, _, done, total in told)
     after = [at for at in told if at[1] == 0]

@@ -46,17 +46,30 @@ def m_step(
         mapped = _mapped_at(recording, e, options, poses, threads)
         progress("mapping", recording.n_scans, recording.n_scans)
         return mapped
+    mapped = _estimated(recording, e, options, progress, start, before)
+    progress("drawing the map", 0, 0)
+    grid = _mapped_at(recording, e, options, mapped.poses, threads).grid
+    return dataclasses.replace(mapped, grid=grid)
+
+
+def _estimated(
+    recording: Recording,
+    e: NDArray[np.float32],
+    options: SlamOptions,
+    progress: Told,
+    start: Mapped | None,
+    before: Float | None,
+) -> Mapped:
+    """The most likely poses alone, see m_step."""
     if not options.loops.enabled:
-        local = _followed(recording, e, options, partial(progress, "mapping"), before)
-        grid = _mapped_at(recording, e, options, local.poses, threads).grid
-        return dataclasses.replace(local, grid=grid)
+        return _followed(recording, e, options, partial(progress, "mapping"), before)
     if start is not None:
-        mapped = _swept(recording, e, options, start, threads, partial(progress, "mapping"))
+        mapped = _swept(recording, e, options, start, partial(progress, "mapping"))
         return dataclasses.replace(mapped, explained=start.explained)
     local = _followed(recording, e, options, partial(progress, "mapping"), before)
     seen = deskewed(recording, local.poses, options)
     closed = closing.closed(seen, e, options, local, partial(progress, "closing loops"))
-    mapped = _swept(recording, e, options, closed, threads, partial(progress, "mapping again"))
+    mapped = _swept(recording, e, options, closed, partial(progress, "mapping again"))
     # a scan that went astray explains itself in the map of all: the map so far tells
     return dataclasses.replace(mapped, explained=local.explained)
 
@@ -83,15 +96,13 @@ def _swept(
     e: NDArray[np.float32],
     options: SlamOptions,
     mapped: Mapped,
-    threads: int,
     progress: Callable[[int, int], None],
 ) -> Mapped:
-    """Poses whose loops are closed, registered once more against all others; with their map."""
+    """Poses whose loops are closed, registered once more against all others."""
     for _ in range(options.loops.sweeps):
         seen = deskewed(recording, mapped.poses, options)
         mapped = sweep(seen, e, options, mapped, progress)
-    grid = _mapped_at(recording, e, options, mapped.poses, threads).grid
-    return dataclasses.replace(mapped, grid=grid)
+    return mapped
 
 
 def _mapped_at(
