@@ -71,6 +71,9 @@ class Loop:
     """How far a run has come.
 
     No grid is kept: poses and weights make it again, to the bit.
+
+    Attributes:
+        closed: whether the first E-step is the last: at given poses the default one is closed.
     """
 
     options: Options
@@ -80,6 +83,7 @@ class Loop:
     best: "Best | None" = None
     finished: bool = False
     reached: Reached | None = None
+    closed: bool = False
 
     def take_next(self, iterations: Iterator[Iteration], recording: Recording) -> bool:
         """Runs one iteration; False when there is none left."""
@@ -118,7 +122,7 @@ class Loop:
         if self.options.estimator == "stillmap":  # the printed labels creep
             settled |= iteration.number > 1 and iteration.changed_share < options.settled
         stuck = iteration.number - self.kept.number >= options.patience
-        self.finished = iteration.number == fixed if fixed else settled or stuck
+        self.finished = iteration.number == fixed if fixed else settled or stuck or self.closed
 
     @property
     def kept(self) -> "Best":
@@ -128,6 +132,8 @@ class Loop:
 
     def _remember(self, iteration: Iteration) -> None:
         """A part of the map for Fig. 8: where the first iteration saw most movers."""
+        if not isinstance(iteration.grid, _core.Grid2D):
+            return
         points = dynamic_points(iteration.seen, iteration.poses, iteration.p_static)
         dynamic = np.zeros(len(points), dtype=np.float32)
         resolution = self.options.slam.resolution

@@ -10,13 +10,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core, em, slam
+from stillmap import em, slam
 from stillmap.em import EmOptions
 from stillmap.objects import ObjectOptions
 from stillmap.options import field_with_doc
 from stillmap.output.map_server import OutputOptions
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
+from stillmap.recording.spacing import spacing
 from stillmap.slam import SlamOptions
 from stillmap.stages import Stages
 from stillmap.threads import resolved_threads
@@ -55,11 +56,16 @@ class Options:
 DEFAULTS = Options()
 
 
-def resolved(options: Options) -> Options:
+def resolved(options: Options, recording: Recording) -> Options:
     """The options as they will be used.
 
-    The printed method has poses by (9) alone, scan by scan, and takes scans as taken at once.
+    The printed method has poses by (9) alone, scan by scan, and takes scans as taken at once. The
+    cells of 3D recordings are voxels.
     """
+    if recording.dimension == 3:
+        edge = options.slam.voxel or spacing(recording)
+        slam_options = dataclasses.replace(options.slam, resolution=edge, voxel=edge)
+        options = dataclasses.replace(options, slam=slam_options)
     if options.estimator != "paper":
         return options
     loops = dataclasses.replace(options.slam.loops, enabled=False)
@@ -94,7 +100,7 @@ class Iteration:
     Attributes:
         number: from 1.
         seen: the recording without the motion during its scans, as `poses` have it.
-        poses: (T, 3, 3) T_map_base.
+        poses: (T, D+1, D+1) T_map_base.
         covariance: (T, 3, 3) of x, y, heading against the map so far.
         grid: the sums alpha, beta of (10).
         weights: (M,) float32, the e that this M-step used; with `poses` they make `grid` again.
@@ -116,7 +122,7 @@ class Iteration:
     seen: Recording
     poses: Float
     covariance: Float
-    grid: _core.Grid2D
+    grid: em.Grid
     weights: NDArray[np.float32]
     p_static: NDArray[np.float32]
     likelihood: em.Likelihood
@@ -138,7 +144,7 @@ class Iteration:
         mapped = slam.Mapped(
             self.poses,
             self.covariance,
-            _core.Grid2D(self.grid.resolution),  # grids are large
+            type(self.grid)(self.grid.resolution),  # grids are large
             self.explained,
             doubts.widened,
             doubts.disagreeing,
@@ -151,7 +157,7 @@ class Iteration:
 
     @property
     def occupancy(self) -> em.OccupancyMap:
-        """The map of this iteration, made anew at every call; every beam is believed."""
+        """The map of this iteration, made anew at every call; every beam is believed. 2D only."""
         return em.occupancy_map(self.grid, self.occupied)
 
     def part(self, box: em.Box) -> em.OccupancyMap:
@@ -172,9 +178,9 @@ def iterate(
     """Interleaves mapping and the estimation of what is static; the caller decides when to stop.
 
     Args:
-        recording: 2D, at least one scan.
+        recording: at least one scan; of 3D ones the poses have to be given.
         options: see Options.
-        poses: (T, 3, 3) T_map_base to keep instead of estimating them.
+        poses: (T, D+1, D+1) T_map_base to keep instead of estimating them.
         progress: called with what is done, the iteration, scans done, and of how many; these are 0
             for what is not counted.
         stages: where time and memory per stage are noted.
@@ -185,12 +191,14 @@ def iterate(
     Yields:
         one Iteration after the other, `options.em.max_iterations` of them at most.
     """
-    if poses is not None and poses.shape != (recording.n_scans, 3, 3):
-        raise ValueError(f"poses: expected ({recording.n_scans}, 3, 3), got {poses.shape}")
+    D = recording.dimension
+    if poses is not None and poses.shape != (recording.n_scans, D + 1, D + 1):
+        wanted = (recording.n_scans, D + 1, D + 1)
+        raise ValueError(f"poses: expected {wanted}, got {poses.shape}")
     if scratch is not None:
         recording = dataclasses.replace(recording, scratch=scratch)
     stages = stages or Stages()
-    options = resolved(options)
+    options = resolved(options, recording)
     threads = resolved_threads(options.threads)
     if after is None:  # e := p(c = 1)
         e = em.initial_expectations(recording, options.estimator, options.em)
@@ -210,6 +218,7 @@ def iterate(
                 _at(progress, number),
                 start=start,
                 before=None if before is None else before.poses,
+                sums=em.needs_sums(D, options.estimator),
             )
             seen = slam.deskewed(recording, mapped.poses, options.slam)
         progress("labelling beams", number, 0, 0)
@@ -223,7 +232,7 @@ def iterate(
                 mapped.poses,
                 found.p_static,
                 options.slam.resolution,
-                options.em.held_out,
+                options.em.held_out if D == 2 else 0,  # lengths through all voxels: too large
                 threads,
             )
         iteration = Iteration(

@@ -18,6 +18,9 @@ from stillmap.output.crops import Snapshot
 from stillmap.output.save import save
 from stillmap.pipeline import DEFAULTS, Options, Progress
 from stillmap.recording.model import Recording
+from stillmap.scene.ground import Ground, ground_of
+from stillmap.scene.movers import moving_in_space
+from stillmap.scene.plan import columns_of, plan_of
 from stillmap.stages import Stages
 from stillmap.threads import resolved_threads
 
@@ -111,15 +114,14 @@ def build(
     Raises:
         OSError: the disk of `scratch` is full.
     """
-    if recording.dimension != 2:
-        raise ValueError(f"recording: expected 2 dimensions, got {recording.dimension}")
     if recording.n_scans == 0:
         raise ValueError("recording: expected at least one scan")
     if scratch is not None:
         recording = dataclasses.replace(recording, scratch=scratch)
     stages = stages or Stages()
-    options = pipeline.resolved(options)
+    options = pipeline.resolved(options, recording)
     loop = go_on or Loop(options)
+    loop.closed = poses is not None and options.estimator == "stillmap"
     iterations = pipeline.iterate(
         recording, options, poses=poses, progress=progress, stages=stages, after=loop.reached
     )
@@ -138,20 +140,27 @@ def _result(loop: Loop, recording: Recording, progress: Progress, stages: Stages
         kept, changes = _settled(loop.kept, seen, options, threads)
     progress("making the map", 0, 0, 0)
     with stages.measure("maps"):
-        filtered = _map(kept, seen, options, threads)
-        raw = _raw_map(seen, kept.poses, filtered, threads)
+        flat, plan, ground = kept, seen, None
+        if seen.dimension == 3:
+            ground = ground_of(seen, kept.poses, kept.p_static)
+            flat, plan = _in_plan(kept, seen, ground, options)
+        filtered = _map(flat, plan, options, threads)
+        raw = _raw_map(plan, flat.poses, filtered, threads)
     progress("counting looks", 0, 0, 0)
     with stages.measure("evidence"):
         evidence = em.evidence(
-            seen, kept.poses, kept.p_static, filtered, kept.no_return, options.em, threads
+            plan, flat.poses, flat.p_static, filtered, flat.no_return, options.em, threads
         )
     progress("following what moves", 0, 0, 0)
     with stages.measure("objects"):
-        moving = moving_objects(seen, kept.poses, kept.p_static, options.objects)
-        things = beams_on_things(seen, kept.poses, kept.p_static, changes, filtered.resolution)
-        moving = _without(moving, things)
+        if ground is not None:
+            moving = moving_in_space(seen, kept.poses, kept.p_static, ground, options.objects)
+        else:
+            moving = moving_objects(seen, kept.poses, kept.p_static, options.objects)
+            things = beams_on_things(seen, kept.poses, kept.p_static, changes, filtered.resolution)
+            moving = _without(moving, things)
         crossed = traffic(moving)
-        del seen
+        del seen, plan, flat
     return Result(
         recording=recording,
         options=options,
@@ -184,8 +193,10 @@ def _settled(
 ) -> tuple[Best, list[Change]]:
     """The last E-step: labels of the map as it is shown, and the places that changed."""
     cell = options.slam.resolution
-    if options.estimator != "stillmap" or not (
-        options.em.dwell.views or options.em.changes.enabled
+    if (
+        recording.dimension == 3
+        or options.estimator != "stillmap"
+        or not (options.em.dwell.views or options.em.changes.enabled)
     ):
         return kept, []
     found, courses = em.last_e_step(recording, kept.poses, cell, options.em, threads)
@@ -212,6 +223,26 @@ def _settled(
     learned = {**kept.learned, "changing": round(courses.share, 6)}
     kept = dataclasses.replace(kept, p_static=p_static, occupied=occupied, learned=learned)
     return kept, changes
+
+
+def _in_plan(
+    kept: Best, recording: Recording, ground: Ground, options: Options
+) -> tuple[Best, Recording]:
+    """The same as a planar recording: what is in the robot's way."""
+    cell, band = options.slam.resolution, options.output.band
+    plan = plan_of(recording, kept.poses, ground, band, cell, open_space=False)
+    occupied = kept.occupied
+    if occupied is not None:
+        occupied = columns_of(occupied, ground, band, cell)
+    flat = dataclasses.replace(
+        kept,
+        poses=plan.poses,
+        weights=kept.weights[plan.beam],
+        p_static=kept.p_static[plan.beam],
+        occupied=occupied,
+        no_return=None,
+    )
+    return flat, plan.recording
 
 
 def _map(kept: Best, recording: Recording, options: Options, threads: int) -> em.OccupancyMap:

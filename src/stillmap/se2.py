@@ -65,3 +65,9 @@ def turned(covariance: Float, T: Float) -> Float:
     R[..., :2, :2] = T[..., :2, :2]
     R[..., 2, 2] = 1.0
     return R @ covariance @ np.swapaxes(R, -1, -2)
+
+
+def planar(poses: Float) -> Float:
+    """(T, 3, 3) place and heading of poses (T, 4, 4) in space."""
+    yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    return matrix(poses[:, 0, 3], poses[:, 1, 3], yaw)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core, em, slam
+from stillmap import em, slam
 from stillmap.loop import Best, IterationRecord, Loop
 from stillmap.output.crops import Snapshot
 from stillmap.pipeline import Options, Reached
@@ -44,7 +44,8 @@ def unpacked(
     """The loop that `packed` was given."""
     best, reached = values["best"], values["reached"]
     way = _way("reached", reached, arrays)
-    grid = _core.Grid2D(options.slam.resolution)
+    D = way["poses"].shape[-1] - 1
+    grid = em.empty_grid(D, options.slam.resolution)
     doubts = way.pop("doubts")
     lists = {name: getattr(doubts, name) for name in _DOUBTS}
     number = reached["number"]
@@ -52,7 +53,7 @@ def unpacked(
         options,
         records=[IterationRecord(**record) for record in values["records"]],
         snapshots={one["number"]: _snapshot(one, arrays) for one in values["snapshots"]},
-        window=tuple(values["window"]),
+        window=None if values["window"] is None else tuple(values["window"]),
         best=_best(best, arrays),
         finished=values["finished"],
         reached=Reached(number, arrays[f"e-{number}"], slam.Mapped(grid=grid, **way, **lists)),
@@ -94,9 +95,11 @@ def _way_packed(name: str, way: Best | slam.Mapped, arrays: Arrays) -> dict[str,
     """Poses, and what is known of them."""
     for part in ("poses", "covariance", "explained"):
         arrays[f"{name}.{part}"] = getattr(way, part)
+    D = way.poses.shape[-1] - 1
+    pose, covariance = (D + 1, D + 1), (way.covariance.shape[-1],) * 2
     arrays[f"{name}.loops.scans"] = _stacked([[c.earlier, c.later] for c in way.loops], (2,), int)
-    arrays[f"{name}.loops.T"] = _stacked([c.T for c in way.loops], (3, 3))
-    arrays[f"{name}.loops.covariance"] = _stacked([c.covariance for c in way.loops], (3, 3))
+    arrays[f"{name}.loops.T"] = _stacked([c.T for c in way.loops], pose)
+    arrays[f"{name}.loops.covariance"] = _stacked([c.covariance for c in way.loops], covariance)
     arrays[f"{name}.loops.explained"] = _stacked([c.explained for c in way.loops], ())
     if way.graph is not None:
         relations = way.graph.relations
@@ -104,8 +107,8 @@ def _way_packed(name: str, way: Best | slam.Mapped, arrays: Arrays) -> dict[str,
         arrays[f"{name}.graph.scans"] = way.graph.scans
         arrays[f"{name}.graph.poses"] = way.graph.poses
         arrays[f"{name}.graph.between"] = _stacked(between, (2,), int)
-        arrays[f"{name}.graph.T"] = _stacked([r.T for r in relations], (3, 3))
-        arrays[f"{name}.graph.covariance"] = _stacked([r.covariance for r in relations], (3, 3))
+        arrays[f"{name}.graph.T"] = _stacked([r.T for r in relations], pose)
+        arrays[f"{name}.graph.covariance"] = _stacked([r.covariance for r in relations], covariance)
     return {
         "doubts": {field: getattr(way.doubts, field) for field in _DOUBTS},
         "refused": [closure.refused for closure in way.loops],

@@ -67,7 +67,10 @@ def _add_method_flags(p: argparse._ArgumentGroup) -> None:
 
 def _add_map_flags(p: argparse._ArgumentGroup) -> None:
     p.add_argument(
-        "--resolution", metavar="M", type=float, help="edge of a map cell in metres (default: 0.05)"
+        "--resolution",
+        metavar="M",
+        type=float,
+        help="edge of a map cell in metres (default: 0.05; in 3D by the sensor)",
     )
     p.add_argument(
         "--map-mode",
@@ -97,7 +100,7 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
     if args.threads is not None:
         changes["threads"] = args.threads
     if args.resolution is not None:
-        changes["slam"] = {"resolution": args.resolution}
+        changes["slam"] = {"resolution": args.resolution, "voxel": args.resolution}
     output = {"map_mode": args.map_mode, "map_state": args.map_state}
     if chosen := {name: value for name, value in output.items() if value}:
         changes["output"] = chosen

@@ -41,7 +41,7 @@ def mapped(args: argparse.Namespace, changes: dict[str, Any]) -> int:
         args: the flags.
         changes: of the options, by them.
     """
-    options = resolved(resolved_options(args, read_changes(args), changes))
+    options = resolved_options(args, read_changes(args), changes)
     output, replace = Path(args.output), args.overwrite or args.resume
     require_new(output, RECORD, replace)
     require_apart(output, Path(args.input))
@@ -73,6 +73,7 @@ def _mapped_and_saved(args: argparse.Namespace, options: Options, place: Place) 
             found = read(Path(args.input), options.read, progress=tell, scratch=place.folder)
         recording = _usable(found, args)
         poses = _given_poses(recording, args)
+        options = resolved(options, recording)
         same = identity(recording, options, poses)
     loop = _resumed(args, place, same, options, stages)
     with shown_progress(args.quiet, em.iterations(options.estimator, options.em)) as progress:
@@ -148,8 +149,6 @@ def _require_writable(output: Path) -> None:
 def _usable(recording: Recording, args: argparse.Namespace) -> Recording:
     if recording.n_scans == 0:
         raise InputError("holds no scan that can be used", where=args.input)
-    if recording.dimension != 2:
-        raise InputError("is 3D: only 2D recordings can be mapped so far", where=args.input)
     recording = dataclasses.replace(recording, source=_found_at(recording.source, args.input))
     return recording.without_odometry() if args.no_odometry else recording
 

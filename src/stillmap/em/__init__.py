@@ -7,12 +7,14 @@ from stillmap.em.estimator import (
     add_recording,
     changed_share,
     e_step,
+    empty_grid,
     fixed_iterations,
     initial_expectations,
     iterations,
+    needs_sums,
 )
 from stillmap.em.evidence import Evidence, evidence
-from stillmap.em.expectations import CellProbabilities, Expectations, Likelihood, NoReturn
+from stillmap.em.expectations import CellProbabilities, Expectations, Grid, Likelihood, NoReturn
 from stillmap.em.held_out import held_out_log_likelihood
 from stillmap.em.last import last_e_step
 from stillmap.em.looks import look_numbers
@@ -30,6 +32,7 @@ __all__ = [
     "Evidence",
     "EvidenceOptions",
     "Expectations",
+    "Grid",
     "Likelihood",
     "MapState",
     "NoReturn",
@@ -39,6 +42,7 @@ __all__ = [
     "add_recording",
     "changed_share",
     "e_step",
+    "empty_grid",
     "evidence",
     "fixed_iterations",
     "held_out_log_likelihood",
@@ -46,5 +50,6 @@ __all__ = [
     "iterations",
     "last_e_step",
     "look_numbers",
+    "needs_sums",
     "occupancy_map",
 ]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from stillmap import _core
 from stillmap.em import dwell, hit_ratio, paper
 from stillmap.em.chunks import chunks
-from stillmap.em.expectations import Expectations, NoReturn, per_beam
+from stillmap.em.expectations import Expectations, Grid, NoReturn, per_beam
 from stillmap.em.occupancy import Seen
 from stillmap.em.options import EmOptions
 from stillmap.em.tracker import on_people
@@ -44,10 +44,21 @@ def fixed_iterations(estimator: Estimator) -> int | None:
     return _FIXED.get(estimator)
 
 
+def empty_grid(dimension: int, resolution: float, approach: float = 0.0) -> Grid:
+    """A grid without any sums."""
+    kind = _core.Grid2D if dimension == 2 else _core.Grid3D
+    return kind(resolution, approach)
+
+
+def needs_sums(dimension: int, estimator: Estimator) -> bool:
+    """Whether the M-step has to make the sums of (10): in 3D they are large."""
+    return dimension == 2 or estimator == "paper"
+
+
 def e_step(
     recording: Recording,
     poses: Float,
-    grid: _core.Grid2D,
+    grid: Grid,
     estimator: Estimator,
     options: EmOptions,
     threads: int = 1,
@@ -55,11 +66,13 @@ def e_step(
     """What is static at these poses, and the likelihood of that."""
     if estimator == "paper":
         return paper.e_step(recording, poses, grid, options.prior, threads)
+    if estimator == "stillmap":
+        return dwell.e_step(recording, poses, grid.resolution, options, threads)
+    if not isinstance(grid, _core.Grid2D):
+        raise ValueError(f"estimator: {estimator} knows 2D recordings alone")
     if estimator == "hit-ratio":
         return hit_ratio.e_step(recording, poses, grid, options.hit_ratio, threads)
-    if estimator == "tracker":
-        return _tracked(recording, poses, grid.resolution, options, threads)
-    return dwell.e_step(recording, poses, grid.resolution, options, threads)
+    return _tracked(recording, poses, grid.resolution, options, threads)
 
 
 def _tracked(
@@ -77,7 +90,7 @@ def _tracked(
 
 
 def add_recording(
-    grid: _core.Grid2D,
+    grid: Grid,
     recording: Recording,
     poses: Float,
     e: NDArray[np.float32] | None,

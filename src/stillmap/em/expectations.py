@@ -5,6 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap import _core
+
+Grid = _core.Grid2D | _core.Grid3D
+
 
 @dataclass(frozen=True)
 class Likelihood:

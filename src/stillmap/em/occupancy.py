@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core
-from stillmap.em.expectations import CellProbabilities
+from stillmap.em.expectations import CellProbabilities, Grid
 
 Cell = NDArray[np.int64]
 Sums = NDArray[np.float64]
@@ -70,7 +70,7 @@ class OccupancyMap:
 
 
 def occupancy_map(
-    grid: _core.Grid2D,
+    grid: Grid,
     occupied: CellProbabilities | None = None,
     seen: Seen | None = None,
     box: Box | None = None,
@@ -85,6 +85,8 @@ def occupancy_map(
             that beams crossed.
         box: which cells are wanted, instead.
     """
+    if not isinstance(grid, _core.Grid2D):
+        raise ValueError("grid: expected one of 2 dimensions")
     if seen is not None:
         box = Box(seen.first_cell, seen.cells.shape)
     box = box or _whole(grid)

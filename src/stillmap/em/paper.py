@@ -5,14 +5,14 @@ from numpy.typing import NDArray
 
 from stillmap import _core
 from stillmap.em.chunks import chunks
-from stillmap.em.expectations import Expectations, Likelihood
+from stillmap.em.expectations import Expectations, Grid, Likelihood
 from stillmap.recording.model import Recording
 
 Float = NDArray[np.float64]
 
 
 def e_step(
-    recording: Recording, poses: Float, grid: _core.Grid2D, prior: float, threads: int = 1
+    recording: Recording, poses: Float, grid: Grid, prior: float, threads: int = 1
 ) -> Expectations:
     """e of (6), (8) for every beam, and (5) at the map of `grid`."""
     e = recording.per_beam(np.float32)
@@ -33,7 +33,7 @@ def e_step(
 def log_likelihood(
     recording: Recording,
     poses: Float,
-    grid: _core.Grid2D,
+    grid: Grid,
     e: NDArray[np.float32],
     prior: float,
     threads: int = 1,

@@ -35,9 +35,10 @@ class MovingObject:
         stamp_ns: (L,) their stamps.
         xy: (L, 2) metres, its middle in the map frame, smoothed; as if it were round.
         velocity: (L, 2) metres per second.
-        size: metres along and across the way it went; of what was seen of it.
+        size: metres along and across the way it went, and in 3D its height; of what was seen of it.
         beams: (n,) beams of the recording that ended on it, rising.
         p_dynamic: mean probability of these beams to be dynamic.
+        z: (L,) metres, how high its middle is in the map frame; None in 2D.
     """
 
     id: int
@@ -45,9 +46,10 @@ class MovingObject:
     stamp_ns: NDArray[np.int64]
     xy: Float
     velocity: Float
-    size: tuple[float, float]
+    size: tuple[float, ...]
     beams: Index
     p_dynamic: float
+    z: Float | None = None
 
 
 def moving_objects(
@@ -103,7 +105,7 @@ class _Kept:
             name: spool.Column(dtype, (2,) if dtype is float else (), scratch)
             for name, dtype in self._OF_SCANS.items()
         }
-        self._rows: list[tuple[int, int, tuple[float, float], float]] = []
+        self._rows: list[tuple[int, int, tuple[float, ...], float]] = []
 
     def add(self, one: MovingObject) -> None:
         self._rows.append((len(one.scan), len(one.beams), one.size, one.p_dynamic))

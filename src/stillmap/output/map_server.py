@@ -1,6 +1,6 @@
 """`map.pgm` or `map.png` with `map.yaml`, as map_server and nav2 read them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -11,6 +11,7 @@ from PIL import Image
 
 from stillmap.em.options import MapState
 from stillmap.options import field_with_doc
+from stillmap.scene.band import BandOptions
 
 if TYPE_CHECKING:
     from stillmap.output.protocols import MapLike
@@ -39,6 +40,7 @@ class OutputOptions:
     map_state: MapState = field_with_doc(
         "last", "of places that changed the map shows the last state, or the one held for longest"
     )
+    band: BandOptions = field(default=BandOptions())
 
 
 def trinary_pixels(p_occupied: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.output.clouds import ply_header
 from stillmap.output.map_npz import write_npz
 from stillmap.output.protocols import MovingObjectLike, ResultLike, TrafficLike
 
@@ -24,16 +25,19 @@ def write_objects(folder: Path, result: ResultLike) -> None:
         file.write("\n]\n" if result.objects else "]\n")
     recording = result.seen
     for one in result.objects:
-        xy = recording.end_points(one.beams, result.poses)
+        ends = recording.end_points(one.beams, result.poses)
         stamps = recording.stamp_ns[recording.scans_of(one.beams)]
         seconds = 1e-9 * (stamps - one.stamp_ns[0])
-        write_ply(folder / f"{one.id:04d}.ply", xy, seconds, 1.0 - result.p_static[one.beams])
+        write_ply(folder / f"{one.id:04d}.ply", ends, seconds, 1.0 - result.p_static[one.beams])
         recording.let_go(result.p_static, one.beams)
 
 
 def object_record(one: MovingObjectLike) -> dict[str, Any]:
     """One entry of `objects.json`: metres, metres per second, nanoseconds."""
-    columns = zip(("x", "y", "vx", "vy"), np.hstack([one.xy, one.velocity]).T, strict=True)
+    columns = dict(zip("xy", one.xy.T, strict=True))
+    if one.z is not None:
+        columns["z"] = one.z
+    columns |= zip(("vx", "vy"), one.velocity.T, strict=True)
     return {
         "id": one.id,
         "first_stamp_ns": int(one.stamp_ns[0]),
@@ -43,25 +47,24 @@ def object_record(one: MovingObjectLike) -> dict[str, Any]:
         "p_dynamic": round(one.p_dynamic, 6),
         "track": {
             "stamp_ns": one.stamp_ns.tolist(),
-            **{name: np.round(values, _MILLIMETRES).tolist() for name, values in columns},
+            **{name: np.round(values, _MILLIMETRES).tolist() for name, values in columns.items()},
         },
     }
 
 
 def write_ply(
     path: Path,
-    xy: NDArray[np.float64],
+    ends: NDArray[np.float64],
     seconds: NDArray[np.float64],
     p_dynamic: NDArray[np.float32],
 ) -> None:
-    """Points (n, 2) of an object at z = 0, when each was seen, and how probably it is dynamic."""
+    """Points (n, D) of an object, when each was seen, and how probably it is dynamic; 2D: z = 0."""
     fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("seconds", "<f4"), ("p_dynamic", "<f4")]
-    vertices = np.zeros(len(xy), fields)
-    vertices["x"], vertices["y"] = xy.T
+    vertices = np.zeros(len(ends), fields)
+    for name, column in zip("xyz", ends.T, strict=False):
+        vertices[name] = column
     vertices["seconds"], vertices["p_dynamic"] = seconds, p_dynamic
-    properties = "".join(f"property float {name}\n" for name, _ in fields)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(xy)}\n{properties}"
-    path.write_bytes(header.encode("ascii") + b"end_header\n" + vertices.tobytes())
+    path.write_bytes(ply_header(fields, len(ends)) + vertices.tobytes())
 
 
 def write_traffic(path: Path, traffic: TrafficLike) -> None:

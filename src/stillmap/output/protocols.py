@@ -178,6 +178,7 @@ class MovingObjectLike(Protocol):
         size: metres along and across the way it went.
         beams: (n,) beams of the recording that ended on it.
         p_dynamic: mean probability of these beams to be dynamic.
+        z: (L,) metres, how high its middle is; None in 2D.
     """
 
     @property
@@ -191,7 +192,9 @@ class MovingObjectLike(Protocol):
     @property
     def velocity(self) -> NDArray[np.float64]: ...
     @property
-    def size(self) -> tuple[float, float]: ...
+    def size(self) -> tuple[float, ...]: ...
+    @property
+    def z(self) -> NDArray[np.float64] | None: ...
     @property
     def beams(self) -> NDArray[np.intp]: ...
     @property

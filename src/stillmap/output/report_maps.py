@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap import se2
 from stillmap.output.crops import Snapshot, Window
 from stillmap.output.known import known_area
 from stillmap.output.points import dynamic_points
@@ -54,7 +55,11 @@ def maps_section(result: ResultLike) -> str:
         filtered.size,
     )
     veil = thin_image(result.map, result.evidence.thin, window)
-    path = _path(result.poses, window, filtered.size)
+    path = _path(
+        se2.planar(result.poses) if result.recording.dimension == 3 else result.poses,
+        window,
+        filtered.size,
+    )
     width, height = window[2] - window[0], window[3] - window[1]
     reduced = filtered.size[0] < round(width / result.map.resolution)
     size = f"{width:.0f} m by {height:.0f} m, cells of {100 * result.map.resolution:.3g} cm"

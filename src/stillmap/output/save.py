@@ -4,6 +4,7 @@ from pathlib import Path
 
 from stillmap.output.atomic import new_folder
 from stillmap.output.beams import write_beams
+from stillmap.output.clouds import write_clouds
 from stillmap.output.graph_g2o import write_g2o
 from stillmap.output.map_npz import write_map_npz
 from stillmap.output.map_server import write_map_server
@@ -35,6 +36,8 @@ def save(
         if result.graph is not None:
             write_g2o(folder / "graph.g2o", result.graph, result.poses)
         write_beams(folder / "beams", result)
+        if result.recording.dimension == 3:
+            write_clouds(folder, result.seen, result.poses, result.p_static)
         if result.options.objects.enabled:
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)

@@ -14,7 +14,7 @@ _NEAR_NS = 20_000_000  # another tool may have rounded its stamps
 
 
 def poses_from_tum(path: Path, recording: Recording) -> NDArray[np.float64]:
-    """(T, 3, 3) T_map_base at the scans of a 2D recording, from a TUM trajectory.
+    """(T, D+1, D+1) T_map_base at the scans of a recording, from a TUM trajectory.
 
     A trajectory with the very stamps of the recording is taken row by row (stamps may repeat);
     otherwise each scan takes the nearest pose within 20 ms.
@@ -22,10 +22,9 @@ def poses_from_tum(path: Path, recording: Recording) -> NDArray[np.float64]:
     Raises:
         InputError: the file is no trajectory, or a scan has no pose.
     """
-    stamp_ns, T = read_tum(path)
-    planar = T[:, [0, 1]][:, :, [0, 1, 3]]
-    yaw = np.arctan2(planar[:, 1, 0], planar[:, 0, 0])
-    poses = se2.matrix(planar[:, 0, 2], planar[:, 1, 2], yaw)
+    stamp_ns, poses = read_tum(path)
+    if recording.dimension == 2:
+        poses = se2.planar(poses)
     if np.array_equal(stamp_ns, recording.stamp_ns):
         return poses
     order = np.argsort(stamp_ns, kind="stable")

@@ -36,6 +36,8 @@ def deskewed(recording: Recording, poses: Float | None, options: SlamOptions) ->
     times = recording.beam_time
     if times is None or not len(times) or poses is None or not options.deskew:
         return recording
+    if recording.dimension != 2:
+        return recording
     after, before = _pairs(recording.stamp_ns, *_span(times))
     later, earlier = (_twists(recording, poses, *pair) for pair in (after, before))
     points = recording.per_beam(np.float32, (recording.dimension,))

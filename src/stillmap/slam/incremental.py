@@ -35,6 +35,9 @@ class SlamOptions:
     """The M-step over poses and map."""
 
     resolution: float = field_with_doc(0.05, "m, edge of a map cell")
+    voxel: float = field_with_doc(
+        0.0, "m, the same of 3D recordings; 0: as fine as the sensor's beams lie apart"
+    )
     spacing: float = field_with_doc(
         0.2, "m, rad or 5 s between scans that later ones are registered against"
     )
@@ -49,6 +52,8 @@ class SlamOptions:
     def __post_init__(self) -> None:
         if not 0.005 <= self.resolution <= 10.0:
             raise ValueError("'slam.resolution' wants 0.005 to 10 metres")
+        if not (self.voxel == 0.0 or 0.005 <= self.voxel <= 10.0):
+            raise ValueError("'slam.voxel' wants 0, or 0.005 to 10 metres")
         if not 0.0 <= self.spacing <= 100.0:
             raise ValueError("'slam.spacing' wants 0 to 100 metres")
 
@@ -85,7 +90,7 @@ class Mapped:
 
     poses: Float
     covariance: Float
-    grid: _core.Grid2D
+    grid: _core.Grid2D | _core.Grid3D
     explained: Float
     widened: list[int]
     disagreeing: list[int] = field(default_factory=list)
@@ -101,7 +106,7 @@ class Mapped:
 
     def without_grid(self) -> "Mapped":
         """Poses and what is known of them alone: grids are large."""
-        return dataclasses.replace(self, grid=_core.Grid2D(self.grid.resolution))
+        return dataclasses.replace(self, grid=type(self.grid)(self.grid.resolution))
 
 
 def build(

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core, em
+from stillmap import em
 from stillmap.recording.model import Recording
 from stillmap.slam import closing, incremental
 from stillmap.slam.deskew import deskewed
@@ -28,24 +28,28 @@ def m_step(
     *,
     start: Mapped | None = None,
     before: Float | None = None,
+    sums: bool = True,
 ) -> Mapped:
     """The most likely poses and map given e: (9), (10)-(15).
 
     Args:
-        recording: 2D, as it was taken: the motion during its scans is taken out of them here.
+        recording: as it was taken: the motion during its scans is taken out of them here.
         e: (M,) probability that each beam was reflected by something static.
         options: see SlamOptions.
-        poses: (T, 3, 3) T_map_base when they are known: then only the map is made.
+        poses: (T, D+1, D+1) T_map_base when they are known: then only the map is made.
         threads: for maps of poses that are known already; the result does not depend on it.
         progress: called with what is done, the number of scans done and their total.
         start: an M-step whose loops are closed already: its poses are only swept again.
         before: (T, 3, 3) earlier poses, which tell how the robot moved during its scans better than
             odometry does.
+        sums: whether the sums of (10) are wanted.
     """
     if poses is not None:
-        mapped = _mapped_at(recording, e, options, poses, threads)
+        mapped = _mapped_at(recording, e, options, poses, threads, sums=sums)
         progress("mapping", recording.n_scans, recording.n_scans)
         return mapped
+    if recording.dimension != 2:
+        raise ValueError("poses: expected those of a 3D recording")
     mapped = _estimated(recording, e, options, progress, start, before)
     progress("drawing the map", 0, 0)
     grid = _mapped_at(recording, e, options, mapped.poses, threads).grid
@@ -106,10 +110,18 @@ def _swept(
 
 
 def _mapped_at(
-    recording: Recording, e: NDArray[np.float32], options: SlamOptions, poses: Float, threads: int
+    recording: Recording,
+    e: NDArray[np.float32],
+    options: SlamOptions,
+    poses: Float,
+    threads: int,
+    *,
+    sums: bool = True,
 ) -> Mapped:
-    """The map of known poses (T, 3, 3)."""
-    grid = _core.Grid2D(options.resolution, options.registration.approach)
-    em.add_recording(grid, deskewed(recording, poses, options), poses, e, threads)
-    T = recording.n_scans
-    return Mapped(poses, np.zeros((T, 3, 3)), grid, np.full(T, np.nan), [])
+    """The map of known poses (T, D+1, D+1)."""
+    D, T = recording.dimension, recording.n_scans
+    grid = em.empty_grid(D, options.resolution, options.registration.approach)
+    if sums:
+        em.add_recording(grid, deskewed(recording, poses, options), poses, e, threads)
+    freedom = D * (D + 1) // 2
+    return Mapped(poses, np.zeros((T, freedom, freedom)), grid, np.full(T, np.nan), [])

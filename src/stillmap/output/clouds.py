@@ -1,0 +1,69 @@
+"""`static.ply` and `dynamic.ply`: where the beams of a 3D recording ended, in the map frame."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.em.chunks import chunks
+from stillmap.output.points import DYNAMIC_BELOW
+from stillmap.recording.model import Recording
+from stillmap.recording.spool import blocks
+
+FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("p_static", "<f4")]
+
+
+def write_clouds(
+    folder: Path, seen: Recording, poses: NDArray[np.float64], p_static: NDArray[np.float32]
+) -> None:
+    """Write every hit to one of the two files; memory is that of a few scans.
+
+    Args:
+        folder: where to.
+        seen: 3D, M beams without the motion during its scans.
+        poses: (T, 4, 4) T_map_base.
+        p_static: (M,) P(c = 1); below one half it is dynamic.
+    """
+    hits = dynamic = 0
+    for block in blocks(seen.hit, p_static):
+        hit = seen.hit[block]
+        hits += int(np.count_nonzero(hit))
+        dynamic += int(np.count_nonzero(hit & (p_static[block] < DYNAMIC_BELOW)))
+    counts = {"static": hits - dynamic, "dynamic": dynamic}
+    files = {name: (folder / f"{name}.ply").open("wb") for name in counts}
+    try:
+        for name, file in files.items():
+            file.write(ply_header(FIELDS, counts[name]))
+        for vertices in _vertices(seen, poses, p_static):
+            moves = vertices["p_static"] < DYNAMIC_BELOW
+            files["static"].write(vertices[~moves].tobytes())
+            files["dynamic"].write(vertices[moves].tobytes())
+    finally:
+        for file in files.values():
+            file.close()
+
+
+def ply_header(fields: list[tuple[str, str]], count: int) -> bytes:
+    """Of a little-endian PLY whose vertices have these fields, all float32."""
+    properties = "".join(f"property float {name}\n" for name, _ in fields)
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
+    return (head + "end_header\n").encode("ascii")
+
+
+def _vertices(
+    seen: Recording, poses: NDArray[np.float64], p_static: NDArray[np.float32]
+) -> Iterator[NDArray[np.void]]:
+    T_map_sensor = seen.T_map_sensor(poses)
+    for scans, beams, offset in chunks(seen, beside=[p_static]):
+        for t, first, last in zip(
+            range(scans.start, scans.stop), offset[:-1], offset[1:], strict=True
+        ):
+            at = slice(beams.start + int(first), beams.start + int(last))
+            hit = seen.hit[at]
+            T = T_map_sensor[t]
+            ends = seen.points[at][hit].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+            vertices = np.empty(len(ends), FIELDS)
+            vertices["x"], vertices["y"], vertices["z"] = ends.T
+            vertices["p_static"] = p_static[at][hit]
+            yield vertices

@@ -1,0 +1,161 @@
+"""How high the ground is: what is flat and lies as far below the sensor as the robot is high."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import _core
+from stillmap.em.chunks import chunks
+from stillmap.recording.model import Recording
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_CELL = 0.3  # m, of the surface that tells what is level
+_BELIEVED = 0.5  # P(c = 1) of what stands still
+_SQUARE = 1.0  # m, edge of a square with one height
+_LEVEL = 0.85  # cosine of the slope from which on a surface is no floor
+_BENEATH = 0.15  # m, the sensor sits at least so high above it
+_NEAR = 8.0  # m from the robot's way, where the ground tells how high the sensor is
+_STEP = 0.3  # m, by which the ground may rise or fall from one square to the next
+_BIN = 0.05  # m
+_MARGIN = 2  # squares around all that is known
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The height of the ground, square by square.
+
+    Attributes:
+        z: (H, W) metres in the map frame, row 0 at the lowest y; known everywhere, where nothing
+            of the ground was seen from the squares beside.
+        corner: (2,) x, y of the lowest square's lower-left corner.
+        sensor: metres of the sensors above it.
+        seen: whether any ground was seen at all.
+    """
+
+    z: Float
+    corner: Float
+    sensor: float
+    seen: bool
+
+    def at(self, xy: Float) -> Float:
+        """(N,) height at places (N, 2) in metres; beyond the edge that of the edge."""
+        column, row = np.floor((xy - self.corner) / _SQUARE).astype(np.int64).T
+        H, W = self.z.shape
+        return np.asarray(self.z[np.clip(row, 0, H - 1), np.clip(column, 0, W - 1)])
+
+
+def ground_of(recording: Recording, poses: Float, p_static: NDArray[np.float32]) -> Ground:
+    """The ground under a robot's way and around it.
+
+    Args:
+        recording: 3D, M beams without motion during its scans.
+        poses: (T, 4, 4) T_map_base; the z axis of the map points up.
+        p_static: (M,) P(c = 1) of every beam.
+    """
+    T_map_sensor = recording.T_map_sensor(poses)
+    surface = _core.Surface3D(_CELL)
+    for scans, beams, offset in chunks(recording, beside=[p_static]):
+        static = recording.hit[beams] & (p_static[beams] >= _BELIEVED)
+        surface.add_end_points(recording.points[beams], static, offset, T_map_sensor[scans])
+    surface.fit()
+    _, means, normals, *_ = surface.elements()
+    return ground_from(means, normals, T_map_sensor[:, :3, 3])
+
+
+def ground_from(means: Float, normals: Float, way: Float) -> Ground:
+    """The ground under a robot's way and around it.
+
+    Args:
+        means, normals: (E, 3) of surface that stands still, metres; a normal of zero: none.
+        way: (T, 3) where the sensors were, in the map frame whose z points up.
+    """
+    floor = means[np.abs(normals[:, 2]) > _LEVEL]
+    sensor = _height(floor, way)
+    low = np.vstack([means[:, :2], way[:, :2]]).min(axis=0)
+    high = np.vstack([means[:, :2], way[:, :2]]).max(axis=0)
+    corner = np.floor(low / _SQUARE - _MARGIN) * _SQUARE
+    W, H = (np.ceil((high - corner) / _SQUARE).astype(int) + _MARGIN).tolist()
+    z = np.full((H, W), np.nan)
+    _lay(z, corner, way[:, :2], way[:, 2] - (sensor or 0.0), np.inf)
+    if sensor is not None:
+        _spread(z, corner, floor)
+    _fill(z)
+    return Ground(z, corner, sensor or 0.0, sensor is not None)
+
+
+def _height(floor: Float, way: Float) -> float | None:
+    """Metres of the sensors above most of what is level and below them, near the way."""
+    import scipy  # its parts load when they are first used
+
+    if not len(floor):
+        return None
+    apart, nearest = scipy.spatial.cKDTree(way[:, :2]).query(floor[:, :2])
+    below = way[nearest, 2] - floor[:, 2]
+    below = below[(apart < _NEAR) & (below > _BENEATH)]
+    if not len(below):
+        return None
+    # things have fewer tops than there is ground, at as many heights as there are things
+    counts = np.bincount((below / _BIN).astype(np.int64))
+    most = int(np.convolve(counts, np.ones(3))[1:-1].argmax())
+    return float(np.median(below[np.abs(below / _BIN - (most + 0.5)) < 1.5]))
+
+
+def _squares(z: Float, corner: Float, xy: Float) -> Index:
+    """(N,) flat numbers of the squares in which places (N, 2) lie."""
+    column, row = np.floor((xy - corner) / _SQUARE).astype(np.intp).T
+    return np.asarray(row * z.shape[1] + column)
+
+
+def _lay(z: Float, corner: Float, xy: Float, height: Float, step: float) -> None:
+    """Squares get the mean of the heights (N,) there that are no farther off than `step`."""
+    square = _squares(z, corner, xy)
+    flat = z.reshape(-1)
+    near = np.ones(len(xy), np.bool_) if step == np.inf else np.abs(height - flat[square]) <= step
+    count = np.bincount(square[near], minlength=flat.size)
+    total = np.bincount(square[near], weights=height[near], minlength=flat.size)
+    flat[count > 0] = total[count > 0] / count[count > 0]
+
+
+def _spread(z: Float, corner: Float, floor: Float) -> None:
+    """From the way outwards: a square is as high as the floor in it that goes on beside it."""
+    order = np.argsort(_squares(z, corner, floor[:, :2]), kind="stable")
+    floor = floor[order]
+    square = _squares(z, corner, floor[:, :2])
+    first = np.searchsorted(square, np.arange(z.size + 1))
+    under_way = np.isfinite(z)
+    here = _members(first, np.flatnonzero(under_way))
+    _lay(z, corner, floor[here, :2], floor[here, 2], _STEP)
+    while True:
+        beside = _beside(z)
+        if not len(beside):
+            return
+        at, height = beside.T
+        z.reshape(-1)[at.astype(np.intp)] = height
+        here = _members(first, at.astype(np.intp))
+        _lay(z, corner, floor[here, :2], floor[here, 2], _STEP)
+
+
+def _members(first: Index, squares: Index) -> Index:
+    """Numbers of what lies in squares (n,), of lists that begin at `first`."""
+    counts = first[squares + 1] - first[squares]
+    starts = np.repeat(first[squares] - np.cumsum(counts) + counts, counts)
+    return np.asarray(starts + np.arange(counts.sum()))
+
+
+def _beside(z: Float) -> Float:
+    """(n, 2) flat number and expected height of unknown squares beside known ones."""
+    padded = np.pad(z, 1, constant_values=np.nan)
+    around = np.stack([padded[1:-1, :-2], padded[1:-1, 2:], padded[:-2, 1:-1], padded[2:, 1:-1]])
+    known = np.isfinite(around)
+    at = np.flatnonzero(known.any(axis=0) & ~np.isfinite(z))
+    total = np.where(known, around, 0.0).reshape(4, -1)[:, at].sum(axis=0)
+    return np.stack([at.astype(float), total / known.reshape(4, -1)[:, at].sum(axis=0)], axis=1)
+
+
+def _fill(z: Float) -> None:
+    """What is unknown is as high as what is beside."""
+    while len(beside := _beside(z)):
+        z.reshape(-1)[beside[:, 0].astype(np.intp)] = beside[:, 1]
