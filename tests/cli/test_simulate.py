@@ -91,6 +91,32 @@ def test_a_second_laser_and_one_upside_down(tmp_path: Path) -> None:
     assert load_truth(tmp_path / "sim").scene["laser"]["upside_down"] == "unknown"
 
 
+def test_a_lidar_records_in_3d(tmp_path: Path) -> None:
+    flags = "--lidar 16 --scans 4 --people 3 --rate 5 --max-range 20 --set lidar.columns=90"
+    call("hall", "-o", str(tmp_path / "sim"), *flags.split())
+    read, truth = recording.read(tmp_path / "sim"), load_truth(tmp_path / "sim")
+    assert (read.dimension, read.n_beams) == (3, 4 * 16 * 90)
+    assert read.stamp_ns[1] - read.stamp_ns[0] == 200_000_000
+    assert np.linalg.norm(read.points, axis=1).max() == pytest.approx(20.0)
+    assert truth.scene["lidar"]["channels"] == 16
+    assert len(truth.static) == read.n_beams
+
+
+@pytest.mark.parametrize(
+    ("flags", "what"),
+    [
+        ("--lidar 0", "channels"),
+        ("--lidar 16 --beams 90", "laser.beams"),
+        ("--lidar 16 --second-laser", "laser.second_laser"),
+        ("--lidar 16 --format carmen", "3D"),
+    ],
+)
+def test_what_a_lidar_has_not_is_refused(tmp_path: Path, flags: str, what: str) -> None:
+    with pytest.raises(InputError, match=what):
+        call("hall", "-o", str(tmp_path / "sim"), *flags.split())
+    assert not (tmp_path / "sim").exists()
+
+
 def test_scenes_with_more_than_people_say_what_moves(tmp_path: Path) -> None:
     call("office", "-o", str(tmp_path / "sim"), *QUICK)
     truth = load_truth(tmp_path / "sim")

@@ -43,6 +43,7 @@ examples:
   stillmap simulate corridor -o sim --people 40 --scans 500 --seed 7
   stillmap simulate office-empty -o sim --format carmen
   stillmap simulate street -o sim --set traffic.vehicles=3 --json
+  stillmap simulate street -o sim --lidar 64 --scans 300 --set lidar.vibration_pitch=0.005
 """
 
 # flag, metavar, type, section and key of the option it sets, help
@@ -63,6 +64,12 @@ _FLAGS: tuple[tuple[str, str, type, str, str, str], ...] = (
     ("resets", "N", int, "odometry", "resets", "how often odometry begins again at its origin"),
     ("carried-at", "SHARE", float, "robot", "carried_at", "when the robot is carried elsewhere"),
     ("stamp-rounding", "S", float, "robot", "stamp_rounding", "how coarse stamps are, seconds"),
+)
+# section and key of options of the laser that a lidar has too, and its own key
+_OF_LIDAR = (
+    ("laser", "max_range", "max_range"),
+    ("laser", "range_noise", "range_noise"),
+    ("robot", "scan_rate", "rate"),
 )
 _GROUPS = {"crowd": "people", "robot": "robot", "laser": "laser", "odometry": "odometry"}
 _ODOMETRY_ERRORS = (
@@ -94,6 +101,12 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     groups["laser"].add_argument(
         "--second-laser", action="store_true", help="another one, that looks backwards"
+    )
+    groups["laser"].add_argument(
+        "--lidar",
+        metavar="N",
+        type=int,
+        help="a spinning lidar of so many channels instead: the world and the recording in 3D",
     )
     groups["odometry"].add_argument(
         "--odometry-noise",
@@ -152,11 +165,12 @@ def run(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise InputError(f"--seed must not be negative, got {args.seed}")
     if args.format == "carmen":
-        require_carmen(scene.laser)
+        require_carmen(scene)
     output = Path(args.output)
     require_new(output, MARK, args.overwrite)
     with shown_share(args.quiet, "simulating") as progress:
-        simulation = simulate(scene, np.random.default_rng(args.seed), progress)
+        rng, scratch = np.random.default_rng(args.seed), output.absolute().parent
+        simulation = simulate(scene, rng, progress, scratch if scratch.is_dir() else None)
     write_simulation(simulation, output, format=args.format, overwrite=args.overwrite)
     summary = _summary(simulation, output)
     if not args.quiet:
@@ -189,7 +203,23 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
         defaults = scene_by_name(args.scene).odometry
         scaled = {key: args.odometry_noise * getattr(defaults, key) for key in _ODOMETRY_ERRORS}
         changes.setdefault("odometry", {}).update(scaled)
+    if args.lidar is not None:
+        _give_to_lidar(args, changes)
     return merged(*map(parse_assignment, args.assignments), changes)
+
+
+def _give_to_lidar(args: argparse.Namespace, changes: dict[str, dict[str, Any]]) -> None:
+    """What the flags say of the laser, for the lidar that takes its place."""
+    if args.lidar < 1:
+        raise InputError(f"--lidar wants a number of channels, got {args.lidar}")
+    lidar: dict[str, Any] = {"channels": args.lidar}
+    for section, key, own in _OF_LIDAR:
+        if key in changes.get(section, {}):
+            lidar[own] = changes[section].pop(key)
+    if changes.get("laser"):
+        hint = "--set lidar.KEY=VALUE, see docs/simulation.md"
+        raise InputError(f"a lidar has no laser.{next(iter(changes['laser']))}", hint=hint)
+    changes["lidar"] = lidar
 
 
 def _summary(simulation: "Simulation", output: Path) -> dict[str, Any]:

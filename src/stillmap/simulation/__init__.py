@@ -1,5 +1,6 @@
 """Simulated recordings of places where people, doors and cars move, with the truth of each beam."""
 
+from stillmap.simulation.lidar_options import GroundOptions, HeightOptions, LidarOptions
 from stillmap.simulation.options import (
     CrowdOptions,
     DoorOptions,
@@ -19,8 +20,11 @@ __all__ = [
     "CrowdOptions",
     "Door",
     "DoorOptions",
+    "GroundOptions",
+    "HeightOptions",
     "Lane",
     "LaserOptions",
+    "LidarOptions",
     "Light",
     "OdometryOptions",
     "RobotOptions",

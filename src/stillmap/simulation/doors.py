@@ -17,6 +17,7 @@ class Doors:
 
     Attributes:
         share: (D,) how far each is open, from 0 to 1.
+        width: (D,) metres.
     """
 
     def __init__(
@@ -25,10 +26,10 @@ class Doors:
         D = len(doors)
         self._options, self._rng = options, rng
         self._hinge = np.array([door.hinge for door in doors]).reshape(-1, 2)
-        self._width = np.array([door.width for door in doors])
+        self.width = np.array([door.width for door in doors])
         self._closed = np.array([door.closed for door in doors])
         self._sweep = np.array([door.opened for door in doors]) - self._closed
-        leaf = self._width[:, None] * _direction(self._closed)
+        leaf = self.width[:, None] * _direction(self._closed)
         self._end, self._middle = self._hinge + leaf, self._hinge + leaf / 2
         self._opens = rng.random(D) < 0.5
         self.share = self._opens.astype(float)
@@ -41,12 +42,12 @@ class Doors:
 
     def poses(self) -> Float:
         """(D, 3) the middle of each leaf in metres and its direction in radians."""
-        middle = self._hinge + self._width[:, None] / 2 * _direction(self.angle)
+        middle = self._hinge + self.width[:, None] / 2 * _direction(self.angle)
         return np.column_stack([middle, self.angle])
 
     def faces(self) -> Float:
         """(D, 4) each leaf as a segment from its hinge."""
-        end = self._hinge + self._width[:, None] * _direction(self.angle)
+        end = self._hinge + self.width[:, None] * _direction(self.angle)
         return np.concatenate([self._hinge, end], axis=1)
 
     def step(self, dt: float, standing: Float, ways: Float) -> None:

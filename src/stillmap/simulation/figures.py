@@ -1,5 +1,7 @@
 """What a laser at knee or waist height sees of a person: two swinging legs, or a body."""
 
+from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,11 +20,15 @@ class Figures:
 
     Attributes:
         semi_axes: (Q, 2) metres, along and across the heading; a person has one part or two.
-        mover: (Q,) int32, whose part this is.
+        mover: (Q,) int32, whose part this is: first left legs, then right ones, then bodies.
     """
 
     def __init__(
-        self, people: int, shape: Shape, space: FreeSpace, rng: np.random.Generator
+        self,
+        people: int,
+        shape: Shape | Literal["whole"],  # a lidar sees legs and body of everybody
+        space: FreeSpace,
+        rng: np.random.Generator,
     ) -> None:
         self._space = space
         has_legs = np.full(people, shape == "legs")
@@ -31,6 +37,8 @@ class Figures:
         self._phase = rng.uniform(0, 2 * np.pi, people)
         self._half_step = np.full(people, 0.2)
         legs, bodies = np.flatnonzero(has_legs), np.flatnonzero(~has_legs)
+        if shape == "whole":
+            legs = bodies = np.arange(people)
         radius = rng.uniform(0.05, 0.07, people)
         deep, wide = rng.uniform(0.12, 0.17, people), rng.uniform(0.2, 0.25, people)
         self._apart = rng.uniform(0.08, 0.12, people)

@@ -49,6 +49,8 @@ class Motion:
         outlines: what it sees of doors and vehicles.
         things: what it sees of things: from one scan to the next they are elsewhere, or nowhere.
         still: (K, 4) faces of those among all these that never moved.
+        sizes: (P, 2) metres, length and width of doors and vehicles; NaN of people and things.
+        moved: (P,) whether each mover is anywhere else at any time.
     """
 
     period: float
@@ -62,6 +64,8 @@ class Motion:
     outlines: Outlines
     things: Outlines
     still: Float
+    sizes: Float
+    moved: NDArray[np.bool_]
 
 
 def move(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
@@ -76,7 +80,7 @@ def move(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
         InputError: no room for the robot on its route or for the people, or the robot is held up.
     """
     world = _World(scene, rngs)
-    o, rate = scene.robot, scene.robot.scan_rate * scene.laser.count
+    o, rate = scene.robot, scene.scan_rate
     steps = max(1, math.ceil(1.0 / (rate * _STEP) - 1e-9))
     dt = 1.0 / (rate * steps)
     expected = o.scans or world.robot.undisturbed_time() * rate
@@ -129,7 +133,8 @@ class _World:
         people_at = np.array(scene.people_at or scene.route[:1], float)
         people_planner = Planner(space, people_at, BODY_RADIUS + _PERSON_MARGIN)
         self.crowd = Crowd(scene.crowd, space, people_planner, start, rngs[0])
-        self.figures = Figures(scene.crowd.people, scene.crowd.shape, space, rngs[0])
+        shape = "whole" if scene.has_lidar else scene.crowd.shape
+        self.figures = Figures(scene.crowd.people, shape, space, rngs[0])
         self.doors = Doors(scene.leaves, scene.doors, rngs[1])
         self.traffic = Traffic(scene.lanes, scene.traffic, rngs[2])
         self._radius = o.radius
@@ -213,13 +218,19 @@ class _Log:
         mover = np.concatenate([others[:doors], np.repeat(others[doors:], 4)])
         moving = moved[mover]
         outlines = Outlines(faces[:, moving], mover[moving])
+        poses = np.concatenate([poses, placed.poses], axis=1)
+        sizes = np.full((poses.shape[1], 2), np.nan)
+        sizes[persons : persons + doors] = np.column_stack([world.doors.width, np.zeros(doors)])
+        sizes[persons + doors : len(kinds)] = world.traffic.size
         return Motion(
             **clock._asdict(),
             robot=np.stack(self.robot),
-            poses=np.concatenate([poses, placed.poses], axis=1),
+            poses=poses,
             kinds=kinds + ["thing"] * placed.poses.shape[1],
             people=people,
             outlines=outlines,
             things=placed.outlines,
             still=np.concatenate([faces[0, ~moving], placed.still]),
+            sizes=sizes,
+            moved=np.concatenate([moved, placed.moved]),
         )

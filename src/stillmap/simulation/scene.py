@@ -5,6 +5,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from stillmap.simulation.lidar_options import GroundOptions, HeightOptions, LidarOptions
 from stillmap.simulation.options import (
     CrowdOptions,
     DoorOptions,
@@ -142,6 +143,8 @@ class Scene:
         things: what is moved, brought or taken away. People and the robot keep clear of every
             place at which one ever stands.
         lights: where the robot stops while it is red.
+        pavements: rectangles that only a lidar sees, a kerb higher than the street: their least
+            and their greatest x and y, x0, y0, x1, y1.
     """
 
     name: str
@@ -160,9 +163,23 @@ class Scene:
     laser: LaserOptions = field(default_factory=LaserOptions)
     robot: RobotOptions = field(default_factory=RobotOptions)
     odometry: OdometryOptions = field(default_factory=OdometryOptions)
+    lidar: LidarOptions = field(default_factory=LidarOptions)
+    ground: GroundOptions = field(default_factory=GroundOptions)
+    heights: HeightOptions = field(default_factory=HeightOptions)
+    pavements: tuple[Segment, ...] = ()
 
     def __post_init__(self) -> None:
         require(len(self.walls) + len(self.glass) > 0, "a scene needs walls")
         require(len(self.route) > 0, "a scene needs a route")
         sweep_share = self.laser.sweep_time * self.robot.scan_rate
         require(sweep_share <= 1 + 1e-9, "sweep_time must not be longer than from scan to scan")
+
+    @property
+    def has_lidar(self) -> bool:
+        """Whether a lidar takes the place of the laser, and the world is one in 3D."""
+        return self.lidar.channels > 0
+
+    @property
+    def scan_rate(self) -> float:
+        """Hz, scans per second of all sensors."""
+        return self.lidar.rate if self.has_lidar else self.robot.scan_rate * self.laser.count

@@ -76,24 +76,25 @@ def cast(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOptions) ->
     parts = []
     for first in range(0, T, block):
         scans = np.arange(first, min(first + block, T))
-        now = _Moment(motion, np.repeat(scans, G), np.tile(sweep.seconds, len(scans)))
+        now = Moment(motion, np.repeat(scans, G), np.tile(sweep.seconds, len(scans)))
         T_robot_sensor = np.repeat(T_base_sensor[scans], G, axis=0)
-        poses = se2.parameters(se2.matrix(*now.robot.T) @ T_robot_sensor)
+        poses = se2.parameters(se2.matrix(*now.at(motion.robot).T) @ T_robot_sensor)
         poses[:, 2] += np.tile(turned, len(scans))
-        part = laser.cast(poses, group, walls, now.people, now.outlines, reach)
+        part = laser.cast(poses, group, walls, *now.seen(), reach)
         parts.append(
             [values[:, order].reshape(-1, G * sweep.group)[:, : o.beams] for values in part]
         )
     return Returns(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
-class _Moment:
+class Moment:
     """Where everything is at N times: `seconds` (N,) after the stamps of `scans` (N,).
 
     Between two scans all goes on evenly; after the last one as before it.
     """
 
     def __init__(self, motion: Motion, scans: Index, seconds: Float) -> None:
+        self._motion = motion
         later = seconds / motion.period
         # nothing goes on evenly while the robot is carried elsewhere, or stands overnight
         breaks = np.unique([0, motion.carried, motion.paused, len(motion.robot)])
@@ -103,15 +104,20 @@ class _Moment:
         self._scan, self._leap = scans, _FASTEST * motion.period
         self._before = np.maximum(np.minimum(scans + later.astype(np.int64), last), first)
         self._share = scans + later - self._before
-        people, outlines, things = motion.people, motion.outlines, motion.things
-        self.robot = self._at(motion.robot)
-        xy, heading = self._at(people.xy), self._at(people.heading)
-        self.people = Movers(xy, heading, people.semi_axes, people.mover)
-        # things do not fly from place to place
-        faces = np.concatenate([self._at(outlines.faces), things.faces[scans]], axis=1)
-        self.outlines = Outlines(faces, np.concatenate([outlines.mover, things.mover]))
 
-    def _at(self, values: Float) -> Float:
+    def seen(self) -> tuple[Movers, Outlines]:
+        """What a laser sees of the movers."""
+        people, outlines, things = self._motion.people, self._motion.outlines, self._motion.things
+        xy, heading = self.at(people.xy), self.at(people.heading)
+        # things do not fly from place to place
+        faces = np.concatenate([self.at(outlines.faces), things.faces[self._scan]], axis=1)
+        return (
+            Movers(xy, heading, people.semi_axes, people.mover),
+            Outlines(faces, np.concatenate([outlines.mover, things.mover])),
+        )
+
+    def at(self, values: Float) -> Float:
+        """(N, ...) values, which are given at all scans (T, ...)."""
         before = values[self._before]
         change = values[np.minimum(self._before + 1, self._last)] - before
         share = self._share.reshape(-1, *[1] * (values.ndim - 1))

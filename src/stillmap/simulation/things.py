@@ -20,11 +20,13 @@ class Placed(NamedTuple):
         outlines: the faces of those that are not the same at all scans; of no length while a thing
             is nowhere.
         still: (K, 4) the faces of those that are.
+        moved: (P,) which are not the same at all scans.
     """
 
     poses: Float
     outlines: Outlines
     still: Float
+    moved: NDArray[np.bool_]
 
 
 class Things:
@@ -47,6 +49,7 @@ class Things:
         """
         T, poses, still = len(seconds), [], [np.empty((0, 4))]
         moving, mover = [np.empty((T, 0, 4))], [np.empty(0, np.int32)]
+        moved: list[bool] = []
         for number, thing in enumerate(self._things, start=first):
             at = np.full((T, 3), np.nan)
             for stay in thing.stays:
@@ -54,13 +57,15 @@ class Things:
                 at[(seconds >= stay.since) & (seconds < end)] = (stay.x, stay.y, stay.yaw)
             faces = faces_at(thing, at)
             poses.append(at)
-            if np.array_equal(at, np.broadcast_to(at[0], at.shape)):
+            moved.append(not np.array_equal(at, np.broadcast_to(at[0], at.shape)))
+            if not moved[-1]:
                 still.append(faces[0])
             else:
                 moving.append(faces)
                 mover.append(np.full(len(thing.faces), number, np.int32))
         outlines = Outlines(np.concatenate(moving, axis=1), np.concatenate(mover))
-        return Placed(np.reshape(poses, (-1, T, 3)).swapaxes(0, 1), outlines, np.concatenate(still))
+        by_scan = np.reshape(poses, (-1, T, 3)).swapaxes(0, 1)
+        return Placed(by_scan, outlines, np.concatenate(still), np.array(moved, bool))
 
 
 def standing(thing: Thing, stay: Stay) -> Float:

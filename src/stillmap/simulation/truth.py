@@ -24,14 +24,16 @@ class Truth:
 
     Attributes:
         static: (M,) bool, the beam was reflected by something that stands still for good.
-        mover: (M,) int32, the id of the mover that reflected the beam, -1: none did.
-        T_world_base: (T, 3, 3) float64 true poses.
+        mover: (M,) int32, the id of the mover that reflected the beam, -1: none did, -2: the robot
+            itself.
+        T_world_base: (T, D+1, D+1) float64 true poses.
         walls: (W, 4) float64 segments x0, y0, x1, y1 in metres.
         movers: (T, P, 3) float64, where each mover is at each scan: x, y of its middle in metres,
             heading in rad. First people, then doors (heading: from the hinge), then vehicles, then
             things; NaN where there is no such thing at that scan.
         scene: name, seed and all parameters, JSON-able; under `mover_kinds` what each mover is:
-            "person", "door", "car", "forklift" or "thing".
+            "person", "door", "car", "forklift" or "thing". With a lidar, under `mover_sizes` the
+            length, width and height of each in metres, null where it has no such measure.
         lasting: (K, 4) faces of things that were moved or brought, where they stand at the end.
     """
 

@@ -7,7 +7,7 @@ from typing import Literal
 from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
 from stillmap.recording import carmen_writing, folder
-from stillmap.simulation.options import LaserOptions
+from stillmap.simulation.scene import Scene
 from stillmap.simulation.simulator import Simulation
 from stillmap.simulation.truth import write_truth
 
@@ -38,7 +38,7 @@ def write_simulation(
             cannot say what the laser measures.
     """
     if format == "carmen":
-        require_carmen(simulation.scene.laser)
+        require_carmen(simulation.scene)
     with new_folder(Path(path), MARK, overwrite) as work:
         if format == "carmen":
             _write_carmen(simulation, work / CARMEN_LOG)
@@ -47,12 +47,15 @@ def write_simulation(
         write_truth(simulation.truth, simulation.recording.stamp_ns, work)
 
 
-def require_carmen(laser: LaserOptions) -> None:
+def require_carmen(scene: Scene) -> None:
     """Whether FLASER lines can hold such scans: half a circle, ranges below the SICK's code.
 
     Raises:
         InputError: they cannot.
     """
+    if scene.has_lidar:
+        raise InputError("CARMEN logs hold no 3D scans", hint="the recording folder")
+    laser = scene.laser
     if abs(laser.fov - math.pi) > 1e-9:
         raise InputError("FLASER lines hold half a circle", hint="a field of view of 180 degrees")
     if laser.upside_down == "known":

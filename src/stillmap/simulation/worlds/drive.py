@@ -17,6 +17,7 @@ from stillmap.simulation.worlds.street import (
     FRONT,
     INNER,
     KERB,
+    OPEN_AIR,
     OUTER,
     PARKED,
     front,
@@ -69,6 +70,7 @@ def drive(people: int = 12) -> Scene:
         laser=LaserOptions(beams=181, max_range=80.0, range_noise=0.03, x=1.9),
         robot=RobotOptions(speed=15.6, acceleration=2.5, turn_rate=0.9, radius=0.9, scan_rate=75.0),
         odometry=OdometryOptions(wheel_base=1.5),
+        heights=OPEN_AIR,
     )
 
 

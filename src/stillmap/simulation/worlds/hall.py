@@ -1,5 +1,6 @@
 """An exhibition hall."""
 
+from stillmap.simulation.lidar_options import HeightOptions
 from stillmap.simulation.options import CrowdOptions
 from stillmap.simulation.scene import Point, Scene
 from stillmap.simulation.walls import Opening, box, pillar, room, wall
@@ -49,4 +50,5 @@ def hall(people: int = 15) -> Scene:
         glass=((45.0, 13.0, 45.0, 18.0),),
         route=(*west, *north, *east, *middle, *home),
         crowd=CrowdOptions(people=people),
+        heights=HeightOptions(ceiling=6.0, furniture=1.2),
     )

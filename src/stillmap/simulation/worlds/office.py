@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from stillmap.simulation.lidar_options import HeightOptions
 from stillmap.simulation.options import CrowdOptions
 from stillmap.simulation.scene import Door, Point, Scene, Segment
 from stillmap.simulation.walls import Opening, Side, box, leaf, pillar, room, wall
@@ -141,6 +142,7 @@ def office(people: int = 10) -> Scene:
         route=(*south, *north, (12.0, 7.7)),
         leaves=tuple(leaves),
         crowd=CrowdOptions(people=people),
+        heights=HeightOptions(furniture=0.75),
     )
 
 

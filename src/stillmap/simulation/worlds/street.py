@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from stillmap.simulation.lidar_options import HeightOptions
 from stillmap.simulation.options import (
     CrowdOptions,
     LaserOptions,
@@ -18,10 +19,12 @@ INNER, OUTER = 1.75, 5.25  # m from the middle of the road to the middles of the
 PARKED = 8.2  # m from there to the middles of parked cars
 KERB = 9.4  # m, beyond it are the pavements
 FRONT = 13.5  # m, where the houses stand
+YARD = FRONT + 10.0  # m, where their yards end
 
 LASER = LaserOptions(beams=181, max_range=80.0, range_noise=0.03, x=0.85)
 ROBOT = RobotOptions(speed=5.0, turn_rate=0.9, radius=0.9, scan_rate=10.0)
 ODOMETRY = OdometryOptions(wheel_base=1.5)
+OPEN_AIR = HeightOptions(ceiling=None)
 
 _LAYOUT_SEED = 35
 
@@ -54,6 +57,8 @@ def street(people: int = 16) -> Scene:
         laser=LASER,
         robot=ROBOT,
         odometry=ODOMETRY,
+        heights=OPEN_AIR,
+        pavements=((west, -YARD, east, -KERB), (west, KERB, east, YARD)),
     )
 
 

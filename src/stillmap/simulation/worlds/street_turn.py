@@ -13,9 +13,11 @@ from stillmap.simulation.worlds.street import (
     KERB,
     LASER,
     ODOMETRY,
+    OPEN_AIR,
     OUTER,
     PARKED,
     ROBOT,
+    YARD,
     front,
     parked,
     trees_and_lamps,
@@ -58,6 +60,8 @@ def street_turn(people: int = 12) -> Scene:
         laser=LASER,
         robot=ROBOT,
         odometry=ODOMETRY,
+        heights=OPEN_AIR,
+        pavements=_pavements(),
     )
 
 
@@ -69,6 +73,17 @@ def _outline(off: float) -> list[Segment]:
         *polyline([(_WEST, off), (west, off), (west, _NORTH)]),
         *polyline([(east, _SOUTH), (east, _NORTH)]),
     ]
+
+
+def _pavements() -> tuple[Segment, ...]:
+    west, east = _CROSSING - KERB, _CROSSING + KERB
+    return (
+        (_WEST, -YARD, west, -KERB),
+        (_WEST, KERB, west, YARD),
+        (_CROSSING - YARD, _SOUTH, west, -YARD),
+        (_CROSSING - YARD, YARD, west, _NORTH),
+        (east, _SOUTH, _CROSSING + YARD, _NORTH),
+    )
 
 
 def _walls() -> list[Segment]:

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from stillmap.simulation.lidar_options import HeightOptions
 from stillmap.simulation.options import CrowdOptions, TrafficOptions
 from stillmap.simulation.scene import Lane, Point, Scene, Segment
 from stillmap.simulation.walls import Opening, box, pillar, wall
@@ -41,6 +42,7 @@ def warehouse(people: int = 12) -> Scene:
         kerbs=((0.0, 25.0, 50.0, 25.0),),
         lanes=(Lane(_circuit(3.0, 47.0, 26.3, 28.5), "forklift"),),
         crowd=CrowdOptions(people=people),
+        heights=HeightOptions(ceiling=7.0),
         traffic=TrafficOptions(
             vehicles=2, min_speed=1.6, max_speed=2.4, stopping_share=1.0, max_stop=20.0
         ),
