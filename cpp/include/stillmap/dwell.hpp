@@ -184,9 +184,7 @@ inline void elements_of(const Surface<D>& surface, const Scans<D>& scans, int th
     for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
       if (!scans.hit[n]) return;
       const Segment<D> beam(pose, scans.points + n * D, surface.resolution());
-      const Cell<D> cell = cell_of<D>(beam.end);
-      if (const auto* block = cursor.block(cell))
-        element[n] = block->counts[static_cast<size_t>(Surface<D>::local_of(cell))];
+      element[n] = surface.owner(cursor, beam.end);
     });
   });
 }

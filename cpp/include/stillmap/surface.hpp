@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <limits>
 #include <stdexcept>
 #include <utility>
 #include <vector>
@@ -75,6 +76,23 @@ class Surface : public CellIndex<D> {
     });
   }
 
+  // The element that an end point is of: that of its cell, or where it lies off the surface there,
+  // the nearest one beside it that it does not lie off.
+  int32_t owner(Cursor<const Surface<D>>& cursor, const Vec<D>& end) const {
+    const Cell<D> cell = cell_of<D>(end);
+    const int32_t own = at(cursor, cell);
+    if (own == kNoElement || !lies_off(own, end)) return own;
+    int32_t nearest = own;
+    double least = std::numeric_limits<double>::infinity();
+    for_each_near<D>(cell, 1, [&](const Cell<D>& beside) {
+      const int32_t k = at(cursor, beside);
+      if (k == kNoElement || lies_off(k, end)) return;
+      const double apart = (element(k).mean - end).squaredNorm();
+      if (apart < least) least = apart, nearest = k;
+    });
+    return nearest;
+  }
+
   // Means, normals and scatter from all end points so far.
   void fit() {
     number_by_place();
@@ -94,6 +112,18 @@ class Surface : public CellIndex<D> {
     std::array<Fixed, D> first{};           // of end point - cell corner
     std::array<Fixed, kProducts> second{};  // of its products, by rows of the upper triangle
   };
+
+  int32_t at(Cursor<const Surface<D>>& cursor, const Cell<D>& cell) const {
+    const Block* block = cursor.block(cell);
+    return block ? block->counts[static_cast<size_t>(this->local_of(cell))] : kNoElement;
+  }
+
+  bool lies_off(int32_t k, const Vec<D>& end) const {
+    const Element<D>& e = element(k);
+    return std::abs(e.normal.dot(end - e.centre)) > kOff * scatter_ + 0.2;
+  }
+
+  static constexpr double kOff = 3.0;  // scatters
 
   // Neighbours get neighbouring numbers, tile by tile, so that a beam in any direction finds them
   // close together in memory.
@@ -205,10 +235,15 @@ class Surface : public CellIndex<D> {
       all += sums_[k].count;
       const bool wide = variance[1] > 0.15 * radius * radius;  // over three cells of five
       if (!wide || variance[0] >= 0.25 * variance[1]) continue;
+      const Vec<D> normal = axes.eigenvectors().col(0);
+      const Vec<D> middle = sums_[k].cell.template cast<double>() + spread.mean();
+      // feet, and wheels, are not of the ground that they stand on
+      const double apart = std::abs(normal.dot(element.mean - middle));
+      if (apart > 0.2 && apart * apart > 4.0 * variance[0]) continue;
       flat += sums_[k].count;
       across.emplace_back(std::sqrt(variance[0]), sums_[k].count);
-      element.normal = axes.eigenvectors().col(0);
-      element.centre = sums_[k].cell.template cast<double>() + spread.mean();
+      element.normal = normal;
+      element.centre = middle;
       // evenly spread points reach sqrt(3) deviations; the inner half is surely surface
       element.half = 0.5 * std::sqrt(3.0 * variance[1]);
       const Vec<D> centre = Vec<D>::Constant(0.5);  // as seen from the cell's corner

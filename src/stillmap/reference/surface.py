@@ -17,6 +17,9 @@ Cell = tuple[int, ...]
 WINDOWS = (2, 4, 6)  # cells to each side: the first in which half of the beams lie on surfaces
 WIDE = 0.15  # a surface varies along itself by more than this times the window's radius squared
 FLAT = 0.25  # and across itself by less than this times that
+OFF = 2.0  # standard deviations from the surface around it, from where on a cell is of another
+OFF_END = 3.0  # scatters, the same for a single end point
+OFF_LEAST = 0.2  # cells; nearer is on it, however smooth it is
 EXTENT = 0.5  # how much of the half width that evenly spread end points fill counts as surface
 
 
@@ -128,12 +131,28 @@ class Surface:
         out = np.full(len(np.asarray(points)), -1, np.int32)
         for beam in usable_beams(self.dimension, points, hit, offset, T_map_sensor):
             if beam.hit:
-                out[beam.number] = number.get(self._end_cell(beam), -1)
+                out[beam.number] = self._owner(beam, number)
         return out
 
     def numbers(self) -> dict[Cell, int]:
         """The element of each cell that has one."""
         return {cell: k for k, cell in enumerate(self.ends)}
+
+    def _owner(self, beam: Beam, number: dict[Cell, int]) -> int:
+        """That of its cell, or of the nearest one beside that it does not lie off."""
+        own = number.get(self._end_cell(beam), -1)
+        if own < 0 or not self._lies_off(own, beam.end):
+            return own
+        beside = [number[c] for c in near(self._end_cell(beam), 1) if c in number]
+        fit = [k for k in beside if not self._lies_off(k, beam.end)]
+        return min(fit, key=lambda k: np.sum((self.list[k].mean - beam.end) ** 2), default=own)
+
+    def _lies_off(self, k: int, end: Float) -> bool:
+        patch = self.list[k].patch
+        least = OFF_LEAST * self.resolution
+        return patch is not None and bool(
+            abs(patch.normal @ (end - patch.centre)) > OFF_END * self.scatter + least
+        )
 
     def _end_cell(self, beam: Beam) -> Cell:
         return tuple(cell_of(beam.end, self.resolution).tolist())
@@ -156,6 +175,9 @@ class Surface:
         if not wide or variance[0] >= FLAT * variance[1]:
             return None
         normal, centre = axes[:, 0], around.mean(axis=0)
+        apart = abs(float(normal @ (np.mean(self.ends[cell], axis=0) - centre)))
+        if apart > OFF_LEAST * self.resolution and apart**2 > OFF**2 * variance[0]:
+            return None  # feet, and wheels, are not of the ground that they stand on
         middle = (np.array(cell) + 0.5) * self.resolution
         return Patch(
             normal=normal,
