@@ -27,6 +27,8 @@ _SCENES = {
     "street": "180 m, there and back, 14 cars, 16 pedestrians",
     "street-moved": "parked cars drive off, others park",
     "street-turn": "185 m, once, cars that wait and cars that drive",
+    "street-jam": "the street with lights and a queue; everybody stops now and then",
+    "crossing": "two streets of 180 m, lights, old trees, a park, 16 cars, 30 pedestrians",
     "drive": "970 m by car, with a red light",
     "building": "grows with --scans, wing by wing",
     "ten-corridors": "56 x 37 m, corridors that all look the same",
