@@ -225,13 +225,15 @@ def _give_to_lidar(args: argparse.Namespace, changes: dict[str, dict[str, Any]])
 
 
 def _summary(simulation: "Simulation", output: Path) -> dict[str, Any]:
-    recording = simulation.recording
+    from stillmap.recording.spool import blocks
+
+    recording, mover = simulation.recording, simulation.truth.mover
     return {
         "output": str(output),
         "files": files_in(output),
         "scene": simulation.scene.name,
         "scans": recording.n_scans,
         "beams": recording.n_beams,
-        "hits": int(recording.hit.sum()),
-        "dynamic": int((simulation.truth.mover >= 0).sum()),
+        "hits": sum(int(recording.hit[part].sum()) for part in blocks(recording.hit)),
+        "dynamic": sum(int((mover[part] >= 0).sum()) for part in blocks(mover)),
     }

@@ -88,7 +88,7 @@ def _trees(rng: np.random.Generator) -> list[Segment]:
     places += [(30.0, -25.0), (46.0, -30.0), (60.0, -25.0), (24.0, -44.0), (56.0, -52.0)]
     walls: list[Segment] = []
     for x, y in places:
-        walls += pillar(x + rng.uniform(-0.3, 0.3), y, rng.uniform(0.55, 0.75), 10)
+        walls += pillar(x + rng.uniform(-0.3, 0.3), y, rng.uniform(0.66, 0.78), 10)
     return walls
 
 
