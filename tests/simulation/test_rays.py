@@ -108,6 +108,16 @@ def test_a_box_has_sides_and_a_top() -> None:
     assert z.min() > 0.2 - 1e-9
 
 
+@pytest.mark.parametrize("form", [BOX, CYLINDER, ELLIPSOID])
+def test_level_beams_along_an_axis_meet_what_is_in_their_way(form: int) -> None:
+    pattern = Pattern.of(LidarOptions(channels=1, columns=4, low=0.0, high=0.0))
+    beams = looking(pattern, matrix(np.array([[0.0, 0.0, 1.0]]), *np.zeros((3, 1))))
+    seen = rays.cast(beams, NO_FACES, [solid(form, [5, 0, 0, 0], (1, 2), (0, 2))], flat(), None)
+    np.testing.assert_allclose(seen.range[:, 0], [np.inf, np.inf, 4.0, np.inf])
+    above = solid(form, [5, 0, 0, 1.5], (1, 2), (0, 2))
+    assert np.isinf(rays.cast(beams, NO_FACES, [above], flat(), None).range).all()
+
+
 def test_an_ellipsoid_hangs_above_what_passes_under_it() -> None:
     _, beams = lidar()
     crown = solid(ELLIPSOID, [8, 0, 0, 0], (2, 3), (2.2, 4.2))
