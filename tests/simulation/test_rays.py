@@ -71,6 +71,8 @@ def test_an_upright_face_has_a_lower_and_an_upper_edge() -> None:
     assert 1.0 <= z.min() < 1.1
     assert 2.4 < z.max() <= 2.5
     assert np.abs(y).max() <= 9.0
+    hidden = rays.cast(beams, face, [solid(BOX, [3, 0, 0, 0], (0.5, 20), (0, 9))], flat(), None)
+    assert not hidden.on_glass[seen.on_glass].any()
     # below it one looks through to the ground behind
     x, _, z = ends(beams, seen, ~seen.on_glass & np.isfinite(seen.range))
     assert ((x > 5.5) & (np.abs(z) < 1e-9)).sum() > 30
