@@ -102,10 +102,24 @@ def test_a_lidar_records_in_3d(tmp_path: Path) -> None:
     assert len(truth.static) == read.n_beams
 
 
+def test_a_laser_that_tilts_makes_two_recordings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call("hall", "-o", str(tmp_path / "sim"), "--lidar", "tilting", *QUICK, "--json", "--quiet")
+    flat, tilting = (recording.read(tmp_path / "sim" / name) for name in ("horizontal", "tilting"))
+    assert (flat.dimension, tilting.dimension) == (2, 3)
+    assert flat.n_beams == tilting.n_beams == 20 * 90
+    assert json.loads(capsys.readouterr().out)["beams"] == 2 * 20 * 90
+    call("hall", "-o", str(tmp_path / "sim"), "--lidar", "tilting", *QUICK, "--overwrite")
+
+
 @pytest.mark.parametrize(
     ("flags", "what"),
     [
         ("--lidar 0", "channels"),
+        ("--lidar many", "channels"),
+        ("--lidar tilting --second-laser", "rig"),
+        ("--lidar tilting --format carmen", "3D"),
         ("--lidar 16 --beams 90", "laser.beams"),
         ("--lidar 16 --second-laser", "laser.second_laser"),
         ("--lidar 16 --format carmen", "3D"),

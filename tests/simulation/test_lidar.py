@@ -128,7 +128,8 @@ def test_points_of_movers_lie_on_them_at_the_time_of_the_beam(kind: str) -> None
         assert (np.abs(aside) < half[:, 1]).all()
     else:
         assert np.hypot(ahead, aside).max() < 0.6
-        # legs, torso and head
+        # they walk on the pavement; legs, torso and head
+        assert (ends[hit, 2] - tall).max() > 0.12 - 0.1
         assert (ends[hit, 2] > 1.5).any()
         assert (ends[hit, 2] < 0.7).any()
 
@@ -172,6 +173,18 @@ def test_the_robot_stands_on_the_slope_and_shakes() -> None:
     np.testing.assert_allclose(
         T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (80, 1, 1)), atol=1e-12
     )
+
+
+def test_a_plane_that_slopes_is_level_for_who_stands_on_it() -> None:
+    lidar = {**SMALL, **EXACT, "sweep": False}
+    ground = {"slope_x": 0.1, "slope_y": 0.2, "kerb": 0.0}
+    run = simulate(
+        scene_by_name("street", {"lidar": lidar, "ground": ground, "robot": {"scans": 5}}), 1
+    )
+    points = run.recording.points[run.truth.static]
+    road = (np.abs(points[:, 1]) < 1.7) & (points[:, 2] < -1.0)
+    assert road.sum() > 200
+    np.testing.assert_allclose(points[road, 2], -1.8, atol=1e-3)
 
 
 def test_beams_without_return_may_be_left_out() -> None:

@@ -71,6 +71,8 @@ def test_an_upright_face_has_a_lower_and_an_upper_edge() -> None:
     assert 1.0 <= z.min() < 1.1
     assert 2.4 < z.max() <= 2.5
     assert np.abs(y).max() <= 9.0
+    hidden = rays.cast(beams, face, [solid(BOX, [3, 0, 0, 0], (0.5, 20), (0, 9))], flat(), None)
+    assert not hidden.on_glass[seen.on_glass].any()
     # below it one looks through to the ground behind
     x, _, z = ends(beams, seen, ~seen.on_glass & np.isfinite(seen.range))
     assert ((x > 5.5) & (np.abs(z) < 1e-9)).sum() > 30
@@ -106,6 +108,16 @@ def test_a_box_has_sides_and_a_top() -> None:
     assert (off[2] < 1e-9).sum() > 50 < (off[1] < 1e-9).sum() + (off[0] < 1e-9).sum()
     assert (np.abs(u) < 2 + 1e-9).all()
     assert z.min() > 0.2 - 1e-9
+
+
+@pytest.mark.parametrize("form", [BOX, CYLINDER, ELLIPSOID])
+def test_level_beams_along_an_axis_meet_what_is_in_their_way(form: int) -> None:
+    pattern = Pattern.of(LidarOptions(channels=1, columns=4, low=0.0, high=0.0))
+    beams = looking(pattern, matrix(np.array([[0.0, 0.0, 1.0]]), *np.zeros((3, 1))))
+    seen = rays.cast(beams, NO_FACES, [solid(form, [5, 0, 0, 0], (1, 2), (0, 2))], flat(), None)
+    np.testing.assert_allclose(seen.range[:, 0], [np.inf, np.inf, 4.0, np.inf])
+    above = solid(form, [5, 0, 0, 1.5], (1, 2), (0, 2))
+    assert np.isinf(rays.cast(beams, NO_FACES, [above], flat(), None).range).all()
 
 
 def test_an_ellipsoid_hangs_above_what_passes_under_it() -> None:

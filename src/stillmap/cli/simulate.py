@@ -27,6 +27,8 @@ _SCENES = {
     "street": "180 m, there and back, 14 cars, 16 pedestrians",
     "street-moved": "parked cars drive off, others park",
     "street-turn": "185 m, once, cars that wait and cars that drive",
+    "street-jam": "the street with lights and a queue; everybody stops now and then",
+    "crossing": "two streets of 180 m, lights, old trees, a park, 16 cars, 30 pedestrians",
     "drive": "970 m by car, with a red light",
     "building": "grows with --scans, wing by wing",
     "ten-corridors": "56 x 37 m, corridors that all look the same",
@@ -105,8 +107,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     groups["laser"].add_argument(
         "--lidar",
         metavar="N",
-        type=int,
-        help="a spinning lidar of so many channels instead: the world and the recording in 3D",
+        help="a spinning lidar of so many channels instead: the world and the recording in 3D; or "
+        "'tilting': another laser that tilts",
     )
     groups["odometry"].add_argument(
         "--odometry-noise",
@@ -158,8 +160,14 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np  # this and what follows takes long to load
 
     from stillmap.output.atomic import require_new
-    from stillmap.simulation import scene_by_name, simulate, write_simulation
-    from stillmap.simulation.writing import MARK, require_carmen
+    from stillmap.simulation import scene_by_name, simulate, simulate_rig
+    from stillmap.simulation.writing import (
+        MARK,
+        RIG_MARK,
+        require_carmen,
+        write_rig,
+        write_simulation,
+    )
 
     scene = scene_by_name(args.scene, _changes(args))
     if args.seed < 0:
@@ -167,12 +175,20 @@ def run(args: argparse.Namespace) -> int:
     if args.format == "carmen":
         require_carmen(scene)
     output = Path(args.output)
-    require_new(output, MARK, args.overwrite)
+    require_new(output, RIG_MARK if scene.rig.tilts else MARK, args.overwrite)
     with shown_share(args.quiet, "simulating") as progress:
-        rng, scratch = np.random.default_rng(args.seed), output.absolute().parent
-        simulation = simulate(scene, rng, progress, scratch if scratch.is_dir() else None)
-    write_simulation(simulation, output, format=args.format, overwrite=args.overwrite)
-    summary = _summary(simulation, output)
+        rng, beside = np.random.default_rng(args.seed), output.absolute().parent
+        scratch = beside if beside.is_dir() else None
+        if scene.rig.tilts:
+            rig = simulate_rig(scene, rng, progress, scratch)
+            made = [rig.horizontal, rig.tilting]
+        else:
+            made = [simulate(scene, rng, progress, scratch)]
+    if scene.rig.tilts:
+        write_rig(rig, output, overwrite=args.overwrite)
+    else:
+        write_simulation(made[0], output, format=args.format, overwrite=args.overwrite)
+    summary = _summary(made, output)
     if not args.quiet:
         share = 100 * summary["dynamic"] / max(summary["hits"], 1)
         say(
@@ -203,16 +219,18 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
         defaults = scene_by_name(args.scene).odometry
         scaled = {key: args.odometry_noise * getattr(defaults, key) for key in _ODOMETRY_ERRORS}
         changes.setdefault("odometry", {}).update(scaled)
-    if args.lidar is not None:
-        _give_to_lidar(args, changes)
+    if args.lidar == "tilting":
+        changes["rig"] = {"tilts": True}
+    elif args.lidar is not None:
+        _give_to_lidar(args.lidar, changes)
     return merged(*map(parse_assignment, args.assignments), changes)
 
 
-def _give_to_lidar(args: argparse.Namespace, changes: dict[str, dict[str, Any]]) -> None:
+def _give_to_lidar(channels: str, changes: dict[str, dict[str, Any]]) -> None:
     """What the flags say of the laser, for the lidar that takes its place."""
-    if args.lidar < 1:
-        raise InputError(f"--lidar wants a number of channels, got {args.lidar}")
-    lidar: dict[str, Any] = {"channels": args.lidar}
+    if not channels.isascii() or not channels.isdigit() or int(channels[:9]) < 1:
+        raise InputError(f"--lidar wants a number of channels or 'tilting', got '{channels}'")
+    lidar: dict[str, Any] = {"channels": int(channels[:9])}
     for section, key, own in _OF_LIDAR:
         if key in changes.get(section, {}):
             lidar[own] = changes[section].pop(key)
@@ -222,14 +240,18 @@ def _give_to_lidar(args: argparse.Namespace, changes: dict[str, dict[str, Any]])
     changes["lidar"] = lidar
 
 
-def _summary(simulation: "Simulation", output: Path) -> dict[str, Any]:
-    recording = simulation.recording
+def _summary(made: "list[Simulation]", output: Path) -> dict[str, Any]:
+    """What there is of one recording, or of several taken at the same stamps."""
+    from stillmap.recording.spool import blocks
+
+    hits = [one.recording.hit for one in made]
+    movers = [one.truth.mover for one in made]
     return {
         "output": str(output),
         "files": files_in(output),
-        "scene": simulation.scene.name,
-        "scans": recording.n_scans,
-        "beams": recording.n_beams,
-        "hits": int(recording.hit.sum()),
-        "dynamic": int((simulation.truth.mover >= 0).sum()),
+        "scene": made[0].scene.name,
+        "scans": made[0].recording.n_scans,
+        "beams": sum(one.recording.n_beams for one in made),
+        "hits": sum(int(hit[part].sum()) for hit in hits for part in blocks(hit)),
+        "dynamic": sum(int((mover[part] >= 0).sum()) for mover in movers for part in blocks(mover)),
     }

@@ -1,14 +1,16 @@
-"""A spinning lidar on a robot: where it looks, from where, and what it measures."""
+"""Sensors in 3D: where they look, from where, and what they measure."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import se2
-from stillmap.simulation import rays
+from stillmap.simulation import laser, rays
 from stillmap.simulation.ground import Ground
-from stillmap.simulation.lidar_options import GroundOptions, LidarOptions
+from stillmap.simulation.lidar_options import GroundOptions, LidarOptions, RigOptions
+from stillmap.simulation.options import LaserOptions
 from stillmap.simulation.rays import Echoes, Rays
 from stillmap.simulation.scene import Scene
 from stillmap.simulation.solids import BOX, Faces, Part, assembled
@@ -27,12 +29,14 @@ class Pattern(NamedTuple):
         elevation: (C,) rad, rising, of the channels.
         direction: (3, n, C) of length one.
         seconds: (n,) after the scan's stamp, when each column looks.
+        off: rad, how far off its channel's elevation a beam may be.
     """
 
     azimuth: Float
     elevation: Float
     direction: Float
     seconds: Float
+    off: float = 0.0
 
     @classmethod
     def of(cls, o: LidarOptions) -> "Pattern":
@@ -50,6 +54,74 @@ class Pattern(NamedTuple):
         )
         seconds = share / o.rate if o.sweep else np.zeros(o.columns)
         return cls(azimuth, elevation, direction, seconds)
+
+    @classmethod
+    def tilted(cls, o: LaserOptions, joint: Float, seconds: Float) -> "Pattern":
+        """That of a planar laser which at each of its beams is tilted by (n,) rad, nose down."""
+        angle = laser.beam_angles(o.beams, o.fov)
+        direction = np.stack(
+            [np.cos(angle) * np.cos(joint), np.sin(angle), -np.cos(angle) * np.sin(joint)]
+        )
+        azimuth = np.unwrap(np.arctan2(direction[1], direction[0]))
+        return cls(azimuth, np.zeros(1), direction[..., None], seconds, np.pi)
+
+
+class Sensor(NamedTuple):
+    """What records, and how.
+
+    Attributes:
+        name: for the recording.
+        dimension: of its recording, 2 or 3.
+        T_base_sensor: (4, 4).
+        options: ranges, noise and losses.
+        pattern: the beams of each scan.
+        takes_time: whether the beams of a scan are taken one after the other.
+        leaves_out: whether beams without return are left out.
+        own: what of the robot itself it sees.
+    """
+
+    name: str
+    dimension: int
+    T_base_sensor: Float
+    options: LidarOptions | LaserOptions
+    pattern: Callable[[int], Pattern]
+    takes_time: bool
+    leaves_out: bool = False
+    own: Echoes | None = None
+
+
+def spinning(scene: Scene) -> Sensor:
+    """The lidar of a scene."""
+    o, pattern = scene.lidar, Pattern.of(scene.lidar)
+    T = matrix(np.array([o.x, o.y, o.z]), *np.array([0.0, o.pitch, o.yaw]))
+    own = own_body(scene, pattern, T) if o.sees_robot else None
+    leaves_out = o.no_returns == "left out"
+    return Sensor("simulated lidar", 3, T, o, lambda _: pattern, o.sweep, leaves_out, own)
+
+
+def of_rig(scene: Scene) -> tuple[Sensor, Sensor]:
+    """The laser of a scene, lying flat, and another one like it that tilts."""
+    o, rig = scene.laser, scene.rig
+    angle = laser.beam_angles(o.beams, o.fov)
+    seconds = o.sweep_time * (angle - angle[0]) / o.fov
+    flat = Pattern.tilted(o, np.zeros(o.beams), seconds)
+
+    def tilted(scan: int) -> Pattern:
+        return Pattern.tilted(o, joint_angle(scan / scene.scan_rate + seconds, rig), seconds)
+
+    low = matrix(np.array([o.x, o.y, rig.low_z]), *np.array([0.0, 0.0, o.yaw]))
+    pivot = matrix(np.array([rig.pivot_x, 0.0, rig.pivot_z]), *np.zeros(3))
+    takes_time = o.sweep_time > 0
+    return (
+        Sensor("simulated laser", 2, low, o, lambda _: flat, takes_time),
+        Sensor("simulated tilting laser", 3, pivot, o, tilted, takes_time),
+    )
+
+
+def joint_angle(seconds: Float, rig: RigOptions) -> Float:
+    """(...) rad, nose down, of the laser that tilts; it begins in the middle, on its way down."""
+    share = (seconds / rig.period + 0.25) % 1.0
+    return np.asarray(rig.middle + rig.amplitude * (1.0 - 4.0 * np.abs(share - 0.5)))
 
 
 def matrix(xyz: Float, roll: Float, pitch: Float, yaw: Float) -> Float:
@@ -87,11 +159,6 @@ def ridden(robot: Float, ground: Ground, o: LidarOptions, rng: np.random.Generat
     return np.stack([x, y, ground.height(x, y) + shaking[2], roll, pitch, yaw], axis=-1)
 
 
-def mounted(o: LidarOptions) -> Float:
-    """(4, 4) T_base_sensor."""
-    return matrix(np.array([o.x, o.y, o.z]), *np.array([0.0, o.pitch, o.yaw]))
-
-
 def looking(pattern: Pattern, T_world_sensor: Float) -> Rays:
     """The beams of one turn in the world.
 
@@ -103,17 +170,18 @@ def looking(pattern: Pattern, T_world_sensor: Float) -> Rays:
     R = T_world_sensor[:, :3, :3]
     turned = np.einsum("nij,jnc->inc", np.broadcast_to(R, (n, 3, 3)), pattern.direction)
     upright = np.arccos(np.clip(R[:, 2, 2], -1.0, 1.0)).max()
-    steepest = np.abs(pattern.elevation).max(initial=0.0)
+    steepest = np.arcsin(np.minimum(np.abs(pattern.direction[2]).max(initial=0.0), 1.0))
     off = np.tan(upright) * np.tan(steepest) * 1.1 + upright**2 if upright > 1e-9 else 0.0
     # the column's azimuth is that of a beam in it without elevation
     a, b = R[:, 0, 0], R[:, 1, 0]
     heading = np.unwrap(np.arctan2(b, a))
     azimuth = np.maximum.accumulate(pattern.azimuth + heading)
     origin = np.broadcast_to(T_world_sensor[:, :3, 3].T[:, :, None], (3, n, 1))
-    return Rays(origin, turned, azimuth, float(off), pattern.elevation, float(upright) + 1e-9)
+    tilt = float(upright) + pattern.off + 1e-9
+    return Rays(origin, turned, azimuth, float(off), pattern.elevation, tilt)
 
 
-def own_body(scene: Scene, pattern: Pattern) -> Echoes:
+def own_body(scene: Scene, pattern: Pattern, T_base_sensor: Float) -> Echoes:
     """What of the robot itself its lidar sees: a box as long and wide as its footprint."""
     o, radius = scene.lidar, scene.robot.radius
     top = max(o.z - _ROOF, 0.1)
@@ -121,13 +189,13 @@ def own_body(scene: Scene, pattern: Pattern) -> Echoes:
     body = box.at(np.zeros((1, 1, 3)), np.zeros((1, 1)))
     nothing = Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool))
     below = Ground.of(GroundOptions(), np.empty((0, 4)))
-    seen = rays.cast(looking(pattern, mounted(o)[None]), nothing, [body], below, None)
+    seen = rays.cast(looking(pattern, T_base_sensor[None]), nothing, [body], below, None)
     range = np.where(seen.mover == ROBOT, seen.range, np.inf)
     return seen._replace(range=range)
 
 
 def measure(
-    exact: Echoes, o: LidarOptions, rng: np.random.Generator
+    exact: Echoes, o: LidarOptions | LaserOptions, rng: np.random.Generator
 ) -> tuple[Float, NDArray[np.bool_]]:
     """Measured ranges (n, C) and whether something came back (n, C).
 

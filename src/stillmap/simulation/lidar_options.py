@@ -72,6 +72,25 @@ class LidarOptions:
 
 
 @dataclass(frozen=True)
+class RigOptions:
+    """Two lasers like `laser`: one lies flat, the other tilts about an axis from left to right."""
+
+    tilts: bool = field_with_doc(False, "there are two lasers, of which one tilts")
+    low_z: float = field_with_doc(0.35, "m, the laser that lies flat, above the floor")
+    pivot_x: float = field_with_doc(0.1, "m, the axis ahead of the base centre")
+    pivot_z: float = field_with_doc(0.9, "m, the same above the floor")
+    middle: float = field_with_doc(0.1, "rad, nose down, about which the laser tilts")
+    amplitude: float = field_with_doc(0.7, "rad, how far it tilts to either side of that")
+    period: float = field_with_doc(4.0, "s, for once up and down, at an even rate")
+
+    def __post_init__(self) -> None:
+        require(self.low_z > 0 and self.pivot_z > 0, "heights must be positive")
+        require(self.amplitude >= 0 and self.period > 0, "amplitude >= 0 and period > 0")
+        reach = abs(self.middle) + self.amplitude
+        require(reach <= _STEEPEST, "the laser must not tilt by more than 85 degrees")
+
+
+@dataclass(frozen=True)
 class GroundOptions:
     """The ground: a plane or a paraboloid, with pavements above it."""
 

@@ -133,7 +133,7 @@ class _World:
         people_at = np.array(scene.people_at or scene.route[:1], float)
         people_planner = Planner(space, people_at, BODY_RADIUS + _PERSON_MARGIN)
         self.crowd = Crowd(scene.crowd, space, people_planner, start, rngs[0])
-        shape = "whole" if scene.has_lidar else scene.crowd.shape
+        shape = "whole" if scene.in_3d else scene.crowd.shape
         self.figures = Figures(scene.crowd.people, shape, space, rngs[0])
         self.doors = Doors(scene.leaves, scene.doors, rngs[1])
         self.traffic = Traffic(scene.lanes, scene.traffic, rngs[2])

@@ -138,9 +138,9 @@ def _to_solid(rays: Rays, columns: slice, channels: slice, solids: Solids, k: in
 
 def _slab(u: Float, du: Float) -> tuple[Float, Float]:
     """Where rays enter and leave -1 <= u <= 1."""
-    one = 1.0 / du
-    middle, half = -u * one, np.abs(one)
-    return middle - half, middle + half
+    one = 1.0 / du  # infinite for rays along it: within from -inf to inf, or never
+    near, far = (-1.0 - u) * one, (1.0 - u) * one
+    return np.minimum(near, far), np.maximum(near, far)
 
 
 def _round(squares: Float, product: Float, rest: Float) -> tuple[Float, Float]:

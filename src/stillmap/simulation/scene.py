@@ -5,7 +5,12 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from stillmap.simulation.lidar_options import GroundOptions, HeightOptions, LidarOptions
+from stillmap.simulation.lidar_options import (
+    GroundOptions,
+    HeightOptions,
+    LidarOptions,
+    RigOptions,
+)
 from stillmap.simulation.options import (
     CrowdOptions,
     DoorOptions,
@@ -166,6 +171,7 @@ class Scene:
     lidar: LidarOptions = field(default_factory=LidarOptions)
     ground: GroundOptions = field(default_factory=GroundOptions)
     heights: HeightOptions = field(default_factory=HeightOptions)
+    rig: RigOptions = field(default_factory=RigOptions)
     pavements: tuple[Segment, ...] = ()
 
     def __post_init__(self) -> None:
@@ -173,13 +179,17 @@ class Scene:
         require(len(self.route) > 0, "a scene needs a route")
         sweep_share = self.laser.sweep_time * self.robot.scan_rate
         require(sweep_share <= 1 + 1e-9, "sweep_time must not be longer than from scan to scan")
+        if self.rig.tilts:
+            require(not self.lidar.channels, "a rig of two lasers has no lidar")
+            usual = not self.laser.second_laser and self.laser.upside_down == "no"
+            require(usual, "a rig has one laser that lies flat, and upright")
 
     @property
-    def has_lidar(self) -> bool:
-        """Whether a lidar takes the place of the laser, and the world is one in 3D."""
-        return self.lidar.channels > 0
+    def in_3d(self) -> bool:
+        """Whether a lidar takes the place of the laser, or another laser tilts."""
+        return self.lidar.channels > 0 or self.rig.tilts
 
     @property
     def scan_rate(self) -> float:
         """Hz, scans per second of all sensors."""
-        return self.lidar.rate if self.has_lidar else self.robot.scan_rate * self.laser.count
+        return self.lidar.rate if self.lidar.channels else self.robot.scan_rate * self.laser.count

@@ -12,6 +12,7 @@ _LEG = 0.1  # m, what is smaller is the leg of a chair
 _SEAT = 0.45  # m
 _LAMP, _LAMP_RADIUS = 6.0, 0.1  # m, posts that are thinner are of lamps
 _CROWN = 9.0  # times as wide as its trunk
+_WIDEST = 7.0  # m, half of what a crown measures
 _BRANCHES = 2.3  # m, where crowns begin
 
 
@@ -85,7 +86,7 @@ def round_thing(radius: float, heights: HeightOptions) -> list[Part]:
     if radius < _LAMP_RADIUS:
         lamp = Part(BOX, 0.0, 0.0, (0.35, 0.12), (_LAMP, _LAMP + 0.15))
         return [Part(CYLINDER, 0.0, 0.0, around, (0.0, _LAMP)), lamp]
-    crown = min(_CROWN * radius, 4.5)
+    crown = min(_CROWN * radius, _WIDEST)
     tall = _BRANCHES + math.sqrt(crown) * 2.0
     trunk = Part(CYLINDER, 0.0, 0.0, around, (0.0, _BRANCHES + 0.5))
     return [trunk, Part(ELLIPSOID, 0.0, 0.0, (crown, crown), (_BRANCHES, tall))]

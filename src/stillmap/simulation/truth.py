@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from stillmap.arrays import open_npy
 from stillmap.errors import InputError
+from stillmap.output.npy import write_npy
 from stillmap.output.trajectory import write_tum
 
 FOLDER = "truth"
 _SCENE = "scene.json"
 _ARRAYS = ("static", "mover", "T_world_base", "walls", "movers")
+_PER_BEAM = ("static", "mover")
 _LASTING = "lasting"  # only where there are any
 
 
@@ -51,7 +53,9 @@ def write_truth(truth: Truth, stamp_ns: NDArray[np.int64], folder: Path) -> None
     inside = folder / FOLDER
     inside.mkdir()
     for name in (*_ARRAYS, *([_LASTING] if len(truth.lasting) else [])):
-        np.save(inside / f"{name}.npy", getattr(truth, name), allow_pickle=False)
+        # those of each beam may be larger than memory
+        write = write_npy if name in _PER_BEAM else np.save
+        write(inside / f"{name}.npy", getattr(truth, name))
     write_tum(inside / "trajectory.tum", stamp_ns, truth.T_world_base)
     (inside / _SCENE).write_text(json.dumps(truth.scene, indent=1) + "\n", encoding="utf-8")
 

@@ -6,15 +6,17 @@ from typing import Literal
 
 from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
+from stillmap.output.npy import write_npy
 from stillmap.recording import carmen_writing, folder
 from stillmap.simulation.scene import Scene
-from stillmap.simulation.simulator import Simulation
+from stillmap.simulation.simulator import RigSimulation, Simulation
 from stillmap.simulation.truth import write_truth
 
 Format = Literal["stillmap", "carmen"]
 
 CARMEN_LOG = "recording.log"
 MARK = "truth"  # every simulation has it
+RIG_MARK = "tilting/truth"  # every one of two lasers has it
 
 
 def write_simulation(
@@ -47,13 +49,30 @@ def write_simulation(
         write_truth(simulation.truth, simulation.recording.stamp_ns, work)
 
 
+def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write what two lasers recorded, each with its truth, into one folder.
+
+    `horizontal` and `tilting` are folders as `write_simulation` makes them; `joint_angle.npy` (T,)
+    beside them has the joint's angle in rad at each stamp.
+
+    Raises:
+        InputError: the folder holds something already or cannot be written to.
+    """
+    with new_folder(Path(path), RIG_MARK, overwrite) as work:
+        for name, one in (("horizontal", rig.horizontal), ("tilting", rig.tilting)):
+            (work / name).mkdir()
+            folder.write_into(one.recording, work / name)
+            write_truth(one.truth, one.recording.stamp_ns, work / name)
+        write_npy(work / "joint_angle.npy", rig.joint_angle)
+
+
 def require_carmen(scene: Scene) -> None:
     """Whether FLASER lines can hold such scans: half a circle, ranges below the SICK's code.
 
     Raises:
         InputError: they cannot.
     """
-    if scene.has_lidar:
+    if scene.in_3d:
         raise InputError("CARMEN logs hold no 3D scans", hint="the recording folder")
     laser = scene.laser
     if abs(laser.fov - math.pi) > 1e-9:

@@ -9,12 +9,14 @@ from stillmap.options import replaced
 from stillmap.simulation.scene import Scene
 from stillmap.simulation.worlds.building import building
 from stillmap.simulation.worlds.corridor import corridor
+from stillmap.simulation.worlds.crossing import crossing
 from stillmap.simulation.worlds.drive import drive
 from stillmap.simulation.worlds.hall import hall
 from stillmap.simulation.worlds.moved import office_moved, street_moved, warehouse_moved
 from stillmap.simulation.worlds.office import office
 from stillmap.simulation.worlds.rounds import rounds
 from stillmap.simulation.worlds.street import street
+from stillmap.simulation.worlds.street_jam import street_jam
 from stillmap.simulation.worlds.street_turn import street_turn
 from stillmap.simulation.worlds.ten_corridors import ten_corridors
 from stillmap.simulation.worlds.warehouse import warehouse
@@ -28,6 +30,8 @@ _WORLDS: dict[str, Callable[[], Scene]] = {
     "warehouse": warehouse,
     "street": street,
     "street-turn": street_turn,
+    "street-jam": street_jam,
+    "crossing": crossing,
     "drive": drive,
     "building": building,
     "ten-corridors": ten_corridors,
