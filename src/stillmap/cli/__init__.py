@@ -11,7 +11,7 @@ from typing import NoReturn
 from stillmap.cli.commands import COMMANDS, parser
 from stillmap.cli.parsing import EXIT_INPUT
 from stillmap.cli.progress import fail, say
-from stillmap.cli.stopping import EXIT_INTERRUPTED, hear_signals
+from stillmap.cli.stopping import EXIT_INTERRUPTED, EXIT_TERMINATED, hear_signals
 from stillmap.errors import InputError, nearest
 
 EXIT_OURS = 1
@@ -37,8 +37,7 @@ def main(argv: list[str] | None = None) -> int:
         fail(str(_with_similar_name(error, args)))
         return EXIT_INPUT
     except KeyboardInterrupt:
-        say("interrupted, nothing was half-written")
-        return EXIT_INTERRUPTED
+        return _interrupted()
     except BrokenPipeError:
         # the reader of our output has gone: nothing more can be said, and nothing is wrong
         _drop_stdout()
@@ -52,6 +51,9 @@ def main(argv: list[str] | None = None) -> int:
         fail(f"not enough memory{': ' if str(error) else ''}{error}")
         return EXIT_INPUT
     except Exception as error:
+        behind = _stopped_by(error)
+        if behind is not None:
+            return EXIT_TERMINATED if isinstance(behind, SystemExit) else _interrupted()
         _report_defect(error)
         return EXIT_OURS
 
@@ -120,6 +122,18 @@ def _report_defect(error: Exception) -> None:
     if sys.stderr is not None:
         traceback.print_exception(error)
     fail("this is a defect of stillmap: please report it, with the lines above")
+
+
+def _stopped_by(error: BaseException | None) -> BaseException | None:
+    """The Ctrl-C or SIGTERM behind an error that was made of it while something was closed."""
+    while error is not None and not isinstance(error, KeyboardInterrupt | SystemExit):
+        error = error.__cause__ or error.__context__
+    return error
+
+
+def _interrupted() -> int:
+    say("interrupted, nothing was half-written")
+    return EXIT_INTERRUPTED
 
 
 def _flush_stdout() -> None:
