@@ -24,6 +24,7 @@ from stillmap.slam.registration import (
     taken,
 )
 from stillmap.slam.scans import Scan, SurfaceOptions, hits
+from stillmap.slam.spinning import SpinningOptions
 
 Float = NDArray[np.float64]
 
@@ -45,6 +46,7 @@ class SlamOptions:
     registration: RegistrationOptions = field(default=RegistrationOptions())
     surface: SurfaceOptions = field(default=SurfaceOptions())
     loops: LoopOptions = field(default=LoopOptions())
+    spinning: SpinningOptions = field(default=SpinningOptions())
 
     def __post_init__(self) -> None:
         if not 0.005 <= self.resolution <= 10.0:
