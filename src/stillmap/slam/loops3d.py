@@ -44,7 +44,10 @@ class SpinningLoopOptions:
     sigma_translation: float = field_with_doc(0.03, "m, error of a closure at least")
     sigma_rotation: float = field_with_doc(0.002, "rad, error of a closure at least")
     compared: float = field_with_doc(
-        0.85, "of the share that the local map explained, that the earlier map must explain"
+        0.75, "of the share that the local map explained, that the earlier map must explain"
+    )
+    met: float = field_with_doc(
+        0.55, "share of surfaces that must meet earlier ones, those of every direction alike"
     )
     through: float = field_with_doc(
         0.1, "share of beams that pass through the earlier map, beyond those that did at that time"
@@ -55,6 +58,8 @@ class SpinningLoopOptions:
         for name, low, high in _LIMITS:
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"'slam.spinning_loops.{name}' wants {low:g} to {high:g}")
+        if 2.0 * self.stretch > self.gap:  # else a sweep may lie in the map it is laid on
+            raise ValueError("'slam.spinning_loops.stretch' wants half of 'gap' at most")
 
 
 _LIMITS = (
@@ -71,6 +76,7 @@ _LIMITS = (
     ("sigma_translation", 1e-4, 10.0),
     ("sigma_rotation", 1e-5, 10.0),
     ("compared", 0.0, 1.0),
+    ("met", 0.0, 1.0),
     ("through", 0.0, 1.0),
     ("misfit", 1e-3, 1e9),
 )
@@ -218,6 +224,8 @@ def _laid_on(
     )
     if explained < options.compared * driven.explained[later]:
         return refuse(closure, "explains too little")
+    if _share_met(drive, local, sweep, later, state) < options.met:
+        return refuse(closure, "surfaces do not meet")
     if _through(drive, solid, sweep, later, state) > usual + options.through:
         return refuse(closure, "looks through what is there")
     off = se3.log(se2.inverse(T) @ found)
@@ -251,6 +259,40 @@ def _local_map(drive: _Drive, earlier: int) -> tuple[_core.SweepMap3D, _core.Gri
         )
     state = State(driven.poses[earlier], driven.twists[earlier], np.zeros((12, 12)))
     return local, solid, _through(drive, solid, drive.sweep(earlier), earlier, state)
+
+
+def _share_met(
+    drive: _Drive, local: _core.SweepMap3D, sweep: Sweep, later: int, state: State
+) -> float:
+    """Share of the surfaces around a later sweep that lie on earlier ones.
+
+    Most of what a lidar sees on a street is the street, which meets any other. So every beam counts
+    by its leverage n^T (sum n n^T)^-1 n, n being the normal where it ended, as the map of its own
+    time has it: surfaces of every direction count the same.
+    """
+    own = _local_map(drive, later)[0]
+    points = sweep.at_its_stamp(state.twist).astype(np.float64)
+    normals, known = _surfaces(drive.spinning, own, points, drive.driven.poses[later])
+    n = normals[known]
+    if len(n) < 10:
+        return 0.0
+    spread = n.T @ n + 1e-6 * len(n) * np.eye(3)
+    leverage = np.einsum("ni,ij,nj->n", n, np.linalg.inv(spread), n)
+    _, met = _surfaces(drive.spinning, local, points[known], state.T_map_base)
+    return float(leverage[met].sum() / leverage.sum())
+
+
+def _surfaces(
+    options: SpinningOptions, local: _core.SweepMap3D, points: Float, T: Float
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Normals (N, 3) in the frame of the base where points (N, 3) at a pose T lie on surfaces of
+    the finest cells, and where they do (N,)."""
+    places = np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3])
+    normals, offsets, variances, known = local.planes(
+        places, 0, least=options.least, flat=options.flat, wide=options.wide
+    )
+    near = offsets**2 < options.kernel**2 * (options.sigma**2 + variances)
+    return normals @ T[:3, :3], (known == 1) & near
 
 
 def _through(drive: _Drive, solid: _core.Grid3D, sweep: Sweep, t: int, state: State) -> float:
