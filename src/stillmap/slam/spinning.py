@@ -135,12 +135,12 @@ def _silent(done: int, total: int) -> None:
 
 
 def _first_twist(recording: Recording, poses: Float) -> Float:
-    """(6,) steady motion from the first of poses (n, 4, 4) to the next one that is later."""
+    """(6,) steady motion from the first of poses (n, 4, 4) to the second one that is later."""
     seconds = 1e-9 * (recording.stamp_ns[: len(poses)] - recording.stamp_ns[0])
     later = np.flatnonzero(seconds > 0.0)
     if not len(later):
         return np.zeros(6)
-    n = int(later[0])
+    n = int(later[:2][-1])  # to the first one it would be as uncertain again
     twist: Float = se3.log(se2.inverse(poses[0]) @ poses[n]) / seconds[n]
     return twist
 
