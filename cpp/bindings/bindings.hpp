@@ -10,5 +10,6 @@ void bind_register(nanobind::module_& m);
 void bind_dwell(nanobind::module_& m);
 void bind_held_out(nanobind::module_& m);
 void bind_look_counts(nanobind::module_& m);
+void bind_sweep(nanobind::module_& m);
 
 }  // namespace stillmap::border

@@ -16,4 +16,5 @@ NB_MODULE(_core, m) {
   stillmap::border::bind_dwell(m);
   stillmap::border::bind_held_out(m);
   stillmap::border::bind_look_counts(m);
+  stillmap::border::bind_sweep(m);
 }

@@ -27,6 +27,13 @@ from stillmap.reference.look_counts import LookCounts, LookCounts2D, LookCounts3
 from stillmap.reference.no_return import add_lost
 from stillmap.reference.search import Lattice, search_lattice
 from stillmap.reference.surface import Surface, Surface2D, Surface3D
+from stillmap.reference.sweep_map import (
+    SweepMap3D,
+    carried,
+    first_in_cells,
+    linearise_sweep,
+    register_sweep,
+)
 from stillmap.reference.traverse import cell_of, traverse
 
 __all__ = [
@@ -50,19 +57,24 @@ __all__ = [
     "Surface",
     "Surface2D",
     "Surface3D",
+    "SweepMap3D",
     "add_beams",
     "add_lost",
+    "carried",
     "cell_of",
     "course",
     "e_step",
     "em_fixed_poses",
     "field",
     "fill_surfaces",
+    "first_in_cells",
     "held_out",
+    "linearise_sweep",
     "log_likelihood",
     "look_at",
     "m_step_map",
     "occupancy",
+    "register_sweep",
     "registration_cost",
     "registration_curvature",
     "registration_gradient",

@@ -13,6 +13,7 @@ from stillmap.recording.model import Recording
 from stillmap.slam import motion, stalls
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.loops import Closure, LoopOptions
+from stillmap.slam.loops3d import SpinningLoopOptions
 from stillmap.slam.motion import MotionOptions, MotionPrior
 from stillmap.slam.pose_graph import Graph
 from stillmap.slam.registration import (
@@ -24,6 +25,7 @@ from stillmap.slam.registration import (
     taken,
 )
 from stillmap.slam.scans import Scan, SurfaceOptions, hits
+from stillmap.slam.spinning import SpinningOptions
 
 Float = NDArray[np.float64]
 
@@ -48,6 +50,8 @@ class SlamOptions:
     registration: RegistrationOptions = field(default=RegistrationOptions())
     surface: SurfaceOptions = field(default=SurfaceOptions())
     loops: LoopOptions = field(default=LoopOptions())
+    spinning: SpinningOptions = field(default=SpinningOptions())
+    spinning_loops: SpinningLoopOptions = field(default=SpinningLoopOptions())
 
     def __post_init__(self) -> None:
         if not 0.005 <= self.resolution <= 10.0:

@@ -5,15 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import se2
+from stillmap import se2, se3
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 
 def travel(poses: Float) -> Float:
-    """(T,) metres travelled up to each of the poses (T, 3, 3)."""
-    steps = np.linalg.norm(np.diff(poses[:, :2, 2], axis=0), axis=1)
+    """(T,) metres travelled up to each of the poses (T, D+1, D+1)."""
+    steps = np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)
     return np.concatenate([[0.0], steps.cumsum()])
 
 
@@ -22,11 +22,9 @@ def chosen(poses: Float, distance: float, turn: float, breaks: Sequence[int] = (
 
     The first and the last one are among them, and those before and after each of the breaks.
     """
-    x = se2.parameters(poses)
-    metres = np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1)
-    radians = np.abs(se2.wrap(np.diff(x[:, 2])))
+    metres = np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)
     kept, since = [0], 0.0
-    for t, step in enumerate(metres / distance + radians / turn, start=1):
+    for t, step in enumerate(metres / distance + _turns(poses) / turn, start=1):
         since += step
         if since >= 1.0:
             kept.append(t)
@@ -35,6 +33,15 @@ def chosen(poses: Float, distance: float, turn: float, breaks: Sequence[int] = (
         kept.append(len(poses) - 1)
     beside = [t + side for t in breaks for side in (-1, 0)]
     return np.unique(np.array([*kept, *beside], np.intp))
+
+
+def _turns(poses: Float) -> Float:
+    """(T-1,) radians from each pose to the next one."""
+    if poses.shape[-1] == 3:
+        return np.abs(se2.wrap(np.diff(se2.parameters(poses)[:, 2])))
+    steps = se3.log_rotation(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
+    turns: Float = np.linalg.norm(steps, axis=-1)
+    return turns
 
 
 def chosen_of_each(
@@ -48,7 +55,7 @@ def chosen_of_each(
 
 
 def spread(poses: Float, keyframes: Index, moved: Float) -> Float:
-    """(T, 3, 3) all poses when the keyframes among them moved to (K, 3, 3).
+    """(T, D+1, D+1) all poses when the keyframes among them moved to (K, D+1, D+1).
 
     A scan between two keyframes is carried along by both; how far it is from each, in travel and
     then in time, says how the two are blended.
@@ -61,8 +68,10 @@ def spread(poses: Float, keyframes: Index, moved: Float) -> Float:
     span = at[keyframes[right]] - at[keyframes[left]]
     share = ((at - at[keyframes[left]]) / span)[:, None]
     correction = moved @ se2.inverse(poses[keyframes])
-    one = se2.parameters(correction[left] @ poses)
-    other = se2.parameters(correction[right] @ poses)
-    difference = other - one
+    one, other = correction[left] @ poses, correction[right] @ poses
+    if poses.shape[-1] == 4:
+        return se3.normalised(one @ se3.exp(share * se3.log(se2.inverse(one) @ other)))
+    x = se2.parameters(one)
+    difference = se2.parameters(other) - x
     difference[:, 2] = se2.wrap(difference[:, 2])
-    return se2.matrix(*(one + share * difference).T)
+    return se2.matrix(*(x + share * difference).T)

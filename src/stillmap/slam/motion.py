@@ -79,10 +79,8 @@ class MotionPrior:
         return 0.5 * float(d @ self.information @ d)
 
 
-def from_odometry(T_map_base: Float, increment: Float, options: MotionOptions) -> MotionPrior:
-    """The prior after moving by an odometry increment (3, 3) from a pose (3, 3)."""
-    x, y, theta = se2.parameters(increment)
-    distance, turn = float(np.hypot(x, y)), abs(float(theta))
+def sigmas(distance: float, turn: float, options: MotionOptions) -> tuple[float, float]:
+    """Standard deviations in metres and radians of an increment of so many metres and radians."""
     sigma_xy = (
         options.translation_floor
         + options.translation_per_metre * distance
@@ -93,6 +91,13 @@ def from_odometry(T_map_base: Float, increment: Float, options: MotionOptions) -
         + options.rotation_per_metre * distance
         + options.rotation_per_radian * turn
     )
+    return sigma_xy, sigma_theta
+
+
+def from_odometry(T_map_base: Float, increment: Float, options: MotionOptions) -> MotionPrior:
+    """The prior after moving by an odometry increment (3, 3) from a pose (3, 3)."""
+    x, y, theta = se2.parameters(increment)
+    sigma_xy, sigma_theta = sigmas(float(np.hypot(x, y)), abs(float(theta)), options)
     return _prior(T_map_base @ increment, sigma_xy, sigma_theta, measured=True)
 
 

@@ -1,6 +1,8 @@
-"""A graph of poses in the plane: what is known of pairs of them, and the poses that fit best.
+"""A graph of poses: what is known of pairs of them, and the poses that fit best.
 
-The only file that knows GTSAM. Its factors compare x, y, heading in the frame of the second pose.
+The only file that knows GTSAM. In the plane its factors compare x, y, heading in the frame of the
+second pose, in space the twist that leads to it: (translation, rotation). Which it is, the shape of
+the poses tells: (K, 3, 3) or (K, 4, 4).
 """
 
 from dataclasses import dataclass
@@ -9,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import se2
+from stillmap import se2, se3
 
 Float = NDArray[np.float64]
 
@@ -23,8 +25,9 @@ class Relation:
 
     Attributes:
         first, second: indices of poses, of keyframes in a Graph.
-        T: (3, 3).
-        covariance: (3, 3) of x, y, heading in the frame of the second pose.
+        T: (D+1, D+1).
+        covariance: (3, 3) of x, y, heading in the frame of the second pose; in space (6, 6) of
+            translation and rotation.
     """
 
     first: int
@@ -52,7 +55,7 @@ class Graph:
 
     Attributes:
         scans: (K,) numbers of the scans that are keyframes, rising.
-        poses: (K, 3, 3) T_map_base that fit the relations best.
+        poses: (K, D+1, D+1) T_map_base that fit the relations best.
         relations: along the way first, then the loops that were accepted; between keyframes.
     """
 
@@ -64,14 +67,14 @@ class Graph:
 def optimised(
     poses: Float, chain: list[Relation], loops: list[Relation], robust: Robust | None
 ) -> Float:
-    """(K, 3, 3) poses of least squares; the first one stays where it is.
+    """(K, D+1, D+1) poses of least squares; the first one stays where it is.
 
     With `robust`, loops that the others contradict lose their weight: Geman and McClure's loss,
     which is made sharper from solution to solution (graduated non-convexity, Yang et al., RA-L
     2020), so that the start does not decide which of them are believed.
 
     Args:
-        poses: (K, 3, 3) the start.
+        poses: (K, D+1, D+1) the start.
         chain: relations that are trusted.
         loops: relations that may be false.
         robust: None: plain least squares.
@@ -107,12 +110,15 @@ class _Problem:
 def _problem(poses: Float, chain: list[Relation]) -> _Problem:
     import gtsam  # takes long to load
 
-    start = gtsam.Values()
-    for k, parameters in enumerate(se2.parameters(poses)):
-        start.insert(k, gtsam.Pose2(*parameters))
-    graph = gtsam.NonlinearFactorGraph()
-    fixed = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
-    graph.add(gtsam.PriorFactorPose2(0, start.atPose2(0), fixed))
+    start, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
+    for k, pose in enumerate(_as_gtsam(poses)):
+        start.insert(k, pose)
+    if poses.shape[-1] == 3:
+        fixed = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
+        graph.add(gtsam.PriorFactorPose2(0, start.atPose2(0), fixed))
+    else:
+        fixed = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+        graph.add(gtsam.PriorFactorPose3(0, start.atPose3(0), fixed))
     for relation in chain:
         graph.add(_factor(relation, 1.0))
     return _Problem(graph, start)
@@ -133,21 +139,27 @@ def _least_squares(
 
 
 def _poses(found: Any, first: Float) -> Float:
-    """(K, 3, 3) of GTSAM's values; the first one is known."""
+    """(K, D+1, D+1) of GTSAM's values; the first one is known."""
     import gtsam
 
-    out = se2.matrix(*gtsam.utilities.extractPose2(found).T)
+    if len(first) == 3:
+        out = se2.matrix(*gtsam.utilities.extractPose2(found).T)
+    else:
+        rows = gtsam.utilities.extractPose3(found)  # nine of the rotation, by rows; x, y, z
+        out = np.tile(np.eye(4), (len(rows), 1, 1))
+        out[:, :3, :3], out[:, :3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
     out[0] = first
     return out
 
 
 def misfits(poses: Float, relations: list[Relation]) -> Float:
-    """(L,) squared Mahalanobis distances of relations to the poses: chi-square, 3 degrees."""
+    """(L,) squared Mahalanobis distances of relations to the poses: chi-square, 3 or 6 degrees."""
     if not relations:
         return np.zeros(0)
     first, second = np.array([[r.first, r.second] for r in relations]).T
     found = se2.inverse(poses[first]) @ poses[second]
-    d = se2.parameters(se2.inverse(np.array([r.T for r in relations])) @ found)
+    apart = se2.inverse(np.array([r.T for r in relations])) @ found
+    d = se2.parameters(apart) if apart.shape[-1] == 3 else se3.log(apart)
     solved = np.linalg.solve(np.array([r.covariance for r in relations]), d[..., None])[..., 0]
     out: Float = (d * solved).sum(axis=1)
     return out
@@ -156,6 +168,20 @@ def misfits(poses: Float, relations: list[Relation]) -> Float:
 def _factor(relation: Relation, weight: float) -> Any:
     import gtsam
 
-    noise = gtsam.noiseModel.Gaussian.Covariance(relation.covariance / weight)
-    T = gtsam.Pose2(*se2.parameters(relation.T))
-    return gtsam.BetweenFactorPose2(relation.first, relation.second, T, noise)
+    covariance = relation.covariance / weight
+    factor: Any = gtsam.BetweenFactorPose2
+    if len(relation.T) == 4:
+        factor = gtsam.BetweenFactorPose3
+        covariance = np.roll(covariance, 3, axis=(0, 1))  # GTSAM has the rotation first
+    noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    [T] = _as_gtsam(relation.T[None])
+    return factor(relation.first, relation.second, T, noise)
+
+
+def _as_gtsam(poses: Float) -> list[Any]:
+    """Poses (K, D+1, D+1) as GTSAM has them."""
+    import gtsam
+
+    if poses.shape[-1] == 3:
+        return [gtsam.Pose2(*parameters) for parameters in se2.parameters(poses)]
+    return [gtsam.Pose3(pose) for pose in poses]
