@@ -47,6 +47,12 @@ struct Element {
 template <int D>
 class Surface : public CellIndex<D> {
  public:
+  // In space things stand on surfaces, on the ground most of all; in a plane they stand beside
+  // them, and what lies off a wall is most often the wall, seen from a pose that is off.
+  static constexpr bool kStandsOn = D == 3;
+  static constexpr double kOff = 2.0;     // standard deviations by which a cell is off a surface
+  static constexpr double kOffEnd = 3.0;  // scatters by which a single end point is
+  static constexpr double kNear = 0.2;    // cells; nearer is on it, however smooth it is
   static constexpr int kProducts = D * (D + 1) / 2;
 
   using Block = typename CellIndex<D>::Block;
@@ -81,7 +87,7 @@ class Surface : public CellIndex<D> {
   int32_t owner(Cursor<const Surface<D>>& cursor, const Vec<D>& end) const {
     const Cell<D> cell = cell_of<D>(end);
     const int32_t own = at(cursor, cell);
-    if (own == kNoElement || !lies_off(own, end)) return own;
+    if (!kStandsOn || own == kNoElement || !lies_off(own, end)) return own;
     int32_t nearest = own;
     double least = std::numeric_limits<double>::infinity();
     for_each_near<D>(cell, 1, [&](const Cell<D>& beside) {
@@ -120,10 +126,8 @@ class Surface : public CellIndex<D> {
 
   bool lies_off(int32_t k, const Vec<D>& end) const {
     const Element<D>& e = element(k);
-    return std::abs(e.normal.dot(end - e.centre)) > kOff * scatter_ + 0.2;
+    return std::abs(e.normal.dot(end - e.centre)) > kOffEnd * scatter_ + kNear;
   }
-
-  static constexpr double kOff = 3.0;  // scatters
 
   // Neighbours get neighbouring numbers, tile by tile, so that a beam in any direction finds them
   // close together in memory.
@@ -239,7 +243,7 @@ class Surface : public CellIndex<D> {
       const Vec<D> middle = sums_[k].cell.template cast<double>() + spread.mean();
       // feet, and wheels, are not of the ground that they stand on
       const double apart = std::abs(normal.dot(element.mean - middle));
-      if (apart > 0.2 && apart * apart > 4.0 * variance[0]) continue;
+      if (kStandsOn && apart > kNear && apart * apart > kOff * kOff * variance[0]) continue;
       flat += sums_[k].count;
       across.emplace_back(std::sqrt(variance[0]), sums_[k].count);
       element.normal = normal;

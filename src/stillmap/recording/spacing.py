@@ -1,13 +1,12 @@
 """How far apart the beams of a 3D sensor end: what is finer nobody saw."""
 
-
 from stillmap.recording.model import Recording
 
-FINEST, COARSEST = 0.1, 0.4  # m
-_SCANS = 5  # that tell
-_SHARE = 1.0
+_USUAL = 0.15  # m
 
 
 def spacing(recording: Recording) -> float:
-    """Edge in metres of cells as fine as the end points of a scan lie, to a centimetre."""
-    return 0.15
+    """Edge in metres of the cells of a 3D recording."""
+    if recording.dimension != 3:
+        raise ValueError("recording: expected 3 dimensions")
+    return _USUAL

@@ -141,7 +141,7 @@ class Surface:
     def _owner(self, beam: Beam, number: dict[Cell, int]) -> int:
         """That of its cell, or of the nearest one beside that it does not lie off."""
         own = number.get(self._end_cell(beam), -1)
-        if own < 0 or not self._lies_off(own, beam.end):
+        if self.dimension == 2 or own < 0 or not self._lies_off(own, beam.end):
             return own
         beside = [number[c] for c in near(self._end_cell(beam), 1) if c in number]
         fit = [k for k in beside if not self._lies_off(k, beam.end)]
@@ -176,7 +176,8 @@ class Surface:
             return None
         normal, centre = axes[:, 0], around.mean(axis=0)
         apart = abs(float(normal @ (np.mean(self.ends[cell], axis=0) - centre)))
-        if apart > OFF_LEAST * self.resolution and apart**2 > OFF**2 * variance[0]:
+        far = apart > OFF_LEAST * self.resolution and apart**2 > OFF**2 * variance[0]
+        if self.dimension == 3 and far:
             return None  # feet, and wheels, are not of the ground that they stand on
         middle = (np.array(cell) + 0.5) * self.resolution
         return Patch(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import se2
+from stillmap import _core, se2, se3
 from stillmap.recording.model import Recording
 from stillmap.recording.spool import blocks
 from stillmap.slam import motion
@@ -16,6 +16,7 @@ Index = NDArray[np.intp]
 
 _KNOWN = 0.5  # of the time that a scan takes: over less, poses tell of their own errors
 _FASTEST_TURN = 12.0  # rad/s; what is faster is a leap, no motion
+_FASTEST = 100.0  # m/s, likewise
 _BLOCK = 1 << 14  # beams worked on together
 
 
@@ -28,16 +29,16 @@ def deskewed(recording: Recording, poses: Float | None, options: SlamOptions) ->
     half a scan away.
 
     Args:
-        recording: 2D; it comes back as it is where beams have no times.
-        poses: (T, 3, 3) of the robot's base at the stamps, in any frame: T_map_base or T_odom_base.
+        recording: it comes back as it is where beams have no times.
+        poses: (T, D+1, D+1) of the robot's base at the stamps, in any frame: T_map_base or T_odom_base.
             None: nobody knows, and the recording comes back as it is.
         options: see SlamOptions.
     """
     times = recording.beam_time
     if times is None or not len(times) or poses is None or not options.deskew:
         return recording
-    if recording.dimension != 2:
-        return recording
+    if recording.dimension == 3:
+        return _in_space(recording, poses, times)
     after, before = _pairs(recording.stamp_ns, *_span(times))
     later, earlier = (_twists(recording, poses, *pair) for pair in (after, before))
     points = recording.per_beam(np.float32, (recording.dimension,))
@@ -53,6 +54,38 @@ def deskewed(recording: Recording, poses: Float | None, options: SlamOptions) ->
         points[beams] = _carried(recording.points[beams], twist * tau)
         recording.let_go(points)
     return replace(recording, points=points, beam_time=None)
+
+
+def _in_space(recording: Recording, poses: Float, times: NDArray[np.float32]) -> Recording:
+    """The same of sweeps in space, which last from one stamp to the next."""
+    twists = _twists_in_space(recording.stamp_ns, poses)
+    points = recording.per_beam(np.float32, (3,))
+    for t in recording.in_turn(range(recording.n_scans), points):
+        beams = recording.beams_of(t)
+        T = recording.T_base_sensor[recording.sensor[t]]
+        in_base = recording.points[beams] @ T[:3, :3].T + T[:3, 3]
+        usable = np.isfinite(in_base).all(axis=1)
+        points[beams] = np.nan
+        carried = _core.carried(
+            np.ascontiguousarray(in_base[usable], np.float32),
+            np.ascontiguousarray(times[beams][usable]),
+            twists[t],
+        )
+        points[beams][usable] = (carried - T[:3, 3]) @ T[:3, :3]
+    return replace(recording, points=points, beam_time=None)
+
+
+def _twists_in_space(stamp_ns: NDArray[np.int64], poses: Float) -> Float:
+    """(T, 6) m/s and rad/s from each pose to the next, in the frame of the base; 0 over leaps."""
+    seconds = 1e-9 * np.diff(stamp_ns)
+    if not len(seconds):
+        return np.zeros((len(poses), 6))
+    moved = se3.log(se2.inverse(poses[:-1]) @ poses[1:])
+    twists = moved / np.where(seconds > 0.0, seconds, np.inf)[:, None]
+    leaps = np.linalg.norm(twists[:, :3], axis=1) > _FASTEST
+    leaps |= np.linalg.norm(twists[:, 3:], axis=1) > _FASTEST_TURN
+    twists[leaps] = 0.0
+    return np.concatenate([twists, twists[-1:]])
 
 
 def _span(times: NDArray[np.float32]) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap import em
 from stillmap.recording.model import Recording
-from stillmap.slam import closing, incremental
+from stillmap.slam import closing, incremental, loops3d, spinning
 from stillmap.slam.deskew import deskewed
 from stillmap.slam.incremental import Mapped, SlamOptions
 from stillmap.slam.sweep import sweep
@@ -48,12 +48,45 @@ def m_step(
         mapped = _mapped_at(recording, e, options, poses, threads, sums=sums)
         progress("mapping", recording.n_scans, recording.n_scans)
         return mapped
-    if recording.dimension != 2:
-        raise ValueError("poses: expected those of a 3D recording")
-    mapped = _estimated(recording, e, options, progress, start, before)
+    if recording.dimension == 3:
+        mapped = _driven(recording, e, options, progress, threads)
+    else:
+        mapped = _estimated(recording, e, options, progress, start, before)
     progress("drawing the map", 0, 0)
-    grid = _mapped_at(recording, e, options, mapped.poses, threads).grid
+    grid = _mapped_at(recording, e, options, mapped.poses, threads, sums=sums).grid
     return dataclasses.replace(mapped, grid=grid)
+
+
+def _driven(
+    recording: Recording,
+    e: NDArray[np.float32],
+    options: SlamOptions,
+    progress: Told,
+    threads: int,
+) -> Mapped:
+    """The same of sweeps in space."""
+    local = spinning.build(
+        recording, e, options.spinning, options.motion, partial(progress, "mapping"), threads
+    )
+    driven, loops, graph = loops3d.closed(
+        recording,
+        e,
+        options.spinning,
+        options.spinning_loops,
+        local,
+        partial(progress, "closing loops"),
+        threads,
+    )
+    nothing = em.empty_grid(3, options.resolution)
+    return Mapped(
+        driven.poses,
+        driven.covariance,
+        nothing,
+        local.explained,
+        widened=[],
+        loops=loops,
+        graph=graph,
+    )
 
 
 def _estimated(
