@@ -52,10 +52,15 @@ def expectations_of(
     poses: Float,
     options: EmOptions,
     threads: int,
+    static: NDArray[np.float32] | None = None,
 ) -> Expectations:
-    """What the looks say of every cell, and with that of every beam that ended in it."""
+    """What the looks say of every cell, and with that of every beam that ended in it.
+
+    static (E,) is what is known better of each cell than the classes of `table` say.
+    """
     shares = fit_shares(table.likelihood, table.n_static, options.prior)
-    static = posterior_static(table.likelihood, shares.classes, table.n_static)
+    if static is None:
+        static = posterior_static(table.likelihood, shares.classes, table.n_static)
     surface, T_map_sensor = looks.surface, recording.T_map_sensor(poses)
     beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
     return Expectations(

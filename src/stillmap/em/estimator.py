@@ -9,6 +9,7 @@ from stillmap import _core
 from stillmap.em import dwell, hit_ratio, paper
 from stillmap.em.chunks import chunks
 from stillmap.em.expectations import Expectations, Grid, NoReturn, per_beam
+from stillmap.em.in_space import e_step_in_space
 from stillmap.em.occupancy import Seen
 from stillmap.em.options import EmOptions
 from stillmap.em.tracker import on_people
@@ -66,6 +67,8 @@ def e_step(
     """What is static at these poses, and the likelihood of that."""
     if estimator == "paper":
         return paper.e_step(recording, poses, grid, options.prior, threads)
+    if estimator == "stillmap" and recording.dimension == 3:
+        return e_step_in_space(recording, poses, grid.resolution, options, threads)
     if estimator == "stillmap":
         return dwell.e_step(recording, poses, grid.resolution, options, threads)
     if not isinstance(grid, _core.Grid2D):
