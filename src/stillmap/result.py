@@ -121,7 +121,8 @@ def build(
     stages = stages or Stages()
     options = pipeline.resolved(options, recording)
     loop = go_on or Loop(options)
-    loop.closed = poses is not None and options.estimator == "stillmap"
+    # with given poses nothing is left that an E-step in space could depend on
+    loop.closed = recording.dimension == 3 and poses is not None and options.estimator == "stillmap"
     iterations = pipeline.iterate(
         recording, options, poses=poses, progress=progress, stages=stages, after=loop.reached
     )

@@ -80,4 +80,4 @@ def test_the_options_that_are_kept_are_those_that_were_used(printed):
     }
     assert replaced(printed.options, {"slam": rest}) == options()
     for estimator in ("stillmap", "hit-ratio", "tracker"):
-        assert pipeline.resolved(options(estimator)) == options(estimator)
+        assert pipeline.resolved(options(estimator), printed.recording) == options(estimator)

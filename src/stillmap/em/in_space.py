@@ -1,7 +1,7 @@
 """The E-step in 3D: the default one, to which what came to stay, or left, is dynamic as well.
 
-A recording of streets lasts for minutes, and a car that waits at a light for half of them, then goes
-on, is no wall. Whoever removes what moves from a cloud wants the car out, and its place free.
+A recording of streets lasts for minutes, and a car that waits at a light for half of them, then
+goes on, is no wall. Whoever removes what moves from a cloud wants the car out, and its place free.
 """
 
 from stillmap.em.courses import courses_of, watch

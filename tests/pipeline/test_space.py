@@ -1,0 +1,153 @@
+"""3D recordings from start to end: labels, poses, clouds, plan and objects against the truth."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from choices import options
+from PIL import Image
+
+import stillmap
+from stillmap.output.trajectory import read_tum
+from stillmap.pipeline import Options
+from stillmap.recording.model import Recording
+from stillmap.simulation import scene_by_name, simulate
+
+
+@pytest.fixture(scope="module")
+def street():
+    """A street with cars and people, 40 sweeps of 32 channels, taken all at once."""
+    lidar = {"channels": 32, "columns": 600, "sweep": False}
+    scene = scene_by_name("street", {"lidar": lidar, "robot": {"scans": 40}})
+    return simulate(scene, 3)
+
+
+@pytest.fixture(scope="module")
+def mapped(street):
+    return stillmap.build(street.recording, poses=street.truth.T_world_base)
+
+
+def near(street):
+    """Hits between 2.5 and 40 m."""
+    distance = np.linalg.norm(street.recording.points, axis=1)
+    return street.recording.hit & (distance > 2.5) & (distance < 40.0)
+
+
+def test_what_moves_is_told_from_what_stands(street, mapped):
+    dynamic, near_ones = mapped.p_static < 0.5, near(street)
+    static = street.truth.static
+    assert (~static & near_ones).sum() > 1000
+    assert dynamic[near_ones & ~static].mean() > 0.75
+    assert dynamic[near_ones & static].mean() < 0.005
+
+
+def test_given_poses_take_one_e_step(mapped):
+    assert len(mapped.iterations) == 1
+    assert mapped.converged
+
+
+def test_estimated_poses_are_those_of_the_truth(street):
+    result = stillmap.build(street.recording)
+    truth = np.linalg.inv(street.truth.T_world_base[0]) @ street.truth.T_world_base
+    apart = np.linalg.norm(result.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
+    assert apart.max() < 0.1
+    dynamic, near_ones = result.p_static < 0.5, near(street)
+    assert dynamic[near_ones & ~street.truth.static].mean() > 0.75
+    assert dynamic[near_ones & street.truth.static].mean() < 0.005
+
+
+def test_the_plan_is_free_where_the_robot_drove(street, mapped):
+    x, y, _ = mapped.map.origin
+    way = street.truth.T_world_base[:, :2, 3]
+    column, row = np.floor((way - [x, y]) / mapped.map.resolution).astype(int).T
+    assert (mapped.map.p_occupied[row, column] < 0.196).all()
+    assert (mapped.map.p_occupied > 0.65).sum() > 500
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_any_number_of_threads_gives_the_same_bytes(street, mapped, threads):
+    other = stillmap.build(
+        street.recording, Options(threads=threads), poses=street.truth.T_world_base
+    )
+    np.testing.assert_array_equal(other.p_static, mapped.p_static)
+    np.testing.assert_array_equal(other.map.p_occupied, mapped.map.p_occupied)
+
+
+def test_cars_are_objects_with_heights(street, mapped):
+    kinds = np.array(street.truth.scene["mover_kinds"])
+    car = [
+        one
+        for one in mapped.objects
+        if (kinds[street.truth.mover[one.beams]] == "car").mean() > 0.8 and len(one.beams) > 500
+    ]
+    assert car
+    for one in car:
+        assert len(one.size) == 3
+        assert 0.5 < one.size[2] < 2.5
+        assert one.z.shape == (len(one.scan),)
+        assert 0.2 < np.median(one.z) < 1.6
+
+
+def test_the_files_hold_what_was_found(street, mapped, tmp_path):
+    mapped.save(tmp_path / "out")
+    out = tmp_path / "out"
+    hits = int(street.recording.hit.sum())
+    clouds = {name: trimesh.load(out / f"{name}.ply") for name in ("static", "dynamic")}
+    assert sum(len(cloud.vertices) for cloud in clouds.values()) == hits
+    moving = int((mapped.p_static[street.recording.hit] < 0.5).sum())
+    assert len(clouds["dynamic"].vertices) == moving
+    stamps, poses = read_tum(out / "trajectory.tum")
+    np.testing.assert_array_equal(stamps, street.recording.stamp_ns)
+    np.testing.assert_allclose(poses, street.truth.T_world_base, atol=1e-8)
+    assert np.array_equal(np.load(out / "beams/p_static.npy"), mapped.p_static, equal_nan=True)
+    described = yaml.safe_load((out / "map.yaml").read_text())
+    with Image.open(out / described["image"]) as picture:
+        assert picture.size == mapped.map.p_occupied.shape[::-1]
+    objects = json.loads((out / "objects/objects.json").read_text())
+    assert all({"x", "y", "z", "vx", "vy"} <= set(one["track"]) for one in objects)
+    run = json.loads((out / "run.json").read_text())
+    assert run["options"]["slam"]["voxel"] == run["options"]["slam"]["resolution"] == 0.15
+    assert "<html" in (out / "report.html").read_text()
+
+
+def test_other_estimators_of_the_plane_are_refused(street):
+    with pytest.raises(ValueError, match="2D recordings alone"):
+        stillmap.build(
+            street.recording,
+            options(estimator="tracker"),
+            poses=street.truth.T_world_base,
+        )
+
+
+def test_the_printed_method_runs_in_space(street):
+    result = stillmap.build(
+        street.recording,
+        options(estimator="paper", max_iterations=2),
+        poses=street.truth.T_world_base,
+    )
+    assert len(result.iterations) == 2
+    assert np.isfinite(result.p_static[street.recording.hit]).all()
+
+
+@pytest.mark.parametrize("how", ["all at the sensor", "nothing came back", "all unusable", "none"])
+@pytest.mark.parametrize("given", [True, False])
+def test_sweeps_that_say_nothing_are_mapped_all_the_same(how, given, tmp_path):
+    n = 0 if how == "none" else 50
+    points = np.zeros((5 * n, 3), np.float32)
+    points[:, 0] = {"nothing came back": 30.0, "all unusable": np.nan}.get(how, 0.0)
+    recording = Recording(
+        stamp_ns=np.arange(5, dtype=np.int64) * 10**8,
+        offset=np.arange(6, dtype=np.int64) * n,
+        points=points,
+        hit=np.full(5 * n, how == "all at the sensor"),
+        T_base_sensor=np.eye(4)[None],
+        sensor=np.zeros(5, np.int32),
+        T_odom_base=None,
+    )
+    poses = np.tile(np.eye(4), (5, 1, 1)) if given else None
+    result = stillmap.build(recording, poses=poses)
+    assert np.isfinite(result.poses).all()
+    result.save(tmp_path / "out")
+    assert (tmp_path / "out/report.html").exists()

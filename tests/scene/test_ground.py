@@ -1,0 +1,53 @@
+"""How high the ground is, from surface that somebody drives over."""
+
+import numpy as np
+import pytest
+
+from stillmap.scene.ground import ground_from
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def slope(x, y):
+    return 0.05 * x - 0.02 * y
+
+
+def floor_with_tables(rng, height=0.0):
+    """Means and normals of a sloping floor of 30 x 20 m and of tables 0.8 m above it."""
+    xy = rng.uniform([-5, -10], [25, 10], (6000, 2))
+    table = (np.abs(xy[:, 1] - 6) < 1) & (xy[:, 0] > 10)
+    z = slope(*xy.T) + 0.8 * table + height + rng.normal(0, 0.01, len(xy))
+    return np.column_stack([xy, z]), np.tile(UP, (len(xy), 1)), table
+
+
+def way_over(height, sensor=1.5):
+    x = np.linspace(0, 20, 40)
+    return np.column_stack([x, np.zeros(40), slope(x, 0.0) + height + sensor])
+
+
+@pytest.mark.parametrize("height", [0.0, -30.0])
+def test_a_slope_is_followed_and_tables_are_none_of_it(height):
+    means, normals, table = floor_with_tables(np.random.default_rng(0), height)
+    ground = ground_from(means, normals, way_over(height))
+    assert ground.seen
+    assert ground.sensor == pytest.approx(1.5, abs=0.03)
+    error = ground.at(means[~table, :2]) - (slope(*means[~table, :2].T) + height)
+    assert np.abs(error).max() < 0.06  # over half of a square
+    below = means[table, 2] - ground.at(means[table, :2])
+    assert np.abs(below - 0.8).max() < 0.1
+
+
+def test_walls_tell_nothing_of_the_ground():
+    rng = np.random.default_rng(1)
+    means = rng.uniform([-5, 3, 0], [25, 3.1, 3], (500, 3))
+    ground = ground_from(means, np.tile([0.0, 1.0, 0.0], (500, 1)), way_over(0.0))
+    assert not ground.seen
+    assert ground.sensor == 0.0
+    assert np.isfinite(ground.z).all()
+
+
+def test_beyond_the_edge_it_is_that_of_the_edge():
+    means, normals, _ = floor_with_tables(np.random.default_rng(2))
+    ground = ground_from(means, normals, way_over(0.0))
+    far = ground.at(np.array([[1e4, 0.0], [-1e4, 0.0]]))
+    assert far[0] > 1.0 > -0.2 > far[1]
