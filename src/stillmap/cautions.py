@@ -27,7 +27,7 @@ def cautions(
     Args:
         records: the numbers of every iteration.
         kept: the iteration that was kept; (T,) `explained` and `doubts` are of it.
-        explained: share of each scan's beams that the map so far explained.
+        explained: share of each scan's beams that the map so far explained; NaN: poses were given.
         doubts: where odometry and scans do not agree.
         recording: what all of it is about.
         options: as resolved.
@@ -44,7 +44,8 @@ def cautions(
             f"the likelihood dipped at iteration {', '.join(map(str, dips))}: poses are estimated "
             f"by matching, not by it; iteration {kept} is the best and was kept"
         )
-    if recording.T_odom_base is None:
+    given = len(explained) > 0 and bool(np.isnan(explained).all())
+    if recording.T_odom_base is None and not given:
         out.append("no odometry: a constant velocity was assumed between scans")
     out += _of_poses(doubts)
     lost = np.flatnonzero(explained < 0.2)

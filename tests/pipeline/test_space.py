@@ -149,5 +149,6 @@ def test_sweeps_that_say_nothing_are_mapped_all_the_same(how, given, tmp_path):
     poses = np.tile(np.eye(4), (5, 1, 1)) if given else None
     result = stillmap.build(recording, poses=poses)
     assert np.isfinite(result.poses).all()
+    assert any("no odometry" in one for one in result.warnings) == (not given)
     result.save(tmp_path / "out")
     assert (tmp_path / "out/report.html").exists()
