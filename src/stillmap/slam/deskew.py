@@ -30,8 +30,8 @@ def deskewed(recording: Recording, poses: Float | None, options: SlamOptions) ->
 
     Args:
         recording: it comes back as it is where beams have no times.
-        poses: (T, D+1, D+1) of the robot's base at the stamps, in any frame: T_map_base or T_odom_base.
-            None: nobody knows, and the recording comes back as it is.
+        poses: (T, D+1, D+1) of the robot's base at the stamps, in any frame: T_map_base or
+            T_odom_base. None: nobody knows, and the recording comes back as it is.
         options: see SlamOptions.
     """
     times = recording.beam_time
