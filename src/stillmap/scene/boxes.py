@@ -89,7 +89,7 @@ def _of_object(one: MovingObject, start: int, hold: float) -> Box:
     # who stands looks where he went
     at = walks[np.clip(np.searchsorted(walks, np.arange(len(speed)), "right") - 1, 0, None)]
     return Box(
-        one.id, seconds, one.xy, (one.velocity / speed[:, None])[at], one.velocity, half, hold
+        one.id, seconds, one.xy, one.velocity[at] / speed[at, None], one.velocity, half, hold
     )
 
 

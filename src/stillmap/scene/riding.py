@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.recording.model import Recording
+from stillmap.recording.stamps import beam_ns
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -88,16 +89,6 @@ def ridden(recording: Recording, stamp_ns: Stamps, poses: Float, pause: float) -
         recording.let_go(points, hit)
     seen = replace(recording, points=points, hit=hit, beam_time=None)
     return Ridden(seen, lifted(at_scan), left_out)
-
-
-def beam_ns(recording: Recording, scans: slice) -> Stamps:
-    """(n,) when each beam of these scans was taken, in nanoseconds."""
-    offset = recording.offset[scans.start : scans.stop + 1]
-    stamps = np.repeat(recording.stamp_ns[scans], np.diff(offset))
-    if recording.beam_time is None:
-        return stamps
-    later = recording.beam_time[offset[0] : offset[-1]].astype(np.float64)
-    return np.asarray(stamps + np.round(1e9 * later).astype(np.int64))
 
 
 def lifted(poses: Float) -> Float:

@@ -8,7 +8,7 @@ counts, too.
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +22,11 @@ from stillmap.pipeline import Options
 from stillmap.recording.model import Recording
 from stillmap.recording.spacing import spacing
 from stillmap.recording.spool import blocks
+from stillmap.recording.stamps import beam_ns
 from stillmap.result import Result
 from stillmap.scene.boxes import Box, boxes_of
 from stillmap.scene.ground import Ground, ground_of
-from stillmap.scene.riding import Ridden, beam_ns, ridden
+from stillmap.scene.riding import Ridden, ridden
 from stillmap.scene.rig_options import RigOptions
 
 Float = NDArray[np.float64]
@@ -61,6 +62,18 @@ class Tilting:
     left_out: int
     boxes: int
     learned: dict[str, Any]
+
+
+class Cut(NamedTuple):
+    """What ended in a box.
+
+    Attributes:
+        beams: (n,) their numbers, rising.
+        core: (n,) whether in the box itself, not in the margin around it.
+    """
+
+    beams: Index
+    core: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,13 +128,13 @@ def built_in_3d(flat: Flat, recording: Recording, options: Options, threads: int
     """
     o = options.rig
     on_way = ridden(recording, flat.seen.stamp_ns, flat.poses, o.pause)
-    found = _evidence(on_way, options, threads) if o.evidence else None
+    ground = _ground(on_way)
+    found = _evidence(on_way, ground, options, threads) if o.evidence else None
     static = _prior(on_way.seen, flat.share) if found is None else found.p_static
-    ground = ground_of(on_way.seen, on_way.poses, static)
     boxes = boxes_of(flat.seen, flat.poses, flat.p_static, flat.objects, options.objects, o.hold)
     cut = _cut(boxes, recording, on_way, ground, int(flat.seen.stamp_ns[0]), o)
     share = flat.share if found is None else _learned_share(found)
-    p_static = _within(static, cut, share, o.inside)
+    p_static = _within(static, cut, share, o)
     return Tilting(
         recording,
         on_way.seen,
@@ -129,15 +142,38 @@ def built_in_3d(flat: Flat, recording: Recording, options: Options, threads: int
         p_static,
         _objects(flat.objects, boxes, cut, on_way, ground, p_static),
         on_way.left_out,
-        sum(len(beams) > 0 for beams in cut),
+        sum(len(one.beams) > 0 for one in cut),
         {} if found is None else found.learned,
     )
 
 
-def _evidence(on_way: Ridden, options: Options, threads: int) -> em.Expectations:
-    """What the laser itself saw to stay and to go."""
+def evidence_of(
+    flat: Flat, recording: Recording, options: Options, threads: int = 1
+) -> em.Expectations:
+    """What that laser itself says of its beams, from where the flat one knows it was.
+
+    Arguments are those of `built_in_3d`.
+    """
+    on_way = ridden(recording, flat.seen.stamp_ns, flat.poses, options.rig.pause)
+    return _evidence(on_way, _ground(on_way), options, threads)
+
+
+def _ground(on_way: Ridden) -> Ground:
+    """By everything that is level: nobody knows yet what moves."""
+    all_static = _prior(on_way.seen, 1.0)
+    return ground_of(on_way.seen, on_way.poses, all_static)
+
+
+def _evidence(on_way: Ridden, ground: Ground, options: Options, threads: int) -> em.Expectations:
+    """What the laser itself saw to stay and to go.
+
+    A border between voxels lies just above the floor: feet share none with it.
+    """
     voxel = options.rig.voxel or spacing(on_way.seen)
-    return dwell.e_step(on_way.seen, on_way.poses, voxel, options.em, threads)
+    floor = float(np.median(ground.at(on_way.poses[:, :2, 3])))
+    poses = on_way.poses.copy()
+    poses[:, 2, 3] -= floor + options.rig.low
+    return dwell.e_step(on_way.seen, poses, voxel, options.em, threads)
 
 
 def _learned_share(found: em.Expectations) -> float:
@@ -163,8 +199,8 @@ def _cut(
     ground: Ground,
     start_ns: int,
     o: RigOptions,
-) -> list[Index]:
-    """Of each box the beams that ended in it, rising."""
+) -> list[Cut]:
+    """Of each box the beams that ended in it or in its margin."""
     ends = _ends(on_way)
     seconds = 1e-9 * (recording.stamp_ns - start_ns)
     early, late = _span(recording)
@@ -174,17 +210,18 @@ def _cut(
         stop = int(np.searchsorted(seconds, box.seconds[-1] + box.hold - early, side="right"))
         beams = slice(int(recording.offset[first]), int(recording.offset[stop]))
         if beams.start == beams.stop:
-            out.append(np.zeros(0, np.intp))
+            out.append(Cut(np.zeros(0, np.intp), np.zeros(0, np.bool_)))
             continue
         at = np.asarray(1e-9 * (beam_ns(recording, slice(first, stop)) - start_ns), np.float64)
         near = np.flatnonzero(_near(box, ends[beams], o.margin))
         xyz = np.asarray(ends[beams][near], np.float64)
         within = box.holds(at[near], xyz[:, :2], o.margin)
         near, xyz = near[within], xyz[within]
+        core = box.holds(at[near], xyz[:, :2], 0.0)
         above = xyz[:, 2] - ground.at(xyz[:, :2])
         tall = o.tallest if 2.0 * max(box.half) >= o.long else o.height
         kept = (above > o.low) & (above <= top_of(above, tall, o.gap))
-        out.append(beams.start + near[kept])
+        out.append(Cut(beams.start + near[kept], core[kept]))
     return out
 
 
@@ -233,7 +270,7 @@ def top_of(above: Float, tallest: float, gap: float) -> float:
 
 
 def _within(
-    static: NDArray[np.float32], cut: Sequence[Index], share: float, inside: float
+    static: NDArray[np.float32], cut: Sequence[Cut], share: float, o: RigOptions
 ) -> NDArray[np.float32]:
     """P(static) with the boxes: in them it is not `share` of all beams that is static.
 
@@ -241,7 +278,10 @@ def _within(
     evidence it adds nothing.
     """
     out = static.copy()
-    beams = np.unique(np.concatenate([np.zeros(0, np.intp), *cut]))
+    all_cut = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in cut)])
+    core = np.concatenate([np.zeros(0, np.bool_), *(one.core for one in cut)])
+    beams, of = np.unique(all_cut, return_inverse=True)
+    inside = np.where(np.bincount(of[core], minlength=len(beams)) > 0, o.inside, o.around)
     p = np.clip(static[beams].astype(np.float64), _SURE, 1.0 - _SURE)
     share = float(np.clip(share, _SURE, 1.0 - _SURE))
     odds = p / (1.0 - p) * (1.0 - share) / share * (1.0 - inside) / inside
@@ -252,7 +292,7 @@ def _within(
 def _objects(
     objects: Sequence[MovingObject],
     boxes: Sequence[Box],
-    cut: Sequence[Index],
+    cut: Sequence[Cut],
     on_way: Ridden,
     ground: Ground,
     p_static: NDArray[np.float32],
@@ -261,7 +301,7 @@ def _objects(
     by_id = {one.id: one for one in objects}
     out = []
     for box, within in zip(boxes, cut, strict=True):
-        beams = within[p_static[within] < _DYNAMIC]
+        beams = within.beams[p_static[within.beams] < _DYNAMIC]
         if box.thing < 0 or len(beams) < _FEWEST:
             continue
         xyz = on_way.seen.end_points(beams, on_way.poses)

@@ -9,8 +9,8 @@ from stillmap.options import field_with_doc
 class RigOptions:
     """A second laser that builds in 3D while the flat one tells what moves; see docs/rig.md."""
 
-    margin: float = field_with_doc(0.25, "m around what the flat laser saw of a thing that moves")
-    low: float = field_with_doc(0.08, "m above the ground: what is lower is the floor itself")
+    margin: float = field_with_doc(0.15, "m around what the flat laser saw of a thing that moves")
+    low: float = field_with_doc(0.05, "m above the ground: what is lower is the floor itself")
     height: float = field_with_doc(2.0, "m above the ground, up to where a thing reaches at most")
     long: float = field_with_doc(1.5, "m, things at least so long may be higher: vehicles")
     tallest: float = field_with_doc(4.0, "m above the ground, up to where these reach at most")
@@ -18,7 +18,10 @@ class RigOptions:
     hold: float = field_with_doc(
         0.5, "s for which a thing goes on before it is first seen and after it is last"
     )
-    inside: float = field_with_doc(0.9, "probability that what ends in a box is dynamic")
+    inside: float = field_with_doc(
+        0.95, "probability that what ends where the flat laser saw a thing is dynamic"
+    )
+    around: float = field_with_doc(0.8, "the same within the margin around that")
     evidence: bool = field_with_doc(
         True, "what the second laser itself saw to come and go counts beside the boxes"
     )
@@ -28,8 +31,9 @@ class RigOptions:
     )
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.inside < 1.0:
-            raise ValueError("'rig.inside' wants a probability between 0 and 1, both excluded")
+        for name in ("inside", "around"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ValueError(f"'rig.{name}' wants a probability between 0 and 1, both excluded")
         if not 0.0 <= self.low < self.height <= self.tallest <= 100.0:
             raise ValueError("'rig' wants 0 <= low < height <= tallest <= 100 metres")
         for name, low, high in _LIMITS:
