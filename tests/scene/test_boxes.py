@@ -8,7 +8,9 @@ from stillmap.options import replaced
 from stillmap.pipeline import Options
 from stillmap.recording.model import Recording
 from stillmap.scene.boxes import boxes_of
-from stillmap.scene.rig import Flat, built_in_3d, top_of
+from stillmap.scene.cutting import Cut, top_of
+from stillmap.scene.rig import Flat, built_in_3d, with_boxes
+from stillmap.scene.rig_options import RigOptions
 
 MS = 1_000_000
 STAMPS = np.arange(0, 2001, 100, dtype=np.int64) * MS
@@ -137,6 +139,20 @@ def test_in_a_box_beams_are_dynamic_and_nowhere_else():
     assert one.size[2] == pytest.approx(1.7, abs=0.05)
     assert one.z is not None
     np.testing.assert_allclose(one.z, 0.85, atol=0.05)
+
+
+def test_evidence_and_boxes_multiply_their_odds():
+    o = RigOptions(inside=0.9, around=0.75)
+    share = 0.8
+    static = np.array([share, share, 0.999, 0.3, share], np.float32)  # of which two are in no box
+    core = Cut(np.array([0, 2]), np.array([True, True]))
+    margin = Cut(
+        np.array([0, 1]), np.array([False, False])
+    )  # the first is in the core of the other
+    found = with_boxes(static, [core, margin], share, o)
+    odds = 999 / 4 / 9
+    np.testing.assert_allclose(found, [0.1, 0.25, odds / (1 + odds), 0.3, share], rtol=1e-4)
+    assert static[0] == np.float32(share)
 
 
 def test_after_it_has_left_the_place_is_static():

@@ -8,31 +8,28 @@ counts, too.
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em
 from stillmap.em import dwell
-from stillmap.em.chunks import chunks
 from stillmap.errors import InputError
 from stillmap.objects import MovingObject
 from stillmap.pipeline import Options
 from stillmap.recording.model import Recording
-from stillmap.recording.spacing import spacing
-from stillmap.recording.spool import blocks
-from stillmap.recording.stamps import beam_ns
+from stillmap.recording.spool import blocks, copied
 from stillmap.result import Result
 from stillmap.scene.boxes import Box, boxes_of
+from stillmap.scene.cutting import Cut, cut_out
 from stillmap.scene.ground import Ground, ground_of
 from stillmap.scene.riding import Ridden, ridden
 from stillmap.scene.rig_options import RigOptions
 
 Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
-_KNEE = 1.0  # m above the ground, below which the flat laser lies: all there is of what it saw
 _EDGE = 98.0  # percent of a thing's end points that lie lower than what counts as its top
 _FEWEST = 3  # end points of a thing in 3D: fewer are noise
 _SURE = 1e-6  # probabilities keep so far from 0 and 1
@@ -62,18 +59,6 @@ class Tilting:
     left_out: int
     boxes: int
     learned: dict[str, Any]
-
-
-class Cut(NamedTuple):
-    """What ended in a box.
-
-    Attributes:
-        beams: (n,) their numbers, rising.
-        core: (n,) whether in the box itself, not in the margin around it.
-    """
-
-    beams: Index
-    core: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,9 +117,9 @@ def built_in_3d(flat: Flat, recording: Recording, options: Options, threads: int
     found = _evidence(on_way, ground, options, threads) if o.evidence else None
     static = _prior(on_way.seen, flat.share) if found is None else found.p_static
     boxes = boxes_of(flat.seen, flat.poses, flat.p_static, flat.objects, options.objects, o.hold)
-    cut = _cut(boxes, recording, on_way, ground, int(flat.seen.stamp_ns[0]), o)
+    cut = cut_out(boxes, recording, on_way, ground, int(flat.seen.stamp_ns[0]), o)
     share = flat.share if found is None else _learned_share(found)
-    p_static = _within(static, cut, share, o)
+    p_static = with_boxes(static, cut, share, o, recording.scratch)
     return Tilting(
         recording,
         on_way.seen,
@@ -169,11 +154,10 @@ def _evidence(on_way: Ridden, ground: Ground, options: Options, threads: int) ->
 
     A border between voxels lies just above the floor: feet share none with it.
     """
-    voxel = options.rig.voxel or spacing(on_way.seen)
     floor = float(np.median(ground.at(on_way.poses[:, :2, 3])))
     poses = on_way.poses.copy()
     poses[:, 2, 3] -= floor + options.rig.low
-    return dwell.e_step(on_way.seen, poses, voxel, options.em, threads)
+    return dwell.e_step(on_way.seen, poses, options.rig.voxel, options.em, threads)
 
 
 def _learned_share(found: em.Expectations) -> float:
@@ -192,92 +176,26 @@ def _prior(seen: Recording, share: float) -> NDArray[np.float32]:
     return out
 
 
-def _cut(
-    boxes: Sequence[Box],
-    recording: Recording,
-    on_way: Ridden,
-    ground: Ground,
-    start_ns: int,
+def with_boxes(
+    static: NDArray[np.float32],
+    cut: Sequence[Cut],
+    share: float,
     o: RigOptions,
-) -> list[Cut]:
-    """Of each box the beams that ended in it or in its margin."""
-    ends = _ends(on_way)
-    seconds = 1e-9 * (recording.stamp_ns - start_ns)
-    early, late = _span(recording)
-    out = []
-    for box in boxes:
-        first = int(np.searchsorted(seconds, box.seconds[0] - box.hold - late))
-        stop = int(np.searchsorted(seconds, box.seconds[-1] + box.hold - early, side="right"))
-        beams = slice(int(recording.offset[first]), int(recording.offset[stop]))
-        if beams.start == beams.stop:
-            out.append(Cut(np.zeros(0, np.intp), np.zeros(0, np.bool_)))
-            continue
-        at = np.asarray(1e-9 * (beam_ns(recording, slice(first, stop)) - start_ns), np.float64)
-        near = np.flatnonzero(_near(box, ends[beams], o.margin))
-        xyz = np.asarray(ends[beams][near], np.float64)
-        within = box.holds(at[near], xyz[:, :2], o.margin)
-        near, xyz = near[within], xyz[within]
-        core = box.holds(at[near], xyz[:, :2], 0.0)
-        above = xyz[:, 2] - ground.at(xyz[:, :2])
-        tall = o.tallest if 2.0 * max(box.half) >= o.long else o.height
-        kept = (above > o.low) & (above <= top_of(above, tall, o.gap))
-        out.append(Cut(beams.start + near[kept], core[kept]))
-    return out
-
-
-def _ends(on_way: Ridden) -> NDArray[np.float32]:
-    """(M, 3) where hits ended in the map frame, NaN for others."""
-    seen = on_way.seen
-    ends = seen.per_beam(np.float32, (3,))
-    T_map_sensor = seen.T_map_sensor(on_way.poses)
-    for scans, beams, offset in chunks(seen, beside=[ends]):
-        T = np.repeat(T_map_sensor[scans], np.diff(offset), axis=0)
-        xyz = np.einsum("nij,nj->ni", T[:, :3, :3], seen.points[beams]) + T[:, :3, 3]
-        ends[beams] = np.where(seen.hit[beams, None], xyz, np.nan)
-    return ends
-
-
-def _span(recording: Recording) -> tuple[float, float]:
-    """Seconds after its scan's stamp of the first beam and of the last, of all scans."""
-    times = recording.beam_time
-    if times is None or not len(times):
-        return 0.0, 0.0
-    parts = [(float(times[b].min()), float(times[b].max())) for b in blocks(times)]
-    return min(low for low, _ in parts), max(high for _, high in parts)
-
-
-def _near(box: Box, ends: NDArray[np.float32], margin: float) -> NDArray[np.bool_]:
-    """(n,) whether ends lie where the box ever is; cheaper than to ask when."""
-    gone = box.hold * float(np.linalg.norm(box.velocity[[0, -1]], axis=1).max())
-    reach = float(np.linalg.norm(box.half)) + 2.0 * margin + gone
-    low, high = box.xy.min(axis=0) - reach, box.xy.max(axis=0) + reach
-    return np.asarray(((ends[:, :2] >= low) & (ends[:, :2] <= high)).all(axis=1))
-
-
-def top_of(above: Float, tallest: float, gap: float) -> float:
-    """Metres above the ground up to where what is connected reaches, from the ground on.
-
-    Args:
-        above: (n,) heights of end points above the ground.
-        tallest: no thing is higher.
-        gap: m without any point, above which something else begins.
-    """
-    higher = np.sort(above[(above > _KNEE) & (above <= tallest)])
-    steps = np.diff(higher, prepend=_KNEE)
-    ends = np.flatnonzero(steps > gap)
-    reached = higher[: ends[0]] if len(ends) else higher
-    return float(reached[-1]) if len(reached) else min(_KNEE, tallest)
-
-
-def _within(
-    static: NDArray[np.float32], cut: Sequence[Cut], share: float, o: RigOptions
+    scratch: Path | None = None,
 ) -> NDArray[np.float32]:
     """P(static) with the boxes: in them it is not `share` of all beams that is static.
 
     The odds are those of the box times what the evidence adds to the odds of `share`; without
     evidence it adds nothing.
+
+    Args:
+        static: (M,) P(static) without boxes.
+        cut: what ended in them.
+        share: what is static of all that nobody looked at twice.
+        o: see RigOptions.
+        scratch: folder for what is large.
     """
-    out = static.copy()
+    out = copied(static, scratch)
     all_cut = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in cut)])
     core = np.concatenate([np.zeros(0, np.bool_), *(one.core for one in cut)])
     beams, of = np.unique(all_cut, return_inverse=True)

@@ -19,13 +19,13 @@ class RigOptions:
         0.5, "s for which a thing goes on before it is first seen and after it is last"
     )
     inside: float = field_with_doc(
-        0.95, "probability that what ends where the flat laser saw a thing is dynamic"
+        0.99, "probability that what ends where the flat laser saw a thing is dynamic"
     )
-    around: float = field_with_doc(0.8, "the same within the margin around that")
+    around: float = field_with_doc(0.9, "the same within the margin around that")
     evidence: bool = field_with_doc(
         True, "what the second laser itself saw to come and go counts beside the boxes"
     )
-    voxel: float = field_with_doc(0.0, "m, edge of the voxels of that; 0: by the sensor")
+    voxel: float = field_with_doc(0.1, "m, edge of the voxels of that")
     pause: float = field_with_doc(
         1.0, "s between two scans of the flat laser, over which nobody knows where the robot was"
     )
@@ -46,6 +46,6 @@ _LIMITS = (
     ("long", 0.0, 1000.0),
     ("gap", 0.01, 100.0),
     ("hold", 0.0, 1000.0),
-    ("voxel", 0.0, 10.0),
+    ("voxel", 0.01, 10.0),
     ("pause", 1e-3, 1e6),
 )
