@@ -82,7 +82,7 @@ def _fig12(path: Path, ends: Float, seconds: Float, at: NDArray[np.int64], built
         middle = own.mean(axis=0)
         near = stays[np.abs(stays[:, :2] - middle[:2]).max(axis=1) < _AROUND]
         axes: Any = figure.add_subplot(2, 3, k + 1, projection="3d")
-        axes.scatter(*near.T, c="0.7", s=1.5, linewidths=0, alpha=0.5)
+        axes.scatter(*near.T, c="0.5", s=2.5, linewidths=0, alpha=0.6)
         axes.scatter(*own.T, c="black", s=9, linewidths=0)
         away = middle[:2] - _place(built, when)  # seen from where the robot was
         axes.view_init(elev=12, azim=np.degrees(np.arctan2(-away[1], -away[0])))
