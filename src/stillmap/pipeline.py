@@ -18,6 +18,7 @@ from stillmap.output.map_server import OutputOptions
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
 from stillmap.recording.spacing import spacing
+from stillmap.scene.rig_options import RigOptions
 from stillmap.slam import SlamOptions
 from stillmap.stages import Stages
 from stillmap.threads import resolved_threads
@@ -46,6 +47,7 @@ class Options:
     em: EmOptions = field(default=EmOptions())
     slam: SlamOptions = field(default=SlamOptions())
     objects: ObjectOptions = field(default=ObjectOptions())
+    rig: RigOptions = field(default=RigOptions())
     output: OutputOptions = field(default=OutputOptions())
 
     def __post_init__(self) -> None:

@@ -49,6 +49,15 @@ def log(T: Float) -> Float:
     return np.stack([arc * (c * x + s * y), arc * (c * y - s * x), theta], axis=-1)
 
 
+def exp(xi: Float) -> Float:
+    """(..., 3, 3) motions of twists (..., 3) x, y, theta: along an arc; the inverse of `log`."""
+    x, y, theta = np.moveaxis(xi, -1, 0)
+    half = 0.5 * theta
+    c, s = np.cos(half), np.sin(half)
+    chord = sine_over_angle(half, s)
+    return matrix(chord * (c * x - s * y), chord * (s * x + c * y), theta)
+
+
 def sine_over_angle(angle: Float, sine: Float) -> Float:
     """sin(angle) / angle, 1 at 0."""
     return np.divide(sine, angle, out=np.ones_like(sine), where=angle != 0.0)

@@ -14,6 +14,7 @@ _EPILOG = """examples:
   stillmap map log.clf.gz -o out --min-range 0.3 --set em.max_iterations=3
   stillmap map log.clf.gz -o out --poses poses.tum --config options.toml
   stillmap map log.bag -o out --resume
+  stillmap map sim/horizontal -o out --tilting sim/tilting
   stillmap map log.clf.gz -o out --quiet --json
 """
 
@@ -32,6 +33,12 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "input",
         metavar="INPUT",
         help="a CARMEN log, a ROS bag, a stillmap recording folder, ...: see docs/input.md",
+    )
+    p.add_argument(
+        "--tilting",
+        metavar="RECORDING",
+        help="of the same robot and time, a laser that tilts or pans, in 3D: INPUT, which lies "
+        "flat, tells what moves in it (docs/rig.md)",
     )
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="where the result goes")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")

@@ -18,6 +18,7 @@ from stillmap.cli.printing import files_in, print_json
 from stillmap.cli.progress import say, shown_progress, shown_share
 from stillmap.cli.reading import read_changes
 from stillmap.cli.results import require_apart
+from stillmap.cli.tilting import built, read_tilting, said
 from stillmap.errors import InputError
 from stillmap.loop import Loop
 from stillmap.output.atomic import require_new
@@ -28,6 +29,7 @@ from stillmap.pipeline import Options, resolved
 from stillmap.recording import Recording, read
 from stillmap.recording.poses import poses_from_tum
 from stillmap.result import Result, build
+from stillmap.scene.rig import Tilting
 from stillmap.stages import Stages
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -45,10 +47,12 @@ def mapped(args: argparse.Namespace, changes: dict[str, Any]) -> int:
     output, replace = Path(args.output), args.overwrite or args.resume
     require_new(output, RECORD, replace)
     require_apart(output, Path(args.input))
+    if args.tilting:
+        require_apart(output, Path(args.tilting))
     _require_writable(output)
     with held(output) as place:
         try:
-            result = _mapped_and_saved(args, options, place)
+            result, in_3d = _mapped_and_saved(args, options, place)
             place.forget()
         except OSError as error:
             if error.errno not in _FULL:
@@ -59,13 +63,15 @@ def mapped(args: argparse.Namespace, changes: dict[str, Any]) -> int:
                 _tell(args, f"{place.folder} keeps how far it came: --resume goes on from there")
             raise
     if not args.quiet:
-        _say(result, output)
+        _say(result, in_3d, output)
     if args.json:
         print_json(_summary(output))
     return 0
 
 
-def _mapped_and_saved(args: argparse.Namespace, options: Options, place: Place) -> Result:
+def _mapped_and_saved(
+    args: argparse.Namespace, options: Options, place: Place
+) -> tuple[Result, Tilting | None]:
     """The whole job; how far it has come is kept after every iteration."""
     stages = Stages()
     with stages.measure("read"):
@@ -73,6 +79,7 @@ def _mapped_and_saved(args: argparse.Namespace, options: Options, place: Place) 
             found = read(Path(args.input), options.read, progress=tell, scratch=place.folder)
         recording = _usable(found, args)
         poses = _given_poses(recording, args)
+        tilting = read_tilting(args, recording, options, place.folder)
         options = resolved(options, recording)
         same = identity(recording, options, poses)
     loop = _resumed(args, place, same, options, stages)
@@ -87,10 +94,16 @@ def _mapped_and_saved(args: argparse.Namespace, options: Options, place: Place) 
             go_on=loop,
             keep=lambda loop: place.save(loop, same, stages),
         )
+        in_3d = None
+        if tilting is not None:
+            progress("cutting out what moves", 0, 0, 0)
+            with stages.measure("tilting"):
+                in_3d = built(result, tilting, options)
+            result = dataclasses.replace(result, stages=stages.to_dict())
         progress("writing", 0, 0, 0)
         replace = args.overwrite or args.resume
-        save(result, Path(args.output), replace, within=place.folder)
-    return result
+        save(result, Path(args.output), replace, within=place.folder, tilting=in_3d)
+    return result, in_3d
 
 
 def _resumed(
@@ -166,11 +179,11 @@ def _summary(output: Path) -> dict[str, Any]:
         "output": str(output),
         "files": files_in(output),
         "iterations": len(record["iterations"]),
-        **{key: record[key] for key in _IN_SUMMARY},
+        **{key: record[key] for key in (*_IN_SUMMARY, "tilting") if key in record},
     }
 
 
-def _say(result: Result, output: Path) -> None:
+def _say(result: Result, in_3d: Tilting | None, output: Path) -> None:
     counts = beam_counts(result.recording, result.p_static)
     end, n = "converged" if result.converged else "not converged", len(result.iterations)
     lines = [
@@ -178,6 +191,7 @@ def _say(result: Result, output: Path) -> None:
         f"{100.0 * counts['dynamic'] / max(counts['hits'], 1):.1f} % of them dynamic",
         f"{n} iteration{'s' if n > 1 else ''}, {end}, the best is {result.best_iteration}",
         *_changed(result),
+        *([] if in_3d is None else [said(in_3d)]),
         *(f"warning: {warning}" for warning in result.warnings),
         f"wrote {output}: open {output / 'report.html'}",
     ]

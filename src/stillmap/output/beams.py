@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillmap.output.npy import write_npy
 from stillmap.output.protocols import ResultLike
+from stillmap.recording.model import Recording
 
 
 def write_beams(folder: Path, result: ResultLike) -> None:
@@ -13,11 +15,15 @@ def write_beams(folder: Path, result: ResultLike) -> None:
 
     `folder` is made. Scan t owns the beams offset[t]:offset[t+1], in the recording's order.
     """
-    recording = result.recording
-    if result.p_static.shape != (recording.n_beams,):
-        raise ValueError(f"p_static: expected ({recording.n_beams},), got {result.p_static.shape}")
+    write_beams_of(folder, result.recording, result.p_static)
+
+
+def write_beams_of(folder: Path, recording: Recording, p_static: NDArray[np.float32]) -> None:
+    """The same of a recording with M beams and their labels (M,)."""
+    if p_static.shape != (recording.n_beams,):
+        raise ValueError(f"p_static: expected ({recording.n_beams},), got {p_static.shape}")
     folder.mkdir()
     write_npy(folder / "stamp_ns.npy", np.asarray(recording.stamp_ns, np.int64))
     write_npy(folder / "offset.npy", np.asarray(recording.offset, np.int64))
-    write_npy(folder / "p_static.npy", np.asarray(result.p_static, np.float32))
+    write_npy(folder / "p_static.npy", np.asarray(p_static, np.float32))
     write_npy(folder / "hit.npy", np.asarray(recording.hit, np.bool_))

@@ -1,6 +1,7 @@
 """`objects/`: what moved, as JSON and as points; `traffic.npz`: where, and how fast."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,26 +11,37 @@ from numpy.typing import NDArray
 from stillmap.output.clouds import ply_header
 from stillmap.output.map_npz import write_npz
 from stillmap.output.protocols import MovingObjectLike, ResultLike, TrafficLike
+from stillmap.recording.model import Recording
 
 _MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
 
 
 def write_objects(folder: Path, result: ResultLike) -> None:
     """Write `objects.json` and `NNNN.ply` of each object into a new folder."""
+    write_objects_of(folder, result.objects, result.seen, result.poses, result.p_static)
+
+
+def write_objects_of(
+    folder: Path,
+    objects: Sequence[MovingObjectLike],
+    recording: Recording,
+    poses: NDArray[np.float64],
+    p_static: NDArray[np.float32],
+) -> None:
+    """The same of objects whose beams are of this recording, with poses and labels (M,)."""
     folder.mkdir()
     with (folder / "objects.json").open("w", encoding="utf-8", newline="\n") as file:
         file.write("[")
-        for number, one in enumerate(result.objects):  # one object a line
+        for number, one in enumerate(objects):  # one object a line
             file.write(",\n" if number else "\n")
             file.write(json.dumps(object_record(one), allow_nan=False))
-        file.write("\n]\n" if result.objects else "]\n")
-    recording = result.seen
-    for one in result.objects:
-        ends = recording.end_points(one.beams, result.poses)
+        file.write("\n]\n" if objects else "]\n")
+    for one in objects:
+        ends = recording.end_points(one.beams, poses)
         stamps = recording.stamp_ns[recording.scans_of(one.beams)]
         seconds = 1e-9 * (stamps - one.stamp_ns[0])
-        write_ply(folder / f"{one.id:04d}.ply", ends, seconds, 1.0 - result.p_static[one.beams])
-        recording.let_go(result.p_static, one.beams)
+        write_ply(folder / f"{one.id:04d}.ply", ends, seconds, 1.0 - p_static[one.beams])
+        recording.let_go(p_static, one.beams)
 
 
 def object_record(one: MovingObjectLike) -> dict[str, Any]:

@@ -275,6 +275,38 @@ class ChangeLike(Protocol):
     def times(self) -> int: ...
 
 
+class TiltingLike(Protocol):
+    """What a second laser built in 3D, T scans with M beams.
+
+    Attributes:
+        recording: as it was read.
+        seen: the same without motion during its scans; what nobody knows the place of is unusable.
+        poses: (T, 4, 4) float64, T_map_base.
+        p_static: (M,) float32, P(c = 1); NaN for unusable beams.
+        objects: what moved, in 3D.
+        left_out: beams that were taken when nobody knows where the robot was.
+        boxes: how many cut something out.
+        learned: what the evidence in 3D says; empty without.
+    """
+
+    @property
+    def recording(self) -> Recording: ...
+    @property
+    def seen(self) -> Recording: ...
+    @property
+    def poses(self) -> NDArray[np.float64]: ...
+    @property
+    def p_static(self) -> NDArray[np.float32]: ...
+    @property
+    def objects(self) -> Sequence[MovingObjectLike]: ...
+    @property
+    def left_out(self) -> int: ...
+    @property
+    def boxes(self) -> int: ...
+    @property
+    def learned(self) -> Mapping[str, Any]: ...
+
+
 class ResultLike(Protocol):
     """What `stillmap map` found out about T scans with M beams in D dimensions.
 

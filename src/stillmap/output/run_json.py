@@ -17,8 +17,11 @@ FORMAT_VERSION = 1
 _MILLIMETRES = 3  # digits
 
 
-def run_record(result: ResultLike) -> dict[str, Any]:
-    """The content of `run.json` as JSON-able values; numbers that are not finite become None."""
+def run_record(result: ResultLike, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The content of `run.json` as JSON-able values; numbers that are not finite become None.
+
+    `more` are further keys with what they hold.
+    """
     counts = beam_counts(result.recording, result.p_static)
     counts = {
         "scans": result.recording.n_scans,
@@ -52,6 +55,7 @@ def run_record(result: ResultLike) -> dict[str, Any]:
             "accepted": [_loop(one) for one in result.loops if not one.refused],
             "refused": [_loop(one) | {"why": one.refused} for one in result.loops if one.refused],
         },
+        **(more or {}),
     }
     plain: dict[str, Any] = jsonable(record)
     return plain
@@ -60,9 +64,9 @@ def run_record(result: ResultLike) -> dict[str, Any]:
 RECORD = "run.json"  # every result has it
 
 
-def write_run_json(path: Path, result: ResultLike) -> None:
+def write_run_json(path: Path, result: ResultLike, more: Mapping[str, Any] | None = None) -> None:
     """Write `run_record` to `path`."""
-    text = json.dumps(run_record(result), indent=2, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(run_record(result, more), indent=2, ensure_ascii=False, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
 
 

@@ -9,14 +9,21 @@ from stillmap.output.graph_g2o import write_g2o
 from stillmap.output.map_npz import write_map_npz
 from stillmap.output.map_server import write_map_server
 from stillmap.output.objects import write_objects, write_traffic
-from stillmap.output.protocols import ResultLike
+from stillmap.output.protocols import ResultLike, TiltingLike
 from stillmap.output.report import write_report
 from stillmap.output.run_json import RECORD, write_run_json
+from stillmap.output.tilting import FOLDER as TILTING
+from stillmap.output.tilting import tilting_record, write_tilting
 from stillmap.output.trajectory import write_tum
 
 
 def save(
-    result: ResultLike, path: Path, overwrite: bool = False, *, within: Path | None = None
+    result: ResultLike,
+    path: Path,
+    overwrite: bool = False,
+    *,
+    within: Path | None = None,
+    tilting: TiltingLike | None = None,
 ) -> None:
     """Write `result` as the folder `path`: map, trajectory, pose graph, labels, objects, report.
 
@@ -25,6 +32,7 @@ def save(
         path: the folder; it must not exist or be empty unless `overwrite` is given.
         overwrite: replace an earlier result, once the new folder is whole.
         within: where the new folder is made until then; None: beside `path`.
+        tilting: what a second laser built in 3D.
 
     Raises:
         InputError: `path` is taken or cannot be written to.
@@ -42,4 +50,8 @@ def save(
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)
         write_report(folder / "report.html", result)
-        write_run_json(folder / RECORD, result)
+        more = {}
+        if tilting is not None:
+            write_tilting(folder, tilting)
+            more = {TILTING: tilting_record(tilting)}
+        write_run_json(folder / RECORD, result, more)

@@ -7,6 +7,8 @@ from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.recording.model import Recording
+
 _LARGEST_S = 9_000_000_000  # int64 holds 9.22e9 s in nanoseconds
 
 
@@ -62,3 +64,13 @@ def longest_non_decreasing(values: Sequence[int]) -> NDArray[np.intp]:
         out[k] = i
         i = int(before[i])
     return out
+
+
+def beam_ns(recording: Recording, scans: slice) -> NDArray[np.int64]:
+    """(n,) when each beam of these scans was taken, in nanoseconds."""
+    offset = recording.offset[scans.start : scans.stop + 1]
+    stamps = np.repeat(recording.stamp_ns[scans], np.diff(offset))
+    if recording.beam_time is None:
+        return stamps
+    later = recording.beam_time[offset[0] : offset[-1]].astype(np.float64)
+    return np.asarray(stamps + np.round(1e9 * later).astype(np.int64))

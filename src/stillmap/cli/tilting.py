@@ -1,0 +1,52 @@
+"""`stillmap map --tilting`: a second recording, of a laser that builds in 3D."""
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+from stillmap.cli.progress import shown_share
+from stillmap.errors import InputError
+from stillmap.output.points import beam_counts
+from stillmap.pipeline import Options
+from stillmap.recording import Recording, read
+from stillmap.result import Result
+from stillmap.scene.rig import Flat, Tilting, built_in_3d, require_rig
+from stillmap.threads import resolved_threads
+
+
+def read_tilting(
+    args: argparse.Namespace, flat: Recording, options: Options, scratch: Path
+) -> Recording | None:
+    """The recording of the laser that tilts; None where none was named.
+
+    Raises:
+        InputError: it cannot be read, or is not of the same robot and time as the flat one.
+    """
+    if not args.tilting:
+        return None
+    if flat.dimension != 2:
+        what = "the laser that decides what moves lies flat, this recording is in 3D"
+        raise InputError(what, where=args.input)
+    # what was chosen of one recording is not in the other one
+    read_as = dataclasses.replace(options.read, topic=None)
+    with shown_share(args.quiet, "reading") as tell:
+        found = read(Path(args.tilting), read_as, progress=tell, scratch=scratch)
+    require_rig(flat, found, args.tilting)
+    return dataclasses.replace(found, source={**found.source, "path": args.tilting})
+
+
+def built(result: Result, tilting: Recording, options: Options) -> Tilting:
+    """What that laser built, once the flat one knows what moves."""
+    return built_in_3d(Flat.of(result), tilting, options, resolved_threads(options.threads))
+
+
+def said(tilting: Tilting) -> str:
+    """A line about it."""
+    counts = beam_counts(tilting.seen, tilting.p_static)
+    out = (
+        f"in 3D {counts['hits']} beams that hit something, "
+        f"{100.0 * counts['dynamic'] / max(counts['hits'], 1):.1f} % of them dynamic"
+    )
+    if tilting.left_out:
+        out += f"; {tilting.left_out} left out: nobody knows where the robot was"
+    return out
