@@ -10,9 +10,9 @@ and `poses_lidar.txt`. PYTHON is an interpreter of its own, so that nothing else
     python3 -m venv peers && peers/bin/pip install dufomap==1.1.1 octomap-python
 They are compared with, never needed. All are given the same beams at the same poses, the true ones
 or those of the folder, without the motion during sweeps; --estimated-poses has stillmap once more
-find its own. Scores are over beams from 2.5 to 50 m. SA, DA and HA are percentages: of the static
-beams called static, of the dynamic ones called dynamic, and the harmonic mean. Recall by kind is
-in percent, too.
+find its own. Others are given what is at least 2.5 m away, scored is what is nearer than 50 m.
+SA, DA and HA are percentages: of the static beams called static, of the dynamic ones called
+dynamic, and the harmonic mean. Recall by kind is in percent, too.
 
 Each method has a process of its own, one after the other, in an order that turns from round to
 round; seconds are the medians of the rounds. "labels" are seconds until every beam has its label,

@@ -52,7 +52,7 @@ class Known:
     Attributes:
         static: (M,) whether each met something that stands still for good.
         kind: (M,) number of what it met in `kinds`.
-        scored: (M,) whether that is known, and it met more than the robot itself.
+        scored: (M,) whether that counts: it is known, and not the robot itself.
         kinds: names of what moves, then NOBODY.
     """
 
@@ -98,9 +98,11 @@ def prepare(case: Case, work: Path) -> dict[str, Any]:
         raise SystemExit(f"{source}: labels or poses are not those of its sweeps")
     np.save(work / "poses.npy", poses)
     (work / "case.json").write_text(json.dumps({"source": str(source), "kinds": known.kinds}))
-    beam = write_given(work, recording, poses)
-    for name in ("static", "kind", "scored"):
-        np.save(work / f"{name}.npy", getattr(known, name)[beam])
+    beam, near = write_given(work, recording, poses)
+    np.save(work / "beam.npy", beam)
+    np.save(work / "static.npy", known.static[beam])
+    np.save(work / "kind.npy", known.kind[beam])
+    np.save(work / "scored.npy", known.scored[beam] & near)
     return {"sweeps": recording.n_scans, "beams": recording.n_beams, "given": len(beam)}
 
 
@@ -128,34 +130,31 @@ def lidar_poses(path: Path) -> Float:
     return poses
 
 
-def write_given(work: Path, recording: stillmap.Recording, poses: Float) -> NDArray[np.int64]:
-    """Points for those that take points alone, and which beams (K,) these are.
+def write_given(
+    work: Path, recording: stillmap.Recording, poses: Float
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Points for those that take points alone; which beams (K,) these are, and which are near.
 
-    All beams that hit something between NEAREST and FARTHEST, without the motion during the sweep.
-    Others are left to nobody's judgement: DUFOMap labels nothing right once it is given points at
-    the sensor.
+    All beams that hit something at least NEAREST away, without the motion during the sweep. Nearer
+    ones nobody is given: points at the sensor itself spoil all labels of DUFOMap. Those beyond
+    FARTHEST help it, as they show free space.
     """
     seen = slam.deskewed(recording, poses, stillmap.Options().slam)
     beams: list[NDArray[np.int64]] = []
+    near: list[NDArray[np.bool_]] = []
     with (work / "points.bin").open("wb") as file:
         for t in range(recording.n_scans):
             part = seen.beams_of(t)
             points = np.asarray(seen.points[part])
-            kept = seen.hit[part] & between(points)
+            far = np.linalg.norm(points.astype(float), axis=1)
+            kept = seen.hit[part] & (far >= NEAREST)
             points[kept].tofile(file)
             beams.append(part.start + np.flatnonzero(kept))
-    beam = np.concatenate(beams)
+            near.append(far[kept] < FARTHEST)
     counts = [len(one) for one in beams]
     np.save(work / "offset.npy", np.concatenate([[0], np.cumsum(counts)]))
     np.save(work / "T_map_sensor.npy", recording.T_map_sensor(poses))
-    np.save(work / "beam.npy", beam)
-    return beam
-
-
-def between(points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(n,) whether points (n, 3) in the frame of the sensor are of those that are scored."""
-    far = np.linalg.norm(points.astype(float), axis=1)
-    return np.asarray((far >= NEAREST) & (far < FARTHEST))
+    return np.concatenate(beams), np.concatenate(near)
 
 
 def known_of_given(work: Path) -> Known:

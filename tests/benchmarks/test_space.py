@@ -112,7 +112,10 @@ def test_ours_and_others_label_the_same_beams(
     known = space_cases.known_of_given(work)
     points = np.fromfile(work / "points.bin", np.float32).reshape(-1, 3)
     assert len(points) == len(known.static) == about["given"] < about["beams"]
-    assert space_cases.between(points).all()
+    far = np.linalg.norm(points, axis=1)
+    assert (far >= space_cases.NEAREST).all()
+    assert (known.scored == (far < space_cases.FARTHEST)).all()
+    assert 0 < known.scored.sum() < len(points)
 
     theirs = space_methods.of_peer(work, "DUFOMap", sys.executable, 2, tmp_path / "d.npy")
     assert np.load(tmp_path / "d.npy").tolist() == (points[:, 0] <= 0).astype(float).tolist()
