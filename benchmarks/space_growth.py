@@ -34,6 +34,7 @@ from stillmap.stages import Stages, peak_memory_bytes
 
 Float = NDArray[np.float64]
 
+_SHOWN = 0.03  # share of the time that a stage takes at least to be printed
 _WIDE = 1 << 20  # m: no simulated world is wider
 
 
@@ -131,8 +132,10 @@ def cost_of(
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """A line per length: ms per sweep of every stage, and the peak until each had ended."""
-    stages = list(rows[0]["stages"])
+    """A line per length: ms per sweep of the stages that take any, and peaks of those that label."""
+    last = rows[-1]["stages"]
+    stages = [name for name in last if last[name] >= _SHOWN * rows[-1]["seconds"]]
+    labelling = ["m_step", "e_step"]
     lines = [
         [
             str(row["sweeps"]),
@@ -142,14 +145,15 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             f"{1e3 * row['seconds']:.0f}",
             f"{1e3 * row['cpu']:.0f}",
             f"{row['loaded']:.0f}",
-            *(f"{row['peaks'][name]:.0f}" for name in stages),
+            *(f"{row['peaks'][name]:.0f}" for name in labelling),
+            f"{row['peak']:.0f}",
             f"{1e3 * (row['peak'] - row['loaded']) / row['area']:.1f}",
         ]
         for row in rows
     ]
-    titles = ["sweeps", "m driven", "m2 seen", *(f"ms {name}" for name in stages)]
-    titles += ["ms whole job", "CPU ms", "MB once read", *(f"MB {name}" for name in stages)]
-    return markdown([*titles, "kB per m2"], lines)
+    titles = ["sweeps", "m driven", "m2 seen", *(f"{name}, ms per sweep" for name in stages)]
+    titles += ["whole job, ms", "CPU, ms", "peak MB once read"]
+    return markdown([*titles, *(f"{name}" for name in labelling), "job", "kB per m2"], lines)
 
 
 if __name__ == "__main__":
