@@ -14,6 +14,7 @@ may grow with these, time per sweep not at all.
 import argparse
 import dataclasses
 import json
+import shutil
 import sys
 import tempfile
 import time
@@ -34,6 +35,7 @@ from stillmap.stages import Stages, peak_memory_bytes
 
 Float = NDArray[np.float64]
 
+_POSES = "poses.npy"
 _SHOWN = 0.03  # share of the time that a stage takes at least to be printed
 _WIDE = 1 << 20  # m: no simulated world is wider
 
@@ -60,8 +62,11 @@ def main() -> None:
             in_fresh_process(write, whole, args.world, changes, args.seed)
         rows = []
         for sweeps in args.sweeps:
-            about = in_fresh_process(size_of, whole, sweeps)
-            cost = in_fresh_process(cost_of, whole, sweeps, chosen, Path(work, f"out-{sweeps}"))
+            first, out = Path(work, f"first-{sweeps}"), Path(work, f"out-{sweeps}")
+            about = in_fresh_process(write_beginning, whole, sweeps, first)
+            cost = in_fresh_process(cost_of, first, chosen, out)
+            shutil.rmtree(first)
+            shutil.rmtree(out)
             rows.append({"sweeps": sweeps, **about, **cost})
             print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     print(table(rows))
@@ -76,9 +81,9 @@ def write(whole: Path, world: str, changes: dict[str, Any], seed: int) -> None:
     write_simulation(simulate(scene_by_name(world, changes), seed), whole)
 
 
-def beginning(whole: Path, sweeps: int) -> tuple[stillmap.Recording, Float]:
-    """The first sweeps, still on the disk, and their true poses."""
-    recording, poses = folder.read(whole), load_truth(whole).T_world_base
+def write_beginning(whole: Path, sweeps: int, first: Path) -> dict[str, float]:
+    """Writes the first sweeps and their true poses; how far the robot went, how much it saw."""
+    recording, poses = folder.read(whole), load_truth(whole).T_world_base[:sweeps]
     beams = slice(0, int(recording.offset[sweeps]))
     times = recording.beam_time
     part = dataclasses.replace(
@@ -91,29 +96,29 @@ def beginning(whole: Path, sweeps: int) -> tuple[stillmap.Recording, Float]:
         T_odom_base=None,
         beam_time=None if times is None else times[beams],
     )
-    return part, poses[:sweeps]
+    folder.write(part, first)
+    np.save(first / _POSES, poses)
+    return size_of(part, poses)
 
 
-def size_of(whole: Path, sweeps: int) -> dict[str, float]:
-    """How far the robot went and how much it saw."""
-    recording, poses = beginning(whole, sweeps)
+def size_of(recording: stillmap.Recording, poses: Float) -> dict[str, float]:
+    """Metres driven, squares of a metre in which beams ended, and beams per sweep."""
     seen = np.zeros(0, np.int64)
-    for t in recording.in_turn(range(sweeps)):
+    for t in recording.in_turn(range(recording.n_scans)):
         beams = recording.beams_of(t)
         points = recording.points[beams][recording.hit[beams]].astype(float)
         T = (poses[t] @ recording.T_base_sensor[recording.sensor[t]])[:2]
         x, y = np.floor(points @ T[:, :3].T + T[:, 3]).astype(np.int64).T
         seen = np.union1d(seen, x * _WIDE + y)
     metres = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1).sum()
-    beams_each = recording.n_beams / sweeps
+    beams_each = recording.n_beams / recording.n_scans
     return {"metres": float(metres), "area": float(len(seen)), "beams": beams_each}
 
 
-def cost_of(
-    whole: Path, sweeps: int, chosen: stillmap.Options, out: Path
-) -> dict[str, dict[str, float] | float]:
-    """Seconds and peak memory of the whole job, and of its stages."""
-    recording, poses = beginning(whole, sweeps)
+def cost_of(first: Path, chosen: stillmap.Options, out: Path) -> dict[str, Any]:
+    """Seconds per sweep and peak memory of the whole job, and of its stages."""
+    recording, poses = folder.read(first), np.load(first / _POSES)
+    sweeps = recording.n_scans
     stages, wall, cpu = Stages(), time.perf_counter(), time.process_time()
     loaded = peak_memory_bytes()
     result = stillmap.build(recording, chosen, poses=poses, stages=stages)
@@ -132,7 +137,7 @@ def cost_of(
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """A line per length: ms per sweep of the stages that take any, and peaks of those that label."""
+    """A line per length: ms per sweep of the stages that take any, and peaks once they ended."""
     last = rows[-1]["stages"]
     stages = [name for name in last if last[name] >= _SHOWN * rows[-1]["seconds"]]
     labelling = ["m_step", "e_step"]
