@@ -14,6 +14,21 @@ from refusals import refused
 from stillmap.output.trajectory import read_tum
 from stillmap.recording import read, write
 
+PCD = """VERSION 0.7
+FIELDS x y z
+SIZE 4 4 4
+TYPE F F F
+COUNT 1 1 1
+WIDTH 3
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS 3
+DATA ascii
+4 0 0
+4 1 0
+4 0 1
+"""
+
 
 @pytest.fixture(scope="module")
 def mapped(stillmap, room, tmp_path_factory):
@@ -114,6 +129,13 @@ def test_what_is_no_recording_is_refused(call, tmp_path, nothing_left, content):
     (tmp_path / "input.log").write_text(content)
     refused(call("map", tmp_path / "input.log", "-o", tmp_path / "out"), "input.log")
     nothing_left("input.log")
+
+
+def test_an_estimator_that_knows_nothing_of_space_is_refused(call, tmp_path, nothing_left):
+    (tmp_path / "sweep.pcd").write_text(PCD)
+    done = call("map", tmp_path / "sweep.pcd", "-o", tmp_path / "out", "--estimator", "tracker")
+    refused(done, "is 3D", "'tracker'", "--estimator stillmap or paper")
+    nothing_left("sweep.pcd")
 
 
 def test_no_odometry(call, room, tmp_path):

@@ -80,6 +80,7 @@ def _mapped_and_saved(
         recording = _usable(found, args)
         poses = _given_poses(recording, args)
         tilting = read_tilting(args, recording, options, place.folder)
+        _require_known(recording, options, args)
         options = resolved(options, recording)
         same = identity(recording, options, poses)
     loop = _resumed(args, place, same, options, stages)
@@ -164,6 +165,16 @@ def _usable(recording: Recording, args: argparse.Namespace) -> Recording:
         raise InputError("holds no scan that can be used", where=args.input)
     recording = dataclasses.replace(recording, source=_found_at(recording.source, args.input))
     return recording.without_odometry() if args.no_odometry else recording
+
+
+def _require_known(recording: Recording, options: Options, args: argparse.Namespace) -> None:
+    """Refuse an estimator that knows nothing of space before the work is done."""
+    if recording.dimension == 3 and options.estimator not in em.IN_SPACE:
+        raise InputError(
+            f"is 3D: estimator '{options.estimator}' knows 2D recordings alone",
+            where=args.input,
+            hint=f"--estimator {' or '.join(em.IN_SPACE)}",
+        )
 
 
 def _found_at(source: dict[str, Any], path: str) -> dict[str, Any]:

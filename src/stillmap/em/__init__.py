@@ -2,6 +2,7 @@
 
 from stillmap.em.courses import Courses
 from stillmap.em.estimator import (
+    IN_SPACE,
     Estimator,
     add_believed_first,
     add_recording,
@@ -22,6 +23,7 @@ from stillmap.em.occupancy import Box, OccupancyMap, Seen, occupancy_map
 from stillmap.em.options import ChangeOptions, DwellOptions, EmOptions, EvidenceOptions, MapState
 
 __all__ = [
+    "IN_SPACE",
     "Box",
     "CellProbabilities",
     "ChangeOptions",

@@ -24,6 +24,9 @@ Estimator = Literal["stillmap", "paper", "hit-ratio", "tracker"]
 _FIXED: dict[Estimator, int] = {"hit-ratio": 1, "tracker": 2}
 
 
+IN_SPACE: tuple[Estimator, ...] = ("stillmap", "paper")  # those that know 3D recordings
+
+
 def initial_expectations(
     recording: Recording, estimator: Estimator, options: EmOptions
 ) -> NDArray[np.float32]:
