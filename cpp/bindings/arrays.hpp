@@ -70,6 +70,25 @@ Cell<D> cell_from(const Cells<D>& cells, size_t k) {
   return cell;
 }
 
+template <int D>
+Pose<D> checked_pose(const OnePose<D>& T, const char* name) {
+  const Pose<D> pose = pose_from<D>(T.data());
+  require(pose.R.allFinite() && pose.t.allFinite(), std::string(name) + ": not finite");
+  return pose;
+}
+
+template <int D>
+auto matrix_of(const Pose<D>& pose) {
+  std::vector<double> T((D + 1) * (D + 1), 0.0);
+  for (size_t r = 0; r < D; ++r) {
+    for (size_t c = 0; c < D; ++c)
+      T[r * (D + 1) + c] = pose.R(static_cast<int>(r), static_cast<int>(c));
+    T[r * (D + 1) + D] = pose.t[static_cast<int>(r)];
+  }
+  T.back() = 1.0;
+  return owned(std::move(T), {D + 1, D + 1});
+}
+
 inline const float* per_beam(const Flat<float>& values, size_t n_beams, const char* name) {
   require(values.shape(0) == n_beams, std::string(name) + ": expected " + std::to_string(n_beams) +
                                           " entries as points has rows, got " +

@@ -29,25 +29,6 @@ WeightedBeams<D> beams_from(const Points<D>& points, const Flat<float>& weights)
 }
 
 template <int D>
-Pose<D> checked_pose(const OnePose<D>& T, const char* name) {
-  const Pose<D> pose = pose_from<D>(T.data());
-  require(pose.R.allFinite() && pose.t.allFinite(), std::string(name) + ": not finite");
-  return pose;
-}
-
-template <int D>
-auto matrix_of(const Pose<D>& pose) {
-  std::vector<double> T((D + 1) * (D + 1), 0.0);
-  for (size_t r = 0; r < D; ++r) {
-    for (size_t c = 0; c < D; ++c)
-      T[r * (D + 1) + c] = pose.R(static_cast<int>(r), static_cast<int>(c));
-    T[r * (D + 1) + D] = pose.t[static_cast<int>(r)];
-  }
-  T.back() = 1.0;
-  return owned(std::move(T), {D + 1, D + 1});
-}
-
-template <int D>
 auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
                     const OnePose<D>& T_prior, const Square<D>& information, double sigma,
                     int radius, double floor, double unknown, double gain, int max_iterations,

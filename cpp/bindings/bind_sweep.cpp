@@ -18,13 +18,6 @@ using MovingSquare =
                 nb::c_contig, nb::device::cpu>;
 
 template <int D>
-Pose<D> finite_pose(const OnePose<D>& T, const char* name) {
-  const Pose<D> pose = pose_from<D>(T.data());
-  require(pose.R.allFinite() && pose.t.allFinite(), std::string(name) + ": not finite");
-  return pose;
-}
-
-template <int D>
 typename Lie<D>::Tangent finite_tangent(const Tangents<D>& twist, const char* name) {
   const typename Lie<D>::Tangent out = Eigen::Map<const typename Lie<D>::Tangent>(twist.data());
   require(out.allFinite(), std::string(name) + ": not finite");
@@ -67,7 +60,7 @@ void add_points(SweepMap<D>& map, const Points<D>& points, const Flat<float>& we
                 const OnePose<D>& T) {
   const float* w = per_beam(weights, points.shape(0), "weights");
   require_weights(w, points.shape(0));
-  const Pose<D> pose = finite_pose<D>(T, "T_map_base");
+  const Pose<D> pose = checked_pose<D>(T, "T_map_base");
   nb::gil_scoped_release released;
   for (size_t i = 0; i < points.shape(0); ++i) {
     const float* p = points.data() + i * D;
@@ -78,7 +71,7 @@ void add_points(SweepMap<D>& map, const Points<D>& points, const Flat<float>& we
 template <int D>
 void keep_near(SweepMap<D>& map, const OnePose<D>& T, double radius) {
   require(radius > 0.0, "radius: expected a positive length in metres");
-  const Pose<D> pose = finite_pose<D>(T, "T_map_base");
+  const Pose<D> pose = checked_pose<D>(T, "T_map_base");
   nb::gil_scoped_release released;
   map.keep_near(pose.t, radius);
 }
@@ -106,18 +99,6 @@ auto planes(const SweepMap<D>& map, const Places<D>& places, int level, double l
   }
   return std::make_tuple(owned(std::move(normals), {n, size_t{D}}), owned(std::move(offsets), {n}),
                          owned(std::move(variances), {n}), owned(std::move(known), {n}));
-}
-
-template <int D>
-auto matrix_of(const Pose<D>& pose) {
-  std::vector<double> T((D + 1) * (D + 1), 0.0);
-  for (size_t r = 0; r < D; ++r) {
-    for (size_t c = 0; c < D; ++c)
-      T[r * (D + 1) + c] = pose.R(static_cast<int>(r), static_cast<int>(c));
-    T[r * (D + 1) + D] = pose.t[static_cast<int>(r)];
-  }
-  T.back() = 1.0;
-  return owned(std::move(T), {D + 1, D + 1});
 }
 
 template <class Matrix>
@@ -158,12 +139,12 @@ auto register_to_map(const SweepMap<D>& map, const Points<D>& points, const Flat
   const auto beams = timed_points<D>(points, weights, times);
   constexpr int n = 2 * Lie<D>::kDof;
   MovingPrior<D> prior;
-  prior.mean = {finite_pose<D>(T_prior, "T_prior"), finite_tangent<D>(twist_prior, "twist_prior")};
+  prior.mean = {checked_pose<D>(T_prior, "T_prior"), finite_tangent<D>(twist_prior, "twist_prior")};
   prior.information =
       Eigen::Map<const Eigen::Matrix<double, n, n, Eigen::RowMajor>>(information.data());
   require(prior.information.allFinite(), "information: not finite");
   Moving<D> start = prior.mean;
-  if (T_start) start.pose = finite_pose<D>(*T_start, "T_start");
+  if (T_start) start.pose = checked_pose<D>(*T_start, "T_start");
   if (twist_start) start.twist = finite_tangent<D>(*twist_start, "twist_start");
   SweepFound<D> found;
   Eigen::Matrix<double, n, n> covariance;
@@ -186,7 +167,7 @@ auto linearise_sweep(const SweepMap<D>& map, const Points<D>& points, const Flat
   const SweepOptions options{
       plane_options(least, flat, wide), sigma, kernel, 1.0, level, slack, 0, 1.0};
   require(level >= 0 && level < map.levels(), "level: there is none of that number");
-  const Moving<D> at{finite_pose<D>(T, "T"), finite_tangent<D>(twist, "twist")};
+  const Moving<D> at{checked_pose<D>(T, "T"), finite_tangent<D>(twist, "twist")};
   const auto q =
       linearise<D>(map, timed_points<D>(points, weights, times), at, level, slack, options, 1);
   return std::make_tuple(square_of(q.hessian), vector_of(q.gradient), q.cost, q.met, q.compared,

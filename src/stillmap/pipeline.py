@@ -17,7 +17,6 @@ from stillmap.options import field_with_doc
 from stillmap.output.map_server import OutputOptions
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
-from stillmap.recording.spacing import spacing
 from stillmap.scene.rig_options import RigOptions
 from stillmap.slam import SlamOptions
 from stillmap.stages import Stages
@@ -65,8 +64,7 @@ def resolved(options: Options, recording: Recording) -> Options:
     cells of 3D recordings are voxels.
     """
     if recording.dimension == 3:
-        edge = options.slam.voxel or spacing(recording)
-        slam_options = dataclasses.replace(options.slam, resolution=edge, voxel=edge)
+        slam_options = dataclasses.replace(options.slam, resolution=options.slam.voxel)
         options = dataclasses.replace(options, slam=slam_options)
     if options.estimator != "paper":
         return options

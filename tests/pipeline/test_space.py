@@ -10,10 +10,12 @@ from choices import options
 from PIL import Image
 
 import stillmap
+from stillmap.cli import main
 from stillmap.output.trajectory import read_tum
 from stillmap.pipeline import Options
 from stillmap.recording.model import Recording
 from stillmap.simulation import scene_by_name, simulate
+from stillmap.simulation.writing import write_simulation
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +112,19 @@ def test_the_files_hold_what_was_found(street, mapped, tmp_path):
     run = json.loads((out / "run.json").read_text())
     assert run["options"]["slam"]["voxel"] == run["options"]["slam"]["resolution"] == 0.15
     assert "<html" in (out / "report.html").read_text()
+
+
+def test_labels_in_space_are_scored_and_plans_are_not(street, mapped, tmp_path, capsys):
+    write_simulation(street, tmp_path / "sim")
+    mapped.save(tmp_path / "out")
+    words = [str(tmp_path / "out"), str(tmp_path / "sim")]
+    assert main(["eval", "labels", *words, "--json"]) == 0
+    scores = json.loads(capsys.readouterr().out)
+    moving = street.recording.hit & ~street.truth.static
+    assert scores["dynamic"] == moving.sum()
+    assert scores["recall"] == pytest.approx((mapped.p_static[moving] < 0.5).mean(), abs=1e-6)
+    assert main(["eval", "map", *words]) == 2
+    assert "is no planar recording" in capsys.readouterr().err
 
 
 def test_other_estimators_of_the_plane_are_refused(street):

@@ -77,7 +77,7 @@ def _add_map_flags(p: argparse._ArgumentGroup) -> None:
         "--resolution",
         metavar="M",
         type=float,
-        help="edge of a map cell in metres (default: 0.05); in 3D by the sensor",
+        help="edge of a map cell in metres (default: 0.05); of a voxel in 3D (0.15)",
     )
     p.add_argument(
         "--map-mode",

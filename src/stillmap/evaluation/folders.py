@@ -34,7 +34,7 @@ class Labels:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A simulated planar recording and its truth. Arrays of truth are read when asked for."""
+    """A simulated recording and its truth. Arrays of truth are read when asked for."""
 
     folder: Path
     recording: Recording
@@ -44,7 +44,9 @@ class Truth:
         return _array(self.folder / "truth/static.npy", (self.recording.n_beams,), "b")
 
     def walls(self) -> Float:
-        """(W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1."""
+        """(W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1; of planar recordings."""
+        if self.recording.dimension != 2:
+            raise InputError("is no planar recording", where=str(self.folder))
         path = self.folder / "truth/walls.npy"
         walls = _finite(path, _array(path, (None, 4), "f"))
         if not len(walls):
@@ -59,12 +61,13 @@ class Truth:
         return _finite(path, _array(path, (None, 4), "f"))
 
     def poses(self) -> Float:
-        """(T, 3, 3) T_world_base."""
+        """(T, D+1, D+1) T_world_base."""
         path = self.folder / "truth/T_world_base.npy"
-        return _finite(path, _array(path, (self.recording.n_scans, 3, 3), "f"))
+        n = self.recording.dimension + 1
+        return _finite(path, _array(path, (self.recording.n_scans, n, n), "f"))
 
     def static_hits(self) -> Float:
-        """(N, 2) end points in the world frame, at true poses, of the static beams that hit."""
+        """(N, D) end points in the world frame, at true poses, of the static beams that hit."""
         use = np.flatnonzero(self.recording.hit & self.static())
         return self.recording.end_points(use, self.poses())
 
@@ -73,7 +76,7 @@ def read_truth(path: Path) -> Truth:
     """A simulated recording, given by its folder or by the `truth` folder inside.
 
     Raises:
-        InputError: it is none, or none in the plane. The arrays of truth can still fail later.
+        InputError: it is none. The arrays of truth can still fail later.
     """
     folder = path.parent if path.name == "truth" and not (path / "truth").exists() else path
     if not (folder / "truth").is_dir():
@@ -82,8 +85,6 @@ def read_truth(path: Path) -> Truth:
         )
     log = folder / "recording.log"  # a simulation in CARMEN's format
     recording = recording_of(log) if log.exists() else read_folder(folder)
-    if recording.dimension != 2:
-        raise InputError("is no planar recording", where=str(folder))
     return Truth(folder, recording)
 
 

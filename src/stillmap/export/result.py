@@ -64,7 +64,8 @@ def read(folder: Path, recording: Recording, p_static: NDArray[np.float32]) -> E
         InputError: a file is missing or damaged, or the recording is 3D.
     """
     if recording.dimension != 2:
-        raise InputError("is of a 3D recording: only results in the plane can be converted so far")
+        what = "is of a 3D recording: only results in the plane can be converted so far"
+        raise InputError(what, where=str(folder))
     return Exported(
         recording,
         poses_from_tum(folder / "trajectory.tum", recording),
