@@ -68,14 +68,14 @@ def resolved(options: Options, recording: Recording) -> Options:
         options = dataclasses.replace(options, slam=slam_options)
     if options.estimator != "paper":
         return options
-    loops = dataclasses.replace(options.slam.loops, enabled=False)
-    registration = dataclasses.replace(options.slam.registration, approach=0.0)
-    return dataclasses.replace(
-        options,
-        slam=dataclasses.replace(
-            options.slam, loops=loops, registration=registration, deskew=False
-        ),
+    slam_options = dataclasses.replace(
+        options.slam,
+        loops=dataclasses.replace(options.slam.loops, enabled=False),
+        spinning_loops=dataclasses.replace(options.slam.spinning_loops, enabled=False),
+        registration=dataclasses.replace(options.slam.registration, approach=0.0),
+        deskew=False,
     )
+    return dataclasses.replace(options, slam=slam_options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +178,7 @@ def iterate(
     """Interleaves mapping and the estimation of what is static; the caller decides when to stop.
 
     Args:
-        recording: at least one scan; of 3D ones the poses have to be given.
+        recording: at least one scan.
         options: see Options.
         poses: (T, D+1, D+1) T_map_base to keep instead of estimating them.
         progress: called with what is done, the iteration, scans done, and of how many; these are 0

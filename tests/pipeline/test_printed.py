@@ -70,11 +70,13 @@ def test_it_is_the_loop_of_fig_2(room):
 
 def test_the_options_that_are_kept_are_those_that_were_used(printed):
     assert not printed.options.slam.loops.enabled
+    assert not printed.options.slam.spinning_loops.enabled
     assert printed.options.slam.registration.approach == 0.0
     # all else as it was asked for, and other estimators as they were
     assert not printed.options.slam.deskew
     rest = {
         "loops": {"enabled": True},
+        "spinning_loops": {"enabled": True},
         "registration": {"approach": SLAM.registration.approach},
         "deskew": True,
     }

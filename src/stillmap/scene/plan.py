@@ -63,8 +63,9 @@ def plan_of(
     T_map_sensor = recording.T_map_sensor(poses)
     planar_poses = se2.planar(T_map_sensor)
     top = max(options.high, ground.sensor + _ABOVE)
-    ends, hits = Column(np.float32, (2,), recording.scratch), Column(np.bool_)
-    numbers, offset = Column(np.intp, (), recording.scratch), np.zeros(recording.n_scans + 1, int)
+    scratch, offset = recording.scratch, np.zeros(recording.n_scans + 1, np.int64)
+    ends, hits = Column(np.float32, (2,), scratch), Column(np.bool_, (), scratch)
+    numbers = Column(np.intp, (), scratch)
     for t in recording.in_turn(range(recording.n_scans)):
         beams = recording.beams_of(t)
         xy, hit, number = _of_scan(
@@ -80,7 +81,7 @@ def plan_of(
         recording,
         points=ends.finished(),
         hit=hits.finished(),
-        offset=offset.astype(np.int64),
+        offset=offset,
         T_base_sensor=np.eye(3)[None],
         sensor=np.zeros(recording.n_scans, np.int32),
         T_odom_base=None,
