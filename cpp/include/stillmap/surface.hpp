@@ -82,6 +82,12 @@ class Surface : public CellIndex<D> {
     });
   }
 
+  // The element of a cell, or kNoElement.
+  int32_t at(Cursor<const Surface<D>>& cursor, const Cell<D>& cell) const {
+    const Block* block = cursor.block(cell);
+    return block ? block->counts[static_cast<size_t>(this->local_of(cell))] : kNoElement;
+  }
+
   // The element that an end point is of: that of its cell, or where it lies off the surface there,
   // the nearest one beside it that it does not lie off.
   int32_t owner(Cursor<const Surface<D>>& cursor, const Vec<D>& end) const {
@@ -118,11 +124,6 @@ class Surface : public CellIndex<D> {
     std::array<Fixed, D> first{};           // of end point - cell corner
     std::array<Fixed, kProducts> second{};  // of its products, by rows of the upper triangle
   };
-
-  int32_t at(Cursor<const Surface<D>>& cursor, const Cell<D>& cell) const {
-    const Block* block = cursor.block(cell);
-    return block ? block->counts[static_cast<size_t>(this->local_of(cell))] : kNoElement;
-  }
 
   bool lies_off(int32_t k, const Vec<D>& end) const {
     const Element<D>& e = element(k);

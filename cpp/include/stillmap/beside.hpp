@@ -1,0 +1,169 @@
+// Things are larger than a cell: what the elements beside one say about it.
+//
+// Mean field of a random field over elements near each other. Static ones speak for an element as
+// far as both were hit in the same time, dynamic ones as far as it was hit while they were and at
+// no other time; both as far as the two can be of one surface. See docs/space.md.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <vector>
+
+#include "stillmap/parallel.hpp"
+#include "stillmap/surface.hpp"
+
+namespace stillmap {
+
+struct BesideOptions {
+  double radius;       // cells between those that speak for each other
+  double coplanar;     // cells: standard deviation of a mean from the plane of another
+  double for_static;   // log odds that static neighbours are worth, if there are no others
+  double for_dynamic;  // the same of dynamic ones
+  double least, most;  // log odds that an element's own looks are worth
+  double moved;        // change of a probability of which the neighbours want to know
+  int rounds;          // at most
+};
+
+constexpr int64_t kLastLook = std::numeric_limits<int32_t>::max();
+
+// First and last look at which a beam ended in an element's cell.
+struct Span {
+  int32_t first, last;
+};
+
+// Widens the spans of the elements by the hits of scans; look: of each scan.
+template <int D>
+void widen_spans(const Surface<D>& surface, const Scans<D>& scans, const int64_t* look,
+                 Span* spans) {
+  Cursor<const Surface<D>> cursor(surface);
+  for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t t, int64_t n, const Pose<D>& pose) {
+    if (!scans.hit[n]) return;
+    const Segment<D> beam(pose, scans.points + n * D, surface.resolution());
+    const int32_t k = surface.at(cursor, cell_of<D>(beam.end));
+    if (k == kNoElement) return;
+    const auto now = static_cast<int32_t>(look[t]);
+    spans[k] = {std::min(spans[k].first, now), std::max(spans[k].last, now)};
+  });
+}
+
+template <int D>
+class Beside {
+ public:
+  // log_odds: (E,) of being static, by an element's own looks
+  Beside(const Surface<D>& surface, const float* log_odds, const Span* spans,
+         const BesideOptions& options, int threads)
+      : surface_(surface), options_(options), threads_(threads), p_(surface.size()) {
+    rows_.reserve(surface.size());
+    for (size_t k = 0; k < surface.size(); ++k) {
+      rows_.push_back(row_of(static_cast<int32_t>(k), log_odds[k], spans[k]));
+      p_[k] = probability(log_odds[k]);
+    }
+    const int radius = static_cast<int>(std::floor(options.radius));
+    for_each_near<D>(Cell<D>::Zero(), radius, [&](const Cell<D>& off) {
+      const double apart = off.template cast<double>().squaredNorm();
+      if (apart > 0.0 && apart <= options.radius * options.radius) offsets_.push_back(off);
+    });
+  }
+
+  // (E,) probability of being static, by what is beside as well.
+  const std::vector<float>& settle() {
+    std::vector<uint8_t> asked(p_.size(), 1);
+    for (int round = 0; round < options_.rounds; ++round) {
+      const std::vector<float> before = p_;
+      parallel_shares(even(), [&](size_t, size_t from, size_t to) {
+        Cursor<const Surface<D>> cursor(surface_);
+        for (size_t k = from; k < to; ++k)
+          if (asked[k]) p_[k] = opinion(cursor, k, before);
+      });
+      if (!pass_on(before, asked)) break;
+    }
+    return p_;
+  }
+
+ private:
+  using Vecf = Eigen::Matrix<float, D, 1>;
+
+  struct Row {
+    Vecf mean, normal;  // cells; the normal of what is round is zero
+    Span hit;
+    float own;  // log odds
+  };
+
+  Row row_of(int32_t k, float log_odds, const Span& hit) const {
+    const Element<D>& e = surface_.element(k);
+    return {e.mean.template cast<float>(), e.normal.template cast<float>(), hit,
+            std::clamp(log_odds, static_cast<float>(options_.least),
+                       static_cast<float>(options_.most))};
+  }
+
+  std::vector<size_t> even() const {
+    const auto n = static_cast<size_t>(std::max(threads_, 1));
+    std::vector<size_t> bounds;
+    for (size_t i = 0; i <= n; ++i) bounds.push_back(p_.size() * i / n);
+    return bounds;
+  }
+
+  static float probability(float log_odds) { return 1.0f / (1.0f + std::exp(-log_odds)); }
+
+  template <class Visit>
+  void for_each_beside(Cursor<const Surface<D>>& cursor, size_t k, Visit&& visit) const {
+    const Cell<D>& cell = surface_.cell(static_cast<int32_t>(k));
+    for (const Cell<D>& off : offsets_) {
+      const int32_t other = surface_.at(cursor, cell + off);
+      if (other != kNoElement) visit(static_cast<size_t>(other));
+    }
+  }
+
+  float opinion(Cursor<const Surface<D>>& cursor, size_t k, const std::vector<float>& p) const {
+    const Row& row = rows_[k];
+    float for_it = 0.0f, against = 0.0f, weight = 1.0f;
+    for_each_beside(cursor, k, [&](size_t other) {
+      const Row& beside = rows_[other];
+      const int64_t both = looks(
+          {std::max(row.hit.first, beside.hit.first), std::min(row.hit.last, beside.hit.last)});
+      if (both <= 0) return;
+      const bool is_static = p[other] > 0.5f;
+      const int64_t of = is_static ? looks(row.hit) + looks(beside.hit) - both : looks(row.hit);
+      const float w = together(row, beside) * static_cast<float>(both) / static_cast<float>(of);
+      weight += w;
+      (is_static ? for_it : against) += w * std::abs(2.0f * p[other] - 1.0f);
+    });
+    const auto pull = static_cast<float>(options_.for_static) * for_it -
+                      static_cast<float>(options_.for_dynamic) * against;
+    return probability(row.own + pull / weight);
+  }
+
+  static int64_t looks(const Span& span) { return int64_t{span.last} - span.first + 1; }
+
+  // How far two can be of one surface.
+  float together(const Row& a, const Row& b) const {
+    const Vecf apart = b.mean - a.mean;
+    const float off = std::max(std::abs(a.normal.dot(apart)), std::abs(b.normal.dot(apart)));
+    const float of = off / static_cast<float>(options_.coplanar);
+    return std::exp(-0.5f * of * of);
+  }
+
+  // Asks in the next round those beside whom somebody thinks otherwise than before.
+  bool pass_on(const std::vector<float>& before, std::vector<uint8_t>& asked) const {
+    std::fill(asked.begin(), asked.end(), uint8_t{0});
+    bool any = false;
+    Cursor<const Surface<D>> cursor(surface_);
+    for (size_t k = 0; k < p_.size(); ++k) {
+      if (!(std::abs(p_[k] - before[k]) > options_.moved)) continue;
+      for_each_beside(cursor, k, [&](size_t other) { asked[other] = 1; });
+      any = true;
+    }
+    return any;
+  }
+
+  const Surface<D>& surface_;
+  BesideOptions options_;
+  int threads_;
+  std::vector<float> p_;
+  std::vector<Row> rows_;
+  std::vector<Cell<D>> offsets_;
+};
+
+}  // namespace stillmap
