@@ -32,6 +32,7 @@ class Dwell {
         options_(options),
         tables_(options.lateral),
         neighbours_(surface, options.reach),
+        beam_tiles_(surface),
         chains_(places_of(surface), std::move(classes), options.seconds) {}
 
   size_t classes() const { return chains_.size(); }
@@ -39,7 +40,7 @@ class Dwell {
 
   // Beams without a return, and those of them that cross something solid.
   Lost lost(const Scans<D>& scans) const {
-    return LookCollector<D>(surface_, neighbours_, options_, tables_).lost(scans);
+    return LookCollector<D>(surface_, beam_tiles_, neighbours_, options_, tables_).lost(scans);
   }
   // The cells in which beams without a return meet something solid.
   std::vector<Cell<D>> solid() const {
@@ -81,8 +82,8 @@ class Dwell {
                                         std::max<size_t>(looks, 1));
     std::vector<std::unique_ptr<LookCollector<D>>> collectors;
     for (size_t i = 0; i < n; ++i)
-      collectors.push_back(
-          std::make_unique<LookCollector<D>>(surface_, neighbours_, options_, tables_));
+      collectors.push_back(std::make_unique<LookCollector<D>>(surface_, beam_tiles_, neighbours_,
+                                                              options_, tables_));
     std::vector<Seen> seen(kWindow);
     for (size_t from = 0; from < looks; from += kWindow) {
       const size_t to = std::min(from + kWindow, looks);
@@ -168,6 +169,7 @@ class Dwell {
   LookOptions options_;
   MeetingTables tables_;
   Neighbours<D> neighbours_;
+  Tiles<D> beam_tiles_;
   Chains chains_;
   std::optional<Changes> changes_;
   int64_t newest_ = kNone;

@@ -7,6 +7,7 @@
 #include <optional>
 #include <vector>
 
+#include "stillmap/crossing.hpp"
 #include "stillmap/look.hpp"
 #include "stillmap/neighbours.hpp"
 #include "stillmap/no_return.hpp"
@@ -26,16 +27,18 @@ inline bool is_solid(const Surface<D>& surface, int32_t k, bool normals) {
 template <int D>
 class LookCollector {
  public:
-  LookCollector(const Surface<D>& surface, const Neighbours<D>& neighbours,
+  LookCollector(const Surface<D>& surface, const Tiles<D>& tiles, const Neighbours<D>& neighbours,
                 const LookOptions& options, const MeetingTables& tables)
       : surface_(surface),
+        tiles_(tiles),
         neighbours_(neighbours),
         options_(options),
         margin_(static_cast<float>(options.margin)),
         tables_(tables),
         sheet_(surface.size()),
         touched_(Seen::spans(surface.size())),
-        cursor_(surface) {
+        open_(tiles.marks()),
+        crossing_(tiles) {
     for (size_t k = 0; k < sheet_.size(); ++k)
       sheet_[k] = row_of(surface, static_cast<int32_t>(k), options.normals);
   }
@@ -46,7 +49,8 @@ class LookCollector {
       const Segment<D> beam(pose, scans.points + n * D, surface_.resolution());
       pass(beam, scans.hit[n]);
       if (!scans.hit[n]) return;
-      if (const auto* k = at(cell_of<D>(beam.end)); k && strike(*k)) struck_.push_back(*k);
+      if (const int32_t k = tiles_.element(cell_of<D>(beam.end)); k != kNoElement && strike(k))
+        struck_.push_back(k);
     });
   }
 
@@ -57,7 +61,7 @@ class LookCollector {
       if (scans.hit[n] || !in_a_row(scans, t, n)) return;
       ++lost.beams;
       cross(Segment<D>(pose, scans.points + n * D, surface_.resolution()), false);
-      for (const Crossed& crossed : crossed_)
+      for (const auto& crossed : crossed_)
         if (sheet_[static_cast<size_t>(crossed.element)].solid) {
           ++lost.through_solid;
           break;
@@ -81,6 +85,8 @@ class LookCollector {
       out.begin.push_back(out.looks.size());
     }
     struck_.clear();
+    for (const size_t block : shut_) open_[block] = tiles_.marks()[block];
+    shut_.clear();
   }
 
  private:
@@ -131,21 +137,17 @@ class LookCollector {
     if (missed == kStruck) return false;
     if (missed == kUntouched) touched_[Seen::span_of(k)].push_back(k);
     missed = kStruck;
+    const Cell<D>& cell = surface_.cell(k);
+    shut(static_cast<size_t>(tiles_.find(Grid<D>::block_of(cell))), cell);
     return true;
   }
 
-  const int32_t* at(const Cell<D>& cell) {
-    const auto* block = cursor_.block(cell);
-    if (!block) return nullptr;
-    const int32_t* k = &block->counts[static_cast<size_t>(Surface<D>::local_of(cell))];
-    return *k == kNoElement ? nullptr : k;
+  // Of the element in a cell more beams of this look tell nothing.
+  void shut(size_t block, const Cell<D>& cell) {
+    auto& open = open_[block];
+    if (open.tiles == tiles_.marks()[block].tiles) shut_.push_back(block);
+    open.unmark(cell);
   }
-
-  // An element whose cell a beam crosses.
-  struct Crossed {
-    int32_t element;
-    Cell<D> cell;
-  };
 
   // A beam in single precision, from the corner of the cell in which it starts.
   struct Line {
@@ -155,8 +157,9 @@ class LookCollector {
     bool hit;
   };
 
-  // Lists the elements whose cells a beam crosses before it ends; returns whether it has a length.
-  // The end cell is not visited: an end in it is a hit, and free range stops before it.
+  // Lists the elements whose cells a beam crosses before it ends, of which it may tell anything;
+  // returns whether it has a length. The end cell is not visited: an end in it is a hit, and free
+  // range stops before it.
   std::optional<Line> cross(const Segment<D>& beam, bool hit) {
     crossed_.clear();
     const Vec<D> way = beam.end - beam.start;
@@ -165,18 +168,11 @@ class LookCollector {
     if (!(usable > 0.0)) return std::nullopt;
     const Vec<D> direction = way / length;
     const Vec<D> end = hit ? beam.end : Vec<D>(beam.start + direction * usable);
-    const auto cells = (cell_of<D>(end) - cell_of<D>(beam.start)).cwiseAbs().sum();
-    crossed_.resize(static_cast<size_t>(cells) + 1);
-    // no branch on whether there is an element: nobody could foresee it
-    Crossed* next = crossed_.data();
-    Walker walker(cursor_, [&](const int32_t* k, const Cell<D>& cell) {
-      const int32_t element = k ? *k : kNoElement;
-      __builtin_prefetch(sheet_.data() + std::max(element, 0), 1);
-      *next = {element, cell};
-      next += element != kNoElement;
+    // what is solid stops one without a return, whether it is known to be there or not
+    crossing_.follow(beam.start, end, hit ? open_ : tiles_.marks(), [&](const auto& place) {
+      __builtin_prefetch(sheet_.data() + place.element, 1);
+      crossed_.push_back(place);
     });
-    traverse<D>(beam.start, end, walker);
-    crossed_.resize(static_cast<size_t>(next - crossed_.data()));
     const Cell<D> corner = cell_of<D>(beam.start);
     return Line{corner, (beam.start - corner.template cast<double>()).template cast<float>(),
                 direction.template cast<float>(), static_cast<float>(length), hit};
@@ -188,7 +184,7 @@ class LookCollector {
     const std::optional<Line> line = cross(beam, hit);
     if (!line) return;
     float trust = 1.0f;
-    for (const Crossed& crossed : crossed_) {
+    for (const auto& crossed : crossed_) {
       Row& row = sheet_[static_cast<size_t>(crossed.element)];
       if (!hit && row.solid) trust = static_cast<float>(options_.open);
       if (row.missed < kSure) continue;
@@ -199,6 +195,7 @@ class LookCollector {
         row.missed = 1.0f;
       }
       row.missed *= 1.0f - met;
+      if (row.missed < kSure) shut(crossed.block, crossed.cell);
     }
   }
 
@@ -227,6 +224,7 @@ class LookCollector {
   }
 
   const Surface<D>& surface_;
+  const Tiles<D>& tiles_;
   const Neighbours<D>& neighbours_;
   LookOptions options_;
   float margin_;
@@ -234,8 +232,11 @@ class LookCollector {
   std::vector<Row> sheet_;
   std::vector<std::vector<int32_t>> touched_;  // by spans
   std::vector<int32_t> struck_;
-  std::vector<Crossed> crossed_;  // of one beam: fetched all at once, then looked at
-  Cursor<const Surface<D>> cursor_;
+  std::vector<typename Crossing<D>::Place>
+      crossed_;                                 // of one beam: fetched all at once, then looked at
+  std::vector<typename Tiles<D>::Marks> open_;  // cells of which more beams of this look tell more
+  std::vector<size_t> shut_;                    // blocks in which some do not
+  Crossing<D> crossing_;
 };
 
 }  // namespace stillmap
