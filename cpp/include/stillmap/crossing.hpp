@@ -46,11 +46,10 @@ class Crossing {
       int axis = when[1] < when[0] ? 1 : 0;
       if (D == 3 && when[D - 1] < when[at(axis)]) axis = D - 1;
       const double left = when[at(axis)];
-      if (page) {
-        const int32_t b = page[Tiles<D>::place_of(block)];
-        if (b != Tiles<D>::kNone)
-          in_block(entered, std::min(left, length_), block, static_cast<size_t>(b), marked, visit);
-      }
+      last_ = page ? page[Tiles<D>::place_of(block)] : Tiles<D>::kNone;
+      if (last_ != Tiles<D>::kNone)
+        in_block(entered, std::min(left, length_), block, static_cast<size_t>(last_), marked,
+                 visit);
       if (!(left < kInf)) return;
       entered = left;
       leaves[at(axis)] += kEdge;
@@ -60,6 +59,9 @@ class Crossing {
       if (!Tiles<D>::same_page(before, block[axis])) page = tiles_.page_of(block);
     }
   }
+
+  // number of the block in which the segment ended
+  int32_t last_block() const { return last_; }
 
  private:
   static constexpr int kEdge = Surface<D>::kEdge;
@@ -76,7 +78,7 @@ class Crossing {
     const double length = direction.norm();
     start_ = start;
     length_ = length;
-    way_ = direction / length;
+    way_ = direction * (1.0 / length);
     for (int d = 0; d < D; ++d) {
       const int32_t n = std::abs(cells[d]);
       step_[at(d)] = cells[d] > 0 ? 1 : -1;
@@ -152,6 +154,7 @@ class Crossing {
   Vec<D> start_, way_;
   double length_;
   Cell<D> first_;
+  int32_t last_ = Tiles<D>::kNone;
   std::array<int32_t, D> step_;
   std::array<std::vector<double>, D> noted_;
   std::array<const double*, D> borders_;

@@ -23,6 +23,37 @@ inline bool is_solid(const Surface<D>& surface, int32_t k, bool normals) {
   return normals && !surface.element(k).normal.isZero(0.0) && surface.beams(k) >= many;
 }
 
+// Where a beam stops being one that tells of free space; nothing, if it is too short to tell.
+template <int D>
+inline std::optional<Vec<D>> free_end(const Segment<D>& beam, bool hit, double beyond) {
+  if (hit) return beam.end;
+  const Vec<D> way = beam.end - beam.start;
+  const double length = way.norm(), usable = length - beyond;
+  if (!(usable > 0.0)) return std::nullopt;
+  return Vec<D>(beam.start + way / length * usable);
+}
+
+// Of the beams of scans [first, last) without a return, what else is known of the surface.
+template <int D>
+inline Lost lost_of(const Surface<D>& surface, const Tiles<D>& tiles, const LookOptions& options,
+                    const Scans<D>& scans, size_t first, size_t last) {
+  Lost lost;
+  Crossing<D> crossing(tiles);
+  for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
+    if (scans.hit[n] || !in_a_row(scans, t, n)) return;
+    ++lost.beams;
+    const Segment<D> beam(pose, scans.points + n * D, surface.resolution());
+    const std::optional<Vec<D>> end = free_end(beam, false, options.beyond);
+    bool through = false;
+    if (end)
+      crossing.follow(beam.start, *end, tiles.marks(), [&](const auto& place) {
+        through |= is_solid(surface, place.element, options.normals);
+      });
+    lost.through_solid += through;
+  });
+  return lost;
+}
+
 // Collects the beams of one look.
 template <int D>
 class LookCollector {
@@ -47,27 +78,13 @@ class LookCollector {
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
       if (!scans.hit[n] && !in_a_row(scans, t, n)) return;
       const Segment<D> beam(pose, scans.points + n * D, surface_.resolution());
-      pass(beam, scans.hit[n]);
+      const bool has_length = pass(beam, scans.hit[n]);
       if (!scans.hit[n]) return;
-      if (const int32_t k = tiles_.element(cell_of<D>(beam.end)); k != kNoElement && strike(k))
-        struck_.push_back(k);
+      const Cell<D> end = cell_of<D>(beam.end);
+      const int32_t k =
+          has_length ? tiles_.element(crossing_.last_block(), end) : tiles_.element(end);
+      if (k != kNoElement && strike(k)) struck_.push_back(k);
     });
-  }
-
-  // Of the beams without a return, what else is known of the surface.
-  Lost lost(const Scans<D>& scans) {
-    Lost lost;
-    for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t t, int64_t n, const Pose<D>& pose) {
-      if (scans.hit[n] || !in_a_row(scans, t, n)) return;
-      ++lost.beams;
-      cross(Segment<D>(pose, scans.points + n * D, surface_.resolution()), false);
-      for (const auto& crossed : crossed_)
-        if (sheet_[static_cast<size_t>(crossed.element)].solid) {
-          ++lost.through_solid;
-          break;
-        }
-    });
-    return lost;
   }
 
   // What the look says, and a clean sheet for the next one.
@@ -164,12 +181,11 @@ class LookCollector {
     crossed_.clear();
     const Vec<D> way = beam.end - beam.start;
     const double length = way.norm();
-    const double usable = hit ? length : length - options_.beyond;
-    if (!(usable > 0.0)) return std::nullopt;
+    const std::optional<Vec<D>> end = free_end(beam, hit, options_.beyond);
+    if (!end || !(length > 0.0)) return std::nullopt;
     const Vec<D> direction = way / length;
-    const Vec<D> end = hit ? beam.end : Vec<D>(beam.start + direction * usable);
     // what is solid stops one without a return, whether it is known to be there or not
-    crossing_.follow(beam.start, end, hit ? open_ : tiles_.marks(), [&](const auto& place) {
+    crossing_.follow(beam.start, *end, hit ? open_ : tiles_.marks(), [&](const auto& place) {
       __builtin_prefetch(sheet_.data() + place.element, 1);
       crossed_.push_back(place);
     });
@@ -179,10 +195,11 @@ class LookCollector {
   }
 
   // Notes what the beam passed. One without a return passed what lies before the first solid
-  // element in its way; that it did not end there without an echo is only so sure.
-  void pass(const Segment<D>& beam, bool hit) {
+  // element in its way; that it did not end there without an echo is only so sure. Returns whether
+  // it has a length.
+  bool pass(const Segment<D>& beam, bool hit) {
     const std::optional<Line> line = cross(beam, hit);
-    if (!line) return;
+    if (!line) return false;
     float trust = 1.0f;
     for (const auto& crossed : crossed_) {
       Row& row = sheet_[static_cast<size_t>(crossed.element)];
@@ -197,6 +214,7 @@ class LookCollector {
       row.missed *= 1.0f - met;
       if (row.missed < kSure) shut(crossed.block, crossed.cell);
     }
+    return true;
   }
 
   // Of the beam crossing the surface within the element, as far as `lateral` lets one tell: small

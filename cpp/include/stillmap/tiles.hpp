@@ -143,7 +143,10 @@ class Tiles {
 
   // kNoElement where there is none
   int32_t element(const Cell<D>& cell) const {
-    const int32_t block = find(Grid<D>::block_of(cell));
+    return element(find(Grid<D>::block_of(cell)), cell);
+  }
+  // the number of its block is known
+  int32_t element(int32_t block, const Cell<D>& cell) const {
     if (block == kNone) return kNoElement;
     const size_t tile = tile_of(cell), number = bit_of(cell);
     const auto b = static_cast<size_t>(block);

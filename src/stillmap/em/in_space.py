@@ -4,7 +4,7 @@ A recording of streets lasts for minutes, and a car that waits at a light for ha
 goes on, is no wall. Whoever removes what moves from a cloud wants the car out, and its place free.
 """
 
-from stillmap.em.courses import courses_of, watch
+from stillmap.em.courses import static_of, watch
 from stillmap.em.dwell import e_step, expectations_of
 from stillmap.em.expectations import Expectations
 from stillmap.em.looks import Classes, Dwell, Float, looked_at
@@ -28,5 +28,5 @@ def e_step_in_space(
         watch(dwell, recording, options)
 
     looks = looked_at(recording, poses, resolution, options, threads, _CLASSES, prepare)
-    static = courses_of(looks, options).p_static
-    return expectations_of(looks, looks.under(), recording, poses, options, threads, static)
+    static = static_of(looks, options)
+    return expectations_of(looks, None, recording, poses, options, threads, static)
