@@ -252,7 +252,7 @@ def test_places_and_classes_of_looks(dimension):
 @pytest.mark.parametrize("call", ["add_end_points", "elements_of", "add"])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_looks_from_nowhere(call, dimension):
-    surface = surface_of(dimension)
+    surface = surface_of(dimension, fitted=call != "add_end_points")
     beams = arguments("add_beams", dimension)
     beams = {k: beams[k] for k in ("points", "hit", "offset", "T_map_sensor")}
     target = dwell_of(surface) if call == "add" else surface
