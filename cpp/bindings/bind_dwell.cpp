@@ -1,7 +1,9 @@
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <array>
 #include <limits>
 #include <optional>
 
@@ -33,23 +35,40 @@ auto elements(const Surface<D>& surface, const Points<D>& points, const Flat<boo
   return owned(std::move(out), {n});
 }
 
+// Some of the elements: first, first + every, ..., n of them.
+struct Rows {
+  size_t first = 0, every = 1, n = 0;
+};
+using Slice = std::array<int64_t, 3>;  // first, last, every
+
+inline Rows rows_from(const std::optional<Slice>& rows, size_t size) {
+  if (!rows) return {0, 1, size};
+  const auto [first, last, every] = *rows;
+  require(0 <= first && first <= last && last <= static_cast<int64_t>(size) && every > 0,
+          "rows: expected some of the elements");
+  return {static_cast<size_t>(first), static_cast<size_t>(every),
+          static_cast<size_t>((last - first + every - 1) / every)};
+}
+
 // cells, means and normals (E, D), distances from the plane and beams (E,)
 template <int D>
-auto describe(const Surface<D>& surface) {
+auto describe(const Surface<D>& surface, const std::optional<Slice>& rows) {
   require(surface.fitted(), "surface: fit it first");
-  const size_t n = surface.size(), d = static_cast<size_t>(D);
-  std::vector<int64_t> cells, beams;
-  std::vector<double> means, normals, off_plane, prominence;
+  const auto [first, every, n] = rows_from(rows, surface.size());
+  const auto d = static_cast<size_t>(D);
+  std::vector<int64_t> cells(n * d), beams(n);
+  std::vector<double> means(n * d), normals(n * d), off_plane(n), prominence(n);
   for (size_t i = 0; i < n; ++i) {
-    const auto k = static_cast<int32_t>(i);
+    const auto k = static_cast<int32_t>(first + i * every);
     for (int a = 0; a < D; ++a) {
-      cells.push_back(surface.cell(k)[a]);
-      means.push_back(surface.element(k).mean[a] * surface.resolution());
-      normals.push_back(surface.element(k).normal[a]);
+      const size_t at = i * d + static_cast<size_t>(a);
+      cells[at] = surface.cell(k)[a];
+      means[at] = surface.element(k).mean[a] * surface.resolution();
+      normals[at] = surface.element(k).normal[a];
     }
-    beams.push_back(surface.beams(k));
-    prominence.push_back(surface.element(k).prominence);
-    off_plane.push_back(surface.element(k).off_plane * surface.resolution());
+    beams[i] = surface.beams(k);
+    prominence[i] = surface.element(k).prominence;
+    off_plane[i] = surface.element(k).off_plane * surface.resolution();
   }
   return std::make_tuple(owned(std::move(cells), {n, d}), owned(std::move(means), {n, d}),
                          owned(std::move(normals), {n, d}), owned(std::move(off_plane), {n}),
@@ -68,44 +87,47 @@ void add_looks(Dwell<D>& dwell, const Points<D>& points, const Flat<bool>& hit,
 }
 
 template <int D>
-auto likelihoods(Dwell<D>& dwell, const std::optional<Flat<bool>>& among) {
+auto likelihoods(Dwell<D>& dwell, const std::optional<Flat<bool>>& among,
+                 const std::optional<Slice>& rows, int threads) {
   std::vector<size_t> classes;
   require(!among || among->shape(0) == dwell.classes(), "among: expected one per class");
   for (size_t c = 0; c < dwell.classes(); ++c)
     if (!among || among->data()[c]) classes.push_back(c);
   require(!classes.empty(), "among: expected a class");
-  const size_t n = dwell.surface().size(), C = classes.size();
+  const auto [first, every, n] = rows_from(rows, dwell.surface().size());
+  const size_t C = classes.size();
   std::vector<float> relative(n * C);
   std::vector<double> log_best(n);
   {
     nb::gil_scoped_release released;
-    dwell.likelihood(classes, relative.data(), log_best.data());
+    dwell.likelihood(classes, first, every, n, threads, relative.data(), log_best.data());
   }
   return std::make_tuple(owned(std::move(relative), {n, C}), owned(std::move(log_best), {n}));
 }
 
 // Of every element, see the docstring of `changes` below.
 template <int D>
-auto describe_changes(const Dwell<D>& dwell) {
+auto describe_changes(const Dwell<D>& dwell, const std::optional<Slice>& rows) {
   const Changes& changes = dwell.changes();
-  const size_t n = changes.members();
+  const auto [first, every, n] = rows_from(rows, changes.members());
   std::vector<double> log_likelihood(n);
   std::vector<float> p_last(n * 2), share(n);
   std::vector<int32_t> count(n * 2), looks(n * 8);
   {
     nb::gil_scoped_release released;
-    for (size_t k = 0; k < n; ++k) {
+    for (size_t i = 0; i < n; ++i) {
+      const size_t k = first + i * every;
       const Course& course = changes.course(k);
-      log_likelihood[k] = changes.log_likelihood(k);
-      share[k] = changes.occupied_share(k);
-      p_last[2 * k] = changes.p_at_last(k, Changes::kThing);
-      p_last[2 * k + 1] = 1.0f - changes.p_at_last(k, Changes::kNothing);
-      for (const auto& [turns, i] : {std::pair{&course.things, 2 * k}, {&course.any, 2 * k + 1}}) {
-        count[i] = turns->count;
-        looks[4 * i] = turns->first.before;
-        looks[4 * i + 1] = turns->first.after;
-        looks[4 * i + 2] = turns->last.before;
-        looks[4 * i + 3] = turns->last.after;
+      log_likelihood[i] = changes.log_likelihood(k);
+      share[i] = changes.occupied_share(k);
+      p_last[2 * i] = changes.p_at_last(k, Changes::kThing);
+      p_last[2 * i + 1] = 1.0f - changes.p_at_last(k, Changes::kNothing);
+      for (const auto& [turns, j] : {std::pair{&course.things, 2 * i}, {&course.any, 2 * i + 1}}) {
+        count[j] = turns->count;
+        looks[4 * j] = turns->first.before;
+        looks[4 * j + 1] = turns->first.after;
+        looks[4 * j + 2] = turns->last.before;
+        looks[4 * j + 3] = turns->last.after;
       }
     }
   }
@@ -116,10 +138,10 @@ auto describe_changes(const Dwell<D>& dwell) {
 
 template <int D>
 auto lost_beams(const Dwell<D>& dwell, const Points<D>& points, const Flat<bool>& hit,
-                const Flat<int64_t>& offset, const Poses<D>& poses) {
+                const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   nb::gil_scoped_release released;
-  const Lost lost = dwell.lost(scans);
+  const Lost lost = dwell.lost(scans, threads);
   return std::make_tuple(lost.beams, lost.through_solid);
 }
 
@@ -158,13 +180,13 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
       .def("add_end_points", &add_end_points<D>, nb::arg("points").noconvert(),
            nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
            nb::arg("T_map_sensor").noconvert(), "Notes where beams ended.")
-      .def(
-          "fit", [](S& s) { s.fit(); }, nb::call_guard<nb::gil_scoped_release>(),
-          "Means, normals and scatter from all end points so far.")
-      .def("elements", &describe<D>,
+      .def("fit", &S::fit, nb::arg("threads") = 1, nb::call_guard<nb::gil_scoped_release>(),
+           "Means, normals and scatter from all end points; none can be added any more.")
+      .def("elements", &describe<D>, nb::arg("rows") = nb::none(),
            "cells (E, D) int64, means (E, D) in metres, normals (E, D) (zero: none), distance (E,) "
            "of the cell's centre from the surface around it in metres (zero: none), prominence "
-           "(E,): its beams against those of the richest cell around, beams (E,).")
+           "(E,): its beams against those of the richest cell around, beams (E,). rows (first, "
+           "last, every): of some of the elements.")
       .def("elements_of", &elements<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            nb::arg("threads") = 1, "(M,) int32: the element in which each beam ended, -1: none.");
@@ -177,18 +199,18 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
           "__init__",
           [](W* self, const S& s, std::vector<double> rho, std::vector<double> tau,
              std::vector<double> turn, double detection, double seconds, double lateral,
-             double margin, double reach, double beyond, bool normals) {
+             double margin, double reach, double beyond, bool normals, int threads) {
             for (const double x : {seconds, lateral, margin, reach, beyond})
               require(x > 0.0 && std::isfinite(x), "looks: expected positive lengths and times");
             const double r = s.resolution();
             new (self)
                 W(s, checked_classes(std::move(rho), std::move(tau), std::move(turn), detection),
-                  {seconds, lateral / r, margin / r, reach / r, beyond / r, 1.0, normals});
+                  {seconds, lateral / r, margin / r, reach / r, beyond / r, 1.0, normals}, threads);
           },
           nb::arg("surface"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"),
           nb::arg("turn") = std::vector<double>{}, nb::arg("detection"), nb::arg("seconds"),
           nb::arg("lateral"), nb::arg("margin"), nb::arg("reach"), nb::arg("beyond"),
-          nb::arg("normals") = true, nb::keep_alive<1, 2>())
+          nb::arg("normals") = true, nb::arg("threads") = 1, nb::keep_alive<1, 2>())
       .def("add", &add_looks<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            nb::arg("look").noconvert(), nb::arg("threads") = 1,
@@ -198,6 +220,7 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
            "sensors' places are asked how far the view turned.")
       .def("lost", &lost_beams<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
+           nb::arg("threads") = 1,
            "Beams without a return that have such beams beside them, and how many of these cross "
            "something solid.")
       .def("solid", &solid_cells<D>,
@@ -224,17 +247,21 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
           nb::arg("detection"),
           "Asks, before the first look, which elements are of things that come to stay or leave: "
           "correlation time in seconds; share of the time and correlation time of passers-by.")
+      .def("rest", &W::rest, "Lets go what only further looks would want; they make it anew.")
       .def(
-          "changes", &describe_changes<D>,
+          "changes", &describe_changes<D>, nb::arg("rows") = nb::none(),
           "Of each element: (E,) logarithm of the likelihood of everything else that was seen, if "
           "things come to stay and leave; of the most probable course (E,) float32 share of the "
           "time in which it was not empty. Then, for things alone and for anything that was there: "
           "(E, 2) float32 probability of it at the last look; (E, 2) int32 how often it came or "
-          "left; (E, 2, 2, 2) int32 looks before and after the first and the last time, -1: none.")
+          "left; (E, 2, 2, 2) int32 looks before and after the first and the last time, -1: none. "
+          "rows (first, last, every): of some of the elements.")
       .def("likelihood", &likelihoods<D>, nb::arg("among") = nb::none(),
+           nb::arg("rows") = nb::none(), nb::arg("threads") = 1,
            "(E, C) float32 relative to the best class, (E,) logarithm of the best: of everything "
            "else that was seen of the cell, given that a beam ended in it; under those of the "
-           "classes (bool, one per class) alone, as if there were no others.");
+           "classes (bool, one per class) alone, as if there were no others. rows (first, last, "
+           "every): of some of the elements.");
 }
 
 }  // namespace

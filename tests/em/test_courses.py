@@ -156,10 +156,13 @@ def test_rounding_makes_nothing_impossible(monkeypatch):
         np.zeros((20_000, 2, 2, 2), np.int32),
     )
     looks = em.looks.Looks(
-        surface=SimpleNamespace(elements=lambda: (grid,)),
+        surface=SimpleNamespace(size=20_000, elements=lambda rows: (grid[slice(*rows)],)),
         dwell=SimpleNamespace(
-            changes=lambda: changes,
-            likelihood=lambda kept: (likelihood[:, kept].astype(np.float32), np.zeros(20_000)),
+            changes=lambda rows: [one[slice(*rows)] for one in changes],
+            likelihood=lambda kept, rows, _: (
+                likelihood[slice(*rows)][:, kept].astype(np.float32),
+                np.zeros(len(range(*rows))),
+            ),
         ),
         trust=1.0,
         rho=np.array(rho),
@@ -169,6 +172,7 @@ def test_rounding_makes_nothing_impossible(monkeypatch):
     )
     monkeypatch.setattr(module, "coverage", lambda _: np.ones(20_000, np.float32))
     found = module.courses_of(looks, em.EmOptions())
+    assert module.static_of(looks, em.EmOptions()).tobytes() == found.p_static.tobytes()
     for p in (found.p_static, found.p_views, found.p_changing):
         assert p.dtype == np.float32
         assert p.min() >= 0.0

@@ -72,7 +72,7 @@ class Beside {
     std::vector<uint8_t> asked(p_.size(), 1);
     for (int round = 0; round < options_.rounds; ++round) {
       const std::vector<float> before = p_;
-      parallel_shares(even(), [&](size_t, size_t from, size_t to) {
+      parallel_shares(even_shares(p_.size(), threads_), [&](size_t, size_t from, size_t to) {
         Cursor<const Surface<D>> cursor(surface_);
         for (size_t k = from; k < to; ++k)
           if (asked[k]) p_[k] = opinion(cursor, k, before);
@@ -96,13 +96,6 @@ class Beside {
     return {e.mean.template cast<float>(), e.normal.template cast<float>(), hit,
             std::clamp(log_odds, static_cast<float>(options_.least),
                        static_cast<float>(options_.most))};
-  }
-
-  std::vector<size_t> even() const {
-    const auto n = static_cast<size_t>(std::max(threads_, 1));
-    std::vector<size_t> bounds;
-    for (size_t i = 0; i <= n; ++i) bounds.push_back(p_.size() * i / n);
-    return bounds;
   }
 
   static float probability(float log_odds) { return 1.0f / (1.0f + std::exp(-log_odds)); }

@@ -22,6 +22,8 @@ struct DwellClasses {
   double detection;          // probability that an occupied cell is seen to be so
 };
 
+// Width: classes that are worked on together.
+template <size_t Width>
 class Chains {
  public:
   // places: of the members, in cells; seconds: between successive looks
@@ -80,7 +82,7 @@ class Chains {
   }
 
  private:
-  static constexpr size_t kWidth = 8;
+  static constexpr size_t kWidth = Width;
   using Packet = Eigen::Array<float, kWidth, 1>;
   static constexpr int32_t kNever = -1;
   static constexpr int kTable = 64;  // gaps whose correlations are kept

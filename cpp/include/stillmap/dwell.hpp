@@ -27,19 +27,33 @@ namespace stillmap {
 template <int D>
 class Dwell {
  public:
-  Dwell(const Surface<D>& surface, DwellClasses classes, const LookOptions& options)
+  Dwell(const Surface<D>& surface, DwellClasses classes, const LookOptions& options,
+        int threads = 1)
       : surface_(checked(surface)),
         options_(options),
         tables_(options.lateral),
-        neighbours_(surface, options.reach),
+        neighbours_(surface, options.reach, threads),
+        beam_tiles_(surface),
         chains_(places_of(surface), std::move(classes), options.seconds) {}
+
+  Dwell(const Dwell&) = delete;  // what collects looks refers to it
+  Dwell& operator=(const Dwell&) = delete;
 
   size_t classes() const { return chains_.size(); }
   const Surface<D>& surface() const { return surface_; }
 
   // Beams without a return, and those of them that cross something solid.
-  Lost lost(const Scans<D>& scans) const {
-    return LookCollector<D>(surface_, neighbours_, options_, tables_).lost(scans);
+  Lost lost(const Scans<D>& scans, int threads = 1) const {
+    const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
+    std::vector<Lost> shares(bounds.size() - 1);
+    parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
+      shares[i] = lost_of(surface_, beam_tiles_, options_, scans, first, last);
+    });
+    for (size_t i = 1; i < shares.size(); ++i) {
+      shares[0].beams += shares[i].beams;
+      shares[0].through_solid += shares[i].through_solid;
+    }
+    return shares[0];
   }
   // The cells in which beams without a return meet something solid.
   std::vector<Cell<D>> solid() const {
@@ -50,7 +64,10 @@ class Dwell {
     return cells;
   }
   // How far to trust them beyond the first solid element, from now on.
-  void trust(double open) { options_.open = open; }
+  void trust(double open) {
+    options_.open = open;
+    rest();
+  }
   // From now on asks, too, which elements are of things that were put there or taken away.
   void watch(const ChangeModel& model) {
     if (newest_ != kNone) throw std::invalid_argument("watch: before the first look");
@@ -64,8 +81,6 @@ class Dwell {
   // look (T,): number of each scan's look, not falling, and not below those added before. place
   // (T, D): in metres, where the robot stood; null: where the sensors did.
   void add(const Scans<D>& scans, const int64_t* look, const double* place, int threads) {
-    if (!surface_.fitted() || chains_.members() != surface_.size())
-      throw std::invalid_argument("surface: has changed since");
     const size_t T = scans.n_scans;
     for (size_t t = 0; t < T; ++t)
       if (look[t] < (t ? look[t - 1] : newest_)) throw std::invalid_argument("look: must not fall");
@@ -76,44 +91,33 @@ class Dwell {
       if (t == 0 || look[t] != look[t - 1]) starts.push_back(t);
     starts.push_back(T);
     const size_t looks = starts.size() - 1;
-    // each has a sheet as large as the map
     const size_t n = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1,
                                         std::max<size_t>(looks, 1));
-    std::vector<std::unique_ptr<LookCollector<D>>> collectors;
-    for (size_t i = 0; i < n; ++i)
-      collectors.push_back(
-          std::make_unique<LookCollector<D>>(surface_, neighbours_, options_, tables_));
-    std::vector<Seen> seen(kWindow);
-    for (size_t from = 0; from < looks; from += kWindow) {
-      const size_t to = std::min(from + kWindow, looks);
-      std::vector<int32_t> taken;
-      for (size_t l = from; l < to; ++l)
-        taken.push_back(
-            chains_.begin(look[starts[l]], taken_from(scans, place, starts[l], starts[l + 1])));
-      std::atomic<size_t> next{from};
-      parallel_shares(one_each(n), [&](size_t i, size_t, size_t) {
-        for (size_t l = next++; l < to; l = next++) {
-          collectors[i]->add(scans, starts[l], starts[l + 1]);
-          collectors[i]->take(seen[l - from]);
-        }
-      });
-      std::atomic<size_t> next_span{0};
-      parallel_shares(one_each(n), [&](size_t, size_t, size_t) {
-        for (size_t s = next_span++; s < Seen::spans(surface_.size()); s = next_span++)
-          for (size_t l = from; l < to; ++l)
-            apply(seen[l - from], s, look[starts[l]], taken[l - from]);
-      });
+    while (collectors_.size() < n)
+      collectors_.push_back(std::make_unique<LookCollector<D>>(surface_, beam_tiles_, neighbours_,
+                                                               options_, tables_));
+    try {
+      follow(scans, look, place, starts, n);
+    } catch (...) {
+      rest();  // sheets are half written
+      throw;
     }
     if (T) newest_ = look[T - 1];
   }
 
-  // (elements, among): likelihood of everything else that was seen of a cell, given that a beam
-  // ended in it, under some of the classes, relative to the best of them; and the logarithm of the
-  // best.
-  void likelihood(const std::vector<size_t>& among, float* relative, double* log_best) const {
-    for (size_t k = 0; k < surface_.size(); ++k)
-      log_best[k] = chains_.likelihood(k, among, relative + k * among.size());
+  // (n, among): likelihood of everything else that was seen of n of the cells, given that a beam
+  // ended in each, under some of the classes, relative to the best of them; and the logarithm of
+  // the best. The cells are first, first + every, ...
+  void likelihood(const std::vector<size_t>& among, size_t first, size_t every, size_t n,
+                  int threads, float* relative, double* log_best) const {
+    parallel_shares(even_shares(n, threads), [&](size_t, size_t from, size_t to) {
+      for (size_t i = from; i < to; ++i)
+        log_best[i] = chains_.likelihood(first + i * every, among, relative + i * among.size());
+    });
   }
+
+  // Nothing is kept that only the next looks would want; they would make it anew.
+  void rest() { collectors_.clear(); }
 
  private:
   static constexpr size_t kWindow = 64;  // looks held at once
@@ -136,6 +140,32 @@ class Dwell {
       places[k].template head<D>() =
           surface.element(static_cast<int32_t>(k)).mean.template cast<float>();
     return places;
+  }
+
+  void follow(const Scans<D>& scans, const int64_t* look, const double* place,
+              const std::vector<size_t>& starts, size_t n) {
+    const size_t looks = starts.size() - 1;
+    std::vector<Seen> seen(kWindow);
+    for (size_t from = 0; from < starts.size() - 1; from += kWindow) {
+      const size_t to = std::min(from + kWindow, looks);
+      std::vector<int32_t> taken;
+      for (size_t l = from; l < to; ++l)
+        taken.push_back(
+            chains_.begin(look[starts[l]], taken_from(scans, place, starts[l], starts[l + 1])));
+      std::atomic<size_t> next{from};
+      parallel_shares(one_each(n), [&](size_t i, size_t, size_t) {
+        for (size_t l = next++; l < to; l = next++) {
+          collectors_[i]->add(scans, starts[l], starts[l + 1]);
+          collectors_[i]->take(seen[l - from]);
+        }
+      });
+      std::atomic<size_t> next_span{0};
+      parallel_shares(one_each(n), [&](size_t, size_t, size_t) {
+        for (size_t s = next_span++; s < Seen::spans(surface_.size()); s = next_span++)
+          for (size_t l = from; l < to; ++l)
+            apply(seen[l - from], s, look[starts[l]], taken[l - from]);
+      });
+    }
   }
 
   // Mean place in those scans, in cells. Of several sensors in turn it would go to and fro.
@@ -168,8 +198,11 @@ class Dwell {
   LookOptions options_;
   MeetingTables tables_;
   Neighbours<D> neighbours_;
-  Chains chains_;
+  Tiles<D> beam_tiles_;
+  Chains<D == 2 ? 8 : 4> chains_;
   std::optional<Changes> changes_;
+  // one for each thread; each has a sheet as large as the map
+  std::vector<std::unique_ptr<LookCollector<D>>> collectors_;
   int64_t newest_ = kNone;
 };
 

@@ -7,6 +7,7 @@
 #include <optional>
 #include <vector>
 
+#include "stillmap/crossing.hpp"
 #include "stillmap/look.hpp"
 #include "stillmap/neighbours.hpp"
 #include "stillmap/no_return.hpp"
@@ -22,20 +23,53 @@ inline bool is_solid(const Surface<D>& surface, int32_t k, bool normals) {
   return normals && !surface.element(k).normal.isZero(0.0) && surface.beams(k) >= many;
 }
 
+// Where a beam stops being one that tells of free space; nothing, if it is too short to tell.
+template <int D>
+inline std::optional<Vec<D>> free_end(const Segment<D>& beam, bool hit, double beyond) {
+  if (hit) return beam.end;
+  const Vec<D> way = beam.end - beam.start;
+  const double length = way.norm(), usable = length - beyond;
+  if (!(usable > 0.0)) return std::nullopt;
+  return Vec<D>(beam.start + way / length * usable);
+}
+
+// Of the beams of scans [first, last) without a return, what else is known of the surface.
+template <int D>
+inline Lost lost_of(const Surface<D>& surface, const Tiles<D>& tiles, const LookOptions& options,
+                    const Scans<D>& scans, size_t first, size_t last) {
+  Lost lost;
+  Crossing<D> crossing(tiles);
+  for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
+    if (scans.hit[n] || !in_a_row(scans, t, n)) return;
+    ++lost.beams;
+    const Segment<D> beam(pose, scans.points + n * D, surface.resolution());
+    const std::optional<Vec<D>> end = free_end(beam, false, options.beyond);
+    bool through = false;
+    if (end)
+      crossing.follow(beam.start, *end, tiles.marks(), [&](const auto& place) {
+        through |= is_solid(surface, place.element, options.normals);
+      });
+    lost.through_solid += through;
+  });
+  return lost;
+}
+
 // Collects the beams of one look.
 template <int D>
 class LookCollector {
  public:
-  LookCollector(const Surface<D>& surface, const Neighbours<D>& neighbours,
+  LookCollector(const Surface<D>& surface, const Tiles<D>& tiles, const Neighbours<D>& neighbours,
                 const LookOptions& options, const MeetingTables& tables)
       : surface_(surface),
+        tiles_(tiles),
         neighbours_(neighbours),
         options_(options),
         margin_(static_cast<float>(options.margin)),
         tables_(tables),
         sheet_(surface.size()),
         touched_(Seen::spans(surface.size())),
-        cursor_(surface) {
+        open_(tiles.marks()),
+        crossing_(tiles) {
     for (size_t k = 0; k < sheet_.size(); ++k)
       sheet_[k] = row_of(surface, static_cast<int32_t>(k), options.normals);
   }
@@ -44,26 +78,13 @@ class LookCollector {
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
       if (!scans.hit[n] && !in_a_row(scans, t, n)) return;
       const Segment<D> beam(pose, scans.points + n * D, surface_.resolution());
-      pass(beam, scans.hit[n]);
+      const bool has_length = pass(beam, scans.hit[n]);
       if (!scans.hit[n]) return;
-      if (const auto* k = at(cell_of<D>(beam.end)); k && strike(*k)) struck_.push_back(*k);
+      const Cell<D> end = cell_of<D>(beam.end);
+      const int32_t k =
+          has_length ? tiles_.element(crossing_.last_block(), end) : tiles_.element(end);
+      if (k != kNoElement && strike(k)) struck_.push_back(k);
     });
-  }
-
-  // Of the beams without a return, what else is known of the surface.
-  Lost lost(const Scans<D>& scans) {
-    Lost lost;
-    for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t t, int64_t n, const Pose<D>& pose) {
-      if (scans.hit[n] || !in_a_row(scans, t, n)) return;
-      ++lost.beams;
-      cross(Segment<D>(pose, scans.points + n * D, surface_.resolution()), false);
-      for (const Crossed& crossed : crossed_)
-        if (sheet_[static_cast<size_t>(crossed.element)].solid) {
-          ++lost.through_solid;
-          break;
-        }
-    });
-    return lost;
   }
 
   // What the look says, and a clean sheet for the next one.
@@ -81,6 +102,8 @@ class LookCollector {
       out.begin.push_back(out.looks.size());
     }
     struck_.clear();
+    for (const size_t block : shut_) open_[block] = tiles_.marks()[block];
+    shut_.clear();
   }
 
  private:
@@ -131,21 +154,17 @@ class LookCollector {
     if (missed == kStruck) return false;
     if (missed == kUntouched) touched_[Seen::span_of(k)].push_back(k);
     missed = kStruck;
+    const Cell<D>& cell = surface_.cell(k);
+    shut(static_cast<size_t>(tiles_.find(Grid<D>::block_of(cell))), cell);
     return true;
   }
 
-  const int32_t* at(const Cell<D>& cell) {
-    const auto* block = cursor_.block(cell);
-    if (!block) return nullptr;
-    const int32_t* k = &block->counts[static_cast<size_t>(Surface<D>::local_of(cell))];
-    return *k == kNoElement ? nullptr : k;
+  // Of the element in a cell more beams of this look tell nothing.
+  void shut(size_t block, const Cell<D>& cell) {
+    auto& open = open_[block];
+    if (open.tiles == tiles_.marks()[block].tiles) shut_.push_back(block);
+    open.unmark(cell);
   }
-
-  // An element whose cell a beam crosses.
-  struct Crossed {
-    int32_t element;
-    Cell<D> cell;
-  };
 
   // A beam in single precision, from the corner of the cell in which it starts.
   struct Line {
@@ -155,40 +174,34 @@ class LookCollector {
     bool hit;
   };
 
-  // Lists the elements whose cells a beam crosses before it ends; returns whether it has a length.
-  // The end cell is not visited: an end in it is a hit, and free range stops before it.
+  // Lists the elements whose cells a beam crosses before it ends, of which it may tell anything;
+  // returns whether it has a length. The end cell is not visited: an end in it is a hit, and free
+  // range stops before it.
   std::optional<Line> cross(const Segment<D>& beam, bool hit) {
     crossed_.clear();
     const Vec<D> way = beam.end - beam.start;
     const double length = way.norm();
-    const double usable = hit ? length : length - options_.beyond;
-    if (!(usable > 0.0)) return std::nullopt;
+    const std::optional<Vec<D>> end = free_end(beam, hit, options_.beyond);
+    if (!end || !(length > 0.0)) return std::nullopt;
     const Vec<D> direction = way / length;
-    const Vec<D> end = hit ? beam.end : Vec<D>(beam.start + direction * usable);
-    const auto cells = (cell_of<D>(end) - cell_of<D>(beam.start)).cwiseAbs().sum();
-    crossed_.resize(static_cast<size_t>(cells) + 1);
-    // no branch on whether there is an element: nobody could foresee it
-    Crossed* next = crossed_.data();
-    Walker walker(cursor_, [&](const int32_t* k, const Cell<D>& cell) {
-      const int32_t element = k ? *k : kNoElement;
-      __builtin_prefetch(sheet_.data() + std::max(element, 0), 1);
-      *next = {element, cell};
-      next += element != kNoElement;
+    // what is solid stops one without a return, whether it is known to be there or not
+    crossing_.follow(beam.start, *end, hit ? open_ : tiles_.marks(), [&](const auto& place) {
+      __builtin_prefetch(sheet_.data() + place.element, 1);
+      crossed_.push_back(place);
     });
-    traverse<D>(beam.start, end, walker);
-    crossed_.resize(static_cast<size_t>(next - crossed_.data()));
     const Cell<D> corner = cell_of<D>(beam.start);
     return Line{corner, (beam.start - corner.template cast<double>()).template cast<float>(),
                 direction.template cast<float>(), static_cast<float>(length), hit};
   }
 
   // Notes what the beam passed. One without a return passed what lies before the first solid
-  // element in its way; that it did not end there without an echo is only so sure.
-  void pass(const Segment<D>& beam, bool hit) {
+  // element in its way; that it did not end there without an echo is only so sure. Returns whether
+  // it has a length.
+  bool pass(const Segment<D>& beam, bool hit) {
     const std::optional<Line> line = cross(beam, hit);
-    if (!line) return;
+    if (!line) return false;
     float trust = 1.0f;
-    for (const Crossed& crossed : crossed_) {
+    for (const auto& crossed : crossed_) {
       Row& row = sheet_[static_cast<size_t>(crossed.element)];
       if (!hit && row.solid) trust = static_cast<float>(options_.open);
       if (row.missed < kSure) continue;
@@ -199,7 +212,9 @@ class LookCollector {
         row.missed = 1.0f;
       }
       row.missed *= 1.0f - met;
+      if (row.missed < kSure) shut(crossed.block, crossed.cell);
     }
+    return true;
   }
 
   // Of the beam crossing the surface within the element, as far as `lateral` lets one tell: small
@@ -227,6 +242,7 @@ class LookCollector {
   }
 
   const Surface<D>& surface_;
+  const Tiles<D>& tiles_;
   const Neighbours<D>& neighbours_;
   LookOptions options_;
   float margin_;
@@ -234,8 +250,11 @@ class LookCollector {
   std::vector<Row> sheet_;
   std::vector<std::vector<int32_t>> touched_;  // by spans
   std::vector<int32_t> struck_;
-  std::vector<Crossed> crossed_;  // of one beam: fetched all at once, then looked at
-  Cursor<const Surface<D>> cursor_;
+  std::vector<typename Crossing<D>::Place>
+      crossed_;                                 // of one beam: fetched all at once, then looked at
+  std::vector<typename Tiles<D>::Marks> open_;  // cells of which more beams of this look tell more
+  std::vector<size_t> shut_;                    // blocks in which some do not
+  Crossing<D> crossing_;
 };
 
 }  // namespace stillmap

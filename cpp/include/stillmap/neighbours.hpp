@@ -13,10 +13,33 @@ namespace stillmap {
 template <int D>
 class Neighbours {
  public:
-  Neighbours(const Surface<D>& surface, double reach) {
+  Neighbours() = default;
+  Neighbours(const Surface<D>& surface, double reach, int threads) {
+    const std::vector<size_t> bounds = even_shares(surface.size(), threads);
+    std::vector<Neighbours> shares(bounds.size() - 1);
+    parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
+      shares[i].add(surface, reach, first, last);
+    });
+    size_t pairs = 0;
+    for (const Neighbours& share : shares) pairs += share.near_.size();
+    near_.reserve(pairs);
+    begin_.reserve(surface.size() + 1);
+    for (Neighbours& share : shares) {
+      for (size_t i = 1; i < share.begin_.size(); ++i)
+        begin_.push_back(near_.size() + share.begin_[i]);
+      near_.insert(near_.end(), share.near_.begin(), share.near_.end());
+      share = Neighbours();
+    }
+  }
+
+  const int32_t* begin(int32_t k) const { return near_.data() + begin_[static_cast<size_t>(k)]; }
+  const int32_t* end(int32_t k) const { return near_.data() + begin_[static_cast<size_t>(k) + 1]; }
+
+ private:
+  void add(const Surface<D>& surface, double reach, size_t first, size_t last) {
     const int radius = static_cast<int>(std::ceil(reach));
     Cursor<const Surface<D>> cursor(surface);
-    for (size_t i = 0; i < surface.size(); ++i) {
+    for (size_t i = first; i < last; ++i) {
       const auto from = static_cast<int32_t>(i);
       for_each_near<D>(surface.cell(from), radius, [&](const Cell<D>& cell) {
         const auto* block = cursor.block(cell);
@@ -30,10 +53,6 @@ class Neighbours {
     }
   }
 
-  const int32_t* begin(int32_t k) const { return near_.data() + begin_[static_cast<size_t>(k)]; }
-  const int32_t* end(int32_t k) const { return near_.data() + begin_[static_cast<size_t>(k) + 1]; }
-
- private:
   std::vector<int32_t> near_;
   std::vector<size_t> begin_{0};
 };

@@ -46,4 +46,14 @@ inline std::vector<size_t> shares_of(const int64_t* offset, size_t scans, int th
   return bounds;
 }
 
+// Bounds that give each thread about the same number of n things.
+inline std::vector<size_t> even_shares(size_t n, int threads) {
+  constexpr size_t few = 1 << 12;  // of which no thread is worth while
+  const size_t shares = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1,
+                                           std::max<size_t>(n / few, 1));
+  std::vector<size_t> bounds;
+  for (size_t i = 0; i <= shares; ++i) bounds.push_back(n * i / shares);
+  return bounds;
+}
+
 }  // namespace stillmap

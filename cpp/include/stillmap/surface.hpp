@@ -65,16 +65,16 @@ class Surface : public CellIndex<D> {
   Surface& operator=(const Surface&) = delete;
 
   double resolution() const { return resolution_; }
-  size_t size() const { return sums_.size(); }
+  size_t size() const { return fitted_ ? cells_.size() : sums_.size(); }
   // standard deviation of end points across surfaces, in cells
   double scatter() const { return scatter_; }
   const Element<D>& element(int32_t k) const { return elements_[static_cast<size_t>(k)]; }
-  int64_t beams(int32_t k) const { return sums_[static_cast<size_t>(k)].count; }
-  const Cell<D>& cell(int32_t k) const { return sums_[static_cast<size_t>(k)].cell; }
+  int64_t beams(int32_t k) const { return beams_[static_cast<size_t>(k)]; }
+  const Cell<D>& cell(int32_t k) const { return cells_[static_cast<size_t>(k)]; }
 
   // Notes the end points of all beams that were hit.
   void add(const Scans<D>& scans) {
-    fitted_ = false;
+    if (fitted_) throw std::invalid_argument("surface: was fitted, and takes no more end points");
     for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t, int64_t n, const Pose<D>& pose) {
       if (!scans.hit[n]) return;
       const Segment<D> beam(pose, scans.points + n * D, resolution_);
@@ -105,14 +105,22 @@ class Surface : public CellIndex<D> {
     return nearest;
   }
 
-  // Means, normals and scatter from all end points so far.
-  void fit() {
+  // Means, normals and scatter from all end points; a second time changes nothing.
+  void fit(int threads = 1) {
+    if (fitted_) return;
     number_by_place();
     elements_.assign(size(), {});
     for (size_t k = 0; k < size(); ++k) elements_[k].mean = mean_of(sums_[k]);
     // noise as large as the window would hide every wall: then a wider one
     for (const int radius : {2, 4, 6})
-      if (fit_normals(radius) >= 0.5) break;
+      if (fit_normals(radius, threads) >= 0.5) break;
+    cells_.reserve(size());
+    beams_.reserve(size());
+    for (const Sums& sums : sums_) {
+      cells_.push_back(sums.cell);
+      beams_.push_back(sums.count);
+    }
+    std::vector<Sums>().swap(sums_);  // as large as all the rest
     fitted_ = true;
   }
   bool fitted() const { return fitted_; }
@@ -222,12 +230,33 @@ class Surface : public CellIndex<D> {
 
   // Principal axes of the end points within `radius` cells of each element; returns the share of
   // the beams that ended on surfaces.
-  double fit_normals(int radius) {
+  double fit_normals(int radius, int threads) {
+    const std::vector<size_t> bounds = even_shares(size(), threads);
+    std::vector<Fitted> shares(bounds.size() - 1);
+    parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
+      shares[i] = fit_normals(radius, first, last);
+    });
+    Fitted& total = shares.front();
+    for (size_t i = 1; i < shares.size(); ++i) {
+      total.all += shares[i].all;
+      total.flat += shares[i].flat;
+      total.across.insert(total.across.end(), shares[i].across.begin(), shares[i].across.end());
+    }
+    scatter_ = weighted_median(total.across);
+    return total.all ? static_cast<double>(total.flat) / static_cast<double>(total.all) : 1.0;
+  }
+
+  // Beams in all and on surfaces; smallest deviation and weight of each of these.
+  struct Fitted {
     int64_t all = 0, flat = 0;
-    std::vector<std::pair<double, int64_t>> across;  // smallest deviation, weight
-    across.reserve(size());
+    std::vector<std::pair<double, int64_t>> across;
+  };
+
+  Fitted fit_normals(int radius, size_t first_element, size_t last_element) {
+    Fitted fitted;
+    auto& [all, flat, across] = fitted;
     Cursor<const Surface<D>> cursor(*this);
-    for (size_t k = 0; k < size(); ++k) {
+    for (size_t k = first_element; k < last_element; ++k) {
       const Spread spread = around(cursor, sums_[k].cell, radius);
       const Eigen::SelfAdjointEigenSolver<Square> axes(spread.covariance());
       const Vec<D> variance = axes.eigenvalues().cwiseMax(0.0);  // rising
@@ -254,8 +283,7 @@ class Surface : public CellIndex<D> {
       const Vec<D> centre = Vec<D>::Constant(0.5);  // as seen from the cell's corner
       element.off_plane = element.normal.dot(centre - spread.mean());
     }
-    scatter_ = weighted_median(across);
-    return all ? static_cast<double>(flat) / static_cast<double>(all) : 1.0;
+    return fitted;
   }
 
   Spread around(Cursor<const Surface<D>>& cursor, const Cell<D>& centre, int radius) const {
@@ -282,8 +310,10 @@ class Surface : public CellIndex<D> {
   double resolution_;
   double scatter_ = 0.0;
   bool fitted_ = false;
-  std::vector<Sums> sums_;
+  std::vector<Sums> sums_;  // until it is fitted
   std::vector<Element<D>> elements_;
+  std::vector<Cell<D>> cells_;
+  std::vector<int64_t> beams_;
 };
 
 }  // namespace stillmap

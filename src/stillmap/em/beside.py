@@ -26,7 +26,7 @@ class BesideOptions(TypedDict):
 
 
 BESIDE: BesideOptions = {
-    "radius": 3.0,  # cells
+    "radius": 2.5,  # cells
     "coplanar": 0.2,  # cells
     "for_static": 5.0,  # nats, all of these
     "for_dynamic": 10.0,

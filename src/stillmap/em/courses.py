@@ -2,12 +2,13 @@
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.em.dwell import coverage
-from stillmap.em.looks import OFTEN_OCCUPIED, Dwell, Float, Looks, Surface, Table
+from stillmap.em.looks import OFTEN_OCCUPIED, Dwell, Float, Looks, Rows, Surface, Table, cells_of
 from stillmap.em.mixture import fit_shares
 from stillmap.em.options import ChangeOptions, EmOptions, MapState
 from stillmap.em.together import components, pairs_near
@@ -79,34 +80,75 @@ def watch(dwell: Dwell, recording: Recording, options: EmOptions) -> None:
 
 def courses_of(looks: Looks, options: EmOptions) -> Courses:
     """What became of each cell; `watch` was called before the looks."""
-    kept = (looks.tau <= _STAY) | (looks.rho == OFTEN_OCCUPIED)
-    kept[: looks.n_static] = True
-    table = looks.under(kept)
-    log_changing, occupied_share, p_last, count, between = looks.dwell.changes()
-    likelihood = _with_changing(table, log_changing)
-    shares = fit_shares(likelihood, looks.n_static, options.prior)
-    views = np.append(np.isfinite(table.turn), False)
-    static = np.arange(len(views)) < looks.n_static
-    often = np.append(table.rho == OFTEN_OCCUPIED, False)
-    stays = _posterior(likelihood, shares.classes, np.arange(len(views)) == len(views) - 1)
-    goes = _posterior(likelihood, shares.classes, often)
-    of = (goes > stays).astype(np.intp)  # what comes and goes does not stay long enough for a thing
-    each = np.arange(len(of))
+    groups, shares = _groups(looks), _shares(looks, options)
+    found = [_of_rows(looks, rows, groups, shares) for rows in looks.blocks()]
+    of_all = {name: np.concatenate([one[name] for one in found]) for name in found[0]}
     return _as_wholes(
         Courses(
-            cells=looks.surface.elements()[0],
-            p_static=_posterior(likelihood, shares.classes, static & ~views),
-            p_views=_posterior(likelihood, shares.classes, views),
-            p_changing=np.minimum(stays + goes, np.float32(1.0)),
-            p_thing=p_last[each, of],
-            occupied_share=occupied_share,
-            count=count[each, of],
-            between=between[each, of],
+            cells=cells_of(looks.surface),
+            **of_all,
             covered=coverage(looks.surface),
-            share=float(shares.classes[-1]),
+            share=float(shares[-1]),
             surface=looks.surface,
         )
     )
+
+
+def static_of(looks: Looks, options: EmOptions) -> NDArray[np.float32]:
+    """(E,) `p_static` of the courses, where nothing else of them is asked."""
+    static, shares = _groups(looks)[0], _shares(looks, options)
+    p = np.empty(looks.surface.size, np.float32)
+    for rows in looks.blocks():
+        likelihood, _ = _likelihood(looks, rows)
+        p[slice(*rows)] = _posterior(likelihood, shares, static)
+    return p
+
+
+def _kept(looks: Looks) -> NDArray[np.bool_]:
+    """(C,) classes that leave room for things that stay."""
+    kept = (looks.tau <= _STAY) | (looks.rho == OFTEN_OCCUPIED)
+    kept[: looks.n_static] = True
+    return np.asarray(kept)
+
+
+def _groups(looks: Looks) -> tuple[NDArray[np.bool_], ...]:
+    """(C + 1,) of those and of the changing class: static, by views, often, changing."""
+    kept = _kept(looks)
+    views = np.append(np.isfinite(looks.turn[kept]), False)
+    static = np.arange(len(views)) < looks.n_static
+    often = np.append(looks.rho[kept] == OFTEN_OCCUPIED, False)
+    return static & ~views, views, often, np.arange(len(views)) == len(views) - 1
+
+
+def _likelihood(looks: Looks, rows: Rows) -> tuple[NDArray[np.float32], tuple[Any, ...]]:
+    """(n, C + 1) of some elements under each of these classes, and the rest of their changes."""
+    log_changing, *rest = looks.dwell.changes(rows)
+    return _with_changing(looks.under(_kept(looks), rows), log_changing), tuple(rest)
+
+
+def _shares(looks: Looks, options: EmOptions) -> Float:
+    """(C + 1,) of these classes."""
+    likelihood, _ = _likelihood(looks, looks.sample())
+    return fit_shares(likelihood, looks.n_static, options.prior).classes
+
+
+def _of_rows(
+    looks: Looks, rows: Rows, groups: tuple[NDArray[np.bool_], ...], shares: Float
+) -> dict[str, NDArray[Any]]:
+    """What Courses says of each of some elements."""
+    likelihood, (occupied_share, p_last, count, between) = _likelihood(looks, rows)
+    static, views, goes, stays = (_posterior(likelihood, shares, some) for some in groups)
+    of = (goes > stays).astype(np.intp)  # what comes and goes does not stay long enough for a thing
+    each = np.arange(len(of))
+    return {
+        "p_static": static,
+        "p_views": views,
+        "p_changing": np.minimum(stays + goes, np.float32(1.0)),
+        "p_thing": p_last[each, of],
+        "occupied_share": occupied_share,
+        "count": count[each, of],
+        "between": between[each, of],
+    }
 
 
 def _posterior(

@@ -11,7 +11,17 @@ from stillmap.em.expectations import (
     NoReturn,
     per_beam,
 )
-from stillmap.em.looks import CLASSES, Classes, Float, Looks, Surface, Table, looked_at
+from stillmap.em.looks import (
+    CLASSES,
+    Classes,
+    Float,
+    Looks,
+    Surface,
+    Table,
+    blocks_of,
+    cells_of,
+    looked_at,
+)
 from stillmap.em.mixture import Shares, fit_shares, posterior_static
 from stillmap.em.options import EmOptions
 from stillmap.recording.model import Recording
@@ -19,7 +29,6 @@ from stillmap.recording.model import Recording
 _UNSEEN = 0.2  # probability that a cell is occupied in which no beam ended and none passed
 _PROMINENT = 0.1  # share of the richest cell's beams that noise alone hardly brings into another
 _BELIEVED = 0.5  # trust in beams without a return from which on they show free space
-_ROWS = 1 << 14
 _EDGE = 0.15  # cells: how sharply a surface ends
 
 
@@ -42,12 +51,12 @@ def e_step(
         classes: see Classes.
     """
     looks = looked_at(recording, poses, resolution, options, threads, classes)
-    return expectations_of(looks, looks.under(), recording, poses, options, threads)
+    return expectations_of(looks, None, recording, poses, options, threads)
 
 
 def expectations_of(
     looks: Looks,
-    table: Table,
+    kept: NDArray[np.bool_] | None,
     recording: Recording,
     poses: Float,
     options: EmOptions,
@@ -56,18 +65,20 @@ def expectations_of(
 ) -> Expectations:
     """What the looks say of every cell, and with that of every beam that ended in it.
 
-    static (E,) is what is known better of each cell than the classes of `table` say.
+    kept (C,): under which of the classes; None: all. static (E,) is what is known better of each
+    cell than these say.
     """
-    shares = fit_shares(table.likelihood, table.n_static, options.prior)
-    if static is None:
-        static = posterior_static(table.likelihood, shares.classes, table.n_static)
+    some = looks.under(kept, looks.sample())
+    shares = fit_shares(some.likelihood, some.n_static, options.prior)
+    found, likelihood = _of_elements(looks, kept, shares)
+    static = found if static is None else static
     surface, T_map_sensor = looks.surface, recording.T_map_sensor(poses)
     beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
     return Expectations(
         p_static=_of_beams(recording, T_map_sensor, surface, static, shares.static, threads),
-        likelihood=_bound(table, shares),
-        occupied=CellProbabilities(surface.elements()[0], static * coverage(surface), _UNSEEN),
-        learned=_learned(looks, table, shares),
+        likelihood=likelihood,
+        occupied=CellProbabilities(cells_of(surface), static * coverage(surface), _UNSEEN),
+        learned=_learned(looks, some, shares),
         no_return=NoReturn(looks.dwell.solid(), beyond),
     )
 
@@ -76,12 +87,15 @@ def coverage(surface: Surface) -> NDArray[np.float32]:
     """(E,) P(what is there runs through the cell itself): noise also fills cells beside it."""
     from scipy.special import ndtr  # takes long to load
 
-    _, _, normals, off_plane, prominence, _ = surface.elements()
-    # of the cell, across the surface; a wall on the border of two cells belongs to both
-    half = 0.5 * np.abs(normals).sum(axis=1) + _EDGE
-    covered = ndtr((half - np.abs(off_plane / surface.resolution)) / _EDGE)
-    lone = np.minimum(prominence / _PROMINENT, 1.0)
-    return np.asarray(np.where(normals.any(axis=1), covered, lone), dtype=np.float32)
+    covered = np.empty(surface.size, np.float32)
+    for rows in blocks_of(surface):
+        _, _, normals, off_plane, prominence, _ = surface.elements(rows)
+        # of the cell, across the surface; a wall on the border of two cells belongs to both
+        half = 0.5 * np.abs(normals).sum(axis=1) + _EDGE
+        runs = ndtr((half - np.abs(off_plane / surface.resolution)) / _EDGE)
+        lone = np.minimum(prominence / _PROMINENT, 1.0)
+        covered[slice(*rows)] = np.where(normals.any(axis=1), runs, lone)
+    return covered
 
 
 def _of_beams(
@@ -102,17 +116,20 @@ def _of_beams(
     return e
 
 
-def _bound(table: Table, shares: Shares) -> Likelihood:
-    bound = entropy = 0.0
-    # whole tables in double precision are large
-    for first in range(0, len(table.likelihood), _ROWS):
-        rows = slice(first, first + _ROWS)
-        joint = table.likelihood[rows] * shares.classes
+def _of_elements(
+    looks: Looks, kept: NDArray[np.bool_] | None, shares: Shares
+) -> tuple[NDArray[np.float32], Likelihood]:
+    """(E,) P(static) by the classes alone, and the bound."""
+    static, bound, entropy = np.empty(looks.surface.size, np.float32), 0.0, 0.0
+    for rows in looks.blocks():
+        table = looks.under(kept, rows)
+        static[slice(*rows)] = posterior_static(table.likelihood, shares.classes, table.n_static)
+        joint = table.likelihood * shares.classes
         evidence = joint.sum(axis=1)
         r = joint / evidence[:, None]
         entropy -= float(np.sum(r * np.log(np.maximum(r, 1e-30))))
-        bound += float(np.sum(np.log(evidence) + table.log_best[rows]))
-    return Likelihood(expected=bound - entropy, bound=bound)
+        bound += float(np.sum(np.log(evidence) + table.log_best))
+    return static, Likelihood(expected=bound - entropy, bound=bound)
 
 
 def _learned(looks: Looks, table: Table, shares: Shares) -> dict[str, object]:

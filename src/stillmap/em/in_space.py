@@ -6,7 +6,7 @@ goes on, is no wall. Whoever removes what moves from a cloud wants the car out, 
 
 from stillmap import _core
 from stillmap.em.beside import with_those_beside
-from stillmap.em.courses import courses_of, watch
+from stillmap.em.courses import static_of, watch
 from stillmap.em.dwell import e_step, expectations_of
 from stillmap.em.expectations import Expectations
 from stillmap.em.looks import Classes, Dwell, Float, looked_at
@@ -30,10 +30,10 @@ def e_step_in_space(
         watch(dwell, recording, options)
 
     looks = looked_at(recording, poses, resolution, options, threads, _CLASSES, prepare)
-    static = courses_of(looks, options).p_static
+    static = static_of(looks, options)
     if isinstance(looks.surface, _core.Surface3D):
         T_map_sensor = recording.T_map_sensor(poses)
         static = with_those_beside(
             static, looks.surface, recording, T_map_sensor, options.dwell, threads
         )
-    return expectations_of(looks, looks.under(), recording, poses, options, threads, static)
+    return expectations_of(looks, None, recording, poses, options, threads, static)

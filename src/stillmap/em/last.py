@@ -49,9 +49,7 @@ def last_e_step(
     looks = looked_at(recording, poses, resolution, options, threads, classes, prepare)
     found = None
     if views:
-        table = looks.under(_for_labels(looks))
-        found = expectations_of(looks, table, recording, poses, options, threads)
-        del table
+        found = expectations_of(looks, _for_labels(looks), recording, poses, options, threads)
     return found, courses_of(looks, options) if options.changes.enabled else None
 
 

@@ -1,6 +1,6 @@
 """What beams see of the cells in which any of them ended, look by look, under classes of chains."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,17 +8,20 @@ from numpy.typing import NDArray
 
 from stillmap import _core
 from stillmap.em.chunks import chunks
+from stillmap.em.mixture import LEARN_FROM
 from stillmap.em.options import DwellOptions, EmOptions
 from stillmap.recording.model import Recording
 
 Float = NDArray[np.float64]
 Surface = _core.Surface2D | _core.Surface3D
 Dwell = _core.Dwell2D | _core.Dwell3D
+Rows = tuple[int, int, int]
 
 OFTEN_OCCUPIED = 0.5  # share of the time in which something is there that comes and goes often
 
 _LEAST = 0.3  # cells: no length is known better, whatever the scatter
 _SWALLOWED = 4.0  # one in so many beams without a return through walls: none is trusted
+_ROWS = 1 << 14  # elements that are looked at together
 _LAST_LOOK = 2**31 - 1  # as far as the core counts
 
 
@@ -88,6 +91,7 @@ class Looks:
         dwell: what was seen of them.
         trust: how far beams without a return are believed, from 0 to 1.
         rho, tau, turn: (C,) of the classes; the first `n_static` are static.
+        threads: same result with any number.
     """
 
     surface: Surface
@@ -97,12 +101,24 @@ class Looks:
     tau: Float
     turn: Float
     n_static: int
+    threads: int = 1
 
-    def under(self, kept: NDArray[np.bool_] | None = None) -> Table:
-        """Of some of the classes (C,), all static ones among them, as if there were no others."""
+    def under(self, kept: NDArray[np.bool_] | None = None, rows: Rows | None = None) -> Table:
+        """Of some of the classes (C,), all static ones among them, as if there were no others.
+
+        rows: first, last, every: of some of the elements.
+        """
         some = slice(None) if kept is None else kept
-        found = self.dwell.likelihood(kept)
+        found = self.dwell.likelihood(kept, rows, self.threads)
         return Table(self.rho[some], self.tau[some], self.turn[some], self.n_static, *found)
+
+    def blocks(self) -> Iterator[Rows]:
+        """All elements: tables of all of them at once would be as large as what they are from."""
+        return blocks_of(self.surface)
+
+    def sample(self) -> Rows:
+        """So many of them, evenly, that shares can be learned from."""
+        return 0, self.surface.size, max(-(-self.surface.size // LEARN_FROM), 1)
 
 
 def looked_at(
@@ -116,18 +132,21 @@ def looked_at(
 ) -> Looks:
     """Follows all beams; `prepare` is called before the first look. See `e_step`."""
     T_map_sensor = recording.T_map_sensor(poses)
-    surface = surface_of(recording, T_map_sensor, resolution)
-    dwell = _dwell(surface, options.dwell, classes)
-    trust = _open(recording, T_map_sensor, dwell)
+    surface = surface_of(recording, T_map_sensor, resolution, threads)
+    dwell = _dwell(surface, options.dwell, classes, threads)
+    trust = _open(recording, T_map_sensor, dwell, threads)
     dwell.trust(trust)
     if prepare is not None:
         prepare(dwell)
     _look(recording, poses, dwell, options.dwell.look, threads)
+    dwell.rest()
     rho, tau, turn = (np.array(values) for values in classes.grid())
-    return Looks(surface, dwell, trust, rho, tau, turn, classes.n_static)
+    return Looks(surface, dwell, trust, rho, tau, turn, classes.n_static, threads)
 
 
-def surface_of(recording: Recording, T_map_sensor: Float, resolution: float) -> Surface:
+def surface_of(
+    recording: Recording, T_map_sensor: Float, resolution: float, threads: int = 1
+) -> Surface:
     """Mean, normal and scatter of the end points in every cell where beams ended."""
     kind = _core.Surface2D if recording.dimension == 2 else _core.Surface3D
     surface = kind(resolution)
@@ -135,8 +154,19 @@ def surface_of(recording: Recording, T_map_sensor: Float, resolution: float) -> 
         surface.add_end_points(
             recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans]
         )
-    surface.fit()
+    surface.fit(threads)
     return surface
+
+
+def blocks_of(surface: Surface) -> Iterator[Rows]:
+    """All elements, some of them at a time; one empty block where there are none."""
+    for first in range(0, max(surface.size, 1), _ROWS):
+        yield first, min(first + _ROWS, surface.size), 1
+
+
+def cells_of(surface: Surface) -> NDArray[np.int64]:
+    """(E, D) of the elements."""
+    return np.concatenate([surface.elements(rows)[0] for rows in blocks_of(surface)])
 
 
 def look_numbers(recording: Recording, seconds: float) -> NDArray[np.int64]:
@@ -166,7 +196,7 @@ def _look(recording: Recording, poses: Float, dwell: Dwell, seconds: float, thre
         )
 
 
-def _dwell(surface: Surface, options: DwellOptions, classes: Classes) -> Dwell:
+def _dwell(surface: Surface, options: DwellOptions, classes: Classes, threads: int) -> Dwell:
     rho, tau, turn = classes.grid()
     cell, scatter = surface.resolution, surface.scatter
     lengths = {
@@ -178,12 +208,26 @@ def _dwell(surface: Surface, options: DwellOptions, classes: Classes) -> Dwell:
     chosen = {"detection": options.detection, "seconds": options.look, **lengths}
     if isinstance(surface, _core.Surface2D):
         return _core.Dwell2D(
-            surface, rho=rho, tau=tau, turn=turn, normals=options.normals, **chosen
+            surface,
+            rho=rho,
+            tau=tau,
+            turn=turn,
+            normals=options.normals,
+            threads=threads,
+            **chosen,
         )
-    return _core.Dwell3D(surface, rho=rho, tau=tau, turn=turn, normals=options.normals, **chosen)
+    return _core.Dwell3D(
+        surface,
+        rho=rho,
+        tau=tau,
+        turn=turn,
+        normals=options.normals,
+        threads=threads,
+        **chosen,
+    )
 
 
-def _open(recording: Recording, T_map_sensor: Float, dwell: Dwell) -> float:
+def _open(recording: Recording, T_map_sensor: Float, dwell: Dwell, threads: int) -> float:
     """How far beams without a return show that nothing is there, from 0 to 1.
 
     Where there is open space they cross nothing solid. Where most of them seem to go through walls,
@@ -192,7 +236,7 @@ def _open(recording: Recording, T_map_sensor: Float, dwell: Dwell) -> float:
     lost = through = 0
     for scans, beams, offset in chunks(recording):
         counts = dwell.lost(
-            recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans]
+            recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans], threads
         )
         lost, through = lost + counts[0], through + counts[1]
     return max(0.0, 1.0 - _SWALLOWED * through / lost) if lost else 0.0

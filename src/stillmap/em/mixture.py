@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
-_LEARN_FROM = 100_000  # members that shares are learned from: more change no digit that matters
+LEARN_FROM = 100_000  # members that shares are learned from: more change no digit that matters
 _PSEUDO = 1.0  # members that each class starts with, so that none is ever impossible
 _MOST_STATIC = 0.998  # a recording cannot show that nothing ever moves
 
@@ -47,7 +47,7 @@ def fit_shares(
     among threads: the result does not depend on the machine's number of processors.
     """
     K, C = likelihood.shape
-    rows = likelihood[:: max(-(-K // _LEARN_FROM), 1)].astype(np.float64)
+    rows = likelihood[:: max(-(-K // LEARN_FROM), 1)].astype(np.float64)
     shares = np.empty(C)
     shares[:n_static] = start / n_static
     shares[n_static:] = (1.0 - start) / (C - n_static)

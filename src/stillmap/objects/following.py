@@ -14,7 +14,7 @@ Index = NDArray[np.intp]
 NOBODY = -1
 
 _SHAPE = 100  # points that a shape has at most: more of them say no more
-_PAIRS = 1_000_000  # distances that are looked at together
+_PAIRS = 1 << 16  # distances that are looked at together: as many as a cache holds
 
 
 def followed(points: MovingPoints, options: ObjectOptions) -> Index:
@@ -86,13 +86,14 @@ class _Following:
 
     def _squared_distances(self, xy: Float) -> Float:
         """(n, K) of points to what was seen of each thing, where that is expected now."""
-        expected = self._motion.x[self._of] + self._offset
+        expected_x, expected_y = (self._motion.x[self._of] + self._offset).T
         begin = np.searchsorted(self._of, np.arange(len(self._motion)))
         out = np.empty((len(xy), len(begin)))
-        step = max(1, _PAIRS // len(expected))
+        step = max(1, _PAIRS // len(expected_x))
         for first in range(0, len(xy), step):  # a crowd right before the laser is large
-            part = xy[first : first + step, None]
-            squared = np.square(part - expected).sum(axis=-1)
+            x, y = xy[first : first + step].T[:, :, None]
+            squared = np.square(x - expected_x)
+            squared += np.square(y - expected_y)
             out[first : first + step] = np.minimum.reduceat(squared, begin, axis=1)
         return out
 

@@ -110,16 +110,26 @@ def _of_scan(
     stands = hit[at] & (above >= low) & (above <= high)
     share = _share_within(start[2], above, low, top)
     way = (end[:, :2] - T[:2, 3]) * share[:, None]
-    length = np.linalg.norm(way, axis=1)
+    length = np.sqrt(np.square(way[:, 0]) + np.square(way[:, 1]))
     direction = np.floor(np.arctan2(way[:, 1], way[:, 0]) * (_DIRECTIONS / (2.0 * np.pi)))
     direction = direction.astype(np.int64) % _DIRECTIONS
-    # of hits one per direction and cell, of the others the longest of each direction
-    rank = np.where(stands, 1 + np.floor(length / cell).astype(np.int64), 0)
-    order = np.lexsort((np.where(stands, at, -length), rank, direction))
-    d, r = direction[order], rank[order]
-    new = np.concatenate([[True], (d[1:] != d[:-1]) | (r[1:] != r[:-1])])[: len(d)]
-    kept = order[new]
+    kept = _kept(direction, length, stands, cell)
     return T[:2, 3] + way[kept], stands[kept], at[kept]
+
+
+def _kept(direction: Index, length: Float, stands: NDArray[np.bool_], cell: float) -> Index:
+    """Of hits the first per direction and cell, of the others the longest of each direction; of
+    equals the first. By directions, hits after the others and the farther ones last."""
+    rank = np.where(stands, 1 + np.floor(length / cell).astype(np.int64), 0)
+    group = direction * (rank.max(initial=0) + 1) + rank
+    hits, others = np.flatnonzero(stands), np.flatnonzero(~stands)
+    hits = hits[np.unique(group[hits], return_index=True)[1]]
+    longest = np.zeros(_DIRECTIONS)
+    np.maximum.at(longest, direction[others], length[others])
+    others = others[length[others] == longest[direction[others]]]
+    others = others[np.unique(direction[others], return_index=True)[1]]
+    kept = np.concatenate([others, hits])
+    return np.asarray(kept[np.argsort(group[kept])])
 
 
 def _share_within(start: float, above: Float, low: float, top: float) -> Float:
