@@ -16,10 +16,23 @@ namespace {
 
 template <int D>
 void add_end_points(Surface<D>& surface, const Points<D>& points, const Flat<bool>& hit,
-                    const Flat<int64_t>& offset, const Poses<D>& poses) {
+                    const Flat<int64_t>& offset, const Poses<D>& poses,
+                    const std::optional<Flat<int64_t>>& look) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
+  require(!look || look->shape(0) == scans.n_scans, "look: expected one number per scan");
+  for (size_t t = 0; look && t < scans.n_scans; ++t)
+    require(look->data()[t] >= 0 && look->data()[t] <= kLastLook, "look: out of range");
   nb::gil_scoped_release released;
-  surface.add(scans);
+  surface.add(scans, look ? look->data() : nullptr);
+}
+
+// (E, 2) first and last look
+template <int D>
+auto spans(const Surface<D>& surface) {
+  std::vector<int32_t> out;
+  for (const Span& span : surface.hits()) out.insert(out.end(), {span.first, span.last});
+  const size_t n = surface.hits().size();
+  return owned(std::move(out), {n, 2});
 }
 
 template <int D>
@@ -179,7 +192,11 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
           "metres: standard deviation of end points across surfaces; 0 before `fit`")
       .def("add_end_points", &add_end_points<D>, nb::arg("points").noconvert(),
            nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
-           nb::arg("T_map_sensor").noconvert(), "Notes where beams ended.")
+           nb::arg("T_map_sensor").noconvert(), nb::arg("look").noconvert() = nb::none(),
+           "Notes where beams ended, and in which looks (T,) int64 where all calls say so.")
+      .def_prop_ro("spans", &spans<D>, nb::rv_policy::move,
+                   "(E, 2) int32: first and last look at which beams ended in the cell of each "
+                   "element, once it is fitted; (0, 2) where nobody said.")
       .def("fit", &S::fit, nb::arg("threads") = 1, nb::call_guard<nb::gil_scoped_release>(),
            "Means, normals and scatter from all end points; none can be added any more.")
       .def("elements", &describe<D>, nb::arg("rows") = nb::none(),

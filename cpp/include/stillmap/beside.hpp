@@ -6,9 +6,9 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
-#include <limits>
 #include <vector>
 
 #include "stillmap/parallel.hpp"
@@ -26,38 +26,50 @@ struct BesideOptions {
   int rounds;          // at most
 };
 
-constexpr int64_t kLastLook = std::numeric_limits<int32_t>::max();
-
-// First and last look at which a beam ended in an element's cell.
-struct Span {
-  int32_t first, last;
-};
-
-// Widens the spans of the elements by the hits of scans; look: of each scan.
+// The elements of the cells around one, by the blocks around its block: neighbours in number share
+// these, so they are seldom looked for.
 template <int D>
-void widen_spans(const Surface<D>& surface, const Scans<D>& scans, const int64_t* look,
-                 Span* spans) {
-  Cursor<const Surface<D>> cursor(surface);
-  for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t t, int64_t n, const Pose<D>& pose) {
-    if (!scans.hit[n]) return;
-    const Segment<D> beam(pose, scans.points + n * D, surface.resolution());
-    const int32_t k = surface.at(cursor, cell_of<D>(beam.end));
-    if (k == kNoElement) return;
-    const auto now = static_cast<int32_t>(look[t]);
-    spans[k] = {std::min(spans[k].first, now), std::max(spans[k].last, now)};
-  });
-}
+class Around {
+ public:
+  explicit Around(const Surface<D>& surface) : surface_(surface) {}
+
+  void move_to(const Cell<D>& cell) {
+    const Cell<D> block = Surface<D>::block_of(cell);
+    if (ready_ && block == block_) return;
+    block_ = block;
+    ready_ = true;
+    size_t i = 0;
+    for_each_near<D>(block, 1, [&](const Cell<D>& near) { blocks_[i++] = surface_.find(near); });
+  }
+
+  // Of a cell within a block's edge of where it was moved to.
+  int32_t at(const Cell<D>& cell) const {
+    const Cell<D> step = Surface<D>::block_of(cell) - block_;
+    size_t i = 0;
+    for (int d = D - 1; d >= 0; --d) i = 3 * i + static_cast<size_t>(step[d] + 1);
+    const auto* block = blocks_[i];
+    return block ? block->counts[static_cast<size_t>(Surface<D>::local_of(cell))] : kNoElement;
+  }
+
+ private:
+  static constexpr size_t kBlocks = D == 2 ? 9 : 27;
+
+  const Surface<D>& surface_;
+  Cell<D> block_ = Cell<D>::Zero();
+  bool ready_ = false;
+  std::array<const typename Surface<D>::Block*, kBlocks> blocks_{};
+};
 
 template <int D>
 class Beside {
  public:
-  // log_odds: (E,) of being static, by an element's own looks
-  Beside(const Surface<D>& surface, const float* log_odds, const Span* spans,
-         const BesideOptions& options, int threads)
+  // log_odds: (E,) of being static, by an element's own looks; the surface knows when these hit
+  Beside(const Surface<D>& surface, const float* log_odds, const BesideOptions& options,
+         int threads)
       : surface_(surface), options_(options), threads_(threads), p_(surface.size()) {
     rows_.reserve(surface.size());
     for (size_t k = 0; k < surface.size(); ++k) {
-      rows_.push_back(row_of(static_cast<int32_t>(k), log_odds[k], spans[k]));
+      rows_.push_back(row_of(static_cast<int32_t>(k), log_odds[k]));
       p_[k] = probability(log_odds[k]);
     }
     const int radius = static_cast<int>(std::floor(options.radius));
@@ -73,9 +85,9 @@ class Beside {
     for (int round = 0; round < options_.rounds; ++round) {
       const std::vector<float> before = p_;
       parallel_shares(even_shares(p_.size(), threads_), [&](size_t, size_t from, size_t to) {
-        Cursor<const Surface<D>> cursor(surface_);
+        Around<D> around(surface_);
         for (size_t k = from; k < to; ++k)
-          if (asked[k]) p_[k] = opinion(cursor, k, before);
+          if (asked[k]) p_[k] = opinion(around, k, before);
       });
       if (!pass_on(before, asked)) break;
     }
@@ -91,9 +103,10 @@ class Beside {
     float own;  // log odds
   };
 
-  Row row_of(int32_t k, float log_odds, const Span& hit) const {
+  Row row_of(int32_t k, float log_odds) const {
     const Element<D>& e = surface_.element(k);
-    return {e.mean.template cast<float>(), e.normal.template cast<float>(), hit,
+    return {e.mean.template cast<float>(), e.normal.template cast<float>(),
+            surface_.hits()[static_cast<size_t>(k)],
             std::clamp(log_odds, static_cast<float>(options_.least),
                        static_cast<float>(options_.most))};
   }
@@ -101,24 +114,26 @@ class Beside {
   static float probability(float log_odds) { return 1.0f / (1.0f + std::exp(-log_odds)); }
 
   template <class Visit>
-  void for_each_beside(Cursor<const Surface<D>>& cursor, size_t k, Visit&& visit) const {
+  void for_each_beside(Around<D>& around, size_t k, Visit&& visit) const {
     const Cell<D>& cell = surface_.cell(static_cast<int32_t>(k));
+    around.move_to(cell);
     for (const Cell<D>& off : offsets_) {
-      const int32_t other = surface_.at(cursor, cell + off);
+      const int32_t other = around.at(cell + off);
       if (other != kNoElement) visit(static_cast<size_t>(other));
     }
   }
 
-  float opinion(Cursor<const Surface<D>>& cursor, size_t k, const std::vector<float>& p) const {
+  float opinion(Around<D>& around, size_t k, const std::vector<float>& p) const {
     const Row& row = rows_[k];
     float for_it = 0.0f, against = 0.0f, weight = 1.0f;
-    for_each_beside(cursor, k, [&](size_t other) {
+    for_each_beside(around, k, [&](size_t other) {
       const Row& beside = rows_[other];
-      const int64_t both = looks(
-          {std::max(row.hit.first, beside.hit.first), std::min(row.hit.last, beside.hit.last)});
+      const Span common{std::max(row.hit.first, beside.hit.first),
+                        std::min(row.hit.last, beside.hit.last)};
+      const int64_t both = common.looks();
       if (both <= 0) return;
       const bool is_static = p[other] > 0.5f;
-      const int64_t of = is_static ? looks(row.hit) + looks(beside.hit) - both : looks(row.hit);
+      const int64_t of = is_static ? row.hit.looks() + beside.hit.looks() - both : row.hit.looks();
       const float w = together(row, beside) * static_cast<float>(both) / static_cast<float>(of);
       weight += w;
       (is_static ? for_it : against) += w * std::abs(2.0f * p[other] - 1.0f);
@@ -127,8 +142,6 @@ class Beside {
                       static_cast<float>(options_.for_dynamic) * against;
     return probability(row.own + pull / weight);
   }
-
-  static int64_t looks(const Span& span) { return int64_t{span.last} - span.first + 1; }
 
   // How far two can be of one surface.
   float together(const Row& a, const Row& b) const {
@@ -142,10 +155,10 @@ class Beside {
   bool pass_on(const std::vector<float>& before, std::vector<uint8_t>& asked) const {
     std::fill(asked.begin(), asked.end(), uint8_t{0});
     bool any = false;
-    Cursor<const Surface<D>> cursor(surface_);
+    Around<D> around(surface_);
     for (size_t k = 0; k < p_.size(); ++k) {
       if (!(std::abs(p_[k] - before[k]) > options_.moved)) continue;
-      for_each_beside(cursor, k, [&](size_t other) { asked[other] = 1; });
+      for_each_beside(around, k, [&](size_t other) { asked[other] = 1; });
       any = true;
     }
     return any;

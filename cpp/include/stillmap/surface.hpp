@@ -44,6 +44,19 @@ struct Element {
   double half = 0.5;               // how far it extends from there for sure
 };
 
+constexpr int64_t kLastLook = std::numeric_limits<int32_t>::max();
+
+// First and last look at which beams ended in a cell.
+struct Span {
+  int32_t first = static_cast<int32_t>(kLastLook), last = -1;
+
+  void widen(int64_t look) {
+    first = std::min(first, static_cast<int32_t>(look));
+    last = std::max(last, static_cast<int32_t>(look));
+  }
+  int64_t looks() const { return int64_t{last} - first + 1; }
+};
+
 template <int D>
 class Surface : public CellIndex<D> {
  public:
@@ -71,14 +84,19 @@ class Surface : public CellIndex<D> {
   const Element<D>& element(int32_t k) const { return elements_[static_cast<size_t>(k)]; }
   int64_t beams(int32_t k) const { return beams_[static_cast<size_t>(k)]; }
   const Cell<D>& cell(int32_t k) const { return cells_[static_cast<size_t>(k)]; }
+  // when beams ended in each cell, if looks were given
+  const std::vector<Span>& hits() const { return hits_; }
 
-  // Notes the end points of all beams that were hit.
-  void add(const Scans<D>& scans) {
+  // Notes the end points of all beams that were hit, and the looks of their scans if given.
+  void add(const Scans<D>& scans, const int64_t* look = nullptr) {
     if (fitted_) throw std::invalid_argument("surface: was fitted, and takes no more end points");
-    for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t, int64_t n, const Pose<D>& pose) {
+    if (sums_.empty()) dated_ = look != nullptr;
+    if (dated_ != (look != nullptr)) throw std::invalid_argument("look: of all scans, or of none");
+    for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t t, int64_t n, const Pose<D>& pose) {
       if (!scans.hit[n]) return;
       const Segment<D> beam(pose, scans.points + n * D, resolution_);
-      add_end_point(beam.end);
+      Sums& sums = add_end_point(beam.end);
+      if (look) sums.hit.widen(look[t]);
     });
   }
 
@@ -116,9 +134,11 @@ class Surface : public CellIndex<D> {
       if (fit_normals(radius, threads) >= 0.5) break;
     cells_.reserve(size());
     beams_.reserve(size());
+    if (dated_) hits_.reserve(size());
     for (const Sums& sums : sums_) {
       cells_.push_back(sums.cell);
       beams_.push_back(sums.count);
+      if (dated_) hits_.push_back(sums.hit);
     }
     std::vector<Sums>().swap(sums_);  // as large as all the rest
     fitted_ = true;
@@ -131,6 +151,7 @@ class Surface : public CellIndex<D> {
     int64_t count = 0;
     std::array<Fixed, D> first{};           // of end point - cell corner
     std::array<Fixed, kProducts> second{};  // of its products, by rows of the upper triangle
+    Span hit;
   };
 
   bool lies_off(int32_t k, const Vec<D>& end) const {
@@ -174,7 +195,7 @@ class Surface : public CellIndex<D> {
     return order;
   }
 
-  void add_end_point(const Vec<D>& end) {
+  Sums& add_end_point(const Vec<D>& end) {
     const Cell<D> cell = cell_of<D>(end);
     int32_t& at = this->place_of(cell);
     if (at == kNoElement) {
@@ -190,6 +211,7 @@ class Surface : public CellIndex<D> {
       sums.first[static_cast<size_t>(i)] += to_fixed(x[i]);
       for (int j = i; j < D; ++j) sums.second[product++] += to_fixed(x[i] * x[j]);
     }
+    return sums;
   }
 
   static Vec<D> mean_of(const Sums& s) {
@@ -310,10 +332,12 @@ class Surface : public CellIndex<D> {
   double resolution_;
   double scatter_ = 0.0;
   bool fitted_ = false;
+  bool dated_ = false;      // whether looks were given
   std::vector<Sums> sums_;  // until it is fitted
   std::vector<Element<D>> elements_;
   std::vector<Cell<D>> cells_;
   std::vector<int64_t> beams_;
+  std::vector<Span> hits_;  // if dated
 };
 
 }  // namespace stillmap

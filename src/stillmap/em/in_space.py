@@ -4,7 +4,6 @@ A recording of streets lasts for minutes, and a car that waits at a light for ha
 goes on, is no wall. Whoever removes what moves from a cloud wants the car out, and its place free.
 """
 
-from stillmap import _core
 from stillmap.em.beside import with_those_beside
 from stillmap.em.courses import static_of, watch
 from stillmap.em.dwell import e_step, expectations_of
@@ -31,9 +30,5 @@ def e_step_in_space(
 
     looks = looked_at(recording, poses, resolution, options, threads, _CLASSES, prepare)
     static = static_of(looks, options)
-    if isinstance(looks.surface, _core.Surface3D):
-        T_map_sensor = recording.T_map_sensor(poses)
-        static = with_those_beside(
-            static, looks.surface, recording, T_map_sensor, options.dwell, threads
-        )
+    static = with_those_beside(static, looks.surface, threads)
     return expectations_of(looks, None, recording, poses, options, threads, static)

@@ -132,7 +132,8 @@ def looked_at(
 ) -> Looks:
     """Follows all beams; `prepare` is called before the first look. See `e_step`."""
     T_map_sensor = recording.T_map_sensor(poses)
-    surface = surface_of(recording, T_map_sensor, resolution, threads)
+    look = look_numbers(recording, options.dwell.look) if recording.dimension == 3 else None
+    surface = surface_of(recording, T_map_sensor, resolution, threads, look)
     dwell = _dwell(surface, options.dwell, classes, threads)
     trust = _open(recording, T_map_sensor, dwell, threads)
     dwell.trust(trust)
@@ -145,15 +146,22 @@ def looked_at(
 
 
 def surface_of(
-    recording: Recording, T_map_sensor: Float, resolution: float, threads: int = 1
+    recording: Recording,
+    T_map_sensor: Float,
+    resolution: float,
+    threads: int = 1,
+    look: NDArray[np.int64] | None = None,
 ) -> Surface:
-    """Mean, normal and scatter of the end points in every cell where beams ended."""
+    """Mean, normal and scatter of the end points in every cell where beams ended.
+
+    With the look (T,) of each scan it also knows when they did.
+    """
     kind = _core.Surface2D if recording.dimension == 2 else _core.Surface3D
     surface = kind(resolution)
     for scans, beams, offset in chunks(recording):
-        surface.add_end_points(
-            recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans]
-        )
+        points, hit = recording.points[beams], recording.hit[beams]
+        of_scans = None if look is None else look[scans]
+        surface.add_end_points(points, hit, offset, T_map_sensor[scans], of_scans)
     surface.fit(threads)
     return surface
 

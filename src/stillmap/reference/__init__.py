@@ -11,6 +11,7 @@ without a thought for speed. Where beams are taken:
 """
 
 from stillmap.reference.beams import add_beams, e_step, log_likelihood
+from stillmap.reference.beside import settled
 from stillmap.reference.changes import ChangeModel, Course, course
 from stillmap.reference.dwell import Dwell, Dwell2D, Dwell3D, Reading, look_at
 from stillmap.reference.em import EmStep, em_fixed_poses, m_step_map
@@ -79,5 +80,6 @@ __all__ = [
     "registration_curvature",
     "registration_gradient",
     "search_lattice",
+    "settled",
     "traverse",
 ]

@@ -79,6 +79,7 @@ class Surface:
         self.resolution = resolution
         self.dimension = dimension
         self.ends: dict[Cell, list[Float]] = {}
+        self.looks: dict[Cell, list[int]] = {}
         self.list: list[Element] = []
         self.scatter = 0.0
 
@@ -87,12 +88,20 @@ class Surface:
         return len(self.ends)
 
     def add_end_points(
-        self, points: ArrayLike, hit: ArrayLike, offset: ArrayLike, T_map_sensor: ArrayLike
+        self,
+        points: ArrayLike,
+        hit: ArrayLike,
+        offset: ArrayLike,
+        T_map_sensor: ArrayLike,
+        look: ArrayLike | None = None,
     ) -> None:
-        """Notes where the beams that were hit ended."""
+        """Notes where the beams that were hit ended, and in which look of their scans (T,)."""
         for beam in usable_beams(self.dimension, points, hit, offset, T_map_sensor):
             if beam.hit:
-                self.ends.setdefault(self._end_cell(beam), []).append(beam.end)
+                cell = self._end_cell(beam)
+                self.ends.setdefault(cell, []).append(beam.end)
+                if look is not None:
+                    self.looks.setdefault(cell, []).append(int(np.asarray(look)[beam.scan]))
 
     def fit(self) -> None:
         """Means, surfaces and scatter; the window widens until it sees walls for all the noise."""
@@ -117,6 +126,12 @@ class Surface:
             np.array([e.prominence for e in self.list]),
             np.array([e.beams for e in self.list], np.int64),
         )
+
+    @property
+    def spans(self) -> NDArray[np.int32]:
+        """(E, 2) first and last look at which beams ended in each, if looks were given."""
+        spans = [(min(looks), max(looks)) for looks in self.looks.values()]
+        return np.array(spans, np.int32).reshape(-1, 2)
 
     def elements_of(
         self,
