@@ -17,6 +17,15 @@ void add(Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit, const Fl
 }
 
 template <int D>
+void ends(Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit, const Flat<float>& e,
+          const Flat<int64_t>& offset, const Poses<D>& poses, bool remove) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  const float* weights = per_beam(e, points.shape(0), "e");
+  nb::gil_scoped_release released;
+  add_ends<D>(grid, scans, weights, remove ? -1 : 1);
+}
+
+template <int D>
 void fill(Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit, const Flat<float>& e,
           const Flat<int64_t>& offset, const Poses<D>& poses, double gap, double tolerance,
           double growth, bool remove) {
@@ -82,6 +91,11 @@ void bind(nb::module_& m) {
         nb::arg("remove") = false,
         "Adds the sums alpha, beta of (10) of all beams to the grid; e (M,) float32. With remove "
         "it subtracts what was added before, to the bit.");
+  m.def("add_ends", &ends<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("remove") = false,
+        "Adds what of the sums of `add_beams` depends on e, or subtracts it, to the bit: taken out "
+        "with one e and added with another, they are those of the other.");
   m.def("fill_surfaces", &fill<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("gap"), nb::arg("tolerance"),

@@ -122,6 +122,7 @@ auto likelihoods(Dwell<D>& dwell, const std::optional<Flat<bool>>& among,
 template <int D>
 auto describe_changes(const Dwell<D>& dwell, const std::optional<Slice>& rows) {
   const Changes& changes = dwell.changes();
+  require(changes.has_courses(), "changes: nobody asked for courses");
   const auto [first, every, n] = rows_from(rows, changes.members());
   std::vector<double> log_likelihood(n);
   std::vector<float> p_last(n * 2), share(n);
@@ -147,6 +148,15 @@ auto describe_changes(const Dwell<D>& dwell, const std::optional<Slice>& rows) {
   return std::make_tuple(owned(std::move(log_likelihood), {n}), owned(std::move(share), {n}),
                          owned(std::move(p_last), {n, 2}), owned(std::move(count), {n, 2}),
                          owned(std::move(looks), {n, 2, 2, 2}));
+}
+
+template <int D>
+auto log_changing(const Dwell<D>& dwell, const std::optional<Slice>& rows) {
+  const Changes& changes = dwell.changes();
+  const auto [first, every, n] = rows_from(rows, changes.members());
+  std::vector<double> values(n);
+  for (size_t i = 0; i < n; ++i) values[i] = changes.log_likelihood(first + i * every);
+  return owned(std::move(values), {n});
 }
 
 template <int D>
@@ -253,17 +263,21 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
           "the way at first.")
       .def(
           "watch",
-          [](W& w, double tau, double passing_occupied, double passing_tau, double detection) {
+          [](W& w, double tau, double passing_occupied, double passing_tau, double detection,
+             bool courses) {
             for (const double t : {tau, passing_tau})
               require(t > 0.0 && std::isfinite(t), "tau: expected positive times");
             for (const double p : {passing_occupied, detection})
               require(p > 0.0 && p < 1.0, "expected probabilities between 0 and 1");
-            w.watch({tau, passing_occupied, passing_tau, detection});
+            w.watch({tau, passing_occupied, passing_tau, detection}, courses);
           },
           nb::kw_only(), nb::arg("tau"), nb::arg("passing_occupied"), nb::arg("passing_tau"),
-          nb::arg("detection"),
+          nb::arg("detection"), nb::arg("courses") = true,
           "Asks, before the first look, which elements are of things that come to stay or leave: "
-          "correlation time in seconds; share of the time and correlation time of passers-by.")
+          "correlation time in seconds; share of the time and correlation time of passers-by. "
+          "Without courses only `log_changing` is known of them.")
+      .def("log_changing", &log_changing<D>, nb::arg("rows") = nb::none(),
+           "(E,) the first of `changes`.")
       .def("rest", &W::rest, "Lets go what only further looks would want; they make it anew.")
       .def(
           "changes", &describe_changes<D>, nb::arg("rows") = nb::none(),

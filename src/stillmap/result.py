@@ -143,10 +143,9 @@ def _result(loop: Loop, recording: Recording, progress: Progress, stages: Stages
     with stages.measure("maps"):
         flat, plan, ground = kept, seen, None
         if seen.dimension == 3:
-            ground = ground_of(seen, kept.poses, kept.p_static)
+            ground = ground_of(seen, kept.poses, kept.p_static, threads)
             flat, plan = _in_plan(kept, seen, ground, options)
-        filtered = _map(flat, plan, options, threads)
-        raw = _raw_map(plan, flat.poses, filtered, threads)
+        filtered, raw = _maps(flat, plan, options, threads)
     progress("counting looks", 0, 0, 0)
     with stages.measure("evidence"):
         evidence = em.evidence(
@@ -246,13 +245,20 @@ def _in_plan(
     return flat, plan.recording
 
 
-def _map(kept: Best, recording: Recording, options: Options, threads: int) -> em.OccupancyMap:
-    """Labels that follow from sums are beside those they were made from, others make them."""
+def _maps(
+    kept: Best, recording: Recording, options: Options, threads: int
+) -> tuple[em.OccupancyMap, em.OccupancyMap]:
+    """The map, and the same with every hit counted as static.
+
+    Labels that follow from sums are beside those they were made from, others make them.
+    """
     makes = options.estimator in ("stillmap", "tracker")
     weights = kept.p_static if makes else kept.weights
     grid = _core.Grid2D(options.slam.resolution)
     seen = em.add_believed_first(grid, recording, kept.poses, weights, kept.no_return, threads)
-    return em.occupancy_map(grid, kept.occupied, seen)
+    filtered = em.occupancy_map(grid, kept.occupied, seen)
+    em.count_as_static(grid, recording, kept.poses, weights)
+    return filtered, em.occupancy_map(grid, box=filtered.box)
 
 
 def _without(objects: list[MovingObject], things: NDArray[np.intp]) -> list[MovingObject]:
@@ -265,11 +271,3 @@ def _common(one: NDArray[np.intp], other: NDArray[np.intp]) -> int:
     """How many numbers two rising arrays have in common."""
     at = np.searchsorted(other, one)
     return int(np.count_nonzero(one[at < len(other)] == other[at[at < len(other)]]))
-
-
-def _raw_map(
-    recording: Recording, poses: Float, filtered: em.OccupancyMap, threads: int
-) -> em.OccupancyMap:
-    grid = _core.Grid2D(filtered.resolution)
-    em.add_recording(grid, recording, poses, None, threads)
-    return em.occupancy_map(grid, box=filtered.box)

@@ -38,6 +38,20 @@ def test_alpha_is_exact_when_e_is(beams):
     assert (sums(core, cells)[:, 0] == sums(plain, cells)[:, 0]).all()
 
 
+def test_ends_with_another_e_are_sums_with_it(beams):
+    other = beams.with_(e=np.ones(len(beams.hit), np.float32))
+    points, hit, offset, T = beams.arguments
+    grids = []
+    for kernels in (_core, reference):
+        grid = beams.grid(kernels)
+        kernels.add_ends(grid, points, hit, beams.e, offset, T, remove=True)
+        kernels.add_ends(grid, points, hit, other.e, offset, T)
+        grids.append(grid)
+    cells = all_cells(*grids)
+    assert (sums(grids[0], cells) == sums(other.grid(_core), cells)).all()
+    np.testing.assert_allclose(sums(grids[1], cells), sums(other.grid(reference), cells), atol=1e-9)
+
+
 def test_untouched_cells_are_unknown_in_both(beams):
     core, plain = beams.grid(_core), beams.grid(reference)
     cells = all_cells(core, plain)

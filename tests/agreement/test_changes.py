@@ -49,7 +49,7 @@ def parallel_poses(points, offset):
     return along, np.arange(len(points) + 1), T, look
 
 
-def watched(kernels, seen, number, threads=1, chunk=None):
+def watched(kernels, seen, number, threads=1, chunk=None, **asked):
     points, hit, offset = beams_of(seen)
     along, own, T, look = parallel_poses(points, offset)
     surface = kernels.Surface2D(0.1)
@@ -67,7 +67,7 @@ def watched(kernels, seen, number, threads=1, chunk=None):
         beyond=0.3,
         normals=False,
     )
-    dwell.watch(**MODEL)
+    dwell.watch(**MODEL, **asked)
     step = chunk or len(number)
     for first in range(0, len(number), step):
         of = np.flatnonzero((look >= first) & (look < first + step))
@@ -76,7 +76,8 @@ def watched(kernels, seen, number, threads=1, chunk=None):
     cells = surface.elements()[0]
     at = np.flatnonzero(cells[:, 0] == 20)
     order = at[np.argsort(cells[at, 1])]
-    return [values[order] for values in dwell.changes()]
+    found = dwell.changes() if asked.get("courses", True) else [dwell.log_changing()]
+    return [values[order] for values in found]
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +113,11 @@ def test_neither_threads_nor_chunks_change_a_bit(both, threads, chunk):
     seen, number = lanes()
     for one, other in zip(both[0], watched(_core, seen, number, threads, chunk), strict=True):
         assert one.tobytes() == other.tobytes()
+
+
+def test_how_probable_it_is_does_not_depend_on_courses(both):
+    [found] = watched(_core, *lanes(), courses=False)
+    assert found.tobytes() == both[0][0].tobytes()
 
 
 def by_hand(pattern):
@@ -167,6 +173,10 @@ def test_refusals():
     for name, value in (("tau", 0.0), ("tau", np.inf), ("passing_tau", -1.0), ("detection", 1.0)):
         with pytest.raises(ValueError, match="expected p"):
             dwell.watch(**{**MODEL, name: value})
+    dwell.watch(**MODEL, courses=False)
+    assert dwell.log_changing().shape == (0,)
+    with pytest.raises(ValueError, match="nobody asked"):
+        dwell.changes([0, 0, 1])
     none = np.empty((0, 2), np.float32), np.empty(0, bool), np.zeros(2, np.int64)
     dwell.add(*none, np.eye(3)[None], np.array([0]))
     with pytest.raises(ValueError, match="before the first look"):

@@ -159,6 +159,7 @@ def test_rounding_makes_nothing_impossible(monkeypatch):
         surface=SimpleNamespace(size=20_000, elements=lambda rows: (grid[slice(*rows)],)),
         dwell=SimpleNamespace(
             changes=lambda rows: [one[slice(*rows)] for one in changes],
+            log_changing=lambda rows: changes[0][slice(*rows)],
             likelihood=lambda kept, rows, _: (
                 likelihood[slice(*rows)][:, kept].astype(np.float32),
                 np.zeros(len(range(*rows))),

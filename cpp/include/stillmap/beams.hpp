@@ -95,6 +95,18 @@ class Approach {
   Cell<D> cell_ = Cell<D>::Zero();
 };
 
+// A hit, static with some probability, in its end cell.
+template <int D>
+inline void add_end(typename Grid<D>::Block& block, const Cell<D>& cell, const Vec<D>& end,
+                    double static_share, Fixed sign) {
+  const auto local = static_cast<size_t>(Grid<D>::local_of(cell));
+  block.counts[local].alpha += sign * to_fixed(static_share);       // alpha_j
+  block.counts[local].beta += sign * to_fixed(1.0 - static_share);  // first sum of beta_j
+  auto& moment = Grid<D>::moments_of(block)[local];
+  for (int d = 0; d < D; ++d)
+    moment[static_cast<size_t>(d)] += sign * to_fixed(static_share * (end[d] - cell[d]));
+}
+
 // alpha_j and beta_j of (10) for the scans [first, last). Sums are integers: with sign -1 scans
 // that were added before are taken out again without a trace.
 template <int D>
@@ -109,14 +121,19 @@ inline void add_scans(Grid<D>& grid, const Scans<D>& scans, const float* e, Fixe
     traverse<D>(beam.start, beam.end, walker);
     if (!scans.hit[n]) return;  // (1 - zeta) = 0: the end cell of a maximum-range beam says nothing
     approach.add(beam);
-    const Cell<D>& end = walker.cell();
-    const double static_share = probability(e[n]);
-    walker.counts()->alpha += sign * to_fixed(static_share);       // alpha_j
-    walker.counts()->beta += sign * to_fixed(1.0 - static_share);  // first sum of beta_j
-    auto& moment =
-        Grid<D>::moments_of(*walker.block())[static_cast<size_t>(Grid<D>::local_of(end))];
-    for (int d = 0; d < D; ++d)
-      moment[static_cast<size_t>(d)] += sign * to_fixed(static_share * (beam.end[d] - end[d]));
+    add_end<D>(*walker.block(), walker.cell(), beam.end, probability(e[n]), sign);
+  });
+}
+
+// What of these sums depends on e: those of the end cells.
+template <int D>
+inline void add_ends(Grid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign) {
+  Cursor<Grid<D>> cursor(grid);
+  for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t, int64_t n, const Pose<D>& pose) {
+    if (!scans.hit[n]) return;
+    const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
+    const Cell<D> end = cell_of<D>(beam.end);
+    add_end<D>(*cursor.block(end), end, beam.end, probability(e[n]), sign);
   });
 }
 

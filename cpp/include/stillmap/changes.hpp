@@ -53,19 +53,24 @@ class Changes {
  public:
   enum State : size_t { kThing, kNothing, kSomebody, kStates };
 
-  // seconds: between successive looks
-  Changes(size_t members, const ChangeModel& model, double seconds)
-      : model_(model), seconds_(seconds), heads_(members) {
+  // seconds: between successive looks; courses: whether they are asked for, or only how probable
+  // the story is
+  Changes(size_t members, const ChangeModel& model, double seconds, bool courses = true)
+      : model_(model),
+        seconds_(seconds),
+        has_courses_(courses),
+        heads_(members),
+        courses_(courses ? members : 0) {
     const auto rho = static_cast<float>(model.passing_occupied);
     const std::array<float, kStates> prior{0.5f, 0.5f * (1.0f - rho), 0.5f * rho};
-    for (Head& head : heads_) {
-      head.weight = prior;
-      for (size_t s = 0; s < kStates; ++s) head.course[s].log_probability = logarithm(prior[s]);
-    }
+    for (Head& head : heads_) head.weight = prior;
+    for (Courses& to : courses_)
+      for (size_t s = 0; s < kStates; ++s) to[s].log_probability = logarithm(prior[s]);
     for (int gap = 0; gap < kTable; ++gap) table_.push_back(transitions(gap));
   }
 
   size_t members() const { return heads_.size(); }
+  bool has_courses() const { return has_courses_; }
 
   // Whether it can remember the number of a look.
   static bool counts(int64_t look) {
@@ -94,16 +99,17 @@ class Changes {
   }
   // The most probable course, and the share of the time from first to last look that it is not
   // empty.
-  const Course& course(size_t k) const { return *best(heads_[k].course); }
+  const Course& course(size_t k) const { return *best(courses_[k]); }
   float occupied_share(size_t k) const {
     const Head& head = heads_[k];
-    const auto& courses = head.course;
+    const Courses& courses = courses_[k];
     if (head.last == head.first) return best(courses) == courses.data() + kNothing ? 0.0f : 1.0f;
     return best(courses)->occupied / static_cast<float>(head.last - head.first);
   }
 
  private:
   using Weights = std::array<float, kStates>;
+  using Courses = std::array<Course, kStates>;  // the most probable one to each state
   using Matrix = std::array<Weights, kStates>;  // [from][to]
   struct Transition {
     Matrix p, log;
@@ -116,14 +122,13 @@ class Changes {
     int32_t first = Between::kNever, last = Between::kNever;  // looks
     Weights weight;  // P(all looks so far, state), relative to exp(log_scale)
     double log_scale = 0.0;
-    std::array<Course, kStates> course;  // the most probable one to each state
   };
 
   static double sum(const Weights& w) {
     return static_cast<double>(w[kThing]) + static_cast<double>(w[kNothing]) +
            static_cast<double>(w[kSomebody]);
   }
-  static const Course* best(const std::array<Course, kStates>& courses) {
+  static const Course* best(const Courses& courses) {
     return std::max_element(courses.begin(), courses.end(), [](const Course& a, const Course& b) {
       return a.log_probability < b.log_probability;
     });
@@ -156,14 +161,16 @@ class Changes {
     if (is_first) head.first = head.last = now;
     const int32_t gap = now - head.last;
     if (gap < kTable) {
-      forward(head, table_[static_cast<size_t>(gap)].p, seen);
-      follow(head, table_[static_cast<size_t>(gap)].log, seen, now);
+      go(k, table_[static_cast<size_t>(gap)], seen, now);
     } else {
-      const Transition far = transitions(gap);
-      forward(head, far.p, seen);
-      follow(head, far.log, seen, now);
+      go(k, transitions(gap), seen, now);
     }
     head.last = now;
+  }
+
+  void go(size_t k, const Transition& transition, const Weights& seen, int32_t now) {
+    forward(heads_[k], transition.p, seen);
+    if (has_courses_) follow(courses_[k], transition.log, seen, heads_[k].last, now);
   }
 
   static void forward(Head& head, const Matrix& p, const Weights& seen) {
@@ -181,26 +188,27 @@ class Changes {
     head.weight = next;
   }
 
-  static void follow(Head& head, const Matrix& log, const Weights& seen, int32_t now) {
-    std::array<Course, kStates> next;
+  static void follow(Courses& courses, const Matrix& log, const Weights& seen, int32_t last,
+                     int32_t now) {
+    Courses next;
     float most = -std::numeric_limits<float>::infinity();
     for (size_t to = 0; to < kStates; ++to) {
       size_t best = 0;
       float most_to = -std::numeric_limits<float>::infinity();
       for (size_t from = 0; from < kStates; ++from) {
-        const float p = head.course[from].log_probability + log[from][to];
+        const float p = courses[from].log_probability + log[from][to];
         if (p > most_to) {
           most_to = p;
           best = from;
         }
       }
-      next[to] = head.course[best];
+      next[to] = courses[best];
       next[to].log_probability = most_to + logarithm(seen[to]);
-      go_on(next[to], best, to, head.last, now);
+      go_on(next[to], best, to, last, now);
       most = std::max(most, next[to].log_probability);
     }
     for (Course& course : next) course.log_probability -= most;
-    head.course = next;
+    courses = next;
   }
 
   static void go_on(Course& course, size_t from, size_t to, int32_t before, int32_t now) {
@@ -214,7 +222,9 @@ class Changes {
 
   ChangeModel model_;
   double seconds_;
+  bool has_courses_;
   std::vector<Head> heads_;
+  std::vector<Courses> courses_;  // of all, or of none
   std::vector<Transition> table_;
 };
 

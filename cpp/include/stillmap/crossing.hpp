@@ -103,8 +103,7 @@ class Crossing {
                 const std::vector<Marks>& marked, Visit&& visit) {
     const Marks& marks = marked[number];
     std::array<uint32_t, D> slices;  // of the box around it, as far as they have marks
-    bool any = true;
-    for (int d = 0; d < D; ++d) {
+    for (int d = D - 1; d >= 0; --d) {  // most beams pass above what is there
       constexpr double margin = 1e-6;  // cells: more than any rounding
       const double corner = start_[d] - block[d] * kEdge;
       const double in = corner + way_[d] * from, out = corner + way_[d] * to;
@@ -114,9 +113,8 @@ class Crossing {
       const uint64_t box = (uint64_t{2} << std::clamp(high, 0, kEdge - 1)) -
                            (uint64_t{1} << std::clamp(low, 0, kEdge - 1));
       slices[at(d)] = static_cast<uint32_t>(box) & marks.slices[at(d)];
-      any &= slices[at(d)] != 0;
+      if (!slices[at(d)]) return;
     }
-    if (!any) return;
     size_t found = 0;
     marks.each_in(slices, [&](size_t tile, size_t bit, const Cell<D>& local) {
       const Cell<D> cell = block * kEdge + local;

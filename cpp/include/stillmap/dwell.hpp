@@ -69,9 +69,10 @@ class Dwell {
     rest();
   }
   // From now on asks, too, which elements are of things that were put there or taken away.
-  void watch(const ChangeModel& model) {
+  // courses: what became of each, too, not only how probable that is.
+  void watch(const ChangeModel& model, bool courses = true) {
     if (newest_ != kNone) throw std::invalid_argument("watch: before the first look");
-    changes_.emplace(surface_.size(), model, options_.seconds);
+    changes_.emplace(surface_.size(), model, options_.seconds, courses);
   }
   const Changes& changes() const {
     if (!changes_) throw std::invalid_argument("changes: nobody asked to watch for them");

@@ -73,9 +73,12 @@ class Courses:
         return np.asarray(np.minimum(p, 1.0), np.float32)
 
 
-def watch(dwell: Dwell, recording: Recording, options: EmOptions) -> None:
-    """Asks, before the first look, for things that come to stay or leave."""
-    dwell.watch(**_model(recording, options))
+def watch(dwell: Dwell, recording: Recording, options: EmOptions, courses: bool = True) -> None:
+    """Asks, before the first look, for things that come to stay or leave.
+
+    Without `courses` only for whether they do: `static_of` wants no more.
+    """
+    dwell.watch(**_model(recording, options), courses=courses)
 
 
 def courses_of(looks: Looks, options: EmOptions) -> Courses:
@@ -99,8 +102,7 @@ def static_of(looks: Looks, options: EmOptions) -> NDArray[np.float32]:
     static, shares = _groups(looks)[0], _shares(looks, options)
     p = np.empty(looks.surface.size, np.float32)
     for rows in looks.blocks():
-        likelihood, _ = _likelihood(looks, rows)
-        p[slice(*rows)] = _posterior(likelihood, shares, static)
+        p[slice(*rows)] = _posterior(_likelihood(looks, rows), shares, static)
     return p
 
 
@@ -120,23 +122,22 @@ def _groups(looks: Looks) -> tuple[NDArray[np.bool_], ...]:
     return static & ~views, views, often, np.arange(len(views)) == len(views) - 1
 
 
-def _likelihood(looks: Looks, rows: Rows) -> tuple[NDArray[np.float32], tuple[Any, ...]]:
-    """(n, C + 1) of some elements under each of these classes, and the rest of their changes."""
-    log_changing, *rest = looks.dwell.changes(rows)
-    return _with_changing(looks.under(_kept(looks), rows), log_changing), tuple(rest)
+def _likelihood(looks: Looks, rows: Rows) -> NDArray[np.float32]:
+    """(n, C + 1) of some elements under each of these classes."""
+    return _with_changing(looks.under(_kept(looks), rows), looks.dwell.log_changing(rows))
 
 
 def _shares(looks: Looks, options: EmOptions) -> Float:
     """(C + 1,) of these classes."""
-    likelihood, _ = _likelihood(looks, looks.sample())
-    return fit_shares(likelihood, looks.n_static, options.prior).classes
+    return fit_shares(_likelihood(looks, looks.sample()), looks.n_static, options.prior).classes
 
 
 def _of_rows(
     looks: Looks, rows: Rows, groups: tuple[NDArray[np.bool_], ...], shares: Float
 ) -> dict[str, NDArray[Any]]:
     """What Courses says of each of some elements."""
-    likelihood, (occupied_share, p_last, count, between) = _likelihood(looks, rows)
+    likelihood = _likelihood(looks, rows)
+    _, occupied_share, p_last, count, between = looks.dwell.changes(rows)
     static, views, goes, stays = (_posterior(likelihood, shares, some) for some in groups)
     of = (goes > stays).astype(np.intp)  # what comes and goes does not stay long enough for a thing
     each = np.arange(len(of))

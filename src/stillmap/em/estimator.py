@@ -117,6 +117,15 @@ def add_recording(
         _core.add_beams(grid, points, hit, weights, offset, T_map_sensor[scans], threads)
 
 
+def count_as_static(grid: Grid, recording: Recording, poses: Float, e: NDArray[np.float32]) -> None:
+    """Makes sums that were added with e those of every hit counted as static, to the bit."""
+    T_map_sensor = recording.T_map_sensor(poses)
+    for scans, beams, offset in chunks(recording, beside=[e]):
+        points, hit, T = recording.points[beams], recording.hit[beams], T_map_sensor[scans]
+        _core.add_ends(grid, points, hit, e[beams], offset, T, remove=True)
+        _core.add_ends(grid, points, hit, np.ones(len(hit), np.float32), offset, T)
+
+
 def add_believed_first(
     grid: _core.Grid2D,
     recording: Recording,

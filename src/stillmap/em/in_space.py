@@ -26,7 +26,7 @@ def e_step_in_space(
         return e_step(recording, poses, resolution, options, threads)
 
     def prepare(dwell: Dwell) -> None:
-        watch(dwell, recording, options)
+        watch(dwell, recording, options, courses=False)
 
     looks = looked_at(recording, poses, resolution, options, threads, _CLASSES, prepare)
     static = static_of(looks, options)

@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 
 IN_MEMORY = 32 << 20  # bytes of one array that are kept in memory
 BLOCK = 1 << 20  # rows that are looked at together
-TOGETHER = 500  # items, as large as a scan, that are looked at before they are let go
+TOGETHER = 500  # items, as large as a planar scan, that are looked at before they are let go
 
 _Item = TypeVar("_Item")
 
@@ -115,10 +115,12 @@ def blocks(*arrays: NDArray[Any], rows: int | None = None) -> Iterator[slice]:
             let_go(array)
 
 
-def in_turn(items: Iterable[_Item], let_go: Callable[[], None]) -> Iterator[_Item]:
-    """The same items; on the way what was looked at for them is let go now and then."""
+def in_turn(
+    items: Iterable[_Item], let_go: Callable[[], None], together: int = TOGETHER
+) -> Iterator[_Item]:
+    """The same items; after so many what was looked at for them is let go."""
     for n, item in enumerate(items):
-        if n % TOGETHER == 0:
+        if n % together == 0:
             let_go()
         yield item
     let_go()

@@ -10,7 +10,7 @@ without a thought for speed. Where beams are taken:
 - scan t owns the beams `offset[t]:offset[t + 1]`, and `T_map_sensor[t]` (D+1, D+1) is its pose.
 """
 
-from stillmap.reference.beams import add_beams, e_step, log_likelihood
+from stillmap.reference.beams import add_beams, add_ends, e_step, log_likelihood
 from stillmap.reference.beside import settled
 from stillmap.reference.changes import ChangeModel, Course, course
 from stillmap.reference.dwell import Dwell, Dwell2D, Dwell3D, Reading, look_at
@@ -60,6 +60,7 @@ __all__ = [
     "Surface3D",
     "SweepMap3D",
     "add_beams",
+    "add_ends",
     "add_lost",
     "carried",
     "cell_of",

@@ -97,15 +97,34 @@ def add_beams(
         T_map_sensor: (T, D+1, D+1).
         threads: not used here.
     """
-    expectation = per_beam(e, points)
     for beam in usable_beams(grid.dimension, points, hit, offset, T_map_sensor):
         for cell, length in passed_cells(grid, beam):
             grid.add(cell, 0.0, length)
+    add_ends(grid, points, hit, e, offset, T_map_sensor)
+
+
+def add_ends(
+    grid: Grid,
+    points: ArrayLike,
+    hit: ArrayLike,
+    e: ArrayLike,
+    offset: ArrayLike,
+    T_map_sensor: ArrayLike,
+    *,
+    remove: bool = False,
+) -> None:
+    """Add, or take out, what of the sums of `add_beams` depends on e: those of the end cells.
+
+    Args: see `add_beams`.
+    """
+    expectation, sign = per_beam(e, points), -1.0 if remove else 1.0
+    for beam in usable_beams(grid.dimension, points, hit, offset, T_map_sensor):
         if beam.hit:
             static = float(expectation[beam.number])
             if not 0 <= static <= 1:
                 raise ValueError(f"e: expected probabilities in [0, 1], got {static}")
-            grid.add(_end_cell(grid, beam), static, 1.0 - static, beam.end)
+            end = _end_cell(grid, beam)
+            grid.add(end, sign * static, sign * (1.0 - static), beam.end)
 
 
 def e_step(

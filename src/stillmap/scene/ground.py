@@ -47,20 +47,23 @@ class Ground:
         return np.asarray(self.z[np.clip(row, 0, H - 1), np.clip(column, 0, W - 1)])
 
 
-def ground_of(recording: Recording, poses: Float, p_static: NDArray[np.float32]) -> Ground:
+def ground_of(
+    recording: Recording, poses: Float, p_static: NDArray[np.float32], threads: int = 1
+) -> Ground:
     """The ground under a robot's way and around it.
 
     Args:
         recording: 3D, M beams without motion during its scans.
         poses: (T, 4, 4) T_map_base; the z axis of the map points up.
         p_static: (M,) P(c = 1) of every beam.
+        threads: same result with any number.
     """
     T_map_sensor = recording.T_map_sensor(poses)
     surface = _core.Surface3D(_CELL)
     for scans, beams, offset in chunks(recording, beside=[p_static]):
         static = recording.hit[beams] & (p_static[beams] >= _BELIEVED)
         surface.add_end_points(recording.points[beams], static, offset, T_map_sensor[scans])
-    surface.fit()
+    surface.fit(threads)
     _, means, normals, *_ = surface.elements()
     return ground_from(means, normals, T_map_sensor[:, :3, 3])
 
