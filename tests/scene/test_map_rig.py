@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from stillmap.cli import main
 from stillmap.output.trajectory import read_tum
@@ -63,6 +64,18 @@ def test_the_files_belong_together(rig, mapped):
     stamps, poses = read_tum(mapped / "tilting/trajectory.tum")
     np.testing.assert_array_equal(stamps, read_tum(mapped / "trajectory.tum")[0])
     np.testing.assert_allclose(poses, read_tum(mapped / "trajectory.tum")[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("only", ["static", "dynamic", None])
+def test_the_cloud_of_the_second_laser_can_be_converted(mapped, tmp_path, only):
+    laspy, path = pytest.importorskip("laspy"), tmp_path / "a.laz"
+    more = () if only is None else ("--only", only)
+    assert main(["convert", str(mapped), "-o", str(path), "--quiet", *more]) == 0
+    parts = [only] if only else ["static", "dynamic"]
+    known = np.concatenate([trimesh.load(mapped / f"{part}.ply").vertices for part in parts])
+    found = laspy.read(path)
+    np.testing.assert_allclose(found.xyz, known, atol=0.6e-4)
+    assert (found["p_static"] < 0.5).any() == (only != "static")
 
 
 def test_objects_have_a_height_and_points(mapped):

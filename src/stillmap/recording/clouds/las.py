@@ -139,7 +139,7 @@ def write(
     """
     path = Path(path)
     require_new_file(path, overwrite)
-    laspy = extra("laspy", path)
+    laspy = extra("laspy", path, "written")
     with new_file(path) as work, work.open("wb") as file:
         head = _header(laspy, poses)
         packed = path.name.lower().endswith(".laz")
