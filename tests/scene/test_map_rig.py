@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from stillmap.cli import main
+from stillmap.output.report_tilting import cut_sentences
 from stillmap.output.trajectory import read_tum
 from stillmap.recording import folder
 from stillmap.simulation import load_truth, scene_by_name, simulate_rig, write_rig
@@ -76,6 +77,23 @@ def test_the_cloud_of_the_second_laser_can_be_converted(mapped, tmp_path, only):
     found = laspy.read(path)
     np.testing.assert_allclose(found.xyz, known, atol=0.6e-4)
     assert (found["p_static"] < 0.5).any() == (only != "static")
+
+
+def test_the_report_says_what_was_cut_out(mapped):
+    text = (mapped / "report.html").read_text()
+    section = text.split("What the second laser built")[1].split("</section>")[0]
+    record = json.loads((mapped / "run.json").read_text())["tilting"]
+    share = 100 * record["dynamic"] / record["counts"]["hits"]
+    for said in (
+        f"{record['dynamic']:,} of these, {share:.1f} %, are dynamic",
+        f"by {record['boxes']:,} boxes",
+        f"{record['objects']:,} of the things that moved",
+        f"{record['counts']['left_out']:,} beams were left out",
+        "by what it saw itself",
+    ):
+        assert said in section
+    assert section.count("<img") == 2
+    assert "by what it saw itself" not in cut_sentences(record | {"learned": {}})
 
 
 def test_objects_have_a_height_and_points(mapped):

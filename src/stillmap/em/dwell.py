@@ -56,18 +56,22 @@ def expectations_of(
 ) -> Expectations:
     """What the looks say of every cell, and with that of every beam that ended in it.
 
-    static (E,) is what is known better of each cell than the classes of `table` say.
+    static (E,) is what is known better of each cell than the classes of `table` say, and with that
+    of all cells.
     """
     shares = fit_shares(table.likelihood, table.n_static, options.prior)
+    share = shares.static
     if static is None:
         static = posterior_static(table.likelihood, shares.classes, table.n_static)
+    elif len(static):
+        share = float(np.mean(static, dtype=np.float64))
     surface, T_map_sensor = looks.surface, recording.T_map_sensor(poses)
     beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
     return Expectations(
-        p_static=_of_beams(recording, T_map_sensor, surface, static, shares.static, threads),
+        p_static=_of_beams(recording, T_map_sensor, surface, static, share, threads),
         likelihood=_bound(table, shares),
         occupied=CellProbabilities(surface.elements()[0], static * coverage(surface), _UNSEEN),
-        learned=_learned(looks, table, shares),
+        learned=_learned(looks, table, shares) | {"p_static": share},
         no_return=NoReturn(looks.dwell.solid(), beyond),
     )
 

@@ -4,6 +4,8 @@ A recording of streets lasts for minutes, and a car that waits at a light for ha
 goes on, is no wall. Whoever removes what moves from a cloud wants the car out, and its place free.
 """
 
+from dataclasses import replace
+
 from stillmap.em.courses import courses_of, watch
 from stillmap.em.dwell import e_step, expectations_of
 from stillmap.em.expectations import Expectations
@@ -28,5 +30,8 @@ def e_step_in_space(
         watch(dwell, recording, options)
 
     looks = looked_at(recording, poses, resolution, options, threads, _CLASSES, prepare)
-    static = courses_of(looks, options).p_static
-    return expectations_of(looks, looks.under(), recording, poses, options, threads, static)
+    courses = courses_of(looks, options)
+    found = expectations_of(
+        looks, looks.under(), recording, poses, options, threads, courses.p_static
+    )
+    return replace(found, learned={**found.learned, "changing": round(courses.share, 6)})
