@@ -1,5 +1,7 @@
 """Clouds of results in 3D, as the libraries of others read them: the points of `static.ply`."""
 
+import subprocess
+import sys
 import tracemalloc
 from pathlib import Path
 
@@ -182,3 +184,33 @@ def test_points_that_are_too_far_off_are_refused(name, tmp_path):
     with pytest.raises(cloud_files.InputError, match=f"{name}: cannot be written: a point lies"):
         cloud_files.write(points, tmp_path / name, form)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57", "a.pcd", "a.ply"])
+def test_a_full_disk_is_said(name, tmp_path):
+    """A limit on the size of files stands for it; the process it holds for is one of its own."""
+    program = f"""
+import resource, signal, sys
+from pathlib import Path
+import numpy as np
+from stillmap.errors import InputError
+from stillmap.export import cloud, cloud_files
+rng, n = np.random.default_rng(1), 200_000
+block = cloud.Block(rng.uniform(-50, 50, (n, 3)), rng.uniform(size=n).astype("f4"), None)
+path = Path("{name}")
+form = cloud_files.format_for(path)
+cloud_files.require_extras(form, path)
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+try:
+    cloud_files.write(cloud.Cloud(9 * n, np.zeros(3), None, lambda: iter([block] * 9)), path, form)
+except InputError as error:
+    print(error)
+"""
+    words = [sys.executable, "-c", program]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert done.stderr == ""
+    assert f"{name}: cannot be written: " in done.stdout
+    if name != "a.e57":
+        assert "File too large" in done.stdout
+    assert list(tmp_path.iterdir()) == []

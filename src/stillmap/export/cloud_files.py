@@ -13,6 +13,7 @@ from stillmap.export import cloud_e57
 from stillmap.export.cloud import Block, Cloud
 from stillmap.output.atomic import new_file
 from stillmap.output.clouds import FIELDS, ply_header
+from stillmap.recording.clouds.las import writer_to
 from stillmap.recording.extras import extra
 
 Tell = Callable[[float], None]
@@ -125,10 +126,7 @@ def _write_las(cloud: Cloud, path: Path, packed: bool, tell: Tell | None) -> Non
     head.generating_software = "stillmap"
     # the day of writing would make other bytes of the same result
     head.creation_date = date(1970, 1, 1)
-    with (
-        path.open("wb") as file,
-        laspy.open(file, "w", header=head, do_compress=packed, closefd=False) as writer,
-    ):
+    with writer_to(path, laspy, head, packed) as writer:
         for block in cloud.told(tell):
             writer.write_points(_las_points(laspy, head, block))
 

@@ -115,10 +115,16 @@ def blocks(*arrays: NDArray[Any], rows: int | None = None) -> Iterator[slice]:
             let_go(array)
 
 
-def in_turn(items: Iterable[_Item], let_go: Callable[[], None]) -> Iterator[_Item]:
-    """The same items; on the way what was looked at for them is let go now and then."""
+def in_turn(
+    items: Iterable[_Item], let_go: Callable[[], None], rows: float = 0.0
+) -> Iterator[_Item]:
+    """The same items; on the way what was looked at for them is let go now and then.
+
+    `rows` says how many rows of the arrays an item takes, about: of large ones fewer are looked at.
+    """
+    together = max(min(TOGETHER, int(BLOCK / max(rows, 1.0))), 1)
     for n, item in enumerate(items):
-        if n % TOGETHER == 0:
+        if n % together == 0:
             let_go()
         yield item
     let_go()
