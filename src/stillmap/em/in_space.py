@@ -6,6 +6,7 @@ goes on, is no wall. Whoever removes what moves from a cloud wants the car out, 
 
 from dataclasses import replace
 
+from stillmap.em.changed import changed_of
 from stillmap.em.courses import courses_of, watch
 from stillmap.em.dwell import e_step, expectations_of
 from stillmap.em.expectations import Expectations
@@ -34,4 +35,5 @@ def e_step_in_space(
     found = expectations_of(
         looks, looks.under(), recording, poses, options, threads, courses.p_static
     )
-    return replace(found, learned={**found.learned, "changing": round(courses.share, 6)})
+    learned = {**found.learned, "changing": round(courses.share, 6)}
+    return replace(found, learned=learned, changed=changed_of(courses))
