@@ -47,7 +47,7 @@ def changes_section(result: ResultLike) -> str:
 def _shown(result: ResultLike) -> str:
     """What the map has of them."""
     if result.recording.dimension == 3:
-        return "The map shows their places as the labels of single voxels have it, mostly free."
+        return "The map shows their places as the labels of single voxels have it."
     last = result.options.output.map_state == "last"
     shown = "as it was last seen" if last else "as it was most"
     unless = "" if last else ", unless it was there for most of the time"
