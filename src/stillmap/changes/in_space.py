@@ -29,9 +29,9 @@ def changed_things(
 
     Args: see `changed_places`; poses are (T, 4, 4) T_map_base, `resolution` is the edge of a voxel.
     """
-    cells = _Cells.of(changed, _STAYS / look)
-    places = changed_places(cells, recording, resolution, look, options)
     first, last = recording.stamp_ns[[0, -1]].tolist()
+    cells = _Cells.of(changed, _STAYS / look, 1e-9 * (last - first) / look)
+    places = changed_places(cells, recording, resolution, look, options)
     things = [
         one
         for one in places
@@ -59,10 +59,12 @@ class _Cells:
     between: NDArray[np.int32]
 
     @classmethod
-    def of(cls, changed: Changed, looks: float) -> "_Cells":
-        """Those that changed once, or twice with so many looks between."""
-        apart = changed.between[:, 1, 0] - changed.between[:, 0, 1]
-        kept = np.flatnonzero((changed.count == 1) | (apart >= looks))
+    def of(cls, changed: Changed, least: float, looks: float) -> "_Cells":
+        """Those that were as before, and otherwise, for so many looks of all of them at least."""
+        before, after = changed.between[..., 0], changed.between[..., 1]
+        once = (after[:, 1] >= least) & (looks - before[:, 1] >= least)
+        twice = before[:, 1] - after[:, 0] >= least
+        kept = np.flatnonzero(np.where(changed.count == 1, once, twice))
         return cls(
             cells=changed.cells[kept],
             p_changing=np.ones(len(kept), np.float32),
