@@ -46,6 +46,7 @@ class Best:
     loops: list[slam.Closure]
     graph: slam.Graph | None
     no_return: em.NoReturn | None
+    changed: em.Changed | None = None
 
     @classmethod
     def of(cls, iteration: Iteration) -> "Best":
@@ -63,6 +64,7 @@ class Best:
             iteration.loops,
             iteration.graph,
             iteration.no_return,
+            iteration.changed,
         )
 
 

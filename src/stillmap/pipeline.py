@@ -115,7 +115,7 @@ class Iteration:
         held_out: nats per beam, see `em.held_out_log_likelihood`; None where it is not computed.
         seconds: wall clock.
         graph: the pose graph of these loops; None where poses were given or none were looked for.
-        no_return: how far beams without a return are believed, see `em.Expectations`.
+        no_return, changed: see `em.Expectations`.
     """
 
     number: int
@@ -136,6 +136,7 @@ class Iteration:
     seconds: float
     graph: slam.Graph | None = None
     no_return: em.NoReturn | None = None
+    changed: em.Changed | None = None
 
     @property
     def reached(self) -> Reached:
@@ -254,6 +255,7 @@ def iterate(
             seconds=time.perf_counter() - started,
             graph=mapped.graph,
             no_return=found.no_return,
+            changed=found.changed,
         )
         after = iteration.reached
         del mapped, found, seen  # grids are large: only the caller decides how long one lives

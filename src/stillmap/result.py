@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stillmap import _core, em, pipeline, slam
 from stillmap.cautions import cautions
-from stillmap.changes import Change, beams_on_things, changed_places, relabelled
+from stillmap.changes import Change, beams_on_things, changed_places, changed_things, relabelled
 from stillmap.loop import Best, IterationRecord, Loop
 from stillmap.objects import MovingObject, Traffic, moving_objects, traffic
 from stillmap.output.crops import Snapshot
@@ -191,8 +191,14 @@ def _result(loop: Loop, recording: Recording, progress: Progress, stages: Stages
 def _settled(
     kept: Best, recording: Recording, options: Options, threads: int
 ) -> tuple[Best, list[Change]]:
-    """The last E-step: labels of the map as it is shown, and the places that changed."""
-    cell = options.slam.resolution
+    """The last E-step: labels of the map as it is shown, and the places that changed.
+
+    In space every E-step knows of them.
+    """
+    cell, look = options.slam.resolution, options.em.dwell.look
+    if kept.changed is not None:
+        seen = recording, kept.poses
+        return kept, changed_things(kept.changed, *seen, cell, look, options.em.changes)
     if (
         recording.dimension == 3
         or options.estimator != "stillmap"
@@ -208,7 +214,6 @@ def _settled(
         return kept, []
     if kept.occupied is None:
         raise RuntimeError("the default estimator knows its cells")
-    look = options.em.dwell.look
     changes = changed_places(courses, recording, cell, look, options.em.changes)
     p_static, occupied = relabelled(
         recording,

@@ -161,6 +161,39 @@ def test_what_a_result_cannot_become(call, room, mapped, tmp_path, nothing_left)
     nothing_left()
 
 
+@pytest.mark.parametrize("ending", [".las", ".laz", ".e57", ".pcd", ".ply"])
+def test_results_in_the_plane_have_no_clouds(call, mapped, tmp_path, nothing_left, ending):
+    done = call("convert", mapped, "-o", tmp_path / f"a{ending}")
+    refused(done, "out: is of a recording in the plane", ".parquet")
+    nothing_left()
+
+
+def test_parts_are_of_clouds(call, room, mapped, tmp_path, nothing_left):
+    refused(
+        call("convert", mapped, "-o", tmp_path / "a.mcap", "--only", "static"), "--only", ".las"
+    )
+    done = call("convert", room, "-o", tmp_path / "a.log", "--only", "static")
+    refused(done, "--only is for results")
+    nothing_left()
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "package"),
+    [
+        ("a.las", "laspy", "laspy"),
+        ("a.laz", "lazrs", "lazrs"),
+        ("a.e57", "pye57.libe57", "pye57"),
+    ],
+)
+def test_without_libraries_there_are_no_such_clouds(
+    call, mapped, tmp_path, monkeypatch, nothing_left, name, module, package
+):
+    monkeypatch.setitem(sys.modules, module, None)
+    done = call("convert", mapped, "-o", tmp_path / name)
+    refused(done, f"needs {package} to be written", "pip install 'stillmap[io]'")
+    nothing_left()
+
+
 def test_a_result_whose_recording_was_moved(call, room, mapped, tmp_path):
     result = tmp_path / "result"
     shutil.copytree(mapped, result)
@@ -194,7 +227,10 @@ def test_damaged_objects(call, mapped, tmp_path, text, words):
 
 def test_the_help_knows_every_format():
     from stillmap.cli import convert
+    from stillmap.export.cloud_files import FORMATS
     from stillmap.recording.writers import WRITERS
+
+    assert [end for form in FORMATS for end in form.endings] == list(convert.CLOUDS)
 
     assert [writer.name for writer in WRITERS] == list(convert.NAMES)
     assert sorted(e for writer in WRITERS for e in writer.endings) == sorted(convert.ENDINGS)

@@ -134,6 +134,46 @@ def test_a_signal_waits_for_the_end_of_an_import(tmp_path, command, number, stat
     assert (done.returncode, done.stdout, done.stderr) == (status, "imported\n", "")
 
 
+PACKING = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
+from pathlib import Path
+import numpy as np
+from stillmap.cli.stopping import hear_signals
+from stillmap.export import cloud, cloud_files
+def command():
+    hear_signals(command.__code__)
+    points = np.random.default_rng(1).normal(size=(50_000, 3))
+    block = cloud.Block(points, np.ones(50_000, "f4"), None)
+    def endless():
+        while True:
+            yield block
+            print("packed", flush=True)
+    path = Path("a.laz")
+    all_points = cloud.Cloud(10**9, np.zeros(3), None, endless)
+    cloud_files.write(all_points, path, cloud_files.format_for(path))
+try:
+    command()
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+
+
+def test_a_signal_waits_for_points_to_be_packed(tmp_path, command):
+    pytest.importorskip("lazrs")
+    words = [command[0], "-c", PACKING]
+    for blocks in (1, 3, 5):
+        process = subprocess.Popen(
+            words, cwd=tmp_path, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        for _ in range(blocks):
+            assert process.stdout.readline() == "packed\n"
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+        assert (process.returncode, err) == (130, "")
+        assert list(tmp_path.iterdir()) == []
+
+
 def test_ctrl_c_stays_ignored_in_the_background_of_a_script(command):
     program = (
         "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"

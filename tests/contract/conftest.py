@@ -32,3 +32,22 @@ def result(recorded: Path) -> Path:
     words = ["map", recorded, "-o", out, "--quiet", "--set", "em.max_iterations=2"]
     assert main([*map(str, words)]) == 0
     return out
+
+
+@pytest.fixture(scope="session")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording folder in 3D: a street with cars, 40 sweeps that take their time."""
+    path = tmp_path_factory.mktemp("contract") / "street"
+    lidar = {"channels": 32, "columns": 300}
+    scene = scene_by_name("street", {"lidar": lidar, "robot": {"scans": 40}})
+    write_simulation(simulate(scene, 3), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def mapped_street(street: Path) -> Path:
+    """What `stillmap map` made of it."""
+    out = street.parent / "mapped"
+    words = ["map", street, "-o", out, "--quiet", "--poses", street / "truth/trajectory.tum"]
+    assert main([*map(str, words)]) == 0
+    return out

@@ -137,3 +137,13 @@ def test_items_in_turn_are_the_same(items, monkeypatch):
     assert got == list(range(items))
     # at first for what was looked at before, and what is left at the end
     assert let_go_after == [*range(0, items, 3), items]
+
+
+@pytest.mark.parametrize(("rows", "together"), [(100.0, 5), (400.0, 2), (1e9, 1), (0.0, 5)])
+def test_of_large_items_fewer_are_held(rows, together, monkeypatch):
+    monkeypatch.setattr(spool, "TOGETHER", 5)
+    monkeypatch.setattr(spool, "BLOCK", 1000)
+    got, let_go_after = [], []
+    for item in spool.in_turn(range(11), lambda: let_go_after.append(len(got)), rows):
+        got.append(item)
+    assert let_go_after == [*range(0, 11, together), 11]

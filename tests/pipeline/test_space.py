@@ -1,5 +1,6 @@
 """3D recordings from start to end: labels, poses, clouds, plan and objects against the truth."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image
 
 import stillmap
 from stillmap.cli import main
+from stillmap.output.report_learned import learned_section
 from stillmap.output.trajectory import read_tum
 from stillmap.pipeline import Options
 from stillmap.recording.model import Recording
@@ -66,6 +68,26 @@ def test_the_plan_is_free_where_the_robot_drove(street, mapped):
     column, row = np.floor((way - [x, y]) / mapped.map.resolution).astype(int).T
     assert (mapped.map.p_occupied[row, column] < 0.196).all()
     assert (mapped.map.p_occupied > 0.65).sum() > 500
+
+
+def test_what_was_learned_is_of_all_classes(street, mapped):
+    """Also of what came to stay or left: as the labels are."""
+    recording, voxel = street.recording, mapped.options.slam.voxel
+    hits = np.flatnonzero(recording.hit)
+    ends = recording.end_points(hits, street.truth.T_world_base)
+    _, cell = np.unique(np.floor(ends / voxel), axis=0, return_inverse=True)
+    static = np.bincount(cell.reshape(-1), street.truth.static[hits]) / np.bincount(
+        cell.reshape(-1)
+    )
+    assert mapped.learned["p_static"] == pytest.approx((static > 0.5).mean(), abs=0.1)
+    assert 0.0 < mapped.learned["changing"] < 0.2
+    missed = ~recording.hit & np.isfinite(mapped.p_static)
+    assert mapped.p_static[missed] == pytest.approx(mapped.learned["p_static"])
+    said = learned_section(mapped)
+    assert f"{100 * mapped.learned['p_static']:.1f} % hold something that stands still" in said
+    assert "came to stay or left, which counts as moving" in said
+    unasked = {k: v for k, v in mapped.learned.items() if k != "changing"}
+    assert "came to stay" not in learned_section(dataclasses.replace(mapped, learned=unasked))
 
 
 @pytest.mark.parametrize("threads", [2, 3])

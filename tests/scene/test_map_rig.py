@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from stillmap.cli import main
+from stillmap.output.report_tilting import cut_sentences
 from stillmap.output.trajectory import read_tum
 from stillmap.recording import folder
 from stillmap.simulation import load_truth, scene_by_name, simulate_rig, write_rig
@@ -63,6 +65,35 @@ def test_the_files_belong_together(rig, mapped):
     stamps, poses = read_tum(mapped / "tilting/trajectory.tum")
     np.testing.assert_array_equal(stamps, read_tum(mapped / "trajectory.tum")[0])
     np.testing.assert_allclose(poses, read_tum(mapped / "trajectory.tum")[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("only", ["static", "dynamic", None])
+def test_the_cloud_of_the_second_laser_can_be_converted(mapped, tmp_path, only):
+    laspy, path = pytest.importorskip("laspy"), tmp_path / "a.laz"
+    more = () if only is None else ("--only", only)
+    assert main(["convert", str(mapped), "-o", str(path), "--quiet", *more]) == 0
+    parts = [only] if only else ["static", "dynamic"]
+    known = np.concatenate([trimesh.load(mapped / f"{part}.ply").vertices for part in parts])
+    found = laspy.read(path)
+    np.testing.assert_allclose(found.xyz, known, atol=0.6e-4)
+    assert (found["p_static"] < 0.5).any() == (only != "static")
+
+
+def test_the_report_says_what_was_cut_out(mapped):
+    text = (mapped / "report.html").read_text()
+    section = text.split("What the second laser built")[1].split("</section>")[0]
+    record = json.loads((mapped / "run.json").read_text())["tilting"]
+    share = 100 * record["dynamic"] / record["counts"]["hits"]
+    for said in (
+        f"{record['dynamic']:,} of these, {share:.1f} %, are dynamic",
+        f"by {record['boxes']:,} boxes",
+        f"{record['objects']:,} of the things that moved",
+        f"{record['counts']['left_out']:,} beams were left out",
+        "by what it saw itself",
+    ):
+        assert said in section
+    assert section.count("<img") == 2
+    assert "by what it saw itself" not in cut_sentences(record | {"learned": {}})
 
 
 def test_objects_have_a_height_and_points(mapped):

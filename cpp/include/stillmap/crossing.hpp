@@ -102,9 +102,9 @@ class Crossing {
   void in_block(double from, double to, const Cell<D>& block, size_t number,
                 const std::vector<Marks>& marked, Visit&& visit) {
     const Marks& marks = marked[number];
-    std::array<uint32_t, D> slices;  // of the box around it, as far as they have marks
+    std::array<uint32_t, D> slices;     // of the box around it, as far as they have marks
     for (int d = D - 1; d >= 0; --d) {  // most beams pass above what is there
-      constexpr double margin = 1e-6;  // cells: more than any rounding
+      constexpr double margin = 1e-6;   // cells: more than any rounding
       const double corner = start_[d] - block[d] * kEdge;
       const double in = corner + way_[d] * from, out = corner + way_[d] * to;
       // one is added, as casts cut off towards zero

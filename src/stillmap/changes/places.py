@@ -1,14 +1,14 @@
 """Cells that changed near each other at the same time are one place."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.changes.swept import swept_cells
-from stillmap.em import ChangeOptions, Courses, look_numbers
+from stillmap.em import ChangeOptions, look_numbers
 from stillmap.em.courses import OFTEN
 from stillmap.em.together import components, pairs_near
 from stillmap.recording.model import Recording
@@ -29,7 +29,7 @@ class Change:
     Attributes:
         kind: something came, left, or comes and goes.
         x, y: metres, the middle of its cells in the map frame.
-        size: metres, along x and y.
+        size: metres, along x and y, and in space z.
         cells: (K, 2) int64, those that changed.
         resolution: metres, of a cell.
         before_ns: stamp of the last scan that saw it as it was.
@@ -37,18 +37,20 @@ class Change:
             comes and goes, of the first change that was seen.
         last_ns: the same of the last change that was seen; `stamp_ns` where there was one only.
         times: how often it changed.
+        z: metres, the middle in space; None in the plane.
     """
 
     kind: Kind
     x: float
     y: float
-    size: tuple[float, float]
+    size: tuple[float, ...]
     cells: NDArray[np.int64]
     resolution: float
     before_ns: int
     stamp_ns: int
     last_ns: int
     times: int
+    z: float | None = None
 
     @property
     def swept(self) -> NDArray[np.int64]:
@@ -61,6 +63,23 @@ class Change:
     def appeared(self) -> bool:
         """Whether something is there now that was not there before."""
         return self.kind == "came"
+
+
+class CoursesLike(Protocol):
+    """What is asked of `em.Courses`."""
+
+    @property
+    def cells(self) -> NDArray[np.int64]: ...
+    @property
+    def p_changing(self) -> NDArray[np.float32]: ...
+    @property
+    def p_thing(self) -> NDArray[np.float32]: ...
+    @property
+    def stands(self) -> NDArray[np.float32]: ...
+    @property
+    def count(self) -> NDArray[np.int32]: ...
+    @property
+    def between(self) -> NDArray[np.int32]: ...
 
 
 def beams_on_things(
@@ -154,7 +173,7 @@ class _Events(NamedTuple):
 
 
 def changed_places(
-    courses: Courses,
+    courses: CoursesLike,
     recording: Recording,
     resolution: float,
     look: float,
@@ -181,7 +200,9 @@ def changed_places(
     return sorted(out, key=lambda change: (change.stamp_ns, change.x, change.y))
 
 
-def _without_noise(changes: list[Change], courses: Courses, options: ChangeOptions) -> list[Change]:
+def _without_noise(
+    changes: list[Change], courses: CoursesLike, options: ChangeOptions
+) -> list[Change]:
     """The places that are more than noise: that of poses and ranges moves surfaces to and fro."""
     stays = courses.cells[courses.stands > _SURE]
     if not len(stays):
@@ -212,7 +233,7 @@ class _Stamps:
         return np.asarray(self._last[np.searchsorted(self._number, looks)], np.int64)
 
 
-def _events(courses: Courses, cells: Index, stamps: _Stamps) -> _Events:
+def _events(courses: CoursesLike, cells: Index, stamps: _Stamps) -> _Events:
     """The one or two changes of each of these cells."""
     twice = np.flatnonzero(courses.count[cells] == 2)
     cell = np.concatenate([cells, cells[twice]])
@@ -224,7 +245,7 @@ def _events(courses: Courses, cells: Index, stamps: _Stamps) -> _Events:
 
 
 def _groups(
-    events: _Events, courses: Courses, resolution: float, options: ChangeOptions
+    events: _Events, courses: CoursesLike, resolution: float, options: ChangeOptions
 ) -> list[_Events]:
     """Events of the same kind near each other, at times that may be the same."""
     slack = round(options.together * 1e9)
@@ -237,7 +258,7 @@ def _groups(
 
 
 def _told_apart(
-    events: _Events, courses: Courses, resolution: float, options: ChangeOptions
+    events: _Events, courses: CoursesLike, resolution: float, options: ChangeOptions
 ) -> list[Change]:
     """One change after the other, each at the time that fits most of the cells that are left."""
     out = []
@@ -259,7 +280,7 @@ def _told_apart(
 
 
 def _coming_and_going(
-    courses: Courses,
+    courses: CoursesLike,
     often: Index,
     stamps: _Stamps,
     resolution: float,
@@ -332,6 +353,6 @@ def _change(
     times: int,
 ) -> Change:
     low, high = cells.min(axis=0) * resolution, (cells.max(axis=0) + 1) * resolution
-    x, y = ((cells.mean(axis=0) + 0.5) * resolution).tolist()
-    width, height = (high - low).tolist()
-    return Change(kind, x, y, (width, height), cells, resolution, before, stamp, last, times)
+    x, y, *z = ((cells.mean(axis=0) + 0.5) * resolution).tolist()
+    size = tuple((high - low).tolist())
+    return Change(kind, x, y, size, cells, resolution, before, stamp, last, times, *z)

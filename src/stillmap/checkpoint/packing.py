@@ -14,6 +14,7 @@ from stillmap.pipeline import Options, Reached
 from stillmap.slam.pose_graph import Relation
 
 Arrays = dict[str, NDArray[Any]]
+_CHANGED = [field.name for field in dataclasses.fields(em.Changed)]
 _DOUBTS = [field.name for field in dataclasses.fields(slam.Doubts)]
 
 
@@ -69,6 +70,8 @@ def _best_packed(best: Best, arrays: Arrays) -> dict[str, Any]:
     if best.no_return is not None:
         arrays["best.stops"] = best.no_return.stops
         values["beyond"] = best.no_return.beyond
+    if best.changed is not None:
+        arrays |= {f"best.changed.{name}": getattr(best.changed, name) for name in _CHANGED}
     return {**values, **_way_packed("best", best, arrays)}
 
 
@@ -79,6 +82,9 @@ def _best(values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Best
         occupied = em.CellProbabilities(cells, p_occupied, values["free_prior"])
     if "beyond" in values:
         no_return = em.NoReturn(arrays["best.stops"], values["beyond"])
+    changed = None
+    if f"best.changed.{_CHANGED[0]}" in arrays:
+        changed = em.Changed(**{name: arrays[f"best.changed.{name}"] for name in _CHANGED})
     return Best(
         number=number,
         bound=values["bound"],
@@ -87,6 +93,7 @@ def _best(values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Best
         occupied=occupied,
         learned=values["learned"],
         no_return=no_return,
+        changed=changed,
         **_way("best", values, arrays),
     )
 

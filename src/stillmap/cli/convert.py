@@ -11,12 +11,15 @@ ENDINGS = (
     *(".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz"),
     *(".bag", ".db3", ".mcap", ".ply", ".las", ".laz"),
 )
+# likewise of stillmap.export.cloud_files
+CLOUDS = (".las", ".laz", ".e57", ".pcd", ".ply")
 NAMES = ("stillmap", "ros2", "carmen", "bag", "db3", "mcap", "kitti", "pcd", "ply", "las")
 _EPILOG = """examples:
   stillmap convert log.clf.gz -o log.bag      for ROS 1
   stillmap convert log.bag -o log --to ros2   a folder for ROS 2
   stillmap convert out -o out.mcap            a result, to look at in Foxglove
   stillmap convert out -o beams.parquet       every beam of a result with its label
+  stillmap convert out -o static.laz --only static    points of a result in 3D
 """
 
 
@@ -27,7 +30,8 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         help=COMMANDS["convert"],
         description="Write a recording in another format, which the ending of FILE names: "
         f"{', '.join(ENDINGS)}; a folder otherwise. A result of `stillmap map` becomes a bag "
-        "that shows it (.mcap for Foxglove) or a table of its beams (.parquet).",
+        "that shows it (.mcap for Foxglove) or a table of its beams (.parquet); in 3D a cloud of "
+        f"points with their p_static ({', '.join(CLOUDS)}).",
         epilog=_EPILOG,
     )
     p.add_argument("input", metavar="INPUT", help="a recording, or what `stillmap map` wrote")
@@ -35,6 +39,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     p.add_argument("--to", metavar="FORMAT", choices=NAMES, help=f"the format: {', '.join(NAMES)}")
     p.add_argument(
         "--input", dest="recording", metavar="FILE", help="a result's recording, if it was moved"
+    )
+    p.add_argument(
+        "--only", choices=("static", "dynamic"), help="of a cloud: these points (default: all)"
     )
     p.add_argument("--overwrite", action="store_true", help="replace what is there")
     p.add_argument("--quiet", action="store_true", help="no summary")

@@ -4,14 +4,19 @@ import argparse
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stillmap import options, slam
 from stillmap.cli.progress import shown_share
 from stillmap.cli.reading import read_changes
 from stillmap.cli.results import Mapped, found, is_result, require_apart
 from stillmap.errors import InputError
-from stillmap.export import bag, beam_table, result
+from stillmap.export import bag, beam_table, cloud, cloud_files, result
 from stillmap.output.atomic import require_new_file
+from stillmap.output.tilting import FOLDER as TILTING
 from stillmap.recording import ReadOptions, Recording, read, ros_writing, writers
+from stillmap.recording.poses import poses_from_tum
 
 _PARQUET = ".parquet"
 
@@ -31,8 +36,9 @@ def converted(args: argparse.Namespace) -> tuple[list[str], str]:
 def _convert_recording(
     args: argparse.Namespace, source: Path, output: Path
 ) -> tuple[list[str], str]:
-    if args.recording:
-        raise InputError("--input is for results", where=str(source))
+    if args.recording or args.only:
+        flag = "--input" if args.recording else "--only"
+        raise InputError(f"{flag} is for results", where=str(source))
     read_options = options.replaced(ReadOptions(), read_changes(args).get("read", {}))
     require_apart(output, source)
     writer = writers.writer_for(output, args.to)
@@ -51,11 +57,16 @@ def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tup
         raise InputError(text, where=str(folder))
     mapped = found(folder, args.recording)
     require_apart(output, mapped.source, folder)
+    if (form := cloud_files.format_for(output, args.to)) is not None:
+        return [], _convert_to_cloud(args, mapped, output, form)
+    if args.only:
+        raise InputError("--only is for clouds of points", where=str(output), hint=_clouds())
     if output.suffix.lower() == _PARQUET and args.to is None:
         require_new_file(output, args.overwrite)
         beam_table.require_pyarrow()
         exported = _exported(mapped)
-        beam_table.write(exported, _seen(mapped, exported), output)
+        seen = _seen(mapped, exported.recording, exported.poses)
+        beam_table.write(exported, seen, output)
         return [], f"{exported.recording.n_beams} beams"
     writer = writers.writer_for(output, args.to)
     kind = next((kind for kind in get_args(ros_writing.Kind) if kind == writer.name), None)
@@ -63,7 +74,8 @@ def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tup
         raise InputError(
             f"a result cannot be written as {writer.about}",
             where=str(output),
-            hint=f"a bag, .mcap for Foxglove, or {_PARQUET}; recordings come of `stillmap filter`",
+            hint=f"a bag, .mcap for Foxglove, {_PARQUET}, or in 3D {_clouds()}; recordings come of "
+            "`stillmap filter`",
         )
     writers.require_free(output, writer, args.overwrite)
     exported = _exported(mapped)
@@ -71,15 +83,47 @@ def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tup
     return lost, f"{exported.recording.n_scans} scans, map, way and {len(exported.tracks)} objects"
 
 
+def _clouds() -> str:
+    return ", ".join(end for form in cloud_files.FORMATS for end in form.endings)
+
+
+def _convert_to_cloud(
+    args: argparse.Namespace, mapped: Mapped, output: Path, form: cloud_files.Format
+) -> str:
+    require_new_file(output, args.overwrite)
+    cloud_files.require_extras(form, output)
+    if isinstance(mapped.record.get(TILTING), dict):
+        points = cloud.cloud_in(mapped.folder, args.only)
+    else:
+        points = _cloud_of(args, mapped, output)
+    with shown_share(args.quiet, "writing") as tell:
+        cloud_files.write(points, output, form, tell)
+    return f"{points.count} points as {form.about}"
+
+
+def _cloud_of(args: argparse.Namespace, mapped: Mapped, output: Path) -> cloud.Cloud:
+    with shown_share(args.quiet, "reading") as tell:
+        recording, labels = mapped.read(tell, output.absolute().parent)
+    if recording.dimension != 3:
+        raise InputError(
+            "is of a recording in the plane: it has no cloud of points",
+            where=str(mapped.folder),
+            hint=f"{_PARQUET} has where its beams ended",
+        )
+    poses = poses_from_tum(mapped.folder / "trajectory.tum", recording)
+    seen = _seen(mapped, recording, poses)
+    return cloud.cloud_of(recording, seen, poses, labels.p_static, args.only)
+
+
 def _exported(mapped: Mapped) -> result.Exported:
     recording, labels = mapped.read()
     return result.read(mapped.folder, recording, labels.p_static)
 
 
-def _seen(mapped: Mapped, exported: result.Exported) -> Recording:
+def _seen(mapped: Mapped, recording: Recording, poses: NDArray[np.float64]) -> Recording:
     """The recording without the motion during its scans, as it was mapped."""
     chosen = mapped.record.get("options")
     section = chosen.get("slam") if isinstance(chosen, dict) else None
     deskew = section.get("deskew") if isinstance(section, dict) else None
     how = slam.SlamOptions(deskew=deskew is not False)
-    return slam.deskewed(exported.recording, exported.poses, how)
+    return slam.deskewed(recording, poses, how)

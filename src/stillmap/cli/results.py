@@ -12,6 +12,7 @@ from stillmap.errors import InputError
 from stillmap.evaluation.folders import Labels, read_labels
 from stillmap.output.run_json import RECORD
 from stillmap.recording import Recording, folder, read, spool
+from stillmap.recording.lines import Progress
 from stillmap.recording.options import ReadOptions
 from stillmap.texts import read_text, require_regular
 
@@ -43,8 +44,14 @@ class Mapped:
         """
         return _read_options(self.record, self.folder)
 
-    def read(self) -> tuple[Recording, Labels]:
+    def read(
+        self, progress: Progress | None = None, scratch: Path | None = None
+    ) -> tuple[Recording, Labels]:
         """The recording, as it was read when it was mapped, and its labels.
+
+        Args:
+            progress: hears which share of the recording is read.
+            scratch: folder for what is too large for memory; None: the system's temporary folder.
 
         Raises:
             InputError: one of them is not there, or they do not belong together.
@@ -53,7 +60,7 @@ class Mapped:
         if not self.given and not self.source.exists():
             hint = "that is where it was when it was mapped: name it with --input"
             raise InputError("does not exist", where=str(self.source), hint=hint)
-        recording = read(self.source, read_as)
+        recording = read(self.source, read_as, progress=progress, scratch=scratch)
         labels = read_labels(self.folder)
         if not np.array_equal(recording.stamp_ns, labels.stamp_ns) or not np.array_equal(
             recording.offset, labels.offset

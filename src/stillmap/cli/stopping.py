@@ -3,6 +3,7 @@
 A library that is just being imported may take the exception for a missing module and go on
 without it, may turn it into an error of its own, or may execute text as code, after which Python
 believes that nobody caught the interrupt. So the signal is sent again until the import is over.
+Likewise while points are packed as LAZ: an exception on the way to the file becomes another one.
 """
 
 import os
@@ -15,6 +16,7 @@ EXIT_INTERRUPTED, EXIT_TERMINATED = 130, 143
 
 _SOON = 0.02  # s until a signal that came at a bad moment is sent again
 _IMPORTS = "<frozen importlib"  # where Python says that the code of its imports is
+_PACKING = "lazrsbackend.py"  # of laspy
 
 
 def hear_signals(command: CodeType) -> None:
@@ -25,7 +27,7 @@ def hear_signals(command: CodeType) -> None:
     """
 
     def heard(number: int, frame: FrameType | None) -> None:
-        if _is_importing(frame, command):
+        if _is_at_a_bad_moment(frame, command):
             again = threading.Timer(_SOON, os.kill, (os.getpid(), number))
             again.daemon = True
             again.start()
@@ -39,9 +41,10 @@ def hear_signals(command: CodeType) -> None:
         signal.signal(signal.SIGINT, heard)
 
 
-def _is_importing(frame: FrameType | None, command: CodeType) -> bool:
+def _is_at_a_bad_moment(frame: FrameType | None, command: CodeType) -> bool:
     while frame is not None and frame.f_code is not command:
-        if frame.f_code.co_filename.startswith(_IMPORTS):
+        name = frame.f_code.co_filename
+        if name.startswith(_IMPORTS) or name.endswith(_PACKING):
             return True
         frame = frame.f_back
     return False

@@ -1,5 +1,6 @@
 """What is static: the E-steps, the map that follows from them, and the likelihood. No I/O."""
 
+from stillmap.em.changed import Changed
 from stillmap.em.courses import Courses
 from stillmap.em.estimator import (
     IN_SPACE,
@@ -28,6 +29,7 @@ __all__ = [
     "Box",
     "CellProbabilities",
     "ChangeOptions",
+    "Changed",
     "Courses",
     "DwellOptions",
     "EmOptions",

@@ -97,13 +97,13 @@ def courses_of(looks: Looks, options: EmOptions) -> Courses:
     )
 
 
-def static_of(looks: Looks, options: EmOptions) -> NDArray[np.float32]:
-    """(E,) `p_static` of the courses, where nothing else of them is asked."""
+def static_of(looks: Looks, options: EmOptions) -> tuple[NDArray[np.float32], float]:
+    """`p_static` (E,) and `share` of the courses, where nothing else of them is asked."""
     static, shares = _groups(looks)[0], _shares(looks, options)
     p = np.empty(looks.surface.size, np.float32)
     for rows in looks.blocks():
         p[slice(*rows)] = _posterior(_likelihood(looks, rows), shares, static)
-    return p
+    return p, float(shares[-1])
 
 
 def _kept(looks: Looks) -> NDArray[np.bool_]:

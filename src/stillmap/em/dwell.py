@@ -66,21 +66,26 @@ def expectations_of(
     """What the looks say of every cell, and with that of every beam that ended in it.
 
     kept (C,): under which of the classes; None: all. static (E,) is what is known better of each
-    cell than these say.
+    cell than these say, and with that of all cells.
     """
     some = looks.under(kept, looks.sample())
     shares = fit_shares(some.likelihood, some.n_static, options.prior)
     found, likelihood = _of_elements(looks, kept, shares)
+    share = shares.static if static is None else _mean(static, shares.static)
     static = found if static is None else static
     surface, T_map_sensor = looks.surface, recording.T_map_sensor(poses)
     beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
     return Expectations(
-        p_static=_of_beams(recording, T_map_sensor, surface, static, shares.static, threads),
+        p_static=_of_beams(recording, T_map_sensor, surface, static, share, threads),
         likelihood=likelihood,
         occupied=CellProbabilities(cells_of(surface), static * coverage(surface), _UNSEEN),
-        learned=_learned(looks, some, shares),
+        learned=_learned(looks, some, shares) | {"p_static": share},
         no_return=NoReturn(looks.dwell.solid(), beyond),
     )
+
+
+def _mean(static: NDArray[np.float32], of_none: float) -> float:
+    return float(np.mean(static, dtype=np.float64)) if len(static) else of_none
 
 
 def coverage(surface: Surface) -> NDArray[np.float32]:

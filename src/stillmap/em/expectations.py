@@ -1,11 +1,15 @@
 """What an E-step finds out, whichever estimator made it."""
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core
+
+if TYPE_CHECKING:
+    from stillmap.em.changed import Changed
 
 Grid = _core.Grid2D | _core.Grid3D
 
@@ -62,6 +66,8 @@ class Expectations:
         occupied: cells it knows more of than alpha / (alpha + beta) says.
         learned: what was learned from the recording, JSON-able.
         no_return: how far beams without a return are believed; None: all of their way.
+        changed: cells that tell of something that came or left; None in the plane, where the
+            last E-step finds them.
     """
 
     p_static: NDArray[np.float32]
@@ -69,6 +75,7 @@ class Expectations:
     occupied: CellProbabilities | None = None
     learned: dict[str, object] = field(default_factory=dict)
     no_return: NoReturn | None = None
+    changed: "Changed | None" = None
 
 
 def per_beam(

@@ -4,8 +4,11 @@ A recording of streets lasts for minutes, and a car that waits at a light for ha
 goes on, is no wall. Whoever removes what moves from a cloud wants the car out, and its place free.
 """
 
+from dataclasses import replace
+
 from stillmap.em.beside import with_those_beside
-from stillmap.em.courses import static_of, watch
+from stillmap.em.changed import changed_of
+from stillmap.em.courses import courses_of, static_of, watch
 from stillmap.em.dwell import e_step, expectations_of
 from stillmap.em.expectations import Expectations
 from stillmap.em.looks import Classes, Dwell, Float, looked_at
@@ -20,15 +23,26 @@ def e_step_in_space(
 ) -> Expectations:
     """P(c = 1) of every beam: of its end cell being occupied by something that was never away.
 
-    Args: see `dwell.e_step`. Without `changes.enabled` it is that one.
+    Args: see `dwell.e_step`. Without `changes.enabled` it is that one. With `changes.in_space`
+    it also says where things came or left.
     """
     if not options.changes.enabled:
         return e_step(recording, poses, resolution, options, threads)
 
+    listed = options.changes.in_space
+
     def prepare(dwell: Dwell) -> None:
-        watch(dwell, recording, options, courses=False)
+        watch(dwell, recording, options, courses=listed)
 
     looks = looked_at(recording, poses, resolution, options, threads, _CLASSES, prepare)
-    static = static_of(looks, options)
+    courses = courses_of(looks, options) if listed else None
+    static, changing = (
+        static_of(looks, options) if courses is None else (courses.p_static, courses.share)
+    )
     static = with_those_beside(static, looks.surface, threads)
-    return expectations_of(looks, None, recording, poses, options, threads, static)
+    found = expectations_of(looks, None, recording, poses, options, threads, static)
+    return replace(
+        found,
+        learned={**found.learned, "changing": round(changing, 6)},
+        changed=None if courses is None else changed_of(courses),
+    )

@@ -51,6 +51,7 @@ class ChangeOptions:
     near: float = field_with_doc(0.5, "m, cells so near to each other that change are one place")
     together: float = field_with_doc(2.0, "s, by which the cells of a place may change apart")
     least: int = field_with_doc(4, "cells below which a place that changed is not listed")
+    in_space: bool = field_with_doc(False, "list them in 3D, too, which takes more time and memory")
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.stays <= 1000.0:

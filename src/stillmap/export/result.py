@@ -64,8 +64,8 @@ def read(folder: Path, recording: Recording, p_static: NDArray[np.float32]) -> E
         InputError: a file is missing or damaged, or the recording is 3D.
     """
     if recording.dimension != 2:
-        what = "is of a 3D recording: only results in the plane can be converted so far"
-        raise InputError(what, where=str(folder))
+        what = "is of a 3D recording: its points can be written, as a cloud"
+        raise InputError(what, where=str(folder), hint=".las, .laz, .e57, .pcd or .ply")
     return Exported(
         recording,
         poses_from_tum(folder / "trajectory.tum", recording),

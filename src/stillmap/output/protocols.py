@@ -244,8 +244,8 @@ class ChangeLike(Protocol):
 
     Attributes:
         kind: "came", "left" or "comes and goes".
-        x, y: metres, its middle in the map frame.
-        size: metres along x and y.
+        x, y, z: metres, its middle in the map frame; z is None in the plane.
+        size: metres along x and y, and in space z.
         cells: (K, 2) int64 cells that changed.
         swept: (S, 2) int64 cells of the whole place: of a door all that it sweeps.
         before_ns, stamp_ns: last scan that saw it as it was, first that saw it otherwise.
@@ -260,7 +260,9 @@ class ChangeLike(Protocol):
     @property
     def y(self) -> float: ...
     @property
-    def size(self) -> tuple[float, float]: ...
+    def z(self) -> float | None: ...
+    @property
+    def size(self) -> tuple[float, ...]: ...
     @property
     def cells(self) -> NDArray[np.int64]: ...
     @property

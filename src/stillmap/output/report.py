@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 
 from stillmap.output.points import beam_counts
-from stillmap.output.protocols import ResultLike
+from stillmap.output.protocols import ResultLike, TiltingLike
 from stillmap.output.report_changes import changes_section
 from stillmap.output.report_curve import likelihood_svg
 from stillmap.output.report_learned import learned_section
@@ -24,6 +24,7 @@ from stillmap.output.report_tables import (
     stages_table,
 )
 from stillmap.output.report_template import PAGE, STYLE
+from stillmap.output.report_tilting import tilting_section
 from stillmap.output.run_json import jsonable, skipped_count, version
 
 # titles of the two curves and the words below them, for each likelihood
@@ -40,12 +41,12 @@ _PRINTED = (
 )
 
 
-def write_report(path: Path, result: ResultLike) -> None:
+def write_report(path: Path, result: ResultLike, tilting: TiltingLike | None = None) -> None:
     """Write the report as one HTML page of a few megabytes at most, whatever the map's size."""
-    path.write_text(report_html(result), encoding="utf-8")
+    path.write_text(report_html(result, tilting), encoding="utf-8")
 
 
-def report_html(result: ResultLike) -> str:
+def report_html(result: ResultLike, tilting: TiltingLike | None = None) -> str:
     """The page. All pictures lie in it; it holds no script and reads without one."""
     name = _name(result)
     sections = [
@@ -55,6 +56,7 @@ def report_html(result: ResultLike) -> str:
         maps_section(result),
         changes_section(result),
         objects_section(result),
+        tilting_section(result, tilting),
         learned_section(result),
         _estimate_section(result),
         evolution_section(result),

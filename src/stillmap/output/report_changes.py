@@ -25,12 +25,11 @@ def changes_section(result: ResultLike) -> str:
     picture = map_image(result.map, window)
     reduced = picture.size[0] < round((window[2] - window[0]) / result.map.resolution)
     marks = _marks(result, window, picture.size)
-    shown = "as it was last seen" if result.options.output.map_state == "last" else "as it was most"
     listed = _most(result.changes)
     rest = len(result.changes) - len(listed)
     return (
-        f"<section><h2>What changed</h2><p>{escape(_summary(result.changes))} The map shows each "
-        f"{shown}; what comes and goes it shows free{_unless(result)}.</p>{_key()}"
+        f"<section><h2>What changed</h2><p>{escape(_summary(result.changes))} {_shown(result)}</p>"
+        f"{_key()}"
         + figure(
             "Changes",
             "numbers as in the table",
@@ -45,10 +44,14 @@ def changes_section(result: ResultLike) -> str:
     )
 
 
-def _unless(result: ResultLike) -> str:
-    if result.options.output.map_state == "last":
-        return ""
-    return ", unless it was there for most of the time"
+def _shown(result: ResultLike) -> str:
+    """What the map has of them."""
+    if result.recording.dimension == 3:
+        return "The map shows their places as the labels of single voxels have it."
+    last = result.options.output.map_state == "last"
+    shown = "as it was last seen" if last else "as it was most"
+    unless = "" if last else ", unless it was there for most of the time"
+    return f"The map shows each {shown}; what comes and goes it shows free{unless}."
 
 
 def _most(changes: Sequence[ChangeLike]) -> list[ChangeLike]:
@@ -117,8 +120,8 @@ def _table(changes: Sequence[ChangeLike], start: int) -> str:
     rows = ""
     for k, one in enumerate(changes, 1):
         cells = (
-            f"{one.x:.2f}, {one.y:.2f}",
-            f"{one.size[0]:.2f} x {one.size[1]:.2f}",
+            f"{one.x:.2f}, {one.y:.2f}" + ("" if one.z is None else f", {one.z:.2f}"),
+            " x ".join(f"{metres:.2f}" for metres in one.size),
             f"{len(one.cells):,}",
             _clock(one.before_ns - start),
             _clock(one.stamp_ns - start),

@@ -39,7 +39,8 @@ def learned_section(result: ResultLike) -> str:
         )
         tables = [stays, fill, *tables]
     return (
-        f"<section><h2>What was learned</h2><p>{escape(_static_sentence(learned))}</p>"
+        f"<section><h2>What was learned</h2><p>{escape(_static_sentence(learned))}"
+        f"{escape(_changing_sentence(result))}</p>"
         f"<p>{note} What never leaves while the robot looks is taken for standing still.</p>"
         f'<div class="row">{"".join(tables)}</div>'
         '<p class="soft">Each bar: share of the cells that hold such things, put down to the '
@@ -58,6 +59,14 @@ def _static_sentence(learned: Mapping[str, Any]) -> str:
             "errors of range and pose taken together."
         )
     return text
+
+
+def _changing_sentence(result: ResultLike) -> str:
+    """In space what came to stay, or left, is dynamic; in the plane it is listed."""
+    if result.recording.dimension == 2 or "changing" not in result.learned:
+        return ""
+    share = share_text(float(result.learned["changing"]))
+    return f" In {share} of them something came to stay or left, which counts as moving."
 
 
 def _bars(title: str, table: Sequence[Mapping[str, float]], text: Callable[[float], str]) -> str:

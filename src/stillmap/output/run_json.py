@@ -106,6 +106,7 @@ def _change(one: ChangeLike) -> dict[str, Any]:
         "kind": one.kind,
         "x": round(one.x, _MILLIMETRES),
         "y": round(one.y, _MILLIMETRES),
+        **({} if one.z is None else {"z": round(one.z, _MILLIMETRES)}),
         "size": [round(metres, _MILLIMETRES) for metres in one.size],
         "cells": len(one.cells),
         "before_ns": one.before_ns,

@@ -49,7 +49,7 @@ def save(
         if result.options.objects.enabled:
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)
-        write_report(folder / "report.html", result)
+        write_report(folder / "report.html", result, tilting)
         more = {}
         if tilting is not None:
             write_tilting(folder, tilting)

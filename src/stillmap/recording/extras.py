@@ -10,12 +10,13 @@ class MissingExtra(InputError):
     """A library is not there: no file at fault, and none that could be skipped for it."""
 
 
-def extra(module: str, path: object) -> Any:
+def extra(module: str, path: object, to_be: str = "read") -> Any:
     """A module that comes with stillmap's extra `io`.
 
     Args:
         module: what to import.
         path: what it is wanted for.
+        to_be: what is to be done with it.
 
     Raises:
         MissingExtra: it is not installed.
@@ -25,4 +26,4 @@ def extra(module: str, path: object) -> Any:
     except ImportError as error:
         package = module.partition(".")[0]
         hint = "pip install 'stillmap[io]'"
-        raise MissingExtra(f"needs {package} to be read", where=str(path), hint=hint) from error
+        raise MissingExtra(f"needs {package} to be {to_be}", where=str(path), hint=hint) from error

@@ -111,9 +111,8 @@ class Recording:
     def in_turn(self, scans: Iterable[int], *more: NDArray[Any]) -> Iterator[int]:
         """The same numbers of scans; what was looked at of the beams, and of other arrays, leaves
         memory on the way."""
-        together = spool.BLOCK * self.n_scans // max(self.n_beams, 1)  # sweeps are large
-        together = min(max(together, 1), spool.TOGETHER)
-        return spool.in_turn(scans, lambda: self.let_go(*more), together)
+        rows = self.n_beams / max(self.n_scans, 1)
+        return spool.in_turn(scans, lambda: self.let_go(*more), rows)
 
     def T_map_sensor(self, T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sensor poses (T, D+1, D+1) that belong to robot poses (T, D+1, D+1)."""

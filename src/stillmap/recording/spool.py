@@ -116,9 +116,13 @@ def blocks(*arrays: NDArray[Any], rows: int | None = None) -> Iterator[slice]:
 
 
 def in_turn(
-    items: Iterable[_Item], let_go: Callable[[], None], together: int = TOGETHER
+    items: Iterable[_Item], let_go: Callable[[], None], rows: float = 0.0
 ) -> Iterator[_Item]:
-    """The same items; after so many what was looked at for them is let go."""
+    """The same items; on the way what was looked at for them is let go now and then.
+
+    `rows` says how many rows of the arrays an item takes, about: of large ones fewer are looked at.
+    """
+    together = max(min(TOGETHER, int(BLOCK / max(rows, 1.0))), 1)
     for n, item in enumerate(items):
         if n % together == 0:
             let_go()

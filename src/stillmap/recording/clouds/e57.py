@@ -33,7 +33,7 @@ _DEEPEST = 100  # elements within each other: libe57 takes their number squared 
 _NO_TAGS = re.compile(rb"<!\[CDATA\[.*?\]\]>|<!--.*?-->|<\?.*?\?>", re.DOTALL)
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-_GPS_EPOCH_S = 315_964_800  # 6 January 1980, since 1970; leap seconds stay out
+GPS_EPOCH_S = 315_964_800  # 6 January 1980, since 1970; leap seconds stay out
 
 
 def read(
@@ -221,4 +221,4 @@ def _stamp_ns(node: Any) -> int | None:
     seconds = start["dateTimeValue"].value() if start.isDefined("dateTimeValue") else 0.0
     if not 0.0 < seconds < 5e9:
         return None
-    return round((seconds + _GPS_EPOCH_S) * 1e9)
+    return round((seconds + GPS_EPOCH_S) * 1e9)

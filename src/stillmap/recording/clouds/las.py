@@ -1,5 +1,6 @@
 """LAS and LAZ files: one cloud, or a folder of them; read by laspy."""
 
+import io
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -139,15 +140,49 @@ def write(
     """
     path = Path(path)
     require_new_file(path, overwrite)
-    laspy = extra("laspy", path)
-    with new_file(path) as work, work.open("wb") as file:
-        head = _header(laspy, poses)
-        packed = path.name.lower().endswith(".laz")
-        with laspy.open(file, "w", header=head, do_compress=packed, closefd=False) as writer:
-            for points in placed(recording, poses):
-                block = laspy.ScaleAwarePointRecord.zeros(len(points), header=head)
-                block.x, block.y, block.z = points.T
-                writer.write_points(block)
+    laspy = extra("laspy", path, "written")
+    head, packed = _header(laspy, poses), path.name.lower().endswith(".laz")
+    with new_file(path) as work, writer_to(work, laspy, head, packed) as writer:
+        for points in placed(recording, poses):
+            block = laspy.ScaleAwarePointRecord.zeros(len(points), header=head)
+            block.x, block.y, block.z = points.T
+            writer.write_points(block)
+
+
+@contextmanager
+def writer_to(path: Path, laspy: Any, head: Any, packed: bool) -> Iterator[Any]:
+    """A writer of laspy.
+
+    Args:
+        path: a new file.
+        laspy: the library.
+        head: a LasHeader.
+        packed: LAZ.
+
+    Raises:
+        OSError: the file cannot be written; what packs points makes an error of its own of that.
+    """
+    with _Remembering(io.FileIO(path, "w")) as file:
+        try:
+            with laspy.open(file, "w", header=head, do_compress=packed, closefd=False) as writer:
+                yield writer
+        except Exception as error:
+            if file.failed is not None:
+                raise file.failed from error
+            raise
+
+
+class _Remembering(io.BufferedWriter):
+    """A file that knows why it could not be written."""
+
+    failed: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            self.failed = error
+            raise
 
 
 def _header(laspy: Any, poses: NDArray[np.float64]) -> Any:

@@ -1,0 +1,216 @@
+"""Clouds of results in 3D, as the libraries of others read them: the points of `static.ply`."""
+
+import subprocess
+import sys
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from stillmap.cli import main
+from stillmap.export import cloud, cloud_files
+from stillmap.recording import folder, read
+from stillmap.recording.clouds import pcd_file, ply
+from stillmap.recording.clouds.records import columns
+
+FIELDS = ("x", "y", "z", "p_static")
+ROUNDED = 0.5001e-4  # m
+
+
+def of_ply(path: Path) -> np.ndarray:
+    """(n, 4) FIELDS."""
+    blocks = [np.stack(block, 1) for block in columns(ply.layout_of(path), FIELDS)]
+    return np.concatenate([np.empty((0, 4), np.float32), *blocks])
+
+
+def of_las(path: Path) -> np.ndarray:
+    read_las = pytest.importorskip("laspy").read(path)
+    assert read_las["p_static"].dtype == np.float32
+    assert read_las.header.point_count == len(read_las.points)
+    return np.stack([read_las.x, read_las.y, read_las.z, read_las["p_static"]], axis=1)
+
+
+def of_e57(path: Path) -> np.ndarray:
+    file = pytest.importorskip("pye57").E57(str(path))
+    assert file.scan_count == 1
+    low, high = (
+        [file.get_header(0)["cartesianBounds"][f"{a}{end}"].value() for a in "xyz"]
+        for end in ("Minimum", "Maximum")
+    )
+    found = file.read_scan_raw(0)
+    file.close()
+    xyz = np.stack([found[f"cartesian{axis}"] for axis in "XYZ"], axis=1)
+    np.testing.assert_allclose([xyz.min(axis=0), xyz.max(axis=0)], [low, high], atol=ROUNDED)
+    return np.column_stack([xyz, found["intensity"]])
+
+
+def of_pcd(path: Path) -> np.ndarray:
+    return np.stack(pcd_file.values(pcd_file.header(path), list(FIELDS)), axis=1)
+
+
+READERS = {".las": of_las, ".laz": of_las, ".e57": of_e57, ".pcd": of_pcd, ".ply": of_ply}
+
+
+@pytest.fixture
+def converted(mapped_street, tmp_path):
+    """Makes a cloud of the street."""
+
+    def convert(ending: str, *more: str) -> Path:
+        path = tmp_path / f"{'-'.join(more)}cloud{ending}"
+        assert main(["convert", str(mapped_street), "-o", str(path), "--quiet", *more]) == 0
+        return path
+
+    return convert
+
+
+def both(result: Path) -> dict[str, np.ndarray]:
+    return {part: of_ply(result / f"{part}.ply") for part in ("static", "dynamic")}
+
+
+@pytest.mark.parametrize("ending", READERS)
+def test_the_points_are_those_of_the_map(converted, mapped_street, ending):
+    """With the motion during sweeps taken out, as the map has them."""
+    found, known = READERS[ending](converted(ending)), both(mapped_street)
+    assert len(known["dynamic"]) > 100
+    moves = found[:, 3] < 0.5
+    for part, its in (("static", found[~moves]), ("dynamic", found[moves])):
+        np.testing.assert_allclose(its[:, :3], known[part][:, :3], atol=ROUNDED + 1e-5)
+        np.testing.assert_array_equal(its[:, 3], known[part][:, 3])
+
+
+@pytest.mark.parametrize("ending", READERS)
+@pytest.mark.parametrize("part", ["static", "dynamic"])
+def test_one_part_alone(converted, mapped_street, ending, part):
+    found = READERS[ending](converted(ending, "--only", part))
+    known = both(mapped_street)[part]
+    np.testing.assert_allclose(found, known, atol=ROUNDED + 1e-5)
+
+
+@pytest.mark.parametrize("ending", READERS)
+def test_the_same_result_gives_the_same_bytes(converted, ending):
+    first = converted(ending).read_bytes()
+    assert converted(ending, "--overwrite").read_bytes() == first
+
+
+def test_motion_during_sweeps_is_more_than_rounding(street, mapped_street):
+    """Else the above would say nothing of it."""
+    recording = folder.read(street)
+    hits, poses = np.flatnonzero(recording.hit), np.load(street / "truth/T_world_base.npy")
+    known, found = both(mapped_street), recording.end_points(hits, poses)
+    moves = np.load(mapped_street / "beams/p_static.npy")[hits] < 0.5
+    apart = np.linalg.norm(found[~moves] - known["static"][:, :3], axis=1)
+    assert np.median(apart) > 0.1
+
+
+def test_times_are_those_of_the_beams(converted, street):
+    laspy = pytest.importorskip("laspy")
+    recording = folder.read(street)
+    scan = np.repeat(np.arange(recording.n_scans), np.diff(recording.offset))
+    seconds = 1e-9 * recording.stamp_ns[scan] + recording.beam_time
+    found = laspy.read(converted(".laz")).gps_time
+    np.testing.assert_allclose(found, seconds[recording.hit], rtol=0, atol=1e-6)
+    assert np.ptp(found) > 1.0
+
+
+def test_other_readers_of_ply_and_of_whole_clouds(converted, mapped_street):
+    n = sum(len(points) for points in both(mapped_street).values())
+    assert trimesh.load(converted(".ply")).vertices.shape == (n, 3)
+    for ending in (".pcd", ".e57", ".las"):
+        assert read(converted(ending, "--overwrite")).n_beams == n
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "a.parquet"])
+def test_what_a_result_in_space_cannot_become(mapped_street, tmp_path, capsys, name):
+    assert main(["convert", str(mapped_street), "-o", str(tmp_path / name)]) == 2
+    assert "3D recording" in (said := capsys.readouterr().err)
+    assert ".laz" in said
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("form", cloud_files.FORMATS, ids=lambda form: form.name)
+def test_memory_is_that_of_some_scans(form, tmp_path):
+    cloud_files.require_extras(form, tmp_path)
+    n, blocks = 1 << 16, 40
+
+    def made():
+        for k in range(blocks):
+            points = np.random.default_rng(k).uniform(-50.0, 50.0, (n, 3))
+            yield cloud.Block(points, np.full(n, 0.75, np.float32), np.full(n, k, np.int64))
+
+    points = cloud.Cloud(n * blocks, np.zeros(3), 0, made)
+    shares = []
+    tracemalloc.start()
+    try:
+        cloud_files.write(points, tmp_path / f"a{form.endings[0]}", form, shares.append)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 5 * (n * 60)  # bytes: a few blocks of the forty
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+@pytest.mark.parametrize("form", cloud_files.FORMATS, ids=lambda form: form.name)
+def test_no_points_are_a_cloud(form, tmp_path):
+    empty = cloud.Block(np.empty((0, 3)), np.empty(0, np.float32), None)
+    path = tmp_path / f"a{form.endings[0]}"
+    cloud_files.write(cloud.Cloud(0, np.zeros(3), None, lambda: iter([empty])), path, form)
+    if form.name != "e57":  # bounds of nothing are not to be had
+        assert len(READERS[form.endings[0]](path)) == 0
+    assert path.stat().st_size > 0
+
+
+@pytest.mark.parametrize("form", cloud_files.FORMATS, ids=lambda form: form.name)
+def test_what_stops_it_leaves_nothing(form, tmp_path):
+    def made():
+        yield cloud.Block(np.zeros((9, 3)), np.zeros(9, np.float32), None)
+        raise KeyboardInterrupt
+
+    points = cloud.Cloud(18, np.zeros(3), None, made)
+    with pytest.raises(KeyboardInterrupt):
+        cloud_files.write(points, tmp_path / f"a{form.endings[0]}", form)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57"])
+def test_points_that_are_too_far_off_are_refused(name, tmp_path):
+    far = np.full((3, 3), 3e5)
+    points = cloud.Cloud(
+        3, np.zeros(3), None, lambda: iter([cloud.Block(far, np.ones(3, np.float32), None)])
+    )
+    form = cloud_files.format_for(tmp_path / name)
+    with pytest.raises(cloud_files.InputError, match=f"{name}: cannot be written: a point lies"):
+        cloud_files.write(points, tmp_path / name, form)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57", "a.pcd", "a.ply"])
+def test_a_full_disk_is_said(name, tmp_path):
+    """A limit on the size of files stands for it; the process it holds for is one of its own."""
+    program = f"""
+import resource, signal, sys
+from pathlib import Path
+import numpy as np
+from stillmap.errors import InputError
+from stillmap.export import cloud, cloud_files
+rng, n = np.random.default_rng(1), 200_000
+block = cloud.Block(rng.uniform(-50, 50, (n, 3)), rng.uniform(size=n).astype("f4"), None)
+path = Path("{name}")
+form = cloud_files.format_for(path)
+cloud_files.require_extras(form, path)
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+try:
+    cloud_files.write(cloud.Cloud(9 * n, np.zeros(3), None, lambda: iter([block] * 9)), path, form)
+except InputError as error:
+    print(error)
+"""
+    words = [sys.executable, "-c", program]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert done.stderr == ""
+    assert f"{name}: cannot be written: " in done.stdout
+    if name != "a.e57":
+        assert "File too large" in done.stdout
+    assert list(tmp_path.iterdir()) == []

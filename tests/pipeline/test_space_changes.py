@@ -1,0 +1,100 @@
+"""A thing that leaves while a lidar looks, and one that comes: listed from start to end."""
+
+import json
+
+import numpy as np
+import pytest
+from choices import options
+
+import stillmap
+from stillmap.checkpoint.packing import packed, unpacked
+from stillmap.options import replaced
+from stillmap.output.report_changes import changes_section
+from stillmap.pipeline import Options
+from stillmap.simulation import CrowdOptions, LidarOptions, RobotOptions, Scene, simulate
+from stillmap.simulation.scene import Stay, Thing
+from stillmap.simulation.walls import box
+
+LISTED = replaced(Options(), {"em": {"changes": {"in_space": True}}})
+LEFT, CAME = (3.0, 2.0), (-3.0, 2.0)  # m, where they stand
+
+
+@pytest.fixture(scope="module")
+def hall():
+    """60 s, two sweeps per second; at 30 s one thing is taken away and another one brought."""
+    crate = tuple(box(0, 0, 1.2, 0.8))
+    scene = Scene(
+        "hall",
+        walls=tuple(box(0, 0, 12, 9)),
+        route=((-3.0, -2.0), (3.0, -2.0), (3.0, -1.0), (-3.0, -1.0)),
+        things=(
+            Thing(crate, (Stay(*LEFT, until=30.0),)),
+            Thing(crate, (Stay(*CAME, 0.3, since=30.0),)),
+        ),
+        lidar=LidarOptions(channels=32, columns=360, rate=2.0, sweep=False),
+        robot=RobotOptions(scans=120, speed=0.4),
+        crowd=CrowdOptions(people=0),
+    )
+    return simulate(scene, 1)
+
+
+@pytest.fixture(scope="module")
+def built(hall):
+    """The result, and how far the run had come after its only iteration."""
+    loops = []
+    result = stillmap.build(
+        hall.recording, LISTED, poses=hall.truth.T_world_base, keep=loops.append
+    )
+    return result, loops[-1]
+
+
+def test_both_are_listed_and_nothing_else(built):
+    result, _ = built
+    assert {one.kind for one in result.changes} == {"left", "came"}
+    start = result.recording.stamp_ns[0]
+    for kind, (x, y) in (("left", LEFT), ("came", CAME)):
+        [one] = [one for one in result.changes if one.kind == kind]
+        assert np.hypot(one.x - x, one.y - y) < 0.4
+        assert 0.2 < one.z < 0.8
+        assert 1e-9 * (one.before_ns - start) <= 30.0 <= 1e-9 * (one.stamp_ns - start) + 0.5
+        assert np.array(one.size) == pytest.approx([1.3, 1.0, 1.0], abs=0.6)
+
+
+def test_the_files_say_so(built, tmp_path):
+    result, _ = built
+    result.save(tmp_path / "out")
+    changes = json.loads((tmp_path / "out/run.json").read_text())["changes"]
+    for one, known in zip(changes, result.changes, strict=True):
+        assert (one["kind"], one["cells"]) == (known.kind, len(known.cells))
+        assert (one["x"], one["y"], one["z"]) == pytest.approx(
+            (known.x, known.y, known.z), abs=1e-3
+        )
+        assert len(one["size"]) == 3
+    changed = np.load(tmp_path / "out/map.npz")["changed"]
+    assert (changed == 1).sum() > 10
+    assert (changed == 2).sum() > 10
+    section = changes_section(result)
+    assert section in (tmp_path / "out/report.html").read_text()
+    assert "2 places changed: 1 where something came, 1 where something left." in section
+    assert "as it was last seen" not in section
+    z, size = result.changes[0].z, result.changes[0].size
+    assert f", {z:.2f}</td>" in section
+    assert f"{size[0]:.2f} x {size[1]:.2f} x {size[2]:.2f}" in section
+
+
+def test_a_run_that_goes_on_knows_them(built, hall):
+    result, loop = built
+    values, arrays = packed(loop)
+    again = unpacked(json.loads(json.dumps(values)), arrays, loop.options)
+    resumed = stillmap.build(hall.recording, LISTED, poses=hall.truth.T_world_base, go_on=again)
+    assert len(resumed.changes) == len(result.changes) == 2
+    for one, known in zip(resumed.changes, result.changes, strict=True):
+        assert (one.x, one.y, one.z, one.stamp_ns) == (known.x, known.y, known.z, known.stamp_ns)
+        np.testing.assert_array_equal(one.cells, known.cells)
+
+
+def test_nothing_is_listed_that_was_not_asked_for(hall):
+    chosen = options("stillmap", changes={"enabled": False})
+    result = stillmap.build(hall.recording, chosen, poses=hall.truth.T_world_base)
+    assert result.changes == []
+    assert "changing" not in result.learned
