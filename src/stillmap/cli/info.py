@@ -87,6 +87,8 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
         yield _row("robot's frame", f"{found['base_frame']} ({found['base_frame_how']})")
     for sensor in found["sensors"]:
         yield from _sensor(sensor)
+    for own in found["own_body"]:
+        yield _row("robot itself", _own(own, found))
     yield from _notes(found)
 
 
@@ -166,6 +168,14 @@ def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
             text = f"beams {first} to {last} end on it: unusable up to {limit:g} m"
             yield _row("  robot itself", text)
         yield _row("  zero means", f"{rule['zero_means']}: {rule['zero_how']}")
+
+
+def _own(own: dict[str, Any], found: dict[str, Any]) -> str:
+    """What a lidar sees of its robot."""
+    of = f" of sensor {own['sensor'] + 1}" if len(found["sensors"]) > 1 else ""
+    spans = zip("xyz", own["low"], own["high"], strict=True)
+    where = ", ".join(f"{axis} {low:g} to {high:g}" for axis, low, high in spans)
+    return f"{own['beams']} beams{of} end on it: unusable; {where} m from the sensor"
 
 
 def _notes(found: dict[str, Any]) -> Iterator[str]:
