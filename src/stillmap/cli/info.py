@@ -80,7 +80,8 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
     yield from _time(found["time"])
     if found["beam_times_s"] is not None:
         first, last = found["beam_times_s"]
-        yield _row("beam times", f"{first:g} to {last:g} s after a scan's stamp")
+        how = f", as it turns {found['spin']}" if found["spin"] else ""
+        yield _row("beam times", f"{first:g} to {last:g} s after a scan's stamp{how}")
     yield from _odometry(found["odometry"])
     yield from _more(found)
     if found["base_frame"] is not None:

@@ -41,6 +41,7 @@ def facts(recording: Recording) -> dict[str, Any]:
         "hit_ranges_m": _spread(_hit_ranges(recording), ("min", "median", "p99", "max")),
         "time": _time(recording.stamp_ns),
         "beam_times_s": _spread_of_times(recording.beam_time),
+        "spin": source["spin"].get("direction"),
         "odometry": _odometry(recording, source["odometry"]),
         "recorded_poses": _way(recording.T_recorded_base),
         "images": _pictures(recording.images),
@@ -52,7 +53,7 @@ def facts(recording: Recording) -> dict[str, Any]:
 
 def _notes(source: dict[str, Any]) -> dict[str, Any]:
     """What the reader noted; notes of another shape than expected (other writers) are left out."""
-    tables = {key: source.get(key) for key in (*_DAMAGE, *_TABLES, "odometry")}
+    tables = {key: source.get(key) for key in (*_DAMAGE, *_TABLES, "odometry", "spin")}
     notes: dict[str, Any] = {k: v if isinstance(v, dict) else {} for k, v in tables.items()}
     lists = {key: source.get(key) for key in (*_LISTS, "sensors", "own_body")}
     notes.update({k: v if isinstance(v, list) else [] for k, v in lists.items()})

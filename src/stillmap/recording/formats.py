@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.errors import InputError
-from stillmap.recording import carmen, folder, limits, own_body_in_space
+from stillmap.recording import carmen, folder, limits, own_body_in_space, spin
 from stillmap.recording.carmen_messages import SCAN_PARSERS
 from stillmap.recording.clouds import e57, kitti, las, pcd, pcd_file, ply, uos
 from stillmap.recording.clouds.files import holds_any, is_named
@@ -126,15 +126,19 @@ def read(
         with np.errstate(over="ignore", invalid="ignore"):
             options = options or ReadOptions()
             recording = format_of(path).read(path, options, progress, scratch)
-            if recording.dimension == 3 and options.own_body:
-                return own_body_in_space.left_out(replace(recording, scratch=scratch))
-            return recording
+            return recording if recording.dimension == 2 else _in_space(recording, options, scratch)
     except OSError as error:
         # files may go, and disks fill up, at any moment
         what = f"cannot be read: {error.strerror or error}"
         raise InputError(what, where=str(error.filename or path)) from error
     except MemoryError as error:
         raise InputError("does not fit into memory", where=str(path)) from error
+
+
+def _in_space(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
+    """What is found out alike of every 3D recording."""
+    recording = spin.timed(replace(recording, scratch=scratch), options)
+    return own_body_in_space.left_out(recording) if options.own_body else recording
 
 
 def format_of(path: Path) -> Format:
