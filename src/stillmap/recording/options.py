@@ -91,6 +91,9 @@ class ReadOptions:
     topic: str | None = field_with_doc(
         None, "of a bag: topics of the scans to use, with commas; unset: found by type and rate"
     )
+    tilting_topic: str | None = field_with_doc(
+        None, "of a bag: scans of a laser that tilts or pans; they are not for the map"
+    )
     base_frame: str | None = field_with_doc(
         None, "of a bag: the robot's own frame; unset: found in the transforms"
     )
@@ -112,7 +115,7 @@ class ReadOptions:
         for name in ("spin_start", "spin_stamp"):
             if getattr(self, name) is not None and not abs(getattr(self, name)) <= 2.0 * math.pi:
                 raise ValueError(f"{name} must lie within a turn, got {getattr(self, name)}")
-        for name in ("topic", "base_frame", "odom_frame"):
+        for name in ("topic", "tilting_topic", "base_frame", "odom_frame"):
             if getattr(self, name) is not None and not getattr(self, name).strip():
                 raise ValueError(f"{name} must name something")
         for number, laser in enumerate(("laser", "laser2")):
