@@ -11,6 +11,7 @@ from stillmap.errors import InputError
 from stillmap.output.points import beam_counts
 from stillmap.pipeline import Options
 from stillmap.recording import Recording, read
+from stillmap.recording.formats import format_of
 from stillmap.recording.lines import Progress
 from stillmap.result import Result
 from stillmap.scene.rig import Flat, Tilting, built_in_3d, require_rig
@@ -56,6 +57,8 @@ def _of_topic(
     """The laser that tilts, of the same bag as the flat one, on the same robot."""
     from stillmap.recording.ros.reading import read_tilting  # types of messages take long to load
 
+    if format_of(path).name != "ROS bag":
+        raise InputError("--tilting-topic is for bags", where=str(path))
     base = flat.source.get("base_frame")
     read_as = dataclasses.replace(
         options.read, topic=topic, tilting_topic=None, base_frame=base if base else None

@@ -9,7 +9,7 @@ from small_bags import Messages, write_bag
 from stillmap import se2
 from stillmap.cli import main
 from stillmap.errors import InputError
-from stillmap.recording import ReadOptions, read
+from stillmap.recording import ReadOptions, read, writers
 from stillmap.recording.ros.reading import read_tilting
 from stillmap.simulation import RigOptions, load_truth, scene_by_name, simulate_rig, write_rig
 from stillmap.simulation.laser import beam_angles
@@ -152,6 +152,14 @@ def test_what_the_map_command_makes_of_it(rig, path, tmp_path):
     assert record["options"]["read"]["tilting_topic"] == "/tilt_scan"
 
 
+def test_clouds_of_points_are_taken_as_they_are(rig, tmp_path):
+    writers.write(rig.tilting.recording, tmp_path / "a.mcap")
+    wanted = ReadOptions(topic="/points", base_frame="base_link")
+    found = read_tilting(tmp_path / "a.mcap", wanted, None, None)
+    hit = rig.tilting.recording.hit
+    np.testing.assert_array_equal(found.points[hit], rig.tilting.recording.points[hit])
+
+
 def refused(capsys, *words):
     """The one line with which the command refuses."""
     assert main([str(word) for word in (*words, *QUICK)]) == 2
@@ -168,6 +176,9 @@ def test_wrong_topics_are_refused(rig, path, tmp_path, capsys):
     assert "exclude each other" in refused(capsys, *words, "/tilt_scan", "--tilting", path)
     write_rig(rig, tmp_path / "sim")
     words = ("map", tmp_path / "sim/horizontal", "--tilting-topic", "/a", "-o", tmp_path / "out")
+    assert "is for bags" in refused(capsys, *words)
+    (tmp_path / "a.log").write_text("FLASER 2 1 2 0 0 0 0 0 0 1.0 host 1.0\n" * 3)
+    words = ("map", tmp_path / "a.log", "--tilting-topic", "/a", "-o", tmp_path / "out")
     assert "is for bags" in refused(capsys, *words)
 
 
