@@ -138,3 +138,10 @@ def test_the_flag(tmp_path, timeless, capsys):
 def test_odd_options(text):
     with pytest.raises((InputError, ValueError)):
         options.replaced(Options(), options.parse_assignment(f"read.{text}"))
+
+
+def test_recordings_in_the_plane_are_refused(tmp_path):
+    flat = simulate(scene_by_name("hall", {"robot": {"scans": 3}}), 0).recording
+    folder.write(flat, tmp_path / "a")
+    with pytest.raises(InputError, match="is for 3D"):
+        read(tmp_path / "a", LEFT)

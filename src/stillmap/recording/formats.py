@@ -126,7 +126,11 @@ def read(
         with np.errstate(over="ignore", invalid="ignore"):
             options = options or ReadOptions()
             recording = format_of(path).read(path, options, progress, scratch)
-            return recording if recording.dimension == 2 else _in_space(recording, options, scratch)
+            if recording.dimension == 3:
+                return _in_space(recording, options, scratch)
+        if options.spin not in ("auto", "none"):
+            raise InputError("read.spin is for 3D recordings, this one is in 2D", where=str(path))
+        return recording
     except OSError as error:
         # files may go, and disks fill up, at any moment
         what = f"cannot be read: {error.strerror or error}"
