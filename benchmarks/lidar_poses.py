@@ -33,6 +33,7 @@ from tables import markdown
 from stillmap import options, se2, se3
 from stillmap.evaluation.trajectory import absolute_errors, relative_errors
 from stillmap.pipeline import Options
+from stillmap.recording import spin
 from stillmap.recording.formats import read
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
@@ -42,7 +43,6 @@ from stillmap.slam import spinning
 
 Float = NDArray[np.float64]
 
-_TURN = 0.1  # s, of a lidar whose beams get their times from their azimuths
 _HEADER = ["recording", "method", "ATE m", "RPE m", "RPE deg", "scatter mm", "s per sweep"]
 
 
@@ -72,15 +72,9 @@ def case_of(path: Path, odometry: bool, azimuth: bool) -> Case:
         raise ValueError(f"{path}: there is no truth and no poses are stated")
     if not odometry:
         recording = recording.without_odometry()
-    if azimuth and recording.beam_time is None:
-        recording = dataclasses.replace(recording, beam_time=times_from_azimuth(recording))
+    if azimuth:
+        recording = spin.timed(recording, ReadOptions(spin="clockwise", spin_stamp=0.0))
     return Case(path.name, recording, truth, e)
-
-
-def times_from_azimuth(recording: Recording) -> NDArray[np.float32]:
-    """(M,) seconds of a lidar that turns clockwise and looks ahead at the stamp."""
-    azimuth = np.arctan2(recording.points[:, 1], recording.points[:, 0])
-    return np.nan_to_num(-_TURN * azimuth / (2.0 * np.pi)).astype(np.float32)
 
 
 def later(truth: Float, stamp_ns: NDArray[np.int64], seconds: float) -> Float:

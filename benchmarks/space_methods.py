@@ -43,7 +43,7 @@ def of_ours(work: Path, method: str, settings: tuple[str, ...], threads: int, ou
     )
     chosen = options.replaced(stillmap.Options(), {"threads": threads, **changes})
     poses = None if method == ESTIMATED else np.load(work / "poses.npy")
-    recording = stillmap.read(json.loads((work / "case.json").read_text())["source"])
+    recording = stillmap.read(json.loads((work / "case.json").read_text())["source"], chosen.read)
     stages, wall, cpu = Stages(), time.perf_counter(), time.process_time()
     result = stillmap.build(recording, chosen, poses=poses, stages=stages)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu

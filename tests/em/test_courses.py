@@ -173,7 +173,9 @@ def test_rounding_makes_nothing_impossible(monkeypatch):
     )
     monkeypatch.setattr(module, "coverage", lambda _: np.ones(20_000, np.float32))
     found = module.courses_of(looks, em.EmOptions())
-    assert module.static_of(looks, em.EmOptions()).tobytes() == found.p_static.tobytes()
+    static, share = module.static_of(looks, em.EmOptions())
+    assert static.tobytes() == found.p_static.tobytes()
+    assert share == found.share
     for p in (found.p_static, found.p_views, found.p_changing):
         assert p.dtype == np.float32
         assert p.min() >= 0.0

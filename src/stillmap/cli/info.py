@@ -80,13 +80,16 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
     yield from _time(found["time"])
     if found["beam_times_s"] is not None:
         first, last = found["beam_times_s"]
-        yield _row("beam times", f"{first:g} to {last:g} s after a scan's stamp")
+        how = f", as it turns {found['spin']}" if found["spin"] else ""
+        yield _row("beam times", f"{first:g} to {last:g} s after a scan's stamp{how}")
     yield from _odometry(found["odometry"])
     yield from _more(found)
     if found["base_frame"] is not None:
         yield _row("robot's frame", f"{found['base_frame']} ({found['base_frame_how']})")
     for sensor in found["sensors"]:
         yield from _sensor(sensor)
+    for own in found["own_body"]:
+        yield _row("robot itself", _own(own, found))
     yield from _notes(found)
 
 
@@ -166,6 +169,14 @@ def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
             text = f"beams {first} to {last} end on it: unusable up to {limit:g} m"
             yield _row("  robot itself", text)
         yield _row("  zero means", f"{rule['zero_means']}: {rule['zero_how']}")
+
+
+def _own(own: dict[str, Any], found: dict[str, Any]) -> str:
+    """What a lidar sees of its robot."""
+    of = f" of sensor {own['sensor'] + 1}" if len(found["sensors"]) > 1 else ""
+    spans = zip("xyz", own["low"], own["high"], strict=True)
+    where = ", ".join(f"{axis} {low:g} to {high:g}" for axis, low, high in spans)
+    return f"{own['beams']} beams{of} end on it: unusable; {where} m from the sensor"
 
 
 def _notes(found: dict[str, Any]) -> Iterator[str]:

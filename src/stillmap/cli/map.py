@@ -40,6 +40,11 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         help="of the same robot and time, a laser that tilts or pans, in 3D: INPUT, which lies "
         "flat, tells what moves in it (docs/rig.md)",
     )
+    p.add_argument(
+        "--tilting-topic",
+        metavar="TOPIC",
+        help="the same, of scans in the bag INPUT, whose transforms say how their laser moves",
+    )
     p.add_argument("-o", "--output", metavar="DIR", required=True, help="where the result goes")
     p.add_argument("--overwrite", action="store_true", help="replace what is in DIR")
     p.add_argument(
@@ -108,6 +113,8 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
         changes["threads"] = args.threads
     if args.resolution is not None:
         changes["slam"] = {"resolution": args.resolution, "voxel": args.resolution}
+    if args.tilting_topic is not None:
+        changes["read"] = {"tilting_topic": args.tilting_topic}
     output = {"map_mode": args.map_mode, "map_state": args.map_state}
     if chosen := {name: value for name, value in output.items() if value}:
         changes["output"] = chosen

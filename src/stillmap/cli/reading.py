@@ -28,6 +28,11 @@ def add_read_flags(parser: argparse.ArgumentParser) -> None:
         help="what a reading of zero stands for (default: auto)",
     )
     group.add_argument(
+        "--spin",
+        choices=("none", "clockwise", "counter-clockwise"),
+        help="how a lidar turns, seen from above, whose beams have no times (default: found)",
+    )
+    group.add_argument(
         "--topic",
         action="append",
         metavar="TOPIC",
@@ -64,7 +69,7 @@ def read_changes(args: argparse.Namespace) -> dict[str, Any]:
     """The flags that were given, as changes to the options: `{"read": {...}}`, `{}` for none."""
     changes: dict[str, Any] = {
         name: value
-        for name in ("min_range", "max_range", "zero_means", "base_frame", "odom_frame")
+        for name in ("min_range", "max_range", "zero_means", "spin", "base_frame", "odom_frame")
         if (value := getattr(args, name)) is not None
     }
     if args.topic:

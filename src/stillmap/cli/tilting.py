@@ -4,11 +4,15 @@ import argparse
 import dataclasses
 from pathlib import Path
 
+import numpy as np
+
 from stillmap.cli.progress import shown_share
 from stillmap.errors import InputError
 from stillmap.output.points import beam_counts
 from stillmap.pipeline import Options
 from stillmap.recording import Recording, read
+from stillmap.recording.formats import format_of
+from stillmap.recording.lines import Progress
 from stillmap.result import Result
 from stillmap.scene.rig import Flat, Tilting, built_in_3d, require_rig
 from stillmap.threads import resolved_threads
@@ -22,17 +26,45 @@ def read_tilting(
     Raises:
         InputError: it cannot be read, or is not of the same robot and time as the flat one.
     """
-    if not args.tilting:
+    named = options.read.tilting_topic
+    if args.tilting and named is not None:
+        raise InputError("--tilting and --tilting-topic exclude each other")
+    if not args.tilting and named is None:
         return None
     if flat.dimension != 2:
         what = "the laser that decides what moves lies flat, this recording is in 3D"
         raise InputError(what, where=args.input)
-    # what was chosen of one recording is not in the other one
-    read_as = dataclasses.replace(options.read, topic=None)
     with shown_share(args.quiet, "reading") as tell:
-        found = read(Path(args.tilting), read_as, progress=tell, scratch=scratch)
-    require_rig(flat, found, args.tilting)
-    return dataclasses.replace(found, source={**found.source, "path": args.tilting})
+        if named is not None:
+            found = _of_topic(Path(args.input), named, flat, options, tell, scratch)
+        else:
+            # what was chosen of one recording is not in the other one
+            read_as = dataclasses.replace(options.read, topic=None)
+            found = read(Path(args.tilting), read_as, progress=tell, scratch=scratch)
+    path = args.tilting or args.input
+    require_rig(flat, found, path)
+    return dataclasses.replace(found, source={**found.source, "path": path})
+
+
+def _of_topic(
+    path: Path,
+    topic: str,
+    flat: Recording,
+    options: Options,
+    tell: Progress | None,
+    scratch: Path,
+) -> Recording:
+    """The laser that tilts, of the same bag as the flat one, on the same robot."""
+    from stillmap.recording.ros.reading import read_tilting  # types of messages take long to load
+
+    if format_of(path).name != "ROS bag":
+        raise InputError("--tilting-topic is for bags", where=str(path))
+    base = flat.source.get("base_frame")
+    read_as = dataclasses.replace(
+        options.read, topic=topic, tilting_topic=None, base_frame=base if base else None
+    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        return read_tilting(path, read_as, tell, scratch)
 
 
 def built(result: Result, tilting: Recording, options: Options) -> Tilting:

@@ -41,19 +41,21 @@ def facts(recording: Recording) -> dict[str, Any]:
         "hit_ranges_m": _spread(_hit_ranges(recording), ("min", "median", "p99", "max")),
         "time": _time(recording.stamp_ns),
         "beam_times_s": _spread_of_times(recording.beam_time),
+        "spin": source["spin"].get("direction"),
         "odometry": _odometry(recording, source["odometry"]),
         "recorded_poses": _way(recording.T_recorded_base),
         "images": _pictures(recording.images),
         "sensors": _sensors(recording, source["sensors"]),
+        "own_body": [noted for noted in source["own_body"] if _is_box(noted)],
         **{key: source[key] for key in (*_DAMAGE, "skipped_unit", *_TABLES, *_LISTS, *_WORDS)},
     }
 
 
 def _notes(source: dict[str, Any]) -> dict[str, Any]:
     """What the reader noted; notes of another shape than expected (other writers) are left out."""
-    tables = {key: source.get(key) for key in (*_DAMAGE, *_TABLES, "odometry")}
+    tables = {key: source.get(key) for key in (*_DAMAGE, *_TABLES, "odometry", "spin")}
     notes: dict[str, Any] = {k: v if isinstance(v, dict) else {} for k, v in tables.items()}
-    lists = {key: source.get(key) for key in (*_LISTS, "sensors")}
+    lists = {key: source.get(key) for key in (*_LISTS, "sensors", "own_body")}
     notes.update({k: v if isinstance(v, list) else [] for k, v in lists.items()})
     for key in _DAMAGE:
         notes[key] = {
@@ -231,6 +233,15 @@ def _is_rule(noted: Any) -> bool:
 def _is_part(noted: Any) -> bool:
     numbers = list(noted) if isinstance(noted, list | tuple) else []
     return len(numbers) == 3 and all(isinstance(number, float | int) for number in numbers)
+
+
+def _is_box(noted: Any) -> bool:
+    """What a sensor of a 3D recording sees of its robot."""
+    return (
+        isinstance(noted, dict)
+        and all(isinstance(noted.get(key), int) for key in ("sensor", "beams"))
+        and all(_is_part(noted.get(key)) for key in ("low", "high"))
+    )
 
 
 def _field_of_view(

@@ -1,13 +1,14 @@
 """Which reader reads what: the one table of formats."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from stillmap.errors import InputError
-from stillmap.recording import carmen, folder, limits
+from stillmap.recording import carmen, folder, limits, own_body_in_space, spin
 from stillmap.recording.carmen_messages import SCAN_PARSERS
 from stillmap.recording.clouds import e57, kitti, las, pcd, pcd_file, ply, uos
 from stillmap.recording.clouds.files import holds_any, is_named
@@ -123,13 +124,25 @@ def read(
     try:
         # what damaged numbers give is looked at: NumPy need not speak of them as well
         with np.errstate(over="ignore", invalid="ignore"):
-            return format_of(path).read(path, options or ReadOptions(), progress, scratch)
+            options = options or ReadOptions()
+            recording = format_of(path).read(path, options, progress, scratch)
+            if recording.dimension == 3:
+                return _in_space(recording, options, scratch)
+        if options.spin not in ("auto", "none"):
+            raise InputError("read.spin is for 3D recordings, this one is in 2D", where=str(path))
+        return recording
     except OSError as error:
         # files may go, and disks fill up, at any moment
         what = f"cannot be read: {error.strerror or error}"
         raise InputError(what, where=str(error.filename or path)) from error
     except MemoryError as error:
         raise InputError("does not fit into memory", where=str(path)) from error
+
+
+def _in_space(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
+    """What is found out alike of every 3D recording."""
+    recording = spin.timed(replace(recording, scratch=scratch), options)
+    return own_body_in_space.left_out(recording) if options.own_body else recording
 
 
 def format_of(path: Path) -> Format:

@@ -27,7 +27,8 @@ def applied(recording: Recording, options: ReadOptions) -> Recording:
     if options == defaults:
         return recording
     given = {key: value for key, value in vars(options).items() if value != getattr(defaults, key)}
-    named = next((key for key in ("topic", "base_frame", "odom_frame") if key in given), None)
+    of_bags = ("topic", "tilting_topic", "base_frame", "odom_frame")
+    named = next((key for key in of_bags if key in given), None)
     if named is not None:
         raise InputError(f"read.{named} is for bags: this recording has no topics and frames")
     changed = replace(recording, source={**recording.source, "read_options": given})

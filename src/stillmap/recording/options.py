@@ -49,6 +49,23 @@ class ReadOptions:
         True,
         "leave out readings of the robot itself: beams that end at the same place wherever it is",
     )
+    spin: Literal["auto", "none", "clockwise", "counter-clockwise"] = field_with_doc(
+        "auto",
+        "how a lidar whose beams have no times turns, seen from above: clockwise, "
+        "counter-clockwise, none: beams count as taken at once; auto: clockwise for raw drives of "
+        "KITTI, else none",
+    )
+    spin_rate: float | None = field_with_doc(
+        None, "turns per second of that; unset: one from stamp to stamp"
+    )
+    spin_start: float = field_with_doc(
+        math.pi, "rad: direction in which its turns begin, 0 ahead, to the left; behind"
+    )
+    spin_stamp: float | None = field_with_doc(
+        None,
+        "rad: direction in which it looks at a scan's stamp; unset: ahead for KITTI, else where "
+        "turns begin",
+    )
     laser_x: float | None = field_with_doc(
         None, "m: first laser ahead of the robot's centre; unset: found in the recording"
     )
@@ -74,6 +91,9 @@ class ReadOptions:
     topic: str | None = field_with_doc(
         None, "of a bag: topics of the scans to use, with commas; unset: found by type and rate"
     )
+    tilting_topic: str | None = field_with_doc(
+        None, "of a bag: scans of a laser that tilts or pans; they are not for the map"
+    )
     base_frame: str | None = field_with_doc(
         None, "of a bag: the robot's own frame; unset: found in the transforms"
     )
@@ -88,7 +108,14 @@ class ReadOptions:
             value = getattr(self, name)
             if value is not None and not self.min_range < value <= BEYOND:
                 raise ValueError(f"{name} must lie in min_range to {BEYOND:g} m, got {value}")
-        for name in ("topic", "base_frame", "odom_frame"):
+        if self.spin_rate is not None and not 0.0 < self.spin_rate <= 1000.0:
+            raise ValueError(
+                f"spin_rate must lie in 0 to 1000 turns per second, got {self.spin_rate}"
+            )
+        for name in ("spin_start", "spin_stamp"):
+            if getattr(self, name) is not None and not abs(getattr(self, name)) <= 2.0 * math.pi:
+                raise ValueError(f"{name} must lie within a turn, got {getattr(self, name)}")
+        for name in ("topic", "tilting_topic", "base_frame", "odom_frame"):
             if getattr(self, name) is not None and not getattr(self, name).strip():
                 raise ValueError(f"{name} must name something")
         for number, laser in enumerate(("laser", "laser2")):

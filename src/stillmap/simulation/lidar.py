@@ -18,7 +18,6 @@ from stillmap.simulation.solids import BOX, Faces, Part, assembled
 Float = NDArray[np.float64]
 
 ROBOT = -2  # the mover's number of the robot itself
-_ROOF = 0.35  # m, from the lidar down to it
 
 
 class Pattern(NamedTuple):
@@ -182,10 +181,12 @@ def looking(pattern: Pattern, T_world_sensor: Float) -> Rays:
 
 
 def own_body(scene: Scene, pattern: Pattern, T_base_sensor: Float) -> Echoes:
-    """What of the robot itself its lidar sees: a box as long and wide as its footprint."""
+    """What of the robot itself its lidar sees: a box as large as its footprint, or as given."""
     o, radius = scene.lidar, scene.robot.radius
-    top = max(o.z - _ROOF, 0.1)
-    box = assembled([(0, ROBOT, Part(BOX, 0.0, 0.0, (radius, 0.8 * radius), (0.0, top)))])
+    top = max(o.z - o.roof_below, 0.1)
+    ahead = radius if o.roof_length is None else 0.5 * o.roof_length
+    aside = 0.8 * radius if o.roof_width is None else 0.5 * o.roof_width
+    box = assembled([(0, ROBOT, Part(BOX, 0.0, 0.0, (ahead, aside), (0.0, top)))])
     body = box.at(np.zeros((1, 1, 3)), np.zeros((1, 1)))
     nothing = Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool))
     below = Ground.of(GroundOptions(), np.empty((0, 4)))

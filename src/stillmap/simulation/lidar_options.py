@@ -48,6 +48,11 @@ class LidarOptions:
     vibration_pitch: float = field_with_doc(0.0, "rad, the same of its pitch")
     vibration_z: float = field_with_doc(0.0, "m, the same of its height")
     sees_robot: bool = field_with_doc(False, "some beams meet the robot's own roof")
+    roof_length: float | None = field_with_doc(
+        None, "m, of that roof; not set: twice the robot's radius"
+    )
+    roof_width: float | None = field_with_doc(None, "m; not set: 0.8 of that")
+    roof_below: float = field_with_doc(0.35, "m, from the sensor down to it")
 
     def __post_init__(self) -> None:
         require(self.channels >= 0, "channels must not be negative")
@@ -59,6 +64,8 @@ class LidarOptions:
         )
         require(self.max_range > 0, "max_range must be positive")
         require(self.z > 0, "z must be positive")
+        sizes = (self.roof_length, self.roof_width, self.roof_below)
+        require(all(v is None or v > 0 for v in sizes), "roof_... must be positive")
         deviations = (self.range_noise, self.vibration_roll, self.vibration_pitch)
         require(min(*deviations, self.vibration_z) >= 0, "deviations must not be negative")
         for share in (self.no_return_share, self.glass_no_return_share):

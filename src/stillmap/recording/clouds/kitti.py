@@ -1,5 +1,6 @@
 """Folders of KITTI: odometry sequences (`velodyne/`, `times.txt`) and raw drives."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
+from stillmap.recording import spin
 from stillmap.recording.clouds import kitti_calibration, kitti_pictures, kitti_poses
 from stillmap.recording.clouds.assembling import Cloud, Known, Source, assembled
 from stillmap.recording.clouds.files import files_in, require_content
@@ -21,9 +23,10 @@ from stillmap.recording.stamps import seconds_text
 
 MARK = "times.txt"  # every such folder has it
 _RECORD = 16  # bytes of a point: float32 x y z and reflectance
+_RAW = Path("velodyne_points/data")
 _LAYOUTS = (  # sweeps, their times
     (Path("velodyne"), Path("times.txt")),
-    (Path("velodyne_points/data"), Path("velodyne_points/timestamps.txt")),
+    (_RAW, Path("velodyne_points/timestamps.txt")),
 )
 
 
@@ -40,7 +43,8 @@ def read(
 ) -> Recording:
     """Read an odometry sequence or a raw drive; the robot's base is its laser.
 
-    Sweeps are taken as taken at once: KITTI has taken their motion out.
+    KITTI has taken the motion out of the sweeps of its sequences, and not of its drives'. Their
+    laser looks ahead at the stamp, and turns clockwise, whatever its manual says.
 
     Raises:
         InputError: there are no times, or no sweep can be read.
@@ -65,7 +69,12 @@ def read(
         T = None if at is None else poses.get(at)
         cloud = partial(_sweep, file, T) if stamp_ns is not None else partial(_no_time, file)
         sources.append(Source(file.name, cloud, stamp_ns))
-    return assembled(sources, known, options, progress, scratch, images=images)
+    recording = assembled(sources, known, options, progress, scratch, images=images)
+    if options.spin_stamp is None:
+        options = replace(options, spin_stamp=0.0)
+    if options.spin == "auto" and sweeps == _RAW:
+        options = replace(options, spin="clockwise")
+    return spin.timed(recording, options)
 
 
 def _sweep(path: Path, T: NDArray[np.float64] | None) -> Cloud:

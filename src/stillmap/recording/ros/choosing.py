@@ -53,6 +53,8 @@ def chosen_topics(bag: Bag, options: ReadOptions) -> Chosen:
     channels = [c for c in bag.channels if c.n_messages]
     usable = [c for c in channels if unknown(c) is None]
     scans = _named(usable, bag, options) or [c for c in usable if c.type in _SCANS]
+    tilting = _tilting(options)
+    scans = [c for c in scans if c.topic not in tilting]
     if not scans:
         raise InputError(_no_scans(bag.channels), hint=_topics(bag.channels))
     flat = {c.topic for c in scans if c.type != CLOUD}
@@ -70,7 +72,7 @@ def chosen_topics(bag: Bag, options: ReadOptions) -> Chosen:
         images=pictures | by_type.get(CAMERA_INFO, set()) if of_3d else set(),
         notes=[],
     )
-    chosen.notes.extend(_note(c, chosen) for c in bag.channels)
+    chosen.notes.extend(_note(c, chosen, tilting) for c in bag.channels)
     return chosen
 
 
@@ -92,6 +94,12 @@ def _named(usable: list[Channel], bag: Bag, options: ReadOptions) -> list[Channe
     return found
 
 
+def _tilting(options: ReadOptions) -> set[str]:
+    """The topic that is not for the map, as it may be written."""
+    name = options.tilting_topic
+    return set() if name is None else {name, f"/{name}"}
+
+
 def _no_scans(channels: list[Channel]) -> str:
     empty = [c.topic for c in channels if c.type in _SCANS and not c.n_messages]
     odd = [f"{c.topic} {unknown(c)}" for c in channels if c.type in _SCANS and unknown(c)]
@@ -110,7 +118,7 @@ def _topics(channels: list[Channel]) -> str:
     return f"topics with scans: {named}" if of_scans else f"it has {named}"
 
 
-def _note(channel: Channel, chosen: Chosen) -> dict[str, Any]:
+def _note(channel: Channel, chosen: Chosen, tilting: set[str]) -> dict[str, Any]:
     """What became of a topic."""
     reasons = {
         "scans": chosen.lasers | chosen.clouds,
@@ -127,6 +135,8 @@ def _note(channel: Channel, chosen: Chosen) -> dict[str, Any]:
         why = f"read for {used[0]}"
     elif fault:
         why = fault
+    elif channel.topic in tilting:
+        why = "not for the map: its laser tilts"
     elif channel.type == CLOUD:
         why = "not used: the laser scans are (name it to use it instead)"
     elif channel.type in _SCANS:

@@ -16,16 +16,18 @@ from stillmap.recording.extrinsics import Extrinsics
 from stillmap.recording.lines import Progress
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
-from stillmap.recording.ros import base, beams, reading_clouds
+from stillmap.recording.ros import base, beams, reading_clouds, tilting
 from stillmap.recording.ros.bags import open_bag, size_of
 from stillmap.recording.ros.channels import Bag, DamagedError
-from stillmap.recording.ros.choosing import chosen_lasers, chosen_topics
+from stillmap.recording.ros.choosing import chosen_topics
 from stillmap.recording.ros.gathered import Content, content
 from stillmap.recording.ros.lasers import Scans
 from stillmap.recording.ros.unpacking import bounded
+from stillmap.recording.ros.used import loss_warning, used_lasers
 from stillmap.recording.skipped import Skipped
 
-_MANY = 0.05  # share of scans whose loss is worth a warning
+OfLasers = Callable[[Content, ReadOptions, Path | None], Recording]
+
 _STILL = (1e-3, 1e-3)  # m, rad: a sensor that moves less on its robot does not
 
 
@@ -40,6 +42,32 @@ def read(
     Raises:
         InputError: it cannot be read, or holds no usable scan.
     """
+    return _read(path, options, progress, scratch, _of_lasers)
+
+
+def read_tilting(
+    path: Path, options: ReadOptions, progress: Progress | None, scratch: Path | None
+) -> Recording:
+    """Read the scans of a laser that tilts or pans as points in 3D, by the transforms of a bag.
+
+    Args:
+        path: of the bag.
+        options: `topic` names its scans, or clouds made from them; `base_frame` the robot.
+        progress, scratch: as for any recording.
+
+    Raises:
+        InputError: it cannot be read, or nothing says how the laser moves.
+    """
+    return _read(path, options, progress, scratch, tilting.of_laser)
+
+
+def _read(
+    path: Path,
+    options: ReadOptions,
+    progress: Progress | None,
+    scratch: Path | None,
+    of_lasers: OfLasers,
+) -> Recording:
     damaged, size = "", size_of(path)
     for trusted in (True, False):
         try:
@@ -50,6 +78,7 @@ def read(
                     progress,
                     scratch,
                     partial(open_bag, path, scratch, trusted=trusted),
+                    of_lasers,
                 )
         except DamagedError as error:
             damaged = str(error)
@@ -80,7 +109,7 @@ def origins(bag: Bag, options: ReadOptions, scratch: Path | None) -> list[tuple[
     if chosen.clouds:
         raise InputError("holds point clouds: beams of laser scans alone can be blanked")
     found = content(bag, chosen, options, None, scratch)
-    used = _used(found, options)[0]
+    used = used_lasers(found, options)[0]
     stamps = np.concatenate([scans.stamp_ns for scans in used])
     all_of_them = [(scans.topic, int(number)) for scans in used for number in scans.number]
     return [all_of_them[scan] for scan in np.argsort(stamps, kind="stable")]
@@ -92,6 +121,7 @@ def _recording(
     progress: Progress | None,
     scratch: Path | None,
     reopened: Callable[[], Bag],
+    of_lasers: OfLasers,
 ) -> Recording:
     chosen = chosen_topics(bag, options)
     found = content(bag, chosen, options, progress, scratch)
@@ -102,7 +132,7 @@ def _recording(
             lambda base: found.pictures.images(found.transforms, base, reopened),
         )
     else:
-        recording = _of_lasers(found, options, scratch)
+        recording = of_lasers(found, options, scratch)
     recording.source.update(
         topics=chosen.notes,
         skipped_unit="message",
@@ -113,7 +143,7 @@ def _recording(
 
 
 def _of_lasers(found: Content, options: ReadOptions, scratch: Path | None) -> Recording:
-    used, T, placed, skipped, left_out = _used(found, options)
+    used, T, placed, skipped, left_out = used_lasers(found, options)
     options.require_lasers(len(used))
     warnings = [w for s in used for w in s.warnings] + base.words(placed)
     T_base_sensor, sensor, mirrored, infos, more = _sensors(used, T, placed, options)
@@ -130,7 +160,7 @@ def _of_lasers(found: Content, options: ReadOptions, scratch: Path | None) -> Re
         found.transforms, placed.base, found.odometry, stamp_ns, options
     )
     lost = Skipped().merged(*(skipped[topic] for topic in {s.topic for s in used}))
-    warnings += more + _loss_warning(sum(s.n_scans for s in used), lost)
+    warnings += more + loss_warning(sum(s.n_scans for s in used), lost)
     return Recording(
         stamp_ns=stamp_ns,
         offset=all_beams.offset,
@@ -150,45 +180,6 @@ def _of_lasers(found: Content, options: ReadOptions, scratch: Path | None) -> Re
             "warnings": warnings,
         },
     )
-
-
-def _used(
-    found: Content, options: ReadOptions
-) -> tuple[list[Scans], list[NDArray[np.float64]], base.Places, dict[str, Skipped], list[str]]:
-    """The lasers to use, T_base_sensor at their scans, the robot's frame, what was skipped by
-    topic, and words on the lasers that are left out."""
-    lasers, skipped = found.lasers.finished()
-    if not lasers:
-        total = Skipped().merged(*skipped.values())
-        raise InputError(f"holds no usable laser scan: {total.summary('message')}")
-    used, left_out = chosen_lasers(lasers, options.topic is not None)
-    where = base.base_frame(found.transforms, [s.frame for s in used], found.odometry, options)
-    asked = [(s.frame, s.stamp_ns) for s in used]
-    placed = base.places(found.transforms, where, asked)
-    used, T, more = _connected(used, placed, given=options.base_frame is not None)
-    left_out += more
-    return used, T, placed, skipped, left_out
-
-
-def _connected(
-    lasers: list[Scans], placed: base.Places, *, given: bool
-) -> tuple[list[Scans], list[NDArray[np.float64]], list[str]]:
-    """The lasers of which it is known where they sit on the robot, and words on the others."""
-    used: list[Scans] = []
-    T: list[NDArray[np.float64]] = []
-    left_out = []
-    for scans, found in zip(lasers, placed.T_base_sensor, strict=True):
-        if found is None and given and not used:
-            raise InputError(f"nothing says where {scans.frame!r} is in {placed.base!r}")
-        if found is None and used:
-            left_out.append(
-                f"{scans.topic}: {scans.n_scans} scans, nothing says where {scans.frame!r} is on "
-                f"the robot beside {used[0].frame!r} (--topic {scans.topic} takes it instead)"
-            )
-            continue
-        used.append(scans)
-        T.append(np.tile(np.eye(4), (scans.n_scans, 1, 1)) if found is None else found)
-    return used, T, left_out
 
 
 def _sensors(
@@ -256,12 +247,3 @@ def _info(scans: Scans, place: Extrinsics, upside_down: bool, how: str) -> dict[
         "upside_down_how": how,
         "extrinsics": place.to_dict(),
     }
-
-
-def _loss_warning(kept: int, lost: Skipped) -> list[str]:
-    if lost.total <= _MANY * (kept + lost.total):
-        return []
-    return [
-        f"{lost.total} of {kept + lost.total} scans are damaged and were skipped: "
-        f"{lost.summary('message')}"
-    ]
