@@ -29,6 +29,7 @@ def of_las(path: Path) -> np.ndarray:
     read_las = pytest.importorskip("laspy").read(path)
     assert read_las["p_static"].dtype == np.float32
     assert read_las.header.point_count == len(read_las.points)
+    assert read_las.header.global_encoding.wkt
     return np.stack([read_las.x, read_las.y, read_las.z, read_las["p_static"]], axis=1)
 
 

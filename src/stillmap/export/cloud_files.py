@@ -123,6 +123,7 @@ def _write_las(cloud: Cloud, path: Path, packed: bool, tell: Tell | None) -> Non
     head = laspy.LasHeader(point_format=_POINTS, version="1.4")
     head.scales, head.offsets = np.full(3, _SCALE), cloud.origin
     head.add_extra_dim(laspy.ExtraBytesParams("p_static", "float32", "probability to be static"))
+    head.global_encoding.wkt = True  # as LAS 1.4 wants it, also where no place on earth is known
     head.generating_software = "stillmap"
     # the day of writing would make other bytes of the same result
     head.creation_date = date(1970, 1, 1)
