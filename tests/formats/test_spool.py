@@ -8,6 +8,7 @@ import pytest
 
 from stillmap.recording import gathering, spool
 from stillmap.recording.gathering import Gathered
+from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
 
 
@@ -137,3 +138,24 @@ def test_items_in_turn_are_the_same(items, monkeypatch):
     assert got == list(range(items))
     # at first for what was looked at before, and what is left at the end
     assert let_go_after == [*range(0, items, 3), items]
+
+
+@pytest.mark.parametrize(("beams", "together"), [(1, 6), (10, 3), (10_000, 1)])
+def test_large_scans_are_let_go_sooner(beams, together, monkeypatch):
+    monkeypatch.setattr(spool, "BLOCK", 30)
+    monkeypatch.setattr(spool, "TOGETHER", 6)
+    monkeypatch.setattr(Recording, "let_go", lambda _: let_go_after.append(len(got)))
+    got, let_go_after = [], []
+    T = 12
+    recording = Recording(
+        stamp_ns=np.arange(T),
+        offset=beams * np.arange(T + 1),
+        points=np.zeros((beams * T, 3), np.float32),
+        hit=np.ones(beams * T, bool),
+        T_base_sensor=np.eye(4)[None],
+        sensor=np.zeros(T, np.int32),
+        T_odom_base=None,
+    )
+    for t in recording.in_turn(range(T)):
+        got.append(t)
+    assert let_go_after == [*range(0, T, together), T]

@@ -116,9 +116,10 @@ def blocks(*arrays: NDArray[Any], rows: int | None = None) -> Iterator[slice]:
 
 
 def in_turn(
-    items: Iterable[_Item], let_go: Callable[[], None], together: int = TOGETHER
+    items: Iterable[_Item], let_go: Callable[[], None], together: int | None = None
 ) -> Iterator[_Item]:
-    """The same items; after so many what was looked at for them is let go."""
+    """The same items; after so many (TOGETHER) what was looked at for them is let go."""
+    together = together or TOGETHER
     for n, item in enumerate(items):
         if n % together == 0:
             let_go()
