@@ -16,6 +16,7 @@ namespace stillmap {
 template <int D>
 class Crossing {
  public:
+  static constexpr bool kByMarks = true;  // else it visits all elements, marked or not
   using Marks = typename Tiles<D>::Marks;
 
   // A marked cell that is crossed.
@@ -25,7 +26,7 @@ class Crossing {
     Cell<D> cell;
   };
 
-  explicit Crossing(const Tiles<D>& tiles) : tiles_(tiles) {}
+  Crossing(const Surface<D>&, const Tiles<D>& tiles) : tiles_(tiles) {}
 
   // Calls visit(place) for the cells marked in blocks that the segment leaves before it ends.
   template <class Visit>
@@ -60,8 +61,8 @@ class Crossing {
     }
   }
 
-  // number of the block in which the segment ended
-  int32_t last_block() const { return last_; }
+  // the element in the cell in which the segment ended
+  int32_t element_at_end(const Cell<D>& end) { return tiles_.element(last_, end); }
 
  private:
   static constexpr int kEdge = Surface<D>::kEdge;
@@ -157,6 +158,45 @@ class Crossing {
   std::array<std::vector<double>, D> noted_;
   std::array<const double*, D> borders_;
   std::array<std::pair<int32_t, Place>, D * kEdge> found_;
+};
+
+// In a plane things are seldom far from one another: all elements on the way, cell by cell.
+template <>
+class Crossing<2> {
+ public:
+  static constexpr bool kByMarks = false;
+  using Marks = Tiles<2>::Marks;
+
+  struct Place {
+    int32_t element;
+    Cell<2> cell;
+  };
+
+  Crossing(const Surface<2>& surface, const Tiles<2>&) : cursor_(surface) {}
+
+  template <class Visit>
+  void follow(const Vec<2>& start, const Vec<2>& end, const std::vector<Marks>&, Visit&& visit) {
+    const auto cells = (cell_of<2>(end) - cell_of<2>(start)).cwiseAbs().sum();
+    places_.resize(std::max(places_.size(), static_cast<size_t>(cells) + 1));
+    // no branch on whether there is an element: nobody could foresee it
+    Place* next = places_.data();
+    Walker walker(cursor_, [&](const int32_t* k, const Cell<2>& cell) {
+      const int32_t element = k ? *k : kNoElement;
+      *next = {element, cell};
+      next += element != kNoElement;
+    });
+    traverse<2>(start, end, walker);
+    for (const Place* place = places_.data(); place != next; ++place) visit(*place);
+  }
+
+  int32_t element_at_end(const Cell<2>& end) {
+    const auto* block = cursor_.block(end);
+    return block ? block->counts[static_cast<size_t>(Surface<2>::local_of(end))] : kNoElement;
+  }
+
+ private:
+  std::vector<Place> places_;
+  Cursor<const Surface<2>> cursor_;
 };
 
 }  // namespace stillmap

@@ -38,7 +38,7 @@ template <int D>
 inline Lost lost_of(const Surface<D>& surface, const Tiles<D>& tiles, const LookOptions& options,
                     const Scans<D>& scans, size_t first, size_t last) {
   Lost lost;
-  Crossing<D> crossing(tiles);
+  Crossing<D> crossing(surface, tiles);
   for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
     if (scans.hit[n] || !in_a_row(scans, t, n)) return;
     ++lost.beams;
@@ -69,7 +69,7 @@ class LookCollector {
         sheet_(surface.size()),
         touched_(Seen::spans(surface.size())),
         open_(tiles.marks()),
-        crossing_(tiles) {
+        crossing_(surface, tiles) {
     for (size_t k = 0; k < sheet_.size(); ++k)
       sheet_[k] = row_of(surface, static_cast<int32_t>(k), options.normals);
   }
@@ -81,8 +81,7 @@ class LookCollector {
       const bool has_length = pass(beam, scans.hit[n]);
       if (!scans.hit[n]) return;
       const Cell<D> end = cell_of<D>(beam.end);
-      const int32_t k =
-          has_length ? tiles_.element(crossing_.last_block(), end) : tiles_.element(end);
+      const int32_t k = has_length ? crossing_.element_at_end(end) : tiles_.element(end);
       if (k != kNoElement && strike(k)) struck_.push_back(k);
     });
   }
@@ -154,8 +153,10 @@ class LookCollector {
     if (missed == kStruck) return false;
     if (missed == kUntouched) touched_[Seen::span_of(k)].push_back(k);
     missed = kStruck;
-    const Cell<D>& cell = surface_.cell(k);
-    shut(static_cast<size_t>(tiles_.find(Grid<D>::block_of(cell))), cell);
+    if constexpr (Crossing<D>::kByMarks) {
+      const Cell<D>& cell = surface_.cell(k);
+      shut(static_cast<size_t>(tiles_.find(Grid<D>::block_of(cell))), cell);
+    }
     return true;
   }
 
@@ -212,7 +213,8 @@ class LookCollector {
         row.missed = 1.0f;
       }
       row.missed *= 1.0f - met;
-      if (row.missed < kSure) shut(crossed.block, crossed.cell);
+      if constexpr (Crossing<D>::kByMarks)
+        if (row.missed < kSure) shut(crossed.block, crossed.cell);
     }
     return true;
   }

@@ -204,7 +204,7 @@ def _look(recording: Recording, poses: Float, dwell: Dwell, seconds: float, thre
         )
 
 
-def _dwell(surface: Surface, options: DwellOptions, classes: Classes, threads: int) -> Dwell:
+def _dwell(surface: Surface, options: DwellOptions, classes: Classes, threads: int = 1) -> Dwell:
     rho, tau, turn = classes.grid()
     cell, scatter = surface.resolution, surface.scatter
     lengths = {
