@@ -1,7 +1,7 @@
 """What is static in space: labels of sweeps, time and memory, beside other programs in one run.
 
 python benchmarks/space.py [--worlds street ...] [--lidar 64 ...] [--scans 150] [--at-once]
-    [--seeds tuning|reporting] [--n-seeds 1] [--folders DIR ...]
+    [--no-stops] [--seeds tuning|reporting] [--n-seeds 1] [--folders DIR ...]
     [--methods stillmap paper ...] [--estimated-poses] [--peer-python PYTHON]
     [--set section.key=value ...] [--threads 2] [--rounds 1] [--json ROWS] [--read ROWS ...]
 
@@ -77,6 +77,9 @@ def _arguments() -> argparse.Namespace:
     p.add_argument("--columns", type=int, default=1875, help="azimuths per turn")
     p.add_argument("--scans", type=int, default=150, help="of a simulated run")
     p.add_argument(
+        "--no-stops", dest="stops", action="store_false", help="nobody stops now and then"
+    )
+    p.add_argument(
         "--at-once", action="store_true", help="simulate lidars whose turns take no time"
     )
     add_seed_arguments(p)
@@ -99,7 +102,7 @@ def _run(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         options.parse_assignment(text)  # refuses before hours have passed
     methods = chosen_methods(args.methods, args.peer_python is not None, args.estimated_poses)
     lidar = {"sweep": not args.at_once, "columns": args.columns}
-    cases = simulated(args.worlds, args.lidar, seeds_of(args), args.scans, lidar)
+    cases = simulated(args.worlds, args.lidar, seeds_of(args), args.scans, lidar, args.stops)
     cases += [Case(path.name, None, 0, path) for path in args.folders]
     for case in cases:
         with tempfile.TemporaryDirectory() as scratch:
