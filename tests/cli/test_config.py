@@ -61,6 +61,7 @@ def test_places_that_change_have_their_options(capsys):
         "near": 0.5,
         "together": 2.0,
         "least": 4,
+        "in_space": False,
     }
 
 
