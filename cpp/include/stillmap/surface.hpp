@@ -13,49 +13,11 @@
 
 #include "stillmap/beams.hpp"
 #include "stillmap/cell_index.hpp"
+#include "stillmap/element.hpp"
 
 namespace stillmap {
 
 constexpr int32_t kNoElement = CellIndex<2>::kNone;
-
-// Calls visit(cell) for the cells of the cube of that radius around a cell.
-template <int D, class Visit>
-inline void for_each_near(const Cell<D>& centre, int radius, Visit&& visit) {
-  Cell<D> cell = centre.array() - radius;
-  for (;;) {
-    visit(static_cast<const Cell<D>&>(cell));
-    int d = 0;
-    while (d < D && ++cell[d] > centre[d] + radius) {
-      cell[d] = centre[d] - radius;
-      ++d;
-    }
-    if (d == D) return;
-  }
-}
-
-// Everything in units of cells.
-template <int D>
-struct Element {
-  Vec<D> mean = Vec<D>::Zero();    // of the end points in the cell
-  Vec<D> normal = Vec<D>::Zero();  // unit length; zero where the surroundings are no surface
-  double off_plane = 0.0;          // of the cell's centre from the surface around it
-  double prominence = 1.0;         // its beams against those of the richest cell around
-  Vec<D> centre = Vec<D>::Zero();  // of the surface around it, else the mean
-  double half = 0.5;               // how far it extends from there for sure
-};
-
-constexpr int64_t kLastLook = std::numeric_limits<int32_t>::max();
-
-// First and last look at which beams ended in a cell.
-struct Span {
-  int32_t first = static_cast<int32_t>(kLastLook), last = -1;
-
-  void widen(int64_t look) {
-    first = std::min(first, static_cast<int32_t>(look));
-    last = std::max(last, static_cast<int32_t>(look));
-  }
-  int64_t looks() const { return int64_t{last} - first + 1; }
-};
 
 template <int D>
 class Surface : public CellIndex<D> {
@@ -66,7 +28,6 @@ class Surface : public CellIndex<D> {
   static constexpr double kOff = 2.0;     // standard deviations by which a cell is off a surface
   static constexpr double kOffEnd = 3.0;  // scatters by which a single end point is
   static constexpr double kNear = 0.2;    // cells; nearer is on it, however smooth it is
-  static constexpr int kProducts = D * (D + 1) / 2;
 
   using Block = typename CellIndex<D>::Block;
 
@@ -95,7 +56,7 @@ class Surface : public CellIndex<D> {
     for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t t, int64_t n, const Pose<D>& pose) {
       if (!scans.hit[n]) return;
       const Segment<D> beam(pose, scans.points + n * D, resolution_);
-      Sums& sums = add_end_point(beam.end);
+      Sums<D>& sums = add_end_point(beam.end);
       if (look) sums.hit.widen(look[t]);
     });
   }
@@ -135,25 +96,17 @@ class Surface : public CellIndex<D> {
     cells_.reserve(size());
     beams_.reserve(size());
     if (dated_) hits_.reserve(size());
-    for (const Sums& sums : sums_) {
+    for (const Sums<D>& sums : sums_) {
       cells_.push_back(sums.cell);
       beams_.push_back(sums.count);
       if (dated_) hits_.push_back(sums.hit);
     }
-    std::vector<Sums>().swap(sums_);  // as large as all the rest
+    std::vector<Sums<D>>().swap(sums_);  // as large as all the rest
     fitted_ = true;
   }
   bool fitted() const { return fitted_; }
 
  private:
-  struct Sums {
-    Cell<D> cell;
-    int64_t count = 0;
-    std::array<Fixed, D> first{};           // of end point - cell corner
-    std::array<Fixed, kProducts> second{};  // of its products, by rows of the upper triangle
-    Span hit;
-  };
-
   bool lies_off(int32_t k, const Vec<D>& end) const {
     const Element<D>& e = element(k);
     return std::abs(e.normal.dot(end - e.centre)) > kOffEnd * scatter_ + kNear;
@@ -162,7 +115,7 @@ class Surface : public CellIndex<D> {
   // Neighbours get neighbouring numbers, tile by tile, so that a beam in any direction finds them
   // close together in memory.
   void number_by_place() {
-    std::vector<Sums> sorted;
+    std::vector<Sums<D>> sorted;
     sorted.reserve(sums_.size());
     const std::vector<size_t> order = by_tiles();
     for (const auto& block : this->blocks())
@@ -195,7 +148,7 @@ class Surface : public CellIndex<D> {
     return order;
   }
 
-  Sums& add_end_point(const Vec<D>& end) {
+  Sums<D>& add_end_point(const Vec<D>& end) {
     const Cell<D> cell = cell_of<D>(end);
     int32_t& at = this->place_of(cell);
     if (at == kNoElement) {
@@ -203,7 +156,7 @@ class Surface : public CellIndex<D> {
       sums_.emplace_back();
       sums_.back().cell = cell;
     }
-    Sums& sums = sums_[static_cast<size_t>(at)];
+    Sums<D>& sums = sums_[static_cast<size_t>(at)];
     const Vec<D> x = end - cell.template cast<double>();
     ++sums.count;
     size_t product = 0;
@@ -214,7 +167,7 @@ class Surface : public CellIndex<D> {
     return sums;
   }
 
-  static Vec<D> mean_of(const Sums& s) {
+  static Vec<D> mean_of(const Sums<D>& s) {
     Vec<D> mean;
     for (int d = 0; d < D; ++d)
       mean[d] =
@@ -223,32 +176,6 @@ class Surface : public CellIndex<D> {
   }
 
   using Square = Eigen::Matrix<double, D, D>;
-
-  // Count, mean and covariance of the end points in the cells around one.
-  struct Spread {
-    double count = 0.0, most = 0.0;  // in all cells, in one
-    Vec<D> first = Vec<D>::Zero();
-    Square second = Square::Zero();
-
-    void add(const Sums& s, const Cell<D>& about) {
-      const Vec<D> corner = (s.cell - about).template cast<double>();
-      const double n = static_cast<double>(s.count);
-      Vec<D> sum;
-      for (int d = 0; d < D; ++d) sum[d] = from_fixed(s.first[static_cast<size_t>(d)]);
-      Square products;
-      size_t product = 0;
-      for (int i = 0; i < D; ++i)
-        for (int j = i; j < D; ++j)
-          products(i, j) = products(j, i) = from_fixed(s.second[product++]);
-      count += n;
-      most = std::max(most, n);
-      first += sum + n * corner;
-      second += products + corner * sum.transpose() + sum * corner.transpose() +
-                n * corner * corner.transpose();
-    }
-    Vec<D> mean() const { return first / count; }
-    Square covariance() const { return second / count - mean() * mean().transpose(); }
-  };
 
   // Principal axes of the end points within `radius` cells of each element; returns the share of
   // the beams that ended on surfaces.
@@ -279,7 +206,7 @@ class Surface : public CellIndex<D> {
     auto& [all, flat, across] = fitted;
     Cursor<const Surface<D>> cursor(*this);
     for (size_t k = first_element; k < last_element; ++k) {
-      const Spread spread = around(cursor, sums_[k].cell, radius);
+      const Spread<D> spread = around(cursor, sums_[k].cell, radius);
       const Eigen::SelfAdjointEigenSolver<Square> axes(spread.covariance());
       const Vec<D> variance = axes.eigenvalues().cwiseMax(0.0);  // rising
       Element<D>& element = elements_[k];
@@ -308,8 +235,8 @@ class Surface : public CellIndex<D> {
     return fitted;
   }
 
-  Spread around(Cursor<const Surface<D>>& cursor, const Cell<D>& centre, int radius) const {
-    Spread spread;
+  Spread<D> around(Cursor<const Surface<D>>& cursor, const Cell<D>& centre, int radius) const {
+    Spread<D> spread;
     for_each_near<D>(centre, radius, [&](const Cell<D>& cell) {
       const Block* block = cursor.block(cell);
       if (!block) return;
@@ -332,8 +259,8 @@ class Surface : public CellIndex<D> {
   double resolution_;
   double scatter_ = 0.0;
   bool fitted_ = false;
-  bool dated_ = false;      // whether looks were given
-  std::vector<Sums> sums_;  // until it is fitted
+  bool dated_ = false;         // whether looks were given
+  std::vector<Sums<D>> sums_;  // until it is fitted
   std::vector<Element<D>> elements_;
   std::vector<Cell<D>> cells_;
   std::vector<int64_t> beams_;
