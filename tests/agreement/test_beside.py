@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from stillmap import _core, reference
-from stillmap.em.beside import BESIDE
+from stillmap.em.beside import arguments, with_those_beside
+from stillmap.em.options import BesideOptions
+
+BESIDE = arguments(BesideOptions())
 
 
 def surfaces(seed):
@@ -156,3 +159,33 @@ def test_refusals():
     for look in ([1, 2], [-1], [2**31]):
         with pytest.raises(ValueError, match="look"):
             _core.Surface3D(0.3).add_end_points(*one, np.array(look))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("radius", 0.5),
+        ("radius", 9.0),
+        ("coplanar", 0.0),
+        ("for_static", -1.0),
+        ("for_dynamic", 101.0),
+        ("least", 4.0),
+        ("most", 101.0),
+        ("moved", 1.5),
+        ("rounds", -1),
+    ],
+)
+def test_options_that_make_no_sense(name, value):
+    with pytest.raises(ValueError, match=rf"em\.beside\.{name}"):
+        BesideOptions(**{name: value})
+
+
+def test_those_beside_need_not_be_asked():
+    core, _ = surfaces(0)
+    p = np.linspace(0.0, 1.0, core.size).astype(np.float32)
+    assert with_those_beside(p, core, BesideOptions(enabled=False)) is p
+    asked = with_those_beside(p, core, BesideOptions())
+    assert asked.dtype == np.float32
+    assert np.isfinite(asked).all()
+    with pytest.raises(TypeError, match="in space"):
+        with_those_beside(p, _core.Surface2D(0.3), BesideOptions())

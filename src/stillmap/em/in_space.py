@@ -39,7 +39,7 @@ def e_step_in_space(
     static, changing = (
         static_of(looks, options) if courses is None else (courses.p_static, courses.share)
     )
-    static = with_those_beside(static, looks.surface, threads)
+    static = with_those_beside(static, looks.surface, options.beside, threads)
     found = expectations_of(looks, None, recording, poses, options, threads, static)
     return replace(
         found,

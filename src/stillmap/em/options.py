@@ -70,6 +70,39 @@ class ChangeOptions:
 
 
 @dataclass(frozen=True)
+class BesideOptions:
+    """What the voxels beside one tell of it; 3D alone, see em.beside."""
+
+    enabled: bool = field_with_doc(True, "ask them")
+    radius: float = field_with_doc(2.5, "voxels between two that are asked about each other")
+    coplanar: float = field_with_doc(
+        0.2, "voxels, standard deviation of one's mean from the other's plane"
+    )
+    for_static: float = field_with_doc(5.0, "nats that they are worth if all of them are static")
+    for_dynamic: float = field_with_doc(10.0, "nats that they are worth if none of them is")
+    least: float = field_with_doc(-4.0, "nats that its own looks are worth at least")
+    # what was hit for ten seconds in a row is a wall, or waits
+    most: float = field_with_doc(3.0, "nats that its own looks are worth at most")
+    moved: float = field_with_doc(0.1, "change of a probability that those beside hear of")
+    rounds: int = field_with_doc(10, "rounds at most in which they ask each other")
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.radius <= 8.0:
+            raise ValueError("'em.beside.radius' wants 1 to 8 voxels")
+        if not 0.01 <= self.coplanar <= 10.0:
+            raise ValueError("'em.beside.coplanar' wants 0.01 to 10 voxels")
+        for name in ("for_static", "for_dynamic"):
+            if not 0.0 <= getattr(self, name) <= 100.0:
+                raise ValueError(f"'em.beside.{name}' wants 0 to 100 nats")
+        if not -100.0 <= self.least <= self.most <= 100.0:
+            raise ValueError("'em.beside.least' and 'em.beside.most' want -100 to 100 nats, rising")
+        if not 0.0 <= self.moved <= 1.0:
+            raise ValueError("'em.beside.moved' wants 0 to 1")
+        if not 0 <= self.rounds <= 1000:
+            raise ValueError("'em.beside.rounds' wants 0 to 1000")
+
+
+@dataclass(frozen=True)
 class EvidenceOptions:
     """What a place has to be seen by to be known; see em.evidence."""
 
@@ -110,6 +143,7 @@ class EmOptions:
     )
     dwell: DwellOptions = field(default=DwellOptions())
     changes: ChangeOptions = field(default=ChangeOptions())
+    beside: BesideOptions = field(default=BesideOptions())
     evidence: EvidenceOptions = field(default=EvidenceOptions())
     tracker: TrackerOptions = field(default=TrackerOptions())
 
