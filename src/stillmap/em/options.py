@@ -73,7 +73,7 @@ class ChangeOptions:
 class BesideOptions:
     """What the voxels beside one tell of it; 3D alone, see em.beside."""
 
-    enabled: bool = field_with_doc(True, "ask them")
+    enabled: bool = field_with_doc(True, "ask about the voxels beside each")
     radius: float = field_with_doc(2.5, "voxels between two that are asked about each other")
     coplanar: float = field_with_doc(
         0.2, "voxels, standard deviation of one's mean from the other's plane"
