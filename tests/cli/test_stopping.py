@@ -118,7 +118,8 @@ def command():
     hear_signals(command.__code__)
     exec("import greedy")
     print("imported")
-    time.sleep(60)
+    while True:
+        time.sleep(0.01)  # a signal just before a longer one would be heard after it
 try:
     command()
 except KeyboardInterrupt:

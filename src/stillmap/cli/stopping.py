@@ -6,7 +6,6 @@ believes that nobody caught the interrupt. So the signal is sent again until the
 Likewise while points are packed as LAZ: an exception on the way to the file becomes another one.
 """
 
-import os
 import signal
 import sys
 import threading
@@ -26,9 +25,11 @@ def hear_signals(command: CodeType) -> None:
     ignored when we began, as in the background of a shell script, stays ignored.
     """
 
+    main = threading.get_ident()  # Python hears signals in it alone
+
     def heard(number: int, frame: FrameType | None) -> None:
         if _is_at_a_bad_moment(frame, command):
-            again = threading.Timer(_SOON, os.kill, (os.getpid(), number))
+            again = threading.Timer(_SOON, signal.pthread_kill, (main, number))
             again.daemon = True
             again.start()
         elif number == signal.SIGINT:
