@@ -112,14 +112,15 @@ except BaseException:
     print("taken for a missing module")
 """
 PROGRAM = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
 from stillmap.cli.stopping import hear_signals
 def command():
     hear_signals(command.__code__)
     exec("import greedy")
     print("imported")
     while True:
-        time.sleep(0.01)  # a signal just before a longer one would be heard after it
+        time.sleep(0.01)
 try:
     command()
 except KeyboardInterrupt:
