@@ -30,8 +30,8 @@ Index = NDArray[np.intp]
 
 _EDGE = 0.1  # m, of a cell in which returns are from one place
 _ALWAYS = 0.9  # share of places in which something comes back from there
-_HELD = 2.0  # m: so near to the sensor the robot must come that holds it
 _OFTEN = 0.25  # the same of a cell itself; beside it noise may take what is at its border
+_HELD = 2.0  # m: so near to the sensor the robot must come that holds it
 _LOOKED_AT = 200  # scans
 _EVENLY = 50  # of these, as the recording goes on
 _LINE = 0.2  # m, cells of the profile across a direction
@@ -63,8 +63,8 @@ class Body:
 def left_out(recording: Recording) -> Recording:
     """The recording without returns of the robot itself: they are unusable.
 
-    `source["own_body"]` says of which sensors, how many beams, and where in the sensor's place
-    and the robot's axes. What is found is the same whatever the order of beams.
+    `source["own_body"]` says of which sensors, how many beams, and where: from the sensor, along
+    the robot's axes. Scans need not have the same beams, nor any order of them.
 
     Args:
         recording: 3D. It comes back as it is where nothing of the robot shows.
