@@ -4,12 +4,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from stillmap import _core
 
-walls = settings(max_examples=40, deadline=None, derandomize=True, database=None)
 SHIFTS = np.linspace(-0.4, 0.4, 17)  # metres, further than beams are apart on the wall
 
 
@@ -52,24 +49,18 @@ def costs_along(points: Any, slant: float, T: Any, is_filled: bool) -> Any:
     return np.array(out)
 
 
+@pytest.mark.parametrize("number", range(40))
 @pytest.mark.parametrize("D", [2, 3])
-@given(
-    distance=st.floats(3.0, 8.0),
-    slant=st.floats(-0.6, 0.6),
-    heading=st.floats(-3.1, 3.1),
-    x=st.floats(-5.0, 5.0),
-    y=st.floats(-5.0, 5.0),
-    noise=st.sampled_from([0.0, 0.005, 0.01]),
-    seed=st.integers(0, 99),
-)
-@walls
-def test_a_bare_wall_does_not_say_where_along_it(D, distance, slant, heading, x, y, noise, seed):
+def test_a_bare_wall_does_not_say_where_along_it(D, number):
+    """Forty walls by chance; in the plane about one in some hundred is a little beyond a bound."""
+    rng = np.random.default_rng(number)
+    distance, slant, heading = rng.uniform([3.0, -0.6, -3.1], [8.0, 0.6, 3.1])
     T = np.eye(D + 1)
     T[0, :2], T[1, :2] = (np.cos(heading), -np.sin(heading)), (np.sin(heading), np.cos(heading))
-    T[:2, D] = x, y
-    points = one_scan(distance, slant, noise, seed, D)
+    T[:2, D] = rng.uniform(-5.0, 5.0, 2)
+    points = one_scan(distance, slant, rng.choice([0.0, 0.005, 0.01]), number, D)
     bare, filled = (costs_along(points, slant, T, is_filled) for is_filled in (False, True))
     # a scan of 150 beams, each counting a fifth: below 2 nats after filling, 4 and more before
     assert np.ptp(filled) < 0.06
     assert np.ptp(bare) > 0.13
-    assert np.ptp(bare) > 3 * np.ptp(filled)
+    assert np.ptp(bare) > 5 * np.ptp(filled)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -213,26 +214,19 @@ def _dwell(surface: Surface, options: DwellOptions, classes: Classes, threads: i
         "reach": options.reach * scatter + 0.7 * cell,  # half a cell's diagonal
         "beyond": options.beyond,
     }
-    chosen = {"detection": options.detection, "seconds": options.look, **lengths}
+    chosen: dict[str, Any] = {
+        "rho": rho,
+        "tau": tau,
+        "turn": turn,
+        "detection": options.detection,
+        "seconds": options.look,
+        "normals": options.normals,
+        "threads": threads,
+        **lengths,
+    }
     if isinstance(surface, _core.Surface2D):
-        return _core.Dwell2D(
-            surface,
-            rho=rho,
-            tau=tau,
-            turn=turn,
-            normals=options.normals,
-            threads=threads,
-            **chosen,
-        )
-    return _core.Dwell3D(
-        surface,
-        rho=rho,
-        tau=tau,
-        turn=turn,
-        normals=options.normals,
-        threads=threads,
-        **chosen,
-    )
+        return _core.Dwell2D(surface, **chosen)
+    return _core.Dwell3D(surface, **chosen)
 
 
 def _open(recording: Recording, T_map_sensor: Float, dwell: Dwell, threads: int) -> float:
