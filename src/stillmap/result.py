@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from stillmap import _core, em, pipeline, slam
 from stillmap.cautions import cautions
 from stillmap.changes import Change, beams_on_things, changed_places, changed_things, relabelled
+from stillmap.em import Ground, ground_of
 from stillmap.loop import Best, IterationRecord, Loop
 from stillmap.objects import MovingObject, Traffic, moving_objects, traffic
 from stillmap.output.crops import Snapshot
 from stillmap.output.save import save
 from stillmap.pipeline import DEFAULTS, Options, Progress
 from stillmap.recording.model import Recording
-from stillmap.scene.ground import Ground, ground_of
 from stillmap.scene.movers import moving_in_space
 from stillmap.scene.plan import columns_of, plan_of
 from stillmap.stages import Stages

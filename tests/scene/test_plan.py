@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from stillmap import em
+from stillmap.em.ground import Ground
 from stillmap.recording.model import Recording
 from stillmap.scene.band import BandOptions
-from stillmap.scene.ground import Ground
 from stillmap.scene.plan import columns_of, plan_of
 
 BAND = BandOptions(low=0.2, high=1.8)

@@ -18,6 +18,7 @@ from stillmap.em.estimator import (
 )
 from stillmap.em.evidence import Evidence, evidence
 from stillmap.em.expectations import CellProbabilities, Expectations, Grid, Likelihood, NoReturn
+from stillmap.em.ground import Ground, ground_of
 from stillmap.em.held_out import held_out_log_likelihood
 from stillmap.em.last import last_e_step
 from stillmap.em.looks import look_numbers
@@ -38,6 +39,7 @@ __all__ = [
     "EvidenceOptions",
     "Expectations",
     "Grid",
+    "Ground",
     "Likelihood",
     "MapState",
     "NoReturn",
@@ -51,6 +53,7 @@ __all__ = [
     "empty_grid",
     "evidence",
     "fixed_iterations",
+    "ground_of",
     "held_out_log_likelihood",
     "initial_expectations",
     "iterations",

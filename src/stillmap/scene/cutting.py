@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.em import Ground
 from stillmap.recording.model import Recording
 from stillmap.recording.spool import blocks
 from stillmap.recording.stamps import beam_ns
 from stillmap.scene.boxes import Box
-from stillmap.scene.ground import Ground
 from stillmap.scene.riding import Ridden
 from stillmap.scene.rig_options import RigOptions
 

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import se2
+from stillmap.em import Ground
 from stillmap.objects import MovingObject, ObjectOptions, moving_objects
 from stillmap.recording.model import Recording
 from stillmap.recording.spool import Column
-from stillmap.scene.ground import Ground
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em, se2
+from stillmap.em import Ground
 from stillmap.recording.model import Recording
 from stillmap.recording.spool import Column
 from stillmap.scene.band import BandOptions
-from stillmap.scene.ground import Ground
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em
-from stillmap.em import dwell
+from stillmap.em import Ground, dwell, ground_of
 from stillmap.errors import InputError
 from stillmap.objects import MovingObject
 from stillmap.pipeline import Options
@@ -24,7 +24,6 @@ from stillmap.recording.spool import blocks, copied
 from stillmap.result import Result
 from stillmap.scene.boxes import Box, boxes_of
 from stillmap.scene.cutting import Cut, cut_out
-from stillmap.scene.ground import Ground, ground_of
 from stillmap.scene.riding import Ridden, ridden
 from stillmap.scene.rig_options import RigOptions
 

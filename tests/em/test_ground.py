@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.scene.ground import ground_from
+from stillmap.em.ground import ground_from
 
 UP = np.array([0.0, 0.0, 1.0])
 
