@@ -9,6 +9,7 @@ void bind_beams(nanobind::module_& m);
 void bind_register(nanobind::module_& m);
 void bind_dwell(nanobind::module_& m);
 void bind_beside(nanobind::module_& m);
+void bind_bodies(nanobind::module_& m);
 void bind_held_out(nanobind::module_& m);
 void bind_look_counts(nanobind::module_& m);
 void bind_sweep(nanobind::module_& m);

@@ -15,6 +15,7 @@ NB_MODULE(_core, m) {
   stillmap::border::bind_register(m);
   stillmap::border::bind_dwell(m);
   stillmap::border::bind_beside(m);
+  stillmap::border::bind_bodies(m);
   stillmap::border::bind_held_out(m);
   stillmap::border::bind_look_counts(m);
   stillmap::border::bind_sweep(m);

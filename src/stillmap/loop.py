@@ -47,6 +47,7 @@ class Best:
     graph: slam.Graph | None
     no_return: em.NoReturn | None
     changed: em.Changed | None = None
+    ground: em.Ground | None = None
 
     @classmethod
     def of(cls, iteration: Iteration) -> "Best":
@@ -65,6 +66,7 @@ class Best:
             iteration.graph,
             iteration.no_return,
             iteration.changed,
+            iteration.ground,
         )
 
 

@@ -115,7 +115,7 @@ class Iteration:
         held_out: nats per beam, see `em.held_out_log_likelihood`; None where it is not computed.
         seconds: wall clock.
         graph: the pose graph of these loops; None where poses were given or none were looked for.
-        no_return, changed: see `em.Expectations`.
+        no_return, changed, ground: see `em.Expectations`.
     """
 
     number: int
@@ -137,6 +137,7 @@ class Iteration:
     graph: slam.Graph | None = None
     no_return: em.NoReturn | None = None
     changed: em.Changed | None = None
+    ground: em.Ground | None = None
 
     @property
     def reached(self) -> Reached:
@@ -256,6 +257,7 @@ def iterate(
             graph=mapped.graph,
             no_return=found.no_return,
             changed=found.changed,
+            ground=found.ground,
         )
         after = iteration.reached
         del mapped, found, seen  # grids are large: only the caller decides how long one lives

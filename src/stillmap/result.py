@@ -143,7 +143,7 @@ def _result(loop: Loop, recording: Recording, progress: Progress, stages: Stages
     with stages.measure("maps"):
         flat, plan, ground = kept, seen, None
         if seen.dimension == 3:
-            ground = ground_of(seen, kept.poses, kept.p_static, threads)
+            ground = kept.ground or ground_of(seen, kept.poses, kept.p_static, threads)
             flat, plan = _in_plan(kept, seen, ground, options)
         filtered, raw = _maps(flat, plan, options, threads)
     progress("counting looks", 0, 0, 0)

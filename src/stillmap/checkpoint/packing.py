@@ -72,6 +72,9 @@ def _best_packed(best: Best, arrays: Arrays) -> dict[str, Any]:
         values["beyond"] = best.no_return.beyond
     if best.changed is not None:
         arrays |= {f"best.changed.{name}": getattr(best.changed, name) for name in _CHANGED}
+    if best.ground is not None:
+        arrays |= {"best.ground.z": best.ground.z, "best.ground.corner": best.ground.corner}
+        values |= {"sensor_height": best.ground.sensor, "ground_seen": best.ground.seen}
     return {**values, **_way_packed("best", best, arrays)}
 
 
@@ -85,6 +88,10 @@ def _best(values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Best
     changed = None
     if f"best.changed.{_CHANGED[0]}" in arrays:
         changed = em.Changed(**{name: arrays[f"best.changed.{name}"] for name in _CHANGED})
+    ground = None
+    if "sensor_height" in values:
+        z, corner = arrays["best.ground.z"], arrays["best.ground.corner"]
+        ground = em.Ground(z, corner, values["sensor_height"], values["ground_seen"])
     return Best(
         number=number,
         bound=values["bound"],
@@ -94,6 +101,7 @@ def _best(values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Best
         learned=values["learned"],
         no_return=no_return,
         changed=changed,
+        ground=ground,
         **_way("best", values, arrays),
     )
 

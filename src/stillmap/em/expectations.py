@@ -10,6 +10,7 @@ from stillmap import _core
 
 if TYPE_CHECKING:
     from stillmap.em.changed import Changed
+    from stillmap.em.ground import Ground
 
 Grid = _core.Grid2D | _core.Grid3D
 
@@ -66,6 +67,7 @@ class Expectations:
         occupied: cells it knows more of than alpha / (alpha + beta) says.
         learned: what was learned from the recording, JSON-able.
         no_return: how far beams without a return are believed; None: all of their way.
+        ground: how high the ground is, where the estimator knows; None in the plane.
         changed: cells that tell of something that came or left; None in the plane, where the
             last E-step finds them.
     """
@@ -76,6 +78,7 @@ class Expectations:
     learned: dict[str, object] = field(default_factory=dict)
     no_return: NoReturn | None = None
     changed: "Changed | None" = None
+    ground: "Ground | None" = None
 
 
 def per_beam(

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from stillmap import _core
 from stillmap.em.chunks import chunks
+from stillmap.em.looks import Surface, blocks_of
 from stillmap.recording.model import Recording
 
 Float = NDArray[np.float64]
@@ -66,6 +67,24 @@ def ground_of(
     surface.fit(threads)
     _, means, normals, *_ = surface.elements()
     return ground_from(means, normals, T_map_sensor[:, :3, 3])
+
+
+def ground_under(surface: Surface, p_static: NDArray[np.float32], way: Float) -> Ground:
+    """The ground by the elements (E,) of a surface in space that stand still.
+
+    Args:
+        surface: fitted.
+        p_static: (E,) of each element.
+        way: (T, 3) where the sensors were, in the map frame whose z points up.
+    """
+    floor = []
+    for rows in blocks_of(surface):
+        _, means, normals, *_ = surface.elements(rows)
+        level = np.abs(normals[:, 2]) > _LEVEL
+        level &= p_static[slice(*rows)] >= _BELIEVED
+        floor.append((means[level], normals[level]))
+    means, normals = (np.concatenate([np.zeros((0, 3)), *of]) for of in zip(*floor, strict=True))
+    return ground_from(means, normals, way)
 
 
 def ground_from(means: Float, normals: Float, way: Float) -> Ground:

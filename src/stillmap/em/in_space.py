@@ -7,10 +7,12 @@ goes on, is no wall. Whoever removes what moves from a cloud wants the car out, 
 from dataclasses import replace
 
 from stillmap.em.beside import with_those_beside
+from stillmap.em.bodies import with_bodies
 from stillmap.em.changed import changed_of
 from stillmap.em.courses import courses_of, static_of, watch
 from stillmap.em.dwell import e_step, expectations_of
 from stillmap.em.expectations import Expectations
+from stillmap.em.ground import ground_under
 from stillmap.em.looks import Classes, Dwell, Float, looked_at
 from stillmap.em.options import EmOptions
 from stillmap.recording.model import Recording
@@ -40,9 +42,15 @@ def e_step_in_space(
         static_of(looks, options) if courses is None else (courses.p_static, courses.share)
     )
     static = with_those_beside(static, looks.surface, options.beside, threads)
+    T_map_sensor = recording.T_map_sensor(poses)
+    ground = ground_under(looks.surface, static, T_map_sensor[:, :3, 3])
+    static = with_bodies(
+        static, looks.surface, ground, recording, T_map_sensor, options.bodies, threads
+    )
     found = expectations_of(looks, None, recording, poses, options, threads, static)
     return replace(
         found,
         learned={**found.learned, "changing": round(changing, 6)},
         changed=None if courses is None else changed_of(courses),
+        ground=ground,
     )

@@ -103,6 +103,33 @@ class BesideOptions:
 
 
 @dataclass(frozen=True)
+class BodyOptions:
+    """What stands apart in a sweep moves as a whole; 3D alone, see em.bodies."""
+
+    enabled: bool = field_with_doc(True, "ask how much of the body around each voxel moves")
+    low: float = field_with_doc(0.2, "m above the ground from where on things are bodies")
+    high: float = field_with_doc(3.0, "m above the ground up to where they are")
+    column: float = field_with_doc(0.3, "m, edge of the columns that touch within a body")
+    fewest: int = field_with_doc(5, "voxels of a body at least, in a sweep")
+    share: float = field_with_doc(0.25, "mean probability to move from where on all of it does")
+    slope: float = field_with_doc(20.0, "nats by which a voxel moves for each unit above that")
+    most: float = field_with_doc(4.0, "nats for it at most")
+
+    def __post_init__(self) -> None:
+        if not -100.0 <= self.low < self.high <= 100.0:
+            raise ValueError("'em.bodies.low' and 'em.bodies.high' want -100 to 100 metres, rising")
+        if not 0.01 <= self.column <= 100.0:
+            raise ValueError("'em.bodies.column' wants 0.01 to 100 metres")
+        if self.fewest < 1:
+            raise ValueError("'em.bodies.fewest' wants at least 1")
+        if not 0.0 <= self.share <= 1.0:
+            raise ValueError("'em.bodies.share' wants 0 to 1")
+        for name in ("slope", "most"):
+            if not 0.0 <= getattr(self, name) <= 1000.0:
+                raise ValueError(f"'em.bodies.{name}' wants 0 to 1000 nats")
+
+
+@dataclass(frozen=True)
 class EvidenceOptions:
     """What a place has to be seen by to be known; see em.evidence."""
 
@@ -144,6 +171,7 @@ class EmOptions:
     dwell: DwellOptions = field(default=DwellOptions())
     changes: ChangeOptions = field(default=ChangeOptions())
     beside: BesideOptions = field(default=BesideOptions())
+    bodies: BodyOptions = field(default=BodyOptions())
     evidence: EvidenceOptions = field(default=EvidenceOptions())
     tracker: TrackerOptions = field(default=TrackerOptions())
 

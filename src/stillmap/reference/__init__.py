@@ -12,6 +12,7 @@ without a thought for speed. Where beams are taken:
 
 from stillmap.reference.beams import add_beams, add_ends, e_step, log_likelihood
 from stillmap.reference.beside import settled
+from stillmap.reference.bodies import Bodies3D
 from stillmap.reference.changes import ChangeModel, Course, course
 from stillmap.reference.dwell import Dwell, Dwell2D, Dwell3D, Reading, look_at
 from stillmap.reference.em import EmStep, em_fixed_poses, m_step_map
@@ -38,6 +39,7 @@ from stillmap.reference.sweep_map import (
 from stillmap.reference.traverse import cell_of, traverse
 
 __all__ = [
+    "Bodies3D",
     "ChangeModel",
     "Course",
     "Dwell",

@@ -1,0 +1,144 @@
+"""Bodies of sweeps: the core against its plain twin, and by hand."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from stillmap import _core, reference
+
+IDENTITY = np.eye(4)[None]
+
+
+def scattered(seed, n=900, scans=6):
+    """Ends in clumps, on both sides of zero, as many as there are in scans that turn."""
+    rng = np.random.default_rng(seed)
+    middle = rng.uniform(-4, 4, (25, 3)) * [1, 1, 0.3]
+    ends = middle[rng.integers(0, 25, n)] + rng.normal(0, 0.3, (n, 3))
+    T = np.tile(np.eye(4), (scans, 1, 1))
+    T[:, :3, 3] = rng.uniform(-1, 1, (scans, 3))
+    offset = np.linspace(0, n, scans + 1).astype(np.int64)
+    points = ends - np.repeat(T[:, :3, 3], np.diff(offset), axis=0)
+    points[rng.random(n) < 0.02] = np.nan
+    return points.astype(np.float32), rng.random(n) < 0.9, offset, T
+
+
+def surfaces(beams, resolution=0.2):
+    made = []
+    for kernels in (_core, reference):
+        surface = kernels.Surface3D(resolution)
+        surface.add_end_points(*beams)
+        surface.fit()
+        made.append(surface)
+    return made
+
+
+def order(surface):
+    return np.lexsort(surface.elements()[0].T)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("column", "fewest"), [(1, 1), (2, 5), (3, 12)])
+def test_core_and_twin_agree(seed, column, fewest):
+    beams = scattered(seed)
+    core, plain = surfaces(beams)
+    of_core, of_plain = order(core), order(plain)
+    rng = np.random.default_rng(seed + 9)
+    stands, p = rng.random(plain.size) < 0.8, rng.random(plain.size).astype(np.float32)
+    shares = []
+    for kernels, surface, of in ((_core, core, of_core), (reference, plain, of_plain)):
+        mine = np.empty(plain.size, bool), np.empty(plain.size, np.float32)
+        mine[0][of], mine[1][of] = stands, p
+        bodies = kernels.Bodies3D(surface, *mine, column=column, fewest=fewest)
+        bodies.add(*beams)
+        shares.append(bodies.share()[of])
+    np.testing.assert_allclose(shares[0], shares[1], atol=2e-6)
+    known = np.isfinite(shares[1])
+    assert not known[~stands].any()
+    assert known.mean() > 0.3
+    assert np.std(shares[1][known]) > 0.02  # bodies differ
+
+
+def test_threads_and_chunks_change_nothing():
+    points, hit, offset, T = scattered(4, 30000, 60)
+    surface = _core.Surface3D(0.2)
+    surface.add_end_points(points, hit, offset, T)
+    surface.fit()
+    p = np.random.default_rng(1).random(surface.size).astype(np.float32)
+    stands = np.ones(surface.size, bool)
+    found = []
+    for threads, cuts in ((1, (0, 60)), (3, (0, 60)), (2, (0, 7, 31, 60))):
+        bodies = _core.Bodies3D(surface, stands, p, column=1, fewest=2)
+        for a, b in itertools.pairwise(cuts):
+            beams = slice(offset[a], offset[b])
+            within = offset[a : b + 1] - offset[a]
+            bodies.add(points[beams], hit[beams], within, T[a:b], threads)
+        found.append(bodies.share())
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0], found[2])
+
+
+def row_of(*x):
+    """Ends side by side, one in the middle of each cell of a metre."""
+    return np.array([[v + 0.5, 0.5, 0.5] for v in x], np.float32)
+
+
+def share_of(scans, moving, column=1, fewest=1):
+    """By x of each cell: the share of the bodies around it."""
+    points, offset = np.concatenate(scans), np.cumsum([0, *map(len, scans)])
+    hit, T = np.ones(len(points), bool), np.repeat(IDENTITY, len(scans), axis=0)
+    surface = _core.Surface3D(1.0)
+    surface.add_end_points(points, hit, offset, T)
+    surface.fit()
+    x = surface.elements()[0][:, 0]
+    p = np.where(np.isin(x, moving), 0.0, 1.0).astype(np.float32)
+    bodies = _core.Bodies3D(surface, np.ones(len(x), bool), p, column=column, fewest=fewest)
+    bodies.add(points, hit, offset, T)
+    return dict(zip(x.tolist(), bodies.share().tolist(), strict=True))
+
+
+def test_what_is_apart_says_nothing():
+    share = share_of([row_of(0, 1, 2, 3, 5, 6)], moving=[3])
+    assert share == {0: 0.25, 1: 0.25, 2: 0.25, 3: 0.25, 5: 0.0, 6: 0.0}
+
+
+def test_columns_wider_than_a_cell_reach_farther_on_both_sides_of_zero():
+    assert share_of([row_of(-5, -3, -1)], moving=[-5]) == pytest.approx({-5: 1, -3: 0, -1: 0})
+    share = share_of([row_of(-5, -3, -1)], moving=[-5], column=2)
+    assert share == pytest.approx({-5: 1 / 3, -3: 1 / 3, -1: 1 / 3}, abs=1e-6)
+
+
+def test_each_sweep_has_the_same_say():
+    share = share_of([row_of(0, 1), row_of(0), row_of(0), row_of(0)], moving=[1])
+    assert share == {0: 0.125, 1: 0.5}
+
+
+def test_small_bodies_tell_nothing():
+    share = share_of([row_of(0, 1, 2), row_of(0, 1)], moving=[1, 2], fewest=3)
+    assert share == pytest.approx({0: 2 / 3, 1: 2 / 3, 2: 2 / 3}, abs=1e-6)
+    assert np.isnan(list(share_of([row_of(0, 1)], moving=[1], fewest=3).values())).all()
+
+
+def bad(**changes):
+    surface = _core.Surface3D(1.0)
+    surface.add_end_points(row_of(0, 1), np.ones(2, bool), np.array([0, 2]), IDENTITY)
+    if not changes.pop("raw", False):
+        surface.fit()
+    given = {"stands": np.ones(2, bool), "p_static": np.ones(2, np.float32)}
+    return _core.Bodies3D(surface, **{**given, "column": 1, "fewest": 1, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"raw": True}, "fit it first"),
+        ({"stands": np.ones(3, bool)}, "stands: expected one per element"),
+        ({"p_static": np.ones(1, np.float32)}, "p_static: expected one per element"),
+        ({"p_static": np.array([0.5, np.nan], np.float32)}, "p_static: expected a probability"),
+        ({"column": 0}, "column"),
+        ({"fewest": 0}, "fewest"),
+    ],
+)
+def test_refusals(changes, match):
+    with pytest.raises(ValueError, match=match):
+        bad(**changes)

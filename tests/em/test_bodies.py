@@ -1,0 +1,136 @@
+"""What stands apart moves as a whole: a car of which only the front was seen to arrive."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stillmap import _core
+from stillmap.em.bodies import above_ground, lowered, with_bodies
+from stillmap.em.ground import Ground, ground_under
+from stillmap.em.options import BodyOptions
+from stillmap.recording.model import Recording
+
+FLAT = Ground(np.zeros((40, 40)), np.array([-20.0, -20.0]), 1.8, True)
+
+
+def box(x, y, length, width=1.6, height=1.4):
+    """Points on the faces of a box over the ground, 5 cm apart, from 0.3 m on."""
+    u, v = np.arange(0, length, 0.05), np.arange(0.3, height, 0.05)
+    side = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    front = np.stack(np.meshgrid(np.arange(0, width, 0.05), v), axis=-1).reshape(-1, 2)
+    return np.concatenate(
+        [
+            np.column_stack([x + side[:, 0], np.full(len(side), y), side[:, 1]]),
+            np.column_stack([np.full(len(front), x), y + front[:, 0], front[:, 1]]),
+        ]
+    )
+
+
+def standing(*things, scans=3):
+    """A recording that sees the same things in every scan, and its surface."""
+    ground = np.stack(np.meshgrid(*[np.arange(-8, 8, 0.1)] * 2), axis=-1).reshape(-1, 2)
+    ends = np.concatenate([np.column_stack([ground, np.zeros(len(ground))]), *things])
+    n = len(ends)
+    recording = Recording(
+        stamp_ns=np.arange(scans) * 10**8,
+        offset=np.arange(scans + 1) * n,
+        points=np.tile(ends, (scans, 1)).astype(np.float32),
+        hit=np.ones(scans * n, bool),
+        sensor=np.zeros(scans, np.int32),
+        T_base_sensor=np.eye(4)[None],
+        T_odom_base=None,
+    )
+    T = np.tile(np.eye(4), (scans, 1, 1))
+    surface = _core.Surface3D(0.15)
+    surface.add_end_points(recording.points, recording.hit, recording.offset, T)
+    surface.fit()
+    return recording, T, surface
+
+
+def labelled(surface, moving):
+    """P(static) of elements whose means are known to move, and of others."""
+    means = surface.elements()[1]
+    return np.where(moving(means), 0.02, 0.99).astype(np.float32), means
+
+
+CAR, OTHER, WALL = box(2.0, 2.0, 4.0), box(-5.0, 2.0, 4.0), box(-6.0, -5.0, 13.0, height=2.5)
+
+
+def front(means):
+    return (means[:, 0] > 4.0) & (means[:, 1] > 1.9) & (means[:, 2] > 0.2)
+
+
+def test_the_rest_of_a_car_goes_with_its_front_and_nothing_else_does():
+    recording, T, surface = standing(CAR, OTHER, WALL)
+    p, means = labelled(surface, front)
+    found = with_bodies(p, surface, FLAT, recording, T, BodyOptions())
+    car = (means[:, 0] > 1.9) & (means[:, 1] > 1.9) & (means[:, 2] > 0.25)
+    assert (found[car] < 0.5).all()
+    np.testing.assert_array_equal(found[~car], p[~car])
+    assert (p[car] > 0.5).mean() > 0.4  # before
+
+
+def test_too_little_of_it_moves():
+    recording, T, surface = standing(CAR)
+    p, _ = labelled(surface, lambda means: front(means) & (means[:, 0] > 5.5))
+    np.testing.assert_array_equal(with_bodies(p, surface, FLAT, recording, T, BodyOptions()), p)
+
+
+def test_who_touches_a_wall_leaves_it_there():
+    person = box(0.0, -4.9, 0.4, width=0.3, height=1.8)
+    recording, T, surface = standing(WALL, person)
+    p, _ = labelled(
+        surface, lambda m: (m[:, 0] > -0.1) & (m[:, 0] < 0.5) & (m[:, 1] > -4.92) & (m[:, 2] > 0.2)
+    )
+    assert (p < 0.5).sum() > 10
+    np.testing.assert_array_equal(with_bodies(p, surface, FLAT, recording, T, BodyOptions()), p)
+
+
+@pytest.mark.parametrize(
+    ("options", "ground"),
+    [(BodyOptions(enabled=False), FLAT), (BodyOptions(), dataclasses.replace(FLAT, seen=False))],
+)
+def test_left_out(options, ground):
+    recording, T, surface = standing(CAR)
+    p, _ = labelled(surface, front)
+    assert with_bodies(p, surface, ground, recording, T, options) is p
+
+
+def test_ground_and_crowns_are_no_bodies():
+    crown = np.random.default_rng(0).uniform([-2, -2, 3.5], [2, 2, 5], (2000, 3))
+    _, _, surface = standing(CAR, crown)
+    z = surface.elements()[1][:, 2]
+    stands = above_ground(surface, FLAT, 0.2, 3.0)
+    np.testing.assert_array_equal(stands, (z > 0.2) & (z < 3.0))
+    assert 100 < stands.sum() < len(z)
+
+
+def test_ground_under_what_stands_still():
+    _, T, surface = standing(CAR)
+    T[:, :3, 3] = [0.0, 0.0, 1.8]
+    means = surface.elements()[1]
+    low = means[:, 2] < 0.1
+    ground = ground_under(surface, np.ones(len(means), np.float32), T[:, :3, 3])
+    assert ground.seen
+    assert ground.sensor == pytest.approx(1.8, abs=0.02)
+    np.testing.assert_allclose(ground.at(means[low, :2]), 0.0, atol=0.02)
+    unknown = ground_under(surface, np.where(low, 0.1, 1.0).astype(np.float32), T[:, :3, 3])
+    assert not unknown.seen or unknown.sensor < 1.0  # roofs at most
+
+
+def test_how_far_it_is_lowered():
+    p = np.array([0.9, 0.9, 0.9, 0.9, 0.3, 0.9, 0.52], np.float32)
+    share = np.array([np.nan, 0.2, 0.3, 1.0, 1.0, 0.25, 0.251], np.float32)
+    found = lowered(p, share, BodyOptions(share=0.25, slope=20.0, most=4.0))
+    odds = [1 / (1 + np.exp(1.0)), 1 / (1 + np.exp(4.0)), 1 / (1 + np.exp(0.02))]
+    np.testing.assert_allclose(found, [0.9, 0.9, odds[0], odds[1], 0.3, 0.9, odds[2]], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"low": 4.0}, {"column": 0.0}, {"fewest": 0}, {"share": 1.5}, {"slope": -1.0}, {"most": 1e9}],
+)
+def test_options_are_checked(bad):
+    with pytest.raises(ValueError, match=r"em\.bodies"):
+        BodyOptions(**bad)
