@@ -25,6 +25,7 @@ WORLDS = ("street", "street-jam", "crossing", "street-turn", "hall", "corridor",
 NEAREST, FARTHEST = 2.5, 50.0  # m: nearer is the car itself, farther nobody is judged
 NOBODY = "static"
 LASTING = ("door", "thing")  # stand still for so long that they may be seen in one state only
+_STOOD, _FACED = 0.5, 0.2  # m, rad: who moves less while he is met stands still
 _MOVING, _STATIC = 252, 9  # labels of SemanticKITTI; all others are not scored
 
 
@@ -54,12 +55,15 @@ class Known:
         kind: (M,) number of what it met in `kinds`.
         scored: (M,) whether that counts: it is known, and not the robot itself.
         kinds: names of what moves, then NOBODY.
+        stood: (M,) whether what it met stood still as long as any beam met it; no recording tells
+            that it ever moves. Not known of labels in files: never.
     """
 
     static: NDArray[np.bool_]
     kind: NDArray[np.int16]
     scored: NDArray[np.bool_]
     kinds: list[str]
+    stood: NDArray[np.bool_]
 
 
 def simulated(
@@ -88,14 +92,17 @@ def prepare(case: Case, work: Path) -> dict[str, Any]:
     if case.changes is not None:
         scene = scene_by_name(case.name.split(",")[0], case.changes)
         write_simulation(simulate(scene, case.seed), work / "recording")
-        truth = load_truth(work / "recording")
-        source, poses, known = work / "recording", truth.T_world_base, known_of(truth)
+        source = work / "recording"
     elif case.folder is not None:
-        source, poses = case.folder.resolve(), lidar_poses(case.folder / "poses_lidar.txt")
-        known = labelled(case.folder / "labels")
+        source = case.folder.resolve()
     else:
         raise ValueError(f"{case.name}: neither simulated nor there")
     recording = stillmap.read(source)
+    if case.folder is None:
+        truth = load_truth(source)
+        poses, known = truth.T_world_base, known_of(truth, recording.offset)
+    else:
+        poses, known = lidar_poses(source / "poses_lidar.txt"), labelled(source / "labels")
     if len(known.static) != recording.n_beams or len(poses) != recording.n_scans:
         raise SystemExit(f"{source}: labels or poses are not those of its sweeps")
     np.save(work / "poses.npy", poses)
@@ -104,16 +111,32 @@ def prepare(case: Case, work: Path) -> dict[str, Any]:
     np.save(work / "beam.npy", beam)
     np.save(work / "static.npy", known.static[beam])
     np.save(work / "kind.npy", known.kind[beam])
+    np.save(work / "stood.npy", known.stood[beam])
     np.save(work / "scored.npy", known.scored[beam] & near)
     return {"sweeps": recording.n_scans, "beams": recording.n_beams, "given": len(beam)}
 
 
-def known_of(truth: Truth) -> Known:
-    """The truth of a simulation."""
+def known_of(truth: Truth, offset: NDArray[np.int64]) -> Known:
+    """The truth of a simulation whose scans t have the beams offset[t] to offset[t + 1]."""
     of_movers = list(truth.scene["mover_kinds"])
     kinds = [*dict.fromkeys(of_movers), NOBODY]
     number = np.array([*(kinds.index(k) for k in of_movers), len(kinds) - 1], np.int16)
-    return Known(truth.static, number[np.maximum(truth.mover, -1)], truth.mover >= -1, kinds)
+    kind = number[np.maximum(truth.mover, -1)]
+    return Known(truth.static, kind, truth.mover >= -1, kinds, stood_still(truth, offset))
+
+
+def stood_still(truth: Truth, offset: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(M,) whether what a beam met stood still from the first scan to the last that met it."""
+    scan = np.repeat(np.arange(len(offset) - 1), np.diff(offset))
+    stood = np.zeros(len(of_movers := truth.scene["mover_kinds"]) + 1, np.bool_)
+    for m in range(len(of_movers)):
+        met = scan[truth.mover == m]
+        if len(met):
+            way = truth.movers[met[0] : met[-1] + 1, m]
+            gone = np.linalg.norm(way[:, :2] - way[0, :2], axis=1)
+            turned = np.abs(way[:, 2] - way[0, 2])
+            stood[m] = np.nanmax(gone) < _STOOD and np.nanmax(turned) < _FACED
+    return stood[np.maximum(truth.mover, -1)]
 
 
 def labelled(folder: Path) -> Known:
@@ -121,7 +144,8 @@ def labelled(folder: Path) -> Known:
     labels = np.concatenate([np.fromfile(f, np.uint32) for f in sorted(folder.glob("*.label"))])
     meaning = labels & 0xFFFF  # the upper half numbers instances
     moves, static = meaning == _MOVING, meaning == _STATIC
-    return Known(static, np.where(moves, 0, 1).astype(np.int16), moves | static, ["moving", NOBODY])
+    kind = np.where(moves, 0, 1).astype(np.int16)
+    return Known(static, kind, moves | static, ["moving", NOBODY], np.zeros(len(kind), np.bool_))
 
 
 def lidar_poses(path: Path) -> Float:
@@ -162,5 +186,7 @@ def write_given(
 def known_of_given(work: Path) -> Known:
     """The truth (K,) of the beams that all were given."""
     kinds = json.loads((work / "case.json").read_text())["kinds"]
-    static, kind, scored = (np.load(work / f"{n}.npy") for n in ("static", "kind", "scored"))
-    return Known(static, kind, scored, kinds)
+    static, kind, scored, stood = (
+        np.load(work / f"{name}.npy") for name in ("static", "kind", "scored", "stood")
+    )
+    return Known(static, kind, scored, kinds, stood)

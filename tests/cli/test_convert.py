@@ -154,6 +154,7 @@ def test_without_pyarrow_there_are_no_tables(call, mapped, tmp_path, monkeypatch
 def test_what_a_result_cannot_become(call, room, mapped, tmp_path, nothing_left):
     refused(call("convert", mapped, "-o", tmp_path / "a.log"), "as a CARMEN log", "filter")
     refused(call("convert", mapped, "-o", tmp_path / "a"), "as a recording folder")
+    refused(call("convert", mapped, "-o", tmp_path / "a.xyz"), "'.xyz'", ".mcap", ".e57", ".pcd")
     refused(call("convert", mapped, "-o", tmp_path / "a.mcap", "--min-range", 1), "no flags")
     for output in (mapped, mapped.parent, room):
         done = call("convert", mapped, "-o", output, "--overwrite", "--to", "ros2")

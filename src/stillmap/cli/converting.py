@@ -68,15 +68,16 @@ def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tup
         seen = _seen(mapped, exported.recording, exported.poses)
         beam_table.write(exported, seen, output)
         return [], f"{exported.recording.n_beams} beams"
-    writer = writers.writer_for(output, args.to)
+    hint = f"a bag, .mcap for Foxglove, {_PARQUET}, or in 3D {_clouds()}"
+    try:
+        writer = writers.writer_for(output, args.to)
+    except InputError as error:
+        raise InputError(error.what, where=str(output), hint=hint) from error
     kind = next((kind for kind in get_args(ros_writing.Kind) if kind == writer.name), None)
     if kind is None:
-        raise InputError(
-            f"a result cannot be written as {writer.about}",
-            where=str(output),
-            hint=f"a bag, .mcap for Foxglove, {_PARQUET}, or in 3D {_clouds()}; recordings come of "
-            "`stillmap filter`",
-        )
+        text = f"a result cannot be written as {writer.about}"
+        more = "; recordings come of `stillmap filter`"
+        raise InputError(text, where=str(output), hint=hint + more)
     writers.require_free(output, writer, args.overwrite)
     exported = _exported(mapped)
     lost = bag.write(exported, output, kind, overwrite=args.overwrite)
