@@ -7,17 +7,21 @@
 namespace stillmap::border {
 namespace {
 
-void make(Bodies* self, const Surface<3>& surface, const Flat<bool>& stands,
-          const Flat<float>& p_static, int column, int64_t fewest) {
-  const size_t n = surface.size();
+using Values = nb::ndarray<const float, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+
+constexpr float kMost = 1e6f;
+
+void make(Bodies* self, const Surface<3>& surface, const Flat<bool>& stands, const Values& values,
+          int column, int64_t fewest) {
+  const size_t n = surface.size(), kinds = values.shape(1);
   require(surface.fitted(), "surface: fit it first");
   require(stands.shape(0) == n, "stands: expected one per element");
-  require(p_static.shape(0) == n, "p_static: expected one per element");
-  for (size_t k = 0; k < n; ++k)
-    require_probability(static_cast<double>(p_static.data()[k]), "p_static");
+  require(values.shape(0) == n && kinds > 0, "values: expected a row per element");
+  for (size_t i = 0; i < n * kinds; ++i)
+    require(std::abs(values.data()[i]) <= kMost, "values: expected -1e6 to 1e6");
   require(column >= 1 && column <= 1 << 20, "column: expected 1 to 1048576 cells");
   require(fewest >= 1, "fewest: expected at least 1");
-  new (self) Bodies(surface, stands.data(), p_static.data(), {column, fewest});
+  new (self) Bodies(surface, stands.data(), values.data(), kinds, {column, fewest});
 }
 
 void add(Bodies& bodies, const Points<3>& points, const Flat<bool>& hit,
@@ -27,27 +31,28 @@ void add(Bodies& bodies, const Points<3>& points, const Flat<bool>& hit,
   bodies.add(scans, threads);
 }
 
-auto share(const Bodies& bodies) {
-  auto out = bodies.share();
-  const size_t n = out.size();
-  return owned(std::move(out), {n});
+auto means(const Bodies& bodies) {
+  auto out = bodies.means();
+  const size_t kinds = bodies.kinds(), n = out.size() / kinds;
+  return owned(std::move(out), {n, kinds});
 }
 
 }  // namespace
 
 void bind_bodies(nb::module_& m) {
-  nb::class_<Bodies>(m, "Bodies3D", "What stands apart in each sweep, and how much of it moves.")
+  nb::class_<Bodies>(m, "Bodies3D", "What stands apart in each sweep, and what is known of it.")
       .def("__init__", &make, nb::arg("surface"), nb::arg("stands").noconvert(),
-           nb::arg("p_static").noconvert(), nb::kw_only(), nb::arg("column"), nb::arg("fewest"),
+           nb::arg("values").noconvert(), nb::kw_only(), nb::arg("column"), nb::arg("fewest"),
            nb::keep_alive<1, 2>(),
-           "stands (E,): of which elements bodies consist; p_static (E,) float32. Columns of that "
-           "many cells touch within a body, which has that many elements at least.")
+           "stands (E,): of which elements bodies consist; values (E, K) float32: what is known of "
+           "each. Columns of that many cells touch within a body, which has that many elements at "
+           "least.")
       .def("add", &add, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            nb::arg("threads") = 1, "Each scan is a sweep.")
-      .def("share", &share,
-           "(E,) float32: mean probability to move of the body around each element, mean over the "
-           "sweeps that saw it; NaN where none did.");
+      .def("means", &means,
+           "(E, K) float32: mean value of the body around each element, mean over the sweeps that "
+           "saw it; NaN where none did.");
 }
 
 }  // namespace stillmap::border

@@ -44,16 +44,17 @@ def test_core_and_twin_agree(seed, column, fewest):
     core, plain = surfaces(beams)
     of_core, of_plain = order(core), order(plain)
     rng = np.random.default_rng(seed + 9)
-    stands, p = rng.random(plain.size) < 0.8, rng.random(plain.size).astype(np.float32)
+    stands, values = rng.random(plain.size) < 0.8, rng.normal(0, 2, (plain.size, 2))
     shares = []
     for kernels, surface, of in ((_core, core, of_core), (reference, plain, of_plain)):
-        mine = np.empty(plain.size, bool), np.empty(plain.size, np.float32)
-        mine[0][of], mine[1][of] = stands, p
+        mine = np.empty(plain.size, bool), np.empty((plain.size, 2), np.float32)
+        mine[0][of], mine[1][of] = stands, values
         bodies = kernels.Bodies3D(surface, *mine, column=column, fewest=fewest)
         bodies.add(*beams)
-        shares.append(bodies.share()[of])
-    np.testing.assert_allclose(shares[0], shares[1], atol=2e-6)
-    known = np.isfinite(shares[1])
+        shares.append(bodies.means()[of])
+    assert shares[0].dtype == np.float32
+    np.testing.assert_allclose(shares[0], shares[1], atol=3e-6)
+    known = np.isfinite(shares[1]).all(axis=1)
     assert not known[~stands].any()
     assert known.mean() > 0.3
     assert np.std(shares[1][known]) > 0.02  # bodies differ
@@ -64,16 +65,16 @@ def test_threads_and_chunks_change_nothing():
     surface = _core.Surface3D(0.2)
     surface.add_end_points(points, hit, offset, T)
     surface.fit()
-    p = np.random.default_rng(1).random(surface.size).astype(np.float32)
+    values = np.random.default_rng(1).random((surface.size, 1)).astype(np.float32)
     stands = np.ones(surface.size, bool)
     found = []
     for threads, cuts in ((1, (0, 60)), (3, (0, 60)), (2, (0, 7, 31, 60))):
-        bodies = _core.Bodies3D(surface, stands, p, column=1, fewest=2)
+        bodies = _core.Bodies3D(surface, stands, values, column=1, fewest=2)
         for a, b in itertools.pairwise(cuts):
             beams = slice(offset[a], offset[b])
             within = offset[a : b + 1] - offset[a]
             bodies.add(points[beams], hit[beams], within, T[a:b], threads)
-        found.append(bodies.share())
+        found.append(bodies.means())
     np.testing.assert_array_equal(found[0], found[1])
     np.testing.assert_array_equal(found[0], found[2])
 
@@ -91,10 +92,10 @@ def share_of(scans, moving, column=1, fewest=1):
     surface.add_end_points(points, hit, offset, T)
     surface.fit()
     x = surface.elements()[0][:, 0]
-    p = np.where(np.isin(x, moving), 0.0, 1.0).astype(np.float32)
-    bodies = _core.Bodies3D(surface, np.ones(len(x), bool), p, column=column, fewest=fewest)
+    moves = np.isin(x, moving).astype(np.float32)[:, None]
+    bodies = _core.Bodies3D(surface, np.ones(len(x), bool), moves, column=column, fewest=fewest)
     bodies.add(points, hit, offset, T)
-    return dict(zip(x.tolist(), bodies.share().tolist(), strict=True))
+    return dict(zip(x.tolist(), bodies.means()[:, 0].tolist(), strict=True))
 
 
 def test_what_is_apart_says_nothing():
@@ -124,7 +125,7 @@ def bad(**changes):
     surface.add_end_points(row_of(0, 1), np.ones(2, bool), np.array([0, 2]), IDENTITY)
     if not changes.pop("raw", False):
         surface.fit()
-    given = {"stands": np.ones(2, bool), "p_static": np.ones(2, np.float32)}
+    given = {"stands": np.ones(2, bool), "values": np.ones((2, 1), np.float32)}
     return _core.Bodies3D(surface, **{**given, "column": 1, "fewest": 1, **changes})
 
 
@@ -133,8 +134,9 @@ def bad(**changes):
     [
         ({"raw": True}, "fit it first"),
         ({"stands": np.ones(3, bool)}, "stands: expected one per element"),
-        ({"p_static": np.ones(1, np.float32)}, "p_static: expected one per element"),
-        ({"p_static": np.array([0.5, np.nan], np.float32)}, "p_static: expected a probability"),
+        ({"values": np.ones((1, 2), np.float32)}, "values: expected a row per element"),
+        ({"values": np.ones((2, 0), np.float32)}, "values: expected a row per element"),
+        ({"values": np.array([[0.5], [np.nan]], np.float32)}, "values: expected -1e6"),
         ({"column": 0}, "column"),
         ({"fewest": 0}, "fewest"),
     ],

@@ -64,17 +64,33 @@ def front(means):
 def test_the_rest_of_a_car_goes_with_its_front_and_nothing_else_does():
     recording, T, surface = standing(CAR, OTHER, WALL)
     p, means = labelled(surface, front)
-    found = with_bodies(p, surface, FLAT, recording, T, BodyOptions())
+    found = with_bodies(p, 0 * p, surface, FLAT, recording, T, BodyOptions())
     car = (means[:, 0] > 1.9) & (means[:, 1] > 1.9) & (means[:, 2] > 0.25)
     assert (found[car] < 0.5).all()
     np.testing.assert_array_equal(found[~car], p[~car])
     assert (p[car] > 0.5).mean() > 0.4  # before
 
 
+def test_what_all_of_it_says_a_little_it_says_loudly():
+    recording, T, surface = standing(CAR, OTHER, WALL)
+    p, means = labelled(surface, lambda means: np.zeros(len(means), bool))
+    car = (means[:, 0] > 1.9) & (means[:, 1] > 1.9) & (means[:, 2] > 0.25)
+    noise = np.random.default_rng(0).normal(0.0, 1.0, len(p))
+    change = (noise + np.where(car, 1.6, -0.3)).astype(np.float32)
+    assert (change[~car] > 1.6).sum() > 20  # elsewhere some say more, alone
+    found = with_bodies(p, change, surface, FLAT, recording, T, BodyOptions())
+    assert (found[car] < 0.5).all()
+    np.testing.assert_array_equal(found[~car], p[~car])
+    calm = with_bodies(p, change - 0.9, surface, FLAT, recording, T, BodyOptions())
+    np.testing.assert_array_equal(calm, p)
+
+
 def test_too_little_of_it_moves():
     recording, T, surface = standing(CAR)
     p, _ = labelled(surface, lambda means: front(means) & (means[:, 0] > 5.5))
-    np.testing.assert_array_equal(with_bodies(p, surface, FLAT, recording, T, BodyOptions()), p)
+    np.testing.assert_array_equal(
+        with_bodies(p, 0 * p, surface, FLAT, recording, T, BodyOptions()), p
+    )
 
 
 def test_who_touches_a_wall_leaves_it_there():
@@ -84,7 +100,9 @@ def test_who_touches_a_wall_leaves_it_there():
         surface, lambda m: (m[:, 0] > -0.1) & (m[:, 0] < 0.5) & (m[:, 1] > -4.92) & (m[:, 2] > 0.2)
     )
     assert (p < 0.5).sum() > 10
-    np.testing.assert_array_equal(with_bodies(p, surface, FLAT, recording, T, BodyOptions()), p)
+    np.testing.assert_array_equal(
+        with_bodies(p, 0 * p, surface, FLAT, recording, T, BodyOptions()), p
+    )
 
 
 @pytest.mark.parametrize(
@@ -94,7 +112,7 @@ def test_who_touches_a_wall_leaves_it_there():
 def test_left_out(options, ground):
     recording, T, surface = standing(CAR)
     p, _ = labelled(surface, front)
-    assert with_bodies(p, surface, ground, recording, T, options) is p
+    assert with_bodies(p, 0 * p, surface, ground, recording, T, options) is p
 
 
 def test_ground_and_crowns_are_no_bodies():
@@ -120,16 +138,28 @@ def test_ground_under_what_stands_still():
 
 
 def test_how_far_it_is_lowered():
-    p = np.array([0.9, 0.9, 0.9, 0.9, 0.3, 0.9, 0.52], np.float32)
-    share = np.array([np.nan, 0.2, 0.3, 1.0, 1.0, 0.25, 0.251], np.float32)
-    found = lowered(p, share, BodyOptions(share=0.25, slope=20.0, most=4.0))
-    odds = [1 / (1 + np.exp(1.0)), 1 / (1 + np.exp(4.0)), 1 / (1 + np.exp(0.02))]
-    np.testing.assert_allclose(found, [0.9, 0.9, odds[0], odds[1], 0.3, 0.9, odds[2]], rtol=1e-4)
+    p = np.array([0.9, 0.9, 0.9, 0.9, 0.3, 0.9, 0.52, 0.9, 0.9], np.float32)
+    moves = [np.nan, 0.2, 0.3, 1.0, 1.0, 0.25, 0.251, 0.0, 0.3]
+    change = [np.nan, 0.9, 0.0, -4.0, 4.0, 1.0, 0.0, 1.1, 4.0]
+    means = np.array([moves, change], np.float32).T
+    found = lowered(p, means, BodyOptions(share=0.25, change=1.0, slope=20.0, most=4.0))
+    nats = np.array([1.0, 4.0, 0.02, 2.0, 4.0])
+    np.testing.assert_allclose(found[[2, 3, 6, 7, 8]], 1 / (1 + np.exp(nats)), rtol=1e-4)
+    kept = [0, 1, 4, 5]
+    np.testing.assert_array_equal(found[kept], p[kept])
 
 
 @pytest.mark.parametrize(
     "bad",
-    [{"low": 4.0}, {"column": 0.0}, {"fewest": 0}, {"share": 1.5}, {"slope": -1.0}, {"most": 1e9}],
+    [
+        {"low": 4.0},
+        {"column": 0.0},
+        {"fewest": 0},
+        {"share": 1.5},
+        {"change": -1.0},
+        {"slope": -1.0},
+        {"most": 1e9},
+    ],
 )
 def test_options_are_checked(bad):
     with pytest.raises(ValueError, match=r"em\.bodies"):

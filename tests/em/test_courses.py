@@ -173,9 +173,12 @@ def test_rounding_makes_nothing_impossible(monkeypatch):
     )
     monkeypatch.setattr(module, "coverage", lambda _: np.ones(20_000, np.float32))
     found = module.courses_of(looks, em.EmOptions())
-    static, share = module.static_of(looks, em.EmOptions())
+    static, change, share = module.told_of(looks, em.EmOptions())
     assert static.tobytes() == found.p_static.tobytes()
     assert share == found.share
+    always = likelihood[:, 0]  # the only static class of these that is met from all around
+    np.testing.assert_allclose(change, np.clip(changes[0] - np.log(always), -4, 4), atol=1e-4)
+    assert np.ptp(change) == 8.0
     for p in (found.p_static, found.p_views, found.p_changing):
         assert p.dtype == np.float32
         assert p.min() >= 0.0

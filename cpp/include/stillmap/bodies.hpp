@@ -1,4 +1,4 @@
-// What stands apart from all else in a sweep is one body: how much of it is known to move.
+// What stands apart from all else in a sweep is one body: what is known of its parts, on average.
 //
 // Elements that beams of a sweep ended in are of one body where the columns over the ground that
 // they stand in touch. Sums over sweeps are integers, so that their order does not matter. See
@@ -25,16 +25,22 @@ struct BodyOptions {
 
 class Bodies {
  public:
-  // stands: (E,) of which elements bodies consist; p_static: (E,) probability of being static
-  Bodies(const Surface<3>& surface, const bool* stands, const float* p_static,
+  // stands: (E,) of which elements bodies consist; values: (E, kinds) what is known of each
+  Bodies(const Surface<3>& surface, const bool* stands, const float* values, size_t kinds,
          const BodyOptions& options)
-      : surface_(surface), options_(options), moves_(surface.size()), told_(surface.size()) {
-    for (size_t k = 0; k < surface.size(); ++k) moves_[k] = stands[k] ? 1.0f - p_static[k] : kNone;
-  }
+      : surface_(surface),
+        options_(options),
+        kinds_(kinds),
+        stands_(stands, stands + surface.size()),
+        values_(values, values + surface.size() * kinds),
+        sums_(values_.size(), 0),
+        sweeps_(surface.size(), 0) {}
+
+  size_t kinds() const { return kinds_; }
 
   void add(const Scans<3>& scans, int threads) {
     const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
-    std::vector<std::vector<Said>> said(bounds.size() - 1);
+    std::vector<Said> said(bounds.size() - 1);
     parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
       Sweep sweep(surface_.size());
       for (size_t t = first; t < last; ++t) {
@@ -42,34 +48,31 @@ class Bodies {
         say(sweep, said[i]);
       }
     });
-    for (const auto& part : said)
-      for (const auto& [k, share] : part) {
-        told_[k].sum += share;
-        ++told_[k].sweeps;
+    for (const Said& part : said)
+      for (size_t i = 0; i < part.elements.size(); ++i) {
+        const size_t k = part.elements[i];
+        for (size_t v = 0; v < kinds_; ++v) sums_[k * kinds_ + v] += part.means[i * kinds_ + v];
+        ++sweeps_[k];
       }
   }
 
-  // (E,) share of the body around each element that moves, mean over the sweeps that saw it; NaN
-  // where none did.
-  std::vector<float> share() const {
-    std::vector<float> out;
-    out.reserve(told_.size());
-    for (const Told& one : told_)
-      out.push_back(one.sweeps ? static_cast<float>(static_cast<double>(one.sum) / kOne /
-                                                    static_cast<double>(one.sweeps))
-                               : std::numeric_limits<float>::quiet_NaN());
+  // (E, kinds) mean over the body around each element, mean over the sweeps that saw it; NaN where
+  // none did.
+  std::vector<float> means() const {
+    std::vector<float> out(sums_.size(), std::numeric_limits<float>::quiet_NaN());
+    for (size_t i = 0; i < out.size(); ++i)
+      if (const int32_t n = sweeps_[i / kinds_])
+        out[i] = static_cast<float>(static_cast<double>(sums_[i]) / kOne / n);
     return out;
   }
 
  private:
-  static constexpr float kNone = -1.0f;
   static constexpr double kOne = 1 << 20;
 
-  struct Told {
-    int64_t sum = 0;
-    int32_t sweeps = 0;
+  struct Said {
+    std::vector<size_t> elements;
+    std::vector<int64_t> means;  // of the body of each, in parts of kOne
   };
-  using Said = std::pair<size_t, int64_t>;     // element, share of its body in parts of kOne
   using Column = std::pair<int32_t, int32_t>;  // x, y
 
   struct Sweep {
@@ -91,7 +94,7 @@ class Bodies {
       const Segment<3> beam(pose, scans.points + n * 3, surface_.resolution());
       const int32_t at = surface_.at(cursor, cell_of<3>(beam.end));
       const auto k = static_cast<size_t>(at);
-      if (at == kNoElement || moves_[k] == kNone) return;
+      if (at == kNoElement || !stands_[k]) return;
       if (std::exchange(sweep.seen[k], scan) == scan) return;
       sweep.elements.emplace_back(column_of(surface_.cell(at)), k);
     });
@@ -112,25 +115,28 @@ class Bodies {
     return (cell - rest) / options_.column - (rest < 0 ? 1 : 0);
   }
 
-  // What the body of each element is worth to it.
-  void say(Sweep& sweep, std::vector<Said>& said) const {
+  // What is known of the body of each element.
+  void say(Sweep& sweep, Said& said) const {
     join(sweep);
     const size_t n = sweep.root.size();
-    std::vector<double> moves(n, 0.0);
+    std::vector<double> sums(n * kinds_, 0.0);
     std::vector<int64_t> all(n, 0);
     for (size_t c = 0; c < n; ++c) {
       const size_t root = sweep.root[c] = root_of(sweep.root, c);
-      for (size_t i = sweep.first[c]; i < sweep.first[c + 1]; ++i) {
-        moves[root] += static_cast<double>(moves_[sweep.elements[i].second]);
-        ++all[root];
-      }
+      for (size_t i = sweep.first[c]; i < sweep.first[c + 1]; ++i, ++all[root])
+        for (size_t v = 0; v < kinds_; ++v)
+          sums[root * kinds_ + v] +=
+              static_cast<double>(values_[sweep.elements[i].second * kinds_ + v]);
     }
     for (size_t c = 0; c < n; ++c) {
       const size_t root = sweep.root[c];
       if (all[root] < options_.fewest) continue;
-      const int64_t share = std::llround(kOne * moves[root] / static_cast<double>(all[root]));
-      for (size_t i = sweep.first[c]; i < sweep.first[c + 1]; ++i)
-        said.emplace_back(sweep.elements[i].second, share);
+      for (size_t i = sweep.first[c]; i < sweep.first[c + 1]; ++i) {
+        said.elements.push_back(sweep.elements[i].second);
+        for (size_t v = 0; v < kinds_; ++v)
+          said.means.push_back(
+              std::llround(kOne * sums[root * kinds_ + v] / static_cast<double>(all[root])));
+      }
     }
   }
 
@@ -160,8 +166,11 @@ class Bodies {
 
   const Surface<3>& surface_;
   BodyOptions options_;
-  std::vector<float> moves_;  // (E,) probability of it, kNone: of no body
-  std::vector<Told> told_;
+  size_t kinds_;
+  std::vector<uint8_t> stands_;
+  std::vector<float> values_;
+  std::vector<int64_t> sums_;    // of means, in parts of kOne
+  std::vector<int32_t> sweeps_;  // in which each was of a body
 };
 
 }  // namespace stillmap

@@ -15,6 +15,7 @@ _STATIC = 0.5  # probability from which on an element is called static
 
 def with_bodies(
     p_static: NDArray[np.float32],
+    change: NDArray[np.float32],
     surface: Surface,
     ground: Ground,
     recording: Recording,
@@ -22,10 +23,11 @@ def with_bodies(
     options: BodyOptions,
     threads: int = 1,
 ) -> NDArray[np.float32]:
-    """(E,) P(static), lowered for static elements of bodies of which enough is known to move.
+    """(E,) P(static), lowered for static elements of bodies that move, or came or left.
 
     Args:
         p_static: (E,) by what is known of each element and of those right beside it.
+        change: (E,) nats by which the looks at it say that a thing came or left; see `Told`.
         surface: the elements, in space.
         ground: how high it is; where none was seen nobody knows what stands on it.
         recording: 3D, M beams without motion during its scans.
@@ -39,11 +41,12 @@ def with_bodies(
         raise TypeError("surface: expected one in space")
     column = max(1, round(options.column / surface.resolution))
     stands = above_ground(surface, ground, options.low, options.high)
-    bodies = _core.Bodies3D(surface, stands, p_static, column=column, fewest=options.fewest)
+    values = np.stack([1.0 - p_static, change], axis=1)
+    bodies = _core.Bodies3D(surface, stands, values, column=column, fewest=options.fewest)
     for scans, beams, offset in chunks(recording):
         points, hit = recording.points[beams], recording.hit[beams]
         bodies.add(points, hit, offset, T_map_sensor[scans], threads)
-    return lowered(p_static, bodies.share(), options)
+    return lowered(p_static, bodies.means(), options)
 
 
 def above_ground(surface: Surface, ground: Ground, low: float, high: float) -> NDArray[np.bool_]:
@@ -57,17 +60,19 @@ def above_ground(surface: Surface, ground: Ground, low: float, high: float) -> N
 
 
 def lowered(
-    p_static: NDArray[np.float32], share: NDArray[np.float32], options: BodyOptions
+    p_static: NDArray[np.float32], means: NDArray[np.float32], options: BodyOptions
 ) -> NDArray[np.float32]:
-    """(E,) with log odds of slope (share - body's), -most at least, where that exceeds the share.
+    """(E,) lowered to log odds of slope (least - mean), -most at least, where that is negative.
 
     Args:
         p_static: (E,).
-        share: (E,) mean probability to move of the bodies around each; NaN: of none.
-        options: see BodyOptions.
+        means: (E, 2) of the bodies around each: probability to move, nats for a change; NaN: of
+            none.
+        options: `share` and `change` are the least values of these that tell.
     """
-    of = np.flatnonzero((p_static >= _STATIC) & (share > options.share))
-    nats = np.minimum(options.slope * (share[of] - np.float32(options.share)), options.most)
+    above = np.nan_to_num(means - np.array([options.share, options.change], np.float32), nan=-1.0)
+    nats = np.minimum(options.slope * above.max(axis=1), options.most)
+    of = np.flatnonzero((p_static >= _STATIC) & (nats > 0.0))
     out = p_static.copy()
-    out[of] = np.minimum(out[of], 1.0 / (1.0 + np.exp(nats)))
+    out[of] = np.minimum(out[of], 1.0 / (1.0 + np.exp(nats[of])))
     return out

@@ -2,7 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from stillmap.recording.model import Recording
 
 _STAY = 12.0  # s, who stays for longer came to stay
 _MOST_NATS = 60.0  # by which one likelihood may exceed another: more is the same
+_MOST_TOLD = 4.0  # nats that the looks at one element tell of a change
+_LEAST = 1e-30  # likelihood that is none
 _POSSIBLE = 0.02  # probability of having changed below which a cell has no say
 _BESIDE = 3.0  # cells
 _LOOKS_APART = 4  # looks by which the cells of one thing may seem to change apart
@@ -76,7 +78,7 @@ class Courses:
 def watch(dwell: Dwell, recording: Recording, options: EmOptions, courses: bool = True) -> None:
     """Asks, before the first look, for things that come to stay or leave.
 
-    Without `courses` only for whether they do: `static_of` wants no more.
+    Without `courses` only for whether they do: `told_of` wants no more.
     """
     dwell.watch(**_model(recording, options), courses=courses)
 
@@ -97,13 +99,40 @@ def courses_of(looks: Looks, options: EmOptions) -> Courses:
     )
 
 
-def static_of(looks: Looks, options: EmOptions) -> tuple[NDArray[np.float32], float]:
-    """`p_static` (E,) and `share` of the courses, where nothing else of them is asked."""
-    static, shares = _groups(looks)[0], _shares(looks, options)
-    p = np.empty(looks.surface.size, np.float32)
+class Told(NamedTuple):
+    """What the looks at E elements say, each by itself.
+
+    Attributes:
+        p_static: (E,) float32, see Courses.
+        change: (E,) float32 nats by which what was seen is likelier if a thing came to stay, or
+            left, than if what is there never did; `_MOST_TOLD` at most, for or against.
+        share: see Courses.
+    """
+
+    p_static: NDArray[np.float32]
+    change: NDArray[np.float32]
+    share: float
+
+
+def told_of(looks: Looks, options: EmOptions) -> Told:
+    """What of the courses a label follows from; `watch` was called before the looks."""
+    (static, *_, changing), shares = _groups(looks), _shares(looks, options)
+    p, change = np.empty((2, looks.surface.size), np.float32)
     for rows in looks.blocks():
-        p[slice(*rows)] = _posterior(_likelihood(looks, rows), shares, static)
-    return p, float(shares[-1])
+        likelihood = _likelihood(looks, rows)
+        p[slice(*rows)] = _posterior(likelihood, shares, static)
+        known = (_under(likelihood, shares, of) for of in (changing, static))
+        came, stayed = (np.log(np.maximum(one, _LEAST)) for one in known)
+        change[slice(*rows)] = np.clip(came - stayed, -_MOST_TOLD, _MOST_TOLD)
+    return Told(p, change, float(shares[-1]))
+
+
+def _under(
+    likelihood: NDArray[np.float32], shares: Float, among: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """(K,) likelihood under some classes (C,), each by its share of these."""
+    weights = np.where(among, shares, 0.0) / max(float(shares[among].sum()), _LEAST)
+    return np.asarray(np.einsum("kc,c->k", likelihood, weights.astype(np.float32)), np.float32)
 
 
 def _kept(looks: Looks) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from stillmap.em.beside import with_those_beside
 from stillmap.em.bodies import with_bodies
 from stillmap.em.changed import changed_of
-from stillmap.em.courses import courses_of, static_of, watch
+from stillmap.em.courses import courses_of, told_of, watch
 from stillmap.em.dwell import e_step, expectations_of
 from stillmap.em.expectations import Expectations
 from stillmap.em.ground import ground_under
@@ -37,20 +37,17 @@ def e_step_in_space(
         watch(dwell, recording, options, courses=listed)
 
     looks = looked_at(recording, poses, resolution, options, threads, _CLASSES, prepare)
-    courses = courses_of(looks, options) if listed else None
-    static, changing = (
-        static_of(looks, options) if courses is None else (courses.p_static, courses.share)
-    )
-    static = with_those_beside(static, looks.surface, options.beside, threads)
+    told = told_of(looks, options)
+    static = with_those_beside(told.p_static, looks.surface, options.beside, threads)
     T_map_sensor = recording.T_map_sensor(poses)
     ground = ground_under(looks.surface, static, T_map_sensor[:, :3, 3])
     static = with_bodies(
-        static, looks.surface, ground, recording, T_map_sensor, options.bodies, threads
+        static, told.change, looks.surface, ground, recording, T_map_sensor, options.bodies, threads
     )
     found = expectations_of(looks, None, recording, poses, options, threads, static)
     return replace(
         found,
-        learned={**found.learned, "changing": round(changing, 6)},
-        changed=None if courses is None else changed_of(courses),
+        learned={**found.learned, "changing": round(told.share, 6)},
+        changed=changed_of(courses_of(looks, options)) if listed else None,
         ground=ground,
     )

@@ -112,7 +112,10 @@ class BodyOptions:
     column: float = field_with_doc(0.3, "m, edge of the columns that touch within a body")
     fewest: int = field_with_doc(5, "voxels of a body at least, in a sweep")
     share: float = field_with_doc(0.25, "mean probability to move from where on all of it does")
-    slope: float = field_with_doc(20.0, "nats by which a voxel moves for each unit above that")
+    change: float = field_with_doc(
+        1.0, "nats, mean of its voxels, by which it came to stay, or left, from where on it did"
+    )
+    slope: float = field_with_doc(20.0, "nats for all of it, for each unit above these two")
     most: float = field_with_doc(4.0, "nats for it at most")
 
     def __post_init__(self) -> None:
@@ -124,7 +127,7 @@ class BodyOptions:
             raise ValueError("'em.bodies.fewest' wants at least 1")
         if not 0.0 <= self.share <= 1.0:
             raise ValueError("'em.bodies.share' wants 0 to 1")
-        for name in ("slope", "most"):
+        for name in ("change", "slope", "most"):
             if not 0.0 <= getattr(self, name) <= 1000.0:
                 raise ValueError(f"'em.bodies.{name}' wants 0 to 1000 nats")
 

@@ -1,4 +1,4 @@
-"""What stands apart from all else in a sweep is one body: how much of it is known to move."""
+"""What stands apart in a sweep is one body: what is known of its parts, on average."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -7,16 +7,17 @@ from stillmap.reference.beams import usable_beams
 from stillmap.reference.surface import Surface
 from stillmap.reference.traverse import cell_of
 
+Float = NDArray[np.float64]
 Column = tuple[int, int]
 
 
 class Bodies3D:
-    """Sums over sweeps of the share of each element's body that moves.
+    """What sweeps say of the body around each element.
 
     Args:
         surface: E elements, in space.
         stands: (E,) of which of them bodies consist.
-        p_static: (E,).
+        values: (E, K) what is known of each.
         column: cells, edge of the columns over the ground that touch within a body.
         fewest: elements of a body at least.
     """
@@ -25,15 +26,15 @@ class Bodies3D:
         self,
         surface: Surface,
         stands: ArrayLike,
-        p_static: ArrayLike,
+        values: ArrayLike,
         *,
         column: int,
         fewest: int,
     ) -> None:
         self.surface, self.column, self.fewest = surface, column, fewest
         self.stands = np.asarray(stands, bool)
-        self.moves = 1.0 - np.asarray(p_static, float)
-        self.told: list[list[float]] = [[] for _ in range(surface.size)]
+        self.values = np.asarray(values, float)
+        self.told: list[list[Float]] = [[] for _ in range(surface.size)]
 
     def add(
         self,
@@ -54,13 +55,14 @@ class Bodies3D:
         for elements in of_scan.values():
             for body in self._apart(elements):
                 if len(body) >= self.fewest:
-                    share = float(np.mean(self.moves[body]))
+                    mean = self.values[body].mean(axis=0)
                     for k in body:
-                        self.told[k].append(share)
+                        self.told[k].append(mean)
 
-    def share(self) -> NDArray[np.float64]:
-        """(E,) means over the sweeps that saw each element in a body; NaN where none did."""
-        return np.array([np.mean(one) if one else np.nan for one in self.told])
+    def means(self) -> Float:
+        """(E, K) means over the sweeps that saw each element in a body; NaN where none did."""
+        unknown = np.full(self.values.shape[1], np.nan)
+        return np.array([np.mean(one, axis=0) if one else unknown for one in self.told])
 
     def _apart(self, elements: set[int]) -> list[list[int]]:
         """Those whose columns touch, corners too, are together."""
