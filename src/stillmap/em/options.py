@@ -111,7 +111,7 @@ class BodyOptions:
     high: float = field_with_doc(3.0, "m above the ground up to where they are")
     column: float = field_with_doc(0.3, "m, edge of the columns that touch within a body")
     fewest: int = field_with_doc(5, "voxels of a body at least, in a sweep")
-    share: float = field_with_doc(0.25, "mean probability to move from where on all of it does")
+    share: float = field_with_doc(0.3, "mean probability to move from where on all of it does")
     change: float = field_with_doc(
         1.0, "nats, mean of its voxels, by which it came to stay, or left, from where on it did"
     )
