@@ -3,6 +3,7 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "stillmap/bodies.hpp"
+#include "stillmap/feet.hpp"
 
 namespace stillmap::border {
 namespace {
@@ -10,6 +11,7 @@ namespace {
 using Values = nb::ndarray<const float, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 constexpr float kMost = 1e6f;
+constexpr int kWidest = 1 << 20;  // cells
 
 void make(Bodies* self, const Surface<3>& surface, const Flat<bool>& stands, const Values& values,
           int column, int64_t fewest) {
@@ -19,7 +21,7 @@ void make(Bodies* self, const Surface<3>& surface, const Flat<bool>& stands, con
   require(values.shape(0) == n && kinds > 0, "values: expected a row per element");
   for (size_t i = 0; i < n * kinds; ++i)
     require(std::abs(values.data()[i]) <= kMost, "values: expected -1e6 to 1e6");
-  require(column >= 1 && column <= 1 << 20, "column: expected 1 to 1048576 cells");
+  require(column >= 1 && column <= kWidest, "column: expected 1 to 1048576 cells");
   require(fewest >= 1, "fewest: expected at least 1");
   new (self) Bodies(surface, stands.data(), values.data(), kinds, {column, fewest});
 }
@@ -35,6 +37,33 @@ auto means(const Bodies& bodies) {
   auto out = bodies.means();
   const size_t kinds = bodies.kinds(), n = out.size() / kinds;
   return owned(std::move(out), {n, kinds});
+}
+
+auto feet(const Surface<3>& surface, const Points<3>& points, const Flat<bool>& hit,
+          const Flat<int64_t>& offset, const Poses<3>& poses, const Flat<int32_t>& element,
+          const Flat<bool>& stands, const Flat<float>& p_static, const Flat<float>& ground,
+          int column, double least, int threads) {
+  const auto scans = scans_from<3>(points, hit, offset, poses);
+  const size_t n = surface.size(), beams = points.shape(0);
+  require(surface.fitted(), "surface: fit it first");
+  require(element.shape(0) == beams, "element: expected one per beam");
+  for (size_t i = 0; i < beams; ++i) {
+    const int32_t k = element.data()[i];
+    require(k >= kNoElement && k < static_cast<int32_t>(n), "element: out of range");
+    require(k == kNoElement || usable<3>(points.data() + i * 3), "element: of an unusable beam");
+  }
+  require(stands.shape(0) == n, "stands: expected one per element");
+  require(p_static.shape(0) == n, "p_static: expected one per element");
+  require(ground.shape(0) == n, "ground: expected one per element");
+  require(column >= 1 && column <= kWidest, "column: expected 1 to 1048576 cells");
+  require(least >= 0.0 && std::isfinite(least), "least: expected a height of at least 0");
+  std::vector<float> out(beams);
+  {
+    nb::gil_scoped_release released;
+    const Feet feet(surface, {stands.data(), p_static.data(), ground.data(), column, least});
+    feet.find(scans, element.data(), threads, out.data());
+  }
+  return owned(std::move(out), {beams});
 }
 
 }  // namespace
@@ -53,6 +82,15 @@ void bind_bodies(nb::module_& m) {
       .def("means", &means,
            "(E, K) float32: mean value of the body around each element, mean over the sweeps that "
            "saw it; NaN where none did.");
+  m.def("feet", &feet, nb::arg("surface"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::arg("element").noconvert(), nb::kw_only(),
+        nb::arg("stands").noconvert(), nb::arg("p_static").noconvert(),
+        nb::arg("ground").noconvert(), nb::arg("column"), nb::arg("least"), nb::arg("threads") = 1,
+        "(M,) float32 of beams that end more than `least` metres above static elements (M,) of the "
+        "ground: mean probability of being static of what stands in the same column in the same "
+        "sweep; NaN where that is half or more, and for all others. stands (E,) bool, p_static and "
+        "ground (E,) float32: metres below each.");
 }
 
 }  // namespace stillmap::border

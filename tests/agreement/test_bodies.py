@@ -79,6 +79,127 @@ def test_threads_and_chunks_change_nothing():
     np.testing.assert_array_equal(found[0], found[2])
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("column", "least"), [(1, 0.02), (3, 0.0)])
+def test_feet_of_core_and_twin_agree(seed, column, least):
+    rng = np.random.default_rng(seed + 40)
+    xy = rng.uniform(-2.5, 2.5, (700, 2))
+    floor = np.column_stack([xy, rng.normal(0.1, 0.01, 700) * np.sign(rng.normal(2, 1, 700))])
+    points, hit, offset, T = scattered(seed, 700)
+    points = np.concatenate([points, floor.astype(np.float32)])[rng.permutation(1400)]
+    beams = points, np.tile(hit, 2), 2 * offset, np.tile(np.eye(4), (len(T), 1, 1))
+    core, plain = surfaces(beams)
+    of_core, of_plain = order(core), order(plain)
+    low = rng.random(plain.size) < 0.5
+    p, ground = rng.random(plain.size), rng.normal(0.0, 0.05, plain.size)
+    found = []
+    for kernels, surface, of in ((_core, core, of_core), (reference, plain, of_plain)):
+        stands = np.empty(plain.size, bool)
+        mine = np.empty((2, plain.size), np.float32)
+        stands[of], mine[0][of], mine[1][of] = ~low, np.where(low, 0.5 + p / 2, p), ground
+        known = {"stands": stands, "p_static": mine[0], "ground": mine[1]}
+        element = surface.elements_of(*beams)
+        for threads in (1, 3):
+            found.append(
+                kernels.feet(
+                    surface, *beams, element, **known, column=column, least=least, threads=threads
+                )
+            )
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_allclose(found[0], found[2], atol=1e-6)
+    assert 5 <= np.isfinite(found[2]).sum() < 700
+    assert np.nanmax(found[2]) < 0.5
+
+
+def feet_of(points, *, stands, p_static, ground=0.0, least=0.05, scans=1):
+    """Beams that end in cells of a metre, as feet; elements by rising x, then z."""
+    points = np.array(points, np.float32)
+    hit, offset = np.ones(len(points), bool), np.linspace(0, len(points), scans + 1).astype(int)
+    T = np.repeat(IDENTITY, scans, axis=0)
+    surface = _core.Surface3D(1.0)
+    surface.add_end_points(points, hit, offset, T)
+    surface.fit()
+    of = np.lexsort(surface.elements()[0].T[[2, 1, 0]])
+    values = np.empty((3, surface.size), np.float32)
+    values[0][of], values[1][of], values[2][of] = stands, p_static, ground
+    element = surface.elements_of(points, hit, offset, T)
+    known = {"stands": values[0].astype(bool), "p_static": values[1], "ground": values[2]}
+    return _core.feet(surface, points, hit, offset, T, element, **known, column=1, least=least)
+
+
+def test_a_sole_under_a_leg_that_moves():
+    leg, sole, below, beside = [0.5, 0.5, 1.2], [0.5, 0.5, 0.07], [0.5, 0.5, 0.04], [1.5, 0.5, 0.9]
+    given = {"stands": [0, 1, 0], "p_static": [0.9, 0.2, 0.9]}
+    found = feet_of([leg, sole, below, beside], **given)
+    np.testing.assert_array_equal(found, np.array([np.nan, 0.2, np.nan, np.nan], np.float32))
+    assert np.isnan(feet_of([leg, sole, below, beside], **given, ground=0.03)).all()
+    static = {**given, "p_static": [0.9, 0.6, 0.9]}
+    assert np.isnan(feet_of([leg, sole, below, beside], **static)).all()
+    known = {**given, "p_static": [0.4, 0.2, 0.9]}  # the foot's own element moves
+    assert np.isnan(feet_of([leg, sole, below, beside], **known)).all()
+
+
+def test_feet_are_of_the_same_sweep():
+    leg, sole = [0.5, 0.5, 1.2], [0.5, 0.5, 0.07]
+    given = {"stands": [0, 1], "p_static": [0.9, 0.2]}
+    assert np.isnan(feet_of([leg, sole], **given, scans=2)).all()
+    assert np.isfinite(feet_of([leg, sole], **given)[1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"element": np.array([0], np.int32)}, "element: expected one per beam"),
+        ({"element": np.array([0, 2], np.int32)}, "element: out of range"),
+        ({"element": np.array([0, -2], np.int32)}, "element: out of range"),
+        ({"stands": np.ones(1, bool)}, "stands: expected one per element"),
+        ({"p_static": np.ones(3, np.float32)}, "p_static: expected one per element"),
+        ({"ground": np.ones(1, np.float32)}, "ground: expected one per element"),
+        ({"column": 0}, "column"),
+        ({"least": -1.0}, "least"),
+    ],
+)
+def test_feet_refuse(changes, match):
+    beams = row_of(0, 1), np.ones(2, bool), np.array([0, 2]), IDENTITY
+    surface = _core.Surface3D(1.0)
+    surface.add_end_points(*beams)
+    surface.fit()
+    given = {
+        "element": np.array([0, 1], np.int32),
+        "stands": np.ones(2, bool),
+        "p_static": np.ones(2, np.float32),
+        "ground": np.zeros(2, np.float32),
+        "column": 1,
+        "least": 0.0,
+    }
+    assert np.isnan(_core.feet(surface, *beams, **given)).all()
+    with pytest.raises(ValueError, match=match):
+        _core.feet(surface, *beams, **{**given, **changes})
+
+
+def test_feet_refuse_unusable_beams():
+    points = row_of(0, 1)
+    surface = _core.Surface3D(1.0)
+    surface.add_end_points(points, np.ones(2, bool), np.array([0, 2]), IDENTITY)
+    surface.fit()
+    points[1] = np.nan
+    one = np.ones(2, np.float32)
+    with pytest.raises(ValueError, match="unusable"):
+        _core.feet(
+            surface,
+            points,
+            np.ones(2, bool),
+            np.array([0, 2]),
+            IDENTITY,
+            np.array([0, 1], np.int32),
+            stands=one.astype(bool),
+            p_static=one,
+            ground=one,
+            column=1,
+            least=0.0,
+        )
+
+
 def row_of(*x):
     """Ends side by side, one in the middle of each cell of a metre."""
     return np.array([[v + 0.5, 0.5, 0.5] for v in x], np.float32)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap import _core
-from stillmap.em.bodies import above_ground, lowered, with_bodies
+from stillmap.em.bodies import feet_of, lowered, standing_on, with_bodies
 from stillmap.em.ground import Ground, ground_under
 from stillmap.em.options import BodyOptions
 from stillmap.recording.model import Recording
@@ -54,6 +54,12 @@ def labelled(surface, moving):
     return np.where(moving(means), 0.02, 0.99).astype(np.float32), means
 
 
+def lowered_by(surface, p, change, recording, T, options, ground=FLAT):
+    """P(static) by bodies on that ground."""
+    standing = standing_on(ground, surface, options)
+    return with_bodies(p, change, standing, recording, T, options)
+
+
 CAR, OTHER, WALL = box(2.0, 2.0, 4.0), box(-5.0, 2.0, 4.0), box(-6.0, -5.0, 13.0, height=2.5)
 
 
@@ -64,7 +70,7 @@ def front(means):
 def test_the_rest_of_a_car_goes_with_its_front_and_nothing_else_does():
     recording, T, surface = standing(CAR, OTHER, WALL)
     p, means = labelled(surface, front)
-    found = with_bodies(p, 0 * p, surface, FLAT, recording, T, BodyOptions())
+    found = lowered_by(surface, p, 0 * p, recording, T, BodyOptions(), FLAT)
     car = (means[:, 0] > 1.9) & (means[:, 1] > 1.9) & (means[:, 2] > 0.25)
     assert (found[car] < 0.5).all()
     np.testing.assert_array_equal(found[~car], p[~car])
@@ -78,10 +84,10 @@ def test_what_all_of_it_says_a_little_it_says_loudly():
     noise = np.random.default_rng(0).normal(0.0, 1.0, len(p))
     change = (noise + np.where(car, 1.6, -0.3)).astype(np.float32)
     assert (change[~car] > 1.6).sum() > 20  # elsewhere some say more, alone
-    found = with_bodies(p, change, surface, FLAT, recording, T, BodyOptions())
+    found = lowered_by(surface, p, change, recording, T, BodyOptions(), FLAT)
     assert (found[car] < 0.5).all()
     np.testing.assert_array_equal(found[~car], p[~car])
-    calm = with_bodies(p, change - 0.9, surface, FLAT, recording, T, BodyOptions())
+    calm = lowered_by(surface, p, change - 0.9, recording, T, BodyOptions(), FLAT)
     np.testing.assert_array_equal(calm, p)
 
 
@@ -89,7 +95,7 @@ def test_too_little_of_it_moves():
     recording, T, surface = standing(CAR)
     p, _ = labelled(surface, lambda means: front(means) & (means[:, 0] > 5.5))
     np.testing.assert_array_equal(
-        with_bodies(p, 0 * p, surface, FLAT, recording, T, BodyOptions()), p
+        lowered_by(surface, p, 0 * p, recording, T, BodyOptions(), FLAT), p
     )
 
 
@@ -101,7 +107,7 @@ def test_who_touches_a_wall_leaves_it_there():
     )
     assert (p < 0.5).sum() > 10
     np.testing.assert_array_equal(
-        with_bodies(p, 0 * p, surface, FLAT, recording, T, BodyOptions()), p
+        lowered_by(surface, p, 0 * p, recording, T, BodyOptions(), FLAT), p
     )
 
 
@@ -112,16 +118,26 @@ def test_who_touches_a_wall_leaves_it_there():
 def test_left_out(options, ground):
     recording, T, surface = standing(CAR)
     p, _ = labelled(surface, front)
-    assert with_bodies(p, 0 * p, surface, ground, recording, T, options) is p
+    assert lowered_by(surface, p, 0 * p, recording, T, options, ground) is p
+    assert feet_of(standing_on(ground, surface, options), p, options) is None
 
 
 def test_ground_and_crowns_are_no_bodies():
     crown = np.random.default_rng(0).uniform([-2, -2, 3.5], [2, 2, 5], (2000, 3))
     _, _, surface = standing(CAR, crown)
     z = surface.elements()[1][:, 2]
-    stands = above_ground(surface, FLAT, 0.2, 3.0)
+    stands = standing_on(FLAT, surface, BodyOptions()).stands
     np.testing.assert_array_equal(stands, (z > 0.2) & (z < 3.0))
     assert 100 < stands.sum() < len(z)
+
+
+def test_feet_are_off_the_ground_by_what_end_points_scatter():
+    _, _, surface = standing(CAR)
+    standing_there = standing_on(FLAT, surface, BodyOptions())
+    assert standing_there.column == 2  # of 0.15 m
+    p = np.ones(surface.size, np.float32)
+    assert feet_of(standing_there, p, BodyOptions(foot=0.06)).least == 0.06
+    assert feet_of(standing_there, p, BodyOptions(foot=0.0)).least == 2.5 * surface.scatter
 
 
 def test_ground_under_what_stands_still():

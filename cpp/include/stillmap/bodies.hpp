@@ -10,9 +10,9 @@
 #include <cstdint>
 #include <limits>
 #include <numeric>
-#include <utility>
 #include <vector>
 
+#include "stillmap/columns.hpp"
 #include "stillmap/parallel.hpp"
 #include "stillmap/surface.hpp"
 
@@ -42,10 +42,10 @@ class Bodies {
     const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
     std::vector<Said> said(bounds.size() - 1);
     parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
-      Sweep sweep(surface_.size());
+      Columns columns(surface_, options_.column);
       for (size_t t = first; t < last; ++t) {
-        gather(scans, t, sweep);
-        say(sweep, said[i]);
+        gather(scans, t, columns);
+        say(columns, said[i]);
       }
     });
     for (const Said& part : said)
@@ -73,85 +73,58 @@ class Bodies {
     std::vector<size_t> elements;
     std::vector<int64_t> means;  // of the body of each, in parts of kOne
   };
-  using Column = std::pair<int32_t, int32_t>;  // x, y
 
-  struct Sweep {
-    explicit Sweep(size_t elements) : seen(elements, -1) {}
-
-    std::vector<int32_t> seen;  // the last scan that did
-    std::vector<std::pair<Column, size_t>> elements;
-    std::vector<size_t> first;  // of each column, and the end
-    std::vector<size_t> root;   // of each column
-  };
-
-  // The elements that a scan's beams ended in, by columns.
-  void gather(const Scans<3>& scans, size_t t, Sweep& sweep) const {
-    sweep.elements.clear();
+  // The elements that a scan's beams ended in.
+  void gather(const Scans<3>& scans, size_t t, Columns& columns) const {
+    columns.clear();
     Cursor<const Surface<3>> cursor(surface_);
-    const auto scan = static_cast<int32_t>(t);
     for_each_beam<3>(scans, t, t + 1, [&](size_t, int64_t n, const Pose<3>& pose) {
       if (!scans.hit[n]) return;
       const Segment<3> beam(pose, scans.points + n * 3, surface_.resolution());
-      const int32_t at = surface_.at(cursor, cell_of<3>(beam.end));
-      const auto k = static_cast<size_t>(at);
-      if (at == kNoElement || !stands_[k]) return;
-      if (std::exchange(sweep.seen[k], scan) == scan) return;
-      sweep.elements.emplace_back(column_of(surface_.cell(at)), k);
+      const int32_t k = surface_.at(cursor, cell_of<3>(beam.end));
+      if (k != kNoElement && stands_[static_cast<size_t>(k)]) columns.add(k);
     });
-    std::sort(sweep.elements.begin(), sweep.elements.end());
-    sweep.first.clear();
-    for (size_t i = 0; i < sweep.elements.size(); ++i)
-      if (i == 0 || sweep.elements[i].first != sweep.elements[i - 1].first)
-        sweep.first.push_back(i);
-    sweep.root.resize(sweep.first.size());
-    std::iota(sweep.root.begin(), sweep.root.end(), size_t{0});
-    sweep.first.push_back(sweep.elements.size());
-  }
-
-  Column column_of(const Cell<3>& cell) const { return {down(cell[0]), down(cell[1])}; }
-
-  int32_t down(int32_t cell) const {
-    const int32_t rest = cell % options_.column;
-    return (cell - rest) / options_.column - (rest < 0 ? 1 : 0);
+    columns.sort();
   }
 
   // What is known of the body of each element.
-  void say(Sweep& sweep, Said& said) const {
-    join(sweep);
-    const size_t n = sweep.root.size();
-    std::vector<double> sums(n * kinds_, 0.0);
-    std::vector<int64_t> all(n, 0);
-    for (size_t c = 0; c < n; ++c) {
-      const size_t root = sweep.root[c] = root_of(sweep.root, c);
-      for (size_t i = sweep.first[c]; i < sweep.first[c + 1]; ++i, ++all[root])
+  void say(const Columns& columns, Said& said) const {
+    std::vector<size_t> root = joined(columns);
+    std::vector<double> sums(root.size() * kinds_, 0.0);
+    std::vector<int64_t> all(root.size(), 0);
+    for (size_t c = 0; c < root.size(); ++c) {
+      const size_t body = root[c] = root_of(root, c);
+      columns.for_each_in(c, [&](size_t k) {
         for (size_t v = 0; v < kinds_; ++v)
-          sums[root * kinds_ + v] +=
-              static_cast<double>(values_[sweep.elements[i].second * kinds_ + v]);
+          sums[body * kinds_ + v] += static_cast<double>(values_[k * kinds_ + v]);
+        ++all[body];
+      });
     }
-    for (size_t c = 0; c < n; ++c) {
-      const size_t root = sweep.root[c];
-      if (all[root] < options_.fewest) continue;
-      for (size_t i = sweep.first[c]; i < sweep.first[c + 1]; ++i) {
-        said.elements.push_back(sweep.elements[i].second);
+    for (size_t c = 0; c < root.size(); ++c) {
+      if (all[root[c]] < options_.fewest) continue;
+      const double one = kOne / static_cast<double>(all[root[c]]);
+      columns.for_each_in(c, [&](size_t k) {
+        said.elements.push_back(k);
         for (size_t v = 0; v < kinds_; ++v)
-          said.means.push_back(
-              std::llround(kOne * sums[root * kinds_ + v] / static_cast<double>(all[root])));
-      }
+          said.means.push_back(std::llround(one * sums[root[c] * kinds_ + v]));
+      });
     }
   }
 
   // Columns that touch, corners too: the next in the same row, and up to three in the row after.
-  static void join(Sweep& sweep) {
-    const size_t n = sweep.root.size();
-    const auto at = [&](size_t c) { return sweep.elements[sweep.first[c]].first; };
+  static std::vector<size_t> joined(const Columns& columns) {
+    const size_t n = columns.size();
+    std::vector<size_t> root(n);
+    std::iota(root.begin(), root.end(), size_t{0});
     size_t beside = 0;
     for (size_t c = 0; c < n; ++c) {
-      const auto [x, y] = at(c);
-      if (c + 1 < n && at(c + 1) == Column{x, y + 1}) unite(sweep.root, c, c + 1);
-      while (beside < n && at(beside) < Column{x + 1, y - 1}) ++beside;
-      for (size_t other = beside; other < n && at(other) <= Column{x + 1, y + 1}; ++other)
-        unite(sweep.root, c, other);
+      const auto [x, y] = columns.at(c);
+      if (c + 1 < n && columns.at(c + 1) == Column{x, y + 1}) unite(root, c, c + 1);
+      while (beside < n && columns.at(beside) < Column{x + 1, y - 1}) ++beside;
+      for (size_t other = beside; other < n && columns.at(other) <= Column{x + 1, y + 1}; ++other)
+        unite(root, c, other);
     }
+    return root;
   }
 
   static size_t root_of(std::vector<size_t>& root, size_t c) {

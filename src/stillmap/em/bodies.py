@@ -1,5 +1,7 @@
 """What stands apart from all else moves as a whole, or stands still. See `docs/space.md`."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,13 +13,47 @@ from stillmap.em.options import BodyOptions
 from stillmap.recording.model import Recording
 
 _STATIC = 0.5  # probability from which on an element is called static
+_SCATTERS = 2.5  # of end points about their surface, within which a beam ended on it
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """Which of E elements are of what stands on the ground.
+
+    Attributes:
+        surface: the elements, in space.
+        stands: (E,) bool.
+        ground: (E,) float32 metres, height of the ground below each.
+        column: cells, edge of the columns over the ground that touch within a body.
+    """
+
+    surface: _core.Surface3D
+    stands: NDArray[np.bool_]
+    ground: NDArray[np.float32]
+    column: int
+
+
+def standing_on(ground: Ground, surface: Surface, options: BodyOptions) -> Standing | None:
+    """What stands on the ground; None where none was seen, and nobody knows, or wants to."""
+    if not (options.enabled and ground.seen):
+        return None
+    if not isinstance(surface, _core.Surface3D):
+        raise TypeError("surface: expected one in space")
+    stands, height = np.empty(surface.size, np.bool_), np.empty(surface.size, np.float32)
+    for rows in blocks_of(surface):
+        means = surface.elements(rows)[1]
+        below = ground.at(means[:, :2])
+        above = means[:, 2] - below
+        stands[slice(*rows)] = (above > options.low) & (above < options.high)
+        height[slice(*rows)] = below
+    column = max(1, round(options.column / surface.resolution))
+    return Standing(surface, stands, height, column)
 
 
 def with_bodies(
     p_static: NDArray[np.float32],
     change: NDArray[np.float32],
-    surface: Surface,
-    ground: Ground,
+    standing: Standing | None,
     recording: Recording,
     T_map_sensor: Float,
     options: BodyOptions,
@@ -28,35 +64,25 @@ def with_bodies(
     Args:
         p_static: (E,) by what is known of each element and of those right beside it.
         change: (E,) nats by which the looks at it say that a thing came or left; see `Told`.
-        surface: the elements, in space.
-        ground: how high it is; where none was seen nobody knows what stands on it.
+        standing: what stands on the ground.
         recording: 3D, M beams without motion during its scans.
         T_map_sensor: (T, 4, 4).
         options: see BodyOptions.
         threads: same result with any number.
     """
-    if not (options.enabled and ground.seen):
+    if standing is None:
         return p_static
-    if not isinstance(surface, _core.Surface3D):
-        raise TypeError("surface: expected one in space")
-    column = max(1, round(options.column / surface.resolution))
-    stands = above_ground(surface, ground, options.low, options.high)
-    values = np.stack([1.0 - p_static, change], axis=1)
-    bodies = _core.Bodies3D(surface, stands, values, column=column, fewest=options.fewest)
+    bodies = _core.Bodies3D(
+        standing.surface,
+        standing.stands,
+        np.stack([1.0 - p_static, change], axis=1),
+        column=standing.column,
+        fewest=options.fewest,
+    )
     for scans, beams, offset in chunks(recording):
         points, hit = recording.points[beams], recording.hit[beams]
         bodies.add(points, hit, offset, T_map_sensor[scans], threads)
     return lowered(p_static, bodies.means(), options)
-
-
-def above_ground(surface: Surface, ground: Ground, low: float, high: float) -> NDArray[np.bool_]:
-    """(E,) whether an element's mean is between two heights (m) above the ground."""
-    stands = np.empty(surface.size, np.bool_)
-    for rows in blocks_of(surface):
-        means = surface.elements(rows)[1]
-        above = means[:, 2] - ground.at(means[:, :2])
-        stands[slice(*rows)] = (above > low) & (above < high)
-    return stands
 
 
 def lowered(
@@ -76,3 +102,59 @@ def lowered(
     out = p_static.copy()
     out[of] = np.minimum(out[of], 1.0 / (1.0 + np.exp(nats[of])))
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class Feet:
+    """Asks of beams that end on the ground whether they met the feet of something that moves.
+
+    Attributes:
+        standing: what stands on the ground.
+        p_static: (E,) of each element.
+        least: m above the ground from where on a beam did not end on it.
+    """
+
+    standing: Standing
+    p_static: NDArray[np.float32]
+    least: float
+
+    def of(
+        self,
+        points: NDArray[np.float32],
+        hit: NDArray[np.bool_],
+        offset: NDArray[np.int64],
+        T_map_sensor: Float,
+        element: NDArray[np.int32],
+        threads: int = 1,
+    ) -> NDArray[np.float32]:
+        """(M,) P(static) of what moves over the end of each beam in its sweep; NaN: nothing does.
+
+        Args:
+            points, hit, offset, T_map_sensor: M beams of some scans.
+            element: (M,) in which each ended, -1: none.
+            threads: same result with any number.
+        """
+        return _core.feet(
+            self.standing.surface,
+            points,
+            hit,
+            offset,
+            T_map_sensor,
+            element,
+            stands=self.standing.stands,
+            p_static=self.p_static,
+            ground=self.standing.ground,
+            column=self.standing.column,
+            least=self.least,
+            threads=threads,
+        )
+
+
+def feet_of(
+    standing: Standing | None, p_static: NDArray[np.float32], options: BodyOptions
+) -> Feet | None:
+    """Feet, as far as end points that scatter can tell them from the ground."""
+    if standing is None:
+        return None
+    least = max(options.foot, _SCATTERS * standing.surface.scatter)
+    return Feet(standing, p_static, least)

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.em.bodies import Feet
 from stillmap.em.chunks import chunks
 from stillmap.em.expectations import (
     CellProbabilities,
@@ -62,11 +63,13 @@ def expectations_of(
     options: EmOptions,
     threads: int,
     static: NDArray[np.float32] | None = None,
+    feet: Feet | None = None,
 ) -> Expectations:
     """What the looks say of every cell, and with that of every beam that ended in it.
 
     kept (C,): under which of the classes; None: all. static (E,) is what is known better of each
-    cell than these say, and with that of all cells.
+    cell than these say, and with that of all cells. feet: what is known of beams that end on the
+    ground below something that moves.
     """
     some = looks.under(kept, looks.sample())
     shares = fit_shares(some.likelihood, some.n_static, options.prior)
@@ -76,7 +79,7 @@ def expectations_of(
     surface, T_map_sensor = looks.surface, recording.T_map_sensor(poses)
     beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
     return Expectations(
-        p_static=_of_beams(recording, T_map_sensor, surface, static, share, threads),
+        p_static=_of_beams(recording, T_map_sensor, surface, static, share, threads, feet),
         likelihood=likelihood,
         occupied=CellProbabilities(cells_of(surface), static * coverage(surface), _UNSEEN),
         learned=_learned(looks, some, shares) | {"p_static": share},
@@ -110,6 +113,7 @@ def _of_beams(
     static: NDArray[np.float32],
     prior: float,
     threads: int,
+    feet: Feet | None,
 ) -> NDArray[np.float32]:
     """(M,) what is known (E,) of the element that each beam ended in."""
     found = np.append(static, np.float32(prior))  # -1: no element
@@ -117,7 +121,11 @@ def _of_beams(
     for scans, beams, offset in chunks(recording, beside=[e]):
         points, hit = recording.points[beams], recording.hit[beams]
         element = surface.elements_of(points, hit, offset, T_map_sensor[scans], threads)
-        e[beams] = per_beam(points, hit, found[element], prior)
+        known = per_beam(points, hit, found[element], prior)
+        if feet is not None:
+            over = feet.of(points, hit, offset, T_map_sensor[scans], element, threads)
+            known = np.where(np.isnan(over), known, over)
+        e[beams] = known
     return e
 
 

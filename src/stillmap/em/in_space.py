@@ -7,7 +7,7 @@ goes on, is no wall. Whoever removes what moves from a cloud wants the car out, 
 from dataclasses import replace
 
 from stillmap.em.beside import with_those_beside
-from stillmap.em.bodies import with_bodies
+from stillmap.em.bodies import feet_of, standing_on, with_bodies
 from stillmap.em.changed import changed_of
 from stillmap.em.courses import courses_of, told_of, watch
 from stillmap.em.dwell import e_step, expectations_of
@@ -41,10 +41,12 @@ def e_step_in_space(
     static = with_those_beside(told.p_static, looks.surface, options.beside, threads)
     T_map_sensor = recording.T_map_sensor(poses)
     ground = ground_under(looks.surface, static, T_map_sensor[:, :3, 3])
+    standing = standing_on(ground, looks.surface, options.bodies)
     static = with_bodies(
-        static, told.change, looks.surface, ground, recording, T_map_sensor, options.bodies, threads
+        static, told.change, standing, recording, T_map_sensor, options.bodies, threads
     )
-    found = expectations_of(looks, None, recording, poses, options, threads, static)
+    feet = feet_of(standing, static, options.bodies)
+    found = expectations_of(looks, None, recording, poses, options, threads, static, feet)
     return replace(
         found,
         learned={**found.learned, "changing": round(told.share, 6)},

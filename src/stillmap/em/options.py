@@ -109,6 +109,9 @@ class BodyOptions:
     enabled: bool = field_with_doc(True, "ask how much of the body around each voxel moves")
     low: float = field_with_doc(0.2, "m above the ground from where on things are bodies")
     high: float = field_with_doc(3.0, "m above the ground up to where they are")
+    foot: float = field_with_doc(
+        0.05, "m above the ground from where on a beam below what moves did not end on it"
+    )
     column: float = field_with_doc(0.3, "m, edge of the columns that touch within a body")
     fewest: int = field_with_doc(5, "voxels of a body at least, in a sweep")
     share: float = field_with_doc(0.3, "mean probability to move from where on all of it does")
@@ -121,6 +124,8 @@ class BodyOptions:
     def __post_init__(self) -> None:
         if not -100.0 <= self.low < self.high <= 100.0:
             raise ValueError("'em.bodies.low' and 'em.bodies.high' want -100 to 100 metres, rising")
+        if not 0.0 <= self.foot <= 100.0:
+            raise ValueError("'em.bodies.foot' wants 0 to 100 metres")
         if not 0.01 <= self.column <= 100.0:
             raise ValueError("'em.bodies.column' wants 0.01 to 100 metres")
         if self.fewest < 1:

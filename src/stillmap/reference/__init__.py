@@ -12,7 +12,7 @@ without a thought for speed. Where beams are taken:
 
 from stillmap.reference.beams import add_beams, add_ends, e_step, log_likelihood
 from stillmap.reference.beside import settled
-from stillmap.reference.bodies import Bodies3D
+from stillmap.reference.bodies import Bodies3D, feet
 from stillmap.reference.changes import ChangeModel, Course, course
 from stillmap.reference.dwell import Dwell, Dwell2D, Dwell3D, Reading, look_at
 from stillmap.reference.em import EmStep, em_fixed_poses, m_step_map
@@ -69,6 +69,7 @@ __all__ = [
     "course",
     "e_step",
     "em_fixed_poses",
+    "feet",
     "field",
     "fill_surfaces",
     "first_in_cells",

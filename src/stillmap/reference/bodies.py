@@ -10,6 +10,8 @@ from stillmap.reference.traverse import cell_of
 Float = NDArray[np.float64]
 Column = tuple[int, int]
 
+LEVEL = 0.85  # cosine of the slope from which on a surface is no floor
+
 
 class Bodies3D:
     """What sweeps say of the body around each element.
@@ -84,3 +86,56 @@ class Bodies3D:
                 ]
             bodies.append(body)
         return bodies
+
+
+def feet(
+    surface: Surface,
+    points: ArrayLike,
+    hit: ArrayLike,
+    offset: ArrayLike,
+    T_map_sensor: ArrayLike,
+    element: ArrayLike,
+    *,
+    stands: ArrayLike,
+    p_static: ArrayLike,
+    ground: ArrayLike,
+    column: int,
+    least: float,
+    threads: int = 1,  # noqa: ARG001  the core's signature
+) -> Float:
+    """(M,) mean P(static) of what moves in the column over each beam that ends on the ground.
+
+    Args:
+        surface: E elements.
+        points, hit, offset, T_map_sensor: M beams.
+        element: (M,) in which each ended, -1: none.
+        stands: (E,) which elements are of what stands on the ground.
+        p_static: (E,).
+        ground: (E,) metres, height below each.
+        column: cells, edge of the columns over the ground.
+        least: metres above the ground from where on a beam did not end on it.
+    """
+    of, standing = np.asarray(element), np.asarray(stands, bool)
+    p, z = np.asarray(p_static, float), np.asarray(ground, float)
+    bounds, out = np.asarray(offset), np.full(len(of), np.nan)
+    for beam in usable_beams(3, points, hit, offset, T_map_sensor):
+        k = of[beam.number]
+        if k < 0 or standing[k] or p[k] < 0.5 or _height(surface, k, beam.end, z[k]) <= least:
+            continue
+        of_scan = of[bounds[beam.scan] : bounds[beam.scan + 1]]
+        met = {other for other in of_scan.tolist() if other >= 0 and standing[other]}
+        x, y, _ = (cell_of(beam.end, surface.resolution) // column).tolist()
+        over = [
+            j for j in met if tuple(np.floor_divide(surface.list[j].cell[:2], column)) == (x, y)
+        ]
+        if over and np.mean(p[over]) < 0.5:
+            out[beam.number] = np.mean(p[over])
+    return out
+
+
+def _height(surface: Surface, k: int, end: Float, ground: float) -> float:
+    """Metres over the floor that an element is of, or else over the ground."""
+    patch = surface.list[k].patch
+    if patch is not None and abs(patch.normal[2]) > LEVEL:
+        return float(np.sign(patch.normal[2]) * (patch.normal @ (end - patch.centre)))
+    return float(end[2] - ground)
