@@ -144,7 +144,7 @@ def _result(loop: Loop, recording: Recording, progress: Progress, stages: Stages
         flat, plan, ground = kept, seen, None
         if seen.dimension == 3:
             ground = ground_of(seen, kept.poses, kept.p_static, threads)
-            flat, plan = _in_plan(kept, seen, ground, options)
+            flat, plan = _in_plan(kept, seen, ground, options, threads)
         filtered, raw = _maps(flat, plan, options, threads)
     progress("counting looks", 0, 0, 0)
     with stages.measure("evidence"):
@@ -231,11 +231,11 @@ def _settled(
 
 
 def _in_plan(
-    kept: Best, recording: Recording, ground: Ground, options: Options
+    kept: Best, recording: Recording, ground: Ground, options: Options, threads: int
 ) -> tuple[Best, Recording]:
     """The same as a planar recording: what is in the robot's way."""
     cell, band = options.slam.resolution, options.output.band
-    plan = plan_of(recording, kept.poses, ground, band, cell, open_space=False)
+    plan = plan_of(recording, kept.poses, ground, band, cell, open_space=False, threads=threads)
     occupied = kept.occupied
     if occupied is not None:
         occupied = columns_of(occupied, ground, band, cell)
