@@ -12,6 +12,7 @@
 #include <utility>
 #include <vector>
 
+#include "stillmap/around.hpp"
 #include "stillmap/beams.hpp"
 #include "stillmap/cell_index.hpp"
 #include "stillmap/element.hpp"
@@ -210,9 +211,13 @@ class Surface : public CellIndex<D> {
   Fitted fit_normals(int radius, size_t first_element, size_t last_element) {
     Fitted fitted;
     auto& [all, flat, across] = fitted;
-    Cursor<const Surface<D>> cursor(*this);
+    Around<D> around(*this);
+    const CellRows<D> window = rows_around<D>(radius, true);
     for (size_t k = first_element; k < last_element; ++k) {
-      const Spread<D> spread = around(cursor, sums_[k].cell, radius);
+      Spread<D> spread;
+      around.each(sums_[k].cell, window, [&](int32_t near) {
+        spread.add(sums_[static_cast<size_t>(near)], sums_[k].cell);
+      });
       const Eigen::SelfAdjointEigenSolver<Square> axes(spread.covariance());
       const Vec<D> variance = axes.eigenvalues().cwiseMax(0.0);  // rising
       Element<D>& element = elements_[k];
@@ -239,17 +244,6 @@ class Surface : public CellIndex<D> {
       element.off_plane = element.normal.dot(centre - spread.mean());
     }
     return fitted;
-  }
-
-  Spread<D> around(Cursor<const Surface<D>>& cursor, const Cell<D>& centre, int radius) const {
-    Spread<D> spread;
-    for_each_near<D>(centre, radius, [&](const Cell<D>& cell) {
-      const Block* block = cursor.block(cell);
-      if (!block) return;
-      const int32_t k = block->counts[static_cast<size_t>(this->local_of(cell))];
-      if (k != kNoElement) spread.add(sums_[static_cast<size_t>(k)], centre);
-    });
-    return spread;
   }
 
   static double weighted_median(std::vector<std::pair<double, int64_t>>& values) {
