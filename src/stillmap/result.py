@@ -137,7 +137,7 @@ def _result(loop: Loop, recording: Recording, progress: Progress, stages: Stages
     options, threads = loop.options, resolved_threads(loop.options.threads)
     progress("labelling beams", 0, 0, 0)
     with stages.measure("changes"):
-        seen = slam.deskewed(recording, loop.kept.poses, options.slam)
+        seen = slam.deskewed(recording, loop.kept.poses, options.slam, threads)
         kept, changes = _settled(loop.kept, seen, options, threads)
     progress("making the map", 0, 0, 0)
     with stages.measure("maps"):
@@ -154,7 +154,9 @@ def _result(loop: Loop, recording: Recording, progress: Progress, stages: Stages
     progress("following what moves", 0, 0, 0)
     with stages.measure("objects"):
         if ground is not None:
-            moving = moving_in_space(seen, kept.poses, kept.p_static, ground, options.objects)
+            moving = moving_in_space(
+                seen, kept.poses, kept.p_static, ground, options.objects, threads
+            )
         else:
             moving = moving_objects(seen, kept.poses, kept.p_static, options.objects)
             things = beams_on_things(seen, kept.poses, kept.p_static, changes, filtered.resolution)
