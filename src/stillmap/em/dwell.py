@@ -117,7 +117,7 @@ def _of_beams(
     for scans, beams, offset in chunks(recording, beside=[e]):
         points, hit = recording.points[beams], recording.hit[beams]
         element = surface.elements_of(points, hit, offset, T_map_sensor[scans], threads)
-        e[beams] = per_beam(points, hit, found[element], prior)
+        e[beams] = per_beam(points, hit, found.take(element), prior)
     return e
 
 
