@@ -17,13 +17,13 @@ namespace {
 template <int D>
 void add_end_points(Surface<D>& surface, const Points<D>& points, const Flat<bool>& hit,
                     const Flat<int64_t>& offset, const Poses<D>& poses,
-                    const std::optional<Flat<int64_t>>& look) {
+                    const std::optional<Flat<int64_t>>& look, int threads) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   require(!look || look->shape(0) == scans.n_scans, "look: expected one number per scan");
   for (size_t t = 0; look && t < scans.n_scans; ++t)
     require(look->data()[t] >= 0 && look->data()[t] <= kLastLook, "look: out of range");
   nb::gil_scoped_release released;
-  surface.add(scans, look ? look->data() : nullptr);
+  surface.add(scans, look ? look->data() : nullptr, threads);
 }
 
 // (E, 2) first and last look
@@ -203,6 +203,7 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
       .def("add_end_points", &add_end_points<D>, nb::arg("points").noconvert(),
            nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
            nb::arg("T_map_sensor").noconvert(), nb::arg("look").noconvert() = nb::none(),
+           nb::arg("threads") = 1,
            "Notes where beams ended, and in which looks (T,) int64 where all calls say so.")
       .def_prop_ro("spans", &spans<D>, nb::rv_policy::move,
                    "(E, 2) int32: first and last look at which beams ended in the cell of each "

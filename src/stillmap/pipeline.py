@@ -222,7 +222,7 @@ def iterate(
                 before=None if before is None else before.poses,
                 sums=em.needs_sums(D, options.estimator),
             )
-            seen = slam.deskewed(recording, mapped.poses, options.slam)
+            seen = slam.deskewed(recording, mapped.poses, options.slam, threads)
         progress("labelling beams", number, 0, 0)
         with stages.measure("e_step"):  # (6), (8) or its successor, and the bound
             found = em.e_step(

@@ -137,14 +137,14 @@ def _result(loop: Loop, recording: Recording, progress: Progress, stages: Stages
     options, threads = loop.options, resolved_threads(loop.options.threads)
     progress("labelling beams", 0, 0, 0)
     with stages.measure("changes"):
-        seen = slam.deskewed(recording, loop.kept.poses, options.slam)
+        seen = slam.deskewed(recording, loop.kept.poses, options.slam, threads)
         kept, changes = _settled(loop.kept, seen, options, threads)
     progress("making the map", 0, 0, 0)
     with stages.measure("maps"):
         flat, plan, ground = kept, seen, None
         if seen.dimension == 3:
             ground = kept.ground or ground_of(seen, kept.poses, kept.p_static, threads)
-            flat, plan = _in_plan(kept, seen, ground, options)
+            flat, plan = _in_plan(kept, seen, ground, options, threads)
         filtered, raw = _maps(flat, plan, options, threads)
     progress("counting looks", 0, 0, 0)
     with stages.measure("evidence"):
@@ -154,7 +154,9 @@ def _result(loop: Loop, recording: Recording, progress: Progress, stages: Stages
     progress("following what moves", 0, 0, 0)
     with stages.measure("objects"):
         if ground is not None:
-            moving = moving_in_space(seen, kept.poses, kept.p_static, ground, options.objects)
+            moving = moving_in_space(
+                seen, kept.poses, kept.p_static, ground, options.objects, threads
+            )
         else:
             moving = moving_objects(seen, kept.poses, kept.p_static, options.objects)
             things = beams_on_things(seen, kept.poses, kept.p_static, changes, filtered.resolution)
@@ -231,11 +233,11 @@ def _settled(
 
 
 def _in_plan(
-    kept: Best, recording: Recording, ground: Ground, options: Options
+    kept: Best, recording: Recording, ground: Ground, options: Options, threads: int
 ) -> tuple[Best, Recording]:
     """The same as a planar recording: what is in the robot's way."""
     cell, band = options.slam.resolution, options.output.band
-    plan = plan_of(recording, kept.poses, ground, band, cell, open_space=False)
+    plan = plan_of(recording, kept.poses, ground, band, cell, open_space=False, threads=threads)
     occupied = kept.occupied
     if occupied is not None:
         occupied = columns_of(occupied, ground, band, cell)

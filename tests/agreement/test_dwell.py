@@ -186,6 +186,24 @@ def test_likelihood(room, moves):
     assert np.abs(np.diff(plain, axis=1)).max() > 5
 
 
+@pytest.mark.parametrize("threads", [1, 2, 5, 100])
+@pytest.mark.parametrize("cuts", [[], [3], [1, 2, 7, 8, 15]])
+@pytest.mark.parametrize("dated", [False, True])
+def test_elements_are_the_same_and_in_order_with_any_threads(room, threads, cuts, dated):
+    surfaces = [type(room.surface(_core))(room.beams.resolution) for _ in range(2)]
+    for surface, pieces, many in zip(surfaces, ([], cuts), (1, threads), strict=True):
+        for first, last in pairwise([0, *pieces, len(room.look)]):
+            look = room.look[first:last] if dated else None
+            surface.add_end_points(*room.scans(first, last), look, many)
+        surface.fit()
+    whole, shared = surfaces
+    assert whole.scatter == shared.scatter
+    for a, b in zip(whole.elements(), shared.elements(), strict=True):
+        assert a.tobytes() == b.tobytes()
+    assert len(whole.spans) == (whole.size if dated else 0)
+    assert whole.spans.tobytes() == shared.spans.tobytes()
+
+
 @pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("cuts", [[], [3], [1, 2, 7, 8, 15]])
 def test_threads_and_pieces_change_no_bit(room, threads, cuts):

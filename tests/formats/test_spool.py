@@ -147,3 +147,25 @@ def test_of_large_items_fewer_are_held(rows, together, monkeypatch):
     for item in spool.in_turn(range(11), lambda: let_go_after.append(len(got)), rows):
         got.append(item)
     assert let_go_after == [*range(0, 11, together), 11]
+
+
+@pytest.mark.parametrize("rows", [1, 3, 1000])
+def test_what_is_looked_at_together_lies_together(monkeypatch, rng, rows):
+    monkeypatch.setattr(spool, "BLOCK", 100)
+    for n in (0, 1, 250):
+        numbers = np.flatnonzero(rng.random(1000) < n / 1000)
+        parts = [numbers[part] for part in spool.near(numbers, rows)]
+        assert np.concatenate([np.zeros(0, int), *parts]).tolist() == numbers.tolist()
+        for part in parts:
+            assert 0 < len(part) <= rows
+            assert part[0] // 100 == part[-1] // 100
+
+
+def test_some_rows_are_those_of_the_array(limit, monkeypatch, tmp_path, rng):
+    monkeypatch.setattr(spool, "BLOCK", 100)
+    column = spool.Column(np.float32, (2,), tmp_path)
+    column.append(rng.normal(size=(1000, 2)))
+    array = column.finished()
+    assert array.flags.writeable == (limit > 0)
+    for numbers in (np.zeros(0, np.intp), np.array([0, 99, 100, 999]), np.arange(1000)):
+        np.testing.assert_array_equal(spool.rows_of(array, numbers), array[numbers])

@@ -11,6 +11,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "stillmap/around.hpp"
 #include "stillmap/parallel.hpp"
 #include "stillmap/surface.hpp"
 
@@ -26,57 +27,22 @@ struct BesideOptions {
   int rounds;          // at most
 };
 
-// The elements of the cells around one, by the blocks around its block: neighbours in number share
-// these, so they are seldom looked for.
-template <int D>
-class Around {
- public:
-  explicit Around(const Surface<D>& surface) : surface_(surface) {}
-
-  void move_to(const Cell<D>& cell) {
-    const Cell<D> block = Surface<D>::block_of(cell);
-    if (ready_ && block == block_) return;
-    block_ = block;
-    ready_ = true;
-    size_t i = 0;
-    for_each_near<D>(block, 1, [&](const Cell<D>& near) { blocks_[i++] = surface_.find(near); });
-  }
-
-  // Of a cell within a block's edge of where it was moved to.
-  int32_t at(const Cell<D>& cell) const {
-    const Cell<D> step = Surface<D>::block_of(cell) - block_;
-    size_t i = 0;
-    for (int d = D - 1; d >= 0; --d) i = 3 * i + static_cast<size_t>(step[d] + 1);
-    const auto* block = blocks_[i];
-    return block ? block->counts[static_cast<size_t>(Surface<D>::local_of(cell))] : kNoElement;
-  }
-
- private:
-  static constexpr size_t kBlocks = D == 2 ? 9 : 27;
-
-  const Surface<D>& surface_;
-  Cell<D> block_ = Cell<D>::Zero();
-  bool ready_ = false;
-  std::array<const typename Surface<D>::Block*, kBlocks> blocks_{};
-};
-
 template <int D>
 class Beside {
  public:
   // log_odds: (E,) of being static, by an element's own looks; the surface knows when these hit
   Beside(const Surface<D>& surface, const float* log_odds, const BesideOptions& options,
          int threads)
-      : surface_(surface), options_(options), threads_(threads), p_(surface.size()) {
+      : surface_(surface),
+        options_(options),
+        threads_(threads),
+        p_(surface.size()),
+        near_(rows_around<D>(options.radius, false)) {
     rows_.reserve(surface.size());
     for (size_t k = 0; k < surface.size(); ++k) {
       rows_.push_back(row_of(static_cast<int32_t>(k), log_odds[k]));
       p_[k] = probability(log_odds[k]);
     }
-    const int radius = static_cast<int>(std::floor(options.radius));
-    for_each_near<D>(Cell<D>::Zero(), radius, [&](const Cell<D>& off) {
-      const double apart = off.template cast<double>().squaredNorm();
-      if (apart > 0.0 && apart <= options.radius * options.radius) offsets_.push_back(off);
-    });
   }
 
   // (E,) probability of being static, by what is beside as well.
@@ -115,12 +81,9 @@ class Beside {
 
   template <class Visit>
   void for_each_beside(Around<D>& around, size_t k, Visit&& visit) const {
-    const Cell<D>& cell = surface_.cell(static_cast<int32_t>(k));
-    around.move_to(cell);
-    for (const Cell<D>& off : offsets_) {
-      const int32_t other = around.at(cell + off);
-      if (other != kNoElement) visit(static_cast<size_t>(other));
-    }
+    around.each(surface_.cell(static_cast<int32_t>(k)), near_, [&](int32_t other) {
+      if (static_cast<size_t>(other) != k) visit(static_cast<size_t>(other));
+    });
   }
 
   float opinion(Around<D>& around, size_t k, const std::vector<float>& p) const {
@@ -169,7 +132,7 @@ class Beside {
   int threads_;
   std::vector<float> p_;
   std::vector<Row> rows_;
-  std::vector<Cell<D>> offsets_;
+  CellRows<D> near_;
 };
 
 }  // namespace stillmap

@@ -94,10 +94,8 @@ class Dwell {
     const size_t looks = starts.size() - 1;
     const size_t n = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1,
                                         std::max<size_t>(looks, 1));
-    while (collectors_.size() < n)
-      collectors_.push_back(std::make_unique<LookCollector<D>>(surface_, beam_tiles_, neighbours_,
-                                                               options_, tables_));
     try {
+      collect_by(n);
       follow(scans, look, place, starts, n);
     } catch (...) {
       rest();  // sheets are half written
@@ -141,6 +139,16 @@ class Dwell {
       places[k].template head<D>() =
           surface.element(static_cast<int32_t>(k)).mean.template cast<float>();
     return places;
+  }
+
+  void collect_by(size_t n) {
+    const size_t made = collectors_.size();
+    if (made >= n) return;
+    collectors_.resize(n);
+    parallel_shares(one_each(n - made), [&](size_t i, size_t, size_t) {
+      collectors_[made + i] =
+          std::make_unique<LookCollector<D>>(surface_, beam_tiles_, neighbours_, options_, tables_);
+    });
   }
 
   void follow(const Scans<D>& scans, const int64_t* look, const double* place,

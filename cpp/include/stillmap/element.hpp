@@ -58,6 +58,24 @@ struct Sums {
   std::array<Fixed, D> first{};           // of end point - cell corner
   std::array<Fixed, kProducts> second{};  // of its products, by rows of the upper triangle
   Span hit;
+
+  void add(const Vec<D>& end) {
+    const Vec<D> x = end - cell.template cast<double>();
+    ++count;
+    size_t product = 0;
+    for (int i = 0; i < D; ++i) {
+      first[static_cast<size_t>(i)] += to_fixed(x[i]);
+      for (int j = i; j < D; ++j) second[product++] += to_fixed(x[i] * x[j]);
+    }
+  }
+  // those of other end points in the same cell
+  void add(const Sums& other) {
+    count += other.count;
+    for (size_t i = 0; i < first.size(); ++i) first[i] += other.first[i];
+    for (size_t i = 0; i < second.size(); ++i) second[i] += other.second[i];
+    hit.first = std::min(hit.first, other.hit.first);
+    hit.last = std::max(hit.last, other.hit.last);
+  }
 };
 
 // Count, mean and covariance of the end points in the cells around one.

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <vector>
 
+#include "stillmap/around.hpp"
 #include "stillmap/surface.hpp"
 
 namespace stillmap {
@@ -37,15 +38,12 @@ class Neighbours {
 
  private:
   void add(const Surface<D>& surface, double reach, size_t first, size_t last) {
-    const int radius = static_cast<int>(std::ceil(reach));
-    Cursor<const Surface<D>> cursor(surface);
+    const CellRows<D> window = rows_around<D>(std::ceil(reach), true);
+    Around<D> around(surface);
     for (size_t i = first; i < last; ++i) {
       const auto from = static_cast<int32_t>(i);
-      for_each_near<D>(surface.cell(from), radius, [&](const Cell<D>& cell) {
-        const auto* block = cursor.block(cell);
-        if (!block) return;
-        const int32_t k = block->counts[static_cast<size_t>(Surface<D>::local_of(cell))];
-        if (k == kNoElement || k == from) return;
+      around.each(surface.cell(from), window, [&](int32_t k) {
+        if (k == from) return;
         const Vec<D> apart = surface.element(k).mean - surface.element(from).mean;
         if (apart.squaredNorm() <= reach * reach) near_.push_back(k);
       });

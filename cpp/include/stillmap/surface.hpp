@@ -6,11 +6,13 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <deque>
 #include <limits>
 #include <stdexcept>
 #include <utility>
 #include <vector>
 
+#include "stillmap/around.hpp"
 #include "stillmap/beams.hpp"
 #include "stillmap/cell_index.hpp"
 #include "stillmap/element.hpp"
@@ -49,16 +51,19 @@ class Surface : public CellIndex<D> {
   const std::vector<Span>& hits() const { return hits_; }
 
   // Notes the end points of all beams that were hit, and the looks of their scans if given.
-  void add(const Scans<D>& scans, const int64_t* look = nullptr) {
+  void add(const Scans<D>& scans, const int64_t* look = nullptr, int threads = 1) {
     if (fitted_) throw std::invalid_argument("surface: was fitted, and takes no more end points");
     if (sums_.empty()) dated_ = look != nullptr;
     if (dated_ != (look != nullptr)) throw std::invalid_argument("look: of all scans, or of none");
-    for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t t, int64_t n, const Pose<D>& pose) {
-      if (!scans.hit[n]) return;
-      const Segment<D> beam(pose, scans.points + n * D, resolution_);
-      Sums<D>& sums = add_end_point(beam.end);
-      if (look) sums.hit.widen(look[t]);
+    const std::vector<size_t> bounds = shares_of(scans.offset, scans.n_scans, threads);
+    std::deque<Surface> others;
+    for (size_t i = 2; i < bounds.size(); ++i) others.emplace_back(resolution_);
+    parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
+      (i == 0 ? *this : others[i - 1]).add_share(scans, look, first, last);
     });
+    // blocks come in the order in which a single thread would have met them
+    for (const Surface& other : others)
+      for (const Sums<D>& sums : other.sums_) sums_of(sums.cell).add(sums);
   }
 
   // The element of a cell, or kNoElement.
@@ -148,23 +153,25 @@ class Surface : public CellIndex<D> {
     return order;
   }
 
-  Sums<D>& add_end_point(const Vec<D>& end) {
-    const Cell<D> cell = cell_of<D>(end);
+  void add_share(const Scans<D>& scans, const int64_t* look, size_t first, size_t last) {
+    for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
+      if (!scans.hit[n]) return;
+      const Segment<D> beam(pose, scans.points + n * D, resolution_);
+      Sums<D>& sums = sums_of(cell_of<D>(beam.end));
+      sums.add(beam.end);
+      if (look) sums.hit.widen(look[t]);
+    });
+  }
+
+  // Those of a cell, of no end point at first.
+  Sums<D>& sums_of(const Cell<D>& cell) {
     int32_t& at = this->place_of(cell);
     if (at == kNoElement) {
       at = static_cast<int32_t>(sums_.size());
       sums_.emplace_back();
       sums_.back().cell = cell;
     }
-    Sums<D>& sums = sums_[static_cast<size_t>(at)];
-    const Vec<D> x = end - cell.template cast<double>();
-    ++sums.count;
-    size_t product = 0;
-    for (int i = 0; i < D; ++i) {
-      sums.first[static_cast<size_t>(i)] += to_fixed(x[i]);
-      for (int j = i; j < D; ++j) sums.second[product++] += to_fixed(x[i] * x[j]);
-    }
-    return sums;
+    return sums_[static_cast<size_t>(at)];
   }
 
   static Vec<D> mean_of(const Sums<D>& s) {
@@ -204,9 +211,13 @@ class Surface : public CellIndex<D> {
   Fitted fit_normals(int radius, size_t first_element, size_t last_element) {
     Fitted fitted;
     auto& [all, flat, across] = fitted;
-    Cursor<const Surface<D>> cursor(*this);
+    Around<D> around(*this);
+    const CellRows<D> window = rows_around<D>(radius, true);
     for (size_t k = first_element; k < last_element; ++k) {
-      const Spread<D> spread = around(cursor, sums_[k].cell, radius);
+      Spread<D> spread;
+      around.each(sums_[k].cell, window, [&](int32_t near) {
+        spread.add(sums_[static_cast<size_t>(near)], sums_[k].cell);
+      });
       const Eigen::SelfAdjointEigenSolver<Square> axes(spread.covariance());
       const Vec<D> variance = axes.eigenvalues().cwiseMax(0.0);  // rising
       Element<D>& element = elements_[k];
@@ -233,17 +244,6 @@ class Surface : public CellIndex<D> {
       element.off_plane = element.normal.dot(centre - spread.mean());
     }
     return fitted;
-  }
-
-  Spread<D> around(Cursor<const Surface<D>>& cursor, const Cell<D>& centre, int radius) const {
-    Spread<D> spread;
-    for_each_near<D>(centre, radius, [&](const Cell<D>& cell) {
-      const Block* block = cursor.block(cell);
-      if (!block) return;
-      const int32_t k = block->counts[static_cast<size_t>(this->local_of(cell))];
-      if (k != kNoElement) spread.add(sums_[static_cast<size_t>(k)], centre);
-    });
-    return spread;
   }
 
   static double weighted_median(std::vector<std::pair<double, int64_t>>& values) {

@@ -10,6 +10,14 @@
 
 namespace stillmap {
 
+// Bits that are set. What compilers have for it calls a library, for processors that cannot count.
+constexpr int32_t ones(uint64_t x) {
+  x -= (x >> 1) & 0x5555555555555555u;
+  x = (x & 0x3333333333333333u) + ((x >> 2) & 0x3333333333333333u);
+  x = (x + (x >> 4)) & 0x0f0f0f0f0f0f0f0fu;
+  return static_cast<int32_t>((x * 0x0101010101010101u) >> 56);
+}
+
 // Of a tile of four cells a side, the cells in some of its slices across each axis.
 template <int D>
 using Across = std::array<std::array<uint64_t, 16>, D>;
@@ -60,19 +68,20 @@ class Tiles {
     // Calls visit(tile, bit, cell in the block) for those in some of the slices across each axis.
     template <class Visit>
     void each_in(const std::array<uint32_t, D>& wanted, Visit&& visit) const {
+      std::array<std::array<uint64_t, kPerEdge>, D> within;  // of the tiles along each axis
+      for (size_t d = 0; d < D; ++d)
+        for (size_t i = 0; i < kPerEdge; ++i)
+          within[d][i] = kAcross<D>[d][wanted[d] >> (i << kShift) & 15u];
+      const auto along = [](size_t t, size_t d) { return (t >> (d * kTileBits)) & (kPerEdge - 1); };
       for (size_t t = 0; t < tiles.size(); ++t) {
         uint64_t mask = tiles[t];
-        Cell<D> corner;
-        for (int d = 0; d < D; ++d) {
-          corner[d] = static_cast<int32_t>((t >> (d * kTileBits)) & (kPerEdge - 1)) << kShift;
-          mask &=
-              kAcross<D>[static_cast<size_t>(d)][wanted[static_cast<size_t>(d)] >> corner[d] & 15u];
-        }
+        for (size_t d = 0; d < D; ++d) mask &= within[d][along(t, d)];
         for (; mask; mask &= mask - 1) {
           const auto number = static_cast<size_t>(__builtin_ctzll(mask));
-          Cell<D> cell = corner;
-          for (int d = 0; d < D; ++d)
-            cell[d] += static_cast<int32_t>(number >> (d * kShift)) & (kTileEdge - 1);
+          Cell<D> cell;
+          for (size_t d = 0; d < D; ++d)
+            cell[static_cast<int>(d)] = static_cast<int32_t>(
+                (along(t, d) << kShift) + ((number >> (d * kShift)) & (kTileEdge - 1)));
           visit(t, number, cell);
         }
       }
@@ -154,7 +163,7 @@ class Tiles {
   }
   int32_t element(size_t block, size_t tile, size_t number) const {
     const auto below = uint64_t{marks_[block].tiles[tile]} & ((uint64_t{1} << number) - 1);
-    return first_[block][tile] + __builtin_popcountll(below);
+    return first_[block][tile] + ones(below);
   }
 
  private:

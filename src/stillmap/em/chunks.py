@@ -29,11 +29,13 @@ def chunks(
     recording: Recording,
     group: NDArray[np.int64] | None = None,
     *,
+    groups: int = 1,
     beside: Sequence[NDArray[Any]] = (),
 ) -> Iterator[Chunk]:
     """Chunks of about CHUNK_BEAMS beams; scans of equal `group` (T,), rising, stay together.
 
-    What of the recording, and of arrays `beside` it, lies in files is let go after each chunk.
+    At least so many `groups` are in a chunk, where there are as many: threads share these out. What
+    of the recording, and of arrays `beside` it, lies in files is let go after each chunk.
     """
     offset, first = recording.offset, 0
     while first < recording.n_scans:
@@ -41,9 +43,17 @@ def chunks(
         end = min(max(end, first + 1), recording.n_scans)
         if group is not None and end < recording.n_scans:
             start = int(np.searchsorted(group, group[end]))  # of the group that would be cut
-            end = start if start > first else int(np.searchsorted(group, group[end], side="right"))
+            end = max(start, _after(group, first, max(groups, 1)))
         beams = slice(int(offset[first]), int(offset[end]))
         within = np.ascontiguousarray(offset[first : end + 1] - offset[first])
         yield Chunk(slice(first, end), beams, within)
         recording.let_go(*beside)
         first = end
+
+
+def _after(group: NDArray[np.int64], first: int, groups: int) -> int:
+    """The first scan after so many groups, or after all."""
+    for _ in range(groups):
+        if first < len(group):
+            first = int(np.searchsorted(group, group[first], side="right"))
+    return first

@@ -121,7 +121,7 @@ def _of_beams(
     for scans, beams, offset in chunks(recording, beside=[e]):
         points, hit = recording.points[beams], recording.hit[beams]
         element = surface.elements_of(points, hit, offset, T_map_sensor[scans], threads)
-        known = per_beam(points, hit, found[element], prior)
+        known = per_beam(points, hit, found.take(element), prior)
         if feet is not None:
             over = feet.of(points, hit, offset, T_map_sensor[scans], element, threads)
             known = np.where(np.isnan(over), known, over)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core
+from stillmap.points import finite
 
 if TYPE_CHECKING:
     from stillmap.em.changed import Changed
@@ -88,7 +89,6 @@ def per_beam(
     prior: float,
 ) -> NDArray[np.float32]:
     """(M,) `values` for the hits, the prior at maximum range, NaN for unusable beams."""
-    usable = np.isfinite(points).all(axis=1)
-    e = np.where(hit, values, np.float32(prior)).astype(np.float32)
-    e[~usable] = np.nan
+    e = np.where(hit, values, np.float32(prior)).astype(np.float32, copy=False)
+    e[~finite(points)] = np.nan
     return e

@@ -43,9 +43,12 @@ class Ground:
 
     def at(self, xy: Float) -> Float:
         """(N,) height at places (N, 2) in metres; beyond the edge that of the edge."""
-        column, row = np.floor((xy - self.corner) / _SQUARE).astype(np.int64).T
         H, W = self.z.shape
-        return np.asarray(self.z[np.clip(row, 0, H - 1), np.clip(column, 0, W - 1)])
+        column, row = (  # one after the other: rows of two numbers are slow
+            np.floor((x - corner) / _SQUARE).astype(np.int64).clip(0, last)
+            for x, corner, last in zip(xy.T, self.corner, (W - 1, H - 1), strict=True)
+        )
+        return np.asarray(self.z.take(row * W + column))
 
 
 def ground_of(
@@ -63,7 +66,9 @@ def ground_of(
     surface = _core.Surface3D(_CELL)
     for scans, beams, offset in chunks(recording, beside=[p_static]):
         static = recording.hit[beams] & (p_static[beams] >= _BELIEVED)
-        surface.add_end_points(recording.points[beams], static, offset, T_map_sensor[scans])
+        surface.add_end_points(
+            recording.points[beams], static, offset, T_map_sensor[scans], threads=threads
+        )
     surface.fit(threads)
     _, means, normals, *_ = surface.elements()
     return ground_from(means, normals, T_map_sensor[:, :3, 3])

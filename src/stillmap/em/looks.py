@@ -23,6 +23,7 @@ OFTEN_OCCUPIED = 0.5  # share of the time in which something is there that comes
 _LEAST = 0.3  # cells: no length is known better, whatever the scatter
 _SWALLOWED = 4.0  # one in so many beams without a return through walls: none is trusted
 _ROWS = 1 << 14  # elements that are looked at together
+_LOOKS_EACH = 2  # of each thread: a look is never shared, and some take longer than others
 _LAST_LOOK = 2**31 - 1  # as far as the core counts
 
 
@@ -162,7 +163,7 @@ def surface_of(
     for scans, beams, offset in chunks(recording):
         points, hit = recording.points[beams], recording.hit[beams]
         of_scans = None if look is None else look[scans]
-        surface.add_end_points(points, hit, offset, T_map_sensor[scans], of_scans)
+        surface.add_end_points(points, hit, offset, T_map_sensor[scans], of_scans, threads)
     surface.fit(threads)
     return surface
 
@@ -193,7 +194,7 @@ def _look(recording: Recording, poses: Float, dwell: Dwell, seconds: float, thre
     look, D = look_numbers(recording, seconds), recording.dimension
     T_map_sensor = recording.T_map_sensor(poses)
     place = np.ascontiguousarray(poses[:, :D, D])
-    for scans, beams, offset in chunks(recording, look):
+    for scans, beams, offset in chunks(recording, look, groups=_LOOKS_EACH * threads):
         dwell.add(
             recording.points[beams],
             recording.hit[beams],

@@ -125,15 +125,16 @@ class Recording:
     def end_points(
         self, beams: NDArray[np.intp], T_map_base: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(n, D) where beams (n,) ended, metres in the map frame, at robot poses (T, D+1, D+1)."""
+        """(n, D) where beams (n,), rising, ended: metres in the map frame, at robot poses
+        (T, D+1, D+1)."""
         D, ends = self.dimension, np.empty((len(beams), self.dimension))
-        for part in spool.blocks(beams, rows=_ENDS):
+        for part in spool.near(beams, _ENDS):
             scan = self.scans_of(beams[part])
             # beams may be few: only the scans that they are of
             T = T_map_base[scan] @ self.T_base_sensor[self.sensor[scan]]
             points = self.points[beams[part]].astype(np.float64)
             ends[part] = np.einsum("nij,nj->ni", T[:, :D, :D], points) + T[:, :D, D]
-            self.let_go()  # they may lie anywhere in it
+            self.let_go()
         return ends
 
     def without_odometry(self) -> "Recording":

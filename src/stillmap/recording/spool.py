@@ -9,6 +9,7 @@ import mmap
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -113,6 +114,26 @@ def blocks(*arrays: NDArray[Any], rows: int | None = None) -> Iterator[slice]:
         yield slice(first, min(first + rows, len(arrays[0])))
         for array in arrays:
             let_go(array)
+
+
+def near(numbers: NDArray[np.intp], rows: int) -> Iterator[slice]:
+    """Slices of rising numbers (n,) of rows, so many at most, of which all are of one BLOCK.
+
+    Few rows from all over a file bring nearly all of it into memory.
+    """
+    cuts = np.flatnonzero(np.diff(numbers // BLOCK)) + 1
+    for first, stop in pairwise([0, *cuts.tolist(), len(numbers)]):
+        for at in range(first, stop, rows):
+            yield slice(at, min(at + rows, stop))
+
+
+def rows_of(array: NDArray[Any], numbers: NDArray[np.intp]) -> NDArray[Any]:
+    """(n, *row) some rows, by rising numbers (n,); what was looked at is let go on the way."""
+    out = np.empty((len(numbers), *array.shape[1:]), array.dtype)
+    for part in near(numbers, BLOCK):
+        out[part] = array[numbers[part]]
+        let_go(array)
+    return out
 
 
 def in_turn(

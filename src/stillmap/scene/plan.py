@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from stillmap import em, se2
 from stillmap.em import Ground
+from stillmap.points import finite, first_of_each
 from stillmap.recording.model import Recording
 from stillmap.recording.spool import Column
 from stillmap.scene.band import BandOptions
+from stillmap.threads import in_order
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -46,6 +48,7 @@ def plan_of(
     options: BandOptions,
     cell: float,
     open_space: bool,
+    threads: int = 1,
 ) -> Plan:
     """What the beams of a 3D recording say of the band above the ground.
 
@@ -59,6 +62,7 @@ def plan_of(
         options: see BandOptions.
         cell: metres of one cell of a map.
         open_space: whether beams without a return show free space.
+        threads: same result with any number.
     """
     T_map_sensor = recording.T_map_sensor(poses)
     planar_poses = se2.planar(T_map_sensor)
@@ -66,16 +70,21 @@ def plan_of(
     scratch, offset = recording.scratch, np.zeros(recording.n_scans + 1, np.int64)
     ends, hits = Column(np.float32, (2,), scratch), Column(np.bool_, (), scratch)
     numbers = Column(np.intp, (), scratch)
-    for t in recording.in_turn(range(recording.n_scans)):
+
+    def of_scan(t: int) -> tuple[NDArray[np.float32], NDArray[np.bool_], Index]:
         beams = recording.beams_of(t)
         xy, hit, number = _of_scan(
             recording.points[beams], recording.hit[beams], T_map_sensor[t], ground,
             (options.low, options.high, top), cell, open_space,
         )  # fmt: skip
         local = (xy - planar_poses[t, :2, 2]) @ planar_poses[t, :2, :2]
-        ends.append(local.astype(np.float32))
+        return local.astype(np.float32), hit, beams.start + number
+
+    in_turn = recording.in_turn(range(recording.n_scans))
+    for t, (local, hit, number) in enumerate(in_order(of_scan, in_turn, threads)):
+        ends.append(local)
         hits.append(hit)
-        numbers.append(beams.start + number)
+        numbers.append(number)
         offset[t + 1] = offset[t] + len(number)
     flat = replace(
         recording,
@@ -103,8 +112,8 @@ def _of_scan(
 ) -> tuple[Float, NDArray[np.bool_], Index]:
     """Ends (n, 2) in the map frame, whether something stands there, which beams these are."""
     low, high, top = heights
-    at = np.flatnonzero(np.isfinite(points).all(axis=1) & (hit | open_space))
-    end: Float = points[at].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+    at = np.flatnonzero(finite(points) & (hit | open_space))
+    end: Float = points.take(at, axis=0).astype(np.float64) @ T[:3, :3].T + T[:3, 3]
     start = T[:3, 3] - [0.0, 0.0, ground.at(T[None, :2, 3])[0]]
     above: Float = end[:, 2] - ground.at(end[:, :2])
     stands = hit[at] & (above >= low) & (above <= high)
@@ -123,11 +132,11 @@ def _kept(direction: Index, length: Float, stands: NDArray[np.bool_], cell: floa
     rank = np.where(stands, 1 + np.floor(length / cell).astype(np.int64), 0)
     group = direction * (rank.max(initial=0) + 1) + rank
     hits, others = np.flatnonzero(stands), np.flatnonzero(~stands)
-    hits = hits[np.unique(group[hits], return_index=True)[1]]
+    hits = hits[first_of_each(group[hits])]
     longest = np.zeros(_DIRECTIONS)
     np.maximum.at(longest, direction[others], length[others])
     others = others[length[others] == longest[direction[others]]]
-    others = others[np.unique(direction[others], return_index=True)[1]]
+    others = others[first_of_each(direction[others])]
     kept = np.concatenate([others, hits])
     return np.asarray(kept[np.argsort(group[kept])])
 

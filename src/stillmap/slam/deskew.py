@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core, se2, se3
+from stillmap.points import finite
 from stillmap.recording.model import Recording
 from stillmap.recording.spool import blocks
 from stillmap.slam import motion
 from stillmap.slam.incremental import SlamOptions
+from stillmap.threads import in_order
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -20,7 +22,9 @@ _FASTEST = 100.0  # m/s, likewise
 _BLOCK = 1 << 14  # beams worked on together
 
 
-def deskewed(recording: Recording, poses: Float | None, options: SlamOptions) -> Recording:
+def deskewed(
+    recording: Recording, poses: Float | None, options: SlamOptions, threads: int = 1
+) -> Recording:
     """The recording as if every scan had been taken at once, at its stamp.
 
     During a scan the robot is taken to go on evenly, along an arc, as from this pose to the next;
@@ -33,12 +37,13 @@ def deskewed(recording: Recording, poses: Float | None, options: SlamOptions) ->
         poses: (T, D+1, D+1) of the robot's base at the stamps, in any frame: T_map_base or
             T_odom_base. None: nobody knows, and the recording comes back as it is.
         options: see SlamOptions.
+        threads: for sweeps in space; same result with any number.
     """
     times = recording.beam_time
     if times is None or not len(times) or poses is None or not options.deskew:
         return recording
     if recording.dimension == 3:
-        return _in_space(recording, poses, times)
+        return _in_space(recording, poses, times, threads)
     after, before = _pairs(recording.stamp_ns, *_span(times))
     later, earlier = (_twists(recording, poses, *pair) for pair in (after, before))
     points = recording.per_beam(np.float32, (recording.dimension,))
@@ -56,22 +61,28 @@ def deskewed(recording: Recording, poses: Float | None, options: SlamOptions) ->
     return replace(recording, points=points, beam_time=None)
 
 
-def _in_space(recording: Recording, poses: Float, times: NDArray[np.float32]) -> Recording:
+def _in_space(
+    recording: Recording, poses: Float, times: NDArray[np.float32], threads: int
+) -> Recording:
     """The same of sweeps in space, which last from one stamp to the next."""
     twists = _twists_in_space(recording.stamp_ns, poses)
     points = recording.per_beam(np.float32, (3,))
-    for t in recording.in_turn(range(recording.n_scans), points):
+
+    def of_scan(t: int) -> NDArray[np.float32]:
         beams = recording.beams_of(t)
         T = recording.T_base_sensor[recording.sensor[t]]
         in_base = recording.points[beams] @ T[:3, :3].T + T[:3, 3]
-        usable = np.isfinite(in_base).all(axis=1)
-        points[beams] = np.nan
+        usable = np.flatnonzero(finite(in_base))
         carried = _core.carried(
-            np.ascontiguousarray(in_base[usable], np.float32),
-            np.ascontiguousarray(times[beams][usable]),
-            twists[t],
+            in_base.take(usable, axis=0).astype(np.float32), times[beams].take(usable), twists[t]
         )
-        points[beams][usable] = (carried - T[:3, 3]) @ T[:3, :3]
+        out = np.full(in_base.shape, np.nan, np.float32)
+        out[usable] = (carried - T[:3, 3]) @ T[:3, :3]
+        return out
+
+    in_turn = recording.in_turn(range(recording.n_scans), points)
+    for t, found in enumerate(in_order(of_scan, in_turn, threads)):
+        points[recording.beams_of(t)] = found
     return replace(recording, points=points, beam_time=None)
 
 

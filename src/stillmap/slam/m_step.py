@@ -155,6 +155,6 @@ def _mapped_at(
     D, T = recording.dimension, recording.n_scans
     grid = em.empty_grid(D, options.resolution, options.registration.approach)
     if sums:
-        em.add_recording(grid, deskewed(recording, poses, options), poses, e, threads)
+        em.add_recording(grid, deskewed(recording, poses, options, threads), poses, e, threads)
     freedom = D * (D + 1) // 2
     return Mapped(poses, np.zeros((T, freedom, freedom)), grid, np.full(T, np.nan), [])

@@ -1,0 +1,51 @@
+"""Recordings piece by piece."""
+
+import numpy as np
+import pytest
+
+from stillmap.em import chunks
+from stillmap.recording.model import Recording
+
+LOOKS = np.array([0, 0, 0, 1, 1, 4, 5, 5, 5, 5])
+
+
+def ten_scans():
+    return Recording(
+        stamp_ns=np.arange(10),
+        offset=100 * np.arange(11),
+        points=np.zeros((1000, 2), np.float32),
+        hit=np.ones(1000, bool),
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(10, np.int32),
+        T_odom_base=None,
+    )
+
+
+def cuts(beams, monkeypatch, **which):
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
+    found = list(chunks.chunks(ten_scans(), **which))
+    for chunk in found:
+        assert chunk.beams == slice(100 * chunk.scans.start, 100 * chunk.scans.stop)
+        assert chunk.offset.tolist() == [100 * k for k in range(len(chunk.offset))]
+    assert [c.scans.start for c in found] == [0, *(c.scans.stop for c in found[:-1])]
+    return [chunk.scans.stop for chunk in found]
+
+
+@pytest.mark.parametrize(
+    ("beams", "stops"), [(1, list(range(1, 11))), (250, [2, 4, 6, 8, 10]), (10**6, [10])]
+)
+def test_chunks_are_no_larger_than_asked_for(beams, stops, monkeypatch):
+    assert cuts(beams, monkeypatch) == stops
+
+
+@pytest.mark.parametrize(("beams", "stops"), [(1, [3, 5, 6, 10]), (600, [6, 10]), (950, [6, 10])])
+def test_no_look_is_cut(beams, stops, monkeypatch):
+    assert cuts(beams, monkeypatch, group=LOOKS) == stops
+
+
+@pytest.mark.parametrize(
+    ("beams", "groups", "stops"),
+    [(1, 2, [5, 10]), (1, 3, [6, 10]), (1, 9, [10]), (600, 2, [6, 10]), (1, 1, [3, 5, 6, 10])],
+)
+def test_threads_find_looks_to_share_out(beams, groups, stops, monkeypatch):
+    assert cuts(beams, monkeypatch, group=LOOKS, groups=groups) == stops

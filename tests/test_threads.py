@@ -1,0 +1,45 @@
+"""Work that threads share."""
+
+import threading
+
+import pytest
+
+from stillmap.threads import in_order
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_outcomes_keep_the_order_of_the_items(threads):
+    assert list(in_order(lambda i: i * i, range(100), threads)) == [i * i for i in range(100)]
+    assert list(in_order(str, [], threads)) == []
+
+
+def test_work_goes_on_side_by_side():
+    both = threading.Barrier(2, timeout=30.0)  # one alone would never pass
+    assert len(list(in_order(lambda _: both.wait(), range(4), 2))) == 4
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_items_are_asked_for_when_they_are_due(threads):
+    asked = []
+
+    def items():
+        for i in range(100):
+            asked.append(i)
+            yield i
+
+    outcomes = in_order(lambda i: i, items(), threads)
+    assert next(outcomes) == 0
+    assert len(asked) <= threads + 1
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_what_goes_wrong_is_told(threads):
+    def work(i):
+        if i == 3:
+            raise ValueError("the third")
+        return i
+
+    outcomes = in_order(work, range(10), threads)
+    assert [next(outcomes) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(ValueError, match="the third"):
+        next(outcomes)
