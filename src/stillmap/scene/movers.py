@@ -1,7 +1,7 @@
 """What moves in a 3D recording: seen from above, followed on the ground, given its height back."""
 
 import dataclasses
-from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from stillmap.em import Ground
 from stillmap.objects import MovingObject, ObjectOptions, moving_objects
 from stillmap.recording.model import Recording
 from stillmap.recording.spool import Column, rows_of
+from stillmap.scene.flat import flat_recording
 from stillmap.threads import in_order
 
 Float = NDArray[np.float64]
@@ -47,16 +48,49 @@ def moving_in_space(
     """
     if not options.enabled:
         return []
-    T_map_sensor = recording.T_map_sensor(poses)
-    flat_poses = se2.planar(T_map_sensor)
-    columns = {
-        "points": Column(np.float32, (2,), recording.scratch),
-        "nearest": Column(np.intp, (), recording.scratch),
-        "part": Column(np.int64, (), recording.scratch),
-        "beam": Column(np.intp, (), recording.scratch),
-    }
-    T = recording.n_scans
-    seen, all_of, parts = np.zeros(T + 1, np.int64), np.zeros(T + 1, np.int64), 0
+    flat_poses = se2.planar(recording.T_map_sensor(poses))
+    found = _dynamic_parts(recording, poses, flat_poses, p_static, ground, options, threads)
+    hit = np.ones(len(found.nearest), np.bool_)
+    flat = flat_recording(recording, found.points, hit, found.offset)
+    things = moving_objects(flat, flat_poses, p_static[found.nearest], options)
+    owned = _of_parts(things, found.nearest, found.part, found.beam)
+    return [
+        _in_space(one, beams, recording, poses, p_static)
+        for one, beams in zip(things, owned, strict=True)
+    ]
+
+
+class _Parts(NamedTuple):
+    """What is dynamic over the ground.
+
+    Attributes:
+        points: (N, 2) metres, the nearest in each direction, in the planar frame of each sensor.
+        nearest: (N,) their beams.
+        offset: (T + 1,) where those of each scan begin.
+        part: (K,) of each dynamic beam, rising from scan to scan.
+        beam: (K,) their numbers, rising.
+    """
+
+    points: NDArray[np.float32]
+    nearest: Index
+    offset: NDArray[np.int64]
+    part: Index
+    beam: Index
+
+
+def _dynamic_parts(
+    recording: Recording,
+    poses: Float,
+    flat_poses: Float,
+    p_static: NDArray[np.float32],
+    ground: Ground,
+    options: ObjectOptions,
+    threads: int,
+) -> _Parts:
+    T_map_sensor, T = recording.T_map_sensor(poses), recording.n_scans
+    scratch, offset, parts = recording.scratch, np.zeros(T + 1, np.int64), 0
+    points, nearest = Column(np.float32, (2,), scratch), Column(np.intp, (), scratch)
+    part_of, beam = Column(np.int64, (), scratch), Column(np.intp, (), scratch)
 
     def of_scan(t: int) -> tuple[Index, Index, Float, Index]:
         beams = recording.beams_of(t)
@@ -69,31 +103,15 @@ def moving_in_space(
 
     in_turn = recording.in_turn(range(T), p_static)
     for t, (number, part, local, near) in enumerate(in_order(of_scan, in_turn, threads)):
-        columns["points"].append(local[near].astype(np.float32))
-        columns["nearest"].append(number[near])
-        columns["part"].append(parts + part)
-        columns["beam"].append(number)
+        points.append(local[near].astype(np.float32))
+        nearest.append(number[near])
+        part_of.append(parts + part)
+        beam.append(number)
         parts += int(part.max()) + 1 if len(part) else 0
-        seen[t + 1], all_of[t + 1] = seen[t] + len(near), all_of[t] + len(number)
-    found = {name: column.finished() for name, column in columns.items()}
-    flat = replace(
-        recording,
-        points=found["points"],
-        hit=np.ones(len(found["points"]), np.bool_),
-        offset=seen,
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(T, np.int32),
-        T_odom_base=None,
-        T_recorded_base=None,
-        beam_time=None,
-        images=None,
+        offset[t + 1] = offset[t] + len(near)
+    return _Parts(
+        points.finished(), nearest.finished(), offset, part_of.finished(), beam.finished()
     )
-    things = moving_objects(flat, flat_poses, p_static[found["nearest"]], options)
-    owned = _of_parts(things, found["nearest"], found["part"], found["beam"])
-    return [
-        _in_space(one, beams, recording, poses, p_static)
-        for one, beams in zip(things, owned, strict=True)
-    ]
 
 
 def _above_ground(

@@ -5,7 +5,7 @@ way; as far as a beam runs within it, nothing is. So each sweep becomes one scan
 looks all around, and everything that is known of planar recordings holds for it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from stillmap.points import finite, first_of_each
 from stillmap.recording.model import Recording
 from stillmap.recording.spool import Column
 from stillmap.scene.band import BandOptions
+from stillmap.scene.flat import flat_recording
 from stillmap.threads import in_order
 
 Float = NDArray[np.float64]
@@ -86,18 +87,7 @@ def plan_of(
         hits.append(hit)
         numbers.append(number)
         offset[t + 1] = offset[t] + len(number)
-    flat = replace(
-        recording,
-        points=ends.finished(),
-        hit=hits.finished(),
-        offset=offset,
-        T_base_sensor=np.eye(3)[None],
-        sensor=np.zeros(recording.n_scans, np.int32),
-        T_odom_base=None,
-        beam_time=None,
-        T_recorded_base=None,
-        images=None,
-    )
+    flat = flat_recording(recording, ends.finished(), hits.finished(), offset)
     return Plan(flat, planar_poses, numbers.finished())
 
 
