@@ -12,8 +12,8 @@ They are compared with, never needed. All are given the same beams at the same p
 or those of the folder, without the motion during sweeps; --estimated-poses has stillmap once more
 find its own. Others are given what is at least 2.5 m away, scored is what is nearer than 50 m.
 SA, DA and HA are percentages: of the static beams called static, of the dynamic ones called
-dynamic, and the harmonic mean. Recall by kind is in percent, too. Dynamic beams "that never move"
-met things which stood still as long as any beam met them: no recording tells that these ever move.
+dynamic, and the harmonic mean. Recall by kind is in percent, too. Dynamic beams "met at rest only"
+are of things that stood still from the first beam on them to the last.
 
 Each method has a process of its own, one after the other, in an order that turns from round to
 round; seconds are the medians of the rounds. "labels" are seconds until every beam has its label,
@@ -45,7 +45,7 @@ LABELS = (
     Column("da", "DA", ".2f", True),
     Column("ha", "HA", ".2f", True),
     Column("ha_without", "HA without doors", ".2f", True),
-    Column("stood", "dynamic that never move, %", ".2f"),
+    Column("rested", "dynamic met at rest only, %", ".2f"),
     Column("ha_moved", "HA of the rest", ".2f", True),
     Column("ap", "AP", ".4f", True),
     Column("brier", "Brier", ".4f"),

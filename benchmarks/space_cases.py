@@ -55,15 +55,16 @@ class Known:
         kind: (M,) number of what it met in `kinds`.
         scored: (M,) whether that counts: it is known, and not the robot itself.
         kinds: names of what moves, then NOBODY.
-        stood: (M,) whether what it met stood still as long as any beam met it; no recording tells
-            that it ever moves. Not known of labels in files: never.
+        rested: (M,) whether what it met was there all the time, and at rest from the first scan to
+            the last that met it: that it moves is at most seen from its place being empty
+            otherwise. Not known of labels in files: never.
     """
 
     static: NDArray[np.bool_]
     kind: NDArray[np.int16]
     scored: NDArray[np.bool_]
     kinds: list[str]
-    stood: NDArray[np.bool_]
+    rested: NDArray[np.bool_]
 
 
 def simulated(
@@ -111,7 +112,7 @@ def prepare(case: Case, work: Path) -> dict[str, Any]:
     np.save(work / "beam.npy", beam)
     np.save(work / "static.npy", known.static[beam])
     np.save(work / "kind.npy", known.kind[beam])
-    np.save(work / "stood.npy", known.stood[beam])
+    np.save(work / "rested.npy", known.rested[beam])
     np.save(work / "scored.npy", known.scored[beam] & near)
     return {"sweeps": recording.n_scans, "beams": recording.n_beams, "given": len(beam)}
 
@@ -122,21 +123,24 @@ def known_of(truth: Truth, offset: NDArray[np.int64]) -> Known:
     kinds = [*dict.fromkeys(of_movers), NOBODY]
     number = np.array([*(kinds.index(k) for k in of_movers), len(kinds) - 1], np.int16)
     kind = number[np.maximum(truth.mover, -1)]
-    return Known(truth.static, kind, truth.mover >= -1, kinds, stood_still(truth, offset))
+    return Known(truth.static, kind, truth.mover >= -1, kinds, met_at_rest(truth, offset))
 
 
-def stood_still(truth: Truth, offset: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(M,) whether what a beam met stood still from the first scan to the last that met it."""
+def met_at_rest(truth: Truth, offset: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(M,) whether what a beam met was at rest from the first scan to the last that met it.
+
+    What is not there at all at some time, as what is brought or taken away, does not count.
+    """
     scan = np.repeat(np.arange(len(offset) - 1), np.diff(offset))
-    stood = np.zeros(len(of_movers := truth.scene["mover_kinds"]) + 1, np.bool_)
+    rested = np.zeros(len(of_movers := truth.scene["mover_kinds"]) + 1, np.bool_)
     for m in range(len(of_movers)):
-        met = scan[truth.mover == m]
-        if len(met):
-            way = truth.movers[met[0] : met[-1] + 1, m]
-            gone = np.linalg.norm(way[:, :2] - way[0, :2], axis=1)
-            turned = np.abs(way[:, 2] - way[0, 2])
-            stood[m] = np.nanmax(gone) < _STOOD and np.nanmax(turned) < _FACED
-    return stood[np.maximum(truth.mover, -1)]
+        met, course = scan[truth.mover == m], truth.movers[:, m]
+        if len(met) and np.isfinite(course).all():
+            way = course[met[0] : met[-1] + 1] - course[met[0]]
+            turned = np.abs(np.angle(np.exp(1j * way[:, 2])))
+            gone = np.linalg.norm(way[:, :2], axis=1)
+            rested[m] = gone.max() < _STOOD and turned.max() < _FACED
+    return rested[np.maximum(truth.mover, -1)]
 
 
 def labelled(folder: Path) -> Known:
@@ -186,7 +190,7 @@ def write_given(
 def known_of_given(work: Path) -> Known:
     """The truth (K,) of the beams that all were given."""
     kinds = json.loads((work / "case.json").read_text())["kinds"]
-    static, kind, scored, stood = (
-        np.load(work / f"{name}.npy") for name in ("static", "kind", "scored", "stood")
+    static, kind, scored, rested = (
+        np.load(work / f"{name}.npy") for name in ("static", "kind", "scored", "rested")
     )
-    return Known(static, kind, scored, kinds, stood)
+    return Known(static, kind, scored, kinds, rested)

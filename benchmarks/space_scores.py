@@ -34,8 +34,8 @@ def scores(p_static: NDArray[np.floating], known: Known, certain: bool) -> Score
         known: the truth of these.
         certain: labels are 0 or 1, and probabilities are not scored.
     """
-    p, static, kind, stood = (
-        one[known.scored] for one in (p_static, known.static, known.kind, known.stood)
+    p, static, kind, rested = (
+        one[known.scored] for one in (p_static, known.static, known.kind, known.rested)
     )
     out: Scores = {**accuracies(p, static), "n_static": static.sum(), "n_dynamic": (~static).sum()}
     for number, name in enumerate(known.kinds):
@@ -45,9 +45,9 @@ def scores(p_static: NDArray[np.floating], known: Known, certain: bool) -> Score
     lasting = np.isin(kind, [known.kinds.index(n) for n in LASTING if n in known.kinds])
     if lasting.any():
         out["ha_without"] = accuracies(p[~lasting], static[~lasting])["ha"]
-    if stood.any():
-        out["ha_moved"] = accuracies(p[~stood], static[~stood])["ha"]
-        out["stood"] = 100.0 * float(np.mean(stood[~static]))
+    if rested.any():
+        out["ha_moved"] = accuracies(p[~rested], static[~rested])["ha"]
+        out["rested"] = 100.0 * float(np.mean(rested[~static]))
     if not certain:
         labels = label_scores(p, static, np.ones(len(p), np.bool_))
         out |= {

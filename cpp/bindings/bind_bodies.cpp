@@ -42,7 +42,7 @@ auto means(const Bodies& bodies) {
 auto feet(const Surface<3>& surface, const Points<3>& points, const Flat<bool>& hit,
           const Flat<int64_t>& offset, const Poses<3>& poses, const Flat<int32_t>& element,
           const Flat<bool>& stands, const Flat<float>& p_static, const Flat<float>& ground,
-          int column, double least, int threads) {
+          int column, double low, double least, int threads) {
   const auto scans = scans_from<3>(points, hit, offset, poses);
   const size_t n = surface.size(), beams = points.shape(0);
   require(surface.fitted(), "surface: fit it first");
@@ -55,12 +55,17 @@ auto feet(const Surface<3>& surface, const Points<3>& points, const Flat<bool>& 
   require(stands.shape(0) == n, "stands: expected one per element");
   require(p_static.shape(0) == n, "p_static: expected one per element");
   require(ground.shape(0) == n, "ground: expected one per element");
+  for (size_t k = 0; k < n; ++k) {
+    require_probability(static_cast<double>(p_static.data()[k]), "p_static");
+    require(std::isfinite(ground.data()[k]), "ground: not finite");
+  }
   require(column >= 1 && column <= kWidest, "column: expected 1 to 1048576 cells");
+  require(std::isfinite(low), "low: not finite");
   require(least >= 0.0 && std::isfinite(least), "least: expected a height of at least 0");
   std::vector<float> out(beams);
   {
     nb::gil_scoped_release released;
-    const Feet feet(surface, {stands.data(), p_static.data(), ground.data(), column, least});
+    const Feet feet(surface, {stands.data(), p_static.data(), ground.data(), column, low, least});
     feet.find(scans, element.data(), threads, out.data());
   }
   return owned(std::move(out), {beams});
@@ -86,7 +91,8 @@ void bind_bodies(nb::module_& m) {
         nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::arg("element").noconvert(), nb::kw_only(),
         nb::arg("stands").noconvert(), nb::arg("p_static").noconvert(),
-        nb::arg("ground").noconvert(), nb::arg("column"), nb::arg("least"), nb::arg("threads") = 1,
+        nb::arg("ground").noconvert(), nb::arg("column"), nb::arg("low"), nb::arg("least"),
+        nb::arg("threads") = 1,
         "(M,) float32 of beams that end more than `least` metres above static elements (M,) of the "
         "ground: mean probability of being static of what stands in the same column in the same "
         "sweep; NaN where that is half or more, and for all others. stands (E,) bool, p_static and "

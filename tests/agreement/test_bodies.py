@@ -80,14 +80,14 @@ def test_threads_and_chunks_change_nothing():
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize(("column", "least"), [(1, 0.02), (3, 0.0)])
+@pytest.mark.parametrize(("column", "least"), [(2, 0.02), (3, 0.0)])
 def test_feet_of_core_and_twin_agree(seed, column, least):
     rng = np.random.default_rng(seed + 40)
-    xy = rng.uniform(-2.5, 2.5, (700, 2))
-    floor = np.column_stack([xy, rng.normal(0.1, 0.01, 700) * np.sign(rng.normal(2, 1, 700))])
-    points, hit, offset, T = scattered(seed, 700)
-    points = np.concatenate([points, floor.astype(np.float32)])[rng.permutation(1400)]
-    beams = points, np.tile(hit, 2), 2 * offset, np.tile(np.eye(4), (len(T), 1, 1))
+    xy = rng.uniform(-2.5, 2.5, (1600, 2))
+    floor = np.column_stack([xy, rng.normal(0.1, 0.01, 1600) * np.sign(rng.normal(2, 1, 1600))])
+    points, hit, offset, T = scattered(seed, 800)
+    points = np.concatenate([points, floor.astype(np.float32)])[rng.permutation(2400)]
+    beams = points, np.tile(hit, 3), 3 * offset, np.tile(np.eye(4), (len(T), 1, 1))
     core, plain = surfaces(beams)
     of_core, of_plain = order(core), order(plain)
     low = rng.random(plain.size) < 0.5
@@ -96,13 +96,20 @@ def test_feet_of_core_and_twin_agree(seed, column, least):
     for kernels, surface, of in ((_core, core, of_core), (reference, plain, of_plain)):
         stands = np.empty(plain.size, bool)
         mine = np.empty((2, plain.size), np.float32)
-        stands[of], mine[0][of], mine[1][of] = ~low, np.where(low, 0.5 + p / 2, p), ground
+        stands[of], mine[0][of], mine[1][of] = ~low, np.where(low, 0.5 + p / 2, 0.6 * p), ground
         known = {"stands": stands, "p_static": mine[0], "ground": mine[1]}
         element = surface.elements_of(*beams)
         for threads in (1, 3):
             found.append(
                 kernels.feet(
-                    surface, *beams, element, **known, column=column, least=least, threads=threads
+                    surface,
+                    *beams,
+                    element,
+                    **known,
+                    column=column,
+                    low=0.15,
+                    least=least,
+                    threads=threads,
                 )
             )
     np.testing.assert_array_equal(found[0], found[1])
@@ -124,7 +131,9 @@ def feet_of(points, *, stands, p_static, ground=0.0, least=0.05, scans=1):
     values[0][of], values[1][of], values[2][of] = stands, p_static, ground
     element = surface.elements_of(points, hit, offset, T)
     known = {"stands": values[0].astype(bool), "p_static": values[1], "ground": values[2]}
-    return _core.feet(surface, points, hit, offset, T, element, **known, column=1, least=least)
+    return _core.feet(
+        surface, points, hit, offset, T, element, **known, column=1, low=0.3, least=least
+    )
 
 
 def test_a_sole_under_a_leg_that_moves():
@@ -137,6 +146,12 @@ def test_a_sole_under_a_leg_that_moves():
     assert np.isnan(feet_of([leg, sole, below, beside], **static)).all()
     known = {**given, "p_static": [0.4, 0.2, 0.9]}  # the foot's own element moves
     assert np.isnan(feet_of([leg, sole, below, beside], **known)).all()
+
+
+def test_crowns_over_what_moves_are_no_feet():
+    leg, sole, crown = [0.5, 0.5, 1.2], [0.5, 0.5, 0.07], [0.5, 0.5, 4.2]
+    found = feet_of([leg, sole, crown], stands=[0, 1, 0], p_static=[0.9, 0.2, 0.9])
+    assert np.isfinite(found).tolist() == [False, True, False]
 
 
 def test_feet_are_of_the_same_sweep():
@@ -155,7 +170,10 @@ def test_feet_are_of_the_same_sweep():
         ({"stands": np.ones(1, bool)}, "stands: expected one per element"),
         ({"p_static": np.ones(3, np.float32)}, "p_static: expected one per element"),
         ({"ground": np.ones(1, np.float32)}, "ground: expected one per element"),
+        ({"p_static": np.array([0.5, 1.5], np.float32)}, "p_static: expected a probability"),
+        ({"ground": np.array([0.0, np.nan], np.float32)}, "ground: not finite"),
         ({"column": 0}, "column"),
+        ({"low": np.inf}, "low"),
         ({"least": -1.0}, "least"),
     ],
 )
@@ -170,6 +188,7 @@ def test_feet_refuse(changes, match):
         "p_static": np.ones(2, np.float32),
         "ground": np.zeros(2, np.float32),
         "column": 1,
+        "low": 0.2,
         "least": 0.0,
     }
     assert np.isnan(_core.feet(surface, *beams, **given)).all()
@@ -196,6 +215,7 @@ def test_feet_refuse_unusable_beams():
             p_static=one,
             ground=one,
             column=1,
+            low=0.2,
             least=0.0,
         )
 

@@ -41,7 +41,7 @@ def test_scores_by_kind_leave_out_what_nobody_knows() -> None:
         kind=np.array([2, 2, 0, 0, 1, 2], np.int16),
         scored=np.array([True, True, True, True, True, False]),
         kinds=["car", "door", "static"],
-        stood=np.array([False, False, False, True, False, True]),
+        rested=np.array([False, False, False, True, False, True]),
     )
     row = scores(np.array([0.9, 0.8, 0.1, 0.2, 0.7, 0.9]), known, certain=False)
     assert row["sa"] == 100.0
@@ -49,7 +49,7 @@ def test_scores_by_kind_leave_out_what_nobody_knows() -> None:
     assert (row["recall_car"], row["recall_door"]) == (100.0, 0.0)
     assert row["ha_without"] == 100.0
     assert row["ha_moved"] == pytest.approx(200.0 / 3.0)  # one of two is found
-    assert row["stood"] == pytest.approx(100.0 / 3.0)
+    assert row["rested"] == pytest.approx(100.0 / 3.0)
     assert row["brier"] == pytest.approx((0.01 + 0.04 + 0.01 + 0.04 + 0.49) / 5.0)
     assert (row["n_static"], row["n_dynamic"], row["n_car"]) == (2.0, 3.0, 2.0)
     assert "recall_static" not in row
@@ -88,22 +88,22 @@ def test_labels_of_files(tmp_path: Path) -> None:
     assert [known.kinds[k] for k in known.kind[known.scored]] == ["moving", "static", "moving"]
 
 
-def test_who_never_moves_while_he_is_met() -> None:
+def test_who_is_met_at_rest_only() -> None:
     movers = np.zeros((4, 4, 3))
     movers[:, 0, 0] = [0.0, 3.0, 3.1, 3.2]  # met once he stands
     movers[:, 1, 0] = [0.0, 0.0, 0.0, 5.0]  # met before and after
     movers[:, 2, 2] = [0.0, 0.0, 0.5, 0.5]  # a door
-    movers[:3, 3] = np.nan  # nobody meets it
+    movers[1:, 3] = np.nan  # taken away
     truth = Truth(
-        static=np.array([True, False, False, False, False, False, False]),
-        mover=np.array([-1, 1, 0, 2, 0, 2, 1], np.int32),
+        static=np.array([True] + [False] * 7),
+        mover=np.array([-1, 1, 3, 0, 2, 0, 2, 1], np.int32),
         T_world_base=np.tile(np.eye(4), (4, 1, 1)),
         walls=np.empty((0, 4)),
         movers=movers,
         scene={"mover_kinds": ["car", "car", "door", "thing"]},
     )
-    stood = space_cases.stood_still(truth, np.array([0, 2, 4, 6, 7]))
-    assert stood.tolist() == [False, False, True, False, True, False, False]
+    rested = space_cases.met_at_rest(truth, np.array([0, 3, 5, 7, 8]))
+    assert np.flatnonzero(rested).tolist() == [3, 5]
 
 
 _PRETENDED = """

@@ -38,7 +38,7 @@ def test_tables_count_the_scored() -> None:
         kind=np.array([1, 1, 0, 0], np.int16),
         scored=np.array([True, True, True, False]),
         kinds=["car", "static"],
-        stood=np.zeros(4, bool),
+        rested=np.zeros(4, bool),
     )
     wrong = np.array([True, False, True, True])
     text = space_errors.table("m", np.array([1.0, 2.0, 1.5, 1.5]), (1, 2, 3), known, wrong)

@@ -154,14 +154,16 @@ def test_ground_under_what_stands_still():
 
 
 def test_how_far_it_is_lowered():
-    p = np.array([0.9, 0.9, 0.9, 0.9, 0.3, 0.9, 0.52, 0.9, 0.9], np.float32)
-    moves = [np.nan, 0.2, 0.3, 1.0, 1.0, 0.25, 0.251, 0.0, 0.3]
-    change = [np.nan, 0.9, 0.0, -4.0, 4.0, 1.0, 0.0, 1.1, 4.0]
+    p = np.array([0.9, 0.9, 0.9, 0.9, 0.3, 0.9, 0.52, 0.9, 0.9, 0.001], np.float32)
+    moves = [np.nan, 0.2, 0.3, 1.0, 1.0, 0.25, 0.251, 0.0, 0.3, 1.0]
+    change = [np.nan, 0.9, 0.0, -4.0, 4.0, 1.0, 0.0, 1.1, 4.0, 0.0]
     means = np.array([moves, change], np.float32).T
     found = lowered(p, means, BodyOptions(share=0.25, change=1.0, slope=20.0, most=4.0))
     nats = np.array([1.0, 4.0, 0.02, 2.0, 4.0])
     np.testing.assert_allclose(found[[2, 3, 6, 7, 8]], 1 / (1 + np.exp(nats)), rtol=1e-4)
-    kept = [0, 1, 4, 5]
+    assert found[4] == pytest.approx(1 / (1 + np.exp(4.0)), rel=1e-4)
+    assert found[9] == p[9]  # surer than its body
+    kept = [0, 1, 5]
     np.testing.assert_array_equal(found[kept], p[kept])
 
 

@@ -20,6 +20,7 @@ struct Standing {
   const float* p_static;  // probability
   const float* ground;    // m, height of the ground below it
   int32_t column;         // cells, edge of the columns over the ground
+  double low;             // m above the ground up to where a mean is the ground's
   double least;           // m above the ground from where on a beam did not end on it
 };
 
@@ -68,12 +69,18 @@ class Feet {
     for (int64_t n = scans.offset[t]; n < scans.offset[t + 1]; ++n) {
       out[n] = std::numeric_limits<float>::quiet_NaN();
       const int32_t k = element[n];
-      if (k == kNoElement || of_.stands[k] || of_.p_static[k] < 0.5f) continue;
+      if (!scans.hit[n] || k == kNoElement || !on_ground(k) || of_.p_static[k] < 0.5f) continue;
       const Segment<3> beam(pose, scans.points + n * 3, surface_.resolution());
       if (height(k, beam.end) <= of_.least) continue;
       const size_t c = columns.find(column_of(cell_of<3>(beam.end), of_.column));
       if (c < columns.size() && p[c] < 0.5) out[n] = static_cast<float>(p[c]);
     }
+  }
+
+  // Crowns and bridges are not.
+  bool on_ground(int32_t k) const {
+    const double z = surface_.element(k).mean[2] * surface_.resolution();
+    return !of_.stands[k] && z - static_cast<double>(of_.ground[k]) <= of_.low;
   }
 
   // Metres over the floor that an element is of, or else over the ground.

@@ -12,7 +12,6 @@ from stillmap.em.looks import Float, Surface, blocks_of
 from stillmap.em.options import BodyOptions
 from stillmap.recording.model import Recording
 
-_STATIC = 0.5  # probability from which on an element is called static
 _SCATTERS = 2.5  # of end points about their surface, within which a beam ended on it
 
 
@@ -59,7 +58,7 @@ def with_bodies(
     options: BodyOptions,
     threads: int = 1,
 ) -> NDArray[np.float32]:
-    """(E,) P(static), lowered for static elements of bodies that move, or came or left.
+    """(E,) P(static), lowered for elements of bodies that move, or came or left.
 
     Args:
         p_static: (E,) by what is known of each element and of those right beside it.
@@ -98,10 +97,8 @@ def lowered(
     """
     above = np.nan_to_num(means - np.array([options.share, options.change], np.float32), nan=-1.0)
     nats = np.minimum(options.slope * above.max(axis=1), options.most)
-    of = np.flatnonzero((p_static >= _STATIC) & (nats > 0.0))
-    out = p_static.copy()
-    out[of] = np.minimum(out[of], 1.0 / (1.0 + np.exp(nats[of])))
-    return out
+    lower = np.where(nats > 0.0, 1.0 / (1.0 + np.exp(nats)), 1.0)
+    return np.minimum(p_static, lower.astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +108,13 @@ class Feet:
     Attributes:
         standing: what stands on the ground.
         p_static: (E,) of each element.
+        low: m above the ground up to where an element's mean is the ground's.
         least: m above the ground from where on a beam did not end on it.
     """
 
     standing: Standing
     p_static: NDArray[np.float32]
+    low: float
     least: float
 
     def of(
@@ -145,6 +144,7 @@ class Feet:
             p_static=self.p_static,
             ground=self.standing.ground,
             column=self.standing.column,
+            low=self.low,
             least=self.least,
             threads=threads,
         )
@@ -157,4 +157,4 @@ def feet_of(
     if standing is None:
         return None
     least = max(options.foot, _SCATTERS * standing.surface.scatter)
-    return Feet(standing, p_static, least)
+    return Feet(standing, p_static, options.low, least)

@@ -82,14 +82,12 @@ def ground_under(surface: Surface, p_static: NDArray[np.float32], way: Float) ->
         p_static: (E,) of each element.
         way: (T, 3) where the sensors were, in the map frame whose z points up.
     """
-    floor = []
+    floor = [np.zeros((0, 3))]
     for rows in blocks_of(surface):
         _, means, normals, *_ = surface.elements(rows)
         level = np.abs(normals[:, 2]) > _LEVEL
-        level &= p_static[slice(*rows)] >= _BELIEVED
-        floor.append((means[level], normals[level]))
-    means, normals = (np.concatenate([np.zeros((0, 3)), *of]) for of in zip(*floor, strict=True))
-    return ground_from(means, normals, way)
+        floor.append(means[level & (p_static[slice(*rows)] >= _BELIEVED)])
+    return _ground_by(np.concatenate(floor), way)
 
 
 def ground_from(means: Float, normals: Float, way: Float) -> Ground:
@@ -99,17 +97,21 @@ def ground_from(means: Float, normals: Float, way: Float) -> Ground:
         means, normals: (E, 3) of surface that stands still, metres; a normal of zero: none.
         way: (T, 3) where the sensors were, in the map frame whose z points up.
     """
-    floor = means[np.abs(normals[:, 2]) > _LEVEL]
+    return _ground_by(means[np.abs(normals[:, 2]) > _LEVEL], way)
+
+
+def _ground_by(floor: Float, way: Float) -> Ground:
     sensor = _height(floor, way)
-    low = np.vstack([means[:, :2], way[:, :2]]).min(axis=0)
-    high = np.vstack([means[:, :2], way[:, :2]]).max(axis=0)
-    corner = np.floor(low / _SQUARE - _MARGIN) * _SQUARE
-    W, H = (np.ceil((high - corner) / _SQUARE).astype(int) + _MARGIN).tolist()
+    low, high = (np.vstack([getattr(one[:, :2], end)(axis=0) for one in (floor, way) if len(one)])
+                 for end in ("min", "max"))  # fmt: skip
+    corner = np.floor(low.min(axis=0) / _SQUARE - _MARGIN) * _SQUARE
+    W, H = (np.ceil((high.max(axis=0) - corner) / _SQUARE).astype(int) + _MARGIN).tolist()
     z = np.full((H, W), np.nan)
-    _lay(z, corner, way[:, :2], way[:, 2] - (sensor or 0.0), np.inf)
-    if sensor is not None:
-        _spread(z, corner, floor)
-    _fill(z)
+    square = _squares(z, corner, way[:, :2])
+    total = np.bincount(square, weights=way[:, 2] - (sensor or 0.0), minlength=z.size)
+    count = np.bincount(square, minlength=z.size)
+    z.reshape(-1)[count > 0] = total[count > 0] / count[count > 0]
+    _spread(z, corner, floor if sensor is not None else floor[:0])
     return Ground(z, corner, sensor or 0.0, sensor is not None)
 
 
@@ -136,53 +138,54 @@ def _squares(z: Float, corner: Float, xy: Float) -> Index:
     return np.asarray(row * z.shape[1] + column)
 
 
-def _lay(z: Float, corner: Float, xy: Float, height: Float, step: float) -> None:
-    """Squares get the mean of the heights (N,) there that are no farther off than `step`."""
-    square = _squares(z, corner, xy)
-    flat = z.reshape(-1)
-    near = np.ones(len(xy), np.bool_) if step == np.inf else np.abs(height - flat[square]) <= step
-    count = np.bincount(square[near], minlength=flat.size)
-    total = np.bincount(square[near], weights=height[near], minlength=flat.size)
-    flat[count > 0] = total[count > 0] / count[count > 0]
-
-
 def _spread(z: Float, corner: Float, floor: Float) -> None:
-    """From the way outwards: a square is as high as the floor in it that goes on beside it."""
-    order = np.argsort(_squares(z, corner, floor[:, :2]), kind="stable")
-    floor = floor[order]
+    """From the way outwards: a square is as high as the floor in it that goes on beside it.
+
+    Without floor it is as high as what is beside. Only squares beside those that became known last
+    can become known next.
+    """
     square = _squares(z, corner, floor[:, :2])
-    first = np.searchsorted(square, np.arange(z.size + 1))
-    under_way = np.isfinite(z)
-    here = _members(first, np.flatnonzero(under_way))
-    _lay(z, corner, floor[here, :2], floor[here, 2], _STEP)
-    while True:
-        beside = _beside(z)
-        if not len(beside):
-            return
-        at, height = beside.T
-        z.reshape(-1)[at.astype(np.intp)] = height
-        here = _members(first, at.astype(np.intp))
-        _lay(z, corner, floor[here, :2], floor[here, 2], _STEP)
+    order = np.argsort(square, kind="stable")
+    height, first = floor[order, 2], np.searchsorted(square[order], np.arange(z.size + 1))
+    flat, known = z.reshape(-1), np.flatnonzero(np.isfinite(z))
+    while len(known):
+        _lay(flat, known, height, first)
+        known = _unknown_beside(z, known)
+        flat[known] = _mean_beside(z, known)
 
 
-def _members(first: Index, squares: Index) -> Index:
-    """Numbers of what lies in squares (n,), of lists that begin at `first`."""
+def _lay(flat: Float, squares: Index, height: Float, first: Index) -> None:
+    """Squares (n,) get the mean of the heights there that are near what was expected.
+
+    Heights of square k are those from first[k] to first[k + 1].
+    """
     counts = first[squares + 1] - first[squares]
-    starts = np.repeat(first[squares] - np.cumsum(counts) + counts, counts)
-    return np.asarray(starts + np.arange(counts.sum()))
+    of = np.repeat(np.arange(len(squares)), counts)
+    at = np.repeat(first[squares] - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+    near = np.abs(height[at] - flat[squares[of]]) <= _STEP
+    count = np.bincount(of[near], minlength=len(squares))
+    total = np.bincount(of[near], weights=height[at[near]], minlength=len(squares))
+    flat[squares[count > 0]] = total[count > 0] / count[count > 0]
 
 
-def _beside(z: Float) -> Float:
-    """(n, 2) flat number and expected height of unknown squares beside known ones."""
-    padded = np.pad(z, 1, constant_values=np.nan)
-    around = np.stack([padded[1:-1, :-2], padded[1:-1, 2:], padded[:-2, 1:-1], padded[2:, 1:-1]])
+def _unknown_beside(z: Float, squares: Index) -> Index:
+    """(n,) flat numbers, rising, of the unknown squares beside some."""
+    beside, inside = _beside(z, squares)
+    unknown = beside[inside]
+    return np.unique(unknown[np.isnan(z.reshape(-1)[unknown])])
+
+
+def _mean_beside(z: Float, squares: Index) -> Float:
+    """(n,) mean height of the known squares beside each."""
+    beside, inside = _beside(z, squares)
+    around = np.where(inside, z.reshape(-1)[np.where(inside, beside, 0)], np.nan)
     known = np.isfinite(around)
-    at = np.flatnonzero(known.any(axis=0) & ~np.isfinite(z))
-    total = np.where(known, around, 0.0).reshape(4, -1)[:, at].sum(axis=0)
-    return np.stack([at.astype(float), total / known.reshape(4, -1)[:, at].sum(axis=0)], axis=1)
+    return np.asarray(np.where(known, around, 0.0).sum(axis=0) / known.sum(axis=0))
 
 
-def _fill(z: Float) -> None:
-    """What is unknown is as high as what is beside."""
-    while len(beside := _beside(z)):
-        z.reshape(-1)[beside[:, 0].astype(np.intp)] = beside[:, 1]
+def _beside(z: Float, squares: Index) -> tuple[Index, NDArray[np.bool_]]:
+    """(4, n) flat numbers of the squares beside some, and whether these are of the grid."""
+    H, W = z.shape
+    row, column = np.divmod(squares, W)
+    inside = np.stack([column > 0, column < W - 1, row > 0, row < H - 1])
+    return squares + np.array([[-1], [1], [-W], [W]]), inside

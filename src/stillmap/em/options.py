@@ -110,9 +110,11 @@ class BodyOptions:
     low: float = field_with_doc(0.2, "m above the ground from where on things are bodies")
     high: float = field_with_doc(3.0, "m above the ground up to where they are")
     foot: float = field_with_doc(
-        0.05, "m above the ground from where on a beam below what moves did not end on it"
+        0.05, "m above the ground, and 2.5 scatters, that end points below what moves are not its"
     )
-    column: float = field_with_doc(0.3, "m, edge of the columns that touch within a body")
+    column: float = field_with_doc(
+        0.3, "m, edge of the columns that touch within a body, to whole voxels"
+    )
     fewest: int = field_with_doc(5, "voxels of a body at least, in a sweep")
     share: float = field_with_doc(0.3, "mean probability to move from where on all of it does")
     change: float = field_with_doc(
@@ -128,13 +130,13 @@ class BodyOptions:
             raise ValueError("'em.bodies.foot' wants 0 to 100 metres")
         if not 0.01 <= self.column <= 100.0:
             raise ValueError("'em.bodies.column' wants 0.01 to 100 metres")
-        if self.fewest < 1:
-            raise ValueError("'em.bodies.fewest' wants at least 1")
+        if not 1 <= self.fewest <= 1_000_000:
+            raise ValueError("'em.bodies.fewest' wants 1 to 1000000")
         if not 0.0 <= self.share <= 1.0:
             raise ValueError("'em.bodies.share' wants 0 to 1")
         for name in ("change", "slope", "most"):
-            if not 0.0 <= getattr(self, name) <= 1000.0:
-                raise ValueError(f"'em.bodies.{name}' wants 0 to 1000 nats")
+            if not 0.0 <= getattr(self, name) <= 80.0:
+                raise ValueError(f"'em.bodies.{name}' wants 0 to 80 nats")
 
 
 @dataclass(frozen=True)

@@ -100,6 +100,7 @@ def feet(
     p_static: ArrayLike,
     ground: ArrayLike,
     column: int,
+    low: float,
     least: float,
     threads: int = 1,  # noqa: ARG001  the core's signature
 ) -> Float:
@@ -113,6 +114,7 @@ def feet(
         p_static: (E,).
         ground: (E,) metres, height below each.
         column: cells, edge of the columns over the ground.
+        low: metres above the ground up to where an element's mean is the ground's.
         least: metres above the ground from where on a beam did not end on it.
     """
     of, standing = np.asarray(element), np.asarray(stands, bool)
@@ -120,7 +122,9 @@ def feet(
     bounds, out = np.asarray(offset), np.full(len(of), np.nan)
     for beam in usable_beams(3, points, hit, offset, T_map_sensor):
         k = of[beam.number]
-        if k < 0 or standing[k] or p[k] < 0.5 or _height(surface, k, beam.end, z[k]) <= least:
+        if not beam.hit or k < 0 or standing[k] or p[k] < 0.5:
+            continue
+        if surface.list[k].mean[2] - z[k] > low or _height(surface, k, beam.end, z[k]) <= least:
             continue
         of_scan = of[bounds[beam.scan] : bounds[beam.scan + 1]]
         met = {other for other in of_scan.tolist() if other >= 0 and standing[other]}
