@@ -45,7 +45,12 @@ def test_no_look_is_cut(beams, stops, monkeypatch):
 
 @pytest.mark.parametrize(
     ("beams", "groups", "stops"),
-    [(1, 2, [5, 10]), (1, 3, [6, 10]), (1, 9, [10]), (600, 2, [6, 10]), (1, 1, [3, 5, 6, 10])],
+    [(99, 2, [5, 10]), (99, 3, [6, 10]), (99, 9, [10]), (600, 2, [6, 10]), (1, 1, [3, 5, 6, 10])],
 )
 def test_threads_find_looks_to_share_out(beams, groups, stops, monkeypatch):
     assert cuts(beams, monkeypatch, group=LOOKS, groups=groups) == stops
+
+
+@pytest.mark.parametrize(("beams", "stops"), [(50, [5, 10]), (20, [3, 5, 10])])
+def test_however_many_threads_chunks_are_no_wider(beams, stops, monkeypatch):
+    assert cuts(beams, monkeypatch, group=LOOKS, groups=200) == stops

@@ -47,6 +47,21 @@ def test_what_moves_is_told_from_what_stands(street, mapped):
     assert dynamic[near_ones & static].mean() < 0.005
 
 
+def test_the_rest_of_what_moves_and_its_feet_go_with_it(street, mapped):
+    alone = options("stillmap", bodies={"enabled": False})
+    low = options("stillmap", bodies={"foot": 100.0})
+    mine = near(street) & ~street.truth.static
+    found = [np.mean(mapped.p_static[mine] < 0.5)]
+    for chosen in (low, alone):
+        other = stillmap.build(street.recording, chosen, poses=street.truth.T_world_base)
+        found.append(np.mean(other.p_static[mine] < 0.5))
+        stands = near(street) & street.truth.static
+        lost = np.mean(mapped.p_static[stands] < 0.5) - np.mean(other.p_static[stands] < 0.5)
+        assert lost < 5e-4
+    assert found[0] > found[1] + 0.002  # feet
+    assert found[1] > found[2] + 0.002  # bodies
+
+
 def test_given_poses_take_one_e_step(mapped):
     assert len(mapped.iterations) == 1
     assert mapped.converged

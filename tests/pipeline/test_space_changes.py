@@ -87,6 +87,10 @@ def test_a_run_that_goes_on_knows_them(built, hall):
     values, arrays = packed(loop)
     again = unpacked(json.loads(json.dumps(values)), arrays, loop.options)
     resumed = stillmap.build(hall.recording, LISTED, poses=hall.truth.T_world_base, go_on=again)
+    kept, known = again.kept.ground, loop.kept.ground
+    np.testing.assert_array_equal(kept.z, known.z)
+    np.testing.assert_array_equal(kept.corner, known.corner)
+    assert (kept.sensor, kept.seen) == (known.sensor, True)
     assert len(resumed.changes) == len(result.changes) == 2
     for one, known in zip(resumed.changes, result.changes, strict=True):
         assert (one.x, one.y, one.z, one.stamp_ns) == (known.x, known.y, known.z, known.stamp_ns)

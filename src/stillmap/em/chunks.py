@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from stillmap.recording.model import Recording
 
 CHUNK_BEAMS = 1 << 20
+_WIDEST = 8  # chunks that one may be as large as, for threads to share it out
 
 
 class Chunk(NamedTuple):
@@ -34,8 +35,9 @@ def chunks(
 ) -> Iterator[Chunk]:
     """Chunks of about CHUNK_BEAMS beams; scans of equal `group` (T,), rising, stay together.
 
-    At least so many `groups` are in a chunk, where there are as many: threads share these out. What
-    of the recording, and of arrays `beside` it, lies in files is let go after each chunk.
+    At least so many `groups` are in a chunk, where there are as many, and as long as it has fewer
+    than _WIDEST times that many beams: threads share these out. What of the recording, and of
+    arrays `beside` it, lies in files is let go after each chunk.
     """
     offset, first = recording.offset, 0
     while first < recording.n_scans:
@@ -43,7 +45,7 @@ def chunks(
         end = min(max(end, first + 1), recording.n_scans)
         if group is not None and end < recording.n_scans:
             start = int(np.searchsorted(group, group[end]))  # of the group that would be cut
-            end = max(start, _after(group, first, max(groups, 1)))
+            end = max(start, _after(group, offset, first, max(groups, 1)))
         beams = slice(int(offset[first]), int(offset[end]))
         within = np.ascontiguousarray(offset[first : end + 1] - offset[first])
         yield Chunk(slice(first, end), beams, within)
@@ -51,9 +53,10 @@ def chunks(
         first = end
 
 
-def _after(group: NDArray[np.int64], first: int, groups: int) -> int:
-    """The first scan after so many groups, or after all."""
+def _after(group: NDArray[np.int64], offset: NDArray[np.int64], first: int, groups: int) -> int:
+    """The first scan after so many groups, or after fewer that have many beams, or after all."""
+    most = offset[first] + _WIDEST * CHUNK_BEAMS
     for _ in range(groups):
-        if first < len(group):
+        if first < len(group) and offset[first] < most:
             first = int(np.searchsorted(group, group[first], side="right"))
     return first
