@@ -19,8 +19,9 @@ void make(Bodies* self, const Surface<3>& surface, const Flat<bool>& stands, con
   require(surface.fitted(), "surface: fit it first");
   require(stands.shape(0) == n, "stands: expected one per element");
   require(values.shape(0) == n && kinds > 0, "values: expected a row per element");
-  for (size_t i = 0; i < n * kinds; ++i)
-    require(std::abs(values.data()[i]) <= kMost, "values: expected -1e6 to 1e6");
+  bool bounded = true;
+  for (size_t i = 0; i < n * kinds; ++i) bounded = bounded && std::abs(values.data()[i]) <= kMost;
+  require(bounded, "values: expected -1e6 to 1e6");
   require(column >= 1 && column <= kWidest, "column: expected 1 to 1048576 cells");
   require(fewest >= 1, "fewest: expected at least 1");
   new (self) Bodies(surface, stands.data(), values.data(), kinds, {column, fewest});
@@ -47,18 +48,24 @@ auto feet(const Surface<3>& surface, const Points<3>& points, const Flat<bool>& 
   const size_t n = surface.size(), beams = points.shape(0);
   require(surface.fitted(), "surface: fit it first");
   require(element.shape(0) == beams, "element: expected one per beam");
+  bool in_range = true, usable_ones = true;
   for (size_t i = 0; i < beams; ++i) {
     const int32_t k = element.data()[i];
-    require(k >= kNoElement && k < static_cast<int32_t>(n), "element: out of range");
-    require(k == kNoElement || usable<3>(points.data() + i * 3), "element: of an unusable beam");
+    in_range = in_range && k >= kNoElement && k < static_cast<int32_t>(n);
+    usable_ones = usable_ones && (k == kNoElement || usable<3>(points.data() + i * 3));
   }
+  require(in_range, "element: out of range");
+  require(usable_ones, "element: of an unusable beam");
   require(stands.shape(0) == n, "stands: expected one per element");
   require(p_static.shape(0) == n, "p_static: expected one per element");
   require(ground.shape(0) == n, "ground: expected one per element");
+  bool probable = true, high = true;
   for (size_t k = 0; k < n; ++k) {
-    require_probability(static_cast<double>(p_static.data()[k]), "p_static");
-    require(std::isfinite(ground.data()[k]), "ground: not finite");
+    probable = probable && p_static.data()[k] >= 0.0f && p_static.data()[k] <= 1.0f;
+    high = high && std::isfinite(ground.data()[k]);
   }
+  require(probable, "p_static: expected a probability in [0, 1]");
+  require(high, "ground: not finite");
   require(column >= 1 && column <= kWidest, "column: expected 1 to 1048576 cells");
   require(std::isfinite(low), "low: not finite");
   require(least >= 0.0 && std::isfinite(least), "least: expected a height of at least 0");

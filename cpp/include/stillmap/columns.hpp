@@ -34,11 +34,15 @@ class Columns {
     members_.clear();
   }
 
+  // Whether an element was not told of before in this sweep.
+  bool first_seen(int32_t element) {
+    return std::exchange(seen_[static_cast<size_t>(element)], sweep_) != sweep_;
+  }
+
   // Once for each element of the sweep, however often it is told.
   void add(int32_t element) {
-    int32_t& seen = seen_[static_cast<size_t>(element)];
-    if (std::exchange(seen, sweep_) == sweep_) return;
-    members_.emplace_back(column_of(surface_.cell(element), edge_), static_cast<size_t>(element));
+    if (first_seen(element))
+      members_.emplace_back(column_of(surface_.cell(element), edge_), static_cast<size_t>(element));
   }
 
   // After all were added: columns by x, then y, and the elements in each by their numbers.

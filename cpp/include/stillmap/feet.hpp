@@ -46,21 +46,32 @@ class Feet {
   }
 
  private:
+  // Mean probability in each column where something moves; `columns` has what moves alone.
   void gather(const Scans<3>& scans, size_t t, const int32_t* element, Columns& columns,
               std::vector<double>& p) const {
+    const auto for_each = [&](bool moving, auto&& visit) {
+      for (int64_t n = scans.offset[t]; n < scans.offset[t + 1]; ++n) {
+        const int32_t k = element[n];
+        if (k == kNoElement || !of_.stands[k] || (of_.p_static[k] < 0.5f) != moving) continue;
+        visit(k);
+      }
+    };
     columns.clear();
-    for (int64_t n = scans.offset[t]; n < scans.offset[t + 1]; ++n)
-      if (element[n] != kNoElement && of_.stands[element[n]]) columns.add(element[n]);
+    for_each(true, [&](int32_t k) { columns.add(k); });
     columns.sort();
     p.assign(columns.size(), 0.0);
-    for (size_t c = 0; c < columns.size(); ++c) {
-      int64_t all = 0;
-      columns.for_each_in(c, [&](size_t k) {
-        p[c] += static_cast<double>(of_.p_static[k]);
-        ++all;
-      });
-      p[c] /= static_cast<double>(all);
-    }
+    if (p.empty()) return;
+    std::vector<int64_t> all(p.size(), 0);
+    const auto add = [&](size_t c, size_t k) {
+      p[c] += static_cast<double>(of_.p_static[k]);
+      ++all[c];
+    };
+    for (size_t c = 0; c < p.size(); ++c) columns.for_each_in(c, [&](size_t k) { add(c, k); });
+    for_each(false, [&](int32_t k) {
+      const size_t c = columns.find(column_of(surface_.cell(k), of_.column));
+      if (c < p.size() && columns.first_seen(k)) add(c, static_cast<size_t>(k));
+    });
+    for (size_t c = 0; c < p.size(); ++c) p[c] /= static_cast<double>(all[c]);
   }
 
   void find(const Scans<3>& scans, size_t t, const int32_t* element, const Columns& columns,
@@ -69,11 +80,12 @@ class Feet {
     for (int64_t n = scans.offset[t]; n < scans.offset[t + 1]; ++n) {
       out[n] = std::numeric_limits<float>::quiet_NaN();
       const int32_t k = element[n];
-      if (!scans.hit[n] || k == kNoElement || !on_ground(k) || of_.p_static[k] < 0.5f) continue;
+      if (p.empty() || !scans.hit[n] || k == kNoElement) continue;
+      if (of_.stands[k] || of_.p_static[k] < 0.5f) continue;
       const Segment<3> beam(pose, scans.points + n * 3, surface_.resolution());
-      if (height(k, beam.end) <= of_.least) continue;
       const size_t c = columns.find(column_of(cell_of<3>(beam.end), of_.column));
-      if (c < columns.size() && p[c] < 0.5) out[n] = static_cast<float>(p[c]);
+      if (c == p.size() || p[c] >= 0.5) continue;
+      if (on_ground(k) && height(k, beam.end) > of_.least) out[n] = static_cast<float>(p[c]);
     }
   }
 
