@@ -1,0 +1,1 @@
+"""Models: of the place without its people, and of the people."""

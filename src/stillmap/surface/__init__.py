@@ -1,0 +1,1 @@
+"""What stands still, as a mesh: polygons of range images, merged, thinned out."""
