@@ -275,7 +275,7 @@ def test_the_library_that_unpacks_is_an_extra(tmp_path, monkeypatch):
     def missing(name):
         raise ImportError(name)
 
-    monkeypatch.setattr("stillmap.recording.extras.import_module", missing)
+    monkeypatch.setattr("stillmap.extras.import_module", missing)
     for path in (tmp_path / "a.pcd", tmp_path):
         with pytest.raises(InputError, match=r"needs lzf.*pip install 'stillmap\[io\]'"):
             read(path)

@@ -247,7 +247,7 @@ def test_missing_libraries_are_named(tmp_path, monkeypatch, name, start):
     def missing(name):
         raise ImportError(name)
 
-    monkeypatch.setattr("stillmap.recording.extras.import_module", missing)
+    monkeypatch.setattr("stillmap.extras.import_module", missing)
     for path in (tmp_path / name, tmp_path):
         with pytest.raises(InputError, match=r"pip install 'stillmap\[io\]'"):
             read(path)

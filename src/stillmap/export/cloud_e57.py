@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from stillmap.errors import InputError
 from stillmap.export.cloud import Block, Cloud
+from stillmap.extras import extra
 from stillmap.recording.clouds.e57 import GPS_EPOCH_S
-from stillmap.recording.extras import extra
 
 _BLOCK = 1 << 16  # points written together
 _SCALE = 0.0001  # m

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from stillmap.errors import InputError
 from stillmap.export import cloud_e57
 from stillmap.export.cloud import Block, Cloud
+from stillmap.extras import extra
 from stillmap.output.atomic import new_file
 from stillmap.output.clouds import FIELDS, ply_header
 from stillmap.recording.clouds.las import writer_to
-from stillmap.recording.extras import extra
 
 Tell = Callable[[float], None]
 

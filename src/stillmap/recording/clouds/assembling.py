@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.errors import InputError
+from stillmap.extras import MissingExtra
 from stillmap.recording.clouds.point_times import Clock, clock_of, since
-from stillmap.recording.extras import MissingExtra
 from stillmap.recording.gathering import Gathered
 from stillmap.recording.lines import Progress
 from stillmap.recording.model import Recording

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.errors import InputError
+from stillmap.extras import extra
 from stillmap.recording.clouds.assembling import Cloud, Known, Source, assembled
 from stillmap.recording.clouds.files import files_in, require_content
 from stillmap.recording.clouds.origin import Growing, Origin
 from stillmap.recording.clouds.records import cut_short
 from stillmap.recording.clouds.rigid import from_quaternion
-from stillmap.recording.extras import extra
 from stillmap.recording.lines import Progress
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.errors import InputError
+from stillmap.extras import extra
 from stillmap.output.atomic import new_file, require_new_file
 from stillmap.recording.clouds.assembling import Cloud
 from stillmap.recording.clouds.files import require_content
@@ -19,7 +20,6 @@ from stillmap.recording.clouds.origin import Growing, Origin
 from stillmap.recording.clouds.placing import placed
 from stillmap.recording.clouds.records import cut_short
 from stillmap.recording.clouds.surveyed import surveyed
-from stillmap.recording.extras import extra
 from stillmap.recording.lines import Progress
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.errors import InputError
+from stillmap.extras import extra
 from stillmap.recording.clouds.files import require_content
 from stillmap.recording.clouds.records import Field, Layout, columns, cut_short, require_record
 from stillmap.recording.clouds.rigid import from_quaternion
-from stillmap.recording.extras import extra
 
 _HEADER = 1 << 14  # bytes in which it must end
 _TYPES = {"F": "f", "I": "i", "U": "u"}
