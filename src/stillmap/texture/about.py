@@ -13,6 +13,8 @@ from stillmap.scene.boxes import Box
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
+_NEVER = np.iinfo(np.int64).max
+
 
 @dataclass(frozen=True, eq=False)
 class Beams:
@@ -44,10 +46,9 @@ class Beams:
             return np.zeros((0, 3)), np.zeros(0, np.float32)
         first, last = self.seen.offset[[scans.start, scans.stop]]
         at_ns = beam_ns(self.recording, scans)
-        near = np.abs(at_ns - stamp_ns) <= 1e9 * window
-        if self.recording.beam_time is None:  # the nearest scan, as if at once
-            nearest = np.abs(at_ns - stamp_ns)
-            near = nearest == nearest.min(initial=np.iinfo(np.int64).max)
+        apart = np.abs(at_ns - stamp_ns)
+        # at least what is nearest, as where scans count as taken at once
+        near = apart <= max(int(1e9 * window), int(apart.min(initial=_NEVER)))
         kept = np.flatnonzero(self.seen.hit[first:last] & near)
         beams = int(first) + kept
         T = self.T_map_sensor[self.seen.scans_of(beams)]
@@ -79,6 +80,6 @@ class Beams:
             mine = np.flatnonzero(owned[np.minimum(place, len(owned) - 1)] == beams)
             if not len(mine):
                 continue
-            then = box.middle(1e-9 * (at_ns[mine] - self.start_ns))
+            then = box.middle(np.asarray(1e-9 * (at_ns[mine] - self.start_ns), np.float64))
             now = box.middle(np.array([1e-9 * (stamp_ns - self.start_ns)]))
             ends[mine, :2] += now - then
