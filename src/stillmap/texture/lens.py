@@ -67,7 +67,7 @@ def project(camera: Camera, points: Float) -> tuple[Float, Mask]:
     ahead = z > 0.0
     safe = np.where(ahead, z, np.inf)
     x = points[:, :2] / safe[:, None]
-    ok = ahead & (_square(x) < np.tan(_limit(*lens)) ** 2)
+    ok: Mask = ahead & (_square(x) < float(np.tan(_limit(*lens))) ** 2)
     distorted = _distorted(lens, np.where(ok[:, None], x, 0.0))
     assert camera.K is not None
     uv = distorted @ camera.K[:2, :2].T + camera.K[:2, 2]
@@ -93,8 +93,7 @@ def rays(camera: Camera, uv: Float) -> Float:
 def within(camera: Camera, uv: Float) -> Mask:
     """(n,) whether pixels (n, 2) lie in the camera's pictures: up to the edges of the outermost."""
     size = np.array([camera.width, camera.height])
-    inside: Mask = ((uv >= -0.5) & (uv < size - 0.5)).all(axis=1)
-    return inside
+    return np.asarray(((uv >= -0.5) & (uv < size - 0.5)).all(axis=1))
 
 
 Lens = tuple[str, tuple[float, ...]]
@@ -135,7 +134,7 @@ def _undistorted(lens: Lens, wanted: Float) -> Float:
         return wanted.copy()
     widest = np.tan(_limit(*lens))
     r = np.sqrt(_square(wanted))
-    x = wanted * np.minimum(1.0, 0.5 * widest / np.maximum(r, 1e-300))[:, None]
+    x: Float = wanted * np.minimum(1.0, 0.5 * widest / np.maximum(r, 1e-300))[:, None]
     open_ = np.flatnonzero(np.isfinite(wanted).all(axis=1))
     error = np.full(len(wanted), np.inf)
     error[open_] = _norm(_distorted(lens, x[open_]) - wanted[open_])
@@ -167,16 +166,14 @@ def _newton(lens: Lens, x: Float, wanted: Float) -> Float:
     residual = _distorted(lens, x) - wanted
     a, b = np.sum(residual * u, axis=1), np.sum(residual * v, axis=1)
     det = along * across - mixed * mixed
-    out: Float = ((across * a - mixed * b) / det)[:, None] * u
-    return out + ((along * b - mixed * a) / det)[:, None] * v
+    back, aside = (across * a - mixed * b) / det, (along * b - mixed * a) / det
+    return np.asarray(back[:, None] * u + aside[:, None] * v)
 
 
 def _towards(k: tuple[float, ...], u: Float, v: Float, model: str) -> tuple[Float, Float]:
     """(n,) q along directions u and v (n, 2)."""
-    if model == "equidistant":
-        return np.zeros(len(u)), np.zeros(len(u))
-    q = np.array([k[3], k[2]])
-    return u @ q, v @ q
+    q = np.zeros(2) if model == "equidistant" else np.array([k[3], k[2]])
+    return np.asarray(u @ q), np.asarray(v @ q)
 
 
 def _jacobian(
