@@ -61,7 +61,7 @@ def test_along_a_flat_side_the_track_counts() -> None:
         return Sweep(at, np.tile([0.0, 1.0, 0.0], (400, 1)), np.ones(400))
 
     one, other = side(), side()
-    other = other._replace(points=other.points + [0.0, 0.15, 0.0])
+    other = other._replace(points=other.points + np.array([0.0, 0.15, 0.0]))
     offsets = aligned([one, other])
     ahead, aside, turn = offsets[1] - offsets[0]
     assert abs(ahead) < 0.02

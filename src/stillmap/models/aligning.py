@@ -81,7 +81,8 @@ def _model(sweeps: Sequence[Sweep], offsets: Float, of: Sequence[int]) -> Sweep:
         [moved(sweeps[k].normals, turn) for k, turn in zip(some, turned, strict=True)]
     )
     weights = np.concatenate([sweeps[k].weights for k in some])
-    _, first = np.unique(np.floor(points / _CELL).astype(np.int64), axis=0, return_index=True)
+    cells = np.floor(points / _CELL).astype(np.int64)
+    first = np.unique(cells, axis=0, return_index=True)[1]
     return Sweep(points[first], normals[first], weights[first])
 
 
@@ -96,7 +97,7 @@ def _registered(sweep: Sweep, model: Sweep, start: Float, track: Float) -> Float
     for k in range(_ROUNDS):
         reach = _REACHES[min(k // 3, len(_REACHES) - 1)]
         at = moved(points, offset)
-        away, nearest = tree.query(at, distance_upper_bound=reach)
+        away, nearest = map(np.asarray, tree.query(at, distance_upper_bound=reach))
         near = np.flatnonzero(np.isfinite(away))
         facing = moved(normals[near], np.array([0.0, 0.0, offset[2]]))
         same = (facing * model.normals[nearest[near]]).sum(axis=1) > _SAME_SIDE
