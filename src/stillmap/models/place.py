@@ -16,7 +16,8 @@ from stillmap.texture.lens import project
 from stillmap.texture.things import Thing, at_time, in_the_way
 from stillmap.texture.told import told
 from stillmap.texture.view import View
-from stillmap.texture.visible import Seen, visible
+from stillmap.texture.options import VisibleOptions
+from stillmap.texture.visible import visible
 from stillmap.threads import in_order
 
 Float = NDArray[np.float64]
@@ -46,6 +47,7 @@ def painted(
     views: Sequence[View],
     sources: Sources,
     options: ChoiceOptions,
+    limits: VisibleOptions,
     threads: int = 1,
     tell: Tell | None = None,
 ) -> Painted:
@@ -56,6 +58,7 @@ def painted(
         views: pictures and where they were taken.
         sources: the beams that tell what moves, and when.
         options: see ChoiceOptions.
+        limits: see VisibleOptions.
         threads: same result with any number.
         tell: called with how many views are looked at, and of how many.
     """
@@ -64,17 +67,18 @@ def painted(
     candidates = Candidates.none(len(mesh), min(options.candidates, max(len(views), 1)))
     seen_at_all = np.zeros(len(mesh), np.bool_)
 
-    def looked_at(view: View) -> tuple[Seen, Float]:
-        seen = visible(mesh, view, slant=options.slant)
-        p = np.zeros(len(seen.face))
-        if options.believe and len(seen.face):
-            p = shown(mesh, seen.face, view, beams, sources.things, options)
-        return seen, p
+    def looked_at(view: View) -> tuple[NDArray[np.intp], Float, Float]:
+        found = visible(mesh, view, limits)
+        faces = np.flatnonzero(found.seen)
+        p = np.zeros(len(faces))
+        if options.believe and len(faces):
+            p = shown(mesh, faces, view, beams, sources.things, options)
+        return faces, found.pixels[faces].astype(np.float64), p
 
-    for number, (seen, p) in enumerate(in_order(looked_at, views, threads)):
-        seen_at_all[seen.face] = True
-        good = utility(p, seen.pixels, areas[seen.face], options)
-        candidates.add(number, seen.face, good, p)
+    for number, (faces, pixels, p) in enumerate(in_order(looked_at, views, threads)):
+        seen_at_all[faces] = True
+        good = utility(p, pixels, areas[faces], options)
+        candidates.add(number, faces, good, p)
         if tell is not None:
             tell(number + 1, len(views))
     view = chosen(candidates, mesh.pairs(), options.border)

@@ -62,7 +62,7 @@ def sources_of(result: Result) -> Sources:
     """Of a recording in 3D."""
     options, seen = result.options, result.seen
     start = int(seen.stamp_ns[0])
-    hold = options.mesh.texture.hold
+    hold = options.mesh.choice.hold
     things = []
     for one in result.objects:
         if one.z is None:

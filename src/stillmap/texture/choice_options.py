@@ -27,9 +27,6 @@ class ChoiceOptions:
     trust: float = field_with_doc(
         10.0, "what the logarithm of that probability counts against that of the resolution"
     )
-    slant: float = field_with_doc(
-        75.0, "degrees from face on, beyond which a picture does not paint a face"
-    )
     border: float = field_with_doc(
         1.0, "what it costs where two pictures meet, in e-folds of resolution of the faces there"
     )
@@ -41,10 +38,10 @@ class ChoiceOptions:
     def __post_init__(self) -> None:
         for name in ("unseen", "least"):
             if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"'mesh.texture.{name}' wants a probability")
+                raise ValueError(f"'mesh.choice.{name}' wants a probability")
         for name, low, high in _LIMITS:
             if not low <= getattr(self, name) <= high:
-                raise ValueError(f"'mesh.texture.{name}' wants {low:g} to {high:g}")
+                raise ValueError(f"'mesh.choice.{name}' wants {low:g} to {high:g}")
 
 
 _LIMITS = (
@@ -53,7 +50,6 @@ _LIMITS = (
     ("hold", 0.0, 1000.0),
     ("window", 1e-3, 1000.0),
     ("trust", 0.0, 1e6),
-    ("slant", 1.0, 90.0),
     ("border", 0.0, 1e6),
     ("candidates", 1, 64),
     ("edge", 0.01, 1000.0),
