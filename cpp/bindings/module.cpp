@@ -14,6 +14,7 @@ NB_MODULE(_core, m) {
   stillmap::border::bind_beams(m);
   stillmap::border::bind_register(m);
   stillmap::border::bind_dwell(m);
+  stillmap::border::bind_fusing(m);
   stillmap::border::bind_beside(m);
   stillmap::border::bind_bodies(m);
   stillmap::border::bind_held_out(m);
