@@ -1,3 +1,5 @@
+#include <nanobind/stl/tuple.h>
+
 #include <cmath>
 
 #include "arrays.hpp"
@@ -44,7 +46,7 @@ auto z_buffer(const Places<3>& vertices, const Faces& faces, const Matrix& K,
     out = z_buffer_of(vertices.data(), V, faces.data(), F, camera, threads);
   }
   const auto h = static_cast<size_t>(height), w = static_cast<size_t>(width);
-  return nb::make_tuple(owned(std::move(out.depth), {h, w}), owned(std::move(out.face), {h, w}));
+  return std::make_tuple(owned(std::move(out.depth), {h, w}), owned(std::move(out.face), {h, w}));
 }
 
 }  // namespace

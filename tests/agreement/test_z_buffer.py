@@ -8,7 +8,7 @@ from stillmap import _core, reference
 K = np.array([[60.0, 0.7, 31.3], [0.0, 55.0, 22.8], [0.0, 0.0, 1.0]])
 
 
-def soup(seed, n=200, size=0.7):
+def soup(seed, n=400, size=0.35):
     """Faces all around the camera, through it, and behind it."""
     rng = np.random.default_rng(seed)
     middle = rng.uniform(-4.0, 4.0, (n, 1, 3))
