@@ -21,7 +21,7 @@ _MOST_RAYS = 1_500
 _MOST_NUMBERS = 60
 _LIFTED = 0.02  # m: what lies on the plan is drawn above it
 _RAY = (240, 170, 60)
-# of what the window shows at first: edges of points of clouds and of ends of beams, the robot's axes
+# of the height of the window: edges of points of clouds and of ends of beams, the robot's axes
 _POINT, _END, _AXES = 0.0007, 0.002, 0.03
 
 
