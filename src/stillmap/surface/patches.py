@@ -120,6 +120,7 @@ def _patch(
     points = np.einsum("nij,nj->ni", T[scan, :3, :3], local) + T[scan, :3, 3]
     origin = T[scan, :3, 3]
     use = seen.hit[beam] & np.isfinite(points).all(axis=1)
+    points[~use] = 0.0  # nothing is made of these
     looking = rows.directions(local)
     if planar:
         number = np.arange(len(beam), dtype=np.int32).reshape(len(scans), -1)
