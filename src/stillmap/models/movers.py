@@ -112,7 +112,9 @@ def shape_of(
         seconds = float(np.median(pieces[int(np.argmax(weight))].seconds))
         span = float(thing.box.seconds[0]), float(thing.box.seconds[-1])
     else:
-        span = best_sweep(pieces, options.sweep, options.near, pictures)
+        # a scan in space sees all of it at once, planar scans one after the other
+        tilts = any(len(np.unique(sources.seen.scans_of(piece.patch.beam))) > 1 for piece in pieces)
+        span = best_sweep(pieces, options.sweep if tilts else 0.0, options.near, pictures)
         seconds = 0.5 * (span[0] + span[1])
         pieces = [piece.within(*span) for piece in pieces]
     local = [piece.in_frame(way) for piece in pieces]
@@ -145,7 +147,8 @@ def pieces_of(
         if not kept.any():
             continue
         seconds = first.seconds[patch.beam]
-        yield _used(patch._replace(faces=patch.faces[kept]), weight[kept], seconds)
+        whole = patch._replace(faces=patch.faces[kept], beam=first.beam + patch.beam)
+        yield _used(whole, weight[kept], seconds)
 
 
 def _used(patch: Patch, weight: Float, seconds: Float) -> Piece:
@@ -224,20 +227,26 @@ def best_sweep(
 ) -> tuple[float, float]:
     """From when to when most of a thing was seen, in `sweep` seconds; rather where a picture is.
 
-    A time without a picture within `near` seconds counts a third.
+    With 0 it is a range image that counts. A time without a picture within `near` seconds counts
+    a third.
     """
-    times = np.concatenate([piece.times() for piece in pieces])
-    areas = np.concatenate([piece.areas() for piece in pieces])
-    order = np.argsort(times, kind="stable")
-    times, total = times[order], np.concatenate([[0.0], np.cumsum(areas[order])])
-    last = np.searchsorted(times, times + sweep, side="right")
-    value = total[last] - total[:-1]
+    if sweep == 0.0:
+        ends = np.array([(piece.seconds.min(), piece.seconds.max()) for piece in pieces])
+        first, final = ends.T
+        value = np.array([piece.areas().sum() for piece in pieces])
+    else:
+        times = np.concatenate([piece.times() for piece in pieces])
+        areas = np.concatenate([piece.areas() for piece in pieces])
+        order = np.argsort(times, kind="stable")
+        first, total = times[order], np.concatenate([[0.0], np.cumsum(areas[order])])
+        last = np.searchsorted(first, first + sweep, side="right")
+        final, value = first[last - 1], total[last] - total[:-1]
     if len(pictures):
-        middle = 0.5 * (times + times[last - 1])
+        middle = 0.5 * (first + final)
         away = np.abs(middle[:, None] - pictures).min(axis=1)
         value = np.where(away <= near, value, value / 3.0)
     best = int(np.argmax(value))
-    return float(times[best]), float(times[last[best] - 1])
+    return float(first[best]), float(final[best])
 
 
 def _laid_over(pieces: Sequence[Piece], way: Way) -> Way:
