@@ -14,9 +14,11 @@ NB_MODULE(_core, m) {
   stillmap::border::bind_beams(m);
   stillmap::border::bind_register(m);
   stillmap::border::bind_dwell(m);
+  stillmap::border::bind_fusing(m);
   stillmap::border::bind_beside(m);
   stillmap::border::bind_bodies(m);
   stillmap::border::bind_held_out(m);
   stillmap::border::bind_look_counts(m);
   stillmap::border::bind_sweep(m);
+  stillmap::border::bind_z_buffer(m);
 }

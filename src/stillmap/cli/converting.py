@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stillmap import options, slam
 from stillmap.cli.progress import shown_share
 from stillmap.cli.reading import read_changes
-from stillmap.cli.results import Mapped, found, is_result, require_apart
+from stillmap.cli.results import Mapped, found, is_deskewed, is_result, require_apart
 from stillmap.errors import InputError
 from stillmap.export import bag, beam_table, cloud, cloud_files, result
 from stillmap.output.atomic import require_new_file
@@ -123,8 +123,5 @@ def _exported(mapped: Mapped) -> result.Exported:
 
 def _seen(mapped: Mapped, recording: Recording, poses: NDArray[np.float64]) -> Recording:
     """The recording without the motion during its scans, as it was mapped."""
-    chosen = mapped.record.get("options")
-    section = chosen.get("slam") if isinstance(chosen, dict) else None
-    deskew = section.get("deskew") if isinstance(section, dict) else None
-    how = slam.SlamOptions(deskew=deskew is not False)
+    how = slam.SlamOptions(deskew=is_deskewed(mapped.record))
     return slam.deskewed(recording, poses, how)

@@ -4,6 +4,10 @@ import argparse
 import math
 from typing import Any
 
+_PLAIN = (
+    *("min_range", "max_range", "zero_means", "spin", "cameras"),
+    *("base_frame", "odom_frame"),
+)
 _LASERS = {"laser": "first", "laser2": "second"}  # flags and options begin with the name
 
 
@@ -31,6 +35,11 @@ def add_read_flags(parser: argparse.ArgumentParser) -> None:
         "--spin",
         choices=("none", "clockwise", "counter-clockwise"),
         help="how a lidar turns, seen from above, whose beams have no times (default: found)",
+    )
+    group.add_argument(
+        "--cameras",
+        metavar="FILE.toml",
+        help="what the recording lacks of its cameras, and further pictures (docs/input.md)",
     )
     group.add_argument(
         "--topic",
@@ -68,9 +77,7 @@ def add_read_flags(parser: argparse.ArgumentParser) -> None:
 def read_changes(args: argparse.Namespace) -> dict[str, Any]:
     """The flags that were given, as changes to the options: `{"read": {...}}`, `{}` for none."""
     changes: dict[str, Any] = {
-        name: value
-        for name in ("min_range", "max_range", "zero_means", "spin", "base_frame", "odom_frame")
-        if (value := getattr(args, name)) is not None
+        name: value for name in _PLAIN if (value := getattr(args, name)) is not None
     }
     if args.topic:
         changes["topic"] = ",".join(args.topic)

@@ -87,6 +87,14 @@ def is_result(path: Path) -> bool:
     return (path / RECORD).is_file()
 
 
+def is_deskewed(record: dict[str, Any]) -> bool:
+    """Whether the motion during scans was taken out, by a run.json."""
+    chosen = record.get("options")
+    section = chosen.get("slam") if isinstance(chosen, dict) else None
+    deskew = section.get("deskew") if isinstance(section, dict) else None
+    return deskew is not False
+
+
 def found(result: Path, given: str | None) -> Mapped:
     """A result folder; its recording is where it says, or where `given` says.
 

@@ -2,18 +2,22 @@
 
 import argparse
 import os
-import sys
 from pathlib import Path
 
+from stillmap.cli.browser import opened
 from stillmap.cli.commands import COMMANDS
 from stillmap.cli.progress import say
 from stillmap.errors import InputError
+from stillmap.extras import MissingExtra, extra
 
 _REPORT = "report.html"
+_LAST_PORT = 65_535
 
 _EPILOG = """examples:
-  stillmap view out                     in the browser
+  stillmap view out                     map, beams, points, models and objects over time
+  stillmap view out --report            the report of the run
   firefox "$(stillmap view out --print)"
+  ssh -L 8080:127.0.0.1:8080 robot stillmap view out --port 8080
 """
 
 
@@ -22,27 +26,54 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     p = commands.add_parser(
         "view",
         help=COMMANDS["view"],
-        description="Open the report of a result in the browser: the raw map beside the clean one, "
-        "what moved and where, and how the run went. Where there is no screen, say where it is.",
+        description="Show a result in the browser, scan by scan: map, beams, points, surface, the "
+        "robot's way, and what moved. The page is served to this machine alone, until Ctrl-C, and "
+        "asks for nothing from outside. It needs `pip install 'stillmap[viewer]'`; without it the "
+        "report is opened. Where there is no screen, say where to look.",
         epilog=_EPILOG,
     )
     p.add_argument("result", metavar="DIR", help="what `stillmap map` wrote")
+    p.add_argument("--report", action="store_true", help="open the report of the run instead")
     p.add_argument("--print", action="store_true", help="print the path of the report instead")
+    p.add_argument(
+        "--port", type=int, metavar="N", default=0, help="of the page (default: one that is free)"
+    )
+    p.add_argument("--input", metavar="FILE", help="the recording, if it is not where it was")
+    p.add_argument(
+        "--no-beams", action="store_true", help="leave the recording alone, which may be large"
+    )
     p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Opens the report.
+    """Shows the result, or opens the report.
 
     Raises:
-        InputError: DIR is no result.
+        InputError: DIR is no result, or a file of it is damaged.
     """
+    if not 0 <= args.port <= _LAST_PORT:
+        raise InputError(f"--port wants 0 to {_LAST_PORT}, got {args.port}")
     report = _report(Path(args.result))
     if args.print:
         print(report)
-    elif not _opened(report):
-        say(f"no browser to be had here; the report is {report}")
+    elif args.report:
+        _show_report(report)
+    else:
+        try:
+            extra("viser", args.result, "shown over time", group="viewer")
+        except MissingExtra as error:
+            say(f"{error}; the report is shown")
+            _show_report(report)
+            return 0
+        from stillmap.cli.viewing import viewed  # takes long to load
+
+        viewed(args, Path(args.result))
     return 0
+
+
+def _show_report(report: Path) -> None:
+    if not opened(report.as_uri()):
+        say(f"no browser to be had here; the report is {report}")
 
 
 def _report(folder: Path) -> Path:
@@ -53,13 +84,3 @@ def _report(folder: Path) -> Path:
     if not report.is_file():
         raise InputError(f"is no result: there is no {_REPORT} in it", where=str(folder), hint=hint)
     return report
-
-
-def _opened(report: Path) -> bool:
-    # without a screen webbrowser would start a browser of text within the terminal
-    screens = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
-    if sys.platform != "darwin" and not any(os.environ.get(name) for name in screens):
-        return False
-    import webbrowser
-
-    return webbrowser.open(report.as_uri())

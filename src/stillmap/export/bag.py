@@ -98,7 +98,7 @@ def _box(bag: Bag, stamp: int, one: Track) -> Any:
     T = np.eye(4)
     T[:2, :2] = se2.matrix(0.0, 0.0, np.arctan2(vy, vx))[:2, :2]
     T[:3, 3] = x, y, _HEIGHT / 2
-    along, across = (max(metres, _LEAST) for metres in one.size)
+    along, across = (max(metres, _LEAST) for metres in one.size[:2])
     return _marker(bag, stamp, _ADD, one.id, T, (along, across, _HEIGHT))
 
 

@@ -25,17 +25,19 @@ class Track:
 
     Attributes:
         id: its number.
-        size: metres along and across its way.
+        size: metres along and across its way; in space how high it is, too.
         stamp_ns: (K,) when it was seen, rising.
         xy: (K, 2) metres in the map frame.
         velocity: (K, 2) metres per second.
+        z: (K,) metres, how high its middle is; None in the plane.
     """
 
     id: int
-    size: tuple[float, float]
+    size: tuple[float, ...]
     stamp_ns: NDArray[np.int64]
     xy: NDArray[np.float64]
     velocity: NDArray[np.float64]
+    z: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +101,12 @@ def _track(one: dict[str, Any]) -> Track:
     stamp_ns = np.array(track["stamp_ns"], np.int64)
     x, y, vx, vy = (np.array(track[name], np.float64) for name in _NUMBERS)
     numbers = np.stack([x, y, vx, vy], axis=-1)
-    along, across = (float(metres) for metres in one["size"])
-    if len(numbers) != len(stamp_ns) or not len(stamp_ns):
+    z = np.array(track["z"], np.float64) if "z" in track else None
+    size = tuple(float(metres) for metres in one["size"])
+    if len(size) != (2 if z is None else 3):
+        raise ValueError(f"a size of {len(size)} lengths")
+    if len(numbers) != len(stamp_ns) or not len(stamp_ns) or (z is not None and z.shape != x.shape):
         raise ValueError("columns of unequal length")
-    if not np.isfinite([*numbers.ravel(), along, across]).all():
+    if not np.isfinite([*numbers.ravel(), *size, *([] if z is None else z)]).all():
         raise ValueError("a number is not finite")
-    return Track(int(one["id"]), (along, across), stamp_ns, numbers[:, :2], numbers[:, 2:])
+    return Track(int(one["id"]), size, stamp_ns, numbers[:, :2], numbers[:, 2:], z)

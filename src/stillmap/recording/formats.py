@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from stillmap.errors import InputError
-from stillmap.recording import carmen, folder, limits, own_body_in_space, spin
+from stillmap.recording import cameras, carmen, folder, limits, own_body_in_space, spin
 from stillmap.recording.carmen_messages import SCAN_PARSERS
-from stillmap.recording.clouds import e57, kitti, las, pcd, pcd_file, ply, uos
+from stillmap.recording.clouds import e57, kitti, las, pcd, pcd_file, ply, rgbd, uos
 from stillmap.recording.clouds.files import holds_any, is_named
 from stillmap.recording.lines import Progress, head
 from stillmap.recording.model import Recording
@@ -87,6 +87,7 @@ FORMATS = (
     Format("stillmap recording", (folder.HEADER,), _is_folder_of_ours, _read_folder_of_ours),
     Format("ROS bag", kinds.ENDINGS, kinds.is_bag, _read_bag),
     Format("KITTI folder", ("velodyne/", "velodyne_points/"), _is_kitti, kitti.read),
+    Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), rgbd.is_one, rgbd.read),
     _clouds("PCD", pcd.ENDINGS, pcd_file.is_pcd, pcd.read),
     _clouds("3DTK", uos.ENDINGS, None, uos.read),
     _clouds("E57", e57.ENDINGS, lambda head: head.startswith(e57.MAGIC), e57.read),
@@ -128,8 +129,13 @@ def read(
             recording = format_of(path).read(path, options, progress, scratch)
             if recording.dimension == 3:
                 return _in_space(recording, options, scratch)
-        if options.spin not in ("auto", "none"):
-            raise InputError("read.spin is for 3D recordings, this one is in 2D", where=str(path))
+        for name, given in (
+            ("spin", options.spin not in ("auto", "none")),
+            ("cameras", options.cameras),
+        ):
+            if given:
+                what = f"read.{name} is for 3D recordings, this one is in 2D"
+                raise InputError(what, where=str(path))
         return recording
     except OSError as error:
         # files may go, and disks fill up, at any moment
@@ -142,6 +148,8 @@ def read(
 def _in_space(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
     """What is found out alike of every 3D recording."""
     recording = spin.timed(replace(recording, scratch=scratch), options)
+    if options.cameras is not None:
+        recording = cameras.applied(recording, Path(options.cameras))
     return own_body_in_space.left_out(recording) if options.own_body else recording
 
 

@@ -88,6 +88,22 @@ class ReadOptions:
         None, "second laser's beams turn the other way round"
     )
     laser2_fov: float | None = field_with_doc(None, "rad: all beams of the second laser")
+    cameras: str | None = field_with_doc(
+        None, "file that says of cameras what the recording does not, and names further pictures"
+    )
+    depth_step: int = field_with_doc(
+        2, "of depth pictures: every so many columns and rows become beams"
+    )
+    depth_max: float = field_with_doc(
+        5.0,
+        "m: readings of depth pictures from there on count as nothing there, if max_range is unset",
+    )
+    depth_scale: float | None = field_with_doc(
+        None, "units of depth pictures per metre; unset: 1000, 5000 of TUM RGB-D"
+    )
+    level: bool = field_with_doc(
+        True, "turn the recorded poses of RGB-D folders so that z is up: their world lies anyhow"
+    )
     topic: str | None = field_with_doc(
         None, "of a bag: topics of the scans to use, with commas; unset: found by type and rate"
     )
@@ -115,7 +131,13 @@ class ReadOptions:
         for name in ("spin_start", "spin_stamp"):
             if getattr(self, name) is not None and not abs(getattr(self, name)) <= 2.0 * math.pi:
                 raise ValueError(f"{name} must lie within a turn, got {getattr(self, name)}")
-        for name in ("topic", "tilting_topic", "base_frame", "odom_frame"):
+        if not 1 <= self.depth_step <= 64:
+            raise ValueError(f"depth_step must lie in 1 to 64, got {self.depth_step}")
+        if not 0.0 < self.depth_max <= BEYOND:
+            raise ValueError(f"depth_max must lie in 0 to {BEYOND:g} m, got {self.depth_max}")
+        if self.depth_scale is not None and not 1e-3 <= self.depth_scale <= 1e6:
+            raise ValueError(f"depth_scale must lie in 0.001 to 1e6, got {self.depth_scale}")
+        for name in ("topic", "tilting_topic", "base_frame", "odom_frame", "cameras"):
             if getattr(self, name) is not None and not getattr(self, name).strip():
                 raise ValueError(f"{name} must name something")
         for number, laser in enumerate(("laser", "laser2")):

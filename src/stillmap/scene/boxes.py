@@ -40,12 +40,19 @@ class Box:
     half: tuple[float, float]
     hold: float
 
-    def holds(self, seconds: Float, xy: Float, margin: float) -> Bool:
-        """(n,) whether places (n, 2) lie in it, or within `margin` metres, at times (n,)."""
+    def middle(self, seconds: Float) -> Float:
+        """(n, 2) metres, where its middle is at times (n,); beyond its ends it goes on evenly."""
         early = np.minimum(seconds - self.seconds[0], 0.0)
         late = np.maximum(seconds - self.seconds[-1], 0.0)
         middle = np.stack([np.interp(seconds, self.seconds, c) for c in self.xy.T], axis=1)
         middle += early[:, None] * self.velocity[0] + late[:, None] * self.velocity[-1]
+        return middle
+
+    def holds(self, seconds: Float, xy: Float, margin: float) -> Bool:
+        """(n,) whether places (n, 2) lie in it, or within `margin` metres, at times (n,)."""
+        early = np.minimum(seconds - self.seconds[0], 0.0)
+        late = np.maximum(seconds - self.seconds[-1], 0.0)
+        middle = self.middle(seconds)
         at = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, None)
         ahead, off = self.ahead[at], xy - middle
         along = np.abs((off * ahead).sum(axis=1))
@@ -73,12 +80,13 @@ def boxes_of(
         hold: s for which an object goes on before it was first seen, and after it was last.
     """
     start = int(recording.stamp_ns[0])
-    return [_of_object(one, start, hold) for one in objects] + _of_others(
+    return [box_of(one, start, hold) for one in objects] + _of_others(
         recording, poses, p_static, objects, options
     )
 
 
-def _of_object(one: MovingObject, start: int, hold: float) -> Box:
+def box_of(one: MovingObject, start: int, hold: float) -> Box:
+    """The box of an object; its time begins at `start` ns, and it goes on for `hold` s."""
     seconds = np.asarray(1e-9 * (one.stamp_ns - start), np.float64)
     speed = np.linalg.norm(one.velocity, axis=1)
     walks = np.flatnonzero(speed > _WALKS)

@@ -1,15 +1,12 @@
 """Pictures in folders of KITTI."""
 
 import re
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap.errors import InputError
-from stillmap.recording import pictures
+from stillmap.recording import cameras, pictures
 from stillmap.recording.clouds.files import files_in
 from stillmap.recording.clouds.kitti_calibration import Calibration, lens
 from stillmap.recording.clouds.kitti_times import read_times, rows_of
@@ -28,10 +25,7 @@ def find(
         calibration: where the cameras sit.
         times: of the sweeps, which are those of pictures without their own.
     """
-    cameras: list[Camera] = []
-    stamp_ns: list[int] = []
-    camera_of: list[int] = []
-    files: list[Path] = []
+    parts: list[Images] = []
     warnings: list[str] = []
     for place in sorted(folder.iterdir()):
         match = _FOLDER.fullmatch(place.name)
@@ -43,25 +37,8 @@ def find(
         except InputError as error:
             warnings.append(f"the pictures in {place.name} are not used: {error}")
             continue
-        files += [file for _, file in found]
-        stamp_ns += [stamp for stamp, _ in found]
-        camera_of += [len(cameras)] * len(found)
-        cameras.append(camera)
-    if not files:
-        return None, warnings
-    order = np.argsort(np.array(stamp_ns, np.int64), kind="stable")
-    sorted_files = [files[i] for i in order]
-    images = Images(
-        stamp_ns=np.array(stamp_ns, np.int64)[order],
-        camera=np.array(camera_of, np.int32)[order],
-        cameras=tuple(cameras),
-        load=partial(_load, sorted_files),
-    )
-    return images, warnings
-
-
-def _load(files: list[Path], image: int) -> NDArray[Any]:
-    return pictures.read_picture(files[image])
+        parts.append(cameras.from_files(found, camera))
+    return cameras.joined(parts) if parts else None, warnings
 
 
 def _of_camera(place: Path, times: list[int | None]) -> list[tuple[int, Path]]:

@@ -1,0 +1,289 @@
+// Signed distances from the surfaces that scans saw, averaged in voxels: Curless and Levoy, "A
+// Volumetric Method for Building Complex Models from Range Images", SIGGRAPH 1996.
+// Threads share blocks of voxels, not triangles: in each voxel the terms come in the triangles'
+// order, so the sums have the same bits whatever the number of threads.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <stdexcept>
+#include <utility>
+#include <vector>
+
+#include "stillmap/blocks.hpp"
+#include "stillmap/parallel.hpp"
+
+namespace stillmap {
+
+// Sums over the triangles that a voxel lies before or behind.
+struct Distances {
+  float weight = 0.0f;
+  float product = 0.0f;  // weight times metres in front of the surface
+};
+
+// Triangles over points, as a sensor saw them.
+struct Triangles {
+  const double* points;    // (n, 3) metres
+  const double* origin;    // (n, 3) where the sensor was
+  const double* standoff;  // (n,) metres from there to the surface's tangent plane at the point
+  const int32_t* faces;    // (m, 3)
+  const float* weight;     // (m,)
+  size_t size;             // m
+};
+
+// alpha + gradient . voxel: of how much something is more than nothing, at voxels' indices
+struct Linear {
+  Vec<3> gradient = Vec<3>::Zero();
+  double constant = 0.0;
+  double at(const Vec<3>& voxel) const { return gradient.dot(voxel) + constant; }
+  Linear plus(double c) const { return {gradient, constant + c}; }
+  Linear times(double c) const { return {c * gradient, c * constant}; }
+};
+
+// Voxels on the lines of sight through a triangle, as far before and behind it as asked for.
+//
+// With o where the sensor was, a voxel is v = o + sum_i mu_i (corner_i - o). All mu_i are positive
+// on lines of sight through the triangle, on which the triangle is met at v / k, k = sum mu_i. The
+// distance from the surface is (1 - k) h with h the standoff, which is exact for a plane.
+class Prism {
+ public:
+  static constexpr double kMargin = 0.01;  // of the triangle: none slips through between two
+
+  Prism(const Triangles& all, size_t face, double voxel, double before, double behind) {
+    std::array<Vec<3>, 3> corner;
+    Vec<3> o = Vec<3>::Zero();
+    for (size_t i = 0; i < 3; ++i) {
+      const auto p = static_cast<size_t>(all.faces[3 * face + i]);
+      corner[i] = Eigen::Map<const Vec<3>>(all.points + 3 * p);
+      o += Eigen::Map<const Vec<3>>(all.origin + 3 * p) / 3.0;
+      standoff_[i] = all.standoff[p];
+    }
+    const Vec<3> a = corner[0] - o, b = corner[1] - o, c = corner[2] - o;
+    const double volume = a.dot(b.cross(c));
+    const double h = (standoff_[0] + standoff_[1] + standoff_[2]) / 3.0;
+    // seen edge on, or behind the sensor
+    if (!(std::abs(volume) > kFlat * a.norm() * b.norm() * c.norm()) || !(h > 0.0)) return;
+    const std::array<Vec<3>, 3> inverse = {b.cross(c) / volume, c.cross(a) / volume,
+                                           a.cross(b) / volume};
+    for (size_t i = 0; i < 3; ++i) {
+      mu_[i].gradient = inverse[i] * voxel;
+      mu_[i].constant = inverse[i].dot(Vec<3>::Constant(0.5 * voxel) - o);
+      k_.gradient += mu_[i].gradient;
+      k_.constant += mu_[i].constant;
+      border_[i] = mu_[i].plus(kMargin);
+    }
+    const double nearest = std::max(1.0 - before / h, kNearest), farthest = 1.0 + behind / h;
+    border_[3] = k_.plus(-nearest);
+    border_[4] = k_.times(-1.0).plus(farthest);
+    surround({a, b, c}, o, nearest, farthest, voxel);
+  }
+
+  bool empty() const { return (high_.array() < low_.array()).any(); }
+  const Cell<3>& low() const { return low_; }
+  const Cell<3>& high() const { return high_; }
+
+  // Whether none of a cube of voxels with this edge is in it, as far as one border tells.
+  bool misses(const Cell<3>& lowest, int edge) const {
+    const Vec<3> first = lowest.cast<double>();
+    for (const Linear& border : border_) {
+      double most = border.at(first);
+      for (int d = 0; d < 3; ++d) most += std::max(border.gradient[d], 0.0) * (edge - 1);
+      if (most < 0.0) return true;
+    }
+    return false;
+  }
+
+  // Of the voxels first to last along x at y, z those within: the first and the last.
+  std::pair<int32_t, int32_t> within(int32_t first, int32_t last, int32_t y, int32_t z) const {
+    double from = first, to = last;
+    for (const Linear& border : border_) {
+      const double slope = border.gradient[0];
+      const double at0 = border.gradient[1] * y + border.gradient[2] * z + border.constant;
+      if (slope > 0.0) {
+        from = std::max(from, -at0 / slope);
+      } else if (slope < 0.0) {
+        to = std::min(to, -at0 / slope);
+      } else if (at0 < 0.0) {
+        return {1, 0};
+      }
+    }
+    if (!(from <= to)) return {1, 0};
+    return {static_cast<int32_t>(std::ceil(from)), static_cast<int32_t>(std::floor(to))};
+  }
+
+  // metres in front of the surface
+  double distance(const Vec<3>& voxel) const {
+    const double k = k_.at(voxel);
+    double sum = 0.0;
+    for (size_t i = 0; i < 3; ++i) sum += mu_[i].at(voxel) * standoff_[i];
+    return (1.0 - k) * sum / k;
+  }
+
+ private:
+  static constexpr double kFlat = 1e-12;
+  static constexpr double kNearest = 0.05;  // of the way from the sensor
+  static constexpr double kFarthest = Grid<3>::kMaxCell;
+
+  void surround(const std::array<Vec<3>, 3>& corner, const Vec<3>& o, double nearest,
+                double farthest, double voxel) {
+    Vec<3> low = Vec<3>::Constant(std::numeric_limits<double>::infinity()), high = -low;
+    for (size_t i = 0; i < 3; ++i) {
+      // mu is at least -margin for the two others
+      const Vec<3> end =
+          corner[i] + 2.0 * kMargin * (2.0 * corner[i] - corner[(i + 1) % 3] - corner[(i + 2) % 3]);
+      for (const double k : {nearest, farthest}) {
+        const Vec<3> at = (o + k * end) / voxel - Vec<3>::Constant(0.5);
+        low = low.cwiseMin(at);
+        high = high.cwiseMax(at);
+      }
+    }
+    if (!(low.minCoeff() > -kFarthest) || !(high.maxCoeff() < kFarthest))
+      throw std::invalid_argument("points: too far away for voxels of this edge");
+    low_ = low.array().floor().cast<int32_t>();
+    high_ = high.array().ceil().cast<int32_t>();
+  }
+
+  std::array<Linear, 3> mu_;
+  std::array<Linear, 5> border_;  // a voxel is within if all are positive
+  Linear k_;
+  std::array<double, 3> standoff_{};
+  Cell<3> low_ = Cell<3>::Ones(), high_ = Cell<3>::Zero();
+};
+
+class SignedDistances : public Blocks<3, Distances> {
+ public:
+  // voxel: metres, its edge; distances are summed from `before` metres in front of surfaces to
+  // `behind` metres behind them
+  SignedDistances(double voxel, double before, double behind)
+      : voxel_(voxel), before_(before), behind_(behind) {
+    if (!(voxel > 0.0) || !std::isfinite(voxel))
+      throw std::invalid_argument("voxel: expected a positive length in metres");
+    if (!(before > 0.0) || !(before <= kMostVoxels * voxel) || !(behind > 0.0) ||
+        !(behind <= kMostVoxels * voxel))
+      throw std::invalid_argument("before, behind: expected above 0 to 64 voxels");
+  }
+
+  SignedDistances(SignedDistances&&) noexcept = default;
+  SignedDistances& operator=(SignedDistances&&) noexcept = default;
+  SignedDistances(const SignedDistances&) = delete;
+  SignedDistances& operator=(const SignedDistances&) = delete;
+
+  double voxel() const { return voxel_; }
+  double before() const { return before_; }
+  double behind() const { return behind_; }
+
+  size_t memory_bytes() const { return blocks().size() * (sizeof(Block) + 64); }
+
+  void add(const Triangles& triangles, int threads) {
+    const auto bounds = even_shares(triangles.size, threads);
+    std::vector<std::vector<Meeting>> met(bounds.size() - 1);
+    parallel_shares(bounds, [&](size_t share, size_t first, size_t last) {
+      for (size_t face = first; face < last; ++face) meet(triangles, face, met[share]);
+    });
+    const Sorted sorted = by_block(met);
+    const auto shares = shares_of(sorted.offset.data(), sorted.block.size(), threads);
+    parallel_shares(shares, [&](size_t, size_t first, size_t last) {
+      for (size_t b = first; b < last; ++b)
+        for (int64_t k = sorted.offset[b]; k < sorted.offset[b + 1]; ++k)
+          sum(triangles, sorted.face[static_cast<size_t>(k)], *sorted.block[b]);
+    });
+  }
+
+ private:
+  static constexpr double kMostVoxels = 64.0;
+  static constexpr int64_t kMostBlocks = 1 << 20;  // around one triangle
+
+  struct Meeting {
+    Cell<3> block;
+    uint32_t face;
+  };
+  // The triangles that meet each block, in their order.
+  struct Sorted {
+    std::vector<Block*> block;
+    std::vector<int64_t> offset;
+    std::vector<uint32_t> face;
+  };
+
+  Prism prism(const Triangles& triangles, size_t face) const {
+    return Prism(triangles, face, voxel_, before_, behind_);
+  }
+
+  void meet(const Triangles& triangles, size_t face, std::vector<Meeting>& met) const {
+    if (!(triangles.weight[face] > 0.0f)) return;
+    const Prism one = prism(triangles, face);
+    if (one.empty()) return;
+    const Cell<3> low = block_of(one.low()), high = block_of(one.high());
+    int64_t blocks = 1;
+    for (int d = 0; d < 3; ++d) blocks *= std::min<int64_t>(high[d] - low[d] + 1, kMostBlocks + 1);
+    if (blocks > kMostBlocks || blocks < 1)
+      throw std::invalid_argument("faces: one is too large for voxels of this edge");
+    Cell<3> block;
+    for (block[2] = low[2]; block[2] <= high[2]; ++block[2])
+      for (block[1] = low[1]; block[1] <= high[1]; ++block[1])
+        for (block[0] = low[0]; block[0] <= high[0]; ++block[0])
+          if (!one.misses(block * kEdge, kEdge))
+            met.push_back({block, static_cast<uint32_t>(face)});
+  }
+
+  Sorted by_block(const std::vector<std::vector<Meeting>>& met) {
+    size_t n = 0;
+    for (const auto& share : met) n += share.size();
+    Sorted out;
+    std::vector<uint32_t> number;  // of the block, for each meeting
+    number.reserve(n);
+    std::vector<int64_t> count;
+    std::unordered_map<const Block*, uint32_t> seen;
+    const Block* last = nullptr;
+    uint32_t of_last = 0;
+    for (const auto& share : met)
+      for (const Meeting& one : share) {
+        Block* block = find_or_add(one.block, Distances{});
+        if (block != last) {
+          const auto [it, added] = seen.try_emplace(block, static_cast<uint32_t>(count.size()));
+          if (added) {
+            out.block.push_back(block);
+            count.push_back(0);
+          }
+          last = block;
+          of_last = it->second;
+        }
+        ++count[of_last];
+        number.push_back(of_last);
+      }
+    out.offset.assign(1, 0);
+    for (const int64_t c : count) out.offset.push_back(out.offset.back() + c);
+    std::vector<int64_t> next(out.offset.begin(), out.offset.end() - 1);
+    out.face.resize(n);
+    size_t k = 0;
+    for (const auto& share : met)
+      for (const Meeting& one : share)
+        out.face[static_cast<size_t>(next[number[k++]]++)] = one.face;
+    return out;
+  }
+
+  void sum(const Triangles& triangles, uint32_t face, Block& block) const {
+    const Prism one = prism(triangles, face);
+    const float weight = triangles.weight[face];
+    const Cell<3> corner = block.origin * kEdge;
+    const Cell<3> low = one.low().cwiseMax(corner);
+    const Cell<3> high = one.high().cwiseMin((corner.array() + (kEdge - 1)).matrix());
+    for (int32_t z = low[2]; z <= high[2]; ++z)
+      for (int32_t y = low[1]; y <= high[1]; ++y) {
+        const auto [first, last] = one.within(low[0], high[0], y, z);
+        Distances* row = &block.counts[static_cast<size_t>(local_of({0, y, z}))];
+        for (int32_t x = first; x <= last; ++x) {
+          Distances& voxel = row[x - corner[0]];
+          const auto d = static_cast<float>(one.distance(Cell<3>(x, y, z).cast<double>()));
+          voxel.weight += weight;
+          voxel.product += weight * d;
+        }
+      }
+  }
+
+  double voxel_, before_, behind_;
+};
+
+}  // namespace stillmap

@@ -1,0 +1,113 @@
+"""The place without its people: a surface, and for each face the picture that paints it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.models.sources import Sources
+from stillmap.surface.dividing import divided
+from stillmap.surface.mesh import Mesh
+from stillmap.texture.about import Beams
+from stillmap.texture.choice import Candidates, chosen, utility
+from stillmap.texture.choice_options import ChoiceOptions
+from stillmap.texture.lens import project
+from stillmap.texture.things import Thing, at_time, in_the_way
+from stillmap.texture.told import told
+from stillmap.texture.view import View
+from stillmap.texture.options import VisibleOptions
+from stillmap.texture.visible import visible
+from stillmap.threads import in_order
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int32]
+Tell = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Painted:
+    """A surface of F faces, and which of N views paints each.
+
+    Attributes:
+        mesh: the surface, its long edges divided.
+        view: (F,) number of the view; -1: none sees it without something that moves before it.
+        p_static: (F,) how probably that view shows static things only; 0 where there is none.
+        seen: (F,) whether any view sees it at all.
+    """
+
+    mesh: Mesh
+    view: Index
+    p_static: NDArray[np.float32]
+    seen: NDArray[np.bool_]
+
+
+def painted(
+    mesh: Mesh,
+    views: Sequence[View],
+    sources: Sources,
+    options: ChoiceOptions,
+    limits: VisibleOptions,
+    threads: int = 1,
+    tell: Tell | None = None,
+) -> Painted:
+    """Chooses for each face the view that most likely shows static things only (Sect. 4.4).
+
+    Args:
+        mesh: what stands still.
+        views: pictures and where they were taken.
+        sources: the beams that tell what moves, and when.
+        options: see ChoiceOptions.
+        limits: see VisibleOptions.
+        threads: same result with any number.
+        tell: called with how many views are looked at, and of how many.
+    """
+    mesh, _ = divided(mesh, options.edge)
+    beams, areas = sources.beams(), mesh.areas()
+    candidates = Candidates.none(len(mesh), min(options.candidates, max(len(views), 1)))
+    seen_at_all = np.zeros(len(mesh), np.bool_)
+
+    def looked_at(view: View) -> tuple[NDArray[np.intp], Float, Float]:
+        found = visible(mesh, view, limits)
+        faces = np.flatnonzero(found.seen)
+        p = np.zeros(len(faces))
+        if options.believe and len(faces):
+            p = shown(mesh, faces, view, beams, sources.things, options)
+        return faces, found.pixels[faces].astype(np.float64), p
+
+    for number, (faces, pixels, p) in enumerate(in_order(looked_at, views, threads)):
+        seen_at_all[faces] = True
+        good = utility(p, pixels, areas[faces], options)
+        candidates.add(number, faces, good, p)
+        if tell is not None:
+            tell(number + 1, len(views))
+    view = chosen(candidates, mesh.pairs(), options.border)
+    p_static = np.where(candidates.picture == view[:, None], candidates.p_static, 0.0).max(axis=1)
+    return Painted(mesh, view, np.where(view >= 0, p_static, 0.0).astype(np.float32), seen_at_all)
+
+
+def shown(
+    mesh: Mesh,
+    faces: NDArray[np.intp],
+    view: View,
+    beams: Beams,
+    things: Sequence[Thing],
+    options: ChoiceOptions,
+) -> Float:
+    """(n,) how probably a view shows static things only where it sees faces (n,).
+
+    The product of two: that no thing that is followed stands before it then, and what beams taken
+    about then say. Of the corners of a face and its middle the least counts.
+    """
+    corners, number = np.unique(mesh.faces[faces], return_inverse=True)
+    points = np.concatenate([mesh.vertices[corners], mesh.centres[faces]])
+    seconds = 1e-9 * (view.stamp_ns - beams.start_ns)
+    there = at_time(things, seconds)
+    p = 1.0 - in_the_way(there, view.place, points, options.margin, options.sigma)
+    found = told(view, *beams.about(view.stamp_ns, options.window), options.margin)
+    local = view.in_camera(points)
+    uv, ok = project(view.camera, local)
+    uv = np.where(ok[:, None], uv, 0.0)  # corners just outside: as at the edge
+    p *= found.shown(uv, local[:, 2], options.margin, options.unseen)
+    of_corners = p[: len(corners)][number.reshape(-1, 3)].min(axis=1)
+    return np.asarray(np.minimum(of_corners, p[len(corners) :]))

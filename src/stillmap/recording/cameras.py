@@ -1,0 +1,133 @@
+"""Cameras and pictures as a file of the user's has them, laid over a recording's own."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.errors import InputError, nearest
+from stillmap.recording import camera_file, pictures
+from stillmap.recording.camera_file import GivenCamera
+from stillmap.recording.clouds.files import files_in, stamps_in, stem_of
+from stillmap.recording.clouds.kitti_times import read_times, rows_of
+from stillmap.recording.images import Camera, Images
+from stillmap.recording.model import Recording
+
+_NO_IMAGES = Images(np.zeros(0, np.int64), np.zeros(0, np.int32), (), lambda _: np.zeros((0, 0)))
+
+
+def applied(recording: Recording, path: Path) -> Recording:
+    """The recording, with cameras as a file says, and the pictures that it names.
+
+    Raises:
+        InputError: the file is wrong, names a camera that is not there, or pictures that are not.
+    """
+    given = camera_file.read(path)
+    images = recording.images or _NO_IMAGES
+    known = [camera.name for camera in images.cameras]
+    for name, one in given.items():
+        if one.folder is None and name not in (*known, *depth_cameras(recording.source)):
+            what = f"there is no camera '{name}'"
+            raise InputError(what, where=str(path), hint=_hint(name, known))
+        if one.folder is not None and name in known:
+            what = f"camera '{name}' has pictures in the recording: 'folder' is for others"
+            raise InputError(what, where=str(path))
+    parts = [_changed(images, given)]
+    for name, one in given.items():
+        if one.folder is not None:
+            parts.append(_added(name, one, one.folder, str(path)))
+    together = joined(parts)
+    return replace(recording, images=together if together.cameras else None)
+
+
+def depth_cameras(source: dict[str, Any]) -> list[str]:
+    """Names of the sensors of a recording that are cameras themselves: their scans are grids."""
+    notes = source.get("sensors")
+    sensors = notes if isinstance(notes, list) else []
+    return [str(one.get("name")) for one in sensors if isinstance(one, dict) and one.get("grid")]
+
+
+def from_files(found: Sequence[tuple[int, Path]], camera: Camera) -> Images:
+    """The pictures of one camera, in files of which the stamps are known, in any order."""
+    ordered = sorted(found, key=lambda one: one[0])
+    return Images(
+        stamp_ns=np.array([stamp for stamp, _ in ordered], np.int64),
+        camera=np.zeros(len(ordered), np.int32),
+        cameras=(camera,),
+        load=partial(_load, [file for _, file in ordered]),
+    )
+
+
+def joined(parts: Sequence[Images]) -> Images:
+    """All pictures of several cameras, or sets of cameras, in the order of their stamps."""
+    if len(parts) == 1:
+        return parts[0]
+    first = np.cumsum([0, *(len(part.cameras) for part in parts)])
+    stamp_ns = np.concatenate([part.stamp_ns for part in parts])
+    camera = np.concatenate([part.camera + n for part, n in zip(parts, first[:-1], strict=True)])
+    of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    number = np.concatenate([np.arange(len(part)) for part in parts])
+    order = np.argsort(stamp_ns, kind="stable")
+    of, number = of[order], number[order]
+
+    def load(image: int) -> NDArray[Any]:
+        picture: NDArray[Any] = parts[of[image]].read(int(number[image]))
+        return picture
+
+    cameras = tuple(one for part in parts for one in part.cameras)
+    return Images(stamp_ns[order], camera[order].astype(np.int32), cameras, load)
+
+
+def _hint(name: str, known: Sequence[str]) -> str:
+    if not known:
+        return "the recording has no pictures; folder = '...' adds some"
+    return f"nearest: '{nearest(name, known, least=0.0)}'; folder = '...' adds one"
+
+
+def _changed(images: Images, given: dict[str, GivenCamera]) -> Images:
+    """The recording's own pictures; with a time added, they may come in another order."""
+    cameras, stamp_ns = list(images.cameras), images.stamp_ns.copy()
+    for number, camera in enumerate(cameras):
+        one = given.get(camera.name)
+        if one is not None:
+            cameras[number] = one.over(camera)
+            stamp_ns[images.camera == number] += one.time_offset_ns
+    order = np.argsort(stamp_ns, kind="stable")
+
+    def load(image: int) -> NDArray[Any]:
+        return images.read(int(order[image]))
+
+    return Images(stamp_ns[order], images.camera[order], tuple(cameras), load)
+
+
+def _added(name: str, given: GivenCamera, folder: Path, where: str) -> Images:
+    """The pictures of a folder that the recording does not know of."""
+    files = files_in(folder, pictures.ENDINGS)
+    if not files:
+        raise InputError("holds no pictures", where=str(folder), hint=f"camera '{name}' of {where}")
+    if given.times is not None:
+        times = read_times(given.times)
+        rows = rows_of(files, len(times), given.times)
+        stamps = [None if row is None else times[row] for row in rows]
+    else:
+        found = stamps_in([stem_of(file.name, pictures.ENDINGS) for file in files])
+        if found is None:
+            hint = f"times = 'FILE' in camera '{name}' of {where}: a line of seconds for each"
+            raise InputError(
+                "holds pictures whose names are no times", where=str(folder), hint=hint
+            )
+        stamps = list(found)
+    used = [(s, f) for s, f in zip(stamps, files, strict=True) if s is not None]
+    if not used:
+        raise InputError("holds no usable time", where=str(given.times))
+    width, height = pictures.size_of(used[0][1])
+    camera = given.over(Camera(name, width, height, None, "", np.zeros(0), None))
+    return from_files([(stamp + given.time_offset_ns, file) for stamp, file in used], camera)
+
+
+def _load(files: list[Path], image: int) -> NDArray[Any]:
+    return pictures.read_picture(files[image])

@@ -1,0 +1,125 @@
+"""The surface of what stands still, from beams by how likely they hit something static."""
+
+from collections.abc import Callable, Iterable
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import _core
+from stillmap.recording.model import Recording
+from stillmap.surface.extraction import extracted, joined_whole, tiles_of, without_islands
+from stillmap.surface.mesh import Mesh
+from stillmap.surface.options import SurfaceOptions
+from stillmap.surface.patches import Patch, order_of, patches_of
+from stillmap.surface.thinning import thinned
+from stillmap.threads import in_order
+
+Float = NDArray[np.float64]
+Tell = Callable[[int, int], None]
+
+
+def surface_of(
+    seen: Recording,
+    poses: Float,
+    p_static: NDArray[np.float32],
+    options: SurfaceOptions,
+    threads: int = 1,
+    tell: Tell | None = None,
+) -> Mesh:
+    """The surface of what stands still, in the map frame.
+
+    Args:
+        seen: 3D, M beams, without motion during its scans.
+        poses: (T, 4, 4) T_map_base.
+        p_static: (M,) P(static) of each beam, NaN where it is not known.
+        options: see SurfaceOptions.
+        threads: same result with any number.
+        tell: called with what is done and what there is to do.
+    """
+    T = seen.T_map_sensor(poses)
+    order = order_of(seen, chosen_scans(T, seen.sensor, options), options)
+    voxel = options.voxel or 0.05
+    n, done = len(order.groups), 0
+
+    def weighed(make: Callable[[], Patch]) -> tuple[Patch, NDArray[np.float32]]:
+        patch = make()
+        return patch, static_weights(patch, p_static, options.least)
+
+    def each() -> Iterable[tuple[Patch, NDArray[np.float32]]]:
+        nonlocal done
+        for one in in_order(weighed, patches_of(seen, poses, order, options), threads):
+            yield one
+            done += 1
+            if tell:
+                tell(done, 2 * n)
+
+    later = partial(_second_half, tell, n) if tell else None
+    return fused(each(), voxel, options, threads, later)
+
+
+def _second_half(tell: Tell, n: int, done: int, total: int) -> None:
+    tell(n + n * done // total, 2 * n)
+
+
+def fused(
+    patches: Iterable[tuple[Patch, NDArray[np.float32]]],
+    voxel: float,
+    options: SurfaceOptions,
+    threads: int = 1,
+    tell: Tell | None = None,
+) -> Mesh:
+    """One surface of many patches, in the frame of their points.
+
+    Args:
+        patches: each with the weight (m,) of its faces; those that weigh nothing are left out.
+        voxel: edge in metres.
+        options: see SurfaceOptions.
+        threads: same result with any number.
+        tell: called with what is done and what there is to do, once the patches are through.
+    """
+    o = options
+    distances = _core.SignedDistances(voxel, before=o.before * voxel, behind=o.behind * voxel)
+    for patch, weight in patches:
+        distances.add(
+            patch.points, patch.origin, patch.standoff, patch.faces, weight, threads=threads
+        )
+    thin = partial(thinned, error=o.error)
+    parts, total = [], len(tiles_of(distances))
+    for done, part in enumerate(extracted(distances, o.fewest, thin), start=1):
+        if part is not None:
+            parts.append(part)
+        if tell:
+            tell(done, total)
+    whole = without_islands(joined_whole(parts), o.island)
+    return thinned(whole, o.error, whole_border=False)
+
+
+def static_weights(
+    patch: Patch, p_static: NDArray[np.float32], least: float
+) -> NDArray[np.float32]:
+    """(m,) weights of a patch's faces: P(static) of all three beams, 0 below `least`."""
+    p = np.nan_to_num(p_static[patch.beam].astype(np.float64), nan=0.0)
+    weight = p[patch.faces].prod(axis=1)
+    return np.where(weight >= least, weight, 0.0).astype(np.float32)
+
+
+def chosen_scans(
+    T_map_sensor: Float, sensor: NDArray[np.int32], o: SurfaceOptions
+) -> NDArray[np.intp]:
+    """The scans that tell something new: so many from each place, and for each direction.
+
+    Args:
+        T_map_sensor: (T, 4, 4).
+        sensor: (T,) which sensor took each.
+        o: `apart`, `turned` and `looks`.
+    """
+    place, R = T_map_sensor[:, :3, 3], T_map_sensor[:, :3, :3]
+    chosen: list[int] = []
+    for t in range(len(place)):
+        of = np.array([k for k in chosen if sensor[k] == sensor[t]], np.intp)
+        near = of[np.linalg.norm(place[of] - place[t], axis=1) < o.apart]
+        cosine = 0.5 * (np.einsum("nij,ij->n", R[near], R[t]) - 1.0)
+        if np.count_nonzero(cosine > np.cos(o.turned)) < o.looks:
+            chosen.append(t)
+    return np.array(chosen, np.intp)

@@ -1,0 +1,71 @@
+"""Triangles that are divided until no edge is long, without gaps between them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.surface.mesh import Mesh
+
+Index = NDArray[np.int32]
+
+_ROUNDS = 12  # at most; each halves the longest edges
+
+
+def divided(mesh: Mesh, edge: float) -> tuple[Mesh, NDArray[np.intp]]:
+    """The same surface, all of whose edges are shorter; neighbours stay neighbours.
+
+    Edges longer than `edge` metres are halved, and triangles with one, two or three such edges
+    become two, three or four, again and again.
+
+    Returns:
+        The mesh, its first vertices those of the old one, and (F,) the face of the old one that
+        each face is a part of.
+    """
+    vertices, faces = mesh.vertices, mesh.faces
+    of = np.arange(len(faces))
+    for _ in range(_ROUNDS):
+        ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)  # (F, 3, 2): edges ab, bc, ca
+        length = np.linalg.norm(vertices[ends[..., 0]] - vertices[ends[..., 1]], axis=2)
+        if not (length > edge).any():
+            break
+        middle, vertices = _halved(ends, length > edge, vertices)
+        faces, of = _parted(faces, middle, of)
+    return Mesh(vertices, faces), of
+
+
+def _halved(
+    ends: Index, long: NDArray[np.bool_], vertices: NDArray[np.float64]
+) -> tuple[Index, NDArray[np.float64]]:
+    """(F, 3) vertices in the middle of long edges, -1 for others; all vertices, with these."""
+    two = np.sort(ends[long].astype(np.int64), axis=1)
+    key, number = np.unique(two[:, 0] * len(vertices) + two[:, 1], return_inverse=True)
+    middle = np.full(long.shape, -1, np.int32)
+    middle[long] = len(vertices) + number
+    a, b = key // len(vertices), key % len(vertices)
+    return middle, np.concatenate([vertices, 0.5 * (vertices[a] + vertices[b])])
+
+
+def _parted(faces: Index, middle: Index, of: NDArray[np.intp]) -> tuple[Index, NDArray[np.intp]]:
+    """The parts of faces whose edges have middles, by how many have."""
+    count = (middle >= 0).sum(axis=1)
+    parts, origin = [faces[count == 0]], [of[count == 0]]
+    for n in (1, 2, 3):
+        rows = np.flatnonzero(count == n)
+        # turned so that the first edge has a middle, or with two the last one has none
+        turn = np.argmax(middle[rows] >= 0, axis=1) if n == 1 else np.zeros(len(rows), np.intp)
+        if n == 2:
+            turn = (np.argmax(middle[rows] < 0, axis=1) + 1) % 3
+        at = (np.arange(3) + turn[:, None]) % 3
+        a, b, c = np.take_along_axis(faces[rows], at, axis=1).T
+        ab, bc, ca = np.take_along_axis(middle[rows], at, axis=1).T
+        corners = {
+            1: [(a, ab, c), (ab, b, c)],
+            2: [(ab, b, bc), (a, ab, bc), (a, bc, c)],
+            3: [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)],
+        }[n]
+        for three in corners:
+            parts.append(np.stack(three, axis=1))
+            origin.append(of[rows])
+    # parts of a face side by side, in the order of the faces
+    owner = np.concatenate(origin)
+    order = np.argsort(owner, kind="stable")
+    return np.concatenate(parts)[order], owner[order]

@@ -1,0 +1,209 @@
+"""The polygons of range images: neighbouring beams that hit the same surface (Sect. 4.5).
+
+How a sensor looks about is told by its beams, whatever the recording was read from:
+
+- scans whose beams lie in a plane through the sensor are rows, and scans that follow one another
+  are neighbours, in whatever direction a joint turns them;
+- scans that are cut into rows of equal length, as depth pictures and the columns of lidars are;
+- all others: the Delaunay triangulation of the directions.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay, QhullError
+
+from stillmap.recording.model import Recording
+from stillmap.surface import rows
+from stillmap.surface.options import SurfaceOptions
+from stillmap.surface.triangles import grid_faces, surface_faces
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_ROWS = 128  # planar scans worked on together
+_SAME = 0.2  # of the usual angle between rows: nearer ones are the same row
+_FAR = 4.0  # times the usual angle between rows, farther ones are no neighbours
+_SEAM = 0.2  # rad by which a turn goes on beyond its end
+_NARROW = 0.5  # cosine of the angle from the middle of a picture to its corners, at least
+
+
+class Patch(NamedTuple):
+    """Polygons of a range image, or of neighbouring planar scans.
+
+    Attributes:
+        points: (n, 3) metres.
+        faces: (m, 3) int32, counter-clockwise seen from the sensor.
+        beam: (n,) that each point is of, in the recording.
+        origin: (n, 3) where the sensor was, in the frame of the points.
+        standoff: (n,) metres from there to the surface's tangent plane at the point.
+    """
+
+    points: Float
+    faces: NDArray[np.int32]
+    beam: Index
+    origin: Float
+    standoff: Float
+
+
+class Order(NamedTuple):
+    """In which order the beams of a recording come.
+
+    Attributes:
+        planar: whether scans are rows.
+        groups: of scans: a range image each, or planar ones that follow one another.
+    """
+
+    planar: bool
+    groups: list[Index]
+
+
+def order_of(seen: Recording, chosen: Index, o: SurfaceOptions) -> Order:
+    """How the sensors look about.
+
+    Args:
+        seen: 3D.
+        chosen: of its scans, those to be used; where scans are rows, all are.
+        o: see SurfaceOptions.
+    """
+    counts = np.diff(seen.offset)
+    asked = np.unique(np.linspace(0, seen.n_scans - 1, min(seen.n_scans, 9)).astype(np.intp))
+    planar = [rows.is_planar(rows.directions(seen.points[seen.beams_of(t)])) for t in asked]
+    if sum(planar) * 2 > len(planar) and len(np.unique(counts[counts > 0])) == 1:
+        return Order(True, _sequences(seen, o.pause))
+    return Order(False, [np.array([t]) for t in chosen if counts[t]])
+
+
+def _sequences(seen: Recording, pause: float) -> list[Index]:
+    """Planar scans that follow one another, each sequence beginning where the last one ended."""
+    out = []
+    for sensor in np.unique(seen.sensor):
+        scans = np.flatnonzero((seen.sensor == sensor) & (np.diff(seen.offset) > 0))
+        ends = np.flatnonzero(np.diff(seen.stamp_ns[scans]) > pause * 1e9) + 1
+        for part in np.split(scans, ends):
+            for first in range(0, max(len(part) - 1, 0), _ROWS):
+                out.append(part[first : first + _ROWS + 1])
+    return sorted(out, key=lambda part: int(part[0]))
+
+
+def patches_of(seen: Recording, poses: Float, order: Order, o: SurfaceOptions) -> Iterator[
+    Callable[[], Patch]
+]:
+    """What makes each patch, in the order of the scans.
+
+    Args:
+        seen: 3D, without motion during its scans.
+        poses: (T, 4, 4) T_map_base.
+        order: see `order_of`.
+        o: limits.
+    """
+    T = seen.T_map_sensor(poses)
+    lengths: dict[tuple[int, int], int] = {}
+    for scans in order.groups:
+        yield lambda scans=scans: _patch(seen, T, scans, order.planar, lengths, o)
+
+
+def _patch(
+    seen: Recording,
+    T_map_sensor: Float,
+    scans: Index,
+    planar: bool,
+    lengths: dict[tuple[int, int], int],
+    o: SurfaceOptions,
+) -> Patch:
+    beam = np.concatenate([np.arange(seen.offset[t], seen.offset[t + 1]) for t in scans])
+    local = seen.points[beam].astype(np.float64)
+    scan = np.repeat(np.arange(len(scans)), np.diff(seen.offset)[scans])
+    T = T_map_sensor[scans]
+    points = np.einsum("nij,nj->ni", T[scan, :3, :3], local) + T[scan, :3, 3]
+    origin = T[scan, :3, 3]
+    use = seen.hit[beam] & np.isfinite(points).all(axis=1)
+    looking = rows.directions(local)
+    if planar:
+        number = np.arange(len(beam), dtype=np.int32).reshape(len(scans), -1)
+        faces = _between_rows(points, use, number, looking)
+    else:
+        key = (int(seen.sensor[scans[0]]), len(beam))
+        if key not in lengths:
+            lengths[key] = rows.row_length(looking)
+        faces = _of_image(points, use, looking, lengths[key], o)
+    kept = surface_faces(points, origin, faces, o)
+    return Patch(points, kept.faces, beam, origin, kept.standoff)
+
+
+def _between_rows(
+    points: Float, use: NDArray[np.bool_], number: NDArray[np.int32], looking: Float
+) -> NDArray[np.int32]:
+    """Triangles between planar scans that follow one another, (R, W) numbers of their points."""
+    angle = np.array(
+        [rows.apart(looking[a], looking[b]) for a, b in zip(number[:-1], number[1:], strict=True)]
+    )
+    usual = float(np.nanmedian(angle)) if np.isfinite(angle).any() else 0.0
+    kept, gone = [0], 0.0
+    breaks = []
+    for row, step in enumerate(angle, start=1):
+        gone += step if np.isfinite(step) else 0.0
+        if gone < _SAME * usual and row < len(number) - 1:
+            continue
+        if gone > _FAR * usual:
+            breaks.append(len(kept))
+        kept.append(row)
+        gone = 0.0
+    parts = np.split(number[kept], breaks)
+    faces = [grid_faces(points, use, part) for part in parts if len(part) > 1]
+    return np.concatenate([np.zeros((0, 3), np.int32), *faces])
+
+
+def _of_image(
+    points: Float, use: NDArray[np.bool_], looking: Float, length: int, o: SurfaceOptions
+) -> NDArray[np.int32]:
+    """Triangles of one scan whose rows have a length, 0: of any order."""
+    if not length:
+        return _in_any_order(use, looking, o)
+    number = np.arange(len(points), dtype=np.int32).reshape(-1, length)
+    along, across = rows.apart(looking[:-1], looking[1:]), 0.0
+    across = rows.apart(looking[:-length], looking[length:])
+    if rows.apart(looking[number[:, -1]], looking[number[:, 0]]) < 2.0 * along:
+        number = np.concatenate([number, number[:, :1]], axis=1)
+    if len(number) > 2 and rows.apart(looking[number[-1]], looking[number[0]]) < 2.0 * across:
+        number = np.concatenate([number, number[:1]])
+    return grid_faces(points, use, number)
+
+
+def _in_any_order(
+    use: NDArray[np.bool_], looking: Float, o: SurfaceOptions
+) -> NDArray[np.int32]:
+    """The Delaunay triangulation of the directions of beams that are used."""
+    beams = np.flatnonzero(use)
+    if len(beams) < 3:
+        return np.zeros((0, 3), np.int32)
+    seen = looking[beams]
+    middle = seen.mean(axis=0) / max(float(np.linalg.norm(seen.mean(axis=0))), 1e-12)
+    if float((seen @ middle).min()) > _NARROW:
+        side = np.linalg.svd(middle[None])[2][1:]
+        plane, of = (seen @ side.T) / (seen @ middle)[:, None], np.arange(len(beams))
+    else:
+        plane, of = _unrolled(seen)
+    try:
+        found = Delaunay(plane).simplices
+    except QhullError:  # all in one line
+        return np.zeros((0, 3), np.int32)
+    found = found[np.abs(plane[found].mean(axis=1)[:, 0]) <= np.pi]
+    faces = of[found]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2])]
+    chord = np.linalg.norm(seen[faces] - np.roll(seen[faces], 1, axis=1), axis=2).max(axis=1)
+    faces = faces[chord <= o.widest * np.median(chord)]
+    return beams[faces].astype(np.int32)
+
+
+def _unrolled(looking: Float) -> tuple[Float, Index]:
+    """Azimuth and elevation, going on beyond a turn on both sides, and which beam each is of."""
+    azimuth = np.arctan2(looking[:, 1], looking[:, 0])
+    elevation = np.arcsin(np.clip(looking[:, 2], -1.0, 1.0))
+    plane, of = np.stack([azimuth, elevation], axis=1), np.arange(len(looking))
+    low, high = azimuth < _SEAM - np.pi, azimuth > np.pi - _SEAM
+    turn = np.array([2.0 * np.pi, 0.0])
+    both = np.concatenate([plane, plane[low] + turn, plane[high] - turn])
+    return both, np.concatenate([of, of[low], of[high]])

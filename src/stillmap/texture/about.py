@@ -1,0 +1,85 @@
+"""The beams that were taken about when a picture was, and where they would have ended then."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.recording.model import Recording
+from stillmap.recording.stamps import beam_ns
+from stillmap.scene.boxes import Box
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_NEVER = np.iinfo(np.int64).max
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """T scans with M beams of a recording in 3D, to be asked for by time.
+
+    Attributes:
+        recording: as it was read; its times count.
+        seen: without the motion during its scans; its points count.
+        T_map_sensor: (T, 4, 4).
+        p_static: (M,) P(c = 1).
+        boxes: of things that move, their times in seconds after `start_ns`.
+        owned: for each of these the beams (n,) that ended on it, rising.
+        start_ns: when the time of the boxes begins.
+    """
+
+    recording: Recording
+    seen: Recording
+    T_map_sensor: Float
+    p_static: NDArray[np.float32]
+    boxes: Sequence[Box]
+    owned: Sequence[Index]
+    start_ns: int
+
+    def about(self, stamp_ns: int, window: float) -> tuple[Float, NDArray[np.float32]]:
+        """(n, 3) metres in the map frame where hits within `window` seconds ended, and their
+        P(static) (n,); what is of a thing that moves has gone on with it to this time."""
+        scans = self._scans(stamp_ns, window)
+        if scans.stop <= scans.start:
+            return np.zeros((0, 3)), np.zeros(0, np.float32)
+        first, last = self.seen.offset[[scans.start, scans.stop]]
+        at_ns = beam_ns(self.recording, scans)
+        apart = np.abs(at_ns - stamp_ns)
+        # at least what is nearest, as where scans count as taken at once
+        near = apart <= max(int(1e9 * window), int(apart.min(initial=_NEVER)))
+        kept = np.flatnonzero(self.seen.hit[first:last] & near)
+        beams = int(first) + kept
+        T = self.T_map_sensor[self.seen.scans_of(beams)]
+        local = self.seen.points[beams].astype(np.float64)
+        ends = np.einsum("nij,nj->ni", T[:, :3, :3], local) + T[:, :3, 3]
+        self._go_on(ends, beams, at_ns[kept], stamp_ns)
+        return ends, self.p_static[beams]
+
+    def _scans(self, stamp_ns: int, window: float) -> slice:
+        """Those of which some beam may have been taken then; at least the nearest."""
+        stamps = self.recording.stamp_ns
+        reach = 1e9 * (window + self._longest())
+        first = int(np.searchsorted(stamps, stamp_ns - reach))
+        last = int(np.searchsorted(stamps, stamp_ns + reach, side="right"))
+        return slice(first, last)
+
+    def _longest(self) -> float:
+        """Seconds that a scan takes at most, about: from one to the next."""
+        steps = np.diff(self.recording.stamp_ns)
+        if not len(steps):
+            return 0.0
+        return 1e-9 * float(np.median(steps))
+
+    def _go_on(self, ends: Float, beams: Index, at_ns: NDArray[np.int64], stamp_ns: int) -> None:
+        for box, owned in zip(self.boxes, self.owned, strict=True):
+            if not len(owned) or not len(beams) or owned[-1] < beams[0] or owned[0] > beams[-1]:
+                continue
+            place = np.searchsorted(owned, beams)
+            mine = np.flatnonzero(owned[np.minimum(place, len(owned) - 1)] == beams)
+            if not len(mine):
+                continue
+            then = box.middle(np.asarray(1e-9 * (at_ns[mine] - self.start_ns), np.float64))
+            now = box.middle(np.array([1e-9 * (stamp_ns - self.start_ns)]))
+            ends[mine, :2] += now - then

@@ -1,0 +1,120 @@
+"""Which picture paints which face: the one that most likely shows static things only (Sect. 4.4).
+
+Of the pictures that see a face those compete that probably show nothing that moves before it, by
+that probability and by their resolution; neighbouring faces prefer the same picture.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.texture.choice_options import ChoiceOptions
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int32]
+
+NONE = -1
+
+_ROUNDS = 20  # in which faces settle with their neighbours
+_KEPT = 0.5  # of what a face was told before, from round to round: it settles, and does not swing
+_UNSURE = 1e-6
+
+
+class Candidates(NamedTuple):
+    """The K best pictures of F faces, the best first.
+
+    Attributes:
+        picture: (F, K) their numbers; -1: there are no more.
+        utility: (F, K) how good they are, e-folds of resolution; -inf where there is none.
+        p_static: (F, K) how probably each shows static things only.
+    """
+
+    picture: Index
+    utility: NDArray[np.float32]
+    p_static: NDArray[np.float32]
+
+    @classmethod
+    def none(cls, faces: int, most: int) -> "Candidates":
+        """Nothing known yet of so many faces."""
+        shape = faces, most
+        return cls(
+            np.full(shape, NONE, np.int32),
+            np.full(shape, -np.inf, np.float32),
+            np.zeros(shape, np.float32),
+        )
+
+    def add(self, picture: int, faces: NDArray[np.intp], utility: Float, p_static: Float) -> None:
+        """Puts a picture of some faces (n,) where it belongs among the best."""
+        better = utility > self.utility[faces, -1]
+        faces = faces[better]
+        row = np.arange(len(faces))[:, None]
+        utilities = np.column_stack([self.utility[faces], utility[better].astype(np.float32)])
+        order = np.argsort(-utilities, axis=1, kind="stable")[:, :-1]
+        self.utility[faces] = utilities[row, order]
+        for array, value in ((self.picture, picture), (self.p_static, p_static[better])):
+            new = np.broadcast_to(np.asarray(value, array.dtype), (len(faces),))
+            array[faces] = np.column_stack([array[faces], new])[row, order]
+
+
+def utility(p_static: Float, pixels: Float, area: Float, options: ChoiceOptions) -> Float:
+    """(n,) how good a picture is for faces, in e-folds of resolution; -inf: not to be used.
+
+    Args:
+        p_static: (n,) how probably it shows static things only.
+        pixels: (n,) that each face covers in it: resolution and angle in one.
+        area: (n,) square metres of each face.
+        options: see ChoiceOptions.
+    """
+    sharp = 0.5 * np.log(np.maximum(pixels, _UNSURE) / np.maximum(area, _UNSURE**2))
+    if not options.believe:
+        return np.asarray(sharp)
+    sure = options.trust * np.log(np.maximum(p_static, _UNSURE))
+    return np.where(p_static >= options.least, sharp + sure, -np.inf)
+
+
+def chosen(candidates: Candidates, pairs: Index, border: float) -> Index:
+    """(F,) the picture of each face, -1 where there is none.
+
+    Minimises the sum of what is lost against each face's best picture, plus `border` for each
+    pair of neighbours with different ones (a Potts model), by min-sum belief propagation.
+
+    Args:
+        candidates: the best pictures of each face.
+        pairs: (N, 2) faces side by side.
+        border: what it costs where two pictures meet.
+    """
+    F, K = candidates.picture.shape
+    best = candidates.utility.max(axis=1, keepdims=True, initial=-np.inf)
+    painted = np.isfinite(best[:, 0])
+    with np.errstate(invalid="ignore"):
+        cost = np.where(np.isfinite(candidates.utility), best - candidates.utility, np.inf)
+    of = pairs[painted[pairs].all(axis=1)].astype(np.intp)
+    giver, taker = np.concatenate([of, of[:, ::-1]]).T
+    back = np.roll(np.arange(len(giver)), len(of))  # the same pair the other way round
+    same = _same(candidates.picture, giver, taker)
+    cost = cost.astype(np.float64)
+    told = np.zeros((len(giver), K))
+    belief = cost
+    for _ in range(_ROUNDS):
+        own = belief[giver] - np.where(np.isfinite(belief[giver]), told[back], 0.0)
+        least = own.min(axis=1, keepdims=True, initial=np.inf)
+        padded = np.column_stack([own, np.full(len(own), np.inf)])
+        heard = np.minimum(np.take_along_axis(padded, same, axis=1), least + border) - least
+        told = _KEPT * told + (1.0 - _KEPT) * heard
+        belief = cost + np.stack(
+            [np.bincount(taker, told[:, k], minlength=F) for k in range(K)], axis=1
+        )
+    label = np.argmin(belief, axis=1)
+    return np.where(painted, candidates.picture[np.arange(F), label], NONE).astype(np.int32)
+
+
+def _same(picture: Index, giver: NDArray[np.intp], taker: NDArray[np.intp]) -> NDArray[np.intp]:
+    """(n, K) which of the giver's candidates each of the taker's is; K: none."""
+    K = picture.shape[1]
+    out = np.full((len(giver), K), K)
+    for i in range(K):
+        for j in range(K):
+            equal = (picture[giver, i] == picture[taker, j]) & (picture[giver, i] != NONE)
+            out[equal, j] = i
+    return out

@@ -1,0 +1,56 @@
+"""How pictures are put on a surface."""
+
+from dataclasses import dataclass
+
+from stillmap.options import field_with_doc
+
+
+@dataclass(frozen=True)
+class ChoiceOptions:
+    """Which picture paints which face; docs/mesh.md says how it is chosen."""
+
+    believe: bool = field_with_doc(
+        True, "ask what the lasers saw to move; without, the sharpest picture paints each face"
+    )
+    margin: float = field_with_doc(0.15, "m around what was seen of a thing that moves")
+    sigma: float = field_with_doc(0.1, "m, by how much its outline may be off beyond that")
+    hold: float = field_with_doc(
+        0.5, "s for which a thing goes on before it is first seen and after it is last"
+    )
+    window: float = field_with_doc(0.06, "s around a picture, beams within which tell of it")
+    unseen: float = field_with_doc(
+        0.9, "probability that a picture shows what stands still where no beam tells of it"
+    )
+    least: float = field_with_doc(
+        0.8, "probability below which a picture does not paint a face, if need be none does"
+    )
+    trust: float = field_with_doc(
+        10.0, "what the logarithm of that probability counts against that of the resolution"
+    )
+    border: float = field_with_doc(
+        1.0, "what it costs where two pictures meet, in e-folds of resolution of the faces there"
+    )
+    candidates: int = field_with_doc(6, "pictures that are compared for each face, the best ones")
+    edge: float = field_with_doc(
+        0.25, "m, longer edges of faces are divided first: each part has its own picture"
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("unseen", "least"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"'mesh.choice.{name}' wants a probability")
+        for name, low, high in _LIMITS:
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"'mesh.choice.{name}' wants {low:g} to {high:g}")
+
+
+_LIMITS = (
+    ("margin", 0.0, 10.0),
+    ("sigma", 1e-3, 10.0),
+    ("hold", 0.0, 1000.0),
+    ("window", 1e-3, 1000.0),
+    ("trust", 0.0, 1e6),
+    ("border", 0.0, 1e6),
+    ("candidates", 1, 64),
+    ("edge", 0.01, 1000.0),
+)

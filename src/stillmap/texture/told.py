@@ -1,0 +1,134 @@
+"""What beams say of a picture that was taken about when they were."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from stillmap.recording.images import Camera
+from stillmap.texture.lens import project
+from stillmap.texture.view import View
+
+Float = NDArray[np.float64]
+
+_CELLS = 80  # over the width of a picture
+_SLOPE = 0.01  # m by which what a beam shows is larger, for each metre: beams diverge
+_WIDE = 1.5  # cells, within which a beam tells of what is beside
+_NEAREST = 0.05  # m from the camera: what is nearer is the camera's own
+_RADII = 12  # cells at most, by which an end point is grown
+
+
+class Told(NamedTuple):
+    """What beams say, on a grid of h by w cells over a picture.
+
+    Attributes:
+        cell: pixels, the edge of a cell.
+        depth: (h, w) metres ahead of the camera, of the nearest thing that moves; inf: none.
+        dynamic: (h, w) how probably it moves.
+        support: (h, w) how many beams ended there on what stands still, about.
+    """
+
+    cell: float
+    depth: Float
+    dynamic: Float
+    support: Float
+
+    def shown(self, uv: Float, depth: Float, margin: float, unseen: float) -> Float:
+        """(n,) how probably the picture shows what stands still.
+
+        Args:
+            uv: (n, 2) pixels, within the picture.
+            depth: (n,) metres ahead of the camera.
+            margin: metres before a thing that moves, from where on it is in the way.
+            unseen: the probability where no beam tells of it.
+        """
+        h, w = self.depth.shape
+        column = np.clip((uv[:, 0] / self.cell).astype(np.intp), 0, w - 1)
+        row = np.clip((uv[:, 1] / self.cell).astype(np.intp), 0, h - 1)
+        still = 1.0 - (1.0 - unseen) * np.exp(-self.support[row, column])
+        hidden = self.depth[row, column] < depth + margin
+        return np.where(hidden, np.minimum(still, 1.0 - self.dynamic[row, column]), still)
+
+
+def told(view: View, points: Float, p_static: NDArray[np.float32], margin: float) -> Told:
+    """What beams say of a picture.
+
+    Args:
+        view: the picture.
+        points: (n, 3) metres in the map frame, where beams ended about when it was taken.
+        p_static: (n,) P(c = 1) of these; below one half something that moves was there, and is
+            `margin` metres larger, to all sides.
+    """
+    camera = view.camera
+    cell = camera.width / _CELLS
+    shape = max(round(camera.height / cell), 1), _CELLS
+    local = view.in_camera(points)
+    uv, ok = project(camera, local)
+    ok &= local[:, 2] > _NEAREST
+    moves = p_static < 0.5
+    support = _support(uv[ok & ~moves], cell, shape)
+    depth, dynamic = np.full(shape, np.inf), np.zeros(shape)
+    seen = ok & moves
+    if seen.any():
+        focal = _focal(camera) / cell
+        _grow(depth, dynamic, uv[seen] / cell, local[seen, 2], 1.0 - p_static[seen], focal, margin)
+    return Told(cell, depth, dynamic, support)
+
+
+def _focal(camera: Camera) -> float:
+    if camera.K is None:
+        raise ValueError("camera: its lens is not known")
+    return float(camera.K[0, 0])
+
+
+def _support(uv: Float, cell: float, shape: tuple[int, int]) -> Float:
+    column, row = np.floor(uv / cell).astype(np.intp).T
+    inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+    at = row[inside] * shape[1] + column[inside]
+    count = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape)
+    # as much as one beam right here
+    near = ndimage.gaussian_filter(count.astype(np.float64), _WIDE, mode="constant")
+    return np.asarray(near * (2.0 * np.pi * _WIDE**2))
+
+
+def _grow(
+    depth: Float,
+    dynamic: Float,
+    at: Float,
+    away: Float,
+    p_dynamic: NDArray[np.float32],
+    focal: float,
+    margin: float,
+) -> None:
+    """Notes discs around what moves, the nearest of them in each cell.
+
+    Args:
+        depth, dynamic: (h, w), changed.
+        at: (n, 2) in cells.
+        away: (n,) metres ahead of the camera.
+        p_dynamic: (n,).
+        focal: length in cells.
+        margin: metres.
+    """
+    h, w = depth.shape
+    radius = np.minimum((margin / away + _SLOPE) * focal, _RADII)
+    parts = []
+    for whole in range(_RADII + 1):
+        of = np.flatnonzero(np.ceil(radius - 0.5).astype(np.intp) == whole)
+        if not len(of):
+            continue
+        dy, dx = np.mgrid[-whole : whole + 1, -whole : whole + 1]
+        disc = dx**2 + dy**2 <= (whole + 0.5) ** 2
+        column = np.floor(at[of, 0]).astype(np.intp)[:, None] + dx[disc]
+        row = np.floor(at[of, 1]).astype(np.intp)[:, None] + dy[disc]
+        inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
+        point = np.repeat(of, inside.sum(axis=1))
+        parts.append(np.stack([(row * w + column)[inside], point], axis=1))
+    if not parts:
+        return
+    cell, point = np.concatenate(parts).T
+    # of several in a cell the last one that is written stays: the nearest
+    order = np.lexsort((point, -away[point]))
+    depth.flat[cell[order]] = away[point[order]]
+    dynamic.flat[cell[order]] = p_dynamic[point[order]]

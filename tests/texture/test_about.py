@@ -1,0 +1,72 @@
+"""Beams that were taken about when a picture was."""
+
+import numpy as np
+
+from stillmap.recording.model import Recording
+from stillmap.scene.boxes import Box
+from stillmap.texture.about import Beams
+
+
+def _recording(times: np.ndarray | None) -> Recording:
+    T, n = 4, 3
+    points = np.zeros((T * n, 3), np.float32)
+    points[:, 0] = np.arange(T * n) + 1.0
+    return Recording(
+        stamp_ns=np.arange(T) * 100_000_000,
+        offset=np.arange(T + 1, dtype=np.int64) * n,
+        points=points,
+        hit=np.ones(T * n, np.bool_),
+        T_base_sensor=np.eye(4)[None],
+        sensor=np.zeros(T, np.int32),
+        T_odom_base=None,
+        beam_time=times,
+    )
+
+
+def _beams(recording: Recording, boxes: list[Box], owned: list[np.ndarray]) -> Beams:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 1, 3] = [0.0, 10.0, 20.0, 30.0]
+    p = np.linspace(0.0, 1.0, 12).astype(np.float32)
+    return Beams(recording, recording, poses, p, boxes, owned, 0)
+
+
+def test_of_scans_taken_at_once_the_nearest_counts_at_least() -> None:
+    beams = _beams(_recording(None), [], [])
+    ends, p = beams.about(140_000_000, 0.01)
+    np.testing.assert_allclose(ends, [[4, 10, 0], [5, 10, 0], [6, 10, 0]])
+    np.testing.assert_allclose(p, np.arange(3, 6) / 11.0)
+    assert len(beams.about(150_000_000, 0.06)[0]) == 6
+
+
+def test_with_times_each_beam_counts_by_its_own() -> None:
+    times = np.tile(np.array([0.0, 0.03, 0.06], np.float32), 4)
+    beams = _beams(_recording(times), [], [])
+    ends, _ = beams.about(145_000_000, 0.02)
+    np.testing.assert_allclose(ends[:, 0], [5.0, 6.0])
+
+
+def test_what_is_of_a_thing_goes_on_with_it() -> None:
+    along = np.array([[0.0, 0.0], [1.0, 2.0]])
+    box = Box(
+        0,
+        np.array([0.0, 1.0]),
+        along,
+        np.array([[1.0, 0.0]] * 2),
+        np.array([[1.0, 2.0]] * 2),
+        (1.0, 1.0),
+        0.5,
+    )
+    beams = _beams(_recording(None), [box], [np.array([4, 9])])
+    ends, _ = beams.about(140_000_000, 0.01)
+    np.testing.assert_allclose(ends, [[4, 10, 0], [5.04, 10.08, 0], [6, 10, 0]], atol=1e-6)
+
+
+def test_beams_that_hit_nothing_say_nothing() -> None:
+    recording = _recording(None)
+    recording.hit[4] = False
+    ends, _ = _beams(recording, [], []).about(100_000_000, 0.01)
+    np.testing.assert_allclose(ends[:, 0], [4.0, 6.0])
+
+
+def test_there_may_be_none() -> None:
+    assert len(_beams(_recording(None), [], []).about(9_000_000_000, 0.1)[0]) == 0
