@@ -46,6 +46,7 @@ examples:
   stillmap simulate office-empty -o sim --format carmen
   stillmap simulate street -o sim --set traffic.vehicles=3 --json
   stillmap simulate street -o sim --lidar 64 --scans 300 --set lidar.vibration_pitch=0.005
+  stillmap simulate hall -o sim --lidar tilting --rate 37.5 --scans 900 --camera
 """
 
 # flag, metavar, type, section and key of the option it sets, help
@@ -109,6 +110,11 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         metavar="N",
         help="a spinning lidar of so many channels instead: the world and the recording in 3D; or "
         "'tilting': another laser that tilts",
+    )
+    groups["laser"].add_argument(
+        "--camera",
+        action="store_true",
+        help="cameras beside it, with --lidar; their pictures show what stands and what moves",
     )
     groups["odometry"].add_argument(
         "--odometry-noise",
@@ -215,6 +221,8 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
         changes.setdefault("crowd", {})["shape"] = args.shape
     if args.second_laser:
         changes.setdefault("laser", {})["second_laser"] = True
+    if args.camera:
+        changes.setdefault("camera", {})["enabled"] = True
     if args.odometry_noise != 1.0:
         defaults = scene_by_name(args.scene).odometry
         scaled = {key: args.odometry_noise * getattr(defaults, key) for key in _ODOMETRY_ERRORS}

@@ -1,6 +1,9 @@
 """Simulated recordings of places where people, doors and cars move, with the truth of each beam."""
 
+from stillmap.simulation.camera_options import CameraOptions
+from stillmap.simulation.colours import static_colour
 from stillmap.simulation.lidar_options import GroundOptions, HeightOptions, LidarOptions, RigOptions
+from stillmap.simulation.moving_surfaces import mover_points
 from stillmap.simulation.options import (
     CrowdOptions,
     DoorOptions,
@@ -9,6 +12,7 @@ from stillmap.simulation.options import (
     RobotOptions,
     TrafficOptions,
 )
+from stillmap.simulation.picture_truth import PictureTruth, load_picture_truth
 from stillmap.simulation.scene import Door, Lane, Light, Scene, Stay, Thing
 from stillmap.simulation.simulator import RigSimulation, Simulation, simulate, simulate_rig
 from stillmap.simulation.truth import Truth, load_truth
@@ -17,6 +21,7 @@ from stillmap.simulation.writing import write_rig, write_simulation
 
 __all__ = [
     "SCENES",
+    "CameraOptions",
     "CrowdOptions",
     "Door",
     "DoorOptions",
@@ -27,6 +32,7 @@ __all__ = [
     "LidarOptions",
     "Light",
     "OdometryOptions",
+    "PictureTruth",
     "RigOptions",
     "RigSimulation",
     "RobotOptions",
@@ -36,10 +42,13 @@ __all__ = [
     "Thing",
     "TrafficOptions",
     "Truth",
+    "load_picture_truth",
     "load_truth",
+    "mover_points",
     "scene_by_name",
     "simulate",
     "simulate_rig",
+    "static_colour",
     "write_rig",
     "write_simulation",
 ]

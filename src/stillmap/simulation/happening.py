@@ -30,6 +30,7 @@ class Happening:
         T_odom_base: (T, 3, 3) odometry.
         sensor_rng: what a planar laser, or the first sensor in 3D, draws from.
         body_rng: how tall people are, how the robot shakes, and what a second sensor in 3D draws.
+        colour_seed: what pictures look like; None: there are none.
     """
 
     scene: Scene
@@ -39,16 +40,24 @@ class Happening:
     T_odom_base: Float
     sensor_rng: np.random.Generator
     body_rng: np.random.Generator
+    colour_seed: int | None = None
 
     @property
     def stamp_ns(self) -> NDArray[np.int64]:
         """(T,) nanoseconds, as well as the recorder knows them."""
-        seconds, o = self.motion.seconds, self.scene.robot
+        o, exact = self.scene.robot, self.exact_ns
         if o.stamps_missing:
-            return np.arange(len(seconds), dtype=np.int64) * 10**9
+            return exact
         tick = max(1, round(o.stamp_rounding * 1e9))
-        exact = np.round(seconds * 1e9).astype(np.int64)
-        return _FIRST_STAMP_NS + (exact + tick // 2) // tick * tick
+        return _FIRST_STAMP_NS + (exact - _FIRST_STAMP_NS + tick // 2) // tick * tick
+
+    @property
+    def exact_ns(self) -> NDArray[np.int64]:
+        """(T,) the same, not rounded."""
+        seconds = self.motion.seconds
+        if self.scene.robot.stamps_missing:
+            return np.arange(len(seconds), dtype=np.int64) * 10**9
+        return _FIRST_STAMP_NS + np.round(seconds * 1e9).astype(np.int64)
 
     def source(self, sensors: list[dict[str, Any]]) -> dict[str, Any]:
         """What a recording says of where it is from."""
@@ -65,6 +74,8 @@ class Happening:
         """The truth about beams; `more` is told of the scene after `mover_kinds`."""
         motion = self.motion
         about = {**describe(self.scene, self.seed), "mover_kinds": motion.kinds, **(more or {})}
+        if self.colour_seed is not None:
+            about["colour_seed"] = self.colour_seed
         for name, scan in (("carried_at_scan", motion.carried), ("paused_at_scan", motion.paused)):
             about[name] = scan if scan < len(T_world_base) else None
         faces = motion.things.faces[-1]
@@ -90,14 +101,19 @@ def let_happen(scene: Scene, rng: np.random.Generator, tell: Progress) -> Happen
     driven = odometry.without_jump(se2.matrix(*motion.robot.T), motion.carried)
     T_odom_base = odometry.drifting(driven, scene.odometry, odometry_rng)
     T_odom_base = odometry.reported(T_odom_base, motion.seconds, scene.odometry, mishap_rngs[1])
-    return Happening(scene, seed, motion, walls, T_odom_base, sensor_rng, rng.spawn(1)[0])
+    body_rng = rng.spawn(1)[0]
+    # spawned last, so that all else stays as it is without a camera
+    seed_of_colours = int(rng.spawn(1)[0].integers(1 << 31)) if scene.camera.enabled else None
+    return Happening(scene, seed, motion, walls, T_odom_base, sensor_rng, body_rng, seed_of_colours)
 
 
 def describe(scene: Scene, seed: Any) -> dict[str, Any]:
     """Name, seed and all parameters of a scene, JSON-able; its walls lie beside as an array."""
     parameters = dataclasses.asdict(scene)
     del parameters["walls"], parameters["kerbs"]
+    unused: tuple[str, ...]
     unused = () if scene.in_3d else ("lidar", "rig", "ground", "heights", "pavements")
+    unused += () if scene.camera.enabled else ("camera",)
     for name in unused:
         del parameters[name]
     return {"name": parameters.pop("name"), "seed": seed, **parameters}

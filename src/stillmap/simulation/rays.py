@@ -79,13 +79,16 @@ def cast(
     mover = np.full(range.shape, -1, np.int32)
     on_glass = np.zeros(range.shape, bool)
     for k, columns, channels in _windows_of_faces(rays, faces, ground):
-        t = _to_face(rays, columns, channels, faces.ends[k], faces.z[k], ground)
+        origin, direction = rays.origin[:, columns], rays.direction[:, columns, channels]
+        t = to_face(origin, direction, faces.ends[k], faces.z[k], ground)
         nearer = t < range[columns, channels]
         range[columns, channels][nearer] = t[nearer]
         on_glass[columns, channels][nearer] = faces.is_glass[k]
     for group in solids:
         for k, columns, channels in _windows_of_solids(rays, group):
-            t = _to_solid(rays, columns, channels, group, k)
+            pose = group.pose[columns if len(group.pose) > 1 else slice(None), k]
+            origin, direction = rays.origin[:, columns], rays.direction[:, columns, channels]
+            t = to_solid(origin, direction, group, k, pose)
             nearer = t < range[columns, channels]
             range[columns, channels][nearer] = t[nearer]
             mover[columns, channels][nearer] = group.mover[k]
@@ -93,12 +96,9 @@ def cast(
     return Echoes(range, mover, on_glass)
 
 
-def _to_face(
-    rays: Rays, columns: slice, channels: slice, ends: Float, z: Float, ground: Ground
-) -> Float:
-    """(n, C) metres to an upright face."""
-    ox, oy, oz = rays.origin[:, columns]
-    dx, dy, dz = rays.direction[:, columns, channels]
+def to_face(origin: Float, direction: Float, ends: Float, z: Float, ground: Ground) -> Float:
+    """(n, C) metres along rays from (3, n, 1) to an upright face; inf: they pass it by."""
+    (ox, oy, oz), (dx, dy, dz) = origin, direction
     x0, y0, x1, y1 = ends
     ux, uy = x1 - x0, y1 - y0
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -111,14 +111,12 @@ def _to_face(
     return np.asarray(np.where(met, t, np.inf))
 
 
-def _to_solid(rays: Rays, columns: slice, channels: slice, solids: Solids, k: int) -> Float:
-    """(n, C) metres to a solid, from outside it."""
-    pose = solids.pose[columns if len(solids.pose) > 1 else slice(None), k]
+def to_solid(origin: Float, direction: Float, solids: Solids, k: int, pose: Float) -> Float:
+    """(n, C) metres along rays from (3, n, 1), outside it, to solid k at poses (n, 4) or (1, 4)."""
     x, y, heading, foot = pose.T[:, :, None]
     (a, b), (z0, z1), form = solids.half[k], solids.z[k], solids.form[k]
     c, s, h = np.cos(heading), np.sin(heading), (z1 - z0) / 2
-    ox, oy, oz = rays.origin[:, columns]
-    dx, dy, dz = rays.direction[:, columns, channels]
+    (ox, oy, oz), (dx, dy, dz) = origin, direction
     # scaled so that it is the unit cube, cylinder or sphere; distances along beams stay
     u, v = ((ox - x) * c + (oy - y) * s) / a, ((oy - y) * c - (ox - x) * s) / b
     w = (oz - foot - z0 - h) / h

@@ -5,6 +5,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from stillmap.simulation.camera_options import CameraOptions
 from stillmap.simulation.lidar_options import (
     GroundOptions,
     HeightOptions,
@@ -172,6 +173,7 @@ class Scene:
     ground: GroundOptions = field(default_factory=GroundOptions)
     heights: HeightOptions = field(default_factory=HeightOptions)
     rig: RigOptions = field(default_factory=RigOptions)
+    camera: CameraOptions = field(default_factory=CameraOptions)
     pavements: tuple[Segment, ...] = ()
 
     def __post_init__(self) -> None:
@@ -183,6 +185,10 @@ class Scene:
             require(not self.lidar.channels, "a rig of two lasers has no lidar")
             usual = not self.laser.second_laser and self.laser.upside_down == "no"
             require(usual, "a rig has one laser that lies flat, and upright")
+        require(
+            self.in_3d or not self.camera.enabled,
+            "cameras want a world in 3D: a lidar, or a laser that tilts",
+        )
 
     @property
     def in_3d(self) -> bool:

@@ -1,6 +1,6 @@
 """The simulation itself: people and robot move, the laser looks, odometry drifts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,10 @@ from stillmap.simulation import laser, lidar, spatial, sweep
 from stillmap.simulation.happening import Happening, let_happen
 from stillmap.simulation.motion import Progress
 from stillmap.simulation.options import LaserOptions
+from stillmap.simulation.photographs import Photographs
+from stillmap.simulation.picture_truth import PictureTruth, picture_truth
 from stillmap.simulation.scene import Scene
+from stillmap.simulation.spatial import World
 from stillmap.simulation.sweep import Sweep
 from stillmap.simulation.truth import Truth
 
@@ -26,11 +29,21 @@ _MOTION_SHARE_3D = 0.05  # the same with a lidar
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A scene, what the robot recorded in it, and what really happened."""
+    """A scene, what the robot recorded in it, and what really happened.
+
+    Attributes:
+        scene: the world and all parameters.
+        recording: what was recorded; its pictures are rendered when they are read.
+        truth: of the beams.
+        photographs: the pictures of its cameras with the truth about them; None: there are none.
+        surfaces: the truth about these and about what they show.
+    """
 
     scene: Scene
     recording: Recording
     truth: Truth
+    photographs: Photographs | None = None
+    surfaces: PictureTruth | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,15 +92,15 @@ def simulate(
     tell, share = progress or _silent, _MOTION_SHARE_3D if scene.in_3d else _MOTION_SHARE
     happening = let_happen(scene, np.random.default_rng(rng), _between(0.0, share, tell))
     if scene.in_3d:
-        world, sensor = spatial.World.of(happening), lidar.spinning(scene)
+        world, sensor = World.of(happening), lidar.spinning(scene)
         rest, own_rng = _between(share, 1.0, tell), happening.sensor_rng
-        recording, truth = spatial.record(world, sensor, own_rng, rest, scratch)
+        made = _photographed(world, *spatial.record(world, sensor, own_rng, rest, scratch))
     else:
         recording, mover = _record(happening)
         static, T_world_base = recording.hit & (mover < 0), se2.matrix(*happening.motion.robot.T)
-        truth = happening.truth(static, mover, T_world_base)
+        made = Simulation(scene, recording, happening.truth(static, mover, T_world_base))
     tell(1.0)
-    return Simulation(scene, recording, truth)
+    return made
 
 
 def simulate_rig(
@@ -105,14 +118,25 @@ def simulate_rig(
     tell, share = progress or _silent, _MOTION_SHARE_3D
     rng = np.random.default_rng(rng)
     happening = let_happen(scene, rng, _between(0.0, share, tell))
-    world, (flat, tilted), half = spatial.World.of(happening), lidar.of_rig(scene), (1 + share) / 2
+    world, (flat, tilted), half = World.of(happening), lidar.of_rig(scene), (1 + share) / 2
     first, second = _between(share, half, tell), _between(half, 1.0, tell)
     below = spatial.record(world, flat, happening.sensor_rng, first, scratch)
     above = spatial.record(world, tilted, happening.body_rng, second, scratch)
-    horizontal, tilting = Simulation(scene, *below), Simulation(scene, *above)
+    # that which builds in 3D has the pictures
+    horizontal, tilting = Simulation(scene, *below), _photographed(world, *above)
     tell(1.0)
     stamps = np.arange(len(happening.motion.robot)) / scene.scan_rate
     return RigSimulation(horizontal, tilting, lidar.joint_angle(stamps, scene.rig))
+
+
+def _photographed(world: World, recording: Recording, truth: Truth) -> Simulation:
+    """A recording in 3D with the pictures of the scene's cameras, if it has any."""
+    scene = world.happening.scene
+    if not scene.camera.enabled:
+        return Simulation(scene, recording, truth)
+    photographs = Photographs(world)
+    recording = replace(recording, images=photographs.images)
+    return Simulation(scene, recording, truth, photographs, picture_truth(world, photographs))
 
 
 def _record(happening: Happening) -> tuple[Recording, NDArray[np.int32]]:

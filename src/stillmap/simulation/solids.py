@@ -42,6 +42,22 @@ class Solids(NamedTuple):
     z: Float
     mover: NDArray[np.int32]
 
+    def some(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> "Solids":
+        """Those that are kept."""
+        return Solids(
+            self.pose[:, kept], self.form[kept], self.half[kept], self.z[kept], self.mover[kept]
+        )
+
+    def with_others(self, others: "Solids") -> "Solids":
+        """These, and then others at the same times."""
+        return Solids(
+            np.concatenate([self.pose, others.pose], axis=1),
+            np.concatenate([self.form, others.form]),
+            np.concatenate([self.half, others.half]),
+            np.concatenate([self.z, others.z]),
+            np.concatenate([self.mover, others.mover]),
+        )
+
 
 class Part(NamedTuple):
     """A solid as a part of something: where it sits on it, ahead and to the left, in metres.

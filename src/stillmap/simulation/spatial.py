@@ -51,11 +51,19 @@ class World(NamedTuple):
         ridden = lidar.ridden(happening.motion.robot, ground, scene.lidar, rng)
         return cls(happening, ground, *standing(scene, ground), carried, ridden)
 
+    def moment(self, scans: NDArray[np.int64], seconds: Float) -> Moment:
+        """N times: so many seconds after the stamps of scans."""
+        return Moment(self.happening.motion, scans, seconds)
+
+    def T_world_base(self, moment: Moment) -> Float:
+        """(N, 4, 4) where the robot is at the times of a moment."""
+        x, y, z, *angles = moment.at(self.ridden).T
+        return lidar.matrix(np.stack([x, y, z], axis=-1), *angles)
+
     def seen(self, sensor: Sensor, pattern: Pattern, scan: int) -> Echoes:
         """What the beams of one scan meet."""
-        moment = Moment(self.happening.motion, np.full(len(pattern.azimuth), scan), pattern.seconds)
-        x, y, z, *angles = moment.at(self.ridden).T
-        T = lidar.matrix(np.stack([x, y, z], axis=-1), *angles) @ sensor.T_base_sensor
+        moment = self.moment(np.full(len(pattern.azimuth), scan), pattern.seconds)
+        T = self.T_world_base(moment) @ sensor.T_base_sensor
         solids = [self.still, self.carried.at(moment, scan)]
         ceiling = self.happening.scene.heights.ceiling
         exact = rays.cast(lidar.looking(pattern, T), self.faces, solids, self.ground, ceiling)

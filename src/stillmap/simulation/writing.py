@@ -1,6 +1,7 @@
 """A simulation as a folder: the recording and, beside it, the truth."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -8,9 +9,10 @@ from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
 from stillmap.output.npy import write_npy
 from stillmap.recording import carmen_writing, folder
+from stillmap.simulation.picture_truth import write_picture_truth, writing_truth
 from stillmap.simulation.scene import Scene
 from stillmap.simulation.simulator import RigSimulation, Simulation
-from stillmap.simulation.truth import write_truth
+from stillmap.simulation.truth import FOLDER, write_truth
 
 Format = Literal["stillmap", "carmen"]
 
@@ -44,9 +46,9 @@ def write_simulation(
     with new_folder(Path(path), MARK, overwrite) as work:
         if format == "carmen":
             _write_carmen(simulation, work / CARMEN_LOG)
+            write_truth(simulation.truth, simulation.recording.stamp_ns, work)
         else:
-            folder.write_into(simulation.recording, work)
-        write_truth(simulation.truth, simulation.recording.stamp_ns, work)
+            _write_folder(simulation, work)
 
 
 def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) -> None:
@@ -61,9 +63,19 @@ def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) 
     with new_folder(Path(path), RIG_MARK, overwrite) as work:
         for name, one in (("horizontal", rig.horizontal), ("tilting", rig.tilting)):
             (work / name).mkdir()
-            folder.write_into(one.recording, work / name)
-            write_truth(one.truth, one.recording.stamp_ns, work / name)
+            _write_folder(one, work / name)
         write_npy(work / "joint_angle.npy", rig.joint_angle)
+
+
+def _write_folder(one: Simulation, work: Path) -> None:
+    """A recording folder with its truth, and pictures with theirs, into an existing folder."""
+    recording = one.recording
+    write_truth(one.truth, recording.stamp_ns, work)
+    if one.photographs is not None and one.surfaces is not None:
+        write_picture_truth(one.surfaces, work / FOLDER)
+        images = writing_truth(one.photographs, work / FOLDER)
+        recording = replace(recording, images=images)
+    folder.write_into(recording, work)
 
 
 def require_carmen(scene: Scene) -> None:
