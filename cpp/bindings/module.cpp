@@ -19,4 +19,5 @@ NB_MODULE(_core, m) {
   stillmap::border::bind_held_out(m);
   stillmap::border::bind_look_counts(m);
   stillmap::border::bind_sweep(m);
+  stillmap::border::bind_z_buffer(m);
 }

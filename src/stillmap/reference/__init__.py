@@ -37,6 +37,7 @@ from stillmap.reference.sweep_map import (
     register_sweep,
 )
 from stillmap.reference.traverse import cell_of, traverse
+from stillmap.reference.z_buffer import z_buffer
 
 __all__ = [
     "Bodies3D",
@@ -86,4 +87,5 @@ __all__ = [
     "search_lattice",
     "settled",
     "traverse",
+    "z_buffer",
 ]

@@ -17,8 +17,8 @@ Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _KNOWN = 0.5  # of the time that a scan takes: over less, poses tell of their own errors
-_FASTEST_TURN = 12.0  # rad/s; what is faster is a leap, no motion
-_FASTEST = 100.0  # m/s, likewise
+FASTEST_TURN = 12.0  # rad/s; what is faster is a leap, no motion
+FASTEST = 100.0  # m/s, likewise
 _BLOCK = 1 << 14  # beams worked on together
 
 
@@ -93,8 +93,8 @@ def _twists_in_space(stamp_ns: NDArray[np.int64], poses: Float) -> Float:
         return np.zeros((len(poses), 6))
     moved = se3.log(se2.inverse(poses[:-1]) @ poses[1:])
     twists = moved / np.where(seconds > 0.0, seconds, np.inf)[:, None]
-    leaps = np.linalg.norm(twists[:, :3], axis=1) > _FASTEST
-    leaps |= np.linalg.norm(twists[:, 3:], axis=1) > _FASTEST_TURN
+    leaps = np.linalg.norm(twists[:, :3], axis=1) > FASTEST
+    leaps |= np.linalg.norm(twists[:, 3:], axis=1) > FASTEST_TURN
     twists[leaps] = 0.0
     return np.concatenate([twists, twists[-1:]])
 
@@ -145,7 +145,7 @@ def _twists(recording: Recording, poses: Float, first: Index, second: Index) -> 
     seconds = 1e-9 * (recording.stamp_ns[second] - recording.stamp_ns[first])
     moved = se2.log(se2.inverse(poses[first]) @ poses[second])
     twists = moved / np.where(seconds > 0.0, seconds, np.inf)[:, None]
-    twists[_leaps(poses, first, second) | (np.abs(twists[:, 2]) > _FASTEST_TURN)] = 0.0
+    twists[_leaps(poses, first, second) | (np.abs(twists[:, 2]) > FASTEST_TURN)] = 0.0
     vx, vy, turn = _steadied(twists).T
     # off the centre of a robot that turns, a sensor goes along with the turn
     x, y, theta = se2.parameters(recording.T_base_sensor[recording.sensor]).T

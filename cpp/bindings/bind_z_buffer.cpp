@@ -1,0 +1,64 @@
+#include <nanobind/stl/tuple.h>
+
+#include <cmath>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "stillmap/z_buffer.hpp"
+
+namespace stillmap::border {
+namespace {
+
+using Faces =
+    nb::ndarray<const int32_t, nb::numpy, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using Matrix = nb::ndarray<const double, nb::numpy, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
+
+constexpr int kLargest = 1 << 15;  // pixels along an edge of a picture
+
+Pinhole checked(const Matrix& K, const OnePose<3>& T_camera_map, int width, int height,
+                double near) {
+  const double* k = K.data();
+  for (size_t i = 0; i < 9; ++i) require(std::isfinite(k[i]), "K: not finite");
+  require(k[0] > 0.0 && k[4] > 0.0, "K: expected positive focal lengths");
+  require(k[3] == 0.0 && k[6] == 0.0 && k[7] == 0.0 && k[8] == 1.0,
+          "K: expected (fx s cx, 0 fy cy, 0 0 1)");
+  require(width > 0 && width <= kLargest && height > 0 && height <= kLargest,
+          "width, height: expected 1 to 32768 pixels");
+  require(near > 0.0 && std::isfinite(near), "near: expected a positive length in metres");
+  const Pose<3> pose = checked_pose<3>(T_camera_map, "T_camera_map");
+  return {pose.R, pose.t, k[0], k[1], k[2], k[4], k[5], width, height, near};
+}
+
+auto z_buffer(const Places<3>& vertices, const Faces& faces, const Matrix& K,
+              const OnePose<3>& T_camera_map, int width, int height, double near, int threads) {
+  const size_t V = vertices.shape(0), F = faces.shape(0);
+  for (size_t i = 0; i < 3 * V; ++i)
+    require(std::isfinite(vertices.data()[i]), "vertices: not finite");
+  for (size_t i = 0; i < 3 * F; ++i) {
+    const int32_t at = faces.data()[i];
+    require(at >= 0 && static_cast<size_t>(at) < V, "faces: a vertex that is not there");
+  }
+  require(F < size_t{1} << 31, "faces: too many");
+  const Pinhole camera = checked(K, T_camera_map, width, height, near);
+  ZBuffer out;
+  {
+    nb::gil_scoped_release released;
+    out = z_buffer_of(vertices.data(), V, faces.data(), F, camera, threads);
+  }
+  const auto h = static_cast<size_t>(height), w = static_cast<size_t>(width);
+  return std::make_tuple(owned(std::move(out.depth), {h, w}), owned(std::move(out.face), {h, w}));
+}
+
+}  // namespace
+
+void bind_z_buffer(nb::module_& m) {
+  m.def("z_buffer", &z_buffer, nb::arg("vertices").noconvert(), nb::arg("faces").noconvert(),
+        nb::arg("K").noconvert(), nb::arg("T_camera_map").noconvert(), nb::arg("width"),
+        nb::arg("height"), nb::kw_only(), nb::arg("near"), nb::arg("threads") = 1,
+        "What an ideal pinhole camera sees of a mesh, vertices (V, 3) float64 and faces (F, 3) "
+        "int32: depth (height, width) float32, metres along its axis, inf where there is "
+        "nothing, and face (height, width) int32, -1 there. Pixel centres have whole numbers; "
+        "what is less than `near` metres ahead is not seen; faces have two sides.");
+}
+
+}  // namespace stillmap::border
