@@ -20,5 +20,6 @@ NB_MODULE(_core, m) {
   stillmap::border::bind_held_out(m);
   stillmap::border::bind_look_counts(m);
   stillmap::border::bind_sweep(m);
+  stillmap::border::bind_texels(m);
   stillmap::border::bind_z_buffer(m);
 }

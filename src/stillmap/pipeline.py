@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap import em, slam
 from stillmap.em import EmOptions
+from stillmap.models.options import MeshOptions
 from stillmap.objects import ObjectOptions
 from stillmap.options import field_with_doc
 from stillmap.output.map_server import OutputOptions
@@ -47,6 +48,7 @@ class Options:
     slam: SlamOptions = field(default=SlamOptions())
     objects: ObjectOptions = field(default=ObjectOptions())
     rig: RigOptions = field(default=RigOptions())
+    mesh: MeshOptions = field(default=MeshOptions())
     output: OutputOptions = field(default=OutputOptions())
 
     def __post_init__(self) -> None:

@@ -1,18 +1,36 @@
-"""`stillmap view`: the report, in a browser where there is one."""
+"""`stillmap view`: a result in a browser over time, or its report."""
 
 import os
+import re
+import shutil
+import signal
+import socket
 import sys
+import time
+import urllib.request
 
 import pytest
+
+from stillmap import extras
 
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
 
 
 @pytest.fixture
-def result(tmp_path):
+def report(tmp_path):
+    """A folder with a report alone."""
     out = tmp_path / "a result"
     out.mkdir()
     (out / "report.html").write_text("<!doctype html>")
+    return out
+
+
+@pytest.fixture(scope="module")
+def mapped(stillmap, room, tmp_path_factory):
+    """The result of mapping the room."""
+    out = tmp_path_factory.mktemp("viewed") / "out"
+    done = stillmap("map", room, "-o", out, "--set", "em.max_iterations=1", "--quiet")
+    assert done.returncode == 0, done.stderr
     return out
 
 
@@ -23,28 +41,164 @@ def elsewhere(monkeypatch):
         monkeypatch.delenv(name, raising=False)
 
 
-def test_prints_where_the_report_is(call, result, monkeypatch):
-    monkeypatch.chdir(result.parent)
+@pytest.fixture
+def without_viser(monkeypatch):
+    """The extra is not installed."""
+
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(extras, "import_module", missing)
+
+
+@pytest.fixture
+def browser(tmp_path):
+    """An environment whose browser notes what it is to open, and the note."""
+    program, note = tmp_path / "browser", tmp_path / "opened"
+    program.write_text(f'#!/bin/sh\necho "$1" > "{note}.part"\nmv "{note}.part" "{note}"\n')
+    program.chmod(0o755)
+    return {**os.environ, "BROWSER": f"{program} %s"}, note
+
+
+def served(process):
+    """Its address, as soon as it says so, and what it said before."""
+    said = ""
+    for line in process.stderr:
+        said += line
+        if found := re.search(r"http://127\.0\.0\.1:\d+", line):
+            return found[0], said
+    raise AssertionError(said)
+
+
+def ended(process, number=signal.SIGINT):
+    process.send_signal(number)
+    out, err = process.communicate(timeout=60)
+    return process.returncode, out, err
+
+
+def without_a_screen():
+    return {name: value for name, value in os.environ.items() if name not in SCREENS}
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="there is always a screen")
+def test_a_result_is_served_until_ctrl_c(start, mapped):
+    pytest.importorskip("viser")
+    process = start("view", mapped, env=without_a_screen())
+    address, said = served(process)
+    with urllib.request.urlopen(address, timeout=10) as page:
+        assert page.status == 200
+    assert "no browser to be had here" in said
+    assert "without beams" not in said
+    assert ended(process) == (0, "", "")
+
+
+def test_terminated_it_goes_at_once(start, mapped):
+    pytest.importorskip("viser")
+    process = start("view", mapped, env=without_a_screen())
+    served(process)
+    assert ended(process, signal.SIGTERM) == (143, "", "")
+
+
+def test_the_browser_of_the_environment_is_opened(start, mapped, browser):
+    pytest.importorskip("viser")
+    environment, note = browser
+    process = start("view", mapped, "--no-beams", env=environment)
+    address, said = served(process)
+    assert "no browser" not in said
+    for _ in range(200):
+        if note.exists():
+            break
+
+        time.sleep(0.05)
+    assert ended(process)[0] == 0
+    assert note.read_text() == f"{address}\n"
+
+
+def test_the_port_that_is_wanted(start, mapped):
+    pytest.importorskip("viser")
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        port = one.getsockname()[1]
+    process = start("view", mapped, "--port", port, env=without_a_screen())
+    address, _ = served(process)
+    assert address.endswith(f":{port}")
+    assert ended(process)[0] == 0
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_a_port_that_is_taken_is_refused(call, mapped):
+    pytest.importorskip("viser")
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        one.listen()
+        done = call("view", mapped, "--no-beams", "--port", one.getsockname()[1])
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "is taken" in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("port", [-1, 65_536])
+def test_a_port_that_cannot_be_is_refused(call, report, port):
+    done = call("view", report, "--port", port)
+    assert done.returncode == 2
+    assert "--port wants 0 to 65535" in done.stderr
+
+
+def test_without_its_recording_a_result_is_shown_without_beams(start, mapped, room, tmp_path):
+    pytest.importorskip("viser")
+    out = shutil.copytree(mapped, tmp_path / "out")
+    record = (out / "run.json").read_text()
+    (out / "run.json").write_text(record.replace(str(room), "/nowhere"))
+    process = start("view", out, env=without_a_screen())
+    _, said = served(process)
+    assert "without beams: /nowhere: does not exist" in said
+    assert ended(process)[0] == 0
+
+
+def test_a_recording_that_was_named_has_to_be_there(call, mapped, tmp_path):
+    pytest.importorskip("viser")
+    done = call("view", mapped, "--input", tmp_path / "nothing")
+    assert done.returncode == 2
+    assert "nothing" in done.stderr
+
+
+def test_a_damaged_result_is_refused(call, mapped, tmp_path):
+    pytest.importorskip("viser")
+    out = shutil.copytree(mapped, tmp_path / "out")
+    (out / "map.npz").write_bytes(b"nonsense")
+    done = call("view", out, "--no-beams")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "map.npz" in done.stderr
+
+
+@pytest.mark.usefixtures("elsewhere", "without_viser")
+@pytest.mark.skipif(sys.platform == "darwin", reason="there is always a screen")
+def test_without_the_extra_it_is_the_report(call, report):
+    done = call("view", report)
+    assert (done.returncode, done.stdout) == (0, "")
+    first, second = done.stderr.splitlines()
+    assert "pip install 'stillmap[viewer]'" in first
+    assert str(report / "report.html") in second
+
+
+def test_prints_where_the_report_is(call, report, monkeypatch):
+    monkeypatch.chdir(report.parent)
     done = call("view", "a result", "--print")
-    assert (done.returncode, done.stdout, done.stderr) == (0, f"{result / 'report.html'}\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{report / 'report.html'}\n", "")
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="there is always a screen")
 @pytest.mark.usefixtures("elsewhere")
-def test_without_a_screen_it_says_where_the_report_is(call, result):
-    done = call("view", result)
+def test_without_a_screen_it_says_where_the_report_is(call, report):
+    done = call("view", report, "--report")
     assert (done.returncode, done.stdout) == (0, "")
-    assert str(result / "report.html") in done.stderr
+    assert str(report / "report.html") in done.stderr
 
 
-def test_opens_the_browser_of_the_environment(stillmap, result, tmp_path):
-    browser = tmp_path / "browser"
-    browser.write_text(f'#!/bin/sh\necho "$1" > "{tmp_path}/opened"\n')
-    browser.chmod(0o755)
-    environment = {**os.environ, "BROWSER": f"{browser} %s"}
-    done = stillmap("view", result, env=environment)
+def test_opens_the_report_in_the_browser_of_the_environment(stillmap, report, browser):
+    environment, note = browser
+    done = stillmap("view", report, "--report", env=environment)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    assert (tmp_path / "opened").read_text() == f"{(result / 'report.html').as_uri()}\n"
+    assert note.read_text() == f"{(report / 'report.html').as_uri()}\n"
 
 
 def test_what_is_no_result_is_refused(call, tmp_path):

@@ -13,10 +13,10 @@ from stillmap.texture.about import Beams
 from stillmap.texture.choice import Candidates, chosen, utility
 from stillmap.texture.choice_options import ChoiceOptions
 from stillmap.texture.lens import project
+from stillmap.texture.options import VisibleOptions
 from stillmap.texture.things import Thing, at_time, in_the_way
 from stillmap.texture.told import told
 from stillmap.texture.view import View
-from stillmap.texture.options import VisibleOptions
 from stillmap.texture.visible import visible
 from stillmap.threads import in_order
 

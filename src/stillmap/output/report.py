@@ -12,6 +12,7 @@ from stillmap.output.report_changes import changes_section
 from stillmap.output.report_curve import likelihood_svg
 from stillmap.output.report_learned import learned_section
 from stillmap.output.report_maps import evolution_section, maps_section
+from stillmap.output.report_model import Stills, model_section
 from stillmap.output.report_objects import objects_section
 from stillmap.output.report_tables import (
     bytes_text,
@@ -41,12 +42,19 @@ _PRINTED = (
 )
 
 
-def write_report(path: Path, result: ResultLike, tilting: TiltingLike | None = None) -> None:
+def write_report(
+    path: Path,
+    result: ResultLike,
+    tilting: TiltingLike | None = None,
+    stills: Stills | None = None,
+) -> None:
     """Write the report as one HTML page of a few megabytes at most, whatever the map's size."""
-    path.write_text(report_html(result, tilting), encoding="utf-8")
+    path.write_text(report_html(result, tilting, stills), encoding="utf-8")
 
 
-def report_html(result: ResultLike, tilting: TiltingLike | None = None) -> str:
+def report_html(
+    result: ResultLike, tilting: TiltingLike | None = None, stills: Stills | None = None
+) -> str:
     """The page. All pictures lie in it; it holds no script and reads without one."""
     name = _name(result)
     sections = [
@@ -57,6 +65,7 @@ def report_html(result: ResultLike, tilting: TiltingLike | None = None) -> str:
         changes_section(result),
         objects_section(result),
         tilting_section(result, tilting),
+        model_section(stills),
         learned_section(result),
         _estimate_section(result),
         evolution_section(result),

@@ -61,6 +61,7 @@ figcaption b { color: var(--ink); }
   vector-effect: non-scaling-stroke; }
 .map .numbers text { fill: #111; stroke: #fff; stroke-width: .25em; paint-order: stroke; }
 .map .ways polyline { stroke: #d96a00; stroke-width: 1.3; }
+.still { display: block; width: 100%; height: auto; border: 1px solid var(--rule); }
 .map .path { display: none; }
 #show-path:checked ~ .pair .path { display: block; }
 #show-dynamic:not(:checked) ~ .pair .dynamic { display: none; }

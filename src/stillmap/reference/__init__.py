@@ -36,6 +36,7 @@ from stillmap.reference.sweep_map import (
     linearise_sweep,
     register_sweep,
 )
+from stillmap.reference.texels import texels
 from stillmap.reference.traverse import cell_of, traverse
 from stillmap.reference.z_buffer import z_buffer
 
@@ -86,6 +87,7 @@ __all__ = [
     "registration_gradient",
     "search_lattice",
     "settled",
+    "texels",
     "traverse",
     "z_buffer",
 ]

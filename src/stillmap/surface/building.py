@@ -12,7 +12,7 @@ from stillmap.surface.extraction import extracted, joined_whole, tiles_of, witho
 from stillmap.surface.mesh import Mesh
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import Patch, order_of, patches_of
-from stillmap.surface.thinning import thinned
+from stillmap.surface.thinning import thinned, within_budget
 from stillmap.threads import in_order
 
 Float = NDArray[np.float64]
@@ -92,7 +92,7 @@ def fused(
         if tell:
             tell(done, total)
     whole = without_islands(joined_whole(parts), o.island)
-    return thinned(whole, o.error, whole_border=False)
+    return within_budget(thinned(whole, o.error), o.error, o.faces)
 
 
 def static_weights(

@@ -88,9 +88,9 @@ def _sequences(seen: Recording, pause: float) -> list[Index]:
     return sorted(out, key=lambda part: int(part[0]))
 
 
-def patches_of(seen: Recording, poses: Float, order: Order, o: SurfaceOptions) -> Iterator[
-    Callable[[], Patch]
-]:
+def patches_of(
+    seen: Recording, poses: Float, order: Order, o: SurfaceOptions
+) -> Iterator[Callable[[], Patch]]:
     """What makes each patch, in the order of the scans.
 
     Args:
@@ -120,6 +120,7 @@ def _patch(
     points = np.einsum("nij,nj->ni", T[scan, :3, :3], local) + T[scan, :3, 3]
     origin = T[scan, :3, 3]
     use = seen.hit[beam] & np.isfinite(points).all(axis=1)
+    points[~use] = 0.0  # nothing is made of these
     looking = rows.directions(local)
     if planar:
         number = np.arange(len(beam), dtype=np.int32).reshape(len(scans), -1)
@@ -172,9 +173,7 @@ def _of_image(
     return grid_faces(points, use, number)
 
 
-def _in_any_order(
-    use: NDArray[np.bool_], looking: Float, o: SurfaceOptions
-) -> NDArray[np.int32]:
+def _in_any_order(use: NDArray[np.bool_], looking: Float, o: SurfaceOptions) -> NDArray[np.int32]:
     """The Delaunay triangulation of the directions of beams that are used."""
     beams = np.flatnonzero(use)
     if len(beams) < 3:

@@ -55,4 +55,20 @@ class VisibleOptions:
 class TextureOptions:
     """Colours of a mesh from pictures."""
 
+    page: int = field_with_doc(4096, "texels along the edge of a page of texture, at most")
+    pages: int = field_with_doc(8, "pages at most; where they would be more, texels are coarser")
+    texel: float = field_with_doc(0.001, "m, edge of a texel where pictures are finer than that")
+    gutter: int = field_with_doc(4, "texels around each piece of texture that get its colours")
+    quality: int = field_with_doc(90, "of pages as JPEG, up to 95; 0: PNG, without loss")
     visible: VisibleOptions = field(default_factory=VisibleOptions)
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("page", 64, 16384),
+            ("pages", 1, 1000),
+            ("texel", 1e-5, 100.0),
+            ("gutter", 1, 16),
+            ("quality", 0, 95),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"'mesh.texture.{name}' wants {low} to {high}")

@@ -1,0 +1,61 @@
+"""How models are made."""
+
+from dataclasses import dataclass, field
+
+from stillmap.options import field_with_doc
+from stillmap.surface.options import SurfaceOptions
+from stillmap.texture.choice_options import ChoiceOptions
+from stillmap.texture.options import TextureOptions
+
+
+@dataclass(frozen=True)
+class MoverOptions:
+    """Models of what moved."""
+
+    enabled: bool = field_with_doc(True, "make models of what moved")
+    voxel: float = field_with_doc(0.04, "m, edge of a voxel of their surfaces")
+    margin: float = field_with_doc(0.15, "m around a thing's box, within which beams are its own")
+    low: float = field_with_doc(0.03, "m above the ground: what is lower is the ground's")
+    rigid: float = field_with_doc(
+        1.5, "m, things at least so long keep their shape: all that was seen of one is put together"
+    )
+    sweep: float = field_with_doc(
+        1.0, "s, in which a laser that tilts sees a thing once: so long others keep their shape"
+    )
+    near: float = field_with_doc(
+        0.5, "s from then to a picture that paints a thing that does not keep its shape"
+    )
+    rim: float = field_with_doc(
+        0.04, "m within a thing's outline in a picture, where it may show what is behind"
+    )
+    least: float = field_with_doc(0.1, "m2 of surface that a model has")
+    island: float = field_with_doc(0.02, "m2, smaller pieces of it are left out")
+
+    def __post_init__(self) -> None:
+        for name, low, high in _LIMITS:
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"'mesh.objects.{name}' wants {low:g} to {high:g}")
+
+
+_LIMITS = (
+    ("voxel", 1e-3, 10.0),
+    ("margin", 0.0, 10.0),
+    ("low", -10.0, 10.0),
+    ("rigid", 0.0, 1000.0),
+    ("sweep", 1e-3, 1000.0),
+    ("near", 0.0, 1000.0),
+    ("rim", 0.0, 10.0),
+    ("least", 0.0, 1000.0),
+    ("island", 0.0, 1000.0),
+)
+
+
+@dataclass(frozen=True)
+class MeshOptions:
+    """Models of recordings in 3D: of the place, and of what moved; docs/mesh.md."""
+
+    enabled: bool = field_with_doc(True, "make them, where the libraries of the extra `mesh` are")
+    surface: SurfaceOptions = field(default=SurfaceOptions())
+    choice: ChoiceOptions = field(default=ChoiceOptions())
+    texture: TextureOptions = field(default=TextureOptions())
+    objects: MoverOptions = field(default=MoverOptions())

@@ -1,0 +1,140 @@
+"""Which pictures paint what moved: those in which it, and nothing else, is seen (Fig. 13)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from stillmap.models.movers import Shape
+from stillmap.models.options import MoverOptions
+from stillmap.models.place import Painted
+from stillmap.surface.dividing import divided
+from stillmap.surface.mesh import Mesh
+from stillmap.texture.choice import Candidates, chosen, utility
+from stillmap.texture.choice_options import ChoiceOptions
+from stillmap.texture.lens import project, within
+from stillmap.texture.options import VisibleOptions
+from stillmap.texture.things import Thing, at_time, in_the_way
+from stillmap.texture.view import View
+from stillmap.texture.visible import Depths, depths_of, visible
+
+Float = NDArray[np.float64]
+
+_BEHIND = 0.1  # m by which a surface may lie before a thing and be taken for its own
+_LEAST = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Dressed:
+    """A moving thing's surface and what paints it, in the thing's own frame.
+
+    Attributes:
+        painted: its faces, and which of `views` paints each.
+        views: pictures, as if the thing had stood still: `T_camera_map` is T_camera_object.
+    """
+
+    painted: Painted
+    views: list[View]
+
+
+def when_in_view(thing: Thing, views: Sequence[View], start_ns: int) -> Float:
+    """(N,) s, when views show the middle of a thing, by the time of its box; NaN: not."""
+    seconds = np.array([1e-9 * (view.stamp_ns - start_ns) for view in views])
+    out = np.full(len(views), np.nan)
+    for k, (view, now) in enumerate(zip(views, seconds.tolist(), strict=True)):
+        for cuboid in at_time([thing], now):
+            uv, ok = project(view.camera, view.in_camera(cuboid.middle[None]))
+            if ok[0] and within(view.camera, uv)[0]:
+                out[k] = now
+    return out
+
+
+def dressed(
+    shape: Shape,
+    views: Sequence[View],
+    place: Mesh,
+    things: Sequence[Thing],
+    start_ns: int,
+    options: MoverOptions,
+    choice: ChoiceOptions,
+    limits: VisibleOptions,
+) -> Dressed:
+    """Chooses for each face of what moved the view that shows it best.
+
+    A view may paint a face if the place does not hide it, if no other thing is likely to, and if it
+    lies within the thing's outline by `options.rim`: beside that it shows what is behind.
+
+    Args:
+        shape: the thing.
+        views: pictures and where they were taken, in the map frame.
+        place: what stands still.
+        things: all that moves, this one too.
+        start_ns: when the time of the things begins.
+        options, choice, limits: see there.
+    """
+    mesh, _ = divided(shape.mesh, choice.edge)
+    candidates = Candidates.none(len(mesh), choice.candidates)
+    seen_at_all, own = np.zeros(len(mesh), np.bool_), list[View]()
+    others = [one for one in things if one.box.thing != shape.id]
+    for view, now in zip(views, when_in_view(shape.way.thing, views, start_ns), strict=True):
+        away = max(shape.span[0] - now, now - shape.span[1], 0.0)
+        if np.isnan(now) or (not shape.rigid and away > options.near):
+            continue
+        T_map_object = shape.way.T_map_object(now)
+        moved = replace(view, T_camera_map=view.T_camera_map @ T_map_object)
+        found = visible(mesh, moved, limits)
+        faces = np.flatnonzero(found.seen)
+        faces = faces[_inside(mesh, faces, moved, options.rim, limits)]
+        if not len(faces):
+            continue
+        points = mesh.centres[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
+        free = _before(place, points, view, limits)
+        faces, points = faces[free], points[free]
+        hidden = in_the_way(at_time(others, now), view.place, points, choice.margin, choice.sigma)
+        seen_at_all[faces] = True
+        pixels = found.pixels[faces].astype(np.float64)
+        good = utility(1.0 - hidden, pixels, mesh.areas()[faces], replace(choice, believe=True))
+        if not shape.rigid:  # who walks looks otherwise a moment later
+            good -= away / max(options.near, _LEAST)
+        candidates.add(len(own), faces, good, 1.0 - hidden)
+        own.append(moved)
+    view_of = chosen(candidates, mesh.pairs(), choice.border)
+    p = np.where(candidates.picture == view_of[:, None], candidates.p_static, 0.0).max(axis=1)
+    p = np.where(view_of >= 0, p, 0.0).astype(np.float32)
+    return Dressed(Painted(mesh, view_of, p, seen_at_all), own)
+
+
+def _inside(
+    mesh: Mesh, faces: NDArray[np.intp], view: View, rim: float, limits: VisibleOptions
+) -> NDArray[np.bool_]:
+    """(n,) whether faces (n,) lie within the outline of a mesh by `rim` metres."""
+    if not len(faces):
+        return np.zeros(0, np.bool_)
+    points = view.in_camera(mesh.vertices)
+    depths = depths_of(mesh, view, points[np.unique(mesh.faces[faces])], limits.scale, limits.near)
+    far = ndimage.distance_transform_edt(np.pad(depths.face >= 0, 1))[1:-1, 1:-1]
+    at = np.concatenate([points[mesh.faces[faces]], points[mesh.faces[faces]].mean(1)[:, None]], 1)
+    metres = _looked_up(far, depths, at) * at[..., 2] / depths.K[0, 0]
+    return np.asarray(metres.min(axis=1) >= rim)
+
+
+def _before(place: Mesh, points: Float, view: View, limits: VisibleOptions) -> NDArray[np.bool_]:
+    """(n,) whether nothing of the place lies before points (n, 3) in the map frame."""
+    at = view.in_camera(points)
+    ahead = at[:, 2] > limits.near
+    if not ahead.any() or not len(place):
+        return ahead
+    depths = depths_of(place, view, at[ahead], limits.scale, limits.near)
+    free = np.zeros(len(points), np.bool_)
+    free[ahead] = _looked_up(depths.depth, depths, at[ahead]) > at[ahead, 2] - _BEHIND
+    return free
+
+
+def _looked_up(values: NDArray[np.floating], depths: Depths, at: Float) -> Float:
+    """(...,) what an image (h, w) has where points (..., 3) of the camera's frame are seen."""
+    h, w = values.shape
+    column = np.rint(depths.K[0, 0] * at[..., 0] / at[..., 2] + depths.K[0, 2]).astype(np.intp)
+    row = np.rint(depths.K[1, 1] * at[..., 1] / at[..., 2] + depths.K[1, 2]).astype(np.intp)
+    return np.asarray(values[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)], np.float64)

@@ -1,0 +1,55 @@
+"""The beams of a scan are those of the whole recording, without its motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stillmap.recording import read
+from stillmap.recording.poses import poses_from_tum
+from stillmap.slam import SlamOptions, deskewed
+from stillmap.viewer.beams import Beams, part
+
+
+@pytest.fixture(params=[(2, False), (2, True), (3, False), (3, True)])
+def beams(request, result_of):
+    dimension, times = request.param
+    out = result_of(dimension, times=times)
+    recording = read(out.parent / f"log{dimension}")
+    poses = poses_from_tum(out / "trajectory.tum", recording)
+    p_static = np.load(out / "beams/p_static.npy", mmap_mode="r")
+    return Beams(recording, p_static, poses, SlamOptions())
+
+
+def test_they_end_where_those_of_the_result_end(beams):
+    whole = deskewed(beams.recording, beams.poses, beams.slam)
+    for scan in range(whole.n_scans):
+        seen, own = beams.at(scan), whole.beams_of(scan)
+        use = np.flatnonzero(whole.hit[own]) + own.start
+        D = whole.dimension
+        assert seen.ends[:, :D] == pytest.approx(whole.end_points(use, beams.poses), abs=1e-6)
+        assert not seen.ends[:, D:].any()
+        assert np.array_equal(seen.p_static, beams.p_static[use])
+        sensor = (beams.poses[scan] @ whole.T_base_sensor[0])[:D, D]
+        assert seen.origin[:D] == pytest.approx(sensor)
+
+
+def test_there_are_no_more_than_asked_for(beams):
+    seen = beams.at(2, most=7)
+    assert (len(seen.ends), len(seen.p_static)) == (7, 7)
+    every = beams.at(2)
+    assert all((every.ends == end).all(axis=1).any() for end in seen.ends)
+
+
+def test_a_part_is_the_same_scans(beams):
+    some = part(beams.recording, 2, 4)
+    assert (some.n_scans, some.T_odom_base) == (2, None)
+    assert np.array_equal(some.points, beams.recording.points[80:160])
+    assert some.offset.tolist() == [0, 40, 80]
+
+
+def test_a_scan_without_beams_shows_none(beams):
+    recording = beams.recording
+    nothing = replace(recording, hit=np.zeros(recording.n_beams, bool))
+    seen = replace(beams, recording=nothing).at(0)
+    assert (seen.ends.shape, seen.p_static.shape) == ((0, 3), (0,))

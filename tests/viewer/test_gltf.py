@@ -1,0 +1,75 @@
+"""Models that are whole are shown; those that need something from elsewhere are not."""
+
+import struct
+
+import numpy as np
+import pytest
+from made_up_models import glb_of
+
+from stillmap.errors import InputError
+from stillmap.viewer.gltf import MAP_FROM_GLTF, require_whole
+
+
+def refusal(path, data, most=1 << 20):
+    path.write_bytes(data)
+    with pytest.raises(InputError) as caught:
+        require_whole(path, most)
+    assert caught.value.where == str(path)
+    return caught.value.what
+
+
+def test_a_whole_model_comes_back_as_it_is(tmp_path, glb):
+    (tmp_path / "a.glb").write_bytes(glb)
+    assert require_whole(tmp_path / "a.glb", len(glb)) == glb
+
+
+def test_what_lies_in_the_file_may_be_named(tmp_path):
+    data = glb_of({"buffers": [{"uri": "data:application/octet-stream;base64,AAAA"}]})
+    (tmp_path / "a.glb").write_bytes(data)
+    assert require_whole(tmp_path / "a.glb", 1000) == data
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {"images": [{"uri": "https://example.org/a.png"}]},
+        {"buffers": [{"uri": "//example.org/a.bin"}]},
+        {"extensions": {"any": [{"deep": {"uri": "a.bin"}}]}},
+        {"images": [{"uri": 3}]},
+    ],
+)
+def test_what_names_another_file_is_refused(tmp_path, document):
+    assert "another file" in refusal(tmp_path / "a.glb", glb_of(document))
+
+
+def test_what_is_packed_is_refused(tmp_path):
+    data = glb_of({"extensionsUsed": ["KHR_draco_mesh_compression"]})
+    assert "draco" in refusal(tmp_path / "a.glb", data)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"glTF",
+        glb_of({}, magic=b"GLTF"),
+        glb_of({}, version=1),
+        glb_of({}) + b"more",
+        glb_of([]),
+        struct.pack("<4sIII4s", b"glTF", 2, 20, 1 << 31, b"JSON"),
+        struct.pack("<4sIII4s", b"glTF", 2, 24, 4, b"JSON") + b"\xff\xff\xff\xff",
+    ],
+)
+def test_what_is_no_model_is_refused(tmp_path, data):
+    assert "no whole .glb" in refusal(tmp_path / "a.glb", data)
+
+
+def test_what_is_too_large_is_refused(tmp_path, glb):
+    assert "larger" in refusal(tmp_path / "a.glb", glb, len(glb) - 1)
+
+
+def test_up_of_a_model_is_up_in_the_map():
+    x, y, z = np.eye(4)[:3]
+    assert (MAP_FROM_GLTF @ y == z).all()
+    assert (MAP_FROM_GLTF @ x == x).all()
+    assert (MAP_FROM_GLTF @ z == -y).all()

@@ -1,0 +1,138 @@
+"""What of a result is shown."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stillmap.errors import InputError
+from stillmap.output.report_figures import UNKNOWN
+from stillmap.viewer import scene as module
+from stillmap.viewer.framing import framing
+from stillmap.viewer.scene import read_scene
+
+
+def test_a_result_in_the_plane(result_of):
+    scene = read_scene(result_of(2))
+    assert scene.is_flat
+    assert (scene.clouds, scene.surface, scene.models, scene.notes) == ({}, None, [], [])
+    assert scene.poses.shape == (6, 4, 4)
+    assert scene.tracks[0].z is None
+    assert (scene.plan.picture[..., 3] == 255).all()
+    assert (scene.plan.picture[0, 0, :3] == UNKNOWN).all()
+
+
+def test_the_plan_lies_as_the_map_does(result_of):
+    plan = read_scene(result_of(2)).plan
+    x0, y0, x1, y1 = plan.window
+    height, width = plan.picture.shape[:2]
+    assert (x1 - x0, y1 - y0) == pytest.approx((0.1 * width, 0.1 * height))
+    row, column = np.nonzero((plan.picture[..., :3] == 0).all(axis=2))
+    # the wall is at the lowest y of what is known: far below in the picture
+    assert y1 - 0.1 * (row + 0.5) == pytest.approx(-3.0 + 0.1 * 10.5)
+    assert (x0 + 0.1 * column.min(), x0 + 0.1 * (column.max() + 1)) == pytest.approx((-3.0, 3.0))
+
+
+def test_a_result_in_space(result_of):
+    out = result_of(3, with_models=True)
+    scene = read_scene(out)
+    assert not scene.is_flat
+    p_static, hit = (np.load(out / f"beams/{name}.npy") for name in ("p_static", "hit"))
+    counts = {"static": (hit & (p_static >= 0.5)).sum(), "dynamic": (hit & (p_static < 0.5)).sum()}
+    assert {name: len(one.points) for name, one in scene.clouds.items()} == counts
+    assert scene.plan.picture[0, 0, 3] == 0
+    assert scene.surface == (out / "mesh.glb").read_bytes()
+    assert [one.track.id for one in scene.models] == [7]
+    z = scene.clouds["static"].points[:, 2]
+    assert z.min() <= scene.ground <= np.median(z)
+
+
+def test_no_more_points_than_a_browser_bears(result_of, monkeypatch):
+    monkeypatch.setitem(module.MOST_POINTS, "static", 11)
+    scene = read_scene(result_of(3))
+    assert len(scene.clouds["static"].points) == 11
+    assert scene.notes[0].startswith("11 of ")
+
+
+def test_models_go_as_their_tracks_do(result_of):
+    scene = read_scene(result_of(3, with_models=True))
+    (model,) = scene.models
+    own = model.at(model.stamp_ns)
+    assert own == pytest.approx(model.T_map_gltf)
+    assert own[:3, 1].tolist() == [0.0, 0.0, 1.0]  # its y is up
+    later = model.at(int(scene.stamp_ns[3]))  # it has turned left by then
+    assert later[:3, 3] == pytest.approx([2.0, 1.0, 0.0])
+    assert later[:3, 0] == pytest.approx([0.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("mesh.glb", b"glTF", "no whole .glb"),
+        ("objects/0007.json", b"{}", "damaged"),
+        ("objects/0007.json", b'{"T_map_object": [[1]], "stamp_ns": 0}', "damaged"),
+        ("objects/0007.json", None, "cannot be read"),
+    ],
+)
+def test_a_model_that_cannot_be_shown_is_noted(result_of, name, content, said):
+    out = result_of(3, with_models=True)
+    if content is None:
+        (out / name).unlink()
+    else:
+        (out / name).write_bytes(content)
+    scene = read_scene(out)
+    assert len(scene.notes) == 1
+    assert said in scene.notes[0]
+    assert (scene.surface is None) == (name == "mesh.glb")
+
+
+def test_a_place_that_is_no_pose_is_noted(result_of):
+    out = result_of(3, with_models=True)
+    place = {"T_map_object": np.diag([2.0, 2.0, 2.0, 1.0]).tolist(), "stamp_ns": 0}
+    (out / "objects/0007.json").write_text(json.dumps(place))
+    scene = read_scene(out)
+    assert (scene.models, len(scene.notes)) == ([], 1)
+    assert "no pose" in scene.notes[0]
+
+
+def test_models_are_bounded_together(result_of, glb, monkeypatch):
+    out = result_of(3, with_models=True)
+    monkeypatch.setattr(module, "_MOST_MODELS", len(glb) - 1)
+    scene = read_scene(out)
+    assert scene.models == []
+    assert "0007.glb" in scene.notes[0]
+
+
+@pytest.mark.parametrize("name", ["map.npz", "trajectory.tum", "objects/objects.json"])
+def test_a_damaged_file_is_refused(result_of, name):
+    out = result_of(2)
+    (out / name).write_bytes(b"nonsense")
+    with pytest.raises(InputError) as caught:
+        read_scene(out)
+    assert str(out / name) in caught.value.where
+
+
+def test_far_from_the_origin_nothing_is_lost(result_of):
+    """A survey's coordinates have more digits than a float32."""
+    out = result_of(3)
+    text = (out / "trajectory.tum").read_text().split("\n")
+    rows = [line.split() for line in text if line]
+    moved = [[row[0], str(500_000.0 + float(row[1])), *row[2:]] for row in rows]
+    (out / "trajectory.tum").write_text("".join(" ".join(row) + "\n" for row in moved))
+    scene = read_scene(out)
+    assert (scene.origin == np.round(scene.origin)).all()
+    assert np.abs(scene.poses[:, :3, 3] - scene.origin).max() < 10.0
+
+
+def test_the_eye_sees_all_of_it(result_of):
+    flat, space = read_scene(result_of(2)), read_scene(result_of(3))
+    above = framing(flat)
+    x0, y0, x1, y1 = flat.plan.window
+    assert above.look_at == pytest.approx([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
+    assert above.across >= y1 - y0
+    down = (above.look_at - above.position) / np.linalg.norm(above.look_at - above.position)
+    assert down[2] < -0.999
+    assert down[1] > 0.0  # north is up
+    slanted = framing(space)
+    away = slanted.position - slanted.look_at
+    assert 0.3 < away[2] / np.linalg.norm(away) < 0.9

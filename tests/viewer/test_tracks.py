@@ -1,0 +1,87 @@
+"""Where things are at a time."""
+
+import numpy as np
+import pytest
+
+from stillmap.export.result import Track
+from stillmap.viewer.tracks import edges, headings, is_there, placed, pose_at, ways
+
+NOW = 1_700_000_000_000_000_000
+
+
+def track(seconds, xy, velocity, size=(2.0, 1.0, 1.5), z=0.7, number=1):
+    stamp_ns = NOW + np.round(1e9 * np.array(seconds)).astype(np.int64)
+    high = None if z is None else np.full(len(seconds), z)
+    return Track(number, size, stamp_ns, np.array(xy, float), np.array(velocity, float), high)
+
+
+def test_it_goes_on_looking_where_it_went_while_it_stands():
+    velocity = np.array([[0, 0], [0, 2], [0, 0.01], [-2, 0]], float)
+    angles = headings(velocity)
+    assert angles[:2] == pytest.approx([np.pi / 2, np.pi / 2])
+    assert angles[3] == pytest.approx(np.pi)
+    assert angles[2] == pytest.approx(0.75 * np.pi)  # half-way on its turn
+
+
+def test_it_turns_the_short_way_past_the_back():
+    a = np.radians([170.0, -170.0])
+    angles = headings(2.0 * np.stack([np.cos(a), np.sin(a)], 1))
+    assert angles[1] - angles[0] == pytest.approx(np.radians(20.0))
+
+
+def test_what_never_moves_looks_along_x():
+    assert headings(np.zeros((3, 2))).tolist() == [0.0, 0.0, 0.0]
+
+
+def test_between_two_times_it_is_between_two_places():
+    one = track([0, 1], [[0, 0], [4, 0]], [[4, 0], [4, 0]])
+    T = pose_at(one, NOW + 250_000_000)
+    assert T[:3, 3] == pytest.approx([1.0, 0.0, 0.7])
+    assert T[:3, :3] == pytest.approx(np.eye(3))
+    assert pose_at(one, NOW - 10**9)[:2, 3].tolist() == [0.0, 0.0]
+    assert pose_at(one, NOW + 10**10)[:2, 3].tolist() == [4.0, 0.0]
+
+
+def test_nanoseconds_are_not_lost():
+    """A double holds stamps of today to a quarter of a microsecond only."""
+    one = track([0, 1e-7], [[0, 0], [1, 0]], [[1, 0], [1, 0]])
+    assert pose_at(one, NOW + 50)[0, 3] == pytest.approx(0.5)
+
+
+def test_only_those_are_there_that_are_seen_before_and_after():
+    one = track([0, 1], [[0, 0], [1, 0]], [[1, 0], [1, 0]])
+    late = track([5, 6], [[0, 0], [1, 0]], [[1, 0], [1, 0]])
+    assert [is_there(one, NOW + s) for s in (-1, 0, 10**9, 10**9 + 1)] == [False, True, True, False]
+    assert placed([late, one], NOW).number.tolist() == [1]
+    nobody = placed([late], NOW)
+    assert edges(nobody).shape == (0, 4, 2, 3)
+
+
+def test_boxes_have_twelve_edges_of_its_lengths():
+    one = track([0, 1], [[3, 4], [3, 5]], [[0, 1], [0, 1]])
+    lines = edges(placed([one], NOW))
+    assert lines.shape == (1, 12, 2, 3)
+    lengths = np.linalg.norm(lines[0, :, 1] - lines[0, :, 0], axis=1)
+    assert sorted(lengths) == pytest.approx([1.0] * 4 + [1.5] * 4 + [2.0] * 4)
+    corners = lines.reshape(-1, 3)
+    # it goes along y: its length lies along y
+    assert corners.min(axis=0) == pytest.approx([2.5, 3.0, 0.7 - 0.75])
+    assert corners.max(axis=0) == pytest.approx([3.5, 5.0, 0.7 + 0.75])
+
+
+def test_in_the_plane_boxes_are_flat():
+    one = track([0, 1], [[0, 0], [1, 0]], [[1, 0], [1, 0]], size=(2.0, 1.0), z=None)
+    lines = edges(placed([one], NOW))
+    assert lines.shape == (1, 4, 2, 3)
+    assert not lines[..., 2].any()
+
+
+def test_ways_say_whose_they_are():
+    a = track([0, 1, 2], [[0, 0], [1, 0], [2, 0]], np.ones((3, 2)))
+    b = track([0], [[9, 9]], np.ones((1, 2)))
+    c = track([0, 1], [[5, 5], [6, 6]], np.ones((2, 2)), z=None)
+    pieces, whose = ways([a, b, c])
+    assert whose.tolist() == [0, 0, 2]
+    assert pieces[1].tolist() == [[1, 0, 0.7], [2, 0, 0.7]]
+    assert pieces[2].tolist() == [[5, 5, 0], [6, 6, 0]]
+    assert ways([])[0].shape == (0, 2, 3)

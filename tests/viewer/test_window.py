@@ -1,0 +1,219 @@
+"""The page is served to this machine alone, shows the time, and ends."""
+
+import socket
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+
+from stillmap.errors import InputError
+from stillmap.recording import read
+from stillmap.recording.poses import poses_from_tum
+from stillmap.slam import SlamOptions
+from stillmap.viewer.beams import Beams
+from stillmap.viewer.scene import read_scene
+
+viser = pytest.importorskip("viser", reason="the extra `viewer` is not installed")
+sockets = pytest.importorskip("websockets.sync.client")
+
+from stillmap.viewer import server as module  # noqa: E402
+from stillmap.viewer.window import Window, _plain  # noqa: E402
+
+
+def beams_of(out):
+    recording = read(out.parent / out.name.replace("out", "log"))
+    poses = poses_from_tum(out / "trajectory.tum", recording)
+    return Beams(recording, np.load(out / "beams/p_static.npy"), poses, SlamOptions())
+
+
+@pytest.fixture
+def opened():
+    windows = []
+
+    def window(*words):
+        windows.append(Window(*words))
+        return windows[-1]
+
+    yield window
+    for one in windows:
+        one.close()
+
+
+@pytest.fixture
+def window(result_of, opened):
+    out = result_of(3, with_models=True)
+    return opened(read_scene(out), beams_of(out))
+
+
+def port_of(window):
+    return int(window.url.rpartition(":")[2])
+
+
+def get(window, path="/", **headers):
+    request = urllib.request.Request(window.url + path, headers=headers)
+    return urllib.request.urlopen(request, timeout=10)
+
+
+def test_the_page_is_served_and_may_reach_nothing_else(window):
+    with get(window) as page:
+        assert page.status == 200
+        assert b"<html" in page.read()
+        policy = page.headers["Content-Security-Policy"]
+    assert f"connect-src 'self' data: blob: ws://127.0.0.1:{port_of(window)};" in policy
+
+
+@pytest.mark.parametrize(
+    "headers", [{"Host": "example.org"}, {"Origin": "https://example.org"}, {"Origin": "null"}]
+)
+def test_a_page_from_elsewhere_is_refused(window, headers):
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        get(window, **headers)
+    with caught.value:
+        assert caught.value.code == 403
+
+
+def test_its_socket_answers_this_page_alone(window):
+    address, protocol = f"ws://127.0.0.1:{port_of(window)}", [f"viser-v{viser.__version__}"]
+    with sockets.connect(address, subprotocols=protocol, origin=window.url) as socket_:
+        assert len(socket_.recv(timeout=10)) > 0
+    with pytest.raises(Exception, match="403"):
+        sockets.connect(address, subprotocols=protocol, origin="https://example.org")
+
+
+def test_other_interfaces_do_not_answer(window):
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as one:
+        # another address of loopback, which stands for those of the network
+        assert one.connect_ex(("127.0.0.2", port_of(window))) != 0
+    for family, *_, address in socket.getaddrinfo(socket.gethostname(), port_of(window)):
+        if family == socket.AF_INET and not address[0].startswith("127."):
+            with socket.socket(family, socket.SOCK_STREAM) as one:
+                one.settimeout(2)
+                assert one.connect_ex(address) != 0
+
+
+def test_nobody_far_away_is_asked_for_an_address(window, monkeypatch):
+    def refused(*_words, **_more):
+        raise AssertionError("a tunnel")
+
+    monkeypatch.setattr("viser._viser.ViserTunnel", refused)
+    assert window._server.request_share_url() is None
+
+
+def test_after_it_is_closed_nothing_is_served(result_of):
+    window = Window(read_scene(result_of(2)), None)
+    window.close()
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as one:
+        assert one.connect_ex(("127.0.0.1", port_of(window))) != 0
+
+
+def test_nothing_is_printed(result_of, capfd):
+    window = Window(read_scene(result_of(2)), None)
+    window.close()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_port_that_is_taken_is_refused(window, result_of):
+    with pytest.raises(InputError, match="is taken"):
+        Window(read_scene(result_of(2)), None, port_of(window))
+
+
+def test_a_port_that_is_free_is_used(result_of, opened):
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as one:
+        one.bind(("127.0.0.1", 0))
+        port = one.getsockname()[1]
+    assert port_of(opened(read_scene(result_of(2)), None, port)) == port
+
+
+def test_a_version_of_viser_that_is_not_guarded_is_not_used(result_of, monkeypatch):
+    """Where its server starts otherwise than we know, it would answer anybody."""
+    from contextlib import contextmanager
+
+    @contextmanager
+    def nothing():
+        yield []
+
+    monkeypatch.setattr(module, "_guarded", nothing)
+    with pytest.raises(RuntimeError, match="viser"):
+        Window(read_scene(result_of(2)), None)
+
+
+def test_layers_are_those_that_there_is_something_of(result_of, opened, window):
+    flat = opened(read_scene(result_of(2)), None)
+    objects = ["Objects", "Object ways", "Object numbers"]
+    assert list(flat._boxes) == ["Map", "Robot", *objects]
+    clouds = ["Static points", "Dynamic points"]
+    assert list(window._boxes) == [
+        *("Map", "Surface", *clouds, "Robot", "Beams", "Rays"),
+        *("Objects", "Object ways", "Object models", "Object numbers"),
+    ]
+
+
+def test_at_a_scan_what_was_there_is_shown(window):
+    layers, scene = window._layers, window._scene
+    for scan in (2, 5, 0):
+        window.show(scan)
+        assert window._slider.value == scan
+        assert window._clock.value == f"{0.5 * scan:.1f} of 2.5 s"
+        beams = layers._beams.at(scan)
+        assert layers._ends.points == pytest.approx(beams.ends, abs=1e-5)
+        assert layers._ends.colors.shape == beams.ends.shape
+        assert layers._robot.position == pytest.approx(scene.poses[scan, :3, 3])
+        there = 1 <= scan <= 3
+        assert layers._models[0].visible is there
+        assert len(layers._box.points) == (12 if there else 0)
+
+
+def test_the_slider_moves_the_time(window):
+    window._slider.value = 4
+    window.step()
+    assert window.scan == 4
+
+
+def test_check_boxes_show_and_hide(window):
+    window.show(2)
+    assert window._layers._nodes["Surface"].visible
+    window._boxes["Surface"].value = False
+    window._boxes["Object numbers"].value = True
+    window.step()
+    assert not window._layers._nodes["Surface"].visible
+    assert [label.text for label in window._layers._label] == ["7"]
+
+
+def test_points_grow(window):
+    before = window._layers._ends.point_size
+    window._size.value = 2.0
+    window.step()
+    assert window._layers._ends.point_size == pytest.approx(2 * before)
+
+
+def test_it_plays_on_and_begins_again(window):
+    window._speed.value = "10 x"
+    window.play(True)
+    assert window._button.label == "Pause"
+    seen = [window.scan]
+    while 0 not in seen[1:] and len(seen) < 100:
+        window.step()
+        if window.scan != seen[-1]:
+            seen.append(window.scan)
+    assert seen[-1] == 0
+    assert len(seen) > 2
+    assert seen[1:-1] == sorted(seen[1:-1])
+    window.play(False)
+    window.step()
+    window.step()
+    assert window.scan == 0
+
+
+def test_one_scan_alone_is_shown(result_of, opened):
+    from dataclasses import replace
+
+    scene = read_scene(result_of(2))
+    one = opened(replace(scene, stamp_ns=scene.stamp_ns[:1], poses=scene.poses[:1]), None)
+    one.play(True)
+    one.step()
+    assert one.scan == 0
+
+
+def test_names_say_nothing_of_how_they_are_shown():
+    assert _plain("a_b <img src=x>") == r"a\_b \<img src=x\>"
