@@ -1,4 +1,4 @@
-"""`stillmap eval`: scores of trajectories, labels and maps, as text or as JSON."""
+"""`stillmap eval`: scores of trajectories, labels, maps and models, as text or as JSON."""
 
 import argparse
 from pathlib import Path
@@ -15,17 +15,18 @@ _EPILOG = """examples:
   stillmap eval trajectory out/trajectory.tum truth.tum --json
   stillmap eval labels out sim
   stillmap eval map out sim
+  stillmap eval model out sim
 """
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add `eval` and its four scores."""
+    """Add `eval` and its five scores."""
     parser = subparsers.add_parser(
         "eval",
         help=COMMANDS["eval"],
         description="Score a result, as text or with --json as one object on stdout. `relations` "
-        "and `trajectory` compare poses with a reference; `labels` and `map` compare a result with "
-        "the truth that `stillmap simulate` writes.",
+        "and `trajectory` compare poses with a reference; `labels`, `map` and `model` compare a "
+        "result with the truth that `stillmap simulate` writes.",
         epilog=_EPILOG,
     )
     parser.set_defaults(run=run)
@@ -34,6 +35,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     _add_trajectory(scores)
     _add_labels(scores)
     _add_map(scores)
+    _add_model(scores)
     for score in scores.choices.values():
         score.add_argument("--json", action="store_true", help="one JSON object on stdout")
 
@@ -138,6 +140,27 @@ def _add_map(scores: "argparse._SubParsersAction[argparse.ArgumentParser]") -> N
         type=Path,
         metavar="DIR",
         help="truth of that other run (default: TRUTH_DIR)",
+    )
+
+
+def _add_model(scores: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    parser = scores.add_parser(
+        "model",
+        help="surface, texture and models of movers, against a simulation's truth",
+        description="How far the mesh lies from the true surface, and how much of that it shows; "
+        "how much of the texture shows movers, and how far its colours are off; shapes and "
+        "textures of the models of what moved. The simulation needs cameras.",
+        epilog="examples:\n"
+        "  stillmap eval model out sim\n"
+        "  stillmap eval model out sim --within 20 --json\n",
+    )
+    _add_result_and_truth(parser)
+    parser.add_argument(
+        "--within",
+        type=_positive,
+        default=float("inf"),
+        metavar="M",
+        help="of the surface, beams no longer than this say what was seen (default: all)",
     )
 
 

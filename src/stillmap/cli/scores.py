@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.cli.model_scores import of_model
 from stillmap.errors import InputError
 from stillmap.evaluation import files, folders, trajectory
 from stillmap.evaluation.labels import LabelScores, label_scores
@@ -155,4 +156,5 @@ SCORES = {
     "trajectory": of_trajectory,
     "labels": of_labels,
     "map": of_map,
+    "model": of_model,
 }

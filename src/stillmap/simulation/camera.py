@@ -98,7 +98,7 @@ def bent(xy: Float, distortion: Float) -> Float:
     """(2, ...) where a lens k1, k2, p1, p2, k3 shows what an ideal one shows at (2, ...).
 
     Both in units of the focal length: Brown, "Decentering distortion of lenses", 1966, as OpenCV
-    writes it.
+    writes it. Not the code that maps with pictures (`texture/lens.py`): each checks the other.
     """
     k1, k2, p1, p2, k3 = distortion
     x, y = xy

@@ -29,19 +29,20 @@ class Moving(NamedTuple):
         """The numbers of a mover's parts."""
         return np.flatnonzero(self.solids.mover == mover)
 
-    def at(self, parts: NDArray[np.intp], stamp_ns: int) -> Solids:
-        """Some parts at one time; between two scans they go on evenly."""
-        last = len(self.stamp_ns) - 1
-        t = min(max(int(np.searchsorted(self.stamp_ns, stamp_ns, "right")) - 1, 0), last)
-        after = min(t + 1, last)
-        span, since = (int(one - self.stamp_ns[t]) for one in (self.stamp_ns[after], stamp_ns))
-        share = min(max(since / span, 0.0), 1.0) if span > 0 else 0.0
-        before = self.solids.pose[t, parts]
-        change = self.solids.pose[after, parts] - before
-        change[:, 2] = (change[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        goes_on = np.hypot(change[:, 0], change[:, 1]) < _FASTEST * 1e-9 * max(span, 1)
-        pose = np.where(goes_on[:, None], before + share * change, before)
-        return self.solids._replace(pose=self.solids.pose[:1]).some(parts)._replace(pose=pose[None])
+    def at(self, parts: NDArray[np.intp], stamp_ns: NDArray[np.int64] | int) -> Solids:
+        """Some parts at n times; between two scans they go on evenly."""
+        at_ns, last = np.atleast_1d(np.asarray(stamp_ns, np.int64)), len(self.stamp_ns) - 1
+        t = np.clip(np.searchsorted(self.stamp_ns, at_ns, side="right") - 1, 0, last)
+        after = np.minimum(t + 1, last)
+        span, since = self.stamp_ns[after] - self.stamp_ns[t], at_ns - self.stamp_ns[t]
+        share = np.clip(since / np.where(span > 0, span, np.inf), 0.0, 1.0)[:, None, None]
+        before = self.solids.pose[t[:, None], parts]
+        change = self.solids.pose[after[:, None], parts] - before
+        change[..., 2] = (change[..., 2] + np.pi) % (2 * np.pi) - np.pi
+        way = np.hypot(change[..., 0], change[..., 1])
+        goes_on = way < _FASTEST * 1e-9 * np.maximum(span, 1)[:, None]
+        pose = np.where(goes_on[..., None], before + share * change, before)
+        return self.solids._replace(pose=self.solids.pose[:1]).some(parts)._replace(pose=pose)
 
 
 def mover_points(

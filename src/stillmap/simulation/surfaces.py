@@ -83,9 +83,10 @@ def to_local(points: Float, pose: Float) -> Float:
 
 
 def nearest_on_solid(points: Float, solids: Solids, k: int) -> Float:
-    """(n, 3) the places of the surface of solid k, at its first time, nearest to points (n, 3)."""
+    """(n, 3) the places of the surface of solid k nearest to points (n, 3), each at a time of its
+    own, or all at one."""
     (a, b), (z0, z1) = solids.half[k], solids.z[k]
-    pose, form = solids.pose[0, k], solids.form[k]
+    pose, form = solids.pose[:, k], solids.form[k]
     middle, h = np.array([0.0, 0.0, (z0 + z1) / 2]), (z1 - z0) / 2
     p = to_local(points, pose) - middle
     if form == BOX:

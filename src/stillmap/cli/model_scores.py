@@ -1,0 +1,110 @@
+"""What `stillmap eval model` computes: scores of textured models."""
+
+import argparse
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.evaluation import files, model_folders, trajectory
+from stillmap.evaluation.model_folders import Seen
+from stillmap.evaluation.models import SurfaceScores, TextureScores, surface_scores, texture_scores
+from stillmap.evaluation.mover_models import MoverScores, mover_of, mover_scores
+from stillmap.scene.riding import lifted
+from stillmap.simulation.truth import load_truth
+
+Float = NDArray[np.float64]
+
+_STAMP_TOLERANCE = 1e-6  # seconds: a result carries the stamps of its recording
+
+
+def of_model(args: argparse.Namespace) -> tuple[dict[str, Any], Iterable[str]]:
+    """Surface, texture, and models of what moved; what a result does not have is left out."""
+    seen = model_folders.read_seen(args.truth)
+    T_world_map = _alignment(args.result, seen)
+    scores: dict[str, Any] = {"alignment": T_world_map.tolist()}
+    lines: list[str] = []
+    glb = model_folders.read_glb(args.result / model_folders.MESH)
+    standing, places = seen.picture_truth.standing, seen.places(args.within)
+    surface = surface_scores(glb.vertices, glb.faces, standing, places, T_world_map)
+    scores["surface"] = surface.to_dict()
+    lines += _surface_lines(surface)
+    n = len(seen.pictures.camera)
+    record = model_folders.read_record(args.result / model_folders.RECORD, n)
+    if record is not None:
+        seed = seen.picture_truth.colour_seed
+        texture = texture_scores(record, glb.coloured, seen.pictures, standing, seed, T_world_map)
+        scores["texture"] = texture.to_dict()
+        lines += _texture_lines(texture)
+    if (model_folders.objects_of(args.result) / "objects.json").exists():
+        movers = _movers(args.result, seen, T_world_map)
+        scores["movers"] = movers.to_dict()
+        lines += _mover_lines(movers)
+    return scores, lines
+
+
+def _alignment(result: Path, seen: Seen) -> Float:
+    """(4, 4) T_world_map."""
+    estimated = files.read_trajectory(result / "trajectory.tum")
+    stamps = files.seconds(seen.truth.recording.stamp_ns)
+    i, j = trajectory.associate(estimated.stamp_s, stamps, _STAMP_TOLERANCE)
+    pair = trajectory.to_plane_where_flat(estimated.poses[i], seen.truth.poses()[j])
+    T = trajectory.align(*pair)
+    return T if len(T) == 4 else lifted(T[None])[0]
+
+
+def _movers(result: Path, seen: Seen, T_world_map: Float) -> MoverScores:
+    truth, folder = load_truth(seen.truth.folder), model_folders.objects_of(result)
+    kinds, sizes = truth.scene["mover_kinds"], truth.scene["mover_sizes"]
+    length = np.array([np.nan if size[0] is None else size[0] for size in sizes], float)
+    stamps = seen.picture_truth.moving.stamp_ns
+    tracks = model_folders.read_tracks(folder, T_world_map)
+    tracked = {one.id: mover_of(one, stamps, truth.movers, length) for one in tracks}
+    models = {}
+    for id, mover in tracked.items():
+        rigid = mover >= 0 and kinds[mover] != "person"
+        model = model_folders.read_model(folder, id, rigid, len(seen.pictures.camera))
+        if model is not None:
+            models[id] = model
+    moving, sighted = seen.picture_truth.moving, seen.sighted()
+    return mover_scores(tracked, models, kinds, moving, sighted, seen.pictures, T_world_map)
+
+
+def _surface_lines(s: SurfaceScores) -> Iterable[str]:
+    yield f"surface      {s.faces} faces, {s.area:.1f} m2"
+    yield f"off truth    mean {_cm(s.mean)}, 95 % below {_cm(s.p95)}"
+    yield f"complete     {_percent(s.complete)} of {s.places} places within 5 cm"
+
+
+def _texture_lines(t: TextureScores) -> Iterable[str]:
+    yield (
+        f"textured     {_percent(t.textured)} of the area, {_percent(t.covered)} of the "
+        f"{_percent(t.in_view)} that a picture sees without a mover"
+    )
+    yield f"shows        movers {_percent(t.mover)}, nothing {_percent(t.nothing)}"
+    yield f"CIEDE2000    median {t.colour_median:.2f}, 95 % below {t.colour_p95:.2f}"
+
+
+def _mover_lines(m: MoverScores) -> Iterable[str]:
+    yield f"movers       {m.tracked} tracked, {_percent(m.modelled)} with a model"
+    yield (
+        f"models       {len(m.models)}: chamfer {_cm(m.chamfer)} on average, "
+        f"{_percent(m.good)} within 5 cm; background {_percent(m.background)}"
+    )
+    for one in m.models:
+        yield (
+            f"  {one.id:04d}       {one.kind} {one.mover}: to truth {_cm(one.accuracy)}, "
+            f"from truth {_cm(one.completeness)}, textured {_percent(one.textured)}, "
+            f"background {_percent(one.background)}"
+        )
+
+
+def _cm(metres: float) -> str:
+    return "-" if math.isnan(metres) else f"{100 * metres:.2f} cm"
+
+
+def _percent(share: float) -> str:
+    return "-" if math.isnan(share) else f"{100 * share:.2f} %"

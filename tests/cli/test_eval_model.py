@@ -1,0 +1,210 @@
+"""`stillmap eval model` on made-up results of a small rig with a camera."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from stillmap import se2
+from stillmap.cli import main
+from stillmap.output.trajectory import write_tum
+from stillmap.recording import read
+from stillmap.simulation import (
+    load_picture_truth,
+    load_truth,
+    scene_by_name,
+    simulate_rig,
+    static_colour,
+    write_rig,
+)
+
+Float = NDArray[np.float64]
+
+trimesh = pytest.importorskip("trimesh")
+pytest.importorskip("skimage")
+
+UP = 0.03  # m, by which the made-up floor is too high
+SIZE = 64  # texels
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory) -> Path:
+    changes = {
+        "rig": {"tilts": True},
+        "robot": {"scans": 60, "scan_rate": 37.5},
+        "crowd": {"people": 40},
+        "camera": {"enabled": True, "width": 96, "height": 72},
+    }
+    path = tmp_path_factory.mktemp("model") / "sim"
+    write_rig(simulate_rig(scene_by_name("hall", changes), 2), path)
+    return path
+
+
+@pytest.fixture
+def result(simulated, tmp_path) -> Path:
+    """Four metres of the floor ahead of the robot, in true colours; one person as a box."""
+    out = tmp_path / "result"
+    (out / "tilting/objects").mkdir(parents=True)
+    recording, truth = read(simulated / "tilting"), load_truth(simulated / "tilting")
+    T_map_world = se2.inverse(truth.T_world_base[0])
+    write_tum(out / "trajectory.tum", recording.stamp_ns, T_map_world @ truth.T_world_base)
+    seed = load_picture_truth(simulated / "tilting").colour_seed
+    _write_floor(out / "mesh.glb", np.linalg.inv(T_map_world), seed)
+    assert recording.images is not None
+    T_base_camera = recording.images.cameras[0].T_base_camera
+    T_world_camera = load_picture_truth(simulated / "tilting").T_world_camera
+    vertices, faces, _ = _floor()
+    np.savez(
+        out / "mesh_faces.npz",
+        vertices=vertices,
+        faces=faces,
+        image=np.zeros(2, np.int32),
+        T_camera_map=se2.inverse(T_map_world @ T_world_camera),
+    )
+    assert T_base_camera is not None
+    _write_person(out / "tilting/objects", simulated, T_map_world)
+    return out
+
+
+def _floor() -> tuple[Float, NDArray[np.int32], Float]:
+    """Corners in the map frame, faces, and where the corners are in the texture."""
+    uv = np.array([(0.0, 0.0), (1, 0), (1, 1), (0, 1)])
+    vertices = np.column_stack([2.0 + 4.0 * uv[:, 0], 4.0 * uv[:, 1] - 2.0, np.full(4, UP)])
+    return vertices, np.array([(0, 1, 2), (0, 2, 3)], np.int32), uv
+
+
+def _write_floor(path: Path, T_world_map: Float, seed: int) -> None:
+    vertices, faces, uv = _floor()
+    at = (np.arange(SIZE) + 0.5) / SIZE
+    u, v = np.meshgrid(at, at[::-1])  # the first row is the upper one
+    places = np.stack([2.0 + 4.0 * u, 4.0 * v - 2.0, np.zeros_like(u)], axis=-1).reshape(-1, 3)
+    world = places @ T_world_map[:3, :3].T + T_world_map[:3, 3]
+    picture = Image.fromarray(static_colour(world, seed).reshape(SIZE, SIZE, 3))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    _export(vertices, faces, path, visual)
+
+
+def _export(vertices: Float, faces: NDArray[np.int32], path: Path, visual: object = None) -> None:
+    x, y, z = vertices.T
+    mesh = trimesh.Trimesh(np.stack([x, z, -y], axis=1), faces, visual=visual, process=False)
+    mesh.export(path)
+
+
+def _write_person(folder: Path, simulated: Path, T_map_world: Float) -> None:
+    """The person who is seen most often, as a box, and a track of nobody."""
+    truth, recording = load_truth(simulated / "tilting"), read(simulated / "tilting")
+    who = np.bincount(truth.mover[truth.mover >= 0]).argmax()
+    xy = truth.movers[:, who, :2] @ T_map_world[:2, :2].T + T_map_world[:2, 3]
+    stamps = recording.stamp_ns.tolist()
+    tracks = [
+        {"id": id, "track": {"stamp_ns": stamps, "x": (x + far).tolist(), "y": y.tolist()}}
+        for id, far, (x, y) in ((3, 0.1, xy.T), (4, 500.0, xy.T))
+    ]
+    (folder / "objects.json").write_text(json.dumps(tracks), encoding="utf-8")
+    box = trimesh.creation.box((0.3, 0.5, 1.7))
+    box.apply_translation((0, 0, 0.85))
+    _export(np.asarray(box.vertices), np.asarray(box.faces, np.int32), folder / "0003.glb")
+    x, y, yaw = truth.movers[30, who]
+    T_map_object = T_map_world @ np.array(
+        [
+            [np.cos(yaw), -np.sin(yaw), 0, x],
+            [np.sin(yaw), np.cos(yaw), 0, y],
+            [0, 0, 1, 0],
+            [0, 0, 0, 1],
+        ]
+    )
+    about = {"T_map_object": T_map_object.tolist(), "stamp_ns": stamps[30]}
+    (folder / "0003.json").write_text(json.dumps(about), encoding="utf-8")
+
+
+def _scores(capsys, *args: object) -> dict:
+    assert main(["eval", "model", *(str(arg) for arg in args), "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    return json.loads(out)
+
+
+def test_a_floor_that_is_too_high(result, simulated, capsys) -> None:
+    found = _scores(capsys, result, simulated)
+    assert found["surface"]["mean"] == pytest.approx(UP, abs=1e-3)
+    assert found["surface"]["area"] == pytest.approx(16.0, abs=1e-3)
+    assert 0.0 < found["surface"]["complete"] < 0.3
+    assert found["texture"]["colour_median"] < 2.5  # between texels of 6 cm
+    assert found["texture"]["mover"] < 0.5
+    assert found["texture"]["textured"] > 0.3
+    # what the picture sees it paints, but for what people stand before
+    assert found["texture"]["covered"] > 0.5
+    assert _scores(capsys, result, simulated / "tilting") == found
+
+
+def test_a_person_as_a_box(result, simulated, capsys) -> None:
+    movers = _scores(capsys, result, simulated)["movers"]
+    assert (movers["tracked"], movers["modelled"]) == (1, 1.0)
+    (one,) = movers["models"]
+    assert (one["id"], one["kind"]) == (3, "person")
+    assert 0.01 < one["accuracy"] < 0.12
+    assert 0.01 < one["completeness"] < 0.12
+    assert one["background"] is None
+
+
+def test_beams_that_are_too_long_do_not_count(result, simulated, capsys) -> None:
+    everything = _scores(capsys, result, simulated)["surface"]
+    near = _scores(capsys, result, simulated, "--within", 3)["surface"]
+    assert near["places"] < everything["places"]
+    assert near["complete"] > everything["complete"]
+
+
+def test_text(result, simulated, capsys) -> None:
+    assert main(["eval", "model", str(result), str(simulated)]) == 0
+    text = capsys.readouterr().out
+    assert "off truth    mean 2.9" in text
+    assert "textured -, background -" in text
+    assert "1 tracked, 100.00 % with a model" in text
+
+
+def test_what_is_not_there_is_not_scored(result, simulated, capsys) -> None:
+    (result / "mesh_faces.npz").unlink()
+    (result / "tilting/objects/objects.json").unlink()
+    assert set(_scores(capsys, result, simulated)) == {"alignment", "surface"}
+
+
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        ("mesh.glb", "is damaged"),
+        ("mesh_faces.npz", "is damaged"),
+        ("tilting/objects/objects.json", "no JSON"),
+        ("tilting/objects/0003.json", "no JSON"),
+        ("tilting/objects/0003.glb", "is damaged"),
+    ],
+)
+def test_damaged_files_are_named(name: str, what: str, result, simulated, capsys) -> None:
+    (result / name).write_bytes(b"nonsense")
+    assert main(["eval", "model", str(result), str(simulated)]) == 2
+    err = capsys.readouterr().err
+    assert what in err
+    assert name in err
+
+
+def test_a_result_without_a_mesh_is_refused(result, simulated, capsys) -> None:
+    (result / "mesh.glb").unlink()
+    assert main(["eval", "model", str(result), str(simulated)]) == 2
+    assert "mesh.glb: is no model" in capsys.readouterr().err
+
+
+def test_records_of_other_pictures_are_refused(result, simulated, capsys) -> None:
+    with np.load(result / "mesh_faces.npz") as archive:
+        arrays = dict(archive)
+    arrays["T_camera_map"] = arrays["T_camera_map"][:1]
+    np.savez(result / "mesh_faces.npz", **arrays)
+    assert main(["eval", "model", str(result), str(simulated)]) == 2
+    assert "speaks of 1 pictures" in capsys.readouterr().err
+
+
+def test_a_simulation_without_cameras_is_refused(result, simulated, capsys) -> None:
+    assert main(["eval", "model", str(result), str(simulated / "horizontal")]) == 2
+    assert "no truth about pictures" in capsys.readouterr().err
