@@ -26,7 +26,12 @@ _APART = 0.2  # of the way between two stills along it
 _WIDE, _NARROW = math.radians(80.0), math.radians(45.0)  # of a still along the way, of the others
 _ABOVE = np.array([-0.5, -0.75, 0.7])  # from where the whole is seen
 _MOST = (0.03, 0.97)  # quantiles of the vertices that are in the picture then
-_AROUND = (math.radians(-35.0), math.radians(85.0), math.radians(205.0))  # from ahead, turned left
+# turned left from ahead
+_SIDES = {
+    "from ahead": math.radians(-35.0),
+    "from its left": math.radians(85.0),
+    "from behind": math.radians(205.0),
+}
 _RAISED = math.radians(20.0)
 _QUALITY = 85  # of JPEG: photographs, which as PNG would be several megabytes
 
@@ -107,7 +112,7 @@ def object_stills(textured: Textured, threads: int = 1) -> list[Picture]:
     used = textured.vertices[np.unique(textured.faces)]
     corners, K = _box(used.min(axis=0), used.max(axis=0)), pinhole(OBJECT_SIZE, _NARROW)
     pictures = []
-    for angle in _AROUND:
+    for angle in _SIDES.values():
         towards = np.array([math.cos(angle), math.sin(angle), math.tan(_RAISED)])
         T = holding(corners, towards, K, OBJECT_SIZE)
         pictures.append(still(textured, T, K, OBJECT_SIZE, threads=threads))
@@ -158,8 +163,8 @@ def _pair(one: PlaceStill) -> str:
 
 def _sides(number: int, pictures: Sequence[Picture]) -> str:
     figures = "".join(
-        _figure(f"Object {number}", f"{n} of {len(pictures)}", picture)
-        for n, picture in enumerate(pictures, 1)
+        _figure(f"Object {number}", side, picture)
+        for side, picture in zip(_SIDES, pictures, strict=True)
     )
     return f'<div class="row">{figures}</div>'
 
