@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap import se2
 from stillmap.errors import InputError
+from stillmap.recording.clouds.rigid import transform
 from stillmap.recording.images import Camera, Images
 from stillmap.recording.ros.channels import Bag, Message
 from stillmap.recording.ros.messages import CAMERA_INFO, COMPRESSED, decoded, frame, stamp_ns
@@ -115,11 +117,7 @@ def _calibrated(camera: Camera, info: Any) -> Camera:
     )
     if _RECTIFIED.search(camera.name):
         K, D, model = P.reshape(-1)[[0, 1, 2, 4, 5, 6, 8, 9, 10]], _NONE, ""
-        T = camera.T_base_camera
-        if T is not None and R.shape == (9,) and np.isfinite(R).all() and R.any():
-            T = T.copy()
-            T[:3, :3] = T[:3, :3] @ R.reshape(3, 3).T
-        camera = replace(camera, T_base_camera=T)
+        camera = replace(camera, T_base_camera=_rectified(camera.T_base_camera, R))
     else:
         model = str(info.distortion_model)
     usable = K.shape == (9,) and np.isfinite(K).all() and K[0] > 0.0
@@ -129,6 +127,15 @@ def _calibrated(camera: Camera, info: Any) -> Camera:
         model=model,
         distortion=D if np.isfinite(D).all() else _NONE,
     )
+
+
+def _rectified(T: NDArray[np.float64] | None, R: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """The place of a camera that is turned by R (9,); as it is where R is no rotation."""
+    try:
+        turn = transform(R, np.zeros(3))
+    except ValueError:
+        return T
+    return None if T is None else T @ se2.inverse(turn)
 
 
 def _camera_of(topic: str) -> str:
