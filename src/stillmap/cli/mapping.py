@@ -20,17 +20,21 @@ from stillmap.cli.reading import read_changes
 from stillmap.cli.results import require_apart
 from stillmap.cli.tilting import built, read_tilting, said
 from stillmap.errors import InputError
+from stillmap.extras import MissingExtra
 from stillmap.loop import Loop
+from stillmap.models.building import Models, models_of
+from stillmap.models.sources import sources_of, sources_of_rig
 from stillmap.output.atomic import require_new
 from stillmap.output.points import beam_counts
 from stillmap.output.run_json import RECORD
 from stillmap.output.save import save
-from stillmap.pipeline import Options, resolved
+from stillmap.pipeline import Options, Progress, resolved
 from stillmap.recording import Recording, read
 from stillmap.recording.poses import poses_from_tum
 from stillmap.result import Result, build
 from stillmap.scene.rig import Tilting
 from stillmap.stages import Stages
+from stillmap.threads import resolved_threads
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seconds", "warnings")
@@ -101,10 +105,29 @@ def _mapped_and_saved(
             with stages.measure("tilting"):
                 in_3d = built(result, tilting, options)
             result = dataclasses.replace(result, stages=stages.to_dict())
+        models, result = _modelled(result, in_3d, progress, stages)
         progress("writing", 0, 0, 0)
         replace = args.overwrite or args.resume
-        save(result, Path(args.output), replace, within=place.folder, tilting=in_3d)
+        save(result, Path(args.output), replace, within=place.folder, tilting=in_3d, models=models)
     return result, in_3d
+
+
+def _modelled(
+    result: Result, in_3d: Tilting | None, progress: Progress, stages: Stages
+) -> tuple[Models | None, Result]:
+    """Models of what is in 3D, where they are wanted and can be made; and what the result says."""
+    options = result.options
+    if not options.mesh.enabled or (in_3d is None and result.recording.dimension == 2):
+        return None, result
+    try:
+        sources = sources_of(result) if in_3d is None else sources_of_rig(result, in_3d)
+        models = models_of(
+            sources, options.mesh, resolved_threads(options.threads), progress, stages
+        )
+    except MissingExtra as error:
+        warning = f"no models: {error}"
+        return None, dataclasses.replace(result, warnings=[*result.warnings, warning])
+    return models, dataclasses.replace(result, stages=stages.to_dict())
 
 
 def _resumed(

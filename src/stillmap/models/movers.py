@@ -24,6 +24,8 @@ from stillmap.texture.things import Thing
 Float = NDArray[np.float64]
 
 _DYNAMIC = 0.5
+_FINEST, _COARSEST = 0.015, 0.06  # m, edges of voxels
+_OF_SPACING = 0.7  # of how far beams lie apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,10 +121,22 @@ def shape_of(
         pieces = [piece.within(*span) for piece in pieces]
     local = [piece.in_frame(way) for piece in pieces]
     limits = dataclasses.replace(surface, island=options.island)
-    mesh = fused([(piece.patch, piece.weight) for piece in local], options.voxel, limits)
+    voxel = options.voxel or voxel_for(local)
+    mesh = fused([(piece.patch, piece.weight) for piece in local], voxel, limits)
     if mesh.areas().sum() < options.least:
         return None
     return Shape(one.id, mesh, way, rigid, seconds, span)
+
+
+def voxel_for(pieces: Sequence[Piece]) -> float:
+    """Metres: a little less than beams lie apart on a thing, within bounds."""
+    edges = [np.zeros(0)]
+    for piece in pieces:
+        corners = piece.patch.points[piece.patch.faces]
+        edges.append(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).ravel())
+    all_edges = np.concatenate(edges)
+    apart = float(np.median(all_edges)) if len(all_edges) else _FINEST
+    return float(np.clip(_OF_SPACING * apart, _FINEST, _COARSEST))
 
 
 def pieces_of(

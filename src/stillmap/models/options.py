@@ -13,7 +13,9 @@ class MoverOptions:
     """Models of what moved."""
 
     enabled: bool = field_with_doc(True, "make models of what moved")
-    voxel: float = field_with_doc(0.04, "m, edge of a voxel of their surfaces")
+    voxel: float | None = field_with_doc(
+        None, "m, edge of a voxel of their surfaces; not set: by how far beams lie apart on them"
+    )
     margin: float = field_with_doc(0.15, "m around a thing's box, within which beams are its own")
     low: float = field_with_doc(0.03, "m above the ground: what is lower is the ground's")
     rigid: float = field_with_doc(
@@ -28,12 +30,13 @@ class MoverOptions:
     rim: float = field_with_doc(
         0.04, "m within a thing's outline in a picture, where it may show what is behind"
     )
-    least: float = field_with_doc(0.1, "m2 of surface that a model has")
-    island: float = field_with_doc(0.02, "m2, smaller pieces of it are left out")
+    least: float = field_with_doc(0.03, "m2 of surface that a model has")
+    island: float = field_with_doc(0.01, "m2, smaller pieces of it are left out")
 
     def __post_init__(self) -> None:
         for name, low, high in _LIMITS:
-            if not low <= getattr(self, name) <= high:
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
                 raise ValueError(f"'mesh.objects.{name}' wants {low:g} to {high:g}")
 
 

@@ -9,10 +9,10 @@ from scipy import ndimage
 
 from stillmap.models.movers import Shape
 from stillmap.models.options import MoverOptions
-from stillmap.models.place import Painted
+from stillmap.models.place import Painted, settled
 from stillmap.surface.dividing import divided
 from stillmap.surface.mesh import Mesh
-from stillmap.texture.choice import Candidates, chosen, utility
+from stillmap.texture.choice import Candidates, utility
 from stillmap.texture.choice_options import ChoiceOptions
 from stillmap.texture.lens import project, within
 from stillmap.texture.options import VisibleOptions
@@ -76,7 +76,7 @@ def dressed(
     """
     mesh, _ = divided(shape.mesh, choice.edge)
     candidates = Candidates.none(len(mesh), choice.candidates)
-    seen_at_all, own = np.zeros(len(mesh), np.bool_), list[View]()
+    sharpest, own = Candidates.none(len(mesh), 1), list[View]()
     others = [one for one in things if one.box.thing != shape.id]
     for view, now in zip(views, when_in_view(shape.way.thing, views, start_ns), strict=True):
         away = max(shape.span[0] - now, now - shape.span[1], 0.0)
@@ -93,17 +93,14 @@ def dressed(
         free = _before(place, points, view, limits)
         faces, points = faces[free], points[free]
         hidden = in_the_way(at_time(others, now), view.place, points, choice.margin, choice.sigma)
-        seen_at_all[faces] = True
         pixels = found.pixels[faces].astype(np.float64)
         good = utility(1.0 - hidden, pixels, mesh.areas()[faces], replace(choice, believe=True))
         if not shape.rigid:  # who walks looks otherwise a moment later
             good -= away / max(options.near, _LEAST)
         candidates.add(len(own), faces, good, 1.0 - hidden)
+        sharpest.add(len(own), faces, pixels, 1.0 - hidden)
         own.append(moved)
-    view_of = chosen(candidates, mesh.pairs(), choice.border)
-    p = np.where(candidates.picture == view_of[:, None], candidates.p_static, 0.0).max(axis=1)
-    p = np.where(view_of >= 0, p, 0.0).astype(np.float32)
-    return Dressed(Painted(mesh, view_of, p, seen_at_all), own)
+    return Dressed(settled(mesh, candidates, sharpest, choice.border), own)
 
 
 def _inside(

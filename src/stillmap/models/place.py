@@ -34,12 +34,16 @@ class Painted:
         view: (F,) number of the view; -1: none sees it without something that moves before it.
         p_static: (F,) how probably that view shows static things only; 0 where there is none.
         seen: (F,) whether any view sees it at all.
+        sharpest: (F,) number of the view that shows it in most pixels, whatever stands before it.
+        p_sharpest: (F,) how probably that one shows static things only.
     """
 
     mesh: Mesh
     view: Index
     p_static: NDArray[np.float32]
     seen: NDArray[np.bool_]
+    sharpest: Index
+    p_sharpest: NDArray[np.float32]
 
 
 def painted(
@@ -65,25 +69,43 @@ def painted(
     mesh, _ = divided(mesh, options.edge)
     beams, areas = sources.beams(), mesh.areas()
     candidates = Candidates.none(len(mesh), min(options.candidates, max(len(views), 1)))
-    seen_at_all = np.zeros(len(mesh), np.bool_)
+    sharpest = Candidates.none(len(mesh), 1)
 
     def looked_at(view: View) -> tuple[NDArray[np.intp], Float, Float]:
         found = visible(mesh, view, limits)
         faces = np.flatnonzero(found.seen)
-        p = np.zeros(len(faces))
-        if options.believe and len(faces):
+        p = np.zeros(0)
+        if len(faces):
             p = shown(mesh, faces, view, beams, sources.things, options)
         return faces, found.pixels[faces].astype(np.float64), p
 
     for number, (faces, pixels, p) in enumerate(in_order(looked_at, views, threads)):
-        seen_at_all[faces] = True
-        good = utility(p, pixels, areas[faces], options)
-        candidates.add(number, faces, good, p)
+        candidates.add(number, faces, utility(p, pixels, areas[faces], options), p)
+        sharpest.add(number, faces, pixels, p)
         if tell is not None:
             tell(number + 1, len(views))
-    view = chosen(candidates, mesh.pairs(), options.border)
+    return settled(mesh, candidates, sharpest, options.border)
+
+
+def settled(mesh: Mesh, candidates: Candidates, sharpest: Candidates, border: float) -> Painted:
+    """What paints each face once neighbours have settled.
+
+    Args:
+        mesh: F faces.
+        candidates: the best views of each.
+        sharpest: of each the one that shows it in most pixels.
+        border: what it costs where two views meet.
+    """
+    view = chosen(candidates, mesh.pairs(), border)
     p_static = np.where(candidates.picture == view[:, None], candidates.p_static, 0.0).max(axis=1)
-    return Painted(mesh, view, np.where(view >= 0, p_static, 0.0).astype(np.float32), seen_at_all)
+    return Painted(
+        mesh,
+        view,
+        np.where(view >= 0, p_static, 0.0).astype(np.float32),
+        sharpest.picture[:, 0] >= 0,
+        sharpest.picture[:, 0],
+        sharpest.p_static[:, 0],
+    )
 
 
 def shown(

@@ -8,8 +8,9 @@ from stillmap.output.clouds import write_clouds
 from stillmap.output.graph_g2o import write_g2o
 from stillmap.output.map_npz import write_map_npz
 from stillmap.output.map_server import write_map_server
+from stillmap.output.models import models_record, write_models
 from stillmap.output.objects import write_objects, write_traffic
-from stillmap.output.protocols import ResultLike, TiltingLike
+from stillmap.output.protocols import ModelsLike, ResultLike, TiltingLike
 from stillmap.output.report import write_report
 from stillmap.output.run_json import RECORD, write_run_json
 from stillmap.output.tilting import FOLDER as TILTING
@@ -24,6 +25,7 @@ def save(
     *,
     within: Path | None = None,
     tilting: TiltingLike | None = None,
+    models: ModelsLike | None = None,
 ) -> None:
     """Write `result` as the folder `path`: map, trajectory, pose graph, labels, objects, report.
 
@@ -33,6 +35,7 @@ def save(
         overwrite: replace an earlier result, once the new folder is whole.
         within: where the new folder is made until then; None: beside `path`.
         tilting: what a second laser built in 3D.
+        models: of the place and of what moved; see `stillmap.models`.
 
     Raises:
         InputError: `path` is taken or cannot be written to.
@@ -53,5 +56,9 @@ def save(
         more = {}
         if tilting is not None:
             write_tilting(folder, tilting)
-            more = {TILTING: tilting_record(tilting)}
+            more[TILTING] = tilting_record(tilting)
+        if models is not None:
+            images = (result if tilting is None else tilting).recording.images
+            write_models(folder, models, 0 if images is None else len(images))
+            more["models"] = models_record(models)
         write_run_json(folder / RECORD, result, more)

@@ -1,0 +1,174 @@
+"""Models of a recording in 3D: a surface, painted; and what moved, likewise (Sect. 4.4, 4.5)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.models.movers import Shape, shape_of
+from stillmap.models.options import MeshOptions
+from stillmap.models.painting import Dressed, dressed, when_in_view
+from stillmap.models.place import Painted, painted
+from stillmap.models.sources import Sources
+from stillmap.objects import MovingObject
+from stillmap.pipeline import Progress, silent
+from stillmap.recording.images import Images
+from stillmap.stages import Stages
+from stillmap.surface.building import surface_of
+from stillmap.texture.baking import baked
+from stillmap.texture.textured import Textured
+from stillmap.texture.things import Thing
+from stillmap.texture.view import View
+from stillmap.texture.views import views_of
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class MoverModel:
+    """What moved, as a model in its own frame: x ahead, y left, z up, on the ground.
+
+    Attributes:
+        shape: its surface, and where it was.
+        dressed: which view paints each face.
+        textured: with the pictures on it.
+        T_map_object: (4, 4) where it was when it was of this shape.
+        stamp_ns: when that was.
+    """
+
+    shape: Shape
+    dressed: Dressed
+    textured: Textured
+    T_map_object: Float
+    stamp_ns: int
+
+
+@dataclass(frozen=True, eq=False)
+class Models:
+    """The place without its people, and the people.
+
+    Attributes:
+        painted: the surface of the place, and which of `views` paints each face.
+        textured: with the pictures on it.
+        views: the pictures that can be used.
+        left_out: how many others there are, by reason.
+        movers: models of what moved, in the order of the objects.
+        tried: how many objects there are.
+    """
+
+    painted: Painted
+    textured: Textured
+    views: list[View]
+    left_out: dict[str, int]
+    movers: list[MoverModel]
+    tried: int
+
+
+def models_of(
+    sources: Sources,
+    options: MeshOptions,
+    threads: int = 1,
+    progress: Progress = silent,
+    stages: Stages | None = None,
+) -> Models:
+    """A surface from what stands still, and for each face the picture that most likely shows it.
+
+    Args:
+        sources: a recording of which everything is known.
+        options: see MeshOptions.
+        threads: same result with any number.
+        progress: called with what is done, 0, and how much of it.
+        stages: where time and memory per stage are noted.
+
+    Raises:
+        MissingExtra: a library of the extra `mesh` is not installed.
+    """
+    stages = stages or Stages()
+
+    def tell(what: str) -> Callable[[int, int], None]:
+        return lambda done, total: progress(what, 0, done, total)
+
+    with stages.measure("surface"):
+        mesh = surface_of(
+            sources.seen,
+            sources.poses,
+            sources.p_static,
+            options.surface,
+            threads,
+            tell("building the surface"),
+        )
+    with stages.measure("painting"):
+        views, left_out = views_of(sources.recording, sources.poses)
+        limits = options.texture.visible
+        place = painted(
+            mesh, views, sources, options.choice, limits, threads, tell("choosing pictures")
+        )
+    progress("putting pictures on the surface", 0, 0, 0)
+    with stages.measure("texture"):
+        read = _reader(sources.recording.images)
+        textured = baked(place.mesh, place.view, views, read, options.texture)
+    with stages.measure("movers"):
+        movers = []
+        if options.objects.enabled:
+            movers = _movers(sources, views, place, options, tell("building what moved"))
+    return Models(place, textured, views, left_out, movers, len(sources.objects))
+
+
+def _reader(images: Images | None) -> Callable[[int], NDArray[np.uint8]]:
+    if images is not None:
+        return images.read
+
+    def none(image: int) -> NDArray[np.uint8]:
+        raise IndexError(f"there is no picture {image}")
+
+    return none
+
+
+def _movers(
+    sources: Sources,
+    views: Sequence[View],
+    place: Painted,
+    options: MeshOptions,
+    tell: Callable[[int, int], None],
+) -> list[MoverModel]:
+    things = {thing.box.thing: thing for thing in sources.things}
+    out = []
+    for number, one in enumerate(sources.objects):
+        if one.id in things:
+            model = _mover(one, things[one.id], sources, views, place, options)
+            if model is not None:
+                out.append(model)
+        tell(number + 1, len(sources.objects))
+    return out
+
+
+def _mover(
+    one: MovingObject,
+    thing: Thing,
+    sources: Sources,
+    views: Sequence[View],
+    place: Painted,
+    options: MeshOptions,
+) -> MoverModel | None:
+    """The model of one object; None where too little of it was seen."""
+    start = sources.start_ns
+    seconds = when_in_view(thing, views, start)
+    shown = seconds[np.isfinite(seconds)]
+    shape = shape_of(one, thing, sources, options.objects, options.surface, shown)
+    if shape is None:
+        return None
+    dress = dressed(
+        shape,
+        views,
+        place.mesh,
+        sources.things,
+        start,
+        options.objects,
+        options.choice,
+        options.texture.visible,
+    )
+    read = _reader(sources.recording.images)
+    textured = baked(dress.painted.mesh, dress.painted.view, dress.views, read, options.texture)
+    T = shape.way.T_map_object(shape.seconds)
+    return MoverModel(shape, dress, textured, T, start + round(1e9 * shape.seconds))
