@@ -4,6 +4,7 @@
 // order, so the sums have the same bits whatever the number of threads.
 #pragma once
 
+#include <Eigen/Geometry>
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -68,17 +69,19 @@ class Prism {
     if (!(std::abs(volume) > kFlat * a.norm() * b.norm() * c.norm()) || !(h > 0.0)) return;
     const std::array<Vec<3>, 3> inverse = {b.cross(c) / volume, c.cross(a) / volume,
                                            a.cross(b) / volume};
+    Linear k;
     for (size_t i = 0; i < 3; ++i) {
       mu_[i].gradient = inverse[i] * voxel;
       mu_[i].constant = inverse[i].dot(Vec<3>::Constant(0.5 * voxel) - o);
-      k_.gradient += mu_[i].gradient;
-      k_.constant += mu_[i].constant;
+      k.gradient += mu_[i].gradient;
+      k.constant += mu_[i].constant;
       border_[i] = mu_[i].plus(kMargin);
     }
-    const double nearest = std::max(1.0 - before / h, kNearest), farthest = 1.0 + behind / h;
-    border_[3] = k_.plus(-nearest);
-    border_[4] = k_.times(-1.0).plus(farthest);
-    surround({a, b, c}, o, nearest, farthest, voxel);
+    nearest_ = std::max(1.0 - before / h, kNearest);
+    farthest_ = 1.0 + behind / h;
+    border_[3] = k.plus(-nearest_);
+    border_[4] = k.times(-1.0).plus(farthest_);
+    surround({a, b, c}, o, voxel);
   }
 
   bool empty() const { return (high_.array() < low_.array()).any(); }
@@ -96,49 +99,74 @@ class Prism {
     return false;
   }
 
-  // Of the voxels first to last along x at y, z those within: the first and the last.
-  std::pair<int32_t, int32_t> within(int32_t first, int32_t last, int32_t y, int32_t z) const {
-    double from = first, to = last;
-    for (const Linear& border : border_) {
-      const double slope = border.gradient[0];
-      const double at0 = border.gradient[1] * y + border.gradient[2] * z + border.constant;
-      if (slope > 0.0) {
-        from = std::max(from, -at0 / slope);
-      } else if (slope < 0.0) {
-        to = std::min(to, -at0 / slope);
-      } else if (at0 < 0.0) {
-        return {1, 0};
-      }
+  // Calls visit(voxel, metres in front of the surface) for the voxels from low to high within.
+  template <class Visit>
+  void each(const Cell<3>& low, const Cell<3>& high, Visit&& visit) const {
+    const int a = axis_, b = (axis_ + 1) % 3, c = (axis_ + 2) % 3;
+    Cell<3> at;
+    for (at[a] = low[a]; at[a] <= high[a]; ++at[a]) {
+      const auto [first_b, last_b] = slice(at[a], b, low[b], high[b]);
+      const auto [first_c, last_c] = slice(at[a], c, low[c], high[c]);
+      for (at[b] = first_b; at[b] <= last_b; ++at[b])
+        for (at[c] = first_c; at[c] <= last_c; ++at[c]) {
+          double metres;
+          if (distance(at.cast<double>(), metres)) visit(at, metres);
+        }
     }
-    if (!(from <= to)) return {1, 0};
-    return {static_cast<int32_t>(std::ceil(from)), static_cast<int32_t>(std::floor(to))};
-  }
-
-  // metres in front of the surface
-  double distance(const Vec<3>& voxel) const {
-    const double k = k_.at(voxel);
-    double sum = 0.0;
-    for (size_t i = 0; i < 3; ++i) sum += mu_[i].at(voxel) * standoff_[i];
-    return (1.0 - k) * sum / k;
   }
 
  private:
+  // Whether a voxel is within, and metres in front of the surface.
+  bool distance(const Vec<3>& voxel, double& metres) const {
+    double k = 0.0, sum = 0.0;
+    for (size_t i = 0; i < 3; ++i) {
+      const double mu = mu_[i].at(voxel);
+      if (mu < -kMargin) return false;
+      k += mu;
+      sum += mu * standoff_[i];
+    }
+    if (!(k >= nearest_ && k <= farthest_)) return false;
+    metres = (1.0 - k) * sum / k;
+    return true;
+  }
+
+  // Of the voxels low to high along an axis those that lines of sight cross at a slice.
+  std::pair<int32_t, int32_t> slice(int32_t number, int along, int32_t low, int32_t high) const {
+    if (wide_) return {low, high};
+    const double from = number - origin_[axis_];
+    double least = std::numeric_limits<double>::infinity(), most = -least;
+    for (const Vec<3>& slope : slope_) {
+      const double at = origin_[along] + from * slope[along];
+      least = std::min(least, at);
+      most = std::max(most, at);
+    }
+    // a slice beside the sensor may be crossed far away
+    return {least > low ? static_cast<int32_t>(std::ceil(std::min(least, high + 1.0))) : low,
+            most < high ? static_cast<int32_t>(std::floor(std::max(most, low - 1.0))) : high};
+  }
+
   static constexpr double kFlat = 1e-12;
   static constexpr double kNearest = 0.05;  // of the way from the sensor
+  static constexpr double kSteep = 0.1;     // of its length that a line of sight goes along axis_
   static constexpr double kFarthest = Grid<3>::kMaxCell;
 
-  void surround(const std::array<Vec<3>, 3>& corner, const Vec<3>& o, double nearest,
-                double farthest, double voxel) {
+  void surround(const std::array<Vec<3>, 3>& corner, const Vec<3>& o, double voxel) {
+    origin_ = o / voxel - Vec<3>::Constant(0.5);
+    (corner[0] + corner[1] + corner[2]).cwiseAbs().maxCoeff(&axis_);
     Vec<3> low = Vec<3>::Constant(std::numeric_limits<double>::infinity()), high = -low;
     for (size_t i = 0; i < 3; ++i) {
       // mu is at least -margin for the two others
       const Vec<3> end =
           corner[i] + 2.0 * kMargin * (2.0 * corner[i] - corner[(i + 1) % 3] - corner[(i + 2) % 3]);
-      for (const double k : {nearest, farthest}) {
-        const Vec<3> at = (o + k * end) / voxel - Vec<3>::Constant(0.5);
+      for (const double k : {nearest_, farthest_}) {
+        const Vec<3> at = origin_ + k * end / voxel;
         low = low.cwiseMin(at);
         high = high.cwiseMax(at);
       }
+      slope_[i] = end / end[axis_];
+      // lines of sight that spread to both sides of a slice
+      wide_ = wide_ || !(std::abs(end[axis_]) > kSteep * end.norm()) ||
+              (end[axis_] > 0.0) != (corner[0][axis_] > 0.0);
     }
     if (!(low.minCoeff() > -kFarthest) || !(high.maxCoeff() < kFarthest))
       throw std::invalid_argument("points: too far away for voxels of this edge");
@@ -148,8 +176,12 @@ class Prism {
 
   std::array<Linear, 3> mu_;
   std::array<Linear, 5> border_;  // a voxel is within if all are positive
-  Linear k_;
   std::array<double, 3> standoff_{};
+  double nearest_ = 0.0, farthest_ = 0.0;  // of the way from the sensor to the surface
+  Vec<3> origin_ = Vec<3>::Zero();         // of lines of sight, in voxels
+  std::array<Vec<3>, 3> slope_;            // of those through the corners, along `axis_`
+  int axis_ = 0;                           // along which they go most
+  bool wide_ = false;
   Cell<3> low_ = Cell<3>::Ones(), high_ = Cell<3>::Zero();
 };
 
@@ -270,17 +302,12 @@ class SignedDistances : public Blocks<3, Distances> {
     const Cell<3> corner = block.origin * kEdge;
     const Cell<3> low = one.low().cwiseMax(corner);
     const Cell<3> high = one.high().cwiseMin((corner.array() + (kEdge - 1)).matrix());
-    for (int32_t z = low[2]; z <= high[2]; ++z)
-      for (int32_t y = low[1]; y <= high[1]; ++y) {
-        const auto [first, last] = one.within(low[0], high[0], y, z);
-        Distances* row = &block.counts[static_cast<size_t>(local_of({0, y, z}))];
-        for (int32_t x = first; x <= last; ++x) {
-          Distances& voxel = row[x - corner[0]];
-          const auto d = static_cast<float>(one.distance(Cell<3>(x, y, z).cast<double>()));
-          voxel.weight += weight;
-          voxel.product += weight * d;
-        }
-      }
+    one.each(low, high, [&](const Cell<3>& at, double metres) {
+      Distances& voxel = block.counts[static_cast<size_t>(local_of(at))];
+      const float here = weight * static_cast<float>(std::min(1.0, 1.0 + metres / behind_));
+      voxel.weight += here;
+      voxel.product += here * static_cast<float>(metres);
+    });
   }
 
   double voxel_, before_, behind_;

@@ -15,8 +15,8 @@ class SurfaceOptions:
     before: float = field_with_doc(3.0, "voxels in front of a surface in which it is known")
     behind: float = field_with_doc(2.0, "voxels behind it, likewise")
     least: float = field_with_doc(0.5, "P(static) that a triangle needs, of its beams together")
-    longest: float = field_with_doc(3.0, "m, longer edges of triangles span holes")
-    longest_share: float = field_with_doc(0.3, "of the range, likewise")
+    longest: float = field_with_doc(1.5, "m, longer edges of triangles span holes")
+    longest_share: float = field_with_doc(0.15, "of the range, likewise")
     widest: float = field_with_doc(
         3.0, "times as far apart as usual are beams between which there are holes"
     )

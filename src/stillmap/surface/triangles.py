@@ -12,6 +12,9 @@ Faces = NDArray[np.int32]
 Bool = NDArray[np.bool_]
 
 _SMOOTHING = 2  # rounds in which normals are averaged with those beside
+_AROUND = 6  # triangles around a point that has neighbours on all sides
+_HALF = 0.73  # standard deviations that a point is off the mean of six beside, or less, half the time
+_NOISES = 5.0  # standard deviations between the farthest and the nearest of three corners
 
 
 class Kept(NamedTuple):
@@ -58,7 +61,8 @@ def surface_faces(points: Float, origin: Float, faces: Faces, o: SurfaceOptions)
 
     A triangle that is seen at a flat angle either belongs to a surface that is, as the floor far
     ahead, and then lies in a plane with those beside; or it leads from something near to what is
-    seen behind its edge.
+    seen behind its edge. One whose corners are as far away as noise lets them seem tells nothing of
+    an angle.
 
     Args:
         points: (n, 3) metres.
@@ -77,10 +81,11 @@ def surface_faces(points: Float, origin: Float, faces: Faces, o: SurfaceOptions)
     faces = np.where(away[:, None], faces[:, ::-1], faces)
     normals = np.where(away, -1.0, 1.0)[:, None] * spans / np.maximum(area, 1e-300)[:, None]
     cosine = np.abs(facing) / np.maximum(area * range, 1e-300)
+    level = is_level(np.linalg.norm(origin - points, axis=1), faces)
     limit = np.minimum(o.longest, o.longest_share * range)
-    kept = (edges.max(axis=1) <= limit) & (cosine >= np.cos(o.steepest)) & (area > 0.0)
+    kept = (edges.max(axis=1) <= limit) & (level | (cosine >= np.cos(o.steepest))) & (area > 0.0)
     faces, normals, cosine = faces[kept], normals[kept], cosine[kept]
-    steep = cosine < np.cos(o.steep)
+    steep = (cosine < np.cos(o.steep)) & ~level[kept]
     at_points = point_normals(normals, faces, len(points), 0)
     bend = np.einsum("nki,ni->nk", at_points[faces[steep]], normals[steep]).min(axis=1)
     fits = np.ones(len(faces), np.bool_)
@@ -89,6 +94,29 @@ def surface_faces(points: Float, origin: Float, faces: Faces, o: SurfaceOptions)
     smooth = point_normals(normals, faces, len(points), _SMOOTHING)
     standoff = np.einsum("ni,ni->n", smooth, origin - points)
     return Kept(faces.astype(np.int32), np.where(np.isfinite(standoff), standoff, 0.0))
+
+
+def is_level(range: Float, faces: Faces) -> Bool:
+    """(m,) whether the corners of triangles are as far away as each other, but for noise.
+
+    How much noise there is, neighbours tell: half of the points are nearer than that to the mean
+    range of those around.
+
+    Args:
+        range: (n,) metres.
+        faces: (m, 3).
+    """
+    if not len(faces):
+        return np.zeros(0, np.bool_)
+    at = range[faces]
+    count = np.bincount(faces.ravel(), minlength=len(range))
+    total = np.bincount(faces.ravel(), np.repeat(at.sum(axis=1), 3), len(range))
+    inside = count >= _AROUND
+    # each triangle around counts the point itself, and each neighbour is of two
+    around = (total[inside] - count[inside] * range[inside]) / (2 * count[inside])
+    off = np.abs(around - range[inside])
+    noise = float(np.median(off)) / _HALF if len(off) else 0.0
+    return np.asarray(at.max(axis=1) - at.min(axis=1) <= _NOISES * noise)
 
 
 def point_normals(normals: Float, faces: Faces, n: int, rounds: int) -> Float:
