@@ -1,10 +1,15 @@
 """Small places to look at, and cameras in them."""
 
+from functools import lru_cache
+
 import numpy as np
 
+from stillmap import _core
 from stillmap.recording.images import Camera
 from stillmap.surface.mesh import Mesh, joined
+from stillmap.texture import lens
 from stillmap.texture.view import View
+from stillmap.texture.visible import visible
 
 K = np.array([[300.0, 0.0, 199.5], [0.0, 300.0, 149.5], [0.0, 0.0, 1.0]])
 
@@ -51,3 +56,70 @@ def box(low, high, n=1, inwards=False):
     ]
     mesh = joined(sides)
     return Mesh(mesh.vertices, mesh.faces[:, ::-1].copy()) if inwards else mesh
+
+
+def colour(points):
+    """(n, 3) 0 to 255, of places in space: what everything is painted with."""
+    slow = np.sin(points * np.array([3.0, 4.0, 5.0]) + np.array([0.0, 1.0, 2.0]))
+    quick = np.sin(points @ np.array([[9.0, 5, -7], [-6, 11, 3], [8, -3, 12]]))
+    return np.clip(128 + 70 * slow + 40 * quick, 0, 255)
+
+
+@lru_cache(maxsize=8)
+def rays_of(camera, finer):
+    """(n, 3) the directions of all parts of a camera's pixels."""
+    u, v = ((np.arange(n * finer) + 0.5) / finer - 0.5 for n in (camera.width, camera.height))
+    return lens.rays(camera, np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
+
+
+def photograph(mesh, view, finer=2):
+    """What a camera takes of a mesh painted with `colour`: (height, width, 3) uint8.
+
+    By rays through parts of the pixels; black where there is nothing.
+    """
+    of = view.camera
+    rays = rays_of(of, finer)
+    wide = np.array([[2.0 * of.K[0, 0], 0, 2.0 * of.width], [0, 0, 0], [0, 0, 1]])
+    wide[1, 1:] = 2.0 * of.K[1, 1], 2.0 * of.height
+    size = 4 * of.width, 4 * of.height
+    _, face = _core.z_buffer(mesh.vertices, mesh.faces, wide, view.T_camera_map, *size, near=0.01)
+    column, row = np.rint(rays[:, :2] @ wide[:2, :2].T + wide[:2, 2]).astype(int).T
+    seen = face[np.clip(row, 0, size[1] - 1), np.clip(column, 0, size[0] - 1)]
+    corners = view.in_camera(mesh.vertices)[mesh.faces[seen]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    z = np.sum(normal * corners[:, 0], axis=1) / np.sum(normal * rays, axis=1)
+    place = (rays * z[:, None] - view.T_camera_map[:3, 3]) @ view.T_camera_map[:3, :3]
+    picture = np.where((seen >= 0)[:, None], colour(place), 0.0)
+    parts = picture.reshape(of.height, finer, of.width, finer, 3)
+    return np.rint(parts.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def furnished():
+    """A crumpled room of 4 by 5 by 2.6 m with a block in it; seen from inside."""
+    mesh = joined(
+        [box([0, 0, 0], [4, 5, 2.6], 10, inwards=True), box([1.5, 2, 0], [2.3, 3, 0.9], 5)]
+    )
+    rng = np.random.default_rng(1)
+    key, at = np.unique(np.round(mesh.vertices, 6), axis=0, return_inverse=True)
+    vertices = key + rng.normal(0.0, 0.01, key.shape)
+    return Mesh(vertices, at.ravel()[mesh.faces].astype(np.int32))
+
+
+def all_round(of=None, n=8):
+    """Views from two places in that room."""
+    angles = 2.0 * np.pi * np.arange(n) / n
+    places = [np.array([1.0, 1.0, 1.5]), np.array([3.0, 4.2, 1.4])]
+    return [
+        looking(places[i % 2], places[i % 2] + [np.cos(a), np.sin(a), -0.3 + 0.3 * (i % 3)], i, of)
+        for i, a in enumerate(angles)
+    ]
+
+
+def sharpest(mesh, views):
+    """(F,) int32 the view that shows each face largest, -1: none."""
+    best, most = np.full(len(mesh), -1, np.int32), np.zeros(len(mesh))
+    for number, view in enumerate(views):
+        seen = visible(mesh, view)
+        better = seen.seen & (seen.pixels > most)
+        best[better], most[better] = number, seen.pixels[better]
+    return best
