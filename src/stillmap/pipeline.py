@@ -16,6 +16,7 @@ from stillmap.models.options import MeshOptions
 from stillmap.objects import ObjectOptions
 from stillmap.options import field_with_doc
 from stillmap.output.map_server import OutputOptions
+from stillmap.recording.cameras import depth_cameras
 from stillmap.recording.model import Recording
 from stillmap.recording.options import ReadOptions
 from stillmap.scene.rig_options import RigOptions
@@ -58,6 +59,9 @@ class Options:
 
 DEFAULTS = Options()
 
+# m, edges of voxels; depth cameras see people from near by, and within few of the larger ones
+_VOXEL, _OF_DEPTH = 0.15, 0.05
+
 
 def resolved(options: Options, recording: Recording) -> Options:
     """The options as they will be used.
@@ -66,7 +70,8 @@ def resolved(options: Options, recording: Recording) -> Options:
     cells of 3D recordings are voxels.
     """
     if recording.dimension == 3:
-        slam_options = dataclasses.replace(options.slam, resolution=options.slam.voxel)
+        voxel = options.slam.voxel or (_OF_DEPTH if depth_cameras(recording.source) else _VOXEL)
+        slam_options = dataclasses.replace(options.slam, voxel=voxel, resolution=voxel)
         options = dataclasses.replace(options, slam=slam_options)
     if options.estimator != "paper":
         return options

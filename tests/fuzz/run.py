@@ -15,7 +15,7 @@ HERE = Path(__file__).resolve().parent
 FOUND = HERE.parent.parent / "build" / "fuzz"
 NAMES = (
     *("carmen", "ours", "bag", "mcap", "db3", "ros1", "cdr", "kitti", "drive", "pcd", "ply"),
-    *("las", "e57", "3dtk", "toml", "rows", "result"),
+    *("las", "e57", "3dtk", "scenes", "tum", "cameras", "toml", "rows", "result"),
 )
 
 

@@ -19,7 +19,7 @@ from stillmap.export.result import read_tracks
 from stillmap.options import load_toml, replaced
 from stillmap.output.trajectory import read_tum
 from stillmap.pipeline import Options
-from stillmap.recording import Recording, read
+from stillmap.recording import ReadOptions, Recording, read
 from stillmap.recording.facts import facts
 from stillmap.recording.ros import reading  # noqa: F401  (loaded now, not at the first bag)
 from stillmap.simulation import load_truth
@@ -42,12 +42,12 @@ class Target(NamedTuple):
     change: Change | None = None
 
 
-def require_sound(path: Path) -> None:
+def require_sound(path: Path, options: ReadOptions | None = None) -> None:
     """Read a recording; what comes out is sound, and nothing is said but in words of ours."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            recording = read(path, scratch=path.parent)
+            recording = read(path, options, scratch=path.parent)
             _walk(recording)
         except InputError as error:
             if "\n" in str(error):
@@ -159,6 +159,16 @@ def _toml(data: bytes, folder: Path) -> None:
         return
 
 
+def _cameras(data: bytes, folder: Path) -> None:
+    """Beside a sound recording, with a folder of further pictures."""
+    place = folder / "in"
+    scenes = next(corpus.scenes(folder))
+    _write(scenes, place, corpus.SCENES)
+    _write(parts.joined([parts.split(scenes)[1], b"0.01\n"]), folder, ("more/0.png", "times.txt"))
+    (folder / "in.toml").write_bytes(data)
+    require_sound(place, ReadOptions(cameras=str(folder / "in.toml")))
+
+
 def _rows(data: bytes, folder: Path) -> None:
     path = folder / "in.txt"
     path.write_bytes(data)
@@ -216,6 +226,9 @@ TARGETS = {
     "las": Target(_file("in.las"), corpus.las),
     "e57": Target(_file("in.e57"), corpus.e57, containers.changed_e57),
     "3dtk": Target(_folder(corpus.UOS), corpus.uos, parts.changed),
+    "scenes": Target(_folder(corpus.SCENES), corpus.scenes, parts.changed),
+    "tum": Target(_folder(corpus.TUM), corpus.tum, parts.changed),
+    "cameras": Target(_cameras, corpus.cameras),
     "toml": Target(_toml, corpus.toml),
     "rows": Target(_rows, corpus.rows),
     "result": Target(_result, _results, parts.changed),

@@ -1,39 +1,32 @@
 """A textured room of 6 x 4 x 3 m, seen from inside, with or without somebody on a wall."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from stillmap.surface.mesh import Mesh
+from stillmap.texture.textured import Textured
 
 SIZE = (6.0, 4.0, 3.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Textured:
-    mesh: Mesh
-    uv: np.ndarray
-    page: np.ndarray
-    pages: tuple
 
 
 def quad(corners, page):
     """Two faces of four corners, lower left, lower right, upper right, upper left as seen, with the
     whole of a page on them."""
-    mesh = Mesh(np.array(corners, float), np.array([[0, 1, 2], [0, 2, 3]], np.int32))
-    at = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
-    return mesh, at[mesh.faces], page
+    at = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], float)
+    return np.array(corners, float), at, page
 
 
 def together(quads, pages):
-    vertices, faces, uv, page = [], [], [], []
-    for mesh, its, number in quads:
-        faces.append(mesh.faces + sum(len(one) for one in vertices))
-        vertices.append(mesh.vertices)
-        uv.append(its)
-        page += [number] * len(mesh)
-    mesh = Mesh(np.concatenate(vertices), np.concatenate(faces).astype(np.int32))
-    return Textured(mesh, np.concatenate(uv), np.array(page, np.int32), tuple(pages))
+    n = len(quads)
+    square = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    page = np.repeat([one for *_, one in quads], 2).astype(np.int32)
+    return Textured(
+        vertices=np.concatenate([corners for corners, *_ in quads]),
+        faces=np.concatenate([square + 4 * k for k in range(n)]).astype(np.int32),
+        uv=np.concatenate([at for _, at, _ in quads]),
+        page=page,
+        pages=tuple(pages),
+        view=page,
+        vertex=np.arange(4 * n, dtype=np.int32),
+    )
 
 
 def wall_page(colour, person=False):

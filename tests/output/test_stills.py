@@ -1,16 +1,17 @@
 """Stills: what a camera would see of a model, pixel by pixel."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from stillmap.output.stills import BACKGROUND, looking_at, painted_share, pinhole, still
+from stillmap.output.stills import BACKGROUND, holding, looking_at, painted_share, pinhole, still
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from made_up_room import Textured, quad, room, together, wall_page
+from made_up_room import quad, room, together, wall_page
 
 SIZE = (96, 64)
 
@@ -47,9 +48,9 @@ def test_what_is_aslant_is_seen_in_perspective():
     page = np.zeros((4, 1000, 3), np.uint8)
     page[:, :, 0] = np.linspace(0, 250, 1000)
     floor = quad([(0, 20, -1.5), (0, -20, -1.5), (40, -20, -1.5), (40, 20, -1.5)], 0)
-    mesh, uv, number = floor
-    along = np.stack([mesh.vertices[mesh.faces][..., 0] / 40.0, uv[..., 1]], axis=-1)
-    textured = together([(mesh, along.astype(np.float32), number)], [page])
+    corners, at, number = floor
+    along = np.stack([corners[:, 0] / 40.0, at[:, 1]], axis=1)
+    textured = together([(corners, along, number)], [page])
     T, K = looking_at(np.zeros(3), np.array([1.0, 0.0, -0.5])), pinhole(SIZE, 1.0)
     seen = still(textured, T, K, SIZE)[..., 0].astype(float)
     v, u = np.mgrid[:64, :96]
@@ -76,7 +77,7 @@ def test_what_has_no_picture_is_grey_and_nothing_is_the_background():
     assert len(set(middle.tolist())) == 1
     assert (seen[0, 0] == BACKGROUND).all()
     assert painted_share(textured, ahead(), K, SIZE) == 0.0
-    painted = Textured(textured.mesh, textured.uv, textured.page + 1, (wall_page((1, 2, 3)),))
+    painted = replace(textured, page=textured.page + 1, pages=(wall_page((1, 2, 3)),))
     assert painted_share(painted, ahead(), exactly(2.0), SIZE) == 1.0
 
 
@@ -93,9 +94,7 @@ def test_without_backs_a_room_has_no_ceiling():
 
 def test_a_model_without_faces_is_all_background():
     nothing = together([facing(0)], [wall_page((9, 9, 9))])
-    empty = Textured(
-        nothing.mesh.part(np.zeros(2, bool)), nothing.uv[:0], nothing.page[:0], nothing.pages
-    )
+    empty = replace(nothing, faces=nothing.faces[:0], page=nothing.page[:0])
     assert (still(empty, ahead(), exactly(2.0), SIZE) == BACKGROUND).all()
 
 
@@ -103,6 +102,21 @@ def test_any_number_of_threads_gives_the_same():
     T, K = looking_at(np.array([1.0, -1.0, 1.4]), np.array([0.0, 3.0, 1.0])), pinhole(SIZE, 1.4)
     one, two = (still(room(), T, K, SIZE, threads=n) for n in (1, 3))
     assert np.array_equal(one, two)
+
+
+@pytest.mark.parametrize("direction", [(1, 0, 0), (-0.5, -0.7, 0.7), (0, 0, 1)])
+def test_all_that_is_to_be_seen_fills_the_picture(direction):
+    points = np.random.default_rng(0).uniform((-9, -2, 0), (4, 3, 5), (50, 3))
+    K = pinhole(SIZE, 0.8)
+    T = holding(points, np.array(direction, float), K, SIZE)
+    seen = (points @ T[:3, :3].T + T[:3, 3]) @ K.T
+    at = seen[:, :2] / seen[:, 2:]
+    assert (seen[:, 2] > 0).all()
+    assert (at >= -0.5).all()
+    assert (at <= np.array(SIZE) - 0.5).all()
+    # it touches two edges that lie across from each other, but for a margin
+    reach = np.abs(at - (np.array(SIZE) - 1) / 2) / (np.array(SIZE) / 2)
+    assert reach.max() > 0.85
 
 
 @pytest.mark.parametrize("target", [(3, 1, 0), (0, 0, -5), (0.0, -2.0, 4.0)])

@@ -9,7 +9,7 @@ from stillmap import se2, se3
 from stillmap.errors import InputError
 from stillmap.recording import Recording
 from stillmap.recording.images import Camera, Images
-from stillmap.texture.views import ViewOptions, colours_of, poses_at, views_of
+from stillmap.texture.views import ViewOptions, colours_of, poses_at, usable, views_of
 
 S = 10**9
 K = np.array([[10.0, 0.0, 7.5], [0.0, 10.0, 5.5], [0.0, 0.0, 1.0]])
@@ -179,6 +179,14 @@ def test_grey_pictures_have_colours_too_and_a_size_may_be_found():
     found = colours_of(pictures, view)
     assert found is not None
     np.testing.assert_array_equal(found, grey[..., None].repeat(3, axis=2))
+
+
+def test_what_could_be_used_is_known_without_poses():
+    both = images([0.0, 0.05, 0.1, 9.0], (CAMERA, replace(CAMERA, K=None)), [0, 1, 0, 0])
+    found, left_out = usable(recording([0.0, 0.1], both))
+    assert found.tolist() == [True, False, True, False]
+    assert sorted(left_out.values()) == [1, 1]
+    assert usable(recording([0.0], None))[1] == {}
 
 
 @pytest.mark.parametrize("given", [{"pause": 0.0}, {"beyond": -0.1}, {"pause": float("nan")}])

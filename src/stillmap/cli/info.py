@@ -131,11 +131,13 @@ def _more(found: dict[str, Any]) -> Iterator[str]:
         yield _row("recorded poses", f"{text}: used with --poses recording")
     if images is None:
         return
-    yield _row("pictures", str(images["count"]))
+    yield _row("pictures", f"{images['count']}, {images['usable']} of them usable")
     for camera in images["cameras"]:
         known = [word for word in ("calibrated", "placed") if camera[word]]
         size = f"{camera['count']} of {camera['width']} x {camera['height']} pixels"
         yield _row("  camera", f"{camera['name']}, {size}, {' and '.join(known) or 'uncalibrated'}")
+    for reason, count in images["left_out"].items():
+        yield _row("  left out", f"{count}: {reason}")
 
 
 def _sensor(sensor: dict[str, Any]) -> Iterator[str]:

@@ -82,7 +82,8 @@ def _add_map_flags(p: argparse._ArgumentGroup) -> None:
         "--resolution",
         metavar="M",
         type=float,
-        help="edge of a map cell in metres (default: 0.05); of a voxel in 3D (0.15)",
+        help="edge of a map cell in metres (default: 0.05); of a voxel in 3D (0.15, of depth "
+        "cameras 0.05)",
     )
     p.add_argument(
         "--map-mode",

@@ -12,15 +12,9 @@ import numpy as np
 from PIL import Image
 
 from stillmap.output.report_tables import share_text
-from stillmap.output.stills import (
-    Float,
-    Picture,
-    TexturedLike,
-    looking_at,
-    painted_share,
-    pinhole,
-    still,
-)
+from stillmap.output.stills import Float, Picture, holding, painted_share, pinhole, still
+from stillmap.surface.mesh import Mesh
+from stillmap.texture.textured import Textured
 
 PLACE_SIZE, OBJECT_SIZE = (640, 400), (300, 225)  # pixels
 MOST_OBJECTS = 8
@@ -32,7 +26,12 @@ _APART = 0.2  # of the way between two stills along it
 _WIDE, _NARROW = math.radians(80.0), math.radians(45.0)  # of a still along the way, of the others
 _ABOVE = np.array([-0.5, -0.75, 0.7])  # from where the whole is seen
 _MOST = (0.03, 0.97)  # quantiles of the vertices that are in the picture then
-_AROUND = (math.radians(-35.0), math.radians(85.0), math.radians(205.0))  # from ahead, turned left
+# turned left from ahead
+_SIDES = {
+    "from ahead": math.radians(-35.0),
+    "from its left": math.radians(85.0),
+    "from behind": math.radians(205.0),
+}
 _RAISED = math.radians(20.0)
 _QUALITY = 85  # of JPEG: photographs, which as PNG would be several megabytes
 
@@ -69,10 +68,10 @@ class Stills:
 
 
 def stills_of(
-    filtered: TexturedLike,
-    sharpest: TexturedLike | None,
+    filtered: Textured,
+    sharpest: Textured | None,
     T_camera_map: Float,
-    objects: Mapping[int, TexturedLike],
+    objects: Mapping[int, Textured],
     threads: int = 1,
 ) -> Stills:
     """Two stills along the way, one from above, and three of each of the first objects.
@@ -85,7 +84,7 @@ def stills_of(
             be shown.
         threads: the result does not depend on them.
     """
-    areas, place = filtered.mesh.areas(), list[PlaceStill]()
+    areas, place = Mesh(filtered.vertices, filtered.faces).areas(), list[PlaceStill]()
 
     def taken(caption: str, T: Float, angle: float, from_behind: bool) -> PlaceStill:
         K = pinhole(PLACE_SIZE, angle)
@@ -96,30 +95,27 @@ def stills_of(
         ]
         return PlaceStill(caption, pictures[0], pictures[1] if sharpest is not None else None)
 
-    if len(filtered.mesh):
+    if len(filtered):
         along = _along(filtered, sharpest, T_camera_map, threads)
         place += [taken("where the robot looked", T, _WIDE, True) for T in along]
         place.append(taken("from above", _from_above(filtered), _NARROW, False))
+    shown = [(n, one) for n, one in objects.items() if len(one)]
     return Stills(
         place,
-        [(n, object_stills(one, threads)) for n, one in list(objects.items())[:MOST_OBJECTS]],
+        [(n, object_stills(one, threads)) for n, one in shown[:MOST_OBJECTS]],
         float(areas[filtered.page < 0].sum() / max(float(areas.sum()), 1e-12)),
     )
 
 
-def object_stills(textured: TexturedLike, threads: int = 1) -> list[Picture]:
+def object_stills(textured: Textured, threads: int = 1) -> list[Picture]:
     """Three sides of an object, (h, w, 3) uint8 each; x ahead and z up in its frame."""
-    corners = textured.mesh.corners.reshape(-1, 3)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    middle, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-    K = pinhole(OBJECT_SIZE, _NARROW)
-    # as high as the picture is the ball that holds it
-    away = radius / math.sin(math.atan(0.5 * OBJECT_SIZE[1] / K[1, 1]))
+    used = textured.vertices[np.unique(textured.faces)]
+    corners, K = _box(used.min(axis=0), used.max(axis=0)), pinhole(OBJECT_SIZE, _NARROW)
     pictures = []
-    for angle in _AROUND:
+    for angle in _SIDES.values():
         towards = np.array([math.cos(angle), math.sin(angle), math.tan(_RAISED)])
-        eye = middle + max(away, 0.1) * towards / np.linalg.norm(towards)
-        pictures.append(still(textured, looking_at(eye, middle), K, OBJECT_SIZE, threads=threads))
+        T = holding(corners, towards, K, OBJECT_SIZE)
+        pictures.append(still(textured, T, K, OBJECT_SIZE, threads=threads))
     return pictures
 
 
@@ -167,8 +163,8 @@ def _pair(one: PlaceStill) -> str:
 
 def _sides(number: int, pictures: Sequence[Picture]) -> str:
     figures = "".join(
-        _figure(f"Object {number}", f"{n} of {len(pictures)}", picture)
-        for n, picture in enumerate(pictures, 1)
+        _figure(f"Object {number}", side, picture)
+        for side, picture in zip(_SIDES, pictures, strict=True)
     )
     return f'<div class="row">{figures}</div>'
 
@@ -183,7 +179,7 @@ def _figure(title: str, caption: str, picture: Picture) -> str:
 
 
 def _along(
-    filtered: TexturedLike, sharpest: TexturedLike | None, T_camera_map: Float, threads: int
+    filtered: Textured, sharpest: Textured | None, T_camera_map: Float, threads: int
 ) -> list[Float]:
     """Two of the places, apart, from which most of the picture is painted, and most of all where
     somebody was taken out."""
@@ -206,11 +202,12 @@ def _along(
     return [T_camera_map[n] for n in sorted(chosen)]
 
 
-def _from_above(textured: TexturedLike) -> Float:
-    low, high = np.quantile(textured.mesh.vertices, _MOST, axis=0)
-    middle, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-    K = pinhole(PLACE_SIZE, _NARROW)
-    away = radius / math.sin(math.atan(0.5 * PLACE_SIZE[1] / K[1, 1]))
-    # what is long fills the picture from side to side
-    eye = middle + max(0.8 * away, 0.1) * _ABOVE / np.linalg.norm(_ABOVE)
-    return looking_at(eye, middle)
+def _from_above(textured: Textured) -> Float:
+    low, high = np.quantile(textured.vertices, _MOST, axis=0)
+    return holding(_box(low, high), _ABOVE, pinhole(PLACE_SIZE, _NARROW), PLACE_SIZE)
+
+
+def _box(low: Float, high: Float) -> Float:
+    """(8, 3) corners."""
+    sides = ((np.arange(8)[:, None] >> np.arange(3)) & 1).astype(bool)
+    return np.where(sides, high, low)

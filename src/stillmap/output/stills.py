@@ -1,14 +1,14 @@
 """Pictures of a textured model, by its z-buffer: what the report shows of it."""
 
 import math
-from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core
 from stillmap.surface.mesh import Mesh
+from stillmap.texture.sampling import bilinear
+from stillmap.texture.textured import Textured
 
 Float = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -18,28 +18,8 @@ _FINER = 2  # pixels along an edge that are drawn for one that is shown: texture
 _NEAR = 0.05  # m
 _GREY = 150.0  # of faces without a picture, seen straight
 _SLANTED = 70.0  # their grey seen along them: edges show
+_MARGIN = 1.05
 _BLOCK = 1 << 17  # pixels that are painted together
-
-
-class TexturedLike(Protocol):
-    """A mesh with F faces, and what each looks like.
-
-    Attributes:
-        mesh: the faces.
-        uv: (F, 3, 2), of each corner: the share of the page's width from the left, and of its
-            height from the top.
-        page: (F,) which page a face is painted from; -1: none shows it.
-        pages: (H, W, 3) uint8 each.
-    """
-
-    @property
-    def mesh(self) -> Mesh: ...
-    @property
-    def uv(self) -> NDArray[np.float32]: ...
-    @property
-    def page(self) -> NDArray[np.int32]: ...
-    @property
-    def pages(self) -> Sequence[Picture]: ...
 
 
 def pinhole(size: tuple[int, int], field_of_view: float) -> Float:
@@ -53,7 +33,7 @@ def pinhole(size: tuple[int, int], field_of_view: float) -> Float:
 
 
 def still(
-    textured: TexturedLike,
+    textured: Textured,
     T_camera_map: Float,
     K: Float,
     size: tuple[int, int],
@@ -64,7 +44,7 @@ def still(
     """What an ideal camera would see of a model, unlit: its textures, grey where it has none.
 
     Args:
-        textured: see TexturedLike.
+        textured: the model.
         T_camera_map: (4, 4), x right, y down, z ahead in the camera.
         K: (3, 3) of the picture, see `pinhole`.
         size: width and height in pixels.
@@ -78,7 +58,7 @@ def still(
     fine = K.copy()
     fine[:2] *= _FINER
     fine[:2, 2] += 0.5 * _FINER - 0.5
-    mesh, kept = textured.mesh, np.arange(len(textured.mesh))
+    mesh, kept = Mesh(textured.vertices, textured.faces), np.arange(len(textured))
     if not from_behind:
         eye = -T_camera_map[:3, :3].T @ T_camera_map[:3, 3]
         front = np.einsum("ij,ij->i", eye - mesh.centres, mesh.normals()) > 0.0
@@ -89,23 +69,23 @@ def still(
     picture = np.empty((height * width, 3), np.float32)
     picture[:] = BACKGROUND
     seen = np.flatnonzero(face >= 0)
-    corners = mesh.vertices @ T[:3, :3].T + T[:3, 3]
+    planes, which = _planes(textured, T, kept, face.ravel()[seen])
     for first in range(0, len(seen), _BLOCK):
-        at = seen[first : first + _BLOCK]
-        row, column = np.divmod(at, width)
-        rays = _rays(fine, column, row)
-        picture[at] = _painted(textured, kept[face.ravel()[at]], corners, rays)
+        at = slice(first, first + _BLOCK)
+        row, column = np.divmod(seen[at], width)
+        whose = kept[face.ravel()[seen[at]]]
+        picture[seen[at]] = _painted(textured, whose, planes[which[at]], _rays(fine, column, row))
     parts = picture.reshape(size[1], _FINER, size[0], _FINER, 3)
     small: NDArray[np.float32] = parts.mean(axis=(1, 3))
     return np.rint(small).astype(np.uint8)
 
 
 def painted_share(
-    textured: TexturedLike, T_camera_map: Float, K: Float, size: tuple[int, int], threads: int = 1
+    textured: Textured, T_camera_map: Float, K: Float, size: tuple[int, int], threads: int = 1
 ) -> float:
     """Share of the pixels of such a picture that some page paints."""
-    vertices = np.ascontiguousarray(textured.mesh.vertices)
-    faces, T = np.ascontiguousarray(textured.mesh.faces), np.ascontiguousarray(T_camera_map)
+    vertices = np.ascontiguousarray(textured.vertices)
+    faces, T = np.ascontiguousarray(textured.faces), np.ascontiguousarray(T_camera_map)
     _, face = _core.z_buffer(vertices, faces, K, T, *size, near=_NEAR, threads=threads)
     return float((textured.page[face[face >= 0]] >= 0).sum() / face.size)
 
@@ -117,29 +97,51 @@ def _rays(K: Float, column: NDArray[np.intp], row: NDArray[np.intp]) -> Float:
     return np.stack([x, y, np.ones(len(x))], axis=1)
 
 
-def _painted(
-    textured: TexturedLike, faces: NDArray[np.intp], corners: Float, rays: Float
-) -> NDArray[np.float32]:
-    """(n, 3) colours where rays meet the faces (n,) that they see.
+def _planes(
+    textured: Textured, T: Float, kept: NDArray[np.intp], seen: NDArray[np.int32]
+) -> tuple[Float, NDArray[np.intp]]:
+    """(k, 3, 3) of the faces that are seen, and (n,) which of them each pixel sees.
+
+    A ray meets a face a, b, c where its products with b x c, c x a and a x b say how near it is to
+    a, b and c: see reference/z_buffer.py.
 
     Args:
-        textured: see TexturedLike.
+        textured: the model.
+        T: (4, 4) T_camera_map.
+        kept: (F',) faces that were drawn.
+        seen: (n,) which of these each pixel sees.
+    """
+    used = np.zeros(len(kept), np.bool_)
+    used[seen] = True
+    number = np.cumsum(used) - 1
+    places = textured.vertices[textured.faces[kept[used]]] @ T[:3, :3].T + T[:3, 3]
+    a, b, c = (places[:, k] for k in range(3))
+    return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1), number[seen]
+
+
+def _painted(
+    textured: Textured, faces: NDArray[np.intp], planes: Float, rays: Float
+) -> NDArray[np.float32]:
+    """(n, 3) colours where rays meet the faces that they see.
+
+    Args:
+        textured: the model.
         faces: (n,).
-        corners: (V, 3) metres in the camera's frame.
+        planes: (n, 3, 3), see `_planes`.
         rays: (n, 3) in the camera's frame.
     """
-    a, b, c = (corners[textured.mesh.faces[faces, k]] for k in range(3))
-    # where a ray meets a plane, by Cramer's rule: see reference/z_buffer.py
-    parts = (np.cross(b, c), np.cross(c, a), np.cross(a, b))
-    across = np.stack([np.einsum("ij,ij->i", rays, part) for part in parts], axis=1)
+    across = np.matmul(planes, rays[:, :, None])[..., 0]
     total = across.sum(axis=1, keepdims=True)
     weights = np.clip(across / np.where(total == 0.0, 1.0, total), 0.0, 1.0)
-    colours = _shaded(parts[0] + parts[1] + parts[2], rays)
-    page = textured.page[faces]
+    page, colours = textured.page[faces], np.empty((len(faces), 3), np.float32)
+    plain = np.flatnonzero(page < 0)
+    colours[plain] = _shaded(planes[plain].sum(axis=1), rays[plain])
     for number, texture in enumerate(textured.pages):
         on = np.flatnonzero(page == number)
-        uv = np.einsum("ij,ijk->ik", weights[on], textured.uv[faces[on]])
-        colours[on] = _sampled(texture, uv)
+        if len(on):
+            corners = textured.uv[textured.faces[faces[on]]]
+            uv = np.matmul(weights[on, None, :], corners)[:, 0]
+            colours[on] = bilinear(texture, uv * texture.shape[1::-1] - 0.5)
     return colours
 
 
@@ -151,20 +153,15 @@ def _shaded(normals: Float, rays: Float) -> NDArray[np.float32]:
     return np.repeat(grey[:, None], 3, axis=1).astype(np.float32)
 
 
-def _sampled(texture: Picture, uv: Float) -> NDArray[np.float32]:
-    """(n, 3) colours between the middles of texels."""
-    height, width = texture.shape[:2]
-    at = uv * (width, height) - 0.5
-    low = np.floor(at).astype(np.int64)
-    share = (at - low).astype(np.float32)
-    out = np.zeros((len(uv), 3), np.float32)
-    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        x, y = np.clip(low[:, 0] + dx, 0, width - 1), np.clip(low[:, 1] + dy, 0, height - 1)
-        weight = (share[:, 0] if dx else 1.0 - share[:, 0]) * (
-            share[:, 1] if dy else 1.0 - share[:, 1]
-        )
-        out += weight[:, None] * texture[y, x]
-    return out
+def holding(points: Float, direction: Float, K: Float, size: tuple[int, int]) -> Float:
+    """(4, 4) T_camera_map of a camera as near as all points (n, 3) are in its picture, which looks
+    at their middle from a direction (3,)."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    towards = direction / np.linalg.norm(direction)
+    x, y, z = looking_at(middle + towards, middle)[:3, :3] @ (points - middle).T
+    aside = np.abs(x) * K[0, 0] / (0.5 * size[0]), np.abs(y) * K[1, 1] / (0.5 * size[1])
+    away = max(float((np.maximum(*aside) - z).max()), 2.0 * _NEAR - float(z.min()))
+    return looking_at(middle + _MARGIN * away * towards, middle)
 
 
 def looking_at(eye: Float, target: Float) -> Float:

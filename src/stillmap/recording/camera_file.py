@@ -142,7 +142,7 @@ def _lens(table: Mapping[str, Any]) -> tuple[str | None, Float | None]:
         if distortion is not None:
             raise ValueError(f"'distortion' wants 'model': one of {_models()}")
         return None, None
-    if model not in MODELS:
+    if not isinstance(model, str) or model not in MODELS:
         raise ValueError(f"'model' must be one of {_models()}, got {model!r}")
     distortion = np.zeros(0) if distortion is None else distortion
     if len(distortion) not in MODELS[model]:

@@ -16,6 +16,7 @@ from stillmap.recording.clouds.files import files_in, stamps_in, stem_of
 from stillmap.recording.clouds.kitti_times import read_times, rows_of
 from stillmap.recording.images import Camera, Images
 from stillmap.recording.model import Recording
+from stillmap.texts import require_regular
 
 _NO_IMAGES = Images(np.zeros(0, np.int64), np.zeros(0, np.int32), (), lambda _: np.zeros((0, 0)))
 
@@ -110,6 +111,7 @@ def _added(name: str, given: GivenCamera, folder: Path, where: str) -> Images:
     if not files:
         raise InputError("holds no pictures", where=str(folder), hint=f"camera '{name}' of {where}")
     if given.times is not None:
+        require_regular(given.times)
         times = read_times(given.times)
         rows = rows_of(files, len(times), given.times)
         stamps = [None if row is None else times[row] for row in rows]

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.recording import spool
-from stillmap.recording.images import Images
 from stillmap.recording.model import Recording
 from stillmap.recording.ranges import RangeRule
 
@@ -44,7 +43,7 @@ def facts(recording: Recording) -> dict[str, Any]:
         "spin": source["spin"].get("direction"),
         "odometry": _odometry(recording, source["odometry"]),
         "recorded_poses": _way(recording.T_recorded_base),
-        "images": _pictures(recording.images),
+        "images": _pictures(recording),
         "sensors": _sensors(recording, source["sensors"]),
         "own_body": [noted for noted in source["own_body"] if _is_box(noted)],
         **{key: source[key] for key in (*_DAMAGE, "skipped_unit", *_TABLES, *_LISTS, *_WORDS)},
@@ -172,22 +171,29 @@ def _way(T: NDArray[np.float64] | None) -> dict[str, Any] | None:
     return {"path_length_m": float(metres.sum()), "turned_deg": float(degrees.sum())}
 
 
-def _pictures(images: Images | None) -> dict[str, Any] | None:
+def _pictures(recording: Recording) -> dict[str, Any] | None:
+    images = recording.images
     if images is None:
         return None
+    from stillmap.texture.views import usable  # takes long to load
+
+    used, left_out = usable(recording)
     taken = np.bincount(images.camera, minlength=len(images.cameras))
     return {
         "count": len(images),
+        "usable": int(used.sum()),
+        "left_out": left_out,
         "cameras": [
             {
                 "name": camera.name,
                 "count": int(n),
+                "usable": int(used[images.camera == number].sum()),
                 "width": camera.width,
                 "height": camera.height,
                 "calibrated": camera.K is not None,
                 "placed": camera.T_base_camera is not None,
             }
-            for camera, n in zip(images.cameras, taken, strict=True)
+            for number, (camera, n) in enumerate(zip(images.cameras, taken, strict=True))
         ],
     }
 

@@ -37,7 +37,9 @@ class SlamOptions:
     """The M-step over poses and map."""
 
     resolution: float = field_with_doc(0.05, "m, edge of a map cell")
-    voxel: float = field_with_doc(0.15, "m, the same of 3D recordings")
+    voxel: float | None = field_with_doc(
+        None, "m, the same of 3D recordings; unset: 0.15, of depth cameras 0.05"
+    )
     spacing: float = field_with_doc(
         0.2, "m, rad or 5 s between scans that later ones are registered against"
     )
@@ -54,7 +56,7 @@ class SlamOptions:
     def __post_init__(self) -> None:
         if not 0.005 <= self.resolution <= 10.0:
             raise ValueError("'slam.resolution' wants 0.005 to 10 metres")
-        if not 0.005 <= self.voxel <= 10.0:
+        if self.voxel is not None and not 0.005 <= self.voxel <= 10.0:
             raise ValueError("'slam.voxel' wants 0.005 to 10 metres")
         if not 0.0 <= self.spacing <= 100.0:
             raise ValueError("'slam.spacing' wants 0 to 100 metres")

@@ -81,6 +81,17 @@ def views_of(
     return views, dict(left_out)
 
 
+def usable(recording: Recording) -> tuple[Mask, dict[str, int]]:
+    """(N,) which images could be used, were the poses known; and how many could not, by reason."""
+    out = np.zeros(0 if recording.images is None else len(recording.images), np.bool_)
+    if recording.dimension != 3:
+        return out, {"of a recording in 2D": len(out)} if len(out) else {}
+    still = np.broadcast_to(np.eye(4), (recording.n_scans, 4, 4))
+    views, left_out = views_of(recording, still)
+    out[[view.image for view in views]] = True
+    return out, left_out
+
+
 def colours_of(images: Images, view: View) -> NDArray[np.uint8] | None:
     """(height, width, 3) the picture of a view; None where it is damaged, or no longer there."""
     try:

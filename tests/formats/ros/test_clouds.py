@@ -5,6 +5,7 @@ import io
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from stillmap.errors import InputError
 from stillmap.recording import read
@@ -292,3 +293,26 @@ def test_where_a_camera_looks_through(bag, messages, rng):
     np.testing.assert_array_equal(camera.K, [[9, 0, 2], [0, 9, 3], [0, 0, 1]])
     assert camera.model == "plumb_bob"
     np.testing.assert_array_equal(camera.distortion, np.arange(5.0))
+
+
+@pytest.mark.parametrize("name", ["image_rect", "image_rect_color"])
+def test_rectified_pictures_have_their_own_camera(bag, messages, rng, name):
+    grey = rng.integers(0, 256, (6, 4), np.uint8)
+    kind = "sensor_msgs/msg/CameraInfo"
+    region = messages.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+    turn = Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
+    raw = np.array([9.0, 0, 2, 0, 9, 3, 0, 0, 1])
+    P = np.array([8.0, 0, 2.5, -0.8, 0, 8, 3.5, 0, 0, 0, 1, 0])
+    values = ["plumb_bob", np.arange(5.0), raw, turn.ravel(), P, 0, 0, region]
+    info = messages.make(kind, messages.header(START, "camera"), 6, 4, *values)
+    pictures = [
+        ("/cam/camera_info", START, (kind, info)),
+        (f"/cam/{name}", START + 1, picture(messages, START + 1, grey, "mono8")),
+    ]
+    camera = read(bag(with_pictures(messages, rng, pictures))).images.cameras[0]
+    np.testing.assert_array_equal(camera.K, [[8, 0, 2.5], [0, 8, 3.5], [0, 0, 1]])
+    assert (camera.model, len(camera.distortion)) == ("", 0)
+    # what the camera saw ahead, the rectified one sees turned
+    ahead = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    np.testing.assert_allclose(camera.T_base_camera[:3, :3], ahead @ turn.T, atol=1e-12)
+    np.testing.assert_allclose(camera.T_base_camera[:3, 3], [0.1, 0.2, 0.3])

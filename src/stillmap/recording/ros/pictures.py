@@ -1,16 +1,20 @@
 """Image, CompressedImage and CameraInfo messages: found while reading, loaded when asked for."""
 
 import io
+import re
 import warnings
 from array import array
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap import se2
 from stillmap.errors import InputError
+from stillmap.recording.clouds.rigid import transform
 from stillmap.recording.images import Camera, Images
 from stillmap.recording.ros.channels import Bag, Message
 from stillmap.recording.ros.messages import CAMERA_INFO, COMPRESSED, decoded, frame, stamp_ns
@@ -37,6 +41,10 @@ _BAYER = {
     "bayer_gbrg8": "gbrg",
     "bayer_grbg8": "grbg",
 }
+
+
+_RECTIFIED = re.compile(r"/image_rect(_color|_mono)?(/compressed)?$")
+_NONE = np.empty(0)
 
 
 class Pictures:
@@ -94,19 +102,40 @@ class Pictures:
         T = None if placed is None or placed.moves else placed.T[0]
         if info is None:
             return Camera(topic, 0, 0, None, "", np.empty(0), T)
-        # ROS 1 names the fields with capitals
-        K = np.asarray(getattr(info, "k", None) if hasattr(info, "k") else info.K, float)
-        D = np.asarray(getattr(info, "d", None) if hasattr(info, "d") else info.D, float)
-        usable = K.shape == (9,) and np.isfinite(K).all() and K[0] > 0.0
-        return Camera(
-            topic,
-            int(info.width),
-            int(info.height),
-            K.reshape(3, 3) if usable else None,
-            str(info.distortion_model),
-            D if np.isfinite(D).all() else np.empty(0),
-            T,
+        return _calibrated(
+            Camera(topic, int(info.width), int(info.height), None, "", _NONE, T), info
         )
+
+
+def _calibrated(camera: Camera, info: Any) -> Camera:
+    """The camera with what a CameraInfo says: of raw pictures, or of those made from them that
+    are rectified, by the name of their topic."""
+    # ROS 1 names the fields with capitals
+    K, D, R, P = (
+        np.asarray(getattr(info, name if hasattr(info, name) else name.upper()), float)
+        for name in "kdrp"
+    )
+    if _RECTIFIED.search(camera.name):
+        K, D, model = P.reshape(-1)[[0, 1, 2, 4, 5, 6, 8, 9, 10]], _NONE, ""
+        camera = replace(camera, T_base_camera=_rectified(camera.T_base_camera, R))
+    else:
+        model = str(info.distortion_model)
+    usable = K.shape == (9,) and np.isfinite(K).all() and K[0] > 0.0
+    return replace(
+        camera,
+        K=K.reshape(3, 3) if usable else None,
+        model=model,
+        distortion=D if np.isfinite(D).all() else _NONE,
+    )
+
+
+def _rectified(T: NDArray[np.float64] | None, R: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """The place of a camera that is turned by R (9,); as it is where R is no rotation."""
+    try:
+        turn = transform(R, np.zeros(3))
+    except ValueError:
+        return T
+    return None if T is None else T @ se2.inverse(turn)
 
 
 def _camera_of(topic: str) -> str:
