@@ -26,11 +26,13 @@ def test_the_plan_lies_as_the_map_does(result_of):
     plan = read_scene(result_of(2)).plan
     x0, y0, x1, y1 = plan.window
     height, width = plan.picture.shape[:2]
-    assert (x1 - x0, y1 - y0) == pytest.approx((0.1 * width, 0.1 * height))
+    edge = (x1 - x0) / width
+    assert (y1 - y0) / height == pytest.approx(edge)
+    assert 0.1 / edge == pytest.approx(round(0.1 / edge))  # cells are whole pixels
     row, column = np.nonzero((plan.picture[..., :3] == 0).all(axis=2))
     # the wall is at the lowest y of what is known: far below in the picture
-    assert y1 - 0.1 * (row + 0.5) == pytest.approx(-3.0 + 0.1 * 10.5)
-    assert (x0 + 0.1 * column.min(), x0 + 0.1 * (column.max() + 1)) == pytest.approx((-3.0, 3.0))
+    assert (y1 - edge * (row.max() + 1), y1 - edge * row.min()) == pytest.approx((-2.0, -1.9))
+    assert (x0 + edge * column.min(), x0 + edge * (column.max() + 1)) == pytest.approx((-3.0, 3.0))
 
 
 def test_a_result_in_space(result_of):

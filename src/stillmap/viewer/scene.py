@@ -29,6 +29,7 @@ _MOST_PLACE = 1 << 20  # bytes of objects/NNNN.json
 _FAR = 8_000.0
 _GROUND = 0.05  # quantile of the heights near the way: walls reach up, holes are few
 _NEAR = 15.0  # m
+_SHARP = 2_000  # pixels along an edge of the plan: between them a browser draws what is blurred
 
 Float = NDArray[np.float64]
 Value = TypeVar("Value")
@@ -165,7 +166,8 @@ def _plan(folder: Path, clear: bool) -> Plan | None:
     picture = np.array(map_image(grid, window).convert("RGBA"))
     if clear:  # no shade of grey is that of what is unknown
         picture[(picture[..., :3] == UNKNOWN).all(axis=2), 3] = 0
-    return Plan(picture, window)
+    larger = max(1, _SHARP // max(picture.shape))
+    return Plan(picture.repeat(larger, axis=0).repeat(larger, axis=1), window)
 
 
 def _cloud(name: str, raw: thinning.Points, origin: Float) -> Cloud:
