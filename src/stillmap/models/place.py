@@ -66,7 +66,8 @@ def painted(
         threads: same result with any number.
         tell: called with how many views are looked at, and of how many.
     """
-    mesh, _ = divided(mesh, options.edge)
+    if views:
+        mesh, _ = divided(mesh, options.edge)
     beams, areas = sources.beams(), mesh.areas()
     candidates = Candidates.none(len(mesh), min(options.candidates, max(len(views), 1)))
     sharpest = Candidates.none(len(mesh), 1)

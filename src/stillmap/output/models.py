@@ -9,33 +9,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.output.map_npz import write_npz
-try:
-    from stillmap.output.meshes import write_glb
-except ImportError:
-    write_glb = None
+from stillmap.output.meshes import write_glb
 from stillmap.output.protocols import ModelsLike, PaintedLike, ViewLike
+from stillmap.surface.mesh import Mesh
+from stillmap.texture.options import TextureOptions
+from stillmap.texture.textured import Textured
 
 _MICROMETRES = 6  # digits
 _SQUARE_CENTIMETRES = 4
 
 
-def write_models(folder: Path, models: ModelsLike, n_images: int) -> None:
+def write_models(folder: Path, models: ModelsLike, n_images: int, options: TextureOptions) -> None:
     """Write models into a new result folder, and beside each what painted its faces.
 
     Args:
         folder: of the result; its `objects/` may be there already.
         models: of the place and of what moved.
         n_images: of the recording.
+        options: see TextureOptions.
     """
-    if len(models.painted.mesh.faces):
-        write_glb(folder / "mesh.glb", models.textured)
+    if len(models.textured):
+        write_glb(folder / "mesh.glb", _seen(models.textured), options)
         write_faces(folder / "mesh_faces.npz", models.painted, models.views, n_images, "map")
     objects = folder / "objects"
     if models.movers:
         objects.mkdir(exist_ok=True)
     for one in models.movers:
         name = f"{one.shape.id:04d}"
-        write_glb(objects / f"{name}.glb", one.textured)
+        write_glb(objects / f"{name}.glb", _seen(one.textured), options)
         painted, views = one.dressed.painted, one.dressed.views
         write_faces(objects / f"{name}_faces.npz", painted, views, n_images, "object")
         record = {
@@ -45,6 +46,11 @@ def write_models(folder: Path, models: ModelsLike, n_images: int) -> None:
         }
         text = json.dumps(record, allow_nan=False)
         (objects / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _seen(model: Textured) -> Textured | Mesh:
+    """What no picture shows is lit: its form is seen."""
+    return model if model.pages else Mesh(model.vertices, model.faces)
 
 
 def write_faces(

@@ -59,6 +59,7 @@ def save(
             more[TILTING] = tilting_record(tilting)
         if models is not None:
             images = (result if tilting is None else tilting).recording.images
-            write_models(folder, models, 0 if images is None else len(images))
+            count = 0 if images is None else len(images)
+            write_models(folder, models, count, result.options.mesh.texture)
             more["models"] = models_record(models)
         write_run_json(folder / RECORD, result, more)
