@@ -23,6 +23,7 @@ from stillmap.reference.field import (
     registration_gradient,
 )
 from stillmap.reference.fill import fill_surfaces
+from stillmap.reference.fusing import SignedDistances
 from stillmap.reference.grid import Grid, Grid2D, Grid3D, occupancy
 from stillmap.reference.held_out import StaticShares, StaticShares2D, StaticShares3D, held_out
 from stillmap.reference.look_counts import LookCounts, LookCounts2D, LookCounts3D
@@ -56,6 +57,7 @@ __all__ = [
     "LookCounts2D",
     "LookCounts3D",
     "Reading",
+    "SignedDistances",
     "StaticShares",
     "StaticShares2D",
     "StaticShares3D",

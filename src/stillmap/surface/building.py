@@ -12,11 +12,14 @@ from stillmap.surface.extraction import extracted, joined_whole, tiles_of, witho
 from stillmap.surface.mesh import Mesh
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import Patch, order_of, patches_of
+from stillmap.surface.resolution import voxel_of
 from stillmap.surface.thinning import thinned, within_budget
 from stillmap.threads import in_order
 
 Float = NDArray[np.float64]
 Tell = Callable[[int, int], None]
+
+_ASKED = 64  # scans of which the ranges are looked at
 
 
 def surface_of(
@@ -38,8 +41,9 @@ def surface_of(
         tell: called with what is done and what there is to do.
     """
     T = seen.T_map_sensor(poses)
-    order = order_of(seen, chosen_scans(T, seen.sensor, options), options)
-    voxel = options.voxel or 0.05
+    chosen = chosen_scans(T, seen.sensor, usual_range(seen), options)
+    order = order_of(seen, chosen, options)
+    voxel = options.voxel or voxel_of(seen, poses, order, options)
     n, done = len(order.groups), 0
 
     def weighed(make: Callable[[], Patch]) -> tuple[Patch, NDArray[np.float32]]:
@@ -104,22 +108,31 @@ def static_weights(
     return np.where(weight >= least, weight, 0.0).astype(np.float32)
 
 
+def usual_range(seen: Recording) -> float:
+    """Median range in metres of the hits of some scans; 0 where there are none."""
+    asked = np.unique(np.linspace(0, seen.n_scans - 1, min(seen.n_scans, _ASKED)).astype(np.intp))
+    parts = [seen.points[b][seen.hit[b]] for b in map(seen.beams_of, asked)]
+    ranges = np.concatenate([np.zeros(0), *(np.linalg.norm(part, axis=1) for part in parts)])
+    ranges = ranges[np.isfinite(ranges)]
+    return float(np.median(ranges)) if len(ranges) else 0.0
+
+
 def chosen_scans(
-    T_map_sensor: Float, sensor: NDArray[np.int32], o: SurfaceOptions
+    T_map_sensor: Float, sensor: NDArray[np.int32], range: float, o: SurfaceOptions
 ) -> NDArray[np.intp]:
     """The scans that tell something new: so many from each place, and for each direction.
 
     Args:
         T_map_sensor: (T, 4, 4).
         sensor: (T,) which sensor took each.
+        range: metres, usual.
         o: `apart`, `turned` and `looks`.
     """
     place, R = T_map_sensor[:, :3, 3], T_map_sensor[:, :3, :3]
-    chosen: list[int] = []
-    for t in range(len(place)):
-        of = np.array([k for k in chosen if sensor[k] == sensor[t]], np.intp)
-        near = of[np.linalg.norm(place[of] - place[t], axis=1) < o.apart]
+    chosen = np.zeros(len(place), np.bool_)
+    for t in np.arange(len(place)):
+        before = np.flatnonzero(chosen[:t] & (sensor[:t] == sensor[t]))
+        near = before[np.linalg.norm(place[before] - place[t], axis=1) < o.apart * range]
         cosine = 0.5 * (np.einsum("nij,ij->n", R[near], R[t]) - 1.0)
-        if np.count_nonzero(cosine > np.cos(o.turned)) < o.looks:
-            chosen.append(t)
-    return np.array(chosen, np.intp)
+        chosen[t] = np.count_nonzero(cosine > np.cos(o.turned)) < o.looks
+    return np.flatnonzero(chosen)

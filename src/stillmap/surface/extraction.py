@@ -107,7 +107,7 @@ def without_islands(mesh: Mesh, area: float) -> Mesh:
         return mesh
     V = len(mesh.vertices)
     a, b, c = mesh.faces.T
-    ones = np.ones(2 * len(mesh), np.bool_)
+    ones = np.ones(2 * len(mesh), np.int32)
     graph = coo_matrix((ones, (np.concatenate([a, b]), np.concatenate([b, c]))), (V, V))
     count, piece = connected_components(graph, directed=False)
     areas = np.bincount(piece[a], mesh.areas(), count)

@@ -26,8 +26,10 @@ class SurfaceOptions:
     )
     bend: float = field_with_doc(0.35, "rad between such a triangle's normal and those beside")
     pause: float = field_with_doc(1.0, "s without a scan after which rows are not neighbours")
-    apart: float = field_with_doc(0.5, "m that the sensor goes on until a scan tells something new")
-    turned: float = field_with_doc(0.3, "rad that it turns, likewise")
+    apart: float = field_with_doc(
+        0.05, "of the usual range, by which the sensor goes on until a scan tells something new"
+    )
+    turned: float = field_with_doc(0.1, "rad by which it turns, likewise")
     looks: int = field_with_doc(3, "scans from one place that are used")
     fewest: float = field_with_doc(0.0, "triangles that a voxel must be of, by their weights")
     island: float = field_with_doc(0.05, "m2, smaller pieces are left out")
@@ -53,7 +55,7 @@ _LIMITS = (
     ("steep", 0.0, 1.58),
     ("bend", 0.0, 3.2),
     ("pause", 0.0, 1e6),
-    ("apart", 0.0, 1000.0),
+    ("apart", 0.0, 100.0),
     ("turned", 0.0, 10.0),
     ("looks", 1, 1_000_000),
     ("fewest", 0.0, 1e9),

@@ -9,6 +9,8 @@ How a sensor looks about is told by its beams, whatever the recording was read f
 """
 
 from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -102,7 +104,7 @@ def patches_of(
     T = seen.T_map_sensor(poses)
     lengths: dict[tuple[int, int], int] = {}
     for scans in order.groups:
-        yield lambda scans=scans: _patch(seen, T, scans, order.planar, lengths, o)
+        yield partial(_patch, seen, T, scans, order.planar, lengths, o)
 
 
 def _patch(
@@ -131,16 +133,17 @@ def _patch(
             lengths[key] = rows.row_length(looking)
         faces = _of_image(points, use, looking, lengths[key], o)
     kept = surface_faces(points, origin, faces, o)
-    return Patch(points, kept.faces, beam, origin, kept.standoff)
+    used = np.zeros(len(points), np.bool_)
+    used[kept.faces] = True
+    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    return Patch(points[used], number[kept.faces], beam[used], origin[used], kept.standoff[used])
 
 
 def _between_rows(
     points: Float, use: NDArray[np.bool_], number: NDArray[np.int32], looking: Float
 ) -> NDArray[np.int32]:
     """Triangles between planar scans that follow one another, (R, W) numbers of their points."""
-    angle = np.array(
-        [rows.apart(looking[a], looking[b]) for a, b in zip(number[:-1], number[1:], strict=True)]
-    )
+    angle = np.array([rows.apart(looking[a], looking[b]) for a, b in pairwise(number)])
     usual = float(np.nanmedian(angle)) if np.isfinite(angle).any() else 0.0
     kept, gone = [0], 0.0
     breaks = []
@@ -164,7 +167,7 @@ def _of_image(
     if not length:
         return _in_any_order(use, looking, o)
     number = np.arange(len(points), dtype=np.int32).reshape(-1, length)
-    along, across = rows.apart(looking[:-1], looking[1:]), 0.0
+    along = rows.apart(looking[:-1], looking[1:])
     across = rows.apart(looking[:-length], looking[length:])
     if rows.apart(looking[number[:, -1]], looking[number[:, 0]]) < 2.0 * along:
         number = np.concatenate([number, number[:, :1]], axis=1)
@@ -194,7 +197,7 @@ def _in_any_order(use: NDArray[np.bool_], looking: Float, o: SurfaceOptions) -> 
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2])]
     chord = np.linalg.norm(seen[faces] - np.roll(seen[faces], 1, axis=1), axis=2).max(axis=1)
     faces = faces[chord <= o.widest * np.median(chord)]
-    return beams[faces].astype(np.int32)
+    return np.asarray(beams[faces], np.int32)
 
 
 def _unrolled(looking: Float) -> tuple[Float, Index]:

@@ -13,7 +13,9 @@ Bool = NDArray[np.bool_]
 
 _SMOOTHING = 2  # rounds in which normals are averaged with those beside
 _AROUND = 6  # triangles around a point that has neighbours on all sides
-_HALF = 0.73  # standard deviations that a point is off the mean of six beside, or less, half the time
+_HALF = (
+    0.73  # standard deviations that a point is off the mean of six beside, or less, half the time
+)
 _NOISES = 5.0  # standard deviations between the farthest and the nearest of three corners
 
 
@@ -99,24 +101,28 @@ def surface_faces(points: Float, origin: Float, faces: Faces, o: SurfaceOptions)
 def is_level(range: Float, faces: Faces) -> Bool:
     """(m,) whether the corners of triangles are as far away as each other, but for noise.
 
-    How much noise there is, neighbours tell: half of the points are nearer than that to the mean
-    range of those around.
-
     Args:
         range: (n,) metres.
         faces: (m, 3).
     """
-    if not len(faces):
-        return np.zeros(0, np.bool_)
     at = range[faces]
+    return np.asarray(np.ptp(at, axis=1) <= _NOISES * noise_of(range, faces))
+
+
+def noise_of(range: Float, faces: Faces) -> float:
+    """Standard deviation of ranges (n,) in metres, by what they are off those around.
+
+    Half of the points are nearer to the mean of their neighbours than noise lets them be; 0 where
+    no point has neighbours on all sides.
+    """
     count = np.bincount(faces.ravel(), minlength=len(range))
-    total = np.bincount(faces.ravel(), np.repeat(at.sum(axis=1), 3), len(range))
+    total = np.bincount(faces.ravel(), np.repeat(range[faces].sum(axis=1), 3), len(range))
     inside = count >= _AROUND
+    if not inside.any():
+        return 0.0
     # each triangle around counts the point itself, and each neighbour is of two
     around = (total[inside] - count[inside] * range[inside]) / (2 * count[inside])
-    off = np.abs(around - range[inside])
-    noise = float(np.median(off)) / _HALF if len(off) else 0.0
-    return np.asarray(at.max(axis=1) - at.min(axis=1) <= _NOISES * noise)
+    return float(np.median(np.abs(around - range[inside]))) / _HALF
 
 
 def point_normals(normals: Float, faces: Faces, n: int, rounds: int) -> Float:

@@ -1,0 +1,68 @@
+"""How fine a surface can be told: by how far beams lie apart, and how exact ranges are."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap import _core
+from stillmap.recording.model import Recording
+from stillmap.surface.options import SurfaceOptions
+from stillmap.surface.patches import Order, Patch, patches_of
+from stillmap.surface.triangles import noise_of
+
+Float = NDArray[np.float64]
+
+_ASKED = 8  # patches
+_FINEST, _COARSEST = 0.01, 0.2  # m
+_NOISES = 2.5  # standard deviations of ranges that a voxel is wide, at least
+_MEMORY = 1.5e9  # bytes for all voxels
+_CELL = 0.5  # m, of squares by which the area is measured
+_BEAMS = 200_000  # by which it is
+_LAYERS = 2.5  # blocks behind each other across a surface
+_BLOCK = 4200  # bytes
+
+
+def voxel_of(seen: Recording, poses: Float, order: Order, o: SurfaceOptions) -> float:
+    """m, the edge of a voxel: as far as beams lie apart where they end, and wider than noise.
+
+    Where that would take too much memory it is larger.
+
+    Args:
+        seen: 3D, without motion during its scans.
+        poses: (T, 4, 4) T_map_base.
+        order: see `order_of`.
+        o: see SurfaceOptions.
+    """
+    groups = order.groups
+    asked = np.unique(np.linspace(0, len(groups) - 1, min(len(groups), _ASKED)).astype(np.intp))
+    some = Order(order.planar, [groups[k] for k in asked])
+    parts = [make() for make in patches_of(seen, poses, some, o)]
+    parts = [one for one in parts if len(one.faces)]
+    if not parts:
+        return _COARSEST
+    apart = float(np.median([spacing(one) for one in parts]))
+    noise = float(np.median([range_noise(one) for one in parts]))
+    wanted = np.clip(max(apart, _NOISES * noise), _FINEST, _COARSEST)
+    return max(float(wanted), least_voxel(seen, poses))
+
+
+def spacing(patch: Patch) -> float:
+    """m, median distance between neighbouring beams across the line of sight."""
+    a, b, c = np.moveaxis(patch.points[patch.faces], 1, 0)
+    sight = patch.origin[patch.faces[:, 0]] - a
+    across = np.einsum("ni,ni->n", np.cross(b - a, c - a), sight) / np.linalg.norm(sight, axis=1)
+    return float(np.median(np.sqrt(np.maximum(across, 0.0))))
+
+
+def range_noise(patch: Patch) -> float:
+    """m, standard deviation of its ranges."""
+    return noise_of(np.linalg.norm(patch.points - patch.origin, axis=1), patch.faces)
+
+
+def least_voxel(seen: Recording, poses: Float) -> float:
+    """m, the edge of voxels that fit into memory, by the cells in which beams end."""
+    beams = np.arange(0, seen.n_beams, max(seen.n_beams // _BEAMS, 1))
+    beams = beams[seen.hit[beams]]
+    ends = seen.end_points(beams, poses)
+    cells = np.unique(np.floor(ends[np.isfinite(ends).all(axis=1)] / _CELL), axis=0)
+    bytes_of_one = _LAYERS * _BLOCK * len(cells) * (_CELL / _core.SignedDistances.edge) ** 2
+    return float(np.sqrt(bytes_of_one / _MEMORY))
