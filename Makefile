@@ -25,7 +25,7 @@ export PYTHONNOUSERSITE := 1
 unexport PYTHONPATH PYTHONHOME
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint stub sanitize fuzz check format clean
+.PHONY: help demo test test-slow test-models lint stub sanitize fuzz check format clean
 
 help:
 	@sed -n 's/^#  *//p' Makefile | sed -n '1,9p'
@@ -71,6 +71,14 @@ test: $(VENV)/tested
 test-slow: $(VENV)/tested
 	$(BIN)/python -m pytest -m slow
 
+# what others open models with; they are fetched once
+build/readers: tools/model_readers.sh
+	@echo "fetching what opens models into build/readers"
+	@tools/model_readers.sh build/readers
+
+test-models: $(VENV)/tested build/readers
+	$(BIN)/python -m pytest tests/contract/test_models.py
+
 lint: $(VENV)/tested
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
@@ -103,7 +111,7 @@ $(VENV)/fuzzed: $(VENV)/tested
 fuzz: $(VENV)/fuzzed
 	$(BIN)/python tests/fuzz/run.py $(FUZZ_SECONDS)
 
-check: lint test test-slow sanitize fuzz
+check: lint test test-slow test-models sanitize fuzz
 
 clean:
 	rm -rf $(VENV) build dist demo .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,5 +1,6 @@
 """A small populated place, mapped: the files that other people's programs read."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,9 @@ import pytest
 from stillmap.cli import main
 from stillmap.recording import Recording, folder
 from stillmap.simulation import scene_by_name, simulate, write_simulation
+
+# for opening_models.py here, and made_up_rooms.py
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "texture")]
 
 
 @pytest.fixture(scope="session")
