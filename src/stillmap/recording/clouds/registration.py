@@ -24,7 +24,7 @@ Float = NDArray[np.float64]
 # of the camera that such folders are made with (Kinect), per pixel of width, and in metres
 _FOCAL, _ASIDE = 525.0 / 640.0, -0.025
 _PICTURES = 16  # that are looked at
-_EDGES = 4000  # of each, upright and level ones
+_EDGES = 1500  # of each, upright and level ones
 _LEAP = 0.1  # of the logarithm of depth, over
 _APART = 3.0 / 640.0  # of the width
 _BETTER = 1.1  # by so much the colours are steeper where it is not laid over
@@ -86,7 +86,7 @@ def _steepest(usual: Float, edges: Sequence[_Edges]) -> Float:
     found = scipy.optimize.fmin(
         misfit,
         usual,
-        xtol=1e-4,
+        xtol=0.02,  # pixels
         ftol=1e-4,
         maxiter=_STEPS,
         disp=False,
