@@ -101,6 +101,9 @@ class ReadOptions:
     depth_scale: float | None = field_with_doc(
         None, "units of depth pictures per metre; unset: 1000, 5000 of TUM RGB-D"
     )
+    register: bool = field_with_doc(
+        True, "find where the colour camera of a folder like 7-Scenes sits, by the edges of things"
+    )
     level: bool = field_with_doc(
         True, "turn the recorded poses of RGB-D folders so that z is up: their world lies anyhow"
     )

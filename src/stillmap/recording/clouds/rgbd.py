@@ -19,6 +19,7 @@ from stillmap.recording.camera_file import GivenCamera
 from stillmap.recording.clouds import rgbd_folders
 from stillmap.recording.clouds.assembling import Cloud, Known, Source, assembled
 from stillmap.recording.clouds.levelling import levelled
+from stillmap.recording.clouds.registration import registered
 from stillmap.recording.clouds.rgbd_folders import Frames
 from stillmap.recording.images import Camera, Images
 from stillmap.recording.lines import Progress
@@ -92,7 +93,9 @@ def read(
             sources.append(Source(file.name, partial(_cloud, file, pose, grid), stamp_ns))
     if options.max_range is None:
         options = replace(options, max_range=max(options.depth_max, options.min_range + 1e-3))
-    images = _images(frames, depth, known.warnings)
+    may_register = options.register and frames.format == rgbd_folders.SCENES
+    may_register &= given.keys().isdisjoint((COLOUR, DEPTH))
+    images = _images(frames, depth, grid.scale if may_register else None, known.warnings)
     recording = assembled(sources, known, options, progress, scratch, images=images)
     rows, columns = grid.rays.shape[:2]
     recording.source["sensors"] = [{"name": DEPTH, "grid": [rows, columns]}]
@@ -161,8 +164,17 @@ def _no_pose(file: Path) -> Cloud:
     raise InputError("has no pose, as most others have", where=str(file))
 
 
-def _images(frames: Frames, depth: Camera, warnings: list[str]) -> Images | None:
-    """The colour pictures; their camera is that of depth where they are as large."""
+def _images(
+    frames: Frames, depth: Camera, scale: float | None, warnings: list[str]
+) -> Images | None:
+    """The colour pictures; their camera is that of depth where they are as large.
+
+    Args:
+        frames: the folder.
+        depth: the camera of depth.
+        scale: units of depth per metre, if it is in question whether both are one; else None.
+        warnings: more are added.
+    """
     for _, file in frames.colour:
         try:
             width, height = pictures.size_of(file)
@@ -175,5 +187,11 @@ def _images(frames: Frames, depth: Camera, warnings: list[str]) -> Images | None
                 "the colour camera sees is not known; --cameras FILE says so"
             )
             camera = replace(camera, K=None, model="", distortion=np.zeros(0))
+        elif scale is not None:
+            colour = dict(frames.colour)
+            pairs = [(file, colour[stamp]) for stamp, file in frames.depth if stamp in colour]
+            beside, said = registered(depth, scale, pairs)
+            camera = replace(beside, name=COLOUR)
+            warnings += [said] if said else []
         return cameras.from_files(frames.colour, camera)
     return None
