@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +18,15 @@ from stillmap.recording.images import Images
 from stillmap.stages import Stages
 from stillmap.surface.building import surface_of
 from stillmap.texture.baking import baked
-from stillmap.texture.textured import Textured
+from stillmap.texture.textured import Textured, replaced
 from stillmap.texture.things import Thing
 from stillmap.texture.view import View
 from stillmap.texture.views import views_of
 
 Float = NDArray[np.float64]
+Read = Callable[[int], NDArray[Any]]
+
+_SPOILED = 0.5  # probability that a picture shows static things only, below which it does not
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +55,8 @@ class Models:
     Attributes:
         painted: the surface of the place, and which of `views` paints each face.
         textured: with the pictures on it.
+        unfiltered: the same with the sharpest picture wherever that probably shows something that
+            moves, as it would be without labels; None where that is nowhere.
         views: the pictures that can be used.
         left_out: how many others there are, by reason.
         movers: models of what moved, in the order of the objects.
@@ -59,6 +65,7 @@ class Models:
 
     painted: Painted
     textured: Textured
+    unfiltered: Textured | None
     views: list[View]
     left_out: dict[str, int]
     movers: list[MoverModel]
@@ -108,18 +115,30 @@ def models_of(
     with stages.measure("texture"):
         read = _reader(sources.recording.images)
         textured = baked(place.mesh, place.view, views, read, options.texture)
+        unfiltered = _unfiltered(textured, place, views, read, options)
     with stages.measure("movers"):
         movers = []
         if options.objects.enabled:
             movers = _movers(sources, views, place, options, tell("building what moved"))
-    return Models(place, textured, views, left_out, movers, len(sources.objects))
+    return Models(place, textured, unfiltered, views, left_out, movers, len(sources.objects))
 
 
-def _reader(images: Images | None) -> Callable[[int], NDArray[np.uint8]]:
+def _unfiltered(
+    textured: Textured, place: Painted, views: list[View], read: Read, options: MeshOptions
+) -> Textured | None:
+    """With the sharpest picture on the faces of which that probably shows something that moves."""
+    spoiled = (place.sharpest >= 0) & (place.p_sharpest < _SPOILED)
+    if not spoiled.any():
+        return None
+    part = baked(place.mesh.part(spoiled), place.sharpest[spoiled], views, read, options.texture)
+    return replaced(textured, spoiled, part)
+
+
+def _reader(images: Images | None) -> Read:
     if images is not None:
         return images.read
 
-    def none(image: int) -> NDArray[np.uint8]:
+    def none(image: int) -> NDArray[Any]:
         raise IndexError(f"there is no picture {image}")
 
     return none

@@ -24,7 +24,7 @@ from stillmap.texture.things import Thing
 Float = NDArray[np.float64]
 
 _DYNAMIC = 0.5
-_FINEST, _COARSEST = 0.015, 0.06  # m, edges of voxels
+_FINEST, _COARSEST = 0.025, 0.06  # m, edges of voxels
 _OF_SPACING = 0.7  # of how far beams lie apart
 
 

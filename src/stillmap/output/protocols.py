@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.models.options import MeshOptions
 from stillmap.objects.options import ObjectOptions
 from stillmap.output.crops import Snapshot
 from stillmap.output.map_server import OutputOptions
@@ -229,11 +230,17 @@ class OptionsLike(Protocol):
         estimator: what said which beams are static: `stillmap`, `paper`, `hit-ratio` or
             `tracker`.
         objects: how moving things were found.
+        mesh: how models were made.
         output: options of the writers.
+        threads: how many may be used, 0: all.
     """
 
     @property
     def estimator(self) -> str: ...
+    @property
+    def threads(self) -> int: ...
+    @property
+    def mesh(self) -> MeshOptions: ...
     @property
     def objects(self) -> ObjectOptions: ...
     @property
@@ -457,6 +464,8 @@ class ModelsLike(Protocol):
     def painted(self) -> PaintedLike: ...
     @property
     def textured(self) -> Textured: ...
+    @property
+    def unfiltered(self) -> Textured | None: ...
     @property
     def views(self) -> Sequence[ViewLike]: ...
     @property

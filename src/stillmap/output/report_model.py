@@ -147,8 +147,8 @@ def _sentence(stills: Stills) -> str:
     )
     if any(one.sharpest is not None for one in stills.place):
         return (
-            "The surface that stands still: left with every part painted by the sharpest picture "
-            f"of it, right by one in which nothing that moves is before it. {grey}"
+            "The surface that stands still: left as the sharpest pictures would paint it, right by "
+            f"those in which nothing that moves is before it. {grey}"
         )
     return f"The surface that stands still, painted by pictures without what moves. {grey}"
 

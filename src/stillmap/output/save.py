@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from stillmap.output.atomic import new_folder
 from stillmap.output.beams import write_beams
 from stillmap.output.clouds import write_clouds
@@ -12,10 +14,12 @@ from stillmap.output.models import models_record, write_models
 from stillmap.output.objects import write_objects, write_traffic
 from stillmap.output.protocols import ModelsLike, ResultLike, TiltingLike
 from stillmap.output.report import write_report
+from stillmap.output.report_model import Stills, stills_of
 from stillmap.output.run_json import RECORD, write_run_json
 from stillmap.output.tilting import FOLDER as TILTING
 from stillmap.output.tilting import tilting_record, write_tilting
 from stillmap.output.trajectory import write_tum
+from stillmap.threads import resolved_threads
 
 
 def save(
@@ -52,7 +56,8 @@ def save(
         if result.options.objects.enabled:
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)
-        write_report(folder / "report.html", result, tilting)
+        stills = None if models is None else _stills(models, result.options.threads)
+        write_report(folder / "report.html", result, tilting, stills)
         more = {}
         if tilting is not None:
             write_tilting(folder, tilting)
@@ -63,3 +68,14 @@ def save(
             write_models(folder, models, count, result.options.mesh.texture)
             more["models"] = models_record(models)
         write_run_json(folder / RECORD, result, more)
+
+
+def _stills(models: ModelsLike, threads: int) -> Stills:
+    """What the report shows of models."""
+    return stills_of(
+        models.textured,
+        models.unfiltered,
+        np.array([view.T_camera_map for view in models.views]).reshape(-1, 4, 4),
+        {one.shape.id: one.textured for one in models.movers},
+        resolved_threads(threads),
+    )

@@ -28,7 +28,7 @@ class Textured:
         page: (F,) int32, -1: grey.
         pages: P pictures (h, w, 3) uint8, as photographed (sRGB).
         view: (F,) int32, which view's picture is on each face, -1: none.
-        vertex: (U,) int32, of the mesh it was made from.
+        vertex: (U,) int32, of the mesh it was made from; -1: it was not.
         unread: one line for each picture that could not be read; its faces are painted grey.
     """
 
@@ -53,3 +53,29 @@ class Textured:
         texel, of, _ = _core.texels(corners, w, h)
         out[texel] = mine[of]
         return out.reshape(h, w)
+
+
+def replaced(whole: Textured, of: NDArray[np.bool_], part: Textured) -> Textured:
+    """A mesh some of whose faces are painted otherwise.
+
+    Args:
+        whole: F faces.
+        of: (F,) which of them are those of `part`, in their order.
+        part: as many faces as `of` names.
+    """
+    if of.shape != (len(whole),) or np.count_nonzero(of) != len(part):
+        raise ValueError(f"of: expected ({len(whole)},) with {len(part)} faces")
+    faces, page, view = whole.faces.copy(), whole.page.copy(), whole.view.copy()
+    faces[of] = part.faces + np.int32(len(whole.vertices))
+    page[of] = np.where(part.page >= 0, part.page + np.int32(len(whole.pages)), part.page)
+    view[of] = part.view
+    return Textured(
+        np.concatenate([whole.vertices, part.vertices]),
+        faces,
+        np.concatenate([whole.uv, part.uv]),
+        page,
+        (*whole.pages, *part.pages),
+        view,
+        np.concatenate([whole.vertex, np.full(len(part.vertices), -1, np.int32)]),
+        (*whole.unread, *part.unread),
+    )
