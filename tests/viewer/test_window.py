@@ -113,6 +113,18 @@ def test_nothing_is_printed(result_of, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+def test_requests_that_make_no_sense_are_not_told_of(window, capfd):
+    for what in (b"nonsense\r\n\r\n", b"GET / HTTP/1.1\r\n\r\n", b""):
+        with socket.create_connection(("127.0.0.1", port_of(window)), timeout=10) as one:
+            one.sendall(what)
+            one.shutdown(socket.SHUT_WR)
+            while one.recv(4096):
+                pass
+    with get(window) as page:
+        assert page.status == 200
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_port_that_is_taken_is_refused(window, result_of):
     with pytest.raises(InputError, match="is taken"):
         Window(read_scene(result_of(2)), None, port_of(window))

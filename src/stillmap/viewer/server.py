@@ -1,5 +1,6 @@
 """A server of viser's that only this machine reaches, and whose page reaches nothing else."""
 
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,6 +33,8 @@ def started(port: int, label: str) -> Server:
     """
     console = rich.get_console()
     quiet, console.quiet = console.quiet, True  # viser prints where it is
+    # it tells of every request that makes no sense, with a trace
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     told = os.environ.pop(_OWN_PORT, None)
     try:
         with _guarded() as asked:
