@@ -119,18 +119,18 @@ def shown(
 ) -> Float:
     """(n,) how probably a view shows static things only where it sees faces (n,).
 
-    The product of two: that no thing that is followed stands before it then, and what beams taken
-    about then say. Of the corners of a face and its middle the least counts.
+    By what beams taken about then say, and where there are none by whether a thing that is followed
+    stands before it. Of the corners of a face and its middle the least counts.
     """
     corners, number = np.unique(mesh.faces[faces], return_inverse=True)
     points = np.concatenate([mesh.vertices[corners], mesh.centres[faces]])
     seconds = 1e-9 * (view.stamp_ns - beams.start_ns)
     there = at_time(things, seconds)
-    p = 1.0 - in_the_way(there, view.place, points, options.margin, options.sigma)
+    free = 1.0 - in_the_way(there, view.place, points, options.margin, options.sigma)
     found = told(view, *beams.about(view.stamp_ns, options.window), options.margin)
     local = view.in_camera(points)
     uv, ok = project(view.camera, local)
     uv = np.where(ok[:, None], uv, 0.0)  # corners just outside: as at the edge
-    p *= found.shown(uv, local[:, 2], options.margin, options.unseen)
+    p = found.shown(uv, local[:, 2], options.margin, options.unseen * free)
     of_corners = p[: len(corners)][number.reshape(-1, 3)].min(axis=1)
     return np.asarray(np.minimum(of_corners, p[len(corners) :]))

@@ -34,14 +34,17 @@ class Told(NamedTuple):
     dynamic: Float
     support: Float
 
-    def shown(self, uv: Float, depth: Float, margin: float, unseen: float) -> Float:
+    def shown(self, uv: Float, depth: Float, margin: float, unseen: Float) -> Float:
         """(n,) how probably the picture shows what stands still.
+
+        What is known otherwise, as that somebody is about there, counts where no beam tells: each
+        that ended on what stands still says that nobody is before it.
 
         Args:
             uv: (n, 2) pixels, within the picture.
             depth: (n,) metres ahead of the camera.
             margin: metres before a thing that moves, from where on it is in the way.
-            unseen: the probability where no beam tells of it.
+            unseen: (n,) the probability where no beam tells of it.
         """
         h, w = self.depth.shape
         column = np.clip((uv[:, 0] / self.cell).astype(np.intp), 0, w - 1)
@@ -71,8 +74,10 @@ def told(view: View, points: Float, p_static: NDArray[np.float32], margin: float
     depth, dynamic = np.full(shape, np.inf), np.zeros(shape)
     seen = ok & moves
     if seen.any():
+        at, away, p = uv[seen] / cell, local[seen, 2], 1.0 - p_static[seen]
+        first = _nearest_of_each(at, away)  # what lies behind in the same cell hides nothing more
         focal = _focal(camera) / cell
-        _grow(depth, dynamic, uv[seen] / cell, local[seen, 2], 1.0 - p_static[seen], focal, margin)
+        _grow(depth, dynamic, at[first], away[first], p[first], focal, margin)
     return Told(cell, depth, dynamic, support)
 
 
@@ -90,6 +95,14 @@ def _support(uv: Float, cell: float, shape: tuple[int, int]) -> Float:
     # as much as one beam right here
     near = ndimage.gaussian_filter(count.astype(np.float64), _WIDE, mode="constant")
     return np.asarray(near * (2.0 * np.pi * _WIDE**2))
+
+
+def _nearest_of_each(at: Float, away: Float) -> NDArray[np.intp]:
+    """Of the points (n, 2) in each cell the nearest."""
+    cells = np.floor(at).astype(np.int64)
+    order = np.lexsort((away, cells[:, 0], cells[:, 1]))
+    new = np.any(np.diff(cells[order], axis=0, prepend=cells[order[:1]] - 1) != 0, axis=1)
+    return order[new]
 
 
 def _grow(
