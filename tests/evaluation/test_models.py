@@ -155,6 +155,14 @@ def test_what_pictures_see_without_movers(z: float, turned: bool, off: float, sh
     assert free.mean() == pytest.approx(share, abs=0.02)
 
 
+def test_what_pictures_see_from_far_away_does_not_count() -> None:
+    record = _record(*_floor((-2, 2), (-1.5, 1.5)))
+    of_mesh = samples(record.vertices, record.faces, 20_000)
+    none = _pictures(np.zeros((30, 40), np.uint16))
+    free = seen_freely(record, of_mesh, none, T_WORLD_MAP, farthest=10**0.5)
+    assert free.mean() == pytest.approx(np.pi / 12, abs=0.01)  # a circle of 1 m
+
+
 def test_texture_scores_of_a_half_painted_floor() -> None:
     pytest.importorskip("skimage")
     mask = np.zeros((30, 40), np.uint16)

@@ -36,7 +36,9 @@ def of_model(args: argparse.Namespace) -> tuple[dict[str, Any], Iterable[str]]:
     record = model_folders.read_record(args.result / model_folders.RECORD, n)
     if record is not None:
         seed = seen.picture_truth.colour_seed
-        texture = texture_scores(record, glb.coloured, seen.pictures, standing, seed, T_world_map)
+        texture = texture_scores(
+            record, glb.coloured, seen.pictures, standing, seed, T_world_map, args.within
+        )
         scores["texture"] = texture.to_dict()
         lines += _texture_lines(texture)
     if (model_folders.objects_of(args.result) / "objects.json").exists():
