@@ -8,8 +8,9 @@ street by a spinning lidar. `stillmap map` makes the models, `stillmap eval mode
 Surface: mean and 95 % of how far it is off, cm, and the share of the places that the sensor saw, or
 saw from within 10 m, that lie within 5 cm of it. Texture: the share that shows movers, the share of
 what some picture sees without movers, or sees from within 10 m, that is textured, and CIEDE2000.
-Movers: the share of those that were tracked of which there is a model, chamfer distance in cm, and
-the share of their textures that shows anything else.
+Movers: the share of those that were tracked of which there is a model, and of those of them that
+100 beams met within a second; chamfer distance in cm, and the share of their textures that shows
+anything else.
 Beside it the same models with pictures chosen by their resolution alone (`mesh.choice.believe`),
 unless --alone is given.
 """
@@ -74,12 +75,14 @@ COLUMNS = (
     Column("colour_p95", "95 %", ".1f"),
     Column("tracked", "tracked", ".0f", True),
     Column("modelled", "with a model, %", ".0f", True),
+    Column("seen_well", "seen well", ".0f", True),
+    Column("modelled_well", "with a model, %", ".0f", True),
     Column("chamfer", "chamfer, cm", ".2f"),
     Column("good", "within 5 cm, %", ".0f", True),
     Column("background", "background, %", ".2f"),
     Column("seconds", "s", ".0f"),
 )
-_PERCENT = {"complete", "mover", "covered", "modelled", "good", "background"}
+_PERCENT = {"complete", "mover", "covered", "modelled", "modelled_well", "good", "background"}
 _CENTIMETRES = {"mean", "p95", "chamfer"}
 
 
