@@ -5,10 +5,12 @@ python benchmarks/models.py [--seeds tuning|reporting] [--n-seeds 3] [--worlds h
 
 Each world is recorded for a minute with a camera: hall and corridor by a rig of two lasers, the
 street by a spinning lidar. `stillmap map` makes the models, `stillmap eval model` scores them.
-Surface: mean and 95 % of how far it is off, cm, and the share of the places that the sensor saw
-within 5 cm of it. Texture: the share that shows movers, the share of what some picture sees without
-movers that is textured, and CIEDE2000. Movers: the share of those that were tracked of which there
-is a model, chamfer distance in cm, and the share of their textures that shows anything else.
+Surface: mean and 95 % of how far it is off, cm, and the share of the places that the sensor saw, or
+saw from within 10 m, that lie within 5 cm of it. Texture: the share that shows movers, the share of
+what some picture sees without movers, or sees from within 10 m, that is textured, and CIEDE2000.
+Movers: the share of those that were tracked of which there is a model, and of those of them that
+100 beams met within a second; chamfer distance in cm, and the share of their textures that shows
+anything else.
 Beside it the same models with pictures chosen by their resolution alone (`mesh.choice.believe`),
 unless --alone is given.
 """
@@ -58,24 +60,29 @@ WORLDS: dict[str, dict[str, Any]] = {
 _NO_BELIEF = "mesh.choice.believe=false"
 WAYS = ("by P(static)", "by resolution alone")
 WALKERS = 0.3  # share of pictures that show somebody, at least
+_NEAR = 10.0  # m
 _SEEN = 1e-3  # share of a picture's pixels
 COLUMNS = (
     Column("walkers", "pictures with movers, %", ".0f", True),
     Column("mean", "off, cm", ".2f"),
     Column("p95", "95 %", ".2f"),
     Column("complete", "complete, %", ".1f", True),
+    Column("complete_near", "within 10 m", ".1f", True),
     Column("mover", "shows movers, %", ".3f"),
     Column("covered", "covered, %", ".1f", True),
+    Column("covered_near", "within 10 m", ".1f", True),
     Column("colour_median", "CIEDE2000", ".2f"),
     Column("colour_p95", "95 %", ".1f"),
     Column("tracked", "tracked", ".0f", True),
     Column("modelled", "with a model, %", ".0f", True),
+    Column("seen_well", "seen well", ".0f", True),
+    Column("modelled_well", "with a model, %", ".0f", True),
     Column("chamfer", "chamfer, cm", ".2f"),
     Column("good", "within 5 cm, %", ".0f", True),
     Column("background", "background, %", ".2f"),
     Column("seconds", "s", ".0f"),
 )
-_PERCENT = {"complete", "mover", "covered", "modelled", "good", "background"}
+_PERCENT = {"complete", "mover", "covered", "modelled", "modelled_well", "good", "background"}
 _CENTIMETRES = {"mean", "p95", "chamfer"}
 
 
@@ -147,7 +154,14 @@ def _rows(job: Job, folder: Path) -> dict[str, Scores]:
         _stillmap("map", *inputs, "-o", result, "--overwrite", "--quiet", *flags)
         seconds = time.monotonic() - started
         found = json.loads(_stillmap("eval", "model", result, sim, "--json"))
-        out[way] = {**flat(found), "walkers": 100.0 * share, "seconds": seconds}
+        near = json.loads(_stillmap("eval", "model", result, sim, "--json", "--within", _NEAR))
+        out[way] = {
+            **flat(found),
+            "complete_near": flat(near)["complete"],
+            "covered_near": flat(near)["covered"],
+            "walkers": 100.0 * share,
+            "seconds": seconds,
+        }
     return out
 
 

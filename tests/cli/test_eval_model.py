@@ -163,7 +163,7 @@ def test_text(result, simulated, capsys) -> None:
     text = capsys.readouterr().out
     assert "off truth    mean 2.9" in text
     assert "textured -, background -" in text
-    assert "1 tracked, 100.00 % with a model" in text
+    assert "1 tracked, 100.00 % with a model; of " in text
 
 
 def test_what_is_not_there_is_not_scored(result, simulated, capsys) -> None:

@@ -23,6 +23,7 @@ from stillmap.evaluation.mover_models import (
     Sighted,
     Track,
     distance_to_solids,
+    most_beams,
     mover_of,
     mover_scores,
     places_seen,
@@ -155,6 +156,14 @@ def test_what_pictures_see_without_movers(z: float, turned: bool, off: float, sh
     assert free.mean() == pytest.approx(share, abs=0.02)
 
 
+def test_what_pictures_see_from_far_away_does_not_count() -> None:
+    record = _record(*_floor((-2, 2), (-1.5, 1.5)))
+    of_mesh = samples(record.vertices, record.faces, 20_000)
+    none = _pictures(np.zeros((30, 40), np.uint16))
+    free = seen_freely(record, of_mesh, none, T_WORLD_MAP, farthest=10**0.5)
+    assert free.mean() == pytest.approx(np.pi / 12, abs=0.01)  # a circle of 1 m
+
+
 def test_texture_scores_of_a_half_painted_floor() -> None:
     pytest.importorskip("skimage")
     mask = np.zeros((30, 40), np.uint16)
@@ -234,13 +243,13 @@ def test_a_model_that_is_too_large_is_off_by_that(grown: float) -> None:
     model = Model(_box(grown), _SIDES, T_MAP_WORLD @ T, 2 * 10**9, (0, 10**9), None)
     none = _pictures(np.zeros((30, 40), np.uint16))
     tracked = {7: 0, 8: -1}
-    found = mover_scores(tracked, {7: model}, ["car"], DRIVES, _seen_box(), none, T_WORLD_MAP)
+    found = mover_scores(tracked, {7: (0, model)}, ["car"], DRIVES, _seen_box(), none, T_WORLD_MAP)
     (one,) = found.models
     assert (one.id, one.mover, one.kind) == (7, 0, "car")
     assert one.accuracy == pytest.approx(grown, abs=0.004)  # edges are a little farther
     assert one.completeness == pytest.approx(grown, abs=1e-9)
     assert one.chamfer == pytest.approx((one.accuracy + one.completeness) / 2)
-    assert (found.tracked, found.modelled) == (1, 1.0)
+    assert (found.tracked, found.modelled) == (found.seen_well, found.modelled_well) == (1, 1.0)
     assert found.good == (1.0 if grown < 0.05 else 0.0)
     assert np.isnan(found.background)
 
@@ -263,7 +272,7 @@ def test_background_on_a_mover_is_told() -> None:
         corners, roof, T_MAP_WORLD, 0, (0, 0), Record(corners, roof, np.zeros(2, np.int32), T)
     )
     found = mover_scores(
-        {1: 0}, {1: model}, ["car"], DRIVES, _seen_box(), _pictures(mask), T_WORLD_MAP
+        {1: 0}, {1: (0, model)}, ["car"], DRIVES, _seen_box(), _pictures(mask), T_WORLD_MAP
     )
     assert found.background == pytest.approx(0.5, abs=0.01)
     assert found.models[0].textured == 1.0
@@ -284,6 +293,31 @@ def test_tracks_are_those_of_the_movers_they_follow() -> None:
     assert follows(0.1, 0.5) == 0
     assert follows(-0.5, 3.0) == 1  # 2 m beside the middle of what is 4 m long
     assert follows(0.0, 1.0) == -1
+
+
+def test_a_model_is_of_whom_the_track_was_on_then() -> None:
+    stamps = np.array([0, 10**9, 2 * 10**9, 3 * 10**9])
+    movers = np.zeros((4, 2, 3))
+    movers[:, 1, 0] = 5.0
+    xy = np.array([(0.0, 0.0), (0, 0), (0, 0), (5, 0)])
+    track = Track(0, stamps, xy)
+    length = np.full(2, np.nan)
+    assert mover_of(track, stamps, movers, length) == 0
+    assert mover_of(track.within((3 * 10**9, 4 * 10**9)), stamps, movers, length) == 1
+    assert track.within((12 * 10**8, 13 * 10**8)).stamp_ns.tolist() == [10**9]
+    assert len(track.within((-(2**62), 2**62)).xy) == 4
+
+
+def test_movers_seen_well_are_met_by_many_beams_at_once() -> None:
+    stamps = np.arange(500) * 10**8  # ten in a second, one more where the next begins
+    rare = Sighted(np.zeros(500, np.int32), stamps, np.zeros((500, 3)))
+    assert most_beams(rare, 0) == 11
+    assert most_beams(rare, 1) == 0
+    found = mover_scores(
+        {1: 0}, {}, ["car"], DRIVES, rare, _pictures(np.zeros((30, 40), np.uint16)), T_WORLD_MAP
+    )
+    assert (found.tracked, found.modelled, found.seen_well) == (1, 0.0, 0)
+    assert np.isnan(found.modelled_well)
 
 
 def test_distances_to_solids() -> None:

@@ -160,7 +160,7 @@ def _add_model(scores: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         type=_positive,
         default=float("inf"),
         metavar="M",
-        help="of the surface, beams no longer than this say what was seen (default: all)",
+        help="only what beams and pictures saw from no farther should be there (default: all)",
     )
 
 

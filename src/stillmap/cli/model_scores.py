@@ -36,7 +36,9 @@ def of_model(args: argparse.Namespace) -> tuple[dict[str, Any], Iterable[str]]:
     record = model_folders.read_record(args.result / model_folders.RECORD, n)
     if record is not None:
         seed = seen.picture_truth.colour_seed
-        texture = texture_scores(record, glb.coloured, seen.pictures, standing, seed, T_world_map)
+        texture = texture_scores(
+            record, glb.coloured, seen.pictures, standing, seed, T_world_map, args.within
+        )
         scores["texture"] = texture.to_dict()
         lines += _texture_lines(texture)
     if (model_folders.objects_of(args.result) / "objects.json").exists():
@@ -61,14 +63,17 @@ def _movers(result: Path, seen: Seen, T_world_map: Float) -> MoverScores:
     kinds, sizes = truth.scene["mover_kinds"], truth.scene["mover_sizes"]
     length = np.array([np.nan if size[0] is None else size[0] for size in sizes], float)
     stamps = seen.picture_truth.moving.stamp_ns
-    tracks = model_folders.read_tracks(folder, T_world_map)
+    tracks = [one for one in model_folders.read_tracks(folder, T_world_map) if len(one.xy)]
     tracked = {one.id: mover_of(one, stamps, truth.movers, length) for one in tracks}
     models = {}
-    for id, mover in tracked.items():
+    for one in tracks:
+        mover = tracked[one.id]
         rigid = mover >= 0 and kinds[mover] != "person"
-        model = model_folders.read_model(folder, id, rigid, len(seen.pictures.camera))
+        model = model_folders.read_model(folder, one.id, rigid, len(seen.pictures.camera))
         if model is not None:
-            models[id] = model
+            # a track may pass from one mover to another
+            shows = mover_of(one.within(model.span_ns), stamps, truth.movers, length)
+            models[one.id] = shows, model
     moving, sighted = seen.picture_truth.moving, seen.sighted()
     return mover_scores(tracked, models, kinds, moving, sighted, seen.pictures, T_world_map)
 
@@ -89,7 +94,10 @@ def _texture_lines(t: TextureScores) -> Iterable[str]:
 
 
 def _mover_lines(m: MoverScores) -> Iterable[str]:
-    yield f"movers       {m.tracked} tracked, {_percent(m.modelled)} with a model"
+    yield (
+        f"movers       {m.tracked} tracked, {_percent(m.modelled)} with a model; "
+        f"of {m.seen_well} seen by 100 beams in a second {_percent(m.modelled_well)}"
+    )
     yield (
         f"models       {len(m.models)}: chamfer {_cm(m.chamfer)} on average, "
         f"{_percent(m.good)} within 5 cm; background {_percent(m.background)}"

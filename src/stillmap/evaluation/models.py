@@ -143,6 +143,7 @@ def texture_scores(
     standing: Standing,
     colour_seed: int,
     T_world_map: Float,
+    farthest: float = float("inf"),
 ) -> TextureScores:
     """Score what paints a surface.
 
@@ -152,10 +153,11 @@ def texture_scores(
         pictures: that may paint it.
         standing, colour_seed: the true surfaces and their colours.
         T_world_map: (4, 4).
+        farthest: metres, from beyond a picture does not count as seeing anything.
     """
     on_mesh = meshes.samples(record.vertices, record.faces, SAMPLES)
     shows = shown(record, on_mesh, pictures)
-    in_view = seen_freely(record, on_mesh, pictures, T_world_map)
+    in_view = seen_freely(record, on_mesh, pictures, T_world_map, farthest)
     textured = shows != GREY
     error = colour_errors(coloured, standing, colour_seed, T_world_map)
     return TextureScores(
@@ -187,12 +189,16 @@ def shown(record: Record, samples: meshes.Samples, pictures: Pictures) -> NDArra
 
 
 def seen_freely(
-    record: Record, samples: meshes.Samples, pictures: Pictures, T_world_map: Float
+    record: Record,
+    samples: meshes.Samples,
+    pictures: Pictures,
+    T_world_map: Float,
+    farthest: float = float("inf"),
 ) -> Bool:
     """(n,) whether some picture truly sees a sample's place, without a mover before it.
 
-    The surface faces the camera, at no more than 80 degrees from upright, and no more than 5 cm
-    and a pixel lie between it and what the pixel shows.
+    The surface faces the camera, at no more than 80 degrees from upright, from no farther than
+    `farthest` metres, and no more than 5 cm and a pixel lie between it and what the pixel shows.
     """
     points = moved(T_world_map, samples.points)
     upright = meshes.normals(moved(T_world_map, record.vertices), record.faces)[samples.face]
@@ -204,7 +210,8 @@ def seen_freely(
         towards = centre - points[left]
         away = np.linalg.norm(towards, axis=1)
         cosine = (towards * upright[left]).sum(axis=1) / np.maximum(away, 1e-9)
-        left, away, cosine = (one[cosine >= _STEEP] for one in (left, away, cosine))
+        use = (cosine >= _STEEP) & (away <= farthest)
+        left, away, cosine = left[use], away[use], cosine[use]
         pixel, inside = _pixels(camera, moved(np.linalg.inv(T_world_camera), points[left]))
         column, row = pixel[inside].T
         left, away, cosine = left[inside], away[inside], cosine[inside]

@@ -1,6 +1,6 @@
 """Scores of the models of what moved, against the true shapes of a simulation's movers."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,6 +22,7 @@ _THIN = 0.02  # m, of the places that the sensor saw
 _REACH = 0.03  # m, between points of a model's lattice
 _OFF = 0.75  # m, from a track to the middle of who left it; of what is long, half its length too
 GOOD = 0.05  # m
+_WELL = 100  # beams
 _NAN = float("nan")
 
 
@@ -31,6 +32,14 @@ class Track(NamedTuple):
     id: int
     stamp_ns: NDArray[np.int64]
     xy: Float
+
+    def within(self, span_ns: tuple[int, int]) -> "Track":
+        """The part between two times, or what comes nearest to their middle."""
+        first, last = span_ns
+        use = np.flatnonzero((self.stamp_ns >= first) & (self.stamp_ns <= last))
+        if not len(use):
+            use = np.array([np.abs(self.stamp_ns - (first + last) // 2).argmin()])
+        return self._replace(stamp_ns=self.stamp_ns[use], xy=self.xy[use])
 
 
 class Model(NamedTuple):
@@ -82,6 +91,8 @@ class MoverScores(Scores):
     Attributes:
         tracked: movers that were tracked.
         modelled: share of them of which there is a model.
+        seen_well: those tracked movers that 100 beams met within a second, once at least.
+        modelled_well: share of these of which there is a model.
         chamfer: mean over models, metres.
         good: share of models with a chamfer distance of at most 5 cm.
         background: mean over models with a texture.
@@ -90,6 +101,8 @@ class MoverScores(Scores):
 
     tracked: int
     modelled: float
+    seen_well: int
+    modelled_well: float
     chamfer: float
     good: float
     background: float
@@ -126,8 +139,8 @@ def mover_of(track: Track, stamp_ns: NDArray[np.int64], movers: Float, sizes: Fl
 
 
 def mover_scores(
-    tracked: dict[int, int],
-    models: dict[int, Model],
+    tracked: Mapping[int, int],
+    models: Mapping[int, tuple[int, Model]],
     kinds: Sequence[str],
     moving: Moving,
     sighted: Sighted,
@@ -138,7 +151,8 @@ def mover_scores(
 
     Args:
         tracked: the mover that each object is, by the objects' numbers; -1: none.
-        models: by the same numbers.
+        models: by the same numbers, and the mover that each shows: that which the object was then.
+            Those of none are not scored.
         kinds: of movers.
         moving: the true shapes.
         sighted: what the sensor saw of them.
@@ -146,26 +160,31 @@ def mover_scores(
         T_world_map: (4, 4).
     """
     movers = {mover for mover in tracked.values() if mover >= 0}
-    have = {tracked[id] for id in models if tracked.get(id, -1) >= 0}
+    have = {tracked.get(id, -1) for id in models}
+    well = {mover for mover in movers if most_beams(sighted, mover) >= _WELL}
     scores = tuple(
-        model_scores(
-            id, tracked[id], kinds[tracked[id]], models[id], moving, sighted, pictures, T_world_map
-        )
-        for id in sorted(models)
-        if tracked.get(id, -1) >= 0
+        model_scores(id, mover, kinds[mover], model, moving, sighted, pictures, T_world_map)
+        for id, (mover, model) in sorted(models.items())
+        if mover >= 0
     )
-    chamfer = np.array([one.chamfer for one in scores])
-    chamfer = chamfer[~np.isnan(chamfer)]
-    background = np.array([one.background for one in scores])
-    background = background[~np.isnan(background)]
+    chamfer = _known([one.chamfer for one in scores])
     return MoverScores(
         tracked=len(movers),
-        modelled=len(have) / len(movers) if movers else _NAN,
-        chamfer=float(chamfer.mean()) if len(chamfer) else _NAN,
-        good=float(np.mean(chamfer <= GOOD)) if len(chamfer) else _NAN,
-        background=float(background.mean()) if len(background) else _NAN,
+        modelled=len(have & movers) / len(movers) if movers else _NAN,
+        seen_well=len(well),
+        modelled_well=len(have & well) / len(well) if well else _NAN,
+        chamfer=_mean(chamfer),
+        good=_mean(chamfer <= GOOD),
+        background=_mean(_known([one.background for one in scores])),
         models=scores,
     )
+
+
+def most_beams(sighted: Sighted, mover: int) -> int:
+    """How many beams met a mover within a second, at most."""
+    stamps = np.sort(sighted.stamp_ns[sighted.mover == mover])
+    last = np.searchsorted(stamps, stamps + 10**9, side="right")
+    return int((last - np.arange(len(stamps))).max(initial=0))
 
 
 def model_scores(
@@ -231,6 +250,11 @@ def places_seen(
         nearest[better], found[better] = off[better], goes_with[better]
     found = found[np.isfinite(found).all(axis=1)]
     return np.asarray(found[meshes.thinned(found, _THIN)])
+
+
+def _known(values: Sequence[float]) -> Float:
+    array = np.array(values, np.float64)
+    return np.asarray(array[~np.isnan(array)])
 
 
 def _mean(values: NDArray[np.generic]) -> float:
