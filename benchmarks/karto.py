@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 import stillmap
 from stillmap import se2
 from stillmap.output.atomic import new_folder
-from stillmap.output.trajectory import write_tum
+from stillmap.recording.tum import write_tum
 
 Float = NDArray[np.float64]
 

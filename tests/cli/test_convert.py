@@ -10,8 +10,8 @@ from refusals import refused
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from stillmap.output.trajectory import read_tum
 from stillmap.recording import folder, read
+from stillmap.recording.tum import read_tum
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ from stillmap import se2
 from stillmap.cli import main
 from stillmap.evaluation.map import Grid
 from stillmap.output.map_npz import write_map_npz
-from stillmap.output.trajectory import write_tum
 from stillmap.recording import folder
+from stillmap.recording.tum import write_tum
 from stillmap.simulation import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.simulation.walls import box
 from stillmap.simulation.writing import write_simulation

@@ -10,8 +10,8 @@ from PIL import Image
 
 from stillmap import se2
 from stillmap.cli import main
-from stillmap.output.trajectory import write_tum
 from stillmap.recording import read
+from stillmap.recording.tum import write_tum
 from stillmap.simulation import (
     load_picture_truth,
     load_truth,

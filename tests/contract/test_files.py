@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from stillmap.cli import main
-from stillmap.output.trajectory import read_tum
 from stillmap.recording import poses as given_poses
+from stillmap.recording.tum import read_tum
 
 
 def planar(T):

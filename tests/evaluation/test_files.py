@@ -12,8 +12,8 @@ from stillmap.evaluation.files import (
     read_trajectory,
     seconds,
 )
-from stillmap.output.trajectory import write_tum
 from stillmap.recording.stamps import parse_ns
+from stillmap.recording.tum import write_tum
 
 ODOM = "ODOM {x} 0 0 0 0 0 {t} host 0.1\n"
 FLASER = "FLASER 3 1.0 1.0 1.0 9 9 9 {x} 0 0 {t} host 0.1\n"

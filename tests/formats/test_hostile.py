@@ -16,9 +16,9 @@ import pytest
 from stillmap.errors import InputError
 from stillmap.evaluation import files, folders
 from stillmap.options import load_toml, parse_assignment, replaced
-from stillmap.output.trajectory import read_tum
 from stillmap.recording import carmen_log, folder, formats, lines, read, writers
 from stillmap.recording.options import ReadOptions
+from stillmap.recording.tum import read_tum
 
 FLASER = "FLASER 2 1.0 2.0 0 0 0 0 0 0 1 host 1\n"
 

@@ -22,11 +22,11 @@ from small_bags import Messages, write_bag
 from stillmap import se2
 from stillmap.options import to_toml
 from stillmap.output.map_npz import write_npz
-from stillmap.output.trajectory import write_tum
 from stillmap.pipeline import Options
 from stillmap.recording import Recording, folder, writers
 from stillmap.recording.clouds.las import _header
 from stillmap.recording.images import Camera, Images
+from stillmap.recording.tum import write_tum
 
 START = 1_700_000_000_000_000_000
 FLOAT, DOUBLE, U32 = 7, 8, 6

@@ -17,11 +17,11 @@ from stillmap.errors import InputError
 from stillmap.evaluation import files, folders
 from stillmap.export.result import read_tracks
 from stillmap.options import load_toml, replaced
-from stillmap.output.trajectory import read_tum
 from stillmap.pipeline import Options
 from stillmap.recording import ReadOptions, Recording, read
 from stillmap.recording.facts import facts
 from stillmap.recording.ros import reading  # noqa: F401  (loaded now, not at the first bag)
+from stillmap.recording.tum import read_tum
 from stillmap.simulation import load_truth
 
 Run = Callable[[bytes, Path], None]

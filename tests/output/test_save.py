@@ -9,7 +9,7 @@ from stillmap.objects import ObjectOptions
 from stillmap.output import save as save_module
 from stillmap.output.map_server import OutputOptions
 from stillmap.output.save import save
-from stillmap.output.trajectory import read_tum
+from stillmap.recording.tum import read_tum
 
 FILES = {
     "map.pgm",

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stillmap.errors import InputError
-from stillmap.output.trajectory import read_tum, write_tum
+from stillmap.recording.tum import read_tum, write_tum
 from stillmap.se2 import matrix
 
 STAMPS = np.array([1, 999_999_999, 1_000_000_000, 1_699_999_999_123_456_789], np.int64)

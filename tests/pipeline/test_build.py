@@ -9,8 +9,8 @@ from choices import RESOLUTION, options, with_any_estimator
 
 import stillmap
 from stillmap import em
-from stillmap.output.trajectory import read_tum
 from stillmap.recording.model import Recording
+from stillmap.recording.tum import read_tum
 
 
 def end_cells(recording, poses, origin, resolution, beams):

@@ -13,9 +13,9 @@ from PIL import Image
 import stillmap
 from stillmap.cli import main
 from stillmap.output.report_learned import learned_section
-from stillmap.output.trajectory import read_tum
 from stillmap.pipeline import Options
 from stillmap.recording.model import Recording
+from stillmap.recording.tum import read_tum
 from stillmap.simulation import scene_by_name, simulate
 from stillmap.simulation.writing import write_simulation
 

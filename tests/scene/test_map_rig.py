@@ -9,8 +9,8 @@ import trimesh
 
 from stillmap.cli import main
 from stillmap.output.report_tilting import cut_sentences
-from stillmap.output.trajectory import read_tum
 from stillmap.recording import folder
+from stillmap.recording.tum import read_tum
 from stillmap.simulation import load_truth, scene_by_name, simulate_rig, write_rig
 
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")

@@ -12,7 +12,7 @@ from stillmap import se2
 from stillmap.output.beams import write_beams
 from stillmap.output.clouds import write_clouds
 from stillmap.output.map_npz import write_npz
-from stillmap.output.trajectory import write_tum
+from stillmap.recording.tum import write_tum
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.errors import InputError
-from stillmap.output.trajectory import LARGEST, read_tum
 from stillmap.recording.carmen_log import CarmenLog, read_log
 from stillmap.recording.lines import head
+from stillmap.recording.tum import LARGEST, read_tum
 from stillmap.texts import read_text, require_regular
 
 Float = NDArray[np.float64]

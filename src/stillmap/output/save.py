@@ -18,7 +18,7 @@ from stillmap.output.report_model import Stills, stills_of
 from stillmap.output.run_json import RECORD, write_run_json
 from stillmap.output.tilting import FOLDER as TILTING
 from stillmap.output.tilting import tilting_record, write_tilting
-from stillmap.output.trajectory import write_tum
+from stillmap.recording.tum import write_tum
 from stillmap.threads import resolved_threads
 
 

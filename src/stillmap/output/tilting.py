@@ -9,7 +9,7 @@ from stillmap.output.objects import write_objects_of
 from stillmap.output.points import beam_counts
 from stillmap.output.protocols import TiltingLike
 from stillmap.output.run_json import skipped_count
-from stillmap.output.trajectory import write_tum
+from stillmap.recording.tum import write_tum
 
 FOLDER = "tilting"
 

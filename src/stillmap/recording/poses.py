@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from stillmap import se2
 from stillmap.errors import InputError
-from stillmap.output.trajectory import read_tum
 from stillmap.recording.model import Recording
+from stillmap.recording.tum import read_tum
 
 _NEAR_NS = 20_000_000  # another tool may have rounded its stamps
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stillmap.arrays import open_npy
 from stillmap.errors import InputError
 from stillmap.output.npy import write_npy
-from stillmap.output.trajectory import write_tum
+from stillmap.recording.tum import write_tum
 
 FOLDER = "truth"
 _SCENE = "scene.json"

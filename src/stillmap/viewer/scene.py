@@ -15,7 +15,7 @@ from stillmap.evaluation.folders import read_grid
 from stillmap.export.result import Track, read_tracks
 from stillmap.output.crops import Window
 from stillmap.output.report_figures import ORANGE, UNKNOWN, map_image, shown_window
-from stillmap.output.trajectory import read_tum
+from stillmap.recording.tum import read_tum
 from stillmap.se2 import inverse
 from stillmap.texts import read_text
 from stillmap.viewer import colours, gltf, thinning

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from stillmap import se2, se3
 from stillmap.errors import InputError
-from stillmap.output.trajectory import read_tum
 from stillmap.recording.clouds.rigid import transform
 from stillmap.recording.lines import numbered_lines
 from stillmap.recording.stamps import parse_ns
+from stillmap.recording.tum import read_tum
 
 Float = NDArray[np.float64]
 
