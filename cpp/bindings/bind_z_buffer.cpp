@@ -14,18 +14,22 @@ using Faces =
 using Matrix = nb::ndarray<const double, nb::numpy, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
 
 constexpr int kLargest = 1 << 15;  // pixels along an edge of a picture
+constexpr double kFarthest = 1e9;  // metres, or pixels: nothing overflows
 
 Pinhole checked(const Matrix& K, const OnePose<3>& T_camera_map, int width, int height,
                 double near) {
   const double* k = K.data();
-  for (size_t i = 0; i < 9; ++i) require(std::isfinite(k[i]), "K: not finite");
+  for (size_t i = 0; i < 9; ++i)
+    require(std::abs(k[i]) <= kFarthest, "K: not finite, or beyond 1e9 pixels");
   require(k[0] > 0.0 && k[4] > 0.0, "K: expected positive focal lengths");
   require(k[3] == 0.0 && k[6] == 0.0 && k[7] == 0.0 && k[8] == 1.0,
           "K: expected (fx s cx, 0 fy cy, 0 0 1)");
   require(width > 0 && width <= kLargest && height > 0 && height <= kLargest,
           "width, height: expected 1 to 32768 pixels");
-  require(near > 0.0 && std::isfinite(near), "near: expected a positive length in metres");
+  require(near >= 1e-6 && near <= kFarthest, "near: expected 1e-6 to 1e9 metres");
   const Pose<3> pose = checked_pose<3>(T_camera_map, "T_camera_map");
+  require(pose.R.cwiseAbs().maxCoeff() <= 2.0, "T_camera_map: expected a rotation");
+  require(pose.t.cwiseAbs().maxCoeff() <= kFarthest, "T_camera_map: beyond 1e9 m");
   return {pose.R, pose.t, k[0], k[1], k[2], k[4], k[5], width, height, near};
 }
 
@@ -33,7 +37,7 @@ auto z_buffer(const Places<3>& vertices, const Faces& faces, const Matrix& K,
               const OnePose<3>& T_camera_map, int width, int height, double near, int threads) {
   const size_t V = vertices.shape(0), F = faces.shape(0);
   for (size_t i = 0; i < 3 * V; ++i)
-    require(std::isfinite(vertices.data()[i]), "vertices: not finite");
+    require(std::abs(vertices.data()[i]) <= kFarthest, "vertices: not finite, or beyond 1e9 m");
   for (size_t i = 0; i < 3 * F; ++i) {
     const int32_t at = faces.data()[i];
     require(at >= 0 && static_cast<size_t>(at) < V, "faces: a vertex that is not there");

@@ -128,7 +128,10 @@ def test_threads_change_nothing():
         ({"T_camera_map": np.full((4, 4), np.nan)}, "T_camera_map: not finite"),
         ({"width": 0}, "width, height"),
         ({"height": 1 << 20}, "width, height"),
-        ({"near": 0.0}, "near: expected a positive length"),
+        ({"near": 0.0}, "near: expected"),
+        ({"near": np.nan}, "near: expected"),
+        ({"vertices": np.full((3, 3), 1e10)}, "vertices: not finite, or beyond"),
+        ({"T_camera_map": 9.0 * np.eye(4)}, "T_camera_map: expected a rotation"),
     ],
 )
 def test_what_is_refused(changes, said):

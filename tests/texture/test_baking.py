@@ -71,6 +71,21 @@ def test_coarse_texels_are_means_of_pixels():
     np.testing.assert_allclose(textured.pages[0][face >= 0], 100, atol=1)
 
 
+def test_coarse_texels_lie_where_fine_ones_do():
+    wall = rectangle([-0.4, 3.0, -0.4], [0.8, 0, 0], [0, 0, 0.8], 4)
+    views = [looking([0, 0, 0], [0, 1, 0])]
+    ramp = np.clip((np.arange(400) - 149.5) * 2.5, 0, 255).round().astype(np.uint8)
+    picture = np.broadcast_to(ramp[None, :, None], (300, 400, 3))
+    options = TextureOptions(texel=0.04)
+    textured = baked(wall, np.zeros(32, np.int32), views, lambda _: picture, options)
+    face = textured.face_of_texel(0)
+    row, column = np.nonzero(face >= 0)
+    # 0.8 m are 80 pixels, and 20 texels
+    left = textured.uv[:, 0].min() * face.shape[1]
+    at = 199.5 - 40 + 4.0 * (column + 0.5 - left)
+    np.testing.assert_allclose(textured.pages[0][row, column, 0], (at - 149.5) * 2.5, atol=1.1)
+
+
 def test_a_picture_that_cannot_be_read_leaves_grey():
     mesh, views = furnished(), all_round()
     view = best_of(mesh, views)

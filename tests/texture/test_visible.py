@@ -73,6 +73,28 @@ def test_a_pole_before_the_middle_of_a_large_face_hides_it():
     assert not visible(joined([wall, pole]), AHEAD).seen[:2].any()
 
 
+def test_edges_are_known_to_a_pixel_only():
+    mesh = joined([WALL, box([-0.6, 2.0, -0.5], [0.4, 2.6, 0.7])])
+    close, wide = (visible(mesh, AHEAD, VisibleOptions(beside=b)).seen for b in (0, 1))
+    assert close[wide].all()
+    lost = WALL.centres[np.flatnonzero(close & ~wide)]
+    assert 10 < len(lost) < 200
+    # the box's shadow on the wall, and one face more
+    low, high = np.array([-1.2, -1.0]) - 0.4, np.array([0.8, 1.4]) + 0.4
+    assert ((lost[:, [0, 2]] > low) & (lost[:, [0, 2]] < high)).all()
+
+
+def test_what_lies_flat_hides_what_is_under_it():
+    floor = rectangle([-2.0, 1.0, -1.2], [4, 0, 0], [0, 5, 0], 50)
+    mesh = joined([floor, rectangle([-0.7, 2.2, -1.16], [1.4, 0, 0], [0, 1.5, 0], 4)])
+    view = looking([0.0, 0, 0], [0.0, 3, -1.0])
+    alone, seen = visible(floor, view).seen, visible(mesh, view).seen[: len(floor)]
+    hidden = hidden_share(mesh, view, len(floor))
+    assert np.sum(alone & (hidden > 0.9)) > 300
+    assert not seen[hidden > 0.9].any()
+    assert seen[alone & (hidden == 0.0)].mean() > 0.9
+
+
 def test_a_noisy_surface_does_not_hide_itself():
     rng = np.random.default_rng(0)
     floor = rectangle([-4.0, 0.5, -1.2], [8.0, 0, 0], [0, 8.0, 0], 80)
