@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from stillmap import se2, se3
 from stillmap.errors import InputError
-from stillmap.output.trajectory import read_tum
 from stillmap.recording.clouds.rigid import transform
 from stillmap.recording.lines import numbered_lines
 from stillmap.recording.stamps import parse_ns
@@ -184,6 +183,8 @@ def _inside(folder: Path, name: str) -> Path:
 
 def _tum_poses(path: Path, stamps: NDArray[np.int64], warnings: list[str]) -> list[Float | None]:
     """Poses at times (n,), by steady motion between those that are known."""
+    from stillmap.output.trajectory import read_tum  # which needs stillmap.recording itself
+
     if not path.is_file():
         return [None] * len(stamps)
     try:
