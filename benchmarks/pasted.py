@@ -1,147 +1,146 @@
-"""Somebody walks through a static RGB-D recording: pasted into its depth and its colours.
+"""People pasted into the depth and colours of a room that was recorded without any.
 
-    python benchmarks/pasted.py FOLDER OUT [--seed 0] [--people 2]
+python benchmarks/pasted.py ../shared/data/rgbd/kitchenette OUT
 
-FOLDER is one of frames (`frame-NNNNNN.color`, `.depth.png`, `.pose.txt`, `camera-intrinsics.txt`,
-as 7-Scenes has them) whose world's y points down. OUT becomes one of the same kind, and
-`OUT/truth/frame-NNNNNN.png` says which pixels of the colours show somebody: 0 nobody, k + 1 walker
-k. Walkers are upright ellipsoids in strong colours, 1.7 m tall, who walk to and fro between the
-camera and what it looks at.
+OUT becomes an RGB-D folder, with `truth.npz` in it: `depth` and `colour` (T, height, width), what
+of each picture is a person. Each is an upright ellipsoid with a pattern, who crosses the view
+within six seconds; for the next six nobody is there.
 """
 
 import argparse
 import shutil
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.ndimage import minimum_filter
+
+import stillmap
+from stillmap.recording import ReadOptions
+from stillmap.recording.images import Camera
+from stillmap.recording.pictures import read_picture
+from stillmap.texture import lens
 
 Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
-_MILLIMETRES = 1000.0
-_NOISE = 2.85e-3  # 1/m: an RGB-D camera's depth is off by this times the depth squared
-_FRAMES_PER_SECOND = 30.0
-_SPEED = 0.7  # m/s
-_HALF = ((0.22, 0.55, 0.18), (0.11, 0.14, 0.12))  # m, of trunk and head
-_ABOVE = (0.85, 1.56)  # m above the floor, their middles
-_COLOURS = np.array(
-    [[230, 40, 160], [40, 220, 60], [250, 200, 20], [30, 60, 230], [240, 90, 20], [20, 210, 220]]
-)
+_HALF = np.array([0.25, 0.25, 0.8])  # m, along the axes
+_CROSSES, _SPEED, _AHEAD, _LOW = 6.0, 0.6, 1.5, -0.6  # s, m/s, m, m below the camera
+_NOISE = 0.002  # m at a metre, growing with the square of the depth
+_STRIPE, _FIELDS = 0.12, 8  # m upwards, and fields around, of the pattern
+_COLOURS = np.array([[230, 190, 20], [30, 60, 200]])
 
 
-class Walker(NamedTuple):
-    """Goes to and fro between two places (3,) on the floor, in the frame of the world."""
+def paste(source: Path, out: Path) -> Path:
+    """Write the folder.
 
-    one: Float
-    other: Float
-    start: float  # s
-    colours: NDArray[np.int64]
+    Args:
+        source: frames of 7-Scenes, with poses of all.
+        out: it must not be there.
 
-    def at(self, seconds: float) -> Float:
-        """(3,) where it stands."""
-        length = float(np.linalg.norm(self.other - self.one))
-        gone = (seconds + self.start) * _SPEED / length % 2.0
-        return np.asarray(self.one + (1.0 - abs(gone - 1.0)) * (self.other - self.one))
-
-
-def walkers(poses: Float, floor: float, people: int, rng: np.random.Generator) -> list[Walker]:
-    """Across what the cameras (T, 4, 4) look at, 0.8 to 1.4 m before them."""
-    middle, ahead = poses[:, :3, 3].mean(axis=0), poses[:, :3, 2].mean(axis=0)
-    ahead[1] = 0.0
-    ahead /= np.linalg.norm(ahead)
-    aside = np.array([ahead[2], 0.0, -ahead[0]])
-    out = []
-    for _ in range(people):
-        at = middle + rng.uniform(0.8, 1.4) * ahead
-        at[1] = floor
-        reach, slant = rng.uniform(0.9, 1.3), rng.uniform(-0.2, 0.2)
-        way = reach * aside + slant * ahead
-        colours = rng.permutation(len(_COLOURS))[:3]
-        out.append(Walker(at - way, at + way, rng.uniform(0.0, 10.0), _COLOURS[colours]))
+    Returns:
+        `out`.
+    """
+    room = stillmap.read(source, options=ReadOptions(depth_step=1))
+    assert room.T_recorded_base is not None
+    assert room.images is not None
+    colour = room.images.cameras[0]
+    same = stillmap.read(source, options=ReadOptions(depth_step=64, register=False)).images
+    assert same is not None
+    depth = same.cameras[0]
+    out.mkdir(parents=True)
+    shutil.copy(source / "camera-intrinsics.txt", out)
+    found: tuple[list[Mask], list[Mask]] = ([], [])
+    for number, file in enumerate(sorted(source.glob("frame-*.depth.png"))):
+        name = file.name.partition(".")[0]
+        shutil.copy(source / f"{name}.pose.txt", out)
+        millimetres, picture = read_picture(file), room.images.read(number)
+        at, T = _centre(room, number), room.T_recorded_base[number]
+        beams = room.beams_of(number)
+        scene = room.points[beams][room.hit[beams]]
+        seen = [_seen(camera, T, at, scene) for camera in (depth, colour)]
+        for one, kept in zip(seen, found, strict=True):
+            kept.append(one[2])
+        z, _, its = seen[0]
+        noise = np.random.default_rng(number).normal(0.0, _NOISE, int(its.sum()))
+        millimetres[its] = np.round(1e3 * (z[its] + noise * z[its] ** 2))
+        _, pattern, its = seen[1]
+        picture[its] = pattern[its]
+        Image.fromarray(millimetres).save(out / f"{name}.depth.png", compress_level=1)
+        Image.fromarray(picture).save(out / f"{name}.color.png", compress_level=1)
+    np.savez_compressed(out / "truth.npz", depth=np.array(found[0]), colour=np.array(found[1]))
     return out
 
 
-def pasted(
-    picture: NDArray[np.uint8],
-    depth: Float,
-    rays: Float,
-    T_world_camera: Float,
-    who: list[Walker],
-    seconds: float,
-    rng: np.random.Generator,
-) -> tuple[NDArray[np.uint8], Float, NDArray[np.uint8]]:
-    """Colours (h, w, 3), depth (h, w) in metres and walkers (h, w) with somebody in them.
+def _centre(room: stillmap.Recording, number: int) -> Float | None:
+    """(3,) where the person is, in the level world; None: nobody is there."""
+    seconds = 1e-9 * (room.stamp_ns - room.stamp_ns[0])
+    spell, since = divmod(seconds[number], _CROSSES)
+    if spell % 2:
+        return None
+    middle = int(np.searchsorted(seconds, (spell + 0.5) * _CROSSES))
+    assert room.T_recorded_base is not None
+    T = room.T_recorded_base[min(middle, room.n_scans - 1)]
+    ahead = T[:2, 0] / np.linalg.norm(T[:2, 0])
+    aside = _SPEED * (0.5 * _CROSSES - since) * np.array([-ahead[1], ahead[0]])
+    return np.append(T[:2, 3] + _AHEAD * ahead + aside, T[2, 3] + _LOW)
 
-    Where the depth is not known (0) whoever is there is nearer.
+
+def _seen(
+    camera: Camera, T_map_base: Float, centre: Float | None, scene: NDArray[np.float32]
+) -> tuple[Float, NDArray[np.uint8], Mask]:
+    """(h, w) depth of the person, (h, w, 3) colours, and (h, w) where nothing is before him.
+
+    Args:
+        camera: it sits on the base.
+        T_map_base: (4, 4).
+        centre: (3,) of the person; None: nobody.
+        scene: (n, 3) what else is seen, in the base's frame.
     """
-    picture, depth = picture.copy(), depth.copy()
-    shown = np.zeros(depth.shape, np.uint8)
-    far = np.where(depth > 0.0, depth, np.inf)
-    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    direction = rays @ R.T
-    for k, one in enumerate(who):
-        for half, above in zip(_HALF, _ABOVE, strict=True):
-            middle = one.at(seconds) - [0.0, above, 0.0]
-            scale = 1.0 / np.array(half)
-            start, along = (t - middle) * scale, direction * scale
-            a, b = (along**2).sum(axis=-1), along @ start
-            inside = b**2 - a * (start @ start - 1.0)
-            away = (-b - np.sqrt(np.maximum(inside, 0.0))) / a  # along rays whose z is 1: depth
-            meets = (inside > 0.0) & (away > 0.3) & (away < far)
-            at = direction[meets] * away[meets, None] + t - middle
-            stripe = np.floor(at[:, 1] / 0.12).astype(int) + np.floor(
-                2.0 * np.arctan2(at[:, 2], at[:, 0])
-            ).astype(int)
-            light = (
-                0.75
-                + 0.25 * -(at * scale**2 / np.linalg.norm(at * scale**2, axis=1)[:, None])[:, 1]
-            )
-            picture[meets] = (one.colours[stripe % 3] * light[:, None]).clip(0, 255)
-            far[meets] = away[meets]
-            depth[meets] = away[meets] + _NOISE * away[meets] ** 2 * rng.normal(size=meets.sum())
-            shown[meets] = k + 1
-    return picture, depth, shown
+    h, w = camera.height, camera.width
+    nobody = np.full((h, w), np.inf), np.zeros((h, w, 3), np.uint8), np.zeros((h, w), bool)
+    if centre is None:
+        return nobody
+    assert camera.T_base_camera is not None
+    T = T_map_base @ camera.T_base_camera
+    columns, rows = np.meshgrid(np.arange(w), np.arange(h))
+    pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
+    rays = lens.rays(camera, pixels) @ T[:3, :3].T
+    # the ellipsoid is a ball of radius 1 where lengths are in its half axes
+    ray, origin = rays / _HALF, (T[:3, 3] - centre) / _HALF
+    a, b, c = np.sum(ray * ray, axis=1), ray @ origin, origin @ origin - 1.0
+    root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+    z = np.where((b * b > a * c) & (-b > root), (-b - root) / a, np.inf)
+    on = np.where(
+        np.isfinite(z)[:, None], origin + np.where(np.isfinite(z), z, 0.0)[:, None] * ray, 0
+    )
+    around = np.floor(np.arctan2(on[:, 1], on[:, 0]) / (2.0 * np.pi) * _FIELDS)
+    field = (around + np.floor(on[:, 2] * _HALF[2] / _STRIPE)).astype(np.intp) % 2
+    before = z.reshape(h, w) < _depth_of(camera, scene)
+    return z.reshape(h, w), _COLOURS[field].astype(np.uint8).reshape(h, w, 3), before
 
 
-def paste(folder: Path, out: Path, seed: int, people: int) -> float:
-    """Makes the folder; returns the share of pictures that show somebody on 1 % of their pixels."""
-    rng = np.random.default_rng(seed)
-    frames = sorted(path.name.split(".")[0] for path in folder.glob("*.pose.txt"))
-    poses = np.stack([np.loadtxt(folder / f"{name}.pose.txt") for name in frames])
-    K = np.loadtxt(folder / "camera-intrinsics.txt")
-    (out / "truth").mkdir(parents=True)
-    shutil.copy(folder / "camera-intrinsics.txt", out)
-    who, shows = walkers(poses, poses[:, 1, 3].mean() + 1.3, people, rng), 0
-    for name, T in zip(frames, poses, strict=True):
-        depth = np.asarray(Image.open(folder / f"{name}.depth.png"), np.float64) / _MILLIMETRES
-        depth[depth > 65.0] = 0.0
-        colour = next(folder.glob(f"{name}.color.*"))
-        picture = np.asarray(Image.open(colour).convert("RGB"))
-        row, column = np.indices(depth.shape)
-        rays = np.stack([column, row, np.ones(depth.shape)], axis=-1) @ np.linalg.inv(K).T
-        seconds = int(name.split("-")[1]) / _FRAMES_PER_SECOND
-        picture, depth, shown = pasted(picture, depth, rays, T, who, seconds, rng)
-        shows += bool((shown > 0).mean() >= 0.01)
-        Image.fromarray(picture).save(out / f"{name}.color.png", compress_level=1)
-        millimetres = np.round(depth * _MILLIMETRES).astype(np.uint16)
-        Image.fromarray(millimetres).save(out / f"{name}.depth.png", compress_level=1)
-        Image.fromarray(shown).save(out / "truth" / f"{name}.png", compress_level=1)
-        shutil.copyfile(folder / f"{name}.pose.txt", out / f"{name}.pose.txt")
-    return shows / max(len(frames), 1)
+def _depth_of(camera: Camera, scene: NDArray[np.float32]) -> Float:
+    """(h, w) how far away the nearest of points (n, 3) on the base is, inf where there is none."""
+    assert camera.T_base_camera is not None
+    R, t = camera.T_base_camera[:3, :3], camera.T_base_camera[:3, 3]
+    points = (scene.astype(np.float64) - t) @ R
+    uv, ok = lens.project(camera, points)
+    ok &= lens.within(camera, uv)
+    column, row = np.round(uv[ok]).astype(np.intp).T
+    out = np.full((camera.height, camera.width), np.inf)
+    np.minimum.at(out, (row, column), points[ok, 2])
+    # between points of another camera there are pixels without one
+    return np.where(np.isfinite(out), out, minimum_filter(out, 3))
 
 
 def main() -> None:
-    """Pastes."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--people", type=int, default=2)
-    args = parser.parse_args()
-    share = paste(args.folder, args.out, args.seed, args.people)
-    print(f"{100.0 * share:.0f} % of the pictures show somebody")
+    p = argparse.ArgumentParser(description="People pasted into a recorded room.")
+    p.add_argument("source", type=Path)
+    p.add_argument("out", type=Path)
+    args = p.parse_args()
+    print(paste(args.source, args.out))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stillmap.cli import info
 from stillmap.cli.reading import add_read_flags, read_changes
@@ -266,3 +267,25 @@ def test_ranges_of_huge_recordings_are_those_of_a_sample(monkeypatch, few):
     sampled = module.facts(recording)
     assert sampled["hit_ranges_m"]["median"] == pytest.approx(6.0, abs=0.3)
     assert sampled["counts"] == exact["counts"]
+
+
+def test_cameras_from_a_file(tmp_path, capsys):
+    folder = tmp_path / "drive"
+    for name in ("velodyne", "image_2"):
+        (folder / name).mkdir(parents=True)
+    for k in range(2):
+        (folder / "velodyne" / f"{k}.bin").write_bytes(np.full(8, 3.0, "<f4").tobytes())
+        Image.new("RGB", (8, 6)).save(folder / "image_2" / f"{k}.png")
+    (folder / "times.txt").write_text("0\n0.1\n")
+    run(folder)
+    assert "2 of 8 x 6 pixels, uncalibrated" in capsys.readouterr().out
+    file = tmp_path / "cameras.toml"
+    place = "translation = [0, 0, 1]\nrpy = [-1.57, 0, -1.57]\n"
+    file.write_text(f"[image_2]\nfx = 9\nfy = 9\ncx = 3.5\ncy = 2.5\n{place}")
+    run(folder, "--cameras", str(file))
+    out = capsys.readouterr().out
+    assert "pictures          2, 2 of them usable" in out
+    assert "2 of 8 x 6 pixels, calibrated and placed" in out
+    file.write_text("[image_3]\n")
+    with pytest.raises(InputError, match="nearest: 'image_2'"):
+        run(folder, "--cameras", str(file))
