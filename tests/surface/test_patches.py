@@ -6,6 +6,7 @@ import pytest
 from stillmap.surface import rows
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import order_of, patches_of
+from stillmap.surface.strips import rows_of
 
 LOOSE = SurfaceOptions(longest=5.0, longest_share=2.0)
 
@@ -74,6 +75,33 @@ def test_any_order_makes_the_same_surface(room):
     assert looks_back(patch).all()
     azimuth = np.arctan2(*patch.points[patch.faces].mean(axis=1)[:, 1::-1].T)
     assert np.histogram(azimuth, 24, (-np.pi, np.pi))[0].min() > 0.9 * len(azimuth) / 24
+
+
+@pytest.mark.parametrize("rows_are", ["columns", "rings"])
+@pytest.mark.parametrize("sense", [1, -1])
+def test_rows_with_gaps_make_the_same_surface(room, rows_are, sense):
+    """Beams are lost at random and in a whole sector."""
+    looking = room.lidar(240, 40, rows_are) * [1, sense, 1]
+    rng = np.random.default_rng(0)
+    sector = np.arctan2(looking[:, 1], looking[:, 0])
+    looking = looking[(rng.random(len(looking)) < 0.95) & (np.abs(sector - 1.0) > 0.2)]
+    found = rows_of(looking)
+    assert len(found.first) - 1 == (240 - 15 if rows_are == "columns" else 40)
+    recording = room.scans(looking, room.standing())
+    _, (patch,) = patches(recording, room.standing())
+    looking = patch.points[patch.faces]
+    area = 0.5 * np.linalg.norm(
+        np.cross(looking[:, 1] - looking[:, 0], looking[:, 2] - looking[:, 0]), axis=1
+    )
+    _, (whole,) = patches(*[room.scans(room.lidar(240, 40), room.standing()), room.standing()])
+    all_of_it = whole.points[whole.faces]
+    most = 0.5 * np.linalg.norm(
+        np.cross(all_of_it[:, 1] - all_of_it[:, 0], all_of_it[:, 2] - all_of_it[:, 0]), axis=1
+    )
+    assert 0.8 * most.sum() < area.sum() < 0.99 * most.sum()
+    assert looks_back(patch).all()
+    middle = looking.mean(axis=1)
+    assert (np.abs(np.arctan2(middle[:, 1], middle[:, 0]) - 1.0) > 0.15).all()
 
 
 def test_scans_of_a_nodding_laser_are_rows_while_the_robot_drives(room):

@@ -16,6 +16,7 @@
 
 #include "stillmap/blocks.hpp"
 #include "stillmap/parallel.hpp"
+#include "stillmap/voxel_table.hpp"
 
 namespace stillmap {
 
@@ -81,10 +82,14 @@ class Prism {
     farthest_ = 1.0 + behind / h;
     border_[3] = k.plus(-nearest_);
     border_[4] = k.times(-1.0).plus(farthest_);
+    longest_ =
+        std::sqrt(std::max({(a - b).squaredNorm(), (b - c).squaredNorm(), (c - a).squaredNorm()})) /
+        voxel;
     surround({a, b, c}, o, voxel);
   }
 
   bool empty() const { return (high_.array() < low_.array()).any(); }
+  double longest() const { return longest_; }  // edge of the triangle, in voxels
   const Cell<3>& low() const { return low_; }
   const Cell<3>& high() const { return high_; }
 
@@ -180,7 +185,8 @@ class Prism {
   double nearest_ = 0.0, farthest_ = 0.0;  // of the way from the sensor to the surface
   Vec<3> origin_ = Vec<3>::Zero();         // of lines of sight, in voxels
   std::array<Vec<3>, 3> slope_;            // of those through the corners, along `axis_`
-  int axis_ = 0;                           // along which they go most
+  double longest_ = 0.0;
+  int axis_ = 0;  // along which they go most
   bool wide_ = false;
   Cell<3> low_ = Cell<3>::Ones(), high_ = Cell<3>::Zero();
 };
@@ -211,42 +217,61 @@ class SignedDistances : public Blocks<3, Distances> {
 
   void add(const Triangles& triangles, int threads) {
     const auto bounds = even_shares(triangles.size, threads);
-    std::vector<std::vector<Meeting>> met(bounds.size() - 1);
+    std::vector<std::vector<Term>> terms(bounds.size() - 1);
     parallel_shares(bounds, [&](size_t share, size_t first, size_t last) {
-      for (size_t face = first; face < last; ++face) meet(triangles, face, met[share]);
+      for (size_t face = first; face < last; ++face) meet(triangles, face, terms[share]);
     });
-    const Sorted sorted = by_block(met);
+    const Sorted sorted = by_block(terms);
     const auto shares = shares_of(sorted.offset.data(), sorted.block.size(), threads);
     parallel_shares(shares, [&](size_t, size_t first, size_t last) {
       for (size_t b = first; b < last; ++b)
         for (int64_t k = sorted.offset[b]; k < sorted.offset[b + 1]; ++k)
-          sum(triangles, sorted.face[static_cast<size_t>(k)], *sorted.block[b]);
+          sum(triangles, *sorted.term[static_cast<size_t>(k)], *sorted.block[b]);
     });
   }
 
  private:
   static constexpr double kMostVoxels = 64.0;
   static constexpr int64_t kMostBlocks = 1 << 20;  // around one triangle
+  static constexpr double kSmall = 4.0;            // voxels along an edge
+  static constexpr float kWhole = -1.0f;
 
-  struct Meeting {
+  // What a triangle adds to a voxel of a block; of a large triangle, all that it adds to the block.
+  struct Term {
     Cell<3> block;
-    uint32_t face;
+    uint32_t number;  // of the voxel in the block, or of the face
+    float weight;     // kWhole: of the face
+    float metres;
   };
-  // The triangles that meet each block, in their order.
+  // The terms of each block, in the order of the triangles.
   struct Sorted {
     std::vector<Block*> block;
     std::vector<int64_t> offset;
-    std::vector<uint32_t> face;
+    std::vector<const Term*> term;
   };
 
   Prism prism(const Triangles& triangles, size_t face) const {
     return Prism(triangles, face, voxel_, before_, behind_);
   }
 
-  void meet(const Triangles& triangles, size_t face, std::vector<Meeting>& met) const {
-    if (!(triangles.weight[face] > 0.0f)) return;
+  // less weight behind the surface, where there may be another one
+  Term term(const Cell<3>& voxel, double metres, float weight) const {
+    return {block_of(voxel), static_cast<uint32_t>(local_of(voxel)),
+            weight * static_cast<float>(std::min(1.0, 1.0 + metres / behind_)),
+            static_cast<float>(metres)};
+  }
+
+  void meet(const Triangles& triangles, size_t face, std::vector<Term>& terms) const {
+    const float weight = triangles.weight[face];
+    if (!(weight > 0.0f)) return;
     const Prism one = prism(triangles, face);
     if (one.empty()) return;
+    if (one.longest() <= kSmall) {
+      one.each(one.low(), one.high(), [&](const Cell<3>& voxel, double metres) {
+        terms.push_back(term(voxel, metres, weight));
+      });
+      return;
+    }
     const Cell<3> low = block_of(one.low()), high = block_of(one.high());
     int64_t blocks = 1;
     for (int d = 0; d < 3; ++d) blocks *= std::min<int64_t>(high[d] - low[d] + 1, kMostBlocks + 1);
@@ -257,57 +282,62 @@ class SignedDistances : public Blocks<3, Distances> {
       for (block[1] = low[1]; block[1] <= high[1]; ++block[1])
         for (block[0] = low[0]; block[0] <= high[0]; ++block[0])
           if (!one.misses(block * kEdge, kEdge))
-            met.push_back({block, static_cast<uint32_t>(face)});
+            terms.push_back({block, static_cast<uint32_t>(face), kWhole, 0.0f});
   }
 
-  Sorted by_block(const std::vector<std::vector<Meeting>>& met) {
+  Sorted by_block(const std::vector<std::vector<Term>>& terms) {
     size_t n = 0;
-    for (const auto& share : met) n += share.size();
+    for (const auto& share : terms) n += share.size();
     Sorted out;
-    std::vector<uint32_t> number;  // of the block, for each meeting
+    std::vector<uint32_t> number;  // of the block, for each term
     number.reserve(n);
     std::vector<int64_t> count;
-    std::unordered_map<const Block*, uint32_t> seen;
-    const Block* last = nullptr;
-    uint32_t of_last = 0;
-    for (const auto& share : met)
-      for (const Meeting& one : share) {
-        Block* block = find_or_add(one.block, Distances{});
-        if (block != last) {
-          const auto [it, added] = seen.try_emplace(block, static_cast<uint32_t>(count.size()));
-          if (added) {
-            out.block.push_back(block);
+    VoxelTable<3, uint32_t> known;  // one more than its number
+    const Cell<3>* last = nullptr;
+    for (const auto& share : terms)
+      for (const Term& one : share) {
+        if (last && *last == one.block) {
+          number.push_back(number.back());
+        } else {
+          uint32_t& place = known.find_or_add(one.block);
+          if (place == 0) {
+            out.block.push_back(find_or_add(one.block, Distances{}));
             count.push_back(0);
+            place = static_cast<uint32_t>(count.size());
           }
-          last = block;
-          of_last = it->second;
+          number.push_back(place - 1);
+          last = &one.block;
         }
-        ++count[of_last];
-        number.push_back(of_last);
+        ++count[number.back()];
       }
     out.offset.assign(1, 0);
     for (const int64_t c : count) out.offset.push_back(out.offset.back() + c);
     std::vector<int64_t> next(out.offset.begin(), out.offset.end() - 1);
-    out.face.resize(n);
+    out.term.resize(n);
     size_t k = 0;
-    for (const auto& share : met)
-      for (const Meeting& one : share)
-        out.face[static_cast<size_t>(next[number[k++]]++)] = one.face;
+    for (const auto& share : terms)
+      for (const Term& one : share) out.term[static_cast<size_t>(next[number[k++]]++)] = &one;
     return out;
   }
 
-  void sum(const Triangles& triangles, uint32_t face, Block& block) const {
-    const Prism one = prism(triangles, face);
-    const float weight = triangles.weight[face];
+  void sum(const Triangles& triangles, const Term& of, Block& block) const {
+    if (of.weight != kWhole) {
+      add_to(block, of);
+      return;
+    }
+    const Prism one = prism(triangles, of.number);
     const Cell<3> corner = block.origin * kEdge;
     const Cell<3> low = one.low().cwiseMax(corner);
     const Cell<3> high = one.high().cwiseMin((corner.array() + (kEdge - 1)).matrix());
-    one.each(low, high, [&](const Cell<3>& at, double metres) {
-      Distances& voxel = block.counts[static_cast<size_t>(local_of(at))];
-      const float here = weight * static_cast<float>(std::min(1.0, 1.0 + metres / behind_));
-      voxel.weight += here;
-      voxel.product += here * static_cast<float>(metres);
+    one.each(low, high, [&](const Cell<3>& voxel, double metres) {
+      add_to(block, term(voxel, metres, triangles.weight[of.number]));
     });
+  }
+
+  static void add_to(Block& block, const Term& one) {
+    Distances& voxel = block.counts[one.number];
+    voxel.weight += one.weight;
+    voxel.product += one.weight * one.metres;
   }
 
   double voxel_, before_, behind_;

@@ -33,8 +33,8 @@ class SurfaceOptions:
     looks: int = field_with_doc(3, "scans from one place that are used")
     fewest: float = field_with_doc(0.0, "triangles that a voxel must be of, by their weights")
     island: float = field_with_doc(0.05, "m2, smaller pieces are left out")
-    error: float = field_with_doc(0.005, "m that thinning out may move the surface by")
-    faces: int = field_with_doc(2_000_000, "triangles at most, whatever the error")
+    error: float = field_with_doc(0.01, "m that thinning out may move the surface by")
+    faces: int = field_with_doc(200_000, "triangles at most, whatever the error")
 
     def __post_init__(self) -> None:
         for name, low, high in _LIMITS:

@@ -5,6 +5,7 @@ How a sensor looks about is told by its beams, whatever the recording was read f
 - scans whose beams lie in a plane through the sensor are rows, and scans that follow one another
   are neighbours, in whatever direction a joint turns them;
 - scans that are cut into rows of equal length, as depth pictures and the columns of lidars are;
+- scans in rows of different lengths, as the rings of lidars without the beams that were lost;
 - all others: the Delaunay triangulation of the directions.
 """
 
@@ -20,6 +21,7 @@ from scipy.spatial import Delaunay, QhullError
 from stillmap.recording.model import Recording
 from stillmap.surface import rows
 from stillmap.surface.options import SurfaceOptions
+from stillmap.surface.strips import rows_of, strip_faces
 from stillmap.surface.triangles import grid_faces, surface_faces
 
 Float = NDArray[np.float64]
@@ -177,27 +179,36 @@ def _of_image(
 
 
 def _in_any_order(use: NDArray[np.bool_], looking: Float, o: SurfaceOptions) -> NDArray[np.int32]:
-    """The Delaunay triangulation of the directions of beams that are used."""
+    """Triangles between beams that are used; none spans much more than most do."""
     beams = np.flatnonzero(use)
     if len(beams) < 3:
         return np.zeros((0, 3), np.int32)
     seen = looking[beams]
-    middle = seen.mean(axis=0) / max(float(np.linalg.norm(seen.mean(axis=0))), 1e-12)
-    if float((seen @ middle).min()) > _NARROW:
+    rows_found = rows_of(seen)
+    faces = delaunay_faces(seen) if rows_found is None else strip_faces(rows_found)
+    if not len(faces):
+        return faces
+    chord = np.linalg.norm(seen[faces] - np.roll(seen[faces], 1, axis=1), axis=2).max(axis=1)
+    faces = faces[chord <= o.widest * np.median(chord)]
+    return np.asarray(beams[faces], np.int32)
+
+
+def delaunay_faces(looking: Float) -> NDArray[np.int32]:
+    """(m, 3) the Delaunay triangulation of directions (n, 3) of length one."""
+    middle = looking.mean(axis=0)
+    middle /= max(float(np.linalg.norm(middle)), 1e-12)
+    if float((looking @ middle).min()) > _NARROW:
         side = np.linalg.svd(middle[None])[2][1:]
-        plane, of = (seen @ side.T) / (seen @ middle)[:, None], np.arange(len(beams))
+        plane, of = (looking @ side.T) / (looking @ middle)[:, None], np.arange(len(looking))
     else:
-        plane, of = _unrolled(seen)
+        plane, of = _unrolled(looking)
     try:
         found = Delaunay(plane).simplices
     except QhullError:  # all in one line
         return np.zeros((0, 3), np.int32)
     found = found[np.abs(plane[found].mean(axis=1)[:, 0]) <= np.pi]
-    faces = of[found]
-    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2])]
-    chord = np.linalg.norm(seen[faces] - np.roll(seen[faces], 1, axis=1), axis=2).max(axis=1)
-    faces = faces[chord <= o.widest * np.median(chord)]
-    return np.asarray(beams[faces], np.int32)
+    faces = of[found].astype(np.int32)
+    return faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2])]
 
 
 def _unrolled(looking: Float) -> tuple[Float, Index]:
