@@ -184,8 +184,6 @@ def _inside(folder: Path, name: str) -> Path:
 
 def _tum_poses(path: Path, stamps: NDArray[np.int64], warnings: list[str]) -> list[Float | None]:
     """Poses at times (n,), by steady motion between those that are known."""
-    from stillmap.recording.tum import read_tum
-
     if not path.is_file():
         return [None] * len(stamps)
     try:
