@@ -22,7 +22,7 @@ class ChoiceOptions:
         0.9, "probability that a picture shows what stands still where no beam tells of it"
     )
     least: float = field_with_doc(
-        0.8, "probability below which a picture does not paint a face, if need be none does"
+        0.6, "probability below which a picture does not paint a face, if need be none does"
     )
     trust: float = field_with_doc(
         10.0, "what the logarithm of that probability counts against that of the resolution"

@@ -15,9 +15,9 @@ class VisibleOptions:
     near: float = field_with_doc(0.05, "m ahead of a camera, nothing before is seen")
     margin: float = field_with_doc(2.0, "pixels by which a face lies within a picture's edges")
     cosine: float = field_with_doc(
-        0.15, "least cosine between a face's normal and the line of sight"
+        0.03, "least cosine between a face's normal and the line of sight"
     )
-    pixels: float = field_with_doc(1.0, "least area of a face in a picture, square pixels")
+    pixels: float = field_with_doc(0.25, "least area of a face in a picture, square pixels")
     tolerance: float = field_with_doc(0.01, "m by which a face may lie behind what hides it")
     relative: float = field_with_doc(0.005, "the same, more, per metre of distance")
     steepest: float = field_with_doc(
