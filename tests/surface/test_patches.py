@@ -140,7 +140,7 @@ def test_points_beams_and_distances_belong_together(room):
     flat = np.sort(across.reshape(-1, 6), axis=1)[:, 1] > 0.5  # far from edges
     assert flat.mean() > 0.4
     # normals are those of what is around, at edges of the room too
-    assert np.mean(np.abs(patch.standoff - middle)[flat] < 0.02) > 0.9
+    assert np.mean(np.abs(patch.standoff - middle)[flat] < 0.02) > 0.85
 
 
 @pytest.mark.parametrize(("sensor", "made"), [("picture", (160, 120, 120.0)), ("lidar", (400, 60))])

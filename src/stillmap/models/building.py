@@ -39,6 +39,7 @@ class MoverModel:
         textured: with the pictures on it.
         T_map_object: (4, 4) where it was when it was of this shape.
         stamp_ns: when that was.
+        span_ns: from when to when what was seen of it is in the model.
     """
 
     shape: Shape
@@ -46,6 +47,7 @@ class MoverModel:
     textured: Textured
     T_map_object: Float
     stamp_ns: int
+    span_ns: tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,4 +192,7 @@ def _mover(
     read = _reader(sources.recording.images)
     textured = baked(dress.painted.mesh, dress.painted.view, dress.views, read, options.texture)
     T = shape.way.T_map_object(shape.seconds)
-    return MoverModel(shape, dress, textured, T, start + round(1e9 * shape.seconds))
+    first, middle, last = (
+        start + round(1e9 * seconds) for seconds in (shape.span[0], shape.seconds, shape.span[1])
+    )
+    return MoverModel(shape, dress, textured, T, middle, (first, last))

@@ -41,6 +41,8 @@ def write_models(folder: Path, models: ModelsLike, n_images: int, options: Textu
         write_faces(objects / f"{name}_faces.npz", painted, views, n_images, "object")
         record = {
             "stamp_ns": one.stamp_ns,
+            "first_stamp_ns": one.span_ns[0],
+            "last_stamp_ns": one.span_ns[1],
             "T_map_object": np.round(one.T_map_object, _MICROMETRES).tolist(),
             "rigid": one.shape.rigid,
         }

@@ -208,7 +208,7 @@ def delaunay_faces(looking: Float) -> NDArray[np.int32]:
         return np.zeros((0, 3), np.int32)
     found = found[np.abs(plane[found].mean(axis=1)[:, 0]) <= np.pi]
     faces = of[found].astype(np.int32)
-    return faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2])]
+    return np.asarray(faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2])])
 
 
 def _unrolled(looking: Float) -> tuple[Float, Index]:

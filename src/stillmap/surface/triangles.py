@@ -89,9 +89,10 @@ def surface_faces(points: Float, origin: Float, faces: Faces, o: SurfaceOptions)
     faces, normals, cosine = faces[kept], normals[kept], cosine[kept]
     steep = (cosine < np.cos(o.steep)) & ~level[kept]
     at_points = point_normals(normals, faces, len(points), 0)
-    bend = np.einsum("nki,ni->nk", at_points[faces[steep]], normals[steep]).min(axis=1)
+    along = np.einsum("nki,ni->nk", at_points[faces[steep]], normals[steep])
     fits = np.ones(len(faces), np.bool_)
-    fits[steep] = bend >= np.cos(o.bend)
+    # at two corners: the third may lie in the edge of a room
+    fits[steep] = np.sort(along, axis=1)[:, 1] >= np.cos(o.bend)
     faces, normals = faces[fits], normals[fits]
     smooth = point_normals(normals, faces, len(points), _SMOOTHING)
     standoff = np.einsum("ni,ni->n", smooth, origin - points)
