@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core
 from stillmap.recording.model import Recording
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import Order, Patch, patches_of
@@ -19,7 +18,7 @@ _MEMORY = 1.5e9  # bytes for all voxels
 _CELL = 0.5  # m, of squares by which the area is measured
 _BEAMS = 200_000  # by which it is
 _LAYERS = 2.5  # blocks behind each other across a surface
-_BLOCK = 4200  # bytes
+_EDGE, _BLOCK = 8, 4200  # voxels along a block, and its bytes
 
 
 def resolution_of(
@@ -70,5 +69,5 @@ def least_voxel(seen: Recording, poses: Float) -> float:
     beams = beams[seen.hit[beams]]
     ends = seen.end_points(beams, poses)
     cells = np.unique(np.floor(ends[np.isfinite(ends).all(axis=1)] / _CELL), axis=0)
-    bytes_of_one = _LAYERS * _BLOCK * len(cells) * (_CELL / _core.SignedDistances.edge) ** 2
+    bytes_of_one = _LAYERS * _BLOCK * len(cells) * (_CELL / _EDGE) ** 2
     return float(np.sqrt(bytes_of_one / _MEMORY))
