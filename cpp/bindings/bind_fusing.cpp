@@ -109,8 +109,9 @@ void bind_fusing(nb::module_& m) {
       .def_prop_ro("before", &SignedDistances::before)
       .def_prop_ro("behind", &SignedDistances::behind)
       .def_prop_ro("memory_bytes", &SignedDistances::memory_bytes)
-      .def_prop_ro_static(
-          "edge", [](nb::handle) { return SignedDistances::kEdge; }, "Voxels along a block.")
+      .def_prop_ro(
+          "edge", [](const SignedDistances&) { return SignedDistances::kEdge; },
+          "Voxels along a block.")
       .def("add", &add, nb::arg("points").noconvert(), nb::arg("origin").noconvert(),
            nb::arg("standoff").noconvert(), nb::arg("faces").noconvert(),
            nb::arg("weight").noconvert(), nb::arg("threads") = 1,

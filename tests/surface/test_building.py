@@ -9,7 +9,7 @@ from stillmap.surface.building import chosen_scans, fused, static_weights, surfa
 from stillmap.surface.mesh import Mesh
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import Patch, order_of, patches_of
-from stillmap.surface.resolution import voxel_of
+from stillmap.surface.resolution import resolution_of
 
 OPTIONS = SurfaceOptions(voxel=0.1, longest_share=1.0)
 
@@ -192,19 +192,36 @@ def test_options_are_checked(bad):
         SurfaceOptions(**bad)
 
 
+FREE = SurfaceOptions(longest_share=1.0)
+
+
 @pytest.mark.parametrize(
     ("made", "noise", "low", "high"),
     [((720, 80), 0.002, 0.02, 0.05), ((180, 20), 0.002, 0.07, 0.15), ((720, 80), 0.05, 0.06, 0.15)],
 )
 def test_voxels_are_as_fine_as_beams_tell(room, made, noise, low, high):
     recording = room.scans(room.lidar(*made), room.standing(2), noise=noise)
-    order = order_of(recording, np.arange(2), OPTIONS)
-    assert low < voxel_of(recording, room.standing(2), order, OPTIONS) < high
+    order = order_of(recording, np.arange(2), FREE)
+    voxel, _ = resolution_of(recording, room.standing(2), order, FREE)
+    assert low < voxel < high
 
 
 def test_voxels_fit_into_memory(room, monkeypatch):
     recording = room.scans(room.lidar(720, 80), room.standing(2))
-    order = order_of(recording, np.arange(2), OPTIONS)
-    fine = voxel_of(recording, room.standing(2), order, OPTIONS)
+    order = order_of(recording, np.arange(2), FREE)
+    fine, _ = resolution_of(recording, room.standing(2), order, FREE)
     monkeypatch.setattr("stillmap.surface.resolution._MEMORY", 1e5)
-    assert voxel_of(recording, room.standing(2), order, OPTIONS) > 2 * fine
+    assert resolution_of(recording, room.standing(2), order, FREE)[0] > 2 * fine
+
+
+def test_pictures_finer_than_voxels_are_thinned(room):
+    recording = room.scans(room.picture(320, 240, 240.0), room.standing())
+    order = order_of(recording, np.arange(1), OPTIONS)
+    voxel, stride = resolution_of(recording, room.standing(), order, OPTIONS)
+    assert voxel == 0.1
+    assert 3 <= stride <= 4
+    thin = order._replace(stride=stride)
+    (patch,) = (make() for make in patches_of(recording, room.standing(), thin, OPTIONS))
+    assert 0.8 < len(patch.points) / (320 * 240 / stride**2) < 1.05
+    mesh = surface_of(recording, room.standing(), static(recording), OPTIONS)
+    assert room.off_walls(samples(mesh)[0]).mean() < 0.005

@@ -12,7 +12,7 @@ from stillmap.surface.extraction import extracted, joined_whole, tiles_of, witho
 from stillmap.surface.mesh import Mesh
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import Patch, order_of, patches_of
-from stillmap.surface.resolution import voxel_of
+from stillmap.surface.resolution import resolution_of
 from stillmap.surface.thinning import thinned, within_budget
 from stillmap.threads import in_order
 
@@ -43,7 +43,8 @@ def surface_of(
     T = seen.T_map_sensor(poses)
     chosen = chosen_scans(T, seen.sensor, usual_range(seen), options)
     order = order_of(seen, chosen, options)
-    voxel = options.voxel or voxel_of(seen, poses, order, options)
+    voxel, stride = resolution_of(seen, poses, order, options)
+    order = order._replace(stride=stride)
     n, done = len(order.groups), 0
 
     def weighed(make: Callable[[], Patch]) -> tuple[Patch, NDArray[np.float32]]:

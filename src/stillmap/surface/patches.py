@@ -58,10 +58,12 @@ class Order(NamedTuple):
     Attributes:
         planar: whether scans are rows.
         groups: of scans: a range image each, or planar ones that follow one another.
+        stride: of pictures only each so many-th row and column is used.
     """
 
     planar: bool
     groups: list[Index]
+    stride: int = 1
 
 
 def order_of(seen: Recording, chosen: Index, o: SurfaceOptions) -> Order:
@@ -106,14 +108,14 @@ def patches_of(
     T = seen.T_map_sensor(poses)
     lengths: dict[tuple[int, int], int] = {}
     for scans in order.groups:
-        yield partial(_patch, seen, T, scans, order.planar, lengths, o)
+        yield partial(_patch, seen, T, scans, order, lengths, o)
 
 
 def _patch(
     seen: Recording,
     T_map_sensor: Float,
     scans: Index,
-    planar: bool,
+    order: Order,
     lengths: dict[tuple[int, int], int],
     o: SurfaceOptions,
 ) -> Patch:
@@ -126,14 +128,14 @@ def _patch(
     use = seen.hit[beam] & np.isfinite(points).all(axis=1)
     points[~use] = 0.0  # nothing is made of these
     looking = rows.directions(local)
-    if planar:
+    if order.planar:
         number = np.arange(len(beam), dtype=np.int32).reshape(len(scans), -1)
         faces = _between_rows(points, use, number, looking)
     else:
         key = (int(seen.sensor[scans[0]]), len(beam))
         if key not in lengths:
             lengths[key] = rows.row_length(looking)
-        faces = _of_image(points, use, looking, lengths[key], o)
+        faces = _of_image(points, use, looking, lengths[key], order.stride, o)
     kept = surface_faces(points, origin, faces, o)
     used = np.zeros(len(points), np.bool_)
     used[kept.faces] = True
@@ -163,7 +165,12 @@ def _between_rows(
 
 
 def _of_image(
-    points: Float, use: NDArray[np.bool_], looking: Float, length: int, o: SurfaceOptions
+    points: Float,
+    use: NDArray[np.bool_],
+    looking: Float,
+    length: int,
+    stride: int,
+    o: SurfaceOptions,
 ) -> NDArray[np.int32]:
     """Triangles of one scan whose rows have a length, 0: of any order."""
     if not length:
@@ -175,7 +182,7 @@ def _of_image(
         number = np.concatenate([number, number[:, :1]], axis=1)
     if len(number) > 2 and rows.apart(looking[number[-1]], looking[number[0]]) < 2.0 * across:
         number = np.concatenate([number, number[:1]])
-    return grid_faces(points, use, number)
+    return grid_faces(points, use, number[::stride, ::stride])
 
 
 def _in_any_order(use: NDArray[np.bool_], looking: Float, o: SurfaceOptions) -> NDArray[np.int32]:

@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core
 from stillmap.recording.model import Recording
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import Order, Patch, patches_of
@@ -14,17 +13,22 @@ Float = NDArray[np.float64]
 _ASKED = 8  # patches
 _FINEST, _COARSEST = 0.01, 0.2  # m
 _NOISES = 2.5  # standard deviations of ranges that a voxel is wide, at least
+_NEAR = 0.75  # voxels between rows that are used, at most
 _MEMORY = 1.5e9  # bytes for all voxels
 _CELL = 0.5  # m, of squares by which the area is measured
 _BEAMS = 200_000  # by which it is
 _LAYERS = 2.5  # blocks behind each other across a surface
-_BLOCK = 4200  # bytes
+_EDGE, _BLOCK = 8, 4200  # voxels along a block, and its bytes
 
 
-def voxel_of(seen: Recording, poses: Float, order: Order, o: SurfaceOptions) -> float:
-    """m, the edge of a voxel: as far as beams lie apart where they end, and wider than noise.
+def resolution_of(
+    seen: Recording, poses: Float, order: Order, o: SurfaceOptions
+) -> tuple[float, int]:
+    """m, the edge of a voxel, and of how many rows and columns of pictures one is enough.
 
-    Where that would take too much memory it is larger.
+    The voxel is as wide as beams lie apart where they end, and wider than noise; larger where that
+    would take too much memory, or as the options say. Beams are to lie as near to one another as
+    that.
 
     Args:
         seen: 3D, without motion during its scans.
@@ -34,15 +38,16 @@ def voxel_of(seen: Recording, poses: Float, order: Order, o: SurfaceOptions) -> 
     """
     groups = order.groups
     asked = np.unique(np.linspace(0, len(groups) - 1, min(len(groups), _ASKED)).astype(np.intp))
-    some = Order(order.planar, [groups[k] for k in asked])
+    some = order._replace(groups=[groups[k] for k in asked])
     parts = [make() for make in patches_of(seen, poses, some, o)]
     parts = [one for one in parts if len(one.faces)]
     if not parts:
-        return _COARSEST
+        return o.voxel or _COARSEST, 1
     apart = float(np.median([spacing(one) for one in parts]))
     noise = float(np.median([range_noise(one) for one in parts]))
-    wanted = np.clip(max(apart, _NOISES * noise), _FINEST, _COARSEST)
-    return max(float(wanted), least_voxel(seen, poses))
+    wanted = float(np.clip(max(apart, _NOISES * noise), _FINEST, _COARSEST))
+    voxel = o.voxel or max(wanted, least_voxel(seen, poses))
+    return voxel, max(int(_NEAR * voxel / apart), 1) if apart > 0.0 else 1
 
 
 def spacing(patch: Patch) -> float:
@@ -64,5 +69,5 @@ def least_voxel(seen: Recording, poses: Float) -> float:
     beams = beams[seen.hit[beams]]
     ends = seen.end_points(beams, poses)
     cells = np.unique(np.floor(ends[np.isfinite(ends).all(axis=1)] / _CELL), axis=0)
-    bytes_of_one = _LAYERS * _BLOCK * len(cells) * (_CELL / _core.SignedDistances.edge) ** 2
+    bytes_of_one = _LAYERS * _BLOCK * len(cells) * (_CELL / _EDGE) ** 2
     return float(np.sqrt(bytes_of_one / _MEMORY))

@@ -72,20 +72,20 @@ def surface_faces(points: Float, origin: Float, faces: Faces, o: SurfaceOptions)
         faces: (m, 3).
         o: limits.
     """
-    corners = points[faces]
-    spans = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    sight = (origin[faces] - corners).mean(axis=1)
-    area, range = np.linalg.norm(spans, axis=1), np.linalg.norm(sight, axis=1)
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    a, b, c = (points[faces[:, k]] for k in (0, 1, 2))
+    spans, sight = np.cross(b - a, c - a), origin[faces[:, 0]] - (a + b + c) / 3.0
+    area, range, longest = _length(spans), _length(sight), _length(b - a)
+    for edge in (c - b, a - c):
+        longest = np.maximum(longest, _length(edge))
     facing = np.einsum("ni,ni->n", spans, sight)
     # counter-clockwise seen from the sensor
     away = facing < 0.0
     faces = np.where(away[:, None], faces[:, ::-1], faces)
-    normals = np.where(away, -1.0, 1.0)[:, None] * spans / np.maximum(area, 1e-300)[:, None]
+    normals = (np.where(away, -1.0, 1.0) / np.maximum(area, 1e-300))[:, None] * spans
     cosine = np.abs(facing) / np.maximum(area * range, 1e-300)
-    level = is_level(np.linalg.norm(origin - points, axis=1), faces)
+    level = is_level(_length(origin - points), faces)
     limit = np.minimum(o.longest, o.longest_share * range)
-    kept = (edges.max(axis=1) <= limit) & (level | (cosine >= np.cos(o.steepest))) & (area > 0.0)
+    kept = (longest <= limit) & (level | (cosine >= np.cos(o.steepest))) & (area > 0.0)
     faces, normals, cosine = faces[kept], normals[kept], cosine[kept]
     steep = (cosine < np.cos(o.steep)) & ~level[kept]
     at_points = point_normals(normals, faces, len(points), 0)
@@ -106,8 +106,9 @@ def is_level(range: Float, faces: Faces) -> Bool:
         range: (n,) metres.
         faces: (m, 3).
     """
-    at = range[faces]
-    return np.asarray(np.ptp(at, axis=1) <= _NOISES * noise_of(range, faces))
+    a, b, c = (range[faces[:, k]] for k in (0, 1, 2))
+    between = np.maximum(np.maximum(a, b), c) - np.minimum(np.minimum(a, b), c)
+    return np.asarray(between <= _NOISES * noise_of(range, faces))
 
 
 def noise_of(range: Float, faces: Faces) -> float:
@@ -117,7 +118,8 @@ def noise_of(range: Float, faces: Faces) -> float:
     no point has neighbours on all sides.
     """
     count = np.bincount(faces.ravel(), minlength=len(range))
-    total = np.bincount(faces.ravel(), np.repeat(range[faces].sum(axis=1), 3), len(range))
+    each = range[faces[:, 0]] + range[faces[:, 1]] + range[faces[:, 2]]
+    total = np.bincount(faces.ravel(), np.repeat(each, 3), len(range))
     inside = count >= _AROUND
     if not inside.any():
         return 0.0
@@ -137,7 +139,9 @@ def point_normals(normals: Float, faces: Faces, n: int, rounds: int) -> Float:
     """
     out = _gathered(normals, faces, n)
     for _ in range(rounds):
-        out = _gathered(_of_length_one(out[faces].sum(axis=1)), faces, n)
+        out = _gathered(
+            _of_length_one(out[faces[:, 0]] + out[faces[:, 1]] + out[faces[:, 2]]), faces, n
+        )
     return out
 
 
@@ -149,5 +153,9 @@ def _gathered(normals: Float, faces: Faces, n: int) -> Float:
 
 
 def _of_length_one(vectors: Float) -> Float:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.asarray(vectors / np.where(length > 0.0, length, 1.0))
+    length = _length(vectors)
+    return np.asarray(vectors / np.where(length > 0.0, length, 1.0)[:, None])
+
+
+def _length(vectors: Float) -> Float:
+    return np.asarray(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)))
