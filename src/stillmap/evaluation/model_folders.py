@@ -262,6 +262,7 @@ def read_model(folder: Path, id: int, rigid: bool, n_pictures: int) -> Model | N
         T, stamp = np.array(said["T_map_object"], float).reshape(4, 4), int(said["stamp_ns"])
         first, last = said.get("first_stamp_ns"), said.get("last_stamp_ns")
         if first is None or last is None:
+            rigid = bool(said.get("rigid", rigid))
             first, last = (-(2**62), 2**62) if rigid else (stamp - _SPAN_NS, stamp + _SPAN_NS)
         span = int(first), int(last)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
