@@ -82,3 +82,19 @@ def test_normals_and_areas() -> None:
 def test_one_point_in_each_cube_is_left() -> None:
     points = np.array([(0.01, 0.01, 0.01), (0.02, 0.02, 0.02), (0.07, 0.0, 0.0), (0.03, 0, 0)])
     assert meshes.thinned(points, 0.05).tolist() == [0, 2]
+
+
+def test_a_large_mesh_is_looked_at_in_parts():
+    rng = np.random.default_rng(5)
+    n = 30
+    y, x = np.mgrid[:n, :n]
+    vertices = np.stack([2.0 * x.ravel(), 2.0 * y.ravel(), rng.uniform(0, 0.3, n * n)], axis=1)
+    k = (y[:-1, :-1] * n + x[:-1, :-1]).ravel()
+    faces = np.concatenate(
+        [np.stack([k, k + 1, k + n], axis=1), np.stack([k + 1, k + n + 1, k + n], axis=1)]
+    ).astype(np.int32)
+    points = rng.uniform([1, 1, -0.3], [57, 57, 0.6], (400, 3))
+    whole = meshes._to_mesh(points, vertices, faces, 0.3)
+    np.testing.assert_allclose(meshes.distance_to_mesh(points, vertices, faces, 0.3), whole)
+    far = np.array([[500.0, 0.0, 0.0]])
+    assert np.isinf(meshes.distance_to_mesh(far, vertices, faces, 0.3)).all()

@@ -12,6 +12,7 @@ Index = NDArray[np.int32]
 _FEW = 6  # triangles that may be the nearest one
 _BLOCK = 1 << 18  # points worked on together
 _MOST_POINTS = 1 << 24  # that a mesh is looked at
+_TILE, _BESIDE = 20.0, 2.0  # m, edge of a part of a large mesh, and how much beside it counts too
 
 
 class Samples(NamedTuple):
@@ -77,10 +78,29 @@ def distance_to_mesh(points: Float, vertices: Float, faces: Index, reach: float)
     """(n,) metres from points (n, 3) to the nearest triangle.
 
     Exact where that is one of those whose lattice comes nearest, which within `reach` it is but
-    for slivers; beyond, too far rather than too near.
+    for slivers; beyond, too far rather than too near. Where a mesh is large, points that have no
+    triangle within some metres are infinitely far from it.
     """
     out = np.full(len(points), np.inf)
     if not len(faces) or not len(points):
+        return out
+    corners = vertices[faces]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    if float(np.ptp(vertices[np.unique(faces)][:, :2], axis=0).max()) <= _TILE:
+        return _to_mesh(points, vertices, faces, reach)
+    tiles, of = np.unique(np.floor(points[:, :2] / _TILE), axis=0, return_inverse=True)
+    for number, tile in enumerate(tiles):
+        first, last = tile * _TILE - _BESIDE, (tile + 1.0) * _TILE + _BESIDE
+        near = ((low[:, :2] <= last) & (high[:, :2] >= first)).all(axis=1)
+        mine = np.flatnonzero(of.ravel() == number)
+        out[mine] = _to_mesh(points[mine], vertices, faces[near], reach)
+    return out
+
+
+def _to_mesh(points: Float, vertices: Float, faces: Index, reach: float) -> Float:
+    """The same of a mesh that is not large."""
+    out = np.full(len(points), np.inf)
+    if not len(faces):
         return out
     of_mesh = lattice(vertices, faces, reach)
     tree = scipy.spatial.cKDTree(of_mesh.points)
