@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stillmap.output.map_npz import write_npz
 from stillmap.output.meshes import write_glb
-from stillmap.output.protocols import ModelsLike, PaintedLike, ViewLike
+from stillmap.output.model_protocols import ModelsLike, PaintedLike, ViewLike
 from stillmap.surface.mesh import Mesh
 from stillmap.texture.options import TextureOptions
 from stillmap.texture.textured import Textured

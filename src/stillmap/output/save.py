@@ -10,9 +10,10 @@ from stillmap.output.clouds import write_clouds
 from stillmap.output.graph_g2o import write_g2o
 from stillmap.output.map_npz import write_map_npz
 from stillmap.output.map_server import write_map_server
+from stillmap.output.model_protocols import ModelsLike
 from stillmap.output.models import models_record, write_models
 from stillmap.output.objects import write_objects, write_traffic
-from stillmap.output.protocols import ModelsLike, ResultLike, TiltingLike
+from stillmap.output.protocols import ResultLike, TiltingLike
 from stillmap.output.report import write_report
 from stillmap.output.report_model import Stills, stills_of
 from stillmap.output.run_json import RECORD, write_run_json
