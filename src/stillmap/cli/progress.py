@@ -123,7 +123,7 @@ def _bar(iterations: int) -> "Iterator[Progress]":
 
 
 class _Step:
-    """What is being done, since when; iterations go through scans, the rest through other things."""
+    """What is being done, since when; only iterations count scans."""
 
     def __init__(self, what: str, iteration: int, iterations: int) -> None:
         self.name = f"{what}, iteration {iteration} of at most {iterations}" if iteration else what
