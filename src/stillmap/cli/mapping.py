@@ -122,7 +122,10 @@ def _modelled(
     except MissingExtra as error:
         warning = f"no models: {error}"
         return None, dataclasses.replace(result, warnings=[*result.warnings, warning])
-    return models, dataclasses.replace(result, stages=stages.to_dict())
+    warnings = [*result.warnings]
+    if not len(models.painted.mesh):
+        warnings.append("no model of the place: hardly any beams lie side by side on it")
+    return models, dataclasses.replace(result, warnings=warnings, stages=stages.to_dict())
 
 
 def _resumed(
