@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from stillmap.errors import InputError
+    from stillmap.models.building import Models
+    from stillmap.models.result import models_of
     from stillmap.pipeline import Iteration, Options, iterate
     from stillmap.recording import Recording, read
     from stillmap.result import Result, build
@@ -20,12 +22,14 @@ if TYPE_CHECKING:
 __all__ = [
     "InputError",
     "Iteration",
+    "Models",
     "Options",
     "Recording",
     "Result",
     "__version__",
     "build",
     "iterate",
+    "models_of",
     "read",
 ]
 
@@ -33,11 +37,13 @@ __all__ = [
 _MODULES = {
     "InputError": "errors",
     "Iteration": "pipeline",
+    "Models": "models.building",
     "Options": "pipeline",
     "Recording": "recording",
     "Result": "result",
     "build": "result",
     "iterate": "pipeline",
+    "models_of": "models.result",
     "read": "recording",
 }
 _ROOMS = ("changes", "em", "evaluation", "objects", "output", "recording", "simulation", "slam")

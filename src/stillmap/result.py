@@ -16,6 +16,7 @@ from stillmap.em import Ground, ground_of
 from stillmap.loop import Best, IterationRecord, Loop
 from stillmap.objects import MovingObject, Traffic, moving_objects, traffic
 from stillmap.output.crops import Snapshot
+from stillmap.output.protocols import ModelsLike
 from stillmap.output.save import save
 from stillmap.pipeline import DEFAULTS, Options, Progress
 from stillmap.recording.model import Recording
@@ -88,9 +89,11 @@ class Result:
         """
         return slam.deskewed(self.recording, self.poses, self.options.slam)
 
-    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Writes the result folder, complete or not at all."""
-        save(self, Path(path), overwrite)
+    def save(
+        self, path: str | Path, *, overwrite: bool = False, models: ModelsLike | None = None
+    ) -> None:
+        """Writes the result folder, complete or not at all; with what `models_of` made."""
+        save(self, Path(path), overwrite, models=models)
 
 
 def build(

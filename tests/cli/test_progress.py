@@ -36,6 +36,12 @@ def test_long_steps_are_told_of_again_and_again(lines):
         assert another("20 of 80").endswith("s left")
         progress("labelling beams", 1, 0, 0)
         another("labelling beams, iteration 1 of at most 6: 0 s so far")
+        progress("choosing pictures", 0, 3, 12)
+        line = another("choosing pictures")
+        assert line.startswith("choosing pictures: 3 of 12, ")
+        assert line.endswith("s left")
+        assert "scans" not in line
+        assert "/s" not in line
         progress("writing", 0, 0, 0)
         assert another("writing").startswith("writing: ")
     count = len(said)

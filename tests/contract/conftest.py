@@ -53,5 +53,6 @@ def mapped_street(street: Path) -> Path:
     """What `stillmap map` made of it."""
     out = street.parent / "mapped"
     words = ["map", street, "-o", out, "--quiet", "--poses", street / "truth/trajectory.tum"]
+    words += ["--set", "mesh.enabled=false"]
     assert main([*map(str, words)]) == 0
     return out

@@ -14,6 +14,7 @@ from stillmap.recording.tum import read_tum
 from stillmap.simulation import load_truth, scene_by_name, simulate_rig, write_rig
 
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
+QUICK += ("--set", "mesh.enabled=false")
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ from made_up_rooms import sharpest as best_of
 
 from stillmap import _core
 from stillmap.errors import InputError
+from stillmap.surface.mesh import Mesh
 from stillmap.texture.baking import baked
 from stillmap.texture.gutters import fill_gutters
 from stillmap.texture.options import TextureOptions
@@ -156,3 +157,9 @@ def test_halves_are_means_of_squares():
     np.testing.assert_allclose(half[0, 0], picture[:2, :2].mean(axis=(0, 1)))
     np.testing.assert_allclose(half[2, 1], picture[4, 2:4].mean(axis=0))
     assert halved(picture, 0).tolist() == picture.tolist()
+
+
+def test_nothing_to_paint_is_nothing_painted():
+    none = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+    model = baked(none, np.zeros(0, np.int32), [], lambda _: np.zeros(0))
+    assert len(model) == len(model.pages) == len(model.unread) == 0

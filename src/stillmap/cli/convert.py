@@ -20,6 +20,7 @@ _EPILOG = """examples:
   stillmap convert out -o out.mcap            a result, to look at in Foxglove
   stillmap convert out -o beams.parquet       every beam of a result with its label
   stillmap convert out -o static.laz --only static    points of a result in 3D
+  stillmap convert out -o model.obj           the model of the place, pages of texture beside it
 """
 
 
@@ -31,7 +32,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         description="Write a recording in another format, which the ending of FILE names: "
         f"{', '.join(ENDINGS)}; a folder otherwise. A result of `stillmap map` becomes a bag "
         "that shows it (.mcap for Foxglove) or a table of its beams (.parquet); in 3D a cloud of "
-        f"points with their p_static ({', '.join(CLOUDS)}).",
+        f"points with their p_static ({', '.join(CLOUDS)}), or the model of the place (.obj).",
         epilog=_EPILOG,
     )
     p.add_argument("input", metavar="INPUT", help="a recording, or what `stillmap map` wrote")

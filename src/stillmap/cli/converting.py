@@ -12,7 +12,7 @@ from stillmap.cli.progress import shown_share
 from stillmap.cli.reading import read_changes
 from stillmap.cli.results import Mapped, found, is_deskewed, is_result, require_apart
 from stillmap.errors import InputError
-from stillmap.export import bag, beam_table, cloud, cloud_files, result
+from stillmap.export import bag, beam_table, cloud, cloud_files, model, result
 from stillmap.output.atomic import require_new_file
 from stillmap.output.tilting import FOLDER as TILTING
 from stillmap.recording import ReadOptions, Recording, read, ros_writing, writers
@@ -61,6 +61,8 @@ def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tup
         return [], _convert_to_cloud(args, mapped, output, form)
     if args.only:
         raise InputError("--only is for clouds of points", where=str(output), hint=_clouds())
+    if output.suffix.lower() == model.ENDING and args.to is None:
+        return [], _convert_to_obj(args, mapped, output)
     if output.suffix.lower() == _PARQUET and args.to is None:
         require_new_file(output, args.overwrite)
         beam_table.require_pyarrow()
@@ -68,7 +70,7 @@ def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tup
         seen = _seen(mapped, exported.recording, exported.poses)
         beam_table.write(exported, seen, output)
         return [], f"{exported.recording.n_beams} beams"
-    hint = f"a bag, .mcap for Foxglove, {_PARQUET}, or in 3D {_clouds()}"
+    hint = f"a bag, .mcap for Foxglove, {_PARQUET}, or in 3D {_clouds()}, {model.ENDING}"
     try:
         writer = writers.writer_for(output, args.to)
     except InputError as error:
@@ -82,6 +84,13 @@ def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tup
     exported = _exported(mapped)
     lost = bag.write(exported, output, kind, overwrite=args.overwrite)
     return lost, f"{exported.recording.n_scans} scans, map, way and {len(exported.tracks)} objects"
+
+
+def _convert_to_obj(args: argparse.Namespace, mapped: Mapped, output: Path) -> str:
+    faces, pages = model.write_obj(
+        mapped.folder, output, mapped.texture_options.quality, args.overwrite
+    )
+    return f"{faces} faces and {pages} pages of texture"
 
 
 def _clouds() -> str:

@@ -22,8 +22,8 @@ from stillmap.cli.tilting import built, read_tilting, said
 from stillmap.errors import InputError
 from stillmap.extras import MissingExtra
 from stillmap.loop import Loop
-from stillmap.models.building import Models, models_of
-from stillmap.models.sources import sources_of, sources_of_rig
+from stillmap.models.building import Models
+from stillmap.models.result import models_of
 from stillmap.output.atomic import require_new
 from stillmap.output.points import beam_counts
 from stillmap.output.run_json import RECORD
@@ -34,7 +34,6 @@ from stillmap.recording.poses import poses_from_tum
 from stillmap.result import Result, build
 from stillmap.scene.rig import Tilting
 from stillmap.stages import Stages
-from stillmap.threads import resolved_threads
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seconds", "warnings")
@@ -116,18 +115,17 @@ def _modelled(
     result: Result, in_3d: Tilting | None, progress: Progress, stages: Stages
 ) -> tuple[Models | None, Result]:
     """Models of what is in 3D, where they are wanted and can be made; and what the result says."""
-    options = result.options
-    if not options.mesh.enabled or (in_3d is None and result.recording.dimension == 2):
+    if not result.options.mesh.enabled or (in_3d is None and result.recording.dimension == 2):
         return None, result
     try:
-        sources = sources_of(result) if in_3d is None else sources_of_rig(result, in_3d)
-        models = models_of(
-            sources, options.mesh, resolved_threads(options.threads), progress, stages
-        )
+        models = models_of(result, tilting=in_3d, progress=progress, stages=stages)
     except MissingExtra as error:
         warning = f"no models: {error}"
         return None, dataclasses.replace(result, warnings=[*result.warnings, warning])
-    return models, dataclasses.replace(result, stages=stages.to_dict())
+    warnings = [*result.warnings]
+    if not len(models.painted.mesh):
+        warnings.append("no model of the place: hardly any beams lie side by side on it")
+    return models, dataclasses.replace(result, warnings=warnings, stages=stages.to_dict())
 
 
 def _resumed(

@@ -114,17 +114,20 @@ def _bar(iterations: int) -> "Iterator[Progress]":
                 bar.remove_task(task)
                 task = bar.add_task(shown.name, total=total or None, counted="")
             if total:
-                counted = f"{done}/{total} scans {shown.rate(done):.0f}/s"
+                counted = f"{done}/{total}"
+                if shown.of_scans:
+                    counted += f" scans {shown.rate(done):.0f}/s"
                 bar.update(task, completed=done, counted=counted)
 
         yield progress
 
 
 class _Step:
-    """What is being done, since when."""
+    """What is being done, since when; only iterations count scans."""
 
     def __init__(self, what: str, iteration: int, iterations: int) -> None:
         self.name = f"{what}, iteration {iteration} of at most {iterations}" if iteration else what
+        self.of_scans = iteration > 0
         self._which, self._started = (what, iteration), time.monotonic()
 
     def is_same(self, what: str, iteration: int) -> bool:
@@ -134,7 +137,7 @@ class _Step:
         return time.monotonic() - self._started
 
     def rate(self, done: int) -> float:
-        """Scans per second."""
+        """How many per second."""
         return done / max(self.seconds(), 1e-3)
 
 
@@ -173,9 +176,11 @@ class _Lines:
         if not total:
             say(f"{step.name}: {step.seconds():.0f} s so far")
             return
-        text, rate = f"{step.name}: {done} of {total} scans", step.rate(done)
-        if step.seconds() > _AT_ONCE:
-            text += f", {rate:.0f}/s"
+        text, rate = f"{step.name}: {done} of {total}", step.rate(done)
+        if step.of_scans:
+            text += " scans"
+            if step.seconds() > _AT_ONCE:
+                text += f", {rate:.0f}/s"
         if done < total:
             text += f", {(total - done) / max(rate, 1e-3):.0f} s left"
         say(text)

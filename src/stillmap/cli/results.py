@@ -15,6 +15,7 @@ from stillmap.recording import Recording, folder, read, spool
 from stillmap.recording.lines import Progress
 from stillmap.recording.options import ReadOptions
 from stillmap.texts import read_text, require_regular
+from stillmap.texture.options import TextureOptions
 
 _MAX_RUN = 32 << 20  # bytes of a run.json
 
@@ -43,6 +44,19 @@ class Mapped:
             InputError: the record does not say so.
         """
         return _read_options(self.record, self.folder)
+
+    @property
+    def texture_options(self) -> TextureOptions:
+        """How its models were painted; the defaults where the record does not say so."""
+        chosen: Any = self.record.get("options")
+        for name in ("mesh", "texture"):
+            chosen = chosen.get(name) if isinstance(chosen, dict) else None
+        quality = chosen.get("quality") if isinstance(chosen, dict) else None
+        try:
+            return TextureOptions() if quality is None else TextureOptions(quality=quality)
+        except (ValueError, TypeError) as error:
+            where = str(self.folder)
+            raise InputError(f"has options that cannot be: {error}", where=where) from error
 
     def read(
         self, progress: Progress | None = None, scratch: Path | None = None

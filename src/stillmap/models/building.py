@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.extras import extra
 from stillmap.models.movers import Shape, shape_of
 from stillmap.models.options import MeshOptions
 from stillmap.models.painting import Dressed, dressed, when_in_view
@@ -26,6 +27,7 @@ from stillmap.texture.views import views_of
 Float = NDArray[np.float64]
 Read = Callable[[int], NDArray[Any]]
 
+_NEEDED = ("skimage.measure", "pyfqmr", "xatlas", "trimesh")  # of the extra `mesh`
 _SPOILED = 0.5  # probability that a picture shows static things only, below which it does not
 
 
@@ -72,6 +74,16 @@ class Models:
     left_out: dict[str, int]
     movers: list[MoverModel]
     tried: int
+
+
+def require_extras() -> None:
+    """Refuses before any work is done.
+
+    Raises:
+        MissingExtra: a library of the extra `mesh` is not installed.
+    """
+    for module in _NEEDED:
+        extra(module, "mesh.glb", "made", group="mesh")
 
 
 def models_of(

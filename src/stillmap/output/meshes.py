@@ -72,7 +72,7 @@ def write_glb(path: Path, mesh: Textured | Mesh, options: TextureOptions | None 
         made = trimesh.Trimesh(
             _y_up(part.vertices - shift),
             part.faces,
-            visual=visual(uv=_from_bottom(part.uv) if part.page >= 0 else None, material=material),
+            visual=visual(uv=from_bottom(part.uv) if part.page >= 0 else None, material=material),
             process=False,
         )
         scene.add_geometry(made, node_name=name, geom_name=name, transform=move)
@@ -107,34 +107,54 @@ def write_obj(folder: Path, mesh: Textured | Mesh, options: TextureOptions | Non
         InputError: the folder holds something, or cannot be written.
         MissingExtra: trimesh is not installed.
     """
-    trimesh = _trimesh(folder)
-    pages = _compressed(mesh, options or TextureOptions())
+    _trimesh(folder)  # it is the folder that cannot be written without
+    files = obj_files(mesh, options or TextureOptions())
+    with new_folder(folder, "mesh.obj") as work:
+        for name, data in files.items():
+            (work / name).write_bytes(data)
+
+
+def obj_files(
+    mesh: Textured | Mesh, options: TextureOptions, name: str = "mesh", before: str = ""
+) -> dict[str, bytes]:
+    """`NAME.obj`, `NAME.mtl` and the pages, by their names.
+
+    Args:
+        mesh: with one face at least.
+        options: how pages are compressed.
+        name: of the first two.
+        before: what the names of pages begin with.
+
+    Raises:
+        MissingExtra: trimesh is not installed.
+    """
+    trimesh = _trimesh(Path(f"{name}.obj"))
+    pages = _compressed(mesh, options)
     simple = trimesh.visual.material.SimpleMaterial
     scene = trimesh.Scene()
     for part in _parts(mesh):  # the grey one is the last: trimesh counts on uv for all before
-        name = _name(part.page)
+        title = _name(part.page)
         paint = 255 if part.page >= 0 else GREY[0]
         material = simple(
             image=_mark(part.page) if part.page >= 0 else None,
             diffuse=[paint, paint, paint, 255],
             specular=[0, 0, 0, 255],
         )
-        material.name = name
-        uv = _from_bottom(part.uv) if part.page >= 0 else None
+        material.name = title
+        uv = from_bottom(part.uv) if part.page >= 0 else None
         visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
         made = trimesh.Trimesh(_y_up(part.vertices), part.faces, visual=visual, process=False)
-        scene.add_geometry(made, node_name=name, geom_name=name)
+        scene.add_geometry(made, node_name=title, geom_name=title)
+    materials = f"{name}.mtl"
     text, beside = trimesh.exchange.obj.export_obj(
-        scene, include_normals=False, return_texture=True, mtl_name="mesh.mtl", header=None
+        scene, include_normals=False, return_texture=True, mtl_name=materials, header=None
     )
-    materials = beside["mesh.mtl"].decode("ascii")
-    with new_folder(folder, "mesh.obj") as work:
-        for number, page in enumerate(pages):
-            name = f"{_name(number)}{page.suffix}"
-            materials = materials.replace(f"map_Kd {_name(number)}.png\n", f"map_Kd {name}\n")
-            (work / name).write_bytes(page.data)
-        (work / "mesh.mtl").write_text(materials, encoding="ascii")
-        (work / "mesh.obj").write_text(text, encoding="ascii")
+    told, named = beside[materials].decode("utf-8"), {}
+    for number, page in enumerate(pages):
+        file = f"{before}{_name(number)}{page.suffix}"
+        told = told.replace(f"map_Kd {_name(number)}.png\n", f"map_Kd {file}\n")
+        named[file] = page.data
+    return {f"{name}.obj": text.encode("utf-8"), materials: told.encode("utf-8"), **named}
 
 
 def _trimesh(path: Path) -> Any:
@@ -165,7 +185,12 @@ def _y_up(points: Float) -> Float:
     return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
 
 
-def _from_bottom(uv: Float) -> Float:
+def z_up(points: Float) -> Float:
+    """(..., 3) y up as z up."""
+    return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
+
+
+def from_bottom(uv: Float) -> Float:
     """As trimesh and OBJ count rows."""
     return np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])
 

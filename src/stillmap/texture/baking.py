@@ -81,6 +81,8 @@ def _by_view(layout: Layout) -> Iterator[tuple[int, NDArray[np.intp]]]:
     """Views that paint anything, and the faces that they do, rising."""
     order = np.argsort(layout.view, kind="stable")
     numbers, first = np.unique(layout.view[order], return_index=True)
+    if not len(numbers):
+        return
     for number, faces in zip(numbers.tolist(), np.split(order, first[1:]), strict=True):
         if number >= 0:
             yield number, faces

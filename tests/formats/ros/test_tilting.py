@@ -18,6 +18,7 @@ from stillmap.simulation.lidar import joint_angle
 NOD = {"tilts": True, "period": 2.0}
 JOINT_NS = 5_000_000  # from one transform of the joint to the next; turns happen at some of them
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
+QUICK += ("--set", "mesh.enabled=false")
 TILT = ReadOptions(topic="tilt_scan", base_frame="base_link")
 
 
