@@ -18,6 +18,16 @@ def _some(rng: np.random.Generator) -> Mesh:
     return Mesh(vertices, faces.astype(np.int32))
 
 
+def _has_no_gaps(fine: Mesh) -> bool:
+    edges = np.sort(fine.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    once = np.unique(edges, axis=0, return_counts=True)
+    border = once[0][once[1] == 1]
+    # what belongs to one face alone lies on the border of the sheet
+    middle = fine.vertices[border].mean(axis=1)
+    return bool((np.isclose(middle[:, :2], 0.0) | np.isclose(middle[:, :2], 6.0)).any(axis=1).all())
+    assert set(once[1].tolist()) == {1, 2}
+
+
 def test_edges_become_short_and_the_surface_stays() -> None:
     mesh = _some(np.random.default_rng(3))
     fine, of = divided(mesh, 0.3)
@@ -32,13 +42,7 @@ def test_there_are_no_gaps_between_the_parts() -> None:
     mesh = _some(np.random.default_rng(4))
     fine, _ = divided(mesh, 0.9)
     assert len(fine) > len(mesh)
-    edges = np.sort(fine.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    once = np.unique(edges, axis=0, return_counts=True)
-    border = once[0][once[1] == 1]
-    # what belongs to one face alone lies on the border of the sheet
-    middle = fine.vertices[border].mean(axis=1)
-    assert (np.isclose(middle[:, :2], 0.0) | np.isclose(middle[:, :2], 6.0)).any(axis=1).all()
-    assert set(once[1].tolist()) == {1, 2}
+    assert _has_no_gaps(fine)
 
 
 def test_what_is_short_stays_as_it_is() -> None:
@@ -46,3 +50,15 @@ def test_what_is_short_stays_as_it_is() -> None:
     same, of = divided(mesh, 10.0)
     np.testing.assert_array_equal(same.faces, mesh.faces)
     np.testing.assert_array_equal(of, np.arange(len(mesh)))
+
+
+def test_edges_may_be_longer_in_some_places_without_gaps() -> None:
+    mesh = _some(np.random.default_rng(5))
+    fine, _ = divided(mesh, lambda points: 0.2 + 0.2 * points[:, 0])
+    a, b = fine.vertices[fine.faces], fine.vertices[np.roll(fine.faces, -1, axis=1)]
+    limit = 0.2 + 0.2 * np.minimum(a[..., 0], b[..., 0])
+    assert (np.linalg.norm(a - b, axis=2) <= limit + 1e-9).all()
+    here = fine.centres[:, 0]
+    assert (here < 1.0).sum() > 2 * ((here > 5.0) & (here < 6.0)).sum()
+    np.testing.assert_allclose(fine.areas().sum(), mesh.areas().sum(), rtol=1e-9)
+    assert _has_no_gaps(fine)

@@ -2,9 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from stillmap.models.sources import Sources
 from stillmap.surface.dividing import divided
@@ -67,7 +69,7 @@ def painted(
         tell: called with how many views are looked at, and of how many.
     """
     if views:
-        mesh, _ = divided(mesh, options.edge)
+        mesh, _ = divided(mesh, partial(longest_edge, views, options))
     beams, areas = sources.beams(), mesh.areas()
     candidates = Candidates.none(len(mesh), min(options.candidates, max(len(views), 1)))
     sharpest = Candidates.none(len(mesh), 1)
@@ -86,6 +88,17 @@ def painted(
         if tell is not None:
             tell(number + 1, len(views))
     return settled(mesh, candidates, sharpest, options.border)
+
+
+def longest_edge(views: Sequence[View], options: ChoiceOptions, points: Float) -> Float:
+    """(n,) metres, how long edges may be that end at points (n, 3).
+
+    `edge` metres, and where the nearest camera is far what is `edge_pixels` wide in its pictures.
+    """
+    away, nearest = cKDTree(np.array([view.place for view in views])).query(points)
+    focal = np.array([0.0 if view.camera.K is None else view.camera.K[0, 0] for view in views])
+    wide = options.edge_pixels * away / np.maximum(focal[nearest], 1.0)
+    return np.asarray(np.maximum(options.edge, wide), np.float64)
 
 
 def settled(mesh: Mesh, candidates: Candidates, sharpest: Candidates, border: float) -> Painted:
@@ -122,8 +135,8 @@ def shown(
     By what beams taken about then say, and where there are none by whether a thing that is followed
     stands before it. Of the corners of a face and its middle the least counts.
     """
-    corners, number = np.unique(mesh.faces[faces], return_inverse=True)
-    points = np.concatenate([mesh.vertices[corners], mesh.centres[faces]])
+    part = mesh.part_of(faces)
+    points = np.concatenate([part.vertices, part.centres])
     seconds = 1e-9 * (view.stamp_ns - beams.start_ns)
     there = at_time(things, seconds)
     free = 1.0 - in_the_way(there, view.place, points, options.margin, options.sigma)
@@ -132,5 +145,5 @@ def shown(
     uv, ok = project(view.camera, local)
     uv = np.where(ok[:, None], uv, 0.0)  # corners just outside: as at the edge
     p = found.shown(uv, local[:, 2], options.margin, options.unseen * free)
-    of_corners = p[: len(corners)][number.reshape(-1, 3)].min(axis=1)
-    return np.asarray(np.minimum(of_corners, p[len(corners) :]))
+    a, b, c = (p[part.faces[:, k]] for k in range(3))
+    return np.minimum(np.minimum(a, b), np.minimum(c, p[len(part.vertices) :]))

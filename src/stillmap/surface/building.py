@@ -105,7 +105,8 @@ def static_weights(
 ) -> NDArray[np.float32]:
     """(m,) weights of a patch's faces: P(static) of all three beams, 0 below `least`."""
     p = np.nan_to_num(p_static[patch.beam].astype(np.float64), nan=0.0)
-    weight = p[patch.faces].prod(axis=1)
+    a, b, c = patch.faces.T
+    weight = p[a] * p[b] * p[c]
     return np.where(weight >= least, weight, 0.0).astype(np.float32)
 
 

@@ -1,20 +1,27 @@
 """Triangles that are divided until no edge is long, without gaps between them."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.surface.mesh import Mesh
 
+Float = NDArray[np.float64]
 Index = NDArray[np.int32]
 
 _ROUNDS = 12  # at most; each halves the longest edges
 
 
-def divided(mesh: Mesh, edge: float) -> tuple[Mesh, NDArray[np.intp]]:
+def divided(mesh: Mesh, edge: float | Callable[[Float], Float]) -> tuple[Mesh, NDArray[np.intp]]:
     """The same surface, all of whose edges are shorter; neighbours stay neighbours.
 
     Edges longer than `edge` metres are halved, and triangles with one, two or three such edges
     become two, three or four, again and again.
+
+    Args:
+        mesh: F faces.
+        edge: metres; or what says of points (n, 3) how long edges may be that end there.
 
     Returns:
         The mesh, its first vertices those of the old one, and (F,) the face of the old one that
@@ -22,22 +29,36 @@ def divided(mesh: Mesh, edge: float) -> tuple[Mesh, NDArray[np.intp]]:
     """
     vertices, faces = mesh.vertices, mesh.faces
     of = np.arange(len(faces))
+    limit = _limits(edge, vertices)
     for _ in range(_ROUNDS):
-        ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)  # (F, 3, 2): edges ab, bc, ca
-        length = np.linalg.norm(vertices[ends[..., 0]] - vertices[ends[..., 1]], axis=2)
-        if not (length > edge).any():
+        long = np.column_stack(
+            [_long(vertices, limit, faces[:, k], faces[:, (k + 1) % 3]) for k in range(3)]
+        )
+        if not long.any():
             break
-        middle, vertices = _halved(ends, length > edge, vertices)
+        ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)  # (F, 3, 2): edges ab, bc, ca
+        middle, vertices = _halved(ends, long, vertices)
+        limit = np.concatenate([limit, _limits(edge, vertices[len(limit) :])])
         faces, of = _parted(faces, middle, of)
     return Mesh(vertices, faces), of
 
 
-def _halved(
-    ends: Index, long: NDArray[np.bool_], vertices: NDArray[np.float64]
-) -> tuple[Index, NDArray[np.float64]]:
+def _limits(edge: float | Callable[[Float], Float], points: Float) -> Float:
+    """(n,) metres, how long edges that end at points (n, 3) may be."""
+    return edge(points) if callable(edge) else np.full(len(points), float(edge))
+
+
+def _long(vertices: Float, limit: Float, a: Index, b: Index) -> NDArray[np.bool_]:
+    """(F,) whether edges from a to b are too long."""
+    x, y, z = (vertices[a] - vertices[b]).T
+    return np.asarray(x * x + y * y + z * z > np.minimum(limit[a], limit[b]) ** 2)
+
+
+def _halved(ends: Index, long: NDArray[np.bool_], vertices: Float) -> tuple[Index, Float]:
     """(F, 3) vertices in the middle of long edges, -1 for others; all vertices, with these."""
-    two = np.sort(ends[long].astype(np.int64), axis=1)
-    key, number = np.unique(two[:, 0] * len(vertices) + two[:, 1], return_inverse=True)
+    one, other = ends[long].astype(np.int64).T
+    key = np.minimum(one, other) * len(vertices) + np.maximum(one, other)
+    key, number = np.unique(key, return_inverse=True)
     middle = np.full(long.shape, -1, np.int32)
     middle[long] = len(vertices) + number
     a, b = key // len(vertices), key % len(vertices)

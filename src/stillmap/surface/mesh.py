@@ -41,21 +41,25 @@ class Mesh:
     @property
     def centres(self) -> Float:
         """(F, 3) metres."""
-        return np.asarray(self.corners.mean(axis=1))
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        return np.asarray((a + b + c) / 3.0)
 
     def areas(self) -> Float:
         """(F,) square metres."""
-        return 0.5 * np.asarray(np.linalg.norm(self._spans(), axis=1))
+        return 0.5 * _length(self._spans())
 
     def normals(self) -> Float:
         """(F, 3) of length one, zero for faces without area; towards where the sensor was."""
         spans = self._spans()
-        length = np.linalg.norm(spans, axis=1, keepdims=True)
-        return spans / np.where(length > 0.0, length, 1.0)
+        length = _length(spans)
+        return spans / np.where(length > 0.0, length, 1.0)[:, None]
 
     def _spans(self) -> Float:
-        a, b, c = np.moveaxis(self.corners, 1, 0)
-        return np.cross(b - a, c - a)
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        u, v = (b - a).T, (c - a).T
+        return np.column_stack(
+            [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+        )
 
     def pairs(self) -> Index:
         """(N, 2) faces that share an edge, the lower number first, each pair once, rising.
@@ -63,17 +67,23 @@ class Mesh:
         Of an edge that more than two share, each is beside the next.
         """
         F = len(self.faces)
-        edges = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-        key, face = edges[:, 0] * len(self.vertices) + edges[:, 1], np.repeat(np.arange(F), 3)
+        corner, next = self.faces.astype(np.int64), np.roll(self.faces, -1, axis=1)
+        key = (np.minimum(corner, next) * len(self.vertices) + np.maximum(corner, next)).ravel()
+        face = np.repeat(np.arange(F), 3)
         order = np.argsort(key, kind="stable")
         same = np.flatnonzero(np.diff(key[order]) == 0)
-        pairs = np.sort(np.stack([face[order[same]], face[order[same + 1]]], axis=1), axis=1)
-        pairs = pairs[pairs[:, 0] < pairs[:, 1]]
-        return np.unique(pairs, axis=0).astype(np.int32)
+        one, other = face[order[same]], face[order[same + 1]]
+        low, high = np.minimum(one, other), np.maximum(one, other)
+        both = np.unique((low * F + high)[low < high])
+        return np.column_stack([both // F, both % F]).astype(np.int32)
 
     def part(self, kept: NDArray[np.bool_]) -> "Mesh":
         """The faces (F,) that are kept, with the vertices that they use, in their order."""
-        faces = self.faces[kept]
+        return self.part_of(np.flatnonzero(kept))
+
+    def part_of(self, numbers: NDArray[np.intp]) -> "Mesh":
+        """The faces with these numbers (n,), with the vertices that they use, in their order."""
+        faces = self.faces[numbers]
         used = np.zeros(len(self.vertices), np.bool_)
         used[faces] = True
         number = np.cumsum(used, dtype=np.int64) - 1
@@ -92,3 +102,7 @@ def joined(meshes: list[Mesh]) -> Mesh:
             ]
         ),
     )
+
+
+def _length(vectors: Float) -> Float:
+    return np.asarray(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)))

@@ -123,9 +123,16 @@ def _patch(
     local = seen.points[beam].astype(np.float64)
     scan = np.repeat(np.arange(len(scans)), np.diff(seen.offset)[scans])
     T = T_map_sensor[scans]
-    points = np.einsum("nij,nj->ni", T[scan, :3, :3], local) + T[scan, :3, 3]
+    bounds = np.concatenate([[0], np.cumsum(np.diff(seen.offset)[scans])])
+    points = np.concatenate(
+        [
+            local[i:j] @ one[:3, :3].T + one[:3, 3]
+            for one, (i, j) in zip(T, pairwise(bounds), strict=True)
+        ]
+    )
     origin = T[scan, :3, 3]
-    use = seen.hit[beam] & np.isfinite(points).all(axis=1)
+    x, y, z = points.T
+    use = seen.hit[beam] & np.isfinite(x + y + z)
     points[~use] = 0.0  # nothing is made of these
     looking = rows.directions(local)
     if order.planar:

@@ -43,19 +43,31 @@ def grid_faces(points: Float, use: Bool, number: NDArray[np.int32]) -> Faces:
     """
     a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
     d, c = number[1:, :-1].ravel(), number[1:, 1:].ravel()
+    some = np.flatnonzero(use[a].astype(np.int8) + use[b] + use[c] + use[d] >= 3)
+    a, b, c, d = a[some], b[some], c[some], d[some]
     ua, ub, uc, ud = use[a], use[b], use[c], use[d]
+    columns = _columns(points)
     with np.errstate(invalid="ignore"):
-        ac = np.linalg.norm(points[a] - points[c], axis=1)
-        bd = np.linalg.norm(points[b] - points[d], axis=1)
-        by_ac = np.where(ua & uc & ub & ud, ac <= bd, ua & uc)
+        shorter = _squares(columns, a, c) <= _squares(columns, b, d)
+    by_ac = np.where(ua & uc & ub & ud, shorter, ua & uc)
     triangles = (
-        ((a, b, c), by_ac & ua & ub & uc),
-        ((a, c, d), by_ac & ua & uc & ud),
-        ((a, b, d), ~by_ac & ua & ub & ud),
-        ((b, c, d), ~by_ac & ub & uc & ud),
+        ((a, b, c), by_ac & ub),
+        ((a, c, d), by_ac & ud),
+        ((a, b, d), ~by_ac & ua),
+        ((b, c, d), ~by_ac & uc),
     )
-    parts = [np.stack(corners, axis=1)[some] for corners, some in triangles]
+    parts = [np.column_stack([one[kept] for one in corners]) for corners, kept in triangles]
     return np.concatenate(parts).astype(np.int32)
+
+
+def _columns(points: Float) -> Float:
+    """(3, n): operations on long rows are fast."""
+    return np.ascontiguousarray(points.T)
+
+
+def _squares(columns: Float, a: NDArray[np.int32], b: NDArray[np.int32]) -> Float:
+    """(m,) squared distances between points of (3, n)."""
+    return np.asarray(sum((x[a] - x[b]) ** 2 for x in columns))
 
 
 def surface_faces(points: Float, origin: Float, faces: Faces, o: SurfaceOptions) -> Kept:
@@ -72,31 +84,49 @@ def surface_faces(points: Float, origin: Float, faces: Faces, o: SurfaceOptions)
         faces: (m, 3).
         o: limits.
     """
-    a, b, c = (points[faces[:, k]] for k in (0, 1, 2))
-    spans, sight = np.cross(b - a, c - a), origin[faces[:, 0]] - (a + b + c) / 3.0
-    area, range, longest = _length(spans), _length(sight), _length(b - a)
-    for edge in (c - b, a - c):
-        longest = np.maximum(longest, _length(edge))
-    facing = np.einsum("ni,ni->n", spans, sight)
+    columns, corners = _columns(points), [np.ascontiguousarray(k) for k in faces.T]
+    a, b, c = (columns[:, k] for k in corners)
+    ab, bc, ca = b - a, c - b, a - c
+    spans, sight = _cross(ca, ab), _columns(origin)[:, corners[0]] - (a + b + c) / 3.0
+    area, range = np.sqrt(_dot(spans, spans)), np.sqrt(_dot(sight, sight))
+    longest = np.sqrt(np.maximum(np.maximum(_dot(ab, ab), _dot(bc, bc)), _dot(ca, ca)))
+    facing = _dot(spans, sight)
     # counter-clockwise seen from the sensor
     away = facing < 0.0
-    faces = np.where(away[:, None], faces[:, ::-1], faces)
-    normals = (np.where(away, -1.0, 1.0) / np.maximum(area, 1e-300))[:, None] * spans
+    faces = np.column_stack(
+        [np.where(away, corners[2], corners[0]), corners[1], np.where(away, *corners[::2])]
+    )
     cosine = np.abs(facing) / np.maximum(area * range, 1e-300)
     level = is_level(_length(origin - points), faces)
     limit = np.minimum(o.longest, o.longest_share * range)
     kept = (longest <= limit) & (level | (cosine >= np.cos(o.steepest))) & (area > 0.0)
-    faces, normals, cosine = faces[kept], normals[kept], cosine[kept]
-    steep = (cosine < np.cos(o.steep)) & ~level[kept]
+    faces, cosine = faces[kept], cosine[kept]
+    normals = spans[:, kept] * (np.where(away, -1.0, 1.0) / np.maximum(area, 1e-300))[kept]
+    steep = np.flatnonzero((cosine < np.cos(o.steep)) & ~level[kept])
     at_points = point_normals(normals, faces, len(points), 0)
-    along = np.einsum("nki,ni->nk", at_points[faces[steep]], normals[steep])
+    along = [_dot(at_points[:, faces[steep, k]], normals[:, steep]) for k in (0, 1, 2)]
     fits = np.ones(len(faces), np.bool_)
     # at two corners: the third may lie in the edge of a room
-    fits[steep] = np.sort(along, axis=1)[:, 1] >= np.cos(o.bend)
-    faces, normals = faces[fits], normals[fits]
+    fits[steep] = _middle(*along) >= np.cos(o.bend)
+    faces, normals = faces[fits], normals[:, fits]
     smooth = point_normals(normals, faces, len(points), _SMOOTHING)
-    standoff = np.einsum("ni,ni->n", smooth, origin - points)
+    standoff = _dot(smooth, _columns(origin - points))
     return Kept(faces.astype(np.int32), np.where(np.isfinite(standoff), standoff, 0.0))
+
+
+def _cross(a: Float, b: Float) -> Float:
+    return np.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
+def _dot(a: Float, b: Float) -> Float:
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+def _middle(a: Float, b: Float, c: Float) -> Float:
+    """(n,) the second of three."""
+    return np.asarray(np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)))
 
 
 def is_level(range: Float, faces: Faces) -> Bool:
@@ -129,32 +159,33 @@ def noise_of(range: Float, faces: Faces) -> float:
 
 
 def point_normals(normals: Float, faces: Faces, n: int, rounds: int) -> Float:
-    """(n, 3) of length one at each point: the mean of those of the triangles around.
+    """(3, n) of length one at each point: the mean of those of the triangles around.
 
     Args:
-        normals: (m, 3) of the triangles, of length one.
+        normals: (3, m) of the triangles, of length one.
         faces: (m, 3).
         n: how many points there are.
         rounds: how often they are averaged again over the triangles' corners.
     """
-    out = _gathered(normals, faces, n)
+    corner = faces.ravel().astype(np.intp)
+    a, b, c = (np.ascontiguousarray(k) for k in faces.T)
+    out = _gathered(normals, corner, n)
     for _ in range(rounds):
-        out = _gathered(
-            _of_length_one(out[faces[:, 0]] + out[faces[:, 1]] + out[faces[:, 2]]), faces, n
-        )
+        mean = _of_length_one(np.stack([x[a] + x[b] + x[c] for x in out]))
+        out = _gathered(mean, corner, n)
     return out
 
 
-def _gathered(normals: Float, faces: Faces, n: int) -> Float:
-    out, corner = np.empty((n, 3)), faces.ravel()
-    for d in range(3):
-        out[:, d] = np.bincount(corner, np.repeat(normals[:, d], 3), n)
+def _gathered(normals: Float, corner: NDArray[np.intp], n: int) -> Float:
+    out = np.empty((3, n))
+    for d, along in enumerate(normals):
+        out[d] = np.bincount(corner, np.repeat(along, 3), n)
     return _of_length_one(out)
 
 
 def _of_length_one(vectors: Float) -> Float:
-    length = _length(vectors)
-    return np.asarray(vectors / np.where(length > 0.0, length, 1.0)[:, None])
+    length = np.sqrt(_dot(vectors, vectors))
+    return np.asarray(vectors / np.where(length > 0.0, length, 1.0))
 
 
 def _length(vectors: Float) -> Float:

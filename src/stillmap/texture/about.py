@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,9 +52,11 @@ class Beams:
         near = apart <= max(int(1e9 * window), int(apart.min(initial=_NEVER)))
         kept = np.flatnonzero(self.seen.hit[first:last] & near)
         beams = int(first) + kept
-        T = self.T_map_sensor[self.seen.scans_of(beams)]
-        local = self.seen.points[beams].astype(np.float64)
-        ends = np.einsum("nij,nj->ni", T[:, :3, :3], local) + T[:, :3, 3]
+        ends = np.empty((len(beams), 3))
+        bounds = np.searchsorted(beams, self.seen.offset[scans.start : scans.stop + 1])
+        for scan, (low, high) in zip(range(scans.start, scans.stop), pairwise(bounds), strict=True):
+            T = self.T_map_sensor[scan]
+            ends[low:high] = self.seen.points[beams[low:high]] @ T[:3, :3].T + T[:3, 3]
         self._go_on(ends, beams, at_ns[kept], stamp_ns)
         return ends, self.p_static[beams]
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stillmap.texture.choice_options import ChoiceOptions
 
 Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
 Index = NDArray[np.int32]
 
 NONE = -1
@@ -19,6 +20,7 @@ NONE = -1
 _ROUNDS = 20  # in which faces settle with their neighbours
 _KEPT = 0.5  # of what a face was told before, from round to round: it settles, and does not swing
 _UNSURE = 1e-6
+_TOGETHER = 1 << 17  # pairs worked on together
 
 
 class Candidates(NamedTuple):
@@ -31,8 +33,8 @@ class Candidates(NamedTuple):
     """
 
     picture: Index
-    utility: NDArray[np.float32]
-    p_static: NDArray[np.float32]
+    utility: Float32
+    p_static: Float32
 
     @classmethod
     def none(cls, faces: int, most: int) -> "Candidates":
@@ -89,32 +91,36 @@ def chosen(candidates: Candidates, pairs: Index, border: float) -> Index:
     painted = np.isfinite(best[:, 0])
     with np.errstate(invalid="ignore"):
         cost = np.where(np.isfinite(candidates.utility), best - candidates.utility, np.inf)
-    of = pairs[painted[pairs].all(axis=1)].astype(np.intp)
-    giver, taker = np.concatenate([of, of[:, ::-1]]).T
-    back = np.roll(np.arange(len(giver)), len(of))  # the same pair the other way round
-    same = _same(candidates.picture, giver, taker)
-    cost = cost.astype(np.float64)
-    told = np.zeros((len(giver), K))
+    pairs = pairs[painted[pairs].all(axis=1)]
+    told = np.zeros((2, len(pairs), K), np.float32)  # to the second of each pair, and to the first
     belief = cost
     for _ in range(_ROUNDS):
-        own = belief[giver] - np.where(np.isfinite(belief[giver]), told[back], 0.0)
-        least = own.min(axis=1, keepdims=True, initial=np.inf)
-        padded = np.column_stack([own, np.full(len(own), np.inf)])
-        heard = np.minimum(np.take_along_axis(padded, same, axis=1), least + border) - least
-        told = _KEPT * told + (1.0 - _KEPT) * heard
-        belief = cost + np.stack(
-            [np.bincount(taker, told[:, k], minlength=F) for k in range(K)], axis=1
-        )
+        for first in range(0, len(pairs), _TOGETHER):
+            part = slice(first, first + _TOGETHER)
+            _tell(candidates.picture, belief, pairs[part], told[:, part], border)
+        belief = cost.copy()
+        for way, taker in enumerate(pairs.T[::-1]):
+            for k in range(K):
+                belief[:, k] += np.bincount(taker, told[way, :, k], minlength=F)
     label = np.argmin(belief, axis=1)
     return np.where(painted, candidates.picture[np.arange(F), label], NONE).astype(np.int32)
 
 
-def _same(picture: Index, giver: NDArray[np.intp], taker: NDArray[np.intp]) -> NDArray[np.intp]:
-    """(n, K) which of the giver's candidates each of the taker's is; K: none."""
-    K = picture.shape[1]
-    out = np.full((len(giver), K), K)
-    for i in range(K):
-        for j in range(K):
-            equal = (picture[giver, i] == picture[taker, j]) & (picture[giver, i] != NONE)
-            out[equal, j] = i
-    return out
+def _tell(picture: Index, belief: Float32, pairs: Index, told: Float32, border: float) -> None:
+    """What some pairs (n, 2) tell each other next, in place of what they told, (2, n, K)."""
+    a, b = pairs.T
+    before = told.copy()
+    for way, (giver, taker) in enumerate(((a, b), (b, a))):
+        own = belief[giver]
+        own -= np.where(np.isfinite(own), before[1 - way], np.float32(0.0))
+        K = own.shape[1]
+        least = own[:, 0].copy()
+        for k in range(1, K):
+            np.minimum(least, own[:, k], out=least)
+        given, taken = picture[giver], picture[taker]
+        for k in range(K):
+            heard = least + np.float32(border)
+            for i in range(K):
+                equal = (given[:, i] == taken[:, k]) & (given[:, i] != NONE)
+                heard = np.where(equal, np.minimum(heard, own[:, i]), heard)
+            told[way, :, k] = _KEPT * before[way, :, k] + (1.0 - _KEPT) * (heard - least)

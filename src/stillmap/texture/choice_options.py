@@ -34,6 +34,9 @@ class ChoiceOptions:
     edge: float = field_with_doc(
         0.25, "m, longer edges of faces are divided first: each part has its own picture"
     )
+    edge_pixels: float = field_with_doc(
+        24.0, "pixels, edges that are shorter in the nearest picture are not divided"
+    )
 
     def __post_init__(self) -> None:
         for name in ("unseen", "least"):
@@ -53,4 +56,5 @@ _LIMITS = (
     ("border", 0.0, 1e6),
     ("candidates", 1, 64),
     ("edge", 0.01, 1000.0),
+    ("edge_pixels", 0.0, 1e6),
 )

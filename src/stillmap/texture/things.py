@@ -80,9 +80,11 @@ def in_the_way(
         margin, sigma: metres.
     """
     free = np.ones(len(points))
+    along = np.ascontiguousarray((points - place).T)
+    square = np.maximum(along[0] ** 2 + along[1] ** 2 + along[2] ** 2, 1e-12)
     for one in cuboids:
         reach = float(np.linalg.norm(one.half)) + 2.0 * (margin + _GROWTHS[-1] * sigma)
-        near = np.flatnonzero(distance_to_segments(one.middle, place, points) <= reach)
+        near = np.flatnonzero(squares_to_segments(one.middle - place, along, square) <= reach**2)
         if not len(near):
             continue
         start, ends = one.local(place[None])[0], one.local(points[near])
@@ -95,12 +97,14 @@ def in_the_way(
     return 1.0 - free
 
 
-def distance_to_segments(middle: Float, start: Float, ends: Float) -> Float:
-    """(n,) metres from a point (3,) to the segments from one point (3,) to others (n, 3)."""
-    along = ends - start
-    length = np.maximum((along**2).sum(axis=1), 1e-12)
-    share = np.clip(along @ (middle - start) / length, 0.0, 1.0)
-    return np.asarray(np.linalg.norm(start + share[:, None] * along - middle, axis=1))
+def squares_to_segments(middle: Float, along: Float, square: Float) -> Float:
+    """(n,) squared metres from a point (3,) to segments from the origin to `along` (3, n).
+
+    `square` (n,) are their squared lengths.
+    """
+    dot = middle[0] * along[0] + middle[1] * along[1] + middle[2] * along[2]
+    share = np.clip(dot / square, 0.0, 1.0)
+    return np.asarray(middle @ middle + share * (share * square - 2.0 * dot))
 
 
 def meets_box(start: Float, ends: Float, half: Float) -> NDArray[np.bool_]:
@@ -108,12 +112,14 @@ def meets_box(start: Float, ends: Float, half: Float) -> NDArray[np.bool_]:
 
     By slabs: a segment is within each pair of faces for an interval of its length.
     """
-    along = ends - start
-    with np.errstate(divide="ignore", invalid="ignore"):
-        one, other = (-half - start) / along, (half - start) / along
-    # parallel to a pair of faces: all of it between them, or nothing
-    beside = np.abs(start) > half
-    first = np.where(along == 0.0, np.where(beside, np.inf, -np.inf), np.minimum(one, other))
-    last = np.where(along == 0.0, np.where(beside, -np.inf, np.inf), np.maximum(one, other))
-    enters, leaves = first.max(axis=1), last.min(axis=1)
+    enters, leaves = np.full(len(ends), -np.inf), np.full(len(ends), np.inf)
+    for axis in range(3):
+        along = ends[:, axis] - start[axis]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one, other = (-half[axis] - start[axis]) / along, (half[axis] - start[axis]) / along
+        first, last = np.minimum(one, other), np.maximum(one, other)
+        # parallel to a pair of faces: all of it between them, or nothing
+        beside = np.inf if abs(start[axis]) > half[axis] else -np.inf
+        first[along == 0.0], last[along == 0.0] = beside, -beside
+        enters, leaves = np.maximum(enters, first), np.minimum(leaves, last)
     return np.asarray((enters <= leaves) & (leaves >= 0.0) & (enters <= 1.0))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import _core
+from stillmap.recording.images import Camera
 from stillmap.surface.mesh import Mesh
 from stillmap.texture import lens
 from stillmap.texture.options import VisibleOptions
@@ -22,6 +23,8 @@ Float32 = NDArray[np.float32]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
+_ASIDE = 1.05  # times what a picture shows at its border, in which faces are looked for
+_BORDER = 33  # places along each edge of a picture that are asked how far aside they look
 _FINEST = 32  # parts that the edge of a large face is cut into, to look at each
 
 
@@ -32,7 +35,7 @@ class Seen(NamedTuple):
         seen: (F,) whether all of a face is in the picture, from its front, nothing before it.
         pixels: (F,) float32, its area in the picture as it was recorded; 0 where not seen.
         cosine: (F,) float32, of the angle between its normal and the line of sight to its centre;
-            below 0 from behind.
+            below 0 from behind; 0 where it is not all in the picture.
     """
 
     seen: Mask
@@ -80,19 +83,28 @@ def visible(
     options = options or VisibleOptions()
     points = view.in_camera(mesh.vertices)
     uv, inside = _in_picture(view, points, options.margin)
-    cosine = _cosines(mesh, view)
-    faces = mesh.faces
-    candidates = np.flatnonzero((cosine > options.cosine) & inside[faces].all(axis=1))
-    pixels = _areas(uv[faces[candidates]])
-    kept = pixels >= options.pixels
-    candidates, pixels = candidates[kept], pixels[kept]
+    a, b, c = mesh.faces.T
+    candidates = np.flatnonzero(inside[a] & inside[b] & inside[c])
+    corners = _corners(points, mesh.faces[candidates])
+    cosine = np.zeros(len(mesh), np.float32)
+    cosine[candidates] = facing = _cosines(corners)
+    pixels = _areas(uv, mesh.faces[candidates])
+    kept = (facing > options.cosine) & (pixels >= options.pixels)
+    candidates, pixels, corners = candidates[kept], pixels[kept], corners[..., kept]
     seen, area = np.zeros(len(mesh), np.bool_), np.zeros(len(mesh), np.float32)
     if len(candidates):
-        used = np.unique(faces[candidates])
+        used = np.zeros(len(points), np.bool_)
+        used[mesh.faces[candidates]] = True
         depths = depths_of(mesh, view, points[used], options.scale, options.near, threads)
-        free = _unhidden(depths, points[faces[candidates]], options)
+        free = _unhidden(depths, corners, options)
         seen[candidates[free]], area[candidates[free]] = True, pixels[free]
-    return Seen(seen, area, cosine.astype(np.float32))
+    return Seen(seen, area, cosine)
+
+
+def _corners(points: Float, faces: NDArray[np.int32]) -> Float:
+    """(3, 3, n) the corners of faces (n, 3), by corner and coordinate: long rows are fast."""
+    columns = np.ascontiguousarray(points.T)
+    return np.stack([columns[:, faces[:, k]] for k in range(3)])
 
 
 def depths_of(
@@ -110,7 +122,7 @@ def depths_of(
     """
     assert view.camera.K is not None
     K = scaled(_upright(view.camera.K), scale)
-    at = _ideal(K, shown)
+    at = np.column_stack(_ideal(K, shown.T))
     # wide lenses: what is 80 degrees aside is six times as far out as what is 45 degrees aside
     most = 2.0 * scale * np.array([view.camera.width, view.camera.height])
     middle = K[:2, 2]
@@ -118,9 +130,10 @@ def depths_of(
     high = np.ceil(np.minimum(at.max(axis=0), middle + most)) + 2.0
     K[:2, 2] -= low
     width, height = (int(size) for size in np.maximum(high - low + 1.0, 1.0))
+    near_by = _within_frustum(mesh, view, K, width, height)
     depth, face = _core.z_buffer(
         np.ascontiguousarray(mesh.vertices),
-        np.ascontiguousarray(mesh.faces),
+        np.ascontiguousarray(mesh.faces[near_by]),
         K,
         np.ascontiguousarray(view.T_camera_map, np.float64),
         width,
@@ -128,7 +141,21 @@ def depths_of(
         near=near,
         threads=threads,
     )
-    return Depths(K, depth, face)
+    number = np.append(near_by, -1).astype(np.int32)
+    return Depths(K, depth, number[face])
+
+
+def _within_frustum(mesh: Mesh, view: View, K: Float, width: int, height: int) -> Index:
+    """The faces that are not beyond one edge of a picture, or behind it, with all their corners."""
+    x, y, z = np.ascontiguousarray(view.in_camera(mesh.vertices).T)
+    u, v = K[0, 0] * x + K[0, 1] * y + K[0, 2] * z, K[1, 1] * y + K[1, 2] * z
+    # a pixel more: edges are met exactly elsewhere
+    sides = (u < -z, v < -z, u > width * z, v > height * z, z < 0.0)
+    beyond = np.zeros(len(z), np.uint8)
+    for bit, side in enumerate(sides):
+        beyond |= side.astype(np.uint8) << np.uint8(bit)
+    a, b, c = mesh.faces.T
+    return np.flatnonzero((beyond[a] & beyond[b] & beyond[c]) == 0)
 
 
 def _upright(K: Float) -> Float:
@@ -136,46 +163,80 @@ def _upright(K: Float) -> Float:
     return np.array([[K[0, 0], K[0, 1], K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
 
 
-def _ideal(K: Float, points: Float) -> Float:
-    """(n, 2) pixels of points (n, 3) ahead of an ideal camera."""
-    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
-    return np.column_stack([K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]])
+def _ideal(K: Float, points: Float) -> tuple[Float, Float]:
+    """(n,) columns and rows of points (3, n) ahead of an ideal camera."""
+    x, y = points[0] / points[2], points[1] / points[2]
+    return K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]
 
 
 def _in_picture(view: View, points: Float, margin: float) -> tuple[Float, Mask]:
-    """(V, 2) pixels of points (V, 3) in the camera's frame, and whether they are in the picture."""
-    uv, ok = lens.project(view.camera, points)
-    size = np.array([view.camera.width, view.camera.height])
+    """(V, 2) pixels of points (V, 3) in the camera's frame, and whether they are in the picture.
+
+    NaN where they are far from it.
+    """
+    uv, ok = np.full((len(points), 2), np.nan), np.zeros(len(points), np.bool_)
+    x, y, z = points.T
+    near = np.flatnonzero((z > 0.0) & (x * x + y * y <= (_ASIDE * _reach(view.camera) * z) ** 2))
+    uv[near], ok[near] = lens.project(view.camera, points[near])
+    u, v = uv.T
+    width, height = view.camera.width - 1.0 - margin, view.camera.height - 1.0 - margin
     with np.errstate(invalid="ignore"):  # NaN: nowhere
-        ok = ok & ((uv >= margin) & (uv <= size - 1.0 - margin)).all(axis=1)
-    return uv, ok
+        return uv, ok & (u >= margin) & (u <= width) & (v >= margin) & (v <= height)
 
 
-def _cosines(mesh: Mesh, view: View) -> Float:
-    towards = view.place - mesh.centres
-    length = np.linalg.norm(towards, axis=1)
-    dot = np.einsum("ij,ij->i", towards, mesh.normals())
-    return np.asarray(dot / np.where(length > 0.0, length, 1.0))
+def _reach(camera: Camera) -> float:
+    """How far aside its pictures show things, per metre ahead; inf: it is not known."""
+    t = np.linspace(0.0, 1.0, _BORDER)
+    low, high = np.zeros_like(t), np.ones_like(t)
+    u, v = np.concatenate([t, t, low, high]), np.concatenate([low, high, t, t])
+    size = np.array([camera.width - 1.0, camera.height - 1.0])
+    found = lens.rays(camera, np.column_stack([u, v]) * size)
+    far = float(np.hypot(found[:, 0], found[:, 1]).max())
+    return far if np.isfinite(far) else np.inf
 
 
-def _areas(uv: Float) -> Float32:
-    """(n,) square pixels of triangles (n, 3, 2)."""
-    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    return (0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])).astype(np.float32)
+def _cosines(corners: Float) -> Float32:
+    """(n,) of the angle between normals and lines of sight, for corners (3, 3, n)."""
+    normal, centre = _normals(corners), corners.sum(axis=0) / 3.0
+    dot, length = -_dot(centre, normal), np.sqrt(_dot(centre, centre))
+    return np.asarray(dot / np.where(length > 0.0, length, 1.0), np.float32)
+
+
+def _normals(corners: Float) -> Float:
+    """(3, n) of length one, zero for faces without area."""
+    a, b = corners[1] - corners[0], corners[2] - corners[0]
+    normal = np.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+    length = np.sqrt(_dot(normal, normal))
+    return np.asarray(normal / np.where(length > 0.0, length, 1.0))
+
+
+def _dot(a: Float, b: Float) -> Float:
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+def _areas(uv: Float, faces: NDArray[np.int32]) -> Float32:
+    """(n,) square pixels of triangles (n, 3) over pixels (V, 2)."""
+    u, v = (np.ascontiguousarray(column) for column in uv.T)
+    a, b, c = faces.T
+    au, av, bu, bv = u[b] - u[a], v[b] - v[a], u[c] - u[a], v[c] - v[a]
+    return np.asarray(0.5 * np.abs(au * bv - av * bu), np.float32)
 
 
 def _unhidden(depths: Depths, corners: Float, options: VisibleOptions) -> Mask:
-    """(n,) whether nothing lies before triangles (n, 3, 3) in the camera's frame."""
-    free = np.ones(len(corners), np.bool_)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal / np.where(length > 0.0, length, 1.0)
+    """(n,) whether nothing lies before triangles (3, 3, n) in the camera's frame."""
+    free = np.ones(corners.shape[2], np.bool_)
+    normal = _normals(corners)
     around = _nearest_around(depths.depth, options.beside)
     for chosen, weights in _samples(depths, corners, options):
+        left, of, normals = chosen, corners[..., chosen], normal[:, chosen]
         for weight in weights:
-            left = chosen[free[chosen]]
-            point = np.einsum("j,ijk->ik", weight, corners[left])
-            free[left] = _passes(depths, around, point, normal[left], options)
+            point = weight[0] * of[0] + weight[1] * of[1] + weight[2] * of[2]
+            passes = _passes(depths, around, point, normals, options)
+            if not passes.all():
+                free[left[~passes]] = False
+                left, of, normals = left[passes], of[..., passes], normals[:, passes]
     return free
 
 
@@ -198,38 +259,40 @@ def _samples(
 
     The finer, the larger they are: `options.spacing` pixels apart along the longest edge.
     """
-    uv = _ideal(depths.K, corners.reshape(-1, 3)).reshape(-1, 3, 2)
-    edge = np.linalg.norm(uv - np.roll(uv, 1, axis=1), axis=2).max(axis=1)
-    parts = np.ceil(np.log2(np.maximum(edge / options.spacing, 1.0)))
-    parts = 2 ** np.minimum(parts, np.log2(_FINEST)).astype(np.int64)
-    for n in np.unique(parts):
+    uv = [_ideal(depths.K, corner) for corner in corners]
+    edges = [np.hypot(uv[k][0] - uv[k - 1][0], uv[k][1] - uv[k - 1][1]) for k in range(3)]
+    edge = np.maximum(np.maximum(edges[0], edges[1]), edges[2])
+    halvings = np.ceil(np.log2(np.maximum(edge / options.spacing, 1.0)))
+    halvings = np.minimum(halvings, np.log2(_FINEST)).astype(np.intp)
+    for times in np.flatnonzero(np.bincount(halvings)):
+        n = 2**times
         i, j = (a.ravel() for a in np.mgrid[: n + 1, : n + 1])
         lattice = np.stack([i, j, n - i - j], axis=1)[i + j <= n] / n
         middle = np.full((1, 3), 1.0 / 3.0)
         inwards = lattice + options.inwards * (middle - lattice)
-        yield np.flatnonzero(parts == n), np.concatenate([middle, inwards])
+        yield np.flatnonzero(halvings == times), np.concatenate([middle, inwards])
 
 
 def _passes(
     depths: Depths, around: Float32, points: Float, normals: Float, options: VisibleOptions
 ) -> Mask:
-    """(n,) whether points (n, 3) in the camera's frame are no farther than what is seen there,
+    """(n,) whether points (3, n) in the camera's frame are no farther than what is seen there,
     and not much farther than what is seen beside.
 
     Within its pixel a face may be nearer by the slope of depth along rows and columns.
     """
     h, w = around.shape
-    at = np.rint(_ideal(depths.K, points)).astype(np.int64)
-    inside = (at >= 0).all(axis=1) & (at[:, 0] < w) & (at[:, 1] < h)
-    column, row = np.clip(at[:, 0], 0, w - 1), np.clip(at[:, 1], 0, h - 1)
-    z = points[:, 2]
-    along = np.abs(np.einsum("ij,ij->i", normals, points / z[:, None]))
-    slope = np.abs(normals[:, 0]) / depths.K[0, 0] + np.abs(normals[:, 1]) / depths.K[1, 1]
+    u, v = (np.rint(a).astype(np.int64) for a in _ideal(depths.K, points))
+    inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
+    at = np.clip(v, 0, h - 1) * w + np.clip(u, 0, w - 1)
+    z = points[2]
+    along = np.abs(_dot(normals, points)) / z
+    slope = np.abs(normals[0]) / depths.K[0, 0] + np.abs(normals[1]) / depths.K[1, 1]
     rise = z * slope / np.maximum(along, 1e-6)
     allowed = options.tolerance + options.relative * z
     here = allowed + np.minimum(0.5 * rise, options.steepest * z)
     # neighbouring faces may be steeper
     beside = allowed + np.minimum((2 * options.beside + 1) * rise, 2.0 * options.steepest * z)
     return np.asarray(
-        inside & (z <= depths.depth[row, column] + here) & (z <= around[row, column] + beside)
+        inside & (z <= depths.depth.ravel()[at] + here) & (z <= around.ravel()[at] + beside)
     )
