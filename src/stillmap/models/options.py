@@ -24,6 +24,10 @@ class MoverOptions:
     sweep: float = field_with_doc(
         1.0, "s, in which a laser that tilts sees a thing once: so long others keep their shape"
     )
+    stretch: float = field_with_doc(
+        2.5, "times as far apart as usual are beams on them between which there is no surface"
+    )
+    longest: float = field_with_doc(0.6, "m, or farther apart than that")
     near: float = field_with_doc(
         0.5, "s from then to a picture that paints a thing that does not keep its shape"
     )
@@ -46,6 +50,8 @@ _LIMITS = (
     ("low", -10.0, 10.0),
     ("rigid", 0.0, 1000.0),
     ("sweep", 1e-3, 1000.0),
+    ("stretch", 1.0, 1000.0),
+    ("longest", 0.0, 1000.0),
     ("near", 0.0, 1000.0),
     ("rim", 0.0, 10.0),
     ("least", 0.0, 1000.0),
