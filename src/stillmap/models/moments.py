@@ -49,7 +49,7 @@ def best_moment(
         seconds: (n,) when beams met it, n > 0.
         look: (n,) number of the scan, rising.
         moment: s that it may last; 0: it is one scan.
-        near: s from its middle to a picture, at which it counts half; beyond the double a third.
+        near: s from its middle to a picture, from which on it counts a fifth.
         pictures: (N,) s, when pictures show it.
     """
     if moment == 0.0:
@@ -63,7 +63,7 @@ def best_moment(
         last, value = first[at - 1], (at - np.arange(len(first))).astype(np.float64)
     if len(pictures):
         away = np.abs(0.5 * (first + last)[:, None] - pictures).min(axis=1)
-        value = value / (1.0 + np.minimum(away / max(near, 1e-9), 2.0))
+        value = value / (1.0 + np.minimum(4.0 * away / max(near, 1e-9), 4.0))
     best = int(np.argmax(value))
     return float(first[best]), float(last[best])
 

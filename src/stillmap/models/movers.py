@@ -7,8 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from stillmap.models.aligning import Sweep, aligned
+from stillmap.models.aligning import Sweep, aligned, spread
 from stillmap.models.frames import Way
 from stillmap.models.moments import Look, best_moment, between_beams
 from stillmap.models.options import MoverOptions
@@ -29,6 +32,9 @@ _DYNAMIC = 0.5
 _FINEST, _COARSEST = 0.025, 0.06  # m, edges of voxels
 _OF_SPACING = 0.7  # of how far beams lie apart
 _FAR = 1000.0  # m
+_AROUND = 0.03  # s, in which a scan sees the rest of a car
+_CAR = 6.0  # m, from one end of it to the other
+_CELL, _LINK = 0.2, 2.3  # m, and cells that may lie between parts of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +137,10 @@ def _put_together(
     pieces = list(pieces_of(own, first, sources, surface))
     if not pieces:
         return None
-    way = _laid_over(pieces, way)
+    laid = _laid_over(pieces, way, options.blurred)
+    if laid is None:
+        return None
+    way = laid
     weight = np.array([one.areas().sum() for one in pieces])
     seconds = float(np.median(pieces[int(np.argmax(weight))].seconds))
     box = way.thing.box
@@ -157,21 +166,54 @@ def _in_a_moment(
     """What one look saw of it: a scan in space, or planar ones that follow one another."""
     hits = np.flatnonzero(own.hit)
     planar = order_of(own, hits[:0], surface).planar
-    span = best_moment(
-        first.seconds[hits],
-        own.scans_of(hits),
-        options.sweep if planar else 0.0,
-        options.near,
-        pictures,
+    fast = np.median(np.linalg.norm(way.thing.box.velocity, axis=1)) > options.fast
+    # who is seen by few beams is looked at longer
+    for moment in (options.sweep, 2.0 * options.sweep) if planar else (0.0,):
+        span = best_moment(first.seconds[hits], own.scans_of(hits), moment, options.near, pictures)
+        around = _AROUND if fast else 0.0
+        then = (first.seconds >= span[0] - around) & (first.seconds <= span[1] + around)
+        beams = np.flatnonzero(then)
+        mine = own.hit[beams]
+        if fast:
+            mine = _grown(beams, mine, way, first, sources, options)
+            span = float(first.seconds[beams[mine]].min()), float(first.seconds[beams[mine]].max())
+        looks = [_look(some, way, first, sources) for some in (beams[mine], beams[~mine])]
+        mesh = between_beams(looks[0], looks[1], options.stretch, options.longest)
+        mesh = without_islands(mesh, options.island)
+        if mesh.areas().sum() >= options.least:
+            return Shape(id, mesh, way, False, 0.5 * (span[0] + span[1]), span)
+    return None
+
+
+def _grown(
+    beams: NDArray[np.intp],
+    mine: NDArray[np.bool_],
+    way: Way,
+    first: First,
+    sources: Sources,
+    options: MoverOptions,
+) -> NDArray[np.bool_]:
+    """(n,) which beams met a thing that is faster than people: all that move, and hang together.
+
+    Parts of a car are often followed each on its own.
+    """
+    number = first.beam + beams
+    moves = np.flatnonzero(sources.seen.hit[number] & (sources.p_static[number] < _DYNAMIC))
+    at = way.local(
+        first.seconds[beams[moves]], sources.seen.end_points(number[moves], sources.poses)
     )
-    then = np.flatnonzero((first.seconds >= span[0]) & (first.seconds <= span[1]))
-    mine = own.hit[then]
-    looks = [_look(beams, way, first, sources) for beams in (then[mine], then[~mine])]
-    mesh = between_beams(looks[0], looks[1], options.stretch, options.longest)
-    mesh = without_islands(mesh, options.island)
-    if mesh.areas().sum() < options.least:
-        return None
-    return Shape(id, mesh, way, False, 0.5 * (span[0] + span[1]), span)
+    some = (at[:, 2] > options.low) & (np.linalg.norm(at[:, :2], axis=1) <= _CAR)
+    moves, at = moves[some], at[some]
+    if not len(moves):
+        return mine
+    cells, of = np.unique(np.floor(at / _CELL), axis=0, return_inverse=True)
+    one, other = cKDTree(cells).query_pairs(_LINK, output_type="ndarray").T
+    n = len(cells)
+    graph = coo_matrix((np.ones(len(one), np.int8), (one, other)), (n, n))
+    piece = connected_components(graph, directed=False)[1][of.ravel()]
+    out = mine.copy()
+    out[moves[np.isin(piece, piece[mine[moves]])]] = True
+    return out
 
 
 def _look(beams: NDArray[np.intp], way: Way, first: First, sources: Sources) -> Look:
@@ -266,8 +308,13 @@ def own_beams(
             theirs = other.beams[np.searchsorted(other.beams, beams.start) :]
             theirs = theirs[: np.searchsorted(theirs, beams.stop)]
             own[theirs - beams.start] = False
-    mine = one.beams[(one.beams >= beams.start) & (one.beams < beams.stop)] - beams.start
-    own[mine] = True
+    mine = one.beams[(one.beams >= beams.start) & (one.beams < beams.stop)]
+    at = Way.of_track(thing).local(
+        seconds[mine - beams.start], seen.end_points(mine, sources.poses)
+    )
+    # a track of somebody may take hold of who stands beside
+    near = (np.abs(at[:, :2]) <= half + options.margin).all(axis=1)
+    own[mine - beams.start] = near | (2.0 * thing.box.half[0] >= options.rigid)
     part = dataclasses.replace(
         seen,
         stamp_ns=seen.stamp_ns[scans],
@@ -283,11 +330,13 @@ def own_beams(
     return part, First(a, beams.start, seconds)
 
 
-def _laid_over(pieces: Sequence[Piece], way: Way) -> Way:
-    """The way on which all sweeps of a rigid thing lie over each other."""
-    local = [piece.in_frame(way) for piece in pieces]
-    offset = aligned([_sweep(piece) for piece in local])
-    seconds = np.array([float(np.median(piece.seconds)) for piece in local])
+def _laid_over(pieces: Sequence[Piece], way: Way, blurred: float) -> Way | None:
+    """The way on which all sweeps of a rigid thing lie over each other; None: they do not."""
+    sweeps = [_sweep(piece.in_frame(way)) for piece in pieces]
+    offset = aligned(sweeps)
+    if spread(sweeps, offset) > blurred:
+        return None
+    seconds = np.array([float(np.median(piece.seconds)) for piece in pieces])
     order = np.argsort(seconds, kind="stable")
     return Way(way.thing, seconds[order], offset[order])
 

@@ -21,8 +21,14 @@ class MoverOptions:
     rigid: float = field_with_doc(
         1.5, "m, things at least so long keep their shape: all that was seen of one is put together"
     )
+    blurred: float = field_with_doc(
+        0.05, "m, by which what was seen of one then may lie off itself; else a moment of it counts"
+    )
+    fast: float = field_with_doc(
+        2.5, "m/s, what is faster is no person: what moves and hangs together with it is its own"
+    )
     sweep: float = field_with_doc(
-        1.0, "s, in which a laser that tilts sees a thing once: so long others keep their shape"
+        0.4, "s, in which a laser that tilts sees a thing: so long others keep their shape"
     )
     stretch: float = field_with_doc(
         2.5, "times as far apart as usual are beams on them between which there is no surface"
@@ -34,6 +40,7 @@ class MoverOptions:
     rim: float = field_with_doc(
         0.04, "m within a thing's outline in a picture, where it may show what is behind"
     )
+    edge: float = field_with_doc(0.05, "m, longer edges are divided before they are painted")
     least: float = field_with_doc(0.03, "m2 of surface that a model has")
     island: float = field_with_doc(0.01, "m2, smaller pieces of it are left out")
 
@@ -49,11 +56,14 @@ _LIMITS = (
     ("margin", 0.0, 10.0),
     ("low", -10.0, 10.0),
     ("rigid", 0.0, 1000.0),
+    ("blurred", 0.0, 1000.0),
+    ("fast", 0.0, 1000.0),
     ("sweep", 1e-3, 1000.0),
     ("stretch", 1.0, 1000.0),
     ("longest", 0.0, 1000.0),
     ("near", 0.0, 1000.0),
     ("rim", 0.0, 10.0),
+    ("edge", 0.005, 1000.0),
     ("least", 0.0, 1000.0),
     ("island", 0.0, 1000.0),
 )

@@ -110,7 +110,7 @@ def dressed(
         start_ns: when the time of the things begins.
         options, choice, limits: see there.
     """
-    mesh, _ = divided(shape.mesh, choice.edge)
+    mesh, _ = divided(shape.mesh, min(choice.edge, options.edge))
     candidates = Candidates.none(len(mesh), choice.candidates)
     sharpest, own = Candidates.none(len(mesh), 1), list[View]()
     others = [one for one in things if one.box.thing != shape.id]
