@@ -23,6 +23,7 @@ _ALONG = 0.1  # m, by how much the nearest point of a surface lies beside
 _POINTS = 2000  # of a sweep, at most: more do not make it better
 _FEWEST = 20  # points of a sweep that say where it is
 _SAME_SIDE = 0.5  # cosine between normals of one surface
+_ASKED = 12  # sweeps of which it is asked how well they lie over the others
 _MOST = 60  # sweeps that are laid over each other at most
 
 
@@ -63,6 +64,30 @@ def aligned(sweeps: Sequence[Sweep]) -> Float:
             others = [other for other in done if other != k]
             out[k] = _registered(sweeps[k], _model(sweeps, out, others), out[k], out[k])
     return out
+
+
+def spread(sweeps: Sequence[Sweep], offsets: Float) -> float:
+    """Metres, by how much sweeps lie off each other across their surface: 3 of 4 places are less.
+
+    0 where they have nothing in common.
+    """
+    asked = np.unique(np.linspace(0, len(sweeps) - 1, min(len(sweeps), _ASKED)).astype(np.intp))
+    off = [np.zeros(0)]
+    for k in asked.tolist():
+        others = [other for other in range(len(sweeps)) if other != k]
+        if not others or not len(sweeps[k].points):
+            continue
+        model = _model(sweeps, offsets, others)
+        every = max(1, len(sweeps[k].points) // _POINTS)
+        at = moved(sweeps[k].points[::every], offsets[k])
+        facing = moved(sweeps[k].normals[::every], np.array([0.0, 0.0, offsets[k, 2]]))
+        away, nearest = map(np.asarray, cKDTree(model.points).query(at))
+        near = away <= _REACHES[1]
+        near &= (facing * model.normals[nearest]).sum(axis=1) > _SAME_SIDE
+        at, nearest = at[near], nearest[near]
+        off.append(np.abs(((at - model.points[nearest]) * model.normals[nearest]).sum(axis=1)))
+    all_off = np.concatenate(off)
+    return float(np.quantile(all_off, 0.75)) if len(all_off) else 0.0
 
 
 def moved(points: Float, offset: Float) -> Float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stillmap.extras import extra
 from stillmap.models.movers import Shape, shape_of
 from stillmap.models.options import MeshOptions
-from stillmap.models.painting import Dressed, dressed, when_in_view
+from stillmap.models.painting import Ahead, Dressed, dressed, when_in_view
 from stillmap.models.place import Painted, painted
 from stillmap.models.sources import Sources
 from stillmap.objects import MovingObject
@@ -166,10 +166,11 @@ def _movers(
     tell: Callable[[int, int], None],
 ) -> list[MoverModel]:
     things = {thing.box.thing: thing for thing in sources.things}
+    ahead = Ahead(place.mesh, views, options.texture.visible)
     out = []
     for number, one in enumerate(sources.objects):
         if one.id in things:
-            model = _mover(one, things[one.id], sources, views, place, options)
+            model = _mover(one, things[one.id], sources, views, ahead, options)
             if model is not None:
                 out.append(model)
         tell(number + 1, len(sources.objects))
@@ -181,7 +182,7 @@ def _mover(
     thing: Thing,
     sources: Sources,
     views: Sequence[View],
-    place: Painted,
+    place: Ahead,
     options: MeshOptions,
 ) -> MoverModel | None:
     """The model of one object; None where too little of it was seen."""
@@ -194,7 +195,7 @@ def _mover(
     dress = dressed(
         shape,
         views,
-        place.mesh,
+        place,
         sources.things,
         start,
         options.objects,

@@ -7,15 +7,20 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from stillmap.models.aligning import Sweep, aligned
+from stillmap.models.aligning import Sweep, aligned, spread
 from stillmap.models.frames import Way
+from stillmap.models.moments import Look, best_moment, between_beams
 from stillmap.models.options import MoverOptions
 from stillmap.models.sources import Sources
 from stillmap.objects import MovingObject
 from stillmap.recording.model import Recording
 from stillmap.recording.stamps import beam_ns
 from stillmap.surface.building import fused
+from stillmap.surface.extraction import without_islands
 from stillmap.surface.mesh import Mesh
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import Patch, order_of, patches_of
@@ -26,6 +31,10 @@ Float = NDArray[np.float64]
 _DYNAMIC = 0.5
 _FINEST, _COARSEST = 0.025, 0.06  # m, edges of voxels
 _OF_SPACING = 0.7  # of how far beams lie apart
+_FAR = 1000.0  # m
+_AROUND = 0.03  # s, in which a scan sees the rest of a car
+_CAR = 6.0  # m, from one end of it to the other
+_CELL, _LINK = 0.2, 2.3  # m, and cells that may lie between parts of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,20 +79,22 @@ class Piece(NamedTuple):
         )
         return self._replace(patch=self.patch._replace(points=at, origin=origin))
 
-    def within(self, first: float, last: float) -> "Piece":
-        """The faces all of whose beams were taken between two times."""
-        inside = (self.seconds >= first) & (self.seconds <= last)
-        kept = inside[self.patch.faces].all(axis=1)
-        patch = self.patch._replace(faces=self.patch.faces[kept])
-        return self._replace(patch=patch, weight=self.weight[kept])
-
     def areas(self) -> Float:
         """(m,) square metres."""
         return Mesh(self.patch.points, self.patch.faces).areas()
 
-    def times(self) -> Float:
-        """(m,) when each face was seen."""
-        return np.asarray(self.seconds[self.patch.faces].mean(axis=1))
+
+class First(NamedTuple):
+    """Where a part of a recording begins in it, and when its beams were taken.
+
+    Attributes:
+        scan, beam: numbers of its first ones.
+        seconds: (n,) of its beams, by the time of boxes.
+    """
+
+    scan: int
+    beam: int
+    seconds: Float
 
 
 def shape_of(
@@ -104,28 +115,120 @@ def shape_of(
         surface: see SurfaceOptions.
         pictures: (N,) s, when pictures show it, by the time of its box.
     """
-    pieces = list(pieces_of(one, thing, sources, options, surface))
-    way, rigid = Way.of_track(thing), 2.0 * thing.box.half[0] >= options.rigid
+    own, first = own_beams(one, thing, sources, options)
+    if not own.hit.any():
+        return None
+    way, shape = Way.of_track(thing), None
+    if 2.0 * thing.box.half[0] >= options.rigid:
+        shape = _put_together(one.id, way, own, first, sources, options, surface)
+    return shape or _in_a_moment(one.id, way, own, first, sources, options, surface, pictures)
+
+
+def _put_together(
+    id: int,
+    way: Way,
+    own: Recording,
+    first: First,
+    sources: Sources,
+    options: MoverOptions,
+    surface: SurfaceOptions,
+) -> Shape | None:
+    """All that was seen of what keeps its shape; None where that is too little."""
+    pieces = list(pieces_of(own, first, sources, surface))
     if not pieces:
         return None
-    if rigid:
-        way = _laid_over(pieces, way)
-        weight = np.array([one.areas().sum() for one in pieces])
-        seconds = float(np.median(pieces[int(np.argmax(weight))].seconds))
-        span = float(thing.box.seconds[0]), float(thing.box.seconds[-1])
-    else:
-        # a scan in space sees all of it at once, planar scans one after the other
-        tilts = any(len(np.unique(sources.seen.scans_of(piece.patch.beam))) > 1 for piece in pieces)
-        span = best_sweep(pieces, options.sweep if tilts else 0.0, options.near, pictures)
-        seconds = 0.5 * (span[0] + span[1])
-        pieces = [piece.within(*span) for piece in pieces]
+    laid = _laid_over(pieces, way, options.blurred)
+    if laid is None:
+        return None
+    way = laid
+    weight = np.array([one.areas().sum() for one in pieces])
+    seconds = float(np.median(pieces[int(np.argmax(weight))].seconds))
+    box = way.thing.box
     local = [piece.in_frame(way) for piece in pieces]
     limits = dataclasses.replace(surface, island=options.island)
     voxel = options.voxel or voxel_for(local)
     mesh = fused([(piece.patch, piece.weight) for piece in local], voxel, limits)
     if mesh.areas().sum() < options.least:
         return None
-    return Shape(one.id, mesh, way, rigid, seconds, span)
+    return Shape(id, mesh, way, True, seconds, (float(box.seconds[0]), float(box.seconds[-1])))
+
+
+def _in_a_moment(
+    id: int,
+    way: Way,
+    own: Recording,
+    first: First,
+    sources: Sources,
+    options: MoverOptions,
+    surface: SurfaceOptions,
+    pictures: Float,
+) -> Shape | None:
+    """What one look saw of it: a scan in space, or planar ones that follow one another."""
+    hits = np.flatnonzero(own.hit)
+    planar = order_of(own, hits[:0], surface).planar
+    fast = np.median(np.linalg.norm(way.thing.box.velocity, axis=1)) > options.fast
+    # who is seen by few beams is looked at longer
+    for moment in (options.sweep, 2.0 * options.sweep) if planar else (0.0,):
+        span = best_moment(first.seconds[hits], own.scans_of(hits), moment, options.near, pictures)
+        around = _AROUND if fast else 0.0
+        then = (first.seconds >= span[0] - around) & (first.seconds <= span[1] + around)
+        beams = np.flatnonzero(then)
+        mine = own.hit[beams]
+        if fast:
+            mine = _grown(beams, mine, way, first, sources, options)
+            span = float(first.seconds[beams[mine]].min()), float(first.seconds[beams[mine]].max())
+        looks = [_look(some, way, first, sources) for some in (beams[mine], beams[~mine])]
+        mesh = between_beams(looks[0], looks[1], options.stretch, options.longest)
+        mesh = without_islands(mesh, options.island)
+        if mesh.areas().sum() >= options.least:
+            return Shape(id, mesh, way, False, 0.5 * (span[0] + span[1]), span)
+    return None
+
+
+def _grown(
+    beams: NDArray[np.intp],
+    mine: NDArray[np.bool_],
+    way: Way,
+    first: First,
+    sources: Sources,
+    options: MoverOptions,
+) -> NDArray[np.bool_]:
+    """(n,) which beams met a thing that is faster than people: all that move, and hang together.
+
+    Parts of a car are often followed each on its own.
+    """
+    number = first.beam + beams
+    moves = np.flatnonzero(sources.seen.hit[number] & (sources.p_static[number] < _DYNAMIC))
+    at = way.local(
+        first.seconds[beams[moves]], sources.seen.end_points(number[moves], sources.poses)
+    )
+    some = (at[:, 2] > options.low) & (np.linalg.norm(at[:, :2], axis=1) <= _CAR)
+    moves, at = moves[some], at[some]
+    if not len(moves):
+        return mine
+    cells, of = np.unique(np.floor(at / _CELL), axis=0, return_inverse=True)
+    one, other = cKDTree(cells).query_pairs(_LINK, output_type="ndarray").T
+    n = len(cells)
+    graph = coo_matrix((np.ones(len(one), np.int8), (one, other)), (n, n))
+    piece = connected_components(graph, directed=False)[1][of.ravel()]
+    out = mine.copy()
+    out[moves[np.isin(piece, piece[mine[moves]])]] = True
+    return out
+
+
+def _look(beams: NDArray[np.intp], way: Way, first: First, sources: Sources) -> Look:
+    """Beams in a thing's own frame; those that came back from nowhere go on for a kilometre."""
+    seen, number = sources.seen, first.beam + beams
+    ends = seen.end_points(number, sources.poses)
+    scan = seen.scans_of(number)
+    T = sources.poses[scan] @ seen.T_base_sensor[seen.sensor[scan]]
+    origin = T[:, :3, 3]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        far = origin + (ends - origin) * (
+            _FAR / np.linalg.norm(ends - origin, axis=1, keepdims=True)
+        )
+    ends = np.where(seen.hit[number][:, None], ends, far)
+    return Look.of(ends, origin, first.seconds[beams], way)
 
 
 def voxel_for(pieces: Sequence[Piece]) -> float:
@@ -140,16 +243,15 @@ def voxel_for(pieces: Sequence[Piece]) -> float:
 
 
 def pieces_of(
-    one: MovingObject,
-    thing: Thing,
-    sources: Sources,
-    options: MoverOptions,
-    surface: SurfaceOptions,
+    own: Recording, first: First, sources: Sources, surface: SurfaceOptions
 ) -> Iterator[Piece]:
-    """Triangles between neighbouring beams that end on a thing, range image by range image."""
-    own, first = own_beams(one, thing, sources, options)
-    if not own.hit.any():
-        return
+    """Triangles between neighbouring beams that end on a thing, range image by range image.
+
+    Args:
+        own, first: see `own_beams`.
+        sources: the beams.
+        surface: see SurfaceOptions.
+    """
     poses = sources.poses[first.scan : first.scan + own.n_scans]
     counts = np.add.reduceat(own.hit, own.offset[:-1]) * (np.diff(own.offset) > 0)
     order = order_of(own, np.flatnonzero(counts), surface)
@@ -180,19 +282,6 @@ def _used(patch: Patch, weight: Float, seconds: Float) -> Piece:
     return Piece(patch, weight.astype(np.float32), seconds[used])
 
 
-class First(NamedTuple):
-    """Where a part of a recording begins in it, and when its beams were taken.
-
-    Attributes:
-        scan, beam: numbers of its first ones.
-        seconds: (n,) of its beams, by the time of boxes.
-    """
-
-    scan: int
-    beam: int
-    seconds: Float
-
-
 def own_beams(
     one: MovingObject, thing: Thing, sources: Sources, options: MoverOptions
 ) -> tuple[Recording, First]:
@@ -219,8 +308,13 @@ def own_beams(
             theirs = other.beams[np.searchsorted(other.beams, beams.start) :]
             theirs = theirs[: np.searchsorted(theirs, beams.stop)]
             own[theirs - beams.start] = False
-    mine = one.beams[(one.beams >= beams.start) & (one.beams < beams.stop)] - beams.start
-    own[mine] = True
+    mine = one.beams[(one.beams >= beams.start) & (one.beams < beams.stop)]
+    at = Way.of_track(thing).local(
+        seconds[mine - beams.start], seen.end_points(mine, sources.poses)
+    )
+    # a track of somebody may take hold of who stands beside
+    near = (np.abs(at[:, :2]) <= half + options.margin).all(axis=1)
+    own[mine - beams.start] = near | (2.0 * thing.box.half[0] >= options.rigid)
     part = dataclasses.replace(
         seen,
         stamp_ns=seen.stamp_ns[scans],
@@ -236,38 +330,13 @@ def own_beams(
     return part, First(a, beams.start, seconds)
 
 
-def best_sweep(
-    pieces: Sequence[Piece], sweep: float, near: float, pictures: Float
-) -> tuple[float, float]:
-    """From when to when most of a thing was seen, in `sweep` seconds; rather where a picture is.
-
-    With 0 it is a range image that counts. A time without a picture within `near` seconds counts
-    a third.
-    """
-    if sweep == 0.0:
-        ends = np.array([(piece.seconds.min(), piece.seconds.max()) for piece in pieces])
-        first, final = ends.T
-        value = np.array([piece.areas().sum() for piece in pieces])
-    else:
-        times = np.concatenate([piece.times() for piece in pieces])
-        areas = np.concatenate([piece.areas() for piece in pieces])
-        order = np.argsort(times, kind="stable")
-        first, total = times[order], np.concatenate([[0.0], np.cumsum(areas[order])])
-        last = np.searchsorted(first, first + sweep, side="right")
-        final, value = first[last - 1], total[last] - total[:-1]
-    if len(pictures):
-        middle = 0.5 * (first + final)
-        away = np.abs(middle[:, None] - pictures).min(axis=1)
-        value = np.where(away <= near, value, value / 3.0)
-    best = int(np.argmax(value))
-    return float(first[best]), float(final[best])
-
-
-def _laid_over(pieces: Sequence[Piece], way: Way) -> Way:
-    """The way on which all sweeps of a rigid thing lie over each other."""
-    local = [piece.in_frame(way) for piece in pieces]
-    offset = aligned([_sweep(piece) for piece in local])
-    seconds = np.array([float(np.median(piece.seconds)) for piece in local])
+def _laid_over(pieces: Sequence[Piece], way: Way, blurred: float) -> Way | None:
+    """The way on which all sweeps of a rigid thing lie over each other; None: they do not."""
+    sweeps = [_sweep(piece.in_frame(way)) for piece in pieces]
+    offset = aligned(sweeps)
+    if spread(sweeps, offset) > blurred:
+        return None
+    seconds = np.array([float(np.median(piece.seconds)) for piece in pieces])
     order = np.argsort(seconds, kind="stable")
     return Way(way.thing, seconds[order], offset[order])
 

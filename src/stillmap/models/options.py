@@ -21,15 +21,26 @@ class MoverOptions:
     rigid: float = field_with_doc(
         1.5, "m, things at least so long keep their shape: all that was seen of one is put together"
     )
-    sweep: float = field_with_doc(
-        1.0, "s, in which a laser that tilts sees a thing once: so long others keep their shape"
+    blurred: float = field_with_doc(
+        0.05, "m, by which what was seen of one then may lie off itself; else a moment of it counts"
     )
+    fast: float = field_with_doc(
+        2.5, "m/s, what is faster is no person: what moves and hangs together with it is its own"
+    )
+    sweep: float = field_with_doc(
+        0.4, "s, in which a laser that tilts sees a thing: so long others keep their shape"
+    )
+    stretch: float = field_with_doc(
+        2.5, "times as far apart as usual are beams on them between which there is no surface"
+    )
+    longest: float = field_with_doc(0.6, "m, or farther apart than that")
     near: float = field_with_doc(
         0.5, "s from then to a picture that paints a thing that does not keep its shape"
     )
     rim: float = field_with_doc(
         0.04, "m within a thing's outline in a picture, where it may show what is behind"
     )
+    edge: float = field_with_doc(0.05, "m, longer edges are divided before they are painted")
     least: float = field_with_doc(0.03, "m2 of surface that a model has")
     island: float = field_with_doc(0.01, "m2, smaller pieces of it are left out")
 
@@ -45,9 +56,14 @@ _LIMITS = (
     ("margin", 0.0, 10.0),
     ("low", -10.0, 10.0),
     ("rigid", 0.0, 1000.0),
+    ("blurred", 0.0, 1000.0),
+    ("fast", 0.0, 1000.0),
     ("sweep", 1e-3, 1000.0),
+    ("stretch", 1.0, 1000.0),
+    ("longest", 0.0, 1000.0),
     ("near", 0.0, 1000.0),
     ("rim", 0.0, 10.0),
+    ("edge", 0.005, 1000.0),
     ("least", 0.0, 1000.0),
     ("island", 0.0, 1000.0),
 )

@@ -14,7 +14,7 @@ from stillmap.surface.dividing import divided
 from stillmap.surface.mesh import Mesh
 from stillmap.texture.choice import Candidates, utility
 from stillmap.texture.choice_options import ChoiceOptions
-from stillmap.texture.lens import project, within
+from stillmap.texture.lens import project, rays, within
 from stillmap.texture.options import VisibleOptions
 from stillmap.texture.things import Thing, at_time, in_the_way
 from stillmap.texture.view import View
@@ -24,6 +24,9 @@ Float = NDArray[np.float64]
 
 _BEHIND = 0.1  # m by which a surface may lie before a thing and be taken for its own
 _LEAST = 1e-9
+_SMALL = 320.0  # pixels across in which it is seen what of the place hides a thing
+_EDGE = 16  # rays along an edge of a picture that tell what it holds
+_NO_FACES = np.zeros((0, 0), np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,39 @@ class Dressed:
 
     painted: Painted
     views: list[View]
+
+
+class Ahead:
+    """How far away what stands still is in views, each looked at once."""
+
+    def __init__(self, place: Mesh, views: Sequence[View], limits: VisibleOptions) -> None:
+        self._place, self._views, self._limits = place, views, limits
+        self._known: dict[int, Depths] = {}
+
+    def free(self, number: int, points: Float) -> NDArray[np.bool_]:
+        """(n,) whether nothing of it lies before points (n, 3) in the map frame, in a view."""
+        view = self._views[number]
+        at = view.in_camera(points)
+        free = at[:, 2] > self._limits.near
+        if not free.any() or not len(self._place):
+            return free
+        if number not in self._known:
+            self._known[number] = self._whole(view)
+        depths = self._known[number]
+        free[free] = _looked_up(depths.depth, depths, at[free]) > at[free, 2] - _BEHIND
+        return free
+
+    def _whole(self, view: View) -> Depths:
+        """A small z-buffer of all that a view shows."""
+        camera = view.camera
+        across, down = np.meshgrid(
+            np.linspace(0, camera.width - 1, _EDGE), np.linspace(0, camera.height - 1, _EDGE)
+        )
+        shown = rays(camera, np.column_stack([across.ravel(), down.ravel()]))
+        shown = shown[np.isfinite(shown).all(axis=1)]
+        scale = min(_SMALL / camera.width, self._limits.scale)
+        depths = depths_of(self._place, view, shown, scale, self._limits.near)
+        return replace(depths, face=_NO_FACES)
 
 
 def when_in_view(thing: Thing, views: Sequence[View], start_ns: int) -> Float:
@@ -54,7 +90,7 @@ def when_in_view(thing: Thing, views: Sequence[View], start_ns: int) -> Float:
 def dressed(
     shape: Shape,
     views: Sequence[View],
-    place: Mesh,
+    place: Ahead,
     things: Sequence[Thing],
     start_ns: int,
     options: MoverOptions,
@@ -69,16 +105,17 @@ def dressed(
     Args:
         shape: the thing.
         views: pictures and where they were taken, in the map frame.
-        place: what stands still.
+        place: what stands still, of the same views.
         things: all that moves, this one too.
         start_ns: when the time of the things begins.
         options, choice, limits: see there.
     """
-    mesh, _ = divided(shape.mesh, choice.edge)
+    mesh, _ = divided(shape.mesh, min(choice.edge, options.edge))
     candidates = Candidates.none(len(mesh), choice.candidates)
     sharpest, own = Candidates.none(len(mesh), 1), list[View]()
     others = [one for one in things if one.box.thing != shape.id]
-    for view, now in zip(views, when_in_view(shape.way.thing, views, start_ns), strict=True):
+    seconds = when_in_view(shape.way.thing, views, start_ns)
+    for number, (view, now) in enumerate(zip(views, seconds.tolist(), strict=True)):
         away = max(shape.span[0] - now, now - shape.span[1], 0.0)
         if np.isnan(now) or (not shape.rigid and away > options.near):
             continue
@@ -90,7 +127,7 @@ def dressed(
         if not len(faces):
             continue
         points = mesh.centres[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
-        free = _before(place, points, view, limits)
+        free = place.free(number, points)
         faces, points = faces[free], points[free]
         hidden = in_the_way(at_time(others, now), view.place, points, choice.margin, choice.sigma)
         pixels = found.pixels[faces].astype(np.float64)
@@ -115,18 +152,6 @@ def _inside(
     at = np.concatenate([points[mesh.faces[faces]], points[mesh.faces[faces]].mean(1)[:, None]], 1)
     metres = _looked_up(far, depths, at) * at[..., 2] / depths.K[0, 0]
     return np.asarray(metres.min(axis=1) >= rim)
-
-
-def _before(place: Mesh, points: Float, view: View, limits: VisibleOptions) -> NDArray[np.bool_]:
-    """(n,) whether nothing of the place lies before points (n, 3) in the map frame."""
-    at = view.in_camera(points)
-    ahead = at[:, 2] > limits.near
-    if not ahead.any() or not len(place):
-        return ahead
-    depths = depths_of(place, view, at[ahead], limits.scale, limits.near)
-    free = np.zeros(len(points), np.bool_)
-    free[ahead] = _looked_up(depths.depth, depths, at[ahead]) > at[ahead, 2] - _BEHIND
-    return free
 
 
 def _looked_up(values: NDArray[np.floating], depths: Depths, at: Float) -> Float:
