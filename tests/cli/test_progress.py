@@ -65,10 +65,3 @@ def test_quiet(lines):
         progress("mapping", 1, 3, 3)
         time.sleep(0.1)
     assert said == []
-
-
-def test_what_is_counted_has_its_name(lines):
-    _, another = lines
-    with shown_progress(False, 6) as progress:
-        progress("building what moved", 0, 3, 9)
-        assert "building what moved: 3 of 9 objects" in another("3 of 9")

@@ -15,11 +15,6 @@ if TYPE_CHECKING:
 
 _AT_ONCE = 0.01  # s: what takes no longer has no rate
 _EVERY = 10.0  # s between lines where there is no terminal
-_COUNTED = {  # where it is not scans
-    "building the surface": "steps",
-    "choosing pictures": "pictures",
-    "building what moved": "objects",
-}
 
 
 def say(line: str) -> None:
@@ -119,7 +114,7 @@ def _bar(iterations: int) -> "Iterator[Progress]":
                 bar.remove_task(task)
                 task = bar.add_task(shown.name, total=total or None, counted="")
             if total:
-                counted = f"{done}/{total} {shown.counted} {shown.rate(done):.0f}/s"
+                counted = f"{done}/{total} scans {shown.rate(done):.0f}/s"
                 bar.update(task, completed=done, counted=counted)
 
         yield progress
@@ -130,7 +125,6 @@ class _Step:
 
     def __init__(self, what: str, iteration: int, iterations: int) -> None:
         self.name = f"{what}, iteration {iteration} of at most {iterations}" if iteration else what
-        self.counted = _COUNTED.get(what, "scans")
         self._which, self._started = (what, iteration), time.monotonic()
 
     def is_same(self, what: str, iteration: int) -> bool:
@@ -140,7 +134,7 @@ class _Step:
         return time.monotonic() - self._started
 
     def rate(self, done: int) -> float:
-        """Scans, or whatever is counted, per second."""
+        """Scans per second."""
         return done / max(self.seconds(), 1e-3)
 
 
@@ -179,7 +173,7 @@ class _Lines:
         if not total:
             say(f"{step.name}: {step.seconds():.0f} s so far")
             return
-        text, rate = f"{step.name}: {done} of {total} {step.counted}", step.rate(done)
+        text, rate = f"{step.name}: {done} of {total} scans", step.rate(done)
         if step.seconds() > _AT_ONCE:
             text += f", {rate:.0f}/s"
         if done < total:
