@@ -1,0 +1,160 @@
+"""How much of a room's texture shows the people who were pasted into its pictures.
+
+python benchmarks/pasted.py ../shared/data/rgbd/kitchenette OUT
+python benchmarks/pasted_scores.py OUT [--set section.key=value ...] [--alone] [--keep DIR]
+
+`stillmap map` makes the model with the recorded poses, and again with pictures chosen by their
+resolution alone (`mesh.choice.believe`), unless --alone is given. Points that lie as densely on
+every square metre are looked up in what of the picture that paints them is a person. Free is what
+some picture shows without one.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tables import Column, means_and_worst
+
+import stillmap
+from stillmap.errors import InputError
+from stillmap.evaluation import meshes
+from stillmap.evaluation.model_folders import RECORD, read_record
+from stillmap.evaluation.models import GREY, SAMPLES, Pictures, Record, shown
+from stillmap.recording import ReadOptions
+from stillmap.recording.images import Images
+from stillmap.surface.mesh import Mesh
+from stillmap.texture import lens
+from stillmap.texture.view import View
+from stillmap.texture.visible import visible
+
+Mask = NDArray[np.bool_]
+
+WAYS = {"by P(static)": (), "by resolution alone": ("mesh.choice.believe=false",)}
+COLUMNS = (
+    Column("area", "area, m2", ".1f"),
+    Column("painted", "painted, %", ".1f", True),
+    Column("free", "free, %", ".1f", True),
+    Column("covered", "of that painted, %", ".1f", True),
+    Column("person", "shows people, %", ".3f"),
+    Column("seconds", "s", ".0f"),
+    Column("memory", "GB", ".2f"),
+)
+
+
+class Scores(NamedTuple):
+    """Of a mesh. NaN where there is nothing to compare.
+
+    Attributes:
+        area: square metres.
+        painted: share of its area that a picture paints.
+        free: share that some picture shows without a person before it.
+        covered: share of that which a picture paints.
+        person: share of what is painted that shows a person.
+    """
+
+    area: float
+    painted: float
+    free: float
+    covered: float
+    person: float
+
+
+def scores(record: Record, images: Images, people: Mask) -> Scores:
+    """Score what paints a mesh.
+
+    Args:
+        record: which picture paints each face.
+        images: that may paint it.
+        people: (N, height, width) where each shows a person.
+    """
+
+    def mask(image: int) -> NDArray[np.uint16]:
+        return people[image].astype(np.uint16)
+
+    def distance(image: int) -> NDArray[np.float32]:
+        raise NotImplementedError("how far pixels see is not looked up")
+
+    at = meshes.samples(record.vertices, record.faces, SAMPLES)
+    places = np.full((len(images), 4, 4), np.nan)
+    shows = shown(record, at, Pictures(images.cameras, images.camera, places, mask, distance))
+    painted, free = shows != GREY, _free(record, at, images, people)
+    return Scores(
+        area=float(meshes.areas(record.vertices, record.faces).sum()),
+        painted=_mean(painted),
+        free=_mean(free),
+        covered=_mean(painted[free]),
+        person=_mean(shows[painted] >= 0),
+    )
+
+
+def _free(record: Record, at: meshes.Samples, images: Images, people: Mask) -> Mask:
+    """(n,) whether a picture that sees a sample's whole face shows no person there."""
+    out, mesh = np.zeros(len(at.face), bool), Mesh(record.vertices, record.faces)
+    for image, T in enumerate(record.T_camera_model):
+        if not np.isfinite(T).all():
+            continue
+        camera = images.cameras[images.camera[image]]
+        view = View(image, int(images.stamp_ns[image]), camera, T)
+        some = np.flatnonzero(~out & visible(mesh, view).seen[at.face])
+        column, row = np.rint(lens.project(camera, view.in_camera(at.points[some]))[0].T)
+        out[some] = ~people[image][row.astype(np.intp), column.astype(np.intp)]
+    return out
+
+
+def _mean(values: Mask) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
+def row(source: Path, result: Path, settings: tuple[str, ...]) -> dict[str, Any]:
+    """Map a folder that `pasted.py` wrote, and score it; shares in percent.
+
+    Args:
+        source: that folder.
+        result: where the model goes; what is there is replaced.
+        settings: `section.key=value`.
+    """
+    flags = [part for one in settings for part in ("--set", one)]
+    words = ["map", source, "--poses", "recording", "-o", result, "--overwrite", "--quiet", *flags]
+    subprocess.run([sys.executable, "-m", "stillmap", *map(str, words)], check=True)
+    images = stillmap.read(source, options=ReadOptions(depth_step=64)).images
+    if images is None:
+        raise InputError("has no pictures", where=str(source))
+    record = read_record(result / RECORD, len(images))
+    if record is None:
+        raise InputError("has no model", where=str(result))
+    with np.load(source / "truth.npz") as truth:
+        found = scores(record, images, truth["colour"])._asdict()
+    done = json.loads((result / "run.json").read_text())
+    percent = {key: 100.0 * value for key, value in found.items() if key != "area"}
+    seconds, memory = sum(done["seconds"].values()), max(done["peak_memory_bytes"].values())
+    return {"area": found["area"], **percent, "seconds": seconds, "memory": 1e-9 * memory}
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("source", type=Path, help="what pasted.py wrote")
+    p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    p.add_argument("--alone", action="store_true", help="not by resolution alone, too")
+    p.add_argument("--keep", type=Path, metavar="DIR", help="leave the results there")
+    args = p.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        kept = args.keep or Path(folder)
+        kept.mkdir(parents=True, exist_ok=True)
+        ways = list(WAYS.items())[: 1 if args.alone else None]
+        rows = [
+            {"case": way, **row(args.source, kept / f"result-{k}", (*args.set, *settings))}
+            for k, (way, settings) in enumerate(ways)
+        ]
+    print(means_and_worst(rows, COLUMNS))
+
+
+if __name__ == "__main__":
+    main()
