@@ -16,7 +16,7 @@ from stillmap.em import Ground, ground_of
 from stillmap.loop import Best, IterationRecord, Loop
 from stillmap.objects import MovingObject, Traffic, moving_objects, traffic
 from stillmap.output.crops import Snapshot
-from stillmap.output.protocols import ModelsLike
+from stillmap.output.model_protocols import ModelsLike
 from stillmap.output.save import save
 from stillmap.pipeline import DEFAULTS, Options, Progress
 from stillmap.recording.model import Recording
