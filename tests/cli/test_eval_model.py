@@ -13,6 +13,7 @@ from PIL import Image
 
 from stillmap import se2
 from stillmap.cli import main
+from stillmap.evaluation import models
 from stillmap.recording import read
 from stillmap.recording.tum import write_tum
 from stillmap.simulation import (
@@ -31,6 +32,14 @@ pytest.importorskip("skimage")
 
 UP = 0.03  # m, by which the made-up floor is too high
 SIZE = 64  # texels
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _fewer_points():
+    """A floor of a few square metres needs no more."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(models, "SAMPLES", 20_000)
+        yield
 
 
 @pytest.fixture(scope="module")
