@@ -42,7 +42,7 @@ def out(tmp_path):
 def test_the_model_with_its_pages(out, call, tmp_path):
     done = call("convert", out, "-o", tmp_path / "a.obj")
     assert done.returncode == 0, done.stderr
-    assert "2 faces and 1 pages of texture" in done.stderr
+    assert "2 faces and 1 page of texture" in done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.mtl", "a.obj", "a_page0.png", "out"]
     scene = trimesh.load_scene(tmp_path / "a.obj", process=False)
     by_name = {part.visual.material.name: part for part in scene.geometry.values()}

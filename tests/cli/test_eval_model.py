@@ -1,6 +1,9 @@
 """`stillmap eval model` on made-up results of a small rig with a camera."""
 
+import io
 import json
+import shutil
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +13,7 @@ from PIL import Image
 
 from stillmap import se2
 from stillmap.cli import main
+from stillmap.evaluation import models
 from stillmap.recording import read
 from stillmap.recording.tum import write_tum
 from stillmap.simulation import (
@@ -30,6 +34,14 @@ UP = 0.03  # m, by which the made-up floor is too high
 SIZE = 64  # texels
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _fewer_points():
+    """A floor of a few square metres needs no more."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(models, "SAMPLES", 20_000)
+        yield
+
+
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory) -> Path:
     changes = {
@@ -43,10 +55,10 @@ def simulated(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.fixture
-def result(simulated, tmp_path) -> Path:
+@pytest.fixture(scope="module")
+def made(simulated, tmp_path_factory) -> Path:
     """Four metres of the floor ahead of the robot, in true colours; one person as a box."""
-    out = tmp_path / "result"
+    out = tmp_path_factory.mktemp("made") / "result"
     (out / "tilting/objects").mkdir(parents=True)
     recording, truth = read(simulated / "tilting"), load_truth(simulated / "tilting")
     T_map_world = se2.inverse(truth.T_world_base[0])
@@ -67,6 +79,21 @@ def result(simulated, tmp_path) -> Path:
     assert T_base_camera is not None
     _write_person(out / "tilting/objects", simulated, T_map_world)
     return out
+
+
+@pytest.fixture
+def result(made, tmp_path) -> Path:
+    """The same, to be changed."""
+    return Path(shutil.copytree(made, tmp_path / "result"))
+
+
+@pytest.fixture(scope="module")
+def scored(made, simulated) -> dict:
+    """Its scores."""
+    out = io.StringIO()
+    with redirect_stdout(out):
+        assert main(["eval", "model", str(made), str(simulated), "--json"]) == 0
+    return json.loads(out.getvalue())
 
 
 def _floor() -> tuple[Float, NDArray[np.int32], Float]:
@@ -128,8 +155,8 @@ def _scores(capsys, *args: object) -> dict:
     return json.loads(out)
 
 
-def test_a_floor_that_is_too_high(result, simulated, capsys) -> None:
-    found = _scores(capsys, result, simulated)
+def test_a_floor_that_is_too_high(made, simulated, scored, capsys) -> None:
+    found = scored
     assert found["surface"]["mean"] == pytest.approx(UP, abs=1e-3)
     assert found["surface"]["area"] == pytest.approx(16.0, abs=1e-3)
     assert 0.0 < found["surface"]["complete"] < 0.3
@@ -138,11 +165,11 @@ def test_a_floor_that_is_too_high(result, simulated, capsys) -> None:
     assert found["texture"]["textured"] > 0.3
     # what the picture sees it paints, but for what people stand before
     assert found["texture"]["covered"] > 0.5
-    assert _scores(capsys, result, simulated / "tilting") == found
+    assert _scores(capsys, made, simulated / "tilting") == found
 
 
-def test_a_person_as_a_box(result, simulated, capsys) -> None:
-    movers = _scores(capsys, result, simulated)["movers"]
+def test_a_person_as_a_box(scored) -> None:
+    movers = scored["movers"]
     assert (movers["tracked"], movers["modelled"]) == (1, 1.0)
     (one,) = movers["models"]
     assert (one["id"], one["kind"]) == (3, "person")
@@ -151,15 +178,15 @@ def test_a_person_as_a_box(result, simulated, capsys) -> None:
     assert one["background"] is None
 
 
-def test_beams_that_are_too_long_do_not_count(result, simulated, capsys) -> None:
-    everything = _scores(capsys, result, simulated)["surface"]
-    near = _scores(capsys, result, simulated, "--within", 3)["surface"]
+def test_beams_that_are_too_long_do_not_count(made, simulated, scored, capsys) -> None:
+    everything = scored["surface"]
+    near = _scores(capsys, made, simulated, "--within", 3)["surface"]
     assert near["places"] < everything["places"]
     assert near["complete"] > everything["complete"]
 
 
-def test_text(result, simulated, capsys) -> None:
-    assert main(["eval", "model", str(result), str(simulated)]) == 0
+def test_text(made, simulated, capsys) -> None:
+    assert main(["eval", "model", str(made), str(simulated)]) == 0
     text = capsys.readouterr().out
     assert "off truth    mean 2.9" in text
     assert "textured -, background -" in text

@@ -90,7 +90,7 @@ def _convert_to_obj(args: argparse.Namespace, mapped: Mapped, output: Path) -> s
     faces, pages = model.write_obj(
         mapped.folder, output, mapped.texture_options.quality, args.overwrite
     )
-    return f"{faces} faces and {pages} pages of texture"
+    return f"{faces} faces and {pages} page{'s' * (pages != 1)} of texture"
 
 
 def _clouds() -> str:
