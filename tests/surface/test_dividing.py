@@ -22,10 +22,10 @@ def _has_no_gaps(fine: Mesh) -> bool:
     edges = np.sort(fine.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     once = np.unique(edges, axis=0, return_counts=True)
     border = once[0][once[1] == 1]
+    assert set(once[1].tolist()) == {1, 2}
     # what belongs to one face alone lies on the border of the sheet
     middle = fine.vertices[border].mean(axis=1)
     return bool((np.isclose(middle[:, :2], 0.0) | np.isclose(middle[:, :2], 6.0)).any(axis=1).all())
-    assert set(once[1].tolist()) == {1, 2}
 
 
 def test_edges_become_short_and_the_surface_stays() -> None:

@@ -215,39 +215,54 @@ class SignedDistances : public Blocks<3, Distances> {
 
   size_t memory_bytes() const { return blocks().size() * (sizeof(Block) + 64); }
 
+  // In batches, so that what waits to be summed stays small.
   void add(const Triangles& triangles, int threads) {
-    const auto bounds = even_shares(triangles.size, threads);
-    std::vector<std::vector<Term>> terms(bounds.size() - 1);
-    parallel_shares(bounds, [&](size_t share, size_t first, size_t last) {
-      for (size_t face = first; face < last; ++face) meet(triangles, face, terms[share]);
-    });
-    const Sorted sorted = by_block(terms);
-    const auto shares = shares_of(sorted.offset.data(), sorted.block.size(), threads);
-    parallel_shares(shares, [&](size_t, size_t first, size_t last) {
-      for (size_t b = first; b < last; ++b)
-        for (int64_t k = sorted.offset[b]; k < sorted.offset[b + 1]; ++k)
-          sum(triangles, *sorted.term[static_cast<size_t>(k)], *sorted.block[b]);
-    });
+    const size_t batch = kBatch * static_cast<size_t>(std::clamp(threads, 1, 64));
+    std::vector<Share> shares;
+    for (size_t first = 0; first < triangles.size; first += batch) {
+      const auto bounds = even_shares(std::min(batch, triangles.size - first), threads);
+      if (shares.size() < bounds.size() - 1) shares.resize(bounds.size() - 1);
+      parallel_shares(bounds, [&](size_t share, size_t low, size_t high) {
+        shares[share].terms.clear();
+        for (size_t face = first + low; face < first + high; ++face)
+          meet(triangles, face, shares[share]);
+      });
+      sum(triangles, shares, bounds.size() - 1);
+    }
   }
 
  private:
   static constexpr double kMostVoxels = 64.0;
   static constexpr int64_t kMostBlocks = 1 << 20;  // around one triangle
-  static constexpr double kSmall = 4.0;            // voxels along an edge
+  static constexpr double kSmall = 16.0;            // voxels along an edge
   static constexpr float kWhole = -1.0f;
+
+  static constexpr size_t kBatch = 1 << 13;  // triangles for each thread
 
   // What a triangle adds to a voxel of a block; of a large triangle, all that it adds to the block.
   struct Term {
-    Cell<3> block;
+    uint32_t block;   // as its share numbers them
     uint32_t number;  // of the voxel in the block, or of the face
     float weight;     // kWhole: of the face
     float metres;
   };
-  // The terms of each block, in the order of the triangles.
-  struct Sorted {
-    std::vector<Block*> block;
-    std::vector<int64_t> offset;
-    std::vector<const Term*> term;
+  // What triangles that follow one another add, in their order.
+  struct Share {
+    std::vector<Term> terms;
+    VoxelTable<3, uint32_t> known;  // one more than the number of each block
+    std::vector<Block*> block;      // by its number
+    std::vector<size_t> owner;      // which thread sums it
+    Cell<3> last = Cell<3>::Zero();
+    uint32_t last_number = 0;
+
+    uint32_t number_of(const Cell<3>& cell) {
+      if (known.size() && cell == last) return last_number;
+      uint32_t& place = known.find_or_add(cell);
+      if (place == 0) place = static_cast<uint32_t>(known.size());
+      last = cell;
+      last_number = place - 1;
+      return last_number;
+    }
   };
 
   Prism prism(const Triangles& triangles, size_t face) const {
@@ -255,20 +270,20 @@ class SignedDistances : public Blocks<3, Distances> {
   }
 
   // less weight behind the surface, where there may be another one
-  Term term(const Cell<3>& voxel, double metres, float weight) const {
-    return {block_of(voxel), static_cast<uint32_t>(local_of(voxel)),
+  Term term(uint32_t block, const Cell<3>& voxel, double metres, float weight) const {
+    return {block, static_cast<uint32_t>(local_of(voxel)),
             weight * static_cast<float>(std::min(1.0, 1.0 + metres / behind_)),
             static_cast<float>(metres)};
   }
 
-  void meet(const Triangles& triangles, size_t face, std::vector<Term>& terms) const {
+  void meet(const Triangles& triangles, size_t face, Share& share) const {
     const float weight = triangles.weight[face];
     if (!(weight > 0.0f)) return;
     const Prism one = prism(triangles, face);
     if (one.empty()) return;
     if (one.longest() <= kSmall) {
       one.each(one.low(), one.high(), [&](const Cell<3>& voxel, double metres) {
-        terms.push_back(term(voxel, metres, weight));
+        share.terms.push_back(term(share.number_of(block_of(voxel)), voxel, metres, weight));
       });
       return;
     }
@@ -282,42 +297,26 @@ class SignedDistances : public Blocks<3, Distances> {
       for (block[1] = low[1]; block[1] <= high[1]; ++block[1])
         for (block[0] = low[0]; block[0] <= high[0]; ++block[0])
           if (!one.misses(block * kEdge, kEdge))
-            terms.push_back({block, static_cast<uint32_t>(face), kWhole, 0.0f});
+            share.terms.push_back(
+                {share.number_of(block), static_cast<uint32_t>(face), kWhole, 0.0f});
   }
 
-  Sorted by_block(const std::vector<std::vector<Term>>& terms) {
-    size_t n = 0;
-    for (const auto& share : terms) n += share.size();
-    Sorted out;
-    std::vector<uint32_t> number;  // of the block, for each term
-    number.reserve(n);
-    std::vector<int64_t> count;
-    VoxelTable<3, uint32_t> known;  // one more than its number
-    const Cell<3>* last = nullptr;
-    for (const auto& share : terms)
-      for (const Term& one : share) {
-        if (last && *last == one.block) {
-          number.push_back(number.back());
-        } else {
-          uint32_t& place = known.find_or_add(one.block);
-          if (place == 0) {
-            out.block.push_back(find_or_add(one.block, Distances{}));
-            count.push_back(0);
-            place = static_cast<uint32_t>(count.size());
-          }
-          number.push_back(place - 1);
-          last = &one.block;
-        }
-        ++count[number.back()];
+  // Each thread has blocks of its own, and meets the terms in their order.
+  void sum(const Triangles& triangles, std::vector<Share>& shares, size_t n) {
+    for (size_t i = 0; i < n; ++i)
+      for (size_t k = shares[i].block.size(); k < shares[i].known.size(); ++k) {
+        const Cell<3>& cell = shares[i].known.cell(k);
+        shares[i].block.push_back(find_or_add(cell, Distances{}));
+        shares[i].owner.push_back(static_cast<size_t>(Grid<3>::Hash{}(Grid<3>::key(cell))));
       }
-    out.offset.assign(1, 0);
-    for (const int64_t c : count) out.offset.push_back(out.offset.back() + c);
-    std::vector<int64_t> next(out.offset.begin(), out.offset.end() - 1);
-    out.term.resize(n);
-    size_t k = 0;
-    for (const auto& share : terms)
-      for (const Term& one : share) out.term[static_cast<size_t>(next[number[k++]]++)] = &one;
-    return out;
+    std::vector<size_t> each(n + 1);
+    for (size_t i = 0; i <= n; ++i) each[i] = i;
+    parallel_shares(each, [&](size_t mine, size_t, size_t) {
+      for (size_t i = 0; i < n; ++i)
+        for (const Term& one : shares[i].terms)
+          if (n == 1 || shares[i].owner[one.block] % n == mine)
+            sum(triangles, one, *shares[i].block[one.block]);
+    });
   }
 
   void sum(const Triangles& triangles, const Term& of, Block& block) const {
@@ -330,7 +329,7 @@ class SignedDistances : public Blocks<3, Distances> {
     const Cell<3> low = one.low().cwiseMax(corner);
     const Cell<3> high = one.high().cwiseMin((corner.array() + (kEdge - 1)).matrix());
     one.each(low, high, [&](const Cell<3>& voxel, double metres) {
-      add_to(block, term(voxel, metres, triangles.weight[of.number]));
+      add_to(block, term(of.block, voxel, metres, triangles.weight[of.number]));
     });
   }
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from functools import partial
+from itertools import chain, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ Float = NDArray[np.float64]
 Tell = Callable[[int, int], None]
 
 _ASKED = 64  # scans of which the ranges are looked at
+_LEAST = 1e-3  # m, edge of the cells by which scans nearby are found
+_AROUND = list(product((-1, 0, 1), repeat=3))
 
 
 def surface_of(
@@ -83,7 +86,19 @@ def fused(
         threads: same result with any number.
         tell: called with what is done and what there is to do, once the patches are through.
     """
-    o = options
+    parts = _in_tiles(patches, voxel, options, threads, tell)
+    whole = without_islands(joined_whole(parts), options.island)
+    return within_budget(thinned(whole, options.error), options.error, options.faces)
+
+
+def _in_tiles(
+    patches: Iterable[tuple[Patch, NDArray[np.float32]]],
+    voxel: float,
+    o: SurfaceOptions,
+    threads: int,
+    tell: Tell | None,
+) -> list[Mesh]:
+    """The surface tile by tile, thinned out; the voxels are gone."""
     distances = _core.SignedDistances(voxel, before=o.before * voxel, behind=o.behind * voxel)
     for patch, weight in patches:
         distances.add(
@@ -96,8 +111,7 @@ def fused(
             parts.append(part)
         if tell:
             tell(done, total)
-    whole = without_islands(joined_whole(parts), o.island)
-    return within_budget(thinned(whole, o.error), o.error, o.faces)
+    return parts
 
 
 def static_weights(
@@ -131,10 +145,18 @@ def chosen_scans(
         o: `apart`, `turned` and `looks`.
     """
     place, R = T_map_sensor[:, :3, 3], T_map_sensor[:, :3, :3]
-    chosen = np.zeros(len(place), np.bool_)
-    for t in np.arange(len(place)):
-        before = np.flatnonzero(chosen[:t] & (sensor[:t] == sensor[t]))
-        near = before[np.linalg.norm(place[before] - place[t], axis=1) < o.apart * range]
+    apart = o.apart * range
+    # by cells, so that each scan is compared with those about alone
+    cells = np.floor(place / max(apart, _LEAST)).astype(np.int64).tolist()
+    known: dict[tuple[int, ...], list[int]] = {}
+    chosen = list[int]()
+    for t, (x, y, z) in enumerate(cells):
+        mine = int(sensor[t])
+        about = [known.get((mine, x + i, y + j, z + k), ()) for i, j, k in _AROUND]
+        before = np.fromiter(chain.from_iterable(about), np.intp)
+        near = before[np.linalg.norm(place[before] - place[t], axis=1) < apart]
         cosine = 0.5 * (np.einsum("nij,ij->n", R[near], R[t]) - 1.0)
-        chosen[t] = np.count_nonzero(cosine > np.cos(o.turned)) < o.looks
-    return np.flatnonzero(chosen)
+        if np.count_nonzero(cosine > np.cos(o.turned)) < o.looks:
+            chosen.append(t)
+            known.setdefault((mine, x, y, z), []).append(t)
+    return np.array(chosen, np.intp)

@@ -27,10 +27,10 @@ class SurfaceOptions:
     bend: float = field_with_doc(0.35, "rad between such a triangle's normal and those beside")
     pause: float = field_with_doc(1.0, "s without a scan after which rows are not neighbours")
     apart: float = field_with_doc(
-        0.05, "of the usual range, by which the sensor goes on until a scan tells something new"
+        0.2, "of the usual range, by which the sensor goes on until a scan tells something new"
     )
     turned: float = field_with_doc(0.1, "rad by which it turns, likewise")
-    looks: int = field_with_doc(3, "scans from one place that are used")
+    looks: int = field_with_doc(2, "scans from one place that are used")
     fewest: float = field_with_doc(0.0, "triangles that a voxel must be of, by their weights")
     island: float = field_with_doc(0.05, "m2, smaller pieces are left out")
     error: float = field_with_doc(0.01, "m that thinning out may move the surface by")

@@ -11,10 +11,10 @@ from stillmap.surface.triangles import noise_of
 Float = NDArray[np.float64]
 
 _ASKED = 8  # patches
-_FINEST, _COARSEST = 0.01, 0.2  # m
+_FINEST, _COARSEST = 0.02, 0.2  # m; what depth cameras see in a room is no more exact
 _NOISES = 2.5  # standard deviations of ranges that a voxel is wide, at least
 _NEAR = 0.75  # voxels between rows that are used, at most
-_MEMORY = 1.5e9  # bytes for all voxels
+_MEMORY = 0.75e9  # bytes for all voxels
 _CELL = 0.5  # m, of squares by which the area is measured
 _BEAMS = 200_000  # by which it is
 _LAYERS = 2.5  # blocks behind each other across a surface

@@ -35,7 +35,7 @@ class ChoiceOptions:
         0.25, "m, longer edges of faces are divided first: each part has its own picture"
     )
     edge_pixels: float = field_with_doc(
-        24.0, "pixels, edges that are shorter in the nearest picture are not divided"
+        16.0, "pixels, edges that are shorter in the nearest picture are not divided"
     )
 
     def __post_init__(self) -> None:
