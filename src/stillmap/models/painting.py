@@ -100,7 +100,8 @@ def dressed(
     """Chooses for each face of what moved the view that shows it best.
 
     A view may paint a face if the place does not hide it, if no other thing is likely to, and if it
-    lies within the thing's outline by `options.rim`: beside that it shows what is behind.
+    lies within the thing's outline by `options.rim`, and more with time: beside that it shows what
+    is behind.
 
     Args:
         shape: the thing.
@@ -120,10 +121,11 @@ def dressed(
         if np.isnan(now) or (not shape.rigid and away > options.near):
             continue
         T_map_object = shape.way.T_map_object(now)
+        rim = options.rim + options.drift * (0.0 if shape.rigid else _gone(shape, now))
         moved = replace(view, T_camera_map=view.T_camera_map @ T_map_object)
         found = visible(mesh, moved, limits)
         faces = np.flatnonzero(found.seen)
-        faces = faces[_inside(mesh, faces, moved, options.rim, limits)]
+        faces = faces[_inside(mesh, faces, moved, rim, limits)]
         if not len(faces):
             continue
         points = mesh.centres[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
@@ -138,6 +140,12 @@ def dressed(
         sharpest.add(len(own), faces, pixels, 1.0 - hidden)
         own.append(moved)
     return Dressed(settled(mesh, candidates, sharpest, choice.border), own)
+
+
+def _gone(shape: Shape, seconds: float) -> float:
+    """Metres that a thing went from when its shape was seen to a time."""
+    there = shape.way.thing.box.middle(np.array([shape.seconds, seconds]))
+    return float(np.linalg.norm(there[1] - there[0]))
 
 
 def _inside(
