@@ -34,6 +34,7 @@ _OF_SPACING = 0.7  # of how far beams lie apart
 _FAR = 1000.0  # m
 _AROUND = 0.03  # s, in which a scan sees the rest of a car
 _CAR = 6.0  # m, from one end of it to the other
+_MOSTLY = 0.1  # of what hangs together is of a track: else another one follows it
 _CELL = 0.2  # m, in which one point is enough
 _SPACING = 0.025  # rad between beams, at most
 _OFTEN = 0.9  # of the time something is not faster
@@ -178,7 +179,10 @@ def _in_a_moment(
         beams = np.flatnonzero(then)
         mine = own.hit[beams]
         if fast:
-            mine = _grown(beams, mine, way, first, sources, options)
+            whole = _grown(beams, mine, way, first, sources, options)
+            if mine.sum() < _MOSTLY * whole.sum():
+                continue
+            mine = whole
             span = float(first.seconds[beams[mine]].min()), float(first.seconds[beams[mine]].max())
         looks = [_look(some, way, first, sources) for some in (beams[mine], beams[~mine])]
         stretch, longest = options.stretch, options.longest
