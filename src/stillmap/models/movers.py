@@ -328,7 +328,7 @@ def own_beams(
     )
     # a track of somebody may take hold of who stands beside
     near = (np.abs(at[:, :2]) <= half + options.margin).all(axis=1)
-    own[mine - beams.start] = near | (2.0 * thing.box.half[0] >= options.rigid)
+    own[mine - beams.start] = near | (options.together and 2.0 * thing.box.half[0] >= options.rigid)
     part = dataclasses.replace(
         seen,
         stamp_ns=seen.stamp_ns[scans],
