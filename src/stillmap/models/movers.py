@@ -34,7 +34,10 @@ _OF_SPACING = 0.7  # of how far beams lie apart
 _FAR = 1000.0  # m
 _AROUND = 0.03  # s, in which a scan sees the rest of a car
 _CAR = 6.0  # m, from one end of it to the other
-_CELL, _LINK = 0.2, 2.3  # m, and cells that may lie between parts of it
+_MOSTLY = 0.1  # of what hangs together is of a track: else another one follows it
+_CELL = 0.2  # m, in which one point is enough
+_SPACING = 0.025  # rad between beams, at most
+_OFTEN = 0.9  # of the time something is not faster
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +122,7 @@ def shape_of(
     if not own.hit.any():
         return None
     way, shape = Way.of_track(thing), None
-    if 2.0 * thing.box.half[0] >= options.rigid:
+    if options.together and 2.0 * thing.box.half[0] >= options.rigid:
         shape = _put_together(one.id, way, own, first, sources, options, surface)
     return shape or _in_a_moment(one.id, way, own, first, sources, options, surface, pictures)
 
@@ -166,7 +169,8 @@ def _in_a_moment(
     """What one look saw of it: a scan in space, or planar ones that follow one another."""
     hits = np.flatnonzero(own.hit)
     planar = order_of(own, hits[:0], surface).planar
-    fast = np.median(np.linalg.norm(way.thing.box.velocity, axis=1)) > options.fast
+    speed = np.linalg.norm(way.thing.box.velocity, axis=1)
+    fast = bool(np.quantile(speed, _OFTEN) > options.fast)
     # who is seen by few beams is looked at longer
     for moment in (options.sweep, 2.0 * options.sweep) if planar else (0.0,):
         span = best_moment(first.seconds[hits], own.scans_of(hits), moment, options.near, pictures)
@@ -175,10 +179,17 @@ def _in_a_moment(
         beams = np.flatnonzero(then)
         mine = own.hit[beams]
         if fast:
-            mine = _grown(beams, mine, way, first, sources, options)
+            whole = _grown(beams, mine, way, first, sources, options)
+            if mine.sum() < _MOSTLY * whole.sum():
+                continue
+            mine = whole
             span = float(first.seconds[beams[mine]].min()), float(first.seconds[beams[mine]].max())
         looks = [_look(some, way, first, sources) for some in (beams[mine], beams[~mine])]
-        mesh = between_beams(looks[0], looks[1], options.stretch, options.longest)
+        stretch, longest = options.stretch, options.longest
+        if fast:  # its sides are seen at flat angles
+            away = np.linalg.norm(looks[0].points - looks[0].origin, axis=1)
+            stretch, longest = np.inf, max(longest, _SPACING * float(np.median(away)))
+        mesh = between_beams(looks[0], looks[1], stretch, longest)
         mesh = without_islands(mesh, options.island)
         if mesh.areas().sum() >= options.least:
             return Shape(id, mesh, way, False, 0.5 * (span[0] + span[1]), span)
@@ -206,8 +217,11 @@ def _grown(
     moves, at = moves[some], at[some]
     if not len(moves):
         return mine
+    place = _look(beams[:1], way, first, sources).origin[0]
+    away = float(np.median(np.linalg.norm(at - place, axis=1)))
+    link = options.link + _SPACING * away
     cells, of = np.unique(np.floor(at / _CELL), axis=0, return_inverse=True)
-    one, other = cKDTree(cells).query_pairs(_LINK, output_type="ndarray").T
+    one, other = cKDTree(cells).query_pairs(link / _CELL, output_type="ndarray").T
     n = len(cells)
     graph = coo_matrix((np.ones(len(one), np.int8), (one, other)), (n, n))
     piece = connected_components(graph, directed=False)[1][of.ravel()]
@@ -314,7 +328,7 @@ def own_beams(
     )
     # a track of somebody may take hold of who stands beside
     near = (np.abs(at[:, :2]) <= half + options.margin).all(axis=1)
-    own[mine - beams.start] = near | (2.0 * thing.box.half[0] >= options.rigid)
+    own[mine - beams.start] = near | (options.together and 2.0 * thing.box.half[0] >= options.rigid)
     part = dataclasses.replace(
         seen,
         stamp_ns=seen.stamp_ns[scans],

@@ -18,15 +18,17 @@ class MoverOptions:
     )
     margin: float = field_with_doc(0.15, "m around a thing's box, within which beams are its own")
     low: float = field_with_doc(0.03, "m above the ground: what is lower is the ground's")
-    rigid: float = field_with_doc(
-        1.5, "m, things at least so long keep their shape: all that was seen of one is put together"
+    rigid: float = field_with_doc(1.5, "m, things at least so long keep their shape")
+    together: bool = field_with_doc(
+        False, "put together all that was seen of these, in place of what one look saw: slower"
     )
     blurred: float = field_with_doc(
         0.05, "m, by which what was seen of one then may lie off itself; else a moment of it counts"
     )
     fast: float = field_with_doc(
-        2.5, "m/s, what is faster is no person: what moves and hangs together with it is its own"
+        2.0, "m/s, what is faster is no person: what moves and hangs together with it is its own"
     )
+    link: float = field_with_doc(0.5, "m between parts of such a thing")
     sweep: float = field_with_doc(
         0.4, "s, in which a laser that tilts sees a thing: so long others keep their shape"
     )
@@ -39,6 +41,9 @@ class MoverOptions:
     )
     rim: float = field_with_doc(
         0.04, "m within a thing's outline in a picture, where it may show what is behind"
+    )
+    drift: float = field_with_doc(
+        0.1, "of the way it went from then to the picture, by which the outline may be off, too"
     )
     edge: float = field_with_doc(0.05, "m, longer edges are divided before they are painted")
     least: float = field_with_doc(0.03, "m2 of surface that a model has")
@@ -57,12 +62,14 @@ _LIMITS = (
     ("low", -10.0, 10.0),
     ("rigid", 0.0, 1000.0),
     ("blurred", 0.0, 1000.0),
+    ("link", 0.0, 1000.0),
     ("fast", 0.0, 1000.0),
     ("sweep", 1e-3, 1000.0),
     ("stretch", 1.0, 1000.0),
     ("longest", 0.0, 1000.0),
     ("near", 0.0, 1000.0),
     ("rim", 0.0, 10.0),
+    ("drift", 0.0, 100.0),
     ("edge", 0.005, 1000.0),
     ("least", 0.0, 1000.0),
     ("island", 0.0, 1000.0),

@@ -12,7 +12,7 @@ from stillmap.models.options import MoverOptions
 from stillmap.models.place import Painted, settled
 from stillmap.surface.dividing import divided
 from stillmap.surface.mesh import Mesh
-from stillmap.texture.choice import Candidates, utility
+from stillmap.texture.choice import NONE, Candidates, utility
 from stillmap.texture.choice_options import ChoiceOptions
 from stillmap.texture.lens import project, rays, within
 from stillmap.texture.options import VisibleOptions
@@ -24,6 +24,7 @@ Float = NDArray[np.float64]
 
 _BEHIND = 0.1  # m by which a surface may lie before a thing and be taken for its own
 _LEAST = 1e-9
+_SCRAPS = 0.05  # of its area: less is no picture of it
 _SMALL = 320.0  # pixels across in which it is seen what of the place hides a thing
 _EDGE = 16  # rays along an edge of a picture that tell what it holds
 _NO_FACES = np.zeros((0, 0), np.int32)
@@ -100,7 +101,8 @@ def dressed(
     """Chooses for each face of what moved the view that shows it best.
 
     A view may paint a face if the place does not hide it, if no other thing is likely to, and if it
-    lies within the thing's outline by `options.rim`: beside that it shows what is behind.
+    lies within the thing's outline by `options.rim`, and more with time: beside that it shows what
+    is behind.
 
     Args:
         shape: the thing.
@@ -120,10 +122,11 @@ def dressed(
         if np.isnan(now) or (not shape.rigid and away > options.near):
             continue
         T_map_object = shape.way.T_map_object(now)
+        rim = options.rim + options.drift * (0.0 if shape.rigid else _gone(shape, now))
         moved = replace(view, T_camera_map=view.T_camera_map @ T_map_object)
         found = visible(mesh, moved, limits)
         faces = np.flatnonzero(found.seen)
-        faces = faces[_inside(mesh, faces, moved, options.rim, limits)]
+        faces = faces[_inside(mesh, faces, moved, rim, limits)]
         if not len(faces):
             continue
         points = mesh.centres[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
@@ -137,7 +140,17 @@ def dressed(
         candidates.add(len(own), faces, good, 1.0 - hidden)
         sharpest.add(len(own), faces, pixels, 1.0 - hidden)
         own.append(moved)
-    return Dressed(settled(mesh, candidates, sharpest, choice.border), own)
+    painted = settled(mesh, candidates, sharpest, choice.border)
+    areas = mesh.areas()
+    if areas[painted.view >= 0].sum() < _SCRAPS * areas.sum():
+        painted = replace(painted, view=np.full_like(painted.view, NONE))
+    return Dressed(painted, own)
+
+
+def _gone(shape: Shape, seconds: float) -> float:
+    """Metres that a thing went from when its shape was seen to a time."""
+    there = shape.way.thing.box.middle(np.array([shape.seconds, seconds]))
+    return float(np.linalg.norm(there[1] - there[0]))
 
 
 def _inside(
