@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tables import Column, means_and_worst
+from tables import Column, markdown
 
 import stillmap
 from stillmap.errors import InputError
@@ -153,7 +153,9 @@ def main() -> None:
             {"case": way, **row(args.source, kept / f"result-{k}", (*args.set, *settings))}
             for k, (way, settings) in enumerate(ways)
         ]
-    print(means_and_worst(rows, COLUMNS))
+    header = ["pictures chosen", *(column.title for column in COLUMNS)]
+    lines = [[one["case"], *(c.mean_and_worst([one]) for c in COLUMNS)] for one in rows]
+    print(markdown(header, lines))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import base64
 import io
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,13 @@ def test_some_objects_are_enough(thing):
     assert [number for number, _ in stills.objects] == list(range(MOST_OBJECTS))
 
 
+def test_those_that_are_painted_most_come_first(thing):
+    bare = replace(thing, page=np.full_like(thing.page, -1))
+    large = replace(bare, vertices=2.0 * bare.vertices)
+    stills = stills_of(room(), None, turning(4), {1: bare, 2: large, 3: thing})
+    assert [number for number, _ in stills.objects] == [3, 2, 1]
+
+
 def test_the_pictures_lie_in_the_page(result, stills):
     page = report_html(result, stills=stills)
     assert "What it looks like" in page
@@ -103,8 +111,6 @@ def test_they_stay_small(stills):
 
     def noise(picture):
         return rng.integers(0, 255, picture.shape).astype(np.uint8)
-
-    from dataclasses import replace
 
     place = [
         replace(one, filtered=noise(one.filtered), sharpest=noise(one.filtered))

@@ -74,14 +74,14 @@ def stills_of(
     objects: Mapping[int, Textured],
     threads: int = 1,
 ) -> Stills:
-    """Two stills along the way, one from above, and three of each of the first objects.
+    """Two stills along the way, one from above, and three of each of the objects of which most is
+    painted.
 
     Args:
         filtered: the place, painted without its people.
         sharpest: the same, each face by its sharpest picture.
         T_camera_map: (N, 4, 4) of pictures that were taken on the way, in order.
-        objects: what moved, by number, x ahead and z up in its own frame, those first that are to
-            be shown.
+        objects: what moved, by number, x ahead and z up in its own frame.
         threads: the result does not depend on them.
     """
     areas, place = Mesh(filtered.vertices, filtered.faces).areas(), list[PlaceStill]()
@@ -99,12 +99,19 @@ def stills_of(
         along = _along(filtered, sharpest, T_camera_map, threads)
         place += [taken("where the robot looked", T, _WIDE, True) for T in along]
         place.append(taken("from above", _from_above(filtered), _NARROW, False))
-    shown = [(n, one) for n, one in objects.items() if len(one)]
+    worth = {n: _extent(one) for n, one in objects.items() if len(one)}
+    shown = sorted(worth, key=lambda n: worth[n], reverse=True)[:MOST_OBJECTS]
     return Stills(
         place,
-        [(n, object_stills(one, threads)) for n, one in shown[:MOST_OBJECTS]],
+        [(n, object_stills(objects[n], threads)) for n in shown],
         float(areas[filtered.page < 0].sum() / max(float(areas.sum()), 1e-12)),
     )
+
+
+def _extent(textured: Textured) -> tuple[float, float]:
+    """Square metres of a model that are painted, and all of them."""
+    areas = Mesh(textured.vertices, textured.faces).areas()
+    return float(areas[textured.page >= 0].sum()), float(areas.sum())
 
 
 def object_stills(textured: Textured, threads: int = 1) -> list[Picture]:
