@@ -234,7 +234,7 @@ class SignedDistances : public Blocks<3, Distances> {
  private:
   static constexpr double kMostVoxels = 64.0;
   static constexpr int64_t kMostBlocks = 1 << 20;  // around one triangle
-  static constexpr double kSmall = 16.0;            // voxels along an edge
+  static constexpr double kSmall = 16.0;           // voxels along an edge
   static constexpr float kWhole = -1.0f;
 
   static constexpr size_t kBatch = 1 << 13;  // triangles for each thread
