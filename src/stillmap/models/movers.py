@@ -7,18 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from stillmap.models.aligning import Sweep, aligned, spread
 from stillmap.models.frames import Way
-from stillmap.models.moments import Look, best_moment, between_beams
+from stillmap.models.moments import best_moment, between_beams
 from stillmap.models.options import MoverOptions
+from stillmap.models.own import SPACING, First, grown, look_of, own_beams
 from stillmap.models.sources import Sources
 from stillmap.objects import MovingObject
 from stillmap.recording.model import Recording
-from stillmap.recording.stamps import beam_ns
 from stillmap.surface.building import fused
 from stillmap.surface.extraction import without_islands
 from stillmap.surface.mesh import Mesh
@@ -28,15 +25,10 @@ from stillmap.texture.things import Thing
 
 Float = NDArray[np.float64]
 
-_DYNAMIC = 0.5
 _FINEST, _COARSEST = 0.025, 0.06  # m, edges of voxels
 _OF_SPACING = 0.7  # of how far beams lie apart
-_FAR = 1000.0  # m
 _AROUND = 0.03  # s, in which a scan sees the rest of a car
-_CAR = 6.0  # m, from one end of it to the other
 _MOSTLY = 0.1  # of what hangs together is of a track: else another one follows it
-_CELL = 0.2  # m, in which one point is enough
-_SPACING = 0.025  # rad between beams, at most
 _OFTEN = 0.9  # of the time something is not faster
 
 
@@ -85,19 +77,6 @@ class Piece(NamedTuple):
     def areas(self) -> Float:
         """(m,) square metres."""
         return Mesh(self.patch.points, self.patch.faces).areas()
-
-
-class First(NamedTuple):
-    """Where a part of a recording begins in it, and when its beams were taken.
-
-    Attributes:
-        scan, beam: numbers of its first ones.
-        seconds: (n,) of its beams, by the time of boxes.
-    """
-
-    scan: int
-    beam: int
-    seconds: Float
 
 
 def shape_of(
@@ -179,70 +158,21 @@ def _in_a_moment(
         beams = np.flatnonzero(then)
         mine = own.hit[beams]
         if fast:
-            whole = _grown(beams, mine, way, first, sources, options)
+            whole = grown(beams, mine, way, first, sources, options)
             if mine.sum() < _MOSTLY * whole.sum():
                 continue
             mine = whole
             span = float(first.seconds[beams[mine]].min()), float(first.seconds[beams[mine]].max())
-        looks = [_look(some, way, first, sources) for some in (beams[mine], beams[~mine])]
+        looks = [look_of(some, way, first, sources) for some in (beams[mine], beams[~mine])]
         stretch, longest = options.stretch, options.longest
         if fast:  # its sides are seen at flat angles
             away = np.linalg.norm(looks[0].points - looks[0].origin, axis=1)
-            stretch, longest = np.inf, max(longest, _SPACING * float(np.median(away)))
+            stretch, longest = np.inf, max(longest, SPACING * float(np.median(away)))
         mesh = between_beams(looks[0], looks[1], stretch, longest)
         mesh = without_islands(mesh, options.island)
         if mesh.areas().sum() >= options.least:
             return Shape(id, mesh, way, False, 0.5 * (span[0] + span[1]), span)
     return None
-
-
-def _grown(
-    beams: NDArray[np.intp],
-    mine: NDArray[np.bool_],
-    way: Way,
-    first: First,
-    sources: Sources,
-    options: MoverOptions,
-) -> NDArray[np.bool_]:
-    """(n,) which beams met a thing that is faster than people: all that move, and hang together.
-
-    Parts of a car are often followed each on its own.
-    """
-    number = first.beam + beams
-    moves = np.flatnonzero(sources.seen.hit[number] & (sources.p_static[number] < _DYNAMIC))
-    at = way.local(
-        first.seconds[beams[moves]], sources.seen.end_points(number[moves], sources.poses)
-    )
-    some = (at[:, 2] > options.low) & (np.linalg.norm(at[:, :2], axis=1) <= _CAR)
-    moves, at = moves[some], at[some]
-    if not len(moves):
-        return mine
-    place = _look(beams[:1], way, first, sources).origin[0]
-    away = float(np.median(np.linalg.norm(at - place, axis=1)))
-    link = options.link + _SPACING * away
-    cells, of = np.unique(np.floor(at / _CELL), axis=0, return_inverse=True)
-    one, other = cKDTree(cells).query_pairs(link / _CELL, output_type="ndarray").T
-    n = len(cells)
-    graph = coo_matrix((np.ones(len(one), np.int8), (one, other)), (n, n))
-    piece = connected_components(graph, directed=False)[1][of.ravel()]
-    out = mine.copy()
-    out[moves[np.isin(piece, piece[mine[moves]])]] = True
-    return out
-
-
-def _look(beams: NDArray[np.intp], way: Way, first: First, sources: Sources) -> Look:
-    """Beams in a thing's own frame; those that came back from nowhere go on for a kilometre."""
-    seen, number = sources.seen, first.beam + beams
-    ends = seen.end_points(number, sources.poses)
-    scan = seen.scans_of(number)
-    T = sources.poses[scan] @ seen.T_base_sensor[seen.sensor[scan]]
-    origin = T[:, :3, 3]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        far = origin + (ends - origin) * (
-            _FAR / np.linalg.norm(ends - origin, axis=1, keepdims=True)
-        )
-    ends = np.where(seen.hit[number][:, None], ends, far)
-    return Look.of(ends, origin, first.seconds[beams], way)
 
 
 def voxel_for(pieces: Sequence[Piece]) -> float:
@@ -294,54 +224,6 @@ def _used(patch: Patch, weight: Float, seconds: Float) -> Piece:
         patch.standoff[used],
     )
     return Piece(patch, weight.astype(np.float32), seconds[used])
-
-
-def own_beams(
-    one: MovingObject, thing: Thing, sources: Sources, options: MoverOptions
-) -> tuple[Recording, First]:
-    """The scans that saw a thing, in which only what ended on it is a hit.
-
-    That is what is rather dynamic than static, in the box around it, and of no other thing.
-    """
-    seen, box = sources.seen, thing.box
-    stamps = 1e-9 * (seen.stamp_ns - sources.start_ns)
-    a = int(np.searchsorted(stamps, box.seconds[0] - box.hold))
-    b = max(int(np.searchsorted(stamps, box.seconds[-1] + box.hold, side="right")), a)
-    scans, beams = slice(a, b), slice(int(seen.offset[a]), int(seen.offset[b]))
-    seconds = np.asarray(1e-9 * (beam_ns(sources.recording, scans) - sources.start_ns), np.float64)
-    own = np.zeros(beams.stop - beams.start, np.bool_)
-    moves = np.flatnonzero(seen.hit[beams] & (sources.p_static[beams] < _DYNAMIC))
-    ends = seen.end_points(beams.start + moves, sources.poses)
-    at = Way.of_track(thing).local(seconds[moves], ends)
-    half = np.array(box.half) + options.margin
-    inside = (np.abs(at[:, :2]) <= half).all(axis=1)
-    inside &= (at[:, 2] > options.low) & (at[:, 2] <= thing.tall + options.margin)
-    own[moves[inside]] = True
-    for other in sources.objects:
-        if other.id != one.id:
-            theirs = other.beams[np.searchsorted(other.beams, beams.start) :]
-            theirs = theirs[: np.searchsorted(theirs, beams.stop)]
-            own[theirs - beams.start] = False
-    mine = one.beams[(one.beams >= beams.start) & (one.beams < beams.stop)]
-    at = Way.of_track(thing).local(
-        seconds[mine - beams.start], seen.end_points(mine, sources.poses)
-    )
-    # a track of somebody may take hold of who stands beside
-    near = (np.abs(at[:, :2]) <= half + options.margin).all(axis=1)
-    own[mine - beams.start] = near | (options.together and 2.0 * thing.box.half[0] >= options.rigid)
-    part = dataclasses.replace(
-        seen,
-        stamp_ns=seen.stamp_ns[scans],
-        offset=seen.offset[a : b + 1] - seen.offset[a],
-        points=np.asarray(seen.points[beams]),
-        hit=own,
-        sensor=seen.sensor[scans],
-        T_odom_base=None,
-        T_recorded_base=None,
-        beam_time=None,
-        images=None,
-    )
-    return part, First(a, beams.start, seconds)
 
 
 def _laid_over(pieces: Sequence[Piece], way: Way, blurred: float) -> Way | None:
