@@ -64,14 +64,18 @@ def picture(width=64, height=48, focal=50.0):
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
-def nodding(T=60, beams=61, amplitude=0.6, period=40):
-    """(T, n, 3) directions of a planar laser that nods evenly."""
-    fan = towards(np.linspace(-1.4, 1.4, beams), np.zeros(beams))
+def nods(T=60, amplitude=0.6, period=40):
+    """(T, 3, 3) how a laser is turned that nods evenly."""
     share = (np.arange(T) / period + 0.25) % 1.0
     tilt = amplitude * (1.0 - 4.0 * np.abs(share - 0.5))
     c, s, o, i = np.cos(tilt), np.sin(tilt), np.zeros(T), np.ones(T)
-    R = np.stack([c, o, s, o, i, o, -s, o, c], axis=-1).reshape(T, 3, 3)
-    return np.einsum("tij,nj->tni", R, fan)
+    return np.stack([c, o, s, o, i, o, -s, o, c], axis=-1).reshape(T, 3, 3)
+
+
+def nodding(T=60, beams=61):
+    """(T, n, 3) directions of a planar laser that nods."""
+    fan = towards(np.linspace(-1.4, 1.4, beams), np.zeros(beams))
+    return np.einsum("tij,nj->tni", nods(T), fan)
 
 
 def standing(T=1, *places):
@@ -90,5 +94,5 @@ def off_walls(points):
 @pytest.fixture(scope="session")
 def room():
     """What makes recordings."""
-    parts = (lidar, nodding, off_walls, picture, scans, standing, towards)
+    parts = (lidar, nodding, nods, off_walls, picture, scans, standing, towards)
     return SimpleNamespace(**{one.__name__: one for one in parts}, corners=ROOM)

@@ -1,9 +1,12 @@
 """Polygons of range images: how sensors look about, and which triangles are surface."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from stillmap.surface import rows
+from stillmap.surface.mesh import Mesh
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import order_of, patches_of
 from stillmap.surface.strips import rows_of
@@ -115,6 +118,26 @@ def test_scans_of_a_nodding_laser_are_rows_while_the_robot_drives(room):
     scan = patch.beam[patch.faces] // 61
     assert np.ptp(scan, axis=1).max() <= 2  # where it turns round, a row may be left out
     np.testing.assert_allclose(patch.origin[:, 0], 0.01 * (patch.beam // 61), atol=1e-12)
+
+
+def test_the_joint_may_be_told_by_where_the_laser_sits(room):
+    """As in bags: each scan is of a sensor of its own."""
+    poses = room.standing(60)
+    turned = room.scans(room.nodding(), poses)
+    R = np.tile(np.eye(4), (60, 1, 1))
+    R[:, :3, :3] = room.nods(60)
+    points = np.einsum("tji,tnj->tni", R[:, :3, :3], turned.points.reshape(60, -1, 3))
+    told = dataclasses.replace(
+        turned,
+        points=points.reshape(-1, 3).astype(np.float32),
+        T_base_sensor=R,
+        sensor=np.arange(60, dtype=np.int32),
+    )
+    _, (one,) = patches(turned, poses)
+    _, (other,) = patches(told, poses)
+    assert looks_back(other).all()
+    areas = [Mesh(patch.points, patch.faces).areas().sum() for patch in (one, other)]
+    assert areas[1] == pytest.approx(areas[0], rel=0.01)  # rounding chooses between diagonals
 
 
 def test_no_triangle_spans_a_pause(room):

@@ -85,8 +85,11 @@ def order_of(seen: Recording, chosen: Index, o: SurfaceOptions) -> Order:
 def _sequences(seen: Recording, pause: float) -> list[Index]:
     """Planar scans that follow one another, each sequence beginning where the last one ended."""
     out = []
-    for sensor in np.unique(seen.sensor):
-        scans = np.flatnonzero((seen.sensor == sensor) & (np.diff(seen.offset) > 0))
+    # a laser on a joint may count as another sensor at each scan, where it sits otherwise
+    once = np.bincount(seen.sensor, minlength=len(seen.T_base_sensor)) == 1
+    of_sensor = np.where(once[seen.sensor], np.int32(-1), seen.sensor)
+    for sensor in np.unique(of_sensor):
+        scans = np.flatnonzero((of_sensor == sensor) & (np.diff(seen.offset) > 0))
         ends = np.flatnonzero(np.diff(seen.stamp_ns[scans]) > pause * 1e9) + 1
         for part in np.split(scans, ends):
             for first in range(0, max(len(part) - 1, 0), _ROWS):
@@ -136,6 +139,8 @@ def _patch(
     points[~use] = 0.0  # nothing is made of these
     looking = rows.directions(local)
     if order.planar:
+        turned = seen.T_base_sensor[seen.sensor[scans], :3, :3]
+        looking = np.einsum("nij,nj->ni", turned[scan], looking)
         number = np.arange(len(beam), dtype=np.int32).reshape(len(scans), -1)
         faces = _between_rows(points, use, number, looking)
     else:

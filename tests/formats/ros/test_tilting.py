@@ -18,7 +18,7 @@ from stillmap.simulation.lidar import joint_angle
 NOD = {"tilts": True, "period": 2.0}
 JOINT_NS = 5_000_000  # from one transform of the joint to the next; turns happen at some of them
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
-QUICK += ("--set", "mesh.enabled=false")
+
 TILT = ReadOptions(topic="tilt_scan", base_frame="base_link")
 
 
@@ -151,6 +151,7 @@ def test_what_the_map_command_makes_of_it(rig, path, tmp_path):
     record = json.loads((out / "run.json").read_text())
     assert record["tilting"]["input"]["path"] == str(path)
     assert record["options"]["read"]["tilting_topic"] == "/tilt_scan"
+    assert record["models"]["area"] > 100.0  # m2: floor, walls and ceiling
 
 
 def test_clouds_of_points_are_taken_as_they_are(rig, tmp_path):
