@@ -117,7 +117,8 @@ def _bar(iterations: int) -> "Iterator[Progress]":
                 counted = f"{done}/{total}"
                 if shown.of_scans:
                     counted += f" scans {shown.rate(done):.0f}/s"
-                bar.update(task, completed=done, counted=counted)
+                # however short it was: what is done is seen
+                bar.update(task, completed=done, counted=counted, refresh=done == total)
 
         yield progress
 
