@@ -197,8 +197,8 @@ def pieces_of(
         surface: see SurfaceOptions.
     """
     poses = sources.poses[first.scan : first.scan + own.n_scans]
-    counts = np.add.reduceat(own.hit, own.offset[:-1]) * (np.diff(own.offset) > 0)
-    order = order_of(own, np.flatnonzero(counts), surface)
+    met = np.unique(own.scans_of(np.flatnonzero(own.hit)))
+    order = order_of(own, met, surface)
     for make in patches_of(own, poses, order, surface):
         patch = make()
         dynamic = 1.0 - sources.p_static[first.beam + patch.beam].astype(np.float64)

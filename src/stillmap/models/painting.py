@@ -18,7 +18,7 @@ from stillmap.texture.lens import project, rays, within
 from stillmap.texture.options import VisibleOptions
 from stillmap.texture.things import Thing, at_time, in_the_way
 from stillmap.texture.view import View
-from stillmap.texture.visible import Depths, depths_of, visible
+from stillmap.texture.visible import Depths, depths_of, ideal, visible
 
 Float = NDArray[np.float64]
 
@@ -170,6 +170,6 @@ def _inside(
 def _looked_up(values: NDArray[np.floating], depths: Depths, at: Float) -> Float:
     """(...,) what an image (h, w) has where points (..., 3) of the camera's frame are seen."""
     h, w = values.shape
-    column = np.rint(depths.K[0, 0] * at[..., 0] / at[..., 2] + depths.K[0, 2]).astype(np.intp)
-    row = np.rint(depths.K[1, 1] * at[..., 1] / at[..., 2] + depths.K[1, 2]).astype(np.intp)
-    return np.asarray(values[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)], np.float64)
+    column, row = (np.rint(a).astype(np.intp) for a in ideal(depths.K, at.reshape(-1, 3).T))
+    found = values[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
+    return np.asarray(found.reshape(at.shape[:-1]), np.float64)

@@ -122,7 +122,7 @@ def depths_of(
     """
     assert view.camera.K is not None
     K = scaled(_upright(view.camera.K), scale)
-    at = np.column_stack(_ideal(K, shown.T))
+    at = np.column_stack(ideal(K, shown.T))
     # wide lenses: what is 80 degrees aside is six times as far out as what is 45 degrees aside
     most = 2.0 * scale * np.array([view.camera.width, view.camera.height])
     middle = K[:2, 2]
@@ -163,7 +163,7 @@ def _upright(K: Float) -> Float:
     return np.array([[K[0, 0], K[0, 1], K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
 
 
-def _ideal(K: Float, points: Float) -> tuple[Float, Float]:
+def ideal(K: Float, points: Float) -> tuple[Float, Float]:
     """(n,) columns and rows of points (3, n) ahead of an ideal camera."""
     x, y = points[0] / points[2], points[1] / points[2]
     return K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]
@@ -259,7 +259,7 @@ def _samples(
 
     The finer, the larger they are: `options.spacing` pixels apart along the longest edge.
     """
-    uv = [_ideal(depths.K, corner) for corner in corners]
+    uv = [ideal(depths.K, corner) for corner in corners]
     edges = [np.hypot(uv[k][0] - uv[k - 1][0], uv[k][1] - uv[k - 1][1]) for k in range(3)]
     edge = np.maximum(np.maximum(edges[0], edges[1]), edges[2])
     halvings = np.ceil(np.log2(np.maximum(edge / options.spacing, 1.0)))
@@ -282,7 +282,7 @@ def _passes(
     Within its pixel a face may be nearer by the slope of depth along rows and columns.
     """
     h, w = around.shape
-    u, v = (np.rint(a).astype(np.int64) for a in _ideal(depths.K, points))
+    u, v = (np.rint(a).astype(np.int64) for a in ideal(depths.K, points))
     inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
     at = np.clip(v, 0, h - 1) * w + np.clip(u, 0, w - 1)
     z = points[2]
