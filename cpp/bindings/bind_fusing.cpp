@@ -52,6 +52,13 @@ auto blocks(const SignedDistances& distances) {
   return owned(std::move(out), {n, 3});
 }
 
+void forget(SignedDistances& distances, const Cells<3>& cells) {
+  std::vector<Cell<3>> gone(cells.shape(0));
+  for (size_t k = 0; k < gone.size(); ++k) gone[k] = cell_from<3>(cells, k);
+  nb::gil_scoped_release released;
+  distances.forget(gone);
+}
+
 // The voxels of a block within a box, x by x.
 template <class Visit>
 void each_within(const SignedDistances::Block& block, const Box<3>& box, Visit&& visit) {
@@ -120,6 +127,8 @@ void bind_fusing(nb::module_& m) {
            "(n,) metres from there to the surface's tangent plane at the point. Faces that are "
            "seen edge on, or whose standoff is not positive, tell nothing.")
       .def("blocks", &blocks, "(B, 3) int64, in blocks: those that were met, in their order.")
+      .def("forget", &forget, nb::arg("blocks").noconvert(),
+           "Voxels of these blocks (B, 3) int64 are as if never met, and their memory is free.")
       .def("dense", &dense, nb::arg("first_cell"), nb::arg("shape"),
            "float32 arrays [z, y, x] over a box of voxels: metres in front of the surface, NaN "
            "where nothing tells, and the sum of weights.");

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from stillmap.surface import building
 from stillmap.surface.building import chosen_scans, fused, static_weights, surface_of
+from stillmap.surface.extraction import without_islands
 from stillmap.surface.mesh import Mesh
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import Patch, order_of, patches_of
@@ -182,8 +182,8 @@ def test_islands_are_dropped():
     mesh = Mesh(
         np.concatenate([triangle, 5 + 0.1 * triangle]), np.arange(6, dtype=np.int32).reshape(2, 3)
     )
-    assert len(building.without_islands(mesh, 0.01)) == 1
-    assert len(building.without_islands(mesh, 0.001)) == 2
+    assert len(without_islands(mesh, 0.01)) == 1
+    assert len(without_islands(mesh, 0.001)) == 2
 
 
 @pytest.mark.parametrize("bad", [{"voxel": 0.0}, {"least": 1.5}, {"looks": 0}, {"faces": 1}])

@@ -4,6 +4,7 @@
 #include <array>
 #include <memory>
 #include <unordered_map>
+#include <utility>
 #include <vector>
 
 #include "stillmap/grid.hpp"
@@ -47,6 +48,24 @@ class Blocks {
     }
     last_ = blocks_[it->second].get();
     return last_;
+  }
+
+  // Keeps the blocks that keep(block coordinates) says, in their order.
+  template <class Keep>
+  void keep_if(Keep&& keep) {
+    last_ = nullptr;
+    size_t kept = 0;
+    for (size_t k = 0; k < blocks_.size(); ++k) {
+      const uint64_t key = G::key(blocks_[k]->origin);
+      if (!keep(blocks_[k]->origin)) {
+        index_.erase(key);
+        continue;
+      }
+      index_[key] = kept;
+      if (kept != k) blocks_[kept] = std::move(blocks_[k]);
+      ++kept;
+    }
+    blocks_.resize(kept);
   }
 
  private:

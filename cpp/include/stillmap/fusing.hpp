@@ -11,6 +11,7 @@
 #include <cstdint>
 #include <limits>
 #include <stdexcept>
+#include <unordered_set>
 #include <utility>
 #include <vector>
 
@@ -214,6 +215,13 @@ class SignedDistances : public Blocks<3, Distances> {
   double behind() const { return behind_; }
 
   size_t memory_bytes() const { return blocks().size() * (sizeof(Block) + 64); }
+
+  // Voxels of these blocks are as if never met.
+  void forget(const std::vector<Cell<3>>& blocks) {
+    std::unordered_set<uint64_t, Grid<3>::Hash> gone;
+    for (const Cell<3>& block : blocks) gone.insert(Grid<3>::key(block));
+    keep_if([&](const Cell<3>& block) { return gone.find(Grid<3>::key(block)) == gone.end(); });
+  }
 
   // In batches, so that what waits to be summed stays small.
   void add(const Triangles& triangles, int threads) {

@@ -63,6 +63,13 @@ class SignedDistances:
         cells = np.array(list(self._sums), np.int64).reshape(-1, 3)
         return np.unique(cells // self.edge, axis=0)
 
+    def forget(self, blocks: NDArray[np.int64]) -> None:
+        """See the core's."""
+        gone = {tuple(block) for block in blocks.tolist()}
+        for cell in list(self._sums):
+            if tuple(c // self.edge for c in cell) in gone:
+                del self._sums[cell]
+
     def dense(
         self, first_cell: list[int], shape: list[int]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from stillmap import _core
 from stillmap.recording.model import Recording
-from stillmap.surface.extraction import extracted, joined_whole, tiles_of, without_islands
+from stillmap.surface.growing import Growing, Reach, reach_of
 from stillmap.surface.mesh import Mesh
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import Patch, order_of, patches_of
 from stillmap.surface.resolution import resolution_of
-from stillmap.surface.thinning import thinned, within_budget
 from stillmap.threads import in_order
 
 Float = NDArray[np.float64]
@@ -63,7 +62,7 @@ def surface_of(
                 tell(done, 2 * n)
 
     later = partial(_second_half, tell, n) if tell else None
-    return fused(each(), voxel, options, threads, later)
+    return fused(each(), voxel, options, threads, later, reach_of(seen, poses, order))
 
 
 def _second_half(tell: Tell, n: int, done: int, total: int) -> None:
@@ -76,6 +75,7 @@ def fused(
     options: SurfaceOptions,
     threads: int = 1,
     tell: Tell | None = None,
+    reach: Reach | None = None,
 ) -> Mesh:
     """One surface of many patches, in the frame of their points.
 
@@ -85,33 +85,17 @@ def fused(
         options: see SurfaceOptions.
         threads: same result with any number.
         tell: called with what is done and what there is to do, once the patches are through.
+        reach: how far patches go; without it all voxels are kept to the end.
     """
-    parts = _in_tiles(patches, voxel, options, threads, tell)
-    whole = without_islands(joined_whole(parts), options.island)
-    return within_budget(thinned(whole, options.error), options.error, options.faces)
-
-
-def _in_tiles(
-    patches: Iterable[tuple[Patch, NDArray[np.float32]]],
-    voxel: float,
-    o: SurfaceOptions,
-    threads: int,
-    tell: Tell | None,
-) -> list[Mesh]:
-    """The surface tile by tile, thinned out; the voxels are gone."""
-    distances = _core.SignedDistances(voxel, before=o.before * voxel, behind=o.behind * voxel)
-    for patch, weight in patches:
-        distances.add(
+    before, behind = options.before * voxel, options.behind * voxel
+    growing = Growing(_core.SignedDistances(voxel, before=before, behind=behind), options)
+    for done, (patch, weight) in enumerate(patches, start=1):
+        growing.distances.add(
             patch.points, patch.origin, patch.standoff, patch.faces, weight, threads=threads
         )
-    thin = partial(thinned, error=o.error)
-    parts, total = [], len(tiles_of(distances))
-    for done, part in enumerate(extracted(distances, o.fewest, thin), start=1):
-        if part is not None:
-            parts.append(part)
-        if tell:
-            tell(done, total)
-    return parts
+        if reach is not None and growing.is_large():
+            growing.let_go(reach, done)
+    return growing.finished(tell)
 
 
 def static_weights(

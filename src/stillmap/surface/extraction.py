@@ -1,6 +1,6 @@
 """Meshes from signed distances: marching cubes, tile by tile, welded."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,8 +20,12 @@ _LEAP = 2.5  # voxels by which distances differ within a cube where there are tw
 
 def tiles_of(distances: _core.SignedDistances) -> NDArray[np.int64]:
     """(N, 3) tiles in which something is known, in the order of their numbers."""
-    blocks = distances.blocks()
-    return np.unique(blocks // (TILE // distances.edge), axis=0)
+    return np.unique(distances.blocks() // blocks_along(distances), axis=0)
+
+
+def blocks_along(distances: _core.SignedDistances) -> int:
+    """Blocks along the edge of a tile."""
+    return TILE // distances.edge
 
 
 def meshed(distances: _core.SignedDistances, tile: NDArray[np.int64], fewest: float) -> Mesh:
@@ -66,21 +70,10 @@ def _of_cubes(
     return values
 
 
-def extracted(
-    distances: _core.SignedDistances, fewest: float, thin: Callable[[Mesh], Mesh]
-) -> Iterator[Mesh | None]:
-    """The surface, tile by tile; None for tiles without, in metres.
-
-    Args:
-        distances: signed distances.
-        fewest: weight that a voxel needs.
-        thin: what makes fewer triangles of many, and leaves their border.
-    """
-    for tile in tiles_of(distances):
-        mesh = meshed(distances, tile, fewest)
-        if len(mesh):
-            mesh = thin(_in_metres(welded(mesh), distances.voxel))
-        yield mesh if len(mesh) else None
+def extracted(distances: _core.SignedDistances, tile: NDArray[np.int64], fewest: float) -> Mesh:
+    """The surface within one tile, in metres; see `meshed`."""
+    mesh = meshed(distances, tile, fewest)
+    return _in_metres(welded(mesh), distances.voxel) if len(mesh) else mesh
 
 
 def _in_metres(mesh: Mesh, voxel: float) -> Mesh:

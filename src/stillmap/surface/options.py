@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 from stillmap.options import field_with_doc
 
+_EXACT, _SHARE = 0.01, 0.25  # m, and of a voxel's edge, that a surface may be moved by
+
 
 @dataclass(frozen=True)
 class SurfaceOptions:
@@ -33,7 +35,9 @@ class SurfaceOptions:
     looks: int = field_with_doc(2, "scans from one place that are used")
     fewest: float = field_with_doc(0.0, "triangles that a voxel must be of, by their weights")
     island: float = field_with_doc(0.05, "m2, smaller pieces are left out")
-    error: float = field_with_doc(0.01, "m that thinning out may move the surface by")
+    error: float | None = field_with_doc(
+        None, "m that thinning out may move the surface by; not set: by the voxel's edge"
+    )
     faces: int = field_with_doc(200_000, "triangles at most, whatever the error")
 
     def __post_init__(self) -> None:
@@ -41,6 +45,10 @@ class SurfaceOptions:
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise ValueError(f"'mesh.surface.{name}' wants {low:g} to {high:g}")
+
+    def error_for(self, voxel: float) -> float:
+        """Metres that thinning out may move a surface by of voxels with this edge in metres."""
+        return max(_EXACT, _SHARE * voxel) if self.error is None else self.error
 
 
 _LIMITS = (

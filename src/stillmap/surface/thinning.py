@@ -12,6 +12,7 @@ _GROWTH = 3.0  # with this power
 _FIRST = 3.0  # the round with which it begins
 _AGAIN = 4.0  # times as much error is allowed next, while there are too many triangles
 _MOST = 12  # times
+_LITTLE = 0.9  # of the triangles left: more error does not help
 
 
 def thinned(mesh: Mesh, error: float, *, whole_border: bool = True, most: int = 0) -> Mesh:
@@ -44,11 +45,16 @@ def thinned(mesh: Mesh, error: float, *, whole_border: bool = True, most: int = 
     return Mesh(np.array(vertices, np.float64), np.array(faces, np.int32).reshape(-1, 3))
 
 
-def within_budget(mesh: Mesh, error: float, most: int) -> Mesh:
-    """The mesh with so many triangles at most, whatever the error; borders go last."""
+def within_budget(mesh: Mesh, error: float, most: int, *, whole_border: bool = False) -> Mesh:
+    """The mesh with so many triangles at most, whatever the error; borders go last.
+
+    With `whole_border` they stay, and there may be more triangles.
+    """
     for _ in range(_MOST):
         if len(mesh) <= most:
             break
         error *= _AGAIN
-        mesh = thinned(mesh, error, most=most)
-    return thinned(mesh, error, whole_border=False, most=most)
+        before, mesh = len(mesh), thinned(mesh, error, most=most)
+        if whole_border and len(mesh) > _LITTLE * before:
+            break
+    return mesh if whole_border else thinned(mesh, error, whole_border=False, most=most)
