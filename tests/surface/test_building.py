@@ -9,6 +9,7 @@ from stillmap.surface.extraction import without_islands
 from stillmap.surface.mesh import Mesh
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import Patch, order_of, patches_of
+from stillmap.surface.reach import reach_of
 from stillmap.surface.resolution import resolution_of
 
 OPTIONS = SurfaceOptions(voxel=0.1, longest_share=1.0)
@@ -195,6 +196,10 @@ def test_options_are_checked(bad):
 FREE = SurfaceOptions(longest_share=1.0)
 
 
+def resolved(recording, poses, order, options):
+    return resolution_of(recording, poses, order, reach_of(recording, poses, order), options)
+
+
 @pytest.mark.parametrize(
     ("made", "noise", "low", "high"),
     [((720, 80), 0.002, 0.02, 0.05), ((180, 20), 0.002, 0.07, 0.15), ((720, 80), 0.05, 0.06, 0.15)],
@@ -202,22 +207,22 @@ FREE = SurfaceOptions(longest_share=1.0)
 def test_voxels_are_as_fine_as_beams_tell(room, made, noise, low, high):
     recording = room.scans(room.lidar(*made), room.standing(2), noise=noise)
     order = order_of(recording, np.arange(2), FREE)
-    voxel, _ = resolution_of(recording, room.standing(2), order, FREE)
+    voxel, _ = resolved(recording, room.standing(2), order, FREE)
     assert low < voxel < high
 
 
 def test_voxels_fit_into_memory(room, monkeypatch):
     recording = room.scans(room.lidar(720, 80), room.standing(2))
     order = order_of(recording, np.arange(2), FREE)
-    fine, _ = resolution_of(recording, room.standing(2), order, FREE)
+    fine, _ = resolved(recording, room.standing(2), order, FREE)
     monkeypatch.setattr("stillmap.surface.resolution._MEMORY", 1e5)
-    assert resolution_of(recording, room.standing(2), order, FREE)[0] > 2 * fine
+    assert resolved(recording, room.standing(2), order, FREE)[0] > 2 * fine
 
 
 def test_pictures_finer_than_voxels_are_thinned(room):
     recording = room.scans(room.picture(320, 240, 240.0), room.standing())
     order = order_of(recording, np.arange(1), OPTIONS)
-    voxel, stride = resolution_of(recording, room.standing(), order, OPTIONS)
+    voxel, stride = resolved(recording, room.standing(), order, OPTIONS)
     assert voxel == 0.1
     assert 3 <= stride <= 4
     thin = order._replace(stride=stride)

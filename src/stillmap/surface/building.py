@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from stillmap import _core
 from stillmap.recording.model import Recording
-from stillmap.surface.growing import Growing, Reach, reach_of
+from stillmap.surface.growing import Growing
 from stillmap.surface.mesh import Mesh
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import Patch, order_of, patches_of
+from stillmap.surface.reach import Reach, reach_of
 from stillmap.surface.resolution import resolution_of
 from stillmap.threads import in_order
 
@@ -45,7 +46,8 @@ def surface_of(
     T = seen.T_map_sensor(poses)
     chosen = chosen_scans(T, seen.sensor, usual_range(seen), options)
     order = order_of(seen, chosen, options)
-    voxel, stride = resolution_of(seen, poses, order, options)
+    reach = reach_of(seen, poses, order)
+    voxel, stride = resolution_of(seen, poses, order, reach, options)
     order = order._replace(stride=stride)
     n, done = len(order.groups), 0
 
@@ -62,7 +64,7 @@ def surface_of(
                 tell(done, 2 * n)
 
     later = partial(_second_half, tell, n) if tell else None
-    return fused(each(), voxel, options, threads, later, reach_of(seen, poses, order))
+    return fused(each(), voxel, options, threads, later, reach)
 
 
 def _second_half(tell: Tell, n: int, done: int, total: int) -> None:

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from stillmap.recording.model import Recording
 from stillmap.surface.options import SurfaceOptions
 from stillmap.surface.patches import Order, Patch, patches_of
+from stillmap.surface.reach import Reach
 from stillmap.surface.triangles import noise_of
 
 Float = NDArray[np.float64]
@@ -14,15 +15,16 @@ _ASKED = 8  # patches
 _FINEST, _COARSEST = 0.02, 0.2  # m; what depth cameras see in a room is no more exact
 _NOISES = 2.5  # standard deviations of ranges that a voxel is wide, at least
 _NEAR = 0.75  # voxels between rows that are used, at most
-_MEMORY = 0.75e9  # bytes for all voxels
+_MEMORY = 0.75e9  # bytes for the voxels about the sensor
 _CELL = 0.5  # m, of squares by which the area is measured
 _BEAMS = 200_000  # by which it is
+_PLACES = 32  # where the sensor was
 _LAYERS = 2.5  # blocks behind each other across a surface
 _EDGE, _BLOCK = 8, 4200  # voxels along a block, and its bytes
 
 
 def resolution_of(
-    seen: Recording, poses: Float, order: Order, o: SurfaceOptions
+    seen: Recording, poses: Float, order: Order, reach: Reach, o: SurfaceOptions
 ) -> tuple[float, int]:
     """m, the edge of a voxel, and of how many rows and columns of pictures one is enough.
 
@@ -34,6 +36,7 @@ def resolution_of(
         seen: 3D, without motion during its scans.
         poses: (T, 4, 4) T_map_base.
         order: see `order_of`.
+        reach: of the patches, see `reach_of`.
         o: see SurfaceOptions.
     """
     groups = order.groups
@@ -46,7 +49,7 @@ def resolution_of(
     apart = float(np.median([spacing(one) for one in parts]))
     noise = float(np.median([range_noise(one) for one in parts]))
     wanted = float(np.clip(max(apart, _NOISES * noise), _FINEST, _COARSEST))
-    voxel = o.voxel or max(wanted, least_voxel(seen, poses))
+    voxel = o.voxel or max(wanted, least_voxel(seen, poses, reach))
     return voxel, max(int(_NEAR * voxel / apart), 1) if apart > 0.0 else 1
 
 
@@ -63,11 +66,20 @@ def range_noise(patch: Patch) -> float:
     return noise_of(np.linalg.norm(patch.points - patch.origin, axis=1), patch.faces)
 
 
-def least_voxel(seen: Recording, poses: Float) -> float:
-    """m, the edge of voxels that fit into memory, by the cells in which beams end."""
+def least_voxel(seen: Recording, poses: Float, reach: Reach) -> float:
+    """m, the edge of voxels that fit into memory, by the cells in which beams end.
+
+    Those count that are as near to where the sensor is at some time as it sees: voxels farther
+    away are triangles by then.
+    """
     beams = np.arange(0, seen.n_beams, max(seen.n_beams // _BEAMS, 1))
     beams = beams[seen.hit[beams]]
     ends = seen.end_points(beams, poses)
-    cells = np.unique(np.floor(ends[np.isfinite(ends).all(axis=1)] / _CELL), axis=0)
-    bytes_of_one = _LAYERS * _BLOCK * len(cells) * (_CELL / _EDGE) ** 2
+    cells = np.unique(np.floor(ends[np.isfinite(ends).all(axis=1)] / _CELL), axis=0) * _CELL
+    asked = np.unique(np.linspace(0, len(reach.place) - 1, _PLACES).astype(np.intp))
+    most = max(
+        int(np.count_nonzero(np.linalg.norm(cells - place, axis=1) <= reach.range.max()))
+        for place in reach.place[asked]
+    )
+    bytes_of_one = _LAYERS * _BLOCK * most * (_CELL / _EDGE) ** 2
     return float(np.sqrt(bytes_of_one / _MEMORY))

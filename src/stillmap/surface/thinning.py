@@ -7,11 +7,11 @@ import numpy as np
 from stillmap.extras import extra
 from stillmap.surface.mesh import Mesh
 
-_ROUNDS = 40  # in which the error that is let pass grows to what is allowed
+_ROUNDS = 20  # in which the error that is let pass grows to what is allowed
 _GROWTH = 3.0  # with this power
 _FIRST = 3.0  # the round with which it begins
-_AGAIN = 4.0  # times as much error is allowed next, while there are too many triangles
-_MOST = 12  # times
+_AGAIN = 2.0  # times as much error is allowed next, while there are too many triangles
+_MOST = 24  # times
 _LITTLE = 0.9  # of the triangles left: more error does not help
 
 
@@ -51,10 +51,14 @@ def within_budget(mesh: Mesh, error: float, most: int, *, whole_border: bool = F
     With `whole_border` they stay, and there may be more triangles.
     """
     for _ in range(_MOST):
-        if len(mesh) <= most:
+        before = len(mesh)
+        if before <= most:
             break
         error *= _AGAIN
-        before, mesh = len(mesh), thinned(mesh, error, most=most)
-        if whole_border and len(mesh) > _LITTLE * before:
+        mesh = thinned(mesh, error, most=most)
+        if not whole_border:
+            # before the surface goes, which would have to make up for ragged borders
+            mesh = thinned(mesh, error, whole_border=False, most=most)
+        elif len(mesh) > _LITTLE * before:
             break
-    return mesh if whole_border else thinned(mesh, error, whole_border=False, most=most)
+    return mesh
