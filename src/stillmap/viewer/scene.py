@@ -178,6 +178,8 @@ def _cloud(name: str, raw: thinning.Points, origin: Float) -> Cloud:
         if name == "static" and len(raw.points):
             z = raw.points[:, 2]
             painted = colours.of_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
+    elif name == "dynamic":  # what no picture shows is no part of the place either
+        painted = np.where((painted == GREY).all(axis=1, keepdims=True), np.uint8(ORANGE), painted)
     return Cloud((raw.points - origin).astype(np.float32), painted, raw.of)
 
 
