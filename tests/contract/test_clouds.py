@@ -51,7 +51,19 @@ def of_pcd(path: Path) -> np.ndarray:
     return np.stack(pcd_file.values(pcd_file.header(path), list(FIELDS)), axis=1)
 
 
-READERS = {".las": of_las, ".laz": of_las, ".e57": of_e57, ".pcd": of_pcd, ".ply": of_ply}
+def of_xyz(path: Path) -> np.ndarray:
+    assert path.read_text().split("\n", 1)[0] == " ".join(FIELDS)
+    return np.loadtxt(path, skiprows=1, ndmin=2).astype(np.float32).reshape(-1, 4)
+
+
+READERS = {
+    ".las": of_las,
+    ".laz": of_las,
+    ".e57": of_e57,
+    ".pcd": of_pcd,
+    ".ply": of_ply,
+    ".xyz": of_xyz,
+}
 
 
 @pytest.fixture
@@ -187,7 +199,7 @@ def test_points_that_are_too_far_off_are_refused(name, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57", "a.pcd", "a.ply"])
+@pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57", "a.pcd", "a.ply", "a.xyz"])
 def test_a_full_disk_is_said(name, tmp_path):
     """A limit on the size of files stands for it; the process it holds for is one of its own."""
     program = f"""

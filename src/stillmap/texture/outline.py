@@ -6,7 +6,7 @@ from scipy import ndimage
 
 Float = NDArray[np.float64]
 
-_CELL = 0.02  # m
+_CELL = 0.01  # m
 _MOST_CELLS = 1 << 10  # along an edge, beyond which they are larger
 
 
@@ -29,4 +29,4 @@ def depth_inside(points: Float, apart: float) -> Float:
     empty[at[:, 0], at[:, 1]] = False
     covered = ndimage.distance_transform_edt(empty) * cell <= apart
     away = ndimage.distance_transform_edt(ndimage.binary_fill_holes(covered)) * cell
-    return np.asarray(np.maximum(away[at[:, 0], at[:, 1]] - apart, 0.0))
+    return np.asarray(np.maximum(away[at[:, 0], at[:, 1]] - cell - apart, 0.0))

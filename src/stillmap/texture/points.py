@@ -18,6 +18,7 @@ _FEW = 4  # places of the mesh around a point, of whose faces one may be the nea
 _MOST_PLACES = 1 << 22  # of a mesh, beyond which they lie farther apart
 _COARSER = 1.5  # by so many times, again and again
 _LEAST = 1e-300
+_SLIVER = 1e-12  # squared sine of the angle of a triangle without area
 _NOT_GREY = (128, 128, 127)  # what a picture shows as grey, so that grey means none
 
 
@@ -107,9 +108,11 @@ def feet(points: Float, corners: Float) -> tuple[Float, Float]:
     p = np.ascontiguousarray(points.T)
     u, v, w = b - a, c - a, p - a
     uu, uv, vv, wu, wv = _dot(u, u), _dot(u, v), _dot(v, v), _dot(w, u), _dot(w, v)
-    square = np.maximum(uu * vv - uv * uv, _LEAST)
+    square = uu * vv - uv * uv
+    flat = square <= _SLIVER * uu * vv  # no more than a line, or a point
+    square = np.where(flat, 1.0, square)
     j, k = (vv * wu - uv * wv) / square, (uu * wv - uv * wu) / square
-    inside = (j >= 0.0) & (k >= 0.0) & (j + k <= 1.0)
+    inside = (j >= 0.0) & (k >= 0.0) & (j + k <= 1.0) & ~flat
     weight = np.stack([1.0 - j - k, j, k], axis=1)
     rest = np.flatnonzero(~inside)
     if len(rest):
