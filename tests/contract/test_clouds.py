@@ -52,8 +52,10 @@ def of_pcd(path: Path) -> np.ndarray:
 
 
 def of_xyz(path: Path) -> np.ndarray:
-    assert path.read_text().split("\n", 1)[0] == " ".join(FIELDS)
-    return np.loadtxt(path, skiprows=1, ndmin=2).astype(np.float32).reshape(-1, 4)
+    names, *lines = path.read_text().splitlines()
+    assert names == " ".join(FIELDS)
+    rows = np.array([line.split() for line in lines], np.float64).reshape(-1, 4)
+    return np.column_stack([rows[:, :3], rows[:, 3].astype(np.float32)])
 
 
 READERS = {
