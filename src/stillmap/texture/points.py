@@ -15,7 +15,7 @@ Index = NDArray[np.intp]
 Colours = NDArray[np.uint8]
 
 _FEW = 4  # places of the mesh around a point, of whose faces one may be the nearest
-_MOST_PLACES = 1 << 22  # of a mesh, beyond which they lie farther apart
+_MOST_PLACES = 1 << 21  # of a mesh, beyond which they lie farther apart
 _COARSER = 1.5  # by so many times, again and again
 _LEAST = 1e-300
 _SLIVER = 1e-12  # squared sine of the angle of a triangle without area
