@@ -84,7 +84,7 @@ def test_refusals(call, room, tmp_path, nothing_left):
     (tmp_path / "a.log").write_text("")
     out = tmp_path / "b.log"
     refused(call("convert", tmp_path / "none", "-o", out), "none: does not exist")
-    refused(call("convert", room, "-o", tmp_path / "a.xyz"), "'.xyz'", ".mcap")
+    refused(call("convert", room, "-o", tmp_path / "a.abc"), "'.abc'", ".mcap")
     refused(call("convert", room, "-o", tmp_path / "a.log"), "is there already", "--overwrite")
     refused(call("convert", room, "-o", tmp_path / "no/a.log"), "no such folder")
     refused(call("convert", room, "-o", room, "--overwrite"), "is the recording itself")
@@ -154,7 +154,7 @@ def test_without_pyarrow_there_are_no_tables(call, mapped, tmp_path, monkeypatch
 def test_what_a_result_cannot_become(call, room, mapped, tmp_path, nothing_left):
     refused(call("convert", mapped, "-o", tmp_path / "a.log"), "as a CARMEN log", "filter")
     refused(call("convert", mapped, "-o", tmp_path / "a"), "as a recording folder")
-    refused(call("convert", mapped, "-o", tmp_path / "a.xyz"), "'.xyz'", ".mcap", ".e57", ".pcd")
+    refused(call("convert", mapped, "-o", tmp_path / "a.abc"), "'.abc'", ".mcap", ".e57", ".pcd")
     refused(call("convert", mapped, "-o", tmp_path / "a.mcap", "--min-range", 1), "no flags")
     for output in (mapped, mapped.parent, room):
         done = call("convert", mapped, "-o", output, "--overwrite", "--to", "ros2")
@@ -162,7 +162,7 @@ def test_what_a_result_cannot_become(call, room, mapped, tmp_path, nothing_left)
     nothing_left()
 
 
-@pytest.mark.parametrize("ending", [".las", ".laz", ".e57", ".pcd", ".ply"])
+@pytest.mark.parametrize("ending", [".las", ".laz", ".e57", ".pcd", ".ply", ".xyz"])
 def test_results_in_the_plane_have_no_clouds(call, mapped, tmp_path, nothing_left, ending):
     done = call("convert", mapped, "-o", tmp_path / f"a{ending}")
     refused(done, "out: is of a recording in the plane", ".parquet")

@@ -51,7 +51,21 @@ def of_pcd(path: Path) -> np.ndarray:
     return np.stack(pcd_file.values(pcd_file.header(path), list(FIELDS)), axis=1)
 
 
-READERS = {".las": of_las, ".laz": of_las, ".e57": of_e57, ".pcd": of_pcd, ".ply": of_ply}
+def of_xyz(path: Path) -> np.ndarray:
+    names, *lines = path.read_text().splitlines()
+    assert names == " ".join(FIELDS)
+    rows = np.array([line.split() for line in lines], np.float64).reshape(-1, 4)
+    return np.column_stack([rows[:, :3], rows[:, 3].astype(np.float32)])
+
+
+READERS = {
+    ".las": of_las,
+    ".laz": of_las,
+    ".e57": of_e57,
+    ".pcd": of_pcd,
+    ".ply": of_ply,
+    ".xyz": of_xyz,
+}
 
 
 @pytest.fixture
@@ -187,7 +201,7 @@ def test_points_that_are_too_far_off_are_refused(name, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57", "a.pcd", "a.ply"])
+@pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57", "a.pcd", "a.ply", "a.xyz"])
 def test_a_full_disk_is_said(name, tmp_path):
     """A limit on the size of files stands for it; the process it holds for is one of its own."""
     program = f"""

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from stillmap.errors import InputError
-from stillmap.output.report_figures import UNKNOWN
+from stillmap.output.clouds import COLOURS, FIELDS, ply_header, put_colours
+from stillmap.output.report_figures import ORANGE, UNKNOWN
 from stillmap.viewer import scene as module
 from stillmap.viewer.framing import framing
 from stillmap.viewer.scene import read_scene
@@ -47,6 +48,17 @@ def test_a_result_in_space(result_of):
     assert [one.track.id for one in scene.models] == [7]
     z = scene.clouds["static"].points[:, 2]
     assert z.min() <= scene.ground <= np.median(z)
+
+
+def test_points_have_their_own_colours_and_without_one_what_moves_stays_orange(result_of):
+    out, (grey, red) = result_of(3), ((128, 128, 128), (200, 0, 0))
+    for part in ("static", "dynamic"):
+        rows = np.zeros(2, FIELDS + COLOURS)
+        put_colours(rows, np.array([grey, red], np.uint8))
+        (out / f"{part}.ply").write_bytes(ply_header(FIELDS + COLOURS, 2) + rows.tobytes())
+    clouds = read_scene(out).clouds
+    assert clouds["static"].colours.tolist() == [[*grey], [*red]]
+    assert clouds["dynamic"].colours.tolist() == [[*ORANGE], [*red]]
 
 
 def test_no_more_points_than_a_browser_bears(result_of, monkeypatch):

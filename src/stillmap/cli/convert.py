@@ -12,7 +12,7 @@ ENDINGS = (
     *(".bag", ".db3", ".mcap", ".ply", ".las", ".laz"),
 )
 # likewise of stillmap.export.cloud_files
-CLOUDS = (".las", ".laz", ".e57", ".pcd", ".ply")
+CLOUDS = (".las", ".laz", ".e57", ".pcd", ".ply", ".xyz")
 NAMES = ("stillmap", "ros2", "carmen", "bag", "db3", "mcap", "kitti", "pcd", "ply", "las")
 _EPILOG = """examples:
   stillmap convert log.clf.gz -o log.bag      for ROS 1
@@ -32,7 +32,8 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         description="Write a recording in another format, which the ending of FILE names: "
         f"{', '.join(ENDINGS)}; a folder otherwise. A result of `stillmap map` becomes a bag "
         "that shows it (.mcap for Foxglove) or a table of its beams (.parquet); in 3D a cloud of "
-        f"points with their p_static ({', '.join(CLOUDS)}), or the model of the place (.obj).",
+        f"points with p_static and colours ({', '.join(CLOUDS)}), or the model of the place "
+        "(.obj).",
         epilog=_EPILOG,
     )
     p.add_argument("input", metavar="INPUT", help="a recording, or what `stillmap map` wrote")

@@ -12,6 +12,7 @@ from stillmap.cli.progress import shown_share
 from stillmap.cli.reading import read_changes
 from stillmap.cli.results import Mapped, found, is_deskewed, is_result, require_apart
 from stillmap.errors import InputError
+from stillmap.evaluation.folders import read_colours
 from stillmap.export import bag, beam_table, cloud, cloud_files, model, result
 from stillmap.output.atomic import require_new_file
 from stillmap.output.tilting import FOLDER as TILTING
@@ -122,7 +123,8 @@ def _cloud_of(args: argparse.Namespace, mapped: Mapped, output: Path) -> cloud.C
         )
     poses = poses_from_tum(mapped.folder / "trajectory.tum", recording)
     seen = _seen(mapped, recording, poses)
-    return cloud.cloud_of(recording, seen, poses, labels.p_static, args.only)
+    colours = read_colours(mapped.folder, recording.n_beams)
+    return cloud.cloud_of(recording, seen, poses, labels.p_static, args.only, colours)
 
 
 def _exported(mapped: Mapped) -> result.Exported:

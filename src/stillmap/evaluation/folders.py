@@ -108,6 +108,21 @@ def read_labels(result: Path) -> Labels:
     return Labels(stamp_ns, offset, p_static, _array(folder / "hit.npy", (beams,), "b"))
 
 
+def read_colours(result: Path, beams: int) -> NDArray[np.uint8] | None:
+    """(M, 3) colours of the ends of a result's beams, so many; None where it has none.
+
+    Raises:
+        InputError: they are damaged, or others.
+    """
+    path = result / "beams" / "colour.npy"
+    if not path.exists():
+        return None
+    colours = _array(path, (beams, 3), "u")
+    if colours.dtype != np.uint8:
+        raise InputError(f"holds {colours.dtype}", where=str(path))
+    return colours
+
+
 def require_same_beams(labels: Labels, truth: Truth, result: Path) -> None:
     """Labels and truth speak of the same beams.
 

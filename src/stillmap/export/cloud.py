@@ -21,6 +21,7 @@ Part = Literal["static", "dynamic"]
 PARTS: tuple[Part, ...] = ("static", "dynamic")
 
 _FIELDS = ("x", "y", "z", "p_static")
+_COLOURS = ("red", "green", "blue")
 
 
 class Block(NamedTuple):
@@ -30,11 +31,13 @@ class Block(NamedTuple):
         points: (n, 3) float64 metres in the map frame.
         p_static: (n,) float32.
         stamp_ns: (n,) int64, when each was taken; None where nobody knows.
+        colours: (n, 3) uint8; None where the cloud has none.
     """
 
     points: NDArray[np.float64]
     p_static: NDArray[np.float32]
     stamp_ns: NDArray[np.int64] | None
+    colours: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +49,14 @@ class Cloud:
         origin: (3,) whole metres that lie among them.
         start_ns: none was taken before; None where nobody knows when.
         blocks: makes them anew.
+        coloured: whether points have colours.
     """
 
     count: int
     origin: NDArray[np.float64]
     start_ns: int | None
     blocks: Callable[[], Iterator[Block]]
+    coloured: bool = False
 
     def told(self, tell: Callable[[float], None] | None) -> Iterator[Block]:
         """The blocks; `tell` hears which share of the points was taken."""
@@ -69,6 +74,7 @@ def cloud_of(
     poses: NDArray[np.float64],
     p_static: NDArray[np.float32],
     only: Part | None = None,
+    colours: NDArray[np.uint8] | None = None,
 ) -> Cloud:
     """Every hit, in the recording's order; memory is that of some scans.
 
@@ -78,6 +84,7 @@ def cloud_of(
         poses: (T, 4, 4) T_map_base.
         p_static: (M,) P(c = 1).
         only: the points on one side of one half alone.
+        colours: (M, 3); None: without.
     """
     times = recording.beam_time
     earliest = 0.0
@@ -86,12 +93,13 @@ def cloud_of(
     T_map_sensor = seen.T_map_sensor(poses)
 
     def made() -> Iterator[Block]:
-        beside = [p_static] if times is None else [p_static, times]
+        beside = [one for one in (p_static, times, colours) if one is not None]
         for chunk in chunks(seen, beside=beside):
             hits = _wanted(seen.hit[chunk.beams], p_static[chunk.beams], only)
             points = _placed(seen, chunk, hits, T_map_sensor)
             stamp_ns = beam_ns(recording, chunk.scans)[hits]
-            yield Block(points, np.asarray(p_static[chunk.beams][hits]), stamp_ns)
+            its = None if colours is None else np.asarray(colours[chunk.beams][hits])
+            yield Block(points, np.asarray(p_static[chunk.beams][hits]), stamp_ns, its)
 
     return Cloud(
         count=sum(
@@ -101,6 +109,7 @@ def cloud_of(
         origin=np.round(poses[0, :3, 3]),
         start_ns=int(recording.stamp_ns[0]) + int(np.floor(1e9 * earliest)),
         blocks=made,
+        coloured=colours is not None,
     )
 
 
@@ -111,16 +120,19 @@ def cloud_in(folder: Path, only: Part | None = None) -> Cloud:
         InputError: one of them is missing or damaged.
     """
     layouts = [ply.layout_of(folder / f"{part}.ply") for part in PARTS if only in (part, None)]
+    coloured = all(set(_COLOURS) <= {one.name for one in layout.fields} for layout in layouts)
+    wanted = (*_FIELDS, *(_COLOURS if coloured else ()))
 
     def made() -> Iterator[Block]:
         for layout in layouts:
-            for values in columns(layout, _FIELDS):
+            for values in columns(layout, wanted):
                 points = np.stack(values[:3], axis=1).astype(np.float64)
                 if not np.isfinite(points).all():
                     raise InputError("holds a point that is not finite", where=str(layout.path))
-                yield Block(points, values[3].astype(np.float32), None)
+                colours = np.stack(values[4:], axis=1).astype(np.uint8) if coloured else None
+                yield Block(points, values[3].astype(np.float32), None, colours)
 
-    return Cloud(sum(layout.rows for layout in layouts), np.zeros(3), None, made)
+    return Cloud(sum(layout.rows for layout in layouts), np.zeros(3), None, made, coloured)
 
 
 def _wanted(

@@ -24,10 +24,12 @@ _BLOCK = 1 << 16  # points written together
 _SCALE = 0.0001  # m
 _LARGEST = 2**31 - 1  # 32 bits for each coordinate
 _AXES = ("cartesianX", "cartesianY", "cartesianZ")
+_COLOURS = ("colorRed", "colorGreen", "colorBlue")
 
 
 def write(cloud: Cloud, path: Path, tell: Callable[[float], None] | None) -> None:
-    """Write `cartesianX`, `Y`, `Z` and `intensity`; coordinates are rounded to 0.1 mm.
+    """Write `cartesianX`, `Y`, `Z` and `intensity`; coordinates are rounded to 0.1 mm. Where there
+    are colours `colorRed`, `Green` and `Blue`, too, from 0 to 255.
 
     Raises:
         InputError: pye57 is missing, or the file cannot be written or cannot hold the points.
@@ -66,6 +68,8 @@ def _fill(library: Any, file: Any, cloud: Cloud, tell: Callable[[float], None] |
     scan.set("description", library.StringNode(file, f"stillmap: {text}"))
     limits = {"intensityMinimum": 0.0, "intensityMaximum": 1.0}
     scan.set("intensityLimits", _numbers(library, file, limits))
+    if cloud.coloured:
+        scan.set("colorLimits", _colour_limits(library, file))
     if cloud.start_ns is not None and cloud.start_ns >= GPS_EPOCH_S * 10**9:
         start = {"dateTimeValue": 1e-9 * cloud.start_ns - GPS_EPOCH_S}
         scan.set("acquisitionStart", _numbers(library, file, start))
@@ -90,6 +94,14 @@ def _numbers(library: Any, file: Any, values: dict[str, float]) -> Any:
     return node
 
 
+def _colour_limits(library: Any, file: Any) -> Any:
+    node = library.StructureNode(file)
+    for name in _COLOURS:
+        node.set(f"{name}Minimum", library.IntegerNode(file, 0, 0, 255))
+        node.set(f"{name}Maximum", library.IntegerNode(file, 255, 0, 255))
+    return node
+
+
 class _Columns:
     """What libe57 takes the points from, as many as are written together."""
 
@@ -103,6 +115,8 @@ class _Columns:
             for name, middle in zip(_AXES, cloud.origin, strict=True)
         }
         nodes["intensity"] = library.FloatNode(file, 0.0, library.E57_SINGLE, 0.0, 1.0)
+        if cloud.coloured:
+            nodes |= {name: library.IntegerNode(file, 0, 0, 255) for name in _COLOURS}
         self._values: dict[str, NDArray[np.float64]] = {}
         self.buffers = library.VectorSourceDestBuffer()
         for name, node in nodes.items():
@@ -124,6 +138,9 @@ class _Columns:
             for name, column in zip(_AXES, points.T, strict=True):
                 self._values[name][:n] = column
             self._values["intensity"][:n] = block.p_static[part]
+            if block.colours is not None:
+                for name, column in zip(_COLOURS, block.colours[part].T, strict=True):
+                    self._values[name][:n] = column
             for column in self._values.values():
                 self.digest.update(column[:n].data)
             yield n

@@ -1,4 +1,5 @@
-"""The points of a result as one file: PLY, PCD, LAS, LAZ or E57, with `p_static` at each."""
+"""The points of a result as one file: PLY, PCD, LAS, LAZ, E57 or text, with `p_static` at each,
+and where there are colours with those."""
 
 from collections.abc import Callable
 from datetime import date
@@ -13,14 +14,17 @@ from stillmap.export import cloud_e57
 from stillmap.export.cloud import Block, Cloud
 from stillmap.extras import extra
 from stillmap.output.atomic import new_file
-from stillmap.output.clouds import FIELDS, ply_header
+from stillmap.output.clouds import COLOURS, FIELDS, ply_header, put_colours
 from stillmap.recording.clouds.las import writer_to
 
 Tell = Callable[[float], None]
 
 _SCALE = 0.0001  # m, of coordinates in LAS
-_POINTS = 6  # the LAS format of points that have a time
+_POINTS, _COLOURED = 6, 7  # the LAS formats of points that have a time, and a colour too
+_FULL = 256  # LAS's colours are 16 bit: so many times those of pictures
+_PACKED = [("rgb", "<u4")]  # 0x00RRGGBB, which PCL and others expect to be called a float
 _LARGEST = 2**31 - 1  # LAS's coordinates are 32 bit
+_LINES = 1 << 14  # of text, made together
 
 
 class Format(NamedTuple):
@@ -83,11 +87,13 @@ def write(cloud: Cloud, path: Path, form: Format, tell: Tell | None = None) -> N
 
 
 def _write_ply(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
-    _write_records(cloud, path, ply_header(FIELDS, cloud.count), tell)
+    fields = FIELDS + COLOURS if cloud.coloured else FIELDS
+    _write_records(cloud, path, ply_header(fields, cloud.count), fields, tell)
 
 
 def _write_pcd(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
-    names = [name for name, _ in FIELDS]
+    fields = FIELDS + _PACKED if cloud.coloured else FIELDS
+    names = [name for name, _ in fields]
     lines = (
         "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",
@@ -101,26 +107,53 @@ def _write_pcd(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
         f"POINTS {cloud.count}",
         "DATA binary",
     )
-    _write_records(cloud, path, "".join(f"{line}\n" for line in lines).encode(), tell)
+    header = "".join(f"{line}\n" for line in lines).encode()
+    _write_records(cloud, path, header, fields, tell)
 
 
-def _write_records(cloud: Cloud, path: Path, header: bytes, tell: Tell | None) -> None:
+def _write_records(
+    cloud: Cloud, path: Path, header: bytes, fields: list[tuple[str, str]], tell: Tell | None
+) -> None:
     with path.open("wb") as file:
         file.write(header)
         for block in cloud.told(tell):
-            file.write(_records(block).tobytes())
+            file.write(_records(block, fields).tobytes())
 
 
-def _records(block: Block) -> NDArray[np.void]:
-    out = np.empty(len(block.points), FIELDS)
+def _records(block: Block, fields: list[tuple[str, str]]) -> NDArray[np.void]:
+    out = np.empty(len(block.points), fields)
     out["x"], out["y"], out["z"] = block.points.T
     out["p_static"] = block.p_static
+    if block.colours is not None and fields[-1:] == _PACKED:
+        red, green, blue = block.colours.T.astype(np.uint32)
+        out["rgb"] = red << 16 | green << 8 | blue
+    elif block.colours is not None:
+        put_colours(out, block.colours)
     return out
+
+
+def _write_text(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
+    names = [name for name, _ in (FIELDS + COLOURS if cloud.coloured else FIELDS)]
+    line = "%.4f %.4f %.4f %.9g" + (" %d %d %d" if cloud.coloured else "") + "\n"
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        file.write(" ".join(names) + "\n")
+        for block in cloud.told(tell):
+            for first in range(0, len(block.points), _LINES):
+                part = slice(first, first + _LINES)
+                values: list[NDArray[Any]] = [
+                    block.points[part],
+                    block.p_static[part, None].astype(np.float64),
+                ]
+                if block.colours is not None:
+                    values.append(block.colours[part])
+                rows = np.concatenate(values, axis=1)
+                file.write(line * len(rows) % tuple(rows.ravel().tolist()))
 
 
 def _write_las(cloud: Cloud, path: Path, packed: bool, tell: Tell | None) -> None:
     laspy = extra("laspy", path, "written")
-    head = laspy.LasHeader(point_format=_POINTS, version="1.4")
+    kind = _COLOURED if cloud.coloured else _POINTS
+    head = laspy.LasHeader(point_format=kind, version="1.4")
     head.scales, head.offsets = np.full(3, _SCALE), cloud.origin
     head.add_extra_dim(laspy.ExtraBytesParams("p_static", "float32", "probability to be static"))
     head.global_encoding.wkt = True  # as LAS 1.4 wants it, also where no place on earth is known
@@ -141,6 +174,8 @@ def _las_points(laspy: Any, head: Any, block: Block) -> Any:
     out["p_static"] = block.p_static
     if block.stamp_ns is not None:
         out.gps_time = 1e-9 * block.stamp_ns
+    if block.colours is not None:
+        out.red, out.green, out.blue = block.colours.T.astype(np.uint16) * np.uint16(_FULL)
     return out
 
 
@@ -153,4 +188,5 @@ FORMATS = (
     Format("e57", "an E57 file", (".e57",), ("pye57.libe57",), _write_e57),
     Format("pcd", "a PCD file", (".pcd",), (), _write_pcd),
     Format("ply", "a PLY file", (".ply",), (), _write_ply),
+    Format("xyz", "lines of text", (".xyz",), (), _write_text),
 )

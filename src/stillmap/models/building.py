@@ -13,6 +13,7 @@ from stillmap.models.options import MeshOptions
 from stillmap.models.painting import Ahead, Dressed, dressed, when_in_view
 from stillmap.models.place import Painted, painted
 from stillmap.models.sources import Sources
+from stillmap.models.tinting import Tints, tinted
 from stillmap.objects import MovingObject
 from stillmap.pipeline import Progress, silent
 from stillmap.recording.images import Images
@@ -65,6 +66,7 @@ class Models:
         left_out: how many others there are, by reason.
         movers: models of what moved, in the order of the objects.
         tried: how many objects there are.
+        tints: colours of the beams' ends; None where there are no pictures, or nobody wants them.
     """
 
     painted: Painted
@@ -74,6 +76,7 @@ class Models:
     left_out: dict[str, int]
     movers: list[MoverModel]
     tried: int
+    tints: Tints | None = None
 
 
 def require_extras() -> None:
@@ -134,7 +137,13 @@ def models_of(
         movers = []
         if options.objects.enabled:
             movers = _movers(sources, views, place, options, tell("building what moved"))
-    return Models(place, textured, unfiltered, views, left_out, movers, len(sources.objects))
+    tints = None
+    if views and options.points.enabled:
+        with stages.measure("points"):
+            now = tell("colouring points")
+            tints = tinted(sources, textured, views, place.mesh, options, threads, now)
+    tried = len(sources.objects)
+    return Models(place, textured, unfiltered, views, left_out, movers, tried, tints)
 
 
 def _unfiltered(

@@ -77,6 +77,25 @@ _LIMITS = (
 
 
 @dataclass(frozen=True)
+class PointOptions:
+    """Colours of the points of clouds."""
+
+    enabled: bool = field_with_doc(True, "take them from pictures, where there are any")
+    off: float = field_with_doc(
+        0.1, "m off the surface of the place, up to which a point has its colour"
+    )
+    rim: float = field_with_doc(
+        0.02, "m within what a thing's points cover in a picture, where it may show what is behind"
+    )
+    apart: float = field_with_doc(0.12, "m around each of its points that a thing covers")
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("off", 1e-3, 10.0), ("rim", 0.0, 10.0), ("apart", 1e-3, 10.0)):
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"'mesh.points.{name}' wants {low:g} to {high:g}")
+
+
+@dataclass(frozen=True)
 class MeshOptions:
     """Models of recordings in 3D: of the place, and of what moved; docs/mesh.md."""
 
@@ -85,3 +104,4 @@ class MeshOptions:
     choice: ChoiceOptions = field(default=ChoiceOptions())
     texture: TextureOptions = field(default=TextureOptions())
     objects: MoverOptions = field(default=MoverOptions())
+    points: PointOptions = field(default=PointOptions())

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,16 @@ from stillmap.recording.model import Recording
 from stillmap.recording.spool import blocks
 
 FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("p_static", "<f4")]
+COLOURS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+_TYPES = {"<f4": "float", "u1": "uchar"}
 
 
 def write_clouds(
-    folder: Path, seen: Recording, poses: NDArray[np.float64], p_static: NDArray[np.float32]
+    folder: Path,
+    seen: Recording,
+    poses: NDArray[np.float64],
+    p_static: NDArray[np.float32],
+    colours: NDArray[np.uint8] | None = None,
 ) -> None:
     """Write every hit to one of the two files; memory is that of a few scans.
 
@@ -24,6 +31,7 @@ def write_clouds(
         seen: 3D, M beams without the motion during its scans.
         poses: (T, 4, 4) T_map_base.
         p_static: (M,) P(c = 1); below one half it is dynamic.
+        colours: (M, 3), None: without.
     """
     hits = dynamic = 0
     for block in blocks(seen.hit, p_static):
@@ -34,8 +42,9 @@ def write_clouds(
     files = {name: (folder / f"{name}.ply").open("wb") for name in counts}
     try:
         for name, file in files.items():
-            file.write(ply_header(FIELDS, counts[name]))
-        for vertices in _vertices(seen, poses, p_static):
+            fields = FIELDS if colours is None else FIELDS + COLOURS
+            file.write(ply_header(fields, counts[name]))
+        for vertices in _vertices(seen, poses, p_static, colours):
             moves = vertices["p_static"] < DYNAMIC_BELOW
             files["static"].write(vertices[~moves].tobytes())
             files["dynamic"].write(vertices[moves].tobytes())
@@ -45,17 +54,28 @@ def write_clouds(
 
 
 def ply_header(fields: list[tuple[str, str]], count: int) -> bytes:
-    """Of a little-endian PLY whose vertices have these fields, all float32."""
-    properties = "".join(f"property float {name}\n" for name, _ in fields)
+    """Of a little-endian PLY whose vertices have these fields, float32 or uint8."""
+    properties = "".join(f"property {_TYPES[kind]} {name}\n" for name, kind in fields)
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
     return (head + "end_header\n").encode("ascii")
 
 
+def put_colours(vertices: NDArray[np.void], colours: NDArray[np.uint8]) -> None:
+    """Sets `red`, `green` and `blue` of vertices (n,) to colours (n, 3)."""
+    for (name, _), column in zip(COLOURS, colours.T, strict=True):
+        vertices[name] = column
+
+
 def _vertices(
-    seen: Recording, poses: NDArray[np.float64], p_static: NDArray[np.float32]
+    seen: Recording,
+    poses: NDArray[np.float64],
+    p_static: NDArray[np.float32],
+    colours: NDArray[np.uint8] | None,
 ) -> Iterator[NDArray[np.void]]:
     T_map_sensor = seen.T_map_sensor(poses)
-    for scans, beams, offset in chunks(seen, beside=[p_static]):
+    fields = FIELDS if colours is None else FIELDS + COLOURS
+    beside: list[NDArray[Any]] = [p_static] if colours is None else [p_static, colours]
+    for scans, beams, offset in chunks(seen, beside=beside):
         for t, first, last in zip(
             range(scans.start, scans.stop), offset[:-1], offset[1:], strict=True
         ):
@@ -63,7 +83,9 @@ def _vertices(
             hit = seen.hit[at]
             T = T_map_sensor[t]
             ends = seen.points[at][hit].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-            vertices = np.empty(len(ends), FIELDS)
+            vertices = np.empty(len(ends), fields)
             vertices["x"], vertices["y"], vertices["z"] = ends.T
             vertices["p_static"] = p_static[at][hit]
+            if colours is not None:
+                put_colours(vertices, colours[at][hit])
             yield vertices

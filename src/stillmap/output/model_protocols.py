@@ -81,6 +81,15 @@ class MoverModelLike(Protocol):
     def span_ns(self) -> tuple[int, int]: ...
 
 
+class TintsLike(Protocol):
+    """Colours of the beams' ends; see `stillmap.models.tinting.Tints`."""
+
+    @property
+    def colours(self) -> NDArray[np.uint8]: ...
+    @property
+    def counts(self) -> Mapping[str, int]: ...
+
+
 class ModelsLike(Protocol):
     """Models of the place and of what moved; see `stillmap.models.building.Models`."""
 
@@ -98,3 +107,5 @@ class ModelsLike(Protocol):
     def movers(self) -> Sequence[MoverModelLike]: ...
     @property
     def tried(self) -> int: ...
+    @property
+    def tints(self) -> TintsLike | None: ...

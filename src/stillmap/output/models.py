@@ -91,6 +91,7 @@ def models_record(models: ModelsLike) -> dict[str, Any]:
     def area(of: NDArray[np.bool_]) -> float:
         return round(float(areas[of].sum()), _SQUARE_CENTIMETRES)
 
+    points = {} if models.tints is None else {"points": dict(models.tints.counts)}
     used = {view.image for k, view in enumerate(models.views) if (painted.view == k).any()}
     return {
         "faces": len(areas),
@@ -105,4 +106,5 @@ def models_record(models: ModelsLike) -> dict[str, Any]:
         },
         "pages": [list(page.shape[:2]) for page in models.textured.pages],
         "objects": {"found": models.tried, "modelled": len(models.movers)},
+        **points,
     }

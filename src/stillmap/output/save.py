@@ -45,15 +45,17 @@ def save(
     Raises:
         InputError: `path` is taken or cannot be written to.
     """
+    colours = None if models is None or models.tints is None else models.tints.colours
     with new_folder(path, RECORD, overwrite, within=within) as folder:
         write_map_server(folder, result.map, result.options.output.map_mode)
         write_map_npz(folder / "map.npz", result.map, result.changes, result.evidence)
         write_tum(folder / "trajectory.tum", result.recording.stamp_ns, result.poses)
         if result.graph is not None:
             write_g2o(folder / "graph.g2o", result.graph, result.poses)
-        write_beams(folder / "beams", result)
-        if result.recording.dimension == 3:
-            write_clouds(folder, result.seen, result.poses, result.p_static)
+        in_space = result.recording.dimension == 3
+        write_beams(folder / "beams", result, colours if in_space else None)
+        if in_space:
+            write_clouds(folder, result.seen, result.poses, result.p_static, colours)
         if result.options.objects.enabled:
             write_objects(folder / "objects", result)
             write_traffic(folder / "traffic.npz", result.traffic)
@@ -61,7 +63,7 @@ def save(
         write_report(folder / "report.html", result, tilting, stills)
         more = {}
         if tilting is not None:
-            write_tilting(folder, tilting)
+            write_tilting(folder, tilting, colours)
             more[TILTING] = tilting_record(tilting)
         if models is not None:
             images = (result if tilting is None else tilting).recording.images

@@ -3,6 +3,9 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stillmap.output.beams import write_beams_of
 from stillmap.output.clouds import write_clouds
 from stillmap.output.objects import write_objects_of
@@ -14,13 +17,16 @@ from stillmap.recording.tum import write_tum
 FOLDER = "tilting"
 
 
-def write_tilting(folder: Path, tilting: TiltingLike) -> None:
-    """Write `static.ply`, `dynamic.ply` and `tilting/`: labels, poses and what moved, in 3D."""
+def write_tilting(
+    folder: Path, tilting: TiltingLike, colours: NDArray[np.uint8] | None = None
+) -> None:
+    """Write `static.ply`, `dynamic.ply` and `tilting/`: labels, poses and what moved, in 3D; with
+    the colours (M, 3) of its beams' ends."""
     seen, poses, p_static = tilting.seen, tilting.poses, tilting.p_static
-    write_clouds(folder, seen, poses, p_static)
+    write_clouds(folder, seen, poses, p_static, colours)
     inside = folder / FOLDER
     inside.mkdir()
-    write_beams_of(inside / "beams", tilting.recording, p_static)
+    write_beams_of(inside / "beams", tilting.recording, p_static, colours)
     write_tum(inside / "trajectory.tum", tilting.recording.stamp_ns, poses)
     write_objects_of(inside / "objects", tilting.objects, seen, poses, p_static)
 

@@ -18,6 +18,7 @@ from stillmap.output.report_figures import ORANGE, UNKNOWN, map_image, shown_win
 from stillmap.recording.tum import read_tum
 from stillmap.se2 import inverse
 from stillmap.texts import read_text
+from stillmap.texture.textured import GREY
 from stillmap.viewer import colours, gltf, thinning
 from stillmap.viewer.tracks import pose_at
 
@@ -178,6 +179,8 @@ def _cloud(name: str, raw: thinning.Points, origin: Float) -> Cloud:
         if name == "static" and len(raw.points):
             z = raw.points[:, 2]
             painted = colours.of_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
+    elif name == "dynamic":  # grey would be taken for a part of the place
+        painted[(painted == GREY).all(axis=1)] = ORANGE
     return Cloud((raw.points - origin).astype(np.float32), painted, raw.of)
 
 

@@ -1,0 +1,198 @@
+"""Points on what moves, and their colours: of pictures taken about when they were seen."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.models.options import MeshOptions
+from stillmap.models.painting import Ahead
+from stillmap.models.sources import Sources
+from stillmap.output.points import DYNAMIC_BELOW
+from stillmap.recording.images import Images
+from stillmap.recording.stamps import beam_ns
+from stillmap.surface.mesh import Mesh
+from stillmap.texture.lens import project
+from stillmap.texture.outline import depth_inside
+from stillmap.texture.points import not_grey
+from stillmap.texture.sampling import bilinear
+from stillmap.texture.things import Cuboid, Thing, at_time, in_the_way
+from stillmap.texture.view import View
+from stillmap.texture.views import colours_of
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Colours = NDArray[np.uint8]
+
+_NOBODY = -1  # owner of a beam that is of no thing
+
+
+class _Seen(NamedTuple):
+    """n beams on things that move, taken about a time.
+
+    Attributes:
+        beam: (n,) their numbers.
+        ends: (n, 3) metres in the map frame, where they ended.
+        seconds: (n,) when, by the time of the things.
+        owner: (n,) of which thing each is, by its place among `things`.
+    """
+
+    beam: NDArray[np.intp]
+    ends: Float
+    seconds: Float
+    owner: NDArray[np.intp]
+
+
+class Moving:
+    """The dynamic beams, to be asked for by time."""
+
+    def __init__(self, sources: Sources, T_map_sensor: Float) -> None:
+        self.sources, self._T_map_sensor = sources, T_map_sensor
+        beams = {one.id: one.beams for one in sources.objects}
+        self._owned = [beams.get(one.box.thing) for one in sources.things]
+        stamps = sources.recording.stamp_ns
+        self._longest = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+
+    def about(self, stamp_ns: int, near: float) -> _Seen:
+        """Those on things that ended within `near` seconds."""
+        s, stamps = self.sources, self.sources.recording.stamp_ns
+        reach = 1e9 * near + self._longest
+        first = int(np.searchsorted(stamps, stamp_ns - reach))
+        last = int(np.searchsorted(stamps, stamp_ns + reach, side="right"))
+        offset = s.seen.offset[first : last + 1]
+        beams = slice(int(offset[0]), int(offset[-1]))
+        moves = s.seen.hit[beams] & (s.p_static[beams] < DYNAMIC_BELOW)
+        at_ns = beam_ns(s.recording, slice(first, last))
+        kept = np.flatnonzero(moves & (np.abs(at_ns - stamp_ns) <= 1e9 * near))
+        owner = self._owners(beams.start + kept)
+        kept, owner = kept[owner != _NOBODY], owner[owner != _NOBODY]
+        beam = beams.start + kept
+        T = self._T_map_sensor[np.searchsorted(offset, beam, side="right") - 1 + first]
+        ends = np.einsum("nij,nj->ni", T[:, :3, :3], s.seen.points[beam].astype(np.float64))
+        seconds = np.asarray(1e-9 * (at_ns[kept] - s.start_ns), np.float64)
+        return _Seen(beam, ends + T[:, :3, 3], seconds, owner)
+
+    def _owners(self, beam: NDArray[np.intp]) -> NDArray[np.intp]:
+        out = np.full(len(beam), _NOBODY)
+        for number, owned in enumerate(self._owned):
+            if owned is None or not len(owned) or not len(beam):
+                continue
+            if owned[-1] < beam[0] or owned[0] > beam[-1]:
+                continue
+            place = np.minimum(np.searchsorted(owned, beam), len(owned) - 1)
+            out[owned[place] == beam] = number
+        return out
+
+
+def tint_moving(
+    out: Colours,
+    late: NDArray[np.float32],
+    moving: Moving,
+    view: View,
+    images: Images,
+    place: Mesh,
+    options: MeshOptions,
+) -> None:
+    """Colours what moves and is seen in a picture, where none nearer in time shows it.
+
+    Args:
+        out: (M, 3), changed.
+        late: (M,) s from each beam to the picture that it has its colour from; changed.
+        moving: the dynamic beams.
+        view: the picture.
+        images: from which it is read, if anything is shown.
+        place: the surface of what stands still, which hides what is behind it.
+        options: see MeshOptions.
+    """
+    sources, limits = moving.sources, options.texture.visible
+    seen = moving.about(view.stamp_ns, options.objects.near)
+    now = 1e-9 * (view.stamp_ns - sources.start_ns)
+    away = np.abs(seen.seconds - now).astype(np.float32)
+    ends = _carried(seen, sources.things, now)
+    local = view.in_camera(ends)
+    uv, ok = project(view.camera, local)
+    size, m = np.array([view.camera.width, view.camera.height]), limits.margin
+    with np.errstate(invalid="ignore"):  # NaN: nowhere
+        ok &= ((uv >= m) & (uv <= size - 1.0 - m)).all(axis=1)
+    ok &= local[:, 2] > limits.near
+    ok &= _within_outlines(seen, local, ok, sources.things, now, options)
+    ok &= away < late[seen.beam]
+    shown = np.flatnonzero(ok)
+    shown = shown[Ahead(place, [view], limits).free(0, ends[shown])] if len(shown) else shown
+    shown = shown[_free(ends[shown], seen.owner[shown], sources.things, view, now, options)]
+    if not len(shown):
+        return
+    picture = colours_of(images, view)
+    if picture is None:
+        return
+    colours = np.rint(bilinear(np.ascontiguousarray(picture[..., :3]), uv[shown]))
+    out[seen.beam[shown]] = not_grey(colours.astype(np.uint8))
+    late[seen.beam[shown]] = away[shown]
+
+
+def _carried(seen: _Seen, things: Sequence[Thing], now: float) -> Float:
+    """(n, 3) where the ends are once each has gone on with its thing to a time."""
+    out = seen.ends.copy()
+    for number in np.unique(seen.owner).tolist():
+        mine, box = seen.owner == number, things[number].box
+        out[mine, :2] += box.middle(np.array([now])) - box.middle(seen.seconds[mine])
+    return out
+
+
+def _within_outlines(
+    seen: _Seen,
+    local: Float,
+    shown: Bool,
+    things: Sequence[Thing],
+    now: float,
+    options: MeshOptions,
+) -> Bool:
+    """(n,) whether points that are shown lie within the outline of their thing in a picture.
+
+    By `mesh.points.rim`, and by `mesh.objects.drift` of the way that it went since.
+
+    Args:
+        seen: the beams.
+        local: (n, 3) metres in the camera's frame, where they have gone on to.
+        shown: (n,) whether they are in the picture.
+        things: all that moves.
+        now: s, when the picture was taken, by their time.
+        options: see MeshOptions.
+    """
+    out = np.zeros(len(shown), np.bool_)
+    for number in np.unique(seen.owner[shown]).tolist():
+        mine = np.flatnonzero(shown & (seen.owner == number))
+        x, y, z = local[mine].T
+        inside = depth_inside(np.stack([x / z, y / z], axis=1) * np.median(z), options.points.apart)
+        box = things[number].box
+        way = box.middle(np.array([now])) - box.middle(seen.seconds[mine])
+        gone = np.linalg.norm(way, axis=1)
+        out[mine] = inside >= options.points.rim + options.objects.drift * gone
+    return out
+
+
+def _free(
+    points: Float,
+    owner: NDArray[np.intp],
+    things: Sequence[Thing],
+    view: View,
+    now: float,
+    options: MeshOptions,
+) -> Bool:
+    """(n,) whether probably no other thing stands between a camera and points.
+
+    What is in a thing's box, or near, is taken for a part of it.
+    """
+    choice, free = options.choice, np.ones(len(points))
+    for number, thing in enumerate(things):
+        for cuboid in at_time([thing], now):
+            mine = (owner == number) | _inside(cuboid, points, choice.margin)
+            rest = np.flatnonzero(~mine)
+            hidden = in_the_way([cuboid], view.place, points[rest], choice.margin, choice.sigma)
+            free[rest] *= 1.0 - hidden
+    return free >= choice.least
+
+
+def _inside(cuboid: Cuboid, points: Float, margin: float) -> Bool:
+    return np.asarray((np.abs(cuboid.local(points)) <= cuboid.half + margin).all(axis=1))
