@@ -68,7 +68,9 @@ def best_moment(
     return float(first[best]), float(last[best])
 
 
-def between_beams(own: Look, others: Look, stretch: float, longest: float) -> Mesh:
+def between_beams(
+    own: Look, others: Look, stretch: float, longest: float, deepest: float = 0.0
+) -> Mesh:
     """The surface between beams that met a thing, as seen from the middle of where they came from.
 
     Args:
@@ -76,6 +78,7 @@ def between_beams(own: Look, others: Look, stretch: float, longest: float) -> Me
         others: beams about then that did not; NaN where nobody knows how far they went.
         stretch: times as long as usual may an edge be.
         longest: metres, an edge at most.
+        deepest: metres along the line of sight, by which it may be longer.
 
     Returns:
         (V, 3) metres, in the thing's own frame; each vertex is of a beam.
@@ -90,9 +93,17 @@ def between_beams(own: Look, others: Look, stretch: float, longest: float) -> Me
     except (QhullError, ValueError):  # all in one line
         return _nothing()
     faces = found.simplices
-    edges = np.linalg.norm(points[faces] - points[np.roll(faces, 1, axis=1)], axis=2)
+    spans = points[faces] - points[np.roll(faces, 1, axis=1)]
+    edges = np.linalg.norm(spans, axis=2)
     limit = min(stretch * float(np.median(edges)), longest)
-    kept = (edges.max(axis=1) <= limit) & ~_passed(found, points, place, middle, others)
+    kept = edges.max(axis=1) <= limit
+    if deepest > 0.0:
+        sight = points[faces].mean(axis=1) - place
+        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+        deep = np.abs(np.einsum("nki,ni->nk", spans, sight))
+        across = np.sqrt(np.maximum(edges**2 - deep**2, 0.0))
+        kept |= (across.max(axis=1) <= limit) & (deep.max(axis=1) <= deepest)
+    kept &= ~_passed(found, points, place, middle, others)
     faces = _towards(points, faces[kept], place)
     if not len(faces):
         return _nothing()

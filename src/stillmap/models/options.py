@@ -18,7 +18,9 @@ class MoverOptions:
     )
     margin: float = field_with_doc(0.15, "m around a thing's box, within which beams are its own")
     low: float = field_with_doc(0.03, "m above the ground: what is lower is the ground's")
-    rigid: float = field_with_doc(1.5, "m, things at least so long keep their shape")
+    rigid: float = field_with_doc(
+        1.2, "m, things at least so long or wide are no people, and keep their shape"
+    )
     together: bool = field_with_doc(
         False, "put together all that was seen of these, in place of what one look saw: slower"
     )
