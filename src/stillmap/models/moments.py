@@ -15,9 +15,11 @@ from stillmap.surface.mesh import Mesh
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
+Bool = NDArray[np.bool_]
 
 _AHEAD = 0.2  # cosine from the middle of a thing, up to which it is seen at once
 _PASSED = 0.25  # m beyond a triangle, from where on a beam passed by
+_STEEPEST = 8.0  # times as long along the line of sight as across
 _ROUNDS = 2  # of smoothing
 _OWN = 0.5  # of its range that a beam keeps in a round
 _STEP = 0.08  # m in range between neighbours that are smoothed together
@@ -78,7 +80,7 @@ def between_beams(
         others: beams about then that did not; NaN where nobody knows how far they went.
         stretch: times as long as usual may an edge be.
         longest: metres, an edge at most.
-        deepest: metres along the line of sight, by which it may be longer.
+        deepest: metres along the line of sight: at flat angles an edge may be so long.
 
     Returns:
         (V, 3) metres, in the thing's own frame; each vertex is of a beam.
@@ -98,11 +100,7 @@ def between_beams(
     limit = min(stretch * float(np.median(edges)), longest)
     kept = edges.max(axis=1) <= limit
     if deepest > 0.0:
-        sight = points[faces].mean(axis=1) - place
-        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-        deep = np.abs(np.einsum("nki,ni->nk", spans, sight))
-        across = np.sqrt(np.maximum(edges**2 - deep**2, 0.0))
-        kept |= (across.max(axis=1) <= limit) & (deep.max(axis=1) <= deepest)
+        kept |= _flat(spans, edges, points[faces].mean(axis=1) - place, limit, deepest)
     kept &= ~_passed(found, points, place, middle, others)
     faces = _towards(points, faces[kept], place)
     if not len(faces):
@@ -110,6 +108,16 @@ def between_beams(
     used, number = np.unique(faces, return_inverse=True)
     faces = number.reshape(-1, 3).astype(np.int32)
     return Mesh(_smoothed(points[used], faces, place), faces)
+
+
+def _flat(spans: Float, edges: Float, sight: Float, limit: float, deepest: float) -> Bool:
+    """(m,) whether triangles are short as they are seen, and long along the line of sight only."""
+    sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
+    deep = np.abs(np.einsum("nki,ni->nk", spans, sight))
+    across = np.sqrt(np.maximum(edges**2 - deep**2, 0.0)).max(axis=1)
+    return np.asarray(
+        (across <= limit) & (deep.max(axis=1) <= np.minimum(deepest, _STEEPEST * across))
+    )
 
 
 def _nothing() -> Mesh:

@@ -1,27 +1,37 @@
 """Models of what moved (Sect. 4.5): what ended on a thing, in its own frame, as a surface."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.models.frames import Way
-from stillmap.models.moments import Look, best_moment, between_beams
+from stillmap.models.looks import DEEPEST, Glimpse, between, look_at, surface_of
+from stillmap.models.moments import best_moment
 from stillmap.models.options import MoverOptions
-from stillmap.models.own import SPACING, Moves, about_as, grown, look_of, scans_about, seconds_of
+from stillmap.models.own import Moves
 from stillmap.models.sources import Sources
+from stillmap.models.together import Sweep, apart, motion_of, pose
 from stillmap.models.wholes import Followed
-from stillmap.surface.extraction import without_islands
+from stillmap.surface.building import fused
 from stillmap.surface.mesh import Mesh
+from stillmap.surface.options import SurfaceOptions
+from stillmap.surface.patches import Patch
+from stillmap.texture.things import Thing
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_DEEPEST = 3.0  # m, the side of a car from its middle to its end
-_AROUND = 0.03  # s, in which a scan sees the rest of a car
-_MOSTLY = 0.1  # of what hangs together is of a track: else another one follows it
+_FINEST, _COARSEST = 0.03, 0.06  # m, edges of voxels
+_OF_SPACING = 0.7  # of how far beams lie apart
+_BEFORE, _BEHIND = 6.0, 5.0  # voxels about a surface: looks are a few of them apart
+_SEEN_TWICE = 1.5  # looks that a voxel must be of, where there are many
+_OF_LOOKS = 0.4  # or this share of them, where there are few
+_DEEP = 1.0  # m along the line of sight that one look of several may bridge
+_TOLD = 100  # points of the best look: of fewer nobody can tell how others lie on it
+_MOST = 0.5  # of the looks must fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +77,7 @@ def shape_of(
         return None
     scans, seconds = sources.seen.scans_of(moves.beam[own]), moves.seconds[own]
     fast = any(one.fast for one in followed)
+    rigid = fast or any(one.large for one in followed)
     # who is seen by few beams is looked at longer
     for moment in (options.sweep, 2.0 * options.sweep) if moves.planar else (0.0,):
         span = best_moment(seconds, scans, moment, options.near, pictures)
@@ -75,77 +86,125 @@ def shape_of(
         look = look_at(own, span, way, fast, sources, moves, options)
         if look is None:
             continue
-        mesh = surface_of_look(look, fast or any(one.large for one in followed), options)
-        if mesh.areas().sum() >= options.least:
-            return Shape(one.object.id, mesh, way, False, 0.5 * sum(look.span), look.span)
+        mesh = surface_of(look, rigid, DEEPEST, options)
+        if mesh.areas().sum() < options.least:
+            continue
+        now = 0.5 * sum(look.span)
+        if rigid and not moves.planar and len(mesh.vertices) >= _TOLD:
+            whole = _put_together(one, own, now, fast, sources, moves, options)
+            if whole is not None:
+                return whole
+        return Shape(one.object.id, mesh, way, False, now, look.span)
     return None
 
 
-class Glimpse(NamedTuple):
-    """What one look saw of a thing.
-
-    Attributes:
-        own: beams that ended on it, in its own frame.
-        others: those about then that did not.
-        span: s, from the first to the last.
-    """
-
-    own: Look
-    others: Look
-    span: tuple[float, float]
-
-
-def look_at(
+def _put_together(
+    one: Followed,
     own: Index,
-    span: tuple[float, float],
+    now: float,
+    fast: bool,
+    sources: Sources,
+    moves: Moves,
+    options: MoverOptions,
+) -> Shape | None:
+    """What the looks about a time saw of a rigid thing; None: they do not lie over each other."""
+    way = Way.of_track(straight(one.thing, now, options.together))
+    looks = _looks(own, now, way, fast, sources, moves, options)
+    sweeps = [_sweep(look, now, options) for look in looks]
+    if len(sweeps) < 2:
+        return None
+    best = int(np.argmin([abs(sweep.later) for sweep in sweeps]))
+    motion = motion_of(sweeps, best)
+    moved = [sweep.moved(motion) for sweep in sweeps]
+    kept = [
+        k
+        for k, sweep in enumerate(moved)
+        if k == best or apart(sweep, moved[best]) <= options.blurred
+    ]
+    if len(kept) < max(2.0, _MOST * len(sweeps)):
+        return None
+    mesh = _fused([moved[k].patch() for k in kept], options)
+    if mesh.areas().sum() < options.least:
+        return None
+    later = np.array([sweeps[k].later for k in kept])
+    offset = np.array([_in_plane(*pose(motion, t)) for t in later.tolist()])
+    span = min(looks[k].span[0] for k in kept), max(looks[k].span[1] for k in kept)
+    return Shape(one.object.id, mesh, Way(way.thing, now + later, offset), True, now, span)
+
+
+def _looks(
+    own: Index,
+    now: float,
     way: Way,
     fast: bool,
     sources: Sources,
     moves: Moves,
     options: MoverOptions,
-) -> Glimpse | None:
-    """What was seen of a thing at a time; None where that is of another one for the most part."""
-    around = _AROUND if fast else 0.0
-    first, last = span[0] - around, span[1] + around
-    scans = scans_about(first, last, sources)
-    offset = sources.seen.offset
-    beams = np.arange(offset[scans.start], offset[scans.stop])
-    seconds = seconds_of(beams, sources)
-    then = (seconds >= first) & (seconds <= last)
-    beams, seconds = beams[then], seconds[then]
-    mine = _between(own, moves.seconds, first, last)
-    if fast:
-        about = moves.between(int(beams[0]), int(beams[-1]) + 1)
-        every = _between(np.arange(about.start, about.stop), moves.seconds, first, last)
-        place = look_of(beams[:1], seconds[:1], way, sources).origin[0]
-        whole = grown(mine, every, way, place, moves, options)
-        if len(mine) < _MOSTLY * len(whole):
-            return None
-        mine = whole
-        span = float(moves.seconds[mine].min()), float(moves.seconds[mine].max())
-    seen = look_of(moves.beam[mine], moves.seconds[mine], way, sources)
-    beside = ~np.isin(beams, moves.beam[mine], assume_unique=True)
-    beams, seconds = beams[beside], seconds[beside]
-    near = about_as(moves.beam[mine], beams, sources)
-    return Glimpse(seen, look_of(beams[near], seconds[near], way, sources), span)
+) -> list[Glimpse]:
+    """At a thing about a time, one in each scan."""
+    near = between(own, moves.seconds, now - options.together, now + options.together)
+    scan = sources.seen.scans_of(moves.beam[near])
+    out = []
+    for part in np.split(near, np.flatnonzero(np.diff(scan)) + 1):
+        if len(part):
+            seconds = moves.seconds[part]
+            span = float(seconds.min()), float(seconds.max())
+            look = look_at(own, span, way, fast, sources, moves, options)
+            out += [look] if look is not None else []
+    return out
 
 
-def surface_of_look(look: Glimpse, rigid: bool, options: MoverOptions) -> Mesh:
-    """Triangles between its beams."""
-    stretch, longest, deepest = options.stretch, options.longest, 0.0
-    if rigid:  # its sides are seen at flat angles
-        away = np.linalg.norm(look.own.points - look.own.origin, axis=1)
-        stretch, longest = np.inf, max(longest, SPACING * float(np.median(away)))
-        deepest = _DEEPEST
-    mesh = between_beams(look.own, look.others, stretch, longest, deepest)
-    return without_islands(mesh, options.island)
+def _sweep(look: Glimpse, now: float, options: MoverOptions) -> Sweep:
+    mesh = surface_of(look, True, _DEEP, options)
+    return Sweep.of(mesh, look.own.origin.mean(axis=0), 0.5 * sum(look.span) - now)
+
+
+def _in_plane(R: Float, t: Float) -> list[float]:
+    """Metres ahead and to the left, rad to the left."""
+    return [float(t[0]), float(t[1]), float(np.arctan2(R[1, 0], R[0, 0]))]
+
+
+def _fused(patches: Sequence[Patch], options: MoverOptions) -> Mesh:
+    """One surface of several looks'."""
+    voxel = options.voxel or voxel_for(patches)
+    limits = SurfaceOptions(
+        before=_BEFORE,
+        behind=_BEHIND,
+        fewest=min(_SEEN_TWICE, _OF_LOOKS * len(patches)),
+        island=options.island,
+    )
+    weighed = [(patch, np.ones(len(patch.faces), np.float32)) for patch in patches]
+    return fused(weighed, voxel, limits)
+
+
+def voxel_for(patches: Sequence[Patch]) -> float:
+    """Metres: a little less than beams lie apart on a thing, within bounds."""
+    edges = [np.zeros(0)]
+    for patch in patches:
+        corners = patch.points[patch.faces]
+        edges.append(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).ravel())
+    all_edges = np.concatenate(edges)
+    apart = float(np.median(all_edges)) if len(all_edges) else _FINEST
+    return float(np.clip(_OF_SPACING * apart, _FINEST, _COARSEST))
+
+
+def straight(thing: Thing, now: float, reach: float) -> Thing:
+    """The same, going on evenly as it does at a time, from `reach` seconds before to after."""
+    box = thing.box
+    seconds = np.array([now - reach, now + reach])
+    velocity = np.array([np.interp(now, box.seconds, column) for column in box.velocity.T])
+    at = int(np.clip(np.searchsorted(box.seconds, now, side="right") - 1, 0, None))
+    even = dataclasses.replace(
+        box,
+        seconds=seconds,
+        xy=box.middle(np.array([now])) + (seconds - now)[:, None] * velocity,
+        ahead=np.tile(box.ahead[at], (2, 1)),
+        velocity=np.tile(velocity, (2, 1)),
+    )
+    return Thing(even, np.full(2, np.interp(now, box.seconds, thing.foot)), thing.tall)
 
 
 def _most_seen(followed: Sequence[Followed], moves: Moves, span: tuple[float, float]) -> Followed:
     """Of some objects the one that most beams met at a time."""
-    count = [len(_between(one.own, moves.seconds, *span)) for one in followed]
+    count = [len(between(one.own, moves.seconds, *span)) for one in followed]
     return followed[int(np.argmax(count))]
-
-
-def _between(some: Index, seconds: Float, first: float, last: float) -> Index:
-    return some[(seconds[some] >= first) & (seconds[some] <= last)]

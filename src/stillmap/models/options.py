@@ -21,8 +21,8 @@ class MoverOptions:
     rigid: float = field_with_doc(
         1.2, "m, things at least so long or wide are no people, and keep their shape"
     )
-    together: bool = field_with_doc(
-        False, "put together all that was seen of these, in place of what one look saw: slower"
+    together: float = field_with_doc(
+        0.5, "s before and after the best look at these, of which all looks are put together"
     )
     blurred: float = field_with_doc(
         0.05, "m, by which what was seen of one then may lie off itself; else a moment of it counts"

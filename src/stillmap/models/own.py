@@ -154,6 +154,8 @@ def grown(
     at = way.local(moves.seconds[within], moves.ends[within])
     some = (at[:, 2] > options.low) & (np.linalg.norm(at[:, :2], axis=1) <= _CAR)
     within, at = within[some], at[some]
+    there = way.local(moves.seconds[own], moves.ends[own])
+    own = own[np.linalg.norm(there[:, :2], axis=1) <= _CAR]
     if not len(within):
         return own
     away = float(np.median(np.linalg.norm(at - place, axis=1)))
