@@ -101,7 +101,7 @@ def _shape(sources: Sources, options: MoverOptions) -> Shape:
     moves = Moves.of(sources)
     followed = followed_of(sources, moves, options)
     (whole,) = wholes_of(followed, moves, sources, options)
-    shape = shape_of(whole, sources, moves, options, np.zeros(0))
+    shape = shape_of(whole, sources, moves, options, [np.zeros(0)] * len(whole))
     assert shape is not None
     return shape
 

@@ -53,7 +53,7 @@ def test_one_model_shows_all_of_a_car_that_was_followed_in_parts() -> None:
     moves = Moves.of(sources)
     followed = followed_of(sources, moves, OPTIONS)
     (whole,) = wholes_of(followed, moves, sources, OPTIONS)
-    shape = shape_of(whole, sources, moves, OPTIONS, np.zeros(0))
+    shape = shape_of(whole, sources, moves, OPTIONS, [np.zeros(0)] * len(whole))
     assert shape is not None
     assert shape.id in (0, 1)
     T = shape.way.T_map_object(shape.seconds)

@@ -188,8 +188,8 @@ def _mover(
 ) -> MoverModel | None:
     """The model of what was followed as one or more objects; None where too little was seen."""
     start = sources.start_ns
-    seconds = np.concatenate([when_in_view(one.thing, views, start) for one in whole])
-    shown = np.unique(seconds[np.isfinite(seconds)])
+    seconds = [when_in_view(one.thing, views, start) for one in whole]
+    shown = [some[np.isfinite(some)] for some in seconds]
     shape = shape_of(whole, sources, moves, options.objects, shown)
     if shape is None:
         return None

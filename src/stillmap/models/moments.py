@@ -44,8 +44,8 @@ class Look(NamedTuple):
 
 def best_moment(
     seconds: Float, look: Index, moment: float, near: float, pictures: Float
-) -> tuple[float, float]:
-    """From when to when most beams met a thing; rather where a picture is.
+) -> tuple[float, float, float]:
+    """From when to when most beams met a thing, rather where a picture is; and how good that is.
 
     Args:
         seconds: (n,) when beams met it, n > 0.
@@ -67,7 +67,7 @@ def best_moment(
         away = np.abs(0.5 * (first + last)[:, None] - pictures).min(axis=1)
         value = value / (1.0 + np.minimum(4.0 * away / max(near, 1e-9), 4.0))
     best = int(np.argmax(value))
-    return float(first[best]), float(last[best])
+    return float(first[best]), float(last[best]), float(value[best])
 
 
 def between_beams(

@@ -61,7 +61,7 @@ def shape_of(
     sources: Sources,
     moves: Moves,
     options: MoverOptions,
-    pictures: Float,
+    pictures: Sequence[Float],
 ) -> Shape | None:
     """The surface of something that moved; None where too little of it was seen.
 
@@ -70,18 +70,16 @@ def shape_of(
         sources: the beams.
         moves: those on what moves.
         options: see MoverOptions.
-        pictures: (N,) s, when pictures show it, by the time of its box.
+        pictures: of each (N,) s, when pictures show it, by the time of its box.
     """
     own = np.unique(np.concatenate([one.own for one in followed]))
     if not len(own):
         return None
-    scans, seconds = sources.seen.scans_of(moves.beam[own]), moves.seconds[own]
     fast = any(one.fast for one in followed)
     rigid = fast or any(one.large for one in followed)
     # who is seen by few beams is looked at longer
     for moment in (options.sweep, 2.0 * options.sweep) if moves.planar else (0.0,):
-        span = best_moment(seconds, scans, moment, options.near, pictures)
-        one = _most_seen(followed, moves, span)
+        one, span = _best(followed, pictures, moment, sources, moves, options)
         way = Way.of_track(one.thing)
         look = look_at(own, span, way, fast, sources, moves, options)
         if look is None:
@@ -204,7 +202,19 @@ def straight(thing: Thing, now: float, reach: float) -> Thing:
     return Thing(even, np.full(2, np.interp(now, box.seconds, thing.foot)), thing.tall)
 
 
-def _most_seen(followed: Sequence[Followed], moves: Moves, span: tuple[float, float]) -> Followed:
-    """Of some objects the one that most beams met at a time."""
-    count = [len(between(one.own, moves.seconds, *span)) for one in followed]
-    return followed[int(np.argmax(count))]
+def _best(
+    followed: Sequence[Followed],
+    pictures: Sequence[Float],
+    moment: float,
+    sources: Sources,
+    moves: Moves,
+    options: MoverOptions,
+) -> tuple[Followed, tuple[float, float]]:
+    """Which of some objects is seen best, and when."""
+    found = []
+    for one, shown in zip(followed, pictures, strict=True):
+        if len(one.own):
+            scans, seconds = sources.seen.scans_of(moves.beam[one.own]), moves.seconds[one.own]
+            found.append((one, best_moment(seconds, scans, moment, options.near, shown)))
+    one, (first, last, _) = max(found, key=lambda each: each[1][2])
+    return one, (first, last)
