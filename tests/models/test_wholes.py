@@ -33,7 +33,7 @@ def test_cars_one_behind_the_other_and_beside_are_two() -> None:
 
 
 def test_cars_that_pass_each_other_are_two() -> None:
-    passing = [Car((8.0, -1.5), (6.0, 0.0)), Car((14.0, 0.8), (-6.0, 0.0))]
+    passing = [Car((8.0, -1.5), (6.0, 0.0)), Car((14.0, 1.5), (-6.0, 0.0))]
     assert _wholes(street(passing, [Part(0), Part(1)])) == [[0], [1]]
 
 

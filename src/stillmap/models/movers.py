@@ -30,8 +30,8 @@ _BEFORE, _BEHIND = 6.0, 5.0  # voxels about a surface: looks are a few of them a
 _SEEN_TWICE = 1.5  # looks that a voxel must be of, where there are many
 _OF_LOOKS = 0.4  # or this share of them, where there are few
 _DEEP = 1.0  # m along the line of sight that one look of several may bridge
-_TOLD = 100  # points of the best look: of fewer nobody can tell how others lie on it
-_MOST = 0.5  # of the looks must fit
+_TOLD = 200  # points of the best look: of fewer nobody can tell how others lie on it
+_MOST = 0.5  # of the looks must fit, and of the best one's area be there
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ def _put_together(
     if len(kept) < max(2.0, _MOST * len(sweeps)):
         return None
     mesh = _fused([moved[k].patch() for k in kept], options)
-    if mesh.areas().sum() < options.least:
+    if mesh.areas().sum() < max(options.least, _MOST * sweeps[best].mesh.areas().sum()):
         return None
     later = np.array([sweeps[k].later for k in kept])
     offset = np.array([_in_plane(*pose(motion, t)) for t in later.tolist()])

@@ -17,7 +17,13 @@ from stillmap.surface.patches import Patch
 
 Float = NDArray[np.float64]
 
+_GUESSES = (0.0, -1.0, 1.0, -2.0, 2.0, -3.0, 3.0, -4.0, 4.0, -5.0, 5.0, -6.0, 6.0)  # m/s
+_GUESSED = 500  # points of a look that tell which one is right
+_NEAR = 0.3  # m, farther points are as good as none
+_PER_SPEED = 0.002  # m for each m/s: where all are as good the track counts
+_FINER = (0.0, *(k * s / 10.0 for k in range(1, 11) for s in (-1.0, 1.0)))  # m/s
 _TRACK = (0.7, 0.4, 0.2, 0.2, 2.0, 1.0)  # what is known of `Motion` by its track
+_TOLD = (0.1, 0.4, 0.2, 0.2, 2.0, 1.0)  # and by the ends
 _SIGMA = 0.03  # m, by how much points lie off a surface
 _REACHES = (0.6, 0.3, 0.15)  # m, within which points are of the same place, round by round less
 _ROUNDS = 5  # with each of them
@@ -91,20 +97,66 @@ def motion_of(sweeps: Sequence[Sweep], best: int) -> Float:
         return motion
     tree = cKDTree(known.mesh.vertices)
     away = np.abs([one.later for one in sweeps])
+    beside = [sweeps[k] for k in (best - 1, best + 1) if 0 <= k < len(sweeps)]
+    others = [one for k, one in enumerate(sweeps) if k != best]
+    motion = guess = _ends_meet(beside, tree, motion, _GUESSES, _PER_SPEED)
     for part, reach in zip((0.4, 0.7, 1.0), _REACHES, strict=True):
-        some = [
-            one for k, one in enumerate(sweeps) if k != best and away[k] <= part * away.max() + 1e-9
-        ]
+        some = [one for one in others if abs(one.later) <= part * away.max() + 1e-9]
         for _ in range(_ROUNDS):
-            motion = _better(some, known, tree, motion, reach)
+            motion = _better(some, known, tree, motion, guess, _TRACK, reach)
+    guess = _ends_meet(others, tree, motion, _FINER, 0.0)
+    motion = guess
+    for _ in range(_ROUNDS):
+        motion = _better(others, known, tree, motion, guess, _TOLD, _REACHES[-1])
     return motion
 
 
-def _better(
-    sweeps: Sequence[Sweep], known: Sweep, tree: "cKDTree[None]", motion: Float, reach: float
+def _ends_meet(
+    sweeps: Sequence[Sweep],
+    tree: "cKDTree[None]",
+    motion: Float,
+    speeds: tuple[float, ...],
+    price: float,
 ) -> Float:
-    hold = np.diag(1.0 / np.square(_TRACK))
-    H, g = hold.copy(), hold @ motion
+    """The motion (6,) with another velocity ahead, if by that looks lie nearer to the best one.
+
+    Point to point, so that its ends tell, and not along its sides only. A track of a part of a car
+    may be wrong by half its velocity.
+
+    Args:
+        sweeps: the looks.
+        tree: the vertices of the best one.
+        motion: where to begin.
+        speeds: m/s that are tried beside, 0 the first of them.
+        price: m for each m/s: where all are as good the track counts.
+    """
+    worth = []
+    for speed in speeds:
+        tried = motion + np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
+        off = [np.zeros(0)]
+        for one in sweeps:
+            R, t = pose(tried, one.later)
+            every = max(1, len(one.mesh.vertices) // _GUESSED)
+            at = one.mesh.vertices[::every] @ R.T + t
+            off.append(np.asarray(tree.query(at, distance_upper_bound=_NEAR)[0]))
+        far = np.minimum(np.concatenate(off), _NEAR)
+        worth.append((float(far.mean()) if len(far) else 0.0) + price * abs(speed))
+    best = np.array([speeds[int(np.argmin(worth))], 0.0, 0.0, 0.0, 0.0, 0.0])
+    return np.asarray(motion + best)
+
+
+def _better(
+    sweeps: Sequence[Sweep],
+    known: Sweep,
+    tree: "cKDTree[None]",
+    motion: Float,
+    guess: Float,
+    sigma: tuple[float, ...],
+    reach: float,
+) -> Float:
+    """One step of Gauss and Newton from `motion`, held to `guess` by standard deviations."""
+    hold = np.diag(1.0 / np.square(sigma))
+    H, g = hold.copy(), hold @ (motion - guess)
     for one in sweeps:
         there = one.moved(motion)
         at, n, residual = _off(there, known, tree, reach)

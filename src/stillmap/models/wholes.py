@@ -20,9 +20,11 @@ Index = NDArray[np.intp]
 
 _LOOKS = 9  # times at which velocities are compared
 _MOSTLY = 0.5  # of scans: what hangs together so often is one
+_MUCH_MORE = 2.0  # times as many beams has that of which something is left over
 _ALIKE = 0.5  # of the faster one's speed may velocities differ
 _SLOW = 1.0  # m/s, or by that
 _NEAR = 10.0  # m, up to where beams are as near each other; then up to twice that, and so on
+_FLAT = 2.0  # times as far apart along the line of sight: sides of cars, at flat angles
 _CELLS = 3.0  # of so many edges is the way between what hangs together
 
 
@@ -120,7 +122,7 @@ def _left_over(scans: Sequence[_Scan], whole: Index, quick: Bool) -> Bool:
     less, times = np.zeros(len(whole), np.intp), np.zeros(len(whole), np.intp)
     for there, piece, beams in scans:
         mine = np.bincount(whole[there], beams)[whole[there]]
-        more = (piece[:, None] == piece) & quick[there] & (mine > mine[:, None])
+        more = (piece[:, None] == piece) & quick[there] & (mine > _MUCH_MORE * mine[:, None])
         less[there] += (more & (whole[there][:, None] != whole[there])).any(axis=1)
         times[there] += 1
     return (less >= _MOSTLY * times) & (times > 0)
@@ -141,7 +143,8 @@ def hanging_together(points: Float, place: Float, link: float) -> Index:
         reach = link + SPACING * far
         some = np.flatnonzero((away >= near - reach) & (away <= far + reach))
         if len(some):
-            piece = pieces_of_cells(points[some], reach / _CELLS, reach)
+            squeezed = place + (points[some] - place) * _squeeze(away[some], near, far)[:, None]
+            piece = pieces_of_cells(squeezed, reach / _CELLS, reach)
             rows.append(some)
             columns.append(first + piece)
             first += int(piece.max()) + 1
@@ -149,6 +152,15 @@ def hanging_together(points: Float, place: Float, link: float) -> Index:
     row, column = np.concatenate(rows), np.concatenate(columns)
     graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), (first, first))
     return np.asarray(connected_components(graph, directed=False)[1][:n], np.intp)
+
+
+def _squeeze(away: Float, near: float, far: float) -> Float:
+    """(n,) by how much points have to come nearer to lie `_FLAT` times as close in range.
+
+    Across the line of sight they stay as far apart as they are, halfway between two ranges.
+    """
+    halfway = 0.5 * (near + far)
+    return (halfway + (away - halfway) / _FLAT) / np.maximum(away, 1e-9)
 
 
 def _alike(one: Followed, other: Followed) -> bool:
