@@ -22,10 +22,10 @@ class MoverOptions:
         1.2, "m, things at least so long or wide are no people, and keep their shape"
     )
     together: float = field_with_doc(
-        0.5, "s before and after the best look at these, of which all looks are put together"
+        0.5, "s before and after the best look at these, from which all looks are put together"
     )
     blurred: float = field_with_doc(
-        0.05, "m, by which what was seen of one then may lie off itself; else a moment of it counts"
+        0.05, "m, looks that lie farther off the best one are left out; most: it counts alone"
     )
     fast: float = field_with_doc(
         2.0, "m/s, what is faster is no person: what moves and hangs together with it is its own"
@@ -63,6 +63,7 @@ _LIMITS = (
     ("margin", 0.0, 10.0),
     ("low", -10.0, 10.0),
     ("rigid", 0.0, 1000.0),
+    ("together", 0.0, 10.0),
     ("blurred", 0.0, 1000.0),
     ("link", 0.0, 1000.0),
     ("fast", 0.0, 1000.0),
