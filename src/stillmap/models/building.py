@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 from stillmap.extras import extra
 from stillmap.models.movers import Shape, shape_of
 from stillmap.models.options import MeshOptions
+from stillmap.models.own import Moves
 from stillmap.models.painting import Ahead, Dressed, dressed, when_in_view
 from stillmap.models.place import Painted, painted
 from stillmap.models.sources import Sources
 from stillmap.models.tinting import Tints, tinted
-from stillmap.objects import MovingObject
+from stillmap.models.wholes import Followed, followed_of, wholes_of
 from stillmap.pipeline import Progress, silent
 from stillmap.recording.images import Images
 from stillmap.stages import Stages
 from stillmap.surface.building import surface_of
 from stillmap.texture.baking import baked
 from stillmap.texture.textured import Textured, replaced
-from stillmap.texture.things import Thing
 from stillmap.texture.view import View
 from stillmap.texture.views import views_of
 
@@ -174,38 +174,40 @@ def _movers(
     options: MeshOptions,
     tell: Callable[[int, int], None],
 ) -> list[MoverModel]:
-    things = {thing.box.thing: thing for thing in sources.things}
     ahead = Ahead(place.mesh, views, options.texture.visible)
+    moves = Moves.of(sources)
+    followed = followed_of(sources, moves, options.objects)
+    wholes = wholes_of(followed, moves, sources, options.objects)
     out = []
-    for number, one in enumerate(sources.objects):
-        if one.id in things:
-            model = _mover(one, things[one.id], sources, views, ahead, options)
-            if model is not None:
-                out.append(model)
-        tell(number + 1, len(sources.objects))
-    return out
+    for number, whole in enumerate(wholes):
+        model = _mover(whole, sources, moves, views, ahead, options)
+        if model is not None:
+            out.append(model)
+        tell(number + 1, len(wholes))
+    return sorted(out, key=lambda model: model.shape.id)
 
 
 def _mover(
-    one: MovingObject,
-    thing: Thing,
+    whole: Sequence[Followed],
     sources: Sources,
+    moves: Moves,
     views: Sequence[View],
     place: Ahead,
     options: MeshOptions,
 ) -> MoverModel | None:
-    """The model of one object; None where too little of it was seen."""
+    """The model of what was followed as one or more objects; None where too little was seen."""
     start = sources.start_ns
-    seconds = when_in_view(thing, views, start)
-    shown = seconds[np.isfinite(seconds)]
-    shape = shape_of(one, thing, sources, options.objects, options.surface, shown)
+    seconds = [when_in_view(one.thing, views, start) for one in whole]
+    shown = [some[np.isfinite(some)] for some in seconds]
+    shape = shape_of(whole, sources, moves, options.objects, shown)
     if shape is None:
         return None
+    parts = {one.object.id for one in whole if one.object.id != shape.id}
     dress = dressed(
         shape,
         views,
         place,
-        sources.things,
+        [thing for thing in sources.things if thing.box.thing not in parts],
         start,
         options.objects,
         options.choice,

@@ -15,9 +15,11 @@ from stillmap.surface.mesh import Mesh
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
+Bool = NDArray[np.bool_]
 
 _AHEAD = 0.2  # cosine from the middle of a thing, up to which it is seen at once
 _PASSED = 0.25  # m beyond a triangle, from where on a beam passed by
+_STEEPEST = 8.0  # times as long along the line of sight as across
 _ROUNDS = 2  # of smoothing
 _OWN = 0.5  # of its range that a beam keeps in a round
 _STEP = 0.08  # m in range between neighbours that are smoothed together
@@ -42,8 +44,8 @@ class Look(NamedTuple):
 
 def best_moment(
     seconds: Float, look: Index, moment: float, near: float, pictures: Float
-) -> tuple[float, float]:
-    """From when to when most beams met a thing; rather where a picture is.
+) -> tuple[float, float, float]:
+    """From when to when most beams met a thing, rather where a picture is; and how good that is.
 
     Args:
         seconds: (n,) when beams met it, n > 0.
@@ -65,10 +67,12 @@ def best_moment(
         away = np.abs(0.5 * (first + last)[:, None] - pictures).min(axis=1)
         value = value / (1.0 + np.minimum(4.0 * away / max(near, 1e-9), 4.0))
     best = int(np.argmax(value))
-    return float(first[best]), float(last[best])
+    return float(first[best]), float(last[best]), float(value[best])
 
 
-def between_beams(own: Look, others: Look, stretch: float, longest: float) -> Mesh:
+def between_beams(
+    own: Look, others: Look, stretch: float, longest: float, deepest: float = 0.0
+) -> Mesh:
     """The surface between beams that met a thing, as seen from the middle of where they came from.
 
     Args:
@@ -76,6 +80,7 @@ def between_beams(own: Look, others: Look, stretch: float, longest: float) -> Me
         others: beams about then that did not; NaN where nobody knows how far they went.
         stretch: times as long as usual may an edge be.
         longest: metres, an edge at most.
+        deepest: metres along the line of sight: at flat angles an edge may be so long.
 
     Returns:
         (V, 3) metres, in the thing's own frame; each vertex is of a beam.
@@ -90,15 +95,29 @@ def between_beams(own: Look, others: Look, stretch: float, longest: float) -> Me
     except (QhullError, ValueError):  # all in one line
         return _nothing()
     faces = found.simplices
-    edges = np.linalg.norm(points[faces] - points[np.roll(faces, 1, axis=1)], axis=2)
+    spans = points[faces] - points[np.roll(faces, 1, axis=1)]
+    edges = np.linalg.norm(spans, axis=2)
     limit = min(stretch * float(np.median(edges)), longest)
-    kept = (edges.max(axis=1) <= limit) & ~_passed(found, points, place, middle, others)
+    kept = edges.max(axis=1) <= limit
+    if deepest > 0.0:
+        kept |= _flat(spans, edges, points[faces].mean(axis=1) - place, limit, deepest)
+    kept &= ~_passed(found, points, place, middle, others)
     faces = _towards(points, faces[kept], place)
     if not len(faces):
         return _nothing()
     used, number = np.unique(faces, return_inverse=True)
     faces = number.reshape(-1, 3).astype(np.int32)
     return Mesh(_smoothed(points[used], faces, place), faces)
+
+
+def _flat(spans: Float, edges: Float, sight: Float, limit: float, deepest: float) -> Bool:
+    """(m,) whether triangles are short as they are seen, and long along the line of sight only."""
+    sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
+    deep = np.abs(np.einsum("nki,ni->nk", spans, sight))
+    across = np.sqrt(np.maximum(edges**2 - deep**2, 0.0)).max(axis=1)
+    return np.asarray(
+        (across <= limit) & (deep.max(axis=1) <= np.minimum(deepest, _STEEPEST * across))
+    )
 
 
 def _nothing() -> Mesh:

@@ -18,12 +18,14 @@ class MoverOptions:
     )
     margin: float = field_with_doc(0.15, "m around a thing's box, within which beams are its own")
     low: float = field_with_doc(0.03, "m above the ground: what is lower is the ground's")
-    rigid: float = field_with_doc(1.5, "m, things at least so long keep their shape")
-    together: bool = field_with_doc(
-        False, "put together all that was seen of these, in place of what one look saw: slower"
+    rigid: float = field_with_doc(
+        1.2, "m, things at least so long or wide are no people, and keep their shape"
+    )
+    together: float = field_with_doc(
+        0.5, "s before and after the best look at these, from which all looks are put together"
     )
     blurred: float = field_with_doc(
-        0.05, "m, by which what was seen of one then may lie off itself; else a moment of it counts"
+        0.05, "m, looks that lie farther off the best one are left out; most: it counts alone"
     )
     fast: float = field_with_doc(
         2.0, "m/s, what is faster is no person: what moves and hangs together with it is its own"
@@ -61,6 +63,7 @@ _LIMITS = (
     ("margin", 0.0, 10.0),
     ("low", -10.0, 10.0),
     ("rigid", 0.0, 1000.0),
+    ("together", 0.0, 10.0),
     ("blurred", 0.0, 1000.0),
     ("link", 0.0, 1000.0),
     ("fast", 0.0, 1000.0),

@@ -1,6 +1,5 @@
 """Which beams met a thing that moves, and these in its own frame."""
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -14,124 +13,217 @@ from stillmap.models.moments import Look
 from stillmap.models.options import MoverOptions
 from stillmap.models.sources import Sources
 from stillmap.objects import MovingObject
-from stillmap.recording.model import Recording
-from stillmap.recording.stamps import beam_ns
+from stillmap.surface import rows
 from stillmap.texture.things import Thing
 
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Index = NDArray[np.intp]
 
+NOBODY = -1
 _DYNAMIC = 0.5
 _FAR = 1000.0  # m
+_OFTEN = 0.9  # of the time something is not faster
+_REACH = 3.0  # m, from the middle of a car to its ends
 _CAR = 6.0  # m, from one end of it to the other
 _CELL = 0.2  # m, in which one point is enough
+_ASKED = 9  # scans that tell whether they are planar
+_BESIDE = 2  # scans before and after a time in which beams may be of it
+_BEYOND = 0.05  # rad beyond a thing, up to where beams are beside it
 SPACING = 0.025  # rad between beams, at most
 
 
-class First(NamedTuple):
-    """Where a part of a recording begins in it, and when its beams were taken.
+class Moves(NamedTuple):
+    """The K beams of a recording that ended on what moves.
 
     Attributes:
-        scan, beam: numbers of its first ones.
-        seconds: (n,) of its beams, by the time of boxes.
+        beam: (K,) their numbers, rising.
+        seconds: (K,) when they were taken, by the time of boxes.
+        ends: (K, 3) metres in the map frame.
+        owner: (K,) the object that each is of; -1: none.
+        dynamic: (K,) whether it is rather dynamic than static; what has an owner may be not.
+        planar: whether scans are rows.
     """
 
-    scan: int
-    beam: int
+    beam: Index
     seconds: Float
+    ends: Float
+    owner: NDArray[np.int32]
+    dynamic: Bool
+    planar: bool
+
+    @classmethod
+    def of(cls, sources: Sources) -> "Moves":
+        """All that moves, once for all things."""
+        seen = sources.seen
+        dynamic = seen.hit & (sources.p_static < _DYNAMIC)
+        owner = np.full(seen.n_beams, NOBODY, np.int32)
+        for one in sources.objects:
+            owner[one.beams] = one.id
+        beam = np.flatnonzero(dynamic | (owner != NOBODY))
+        seconds = seconds_of(beam, sources)
+        ends = seen.end_points(beam, sources.poses)
+        asked = np.unique(np.linspace(0, seen.n_scans - 1, min(seen.n_scans, _ASKED)).astype(int))
+        planar = [rows.is_planar(rows.directions(seen.points[seen.beams_of(t)])) for t in asked]
+        return cls(beam, seconds, ends, owner[beam], dynamic[beam], 2 * sum(planar) > len(planar))
+
+    def between(self, first: int, last: int) -> slice:
+        """Those with numbers from the first to before the last."""
+        a, b = np.searchsorted(self.beam, [first, last])
+        return slice(int(a), int(b))
 
 
-def own_beams(
-    one: MovingObject, thing: Thing, sources: Sources, options: MoverOptions
-) -> tuple[Recording, First]:
-    """The scans that saw a thing, in which only what ended on it is a hit.
+def seconds_of(beams: Index, sources: Sources) -> Float:
+    """(n,) when beams (n,), rising, were taken, by the time of boxes."""
+    recording = sources.recording
+    times = recording.stamp_ns[recording.scans_of(beams)]
+    if recording.beam_time is not None:
+        times = times + np.round(1e9 * recording.beam_time[beams].astype(np.float64)).astype(int)
+    return np.asarray(1e-9 * (times - sources.start_ns), np.float64)
+
+
+def scans_about(first: float, last: float, sources: Sources) -> slice:
+    """The scans that have beams of these times, and some others beside."""
+    stamps = 1e-9 * (sources.seen.stamp_ns - sources.start_ns)
+    a = int(np.searchsorted(stamps, first)) - _BESIDE
+    b = int(np.searchsorted(stamps, last, side="right")) + _BESIDE
+    return slice(max(a, 0), min(b, len(stamps)))
+
+
+def fast(thing: Thing, options: MoverOptions) -> bool:
+    """Whether it is faster than people are."""
+    speed = np.linalg.norm(thing.box.velocity, axis=1)
+    return bool(np.quantile(speed, _OFTEN) > options.fast)
+
+
+def large(thing: Thing, options: MoverOptions) -> bool:
+    """Whether it is longer or wider than people are."""
+    return 2.0 * max(thing.box.half) >= options.rigid
+
+
+def own_moves(
+    one: MovingObject, thing: Thing, moves: Moves, sources: Sources, options: MoverOptions
+) -> Index:
+    """(n,) of what moves that which ended on a thing: rising numbers within `moves`.
 
     That is what is rather dynamic than static, in the box around it, and of no other thing.
     """
-    seen, box = sources.seen, thing.box
-    stamps = 1e-9 * (seen.stamp_ns - sources.start_ns)
+    box, offset = thing.box, sources.seen.offset
+    stamps = 1e-9 * (sources.seen.stamp_ns - sources.start_ns)
     a = int(np.searchsorted(stamps, box.seconds[0] - box.hold))
     b = max(int(np.searchsorted(stamps, box.seconds[-1] + box.hold, side="right")), a)
-    scans, beams = slice(a, b), slice(int(seen.offset[a]), int(seen.offset[b]))
-    seconds = np.asarray(1e-9 * (beam_ns(sources.recording, scans) - sources.start_ns), np.float64)
-    own = np.zeros(beams.stop - beams.start, np.bool_)
-    moves = np.flatnonzero(seen.hit[beams] & (sources.p_static[beams] < _DYNAMIC))
-    ends = seen.end_points(beams.start + moves, sources.poses)
-    at = Way.of_track(thing).local(seconds[moves], ends)
+    some = moves.between(int(offset[a]), int(offset[b]))
     half = np.array(box.half) + options.margin
+    # what is far from all of its way need not be asked where it was then
+    reach = max(float(np.linalg.norm(half)) + options.margin, _REACH)
+    way = box.middle(np.concatenate([box.seconds, box.seconds[[0, -1]] + [-box.hold, box.hold]]))
+    low, high = way.min(axis=0) - reach, way.max(axis=0) + reach
+    x, y = moves.ends[some, 0], moves.ends[some, 1]
+    near = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
+    near &= (moves.owner[some] == one.id) | (moves.owner[some] == NOBODY)
+    number = some.start + np.flatnonzero(near)
+    at = Way.of_track(thing).local(moves.seconds[number], moves.ends[number])
     inside = (np.abs(at[:, :2]) <= half).all(axis=1)
     inside &= (at[:, 2] > options.low) & (at[:, 2] <= thing.tall + options.margin)
-    own[moves[inside]] = True
-    for other in sources.objects:
-        if other.id != one.id:
-            theirs = other.beams[np.searchsorted(other.beams, beams.start) :]
-            theirs = theirs[: np.searchsorted(theirs, beams.stop)]
-            own[theirs - beams.start] = False
-    mine = one.beams[(one.beams >= beams.start) & (one.beams < beams.stop)]
-    at = Way.of_track(thing).local(
-        seconds[mine - beams.start], seen.end_points(mine, sources.poses)
-    )
     # a track of somebody may take hold of who stands beside
-    near = (np.abs(at[:, :2]) <= half + options.margin).all(axis=1)
-    own[mine - beams.start] = near | (options.together and 2.0 * thing.box.half[0] >= options.rigid)
-    part = dataclasses.replace(
-        seen,
-        stamp_ns=seen.stamp_ns[scans],
-        offset=seen.offset[a : b + 1] - seen.offset[a],
-        points=np.asarray(seen.points[beams]),
-        hit=own,
-        sensor=seen.sensor[scans],
-        T_odom_base=None,
-        T_recorded_base=None,
-        beam_time=None,
-        images=None,
-    )
-    return part, First(a, beams.start, seconds)
+    mine = (np.abs(at[:, :2]) <= half + options.margin).all(axis=1)
+    if large(thing, options) and not fast(thing, options):
+        # the middle of what is seen of it goes to and fro on it
+        mine = np.linalg.norm(at[:, :2], axis=1) <= _REACH
+    kept = np.where(moves.owner[number] == one.id, mine, inside)
+    return np.asarray(number[kept], np.intp)
 
 
 def grown(
-    beams: NDArray[np.intp],
-    mine: NDArray[np.bool_],
-    way: Way,
-    first: First,
-    sources: Sources,
-    options: MoverOptions,
-) -> NDArray[np.bool_]:
-    """(n,) which beams met a thing that is faster than people: all that move, and hang together.
+    own: Index, within: Index, way: Way, place: Float, moves: Moves, options: MoverOptions
+) -> Index:
+    """(n,) of what moves that which hangs together with what is known to be of a thing.
 
-    Parts of a car are often followed each on its own.
+    Of things that are faster than people all that moves beside them is theirs: parts of a car are
+    often followed each on its own.
+
+    Args:
+        own: numbers within `moves` that are known to be of it, rising.
+        within: rising numbers of all that may be.
+        way: where its own frame is.
+        place: (3,) metres in that frame, where the sensor was.
+        moves: all that moves.
+        options: see MoverOptions.
     """
-    number = first.beam + beams
-    moves = np.flatnonzero(sources.seen.hit[number] & (sources.p_static[number] < _DYNAMIC))
-    at = way.local(
-        first.seconds[beams[moves]], sources.seen.end_points(number[moves], sources.poses)
-    )
+    within = within[moves.dynamic[within]]
+    at = way.local(moves.seconds[within], moves.ends[within])
     some = (at[:, 2] > options.low) & (np.linalg.norm(at[:, :2], axis=1) <= _CAR)
-    moves, at = moves[some], at[some]
-    if not len(moves):
-        return mine
-    place = look_of(beams[:1], way, first, sources).origin[0]
+    within, at = within[some], at[some]
+    there = way.local(moves.seconds[own], moves.ends[own])
+    own = own[np.linalg.norm(there[:, :2], axis=1) <= _CAR]
+    if not len(within):
+        return own
     away = float(np.median(np.linalg.norm(at - place, axis=1)))
     link = options.link + SPACING * away
-    cells, of = np.unique(np.floor(at / _CELL), axis=0, return_inverse=True)
-    one, other = cKDTree(cells).query_pairs(link / _CELL, output_type="ndarray").T
+    piece = pieces_of_cells(at, _CELL, link)
+    mine = np.isin(within, own)
+    return np.union1d(own, within[np.isin(piece, piece[mine])])
+
+
+def pieces_of_cells(points: Float, edge: float, link: float) -> Index:
+    """(n,) which piece points (n, 3) are of: their cells are at most `link` metres apart."""
+    cells, of = distinct_cells(points, edge)
+    one, other = cKDTree(cells).query_pairs(link / edge, output_type="ndarray").T
     n = len(cells)
     graph = coo_matrix((np.ones(len(one), np.int8), (one, other)), (n, n))
-    piece = connected_components(graph, directed=False)[1][of.ravel()]
-    out = mine.copy()
-    out[moves[np.isin(piece, piece[mine[moves]])]] = True
-    return out
+    return np.asarray(connected_components(graph, directed=False)[1][of], np.intp)
 
 
-def look_of(beams: NDArray[np.intp], way: Way, first: First, sources: Sources) -> Look:
-    """Beams in a thing's own frame; those that came back from nowhere go on for a kilometre."""
-    seen, number = sources.seen, first.beam + beams
-    ends = seen.end_points(number, sources.poses)
-    scan = seen.scans_of(number)
+def distinct_cells(points: Float, edge: float) -> tuple[Float, Index]:
+    """(m, 3) the cells that points (n, 3) lie in, numbers along each axis, and (n,) whose is which.
+
+    Rising, as `np.unique` has them, which takes ten times as long for rows.
+    """
+    cells = np.floor(points / edge).astype(np.int64)
+    low = cells.min(axis=0)
+    x, y, z = (cells.max(axis=0) - low + 1).tolist()
+    if x * y * z >= 1 << 62:
+        raise ValueError("points: too far apart")
+    key = ((cells[:, 0] - low[0]) * y + cells[:, 1] - low[1]) * z + cells[:, 2] - low[2]
+    key, of = np.unique(key, return_inverse=True)
+    distinct = np.stack([key // (y * z), key // z % y, key % z], axis=1) + low
+    return distinct.astype(np.float64), of
+
+
+def look_of(beams: Index, seconds: Float, way: Way, sources: Sources) -> Look:
+    """Beams (n,), rising, taken at times (n,), in a thing's own frame.
+
+    Those that came back from nowhere go on for a kilometre.
+    """
+    seen = sources.seen
+    ends = seen.end_points(beams, sources.poses)
+    scan = seen.scans_of(beams)
     T = sources.poses[scan] @ seen.T_base_sensor[seen.sensor[scan]]
     origin = T[:, :3, 3]
     with np.errstate(invalid="ignore", divide="ignore"):
         far = origin + (ends - origin) * (
             _FAR / np.linalg.norm(ends - origin, axis=1, keepdims=True)
         )
-    ends = np.where(seen.hit[number][:, None], ends, far)
-    return Look.of(ends, origin, first.seconds[beams], way)
+    ends = np.where(seen.hit[beams][:, None], ends, far)
+    return Look.of(ends, origin, seconds, way)
+
+
+def about_as(mine: Index, beams: Index, sources: Sources) -> Bool:
+    """(n,) which of beams (n,) look about where others, n > 0, ended; unknown ones do not."""
+    seen = sources.seen
+    middle = seen.end_points(mine, sources.poses).mean(axis=0)
+    own, other = (_towards(middle, some, sources) for some in (mine, beams))
+    widest = np.arccos(np.clip(own.min(), -1.0, 1.0)) + _BEYOND
+    return np.asarray(other >= np.cos(min(float(widest), np.pi)))
+
+
+def _towards(middle: Float, beams: Index, sources: Sources) -> Float:
+    """(n,) cosine of the angle between beams and the way from the sensor to a place (3,)."""
+    seen = sources.seen
+    first, last = seen.scans_of(beams[[0, -1]]) if len(beams) else (0, -1)
+    scans = np.arange(first, last + 1)
+    T = sources.poses[scans] @ seen.T_base_sensor[seen.sensor[scans]]
+    axis = np.einsum("nji,nj->ni", T[:, :3, :3], middle - T[:, :3, 3])
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    looking = rows.directions(seen.points[beams])
+    return np.asarray(np.einsum("ni,ni->n", looking, axis[seen.scans_of(beams) - first]))

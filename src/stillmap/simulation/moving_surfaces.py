@@ -30,18 +30,20 @@ class Moving(NamedTuple):
         return np.flatnonzero(self.solids.mover == mover)
 
     def at(self, parts: NDArray[np.intp], stamp_ns: NDArray[np.int64] | int) -> Solids:
-        """Some parts at n times; between two scans they go on evenly."""
+        """Some parts at n times; between two scans, and during the last one, they go on evenly."""
         at_ns, last = np.atleast_1d(np.asarray(stamp_ns, np.int64)), len(self.stamp_ns) - 1
-        t = np.clip(np.searchsorted(self.stamp_ns, at_ns, side="right") - 1, 0, last)
+        t = np.clip(np.searchsorted(self.stamp_ns, at_ns, side="right") - 1, 0, max(last - 1, 0))
         after = np.minimum(t + 1, last)
         span, since = self.stamp_ns[after] - self.stamp_ns[t], at_ns - self.stamp_ns[t]
-        share = np.clip(since / np.where(span > 0, span, np.inf), 0.0, 1.0)[:, None, None]
+        share = np.clip(since / np.where(span > 0, span, np.inf), 0.0, 2.0)[:, None, None]
         before = self.solids.pose[t[:, None], parts]
         change = self.solids.pose[after[:, None], parts] - before
         change[..., 2] = (change[..., 2] + np.pi) % (2 * np.pi) - np.pi
         way = np.hypot(change[..., 0], change[..., 1])
         goes_on = way < _FASTEST * 1e-9 * np.maximum(span, 1)[:, None]
-        pose = np.where(goes_on[..., None], before + share * change, before)
+        # who is somewhere else in the next scan was put there
+        stays = np.where(share < 1.0, before, before + change)
+        pose = np.where(goes_on[..., None], before + share * change, stays)
         return self.solids._replace(pose=self.solids.pose[:1]).some(parts)._replace(pose=pose)
 
 

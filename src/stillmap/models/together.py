@@ -1,0 +1,207 @@
+"""Looks at one rigid thing that follow one another, laid over each other in its own frame.
+
+Over a second a car goes evenly: what its track may be wrong by is its velocity, how fast it turns
+and how it brakes, few numbers that all looks tell together. Where nothing tells, as along a side
+without ends, its track counts.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from stillmap.surface.mesh import Mesh
+from stillmap.surface.patches import Patch
+
+Float = NDArray[np.float64]
+
+_GUESSES = (0.0, -1.0, 1.0, -2.0, 2.0, -3.0, 3.0, -4.0, 4.0, -5.0, 5.0, -6.0, 6.0)  # m/s
+_GUESSED = 500  # points of a look that tell which one is right
+_NEAR = 0.3  # m, farther points are as good as none
+_PER_SPEED = 0.002  # m for each m/s: where all are as good the track counts
+_FINER = (0.0, *(k * s / 10.0 for k in range(1, 11) for s in (-1.0, 1.0)))  # m/s
+_TRACK = (0.7, 0.4, 0.2, 0.2, 2.0, 1.0)  # what is known of `Motion` by its track
+_TOLD = (0.1, 0.4, 0.2, 0.2, 2.0, 1.0)  # and by the ends
+_SIGMA = 0.03  # m, by how much points lie off a surface
+_REACHES = (0.6, 0.3, 0.15)  # m, within which points are of the same place, round by round less
+_ROUNDS = 5  # with each of them
+_POINTS = 2000  # of a look, at most: more do not make it better
+_FEWEST = 20  # points that say anything
+_TELL = 100.0  # points of a look that tell on their own: neighbours are off together
+_SAME_SIDE = 0.5  # cosine between normals of one surface
+
+
+class Sweep(NamedTuple):
+    """What one look saw of a thing, in its own frame as its track has it.
+
+    Attributes:
+        mesh: its surface.
+        normals: (V, 3) of length one, of its vertices, towards the sensor.
+        place: (3,) where the sensor was.
+        later: s after the time at which the frame is known.
+    """
+
+    mesh: Mesh
+    normals: Float
+    place: Float
+    later: float
+
+    @classmethod
+    def of(cls, mesh: Mesh, place: Float, later: float) -> "Sweep":
+        """With the normals of the faces around each vertex."""
+        spans = np.repeat(mesh.normals() * mesh.areas()[:, None], 3, axis=0)
+        at, n = mesh.faces.ravel(), len(mesh.vertices)
+        normals = np.stack([np.bincount(at, column, n) for column in spans.T], axis=1)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        return cls(mesh, normals / np.maximum(length, 1e-12), place, later)
+
+    def moved(self, motion: Float) -> "Sweep":
+        """As it lies where the thing went otherwise than its track by `motion` (6,)."""
+        R, t = pose(motion, self.later)
+        mesh = Mesh(self.mesh.vertices @ R.T + t, self.mesh.faces)
+        return self._replace(mesh=mesh, normals=self.normals @ R.T, place=R @ self.place + t)
+
+    def patch(self) -> Patch:
+        """To be fused."""
+        points = self.mesh.vertices
+        origin = np.tile(self.place, (len(points), 1))
+        standoff = ((origin - points) * self.normals).sum(axis=1)
+        return Patch(points, self.mesh.faces, np.arange(len(points)), origin, standoff)
+
+
+def pose(motion: Float, later: float) -> tuple[Float, Float]:
+    """(3, 3) and (3,) metres by which a look has to be moved.
+
+    Args:
+        motion: (6,) metres per second ahead, to the left and up, rad per second to the left, metres
+            per square second ahead and to the left.
+        later: s.
+    """
+    turn = motion[3] * later
+    c, s = np.cos(turn), np.sin(turn)
+    t = motion[:3] * later
+    t[:2] += 0.5 * motion[4:] * later**2
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), t
+
+
+def motion_of(sweeps: Sequence[Sweep], best: int) -> Float:
+    """(6,) how the thing went otherwise than its track, as `pose` has it.
+
+    Point to plane against the best look, from the looks beside it to those far from it.
+    """
+    known = sweeps[best]
+    motion = np.zeros(6)
+    if len(known.mesh.vertices) < _FEWEST:
+        return motion
+    tree = cKDTree(known.mesh.vertices)
+    away = np.abs([one.later for one in sweeps])
+    beside = [sweeps[k] for k in (best - 1, best + 1) if 0 <= k < len(sweeps)]
+    others = [one for k, one in enumerate(sweeps) if k != best]
+    motion = guess = _ends_meet(beside, tree, motion, _GUESSES, _PER_SPEED)
+    for part, reach in zip((0.4, 0.7, 1.0), _REACHES, strict=True):
+        some = [one for one in others if abs(one.later) <= part * away.max() + 1e-9]
+        for _ in range(_ROUNDS):
+            motion = _better(some, known, tree, motion, guess, _TRACK, reach)
+    guess = _ends_meet(others, tree, motion, _FINER, 0.0)
+    motion = guess
+    for _ in range(_ROUNDS):
+        motion = _better(others, known, tree, motion, guess, _TOLD, _REACHES[-1])
+    return motion
+
+
+def _ends_meet(
+    sweeps: Sequence[Sweep],
+    tree: "cKDTree[None]",
+    motion: Float,
+    speeds: tuple[float, ...],
+    price: float,
+) -> Float:
+    """The motion (6,) with another velocity ahead, if by that looks lie nearer to the best one.
+
+    Point to point, so that its ends tell, and not along its sides only. A track of a part of a car
+    may be wrong by half its velocity.
+
+    Args:
+        sweeps: the looks.
+        tree: the vertices of the best one.
+        motion: where to begin.
+        speeds: m/s that are tried beside, 0 the first of them.
+        price: m for each m/s: where all are as good the track counts.
+    """
+    worth = []
+    for speed in speeds:
+        tried = motion + np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
+        off = [np.zeros(0)]
+        for one in sweeps:
+            R, t = pose(tried, one.later)
+            every = max(1, len(one.mesh.vertices) // _GUESSED)
+            at = one.mesh.vertices[::every] @ R.T + t
+            off.append(np.asarray(tree.query(at, distance_upper_bound=_NEAR)[0]))
+        far = np.minimum(np.concatenate(off), _NEAR)
+        worth.append((float(far.mean()) if len(far) else 0.0) + price * abs(speed))
+    best = np.array([speeds[int(np.argmin(worth))], 0.0, 0.0, 0.0, 0.0, 0.0])
+    return np.asarray(motion + best)
+
+
+def _better(
+    sweeps: Sequence[Sweep],
+    known: Sweep,
+    tree: "cKDTree[None]",
+    motion: Float,
+    guess: Float,
+    sigma: tuple[float, ...],
+    reach: float,
+) -> Float:
+    """One step of Gauss and Newton from `motion`, held to `guess` by standard deviations."""
+    hold = np.diag(1.0 / np.square(sigma))
+    H, g = hold.copy(), hold @ (motion - guess)
+    for one in sweeps:
+        there = one.moved(motion)
+        at, n, residual = _off(there, known, tree, reach)
+        if len(at) < _FEWEST:
+            continue
+        T = one.later
+        w = 1.0 / (1.0 + (residual / (3.0 * _SIGMA)) ** 2) ** 2 / _SIGMA**2
+        w *= min(1.0, _TELL / len(at))
+        around = at - pose(motion, T)[1]
+        J = np.stack(
+            [
+                T * n[:, 0],
+                T * n[:, 1],
+                T * n[:, 2],
+                T * (n[:, 1] * around[:, 0] - n[:, 0] * around[:, 1]),
+                0.5 * T**2 * n[:, 0],
+                0.5 * T**2 * n[:, 1],
+            ],
+            axis=1,
+        )
+        H, g = H + J.T @ (w[:, None] * J), g + J.T @ (w * residual)
+    return np.asarray(motion - np.linalg.solve(H, g))
+
+
+def _off(
+    one: Sweep, known: Sweep, tree: "cKDTree[None]", reach: float
+) -> tuple[Float, Float, Float]:
+    """(n, 3) points that have a place on what is known, (n, 3) its normals, (n,) metres off it."""
+    every = max(1, len(one.mesh.vertices) // _POINTS)
+    at, facing = one.mesh.vertices[::every], one.normals[::every]
+    away, nearest = map(np.asarray, tree.query(at, distance_upper_bound=reach))
+    near = np.flatnonzero(np.isfinite(away))
+    normals = known.normals[nearest[near]]
+    same = (facing[near] * normals).sum(axis=1) > _SAME_SIDE
+    near, normals = near[same], normals[same]
+    residual = ((at[near] - known.mesh.vertices[nearest[near]]) * normals).sum(axis=1)
+    return at[near], normals, residual
+
+
+def apart(one: Sweep, known: Sweep) -> float:
+    """Metres, by which 3 of 4 places of a look lie off another one at most.
+
+    NaN where they have little in common.
+    """
+    if not len(known.mesh.vertices):
+        return float("nan")
+    residual = _off(one, known, cKDTree(known.mesh.vertices), _REACHES[0])[2]
+    return float(np.quantile(np.abs(residual), 0.75)) if len(residual) >= _FEWEST else float("nan")

@@ -1,0 +1,72 @@
+"""Which tracks are of one thing."""
+
+import numpy as np
+from made_up_street import Car, Part, street
+
+from stillmap.models.movers import shape_of
+from stillmap.models.options import MoverOptions
+from stillmap.models.own import Moves
+from stillmap.models.sources import Sources
+from stillmap.models.wholes import followed_of, hanging_together, wholes_of
+
+OPTIONS = MoverOptions()
+CAR = Car((6.0, -2.5), (6.0, 0.0))
+
+
+def _wholes(sources: Sources) -> list[list[int]]:
+    moves = Moves.of(sources)
+    followed = followed_of(sources, moves, OPTIONS)
+    found = wholes_of(followed, moves, sources, OPTIONS)
+    return [[one.object.id for one in whole] for whole in found]
+
+
+def test_front_and_rear_of_a_car_are_one() -> None:
+    parts = [Part(0, 0.0, 0.3), Part(0, 0.5, 1.0), Part(0, 0.3, 0.5, (2, 6))]
+    assert _wholes(street([CAR], parts)) == [[0, 1, 2]]
+
+
+def test_cars_one_behind_the_other_and_beside_are_two() -> None:
+    behind = [CAR, Car((13.0, -2.5), (6.0, 0.0))]
+    assert _wholes(street(behind, [Part(0), Part(1)])) == [[0], [1]]
+    beside = [CAR, Car((6.0, 2.5), (6.0, 0.0))]
+    assert _wholes(street(beside, [Part(0), Part(1)])) == [[0], [1]]
+
+
+def test_cars_that_pass_each_other_are_two() -> None:
+    passing = [Car((8.0, -1.5), (6.0, 0.0)), Car((14.0, 1.5), (-6.0, 0.0))]
+    assert _wholes(street(passing, [Part(0), Part(1)])) == [[0], [1]]
+
+
+def test_people_stay_alone() -> None:
+    size = (0.4, 0.4, 1.7)
+    pair = [Car((6.0, 0.0), (1.0, 0.0), size), Car((6.0, 0.7), (1.0, 0.0), size)]
+    assert _wholes(street(pair, [Part(0), Part(1)])) == [[0], [1]]
+
+
+def test_what_is_left_over_of_a_car_is_no_thing() -> None:
+    stands = Part(0, 0.6, 0.8, (2, 6), drift=(-6.0, 0.0))
+    assert _wholes(street([CAR], [Part(0, 0.0, 0.6), stands])) == [[0]]
+
+
+def test_one_model_shows_all_of_a_car_that_was_followed_in_parts() -> None:
+    sources = street([CAR], [Part(0, 0.0, 0.3), Part(0, 0.3, 1.0)])
+    moves = Moves.of(sources)
+    followed = followed_of(sources, moves, OPTIONS)
+    (whole,) = wholes_of(followed, moves, sources, OPTIONS)
+    shape = shape_of(whole, sources, moves, OPTIONS, [np.zeros(0)] * len(whole))
+    assert shape is not None
+    assert shape.id in (0, 1)
+    T = shape.way.T_map_object(shape.seconds)
+    there = shape.mesh.vertices @ T[:3, :3].T + T[:3, 3]
+    rear = CAR.start[0] - 2.0 + 6.0 * shape.seconds
+    assert there[:, 0].min() < rear + 0.1
+    assert there[:, 0].max() > rear + 3.6
+
+
+def test_points_hang_together_as_far_as_beams_are_apart() -> None:
+    place = np.zeros(3)
+    for away, apart, together in ((5.0, 0.6, True), (5.0, 1.2, False), (45.0, 1.6, True)):
+        points = np.array([[away, 0.0, 0.0], [away, apart, 0.0]])
+        one, other = hanging_together(points, place, 0.5)
+        assert (one == other) == together
+    assert len(hanging_together(np.zeros((0, 3)), place, 0.5)) == 0
