@@ -140,7 +140,7 @@ def shown(
     seconds = 1e-9 * (view.stamp_ns - beams.start_ns)
     there = at_time(things, seconds)
     free = 1.0 - in_the_way(there, view.place, points, options.margin, options.sigma)
-    found = told(view, *beams.about(view.stamp_ns, options.window), options.margin)
+    found = told(view, *beams.about(view.stamp_ns, options), options.margin)
     local = view.in_camera(points)
     uv, ok = project(view.camera, local)
     uv = np.where(ok[:, None], uv, 0.0)  # corners just outside: as at the edge

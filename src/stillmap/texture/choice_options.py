@@ -12,12 +12,18 @@ class ChoiceOptions:
     believe: bool = field_with_doc(
         True, "ask what the lasers saw to move; without, the sharpest picture paints each face"
     )
-    margin: float = field_with_doc(0.15, "m around what was seen of a thing that moves")
-    sigma: float = field_with_doc(0.1, "m, by how much its outline may be off beyond that")
+    margin: float = field_with_doc(0.05, "m around what was seen of a thing that moves")
+    sigma: float = field_with_doc(0.05, "m, by how much its outline may be off beyond that")
     hold: float = field_with_doc(
         0.5, "s for which a thing goes on before it is first seen and after it is last"
     )
     window: float = field_with_doc(0.06, "s around a picture, beams within which tell of it")
+    rows: float = field_with_doc(
+        0.15, "the same where scans lie in a plane, as those of a laser that tilts"
+    )
+    carried: float = field_with_doc(
+        0.5, "the same, there, of beams on things that are followed: they go on with these"
+    )
     unseen: float = field_with_doc(
         0.9, "probability that a picture shows what stands still where no beam tells of it"
     )
@@ -52,6 +58,8 @@ _LIMITS = (
     ("sigma", 1e-3, 10.0),
     ("hold", 0.0, 1000.0),
     ("window", 1e-3, 1000.0),
+    ("rows", 1e-3, 1000.0),
+    ("carried", 0.0, 1000.0),
     ("trust", 0.0, 1e6),
     ("border", 0.0, 1e6),
     ("candidates", 1, 64),
