@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.extras import extra
+from stillmap.models.ahead import Ahead
 from stillmap.models.movers import Shape, shape_of
 from stillmap.models.options import MeshOptions
-from stillmap.models.painting import Ahead, Dressed, dressed, when_in_view
+from stillmap.models.painting import Dressed, dressed, when_in_view
 from stillmap.models.place import Painted, painted
 from stillmap.models.sources import Sources
 from stillmap.objects import MovingObject
@@ -22,7 +23,7 @@ from stillmap.texture.baking import baked
 from stillmap.texture.textured import Textured, replaced
 from stillmap.texture.things import Thing
 from stillmap.texture.view import View
-from stillmap.texture.views import views_of
+from stillmap.texture.views import colours_of, views_of
 
 Float = NDArray[np.float64]
 Read = Callable[[int], NDArray[Any]]
@@ -166,7 +167,12 @@ def _movers(
     tell: Callable[[int, int], None],
 ) -> list[MoverModel]:
     things = {thing.box.thing: thing for thing in sources.things}
-    ahead = Ahead(place.mesh, views, options.texture.visible)
+    images = sources.recording.images
+
+    def colours(view: View) -> NDArray[np.uint8] | None:
+        return None if images is None else colours_of(images, view)
+
+    ahead = Ahead(place, views, options.texture.visible, colours)
     out = []
     for number, one in enumerate(sources.objects):
         if one.id in things:
