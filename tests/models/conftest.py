@@ -1,5 +1,6 @@
 """A small room with people, seen by a lidar and a camera, or by two lasers and a camera."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,9 @@ from stillmap.simulation import (
 from stillmap.simulation.camera_options import CameraOptions
 from stillmap.simulation.lidar_options import LidarOptions
 from stillmap.simulation.walls import box
+
+# for made_up_rooms.py
+sys.path.insert(0, str(Path(__file__).parents[1] / "texture"))
 
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
 
