@@ -12,6 +12,7 @@ from stillmap.models.sources import Sources
 from stillmap.surface.dividing import divided
 from stillmap.surface.mesh import Mesh
 from stillmap.texture.about import Beams
+from stillmap.texture.agreeing import agreeing
 from stillmap.texture.choice import Candidates, chosen, utility
 from stillmap.texture.choice_options import ChoiceOptions
 from stillmap.texture.lens import project
@@ -19,6 +20,7 @@ from stillmap.texture.options import VisibleOptions
 from stillmap.texture.things import Thing, at_time, in_the_way, within_or_behind
 from stillmap.texture.told import told
 from stillmap.texture.view import View
+from stillmap.texture.views import colours_of
 from stillmap.texture.visible import visible
 from stillmap.threads import in_order
 
@@ -87,6 +89,10 @@ def painted(
         sharpest.add(number, faces, pixels, p)
         if tell is not None:
             tell(number + 1, len(views))
+    images = sources.recording.images
+    if images is not None and options.believe and options.odd > 0.0:
+        read = partial(colours_of, images)
+        candidates = agreeing(mesh, candidates, views, read, options.odd)
     return settled(mesh, candidates, sharpest, options.border)
 
 

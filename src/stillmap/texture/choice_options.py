@@ -33,6 +33,9 @@ class ChoiceOptions:
     trust: float = field_with_doc(
         10.0, "what the logarithm of that probability counts against that of the resolution"
     )
+    odd: float = field_with_doc(
+        40.0, "by which a colour, of 442, differs from those of most other pictures; 0: not asked"
+    )
     border: float = field_with_doc(
         1.0, "what it costs where two pictures meet, in e-folds of resolution of the faces there"
     )
@@ -61,6 +64,7 @@ _LIMITS = (
     ("rows", 1e-3, 1000.0),
     ("carried", 0.0, 1000.0),
     ("trust", 0.0, 1e6),
+    ("odd", 0.0, 442.0),
     ("border", 0.0, 1e6),
     ("candidates", 1, 64),
     ("edge", 0.01, 1000.0),
