@@ -27,10 +27,12 @@ def room():
 
 @pytest.fixture(scope="module")
 def poster():
-    """A wall 3 m ahead with a poster of four colours, above a floor that no picture shows."""
+    """A wall 3 m ahead with a poster of four colours; no picture shows the floor, and a low wall
+    to the left."""
     wall = rectangle([-2.0, 3.0, -1.4], [4, 0, 0], [0, 0, 2.9], 4)
     floor = rectangle([-2.0, 0.5, -1.4], [4, 0, 0], [0, 2.5, 0], 2)
-    mesh = joined([wall, floor])
+    low = rectangle([-2.0, 0.5, -1.4], [0, 2.5, 0], [0, 0, 1.4], 2)
+    mesh = joined([wall, floor, low])
     view = np.zeros(len(mesh), np.int32)
     view[len(wall) :] = -1
     picture = CORNERS.repeat(150, axis=0).repeat(200, axis=1)
@@ -121,8 +123,14 @@ def test_a_browser_shows_colours_as_they_were_photographed(written, tmp_path):
         found = picture[200 + 80 * row, 300 + 80 * column].astype(int)
         expected = CORNERS[(row + 1) // 2, (column + 1) // 2]
         assert np.abs(found - expected).max() <= 6, (row, column, found)
-    assert np.abs(picture[390, 300].astype(int) - 128).max() <= 2  # the floor
     assert (picture[5, 5] == 255).all()  # beyond the wall
+
+
+def test_and_what_is_grey_with_light_and_shade(written, tmp_path):
+    picture = shown(written["poster"], [0, 0, 0], [0, 0, -1], tmp_path)
+    # linear 0.216 under a light of 3 / pi from above, and half of that and half of 0.246 from aside
+    for row, column, expected in ((390, 300, 126), (297, 23, 101)):
+        assert np.abs(picture[row, column].astype(int) - expected).max() <= 3, (row, column)
 
 
 def test_a_browser_shows_a_room(written, tmp_path):

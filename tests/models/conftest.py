@@ -21,7 +21,9 @@ from stillmap.simulation.camera_options import CameraOptions
 from stillmap.simulation.lidar_options import LidarOptions
 from stillmap.simulation.walls import box
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))  # `made_up_street`
+_HERE = Path(__file__).resolve()
+# for made_up_street.py, and made_up_rooms.py
+sys.path[:0] = [str(_HERE.parent), str(_HERE.parents[1] / "texture")]
 
 QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
 

@@ -7,15 +7,19 @@ import numpy as np
 import pytest
 
 from stillmap.errors import InputError
+from stillmap.models.ahead import Ahead
 from stillmap.models.moving_points import Moving, tint_moving
 from stillmap.models.options import MeshOptions
+from stillmap.models.place import Painted
 from stillmap.recording.images import Camera, Images
 from stillmap.recording.model import Recording
 from stillmap.scene.boxes import Box
 from stillmap.surface.mesh import Mesh
+from stillmap.texture.options import VisibleOptions
 from stillmap.texture.textured import GREY
 from stillmap.texture.things import Thing
 from stillmap.texture.view import View
+from stillmap.texture.views import colours_of
 
 SPEED, AHEAD = 2.0, 3.0  # m/s to the right, along x; m from the camera, along y
 BOARD = np.stack(np.meshgrid(np.arange(-0.5, 0.51, 0.05), np.arange(0.2, 1.81, 0.05)), -1)
@@ -79,8 +83,11 @@ def columns(image: int) -> np.ndarray:
 def tint(moving, views, load=columns, place=NOTHING, options=None):
     n = moving.sources.recording.n_beams
     out, late = np.full((n, 3), GREY[0], np.uint8), np.full(n, np.inf, np.float32)
-    for one in views:
-        tint_moving(out, late, moving, one, pictures(load), place, options or MeshOptions())
+    images, none = pictures(load), np.full(len(place), -1)
+    still = Painted(place, none, np.zeros(len(place), np.float32), none < 0, none, none * 0.0)
+    ahead = Ahead(still, views, VisibleOptions(), lambda one: colours_of(images, one))
+    for number in range(len(views)):
+        tint_moving(out, late, moving, number, ahead, options or MeshOptions())
     return out.reshape(2, -1, 3), late.reshape(2, -1)
 
 

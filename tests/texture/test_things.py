@@ -10,6 +10,7 @@ from stillmap.texture.things import (
     in_the_way,
     meets_box,
     squares_to_segments,
+    within_or_behind,
 )
 
 
@@ -85,3 +86,18 @@ def test_two_things_hide_more_than_one() -> None:
     both = in_the_way([near, far], place, points, 0.1, 0.1)[0]
     assert min(alone) > 0.0
     assert max(alone) < both < 1.0
+
+
+def test_what_lies_behind_a_box_or_within_it() -> None:
+    box = Cuboid(np.array([2.0, 0.0, 1.0]), np.array([0.6, 0.8]), np.array([0.5, 0.2, 1.0]))
+    rng = np.random.default_rng(3)
+    place, points = np.array([0.0, 0.3, 1.2]), rng.uniform([0, -2, 0], [5, 2, 2], (400, 3))
+    found = within_or_behind([box], place, points)
+    start, ends = box.local(place[None])[0], box.local(points)
+    expected = [_meets_by_sampling(start, end, box.half) for end in ends]
+    assert 20 < np.sum(expected) < 380
+    assert np.mean(found != expected) <= 0.005  # grazed edges
+    other = box._replace(middle=np.array([2.0, 1.5, 1.0]))
+    both = within_or_behind([box, other], place, points)
+    np.testing.assert_array_equal(both, found | within_or_behind([other], place, points))
+    assert not within_or_behind([], place, points).any()

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.extras import extra
+from stillmap.models.ahead import Ahead
 from stillmap.models.movers import Shape, shape_of
 from stillmap.models.options import MeshOptions
 from stillmap.models.own import Moves
-from stillmap.models.painting import Ahead, Dressed, dressed, when_in_view
+from stillmap.models.painting import Dressed, dressed, when_in_view
 from stillmap.models.place import Painted, painted
 from stillmap.models.sources import Sources
 from stillmap.models.tinting import Tints, tinted
@@ -21,9 +22,10 @@ from stillmap.recording.images import Images
 from stillmap.stages import Stages
 from stillmap.surface.building import surface_of
 from stillmap.texture.baking import baked
+from stillmap.texture.options import VisibleOptions
 from stillmap.texture.textured import Textured, replaced
 from stillmap.texture.view import View
-from stillmap.texture.views import views_of
+from stillmap.texture.views import colours_of, views_of
 
 Float = NDArray[np.float64]
 Read = Callable[[int], NDArray[Any]]
@@ -133,15 +135,16 @@ def models_of(
         read = _reader(sources.recording.images)
         textured = baked(place.mesh, place.view, views, read, options.texture)
         unfiltered = _unfiltered(textured, place, views, read, options)
+    ahead = _ahead(place, views, sources.recording.images, limits)
     with stages.measure("movers"):
         movers = []
         if options.objects.enabled:
-            movers = _movers(sources, views, place, options, tell("building what moved"))
+            movers = _movers(sources, views, ahead, options, tell("building what moved"))
     tints = None
     if views and options.points.enabled:
         with stages.measure("points"):
             now = tell("colouring points")
-            tints = tinted(sources, textured, views, place.mesh, options, threads, now)
+            tints = tinted(sources, textured, ahead, options, threads, now)
     tried = len(sources.objects)
     return Models(place, textured, unfiltered, views, left_out, movers, tried, tints)
 
@@ -167,14 +170,22 @@ def _reader(images: Images | None) -> Read:
     return none
 
 
+def _ahead(
+    place: Painted, views: list[View], images: Images | None, limits: VisibleOptions
+) -> Ahead:
+    def colours(view: View) -> NDArray[np.uint8] | None:
+        return None if images is None else colours_of(images, view)
+
+    return Ahead(place, views, limits, colours)
+
+
 def _movers(
     sources: Sources,
     views: Sequence[View],
-    place: Painted,
+    ahead: Ahead,
     options: MeshOptions,
     tell: Callable[[int, int], None],
 ) -> list[MoverModel]:
-    ahead = Ahead(place.mesh, views, options.texture.visible)
     moves = Moves.of(sources)
     followed = followed_of(sources, moves, options.objects)
     wholes = wholes_of(followed, moves, sources, options.objects)

@@ -6,20 +6,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.models.ahead import Ahead
 from stillmap.models.options import MeshOptions
-from stillmap.models.painting import Ahead
 from stillmap.models.sources import Sources
 from stillmap.output.points import DYNAMIC_BELOW
-from stillmap.recording.images import Images
 from stillmap.recording.stamps import beam_ns
-from stillmap.surface.mesh import Mesh
 from stillmap.texture.lens import project
 from stillmap.texture.outline import depth_inside
 from stillmap.texture.points import not_grey
 from stillmap.texture.sampling import bilinear
 from stillmap.texture.things import Cuboid, Thing, at_time, in_the_way
 from stillmap.texture.view import View
-from stillmap.texture.views import colours_of
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -89,9 +86,8 @@ def tint_moving(
     out: Colours,
     late: NDArray[np.float32],
     moving: Moving,
-    view: View,
-    images: Images,
-    place: Mesh,
+    number: int,
+    place: Ahead,
     options: MeshOptions,
 ) -> None:
     """Colours what moves and is seen in a picture, where none nearer in time shows it.
@@ -100,12 +96,12 @@ def tint_moving(
         out: (M, 3), changed.
         late: (M,) s from each beam to the picture that it has its colour from; changed.
         moving: the dynamic beams.
-        view: the picture.
-        images: from which it is read, if anything is shown.
-        place: the surface of what stands still, which hides what is behind it.
+        number: of the view.
+        place: what stands still, which hides what is behind it.
         options: see MeshOptions.
     """
     sources, limits = moving.sources, options.texture.visible
+    view = place.views[number]
     seen = moving.about(view.stamp_ns, options.objects.near)
     now = 1e-9 * (view.stamp_ns - sources.start_ns)
     away = np.abs(seen.seconds - now).astype(np.float32)
@@ -119,11 +115,11 @@ def tint_moving(
     ok &= _within_outlines(seen, local, ok, sources.things, now, options)
     ok &= away < late[seen.beam]
     shown = np.flatnonzero(ok)
-    shown = shown[Ahead(place, [view], limits).free(0, ends[shown])] if len(shown) else shown
+    shown = shown[place.free(number, ends[shown])] if len(shown) else shown
     shown = shown[_free(ends[shown], seen.owner[shown], sources.things, view, now, options)]
     if not len(shown):
         return
-    picture = colours_of(images, view)
+    picture = place.picture(number)
     if picture is None:
         return
     colours = np.rint(bilinear(np.ascontiguousarray(picture[..., :3]), uv[shown]))

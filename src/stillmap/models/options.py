@@ -42,10 +42,13 @@ class MoverOptions:
         0.5, "s from then to a picture that paints a thing that does not keep its shape"
     )
     rim: float = field_with_doc(
-        0.04, "m within a thing's outline in a picture, where it may show what is behind"
+        0.01, "m within a thing's outline in a picture, where it may show what is behind"
     )
     drift: float = field_with_doc(
-        0.1, "of the way it went from then to the picture, by which the outline may be off, too"
+        0.05, "of the way it went from then to the picture, by which the outline may be off, too"
+    )
+    differs: float = field_with_doc(
+        30.0, "by which colours differ from those of the place behind, of 442; 0: not asked for"
     )
     edge: float = field_with_doc(0.05, "m, longer edges are divided before they are painted")
     least: float = field_with_doc(0.03, "m2 of surface that a model has")
@@ -73,6 +76,7 @@ _LIMITS = (
     ("near", 0.0, 1000.0),
     ("rim", 0.0, 10.0),
     ("drift", 0.0, 100.0),
+    ("differs", 0.0, 442.0),
     ("edge", 0.005, 1000.0),
     ("least", 0.0, 1000.0),
     ("island", 0.0, 1000.0),

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from stillmap.models.ahead import Ahead, looked_up
 from stillmap.models.movers import Shape
 from stillmap.models.options import MoverOptions
 from stillmap.models.place import Painted, settled
@@ -14,20 +15,16 @@ from stillmap.surface.dividing import divided
 from stillmap.surface.mesh import Mesh
 from stillmap.texture.choice import NONE, Candidates, utility
 from stillmap.texture.choice_options import ChoiceOptions
-from stillmap.texture.lens import project, rays, within
+from stillmap.texture.lens import project, within
 from stillmap.texture.options import VisibleOptions
 from stillmap.texture.things import Thing, at_time, in_the_way
 from stillmap.texture.view import View
-from stillmap.texture.visible import Depths, depths_of, ideal, visible
+from stillmap.texture.visible import depths_of, visible
 
 Float = NDArray[np.float64]
 
-_BEHIND = 0.1  # m by which a surface may lie before a thing and be taken for its own
 _LEAST = 1e-9
 _SCRAPS = 0.05  # of its area: less is no picture of it
-_SMALL = 320.0  # pixels across in which it is seen what of the place hides a thing
-_EDGE = 16  # rays along an edge of a picture that tell what it holds
-_NO_FACES = np.zeros((0, 0), np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,39 +38,6 @@ class Dressed:
 
     painted: Painted
     views: list[View]
-
-
-class Ahead:
-    """How far away what stands still is in views, each looked at once."""
-
-    def __init__(self, place: Mesh, views: Sequence[View], limits: VisibleOptions) -> None:
-        self._place, self._views, self._limits = place, views, limits
-        self._known: dict[int, Depths] = {}
-
-    def free(self, number: int, points: Float) -> NDArray[np.bool_]:
-        """(n,) whether nothing of it lies before points (n, 3) in the map frame, in a view."""
-        view = self._views[number]
-        at = view.in_camera(points)
-        free = at[:, 2] > self._limits.near
-        if not free.any() or not len(self._place):
-            return free
-        if number not in self._known:
-            self._known[number] = self._whole(view)
-        depths = self._known[number]
-        free[free] = _looked_up(depths.depth, depths, at[free]) > at[free, 2] - _BEHIND
-        return free
-
-    def _whole(self, view: View) -> Depths:
-        """A small z-buffer of all that a view shows."""
-        camera = view.camera
-        across, down = np.meshgrid(
-            np.linspace(0, camera.width - 1, _EDGE), np.linspace(0, camera.height - 1, _EDGE)
-        )
-        shown = rays(camera, np.column_stack([across.ravel(), down.ravel()]))
-        shown = shown[np.isfinite(shown).all(axis=1)]
-        scale = min(_SMALL / camera.width, self._limits.scale)
-        depths = depths_of(self._place, view, shown, scale, self._limits.near)
-        return replace(depths, face=_NO_FACES)
 
 
 def when_in_view(thing: Thing, views: Sequence[View], start_ns: int) -> Float:
@@ -102,7 +66,8 @@ def dressed(
 
     A view may paint a face if the place does not hide it, if no other thing is likely to, and if it
     lies within the thing's outline by `options.rim`, and more with time: beside that it shows what
-    is behind.
+    is behind. So it may within it, too, as between legs: there must be other colours than what the
+    place behind has in other views.
 
     Args:
         shape: the thing.
@@ -130,8 +95,10 @@ def dressed(
         if not len(faces):
             continue
         points = mesh.centres[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
-        free = place.free(number, points)
-        faces, points = faces[free], points[free]
+        its_own = place.free(number, points)
+        if options.differs > 0.0:
+            its_own[its_own] = place.differs(number, points[its_own]) >= options.differs
+        faces, points = faces[its_own], points[its_own]
         hidden = in_the_way(at_time(others, now), view.place, points, choice.margin, choice.sigma)
         pixels = found.pixels[faces].astype(np.float64)
         good = utility(1.0 - hidden, pixels, mesh.areas()[faces], replace(choice, believe=True))
@@ -163,13 +130,5 @@ def _inside(
     depths = depths_of(mesh, view, points[np.unique(mesh.faces[faces])], limits.scale, limits.near)
     far = ndimage.distance_transform_edt(np.pad(depths.face >= 0, 1))[1:-1, 1:-1]
     at = np.concatenate([points[mesh.faces[faces]], points[mesh.faces[faces]].mean(1)[:, None]], 1)
-    metres = _looked_up(far, depths, at) * at[..., 2] / depths.K[0, 0]
+    metres = looked_up(far, depths, at) * at[..., 2] / depths.K[0, 0]
     return np.asarray(metres.min(axis=1) >= rim)
-
-
-def _looked_up(values: NDArray[np.floating], depths: Depths, at: Float) -> Float:
-    """(...,) what an image (h, w) has where points (..., 3) of the camera's frame are seen."""
-    h, w = values.shape
-    column, row = (np.rint(a).astype(np.intp) for a in ideal(depths.K, at.reshape(-1, 3).T))
-    found = values[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
-    return np.asarray(found.reshape(at.shape[:-1]), np.float64)

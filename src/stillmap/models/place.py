@@ -12,13 +12,15 @@ from stillmap.models.sources import Sources
 from stillmap.surface.dividing import divided
 from stillmap.surface.mesh import Mesh
 from stillmap.texture.about import Beams
+from stillmap.texture.agreeing import agreeing
 from stillmap.texture.choice import Candidates, chosen, utility
 from stillmap.texture.choice_options import ChoiceOptions
 from stillmap.texture.lens import project
 from stillmap.texture.options import VisibleOptions
-from stillmap.texture.things import Thing, at_time, in_the_way
+from stillmap.texture.things import Thing, at_time, in_the_way, within_or_behind
 from stillmap.texture.told import told
 from stillmap.texture.view import View
+from stillmap.texture.views import colours_of
 from stillmap.texture.visible import visible
 from stillmap.threads import in_order
 
@@ -87,6 +89,10 @@ def painted(
         sharpest.add(number, faces, pixels, p)
         if tell is not None:
             tell(number + 1, len(views))
+    images = sources.recording.images
+    if images is not None and options.believe and options.odd > 0.0:
+        read = partial(colours_of, images)
+        candidates = agreeing(mesh, candidates, views, read, options.odd)
     return settled(mesh, candidates, sharpest, options.border)
 
 
@@ -133,14 +139,18 @@ def shown(
     """(n,) how probably a view shows static things only where it sees faces (n,).
 
     By what beams taken about then say, and where there are none by whether a thing that is followed
-    stands before it. Of the corners of a face and its middle the least counts.
+    stands before it; where one does, nothing behind it speaks against that. Of the corners of a
+    face and its middle the least counts.
     """
     part = mesh.part_of(faces)
     points = np.concatenate([part.vertices, part.centres])
     seconds = 1e-9 * (view.stamp_ns - beams.start_ns)
     there = at_time(things, seconds)
     free = 1.0 - in_the_way(there, view.place, points, options.margin, options.sigma)
-    found = told(view, *beams.about(view.stamp_ns, options.window), options.margin)
+    ends, p_static = beams.about(view.stamp_ns, options)
+    # a laser sees past a thing what the camera beside it does not see
+    speaks = (p_static < 0.5) | ~within_or_behind(there, view.place, ends)
+    found = told(view, ends[speaks], p_static[speaks], options.margin)
     local = view.in_camera(points)
     uv, ok = project(view.camera, local)
     uv = np.where(ok[:, None], uv, 0.0)  # corners just outside: as at the edge

@@ -12,6 +12,8 @@ from stillmap.recording.model import Recording
 from stillmap.result import Result
 from stillmap.scene.boxes import Box, box_of, boxes_of
 from stillmap.scene.rig import Tilting
+from stillmap.surface.options import SurfaceOptions
+from stillmap.surface.patches import order_of
 from stillmap.texture.about import Beams
 from stillmap.texture.things import Thing
 from stillmap.threads import resolved_threads
@@ -55,6 +57,7 @@ class Sources:
             boxes,
             [owned[box.thing] for box in boxes],
             self.start_ns,
+            order_of(self.seen, np.zeros(0, np.intp), SurfaceOptions()).planar,
         )
 
 

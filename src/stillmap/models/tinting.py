@@ -1,22 +1,21 @@
 """Colours of the beams' end points: of what stands still as the surface there is painted, of what
 moves from pictures taken about when it was seen."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.em.chunks import Chunk, chunks
+from stillmap.models.ahead import Ahead
 from stillmap.models.moving_points import Moving, tint_moving
 from stillmap.models.options import MeshOptions
 from stillmap.models.sources import Sources
 from stillmap.output.points import DYNAMIC_BELOW
 from stillmap.recording import spool
-from stillmap.surface.mesh import Mesh
 from stillmap.texture.points import PaintedMesh
 from stillmap.texture.textured import GREY, Textured
-from stillmap.texture.view import View
 from stillmap.threads import in_order
 
 Float = NDArray[np.float64]
@@ -44,8 +43,7 @@ class Tints:
 def tinted(
     sources: Sources,
     textured: Textured,
-    views: Sequence[View],
-    place: Mesh,
+    place: Ahead,
     options: MeshOptions,
     threads: int = 1,
     tell: Tell | None = None,
@@ -60,15 +58,14 @@ def tinted(
     Args:
         sources: M beams.
         textured: the surface of the place.
-        views: the pictures that can be used; each is read once, one at a time.
-        place: the surface, which hides what is behind it.
+        place: what stands still, and the pictures that can be used.
         options: see MeshOptions.
         threads: same result with any number.
         tell: called with what is done, and how much of it.
     """
     recording = sources.recording
     out: Colours = recording.per_beam(np.uint8, (3,))
-    scans, n = recording.n_scans, recording.n_scans + len(views)
+    scans, n = recording.n_scans, recording.n_scans + len(place.views)
     painted = PaintedMesh(textured, options.points.off)
     T_map_sensor = sources.seen.T_map_sensor(sources.poses)
     for chunk in chunks(sources.seen, beside=[sources.p_static, out]):
@@ -80,10 +77,8 @@ def tinted(
     for block in spool.blocks(late):
         late[block] = np.inf
     moving = Moving(sources, T_map_sensor)
-    images = recording.images
-    for number, view in enumerate(views):
-        assert images is not None
-        tint_moving(out, late, moving, view, images, place, options)
+    for number in range(len(place.views)):
+        tint_moving(out, late, moving, number, place, options)
         sources.seen.let_go(sources.p_static, out, late)
         if tell is not None:
             tell(scans + number + 1, n)

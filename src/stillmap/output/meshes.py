@@ -43,8 +43,8 @@ class Part(NamedTuple):
 
 
 def write_glb(path: Path, mesh: Textured | Mesh, options: TextureOptions | None = None) -> None:
-    """Writes binary glTF: one mesh per page, and one of what is grey; unlit, so that colours are
-    seen as they were photographed. A mesh without pictures is grey, and lit.
+    """Writes binary glTF: one mesh per page, unlit, so that colours are seen as they were
+    photographed, and one of what is grey, lit, as without shades its form is not seen.
 
     Where coordinates are large, nodes have a translation of whole metres.
 
@@ -88,7 +88,7 @@ def write_glb(path: Path, mesh: Textured | Mesh, options: TextureOptions | None 
     def finish(tree: dict[str, Any]) -> None:
         for image, page in zip(images, pages, strict=True):
             tree["bufferViews"][image["bufferView"]]["byteLength"] = len(page.data)
-        _finish(tree, unlit=isinstance(mesh, Textured))
+        _finish(tree)
 
     data = trimesh.exchange.gltf.export_glb(
         scene,
@@ -228,18 +228,18 @@ def _each_compressed(mesh: Textured, options: TextureOptions) -> Iterator[Page]:
             yield Page(".png", "image/png", out.getvalue())
 
 
-def _finish(tree: dict[str, Any], unlit: bool) -> None:
-    """What trimesh does not say."""
+def _finish(tree: dict[str, Any]) -> None:
+    """What trimesh does not say. Without normals, programs light faces as flat ones."""
     tree["asset"]["generator"] = "stillmap"
     if tree.get("textures"):
         sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR}
         tree["samplers"] = [{**sampler, "wrapS": _CLAMP_TO_EDGE, "wrapT": _CLAMP_TO_EDGE}]
         for texture in tree["textures"]:
             texture["sampler"] = 0
-    if unlit:
-        tree["extensionsUsed"] = ["KHR_materials_unlit"]
-        for material in tree["materials"]:
+    for material in tree["materials"]:
+        if "baseColorTexture" in material["pbrMetallicRoughness"]:
             material["extensions"] = {"KHR_materials_unlit": {}}
+            tree["extensionsUsed"] = ["KHR_materials_unlit"]
     for mesh in tree["meshes"]:
         del mesh["extras"]
         for primitive in mesh["primitives"]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from stillmap.recording.model import Recording
 from stillmap.recording.stamps import beam_ns
 from stillmap.scene.boxes import Box
+from stillmap.texture.choice_options import ChoiceOptions
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -29,6 +31,7 @@ class Beams:
         boxes: of things that move, their times in seconds after `start_ns`.
         owned: for each of these the beams (n,) that ended on it, rising.
         start_ns: when the time of the boxes begins.
+        planar: whether scans lie in a plane, so that each sees only a line of what is there.
     """
 
     recording: Recording
@@ -38,11 +41,28 @@ class Beams:
     boxes: Sequence[Box]
     owned: Sequence[Index]
     start_ns: int
+    planar: bool = False
 
-    def about(self, stamp_ns: int, window: float) -> tuple[Float, NDArray[np.float32]]:
-        """(n, 3) metres in the map frame where hits within `window` seconds ended, and their
-        P(static) (n,); what is of a thing that moves has gone on with it to this time."""
-        scans = self._scans(stamp_ns, window)
+    @cached_property
+    def _moving(self) -> NDArray[np.bool_]:
+        """(M,) whether a beam ended on one of the things, and rather moves."""
+        out = np.zeros(len(self.p_static), np.bool_)
+        for owned in self.owned:
+            out[owned] = self.p_static[owned] < 0.5
+        return out
+
+    def about(self, stamp_ns: int, options: ChoiceOptions) -> tuple[Float, NDArray[np.float32]]:
+        """Where hits ended about a time, had things that move been where they are then.
+
+        Those within `options.window` seconds; of planar scans those within `options.rows`, and
+        what ended on a thing that is followed within `options.carried`.
+
+        Returns:
+            (n, 3) metres in the map frame, and P(static) (n,).
+        """
+        window = options.rows if self.planar else options.window
+        carried = max(options.carried, window) if self.planar else window
+        scans = self._scans(stamp_ns, carried)
         if scans.stop <= scans.start:
             return np.zeros((0, 3)), np.zeros(0, np.float32)
         first, last = self.seen.offset[[scans.start, scans.stop]]
@@ -50,6 +70,8 @@ class Beams:
         apart = np.abs(at_ns - stamp_ns)
         # at least what is nearest, as where scans count as taken at once
         near = apart <= max(int(1e9 * window), int(apart.min(initial=_NEVER)))
+        if carried > window:
+            near |= (apart <= int(1e9 * carried)) & self._moving[first:last]
         kept = np.flatnonzero(self.seen.hit[first:last] & near)
         beams = int(first) + kept
         ends = np.empty((len(beams), 3))

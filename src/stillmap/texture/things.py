@@ -97,6 +97,26 @@ def in_the_way(
     return 1.0 - free
 
 
+def within_or_behind(cuboids: Sequence[Cuboid], place: Float, points: Float) -> NDArray[np.bool_]:
+    """(n,) whether the line of sight from a camera to points meets the box of some thing.
+
+    Args:
+        cuboids: the things, when the picture was taken.
+        place: (3,) metres, where the camera was.
+        points: (n, 3) metres.
+    """
+    out = np.zeros(len(points), np.bool_)
+    along = np.ascontiguousarray((points - place).T)
+    square = np.maximum(along[0] ** 2 + along[1] ** 2 + along[2] ** 2, 1e-12)
+    for one in cuboids:
+        reach = float(one.half @ one.half)
+        near = np.flatnonzero(squares_to_segments(one.middle - place, along, square) <= reach)
+        if len(near):
+            start, ends = one.local(place[None])[0], one.local(points[near])
+            out[near] |= meets_box(start, ends, one.half)
+    return out
+
+
 def squares_to_segments(middle: Float, along: Float, square: Float) -> Float:
     """(n,) squared metres from a point (3,) to segments from the origin to `along` (3, n).
 
