@@ -134,7 +134,7 @@ def test_the_place_behind_is_compared_where_it_is_seen_from_elsewhere():
 
 
 @pytest.mark.parametrize("why", ["grey", "by the same picture", "damaged", "nothing is there"])
-def test_where_nobody_knows_what_is_behind_nothing_is_painted(why):
+def test_where_nobody_knows_what_is_behind_it_lies_farther_within(why):
     views, place, colours = [view(0, 0.0), view(1, 30.0)], place_of(), pictures()
     if why == "grey":
         place = place_of(painter=-1)
@@ -144,7 +144,12 @@ def test_where_nobody_knows_what_is_behind_nothing_is_painted(why):
         colours = lambda one: None if one.image else pictures()(one)  # noqa: E731
     else:
         place = place_of(rectangle([-8.0, 4.0, 2.0], [16.0, 0, 0], [0, 0, 1.0]))
-    assert area_painted(dress(views, place, colours)) == 0.0
+    found = dress(views, place, colours, replace(OPTIONS, unsure=0.1))
+    x, z = painted_at(found).T
+    assert 0.1 < np.abs(x).max() < 0.17
+    assert 0.08 < z.min() < z.max() < 0.92
+    never = replace(OPTIONS, unsure=10.0)
+    assert area_painted(dress(views, place, colours, never)) == 0.0
     careless = replace(OPTIONS, differs=0.0)
     assert area_painted(dress(views, place, colours, careless)) == pytest.approx(0.5)
 

@@ -50,6 +50,9 @@ class MoverOptions:
     differs: float = field_with_doc(
         30.0, "by which colours differ from those of the place behind, of 442; 0: not asked for"
     )
+    unsure: float = field_with_doc(
+        0.05, "m more than `rim` within the outline, where nobody knows what is behind"
+    )
     edge: float = field_with_doc(0.05, "m, longer edges are divided before they are painted")
     least: float = field_with_doc(0.03, "m2 of surface that a model has")
     island: float = field_with_doc(0.01, "m2, smaller pieces of it are left out")
@@ -76,6 +79,7 @@ _LIMITS = (
     ("near", 0.0, 1000.0),
     ("rim", 0.0, 10.0),
     ("drift", 0.0, 100.0),
+    ("unsure", 0.0, 1000.0),
     ("differs", 0.0, 442.0),
     ("edge", 0.005, 1000.0),
     ("least", 0.0, 1000.0),

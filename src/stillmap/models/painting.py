@@ -67,7 +67,7 @@ def dressed(
     A view may paint a face if the place does not hide it, if no other thing is likely to, and if it
     lies within the thing's outline by `options.rim`, and more with time: beside that it shows what
     is behind. So it may within it, too, as between legs: there must be other colours than what the
-    place behind has in other views.
+    place behind has in other views. Where none shows that, a face must lie farther within.
 
     Args:
         shape: the thing.
@@ -91,13 +91,16 @@ def dressed(
         moved = replace(view, T_camera_map=view.T_camera_map @ T_map_object)
         found = visible(mesh, moved, limits)
         faces = np.flatnonzero(found.seen)
-        faces = faces[_inside(mesh, faces, moved, rim, limits)]
+        within = _within(mesh, faces, moved, limits)
+        faces, within = faces[within >= rim], within[within >= rim]
         if not len(faces):
             continue
         points = mesh.centres[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
         its_own = place.free(number, points)
         if options.differs > 0.0:
-            its_own[its_own] = place.differs(number, points[its_own]) >= options.differs
+            off, some = place.differs(number, points[its_own]), within[its_own]
+            unsure = np.isnan(off) & (some >= rim + options.unsure)
+            its_own[its_own] = unsure | (off >= options.differs)
         faces, points = faces[its_own], points[its_own]
         hidden = in_the_way(at_time(others, now), view.place, points, choice.margin, choice.sigma)
         pixels = found.pixels[faces].astype(np.float64)
@@ -120,15 +123,13 @@ def _gone(shape: Shape, seconds: float) -> float:
     return float(np.linalg.norm(there[1] - there[0]))
 
 
-def _inside(
-    mesh: Mesh, faces: NDArray[np.intp], view: View, rim: float, limits: VisibleOptions
-) -> NDArray[np.bool_]:
-    """(n,) whether faces (n,) lie within the outline of a mesh by `rim` metres."""
+def _within(mesh: Mesh, faces: NDArray[np.intp], view: View, limits: VisibleOptions) -> Float:
+    """(n,) metres by which faces (n,) lie within the outline of a mesh."""
     if not len(faces):
-        return np.zeros(0, np.bool_)
+        return np.zeros(0)
     points = view.in_camera(mesh.vertices)
     depths = depths_of(mesh, view, points[np.unique(mesh.faces[faces])], limits.scale, limits.near)
     far = ndimage.distance_transform_edt(np.pad(depths.face >= 0, 1))[1:-1, 1:-1]
     at = np.concatenate([points[mesh.faces[faces]], points[mesh.faces[faces]].mean(1)[:, None]], 1)
     metres = looked_up(far, depths, at) * at[..., 2] / depths.K[0, 0]
-    return np.asarray(metres.min(axis=1) >= rim)
+    return np.asarray(metres.min(axis=1))
