@@ -116,3 +116,19 @@ def test_what_lies_within_another_part_is_no_surface() -> None:
     assert local[part == 1][:, 2].min() >= 1.0
     hole = (part == 0) & (np.hypot(local[:, 0], local[:, 1]) < 0.19) & (local[:, 2] > 0.9)
     assert not hole.any()
+
+
+def test_many_places_far_apart_are_each_as_if_alone() -> None:
+    walls = np.array([[-30.0, 9.0, 40.0, 9.0], [12.0, -3.0, 12.0, 7.0], [0.0, 0.0, 0.4, 0.0]])
+    faces = Faces(walls, np.tile([0.0, 3.0], (3, 1)), np.zeros(3, bool))
+    standing = Standing(faces, _solid(BOX, (1.0, 0.4), (0.1, 0.9)), STREET, None)
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-40.0, -20.0, -1.0), (50.0, 30.0, 12.0), (400, 3))
+    distance, places = standing.nearest(points)
+    alone = [standing.nearest(one[None]) for one in points]
+    np.testing.assert_array_equal(distance, [d[0] for d, _ in alone])
+    np.testing.assert_array_equal(places, [at[0] for _, at in alone])
+    assert len(np.unique(np.floor(points[:, :2] / 4.0), axis=0)) > 150
+    empty, nowhere = standing.nearest(np.zeros((0, 3)))
+    assert empty.shape == (0,)
+    assert nowhere.shape == (0, 3)

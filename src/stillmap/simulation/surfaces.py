@@ -12,7 +12,9 @@ from stillmap.simulation.solids import BOX, CYLINDER, Faces, Solids
 
 Float = NDArray[np.float64]
 Nearest = Callable[[Float], Float]
+_Thing = tuple[Float, Float, Nearest]
 
+_SQUARE = 4.0  # m, within which points have the same things near
 _HALVINGS = 80  # after which the nearest point of an ellipse is known to the last digit
 
 
@@ -44,18 +46,19 @@ class Standing(NamedTuple):
         """
         places = _on_ground(points, self.ground, self.ceiling)
         distance = np.linalg.norm(places - points, axis=1)
-        for low, high, nearest in self._things():
-            off = np.maximum(np.maximum(low - points[:, :2], points[:, :2] - high), 0.0)
-            near = np.flatnonzero((off * off).sum(axis=1) < distance * distance)
-            if not len(near):
-                continue
-            found = nearest(points[near])
-            d = np.linalg.norm(found - points[near], axis=1)
-            better = d < distance[near]
-            distance[near[better]], places[near[better]] = d[better], found[better]
+        things = list(self._things())
+        lowest = np.array([low for low, _, _ in things]).reshape(-1, 2)
+        highest = np.array([high for _, high, _ in things]).reshape(-1, 2)
+        for part in _in_squares(points):
+            some, d, at = points[part], distance[part], places[part]
+            low, high = some[:, :2].min(axis=0), some[:, :2].max(axis=0)
+            off = np.maximum(np.maximum(lowest - high, low - highest), 0.0)
+            for k in np.flatnonzero((off * off).sum(axis=1) < d.max() ** 2).tolist():
+                _take_nearer(some, d, at, things[k])
+            distance[part], places[part] = d, at
         return distance, places
 
-    def _things(self) -> Iterator[tuple[Float, Float, Nearest]]:
+    def _things(self) -> Iterator[_Thing]:
         """Least and greatest x and y of each thing, and its nearest places."""
         for ends, z in zip(self.faces.ends, self.faces.z, strict=True):
             low, high = np.minimum(ends[:2], ends[2:]), np.maximum(ends[:2], ends[2:])
@@ -64,6 +67,30 @@ class Standing(NamedTuple):
             reach = float(np.hypot(*self.solids.half[k]))
             nearest = partial(nearest_on_solid, solids=self.solids, k=k)
             yield pose[:2] - reach, pose[:2] + reach, nearest
+
+
+def _in_squares(points: Float) -> Iterator[NDArray[np.intp]]:
+    """Numbers of the points (n, 3) in each square of the plane that has any."""
+    if not len(points):
+        return
+    cell = np.floor(points[:, :2] / _SQUARE).astype(np.int64)
+    cell -= cell.min(axis=0)
+    key = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
+    order = np.argsort(key, kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
+
+
+def _take_nearer(points: Float, distance: Float, places: Float, thing: _Thing) -> None:
+    """Replaces places (n, 3) and how far they are from points by those of a thing, if nearer."""
+    low, high, nearest = thing
+    off = np.maximum(np.maximum(low - points[:, :2], points[:, :2] - high), 0.0)
+    near = np.flatnonzero((off * off).sum(axis=1) < distance * distance)
+    if not len(near):
+        return
+    found = nearest(points[near])
+    d = np.linalg.norm(found - points[near], axis=1)
+    better = d < distance[near]
+    distance[near[better]], places[near[better]] = d[better], found[better]
 
 
 def to_world(local: Float, pose: Float) -> Float:
