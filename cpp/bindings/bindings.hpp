@@ -13,6 +13,7 @@ void bind_beside(nanobind::module_& m);
 void bind_bodies(nanobind::module_& m);
 void bind_held_out(nanobind::module_& m);
 void bind_look_counts(nanobind::module_& m);
+void bind_near_faces(nanobind::module_& m);
 void bind_sweep(nanobind::module_& m);
 void bind_texels(nanobind::module_& m);
 void bind_z_buffer(nanobind::module_& m);

@@ -19,6 +19,7 @@ NB_MODULE(_core, m) {
   stillmap::border::bind_bodies(m);
   stillmap::border::bind_held_out(m);
   stillmap::border::bind_look_counts(m);
+  stillmap::border::bind_near_faces(m);
   stillmap::border::bind_sweep(m);
   stillmap::border::bind_texels(m);
   stillmap::border::bind_z_buffer(m);

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.surface.mesh import Mesh
-from stillmap.texture.points import PaintedMesh, feet, not_grey
+from stillmap.texture.points import PaintedMesh, not_grey
 from stillmap.texture.textured import GREY, Textured
 
 ABOVE = np.array([0.5, 0.5, 9.0])
@@ -36,53 +35,6 @@ def gradient() -> np.ndarray:
     page = np.zeros((100, 200, 3), np.uint8)
     page[..., 0], page[..., 1] = np.arange(200), 2 * np.arange(100)[:, None]
     return page
-
-
-def test_feet_are_the_nearest_of_all_places_of_a_triangle():
-    rng = np.random.default_rng(1)
-    corners, points = rng.normal(size=(300, 3, 3)), 2.0 * rng.normal(size=(300, 3))
-    corners[:20, 2] = corners[:20, 0] + 0.3 * (corners[:20, 1] - corners[:20, 0])  # slivers
-    corners[20:25] = corners[20:25, :1]  # points
-    weight, off = feet(points, corners)
-    assert (weight >= 0.0).all()
-    np.testing.assert_allclose(weight.sum(axis=1), 1.0, atol=1e-9)
-    places = np.einsum("nk,nkd->nd", weight, corners)
-    np.testing.assert_allclose(off, np.linalg.norm(points - places, axis=1), atol=1e-9)
-    i, j = (one.ravel() for one in np.mgrid[:81, :81])
-    lattice = np.stack([i, j, 80 - i - j], axis=1)[i + j <= 80] / 80.0
-    tried = np.einsum("mk,nkd->nmd", lattice, corners) - points[:, None]
-    least = np.linalg.norm(tried, axis=2).min(axis=1)
-    assert (off <= least + 1e-9).all()
-    np.testing.assert_allclose(off, least, atol=0.05)
-
-
-def test_the_nearest_face_is_found_among_large_and_small_ones():
-    rng = np.random.default_rng(2)
-    middle = rng.uniform(0.0, 4.0, (400, 1, 3))
-    size = np.where(np.arange(400) % 7 == 0, 0.7, 0.05)[:, None, None]
-    corners = middle + size * rng.normal(size=(400, 3, 3))
-    mesh = Mesh(corners.reshape(-1, 3), np.arange(1200, dtype=np.int32).reshape(-1, 3))
-    textured = Textured(
-        mesh.vertices,
-        mesh.faces,
-        np.zeros((1200, 2)),
-        np.full(400, -1, np.int32),
-        (),
-        np.full(400, -1, np.int32),
-        np.arange(1200, dtype=np.int32),
-    )
-    points = corners.mean(axis=1)[rng.integers(0, 400, 500)] + 0.1 * rng.normal(size=(500, 3))
-    origins = rng.uniform(-9.0, 13.0, (500, 3))
-    found = PaintedMesh(textured, 0.15).places(points, origins)
-    towards = np.einsum("nd,fd->nf", origins, mesh.normals())
-    towards -= np.einsum("nd,fd->nf", points, mesh.normals())
-    _, off = feet(np.repeat(points, 400, axis=0), np.tile(corners, (500, 1, 1)))
-    off = np.where(towards > 0.0, off.reshape(500, 400), np.inf)
-    nearest = np.where(off.min(axis=1) < 0.15, off.argmin(axis=1), 400)
-    assert 0.3 < (nearest < 400).mean() < 1.0
-    assert (found.face == nearest).mean() > 0.97  # of a few crossing ones another is as near
-    has = found.face < 400
-    assert (off[np.flatnonzero(has), found.face[has]] < 0.15).all()
 
 
 def test_points_have_the_colour_beneath_them(gradient):

@@ -27,6 +27,7 @@ from stillmap.reference.fusing import SignedDistances
 from stillmap.reference.grid import Grid, Grid2D, Grid3D, occupancy
 from stillmap.reference.held_out import StaticShares, StaticShares2D, StaticShares3D, held_out
 from stillmap.reference.look_counts import LookCounts, LookCounts2D, LookCounts3D
+from stillmap.reference.near_faces import NearFaces
 from stillmap.reference.no_return import add_lost
 from stillmap.reference.search import Lattice, search_lattice
 from stillmap.reference.surface import Surface, Surface2D, Surface3D
@@ -56,6 +57,7 @@ __all__ = [
     "LookCounts",
     "LookCounts2D",
     "LookCounts3D",
+    "NearFaces",
     "Reading",
     "SignedDistances",
     "StaticShares",
