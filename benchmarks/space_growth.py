@@ -118,7 +118,9 @@ def size_of(recording: stillmap.Recording, poses: Float) -> dict[str, float]:
     return {"metres": float(metres), "area": float(len(seen)), "beams": beams_each}
 
 
-def cost_of(first: Path, chosen: stillmap.Options, out: Path, with_models: bool) -> dict[str, Any]:
+def cost_of(
+    first: Path, chosen: stillmap.Options, out: Path, with_models: bool = False
+) -> dict[str, Any]:
     """Seconds per sweep and peak memory of the whole job, and of its stages."""
     recording, poses = folder.read(first), np.load(first / _POSES)
     sweeps = recording.n_scans

@@ -33,3 +33,8 @@ def test_beginnings_of_one_recording(tmp_path: Path) -> None:
     lines = space_growth.table([{"sweeps": 4, **sizes[4], **row}]).splitlines()
     assert len(lines) == 3
     assert lines[2].split("|")[1].strip() == "4"
+
+    row = space_growth.cost_of(tmp_path / "first-4", chosen, tmp_path / "modelled", True)
+    assert (tmp_path / "modelled" / "mesh.glb").is_file()
+    assert {"surface", "movers"} <= set(row["stages"])
+    assert "surface" in space_growth.table([{"sweeps": 4, **sizes[4], **row}])

@@ -54,8 +54,8 @@ class MoverOptions:
         0.05, "m more than `rim` within the outline, where nobody knows what is behind"
     )
     edge: float = field_with_doc(0.05, "m, longer edges are divided before they are painted")
-    least: float = field_with_doc(0.03, "m2 of surface that a model has")
-    island: float = field_with_doc(0.01, "m2, smaller pieces of it are left out")
+    least: float = field_with_doc(0.01, "m2 of surface that a model has")
+    island: float = field_with_doc(0.005, "m2, smaller pieces of it are left out")
 
     def __post_init__(self) -> None:
         for name, low, high in _LIMITS:
