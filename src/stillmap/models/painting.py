@@ -92,16 +92,11 @@ def dressed(
         found = visible(mesh, moved, limits)
         faces = np.flatnonzero(found.seen)
         within = _within(mesh, faces, moved, limits)
-        faces, within = faces[within >= rim], within[within >= rim]
+        points = mesh.centres[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
+        own_colours = _shows_it(points, within - rim, number, place, options)
+        faces, points = faces[own_colours], points[own_colours]
         if not len(faces):
             continue
-        points = mesh.centres[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
-        its_own = place.free(number, points)
-        if options.differs > 0.0:
-            off, some = place.differs(number, points[its_own]), within[its_own]
-            unsure = np.isnan(off) & (some >= rim + options.unsure)
-            its_own[its_own] = unsure | (off >= options.differs)
-        faces, points = faces[its_own], points[its_own]
         hidden = in_the_way(at_time(others, now), view.place, points, choice.margin, choice.sigma)
         pixels = found.pixels[faces].astype(np.float64)
         good = utility(1.0 - hidden, pixels, mesh.areas()[faces], replace(choice, believe=True))
@@ -115,6 +110,23 @@ def dressed(
     if areas[painted.view >= 0].sum() < _SCRAPS * areas.sum():
         painted = replace(painted, view=np.full_like(painted.view, NONE))
     return Dressed(painted, own)
+
+
+def _shows_it(
+    points: Float, within: Float, number: int, place: Ahead, options: MoverOptions
+) -> NDArray[np.bool_]:
+    """(n,) whether a view shows a thing where it has points (n, 3) in the map frame.
+
+    They lie (n,) metres farther within its outline than they need to. Nothing of the place is
+    before them, and the view's colours are not those of the place behind.
+    """
+    shown = within >= 0.0
+    shown[shown] = place.free(number, points[shown])
+    if options.differs > 0.0 and shown.any():
+        off = place.differs(number, points[shown])
+        unsure = np.isnan(off) & (within[shown] >= options.unsure)
+        shown[shown] = unsure | (off >= options.differs)
+    return shown
 
 
 def _gone(shape: Shape, seconds: float) -> float:
