@@ -139,7 +139,7 @@ def _looks(
     moves: Moves,
     options: MoverOptions,
 ) -> list[Glimpse]:
-    """At a thing about a time, one in each scan."""
+    """At a thing about a time, one in each scan, in the order of their times."""
     near = between(own, moves.seconds, now - options.together, now + options.together)
     scan = sources.seen.scans_of(moves.beam[near])
     out = []
@@ -149,7 +149,8 @@ def _looks(
             span = float(seconds.min()), float(seconds.max())
             look = look_at(own, span, way, fast, sources, moves, options)
             out += [look] if look is not None else []
-    return out
+    # scans of several sensors overlap: which begins first may see it last
+    return sorted(out, key=lambda look: look.span[0] + look.span[1])
 
 
 def _sweep(look: Glimpse, now: float, options: MoverOptions) -> Sweep:
