@@ -169,3 +169,11 @@ def test_looks_of_several_lidars_follow_one_another() -> None:
     assert shape.rigid
     assert len(shape.way.seconds) > 8
     assert (np.diff(shape.way.seconds) >= 0.0).all()
+
+
+def test_without_a_surface_there_is_no_model() -> None:
+    sources = street([Car((8.0, -2.0), (6.0, 0.0))], [Part(0)])
+    options = MoverOptions(least=0.0, island=1000.0)
+    moves = Moves.of(sources)
+    (whole,) = wholes_of(followed_of(sources, moves, options), moves, sources, options)
+    assert shape_of(whole, sources, moves, options, [np.zeros(0)]) is None
