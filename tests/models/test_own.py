@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from made_up_street import Car, Part, street
+from made_up_street import Car, Part, by_several, street
 
 from stillmap.models.frames import Way
+from stillmap.models.moving_points import Moving
 from stillmap.models.options import MoverOptions
 from stillmap.models.own import (
     Moves,
@@ -17,6 +18,7 @@ from stillmap.models.own import (
     scans_about,
     seconds_of,
 )
+from stillmap.texture.choice_options import ChoiceOptions
 
 OPTIONS = MoverOptions()
 TWO = [Car((8.0, -2.0), (6.0, 0.0)), Car((20.0, 4.0), (-4.0, 0.0))]
@@ -46,6 +48,26 @@ def test_beams_have_times_of_their_own() -> None:
     about = scans_about(0.3, 0.4, sources)
     assert about.start <= 2
     assert about.stop >= 5
+
+
+@pytest.mark.parametrize("lidars", [1, 2, 6])
+def test_beams_of_lidars_that_begin_at_once_are_found(lidars: int) -> None:
+    sources = by_several(street(TWO, [Part(0)]), lidars)
+    seconds = seconds_of(np.arange(sources.recording.n_beams), sources)
+    for now in (0.28, 0.3, 0.389):
+        scans = scans_about(now, now, sources)
+        about = sources.recording.offset[[scans.start, scans.stop]]
+        then = np.flatnonzero(np.abs(seconds - now) < 1e-3)
+        assert about[0] <= then[0]
+        assert then[-1] < about[1]
+    # of a picture, too
+    ends, _ = sources.beams().about(280_000_000, ChoiceOptions())
+    assert len(ends) == np.count_nonzero(np.abs(seconds - 0.28) <= 0.06)
+    moving = Moving(sources, sources.seen.T_map_sensor(sources.poses))
+    beams = sources.objects[0].beams
+    found = moving.about(280_000_000, 0.07).beam
+    np.testing.assert_array_equal(found, beams[np.abs(seconds[beams] - 0.28) <= 0.07])
+    assert len(found) > 0
 
 
 def test_a_thing_has_what_ended_in_its_box_and_nothing_of_others() -> None:

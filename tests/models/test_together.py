@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from made_up_street import Car, Part, street
+from made_up_street import Car, Part, by_several, street
 
 from stillmap.models.looks import Glimpse, surface_of
 from stillmap.models.moments import Look
@@ -160,3 +160,20 @@ def test_the_side_of_a_car_is_bridged_where_people_are_not() -> None:
     assert len(surface_of(look, True, 3.0, OPTIONS)) == 36
     assert len(surface_of(look, False, 3.0, OPTIONS)) < 36
     assert len(surface_of(look, True, 0.3, OPTIONS)) < 36
+
+
+def test_looks_of_several_lidars_follow_one_another() -> None:
+    # each sees one half of it, the second one earlier
+    sources = by_several(street([Car((14.0, 0.0), (-6.0, 0.0))], [Part(0)], noise=0.01), 2)
+    shape = _shape(sources, OPTIONS)
+    assert shape.rigid
+    assert len(shape.way.seconds) > 8
+    assert (np.diff(shape.way.seconds) >= 0.0).all()
+
+
+def test_without_a_surface_there_is_no_model() -> None:
+    sources = street([Car((8.0, -2.0), (6.0, 0.0))], [Part(0)])
+    options = MoverOptions(least=0.0, island=1000.0)
+    moves = Moves.of(sources)
+    (whole,) = wholes_of(followed_of(sources, moves, options), moves, sources, options)
+    assert shape_of(whole, sources, moves, options, [np.zeros(0)]) is None

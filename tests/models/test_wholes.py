@@ -1,8 +1,12 @@
 """Which tracks are of one thing."""
 
+import dataclasses
+import tracemalloc
+
 import numpy as np
 from made_up_street import Car, Part, street
 
+from stillmap.models import wholes
 from stillmap.models.movers import shape_of
 from stillmap.models.options import MoverOptions
 from stillmap.models.own import Moves
@@ -70,3 +74,35 @@ def test_points_hang_together_as_far_as_beams_are_apart() -> None:
         one, other = hanging_together(points, place, 0.5)
         assert (one == other) == together
     assert len(hanging_together(np.zeros((0, 3)), place, 0.5)) == 0
+
+
+def test_pairs_are_counted_as_in_a_square_of_all(monkeypatch) -> None:
+    monkeypatch.setattr(wholes, "_AT_ONCE", 3)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        n, scans = int(rng.integers(1, 12)), []
+        met, both = np.zeros((n, n), np.intp), np.zeros((n, n), np.intp)
+        for _ in range(int(rng.integers(0, 20))):
+            there = np.flatnonzero(rng.random(n) < 0.6)
+            piece = rng.integers(0, 3, len(there))
+            scans.append(wholes._Scan(there, piece, np.ones(len(there), np.intp)))
+            met[np.ix_(there, there)] += piece[:, None] == piece
+            both[np.ix_(there, there)] += 1
+        often = np.argwhere(np.triu((2 * met >= both) & (met > 0), 1))
+        np.testing.assert_array_equal(wholes._often_together(scans, n), often)
+
+
+def test_many_tracks_that_never_meet_need_no_room() -> None:
+    sources = street([CAR], [Part(0)])
+    moves = Moves.of(sources)
+    (one,) = followed_of(sources, moves, OPTIONS)
+    far = [
+        one._replace(object=dataclasses.replace(one.object, id=k, beams=one.object.beams[:0]))
+        for k in range(1, 3000)
+    ]
+    tracemalloc.start()
+    found = wholes_of([one, *far], moves, sources, OPTIONS)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(found) == 3000
+    assert most < 10e6

@@ -85,7 +85,7 @@ def shape_of(
         if look is None:
             continue
         mesh = surface_of(look, rigid, DEEPEST, options)
-        if mesh.areas().sum() < options.least:
+        if not len(mesh) or mesh.areas().sum() < options.least:
             continue
         now = 0.5 * sum(look.span)
         if rigid and not moves.planar and len(mesh.vertices) >= _TOLD:
@@ -122,7 +122,8 @@ def _put_together(
     if len(kept) < max(2.0, _MOST * len(sweeps)):
         return None
     mesh = _fused([moved[k].patch() for k in kept], options)
-    if mesh.areas().sum() < max(options.least, _MOST * sweeps[best].mesh.areas().sum()):
+    least = max(options.least, _MOST * sweeps[best].mesh.areas().sum())
+    if not len(mesh) or mesh.areas().sum() < least:
         return None
     later = np.array([sweeps[k].later for k in kept])
     offset = np.array([_in_plane(*pose(motion, t)) for t in later.tolist()])
@@ -139,7 +140,7 @@ def _looks(
     moves: Moves,
     options: MoverOptions,
 ) -> list[Glimpse]:
-    """At a thing about a time, one in each scan."""
+    """At a thing about a time, one in each scan, in the order of their times."""
     near = between(own, moves.seconds, now - options.together, now + options.together)
     scan = sources.seen.scans_of(moves.beam[near])
     out = []
@@ -149,7 +150,8 @@ def _looks(
             span = float(seconds.min()), float(seconds.max())
             look = look_at(own, span, way, fast, sources, moves, options)
             out += [look] if look is not None else []
-    return out
+    # scans of several sensors overlap: which begins first may see it last
+    return sorted(out, key=lambda look: look.span[0] + look.span[1])
 
 
 def _sweep(look: Glimpse, now: float, options: MoverOptions) -> Sweep:

@@ -10,7 +10,7 @@ from stillmap.models.ahead import Ahead
 from stillmap.models.options import MeshOptions
 from stillmap.models.sources import Sources
 from stillmap.output.points import DYNAMIC_BELOW
-from stillmap.recording.stamps import beam_ns
+from stillmap.recording.stamps import beam_ns, longest_scan_ns
 from stillmap.texture.lens import project
 from stillmap.texture.outline import depth_inside
 from stillmap.texture.points import not_grey
@@ -48,8 +48,7 @@ class Moving:
         self.sources, self._T_map_sensor = sources, T_map_sensor
         beams = {one.id: one.beams for one in sources.objects}
         self._owned = [beams.get(one.box.thing) for one in sources.things]
-        stamps = sources.recording.stamp_ns
-        self._longest = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+        self._longest = longest_scan_ns(sources.recording)
 
     def about(self, stamp_ns: int, near: float) -> _Seen:
         """Those on things that ended within `near` seconds."""

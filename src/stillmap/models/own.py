@@ -28,7 +28,7 @@ _REACH = 3.0  # m, from the middle of a car to its ends
 _CAR = 6.0  # m, from one end of it to the other
 _CELL = 0.2  # m, in which one point is enough
 _ASKED = 9  # scans that tell whether they are planar
-_BESIDE = 2  # scans before and after a time in which beams may be of it
+_BESIDE = 1  # scans before and after a time in which beams may be of it
 _BEYOND = 0.05  # rad beyond a thing, up to where beams are beside it
 SPACING = 0.025  # rad between beams, at most
 
@@ -85,8 +85,9 @@ def seconds_of(beams: Index, sources: Sources) -> Float:
 def scans_about(first: float, last: float, sources: Sources) -> slice:
     """The scans that have beams of these times, and some others beside."""
     stamps = 1e-9 * (sources.seen.stamp_ns - sources.start_ns)
-    a = int(np.searchsorted(stamps, first)) - _BESIDE
-    b = int(np.searchsorted(stamps, last, side="right")) + _BESIDE
+    reach = 1e-9 * sources.longest_scan_ns
+    a = int(np.searchsorted(stamps, first - reach)) - _BESIDE
+    b = int(np.searchsorted(stamps, last + reach, side="right")) + _BESIDE
     return slice(max(a, 0), min(b, len(stamps)))
 
 

@@ -1,6 +1,7 @@
 """What models are made of: beams in space, what moves among them, and pictures."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from stillmap.em import Ground, ground_of
 from stillmap.objects import MovingObject
 from stillmap.pipeline import Options
 from stillmap.recording.model import Recording
+from stillmap.recording.stamps import longest_scan_ns
 from stillmap.result import Result
 from stillmap.scene.boxes import Box, box_of, boxes_of
 from stillmap.scene.rig import Tilting
@@ -44,6 +46,11 @@ class Sources:
     things: list[Thing]
     start_ns: int
     ground: Ground
+
+    @cached_property
+    def longest_scan_ns(self) -> int:
+        """Nanoseconds that a scan takes at most, about."""
+        return longest_scan_ns(self.recording)
 
     def beams(self) -> Beams:
         """To be asked for by time."""

@@ -25,6 +25,7 @@ _ALIKE = 0.5  # of the faster one's speed may velocities differ
 _SLOW = 1.0  # m/s, or by that
 _NEAR = 10.0  # m, up to where beams are as near each other; then up to twice that, and so on
 _FLAT = 2.0  # times as far apart along the line of sight: sides of cars, at flat angles
+_AT_ONCE = 1000  # scans, after which their pairs are counted
 _CELLS = 3.0  # of so many edges is the way between what hangs together
 
 
@@ -72,14 +73,9 @@ def wholes_of(
     if moves.planar or not quick.any():
         return [[one] for one in followed]
     scans = list(_scans(followed, moves, sources, options))
-    met, both = np.zeros((n, n), np.intp), np.zeros((n, n), np.intp)
-    for there, piece, _ in scans:
-        met[np.ix_(there, there)] += piece[:, None] == piece
-        both[np.ix_(there, there)] += 1
-    often = (met >= _MOSTLY * both) & (met > 0) & (quick[:, None] | quick)
-    pairs = [
-        (a, b) for a, b in np.argwhere(often).tolist() if a < b and _alike(followed[a], followed[b])
-    ]
+    often = _often_together(scans, n)
+    often = often[quick[often].any(axis=1)]
+    pairs = [(a, b) for a, b in often.tolist() if _alike(followed[a], followed[b])]
     ends = np.array(pairs, np.intp).reshape(-1, 2)
     graph = coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), (n, n))
     piece = np.asarray(connected_components(graph, directed=False)[1], np.intp)
@@ -115,6 +111,27 @@ def _scans(
         np.add.at(count, (whose, piece), 1)
         there = np.flatnonzero(count[:n].any(axis=1))
         yield _Scan(there, count[there].argmax(axis=1), count[there].max(axis=1))
+
+
+def _often_together(scans: Sequence[_Scan], n: int) -> Index:
+    """(m, 2) numbers of things below n, the lesser one first: those that hang together in most
+    scans that saw both."""
+    # of so many things most never meet: pairs that were seen, and no square of all
+    key, met, both = (np.zeros(0, np.intp) for _ in range(3))
+    for first in range(0, len(scans), _AT_ONCE):
+        keys, ones = [key], [met]
+        for there, piece, _ in scans[first : first + _AT_ONCE]:
+            a, b = np.triu_indices(len(there), 1)
+            keys.append(there[a] * n + there[b])
+            ones.append((piece[a] == piece[b]).astype(np.intp))
+        before = both
+        key, number = np.unique(np.concatenate(keys), return_inverse=True)
+        met, both = np.zeros(len(key), np.intp), np.zeros(len(key), np.intp)
+        np.add.at(met, number, np.concatenate(ones))
+        np.add.at(both, number[: len(before)], before)
+        np.add.at(both, number[len(before) :], 1)
+    often = key[(met >= _MOSTLY * both) & (met > 0)]
+    return np.stack([often // n, often % n], axis=1)
 
 
 def _left_over(scans: Sequence[_Scan], whole: Index, quick: Bool) -> Bool:

@@ -7,6 +7,7 @@ from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.recording import spool
 from stillmap.recording.model import Recording
 
 _LARGEST_S = 9_000_000_000  # int64 holds 9.22e9 s in nanoseconds
@@ -74,3 +75,17 @@ def beam_ns(recording: Recording, scans: slice) -> NDArray[np.int64]:
         return stamps
     later = recording.beam_time[offset[0] : offset[-1]].astype(np.float64)
     return np.asarray(stamps + np.round(1e9 * later).astype(np.int64))
+
+
+def longest_scan_ns(recording: Recording) -> int:
+    """Nanoseconds from a scan's stamp, at most, to the times of its beams; where these are not
+    known, about as many as from one scan to the next.
+
+    Several sensors may begin at once: their scans follow one another sooner than they end.
+    """
+    steps, times = np.diff(recording.stamp_ns), recording.beam_time
+    longest = float(np.median(steps)) if len(steps) else 0.0
+    if times is not None:
+        for block in spool.blocks(times):
+            longest = max(longest, 1e9 * float(np.abs(times[block]).max()))
+    return int(np.ceil(longest))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.recording.model import Recording
-from stillmap.recording.stamps import beam_ns
+from stillmap.recording.stamps import beam_ns, longest_scan_ns
 from stillmap.scene.boxes import Box
 from stillmap.texture.choice_options import ChoiceOptions
 
@@ -85,17 +85,15 @@ class Beams:
     def _scans(self, stamp_ns: int, window: float) -> slice:
         """Those of which some beam may have been taken then; at least the nearest."""
         stamps = self.recording.stamp_ns
-        reach = 1e9 * (window + self._longest())
+        reach = 1e9 * window + self._longest
         first = int(np.searchsorted(stamps, stamp_ns - reach))
         last = int(np.searchsorted(stamps, stamp_ns + reach, side="right"))
         return slice(first, last)
 
-    def _longest(self) -> float:
-        """Seconds that a scan takes at most, about: from one to the next."""
-        steps = np.diff(self.recording.stamp_ns)
-        if not len(steps):
-            return 0.0
-        return 1e-9 * float(np.median(steps))
+    @cached_property
+    def _longest(self) -> int:
+        """Nanoseconds that a scan takes at most, about."""
+        return longest_scan_ns(self.recording)
 
     def _go_on(self, ends: Float, beams: Index, at_ns: NDArray[np.int64], stamp_ns: int) -> None:
         for box, owned in zip(self.boxes, self.owned, strict=True):
