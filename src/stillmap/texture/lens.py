@@ -32,6 +32,7 @@ _PARAMETERS = {
 }
 _WIDEST = np.radians(89.5)  # from the axis; a pinhole camera sees nothing beside itself
 _SAMPLES, _DIRECTIONS = 4096, 64  # at which the Jacobian is looked at
+_LARGEST, _LEAST = 1e9, 1e-6  # pixels, and their square, of a calibration that means something
 _STEPS = 50  # of Newton's method at most; a handful does away from the fold
 _CLOSE = 1e-10  # error at which it ends, in units of the focal length
 _SOLVED = 1e-6  # error with which a solution counts as one
@@ -42,13 +43,15 @@ def unusable(camera: Camera) -> str:
     if camera.K is None:
         return "a camera without calibration"
     K = camera.K
-    if not np.isfinite(K).all() or not abs(np.linalg.det(K[:2, :2])) > 0.0:
+    if not (np.abs(K) <= _LARGEST).all() or not abs(np.linalg.det(K[:2, :2])) >= _LEAST:
         return "a camera whose calibration is none"
     if camera.model not in _PARAMETERS:
         return f"a lens of a model that is not known ({camera.model})"
     if len(camera.distortion) not in _PARAMETERS[camera.model]:
         return f"a lens with {len(camera.distortion)} parameters ({camera.model or 'none'})"
-    return "" if np.isfinite(camera.distortion).all() else "a lens whose parameters are not finite"
+    if not (np.abs(camera.distortion) <= _LARGEST).all():
+        return "a lens whose parameters are not finite, or far too large"
+    return ""
 
 
 def project(camera: Camera, points: Float) -> tuple[Float, Mask]:
