@@ -10,6 +10,7 @@ from stillmap.errors import InputError
 from stillmap.models.ahead import Ahead
 from stillmap.models.moving_points import Moving, tint_moving
 from stillmap.models.options import MeshOptions
+from stillmap.models.own import Moves
 from stillmap.models.place import Painted
 from stillmap.recording.images import Camera, Images
 from stillmap.recording.model import Recording
@@ -56,12 +57,13 @@ def board_seen(*others: Thing) -> Moving:
     sources = SimpleNamespace(
         recording=recording,
         seen=recording,
+        poses=np.tile(np.eye(4), (2, 1, 1)),
         p_static=np.full(2 * n, 0.1, np.float32),
         objects=[SimpleNamespace(id=7, beams=np.arange(2 * n))],
         things=[thing(7, 0.0, AHEAD, (0.6, 0.2), SPEED), *others],
         start_ns=0,
     )
-    return Moving(sources, np.tile(np.eye(4), (2, 1, 1)))
+    return Moving(sources, Moves.of(sources))
 
 
 def view(number: int, seconds: float) -> View:
@@ -150,7 +152,7 @@ def test_what_is_of_no_track_and_what_stands_still_are_left_alone():
     moving = board_seen()
     moving.sources.p_static[:100] = 0.9
     moving.sources.objects[0].beams = np.arange(200, 2 * len(BOARD))
-    again = Moving(moving.sources, np.tile(np.eye(4), (2, 1, 1)))
+    again = Moving(moving.sources, Moves.of(moving.sources))
     colours, _ = tint(again, [view(1, 0.05)])
     assert (colours[0, :200] == GREY).all()
     assert (colours[0, 200:] != GREY).any()

@@ -137,14 +137,14 @@ def models_of(
         unfiltered = _unfiltered(textured, place, views, read, options)
     ahead = _ahead(place, views, sources.recording.images, limits)
     with stages.measure("movers"):
-        movers = []
+        movers, moves = [], Moves.of(sources)
         if options.objects.enabled:
-            movers = _movers(sources, views, ahead, options, tell("building what moved"))
+            movers = _movers(sources, moves, views, ahead, options, tell("building what moved"))
     tints = None
     if views and options.points.enabled:
         with stages.measure("points"):
             now = tell("colouring points")
-            tints = tinted(sources, textured, ahead, options, threads, now)
+            tints = tinted(sources, textured, ahead, moves, options, threads, now)
     tried = len(sources.objects)
     return Models(place, textured, unfiltered, views, left_out, movers, tried, tints)
 
@@ -181,12 +181,12 @@ def _ahead(
 
 def _movers(
     sources: Sources,
+    moves: Moves,
     views: Sequence[View],
     ahead: Ahead,
     options: MeshOptions,
     tell: Callable[[int, int], None],
 ) -> list[MoverModel]:
-    moves = Moves.of(sources)
     followed = followed_of(sources, moves, options.objects)
     wholes = wholes_of(followed, moves, sources, options.objects)
     out = []

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from stillmap.models.ahead import Ahead
 from stillmap.models.options import MeshOptions
+from stillmap.models.own import NOBODY, Moves
 from stillmap.models.sources import Sources
-from stillmap.output.points import DYNAMIC_BELOW
-from stillmap.recording.stamps import beam_ns, longest_scan_ns
 from stillmap.texture.lens import project
 from stillmap.texture.outline import depth_inside
 from stillmap.texture.points import not_grey
@@ -21,8 +20,6 @@ from stillmap.texture.view import View
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 Colours = NDArray[np.uint8]
-
-_NOBODY = -1  # owner of a beam that is of no thing
 
 
 class _Seen(NamedTuple):
@@ -42,43 +39,24 @@ class _Seen(NamedTuple):
 
 
 class Moving:
-    """The dynamic beams, to be asked for by time."""
+    """The dynamic beams on things that are followed, to be asked for by time."""
 
-    def __init__(self, sources: Sources, T_map_sensor: Float) -> None:
-        self.sources, self._T_map_sensor = sources, T_map_sensor
-        beams = {one.id: one.beams for one in sources.objects}
-        self._owned = [beams.get(one.box.thing) for one in sources.things]
-        self._longest = longest_scan_ns(sources.recording)
+    def __init__(self, sources: Sources, moves: Moves) -> None:
+        self.sources = sources
+        place = {one.box.thing: number for number, one in enumerate(sources.things)}
+        ids, of = np.unique(moves.owner, return_inverse=True)
+        owner = np.array([place.get(int(one), NOBODY) for one in ids], np.intp)[of]
+        kept = np.flatnonzero(moves.dynamic & (owner != NOBODY))
+        kept = kept[np.argsort(moves.seconds[kept], kind="stable")]
+        self._all = _Seen(moves.beam[kept], moves.ends[kept], moves.seconds[kept], owner[kept])
 
-    def about(self, stamp_ns: int, near: float) -> _Seen:
-        """Those on things that ended within `near` seconds."""
-        s, stamps = self.sources, self.sources.recording.stamp_ns
-        reach = 1e9 * near + self._longest
-        first = int(np.searchsorted(stamps, stamp_ns - reach))
-        last = int(np.searchsorted(stamps, stamp_ns + reach, side="right"))
-        offset = s.seen.offset[first : last + 1]
-        beams = slice(int(offset[0]), int(offset[-1]))
-        moves = s.seen.hit[beams] & (s.p_static[beams] < DYNAMIC_BELOW)
-        at_ns = beam_ns(s.recording, slice(first, last))
-        kept = np.flatnonzero(moves & (np.abs(at_ns - stamp_ns) <= 1e9 * near))
-        owner = self._owners(beams.start + kept)
-        kept, owner = kept[owner != _NOBODY], owner[owner != _NOBODY]
-        beam = beams.start + kept
-        T = self._T_map_sensor[np.searchsorted(offset, beam, side="right") - 1 + first]
-        ends = np.einsum("nij,nj->ni", T[:, :3, :3], s.seen.points[beam].astype(np.float64))
-        seconds = np.asarray(1e-9 * (at_ns[kept] - s.start_ns), np.float64)
-        return _Seen(beam, ends + T[:, :3, 3], seconds, owner)
-
-    def _owners(self, beam: NDArray[np.intp]) -> NDArray[np.intp]:
-        out = np.full(len(beam), _NOBODY)
-        for number, owned in enumerate(self._owned):
-            if owned is None or not len(owned) or not len(beam):
-                continue
-            if owned[-1] < beam[0] or owned[0] > beam[-1]:
-                continue
-            place = np.minimum(np.searchsorted(owned, beam), len(owned) - 1)
-            out[owned[place] == beam] = number
-        return out
+    def about(self, now: float, near: float) -> _Seen:
+        """Those that ended within `near` seconds of a time."""
+        seen = self._all
+        first = int(np.searchsorted(seen.seconds, now - near))
+        last = int(np.searchsorted(seen.seconds, now + near, side="right"))
+        then = slice(first, last)
+        return _Seen(seen.beam[then], seen.ends[then], seen.seconds[then], seen.owner[then])
 
 
 def tint_moving(
@@ -101,8 +79,8 @@ def tint_moving(
     """
     sources, limits = moving.sources, options.texture.visible
     view = place.views[number]
-    seen = moving.about(view.stamp_ns, options.objects.near)
     now = 1e-9 * (view.stamp_ns - sources.start_ns)
+    seen = moving.about(now, options.objects.near)
     away = np.abs(seen.seconds - now).astype(np.float32)
     ends = _carried(seen, sources.things, now)
     local = view.in_camera(ends)

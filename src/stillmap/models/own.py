@@ -13,6 +13,8 @@ from stillmap.models.moments import Look
 from stillmap.models.options import MoverOptions
 from stillmap.models.sources import Sources
 from stillmap.objects import MovingObject
+from stillmap.output.points import DYNAMIC_BELOW
+from stillmap.recording import spool
 from stillmap.surface import rows
 from stillmap.texture.things import Thing
 
@@ -21,7 +23,6 @@ Bool = NDArray[np.bool_]
 Index = NDArray[np.intp]
 
 NOBODY = -1
-_DYNAMIC = 0.5
 _FAR = 1000.0  # m
 _OFTEN = 0.9  # of the time something is not faster
 _REACH = 3.0  # m, from the middle of a car to its ends
@@ -55,22 +56,31 @@ class Moves(NamedTuple):
     @classmethod
     def of(cls, sources: Sources) -> "Moves":
         """All that moves, once for all things."""
-        seen = sources.seen
-        dynamic = seen.hit & (sources.p_static < _DYNAMIC)
-        owner = np.full(seen.n_beams, NOBODY, np.int32)
-        for one in sources.objects:
-            owner[one.beams] = one.id
-        beam = np.flatnonzero(dynamic | (owner != NOBODY))
-        seconds = seconds_of(beam, sources)
-        ends = seen.end_points(beam, sources.poses)
+        seen, objects = sources.seen, sources.objects
+        owned = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in objects)])
+        whose = np.repeat([one.id for one in objects], [len(one.beams) for one in objects])
+        beam = np.union1d(_dynamic(seen.hit, sources.p_static), owned).astype(np.intp)
+        owner = np.full(len(beam), NOBODY, np.int32)
+        owner[np.searchsorted(beam, owned)] = whose
+        dynamic = seen.hit[beam] & (sources.p_static[beam] < DYNAMIC_BELOW)
+        seconds, ends = seconds_of(beam, sources), seen.end_points(beam, sources.poses)
         asked = np.unique(np.linspace(0, seen.n_scans - 1, min(seen.n_scans, _ASKED)).astype(int))
         planar = [rows.is_planar(rows.directions(seen.points[seen.beams_of(t)])) for t in asked]
-        return cls(beam, seconds, ends, owner[beam], dynamic[beam], 2 * sum(planar) > len(planar))
+        return cls(beam, seconds, ends, owner, dynamic, 2 * sum(planar) > len(planar))
 
     def between(self, first: int, last: int) -> slice:
         """Those with numbers from the first to before the last."""
         a, b = np.searchsorted(self.beam, [first, last])
         return slice(int(a), int(b))
+
+
+def _dynamic(hit: Bool, p_static: NDArray[np.float32]) -> Index:
+    """The beams that hit something rather dynamic than static; little waits in memory."""
+    found = [np.zeros(0, np.intp)]
+    for block in spool.blocks(hit, p_static):
+        moves = hit[block] & (p_static[block] < DYNAMIC_BELOW)
+        found.append(block.start + np.flatnonzero(moves))
+    return np.concatenate(found)
 
 
 def seconds_of(beams: Index, sources: Sources) -> Float:

@@ -11,6 +11,7 @@ from stillmap.em.chunks import Chunk, chunks
 from stillmap.models.ahead import Ahead
 from stillmap.models.moving_points import Moving, tint_moving
 from stillmap.models.options import MeshOptions
+from stillmap.models.own import Moves
 from stillmap.models.sources import Sources
 from stillmap.output.points import DYNAMIC_BELOW
 from stillmap.recording import spool
@@ -44,6 +45,7 @@ def tinted(
     sources: Sources,
     textured: Textured,
     place: Ahead,
+    moves: Moves,
     options: MeshOptions,
     threads: int = 1,
     tell: Tell | None = None,
@@ -59,6 +61,7 @@ def tinted(
         sources: M beams.
         textured: the surface of the place.
         place: what stands still, and the pictures that can be used.
+        moves: the beams on what moves.
         options: see MeshOptions.
         threads: same result with any number.
         tell: called with what is done, and how much of it.
@@ -76,7 +79,7 @@ def tinted(
     late = recording.per_beam(np.float32)
     for block in spool.blocks(late):
         late[block] = np.inf
-    moving = Moving(sources, T_map_sensor)
+    moving = Moving(sources, moves)
     for number in range(len(place.views)):
         tint_moving(out, late, moving, number, place, options)
         sources.seen.let_go(sources.p_static, out, late)
