@@ -9,8 +9,8 @@ that comes to the end of its route turns back. With --keep the recording is look
 or put there: 1.3 MB a sweep of 64 channels and 900 columns. Each length has a process of its own,
 which reads the recording, labels it and writes the result; its memory is the largest resident size,
 in which mapped pages of files count. With --models it makes models of the place and of what moved,
-too. "m2 seen" are squares of a metre in which beams ended: memory
-may grow with these, time per sweep not at all.
+too. "m2 seen" are squares of a metre in which beams ended: memory may grow with these, time per
+sweep not at all.
 """
 
 import argparse

@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import containers
 import corpus
+import corpus_bags
+import corpus_pictures
 import numpy as np
 import parts
 
@@ -162,8 +164,8 @@ def _toml(data: bytes, folder: Path) -> None:
 def _cameras(data: bytes, folder: Path) -> None:
     """Beside a sound recording, with a folder of further pictures."""
     place = folder / "in"
-    scenes = next(corpus.scenes(folder))
-    _write(scenes, place, corpus.SCENES)
+    scenes = next(corpus_pictures.scenes(folder))
+    _write(scenes, place, corpus_pictures.SCENES)
     _write(parts.joined([parts.split(scenes)[1], b"0.01\n"]), folder, ("more/0.png", "times.txt"))
     (folder / "in.toml").write_bytes(data)
     require_sound(place, ReadOptions(cameras=str(folder / "in.toml")))
@@ -214,11 +216,11 @@ def _results(work: Path) -> Iterator[bytes]:
 TARGETS = {
     "carmen": Target(_file("in.log"), corpus.carmen),
     "ours": Target(_folder(corpus.OURS), corpus.ours, parts.changed),
-    "bag": Target(_file("in.bag"), corpus.bag1, containers.changed_bag),
-    "mcap": Target(_file("in.mcap"), corpus.mcap, containers.changed_mcap),
-    "db3": Target(_file("in.db3"), corpus.db3, containers.changed_db3),
-    "ros1": Target(_messages("ros1"), lambda _: corpus.messages_of("ros1"), parts.changed),
-    "cdr": Target(_messages("cdr"), lambda _: corpus.messages_of("cdr"), parts.changed),
+    "bag": Target(_file("in.bag"), corpus_bags.bag1, containers.changed_bag),
+    "mcap": Target(_file("in.mcap"), corpus_bags.mcap, containers.changed_mcap),
+    "db3": Target(_file("in.db3"), corpus_bags.db3, containers.changed_db3),
+    "ros1": Target(_messages("ros1"), lambda _: corpus_bags.messages_of("ros1"), parts.changed),
+    "cdr": Target(_messages("cdr"), lambda _: corpus_bags.messages_of("cdr"), parts.changed),
     "kitti": Target(_folder(corpus.KITTI), corpus.kitti, parts.changed),
     "drive": Target(_folder(corpus.DRIVE), corpus.drive, parts.changed),
     "pcd": Target(_file("in.pcd"), corpus.pcd, containers.changed_pcd),
@@ -226,9 +228,9 @@ TARGETS = {
     "las": Target(_file("in.las"), corpus.las),
     "e57": Target(_file("in.e57"), corpus.e57, containers.changed_e57),
     "3dtk": Target(_folder(corpus.UOS), corpus.uos, parts.changed),
-    "scenes": Target(_folder(corpus.SCENES), corpus.scenes, parts.changed),
-    "tum": Target(_folder(corpus.TUM), corpus.tum, parts.changed),
-    "cameras": Target(_cameras, corpus.cameras),
+    "scenes": Target(_folder(corpus_pictures.SCENES), corpus_pictures.scenes, parts.changed),
+    "tum": Target(_folder(corpus_pictures.TUM), corpus_pictures.tum, parts.changed),
+    "cameras": Target(_cameras, corpus_pictures.cameras),
     "toml": Target(_toml, corpus.toml),
     "rows": Target(_rows, corpus.rows),
     "result": Target(_result, _results, parts.changed),

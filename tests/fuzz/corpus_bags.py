@@ -1,0 +1,170 @@
+"""What fuzzing begins with: bags of every kind, and the messages in them."""
+
+import io
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from corpus import START
+from parts import joined
+from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "formats" / "ros"))
+
+from small_bags import Messages, write_bag
+
+FLOAT, DOUBLE, U32 = 7, 8, 6
+
+
+def _cloud(messages: Messages, stamp: int, big: bool = False) -> tuple[str, Any]:
+    rng, order = np.random.default_rng(3), ">" if big else "<"
+    layout = [("x", FLOAT, "f4"), ("y", FLOAT, "f4"), ("z", DOUBLE, "f8"), ("t", U32, "u4")]
+    dtype = np.dtype([(name, order + kind) for name, _, kind in layout])
+    rows = np.zeros(8, dtype)
+    for name in "xyz":
+        rows[name] = rng.normal(0, 5, 8)
+    rows["t"] = np.linspace(0, 9e7, 8)
+    fields = [
+        messages.make("sensor_msgs/msg/PointField", name, dtype.fields[name][1], kind, 1)
+        for name, kind, _ in layout
+    ]
+    kind = "sensor_msgs/msg/PointCloud2"
+    return kind, messages.make(
+        kind,
+        messages.header(stamp, "lidar"),
+        height=2,
+        width=4,
+        fields=fields,
+        is_bigendian=big,
+        point_step=dtype.itemsize,
+        row_step=4 * dtype.itemsize,
+        data=rows.view(np.uint8).ravel(),
+        is_dense=True,
+    )
+
+
+def _image(messages: Messages, stamp: int) -> tuple[str, Any]:
+    kind, data = "sensor_msgs/msg/Image", np.arange(2 * 3 * 3, dtype=np.uint8)
+    return kind, messages.make(kind, messages.header(stamp, "cam"), 2, 3, "rgb8", 0, 9, data)
+
+
+def _packed_image(messages: Messages, stamp: int) -> tuple[str, Any]:
+    kind, out = "sensor_msgs/msg/CompressedImage", io.BytesIO()
+    Image.new("RGB", (4, 3), (9, 99, 200)).save(out, format="PNG")
+    data = np.frombuffer(out.getvalue(), np.uint8)
+    return kind, messages.make(kind, messages.header(stamp, "cam2"), "png", data)
+
+
+def _camera_info(messages: Messages, stamp: int) -> tuple[str, Any]:
+    names = "DKRP" if messages.encoding == "ros1" else "dkrp"
+    values = [np.zeros(5), np.eye(3).ravel() * 4, np.eye(3).ravel(), np.zeros(12)]
+    region = messages.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+    kind = "sensor_msgs/msg/CameraInfo"
+    return kind, messages.make(
+        kind,
+        header=messages.header(stamp, "cam"),
+        height=2,
+        width=3,
+        distortion_model="plumb_bob",
+        binning_x=0,
+        binning_y=0,
+        roi=region,
+        **dict(zip(names, values, strict=True)),
+    )
+
+
+def _multi_echo(messages: Messages, stamp: int) -> tuple[str, Any]:
+    echo = [messages.make("sensor_msgs/msg/LaserEcho", np.array(e, np.float32)) for e in ([1], [])]
+    kind = "sensor_msgs/msg/MultiEchoLaserScan"
+    numbers = dict.fromkeys(("angle_max", "scan_time"), 0.0)
+    return kind, messages.make(
+        kind,
+        header=messages.header(stamp, "laser2"),
+        angle_min=0.0,
+        angle_increment=0.1,
+        time_increment=0.001,
+        range_min=0.1,
+        range_max=9.0,
+        ranges=echo,
+        intensities=[],
+        **numbers,
+    )
+
+
+def laser_messages(messages: Messages) -> list[tuple[str, int, tuple[str, Any]]]:
+    fixed = messages.transform(START, "base_link", "laser", (0.1, 0, 0))
+    out = [("/tf_static", START, messages.tf(fixed))]
+    for k in range(4):
+        stamp = START + k * 10**8
+        moving = messages.transform(stamp, "odom", "base_link", (0.1 * k, 0, 0))
+        out += [
+            ("/tf", stamp, messages.tf(moving)),
+            ("/odom", stamp, messages.odometry(stamp, (0.1 * k, 0, 0), (0, 0, 0, 1))),
+            ("/scan", stamp, messages.scan(stamp, [1.0, 2.0 + k, np.inf], time_increment=0.01)),
+        ]
+    return [*out, ("/echoes", START, _multi_echo(messages, START))]
+
+
+def cloud_messages(messages: Messages) -> list[tuple[str, int, tuple[str, Any]]]:
+    fixed = messages.transform(START, "base_link", "lidar", (0.1, 0, 0.5))
+    out = [("/tf_static", START, messages.tf(fixed))]
+    for k in range(3):
+        stamp = START + k * 10**8
+        moving = messages.transform(stamp, "odom", "base_link", (0.1 * k, 0, 0))
+        out += [
+            ("/tf", stamp, messages.tf(moving)),
+            ("/points", stamp, _cloud(messages, stamp, big=k == 2)),
+        ]
+    return [
+        *out,
+        ("/cam/image_raw", START, _image(messages, START)),
+        ("/cam/camera_info", START, _camera_info(messages, START)),
+        ("/other/image/compressed", START + 5, _packed_image(messages, START + 5)),
+    ]
+
+
+def _bags(work: Path, kind: str, packings: list[dict[str, Any]]) -> Iterator[bytes]:
+    messages = Messages("ros1" if kind == "bag" else "cdr")
+    for number, packing in enumerate(packings):
+        content = (cloud_messages if number == 1 else laser_messages)(messages)
+        path = write_bag(work, kind, messages, content, f"b{number}", **packing)
+        yield path.read_bytes()
+        path.unlink()
+        shutil.rmtree(work / f"b{number}", ignore_errors=True)
+
+
+def bag1(work: Path) -> Iterator[bytes]:
+    from rosbags.rosbag1 import Writer
+
+    kinds = Writer.CompressionFormat
+    packings = [{}, {}, {"fmt": kinds.BZ2}, {"fmt": kinds.LZ4}]
+    yield from _bags(work, "bag", packings)
+
+
+def mcap(work: Path) -> Iterator[bytes]:
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+    packed = {"mode": CompressionMode.STORAGE, "fmt": CompressionFormat.ZSTD}
+    yield from _bags(work, "mcap", [{}, {}, packed])
+
+
+def db3(work: Path) -> Iterator[bytes]:
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+    packed = {"mode": CompressionMode.MESSAGE, "fmt": CompressionFormat.ZSTD}
+    yield from _bags(work, "db3", [{}, {}, packed])
+
+
+def messages_of(encoding: str) -> Iterator[bytes]:
+    """Messages as parts: their type and topic in a line, then their bytes."""
+    messages = Messages(encoding)
+    for content in (laser_messages(messages), cloud_messages(messages)):
+        yield joined(
+            [
+                f"{kind} {topic}\n".encode() + messages.raw(kind, message)
+                for topic, _, (kind, message) in content
+            ]
+        )
