@@ -3,6 +3,7 @@
 import dataclasses
 import errno
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -156,6 +157,36 @@ def test_without_pictures_the_surface_is_grey_and_lit(room, result, mapped, tmp_
     assert record["area_painted"] == record["area_seen"] == record["pictures"]["usable"] == 0
     assert (np.load(out / "mesh_faces.npz")["image"] == -1).all()
     assert record["area"] == pytest.approx(record_of(result)["area"], rel=0.01)
+
+
+def test_damaged_pictures_are_told_of_and_others_paint_in_their_place(
+    room, result, mapped, tmp_path
+):
+    bad, n = tmp_path / "bad", len(folder.read(room).images)
+    shutil.copytree(room, bad)
+    pictures = sorted((bad / "images").iterdir())
+    pictures[1].write_bytes(pictures[1].read_bytes()[:200])
+    pictures[4].write_bytes(b"")
+    out = mapped("bad", source=bad)
+    record = json.loads((out / "run.json").read_text())
+    told = record["models"]["pictures"]
+    assert told["usable"] == n - 2
+    assert told["left_out"] == {"pictures that cannot be read": 2}
+    first, second = told["unread"]
+    assert pictures[1].name in first
+    assert pictures[4].name in second
+    assert f"2 pictures are not used, the first: {first}" in record["warnings"]
+    # what paints is what was left; but for what only those two saw, all is painted as before
+    image = np.load(out / "mesh_faces.npz")["image"]
+    assert not np.isin(image, (1, 4)).any()
+    assert np.isin(np.load(result / "mesh_faces.npz")["image"], (1, 4)).any()
+    assert record["models"]["area_painted"] > 0.9 * record_of(result)["area_painted"]
+    # and nothing that counts as painted is grey
+    page = trimesh.load(out / "mesh.glb").geometry["page0"]
+    colours = trimesh.visual.color.uv_to_color(
+        page.visual.uv, page.visual.material.baseColorTexture
+    )
+    assert (colours[:, :3] == 128).all(axis=1).mean() < 0.01
 
 
 def test_without_the_libraries_all_the_rest_is_written(mapped, monkeypatch):

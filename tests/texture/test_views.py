@@ -9,7 +9,7 @@ from stillmap import se2, se3
 from stillmap.errors import InputError
 from stillmap.recording import Recording
 from stillmap.recording.images import Camera, Images
-from stillmap.texture.views import ViewOptions, colours_of, poses_at, usable, views_of
+from stillmap.texture.views import ViewOptions, colours_of, poses_at, readable, usable, views_of
 
 S = 10**9
 K = np.array([[10.0, 0.0, 7.5], [0.0, 10.0, 5.5], [0.0, 0.0, 1.0]])
@@ -162,6 +162,13 @@ def test_damaged_pictures_are_found_when_they_are_wanted():
     assert len(views) == 4
     assert left_out == {}
     assert [colours_of(pictures, view) is None for view in views] == [True, False, True, True]
+    told = []
+    kept, unread = readable(pictures, views, lambda *done: told.append(done))
+    assert [view.image for view in kept] == [1]
+    assert unread[:2] == ["is no picture"] * 2
+    assert "picture 3 is (6, 16, 3)" in unread[2]
+    assert told == [(k, 4) for k in (1, 2, 3, 4)]
+    assert readable(None, []) == ([], [])
 
     def never(image: int) -> np.ndarray:
         raise InputError(f"{image} is no picture")

@@ -125,6 +125,11 @@ def _modelled(
     warnings = [*result.warnings]
     if not len(models.painted.mesh):
         warnings.append("no model of the place: hardly any beams lie side by side on it")
+    if count := len(models.unread):
+        what = (
+            "a picture is not used" if count == 1 else f"{count} pictures are not used, the first"
+        )
+        warnings.append(f"{what}: {models.unread[0]}")
     return models, dataclasses.replace(result, warnings=warnings, stages=stages.to_dict())
 
 

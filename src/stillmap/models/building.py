@@ -25,10 +25,11 @@ from stillmap.texture.baking import baked
 from stillmap.texture.options import VisibleOptions
 from stillmap.texture.textured import Textured, replaced
 from stillmap.texture.view import View
-from stillmap.texture.views import colours_of, views_of
+from stillmap.texture.views import UNREAD, colours_of, readable, views_of
 
 Float = NDArray[np.float64]
 Read = Callable[[int], NDArray[Any]]
+Tell = Callable[[int, int], None]
 
 _NEEDED = ("skimage.measure", "pyfqmr", "xatlas", "trimesh")  # of the extra `mesh`
 _SPOILED = 0.5  # probability that a picture shows static things only, below which it does not
@@ -66,6 +67,7 @@ class Models:
             moves, as it would be without labels; None where that is nowhere.
         views: the pictures that can be used.
         left_out: how many others there are, by reason.
+        unread: a line for each of the others that could not be read.
         movers: models of what moved, in the order of the objects.
         tried: how many objects there are.
         tints: colours of the beams' ends; None where there are no pictures, or nobody wants them.
@@ -76,6 +78,7 @@ class Models:
     unfiltered: Textured | None
     views: list[View]
     left_out: dict[str, int]
+    unread: list[str]
     movers: list[MoverModel]
     tried: int
     tints: Tints | None = None
@@ -112,7 +115,7 @@ def models_of(
     """
     stages = stages or Stages()
 
-    def tell(what: str) -> Callable[[int, int], None]:
+    def tell(what: str) -> Tell:
         return lambda done, total: progress(what, 0, done, total)
 
     with stages.measure("surface"):
@@ -125,7 +128,7 @@ def models_of(
             tell("building the surface"),
         )
     with stages.measure("painting"):
-        views, left_out = views_of(sources.recording, sources.poses)
+        views, left_out, unread = _usable(sources, tell("reading pictures"))
         limits = options.texture.visible
         place = painted(
             mesh, views, sources, options.choice, limits, threads, tell("choosing pictures")
@@ -146,7 +149,16 @@ def models_of(
             now = tell("colouring points")
             tints = tinted(sources, textured, ahead, moves, options, threads, now)
     tried = len(sources.objects)
-    return Models(place, textured, unfiltered, views, left_out, movers, tried, tints)
+    return Models(place, textured, unfiltered, views, left_out, unread, movers, tried, tints)
+
+
+def _usable(sources: Sources, tell: Tell) -> tuple[list[View], dict[str, int], list[str]]:
+    """Pictures of a known place that can be read; how many cannot be used, and which not read."""
+    views, left_out = views_of(sources.recording, sources.poses)
+    views, unread = readable(sources.recording.images, views, tell)
+    if unread:
+        left_out = {**left_out, UNREAD: left_out.get(UNREAD, 0) + len(unread)}
+    return views, left_out, unread
 
 
 def _unfiltered(
@@ -185,7 +197,7 @@ def _movers(
     views: Sequence[View],
     ahead: Ahead,
     options: MeshOptions,
-    tell: Callable[[int, int], None],
+    tell: Tell,
 ) -> list[MoverModel]:
     followed = followed_of(sources, moves, options.objects)
     wholes = wholes_of(followed, moves, sources, options.objects)

@@ -102,7 +102,7 @@ def models_record(models: ModelsLike) -> dict[str, Any]:
             "used": len(used),
             "usable": len(models.views),
             "left_out": dict(models.left_out),
-            "unread": list(models.textured.unread),
+            "unread": [*models.unread, *models.textured.unread],
         },
         "pages": [list(page.shape[:2]) for page in models.textured.pages],
         "objects": {"found": models.tried, "modelled": len(models.movers)},

@@ -16,6 +16,7 @@ from stillmap.texture.options import TextureOptions
 from stillmap.texture.sampling import bilinear, halved
 from stillmap.texture.textured import GREY, Textured
 from stillmap.texture.view import View
+from stillmap.texture.views import of_colours
 
 Index = NDArray[np.int32]
 
@@ -52,7 +53,7 @@ def baked(
     for number, faces in _by_view(layout):
         one = views[number]
         try:
-            picture = _of_colours(read(one.image), one)
+            picture = of_colours(read(one.image), one)
         except InputError as error:
             unread.append(str(error))
             view[faces] = -1
@@ -86,17 +87,6 @@ def _by_view(layout: Layout) -> Iterator[tuple[int, NDArray[np.intp]]]:
     for number, faces in zip(numbers.tolist(), np.split(order, first[1:]), strict=True):
         if number >= 0:
             yield number, faces
-
-
-def _of_colours(picture: NDArray[Any], view: View) -> NDArray[np.uint8]:
-    """A picture with three colours."""
-    camera = view.camera
-    if picture.shape[:2] != (camera.height, camera.width) or picture.dtype != np.uint8:
-        what = f"picture {view.image} is {picture.shape} {picture.dtype}, and not what its camera"
-        raise InputError(f"{what} takes: {camera.height} by {camera.width} of 8 bits")
-    if picture.ndim == 2:
-        picture = picture[:, :, None]
-    return np.broadcast_to(picture[:, :, :3], (*picture.shape[:2], 3))
 
 
 def _paint(

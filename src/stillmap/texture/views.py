@@ -2,6 +2,7 @@
 from."""
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,10 +21,12 @@ from stillmap.texture.view import View
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
+Tell = Callable[[int, int], None]
 
 _TRIED = 5  # pictures of a camera that are looked at to find one that can be read
 _STILL = (0.02, np.radians(0.5))  # m, rad: who moved less over a pause stood
 
+UNREAD = "pictures that cannot be read"
 _BEYOND = "taken when nobody knows where the robot was"
 _PAUSE = "taken in a pause of the scans, after which the robot was elsewhere"
 _LEAP = "taken where the poses leap"
@@ -92,15 +95,54 @@ def usable(recording: Recording) -> tuple[Mask, dict[str, int]]:
     return out, left_out
 
 
+def readable(
+    images: Images | None, views: Sequence[View], tell: Tell | None = None
+) -> tuple[list[View], list[str]]:
+    """The views whose pictures can be read, and for each of the others a line that says why not.
+
+    Args:
+        images: of the recording; None: there are none, and no views.
+        views: some of them.
+        tell: called with how many are read, and of how many.
+    """
+    kept, unread = list[View](), list[str]()
+    for number, view in enumerate(views):
+        assert images is not None
+        try:
+            of_colours(images.read(view.image), view)
+            kept.append(view)
+        except InputError as error:
+            unread.append(str(error))
+        if tell is not None:
+            tell(number + 1, len(views))
+    return kept, unread
+
+
 def colours_of(images: Images, view: View) -> NDArray[np.uint8] | None:
     """(height, width, 3) the picture of a view; None where it is damaged, or no longer there."""
     try:
-        picture = images.read(view.image)
+        return of_colours(images.read(view.image), view)
     except InputError:
         return None
-    if picture.dtype != np.uint8 or picture.shape[:2] != (view.camera.height, view.camera.width):
-        return None
-    return np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture
+
+
+def of_colours(picture: NDArray[Any], view: View) -> NDArray[np.uint8]:
+    """(height, width, 3) the picture of a view with three colours.
+
+    Args:
+        picture: (height, width[, 3 or more]) as it was read.
+        view: which it is of.
+
+    Raises:
+        InputError: it is not of 8 bits, or not as large as its camera's pictures.
+    """
+    camera = view.camera
+    if picture.shape[:2] != (camera.height, camera.width) or picture.dtype != np.uint8:
+        what = f"picture {view.image} is {picture.shape} {picture.dtype}, and not what its camera"
+        raise InputError(f"{what} takes: {camera.height} by {camera.width} of 8 bits")
+    if picture.ndim == 2:
+        return np.repeat(picture[:, :, None], 3, axis=2)
+    return np.broadcast_to(picture[:, :, :3], (*picture.shape[:2], 3))
 
 
 def poses_at(
@@ -178,7 +220,7 @@ def _usable(images: Images, number: int) -> tuple[Camera | None, str]:
         return None, "a camera whose place is not finite"
     picture = _first(images, number)
     if picture is None:
-        return None, "pictures that cannot be read"
+        return None, UNREAD
     if picture.dtype != np.uint8 or picture.ndim not in (2, 3):
         return None, "pictures without colours (depth, or 16 bits)"
     height, width = picture.shape[:2]
