@@ -3,8 +3,9 @@
 import threading
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from stillmap.threads import in_order
+from stillmap.threads import in_order, one_blas_thread
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
@@ -43,3 +44,16 @@ def test_what_goes_wrong_is_told(threads):
     assert [next(outcomes) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(ValueError, match="the third"):
         next(outcomes)
+
+
+def blas_threads():
+    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+
+def test_linear_algebra_is_done_by_one_thread_meanwhile():
+    with threadpool_limits(2, "blas"):
+        if blas_threads() != {2}:
+            pytest.skip("this BLAS has one thread only")
+        with one_blas_thread():
+            assert blas_threads() == {1}
+        assert blas_threads() == {2}

@@ -22,7 +22,7 @@ from stillmap.recording.options import ReadOptions
 from stillmap.scene.rig_options import RigOptions
 from stillmap.slam import SlamOptions
 from stillmap.stages import Stages
-from stillmap.threads import resolved_threads
+from stillmap.threads import one_blas_thread, resolved_threads
 
 Float = NDArray[np.float64]
 # what, iteration (0: after the last), scans done, of how many (0: not counted)
@@ -217,7 +217,7 @@ def iterate(
         e, before = after.p_static, after.mapped
         # the first labels change most: from the second poses on, a sweep follows what is left
         start = before if after.number > 1 else None
-        with stages.measure("m_step"):  # (9)-(15)
+        with stages.measure("m_step"), one_blas_thread():  # (9)-(15)
             mapped = slam.m_step(
                 recording,
                 e,

@@ -23,7 +23,7 @@ from stillmap.recording.model import Recording
 from stillmap.scene.movers import moving_in_space
 from stillmap.scene.plan import columns_of, plan_of
 from stillmap.stages import Stages
-from stillmap.threads import resolved_threads
+from stillmap.threads import one_blas_thread, resolved_threads
 
 Float = NDArray[np.float64]
 
@@ -96,6 +96,7 @@ class Result:
         save(self, Path(path), overwrite, models=models)
 
 
+@one_blas_thread()
 def build(
     recording: Recording,
     options: Options = DEFAULTS,

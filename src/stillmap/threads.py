@@ -4,7 +4,11 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
+
+import scipy.linalg  # noqa: F401  (loads SciPy's own BLAS, which is told of below, too)
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 _Item = TypeVar("_Item")
 _Outcome = TypeVar("_Outcome")
@@ -17,6 +21,18 @@ def resolved_threads(asked: int) -> int:
     if hasattr(os, "sched_getaffinity"):
         return max(1, len(os.sched_getaffinity(0)))
     return max(1, os.cpu_count() or 1)
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Linear algebra by one thread meanwhile, in the whole process.
+
+    Matrices are small here, and kernels have threads of their own. BLAS's wait for each other
+    busily: where other processes want the processors, that costs more than all the work. Sums have
+    the same bits on every machine, too.
+    """
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
 
 
 def in_order(

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from choices import RESOLUTION, options, with_any_estimator
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import stillmap
 from stillmap import em
@@ -330,3 +331,14 @@ def test_the_order_of_memory_does_not_matter(room):
         stillmap.build(room.recording, chosen),
         stillmap.build(dataclasses.replace(room.recording, **frozen), chosen),
     )
+
+
+def test_linear_algebra_has_one_thread_while_a_job_is_done(room):
+    seen = set()
+
+    def look(*_):
+        seen.update(one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas")
+
+    with threadpool_limits(2, "blas"):
+        stillmap.build(room.recording, options("stillmap", max_iterations=1), progress=look)
+    assert seen == {1}

@@ -15,7 +15,7 @@ from stillmap.recording.formats import format_of
 from stillmap.recording.lines import Progress
 from stillmap.result import Result
 from stillmap.scene.rig import Flat, Tilting, built_in_3d, require_rig
-from stillmap.threads import resolved_threads
+from stillmap.threads import one_blas_thread, resolved_threads
 
 
 def read_tilting(
@@ -67,6 +67,7 @@ def _of_topic(
         return read_tilting(path, read_as, tell, scratch)
 
 
+@one_blas_thread()
 def built(result: Result, tilting: Recording, options: Options) -> Tilting:
     """What that laser built, once the flat one knows what moves."""
     return built_in_3d(Flat.of(result), tilting, options, resolved_threads(options.threads))

@@ -7,9 +7,10 @@ from stillmap.pipeline import Progress, silent
 from stillmap.result import Result
 from stillmap.scene.rig import Tilting
 from stillmap.stages import Stages
-from stillmap.threads import resolved_threads
+from stillmap.threads import one_blas_thread, resolved_threads
 
 
+@one_blas_thread()
 def models_of(
     result: Result,
     *,
