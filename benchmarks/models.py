@@ -80,6 +80,7 @@ COLUMNS = (
     Column("chamfer", "chamfer, cm", ".2f"),
     Column("good", "within 5 cm, %", ".0f", True),
     Column("background", "background, %", ".2f"),
+    Column("nothing", "models of no mover", ".1f"),
     Column("seconds", "s", ".0f"),
 )
 _PERCENT = {"complete", "mover", "covered", "modelled", "modelled_well", "good", "background"}

@@ -243,8 +243,10 @@ def test_a_model_that_is_too_large_is_off_by_that(grown: float) -> None:
     model = Model(_box(grown), _SIDES, T_MAP_WORLD @ T, 2 * 10**9, (0, 10**9), None)
     none = _pictures(np.zeros((30, 40), np.uint16))
     tracked = {7: 0, 8: -1}
-    found = mover_scores(tracked, {7: (0, model)}, ["car"], DRIVES, _seen_box(), none, T_WORLD_MAP)
+    models = {7: (0, model), 8: (-1, model)}
+    found = mover_scores(tracked, models, ["car"], DRIVES, _seen_box(), none, T_WORLD_MAP)
     (one,) = found.models
+    assert found.nothing == 1
     assert (one.id, one.mover, one.kind) == (7, 0, "car")
     assert one.accuracy == pytest.approx(grown, abs=0.004)  # edges are a little farther
     assert one.completeness == pytest.approx(grown, abs=1e-9)

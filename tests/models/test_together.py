@@ -171,9 +171,20 @@ def test_looks_of_several_lidars_follow_one_another() -> None:
     assert (np.diff(shape.way.seconds) >= 0.0).all()
 
 
-def test_without_a_surface_there_is_no_model() -> None:
+@pytest.mark.parametrize(
+    ("options", "any_model"),
+    [
+        (MoverOptions(), True),
+        (MoverOptions(least=0.0, island=1000.0), False),  # no surface
+        (MoverOptions(least=50.0), False),
+        (MoverOptions(height=0.8), True),
+        (MoverOptions(height=2.0), False),  # a car is not so high
+    ],
+)
+def test_without_enough_of_a_surface_there_is_no_model(
+    options: MoverOptions, any_model: bool
+) -> None:
     sources = street([Car((8.0, -2.0), (6.0, 0.0))], [Part(0)])
-    options = MoverOptions(least=0.0, island=1000.0)
     moves = Moves.of(sources)
     (whole,) = wholes_of(followed_of(sources, moves, options), moves, sources, options)
-    assert shape_of(whole, sources, moves, options, [np.zeros(0)]) is None
+    assert (shape_of(whole, sources, moves, options, [np.zeros(0)]) is not None) == any_model

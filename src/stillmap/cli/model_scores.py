@@ -100,7 +100,8 @@ def _mover_lines(m: MoverScores) -> Iterable[str]:
     )
     yield (
         f"models       {len(m.models)}: chamfer {_cm(m.chamfer)} on average, "
-        f"{_percent(m.good)} within 5 cm; background {_percent(m.background)}"
+        f"{_percent(m.good)} within 5 cm; background {_percent(m.background)}; "
+        f"of what is no mover {m.nothing} more"
     )
     for one in m.models:
         yield (

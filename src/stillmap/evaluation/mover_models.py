@@ -96,7 +96,8 @@ class MoverScores(Scores):
         chamfer: mean over models, metres.
         good: share of models with a chamfer distance of at most 5 cm.
         background: mean over models with a texture.
-        models: each of them.
+        nothing: models of what is no mover.
+        models: each of the others.
     """
 
     tracked: int
@@ -106,6 +107,7 @@ class MoverScores(Scores):
     chamfer: float
     good: float
     background: float
+    nothing: int
     models: tuple[ModelScores, ...]
 
 
@@ -152,7 +154,7 @@ def mover_scores(
     Args:
         tracked: the mover that each object is, by the objects' numbers; -1: none.
         models: by the same numbers, and the mover that each shows: that which the object was then.
-            Those of none are not scored.
+            Those of none are only counted.
         kinds: of movers.
         moving: the true shapes.
         sighted: what the sensor saw of them.
@@ -176,6 +178,7 @@ def mover_scores(
         chamfer=_mean(chamfer),
         good=_mean(chamfer <= GOOD),
         background=_mean(_known([one.background for one in scores])),
+        nothing=len(models) - len(scores),
         models=scores,
     )
 

@@ -85,7 +85,7 @@ def shape_of(
         if look is None:
             continue
         mesh = surface_of(look, rigid, DEEPEST, options)
-        if not len(mesh) or mesh.areas().sum() < options.least:
+        if not _enough(mesh, options.least, options):
             continue
         now = 0.5 * sum(look.span)
         if rigid and not moves.planar and len(mesh.vertices) >= _TOLD:
@@ -123,12 +123,19 @@ def _put_together(
         return None
     mesh = _fused([moved[k].patch() for k in kept], options)
     least = max(options.least, _MOST * sweeps[best].mesh.areas().sum())
-    if not len(mesh) or mesh.areas().sum() < least:
+    if not _enough(mesh, least, options):
         return None
     later = np.array([sweeps[k].later for k in kept])
     offset = np.array([_in_plane(*pose(motion, t)) for t in later.tolist()])
     span = min(looks[k].span[0] for k in kept), max(looks[k].span[1] for k in kept)
     return Shape(one.object.id, mesh, Way(way.thing, now + later, offset), True, now, span)
+
+
+def _enough(mesh: Mesh, area: float, options: MoverOptions) -> bool:
+    """Whether a surface is of something: as large as that, and higher than the ground is rough."""
+    if not len(mesh) or mesh.areas().sum() < area:
+        return False
+    return bool(np.ptp(mesh.vertices[:, 2]) >= options.height)
 
 
 def _looks(

@@ -55,6 +55,9 @@ class MoverOptions:
     )
     edge: float = field_with_doc(0.05, "m, longer edges are divided before they are painted")
     least: float = field_with_doc(0.01, "m2 of surface that a model has")
+    height: float = field_with_doc(
+        0.05, "m from its lowest to its highest point, at least: what is flatter is the ground's"
+    )
     island: float = field_with_doc(0.005, "m2, smaller pieces of it are left out")
 
     def __post_init__(self) -> None:
@@ -83,6 +86,7 @@ _LIMITS = (
     ("differs", 0.0, 442.0),
     ("edge", 0.005, 1000.0),
     ("least", 0.0, 1000.0),
+    ("height", 0.0, 1000.0),
     ("island", 0.0, 1000.0),
 )
 
