@@ -154,6 +154,7 @@ def _in_space(recording: Recording, options: ReadOptions, scratch: Path | None) 
     recording = spin.timed(replace(recording, scratch=scratch), options)
     if options.cameras is not None:
         recording = cameras.applied(recording, Path(options.cameras))
+    recording = cameras.doubted(recording)
     return own_body_in_space.left_out(recording) if options.own_body else recording
 
 
