@@ -334,6 +334,8 @@ def test_folders_that_are_not_there_are_named(capsys, result, simulated, tmp_pat
     for kind in ("labels", "map"):
         for pair in ((nothere, simulated), (result, nothere)):
             assert f"{nothere}: does not exist" in refusal(capsys, kind, *pair)
+    said = refusal(capsys, "map", result, simulated, "--reference", nothere)
+    assert f"{nothere}: does not exist" in said
 
 
 def test_a_map_of_another_recording_is_refused(capsys, result, simulated, tmp_path):

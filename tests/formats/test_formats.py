@@ -65,6 +65,9 @@ def test_recordings_inside_are_named(tmp_path):
     assert both.startswith(f"{outer}: is no recording but holds several recordings: ")
     assert f"{outer / 'horizontal'}, {outer / 'tilting'} (both: " in both
     assert f"map {outer / 'horizontal'} --tilting {outer / 'tilting'} -o DIR" in both
+    (outer / "run.json").write_text("")
+    assert "is a folder without a recording" in said()  # but a result: clouds in it are objects
+    (outer / "run.json").unlink()
     many = said("a", "b", "c")
     assert f"{outer / 'a'}, {outer / 'b'}, {outer / 'c'} and 2 more (name one of them)" in many
 

@@ -31,11 +31,12 @@ def converted(args: argparse.Namespace) -> tuple[list[str], str]:
         InputError: it cannot be read, or the output cannot hold it.
     """
     source, output = Path(args.input), Path(args.output)
-    convert = _convert_result if is_result(source) else _convert_recording
-    if convert is _convert_recording:
-        format_of(source)  # what is not there is told before what cannot be written
+    if is_result(source):
+        with parents_made(output):
+            return _convert_result(args, source, output)
+    format_of(source)  # what is not there is told before what cannot be written
     with parents_made(output):
-        return convert(args, source, output)
+        return _convert_recording(args, source, output)
 
 
 def _convert_recording(

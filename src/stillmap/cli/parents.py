@@ -22,10 +22,10 @@ def parents_made(output: Path) -> Iterator[None]:
         try:
             for folder in reversed((parent, *parent.parents)):
                 if not folder.exists():
-                    folder.mkdir()
+                    folder.mkdir(exist_ok=True)
                     made.append(folder)
-            # what is in the way, a device, say, is told of by who writes
-            if not output.exists() or output.is_file():
+            # a device in the way is told of by who writes
+            if not output.exists() or output.is_file() or output.is_dir():
                 tempfile.TemporaryFile(dir=parent).close()
         except OSError as error:
             what = f"cannot be written: {error.strerror or error}"

@@ -112,7 +112,8 @@ def _label_lines(s: LabelScores) -> Iterable[str]:
 
 def of_map(args: argparse.Namespace) -> Scores:
     """Ghosts and walls."""
-    folders.require_there(args.result, args.truth)
+    others = [path for path in (args.reference, args.reference_truth) if path is not None]
+    folders.require_there(args.result, args.truth, *others)
     truth = folders.read_truth(args.truth)
     grid, walls = folders.read_grid(args.result), truth.walls()
     T_world_map = _alignment(args.result, truth)
