@@ -86,7 +86,11 @@ def test_refusals(call, room, tmp_path, nothing_left):
     refused(call("convert", tmp_path / "none", "-o", out), "none: does not exist")
     refused(call("convert", room, "-o", tmp_path / "a.abc"), "'.abc'", ".mcap")
     refused(call("convert", room, "-o", tmp_path / "a.log"), "is there already", "--overwrite")
-    refused(call("convert", room, "-o", tmp_path / "no/a.log"), "no such folder")
+    refused(call("convert", tmp_path / "none", "-o", tmp_path / "a.obj"), "none: does not exist")
+    (tmp_path / "afile").write_text("")
+    for name in ("afile/a.log", "afile/b/a"):
+        said = f"{tmp_path / name}: cannot be written: Not a directory"
+        refused(call("convert", room, "-o", tmp_path / name), said)
     refused(call("convert", room, "-o", room, "--overwrite"), "is the recording itself")
     refused(call("convert", room, "-o", room.parent, "--overwrite"), "holds the recording")
     refused(call("convert", room, "-o", "/dev/null", "--to", "carmen", "--overwrite"), "no regular")
@@ -95,8 +99,33 @@ def test_refusals(call, room, tmp_path, nothing_left):
     for to in ("stillmap", "ros2"):  # only folders of the same kind are overwritten
         done = call("convert", room, "-o", precious, "--overwrite", "--to", to)
         refused(done, "holds other things")
-    nothing_left("precious", "a.log")
+    nothing_left("precious", "a.log", "afile")
     assert (precious / "file").exists()
+
+
+@pytest.mark.parametrize("name", ["conv/c.log", "conv/more/c.bag", "conv/c"])
+def test_folders_above_the_output_are_made(call, room, mapped, tmp_path, nothing_left, name):
+    output = tmp_path / name
+    refused(call("convert", room, "-o", output, "--only", "static"), "--only is for results")
+    refused(call("convert", mapped, "-o", output, "--min-range", 1), "no flags")
+    nothing_left()
+    assert call("convert", room, "-o", output).returncode == 0
+    assert read(output).n_scans == 40
+    nothing_left("conv")
+
+
+def test_what_cannot_be_written_is_said_by_its_name(call, room, tmp_path, monkeypatch):
+    """Where nobody may write; root may nearly everywhere."""
+
+    def denied(*_, **__):
+        raise PermissionError(13, "Permission denied", f"{tmp_path}/stillmap-rhh5gxx6")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", denied)
+    for name in ("x.log", "new/x.log"):
+        done = call("convert", room, "-o", tmp_path / name)
+        refused(done, f"{tmp_path / name}: cannot be written: Permission denied")
+        assert "rhh5gxx6" not in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["a.log", "a.mcap", "a"])
@@ -189,6 +218,7 @@ def test_parts_are_of_clouds(call, room, mapped, tmp_path, nothing_left):
 def test_without_libraries_there_are_no_such_clouds(
     call, mapped, tmp_path, monkeypatch, nothing_left, name, module, package
 ):
+    pytest.importorskip("laspy")  # it looks for lazrs once, and remembers what it found
     monkeypatch.setitem(sys.modules, module, None)
     done = call("convert", mapped, "-o", tmp_path / name)
     refused(done, f"needs {package} to be written", "pip install 'stillmap[io]'")

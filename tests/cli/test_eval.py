@@ -12,9 +12,18 @@ from stillmap.evaluation.map import Grid
 from stillmap.output.map_npz import write_map_npz
 from stillmap.recording import folder
 from stillmap.recording.tum import write_tum
-from stillmap.simulation import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
+from stillmap.simulation import (
+    CrowdOptions,
+    LaserOptions,
+    RobotOptions,
+    Scene,
+    scene_by_name,
+    simulate,
+    simulate_rig,
+    write_rig,
+    write_simulation,
+)
 from stillmap.simulation.walls import box
-from stillmap.simulation.writing import write_simulation
 
 RESOLUTION = 0.1
 SIZE = 140  # cells: the room from anywhere in it
@@ -318,3 +327,57 @@ def test_maps_of_another_kind_are_refused(capsys, simulated, result, change):
 def test_folders_without_truth_are_refused(capsys, result, tmp_path):
     for kind in ("labels", "map"):
         assert "holds no truth" in refusal(capsys, kind, result, tmp_path)
+
+
+def test_folders_that_are_not_there_are_named(capsys, result, simulated, tmp_path):
+    nothere = tmp_path / "nothere"
+    for kind in ("labels", "map"):
+        for pair in ((nothere, simulated), (result, nothere)):
+            assert f"{nothere}: does not exist" in refusal(capsys, kind, *pair)
+    said = refusal(capsys, "map", result, simulated, "--reference", nothere)
+    assert f"{nothere}: does not exist" in said
+
+
+def test_a_map_of_another_recording_is_refused(capsys, result, simulated, tmp_path):
+    other = shutil.copytree(simulated, tmp_path / "other")
+    np.save(other / "stamp_ns.npy", np.load(other / "stamp_ns.npy") + 10**12)
+    said = refusal(capsys, "map", result, other)
+    assert f"{result}: is not of the recording in {other}" in said
+    assert "--max-dt" not in said
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory) -> Path:
+    """What two lasers recorded, as many beams each at the same times."""
+    changes = {"rig": {"tilts": True}, "robot": {"scans": 20, "scan_rate": 37.5}}
+    path = tmp_path_factory.mktemp("rig") / "sim"
+    write_rig(simulate_rig(scene_by_name("hall", changes), 2), path)
+    for name in ("stamp_ns", "offset"):
+        of = [np.load(path / part / f"{name}.npy") for part in ("horizontal", "tilting")]
+        np.testing.assert_array_equal(*of)
+    return path
+
+
+@pytest.mark.parametrize("part", ["horizontal", "tilting"])
+def test_of_a_rig_the_labels_say_whose_truth_counts(capsys, rig, tmp_path, part):
+    out, recording = tmp_path / "out", folder.read(rig / part)
+    (out / "beams").mkdir(parents=True)
+    p_static = np.where(np.load(rig / part / "truth/static.npy"), 0.9, 0.2).astype(np.float32)
+    np.save(out / "beams/p_static.npy", p_static)
+    for name in ("hit", "stamp_ns", "offset"):
+        np.save(out / f"beams/{name}.npy", getattr(recording, name))
+    found = scores(capsys, "labels", out, rig)
+    assert found == scores(capsys, "labels", out, rig / part)
+    assert found["brier"] < 0.05
+    assert found["hits"] == np.count_nonzero(recording.hit)
+
+
+def test_of_a_rig_the_flat_laser_made_the_map(capsys, rig, tmp_path):
+    out, recording = tmp_path / "out", folder.read(rig / "horizontal")
+    out.mkdir()
+    T_world_base = np.load(rig / "horizontal/truth/T_world_base.npy")
+    T_map_base = se2.inverse(T_world_base[0]) @ T_world_base
+    write_tum(out / "trajectory.tum", recording.stamp_ns, T_map_base)
+    near = np.linalg.norm(recording.points, axis=1) < 5.0  # the grid is small
+    write_map(out, recording, T_map_base, recording.hit & near)
+    assert scores(capsys, "map", out, rig) == scores(capsys, "map", out, rig / "horizontal")

@@ -220,7 +220,27 @@ def test_damaged_files_are_named(name: str, what: str, result, simulated, capsys
 def test_a_result_without_a_mesh_is_refused(result, simulated, capsys) -> None:
     (result / "mesh.glb").unlink()
     assert main(["eval", "model", str(result), str(simulated)]) == 2
-    assert "mesh.glb: is no model" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert f"{result}: holds no model" in err
+    assert "pip install 'stillmap[mesh]'" in err
+
+
+def test_a_result_of_another_recording_is_refused(result, simulated, tmp_path, capsys) -> None:
+    other = shutil.copytree(simulated, tmp_path / "other")
+    stamps = np.load(other / "tilting/stamp_ns.npy")
+    np.save(other / "tilting/stamp_ns.npy", stamps + 10**12)
+    assert main(["eval", "model", str(result), str(other)]) == 2
+    err = capsys.readouterr().err
+    assert f"{result}: is not of the recording in {other / 'tilting'}" in err
+    assert "--max-dt" not in err
+
+
+@pytest.mark.parametrize("missing", [0, 1])
+def test_folders_that_are_not_there_are_named(missing, result, simulated, tmp_path, capsys) -> None:
+    words = [str(result), str(simulated)]
+    words[missing] = str(tmp_path / "nothere")
+    assert main(["eval", "model", *words]) == 2
+    assert f"{tmp_path / 'nothere'}: does not exist" in capsys.readouterr().err
 
 
 def test_records_of_other_pictures_are_refused(result, simulated, capsys) -> None:

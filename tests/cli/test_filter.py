@@ -114,6 +114,13 @@ def test_refusals(call, room, mapped, tmp_path):
     assert not (tmp_path / "c").exists()
 
 
+def test_folders_above_the_output_are_made(call, mapped, tmp_path):
+    refused(call("filter", tmp_path / "none", "-o", tmp_path / "a/b/clean"), "run.json")
+    assert not list(tmp_path.iterdir())
+    assert call("filter", mapped, "-o", tmp_path / "a/b/clean").returncode == 0
+    assert read(tmp_path / "a/b/clean").n_scans == 40
+
+
 def test_what_is_read_is_never_overwritten(call, room, mapped, tmp_path):
     shutil.copytree(room, tmp_path / "all/room")
     (tmp_path / "all/precious").write_text("")

@@ -1,5 +1,6 @@
 """Clouds of results in 3D, as the libraries of others read them: the points of `static.ply`."""
 
+import re
 import subprocess
 import sys
 import tracemalloc
@@ -141,6 +142,7 @@ def test_what_a_result_in_space_cannot_become(mapped_street, tmp_path, capsys, n
     assert main(["convert", str(mapped_street), "-o", str(tmp_path / name)]) == 2
     assert "3D recording" in (said := capsys.readouterr().err)
     assert ".laz" in said
+    assert ".obj" in said
     assert not list(tmp_path.iterdir())
 
 
@@ -199,6 +201,16 @@ def test_points_that_are_too_far_off_are_refused(name, tmp_path):
     with pytest.raises(cloud_files.InputError, match=f"{name}: cannot be written: a point lies"):
         cloud_files.write(points, tmp_path / name, form)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("form", cloud_files.FORMATS, ids=lambda form: form.name)
+def test_why_a_file_cannot_be_made_is_said(form, tmp_path):
+    (tmp_path / "file").write_text("")
+    path = tmp_path / f"file/a{form.endings[0]}"
+    points = cloud.Cloud(0, np.zeros(3), None, lambda: iter(()))
+    said = f"{path}: cannot be written: Not a directory"
+    with pytest.raises(cloud_files.InputError, match=re.escape(said)):
+        cloud_files.write(points, path, form)
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57", "a.pcd", "a.ply", "a.xyz"])

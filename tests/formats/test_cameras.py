@@ -6,7 +6,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from stillmap.errors import InputError
-from stillmap.recording import ReadOptions, read
+from stillmap.recording import ReadOptions, read, write
 from stillmap.recording.camera_file import read as read_file
 from stillmap.recording.facts import facts
 
@@ -119,9 +119,21 @@ def test_names_of_pictures_may_be_their_times(drive, file, more):
     ("text", "what"),
     [
         ("[imag_2]\n", r"there is no camera 'imag_2' \(nearest: 'image_2'; folder"),
+        ("[image_2]\nfx = 1\n[imag_2]\n", r"there is no camera 'imag_2' \(nearest: 'image_2'"),
+        ("[imag_2]\nfx = 1\n", r"there is no camera 'imag_2' \(nearest: 'image_2'; folder"),
         ('[image_2]\nfolder = "left"\n', "has pictures in the recording"),
-        ('[left]\nfolder = "missing"\n', "missing: cannot be read: No such file"),
-        ('[left]\nfolder = "empty"\n', "empty: holds no pictures"),
+        (
+            '[left]\nfolder = "missing"\n',
+            r"missing: cannot be read: No such file.*\(camera 'left' of .*cameras\.toml\)",
+        ),
+        (
+            '[left]\nfolder = "empty"\n',
+            r"empty: holds no pictures \(camera 'left' of .*cameras\.toml\)",
+        ),
+        (
+            '[left]\nfolder = "bad"\n',
+            r"1\.5\.png: is no picture.* \(camera 'left' of .*cameras\.toml\)",
+        ),
         ('[left]\nfolder = "left"\n', "names are no times .times = 'FILE' in camera 'left'"),
         ('[left]\nfolder = "left"\ntimes = "no.txt"\n', r"no\.txt: cannot be read|No such file"),
         ('[left]\nfolder = "left"\ntimes = "short.txt"\n', "has 2 times for 3 files"),
@@ -131,10 +143,39 @@ def test_names_of_pictures_may_be_their_times(drive, file, more):
 )
 def test_cameras_and_pictures_that_are_not_there(drive, file, more, text, what):
     (more.parent / "empty").mkdir()
+    (more.parent / "bad").mkdir()
+    (more.parent / "bad/1.5.png").write_text("no picture")
     (more.parent / "short.txt").write_text("1\n2\n")
     (more.parent / "words.txt").write_text("a\nb\nc\n")
     with pytest.raises(InputError, match=what):
         with_cameras(drive, file(text))
+
+
+def warned(recording) -> list[str]:
+    return [text for text in facts(recording)["warnings"] if "principal point" in text]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "at"),
+    [("cx = 7.5", "cx = 32000", "32000, 5.5"), ("cy = 5.5", "cy = -3", "7.5, -3")],
+)
+def test_a_centre_outside_of_the_pictures_is_doubted(drive, file, old, new, at):
+    assert warned(with_cameras(drive, file(f"[image_2]\n{LENS}{AHEAD}"))) == []
+    found = with_cameras(drive, file(f"[image_2]\n{LENS.replace(old, new)}{AHEAD}"))
+    (said,) = warned(found)
+    assert said.startswith(f"camera 'image_2': its principal point, {at}, lies outside of pictures")
+    assert " 16 x 12 pixels" in said
+    assert facts(found)["images"]["usable"] == 4  # parts of larger pictures may have such
+
+
+def test_a_centre_that_the_recording_has_wrong_is_doubted_once(drive, tmp_path):
+    (drive / "calib.txt").write_text(f"P2: 20 0 99 0 0 20 5 0 0 0 1 0\nTr: {ROW}")
+    found = read(drive)
+    (said,) = warned(found)
+    assert "'image_2'" in said
+    assert "99, 5" in said
+    write(found, tmp_path / "own")
+    assert warned(read(tmp_path / "own")) == [said]
 
 
 def test_a_recording_without_pictures_says_so(drive, file):

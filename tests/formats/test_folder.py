@@ -296,6 +296,9 @@ def test_pictures(tmp_path):
     for i in (0, 2):
         with pytest.raises(InputError, match=f"00000{i}"):
             read(tmp_path / "rec").images.read(i)
+        (next((tmp_path / "rec/images").glob(f"00000{i}.*"))).unlink()
+        with pytest.raises(InputError, match=rf"00000{i}\.png: is listed, but not there$"):
+            read(tmp_path / "rec").images.read(i)
 
 
 def test_pictures_that_cannot_be_read_are_left_out(tmp_path):

@@ -46,6 +46,32 @@ def test_nothing_there(tmp_path):
         read(tmp_path)
 
 
+def test_recordings_inside_are_named(tmp_path):
+    outer = tmp_path / "sim"
+    (outer / "notes").mkdir(parents=True)
+    (outer / ".hidden").write_text("")
+
+    def said(*more: str) -> str:
+        for name in more:
+            (outer / name).mkdir()
+            (outer / name / "recording.json").write_text("")
+        with pytest.raises(InputError) as caught:
+            read(outer)
+        return str(caught.value)
+
+    assert "is a folder without a recording" in said()
+    assert said("tilting").endswith(f"holds a recording: {outer / 'tilting'} (name it)")
+    both = said("horizontal")
+    assert both.startswith(f"{outer}: is no recording but holds several recordings: ")
+    assert f"{outer / 'horizontal'}, {outer / 'tilting'} (both: " in both
+    assert f"map {outer / 'horizontal'} --tilting {outer / 'tilting'} -o DIR" in both
+    (outer / "run.json").write_text("")
+    assert "is a folder without a recording" in said()  # but a result: clouds in it are objects
+    (outer / "run.json").unlink()
+    many = said("a", "b", "c")
+    assert f"{outer / 'a'}, {outer / 'b'}, {outer / 'c'} and 2 more (name one of them)" in many
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
 def test_named_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe.log")

@@ -17,10 +17,10 @@ NAMES = ("stillmap", "ros2", "carmen", "bag", "db3", "mcap", "kitti", "pcd", "pl
 _EPILOG = """examples:
   stillmap convert log.clf.gz -o log.bag      for ROS 1
   stillmap convert log.bag -o log --to ros2   a folder for ROS 2
-  stillmap convert out -o out.mcap            a result, to look at in Foxglove
-  stillmap convert out -o beams.parquet       every beam of a result with its label
+  stillmap convert out -o out.mcap            a result in 2D, to look at in Foxglove
+  stillmap convert out -o beams.parquet       likewise, every beam with its label
   stillmap convert out -o static.laz --only static    points of a result in 3D
-  stillmap convert out -o model.obj           the model of the place, pages of texture beside it
+  stillmap convert out -o model.obj           its model of the place, pages of texture beside it
 """
 
 
@@ -30,7 +30,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "convert",
         help=COMMANDS["convert"],
         description="Write a recording in another format, which the ending of FILE names: "
-        f"{', '.join(ENDINGS)}; a folder otherwise. A result of `stillmap map` becomes a bag "
+        f"{', '.join(ENDINGS)}; a folder otherwise. A result of `stillmap map` in 2D becomes a bag "
         "that shows it (.mcap for Foxglove) or a table of its beams (.parquet); in 3D a cloud of "
         f"points with p_static and colours ({', '.join(CLOUDS)}), or the model of the place "
         "(.obj).",

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import options, slam
+from stillmap.cli.parents import parents_made
 from stillmap.cli.progress import shown_share
 from stillmap.cli.reading import read_changes
 from stillmap.cli.results import Mapped, found, is_deskewed, is_result, require_apart
@@ -17,6 +18,7 @@ from stillmap.export import bag, beam_table, cloud, cloud_files, model, result
 from stillmap.output.atomic import require_new_file
 from stillmap.output.tilting import FOLDER as TILTING
 from stillmap.recording import ReadOptions, Recording, read, ros_writing, writers
+from stillmap.recording.formats import format_of
 from stillmap.recording.poses import poses_from_tum
 
 _PARQUET = ".parquet"
@@ -30,8 +32,11 @@ def converted(args: argparse.Namespace) -> tuple[list[str], str]:
     """
     source, output = Path(args.input), Path(args.output)
     if is_result(source):
-        return _convert_result(args, source, output)
-    return _convert_recording(args, source, output)
+        with parents_made(output):
+            return _convert_result(args, source, output)
+    format_of(source)  # what is not there is told before what cannot be written
+    with parents_made(output):
+        return _convert_recording(args, source, output)
 
 
 def _convert_recording(

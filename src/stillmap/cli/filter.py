@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from stillmap.cli.commands import COMMANDS
+from stillmap.cli.parents import parents_made
 from stillmap.cli.printing import print_json
 from stillmap.cli.progress import say
 from stillmap.errors import InputError
@@ -47,7 +48,8 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.cli.filtering import filtered  # takes long to load
 
     output = Path(args.output)
-    done = filtered(Path(args.result), output, args.input, args.below, args.overwrite)
+    with parents_made(output):
+        done = filtered(Path(args.result), output, args.input, args.below, args.overwrite)
     if args.json:
         counts = {"hits": done.hits, "blanked": done.blanked, "scans_left_out": done.left_out}
         print_json({"output": str(output), "input": str(done.source), **counts})

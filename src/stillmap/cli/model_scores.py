@@ -9,25 +9,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.evaluation import files, model_folders, trajectory
+from stillmap.evaluation import folders, model_folders, trajectory
 from stillmap.evaluation.model_folders import Seen
 from stillmap.evaluation.models import SurfaceScores, TextureScores, surface_scores, texture_scores
 from stillmap.evaluation.mover_models import MoverScores, mover_of, mover_scores
+from stillmap.evaluation.pairing import paired
 from stillmap.scene.riding import lifted
 from stillmap.simulation.truth import load_truth
 
 Float = NDArray[np.float64]
 
-_STAMP_TOLERANCE = 1e-6  # seconds: a result carries the stamps of its recording
-
 
 def of_model(args: argparse.Namespace) -> tuple[dict[str, Any], Iterable[str]]:
     """Surface, texture, and models of what moved; what a result does not have is left out."""
+    folders.require_there(args.result, args.truth)
     seen = model_folders.read_seen(args.truth)
     T_world_map = _alignment(args.result, seen)
     scores: dict[str, Any] = {"alignment": T_world_map.tolist()}
     lines: list[str] = []
-    glb = model_folders.read_glb(args.result / model_folders.MESH)
+    glb = model_folders.read_glb(folders.require_model(args.result))
     standing, places = seen.picture_truth.standing, seen.places(args.within)
     surface = surface_scores(glb.vertices, glb.faces, standing, places, T_world_map)
     scores["surface"] = surface.to_dict()
@@ -50,11 +50,7 @@ def of_model(args: argparse.Namespace) -> tuple[dict[str, Any], Iterable[str]]:
 
 def _alignment(result: Path, seen: Seen) -> Float:
     """(4, 4) T_world_map."""
-    estimated = files.read_trajectory(result / "trajectory.tum")
-    stamps = files.seconds(seen.truth.recording.stamp_ns)
-    i, j = trajectory.associate(estimated.stamp_s, stamps, _STAMP_TOLERANCE)
-    pair = trajectory.to_plane_where_flat(estimated.poses[i], seen.truth.poses()[j])
-    T = trajectory.align(*pair)
+    T = trajectory.align(*trajectory.to_plane_where_flat(*paired(result, seen.truth)))
     return T if len(T) == 4 else lifted(T[None])[0]
 
 

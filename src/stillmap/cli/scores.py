@@ -18,11 +18,10 @@ from stillmap.evaluation.map import (
     wall_cells_of_hits,
     wall_cells_of_map,
 )
+from stillmap.evaluation.pairing import paired
 from stillmap.evaluation.relations import RelationErrors, relation_errors
 
 Float = NDArray[np.float64]
-
-_STAMP_TOLERANCE = 1e-6  # seconds: a result carries the stamps of its recording
 
 Scores = tuple[dict[str, Any], Iterable[str]]
 
@@ -64,7 +63,10 @@ def of_trajectory(args: argparse.Namespace) -> Scores:
     """ATE and RPE."""
     estimated = files.read_trajectory(args.trajectory)
     reference = files.read_trajectory(args.reference)
-    i, j = _associated(estimated, reference.stamp_s, args.max_dt, args.trajectory)
+    try:
+        i, j = trajectory.associate(estimated.stamp_s, reference.stamp_s, args.max_dt)
+    except InputError as error:
+        raise InputError(error.what, where=str(args.trajectory), hint=error.hint) from error
     P, Q = trajectory.to_plane_where_flat(estimated.poses[i], reference.poses[j])
     absolute = trajectory.absolute_errors(P, Q)
     relative = trajectory.relative_errors(P, Q, args.delta, args.delta_unit)
@@ -90,7 +92,9 @@ def _stats(e: trajectory.ErrorStats, unit: str) -> str:
 
 def of_labels(args: argparse.Namespace) -> Scores:
     """Static or dynamic, per beam."""
-    labels, truth = folders.read_labels(args.result), folders.read_truth(args.truth)
+    folders.require_there(args.result, args.truth)
+    labels = folders.read_labels(args.result)
+    truth = folders.read_truth(args.truth, labels)
     folders.require_same_beams(labels, truth, args.result)
     scores = label_scores(labels.p_static, truth.static(), labels.hit & truth.recording.hit)
     return scores.to_dict(), _label_lines(scores)
@@ -108,6 +112,8 @@ def _label_lines(s: LabelScores) -> Iterable[str]:
 
 def of_map(args: argparse.Namespace) -> Scores:
     """Ghosts and walls."""
+    others = [path for path in (args.reference, args.reference_truth) if path is not None]
+    folders.require_there(args.result, args.truth, *others)
     truth = folders.read_truth(args.truth)
     grid, walls = folders.read_grid(args.result), truth.walls()
     T_world_map = _alignment(args.result, truth)
@@ -126,10 +132,8 @@ def of_map(args: argparse.Namespace) -> Scores:
 
 def _alignment(result: Path, truth: folders.Truth) -> Float:
     """T_world_map of a result: the map frame is where its trajectory started, not the world's."""
-    path = result / "trajectory.tum"
-    estimated = files.read_trajectory(path)
-    i, j = _associated(estimated, files.seconds(truth.recording.stamp_ns), _STAMP_TOLERANCE, path)
-    return trajectory.align(trajectory.planar(estimated.poses[i]), truth.poses()[j])
+    poses, true_poses = paired(result, truth)
+    return trajectory.align(trajectory.planar(poses), true_poses)
 
 
 def _map_lines(s: MapScores) -> Iterable[str]:
@@ -140,15 +144,6 @@ def _map_lines(s: MapScores) -> Iterable[str]:
         f"{s.ghosts_per_100_m2:.3f} per 100 m2 of {s.free_area:.1f} m2 free"
     )
     yield f"walls kept   {100 * s.walls_kept:.2f} % of {s.reference_wall_cells} cells"
-
-
-def _associated(
-    estimated: files.Trajectory, reference_s: Float, max_dt: float, path: Path
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    try:
-        return trajectory.associate(estimated.stamp_s, reference_s, max_dt)
-    except InputError as error:
-        raise InputError(error.what, where=str(path), hint=error.hint) from error
 
 
 SCORES = {

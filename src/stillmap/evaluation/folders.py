@@ -16,6 +16,9 @@ from stillmap.recording.formats import read as recording_of
 from stillmap.recording.model import Recording
 from stillmap.texts import require_regular
 
+MODEL = "mesh.glb"
+
+_RIG = ("horizontal", "tilting")  # recordings of one robot, as `stillmap simulate` names them
 _MAX_MAP = 1 << 29  # bytes of a map when it is unpacked: a thousand times what they take packed
 
 Float = NDArray[np.float64]
@@ -72,20 +75,54 @@ class Truth:
         return self.recording.end_points(use, self.poses())
 
 
-def read_truth(path: Path) -> Truth:
+def require_there(*paths: Path) -> None:
+    """Refuse folders that are not there.
+
+    Raises:
+        InputError: names the first of them.
+    """
+    for path in paths:
+        if not path.is_dir():
+            what = "is no folder" if path.exists() else "does not exist"
+            raise InputError(what, where=str(path))
+
+
+def read_truth(path: Path, labels: Labels | None = None) -> Truth:
     """A simulated recording, given by its folder or by the `truth` folder inside.
+
+    Args:
+        path: the folder. Of one with the two recordings of a rig the flat laser's is taken.
+        labels: of the two the one with their beams is taken.
 
     Raises:
         InputError: it is none. The arrays of truth can still fail later.
     """
     folder = path.parent if path.name == "truth" and not (path / "truth").exists() else path
-    if not (folder / "truth").is_dir():
+    if (folder / "truth").is_dir():
+        return _truth(folder)
+    inside = [path / name for name in _RIG]
+    if not all((one / "truth").is_dir() for one in inside):
         raise InputError(
             "holds no truth", where=str(path), hint="a folder that 'stillmap simulate' wrote"
         )
+    if labels is None:
+        return _truth(inside[0])
+    # both lasers may scan at the same times, as many beams each: where these ended differs
+    return max(map(_truth, inside), key=lambda truth: _share_alike(labels, truth.recording))
+
+
+def _truth(folder: Path) -> Truth:
     log = folder / "recording.log"  # a simulation in CARMEN's format
-    recording = recording_of(log) if log.exists() else read_folder(folder)
-    return Truth(folder, recording)
+    return Truth(folder, recording_of(log) if log.exists() else read_folder(folder))
+
+
+def _share_alike(labels: Labels, recording: Recording) -> float:
+    """The share of beams that hit something in both, or in neither; -1 of other beams."""
+    if labels.hit.shape != recording.hit.shape:
+        return -1.0
+    blocks = spool.blocks(labels.hit, recording.hit)
+    same = sum(int((labels.hit[b] == recording.hit[b]).sum()) for b in blocks)
+    return same / max(len(labels.hit), 1)
 
 
 def read_labels(result: Path) -> Labels:
@@ -106,6 +143,19 @@ def read_labels(result: Path) -> Labels:
             beam = block.start + int(wrong[0])
             raise InputError(f"beam {beam} has no probability in [0, 1]", where=str(path))
     return Labels(stamp_ns, offset, p_static, _array(folder / "hit.npy", (beams,), "b"))
+
+
+def require_model(result: Path) -> Path:
+    """The model of the place in a result.
+
+    Raises:
+        InputError: there is none.
+    """
+    path = result / MODEL
+    if not path.is_file():
+        hint = "`stillmap map` makes them of 3D recordings, with pip install 'stillmap[mesh]'"
+        raise InputError("holds no model", where=str(result), hint=hint)
+    return path
 
 
 def read_colours(result: Path, beams: int) -> NDArray[np.uint8] | None:

@@ -22,7 +22,7 @@ from stillmap.texts import read_text, require_regular
 
 Float = NDArray[np.float64]
 
-MESH, RECORD = "mesh.glb", "mesh_faces.npz"
+RECORD = "mesh_faces.npz"
 _PLACES = 0.05  # m, of cubes in each of which one place counts
 _SPAN_NS = 10**9  # before and after a person's model: he walks on
 _MAX_JSON = 1 << 28  # bytes
@@ -110,11 +110,9 @@ def read_glb(path: Path, n: int = SAMPLES) -> Glb:
     """A GLB file, with n points of its textures.
 
     Raises:
-        InputError: it is missing or damaged, or trimesh is not installed.
+        InputError: it is damaged, or trimesh is not installed.
     """
     require_regular(path)
-    if not path.is_file():
-        raise InputError("is no model", where=str(path), hint="the result of 'stillmap map'")
     trimesh = extra("trimesh", path, "compared with the truth", group="mesh")
     try:
         parts = list(_parts(trimesh.load_scene(path, process=False)))

@@ -33,10 +33,12 @@ def write(cloud: Cloud, path: Path, tell: Callable[[float], None] | None) -> Non
 
     Raises:
         InputError: pye57 is missing, or the file cannot be written or cannot hold the points.
+        OSError: the file cannot be made.
     """
     library = extra("pye57.libe57", path, "written")
     if not str(path).isprintable():
         raise InputError("has a name that its library cannot open", where=str(path))
+    path.open("wb").close()  # the library does not say why it cannot
     try:
         file = library.ImageFile(str(path), "w")
         try:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from stillmap.errors import InputError
+from stillmap.evaluation.folders import require_model
 from stillmap.extras import extra
 from stillmap.output.atomic import new_file, require_new_file
 from stillmap.output.meshes import from_bottom, obj_files, z_up
@@ -18,7 +19,6 @@ from stillmap.viewer.gltf import require_whole
 
 ENDING = ".obj"
 
-_MODEL = "mesh.glb"
 _MOST = 2 << 30  # bytes
 _PAGE = "page"
 
@@ -83,11 +83,7 @@ def write_obj(folder: Path, output: Path, quality: int, overwrite: bool = False)
         MissingExtra: trimesh is not installed.
     """
     require_new_file(output, overwrite)
-    path = folder / _MODEL
-    if not path.is_file():
-        hint = "`stillmap map` makes them of 3D recordings, with pip install 'stillmap[mesh]'"
-        raise InputError("holds no model", where=str(folder), hint=hint)
-    model = read_model(path)
+    model = read_model(require_model(folder))
     files = obj_files(model, TextureOptions(quality=quality), output.stem, f"{output.stem}_")
     named = {output.with_name(name): data for name, data in files.items()}
     for one in named:

@@ -67,7 +67,8 @@ def read(folder: Path, recording: Recording, p_static: NDArray[np.float32]) -> E
     """
     if recording.dimension != 2:
         what = "is of a 3D recording: its points can be written, as a cloud"
-        raise InputError(what, where=str(folder), hint=".las, .laz, .e57, .pcd, .ply or .xyz")
+        hint = ".las, .laz, .e57, .pcd, .ply or .xyz; .obj writes its model, if there is one"
+        raise InputError(what, where=str(folder), hint=hint)
     return Exported(
         recording,
         poses_from_tum(folder / "trajectory.tum", recording),

@@ -12,7 +12,7 @@ quaternion = [-0.5, 0.5, -0.5, 0.5]
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -71,17 +71,25 @@ class GivenCamera:
         return replace(camera, **{n: v for n in names if (v := getattr(self, n)) is not None})
 
 
-def read(path: Path) -> dict[str, GivenCamera]:
+def read(path: Path, known: Sequence[str] | None = None) -> dict[str, GivenCamera]:
     """The cameras of a file, by name.
 
+    Args:
+        path: the file.
+        known: names of cameras that need no folder of pictures; None: all.
+
     Raises:
-        InputError: it cannot be read, or a key or a value in it is wrong; it is named.
+        InputError: it cannot be read, or a name, a key or a value in it is wrong; it is named.
     """
-    out = {}
-    for name, table in load_toml(path).items():
+    out, tables = {}, load_toml(path)
+    for name, table in tables.items():
         if not isinstance(table, Mapping):
             hint = "a camera is a table: [NAME], and its values below"
             raise InputError(f"'{name}' stands outside of a camera", where=str(path), hint=hint)
+        if known is not None and name not in known and "folder" not in table:
+            what = f"there is no camera '{name}'"
+            raise InputError(what, where=str(path), hint=_hint(name, known))
+    for name, table in tables.items():
         try:
             out[name] = _camera(table, path.parent)
         except ValueError as error:
@@ -89,6 +97,12 @@ def read(path: Path) -> dict[str, GivenCamera]:
     if not out:
         raise InputError("names no camera", where=str(path), hint="a table for each: [NAME]")
     return out
+
+
+def _hint(name: str, known: Sequence[str]) -> str:
+    if not known:
+        return "the recording has no pictures; folder = '...' adds some"
+    return f"nearest: '{nearest(name, known, least=0.0)}'; folder = '...' adds one"
 
 
 def _camera(table: Mapping[str, Any], beside: Path) -> GivenCamera:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.errors import InputError, nearest
+from stillmap.errors import InputError
 from stillmap.recording import camera_file, pictures
 from stillmap.recording.camera_file import GivenCamera
 from stillmap.recording.clouds.files import files_in, stamps_in, stem_of
@@ -27,22 +27,48 @@ def applied(recording: Recording, path: Path) -> Recording:
     Raises:
         InputError: the file is wrong, names a camera that is not there, or pictures that are not.
     """
-    given = camera_file.read(path)
     images = recording.images or _NO_IMAGES
     known = [camera.name for camera in images.cameras]
+    given = camera_file.read(path, [*known, *depth_cameras(recording.source)])
     for name, one in given.items():
-        if one.folder is None and name not in (*known, *depth_cameras(recording.source)):
-            what = f"there is no camera '{name}'"
-            raise InputError(what, where=str(path), hint=_hint(name, known))
         if one.folder is not None and name in known:
             what = f"camera '{name}' has pictures in the recording: 'folder' is for others"
             raise InputError(what, where=str(path))
     parts = [_changed(images, given)]
     for name, one in given.items():
         if one.folder is not None:
-            parts.append(_added(name, one, one.folder, str(path)))
+            try:
+                parts.append(_added(name, one, one.folder, str(path)))
+            except InputError as error:
+                hint = error.hint or f"camera '{name}' of {path}"
+                raise InputError(error.what, where=error.where, hint=hint) from error
     together = joined(parts)
     return replace(recording, images=together if together.cameras else None)
+
+
+def doubted(recording: Recording) -> Recording:
+    """The recording, with a warning for each camera whose calibration is hardly that of its
+    pictures; one that it has already is not repeated."""
+    of = recording.images.cameras if recording.images is not None else ()
+    noted = recording.source.get("warnings")
+    warnings = noted if isinstance(noted, list) else []
+    new = [what for camera in of if (what := doubt(camera)) and what not in warnings]
+    if not new:
+        return recording
+    return replace(recording, source={**recording.source, "warnings": [*warnings, *new]})
+
+
+def doubt(camera: Camera) -> str:
+    """Why a camera's calibration is hardly that of its pictures; "" where it may well be."""
+    if camera.K is None or not np.isfinite(camera.K).all():
+        return ""
+    at, size = camera.K[:2, 2], np.array([camera.width, camera.height])
+    if not size.all() or ((at >= 0.0) & (at <= size)).all():
+        return ""
+    return (
+        f"camera '{camera.name}': its principal point, {at[0]:g}, {at[1]:g}, lies outside of "
+        f"pictures of {size[0]} x {size[1]} pixels: right only where they are parts of larger ones"
+    )
 
 
 def depth_cameras(source: dict[str, Any]) -> list[str]:
@@ -83,12 +109,6 @@ def joined(parts: Sequence[Images]) -> Images:
     return Images(stamp_ns[order], camera[order].astype(np.int32), cameras, load)
 
 
-def _hint(name: str, known: Sequence[str]) -> str:
-    if not known:
-        return "the recording has no pictures; folder = '...' adds some"
-    return f"nearest: '{nearest(name, known, least=0.0)}'; folder = '...' adds one"
-
-
 def _changed(images: Images, given: dict[str, GivenCamera]) -> Images:
     """The recording's own pictures; with a time added, they may come in another order."""
     cameras, stamp_ns = list(images.cameras), images.stamp_ns.copy()
@@ -109,7 +129,7 @@ def _added(name: str, given: GivenCamera, folder: Path, where: str) -> Images:
     """The pictures of a folder that the recording does not know of."""
     files = files_in(folder, pictures.ENDINGS)
     if not files:
-        raise InputError("holds no pictures", where=str(folder), hint=f"camera '{name}' of {where}")
+        raise InputError("holds no pictures", where=str(folder))
     if given.times is not None:
         require_regular(given.times)
         times = read_times(given.times)

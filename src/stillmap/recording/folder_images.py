@@ -97,10 +97,10 @@ def _matrix(rows: Any, n: int) -> NDArray[np.float64] | None:
 
 
 def _load(folder: Path, image: int) -> NDArray[Any]:
-    path = folder / f"{image:06d}.png"
-    if path.exists():
-        return read_picture(path)
-    path = path.with_suffix(".npy")
+    path = folder / f"{image:06d}.npy"
+    png = path.with_suffix(".png")
+    if png.exists() or not path.exists():
+        return read_picture(png)
     picture = open_npy(path)
     if picture.dtype != np.float32 or picture.ndim != 2:
         raise InputError(f"is damaged: {picture.shape} {picture.dtype}", where=str(path))

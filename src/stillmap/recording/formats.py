@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +19,9 @@ from stillmap.recording.options import ReadOptions
 from stillmap.recording.ros import kinds
 
 _HEAD = 1 << 16  # bytes looked at to tell what a file is
+_INSIDE = 1000  # entries of a folder that are looked at for recordings
+_NAMED = 3  # of them
+_RIG = ("horizontal", "tilting")  # as `stillmap simulate` names the recordings of one robot
 
 Reader = Callable[[Path, ReadOptions, Progress | None, Path | None], Recording]
 
@@ -150,6 +154,7 @@ def _in_space(recording: Recording, options: ReadOptions, scratch: Path | None) 
     recording = spin.timed(replace(recording, scratch=scratch), options)
     if options.cameras is not None:
         recording = cameras.applied(recording, Path(options.cameras))
+    recording = cameras.doubted(recording)
     return own_body_in_space.left_out(recording) if options.own_body else recording
 
 
@@ -171,8 +176,35 @@ def format_of(path: Path) -> Format:
         if known.is_one(path, start):
             return known
     if start is None:
-        raise InputError("is a folder without a recording", where=str(path), hint=_known())
+        raise _no_recording(path)
     return _by_name(path, start)
+
+
+def _no_recording(path: Path) -> InputError:
+    """What to say of a folder that is none: one of those inside may have been meant."""
+    inside = _recordings_in(path)
+    if not inside:
+        return InputError("is a folder without a recording", where=str(path), hint=_known())
+    more = f" and {len(inside) - _NAMED} more" if len(inside) > _NAMED else ""
+    shown = ", ".join(map(str, inside[:_NAMED])) + more
+    if tuple(one.name for one in inside) == _RIG:
+        flat, tilting = inside
+        hint = f"both: stillmap map {flat} --tilting {tilting} -o DIR"
+    else:
+        hint = "name it" if len(inside) == 1 else "name one of them"
+    what = "a recording" if len(inside) == 1 else "several recordings"
+    return InputError(f"is no recording but holds {what}: {shown}", where=str(path), hint=hint)
+
+
+def _recordings_in(path: Path) -> list[Path]:
+    """Folders right in a folder that are recordings, by name; none of a result."""
+    try:
+        if (path / "run.json").exists():  # its objects are clouds
+            return []
+        folders = [one for one in islice(path.iterdir(), _INSIDE) if one.is_dir()]
+    except OSError:
+        return []
+    return [one for one in sorted(folders) if any(known.is_one(one, None) for known in FORMATS)]
 
 
 def _by_name(path: Path, start: bytes) -> Format:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from stillmap.errors import InputError
 
@@ -21,7 +21,7 @@ def size_of(path: Path) -> tuple[int, int]:
     """Width and height in pixels, from the header alone.
 
     Raises:
-        InputError: no picture.
+        InputError: no picture, or it cannot be read.
     """
     with _opened(path) as image:
         return int(image.size[0]), int(image.size[1])
@@ -31,7 +31,7 @@ def read_picture(path: Path) -> NDArray[Any]:
     """(height, width, 3) uint8, or (height, width) uint8, uint16 or float32; see Images.read.
 
     Raises:
-        InputError: no picture, or damaged.
+        InputError: no picture, damaged, or it cannot be read.
     """
     with _opened(path) as image:
         if image.mode == "L":
@@ -51,17 +51,22 @@ def write_picture(picture: NDArray[Any], path: Path) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    if not path.is_file():
-        raise InputError("is no file", where=str(path))
     try:
+        if not path.is_file():
+            what = "is no file" if path.exists() else "is listed, but not there"
+            raise InputError(what, where=str(path))
         with warnings.catch_warnings():
             # more pixels than any camera has: a picture that unpacks to more than memory
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             warnings.filterwarnings("ignore", category=UserWarning)
             with Image.open(path) as image:
                 yield image
+    except UnidentifiedImageError as error:
+        raise InputError("is no picture", where=str(path)) from error
     except (OSError, ValueError, SyntaxError, EOFError) as error:
-        raise InputError(f"is no picture: {error}", where=str(path)) from error
+        reason = error.strerror if isinstance(error, OSError) else None
+        what = f"cannot be read: {reason}" if reason else f"is no picture: {error}"
+        raise InputError(what, where=str(path)) from error
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise InputError("is too large a picture", where=str(path)) from error
     except MemoryError as error:  # a length in it promises more than there is

@@ -76,7 +76,9 @@ def read(
         InputError: no depth picture can be read.
     """
     frames = rgbd_folders.found(path)
-    given = {} if options.cameras is None else camera_file.read(Path(options.cameras))
+    given = {}
+    if options.cameras is not None:
+        given = camera_file.read(Path(options.cameras), (DEPTH, COLOUR))
     known = Known(path, frames.format, list(frames.warnings))
     depth = _depth_camera(frames, given, known.warnings)
     grid = _grid(depth, options, options.depth_scale or frames.scale)
@@ -125,6 +127,7 @@ def _depth_camera(frames: Frames, given: dict[str, GivenCamera], warnings: list[
     why = lens.unusable(camera)
     if why:
         raise InputError(f"cannot be used: {why}", where=str(frames.depth[0][1]))
+    warnings += [said] if (said := cameras.doubt(camera)) else []
     return camera
 
 
