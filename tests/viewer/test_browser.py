@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from stillmap.output.meshes import write_glb
+from stillmap.output.stills import BACKGROUND
 from stillmap.texture.options import TextureOptions
 from stillmap.texture.textured import Textured
 from stillmap.viewer.scene import read_scene
@@ -161,7 +162,8 @@ def test_colours_of_a_model_are_as_they_were_photographed(result_of, tab):
     window = Window(read_scene(out), None)
 
     def counted(picture):
-        return {tone: int((np.abs(picture - tone).max(axis=2) <= 1).sum()) for tone in tones}
+        wanted = [*tones, BACKGROUND]
+        return {tone: int((np.abs(picture - tone).max(axis=2) <= 1).sum()) for tone in wanted}
 
     try:
         counts = shown_in(tab, window, counted, tones)

@@ -7,6 +7,7 @@ import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
+from stillmap.output.stills import BACKGROUND
 from stillmap.viewer import colours, gltf, tracks
 from stillmap.viewer.beams import Beams
 from stillmap.viewer.scene import Scene
@@ -132,6 +133,8 @@ class Layers:
 
     def _make_surface(self) -> None:
         assert self._scene.surface is not None
+        # a white wall would not be told from a white page
+        self._server.scene.set_background_image(np.array([[BACKGROUND]], np.uint8), format="png")
         node = self._server.scene.add_glb(
             _path("Surface", "mesh"), self._scene.surface, cast_shadow=False, receive_shadow=False
         )
