@@ -7,7 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillmap.output.stills import BACKGROUND, holding, looking_at, painted_share, pinhole, still
+from stillmap.output.stills import (
+    BACKGROUND,
+    covered_share,
+    holding,
+    looking_at,
+    mostly,
+    painted_share,
+    pinhole,
+    still,
+)
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -104,6 +113,30 @@ def test_any_number_of_threads_gives_the_same():
     assert np.array_equal(one, two)
 
 
+def test_what_is_covered_is_counted():
+    facing_it, K = together([facing(-1)], []), exactly(1.0)
+    far = exactly(1.0, 1.5)  # looks as far as the quad's half
+
+    def share(textured, K, **how):
+        return covered_share(textured, ahead(), K, SIZE, **how)
+
+    assert share(facing_it, K) == pytest.approx(0.25, abs=0.01)
+    assert share(facing_it, far) == pytest.approx(1.0)
+    turned = replace(facing_it, faces=np.ascontiguousarray(facing_it.faces[:, ::-1]))
+    assert share(turned, K) == share(facing_it, K)
+    fronts = [share(one, K, from_behind=False) for one in (facing_it, turned)]
+    assert sorted(fronts) == [0.0, share(facing_it, K)]
+
+
+def test_what_is_mostly_there_leaves_islands_out():
+    tiles = [quad([(x, 0, 0), (x + 1, 0, 0), (x + 1, 1, 0), (x, 1, 0)], -1) for x in range(98)]
+    far = [quad([(x, 0, 0), (x + 1, 0, 0), (x + 1, 1, 0), (x, 1, 0)], -1) for x in (-900, 900)]
+    kept = mostly(together(tiles + far, []), np.array([0.0, 0.0, 1.0]), 0.011)
+    assert (kept[:, 0].min(), kept[:, 0].max()) == (0.0, 98.0)
+    away = mostly(together(tiles, []), np.array([0.0, 0.0, -1.0]), 0.01)
+    assert len(away) == 3 * 2 * 98  # nothing is seen from below
+
+
 @pytest.mark.parametrize("direction", [(1, 0, 0), (-0.5, -0.7, 0.7), (0, 0, 1)])
 def test_all_that_is_to_be_seen_fills_the_picture(direction):
     points = np.random.default_rng(0).uniform((-9, -2, 0), (4, 3, 5), (50, 3))
@@ -115,8 +148,10 @@ def test_all_that_is_to_be_seen_fills_the_picture(direction):
     assert (at >= -0.5).all()
     assert (at <= np.array(SIZE) - 0.5).all()
     # it touches two edges that lie across from each other, but for a margin
-    reach = np.abs(at - (np.array(SIZE) - 1) / 2) / (np.array(SIZE) / 2)
-    assert reach.max() > 0.85
+    reach = (at - (np.array(SIZE) - 1) / 2) / (np.array(SIZE) / 2)
+    low, high = reach.min(axis=0), reach.max(axis=0)
+    assert -low == pytest.approx(high, abs=0.1)
+    assert high.max() == pytest.approx(1 / 1.05, abs=1e-6)
 
 
 @pytest.mark.parametrize("target", [(3, 1, 0), (0, 0, -5), (0.0, -2.0, 4.0)])

@@ -13,6 +13,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stillmap.output.meshes import write_glb
+from stillmap.output.stills import BACKGROUND
+from stillmap.texture.options import TextureOptions
+from stillmap.texture.textured import Textured
 from stillmap.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
@@ -93,16 +97,36 @@ def hues(picture):
     }
 
 
-def shown_in(tab, window, wanted):
-    """The colours of the page as soon as there are some of each kind, or after a while."""
+def shown_in(tab, window, counted, wanted):
+    """How many pixels of each kind the page has as soon as there are some, or after a while."""
     tab.call("Page.navigate", url=window.url)
     end = time.monotonic() + 40
     while True:
         for _ in range(20):
             window.step()
-        counts = hues(tab.picture())
+        counts = counted(tab.picture())
         if all(counts[name] > 20 for name in wanted) or time.monotonic() > end:
             return counts
+
+
+def tiled(path, tones):
+    """A model of square metres side by side, each painted in one colour, in the map's plane."""
+    corners = [
+        np.array([(n, 0, 0), (n + 1, 0, 0), (n + 1, 1, 0), (n, 1, 0)]) for n in range(len(tones))
+    ]
+    uv = np.tile([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]], (len(tones), 1))
+    square = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    page = np.repeat(np.arange(len(tones), dtype=np.int32), 2)
+    textured = Textured(
+        vertices=np.concatenate(corners).astype(float),
+        faces=np.concatenate([square + 4 * n for n in range(len(tones))]).astype(np.int32),
+        uv=uv,
+        page=page,
+        pages=tuple(np.full((16, 16, 3), tone, np.uint8) for tone in tones),
+        view=page,
+        vertex=np.arange(4 * len(tones), dtype=np.int32),
+    )
+    write_glb(path, textured, TextureOptions(quality=0))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -112,9 +136,11 @@ def test_it_shows_the_result_and_asks_nobody_else(result_of, tab, dimension):
     out = result_of(dimension, with_models=dimension == 3)
     window = Window(read_scene(out), beams_of(out))
     try:
+        window._boxes["Beams"].value = True
+        window.step()
         window.show(2)
         window._size.value = 3.0
-        counts = shown_in(tab, window, ("orange", "blue", "dark"))
+        counts = shown_in(tab, window, hues, ("orange", "blue", "dark"))
     finally:
         window.close()
     assert min(counts.values()) > 20, counts
@@ -126,3 +152,21 @@ def test_it_shows_the_result_and_asks_nobody_else(result_of, tab, dimension):
     assert tab.of("Runtime.exceptionThrown") == []
     refused = [one["entry"]["text"] for one in tab.of("Log.entryAdded")]
     assert not any("Security Policy" in text for text in refused)
+
+
+def test_colours_of_a_model_are_as_they_were_photographed(result_of, tab):
+    pytest.importorskip("trimesh", reason="the extra `mesh` is not installed")
+    out = result_of(3)
+    tones = [(118, 13, 41), (250, 248, 240), (230, 60, 40), (60, 200, 60)]
+    tiled(out / "mesh.glb", tones)
+    window = Window(read_scene(out), None)
+
+    def counted(picture):
+        wanted = [*tones, BACKGROUND]
+        return {tone: int((np.abs(picture - tone).max(axis=2) <= 1).sum()) for tone in wanted}
+
+    try:
+        counts = shown_in(tab, window, counted, tones)
+    finally:
+        window.close()
+    assert min(counts.values()) > 100, counts

@@ -1,8 +1,10 @@
 """The page is served to this machine alone, shows the time, and ends."""
 
+import gzip
 import socket
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from stillmap.errors import InputError
 from stillmap.recording import read
 from stillmap.recording.poses import poses_from_tum
 from stillmap.slam import SlamOptions
+from stillmap.viewer import scene as scenes
 from stillmap.viewer.beams import Beams
 from stillmap.viewer.scene import read_scene
 
@@ -71,6 +74,20 @@ def test_a_page_from_elsewhere_is_refused(window, headers):
         get(window, **headers)
     with caught.value:
         assert caught.value.code == 403
+
+
+@pytest.mark.parametrize("packed", ["gzip", "identity"])
+def test_the_page_shows_colours_as_they_are(window, packed):
+    """It is what viser has, and before all of its own scripts the one that does so."""
+    with get(window, **{"Accept-Encoding": packed}) as answer:
+        page, headers = answer.read(), answer.headers
+    assert int(headers["Content-Length"]) == len(page)
+    assert headers["Content-Encoding"] == packed
+    page = gzip.decompress(page) if packed == "gzip" else page
+    first = page[page.index(b"<script") : page.index(b"</script>")]
+    assert b"TONE_MAPPING" in first
+    plain = (Path(viser.__file__).parent / "client/build/index.html").read_bytes()
+    assert page.replace(first + b"</script>", b"") == plain
 
 
 def test_its_socket_answers_this_page_alone(window):
@@ -163,6 +180,8 @@ def test_layers_are_those_that_there_is_something_of(result_of, opened, window):
 
 def test_at_a_scan_what_was_there_is_shown(window):
     layers, scene = window._layers, window._scene
+    window._boxes["Beams"].value = True
+    window.step()
     for scan in (2, 5, 0):
         window.show(scan)
         assert window._slider.value == scan
@@ -180,6 +199,48 @@ def test_the_slider_moves_the_time(window):
     window._slider.value = 4
     window.step()
     assert window.scan == 4
+
+
+def test_where_there_is_a_surface_nothing_lies_on_it_at_first(window):
+    shown = {name for name, box in window._boxes.items() if box.value}
+    assert shown == {"Surface", "Robot", "Objects", "Object models"}
+    assert all(node.visible is (name in shown) for name, node in window._layers._nodes.items())
+
+
+def test_without_a_surface_map_points_and_beams_are_shown(result_of, opened):
+    out = result_of(3)
+    bare = opened(read_scene(out), beams_of(out))
+    shown = {name for name, box in bare._boxes.items() if box.value}
+    assert shown == {"Map", "Static points", "Robot", "Beams", "Objects"}
+
+
+def test_the_plan_lies_below_a_floor_that_is_drawn(result_of, opened, window):
+    def height(of):
+        plan = of._server.scene.get_handle_by_name("/map/plan")
+        return float(plan.position[2]) + of._scene.origin[2]
+
+    assert -0.3 < height(window) - window._scene.ground < -0.05
+    flat = opened(read_scene(result_of(2)), None)
+    assert height(flat) == flat._scene.ground
+
+
+def test_notes_stand_beside_what_is_shown(result_of, opened, monkeypatch):
+    monkeypatch.setitem(scenes.MOST_POINTS, "static", 11)
+    out = result_of(3, with_models=True)
+    window = opened(read_scene(out), beams_of(out))
+
+    def told():
+        return [note.content for note in window._notes.values() if note.visible]
+
+    assert told() == []
+    window._boxes["Beams"].value = True
+    window.step()
+    assert [text.split(":")[0] for text in told()] == ["Beams\\"]
+    window._boxes["Beams"].value = False
+    window._boxes["Static points"].value = True
+    window.step()
+    (text,) = told()
+    assert text.startswith("11 of ")
 
 
 def test_check_boxes_show_and_hide(window):

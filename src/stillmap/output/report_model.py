@@ -4,7 +4,7 @@ of what moved (Fig. 13)."""
 import base64
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 
@@ -12,7 +12,16 @@ import numpy as np
 from PIL import Image
 
 from stillmap.output.report_tables import share_text
-from stillmap.output.stills import Float, Picture, holding, painted_share, pinhole, still
+from stillmap.output.stills import (
+    Float,
+    Picture,
+    covered_share,
+    holding,
+    mostly,
+    painted_share,
+    pinhole,
+    still,
+)
 from stillmap.surface.mesh import Mesh
 from stillmap.texture.textured import Textured
 
@@ -25,13 +34,16 @@ _LITTLE = 0.1  # a pixel that is painted counts as this many in which somebody s
 _APART = 0.2  # of the way between two stills along it
 _WIDE, _NARROW = math.radians(80.0), math.radians(45.0)  # of a still along the way, of the others
 _ABOVE = np.array([-0.5, -0.75, 0.7])  # from where the whole is seen
-_MOST = (0.03, 0.97)  # quantiles of the vertices that are in the picture then
-# turned left from ahead
+_OUTER = 0.02  # of the area of what is seen then that may lie beyond each edge
+# of things, turned left from ahead
 _SIDES = {
     "from ahead": math.radians(-35.0),
     "from its left": math.radians(85.0),
     "from behind": math.radians(205.0),
+    "from its right": math.radians(-95.0),
 }
+_MOST_SIDES = 3
+_FRONTS = 0.5  # of what there is to be seen from a side, where the rest are backs
 _RAISED = math.radians(20.0)
 _QUALITY = 85  # of JPEG: photographs, which as PNG would be several megabytes
 
@@ -53,18 +65,35 @@ class PlaceStill:
 
 
 @dataclass(frozen=True, eq=False)
+class ObjectStills:
+    """What moved.
+
+    Attributes:
+        number: of the object.
+        size: metres, length, width and height of its model.
+        sides: by side, (h, w, 3) uint8.
+    """
+
+    number: int
+    size: tuple[float, float, float]
+    sides: dict[str, Picture]
+
+
+@dataclass(frozen=True, eq=False)
 class Stills:
     """What the report shows of models.
 
     Attributes:
         place: of the place.
-        objects: of what moved: number, and pictures (h, w, 3) uint8 from three sides.
+        objects: of what moved.
         unpainted: share of the surface that no picture shows without somebody before it.
+        why_bare: why no picture paints anything, where none can; else empty.
     """
 
     place: list[PlaceStill]
-    objects: list[tuple[int, list[Picture]]]
+    objects: list[ObjectStills]
     unpainted: float
+    why_bare: str = ""
 
 
 def stills_of(
@@ -73,9 +102,10 @@ def stills_of(
     T_camera_map: Float,
     objects: Mapping[int, Textured],
     threads: int = 1,
+    left_out: Mapping[str, int] | None = None,
 ) -> Stills:
-    """Two stills along the way, one from above, and three of each of the objects of which most is
-    painted.
+    """Two stills along the way, one from above, and up to three of each of the objects of which
+    most is painted.
 
     Args:
         filtered: the place, painted without its people.
@@ -83,6 +113,7 @@ def stills_of(
         T_camera_map: (N, 4, 4) of pictures that were taken on the way, in order.
         objects: what moved, by number, x ahead and z up in its own frame.
         threads: the result does not depend on them.
+        left_out: how many other pictures there are, by why they cannot be used.
     """
     areas, place = Mesh(filtered.vertices, filtered.faces).areas(), list[PlaceStill]()
 
@@ -103,9 +134,21 @@ def stills_of(
     shown = sorted(worth, key=lambda n: worth[n], reverse=True)[:MOST_OBJECTS]
     return Stills(
         place,
-        [(n, object_stills(objects[n], threads)) for n in shown],
+        [object_stills(n, objects[n], threads) for n in shown],
         float(areas[filtered.page < 0].sum() / max(float(areas.sum()), 1e-12)),
+        _why_bare(len(T_camera_map), len(filtered.unread), left_out or {}),
     )
+
+
+def _why_bare(usable: int, unread: int, left_out: Mapping[str, int]) -> str:
+    """Why there is no picture that could paint anything; empty where there is one."""
+    if usable > unread:
+        return ""
+    reasons = dict(left_out) | ({"damaged": unread} if unread else {})
+    if not reasons:
+        return "there are no pictures"
+    listed = "; ".join(f"{count:,}: {why}" for why, count in reasons.items())
+    return f"none of the {sum(reasons.values()):,} pictures can be used ({listed})"
 
 
 def _extent(textured: Textured) -> tuple[float, float]:
@@ -114,16 +157,29 @@ def _extent(textured: Textured) -> tuple[float, float]:
     return float(areas[textured.page >= 0].sum()), float(areas.sum())
 
 
-def object_stills(textured: Textured, threads: int = 1) -> list[Picture]:
-    """Three sides of an object, (h, w, 3) uint8 each; x ahead and z up in its frame."""
-    used = textured.vertices[np.unique(textured.faces)]
-    corners, K = _box(used.min(axis=0), used.max(axis=0)), pinhole(OBJECT_SIZE, _NARROW)
-    pictures = []
-    for angle in _SIDES.values():
+def object_stills(number: int, textured: Textured, threads: int = 1) -> ObjectStills:
+    """An object from up to three sides, x ahead and z up in its frame: those from which most of it
+    is seen, and more of its fronts than of its backs, as only fronts are drawn."""
+    used, K = textured.vertices[np.unique(textured.faces)], pinhole(OBJECT_SIZE, _NARROW)
+    places, fronts, mostly_front = dict[str, Float](), dict[str, float](), list[str]()
+    for side, angle in _SIDES.items():
         towards = np.array([math.cos(angle), math.sin(angle), math.tan(_RAISED)])
-        T = holding(corners, towards, K, OBJECT_SIZE)
-        pictures.append(still(textured, T, K, OBJECT_SIZE, threads=threads))
-    return pictures
+        places[side] = T = holding(used, towards, K, OBJECT_SIZE)
+        fronts[side], whole = (
+            covered_share(textured, T, K, OBJECT_SIZE, from_behind=backs, threads=threads)
+            for backs in (False, True)
+        )
+        if fronts[side] >= _FRONTS * whole:
+            mostly_front.append(side)
+    best = sorted(fronts, key=lambda side: fronts[side], reverse=True)
+    shown = [side for side in best if side in mostly_front][:_MOST_SIDES] or best[:1]
+    length, width, height = np.ptp(used, axis=0).tolist()
+    sides = {
+        side: still(textured, places[side], K, OBJECT_SIZE, from_behind=False, threads=threads)
+        for side in _SIDES
+        if side in shown
+    }
+    return ObjectStills(number, (length, width, height), sides)
 
 
 def model_section(stills: Stills | None) -> str:
@@ -133,10 +189,15 @@ def model_section(stills: Stills | None) -> str:
     text = "<section><h2>What it looks like</h2>"
     if stills.place:
         text += f"<p>{escape(_sentence(stills))}</p>"
-        text += "".join(_pair(one) for one in stills.place)
+        title = "Surface" if stills.why_bare else "Filtered"
+        text += "".join(_pair(one, title) for one in stills.place)
     if stills.objects:
-        text += "<p>What moved, each from three sides; all are in <code>objects/</code>.</p>"
-        text += "".join(_sides(number, pictures) for number, pictures in stills.objects)
+        text += (
+            f"<p>What moved, each from up to {_MOST_SIDES} sides, with length, width and height of "
+            "its model; all are in <code>objects/</code>. Surfaces have one side, that which was "
+            "seen: where more backs than fronts would be in the picture, it is left out.</p>"
+        )
+        text += "".join(_sides(one) for one in stills.objects)
     return text + "</section>"
 
 
@@ -148,6 +209,8 @@ def jpeg_uri(picture: Picture) -> str:
 
 
 def _sentence(stills: Stills) -> str:
+    if stills.why_bare:
+        return f"The surface that stands still. It is grey: {stills.why_bare}."
     grey = (
         f"Grey is what no picture shows with nobody before it, {share_text(stills.unpainted)} of "
         "the surface."
@@ -160,20 +223,21 @@ def _sentence(stills: Stills) -> str:
     return f"The surface that stands still, painted by pictures without what moves. {grey}"
 
 
-def _pair(one: PlaceStill) -> str:
-    shown = [("Sharpest", one.sharpest), ("Filtered", one.filtered)]
+def _pair(one: PlaceStill, title: str) -> str:
+    shown = [("Sharpest", one.sharpest), (title, one.filtered)]
     figures = "".join(
         _figure(title, one.caption, picture) for title, picture in shown if picture is not None
     )
     return f'<div class="pair">{figures}</div>'
 
 
-def _sides(number: int, pictures: Sequence[Picture]) -> str:
+def _sides(one: ObjectStills) -> str:
+    size = " x ".join(f"{metres:.2f}" for metres in one.size) + " m"
     figures = "".join(
-        _figure(f"Object {number}", side, picture)
-        for side, picture in zip(_SIDES, pictures, strict=True)
+        _figure(f"Object {one.number}", f"{size}, {side}", picture)
+        for side, picture in one.sides.items()
     )
-    return f'<div class="row">{figures}</div>'
+    return f'<div class="row sides">{figures}</div>'
 
 
 def _figure(title: str, caption: str, picture: Picture) -> str:
@@ -210,11 +274,5 @@ def _along(
 
 
 def _from_above(textured: Textured) -> Float:
-    low, high = np.quantile(textured.vertices, _MOST, axis=0)
-    return holding(_box(low, high), _ABOVE, pinhole(PLACE_SIZE, _NARROW), PLACE_SIZE)
-
-
-def _box(low: Float, high: Float) -> Float:
-    """(8, 3) corners."""
-    sides = ((np.arange(8)[:, None] >> np.arange(3)) & 1).astype(bool)
-    return np.where(sides, high, low)
+    points = mostly(textured, _ABOVE, _OUTER)
+    return holding(points, _ABOVE, pinhole(PLACE_SIZE, _NARROW), PLACE_SIZE)

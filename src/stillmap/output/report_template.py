@@ -47,6 +47,7 @@ code { font-family: ui-monospace, "DejaVu Sans Mono", monospace; font-size: .88e
 .pair { align-items: end; grid-template-columns: repeat(auto-fit, minmax(min(26rem, 100%), 1fr)); }
 .row { grid-template-columns: repeat(auto-fit, minmax(min(15rem, 100%), 1fr)); }
 .row figure { max-width: 38rem; }
+.sides { grid-template-columns: repeat(auto-fill, minmax(min(18rem, 100%), 1fr)); }
 #large:checked ~ .pair { grid-template-columns: 1fr; }
 figure { margin: 0; }
 figcaption { font-size: .9rem; margin-bottom: .35rem; }

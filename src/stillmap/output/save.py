@@ -81,4 +81,5 @@ def _stills(models: ModelsLike, threads: int) -> Stills:
         np.array([view.T_camera_map for view in models.views]).reshape(-1, 4, 4),
         {one.shape.id: one.textured for one in models.movers},
         resolved_threads(threads),
+        models.left_out,
     )

@@ -58,14 +58,8 @@ def still(
     fine = K.copy()
     fine[:2] *= _FINER
     fine[:2, 2] += 0.5 * _FINER - 0.5
-    mesh, kept = Mesh(textured.vertices, textured.faces), np.arange(len(textured))
-    if not from_behind:
-        eye = -T_camera_map[:3, :3].T @ T_camera_map[:3, 3]
-        front = np.einsum("ij,ij->i", eye - mesh.centres, mesh.normals()) > 0.0
-        kept = np.flatnonzero(front)
-    faces = np.ascontiguousarray(mesh.faces[kept])
-    vertices, T = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(T_camera_map)
-    _, face = _core.z_buffer(vertices, faces, fine, T, width, height, near=_NEAR, threads=threads)
+    kept, T = _drawn(textured, T_camera_map, from_behind), np.ascontiguousarray(T_camera_map)
+    face = _nearest(textured, kept, T, fine, (width, height), threads)
     picture = np.empty((height * width, 3), np.float32)
     picture[:] = BACKGROUND
     seen = np.flatnonzero(face >= 0)
@@ -84,10 +78,46 @@ def painted_share(
     textured: Textured, T_camera_map: Float, K: Float, size: tuple[int, int], threads: int = 1
 ) -> float:
     """Share of the pixels of such a picture that some page paints."""
-    vertices = np.ascontiguousarray(textured.vertices)
-    faces, T = np.ascontiguousarray(textured.faces), np.ascontiguousarray(T_camera_map)
-    _, face = _core.z_buffer(vertices, faces, K, T, *size, near=_NEAR, threads=threads)
+    face = _nearest(textured, np.arange(len(textured)), T_camera_map, K, size, threads)
     return float((textured.page[face[face >= 0]] >= 0).sum() / face.size)
+
+
+def covered_share(
+    textured: Textured,
+    T_camera_map: Float,
+    K: Float,
+    size: tuple[int, int],
+    *,
+    from_behind: bool = True,
+    threads: int = 1,
+) -> float:
+    """Share of the pixels of such a picture that show any of the model, see `still`."""
+    kept = _drawn(textured, T_camera_map, from_behind)
+    return float((_nearest(textured, kept, T_camera_map, K, size, threads) >= 0).mean())
+
+
+def _drawn(textured: Textured, T_camera_map: Float, from_behind: bool) -> NDArray[np.intp]:
+    """Faces that are drawn: all, or those whose front the camera sees."""
+    if from_behind:
+        return np.arange(len(textured))
+    mesh = Mesh(textured.vertices, textured.faces)
+    eye = -T_camera_map[:3, :3].T @ T_camera_map[:3, 3]
+    return np.flatnonzero(np.einsum("ij,ij->i", eye - mesh.centres, mesh.normals()) > 0.0)
+
+
+def _nearest(
+    textured: Textured,
+    kept: NDArray[np.intp],
+    T_camera_map: Float,
+    K: Float,
+    size: tuple[int, int],
+    threads: int,
+) -> NDArray[np.int32]:
+    """(height, width) which of the faces that are drawn each pixel sees, -1: none."""
+    vertices, T = np.ascontiguousarray(textured.vertices), np.ascontiguousarray(T_camera_map)
+    faces = np.ascontiguousarray(textured.faces[kept])
+    _, face = _core.z_buffer(vertices, faces, K, T, *size, near=_NEAR, threads=threads)
+    return face
 
 
 def _rays(K: Float, column: NDArray[np.intp], row: NDArray[np.intp]) -> Float:
@@ -154,14 +184,47 @@ def _shaded(normals: Float, rays: Float) -> NDArray[np.float32]:
 
 
 def holding(points: Float, direction: Float, K: Float, size: tuple[int, int]) -> Float:
-    """(4, 4) T_camera_map of a camera as near as all points (n, 3) are in its picture, which looks
-    at their middle from a direction (3,)."""
-    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    towards = direction / np.linalg.norm(direction)
-    x, y, z = looking_at(middle + towards, middle)[:3, :3] @ (points - middle).T
-    aside = np.abs(x) * K[0, 0] / (0.5 * size[0]), np.abs(y) * K[1, 1] / (0.5 * size[1])
-    away = max(float((np.maximum(*aside) - z).max()), 2.0 * _NEAR - float(z.min()))
-    return looking_at(middle + _MARGIN * away * towards, middle)
+    """(4, 4) T_camera_map of a camera that sees from a direction (3,), as near as all points (n, 3)
+    are in its picture, in the middle of it.
+
+    A point (x, y, z) in the camera's axes is left of the right edge of what an eye at e sees where
+    x - e_x <= s (z - e_z), and right of the left edge where e_x - x <= s (z - e_z). Of the points
+    that lie outermost both together say how far ahead e_z may be; likewise up and down.
+
+    Args:
+        points: metres.
+        direction: from them towards the camera.
+        K: (3, 3) of the picture, see `pinhole`.
+        size: width and height in pixels.
+    """
+    T = looking_at(direction, np.zeros(3))
+    own = points @ T[:3, :3].T
+    slopes = 0.5 * np.array(size) / np.array([K[0, 0], K[1, 1]]) / _MARGIN
+    right = (own[:, :2] - slopes * own[:, 2:]).max(axis=0)
+    left = (-own[:, :2] - slopes * own[:, 2:]).max(axis=0)
+    ahead = min(float((-(left + right) / (2.0 * slopes)).min()), own[:, 2].min() - 2.0 * _NEAR)
+    eye = T[:3, :3].T @ np.array([*(0.5 * (right - left)), ahead])
+    return looking_at(eye, eye - direction)
+
+
+def mostly(textured: Textured, direction: Float, share: float) -> Float:
+    """(n, 3) corners of the faces in which most is that is seen from a direction (3,).
+
+    As seen from there, a share of the area lies farther left than any of them, and as much farther
+    right, higher, lower, nearer and farther away: islands far out do not count. Where nothing is
+    seen from there these are all corners.
+    """
+    mesh, towards = Mesh(textured.vertices, textured.faces), direction / np.linalg.norm(direction)
+    area = mesh.areas() * np.maximum(mesh.normals() @ towards, 0.0)
+    if not area.any():
+        return mesh.corners.reshape(-1, 3)
+    kept = area > 0.0
+    for place in (mesh.centres @ looking_at(direction, np.zeros(3))[:3, :3].T).T:
+        order = np.argsort(place, kind="stable")
+        below = (np.cumsum(area[order]) - 0.5 * area[order]) / area.sum()
+        first, last = np.searchsorted(below, [share, 1.0 - share])
+        kept &= (place >= place[order[first]]) & (place <= place[order[max(last - 1, 0)]])
+    return mesh.corners[kept if kept.any() else area > 0.0].reshape(-1, 3)
 
 
 def looking_at(eye: Float, target: Float) -> Float:

@@ -7,6 +7,7 @@ import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
+from stillmap.output.stills import BACKGROUND
 from stillmap.viewer import colours, gltf, tracks
 from stillmap.viewer.beams import Beams
 from stillmap.viewer.scene import Scene
@@ -20,6 +21,8 @@ _MOST_WAYS = 100_000  # of the ways of all that moved
 _MOST_RAYS = 1_500
 _MOST_NUMBERS = 60
 _LIFTED = 0.02  # m: what lies on the plan is drawn above it
+_LOWERED = 0.15  # m: the plan lies below a floor that is drawn, which is uneven
+_KEY = "Beams: orange dynamic, blue static"
 _RAY = (240, 170, 60)
 # of the height of the window: edges of points of clouds and of ends of beams, the robot's axes
 _POINT, _END, _AXES = 0.0007, 0.002, 0.03
@@ -30,6 +33,7 @@ class Layers:
 
     Attributes:
         shown: by name, those that there is something of, and whether they are shown at first.
+        notes: by name, what there is to say of a layer while it is shown.
     """
 
     def __init__(self, server: Server, scene: Scene, beams: Beams | None, across: float) -> None:
@@ -46,6 +50,7 @@ class Layers:
         self._label: list[Any] = []
         self._nodes: dict[str, Any] = {}
         self.shown: dict[str, bool] = {}
+        self.notes: dict[str, str] = {} if beams is None else {"Beams": _KEY}
         for name, shown, is_there, make in self._kinds():
             if is_there:
                 self.shown[name] = shown
@@ -55,11 +60,12 @@ class Layers:
     def _kinds(self) -> list[tuple[str, bool, bool, Callable[[], None]]]:
         """Name, whether it is shown at first, whether there is any of it, what makes it."""
         scene, beams = self._scene, self._beams is not None
-        static = "static" in scene.clouds
+        static, bare = "static" in scene.clouds, scene.surface is None
         return [
-            ("Map", True, scene.plan is not None, self._make_plan),
-            ("Surface", True, scene.surface is not None, self._make_surface),
-            ("Static points", scene.surface is None, static, lambda: self._make_cloud("static")),
+            # these would hide a surface, or lie on it
+            ("Map", bare, scene.plan is not None, self._make_plan),
+            ("Surface", True, not bare, self._make_surface),
+            ("Static points", bare, static, lambda: self._make_cloud("static")),
             (
                 "Dynamic points",
                 False,
@@ -67,7 +73,7 @@ class Layers:
                 lambda: self._make_cloud("dynamic"),
             ),
             ("Robot", True, True, self._make_way),
-            ("Beams", True, beams, self._make_beams),
+            ("Beams", bare, beams, self._make_beams),
             ("Rays", False, beams, self._make_rays),
             ("Objects", True, bool(scene.tracks), self._make_boxes),
             ("Object ways", False, bool(scene.tracks), self._make_ways),
@@ -110,7 +116,8 @@ class Layers:
         plan = self._scene.plan
         assert plan is not None
         x0, y0, x1, y1 = plan.window
-        middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), self._scene.ground])
+        z = self._scene.ground - (0.0 if self._scene.surface is None else _LOWERED)
+        middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), z])
         self._server.scene.add_image(
             _path("Map", "plan"),
             plan.picture,
@@ -126,14 +133,18 @@ class Layers:
 
     def _make_surface(self) -> None:
         assert self._scene.surface is not None
+        # a white wall would not be told from a white page
+        self._server.scene.set_background_image(np.array([[BACKGROUND]], np.uint8), format="png")
         node = self._server.scene.add_glb(
             _path("Surface", "mesh"), self._scene.surface, cast_shadow=False, receive_shadow=False
         )
         _place(node, gltf.MAP_FROM_GLTF, self._scene.origin)
 
     def _make_cloud(self, name: str) -> None:
-        cloud = self._scene.clouds[name]
-        self._cloud(f"{name.capitalize()} points", cloud.points, cloud.colours)
+        cloud, layer = self._scene.clouds[name], f"{name.capitalize()} points"
+        self._cloud(layer, cloud.points, cloud.colours)
+        if len(cloud.points) < cloud.of:
+            self.notes[layer] = f"{len(cloud.points):,} of {cloud.of:,} {name} points are shown"
 
     def _make_way(self) -> None:
         places = self._scene.poses[:, :3, 3] - self._scene.origin

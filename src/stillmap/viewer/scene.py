@@ -96,7 +96,7 @@ class Scene:
         models: those of `tracks` that have one.
         origin: (3,) whole metres in the map frame, around which everything is shown.
         ground: metres, how high the plan lies.
-        notes: what is not shown, and why.
+        notes: what cannot be shown, and why.
     """
 
     name: str
@@ -134,9 +134,6 @@ def read_scene(folder: Path) -> Scene:
     tracks, notes = read_tracks(folder / "objects" / "objects.json"), list[str]()
     surface = _noted(notes, _surface, folder / "mesh.glb")
     models = _models(folder / "objects", tracks, notes)
-    for name, one in raw.items():
-        if len(one.points) < one.of:
-            notes.append(f"{len(one.points):,} of {one.of:,} {name} points are shown")
     return Scene(
         name=folder.resolve().name,
         stamp_ns=stamp_ns,

@@ -12,7 +12,7 @@ import viser
 import websockets.asyncio.server
 
 from stillmap.errors import InputError
-from stillmap.viewer import guard
+from stillmap.viewer import guard, page
 
 _OWN_PORT = "_VISER_PORT_OVERRIDE"  # a variable that would tell viser another port
 
@@ -78,6 +78,7 @@ def _guarded() -> Iterator[list[int]]:
                 return connection.respond(HTTPStatus.FORBIDDEN, "not from this page\n")
             response = process_request(connection, request)
             if response is not None:
+                page.show_as_they_are(response)
                 response.headers["Content-Security-Policy"] = guard.policy(request.headers["Host"])
             return response
 

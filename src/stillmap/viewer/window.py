@@ -15,7 +15,6 @@ from stillmap.viewer.server import started, stop
 _FRAME = 0.1  # s: as often as the page is told of something new while it plays
 _IDLE = 0.05  # s between looks at what was clicked
 _SPEEDS = {"1 x": 1.0, "3 x": 3.0, "10 x": 10.0, "30 x": 30.0, "100 x": 100.0}
-_KEY = "Beams: orange dynamic, blue static"
 _MARKS = re.compile(r"([\\`*_{}\[\]()<>#+\-.!|~&$:])")  # that mean something in Markdown
 
 
@@ -34,7 +33,7 @@ class Window:
         self._server = started(port, "stillmap")
         try:
             self._layers = Layers(self._server, scene, beams, self._look())
-            self._controls(beams is not None)
+            self._controls()
             self.show(0)
         except BaseException:
             self.close()
@@ -83,6 +82,9 @@ class Window:
             wanted = self._later(passed)
         self._layers.resize(self._size.value)
         changed = [self._layers.set_shown(name, box.value) for name, box in self._boxes.items()]
+        if any(changed):
+            for name, note in self._notes.items():
+                note.visible = self._boxes[name].value
         if wanted != self._scan or any(changed):
             self.show(wanted)
 
@@ -100,7 +102,7 @@ class Window:
         camera.position, camera.look_at = first.position, first.look_at
         return first.across
 
-    def _controls(self, with_beams: bool) -> None:
+    def _controls(self) -> None:
         gui, last = self._server.gui, len(self._seconds) - 1
         gui.add_markdown(f"**{_plain(self._scene.name)}**")
         # Any: their values are set, which viser's types do not know
@@ -114,7 +116,11 @@ class Window:
                 name: gui.add_checkbox(name, shown) for name, shown in self._layers.shown.items()
             }
             self._size = gui.add_slider("Point size", 0.5, 5.0, 0.5, 1.0)
-        for note in [*([_KEY] if with_beams else []), *self._scene.notes]:
+        self._notes = {
+            name: gui.add_markdown(_plain(note), visible=self._layers.shown[name])
+            for name, note in self._layers.notes.items()
+        }
+        for note in self._scene.notes:
             gui.add_markdown(_plain(note))
 
     def _clicked(self, _event: Any) -> None:
