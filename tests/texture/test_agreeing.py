@@ -3,7 +3,7 @@
 import numpy as np
 from made_up_rooms import looking, rectangle
 
-from stillmap.texture.agreeing import agreeing
+from stillmap.texture.agreeing import agreeing, colours_of_faces
 from stillmap.texture.choice import Candidates
 
 WALL = rectangle([-0.5, 4.0, -0.5], [1.0, 0, 0], [0, 0, 1.0], 2)
@@ -20,7 +20,7 @@ def left(shades, odd=40.0):
         shade = shades[view.image]
         return None if shade is None else np.full((300, 400, 3), shade, np.uint8)
 
-    found = agreeing(WALL, candidates, views, colours, odd)
+    found = agreeing(candidates, colours_of_faces(WALL, candidates, views, colours), odd)
     assert (found.picture == found.picture[0]).all()
     assert (np.isfinite(found.utility) == (found.picture >= 0)).all()
     return [k for k in found.picture[0].tolist() if k >= 0]

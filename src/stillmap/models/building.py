@@ -1,7 +1,7 @@
 """Models of a recording in 3D: a surface, painted; and what moved, likewise (Sect. 4.4, 4.5)."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from stillmap.recording.images import Images
 from stillmap.stages import Stages
 from stillmap.surface.building import surface_of
 from stillmap.texture.baking import baked
+from stillmap.texture.levelling import levelled
 from stillmap.texture.options import VisibleOptions
 from stillmap.texture.textured import Textured, replaced
 from stillmap.texture.view import View
@@ -130,9 +131,10 @@ def models_of(
     with stages.measure("painting"):
         views, left_out, unread = _usable(sources, tell("reading pictures"))
         limits = options.texture.visible
-        place = painted(
+        place, gain = painted(
             mesh, views, sources, options.choice, limits, threads, tell("choosing pictures")
         )
+        sources = _levelled(sources, views, gain)
     progress("putting pictures on the surface", 0, 0, 0)
     with stages.measure("texture"):
         read = _reader(sources.recording.images)
@@ -159,6 +161,15 @@ def _usable(sources: Sources, tell: Tell) -> tuple[list[View], dict[str, int], l
     if unread:
         left_out = {**left_out, UNREAD: left_out.get(UNREAD, 0) + len(unread)}
     return views, left_out, unread
+
+
+def _levelled(sources: Sources, views: Sequence[View], gain: Float) -> Sources:
+    """The same with pictures of one exposure."""
+    images = sources.recording.images
+    if images is None:
+        return sources
+    recording = replace(sources.recording, images=levelled(images, views, gain))
+    return replace(sources, recording=recording)
 
 
 def _unfiltered(

@@ -12,10 +12,11 @@ from stillmap.models.sources import Sources
 from stillmap.surface.dividing import divided
 from stillmap.surface.mesh import Mesh
 from stillmap.texture.about import Beams
-from stillmap.texture.agreeing import agreeing
+from stillmap.texture.agreeing import agreeing, colours_of_faces
 from stillmap.texture.choice import Candidates, chosen, utility
 from stillmap.texture.choice_options import ChoiceOptions
 from stillmap.texture.lens import project
+from stillmap.texture.levelling import gains
 from stillmap.texture.options import VisibleOptions
 from stillmap.texture.things import Thing, at_time, in_the_way, within_or_behind
 from stillmap.texture.told import told
@@ -58,7 +59,7 @@ def painted(
     limits: VisibleOptions,
     threads: int = 1,
     tell: Tell | None = None,
-) -> Painted:
+) -> tuple[Painted, Float]:
     """Chooses for each face the view that most likely shows static things only (Sect. 4.4).
 
     Args:
@@ -69,6 +70,10 @@ def painted(
         limits: see VisibleOptions.
         threads: same result with any number.
         tell: called with how many views are looked at, and of how many.
+
+    Returns:
+        What paints each face; (N, 3) by which colours of N views are multiplied to be of one
+        exposure.
     """
     if views:
         mesh, _ = divided(mesh, partial(longest_edge, views, options))
@@ -89,11 +94,15 @@ def painted(
         sharpest.add(number, faces, pixels, p)
         if tell is not None:
             tell(number + 1, len(views))
-    images = sources.recording.images
-    if images is not None and options.believe and options.odd > 0.0:
-        read = partial(colours_of, images)
-        candidates = agreeing(mesh, candidates, views, read, options.odd)
-    return settled(mesh, candidates, sharpest, options.border)
+    images, gain = sources.recording.images, np.ones((len(views), 3))
+    if views and images is not None and (options.level or (options.believe and options.odd > 0.0)):
+        found = colours_of_faces(mesh, candidates, views, partial(colours_of, images))
+        if options.level:
+            gain = gains(candidates.picture, found, len(views))
+            found *= gain[candidates.picture]  # of no picture, NaN stays
+        if options.believe and options.odd > 0.0:
+            candidates = agreeing(candidates, found, options.odd)
+    return settled(mesh, candidates, sharpest, options.border), gain
 
 
 def longest_edge(views: Sequence[View], options: ChoiceOptions, points: Float) -> Float:

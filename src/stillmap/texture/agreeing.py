@@ -14,22 +14,19 @@ from stillmap.texture.view import View
 _FEWEST = 3  # pictures of a face: of two nobody knows which one is wrong
 
 
-def agreeing(
+def colours_of_faces(
     mesh: Mesh,
     candidates: Candidates,
     views: Sequence[View],
     colours: Callable[[View], NDArray[np.uint8] | None],
-    odd: float,
-) -> Candidates:
-    """Leaves out pictures that most others of a face contradict.
+) -> NDArray[np.float32]:
+    """(F, K, 3) what pictures show in the middles of faces, 0 to 255; NaN where that is unknown.
 
     Args:
-        mesh: F faces, looked at in their middles.
-        candidates: the best pictures of each.
+        mesh: F faces.
+        candidates: the K best pictures of each.
         views: the pictures.
         colours: (h, w, 3) the picture of a view; None: it is damaged.
-        odd: by how much colours, of 442, differ at least from the median of those of all, where
-            more than half of them lie within half of that.
     """
     found = np.full((*candidates.picture.shape, 3), np.nan, np.float32)
     for number, view in enumerate(views):
@@ -38,6 +35,18 @@ def agreeing(
         if picture is not None:
             uv, ok = project(view.camera, view.in_camera(mesh.centres[face]))
             found[face[ok], place[ok]] = bilinear(picture, uv[ok])
+    return found
+
+
+def agreeing(candidates: Candidates, found: NDArray[np.float32], odd: float) -> Candidates:
+    """Leaves out pictures that most others of a face contradict.
+
+    Args:
+        candidates: the K best pictures of each of F faces.
+        found: (F, K, 3) what they show there; NaN: unknown.
+        odd: by how much colours, of 442, differ at least from the median of those of all, where
+            more than half of them lie within half of that.
+    """
     known = np.isfinite(found[..., 0]).sum(axis=1)
     asked = np.flatnonzero(known >= _FEWEST)
     off = np.full(candidates.picture.shape, np.nan, np.float32)

@@ -36,6 +36,9 @@ class ChoiceOptions:
     odd: float = field_with_doc(
         40.0, "by which a colour, of 442, differs from those of most other pictures; 0: not asked"
     )
+    level: bool = field_with_doc(
+        True, "brighten pictures, each of its three colours, until they agree with one another"
+    )
     border: float = field_with_doc(
         1.0, "what it costs where two pictures meet, in e-folds of resolution of the faces there"
     )
