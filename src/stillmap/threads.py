@@ -7,7 +7,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
-import scipy.linalg  # noqa: F401  (loads SciPy's own BLAS, which is told of below, too)
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 _Item = TypeVar("_Item")
@@ -31,6 +30,8 @@ def one_blas_thread() -> Iterator[None]:
     busily: where other processes want the processors, that costs more than all the work. Sums have
     the same bits on every machine, too.
     """
+    import scipy.linalg  # noqa: F401  (SciPy has a BLAS of its own; takes long to load)
+
     with threadpool_limits(limits=1, user_api="blas"):
         yield
 
