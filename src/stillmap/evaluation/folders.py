@@ -12,13 +12,13 @@ from stillmap.errors import InputError
 from stillmap.evaluation.map import Grid
 from stillmap.recording import spool
 from stillmap.recording.folder import read as read_folder
+from stillmap.recording.formats import RIG
 from stillmap.recording.formats import read as recording_of
 from stillmap.recording.model import Recording
 from stillmap.texts import require_regular
 
 MODEL = "mesh.glb"
 
-_RIG = ("horizontal", "tilting")  # recordings of one robot, as `stillmap simulate` names them
 _MAX_MAP = 1 << 29  # bytes of a map when it is unpacked: a thousand times what they take packed
 
 Float = NDArray[np.float64]
@@ -100,7 +100,7 @@ def read_truth(path: Path, labels: Labels | None = None) -> Truth:
     folder = path.parent if path.name == "truth" and not (path / "truth").exists() else path
     if (folder / "truth").is_dir():
         return _truth(folder)
-    inside = [path / name for name in _RIG]
+    inside = [path / name for name in RIG]
     if not all((one / "truth").is_dir() for one in inside):
         raise InputError(
             "holds no truth", where=str(path), hint="a folder that 'stillmap simulate' wrote"

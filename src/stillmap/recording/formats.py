@@ -21,7 +21,7 @@ from stillmap.recording.ros import kinds
 _HEAD = 1 << 16  # bytes looked at to tell what a file is
 _INSIDE = 1000  # entries of a folder that are looked at for recordings
 _NAMED = 3  # of them
-_RIG = ("horizontal", "tilting")  # as `stillmap simulate` names the recordings of one robot
+RIG = ("horizontal", "tilting")  # as `stillmap simulate` names the recordings of one robot
 
 Reader = Callable[[Path, ReadOptions, Progress | None, Path | None], Recording]
 
@@ -187,7 +187,7 @@ def _no_recording(path: Path) -> InputError:
         return InputError("is a folder without a recording", where=str(path), hint=_known())
     more = f" and {len(inside) - _NAMED} more" if len(inside) > _NAMED else ""
     shown = ", ".join(map(str, inside[:_NAMED])) + more
-    if tuple(one.name for one in inside) == _RIG:
+    if tuple(one.name for one in inside) == RIG:
         flat, tilting = inside
         hint = f"both: stillmap map {flat} --tilting {tilting} -o DIR"
     else:

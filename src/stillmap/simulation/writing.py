@@ -9,6 +9,7 @@ from stillmap.errors import InputError
 from stillmap.output.atomic import new_folder
 from stillmap.output.npy import write_npy
 from stillmap.recording import carmen_writing, folder
+from stillmap.recording.formats import RIG
 from stillmap.simulation.picture_truth import write_picture_truth, writing_truth
 from stillmap.simulation.scene import Scene
 from stillmap.simulation.simulator import RigSimulation, Simulation
@@ -61,7 +62,7 @@ def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) 
         InputError: the folder holds something already or cannot be written to.
     """
     with new_folder(Path(path), RIG_MARK, overwrite) as work:
-        for name, one in (("horizontal", rig.horizontal), ("tilting", rig.tilting)):
+        for name, one in zip(RIG, (rig.horizontal, rig.tilting), strict=True):
             (work / name).mkdir()
             _write_folder(one, work / name)
         write_npy(work / "joint_angle.npy", rig.joint_angle)
