@@ -166,3 +166,20 @@ def test_too_large_a_triangle_is_refused():
         _core.SignedDistances(0.01, before=0.03, behind=0.02).add(
             points, origin, standoff, faces, weight
         )
+
+
+@pytest.mark.parametrize("standoff", [1e-3, 1e-9, 1e-300])
+def test_a_surface_that_is_met_at_next_to_no_angle_ends(standoff):
+    points, origin, _, faces, weight = wall(20.0, 0.1)
+    both = [
+        kernels.SignedDistances(0.03, before=0.18, behind=0.15) for kernels in (_core, reference)
+    ]
+    for one in both:
+        one.add(points, origin, np.full(4, standoff), faces, weight)
+    for one in both:
+        x = one.blocks()[:, 0] * one.edge * 0.03
+        assert 20.0 - 18.3 < x.min() < 20.0 - 15.0
+        assert 20.0 + 14.7 < x.max() < 20.0 + 15.0
+    where = [600, -4, -4], [8, 8, 60]
+    for metres, plain in zip(both[0].dense(*where), both[1].dense(*where), strict=True):
+        np.testing.assert_allclose(metres, plain, atol=2e-6)

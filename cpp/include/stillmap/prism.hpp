@@ -67,8 +67,10 @@ class Prism {
       k.constant += mu_[i].constant;
       border_[i] = mu_[i].plus(kMargin);
     }
-    nearest_ = std::max(1.0 - before / h, kNearest);
-    farthest_ = 1.0 + behind / h;
+    // a plane that is met at next to no angle would be near for kilometres
+    const double per_metre = std::min(1.0 / h, 3.0 * kSlant / (a + b + c).norm());
+    nearest_ = std::max(1.0 - before * per_metre, kNearest);
+    farthest_ = 1.0 + behind * per_metre;
     border_[3] = k.plus(-nearest_);
     border_[4] = k.times(-1.0).plus(farthest_);
     longest_ =
@@ -141,6 +143,7 @@ class Prism {
 
   static constexpr double kFlat = 1e-12;
   static constexpr double kNearest = 0.05;  // of the way from the sensor
+  static constexpr double kSlant = 100.0;   // times as far along a line of sight as off a surface
   static constexpr double kSteep = 0.1;     // of its length that a line of sight goes along axis_
   static constexpr double kFarthest = Grid<3>::kMaxCell;
 

@@ -8,6 +8,7 @@ Float = NDArray[np.float64]
 _MARGIN = 0.01  # of a triangle
 _FLAT = 1e-12  # of the product of its corners' distances, the volume of one that is seen edge on
 _NEAREST = 0.05  # of the way from the sensor
+_SLANT = 100.0  # times as far along a line of sight as off a surface
 
 
 class SignedDistances:
@@ -38,7 +39,9 @@ class SignedDistances:
         volume, h = np.linalg.det(M), float(standoff.mean())
         if abs(volume) <= _FLAT * np.prod(np.linalg.norm(M, axis=0)) or h <= 0.0:
             return
-        nearest, farthest = max(1.0 - self.before / h, _NEAREST), 1.0 + self.behind / h
+        per_metre = min(1.0 / h, _SLANT / float(np.linalg.norm(M.mean(axis=1))))
+        nearest = max(1.0 - self.before * per_metre, _NEAREST)
+        farthest = 1.0 + self.behind * per_metre
         # of lines of sight along the triangle's margin, where they begin and end
         outer = M @ (np.eye(3) + 2 * _MARGIN * (3.0 * np.eye(3) - np.ones((3, 3))))
         ends = np.concatenate([nearest * outer, farthest * outer], axis=1).T + o
