@@ -64,6 +64,23 @@ def test_a_wrong_velocity_is_found(seed: int) -> None:
     assert after[2] == 0.0
 
 
+@pytest.mark.parametrize("turn", [0.1, -0.1])
+@pytest.mark.parametrize("wrong", [(-0.5, -0.6), (0.0, 0.6), (0.3, -1.0)])
+def test_a_side_that_is_askew_is_not_moved_along_itself(
+    wrong: tuple[float, float], turn: float
+) -> None:
+    rng = np.random.default_rng(0)
+    askew, _ = pose(np.array([0.0, 0.0, 0.0, turn, 0.0, 0.0]), 1.0)
+    motion = np.array([*wrong, 0.0, 0.0, 0.0, 0.0])
+    sweeps = []
+    for later in LATER:
+        mesh, (R, t) = _corner(rng, 25), pose(motion, later)
+        side = mesh.part(mesh.centres[:, 1] > 0.8)
+        seen = Mesh((side.vertices @ askew.T - t) @ R, side.faces)
+        sweeps.append(Sweep.of(seen, np.array([0.5, 4.0, 1.0]), later))
+    np.testing.assert_allclose(motion_of(sweeps, 2)[:2], wrong, atol=0.03)
+
+
 def test_where_nothing_tells_the_track_counts() -> None:
     sweeps = []
     for k, later in enumerate(LATER):

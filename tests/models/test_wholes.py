@@ -6,12 +6,13 @@ import tracemalloc
 import numpy as np
 from made_up_street import Car, Part, street
 
-from stillmap.models import wholes
 from stillmap.models.movers import shape_of
 from stillmap.models.options import MoverOptions
 from stillmap.models.own import Moves
 from stillmap.models.sources import Sources
 from stillmap.models.wholes import followed_of, hanging_together, wholes_of
+from stillmap.scene.boxes import box_of
+from stillmap.texture.things import Thing
 
 OPTIONS = MoverOptions()
 CAR = Car((6.0, -2.5), (6.0, 0.0))
@@ -34,6 +35,27 @@ def test_cars_one_behind_the_other_and_beside_are_two() -> None:
     assert _wholes(street(behind, [Part(0), Part(1)])) == [[0], [1]]
     beside = [CAR, Car((6.0, 2.5), (6.0, 0.0))]
     assert _wholes(street(beside, [Part(0), Part(1)])) == [[0], [1]]
+
+
+def test_a_track_of_two_cars_does_not_make_them_one() -> None:
+    row = [CAR, Car((13.0, -2.5), (6.0, 0.0))]
+    one_and_the_next = Part(0, 0.0, 0.2, (0, 4)), Part(1, 0.8, 1.0, (4, 8))
+    sources = street(row, [Part(0, 0.2, 1.0), Part(1, 0.0, 0.8), *one_and_the_next])
+    first, last = sources.objects[2:]
+    n = len(last.scan)
+    both = dataclasses.replace(
+        first,
+        scan=np.concatenate([first.scan, last.scan]),
+        stamp_ns=np.concatenate([first.stamp_ns, last.stamp_ns]),
+        xy=np.concatenate([first.xy, last.xy]),
+        velocity=np.concatenate([first.velocity, last.velocity]),
+        beams=np.concatenate([first.beams, last.beams]),
+        z=np.concatenate([np.asarray(first.z), np.asarray(last.z)[:n]]),
+    )
+    thing = Thing(box_of(both, 0, 0.5), np.zeros(len(both.scan)), both.size[2])
+    objects, things = [*sources.objects[:2], both], [*sources.things[:2], thing]
+    found = _wholes(dataclasses.replace(sources, objects=objects, things=things))
+    assert sorted(found) == [[0, 2], [1]] or sorted(found) == [[0], [1, 2]]
 
 
 def test_cars_that_pass_each_other_are_two() -> None:
@@ -74,22 +96,6 @@ def test_points_hang_together_as_far_as_beams_are_apart() -> None:
         one, other = hanging_together(points, place, 0.5)
         assert (one == other) == together
     assert len(hanging_together(np.zeros((0, 3)), place, 0.5)) == 0
-
-
-def test_pairs_are_counted_as_in_a_square_of_all(monkeypatch) -> None:
-    monkeypatch.setattr(wholes, "_AT_ONCE", 3)
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        n, scans = int(rng.integers(1, 12)), []
-        met, both = np.zeros((n, n), np.intp), np.zeros((n, n), np.intp)
-        for _ in range(int(rng.integers(0, 20))):
-            there = np.flatnonzero(rng.random(n) < 0.6)
-            piece = rng.integers(0, 3, len(there))
-            scans.append(wholes._Scan(there, piece, np.ones(len(there), np.intp)))
-            met[np.ix_(there, there)] += piece[:, None] == piece
-            both[np.ix_(there, there)] += 1
-        often = np.argwhere(np.triu((2 * met >= both) & (met > 0), 1))
-        np.testing.assert_array_equal(wholes._often_together(scans, n), often)
 
 
 def test_many_tracks_that_never_meet_need_no_room() -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.models.alone import p_dynamic_at
 from stillmap.models.frames import Way
 from stillmap.models.looks import DEEPEST, Glimpse, between, look_at, surface_of
 from stillmap.models.moments import best_moment
@@ -63,7 +64,7 @@ def shape_of(
     options: MoverOptions,
     pictures: Sequence[Float],
 ) -> Shape | None:
-    """The surface of something that moved; None where too little of it was seen.
+    """The surface of something that moved; None where too little of it was seen, or it stood still.
 
     Args:
         followed: the objects as which it was followed.
@@ -91,9 +92,15 @@ def shape_of(
         if rigid and not moves.planar and len(mesh.vertices) >= _TOLD:
             whole = _put_together(one, own, now, fast, sources, moves, options)
             if whole is not None:
-                return whole
-        return Shape(one.object.id, mesh, way, False, now, look.span)
+                return _if_it_moves(whole, sources, options)
+        shape = Shape(one.object.id, mesh, way, False, now, look.span)
+        return _if_it_moves(shape, sources, options)
     return None
+
+
+def _if_it_moves(shape: Shape, sources: Sources, options: MoverOptions) -> Shape | None:
+    p = p_dynamic_at(shape.mesh, shape.way, shape.span, sources, options.about)
+    return shape if p >= options.dynamic else None
 
 
 def _put_together(

@@ -58,6 +58,10 @@ class MoverOptions:
     height: float = field_with_doc(
         0.05, "m from its lowest to its highest point, at least: what is flatter is the ground's"
     )
+    dynamic: float = field_with_doc(
+        0.7, "P(dynamic) of what ended at it when it was seen, on average: else it stands still"
+    )
+    about: float = field_with_doc(0.2, "m from its surface, up to where beams ended at it")
     island: float = field_with_doc(0.005, "m2, smaller pieces of it are left out")
 
     def __post_init__(self) -> None:
@@ -87,6 +91,8 @@ _LIMITS = (
     ("edge", 0.005, 1000.0),
     ("least", 0.0, 1000.0),
     ("height", 0.0, 1000.0),
+    ("dynamic", 0.0, 1.0),
+    ("about", 1e-3, 10.0),
     ("island", 0.0, 1000.0),
 )
 

@@ -27,6 +27,7 @@ _TOLD = (0.1, 0.4, 0.2, 0.2, 2.0, 1.0)  # and by the ends
 _SIGMA = 0.03  # m, by how much points lie off a surface
 _REACHES = (0.6, 0.3, 0.15)  # m, within which points are of the same place, round by round less
 _ROUNDS = 5  # with each of them
+_SETTLED = 2  # rounds by which a velocity that is tried is made better
 _POINTS = 2000  # of a look, at most: more do not make it better
 _FEWEST = 20  # points that say anything
 _TELL = 100.0  # points of a look that tell on their own: neighbours are off together
@@ -99,12 +100,12 @@ def motion_of(sweeps: Sequence[Sweep], best: int) -> Float:
     away = np.abs([one.later for one in sweeps])
     beside = [sweeps[k] for k in (best - 1, best + 1) if 0 <= k < len(sweeps)]
     others = [one for k, one in enumerate(sweeps) if k != best]
-    motion = guess = _ends_meet(beside, tree, motion, _GUESSES, _PER_SPEED)
+    motion = guess = _ends_meet(beside, known, tree, motion, _GUESSES, _PER_SPEED)
     for part, reach in zip((0.4, 0.7, 1.0), _REACHES, strict=True):
         some = [one for one in others if abs(one.later) <= part * away.max() + 1e-9]
         for _ in range(_ROUNDS):
             motion = _better(some, known, tree, motion, guess, _TRACK, reach)
-    guess = _ends_meet(others, tree, motion, _FINER, 0.0)
+    guess = _ends_meet(others, known, tree, motion, _FINER, 0.0)
     motion = guess
     for _ in range(_ROUNDS):
         motion = _better(others, known, tree, motion, guess, _TOLD, _REACHES[-1])
@@ -113,6 +114,7 @@ def motion_of(sweeps: Sequence[Sweep], best: int) -> Float:
 
 def _ends_meet(
     sweeps: Sequence[Sweep],
+    known: Sweep,
     tree: "cKDTree[None]",
     motion: Float,
     speeds: tuple[float, ...],
@@ -121,18 +123,23 @@ def _ends_meet(
     """The motion (6,) with another velocity ahead, if by that looks lie nearer to the best one.
 
     Point to point, so that its ends tell, and not along its sides only. A track of a part of a car
-    may be wrong by half its velocity.
+    may be wrong by half its velocity. With each velocity ahead the rest of the motion is made
+    better first: along a side that is askew one ahead is nearly as good as one to the left.
 
     Args:
         sweeps: the looks.
-        tree: the vertices of the best one.
+        known: the best one.
+        tree: its vertices.
         motion: where to begin.
         speeds: m/s that are tried beside, 0 the first of them.
         price: m for each m/s: where all are as good the track counts.
     """
-    worth = []
+    found, worth = list[Float](), list[float]()
     for speed in speeds:
-        tried = motion + np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
+        tried = guess = motion + np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
+        for _ in range(_SETTLED):
+            tried = _better(sweeps, known, tree, tried, guess, _TOLD, _REACHES[1])
+        found.append(tried)
         off = [np.zeros(0)]
         for one in sweeps:
             R, t = pose(tried, one.later)
@@ -141,8 +148,7 @@ def _ends_meet(
             off.append(np.asarray(tree.query(at, distance_upper_bound=_NEAR)[0]))
         far = np.minimum(np.concatenate(off), _NEAR)
         worth.append((float(far.mean()) if len(far) else 0.0) + price * abs(speed))
-    best = np.array([speeds[int(np.argmin(worth))], 0.0, 0.0, 0.0, 0.0, 0.0])
-    return np.asarray(motion + best)
+    return found[int(np.argmin(worth))]
 
 
 def _better(

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from stillmap.models.grouping import MOSTLY, Scan, grouped, pairs_of
 from stillmap.models.options import MoverOptions
 from stillmap.models.own import SPACING, Moves, fast, large, own_moves, pieces_of_cells
 from stillmap.models.sources import Sources
@@ -19,13 +20,11 @@ Bool = NDArray[np.bool_]
 Index = NDArray[np.intp]
 
 _LOOKS = 9  # times at which velocities are compared
-_MOSTLY = 0.5  # of scans: what hangs together so often is one
 _MUCH_MORE = 2.0  # times as many beams has that of which something is left over
 _ALIKE = 0.5  # of the faster one's speed may velocities differ
 _SLOW = 1.0  # m/s, or by that
 _NEAR = 10.0  # m, up to where beams are as near each other; then up to twice that, and so on
 _FLAT = 2.0  # times as far apart along the line of sight: sides of cars, at flat angles
-_AT_ONCE = 1000  # scans, after which their pairs are counted
 _CELLS = 3.0  # of so many edges is the way between what hangs together
 
 
@@ -64,38 +63,30 @@ def wholes_of(
 ) -> list[list[Followed]]:
     """The same, those together that are parts of one thing.
 
-    Of two that are of one velocity, one of them faster than people, and hang together in most
-    scans that saw both. What is of another velocity, and mostly hangs together with more beams of
-    something fast, is no thing, but what was left over of those that passed: it is left out.
+    Of two that are of one velocity, one of them faster than people, and mostly hang together in
+    scans that saw both; `grouped` says of more than two. What is of another velocity, and mostly
+    hangs together with more beams of something fast, is no thing, but what was left over of those
+    that passed: it is left out.
     """
     n = len(followed)
     quick = np.array([one.fast for one in followed], np.bool_)
     if moves.planar or not quick.any():
         return [[one] for one in followed]
     scans = list(_scans(followed, moves, sources, options))
-    often = _often_together(scans, n)
-    often = often[quick[often].any(axis=1)]
-    pairs = [(a, b) for a, b in often.tolist() if _alike(followed[a], followed[b])]
-    ends = np.array(pairs, np.intp).reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), (n, n))
-    piece = np.asarray(connected_components(graph, directed=False)[1], np.intp)
+    pairs = pairs_of(scans, n)
+    may = quick[pairs.ends].any(axis=1) & (pairs.met >= MOSTLY * pairs.both)
+    some = np.flatnonzero(may)
+    may[some] = [_alike(followed[a], followed[b]) for a, b in pairs.ends[some].tolist()]
+    piece = grouped(pairs, may, n)
     groups: dict[int, list[Followed]] = {}
     for k in np.flatnonzero(~_left_over(scans, piece, quick)).tolist():
         groups.setdefault(int(piece[k]), []).append(followed[k])
     return list(groups.values())
 
 
-class _Scan(NamedTuple):
-    """Which things a scan saw: (n,) numbers, the piece that most of each is of, and its beams."""
-
-    there: Index
-    piece: Index
-    beams: Index
-
-
 def _scans(
     followed: Sequence[Followed], moves: Moves, sources: Sources, options: MoverOptions
-) -> Iterator[_Scan]:
+) -> Iterator[Scan]:
     """The scans that saw something fast."""
     n, seen = len(followed), sources.seen
     quick = np.array([one.fast for one in followed], np.bool_)
@@ -110,31 +101,10 @@ def _scans(
         count = np.zeros((n + 1, int(piece.max()) + 1), np.intp)
         np.add.at(count, (whose, piece), 1)
         there = np.flatnonzero(count[:n].any(axis=1))
-        yield _Scan(there, count[there].argmax(axis=1), count[there].max(axis=1))
+        yield Scan(there, count[there].argmax(axis=1), count[there].max(axis=1))
 
 
-def _often_together(scans: Sequence[_Scan], n: int) -> Index:
-    """(m, 2) numbers of things below n, the lesser one first: those that hang together in most
-    scans that saw both."""
-    # of so many things most never meet: pairs that were seen, and no square of all
-    key, met, both = (np.zeros(0, np.intp) for _ in range(3))
-    for first in range(0, len(scans), _AT_ONCE):
-        keys, ones = [key], [met]
-        for there, piece, _ in scans[first : first + _AT_ONCE]:
-            a, b = np.triu_indices(len(there), 1)
-            keys.append(there[a] * n + there[b])
-            ones.append((piece[a] == piece[b]).astype(np.intp))
-        before = both
-        key, number = np.unique(np.concatenate(keys), return_inverse=True)
-        met, both = np.zeros(len(key), np.intp), np.zeros(len(key), np.intp)
-        np.add.at(met, number, np.concatenate(ones))
-        np.add.at(both, number[: len(before)], before)
-        np.add.at(both, number[len(before) :], 1)
-    often = key[(met >= _MOSTLY * both) & (met > 0)]
-    return np.stack([often // n, often % n], axis=1)
-
-
-def _left_over(scans: Sequence[_Scan], whole: Index, quick: Bool) -> Bool:
+def _left_over(scans: Sequence[Scan], whole: Index, quick: Bool) -> Bool:
     """(n,) which ones mostly hang together with more beams of another whole that is fast."""
     less, times = np.zeros(len(whole), np.intp), np.zeros(len(whole), np.intp)
     for there, piece, beams in scans:
@@ -142,7 +112,7 @@ def _left_over(scans: Sequence[_Scan], whole: Index, quick: Bool) -> Bool:
         more = (piece[:, None] == piece) & quick[there] & (mine > _MUCH_MORE * mine[:, None])
         less[there] += (more & (whole[there][:, None] != whole[there])).any(axis=1)
         times[there] += 1
-    return (less >= _MOSTLY * times) & (times > 0)
+    return (less >= MOSTLY * times) & (times > 0)
 
 
 def hanging_together(points: Float, place: Float, link: float) -> Index:
