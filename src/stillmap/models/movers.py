@@ -25,6 +25,7 @@ from stillmap.texture.things import Thing
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
+_LONGER = (1.0, 2.0, 4.0)  # times a sweep, one after the other, until there is a surface
 _FINEST, _COARSEST = 0.03, 0.06  # m, edges of voxels
 _OF_SPACING = 0.7  # of how far beams lie apart
 _BEFORE, _BEHIND = 6.0, 5.0  # voxels about a surface: looks are a few of them apart
@@ -79,7 +80,8 @@ def shape_of(
     fast = any(one.fast for one in followed)
     rigid = fast or any(one.large for one in followed)
     # who is seen by few beams is looked at longer
-    for moment in (options.sweep, 2.0 * options.sweep) if moves.planar else (0.0,):
+    for longer in _LONGER if moves.planar else (0.0,):
+        moment = longer * options.sweep
         one, span = _best(followed, pictures, moment, sources, moves, options)
         way = Way.of_track(one.thing)
         look = look_at(own, span, way, fast, sources, moves, options)
