@@ -171,15 +171,14 @@ def test_too_large_a_triangle_is_refused():
 @pytest.mark.parametrize("standoff", [1e-3, 1e-9, 1e-300])
 def test_a_surface_that_is_met_at_next_to_no_angle_ends(standoff):
     points, origin, _, faces, weight = wall(20.0, 0.1)
-    both = [
-        kernels.SignedDistances(0.03, before=0.18, behind=0.15) for kernels in (_core, reference)
-    ]
+    both = [k.SignedDistances(0.03, before=0.18, behind=0.15) for k in (_core, reference)]
     for one in both:
         one.add(points, origin, np.full(4, standoff), faces, weight)
-    for one in both:
         x = one.blocks()[:, 0] * one.edge * 0.03
         assert 20.0 - 18.3 < x.min() < 20.0 - 15.0
         assert 20.0 + 14.7 < x.max() < 20.0 + 15.0
-    where = [600, -4, -4], [8, 8, 60]
-    for metres, plain in zip(both[0].dense(*where), both[1].dense(*where), strict=True):
-        np.testing.assert_allclose(metres, plain, atol=2e-6)
+    (metres, weights), (plain, plain_weights) = (d.dense([600, -4, -4], [8, 8, 60]) for d in both)
+    assert (weights > 0.0).sum() > 2000
+    np.testing.assert_allclose(weights, plain_weights, rtol=1e-5)
+    off = 1e-6 * standoff + 1e-38  # float32
+    np.testing.assert_allclose(metres, plain, rtol=1e-4, atol=off)

@@ -57,32 +57,76 @@ def test_static_things_farther_away_do_not_matter() -> None:
     assert _shape(sources, MoverOptions(about=1.0, dynamic=0.9)) is None
 
 
-@pytest.mark.parametrize("reach", [0.05, 0.2])
-def test_the_mean_is_that_of_beams_near_the_surface_and_above_the_ground(reach: float) -> None:
+def _face(height: float) -> tuple[Sources, Mesh, Way]:
+    """The front of the box, up to a height, in its own frame."""
     sources = street([STANDS], [Part(0)])
-    (one,), (thing,) = sources.objects, sources.things
-    rng = np.random.default_rng(3)
-    p_static = rng.random(len(sources.p_static)).astype(np.float32)
-    sources = dataclasses.replace(sources, p_static=p_static)
-    way = Way.of_track(thing)
-    T = way.T_map_object(0.0)
-    x = ((sources.seen.end_points(one.beams[:1], sources.poses)[0] - T[:3, 3]) @ T[:3, :3])[0]
-    corners = np.array([[x, -0.4, 0.0], [x, 0.4, 0.0], [x, 0.4, 0.9], [x, -0.4, 0.9]])
-    mesh = Mesh(corners, np.array([[0, 2, 1], [0, 3, 2]], np.int32))
-    found = p_dynamic_at(mesh, way, (0.0, 0.05), sources, reach)
-    first = np.arange(sources.seen.offset[1])
-    at = (sources.seen.end_points(first, sources.poses) - T[:3, 3]) @ T[:3, :3]
-    off = np.abs(at) - np.array([np.inf, 0.4, 0.9])
-    outside = np.linalg.norm(np.maximum(off[:, 1:], 0.0), axis=1)
-    surely = (np.abs(at[:, 0] - x) < 0.01) & (at[:, 2] > 0.1)
-    inner, outer = surely & (outside < 0.9 * reach - 0.01), surely & (outside < reach)
-    means = [1.0 - p_static[first[some]].mean(dtype=np.float64) for some in (inner, outer)]
-    assert min(means) - 0.02 <= found <= max(means) + 0.02
-    assert inner.sum() > 20
-
-
-def test_where_all_is_the_grounds_nothing_is_known() -> None:
-    sources = street([STANDS], [Part(0)])
-    flat = Mesh(np.array([[0.0, 0, 0], [0.5, 0, 0], [0, 0.5, 0.05]]), np.array([[0, 1, 2]], "i4"))
     way = Way.of_track(sources.things[0])
-    assert np.isnan(p_dynamic_at(flat, way, (0.0, 0.05), sources, 0.04))
+    x, y = -0.3, 0.4
+    corners = np.array([[x, -y, 0.0], [x, y, 0.0], [x, y, height], [x, -y, height]])
+    return sources, Mesh(corners, np.array([[0, 2, 1], [0, 3, 2]], np.int32)), way
+
+
+def _set(sources: Sources, which: np.ndarray, p: float) -> Sources:
+    p_static = np.where(which, np.float32(p), np.float32(0.0))
+    return dataclasses.replace(sources, p_static=p_static)
+
+
+def _local(sources: Sources, way: Way) -> np.ndarray:
+    T = way.T_map_object(0.0)
+    every = np.arange(sources.seen.n_beams)
+    return np.asarray((sources.seen.end_points(every, sources.poses) - T[:3, 3]) @ T[:3, :3])
+
+
+@pytest.mark.parametrize("reach", [0.05, 0.2])
+def test_the_mean_is_that_of_beams_near_the_surface(reach: float) -> None:
+    sources, mesh, way = _face(0.9)
+    at = _local(sources, way)
+    outside = np.maximum(np.abs(at[:, 1]) - 0.4, np.maximum(at[:, 2] - 0.9, 0.0))
+    near = (np.abs(at[:, 0] + 0.3) < 0.01) & (outside < 0.8 * reach) & (at[:, 2] > 0.1)
+    far = (np.abs(at[:, 0] + 0.3) > reach) | (outside > reach)
+    assert near.sum() > 100
+    span = (0.0, 0.05)
+    assert p_dynamic_at(mesh, way, span, _set(sources, far, 1.0), reach) == 1.0
+    found = p_dynamic_at(mesh, way, span, _set(sources, near, 0.25), reach)
+    assert found == pytest.approx(0.75, abs=0.06)
+    assert found > 0.7499
+
+
+def test_other_times_do_not_count() -> None:
+    sources, mesh, way = _face(0.9)
+    later = np.arange(sources.seen.n_beams) >= sources.seen.offset[3]
+    sources = _set(sources, later, 1.0)
+    assert p_dynamic_at(mesh, way, (0.0, 0.25), sources, 0.2) == 1.0
+    assert p_dynamic_at(mesh, way, (0.35, 0.65), sources, 0.2) == 0.0
+    assert p_dynamic_at(mesh, way, (0.15, 0.35), sources, 0.2) == pytest.approx(0.5)
+
+
+def test_what_goes_on_leaves_what_it_passed_behind() -> None:
+    goes = Car((8.0, -2.0), (0.0, 10.0), (0.6, 1.0, 1.5))
+    wall = Car((9.0, -2.0), (0.0, 0.0), (0.6, 1.0, 1.5))
+    sources = street([goes, wall], [Part(0), Part(1)], scans=6)
+    x = _local(sources, Way.of_track(sources.things[1]))[:, 0]
+    sources = _set(sources, np.abs(x + 0.3) < 0.05, 1.0)
+    way = Way.of_track(sources.things[0])
+    corners = np.array([[-0.3, -0.4, 0.2], [-0.3, 0.4, 0.2], [-0.3, 0.4, 1.2]])
+    mesh = Mesh(corners, np.array([[0, 2, 1]], np.int32))
+    standing = way._replace(thing=way.thing._replace(box=sources.things[1].box))
+    assert p_dynamic_at(mesh, way, (0.15, 0.45), sources, 0.2) == 1.0
+    assert p_dynamic_at(mesh, standing, (0.15, 0.45), sources, 0.2) < 0.5
+
+
+def test_the_ground_does_not_count() -> None:
+    sources, mesh, way = _face(0.9)
+    low = _local(sources, way)[:, 2] < 0.1
+    assert (low & (np.abs(_local(sources, way)[:, 1]) < 0.4)).sum() > 10
+    assert p_dynamic_at(mesh, way, (0.0, 0.05), _set(sources, low, 1.0), 0.2) == 1.0
+    _, flat, _ = _face(0.04)
+    assert np.isnan(p_dynamic_at(flat, way, (0.0, 0.05), sources, 0.05))
+
+
+def test_flat_things_have_models_where_nobody_asks() -> None:
+    low = Car((8.0, 0.0), (0.0, 0.0), (0.6, 2.0, 0.09))
+    sources = street([low], [Part(0)], rows=200)
+    options = MoverOptions(height=0.0, least=0.0)
+    assert _shape(sources, options) is None
+    assert _shape(sources, dataclasses.replace(options, dynamic=0.0)) is not None

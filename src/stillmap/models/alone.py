@@ -5,7 +5,6 @@ dynamic, and followed; others ended right beside them, at the same time, on what
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from stillmap.models.frames import Way
@@ -14,7 +13,7 @@ from stillmap.models.sources import Sources
 from stillmap.surface.dividing import divided
 from stillmap.surface.mesh import Mesh
 
-_GROUND = 0.1  # m, how rough it is
+_GROUND = 0.1  # m above the foot of a thing, up to where beams may have met the ground
 _FINE = 0.5  # of the distance that counts, between points of the surface
 
 
@@ -31,24 +30,24 @@ def p_dynamic_at(
         reach: metres from its surface.
 
     Returns:
-        NaN where all ended on the ground.
+        NaN where no beam ended there, 0.1 m above its foot or higher.
     """
-    scans, offset = scans_about(*span, sources), sources.seen.offset
-    beams = np.arange(offset[scans.start], offset[scans.stop])
-    seconds = seconds_of(beams, sources)
-    then = (seconds >= span[0]) & (seconds <= span[1]) & sources.seen.hit[beams]
-    beams, seconds = beams[then], seconds[then]
-    at = way.local(seconds, sources.seen.end_points(beams, sources.poses))
-    near = _within(at, mesh, reach)
-    p_static = sources.p_static[beams[near]].astype(np.float64)
-    return float(1.0 - p_static.mean()) if len(p_static) else float("nan")
-
-
-def _within(points: NDArray[np.float64], mesh: Mesh, reach: float) -> NDArray[np.intp]:
-    """Which of points (n, 3) lie that near to a surface, and above the ground."""
-    low, high = mesh.vertices.min(axis=0) - reach, mesh.vertices.max(axis=0) + reach
+    seen = sources.seen
+    fine, _ = divided(mesh, _FINE * reach)
+    tree = cKDTree(fine.vertices)
+    low, high = fine.vertices.min(axis=0) - reach, fine.vertices.max(axis=0) + reach
     low[2] = max(low[2], _GROUND)
-    some = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
-    fine, _ = divided(mesh, max(_FINE * reach, 0.01))
-    off = cKDTree(fine.vertices).query(points[some], distance_upper_bound=reach)[0]
-    return some[np.isfinite(off)]
+    total, count = 0.0, 0
+    scans = scans_about(*span, sources)
+    for scan in range(scans.start, scans.stop):  # all of a second's would be too many at once
+        beams = np.arange(seen.offset[scan], seen.offset[scan + 1])
+        seconds = seconds_of(beams, sources)
+        then = (seconds >= span[0]) & (seconds <= span[1]) & seen.hit[beams]
+        beams, seconds = beams[then], seconds[then]
+        at = way.local(seconds, seen.end_points(beams, sources.poses))
+        some = np.flatnonzero(((at > low) & (at < high)).all(axis=1))
+        off = tree.query(at[some], distance_upper_bound=reach)[0]
+        near = sources.p_static[beams[some[np.isfinite(off)]]]
+        total += float(near.sum(dtype=np.float64))
+        count += len(near)
+    return 1.0 - total / count if count else float("nan")

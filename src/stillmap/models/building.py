@@ -229,7 +229,7 @@ def _mover(
     place: Ahead,
     options: MeshOptions,
 ) -> MoverModel | None:
-    """The model of what was followed as one or more objects; None where too little was seen."""
+    """The model of what was followed as one or more objects; None where `shape_of` finds none."""
     start = sources.start_ns
     seconds = [when_in_view(one.thing, views, start) for one in whole]
     shown = [some[np.isfinite(some)] for some in seconds]

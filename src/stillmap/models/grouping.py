@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Bool = NDArray[np.bool_]
 Index = NDArray[np.intp]
 
-MOSTLY = 0.5  # of what both are seen with: what hangs together so often is one
+MOSTLY = 0.5  # of what is counted
 _AT_ONCE = 1000  # scans, after which their pairs are counted
 
 
@@ -62,8 +62,8 @@ def pairs_of(scans: Sequence[Scan], n: int) -> Pairs:
 def grouped(pairs: Pairs, may: Bool, n: int) -> Index:
     """(n,) which whole each of n things is of.
 
-    Those pairs that hang together most come first. Two wholes become one where a pair of them may,
-    and all their pairs together mostly hang together.
+    Pairs are asked in the order in which they hang together most, each once. Two wholes become one
+    where a pair of them may, and all their pairs together mostly hang together by then.
 
     Args:
         pairs: all that were seen.

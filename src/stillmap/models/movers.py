@@ -80,8 +80,7 @@ def shape_of(
     fast = any(one.fast for one in followed)
     rigid = fast or any(one.large for one in followed)
     # who is seen by few beams is looked at longer
-    for longer in _LONGER if moves.planar else (0.0,):
-        moment = longer * options.sweep
+    for moment in [k * options.sweep for k in _LONGER] if moves.planar else [0.0]:
         one, span = _best(followed, pictures, moment, sources, moves, options)
         way = Way.of_track(one.thing)
         look = look_at(own, span, way, fast, sources, moves, options)
@@ -94,13 +93,16 @@ def shape_of(
         if rigid and not moves.planar and len(mesh.vertices) >= _TOLD:
             whole = _put_together(one, own, now, fast, sources, moves, options)
             if whole is not None:
-                return _if_it_moves(whole, sources, options)
+                return _moving(whole, sources, options)
         shape = Shape(one.object.id, mesh, way, False, now, look.span)
-        return _if_it_moves(shape, sources, options)
+        return _moving(shape, sources, options)
     return None
 
 
-def _if_it_moves(shape: Shape, sources: Sources, options: MoverOptions) -> Shape | None:
+def _moving(shape: Shape, sources: Sources, options: MoverOptions) -> Shape | None:
+    """The shape; None where most of what is there stands still."""
+    if options.dynamic == 0.0:
+        return shape
     p = p_dynamic_at(shape.mesh, shape.way, shape.span, sources, options.about)
     return shape if p >= options.dynamic else None
 

@@ -59,7 +59,9 @@ class MoverOptions:
         0.05, "m from its lowest to its highest point, at least: what is flatter is the ground's"
     )
     dynamic: float = field_with_doc(
-        0.7, "P(dynamic) of what ended at it when it was seen, on average: else it stands still"
+        0.7,
+        "P(dynamic) of what ended at it when it was seen, on average, at least: what is less "
+        "stands still; 0: not asked for",
     )
     about: float = field_with_doc(0.2, "m from its surface, up to where beams ended at it")
     island: float = field_with_doc(0.005, "m2, smaller pieces of it are left out")
@@ -92,7 +94,7 @@ _LIMITS = (
     ("least", 0.0, 1000.0),
     ("height", 0.0, 1000.0),
     ("dynamic", 0.0, 1.0),
-    ("about", 1e-3, 10.0),
+    ("about", 0.02, 10.0),
     ("island", 0.0, 1000.0),
 )
 

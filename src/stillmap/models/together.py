@@ -72,6 +72,23 @@ class Sweep(NamedTuple):
         return Patch(points, self.mesh.faces, np.arange(len(points)), origin, standoff)
 
 
+class _Points(NamedTuple):
+    """Some of the vertices of a look, (n, 3) metres, and (n, 3) where they face."""
+
+    at: Float
+    facing: Float
+    later: float
+
+    @classmethod
+    def of(cls, one: Sweep, most: int) -> "_Points":
+        every = max(1, len(one.mesh.vertices) // most)
+        return cls(one.mesh.vertices[::every], one.normals[::every], one.later)
+
+    def moved(self, motion: Float) -> "_Points":
+        R, t = pose(motion, self.later)
+        return _Points(self.at @ R.T + t, self.facing @ R.T, self.later)
+
+
 def pose(motion: Float, later: float) -> tuple[Float, Float]:
     """(3, 3) and (3,) metres by which a look has to be moved.
 
@@ -97,23 +114,24 @@ def motion_of(sweeps: Sequence[Sweep], best: int) -> Float:
     if len(known.mesh.vertices) < _FEWEST:
         return motion
     tree = cKDTree(known.mesh.vertices)
-    away = np.abs([one.later for one in sweeps])
-    beside = [sweeps[k] for k in (best - 1, best + 1) if 0 <= k < len(sweeps)]
-    others = [one for k, one in enumerate(sweeps) if k != best]
-    motion = guess = _ends_meet(beside, known, tree, motion, _GUESSES, _PER_SPEED)
+    some, few = ([_Points.of(one, most) for one in sweeps] for most in (_POINTS, _GUESSED))
+    beside = [few[k] for k in (best - 1, best + 1) if 0 <= k < len(sweeps)]
+    motion = _ends_meet(beside, known, tree, motion, _GUESSES, _PER_SPEED)
+    guess = motion * np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # of the rest the track tells more
+    others = [k for k in range(len(sweeps)) if k != best]
+    farthest = max(abs(one.later) for one in sweeps)
     for part, reach in zip((0.4, 0.7, 1.0), _REACHES, strict=True):
-        some = [one for one in others if abs(one.later) <= part * away.max() + 1e-9]
+        near = [some[k] for k in others if abs(some[k].later) <= part * farthest + 1e-9]
         for _ in range(_ROUNDS):
-            motion = _better(some, known, tree, motion, guess, _TRACK, reach)
-    guess = _ends_meet(others, known, tree, motion, _FINER, 0.0)
-    motion = guess
+            motion = _better(near, known, tree, motion, guess, _TRACK, reach)
+    motion = guess = _ends_meet([few[k] for k in others], known, tree, motion, _FINER, 0.0)
     for _ in range(_ROUNDS):
-        motion = _better(others, known, tree, motion, guess, _TOLD, _REACHES[-1])
+        motion = _better([some[k] for k in others], known, tree, motion, guess, _TOLD, _REACHES[-1])
     return motion
 
 
 def _ends_meet(
-    sweeps: Sequence[Sweep],
+    looks: Sequence[_Points],
     known: Sweep,
     tree: "cKDTree[None]",
     motion: Float,
@@ -127,7 +145,7 @@ def _ends_meet(
     better first: along a side that is askew one ahead is nearly as good as one to the left.
 
     Args:
-        sweeps: the looks.
+        looks: the others.
         known: the best one.
         tree: its vertices.
         motion: where to begin.
@@ -138,21 +156,17 @@ def _ends_meet(
     for speed in speeds:
         tried = guess = motion + np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
         for _ in range(_SETTLED):
-            tried = _better(sweeps, known, tree, tried, guess, _TOLD, _REACHES[1])
+            tried = _better(looks, known, tree, tried, guess, _TOLD, _REACHES[1])
         found.append(tried)
-        off = [np.zeros(0)]
-        for one in sweeps:
-            R, t = pose(tried, one.later)
-            every = max(1, len(one.mesh.vertices) // _GUESSED)
-            at = one.mesh.vertices[::every] @ R.T + t
-            off.append(np.asarray(tree.query(at, distance_upper_bound=_NEAR)[0]))
-        far = np.minimum(np.concatenate(off), _NEAR)
+        at = np.concatenate([np.zeros((0, 3)), *(one.moved(tried).at for one in looks)])
+        off = np.asarray(tree.query(at, distance_upper_bound=_NEAR)[0])
+        far = np.minimum(off, _NEAR)
         worth.append((float(far.mean()) if len(far) else 0.0) + price * abs(speed))
     return found[int(np.argmin(worth))]
 
 
 def _better(
-    sweeps: Sequence[Sweep],
+    looks: Sequence[_Points],
     known: Sweep,
     tree: "cKDTree[None]",
     motion: Float,
@@ -163,9 +177,8 @@ def _better(
     """One step of Gauss and Newton from `motion`, held to `guess` by standard deviations."""
     hold = np.diag(1.0 / np.square(sigma))
     H, g = hold.copy(), hold @ (motion - guess)
-    for one in sweeps:
-        there = one.moved(motion)
-        at, n, residual = _off(there, known, tree, reach)
+    for one in looks:
+        at, n, residual = _off(one.moved(motion), known, tree, reach)
         if len(at) < _FEWEST:
             continue
         T = one.later
@@ -188,11 +201,10 @@ def _better(
 
 
 def _off(
-    one: Sweep, known: Sweep, tree: "cKDTree[None]", reach: float
+    one: _Points, known: Sweep, tree: "cKDTree[None]", reach: float
 ) -> tuple[Float, Float, Float]:
     """(n, 3) points that have a place on what is known, (n, 3) its normals, (n,) metres off it."""
-    every = max(1, len(one.mesh.vertices) // _POINTS)
-    at, facing = one.mesh.vertices[::every], one.normals[::every]
+    at, facing, _ = one
     away, nearest = map(np.asarray, tree.query(at, distance_upper_bound=reach))
     near = np.flatnonzero(np.isfinite(away))
     normals = known.normals[nearest[near]]
@@ -209,5 +221,6 @@ def apart(one: Sweep, known: Sweep) -> float:
     """
     if not len(known.mesh.vertices):
         return float("nan")
-    residual = _off(one, known, cKDTree(known.mesh.vertices), _REACHES[0])[2]
+    some = _Points.of(one, _POINTS)
+    residual = _off(some, known, cKDTree(known.mesh.vertices), _REACHES[0])[2]
     return float(np.quantile(np.abs(residual), 0.75)) if len(residual) >= _FEWEST else float("nan")

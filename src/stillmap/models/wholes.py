@@ -64,9 +64,9 @@ def wholes_of(
     """The same, those together that are parts of one thing.
 
     Of two that are of one velocity, one of them faster than people, and mostly hang together in
-    scans that saw both; `grouped` says of more than two. What is of another velocity, and mostly
-    hangs together with more beams of something fast, is no thing, but what was left over of those
-    that passed: it is left out.
+    scans that saw both, counted by beams; `grouped` says of more than two. What is of another
+    velocity, and in most scans hangs together with more beams of something fast, is no thing, but
+    what was left over of those that passed: it is left out.
     """
     n = len(followed)
     quick = np.array([one.fast for one in followed], np.bool_)
@@ -74,13 +74,13 @@ def wholes_of(
         return [[one] for one in followed]
     scans = list(_scans(followed, moves, sources, options))
     pairs = pairs_of(scans, n)
-    may = quick[pairs.ends].any(axis=1) & (pairs.met >= MOSTLY * pairs.both)
-    some = np.flatnonzero(may)
-    may[some] = [_alike(followed[a], followed[b]) for a, b in pairs.ends[some].tolist()]
-    piece = grouped(pairs, may, n)
+    alike = quick[pairs.ends].any(axis=1) & (pairs.met > 0)
+    some = np.flatnonzero(alike)
+    alike[some] = [_alike(followed[a], followed[b]) for a, b in pairs.ends[some].tolist()]
+    whole = grouped(pairs, alike & (pairs.met >= MOSTLY * pairs.both), n)
     groups: dict[int, list[Followed]] = {}
-    for k in np.flatnonzero(~_left_over(scans, piece, quick)).tolist():
-        groups.setdefault(int(piece[k]), []).append(followed[k])
+    for k in np.flatnonzero(~_left_over(scans, whole, quick, pairs.ends[alike])).tolist():
+        groups.setdefault(int(whole[k]), []).append(followed[k])
     return list(groups.values())
 
 
@@ -104,13 +104,25 @@ def _scans(
         yield Scan(there, count[there].argmax(axis=1), count[there].max(axis=1))
 
 
-def _left_over(scans: Sequence[Scan], whole: Index, quick: Bool) -> Bool:
-    """(n,) which ones mostly hang together with more beams of another whole that is fast."""
-    less, times = np.zeros(len(whole), np.intp), np.zeros(len(whole), np.intp)
+def _left_over(scans: Sequence[Scan], whole: Index, quick: Bool, alike: Index) -> Bool:
+    """(n,) which ones in most scans hang together with more beams of another whole that is fast.
+
+    Args:
+        scans: that saw something fast.
+        whole: (n,) of each.
+        quick: (n,) which are fast.
+        alike: (m, 2) pairs of one velocity: those go on beside each other, as cars in a row.
+    """
+    n = len(whole)
+    both_ways = np.concatenate([alike, alike[:, ::-1]])
+    beside = np.unique(both_ways[:, 0] * n + both_ways[:, 1])
+    less, times = np.zeros(n, np.intp), np.zeros(n, np.intp)
     for there, piece, beams in scans:
         mine = np.bincount(whole[there], beams)[whole[there]]
         more = (piece[:, None] == piece) & quick[there] & (mine > _MUCH_MORE * mine[:, None])
-        less[there] += (more & (whole[there][:, None] != whole[there])).any(axis=1)
+        more &= whole[there][:, None] != whole[there]
+        more &= ~np.isin(there[:, None] * n + there, beside)
+        less[there] += more.any(axis=1)
         times[there] += 1
     return (less >= MOSTLY * times) & (times > 0)
 
