@@ -27,8 +27,8 @@ def one_blas_thread() -> Iterator[None]:
     """Linear algebra by one thread meanwhile, in the whole process.
 
     Matrices are small here, and kernels have threads of their own. BLAS's wait for each other
-    busily: where other processes want the processors, that costs more than all the work. Sums have
-    the same bits on every machine, too.
+    busily: where other processes want the processors, that costs more than all the work. Sums no
+    longer depend on how many processors there are, either.
     """
     import scipy.linalg  # noqa: F401  (SciPy has a BLAS of its own; takes long to load)
 

@@ -183,20 +183,16 @@ def office(seed):
     return simulate(scene_by_name("office", {"robot": {"scans": 500}}), seed)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("n", [1, 3])
-def test_scans_alone_are_hardly_worse(n):
+def test_scans_alone_are_hardly_worse(seed, n):
     # a third of the scans: 0.3 m and up to 28 degrees from one to the next
-    hardly = 0
-    for seed in range(4):
-        kept = np.arange(0, office(seed).recording.n_scans, n)
-        recording, T = picked(office(seed).recording, kept), office(seed).truth.T_world_base[kept]
-        with_odometry = error(recording, T)
-        without = error(recording.without_odometry(), T)
-        assert with_odometry < 0.04
-        hardly += without < 1.5 * with_odometry + 0.01
-    # where a corridor shows little of its length, poses 0.2 m apart differ by two nats in what they
-    # explain: there rounding, which is another one on other processors, may decide
-    assert hardly >= 3
+    kept = np.arange(0, office(seed).recording.n_scans, n)
+    recording, T = picked(office(seed).recording, kept), office(seed).truth.T_world_base[kept]
+    with_odometry = error(recording, T)
+    without = error(recording.without_odometry(), T)
+    assert with_odometry < 0.04
+    assert without < 1.5 * with_odometry + 0.01
 
 
 def two_lasers(seed, both):

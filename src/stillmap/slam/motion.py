@@ -167,8 +167,11 @@ def from_constant_velocity(
     T_map_base: Float, T_map_base_before: Float, steadiness: Steadiness
 ) -> MotionPrior:
     """The prior without odometry: the last motion once more."""
-    increment = se2.inverse(T_map_base_before) @ T_map_base
-    return _prior(T_map_base @ increment, steadiness.translation, steadiness.rotation)
+    # not by BLAS, whose rounding is another one on other processors: along a corridor without ends
+    # poses hang on these guesses alone
+    increment = np.einsum("ij,jk->ik", se2.inverse(T_map_base_before), T_map_base)
+    mean = np.einsum("ij,jk->ik", T_map_base, increment)
+    return _prior(mean, steadiness.translation, steadiness.rotation)
 
 
 def from_increment(
