@@ -27,10 +27,10 @@ from common import (
 from prepared import RESOLUTION
 from tables import markdown
 
-from stillmap.em import EmOptions, dwell
-from stillmap.em.looks import CLASSES, Classes
-from stillmap.evaluation.labels import LabelScores, label_scores
-from stillmap.simulation import simulate
+from stillmap.em import EmOptions, occupancy_hmm
+from stillmap.em.observations import CLASSES, Classes
+from stillmap.eval.labels import LabelScores, label_scores
+from stillmap.sim import simulate
 
 _NONE = 1e-6  # scatters: as good as none; half a cell remains where noise is not the reason
 
@@ -82,7 +82,7 @@ def scores_of(run: Run) -> list[LabelScores]:
     kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
     scored = recording.hit & ~np.isin(kinds, LASTING)
     found = (
-        dwell.e_step(recording, poses, RESOLUTION, v.options(options.em), 1, v.classes)
+        occupancy_hmm.e_step(recording, poses, RESOLUTION, v.options(options.em), 1, v.classes)
         for v in VARIANTS
     )
     return [label_scores(e.p_static, truth.static, scored) for e in found]

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from prepared import RESOLUTION, counts
 from tables import grouped, markdown
 
-from stillmap.evaluation.labels import UNSURE, calibration_error, equal_mass_bins
-from stillmap.recording.model import Recording
-from stillmap.simulation import simulate
+from stillmap.core.recording import Recording
+from stillmap.eval.labels import UNSURE, calibration_error, equal_mass_bins
+from stillmap.sim import simulate
 
 Float = NDArray[np.float64]
 

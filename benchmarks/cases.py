@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from stillmap.simulation import OdometryOptions, Scene, scene_by_name
+from stillmap.sim import OdometryOptions, Scene, scene_by_name
 
 POPULATED = "populated"
 STOPS = "everyone stops"

@@ -23,18 +23,12 @@ from prepared import grid_of
 from tables import Column, means_and_worst
 
 import stillmap
-from stillmap.changes import Change
-from stillmap.evaluation.changes import (
-    Beams,
-    Stay,
-    change_scores,
-    change_time_errors,
-    true_changes,
-)
-from stillmap.evaluation.map import moved
-from stillmap.evaluation.trajectory import absolute_errors, align
-from stillmap.simulation import Simulation, simulate
-from stillmap.simulation.things import standing
+from stillmap.eval.changes import Beams, Stay, change_scores, change_time_errors, true_changes
+from stillmap.eval.trajectory import absolute_errors, align
+from stillmap.mapping import Change
+from stillmap.results.reader import moved
+from stillmap.sim import Simulation, simulate
+from stillmap.sim.objects import standing
 
 _IN_TIME = 2.0  # s
 _BESIDE_DOOR = 0.2  # m

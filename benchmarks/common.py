@@ -18,10 +18,11 @@ from prepared import Prepared, grid_of
 from seeds import REPORTING, TUNING
 
 import stillmap
-from stillmap import em, options
-from stillmap.evaluation.labels import label_scores
-from stillmap.evaluation.map import map_scores
-from stillmap.evaluation.trajectory import absolute_errors, align
+from stillmap import em
+from stillmap.core import config
+from stillmap.eval.labels import label_scores
+from stillmap.eval.map import map_scores
+from stillmap.eval.trajectory import absolute_errors, align
 
 METHODS: dict[str, dict[str, Any]] = {
     "stillmap": {"estimator": "stillmap"},
@@ -113,8 +114,8 @@ def options_of(method: str, settings: Iterable[str]) -> stillmap.Options:
     Raises:
         InputError: an option that is not there or has another type.
     """
-    changes = options.merged(METHODS[method], *(options.parse_assignment(s) for s in settings))
-    return options.replaced(stillmap.Options(), {"threads": 1, **changes})
+    changes = config.merged(METHODS[method], *(config.parse_assignment(s) for s in settings))
+    return config.replaced(stillmap.Options(), {"threads": 1, **changes})
 
 
 def built(

@@ -26,9 +26,10 @@ from poses import ABSOLUTE, RELATIONS, pose_scores
 from tables import Column, Row, grouped, markdown
 
 import stillmap
-from stillmap import em, pipeline, slam
-from stillmap.evaluation.relations import relation_errors
-from stillmap.simulation import simulate
+from stillmap import em, slam
+from stillmap.eval.relations import relation_errors
+from stillmap.pipeline import em_loop
+from stillmap.sim import simulate
 
 Float = NDArray[np.float64]
 Weights = NDArray[np.float32]
@@ -160,7 +161,7 @@ def poses_with(recording: stillmap.Recording, options: stillmap.Options, e: Weig
 
 
 def _silent(what: str, done: int, total: int) -> None:
-    pipeline.silent(what, 0, done, total)
+    em_loop.silent(what, 0, done, total)
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -20,10 +20,10 @@ from scipy.ndimage import binary_dilation
 from tables import Row, grouped, markdown
 
 import stillmap
-from stillmap import se2
-from stillmap.evaluation.map import GHOST_DISTANCE, distance_to_walls
-from stillmap.evaluation.trajectory import align
-from stillmap.stages import Stages
+from stillmap.core import se2
+from stillmap.core.profiling import Stages
+from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
+from stillmap.eval.trajectory import align
 
 CASES = ["hall-15", "corridor-40", "office-10", "street-16", "warehouse-12"]
 _EDGES = (0, 1, 2, 3, 4, 5, 7, 10, 20, 50)  # of classes of clear looks

@@ -24,8 +24,8 @@ from prepared import Prepared, grid_of, prepare
 from tables import Column, Row, grouped, markdown
 
 import stillmap
-from stillmap.evaluation.map import map_scores
-from stillmap.evaluation.trajectory import align
+from stillmap.eval.map import map_scores
+from stillmap.eval.trajectory import align
 
 COLUMNS = (
     Column("translation", "relations, m: mean", ".4f"),

@@ -21,8 +21,8 @@ from sweep import in_fresh_process
 from tables import Column, Row, markdown
 
 import stillmap
-from stillmap.simulation import SCENES
-from stillmap.stages import peak_memory_bytes
+from stillmap.core.profiling import peak_memory_bytes
+from stillmap.sim import SCENES
 
 COLUMNS = (
     Column("metres", "m driven", ".0f"),

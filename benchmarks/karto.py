@@ -25,9 +25,9 @@ from common import timed
 from numpy.typing import NDArray
 
 import stillmap
-from stillmap import se2
-from stillmap.output.atomic import new_folder
-from stillmap.recording.tum import write_tum
+from stillmap.core import se2
+from stillmap.core.files import new_folder
+from stillmap.io.trajectory import write_tum
 
 Float = NDArray[np.float64]
 

@@ -20,8 +20,8 @@ from wanted import judged
 
 import stillmap
 from stillmap import _core
-from stillmap.em import dwell, looks
-from stillmap.simulation import Scene, scene_by_name, simulate
+from stillmap.em import observations, occupancy_hmm
+from stillmap.sim import Scene, scene_by_name, simulate
 
 RESOLUTION = 0.05  # m
 THREADS = (1, 2)
@@ -66,18 +66,18 @@ def kernels_of(recording: stillmap.Recording, poses: NDArray[np.float64]) -> dic
     scans = (recording.points, recording.hit, e, recording.offset, T_map_sensor)
     grid = _core.Grid2D(RESOLUTION)
     _core.add_beams(grid, *scans, 1)
-    surface = looks.surface_of(recording, T_map_sensor, RESOLUTION)
+    surface = observations.surface_of(recording, T_map_sensor, RESOLUTION)
 
     def elements(threads: int) -> object:
-        seen = looks._dwell(surface, options.dwell, looks.CLASSES)
-        looks._look(recording, poses, seen, options.dwell.look, threads)
+        seen = observations._dwell(surface, options.dwell, observations.CLASSES)
+        observations._look(recording, poses, seen, options.dwell.look, threads)
         return seen.likelihood()
 
     return {
         "M-step: sums of (10)": lambda n: _core.add_beams(_core.Grid2D(RESOLUTION), *scans, n),
         "likelihood (5)": lambda n: _core.log_likelihood(grid, *scans, options.prior, n),
         "E-step: element pass": elements,
-        "E-step": lambda n: dwell.e_step(recording, poses, RESOLUTION, options, n),
+        "E-step": lambda n: occupancy_hmm.e_step(recording, poses, RESOLUTION, options, n),
     }
 
 

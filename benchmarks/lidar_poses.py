@@ -30,16 +30,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from tables import markdown
 
-from stillmap import options, se2, se3
-from stillmap.evaluation.trajectory import absolute_errors, relative_errors
-from stillmap.pipeline import Options
-from stillmap.recording import spin
-from stillmap.recording.formats import read
-from stillmap.recording.model import Recording
-from stillmap.recording.options import ReadOptions
-from stillmap.simulation import load_truth
-from stillmap.simulation.truth import FOLDER
-from stillmap.slam import spinning
+from stillmap.core import config, se2, se3
+from stillmap.core.recording import Recording
+from stillmap.eval.trajectory import absolute_errors, relative_errors
+from stillmap.io.registry import read
+from stillmap.pipeline.options import Options
+from stillmap.preprocessing import laser_scan
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.sim import load_truth
+from stillmap.sim.truth import FOLDER
+from stillmap.slam import lidar_odometry
 
 Float = NDArray[np.float64]
 
@@ -73,7 +73,7 @@ def case_of(path: Path, odometry: bool, azimuth: bool) -> Case:
     if not odometry:
         recording = recording.without_odometry()
     if azimuth:
-        recording = spin.timed(recording, ReadOptions(spin="clockwise", spin_stamp=0.0))
+        recording = laser_scan.timed(recording, ReadOptions(spin="clockwise", spin_stamp=0.0))
     return Case(path.name, recording, truth, e)
 
 
@@ -109,7 +109,7 @@ def stillmap(
     """(T, 4, 4) poses at the stamps, and seconds per sweep."""
     started = time.perf_counter()
     slam = chosen.slam
-    found = spinning.build(case.recording, e, slam.spinning, slam.motion, _silent, threads)
+    found = lidar_odometry.build(case.recording, e, slam.spinning, slam.motion, _silent, threads)
     return found.poses, (time.perf_counter() - started) / case.recording.n_scans
 
 
@@ -179,8 +179,8 @@ def main() -> None:
     p.add_argument("--beam-times-from-azimuth", action="store_true")
     p.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", dest="settings")
     args = p.parse_args()
-    changes = options.merged(*(options.parse_assignment(text) for text in args.settings))
-    chosen = options.replaced(Options(), changes)
+    changes = config.merged(*(config.parse_assignment(text) for text in args.settings))
+    chosen = config.replaced(Options(), changes)
     lines = []
     for path in args.recordings:
         case = case_of(path, args.odometry, args.beam_times_from_azimuth)

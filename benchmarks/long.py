@@ -25,13 +25,13 @@ from numpy.typing import NDArray
 from sweep import in_fresh_process
 from tables import markdown
 
-from stillmap import se2
-from stillmap.recording import folder
-from stillmap.recording.model import Recording
-from stillmap.recording.spool import Column
-from stillmap.simulation import SCENES, laser, odometry, scene_by_name, sweep
-from stillmap.simulation.motion import Motion, move
-from stillmap.simulation.scene import Scene
+from stillmap.core import se2
+from stillmap.core.arrays import Column
+from stillmap.core.recording import Recording
+from stillmap.io import stillmap_folder
+from stillmap.sim import SCENES, laser, odometry, scene_by_name, sweep
+from stillmap.sim.dynamics import Motion, move
+from stillmap.sim.scene import Scene
 
 LASER = {"beams": 1081, "fov": math.radians(270.0), "max_range": 30.0}
 RATE = 40.0  # Hz
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def write(whole: Path, world: str, scans: int, seed: int, work: Path) -> None:
-    folder.write(simulated(world, scans, seed, work), whole)
+    stillmap_folder.write(simulated(world, scans, seed, work), whole)
 
 
 def simulated(world: str, scans: int, seed: int, work: Path) -> Recording:
@@ -142,7 +142,7 @@ def row_of(whole: Path, scans: int, settings: list[str], work: Path) -> dict[str
 
 
 def write_beginning(whole: Path, scans: int, beginning: Path) -> None:
-    folder.write(first_scans(folder.read(whole), scans), beginning)
+    stillmap_folder.write(first_scans(stillmap_folder.read(whole), scans), beginning)
 
 
 def first_scans(recording: Recording, scans: int) -> Recording:

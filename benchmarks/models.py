@@ -29,7 +29,7 @@ import numpy as np
 from common import Scores, add_arguments, add_seed_arguments, options_of, outcomes, seeds_of
 from tables import Column, means_and_worst
 
-from stillmap.simulation import (
+from stillmap.sim import (
     load_picture_truth,
     scene_by_name,
     simulate,
@@ -37,7 +37,7 @@ from stillmap.simulation import (
     write_rig,
     write_simulation,
 )
-from stillmap.simulation.photographs import SKY
+from stillmap.sim.camera import SKY
 
 _CAMERA: dict[str, Any] = {"enabled": True, "rate": 2.0}
 # a SICK's scan in half of its turn, and a joint that goes up and down in 4 s

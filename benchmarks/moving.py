@@ -21,12 +21,12 @@ from prepared import grid_of
 from tables import Column, means_and_worst
 
 import stillmap
-from stillmap import se2
-from stillmap.evaluation.objects import object_scores, rank_correlation, sightings, true_traffic
-from stillmap.evaluation.trajectory import align
-from stillmap.objects import traffic
-from stillmap.simulation import Simulation, simulate
-from stillmap.stages import Stages
+from stillmap.core import se2
+from stillmap.core.profiling import Stages
+from stillmap.eval.objects import object_scores, rank_correlation, sightings, true_traffic
+from stillmap.eval.trajectory import align
+from stillmap.sim import Simulation, simulate
+from stillmap.tracking import traffic
 
 COLUMNS = (
     Column("sightings", "seen > 3 s", ".0f"),

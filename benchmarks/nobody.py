@@ -16,7 +16,8 @@ import numpy as np
 from common import add_arguments, built, options_of, outcomes
 from tables import grouped, markdown
 
-from stillmap.recording import ReadOptions, read
+from stillmap.io import read
+from stillmap.preprocessing.options import ReadOptions
 
 WANTED = 0.03  # of the beams, at most
 

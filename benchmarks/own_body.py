@@ -14,9 +14,9 @@ import numpy as np
 from common import add_seed_arguments, seeds_of
 from tables import markdown
 
-from stillmap.recording import own_body_in_space
-from stillmap.simulation import scene_by_name, simulate
-from stillmap.simulation.lidar import ROBOT
+from stillmap.preprocessing import self_filter
+from stillmap.sim import scene_by_name, simulate
+from stillmap.sim.lidar import ROBOT
 
 _CAR = {"roof_length": 4.0, "roof_width": 1.7, "roof_below": 0.35}
 _CART = {"roof_length": 0.9, "roof_width": 0.7, "roof_below": 0.3, "z": 1.1, "low": -0.9}
@@ -54,7 +54,7 @@ def outcome(world: str, seed: int, lidar: dict[str, Any], robot: dict[str, Any])
     scene = scene_by_name(world, {"lidar": {"columns": _COLUMNS, **lidar}, "robot": robot})
     run = simulate(scene, seed)
     hit, own = run.recording.hit, run.truth.mover == ROBOT
-    gone = hit & ~own_body_in_space.left_out(run.recording).hit
+    gone = hit & ~self_filter.left_out(run.recording).hit
     counts = (hit & own, gone & own, hit & ~own, gone & ~own)
     return Outcome(*(int(np.count_nonzero(one)) for one in counts))
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from stillmap import se2
-from stillmap.evaluation.files import read_relations, seconds
-from stillmap.evaluation.relations import RelationErrors, relation_errors
-from stillmap.simulation import load_truth
-from stillmap.simulation.truth import FOLDER
+from stillmap.core import se2
+from stillmap.eval.readers import read_relations, seconds
+from stillmap.eval.relations import RelationErrors, relation_errors
+from stillmap.sim import load_truth
+from stillmap.sim.truth import FOLDER
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -17,10 +17,10 @@ from PIL import Image
 from scipy.ndimage import minimum_filter
 
 import stillmap
-from stillmap.recording import ReadOptions
-from stillmap.recording.images import Camera
-from stillmap.recording.pictures import read_picture
-from stillmap.texture import lens
+from stillmap.core import camera as camera_module
+from stillmap.core.camera import Camera
+from stillmap.io.images import read_picture
+from stillmap.preprocessing.options import ReadOptions
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -106,7 +106,7 @@ def _seen(
     T = T_map_base @ camera.T_base_camera
     columns, rows = np.meshgrid(np.arange(w), np.arange(h))
     pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
-    rays = lens.rays(camera, pixels) @ T[:3, :3].T
+    rays = camera_module.rays(camera, pixels) @ T[:3, :3].T
     # the ellipsoid is a ball of radius 1 where lengths are in its half axes
     ray, origin = rays / _HALF, (T[:3, 3] - centre) / _HALF
     a, b, c = np.sum(ray * ray, axis=1), ray @ origin, origin @ origin - 1.0
@@ -126,8 +126,8 @@ def _depth_of(camera: Camera, scene: NDArray[np.float32]) -> Float:
     assert camera.T_base_camera is not None
     R, t = camera.T_base_camera[:3, :3], camera.T_base_camera[:3, 3]
     points = (scene.astype(np.float64) - t) @ R
-    uv, ok = lens.project(camera, points)
-    ok &= lens.within(camera, uv)
+    uv, ok = camera_module.project(camera, points)
+    ok &= camera_module.within(camera, uv)
     column, row = np.round(uv[ok]).astype(np.intp).T
     out = np.full((camera.height, camera.width), np.inf)
     np.minimum.at(out, (row, column), points[ok, 2])

@@ -22,16 +22,16 @@ from numpy.typing import NDArray
 from tables import Column, markdown
 
 import stillmap
-from stillmap.errors import InputError
-from stillmap.evaluation import meshes
-from stillmap.evaluation.model_folders import RECORD, read_record
-from stillmap.evaluation.models import GREY, SAMPLES, Pictures, Record, shown
-from stillmap.recording import ReadOptions
-from stillmap.recording.images import Images
-from stillmap.surface.mesh import Mesh
-from stillmap.texture import lens
-from stillmap.texture.view import View
-from stillmap.texture.visible import visible
+from stillmap.core import camera as camera_module
+from stillmap.core.camera import Images
+from stillmap.core.errors import InputError
+from stillmap.eval import mesh_distance
+from stillmap.eval.mesh import GREY, SAMPLES, Pictures, Record, shown
+from stillmap.eval.model_readers import RECORD, read_record
+from stillmap.mesh.texture.views import View
+from stillmap.mesh.texture.visibility import visible
+from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.preprocessing.options import ReadOptions
 
 Mask = NDArray[np.bool_]
 
@@ -80,12 +80,12 @@ def scores(record: Record, images: Images, people: Mask) -> Scores:
     def distance(image: int) -> NDArray[np.float32]:
         raise NotImplementedError("how far pixels see is not looked up")
 
-    at = meshes.samples(record.vertices, record.faces, SAMPLES)
+    at = mesh_distance.samples(record.vertices, record.faces, SAMPLES)
     places = np.full((len(images), 4, 4), np.nan)
     shows = shown(record, at, Pictures(images.cameras, images.camera, places, mask, distance))
     painted, free = shows != GREY, _free(record, at, images, people)
     return Scores(
-        area=float(meshes.areas(record.vertices, record.faces).sum()),
+        area=float(mesh_distance.areas(record.vertices, record.faces).sum()),
         painted=_mean(painted),
         free=_mean(free),
         covered=_mean(painted[free]),
@@ -93,7 +93,7 @@ def scores(record: Record, images: Images, people: Mask) -> Scores:
     )
 
 
-def _free(record: Record, at: meshes.Samples, images: Images, people: Mask) -> Mask:
+def _free(record: Record, at: mesh_distance.Samples, images: Images, people: Mask) -> Mask:
     """(n,) whether a picture that sees a sample's whole face shows no person there."""
     out, mesh = np.zeros(len(at.face), bool), Mesh(record.vertices, record.faces)
     for image, T in enumerate(record.T_camera_model):
@@ -102,7 +102,7 @@ def _free(record: Record, at: meshes.Samples, images: Images, people: Mask) -> M
         camera = images.cameras[images.camera[image]]
         view = View(image, int(images.stamp_ns[image]), camera, T)
         some = np.flatnonzero(~out & visible(mesh, view).seen[at.face])
-        column, row = np.rint(lens.project(camera, view.in_camera(at.points[some]))[0].T)
+        column, row = np.rint(camera_module.project(camera, view.in_camera(at.points[some]))[0].T)
         out[some] = ~people[image][row.astype(np.intp), column.astype(np.intp)]
     return out
 

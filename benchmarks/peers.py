@@ -31,8 +31,8 @@ from real_logs import split
 from tables import markdown
 
 import stillmap
-from stillmap.evaluation.files import read_planar
-from stillmap.evaluation.relations import RelationErrors, relation_errors
+from stillmap.eval.readers import read_planar
+from stillmap.eval.relations import RelationErrors, relation_errors
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,8 @@ from common import add_arguments, built, options_of, outcomes
 from numpy.typing import NDArray
 from tables import grouped, markdown
 
-from stillmap.recording import Recording, read
+from stillmap.core.recording import Recording
+from stillmap.io import read
 
 WANTED_RECALL, WANTED_COVERED = 0.95, 0.9
 

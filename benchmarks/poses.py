@@ -38,11 +38,12 @@ from sweep import in_fresh_process
 from tables import Column, Row, grouped, markdown
 
 import stillmap
-from stillmap import se2, slam
-from stillmap.evaluation.trajectory import absolute_errors
-from stillmap.simulation import load_truth, simulate, write_simulation
-from stillmap.slam.keyframes import travel
-from stillmap.stages import peak_memory_bytes
+from stillmap import slam
+from stillmap.core import se2
+from stillmap.core.profiling import peak_memory_bytes
+from stillmap.eval.trajectory import absolute_errors
+from stillmap.sim import load_truth, simulate, write_simulation
+from stillmap.slam.local_map import travel
 
 Float = NDArray[np.float64]
 

@@ -6,11 +6,13 @@ import numpy as np
 from cases import Case
 from numpy.typing import NDArray
 
-from stillmap import _core, em, se2
-from stillmap.evaluation.map import Grid, MapScores, map_scores, wall_cells_of_map
-from stillmap.recording.model import Recording
-from stillmap.simulation import Simulation, laser, simulate
-from stillmap.simulation.things import faces_at
+from stillmap import _core, em
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.eval.map import MapScores, map_scores, wall_cells_of_map
+from stillmap.results.reader import Grid
+from stillmap.sim import Simulation, laser, simulate
+from stillmap.sim.objects import faces_at
 
 Float = NDArray[np.float64]
 

@@ -25,8 +25,8 @@ from prepared import prepare
 from scipy.stats import spearmanr
 from tables import BY_KEY, Row, grouped, markdown
 
-from stillmap import se2
-from stillmap.options import merged
+from stillmap.core import se2
+from stillmap.core.config import merged
 
 TRUTHS = ("ap", "f1", "brier", "log_loss", "walls", "ghosts", "ate")
 OWN_WORDS = ("held_out", "bound")

@@ -18,13 +18,15 @@ import numpy as np
 from tables import markdown
 
 from stillmap import build
-from stillmap.recording import ReadOptions, Recording, read, writers
-from stillmap.recording.ros.bags import open_bag
-from stillmap.recording.ros.choosing import chosen_topics
-from stillmap.recording.ros.gathered import content
-from stillmap.recording.ros.kinds import ENDINGS
-from stillmap.simulation import scene_by_name, simulate
-from stillmap.stages import Stages
+from stillmap.core.profiling import Stages
+from stillmap.core.recording import Recording
+from stillmap.io import read, writers
+from stillmap.io.ros.bag import open_bag
+from stillmap.io.ros.bag_types import ENDINGS
+from stillmap.io.ros.collect import content
+from stillmap.io.ros.topics import chosen_topics
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.sim import scene_by_name, simulate
 
 FORMS = (".bag", ".db3", ".mcap", ".log", ".log.gz", "")
 WANTED = 40_000  # scans of 1081 beams per second

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from tables import Column, means_and_worst
 
 import stillmap
-from stillmap import options
-from stillmap.evaluation.labels import label_scores
-from stillmap.scene.rig import Flat, Tilting, built_in_3d, evidence_of
-from stillmap.simulation import RigSimulation, scene_by_name, simulate_rig
+from stillmap.core import config
+from stillmap.eval.labels import label_scores
+from stillmap.rig.build import Flat, Tilting, built_in_3d, evidence_of
+from stillmap.sim import RigSimulation, scene_by_name, simulate_rig
 
 WORLDS: dict[str, dict[str, Any]] = {
     "hall": {"crowd": {"people": 30}},
@@ -95,14 +95,14 @@ def rows(job: Job) -> dict[str, Scores]:
 
 def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, Tilting]]:
     """A rig, P(static) of tilting beams by their own evidence alone, and with the flat laser."""
-    scene = scene_by_name(job.world, options.merged(WORLDS[job.world], _COMMON))
+    scene = scene_by_name(job.world, config.merged(WORLDS[job.world], _COMMON))
     rig = simulate_rig(scene, job.seed)
     chosen = options_of("stillmap", job.settings)
     flat = Flat.of(stillmap.build(rig.horizontal.recording, chosen))
     tilting = rig.tilting.recording
     built = {
         way: built_in_3d(
-            flat, tilting, options.replaced(chosen, {"rig": {"evidence": way == WAYS[1]}})
+            flat, tilting, config.replaced(chosen, {"rig": {"evidence": way == WAYS[1]}})
         )
         for way in WAYS[:2]
     }

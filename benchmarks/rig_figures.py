@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.objects import MovingObject
-from stillmap.scene.rig import Tilting
-from stillmap.simulation import RigSimulation
+from stillmap.rig.build import Tilting
+from stillmap.sim import RigSimulation
+from stillmap.tracking import MovingObject
 
 Float = NDArray[np.float64]
 

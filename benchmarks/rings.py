@@ -30,11 +30,12 @@ from pairs import timed_poses
 from real_logs import split, stillmap
 from tables import markdown
 
-from stillmap import recording, se2
-from stillmap.errors import InputError
-from stillmap.evaluation.files import read_planar
-from stillmap.evaluation.trajectory import absolute_errors
-from stillmap.recording import Recording
+from stillmap import io
+from stillmap.core import se2
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.eval.readers import read_planar
+from stillmap.eval.trajectory import absolute_errors
 
 Float = NDArray[np.float64]
 
@@ -58,7 +59,7 @@ class Ring:
         elevation: rad, where the ring looks.
     """
 
-    recording: Recording
+    io: Recording
     label: NDArray[np.int8]
     reference: Float | None
     elevation: float
@@ -193,7 +194,7 @@ _HEADER = (
 
 def row(ring: Ring, out: Path, flags: list[str]) -> list[str]:
     """What `stillmap map` makes of a ring, in a folder of its own."""
-    recording.write(ring.recording, out / "recording", overwrite=True)
+    io.write(ring.recording, out / "recording", overwrite=True)
     arguments = ["map", str(out / "recording"), "-o", str(out / "map"), "--no-odometry"]
     _, cpu = stillmap(*arguments, "--overwrite", "--quiet", *flags)
     run = json.loads((out / "map" / "run.json").read_text())

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 import stillmap
 from stillmap import slam
-from stillmap.simulation import scene_by_name, simulate, write_simulation
-from stillmap.simulation.truth import Truth, load_truth
+from stillmap.sim import scene_by_name, simulate, write_simulation
+from stillmap.sim.truth import Truth, load_truth
 
 Float = NDArray[np.float64]
 

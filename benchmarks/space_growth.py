@@ -30,10 +30,10 @@ from sweep import in_fresh_process
 from tables import markdown
 
 import stillmap
-from stillmap import options
-from stillmap.recording import folder
-from stillmap.simulation import SCENES, load_truth, scene_by_name, simulate, write_simulation
-from stillmap.stages import Stages, peak_memory_bytes
+from stillmap.core import config
+from stillmap.core.profiling import Stages, peak_memory_bytes
+from stillmap.io import stillmap_folder
+from stillmap.sim import SCENES, load_truth, scene_by_name, simulate, write_simulation
 
 Float = NDArray[np.float64]
 
@@ -76,8 +76,8 @@ def main() -> None:
 
 
 def options_of(settings: Sequence[str], threads: int) -> stillmap.Options:
-    changes = options.merged(*(options.parse_assignment(text) for text in settings))
-    return options.replaced(stillmap.Options(), {"threads": threads, **changes})
+    changes = config.merged(*(config.parse_assignment(text) for text in settings))
+    return config.replaced(stillmap.Options(), {"threads": threads, **changes})
 
 
 def write(whole: Path, world: str, changes: dict[str, Any], seed: int) -> None:
@@ -86,7 +86,7 @@ def write(whole: Path, world: str, changes: dict[str, Any], seed: int) -> None:
 
 def write_beginning(whole: Path, sweeps: int, first: Path) -> dict[str, float]:
     """Writes the first sweeps and their true poses; how far the robot went, how much it saw."""
-    recording, poses = folder.read(whole), load_truth(whole).T_world_base[:sweeps]
+    recording, poses = stillmap_folder.read(whole), load_truth(whole).T_world_base[:sweeps]
     beams = slice(0, int(recording.offset[sweeps]))
     times = recording.beam_time
     part = dataclasses.replace(
@@ -99,7 +99,7 @@ def write_beginning(whole: Path, sweeps: int, first: Path) -> dict[str, float]:
         T_odom_base=None,
         beam_time=None if times is None else times[beams],
     )
-    folder.write(part, first)
+    stillmap_folder.write(part, first)
     np.save(first / _POSES, poses)
     return size_of(part, poses)
 
@@ -122,7 +122,7 @@ def cost_of(
     first: Path, chosen: stillmap.Options, out: Path, with_models: bool = False
 ) -> dict[str, Any]:
     """Seconds per sweep and peak memory of the whole job, and of its stages."""
-    recording, poses = folder.read(first), np.load(first / _POSES)
+    recording, poses = stillmap_folder.read(first), np.load(first / _POSES)
     sweeps = recording.n_scans
     stages, wall, cpu = Stages(), time.perf_counter(), time.process_time()
     loaded = peak_memory_bytes()

@@ -16,8 +16,8 @@ import numpy as np
 from common import Scores
 
 import stillmap
-from stillmap import options
-from stillmap.stages import Stages, peak_memory_bytes
+from stillmap.core import config
+from stillmap.core.profiling import Stages, peak_memory_bytes
 
 OURS: dict[str, dict[str, Any]] = {
     "stillmap": {},
@@ -38,10 +38,10 @@ _WORKER = Path(__file__).with_name("space_peer_worker.py")
 
 def of_ours(work: Path, method: str, settings: tuple[str, ...], threads: int, out: Path) -> Scores:
     """What stillmap takes from the recording on the disk to the whole result, nothing written."""
-    changes = options.merged(
-        OURS.get(method, {}), *(options.parse_assignment(text) for text in settings)
+    changes = config.merged(
+        OURS.get(method, {}), *(config.parse_assignment(text) for text in settings)
     )
-    chosen = options.replaced(stillmap.Options(), {"threads": threads, **changes})
+    chosen = config.replaced(stillmap.Options(), {"threads": threads, **changes})
     poses = None if method == ESTIMATED else np.load(work / "poses.npy")
     recording = stillmap.read(json.loads((work / "case.json").read_text())["source"], chosen.read)
     stages, wall, cpu = Stages(), time.perf_counter(), time.process_time()

@@ -7,7 +7,7 @@ from common import Scores
 from numpy.typing import NDArray
 from space_cases import LASTING, NOBODY, Known, known_of_given
 
-from stillmap.evaluation.labels import label_scores
+from stillmap.eval.labels import label_scores
 
 _NAN = float("nan")
 

@@ -30,9 +30,9 @@ from wanted import judged
 
 import stillmap
 from stillmap import _core, em
-from stillmap.recording import folder
-from stillmap.simulation import simulate
-from stillmap.stages import peak_memory_bytes
+from stillmap.core.profiling import peak_memory_bytes
+from stillmap.io import stillmap_folder
+from stillmap.sim import simulate
 
 _POSES = "poses.npy"
 
@@ -77,7 +77,7 @@ def write(work: Path, scans: int, beams: int) -> int:
     """Writes a recording folder and the true poses into `work`; cells that the beams cross."""
     sim = simulate(wide_hall(scans, beams), SEED)
     recording, poses = sim.recording, sim.truth.T_world_base
-    folder.write(recording, work / "recording")
+    stillmap_folder.write(recording, work / "recording")
     np.save(work / _POSES, poses)
     return cells_crossed(recording.points, recording.offset, recording.T_map_sensor(poses))
 

@@ -1,6 +1,11 @@
+"""Puts the NumPy twins of the kernels (tests/reference) where every test can import them."""
+
+import sys
 from pathlib import Path
 
 import pytest
+
+sys.path.append(str(Path(__file__).resolve().parent))
 
 
 @pytest.fixture(scope="session")

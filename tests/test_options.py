@@ -10,8 +10,7 @@ from typing import Any, Literal
 
 import pytest
 
-from stillmap.errors import InputError
-from stillmap.options import (
+from stillmap.core.config import (
     field_with_doc,
     load_toml,
     merged,
@@ -20,7 +19,8 @@ from stillmap.options import (
     to_dict,
     to_toml,
 )
-from stillmap.pipeline import Options
+from stillmap.core.errors import InputError
+from stillmap.pipeline.options import Options
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.points import finite, first_of_each
+from stillmap.core.arrays import finite, first_of_each
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from stillmap import se2
+from stillmap.core import se2
 
 angles = st.floats(-50.0, 50.0)
 lengths = st.floats(-1e3, 1e3)

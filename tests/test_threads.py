@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg  # noqa: F401  (its BLAS is loaded before threads are counted)
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from stillmap.threads import in_order, one_blas_thread
+from stillmap.core.parallel import in_order, one_blas_thread
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

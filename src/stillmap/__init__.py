@@ -10,12 +10,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from stillmap.errors import InputError
-    from stillmap.models.building import Models
-    from stillmap.models.result import models_of
-    from stillmap.pipeline import Iteration, Options, iterate
-    from stillmap.recording import Recording, read
-    from stillmap.result import Result, build
+    from stillmap.core.errors import InputError
+    from stillmap.core.recording import Recording
+    from stillmap.io import read
+    from stillmap.mesh.build import Models
+    from stillmap.pipeline.em_loop import Iteration, iterate
+    from stillmap.pipeline.models import models_of
+    from stillmap.pipeline.options import Options
+    from stillmap.pipeline.result import Result, build
 
     __version__: str
 
@@ -35,18 +37,33 @@ __all__ = [
 
 # loaded when they are first used: `stillmap --help` has no use for them, and they take long
 _MODULES = {
-    "InputError": "errors",
-    "Iteration": "pipeline",
-    "Models": "models.building",
-    "Options": "pipeline",
-    "Recording": "recording",
-    "Result": "result",
-    "build": "result",
-    "iterate": "pipeline",
-    "models_of": "models.result",
-    "read": "recording",
+    "InputError": "core.errors",
+    "Iteration": "pipeline.em_loop",
+    "Models": "mesh.build",
+    "Options": "pipeline.options",
+    "Recording": "core.recording",
+    "Result": "pipeline.result",
+    "build": "pipeline.result",
+    "iterate": "pipeline.em_loop",
+    "models_of": "pipeline.models",
+    "read": "io",
 }
-_ROOMS = ("changes", "em", "evaluation", "objects", "output", "recording", "simulation", "slam")
+_ROOMS = (
+    "core",
+    "em",
+    "eval",
+    "io",
+    "mapping",
+    "mesh",
+    "pipeline",
+    "preprocessing",
+    "results",
+    "rig",
+    "sim",
+    "slam",
+    "tracking",
+    "viewer",
+)
 
 
 def __getattr__(name: str) -> Any:

@@ -2,6 +2,6 @@
 
 import sys
 
-from stillmap.cli import main
+from stillmap.cli.main import main
 
 sys.exit(main())

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import reference
 
-from stillmap import _core, reference
-from stillmap.em.beside import arguments, with_those_beside
+from stillmap import _core
 from stillmap.em.options import BesideOptions
+from stillmap.em.spatial_prior import arguments, with_those_beside
 
 BESIDE = arguments(BesideOptions())
 

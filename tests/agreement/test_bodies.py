@@ -4,8 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
+import reference
 
-from stillmap import _core, reference
+from stillmap import _core
 
 IDENTITY = np.eye(4)[None]
 

@@ -5,10 +5,10 @@ from math import inf, log
 
 import numpy as np
 import pytest
+from reference.dwell import HIT, chain_log_likelihood
 
 from stillmap import _core
-from stillmap.em.looks import Classes
-from stillmap.reference.dwell import HIT, chain_log_likelihood
+from stillmap.em.observations import Classes
 
 CLASSES = Classes(views_occupied=(0.65,)).grid()
 

@@ -6,10 +6,11 @@ from math import inf
 
 import numpy as np
 import pytest
+import reference
+from reference.dwell import HIT, SURE
 
-from stillmap import _core, reference
-from stillmap.em.looks import Classes
-from stillmap.reference.dwell import HIT, SURE
+from stillmap import _core
+from stillmap.em.observations import Classes
 
 CLASSES = Classes(views_occupied=(0.65,)).grid()
 

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import reference
+from reference.field import moved
 
-from stillmap import _core, reference
-from stillmap.reference.field import moved
+from stillmap import _core
 
 FLOOR, UNKNOWN = 0.02, 0.3
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+import reference
 
-from stillmap import _core, reference
+from stillmap import _core
 
 OPTIONS = {"gap": 1.5, "tolerance": 0.1, "growth": 3.0}
 LOOSE = {"gap": 0.6, "tolerance": 0.15, "growth": 1.6}  # for random points

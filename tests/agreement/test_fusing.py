@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+import reference
 
-from stillmap import _core, reference
+from stillmap import _core
 
 VOXEL, REACH = 0.1, {"before": 0.3, "behind": 0.2}
 

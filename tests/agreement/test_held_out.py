@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+import reference
 
-from stillmap import _core, reference
+from stillmap import _core
 
 MODEL = {"stopping": 4.0, "noise": 0.08, "late": 0.4, "delay": 0.2, "outliers": 0.02}
 

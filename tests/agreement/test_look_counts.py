@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import reference
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stillmap import _core, reference
+from stillmap import _core
 
 KERNELS = (_core, reference)
 

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import reference
+from reference.near_faces import place_on
 
-from stillmap import _core, reference
-from stillmap.reference.near_faces import place_on
+from stillmap import _core
 
 TRIANGLE = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
 UP = np.array([0.0, 0.0, 1.0])

@@ -4,8 +4,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import reference
 
-from stillmap import _core, reference
+from stillmap import _core
 
 
 @pytest.fixture(scope="module", params=[(2, 0.15, 120), (3, 0.4, 160)], ids=["2D", "3D"])

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import reference
+from reference.field import moved
 
-from stillmap import _core, reference
-from stillmap.reference.field import moved
+from stillmap import _core
 
 FLOOR, GAIN = 0.05, 0.2
 # a step of the raster more or less for two beams: rounding may fall either way

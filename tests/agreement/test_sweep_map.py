@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import reference
 
-from stillmap import _core, reference, se3
+from stillmap import _core
+from stillmap.core import se3
 
 PLANE = {"least": 4.0, "flat": 0.2, "wide": 0.02}
 FIT = {**PLANE, "sigma": 0.03, "kernel": 3.0}

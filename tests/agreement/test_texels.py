@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+import reference
 
-from stillmap import _core, reference
+from stillmap import _core
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from stillmap import _core, se2
+from stillmap import _core
+from stillmap.core import se2
 
 MARGIN = {"margin": 0.5, "occupied": 0.4}
 

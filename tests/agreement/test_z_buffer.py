@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+import reference
 
-from stillmap import _core, reference
+from stillmap import _core
 
 K = np.array([[60.0, 0.7, 31.3], [0.0, 55.0, 22.8], [0.0, 0.0, 1.0]])
 

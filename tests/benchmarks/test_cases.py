@@ -14,7 +14,7 @@ from cases import (
     scaled_odometry,
 )
 
-from stillmap.simulation import OdometryOptions
+from stillmap.sim import OdometryOptions
 
 
 def test_names_are_unique_and_every_world_can_be_built() -> None:

@@ -9,9 +9,9 @@ from changes import COLUMNS, _of_things, _scored, beams_of, scores_of, stays_of
 from common import Run
 from tables import means_and_worst
 
-from stillmap.evaluation.changes import true_changes
-from stillmap.se2 import inverse, matrix
-from stillmap.simulation import Simulation, scene_by_name, simulate
+from stillmap.core.se2 import inverse, matrix
+from stillmap.eval.changes import true_changes
+from stillmap.sim import Simulation, scene_by_name, simulate
 
 SHORT = {"robot": {"scans": 1000}}
 

@@ -8,9 +8,10 @@ from common import options_of
 from crowds import Job, draw, poses_by, poses_with, rows_of, table
 
 import stillmap
-from stillmap import em, pipeline
-from stillmap.simulation import scene_by_name, simulate, write_simulation
-from stillmap.simulation.simulator import Simulation
+from stillmap import em
+from stillmap.pipeline import em_loop
+from stillmap.sim import scene_by_name, simulate, write_simulation
+from stillmap.sim.simulator import Simulation
 
 _THREE = options_of("stillmap", ["em.max_iterations=3"])
 
@@ -39,7 +40,7 @@ def test_m_steps_are_those_of_the_loop_when_the_e_step_finds_nothing(
     by_prior = poses_by("prior", recording, _THREE, None)
     weighted = poses_by("e", recording, _THREE, None)
     np.testing.assert_array_equal(weighted, last_of(recording))
-    monkeypatch.setattr(pipeline.em, "e_step", same_as_ever)
+    monkeypatch.setattr(em_loop.em, "e_step", same_as_ever)
     np.testing.assert_array_equal(by_prior, last_of(recording))
     assert not np.array_equal(by_prior, weighted)
 

@@ -2,7 +2,7 @@ import numpy as np
 from cases import Case
 from filtered import COLUMNS, Job, _rows, table, without_dynamic
 
-from stillmap.simulation import simulate
+from stillmap.sim import simulate
 
 SHORT = Case("short", "populated", "hall", {"robot": {"scans": 60}, "crowd": {"people": 12}})
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap import se2
-from stillmap.simulation import scene_by_name, simulate
+from stillmap.core import se2
+from stillmap.sim import scene_by_name, simulate
 
 # answers with the odometry, ten metres aside, and keeps what it was given
 STAND_IN = {

@@ -11,7 +11,7 @@ from kernels import (
 )
 
 from stillmap import em
-from stillmap.simulation import simulate
+from stillmap.sim import simulate
 
 
 def cells_of(table: str) -> dict[str, list[str]]:

@@ -4,7 +4,7 @@ import lidar_poses
 import numpy as np
 import pytest
 
-from stillmap import se3
+from stillmap.core import se3
 
 
 def test_later_goes_on_as_to_the_next_pose():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from models import COLUMNS, WORLDS, flat, walkers
 
-from stillmap.simulation import scene_by_name, simulate, write_simulation
+from stillmap.sim import scene_by_name, simulate, write_simulation
 
 
 def test_scores_in_percent_and_centimetres():

@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 from nobody import Job, found, table
 
-from stillmap.recording import writers
-from stillmap.simulation import scene_by_name, simulate
+from stillmap.io import writers
+from stillmap.sim import scene_by_name, simulate
 
 
 @pytest.fixture(scope="module")

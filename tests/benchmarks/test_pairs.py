@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from pairs import errors_of, known_relations, name_of, near_pairs, relations_beside, relations_of
 
-from stillmap import se2
-from stillmap.evaluation.files import read_relations
-from stillmap.simulation import scene_by_name, simulate, write_simulation
+from stillmap.core import se2
+from stillmap.eval.readers import read_relations
+from stillmap.sim import scene_by_name, simulate, write_simulation
 
 
 def line(T: int) -> np.ndarray:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from pasted import _HALF, _seen
 
-from stillmap.recording.clouds.rgbd import T_BASE_CAMERA
-from stillmap.recording.images import Camera
+from stillmap.core.camera import Camera
+from stillmap.io.rgbd import T_BASE_CAMERA
 
 K = np.array([[100.0, 0.0, 31.5], [0.0, 100.0, 23.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera("color", 64, 48, K, "", np.zeros(0), T_BASE_CAMERA)

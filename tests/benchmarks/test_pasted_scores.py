@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from pasted_scores import scores
 
-from stillmap.evaluation.models import Record
-from stillmap.recording.clouds.rgbd import T_BASE_CAMERA
-from stillmap.recording.images import Camera, Images
+from stillmap.core.camera import Camera, Images
+from stillmap.eval.mesh import Record
+from stillmap.io.rgbd import T_BASE_CAMERA
 
 K = np.array([[100.0, 0.0, 49.5], [0.0, 100.0, 49.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera("color", 100, 100, K, "", np.zeros(0), T_BASE_CAMERA)

@@ -6,8 +6,8 @@ from karto import KartoError
 from pairs import timed_poses
 from peers import Found, methods, table
 
-from stillmap import se2
-from stillmap.simulation import scene_by_name, simulate, write_simulation
+from stillmap.core import se2
+from stillmap.sim import scene_by_name, simulate, write_simulation
 
 
 @pytest.fixture(scope="module")

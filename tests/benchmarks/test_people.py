@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from people import recording_of
 
-from stillmap.recording import Recording, writers
+from stillmap.core.recording import Recording
+from stillmap.io import writers
 
 
 @pytest.fixture

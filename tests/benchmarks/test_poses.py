@@ -19,7 +19,7 @@ from poses import (
     variants,
 )
 
-from stillmap import se2
+from stillmap.core import se2
 from stillmap.slam import Closure
 
 

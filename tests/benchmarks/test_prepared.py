@@ -8,7 +8,7 @@ from common import scores
 from prepared import Prepared, counts, prepare, without_people
 
 from stillmap import em
-from stillmap.recording.model import Recording
+from stillmap.core.recording import Recording
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 import numpy as np
 from quality import TRUTHS, VARIANTS, correlations, jittered
 
-from stillmap import se2
+from stillmap.core import se2
 
 
 def test_there_are_enough_runs() -> None:

@@ -7,10 +7,10 @@ import rings
 from numpy.typing import NDArray
 from rings import BEAMS, NO_RETURN, label_columns, pose_columns, ring_of, row
 
-from stillmap import se2
-from stillmap.errors import InputError
-from stillmap.simulation.laser import Movers, cast
-from stillmap.simulation.walls import box
+from stillmap.core import se2
+from stillmap.core.errors import InputError
+from stillmap.sim.laser import Movers, cast
+from stillmap.sim.walls import box
 
 Float = NDArray[np.float64]
 

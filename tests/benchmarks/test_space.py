@@ -12,7 +12,7 @@ import space_methods
 from space_cases import Case, Known
 from space_scores import accuracies, scores
 
-from stillmap.simulation.truth import Truth
+from stillmap.sim.truth import Truth
 
 NAN = float("nan")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import space_growth
 
-from stillmap.recording import folder
+from stillmap.io import stillmap_folder
 
 
 def test_beginnings_of_one_recording(tmp_path: Path) -> None:
@@ -14,7 +14,7 @@ def test_beginnings_of_one_recording(tmp_path: Path) -> None:
     changes = {"lidar": {"channels": 16, "columns": 60}, "robot": {"scans": 6}}
     space_growth.write(whole, "street", changes, 0)
     sizes = {n: space_growth.write_beginning(whole, n, tmp_path / f"first-{n}") for n in (4, 6)}
-    first = folder.read(tmp_path / "first-4")
+    first = stillmap_folder.read(tmp_path / "first-4")
     assert (first.n_scans, first.n_beams) == (4, 4 * 16 * 60)
     assert first.beam_time is not None
     poses = np.load(tmp_path / "first-4" / "poses.npy")

@@ -5,7 +5,7 @@ import pytest
 from sweep import FIGURES, against_wanted, in_fresh_process, speeds, sweep, write
 
 import stillmap
-from stillmap.stages import peak_memory_bytes
+from stillmap.core.profiling import peak_memory_bytes
 
 
 @pytest.fixture(scope="module")

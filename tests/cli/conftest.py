@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillmap.cli import main
-from stillmap.simulation import (
+from stillmap.cli.main import main
+from stillmap.sim import (
     CrowdOptions,
     LaserOptions,
     RobotOptions,
@@ -20,7 +20,7 @@ from stillmap.simulation import (
     simulate,
     write_simulation,
 )
-from stillmap.simulation.walls import box
+from stillmap.sim.walls import box
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from stillmap.cli import main
+from stillmap.cli.main import main
 
 BASH = """
 eval "$(stillmap completion bash)"

@@ -6,9 +6,9 @@ import tomllib
 
 import pytest
 
-from stillmap.cli import main
-from stillmap.options import described, names, to_dict
-from stillmap.pipeline import Options
+from stillmap.cli.main import main
+from stillmap.core.config import described, names, to_dict
+from stillmap.pipeline.options import Options
 
 
 def config(capsys, *words: object) -> str:

@@ -10,8 +10,8 @@ from refusals import refused
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from stillmap.recording import folder, read
-from stillmap.recording.tum import read_tum
+from stillmap.io import read, stillmap_folder
+from stillmap.io.trajectory import read_tum
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_to_a_log(call, room, tmp_path, nothing_left, name):
     done = call("convert", room, "-o", tmp_path / name)
     assert (done.returncode, done.stdout) == (0, "")
     assert "40 scans, 4800 beams as a CARMEN log" in done.stderr
-    before, after = folder.read(room), read(tmp_path / name)
+    before, after = stillmap_folder.read(room), read(tmp_path / name)
     np.testing.assert_array_equal(before.hit, after.hit)
     np.testing.assert_allclose(after.points[after.hit], before.points[before.hit], atol=6e-5)
     nothing_left(name)
@@ -51,7 +51,7 @@ def test_to_a_bag(call, room, tmp_path, nothing_left, name):
 def test_to_a_recording_folder(call, room, tmp_path):
     for source, name in ((room, "a.log"), (tmp_path / "a.log", "b")):
         assert call("convert", source, "-o", tmp_path / name).returncode == 0
-    before, after = read(tmp_path / "a.log"), folder.read(tmp_path / "b")
+    before, after = read(tmp_path / "a.log"), stillmap_folder.read(tmp_path / "b")
     for name in ("stamp_ns", "points", "hit", "T_odom_base", "T_base_sensor"):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
     assert after.source == before.source
@@ -59,9 +59,9 @@ def test_to_a_recording_folder(call, room, tmp_path):
 
 def test_flags_of_reading_count(call, room, tmp_path):
     assert call("convert", room, "-o", tmp_path / "a", "--max-range", "3").returncode == 0
-    length = np.linalg.norm(folder.read(tmp_path / "a").points, axis=1)
+    length = np.linalg.norm(stillmap_folder.read(tmp_path / "a").points, axis=1)
     assert length.max() <= 3.00001
-    assert np.linalg.norm(folder.read(room).points, axis=1).max() > 5
+    assert np.linalg.norm(stillmap_folder.read(room).points, axis=1).max() > 5
 
 
 def test_a_format_by_its_name(call, room, tmp_path):
@@ -155,7 +155,7 @@ def test_a_result_as_a_table(call, room, mapped, tmp_path):
     assert call("convert", mapped, "-o", tmp_path / "a.parquet").returncode == 0
     table = parquet.read_table(tmp_path / "a.parquet")
     columns = {name: table[name].to_numpy() for name in table.column_names}
-    recording, (_, T) = folder.read(room), read_tum(mapped / "trajectory.tum")
+    recording, (_, T) = stillmap_folder.read(room), read_tum(mapped / "trajectory.tum")
     poses = T[:, [0, 1, 3]][:, :, [0, 1, 3]]
     scan = np.repeat(np.arange(40), 120)
     np.testing.assert_array_equal(columns["scan"], scan)
@@ -258,8 +258,8 @@ def test_damaged_objects(call, mapped, tmp_path, text, words):
 
 def test_the_help_knows_every_format():
     from stillmap.cli import convert
-    from stillmap.export.cloud_files import FORMATS
-    from stillmap.recording.writers import WRITERS
+    from stillmap.io.writers import WRITERS
+    from stillmap.results.export.point_cloud_files import FORMATS
 
     assert [end for form in FORMATS for end in form.endings] == list(convert.CLOUDS)
 

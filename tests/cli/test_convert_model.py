@@ -6,10 +6,10 @@ import os
 import numpy as np
 import pytest
 
-from stillmap.output.meshes import write_glb
-from stillmap.surface.mesh import Mesh
-from stillmap.texture.options import TextureOptions
-from stillmap.texture.textured import Textured
+from stillmap.mesh.options import TextureOptions
+from stillmap.mesh.texture.atlas import Textured
+from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.results.gltf import write_glb
 
 trimesh = pytest.importorskip("trimesh")
 

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stillmap import se2
-from stillmap.cli import main
-from stillmap.evaluation.map import Grid
-from stillmap.output.map_npz import write_map_npz
-from stillmap.recording import folder
-from stillmap.recording.tum import write_tum
-from stillmap.simulation import (
+from stillmap.cli.main import main
+from stillmap.core import se2
+from stillmap.io import stillmap_folder
+from stillmap.io.trajectory import write_tum
+from stillmap.results.map_npz import write_map_npz
+from stillmap.results.reader import Grid
+from stillmap.sim import (
     CrowdOptions,
     LaserOptions,
     RobotOptions,
@@ -23,7 +23,7 @@ from stillmap.simulation import (
     write_rig,
     write_simulation,
 )
-from stillmap.simulation.walls import box
+from stillmap.sim.walls import box
 
 RESOLUTION = 0.1
 SIZE = 140  # cells: the room from anywhere in it
@@ -52,7 +52,7 @@ def result(simulated, tmp_path) -> Path:
     """A result as good as the truth allows, in the frame of the first pose."""
     out = tmp_path / "result"
     (out / "beams").mkdir(parents=True)
-    recording = folder.read(simulated)
+    recording = stillmap_folder.read(simulated)
     truth = simulated / "truth"
     T_world_base, static = np.load(truth / "T_world_base.npy"), np.load(truth / "static.npy")
     T_map_base = se2.inverse(T_world_base[0]) @ T_world_base
@@ -169,7 +169,7 @@ def test_trajectories_without_a_common_time(capsys, texts, tmp_path):
 
 
 def test_labels(capsys, simulated, result):
-    recording = folder.read(simulated)
+    recording = stillmap_folder.read(simulated)
     s = scores(capsys, "labels", result, simulated)
     static = np.load(simulated / "truth/static.npy")
     assert s["hits"] == recording.hit.sum()
@@ -201,7 +201,7 @@ def test_map(capsys, simulated, result):
 
 
 def test_map_with_people_in_it_and_another_as_reference(capsys, simulated, result, tmp_path):
-    recording = folder.read(simulated)
+    recording = stillmap_folder.read(simulated)
     T_world_base = np.load(simulated / "truth/T_world_base.npy")
     other = tmp_path / "raw"
     other.mkdir()
@@ -218,7 +218,7 @@ def test_map_with_people_in_it_and_another_as_reference(capsys, simulated, resul
 
 
 def test_what_was_brought_and_is_still_there_is_no_ghost(capsys, simulated, tmp_path):
-    recording, there = folder.read(simulated), tmp_path / "there"
+    recording, there = stillmap_folder.read(simulated), tmp_path / "there"
     shutil.copytree(simulated, there)
     T_world_base = np.load(there / "truth/T_world_base.npy")
     out = tmp_path / "raw"
@@ -360,7 +360,7 @@ def rig(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize("part", ["horizontal", "tilting"])
 def test_of_a_rig_the_labels_say_whose_truth_counts(capsys, rig, tmp_path, part):
-    out, recording = tmp_path / "out", folder.read(rig / part)
+    out, recording = tmp_path / "out", stillmap_folder.read(rig / part)
     (out / "beams").mkdir(parents=True)
     p_static = np.where(np.load(rig / part / "truth/static.npy"), 0.9, 0.2).astype(np.float32)
     np.save(out / "beams/p_static.npy", p_static)
@@ -373,7 +373,7 @@ def test_of_a_rig_the_labels_say_whose_truth_counts(capsys, rig, tmp_path, part)
 
 
 def test_of_a_rig_the_flat_laser_made_the_map(capsys, rig, tmp_path):
-    out, recording = tmp_path / "out", folder.read(rig / "horizontal")
+    out, recording = tmp_path / "out", stillmap_folder.read(rig / "horizontal")
     out.mkdir()
     T_world_base = np.load(rig / "horizontal/truth/T_world_base.npy")
     T_map_base = se2.inverse(T_world_base[0]) @ T_world_base

@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from stillmap import se2
-from stillmap.cli import main
-from stillmap.evaluation import models
-from stillmap.recording import read
-from stillmap.recording.tum import write_tum
-from stillmap.simulation import (
+from stillmap.cli.main import main
+from stillmap.core import se2
+from stillmap.eval import mesh as mesh_module
+from stillmap.io import read
+from stillmap.io.trajectory import write_tum
+from stillmap.sim import (
     load_picture_truth,
     load_truth,
     scene_by_name,
@@ -38,7 +38,7 @@ SIZE = 64  # texels
 def _fewer_points():
     """A floor of a few square metres needs no more."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(models, "SAMPLES", 20_000)
+        patch.setattr(mesh_module, "SAMPLES", 20_000)
         yield
 
 

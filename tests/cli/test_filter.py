@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
-from stillmap.recording import folder, read
+from stillmap.io import read, stillmap_folder
 
 QUICK = ("--set", "em.max_iterations=1", "--quiet")
 
@@ -26,7 +26,7 @@ def test_dynamic_beams_met_nothing(call, room, mapped, tmp_path, below):
     more = [] if below is None else ["--below", below]
     done = call("filter", mapped, "-o", tmp_path / "clean", *more)
     assert done.returncode == 0, done.stderr
-    before, after = folder.read(room), folder.read(tmp_path / "clean")
+    before, after = stillmap_folder.read(room), stillmap_folder.read(tmp_path / "clean")
     p = np.load(mapped / "beams/p_static.npy")
     blank = before.hit & (p < (0.5 if below is None else below))
     np.testing.assert_array_equal(after.hit, before.hit & ~blank)
@@ -129,7 +129,7 @@ def test_what_is_read_is_never_overwritten(call, room, mapped, tmp_path):
         refused(call("filter", mapped, "-o", tmp_path / "all" / output, *given), words)
     refused(call("filter", mapped, "-o", mapped, *given), "holds the recording or the result")
     assert (tmp_path / "all/precious").exists()
-    before, after = folder.read(room), folder.read(tmp_path / "all/room")
+    before, after = stillmap_folder.read(room), stillmap_folder.read(tmp_path / "all/room")
     np.testing.assert_array_equal(before.hit, after.hit)
 
 
@@ -157,10 +157,10 @@ def test_records_that_are_none(call, mapped, tmp_path, content, words):
 
 
 def test_another_recording_is_refused(call, room, mapped, tmp_path):
-    shorter = folder.read(room)
+    shorter = stillmap_folder.read(room)
     path = tmp_path / "shorter"
     n = int(shorter.offset[10])
-    folder.write(
+    stillmap_folder.write(
         type(shorter)(
             stamp_ns=shorter.stamp_ns[:10],
             offset=shorter.offset[:11],

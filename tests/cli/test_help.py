@@ -7,14 +7,13 @@ import typing
 
 import pytest
 
-from stillmap.cli.commands import COMMANDS, parser
+from stillmap.cli.parser import COMMANDS, parser
+from stillmap.core.config import described
 from stillmap.em import Estimator, MapState
-from stillmap.evaluation.relations import MAX_DT
-from stillmap.options import described
-from stillmap.output.map_server import MapMode
-from stillmap.pipeline import Options
-from stillmap.recording.options import ReadOptions
-from stillmap.simulation import SCENES, CrowdOptions
+from stillmap.eval.relations import MAX_DT
+from stillmap.pipeline.options import MapMode, Options
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.sim import SCENES, CrowdOptions
 
 TOP = parser()
 

@@ -5,9 +5,9 @@ import subprocess
 
 import pytest
 
-from stillmap.cli import main
-from stillmap.cli.commands import COMMANDS
-from stillmap.errors import InputError, nearest
+from stillmap.cli.main import main
+from stillmap.cli.parser import COMMANDS
+from stillmap.core.errors import InputError, nearest
 
 
 def refusal(capsys, *words: object) -> str:
@@ -127,7 +127,7 @@ def test_a_defect_says_so_after_its_trace(command):
         "import sys, stillmap.cli.config as c\n"
         "def fail(args): raise RuntimeError('ours')\n"
         "c.run = fail\n"
-        "from stillmap.cli import main\n"
+        "from stillmap.cli.main import main\n"
         "sys.exit(main(['config']))\n"
     )
     done = subprocess.run([command[0], "-c", program], capture_output=True, text=True, timeout=60)
@@ -152,7 +152,7 @@ def test_what_goes_wrong_is_one_line(monkeypatch, capsys, error, status, said):
         raise error
 
     monkeypatch.setattr("stillmap.cli.config.run", fail)
-    monkeypatch.setattr("stillmap.cli._drop_stdout", lambda: None)
+    monkeypatch.setattr("stillmap.cli.main._drop_stdout", lambda: None)
     assert main(["config"]) == status
     assert capsys.readouterr() == ("", f"stillmap: {said}\n")
 
@@ -182,7 +182,7 @@ def test_verbose_and_quiet_stand_anywhere(monkeypatch, words, verbose, quiet):
 
 def test_verbose_says_more_on_stderr(monkeypatch, capsys):
     def run(_):
-        logging.getLogger("stillmap.result").info("iteration %d", 3)
+        logging.getLogger("stillmap.pipeline.result").info("iteration %d", 3)
         return 0
 
     monkeypatch.setattr("stillmap.cli.config.run", run)

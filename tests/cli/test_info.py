@@ -9,11 +9,12 @@ import pytest
 from PIL import Image
 
 from stillmap.cli import info
-from stillmap.cli.reading import add_read_flags, read_changes
-from stillmap.errors import InputError
-from stillmap.recording import Recording, read, write
-from stillmap.recording import facts as module
-from stillmap.recording.images import Camera, Images
+from stillmap.cli import recording_info as module
+from stillmap.cli.arguments import add_read_flags, read_changes
+from stillmap.core.camera import Camera, Images
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.io import read, write
 
 LINES = [
     "# CARMEN Logfile",

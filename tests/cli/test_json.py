@@ -5,9 +5,9 @@ import math
 
 import pytest
 
-from stillmap.cli.printing import print_json
-from stillmap.options import described
-from stillmap.pipeline import Options
+from stillmap.cli.console import print_json
+from stillmap.core.config import described
+from stillmap.pipeline.options import Options
 
 
 def no_constant(text: str) -> None:

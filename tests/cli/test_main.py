@@ -7,7 +7,7 @@ import subprocess
 import pytest
 from refusals import refused
 
-from stillmap.cli import main
+from stillmap.cli.main import main
 
 COMMANDS = [
     (),
@@ -25,7 +25,7 @@ COMMANDS = [
 
 @pytest.mark.parametrize("names", COMMANDS, ids=" ".join)
 def test_help(names, capsys, monkeypatch):
-    from stillmap.cli import main
+    from stillmap.cli.main import main
 
     monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit) as left:
@@ -59,7 +59,7 @@ def test_version(stillmap):
     ],
 )
 def test_a_bad_call_is_one_line(words, said, capsys):
-    from stillmap.cli import main
+    from stillmap.cli.main import main
 
     with pytest.raises(SystemExit) as left:
         main(list(words))
@@ -125,7 +125,7 @@ def test_a_defect_of_ours_exits_with_1(command):
         "import sys, stillmap.cli.config as c\n"
         "def fail(args): raise RuntimeError('ours')\n"
         "c.run = fail\n"
-        "from stillmap.cli import main\n"
+        "from stillmap.cli.main import main\n"
         "sys.exit(main(['config']))\n"
     )
     done = subprocess.run([command[0], "-c", program], capture_output=True, text=True, timeout=60)

@@ -11,8 +11,8 @@ import yaml
 from maps import FILES, QUICK, files_in
 from refusals import refused
 
-from stillmap.recording import read, write
-from stillmap.recording.tum import read_tum
+from stillmap.io import read, write
+from stillmap.io.trajectory import read_tum
 
 PCD = """VERSION 0.7
 FIELDS x y z

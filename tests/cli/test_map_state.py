@@ -6,8 +6,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from stillmap.cli import main
-from stillmap.simulation import (
+from stillmap.cli.main import main
+from stillmap.sim import (
     CrowdOptions,
     LaserOptions,
     RobotOptions,
@@ -17,7 +17,7 @@ from stillmap.simulation import (
     simulate,
     write_simulation,
 )
-from stillmap.simulation.walls import box
+from stillmap.sim.walls import box
 
 CRATE = tuple(box(0, 0, 1.0, 0.8))
 

@@ -4,8 +4,8 @@ import time
 
 import pytest
 
-from stillmap.cli import progress as module
-from stillmap.cli.progress import shown_progress
+from stillmap.cli import console as module
+from stillmap.cli.console import shown_progress
 
 
 @pytest.fixture

@@ -14,10 +14,9 @@ import time
 import numpy as np
 import pytest
 
-from stillmap import result
-from stillmap.checkpoint import place
-from stillmap.output import beams
-from stillmap.pipeline import iterate
+from stillmap.pipeline import checkpoint, result
+from stillmap.pipeline.em_loop import iterate
+from stillmap.results import points as points_module
 
 WORDS = ("--set", "em.max_iterations=4", "--set", "em.patience=9", "--set", "em.tolerance=0")
 WORDS += ("--set", "em.settled=0", "--threads", "1")
@@ -246,7 +245,7 @@ def test_a_full_disk_leaves_the_checkpoint_before(
     call, room, tmp_path, interrupted, whole, monkeypatch, after
 ):
     with monkeypatch.context() as here:
-        here.setattr(place, "write_npy", _Full(place.write_npy, after))
+        here.setattr(checkpoint, "write_npy", _Full(checkpoint.write_npy, after))
         done = call("map", room, "-o", tmp_path / "out", "--resume", "--quiet", *WORDS)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
@@ -261,7 +260,7 @@ def test_a_full_disk_leaves_the_earlier_result(call, room, tmp_path, whole, monk
     out.mkdir()
     (out / "run.json").write_text("old")
     with monkeypatch.context() as here:
-        here.setattr(beams, "write_npy", _Full(beams.write_npy, 2))
+        here.setattr(points_module, "write_npy", _Full(points_module.write_npy, 2))
         done = call("map", room, "-o", out, "--overwrite", "--quiet", *WORDS)
     assert done.returncode == 2
     assert "No space left" in done.stderr

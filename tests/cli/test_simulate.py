@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillmap import recording
+from stillmap import io
 from stillmap.cli import simulate
-from stillmap.errors import InputError
-from stillmap.simulation import load_truth
+from stillmap.core.errors import InputError
+from stillmap.sim import load_truth
 
 QUICK = ("--scans", "20", "--beams", "90", "--people", "3")
 
@@ -27,7 +27,7 @@ def call(*words: str) -> int:
 def test_writes_a_recording_that_reads_back_with_its_truth(tmp_path: Path) -> None:
     out = tmp_path / "sim"
     assert call("hall", "-o", str(out), *QUICK, "--seed", "7") == 0
-    read = recording.read(out)
+    read = io.read(out)
     truth = load_truth(out)
     assert read.n_scans == 20
     assert read.n_beams == 20 * 90 == len(truth.static) == len(truth.mover)
@@ -77,7 +77,7 @@ def test_any_option_can_be_set_and_flags_win(tmp_path: Path) -> None:
 
 def test_a_scan_that_takes_time_says_when_its_beams_were_taken(tmp_path: Path) -> None:
     call("hall", "-o", str(tmp_path / "sim"), *QUICK, "--sweep-time", "0.1")
-    times = recording.read(tmp_path / "sim").beam_time
+    times = io.read(tmp_path / "sim").beam_time
     assert times is not None
     assert 0.09 < np.ptp(times) < 0.1
 
@@ -85,7 +85,7 @@ def test_a_scan_that_takes_time_says_when_its_beams_were_taken(tmp_path: Path) -
 def test_a_second_laser_and_one_upside_down(tmp_path: Path) -> None:
     flags = ("--second-laser", "--set", "laser.upside_down=unknown")
     call("hall", "-o", str(tmp_path / "sim"), *QUICK, *flags)
-    read = recording.read(tmp_path / "sim")
+    read = io.read(tmp_path / "sim")
     assert read.sensor.tolist() == [0, 1] * 10
     assert len(read.T_base_sensor) == 2
     assert load_truth(tmp_path / "sim").scene["laser"]["upside_down"] == "unknown"
@@ -94,7 +94,7 @@ def test_a_second_laser_and_one_upside_down(tmp_path: Path) -> None:
 def test_a_lidar_records_in_3d(tmp_path: Path) -> None:
     flags = "--lidar 16 --scans 4 --people 3 --rate 5 --max-range 20 --set lidar.columns=90"
     call("hall", "-o", str(tmp_path / "sim"), *flags.split())
-    read, truth = recording.read(tmp_path / "sim"), load_truth(tmp_path / "sim")
+    read, truth = io.read(tmp_path / "sim"), load_truth(tmp_path / "sim")
     assert (read.dimension, read.n_beams) == (3, 4 * 16 * 90)
     assert read.stamp_ns[1] - read.stamp_ns[0] == 200_000_000
     assert np.linalg.norm(read.points, axis=1).max() == pytest.approx(20.0)
@@ -106,7 +106,7 @@ def test_a_laser_that_tilts_makes_two_recordings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     call("hall", "-o", str(tmp_path / "sim"), "--lidar", "tilting", *QUICK, "--json", "--quiet")
-    flat, tilting = (recording.read(tmp_path / "sim" / name) for name in ("horizontal", "tilting"))
+    flat, tilting = (io.read(tmp_path / "sim" / name) for name in ("horizontal", "tilting"))
     assert (flat.dimension, tilting.dimension) == (2, 3)
     assert flat.n_beams == tilting.n_beams == 20 * 90
     assert json.loads(capsys.readouterr().out)["beams"] == 2 * 20 * 90
@@ -143,7 +143,7 @@ def test_scenes_with_more_than_people_say_what_moves(tmp_path: Path) -> None:
 def test_carmen_log_says_the_same_as_the_recording_folder(tmp_path: Path) -> None:
     call("hall", "-o", str(tmp_path / "a"), *QUICK)
     call("hall", "-o", str(tmp_path / "b"), *QUICK, "--format", "carmen")
-    own, log = recording.read(tmp_path / "a"), recording.read(tmp_path / "b/recording.log")
+    own, log = io.read(tmp_path / "a"), io.read(tmp_path / "b/recording.log")
     np.testing.assert_array_equal(own.stamp_ns, log.stamp_ns)
     np.testing.assert_array_equal(own.hit, log.hit)
     np.testing.assert_allclose(own.points[own.hit], log.points[log.hit], atol=0.0051)

@@ -114,7 +114,7 @@ except BaseException:
 PROGRAM = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
-from stillmap.cli.stopping import hear_signals
+from stillmap.cli.console import hear_signals
 def command():
     hear_signals(command.__code__)
     exec("import greedy")
@@ -141,19 +141,19 @@ import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # it may be ignored where tests run
 from pathlib import Path
 import numpy as np
-from stillmap.cli.stopping import hear_signals
-from stillmap.export import cloud, cloud_files
+from stillmap.cli.console import hear_signals
+from stillmap.results.export import point_cloud, point_cloud_files
 def command():
     hear_signals(command.__code__)
     points = np.random.default_rng(1).normal(size=(50_000, 3))
-    block = cloud.Block(points, np.ones(50_000, "f4"), None)
+    block = point_cloud.Block(points, np.ones(50_000, "f4"), None)
     def endless():
         while True:
             yield block
             print("packed", flush=True)
     path = Path("a.laz")
-    all_points = cloud.Cloud(10**9, np.zeros(3), None, endless)
-    cloud_files.write(all_points, path, cloud_files.format_for(path))
+    all_points = point_cloud.Cloud(10**9, np.zeros(3), None, endless)
+    point_cloud_files.write(all_points, path, point_cloud_files.format_for(path))
 try:
     command()
 except KeyboardInterrupt:
@@ -179,7 +179,7 @@ def test_a_signal_waits_for_points_to_be_packed(tmp_path, command):
 def test_ctrl_c_stays_ignored_in_the_background_of_a_script(command):
     program = (
         "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-        "from stillmap.cli.stopping import hear_signals\n"
+        "from stillmap.cli.console import hear_signals\n"
         "hear_signals(hear_signals.__code__); signal.raise_signal(signal.SIGINT)\n"
     )
     assert subprocess.run([command[0], "-c", program], timeout=50).returncode == 0

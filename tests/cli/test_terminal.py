@@ -6,7 +6,7 @@ import re
 import pytest
 from maps import ENDLESS
 
-from stillmap.cli.terminal import coloured, is_terminal, painted
+from stillmap.cli.console import coloured, is_terminal, painted
 
 VARIABLES = ("NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE", "TERM")
 RED, PLAIN = "\x1b[1;31m", "\x1b[0m"

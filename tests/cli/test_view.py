@@ -11,7 +11,7 @@ import urllib.request
 
 import pytest
 
-from stillmap import extras
+from stillmap.core import errors
 
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
 
@@ -48,7 +48,7 @@ def without_viser(monkeypatch):
     def missing(name):
         raise ImportError(name)
 
-    monkeypatch.setattr(extras, "import_module", missing)
+    monkeypatch.setattr(errors, "import_module", missing)
 
 
 @pytest.fixture

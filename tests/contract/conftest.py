@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from stillmap.cli import main
-from stillmap.recording import Recording, folder
-from stillmap.simulation import scene_by_name, simulate, write_simulation
+from stillmap.cli.main import main
+from stillmap.core.recording import Recording
+from stillmap.io import stillmap_folder
+from stillmap.sim import scene_by_name, simulate, write_simulation
 
 # for opening_models.py here, and made_up_rooms.py
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "texture")]
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "mesh" / "texture")]
 
 
 @pytest.fixture(scope="session")
@@ -26,7 +27,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def recording(recorded: Path) -> Recording:
     """The same as arrays."""
-    return folder.read(recorded)
+    return stillmap_folder.read(recorded)
 
 
 @pytest.fixture(scope="session")

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from stillmap.cli import main
-from stillmap.export import cloud, cloud_files
-from stillmap.recording import folder, read
-from stillmap.recording.clouds import pcd_file, ply
-from stillmap.recording.clouds.records import columns
+from stillmap.cli.main import main
+from stillmap.core.errors import InputError
+from stillmap.io import read, stillmap_folder
+from stillmap.io.point_cloud import pcd, ply
+from stillmap.io.point_cloud.binary_table import columns
+from stillmap.results.export import point_cloud, point_cloud_files
 
 FIELDS = ("x", "y", "z", "p_static")
 ROUNDED = 0.5001e-4  # m
@@ -49,7 +50,7 @@ def of_e57(path: Path) -> np.ndarray:
 
 
 def of_pcd(path: Path) -> np.ndarray:
-    return np.stack(pcd_file.values(pcd_file.header(path), list(FIELDS)), axis=1)
+    return np.stack(pcd.values(pcd.header(path), list(FIELDS)), axis=1)
 
 
 def of_xyz(path: Path) -> np.ndarray:
@@ -112,7 +113,7 @@ def test_the_same_result_gives_the_same_bytes(converted, ending):
 
 def test_motion_during_sweeps_is_more_than_rounding(street, mapped_street):
     """Else the above would say nothing of it."""
-    recording = folder.read(street)
+    recording = stillmap_folder.read(street)
     hits, poses = np.flatnonzero(recording.hit), np.load(street / "truth/T_world_base.npy")
     known, found = both(mapped_street), recording.end_points(hits, poses)
     moves = np.load(mapped_street / "beams/p_static.npy")[hits] < 0.5
@@ -122,7 +123,7 @@ def test_motion_during_sweeps_is_more_than_rounding(street, mapped_street):
 
 def test_times_are_those_of_the_beams(converted, street):
     laspy = pytest.importorskip("laspy")
-    recording = folder.read(street)
+    recording = stillmap_folder.read(street)
     scan = np.repeat(np.arange(recording.n_scans), np.diff(recording.offset))
     seconds = 1e-9 * recording.stamp_ns[scan] + recording.beam_time
     found = laspy.read(converted(".laz")).gps_time
@@ -146,21 +147,21 @@ def test_what_a_result_in_space_cannot_become(mapped_street, tmp_path, capsys, n
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("form", cloud_files.FORMATS, ids=lambda form: form.name)
+@pytest.mark.parametrize("form", point_cloud_files.FORMATS, ids=lambda form: form.name)
 def test_memory_is_that_of_some_scans(form, tmp_path):
-    cloud_files.require_extras(form, tmp_path)
+    point_cloud_files.require_extras(form, tmp_path)
     n, blocks = 1 << 14, 40
 
     def made():
         for k in range(blocks):
             points = np.random.default_rng(k).uniform(-50.0, 50.0, (n, 3))
-            yield cloud.Block(points, np.full(n, 0.75, np.float32), np.full(n, k, np.int64))
+            yield point_cloud.Block(points, np.full(n, 0.75, np.float32), np.full(n, k, np.int64))
 
-    points = cloud.Cloud(n * blocks, np.zeros(3), 0, made)
+    points = point_cloud.Cloud(n * blocks, np.zeros(3), 0, made)
     shares = []
     tracemalloc.start()
     try:
-        cloud_files.write(points, tmp_path / f"a{form.endings[0]}", form, shares.append)
+        point_cloud_files.write(points, tmp_path / f"a{form.endings[0]}", form, shares.append)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -169,48 +170,50 @@ def test_memory_is_that_of_some_scans(form, tmp_path):
     assert shares[-1] == 1.0
 
 
-@pytest.mark.parametrize("form", cloud_files.FORMATS, ids=lambda form: form.name)
+@pytest.mark.parametrize("form", point_cloud_files.FORMATS, ids=lambda form: form.name)
 def test_no_points_are_a_cloud(form, tmp_path):
-    empty = cloud.Block(np.empty((0, 3)), np.empty(0, np.float32), None)
+    empty = point_cloud.Block(np.empty((0, 3)), np.empty(0, np.float32), None)
     path = tmp_path / f"a{form.endings[0]}"
-    cloud_files.write(cloud.Cloud(0, np.zeros(3), None, lambda: iter([empty])), path, form)
+    point_cloud_files.write(
+        point_cloud.Cloud(0, np.zeros(3), None, lambda: iter([empty])), path, form
+    )
     if form.name != "e57":  # bounds of nothing are not to be had
         assert len(READERS[form.endings[0]](path)) == 0
     assert path.stat().st_size > 0
 
 
-@pytest.mark.parametrize("form", cloud_files.FORMATS, ids=lambda form: form.name)
+@pytest.mark.parametrize("form", point_cloud_files.FORMATS, ids=lambda form: form.name)
 def test_what_stops_it_leaves_nothing(form, tmp_path):
     def made():
-        yield cloud.Block(np.zeros((9, 3)), np.zeros(9, np.float32), None)
+        yield point_cloud.Block(np.zeros((9, 3)), np.zeros(9, np.float32), None)
         raise KeyboardInterrupt
 
-    points = cloud.Cloud(18, np.zeros(3), None, made)
+    points = point_cloud.Cloud(18, np.zeros(3), None, made)
     with pytest.raises(KeyboardInterrupt):
-        cloud_files.write(points, tmp_path / f"a{form.endings[0]}", form)
+        point_cloud_files.write(points, tmp_path / f"a{form.endings[0]}", form)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57"])
 def test_points_that_are_too_far_off_are_refused(name, tmp_path):
     far = np.full((3, 3), 3e5)
-    points = cloud.Cloud(
-        3, np.zeros(3), None, lambda: iter([cloud.Block(far, np.ones(3, np.float32), None)])
+    points = point_cloud.Cloud(
+        3, np.zeros(3), None, lambda: iter([point_cloud.Block(far, np.ones(3, np.float32), None)])
     )
-    form = cloud_files.format_for(tmp_path / name)
-    with pytest.raises(cloud_files.InputError, match=f"{name}: cannot be written: a point lies"):
-        cloud_files.write(points, tmp_path / name, form)
+    form = point_cloud_files.format_for(tmp_path / name)
+    with pytest.raises(InputError, match=f"{name}: cannot be written: a point lies"):
+        point_cloud_files.write(points, tmp_path / name, form)
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("form", cloud_files.FORMATS, ids=lambda form: form.name)
+@pytest.mark.parametrize("form", point_cloud_files.FORMATS, ids=lambda form: form.name)
 def test_why_a_file_cannot_be_made_is_said(form, tmp_path):
     (tmp_path / "file").write_text("")
     path = tmp_path / f"file/a{form.endings[0]}"
-    points = cloud.Cloud(0, np.zeros(3), None, lambda: iter(()))
+    points = point_cloud.Cloud(0, np.zeros(3), None, lambda: iter(()))
     said = f"{path}: cannot be written: Not a directory"
-    with pytest.raises(cloud_files.InputError, match=re.escape(said)):
-        cloud_files.write(points, path, form)
+    with pytest.raises(InputError, match=re.escape(said)):
+        point_cloud_files.write(points, path, form)
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.laz", "a.e57", "a.pcd", "a.ply", "a.xyz"])
@@ -220,17 +223,18 @@ def test_a_full_disk_is_said(name, tmp_path):
 import resource, signal, sys
 from pathlib import Path
 import numpy as np
-from stillmap.errors import InputError
-from stillmap.export import cloud, cloud_files
+from stillmap.core.errors import InputError
+from stillmap.results.export import point_cloud, point_cloud_files
 rng, n = np.random.default_rng(1), 200_000
-block = cloud.Block(rng.uniform(-50, 50, (n, 3)), rng.uniform(size=n).astype("f4"), None)
+block = point_cloud.Block(rng.uniform(-50, 50, (n, 3)), rng.uniform(size=n).astype("f4"), None)
 path = Path("{name}")
-form = cloud_files.format_for(path)
-cloud_files.require_extras(form, path)
+form = point_cloud_files.format_for(path)
+point_cloud_files.require_extras(form, path)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
 try:
-    cloud_files.write(cloud.Cloud(9 * n, np.zeros(3), None, lambda: iter([block] * 9)), path, form)
+    cloud = point_cloud.Cloud(9 * n, np.zeros(3), None, lambda: iter([block] * 9))
+    point_cloud_files.write(cloud, path, form)
 except InputError as error:
     print(error)
 """

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 import trimesh
 
-from stillmap.export import cloud, cloud_files
-from stillmap.output.clouds import COLOURS, FIELDS, ply_header, put_colours
+from stillmap.results.export import point_cloud, point_cloud_files
+from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
 
 N = 70_000
 
 
 @pytest.fixture(scope="module")
-def points() -> cloud.Block:
+def points() -> point_cloud.Block:
     rng = np.random.default_rng(3)
     colours = rng.integers(0, 256, (N, 3)).astype(np.uint8)
     colours[:3] = [[0, 0, 0], [255, 255, 255], [255, 0, 1]]
     xyz = rng.uniform(-40.0, 40.0, (N, 3))
-    return cloud.Block(xyz, rng.uniform(size=N).astype(np.float32), np.arange(N), colours)
+    return point_cloud.Block(xyz, rng.uniform(size=N).astype(np.float32), np.arange(N), colours)
 
 
 @pytest.fixture
@@ -26,8 +26,8 @@ def written(points, tmp_path):
     def write(ending: str, *, coloured: bool = True) -> Path:
         block = points if coloured else points._replace(colours=None)
         path = tmp_path / f"{'coloured' if coloured else 'plain'}{ending}"
-        whole = cloud.Cloud(N, np.zeros(3), 0, lambda: iter([block]), coloured)
-        cloud_files.write(whole, path, cloud_files.format_for(path))
+        whole = point_cloud.Cloud(N, np.zeros(3), 0, lambda: iter([block]), coloured)
+        point_cloud_files.write(whole, path, point_cloud_files.format_for(path))
         return path
 
     return write
@@ -98,13 +98,13 @@ def test_clouds_of_a_folder_have_the_colours_of_both_files(points, tmp_path):
     for part, its in (("dynamic", rows[:9]), ("static", rows[9:])):
         head = ply_header(FIELDS + COLOURS, len(its))
         (tmp_path / f"{part}.ply").write_bytes(head + its.tobytes())
-    found = cloud.cloud_in(tmp_path)
+    found = point_cloud.cloud_in(tmp_path)
     assert found.coloured
     colours = np.concatenate([block.colours for block in found.blocks()])
     np.testing.assert_array_equal(colours, np.roll(points.colours, -9, axis=0))
     plain = np.zeros(2, FIELDS)
     (tmp_path / "dynamic.ply").write_bytes(ply_header(FIELDS, 2) + plain.tobytes())
-    found = cloud.cloud_in(tmp_path)
+    found = point_cloud.cloud_in(tmp_path)
     assert not found.coloured
     assert all(block.colours is None for block in found.blocks())
-    assert cloud.cloud_in(tmp_path, "static").coloured
+    assert point_cloud.cloud_in(tmp_path, "static").coloured

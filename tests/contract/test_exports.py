@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stillmap.cli import main
-from stillmap.recording.poses import poses_from_tum
+from stillmap.cli.main import main
+from stillmap.io.trajectory import poses_from_tum
 
 
 @pytest.fixture(scope="module")

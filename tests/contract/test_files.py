@@ -7,9 +7,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from stillmap.cli import main
-from stillmap.recording import poses as given_poses
-from stillmap.recording.tum import read_tum
+from stillmap.cli.main import main
+from stillmap.io import trajectory as given_poses
+from stillmap.io.trajectory import read_tum
 
 
 def planar(T):

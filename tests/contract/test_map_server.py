@@ -12,7 +12,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from stillmap.cli import main
+from stillmap.cli.main import main
 
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
 

@@ -5,10 +5,10 @@ import pytest
 from made_up_rooms import all_round, furnished, looking, photograph, rectangle, sharpest
 from opening_models import shown, validated
 
-from stillmap.output.meshes import write_glb, write_obj
-from stillmap.surface.mesh import joined
-from stillmap.texture.baking import baked
-from stillmap.texture.options import TextureOptions
+from stillmap.mesh.options import TextureOptions
+from stillmap.mesh.texture.baking import baked
+from stillmap.mesh.triangle_mesh import joined
+from stillmap.results.gltf import write_glb, write_obj
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("xatlas")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from stillmap import _core, em
-from stillmap.recording.model import Recording
+from stillmap.core.recording import Recording
 
 RESOLUTION = 0.1
 FAR = 30.0  # metres: maximum range

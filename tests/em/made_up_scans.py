@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stillmap.recording.model import Recording
+from stillmap.core.recording import Recording
 
 ANGLES = np.radians(np.arange(-90.0, 91.0))
 WALL = 6.0  # metres ahead

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from stillmap import _core
-from stillmap.em.bodies import feet_of, lowered, standing_on, with_bodies
+from stillmap.core.recording import Recording
 from stillmap.em.ground import Ground, ground_under
 from stillmap.em.options import BodyOptions
-from stillmap.recording.model import Recording
+from stillmap.em.spatial_prior import feet_of, lowered, standing_on, with_bodies
 
 FLAT = Ground(np.zeros((40, 40)), np.array([-20.0, -20.0]), 1.8, True)
 

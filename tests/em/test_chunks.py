@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stillmap.em import chunks
-from stillmap.recording.model import Recording
+from stillmap.core.recording import Recording
+from stillmap.em import observations
 
 LOOKS = np.array([0, 0, 0, 1, 1, 4, 5, 5, 5, 5])
 
@@ -22,8 +22,8 @@ def ten_scans():
 
 
 def cuts(beams, monkeypatch, **which):
-    monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
-    found = list(chunks.chunks(ten_scans(), **which))
+    monkeypatch.setattr(observations, "CHUNK_BEAMS", beams)
+    found = list(observations.chunks(ten_scans(), **which))
     for chunk in found:
         assert chunk.beams == slice(100 * chunk.scans.start, 100 * chunk.scans.stop)
         assert chunk.offset.tolist() == [100 * k for k in range(len(chunk.offset))]

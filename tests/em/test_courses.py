@@ -9,10 +9,10 @@ import pytest
 from made_up import RESOLUTION, Ball, Wall, watch
 
 from stillmap import em
-from stillmap.changes import changed_places, relabelled
-from stillmap.em import chunks
-from stillmap.em import courses as module
-from stillmap.em.courses import _as_wholes
+from stillmap.em import changepoints as module
+from stillmap.em import observations
+from stillmap.em.changepoints import _as_wholes
+from stillmap.mapping import changed_places, relabelled
 
 WALLS = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
 CAME, LEFT, STANDS, STOOD, PASSED = 3, 4, 5, 6, 7
@@ -338,7 +338,7 @@ def test_cells_decide_together_before_anything_is_shown(seen, monkeypatch):
 @pytest.mark.parametrize("beams", [1000, 5000])
 @pytest.mark.parametrize("threads", [1, 3])
 def test_pieces_and_threads_change_no_bit(seen, last, monkeypatch, beams, threads):
-    monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
+    monkeypatch.setattr(observations, "CHUNK_BEAMS", beams)
     (p_static, _), found = last_e_step(seen, threads=threads)
     assert p_static.tobytes() == last[0][0].tobytes()
     assert found.between.tobytes() == last[1].between.tobytes()

@@ -7,11 +7,11 @@ import pytest
 from made_up import RESOLUTION, Ball, Wall, Watched, cone, fan, watch
 
 from stillmap import _core, em
-from stillmap.em import chunks, dwell
-from stillmap.em.looks import CLASSES, surface_of
-from stillmap.evaluation.labels import calibration_error, equal_width_bins
-from stillmap.simulation import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
-from stillmap.simulation.walls import box
+from stillmap.em import observations, occupancy_hmm
+from stillmap.em.observations import CLASSES, surface_of
+from stillmap.eval.labels import calibration_error, equal_width_bins
+from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
+from stillmap.sim.walls import box
 
 WALLS = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
 BALL = len(WALLS)  # the number of the first ball
@@ -168,7 +168,7 @@ def test_a_look_may_be_many_scans(busy, known):
 
 @pytest.mark.parametrize("beams", [1, 1000, 5000])
 def test_pieces_and_threads_change_no_bit(busy, known, monkeypatch, beams):
-    monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
+    monkeypatch.setattr(observations, "CHUNK_BEAMS", beams)
     for threads in (1, 3):
         options = em.EmOptions()
         grid = _core.Grid2D(0.1)
@@ -185,7 +185,7 @@ def test_where_it_begins_does_not_matter(busy, known):
     assert later.e_step().p_static.tobytes() == known.p_static.tobytes()
     moved = busy.poses
     moved[:, :2, 2] = 800.0, -1600.0  # whole cells
-    found = dwell.e_step(r, moved, 0.1, em.EmOptions())
+    found = occupancy_hmm.e_step(r, moved, 0.1, em.EmOptions())
     np.testing.assert_allclose(found.p_static, known.p_static, atol=0.02)
 
 
@@ -194,7 +194,7 @@ def test_the_bound_is_above_the_expectation_and_prefers_true_poses(busy, known):
     rng = np.random.default_rng(0)
     shaken = busy.poses
     shaken[:, :2, 2] += rng.normal(scale=0.15, size=(len(shaken), 2))
-    found = dwell.e_step(busy.recording, shaken, 0.1, em.EmOptions())
+    found = occupancy_hmm.e_step(busy.recording, shaken, 0.1, em.EmOptions())
     assert found.likelihood.bound < known.likelihood.bound
 
 
@@ -248,7 +248,7 @@ def crowd():
 
 def test_it_knows_how_sure_it_is(crowd):
     r = crowd.recording
-    found = dwell.e_step(r, crowd.truth.T_world_base, 0.05, em.EmOptions())
+    found = occupancy_hmm.e_step(r, crowd.truth.T_world_base, 0.05, em.EmOptions())
     p, static = found.p_static[r.hit].astype(float), crowd.truth.static[r.hit]
     assert 0.01 < 1 - static.mean() < 0.4
     assert calibration_error(p, static, equal_width_bins(p)) < 0.01

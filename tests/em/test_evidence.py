@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from stillmap import _core, em, se2
-from stillmap.em import chunks
-from stillmap.em.expectations import NoReturn
-from stillmap.recording.model import Recording
+from stillmap import _core, em
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.em import observations
+from stillmap.em.types import NoReturn
 
 RESOLUTION = 0.1
 SECOND = 1_000_000_000
@@ -99,7 +100,7 @@ def test_scans_of_half_a_second_are_one_look(visitors):
 def test_threads_and_chunks_do_not_matter(visitors, monkeypatch):
     _, found = evidence_of(*visitors)
     _, threaded = evidence_of(*visitors, threads=3)
-    monkeypatch.setattr(chunks, "CHUNK_BEAMS", 500)
+    monkeypatch.setattr(observations, "CHUNK_BEAMS", 500)
     _, chunked = evidence_of(*visitors, threads=2)
     for name in ("looks", "clear", "thin"):
         np.testing.assert_array_equal(getattr(found, name), getattr(threaded, name))

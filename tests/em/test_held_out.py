@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from stillmap import em, se2
-from stillmap.em import chunks as chunking
+from stillmap import em
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.em import observations as chunking
 from stillmap.em.held_out import held_out_scans
-from stillmap.recording.model import Recording
-from stillmap.simulation import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
-from stillmap.simulation.walls import box
+from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
+from stillmap.sim.walls import box
 
 RESOLUTION, EVERY = 0.05, 10
 

@@ -5,7 +5,7 @@ import pytest
 from made_up import Ball, Wall, watch
 
 from stillmap import _core, em
-from stillmap.recording.model import Recording
+from stillmap.core.recording import Recording
 
 
 def lane(hits, passes):

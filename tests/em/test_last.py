@@ -8,8 +8,8 @@ import pytest
 from made_up_scans import ANGLES
 
 from stillmap import _core, em
-from stillmap.em import last as module
-from stillmap.recording.model import Recording
+from stillmap.core.recording import Recording
+from stillmap.em import occupancy_hmm as module
 
 POST, RADIUS, WALL = (5.0, 3.0), 0.15, 5.0
 LOOKS, SECONDS = 80, 0.5
@@ -125,8 +125,8 @@ def test_who_stands_with_two_lasers_stands():
 
 def test_labels_know_neither_crowds_nor_who_waits_nor_what_comes_often():
     """A chair that a robot passes looks like them."""
-    rho, tau, _ = (np.array(values) for values in module._CLASSES.grid())
-    n_static = module._CLASSES.n_static
+    rho, tau, _ = (np.array(values) for values in module._FINAL_CLASSES.grid())
+    n_static = module._FINAL_CLASSES.n_static
     kept = module._for_labels(SimpleNamespace(rho=rho, tau=tau, n_static=n_static))
     assert kept[:n_static].all()
     movers = {(r, t) for r, t in zip(rho[n_static:], tau[n_static:], strict=True)}

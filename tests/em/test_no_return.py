@@ -7,6 +7,7 @@ import pytest
 from made_up import FAR, RESOLUTION, Wall, fan, watch
 
 from stillmap import _core, em
+from stillmap.em import observations
 
 
 def with_lost(seen, lost, length=FAR):
@@ -98,7 +99,7 @@ def test_pieces_and_threads_change_no_bit(monkeypatch, threads, beams):
     lost = np.random.default_rng(1).random(len(seen.what)) < 0.2
     seen = with_lost(seen, lost)
     once = known(seen)[3].p_occupied
-    monkeypatch.setattr(em.chunks, "CHUNK_BEAMS", beams)
+    monkeypatch.setattr(observations, "CHUNK_BEAMS", beams)
     np.testing.assert_array_equal(known(seen, threads)[3].p_occupied, once)
 
 

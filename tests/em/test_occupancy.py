@@ -160,7 +160,7 @@ def test_a_part_of_a_map_is_what_the_whole_has_there(printed, monkeypatch):
         occupied = em.CellProbabilities(cells, np.array([0.5, 0.9, 0.4], np.float32), FREE)
     whole = em.occupancy_map(grid, occupied)
     first = np.round(np.array(whole.origin[:2]) / RESOLUTION).astype(int)
-    monkeypatch.setattr("stillmap.em.occupancy._TILE", 7)
+    monkeypatch.setattr("stillmap.em.occupancy_grid._TILE", 7)
     again = em.occupancy_map(grid, occupied)
     box = em.Box(first + np.array([20, -2]), (12, 15))
     part = em.occupancy_map(grid, occupied, box=box)

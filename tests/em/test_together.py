@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.em.together import components, pairs_near
+from stillmap.em.spatial_prior import components, pairs_near
 
 
 def held(pairs):

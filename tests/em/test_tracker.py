@@ -7,10 +7,10 @@ import pytest
 from made_up_scans import before, crossing, poses, recording, wall
 
 from stillmap import _core, em
-from stillmap.em.tracker import TrackerOptions, on_people
-from stillmap.em.tracker.boxes import in_boxes
-from stillmap.em.tracker.features import features
-from stillmap.em.tracker.tracks import Places, people
+from stillmap.em.options import TrackerOptions
+from stillmap.em.people import on_people
+from stillmap.em.people.detector import features
+from stillmap.em.people.tracker import Places, in_boxes, people
 
 OPTIONS = TrackerOptions()
 TIMES = np.arange(0.0, 3.4, 0.2)

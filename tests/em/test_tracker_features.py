@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from made_up_scans import ANGLES, before, poses, recording, wall
 
-from stillmap import se2
-from stillmap.em.tracker import TrackerOptions
-from stillmap.em.tracker.changes import changed
-from stillmap.em.tracker.features import features
+from stillmap.core import se2
+from stillmap.em.options import TrackerOptions
+from stillmap.em.people.detector import changed, features
 
 OPTIONS = TrackerOptions()
 

@@ -12,14 +12,15 @@ import pye57
 from parts import joined
 from PIL import Image
 
-from stillmap import se2
-from stillmap.options import to_toml
-from stillmap.output.map_npz import write_npz
-from stillmap.pipeline import Options
-from stillmap.recording import Recording, folder, writers
-from stillmap.recording.clouds.las import _header
-from stillmap.recording.images import Camera, Images
-from stillmap.recording.tum import write_tum
+from stillmap.core import se2
+from stillmap.core.arrays import write_npz
+from stillmap.core.camera import Camera, Images
+from stillmap.core.config import to_toml
+from stillmap.core.recording import Recording
+from stillmap.io import stillmap_folder, writers
+from stillmap.io.point_cloud.las import _header
+from stillmap.io.trajectory import write_tum
+from stillmap.pipeline.options import Options
 
 START = 1_700_000_000_000_000_000
 
@@ -99,7 +100,7 @@ OURS = (
 
 def ours(work: Path) -> Iterator[bytes]:
     for name, recording in (("flat", planar()), ("space", space())):
-        folder.write(recording, work / name)
+        stillmap_folder.write(recording, work / name)
         yield parts_of(work / name, OURS)
 
 

@@ -12,7 +12,7 @@ from corpus import START
 from parts import joined
 from PIL import Image
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "formats" / "ros"))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "io" / "ros"))
 
 from small_bags import Messages, write_bag
 

@@ -14,17 +14,20 @@ import corpus_pictures
 import numpy as np
 import parts
 
-from stillmap.cli import results
-from stillmap.errors import InputError
-from stillmap.evaluation import files, folders
-from stillmap.export.result import read_tracks
-from stillmap.options import load_toml, replaced
-from stillmap.pipeline import Options
-from stillmap.recording import ReadOptions, Recording, read
-from stillmap.recording.facts import facts
-from stillmap.recording.ros import reading  # noqa: F401  (loaded now, not at the first bag)
-from stillmap.recording.tum import read_tum
-from stillmap.simulation import load_truth
+from stillmap.cli import arguments
+from stillmap.cli.recording_info import facts
+from stillmap.core.config import load_toml, replaced
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.eval import readers
+from stillmap.io import read
+from stillmap.io.ros import reader as reader_module  # noqa: F401  (loaded now, not at the first bag)
+from stillmap.io.trajectory import read_tum
+from stillmap.pipeline.options import Options
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.results import reader as result_reader
+from stillmap.results.reader import read_tracks
+from stillmap.sim import load_truth
 
 Run = Callable[[bytes, Path], None]
 Change = Callable[[bytes, parts.Change, random.Random], bytes]
@@ -176,7 +179,12 @@ def _rows(data: bytes, folder: Path) -> None:
     path.write_bytes(data)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for reader in (read_tum, files.read_planar, files.read_relations, files.read_odometry):
+        for reader in (
+            read_tum,
+            readers.read_planar,
+            readers.read_relations,
+            readers.read_odometry,
+        ):
             try:
                 reader(path)
             except InputError:
@@ -188,14 +196,14 @@ def _result(data: bytes, folder: Path) -> None:
     _write(data, place, corpus.RESULT)
     _write(parts.joined(_OURS), place, corpus.OURS)
     for reader in (
-        lambda: results.found(place, None).read_options,
-        lambda: results.found(place, str(place)).read(),
-        lambda: folders.read_labels(place),
-        lambda: folders.read_grid(place),
+        lambda: arguments.found(place, None).read_options,
+        lambda: arguments.found(place, str(place)).read(),
+        lambda: readers.read_labels(place),
+        lambda: result_reader.read_grid(place),
         lambda: read_tracks(place / "objects.json"),
-        lambda: folders.read_truth(place).static_hits(),
-        lambda: folders.read_truth(place).walls(),
-        lambda: folders.read_truth(place).lasting(),
+        lambda: readers.read_truth(place).static_hits(),
+        lambda: readers.read_truth(place).walls(),
+        lambda: readers.read_truth(place).lasting(),
         lambda: load_truth(place),
     ):
         try:

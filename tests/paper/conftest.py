@@ -84,7 +84,7 @@ def _module(name: str) -> ModuleType:
         from stillmap import _core
 
         return _core
-    from stillmap import reference
+    import reference
 
     return reference
 

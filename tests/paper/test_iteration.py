@@ -3,8 +3,7 @@
 from itertools import pairwise
 
 import pytest
-
-from stillmap.reference import em_fixed_poses
+from reference import em_fixed_poses
 
 
 def test_figure_2_two_rounds_by_hand(lane):

@@ -4,8 +4,7 @@ from math import log
 
 import numpy as np
 import pytest
-
-from stillmap.reference import occupancy
+from reference import occupancy
 
 
 def test_sums_of_equation_10(lane):

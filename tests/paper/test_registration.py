@@ -4,8 +4,7 @@ from math import exp, log, pi, sqrt
 
 import numpy as np
 import pytest
-
-from stillmap.reference.field import moved
+from reference.field import moved
 
 FLOOR, SIGMA = 0.01, 0.5
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from stillmap.options import replaced
-from stillmap.pipeline import Options
+from stillmap.core.config import replaced
+from stillmap.pipeline.options import Options
 
 RESOLUTION = 0.05
 ESTIMATORS = ("stillmap", "paper", "hit-ratio", "tracker")

@@ -10,8 +10,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import stillmap
 from stillmap import em
-from stillmap.recording.model import Recording
-from stillmap.recording.tum import read_tum
+from stillmap.core.recording import Recording
+from stillmap.io.trajectory import read_tum
 
 
 def end_cells(recording, poses, origin, resolution, beams):

@@ -7,10 +7,10 @@ import pytest
 
 import stillmap
 from stillmap import em
-from stillmap.options import replaced
-from stillmap.output.map_npz import CHANGED, changed_cells
-from stillmap.pipeline import Options
-from stillmap.simulation import (
+from stillmap.core.config import replaced
+from stillmap.pipeline.options import Options
+from stillmap.results.map_npz import CHANGED, changed_cells
+from stillmap.sim import (
     CrowdOptions,
     Door,
     DoorOptions,
@@ -21,7 +21,7 @@ from stillmap.simulation import (
     Thing,
     simulate,
 )
-from stillmap.simulation.walls import box
+from stillmap.sim.walls import box
 
 HINGE, WIDTH = (2.0, 0.9), 0.9
 CRATE = tuple(box(0, 0, 0.9, 0.6))

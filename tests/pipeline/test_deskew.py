@@ -9,10 +9,10 @@ from choices import RESOLUTION, options
 
 import stillmap
 from stillmap import _core, em, slam
-from stillmap.evaluation.trajectory import absolute_errors
-from stillmap.options import replaced
-from stillmap.simulation import scene_by_name, simulate
-from stillmap.slam import incremental
+from stillmap.core.config import replaced
+from stillmap.eval.trajectory import absolute_errors
+from stillmap.sim import scene_by_name, simulate
+from stillmap.slam import odometry_2d
 
 AT_ONCE = {"slam": {"deskew": False}}
 # 1.5 m/s and 1.5 rad/s indoors, 12 m/s outdoors, ten scans a second that take all of the time
@@ -92,14 +92,14 @@ def test_map_and_labels_are_made_of_the_same_points(room, swept, estimator, give
 @pytest.mark.parametrize("odometry", [True, False])
 def test_what_tells_of_the_motion(swept, monkeypatch, odometry):
     """Odometry, or else poses of the scans as they were taken; then the poses so far."""
-    built, found, plain = [], [], incremental.build
+    built, found, plain = [], [], odometry_2d.build
 
     def noted(recording, *rest):
         built.append(recording)
         found.append(plain(recording, *rest))
         return found[-1]
 
-    monkeypatch.setattr(incremental, "build", noted)
+    monkeypatch.setattr(odometry_2d, "build", noted)
     recording = swept if odometry else swept.without_odometry()
     chosen = options(max_iterations=2)
     first, _ = stillmap.iterate(recording, chosen)

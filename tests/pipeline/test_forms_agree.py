@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from stillmap import build
-from stillmap.recording import ReadOptions, read, writers
+from stillmap.io import read, writers
+from stillmap.preprocessing.options import ReadOptions
 
 FREE = 6.0  # m: bags and logs only say that nothing came back, not how far away that was
 

@@ -6,8 +6,8 @@ import pytest
 
 import stillmap
 from stillmap import em
-from stillmap.options import replaced
-from stillmap.pipeline import Options
+from stillmap.core.config import replaced
+from stillmap.pipeline.options import Options
 
 WITHOUT_LAST = {"changes": {"enabled": False}, "dwell": {"views": False}}
 

@@ -7,9 +7,9 @@ import pytest
 from choices import options, with_any_estimator
 
 import stillmap
-from stillmap import se2
-from stillmap.options import replaced
-from stillmap.recording.model import Recording
+from stillmap.core import se2
+from stillmap.core.config import replaced
+from stillmap.core.recording import Recording
 
 
 @pytest.mark.parametrize("how", ["one scan", "no hits", "all unusable", "no beams"])

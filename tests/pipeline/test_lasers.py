@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap import se2
-from stillmap.recording import read
-from stillmap.recording.options import ReadOptions
-from stillmap.simulation import Simulation, scene_by_name, simulate
+from stillmap.core import se2
+from stillmap.io import read
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.sim import Simulation, scene_by_name, simulate
 
 TURNED = math.radians(20.0)
 FRONT = {"x": 0.25, "y": -0.15, "yaw": TURNED}

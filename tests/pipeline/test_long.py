@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap.em import chunks
-from stillmap.output.save import save
-from stillmap.recording import spool
+from stillmap.core import arrays
+from stillmap.core.config import replaced
+from stillmap.em import observations
+from stillmap.results.save import save
 
 ESTIMATORS = ("stillmap", "paper", "hit-ratio", "tracker")
 
@@ -24,7 +25,7 @@ def swept(room):
 
 def files_of(recording, estimator: str, out: Path) -> dict[str, bytes]:
     """All that a run writes, but for what tells of time and memory."""
-    options = stillmap.options.replaced(
+    options = replaced(
         stillmap.Options(),
         {"threads": 1, "estimator": estimator, "em": {"max_iterations": 2, "held_out": 5}},
     )
@@ -40,7 +41,7 @@ def files_of(recording, estimator: str, out: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_arrays_in_files_give_the_same_bytes(swept, estimator, tmp_path, monkeypatch):
     in_memory = files_of(swept, estimator, tmp_path / "in memory")
-    monkeypatch.setattr(spool, "IN_MEMORY", 0)
+    monkeypatch.setattr(arrays, "IN_MEMORY", 0)
     assert files_of(swept, estimator, tmp_path / "in files") == in_memory
     assert {path.name for path in tmp_path.iterdir()} == {"in memory", "in files"}
 
@@ -48,8 +49,8 @@ def test_arrays_in_files_give_the_same_bytes(swept, estimator, tmp_path, monkeyp
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_pieces_of_any_size_give_the_same_bytes(swept, estimator, tmp_path, monkeypatch):
     whole = files_of(swept, estimator, tmp_path / "whole")
-    monkeypatch.setattr(spool, "IN_MEMORY", 0)
-    monkeypatch.setattr(spool, "BLOCK", 1000)
-    monkeypatch.setattr(chunks, "CHUNK_BEAMS", 700)
-    monkeypatch.setattr(spool, "TOGETHER", 3)
+    monkeypatch.setattr(arrays, "IN_MEMORY", 0)
+    monkeypatch.setattr(arrays, "BLOCK", 1000)
+    monkeypatch.setattr(observations, "CHUNK_BEAMS", 700)
+    monkeypatch.setattr(arrays, "TOGETHER", 3)
     assert files_of(swept, estimator, tmp_path / "pieces") == whole

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap import em, pipeline, slam
-from stillmap.options import replaced
-from stillmap.pipeline import Options
+from stillmap import em, slam
+from stillmap.core.config import replaced
+from stillmap.pipeline import em_loop
+from stillmap.pipeline.options import Options
 
 SLAM = slam.SlamOptions()
 
@@ -82,4 +83,4 @@ def test_the_options_that_are_kept_are_those_that_were_used(printed):
     }
     assert replaced(printed.options, {"slam": rest}) == options()
     for estimator in ("stillmap", "hit-ratio", "tracker"):
-        assert pipeline.resolved(options(estimator), printed.recording) == options(estimator)
+        assert em_loop.resolved(options(estimator), printed.recording) == options(estimator)

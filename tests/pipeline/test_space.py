@@ -11,13 +11,13 @@ from choices import options
 from PIL import Image
 
 import stillmap
-from stillmap.cli import main
-from stillmap.output.report_learned import learned_section
-from stillmap.pipeline import Options
-from stillmap.recording.model import Recording
-from stillmap.recording.tum import read_tum
-from stillmap.simulation import scene_by_name, simulate
-from stillmap.simulation.writing import write_simulation
+from stillmap.cli.main import main
+from stillmap.core.recording import Recording
+from stillmap.io.trajectory import read_tum
+from stillmap.pipeline.options import Options
+from stillmap.results.report.tables import learned_section
+from stillmap.sim import scene_by_name, simulate
+from stillmap.sim.writer import write_simulation
 
 
 @pytest.fixture(scope="module")

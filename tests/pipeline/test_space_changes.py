@@ -7,13 +7,13 @@ import pytest
 from choices import options
 
 import stillmap
-from stillmap.checkpoint.packing import packed, unpacked
-from stillmap.options import replaced
-from stillmap.output.report_changes import changes_section
-from stillmap.pipeline import Options
-from stillmap.simulation import CrowdOptions, LidarOptions, RobotOptions, Scene, simulate
-from stillmap.simulation.scene import Stay, Thing
-from stillmap.simulation.walls import box
+from stillmap.core.config import replaced
+from stillmap.pipeline.checkpoint_files import packed, unpacked
+from stillmap.pipeline.options import Options
+from stillmap.results.report.maps import changes_section
+from stillmap.sim import CrowdOptions, LidarOptions, RobotOptions, Scene, simulate
+from stillmap.sim.scene import Stay, Thing
+from stillmap.sim.walls import box
 
 LISTED = replaced(Options(), {"em": {"changes": {"in_space": True}}})
 LEFT, CAME = (3.0, 2.0), (-3.0, 2.0)  # m, where they stand

@@ -1,6 +1,6 @@
 import time
 
-from stillmap.stages import Stages
+from stillmap.core.profiling import Stages
 
 
 def busy(seconds):

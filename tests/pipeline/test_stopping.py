@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap import _core, em, pipeline, se2, slam
-from stillmap.options import replaced
-from stillmap.pipeline import Iteration, Options
+from stillmap import _core, em, slam
+from stillmap.core import se2
+from stillmap.core.config import replaced
+from stillmap.pipeline import em_loop
+from stillmap.pipeline.em_loop import Iteration
+from stillmap.pipeline.options import Options
 
 
 def options(estimator="stillmap", **changes):
@@ -35,7 +38,7 @@ def build(monkeypatch, short):
                 share = changed[number - 1] if changed else 0.5 / number
                 yield made_up(recording, number, bound * recording.n_beams, share)
 
-        monkeypatch.setattr(pipeline, "iterate", fake)
+        monkeypatch.setattr(em_loop, "iterate", fake)
         return stillmap.build(recording, chosen), len(asked)
 
     return run

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap import se2, slam
-from stillmap.options import replaced
-from stillmap.pipeline import Options
+from stillmap import slam
+from stillmap.core import se2
+from stillmap.core.config import replaced
+from stillmap.pipeline.options import Options
 
 # so short a way that there is something to close after a metre, and wheels that are believed
 CHOSEN = replaced(

@@ -6,7 +6,7 @@ from choices import RESOLUTION, options
 
 import stillmap
 from stillmap import _core, em
-from stillmap.evaluation.labels import label_scores
+from stillmap.eval.labels import label_scores
 
 
 @pytest.fixture

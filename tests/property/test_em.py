@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import reference
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stillmap import _core, reference
+from stillmap import _core
 
 both = pytest.mark.parametrize("kernels", [reference, _core])
 worlds_of = settings(max_examples=40, deadline=None, derandomize=True, database=None)

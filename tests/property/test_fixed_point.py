@@ -7,8 +7,9 @@ m* = max(0, (p (1 + r) - 1) / (2 p - 1)), e* = m* / r: p is a threshold (1 - p) 
 
 import numpy as np
 import pytest
+import reference
 
-from stillmap import _core, reference
+from stillmap import _core
 
 # hits in a cell and the length of the passages through it, in cells
 COUNTS = [(1, 0.0), (5, 1.0), (2, 0.75), (3, 2.0), (2, 3.0), (1, 4.0), (1, 9.0)]

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from stillmap import _core, se3
+from stillmap import _core
+from stillmap.core import se3
 
 FIT = {"least": 4.0, "flat": 0.2, "wide": 0.02, "sigma": 0.03, "kernel": 3.0, "gain": 0.5}
 STEPS = {"start_level": 1, "start_slack": 0.1, "max_iterations": 20, "tolerance": 1e-6}

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import se2, se3
-from stillmap.recording.model import Recording
+from stillmap.core import se2, se3
+from stillmap.core.recording import Recording
 
 Float = NDArray[np.float64]
 

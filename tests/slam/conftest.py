@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap import _core, se2
-from stillmap.simulation.laser import Movers, beam_angles, cast
-from stillmap.simulation.walls import box, pillar, polyline
-from stillmap.slam.scans import SurfaceOptions
+from stillmap import _core
+from stillmap.core import se2
+from stillmap.sim.laser import Movers, beam_angles, cast
+from stillmap.sim.walls import box, pillar, polyline
+from stillmap.slam.scan_matching import SurfaceOptions
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from stillmap import se2
-from stillmap.simulation import RobotOptions, Scene, simulate
-from stillmap.simulation.scene import CrowdOptions, OdometryOptions
-from stillmap.slam import SlamOptions, keyframes
-from stillmap.slam.loops import Track
+from stillmap.core import se2
+from stillmap.sim import RobotOptions, Scene, simulate
+from stillmap.sim.options import CrowdOptions, OdometryOptions
+from stillmap.slam import SlamOptions, local_map
+from stillmap.slam.loop_types import Track
 
 OPTIONS = SlamOptions()
 
@@ -29,9 +29,9 @@ def driven(walls, route, laser, speed=1.0):
         simulation.recording,
         np.full(simulation.recording.n_beams, 0.9, np.float32),
         poses,
-        keyframes.travel(poses),
+        local_map.travel(poses),
         np.ones(len(poses)),
-        keyframes.chosen(poses, 1.0, 0.5),
+        local_map.chosen(poses, 1.0, 0.5),
         0.05,
         OPTIONS.registration,
         OPTIONS.surface,

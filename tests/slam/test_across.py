@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from driven import driven
 
-from stillmap import _core, se2
-from stillmap.simulation.scene import LaserOptions
-from stillmap.simulation.walls import box
-from stillmap.slam import candidates
-from stillmap.slam.loops import Candidate
-from stillmap.slam.scans import Scan
-from stillmap.slam.verification import _before, _comparable, attempts, laid_on, local_map
+from stillmap import _core
+from stillmap.core import se2
+from stillmap.sim.options import LaserOptions
+from stillmap.sim.walls import box
+from stillmap.slam import loop_candidates
+from stillmap.slam.loop_types import Candidate
+from stillmap.slam.loop_verification import _before, _comparable, attempts, laid_on, local_map
+from stillmap.slam.scan_matching import Scan
 
 
 @functools.cache
@@ -75,8 +76,10 @@ def street():
 
 def test_who_comes_back_on_the_other_side_of_a_street_has_seen_it_before():
     track = street()
-    looks = candidates.looks(track)
-    asked = list(candidates.of_stage(track, track.poses[track.keyframes], looks, 0, len(looks), []))
+    looks = loop_candidates.looks(track)
+    asked = list(
+        loop_candidates.of_stage(track, track.poses[track.keyframes], looks, 0, len(looks), [])
+    )
     # never nearer than that
     assert min(np.linalg.norm(c.T[:2, 2]) for c in asked if track.travelled[c.later] > 90.0) > 9.9
     found = [c for c in attempts(track, asked) if not c.refused]
@@ -94,7 +97,7 @@ def test_where_a_keyframe_looks_by_hand():
     hit = track.recording.hit[beams]
     # weights are all alike; the laser sits 8 cm ahead of the middle of the robot
     expected = track.recording.points[beams][hit].mean(axis=0)
-    np.testing.assert_allclose(candidates.looks(track)[k] - (0.08, 0.0), expected, atol=1e-4)
+    np.testing.assert_allclose(loop_candidates.looks(track)[k] - (0.08, 0.0), expected, atol=1e-4)
 
 
 def test_comparable_is_what_was_looked_at_from_the_same_side():

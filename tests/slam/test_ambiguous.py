@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from driven import driven
 
-from stillmap import se2
-from stillmap.simulation.scene import LaserOptions
-from stillmap.simulation.walls import box
-from stillmap.slam.loops import Candidate
-from stillmap.slam.verification import _ambiguous, laid_on, local_map
+from stillmap.core import se2
+from stillmap.sim.options import LaserOptions
+from stillmap.sim.walls import box
+from stillmap.slam.loop_types import Candidate
+from stillmap.slam.loop_verification import _ambiguous, laid_on, local_map
 
 
 @functools.cache

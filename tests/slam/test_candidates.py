@@ -6,18 +6,26 @@ from itertools import accumulate, pairwise
 import numpy as np
 import pytest
 
-from stillmap import _core, se2
-from stillmap.evaluation.trajectory import absolute_errors
-from stillmap.recording.model import Recording
-from stillmap.simulation import RobotOptions, Scene, simulate
-from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
-from stillmap.simulation.walls import box
-from stillmap.slam import SlamOptions, keyframes, loops, registration, verification
-from stillmap.slam.candidates import looks, metres_to, of_stage, stages
-from stillmap.slam.chain import agreeing, agreeing_since, relations
-from stillmap.slam.closing import closed
-from stillmap.slam.incremental import Mapped
-from stillmap.slam.loops import Closure, LoopOptions, Track
+from stillmap import _core
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.eval.trajectory import absolute_errors
+from stillmap.sim import RobotOptions, Scene, simulate
+from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.sim.walls import box
+from stillmap.slam import SlamOptions, local_map, loop_types, loop_verification, scan_matching
+from stillmap.slam.loop_candidates import (
+    agreeing,
+    agreeing_since,
+    looks,
+    metres_to,
+    of_stage,
+    relations,
+    stages,
+)
+from stillmap.slam.loop_closure import closed
+from stillmap.slam.loop_types import Closure, LoopOptions, Track
+from stillmap.slam.odometry_2d import Mapped
 
 OPTIONS = SlamOptions()
 # as sure as 5 m of travel
@@ -186,13 +194,13 @@ def missed(T, truth, candidate):
 
 def test_loops_are_looked_for_where_those_before_put_them(monkeypatch):
     asked = []
-    attempts = verification.attempts
+    attempts = loop_verification.attempts
 
     def recorded(track, candidates):
         asked.append(list(candidates))
         return attempts(track, asked[-1])
 
-    monkeypatch.setattr(verification, "attempts", recorded)
+    monkeypatch.setattr(loop_verification, "attempts", recorded)
     recording, truth, poses = rounds(drift=4.0)
     e = np.full(recording.n_beams, 0.9, np.float32)
     told = []
@@ -210,31 +218,31 @@ def test_loops_are_looked_for_where_those_before_put_them(monkeypatch):
 
 def test_a_scan_is_laid_where_the_candidate_says():
     recording, truth, poses = rounds(drift=4.0)
-    frames = keyframes.chosen(poses, 1.0, 0.5)
-    later = int(frames[np.searchsorted(keyframes.travel(poses)[frames], 60.0)])
+    frames = local_map.chosen(poses, 1.0, 0.5)
+    later = int(frames[np.searchsorted(local_map.travel(poses)[frames], 60.0)])
     earlier = min(range(200), key=lambda t: np.linalg.norm(truth[t] - truth[later]))
     track = dataclasses.replace(
         track_of(poses),
         recording=recording,
         e=np.full(recording.n_beams, 0.9, np.float32),
-        travelled=keyframes.travel(poses),
+        travelled=local_map.travel(poses),
         keyframes=frames,
     )
     T = se2.inverse(truth[earlier]) @ truth[later]
-    (found,) = verification.attempts(track, [loops.Candidate(earlier, later, T, 0.0)])
+    (found,) = loop_verification.attempts(track, [loop_types.Candidate(earlier, later, T, 0.0)])
     assert missed(se2.inverse(poses[earlier]) @ poses[later], truth, found) > 0.5
     assert missed(found.T, truth, found) < 0.05  # though no more than 0.2 m are searched
 
 
 def test_a_round_passed_again_is_not_searched_more_widely(monkeypatch):
     windows = []
-    search = registration.search
+    search = scan_matching.search
 
     def recorded(grid, scan, prior, options, translation, rotation):
         windows.append(translation)
         return search(grid, scan, prior, options, translation, rotation)
 
-    monkeypatch.setattr(registration, "search", recorded)
+    monkeypatch.setattr(scan_matching, "search", recorded)
     recording, truth, poses = rounds()
     e = np.full(recording.n_beams, 0.9, np.float32)
 

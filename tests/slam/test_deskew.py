@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from stillmap import se2
-from stillmap.recording.model import Recording
+from stillmap.core import se2
+from stillmap.core.recording import Recording
 from stillmap.slam import SlamOptions, deskewed
 
 Float = NDArray[np.float64]

@@ -6,14 +6,15 @@ import functools
 import numpy as np
 import pytest
 
-from stillmap import _core, em, se2
-from stillmap.evaluation.trajectory import absolute_errors
-from stillmap.recording.model import Recording
-from stillmap.simulation import RobotOptions, Scene, scene_by_name, simulate
-from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
-from stillmap.simulation.walls import box
-from stillmap.slam import SlamOptions, incremental, m_step
-from stillmap.slam.loops import LoopOptions
+from stillmap import _core, em
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.eval.trajectory import absolute_errors
+from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
+from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.sim.walls import box
+from stillmap.slam import SlamOptions, m_step, odometry_2d
+from stillmap.slam.loop_types import LoopOptions
 
 OPTIONS = SlamOptions()
 
@@ -27,7 +28,7 @@ def prior(recording):
 
 
 def build(recording, e=None):
-    return incremental.build(recording, prior(recording) if e is None else e, OPTIONS, silent)
+    return odometry_2d.build(recording, prior(recording) if e is None else e, OPTIONS, silent)
 
 
 @functools.cache
@@ -234,7 +235,7 @@ def test_one_scan():
 def test_progress_counts_every_scan():
     recording = small_room(scans=10).recording
     told = []
-    incremental.build(recording, prior(recording), OPTIONS, lambda *at: told.append(at))
+    odometry_2d.build(recording, prior(recording), OPTIONS, lambda *at: told.append(at))
     assert told == [(t, 10) for t in range(1, 11)]
 
 

@@ -5,8 +5,9 @@ import functools
 import numpy as np
 import pytest
 
-from stillmap import _core, se2
-from stillmap.simulation import scene_by_name, simulate
+from stillmap import _core
+from stillmap.core import se2
+from stillmap.sim import scene_by_name, simulate
 from stillmap.slam import SlamOptions
 from stillmap.slam.local_map import LocalMap
 

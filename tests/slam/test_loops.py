@@ -6,16 +6,17 @@ import functools
 import numpy as np
 import pytest
 
-from stillmap import _core, em, se2
-from stillmap.evaluation.trajectory import absolute_errors
-from stillmap.simulation import RobotOptions, Scene, scene_by_name, simulate
-from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
-from stillmap.simulation.walls import box
-from stillmap.slam import SlamOptions, incremental, keyframes, loops, m_step
-from stillmap.slam.chain import agreeing, relations
-from stillmap.slam.closing import closed
-from stillmap.slam.incremental import Mapped
-from stillmap.slam.loops import Closure, LoopOptions, Track
+from stillmap import _core, em
+from stillmap.core import se2
+from stillmap.eval.trajectory import absolute_errors
+from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
+from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.sim.walls import box
+from stillmap.slam import SlamOptions, local_map, loop_types, m_step, odometry_2d
+from stillmap.slam.loop_candidates import agreeing, relations
+from stillmap.slam.loop_closure import closed
+from stillmap.slam.loop_types import Closure, LoopOptions, Track
+from stillmap.slam.odometry_2d import Mapped
 
 OPTIONS = SlamOptions()
 OPEN = dataclasses.replace(OPTIONS, loops=dataclasses.replace(OPTIONS.loops, enabled=False))
@@ -191,10 +192,10 @@ def test_a_closure_on_its_own_is_refused():
 def test_a_way_that_odometry_contradicts_is_loose():
     simulation = square()
     recording, poses = simulation.recording, simulation.truth.T_world_base.copy()
-    frames = keyframes.chosen(poses, 1.0, 0.5)
+    frames = local_map.chosen(poses, 1.0, 0.5)
     at = int(frames[5]) + 1
     poses[at:] = se2.matrix(0.0, 0.8, 0.0) @ poses[at:]  # a leap of 0.8 m in the map's y
-    track = track_of(recording, poses, keyframes.travel(poses), frames)
+    track = track_of(recording, poses, local_map.travel(poses), frames)
     way = relations(track, OPTIONS.motion, [])
     widths = np.array([np.sqrt(np.linalg.eigvalsh(r.covariance[:2, :2]).max()) for r in way])
     assert widths[5] == pytest.approx(0.8, abs=0.1)
@@ -205,7 +206,7 @@ def test_corrections_spread_between_keyframes():
     poses = se2.matrix(np.arange(11.0), 0.0, 0.0)
     frames = np.array([0, 10])
     moved = se2.matrix(np.array([0.0, 10.0]), np.array([0.0, 1.0]), 0.0)
-    spread = se2.parameters(keyframes.spread(poses, frames, moved))
+    spread = se2.parameters(local_map.spread(poses, frames, moved))
     np.testing.assert_allclose(spread[:, 1], np.arange(11) / 10, atol=1e-5)
     np.testing.assert_allclose(spread[:, 0], np.arange(11), atol=1e-9)
 
@@ -213,18 +214,18 @@ def test_corrections_spread_between_keyframes():
 def test_keyframes_by_hand():
     # a metre a scan, two scans turning by 0.3 rad each, one on the spot
     x = se2.matrix([0, 1, 2, 2, 2, 2], 0.0, [0, 0, 0, 0.3, 0.6, 0.6])
-    assert keyframes.chosen(x, 1.0, 0.5).tolist() == [0, 1, 2, 4, 5]
-    assert keyframes.chosen(x[:1], 1.0, 0.5).tolist() == [0]
-    assert keyframes.travel(x).tolist() == [0, 1, 2, 2, 2, 2]
+    assert local_map.chosen(x, 1.0, 0.5).tolist() == [0, 1, 2, 4, 5]
+    assert local_map.chosen(x[:1], 1.0, 0.5).tolist() == [0]
+    assert local_map.travel(x).tolist() == [0, 1, 2, 2, 2, 2]
 
 
 def test_scans_of_each_laser_are_chosen_by_themselves():
     x = np.tile(np.eye(3), (8, 1, 1))
     x[:, 0, 2] = 0.3 * np.arange(8)
     sensor = np.array([0, 1, 0, 1, 0, 1, 0, 1])
-    frames = keyframes.chosen_of_each(x, sensor, 1.0, 0.5)
+    frames = local_map.chosen_of_each(x, sensor, 1.0, 0.5)
     assert frames.tolist() == [0, 1, 4, 5, 6, 7]
-    assert keyframes.chosen_of_each(x, 0 * sensor, 1.0, 0.5).tolist() == [0, 4, 7]
+    assert local_map.chosen_of_each(x, 0 * sensor, 1.0, 0.5).tolist() == [0, 4, 7]
 
 
 def test_the_grid_is_what_the_poses_make():
@@ -273,7 +274,7 @@ def test_the_graph_is_what_was_found():
 def test_without_loops_poses_are_incremental():
     simulation = square()
     e = np.full(simulation.recording.n_beams, 0.9, np.float32)
-    plain = incremental.build(simulation.recording, e, OPEN, silent)
+    plain = odometry_2d.build(simulation.recording, e, OPEN, silent)
     found = mapped(simulation, OPEN)
     np.testing.assert_array_equal(found.poses, plain.poses)
     assert found.loops == []
@@ -310,7 +311,7 @@ def test_corridors_close(seed):
 
 def test_drift_grows_with_the_way_and_then_no_more():
     options = LoopOptions(drift_until=500.0)
-    near, far, lost = (loops.drift(metres, options) for metres in (50.0, 500.0, 1e6))
+    near, far, lost = (loop_types.drift(metres, options) for metres in (50.0, 500.0, 1e6))
     assert near < far == lost
     assert lost == pytest.approx((500 * 0.006, 500 * 0.0003), rel=0.03)
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from boxes import Boxes, Lidar, Way, recorded
 
-from stillmap import se2, se3
-from stillmap.evaluation.trajectory import absolute_errors
-from stillmap.slam import loops3d, spinning
-from stillmap.slam.motion import MotionOptions
+from stillmap.core import se2, se3
+from stillmap.eval.trajectory import absolute_errors
+from stillmap.slam import lidar_odometry, loop_closure_3d
+from stillmap.slam.motion_model import MotionOptions
 from stillmap.slam.pose_graph import Relation, Robust, misfits, optimised
 
 LIDAR = Lidar(rings=16, columns=180, period=0.2, reach=40.0)
@@ -39,8 +39,8 @@ def round_the_block():
 def drive():
     """A recording, its true poses, e, and what odometry without any error would find."""
     recording, truth, e = recorded(block(), LIDAR, round_the_block(), 200, seed=1)
-    options = spinning.SpinningOptions()
-    driven = spinning.build(recording, e, options, MotionOptions(), _silent, 1)
+    options = lidar_odometry.SpinningOptions()
+    driven = lidar_odometry.build(recording, e, options, MotionOptions(), _silent, 1)
     assert absolute_errors(driven.poses, truth).rmse < 0.1
     return recording, truth, e, driven
 
@@ -60,8 +60,10 @@ def drifted(driven, per_step):
 
 def closed(drive, driven, **changes):
     recording, _, e, _ = drive
-    options = replace(loops3d.SpinningLoopOptions(), **changes)
-    return loops3d.closed(recording, e, spinning.SpinningOptions(), options, driven, _silent, 1)
+    options = replace(loop_closure_3d.SpinningLoopOptions(), **changes)
+    return loop_closure_3d.closed(
+        recording, e, lidar_odometry.SpinningOptions(), options, driven, _silent, 1
+    )
 
 
 def test_drift_is_taken_out(drive):
@@ -106,7 +108,7 @@ def test_a_street_is_not_every_street():
     twists = np.zeros((400, 6))
     twists[:, 0] = 4.0
     recording, truth, e = recorded(Boxes.of(rows), LIDAR, Way(np.eye(4), twists, 0.1), 110, seed=2)
-    straight = spinning.Driven(
+    straight = lidar_odometry.Driven(
         truth, np.tile(twists[0], (110, 1)), np.zeros((110, 6, 6)), np.full(110, 0.8)
     )
     wrong = truth.copy()

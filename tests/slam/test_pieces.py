@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from stillmap import se2
-from stillmap.evaluation.trajectory import absolute_errors
-from stillmap.simulation import RobotOptions, Scene, scene_by_name, simulate
-from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
-from stillmap.simulation.walls import box, pillar
+from stillmap.core import se2
+from stillmap.eval.trajectory import absolute_errors
+from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
+from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.sim.walls import box, pillar
 from stillmap.slam import SlamOptions, m_step
-from stillmap.slam.pieces import separated
+from stillmap.slam.relocalization import separated
 
 OPTIONS = SlamOptions()
 

@@ -7,12 +7,12 @@ from itertools import accumulate
 import numpy as np
 import pytest
 
-from stillmap import se2
-from stillmap.evaluation.trajectory import absolute_errors
-from stillmap.simulation import RobotOptions, Scene, scene_by_name, simulate
-from stillmap.simulation.scene import CrowdOptions, LaserOptions, OdometryOptions
-from stillmap.simulation.walls import box
-from stillmap.slam import SlamOptions, incremental, m_step
+from stillmap.core import se2
+from stillmap.eval.trajectory import absolute_errors
+from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
+from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
+from stillmap.sim.walls import box
+from stillmap.slam import SlamOptions, m_step, odometry_2d
 
 OPTIONS = SlamOptions()
 
@@ -23,7 +23,7 @@ def silent(*_):
 
 def followed(recording):
     e = np.full(recording.n_beams, 0.9, np.float32)
-    return incremental.build(recording, e, OPTIONS, silent)
+    return odometry_2d.build(recording, e, OPTIONS, silent)
 
 
 @functools.cache

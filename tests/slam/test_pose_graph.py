@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap import se2
+from stillmap.core import se2
 from stillmap.slam.pose_graph import Relation, Robust, misfits, optimised
 
 SURE = np.diag([1e-4, 1e-4, 1e-6])

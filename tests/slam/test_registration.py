@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from stillmap import _core, se2
-from stillmap.slam.motion import MotionPrior
-from stillmap.slam.registration import RegistrationOptions, register, search
-from stillmap.slam.scans import Scan
+from stillmap import _core
+from stillmap.core import se2
+from stillmap.slam.motion_model import MotionPrior
+from stillmap.slam.scan_matching import RegistrationOptions, Scan, register, search
 
 OPTIONS = RegistrationOptions()
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from boxes import Boxes, Lidar, Way, at_once, recorded
 
-from stillmap import _core, se2, se3
-from stillmap.evaluation.trajectory import absolute_errors, relative_errors
-from stillmap.slam import spinning, steady
-from stillmap.slam.motion import MotionOptions
+from stillmap import _core
+from stillmap.core import se2, se3
+from stillmap.eval.trajectory import absolute_errors, relative_errors
+from stillmap.slam import constant_velocity, lidar_odometry
+from stillmap.slam.motion_model import MotionOptions
 
 ROOM = [
     [0.0, 0.0, 1.0, 16.0, 11.0, 3.2, 0, 0, 0],
@@ -36,8 +37,8 @@ def _silent(*_):
 
 def built(recording, e=None, threads=1, **changes):
     e = np.ones(recording.n_beams, np.float32) if e is None else e
-    options = replace(spinning.SpinningOptions(), **changes)
-    return spinning.build(recording, e, options, MotionOptions(), _silent, threads)
+    options = replace(lidar_odometry.SpinningOptions(), **changes)
+    return lidar_odometry.build(recording, e, options, MotionOptions(), _silent, threads)
 
 
 @pytest.fixture(scope="module")
@@ -116,11 +117,11 @@ def test_odometry_holds_where_nothing_is_seen():
 
 
 def test_odometry_that_lies_is_disbelieved():
-    state = steady.at_first(np.array([1.0, 0, 0, 0, 0, 0]), 0.2, 0.2)
+    state = constant_velocity.at_first(np.array([1.0, 0, 0, 0, 0, 0]), 0.2, 0.2)
     options = MotionOptions()
     leap = se3.exp(np.array([3.0, 0, 0, 0, 0, 0]))
-    assert steady.told(state, leap, 0.1, options) is state
-    true = steady.told(state, se3.exp(np.array([0.12, 0, 0, 0, 0, 0])), 0.1, options)
+    assert constant_velocity.told(state, leap, 0.1, options) is state
+    true = constant_velocity.told(state, se3.exp(np.array([0.12, 0, 0, 0, 0, 0])), 0.1, options)
     assert 1.0 < true.twist[0] < 1.2
 
 
@@ -142,7 +143,7 @@ def test_memory_is_bounded_by_the_reach():
     sizes = []
     for t, x in enumerate(np.arange(0.0, 120.0, 3.0)):
         T = se3.exp(np.array([x, 0, 0, 0, 0, 0]))
-        sweep = spinning.sweep_of(recording, e, t, 20.0, 0.2)
+        sweep = lidar_odometry.sweep_of(recording, e, t, 20.0, 0.2)
         local.add(sweep.points, sweep.weights, T)
         local.keep_near(T, 20.0)
         sizes.append(len(local))

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillmap import recording as recordings
-from stillmap import se2
-from stillmap.output.beams import write_beams
-from stillmap.output.clouds import write_clouds
-from stillmap.output.map_npz import write_npz
-from stillmap.recording.tum import write_tum
+from stillmap import io as recordings
+from stillmap.core import se2
+from stillmap.core.arrays import write_npz
+from stillmap.io.trajectory import write_tum
+from stillmap.results.points import write_beams, write_clouds
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 

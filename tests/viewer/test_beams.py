@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stillmap.recording import read
-from stillmap.recording.poses import poses_from_tum
+from stillmap.io import read
+from stillmap.io.trajectory import poses_from_tum
 from stillmap.slam import SlamOptions, deskewed
-from stillmap.viewer.beams import Beams, part
+from stillmap.viewer.tracks import Beams, part
 
 
 @pytest.fixture(params=[(2, False), (2, True), (3, False), (3, True)])

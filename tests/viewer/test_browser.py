@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stillmap.output.meshes import write_glb
-from stillmap.output.stills import BACKGROUND
-from stillmap.texture.options import TextureOptions
-from stillmap.texture.textured import Textured
+from stillmap.mesh.options import TextureOptions
+from stillmap.mesh.texture.atlas import Textured
+from stillmap.results.gltf import write_glb
+from stillmap.results.report.renders import BACKGROUND
 from stillmap.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")

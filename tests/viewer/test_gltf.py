@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from made_up_models import glb_of
 
-from stillmap.errors import InputError
-from stillmap.viewer.gltf import MAP_FROM_GLTF, require_whole
+from stillmap.core.errors import InputError
+from stillmap.results.gltf import MAP_FROM_GLTF, require_whole
 
 
 def refusal(path, data, most=1 << 20):

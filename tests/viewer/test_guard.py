@@ -2,7 +2,7 @@
 
 import pytest
 
-from stillmap.viewer.guard import is_ours, policy
+from stillmap.viewer.server import is_ours, policy
 
 
 @pytest.mark.parametrize(

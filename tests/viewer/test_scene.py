@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from stillmap.errors import InputError
-from stillmap.output.clouds import COLOURS, FIELDS, ply_header, put_colours
-from stillmap.output.report_figures import ORANGE, UNKNOWN
+from stillmap.core.errors import InputError
+from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
+from stillmap.results.report.figures import ORANGE, UNKNOWN
 from stillmap.viewer import scene as module
-from stillmap.viewer.framing import framing
 from stillmap.viewer.scene import read_scene
+from stillmap.viewer.window import framing
 
 
 def test_a_result_in_the_plane(result_of):

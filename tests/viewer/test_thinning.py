@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from stillmap.errors import InputError
-from stillmap.output.clouds import ply_header
-from stillmap.viewer.thinning import chosen, points_in
+from stillmap.core.errors import InputError
+from stillmap.results.points import ply_header
+from stillmap.viewer.display import chosen, points_in
 
 
 def test_all_are_taken_where_there_are_few():

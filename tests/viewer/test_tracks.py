@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.export.result import Track
+from stillmap.results.reader import Track
 from stillmap.viewer.tracks import edges, headings, is_there, placed, pose_at, ways
 
 NOW = 1_700_000_000_000_000_000

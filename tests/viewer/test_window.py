@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillmap.errors import InputError
-from stillmap.recording import read
-from stillmap.recording.poses import poses_from_tum
+from stillmap.core.errors import InputError
+from stillmap.io import read
+from stillmap.io.trajectory import poses_from_tum
 from stillmap.slam import SlamOptions
 from stillmap.viewer import scene as scenes
-from stillmap.viewer.beams import Beams
 from stillmap.viewer.scene import read_scene
+from stillmap.viewer.tracks import Beams
 
 viser = pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 sockets = pytest.importorskip("websockets.sync.client")

@@ -5,8 +5,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
-from stillmap.cli.commands import COMMANDS
-from stillmap.cli.parsing import Parser
+from stillmap.cli.parser import COMMANDS, Parser
 
 _EPILOG = """to install it:
   bash  stillmap completion bash > ~/.local/share/bash-completion/completions/stillmap

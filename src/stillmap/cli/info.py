@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from stillmap.cli.commands import COMMANDS
-from stillmap.cli.progress import shown_share
-from stillmap.cli.reading import add_read_flags, read_changes
+from stillmap.cli.arguments import add_read_flags, read_changes
+from stillmap.cli.console import shown_share
+from stillmap.cli.parser import COMMANDS
 
 _LINES_SHOWN = 10
 _EPILOG = """examples:
@@ -41,11 +41,12 @@ def run(args: argparse.Namespace) -> int:
         InputError: it could not.
     """
     # these take long to load
-    from stillmap import options
-    from stillmap.recording import ReadOptions, read
-    from stillmap.recording.facts import facts
+    from stillmap.cli.recording_info import facts
+    from stillmap.core import config
+    from stillmap.io import read
+    from stillmap.preprocessing.options import ReadOptions
 
-    read_options = options.replaced(ReadOptions(), read_changes(args).get("read", {}))
+    read_options = config.replaced(ReadOptions(), read_changes(args).get("read", {}))
     with shown_share(args.quiet, "reading") as tell:
         recording = read(args.input, read_options, progress=tell)
     found = {"input": args.input, **facts(recording)}
@@ -94,7 +95,7 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
 
 
 def _time(time: dict[str, Any]) -> Iterator[str]:
-    from stillmap.recording.stamps import seconds_text
+    from stillmap.core.timestamps import seconds_text
 
     first, last = (seconds_text(time[key]) for key in ("first_stamp_ns", "last_stamp_ns"))
     rate = f", {time['rate_hz']:.2f} scans/s" if time["rate_hz"] else ""
@@ -112,7 +113,7 @@ def _odometry(odometry: dict[str, Any] | None) -> Iterator[str]:
         "odometry",
         f"path {odometry['path_length_m']:.2f} m, turned {odometry['turned_deg']:.0f} deg{origin}",
     )
-    from stillmap.recording.stamps import seconds_text
+    from stillmap.core.timestamps import seconds_text
 
     at = odometry["largest_step_at_ns"]
     if at is not None:

@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.commands import COMMANDS
-from stillmap.cli.options import add_set, assignments
-from stillmap.cli.printing import files_in, print_json
-from stillmap.cli.progress import say, shown_share
-from stillmap.errors import InputError
+from stillmap.cli.config import add_set, assignments
+from stillmap.cli.console import files_in, print_json, say, shown_share
+from stillmap.cli.parser import COMMANDS
+from stillmap.core.errors import InputError
 
 if TYPE_CHECKING:
-    from stillmap.simulation import Simulation
+    from stillmap.sim import Simulation
 
 _SCENES = {
     "hall": "45 x 30 m, 15 people",
@@ -151,7 +150,7 @@ def _scene_names(**_: Any) -> Iterator[str]:
 
 
 def _assignments(prefix: str, **_: Any) -> Iterator[str]:
-    from stillmap.simulation import scene_by_name
+    from stillmap.sim import scene_by_name
 
     found = assignments(scene_by_name("hall"), prefix)
     return (text for text in found if "." in text)  # what is no section is the scene's geometry
@@ -165,15 +164,9 @@ def run(args: argparse.Namespace) -> int:
     """
     import numpy as np  # this and what follows takes long to load
 
-    from stillmap.output.atomic import require_new
-    from stillmap.simulation import scene_by_name, simulate, simulate_rig
-    from stillmap.simulation.writing import (
-        MARK,
-        RIG_MARK,
-        require_carmen,
-        write_rig,
-        write_simulation,
-    )
+    from stillmap.core.files import require_new
+    from stillmap.sim import scene_by_name, simulate, simulate_rig
+    from stillmap.sim.writer import MARK, RIG_MARK, require_carmen, write_rig, write_simulation
 
     scene = scene_by_name(args.scene, _changes(args))
     if args.seed < 0:
@@ -207,8 +200,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _changes(args: argparse.Namespace) -> dict[str, Any]:
-    from stillmap.options import merged, parse_assignment
-    from stillmap.simulation import scene_by_name
+    from stillmap.core.config import merged, parse_assignment
+    from stillmap.sim import scene_by_name
 
     changes: dict[str, dict[str, Any]] = {}
     for flag, _, _, section, key, _ in _FLAGS:
@@ -250,7 +243,7 @@ def _give_to_lidar(channels: str, changes: dict[str, dict[str, Any]]) -> None:
 
 def _summary(made: "list[Simulation]", output: Path) -> dict[str, Any]:
     """What there is of one recording, or of several taken at the same stamps."""
-    from stillmap.recording.spool import blocks
+    from stillmap.core.arrays import blocks
 
     hits = [one.recording.hit for one in made]
     movers = [one.truth.mover for one in made]

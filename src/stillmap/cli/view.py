@@ -1,16 +1,53 @@
-"""`stillmap view DIR`: look at a result."""
+"""`stillmap view DIR`: look at a result.
+
+The browser of whoever sits here.
+
+What `stillmap view` does once it is known what is wanted: a page that shows a result.
+"""
 
 import argparse
 import os
+import sys
+import threading
+from dataclasses import replace
 from pathlib import Path
 
-from stillmap.cli.browser import opened
-from stillmap.cli.commands import COMMANDS
-from stillmap.cli.progress import say
-from stillmap.errors import InputError
-from stillmap.extras import MissingExtra, extra
+from stillmap.cli.arguments import Mapped, found, is_deskewed
+from stillmap.cli.console import say, shown_share
+from stillmap.cli.parser import COMMANDS
+from stillmap.core.errors import InputError, MissingExtra, extra
+from stillmap.io.trajectory import poses_from_tum
+from stillmap.slam import SlamOptions
+from stillmap.viewer.scene import read_scene
+from stillmap.viewer.tracks import Beams
+from stillmap.viewer.window import Window
+
+
+def has_screen() -> bool:
+    """Whether there is one to open: without a screen it would be one of text in the terminal."""
+    screens = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
+    return sys.platform == "darwin" or any(os.environ.get(name) for name in screens)
+
+
+def opened(address: str) -> bool:
+    """Open an address; whether that went well. Some browsers come back when they are closed."""
+    if not has_screen():
+        return False
+    import webbrowser
+
+    return webbrowser.open(address)
+
+
+def opened_beside(address: str) -> bool:
+    """The same without waiting for it; whether there is a screen."""
+    if has_screen():
+        threading.Thread(target=opened, args=(address,), daemon=True).start()
+        return True
+    return False
+
 
 _REPORT = "report.html"
+
 _LAST_PORT = 65_535
 
 _EPILOG = """examples:
@@ -65,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
             say(f"{error}; the report is shown")
             _show_report(report)
             return 0
-        from stillmap.cli.viewing import viewed  # takes long to load
+        pass  # DROPPED  # takes long to load
 
         viewed(args, Path(args.result))
     return 0
@@ -84,3 +121,40 @@ def _report(folder: Path) -> Path:
     if not report.is_file():
         raise InputError(f"is no result: there is no {_REPORT} in it", where=str(folder), hint=hint)
     return report
+
+
+def viewed(args: argparse.Namespace, folder: Path) -> None:
+    """Serve the page until Ctrl-C.
+
+    Raises:
+        InputError: a file of the result is damaged, or the recording that was named is another.
+    """
+    mapped = found(folder, args.input)
+    scene = read_scene(folder)
+    try:
+        beams = None if args.no_beams else _beams(mapped, args.quiet)
+    except InputError as error:
+        if args.input:
+            raise
+        beams = None
+        say(f"without beams: {error}")
+        scene = replace(scene, notes=[f"Without beams: {error}", *scene.notes])
+    window = Window(scene, beams, args.port)
+    try:
+        where = f"{args.result} is at {window.url}"
+        here = "" if opened_beside(window.url) else "no browser to be had here; "
+        say(f"{here}{where}, until Ctrl-C")
+        while True:
+            window.step()
+    except KeyboardInterrupt:  # that is how it ends
+        pass
+    finally:
+        window.close()
+
+
+def _beams(mapped: Mapped, quiet: bool) -> Beams:
+    with shown_share(quiet, "reading") as tell:
+        recording, labels = mapped.read(tell)
+    poses = poses_from_tum(mapped.folder / "trajectory.tum", recording)
+    slam = SlamOptions(deskew=is_deskewed(mapped.record))
+    return Beams(recording, labels.p_static, poses, slam)

@@ -1,7 +1,7 @@
 """What is static: the E-steps, the map that follows from them, and the likelihood. No I/O."""
 
-from stillmap.em.changed import Changed
-from stillmap.em.courses import Courses
+from stillmap.em.changepoints import Courses
+from stillmap.em.coverage import Evidence, evidence
 from stillmap.em.estimator import (
     IN_SPACE,
     Estimator,
@@ -16,14 +16,13 @@ from stillmap.em.estimator import (
     iterations,
     needs_sums,
 )
-from stillmap.em.evidence import Evidence, evidence
-from stillmap.em.expectations import CellProbabilities, Expectations, Grid, Likelihood, NoReturn
 from stillmap.em.ground import Ground, ground_of
 from stillmap.em.held_out import held_out_log_likelihood
-from stillmap.em.last import last_e_step
-from stillmap.em.looks import look_numbers
-from stillmap.em.occupancy import Box, OccupancyMap, Seen, occupancy_map
+from stillmap.em.observations import look_numbers
+from stillmap.em.occupancy_grid import Box, OccupancyMap, Seen, occupancy_map
+from stillmap.em.occupancy_hmm import last_e_step
 from stillmap.em.options import ChangeOptions, DwellOptions, EmOptions, EvidenceOptions, MapState
+from stillmap.em.types import CellProbabilities, Changed, Expectations, Grid, Likelihood, NoReturn
 
 __all__ = [
     "IN_SPACE",

@@ -5,16 +5,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core
-from stillmap.em import dwell, hit_ratio, paper
-from stillmap.em.chunks import chunks
-from stillmap.em.expectations import Expectations, Grid, NoReturn, per_beam
-from stillmap.em.in_space import e_step_in_space
-from stillmap.em.occupancy import Seen
+import stillmap._core as _core
+from stillmap.core.arrays import blocks
+from stillmap.core.recording import Recording
+from stillmap.em import beam_counting, occupancy_hmm
+from stillmap.em.beam_counting import hit_ratio_e_step, log_likelihood, paper_e_step
+from stillmap.em.observations import chunks
+from stillmap.em.occupancy_grid import Seen
+from stillmap.em.occupancy_hmm import e_step_in_space
 from stillmap.em.options import EmOptions
-from stillmap.em.tracker import on_people
-from stillmap.recording.model import Recording
-from stillmap.recording.spool import blocks
+from stillmap.em.people import on_people
+from stillmap.em.types import Expectations, Grid, NoReturn, per_beam
 
 Float = NDArray[np.float64]
 Estimator = Literal["stillmap", "paper", "hit-ratio", "tracker"]
@@ -69,15 +70,15 @@ def e_step(
 ) -> Expectations:
     """What is static at these poses, and the likelihood of that."""
     if estimator == "paper":
-        return paper.e_step(recording, poses, grid, options.prior, threads)
+        return paper_e_step(recording, poses, grid, options.prior, threads)
     if estimator == "stillmap" and recording.dimension == 3:
         return e_step_in_space(recording, poses, grid.resolution, options, threads)
     if estimator == "stillmap":
-        return dwell.e_step(recording, poses, grid.resolution, options, threads)
+        return occupancy_hmm.e_step(recording, poses, grid.resolution, options, threads)
     if not isinstance(grid, _core.Grid2D):
         raise ValueError(f"estimator: {estimator} knows 2D recordings alone")
     if estimator == "hit-ratio":
-        return hit_ratio.e_step(recording, poses, grid, options.hit_ratio, threads)
+        return hit_ratio_e_step(recording, poses, grid, options.hit_ratio, threads)
     return _tracked(recording, poses, grid.resolution, options, threads)
 
 
@@ -91,8 +92,8 @@ def _tracked(
         e[beams] = per_beam(recording.points[beams], recording.hit[beams], kept, options.prior)
     grid = _core.Grid2D(resolution)
     add_recording(grid, recording, poses, e, threads)
-    likelihood = paper.log_likelihood(recording, poses, grid, e, options.prior, threads)
-    return Expectations(e, likelihood, hit_ratio.kept_cells(grid, options.hit_ratio))
+    likelihood = log_likelihood(recording, poses, grid, e, options.prior, threads)
+    return Expectations(e, likelihood, beam_counting.kept_cells(grid, options.hit_ratio))
 
 
 def add_recording(

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core
-from stillmap.em.chunks import chunks
-from stillmap.em.looks import Surface, blocks_of
-from stillmap.recording.model import Recording
+import stillmap._core as _core
+from stillmap.core.recording import Recording
+from stillmap.em.observations import Surface, blocks_of, chunks
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -6,9 +6,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core
-from stillmap.em.chunks import chunks
-from stillmap.recording.model import Recording
+import stillmap._core as _core
+from stillmap.core.recording import Recording
+from stillmap.em.observations import chunks
 
 Float = NDArray[np.float64]
 

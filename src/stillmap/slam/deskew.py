@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core, se2, se3
-from stillmap.points import finite
-from stillmap.recording.model import Recording
-from stillmap.recording.spool import blocks
-from stillmap.slam import motion
-from stillmap.slam.incremental import SlamOptions
-from stillmap.threads import in_order
+import stillmap._core as _core
+from stillmap.core import se2, se3
+from stillmap.core.arrays import blocks, finite
+from stillmap.core.parallel import in_order
+from stillmap.core.recording import Recording
+from stillmap.slam import motion_model
+from stillmap.slam.odometry_2d import SlamOptions
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -156,7 +156,7 @@ def _twists(recording: Recording, poses: Float, first: Index, second: Index) -> 
 
 def _leaps(poses: Float, first: Index, second: Index) -> NDArray[np.bool_]:
     """(T,) whether there is a step between two scans that no robot goes."""
-    steps = motion.odometry_steps(poses)
+    steps = motion_model.odometry_steps(poses)
     implausible = np.zeros(0, np.bool_) if steps is None else ~steps.plausible
     so_far = np.concatenate([[0], np.cumsum(implausible)])
     return np.asarray(so_far[second] > so_far[first])

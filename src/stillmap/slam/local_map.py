@@ -1,15 +1,22 @@
-"""The map of the last stretch of travel, which scans are registered against as they come."""
+"""The map of the last stretch of travel, which scans are registered against as they come.
+
+Keyframes along the way, and how what is found out about them spreads to the other scans.
+"""
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import _core, se2
-from stillmap.recording.model import Recording
-from stillmap.slam.scans import SurfaceOptions, put
+import stillmap._core as _core
+from stillmap.core import se2, se3
+from stillmap.core.recording import Recording
+from stillmap.slam.scan_matching import SurfaceOptions, put
 
 Float = NDArray[np.float64]
+
+Index = NDArray[np.intp]
 
 
 class LocalMap:
@@ -74,3 +81,69 @@ class LocalMap:
             kept for kept in reversed(self._kept) if self._recording.sensor[kept[0]] == sensor
         )
         return next(of_sensor, None)
+
+
+def travel(poses: Float) -> Float:
+    """(T,) metres travelled up to each of the poses (T, D+1, D+1)."""
+    steps = np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)
+    return np.concatenate([[0.0], steps.cumsum()])
+
+
+def chosen(poses: Float, distance: float, turn: float, breaks: Sequence[int] = ()) -> Index:
+    """(K,) indices of scans about `distance` metres or `turn` radians apart.
+
+    The first and the last one are among them, and those before and after each of the breaks.
+    """
+    metres = np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)
+    kept, since = [0], 0.0
+    for t, step in enumerate(metres / distance + _turns(poses) / turn, start=1):
+        since += step
+        if since >= 1.0:
+            kept.append(t)
+            since = 0.0
+    if kept[-1] != len(poses) - 1:
+        kept.append(len(poses) - 1)
+    beside = [t + side for t in breaks for side in (-1, 0)]
+    return np.unique(np.array([*kept, *beside], np.intp))
+
+
+def _turns(poses: Float) -> Float:
+    """(T-1,) radians from each pose to the next one."""
+    if poses.shape[-1] == 3:
+        return np.abs(se2.wrap(np.diff(se2.parameters(poses)[:, 2])))
+    steps = se3.log_rotation(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
+    turns: Float = np.linalg.norm(steps, axis=-1)
+    return turns
+
+
+def chosen_of_each(
+    poses: Float, sensor: NDArray[np.integer], distance: float, turn: float
+) -> Index:
+    """(K,) indices of scans chosen from those of each sensor (T,): each may see its own side."""
+    of_each = [np.flatnonzero(sensor == s) for s in np.unique(sensor)]
+    return np.sort(
+        np.concatenate([scans[chosen(poses[scans], distance, turn)] for scans in of_each])
+    )
+
+
+def spread(poses: Float, keyframes: Index, moved: Float) -> Float:
+    """(T, D+1, D+1) all poses when the keyframes among them moved to (K, D+1, D+1).
+
+    A scan between two keyframes is carried along by both; how far it is from each, in travel and
+    then in time, says how the two are blended.
+    """
+    if len(keyframes) < 2:
+        return poses
+    at = travel(poses) + 1e-6 * np.arange(len(poses))
+    right = np.clip(np.searchsorted(keyframes, np.arange(len(poses))), 1, len(keyframes) - 1)
+    left = right - 1
+    span = at[keyframes[right]] - at[keyframes[left]]
+    share = ((at - at[keyframes[left]]) / span)[:, None]
+    correction = moved @ se2.inverse(poses[keyframes])
+    one, other = correction[left] @ poses, correction[right] @ poses
+    if poses.shape[-1] == 4:
+        return se3.normalised(one @ se3.exp(share * se3.log(se2.inverse(one) @ other)))
+    x = se2.parameters(one)
+    difference = se2.parameters(other) - x
+    difference[:, 2] = se2.wrap(difference[:, 2])
+    return se2.matrix(*(x + share * difference).T)

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em
-from stillmap.recording.model import Recording
-from stillmap.slam import closing, incremental, loops3d, spinning
+from stillmap.core.recording import Recording
+from stillmap.slam import lidar_odometry, loop_closure, loop_closure_3d, odometry_2d
 from stillmap.slam.deskew import deskewed
-from stillmap.slam.incremental import Mapped, SlamOptions
-from stillmap.slam.sweep import sweep
+from stillmap.slam.odometry_2d import Mapped, SlamOptions
+from stillmap.slam.refinement import sweep
 
 Float = NDArray[np.float64]
 Told = Callable[[str, int, int], None]  # what, scans done, of how many
@@ -65,10 +65,10 @@ def _driven(
     threads: int,
 ) -> Mapped:
     """The same of sweeps in space."""
-    local = spinning.build(
+    local = lidar_odometry.build(
         recording, e, options.spinning, options.motion, partial(progress, "mapping"), threads
     )
-    driven, loops, graph = loops3d.closed(
+    driven, loops, graph = loop_closure_3d.closed(
         recording,
         e,
         options.spinning,
@@ -105,7 +105,7 @@ def _estimated(
         return dataclasses.replace(mapped, explained=start.explained)
     local = _followed(recording, e, options, partial(progress, "mapping"), before)
     seen = deskewed(recording, local.poses, options)
-    closed = closing.closed(seen, e, options, local, partial(progress, "closing loops"))
+    closed = loop_closure.closed(seen, e, options, local, partial(progress, "closing loops"))
     mapped = _swept(recording, e, options, closed, partial(progress, "mapping again"))
     # a scan that went astray explains itself in the map of all: the map so far tells
     return dataclasses.replace(mapped, explained=local.explained)
@@ -123,9 +123,9 @@ def _followed(
     known = recording.T_odom_base if before is None else before
     if known is None and options.deskew and recording.beam_time is not None:
         # scans as they were taken are alike enough to tell how the robot went
-        known = incremental.build(recording, e, options, progress, memory).poses
+        known = odometry_2d.build(recording, e, options, progress, memory).poses
     seen = deskewed(recording, known, options)
-    return incremental.build(seen, e, options, progress, memory)
+    return odometry_2d.build(seen, e, options, progress, memory)
 
 
 def _swept(

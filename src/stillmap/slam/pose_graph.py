@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap import se2, se3
+from stillmap.core import se2, se3
 
 Float = NDArray[np.float64]
 

@@ -7,12 +7,13 @@ import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
-from stillmap.output.stills import BACKGROUND
-from stillmap.viewer import colours, gltf, tracks
-from stillmap.viewer.beams import Beams
+from stillmap.results import gltf
+from stillmap.results.report.renders import BACKGROUND
+from stillmap.viewer import display, tracks
+from stillmap.viewer.display import chosen
 from stillmap.viewer.scene import Scene
 from stillmap.viewer.server import Server
-from stillmap.viewer.thinning import chosen
+from stillmap.viewer.tracks import Beams
 
 Float = NDArray[np.float64]
 
@@ -152,7 +153,7 @@ class Layers:
             places = places + np.array([0.0, 0.0, 2 * _LIFTED])
         use = places[chosen(len(places), _MOST_WAY)]
         pieces = np.stack([use[:-1], use[1:]], axis=1)
-        self._lines("Robot", pieces, np.array(colours.BLUE, np.uint8), 2.5)
+        self._lines("Robot", pieces, np.array(display.BLUE, np.uint8), 2.5)
         length = _AXES * self._across
         self._robot = self._server.scene.add_frame(
             _path("Robot", "robot"), axes_length=length, axes_radius=0.06 * length
@@ -172,7 +173,7 @@ class Layers:
             ends[:, 2] = 3 * _LIFTED
         with self._server.atomic():
             self._ends.points = ends.astype(np.float32)
-            self._ends.colors = colours.of_p_static(seen.p_static)
+            self._ends.colors = display.of_p_static(seen.p_static)
         some = ends[chosen(len(ends), _MOST_RAYS)]
         begin = np.broadcast_to(seen.origin - self._scene.origin, some.shape)
         self._ray.points = np.stack([begin, some], axis=1).astype(np.float32)
@@ -185,7 +186,7 @@ class Layers:
         lines = tracks.edges(things) - self._scene.origin
         if self._scene.is_flat:
             lines = lines + np.array([0.0, 0.0, 2 * _LIFTED])
-        tone = colours.of_number([self._scene.tracks[n].id for n in things.number])
+        tone = display.of_number([self._scene.tracks[n].id for n in things.number])
         tones = np.broadcast_to(tone[:, None, None], lines.shape)
         with self._server.atomic():
             self._box.points = lines.reshape(-1, 2, 3).astype(np.float32)
@@ -194,7 +195,7 @@ class Layers:
     def _make_ways(self) -> None:
         pieces, whose = tracks.ways(self._scene.tracks)
         use = chosen(len(pieces), _MOST_WAYS)
-        tone = colours.of_number([self._scene.tracks[n].id for n in whose[use]])
+        tone = display.of_number([self._scene.tracks[n].id for n in whose[use]])
         lifted = np.array([0.0, 0.0, _LIFTED if self._scene.is_flat else 0.0])
         lines = pieces[use] - self._scene.origin + lifted
         self._lines("Object ways", lines, np.repeat(tone[:, None], 2, axis=1), 1.5)

@@ -10,16 +10,17 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.errors import InputError
-from stillmap.evaluation.folders import read_grid
-from stillmap.export.result import Track, read_tracks
-from stillmap.output.crops import Window
-from stillmap.output.report_figures import ORANGE, UNKNOWN, map_image, shown_window
-from stillmap.recording.tum import read_tum
-from stillmap.se2 import inverse
-from stillmap.texts import read_text
-from stillmap.texture.textured import GREY
-from stillmap.viewer import colours, gltf, thinning
+from stillmap.core.errors import InputError
+from stillmap.core.files import read_text
+from stillmap.core.se2 import inverse
+from stillmap.io.trajectory import read_tum
+from stillmap.mesh.texture.atlas import GREY
+from stillmap.pipeline.snapshots import Window
+from stillmap.results import gltf
+from stillmap.results.reader import Track, read_grid, read_tracks
+from stillmap.results.report.figures import ORANGE, UNKNOWN, map_image, shown_window
+from stillmap.viewer import display
+from stillmap.viewer.display import Points, points_in
 from stillmap.viewer.tracks import pose_at
 
 MOST_POINTS = {"static": 500_000, "dynamic": 200_000}
@@ -127,7 +128,7 @@ def read_scene(folder: Path) -> Scene:
     stamp_ns, poses = read_tum(folder / "trajectory.tum")
     origin = _origin(poses)
     raw = {
-        name: thinning.points_in(folder / f"{name}.ply", most)
+        name: points_in(folder / f"{name}.ply", most)
         for name, most in MOST_POINTS.items()
         if (folder / f"{name}.ply").exists()
     }
@@ -168,20 +169,20 @@ def _plan(folder: Path, clear: bool) -> Plan | None:
     return Plan(picture.repeat(larger, axis=0).repeat(larger, axis=1), window)
 
 
-def _cloud(name: str, raw: thinning.Points, origin: Float) -> Cloud:
+def _cloud(name: str, raw: Points, origin: Float) -> Cloud:
     painted = raw.colours
     if painted is None:
         painted = np.empty((len(raw.points), 3), np.uint8)
         painted[:] = ORANGE
         if name == "static" and len(raw.points):
             z = raw.points[:, 2]
-            painted = colours.of_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
+            painted = display.of_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
     elif name == "dynamic":  # grey would be taken for a part of the place
         painted[(painted == GREY).all(axis=1)] = ORANGE
     return Cloud((raw.points - origin).astype(np.float32), painted, raw.of)
 
 
-def _ground(static: thinning.Points | None, poses: Float) -> float:
+def _ground(static: Points | None, poses: Float) -> float:
     """How high the floor is along the way, by what stands around it."""
     if static is None or not len(static.points):
         return 0.0

@@ -1,8 +1,18 @@
-"""A server of viser's that only this machine reaches, and whose page reaches nothing else."""
+"""A server of viser's that only this machine reaches, and whose page reaches nothing else.
 
+Who may look, and what the page may reach: this machine, and nothing else.
+
+A port on loopback can be reached by every page in every browser of the machine. A page from
+elsewhere says so in `Origin`, and one whose name was turned to 127.0.0.1 says it in `Host`.
+
+What is changed of viser's page before it is sent.
+"""
+
+import gzip
 import logging
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
@@ -11,8 +21,66 @@ import rich
 import viser
 import websockets.asyncio.server
 
-from stillmap.errors import InputError
-from stillmap.viewer import guard, page
+from stillmap.core.errors import InputError
+
+HERE = "127.0.0.1"
+
+# any port: a tunnel may end in another one
+_OWN = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
+
+
+def is_ours(headers: Mapping[str, str]) -> bool:
+    """Whether a request was meant for this machine, and comes from this page or from none."""
+    host, origin = headers.get("Host", ""), headers.get("Origin")
+    if not _OWN.fullmatch(host):
+        return False
+    return origin is None or origin == f"http://{host}"
+
+
+def policy(host: str) -> str:
+    """The `Content-Security-Policy` of the page at `host`, one of ours: a browser lets it reach
+    nothing but where it came from."""
+    own = "'self' data: blob:"
+    return "; ".join(
+        (
+            f"default-src {own} 'unsafe-inline'",
+            # its kernels are WebAssembly, and all its parts lie in one page
+            f"script-src {own} 'unsafe-inline' 'unsafe-eval'",
+            f"connect-src {own} ws://{host}",
+            "frame-ancestors 'none'",
+            "form-action 'none'",
+            "base-uri 'none'",
+        )
+    )
+
+
+_HEAD = b"<head>"
+
+# viser gives no choice: what its meshes are drawn with goes through a film's curve (ACES), which
+# darkens and greys what was photographed. three.js asks for it by a word in each shader.
+_AS_THEY_ARE = b"""<script>{
+  const drawing = WebGL2RenderingContext.prototype, plain = drawing.shaderSource;
+  drawing.shaderSource = function (shader, text) {
+    plain.call(this, shader, text.replace("#define TONE_MAPPING", ""));
+  };
+}</script>"""
+
+
+def show_as_they_are(response: Any) -> None:
+    """Let a page of viser's show colours as they were sent; anything else is left as it is.
+
+    Args:
+        response: of `websockets`, with `headers` and `body`; both are changed.
+    """
+    if not response.headers.get("Content-Type", "").startswith("text/html"):
+        return
+    packed = response.headers.get("Content-Encoding") == "gzip"
+    body = gzip.decompress(response.body) if packed else response.body
+    body = body.replace(_HEAD, _HEAD + _AS_THEY_ARE, 1)
+    response.body = gzip.compress(body, 6) if packed else body
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
+
 
 _OWN_PORT = "_VISER_PORT_OVERRIDE"  # a variable that would tell viser another port
 
@@ -38,7 +106,7 @@ def started(port: int, label: str) -> Server:
     told = os.environ.pop(_OWN_PORT, None)
     try:
         with _guarded() as asked:
-            server = Server(guard.HERE, port, label=label, verbose=False)
+            server = Server(HERE, port, label=label, verbose=False)
     finally:
         console.quiet = quiet
         if told is not None:
@@ -74,12 +142,12 @@ def _guarded() -> Iterator[list[int]]:
         asked.append(port)
 
         def answer(connection: Any, request: Any) -> Any:
-            if not guard.is_ours(request.headers):
+            if not is_ours(request.headers):
                 return connection.respond(HTTPStatus.FORBIDDEN, "not from this page\n")
             response = process_request(connection, request)
             if response is not None:
-                page.show_as_they_are(response)
-                response.headers["Content-Security-Policy"] = guard.policy(request.headers["Host"])
+                show_as_they_are(response)
+                response.headers["Content-Security-Policy"] = policy(request.headers["Host"])
             return response
 
         return plain(handler, host, port, process_request=answer, **more)

@@ -1,0 +1,116 @@
+"""What `stillmap eval model` computes: scores of textured models."""
+
+import argparse
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.eval import model_readers, trajectory
+from stillmap.eval.mesh import SurfaceScores, TextureScores, surface_scores, texture_scores
+from stillmap.eval.model_readers import Seen
+from stillmap.eval.object_models import MoverScores, mover_of, mover_scores
+from stillmap.eval.trajectory import paired
+from stillmap.results.reader import require_model, require_there
+from stillmap.rig.trajectory import lifted
+from stillmap.sim.truth import load_truth
+
+Float = NDArray[np.float64]
+
+
+def of_model(args: argparse.Namespace) -> tuple[dict[str, Any], Iterable[str]]:
+    """Surface, texture, and models of what moved; what a result does not have is left out."""
+    require_there(args.result, args.truth)
+    seen = model_readers.read_seen(args.truth)
+    T_world_map = _alignment(args.result, seen)
+    scores: dict[str, Any] = {"alignment": T_world_map.tolist()}
+    lines: list[str] = []
+    glb = model_readers.read_glb(require_model(args.result))
+    standing, places = seen.picture_truth.standing, seen.places(args.within)
+    surface = surface_scores(glb.vertices, glb.faces, standing, places, T_world_map)
+    scores["surface"] = surface.to_dict()
+    lines += _surface_lines(surface)
+    n = len(seen.pictures.camera)
+    record = model_readers.read_record(args.result / model_readers.RECORD, n)
+    if record is not None:
+        seed = seen.picture_truth.colour_seed
+        texture = texture_scores(
+            record, glb.coloured, seen.pictures, standing, seed, T_world_map, args.within
+        )
+        scores["texture"] = texture.to_dict()
+        lines += _texture_lines(texture)
+    if (model_readers.objects_of(args.result) / "objects.json").exists():
+        movers = _movers(args.result, seen, T_world_map)
+        scores["movers"] = movers.to_dict()
+        lines += _mover_lines(movers)
+    return scores, lines
+
+
+def _alignment(result: Path, seen: Seen) -> Float:
+    """(4, 4) T_world_map."""
+    T = trajectory.align(*trajectory.to_plane_where_flat(*paired(result, seen.truth)))
+    return T if len(T) == 4 else lifted(T[None])[0]
+
+
+def _movers(result: Path, seen: Seen, T_world_map: Float) -> MoverScores:
+    truth, folder = load_truth(seen.truth.folder), model_readers.objects_of(result)
+    kinds, sizes = truth.scene["mover_kinds"], truth.scene["mover_sizes"]
+    length = np.array([np.nan if size[0] is None else size[0] for size in sizes], float)
+    stamps = seen.picture_truth.moving.stamp_ns
+    tracks = [one for one in model_readers.read_tracks(folder, T_world_map) if len(one.xy)]
+    tracked = {one.id: mover_of(one, stamps, truth.movers, length) for one in tracks}
+    models = {}
+    for one in tracks:
+        mover = tracked[one.id]
+        rigid = mover >= 0 and kinds[mover] != "person"
+        model = model_readers.read_model(folder, one.id, rigid, len(seen.pictures.camera))
+        if model is not None:
+            # a track may pass from one mover to another
+            shows = mover_of(one.within(model.span_ns), stamps, truth.movers, length)
+            models[one.id] = shows, model
+    moving, sighted = seen.picture_truth.moving, seen.sighted()
+    return mover_scores(tracked, models, kinds, moving, sighted, seen.pictures, T_world_map)
+
+
+def _surface_lines(s: SurfaceScores) -> Iterable[str]:
+    yield f"surface      {s.faces} faces, {s.area:.1f} m2"
+    yield f"off truth    mean {_cm(s.mean)}, 95 % below {_cm(s.p95)}"
+    yield f"complete     {_percent(s.complete)} of {s.places} places within 5 cm"
+
+
+def _texture_lines(t: TextureScores) -> Iterable[str]:
+    yield (
+        f"textured     {_percent(t.textured)} of the area, {_percent(t.covered)} of the "
+        f"{_percent(t.in_view)} that a picture sees without a mover"
+    )
+    yield f"shows        movers {_percent(t.mover)}, nothing {_percent(t.nothing)}"
+    yield f"CIEDE2000    median {t.colour_median:.2f}, 95 % below {t.colour_p95:.2f}"
+
+
+def _mover_lines(m: MoverScores) -> Iterable[str]:
+    yield (
+        f"movers       {m.tracked} tracked, {_percent(m.modelled)} with a model; "
+        f"of {m.seen_well} seen by 100 beams in a second {_percent(m.modelled_well)}"
+    )
+    yield (
+        f"models       {len(m.models)}: chamfer {_cm(m.chamfer)} on average, "
+        f"{_percent(m.good)} within 5 cm; background {_percent(m.background)}; "
+        f"of what is no mover {m.nothing} more"
+    )
+    for one in m.models:
+        yield (
+            f"  {one.id:04d}       {one.kind} {one.mover}: to truth {_cm(one.accuracy)}, "
+            f"from truth {_cm(one.completeness)}, textured {_percent(one.textured)}, "
+            f"background {_percent(one.background)}"
+        )
+
+
+def _cm(metres: float) -> str:
+    return "-" if math.isnan(metres) else f"{100 * metres:.2f} cm"
+
+
+def _percent(share: float) -> str:
+    return "-" if math.isnan(share) else f"{100 * share:.2f} %"

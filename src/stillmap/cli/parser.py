@@ -1,0 +1,171 @@
+"""argparse as people expect it: one line per error, with a hint; help as wide as the terminal.
+
+All commands by name. The module of one is loaded when it is called: that is what takes long.
+"""
+
+import argparse
+import re
+import sys
+from collections.abc import Collection, Iterable, Sequence
+from importlib import import_module
+from typing import Any, NoReturn
+
+from stillmap.cli.console import painted
+from stillmap.core.errors import nearest
+
+EXIT_INPUT = 2
+
+
+class _Help(argparse.HelpFormatter):
+    """Paragraphs are as wide as the terminal; examples stay as they are written."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        if "\n" in text:
+            return "".join(indent + line for line in text.splitlines(keepends=True))
+        return super()._fill_text(text, width, indent)
+
+
+class Parser(argparse.ArgumentParser):
+    """Errors are one line, name what was meant, and exit with status 2."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**{"formatter_class": _Help, **settings})
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Refuses unknown flags before it misses arguments that may be behind them."""
+        words = list(sys.argv[1:] if args is None else args)
+        # as a path it would be the folder one is in, which --overwrite would replace
+        if any(re.fullmatch(r"(--[^=]+=)?", word) for word in words):
+            self.error("an argument is empty", "a variable that is not set?")
+        if self.subcommands() is None:
+            self._refuse([word for word in _flags(words) if not self._knows(word)])
+        found, unknown = super().parse_known_args(words, namespace)
+        self._refuse(unknown)
+        return found, unknown
+
+    def subcommands(self) -> dict[str, "Parser"] | None:
+        """The commands below this one by name; None: it is one that does something."""
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                return action.choices
+        return None
+
+    def flags(self) -> list[str]:
+        """Every flag, long and short."""
+        return [flag for action in self._actions for flag in action.option_strings]
+
+    def error(self, message: str, hint: str = "") -> NoReturn:
+        """Says what is wrong with the call, on one line, and exits."""
+        advice = f"{hint} see" if hint else "see"
+        line = f"{message} ({advice} {self.prog} --help)".replace("\n", " ")
+        self.exit(EXIT_INPUT, f"{painted(f'{self.prog}:', 'error', sys.stderr)} {line}\n")
+
+    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
+        """Flushes first: --help and --version may be going into a pipe that has closed."""
+        if sys.stdout is not None:  # None: it was closed before we began
+            sys.stdout.flush()
+        super().exit(status, message)
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is None or value in action.choices:
+            return
+        choices = [str(one) for one in action.choices]
+        if isinstance(action, argparse._SubParsersAction):
+            self.error(f"unknown {str(action.metavar).lower()} '{value}'", _meant(value, choices))
+        name = argparse.ArgumentError(action, "").argument_name
+        what = f"argument {name}: invalid choice: '{value}' (choose from {', '.join(choices)})"
+        self.error(what, _meant(str(value), choices))
+
+    def _refuse(self, unknown: list[str]) -> None:
+        if unknown:
+            flag = unknown[0].partition("=")[0]
+            hint = _meant(flag, self.flags()) if flag.startswith("-") else ""
+            self.error(f"unrecognized arguments: {' '.join(unknown)}", hint)
+
+    def _knows(self, word: str) -> bool:
+        """Whether a word begins a flag: argparse takes abbreviations too."""
+        flag = word.partition("=")[0]
+        return any(known.startswith(flag) for known in self.flags())
+
+
+def _flags(words: list[str]) -> Iterable[str]:
+    """The words that can only be long flags."""
+    end = words.index("--") if "--" in words else len(words)
+    return (word for word in words[:end] if word.startswith("--") and " " not in word)
+
+
+def _meant(word: str, known: Iterable[str]) -> str:
+    meant = nearest(word, known)
+    return f"did you mean '{meant}'?" if meant else ""
+
+
+COMMANDS = {
+    "map": "the main job: recording in, folder out",
+    "info": "what is in a recording",
+    "view": "look at a result",
+    "filter": "the recording again, without beams on what moves, for other mappers",
+    "convert": "one recording format to another; results for other programs",
+    "simulate": "a recording with truth, for tests and demos",
+    "eval": "score a trajectory, labels or a map",
+    "config": "every option with its default, unit and meaning, as TOML",
+    "completion": "what lets a shell complete commands, flags and options",
+}
+
+_COMMANDS_EPILOG = """examples:
+  stillmap info log.clf.gz              what is in a recording
+  stillmap map log.clf.gz -o out        map it
+  stillmap view out                     look at the map and the report
+  stillmap filter out -o clean.clf      the recording without what moved
+  stillmap convert log.bag -o log.mcap  one format to another
+  stillmap simulate hall -o sim         a recording with truth
+  stillmap eval labels out sim          how good the labels are
+
+exit status:
+  0    done
+  1    a defect of stillmap
+  2    the input or the call is at fault; one line says what to do
+  130  interrupted; nothing is half-written
+"""
+
+
+def parser(wanted: Collection[str] = tuple(COMMANDS)) -> Parser:
+    """The command line; flags and arguments are there for the commands that are wanted."""
+    top = Parser(
+        prog="stillmap",
+        description="Clean maps of what stands still, from recordings of places full of movers.",
+        epilog=_COMMANDS_EPILOG,
+    )
+    top.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    top.set_defaults(verbose=False, quiet=False)
+    commands = top.add_subparsers(title="commands", metavar="COMMAND", dest="command")
+    for name, about in COMMANDS.items():
+        if name in wanted:
+            import_module(f"stillmap.cli.{name}").add_parser(commands)
+        else:
+            commands.add_parser(name, help=about)
+    _add_common(top)
+    return top
+
+
+class _Version(argparse.Action):
+    """Looked up when it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from stillmap import __version__
+
+        print(f"stillmap {__version__}")
+        parser.exit()
+
+
+def _add_common(parser: Parser) -> None:
+    """-v and --quiet, before the command and behind it."""
+    if not any(action.dest == "quiet" for action in parser._actions):
+        parser.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    parser.add_argument("-v", "--verbose", action="store_true", help="say more while working")
+    for action in parser._actions:
+        if action.dest in ("quiet", "verbose"):
+            action.default = argparse.SUPPRESS  # not given here: what was said before it stays
+    for command in (parser.subcommands() or {}).values():
+        _add_common(command)

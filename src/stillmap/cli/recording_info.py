@@ -1,0 +1,268 @@
+"""What is in a recording, in numbers."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import arrays, se2
+from stillmap.core.recording import Recording
+from stillmap.preprocessing.max_range import RangeRule
+
+_SAMPLED = 1 << 24  # beams of which quantiles are taken; of more than that, of as many
+_FEW = 100  # scans that a sample needs
+_DAMAGE = ("skipped", "skipped_odometry", "damage")
+_TABLES = ("records", "ignored", "params", "read_options")
+_LISTS = ("duplicates", "warnings", "topics")
+_WORDS = ("base_frame", "base_frame_how")
+_SENSOR_NOTES = (
+    *("name", "beams_per_scan", "start_angle", "angle_step", "extrinsics", "ranges"),
+    *("upside_down", "upside_down_how", "frame"),
+)
+_RULE = {field.name for field in dataclasses.fields(RangeRule)}
+
+
+def facts(recording: Recording) -> dict[str, Any]:
+    """Everything that `stillmap info` shows, JSON-able: metres, seconds, degrees."""
+    source = _notes(recording.source)
+    beams = np.diff(recording.offset)
+    return {
+        "path": source.get("path"),
+        "format": source.get("format"),
+        "dimension": recording.dimension,
+        "scans": recording.n_scans,
+        "beams": recording.n_beams,
+        "beams_per_scan": _spread(beams, ("min", "median", "max")),
+        "counts": _counts(recording),
+        "hit_ranges_m": _spread(_hit_ranges(recording), ("min", "median", "p99", "max")),
+        "time": _time(recording.stamp_ns),
+        "beam_times_s": _spread_of_times(recording.beam_time),
+        "spin": source["spin"].get("direction"),
+        "odometry": _odometry(recording, source["odometry"]),
+        "recorded_poses": _way(recording.T_recorded_base),
+        "images": _pictures(recording),
+        "sensors": _sensors(recording, source["sensors"]),
+        "own_body": [noted for noted in source["own_body"] if _is_box(noted)],
+        **{key: source[key] for key in (*_DAMAGE, "skipped_unit", *_TABLES, *_LISTS, *_WORDS)},
+    }
+
+
+def _notes(source: dict[str, Any]) -> dict[str, Any]:
+    """What the reader noted; notes of another shape than expected (other writers) are left out."""
+    tables = {key: source.get(key) for key in (*_DAMAGE, *_TABLES, "odometry", "spin")}
+    notes: dict[str, Any] = {k: v if isinstance(v, dict) else {} for k, v in tables.items()}
+    lists = {key: source.get(key) for key in (*_LISTS, "sensors", "own_body")}
+    notes.update({k: v if isinstance(v, list) else [] for k, v in lists.items()})
+    for key in _DAMAGE:
+        notes[key] = {
+            reason: damage
+            for reason, damage in notes[key].items()
+            if isinstance(damage, dict)
+            and isinstance(damage.get("count"), int)
+            and isinstance(damage.get("lines"), list)
+        }
+    words = {key: source.get(key) for key in ("path", "format", "skipped_unit", *_WORDS)}
+    notes.update({k: v if isinstance(v, str) else None for k, v in words.items()})
+    notes["skipped_unit"] = notes["skipped_unit"] or "line"
+    return notes
+
+
+def _hit_ranges(recording: Recording) -> NDArray[np.float32]:
+    """Ranges of the hits; of huge recordings, of evenly spaced scans only."""
+    step = -(-recording.n_beams // _SAMPLED)
+    parts = [np.empty(0, np.float32)]
+    for beams in (
+        arrays.blocks(recording.points, recording.hit) if step <= 1 else _scans(recording, step)
+    ):
+        points = recording.points[beams][recording.hit[beams]]
+        parts.append(np.linalg.norm(points.astype(np.float64), axis=1).astype(np.float32))
+    return np.concatenate(parts)
+
+
+def _scans(recording: Recording, step: int) -> Iterator[slice]:
+    """Every so many scans; of the scans every so many beams where they are few and large."""
+    every = step if recording.n_scans >= _FEW * step else 1
+    for scan in recording.in_turn(range(0, recording.n_scans, every)):
+        beams = recording.beams_of(scan)
+        yield slice(beams.start, beams.stop, step // every)
+
+
+def _spread(values: NDArray[Any], wanted: tuple[str, ...]) -> dict[str, float] | None:
+    """Quantiles by name; values that occur, so that 81.83 stays 81.83."""
+    if values.size == 0:
+        return None
+    share = {"min": 0.0, "median": 0.5, "p99": 0.99, "max": 1.0}
+    found = np.quantile(values, [share[name] for name in wanted], method="lower")
+    return {name: round(float(value), 4) for name, value in zip(wanted, found, strict=True)}
+
+
+def _counts(recording: Recording) -> dict[str, Any]:
+    hits = unusable = 0
+    for block in arrays.blocks(recording.points, recording.hit):
+        hits += int(np.count_nonzero(recording.hit[block]))
+        unusable += int(np.count_nonzero(np.isnan(recording.points[block]).any(axis=1)))
+    counts = {
+        "hits": hits,
+        "max_range": recording.n_beams - hits - unusable,
+        "unusable": unusable,
+    }
+    total = max(recording.n_beams, 1)
+    return {**counts, "shares": {name: count / total for name, count in counts.items()}}
+
+
+def _time(stamp_ns: NDArray[np.int64]) -> dict[str, Any] | None:
+    if len(stamp_ns) == 0:
+        return None
+    first, last = int(stamp_ns[0]), int(stamp_ns[-1])
+    duration = (last - first) / 1e9
+    gaps = np.diff(stamp_ns)
+    return {
+        "first_stamp_ns": first,
+        "last_stamp_ns": last,
+        "duration_s": duration,
+        "rate_hz": len(gaps) / duration if duration > 0 else None,
+        "largest_gap_s": float(gaps.max()) / 1e9 if len(gaps) else None,
+    }
+
+
+def _spread_of_times(beam_time: NDArray[np.float32] | None) -> list[float] | None:
+    """When after its scan's stamp the first and the last beam of any scan was taken."""
+    if beam_time is None or not len(beam_time):
+        return None
+    blocks = arrays.blocks(beam_time)
+    first, last = zip(*((beam_time[b].min(), beam_time[b].max()) for b in blocks), strict=True)
+    return [float(min(first)), float(max(last))]
+
+
+def _odometry(recording: Recording, noted: dict[str, Any]) -> dict[str, Any] | None:
+    T = recording.T_odom_base
+    if T is None:
+        return None
+    found = {key: noted[key] for key in ("from", "outside") if noted.get(key) is not None}
+    metres, degrees = _steps(T)
+    at = int(metres.argmax()) if len(metres) else 0
+    return {
+        **found,
+        "path_length_m": float(metres.sum()),
+        "turned_deg": float(degrees.sum()),
+        "largest_step_m": float(metres.max(initial=0.0)),
+        "largest_step_deg": float(degrees.max(initial=0.0)),
+        "largest_step_at_ns": int(recording.stamp_ns[at]) if len(metres) else None,
+    }
+
+
+def _steps(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(T-1,) metres and degrees from pose to pose."""
+    step = se2.inverse(T[:-1]) @ T[1:]
+    # the angle of a rotation in any dimension follows from its trace
+    trace = np.trace(step[:, :-1, :-1], axis1=1, axis2=2)
+    cosine = trace / 2.0 if T.shape[-1] == 3 else (trace - 1.0) / 2.0
+    metres = np.linalg.norm(step[:, :-1, -1], axis=1)
+    return metres, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def _way(T: NDArray[np.float64] | None) -> dict[str, Any] | None:
+    if T is None:
+        return None
+    metres, degrees = _steps(T)
+    return {"path_length_m": float(metres.sum()), "turned_deg": float(degrees.sum())}
+
+
+def _pictures(recording: Recording) -> dict[str, Any] | None:
+    images = recording.images
+    if images is None:
+        return None
+    from stillmap.mesh.texture.views import usable  # takes long to load
+
+    used, left_out = usable(recording)
+    taken = np.bincount(images.camera, minlength=len(images.cameras))
+    return {
+        "count": len(images),
+        "usable": int(used.sum()),
+        "left_out": left_out,
+        "cameras": [
+            {
+                "name": camera.name,
+                "count": int(n),
+                "usable": int(used[images.camera == number].sum()),
+                "width": camera.width,
+                "height": camera.height,
+                "calibrated": camera.K is not None,
+                "placed": camera.T_base_camera is not None,
+            }
+            for number, (camera, n) in enumerate(zip(images.cameras, taken, strict=True))
+        ],
+    }
+
+
+def _sensors(recording: Recording, noted: list[Any]) -> list[dict[str, Any]]:
+    """Every sensor; one that moves on its robot has many places in the arrays and one note."""
+    out, first, number = [], 0, 0
+    while first < len(recording.T_base_sensor):
+        notes = noted[number] if number < len(noted) and isinstance(noted[number], dict) else {}
+        places = notes.get("places", 1)
+        places = places if isinstance(places, int) and places > 0 else 1
+        out.append(_sensor(recording, range(first, first + places), notes))
+        first, number = first + places, number + 1
+    return out
+
+
+def _sensor(recording: Recording, numbers: range, noted: dict[str, Any]) -> dict[str, Any]:
+    """One sensor: what its reader noted, else what shows in the arrays."""
+    its = (recording.sensor >= numbers.start) & (recording.sensor < numbers.stop)
+    scans = np.flatnonzero(its)
+    out: dict[str, Any] = {"scans": len(scans)}
+    out.update((key, noted[key]) for key in _SENSOR_NOTES if key in noted)
+    if not _is_rule(out.get("ranges")):
+        out.pop("ranges", None)
+    if recording.dimension == 2:
+        x, y, theta = (float(v) for v in se2.parameters(recording.T_base_sensor[numbers.start]))
+        place = out.get("extrinsics")
+        how = str(place.get("how", "")) if isinstance(place, dict) else "as recorded"
+        out["extrinsics"] = {"x": x, "y": y, "theta_deg": float(np.degrees(theta)), "how": how}
+        out["field_of_view_deg"] = _field_of_view(recording, scans, out)
+    return out
+
+
+def _is_rule(noted: Any) -> bool:
+    return (
+        isinstance(noted, dict)
+        and set(noted) | {"own_body"} == _RULE  # older recordings do not have it
+        and all(isinstance(noted[k], float | int | None) for k in ("threshold", "free_range"))
+        and all(_is_part(part) for part in noted.get("own_body", ()))
+    )
+
+
+def _is_part(noted: Any) -> bool:
+    numbers = list(noted) if isinstance(noted, list | tuple) else []
+    return len(numbers) == 3 and all(isinstance(number, float | int) for number in numbers)
+
+
+def _is_box(noted: Any) -> bool:
+    """What a sensor of a 3D recording sees of its robot."""
+    return (
+        isinstance(noted, dict)
+        and all(isinstance(noted.get(key), int) for key in ("sensor", "beams"))
+        and all(_is_part(noted.get(key)) for key in ("low", "high"))
+    )
+
+
+def _field_of_view(
+    recording: Recording, scans: NDArray[np.intp], noted: dict[str, Any]
+) -> list[float] | None:
+    """First and last beam in degrees: as noted, else the extremes of all usable beams."""
+    first, step, n = (noted.get(k) for k in ("start_angle", "angle_step", "beams_per_scan"))
+    if isinstance(first, float) and isinstance(step, float) and isinstance(n, int):
+        last = first + (n - 1) * step
+        lowest, highest = sorted([first, last])  # a laser upside down turns clockwise
+        return [float(np.degrees(lowest)), float(np.degrees(highest))]
+    lowest, highest = np.inf, -np.inf
+    for scan in recording.in_turn(scans.tolist()):
+        points = recording.points[recording.beams_of(scan)]
+        angle = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+        angle = angle[np.isfinite(angle)]
+        lowest = min(lowest, float(angle.min(initial=np.inf)))
+        highest = max(highest, float(angle.max(initial=-np.inf)))
+    return [lowest, highest] if lowest <= highest else None

@@ -1,0 +1,149 @@
+"""The one data shape of a recording, 2D and 3D alike: flat arrays."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from stillmap.core import arrays
+from stillmap.core.camera import Images
+
+_ENDS = 1 << 14  # beams that are asked for their ends together
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """T scans with M beams in all, in D dimensions, taken by S sensors on one robot.
+
+    Attributes:
+        stamp_ns: (T,) int64, the recording's own stamps in nanoseconds, non-decreasing.
+        offset: (T+1,) int64, scan t owns the beams offset[t]:offset[t+1].
+        points: (M, D) float32, end points in the sensor frame in metres. NaN marks an unusable
+            beam; a maximum-range beam (not hit, finite) ends where free space is known to end.
+        hit: (M,) bool, True where something reflected the beam: zeta = 0 of (1), and usable.
+        T_base_sensor: (S, D+1, D+1) float64, where each sensor sits on the robot.
+        sensor: (T,) int32, the sensor that took each scan.
+        T_odom_base: (T, D+1, D+1) float64, odometry at each scan; None where there is none.
+        beam_time: (M,) float32, seconds after its scan's stamp at which each beam was taken,
+            finite; None where the beams of a scan count as taken at once.
+        source: what the recording was read from and how, what was skipped: JSON-able.
+        T_recorded_base: (T, D+1, D+1) float64, poses that the recording itself states, of a survey
+            or another program; used only when asked for. None where there are none.
+        images: pictures taken meanwhile; None where there are none.
+        scratch: folder for what becomes known of each beam, where that is too large for memory;
+            None: the system's temporary folder.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    offset: NDArray[np.int64]
+    points: NDArray[np.float32]
+    hit: NDArray[np.bool_]
+    T_base_sensor: NDArray[np.float64]
+    sensor: NDArray[np.int32]
+    T_odom_base: NDArray[np.float64] | None
+    source: dict[str, Any] = field(default_factory=dict)
+    beam_time: NDArray[np.float32] | None = None
+    T_recorded_base: NDArray[np.float64] | None = None
+    images: Images | None = None
+    scratch: Path | None = None
+
+    def __post_init__(self) -> None:
+        T, M, D = self.n_scans, self.n_beams, self.dimension
+        if D not in (2, 3) or self.points.shape != (M, D):
+            raise ValueError(f"points: expected (M, 2) or (M, 3), got {self.points.shape}")
+        _check("stamp_ns", self.stamp_ns, (T,), np.int64)
+        _check("offset", self.offset, (T + 1,), np.int64)
+        _check("points", self.points, (M, D), np.float32)
+        _check("hit", self.hit, (M,), np.bool_)
+        _check("sensor", self.sensor, (T,), np.int32)
+        S = len(self.T_base_sensor)
+        _check("T_base_sensor", self.T_base_sensor, (S, D + 1, D + 1), np.float64)
+        for name in ("T_odom_base", "T_recorded_base"):
+            if getattr(self, name) is not None:
+                _check(name, getattr(self, name), (T, D + 1, D + 1), np.float64)
+        if self.beam_time is not None:
+            _check("beam_time", self.beam_time, (M,), np.float32)
+            for block in arrays.blocks(self.beam_time):
+                if not np.isfinite(self.beam_time[block]).all():
+                    raise ValueError("beam_time: a time is not finite")
+        if (
+            self.offset[0] != 0
+            or self.offset[-1] != M
+            or np.any(self.offset[1:] < self.offset[:-1])
+        ):
+            raise ValueError(f"offset: must rise from 0 to {M}")
+        if T and (self.sensor.min() < 0 or self.sensor.max() >= S):
+            raise ValueError(f"sensor: indices must lie in [0, {S})")
+
+    @property
+    def n_scans(self) -> int:
+        return len(self.stamp_ns)
+
+    @property
+    def n_beams(self) -> int:
+        return len(self.points)
+
+    @property
+    def dimension(self) -> int:
+        return int(self.points.shape[-1])
+
+    def beams_of(self, scan: int) -> slice:
+        """The beams of one scan, as a slice into `points`, `hit` and results per beam."""
+        return slice(int(self.offset[scan]), int(self.offset[scan + 1]))
+
+    def per_beam(self, dtype: DTypeLike, row: tuple[int, ...] = ()) -> NDArray[Any]:
+        """A new array (M, *row), its content not defined; in a file where it is large.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        return arrays.empty((self.n_beams, *row), dtype, self.scratch)
+
+    def let_go(self, *more: NDArray[Any]) -> None:
+        """What lies in memory of the beams, and of other arrays, only because it was looked at."""
+        for array in (self.points, self.hit, self.beam_time, *more):
+            if array is not None:
+                arrays.let_go(array)
+
+    def in_turn(self, scans: Iterable[int], *more: NDArray[Any]) -> Iterator[int]:
+        """The same numbers of scans; what was looked at of the beams, and of other arrays, leaves
+        memory on the way."""
+        rows = self.n_beams / max(self.n_scans, 1)
+        return arrays.in_turn(scans, lambda: self.let_go(*more), rows)
+
+    def T_map_sensor(self, T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sensor poses (T, D+1, D+1) that belong to robot poses (T, D+1, D+1)."""
+        return T_map_base @ self.T_base_sensor[self.sensor]
+
+    def scans_of(self, beams: NDArray[np.intp]) -> NDArray[np.intp]:
+        """(n,) the scans that beams (n,) belong to."""
+        return np.searchsorted(self.offset, beams, side="right") - 1
+
+    def end_points(
+        self, beams: NDArray[np.intp], T_map_base: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(n, D) where beams (n,), rising, ended: metres in the map frame, at robot poses
+        (T, D+1, D+1)."""
+        D, ends = self.dimension, np.empty((len(beams), self.dimension))
+        for part in arrays.near(beams, _ENDS):
+            scan = self.scans_of(beams[part])
+            # beams may be few: only the scans that they are of
+            T = T_map_base[scan] @ self.T_base_sensor[self.sensor[scan]]
+            points = self.points[beams[part]].astype(np.float64)
+            ends[part] = np.einsum("nij,nj->ni", T[:, :D, :D], points) + T[:, :D, D]
+            self.let_go()
+        return ends
+
+    def without_odometry(self) -> "Recording":
+        """The same recording as if no odometry had been recorded."""
+        return replace(self, T_odom_base=None)
+
+
+def _check(name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: type) -> None:
+    if array.shape != shape or array.dtype != dtype:
+        raise ValueError(
+            f"{name}: expected {shape} {np.dtype(dtype)}, got {array.shape} {array.dtype}"
+        )

@@ -1,0 +1,291 @@
+"""Scores of what a map says of things that were moved, brought or taken away while it was made."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.se2 import inverse
+from stillmap.eval.labels import Scores
+from stillmap.eval.map import GHOST_DISTANCE, MIN_HITS, distance_to_walls, near_occupied
+from stillmap.results.reader import Grid, moved
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+LOOK = 3  # beams of a scan on a thing, or through its place: less is not looking at it
+AGAIN = 3  # scans that must have seen through a cell for its state to be known
+NEAR = 0.5  # m from a thing, within which a change is taken for that of the thing
+
+
+@dataclass(frozen=True, eq=False)
+class Stay:
+    """A thing at one of its places, in the world.
+
+    Attributes:
+        mover: its number.
+        middle: (2,) metres.
+        faces: (K, 4) segments x0, y0, x1, y1 in metres.
+        since_ns: when it came; None: it was there before.
+        until_ns: when it was gone; None: never.
+    """
+
+    mover: int
+    middle: Float
+    faces: Float
+    since_ns: int | None
+    until_ns: int | None
+
+    def holds(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(N,) whether it stands there at stamps (N,)."""
+        since = -np.inf if self.since_ns is None else self.since_ns
+        until = np.inf if self.until_ns is None else self.until_ns
+        return np.asarray((stamp_ns >= since) & (stamp_ns < until))
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """M beams of T scans at true poses.
+
+    Attributes:
+        start, end: (M, 2) metres in the world.
+        mover: (M,) number of what reflected each, -1: nothing that moves.
+        scan: (M,) rising.
+        stamp_ns: (T,) of the scans.
+    """
+
+    start: Float
+    end: Float
+    mover: NDArray[np.int32]
+    scan: Index
+    stamp_ns: NDArray[np.int64]
+
+    def on(self, stay: Stay) -> Index:
+        """The beams that a thing reflected during a stay."""
+        return np.flatnonzero((self.mover == stay.mover) & stay.holds(self.stamp_ns)[self.scan])
+
+    def near(self, point: Float, distance: float) -> Index:
+        """The beams that come as near as that to a point (2,), metres."""
+        along = self.end - self.start
+        length = np.maximum(np.sum(along**2, axis=1), np.finfo(float).tiny)
+        share = np.clip(np.sum((point - self.start) * along, axis=1) / length, 0.0, 1.0)
+        off = self.start + share[:, None] * along - point
+        return np.flatnonzero(np.hypot(*off.T) <= distance)
+
+
+@dataclass(frozen=True)
+class ChangeScores(Scores):
+    """NaN where there is no cell.
+
+    Attributes:
+        new_cells: cells that show what was brought and is still there: hit MIN_HITS times.
+        new_kept: share of these with an occupied cell among themselves and their 8 neighbours.
+        old_cells: cells that showed what was taken away, far from walls and all that is still
+            there, and seen through again in AGAIN scans.
+        old_occupied: share of these that are occupied.
+    """
+
+    new_cells: int
+    new_kept: float
+    old_cells: int
+    old_occupied: float
+
+
+class Detected(Protocol):
+    """A change that was found: where, in metres of the map frame, what, and when."""
+
+    @property
+    def x(self) -> float: ...
+    @property
+    def y(self) -> float: ...
+    @property
+    def appeared(self) -> bool: ...
+    @property
+    def stamp_ns(self) -> int: ...
+
+
+@dataclass(frozen=True, eq=False)
+class TrueChange:
+    """A thing that came or went.
+
+    Attributes:
+        stay: the stay that began or ended.
+        appeared: it began.
+        stamp_ns: when.
+        look_ns: the first scan afterwards that looked there; None: none did, or none before, so
+            nobody could know of the change.
+    """
+
+    stay: Stay
+    appeared: bool
+    stamp_ns: int
+    look_ns: int | None
+
+
+@dataclass(frozen=True)
+class ChangeTimes(Scores):
+    """How well changes were found that could be.
+
+    Attributes:
+        seen: true changes whose place was looked at before and afterwards.
+        found: of these, how many have a found change of their kind within NEAR of the thing.
+        missed: all others.
+        false: found changes near no true one of their kind, seen or not.
+        errors: s, one for each of `found`: how far the stamp is from the time between the change
+            and the first look afterwards.
+    """
+
+    seen: int
+    found: int
+    missed: int
+    false: int
+    errors: tuple[float, ...]
+
+
+def change_scores(
+    grid: Grid, stays: Sequence[Stay], beams: Beams, walls: Float, T_world_map: Float
+) -> ChangeScores:
+    """Score a map that shall show what is there at the end.
+
+    Args:
+        grid: the map.
+        stays: all stays of things that change.
+        beams: of the whole recording.
+        walls: (W, 4) segments in the world, of what never changes.
+        T_world_map: (3, 3), see `trajectory.align`.
+    """
+    T_map_world = inverse(T_world_map)
+    lasting = [stay for stay in stays if stay.holds(beams.stamp_ns[-1:])[0]]
+    ended = [stay for stay in stays if not stay.holds(beams.stamp_ns[-1:])[0]]
+    shown = [_cells(grid, beams.end[beams.on(stay)], T_map_world) for stay in lasting]
+    left = [_left_cells(grid, stay, beams, T_world_map) for stay in ended]
+    new, old = _union(shown), _union(left)
+    solid = np.concatenate([walls, *(stay.faces for stay in lasting)])
+    centres = moved(T_world_map, grid.centres(old))
+    old = old[distance_to_walls(centres, solid) > GHOST_DISTANCE * grid.resolution]
+    return ChangeScores(
+        new_cells=len(new),
+        new_kept=_mean(near_occupied(grid, grid.centres(new))),
+        old_cells=len(old),
+        old_occupied=_mean(_occupied(grid, old)),
+    )
+
+
+def true_changes(stays: Iterable[Stay], beams: Beams) -> list[TrueChange]:
+    """Every beginning and end of a stay within the recording, in no order."""
+    first, last = beams.stamp_ns[[0, -1]].tolist()
+    changes = []
+    for stay in stays:
+        on, through = _looks(beams.on(stay), beams), _looks(_through(stay, beams), beams)
+        for stamp, before, after in ((stay.since_ns, through, on), (stay.until_ns, on, through)):
+            if stamp is not None and first < stamp <= last:
+                later = after[after >= stamp]
+                seen = bool(np.any(before < stamp)) and len(later) > 0
+                look = int(later[0]) if seen else None
+                changes.append(TrueChange(stay, after is on, stamp, look))
+    return changes
+
+
+def change_time_errors(
+    changes: Sequence[Detected], true: Sequence[TrueChange], T_world_map: Float
+) -> ChangeTimes:
+    """Compare changes that were found with true ones: each of these with the nearest of its kind.
+
+    One that was found may stand for several things side by side, and several for one large thing.
+
+    Args:
+        changes: what was found.
+        true: from `true_changes`.
+        T_world_map: (3, 3), see `trajectory.align`.
+    """
+    xy = moved(T_world_map, np.array([(c.x, c.y) for c in changes], float).reshape(-1, 2))
+    appeared = np.array([c.appeared for c in changes], bool)
+    errors, known = [], np.zeros(len(changes), bool)
+    for one in true:
+        distance = np.where(appeared == one.appeared, _distance(xy, one.stay), np.inf)
+        known |= distance <= NEAR
+        if one.look_ns is not None and distance.min(initial=np.inf) <= NEAR:
+            stamp = changes[int(distance.argmin())].stamp_ns
+            errors.append(1e-9 * max(one.stamp_ns - stamp, stamp - one.look_ns, 0))
+    seen = sum(one.look_ns is not None for one in true)
+    return ChangeTimes(
+        seen=seen,
+        found=len(errors),
+        missed=seen - len(errors),
+        false=int(np.count_nonzero(~known)),
+        errors=tuple(errors),
+    )
+
+
+def _cells(grid: Grid, points: Float, T_map_world: Float) -> NDArray[np.int64]:
+    """(N, 2) row and column of the cells that hold MIN_HITS of the points."""
+    cells, count = np.unique(grid.cells(moved(T_map_world, points)), axis=0, return_counts=True)
+    return np.asarray(cells[count >= MIN_HITS].reshape(-1, 2))
+
+
+def _left_cells(grid: Grid, stay: Stay, beams: Beams, T_world_map: Float) -> NDArray[np.int64]:
+    """The cells of a stay that ended, as far as enough scans saw through them afterwards."""
+    cells = _cells(grid, beams.end[beams.on(stay)], inverse(T_world_map))
+    near = beams.near(stay.middle, _radius(stay) + 2 * grid.resolution)
+    near = near[beams.stamp_ns[beams.scan[near]] >= (stay.until_ns or 0)]
+    start, along = beams.start[near], beams.end[near] - beams.start[near]
+    length = np.maximum(np.hypot(*along.T), np.finfo(float).tiny)
+    along = along / length[:, None]
+    again = np.zeros(len(cells), bool)
+    for k, centre in enumerate(moved(T_world_map, grid.centres(cells))):
+        delta = centre - start
+        ahead = np.sum(delta * along, axis=1)
+        off = np.abs(along[:, 0] * delta[:, 1] - along[:, 1] * delta[:, 0])
+        through = (off < grid.resolution / 2) & (ahead > 0) & (ahead < length - grid.resolution)
+        again[k] = len(np.unique(beams.scan[near[through]])) >= AGAIN
+    return cells[again]
+
+
+def _union(cells: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    return np.unique(np.concatenate([np.empty((0, 2), np.int64), *cells]), axis=0)
+
+
+def _occupied(grid: Grid, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+    inside = np.all((cells >= 0) & (cells < grid.p_occupied.shape), axis=1)
+    out = np.zeros(len(cells), bool)
+    out[inside] = grid.occupied[tuple(cells[inside].T)]
+    return out
+
+
+def _through(stay: Stay, beams: Beams) -> Index:
+    """The beams that go through the faces of a thing while it is not there."""
+    near = beams.near(stay.middle, _radius(stay))
+    near = near[~stay.holds(beams.stamp_ns[beams.scan[near]])]
+    a, b = beams.start[near], beams.end[near]
+    crossed = np.zeros(len(near), bool)
+    for face in stay.faces:
+        c, d = face[:2], face[2:]
+        crossed |= (_side(a, b, c) * _side(a, b, d) < 0) & (_side(c, d, a) * _side(c, d, b) < 0)
+    return near[crossed]
+
+
+def _side(a: Float, b: Float, c: Float) -> Float:
+    """Positive where c lies to the left of the line from a to b."""
+    along, across = b - a, c - a
+    return np.asarray(along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0])
+
+
+def _looks(some: Index, beams: Beams) -> NDArray[np.int64]:
+    """Stamps, rising, of the scans with LOOK of the beams `some`."""
+    scan, count = np.unique(beams.scan[some], return_counts=True)
+    return np.asarray(np.sort(beams.stamp_ns[scan[count >= LOOK]]))
+
+
+def _radius(stay: Stay) -> float:
+    return float(np.hypot(*(stay.faces.reshape(-1, 2) - stay.middle).T).max())
+
+
+def _distance(xy: Float, stay: Stay) -> Float:
+    """(N,) metres from points to a thing's middle or, if nearer, its faces."""
+    return np.minimum(np.hypot(*(xy - stay.middle).T), distance_to_walls(xy, stay.faces))
+
+
+def _mean(values: NDArray[np.bool_]) -> float:
+    return float(values.mean()) if len(values) else float("nan")

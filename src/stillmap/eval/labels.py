@@ -1,0 +1,169 @@
+"""Scores of P(static) per beam against the truth. The positive class is *dynamic*.
+
+What all scores have in common: plain numbers, ready for JSON.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Base of all results. NaN stands for a score that its input leaves undefined."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Nested dictionaries of plain numbers; NaN becomes None, since JSON has no NaN."""
+        return {key: _plain(value) for key, value in dataclasses.asdict(self).items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(inner) for inner in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+# One certain mistake costs 13.8 nats. Labels are float32, so anything below 6e-8 would be lost
+# near 1 anyway; the result depends on this number where an estimator claims certainty.
+LOG_LOSS_EPS = 1e-6
+
+ECE_BINS = 15
+
+UNSURE = (0.05, 0.95)  # P(dynamic) strictly between: where calibration means something
+
+_NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class LabelScores(Scores):
+    """Scores over the beams that hit something and carry a label. NaN: undefined.
+
+    Attributes:
+        hits: beams scored; `dynamic` of them are truly dynamic.
+        unlabelled: beams that hit something but have no P(static).
+        average_precision: sum of (R_n - R_{n-1}) P_n over falling thresholds.
+        precision, recall, f1: for P(dynamic) > 1/2.
+        brier: mean squared error of P(dynamic).
+        log_loss: nats per beam, probabilities clipped to [LOG_LOSS_EPS, 1 - LOG_LOSS_EPS].
+        ece: expected calibration error over ECE_BINS bins of equal width.
+        ece_unsure: the same over bins of equal mass of the `unsure` beams, those with
+            .05 < P(dynamic) < .95.
+        share_called_dynamic: share of beams with P(static) < 1/2.
+    """
+
+    hits: int
+    dynamic: int
+    unlabelled: int
+    average_precision: float
+    precision: float
+    recall: float
+    f1: float
+    brier: float
+    log_loss: float
+    ece: float
+    unsure: int
+    ece_unsure: float
+    share_called_dynamic: float
+
+
+def label_scores(p_static: NDArray[np.floating], static: Bool, hit: Bool) -> LabelScores:
+    """Score labels (M,) against truth.
+
+    Args:
+        p_static: (M,) P(c = 1) in [0, 1]; NaN where there is no label.
+        static: (M,) truth, True where something static reflected the beam.
+        hit: (M,) beams that something reflected and whose truth is known.
+    """
+    if not p_static.shape == static.shape == hit.shape or p_static.ndim != 1:
+        raise ValueError(f"lengths differ: {p_static.shape}, {static.shape}, {hit.shape}")
+    labelled = hit & ~np.isnan(p_static)
+    p = p_static[labelled].astype(np.float64)
+    if len(p) and not (p.min() >= 0 and p.max() <= 1):
+        raise ValueError("p_static: probabilities must lie in [0, 1]")
+    y = ~static[labelled]
+    q = 1.0 - p
+    unsure = (q > UNSURE[0]) & (q < UNSURE[1])
+    precision, recall, f1 = precision_recall_f1(p < 0.5, y)
+    return LabelScores(
+        hits=len(p),
+        dynamic=int(y.sum()),
+        unlabelled=int(np.count_nonzero(hit & ~labelled)),
+        # ranked by p itself: 1 - p would tie labels that differ by less than 1e-16
+        average_precision=average_precision(-p, y),
+        precision=precision,
+        recall=recall,
+        f1=f1,
+        brier=_mean((q - y) ** 2),
+        log_loss=log_loss(q, y),
+        ece=calibration_error(q, y, equal_width_bins(q)),
+        unsure=int(unsure.sum()),
+        ece_unsure=calibration_error(q[unsure], y[unsure], equal_mass_bins(q[unsure])),
+        share_called_dynamic=_mean((p < 0.5).astype(np.float64)),
+    )
+
+
+def average_precision(score: Float, positive: Bool) -> float:
+    """Step-wise sum of (R_n - R_{n-1}) P_n, n over the distinct scores from high to low.
+
+    Equal scores share one threshold, so their order cannot matter. NaN without a positive.
+    """
+    n_positive = int(positive.sum())
+    if not n_positive:
+        return _NAN
+    order = np.argsort(-score, kind="stable")
+    last_of_ties = np.append(np.flatnonzero(np.diff(score[order])), len(score) - 1)
+    true_positives = np.cumsum(positive[order])[last_of_ties]
+    precision = true_positives / (last_of_ties + 1)
+    return float(np.sum(np.diff(true_positives, prepend=0) * precision) / n_positive)
+
+
+def precision_recall_f1(called: Bool, positive: Bool) -> tuple[float, float, float]:
+    """Of beams called positive; NaN where a denominator is zero."""
+    both, n_called, n_positive = (
+        int(np.count_nonzero(mask)) for mask in (called & positive, called, positive)
+    )
+    return (
+        both / n_called if n_called else _NAN,
+        both / n_positive if n_positive else _NAN,
+        2 * both / (n_called + n_positive) if n_called + n_positive else _NAN,
+    )
+
+
+def log_loss(p: Float, positive: Bool, eps: float = LOG_LOSS_EPS) -> float:
+    """Mean of -ln P(truth), in nats, P clipped to [eps, 1 - eps]."""
+    p = np.clip(p, eps, 1.0 - eps)
+    return _mean(-np.log(np.where(positive, p, 1.0 - p)))
+
+
+def equal_width_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
+    """Bin of each probability: [0, 1/bins), ..., [1 - 1/bins, 1]."""
+    return np.minimum((p * bins).astype(np.intp), bins - 1)
+
+
+def equal_mass_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
+    """Bin of each probability, as many in each bin as ties allow: equal ones stay together."""
+    _, group, size = np.unique(p, return_inverse=True, return_counts=True)
+    middle = np.cumsum(size) - size / 2
+    return (middle * bins / max(len(p), 1)).astype(np.intp)[group]
+
+
+def calibration_error(p: Float, positive: Bool, bin_of: NDArray[np.intp]) -> float:
+    """Mean over all beams of |share of positives - mean p| of their bin (Naeini et al. 2015)."""
+    if not len(p):
+        return _NAN
+    surplus = np.bincount(bin_of, weights=positive - p)
+    return float(np.abs(surplus).sum() / len(p))
+
+
+def _mean(values: Float) -> float:
+    return float(values.mean()) if len(values) else _NAN

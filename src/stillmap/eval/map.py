@@ -1,0 +1,112 @@
+"""Scores of an occupancy map against the true walls: what should not be there, what is missing."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy  # its parts load when they are first used
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.eval.labels import Scores
+from stillmap.results.reader import Float, Grid, moved
+
+GHOST_DISTANCE = 2.0  # cells from the nearest wall
+
+WALL_DISTANCE = 1.0  # cells
+
+MIN_HITS = 3  # fewer are noise on a neighbouring cell, or a wall seen in passing
+
+
+@dataclass(frozen=True)
+class MapScores(Scores):
+    """NaN where a denominator is zero.
+
+    Attributes:
+        ghost_cells: occupied cells whose centre lies more than two cells from any wall.
+        free_area: m2 of free cells.
+        ghosts_per_100_m2: ghost cells per 100 m2 of free area.
+        reference_wall_cells: wall cells that should be there.
+        walls_kept: share of these with an occupied cell among themselves and their 8 neighbours.
+        T_world_map: x, y, theta of the alignment used.
+    """
+
+    resolution: float
+    occupied_cells: int
+    ghost_cells: int
+    free_area: float
+    ghosts_per_100_m2: float
+    reference_wall_cells: int
+    walls_kept: float
+    T_world_map: tuple[float, float, float]
+
+
+def map_scores(grid: Grid, walls: Float, reference: Float, T_world_map: Float) -> MapScores:
+    """Score a map.
+
+    Args:
+        grid: the map.
+        walls: (W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1: all that the map may show.
+        reference: (K, 2) centres, in the world frame, of wall cells that should be there: from
+            `wall_cells_of_map` or `wall_cells_of_hits`.
+        T_world_map: (3, 3), see `trajectory.align`.
+    """
+    occupied = moved(T_world_map, grid.centres(np.argwhere(grid.occupied)))
+    ghosts = int(np.sum(distance_to_walls(occupied, walls) > GHOST_DISTANCE * grid.resolution))
+    free_area = float(np.count_nonzero(grid.free)) * grid.resolution**2
+    kept = near_occupied(grid, moved(se2.inverse(T_world_map), reference))
+    x, y, theta = se2.parameters(T_world_map).tolist()
+    return MapScores(
+        resolution=grid.resolution,
+        occupied_cells=len(occupied),
+        ghost_cells=ghosts,
+        free_area=free_area,
+        ghosts_per_100_m2=100.0 * ghosts / free_area if free_area else float("nan"),
+        reference_wall_cells=len(reference),
+        walls_kept=float(kept.mean()) if len(kept) else float("nan"),
+        T_world_map=(x, y, theta),
+    )
+
+
+def wall_cells_of_map(grid: Grid, walls: Float, T_world_map: Float) -> Float:
+    """(K, 2) centres, in the world frame, of a map's occupied cells within one cell of a wall."""
+    centres = moved(T_world_map, grid.centres(np.argwhere(grid.occupied)))
+    return centres[distance_to_walls(centres, walls) <= WALL_DISTANCE * grid.resolution]
+
+
+def wall_cells_of_hits(hits: Float, walls: Float, grid: Grid, T_world_map: Float) -> Float:
+    """(K, 2) centres, in the world frame, of the cells that true static hits show to be wall.
+
+    The cells are those of the lattice of `grid`, within one cell of a wall, hit MIN_HITS times.
+
+    Args:
+        hits: (N, 2) end points in the world frame, at true poses, of static beams alone.
+    """
+    cells, count = np.unique(
+        grid.cells(moved(se2.inverse(T_world_map), hits)), axis=0, return_counts=True
+    )
+    centres = moved(T_world_map, grid.centres(cells[count >= MIN_HITS]))
+    return centres[distance_to_walls(centres, walls) <= WALL_DISTANCE * grid.resolution]
+
+
+def distance_to_walls(points: Float, walls: Float, chunk: int = 1 << 20) -> Float:
+    """(N,) distances of (N, 2) points to the nearest of (W, 4) segments."""
+    start, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
+    length_squared = np.maximum(np.sum(along**2, axis=1), np.finfo(float).tiny)
+    out = np.empty(len(points))
+    step = max(chunk // len(walls), 1)
+    for k in range(0, len(points), step):
+        from_start = points[k : k + step, None] - start
+        share = np.clip(np.sum(from_start * along, axis=2) / length_squared, 0.0, 1.0)
+        off = from_start - share[..., None] * along
+        out[k : k + step] = np.sqrt(np.sum(off**2, axis=2).min(axis=1))
+    return out
+
+
+def near_occupied(grid: Grid, points: Float) -> NDArray[np.bool_]:
+    """Whether the cell of each (N, 2) point of the map frame, or a neighbour of it, is occupied."""
+    near = scipy.ndimage.binary_dilation(np.pad(grid.occupied, 1), np.ones((3, 3), bool))
+    cells = grid.cells(points) + 1
+    inside = np.all((cells >= 0) & (cells < near.shape), axis=1)
+    out = np.zeros(len(points), bool)
+    out[inside] = near[tuple(cells[inside].T)]
+    return out

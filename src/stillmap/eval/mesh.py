@@ -1,0 +1,255 @@
+"""Scores of a textured model against a simulation's truth: its surface, and what paints it.
+
+Shares are of areas, counted at points that lie as densely on every square metre.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.camera import Camera, project, within
+from stillmap.core.errors import extra
+from stillmap.eval import mesh_distance
+from stillmap.eval.labels import Scores
+from stillmap.sim.appearance import static_colour
+from stillmap.sim.camera import SKY
+from stillmap.sim.truth_surfaces import Standing
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int32]
+Bool = NDArray[np.bool_]
+
+SAMPLES = 200_000
+COMPLETE = 0.05  # m
+GREY, STATIC, NOTHING = -3, -1, -2  # what a sample shows, if no mover
+_STEEP = 0.17  # cosine of 80 degrees: what is seen at a smaller angle is not seen
+_CLOSE, _FARTHEST = 0.05, 0.5  # m, by which a surface may lie before what the pixel shows
+_NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class SurfaceScores(Scores):
+    """How well triangles lie on what stands still; metres. NaN: there is nothing to compare.
+
+    Attributes:
+        faces, area: of the mesh, square metres.
+        mean, p95: distance of its points from the true surface.
+        complete: share of the places that the sensor saw that lie within 5 cm of the mesh.
+        places: how many these are.
+    """
+
+    faces: int
+    area: float
+    mean: float
+    p95: float
+    complete: float
+    places: int
+
+
+@dataclass(frozen=True)
+class TextureScores(Scores):
+    """What paints a mesh. NaN where there is nothing to compare.
+
+    Attributes:
+        textured: share of its area that has a texture.
+        mover: share of that which shows something that moves.
+        nothing: share of that which shows the sky.
+        in_view: share of the area that some picture sees, and no mover before it.
+        covered: share of that which has a texture.
+        colour_median, colour_p95: CIEDE2000 between texture and true colour.
+    """
+
+    textured: float
+    mover: float
+    nothing: float
+    in_view: float
+    covered: float
+    colour_median: float
+    colour_p95: float
+
+
+class Record(NamedTuple):
+    """Which picture paints each triangle of a model.
+
+    Attributes:
+        vertices: (V, 3) metres, in the model's frame: of the map, or of an object.
+        faces: (F, 3).
+        image: (F,) number of the picture; -1: none.
+        T_camera_model: (N, 4, 4) from that frame to the camera's, NaN of pictures without use.
+    """
+
+    vertices: Float
+    faces: Index
+    image: Index
+    T_camera_model: Float
+
+
+class Pictures(NamedTuple):
+    """N pictures and the truth about them.
+
+    Attributes:
+        cameras: the cameras.
+        camera: (N,) which took each.
+        T_world_camera: (N, 4, 4) the true places.
+        mask, distance: of a picture, as `PictureTruth` has them.
+    """
+
+    cameras: Sequence[Camera]
+    camera: Index
+    T_world_camera: Float
+    mask: Callable[[int], NDArray[np.uint16]]
+    distance: Callable[[int], NDArray[np.float32]]
+
+
+class Coloured(NamedTuple):
+    """Points (n, 3) of a texture, in the map frame, and their colours (n, 3) uint8."""
+
+    points: Float
+    colour: NDArray[np.uint8]
+
+
+def surface_scores(
+    vertices: Float, faces: Index, standing: Standing, places: Float, T_world_map: Float
+) -> SurfaceScores:
+    """Score a surface.
+
+    Args:
+        vertices, faces: (V, 3) metres in the map frame, (F, 3).
+        standing: the true surfaces.
+        places: (n, 3) on them, in the world, that the sensor saw.
+        T_world_map: (4, 4).
+    """
+    on_mesh = moved(T_world_map, mesh_distance.samples(vertices, faces, SAMPLES).points)
+    off, _ = standing.nearest(on_mesh)
+    gaps = mesh_distance.distance_to_mesh(places, moved(T_world_map, vertices), faces, COMPLETE)
+    return SurfaceScores(
+        faces=len(faces),
+        area=float(mesh_distance.areas(vertices, faces).sum()),
+        mean=_mean(off),
+        p95=float(np.percentile(off, 95)) if len(off) else _NAN,
+        complete=_mean(gaps <= COMPLETE),
+        places=len(places),
+    )
+
+
+def texture_scores(
+    record: Record,
+    coloured: Coloured,
+    pictures: Pictures,
+    standing: Standing,
+    colour_seed: int,
+    T_world_map: Float,
+    farthest: float = float("inf"),
+) -> TextureScores:
+    """Score what paints a surface.
+
+    Args:
+        record: of the model in the map frame.
+        coloured: points of its texture.
+        pictures: that may paint it.
+        standing, colour_seed: the true surfaces and their colours.
+        T_world_map: (4, 4).
+        farthest: metres, from beyond a picture does not count as seeing anything.
+    """
+    on_mesh = mesh_distance.samples(record.vertices, record.faces, SAMPLES)
+    shows = shown(record, on_mesh, pictures)
+    in_view = seen_freely(record, on_mesh, pictures, T_world_map, farthest)
+    textured = shows != GREY
+    error = colour_errors(coloured, standing, colour_seed, T_world_map)
+    return TextureScores(
+        textured=_mean(textured),
+        mover=_mean(shows[textured] >= 0),
+        nothing=_mean(shows[textured] == NOTHING),
+        in_view=_mean(in_view),
+        covered=_mean(textured[in_view]),
+        colour_median=float(np.median(error)) if len(error) else _NAN,
+        colour_p95=float(np.percentile(error, 95)) if len(error) else _NAN,
+    )
+
+
+def shown(record: Record, samples: mesh_distance.Samples, pictures: Pictures) -> NDArray[np.int64]:
+    """(n,) what the texture shows: the number of a mover, STATIC, NOTHING, or GREY for no picture.
+
+    Also GREY: where a picture was to paint what lies outside of it.
+    """
+    image, out = record.image[samples.face], np.full(len(samples.face), GREY)
+    for number in np.unique(image[image >= 0]).tolist():
+        some = np.flatnonzero(image == number)
+        points = moved(record.T_camera_model[number], samples.points[some])
+        pixel, inside = _pixels(pictures.cameras[pictures.camera[number]], points)
+        column, row = pixel[inside].T
+        value = pictures.mask(number)[row, column].astype(np.int64)
+        what = np.where(value == SKY, NOTHING, value - 1)
+        out[some[inside]] = what
+    return out
+
+
+def seen_freely(
+    record: Record,
+    samples: mesh_distance.Samples,
+    pictures: Pictures,
+    T_world_map: Float,
+    farthest: float = float("inf"),
+) -> Bool:
+    """(n,) whether some picture truly sees a sample's place, without a mover before it.
+
+    The surface faces the camera, at no more than 80 degrees from upright, from no farther than
+    `farthest` metres, and no more than 5 cm and a pixel lie between it and what the pixel shows.
+    """
+    points = moved(T_world_map, samples.points)
+    upright = mesh_distance.normals(moved(T_world_map, record.vertices), record.faces)[samples.face]
+    out = np.zeros(len(points), bool)
+    for number, T_world_camera in enumerate(pictures.T_world_camera):
+        camera, centre = pictures.cameras[pictures.camera[number]], T_world_camera[:3, 3]
+        assert camera.K is not None
+        left = np.flatnonzero(~out)
+        towards = centre - points[left]
+        away = np.linalg.norm(towards, axis=1)
+        cosine = (towards * upright[left]).sum(axis=1) / np.maximum(away, 1e-9)
+        use = (cosine >= _STEEP) & (away <= farthest)
+        left, away, cosine = left[use], away[use], cosine[use]
+        pixel, inside = _pixels(camera, moved(np.linalg.inv(T_world_camera), points[left]))
+        column, row = pixel[inside].T
+        left, away, cosine = left[inside], away[inside], cosine[inside]
+        off = np.abs(pictures.distance(number)[row, column] - away)
+        limit = np.minimum((_CLOSE + away / camera.K[0, 0]) / cosine, _FARTHEST)
+        out[left] = (pictures.mask(number)[row, column] == 0) & (off <= limit)
+    return out
+
+
+def colour_errors(
+    coloured: Coloured, standing: Standing, colour_seed: int, T_world_map: Float
+) -> Float:
+    """(n,) CIEDE2000 between a texture and the true colour of the nearest place that stands still.
+
+    Raises:
+        MissingExtra: scikit-image is not installed.
+    """
+    _, places = standing.nearest(moved(T_world_map, coloured.points))
+    return colour_difference(coloured.colour, static_colour(places, colour_seed))
+
+
+def colour_difference(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float:
+    """(n,) CIEDE2000 between colours (n, 3), sRGB."""
+    color = extra("skimage.color", "texture", "compared with the truth", group="mesh")
+    labs = [color.rgb2lab(colour[None]) for colour in (one, other)]
+    return np.asarray(color.deltaE_ciede2000(*labs)[0], np.float64)
+
+
+def moved(T: Float, points: Float) -> Float:
+    """(n, 3) points moved by T (4, 4)."""
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def _pixels(camera: Camera, points: Float) -> tuple[NDArray[np.int64], Bool]:
+    """(n, 2) the pixels nearest to points in the camera's frame, and whether they are in it."""
+    uv, ahead = project(camera, points)
+    inside = ahead & within(camera, uv)
+    return np.rint(np.where(inside[:, None], uv, 0.0)).astype(np.int64), inside
+
+
+def _mean(values: NDArray[np.generic]) -> float:
+    return float(np.mean(values)) if len(values) else _NAN  # type: ignore[arg-type]

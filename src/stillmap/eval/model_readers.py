@@ -1,0 +1,276 @@
+"""Folders that scores of models are computed from."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.errors import InputError, extra
+from stillmap.core.files import read_text, require_regular
+from stillmap.core.recording import Recording
+from stillmap.eval import mesh_distance, readers
+from stillmap.eval.mesh import SAMPLES, Coloured, Pictures, Record
+from stillmap.eval.object_models import Model, Sighted, Track
+from stillmap.sim.truth_images import PictureTruth, load_picture_truth
+from stillmap.slam.deskew import deskewed
+from stillmap.slam.odometry_2d import SlamOptions
+
+Float = NDArray[np.float64]
+
+RECORD = "mesh_faces.npz"
+_PLACES = 0.05  # m, of cubes in each of which one place counts
+_SPAN_NS = 10**9  # before and after a person's model: he walks on
+_MAX_JSON = 1 << 28  # bytes
+
+
+class Seen(NamedTuple):
+    """A simulated recording with cameras, and what is true of it.
+
+    Attributes:
+        truth: its folder, recording and truth about beams.
+        pictures, picture_truth: the same about pictures and surfaces.
+        ends: (M, 3) where its beams ended in the world, with their noise, each from where the
+            robot truly was at its time.
+    """
+
+    truth: readers.Truth
+    pictures: Pictures
+    picture_truth: PictureTruth
+    ends: Float
+
+    def places(self, farthest: float) -> Float:
+        """(n, 3) true places of what stands still that the sensor saw, one in each 5 cm.
+
+        Args:
+            farthest: metres, beams that are longer do not count.
+        """
+        recording = self.truth.recording
+        use = recording.hit & self.truth.static()
+        use &= np.linalg.norm(recording.points, axis=1) <= farthest
+        _, places = self.picture_truth.standing.nearest(self.ends[use])
+        return places[mesh_distance.thinned(places, _PLACES)]
+
+    def sighted(self) -> Sighted:
+        """The beams on movers."""
+        recording = self.truth.recording
+        mover = np.load(self.truth.folder / "truth/mover.npy", allow_pickle=False)
+        beams = np.flatnonzero(recording.hit & (mover >= 0))
+        stamps = recording.stamp_ns[recording.scans_of(beams)]
+        if recording.beam_time is not None:
+            stamps = stamps + np.rint(1e9 * recording.beam_time[beams].astype(float)).astype(int)
+        return Sighted(mover[beams], stamps, self.ends[beams])
+
+
+def read_seen(path: Path) -> Seen:
+    """A simulation with cameras; of a rig's folder the recording that has them.
+
+    Raises:
+        InputError: it is none.
+    """
+    if (path / "tilting").is_dir():
+        path = path / "tilting"
+    truth, picture_truth = readers.read_truth(path), load_picture_truth(path)
+    recording, images = truth.recording, truth.recording.images
+    if images is None or len(images) != len(picture_truth.T_world_camera):
+        raise InputError("has other pictures than its truth", where=str(path))
+    pictures = Pictures(
+        images.cameras,
+        images.camera,
+        picture_truth.T_world_camera,
+        picture_truth.mask,
+        picture_truth.distance,
+    )
+    return Seen(truth, pictures, picture_truth, _ends(recording, truth.poses()))
+
+
+def _ends(recording: Recording, T_world_base: Float) -> Float:
+    at_once = deskewed(recording, T_world_base, SlamOptions())
+    return at_once.end_points(np.arange(recording.n_beams), T_world_base)
+
+
+class Glb(NamedTuple):
+    """The content of a GLB file, z up.
+
+    Attributes:
+        vertices, faces: (V, 3) metres and (F, 3), of all parts.
+        coloured: points of its textures, as dense everywhere.
+    """
+
+    vertices: Float
+    faces: NDArray[np.int32]
+    coloured: Coloured
+
+
+def read_glb(path: Path, n: int = SAMPLES) -> Glb:
+    """A GLB file, with n points of its textures.
+
+    Raises:
+        InputError: it is damaged, or trimesh is not installed.
+    """
+    require_regular(path)
+    trimesh = extra("trimesh", path, "compared with the truth", group="mesh")
+    try:
+        parts = list(_parts(trimesh.load_scene(path, process=False)))
+        return _joined(parts, n)
+    except Exception as error:  # whatever trimesh makes of damaged bytes
+        raise InputError(f"is damaged: {error}", where=str(path)) from error
+
+
+class _Part(NamedTuple):
+    vertices: Float
+    faces: NDArray[np.int32]
+    uv: Float | None
+    picture: NDArray[np.uint8] | None
+
+
+def _parts(scene: Any) -> Iterator[_Part]:
+    for node in scene.graph.nodes_geometry:
+        T, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        x, y, z = (np.asarray(mesh.vertices, float) @ T[:3, :3].T + T[:3, 3]).T
+        vertices = np.stack([x, -z, y], axis=1)  # y is up in the file
+        material = getattr(mesh.visual, "material", None)
+        image = getattr(material, "baseColorTexture", None)
+        uv = getattr(mesh.visual, "uv", None)
+        faces = np.asarray(mesh.faces, np.int32)
+        if image is None or uv is None:
+            yield _Part(vertices, faces, None, None)
+        else:
+            yield _Part(vertices, faces, np.asarray(uv, float), np.asarray(image.convert("RGB")))
+
+
+def _joined(parts: list[_Part], n: int) -> Glb:
+    vertices, faces, first = [np.empty((0, 3))], [np.empty((0, 3), np.int32)], 0
+    points, colour = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
+    area = [float(mesh_distance.areas(one.vertices, one.faces).sum()) for one in parts]
+    total = sum(a for a, one in zip(area, parts, strict=True) if one.uv is not None)
+    for a, one in zip(area, parts, strict=True):
+        vertices.append(one.vertices)
+        faces.append(one.faces + np.int32(first))
+        first += len(one.vertices)
+        if one.uv is not None and one.picture is not None and a > 0.0:
+            some = mesh_distance.samples(one.vertices, one.faces, max(1, round(n * a / total)))
+            uv = np.einsum("nk,nkd->nd", some.weight, one.uv[one.faces[some.face]])
+            points.append(some.points)
+            colour.append(_texels(one.picture, uv))
+    coloured = Coloured(np.concatenate(points), np.concatenate(colour))
+    return Glb(np.concatenate(vertices), np.concatenate(faces), coloured)
+
+
+def _texels(picture: NDArray[np.uint8], uv: Float) -> NDArray[np.uint8]:
+    """(n, 3) colours between four texels; the origin of (n, 2) is the lower left corner."""
+    height, width, _ = picture.shape
+    at = np.stack([uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5], axis=1)
+    at = np.clip(at, 0.0, (width - 1, height - 1))
+    low = np.minimum(at.astype(np.int64), np.maximum((width - 2, height - 2), 0))
+    right, down = (at - low).T[:, :, None]
+    (column, row), across = low.T, min(width - 1, 1)
+    below = row + min(height - 1, 1)
+    upper = picture[row, column] * (1 - right) + picture[row, column + across] * right
+    lower = picture[below, column] * (1 - right) + picture[below, column + across] * right
+    out: NDArray[np.uint8] = np.rint(upper * (1 - down) + lower * down).astype(np.uint8)
+    return out
+
+
+def read_record(path: Path, n_pictures: int, frame: str = "map") -> Record | None:
+    """`mesh_faces.npz` or `NNNN_faces.npz`; None: there is none.
+
+    Args:
+        path: the file.
+        n_pictures: how many the recording has.
+        frame: of the model, "map" or "object".
+
+    Raises:
+        InputError: it is damaged, or speaks of other pictures.
+    """
+    if not path.exists():
+        return None
+    require_regular(path)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            vertices = np.asarray(archive["vertices"], np.float64).reshape(-1, 3)
+            faces = np.asarray(archive["faces"], np.int32).reshape(-1, 3)
+            image = np.asarray(archive["image"], np.int32).reshape(len(faces))
+            T = np.asarray(archive[f"T_camera_{frame}"], np.float64).reshape(-1, 4, 4)
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise InputError(f"is damaged: {error}", where=str(path)) from error
+    if len(T) != n_pictures or image.max(initial=-1) >= n_pictures or image.min(initial=0) < -1:
+        what = f"speaks of {len(T)} pictures, the recording has {n_pictures}"
+        raise InputError(what, where=str(path), hint="is it the result of another recording?")
+    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise InputError("is damaged: a vertex that is not there", where=str(path))
+    if not np.isfinite(T[np.unique(image[image >= 0])]).all():
+        raise InputError("is damaged: a picture from nowhere paints", where=str(path))
+    return Record(vertices, faces, image, T)
+
+
+def objects_of(result: Path) -> Path:
+    """The folder of the objects that a result has models of: of a rig, those of what tilts."""
+    tilting = result / "tilting/objects"
+    has_models = any((result / "objects").glob("[0-9]*.glb"))
+    return tilting if tilting.is_dir() and not has_models else result / "objects"
+
+
+def read_tracks(folder: Path, T_world_map: Float) -> list[Track]:
+    """`objects.json`, in the world.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    path = folder / "objects.json"
+    out, said = [], _json(path)
+    if not isinstance(said, list):
+        raise InputError("is damaged: no list of objects", where=str(path))
+    for one in said:
+        try:
+            track = one["track"]
+            xy = np.column_stack([track["x"], track["y"]]).astype(float)
+            points = np.column_stack([xy, np.zeros(len(xy))]) @ T_world_map[:3, :3].T
+            stamps = np.array(track["stamp_ns"], np.int64)
+            out.append(Track(int(one["id"]), stamps, points[:, :2] + T_world_map[:2, 3]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"is damaged: {error!r}", where=str(path)) from error
+    return out
+
+
+def read_model(folder: Path, id: int, rigid: bool, n_pictures: int) -> Model | None:
+    """The model of an object; None: there is none.
+
+    Args:
+        folder: `objects/`.
+        id: its number.
+        rigid: whether what was seen of it at all times may be in its model, where
+            `NNNN.json` does not say.
+        n_pictures: of the recording.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    path = folder / f"{id:04d}.glb"
+    if not path.exists():
+        return None
+    glb, about = read_glb(path, n=1), path.with_suffix(".json")
+    try:
+        said = _json(about)
+        T, stamp = np.array(said["T_map_object"], float).reshape(4, 4), int(said["stamp_ns"])
+        first, last = said.get("first_stamp_ns"), said.get("last_stamp_ns")
+        if first is None or last is None:
+            rigid = bool(said.get("rigid", rigid))
+            first, last = (-(2**62), 2**62) if rigid else (stamp - _SPAN_NS, stamp + _SPAN_NS)
+        span = int(first), int(last)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"is damaged: {error!r}", where=str(about)) from error
+    record = read_record(folder / f"{id:04d}_faces.npz", n_pictures, "object")
+    return Model(glb.vertices, glb.faces, T, stamp, span, record)
+
+
+def _json(path: Path) -> Any:
+    require_regular(path)
+    try:
+        return json.loads(read_text(path, _MAX_JSON))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is no JSON: {error}", where=str(path)) from error

@@ -1,0 +1,263 @@
+"""Scores of the models of what moved, against the true shapes of a simulation's movers."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.eval import mesh_distance
+from stillmap.eval.labels import Scores
+from stillmap.eval.mesh import GREY, Pictures, Record, moved, shown
+from stillmap.sim.geometry import Solids
+from stillmap.sim.truth_surfaces import Moving, nearest_on_solid, to_local, to_world
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int32]
+
+_SAMPLES = 20_000
+_THIN = 0.02  # m, of the places that the sensor saw
+_REACH = 0.03  # m, between points of a model's lattice
+_OFF = 0.75  # m, from a track to the middle of who left it; of what is long, half its length too
+GOOD = 0.05  # m
+_WELL = 100  # beams
+_NAN = float("nan")
+
+
+class Track(NamedTuple):
+    """Where an object was: (L,) stamps, (L, 2) metres in the world."""
+
+    id: int
+    stamp_ns: NDArray[np.int64]
+    xy: Float
+
+    def within(self, span_ns: tuple[int, int]) -> "Track":
+        """The part between two times, or what comes nearest to their middle."""
+        first, last = span_ns
+        use = np.flatnonzero((self.stamp_ns >= first) & (self.stamp_ns <= last))
+        if not len(use):
+            use = np.array([np.abs(self.stamp_ns - (first + last) // 2).argmin()])
+        return self._replace(stamp_ns=self.stamp_ns[use], xy=self.xy[use])
+
+
+class Model(NamedTuple):
+    """The model of an object.
+
+    Attributes:
+        vertices, faces: (V, 3) metres in the object's frame, z up, and (F, 3).
+        T_map_object: (4, 4) where the object stood.
+        stamp_ns: when.
+        span_ns: from when to when what was seen of it is in the model.
+        record: what paints it; None: unknown, or nothing does.
+    """
+
+    vertices: Float
+    faces: Index
+    T_map_object: Float
+    stamp_ns: int
+    span_ns: tuple[int, int]
+    record: Record | None
+
+
+@dataclass(frozen=True)
+class ModelScores(Scores):
+    """One model; metres. NaN where there is nothing to compare.
+
+    Attributes:
+        id, mover, kind: of the object, and whose model it is.
+        accuracy: mean distance of the model from the true shape.
+        completeness: mean distance from what the sensor saw of that to the model.
+        chamfer: the mean of both.
+        textured: share of its area that has a texture.
+        background: share of that which shows anything but the mover.
+    """
+
+    id: int
+    mover: int
+    kind: str
+    accuracy: float
+    completeness: float
+    chamfer: float
+    textured: float
+    background: float
+
+
+@dataclass(frozen=True)
+class MoverScores(Scores):
+    """All of them. NaN where there is nothing to compare.
+
+    Attributes:
+        tracked: movers that were tracked.
+        modelled: share of them of which there is a model.
+        seen_well: those tracked movers that 100 beams met within a second, once at least.
+        modelled_well: share of these of which there is a model.
+        chamfer: mean over models, metres.
+        good: share of models with a chamfer distance of at most 5 cm.
+        background: mean over models with a texture.
+        nothing: models of what is no mover.
+        models: each of the others.
+    """
+
+    tracked: int
+    modelled: float
+    seen_well: int
+    modelled_well: float
+    chamfer: float
+    good: float
+    background: float
+    nothing: int
+    models: tuple[ModelScores, ...]
+
+
+class Sighted(NamedTuple):
+    """What the sensor saw of movers: B beams.
+
+    Attributes:
+        mover: (B,) whom each met.
+        stamp_ns: (B,) when.
+        points: (B, 3) where, in the world.
+    """
+
+    mover: Index
+    stamp_ns: NDArray[np.int64]
+    points: Float
+
+
+def mover_of(track: Track, stamp_ns: NDArray[np.int64], movers: Float, sizes: Float) -> int:
+    """The mover that an object is; -1: none.
+
+    Args:
+        track: the object's.
+        stamp_ns, movers: (T,) and (T, P, 3) where movers are; x, y in metres.
+        sizes: (P,) metres, how long each is; NaN of people and of what has no such measure.
+    """
+    scan = np.clip(np.searchsorted(stamp_ns, track.stamp_ns), 0, len(stamp_ns) - 1)
+    off = np.linalg.norm(movers[scan, :, :2] - track.xy[:, None], axis=2)
+    off = np.median(np.where(np.isnan(off), np.inf, off), axis=0)
+    near = off - _OFF - np.nan_to_num(sizes) / 2
+    return int(near.argmin()) if near.size and near.min() <= 0.0 else -1
+
+
+def mover_scores(
+    tracked: Mapping[int, int],
+    models: Mapping[int, tuple[int, Model]],
+    kinds: Sequence[str],
+    moving: Moving,
+    sighted: Sighted,
+    pictures: Pictures,
+    T_world_map: Float,
+) -> MoverScores:
+    """Score models.
+
+    Args:
+        tracked: the mover that each object is, by the objects' numbers; -1: none.
+        models: by the same numbers, and the mover that each shows: that which the object was then.
+            Those of none are only counted.
+        kinds: of movers.
+        moving: the true shapes.
+        sighted: what the sensor saw of them.
+        pictures: that paint the models.
+        T_world_map: (4, 4).
+    """
+    movers = {mover for mover in tracked.values() if mover >= 0}
+    have = {tracked.get(id, -1) for id in models}
+    well = {mover for mover in movers if most_beams(sighted, mover) >= _WELL}
+    scores = tuple(
+        model_scores(id, mover, kinds[mover], model, moving, sighted, pictures, T_world_map)
+        for id, (mover, model) in sorted(models.items())
+        if mover >= 0
+    )
+    chamfer = _known([one.chamfer for one in scores])
+    return MoverScores(
+        tracked=len(movers),
+        modelled=len(have & movers) / len(movers) if movers else _NAN,
+        seen_well=len(well),
+        modelled_well=len(have & well) / len(well) if well else _NAN,
+        chamfer=_mean(chamfer),
+        good=_mean(chamfer <= GOOD),
+        background=_mean(_known([one.background for one in scores])),
+        nothing=len(models) - len(scores),
+        models=scores,
+    )
+
+
+def most_beams(sighted: Sighted, mover: int) -> int:
+    """How many beams met a mover within a second, at most."""
+    stamps = np.sort(sighted.stamp_ns[sighted.mover == mover])
+    last = np.searchsorted(stamps, stamps + 10**9, side="right")
+    return int((last - np.arange(len(stamps))).max(initial=0))
+
+
+def model_scores(
+    id: int,
+    mover: int,
+    kind: str,
+    model: Model,
+    moving: Moving,
+    sighted: Sighted,
+    pictures: Pictures,
+    T_world_map: Float,
+) -> ModelScores:
+    """Score one model; arguments are those of `mover_scores`."""
+    solids = moving.at(moving.parts(mover), model.stamp_ns)
+    T = T_world_map @ model.T_map_object
+    on_model = moved(T, mesh_distance.samples(model.vertices, model.faces, _SAMPLES).points)
+    accuracy = _mean(distance_to_solids(on_model, solids))
+    places = places_seen(moving, mover, model.stamp_ns, model.span_ns, sighted)
+    gaps = mesh_distance.distance_to_mesh(places, moved(T, model.vertices), model.faces, _REACH)
+    completeness = _mean(gaps)
+    textured = background = _NAN
+    if model.record is not None:
+        of_record = mesh_distance.samples(model.record.vertices, model.record.faces, _SAMPLES)
+        shows = shown(model.record, of_record, pictures)
+        textured = _mean(shows != GREY)
+        background = _mean(shows[shows != GREY] != mover)
+    chamfer = (accuracy + completeness) / 2
+    return ModelScores(id, mover, kind, accuracy, completeness, chamfer, textured, background)
+
+
+def distance_to_solids(points: Float, solids: Solids) -> Float:
+    """(n,) metres to the nearest of solids at one time."""
+    out = np.full(len(points), np.inf)
+    for k in range(len(solids.form)):
+        off = np.linalg.norm(nearest_on_solid(points, solids, k) - points, axis=1)
+        np.fmin(out, off, out=out)
+    return out
+
+
+def places_seen(
+    moving: Moving, mover: int, stamp_ns: int, span_ns: tuple[int, int], sighted: Sighted
+) -> Float:
+    """(n, 3) the places of a mover that the sensor saw, where they are at a stamp; in the world.
+
+    Each beam's end, put on the part that it is nearest to at its own time, goes with that part.
+
+    Args:
+        moving, mover, sighted: see `mover_scores`.
+        stamp_ns: when they are wanted.
+        span_ns: from when to when beams count.
+    """
+    first, last = span_ns
+    use = (sighted.mover == mover) & (sighted.stamp_ns >= first) & (sighted.stamp_ns <= last)
+    points, stamps = sighted.points[use], sighted.stamp_ns[use]
+    parts = moving.parts(mover)
+    then, now = moving.at(parts, stamps), moving.at(parts, stamp_ns)
+    nearest, found = np.full(len(points), np.inf), np.full((len(points), 3), np.nan)
+    for k in range(len(parts)):
+        on = nearest_on_solid(points, then, k)
+        off = np.linalg.norm(on - points, axis=1)
+        better = off < nearest
+        goes_with = to_world(to_local(on, then.pose[:, k]), now.pose[:, k])
+        nearest[better], found[better] = off[better], goes_with[better]
+    found = found[np.isfinite(found).all(axis=1)]
+    return np.asarray(found[mesh_distance.thinned(found, _THIN)])
+
+
+def _known(values: Sequence[float]) -> Float:
+    array = np.array(values, np.float64)
+    return np.asarray(array[~np.isnan(array)])
+
+
+def _mean(values: NDArray[np.generic]) -> float:
+    return float(np.mean(values)) if len(values) else _NAN  # type: ignore[arg-type]

@@ -1,0 +1,341 @@
+"""Folders that scores are computed from: results of `stillmap map`, simulated recordings.
+
+Text files that scores are computed from: trajectories, relations, odometry.
+"""
+
+import logging
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import arrays, se2
+from stillmap.core.arrays import open_npy
+from stillmap.core.errors import InputError
+from stillmap.core.files import read_text, require_regular
+from stillmap.core.recording import Recording
+from stillmap.io.carmen.log import CarmenLog, read_log
+from stillmap.io.registry import RIG
+from stillmap.io.registry import read as recording_of
+from stillmap.io.stillmap_folder import read as read_folder
+from stillmap.io.text_lines import head
+from stillmap.io.trajectory import LARGEST, read_tum
+from stillmap.results.reader import shape_text
+
+Bool = NDArray[np.bool_]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """`beams/` of a result: see the contract of `stillmap map`."""
+
+    stamp_ns: NDArray[np.int64]
+    offset: NDArray[np.int64]
+    p_static: NDArray[np.float32]
+    hit: Bool
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """A simulated recording and its truth. Arrays of truth are read when asked for."""
+
+    folder: Path
+    recording: Recording
+
+    def static(self) -> Bool:
+        """(M,) True where something static reflected the beam; meaningful where it hit."""
+        return _array(self.folder / "truth/static.npy", (self.recording.n_beams,), "b")
+
+    def walls(self) -> Float:
+        """(W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1; of planar recordings."""
+        if self.recording.dimension != 2:
+            raise InputError("is no planar recording", where=str(self.folder))
+        path = self.folder / "truth/walls.npy"
+        walls = _finite(path, _array(path, (None, 4), "f"))
+        if not len(walls):
+            raise InputError("holds no walls", where=str(path))
+        return walls
+
+    def lasting(self) -> Float:
+        """(K, 4) the same of things that were moved or brought and are there at the end."""
+        path = self.folder / "truth/lasting.npy"
+        if not path.exists():
+            return np.empty((0, 4))
+        return _finite(path, _array(path, (None, 4), "f"))
+
+    def poses(self) -> Float:
+        """(T, D+1, D+1) T_world_base."""
+        path = self.folder / "truth/T_world_base.npy"
+        n = self.recording.dimension + 1
+        return _finite(path, _array(path, (self.recording.n_scans, n, n), "f"))
+
+    def static_hits(self) -> Float:
+        """(N, D) end points in the world frame, at true poses, of the static beams that hit."""
+        use = np.flatnonzero(self.recording.hit & self.static())
+        return self.recording.end_points(use, self.poses())
+
+
+def read_truth(path: Path, labels: Labels | None = None) -> Truth:
+    """A simulated recording, given by its folder or by the `truth` folder inside.
+
+    Args:
+        path: the folder. Of one with the two recordings of a rig the flat laser's is taken.
+        labels: of the two the one with their beams is taken.
+
+    Raises:
+        InputError: it is none. The arrays of truth can still fail later.
+    """
+    folder = path.parent if path.name == "truth" and not (path / "truth").exists() else path
+    if (folder / "truth").is_dir():
+        return _truth(folder)
+    inside = [path / name for name in RIG]
+    if not all((one / "truth").is_dir() for one in inside):
+        raise InputError(
+            "holds no truth", where=str(path), hint="a folder that 'stillmap simulate' wrote"
+        )
+    if labels is None:
+        return _truth(inside[0])
+    # both lasers may scan at the same times, as many beams each: where these ended differs
+    return max(map(_truth, inside), key=lambda truth: _share_alike(labels, truth.recording))
+
+
+def _truth(folder: Path) -> Truth:
+    log = folder / "recording.log"  # a simulation in CARMEN's format
+    return Truth(folder, recording_of(log) if log.exists() else read_folder(folder))
+
+
+def _share_alike(labels: Labels, recording: Recording) -> float:
+    """The share of beams that hit something in both, or in neither; -1 of other beams."""
+    if labels.hit.shape != recording.hit.shape:
+        return -1.0
+    blocks = arrays.blocks(labels.hit, recording.hit)
+    same = sum(int((labels.hit[b] == recording.hit[b]).sum()) for b in blocks)
+    return same / max(len(labels.hit), 1)
+
+
+def read_labels(result: Path) -> Labels:
+    """The labels of a result folder.
+
+    Raises:
+        InputError: they are missing, damaged, or of lengths that do not go together.
+    """
+    folder = result / "beams"
+    stamp_ns = _array(folder / "stamp_ns.npy", (None,), "i")
+    offset = _array(folder / "offset.npy", (len(stamp_ns) + 1,), "i")
+    beams = int(offset[-1])
+    path = folder / "p_static.npy"
+    p_static = _array(path, (beams,), "f")
+    for block in arrays.blocks(p_static):
+        wrong = np.flatnonzero((p_static[block] < 0) | (p_static[block] > 1))
+        if len(wrong):
+            beam = block.start + int(wrong[0])
+            raise InputError(f"beam {beam} has no probability in [0, 1]", where=str(path))
+    return Labels(stamp_ns, offset, p_static, _array(folder / "hit.npy", (beams,), "b"))
+
+
+def read_colours(result: Path, beams: int) -> NDArray[np.uint8] | None:
+    """(M, 3) colours of the ends of a result's beams, so many; None where it has none.
+
+    Raises:
+        InputError: they are damaged, or others.
+    """
+    path = result / "beams" / "colour.npy"
+    if not path.exists():
+        return None
+    colours = _array(path, (beams, 3), "u")
+    if colours.dtype != np.uint8:
+        raise InputError(f"holds {colours.dtype}", where=str(path))
+    return colours
+
+
+def require_same_beams(labels: Labels, truth: Truth, result: Path) -> None:
+    """Labels and truth speak of the same beams.
+
+    Raises:
+        InputError: scans, beams or stamps differ.
+    """
+    for name, got, wanted in (
+        ("scans", len(labels.stamp_ns), truth.recording.n_scans),
+        ("beams", len(labels.p_static), truth.recording.n_beams),
+    ):
+        if got != wanted:
+            raise InputError(
+                f"has {got} {name}, the truth in {truth.folder} has {wanted}",
+                where=str(result / "beams"),
+                hint="is it the result of another recording?",
+            )
+    differ = labels.stamp_ns != truth.recording.stamp_ns
+    differ |= labels.offset[1:] != truth.recording.offset[1:]
+    if differ.any():
+        raise InputError(
+            f"scan {int(np.argmax(differ))} is another one than in {truth.folder}",
+            where=str(result / "beams"),
+            hint="is it the result of another recording?",
+        )
+
+
+def _array(path: Path, shape: tuple[int | None, ...], kinds: str) -> NDArray[Any]:
+    """An .npy array of this shape (None: any length) and one of these kinds of dtype."""
+    array = open_npy(path)
+    if len(array.shape) != len(shape) or any(
+        want not in (None, got) for got, want in zip(array.shape, shape, strict=True)
+    ):
+        raise InputError(f"is {shape_text(array.shape)}, not {shape_text(shape)}", where=str(path))
+    if array.dtype.kind not in kinds:
+        raise InputError(f"holds {array.dtype}", where=str(path))
+    return array
+
+
+def _finite(path: Path, array: NDArray[Any]) -> Float:
+    if not np.isfinite(array).all():
+        raise InputError("holds a number that is not finite", where=str(path))
+    return np.asarray(array, np.float64)
+
+
+_RELATION = "t1 t2 x y z roll pitch yaw"
+
+_POSE = "t x y theta, or stamp x y z qx qy qz qw"
+
+_HEAD = 1 << 16  # bytes: what stands before the first row
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses (N, 4, 4) at times (N,) in seconds, sorted by time, N >= 1."""
+
+    stamp_s: Float
+    poses: Float
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Rows `t x y theta` or TUM rows, whichever the file holds.
+
+    Raises:
+        InputError: the file cannot be read, or a line of it is no pose.
+    """
+    if _first_row(path, _POSE).count == 4:
+        rows = _rows(path, 4, "t x y theta")
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        T = se2.matrix(*rows[:, 1:].T)
+        poses[:, :2, :2], poses[:, :2, 3] = T[:, :2, :2], T[:, :2, 2]
+        stamps = rows[:, 0]
+    else:
+        stamp_ns, poses = read_tum(path)
+        stamps = seconds(stamp_ns)
+    order = np.argsort(stamps, kind="stable")
+    return Trajectory(stamps[order], poses[order])
+
+
+def read_planar(path: Path) -> Float:
+    """The same file as (N, 4) t, x, y, theta; of a pose in space the yaw is taken."""
+    trajectory = read_trajectory(path)
+    T = trajectory.poses
+    yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
+    return np.column_stack([trajectory.stamp_s, T[:, 0, 3], T[:, 1, 3], yaw])
+
+
+def read_relations(path: Path) -> Float:
+    """(R, 8) rows t1, t2, x, y, z, roll, pitch, yaw.
+
+    Raises:
+        InputError: the file cannot be read, or a line of it is no relation.
+    """
+    return _rows(path, 8, _RELATION)
+
+
+def read_odometry(path: Path) -> Float:
+    """(K, 4) t, x, y, theta of a CARMEN log, plain or gzip, or of a trajectory file.
+
+    Of a log the ODOM lines count; where it has none, the robot poses of its laser lines do.
+
+    Raises:
+        InputError: the file cannot be read or holds no odometry.
+    """
+    if not _first_row(path, f"a CARMEN log or {_POSE}").is_log:
+        return read_planar(path)
+    log = read_log(path)
+    if log.skipped_odometry.total:
+        _log.warning("%s: odometry skipped: %s", path, log.skipped_odometry.summary())
+    rows = _log_rows(log)
+    if not len(rows):
+        raise InputError("holds no odometry", where=str(path), hint="ODOM lines, or laser lines")
+    return rows[np.argsort(rows[:, 0], kind="stable")]
+
+
+def seconds(stamp_ns: NDArray[np.int64]) -> Float:
+    """The double nearest to each stamp, as if parsed from its decimal text.
+
+    Dividing the array would round twice, and move stamps of our century by up to 2e-7 s.
+    """
+    return np.array([stamp / 10**9 for stamp in stamp_ns.tolist()], np.float64)
+
+
+def _log_rows(log: CarmenLog) -> Float:
+    if len(log.odom_stamp_ns):
+        stamps, poses = np.asarray(log.odom_stamp_ns), np.asarray(log.odom_poses).reshape(-1, 3)
+        return np.column_stack([seconds(stamps), poses])
+    for laser in log.lasers.values():
+        if laser.has_poses:
+            poses = np.asarray(laser.poses).reshape(-1, 6)[:, 3:]
+            return np.column_stack([seconds(np.asarray(laser.stamp_ns)), poses])
+    return np.zeros((0, 4))
+
+
+@dataclass(frozen=True)
+class _FirstRow:
+    count: int
+    is_log: bool
+
+
+def _first_row(path: Path, wanted: str) -> _FirstRow:
+    """What the first row looks like: how many columns, and whether it starts with a word."""
+    require_regular(path)
+    text = head(path, _HEAD).decode("utf-8", "replace")
+    for line in text.splitlines():
+        words = line.split("#")[0].split()
+        if words:
+            return _FirstRow(len(words), not _is_number(words[0]))
+    raise InputError("holds no rows", where=str(path), hint=f"rows of {wanted}")
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _rows(path: Path, columns: int, names: str) -> Float:
+    """(N, columns) finite numbers; what follows a # is a comment."""
+    try:
+        lines = read_text(path, LARGEST).splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError("is not a text file", where=str(path)) from error
+    rows = [
+        _row(words, columns, names, f"{path}:{number}")
+        for number, line in enumerate(lines, start=1)
+        if (words := line.split("#")[0].split())
+    ]
+    if not rows:
+        raise InputError("holds no rows", where=str(path), hint=f"rows of {names}")
+    return np.array(rows, np.float64)
+
+
+def _row(words: list[str], columns: int, names: str, where: str) -> list[float]:
+    if len(words) != columns:
+        raise InputError(f"has {len(words)} columns, not {columns}", where=where, hint=names)
+    try:
+        row = [float(word) for word in words]
+    except ValueError as error:
+        raise InputError("holds something that is no number", where=where, hint=names) from error
+    if not all(math.isfinite(value) for value in row):
+        raise InputError("holds a number that is not finite", where=where)
+    return row

@@ -1,0 +1,133 @@
+"""Relation errors of a trajectory in the plane.
+
+Kuemmerle et al., "On measuring the accuracy of SLAM algorithms", Autonomous Robots 27 (2009):
+a trajectory is judged by how well it reproduces known displacements between pairs of its poses,
+so that neither the choice of the map frame nor one early turn decides the score. Where their
+program and their text differ, the default follows the program, whose numbers are the published
+ones.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.eval.labels import Scores
+from stillmap.eval.trajectory import nearest
+
+Float = NDArray[np.float64]
+
+MAX_DT = 0.1  # seconds, as in the authors' program
+
+
+@dataclass(frozen=True)
+class Spread(Scores):
+    """Mean and sample standard deviation of absolute and of squared errors, median, largest."""
+
+    mean: float
+    std: float
+    squared_mean: float
+    squared_std: float
+    median: float
+    max: float
+
+
+@dataclass(frozen=True)
+class RelationErrors(Scores):
+    """Errors over the relations that could be used.
+
+    Attributes:
+        relations: all that were given.
+        used: those with a pose at both ends.
+        stamps: different times that the relations name.
+        stamps_by_odometry: of these, times that only odometry could reach.
+        translation: metres. rotation: degrees. NaN where no relation was used.
+    """
+
+    relations: int
+    used: int
+    stamps: int
+    stamps_by_odometry: int
+    translation: Spread
+    rotation: Spread
+
+
+def relation_errors(
+    trajectory: Float,
+    relations: Float,
+    odometry: Float | None = None,
+    max_dt: float = MAX_DT,
+    compose: bool = False,
+) -> RelationErrors:
+    """Compare the displacements of a trajectory with known ones.
+
+    The pose at a time is the nearest one within `max_dt`. Beyond it the nearest pose is moved by
+    the odometry between the two times (nearest odometry rows); without odometry, the relation is
+    left out.
+
+    Args:
+        trajectory: (N, 4) t, x, y, theta in seconds, metres, radians; N >= 1, sorted by t.
+        relations: (R, 8) t1, t2, x, y, z, roll, pitch, yaw; only x, y and yaw are compared.
+        odometry: (K, 4) as `trajectory`, K >= 1.
+        max_dt: seconds.
+        compose: error as the displacement that leads from the reference to the estimate, as in
+            the paper's equation; otherwise the difference of the components, as in its program.
+    """
+    times, index = np.unique(relations[:, :2].ravel(), return_inverse=True)
+    poses, known, by_odometry = _poses_at(times, trajectory, odometry, max_dt)
+    first, second = index.reshape(-1, 2).T
+    used = known[first] & known[second]
+    estimate = _displacement(poses[first[used]], poses[second[used]])
+    reference = relations[used][:, [2, 3, 7]]
+    error = _displacement(reference, estimate) if compose else estimate - reference
+    return RelationErrors(
+        relations=len(relations),
+        used=int(used.sum()),
+        stamps=len(times),
+        stamps_by_odometry=by_odometry,
+        translation=_spread(np.hypot(error[:, 0], error[:, 1])),
+        rotation=_spread(np.degrees(np.abs(se2.wrap(error[:, 2])))),
+    )
+
+
+def _poses_at(
+    times: Float, trajectory: Float, odometry: Float | None, max_dt: float
+) -> tuple[Float, NDArray[np.bool_], int]:
+    index, distance = nearest(trajectory[:, 0], times)
+    poses = trajectory[index, 1:]
+    far = distance > max_dt
+    if odometry is None:
+        return poses, ~far, 0
+    start, _ = nearest(odometry[:, 0], trajectory[index[far], 0])
+    end, _ = nearest(odometry[:, 0], times[far])
+    poses[far] = _moved(poses[far], _displacement(odometry[start, 1:], odometry[end, 1:]))
+    return poses, np.ones(len(times), bool), int(far.sum())
+
+
+def _displacement(a: Float, b: Float) -> Float:
+    """a^-1 b for (N, 3) poses."""
+    return se2.parameters(se2.inverse(se2.matrix(*a.T)) @ se2.matrix(*b.T))
+
+
+def _moved(a: Float, step: Float) -> Float:
+    """a step for (N, 3) poses."""
+    return se2.parameters(se2.matrix(*a.T) @ se2.matrix(*step.T))
+
+
+def _spread(error: Float) -> Spread:
+    if not len(error):
+        return Spread(*[float("nan")] * 6)
+    squared = error**2
+    return Spread(
+        mean=float(error.mean()),
+        std=_sample_std(error),
+        squared_mean=float(squared.mean()),
+        squared_std=_sample_std(squared),
+        median=float(np.median(error)),
+        max=float(error.max()),
+    )
+
+
+def _sample_std(values: Float) -> float:
+    return float(values.std(ddof=1)) if len(values) > 1 else 0.0

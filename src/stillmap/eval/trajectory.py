@@ -1,0 +1,235 @@
+"""Absolute and relative errors of a trajectory, in the plane or in space.
+
+Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012. Alignment: the
+rigid case of Umeyama, "Least-squares estimation of transformation parameters between two point
+patterns", PAMI 13 (1991); the scale is never estimated, since a laser measures it.
+
+Poses of a result beside those that are true.
+
+Which of a list of times lies nearest to another time.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import scipy  # its parts load when they are first used
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.errors import InputError
+from stillmap.eval import readers
+from stillmap.eval.labels import Scores
+from stillmap.eval.readers import Truth
+
+Float = NDArray[np.float64]
+
+Unit = Literal["m", "frames"]
+
+
+def nearest(
+    stamps: NDArray[np.float64], at: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Index of the nearest of the sorted `stamps` (N >= 1) for each of `at`, and how far it is.
+
+    Of two as near the earlier one is taken. Any unit; also used for distances along a path.
+    """
+    after = np.searchsorted(stamps, at).clip(0, len(stamps) - 1)
+    before = (after - 1).clip(0)
+    index = np.where(np.abs(stamps[before] - at) <= np.abs(stamps[after] - at), before, after)
+    return index, np.abs(stamps[index] - at)
+
+
+_PLANAR = 1e-6  # metres and sines: what is left of a plane after text and quaternions
+
+_PATH_TOLERANCE = 0.1  # of the distance asked for
+
+
+@dataclass(frozen=True)
+class ErrorStats(Scores):
+    """NaN where there was nothing to measure."""
+
+    rmse: float
+    mean: float
+    median: float
+    max: float
+
+
+@dataclass(frozen=True)
+class RelativeErrors(Scores):
+    """RPE over `pairs` pairs of poses: translation in metres, rotation in degrees."""
+
+    pairs: int
+    translation: ErrorStats
+    rotation: ErrorStats
+
+
+def associate(
+    estimated_s: Float, reference_s: Float, max_dt: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices of poses that belong together by their stamps.
+
+    The very same stamps belong together one by one. Else each pose of the trajectory with fewer of
+    them takes the nearest of the other one, when it lies within `max_dt` seconds.
+
+    Args:
+        estimated_s, reference_s: (N,) and (K,) seconds, sorted, N, K >= 1.
+
+    Raises:
+        InputError: no two stamps lie that near.
+    """
+    if np.array_equal(estimated_s, reference_s):  # stamps may repeat
+        return np.arange(len(estimated_s)), np.arange(len(estimated_s))
+    swap = len(estimated_s) > len(reference_s)
+    few, many = (reference_s, estimated_s) if swap else (estimated_s, reference_s)
+    partner, distance = nearest(many, few)
+    near = np.flatnonzero(distance <= max_dt)
+    if not len(near):
+        raise InputError(
+            f"no two stamps lie within {max_dt:g} s of each other",
+            hint="other clocks? see --max-dt",
+        )
+    return (partner[near], near) if swap else (near, partner[near])
+
+
+def to_plane_where_flat(a: Float, b: Float) -> tuple[Float, Float]:
+    """Both trajectories (N, 4, 4) as (N, 3, 3) when neither leaves the plane z = 0.
+
+    An alignment in space may turn a flat trajectory over; one in the plane may not.
+    """
+    return (planar(a), planar(b)) if _is_flat(a) and _is_flat(b) else (a, b)
+
+
+def planar(T: Float) -> Float:
+    """(N, 3, 3) from flat poses (N, 4, 4)."""
+    keep = np.array([0, 1, 3])
+    return T[:, keep[:, None], keep]
+
+
+def _is_flat(T: Float) -> bool:
+    return bool(np.all(np.abs(T[:, 2, :] - (0.0, 0.0, 1.0, 0.0)) < _PLANAR))
+
+
+def align_points(source: Float, target: Float) -> Float:
+    """(D+1, D+1) rigid T that minimises sum |target - T source|^2 over (N, D) points, N >= 1."""
+    centre_source, centre_target = source.mean(0), target.mean(0)
+    U, _, Vt = np.linalg.svd((target - centre_target).T @ (source - centre_source))
+    D = source.shape[1]
+    # the last axis is the one whose reversal costs least: it keeps R a rotation
+    flip = np.ones(D)
+    flip[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    T = np.eye(D + 1)
+    T[:D, :D] = (U * flip) @ Vt
+    T[:D, D] = centre_target - T[:D, :D] @ centre_source
+    return T
+
+
+def align(estimated: Float, truth: Float, lever: float = 1.0) -> Float:
+    """T_truth_estimated that lays estimated poses on true ones, (N, D+1, D+1) each, N >= 1.
+
+    Every pose counts as points `lever` metres from its origin along both directions of each of
+    its axes. So headings settle what positions leave open, the turn of a robot that stood still
+    or drove straight, and weigh little against a path much longer than the lever.
+    """
+    return align_points(_arms(estimated, lever), _arms(truth, lever))
+
+
+def _arms(T: Float, lever: float) -> Float:
+    D = T.shape[-1] - 1
+    axes = lever * np.swapaxes(T[:, :D, :D], 1, 2)
+    origin = T[:, None, :D, D]
+    return np.concatenate([origin + axes, origin - axes], axis=1).reshape(-1, D)
+
+
+def absolute_errors(estimated: Float, reference: Float) -> ErrorStats:
+    """ATE in metres: distances between positions after the best rigid alignment.
+
+    Args:
+        estimated, reference: (N, D+1, D+1) poses that belong together, N >= 1.
+    """
+    D = estimated.shape[-1] - 1
+    source, target = estimated[:, :D, D], reference[:, :D, D]
+    T = align_points(source, target)
+    return error_stats(np.linalg.norm(target - (source @ T[:D, :D].T + T[:D, D]), axis=1))
+
+
+def relative_errors(
+    estimated: Float, reference: Float, delta: float = 1.0, unit: Unit = "m"
+) -> RelativeErrors:
+    """RPE: (Q_i^-1 Q_j)^-1 (P_i^-1 P_j) over all pairs i, j that lie `delta` apart.
+
+    In frames j = i + delta. In metres j is the pose whose distance from i along the reference
+    path comes nearest to delta; a pair more than a tenth off is left out.
+
+    Args:
+        estimated, reference: (N, D+1, D+1) poses P and Q that belong together.
+        delta: > 0; a whole number when the unit is frames.
+    """
+    i, j = _pairs(reference, delta, unit)
+    wanted = se2.inverse(reference[i]) @ reference[j]
+    error = se2.inverse(wanted) @ se2.inverse(estimated[i]) @ estimated[j]
+    D = error.shape[-1] - 1
+    return RelativeErrors(
+        pairs=len(i),
+        translation=error_stats(np.linalg.norm(error[:, :D, D], axis=1)),
+        rotation=error_stats(np.degrees(_angle(error[:, :D, :D]))),
+    )
+
+
+def _pairs(reference: Float, delta: float, unit: Unit) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    if unit == "frames":
+        step = round(delta)
+        if step != delta or step < 1:
+            raise InputError(f"a step of {delta:g} frames is no whole number of them")
+        first = np.arange(max(len(reference) - step, 0))
+        return first, first + step
+    if not delta > 0:
+        raise InputError(f"a step of {delta:g} m leads nowhere")
+    position = reference[:, :-1, -1]
+    path = np.concatenate([[0.0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
+    second, off = nearest(path, path + delta)
+    first = np.flatnonzero(off <= _PATH_TOLERANCE * delta)
+    return first, second[first]
+
+
+def _angle(R: Float) -> Float:
+    if R.shape[-1] == 2:
+        return np.abs(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
+    # scipy < 1.15 refuses an empty stack
+    return (
+        np.asarray(scipy.spatial.transform.Rotation.from_matrix(R).magnitude())
+        if len(R)
+        else np.zeros(0)
+    )
+
+
+def error_stats(error: Float) -> ErrorStats:
+    """Summary of (N,) errors."""
+    if not len(error):
+        return ErrorStats(*[float("nan")] * 4)
+    return ErrorStats(
+        rmse=float(np.sqrt(np.mean(error**2))),
+        mean=float(error.mean()),
+        median=float(np.median(error)),
+        max=float(error.max()),
+    )
+
+
+_STAMP_TOLERANCE = 1e-6  # seconds: a result carries the stamps of its recording
+
+
+def paired(result: Path, truth: Truth) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Poses (N, 4, 4) of a result's trajectory, and the true ones (N, D+1, D+1) at their stamps.
+
+    Raises:
+        InputError: the trajectory is missing or damaged, or is of another recording.
+    """
+    estimated = readers.read_trajectory(result / "trajectory.tum")
+    stamps = readers.seconds(truth.recording.stamp_ns)
+    try:
+        i, j = associate(estimated.stamp_s, stamps, _STAMP_TOLERANCE)
+    except InputError as error:
+        what = f"is not of the recording in {truth.folder}: they have no stamp in common"
+        raise InputError(what, where=str(result)) from error
+    return estimated.poses[i], truth.poses()[j]

@@ -1,0 +1,8 @@
+"""Recordings: one shape for all formats, one file per format."""
+
+from stillmap.core.recording import Recording
+from stillmap.io.registry import read
+from stillmap.io.stillmap_folder import write
+from stillmap.preprocessing.options import ReadOptions
+
+__all__ = ["ReadOptions", "Recording", "read", "write"]

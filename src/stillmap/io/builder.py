@@ -1,0 +1,209 @@
+"""Scans gathered one by one into a recording, whatever their number.
+
+What was skipped while reading, by reason and with line numbers.
+"""
+
+from array import array
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import Column, empty
+from stillmap.core.recording import Recording
+from stillmap.preprocessing.options import FARTHEST, ReadOptions
+
+_BLOCK = 1 << 20  # points of a scan looked at together
+
+
+class Gathered:
+    """Scans of point clouds, in any order; what does not fit into memory goes to files.
+
+    Args:
+        dimension: 2 or 3.
+        options: readings nearer than `min_range` are unusable, those from `max_range` on are
+            taken for maximum range, at that range.
+        beam_times: whether `add` will be told when beams were taken.
+        folder: for the files; None: the system's temporary folder.
+    """
+
+    def __init__(
+        self,
+        dimension: int,
+        options: ReadOptions,
+        *,
+        beam_times: bool = False,
+        folder: Path | None = None,
+    ) -> None:
+        self._options, self._folder = options, folder
+        self._stamp_ns, self._length, self._sensor = array("q"), array("q"), array("i")
+        self._points = Column(np.float32, (dimension,), folder)
+        self._hit = Column(np.bool_, (), folder)
+        self._times = Column(np.float32, (), folder) if beam_times else None
+
+    def __len__(self) -> int:
+        return len(self._stamp_ns)
+
+    def add(
+        self,
+        stamp_ns: int,
+        points: NDArray[Any],
+        *,
+        sensor: int = 0,
+        beam_time: NDArray[Any] | None = None,
+    ) -> None:
+        """One scan.
+
+        Args:
+            stamp_ns: when it was taken.
+            points: (n, D) metres in the sensor's frame; not finite, or not to be believed:
+                unusable. It may be larger than memory.
+            sensor: which sensor took it.
+            beam_time: (n,) seconds after the stamp; not finite counts as 0.
+        """
+        for start in range(0, len(points), _BLOCK):
+            block = slice(start, start + _BLOCK)
+            known, hit = _understood(np.asarray(points[block], np.float32), self._options)
+            self._points.append(known)
+            self._hit.append(hit)
+            if self._times is not None:
+                times = np.zeros(len(known)) if beam_time is None else beam_time[block]
+                self._times.append(np.where(np.isfinite(times), times, 0.0))
+        self._stamp_ns.append(stamp_ns)
+        self._length.append(len(points))
+        self._sensor.append(sensor)
+
+    def recording(
+        self,
+        T_base_sensor: NDArray[np.float64],
+        *,
+        source: dict[str, Any],
+        T_odom_base: NDArray[np.float64] | None = None,
+        T_recorded_base: NDArray[np.float64] | None = None,
+        chosen: NDArray[np.intp] | None = None,
+        **more: Any,
+    ) -> Recording:
+        """The recording of scans by their stamps; nothing can be added any more.
+
+        Args:
+            T_base_sensor: (S, D+1, D+1).
+            source: see Recording.
+            T_odom_base, T_recorded_base: (T, D+1, D+1) in the order in which scans were added.
+            chosen: which of the scans; None: all.
+            more: other fields of the Recording.
+        """
+        stamp_ns = np.asarray(self._stamp_ns, np.int64)
+        length = np.asarray(self._length, np.int64)
+        chosen = np.arange(len(stamp_ns)) if chosen is None else np.sort(chosen)
+        order = chosen[np.argsort(stamp_ns[chosen], kind="stable")]
+        start = np.cumsum(length) - length
+        columns = [
+            _ordered(column.finished(), start, length, order, self._folder)
+            for column in (self._points, self._hit, self._times)
+            if column is not None
+        ]
+        return Recording(
+            stamp_ns=stamp_ns[order],
+            offset=np.concatenate([[0], np.cumsum(length[order])]).astype(np.int64),
+            points=columns[0],
+            hit=columns[1],
+            T_base_sensor=T_base_sensor,
+            sensor=np.asarray(self._sensor, np.int32)[order],
+            T_odom_base=None if T_odom_base is None else T_odom_base[order],
+            source=source,
+            beam_time=columns[2] if self._times is not None else None,
+            T_recorded_base=None if T_recorded_base is None else T_recorded_base[order],
+            **more,
+        )
+
+
+def _understood(
+    points: NDArray[np.float32], options: ReadOptions
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Points (n, D), NaN where unusable, and which of them something reflected."""
+    # column by column: along rows of two or three numbers NumPy is slow
+    length = np.sqrt(sum(column * column for column in points.T.astype(np.float64)))
+    usable = (length <= FARTHEST) & (length >= options.min_range) & (length > 0.0)
+    if options.max_range is None and usable.all():
+        return points, usable
+    out = np.where(usable[:, None], points, np.float32(np.nan))
+    if options.max_range is None:
+        return out, usable
+    far = usable & (length >= options.max_range)
+    end = options.max_range if options.free_range is None else options.free_range
+    out[far] *= (end / length[far])[:, None].astype(np.float32)
+    return out, usable & ~far
+
+
+def _ordered(
+    values: NDArray[Any],
+    start: NDArray[np.int64],
+    length: NDArray[np.int64],
+    order: NDArray[np.intp],
+    folder: Path | None,
+) -> NDArray[Any]:
+    """Values per beam of the scans in `order`."""
+    if np.array_equal(order, np.arange(len(start))):
+        return values
+    out = empty((int(length[order].sum()), *values.shape[1:]), values.dtype, folder)
+    at = 0
+    for scan in order:
+        first, n = int(start[scan]), int(length[scan])
+        out[at : at + n] = values[first : first + n]
+        at += n
+    return out
+
+
+KEPT_LINES = 1000
+
+
+class Skipped:
+    """Counts of skipped records by reason; at most `KEPT_LINES` line numbers each."""
+
+    def __init__(self) -> None:
+        self._count: dict[str, int] = {}
+        self._lines: dict[str, list[int]] = {}
+
+    def add(self, reason: str, line: int) -> None:
+        self.add_all(reason, (line,))
+
+    def add_all(self, reason: str, lines: Iterable[int]) -> None:
+        for line in lines:
+            self._count[reason] = self._count.get(reason, 0) + 1
+            kept = self._lines.setdefault(reason, [])
+            if len(kept) < KEPT_LINES:
+                kept.append(int(line))
+
+    def merged(self, *others: "Skipped") -> "Skipped":
+        """These and the others' together; neither is changed."""
+        out = Skipped()
+        for part in (self, *others):
+            for reason, count in part._count.items():
+                out._count[reason] = out._count.get(reason, 0) + count
+                lines = sorted(out._lines.get(reason, []) + part._lines[reason])
+                out._lines[reason] = lines[:KEPT_LINES]
+        return out
+
+    @property
+    def total(self) -> int:
+        return sum(self._count.values())
+
+    def summary(self, unit: str = "line") -> str:
+        """`3 x unreadable number (line 4, 8, 15)`, the most frequent reason first.
+
+        Args:
+            unit: what the numbers count.
+        """
+        parts = []
+        for reason, count in sorted(self._count.items(), key=lambda item: -item[1]):
+            shown = ", ".join(str(line) for line in sorted(self._lines[reason])[:3])
+            parts.append(f"{count} x {reason} ({unit} {shown}{', ...' if count > 3 else ''})")
+        return "; ".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            reason: {"count": count, "lines": sorted(self._lines[reason])}
+            for reason, count in self._count.items()
+        }

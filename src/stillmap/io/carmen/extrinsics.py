@@ -1,0 +1,152 @@
+"""Where the lasers of a CARMEN log sit on the robot."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.io.carmen.log import LaserLog, param_number
+from stillmap.preprocessing.options import GivenLaser
+
+# differences between laser pose and robot pose that are one place on the robot: rounded to cm in
+# old logs; a corrected pose in the laser field differs by metres, and differently in each scan
+_SAME_M, _SAME_RAD = 0.02, 0.01
+_LARGEST_OFFSET = 3.0  # m on a robot
+_SMALLEST = 0.002  # m or rad: less is rounding, not a place
+
+
+class Extrinsics(NamedTuple):
+    """Pose of a laser on the robot: metres, radians, and how it was found."""
+
+    x: float
+    y: float
+    theta: float
+    how: str
+
+    def matrix(self) -> NDArray[np.float64]:
+        """(3, 3) T_base_sensor."""
+        return se2.matrix(self.x, self.y, self.theta)
+
+    def to_dict(self) -> dict[str, Any]:
+        return self._asdict()
+
+
+def find(
+    laser: LaserLog, poses: NDArray[np.float64] | None, params: dict[str, str]
+) -> tuple[Extrinsics, list[str]]:
+    """Extrinsics of a laser, and warnings in words.
+
+    In this order: the laser's pose against the robot's on the scan lines themselves, where they
+    differ and always alike (median); the log's PARAMs; facing backwards for RLASER, which CARMEN
+    names for it; the robot's centre.
+
+    Args:
+        laser: its scans.
+        poses: (T, 6) laser and robot pose of each scan, None where the lines have none.
+        params: the log's PARAMs.
+    """
+    warnings: list[str] = []
+    if poses is not None:
+        offset, alike = _offset(poses)
+        x, y, theta = (round(float(value), 6) for value in offset)
+        if alike and is_told_by_lines(x, y, theta):
+            return Extrinsics(x, y, theta, "scan lines"), warnings
+        if not alike:
+            warnings.append(
+                f"{laser.kind}: the laser poses on the scan lines do not keep to one place on the "
+                "robot (a corrected log?): not used"
+            )
+    found = _from_params(laser.kind, params)
+    if found is not None:
+        return found, warnings
+    if laser.kind == "RLASER":
+        return Extrinsics(0.0, 0.0, math.pi, "a rear laser faces backwards"), warnings
+    if laser.kind in ("RAWLASER2", "RAWLASER3", "RAWLASER4"):
+        warnings.append(f"{laser.kind}: the log does not say where it sits: robot centre assumed")
+    return Extrinsics(0.0, 0.0, 0.0, "robot centre assumed"), warnings
+
+
+def is_told_by_lines(x: float, y: float, theta: float) -> bool:
+    """Whether poses on scan lines tell a laser's place: on the robot, and not at its centre."""
+    away = math.hypot(x, y)
+    return away < _LARGEST_OFFSET and max(away, abs(theta)) > _SMALLEST
+
+
+def overridden(found: Extrinsics, given: GivenLaser) -> Extrinsics:
+    """`found` with what the options name in its place."""
+    if given.place == (None, None, None):
+        return found
+    x, y, theta = (f if w is None else w for f, w in zip(found[:3], given.place, strict=True))
+    return Extrinsics(x, y, theta, "given")
+
+
+def upside_down(kind: str, params: dict[str, str], given: GivenLaser) -> tuple[bool, str]:
+    """Whether a laser's beams turn clockwise, for it hangs upside down; and who says so.
+
+    CARMEN's own laser_..._flipped do not: its laser server turns such readings round before they
+    are logged.
+    """
+    if given.upside_down is not None:
+        return given.upside_down, "given"
+    stated = param_number(params, f"robot_{position(kind, params)}laser_flipped")
+    return (False, "assumed") if stated is None else (stated != 0.0, "PARAM")
+
+
+def field_of_view(kind: str, params: dict[str, str], given: GivenLaser) -> float | None:
+    """Of a laser whose lines state no angles, in radians; None: nobody says."""
+    if given.fov is not None:
+        return given.fov
+    degrees = param_number(params, f"laser_{position(kind, params)}_laser_fov")
+    return math.radians(degrees) if degrees is not None and 0.0 < degrees <= 360.0 else None
+
+
+def position(kind: str, params: dict[str, str]) -> str:
+    """`front`, `rear` or the kind itself: lines with the same position show the same laser."""
+    if kind in ("FLASER", "ROBOTLASER1"):
+        return "front"
+    if kind in ("RLASER", "ROBOTLASER2"):
+        return "rear"
+    number = float(kind[-1])
+    for place, default in (("front", 1.0), ("rear", 2.0)):
+        stated = param_number(params, f"robot_{place}laser_id")
+        if number == (default if stated is None else stated):
+            return place
+    return kind
+
+
+def declared_max_range(laser: LaserLog, params: dict[str, str]) -> float | None:
+    """The largest range that the log names for a laser, in metres: PARAM or header, the smaller."""
+    in_headers = [config.max_range for config in laser.configs if config.max_range is not None]
+    in_params = param_number(params, f"robot_{position(laser.kind, params)}_laser_max")
+    # a header may be damaged in one line: the most cautious of what remains is the largest
+    stated = [max(in_headers)] if in_headers else []
+    if in_params is not None and in_params > 0.0:
+        stated.append(in_params)
+    return min(stated) if stated else None
+
+
+def _offset(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+    """Median (x, y, theta) of the laser in the robot's frame, and whether scans agree on it."""
+    T_odom_sensor, T_odom_base = se2.matrix(*poses[:, :3].T), se2.matrix(*poses[:, 3:].T)
+    offsets = se2.parameters(se2.inverse(T_odom_base) @ T_odom_sensor)
+    # angles near pi fall on both sides of the cut: unwrap them about the first
+    offsets[:, 2] = offsets[0, 2] + se2.wrap(offsets[:, 2] - offsets[0, 2])
+    middle = np.median(offsets, axis=0)
+    off = np.abs(offsets - middle)
+    alike = np.mean((off[:, :2].max(axis=1) < _SAME_M) & (off[:, 2] < _SAME_RAD)) > 0.9
+    return middle, bool(alike) and bool(np.hypot(*middle[:2]) < _LARGEST_OFFSET)
+
+
+def _from_params(kind: str, params: dict[str, str]) -> Extrinsics | None:
+    place = position(kind, params)
+    names = [f"robot_{place}laser_{what}" for what in ("offset", "side_offset", "angular_offset")]
+    x, y, theta = (param_number(params, name) for name in names)
+    if x is None and y is None and theta is None:
+        return None
+    if theta is None:
+        theta = math.pi if place == "rear" else 0.0
+    elif abs(theta) > 2.0 * math.pi:  # some logs write degrees
+        theta = math.radians(theta)
+    return Extrinsics(x or 0.0, y or 0.0, theta, "PARAM")

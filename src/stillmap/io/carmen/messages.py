@@ -1,0 +1,226 @@
+"""The grammar of CARMEN log lines.
+
+One message per line: name, contents, then `ipc_timestamp hostname logger_timestamp`, of which old
+logs leave out the last one or two. The first of the two stamps is the record's time.
+
+    FLASER, RLASER  n r*n  laser_pose  robot_pose
+    RAWLASER1-4     header n r*n  m remission*m
+    ROBOTLASER1-2   header n r*n  m remission*m  laser_pose robot_pose
+                    tv rv forward_safety side_safety turn_axis
+    ODOM            x y theta tv rv acceleration
+    PARAM           name value
+    header          laser_type start_angle field_of_view angular_resolution maximum_range
+                    accuracy remission_mode
+
+Source: the header that CARMEN's logger writes into its logs, and logs themselves: the logger's
+comment on ROBOTLASER leaves the remissions out, its lines have them.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from stillmap.core.timestamps import parse_ns
+
+WRONG_COUNT = "wrong number of readings"
+UNREADABLE = "unreadable number"
+BAD_POSE = "pose not finite"
+
+_HEADER_FIELDS = 7
+_LARGEST_POSE = 1e7  # m or rad: nothing a robot's odometry reaches
+
+
+class BadRecord(Exception):
+    """One line that cannot be used; `reason` is what it is counted under."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
+        super().__init__(reason)
+
+
+class ScanConfig(NamedTuple):
+    """Where the beams of a scan point, and the range that the line declares as the largest."""
+
+    start_angle: float  # rad
+    angle_step: float  # rad
+    max_range: float | None  # m
+    field_of_view: float | None  # rad, as stated
+
+
+class ScanLine(NamedTuple):
+    """A laser line. Poses are (x, y, theta); None where the kind of line has none."""
+
+    stamp_ns: int
+    ranges: list[float]
+    config: ScanConfig
+    laser_pose: tuple[float, float, float] | None
+    robot_pose: tuple[float, float, float] | None
+    stamp_fields: int  # 1 to 3, how much of `ipc_timestamp hostname logger_timestamp` is there
+    host_is_number: bool  # possible, but in a log with named hosts a sign of shifted fields
+
+
+class OdometryLine(NamedTuple):
+    stamp_ns: int
+    pose: tuple[float, float, float]
+    stamp_fields: int
+
+
+def flaser_angles(n: int, fov: float = math.pi) -> ScanConfig:
+    """Angles of a FLASER or RLASER line, which states none: half a circle from -90 degrees.
+
+    180 and 181 readings are 1 degree apart, 360 and 361 half a degree: an even number leaves out
+    the last beam of the half circle, so the step is 180 / n degrees for even and 180 / (n - 1)
+    for odd n. Likewise for another field of view `fov`, in radians.
+    """
+    steps = n if n % 2 == 0 else max(n - 1, 1)
+    return ScanConfig(-fov / 2, fov / steps, None, None)
+
+
+def parse_flaser(fields: list[bytes]) -> ScanLine:
+    """FLASER and RLASER, `fields` without the name.
+
+    Raises:
+        BadRecord: the line cannot be used.
+    """
+    n = _count(fields, 0)
+    tail = fields[1 + n :]
+    if not _is_stamp(tail[6:]):
+        raise BadRecord(WRONG_COUNT)
+    ranges = _numbers(fields[1 : 1 + n])
+    stamp_ns = _stamp(tail[6])
+    poses = _pose(tail[0:3]), _pose(tail[3:6])
+    return ScanLine(stamp_ns, ranges, flaser_angles(n), *poses, *_stamp_form(tail[6:]))
+
+
+def parse_rawlaser(fields: list[bytes]) -> ScanLine:
+    """RAWLASER1-4, see `parse_flaser`."""
+    n = _count(fields, _HEADER_FIELDS)
+    tail = _after_remissions(fields[_HEADER_FIELDS + 1 + n :], 0)
+    config = _config(fields[:_HEADER_FIELDS], n)
+    ranges = _numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n])
+    return ScanLine(_stamp(tail[0]), ranges, config, None, None, *_stamp_form(tail))
+
+
+def parse_robotlaser(fields: list[bytes]) -> ScanLine:
+    """ROBOTLASER1-2, see `parse_flaser`."""
+    n = _count(fields, _HEADER_FIELDS)
+    tail = _after_remissions(fields[_HEADER_FIELDS + 1 + n :], 11)
+    config = _config(fields[:_HEADER_FIELDS], n)
+    ranges = _numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n])
+    stamp_ns = _stamp(tail[11])
+    poses = _pose(tail[0:3]), _pose(tail[3:6])
+    return ScanLine(stamp_ns, ranges, config, *poses, *_stamp_form(tail[11:]))
+
+
+def parse_odom(fields: list[bytes]) -> OdometryLine:
+    """ODOM, `fields` without the name.
+
+    Raises:
+        BadRecord: the line cannot be used.
+    """
+    if not _is_stamp(fields[6:]):
+        raise BadRecord("wrong number of fields")
+    stamp_ns = _stamp(fields[6])
+    return OdometryLine(stamp_ns, _pose(fields[0:3]), len(fields) - 6)
+
+
+SCAN_PARSERS: dict[bytes, Callable[[list[bytes]], ScanLine]] = {
+    b"FLASER": parse_flaser,
+    b"RLASER": parse_flaser,
+    b"RAWLASER1": parse_rawlaser,
+    b"RAWLASER2": parse_rawlaser,
+    b"RAWLASER3": parse_rawlaser,
+    b"RAWLASER4": parse_rawlaser,
+    b"ROBOTLASER1": parse_robotlaser,
+    b"ROBOTLASER2": parse_robotlaser,
+}
+
+
+def _count(fields: list[bytes], at: int) -> int:
+    """The stated number of readings, no larger than what the line can hold."""
+    if len(fields) <= at:
+        raise BadRecord(WRONG_COUNT)
+    if not fields[at].isdigit() or len(fields[at]) > 9:
+        raise BadRecord(UNREADABLE)
+    n = int(fields[at])
+    if n == 0 or n > len(fields) - at - 2:
+        raise BadRecord(WRONG_COUNT)
+    return n
+
+
+def _after_remissions(rest: list[bytes], fixed: int) -> list[bytes]:
+    """What follows the remissions: `fixed` fields, then the stamp."""
+    if rest and rest[0].isdigit() and len(rest[0]) <= 9:
+        tail = rest[1 + int(rest[0]) :]
+        if _is_stamp(tail[fixed:]):
+            return tail
+    raise BadRecord(WRONG_COUNT)
+
+
+def _is_stamp(fields: list[bytes]) -> bool:
+    """Whether `fields` read as `ipc_timestamp [hostname [logger_timestamp]]`.
+
+    A host name is no number, or a plain integer where the logger's stamp follows: so a line with
+    a reading too many or too few is seen even where missing stamps would hide it.
+    """
+    if len(fields) == 1:
+        return True
+    if len(fields) == 2:
+        return not _is_number(fields[1])
+    return (
+        len(fields) == 3
+        and (fields[1].isdigit() or not _is_number(fields[1]))
+        and _is_number(fields[2])
+    )
+
+
+def _stamp_form(fields: list[bytes]) -> tuple[int, bool]:
+    return len(fields), len(fields) > 1 and _is_number(fields[1])
+
+
+def _is_number(field: bytes) -> bool:
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
+
+
+def _numbers(fields: list[bytes]) -> list[float]:
+    try:
+        values = [float(field) for field in fields]
+    except ValueError as error:
+        raise BadRecord(UNREADABLE) from error
+    if any(b"_" in field for field in fields):  # Python reads 1_000 as a number
+        raise BadRecord(UNREADABLE)
+    return values
+
+
+def _pose(fields: list[bytes]) -> tuple[float, float, float]:
+    x, y, theta = _numbers(fields)
+    # written so that NaN fails too
+    if not (abs(x) < _LARGEST_POSE and abs(y) < _LARGEST_POSE and abs(theta) < _LARGEST_POSE):
+        raise BadRecord(BAD_POSE)
+    return x, y, theta
+
+
+def _stamp(field: bytes) -> int:
+    try:
+        return parse_ns(field.decode("ascii"))
+    except ValueError as error:
+        raise BadRecord(UNREADABLE) from error
+
+
+def _config(header: list[bytes], n: int) -> ScanConfig:
+    """Start, step and declared maximum of a header; a missing step follows from the field of view.
+
+    Only these four of its fields are read: the others matter to nobody here.
+    """
+    start, fov, step, max_range = _numbers(header[1:5])
+    stated_fov = fov if 0.0 < fov <= 2.1 * math.pi else None
+    if not 0.0 < step < math.pi and stated_fov is not None:
+        step = stated_fov / max(n - 1, 1)
+    if not (0.0 < step < math.pi and abs(start) <= 4.0 * math.pi):
+        raise BadRecord(UNREADABLE)
+    stated_max = max_range if 0.0 < max_range < math.inf else None
+    return ScanConfig(start, step, stated_max, stated_fov)

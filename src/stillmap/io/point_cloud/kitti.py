@@ -1,0 +1,218 @@
+"""Folders of KITTI: odometry sequences (`velodyne/`, `times.txt`) and raw drives.
+
+Poses that lie in folders of KITTI, as poses of the laser.
+"""
+
+import math
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import scipy  # its parts load when they are first used
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.errors import InputError
+from stillmap.core.files import new_folder
+from stillmap.core.recording import Recording
+from stillmap.core.timestamps import seconds_text
+from stillmap.io.point_cloud import kitti_cameras
+from stillmap.io.point_cloud.binary_table import cut_short, numbers_in, text_lines
+from stillmap.io.point_cloud.files import (
+    files_in,
+    from_row,
+    hits_of,
+    one_sensor,
+    require_content,
+    sensor_poses,
+    transform,
+)
+from stillmap.io.point_cloud.kitti_cameras import Calibration, find_images
+from stillmap.io.point_cloud.kitti_times import read_times, rows_of
+from stillmap.io.point_cloud.scans import Cloud, Known, Source, assembled
+from stillmap.io.text_lines import Progress
+from stillmap.preprocessing import laser_scan
+from stillmap.preprocessing.options import ReadOptions
+
+Poses = list[NDArray[np.float64]]
+
+_EARTH = 6378137.0  # m
+
+_MOST = 10_000_000  # poses of a file
+
+
+def recorded(
+    folder: Path, calibration: Calibration, lines: int, files: int
+) -> tuple[dict[int, NDArray[np.float64]], list[str], bool]:
+    """Poses of the laser, by line of the times or by file.
+
+    Args:
+        folder: the recording.
+        calibration: where the cameras sit.
+        lines: how many times there are.
+        files: how many sweeps there are.
+
+    Returns:
+        T_map_laser (4, 4) by number from 0, warnings, and whether the numbers count lines.
+    """
+    try:
+        poses, name = _found(folder, calibration)
+    except InputError as error:
+        return {}, [f"poses are not used: {error}"], True
+    if len(poses) not in (0, lines, files):
+        return {}, [f"poses are not used: {name} has {len(poses)} for {files} sweeps"], True
+    return dict(enumerate(poses)), [], len(poses) == lines
+
+
+def _found(folder: Path, calibration: Calibration) -> tuple[Poses, str]:
+    if (folder / "poses_lidar.txt").is_file():
+        return _rows(folder / "poses_lidar.txt"), "poses_lidar.txt"
+    if (folder / "poses.txt").is_file():
+        T = calibration.T_camera_laser
+        if T is None:
+            raise InputError("they are of the camera, and no calib.txt says where that is")
+        return [se2.inverse(T) @ P @ T for P in _rows(folder / "poses.txt")], "poses.txt"
+    if (folder / "oxts" / "data").is_dir():
+        if calibration.T_laser_imu is None:
+            raise InputError("no calib_imu_to_velo.txt says where the inertial unit is")
+        T = se2.inverse(calibration.T_laser_imu)
+        return [P @ T for P in _inertial(folder / "oxts" / "data")], "oxts"
+    return [], ""
+
+
+def _rows(path: Path) -> Poses:
+    numbers = numbers_in(text_lines(path), _MOST, range(12), path)
+    out = []
+    for i, row in enumerate(numbers):
+        try:
+            out.append(from_row(row))
+        except ValueError as error:
+            raise InputError(str(error), where=f"{path}:{i + 1}") from error
+    return out
+
+
+def _inertial(folder: Path) -> Poses:
+    """T_map_imu of files of latitude, longitude (degrees), height (m), roll, pitch, yaw (rad).
+
+    East, north and up from the first, on the Mercator map that is true to scale there.
+    """
+    out: Poses = []
+    scale = first = None
+    for path in files_in(folder, (".txt",)):
+        require_content(path)
+        numbers = numbers_in(text_lines(path), 1, range(6), path)
+        if not len(numbers):
+            raise InputError("is empty", where=str(path))
+        latitude, longitude, height, *angles = numbers[0]
+        try:
+            scale = scale or math.cos(math.radians(latitude))
+            x = scale * _EARTH * math.radians(longitude)
+            y = scale * _EARTH * math.log(math.tan(math.pi * (90.0 + latitude) / 360.0))
+            place = np.array([x, y, height])
+            first = place if first is None else first
+            R = scipy.spatial.transform.Rotation.from_euler("ZYX", angles[::-1]).as_matrix()
+            out.append(transform(R, place - first))
+        except ValueError as error:
+            raise InputError(f"is damaged: {error}", where=str(path)) from error
+    return out
+
+
+MARK = "times.txt"  # every such folder has it
+
+_RECORD = 16  # bytes of a point: float32 x y z and reflectance
+
+_RAW = Path("velodyne_points/data")
+
+_LAYOUTS = (  # sweeps, their times
+    (Path("velodyne"), Path("times.txt")),
+    (_RAW, Path("velodyne_points/timestamps.txt")),
+)
+
+
+def is_one(path: Path) -> bool:
+    """Whether a folder looks like one of KITTI."""
+    return any((path / sweeps).is_dir() for sweeps, _ in _LAYOUTS)
+
+
+def read(
+    path: Path,
+    options: ReadOptions,
+    progress: Progress | None = None,
+    scratch: Path | None = None,
+) -> Recording:
+    """Read an odometry sequence or a raw drive; the robot's base is its laser.
+
+    KITTI has taken the motion out of the sweeps of its sequences, and not of its drives'. Their
+    laser looks ahead at the stamp, and turns clockwise, whatever its manual says.
+
+    Raises:
+        InputError: there are no times, or no sweep can be read.
+    """
+    sweeps, times_file = next(one for one in _LAYOUTS if (path / one[0]).is_dir())
+    files = files_in(path / sweeps, (".bin",))
+    if not files:
+        raise InputError("holds no sweep (*.bin)", where=str(path / sweeps))
+    if not (path / times_file).is_file():
+        hint = "one line for each sweep: its time in seconds"
+        raise InputError("does not exist", where=str(path / times_file), hint=hint)
+    times = read_times(path / times_file)
+    rows = rows_of(files, len(times), path / times_file)
+    calibration = kitti_cameras.find_calibration(path)
+    poses, notes, by_line = recorded(path, calibration, len(times), len(files))
+    images, more = find_images(path, calibration, times)
+    known = Known(path, "KITTI", [*calibration.warnings, *notes, *more])
+    sources = []
+    for number, (file, row) in enumerate(zip(files, rows, strict=True)):
+        stamp_ns = None if row is None else times[row]
+        at = row if by_line else number
+        T = None if at is None else poses.get(at)
+        cloud = partial(_sweep, file, T) if stamp_ns is not None else partial(_no_time, file)
+        sources.append(Source(file.name, cloud, stamp_ns))
+    recording = assembled(sources, known, options, progress, scratch, images=images)
+    if options.spin_stamp is None:
+        options = replace(options, spin_stamp=0.0)
+    if options.spin == "auto" and sweeps == _RAW:
+        options = replace(options, spin="clockwise")
+    return laser_scan.timed(recording, options)
+
+
+def _sweep(path: Path, T: NDArray[np.float64] | None) -> Cloud:
+    require_content(path)
+    size = path.stat().st_size
+    if size % _RECORD:
+        raise cut_short(path, size // _RECORD, size // _RECORD + 1)
+    return Cloud(np.fromfile(path, "<f4").reshape(-1, 4)[:, :3], T)
+
+
+def _no_time(path: Path) -> Cloud:
+    raise InputError("has no time", where=str(path))
+
+
+def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write an odometry sequence: the hits of each scan in the sensor's frame.
+
+    The recorded poses, else the odometry, become `poses.txt`. It appears whole or not at all.
+
+    Raises:
+        InputError: `path` is taken or cannot be written to, or there are several sensors.
+    """
+    one_sensor(recording, str(path))
+    T = recording.T_odom_base if recording.T_recorded_base is None else recording.T_recorded_base
+    T = sensor_poses(recording, T)
+    digits = max(6, len(str(recording.n_scans)))
+    with new_folder(Path(path), MARK, overwrite) as folder:
+        (folder / "velodyne").mkdir()
+        for scan in recording.in_turn(range(recording.n_scans)):
+            points, _ = hits_of(recording, scan)
+            rows = np.zeros((len(points), 4), "<f4")
+            rows[:, :3] = points
+            rows.tofile(folder / "velodyne" / f"{scan:0{digits}d}.bin")
+        stamps = (f"{seconds_text(stamp)}\n" for stamp in recording.stamp_ns.tolist())
+        (folder / "times.txt").write_text("".join(stamps), encoding="ascii")
+        identity = " ".join(f"{value:g}" for value in np.eye(4)[:3].ravel())
+        (folder / "calib.txt").write_text(f"Tr: {identity}\n", encoding="ascii")
+        if T is not None:
+            rows_of_poses = (" ".join(f"{v:.17g}" for v in pose[:3].ravel()) for pose in T)
+            text = "".join(f"{row}\n" for row in rows_of_poses)
+            (folder / "poses.txt").write_text(text, encoding="ascii")

@@ -1,0 +1,178 @@
+"""Calibration files of KITTI: where cameras and the inertial unit sit beside the laser.
+
+Pictures in folders of KITTI.
+"""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.camera import Camera, Images
+from stillmap.core.errors import InputError
+from stillmap.io import cameras, images
+from stillmap.io.point_cloud.files import files_in, from_row, transform
+from stillmap.io.point_cloud.kitti_times import read_times, rows_of
+
+_LARGEST = 1 << 20  # bytes of a calibration file
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the files say.
+
+    Attributes:
+        T_camera_laser: (4, 4), of the first camera, rectified; None: unknown.
+        projection: (3, 4) of cameras by their numbers, rectified.
+        T_laser_imu: (4, 4); None: unknown.
+        warnings: what could not be read.
+    """
+
+    T_camera_laser: NDArray[np.float64] | None = None
+    projection: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    T_laser_imu: NDArray[np.float64] | None = None
+    warnings: tuple[str, ...] = ()
+
+
+class Lens(NamedTuple):
+    """A camera: its pinhole matrix (3, 3) and where it sits on the laser (4, 4), if known."""
+
+    K: NDArray[np.float64] | None
+    T_laser_camera: NDArray[np.float64] | None
+
+
+def find_calibration(folder: Path) -> Calibration:
+    """Calibration of an odometry folder, or of a raw one, where it lies in the folder above."""
+    try:
+        if (folder / "calib.txt").is_file():
+            return _of_odometry(_entries(folder / "calib.txt"))
+        for place in (folder, Path(folder.absolute()).parent):
+            if (place / "calib_velo_to_cam.txt").is_file():
+                return _of_raw(place)
+    except InputError as error:
+        return Calibration(warnings=(f"the calibration is not used: {error}",))
+    return Calibration()
+
+
+def lens(calibration: Calibration, camera: int) -> Lens:
+    """What is known of a camera.
+
+    P = K [I | t] projects what the first camera, rectified, sees: t is the way from it to here.
+    """
+    P = calibration.projection.get(camera)
+    if P is None:
+        return Lens(None, None)
+    K = P[:, :3].copy()
+    if calibration.T_camera_laser is None:
+        return Lens(K, None)
+    T = np.eye(4)
+    try:
+        T[:3, 3] = np.linalg.solve(K, P[:, 3])
+    except np.linalg.LinAlgError:
+        return Lens(None, None)
+    return Lens(K, se2.inverse(T @ calibration.T_camera_laser))
+
+
+def _of_odometry(entries: dict[str, NDArray[np.float64]]) -> Calibration:
+    Tr = next((entries[n] for n in ("Tr", "Tr_velo_cam", "Tr_velo_to_cam") if n in entries), None)
+    projection = {n: entries[f"P{n}"] for n in range(4) if f"P{n}" in entries}
+    try:
+        T = None if Tr is None else from_row(Tr)
+        return Calibration(T, {n: _projection(P) for n, P in projection.items()})
+    except ValueError as error:
+        raise InputError(f"calib.txt: {error}") from error
+
+
+def _of_raw(folder: Path) -> Calibration:
+    try:
+        laser = _entries(folder / "calib_velo_to_cam.txt")
+        T, projection, T_laser_imu = transform(laser["R"], laser["T"]), {}, None
+        if (folder / "calib_cam_to_cam.txt").is_file():
+            cameras = _entries(folder / "calib_cam_to_cam.txt")
+            T = transform(cameras["R_rect_00"], np.zeros(3)) @ T
+            named = {n: cameras.get(f"P_rect_{n:02d}") for n in range(4)}
+            projection = {n: _projection(P) for n, P in named.items() if P is not None}
+        if (folder / "calib_imu_to_velo.txt").is_file():
+            imu = _entries(folder / "calib_imu_to_velo.txt")
+            T_laser_imu = transform(imu["R"], imu["T"])
+        return Calibration(T, projection, T_laser_imu)
+    except (ValueError, KeyError) as error:
+        raise InputError(f"is damaged: {error}", where=str(folder)) from error
+
+
+def _projection(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    P = numbers.reshape(3, 4)
+    if not np.isfinite(P).all():
+        raise ValueError("a projection is not finite")
+    return P
+
+
+def _entries(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Numbers by the word before the colon; lines of other things are passed over."""
+    try:
+        with path.open("rb") as file:
+            text = file.read(_LARGEST).decode("ascii", "replace")
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    out = {}
+    for line in text.splitlines():
+        name, _, numbers = line.partition(":")
+        try:
+            out[name.strip()] = np.array([float(word) for word in numbers.split()])
+        except ValueError:
+            continue
+    return out
+
+
+_FOLDER = re.compile(r"image_0?([0-3])")
+
+
+def find_images(
+    folder: Path, calibration: Calibration, times: list[int | None]
+) -> tuple[Images | None, list[str]]:
+    """The pictures of all cameras, and warnings on those that cannot be used.
+
+    Args:
+        folder: the recording.
+        calibration: where the cameras sit.
+        times: of the sweeps, which are those of pictures without their own.
+    """
+    parts: list[Images] = []
+    warnings: list[str] = []
+    for place in sorted(folder.iterdir()):
+        match = _FOLDER.fullmatch(place.name)
+        if match is None or not place.is_dir():
+            continue
+        try:
+            found = _of_camera(place, times)
+            camera = _camera(place.name, int(match[1]), found, calibration)
+        except InputError as error:
+            warnings.append(f"the pictures in {place.name} are not used: {error}")
+            continue
+        parts.append(cameras.from_files(found, camera))
+    return cameras.joined(parts) if parts else None, warnings
+
+
+def _of_camera(place: Path, times: list[int | None]) -> list[tuple[int, Path]]:
+    """Stamps and files of one camera's pictures."""
+    inner = place / "data" if (place / "data").is_dir() else place
+    files = files_in(inner, images.ENDINGS)
+    own = place / "timestamps.txt"
+    times = read_times(own) if own.is_file() else times
+    rows = rows_of(files, len(times), place) if files else []
+    stamps = (None if row is None else times[row] for row in rows)
+    return [(stamp, file) for stamp, file in zip(stamps, files, strict=True) if stamp is not None]
+
+
+def _camera(
+    name: str, number: int, found: list[tuple[int, Path]], calibration: Calibration
+) -> Camera:
+    if not found:
+        raise InputError("there are none")
+    width, height = images.size_of(found[0][1])
+    K, T = lens(calibration, number)
+    return Camera(name, width, height, K, "", np.zeros(0), T)

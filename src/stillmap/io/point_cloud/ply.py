@@ -1,0 +1,133 @@
+"""PLY files of points: one cloud, or a folder of them.
+
+Written here because no library at hand reads files that lie about their size safely.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.errors import InputError
+from stillmap.core.files import new_file, require_new_file
+from stillmap.core.recording import Recording
+from stillmap.io.point_cloud.binary_table import Field, Layout, columns
+from stillmap.io.point_cloud.files import placed, require_content
+from stillmap.io.point_cloud.scans import Cloud, Growing, Origin, surveyed
+from stillmap.io.text_lines import Progress
+from stillmap.preprocessing.options import ReadOptions
+
+ENDINGS = (".ply",)
+
+_HEADER = 1 << 16  # bytes in which it must end
+_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+
+
+def read(
+    path: Path,
+    options: ReadOptions,
+    progress: Progress | None = None,
+    scratch: Path | None = None,
+) -> Recording:
+    """Read the vertices of one PLY file or of a folder of them.
+
+    Raises:
+        InputError: no cloud can be read.
+    """
+    return surveyed(path, "PLY", ENDINGS, _cloud, options, progress, scratch)
+
+
+def _cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
+    points = Growing(origin, scratch)
+    for block in columns(layout_of(path), ("x", "y", "z")):
+        points.add(np.stack(block, axis=1))
+    return Cloud(points.finished())
+
+
+def layout_of(path: Path) -> Layout:
+    """Where the vertices lie.
+
+    Raises:
+        InputError: no PLY file, or one whose vertices cannot be found.
+    """
+    require_content(path)
+    with path.open("rb") as file:
+        head = file.read(_HEADER)
+    lines, start = _header(head, path)
+    try:
+        return _understood(path, lines, start)
+    except (ValueError, KeyError, IndexError) as error:
+        raise InputError(f"is damaged: its header: {error}", where=str(path)) from error
+
+
+def _header(head: bytes, path: Path) -> tuple[list[list[str]], int]:
+    """Words of the header's lines, and where it ends."""
+    lines: list[list[str]] = []
+    at = 0
+    while lines[-1:] != [["end_header"]]:
+        end = head.find(b"\n", at)
+        if end < 0:
+            raise InputError("is cut short: its header has no end", where=str(path))
+        lines.append(head[at:end].decode("ascii", "replace").split())
+        at = end + 1
+    if lines[0] != ["ply"]:
+        raise InputError("is no PLY file", where=str(path))
+    return lines, at
+
+
+def _understood(path: Path, lines: list[list[str]], start: int) -> Layout:
+    encoding, order = "", ""
+    elements: list[tuple[str, int, list[Field | None]]] = []  # None: a list
+    for words in lines[1:-1]:
+        if words[:1] == ["format"]:
+            encoding, order = words[1], _ORDERS[words[1]]
+        elif words[:1] == ["element"]:
+            elements.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"]:
+            is_list = words[1] == "list"
+            field = None if is_list else Field(words[2], np.dtype(order + _TYPES[words[1]]))
+            elements[-1][2].append(field)
+    text, before = encoding == "ascii", len(lines)
+    for name, rows, fields in elements:
+        if rows < 0:
+            raise ValueError("a number of points below zero")
+        plain = tuple(field for field in fields if field is not None)
+        if name == "vertex":
+            if len(plain) < len(fields):
+                raise ValueError("its vertices hold lists")
+            return Layout(path, plain, rows, start, before, text)
+        if len(plain) < len(fields) and not text:
+            raise ValueError("lists come before its vertices")
+        start += rows * sum(field.size for field in plain)
+        before += rows
+    raise ValueError("no vertices")
+
+
+def write(
+    recording: Recording, path: str | Path, poses: NDArray[np.float64], *, overwrite: bool = False
+) -> None:
+    """Write one binary cloud of all hits in the map frame; it appears whole or not at all.
+
+    Args:
+        recording: T scans.
+        path: the file.
+        poses: (T, D+1, D+1) T_map_base.
+        overwrite: replace a file.
+
+    Raises:
+        InputError: `path` is taken or cannot be written to.
+    """
+    path = Path(path)
+    require_new_file(path, overwrite)
+    n = int(np.count_nonzero(recording.hit))
+    with new_file(path) as work, work.open("wb") as file:
+        names = "".join(f"property double {name}\n" for name in "xyz")
+        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{names}end_header\n"
+        file.write(head.encode())
+        for points in placed(recording, poses):
+            file.write(points.astype("<f8").tobytes())

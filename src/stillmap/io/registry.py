@@ -1,0 +1,233 @@
+"""Which reader reads what: the one table of formats."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.io import cameras, rgbd, stillmap_folder
+from stillmap.io.carmen import reader
+from stillmap.io.carmen.messages import SCAN_PARSERS
+from stillmap.io.point_cloud import e57, kitti, las, pcd, ply, threedtk
+from stillmap.io.point_cloud.files import holds_any, is_named
+from stillmap.io.point_cloud.pcd import is_pcd
+from stillmap.io.ros import bag_types
+from stillmap.io.text_lines import Progress, head
+from stillmap.preprocessing import laser_scan, self_filter
+from stillmap.preprocessing.options import ReadOptions, applied
+
+_HEAD = 1 << 16  # bytes looked at to tell what a file is
+_INSIDE = 1000  # entries of a folder that are looked at for recordings
+_NAMED = 3  # of them
+RIG = ("horizontal", "tilting")  # as `stillmap simulate` names the recordings of one robot
+
+Reader = Callable[[Path, ReadOptions, Progress | None, Path | None], Recording]
+
+
+class Format(NamedTuple):
+    """A format.
+
+    Attributes:
+        name: for people.
+        endings: of names of such files or folders, for people and where the content does not tell.
+        is_one: whether a file with these first bytes, or a folder (None), is of the format.
+        read: of a path, options, progress and the folder for what does not fit into memory.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    is_one: Callable[[Path, bytes | None], bool]
+    read: Reader
+
+
+def _is_carmen(path: Path, text: bytes | None) -> bool:  # noqa: ARG001
+    words = {*SCAN_PARSERS, b"ODOM", b"PARAM"}
+    first_words = (line.split(maxsplit=1)[:1] for line in (text or b"").splitlines())
+    return any(word in words for first in first_words for word in first)
+
+
+def _is_folder_of_ours(path: Path, text: bytes | None) -> bool:
+    return (
+        path.name == stillmap_folder.HEADER
+        if text is not None
+        else (path / stillmap_folder.HEADER).is_file()
+    )
+
+
+def _read_folder_of_ours(
+    path: Path,
+    options: ReadOptions,
+    progress: Progress | None,  # noqa: ARG001
+    scratch: Path | None,  # noqa: ARG001
+) -> Recording:
+    return applied(stillmap_folder.read(path if path.is_dir() else path.parent), options)
+
+
+def _read_bag(
+    path: Path, options: ReadOptions, progress: Progress | None, scratch: Path | None
+) -> Recording:
+    # message types take a moment to load: only for those who have a bag
+    from stillmap.io.ros.reader import read as read_bag
+
+    return read_bag(path, options, progress, scratch)
+
+
+def _is_kitti(path: Path, head: bytes | None) -> bool:
+    return head is None and kitti.is_one(path)
+
+
+def _clouds(
+    name: str, endings: tuple[str, ...], is_one: Callable[[bytes], bool] | None, read: Reader
+) -> Format:
+    """A format of single files, known by their first bytes or by name, and of folders of them."""
+
+    def found(path: Path, head: bytes | None) -> bool:
+        if head is None:
+            return holds_any(path, endings)
+        return is_named(path, endings) and len(head) > 0 if is_one is None else is_one(head)
+
+    return Format(name, endings, found, read)
+
+
+FORMATS = (
+    Format(
+        "stillmap recording", (stillmap_folder.HEADER,), _is_folder_of_ours, _read_folder_of_ours
+    ),
+    Format("ROS bag", bag_types.ENDINGS, bag_types.is_bag, _read_bag),
+    Format("KITTI folder", ("velodyne/", "velodyne_points/"), _is_kitti, kitti.read),
+    Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), rgbd.is_one, rgbd.read),
+    _clouds("PCD", pcd.ENDINGS, is_pcd, pcd.read),
+    _clouds("3DTK", threedtk.ENDINGS, None, threedtk.read),
+    _clouds("E57", e57.ENDINGS, lambda head: head.startswith(e57.MAGIC), e57.read),
+    _clouds("LAS", las.ENDINGS, lambda head: head.startswith(las.MAGIC), las.read),
+    _clouds("PLY", ply.ENDINGS, lambda head: head.startswith((b"ply\n", b"ply\r")), ply.read),
+    Format(
+        "CARMEN log",
+        (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz"),
+        _is_carmen,
+        lambda path, options, progress, _: reader.read(path, options, progress),
+    ),
+)
+
+
+def read(
+    path: str | Path,
+    options: ReadOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    scratch: Path | None = None,
+) -> Recording:
+    """Read a recording, whatever its format.
+
+    Args:
+        path: a file or a folder, see `FORMATS`.
+        options: how readings are understood, None for the defaults. Of a recording folder, whose
+            readings are understood already, they narrow what is there.
+        progress: called now and then with the share of the file that is read, 0 to 1.
+        scratch: folder for what does not fit into memory; None: the system's temporary folder.
+
+    Raises:
+        InputError: nothing there, or no recording that can be read.
+    """
+    path = Path(path)
+    try:
+        # what damaged numbers give is looked at: NumPy need not speak of them as well
+        with np.errstate(over="ignore", invalid="ignore"):
+            options = options or ReadOptions()
+            recording = format_of(path).read(path, options, progress, scratch)
+            if recording.dimension == 3:
+                return _in_space(recording, options, scratch)
+        for name, given in (
+            ("spin", options.spin not in ("auto", "none")),
+            ("cameras", options.cameras),
+        ):
+            if given:
+                what = f"read.{name} is for 3D recordings, this one is in 2D"
+                raise InputError(what, where=str(path))
+        return recording
+    except OSError as error:
+        # files may go, and disks fill up, at any moment
+        what = f"cannot be read: {error.strerror or error}"
+        raise InputError(what, where=str(error.filename or path)) from error
+    except MemoryError as error:
+        raise InputError("does not fit into memory", where=str(path)) from error
+
+
+def _in_space(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
+    """What is found out alike of every 3D recording."""
+    recording = laser_scan.timed(replace(recording, scratch=scratch), options)
+    if options.cameras is not None:
+        recording = cameras.applied(recording, Path(options.cameras))
+    recording = cameras.doubted(recording)
+    return self_filter.left_out(recording) if options.own_body else recording
+
+
+def format_of(path: Path) -> Format:
+    """The format of a file or folder: by content where it tells, else by name.
+
+    Raises:
+        InputError: nothing there, or no recording.
+    """
+    try:
+        is_folder, is_file = path.is_dir(), path.is_file()
+    except (OSError, ValueError) as error:
+        raise InputError(f"is no usable path: {error}", where=repr(str(path))) from error
+    if not is_folder and not is_file:
+        what = "is no regular file" if path.exists() else "does not exist"
+        raise InputError(what, where=str(path), hint=_known())
+    start = head(path, _HEAD) if is_file else None
+    for known in FORMATS:
+        if known.is_one(path, start):
+            return known
+    if start is None:
+        raise _no_recording(path)
+    return _by_name(path, start)
+
+
+def _no_recording(path: Path) -> InputError:
+    """What to say of a folder that is none: one of those inside may have been meant."""
+    inside = _recordings_in(path)
+    if not inside:
+        return InputError("is a folder without a recording", where=str(path), hint=_known())
+    more = f" and {len(inside) - _NAMED} more" if len(inside) > _NAMED else ""
+    shown = ", ".join(map(str, inside[:_NAMED])) + more
+    if tuple(one.name for one in inside) == RIG:
+        flat, tilting = inside
+        hint = f"both: stillmap map {flat} --tilting {tilting} -o DIR"
+    else:
+        hint = "name it" if len(inside) == 1 else "name one of them"
+    what = "a recording" if len(inside) == 1 else "several recordings"
+    return InputError(f"is no recording but holds {what}: {shown}", where=str(path), hint=hint)
+
+
+def _recordings_in(path: Path) -> list[Path]:
+    """Folders right in a folder that are recordings, by name; none of a result."""
+    try:
+        if (path / "run.json").exists():  # its objects are clouds
+            return []
+        folders = [one for one in islice(path.iterdir(), _INSIDE) if one.is_dir()]
+    except OSError:
+        return []
+    return [one for one in sorted(folders) if any(known.is_one(one, None) for known in FORMATS)]
+
+
+def _by_name(path: Path, start: bytes) -> Format:
+    if path.stat().st_size == 0:
+        raise InputError("is empty", where=str(path), hint=_known())
+    if b"\0" in start:
+        raise InputError(
+            "is binary, no recording that stillmap reads", where=str(path), hint=_known()
+        )
+    for known in FORMATS:
+        if path.name.lower().endswith(known.endings):
+            return known
+    raise InputError("is no recording that stillmap reads", where=str(path), hint=_known())
+
+
+def _known() -> str:
+    return "stillmap reads: " + "; ".join(f"{f.name} ({', '.join(f.endings)})" for f in FORMATS)

@@ -1,0 +1,1 @@
+"""ROS bags: reading recordings, writing recordings and results."""

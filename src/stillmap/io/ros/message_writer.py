@@ -1,0 +1,190 @@
+"""ROS messages from arrays."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from stillmap.io.ros.bag_writer import BagWriter
+
+BASE, ODOM, MAP = "base_link", "odom", "map"
+
+SCAN = "sensor_msgs/msg/LaserScan"
+POINTS = "sensor_msgs/msg/PointCloud2"
+ODOMETRY = "nav_msgs/msg/Odometry"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+PATH = "nav_msgs/msg/Path"
+GRID = "nav_msgs/msg/OccupancyGrid"
+MARKERS = "visualization_msgs/msg/MarkerArray"
+
+_FLOAT32 = 7  # of sensor_msgs/PointField
+_NONE = np.empty(0, np.float32)
+
+
+def laser_scan(
+    bag: BagWriter,
+    stamp_ns: int,
+    frame: str,
+    ranges: NDArray[np.float32],
+    fan: tuple[float, float],
+    time_increment: float,
+    range_max: float,
+) -> Any:
+    """A LaserScan.
+
+    Args:
+        bag: where it will go.
+        stamp_ns: when its first beam was taken.
+        frame: of the laser.
+        ranges: (n,) metres, +inf where nothing came back, NaN where unusable (REP 117).
+        fan: first angle and step in radians, counterclockwise.
+        time_increment: seconds from beam to beam, 0 where all count as taken at once.
+        range_max: metres, above all finite ranges.
+    """
+    start, step = fan
+    return bag.make(
+        SCAN,
+        header=bag.header(stamp_ns, frame),
+        angle_min=start,
+        angle_max=start + step * max(len(ranges) - 1, 0),
+        angle_increment=step,
+        time_increment=time_increment,
+        scan_time=0.0,
+        range_min=0.0,
+        range_max=range_max,
+        ranges=ranges,
+        intensities=_NONE,
+    )
+
+
+def point_cloud(
+    bag: BagWriter,
+    stamp_ns: int,
+    frame: str,
+    points: NDArray[np.float32],
+    times: NDArray[np.float32] | None,
+) -> Any:
+    """A PointCloud2 of points (n, 3) in metres, with `t`, seconds after the stamp, if times (n,)
+    are given."""
+    columns = points if times is None else np.column_stack([points, times])
+    names = "xyz" if times is None else "xyzt"
+    fields = [
+        bag.make("sensor_msgs/msg/PointField", name=name, offset=4 * k, datatype=_FLOAT32, count=1)
+        for k, name in enumerate(names)
+    ]
+    data = np.ascontiguousarray(columns, "<f4").view(np.uint8).ravel()
+    return bag.make(
+        POINTS,
+        header=bag.header(stamp_ns, frame),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=4 * len(names),
+        row_step=4 * len(names) * len(points),
+        data=data,
+        is_dense=bool(np.isfinite(points).all()),
+    )
+
+
+def transforms(
+    bag: BagWriter, stamp_ns: int, placed: list[tuple[str, str, NDArray[np.float64]]]
+) -> Any:
+    """A TFMessage of parent, child and T_parent_child (D+1, D+1)."""
+    return bag.make(
+        TRANSFORMS,
+        transforms=[
+            bag.make(
+                "geometry_msgs/msg/TransformStamped",
+                header=bag.header(stamp_ns, parent),
+                child_frame_id=child,
+                transform=_transform(bag, T),
+            )
+            for parent, child, T in placed
+        ],
+    )
+
+
+def odometry(bag: BagWriter, stamp_ns: int, T_odom_base: NDArray[np.float64]) -> Any:
+    """An Odometry message: a pose; nothing is said of speed and errors."""
+    zero = bag.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    still = bag.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+    unknown = np.zeros(36)
+    return bag.make(
+        ODOMETRY,
+        header=bag.header(stamp_ns, ODOM),
+        child_frame_id=BASE,
+        pose=bag.make(
+            "geometry_msgs/msg/PoseWithCovariance", pose=pose(bag, T_odom_base), covariance=unknown
+        ),
+        twist=bag.make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=unknown),
+    )
+
+
+def path(bag: BagWriter, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> Any:
+    """A Path in the map frame along T_map_base (T, D+1, D+1)."""
+    stamps = stamp_ns.tolist()
+    return bag.make(
+        PATH,
+        header=bag.header(stamps[0], MAP),
+        poses=[
+            bag.make(
+                "geometry_msgs/msg/PoseStamped", header=bag.header(stamp, MAP), pose=pose(bag, T)
+            )
+            for stamp, T in zip(stamps, poses, strict=True)
+        ],
+    )
+
+
+def occupancy_grid(
+    bag: BagWriter,
+    stamp_ns: int,
+    p_occupied: NDArray[np.floating[Any]],
+    T_map_corner: NDArray[np.float64],
+    resolution: float,
+) -> Any:
+    """An OccupancyGrid in percent, -1 where p_occupied (H, W) is NaN; row 0 is the lowest y.
+
+    T_map_corner (3, 3) is the pose of its lower-left corner, resolution in metres.
+    """
+    known = ~np.isnan(p_occupied)
+    percent = np.where(known, np.rint(100.0 * np.where(known, p_occupied, 0.0)), -1.0)
+    height, width = p_occupied.shape
+    info = bag.make(
+        "nav_msgs/msg/MapMetaData",
+        map_load_time=bag.time(stamp_ns),
+        resolution=resolution,
+        width=width,
+        height=height,
+        origin=pose(bag, T_map_corner),
+    )
+    data = percent.astype(np.int8).ravel()
+    return bag.make(GRID, header=bag.header(stamp_ns, MAP), info=info, data=data)
+
+
+def pose(bag: BagWriter, T: NDArray[np.float64]) -> Any:
+    """A Pose of T (D+1, D+1)."""
+    position, orientation = _split(bag, T, "Point")
+    return bag.make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
+
+
+def _transform(bag: BagWriter, T: NDArray[np.float64]) -> Any:
+    translation, rotation = _split(bag, T, "Vector3")
+    return bag.make("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
+
+
+def _split(bag: BagWriter, T: NDArray[np.float64], kind: str) -> tuple[Any, Any]:
+    """Translation, as a Point or Vector3, and rotation as a Quaternion with w >= 0."""
+    D = len(T) - 1
+    x, y, z = (*T[:D, D].tolist(), 0.0)[:3]
+    if D == 2:
+        half = np.arctan2(T[1, 0], T[0, 0]) / 2
+        q = (0.0, 0.0, float(np.sin(half)), float(np.cos(half)))
+    else:
+        q = tuple(Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist())
+    turn = dict(zip("xyzw", q, strict=True))
+    return (
+        bag.make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z),
+        bag.make("geometry_msgs/msg/Quaternion", **turn),
+    )

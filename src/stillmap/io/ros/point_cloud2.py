@@ -1,0 +1,149 @@
+"""PointCloud2 messages as scans."""
+
+from array import array
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.io.builder import Gathered, Skipped
+from stillmap.io.point_cloud import point_times
+from stillmap.io.ros.bag_types import Message
+from stillmap.io.ros.laser_scan import UNREADABLE
+from stillmap.io.ros.messages import decoded, frame, stamp_ns
+from stillmap.preprocessing.options import ReadOptions
+
+NO_PLACES = "cloud without x, y and z"
+WRONG_SIZE = "cloud whose size is not what it states"
+
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_MAX_STEP = 1 << 16  # bytes of one point
+_RARE = 0.25
+
+
+class Cloud(NamedTuple):
+    """The points of one message.
+
+    Attributes:
+        points: (n, 3) float32 metres; not finite where nothing came back.
+        times: (n,) seconds after the stamp, None where no field tells.
+    """
+
+    points: NDArray[np.float32]
+    times: NDArray[np.float64] | None
+
+
+def cloud(message: Any) -> Cloud | str:
+    """The points of a PointCloud2 message, whatever the order of its fields; or why not."""
+    fields = {str(f.name).lower(): f for f in message.fields}
+    step, width, height = int(message.point_step), int(message.width), int(message.height)
+    row = int(message.row_step) or width * step
+    if not 0 < step <= _MAX_STEP or row < width * step:
+        return WRONG_SIZE
+    end = (height - 1) * row + width * step if width and height else 0
+    if end > len(message.data):
+        return WRONG_SIZE
+    time = point_times.column_of(fields)
+    kept = [name for name in ("x", "y", "z", time) if name in fields]
+    layout = {name: _layout(fields[name], bool(message.is_bigendian), step) for name in kept}
+    if any(layout.get(name) is None for name in "xyz"):
+        return NO_PLACES
+    known = {name: where for name, where in layout.items() if where is not None}
+    dtype = np.dtype(
+        {
+            "names": list(known),
+            "formats": [kind for kind, _ in known.values()],
+            "offsets": [offset for _, offset in known.values()],
+            "itemsize": step,
+        }
+    )
+    if end == 0:
+        return Cloud(np.empty((0, 3), np.float32), None)
+    values = np.ndarray((height, width), dtype, message.data, strides=(row, step)).reshape(-1)
+    points = np.stack([values[name].astype(np.float32) for name in "xyz"], axis=1)
+    times = _times(values[time], points, stamp_ns(message.header)) if time in known else None
+    return Cloud(points, times)
+
+
+def _times(
+    values: NDArray[Any], points: NDArray[np.float32], stamp: int
+) -> NDArray[np.float64] | None:
+    clock = point_times.clock_of(values, None)
+    if clock is None:
+        return None
+    usable = np.asarray(np.isfinite(points).all(axis=1))
+    return point_times.since(values, usable, clock, stamp)[1]
+
+
+def _layout(field: Any, bigendian: bool, step: int) -> tuple[str, int] | None:
+    kind = _TYPES.get(int(field.datatype))
+    if kind is None or int(field.offset) + int(kind[1]) > step:
+        return None
+    return f"{'>' if bigendian else '<'}{kind}", int(field.offset)
+
+
+class CloudTopics:
+    """Every cloud on the topics that are read: one topic may carry several sensors, by frame."""
+
+    def __init__(self, options: ReadOptions, scratch: Path | None) -> None:
+        self._seen: dict[str, int] = {}
+        self.skipped: dict[str, Skipped] = {}
+        self.sensors: dict[tuple[str, str], int] = {}  # topic and frame
+        self.timed: set[int] = set()
+        self.stamp_ns, self.sensor, self.number = array("q"), array("i"), array("q")
+        self.beams = array("q")
+        self.scans = Gathered(3, options, beam_times=True, folder=scratch)
+
+    def add(self, message: Message) -> None:
+        """Take in a message; what cannot be used is counted."""
+        topic = message.channel.topic
+        number = self._seen[topic] = self._seen.get(topic, 0) + 1
+        name, stamp = "", 0
+        found: Cloud | str
+        try:
+            raw = decoded(message)
+            name, stamp = frame(raw.header.frame_id), stamp_ns(raw.header)
+            found = cloud(raw)
+        except Exception:  # whatever the library makes of damaged bytes
+            found = UNREADABLE
+        if isinstance(found, str):
+            self.skipped.setdefault(topic, Skipped()).add(found, number)
+            return
+        stamp = stamp or message.log_ns  # drivers that leave it unset
+        sensor = self.sensors.setdefault((topic, name), len(self.sensors))
+        if found.times is not None:
+            self.timed.add(sensor)
+        self.scans.add(stamp, found.points, sensor=sensor, beam_time=found.times)
+        self.stamp_ns.append(stamp)
+        self.sensor.append(sensor)
+        self.number.append(number)
+        self.beams.append(len(found.points))
+
+
+def chosen_scans(topics: CloudTopics, named: bool) -> tuple[list[int], list[str]]:
+    """The sensors to use, and words on those that are left out.
+
+    Of topics that show the same sensor (the same frame) the one with most points is used: others
+    are made from it. Topics with few scans are left out.
+
+    Args:
+        topics: what was read.
+        named: whether the user named their topics.
+    """
+    sensor, beams = np.asarray(topics.sensor), np.asarray(topics.beams)
+    names = list(topics.sensors)
+    scans = [int(np.count_nonzero(sensor == k)) for k in range(len(names))]
+    points = [int(beams[sensor == k].sum()) for k in range(len(names))]
+    used: list[int] = []
+    left_out = []
+    for k in sorted(range(len(names)), key=lambda k: (-points[k], names[k])):
+        same = next((u for u in used if names[u][1] == names[k][1]), None)
+        if same is not None:
+            text = f"{scans[k]} clouds, {names[same][0]} shows the same sensor"
+            left_out.append(f"{names[k][0]}: {text}")
+        elif not named and scans[k] < _RARE * max(scans):
+            left_out.append(f"{names[k][0]}: {scans[k]} clouds are too few")
+        else:
+            used.append(k)
+    return used, left_out

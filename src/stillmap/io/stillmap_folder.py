@@ -1,0 +1,292 @@
+"""stillmap's own recording folder: `recording.json` and flat `.npy` arrays, read as they lie.
+
+Pictures in stillmap's own recording folder: PNG files, and cameras in the header.
+
+Pictures of fractions (depth in metres) are `.npy` files of float32.
+"""
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import blocks, open_npy, write_npy
+from stillmap.core.camera import Camera, Images
+from stillmap.core.errors import InputError
+from stillmap.core.files import new_folder, read_text, require_regular
+from stillmap.core.recording import Recording
+from stillmap.io.images import read_picture, write_picture
+from stillmap.preprocessing.options import FARTHEST
+
+FOLDER = "images"
+
+
+def write_images(images: Images, folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """Write pictures, stamps and cameras into an existing folder.
+
+    Returns:
+        Entries for the header, and a warning where pictures could not be read: they are left out.
+    """
+    (folder / FOLDER).mkdir()
+    kept: list[int] = []
+    lost: list[str] = []
+    for image in range(len(images)):
+        try:
+            picture = images.read(image)
+        except InputError as error:
+            lost.append(str(error))
+            continue
+        _write_one(picture, folder / FOLDER / f"{len(kept):06d}")
+        kept.append(image)
+    np.save(folder / "image_stamp_ns.npy", images.stamp_ns[kept], allow_pickle=False)
+    np.save(folder / "image_camera.npy", images.camera[kept], allow_pickle=False)
+    header = {"images": len(kept), "cameras": [_described(camera) for camera in images.cameras]}
+    return header, [f"{len(lost)} pictures left out: {lost[0]}"] if lost else []
+
+
+def _write_one(picture: NDArray[Any], path: Path) -> None:
+    if picture.dtype.kind == "f":
+        np.save(path.with_suffix(".npy"), picture.astype(np.float32), allow_pickle=False)
+    else:
+        write_picture(picture, path.with_suffix(".png"))
+
+
+def _described(camera: Camera) -> dict[str, Any]:
+    return {
+        "name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "K": None if camera.K is None else camera.K.tolist(),
+        "model": camera.model,
+        "distortion": camera.distortion.tolist(),
+        "T_base_camera": None if camera.T_base_camera is None else camera.T_base_camera.tolist(),
+    }
+
+
+def read_images(
+    folder: Path, described: Any, stamp_ns: NDArray[np.int64], camera: NDArray[np.int32]
+) -> Images:
+    """The pictures of a folder, read one by one when they are asked for.
+
+    Args:
+        folder: the recording.
+        described: the header's "cameras".
+        stamp_ns, camera: (N,) as they lie beside it.
+
+    Raises:
+        InputError: the entries of the header do not fit.
+    """
+    try:
+        cameras = tuple(_camera(one) for one in described)
+        return Images(stamp_ns, camera, cameras, partial(_load, folder / FOLDER))
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"is damaged: its cameras: {error}", where=str(folder)) from error
+
+
+def _camera(one: dict[str, Any]) -> Camera:
+    return Camera(
+        name=str(one["name"]),
+        width=int(one["width"]),
+        height=int(one["height"]),
+        K=_matrix(one["K"], 3),
+        model=str(one["model"]),
+        distortion=np.array(one["distortion"], np.float64).reshape(-1),
+        T_base_camera=_matrix(one["T_base_camera"], 4),
+    )
+
+
+def _matrix(rows: Any, n: int) -> NDArray[np.float64] | None:
+    return None if rows is None else np.array(rows, np.float64).reshape(n, n)
+
+
+def _load(folder: Path, image: int) -> NDArray[Any]:
+    path = folder / f"{image:06d}.npy"
+    png = path.with_suffix(".png")
+    if png.exists() or not path.exists():
+        return read_picture(png)
+    picture = open_npy(path)
+    if picture.dtype != np.float32 or picture.ndim != 2:
+        raise InputError(f"is damaged: {picture.shape} {picture.dtype}", where=str(path))
+    return np.array(picture)
+
+
+HEADER = "recording.json"
+
+FORMAT = "stillmap-recording"
+
+FORMAT_VERSION = 1
+
+_MAX_HEADER = 16 << 20  # bytes: a JSON of empty lists takes thirty times as many
+
+
+def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a recording folder; it appears complete or not at all.
+
+    Raises:
+        InputError: `path` holds something already, or cannot be written to.
+    """
+    with new_folder(Path(path), HEADER, overwrite) as work:
+        write_into(recording, work)
+
+
+def write_into(recording: Recording, folder: Path) -> None:
+    """The files of a recording into an existing folder, for writers that add files of their own."""
+    pictures: dict[str, Any] = {}
+    warnings: list[str] = []
+    if recording.images is not None:
+        pictures, warnings = write_images(recording.images, folder)
+    header = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "dimension": recording.dimension,
+        "scans": recording.n_scans,
+        "beams": recording.n_beams,
+        "sensors": len(recording.T_base_sensor),
+        "odometry": recording.T_odom_base is not None,
+        "beam_times": recording.beam_time is not None,
+        "recorded_poses": recording.T_recorded_base is not None,
+        **pictures,
+        "source": _with_warnings(recording.source, warnings),
+    }
+    text = json.dumps(header, indent=1, allow_nan=False)
+    for name in ("stamp_ns", "offset", "points", "hit", "T_base_sensor", "sensor"):
+        write_npy(folder / f"{name}.npy", getattr(recording, name))
+    for name in ("T_odom_base", "beam_time", "T_recorded_base"):
+        if getattr(recording, name) is not None:
+            write_npy(folder / f"{name}.npy", getattr(recording, name))
+    (folder / HEADER).write_text(text + "\n", encoding="utf-8")
+
+
+def _with_warnings(source: dict[str, Any], warnings: list[str]) -> dict[str, Any]:
+    return {**source, "warnings": [*source.get("warnings", []), *warnings]} if warnings else source
+
+
+def read(path: Path) -> Recording:
+    """Read a recording folder; what there is per beam stays on disk until it is used.
+
+    Raises:
+        InputError: a file is missing, damaged, or does not fit the others.
+    """
+    header = _header(path / HEADER)
+    T, M = _size(path, header, "scans"), _size(path, header, "beams")
+    S, D = _size(path, header, "sensors"), _size(path, header, "dimension")
+    if D not in (2, 3):
+        raise InputError(f"dimension must be 2 or 3, got {D}", where=str(path / HEADER))
+    T_odom_base = T_recorded_base = beam_time = None
+    if header.get("odometry"):
+        T_odom_base = _poses(path, "T_odom_base", T, D)
+    if header.get("recorded_poses"):
+        T_recorded_base = _poses(path, "T_recorded_base", T, D)
+    if header.get("beam_times"):
+        beam_time = _array(path, "beam_time", (M,), np.float32)
+    stamp_ns = np.array(_array(path, "stamp_ns", (T,), np.int64))
+    offset = np.array(_array(path, "offset", (T + 1,), np.int64))
+    points = _array(path, "points", (M, D), np.float32)
+    hit = _array(path, "hit", (M,), np.bool_)
+    sensor = np.array(_array(path, "sensor", (T,), np.int32))
+    if np.any(stamp_ns[1:] < stamp_ns[:-1]):  # a difference of wild numbers could wrap around
+        raise _damaged(path, "stamp_ns", "time runs backwards")
+    _require_offsets(path, offset, M)
+    _require_sound_ends(path, points, hit)
+    source = header.get("source", {})
+    try:
+        return Recording(
+            stamp_ns=stamp_ns,
+            offset=offset,
+            points=points,
+            hit=hit,
+            T_base_sensor=_poses(path, "T_base_sensor", S, D),
+            sensor=sensor,
+            T_odom_base=T_odom_base,
+            source=source if isinstance(source, dict) else {},
+            beam_time=beam_time,
+            T_recorded_base=T_recorded_base,
+            images=_images(path, header),
+        )
+    except ValueError as error:
+        raise InputError(f"is damaged: {error}", where=str(path)) from error
+
+
+def _images(path: Path, header: dict[str, Any]) -> Images | None:
+    if "images" not in header:
+        return None
+    N = _size(path, header, "images")
+    stamp_ns = np.array(_array(path, "image_stamp_ns", (N,), np.int64))
+    camera = np.array(_array(path, "image_camera", (N,), np.int32))
+    return read_images(path, header.get("cameras"), stamp_ns, camera)
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(f"{text} is none of its numbers")
+
+
+def _header(path: Path) -> dict[str, Any]:
+    try:
+        require_regular(path)
+        header = json.loads(read_text(path, _MAX_HEADER), parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is not JSON: {error}", where=str(path)) from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise InputError(f"is not the header of a {FORMAT}", where=str(path))
+    if header.get("format_version") != FORMAT_VERSION:
+        raise InputError(
+            f"format_version {header.get('format_version')!r} is unknown here",
+            where=str(path),
+            hint=f"this version reads {FORMAT_VERSION}",
+        )
+    return header
+
+
+def _size(path: Path, header: dict[str, Any], key: str) -> int:
+    value = header.get(key)
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 60:
+        raise InputError(f"'{key}' must be a count, got {value!r}", where=str(path / HEADER))
+    return value
+
+
+def _array(path: Path, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
+    """One `.npy` file as it lies on disk, of exactly this shape and type."""
+    loaded = open_npy(path / f"{name}.npy")
+    if loaded.shape != shape or loaded.dtype != np.dtype(dtype):
+        raise _damaged(
+            path,
+            name,
+            f"expected {shape} {np.dtype(dtype)}, got {loaded.shape} {loaded.dtype}",
+        )
+    return np.ascontiguousarray(loaded)
+
+
+def _poses(path: Path, name: str, count: int, D: int) -> NDArray[np.float64]:
+    T = np.array(_array(path, name, (count, D + 1, D + 1), np.float64))
+    R = T[:, :D, :D]
+    last_row = np.eye(D + 1)[D]
+    if not (
+        np.all(np.abs(T) < 1e12)
+        and np.all(T[:, D] == last_row)
+        and np.allclose(R @ R.transpose(0, 2, 1), np.eye(D), atol=1e-6)
+    ):
+        raise _damaged(path, name, "not rigid transforms")
+    return T
+
+
+def _require_offsets(path: Path, offset: NDArray[np.int64], M: int) -> None:
+    # compared pairwise: a difference of wild numbers could wrap around
+    if offset[0] != 0 or offset[-1] != M or np.any(offset[1:] < offset[:-1]):
+        raise _damaged(path, "offset", f"must rise from 0 to {M}")
+
+
+def _require_sound_ends(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
+    for block in blocks(points, hit):
+        chunk = points[block]
+        usable = np.isfinite(chunk).all(axis=1)
+        if np.any(hit[block] & ~usable) or np.any(np.isinf(chunk)):
+            raise _damaged(path, "points", "a hit or a maximum-range beam ends nowhere")
+        if np.any(np.abs(chunk) > FARTHEST):
+            raise _damaged(path, "points", f"a beam ends farther than {FARTHEST:.0f} m away")
+
+
+def _damaged(path: Path, name: str, what: str) -> InputError:
+    return InputError(f"is damaged: {what}", where=str(path / f"{name}.npy"))

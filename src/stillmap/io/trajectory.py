@@ -1,0 +1,178 @@
+"""TUM trajectories: `stamp x y z qx qy qz qw`, the stamp in seconds, exact to the nanosecond.
+
+Odometry at the time of a scan.
+
+Given poses for the scans of a recording.
+"""
+
+import decimal
+from pathlib import Path
+
+import numpy as np
+import scipy  # its parts load when they are first used
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.arrays import blocks
+from stillmap.core.errors import InputError
+from stillmap.core.files import read_text
+from stillmap.core.recording import Recording
+from stillmap.core.timestamps import seconds_text
+
+LARGEST = 128 << 20  # bytes: four hours at 100 Hz
+
+_COLUMNS = "stamp x y z qx qy qz qw"
+
+_TOGETHER = 1 << 14  # poses that are written together: as numbers of Python they are large
+
+# a quaternion printed with three decimals still lies well within this of length one
+_UNIT_TOLERANCE = 0.02
+
+
+def write_tum(path: Path, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+    """Write one line per pose.
+
+    Args:
+        path: the file.
+        stamp_ns: (T,) int64 nanoseconds.
+        poses: (T, D+1, D+1) float64, T_map_base, D = 2 or 3.
+    """
+    if len(stamp_ns) != len(poses):
+        raise ValueError(f"poses: expected {len(stamp_ns)}, got {len(poses)}")
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        for part in blocks(poses, rows=_TOGETHER):
+            # + 0.0 turns the negative zeros that rounding leaves into zeros
+            rows = np.round(_rows_of(poses[part]), 9) + 0.0
+            for stamp, row in zip(stamp_ns[part].tolist(), rows.tolist(), strict=True):
+                file.write(f"{seconds_text(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
+
+
+def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Stamps (T,) int64 in nanoseconds and poses (T, 4, 4) of a TUM file, in the file's order.
+
+    Stamps are parsed as decimals, never as floats; digits beyond nanoseconds are rounded.
+    Blank lines and lines that start with `#` are passed over.
+
+    Raises:
+        InputError: the file cannot be read, a line is no pose, or there is none at all.
+    """
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(_lines(path), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        stamp, row = _parsed(words, f"{path}:{number}")
+        stamps.append(stamp)
+        rows.append(row)
+    if not stamps:
+        raise InputError("holds no poses", where=str(path), hint=f"lines of '{_COLUMNS}'")
+    values = np.array(rows)
+    poses = np.tile(np.eye(4), (len(values), 1, 1))
+    poses[:, :3, 3] = values[:, :3]
+    poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(values[:, 3:]).as_matrix()
+    return np.array(stamps, np.int64), poses
+
+
+def _rows_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T, 7) x y z qx qy qz qw with qw >= 0."""
+    rows = np.zeros((len(poses), 7))
+    dimension = poses.shape[-1] - 1
+    rows[:, :dimension] = poses[:, :dimension, dimension]
+    if dimension == 2:
+        half = np.arctan2(poses[:, 1, 0], poses[:, 0, 0]) / 2
+        rows[:, 5], rows[:, 6] = np.sin(half), np.cos(half)
+    elif len(poses):
+        quaternion = scipy.spatial.transform.Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        rows[:, 3:] = np.where(quaternion[:, 3:] < 0, -quaternion, quaternion)
+    return rows
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return read_text(path, LARGEST).splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError("is not a text file", where=str(path)) from error
+
+
+def _parsed(words: list[str], where: str) -> tuple[int, list[float]]:
+    if len(words) != 8:
+        raise InputError(f"has {len(words)} columns, not 8", where=where, hint=_COLUMNS)
+    try:
+        row = [float(word) for word in words[1:]]
+        # a stamp of 19 digits at most leaves 9 beyond the nanosecond before anything is rounded
+        stamp = int(decimal.Decimal(words[0]).scaleb(9).to_integral_value())
+    except (ValueError, decimal.DecimalException, OverflowError) as error:
+        raise InputError("holds something that is no number", where=where, hint=_COLUMNS) from error
+    if not np.all(np.isfinite(row)):
+        raise InputError("holds a number that is not finite", where=where)
+    if abs(stamp) >= 2**63:
+        raise InputError("has a stamp beyond what 64 bit nanoseconds hold", where=where)
+    if abs(np.linalg.norm(row[3:]) - 1) > _UNIT_TOLERANCE:
+        raise InputError("has a quaternion that is not of length one", where=where, hint=_COLUMNS)
+    return stamp, row
+
+
+def interpolate(
+    stamp_ns: NDArray[np.int64], poses: NDArray[np.float64], at_ns: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], int]:
+    """Poses at given times: linear in x and y, along the shortest arc in theta.
+
+    Args:
+        stamp_ns: (N,) int64, N >= 1, in any order.
+        poses: (N, 3) x, y in metres and theta in radians.
+        at_ns: (T,) int64.
+
+    Returns:
+        (T, 3) poses, and how many of the times lie outside the span of `stamp_ns`: those take
+        the nearest pose.
+    """
+    order = np.argsort(stamp_ns, kind="stable")
+    stamp_ns, poses = stamp_ns[order], poses[order]
+    after = np.clip(np.searchsorted(stamp_ns, at_ns, side="right"), 1, max(len(stamp_ns) - 1, 1))
+    after = np.minimum(after, len(stamp_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    span = (stamp_ns[after] - stamp_ns[before]).astype(float)
+    share = (at_ns - stamp_ns[before]) / np.where(span > 0, span, 1.0)
+    share = np.clip(share, 0.0, 1.0)[:, None]
+    step = poses[after] - poses[before]
+    step[:, 2] = se2.wrap(step[:, 2])
+    outside = int(np.count_nonzero((at_ns < stamp_ns[0]) | (at_ns > stamp_ns[-1])))
+    return poses[before] + share * step, outside
+
+
+_NEAR_NS = 20_000_000  # another tool may have rounded its stamps
+
+
+def poses_from_tum(path: Path, recording: Recording) -> NDArray[np.float64]:
+    """(T, D+1, D+1) T_map_base at the scans of a recording, from a TUM trajectory.
+
+    A trajectory with the very stamps of the recording is taken row by row (stamps may repeat);
+    otherwise each scan takes the nearest pose within 20 ms.
+
+    Raises:
+        InputError: the file is no trajectory, or a scan has no pose.
+    """
+    stamp_ns, poses = read_tum(path)
+    if recording.dimension == 2:
+        poses = se2.planar(poses)
+    if np.array_equal(stamp_ns, recording.stamp_ns):
+        return poses
+    order = np.argsort(stamp_ns, kind="stable")
+    nearest = order[_nearest(stamp_ns[order], recording.stamp_ns)]
+    missing = np.flatnonzero(np.abs(stamp_ns[nearest] - recording.stamp_ns) > _NEAR_NS)
+    if len(missing):
+        raise InputError(
+            f"no pose within {_NEAR_NS / 1e9:g} s of {len(missing)} of {recording.n_scans} scans, "
+            f"the first is scan {missing[0]} at {recording.stamp_ns[missing[0]] / 1e9:.3f} s",
+            where=str(path),
+        )
+    return poses[nearest]
+
+
+def _nearest(sorted_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    right = np.clip(np.searchsorted(sorted_ns, wanted_ns), 1, max(len(sorted_ns) - 1, 1))
+    right = np.minimum(right, len(sorted_ns) - 1)
+    left = np.maximum(right - 1, 0)
+    closer_left = wanted_ns - sorted_ns[left] <= sorted_ns[right] - wanted_ns
+    return np.where(closer_left, left, right)

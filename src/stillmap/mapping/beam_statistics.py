@@ -1,0 +1,73 @@
+"""Counts and end points over all beams, a block at a time: a recording may be long."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import blocks
+from stillmap.core.recording import Recording
+
+DYNAMIC_BELOW = 0.5
+
+
+def beam_counts(recording: Recording, p_static: NDArray[np.float32]) -> dict[str, int]:
+    """Numbers of `beams`, `hits`, `max_range`, `unusable`, `dynamic` (hits below 0.5)."""
+    hits = unusable = dynamic = 0
+    for block in blocks(recording.points, recording.hit, p_static):
+        hit = recording.hit[block]
+        hits += int(np.count_nonzero(hit))
+        unusable += int(np.count_nonzero(np.isnan(recording.points[block]).any(axis=1)))
+        dynamic += int(np.count_nonzero(hit & (p_static[block] < DYNAMIC_BELOW)))
+    beams = recording.n_beams
+    return {
+        "beams": beams,
+        "hits": hits,
+        "max_range": beams - hits - unusable,
+        "unusable": unusable,
+        "dynamic": dynamic,
+    }
+
+
+def dynamic_points(
+    recording: Recording,
+    poses: NDArray[np.float64],
+    p_static: NDArray[np.float32],
+    threshold: float = DYNAMIC_BELOW,
+    limit: int = 200_000,
+) -> NDArray[np.float32]:
+    """End points in the map frame of the hits with p_static below `threshold`.
+
+    Args:
+        recording: T scans with M beams in D dimensions.
+        poses: (T, D+1, D+1) float64, T_map_base.
+        p_static: (M,) float32.
+        threshold: the probability below which a beam counts as dynamic.
+        limit: where there are more, this many are taken, evenly spread over the recording.
+
+    Returns:
+        (K, D) float32 in metres, in the recording's order, K <= limit.
+    """
+    beams = _dynamic_beams(recording, p_static, threshold, limit)
+    return recording.end_points(beams, poses).astype(np.float32)
+
+
+def _dynamic_beams(
+    recording: Recording, p_static: NDArray[np.float32], threshold: float, limit: int
+) -> NDArray[np.int64]:
+    """(K,) indices of the dynamic beams; every n-th, not the first ones, beyond `limit`."""
+
+    def of_block(block: slice) -> NDArray[np.bool_]:
+        return recording.hit[block] & (p_static[block] < threshold)
+
+    arrays = recording.hit, p_static
+    counts = [int(np.count_nonzero(of_block(block))) for block in blocks(*arrays)]
+    total = sum(counts)
+    kept = min(total, limit)
+    # which of the dynamic beams are taken, counted over the whole recording
+    wanted = np.arange(kept, dtype=np.int64) * total // max(kept, 1)
+    before = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+    parts = [np.zeros(0, np.int64)]
+    for block, start, end in zip(blocks(*arrays), before[:-1], before[1:], strict=True):
+        low, high = np.searchsorted(wanted, [start, end])
+        found = np.flatnonzero(of_block(block))
+        parts.append(block.start + found[wanted[low:high] - start])
+    return np.concatenate(parts)

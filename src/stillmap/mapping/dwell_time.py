@@ -1,0 +1,99 @@
+"""For how long things in space were seen to stand where they came to stay, or left from."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.recording import Recording
+from stillmap.mapping.change_detection import Change
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_MOST = 0.25  # share of a thing's voxels that may have been seen for less
+
+
+def seconds_seen(
+    places: Sequence[Change], recording: Recording, poses: Float, resolution: float
+) -> list[float]:
+    """How long each thing was seen while it stood: three quarters of its voxels so long or longer.
+
+    Who drives along, or is hidden soon after, came as well; but each voxel is met for a moment.
+
+    Args:
+        places: where something came or left; `cells` are (K, 3) voxels.
+        recording: 3D, M beams without the motion during its scans.
+        poses: (T, 4, 4) T_map_base.
+        resolution: metres, edge of a voxel.
+    """
+    if not places:
+        return []
+    voxels = _Voxels.of(places)
+    ever = np.iinfo(np.int64)
+    first = np.full(len(voxels.place), ever.max)
+    last = np.full(len(voxels.place), ever.min)
+    since = np.array([one.stamp_ns if one.appeared else ever.min for one in places])[voxels.place]
+    until = np.array([ever.max if one.appeared else one.before_ns for one in places])[voxels.place]
+    T_map_sensor = recording.T_map_sensor(poses)
+    for t in recording.in_turn(range(recording.n_scans)):
+        stamp, beams, T = int(recording.stamp_ns[t]), recording.beams_of(t), T_map_sensor[t]
+        points = recording.points[beams][recording.hit[beams]].astype(np.float64)
+        ends = points @ T[:3, :3].T + T[:3, 3]
+        met = voxels.met(np.floor(ends / resolution).astype(np.int64))
+        met = met[(since[met] <= stamp) & (stamp <= until[met])]
+        first[met] = np.minimum(first[met], stamp)
+        last[met] = np.maximum(last[met], stamp)
+    out = []
+    for number, one in enumerate(places):
+        its = voxels.place == number
+        known = last[its] >= first[its]
+        shown = last[its] - one.stamp_ns if one.appeared else one.before_ns - first[its]
+        seconds = np.where(known, 1e-9 * np.where(known, shown, 0), 0.0)
+        out.append(float(np.quantile(seconds, _MOST, method="lower")))
+    return out
+
+
+class _Voxels(NamedTuple):
+    """The N voxels of all places; one in several places is there several times.
+
+    Attributes:
+        place: (N,) which place each is of.
+        low, shape: (3,) the lowest and how many there are along each axis around all of them.
+        key: (U,) rising, one for each that is different.
+        copies: (C, U) where these are among the N; -1: there are no more.
+    """
+
+    place: Index
+    low: NDArray[np.int64]
+    shape: NDArray[np.int64]
+    key: NDArray[np.int64]
+    copies: Index
+
+    @classmethod
+    def of(cls, places: Sequence[Change]) -> "_Voxels":
+        cells = np.concatenate([one.cells for one in places])
+        place = np.repeat(np.arange(len(places)), [len(one.cells) for one in places])
+        low = cells.min(axis=0)
+        shape = cells.max(axis=0) - low + 1
+        key, of = np.unique(_keys(cells - low, shape), return_inverse=True)
+        order = np.argsort(of, kind="stable")
+        begins = np.searchsorted(of[order], np.arange(len(key)))
+        rank = np.arange(len(of)) - begins[of[order]]
+        copies = np.full((int(rank.max()) + 1, len(key)), -1, np.intp)
+        copies[rank, of[order]] = order
+        return cls(place, low, shape, key, copies)
+
+    def met(self, cells: NDArray[np.int64]) -> Index:
+        """Which of the N voxels are among cells (K, 3)."""
+        inside = ((cells >= self.low) & (cells < self.low + self.shape)).all(axis=1)
+        key = np.unique(_keys(cells[inside] - self.low, self.shape))
+        at = np.minimum(np.searchsorted(self.key, key), len(self.key) - 1)
+        found = self.copies[:, at[self.key[at] == key]]
+        return found[found >= 0]
+
+
+def _keys(cells: NDArray[np.int64], shape: NDArray[np.int64]) -> NDArray[np.int64]:
+    x, y, z = cells.T
+    return np.asarray((x * shape[1] + y) * shape[2] + z, np.int64)

@@ -1,0 +1,254 @@
+"""Models of a recording in 3D: a surface, painted; and what moved, likewise (Sect. 4.4, 4.5)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.camera import Images
+from stillmap.core.errors import extra
+from stillmap.core.profiling import Stages
+from stillmap.mesh.background import Ahead
+from stillmap.mesh.inputs import Sources
+from stillmap.mesh.objects.merging import Followed, followed_of, wholes_of
+from stillmap.mesh.objects.reconstruction import Shape, shape_of
+from stillmap.mesh.objects.segmentation import Moves
+from stillmap.mesh.objects.texturing import Dressed, dressed, when_in_view
+from stillmap.mesh.options import MeshOptions, VisibleOptions
+from stillmap.mesh.place import Painted, painted
+from stillmap.mesh.point_colors import Tints, tinted
+from stillmap.mesh.texture.atlas import Textured, replaced
+from stillmap.mesh.texture.baking import baked
+from stillmap.mesh.texture.exposure import levelled
+from stillmap.mesh.texture.views import UNREAD, View, colours_of, readable, views_of
+from stillmap.mesh.tsdf import surface_of
+from stillmap.pipeline.em_loop import Progress, silent
+
+Float = NDArray[np.float64]
+Read = Callable[[int], NDArray[Any]]
+Tell = Callable[[int, int], None]
+
+_NEEDED = ("skimage.measure", "pyfqmr", "xatlas", "trimesh")  # of the extra `mesh`
+_SPOILED = 0.5  # probability that a picture shows static things only, below which it does not
+
+
+@dataclass(frozen=True, eq=False)
+class MoverModel:
+    """What moved, as a model in its own frame: x ahead, y left, z up, on the ground.
+
+    Attributes:
+        shape: its surface, and where it was.
+        dressed: which view paints each face.
+        textured: with the pictures on it.
+        T_map_object: (4, 4) where it was when it was of this shape.
+        stamp_ns: when that was.
+        span_ns: from when to when what was seen of it is in the model.
+    """
+
+    shape: Shape
+    dressed: Dressed
+    textured: Textured
+    T_map_object: Float
+    stamp_ns: int
+    span_ns: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Models:
+    """The place without its people, and the people.
+
+    Attributes:
+        painted: the surface of the place, and which of `views` paints each face.
+        textured: with the pictures on it.
+        unfiltered: the same with the sharpest picture wherever that probably shows something that
+            moves, as it would be without labels; None where that is nowhere.
+        views: the pictures that can be used.
+        left_out: how many others there are, by reason.
+        unread: a line for each of the others that could not be read.
+        movers: models of what moved, in the order of the objects.
+        tried: how many objects there are.
+        tints: colours of the beams' ends; None where there are no pictures, or nobody wants them.
+    """
+
+    painted: Painted
+    textured: Textured
+    unfiltered: Textured | None
+    views: list[View]
+    left_out: dict[str, int]
+    unread: list[str]
+    movers: list[MoverModel]
+    tried: int
+    tints: Tints | None = None
+
+
+def require_extras() -> None:
+    """Refuses before any work is done.
+
+    Raises:
+        MissingExtra: a library of the extra `mesh` is not installed.
+    """
+    for module in _NEEDED:
+        extra(module, "mesh.glb", "made", group="mesh")
+
+
+def models_of(
+    sources: Sources,
+    options: MeshOptions,
+    threads: int = 1,
+    progress: Progress = silent,
+    stages: Stages | None = None,
+) -> Models:
+    """A surface from what stands still, and for each face the picture that most likely shows it.
+
+    Args:
+        sources: a recording of which everything is known.
+        options: see MeshOptions.
+        threads: same result with any number.
+        progress: called with what is done, 0, and how much of it.
+        stages: where time and memory per stage are noted.
+
+    Raises:
+        MissingExtra: a library of the extra `mesh` is not installed.
+    """
+    stages = stages or Stages()
+
+    def tell(what: str) -> Tell:
+        return lambda done, total: progress(what, 0, done, total)
+
+    with stages.measure("surface"):
+        mesh = surface_of(
+            sources.seen,
+            sources.poses,
+            sources.p_static,
+            options.surface,
+            threads,
+            tell("building the surface"),
+        )
+    with stages.measure("painting"):
+        views, left_out, unread = _usable(sources, tell("reading pictures"))
+        limits = options.texture.visible
+        place, gain = painted(
+            mesh, views, sources, options.choice, limits, threads, tell("choosing pictures")
+        )
+        sources = _levelled(sources, views, gain)
+    progress("putting pictures on the surface", 0, 0, 0)
+    with stages.measure("texture"):
+        read = _reader(sources.recording.images)
+        textured = baked(place.mesh, place.view, views, read, options.texture)
+        unfiltered = _unfiltered(textured, place, views, read, options)
+    ahead = _ahead(place, views, sources.recording.images, limits)
+    with stages.measure("movers"):
+        movers, moves = [], Moves.of(sources)
+        if options.objects.enabled:
+            movers = _movers(sources, moves, views, ahead, options, tell("building what moved"))
+    tints = None
+    if views and options.points.enabled:
+        with stages.measure("points"):
+            now = tell("colouring points")
+            tints = tinted(sources, textured, ahead, moves, options, threads, now)
+    tried = len(sources.objects)
+    return Models(place, textured, unfiltered, views, left_out, unread, movers, tried, tints)
+
+
+def _usable(sources: Sources, tell: Tell) -> tuple[list[View], dict[str, int], list[str]]:
+    """Pictures of a known place that can be read; how many cannot be used, and which not read."""
+    views, left_out = views_of(sources.recording, sources.poses)
+    views, unread = readable(sources.recording.images, views, tell)
+    if unread:
+        left_out = {**left_out, UNREAD: left_out.get(UNREAD, 0) + len(unread)}
+    return views, left_out, unread
+
+
+def _levelled(sources: Sources, views: Sequence[View], gain: Float) -> Sources:
+    """The same with pictures of one exposure."""
+    images = sources.recording.images
+    if images is None:
+        return sources
+    recording = replace(sources.recording, images=levelled(images, views, gain))
+    return replace(sources, recording=recording)
+
+
+def _unfiltered(
+    textured: Textured, place: Painted, views: list[View], read: Read, options: MeshOptions
+) -> Textured | None:
+    """With the sharpest picture on the faces of which that probably shows something that moves."""
+    spoiled = (place.sharpest >= 0) & (place.p_sharpest < _SPOILED)
+    if not spoiled.any():
+        return None
+    part = baked(place.mesh.part(spoiled), place.sharpest[spoiled], views, read, options.texture)
+    return replaced(textured, spoiled, part)
+
+
+def _reader(images: Images | None) -> Read:
+    if images is not None:
+        return images.read
+
+    def none(image: int) -> NDArray[Any]:
+        raise IndexError(f"there is no picture {image}")
+
+    return none
+
+
+def _ahead(
+    place: Painted, views: list[View], images: Images | None, limits: VisibleOptions
+) -> Ahead:
+    def colours(view: View) -> NDArray[np.uint8] | None:
+        return None if images is None else colours_of(images, view)
+
+    return Ahead(place, views, limits, colours)
+
+
+def _movers(
+    sources: Sources,
+    moves: Moves,
+    views: Sequence[View],
+    ahead: Ahead,
+    options: MeshOptions,
+    tell: Tell,
+) -> list[MoverModel]:
+    followed = followed_of(sources, moves, options.objects)
+    wholes = wholes_of(followed, moves, sources, options.objects)
+    out = []
+    for number, whole in enumerate(wholes):
+        model = _mover(whole, sources, moves, views, ahead, options)
+        if model is not None:
+            out.append(model)
+        tell(number + 1, len(wholes))
+    return sorted(out, key=lambda model: model.shape.id)
+
+
+def _mover(
+    whole: Sequence[Followed],
+    sources: Sources,
+    moves: Moves,
+    views: Sequence[View],
+    place: Ahead,
+    options: MeshOptions,
+) -> MoverModel | None:
+    """The model of what was followed as one or more objects; None where `shape_of` finds none."""
+    start = sources.start_ns
+    seconds = [when_in_view(one.thing, views, start) for one in whole]
+    shown = [some[np.isfinite(some)] for some in seconds]
+    shape = shape_of(whole, sources, moves, options.objects, shown)
+    if shape is None:
+        return None
+    parts = {one.object.id for one in whole if one.object.id != shape.id}
+    dress = dressed(
+        shape,
+        views,
+        place,
+        [thing for thing in sources.things if thing.box.thing not in parts],
+        start,
+        options.objects,
+        options.choice,
+        options.texture.visible,
+    )
+    read = _reader(sources.recording.images)
+    textured = baked(dress.painted.mesh, dress.painted.view, dress.views, read, options.texture)
+    T = shape.way.T_map_object(shape.seconds)
+    first, middle, last = (
+        start + round(1e9 * seconds) for seconds in (shape.span[0], shape.seconds, shape.span[1])
+    )
+    return MoverModel(shape, dress, textured, T, middle, (first, last))

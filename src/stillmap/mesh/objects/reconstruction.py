@@ -1,0 +1,305 @@
+"""Models of what moved (Sect. 4.5): what ended on a thing, in its own frame, as a surface.
+
+Whether what was followed moved: what ended there was dynamic, not some of it only.
+
+Of what stands still, as a hedge or the edge of a wall, some beams are now and then taken for
+dynamic, and followed; others ended right beside them, at the same time, on what is static.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from stillmap.mesh.inputs import Sources
+from stillmap.mesh.objects.frame import Way
+from stillmap.mesh.objects.merging import Followed
+from stillmap.mesh.objects.registration import (
+    DEEPEST,
+    Glimpse,
+    Sweep,
+    apart,
+    between,
+    look_at,
+    motion_of,
+    pose,
+    surface_of,
+)
+from stillmap.mesh.objects.segmentation import Moves, scans_about, seconds_of
+from stillmap.mesh.objects.sweep_surface import best_moment
+from stillmap.mesh.options import MoverOptions, SurfaceOptions
+from stillmap.mesh.range_image import Patch
+from stillmap.mesh.simplification import divided
+from stillmap.mesh.texture.occluders import Thing
+from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.mesh.tsdf import fused
+
+Float = NDArray[np.float64]
+
+Index = NDArray[np.intp]
+
+_GROUND = 0.1  # m above the foot of a thing, up to where beams may have met the ground
+
+_FINE = 0.5  # of the distance that counts, between points of the surface
+
+
+def p_dynamic_at(
+    mesh: Mesh, way: Way, span: tuple[float, float], sources: Sources, reach: float
+) -> float:
+    """Mean P(c = 0) of the beams that ended at a thing when it was seen, but for the ground's.
+
+    Args:
+        mesh: its surface, in its own frame.
+        way: where that frame was.
+        span: s, from when to when it was seen.
+        sources: the beams.
+        reach: metres from its surface.
+
+    Returns:
+        NaN where no beam ended there, 0.1 m above its foot or higher.
+    """
+    seen = sources.seen
+    fine, _ = divided(mesh, _FINE * reach)
+    tree = cKDTree(fine.vertices)
+    low, high = fine.vertices.min(axis=0) - reach, fine.vertices.max(axis=0) + reach
+    low[2] = max(low[2], _GROUND)
+    total, count = 0.0, 0
+    scans = scans_about(*span, sources)
+    for scan in range(scans.start, scans.stop):  # all of a second's would be too many at once
+        beams = np.arange(seen.offset[scan], seen.offset[scan + 1])
+        seconds = seconds_of(beams, sources)
+        then = (seconds >= span[0]) & (seconds <= span[1]) & seen.hit[beams]
+        beams, seconds = beams[then], seconds[then]
+        at = way.local(seconds, seen.end_points(beams, sources.poses))
+        some = np.flatnonzero(((at > low) & (at < high)).all(axis=1))
+        off = tree.query(at[some], distance_upper_bound=reach)[0]
+        near = sources.p_static[beams[some[np.isfinite(off)]]]
+        total += float(near.sum(dtype=np.float64))
+        count += len(near)
+    return 1.0 - total / count if count else float("nan")
+
+
+_LONGER = (1.0, 2.0, 4.0)  # times a sweep, one after the other, until there is a surface
+
+_FINEST, _COARSEST = 0.03, 0.06  # m, edges of voxels
+
+_OF_SPACING = 0.7  # of how far beams lie apart
+
+_BEFORE, _BEHIND = 6.0, 5.0  # voxels about a surface: looks are a few of them apart
+
+_SEEN_TWICE = 1.5  # looks that a voxel must be of, where there are many
+
+_OF_LOOKS = 0.4  # or this share of them, where there are few
+
+_DEEP = 1.0  # m along the line of sight that one look of several may bridge
+
+_TOLD = 200  # points of the best look: of fewer nobody can tell how others lie on it
+
+_MOST = 0.5  # of the looks must fit, and of the best one's area be there
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """The surface of a thing that moved.
+
+    Attributes:
+        id: of the object.
+        mesh: in the thing's own frame: x ahead, y left, z up, on the ground below its middle.
+        way: where that frame was.
+        rigid: whether it kept its shape.
+        seconds: when it was of this shape: of one that is not rigid the middle of the sweep, of a
+            rigid one when most of it was seen; by the time of its box.
+        span: s, from the first beam of that sweep to the last; what is rigid: of all of them.
+    """
+
+    id: int
+    mesh: Mesh
+    way: Way
+    rigid: bool
+    seconds: float
+    span: tuple[float, float]
+
+
+def shape_of(
+    followed: Sequence[Followed],
+    sources: Sources,
+    moves: Moves,
+    options: MoverOptions,
+    pictures: Sequence[Float],
+) -> Shape | None:
+    """The surface of something that moved; None where too little of it was seen, or it stood still.
+
+    Args:
+        followed: the objects as which it was followed.
+        sources: the beams.
+        moves: those on what moves.
+        options: see MoverOptions.
+        pictures: of each (N,) s, when pictures show it, by the time of its box.
+    """
+    own = np.unique(np.concatenate([one.own for one in followed]))
+    if not len(own):
+        return None
+    fast = any(one.fast for one in followed)
+    rigid = fast or any(one.large for one in followed)
+    # who is seen by few beams is looked at longer
+    for moment in [k * options.sweep for k in _LONGER] if moves.planar else [0.0]:
+        one, span = _best(followed, pictures, moment, sources, moves, options)
+        way = Way.of_track(one.thing)
+        look = look_at(own, span, way, fast, sources, moves, options)
+        if look is None:
+            continue
+        mesh = surface_of(look, rigid, DEEPEST, options)
+        if not _enough(mesh, options.least, options):
+            continue
+        now = 0.5 * sum(look.span)
+        if rigid and not moves.planar and len(mesh.vertices) >= _TOLD:
+            whole = _put_together(one, own, now, fast, sources, moves, options)
+            if whole is not None:
+                return _moving(whole, sources, options)
+        shape = Shape(one.object.id, mesh, way, False, now, look.span)
+        return _moving(shape, sources, options)
+    return None
+
+
+def _moving(shape: Shape, sources: Sources, options: MoverOptions) -> Shape | None:
+    """The shape; None where most of what is there stands still."""
+    if options.dynamic == 0.0:
+        return shape
+    p = p_dynamic_at(shape.mesh, shape.way, shape.span, sources, options.about)
+    return shape if p >= options.dynamic else None
+
+
+def _put_together(
+    one: Followed,
+    own: Index,
+    now: float,
+    fast: bool,
+    sources: Sources,
+    moves: Moves,
+    options: MoverOptions,
+) -> Shape | None:
+    """What the looks about a time saw of a rigid thing; None: they do not lie over each other."""
+    way = Way.of_track(straight(one.thing, now, options.together))
+    looks = _looks(own, now, way, fast, sources, moves, options)
+    sweeps = [_sweep(look, now, options) for look in looks]
+    if len(sweeps) < 2:
+        return None
+    best = int(np.argmin([abs(sweep.later) for sweep in sweeps]))
+    motion = motion_of(sweeps, best)
+    moved = [sweep.moved(motion) for sweep in sweeps]
+    kept = [
+        k
+        for k, sweep in enumerate(moved)
+        if k == best or apart(sweep, moved[best]) <= options.blurred
+    ]
+    if len(kept) < max(2.0, _MOST * len(sweeps)):
+        return None
+    mesh = _fused([moved[k].patch() for k in kept], options)
+    least = max(options.least, _MOST * sweeps[best].mesh.areas().sum())
+    if not _enough(mesh, least, options):
+        return None
+    later = np.array([sweeps[k].later for k in kept])
+    offset = np.array([_in_plane(*pose(motion, t)) for t in later.tolist()])
+    span = min(looks[k].span[0] for k in kept), max(looks[k].span[1] for k in kept)
+    return Shape(one.object.id, mesh, Way(way.thing, now + later, offset), True, now, span)
+
+
+def _enough(mesh: Mesh, area: float, options: MoverOptions) -> bool:
+    """Whether a surface is of something: as large as that, and higher than the ground is rough."""
+    if not len(mesh) or mesh.areas().sum() < area:
+        return False
+    return bool(np.ptp(mesh.vertices[:, 2]) >= options.height)
+
+
+def _looks(
+    own: Index,
+    now: float,
+    way: Way,
+    fast: bool,
+    sources: Sources,
+    moves: Moves,
+    options: MoverOptions,
+) -> list[Glimpse]:
+    """At a thing about a time, one in each scan, in the order of their times."""
+    near = between(own, moves.seconds, now - options.together, now + options.together)
+    scan = sources.seen.scans_of(moves.beam[near])
+    out = []
+    for part in np.split(near, np.flatnonzero(np.diff(scan)) + 1):
+        if len(part):
+            seconds = moves.seconds[part]
+            span = float(seconds.min()), float(seconds.max())
+            look = look_at(own, span, way, fast, sources, moves, options)
+            out += [look] if look is not None else []
+    # scans of several sensors overlap: which begins first may see it last
+    return sorted(out, key=lambda look: look.span[0] + look.span[1])
+
+
+def _sweep(look: Glimpse, now: float, options: MoverOptions) -> Sweep:
+    mesh = surface_of(look, True, _DEEP, options)
+    return Sweep.of(mesh, look.own.origin.mean(axis=0), 0.5 * sum(look.span) - now)
+
+
+def _in_plane(R: Float, t: Float) -> list[float]:
+    """Metres ahead and to the left, rad to the left."""
+    return [float(t[0]), float(t[1]), float(np.arctan2(R[1, 0], R[0, 0]))]
+
+
+def _fused(patches: Sequence[Patch], options: MoverOptions) -> Mesh:
+    """One surface of several looks'."""
+    voxel = options.voxel or voxel_for(patches)
+    limits = SurfaceOptions(
+        before=_BEFORE,
+        behind=_BEHIND,
+        fewest=min(_SEEN_TWICE, _OF_LOOKS * len(patches)),
+        island=options.island,
+    )
+    weighed = [(patch, np.ones(len(patch.faces), np.float32)) for patch in patches]
+    return fused(weighed, voxel, limits)
+
+
+def voxel_for(patches: Sequence[Patch]) -> float:
+    """Metres: a little less than beams lie apart on a thing, within bounds."""
+    edges = [np.zeros(0)]
+    for patch in patches:
+        corners = patch.points[patch.faces]
+        edges.append(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).ravel())
+    all_edges = np.concatenate(edges)
+    apart = float(np.median(all_edges)) if len(all_edges) else _FINEST
+    return float(np.clip(_OF_SPACING * apart, _FINEST, _COARSEST))
+
+
+def straight(thing: Thing, now: float, reach: float) -> Thing:
+    """The same, going on evenly as it does at a time, from `reach` seconds before to after."""
+    box = thing.box
+    seconds = np.array([now - reach, now + reach])
+    velocity = np.array([np.interp(now, box.seconds, column) for column in box.velocity.T])
+    at = int(np.clip(np.searchsorted(box.seconds, now, side="right") - 1, 0, None))
+    even = dataclasses.replace(
+        box,
+        seconds=seconds,
+        xy=box.middle(np.array([now])) + (seconds - now)[:, None] * velocity,
+        ahead=np.tile(box.ahead[at], (2, 1)),
+        velocity=np.tile(velocity, (2, 1)),
+    )
+    return Thing(even, np.full(2, np.interp(now, box.seconds, thing.foot)), thing.tall)
+
+
+def _best(
+    followed: Sequence[Followed],
+    pictures: Sequence[Float],
+    moment: float,
+    sources: Sources,
+    moves: Moves,
+    options: MoverOptions,
+) -> tuple[Followed, tuple[float, float]]:
+    """Which of some objects is seen best, and when."""
+    found = []
+    for one, shown in zip(followed, pictures, strict=True):
+        if len(one.own):
+            scans, seconds = sources.seen.scans_of(moves.beam[one.own]), moves.seconds[one.own]
+            found.append((one, best_moment(seconds, scans, moment, options.near, shown)))
+    one, (first, last, _) = max(found, key=lambda each: each[1][2])
+    return one, (first, last)

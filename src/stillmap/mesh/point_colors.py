@@ -1,0 +1,284 @@
+"""Colours of the beams' end points: of what stands still as the surface there is painted, of what
+moves from pictures taken about when it was seen.
+
+Points on what moves, and their colours: of pictures taken about when they were seen.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import arrays
+from stillmap.core.camera import project
+from stillmap.core.parallel import in_order
+from stillmap.em.observations import Chunk, chunks
+from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
+from stillmap.mesh.background import Ahead
+from stillmap.mesh.inputs import Sources
+from stillmap.mesh.objects.segmentation import NOBODY, Moves
+from stillmap.mesh.options import MeshOptions
+from stillmap.mesh.texture.atlas import GREY, Textured
+from stillmap.mesh.texture.baking import bilinear
+from stillmap.mesh.texture.occluders import Cuboid, Thing, at_time, in_the_way
+from stillmap.mesh.texture.point_colors import PaintedMesh, depth_inside, not_grey
+from stillmap.mesh.texture.views import View
+
+Tell = Callable[[int, int], None]
+
+Float = NDArray[np.float64]
+
+Bool = NDArray[np.bool_]
+
+Colours = NDArray[np.uint8]
+
+
+class _Seen(NamedTuple):
+    """n beams on things that move, taken about a time.
+
+    Attributes:
+        beam: (n,) their numbers.
+        ends: (n, 3) metres in the map frame, where they ended.
+        seconds: (n,) when, by the time of the things.
+        owner: (n,) of which thing each is, by its place among `things`.
+    """
+
+    beam: NDArray[np.intp]
+    ends: Float
+    seconds: Float
+    owner: NDArray[np.intp]
+
+
+class Moving:
+    """The dynamic beams on things that are followed, to be asked for by time."""
+
+    def __init__(self, sources: Sources, moves: Moves) -> None:
+        self.sources = sources
+        place = {one.box.thing: number for number, one in enumerate(sources.things)}
+        ids, of = np.unique(moves.owner, return_inverse=True)
+        owner = np.array([place.get(int(one), NOBODY) for one in ids], np.intp)[of]
+        kept = np.flatnonzero(moves.dynamic & (owner != NOBODY))
+        kept = kept[np.argsort(moves.seconds[kept], kind="stable")]
+        self._all = _Seen(moves.beam[kept], moves.ends[kept], moves.seconds[kept], owner[kept])
+
+    def about(self, now: float, near: float) -> _Seen:
+        """Those that ended within `near` seconds of a time."""
+        seen = self._all
+        first = int(np.searchsorted(seen.seconds, now - near))
+        last = int(np.searchsorted(seen.seconds, now + near, side="right"))
+        then = slice(first, last)
+        return _Seen(seen.beam[then], seen.ends[then], seen.seconds[then], seen.owner[then])
+
+
+def tint_moving(
+    out: Colours,
+    late: NDArray[np.float32],
+    moving: Moving,
+    number: int,
+    place: Ahead,
+    options: MeshOptions,
+) -> None:
+    """Colours what moves and is seen in a picture, where none nearer in time shows it.
+
+    Args:
+        out: (M, 3), changed.
+        late: (M,) s from each beam to the picture that it has its colour from; changed.
+        moving: the dynamic beams.
+        number: of the view.
+        place: what stands still, which hides what is behind it.
+        options: see MeshOptions.
+    """
+    sources, limits = moving.sources, options.texture.visible
+    view = place.views[number]
+    now = 1e-9 * (view.stamp_ns - sources.start_ns)
+    seen = moving.about(now, options.objects.near)
+    away = np.abs(seen.seconds - now).astype(np.float32)
+    ends = _carried(seen, sources.things, now)
+    local = view.in_camera(ends)
+    uv, ok = project(view.camera, local)
+    size, m = np.array([view.camera.width, view.camera.height]), limits.margin
+    with np.errstate(invalid="ignore"):  # NaN: nowhere
+        ok &= ((uv >= m) & (uv <= size - 1.0 - m)).all(axis=1)
+    ok &= local[:, 2] > limits.near
+    ok &= _within_outlines(seen, local, ok, sources.things, now, options)
+    ok &= away < late[seen.beam]
+    shown = np.flatnonzero(ok)
+    shown = shown[place.free(number, ends[shown])] if len(shown) else shown
+    shown = shown[_free(ends[shown], seen.owner[shown], sources.things, view, now, options)]
+    if not len(shown):
+        return
+    picture = place.picture(number)
+    if picture is None:
+        return
+    colours = np.rint(bilinear(np.ascontiguousarray(picture[..., :3]), uv[shown]))
+    out[seen.beam[shown]] = not_grey(colours.astype(np.uint8))
+    late[seen.beam[shown]] = away[shown]
+
+
+def _carried(seen: _Seen, things: Sequence[Thing], now: float) -> Float:
+    """(n, 3) where the ends are once each has gone on with its thing to a time."""
+    out = seen.ends.copy()
+    for number in np.unique(seen.owner).tolist():
+        mine, box = seen.owner == number, things[number].box
+        out[mine, :2] += box.middle(np.array([now])) - box.middle(seen.seconds[mine])
+    return out
+
+
+def _within_outlines(
+    seen: _Seen,
+    local: Float,
+    shown: Bool,
+    things: Sequence[Thing],
+    now: float,
+    options: MeshOptions,
+) -> Bool:
+    """(n,) whether points that are shown lie within the outline of their thing in a picture.
+
+    By `mesh.points.rim`, and by `mesh.objects.drift` of the way that it went since.
+
+    Args:
+        seen: the beams.
+        local: (n, 3) metres in the camera's frame, where they have gone on to.
+        shown: (n,) whether they are in the picture.
+        things: all that moves.
+        now: s, when the picture was taken, by their time.
+        options: see MeshOptions.
+    """
+    out = np.zeros(len(shown), np.bool_)
+    for number in np.unique(seen.owner[shown]).tolist():
+        mine = np.flatnonzero(shown & (seen.owner == number))
+        x, y, z = local[mine].T
+        inside = depth_inside(np.stack([x / z, y / z], axis=1) * np.median(z), options.points.apart)
+        box = things[number].box
+        way = box.middle(np.array([now])) - box.middle(seen.seconds[mine])
+        gone = np.linalg.norm(way, axis=1)
+        out[mine] = inside >= options.points.rim + options.objects.drift * gone
+    return out
+
+
+def _free(
+    points: Float,
+    owner: NDArray[np.intp],
+    things: Sequence[Thing],
+    view: View,
+    now: float,
+    options: MeshOptions,
+) -> Bool:
+    """(n,) whether probably no other thing stands between a camera and points.
+
+    What is in a thing's box, or near, is taken for a part of it.
+    """
+    choice, free = options.choice, np.ones(len(points))
+    for number, thing in enumerate(things):
+        for cuboid in at_time([thing], now):
+            mine = (owner == number) | _inside(cuboid, points, choice.margin)
+            rest = np.flatnonzero(~mine)
+            hidden = in_the_way([cuboid], view.place, points[rest], choice.margin, choice.sigma)
+            free[rest] *= 1.0 - hidden
+    return free >= choice.least
+
+
+def _inside(cuboid: Cuboid, points: Float, margin: float) -> Bool:
+    return np.asarray((np.abs(cuboid.local(points)) <= cuboid.half + margin).all(axis=1))
+
+
+_TOGETHER = 1 << 16  # points
+
+
+@dataclass(frozen=True, eq=False)
+class Tints:
+    """Colours of the ends of M beams.
+
+    Attributes:
+        colours: (M, 3) uint8, as photographed (sRGB); GREY where no picture tells, and only there.
+        counts: numbers of hits, `static` and `dynamic`, and how many of them have a colour:
+            `static_coloured`, `dynamic_coloured`.
+    """
+
+    colours: Colours
+    counts: dict[str, int]
+
+
+def tinted(
+    sources: Sources,
+    textured: Textured,
+    place: Ahead,
+    moves: Moves,
+    options: MeshOptions,
+    threads: int = 1,
+    tell: Tell | None = None,
+) -> Tints:
+    """The colour of each beam's end.
+
+    What lies on the surface of the place has the colour that is painted there: of a picture that
+    probably shows nothing that moves before it. What moves is carried along its track to the time
+    of pictures `mesh.objects.near` seconds from then at most; of those that show it the nearest in
+    time counts. What is of no track has none.
+
+    Args:
+        sources: M beams.
+        textured: the surface of the place.
+        place: what stands still, and the pictures that can be used.
+        moves: the beams on what moves.
+        options: see MeshOptions.
+        threads: same result with any number.
+        tell: called with what is done, and how much of it.
+    """
+    recording = sources.recording
+    out: Colours = recording.per_beam(np.uint8, (3,))
+    scans, n = recording.n_scans, recording.n_scans + len(place.views)
+    painted = PaintedMesh(textured, options.points.off)
+    T_map_sensor = sources.seen.T_map_sensor(sources.poses)
+    for chunk in chunks(sources.seen, beside=[sources.p_static, out]):
+        out[chunk.beams] = GREY
+        _tint_static(out, chunk, sources, T_map_sensor, painted, threads)
+        if tell is not None:
+            tell(chunk.scans.stop, n)
+    late = recording.per_beam(np.float32)
+    for block in arrays.blocks(late):
+        late[block] = np.inf
+    moving = Moving(sources, moves)
+    for number in range(len(place.views)):
+        tint_moving(out, late, moving, number, place, options)
+        sources.seen.let_go(sources.p_static, out, late)
+        if tell is not None:
+            tell(scans + number + 1, n)
+    return Tints(out, _counts(out, sources))
+
+
+def _counts(colours: Colours, sources: Sources) -> dict[str, int]:
+    hit, p_static = sources.seen.hit, sources.p_static
+    out = dict.fromkeys(("static", "static_coloured", "dynamic", "dynamic_coloured"), 0)
+    for block in arrays.blocks(hit, p_static, colours):
+        has, still = (colours[block] != GREY).any(axis=1), p_static[block] >= DYNAMIC_BELOW
+        for name, part in (("static", hit[block] & still), ("dynamic", hit[block] & ~still)):
+            out[name] += int(np.count_nonzero(part))
+            out[f"{name}_coloured"] += int(np.count_nonzero(part & has))
+    return out
+
+
+def _tint_static(
+    out: Colours,
+    chunk: Chunk,
+    sources: Sources,
+    T_map_sensor: Float,
+    painted: PaintedMesh,
+    threads: int,
+) -> None:
+    """Colours what stands still of some scans."""
+    beams = chunk.beams
+    still = sources.seen.hit[beams] & (sources.p_static[beams] >= DYNAMIC_BELOW)
+    numbers = np.flatnonzero(still)
+    scan = np.searchsorted(chunk.offset, numbers, side="right") - 1 + chunk.scans.start
+    parts = [slice(k, k + _TOGETHER) for k in range(0, len(numbers), _TOGETHER)]
+
+    def found(part: slice) -> tuple[slice, Colours, Bool]:
+        T = T_map_sensor[scan[part]]
+        local = sources.seen.points[beams.start + numbers[part]].astype(np.float64)
+        ends = np.einsum("nij,nj->ni", T[:, :3, :3], local) + T[:, :3, 3]
+        return part, *painted.colours(ends, T[:, :3, 3])
+
+    for part, colours, has in in_order(found, parts, threads):
+        out[beams.start + numbers[part][has]] = colours[has]

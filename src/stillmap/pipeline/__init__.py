@@ -1,0 +1,1 @@
+"""The EM loop: M-step, E-step, bound; its estimate, checkpoints and result."""

@@ -1,0 +1,256 @@
+"""The folder beside a result in which a run keeps how far it has come, and which is its alone.
+
+`.NAME.resume/` beside NAME holds `lock`, and `iteration-K/` once iteration K is finished: flat
+arrays and `state.json`, which knows the checksum of each. A checkpoint is written beside the one
+before, which goes only when the new one is whole and on the disk.
+"""
+
+import fcntl
+import json
+import os
+import re
+import shutil
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import blocks, write_npy
+from stillmap.core.errors import InputError
+from stillmap.core.profiling import Stages
+from stillmap.pipeline.checkpoint_files import packed, require_same, unpacked
+from stillmap.pipeline.options import Options
+from stillmap.pipeline.progress import Loop
+
+_FORMAT_VERSION = 1
+_STATE, _LOCK = "state.json", "lock"
+_NAME = re.compile(r"[A-Za-z0-9_.-]+")
+_LARGEST_STATE = 1 << 30  # bytes
+_IN_MEMORY = 1 << 20  # bytes of an array that is read at once instead of mapped
+
+
+class Damaged(Exception):
+    """A checkpoint that cannot be used; says which file and why."""
+
+
+class Place:
+    """Where one run keeps how far it has come; see `held`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._whole: dict[str, int] = {}  # checksums of the arrays in the present checkpoint
+
+    @property
+    def present(self) -> Path | None:
+        """The last checkpoint that is whole; None where there is none."""
+        numbers = [
+            int(path.name.removeprefix("iteration-"))
+            for path in self.folder.iterdir()
+            if re.fullmatch(r"iteration-[0-9]{1,9}", path.name)
+        ]
+        return self.folder / f"iteration-{max(numbers)}" if numbers else None
+
+    def load(self, identity: Mapping[str, Any], options: Options, stages: Stages) -> Loop | None:
+        """How far the run came; None where there is no checkpoint.
+
+        Args:
+            identity: what is to be mapped, and how.
+            options: the same as a whole.
+            stages: gets the time that the run took so far.
+
+        Raises:
+            InputError: it is of another recording or other options.
+            Damaged: a file of it is not what was written.
+        """
+        if self.present is None:
+            return None
+        state = _state(self.present / _STATE)
+        require_same(state["identity"], dict(identity), str(self.folder))
+        arrays = {
+            name: _array(self.present / f"{name}.npy", about)
+            for name, about in state["arrays"].items()
+        }
+        loop = unpacked(state["loop"], arrays, options)
+        self._whole = {name: about["crc32"] for name, about in state["arrays"].items()}
+        stages.add(state["stages"])
+        return loop
+
+    def save(self, loop: Loop, identity: Mapping[str, Any], stages: Stages) -> None:
+        """Keep how far a run has come, instead of what is kept so far.
+
+        Raises:
+            InputError: the disk is full, or the like; what was kept so far still is.
+        """
+        before, number = self.present, len(loop.records)
+        work, final = self.folder / "new.part", self.folder / f"iteration-{number}"
+        try:
+            self._clear(work)
+            work.mkdir()
+            values, arrays = packed(loop)
+            checksums = {n: self._put(work, before, n, array) for n, array in arrays.items()}
+            about = {
+                name: {"crc32": checksums[name], "shape": a.shape, "dtype": a.dtype.str}
+                for name, a in arrays.items()
+            }
+            state = {"identity": dict(identity), "arrays": about, "loop": values}
+            _write_state(work / _STATE, {**state, "stages": stages.to_dict()})
+            _sync(work)
+            os.rename(work, final)
+            _sync(self.folder)
+        except OSError as error:
+            self._clear(work)
+            what = f"no checkpoint can be written: {error.strerror or error}"
+            raise InputError(what, where=str(self.folder)) from error
+        self._whole = checksums
+        self._clear(
+            *(path for path in self.folder.iterdir() if path.name not in (_LOCK, final.name))
+        )
+
+    def _put(self, work: Path, before: Path | None, name: str, array: NDArray[Any]) -> int:
+        """Writes an array, unless the checkpoint before has it; its checksum."""
+        if before is not None and name in self._whole and name.startswith("e-"):
+            os.link(before / f"{name}.npy", work / f"{name}.npy")
+            return self._whole[name]
+        write_npy(work / f"{name}.npy", array)
+        _sync(work / f"{name}.npy")
+        return _checksum(array)
+
+    def forget(self) -> None:
+        """What is left of earlier runs goes."""
+        self._clear(*(path for path in self.folder.iterdir() if path.name != _LOCK))
+
+    def clean(self, output: Path) -> None:
+        """What a run left that was killed goes; an earlier result that it moved aside goes back."""
+        for path in list(self.folder.iterdir()):
+            if path.name.endswith(".old") and not output.exists():
+                os.rename(path, output)
+            elif path.name.endswith((".part", ".old")):
+                self._clear(path)
+
+    def _clear(self, *paths: Path) -> None:
+        for path in paths:
+            if path.is_dir() and not path.is_symlink():
+                if not path.name.endswith(".part"):
+                    # who is stopped in the middle leaves no half of a checkpoint
+                    path = path.rename(self.folder / f"{path.name}.gone.part")
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+
+
+@contextmanager
+def held(output: Path) -> Iterator[Place]:
+    """The place beside a result folder, for as long as the block runs; no other run may have it.
+
+    It goes when there is nothing in it to go on from.
+
+    Raises:
+        InputError: another run has it, or it cannot be made.
+    """
+    output = Path(os.path.abspath(output))
+    folder = output.parent / f".{output.name}.resume"
+    made = [path for path in (*reversed(output.parents),) if not path.exists()]
+    try:
+        file = _locked(folder, output)
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror}", where=str(output)) from error
+    place = Place(folder)
+    try:
+        place.clean(output)
+        yield place
+    finally:
+        if place.present is None:
+            shutil.rmtree(folder, ignore_errors=True)
+            for path in reversed(made):
+                with suppress(OSError):
+                    path.rmdir()
+        file.close()
+
+
+def _locked(folder: Path, output: Path) -> IO[bytes]:
+    """The open lock file of a place, which the kernel unlocks when this process ends."""
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            file = (folder / _LOCK).open("ab")
+        except FileNotFoundError:  # the run that had it has just ended
+            continue
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.close()
+            raise InputError(
+                "another run is writing there", where=str(output), hint="wait for it, or stop it"
+            ) from error
+        except OSError:
+            pass  # a file system without locks
+        if _is_there(folder / _LOCK, file):
+            return file
+        file.close()
+
+
+def _is_there(path: Path, file: IO[bytes]) -> bool:
+    """Whether an open file still has its name."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except OSError:
+        return False
+
+
+def _write_state(path: Path, state: Mapping[str, Any]) -> None:
+    text = json.dumps({"format_version": _FORMAT_VERSION, **state})
+    whole = {"crc32": zlib.crc32(text.encode()), "text": text}
+    path.write_text(json.dumps(whole), encoding="utf-8")
+    _sync(path)
+
+
+def _state(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > _LARGEST_STATE:
+            raise Damaged(f"{path}: too large")
+        whole = json.loads(path.read_text(encoding="utf-8"))
+        text = whole["text"]
+        if zlib.crc32(text.encode()) != whole["crc32"]:
+            raise Damaged(f"{path}: its checksum differs")
+        state: dict[str, Any] = json.loads(text)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, AttributeError) as error:
+        raise Damaged(f"{path}: {error!r}") from error
+    if state["format_version"] != _FORMAT_VERSION:
+        raise Damaged(f"{path}: format_version {state['format_version']!r} is unknown here")
+    return state
+
+
+def _array(path: Path, about: Mapping[str, Any]) -> NDArray[Any]:
+    if not _NAME.fullmatch(path.name):
+        raise Damaged(f"{path}: no name of an array")
+    try:
+        # np.load would also open archives and pickles
+        found = np.lib.format.open_memmap(path, mode="r")
+    except Exception as error:  # whatever NumPy's parser makes of damaged bytes
+        raise Damaged(f"{path}: {error!r}") from error
+    if list(found.shape) != about["shape"] or found.dtype.str != about["dtype"]:
+        raise Damaged(f"{path}: not the array that was written")
+    if _checksum(found) != about["crc32"]:
+        raise Damaged(f"{path}: its checksum differs")
+    return np.array(found) if found.nbytes < _IN_MEMORY else np.asarray(found)
+
+
+def _checksum(array: NDArray[Any]) -> int:
+    found = 0
+    for block in blocks(array):
+        part = np.ascontiguousarray(array[block]).reshape(-1)
+        found = zlib.crc32(part.view(np.uint8).data, found)
+    return found
+
+
+def _sync(path: Path) -> None:
+    """Waits until a file or folder is on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

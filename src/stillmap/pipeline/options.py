@@ -1,0 +1,86 @@
+"""All options of a run, and their resolution for a recording."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Literal
+
+from stillmap.core.config import field_with_doc
+from stillmap.core.recording import Recording
+from stillmap.em import EmOptions
+from stillmap.em.options import MapState
+from stillmap.io.cameras import depth_cameras
+from stillmap.mapping.projection import BandOptions
+from stillmap.mesh.options import MeshOptions
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.rig.options import RigOptions
+from stillmap.slam import SlamOptions
+from stillmap.tracking import ObjectOptions
+
+MapMode = Literal["trinary", "scale", "raw"]
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """How the result folder is written."""
+
+    map_mode: MapMode = field_with_doc(
+        "trinary",
+        "pixels of the map picture: trinary (occupied, unknown, free), scale (grey between the "
+        "thresholds; a .png, as unknown needs transparency) or raw (percent occupied, 255 unknown)",
+    )
+    map_state: MapState = field_with_doc(
+        "last", "of places that changed the map shows the last state, or the one held for longest"
+    )
+    band: BandOptions = field(default=BandOptions())
+
+
+@dataclass(frozen=True)
+class Options:
+    """Everything that can be chosen."""
+
+    threads: int = field_with_doc(0, "threads to use; 0: one per processor. Same result with any")
+    # spelled out: ruff takes the default for mutable under an alias
+    estimator: Literal["stillmap", "paper", "hit-ratio", "tracker"] = field_with_doc(
+        "stillmap",
+        "what says which beams are static; paper: (8) as printed, hit-ratio: counting, "
+        "tracker: all that are not on people who are tracked",
+    )
+    read: ReadOptions = field(default=ReadOptions())
+    em: EmOptions = field(default=EmOptions())
+    slam: SlamOptions = field(default=SlamOptions())
+    objects: ObjectOptions = field(default=ObjectOptions())
+    rig: RigOptions = field(default=RigOptions())
+    mesh: MeshOptions = field(default=MeshOptions())
+    output: OutputOptions = field(default=OutputOptions())
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.threads <= 1024:
+            raise ValueError("'threads' wants 0 to 1024")
+
+
+DEFAULTS = Options()
+
+# m, edges of voxels; depth cameras see people from near by, and within few of the larger ones
+_VOXEL, _OF_DEPTH = 0.15, 0.05
+
+
+def resolved(options: Options, recording: Recording) -> Options:
+    """The options as they will be used.
+
+    The printed method has poses by (9) alone, scan by scan, and takes scans as taken at once. The
+    cells of 3D recordings are voxels.
+    """
+    if recording.dimension == 3:
+        voxel = options.slam.voxel or (_OF_DEPTH if depth_cameras(recording.source) else _VOXEL)
+        slam_options = dataclasses.replace(options.slam, voxel=voxel, resolution=voxel)
+        options = dataclasses.replace(options, slam=slam_options)
+    if options.estimator != "paper":
+        return options
+    slam_options = dataclasses.replace(
+        options.slam,
+        loops=dataclasses.replace(options.slam.loops, enabled=False),
+        spinning_loops=dataclasses.replace(options.slam.spinning_loops, enabled=False),
+        registration=dataclasses.replace(options.slam.registration, approach=0.0),
+        deskew=False,
+    )
+    return dataclasses.replace(options, slam=slam_options)

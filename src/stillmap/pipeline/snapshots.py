@@ -1,0 +1,148 @@
+"""Small parts of a map, to show how it evolves (Fig. 8) without keeping every map."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
+
+if TYPE_CHECKING:
+    from stillmap.results.protocols import MapLike
+
+Window = tuple[float, float, float, float]
+Value = TypeVar("Value", np.float32, np.bool_)
+_MOST_POINTS = 50_000
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """A part of the map at one iteration.
+
+    Attributes:
+        number: the iteration, from 1.
+        p_occupied: (h, w) float32, NaN where unknown, row 0 = lowest y.
+        origin: x, y, yaw of the lower-left cell's lower-left corner in the map frame.
+        resolution: edge of a cell in metres.
+        dynamic_points: (K, 2) float32, end points in the map frame that lie in this part.
+    """
+
+    number: int
+    p_occupied: NDArray[np.float32]
+    origin: tuple[float, float, float]
+    resolution: float
+    dynamic_points: NDArray[np.float32]
+
+
+def extent(occupancy: "MapLike") -> Window:
+    """x0, y0, x1, y1 of the whole map in metres, in the map frame."""
+    x, y, yaw = occupancy.origin
+    if yaw != 0:
+        raise ValueError(f"a map turned by {yaw} rad cannot be cut along its axes")
+    height, width = occupancy.p_occupied.shape
+    return x, y, x + width * occupancy.resolution, y + height * occupancy.resolution
+
+
+def choose_window(
+    whole: Window,
+    resolution: float,
+    points_world: NDArray[np.float64] | NDArray[np.float32],
+    p_static: NDArray[np.float32],
+    size_m: float = 12.0,
+) -> Window:
+    """The square of edge `size_m` that holds most dynamic end points, within the map's bounds.
+
+    Args:
+        whole: x0, y0, x1, y1 of the map in metres.
+        resolution: edge of its cells in metres.
+        points_world: (M, 2) end points in the map frame; rows that are no hits are NaN.
+        p_static: (M,) their probabilities of being static.
+        size_m: edge in metres; smaller where the map is smaller.
+
+    Returns:
+        x0, y0, x1, y1 in metres. Without dynamic beams: the middle of the map.
+    """
+    x0, y0, x1, y1 = whole
+    size = np.minimum(size_m, [x1 - x0, y1 - y0])
+    low, high = np.array([x0, y0]), np.array([x1, y1]) - size
+    points = points_world[_dynamic_within(points_world, p_static, (x0, y0, x1, y1))]
+    corner = (low + high) / 2
+    if len(points):
+        corner = np.clip(_densest(points, low, size_m) - size_m / 2, low, high)
+    # on the grid's own lines, so that every iteration shows the same cells
+    corner = low + np.floor((corner - low) / resolution + 1e-6) * resolution
+    (left, bottom), (right, top) = corner.tolist(), (corner + size).tolist()
+    return left, bottom, right, top
+
+
+def snapshot(
+    number: int,
+    occupancy: "MapLike",
+    points_world: NDArray[np.float64] | NDArray[np.float32],
+    p_static: NDArray[np.float32],
+    window: Window,
+) -> Snapshot:
+    """The part of iteration `number`'s map that lies in `window`; points as `choose_window`."""
+    p_occupied, origin = cut(occupancy, window)
+    inside = np.flatnonzero(_dynamic_within(points_world, p_static, window))
+    if len(inside) > _MOST_POINTS:
+        inside = inside[np.arange(_MOST_POINTS) * len(inside) // _MOST_POINTS]
+    return Snapshot(
+        number=number,
+        p_occupied=p_occupied.copy(),
+        origin=origin,
+        resolution=float(occupancy.resolution),
+        dynamic_points=points_world[inside].astype(np.float32),
+    )
+
+
+def cut(
+    occupancy: "MapLike", window: Window
+) -> tuple[NDArray[np.float32], tuple[float, float, float]]:
+    """The cells (h, w) in `window` and their origin; NaN where the window leaves the map."""
+    return cut_layer(occupancy, occupancy.p_occupied, window, np.nan)
+
+
+def cut_layer(
+    occupancy: "MapLike", layer: NDArray[Value], window: Window, outside: float
+) -> tuple[NDArray[Value], tuple[float, float, float]]:
+    """The same of any (H, W) layer of a map; `outside` where the window leaves it."""
+    x, y, _, _ = extent(occupancy)
+    step = occupancy.resolution
+    left, bottom = round((window[0] - x) / step), round((window[1] - y) / step)
+    w, h = round((window[2] - window[0]) / step), round((window[3] - window[1]) / step)
+    height, width = layer.shape
+    origin = (x + left * step, y + bottom * step, 0.0)
+    if left >= 0 and bottom >= 0 and left + w <= width and bottom + h <= height:
+        return layer[bottom : bottom + h, left : left + w], origin
+    cells = np.full((h, w), outside, layer.dtype)
+    i0, i1 = np.clip([bottom, bottom + h], 0, height)
+    j0, j1 = np.clip([left, left + w], 0, width)
+    cells[i0 - bottom : i1 - bottom, j0 - left : j1 - left] = layer[i0:i1, j0:j1]
+    return cells, origin
+
+
+def _dynamic_within(
+    points: NDArray[np.float64] | NDArray[np.float32],
+    p_static: NDArray[np.float32],
+    window: Window,
+) -> NDArray[np.bool_]:
+    x0, y0, x1, y1 = window
+    inside = (points[:, 0] >= x0) & (points[:, 0] < x1) & (points[:, 1] >= y0)
+    return inside & (points[:, 1] < y1) & (p_static < DYNAMIC_BELOW)
+
+
+def _densest(
+    points: NDArray[np.float64] | NDArray[np.float32], low: NDArray[np.float64], size: float
+) -> NDArray[np.float64]:
+    """(2,) middle of the square of edge `size` with most points, to an eighth of its edge."""
+    step = size / 8
+    index = np.floor((points - low) / step).astype(np.int64)
+    # eight empty rows and columns on either side: the square may hang over the edge
+    counts = np.zeros(index.max(axis=0) + 17)
+    np.add.at(counts, (index[:, 0] + 8, index[:, 1] + 8), 1)
+    total = np.pad(counts.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    squares = total[8:, 8:] - total[:-8, 8:] - total[8:, :-8] + total[:-8, :-8]
+    best = np.array(np.unravel_index(squares.argmax(), squares.shape))
+    return low + (best - 8 + 4) * step

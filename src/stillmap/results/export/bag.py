@@ -1,0 +1,148 @@
+"""A result as a ROS bag that shows it moving: scans with what moves apart, map, way, objects."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.io.ros import message_writer
+from stillmap.io.ros.bag_types import Kind
+from stillmap.io.ros.bag_writer import BagWriter, new_bag, require_stamps
+from stillmap.io.ros.message_writer import BASE, MAP
+from stillmap.io.ros.recording_writer import Lasers, numbered, place_sensors
+from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
+from stillmap.results.reader import Exported, Track
+
+_COLOUR = (0.9, 0.4, 0.0, 0.8)  # the orange of the report
+_HEIGHT, _LEAST = 0.5, 0.1  # m, of the boxes
+_CUBE, _ADD, _DELETE_ALL = 1, 0, 3  # of visualization_msgs/Marker
+
+
+def write(result: Exported, path: Path, kind: Kind, *, overwrite: bool = False) -> list[str]:
+    """Write a result as a ROS bag.
+
+    `/scan` holds the beams that something static reflected and those at maximum range,
+    `/scan_dynamic` those on what moves, with NaN for each other's beams; `/map`, `/trajectory`
+    and `/objects` the rest. Transforms go from map over base_link to the lasers.
+
+    Returns:
+        What could not be said, a sentence each.
+
+    Raises:
+        InputError: the bag cannot be written or cannot hold the scans.
+    """
+    recording, stamps = result.recording, result.recording.stamp_ns.tolist()
+    require_stamps(stamps[0], stamps[-1], kind)
+    lasers = Lasers(recording)
+    with new_bag(path, kind, overwrite=overwrite) as bag:
+        frames = place_sensors(bag, recording)
+        _show_whole(bag, result)
+        names = [f"/{name}" for name in numbered("scan", len(frames))]
+        static = [bag.topic(name, message_writer.SCAN) for name in names]
+        dynamic = [bag.topic(f"{name}_dynamic", message_writer.SCAN) for name in names]
+        send_tf = bag.topic("/tf", message_writer.TRANSFORMS)
+        show_objects = _shown_objects(bag, result)
+        for t in recording.in_turn(range(recording.n_scans), result.p_static):
+            stamp = stamps[t]
+            send_tf(stamp, message_writer.transforms(bag, stamp, [(MAP, BASE, result.poses[t])]))
+            s = int(recording.sensor[t])
+            beams, ranges = recording.beams_of(t), lasers.ranges(t)
+            moves = recording.hit[beams] & (result.p_static[beams] < DYNAMIC_BELOW)
+            for sends, its in ((static, ~moves), (dynamic, moves)):
+                apart = np.where(its, ranges, np.float32(np.nan))
+                sends[s](stamp, lasers.message(bag, t, frames[s], apart))
+            show_objects(t)
+    return lasers.left_out()
+
+
+def _show_whole(bag: BagWriter, result: Exported) -> None:
+    """What holds for the whole recording, sent once."""
+    stamp_ns, grid = result.recording.stamp_ns, result.map
+    first = int(stamp_ns[0])
+    send = bag.topic("/map", message_writer.GRID, latched=True)
+    corner = se2.matrix(*grid.origin)
+    send(first, message_writer.occupancy_grid(bag, first, grid.p_occupied, corner, grid.resolution))
+    send = bag.topic("/trajectory", message_writer.PATH, latched=True)
+    send(first, message_writer.path(bag, stamp_ns, result.poses))
+
+
+def _shown_objects(bag: BagWriter, result: Exported) -> Callable[[int], None]:
+    """A function that shows where everything is that moves at a scan."""
+    send = bag.topic("/objects", message_writer.MARKERS)
+    stamp_ns = result.recording.stamp_ns
+    first = [int(np.searchsorted(stamp_ns, one.stamp_ns[0])) for one in result.tracks]
+    last = [int(np.searchsorted(stamp_ns, one.stamp_ns[-1], "right")) for one in result.tracks]
+    starting: dict[int, list[int]] = {}
+    for number, scan in enumerate(first):
+        starting.setdefault(scan, []).append(number)
+    shown: list[int] = []
+
+    def show(t: int) -> None:
+        nonlocal shown
+        before, stamp = shown, int(stamp_ns[t])
+        shown = [n for n in (*shown, *starting.get(t, ())) if last[n] > t]
+        if not before and not shown:
+            return
+        markers = [_marker(bag, stamp, _DELETE_ALL)]
+        markers += [_box(bag, stamp, result.tracks[n]) for n in shown]
+        send(stamp, bag.make(message_writer.MARKERS, markers=markers))
+
+    return show
+
+
+def _box(bag: BagWriter, stamp: int, one: Track) -> Any:
+    """A box where a thing is, between where it was seen before and after."""
+    since = 1e-9 * (one.stamp_ns - stamp)
+    x, y, vx, vy = (np.interp(0.0, since, row) for row in (*one.xy.T, *one.velocity.T))
+    T = np.eye(4)
+    T[:2, :2] = se2.matrix(0.0, 0.0, np.arctan2(vy, vx))[:2, :2]
+    T[:3, 3] = x, y, _HEIGHT / 2
+    along, across = (max(metres, _LEAST) for metres in one.size[:2])
+    return _marker(bag, stamp, _ADD, one.id, T, (along, across, _HEIGHT))
+
+
+def _marker(
+    bag: BagWriter,
+    stamp: int,
+    action: int,
+    number: int = 0,
+    T: NDArray[np.float64] | None = None,
+    size: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> Any:
+    x, y, z = size
+    r, g, b, a = _COLOUR
+    fields = {
+        "header": bag.header(stamp, MAP),
+        "ns": "objects",
+        "id": number,
+        "type": _CUBE,
+        "action": action,
+        "pose": message_writer.pose(bag, np.eye(4) if T is None else T),
+        "scale": bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+        "color": bag.make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a),
+        "lifetime": bag.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+        "frame_locked": False,
+        "points": [],
+        "colors": [],
+        "text": "",
+        "mesh_resource": "",
+        "mesh_use_embedded_materials": False,
+    }
+    if not bag.is_ros1:
+        fields |= _of_ros2(bag, stamp)
+    return bag.make("visualization_msgs/msg/Marker", **fields)
+
+
+def _of_ros2(bag: BagWriter, stamp: int) -> dict[str, Any]:
+    nothing = np.empty(0, np.uint8)
+    picture = {"header": bag.header(stamp, ""), "format": "", "data": nothing}
+    mesh = {"filename": "", "data": nothing}
+    return {
+        "texture_resource": "",
+        "texture": bag.make("sensor_msgs/msg/CompressedImage", **picture),
+        "uv_coordinates": [],
+        "mesh_file": bag.make("visualization_msgs/msg/MeshFile", **mesh),
+    }

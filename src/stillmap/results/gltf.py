@@ -1,0 +1,322 @@
+"""Meshes as files that other programs open: glTF in one file, and OBJ. y is up in both.
+
+trimesh writes them, with marks where the pages are to be, which are compressed here.
+
+Models as they lie in a result: binary glTF files that hold all that they need.
+"""
+
+import io
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from stillmap.core.errors import InputError, extra
+from stillmap.core.files import new_file, new_folder, require_regular
+from stillmap.mesh.options import TextureOptions
+from stillmap.mesh.texture.atlas import GREY, Textured
+from stillmap.mesh.triangle_mesh import Mesh
+
+Float = NDArray[np.float64]
+
+_LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071  # as glTF calls them
+
+_VERTICES, _INDICES = 34962, 34963
+
+_FAR = 1000.0  # m, from where on floats of 32 bits are coarse
+
+
+class Page(NamedTuple):
+    """A page, compressed."""
+
+    suffix: str
+    kind: str
+    data: bytes
+
+
+class Part(NamedTuple):
+    """The faces of one page, or the grey ones (page -1), with vertices of their own."""
+
+    page: int
+    vertices: Float
+    faces: NDArray[np.int64]
+    uv: Float
+
+
+def write_glb(path: Path, mesh: Textured | Mesh, options: TextureOptions | None = None) -> None:
+    """Writes binary glTF: one mesh per page, unlit, so that colours are seen as they were
+    photographed, and one of what is grey, lit, as without shades its form is not seen.
+
+    Where coordinates are large, nodes have a translation of whole metres.
+
+    Args:
+        path: the file, which appears complete or not at all.
+        mesh: with one face at least.
+        options: how pages are compressed.
+
+    Raises:
+        InputError: it cannot be written.
+        MissingExtra: trimesh is not installed.
+    """
+    trimesh = _trimesh(path)
+    pages = _compressed(mesh, options or TextureOptions())
+    parts = _parts(mesh)
+    shift = np.zeros(3)
+    if max(np.abs(part.vertices).max() for part in parts) > _FAR:
+        shift = np.rint(np.mean([part.vertices.mean(axis=0) for part in parts], axis=0))
+    move = np.eye(4)
+    move[:3, 3] = _y_up(shift)
+    scene = trimesh.Scene()
+    for part in parts:
+        name, visual = _name(part.page), trimesh.visual.TextureVisuals
+        material = _material(trimesh, part.page)
+        made = trimesh.Trimesh(
+            _y_up(part.vertices - shift),
+            part.faces,
+            visual=visual(uv=from_bottom(part.uv) if part.page >= 0 else None, material=material),
+            process=False,
+        )
+        scene.add_geometry(made, node_name=name, geom_name=name, transform=move)
+    images: list[dict[str, Any]] = []
+
+    def put_pages(buffers: Any, tree: dict[str, Any]) -> None:
+        keys = list(buffers)
+        images.extend(tree["images"])
+        for image, page in zip(images, pages, strict=True):
+            buffers[keys[image["bufferView"]]] = page.data + bytes(-len(page.data) % 4)
+            image["mimeType"] = page.kind
+
+    def finish(tree: dict[str, Any]) -> None:
+        for image, page in zip(images, pages, strict=True):
+            tree["bufferViews"][image["bufferView"]]["byteLength"] = len(page.data)
+        _finish(tree)
+
+    data = trimesh.exchange.gltf.export_glb(
+        scene,
+        include_normals=False,
+        buffer_postprocessor=put_pages,
+        tree_postprocessor=finish,
+    )
+    with new_file(path) as work:
+        work.write_bytes(data)
+
+
+def write_obj(folder: Path, mesh: Textured | Mesh, options: TextureOptions | None = None) -> None:
+    """Writes `mesh.obj`, `mesh.mtl` and `page0.jpg`, ... into a new folder; see `write_glb`.
+
+    Raises:
+        InputError: the folder holds something, or cannot be written.
+        MissingExtra: trimesh is not installed.
+    """
+    _trimesh(folder)  # it is the folder that cannot be written without
+    files = obj_files(mesh, options or TextureOptions())
+    with new_folder(folder, "mesh.obj") as work:
+        for name, data in files.items():
+            (work / name).write_bytes(data)
+
+
+def obj_files(
+    mesh: Textured | Mesh, options: TextureOptions, name: str = "mesh", before: str = ""
+) -> dict[str, bytes]:
+    """`NAME.obj`, `NAME.mtl` and the pages, by their names.
+
+    Args:
+        mesh: with one face at least.
+        options: how pages are compressed.
+        name: of the first two.
+        before: what the names of pages begin with.
+
+    Raises:
+        MissingExtra: trimesh is not installed.
+    """
+    trimesh = _trimesh(Path(f"{name}.obj"))
+    pages = _compressed(mesh, options)
+    simple = trimesh.visual.material.SimpleMaterial
+    scene = trimesh.Scene()
+    for part in _parts(mesh):  # the grey one is the last: trimesh counts on uv for all before
+        title = _name(part.page)
+        paint = 255 if part.page >= 0 else GREY[0]
+        material = simple(
+            image=_mark(part.page) if part.page >= 0 else None,
+            diffuse=[paint, paint, paint, 255],
+            specular=[0, 0, 0, 255],
+        )
+        material.name = title
+        uv = from_bottom(part.uv) if part.page >= 0 else None
+        visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+        made = trimesh.Trimesh(_y_up(part.vertices), part.faces, visual=visual, process=False)
+        scene.add_geometry(made, node_name=title, geom_name=title)
+    materials = f"{name}.mtl"
+    text, beside = trimesh.exchange.obj.export_obj(
+        scene, include_normals=False, return_texture=True, mtl_name=materials, header=None
+    )
+    told, named = beside[materials].decode("utf-8"), {}
+    for number, page in enumerate(pages):
+        file = f"{before}{_name(number)}{page.suffix}"
+        told = told.replace(f"map_Kd {_name(number)}.png\n", f"map_Kd {file}\n")
+        named[file] = page.data
+    return {f"{name}.obj": text.encode("utf-8"), materials: told.encode("utf-8"), **named}
+
+
+def _trimesh(path: Path) -> Any:
+    for name in ("trimesh.exchange.gltf", "trimesh.exchange.obj", "trimesh.visual.material"):
+        extra(name, path, "written", group="mesh")
+    return extra("trimesh", path, "written", group="mesh")
+
+
+def _parts(mesh: Textured | Mesh) -> list[Part]:
+    """By page, the grey one last."""
+    if not len(mesh):
+        raise ValueError("a mesh without faces")
+    uv_of_all = mesh.uv if isinstance(mesh, Textured) else np.zeros((len(mesh.vertices), 2))
+    of_face = mesh.page if isinstance(mesh, Textured) else np.full(len(mesh), -1, np.int32)
+    parts = []
+    for page in sorted(np.unique(of_face).tolist(), key=lambda number: (number < 0, number)):
+        used, faces = np.unique(mesh.faces[of_face == page], return_inverse=True)
+        parts.append(Part(page, mesh.vertices[used], faces.reshape(-1, 3), uv_of_all[used]))
+    return parts
+
+
+def _name(page: int) -> str:
+    return f"page{page}" if page >= 0 else "grey"
+
+
+def _y_up(points: Float) -> Float:
+    """(..., 3) z up as y up."""
+    return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
+
+
+def z_up(points: Float) -> Float:
+    """(..., 3) y up as z up."""
+    return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
+
+
+def from_bottom(uv: Float) -> Float:
+    """As trimesh and OBJ count rows."""
+    return np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])
+
+
+def _mark(page: int) -> Image.Image:
+    """A picture in the place of a page, like no other."""
+    return Image.new("RGB", (1, 1), (page & 255, page >> 8, 0))
+
+
+def _material(trimesh: Any, page: int) -> Any:
+    """Of a page, or grey; colours that are no pictures are linear in glTF."""
+    linear = ((GREY[0] / 255.0 + 0.055) / 1.055) ** 2.4
+    return trimesh.visual.material.PBRMaterial(
+        name=_name(page),
+        baseColorTexture=_mark(page) if page >= 0 else None,
+        baseColorFactor=None if page >= 0 else [linear, linear, linear, 1.0],
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+    )
+
+
+def _compressed(mesh: Textured | Mesh, options: TextureOptions) -> list[Page]:
+    return list(_each_compressed(mesh, options)) if isinstance(mesh, Textured) else []
+
+
+def _each_compressed(mesh: Textured, options: TextureOptions) -> Iterator[Page]:
+    for page in mesh.pages:
+        out = io.BytesIO()
+        if options.quality:
+            # colours at full resolution: charts have sharp edges
+            Image.fromarray(page).save(out, "JPEG", quality=options.quality, subsampling=0)
+            yield Page(".jpg", "image/jpeg", out.getvalue())
+        else:
+            Image.fromarray(page).save(out, "PNG")
+            yield Page(".png", "image/png", out.getvalue())
+
+
+def _finish(tree: dict[str, Any]) -> None:
+    """What trimesh does not say. Without normals, programs light faces as flat ones."""
+    tree["asset"]["generator"] = "stillmap"
+    if tree.get("textures"):
+        sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR}
+        tree["samplers"] = [{**sampler, "wrapS": _CLAMP_TO_EDGE, "wrapT": _CLAMP_TO_EDGE}]
+        for texture in tree["textures"]:
+            texture["sampler"] = 0
+    for material in tree["materials"]:
+        if "baseColorTexture" in material["pbrMetallicRoughness"]:
+            material["extensions"] = {"KHR_materials_unlit": {}}
+            tree["extensionsUsed"] = ["KHR_materials_unlit"]
+    for mesh in tree["meshes"]:
+        del mesh["extras"]
+        for primitive in mesh["primitives"]:
+            used = [(primitive["indices"], _INDICES)]
+            used += [(accessor, _VERTICES) for accessor in primitive["attributes"].values()]
+            for accessor, target in used:
+                view = tree["accessors"][accessor]["bufferView"]
+                tree["bufferViews"][view]["target"] = target
+
+
+# of the map frame, z up, where a model's y is up
+MAP_FROM_GLTF: NDArray[np.float64] = np.array(
+    [[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
+)
+
+_MAGIC, _JSON = b"glTF", b"JSON"
+
+_HEAD = struct.Struct("<4sII")  # magic, version, length of all
+
+_CHUNK = struct.Struct("<I4s")  # length, kind
+
+_MOST_JSON = 64 << 20
+
+# a browser would fetch what unpacks it from elsewhere
+_PACKED = "KHR_draco_mesh_compression"
+
+
+def require_whole(path: Path, most: int) -> bytes:
+    """A .glb file of at most so many bytes that needs nothing from anywhere else.
+
+    Raises:
+        InputError: it is missing, too large, damaged, or names other files.
+    """
+    require_regular(path)
+    if path.stat().st_size > most:
+        raise InputError(f"is larger than {most >> 20} MiB", where=str(path))
+    data = path.read_bytes()
+    try:
+        document = _document(data)
+    except (ValueError, RecursionError, struct.error) as error:
+        raise InputError(f"is no whole .glb file: {error}", where=str(path)) from error
+    for uri in _addresses(document):
+        if not (isinstance(uri, str) and uri.startswith("data:")):
+            raise InputError("names another file: it is not shown", where=str(path))
+    if _PACKED in document.get("extensionsUsed", []):
+        raise InputError(f"uses {_PACKED}: it is not shown", where=str(path))
+    return data
+
+
+def _document(data: bytes) -> dict[str, Any]:
+    magic, version, length = _HEAD.unpack_from(data)
+    size, kind = _CHUNK.unpack_from(data, _HEAD.size)
+    start = _HEAD.size + _CHUNK.size
+    if magic != _MAGIC or version != 2 or length != len(data):
+        raise ValueError("its header is that of something else")
+    if kind != _JSON or size > min(len(data) - start, _MOST_JSON):
+        raise ValueError("its first part is not what it is made of")
+    document = json.loads(data[start : start + size].decode("utf-8"))
+    if not isinstance(document, dict):
+        raise ValueError("what it is made of is no object")
+    return document
+
+
+def _addresses(document: object) -> Iterator[object]:
+    """Every `uri`, wherever it stands."""
+    rest = [document]
+    while rest:
+        one = rest.pop()
+        if isinstance(one, dict):
+            rest.extend(one.values())
+            if "uri" in one:
+                yield one["uri"]
+        elif isinstance(one, list):
+            rest.extend(one)

@@ -1,0 +1,110 @@
+"""`mesh.glb` and `objects/NNNN.glb`: the place without its people, and the people."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import write_npz
+from stillmap.mesh.options import TextureOptions
+from stillmap.mesh.texture.atlas import Textured
+from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.results.gltf import write_glb
+from stillmap.results.model_protocols import ModelsLike, PaintedLike, ViewLike
+
+_MICROMETRES = 6  # digits
+_SQUARE_CENTIMETRES = 4
+
+
+def write_models(folder: Path, models: ModelsLike, n_images: int, options: TextureOptions) -> None:
+    """Write models into a new result folder, and beside each what painted its faces.
+
+    Args:
+        folder: of the result; its `objects/` may be there already.
+        models: of the place and of what moved.
+        n_images: of the recording.
+        options: see TextureOptions.
+    """
+    if len(models.textured):
+        write_glb(folder / "mesh.glb", _seen(models.textured), options)
+        write_faces(folder / "mesh_faces.npz", models.painted, models.views, n_images, "map")
+    objects = folder / "objects"
+    if models.movers:
+        objects.mkdir(exist_ok=True)
+    for one in models.movers:
+        name = f"{one.shape.id:04d}"
+        write_glb(objects / f"{name}.glb", _seen(one.textured), options)
+        painted, views = one.dressed.painted, one.dressed.views
+        write_faces(objects / f"{name}_faces.npz", painted, views, n_images, "object")
+        record = {
+            "stamp_ns": one.stamp_ns,
+            "first_stamp_ns": one.span_ns[0],
+            "last_stamp_ns": one.span_ns[1],
+            "T_map_object": np.round(one.T_map_object, _MICROMETRES).tolist(),
+            "rigid": one.shape.rigid,
+        }
+        text = json.dumps(record, allow_nan=False)
+        (objects / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _seen(model: Textured) -> Textured | Mesh:
+    """What no picture shows is lit: its form is seen."""
+    return model if model.pages else Mesh(model.vertices, model.faces)
+
+
+def write_faces(
+    path: Path,
+    painted: PaintedLike,
+    views: Sequence[ViewLike],
+    n_images: int,
+    frame: str,
+) -> None:
+    """Write which picture paints each face.
+
+    `vertices` (V, 3) metres, `faces` (F, 3), `image` (F,) number of the picture or -1, `p_static`
+    (F,), and `T_camera_map` or `T_camera_object` (N, 4, 4) of all pictures, NaN where not used.
+    """
+    number = np.array([view.image for view in views] + [-1], np.int32)
+    poses = np.full((n_images, 4, 4), np.nan)
+    for view in views:
+        poses[view.image] = view.T_camera_map
+    write_npz(
+        path,
+        {
+            "vertices": painted.mesh.vertices,
+            "faces": painted.mesh.faces,
+            "image": number[painted.view],
+            "p_static": painted.p_static,
+            f"T_camera_{frame}": poses,
+        },
+    )
+
+
+def models_record(models: ModelsLike) -> dict[str, Any]:
+    """What `run.json` says of them."""
+    painted = models.painted
+    areas = painted.mesh.areas()
+
+    def area(of: NDArray[np.bool_]) -> float:
+        return round(float(areas[of].sum()), _SQUARE_CENTIMETRES)
+
+    points = {} if models.tints is None else {"points": dict(models.tints.counts)}
+    used = {view.image for k, view in enumerate(models.views) if (painted.view == k).any()}
+    return {
+        "faces": len(areas),
+        "area": area(np.ones(len(areas), np.bool_)),
+        "area_seen": area(painted.seen),
+        "area_painted": area(painted.view >= 0),
+        "pictures": {
+            "used": len(used),
+            "usable": len(models.views),
+            "left_out": dict(models.left_out),
+            "unread": [*models.unread, *models.textured.unread],
+        },
+        "pages": [list(page.shape[:2]) for page in models.textured.pages],
+        "objects": {"found": models.tried, "modelled": len(models.movers)},
+        **points,
+    }

@@ -1,0 +1,92 @@
+"""`objects/`: what moved, as JSON and as points; `traffic.npz`: where, and how fast."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import write_npz
+from stillmap.core.recording import Recording
+from stillmap.results.points import ply_header
+from stillmap.results.protocols import MovingObjectLike, ResultLike, TrafficLike
+
+_MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
+
+
+def write_objects(folder: Path, result: ResultLike) -> None:
+    """Write `objects.json` and `NNNN.ply` of each object into a new folder."""
+    write_objects_of(folder, result.objects, result.seen, result.poses, result.p_static)
+
+
+def write_objects_of(
+    folder: Path,
+    objects: Sequence[MovingObjectLike],
+    recording: Recording,
+    poses: NDArray[np.float64],
+    p_static: NDArray[np.float32],
+) -> None:
+    """The same of objects whose beams are of this recording, with poses and labels (M,)."""
+    folder.mkdir()
+    with (folder / "objects.json").open("w", encoding="utf-8", newline="\n") as file:
+        file.write("[")
+        for number, one in enumerate(objects):  # one object a line
+            file.write(",\n" if number else "\n")
+            file.write(json.dumps(object_record(one), allow_nan=False))
+        file.write("\n]\n" if objects else "]\n")
+    for one in objects:
+        ends = recording.end_points(one.beams, poses)
+        stamps = recording.stamp_ns[recording.scans_of(one.beams)]
+        seconds = 1e-9 * (stamps - one.stamp_ns[0])
+        write_ply(folder / f"{one.id:04d}.ply", ends, seconds, 1.0 - p_static[one.beams])
+        recording.let_go(p_static, one.beams)
+
+
+def object_record(one: MovingObjectLike) -> dict[str, Any]:
+    """One entry of `objects.json`: metres, metres per second, nanoseconds."""
+    columns = dict(zip("xy", one.xy.T, strict=True))
+    if one.z is not None:
+        columns["z"] = one.z
+    columns |= zip(("vx", "vy"), one.velocity.T, strict=True)
+    return {
+        "id": one.id,
+        "first_stamp_ns": int(one.stamp_ns[0]),
+        "last_stamp_ns": int(one.stamp_ns[-1]),
+        "size": [round(metres, _MILLIMETRES) for metres in one.size],
+        "beams": len(one.beams),
+        "p_dynamic": round(one.p_dynamic, 6),
+        "track": {
+            "stamp_ns": one.stamp_ns.tolist(),
+            **{name: np.round(values, _MILLIMETRES).tolist() for name, values in columns.items()},
+        },
+    }
+
+
+def write_ply(
+    path: Path,
+    ends: NDArray[np.float64],
+    seconds: NDArray[np.float64],
+    p_dynamic: NDArray[np.float32],
+) -> None:
+    """Points (n, D) of an object, when each was seen, and how probably it is dynamic; 2D: z = 0."""
+    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("seconds", "<f4"), ("p_dynamic", "<f4")]
+    vertices = np.zeros(len(ends), fields)
+    for name, column in zip("xyz", ends.T, strict=False):
+        vertices[name] = column
+    vertices["seconds"], vertices["p_dynamic"] = seconds, p_dynamic
+    path.write_bytes(ply_header(fields, len(ends)) + vertices.tobytes())
+
+
+def write_traffic(path: Path, traffic: TrafficLike) -> None:
+    """Write `crossings`, `speed` (H, W), `origin` (x, y, yaw) and `resolution` in metres."""
+    write_npz(
+        path,
+        {
+            "crossings": np.asarray(traffic.crossings, np.int32),
+            "speed": np.asarray(traffic.speed, np.float32),
+            "origin": np.asarray(traffic.origin, np.float64),
+            "resolution": np.asarray(traffic.resolution, np.float64),
+        },
+    )

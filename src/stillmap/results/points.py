@@ -1,0 +1,124 @@
+"""`static.ply` and `dynamic.ply`: where the beams of a 3D recording ended, in the map frame.
+
+`beams/`: the label of every beam, as flat arrays that can be memory-mapped.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import blocks, write_npy
+from stillmap.core.recording import Recording
+from stillmap.em.observations import chunks
+from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
+from stillmap.results.protocols import ResultLike
+
+FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("p_static", "<f4")]
+
+COLOURS = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+
+_TYPES = {"<f4": "float", "u1": "uchar"}
+
+
+def write_clouds(
+    folder: Path,
+    seen: Recording,
+    poses: NDArray[np.float64],
+    p_static: NDArray[np.float32],
+    colours: NDArray[np.uint8] | None = None,
+) -> None:
+    """Write every hit to one of the two files; memory is that of a few scans.
+
+    Args:
+        folder: where to.
+        seen: 3D, M beams without the motion during its scans.
+        poses: (T, 4, 4) T_map_base.
+        p_static: (M,) P(c = 1); below one half it is dynamic.
+        colours: (M, 3), None: without.
+    """
+    hits = dynamic = 0
+    for block in blocks(seen.hit, p_static):
+        hit = seen.hit[block]
+        hits += int(np.count_nonzero(hit))
+        dynamic += int(np.count_nonzero(hit & (p_static[block] < DYNAMIC_BELOW)))
+    counts = {"static": hits - dynamic, "dynamic": dynamic}
+    files = {name: (folder / f"{name}.ply").open("wb") for name in counts}
+    try:
+        for name, file in files.items():
+            fields = FIELDS if colours is None else FIELDS + COLOURS
+            file.write(ply_header(fields, counts[name]))
+        for vertices in _vertices(seen, poses, p_static, colours):
+            moves = vertices["p_static"] < DYNAMIC_BELOW
+            files["static"].write(vertices[~moves].tobytes())
+            files["dynamic"].write(vertices[moves].tobytes())
+    finally:
+        for file in files.values():
+            file.close()
+
+
+def ply_header(fields: list[tuple[str, str]], count: int) -> bytes:
+    """Of a little-endian PLY whose vertices have these fields, float32 or uint8."""
+    properties = "".join(f"property {_TYPES[kind]} {name}\n" for name, kind in fields)
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
+    return (head + "end_header\n").encode("ascii")
+
+
+def put_colours(vertices: NDArray[np.void], colours: NDArray[np.uint8]) -> None:
+    """Sets `red`, `green` and `blue` of vertices (n,) to colours (n, 3)."""
+    for (name, _), column in zip(COLOURS, colours.T, strict=True):
+        vertices[name] = column
+
+
+def _vertices(
+    seen: Recording,
+    poses: NDArray[np.float64],
+    p_static: NDArray[np.float32],
+    colours: NDArray[np.uint8] | None,
+) -> Iterator[NDArray[np.void]]:
+    T_map_sensor = seen.T_map_sensor(poses)
+    fields = FIELDS if colours is None else FIELDS + COLOURS
+    beside: list[NDArray[Any]] = [p_static] if colours is None else [p_static, colours]
+    for scans, beams, offset in chunks(seen, beside=beside):
+        for t, first, last in zip(
+            range(scans.start, scans.stop), offset[:-1], offset[1:], strict=True
+        ):
+            at = slice(beams.start + int(first), beams.start + int(last))
+            hit = seen.hit[at]
+            T = T_map_sensor[t]
+            ends = seen.points[at][hit].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+            vertices = np.empty(len(ends), fields)
+            vertices["x"], vertices["y"], vertices["z"] = ends.T
+            vertices["p_static"] = p_static[at][hit]
+            if colours is not None:
+                put_colours(vertices, colours[at][hit])
+            yield vertices
+
+
+def write_beams(folder: Path, result: ResultLike, colours: NDArray[np.uint8] | None = None) -> None:
+    """Write `stamp_ns` (T,), `offset` (T+1,), `p_static` (M,) and `hit` (M,) as .npy into `folder`.
+
+    `folder` is made. Scan t owns the beams offset[t]:offset[t+1], in the recording's order. Where
+    there are colours of the beams' ends, they are written as `colour` (M, 3).
+    """
+    write_beams_of(folder, result.recording, result.p_static, colours)
+
+
+def write_beams_of(
+    folder: Path,
+    recording: Recording,
+    p_static: NDArray[np.float32],
+    colours: NDArray[np.uint8] | None = None,
+) -> None:
+    """The same of a recording with M beams and their labels (M,)."""
+    if p_static.shape != (recording.n_beams,):
+        raise ValueError(f"p_static: expected ({recording.n_beams},), got {p_static.shape}")
+    folder.mkdir()
+    write_npy(folder / "stamp_ns.npy", np.asarray(recording.stamp_ns, np.int64))
+    write_npy(folder / "offset.npy", np.asarray(recording.offset, np.int64))
+    write_npy(folder / "p_static.npy", np.asarray(p_static, np.float32))
+    write_npy(folder / "hit.npy", np.asarray(recording.hit, np.bool_))
+    if colours is not None:
+        write_npy(folder / "colour.npy", colours)

@@ -1,0 +1,230 @@
+"""A result folder read again, beside the recording that it was made from."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.errors import InputError
+from stillmap.core.files import require_regular
+from stillmap.core.recording import Recording
+from stillmap.io.trajectory import poses_from_tum
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """An occupancy map as stored in `map.npz`.
+
+    Attributes:
+        p_occupied: (H, W) probabilities, NaN where unknown, row 0 = lowest y.
+        origin: x, y, yaw of the lower-left corner of the lower-left cell in the map frame.
+        resolution: metres.
+    """
+
+    p_occupied: NDArray[np.floating]
+    origin: tuple[float, float, float]
+    resolution: float
+
+    @property
+    def occupied(self) -> NDArray[np.bool_]:
+        return self.p_occupied > OCCUPIED
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        return self.p_occupied < FREE
+
+    def cells(self, points: Float) -> NDArray[np.int64]:
+        """(N, 2) row and column of the cells that hold (N, 2) points; may lie outside the map."""
+        T_grid_map = se2.inverse(se2.matrix(*self.origin))
+        return np.floor(moved(T_grid_map, points) / self.resolution).astype(np.int64)[:, ::-1]
+
+    def centres(self, cells: NDArray[np.integer]) -> Float:
+        """(N, 2) centres in the map frame of (N, 2) cells, row and column."""
+        return moved(se2.matrix(*self.origin), (cells[:, ::-1] + np.float64(0.5)) * self.resolution)
+
+
+MODEL = "mesh.glb"
+
+_MAX_MAP = 1 << 29  # bytes of a map when it is unpacked: a thousand times what they take packed
+
+
+def require_there(*paths: Path) -> None:
+    """Refuse folders that are not there.
+
+    Raises:
+        InputError: names the first of them.
+    """
+    for path in paths:
+        if not path.is_dir():
+            what = "is no folder" if path.exists() else "does not exist"
+            raise InputError(what, where=str(path))
+
+
+def require_model(result: Path) -> Path:
+    """The model of the place in a result.
+
+    Raises:
+        InputError: there is none.
+    """
+    path = result / MODEL
+    if not path.is_file():
+        hint = "`stillmap map` makes them of 3D recordings, with pip install 'stillmap[mesh]'"
+        raise InputError("holds no model", where=str(result), hint=hint)
+    return path
+
+
+def read_grid(result: Path) -> Grid:
+    """`map.npz` of a result folder.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    path = result / "map.npz"
+    require_regular(path)
+    try:
+        # opened here: given a path, np.load leaves a damaged archive open
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            size = archive.zip.getinfo("p_occupied.npy").file_size
+            if size > _MAX_MAP:
+                raise InputError(f"is too large: {size >> 20} MiB when unpacked", where=str(path))
+            p_occupied = np.asarray(archive["p_occupied"])
+            x, y, yaw = (float(value) for value in archive["origin"])
+            resolution = float(archive["resolution"])
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(read_failure(error), where=str(path)) from error
+    except Exception as error:  # whatever NumPy, zip and zlib make of damaged bytes
+        raise InputError(f"is damaged: {error}", where=str(path)) from error
+    if p_occupied.ndim != 2 or p_occupied.dtype.kind != "f":
+        raise InputError(
+            f"p_occupied is {shape_text(p_occupied.shape)} {p_occupied.dtype}",
+            where=str(path),
+            hint="scores are for maps in the plane",
+        )
+    if not (np.isfinite((x, y, yaw)).all() and 0 < resolution < np.inf):
+        raise InputError("origin or resolution is no usable number", where=str(path))
+    return Grid(p_occupied, (x, y, yaw), resolution)
+
+
+# map_server's thresholds, so that the scores speak of the map as others load it
+OCCUPIED = 0.65
+
+FREE = 0.196
+
+
+def moved(T: Float, points: Float) -> Float:
+    return np.asarray(points @ T[:2, :2].T + T[:2, 2])
+
+
+_NUMBERS = ("x", "y", "vx", "vy")
+
+_MAX_OBJECTS = 256 << 20  # bytes of an objects.json
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Something that moved.
+
+    Attributes:
+        id: its number.
+        size: metres along and across its way; in space how high it is, too.
+        stamp_ns: (K,) when it was seen, rising.
+        xy: (K, 2) metres in the map frame.
+        velocity: (K, 2) metres per second.
+        z: (K,) metres, how high its middle is; None in the plane.
+    """
+
+    id: int
+    size: tuple[float, ...]
+    stamp_ns: NDArray[np.int64]
+    xy: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    z: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """What others are told of a result in the plane.
+
+    Attributes:
+        recording: T scans with M beams.
+        poses: (T, 3, 3) T_map_base.
+        p_static: (M,) float32, NaN for unusable beams.
+        map: what stands still.
+        tracks: what moved.
+    """
+
+    recording: Recording
+    poses: NDArray[np.float64]
+    p_static: NDArray[np.float32]
+    map: Grid
+    tracks: list[Track]
+
+
+def read(folder: Path, recording: Recording, p_static: NDArray[np.float32]) -> Exported:
+    """The result in `folder` of a recording, with its labels.
+
+    Raises:
+        InputError: a file is missing or damaged, or the recording is 3D.
+    """
+    if recording.dimension != 2:
+        what = "is of a 3D recording: its points can be written, as a cloud"
+        hint = ".las, .laz, .e57, .pcd, .ply or .xyz; .obj writes its model, if there is one"
+        raise InputError(what, where=str(folder), hint=hint)
+    return Exported(
+        recording,
+        poses_from_tum(folder / "trajectory.tum", recording),
+        p_static,
+        read_grid(folder),
+        read_tracks(folder / "objects" / "objects.json"),
+    )
+
+
+def read_tracks(path: Path) -> list[Track]:
+    """What moved, from `objects.json`; nothing where there is no such file.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    try:
+        require_regular(path)
+        if path.stat().st_size > _MAX_OBJECTS:
+            raise InputError("is no list of objects: too large", where=str(path))
+        return [_track(one) for one in json.loads(path.read_text(encoding="utf-8"))]
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
+        raise InputError(f"is damaged: {error!r}", where=str(path)) from error
+
+
+def _track(one: dict[str, Any]) -> Track:
+    track = one["track"]
+    stamp_ns = np.array(track["stamp_ns"], np.int64)
+    x, y, vx, vy = (np.array(track[name], np.float64) for name in _NUMBERS)
+    numbers = np.stack([x, y, vx, vy], axis=-1)
+    z = np.array(track["z"], np.float64) if "z" in track else None
+    size = tuple(float(metres) for metres in one["size"])
+    if len(size) != (2 if z is None else 3):
+        raise ValueError(f"a size of {len(size)} lengths")
+    if len(numbers) != len(stamp_ns) or not len(stamp_ns) or (z is not None and z.shape != x.shape):
+        raise ValueError("columns of unequal length")
+    if not np.isfinite([*numbers.ravel(), *size, *([] if z is None else z)]).all():
+        raise ValueError("a number is not finite")
+    return Track(int(one["id"]), size, stamp_ns, numbers[:, :2], numbers[:, 2:], z)
+
+
+def shape_text(shape: tuple[int | None, ...]) -> str:
+    return f"({', '.join('any' if n is None else str(n) for n in shape)})"
+
+
+def read_failure(error: OSError) -> str:
+    return f"cannot be read: {error.strerror or error}"

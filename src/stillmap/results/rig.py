@@ -1,0 +1,48 @@
+"""What a second laser built in 3D, beside the result of the flat one that told it what moves."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.json import skipped_count
+from stillmap.io.trajectory import write_tum
+from stillmap.mapping.beam_statistics import beam_counts
+from stillmap.results.objects import write_objects_of
+from stillmap.results.points import write_beams_of, write_clouds
+from stillmap.results.protocols import TiltingLike
+
+FOLDER = "tilting"
+
+
+def write_tilting(
+    folder: Path, tilting: TiltingLike, colours: NDArray[np.uint8] | None = None
+) -> None:
+    """Write `static.ply`, `dynamic.ply` and `tilting/`: labels, poses and what moved, in 3D; with
+    the colours (M, 3) of its beams' ends."""
+    seen, poses, p_static = tilting.seen, tilting.poses, tilting.p_static
+    write_clouds(folder, seen, poses, p_static, colours)
+    inside = folder / FOLDER
+    inside.mkdir()
+    write_beams_of(inside / "beams", tilting.recording, p_static, colours)
+    write_tum(inside / "trajectory.tum", tilting.recording.stamp_ns, poses)
+    write_objects_of(inside / "objects", tilting.objects, seen, poses, p_static)
+
+
+def tilting_record(tilting: TiltingLike) -> dict[str, Any]:
+    """What `run.json` says of it, JSON-able but for arrays."""
+    counts = beam_counts(tilting.seen, tilting.p_static)
+    return {
+        "input": tilting.recording.source,
+        "counts": {
+            "scans": tilting.recording.n_scans,
+            **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
+            "left_out": tilting.left_out,
+            "skipped": skipped_count(tilting.recording.source),
+        },
+        "dynamic": counts["dynamic"],
+        "boxes": tilting.boxes,
+        "objects": len(tilting.objects),
+        "learned": tilting.learned,
+    }

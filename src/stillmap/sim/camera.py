@@ -1,0 +1,276 @@
+"""Cameras: where they sit, where each pixel looks, and when pictures are taken.
+
+Pictures of a simulated world: rendered when they are read, each the same however often.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.camera import Camera, Images
+from stillmap.core.errors import InputError
+from stillmap.sim import appearance, lidar, renderer
+from stillmap.sim.appearance import Spot
+from stillmap.sim.episode import Happening
+from stillmap.sim.geometry import Solids
+from stillmap.sim.options import CameraOptions
+from stillmap.sim.recorder import World
+from stillmap.sim.renderer import NOTHING, Lens, Shown
+from stillmap.sim.truth_surfaces import to_local
+
+Float = NDArray[np.float64]
+
+Colour = NDArray[np.uint8]
+
+_LATER = 0.31  # of the time between two scans: no picture is taken at a scan's stamp
+
+_STEPS = 50  # that undo a lens
+
+_EXACT = 1e-10  # of the focal length
+
+# x right, y down, z ahead in the camera, of x ahead, y left, z up
+_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+class Shots(NamedTuple):
+    """N pictures, in the order of their stamps.
+
+    Attributes:
+        stamp_ns: (N,) int64, by the clock of the scans.
+        camera: (N,) int32.
+        scan: (N,) the last scan before.
+        seconds: (N,) after it.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    camera: NDArray[np.int32]
+    scan: NDArray[np.int64]
+    seconds: Float
+
+    @classmethod
+    def of(cls, happening: Happening, o: CameraOptions) -> "Shots":
+        """Pictures at an even rate while the robot scans."""
+        motion, T = happening.motion, len(happening.motion.robot)
+        step = 1.0 / (o.rate * motion.period)  # in scans
+        at = np.arange(_LATER, max(T - 1, _LATER), step)
+        scan = at.astype(np.int64)
+        seconds = (at - scan) * motion.period
+        # rounded as the recorder rounds them, stamps of scans could lie on either side
+        since = np.round(seconds * 1e9).astype(np.int64)
+        if happening.scene.robot.stamps_missing:
+            since = np.round((at - scan) * 1e9).astype(np.int64)
+        stamp_ns = happening.exact_ns[scan] + since
+        which = np.tile(np.arange(o.count, dtype=np.int32), len(at))
+        scan, seconds = np.repeat(scan, o.count), np.repeat(seconds, o.count)
+        return cls(np.repeat(stamp_ns, o.count), which, scan, seconds)
+
+
+def place_cameras(o: CameraOptions) -> tuple[Camera, ...]:
+    """The cameras; the centre of the first pixel is at (0, 0)."""
+    f = 0.5 * o.width / math.tan(0.5 * o.fov)
+    K = np.array([[f, 0.0, 0.5 * (o.width - 1)], [0.0, f, 0.5 * (o.height - 1)], [0.0, 0.0, 1.0]])
+    model = "plumb_bob" if o.distortion else ""
+    out = []
+    for k in range(o.count):
+        turn = 2 * math.pi * k / o.count
+        sits = np.array([o.x, o.y, o.z])
+        T = lidar.matrix(np.zeros(3), *np.array([0.0, 0.0, turn])) @ lidar.matrix(
+            sits, *np.array([0.0, o.pitch, o.yaw])
+        )
+        T[:3, :3] = T[:3, :3] @ _AHEAD
+        name = f"simulated camera {k}" if o.count > 1 else "simulated camera"
+        distortion = np.array(o.distortion, np.float64)
+        out.append(Camera(name, o.width, o.height, K, model, distortion, T))
+    return tuple(out)
+
+
+def looking(camera: Camera, right: float = 0.0, down: float = 0.0) -> Float:
+    """(3, height, width) of length one: where each pixel looks, in the camera's frame.
+
+    Args:
+        camera: ideal, or of the model `plumb_bob`.
+        right, down: pixels beside their centres.
+    """
+    assert camera.K is not None
+    u, v = np.arange(camera.width) + right, np.arange(camera.height) + down
+    bent = np.stack(
+        np.broadcast_arrays(
+            (u[None] - camera.K[0, 2]) / camera.K[0, 0],
+            (v[:, None] - camera.K[1, 2]) / camera.K[1, 1],
+        )
+    )
+    xy = straightened(bent, camera.distortion) if len(camera.distortion) else bent
+    rays = np.concatenate([xy, np.ones((1, *xy.shape[1:]))])
+    return np.asarray(rays / np.linalg.norm(rays, axis=0))
+
+
+def bent(xy: Float, distortion: Float) -> Float:
+    """(2, ...) where a lens k1, k2, p1, p2, k3 shows what an ideal one shows at (2, ...).
+
+    Both in units of the focal length: Brown, "Decentering distortion of lenses", 1966, as OpenCV
+    writes it. Not the code that maps with pictures (`texture/lens.py`): each checks the other.
+    """
+    k1, k2, p1, p2, k3 = distortion
+    x, y = xy
+    rr = x * x + y * y
+    radial = 1.0 + rr * (k1 + rr * (k2 + rr * k3))
+    return np.stack(
+        [
+            x * radial + 2.0 * p1 * x * y + p2 * (rr + 2.0 * x * x),
+            y * radial + p1 * (rr + 2.0 * y * y) + 2.0 * p2 * x * y,
+        ]
+    )
+
+
+def straightened(shown: Float, distortion: Float) -> Float:
+    """The inverse of `bent`, by Newton's method.
+
+    Raises:
+        InputError: the lens shows nothing there, or several things.
+    """
+    k1, k2, p1, p2, k3 = distortion
+    xy = shown.copy()
+    for _ in range(_STEPS):
+        x, y = xy
+        rr = x * x + y * y
+        radial, slope = 1.0 + rr * (k1 + rr * (k2 + rr * k3)), k1 + rr * (2 * k2 + rr * 3 * k3)
+        xx = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+        yy = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+        across = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+        left, size = shown - bent(xy, distortion), xx * yy - across * across
+        if np.abs(left).max() < _EXACT:
+            break
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            xy = (
+                xy
+                + np.stack([yy * left[0] - across * left[1], xx * left[1] - across * left[0]])
+                / size
+            )
+    if not (np.abs(left).max() < _EXACT and (size > 0).all() and (xx > 0).all()):
+        hint = "a smaller camera.fov, or a larger camera.k2"
+        raise InputError("the camera's lens does not reach the corners of its pictures", hint=hint)
+    return xy
+
+
+SKY = 65535  # in masks: nothing there
+
+MOST_MOVERS = SKY - 1
+
+
+class Photograph(NamedTuple):
+    """One picture and its truth.
+
+    Attributes:
+        colour: (h, w, 3) uint8.
+        mask: (h, w) uint16, 0: something that stands still, k + 1: mover k, `SKY`: nothing.
+        distance: (h, w) float32 metres along the pixel's ray; inf where nothing is.
+    """
+
+    colour: Colour
+    mask: NDArray[np.uint16]
+    distance: NDArray[np.float32]
+
+
+class Photographs:
+    """All pictures that the cameras of a world take.
+
+    Attributes:
+        images: as a recording has them.
+        T_world_camera: (N, 4, 4) from where each was taken.
+        colour_seed: of what they look like.
+    """
+
+    def __init__(self, world: World) -> None:
+        happening, o = world.happening, world.happening.scene.camera
+        if happening.colour_seed is None:
+            raise ValueError("the scene has no camera")
+        self._world, self._options, self.colour_seed = world, o, happening.colour_seed
+        self._shots = Shots.of(happening, o)
+        cameras = place_cameras(o)
+        # all alike
+        self._lenses = [_lens(cameras[0], *offset) for offset in _within_a_pixel(o.antialias)]
+        T_base_camera = np.stack([c.T_base_camera for c in cameras if c.T_base_camera is not None])
+        moment = world.moment(self._shots.scan, self._shots.seconds)
+        self.T_world_camera = world.T_world_base(moment) @ T_base_camera[self._shots.camera]
+        self.images = Images(self._shots.stamp_ns, self._shots.camera, cameras, self._colours)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def take(self, image: int) -> Photograph:
+        """One picture with its truth.
+
+        With several rays for each pixel, one that a mover touches is his, and the nearest of its
+        distances counts.
+        """
+        moving = self._moving(image)
+        parts = [self._rendered(lens, self.T_world_camera[image], moving) for lens in self._lenses]
+        mask, distance = parts[0].mask, parts[0].distance
+        total = parts[0].colour.astype(np.float64)
+        for one in parts[1:]:
+            theirs = (mask == 0) | ((mask == SKY) & (one.mask != 0))
+            mask = np.where(theirs & (one.mask != SKY), one.mask, mask)
+            distance = np.minimum(distance, one.distance)
+            total += one.colour
+        return Photograph(self._developed(total / len(parts), image), mask, distance)
+
+    def _colours(self, image: int) -> Colour:
+        return self.take(image).colour
+
+    def _moving(self, image: int) -> Solids:
+        scan = int(self._shots.scan[image])
+        moment = self._world.moment(np.array([scan]), self._shots.seconds[image : image + 1])
+        return self._world.carried.at(moment, scan)
+
+    def _rendered(self, lens: Lens, T_world_camera: Float, moving: Solids) -> Photograph:
+        world, R = self._world, T_world_camera[:3, :3]
+        ceiling = world.happening.scene.heights.ceiling
+        seen = renderer.shown(
+            lens, T_world_camera, world.faces, world.still, moving, world.ground, ceiling
+        )
+        direction = np.einsum("ij,jhw->hwi", R, lens.direction)
+        colour = np.empty((*seen.part.shape, 3), np.uint8)
+        sky, static = seen.part == NOTHING, seen.part == renderer.STATIC
+        colour[sky] = appearance.sky_colour(direction[sky])
+        range = seen.range[static]
+        places = T_world_camera[:3, 3] + range[:, None] * direction[static]
+        colour[static] = appearance.static_colour(places, self.colour_seed, range / lens.K[0, 0])
+        self._paint_movers(colour, seen, T_world_camera[:3, 3], direction, moving)
+        mask = np.zeros(seen.part.shape, np.uint16)
+        mask[sky] = SKY
+        moves = seen.part >= 0
+        mask[moves] = moving.mover[seen.part[moves]] + 1
+        return Photograph(colour, mask, seen.range.astype(np.float32))
+
+    def _paint_movers(
+        self, colour: Colour, seen: Shown, at: Float, direction: Float, moving: Solids
+    ) -> None:
+        kinds = self._world.happening.motion.kinds
+        for k in np.unique(seen.part[seen.part >= 0]).tolist():
+            pixels, mover = seen.part == k, int(moving.mover[k])
+            p = at + seen.range[pixels][:, None] * direction[pixels]
+            part = (int(moving.form[k]), moving.half[k], moving.z[k])
+            spot = Spot(mover, *part, to_local(p, moving.pose[0, k]), self.colour_seed)
+            colour[pixels] = appearance.mover_colour(kinds[mover], spot)
+
+    def _developed(self, colour: Float, image: int) -> Colour:
+        """With the exposure and the noise of this picture."""
+        rng = np.random.default_rng((self.colour_seed, image))
+        o = self._options
+        gain = np.exp(o.exposure * rng.standard_normal())
+        noise = o.noise * rng.standard_normal(colour.shape, dtype=np.float32)
+        out: Colour = np.clip(np.rint(gain * colour + noise), 0, 255).astype(np.uint8)
+        return out
+
+
+def _lens(one: Camera, right: float, down: float) -> Lens:
+    assert one.K is not None
+    return Lens.of(looking(one, right, down), one.K)
+
+
+def _within_a_pixel(n: int) -> list[tuple[float, float]]:
+    """Pixels beside its centre, of n x n rays."""
+    steps = ((np.arange(n) + 0.5) / n - 0.5).tolist()
+    return [(right, down) for down in steps for right in steps]

@@ -1,0 +1,285 @@
+"""What a lidar can hit: upright faces that stand still, and solids that stand still or move.
+
+The ground: a paraboloid with pavements above it, and the ceiling, which follows it.
+
+The parts of cars, people, trees and the like, about their middles; metres.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.sim.options import GroundOptions, HeightOptions
+
+Float = NDArray[np.float64]
+
+BOX, CYLINDER, ELLIPSOID = 0, 1, 2
+
+
+class Faces(NamedTuple):
+    """F upright faces.
+
+    Attributes:
+        ends: (F, 4) x0, y0, x1, y1 in metres.
+        z: (F, 2) metres above the street, their lower and upper edges, which follow its slope.
+        is_glass: (F,) bool.
+    """
+
+    ends: Float
+    z: Float
+    is_glass: NDArray[np.bool_]
+
+
+class Solids(NamedTuple):
+    """P upright boxes, elliptic cylinders and ellipsoids, at n times or at all times (n = 1).
+
+    Attributes:
+        pose: (n, P, 4) x, y of the middle in metres, heading in rad, height of the foot in metres.
+        form: (P,) BOX, CYLINDER or ELLIPSOID.
+        half: (P, 2) metres, half of what they measure along and across the heading.
+        z: (P, 2) metres above the foot, from where to where they reach.
+        mover: (P,) int32 whose part it is; -1: it stands still.
+    """
+
+    pose: Float
+    form: NDArray[np.int8]
+    half: Float
+    z: Float
+    mover: NDArray[np.int32]
+
+    def some(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> "Solids":
+        """Those that are kept."""
+        return Solids(
+            self.pose[:, kept], self.form[kept], self.half[kept], self.z[kept], self.mover[kept]
+        )
+
+    def with_others(self, others: "Solids") -> "Solids":
+        """These, and then others at the same times."""
+        return Solids(
+            np.concatenate([self.pose, others.pose], axis=1),
+            np.concatenate([self.form, others.form]),
+            np.concatenate([self.half, others.half]),
+            np.concatenate([self.z, others.z]),
+            np.concatenate([self.mover, others.mover]),
+        )
+
+
+class Part(NamedTuple):
+    """A solid as a part of something: where it sits on it, ahead and to the left, in metres.
+
+    `half` and `z` as in Solids; `turn` in rad against the heading of the whole.
+    """
+
+    form: int
+    ahead: float
+    aside: float
+    half: tuple[float, float]
+    z: tuple[float, float]
+    turn: float = 0.0
+
+
+class Assembly(NamedTuple):
+    """Parts of things, each of which is carried by one of K carriers.
+
+    Attributes:
+        carrier: (P,) which one carries it.
+        offset: (P, 3) metres ahead and to the left of the carrier's middle, rad to the left.
+        form, half, z: see Solids.
+        mover: see Solids.
+    """
+
+    carrier: NDArray[np.int64]
+    offset: Float
+    form: NDArray[np.int8]
+    half: Float
+    z: Float
+    mover: NDArray[np.int32]
+
+    def at(self, poses: Float, foot: Float) -> Solids:
+        """Where all parts are.
+
+        Args:
+            poses: (n, K, 3) of the carriers: x, y in metres, heading in rad.
+            foot: (n, K) how high the floor is on which they stand, metres.
+        """
+        x, y, heading = np.moveaxis(poses, -1, 0)
+        c, s = np.cos(heading)[:, self.carrier], np.sin(heading)[:, self.carrier]
+        ahead, aside, turn = self.offset.T
+        at = np.empty((*c.shape, 4))
+        at[..., 0] = x[:, self.carrier] + c * ahead - s * aside
+        at[..., 1] = y[:, self.carrier] + s * ahead + c * aside
+        at[..., 2], at[..., 3] = heading[:, self.carrier] + turn, foot[:, self.carrier]
+        return Solids(at, self.form, self.half, self.z, self.mover)
+
+
+def assembled(parts: Sequence[tuple[int, int, Part]]) -> Assembly:
+    """The parts of things: number of the carrier, number of the mover, and the part itself."""
+    return Assembly(
+        np.array([carrier for carrier, _, _ in parts], np.int64),
+        np.array([(p.ahead, p.aside, p.turn) for _, _, p in parts], float).reshape(-1, 3),
+        np.array([p.form for _, _, p in parts], np.int8),
+        np.array([p.half for _, _, p in parts], float).reshape(-1, 2),
+        np.array([p.z for _, _, p in parts], float).reshape(-1, 2),
+        np.array([mover for _, mover, _ in parts], np.int32),
+    )
+
+
+class Ground(NamedTuple):
+    """z = slope . (x, y) + bend . (x^2, y^2) / 2, and `kerb` more on the pavements.
+
+    Attributes:
+        slope: (2,) metres per metre.
+        bend: (2,) per metre.
+        pavements: (R, 4) rectangles, their least and their greatest x and y: x0, y0, x1, y1.
+        kerb: metres.
+    """
+
+    slope: Float
+    bend: Float
+    pavements: Float
+    kerb: float
+
+    @classmethod
+    def of(cls, options: GroundOptions, pavements: Float) -> "Ground":
+        """The ground that the options describe."""
+        slope, bend = (options.slope_x, options.slope_y), (options.bend_x, options.bend_y)
+        return cls(np.array(slope), np.array(bend), pavements, options.kerb)
+
+    def level(self, x: Float, y: Float) -> Float:
+        """(...) metres, how high the street is at points (...), or would be under pavements."""
+        (sx, sy), (bx, by) = self.slope, self.bend
+        return np.asarray(x * (sx + bx / 2 * x) + y * (sy + by / 2 * y))
+
+    def height(self, x: Float, y: Float) -> Float:
+        """(...) metres, what one stands on at points (...)."""
+        return np.asarray(self.level(x, y) + self.kerb * self.is_paved(x, y))
+
+    def is_paved(self, x: Float, y: Float) -> NDArray[np.bool_]:
+        """(...) whether points (...) lie on a pavement."""
+        inside = np.zeros(np.shape(x), bool)
+        for x0, y0, x1, y1 in self.pavements:
+            inside |= (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)
+        return inside
+
+    def gradient(self, x: Float, y: Float) -> tuple[Float, Float]:
+        """How steeply it rises to the east and to the north at points (...), metres per metre."""
+        (sx, sy), (bx, by) = self.slope, self.bend
+        return np.asarray(sx + bx * x), np.asarray(sy + by * y)
+
+    def distance(self, origin: Float, direction: Float, above: float = 0.0) -> Float:
+        """(...) metres along rays to the level that lies `above` that of the street; inf: never.
+
+        Args:
+            origin: (3, ...) metres.
+            direction: (3, ...) of length one.
+            above: metres; the level is met from above and from below alike.
+        """
+        (x, y, z), (dx, dy, dz) = origin, direction
+        gx, gy = self.gradient(x, y)
+        a = -(self.bend[0] * dx * dx + self.bend[1] * dy * dy) / 2
+        b = dz - gx * dx - gy * dy
+        c = z - self.level(x, y) - above
+        # a t^2 + b t + c = 0 for the height over the level; its sign is made positive at t = 0
+        sign = np.where(c >= 0, 1.0, -1.0)
+        root = b * b - 4 * a * c
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = 2 * c * sign / (np.sqrt(root) - sign * b)
+        return np.asarray(np.where((root >= 0) & (t > 0), t, np.inf))
+
+
+VAN = 5.2  # m, cars that are longer are vans
+
+LEAF = 0.04  # m, how thick doors are
+
+_THIN = 0.2  # m, furniture that is thinner is a panel
+
+_LEG = 0.1  # m, what is smaller is the leg of a chair
+
+_SEAT = 0.45  # m
+
+_LAMP, _LAMP_RADIUS = 6.0, 0.1  # m, posts that are thinner are of lamps
+
+_CROWN = 9.0  # times as wide as its trunk
+
+_WIDEST = 7.0  # m, half of what a crown measures
+
+_BRANCHES = 2.3  # m, where crowns begin
+
+
+def vehicle(length: float, width: float, kind: str) -> list[Part]:
+    """A car, a van or a forklift that heads along its length."""
+    if kind == "forklift":
+        return _forklift(length, width)
+    half = width / 2
+    wheels = [
+        Part(BOX, i * 0.31 * length, j * (half - 0.12), (0.3, 0.1), (0.0, 0.6))
+        for i in (-1, 1)
+        for j in (-1, 1)
+    ]
+    if length > VAN:
+        body = Part(BOX, 0.0, 0.0, (length / 2, half), (0.3, 1.1))
+        return [body, Part(BOX, -0.09 * length, 0.0, (0.41 * length, half), (1.1, 2.1)), *wheels]
+    body = Part(BOX, 0.0, 0.0, (length / 2, half), (0.22, 0.88))
+    cabin = Part(BOX, -0.06 * length, 0.0, (0.29 * length, 0.88 * half), (0.88, 1.48))
+    return [body, cabin, *wheels]
+
+
+def _forklift(length: float, width: float) -> list[Part]:
+    half, rear = width / 2, -0.17 * length
+    mast = Part(BOX, 0.19 * length, 0.0, (0.04 * length, 0.7 * half), (0.05, 2.2))
+    forks = [Part(BOX, 0.36 * length, j * 0.3, (0.14 * length, 0.06), (0.04, 0.1)) for j in (-1, 1)]
+    roof = Part(BOX, rear, 0.0, (0.2 * length, 0.85 * half), (2.05, 2.12))
+    posts = [
+        Part(CYLINDER, rear + i * 0.18 * length, j * 0.75 * half, (0.03, 0.03), (1.1, 2.05))
+        for i in (-1, 1)
+        for j in (-1, 1)
+    ]
+    body = Part(BOX, rear, 0.0, (0.33 * length, half), (0.1, 1.1))
+    return [body, mast, roof, *forks, *posts]
+
+
+def leg(half: tuple[float, float], tall: float) -> list[Part]:
+    """One leg of a person so many metres tall."""
+    return [Part(CYLINDER, 0.0, 0.0, half, (0.0, 0.48 * tall))]
+
+
+def torso_and_head(half: tuple[float, float], tall: float) -> list[Part]:
+    """What is above the legs."""
+    torso = Part(CYLINDER, 0.0, 0.0, half, (0.46 * tall, 0.83 * tall))
+    return [torso, Part(ELLIPSOID, 0.02, 0.0, (0.1, 0.08), (0.84 * tall, tall))]
+
+
+def door(width: float, height: float) -> list[Part]:
+    """A leaf."""
+    return [Part(BOX, 0.0, 0.0, (width / 2, LEAF / 2), (0.01, height))]
+
+
+def boxed(length: float, width: float, heights: HeightOptions) -> list[Part]:
+    """What is drawn as a box with sides along and across its heading.
+
+    Under the open sky what measures as much as a car is one; else it is furniture.
+    """
+    if heights.ceiling is None and 3.8 <= length <= 6.0 and 1.5 <= width <= 2.3:
+        return vehicle(length, width, "car")
+    if max(length, width) < _LEG:
+        top = _SEAT
+    else:
+        top = heights.panels if min(length, width) < _THIN else heights.furniture
+    return [Part(BOX, 0.0, 0.0, (length / 2, width / 2), (0.0, min(top, heights.top)))]
+
+
+def round_thing(radius: float, heights: HeightOptions) -> list[Part]:
+    """What is drawn as a circle: a column; under the open sky a lamp post, or a tree."""
+    around = (radius, radius)
+    if heights.ceiling is not None:
+        return [Part(CYLINDER, 0.0, 0.0, around, (0.0, heights.ceiling))]
+    if radius < _LAMP_RADIUS:
+        lamp = Part(BOX, 0.0, 0.0, (0.35, 0.12), (_LAMP, _LAMP + 0.15))
+        return [Part(CYLINDER, 0.0, 0.0, around, (0.0, _LAMP)), lamp]
+    crown = min(_CROWN * radius, _WIDEST)
+    tall = _BRANCHES + math.sqrt(crown) * 2.0
+    trunk = Part(CYLINDER, 0.0, 0.0, around, (0.0, _BRANCHES + 0.5))
+    return [trunk, Part(ELLIPSOID, 0.0, 0.0, (crown, crown), (_BRANCHES, tall))]

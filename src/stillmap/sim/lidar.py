@@ -1,0 +1,217 @@
+"""Sensors in 3D: where they look, from where, and what they measure."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.sim import laser, ray_casting
+from stillmap.sim.geometry import BOX, Faces, Ground, Part, assembled
+from stillmap.sim.options import GroundOptions, LaserOptions, LidarOptions, RigOptions
+from stillmap.sim.ray_casting import Echoes, Rays
+from stillmap.sim.scene import Scene
+
+Float = NDArray[np.float64]
+
+ROBOT = -2  # the mover's number of the robot itself
+
+
+class Pattern(NamedTuple):
+    """The beams of one turn, in the frame of the sensor.
+
+    Attributes:
+        azimuth: (n,) rad, rising, of the columns.
+        elevation: (C,) rad, rising, of the channels.
+        direction: (3, n, C) of length one.
+        seconds: (n,) after the scan's stamp, when each column looks.
+        off: rad, how far off its channel's elevation a beam may be.
+    """
+
+    azimuth: Float
+    elevation: Float
+    direction: Float
+    seconds: Float
+    off: float = 0.0
+
+    @classmethod
+    def of(cls, o: LidarOptions) -> "Pattern":
+        """That of a lidar that turns to the left and begins each turn behind it."""
+        share = np.arange(o.columns) / o.columns
+        azimuth = -np.pi + 2 * np.pi * share
+        elevation = np.linspace(*o.field, o.channels)
+        flat, up = np.cos(elevation), np.sin(elevation)
+        direction = np.stack(
+            [
+                np.cos(azimuth)[:, None] * flat,
+                np.sin(azimuth)[:, None] * flat,
+                np.broadcast_to(up, (o.columns, o.channels)),
+            ]
+        )
+        seconds = share / o.rate if o.sweep else np.zeros(o.columns)
+        return cls(azimuth, elevation, direction, seconds)
+
+    @classmethod
+    def tilted(cls, o: LaserOptions, joint: Float, seconds: Float) -> "Pattern":
+        """That of a planar laser which at each of its beams is tilted by (n,) rad, nose down."""
+        angle = laser.beam_angles(o.beams, o.fov)
+        direction = np.stack(
+            [np.cos(angle) * np.cos(joint), np.sin(angle), -np.cos(angle) * np.sin(joint)]
+        )
+        azimuth = np.unwrap(np.arctan2(direction[1], direction[0]))
+        return cls(azimuth, np.zeros(1), direction[..., None], seconds, np.pi)
+
+
+class Sensor(NamedTuple):
+    """What records, and how.
+
+    Attributes:
+        name: for the recording.
+        dimension: of its recording, 2 or 3.
+        T_base_sensor: (4, 4).
+        options: ranges, noise and losses.
+        pattern: the beams of each scan.
+        takes_time: whether the beams of a scan are taken one after the other.
+        leaves_out: whether beams without return are left out.
+        own: what of the robot itself it sees.
+    """
+
+    name: str
+    dimension: int
+    T_base_sensor: Float
+    options: LidarOptions | LaserOptions
+    pattern: Callable[[int], Pattern]
+    takes_time: bool
+    leaves_out: bool = False
+    own: Echoes | None = None
+
+
+def spinning(scene: Scene) -> Sensor:
+    """The lidar of a scene."""
+    o, pattern = scene.lidar, Pattern.of(scene.lidar)
+    T = matrix(np.array([o.x, o.y, o.z]), *np.array([0.0, o.pitch, o.yaw]))
+    own = own_body(scene, pattern, T) if o.sees_robot else None
+    leaves_out = o.no_returns == "left out"
+    return Sensor("simulated lidar", 3, T, o, lambda _: pattern, o.sweep, leaves_out, own)
+
+
+def of_rig(scene: Scene) -> tuple[Sensor, Sensor]:
+    """The laser of a scene, lying flat, and another one like it that tilts."""
+    o, rig = scene.laser, scene.rig
+    angle = laser.beam_angles(o.beams, o.fov)
+    seconds = o.sweep_time * (angle - angle[0]) / o.fov
+    flat = Pattern.tilted(o, np.zeros(o.beams), seconds)
+
+    def tilted(scan: int) -> Pattern:
+        return Pattern.tilted(o, joint_angle(scan / scene.scan_rate + seconds, rig), seconds)
+
+    low = matrix(np.array([o.x, o.y, rig.low_z]), *np.array([0.0, 0.0, o.yaw]))
+    pivot = matrix(np.array([rig.pivot_x, 0.0, rig.pivot_z]), *np.zeros(3))
+    takes_time = o.sweep_time > 0
+    return (
+        Sensor("simulated laser", 2, low, o, lambda _: flat, takes_time),
+        Sensor("simulated tilting laser", 3, pivot, o, tilted, takes_time),
+    )
+
+
+def joint_angle(seconds: Float, rig: RigOptions) -> Float:
+    """(...) rad, nose down, of the laser that tilts; it begins in the middle, on its way down."""
+    share = (seconds / rig.period + 0.25) % 1.0
+    return np.asarray(rig.middle + rig.amplitude * (1.0 - 4.0 * np.abs(share - 0.5)))
+
+
+def matrix(xyz: Float, roll: Float, pitch: Float, yaw: Float) -> Float:
+    """(..., 4, 4) poses: turned by roll about x, then pitch about y, then yaw about z, in rad.
+
+    Args:
+        xyz: (..., 3) metres.
+        roll, pitch, yaw: (...) rad; a positive pitch is nose down.
+    """
+    (a, b, c), (u, v, w) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    T = np.zeros((*np.shape(yaw), 4, 4))
+    T[..., 0, :3] = np.stack([c * b, c * v * u - w * a, c * v * a + w * u], axis=-1)
+    T[..., 1, :3] = np.stack([w * b, w * v * u + c * a, w * v * a - c * u], axis=-1)
+    T[..., 2, :3] = np.stack([-v, b * u, b * a], axis=-1)
+    T[..., :3, 3], T[..., 3, 3] = xyz, 1.0
+    return T
+
+
+def ridden(robot: Float, ground: Ground, o: LidarOptions, rng: np.random.Generator) -> Float:
+    """(T, 6) x, y, z, roll, pitch, yaw of a robot that stands on the ground and shakes.
+
+    Args:
+        robot: (T, 3) x, y, theta in the plan.
+        ground: what it stands on.
+        o: how much it shakes.
+        rng: how it shakes.
+    """
+    x, y, yaw = robot.T
+    gx, gy = ground.gradient(x, y)
+    ahead, left = gx * np.cos(yaw) + gy * np.sin(yaw), gy * np.cos(yaw) - gx * np.sin(yaw)
+    shaking = rng.standard_normal((3, len(robot)))
+    shaking *= np.array([[o.vibration_roll], [o.vibration_pitch], [o.vibration_z]])
+    pitch = -np.arctan(ahead) + shaking[1]
+    roll = np.arctan(left * np.cos(np.arctan(ahead))) + shaking[0]
+    return np.stack([x, y, ground.height(x, y) + shaking[2], roll, pitch, yaw], axis=-1)
+
+
+def looking(pattern: Pattern, T_world_sensor: Float) -> Rays:
+    """The beams of one turn in the world.
+
+    Args:
+        pattern: the same in the sensor's frame.
+        T_world_sensor: (n, 4, 4) where the sensor is when each column looks, or (1, 4, 4).
+    """
+    n = len(pattern.azimuth)
+    R = T_world_sensor[:, :3, :3]
+    turned = np.einsum("nij,jnc->inc", np.broadcast_to(R, (n, 3, 3)), pattern.direction)
+    upright = np.arccos(np.clip(R[:, 2, 2], -1.0, 1.0)).max()
+    steepest = np.arcsin(np.minimum(np.abs(pattern.direction[2]).max(initial=0.0), 1.0))
+    off = np.tan(upright) * np.tan(steepest) * 1.1 + upright**2 if upright > 1e-9 else 0.0
+    # the column's azimuth is that of a beam in it without elevation
+    a, b = R[:, 0, 0], R[:, 1, 0]
+    heading = np.unwrap(np.arctan2(b, a))
+    azimuth = np.maximum.accumulate(pattern.azimuth + heading)
+    origin = np.broadcast_to(T_world_sensor[:, :3, 3].T[:, :, None], (3, n, 1))
+    tilt = float(upright) + pattern.off + 1e-9
+    return Rays(origin, turned, azimuth, float(off), pattern.elevation, tilt)
+
+
+def own_body(scene: Scene, pattern: Pattern, T_base_sensor: Float) -> Echoes:
+    """What of the robot itself its lidar sees: a box as large as its footprint, or as given."""
+    o, radius = scene.lidar, scene.robot.radius
+    top = max(o.z - o.roof_below, 0.1)
+    ahead = radius if o.roof_length is None else 0.5 * o.roof_length
+    aside = 0.8 * radius if o.roof_width is None else 0.5 * o.roof_width
+    box = assembled([(0, ROBOT, Part(BOX, 0.0, 0.0, (ahead, aside), (0.0, top)))])
+    body = box.at(np.zeros((1, 1, 3)), np.zeros((1, 1)))
+    nothing = Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool))
+    below = Ground.of(GroundOptions(), np.empty((0, 4)))
+    seen = ray_casting.cast(looking(pattern, T_base_sensor[None]), nothing, [body], below, None)
+    range = np.where(seen.mover == ROBOT, seen.range, np.inf)
+    return seen._replace(range=range)
+
+
+def measure(
+    exact: Echoes, o: LidarOptions | LaserOptions, rng: np.random.Generator
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Measured ranges (n, C) and whether something came back (n, C).
+
+    Args:
+        exact: what the beams meet.
+        o: noise and losses. A beam without return gets o.max_range.
+        rng: noise and losses.
+    """
+    lost = rng.random(exact.range.shape)
+    noisy = exact.range + o.range_noise * rng.standard_normal(exact.range.shape)
+    share = o.no_return_share + exact.on_glass * o.glass_no_return_share
+    hit = (noisy < o.max_range) & (lost >= share)
+    return np.where(hit, np.maximum(noisy, 1e-3), o.max_range), hit
+
+
+def planar(poses: Float) -> Float:
+    """(T, 4, 4) of poses (T, 3, 3) in the plane."""
+    x, y, yaw = se2.parameters(poses).T
+    still = np.zeros_like(x)
+    return matrix(np.stack([x, y, still], axis=-1), still, still, yaw)

@@ -1,0 +1,180 @@
+"""Things that are moved, brought and taken away: where each of them is, by the clock.
+
+Doors: leaves that swing open and shut by themselves, and for whoever wants to pass.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.sim.laser import Outlines
+from stillmap.sim.options import DoorOptions
+from stillmap.sim.scene import Door, Stay, Thing
+
+Float = NDArray[np.float64]
+
+
+class Placed(NamedTuple):
+    """Where P things are at T scans.
+
+    Attributes:
+        poses: (T, P, 3) x, y in metres, yaw in rad; NaN where a thing is nowhere.
+        outlines: the faces of those that are not the same at all scans; of no length while a thing
+            is nowhere.
+        still: (K, 4) the faces of those that are.
+        moved: (P,) which are not the same at all scans.
+    """
+
+    poses: Float
+    outlines: Outlines
+    still: Float
+    moved: NDArray[np.bool_]
+
+
+class Things:
+    """P things and all their places."""
+
+    def __init__(self, things: tuple[Thing, ...]) -> None:
+        self._things = things
+
+    def everywhere(self) -> Float:
+        """(K, 4) the faces of all things at all places where they ever stand."""
+        faces = [standing(thing, stay) for thing in self._things for stay in thing.stays]
+        return np.concatenate([np.empty((0, 4)), *faces])
+
+    def placed(self, seconds: Float, first: int) -> Placed:
+        """Where they are when scans are taken.
+
+        Args:
+            seconds: (T,) since the recording began.
+            first: the number of the first of them among all movers.
+        """
+        T, poses, still = len(seconds), [], [np.empty((0, 4))]
+        moving, mover = [np.empty((T, 0, 4))], [np.empty(0, np.int32)]
+        moved: list[bool] = []
+        for number, thing in enumerate(self._things, start=first):
+            at = np.full((T, 3), np.nan)
+            for stay in thing.stays:
+                end = np.inf if stay.until is None else stay.until
+                at[(seconds >= stay.since) & (seconds < end)] = (stay.x, stay.y, stay.yaw)
+            faces = faces_at(thing, at)
+            poses.append(at)
+            moved.append(not np.array_equal(at, np.broadcast_to(at[0], at.shape)))
+            if not moved[-1]:
+                still.append(faces[0])
+            else:
+                moving.append(faces)
+                mover.append(np.full(len(thing.faces), number, np.int32))
+        outlines = Outlines(np.concatenate(moving, axis=1), np.concatenate(mover))
+        by_scan = np.reshape(poses, (-1, T, 3)).swapaxes(0, 1)
+        return Placed(by_scan, outlines, np.concatenate(still), np.array(moved, bool))
+
+
+def standing(thing: Thing, stay: Stay) -> Float:
+    """(K, 4) the faces of a thing in the world, as it stands during a stay."""
+    return np.asarray(faces_at(thing, np.array([[stay.x, stay.y, stay.yaw]]))[0])
+
+
+def faces_at(thing: Thing, poses: Float) -> Float:
+    """(T, K, 4) the faces of a thing at poses (T, 3); of no length where these are NaN."""
+    T = se2.matrix(*poses.T)[:, None]
+    ends = np.reshape(thing.faces, (-1, 2)).astype(float)
+    moved = np.einsum("tkij,nj->tni", T[..., :2, :2], ends) + T[..., :2, 2]
+    return np.asarray(np.nan_to_num(moved.reshape(len(poses), -1, 4)), np.float64)
+
+
+REACH = 3.0  # m before the doorway somebody's coming opens the door
+
+_NEAR = 1.2  # m around the doorway's middle: no leaf closes while somebody is there
+
+
+class Doors:
+    """State of D doors.
+
+    Attributes:
+        share: (D,) how far each is open, from 0 to 1.
+        width: (D,) metres.
+    """
+
+    def __init__(
+        self, doors: tuple[Door, ...], options: DoorOptions, rng: np.random.Generator
+    ) -> None:
+        D = len(doors)
+        self._options, self._rng = options, rng
+        self._hinge = np.array([door.hinge for door in doors]).reshape(-1, 2)
+        self.width = np.array([door.width for door in doors])
+        self._closed = np.array([door.closed for door in doors])
+        self._sweep = np.array([door.opened for door in doors]) - self._closed
+        leaf = self.width[:, None] * _direction(self._closed)
+        self._end, self._middle = self._hinge + leaf, self._hinge + leaf / 2
+        self._opens = rng.random(D) < 0.5
+        self.share = self._opens.astype(float)
+        self._left = rng.random(D) * [self._lasts(opens) for opens in self._opens.tolist()]
+
+    @property
+    def angle(self) -> Float:
+        """(D,) rad, direction from the hinge along the leaf."""
+        return np.asarray(self._closed + self.share * self._sweep)
+
+    def poses(self) -> Float:
+        """(D, 3) the middle of each leaf in metres and its direction in radians."""
+        middle = self._hinge + self.width[:, None] / 2 * _direction(self.angle)
+        return np.column_stack([middle, self.angle])
+
+    def faces(self) -> Float:
+        """(D, 4) each leaf as a segment from its hinge."""
+        end = self._hinge + self.width[:, None] * _direction(self.angle)
+        return np.concatenate([self._hinge, end], axis=1)
+
+    def step(self, dt: float, standing: Float, ways: Float) -> None:
+        """The leaves go on for dt seconds.
+
+        Args:
+            dt: seconds.
+            standing: (N, 2) where people and robot are, metres.
+            ways: (K, 4) the legs of the ways that they want to go next, x0, y0, x1, y1.
+        """
+        delta = self._middle[:, None] - standing
+        near = np.any(np.hypot(delta[..., 0], delta[..., 1]) < _NEAR, axis=1)
+        passing = self._crossed_by(ways)
+        self._left -= dt
+        for door in np.flatnonzero(passing & ~self._opens).tolist():
+            self._turn(door, opens=True)
+        for door in np.flatnonzero((self._left <= 0) & ~passing & ~near).tolist():
+            self._turn(door, opens=not self._opens[door])
+        step = dt / self._options.swing
+        change = np.where(self._opens, step, np.where(near, 0.0, -step))
+        self.share = np.clip(self.share + change, 0.0, 1.0)
+
+    def _turn(self, door: int, opens: bool) -> None:
+        self._opens[door] = opens
+        self._left[door] = self._lasts(opens)
+
+    def _lasts(self, opens: bool) -> float:
+        o = self._options
+        low, high = (o.min_open, o.max_open) if opens else (o.min_closed, o.max_closed)
+        return float(np.exp(self._rng.uniform(np.log(low), np.log(high))))
+
+    def _crossed_by(self, ways: Float) -> NDArray[np.bool_]:
+        """(D,) whether a leg of the ways (K, 4) goes through the doorway."""
+        start, end = ways[:, None, :2], ways[:, None, 2:]
+        aside = _turned(self._hinge, self._end, start) * _turned(self._hinge, self._end, end)
+        through = _turned(start, end, self._hinge) * _turned(start, end, self._end)
+        return np.asarray(np.any((aside < 0) & (through < 0), axis=0))
+
+
+def legs(corners: Float) -> Float:
+    """(N (K - 1), 4) the legs of N ways with K corners (N, K, 2)."""
+    return np.concatenate([corners[:, :-1], corners[:, 1:]], axis=-1).reshape(-1, 4)
+
+
+def _direction(angle: Float) -> Float:
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _turned(a: Float, b: Float, c: Float) -> Float:
+    """Positive where c lies to the left of the line from a to b."""
+    along, across = b - a, c - a
+    return np.asarray(along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0])

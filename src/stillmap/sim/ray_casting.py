@@ -1,0 +1,239 @@
+"""Exact ranges of the beams of one turn of a lidar, among faces, solids, ground and ceiling.
+
+A thing covers an interval of columns and one of channels. Only the beams within both are
+intersected with it, all at once.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.sim.geometry import BOX, CYLINDER, Faces, Ground, Solids
+
+Float = NDArray[np.float64]
+Window = tuple[int, slice, slice]
+
+_NEAREST = 1e-3  # m, the lidar sees nothing nearer
+_EDGE = 1e-9  # rad, so that no beam slips between two faces that share an edge
+_NOWHERE = 1e9  # m, where things are that are nowhere
+
+
+class Rays(NamedTuple):
+    """n columns of C beams each; those of a column are taken at once.
+
+    Attributes:
+        origin: (3, n, 1) metres, in the world.
+        direction: (3, n, C) of length one, in the world.
+        azimuth: (n,) rad, rising, over one turn or little more; that of each column in the world.
+        spread: rad, how far off that a beam of the column may be.
+        elevation: (C,) rad, rising.
+        tilt: rad, how far off that a beam of the channel may be, in the world.
+    """
+
+    origin: Float
+    direction: Float
+    azimuth: Float
+    spread: float
+    elevation: Float
+    tilt: float
+
+
+class Echoes(NamedTuple):
+    """The nearest thing on each of (n, C) beams.
+
+    Attributes:
+        range: metres, inf where there is nothing.
+        mover: int32 id of the mover that is hit, -1: none.
+        on_glass: bool.
+    """
+
+    range: Float
+    mover: NDArray[np.int32]
+    on_glass: NDArray[np.bool_]
+
+
+def cast(
+    rays: Rays, faces: Faces, solids: list[Solids], ground: Ground, ceiling: float | None
+) -> Echoes:
+    """What each beam meets first.
+
+    Args:
+        rays: the beams.
+        faces: what stands still.
+        solids: what stands still or moves, at all times or at those of the columns.
+        ground: the ground.
+        ceiling: metres above it; None: the open sky.
+    """
+    range = ground.distance(rays.origin, rays.direction)
+    if ground.kerb > 0 and len(ground.pavements):
+        upper = ground.distance(rays.origin, rays.direction, ground.kerb)
+        with np.errstate(invalid="ignore"):
+            x, y = (rays.origin + upper * rays.direction)[:2]
+        np.copyto(range, upper, where=ground.is_paved(x, y))
+    if ceiling is not None:
+        np.minimum(range, ground.distance(rays.origin, rays.direction, ceiling), out=range)
+    range[range < _NEAREST] = np.inf
+    mover = np.full(range.shape, -1, np.int32)
+    on_glass = np.zeros(range.shape, bool)
+    for k, columns, channels in _windows_of_faces(rays, faces, ground):
+        origin, direction = rays.origin[:, columns], rays.direction[:, columns, channels]
+        t = to_face(origin, direction, faces.ends[k], faces.z[k], ground)
+        nearer = t < range[columns, channels]
+        range[columns, channels][nearer] = t[nearer]
+        on_glass[columns, channels][nearer] = faces.is_glass[k]
+    for group in solids:
+        for k, columns, channels in _windows_of_solids(rays, group):
+            pose = group.pose[columns if len(group.pose) > 1 else slice(None), k]
+            origin, direction = rays.origin[:, columns], rays.direction[:, columns, channels]
+            t = to_solid(origin, direction, group, k, pose)
+            nearer = t < range[columns, channels]
+            range[columns, channels][nearer] = t[nearer]
+            mover[columns, channels][nearer] = group.mover[k]
+            on_glass[columns, channels][nearer] = False
+    return Echoes(range, mover, on_glass)
+
+
+def to_face(origin: Float, direction: Float, ends: Float, z: Float, ground: Ground) -> Float:
+    """(n, C) metres along rays from (3, n, 1) to an upright face; inf: they pass it by."""
+    (ox, oy, oz), (dx, dy, dz) = origin, direction
+    x0, y0, x1, y1 = ends
+    ux, uy = x1 - x0, y1 - y0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = ((x0 - ox) * uy - (y0 - oy) * ux) / (dx * uy - dy * ux)
+        x, y = ox + t * dx, oy + t * dy
+        along = (x - x0) * ux + (y - y0) * uy
+        above = oz + t * dz - ground.level(x, y)
+        met = (t > _NEAREST) & (along >= -_EDGE) & (along <= ux * ux + uy * uy + _EDGE)
+        met &= (above >= z[0]) & (above <= z[1])
+    return np.asarray(np.where(met, t, np.inf))
+
+
+def to_solid(origin: Float, direction: Float, solids: Solids, k: int, pose: Float) -> Float:
+    """(n, C) metres along rays from (3, n, 1), outside it, to solid k at poses (n, 4) or (1, 4)."""
+    x, y, heading, foot = pose.T[:, :, None]
+    (a, b), (z0, z1), form = solids.half[k], solids.z[k], solids.form[k]
+    c, s, h = np.cos(heading), np.sin(heading), (z1 - z0) / 2
+    (ox, oy, oz), (dx, dy, dz) = origin, direction
+    # scaled so that it is the unit cube, cylinder or sphere; distances along beams stay
+    u, v = ((ox - x) * c + (oy - y) * s) / a, ((oy - y) * c - (ox - x) * s) / b
+    w = (oz - foot - z0 - h) / h
+    du, dv, dw = dx * (c / a) + dy * (s / a), dy * (c / b) - dx * (s / b), dz / h
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if form == BOX:
+            enters, leaves = _between(_slab(u, du), _slab(v, dv))
+        elif form == CYLINDER:
+            enters, leaves = _round(du * du + dv * dv, u * du + v * dv, u * u + v * v)
+        else:
+            squares = du * du + dv * dv + dw * dw
+            enters, leaves = _round(squares, u * du + v * dv + w * dw, u * u + v * v + w * w)
+        if form in (BOX, CYLINDER):
+            enters, leaves = _between((enters, leaves), _slab(w, dw))
+        return np.asarray(np.where((enters <= leaves) & (enters > _NEAREST), enters, np.inf))
+
+
+def _slab(u: Float, du: Float) -> tuple[Float, Float]:
+    """Where rays enter and leave -1 <= u <= 1."""
+    one = 1.0 / du  # infinite for rays along it: within from -inf to inf, or never
+    near, far = (-1.0 - u) * one, (1.0 - u) * one
+    return np.minimum(near, far), np.maximum(near, far)
+
+
+def _round(squares: Float, product: Float, rest: Float) -> tuple[Float, Float]:
+    """Where rays enter and leave |u| <= 1; |du|^2, u . du and |u|^2 are given."""
+    root = np.sqrt(product * product - squares * (rest - 1.0))  # NaN: passed by
+    return (-product - root) / squares, (-product + root) / squares
+
+
+def _between(one: tuple[Float, Float], other: tuple[Float, Float]) -> tuple[Float, Float]:
+    return np.maximum(one[0], other[0]), np.minimum(one[1], other[1])
+
+
+def _windows_of_faces(rays: Rays, faces: Faces, ground: Ground) -> Iterator[Window]:
+    """Number of each face, and the columns and channels that may meet it."""
+    if not len(faces.ends):
+        return
+    ox, oy, oz, move = _middle(rays)
+    x0, y0, x1, y1 = faces.ends.T
+    bearing, other = np.arctan2(y0 - oy, x0 - ox), np.arctan2(y1 - oy, x1 - ox)
+    turn = (other - bearing + np.pi) % (2 * np.pi) - np.pi
+    ux, uy = x1 - x0, y1 - y0
+    share = ((ox - x0) * ux + (oy - y0) * uy) / np.maximum(ux * ux + uy * uy, 1e-12)
+    share = np.clip(share, 0.0, 1.0)
+    near = np.hypot(x0 + share * ux - ox, y0 + share * uy - oy)
+    far = np.maximum(np.hypot(x0 - ox, y0 - oy), np.hypot(x1 - ox, y1 - oy))
+    levels = np.stack([ground.level(x0, y0), ground.level(x1, y1)])
+    sag = np.abs(ground.bend).max() * (ux * ux + uy * uy) / 8
+    low = levels.min(axis=0) - sag + faces.z[:, 0] - oz
+    high = levels.max(axis=0) + sag + faces.z[:, 1] - oz
+    middle = bearing + turn / 2
+    yield from _windows(rays, middle, np.abs(turn) / 2, near, far, (low, high), move)
+
+
+def _windows_of_solids(rays: Rays, solids: Solids) -> Iterator[Window]:
+    """Number of each solid, and the columns and channels that may meet it."""
+    if not len(solids.form):
+        return
+    ox, oy, oz, move = _middle(rays)
+    pose = np.nan_to_num(solids.pose, nan=_NOWHERE)
+    at = pose[len(pose) // 2]
+    own = np.hypot(pose[..., 0] - at[:, 0], pose[..., 1] - at[:, 1]).max(axis=0)
+    a, b = solids.half.T
+    radius = np.where(solids.form == BOX, np.hypot(a, b), np.maximum(a, b)) + own
+    distance = np.hypot(at[:, 0] - ox, at[:, 1] - oy)
+    z = solids.z + at[:, 3:] - oz
+    z[:, 0] -= np.ptp(pose[..., 3], axis=0)
+    z[:, 1] += np.ptp(pose[..., 3], axis=0)
+    bearing = np.arctan2(at[:, 1] - oy, at[:, 0] - ox)
+    half = np.arcsin(np.minimum(radius / np.maximum(distance, 1e-6), 1.0))
+    near, far = distance - radius, distance + radius
+    yield from _windows(rays, bearing, half, near, far, (z[:, 0], z[:, 1]), move)
+
+
+def _middle(rays: Rays) -> tuple[float, float, float, float]:
+    """x, y, z of the lidar in the middle of its turn, and how far off that it gets, metres."""
+    at = rays.origin[:, rays.origin.shape[1] // 2]
+    x, y, z = at[:, 0].tolist()
+    return x, y, z, float(np.sqrt(((rays.origin - at[:, None]) ** 2).sum(axis=0)).max())
+
+
+def _windows(
+    rays: Rays,
+    bearing: Float,
+    half: Float,
+    near: Float,
+    far: Float,
+    heights: tuple[Float, Float],
+    move: float,
+) -> Iterator[Window]:
+    """Columns and channels that may meet things.
+
+    Args:
+        rays: the beams.
+        bearing, half: (P,) rad, things lie within bearing +- half, seen from the middle of the
+            turn.
+        near, far: (P,) metres, how near and how far they come there.
+        heights: two of (P,) metres, their least and their greatest height over the lidar.
+        move: metres, how far from there the lidar moves.
+    """
+    n, first = len(rays.azimuth), rays.azimuth[0]
+    near, far = near - move, far + move
+    half = half + np.arcsin(np.minimum(move / np.maximum(near + move, 1e-9), 1.0))
+    half += rays.spread + _EDGE
+    half[(near <= 0) | (half >= np.pi)] = np.inf
+    low, high = heights[0] - move, heights[1] + move
+    closest = np.maximum(near, 1e-3)
+    lowest = np.arctan2(low, np.where(low > 0, far, closest)) - rays.tilt - _EDGE
+    highest = np.arctan2(high, np.where(high > 0, closest, far)) + rays.tilt + _EDGE
+    begin = np.searchsorted(rays.elevation, lowest, side="left")
+    end = np.searchsorted(rays.elevation, highest, side="right")
+    middle = first + (bearing - first) % (2 * np.pi)
+    shifts = middle[:, None] + 2 * np.pi * np.arange(-1, 2)
+    start = np.searchsorted(rays.azimuth, shifts - half[:, None], side="left")
+    stop = np.searchsorted(rays.azimuth, shifts + half[:, None], side="right")
+    all_round = np.isinf(half)
+    start[all_round], stop[all_round] = 0, [n, 0, 0]
+    use = (start < stop) & (begin < end)[:, None]
+    for k, turn in np.argwhere(use).tolist():
+        yield k, slice(start[k, turn], stop[k, turn]), slice(begin[k], end[k])

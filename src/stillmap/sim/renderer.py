@@ -1,0 +1,218 @@
+"""What each pixel of a picture shows, among faces, solids, ground and ceiling.
+
+The same rays as a lidar's, in another order: a thing lies within a rectangle of pixels, and things
+are looked at from the nearest on, so that what is hidden costs little.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.sim import ray_casting
+from stillmap.sim.geometry import BOX, Faces, Ground, Solids
+
+Float = NDArray[np.float64]
+
+STATIC, NOTHING = -1, -2
+
+_NEAR = 0.05  # m ahead of the camera: nothing nearer is looked for
+_NEAREST = 1e-3  # m, as a lidar's
+_EDGES = np.array(
+    [(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)]
+)
+_EDGES_OF_FACE = np.array([(0, 1), (1, 3), (3, 2), (2, 0)])
+
+
+class Lens(NamedTuple):
+    """Where the pixels of a camera look.
+
+    Attributes:
+        direction: (3, h, w) of length one, in the camera's frame.
+        K: (3, 3) pinhole matrix.
+        bends: pixels, how far off its place for an ideal lens anything is shown, at most.
+    """
+
+    direction: Float
+    K: Float
+    bends: float
+
+    @classmethod
+    def of(cls, direction: Float, K: Float) -> "Lens":
+        """That of rays (3, h, w) in a camera's frame."""
+        _, h, w = direction.shape
+        x, y = direction[:2] / direction[2]
+        right = np.abs(K[0, 0] * x + K[0, 2] - np.arange(w)).max()
+        down = np.abs(K[1, 1] * y + K[1, 2] - np.arange(h)[:, None]).max()
+        return cls(direction, K, float(max(right, down)))
+
+
+class Shown(NamedTuple):
+    """What each pixel (h, w) shows.
+
+    Attributes:
+        range: metres along its ray, inf where there is nothing.
+        part: int32, the number of the moving solid; STATIC, or NOTHING.
+    """
+
+    range: Float
+    part: NDArray[np.int32]
+
+
+class _Thing(NamedTuple):
+    """Something that may be seen: face k, or solid k of a group, and the pixels it lies within."""
+
+    near: float
+    group: int
+    k: int
+    rows: slice
+    columns: slice
+
+
+def shown(
+    lens: Lens,
+    T_world_camera: Float,
+    faces: Faces,
+    still: Solids,
+    moving: Solids,
+    ground: Ground,
+    ceiling: float | None,
+) -> Shown:
+    """What each pixel shows.
+
+    Args:
+        lens: where they look.
+        T_world_camera: (4, 4).
+        faces, still: what stands still.
+        moving: the solids that move, at one time; those of no mover stand still.
+        ground: the ground.
+        ceiling: metres above it; None: the open sky.
+    """
+    R, at = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    direction = np.einsum("ij,jhw->ihw", R, lens.direction)
+    origin = np.ascontiguousarray(at[:, None, None])
+    range = _level_ground(origin, direction, ground, ceiling)
+    part = np.where(np.isinf(range), np.int32(NOTHING), np.int32(STATIC))
+    groups = (still, moving)
+    things = [*_seen_faces(lens, T_world_camera, faces, ground)]
+    for number, group in enumerate(groups):
+        things += _seen_solids(lens, T_world_camera, group, number)
+    for near, number, k, rows, columns in sorted(things, key=lambda one: one.near):
+        before = range[rows, columns]
+        if before.max(initial=0.0) <= near:
+            continue
+        along = direction[:, rows, columns]
+        if number < 0:
+            t = ray_casting.to_face(origin, along, faces.ends[k], faces.z[k], ground)
+            what = STATIC
+        else:
+            group = groups[number]
+            t = ray_casting.to_solid(origin, along, group, k, group.pose[:1, k])
+            what = k if number and group.mover[k] >= 0 else STATIC
+        nearer = t < before
+        before[nearer] = t[nearer]
+        part[rows, columns][nearer] = what
+    return Shown(range, part)
+
+
+def _level_ground(origin: Float, direction: Float, ground: Ground, ceiling: float | None) -> Float:
+    """(h, w) metres to street, pavements and ceiling."""
+    range = ground.distance(origin, direction)
+    if ground.kerb > 0 and len(ground.pavements):
+        upper = ground.distance(origin, direction, ground.kerb)
+        with np.errstate(invalid="ignore"):
+            x, y = (origin + upper * direction)[:2]
+        np.copyto(range, upper, where=ground.is_paved(x, y))
+    if ceiling is not None:
+        np.minimum(range, ground.distance(origin, direction, ceiling), out=range)
+    range[range < _NEAREST] = np.inf
+    return range
+
+
+def _seen_faces(
+    lens: Lens, T_world_camera: Float, faces: Faces, ground: Ground
+) -> Iterator[_Thing]:
+    if not len(faces.ends):
+        return
+    x0, y0, x1, y1 = faces.ends.T
+    sag = np.abs(ground.bend).max() * ((x1 - x0) ** 2 + (y1 - y0) ** 2) / 8
+    low, high = faces.z[:, 0] - sag, faces.z[:, 1] + sag
+    start, end = ground.level(x0, y0), ground.level(x1, y1)
+    corners = np.stack(
+        [
+            np.stack([x, y, level + z], axis=-1)
+            for x, y, level in ((x0, y0, start), (x1, y1, end))
+            for z in (low, high)
+        ],
+        axis=1,
+    )
+    cx, cy, _ = T_world_camera[:3, 3]
+    ux, uy = x1 - x0, y1 - y0
+    share = ((cx - x0) * ux + (cy - y0) * uy) / np.maximum(ux * ux + uy * uy, 1e-12)
+    share = np.clip(share, 0.0, 1.0)
+    near = np.hypot(x0 + share * ux - cx, y0 + share * uy - cy)
+    yield from _windows(lens, T_world_camera, corners, _EDGES_OF_FACE, near, -1)
+
+
+def _seen_solids(
+    lens: Lens, T_world_camera: Float, solids: Solids, number: int
+) -> Iterator[_Thing]:
+    if not len(solids.form):
+        return
+    x, y, heading, foot = np.moveaxis(solids.pose[0], -1, 0)
+    (a, b), (z0, z1) = solids.half.T, solids.z.T
+    c, s = np.cos(heading), np.sin(heading)
+    corners = np.stack(
+        [
+            np.stack([x + c * u * a - s * v * b, y + s * u * a + c * v * b, foot + z], axis=-1)
+            for u in (-1, 1)
+            for v in (-1, 1)
+            for z in (z0, z1)
+        ],
+        axis=1,
+    )
+    cx, cy, _ = T_world_camera[:3, 3]
+    radius = np.where(solids.form == BOX, np.hypot(a, b), np.maximum(a, b))
+    near = np.hypot(x - cx, y - cy) - radius
+    yield from _windows(lens, T_world_camera, corners, _EDGES, near, number)
+
+
+def _windows(
+    lens: Lens,
+    T_world_camera: Float,
+    corners: Float,
+    edges: NDArray[np.int64],
+    near: Float,
+    number: int,
+) -> Iterator[_Thing]:
+    """The pixels within which convex things lie, those that lie within the picture.
+
+    Args:
+        lens, T_world_camera: the camera.
+        corners: (P, C, 3) metres, in the world; NaN of what is nowhere.
+        edges: (E, 2) which corners are joined.
+        near: (P,) metres, nearer to the camera they are not.
+        number: of the group.
+    """
+    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    points = (corners - t) @ R
+    a, b = points[:, edges[:, 0]], points[:, edges[:, 1]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (_NEAR - a[..., 2:]) / (b[..., 2:] - a[..., 2:])
+        cut = np.where((share > 0) & (share < 1), a + share * (b - a), np.nan)
+    points = np.concatenate([points, cut], axis=1)
+    z = points[..., 2]
+    ahead = z >= _NEAR * (1.0 - 1e-9)
+    _, height, width = lens.direction.shape
+    bounds = []
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for axis, size in ((0, width), (1, height)):
+            pixel = lens.K[axis, axis] * points[..., axis] / z + lens.K[axis, 2]
+            low = np.where(ahead, pixel, np.inf).min(axis=1) - lens.bends - 1.0
+            high = np.where(ahead, pixel, -np.inf).max(axis=1) + lens.bends + 1.0
+            bounds += [np.clip(low, 0, size), np.clip(high + 1.0, 0, size)]
+    left, right, top, bottom = bounds
+    for k in np.flatnonzero(ahead.any(axis=1) & (left < right) & (top < bottom)).tolist():
+        rows, columns = slice(int(top[k]), int(bottom[k])), slice(int(left[k]), int(right[k]))
+        yield _Thing(float(near[k]), number, k, rows, columns)

@@ -1,0 +1,172 @@
+"""A robot that follows its route, waits for people in its way, and goes on when patience ends."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.sim.options import RobotOptions
+from stillmap.sim.planner import FreeSpace, Planner
+from stillmap.sim.scene import Light, Point
+from stillmap.sim.vehicles import Pace
+
+Float = NDArray[np.float64]
+
+_SPACING = 0.05  # m between points of the route
+_CARROT = 0.35  # m ahead of the robot, the point of the route that it steers for
+_CARROT_TIME = 0.5  # s, the same for a fast one
+_SEES_AHEAD = 1.5  # m
+_SEES_AHEAD_TIME = 1.2  # s, the same for a fast one
+_CREEP = 0.12  # m/s
+_ELSEWHERE = 0.3  # of the way to the farthest place: nearer ones are not elsewhere
+_ROOM = 2.0  # m from anybody, where it is put down
+_TURN_IN_PLACE = 0.4  # rad off the route
+
+
+class Robot:
+    """Pose and progress of the robot.
+
+    Attributes:
+        pose: (3,) x, y in metres, theta in radians.
+        impatient: it has waited long enough and creeps on.
+        arrived: it is at the end of its way (never, if that is closed).
+    """
+
+    def __init__(
+        self,
+        way: Float,
+        space: FreeSpace,
+        options: RobotOptions,
+        closed: bool,
+        lights: tuple[Light, ...] = (),
+    ) -> None:
+        self._way, self._space, self._options, self._closed = way, space, options, closed
+        self._pace = Pace(way, closed, options, lights)
+        self._seconds, self._speed = 0.0, 0.0
+        first = way[min(1, len(way) - 1)] - way[0]
+        self.pose: Float = np.array([*way[0], np.arctan2(first[1], first[0])])
+        self.impatient = False
+        self.arrived = False
+        self._at = 0
+        self._waited = 0.0
+
+    def step(self, dt: float, people: Float, contact: float) -> None:
+        """Drive for dt seconds.
+
+        Args:
+            dt: seconds.
+            people: (P, 2) where people and corners of vehicles are, metres.
+            contact: m, the nearest one of these may be to the robot's centre.
+        """
+        self._advance()
+        o = self._options
+        x, y, theta = self.pose
+        to = self._way[self._ahead(self._carrot())[-1]] - self.pose[:2]
+        error = np.arctan2(to[1], to[0]) - theta
+        error = (error + np.pi) % (2 * np.pi) - np.pi
+        turn = float(np.clip(2.0 * error, -o.turn_rate, o.turn_rate))
+        past = (x - self._way[self._at, 0]) * np.cos(theta)
+        past += (y - self._way[self._at, 1]) * np.sin(theta)
+        speed = self._pace.allowed(self._at, float(past), self._speed, self._seconds, dt)
+        speed = self._pace.gained(speed * self._facing(error), self._speed, dt)
+        speed = self._careful(dt, min(speed, np.hypot(*to) / dt), people, contact)
+        middle = theta + turn * dt / 2
+        new = np.array([x + speed * dt * np.cos(middle), y + speed * dt * np.sin(middle)])
+        if not self._is_free(new, people, contact):
+            new, speed = self.pose[:2], 0.0
+        self._seconds, self._speed = self._seconds + dt, float(speed)
+        self.pose = np.array([new[0], new[1], theta + turn * dt])
+
+    def rest(self, dt: float) -> None:
+        """Stand for dt seconds."""
+        self._seconds, self._speed = self._seconds + dt, 0.0
+
+    def put_down(self, rng: np.random.Generator, others: Float) -> None:
+        """Go on from a place of its way far from here, facing anywhere.
+
+        Args:
+            rng: which one.
+            others: (N, 2) where people and corners of vehicles are, metres.
+        """
+        away = np.hypot(*(self._way - self.pose[:2]).T)
+        places = np.flatnonzero(away > _ELSEWHERE * away.max())
+        if not self._closed:  # or the recording would soon be over
+            places = places[places < (1.0 - _ELSEWHERE) * len(self._way)]
+        for at in rng.permutation(places).tolist():
+            near = np.hypot(*(others - self._way[at]).T).min(initial=np.inf)
+            if near > _ROOM:
+                self._at = at
+                break
+        self.pose = np.array([*self._way[self._at], rng.uniform(-np.pi, np.pi)])
+        self._speed, self._waited = 0.0, 0.0
+
+    def undisturbed_time(self) -> float:
+        """Seconds that one lap takes at full speed."""
+        return len(self._way) * _SPACING / self._options.speed
+
+    def way_ahead(self, reach: float) -> Float:
+        """(K, 2) the next `reach` metres of its route."""
+        return np.asarray(self._way[self._ahead(round(reach / _SPACING))])
+
+    def _ahead(self, count: int) -> NDArray[np.int64]:
+        ahead = np.arange(self._at, self._at + count + 1)
+        last = len(self._way) - 1
+        return ahead % len(self._way) if self._closed else np.minimum(ahead, last)
+
+    def _facing(self, error: float) -> float:
+        """How much of its speed it drives so many rad off its way; what brakes slowly, later."""
+        share = 1.0 - abs(error) / _TURN_IN_PLACE
+        if self._options.acceleration is not None:
+            share = min(1.0, 1.0 + share)
+        return max(0.0, share)
+
+    def _fast(self) -> float:
+        """m/s, the speed that it looks ahead for: its own, if it takes time to change that."""
+        return self._options.speed if self._options.acceleration is None else self._speed
+
+    def _carrot(self) -> int:
+        """How many points of the way ahead the one is that it steers for."""
+        return round(max(_CARROT, _CARROT_TIME * self._fast()) / _SPACING)
+
+    def _advance(self) -> None:
+        ahead = self._ahead(2 * self._carrot())
+        nearest = int(ahead[np.argmin(np.hypot(*(self._way[ahead] - self.pose[:2]).T))])
+        self.arrived = not self._closed and nearest == len(self._way) - 1
+        self._at = nearest
+
+    def _careful(self, dt: float, speed: float, people: Float, contact: float) -> float:
+        """The speed that people ahead allow."""
+        c, s = np.cos(self.pose[2]), np.sin(self.pose[2])
+        dx, dy = (people - self.pose[:2]).T
+        x, y = c * dx + s * dy, c * dy - s * dx
+        sees = max(_SEES_AHEAD, contact + 0.1 + _SEES_AHEAD_TIME * self._fast())
+        ahead = (x > 0) & (x < sees) & (np.abs(y) < contact)
+        gap = float(x[ahead].min(initial=np.inf)) - contact
+        allowed = max(0.0, gap - 0.1)
+        if speed > 0 and allowed < 0.1:
+            self._waited += dt
+        else:
+            self._waited = max(0.0, self._waited - dt)
+        self.impatient = self._waited > self._options.patience
+        return min(speed, max(allowed, _CREEP if self.impatient else 0.0))
+
+    def _is_free(self, xy: Float, people: Float, contact: float) -> bool:
+        clear, _ = self._space.clearance_at(np.stack([xy, self.pose[:2]]))
+        near = np.hypot(*(people - xy).T).min(initial=np.inf)
+        # a robot that has cut a corner may always go back to where there is more room
+        return bool(clear[0] >= min(self._options.radius, clear[1]) and near >= contact)
+
+
+def plan_way(route: tuple[Point, ...], planner: Planner, closed: bool) -> Float:
+    """(N, 2) points every few centimetres along the route, around walls; closed: and back."""
+    stops = [np.array(p, float) for p in route]
+    if closed:
+        stops.append(stops[0])
+    corners = [stops[0]]
+    for stop in stops[1:]:
+        if planner.sees(corners[-1], stop[None])[0]:
+            corners.append(stop)
+        else:
+            corners.extend(planner.path(corners[-1], planner.node(stop)))
+    line = np.array(corners)
+    lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    along = np.linspace(0.0, lengths[-1], max(2, int(lengths[-1] / _SPACING) + 1))
+    return np.stack([np.interp(along, lengths, line[:, k]) for k in (0, 1)], axis=-1)

@@ -1,0 +1,193 @@
+"""The simulation itself: people and robot move, the laser looks, odometry drifts."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.sim import laser, lidar, recorder, sweep
+from stillmap.sim.camera import Photographs
+from stillmap.sim.dynamics import Progress
+from stillmap.sim.episode import Happening, let_happen
+from stillmap.sim.options import LaserOptions
+from stillmap.sim.recorder import World
+from stillmap.sim.scene import Scene
+from stillmap.sim.sweep import Sweep
+from stillmap.sim.truth import Truth
+from stillmap.sim.truth_images import PictureTruth, picture_truth
+
+Float = NDArray[np.float64]
+
+_MOTION_SHARE = 0.7  # of the time that a simulation takes, for progress
+_MOTION_SHARE_3D = 0.05  # the same with a lidar
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A scene, what the robot recorded in it, and what really happened.
+
+    Attributes:
+        scene: the world and all parameters.
+        recording: what was recorded; its pictures are rendered when they are read.
+        truth: of the beams.
+        photographs: the pictures of its cameras with the truth about them; None: there are none.
+        surfaces: the truth about these and about what they show.
+    """
+
+    scene: Scene
+    recording: Recording
+    truth: Truth
+    photographs: Photographs | None = None
+    surfaces: PictureTruth | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RigSimulation:
+    """What a laser that lies flat and one that tilts recorded in the same world, on one clock.
+
+    Attributes:
+        horizontal: the first, in 2D.
+        tilting: the second, in 3D; its points are in the frame of the pivot, which does not tilt.
+        joint_angle: (T,) rad at each stamp of `tilting`, nose down.
+    """
+
+    horizontal: Simulation
+    tilting: Simulation
+    joint_angle: Float
+
+
+def simulate(
+    scene: Scene,
+    rng: np.random.Generator | int = 0,
+    progress: Progress | None = None,
+    scratch: Path | None = None,
+) -> Simulation:
+    """Let a robot record a scene.
+
+    People, laser, odometry, doors, vehicles and mishaps draw from generators of their own, spawned
+    from `rng`: another laser or odometry leaves the way everybody goes unchanged.
+
+    A door, vehicle or thing that does not move once while the robot records is a wall: no recording
+    could tell it from one.
+
+    Args:
+        scene: the world and all parameters. With a lidar the recording and its truth are in 3D.
+        rng: the generator, or a seed for one. The same seed gives the same recording to the bit.
+        progress: called now and then with the share that is done, 0 to 1.
+        scratch: folder for what a lidar records, where that is too large for memory; None: the
+            system's temporary folder.
+
+    Raises:
+        InputError: no room for the robot on its route or for the people, or the robot is held up;
+            or two lasers record, see `simulate_rig`.
+        OSError: the disk is full.
+    """
+    if scene.rig.tilts:
+        raise InputError("a rig of two lasers makes two recordings", hint="simulate_rig")
+    tell, share = progress or _silent, _MOTION_SHARE_3D if scene.in_3d else _MOTION_SHARE
+    happening = let_happen(scene, np.random.default_rng(rng), _between(0.0, share, tell))
+    if scene.in_3d:
+        world, sensor = World.of(happening), lidar.spinning(scene)
+        rest, own_rng = _between(share, 1.0, tell), happening.sensor_rng
+        made = _photographed(world, *recorder.record(world, sensor, own_rng, rest, scratch))
+    else:
+        recording, mover = _record(happening)
+        static, T_world_base = recording.hit & (mover < 0), se2.matrix(*happening.motion.robot.T)
+        made = Simulation(scene, recording, happening.truth(static, mover, T_world_base))
+    tell(1.0)
+    return made
+
+
+def simulate_rig(
+    scene: Scene,
+    rng: np.random.Generator | int = 0,
+    progress: Progress | None = None,
+    scratch: Path | None = None,
+) -> RigSimulation:
+    """Let a robot with two lasers record a scene, one of which tilts.
+
+    Arguments and errors are those of `simulate`; `scene.rig.tilts` must be set.
+    """
+    if not scene.rig.tilts:
+        raise InputError("no laser of the scene tilts", hint="rig.tilts=true")
+    tell, share = progress or _silent, _MOTION_SHARE_3D
+    rng = np.random.default_rng(rng)
+    happening = let_happen(scene, rng, _between(0.0, share, tell))
+    world, (flat, tilted), half = World.of(happening), lidar.of_rig(scene), (1 + share) / 2
+    first, second = _between(share, half, tell), _between(half, 1.0, tell)
+    below = recorder.record(world, flat, happening.sensor_rng, first, scratch)
+    above = recorder.record(world, tilted, happening.body_rng, second, scratch)
+    # that which builds in 3D has the pictures
+    horizontal, tilting = Simulation(scene, *below), _photographed(world, *above)
+    tell(1.0)
+    stamps = np.arange(len(happening.motion.robot)) / scene.scan_rate
+    return RigSimulation(horizontal, tilting, lidar.joint_angle(stamps, scene.rig))
+
+
+def _photographed(world: World, recording: Recording, truth: Truth) -> Simulation:
+    """A recording in 3D with the pictures of the scene's cameras, if it has any."""
+    scene = world.happening.scene
+    if not scene.camera.enabled:
+        return Simulation(scene, recording, truth)
+    photographs = Photographs(world)
+    recording = replace(recording, images=photographs.images)
+    return Simulation(scene, recording, truth, photographs, picture_truth(world, photographs))
+
+
+def _record(happening: Happening) -> tuple[Recording, NDArray[np.int32]]:
+    """The recording of a planar laser, and the mover (M,) that each of its beams met."""
+    scene, motion, walls = happening.scene, happening.motion, happening.walls
+    o, T = scene.laser, len(motion.robot)
+    T_base_sensor, sensor = _sensors(o), np.arange(T, dtype=np.int32) % o.count
+    exact = sweep.cast(motion, walls, T_base_sensor[sensor], o)
+    is_glass = np.zeros(len(walls), bool)
+    is_glass[len(scene.walls) : len(scene.walls) + len(scene.glass)] = True
+    ranges, hit = laser.measure(exact, is_glass, o, happening.sensor_rng)
+    angles = laser.beam_angles(o.beams, o.fov)
+    if o.upside_down == "known":
+        angles = -angles
+    points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    recording = Recording(
+        stamp_ns=happening.stamp_ns,
+        offset=np.arange(T + 1, dtype=np.int64) * o.beams,
+        points=points.reshape(-1, 2).astype(np.float32),
+        hit=hit.ravel(),
+        T_base_sensor=T_base_sensor,
+        sensor=sensor,
+        T_odom_base=happening.T_odom_base,
+        source=happening.source(_described(o, angles)),
+        beam_time=np.tile(Sweep.of(o).beam_times(o.beams), T) if o.sweep_time > 0 else None,
+    )
+    return recording, np.where(hit, exact.mover, np.int32(-1)).ravel()
+
+
+def _sensors(o: LaserOptions) -> Float:
+    """(S, 3, 3) T_base_sensor."""
+    front = se2.matrix(o.x, o.y, o.yaw)
+    return np.stack([front, se2.matrix(0.0, 0.0, np.pi) @ front][: o.count])
+
+
+def _described(o: LaserOptions, angles: Float) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": name,
+            "beams_per_scan": len(angles),
+            "start_angle": float(angles[0]),
+            "angle_step": float(angles[1] - angles[0]),
+        }
+        for name in ("simulated laser", "simulated rear laser")[: o.count]
+    ]
+
+
+def _between(first: float, last: float, tell: Progress) -> Progress:
+    """Tells of a part of the whole."""
+    return lambda share: tell(first + (last - first) * share)
+
+
+def _silent(share: float) -> None:
+    pass

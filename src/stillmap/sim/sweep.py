@@ -1,0 +1,125 @@
+"""A scan takes time: its beams are taken one after the other, while robot and movers go on."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.sim import laser
+from stillmap.sim.dynamics import Motion
+from stillmap.sim.laser import Movers, Outlines, Returns
+from stillmap.sim.options import LaserOptions
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_GROUPS = 64  # at most, in which the beams of a scan are taken; those of a group at once
+_TOGETHER = 1000  # groups of beams worked on together
+_SURELY = 10.0  # standard deviations of a range
+_FASTEST = 40.0  # m/s; what is farther away at the next scan has begun its lane again
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """When the beams of a scan are taken.
+
+    Attributes:
+        group: how many beams are taken at once; the last group may be smaller.
+        seconds: (G,) after the scan's stamp, of each group.
+    """
+
+    group: int
+    seconds: Float
+
+    @classmethod
+    def of(cls, options: LaserOptions) -> "Sweep":
+        """The sweep of a laser: times grow with the beams' angles, the field of view takes all."""
+        n = options.beams
+        if options.sweep_time == 0:
+            return cls(n, np.zeros(1))
+        group = max(2, math.ceil(n / _GROUPS))
+        first = np.arange(0, n, group)
+        middle = (first + np.minimum(first + group, n) - 1) / 2
+        angles = laser.beam_angles(n, options.fov)
+        share = middle * (angles[1] - angles[0]) / options.fov
+        return cls(group, options.sweep_time * share)
+
+    def beam_times(self, beams: int) -> NDArray[np.float32]:
+        """(n,) seconds after the stamp, of each beam of a scan."""
+        return np.repeat(self.seconds, self.group)[:beams].astype(np.float32)
+
+
+def cast(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOptions) -> Returns:
+    """The nearest thing on every beam of every scan.
+
+    Args:
+        motion: where everything is at T scans.
+        walls: (W, 4) segments in metres.
+        T_base_sensor: (T, 3, 3) where the laser sits that took each scan.
+        o: the lasers.
+
+    Returns:
+        Beams in the order in which a scan has them: from the last angle to the first if the laser
+        hangs upside down.
+    """
+    sweep, angles = Sweep.of(o), laser.beam_angles(o.beams, o.fov)
+    T, G = len(motion.robot), len(sweep.seconds)
+    reach = o.max_range + _SURELY * o.range_noise
+    # a group of beams is a scan of its own, turned so that the first group's angles fit
+    turned, group = np.arange(G) * sweep.group * (angles[1] - angles[0]), angles[: sweep.group]
+    order = slice(None)
+    if o.upside_down != "no":
+        turned, group, order = -turned, -group[::-1], slice(None, None, -1)
+    block = max(1, _TOGETHER // G)
+    parts = []
+    for first in range(0, T, block):
+        scans = np.arange(first, min(first + block, T))
+        now = Moment(motion, np.repeat(scans, G), np.tile(sweep.seconds, len(scans)))
+        T_robot_sensor = np.repeat(T_base_sensor[scans], G, axis=0)
+        poses = se2.parameters(se2.matrix(*now.at(motion.robot).T) @ T_robot_sensor)
+        poses[:, 2] += np.tile(turned, len(scans))
+        part = laser.cast(poses, group, walls, *now.seen(), reach)
+        parts.append(
+            [values[:, order].reshape(-1, G * sweep.group)[:, : o.beams] for values in part]
+        )
+    return Returns(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+class Moment:
+    """Where everything is at N times: `seconds` (N,) after the stamps of `scans` (N,).
+
+    Between two scans all goes on evenly; after the last one as before it.
+    """
+
+    def __init__(self, motion: Motion, scans: Index, seconds: Float) -> None:
+        self._motion = motion
+        later = seconds / motion.period
+        # nothing goes on evenly while the robot is carried elsewhere, or stands overnight
+        breaks = np.unique([0, motion.carried, motion.paused, len(motion.robot)])
+        piece = np.searchsorted(breaks, scans, side="right")
+        self._last = breaks[piece] - 1
+        first, last = breaks[piece - 1], self._last - (later > 0)
+        self._scan, self._leap = scans, _FASTEST * motion.period
+        self._before = np.maximum(np.minimum(scans + later.astype(np.int64), last), first)
+        self._share = scans + later - self._before
+
+    def seen(self) -> tuple[Movers, Outlines]:
+        """What a laser sees of the movers."""
+        people, outlines, things = self._motion.people, self._motion.outlines, self._motion.things
+        xy, heading = self.at(people.xy), self.at(people.heading)
+        # things do not fly from place to place
+        faces = np.concatenate([self.at(outlines.faces), things.faces[self._scan]], axis=1)
+        return (
+            Movers(xy, heading, people.semi_axes, people.mover),
+            Outlines(faces, np.concatenate([outlines.mover, things.mover])),
+        )
+
+    def at(self, values: Float) -> Float:
+        """(N, ...) values, which are given at all scans (T, ...)."""
+        before = values[self._before]
+        change = values[np.minimum(self._before + 1, self._last)] - before
+        share = self._share.reshape(-1, *[1] * (values.ndim - 1))
+        leaps = np.abs(change) > self._leap
+        return np.where(leaps, values[self._scan], before + share * change)

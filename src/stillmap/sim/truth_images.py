@@ -1,0 +1,159 @@
+"""The truth about pictures, surfaces and colours of a simulation, as files beside the truth of its
+beams."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import open_npy, write_npy, write_npz
+from stillmap.core.camera import Images
+from stillmap.core.errors import InputError
+from stillmap.io.images import read_picture, write_picture
+from stillmap.sim.camera import Photographs
+from stillmap.sim.geometry import Faces, Ground, Solids
+from stillmap.sim.recorder import World
+from stillmap.sim.truth_surfaces import Moving, Standing
+
+Float = NDArray[np.float64]
+
+_IMAGES = "images"
+_STANDING, _MOVING, _POSE = "standing.npz", "moving.npz", "moving_pose.npy"
+_CAMERAS = "T_world_camera.npy"
+_FARTHEST = 65.535  # m, that a picture of millimetres holds
+
+
+@dataclass(frozen=True, eq=False)
+class PictureTruth:
+    """What is known of N pictures and of the world that they show.
+
+    Attributes:
+        colour_seed: of `colours.static_colour`.
+        standing, moving: the true surfaces.
+        T_world_camera: (N, 4, 4) from where each picture was taken.
+        mask: of a picture, (h, w) uint16; 0: something that stands still, k + 1: mover k, 65535:
+            nothing.
+        distance: of a picture, (h, w) float32 metres along each pixel's ray; inf: nothing, or too
+            far.
+    """
+
+    colour_seed: int
+    standing: Standing
+    moving: Moving
+    T_world_camera: Float
+    mask: Callable[[int], NDArray[np.uint16]]
+    distance: Callable[[int], NDArray[np.float32]]
+
+
+def picture_truth(world: World, photographs: Photographs) -> PictureTruth:
+    """The truth about the pictures of a world."""
+    return PictureTruth(
+        photographs.colour_seed,
+        *surfaces(world),
+        photographs.T_world_camera,
+        lambda image: photographs.take(image).mask,
+        lambda image: photographs.take(image).distance,
+    )
+
+
+def surfaces(world: World) -> tuple[Standing, Moving]:
+    """The surfaces of a world; what might have moved, and never did, stands still."""
+    poses = []
+    for scan in range(len(world.ridden)):
+        moment = world.moment(np.array([scan]), np.zeros(1))
+        carried = world.carried.at(moment, scan)
+        poses.append(carried.pose[0])
+    carried = carried._replace(pose=np.stack(poses))
+    moves = carried.mover >= 0
+    never = carried._replace(pose=carried.pose[:1]).some(~moves)
+    ceiling = world.happening.scene.heights.ceiling
+    standing = Standing(world.faces, world.still.with_others(never), world.ground, ceiling)
+    return standing, Moving(world.happening.exact_ns, carried.some(moves))
+
+
+def write_picture_truth(truth: PictureTruth, folder: Path) -> None:
+    """Write all but the pictures' own truth into an existing folder."""
+    faces, solids, ground, ceiling = truth.standing
+    standing: dict[str, NDArray[Any]] = {
+        "faces_ends": faces.ends,
+        "faces_z": faces.z,
+        "faces_glass": faces.is_glass,
+        **{f"solids_{name}": value for name, value in solids._asdict().items()},
+        **{f"ground_{name}": np.asarray(value) for name, value in ground._asdict().items()},
+        "ceiling": np.array(np.nan if ceiling is None else ceiling),
+        "colour_seed": np.array(truth.colour_seed),
+    }
+    write_npz(folder / _STANDING, standing)
+    moving = truth.moving.solids._asdict()
+    write_npy(folder / _POSE, moving.pop("pose"))
+    write_npz(folder / _MOVING, {"stamp_ns": truth.moving.stamp_ns, **moving})
+    np.save(folder / _CAMERAS, truth.T_world_camera)
+
+
+def writing_truth(photographs: Photographs, folder: Path) -> Images:
+    """The pictures; when one is read, its truth goes into a folder.
+
+    So each is rendered once only.
+    """
+    inside = folder / _IMAGES
+    inside.mkdir()
+
+    def load(image: int) -> NDArray[np.uint8]:
+        one = photographs.take(image)
+        write_picture(one.mask, inside / f"{image:06d}.png")
+        near = np.where(one.distance < _FARTHEST, one.distance, 0.0)
+        write_picture(np.rint(1e3 * near).astype(np.uint16), inside / _distance(image))
+        return one.colour
+
+    images = photographs.images
+    return Images(images.stamp_ns, images.camera, images.cameras, load)
+
+
+def load_picture_truth(path: str | Path) -> PictureTruth:
+    """The truth about the pictures of a simulation, given its folder or the `truth` inside.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
+    folder = Path(path)
+    if (folder / "truth").is_dir():
+        folder = folder / "truth"
+    if not (folder / _STANDING).is_file():
+        hint = "a folder that 'stillmap simulate ... --camera' wrote"
+        raise InputError("holds no truth about pictures", where=str(path), hint=hint)
+    try:
+        of, moves = _arrays(folder / _STANDING), _arrays(folder / _MOVING)
+        faces = Faces(of["faces_ends"], of["faces_z"], of["faces_glass"])
+        solids = Solids(*(of[f"solids_{name}"] for name in Solids._fields))
+        kerb = float(of["ground_kerb"])
+        ground = Ground(of["ground_slope"], of["ground_bend"], of["ground_pavements"], kerb)
+        ceiling, seed = float(of["ceiling"]), int(of["colour_seed"])
+        parts = Solids(open_npy(folder / _POSE), *(moves[name] for name in Solids._fields[1:]))
+        moving = Moving(moves["stamp_ns"], parts)
+        T_world_camera = np.array(open_npy(folder / _CAMERAS))
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise InputError(f"is damaged: {error}", where=str(folder)) from error
+    standing = Standing(faces, solids, ground, None if np.isnan(ceiling) else ceiling)
+    inside = folder / _IMAGES
+
+    def mask(image: int) -> NDArray[np.uint16]:
+        return read_picture(inside / f"{image:06d}.png")
+
+    def distance(image: int) -> NDArray[np.float32]:
+        metres = read_picture(inside / _distance(image)).astype(np.float32) / 1e3
+        return np.where(metres > 0.0, metres, np.float32(np.inf))
+
+    return PictureTruth(seed, standing, moving, T_world_camera, mask, distance)
+
+
+def _distance(image: int) -> str:
+    return f"{image:06d}-distance.png"
+
+
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+    with np.load(path, allow_pickle=False) as archive:
+        return dict(archive)

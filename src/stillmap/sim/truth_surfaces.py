@@ -1,0 +1,337 @@
+"""The true surfaces of what stands still in a simulated world: how far points are from them.
+
+The true surfaces of what moves in a simulated world, as points.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.sim.geometry import BOX, CYLINDER, Faces, Ground, Solids
+
+Float = NDArray[np.float64]
+
+Nearest = Callable[[Float], Float]
+
+_Thing = tuple[Float, Float, Nearest]
+
+_SQUARE = 4.0  # m, within which points have the same things near
+
+_HALVINGS = 80  # after which the nearest point of an ellipse is known to the last digit
+
+
+class Standing(NamedTuple):
+    """What stands still in a world.
+
+    Attributes:
+        faces, solids: what there is; the solids at all times.
+        ground: the ground.
+        ceiling: metres above it; None: the open sky.
+    """
+
+    faces: Faces
+    solids: Solids
+    ground: Ground
+    ceiling: float | None
+
+    def nearest(self, points: Float) -> tuple[Float, Float]:
+        """The nearest places of the surfaces.
+
+        Exact for solids, and for faces and ground where the ground is level; where it slopes, up
+        to the square of the slope. Surfaces within others count: the floor below a cupboard.
+
+        Args:
+            points: (n, 3) metres.
+
+        Returns:
+            (n,) distances in metres, and the places (n, 3).
+        """
+        places = _on_ground(points, self.ground, self.ceiling)
+        distance = np.linalg.norm(places - points, axis=1)
+        things = list(self._things())
+        lowest = np.array([low for low, _, _ in things]).reshape(-1, 2)
+        highest = np.array([high for _, high, _ in things]).reshape(-1, 2)
+        for part in _in_squares(points):
+            some, d, at = points[part], distance[part], places[part]
+            low, high = some[:, :2].min(axis=0), some[:, :2].max(axis=0)
+            off = np.maximum(np.maximum(lowest - high, low - highest), 0.0)
+            for k in np.flatnonzero((off * off).sum(axis=1) < d.max() ** 2).tolist():
+                _take_nearer(some, d, at, things[k])
+            distance[part], places[part] = d, at
+        return distance, places
+
+    def _things(self) -> Iterator[_Thing]:
+        """Least and greatest x and y of each thing, and its nearest places."""
+        for ends, z in zip(self.faces.ends, self.faces.z, strict=True):
+            low, high = np.minimum(ends[:2], ends[2:]), np.maximum(ends[:2], ends[2:])
+            yield low, high, partial(_on_face, ends=ends, z=z, ground=self.ground)
+        for k, pose in enumerate(self.solids.pose[0]):
+            reach = float(np.hypot(*self.solids.half[k]))
+            nearest = partial(nearest_on_solid, solids=self.solids, k=k)
+            yield pose[:2] - reach, pose[:2] + reach, nearest
+
+
+def _in_squares(points: Float) -> Iterator[NDArray[np.intp]]:
+    """Numbers of the points (n, 3) in each square of the plane that has any."""
+    if not len(points):
+        return
+    cell = np.floor(points[:, :2] / _SQUARE).astype(np.int64)
+    cell -= cell.min(axis=0)
+    key = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
+    order = np.argsort(key, kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
+
+
+def _take_nearer(points: Float, distance: Float, places: Float, thing: _Thing) -> None:
+    """Replaces places (n, 3) and how far they are from points by those of a thing, if nearer."""
+    low, high, nearest = thing
+    off = np.maximum(np.maximum(low - points[:, :2], points[:, :2] - high), 0.0)
+    near = np.flatnonzero((off * off).sum(axis=1) < distance * distance)
+    if not len(near):
+        return
+    found = nearest(points[near])
+    d = np.linalg.norm(found - points[near], axis=1)
+    better = d < distance[near]
+    distance[near[better]], places[near[better]] = d[better], found[better]
+
+
+def to_world(local: Float, pose: Float) -> Float:
+    """(n, 3) of points in the frame of a solid at poses (4,) or (n, 4): x, y, heading, foot."""
+    x, y, heading, foot = np.moveaxis(pose, -1, 0)
+    c, s = np.cos(heading), np.sin(heading)
+    u, v, w = local.T
+    return np.stack([x + c * u - s * v, y + s * u + c * v, foot + w], axis=1)
+
+
+def to_local(points: Float, pose: Float) -> Float:
+    """The inverse of `to_world`."""
+    x, y, heading, foot = np.moveaxis(pose, -1, 0)
+    c, s = np.cos(heading), np.sin(heading)
+    u, v = points[:, 0] - x, points[:, 1] - y
+    return np.stack([c * u + s * v, c * v - s * u, points[:, 2] - foot], axis=1)
+
+
+def nearest_on_solid(points: Float, solids: Solids, k: int) -> Float:
+    """(n, 3) the places of the surface of solid k nearest to points (n, 3), each at a time of its
+    own, or all at one."""
+    (a, b), (z0, z1) = solids.half[k], solids.z[k]
+    pose, form = solids.pose[:, k], solids.form[k]
+    middle, h = np.array([0.0, 0.0, (z0 + z1) / 2]), (z1 - z0) / 2
+    p = to_local(points, pose) - middle
+    if form == BOX:
+        found = _on_box(p, np.array([a, b, h]))
+    elif form == CYLINDER:
+        found = _on_cylinder(p, np.array([a, b]), h)
+    else:
+        found = _on_ellipsoid(p, np.array([a, b, h]))
+    return to_world(found + middle, pose)
+
+
+def _on_ground(points: Float, ground: Ground, ceiling: float | None) -> Float:
+    """The nearest places of street, pavements and ceiling."""
+    x, y, z = points.T
+    level = ground.level(x, y)
+    gx, gy = ground.gradient(x, y)
+    steep = 1.0 + gx * gx + gy * gy
+    above = [ground.kerb * ground.is_paved(x, y)]
+    if ceiling is not None:
+        above.append(np.full(len(points), ceiling))
+    best, places = np.full(len(points), np.inf), points.copy()
+    for up in above:
+        over = (z - level - up) / steep
+        d = np.abs(over) * np.sqrt(steep)
+        found = np.stack([x + gx * over, y + gy * over, z - over], axis=1)
+        places = np.where((d < best)[:, None], found, places)
+        best = np.minimum(best, d)
+    return places
+
+
+def _on_face(points: Float, ends: Float, z: Float, ground: Ground) -> Float:
+    start, along = ends[:2], ends[2:] - ends[:2]
+    share = (points[:, :2] - start) @ along / max(float(along @ along), 1e-24)
+    xy = start + np.clip(share, 0.0, 1.0)[:, None] * along
+    level = ground.level(*xy.T)
+    return np.column_stack([xy, np.clip(points[:, 2], level + z[0], level + z[1])])
+
+
+def _on_box(p: Float, half: Float) -> Float:
+    out = np.clip(p, -half, half)
+    inside = np.flatnonzero((np.abs(p) < half).all(axis=1))
+    axis = (half - np.abs(p[inside])).argmin(axis=1)
+    out[inside, axis] = np.where(p[inside, axis] < 0, -half[axis], half[axis])
+    return out
+
+
+def _on_cylinder(p: Float, half: Float, h: float) -> Float:
+    rim = _on_ellipsoid(p[:, :2], half)
+    within = (p[:, :2] ** 2 / half**2).sum(axis=1) <= 1.0
+    z = np.clip(p[:, 2], -h, h)
+    out = np.column_stack([np.where(within[:, None], p[:, :2], rim), z])
+    inside = within & (np.abs(p[:, 2]) < h)
+    to_side = np.linalg.norm(rim - p[:, :2], axis=1)
+    side = inside & (to_side < h - np.abs(p[:, 2]))
+    out[side, :2] = rim[side]
+    cap = inside & ~side
+    out[cap, 2] = np.where(p[cap, 2] < 0, -h, h)
+    return out
+
+
+def _on_ellipsoid(p: Float, half: Float) -> Float:
+    """The nearest places of an ellipse or ellipsoid (D half axes) to points (n, D).
+
+    They are half^2 |p| / (t + half^2) for the greatest root t of sum (half |p| / (t + half^2))^2
+    = 1 (Eberly, "Distance from a point to an ellipse, an ellipsoid, or a hyperellipsoid", 2013),
+    found by halving.
+    """
+    if not len(p):
+        return p.copy()
+    q = np.maximum(np.abs(p), 1e-9 * half.min())  # off the axes, where the root is a pole
+    squares, least = half * half, half.argmin()
+    low = -squares[least] + half[least] * q[:, least]
+    high = -squares[least] + np.linalg.norm(half * q, axis=1)
+    for _ in range(_HALVINGS):
+        t = 0.5 * (low + high)
+        beyond = ((half * q / (t[:, None] + squares)) ** 2).sum(axis=1) > 1.0
+        low, high = np.where(beyond, t, low), np.where(beyond, high, t)
+    found = squares * q / (0.5 * (low + high)[:, None] + squares)
+    return np.asarray(np.copysign(found, p))
+
+
+_FASTEST = 40.0  # m/s; what goes faster has begun its way again elsewhere
+
+_INSIDE = 1e-6  # m, points less deep in another part are on the surface
+
+
+class Moving(NamedTuple):
+    """The parts of what moves, at T scans.
+
+    Attributes:
+        stamp_ns: (T,) by the clock of the scans.
+        solids: the parts, at these times.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    solids: Solids
+
+    def parts(self, mover: int) -> NDArray[np.intp]:
+        """The numbers of a mover's parts."""
+        return np.flatnonzero(self.solids.mover == mover)
+
+    def at(self, parts: NDArray[np.intp], stamp_ns: NDArray[np.int64] | int) -> Solids:
+        """Some parts at n times; between two scans, and during the last one, they go on evenly."""
+        at_ns, last = np.atleast_1d(np.asarray(stamp_ns, np.int64)), len(self.stamp_ns) - 1
+        t = np.clip(np.searchsorted(self.stamp_ns, at_ns, side="right") - 1, 0, max(last - 1, 0))
+        after = np.minimum(t + 1, last)
+        span, since = self.stamp_ns[after] - self.stamp_ns[t], at_ns - self.stamp_ns[t]
+        share = np.clip(since / np.where(span > 0, span, np.inf), 0.0, 2.0)[:, None, None]
+        before = self.solids.pose[t[:, None], parts]
+        change = self.solids.pose[after[:, None], parts] - before
+        change[..., 2] = (change[..., 2] + np.pi) % (2 * np.pi) - np.pi
+        way = np.hypot(change[..., 0], change[..., 1])
+        goes_on = way < _FASTEST * 1e-9 * np.maximum(span, 1)[:, None]
+        # who is somewhere else in the next scan was put there
+        stays = np.where(share < 1.0, before, before + change)
+        pose = np.where(goes_on[..., None], before + share * change, stays)
+        return self.solids._replace(pose=self.solids.pose[:1]).some(parts)._replace(pose=pose)
+
+
+def mover_points(
+    moving: Moving, mover: int, stamp_ns: int, spacing: float
+) -> tuple[Float, NDArray[np.intp]]:
+    """Points on the surface of a mover at one time.
+
+    What lies within another of its parts is no surface.
+
+    Args:
+        moving: what moves.
+        mover: which.
+        stamp_ns: when.
+        spacing: metres from one point to the next, about.
+
+    Returns:
+        (n, 3) metres in the world, none where it is nowhere; (n,) which of `moving.parts(mover)`
+        each is on.
+    """
+    parts = moving.parts(mover)
+    solids = moving.at(parts, stamp_ns)
+    points, which = [np.empty((0, 3))], [np.empty(0, np.intp)]
+    for k in np.flatnonzero(np.isfinite(solids.pose[0]).all(axis=1)).tolist():
+        on = to_world(_samples(solids, k, spacing), solids.pose[0, k])
+        outside = np.ones(len(on), bool)
+        for other in range(len(parts)):
+            if other != k:
+                outside &= ~_is_within(on, solids, other)
+        points.append(on[outside])
+        which.append(np.full(len(points[-1]), k, np.intp))
+    return np.concatenate(points), np.concatenate(which)
+
+
+def _is_within(points: Float, solids: Solids, k: int) -> NDArray[np.bool_]:
+    (a, b), (z0, z1) = solids.half[k] - _INSIDE, solids.z[k] + (_INSIDE, -_INSIDE)
+    u, v, w = to_local(points, solids.pose[0, k]).T
+    h, up = (z1 - z0) / 2, w - (z0 + z1) / 2
+    if solids.form[k] == BOX:
+        return np.asarray((np.abs(u) < a) & (np.abs(v) < b) & (np.abs(up) < h))
+    flat = (u / a) ** 2 + (v / b) ** 2
+    if solids.form[k] == CYLINDER:
+        return np.asarray((flat < 1.0) & (np.abs(up) < h))
+    return np.asarray(flat + (up / h) ** 2 < 1.0)
+
+
+def _samples(solids: Solids, k: int, spacing: float) -> Float:
+    """(n, 3) points on the surface of solid k, in its frame."""
+    (a, b), (z0, z1) = solids.half[k], solids.z[k]
+    h, middle = (z1 - z0) / 2, np.array([0.0, 0.0, (z0 + z1) / 2])
+    if solids.form[k] == BOX:
+        found = _box_samples(np.array([a, b, h]), spacing)
+    elif solids.form[k] == CYLINDER:
+        found = _cylinder_samples(np.array([a, b]), h, spacing)
+    else:
+        found = _ellipsoid_samples(np.array([a, b, h]), spacing)
+    return np.asarray(found + middle)
+
+
+def _cylinder_samples(half: Float, h: float, spacing: float) -> Float:
+    around = _even(2 * np.pi * half.max(), spacing) * 2 * np.pi
+    angle, up = np.meshgrid(around, _along(h, spacing))
+    rim = [half[0] * np.cos(angle), half[1] * np.sin(angle), up]
+    disc = np.stack(np.meshgrid(*(_along(one, spacing) for one in half)), axis=-1).reshape(-1, 2)
+    disc = disc[((disc / half) ** 2).sum(axis=1) <= 1.0]
+    caps = [np.column_stack([disc, np.full(len(disc), end)]) for end in (-h, h)]
+    return np.concatenate([np.stack(rim, axis=-1).reshape(-1, 3), *caps])
+
+
+def _ellipsoid_samples(half: Float, spacing: float) -> Float:
+    rows = []
+    for tilt in ((_even(np.pi * half.max(), spacing) - 0.5) * np.pi).tolist():
+        round_it = 2 * np.pi * half[:2].max() * np.cos(tilt)
+        angle = _even(round_it, spacing) * 2 * np.pi
+        flat = np.cos(tilt) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        rows.append(half * np.column_stack([flat, np.full(len(angle), np.sin(tilt))]))
+    return np.concatenate(rows)
+
+
+def _box_samples(half: Float, spacing: float) -> Float:
+    sides = []
+    for axis in range(3):
+        others = [(axis + 1) % 3, (axis + 2) % 3]
+        grid = np.meshgrid(*(_along(half[one], spacing) for one in others))
+        for end in (-half[axis], half[axis]):
+            side = np.full((grid[0].size, 3), end)
+            side[:, others] = np.stack(grid, axis=-1).reshape(-1, 2)
+            sides.append(side)
+    return np.concatenate(sides)
+
+
+def _along(half: float, spacing: float) -> Float:
+    """Middles of equal parts of -half to half."""
+    return half * (2.0 * _even(2.0 * half, spacing) - 1.0)
+
+
+def _even(length: float, spacing: float) -> Float:
+    """Middles of equal parts of 0 to 1, each no longer than `spacing` of `length`."""
+    n = max(1, int(np.ceil(length / spacing - 1e-9)))
+    return np.asarray((np.arange(n) + 0.5) / n)

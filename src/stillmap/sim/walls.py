@@ -1,0 +1,137 @@
+"""Drawing worlds: common pieces of buildings as wall segments x0, y0, x1, y1."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from stillmap.sim.scene import Door, Point, Segment
+
+Side = Literal["north", "south", "east", "west"]
+
+# unit vectors along a wall and out of the hall through it
+_ALONG: dict[Side, Point] = {
+    "south": (1.0, 0.0),
+    "north": (1.0, 0.0),
+    "west": (0.0, 1.0),
+    "east": (0.0, 1.0),
+}
+_OUT: dict[Side, Point] = {
+    "south": (0.0, -1.0),
+    "north": (0.0, 1.0),
+    "west": (-1.0, 0.0),
+    "east": (1.0, 0.0),
+}
+
+
+@dataclass(frozen=True)
+class Opening:
+    """A piece of a wall that steps back.
+
+    Attributes:
+        start: metres along the wall.
+        width: metres.
+        depth: metres; how far the closed door stands back, or how thick the open doorway is.
+        is_open: a doorway without a door: nothing closes it.
+    """
+
+    start: float
+    width: float = 1.0
+    depth: float = 0.2
+    is_open: bool = False
+
+
+def polyline(points: Sequence[Point], closed: bool = False) -> list[Segment]:
+    """Segments from point to point; `closed` joins the last one to the first."""
+    ends = [*points[1:], points[0]] if closed else points[1:]
+    return [(*a, *b) for a, b in zip(points, ends, strict=closed)]
+
+
+def box(x: float, y: float, width: float, height: float, angle: float = 0.0) -> list[Segment]:
+    """The four sides of a box centred at x, y and turned by `angle` radians."""
+    c, s = math.cos(angle), math.sin(angle)
+    corners = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+    halves = [(i * width / 2, j * height / 2) for i, j in corners]
+    return polyline([(x + c * u - s * v, y + s * u + c * v) for u, v in halves], closed=True)
+
+
+def pillar(x: float, y: float, radius: float, sides: int = 8) -> list[Segment]:
+    """A column as a regular polygon with corners at `radius`."""
+    turns = [2 * math.pi * (k + 0.5) / sides for k in range(sides)]
+    corners = [(x + radius * math.cos(a), y + radius * math.sin(a)) for a in turns]
+    return polyline(corners, closed=True)
+
+
+def wall(
+    start: Point, length: float, side: Side, openings: Iterable[Opening] = ()
+) -> list[Segment]:
+    """A straight wall along +x or +y whose openings step back to `side`, in ascending order."""
+    (ux, uy), (ox, oy) = _ALONG[side], _OUT[side]
+
+    def at(along: float, out: float) -> Point:
+        return (start[0] + along * ux + out * ox, start[1] + along * uy + out * oy)
+
+    segments: list[Segment] = []
+    done = 0.0
+    for o in openings:
+        end = o.start + o.width
+        segments.append((*at(done, 0), *at(o.start, 0)))
+        segments.append((*at(o.start, 0), *at(o.start, o.depth)))
+        if not o.is_open:
+            segments.append((*at(o.start, o.depth), *at(end, o.depth)))
+        segments.append((*at(end, o.depth), *at(end, 0)))
+        done = end
+    segments.append((*at(done, 0), *at(length, 0)))
+    return [s for s in segments if s[:2] != s[2:]]
+
+
+def room(
+    start: Point,
+    side: Side,
+    along: tuple[float, float],
+    depth: float,
+    door: Opening,
+) -> list[Segment]:
+    """A room behind the open `door` of a wall that begins at `start`.
+
+    Args:
+        start: where the wall begins, as for `wall`.
+        side: the side of the wall on which the room lies.
+        along: where the room begins and ends, metres along the wall.
+        depth: metres, inside, measured from the back of the doorway.
+        door: the doorway, an opening of that same wall.
+    """
+    (ux, uy), (ox, oy) = _ALONG[side], _OUT[side]
+    near, far = door.depth, door.depth + depth
+    corners = [
+        (door.start, near),
+        (along[0], near),
+        (along[0], far),
+        (along[1], far),
+        (along[1], near),
+        (door.start + door.width, near),
+    ]
+    return polyline([(start[0] + a * ux + o * ox, start[1] + a * uy + o * oy) for a, o in corners])
+
+
+def leaf(
+    start: Point, side: Side, opening: Opening, swing: float, hinged_at_end: bool = False
+) -> Door:
+    """A door in the doorway `opening` of a wall that begins at `start`; it opens outwards.
+
+    Args:
+        start: where the wall begins, as for `wall`.
+        side: the side of the wall on which the room lies.
+        opening: the doorway, an opening of that same wall.
+        swing: rad, how far it opens.
+        hinged_at_end: its hinge is where the opening ends, seen along the wall.
+    """
+    (ux, uy), (ox, oy) = _ALONG[side], _OUT[side]
+    gap = 0.02
+    at = opening.start + (opening.width - gap if hinged_at_end else gap)
+    hinge = (start[0] + at * ux + opening.depth * ox, start[1] + at * uy + opening.depth * oy)
+    if hinged_at_end:
+        ux, uy = -ux, -uy
+    closed = math.atan2(uy, ux)
+    turn = swing if ux * oy - uy * ox > 0 else -swing
+    return Door(hinge, opening.width - 2 * gap, closed, closed + turn)

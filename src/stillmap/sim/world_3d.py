@@ -1,0 +1,199 @@
+"""What stands in a world, in 3D: told from its plan, where everything is lines.
+
+Everything that moves, or might have, in 3D: solids carried along by the plan's poses.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.sim import geometry
+from stillmap.sim.dynamics import Motion
+from stillmap.sim.geometry import BOX, Faces, Ground, Part, Solids, assembled
+from stillmap.sim.options import HeightOptions
+from stillmap.sim.scene import Scene, Segment
+from stillmap.sim.sweep import Moment
+
+Float = NDArray[np.float64]
+
+_LARGEST = 6.0  # m, a loop that is longer is a room or a house
+
+_MOST_SIDES = 16
+
+_BELOW = -0.5  # m, how deep walls go, so that no beam gets below them
+
+
+class Loop(NamedTuple):
+    """A closed outline: x, y of its middle, heading, length along and width across it, sides."""
+
+    x: float
+    y: float
+    heading: float
+    length: float
+    width: float
+    sides: int
+
+
+def standing(scene: Scene, ground: Ground) -> tuple[Faces, Solids]:
+    """Walls, lintels and kerbs as faces; columns, furniture, trees and parked cars as solids."""
+    loops, lines = outlines(scene.walls)
+    top = scene.heights.top
+    lintels = [door.leaf(door.closed) for door in scene.leaves if scene.heights.doors < top]
+    kerbs = [side for x0, y0, x1, y1 in scene.pavements for side in _sides(x0, y0, x1, y1)]
+    z = [(_BELOW, top)] * (len(lines) + len(scene.glass))
+    z += [(scene.heights.doors, top)] * len(lintels) + [(_BELOW, ground.kerb)] * len(kerbs)
+    ends = [*lines, *scene.glass, *lintels, *kerbs]
+    is_glass = np.zeros(len(ends), bool)
+    is_glass[len(lines) : len(lines) + len(scene.glass)] = True
+    faces = Faces(np.reshape(ends, (-1, 4)).astype(float), np.reshape(z, (-1, 2)), is_glass)
+    parts = [(k, -1, p) for k, one in enumerate(loops) for p in parts_of(one, scene.heights)]
+    poses = np.reshape([one[:3] for one in loops], (1, -1, 3)).astype(float)
+    return faces, assembled(parts).at(poses, ground.height(poses[..., 0], poses[..., 1]))
+
+
+def parts_of(loop: Loop, heights: HeightOptions) -> list[Part]:
+    """What a closed outline is, in 3D, about its middle and heading."""
+    if loop.sides == 4:
+        return geometry.boxed(loop.length, loop.width, heights)
+    return geometry.round_thing(loop.length / 2, heights)
+
+
+def outlines(walls: Sequence[Segment]) -> tuple[list[Loop], list[Segment]]:
+    """The closed outlines of things in a plan, and the lines that are left."""
+    loops: list[Loop] = []
+    lines: list[Segment] = []
+    for chain in _chains(walls):
+        loop = _loop(chain)
+        if loop is None:
+            lines += chain
+        else:
+            loops.append(loop)
+    return loops, lines
+
+
+def _chains(walls: Sequence[Segment]) -> Iterator[list[Segment]]:
+    """Segments that follow one another, up to where an outline closes."""
+    chain: list[Segment] = []
+    for segment in walls:
+        if chain and not np.allclose(chain[-1][2:], segment[:2], rtol=0.0, atol=1e-6):
+            yield chain
+            chain = []
+        chain.append(segment)
+        if np.allclose(chain[0][:2], segment[2:], rtol=0.0, atol=1e-6):
+            yield chain
+            chain = []
+    if chain:
+        yield chain
+
+
+def _loop(chain: list[Segment]) -> Loop | None:
+    """The outline of a thing; None: the chain is not closed, or it is a room or a house."""
+    starts, ends = np.array(chain)[:, :2], np.array(chain)[:, 2:]
+    if not 4 <= len(chain) <= _MOST_SIDES or not np.allclose(starts[0], ends[-1], atol=1e-6):
+        return None
+    sides, middle = ends - starts, starts.mean(axis=0)
+    length, width = np.hypot(*sides[0]), np.hypot(*sides[1])
+    if len(chain) > 4:
+        length = width = 2 * np.hypot(*(starts - middle).T).mean()
+    elif abs(sides[0] @ sides[1]) > 1e-6 * max(length * width, 1e-9):
+        return None
+    if max(length, width) > _LARGEST:
+        return None
+    along = sides[0] if length >= width else sides[1]
+    heading = float(np.arctan2(along[1], along[0]))
+    length, width = max(length, width), min(length, width)
+    x, y = middle.tolist()
+    return Loop(x, y, heading, float(length), float(width), len(chain))
+
+
+def _sides(x0: float, y0: float, x1: float, y1: float) -> list[Segment]:
+    return [(x0, y0, x1, y0), (x1, y0, x1, y1), (x1, y1, x0, y1), (x0, y1, x0, y0)]
+
+
+_TALL = (1.7, 0.09)  # m, mean and standard deviation of how tall people are
+
+_TALLEST = 2.0  # m
+
+_THIN = 0.02  # m, faces of things that are no closed outlines
+
+
+class Carried:
+    """People, doors, vehicles and things of a scene.
+
+    Those that never moved have no mover's number: nobody could tell that they might have.
+
+    Args:
+        scene: the world.
+        motion: where everything is at each scan.
+        ground: what it stands on.
+        rng: how tall people are.
+
+    Attributes:
+        tall: (P,) metres, how high each mover reaches above its foot.
+    """
+
+    def __init__(
+        self, scene: Scene, motion: Motion, ground: Ground, rng: np.random.Generator
+    ) -> None:
+        self._motion, self._ground = motion, ground
+        persons, Q = motion.kinds.count("person"), len(motion.people.mover)
+        self._persons = persons
+        # NaN of things is nowhere; headings of vehicles go round and round
+        others = motion.poses[:, persons:].copy()
+        solid = np.array([kind != "thing" for kind in motion.kinds[persons:]], bool)
+        others[:, solid, 2] = np.unwrap(others[:, solid, 2], axis=0)
+        self._others, self._is_thing = others, ~solid
+        parts: list[tuple[int, int, Part]] = []
+        self.tall = np.zeros(len(motion.kinds))
+        self.tall[:persons] = np.minimum(
+            _TALL[0] + _TALL[1] * rng.standard_normal(persons), _TALLEST
+        )
+        for q, person in enumerate(motion.people.mover.tolist()):
+            half = tuple(motion.people.semi_axes[q].tolist())
+            figure = geometry.leg if q < 2 * Q // 3 else geometry.torso_and_head
+            parts += [(q, person, part) for part in figure(half, self.tall[person])]
+        for number, kind in enumerate(motion.kinds[persons:], start=persons):
+            mover = number if motion.moved[number] else -1
+            own = _parts_of(scene, motion, number, kind)
+            parts += [(Q + number - persons, mover, part) for part in own]
+            self.tall[number] = max(part.z[1] for part in own)
+        self._assembly = assembled(parts)
+
+    def at(self, moment: Moment, scan: int) -> Solids:
+        """Where they are at the n times of a moment within one scan."""
+        people, others = self._motion.people, moment.at(self._others)
+        # things do not fly from place to place
+        others[:, self._is_thing] = self._others[scan, self._is_thing]
+        walking = np.concatenate(
+            [moment.at(people.xy), moment.at(people.heading)[..., None]], axis=-1
+        )
+        poses = np.concatenate([walking, others], axis=1)
+        foot = self._ground.height(poses[..., 0], poses[..., 1])
+        return self._assembly.at(poses, foot)
+
+
+def _parts_of(scene: Scene, motion: Motion, number: int, kind: str) -> list[Part]:
+    """The parts of a door, a vehicle or a thing."""
+    length, width = motion.sizes[number].tolist()
+    if kind == "door":
+        return geometry.door(length, min(scene.heights.doors, scene.heights.top))
+    if kind != "thing":
+        return geometry.vehicle(length, width, kind)
+    loops, lines = outlines(scene.things[number - motion.kinds.index("thing")].faces)
+    parts = [_placed(part, loop) for loop in loops for part in parts_of(loop, scene.heights)]
+    for x0, y0, x1, y1 in lines:
+        long, turn = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
+        half, z = (long / 2, _THIN / 2), (0.0, scene.heights.furniture)
+        parts.append(Part(BOX, (x0 + x1) / 2, (y0 + y1) / 2, half, z, turn))
+    return parts
+
+
+def _placed(part: Part, loop: Loop) -> Part:
+    """A part about the middle of a loop, as one about the middle of the whole."""
+    c, s = math.cos(loop.heading), math.sin(loop.heading)
+    ahead = loop.x + c * part.ahead - s * part.aside
+    aside = loop.y + s * part.ahead + c * part.aside
+    return part._replace(ahead=ahead, aside=aside, turn=loop.heading + part.turn)

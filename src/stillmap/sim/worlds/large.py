@@ -1,0 +1,319 @@
+"""A building that grows with the recording: wing after wing, floor after floor.
+
+A wing of a building: a ring of corridors with rooms on both sides, and ways through it.
+"""
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from stillmap.sim.options import CrowdOptions, RobotOptions
+from stillmap.sim.scene import Point, Scene, Segment
+from stillmap.sim.walls import Opening, Side, box, pillar, room, wall
+
+LENGTH, DEPTH = 34.0, 21.6  # m, of the ground that a wing stands on
+
+ENTRANCE = 2.4  # m, how wide its entrance is
+
+_WEST, _EAST, _SOUTH, _NORTH = 5.2, 28.8, 1.6, 16.8  # m, the outer walls of the ring
+
+_WIDTH = 2.2  # m, of its corridors
+
+_THICK = 0.15  # m, of walls
+
+_DOOR = 1.0  # m, width of a doorway
+
+_INSIDE = 1.5  # m behind its doorway, where one turns who looks into a room
+
+
+@dataclass(frozen=True)
+class _Row:
+    """Rooms along a wall of the ring: where the wall begins, its length, their side and depth."""
+
+    start: Point
+    length: float
+    side: Side
+    depth: float
+
+
+_ROWS = (
+    _Row((_WEST, _SOUTH), _NORTH - _SOUTH, "west", 4.3),
+    _Row((_WEST, _NORTH), _EAST - _WEST, "north", 4.3),
+    _Row((_EAST, _SOUTH), _NORTH - _SOUTH, "east", 4.3),
+    _Row((_WEST + _WIDTH, _NORTH - _WIDTH), _EAST - _WEST - 2 * _WIDTH, "south", 5.1),
+    _Row((_WEST + _WIDTH, _SOUTH + _WIDTH), _EAST - _WEST - 2 * _WIDTH, "north", 5.1),
+)
+
+
+@dataclass(frozen=True)
+class Wing:
+    """A wing with its entrance on the x axis, in metres; y into it.
+
+    Attributes:
+        walls: everything in it.
+        entrance: where its entrance begins, on the x axis.
+        looks: for rooms that one can look into, a point before the doorway and one behind it.
+    """
+
+    walls: tuple[Segment, ...]
+    entrance: float
+    looks: tuple[tuple[Point, Point], ...]
+
+    def tour(self, rooms: Iterable[int], westward: bool) -> list[Point]:
+        """The way in, once round the ring with a look into these rooms of `looks`, and out."""
+        near, far = _SOUTH + _WIDTH / 2, _NORTH - _WIDTH / 2
+        west, east = _WEST + _WIDTH / 2, _EAST - _WIDTH / 2
+        gate: Point = (self.entrance + ENTRANCE / 2, near)
+        corners: list[Point] = [gate, (west, near), (west, far), (east, far), (east, near), gate]
+        if not westward:
+            corners.reverse()
+        way = [corners[0]]
+        looks = [self.looks[k] for k in rooms]
+        for a, b in itertools.pairwise(corners):
+            passed = [look for look in looks if _is_between(look[0], a, b)]
+            looks = [look for look in looks if look not in passed]
+            for before, behind in sorted(passed, key=lambda look: math.dist(a, look[0])):
+                way += [before, behind, before]
+            way.append(b)
+        return [(gate[0], 0.0), *way, (gate[0], 0.0)]
+
+
+def wing(rng: np.random.Generator) -> Wing:
+    """Another wing from each generator: doors, furniture, which rooms are open."""
+    entrance = float(rng.uniform(12.0, 19.0))
+    walls: list[Segment] = []
+    looks: list[tuple[Point, Point]] = []
+    for row in _ROWS:
+        more, doors = _rooms(row, rng)
+        walls += more
+        looks += doors
+    gate = Opening(entrance - _WEST, ENTRANCE, _SOUTH, is_open=True)
+    closed = [Opening(float(rng.uniform(*ends)), 0.95, 0.18) for ends in ((1, 4), (18, 21))]
+    walls += wall((_WEST, _SOUTH), _EAST - _WEST, "south", [closed[0], gate, closed[1]])
+    inner = _NORTH - _SOUTH - 2 * _WIDTH
+    for x, side in ((_WEST + _WIDTH, "east"), (_EAST - _WIDTH, "west")):
+        niche = Opening(float(rng.uniform(1.0, inner - 2.0)), float(rng.uniform(0.8, 1.6)), 0.3)
+        walls += wall((x, _SOUTH + _WIDTH), inner, "east" if side == "east" else "west", [niche])
+    return Wing((*walls, *_in_corridors(rng)), entrance, tuple(looks))
+
+
+def _rooms(row: _Row, rng: np.random.Generator) -> tuple[list[Segment], list[tuple[Point, Point]]]:
+    """The wall, the rooms behind it, and where one looks into the open ones."""
+    openings, behind, walls, looks = [], [], [], []
+    low = 0.2
+    while row.length - low > 3.2:
+        high = low + float(rng.uniform(3.6, 6.2))
+        if row.length - high < 3.4:
+            high = row.length - 0.2
+        at = float(rng.uniform(low + 0.4, high - _DOOR - 0.4))
+        is_open = rng.random() < 0.6
+        opening = Opening(at, _DOOR, _THICK, is_open)
+        openings.append(opening)
+        if is_open:
+            behind.append((low, high, opening))
+        low = high + 0.2
+    walls += wall(row.start, row.length, row.side, openings)
+    for low, high, opening in behind:
+        walls += room(row.start, row.side, (low, high), row.depth, opening)
+        walls += _furnished(row, low, high, rng)
+        middle = opening.start + _DOOR / 2
+        looks.append((_at(row, middle, -_WIDTH / 2), _at(row, middle, _THICK + _INSIDE)))
+    return walls, looks
+
+
+def _furnished(row: _Row, low: float, high: float, rng: np.random.Generator) -> list[Segment]:
+    """Desks and cupboards in the back of a room, out of the way of whoever looks in."""
+    walls: list[Segment] = []
+    at = low + 0.2
+    while high - at > 1.4:
+        width, deep = rng.uniform((0.7, 0.5), (1.9, 0.9)).tolist()
+        width = min(width, high - at - 0.2)
+        back = row.depth - deep / 2 - float(rng.uniform(0.05, 0.5))
+        x, y = _at(row, at + width / 2, _THICK + back)
+        if row.side in ("west", "east"):
+            width, deep = deep, width
+        walls += box(x, y, width, deep, float(rng.normal(0.0, 0.04)))
+        at += max(width, deep) + float(rng.uniform(0.3, 1.6))
+    return walls
+
+
+def _in_corridors(rng: np.random.Generator) -> list[Segment]:
+    """Cupboards along the walls without doors, and a pillar in a corner."""
+    walls: list[Segment] = []
+    for x, out in ((_WEST + _WIDTH, -1.0), (_EAST - _WIDTH, 1.0)):
+        deep, width, y = rng.uniform((0.3, 0.6, _SOUTH + 4.0), (0.5, 1.6, _NORTH - 4.0)).tolist()
+        walls += box(x + out * deep / 2, y, deep, width)
+    corner = rng.integers(4)
+    x = _WEST + 0.3 if corner % 2 else _EAST - 0.3
+    return walls + pillar(x, _SOUTH + 0.3 if corner // 2 else _NORTH - 0.3, 0.2)
+
+
+def _at(row: _Row, along: float, into: float) -> Point:
+    """The point so far along the wall of a row, and so far into its rooms."""
+    x, y = row.start
+    out = 1.0 if row.side in ("north", "east") else -1.0
+    if row.side in ("north", "south"):
+        return (x + along, y + out * into)
+    return (x + out * into, y + along)
+
+
+def _is_between(point: Point, a: Point, b: Point) -> bool:
+    return math.dist(a, point) + math.dist(point, b) < math.dist(a, b) + 1e-6
+
+
+_LAYOUT_SEED = 41
+
+_COLUMNS = 4  # wings beside one another on each side of a floor's corridor
+
+_ON_FLOOR = 2 * _COLUMNS  # wings
+
+_HALF = 1.3  # m, half the width of the floors' corridors and of the one that joins them
+
+_PITCH = 2 * (_HALF + DEPTH) + 1.0  # m from floor to floor, which lie side by side
+
+_ROOMS = 4  # that the robot looks into when it is in a wing for the first time
+
+_ROBOT = RobotOptions(speed=0.8)
+
+_SHARE = 0.8  # of the way at full speed: it turns, and people are in its way
+
+
+def building(scans: int | None = None) -> Scene:
+    """As much of a building as a robot gets about in while it takes so many scans.
+
+    Each floor has a corridor with four wings on each side, and floors lie side by side along a
+    corridor that joins them, as if unrolled. A wing is a ring of corridors with rooms, 69 m around.
+    The robot goes round one wing after the other and looks into rooms; after every second new wing
+    it goes round an earlier one of the floor again, and after every second floor back to where it
+    began. The route for more scans begins with the route for fewer; wings that this does not get to
+    are not there, and their entrances are closed.
+
+    Args:
+        scans: how many; not given: one floor.
+    """
+    target = math.inf if scans is None else _SHARE * scans * _ROBOT.speed / _ROBOT.scan_rate
+    route: list[Point] = [_HUB]
+    length, wings = 0.0, 0
+    for number, stops in _tours():
+        if length >= target or (scans is None and number >= _ON_FLOOR):
+            break
+        length += sum(map(math.dist, [route[-1], *stops], stops))
+        route += stops
+        wings = max(wings, number + 1)
+    floor = (wings - 1) // _ON_FLOOR
+    home = [(-_HALF, floor * _PITCH), _HUB]
+    return Scene(
+        name="building",
+        walls=tuple(_walls(wings)),
+        route=(*route, (route[-1][0], floor * _PITCH), *home),
+        crowd=CrowdOptions(people=6 + wings),
+        robot=_ROBOT,
+    )
+
+
+_HUB: Point = (-_HALF, 0.0)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a wing stands: its own origin in metres, and whether y goes down."""
+
+    x: float
+    y: float
+    south: bool
+
+    @classmethod
+    def of(cls, number: int) -> "_Place":
+        floor, on_floor = divmod(number, _ON_FLOOR)
+        column, side = divmod(on_floor, 2)
+        return cls(column * LENGTH, floor * _PITCH + (-_HALF if side else _HALF), bool(side))
+
+    def point(self, point: Point) -> Point:
+        return (self.x + point[0], self.y + (-point[1] if self.south else point[1]))
+
+    def segment(self, s: Segment) -> Segment:
+        return (*self.point(s[:2]), *self.point(s[2:]))
+
+
+@cache
+def _wing(number: int) -> Wing:
+    return wing(np.random.default_rng([_LAYOUT_SEED, number]))
+
+
+def _tours() -> Iterator[tuple[int, list[Point]]]:
+    """Without end: the wing that the robot goes to next, and the way from the corridor and back."""
+    rng = np.random.default_rng(_LAYOUT_SEED)
+    for number in itertools.count():
+        floor, on_floor = divmod(number, _ON_FLOOR)
+        if on_floor == 0:
+            yield number, [(-_HALF, floor * _PITCH)]
+        looks = len(_wing(number).looks)
+        some = rng.choice(looks, min(_ROOMS, looks), replace=False)
+        yield number, _tour(number, some.tolist(), rng.random() < 0.5)
+        if on_floor % 2:
+            earlier = floor * _ON_FLOOR + int(rng.integers(on_floor))
+            yield number, _tour(earlier, [], rng.random() < 0.5)
+        if on_floor == _ON_FLOOR - 1:
+            there: list[Point] = [(-_HALF, floor * _PITCH)]
+            yield number, [*there, _HUB, *there] if floor % 2 else there
+
+
+def _tour(number: int, rooms: list[int], westward: bool) -> list[Point]:
+    place = _Place.of(number)
+    stops = [place.point(p) for p in _wing(number).tour(rooms, westward)]
+    corridor: Point = (stops[0][0], place.y + (_HALF if place.south else -_HALF))
+    return [corridor, *stops[1:-1], corridor]
+
+
+def _walls(wings: int) -> list[Segment]:
+    """The wings, the corridors of their floors, and the one that joins these."""
+    floors = (wings - 1) // _ON_FLOOR + 1
+    walls: list[Segment] = []
+    for number in range(wings):
+        place = _Place.of(number)
+        walls += [place.segment(s) for s in _wing(number).walls]
+    for floor in range(floors):
+        walls += _floor(floor, wings)
+    north = (floors - 1) * _PITCH + _HALF
+    rng = np.random.default_rng([_LAYOUT_SEED, 1])
+    doors = [Opening(y, 1.2, 0.3) for y in _spaced(north + _HALF, rng)]
+    walls += wall((-2 * _HALF, -_HALF), north + _HALF, "west", doors)
+    for floor in range(floors - 1):
+        between = floor * _PITCH + _HALF
+        doors = [Opening(y, 0.95, 0.18) for y in _spaced(_PITCH - 2 * _HALF, rng)]
+        walls += wall((0.0, between), _PITCH - 2 * _HALF, "east", doors)
+    return [*walls, (-2 * _HALF, -_HALF, 0.0, -_HALF), (-2 * _HALF, north, 0.0, north)]
+
+
+def _floor(floor: int, wings: int) -> list[Segment]:
+    """A floor's corridor: entrances of its wings, closed doors before, between and after them."""
+    walls: list[Segment] = []
+    sides: tuple[Side, Side] = ("north", "south")
+    for k, side in enumerate(sides):
+        rng = np.random.default_rng([_LAYOUT_SEED, floor, k])
+        openings = []
+        for column in range(_COLUMNS):
+            number = floor * _ON_FLOOR + 2 * column + k
+            start = column * LENGTH
+            gate = start + _wing(number).entrance
+            before, after = rng.uniform((1.0, 22.5), (9.5, 31.0)).tolist()
+            openings.append(Opening(start + before, 0.95, float(rng.uniform(0.1, 0.3))))
+            openings.append(Opening(gate, ENTRANCE, 0.0 if number < wings else 0.3, number < wings))
+            openings.append(Opening(start + after, 0.95, float(rng.uniform(0.1, 0.3))))
+        y = floor * _PITCH + (-_HALF if k else _HALF)
+        walls += wall((0.0, y), _COLUMNS * LENGTH, side, openings)
+    end, y = _COLUMNS * LENGTH, floor * _PITCH
+    return [*walls, (end, y - _HALF, end, y + _HALF)]
+
+
+def _spaced(length: float, rng: np.random.Generator) -> list[float]:
+    """Where closed doors begin along a wall."""
+    places, at = [], float(rng.uniform(3.0, 6.0))
+    while at < length - 3.0:
+        places.append(at)
+        at += float(rng.uniform(4.0, 11.0))
+    return places

@@ -1,0 +1,114 @@
+"""A simulation as a folder: the recording and, beside it, the truth."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from stillmap.core.arrays import write_npy
+from stillmap.core.errors import InputError
+from stillmap.core.files import new_folder
+from stillmap.io import stillmap_folder
+from stillmap.io.carmen import writer
+from stillmap.io.registry import RIG
+from stillmap.sim.scene import Scene
+from stillmap.sim.simulator import RigSimulation, Simulation
+from stillmap.sim.truth import FOLDER, write_truth
+from stillmap.sim.truth_images import write_picture_truth, writing_truth
+
+Format = Literal["stillmap", "carmen"]
+
+CARMEN_LOG = "recording.log"
+MARK = "truth"  # every simulation has it
+RIG_MARK = "tilting/truth"  # every one of two lasers has it
+
+
+def write_simulation(
+    simulation: Simulation,
+    path: str | Path,
+    *,
+    format: Format = "stillmap",
+    overwrite: bool = False,
+) -> None:
+    """Write recording and truth into one folder that appears complete or not at all.
+
+    Args:
+        simulation: what `simulate` returned.
+        path: the folder.
+        format: "stillmap" writes the files of a recording folder, "carmen" a `recording.log`
+            with FLASER, RLASER and ODOM lines, ranges in whole centimetres.
+        overwrite: replace an earlier simulation.
+
+    Raises:
+        InputError: the folder holds something already or cannot be written to, or the format
+            cannot say what the laser measures.
+    """
+    if format == "carmen":
+        require_carmen(simulation.scene)
+    with new_folder(Path(path), MARK, overwrite) as work:
+        if format == "carmen":
+            _write_carmen(simulation, work / CARMEN_LOG)
+            write_truth(simulation.truth, simulation.recording.stamp_ns, work)
+        else:
+            _write_folder(simulation, work)
+
+
+def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write what two lasers recorded, each with its truth, into one folder.
+
+    `horizontal` and `tilting` are folders as `write_simulation` makes them; `joint_angle.npy` (T,)
+    beside them has the joint's angle in rad at each stamp.
+
+    Raises:
+        InputError: the folder holds something already or cannot be written to.
+    """
+    with new_folder(Path(path), RIG_MARK, overwrite) as work:
+        for name, one in zip(RIG, (rig.horizontal, rig.tilting), strict=True):
+            (work / name).mkdir()
+            _write_folder(one, work / name)
+        write_npy(work / "joint_angle.npy", rig.joint_angle)
+
+
+def _write_folder(one: Simulation, work: Path) -> None:
+    """A recording folder with its truth, and pictures with theirs, into an existing folder."""
+    recording = one.recording
+    write_truth(one.truth, recording.stamp_ns, work)
+    if one.photographs is not None and one.surfaces is not None:
+        write_picture_truth(one.surfaces, work / FOLDER)
+        images = writing_truth(one.photographs, work / FOLDER)
+        recording = replace(recording, images=images)
+    stillmap_folder.write_into(recording, work)
+
+
+def require_carmen(scene: Scene) -> None:
+    """Whether FLASER lines can hold such scans: half a circle, ranges below the SICK's code.
+
+    Raises:
+        InputError: they cannot.
+    """
+    if scene.in_3d:
+        raise InputError("CARMEN logs hold no 3D scans", hint="the recording folder")
+    laser = scene.laser
+    if abs(laser.fov - math.pi) > 1e-9:
+        raise InputError("FLASER lines hold half a circle", hint="a field of view of 180 degrees")
+    if laser.upside_down == "known":
+        raise InputError(
+            "FLASER lines cannot say that the laser hangs upside down",
+            hint="laser.upside_down=unknown",
+        )
+    if laser.max_range > writer.NO_RETURN:
+        what = f"CARMEN logs hold ranges up to {writer.NO_RETURN} m"
+        raise InputError(what, hint="a lower max_range")
+
+
+def _write_carmen(simulation: Simulation, path: Path) -> None:
+    form = writer.Form(
+        lasers=(writer.Laser("FLASER"), writer.Laser("RLASER")),
+        fans=None,
+        params={},
+        comment=f"stillmap simulate {simulation.scene.name}",
+        host="simulated",
+        digits=2,
+    )
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        file.writelines(writer.lines(simulation.recording, form))

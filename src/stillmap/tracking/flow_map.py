@@ -1,0 +1,87 @@
+"""Where things move: how often each square of the floor was crossed, and how fast."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.tracking.objects import MovingObject
+
+Float = NDArray[np.float64]
+
+_STEP = 0.25  # of a square: points along a way that are asked which square they are in
+_AGAIN = 5.0  # s after which being in a square is crossing it again
+
+
+@dataclass(frozen=True, eq=False)
+class Traffic:
+    """Squares of the floor.
+
+    Attributes:
+        crossings: (H, W) int32, how often something crossed each; row 0 has the lowest y.
+        speed: (H, W) float32, metres per second, the mean of those that crossed; NaN: none did.
+        origin: x, y (metres) and yaw of the lower-left corner of the lower-left square.
+        resolution: metres.
+    """
+
+    crossings: NDArray[np.int32]
+    speed: NDArray[np.float32]
+    origin: tuple[float, float, float]
+    resolution: float
+
+
+def traffic(objects: Sequence[MovingObject], resolution: float = 0.5) -> Traffic:
+    """How often each square was crossed.
+
+    Who stays in a square, or comes back to it within a few seconds, has crossed it once.
+
+    Args:
+        objects: what moved.
+        resolution: metres, edge of a square.
+    """
+    visits = [_visits(one, resolution) for one in objects]
+    cells = np.concatenate([np.zeros((0, 2), np.int64), *(cell for cell, _ in visits)])
+    speeds = np.concatenate([np.zeros(0), *(speed for _, speed in visits)])
+    if len(cells) == 0:
+        none = np.zeros((0, 0), np.int32)
+        return Traffic(none, none.astype(np.float32), (0.0, 0.0, 0.0), resolution)
+    first = cells.min(axis=0)
+    width, height = (cells.max(axis=0) - first + 1).tolist()
+    column, row = (cells - first).T
+    flat = row * width + column
+    count = np.bincount(flat, minlength=height * width)
+    total = np.bincount(flat, speeds, minlength=height * width)
+    mean = np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0)
+    x, y = (first * resolution).tolist()
+    return Traffic(
+        count.astype(np.int32).reshape(height, width),
+        mean.astype(np.float32).reshape(height, width),
+        (x, y, 0.0),
+        resolution,
+    )
+
+
+def _visits(one: MovingObject, resolution: float) -> tuple[NDArray[np.int64], Float]:
+    """(V, 2) squares that a thing crossed, column and row, and its speed (V,) there."""
+    seconds = 1e-9 * (one.stamp_ns - one.stamp_ns[0])
+    xy, t = _between(one.xy, seconds, _STEP * resolution)
+    speed = np.interp(t, seconds, np.linalg.norm(one.velocity, axis=1))
+    cell = np.floor(xy / resolution).astype(np.int64)
+    # in the order of squares, then time: a visit begins with a new square, or after a while
+    order = np.lexsort((t, cell[:, 0], cell[:, 1]))
+    cell, t, speed = cell[order], t[order], speed[order]
+    begins = (np.diff(cell, axis=0) != 0).any(axis=1) | (np.diff(t) > _AGAIN)
+    begins = np.flatnonzero(np.concatenate([[True], begins]))
+    count = np.diff(begins, append=len(t))
+    return cell[begins], np.add.reduceat(speed, begins) / count
+
+
+def _between(xy: Float, seconds: Float, step: float) -> tuple[Float, Float]:
+    """Points (n, 2) no farther apart than `step` along a way, and when (n,)."""
+    length = np.linalg.norm(np.diff(xy, axis=0), axis=1)
+    pieces = np.maximum(np.ceil(length / step), 1.0)
+    whole = np.concatenate([[0.0], np.cumsum(pieces)])
+    at = np.arange(int(whole[-1]) + 1)
+    t = np.interp(at, whole, seconds)
+    return np.stack([np.interp(at, whole, xy[:, d]) for d in (0, 1)], axis=-1), t

@@ -1,0 +1,57 @@
+"""Models as `stillmap map` writes them, read to be scored."""
+
+import numpy as np
+import pytest
+
+from stillmap.eval import mesh_distance
+from stillmap.eval.model_readers import read_glb
+from stillmap.mesh.texture.atlas import Textured
+from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.results.gltf import write_glb
+
+pytest.importorskip("trimesh")
+
+
+def test_colours_stay_where_they_are(tmp_path):
+    """A slanting square, red along its u and green along its v, beside a grey face."""
+    uv = np.array([(0.0, 0.0), (1, 0), (1, 1), (0, 1), (0, 0)])
+    corner, along, up = np.array([1.0, 2, 3]), np.array([2.0, 0, 0.5]), np.array([0, 1.0, 1.5])
+    vertices = corner + uv[:, :1] * along + uv[:, 1:] * up
+    vertices[4] = (1, 1, 1)
+    n = 64
+    level = np.rint((np.arange(n) + 0.5) / n * 255)
+    red, green = np.meshgrid(level, level)
+    page = np.stack([red, green, np.zeros_like(red)], axis=-1).astype(np.uint8)
+    model = Textured(
+        vertices,
+        np.array([(0, 1, 2), (0, 2, 3), (0, 1, 4)], np.int32),
+        uv,
+        np.array([0, 0, -1], np.int32),
+        (page,),
+        np.array([0, 0, -1], np.int32),
+        np.arange(5, dtype=np.int32),
+    )
+    write_glb(tmp_path / "mesh.glb", model)
+    found = read_glb(tmp_path / "mesh.glb", n=2000)
+    assert len(found.faces) == 3
+    assert np.allclose(
+        mesh_distance.areas(found.vertices, found.faces).sum(),
+        mesh_distance.areas(vertices, model.faces).sum(),
+    )
+    assert 1900 < len(found.coloured.points) <= 2000
+    basis = np.stack([along, up, np.cross(along, up)], axis=1)
+    u, v, off = np.linalg.solve(basis, (found.coloured.points - corner).T)
+    assert np.allclose(off, 0.0, atol=1e-6)
+    # pages may be compressed
+    assert np.abs(found.coloured.colour[:, 0] - 255 * u).mean() < 4.0
+    assert np.abs(found.coloured.colour[:, 1] - 255 * v).mean() < 4.0
+
+
+def test_a_model_without_texture_has_no_colours(tmp_path):
+    square = np.array([(0.0, 0, 1), (2, 0, 1), (2, 1, 1), (0, 1, 1)])
+    faces = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
+    write_glb(tmp_path / "mesh.glb", Mesh(square, faces))
+    found = read_glb(tmp_path / "mesh.glb")
+    assert len(found.coloured.points) == 0
+    assert np.allclose(found.vertices[:, 2], 1.0)
+    assert np.allclose(np.ptp(found.vertices, axis=0), (2.0, 1.0, 0.0))

@@ -1,0 +1,124 @@
+"""Scores of objects, counted by hand."""
+
+import numpy as np
+import pytest
+
+from stillmap.eval.objects import object_scores, rank_correlation, sightings, true_traffic
+from stillmap.tracking import MovingObject, Traffic
+from stillmap.tracking.flow_map import traffic
+
+T, N = 40, 4  # scans at 5 Hz; beams of each
+OFFSET = np.arange(T + 1) * N
+SECONDS = 0.2 * np.arange(T)
+
+
+def walkers():
+    """Mover 0 on beams 0 and 1 of every scan, mover 1 on beam 2 but for 2.4 s, a wall on beam 3."""
+    mover = np.tile(np.array([0, 0, 1, -1], np.int32), (T, 1))
+    mover[20:33, 2] = -1
+    return mover.reshape(-1)
+
+
+def where():
+    """0 walks at 1 m/s along x, 1 stands."""
+    at = np.zeros((T, 2, 3))
+    at[:, 0, 0] = SECONDS
+    at[:, 1, 1] = 5.0
+    return at
+
+
+def thing(beams, speed=1.0):
+    beams = np.sort(np.asarray(beams))
+    scan = np.unique(beams // N)
+    velocity = np.tile([speed, 0.0], (len(scan), 1))
+    xy = np.zeros((len(scan), 2))
+    return MovingObject(
+        0, scan, (2e8 * scan).astype(np.int64), xy, velocity, (0.5, 0.3), beams, 1.0
+    )
+
+
+def beams_of(mover, first=0, last=T):
+    beams = np.flatnonzero(walkers() == mover)
+    return beams[(beams // N >= first) & (beams // N < last)]
+
+
+def scores(*objects, chosen=(0, 1)):
+    return object_scores(objects, walkers(), where(), OFFSET, SECONDS, chosen)
+
+
+def test_a_mover_that_was_not_seen_for_a_while_is_seen_anew():
+    found = sightings(walkers(), OFFSET, SECONDS, (0, 1), least=1.0)
+    assert [(one.mover, len(one.scans), len(one.beams)) for one in found] == [
+        (0, 40, 80),
+        (1, 20, 20),
+        (1, 7, 7),
+    ]
+    assert len(sightings(walkers(), OFFSET, SECONDS, (0, 1))) == 2  # 7 scans are 1.4 s
+
+
+def test_all_right():
+    found = scores(thing(beams_of(0)), thing(beams_of(1, 0, 20), 0.0), thing(beams_of(1, 33), 0.0))
+    assert (found.sightings, found.whole, found.objects) == (2, 2, 3)
+    assert (found.lost, found.split, found.merged, found.switches, found.false) == (0,) * 5
+    assert found.speed_error == pytest.approx(0.0, abs=1e-12)
+
+
+def test_lost():
+    found = scores(thing(beams_of(0, 0, 20)), chosen=(0,))
+    assert (found.sightings, found.whole, found.lost, found.split) == (1, 0, 1, 0)
+    assert (scores(chosen=(0,)).whole, scores(chosen=(0,)).lost) == (0, 1)
+    assert np.isnan(scores().speed_error)
+
+
+def test_split_and_switched():
+    found = scores(thing(beams_of(0, 0, 26)), thing(beams_of(0, 26)), chosen=(0,))
+    assert (found.whole, found.lost, found.split, found.switches) == (0, 0, 1, 1)
+    nearly = scores(thing(beams_of(0, 0, 34)), thing(beams_of(0, 34)), chosen=(0,))
+    assert (nearly.whole, nearly.split, nearly.switches) == (1, 0, 1)
+
+
+def test_merged():
+    both = thing(np.concatenate([beams_of(0), beams_of(1)]))
+    found = scores(both)
+    assert (found.whole, found.merged) == (0, 2)
+
+
+def test_false_objects_lie_on_what_is_static():
+    walls = np.flatnonzero(walkers() == -1)
+    found = scores(thing(beams_of(0)), thing(walls))
+    assert (found.objects, found.false) == (2, 1)
+
+
+def test_speed():
+    found = scores(thing(beams_of(0), 1.3))
+    assert found.speed_error == pytest.approx(0.3)
+
+
+def squares(crossings, origin=(0.0, 0.0, 0.0)):
+    crossings = np.asarray(crossings, np.int32)
+    return Traffic(crossings, crossings.astype(np.float32), origin, 1.0)
+
+
+def floor(width, height):
+    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
+
+
+def test_squares_are_compared_where_the_floor_is():
+    true = squares([[1, 2], [3, 4]])
+    assert rank_correlation(true, true, floor(2, 2)) == pytest.approx(1.0)
+    assert rank_correlation(squares([[4, 3], [2, 1]]), true, floor(2, 2)) == pytest.approx(-1.0)
+    moved = squares([[2], [4]], (1.0, 0.0, 0.0))  # its first column was never crossed
+    assert 0.5 < rank_correlation(moved, true, floor(2, 2)) < 1.0
+    assert np.isnan(rank_correlation(true, squares([[0, 0], [0, 0]]), floor(2, 2)))
+    assert np.isnan(rank_correlation(true, true, floor(1, 1)))
+    with pytest.raises(ValueError, match="resolution"):
+        rank_correlation(traffic([]), true, floor(2, 2))
+
+
+def test_true_crossings_lie_in_the_map():
+    seen = sightings(walkers(), OFFSET, SECONDS, (0,))
+    stamps = (1e9 * SECONDS).astype(np.int64)
+    T_map_world = np.array([[1.0, 0.0, 10.0], [0.0, 1.0, 3.0], [0.0, 0.0, 1.0]])
+    found = true_traffic(seen, where(), stamps, T_map_world, 1.0)
+    assert found.origin == (10.0, 3.0, 0.0)
+    np.testing.assert_array_equal(found.crossings, [[1] * 8])

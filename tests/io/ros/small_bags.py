@@ -1,0 +1,135 @@
+"""Makes small bags of every kind."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+
+from stillmap.io.ros.messages import typestore
+
+KINDS = ("bag", "db3", "mcap", "folder")
+
+
+class Messages:
+    """Makes messages of one generation of ROS."""
+
+    def __init__(self, encoding: str) -> None:
+        self.encoding = encoding
+        self.store = typestore(encoding)
+
+    def make(self, kind: str, *args: Any, **kwargs: Any) -> Any:
+        return self.store.types[kind](*args, **kwargs)
+
+    def header(self, stamp: int, frame: str) -> Any:
+        time = self.make("builtin_interfaces/msg/Time", *divmod(stamp, 10**9))
+        sequence = {"seq": 0} if self.encoding == "ros1" else {}
+        return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame, **sequence)
+
+    def scan(
+        self, stamp: int, ranges: Any, frame: str = "laser", **changes: Any
+    ) -> tuple[str, Any]:
+        ranges = np.asarray(ranges, np.float32)
+        fields = {
+            "angle_min": -0.5,
+            "angle_max": 0.5,
+            "angle_increment": 1.0 / max(len(ranges) - 1, 1),
+            "time_increment": 0.0,
+            "scan_time": 0.0,
+            "range_min": 0.1,
+            "range_max": 20.0,
+            "intensities": np.zeros(0, np.float32),
+        } | changes
+        kind = "sensor_msgs/msg/LaserScan"
+        return kind, self.make(kind, header=self.header(stamp, frame), ranges=ranges, **fields)
+
+    def pose(self, xyz: tuple[float, float, float], theta: float, flipped: bool = False) -> Any:
+        half = 0.5 * theta
+        q = (
+            (np.cos(half), np.sin(half), 0.0, 0.0)
+            if flipped
+            else (0.0, 0.0, np.sin(half), np.cos(half))
+        )
+        return xyz, q
+
+    def transform(
+        self, stamp: int, parent: str, child: str, xyz: Any, q: Any = (0.0, 0.0, 0.0, 1.0)
+    ) -> Any:
+        return self.make(
+            "geometry_msgs/msg/TransformStamped",
+            self.header(stamp, parent),
+            child,
+            self.make(
+                "geometry_msgs/msg/Transform",
+                self.make("geometry_msgs/msg/Vector3", *map(float, xyz)),
+                self.make("geometry_msgs/msg/Quaternion", *map(float, q)),
+            ),
+        )
+
+    def tf(self, *transforms: Any) -> tuple[str, Any]:
+        kind = "tf2_msgs/msg/TFMessage"
+        return kind, self.make(kind, list(transforms))
+
+    def odometry(
+        self, stamp: int, xyz: Any, q: Any, frame: str = "odom", child: str = "base_link"
+    ) -> tuple[str, Any]:
+        point = self.make("geometry_msgs/msg/Point", *map(float, xyz))
+        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
+        zero = self.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+        kind = "nav_msgs/msg/Odometry"
+        message = self.make(
+            kind,
+            self.header(stamp, frame),
+            child,
+            self.make(
+                "geometry_msgs/msg/PoseWithCovariance",
+                self.make("geometry_msgs/msg/Pose", point, turn),
+                np.zeros(36),
+            ),
+            self.make(
+                "geometry_msgs/msg/TwistWithCovariance",
+                self.make("geometry_msgs/msg/Twist", zero, zero),
+                np.zeros(36),
+            ),
+        )
+        return kind, message
+
+    def raw(self, kind: str, message: Any) -> bytes:
+        if self.encoding == "ros1":
+            return bytes(self.store.serialize_ros1(message, kind))
+        return bytes(self.store.serialize_cdr(message, kind))
+
+
+def write_bag(
+    folder: Path,
+    kind: str,
+    messages: Messages,
+    content: list[tuple[str, int, tuple[str, Any]]],
+    name: str = "tiny",
+    **packing: Any,
+) -> Path:
+    path = folder / (f"{name}.bag" if kind == "bag" else name)
+    if kind == "bag":
+        writer: Any = Writer1(path)
+    else:
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        writer = Writer2(path, version=9, storage_plugin=plugin)
+    if packing:
+        writer.set_compression(**packing)
+    with writer:
+        connections: dict[str, Any] = {}
+        for topic, log_ns, (message_type, message) in content:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(
+                    topic, message_type, typestore=messages.store
+                )
+            raw = message if isinstance(message, bytes) else messages.raw(message_type, message)
+            writer.write(connections[topic], log_ns, raw)
+    if kind in ("db3", "mcap"):
+        single = folder / f"{name}.{kind}"
+        shutil.move(path / single.name, single)
+        return single
+    return path

@@ -1,0 +1,318 @@
+"""Point clouds and pictures in bags."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from stillmap.cli.recording_info import facts
+from stillmap.core.errors import InputError
+from stillmap.io import read
+from stillmap.io.ros import point_cloud2
+
+START = 1_700_000_000_000_000_000
+SECOND = 10**9
+FLOAT, DOUBLE, UINT32, UINT16 = 7, 8, 6, 4
+_KINDS = {FLOAT: "f4", DOUBLE: "f8", UINT32: "u4", UINT16: "u2"}
+
+
+def cloud_message(
+    messages, stamp, columns, *, frame="lidar", height=1, step=None, padding=0, big=False, **changes
+):
+    """A cloud of named columns (name, type, values), in this order; rows may be padded."""
+    n = len(columns[0][2])
+    offsets, at = [], 0
+    for _, kind, _ in columns:
+        offsets.append(at)
+        at += np.dtype(_KINDS[kind]).itemsize
+    step = step or at
+    order = ">" if big else "<"
+    dtype = np.dtype(
+        {
+            "names": [name for name, _, _ in columns],
+            "formats": [order + _KINDS[kind] for _, kind, _ in columns],
+            "offsets": offsets,
+            "itemsize": step,
+        }
+    )
+    values = np.zeros(n, dtype)
+    for name, _, column in columns:
+        values[name] = column
+    width = n // height
+    rows = values.view(np.uint8).reshape(height, width * step)
+    data = np.concatenate([rows, np.full((height, padding), 0xAB, np.uint8)], axis=1)
+    field = messages.store.types["sensor_msgs/msg/PointField"]
+    fields = [field(name, o, kind, 1) for (name, kind, _), o in zip(columns, offsets, strict=True)]
+    stated = {
+        "height": height,
+        "width": width,
+        "fields": fields,
+        "is_bigendian": big,
+        "point_step": step,
+        "row_step": width * step + padding,
+        "data": data.ravel(),
+        "is_dense": True,
+    } | changes
+    kind = "sensor_msgs/msg/PointCloud2"
+    return kind, messages.make(kind, messages.header(stamp, frame), **stated)
+
+
+def xyz(rng, n=12):
+    return rng.normal(size=(3, n)).astype(np.float32) * 5.0
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(5)
+
+
+def test_fields_in_any_order_with_gaps(bag, messages, rng):
+    x, y, z = xyz(rng)
+    x[3] = np.nan
+    layouts = [
+        {"columns": [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]},
+        {
+            "columns": [
+                ("ring", UINT16, np.ones(12)),
+                ("z", FLOAT, z),
+                ("x", FLOAT, x),
+                ("y", FLOAT, y),
+            ]
+        },
+        {"columns": [("x", DOUBLE, x), ("y", DOUBLE, y), ("z", DOUBLE, z)], "step": 48},
+        {"columns": [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)], "height": 3, "padding": 7},
+        {"columns": [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)], "big": True},
+    ]
+    content = [
+        ("/points", START + k, cloud_message(messages, START + k, **layout))
+        for k, layout in enumerate(layouts)
+    ]
+    recording = read(bag(content))
+    assert recording.dimension == 3
+    assert recording.n_scans == len(layouts)
+    assert recording.beam_time is None
+    expected = np.stack([x, y, z], axis=1)
+    expected[3] = np.nan
+    for scan in range(len(layouts)):
+        np.testing.assert_array_equal(recording.points[recording.beams_of(scan)], expected)
+        assert recording.hit[recording.beams_of(scan)].sum() == 11
+
+
+def test_when_points_were_taken(bag, messages, rng):
+    x, y, z = xyz(rng)
+    after = np.linspace(0.0, 0.1, 12)
+    times = [
+        ("t", UINT32, np.round(after * 1e9)),
+        ("time", FLOAT, after),
+        ("timestamp", DOUBLE, START / 1e9 + after),
+        ("timestamp", DOUBLE, START + np.round(after * 1e9)),
+        ("offset_time", UINT32, np.round(after * 1e6)),
+    ]
+    for name, kind, values in times:
+        columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z), (name, kind, values)]
+        content = [("/points", START, cloud_message(messages, START, columns))]
+        recording = read(bag(content, f"{name}{kind}{values[-1]:.0f}"))
+        np.testing.assert_allclose(recording.beam_time, after, atol=2e-6)
+
+
+def test_damaged_clouds_are_counted(bag, messages, rng):
+    x, y, z = xyz(rng)
+    columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
+    odd = [
+        {},
+        {"width": 2**32 - 1},
+        {"point_step": 0},
+        {"row_step": 3},
+        {"width": 13, "row_step": 0},
+        {"point_step": 2**32 - 1},
+        {"fields": []},
+    ]
+    content = [
+        ("/points", START + k, cloud_message(messages, START + k, columns, **changes))
+        for k, changes in enumerate(odd)
+    ]
+    recording = read(bag(content))
+    assert recording.n_scans == 1
+    found = {reason: one["count"] for reason, one in recording.source["skipped"].items()}
+    assert found == {point_cloud2.WRONG_SIZE: 5, point_cloud2.NO_PLACES: 1}
+
+
+def test_points_that_nothing_can_see(bag, messages, rng):
+    x, y, z = xyz(rng)
+    x[3], y[4], z[5] = 1e30, -3e38, 2e5
+    x[6] = y[6] = z[6] = 3e38  # its distance is no float32
+    columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
+    recording = read(bag([("/points", START, cloud_message(messages, START, columns))]))
+    wild = np.isin(np.arange(12), [3, 4, 5, 6])
+    np.testing.assert_array_equal(recording.hit, ~wild)
+    assert np.isnan(recording.points[wild]).all()
+    with np.errstate(all="raise"):
+        assert facts(recording)["counts"]["unusable"] == 4
+
+
+def test_places_of_lidars_and_odometry(bag, messages, rng):
+    x, y, z = xyz(rng)
+    columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
+    mounts = [
+        messages.transform(0, "base_link", "front", (1, 0, 0.5)),
+        messages.transform(0, "base_link", "rear", (-1, 0, 0.5), (0, 0, 1, 0)),
+    ]
+    content = [("/tf_static", START, messages.tf(*mounts))]
+    for k in range(4):
+        stamp = START + k * SECOND
+        move = messages.transform(stamp, "odom", "base_link", (k, 0, 0.1 * k))
+        content.append(("/tf", stamp, messages.tf(move)))
+        for frame in ("front", "rear"):
+            cloud = cloud_message(messages, stamp, columns, frame=frame)
+            content.append((f"/{frame}/points", stamp, cloud))
+    recording = read(bag(content))
+    assert recording.n_scans == 8
+    places = recording.T_base_sensor[recording.sensor]
+    assert sorted(places[:2, 0, 3]) == [-1.0, 1.0]
+    np.testing.assert_allclose(recording.T_odom_base[::2, 2, 3], 0.1 * np.arange(4), atol=1e-9)
+
+
+def test_scans_of_lasers_come_first(bag, messages, rng):
+    x, y, z = xyz(rng)
+    columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
+    content = [
+        ("/points", START, cloud_message(messages, START, columns)),
+        ("/scan", START, messages.scan(START, [1.0, 2.0])),
+    ]
+    recording = read(bag(content))
+    assert recording.dimension == 2
+    why = {note["topic"]: note["why"] for note in recording.source["topics"]}
+    assert why["/points"].startswith("not used: the laser scans are")
+
+
+def picture(messages, stamp, pixels, encoding, row_bytes=None, **changes):
+    height, width = pixels.shape[:2]
+    row = pixels.reshape(height, -1).view(np.uint8)
+    step = row_bytes or row.shape[1]
+    data = np.zeros((height, step), np.uint8)
+    data[:, : row.shape[1]] = row
+    kind = "sensor_msgs/msg/Image"
+    stated = {"height": height, "width": width, "encoding": encoding, "is_bigendian": 0}
+    stated = stated | {"step": step, "data": data.ravel()} | changes
+    return kind, messages.make(kind, messages.header(stamp, "camera"), **stated)
+
+
+def with_pictures(messages, rng, pictures):
+    x, y, z = xyz(rng)
+    columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
+    mounts = [
+        messages.transform(0, "lidar", "camera", (0.1, 0.2, 0.3), (-0.5, 0.5, -0.5, 0.5)),
+    ]
+    content = [("/tf_static", START, messages.tf(*mounts))]
+    for k in range(3):
+        stamp = START + k * SECOND
+        content.append(("/points", stamp, cloud_message(messages, stamp, columns)))
+    return content + pictures
+
+
+def test_pictures_are_read_when_asked_for(bag, messages, rng):
+    colours = rng.integers(0, 256, (6, 4, 3), np.uint8)
+    grey = rng.integers(0, 256, (6, 4), np.uint8)
+    depth = rng.integers(0, 5000, (6, 4), np.uint16)
+    stream = io.BytesIO()
+    Image.fromarray(colours).save(stream, "PNG")
+    packed = messages.make(
+        "sensor_msgs/msg/CompressedImage",
+        messages.header(START + 4, "camera"),
+        "png",
+        np.frombuffer(stream.getvalue(), np.uint8),
+    )
+    pictures = [
+        ("/cam/image", START + 1, picture(messages, START + 1, colours, "rgb8")),
+        (
+            "/cam/image",
+            START + 2,
+            picture(messages, START + 2, colours[..., ::-1].copy(), "bgr8", 20),
+        ),
+        ("/grey/image", START + 3, picture(messages, START + 3, grey, "mono8")),
+        ("/other/image/compressed", START + 4, ("sensor_msgs/msg/CompressedImage", packed)),
+        ("/depth/image", START + 5, picture(messages, START + 5, depth, "16UC1")),
+    ]
+    images = read(bag(with_pictures(messages, rng, pictures))).images
+    assert images is not None
+    np.testing.assert_array_equal(images.stamp_ns, START + np.arange(1, 6))
+    for number, expected in enumerate((colours, colours, grey, colours, depth)):
+        np.testing.assert_array_equal(images.read(number), expected)
+    assert images.cameras[images.camera[2]].name == "/grey/image"
+    T = images.cameras[0].T_base_camera
+    np.testing.assert_allclose(T[:3, 2], [1, 0, 0], atol=1e-12)  # looks ahead
+    np.testing.assert_allclose(T[:3, 3], [0.1, 0.2, 0.3])
+
+
+def test_pictures_of_unknown_encoding(bag, messages, rng):
+    grey = rng.integers(0, 256, (6, 4), np.uint8)
+    pictures = [("/cam/image", START + 1, picture(messages, START + 1, grey, "yuv999"))]
+    images = read(bag(with_pictures(messages, rng, pictures))).images
+    with pytest.raises(InputError, match="'yuv999', which is not read"):
+        images.read(0)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"height": 2**20}, {"step": 1}, {"row_bytes": 5, "width": 6}, {"width": 2**31}]
+)
+def test_damaged_pictures(bag, messages, rng, changes):
+    grey = rng.integers(0, 256, (6, 4), np.uint8)
+    pictures = [("/cam/image", START + 1, picture(messages, START + 1, grey, "mono8", **changes))]
+    images = read(bag(with_pictures(messages, rng, pictures))).images
+    with pytest.raises(InputError, match="a picture is"):
+        images.read(0)
+
+
+def test_bayer(bag, messages, rng):
+    mosaic = np.array([[10, 20], [40, 30]], np.uint8)  # red, green, green, blue
+    pictures = [("/cam/image", START + 1, picture(messages, START + 1, mosaic, "bayer_rggb8"))]
+    images = read(bag(with_pictures(messages, rng, pictures))).images
+    np.testing.assert_array_equal(images.read(0), np.full((2, 2, 3), [10, 30, 30]))
+
+
+def test_where_a_camera_looks_through(bag, messages, rng):
+    grey = rng.integers(0, 256, (6, 4), np.uint8)
+    kind = "sensor_msgs/msg/CameraInfo"
+    region = messages.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+    values = [
+        "plumb_bob",
+        np.arange(5.0),
+        np.array([9.0, 0, 2, 0, 9, 3, 0, 0, 1]),
+        np.eye(3).ravel(),
+    ]
+    info = messages.make(
+        kind, messages.header(START, "camera"), 6, 4, *values, np.zeros(12), 0, 0, region
+    )
+    pictures = [
+        ("/cam/camera_info", START, (kind, info)),
+        ("/cam/image_raw", START + 1, picture(messages, START + 1, grey, "mono8")),
+    ]
+    camera = read(bag(with_pictures(messages, rng, pictures))).images.cameras[0]
+    np.testing.assert_array_equal(camera.K, [[9, 0, 2], [0, 9, 3], [0, 0, 1]])
+    assert camera.model == "plumb_bob"
+    np.testing.assert_array_equal(camera.distortion, np.arange(5.0))
+
+
+@pytest.mark.parametrize("name", ["image_rect", "image_rect_color"])
+def test_rectified_pictures_have_their_own_camera(bag, messages, rng, name):
+    grey = rng.integers(0, 256, (6, 4), np.uint8)
+    kind = "sensor_msgs/msg/CameraInfo"
+    region = messages.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+    turn = Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
+    raw = np.array([9.0, 0, 2, 0, 9, 3, 0, 0, 1])
+    P = np.array([8.0, 0, 2.5, -0.8, 0, 8, 3.5, 0, 0, 0, 1, 0])
+    values = ["plumb_bob", np.arange(5.0), raw, turn.ravel(), P, 0, 0, region]
+    info = messages.make(kind, messages.header(START, "camera"), 6, 4, *values)
+    pictures = [
+        ("/cam/camera_info", START, (kind, info)),
+        (f"/cam/{name}", START + 1, picture(messages, START + 1, grey, "mono8")),
+    ]
+    camera = read(bag(with_pictures(messages, rng, pictures))).images.cameras[0]
+    np.testing.assert_array_equal(camera.K, [[8, 0, 2.5], [0, 8, 3.5], [0, 0, 1]])
+    assert (camera.model, len(camera.distortion)) == ("", 0)
+    # what the camera saw ahead, the rectified one sees turned
+    ahead = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    np.testing.assert_allclose(camera.T_base_camera[:3, :3], ahead @ turn.T, atol=1e-12)
+    np.testing.assert_allclose(camera.T_base_camera[:3, 3], [0.1, 0.2, 0.3])

@@ -1,0 +1,266 @@
+"""What bags may do to a reader, and what it answers: one line, or what was skipped."""
+
+import bz2
+import shutil
+import struct
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+from small_bags import Messages, write_bag
+
+from stillmap.core.errors import InputError
+from stillmap.io import read
+from stillmap.io.ros import laser_scan, limits
+
+START = 1_700_000_000_000_000_000
+SECOND = 10**9
+
+
+def scans_of(messages, n, **changes):
+    out = []
+    for k in range(n):
+        stamp = START + k * SECOND // 10
+        ranges = 2.0 + 0.05 * k + 0.001 * np.arange(400)
+        out.append(("/scan", stamp, messages.scan(stamp, ranges, angle_increment=0.01, **changes)))
+    return out
+
+
+def skipped(recording):
+    return {reason: one["count"] for reason, one in recording.source["skipped"].items()}
+
+
+def file_of(path: Path) -> Path:
+    return next(path.glob("*.db3")) if path.is_dir() else path
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.9, 0.999])
+def test_cut(bag, messages, kind, share):
+    path = bag(scans_of(messages, 200))
+    file = file_of(path)
+    content = file.read_bytes()
+    file.write_bytes(content[: int(share * len(content))])
+    try:
+        recording = read(path)
+    except InputError:
+        # SQLite keeps its list of tables and pages where it likes
+        assert share < 0.1 or kind in ("db3", "folder")
+        return
+    assert recording.n_scans > 0.7 * share * 200 - 3
+    if kind in ("bag", "mcap"):
+        assert "cut or damaged" in recording.source["warnings"][0]
+    # what is there is what was recorded
+    got = np.linalg.norm(recording.points, axis=1).reshape(-1, 400)[:, 0]
+    k = (recording.stamp_ns - START) // (SECOND // 10)
+    np.testing.assert_allclose(got, 2.0 + 0.05 * k, rtol=1e-6)
+
+
+def test_bits_that_flipped_in_the_middle(bag, messages, rng):
+    path = bag(scans_of(messages, 200))
+    file = file_of(path)
+    content = bytearray(file.read_bytes())
+    for at in rng.integers(len(content) // 4, 3 * len(content) // 4, 3):
+        content[at : at + 64] = rng.integers(0, 256, 64, np.uint8).tobytes()
+    file.write_bytes(bytes(content))
+    assert read(path).n_scans > 20
+
+
+def test_no_index(bag, messages, kind):
+    """A recorder that was killed leaves no index behind."""
+    if kind != "bag":
+        pytest.skip("ROS 1 alone")
+    path = bag(scans_of(messages, 20))
+    content = path.read_bytes()
+    at = content.index(b"index_pos=") + len("index_pos=")
+    path.write_bytes(content[:at] + bytes(8) + content[at + 8 :])
+    assert read(path).n_scans == 20
+
+
+def test_wrong_lengths_within_messages(bag, messages):
+    content = scans_of(messages, 6)
+    kind, message = content[3][2]
+    raw = messages.raw(kind, message)
+    at = raw.index(struct.pack("<I", 400))
+    for k, count in ((1, 401), (3, 2**31), (4, 2**32 - 1)):
+        content[k] = (*content[k][:2], (kind, raw[:at] + struct.pack("<I", count) + raw[at + 4 :]))
+    content[5] = (*content[5][:2], (kind, raw[:50]))
+    recording = read(bag(content))
+    assert recording.n_scans == 2
+    assert skipped(recording) == {laser_scan.UNREADABLE: 4}
+    assert recording.source["skipped"][laser_scan.UNREADABLE]["lines"] == [2, 4, 5, 6]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"angle_increment": 0.0}, laser_scan.NO_STEP),
+        ({"angle_increment": np.nan}, laser_scan.NO_ANGLES),
+        ({"angle_min": np.inf}, laser_scan.NO_ANGLES),
+        ({"angle_increment": 0.1}, laser_scan.MANY_TURNS),
+    ],
+)
+def test_angles_that_cannot_be(bag, messages, changes, reason):
+    content = scans_of(messages, 4)
+    kind, message = content[2][2]
+    for name, value in changes.items():
+        object.__setattr__(message, name, value)
+    content[2] = (*content[2][:2], (kind, message))
+    recording = read(bag(content))
+    assert skipped(recording) == {reason: 1}
+    assert recording.n_scans == 3
+
+
+def test_numbers_of_beams_may_vary(bag, messages):
+    content = [
+        ("/scan", START + k, messages.scan(START + k, np.full(n, 3.0), angle_increment=0.01))
+        for k, n in enumerate((5, 7, 0, 5, 1))
+    ]
+    recording = read(bag(content))
+    np.testing.assert_array_equal(np.diff(recording.offset), [5, 7, 5, 1])
+    assert skipped(recording) == {laser_scan.NO_READINGS: 1}
+
+
+def test_stamps_that_run_backwards_and_repeat(bag, messages):
+    stamps = [0, 1, 2, 2, 9, 3, 3, 4]
+    readings = [1.0, 2.0, 3.0, 3.0, 4.0, 5.0, 6.0, 7.0]
+    content = [
+        ("/scan", START + k, messages.scan(START + s * SECOND, np.full(4, r)))
+        for k, (s, r) in enumerate(zip(stamps, readings, strict=True))
+    ]
+    recording = read(bag(content))
+    np.testing.assert_array_equal((recording.stamp_ns - START) // SECOND, [0, 1, 2, 3, 3, 4])
+    assert skipped(recording) == {laser_scan.TIME_BACKWARDS: 1, laser_scan.REPEATED: 1}
+
+
+def test_headers_without_stamps(bag, messages):
+    content = [
+        ("/scan", START + k * SECOND, messages.scan(0, np.full(4, 2.0 + k))) for k in range(3)
+    ]
+    recording = read(bag(content))
+    np.testing.assert_array_equal(recording.stamp_ns, START + np.arange(3) * SECOND)
+    assert "times of recording are used" in recording.source["warnings"][0]
+
+
+def test_transforms_that_are_none(bag, messages):
+    content = scans_of(messages, 3)
+    bad = [
+        messages.transform(START, "odom", "base_link", (np.nan, 0, 0)),
+        messages.transform(START, "odom", "base_link", (0, 0, 0), (0, 0, 0, 0)),
+        messages.transform(START, "odom", "odom", (0, 0, 0)),
+        messages.transform(START, "", "base_link", (0, 0, 0)),
+    ]
+    content.append(("/tf", START, messages.tf(*bad)))
+    recording = read(bag(content))
+    assert recording.T_odom_base is None
+    assert recording.source["skipped_odometry"]["transform that is none"]["count"] == 4
+
+
+def test_frames_in_a_circle(bag, messages):
+    content = scans_of(messages, 3)
+    circle = [messages.transform(0, a, b, (1, 0, 0)) for a, b in (("laser", "x"), ("x", "laser"))]
+    content.append(("/tf_static", START, messages.tf(*circle)))
+    assert read(bag(content)).n_scans == 3
+
+
+def test_only_empty_topics(bag, messages, kind):
+    if kind in ("bag", "mcap"):
+        pytest.skip("topics without messages are not written here")
+    path = bag(scans_of(messages, 2))
+    import sqlite3
+
+    with sqlite3.connect(file_of(path)) as database:
+        database.execute("DELETE FROM messages")
+    with pytest.raises(InputError, match="holds no scans: /scan is empty"):
+        read(path)
+
+
+@pytest.mark.parametrize("packing", ["bz2", "lz4"])
+def test_packed_chunks(tmp_path, packing):
+    from rosbags.rosbag1 import Writer
+
+    messages = Messages("ros1")
+    content = scans_of(messages, 20)
+    path = write_bag(
+        tmp_path, "bag", messages, content, fmt=Writer.CompressionFormat[packing.upper()]
+    )
+    assert read(path).n_scans == 20
+
+
+@pytest.mark.parametrize(
+    ("kind", "mode"), [("folder", "MESSAGE"), ("folder", "FILE"), ("mcap", "STORAGE")]
+)
+def test_packed_ros2(tmp_path, kind, mode):
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+    messages = Messages("cdr")
+    path = write_bag(
+        tmp_path,
+        kind,
+        messages,
+        scans_of(messages, 20),
+        mode=CompressionMode[mode],
+        fmt=CompressionFormat.ZSTD,
+    )
+    assert read(path).n_scans == 20
+
+
+def test_a_folder_without_metadata(bag, messages, kind):
+    if kind != "folder":
+        pytest.skip("folders alone")
+    path = bag(scans_of(messages, 5))
+    (path / "metadata.yaml").unlink()
+    assert read(path).n_scans == 5
+
+
+def test_a_folder_that_lacks_a_file(bag, messages, kind):
+    if kind != "folder":
+        pytest.skip("folders alone")
+    path = bag(scans_of(messages, 5))
+    shutil.copy(file_of(path), path / "other.db3")
+    file_of(path).unlink() if file_of(path).name != "other.db3" else (path / "tiny.db3").unlink()
+    with pytest.raises(InputError, match=r"lacks the file 'tiny\.db3'"):
+        read(path)
+
+
+def test_names_that_addresses_would_misread(bag, messages):
+    path = bag(scans_of(messages, 5))
+    odd = path.rename(path.with_name(f"a%20b?c#d{path.suffix}"))
+    assert read(odd).n_scans == 5
+
+
+@pytest.mark.parametrize("unpack", [limits.bz2_unpacked, limits.lz4_unpacked, limits.zstd_unpacked])
+def test_bombs(unpack, monkeypatch):
+    monkeypatch.setattr(limits, "LIMIT", 1 << 20)
+    pack = {
+        "bz2_unpacked": bz2.compress,
+        "lz4_unpacked": lz4.frame.compress,
+        "zstd_unpacked": limits.zstd.compress,
+    }[unpack.__name__]
+    assert unpack(pack(bytes(1 << 20))) == bytes(1 << 20)
+    with pytest.raises(InputError, match="larger than 1 MiB"):
+        unpack(pack(bytes((1 << 20) + 1)))
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (b"#ROSBAG V1.2\n", "is a bag of version V1.2"),
+        (b"#ROSBAG V2.0\n", "holds no scans"),
+        (b"\x89MCAP0\r\n", "holds no scans"),
+        (b"SQLite format 3\0" + bytes(100), "holds no scans"),
+        (b"", "is empty"),
+        (b"\0\1\2\3", "is binary, no recording"),
+    ],
+)
+def test_files_that_are_no_bags(tmp_path, content, text):
+    path = tmp_path / "odd.bag"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=text) as caught:
+        read(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(11)

@@ -1,0 +1,210 @@
+"""Bags that would keep their reader for ever, fill its memory, or break it."""
+
+import bz2
+import os
+import sqlite3
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_bags import Messages, write_bag
+
+from stillmap.core.errors import InputError
+from stillmap.io import read
+from stillmap.io.ros import limits, scan_beams, sqlite_limits
+from stillmap.io.ros.laser_scan import Scans, Shape
+
+START = 1_700_000_000_000_000_000
+ENDLESS = "WITH RECURSIVE r(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM r) SELECT x AS id"
+
+
+def scans_of(messages, n=3):
+    return [("/scan", START + k, messages.scan(START + k, [1.0, 2.0, 3.0])) for k in range(n)]
+
+
+@pytest.fixture
+def db3(tmp_path):
+    """A SQLite bag of three scans, changed by a script; gives its path."""
+
+    def write(script: str = "") -> Path:
+        messages = Messages("cdr")
+        name = f"bag{len(list(tmp_path.iterdir()))}"
+        path = write_bag(tmp_path, "db3", messages, scans_of(messages), name)
+        database = sqlite3.connect(path)
+        database.executescript(script)
+        database.commit()
+        database.close()
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("place", [(np.nan, 0, 0), (1, np.nan, 0), (0, 0, np.inf), (1e300, 0, 0)])
+def test_places_that_are_none(bag, messages, place):
+    turn = (0.0, 0.0, 0.0, 1.0)
+    content = scans_of(messages)
+    for k, xyz in enumerate([place, (1, 2, 0), place]):
+        moving = messages.transform(START + k, "odom", "base_link", xyz)
+        fixed = messages.transform(START, "base_link", "laser", (0.1, 0, 0) if k else place)
+        content += [
+            ("/tf", START + k, messages.tf(moving)),
+            ("/tf_static", START + k, messages.tf(fixed)),
+            ("/odom", START + k, messages.odometry(START + k, xyz, turn)),
+        ]
+    recording = read(bag(content))
+    assert np.isfinite(recording.T_base_sensor).all()
+    assert np.isfinite(recording.T_odom_base).all()
+    assert recording.source["skipped_odometry"]["transform that is none"]["count"] == 5
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        f"DROP TABLE messages; CREATE VIEW messages AS {ENDLESS}, 1 AS topic_id, 1 AS timestamp, "
+        "x'00' AS data FROM r",
+        f"DROP TABLE topics; CREATE VIEW topics AS {ENDLESS}, '/scan' AS name, 'x' AS type, "
+        "'cdr' AS serialization_format FROM r",
+        f"DROP TABLE message_definitions; CREATE VIEW message_definitions AS {ENDLESS}, "
+        "'a' AS topic_type, 'ros2msg' AS encoding, '' AS encoded_message_definition FROM r",
+        "DROP TABLE messages; CREATE VIRTUAL TABLE messages USING fts5(topic_id, timestamp, data)",
+        "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, "
+        "timestamp INTEGER, data AS (zeroblob(900000000)))",
+    ],
+)
+def test_tables_that_are_none(db3, script):
+    with pytest.raises(InputError, match=r"is no bag: its .* are no plain table"):
+        read(db3(script))
+
+
+def test_values_of_other_types(db3):
+    changes = (
+        "UPDATE messages SET timestamp = 'x' WHERE id = 1;",
+        "UPDATE messages SET timestamp = 1.5 WHERE id = 1;",
+        "UPDATE messages SET data = 'text' WHERE id = 1;",
+    )
+    for change in changes:
+        assert read(db3(change)).n_scans == 2
+    for column in ("name", "type", "serialization_format"):
+        with pytest.raises(InputError):
+            read(db3(f"UPDATE topics SET {column} = x'00ff'"))
+
+
+def test_tree_in_which_one_page_stands_for_millions(db3, monkeypatch):
+    monkeypatch.setattr(sqlite_limits, "_SURELY_FINE", 0)
+    monkeypatch.setattr(sqlite_limits, "_STEPS_PER_BYTE", 3)
+    path, size = db3(), 4096
+    content = bytearray(path.read_bytes())
+    root = sqlite3.connect(path).execute(
+        "SELECT rootpage FROM sqlite_master WHERE name = 'messages'"
+    )
+    at = (next(root)[0] - 1) * size
+    content += content[at : at + size]
+    for _ in range(3):
+        child, inner = len(content) // size, bytearray(size)
+        struct.pack_into(">BHHHBI", inner, 0, 5, 0, 400, size - 2000, 0, child)
+        for k in range(400):
+            struct.pack_into(">H", inner, 12 + 2 * k, size - 5 * (k + 1))
+            struct.pack_into(">IB", inner, size - 5 * (k + 1), child, 127)
+        content += inner
+    content[at : at + size] = content[-size:]
+    struct.pack_into(">I", content, 28, len(content) // size)
+    path.write_bytes(content)
+    recording = read(path)
+    assert recording.source["damage"]["rows that cannot be read"]["count"] == 1
+    assert recording.n_scans <= 3  # the others have their stamps and readings
+
+
+def test_names_of_any_bytes(db3, tmp_path):
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/not\xfftext?#%41.db3"))
+    db3().rename(path)
+    assert read(path).n_scans == 3
+
+
+def _record(fields: dict[bytes, bytes], content: bytes) -> bytes:
+    lines = [name + b"=" + value for name, value in fields.items()]
+    head = b"".join(struct.pack("<I", len(line)) + line for line in lines)
+    return struct.pack("<I", len(head)) + head + struct.pack("<I", len(content)) + content
+
+
+def _chunk(content: bytes) -> bytes:
+    size = struct.pack("<I", len(content))
+    fields = {b"op": b"\5", b"compression": b"bz2", b"size": size}
+    return _record(fields, bz2.compress(content))
+
+
+def test_chunks_in_chunks(tmp_path):
+    content = b""
+    for _ in range(12):
+        content = _chunk(content * 20)
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + content)
+    with pytest.raises(InputError, match="holds no scans"):
+        read(tmp_path / "a.bag")
+
+
+def test_parts_that_unpack_to_too_much(tmp_path, monkeypatch):
+    monkeypatch.setattr(limits, "_SURELY_FINE", 1 << 20)
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + _chunk(b"\0" * (1 << 20)) * 30)
+    with pytest.raises(InputError, match="more than 300 times its size"):
+        read(tmp_path / "a.bag")
+
+
+def test_index_that_names_one_message_many_times(tmp_path, monkeypatch):
+    monkeypatch.setattr(limits, "_SURELY_FINE", 1 << 20)
+    monkeypatch.setattr(limits, "_MAX_GROWTH", 10)
+    messages = Messages("ros1")
+    scan = messages.scan(START, np.ones(4000), angle_increment=1e-5)
+    path = write_bag(tmp_path, "bag", messages, [("/scan", START, scan)])
+    content, times = path.read_bytes(), 20_000
+    at = content.index(b"op=\4") - 8
+    (head,) = struct.unpack_from("<I", content, at)
+    entry = content[at + 8 + head : at + 20 + head]
+    index = content[at : at + 4 + head].replace(b"count=\1\0", b"count=" + struct.pack("<H", times))
+    index += struct.pack("<I", 12 * times) + entry * times
+    moved = len(index) - (20 + head)
+    content = bytearray(content[:at] + index + content[at + 20 + head :])
+    place = content.index(b"index_pos=") + 10
+    (end,) = struct.unpack_from("<Q", content, place)
+    struct.pack_into("<Q", content, place, end + moved)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="more than 10 times its size"):
+        read(path)
+
+
+def test_recorded_after_the_end_of_time(tmp_path):
+    messages = Messages("cdr")
+    path = write_bag(tmp_path, "mcap", messages, scans_of(messages))
+    late = struct.pack("<Q", START + 1), struct.pack("<Q", 2**64 - 1)
+    content = path.read_bytes().replace(*late)
+    path.write_bytes(content)
+    assert read(path).n_scans == 2  # the library passes over it
+    path.write_bytes(content[:-50])
+    assert read(path).n_scans == 3
+
+
+def test_list_in_a_list_in_a_list(tmp_path):
+    messages = Messages("cdr")
+    path = write_bag(tmp_path, "folder", messages, scans_of(messages))
+    lines = ["a0: &a0 [x, x]"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12)]
+    lines += ["rosbag2_bagfile_information: {relative_file_paths: *a11}"]
+    (path / "metadata.yaml").write_text("\n".join(lines))
+    assert read(path).n_scans == 3
+    (path / "metadata.yaml").unlink()
+    os.mkfifo(path / "metadata.yaml")
+    assert read(path).n_scans == 3
+    os.mkfifo(path / "more.db3")
+    with pytest.raises(InputError, match="is no regular file"):
+        read(path)
+
+
+def test_long_scan_among_many_short_ones(monkeypatch):
+    monkeypatch.setattr(scan_beams, "_SAMPLE", 1000)
+    shapes = [Shape(0.0, 1e-4, n, 0.1, 9.0, 0.0) for n in (5000, 1)]
+    shape = np.array([0] + [1] * 4000, np.int32)
+    n = np.where(shape == 0, 5000, 1)
+    stamps = np.arange(len(shape), dtype=np.int64)
+    ranges = np.ones(n.sum(), np.float32)
+    start = np.cumsum(n) - n
+    scans = Scans("/scan", "", "", stamps, stamps, start, shape, shapes, ranges, [])
+    assert scan_beams._sample(scans).size <= 5 * 1000

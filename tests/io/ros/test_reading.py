@@ -1,0 +1,314 @@
+"""Bags as recordings: what is in them comes out, whatever the kind of bag."""
+
+import numpy as np
+import pytest
+
+from stillmap.core import se2
+from stillmap.core.errors import InputError
+from stillmap.io import read
+from stillmap.preprocessing.options import ReadOptions
+
+START = 1_700_000_000_000_000_000
+SECOND = 10**9
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+def turned(theta, over=0.0):
+    """Quaternion of a turn to the left after one about the x axis."""
+    c, s = np.cos(theta / 2), np.sin(theta / 2)
+    a, b = np.cos(over / 2), np.sin(over / 2)
+    return (c * b, s * b, s * a, c * a)
+
+
+def ranges_at(k, n=5):
+    return 2.0 + 0.1 * k + 0.01 * np.arange(n)
+
+
+def drive(messages, n_scans=10, n_beams=5):
+    """A robot that goes ahead by 0.1 m a scan, its laser 0.2 m ahead, transforms between scans."""
+    content = [
+        ("/tf_static", START, messages.tf(messages.transform(0, "base_link", "laser", (0.2, 0, 0))))
+    ]
+    for k in range(-1, 2 * n_scans):
+        stamp = START + k * SECOND // 20
+        step = messages.transform(stamp, "odom", "base_link", (0.05 * k, 0, 0))
+        content.append(("/tf", stamp, messages.tf(step)))
+    for k in range(n_scans):
+        stamp = START + k * SECOND // 10 + SECOND // 40  # half way between two transforms
+        content.append(("/scan", stamp, messages.scan(stamp, ranges_at(k, n_beams))))
+    return sorted(content, key=lambda one: one[1])
+
+
+def test_a_drive(bag, messages):
+    recording = read(bag(drive(messages)))
+    assert recording.n_scans == 10
+    np.testing.assert_array_equal(
+        recording.stamp_ns, START + np.arange(10) * SECOND // 10 + SECOND // 40
+    )
+    x, y, theta = se2.parameters(recording.T_odom_base).T
+    np.testing.assert_allclose(x, 0.1 * np.arange(10) + 0.025, atol=1e-9)
+    np.testing.assert_allclose([y, theta], 0.0, atol=1e-9)
+    np.testing.assert_allclose(se2.parameters(recording.T_base_sensor), [[0.2, 0, 0]], atol=1e-9)
+    expected = np.stack([ranges_at(k) for k in range(10)])
+    got = np.linalg.norm(recording.points, axis=1).reshape(10, 5)
+    np.testing.assert_allclose(got, expected, rtol=1e-6)
+    angle = np.arctan2(recording.points[:, 1], recording.points[:, 0]).reshape(10, 5)
+    np.testing.assert_allclose(angle, np.tile([-0.5, -0.25, 0, 0.25, 0.5], (10, 1)), atol=1e-6)
+    assert recording.hit.all()
+    assert recording.source["odometry"]["from"] == "TF from odom to base_link"
+    assert recording.source["base_frame"] == "base_link"
+    assert not recording.source["warnings"]
+
+
+def test_no_transforms(bag, messages):
+    scans = [("/scan", START + k, messages.scan(START + k, ranges_at(k))) for k in range(3)]
+    recording = read(bag(scans))
+    assert recording.T_odom_base is None
+    np.testing.assert_array_equal(recording.T_base_sensor[0], np.eye(3))
+    assert "took the laser as the base" in recording.source["warnings"][0]
+
+
+def test_odometry_messages(bag, messages):
+    content = [
+        ("/tf_static", START, messages.tf(messages.transform(0, "base_link", "laser", (0, 0, 0))))
+    ]
+    for k in range(4):
+        stamp = START + k * SECOND
+        odometry = messages.odometry(stamp, (k, 2 * k, 0), turned(0.1 * k))
+        content.append(("/odom", stamp, odometry))
+        content.append(("/scan", stamp, messages.scan(stamp, ranges_at(k))))
+    recording = read(bag(content))
+    x, y, theta = se2.parameters(recording.T_odom_base).T
+    np.testing.assert_allclose(
+        np.stack([x, y, theta]), [[0, 1, 2, 3], [0, 2, 4, 6], 0.1 * np.arange(4)]
+    )
+    assert recording.source["odometry"]["from"] == "/odom"
+    assert recording.source["base_frame_how"] == "/odom names it"
+
+
+def test_infinity_is_nothing_in_range(bag, messages):
+    """REP 117: +inf nothing in range, -inf too near to measure, NaN no measurement."""
+    readings = [1.0, np.inf, -np.inf, np.nan, 0.05, -1.0, 15.0]
+    scans = [("/scan", START + k, messages.scan(START + k, readings)) for k in range(2)]
+    recording = read(bag(scans))
+    np.testing.assert_array_equal(recording.hit[:7], [1, 0, 0, 0, 0, 0, 1])
+    length = np.linalg.norm(recording.points[:7], axis=1)
+    np.testing.assert_allclose(length, [1.0, 15.0, np.nan, np.nan, np.nan, np.nan, 15.0], rtol=1e-6)
+
+
+def test_beams_take_time(bag, messages):
+    scans = [
+        (
+            "/scan",
+            START + k * SECOND,
+            messages.scan(START + k * SECOND, ranges_at(k), time_increment=0.01),
+        )
+        for k in range(3)
+    ]
+    recording = read(bag(scans))
+    np.testing.assert_allclose(recording.beam_time, np.tile(0.01 * np.arange(5), 3), rtol=1e-6)
+
+
+def test_increments_that_cannot_be_are_not_heeded(bag, messages):
+    scans = [
+        (
+            "/scan",
+            START + k * SECOND,
+            messages.scan(START + k * SECOND, ranges_at(k), time_increment=1.0),
+        )
+        for k in range(3)
+    ]
+    assert read(bag(scans)).beam_time is None
+
+
+def test_a_laser_upside_down(bag, messages):
+    """Its angles rise to the right of the robot, seen from above."""
+    over = messages.transform(0, "base_link", "laser", (0.1, 0.2, 0.3), turned(0.3, np.pi))
+    content = [("/tf_static", START, messages.tf(over))]
+    content += [("/scan", START + k, messages.scan(START + k, ranges_at(k))) for k in range(2)]
+    recording = read(bag(content))
+    np.testing.assert_allclose(
+        se2.parameters(recording.T_base_sensor), [[0.1, 0.2, 0.3]], atol=1e-9
+    )
+    angle = np.arctan2(recording.points[:5, 1], recording.points[:5, 0])
+    np.testing.assert_allclose(angle, [0.5, 0.25, 0, -0.25, -0.5], atol=1e-6)
+    assert recording.source["sensors"][0]["upside_down"]
+
+
+def test_clockwise_angles(bag, messages):
+    scans = [
+        (
+            "/scan",
+            START + k,
+            messages.scan(START + k, ranges_at(k), angle_min=0.5, angle_increment=-0.25),
+        )
+        for k in range(2)
+    ]
+    recording = read(bag(scans))
+    angle = np.arctan2(recording.points[:5, 1], recording.points[:5, 0])
+    np.testing.assert_allclose(angle, [0.5, 0.25, 0, -0.25, -0.5], atol=1e-6)
+
+
+def test_two_lasers_interleave(bag, messages):
+    content = [
+        (
+            "/tf_static",
+            START,
+            messages.tf(
+                messages.transform(0, "base_link", "front", (0.3, 0, 0)),
+                messages.transform(0, "base_link", "rear", (-0.3, 0, 0), turned(np.pi)),
+            ),
+        )
+    ]
+    for k in range(6):
+        front, rear = START + k * SECOND, START + k * SECOND + SECOND // 3
+        content.append(("/front", front, messages.scan(front, ranges_at(k), "front")))
+        content.append(("/rear", rear, messages.scan(rear, ranges_at(10 + k, 3), "rear")))
+    recording = read(bag(content))
+    np.testing.assert_array_equal(recording.sensor, [0, 1] * 6)
+    np.testing.assert_array_equal(np.diff(recording.offset), [5, 3] * 6)
+    length = np.linalg.norm(recording.points, axis=1)
+    np.testing.assert_allclose(length[:8], [*ranges_at(0), *ranges_at(10, 3)], rtol=1e-6)
+    np.testing.assert_allclose(length[-3:], ranges_at(15, 3), rtol=1e-6)
+    alone = read(bag(content, "again"), ReadOptions(topic="/rear"))
+    np.testing.assert_array_equal(np.diff(alone.offset), [3] * 6)
+    np.testing.assert_allclose(
+        np.abs(se2.parameters(alone.T_base_sensor)), [[0.3, 0, np.pi]], atol=1e-9
+    )
+
+
+def test_lasers_that_nothing_connects(bag, messages):
+    content = []
+    for k in range(6):
+        stamp = START + k * SECOND
+        content.append(("/a", stamp, messages.scan(stamp, ranges_at(k), "one")))
+        content.append(("/b", stamp, messages.scan(stamp, ranges_at(k), "other")))
+    recording = read(bag(content))
+    assert recording.n_scans == 6
+    assert "nothing says where 'other' is" in recording.source["duplicates"][0]
+
+
+def test_the_same_laser_twice_is_used_once(bag, messages):
+    content = []
+    for k in range(6):
+        stamp = START + k * SECOND
+        content.append(("/scan", stamp, messages.scan(stamp, ranges_at(k))))
+        content.append(("/scan_filtered", stamp, messages.scan(stamp, ranges_at(k))))
+    recording = read(bag(content))
+    assert [s["name"] for s in recording.source["sensors"]] == ["/scan"]
+    assert recording.source["duplicates"] == ["/scan_filtered: 6 scans, /scan shows the same laser"]
+
+
+def test_a_rare_topic_is_left_out(bag, messages):
+    content = [
+        ("/tf_static", START, messages.tf(messages.transform(0, "laser", "camera", (0, 0, 0))))
+    ]
+    for k in range(12):
+        stamp = START + k * SECOND
+        content.append(("/scan", stamp, messages.scan(stamp, ranges_at(k))))
+        if k < 2:
+            content.append(("/depth", stamp, messages.scan(stamp, ranges_at(k), "camera")))
+    recording = read(bag(content))
+    assert len(recording.T_base_sensor) == 1
+    assert recording.source["duplicates"] == ["/depth: 2 scans are too few beside /scan"]
+
+
+def test_a_laser_that_turns_on_the_robot(bag, messages):
+    content = []
+    for k in range(5):
+        stamp = START + k * SECOND
+        mount = messages.transform(stamp, "base_link", "laser", (0.1, 0, 0), turned(0.1 * k))
+        move = messages.transform(stamp, "odom", "base_link", (k, 0, 0))
+        content.append(("/tf", stamp, messages.tf(mount, move)))
+        content.append(("/scan", stamp, messages.scan(stamp, ranges_at(k))))
+    recording = read(bag(content))
+    assert recording.source["base_frame"] == "base_link"
+    places = se2.parameters(recording.T_base_sensor)[recording.sensor]
+    np.testing.assert_allclose(places[:, 2], 0.1 * np.arange(5), atol=1e-9)
+    np.testing.assert_allclose(se2.parameters(recording.T_odom_base)[:, 0], np.arange(5))
+
+
+def test_frames_can_be_named(bag, messages):
+    content = drive(messages)
+    for k in range(-1, 22):
+        stamp = START + k * SECOND // 20
+        step = messages.transform(stamp, "map", "odom", (0, k, 0))
+        content.append(("/tf", stamp, messages.tf(step)))
+    path = bag(sorted(content, key=lambda one: one[1]))
+    y = se2.parameters(read(path).T_odom_base)[:, 1]
+    np.testing.assert_allclose(y, 0.0, atol=1e-9)
+    y = se2.parameters(read(path, ReadOptions(odom_frame="map")).T_odom_base)[:, 1]
+    np.testing.assert_allclose(y, 2.0 * np.arange(10) + 0.5, atol=1e-9)
+    laser = read(path, ReadOptions(base_frame="laser"))
+    np.testing.assert_allclose(se2.parameters(laser.T_base_sensor), 0.0, atol=1e-9)
+    np.testing.assert_allclose(se2.parameters(laser.T_odom_base)[0], [0.225, 0, 0], atol=1e-9)
+    with pytest.raises(
+        InputError, match=r"base frame 'robot' is not in the recording \(has: base_link"
+    ):
+        read(path, ReadOptions(base_frame="robot"))
+    with pytest.raises(InputError, match="odometry frame 'world' is not"):
+        read(path, ReadOptions(odom_frame="world"))
+
+
+def test_topics_that_are_not_there(bag, messages):
+    path = bag(drive(messages))
+    with pytest.raises(InputError, match=r"topic '/sacn' is not there \(topics with scans: /scan"):
+        read(path, ReadOptions(topic="/sacn"))
+    with pytest.raises(InputError, match="topic '/tf' has tf2_msgs/msg/TFMessage, no scans"):
+        read(path, ReadOptions(topic="/tf"))
+    assert read(path, ReadOptions(topic="scan")).n_scans == 10
+
+
+def test_no_scans_at_all(bag, messages):
+    path = bag([("/tf", START, messages.tf(messages.transform(START, "a", "b", (0, 0, 0))))])
+    with pytest.raises(InputError, match=r"holds no scans \(it has /tf \(TFMessage\)\)"):
+        read(path)
+
+
+def test_odometry_with_a_gap(bag, messages):
+    content = [
+        one
+        for one in drive(messages, 60)
+        if one[0] != "/tf" or not 1.0 < (one[1] - START) / 1e9 < 4.0
+    ]
+    recording = read(bag(content))
+    x = se2.parameters(recording.T_odom_base)[:, 0]
+    np.testing.assert_allclose(x, 0.1 * np.arange(60) + 0.025, atol=1e-6)
+    assert any("no odometry for 3.0 s" in text for text in recording.source["warnings"])
+
+
+def test_scans_outside_the_odometry(bag, messages):
+    content = [one for one in drive(messages) if one[0] != "/tf" or one[1] < START + SECOND // 2]
+    warnings = read(bag(content)).source["warnings"]
+    assert any("scans outside the time of the odometry" in text for text in warnings)
+
+
+def test_echoes(bag, messages):
+    echo = messages.store.types["sensor_msgs/msg/LaserEcho"]
+    kind = "sensor_msgs/msg/MultiEchoLaserScan"
+    content = []
+    for k in range(2):
+        echoes = [np.array(e, np.float32) for e in ([1.0, 3.0], [], [2.0], [np.inf], [4.0, 5.0])]
+        scan = messages.make(
+            kind,
+            messages.header(START + k, "laser"),
+            *(-0.5, 0.5, 0.25, 0.0, 0.0, 0.1, 20.0),
+            [echo(e) for e in echoes],
+            [],
+        )
+        content.append(("/echoes", START + k, (kind, scan)))
+    recording = read(bag(content))
+    length = np.linalg.norm(recording.points[:5], axis=1)
+    np.testing.assert_array_equal(recording.hit[:5], [1, 0, 1, 0, 1])
+    np.testing.assert_allclose(length[[0, 2, 4]], [1.0, 2.0, 4.0], rtol=1e-6)
+
+
+def test_order_of_scans_does_not_depend_on_where_arrays_lie(bag, messages, monkeypatch):
+    from stillmap.core import arrays
+
+    path = bag(drive(messages, 40))
+    before = read(path)
+    monkeypatch.setattr(arrays, "IN_MEMORY", 0)
+    after = read(path)
+    np.testing.assert_array_equal(before.points, after.points)
+    np.testing.assert_array_equal(before.hit, after.hit)

@@ -1,0 +1,191 @@
+"""A laser that tilts, in the same bag as one that lies flat."""
+
+import json
+
+import numpy as np
+import pytest
+from small_bags import Messages, write_bag
+
+from stillmap.cli.main import main
+from stillmap.core import se2
+from stillmap.core.errors import InputError
+from stillmap.io import read, writers
+from stillmap.io.ros.reader import read_tilting
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.sim import RigOptions, load_truth, scene_by_name, simulate_rig, write_rig
+from stillmap.sim.laser import beam_angles
+from stillmap.sim.lidar import joint_angle
+
+NOD = {"tilts": True, "period": 2.0}
+JOINT_NS = 5_000_000  # from one transform of the joint to the next; turns happen at some of them
+QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
+
+TILT = ReadOptions(topic="tilt_scan", base_frame="base_link")
+
+
+@pytest.fixture(scope="module")
+def rig():
+    """A hall with people, for 8 s."""
+    changes = {
+        "rig": NOD,
+        "laser": {"beams": 91, "sweep_time": 0.02, "max_range": 12.0},
+        "robot": {"scans": 200, "scan_rate": 25.0},
+        "crowd": {"people": 25},
+    }
+    return simulate_rig(scene_by_name("hall", changes), 5)
+
+
+def scans(messages, recording, frame, laser):
+    """LaserScan messages of a recording, from the ends of its beams."""
+    angles, n = beam_angles(laser.beams, laser.fov), laser.beams
+    length = np.linalg.norm(recording.points, axis=1)
+    ranges = np.where(recording.hit, length, np.inf).reshape(-1, n)
+    shape = {
+        "angle_min": angles[0],
+        "angle_max": angles[-1],
+        "angle_increment": angles[1] - angles[0],
+        "time_increment": laser.sweep_time / (n - 1),
+        "range_max": laser.max_range,
+    }
+    for stamp, readings in zip(recording.stamp_ns.tolist(), ranges, strict=True):
+        yield stamp, messages.scan(stamp, readings, frame, **shape)
+
+
+def nods(messages, rig, joint_ns):
+    """The joint, told at times of its own."""
+    start = int(rig.tilting.recording.stamp_ns[0])
+    o = RigOptions(**NOD)
+    half = 0.5 * joint_angle((joint_ns - start) / 1e9, o)
+    for stamp, a in zip(joint_ns.tolist(), half, strict=True):
+        turn = (0.0, np.sin(a), 0.0, np.cos(a))
+        at = (o.pivot_x, 0.0, o.pivot_z)
+        yield stamp, messages.tf(messages.transform(stamp, "base_link", "tilt", at, turn))
+
+
+def bag_of(folder, rig, joint_ns=None, kind="mcap"):
+    """A bag of both lasers, odometry, and the joint's transforms."""
+    messages = Messages("ros1" if kind == "bag" else "cdr")
+    flat, tilting = rig.horizontal.recording, rig.tilting.recording
+    laser = rig.horizontal.scene.laser
+    first, last = int(flat.stamp_ns[0]), int(flat.stamp_ns[-1]) + 100_000_000
+    if joint_ns is None:
+        joint_ns = np.arange(first, last, JOINT_NS)
+    x, y, yaw = se2.parameters(flat.T_base_sensor)[0]
+    turned = (0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
+    fixed = messages.transform(first, "base_link", "laser", (x, y, 0.35), turned)
+    content = [("/tf_static", first, messages.tf(fixed))]
+    content += [("/scan", at, m) for at, m in scans(messages, flat, "laser", laser)]
+    content += [("/tilt_scan", at, m) for at, m in scans(messages, tilting, "tilt", laser)]
+    content += [("/tf", at, m) for at, m in nods(messages, rig, joint_ns)]
+    for stamp, T in zip(flat.stamp_ns.tolist(), flat.T_odom_base, strict=True):
+        x, y, yaw = se2.parameters(T[None])[0]
+        turned = (0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
+        at = messages.tf(messages.transform(stamp, "odom", "base_link", (x, y, 0.0), turned))
+        content.append(("/tf", stamp, at))
+    return write_bag(folder, kind, messages, sorted(content, key=lambda one: one[1]), "rig")
+
+
+@pytest.fixture(scope="module")
+def path(rig, tmp_path_factory):
+    return bag_of(tmp_path_factory.mktemp("bag"), rig)
+
+
+def in_base(recording):
+    """Ends of beams on the robot, metres."""
+    T = recording.T_base_sensor[recording.sensor].repeat(np.diff(recording.offset), axis=0)
+    return np.einsum("nij,nj->ni", T[:, :3, :3], recording.points.astype(float)) + T[:, :3, 3]
+
+
+def test_points_lie_where_the_joint_turned_them(rig, path):
+    found, true = read_tilting(path, TILT, None, None), rig.tilting.recording
+    assert found.dimension == 3
+    np.testing.assert_array_equal(found.stamp_ns, true.stamp_ns)
+    np.testing.assert_array_equal(found.hit, true.hit)
+    np.testing.assert_allclose(found.beam_time, true.beam_time, atol=1e-6)
+    off = np.linalg.norm(in_base(found) - in_base(true), axis=1)[true.hit]
+    assert off.max() < 2e-3
+    # each scan's sensor is tilted as at its stamp
+    down = np.arcsin(-found.T_base_sensor[:, 2, 0])
+    np.testing.assert_allclose(down, rig.joint_angle, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["bag", "folder"])
+def test_other_kinds_of_bags(rig, path, tmp_path, kind):
+    found = read_tilting(bag_of(tmp_path, rig, kind=kind), TILT, None, None)
+    np.testing.assert_array_equal(found.points, read_tilting(path, TILT, None, None).points)
+
+
+def test_the_map_is_not_made_from_it(rig, path):
+    flat = read(path, ReadOptions(tilting_topic="/tilt_scan"))
+    assert flat.dimension == 2
+    assert flat.n_scans == rig.horizontal.recording.n_scans
+    (why,) = (t["why"] for t in flat.source["topics"] if t["topic"] == "/tilt_scan")
+    assert "tilts" in why
+
+
+def test_pauses_of_the_joint_are_unusable(rig, tmp_path):
+    stamps = rig.tilting.recording.stamp_ns
+    first, last = int(stamps[0]), int(stamps[-1]) + 100_000_000
+    joint_ns = np.arange(first, last, JOINT_NS)
+    after = (joint_ns - first) / 1e9
+    joint_ns = joint_ns[(after >= 1.0) & ((after <= 3.0) | (after >= 5.0))]
+    found = read_tilting(bag_of(tmp_path, rig, joint_ns), TILT, None, None)
+    taken = (stamps.repeat(91) - first) / 1e9 + found.beam_time
+    known = (taken >= 1.0) & ((taken <= 3.0) | (taken >= 5.0))
+    np.testing.assert_array_equal(found.hit, rig.tilting.recording.hit & known)
+    assert np.isnan(found.points[~known]).all()
+    assert any("do not say how the laser is tilted" in w for w in found.source["warnings"])
+
+
+def test_what_the_map_command_makes_of_it(rig, path, tmp_path):
+    out = tmp_path / "out"
+    words = ("map", path, "--tilting-topic", "/tilt_scan", "-o", out, *QUICK)
+    assert main([str(word) for word in words]) == 0
+    write_rig(rig, tmp_path / "sim")
+    p_static = np.load(out / "tilting/beams/p_static.npy")
+    truth = load_truth(tmp_path / "sim" / "tilting")
+    known = rig.tilting.recording.hit & ~np.isnan(p_static)
+    removed, static = p_static[known] < 0.5, truth.static[known]
+    assert (~static).sum() > 100
+    assert removed[~static].mean() > 0.85
+    assert removed[static].mean() < 0.01
+    record = json.loads((out / "run.json").read_text())
+    assert record["tilting"]["input"]["path"] == str(path)
+    assert record["options"]["read"]["tilting_topic"] == "/tilt_scan"
+    assert record["models"]["area"] > 100.0  # m2: floor, walls and ceiling
+
+
+def test_clouds_of_points_are_taken_as_they_are(rig, tmp_path):
+    writers.write(rig.tilting.recording, tmp_path / "a.mcap")
+    wanted = ReadOptions(topic="/points", base_frame="base_link")
+    found = read_tilting(tmp_path / "a.mcap", wanted, None, None)
+    hit = rig.tilting.recording.hit
+    np.testing.assert_array_equal(found.points[hit], rig.tilting.recording.points[hit])
+
+
+def refused(capsys, *words):
+    """The one line with which the command refuses."""
+    assert main([str(word) for word in (*words, *QUICK)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    return err
+
+
+def test_wrong_topics_are_refused(rig, path, tmp_path, capsys):
+    words = ("map", path, "-o", tmp_path / "out", "--tilting-topic")
+    assert "is not there" in refused(capsys, *words, "/nod")
+    assert "no scans" in refused(capsys, *words, "/tf")
+    assert "exclude each other" in refused(capsys, *words, "/tilt_scan", "--tilting", path)
+    write_rig(rig, tmp_path / "sim")
+    words = ("map", tmp_path / "sim/horizontal", "--tilting-topic", "/a", "-o", tmp_path / "out")
+    assert "is for bags" in refused(capsys, *words)
+    (tmp_path / "a.log").write_text("FLASER 2 1 2 0 0 0 0 0 0 1.0 host 1.0\n" * 3)
+    words = ("map", tmp_path / "a.log", "--tilting-topic", "/a", "-o", tmp_path / "out")
+    assert "is for bags" in refused(capsys, *words)
+
+
+def test_a_laser_that_does_not_tilt_is_refused(path):
+    flat = ReadOptions(topic="/scan", base_frame="base_link")
+    with pytest.raises(InputError, match="does not tilt"):
+        read_tilting(path, flat, None, None)

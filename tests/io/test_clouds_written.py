@@ -1,0 +1,173 @@
+"""What is written as clouds is read again as it was, as far as the format goes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.io import read
+from stillmap.io import write as write_folder
+from stillmap.io.point_cloud import kitti, las, pcd, ply
+from stillmap.preprocessing.options import ReadOptions
+
+WRITERS = {"KITTI": kitti.write, "PCD": pcd.write, "own": write_folder}
+
+
+def require_same(found, wanted):
+    for name in ("stamp_ns", "offset", "hit", "points", "sensor", "T_base_sensor"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name), name)
+
+
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_round_trip(space, tmp_path, write):
+    write(space, tmp_path / "out")
+    found = read(tmp_path / "out")
+    require_same(found, space)
+    np.testing.assert_allclose(found.T_recorded_base, space.T_recorded_base, atol=1e-12)
+    assert found.source.get("skipped", {}) == {}
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_the_same_recording_gives_the_same_bytes(space, tmp_path, write):
+    for name in ("a", "b"):
+        write(space, tmp_path / name)
+    files = [p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file()]
+    assert files
+    for file in files:
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_without_poses(space, tmp_path, write):
+    write(replace(space, T_recorded_base=None), tmp_path / "out")
+    assert read(tmp_path / "out").T_recorded_base is None
+
+
+@pytest.mark.parametrize("write", [kitti.write, pcd.write])
+def test_beams_without_a_hit_are_left_out(space, tmp_path, write):
+    points, hit = space.points.copy(), space.hit.copy()
+    points[3], hit[3], hit[5] = np.nan, False, False
+    write(replace(space, points=points, hit=hit), tmp_path / "out")
+    np.testing.assert_array_equal(read(tmp_path / "out").points, points[hit])
+
+
+def test_odometry_becomes_poses_of_kitti_where_there_are_no_others(space, tmp_path):
+    odom = replace(space, T_odom_base=space.T_recorded_base, T_recorded_base=None)
+    kitti.write(odom, tmp_path / "out")
+    np.testing.assert_allclose(read(tmp_path / "out").T_recorded_base, odom.T_odom_base, atol=1e-12)
+
+
+def test_the_place_of_the_sensor_is_part_of_its_poses(space, tmp_path):
+    moved = space.T_base_sensor.copy()
+    moved[0, :3, 3] = 0.1, 0.2, 1.5
+    mounted = replace(space, T_base_sensor=moved)
+    for name, write in (("k", kitti.write), ("p", pcd.write)):
+        write(mounted, tmp_path / name)
+        T = read(tmp_path / name).T_recorded_base
+        np.testing.assert_allclose(T, mounted.T_map_sensor(mounted.T_recorded_base), atol=1e-12)
+
+
+@pytest.mark.parametrize("write", [kitti.write, pcd.write])
+def test_several_sensors_do_not_fit(space, tmp_path, write):
+    two = replace(space, T_base_sensor=np.stack([np.eye(4)] * 2))
+    with pytest.raises(InputError, match="2 sensors"):
+        write(two, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_nothing_is_written_over(space, tmp_path, write):
+    write(space, tmp_path / "out")
+    with pytest.raises(InputError, match="already holds"):
+        write(space, tmp_path / "out")
+    shorter = replace(space, points=np.ones_like(space.points))
+    write(shorter, tmp_path / "out", overwrite=True)
+    np.testing.assert_array_equal(read(tmp_path / "out").points, shorter.points)
+
+
+def test_beam_times_go_into_pcd(space, tmp_path):
+    times = np.linspace(0.0, 0.1, space.n_beams).astype(np.float32)
+    pcd.write(replace(space, beam_time=times), tmp_path / "out")
+    np.testing.assert_array_equal(read(tmp_path / "out").beam_time, times)
+
+
+def test_stamps_that_repeat_or_are_negative(space, tmp_path):
+    stamps = np.array([-7, -7, 0, 0], np.int64)
+    for name, write in (("k", kitti.write), ("p", pcd.write)):
+        write(replace(space, stamp_ns=stamps), tmp_path / name)
+        require_same(read(tmp_path / name), replace(space, stamp_ns=stamps))
+
+
+def test_a_recording_of_the_plane_lies_at_height_zero(tmp_path):
+    plane = Recording(
+        stamp_ns=np.array([1], np.int64),
+        offset=np.array([0, 2]),
+        points=np.array([[1, 2], [3, 4]], np.float32),
+        hit=np.ones(2, bool),
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(1, np.int32),
+        T_odom_base=None,
+        T_recorded_base=np.array([[[0.0, -1, 5], [1, 0, 6], [0, 0, 1]]]),
+    )
+    pcd.write(plane, tmp_path / "p")
+    found = read(tmp_path / "p")
+    np.testing.assert_array_equal(found.points, [[1, 2, 0], [3, 4, 0]])
+    np.testing.assert_allclose(found.T_recorded_base[0] @ [1, 2, 0, 1], [3, 7, 0, 1])
+    ply.write(plane, tmp_path / "p.ply", plane.T_recorded_base)
+    np.testing.assert_allclose(read(tmp_path / "p.ply").points, [[3, 7, 0], [1, 9, 0]])
+
+
+@pytest.mark.parametrize(
+    ("module", "ending", "tolerance"), [(ply, "ply", 1e-6), (las, "las", 6e-5), (las, "laz", 6e-5)]
+)
+def test_one_cloud_of_all_hits(space, tmp_path, module, ending, tolerance):
+    if module is las:
+        pytest.importorskip("laspy")
+    path = tmp_path / f"cloud.{ending}"
+    hit = space.hit.copy()
+    hit[[2, 40]] = False
+    some = replace(space, hit=hit)
+    module.write(some, path, some.T_recorded_base)
+    placed = some.end_points(np.flatnonzero(hit), some.T_recorded_base)
+    found = read(path)
+    np.testing.assert_allclose(found.points, placed, atol=tolerance + 4e-6)
+    assert found.n_scans == 1
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="is there already"):
+        module.write(some, path, some.T_recorded_base)
+    module.write(some, path, some.T_recorded_base, overwrite=True)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize(("module", "ending"), [(ply, "ply"), (las, "laz")])
+def test_clouds_far_from_zero_keep_their_millimetres(space, tmp_path, module, ending):
+    if module is las:
+        pytest.importorskip("laspy")
+    T = space.T_recorded_base.copy()
+    T[:, :3, 3] += [512_345.25, 5_401_234.75, 300.5]
+    module.write(space, tmp_path / f"c.{ending}", T)
+    found = read(tmp_path / f"c.{ending}")
+    origin = np.array(found.source["origin"])
+    assert np.all(origin == np.round(origin))
+    placed = space.end_points(np.arange(space.n_beams), T)
+    np.testing.assert_allclose(found.points + origin, placed, atol=2e-4)
+    assert np.abs(found.points).max() < 200
+    assert any("the new zero" in warning for warning in found.source["warnings"])
+
+
+def test_ranges_are_narrowed_while_reading(space, tmp_path):
+    kitti.write(space, tmp_path / "out")
+    options = ReadOptions(min_range=10.0, max_range=30.0)
+    found = read(tmp_path / "out", options)
+    length = np.linalg.norm(space.points.astype(float), axis=1)
+    np.testing.assert_array_equal(found.hit, (length >= 10) & (length < 30))
+    assert np.isnan(found.points[length < 10]).all()
+    ends = np.linalg.norm(found.points[length >= 30], axis=1)
+    np.testing.assert_allclose(ends, 30.0, rtol=1e-6)
+    assert found.source["read_options"] == {"min_range": 10.0, "max_range": 30.0}
+    with pytest.raises(InputError, match="2D recordings only"):
+        read(tmp_path / "out", ReadOptions(laser_x=0.1))

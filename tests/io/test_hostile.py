@@ -1,0 +1,194 @@
+"""Files that would keep a reader for ever, fill its memory, or break it: found by fuzzing, or
+thought of. What is asserted first of all is that reading ends."""
+
+import gzip
+import os
+import re
+import struct
+import tracemalloc
+import zipfile
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillmap.core.config import load_toml, parse_assignment, replaced
+from stillmap.core.errors import InputError
+from stillmap.eval import readers
+from stillmap.io import read, registry, stillmap_folder, text_lines, writers
+from stillmap.io.carmen import log as log_module
+from stillmap.io.trajectory import read_tum
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.results import reader
+
+FLASER = "FLASER 2 1.0 2.0 0 0 0 0 0 0 1 host 1\n"
+
+
+def test_header_of_an_array_that_numpy_would_speak_of(tmp_path, log):
+    stillmap_folder.write(read(log([FLASER])), tmp_path / "r")
+    for name, old, new in (("offset", b"(2,)", b"(2L,)"), ("stamp_ns", b"'<i8'", b"'\\_i8'")):
+        path = tmp_path / "r" / f"{name}.npy"
+        content = path.read_bytes()
+        grown = len(new) - len(old)
+        path.write_bytes(content.replace(old, new, 1).replace(b" " * (1 + grown), b" ", 1))
+        if name == "offset":
+            assert read(tmp_path / "r").n_scans == 1
+    with pytest.raises(InputError, match=r"stamp_ns\.npy: is damaged"):
+        read(tmp_path / "r")
+
+
+@contextmanager
+def little_memory(most):
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < most
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.fixture
+def few_bytes_are_fine(monkeypatch):
+    monkeypatch.setattr(text_lines, "_SURELY_FINE", 1 << 20)
+
+
+@pytest.mark.parametrize("piece", [b"\n", b"\0" * 1000, b"ODOM 0 0 0 0 0 0 1 h 1\n"])
+@pytest.mark.usefixtures("few_bytes_are_fine")
+def test_gzip_that_unpacks_to_too_much(tmp_path, piece):
+    for name, start in (("a.log.gz", FLASER), ("a.3d.gz", "1 2 3\n")):
+        text = start.encode() + piece * ((2 << 20) // len(piece))
+        (tmp_path / name).write_bytes(gzip.compress(text))
+        with pytest.raises(InputError, match=r"more than 100 times its size|is damaged"):
+            read(tmp_path / name)
+
+
+@pytest.mark.usefixtures("few_bytes_are_fine")
+def test_logs_that_pack_well_are_read(tmp_path):
+    rng = np.random.default_rng(0)
+    log = "".join(FLASER.replace(" 1 host", f" {t + rng.random():.6f} host") for t in range(30_000))
+    (tmp_path / "a.log.gz").write_bytes(gzip.compress(log.encode()))
+    assert read(tmp_path / "a.log.gz").n_scans == 30_000
+
+
+def test_log_without_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(log_module, "_MOST_OTHER", 100)
+    (tmp_path / "a.log").write_text(FLASER + "other\n" * 300)
+    with pytest.raises(InputError, match="100 lines in a row that are no records"):
+        read(tmp_path / "a.log")
+    (tmp_path / "b.log").write_text((FLASER + "other\n" * 90) * 5)
+    assert read(tmp_path / "b.log").n_scans == 5
+
+
+@pytest.mark.parametrize("name", ["stamp_ns.npy", "points.npy", "T_odom_base.npy"])
+def test_pipe_in_a_recording(tmp_path, log, name):
+    stillmap_folder.write(read(log([FLASER])), tmp_path / "r")
+    (tmp_path / "r" / name).unlink()
+    os.mkfifo(tmp_path / "r" / name)
+    with pytest.raises(InputError, match=f"{name}: is no regular file"):
+        read(tmp_path / "r")
+
+
+@pytest.mark.parametrize(
+    ("reader", "said"),
+    [
+        (load_toml, "is too large: more than 64 KiB"),
+        (read_tum, "is too large"),
+        (readers.read_relations, "is too large"),
+        (readers.read_trajectory, "is no regular file"),
+        (readers.read_odometry, "is no regular file"),
+        (read, "is no regular file"),
+    ],
+)
+def test_device_without_end(tmp_path, reader, said):
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    with pytest.raises(InputError, match=said):
+        reader(tmp_path / "zero")
+
+
+@pytest.mark.parametrize("number", ["0x" + "f" * 5000, "9" * 5000, "-0x" + "f" * 5000])
+@pytest.mark.parametrize("name", ["max_range", "topic", "own_body"])
+def test_options_of_thousands_of_digits(tmp_path, name, number):
+    (tmp_path / "a.toml").write_text(f"{name} = {number}")
+    with pytest.raises(InputError) as caught:
+        replaced(ReadOptions(), load_toml(tmp_path / "a.toml"))
+    assert len(str(caught.value)) < 400
+    parse_assignment(f"read.{name}={number}")
+
+
+def test_map_that_unpacks_to_too_much(tmp_path, monkeypatch):
+    monkeypatch.setattr(reader, "_MAX_MAP", 1 << 20)
+    with zipfile.ZipFile(tmp_path / "map.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("p_occupied.npy", b"\0" * (2 << 20))
+    with pytest.raises(InputError, match="2 MiB when unpacked"):
+        reader.read_grid(tmp_path)
+
+
+def test_points_of_impossible_size(tmp_path, space):
+    pytest.importorskip("laspy")
+    path = tmp_path / "a.las"
+    writers.write(space, path)
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<HI", content, 105, 17_197, 200_000)  # bytes of a point, points
+    path.write_bytes(content)
+    with little_memory(100 << 20), pytest.raises(InputError):
+        read(path)
+
+
+def test_packed_points_that_cannot_be(tmp_path, space):
+    pytest.importorskip("lazrs")
+    path = tmp_path / "a.laz"
+    writers.write(space, path)
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<I", content, 107, 2_000_000_000)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="cut short: 0 of 2000000000 points"):
+        read(path)
+
+
+def test_time_beyond_the_clock(tmp_path, space):
+    writers.write(space, tmp_path / "k", name="kitti")
+    times = ["1.0", "9999-12-31 23:59:59.9", "2.0", "3.0"]
+    (tmp_path / "k" / "times.txt").write_text("\n".join(times))
+    assert read(tmp_path / "k").stamp_ns.tolist() == [10**9, 2 * 10**9, 3 * 10**9]
+
+
+@pytest.mark.parametrize("blank", [b"\x1c", b"\x1f\x1f", b"\x85", b"\xa0"])
+def test_lines_that_only_numpy_takes_for_empty(tmp_path, blank):
+    header = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n"
+    (tmp_path / "a.pcd").write_bytes(header + blank + b"\n1 2 3\n")
+    assert read(tmp_path / "a.pcd").points.tolist() == [[1.0, 2.0, 3.0]]
+
+
+@pytest.mark.parametrize("value", [struct.pack("<I", 0x7FA00001), struct.pack("<f", 3e38)])
+def test_numbers_that_numpy_would_speak_of(tmp_path, value):
+    header = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 3\nDATA binary\n"
+    (tmp_path / "a.pcd").write_bytes(header + value + struct.pack("<8f", *range(1, 9)))
+    assert read(tmp_path / "a.pcd").hit.tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize("error", [FileNotFoundError(2, "gone", "a.log"), MemoryError()])
+def test_what_happens_while_reading(log, monkeypatch, error):
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr(registry.carmen, "read", fails)
+    with pytest.raises(InputError, match=r"cannot be read: gone|does not fit into memory"):
+        read(log([FLASER]))
+
+
+def test_errors_are_one_short_line():
+    error = InputError("x" * 10_000, where="a\nb\x1b[31m\x85", hint="y" * 10_000)
+    assert len(str(error)) < 2100
+    assert re.match(r"a b\\x1b\[31m\\x85: xxx", str(error))
+
+
+@pytest.mark.parametrize("name", [b"new\nline.log", b"not\xfftext.log", b"a?b#c%41.log"])
+def test_names_of_any_bytes(tmp_path, name):
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name))
+    path.write_text(FLASER)
+    assert read(path).n_scans == 1
+    path.write_text("nothing\n")
+    with pytest.raises(InputError) as caught:
+        read(path)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,155 @@
+"""Returns of the robot itself in 3D recordings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stillmap.cli.main import main
+from stillmap.cli.recording_info import facts
+from stillmap.core.recording import Recording
+from stillmap.io import read, stillmap_folder, writers
+from stillmap.preprocessing import self_filter
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.sim import Simulation, scene_by_name, simulate
+
+CAR = {"sees_robot": True, "roof_length": 4.0, "roof_width": 1.7}
+LOW = {"z": 0.7, "low": -0.6, "high": 0.3}  # the lidar of a small robot
+SMALL = {**LOW, "sees_robot": True, "roof_length": 0.6, "roof_width": 0.5, "roof_below": 0.2}
+
+
+def run(world: str, scans: int, seed: int = 0, speed: float | None = None, **lidar) -> Simulation:
+    robot = {"scans": scans} if speed is None else {"scans": scans, "speed": speed}
+    options = {"channels": 32, "columns": 200, **lidar}
+    return simulate(scene_by_name(world, {"lidar": options, "robot": robot}), seed)
+
+
+@pytest.fixture(scope="module")
+def drive() -> Simulation:
+    """A car that sees its own roof."""
+    return run("street", 90, **CAR)
+
+
+def gone(recording: Recording) -> np.ndarray:
+    """Hits that are left out."""
+    out = self_filter.left_out(recording)
+    lost = recording.hit & ~out.hit
+    assert np.isnan(out.points[lost]).all()
+    np.testing.assert_array_equal(out.points[~lost], recording.points[~lost])
+    return lost
+
+
+def test_a_car_that_sees_its_roof(drive):
+    own = (drive.truth.mover == -2) & drive.recording.hit
+    assert own.mean() > 0.2
+    np.testing.assert_array_equal(gone(drive.recording), own)
+
+
+def test_what_was_found_is_noted(drive):
+    out = self_filter.left_out(drive.recording)
+    (noted,) = facts(out)["own_body"]
+    assert noted["beams"] == np.count_nonzero(drive.recording.hit & ~out.hit)
+    np.testing.assert_allclose(noted["low"], [-2.0, -0.85, -0.35], atol=0.25)
+    np.testing.assert_allclose(noted["high"], [2.0, 0.85, -0.35], atol=0.25)
+
+
+def test_the_order_of_beams_means_nothing(drive):
+    """Clouds need not have the same beams, nor any order."""
+    rng = np.random.default_rng(5)
+    r = drive.recording
+    kept = [
+        rng.permutation(np.arange(r.beams_of(t).start, r.beams_of(t).stop))[
+            : rng.integers(4000, 6000)
+        ]
+        for t in range(r.n_scans)
+    ]
+    order = np.concatenate(kept)
+    offset = np.concatenate([[0], np.cumsum([len(k) for k in kept])]).astype(np.int64)
+    mixed = replace(r, points=r.points[order], hit=r.hit[order], offset=offset, beam_time=None)
+    own = ((drive.truth.mover == -2) & r.hit)[order]
+    found = gone(mixed)
+    assert not (found & ~own).any()
+    assert found[own].mean() > 0.99
+
+
+@pytest.mark.parametrize("world", ["hall", "corridor"])
+def test_a_small_robot_indoors(world):
+    sim = run(world, 300, **SMALL)
+    own, lost = sim.truth.mover == -2, gone(sim.recording)
+    assert lost[own & sim.recording.hit].mean() > 0.99
+    assert np.count_nonzero(lost & ~own) < 1e-3 * own.sum()
+
+
+@pytest.mark.parametrize(
+    ("world", "scans", "lidar"),
+    [
+        ("street", 90, {}),
+        ("street-jam", 90, {"channels": 16}),
+        ("hall", 300, LOW),
+        ("corridor", 300, {"channels": 16}),
+        ("office", 300, {"channels": 16}),
+    ],
+)
+def test_where_nothing_of_the_robot_shows_nothing_is_lost(world, scans, lidar):
+    """Level ground, ceilings and the walls of a corridor come back from one place, too."""
+    recording = run(world, scans, **lidar).recording
+    assert self_filter.left_out(recording) is recording
+
+
+@pytest.mark.parametrize("world", ["street-jam", "hall"])
+def test_a_robot_that_stands_loses_nothing(world):
+    """What stands near it could be a part of it."""
+    recording = run(world, 60, speed=1e-3, **CAR).recording
+    assert self_filter.left_out(recording) is recording
+
+
+def test_a_few_scans_show_nothing(drive):
+    r = drive.recording
+    n = int(r.offset[10])
+    few = replace(
+        r,
+        stamp_ns=r.stamp_ns[:10],
+        offset=r.offset[:11],
+        points=r.points[:n],
+        hit=r.hit[:n],
+        sensor=r.sensor[:10],
+        T_odom_base=None,
+        beam_time=None,
+    )
+    assert self_filter.left_out(few) is few
+
+
+def test_a_fan_of_beams_is_no_sweep(drive):
+    """A laser that tilts looks elsewhere in every scan."""
+    r = drive.recording
+    points = np.array(r.points)
+    points[:, 2] = 0.02 * points[:, 0]
+    flat = replace(r, points=points)
+    assert self_filter.left_out(flat) is flat
+
+
+def test_recordings_without_any_hit():
+    recording = run("street", 20, max_range=0.5).recording
+    assert self_filter.left_out(recording) is recording
+
+
+@pytest.mark.parametrize("form", ["kitti", "stillmap", "mcap"])
+def test_every_reader_leaves_it_out(tmp_path, drive, form):
+    path = tmp_path / ("a.mcap" if form == "mcap" else "a")
+    writers.write(drive.recording, path, name=form)
+    own = np.count_nonzero((drive.truth.mover == -2) & drive.recording.hit)
+    everything = read(path, ReadOptions(own_body=False))
+    assert np.count_nonzero(everything.hit) == np.count_nonzero(drive.recording.hit)
+    assert np.count_nonzero(read(path).hit) == np.count_nonzero(drive.recording.hit) - own
+
+
+def test_info_says_so(tmp_path, drive, capsys):
+    stillmap_folder.write(drive.recording, tmp_path / "sim")
+    assert main(["info", str(tmp_path / "sim"), "--quiet"]) == 0
+    assert "beams end on it: unusable" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("noted", [3, [4], [{}], [{"sensor": 0, "beams": 1, "low": 2, "high": []}]])
+def test_odd_notes_are_not_shown(drive, noted):
+    odd = replace(drive.recording, source={"own_body": noted})
+    assert facts(odd)["own_body"] == []

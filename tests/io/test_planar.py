@@ -1,0 +1,148 @@
+"""What a laser's driver would have said of scans in the plane."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.preprocessing import laser_scan
+
+
+def recording(scans, *, hit=None, sensors=(), sensor=None, beam_time=None):
+    """A recording of scans given by (angles, ranges); NaN ranges are unusable beams."""
+    points = [
+        np.stack([r * np.cos(a), r * np.sin(a)], axis=-1)
+        for a, r in ((np.asarray(a, float), np.asarray(r, float)) for a, r in scans)
+    ]
+    T, flat = len(scans), np.concatenate(points).astype(np.float32)
+    usable = ~np.isnan(flat[:, 0])
+    sensor = np.zeros(T, np.int32) if sensor is None else np.asarray(sensor, np.int32)
+    return Recording(
+        stamp_ns=np.arange(T, dtype=np.int64),
+        offset=np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64),
+        points=flat,
+        hit=usable if hit is None else np.asarray(hit),
+        T_base_sensor=np.tile(np.eye(3), (sensor.max(initial=0) + 1, 1, 1)),
+        sensor=sensor,
+        T_odom_base=None,
+        source={"sensors": list(sensors)},
+        beam_time=None if beam_time is None else np.asarray(beam_time, np.float32),
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    start=st.floats(-6.0, 6.0),
+    degrees=st.floats(0.05, 2.0),
+    falling=st.booleans(),
+    n=st.integers(2, 400),
+    seed=st.integers(0, 1000),
+)
+def test_angles_are_found_in_the_points(start, degrees, falling, n, seed):
+    rng = np.random.default_rng(seed)
+    step = np.radians(degrees) * (-1 if falling else 1)
+    ranges = rng.uniform(0.1, 80.0, n)
+    lost = rng.random(n) < rng.uniform(0.0, 0.5)
+    lost[rng.choice(n, 2, replace=False)] = False
+    ranges[lost] = np.nan
+    seen = np.flatnonzero(~lost)
+    if np.diff(seen).min() * abs(step) > 3.0:
+        return  # neighbours more than half a turn apart tell nothing
+    angles = start + step * np.arange(n)
+    (first, found) = laser_scan.fans(recording([(angles, ranges)]))[0]
+    off = (first + found * seen - angles[seen] + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(off).max() < 1e-6
+
+
+def test_what_the_reader_noted_comes_first():
+    angles, noted = np.linspace(-1.0, 1.0, 21), {"start_angle": -1.0, "angle_step": 0.1}
+    one = recording([(angles, np.full(21, 5.0))], sensors=[noted])
+    assert laser_scan.fans(one).tolist() == [[-1.0, 0.1]]
+
+
+@pytest.mark.parametrize(
+    "noted", [{"start_angle": -2.0, "angle_step": 0.1}, {"start_angle": "x"}, None, 7]
+)
+def test_notes_that_do_not_fit_are_not_believed(noted):
+    angles = np.linspace(-1.0, 1.0, 21)
+    one = recording([(angles, np.full(21, 5.0))], sensors=[noted])
+    np.testing.assert_allclose(laser_scan.fans(one), [[-1.0, 0.1]], atol=1e-7)
+
+
+def test_every_scan_may_have_its_own():
+    scans = [(s + d * np.arange(n), np.full(n, 3.0)) for s, d, n in [(0, 0.1, 9), (1, -0.02, 9)]]
+    scans += [(2 + 0.3 * np.arange(4), np.full(4, 3.0)), scans[0]]
+    found = laser_scan.fans(recording(scans))
+    np.testing.assert_allclose(found, [[0, 0.1], [1, -0.02], [2, 0.3], [0, 0.1]], atol=1e-6)
+
+
+def test_a_scan_that_tells_nothing_has_the_angles_of_the_others():
+    angles, blind = np.linspace(-1.0, 1.0, 21), np.full(21, np.nan)
+    scans = [(angles, blind), (angles, np.full(21, 5.0)), (angles, blind)]
+    np.testing.assert_allclose(laser_scan.fans(recording(scans)), [[-1.0, 0.1]] * 3, atol=1e-7)
+    lone = blind.copy()
+    lone[3] = 2.0  # one beam, and no other scan: any angles that let it point there
+    first, step = laser_scan.fans(recording([(angles, lone)]))[0]
+    assert np.isclose(first + 3 * step, angles[3])
+    assert np.isfinite(laser_scan.fans(recording([(angles, blind)]))).all()
+
+
+def test_directions_that_no_driver_states_are_refused():
+    angles = np.linspace(-1.0, 1.0, 21)
+    even = (angles, np.full(21, 5.0))
+    angles = angles.copy()
+    angles[7] += 0.01
+    with pytest.raises(InputError, match=r"scan 1: the directions .* not evenly spaced"):
+        laser_scan.fans(recording([even, (angles, np.full(21, 5.0))]))
+
+
+def test_clouds_are_refused():
+    flat = recording([([0.0], [1.0])])
+    cloud = dataclasses.replace(
+        flat, points=np.ones((1, 3), np.float32), T_base_sensor=np.eye(4)[None]
+    )
+    with pytest.raises(InputError, match="3D"):
+        laser_scan.fans(cloud)
+
+
+def test_ranges():
+    one = recording([([0.0, 1.0, 2.0], [3.0, 7.0, np.nan])], hit=[True, False, False])
+    np.testing.assert_allclose(laser_scan.ranges(one, 0, np.inf), [3.0, np.inf, np.nan])
+
+
+def test_how_far_lasers_see():
+    noted = {"ranges": {"threshold": 81.91}}
+    scans = [([0.0, 1.0], [3.0, 7.0]), ([0.0, 1.0], [4.0, 9.0]), ([0.0], [np.nan])]
+    one = recording(
+        scans, hit=[True, False, True, True, False], sensor=[0, 1, 2], sensors=[{}, noted]
+    )
+    first, second, third = laser_scan.reaches(one)
+    assert first == (pytest.approx(3.0), pytest.approx(7.0))
+    assert second.declared == 81.91
+    assert third == (0.0, None)
+    # a hit is never at the limit: readers take what reaches it for maximum range
+    for reach, hit in ((first, 3.0), (second, 9.0)):
+        assert np.float32(reach.limit()) > np.float32(hit)
+    clipped = laser_scan.Reach(5.0, 5.0)
+    assert np.float32(clipped.limit()) > np.float32(5.0)
+    assert clipped.limit() < 5.00001
+
+
+def test_even_times_are_a_step_from_beam_to_beam():
+    scan = (np.arange(5) * 0.1, np.ones(5))
+    even, falling, late, uneven = (
+        [0.0, 0.01, 0.02, 0.03, 0.04],
+        [0.0, -0.01, -0.02, -0.03, -0.04],
+        [0.1, 0.11, 0.12, 0.13, 0.14],
+        [0.0, 0.01, 0.025, 0.03, 0.04],
+    )
+    one = recording([scan] * 4, beam_time=[*even, *falling, *late, *uneven])
+    steps, n_uneven = laser_scan.time_increments(one)
+    np.testing.assert_allclose(steps, [0.01, -0.01, 0.0, 0.0], atol=1e-8)
+    assert n_uneven == 2
+    steps, n_uneven = laser_scan.time_increments(recording([scan]))
+    assert (steps.tolist(), n_uneven) == ([0.0], 0)

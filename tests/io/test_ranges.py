@@ -1,0 +1,194 @@
+"""The maximum-range code, what zero means, and what a maximum-range beam shows."""
+
+import numpy as np
+import pytest
+
+from stillmap.preprocessing.max_range import apply, decide, find_max_range
+from stillmap.preprocessing.options import ReadOptions
+
+T, N = 200, 181
+
+
+def room(rng, noise, moving, quantum):
+    """Ranges (T, N) in a 9.8 m x 6 m room, cm-quantised where `quantum` is given."""
+    angle = np.radians(np.linspace(-90, 90, N))
+    x = 1.0 + (np.linspace(0, 3, T) if moving else np.zeros(T))
+    with np.errstate(divide="ignore"):
+        ahead = (9.8 - x)[:, None] / np.maximum(np.cos(angle), 1e-9)
+        side = 3.0 / np.maximum(np.abs(np.sin(angle)), 1e-9)
+    ranges = np.minimum(ahead, side) + rng.normal(0.0, noise, (T, N))
+    return (np.round(ranges / quantum) * quantum if quantum else ranges).astype(np.float32)
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.02, 0.03])
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("quantum", [0.0, 0.001, 0.01])
+def test_noisy_walls_are_no_code(noise, moving, quantum):
+    ranges = room(np.random.default_rng(5), noise, moving, quantum)
+    assert find_max_range(ranges).threshold is None
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.02, 0.03])
+@pytest.mark.parametrize("quantum", [0.0, 0.01])
+def test_corridor_end_read_over_and_over_is_no_code(noise, quantum):
+    # the end wall at 9.8 m fills a few beams; the sides lead up to it; the robot stands
+    rng = np.random.default_rng(6)
+    angle = np.radians(np.linspace(-90, 90, N))
+    with np.errstate(divide="ignore"):
+        ranges = np.minimum(9.8 / np.cos(angle), 0.5 / np.maximum(np.abs(np.sin(angle)), 1e-9))
+    ranges = ranges + rng.normal(0.0, noise, (T, N))
+    if quantum:
+        ranges = np.round(ranges / quantum) * quantum
+    assert find_max_range(ranges.astype(np.float32)).threshold is None
+
+
+def test_far_wall_seen_by_three_beams_only():
+    rng = np.random.default_rng(7)
+    ranges = rng.uniform(1.0, 5.0, (T, N))
+    ranges[:, 90:93] = np.round(9.8 + rng.normal(0, 0.01, (T, 3)), 2)
+    assert find_max_range(ranges.astype(np.float32)).threshold is None
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.02, 0.03])
+def test_round_room_read_in_all_directions_is_no_code(noise):
+    ranges = np.round(9.8 + np.random.default_rng(10).normal(0, noise, (T, N)), 2)
+    assert find_max_range(ranges.astype(np.float32)).threshold is None
+
+
+@pytest.mark.parametrize(("repeats", "coded"), [(200, True), (5, True), (4, False)])
+def test_rare_code_among_dense_readings(repeats, coded):
+    # 4500 readings to the metre, no two alike: a value repeated in several directions is a code
+    ranges = np.linspace(2.0, 9.999, T * N).reshape(N, T).T.copy()
+    ranges.ravel()[: 40 * repeats : 40] = 10.0
+    assert find_max_range(ranges.astype(np.float32)).coded == coded
+
+
+def test_readings_in_millimetres_that_repeat_by_chance_are_no_code():
+    rng = np.random.default_rng(11)
+    ranges = np.round(rng.uniform(2.0, 10.0, (T, N)), 3)
+    assert not find_max_range(ranges.astype(np.float32)).coded
+
+
+@pytest.mark.parametrize("clip", [3.5, 5.0, 8.0])
+@pytest.mark.parametrize("noise", [0.005, 0.02])
+def test_clipped_sensor(clip, noise):
+    ranges = np.minimum(room(np.random.default_rng(8), noise, True, 0.0), np.float32(clip))
+    found = find_max_range(ranges)
+    assert found.coded
+    assert found.threshold == pytest.approx(clip)
+    _, hit = apply(ranges, decide(ranges, None, ReadOptions())[0])
+    np.testing.assert_array_equal(hit, ranges < np.float32(clip))
+
+
+def test_smeared_code_above_real_readings():
+    rng = np.random.default_rng(9)
+    ranges = np.round(rng.uniform(1.0, 20.0, (T, N)), 2)
+    codes = rng.random((T, N)) < 0.05
+    smear = rng.choice([51.10, 51.14, 51.15, 51.16], (T, N), p=[0.03, 0.06, 0.89, 0.02])
+    ranges = np.where(codes, smear, ranges)
+    ranges[17, 30] = 50.75
+    assert find_max_range(ranges.astype(np.float32)).threshold == 51.10
+
+
+def test_rare_sick_overflow_is_known_by_its_value():
+    ranges = np.full((T, N), 5.0, np.float32)
+    ranges[3, 4] = 81.91
+    assert find_max_range(ranges).threshold == 81.91
+
+
+def test_declared_maximum():
+    ranges = np.linspace(1.0, 9.0, 100, dtype=np.float32)
+    found = find_max_range(ranges, 8.0)
+    assert (found.threshold, found.coded) == (8.0, False)
+    for useless in (0.0, -1.0, float("nan"), float("inf")):
+        assert find_max_range(ranges, useless).threshold is None
+
+
+@pytest.mark.parametrize("value", [np.inf, 3.4e38, 1e4])
+def test_infinite_readings_are_maximum_range(value):
+    ranges = np.random.default_rng(2).uniform(1.0, 5.0, (T, N)).astype(np.float32)
+    ranges[:, ::7] = value
+    rule, _ = decide(ranges, None, ReadOptions())
+    assert rule.threshold is None
+    length, hit = apply(ranges, rule)
+    assert not hit[:, ::7].any()
+    assert hit.sum() == T * N - ranges[:, ::7].size
+    assert np.all(length[:, ::7] == np.float32(rule.free_range))
+    assert 4.99 < rule.free_range < 5.0
+
+
+def zeros_and_hits(share, code=None):
+    rng = np.random.default_rng(3)
+    ranges = rng.uniform(1.0, 5.0, (T, N)).astype(np.float32)
+    ranges[rng.random((T, N)) < share] = 0.0
+    if code:
+        ranges[rng.random((T, N)) < 0.02] = code
+    return ranges
+
+
+@pytest.mark.parametrize(
+    ("share", "code", "wanted", "means"),
+    [
+        (0.05, None, "auto", "max-range"),
+        (0.001, None, "auto", "unusable"),
+        (0.05, 81.83, "auto", "unusable"),
+        (0.05, np.inf, "auto", "unusable"),
+        (0.15, np.inf, "auto", "unusable"),  # seven times as many
+        (0.4, np.inf, "auto", "max-range"),
+        (0.4, 81.83, "auto", "max-range"),
+        (0.05, None, "unusable", "unusable"),
+        (0.05, 81.83, "max-range", "max-range"),
+    ],
+)
+def test_what_zero_means(share, code, wanted, means):
+    ranges = zeros_and_hits(share, code)
+    rule, _ = decide(ranges, None, ReadOptions(zero_means=wanted))
+    assert rule.zero_means == means
+    length, hit = apply(ranges, rule)
+    zero = ranges == 0.0
+    assert not hit[zero].any()
+    assert np.isnan(length[zero]).all() == (means == "unusable")
+
+
+def test_unusable_readings():
+    ranges = np.array([[np.nan, -np.inf, -1.0, 0.01, 0.5, 1.0]], np.float32)
+    length, hit = apply(
+        ranges, decide(ranges, None, ReadOptions(min_range=0.6, zero_means="unusable"))[0]
+    )
+    assert hit.tolist() == [[False] * 5 + [True]]
+    assert np.isnan(length[0, :5]).all()
+
+
+def test_free_range_is_what_the_laser_really_sees():
+    ranges = zeros_and_hits(0.0, 81.83)
+    ranges[0, 0] = 60.0  # one far reading does not make the laser see 60 m
+    rule, _ = decide(ranges, None, ReadOptions())
+    assert 4.9 < rule.free_range < 5.01
+    assert decide(ranges, None, ReadOptions(free_range=7.0))[0].free_range == 7.0
+    clipped = np.minimum(ranges, np.float32(3.0))
+    assert decide(clipped, None, ReadOptions())[0].free_range == pytest.approx(3.0, abs=0.01)
+
+
+def test_given_maximum_range():
+    ranges = zeros_and_hits(0.0, 81.83)
+    rule, warnings = decide(ranges, None, ReadOptions(max_range=4.0))
+    assert not warnings
+    assert (rule.threshold, rule.threshold_how) == (4.0, "given")
+    assert rule.free_range < 4.0
+    rule, warnings = decide(ranges, None, ReadOptions(max_range=90.0))
+    assert "81.83" in warnings[0]
+
+
+def test_no_reading_says_anything():
+    ranges = np.full((2, 3), np.inf, np.float32)
+    rule, warnings = decide(ranges, None, ReadOptions())
+    assert warnings
+    assert np.isnan(apply(ranges, rule)[0]).all()
+
+
+@pytest.mark.parametrize(
+    "options", [{"min_range": -1.0}, {"max_range": 0.0}, {"free_range": float("nan")}]
+)
+def test_options_out_of_range(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        ReadOptions(**options)

@@ -1,0 +1,41 @@
+"""The public logs, where they are at hand: what is in them is known."""
+
+import time
+
+import numpy as np
+import pytest
+
+from stillmap.io import read
+
+LOGS = [
+    # scans in the log, beams each, maximum-range code, scans that run backwards in time
+    ("aces", 440, 180, 50.0, 0),
+    ("belgioioso", 395, 361, 81.91, 0),
+    ("edmonton", 340, 180, 51.09, 0),
+    ("fr101", 292, 360, 81.83, 0),
+    ("intel", 4610, 180, 81.83, 256),
+    ("seattle", 241, 361, 81.87, 0),
+]
+
+
+@pytest.mark.parametrize(("name", "scans", "beams", "code", "backwards"), LOGS)
+def test_public_log(shared_data, name, scans, beams, code, backwards):
+    recording = read(shared_data / "laser2d" / f"{name}.clf.gz")
+    skipped = recording.source["skipped"]
+    assert sum(damage["count"] for damage in skipped.values()) == backwards
+    assert recording.n_scans == scans - backwards
+    assert set(np.diff(recording.offset)) == {beams}
+    (sensor,) = recording.source["sensors"]
+    assert sensor["ranges"]["threshold"] == code
+    assert sensor["ranges"]["zero_means"] == "unusable"
+    length = np.linalg.norm(recording.points, axis=1)
+    assert length[recording.hit].max() < code
+    assert 10.0 < sensor["ranges"]["free_range"] < code
+    assert np.isfinite(recording.points).all()
+    assert recording.T_odom_base is not None
+
+
+def test_intel_is_read_quickly(shared_data):
+    start = time.process_time()
+    read(shared_data / "laser2d" / "intel.clf.gz")
+    assert time.process_time() - start < 3.0  # 0.4 s of processor time when measured

@@ -1,0 +1,59 @@
+"""Exact stamps, and the longest stretch of time that runs forwards."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stillmap.core.timestamps import longest_non_decreasing, parse_ns
+
+
+@pytest.mark.parametrize(
+    ("text", "ns"),
+    [
+        ("976052857.337483", 976052857337483000),
+        ("976052857.337483123", 976052857337483123),
+        ("1.23e+09", 1_230_000_000 * 10**9),
+        ("1e-3", 1_000_000),
+        ("+5", 5 * 10**9),
+        ("-0.5", -500_000_000),
+        ("0", 0),
+        ("0.0000000005", 0),  # half to even
+        ("0.0000000015", 2),
+        ("1e-999999", 0),
+        (".25", 250_000_000),
+    ],
+)
+def test_exact(text, ns):
+    assert parse_ns(text) == ns
+
+
+@pytest.mark.parametrize(
+    "text", ["", "x", "nan", "inf", "-inf", "1e10", "1_0", "1e999999999", "snan"]
+)
+def test_refused(text):
+    with pytest.raises(ValueError, match="time stamp"):
+        parse_ns(text)
+
+
+@given(st.integers(-9 * 10**18, 9 * 10**18))
+def test_every_nanosecond_is_kept(ns):
+    sign = "-" if ns < 0 else ""
+    assert parse_ns(f"{sign}{abs(ns) // 10**9}.{abs(ns) % 10**9:09d}") == ns
+
+
+@given(st.lists(st.integers(-3, 6), max_size=9))
+def test_longest_non_decreasing_against_all_subsets(values):
+    kept = longest_non_decreasing(values)
+    chosen = [values[i] for i in kept]
+    assert np.all(np.diff(kept) > 0)
+    assert chosen == sorted(chosen)
+    best = max(
+        n
+        for n in range(len(values) + 1)
+        for subset in combinations(values, n)
+        if list(subset) == sorted(subset)
+    )
+    assert len(kept) == best

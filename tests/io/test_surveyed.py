@@ -1,0 +1,253 @@
+"""PLY, LAS, LAZ and E57: surveys, and files that lie."""
+
+import re
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stillmap.core.errors import InputError
+from stillmap.io import read
+from stillmap.io.point_cloud import las
+
+VERTICES = "element vertex 2\nproperty float x\nproperty float y\nproperty double z\n"
+ROWS = np.array([(1, 2, 3), (4, 5, 6)], [("x", "<f4"), ("y", "<f4"), ("z", "<f8")])
+
+
+def ply(path, header, body=b"", kind="binary_little_endian"):
+    path.write_bytes(f"ply\nformat {kind} 1.0\n{header}end_header\n".encode() + body)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_ply(tmp_path, kind):
+    order = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}[kind]
+    before, after = np.array([7, 8], f"{order}i2"), np.array([1], f"{order}i4")
+    header = (
+        f"comment made by hand\nelement camera 2\nproperty short a\n{VERTICES}"
+        "element face 1\nproperty list uchar int vertex_indices\n"
+    )
+    rows = ROWS.astype([(name, f"{order}{t[1:]}") for name, t in ROWS.dtype.descr])
+    body = before.tobytes() + rows.tobytes() + b"\x01" + after.tobytes()
+    if kind == "ascii":
+        body = b"7\n8\n1 2 3\n4 5 6\n1 1\n"
+    found = read(ply(tmp_path / "a.ply", header, body, kind))
+    np.testing.assert_array_equal(found.points, [[1, 2, 3], [4, 5, 6]])
+    assert found.T_recorded_base is None
+    assert "beams count as sent from the origin" in found.source["warnings"][0]
+
+
+def test_a_folder_of_ply_shares_its_zero(tmp_path):
+    for i in range(3):
+        rows = ROWS.copy()
+        rows["z"] += 1e6 + i
+        ply(tmp_path / f"{i}.ply", VERTICES, rows.tobytes() if i != 1 else b"")
+    found = read(tmp_path)
+    assert found.n_scans == 2
+    assert found.source["skipped"] == {"is cut short": {"count": 1, "lines": [2]}}
+    assert found.source["skipped_unit"] == "file"
+    np.testing.assert_allclose(found.points[2:] - found.points[:2], [[0, 0, 2]] * 2)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"ply\n",
+        b"ply\nformat binary_little_endian 1.0\nend_header\n",
+        b"ply\nelement vertex 2\nproperty float x\nend_header\n",
+        b"ply\nformat nonsense 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+        b"ply\nformat ascii 1.0\nproperty float x\nelement vertex 1\nend_header\n1\n",
+        b"ply\nformat ascii 1.0\nelement vertex -1\nproperty float x\nend_header\n1\n",
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1\n",
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+        b"ply\nformat ascii 1.0\nelement vertex " + b"9" * 5000 + b"\nend_header\n1\n",
+        f"ply\nformat ascii 1.0\n{VERTICES}end_header\n1 2 3\n4 5\n".encode(),
+        f"ply\nformat ascii 1.0\n{VERTICES}end_header\n".encode(),
+        f"ply\nformat binary_little_endian 1.0\n{VERTICES}end_header\n".encode() + bytes(31),
+        b"ply\nformat binary_little_endian 1.0\nelement a 99999999999999\nproperty int a\n"
+        + f"{VERTICES}end_header\n".encode() + bytes(32),
+        b"ply\nformat binary_little_endian 1.0\nelement a 1\nproperty list int int a\n"
+        + f"{VERTICES}end_header\n".encode() + bytes(40),
+    ],
+)  # fmt: skip
+def test_ply_that_lies(tmp_path, content):
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.ply: "):
+        read(tmp_path / "a.ply")
+
+
+@pytest.fixture(params=["las", "laz"])
+def survey(request, space, tmp_path):
+    """A file that was written well, its ending."""
+    pytest.importorskip("laspy")
+    path = tmp_path / f"a.{request.param}"
+    las.write(replace(space, T_recorded_base=None), path, space.T_recorded_base)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("at", "form", "value"),
+    [
+        (96, "<I", 2**31),  # where points begin
+        (100, "<I", 2**32 - 1),  # how many records come before
+        (105, "<H", 65535),  # bytes of a point
+        (107, "<I", 2**32 - 1),  # points
+        (104, "<B", 200),  # format of points
+    ],
+)
+def test_las_that_lies(survey, at, form, value):
+    content = bytearray(survey.read_bytes())
+    struct.pack_into(form, content, at, value)
+    survey.write_bytes(content)
+    with pytest.raises(InputError, match=r"is (damaged|cut short)"):
+        read(survey)
+
+
+@pytest.mark.parametrize("kept", [4, 100, 226, 227, 400, -20])
+def test_las_that_is_cut(survey, kept):
+    survey.write_bytes(survey.read_bytes()[:kept])
+    with pytest.raises(InputError, match=r"is (damaged|cut short|no LAS)"):
+        read(survey)
+
+
+def test_chunks_that_are_not_there_do_not_end_the_process(survey):
+    content = bytearray(survey.read_bytes())
+    if survey.suffix == ".las":
+        pytest.skip("has no chunks")
+    (start,) = struct.unpack_from("<I", content, 96)
+    (table,) = struct.unpack_from("<q", content, start)
+    struct.pack_into("<I", content, table + 4, 2**32 - 1)
+    survey.write_bytes(content)
+    with pytest.raises(InputError, match="table of chunks"):
+        read(survey)
+
+
+@pytest.mark.slow
+def test_las_mutations(survey):
+    content, rng = survey.read_bytes(), np.random.default_rng(2)
+    for _ in range(300):
+        changed = bytearray(content)
+        for _ in range(rng.integers(1, 4)):
+            changed[rng.integers(len(changed))] = rng.integers(256)
+        survey.write_bytes(changed)
+        try:
+            read(survey)
+        except InputError:
+            continue
+
+
+@pytest.fixture
+def scanned(tmp_path):
+    """An E57 file of two scans, their points and poses."""
+    pye57 = pytest.importorskip("pye57")
+    rng = np.random.default_rng(5)
+    file = pye57.E57(str(tmp_path / "a.e57"), mode="w")
+    points, poses = rng.normal(0, 5, (2, 300, 3)).astype(np.float32), np.stack([np.eye(4)] * 2)
+    poses[1, :3, :3] = Rotation.from_euler("zyx", [0.5, 0.1, -0.2]).as_matrix()
+    poses[1, :3, 3] = 400_000, 5_000_000, 100
+    for scan, T in zip(points, poses, strict=True):
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+        columns = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), scan.T.copy(), strict=True))
+        columns["cartesianInvalidState"] = (np.arange(300) == 7).astype(np.int8)
+        file.write_scan_raw(columns, rotation=np.array([w, x, y, z]), translation=T[:3, 3])
+    file.close()
+    return tmp_path / "a.e57", points, poses
+
+
+def test_e57(scanned):
+    path, points, poses = scanned
+    found = read(path)
+    valid = np.arange(600) % 300 != 7
+    np.testing.assert_array_equal(found.hit, valid)
+    np.testing.assert_allclose(found.points[valid], points.reshape(-1, 3)[valid], atol=1e-6)
+    np.testing.assert_allclose(found.T_recorded_base, poses, atol=1e-9)
+    assert found.stamp_ns.tolist() == [0, 10**9]
+    both = path.with_name("b.e57")
+    both.write_bytes(path.read_bytes())
+    path.with_name("c.e57").write_bytes(path.read_bytes()[:5000])
+    folder = read(path.parent)
+    assert folder.n_scans == 4
+    assert folder.source["skipped"]["is damaged"]["lines"] == [5]
+
+
+def checksum(page):
+    """CRC-32C."""
+    value = 0xFFFFFFFF
+    for byte in page:
+        value ^= byte
+        for _ in range(8):
+            value = (value >> 1) ^ (0x82F63B78 if value & 1 else 0)
+    return value ^ 0xFFFFFFFF
+
+
+def described(path, change):
+    """The file with another description."""
+    content = path.read_bytes()
+    plain = b"".join(content[i : i + 1020] for i in range(0, len(content), 1024))
+    start, length = plain.index(b"<?xml"), int.from_bytes(content[32:40], "little")
+    xml = change(plain[start : start + length])
+    plain = bytearray(plain[:start] + xml)
+    plain += bytes(-len(plain) % 1020)
+    struct.pack_into("<QQQ", plain, 16, len(plain) // 1020 * 1024,
+                     start // 1020 * 1024 + start % 1020, len(xml))  # fmt: skip
+    pages = (bytes(plain[i : i + 1020]) for i in range(0, len(plain), 1020))
+    path.write_bytes(b"".join(page + struct.pack(">I", checksum(page)) for page in pages))
+
+
+def test_e57_with_another_description_is_read(scanned):
+    path, *_ = scanned
+    described(path, lambda xml: re.sub(rb"<pose.*?</pose>", b"", xml, flags=re.DOTALL))
+    found = read(path)
+    assert found.n_scans == 2
+    assert found.T_recorded_base is None
+    assert "no place of a sensor" in found.source["warnings"][-1]
+
+
+@pytest.mark.parametrize("count", [b"301", b"5000", b"9999999999999"])
+def test_e57_that_promises_more(scanned, count):
+    path, *_ = scanned
+    old, new = b'recordCount="300"', b'recordCount="' + count + b'"'
+    described(path, lambda xml: xml.replace(old, new, 1))
+    found = read(path)
+    assert found.n_scans == 1
+    ((reason, damage),) = found.source["skipped"].items()
+    assert reason in ("is cut short", "is damaged")
+    assert damage == {"count": 1, "lines": [1]}
+
+
+def test_e57_with_entities_is_refused(scanned):
+    path, *_ = scanned
+    described(path, lambda xml: xml.replace(b"?>", b'?><!DOCTYPE a [<!ENTITY b "c">]>', 1))
+    with pytest.raises(InputError, match="entities"):
+        read(path)
+
+
+def test_e57_nested_without_end(scanned):
+    path, *_ = scanned
+    inner = b'<a type="Structure">' * 2000 + b"</a>" * 2000
+    described(path, lambda xml: xml.replace(b"</e57Root>", inner + b"</e57Root>"))
+    with pytest.raises(InputError, match="nested too deeply"):
+        read(path)
+
+
+@pytest.mark.parametrize("kept", [10, 48, 1024, 5000])
+def test_e57_that_is_cut(scanned, kept):
+    path, *_ = scanned
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(InputError, match=r"is (no E57|damaged)"):
+        read(path)
+
+
+@pytest.mark.parametrize(("name", "start"), [("a.las", b"LASF"), ("a.e57", b"ASTM-E57")])
+def test_missing_libraries_are_named(tmp_path, monkeypatch, name, start):
+    (tmp_path / name).write_bytes(start + bytes(300))
+
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr("stillmap.core.errors.import_module", missing)
+    for path in (tmp_path / name, tmp_path):
+        with pytest.raises(InputError, match=r"pip install 'stillmap\[io\]'"):
+            read(path)

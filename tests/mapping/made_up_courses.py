@@ -1,0 +1,92 @@
+"""Courses of cells made up by hand, and recordings that only know when they were made."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from stillmap import em
+from stillmap.core.recording import Recording
+from stillmap.mapping import Change, changed_places
+
+RESOLUTION = 0.1
+S = 10**9
+NEVER = (-1, -1)
+Between = tuple[int, int]
+
+
+def block(x: int, y: int, width: int, height: int) -> Any:
+    """(width * height, 2) cells from x, y on."""
+    columns, rows = np.meshgrid(np.arange(x, x + width), np.arange(y, y + height))
+    return np.column_stack([columns.ravel(), rows.ravel()]).astype(np.int64)
+
+
+def course(
+    cells: Any,
+    there: bool,
+    *between: Between,
+    count: int | None = None,
+    p: float = 0.9,
+    share: float = 0.5,
+    static: float = 0.05,
+) -> em.Courses:
+    """All cells alike: what is there at last, and looks before and after the changes."""
+    n = len(cells)
+    ends = [between[0], between[-1]] if between else [NEVER, NEVER]
+    return em.Courses(
+        cells=np.asarray(cells, np.int64),
+        p_static=np.full(n, static, np.float32),
+        p_views=np.zeros(n, np.float32),
+        p_changing=np.full(n, p, np.float32),
+        p_thing=np.full(n, 0.97 if there else 0.02, np.float32),
+        occupied_share=np.full(n, share, np.float32),
+        count=np.full(n, len(between) if count is None else count, np.int32),
+        between=np.tile(np.array(ends, np.int32), (n, 1, 1)),
+        covered=np.ones(n, np.float32),
+        share=0.1,
+        surface=None,
+    )
+
+
+def together(*parts: em.Courses) -> em.Courses:
+    """One after the other."""
+    return em.Courses(
+        **{
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in em.Courses.__dataclass_fields__
+            if name not in ("share", "surface")
+        },
+        share=0.1,
+        surface=None,
+    )
+
+
+def recording(stamps: Sequence[float], beams: int = 0) -> Recording:
+    """Scans at these seconds, of so many beams each that met nothing."""
+    T = len(stamps)
+    return Recording(
+        stamp_ns=np.round(np.array(stamps) * S).astype(np.int64) + 5 * S,
+        offset=np.arange(T + 1, dtype=np.int64) * beams,
+        points=np.full((T * beams, 2), 9.0, np.float32),
+        hit=np.zeros(T * beams, bool),
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(T, np.int32),
+        T_odom_base=None,
+    )
+
+
+EVERY_SECOND = recording(range(100))
+
+
+def found(
+    *parts: em.Courses, seen: Recording = EVERY_SECOND, look: float = 1.0, **options: Any
+) -> list[Change]:
+    """The places that changed, by default with a look in every second."""
+    return changed_places(together(*parts), seen, RESOLUTION, look, em.ChangeOptions(**options))
+
+
+def seconds(change: Change) -> tuple[float, float, float]:
+    """Before, after the first and after the last change, since the recording began."""
+    begin = 5 * S
+    before, stamp, last = change.before_ns, change.stamp_ns, change.last_ns
+    return (before - begin) / S, (stamp - begin) / S, (last - begin) / S

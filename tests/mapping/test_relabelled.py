@@ -1,0 +1,163 @@
+"""In the cells that are listed labels and map are those of the last E-step, to the bit."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from made_up_courses import RESOLUTION, block, course, recording
+
+from stillmap import em
+from stillmap.core import se2
+from stillmap.core.recording import Recording
+from stillmap.em import observations
+from stillmap.em.observations import surface_of
+from stillmap.mapping import Change, relabelled
+
+SCANS, BEAMS = 60, 20
+# around the origin, and with cells in which no beam ended
+LISTED = [block(-2, -3, 4, 5), block(3, 1, 2, 2), block(40, 40, 2, 2)]
+
+
+def change(cells):
+    return Change("came", 0.0, 0.0, (0.1, 0.1), cells, RESOLUTION, 1, 2, 2, 1)
+
+
+CHANGES = [change(cells) for cells in LISTED]
+
+
+@dataclass(frozen=True)
+class Known:
+    """A recording, the cells in which its beams end, what the loop said of them, and courses."""
+
+    seen: Recording
+    poses: np.ndarray
+    ends: np.ndarray  # (M, 2) cells
+    p_static: np.ndarray
+    occupied: em.CellProbabilities
+    courses: em.Courses
+
+    def relabelled(self, changes=CHANGES, state="last", threads=1, **other):
+        said = {"occupied": self.occupied, "courses": self.courses} | other
+        return relabelled(
+            self.seen,
+            self.poses,
+            self.p_static,
+            **said,
+            changes=changes,
+            state=state,
+            threads=threads,
+        )
+
+
+@pytest.fixture(scope="module")
+def known():
+    rng = np.random.default_rng(5)
+    M = SCANS * BEAMS
+    ends = rng.integers(-6, 7, (M, 2))
+    poses = se2.matrix(rng.normal(size=SCANS), rng.normal(size=SCANS), rng.uniform(-3, 3, SCANS))
+    # well within its cell: single precision moves none across an edge
+    there = np.column_stack([(ends + rng.uniform(0.2, 0.8, (M, 2))) * RESOLUTION, np.ones(M)])
+    T = se2.inverse(poses).repeat(BEAMS, axis=0)
+    points = np.einsum("nij,nj->ni", T, there)[:, :2].astype(np.float32)
+    hit, usable = rng.random(M) < 0.8, rng.random(M) < 0.95
+    points[~usable] = np.nan
+    seen = replace(recording(range(SCANS), BEAMS), points=points, hit=hit & usable)
+    surface = surface_of(seen, seen.T_map_sensor(poses), RESOLUTION)
+    cells = surface.elements()[0]
+    loop = rng.random(M).astype(np.float32)
+    loop[~usable] = np.nan
+    of_cells, thing, share, covered = rng.random((4, len(cells))).astype(np.float32)
+    return Known(
+        seen,
+        poses,
+        ends,
+        loop,
+        em.CellProbabilities(cells, of_cells, 0.2),
+        replace(
+            course(cells, True, (10, 12)),
+            p_thing=thing,
+            occupied_share=share,
+            covered=covered,
+            surface=surface,
+        ),
+    )
+
+
+def listed(cells):
+    """(K,) whether they are among those of the changes."""
+    those = {tuple(cell) for one in LISTED for cell in one.tolist()}
+    return np.array([tuple(cell) in those for cell in cells.tolist()])
+
+
+@pytest.mark.parametrize("state", ["last", "majority"])
+def test_labels_of_beams_that_end_there_are_what_is_shown(known, state):
+    p_static, _ = known.relabelled(state=state)
+    there = listed(known.ends) & known.seen.hit
+    assert 50 < there.sum() < 400
+    of_cell = dict(
+        zip(map(tuple, known.courses.cells.tolist()), known.courses.shown(state), strict=True)
+    )
+    shown = np.array([of_cell.get(tuple(cell), np.nan) for cell in known.ends.tolist()], np.float32)
+    assert p_static.dtype == np.float32
+    np.testing.assert_array_equal(p_static, np.where(there, shown, known.p_static))
+    assert np.isnan(p_static).sum() > 20
+
+
+@pytest.mark.parametrize("state", ["last", "majority"])
+def test_the_map_says_there_what_is_shown_as_far_as_it_covers_the_cell(known, state):
+    _, occupied = known.relabelled(state=state)
+    there = listed(known.occupied.cells)
+    assert 15 < there.sum() < 30
+    shown = known.courses.shown(state) * known.courses.covered
+    assert occupied.p_occupied.dtype == np.float32
+    np.testing.assert_array_equal(
+        occupied.p_occupied, np.where(there, shown, known.occupied.p_occupied)
+    )
+    np.testing.assert_array_equal(occupied.cells, known.occupied.cells)
+    assert occupied.free_prior == known.occupied.free_prior
+
+
+def test_what_it_is_given_stays_as_it_was(known):
+    before = known.p_static.tobytes(), known.occupied.p_occupied.tobytes()
+    p_static, occupied = known.relabelled()
+    assert (known.p_static.tobytes(), known.occupied.p_occupied.tobytes()) == before
+    assert (p_static.tobytes(), occupied.p_occupied.tobytes()) != before
+
+
+@pytest.mark.parametrize("beams", [50, 10**6])
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_pieces_and_threads_change_no_bit(known, monkeypatch, beams, threads):
+    one, of_one = known.relabelled()
+    monkeypatch.setattr(observations, "CHUNK_BEAMS", beams)
+    other, of_other = known.relabelled(threads=threads)
+    assert one.tobytes() == other.tobytes()
+    assert of_one.p_occupied.tobytes() == of_other.p_occupied.tobytes()
+
+
+def test_the_order_of_the_changes_does_not_matter(known):
+    one, other = known.relabelled(), known.relabelled(CHANGES[::-1])
+    assert one[0].tobytes() == other[0].tobytes()
+    assert one[1].p_occupied.tobytes() == other[1].p_occupied.tobytes()
+
+
+def test_where_nothing_is_listed_nothing_is_touched(known):
+    p_static, occupied = known.relabelled([])
+    assert p_static is known.p_static
+    assert occupied is known.occupied
+
+
+def test_a_change_where_no_beam_ended_changes_nothing(known):
+    p_static, occupied = known.relabelled([change(block(40, 40, 2, 2))])
+    np.testing.assert_array_equal(p_static, known.p_static)
+    np.testing.assert_array_equal(occupied.p_occupied, known.occupied.p_occupied)
+
+
+@pytest.mark.parametrize("wrong", ["fewer", "others"])
+def test_cells_that_do_not_match_are_refused(known, wrong):
+    cells, p = known.occupied.cells, known.occupied.p_occupied
+    other = {
+        "fewer": em.CellProbabilities(cells[1:], p[1:], 0.2),
+        "others": em.CellProbabilities(cells + 1, p, 0.2),
+    }
+    with pytest.raises(ValueError, match="occupied: expected the cells"):
+        known.relabelled(occupied=other[wrong])

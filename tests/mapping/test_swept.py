@@ -1,0 +1,151 @@
+"""The area of a door from cells where its leaf was seen; of anything else the cells alone."""
+
+import numpy as np
+import pytest
+from made_up_courses import RESOLUTION, block, course, found
+
+from stillmap.mapping import swept_cells
+from stillmap.mapping.doors import _sector
+
+LENGTH = 18.0  # cells
+HINGE = np.array([-7, 12])
+LEAF = 1.0 / LENGTH  # metres of a cell, so that the leaf is one of a metre
+
+
+def leaf(angle, length=LENGTH, hinge=HINGE, thick=2):
+    """The cells of a line from the hinge, so many wide."""
+    along = np.arange(0.0, length + 0.25, 0.25)[:, None]
+    u = np.array([np.cos(angle), np.sin(angle)])
+    aside = np.array([-u[1], u[0]])
+    points = [hinge + along * u + k * aside for k in np.arange(thick) - (thick - 1) / 2]
+    return np.unique(np.round(np.concatenate(points)).astype(np.int64), axis=0)
+
+
+def door(first, swing, **line):
+    return np.unique(np.concatenate([leaf(first, **line), leaf(first + swing, **line)]), axis=0)
+
+
+def held(cells):
+    return set(map(tuple, np.asarray(cells).tolist()))
+
+
+def inside(first, swing, margin, length=LENGTH):
+    """Cells well within the true sector, and those well outside of it."""
+    around = block(*(HINGE - 40), 80, 80)
+    x, y = (around - HINGE).T
+    far, angle = np.hypot(x, y), np.arctan2(y, x)
+    middle = first + swing / 2
+    off = np.abs(np.angle(np.exp(1j * (angle - middle)))) - swing / 2
+    aside = far * np.sin(np.minimum(off, np.pi / 2))
+    within = (far <= length - margin) & (aside < -margin)
+    without = (far > length + margin) | ((aside > margin) & (far > margin))
+    return held(around[within]), held(around[without])
+
+
+@pytest.mark.parametrize("swing", [60, 90, 120, 145])
+@pytest.mark.parametrize("first", range(-180, 180, 40))
+def test_a_door_sweeps_a_sector(first, swing):
+    first, swing = np.radians([first, swing])
+    cells = door(first, swing)
+    got = held(swept_cells(cells, LEAF))
+    assert got >= held(cells)
+    within, without = inside(first, swing, 2.0)
+    assert len(within) > 50
+    assert len(within - got) <= 0.03 * len(within)
+    assert not without & got
+
+
+@pytest.mark.parametrize("first", [135, 170, -135])
+def test_the_bow_is_swept_and_not_only_the_triangle(first):
+    # also where directions jump by a whole turn
+    first, swing = np.radians([first, 90])
+    middle = first + swing / 2
+    u = np.array([np.cos(middle), np.sin(middle)])
+    bow = np.round(HINGE + (LENGTH - 2) * u).astype(int)
+    cells = door(first, swing)
+    assert tuple(bow) in held(swept_cells(cells, LEAF))
+    assert bow @ u > (cells @ u).max()  # beyond the line from tip to tip
+
+
+def test_where_the_cells_lie_and_their_order_change_nothing():
+    cells = door(0.3, 1.4)
+    one = swept_cells(cells, LEAF)
+    far = np.array([1000, -3000])
+    assert held(swept_cells(cells[::-1] + far, LEAF)) == held(one + far)
+    assert len(held(one)) == len(one)  # none twice
+
+
+def test_a_leaf_that_is_seen_on_its_way_now_and_then_is_still_a_door():
+    cells = np.concatenate([door(0.0, np.pi / 2), leaf(0.7)[::5]])
+    within, _ = inside(0.0, np.pi / 2, 2.0)
+    assert len(within - held(swept_cells(cells, LEAF))) <= 0.03 * len(within)
+
+
+@pytest.mark.parametrize("length", [10.0, 18.0, 40.0])
+def test_a_leaf_is_as_long_as_those_of_doors(length):
+    cells = door(0.0, np.pi / 2, length=length)
+    assert _sector(cells).length == pytest.approx(length, abs=1.0)
+
+    def sweeps(metres):
+        return len(swept_cells(cells, metres / length)) > len(cells)
+
+    assert [sweeps(metres) for metres in (0.3, 0.5, 1.8, 2.3)] == [False, True, True, False]
+
+
+def alone(cells):
+    """Nothing beside the cells, and they in their order."""
+    np.testing.assert_array_equal(swept_cells(cells, LEAF), cells)
+    return True
+
+
+def test_a_blob_is_its_cells():
+    x, y = block(-8, -8, 17, 17).T
+    disc = np.column_stack([x, y])[np.hypot(x, y) < 8]
+    ring = disc[np.hypot(*disc.T) > 5]
+    assert _sector(ring) is None
+    assert alone(disc)
+    assert alone(ring)  # and not what it goes round
+
+
+def test_two_bays_beside_each_other_are_their_cells():
+    bays = np.concatenate([block(0, 0, 6, 3), block(12, 0, 6, 3)])
+    assert _sector(bays) is None
+    assert alone(bays)
+
+
+def test_a_wide_shelf_round_a_corner_is_its_cells():
+    # thicker than a leaf
+    shelf = np.concatenate([block(0, 0, 20, 7), block(0, 7, 7, 13)])
+    assert _sector(shelf) is None
+    assert alone(shelf)
+
+
+@pytest.mark.parametrize("thick", [2, 3, 4])
+@pytest.mark.parametrize("length", [10, 18, 40])
+@pytest.mark.parametrize("angle", [0.0, 0.4, 2.0])
+def test_one_leaf_alone_is_no_door(angle, length, thick):
+    # a gate that slides, a bay: not two leaves that point away from each other
+    assert alone(leaf(angle, length, thick=thick))
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [
+        [[4, -2]],
+        [[4, -2], [5, -2]],
+        block(3, 3, 12, 1),
+        block(3, 3, 1, 12),
+        np.arange(9)[:, None] * [2, 3],
+    ],
+)
+def test_cells_in_a_line_are_all_there_is(cells):
+    assert alone(np.array(cells, np.int64))
+
+
+def test_only_what_comes_and_goes_sweeps():
+    cells = door(0.0, np.pi / 2, length=9.0)
+    (often,) = found(course(cells, True, (10, 12), (80, 82), count=5))
+    assert often.resolution == RESOLUTION
+    assert held(often.swept) == held(swept_cells(cells, RESOLUTION)) > held(cells)
+    (once,) = found(course(cells, True, (10, 12)))
+    assert held(once.swept) == held(cells)

@@ -1,0 +1,126 @@
+"""Beams on what stood somewhere for a while are on no object on its way."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_up_courses import RESOLUTION, block, course, found, recording
+
+from stillmap.core import se2
+from stillmap.mapping import beams_on_things
+
+BOX = block(10, 20, 4, 3)
+
+
+def labels_without(seen, poses, p_static, places, resolution):
+    """The labels, but one for the beams on things."""
+    out = p_static.copy()
+    out[beams_on_things(seen, poses, p_static, places, resolution)] = 1.0
+    return out
+
+
+def beside(cells):
+    """The same, so many cells farther along x."""
+    return block(10 + cells, 20, 4, 3)
+
+
+INSIDE = [1.25, 2.15]
+
+
+def left_out(*parts, at=INSIDE, p=0.1, hit=True, least=1, poses=None):
+    """In which of a hundred seconds beams that end there are on something that stood there."""
+    seen = recording(range(100), beams=1)
+    points = np.tile(np.array(at, np.float32), (100, 1))
+    seen = replace(seen, points=points, hit=np.full(100, hit))
+    poses = np.tile(np.eye(3), (100, 1, 1)) if poses is None else poses
+    before = np.full(100, p, np.float32)
+    places = found(*parts, seen=seen, least=least)
+    assert len(places) > 0
+    after = labels_without(seen, poses, before, places, RESOLUTION)
+    assert after.dtype == np.float32
+    np.testing.assert_array_equal(before, np.float32(p))  # as it was
+    assert set(after.tolist()) <= {np.float32(p), 1.0}
+    return np.flatnonzero(after == 1.0).tolist()
+
+
+def test_what_came_stands_there_from_then_on():
+    assert left_out(course(BOX, True, (40, 43))) == [*range(41, 100)]
+
+
+def test_what_left_stood_there_until_then():
+    assert left_out(course(BOX, False, (40, 43))) == [*range(41)]
+
+
+def test_a_door_is_no_object_at_any_time():
+    leaves = np.concatenate([block(10, 20, 9, 2), block(10, 20, 2, 9)])
+    door = course(leaves, False, (10, 12), (80, 82), count=5)
+    assert left_out(door, at=[1.75, 2.05]) == [*range(100)]
+    # who walks where it sweeps over is none of its leaf
+    assert left_out(door, at=[1.45, 2.55]) == []
+
+
+def test_what_comes_and_goes_without_being_a_door_may_be_people():
+    assert left_out(course(BOX, False, (10, 12), (80, 82), count=5)) == []
+
+
+def test_something_that_came_beside_them_takes_none_of_them_along():
+    wait = course(beside(6), False, (10, 12), (80, 82), count=5)
+    came = course(BOX, True, (40, 43))
+    assert left_out(came, wait, at=[1.85, 2.15]) == []
+    assert left_out(came, wait) == [*range(41, 100)]
+
+
+def test_who_walks_there_before_it_came_and_after_it_left_stays_an_object():
+    assert left_out(course(BOX, False, (20, 22), (60, 64))) == [*range(21, 61)]
+
+
+def test_who_walks_there_while_it_is_away_stays_an_object():
+    assert left_out(course(BOX, True, (20, 22), (60, 64))) == [*range(21), *range(61, 100)]
+
+
+def test_a_neighbour_that_left_takes_nothing_along():
+    # what stands beside it goes on standing, also in the cells on the border
+    gone = course(beside(4), False, (60, 64))
+    came = course(BOX, True, (20, 22))
+    for x in (1.15, 1.25, 1.35):
+        assert left_out(came, gone, at=[x, 2.15])[-1] == 99
+
+
+@pytest.mark.parametrize(
+    ("at", "beside"),
+    [((0.95, 1.95), True), ((1.45, 2.35), True), ((0.85, 2.1), False), ((1.2, 2.45), False)],
+)
+def test_a_cell_beside_it_is_of_it(at, beside):
+    assert bool(left_out(course(BOX, True, (40, 43)), at=list(at))) == beside
+
+
+def test_only_cells_that_changed_count_and_not_what_lies_between():
+    corner = np.concatenate([block(0, 0, 10, 1), block(0, 1, 1, 9)])
+    assert left_out(course(corner, True, (40, 43)), at=[0.45, 0.05])
+    assert left_out(course(corner, True, (40, 43)), at=[0.55, 0.55]) == []
+
+
+@pytest.mark.parametrize(("p", "hit"), [(0.5, True), (0.9, True), (np.nan, True), (0.1, False)])
+def test_what_is_static_or_met_nothing_stays_as_it_is(p, hit):
+    seen = recording(range(100), beams=1)
+    points = np.tile(np.array(INSIDE, np.float32), (100, 1))
+    seen = replace(seen, points=points, hit=np.full(100, hit))
+    before = np.full(100, p, np.float32)
+    places = found(course(BOX, True, (40, 43)), seen=seen)
+    after = labels_without(seen, np.tile(np.eye(3), (100, 1, 1)), before, places, RESOLUTION)
+    np.testing.assert_array_equal(after, before)
+
+
+def test_poses_and_sensors_say_where_a_beam_ended():
+    poses = np.tile(se2.matrix(-3.0, 1.0, np.pi / 2), (100, 1, 1))
+    there = se2.inverse(poses[0]) @ [*INSIDE, 1.0]
+    moved = left_out(course(BOX, True, (40, 43)), at=there[:2].tolist(), poses=poses)
+    assert moved == [*range(41, 100)]
+    assert left_out(course(BOX, True, (40, 43)), poses=poses) == []
+
+
+def test_where_nothing_changed_nothing_is_touched():
+    seen = recording(range(3), beams=1)
+    p = np.array([0.1, 0.2, np.nan], np.float32)
+    poses = np.tile(np.eye(3), (3, 1, 1))
+    assert not len(beams_on_things(seen, poses, p, [], RESOLUTION))

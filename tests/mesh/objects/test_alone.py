@@ -1,0 +1,131 @@
+"""Whether what was followed moved."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from made_up_street import Car, Part, street
+
+from stillmap.mesh.inputs import Sources
+from stillmap.mesh.objects.frame import Way
+from stillmap.mesh.objects.merging import followed_of
+from stillmap.mesh.objects.reconstruction import Shape, p_dynamic_at, shape_of
+from stillmap.mesh.objects.segmentation import Moves
+from stillmap.mesh.options import MoverOptions
+from stillmap.mesh.triangle_mesh import Mesh
+
+OPTIONS = MoverOptions()
+STANDS = Car((8.0, 0.0), (0.0, 0.0), (0.6, 2.0, 1.5))
+
+
+def _shape(sources: Sources, options: MoverOptions = OPTIONS) -> Shape | None:
+    moves = Moves.of(sources)
+    followed = followed_of(sources, moves, options)
+    return shape_of(followed, sources, moves, options, [np.zeros(0)] * len(followed))
+
+
+def _partly(sources: Sources, share: float) -> Sources:
+    """The same, but what ended on the box in `share` of its width is static, and nobody's."""
+    (one,) = sources.objects
+    y = sources.seen.end_points(one.beams, sources.poses)[:, 1]
+    static = one.beams[y < -1.0 + 2.0 * share]
+    p_static = sources.p_static.copy()
+    p_static[static] = 0.95
+    rest = dataclasses.replace(one, beams=np.setdiff1d(one.beams, static))
+    return dataclasses.replace(sources, p_static=p_static, objects=[rest])
+
+
+def test_what_is_dynamic_all_over_has_a_model() -> None:
+    assert _shape(street([STANDS], [Part(0)])) is not None
+
+
+def test_a_part_of_what_stands_still_has_none() -> None:
+    sources = _partly(street([STANDS], [Part(0)]), 0.9)
+    assert _shape(sources) is None
+    assert _shape(sources, MoverOptions(dynamic=0.05)) is not None
+
+
+def test_static_things_farther_away_do_not_matter() -> None:
+    beside = Car((8.0, 1.5), (0.0, 0.0), (0.6, 0.4, 1.5))
+    sources = street([STANDS, beside], [Part(0)])
+    every = np.arange(sources.seen.n_beams)
+    met = np.abs(sources.seen.end_points(every, sources.poses)[:, 1] - 1.5) < 0.25
+    p_static = np.where(met, np.float32(0.95), sources.p_static)
+    sources = dataclasses.replace(sources, p_static=p_static)
+    assert _shape(sources) is not None
+    assert _shape(sources, MoverOptions(about=1.0, dynamic=0.9)) is None
+
+
+def _face(height: float) -> tuple[Sources, Mesh, Way]:
+    """The front of the box, up to a height, in its own frame."""
+    sources = street([STANDS], [Part(0)])
+    way = Way.of_track(sources.things[0])
+    x, y = -0.3, 0.4
+    corners = np.array([[x, -y, 0.0], [x, y, 0.0], [x, y, height], [x, -y, height]])
+    return sources, Mesh(corners, np.array([[0, 2, 1], [0, 3, 2]], np.int32)), way
+
+
+def _set(sources: Sources, which: np.ndarray, p: float) -> Sources:
+    p_static = np.where(which, np.float32(p), np.float32(0.0))
+    return dataclasses.replace(sources, p_static=p_static)
+
+
+def _local(sources: Sources, way: Way) -> np.ndarray:
+    T = way.T_map_object(0.0)
+    every = np.arange(sources.seen.n_beams)
+    return np.asarray((sources.seen.end_points(every, sources.poses) - T[:3, 3]) @ T[:3, :3])
+
+
+@pytest.mark.parametrize("reach", [0.05, 0.2])
+def test_the_mean_is_that_of_beams_near_the_surface(reach: float) -> None:
+    sources, mesh, way = _face(0.9)
+    at = _local(sources, way)
+    outside = np.maximum(np.abs(at[:, 1]) - 0.4, np.maximum(at[:, 2] - 0.9, 0.0))
+    near = (np.abs(at[:, 0] + 0.3) < 0.01) & (outside < 0.8 * reach) & (at[:, 2] > 0.1)
+    far = (np.abs(at[:, 0] + 0.3) > reach) | (outside > reach)
+    assert near.sum() > 100
+    span = (0.0, 0.05)
+    assert p_dynamic_at(mesh, way, span, _set(sources, far, 1.0), reach) == 1.0
+    found = p_dynamic_at(mesh, way, span, _set(sources, near, 0.25), reach)
+    assert found == pytest.approx(0.75, abs=0.06)
+    assert found > 0.7499
+
+
+def test_other_times_do_not_count() -> None:
+    sources, mesh, way = _face(0.9)
+    later = np.arange(sources.seen.n_beams) >= sources.seen.offset[3]
+    sources = _set(sources, later, 1.0)
+    assert p_dynamic_at(mesh, way, (0.0, 0.25), sources, 0.2) == 1.0
+    assert p_dynamic_at(mesh, way, (0.35, 0.65), sources, 0.2) == 0.0
+    assert p_dynamic_at(mesh, way, (0.15, 0.35), sources, 0.2) == pytest.approx(0.5)
+
+
+def test_what_goes_on_leaves_what_it_passed_behind() -> None:
+    goes = Car((8.0, -2.0), (0.0, 10.0), (0.6, 1.0, 1.5))
+    wall = Car((9.0, -2.0), (0.0, 0.0), (0.6, 1.0, 1.5))
+    sources = street([goes, wall], [Part(0), Part(1)], scans=6)
+    x = _local(sources, Way.of_track(sources.things[1]))[:, 0]
+    sources = _set(sources, np.abs(x + 0.3) < 0.05, 1.0)
+    way = Way.of_track(sources.things[0])
+    corners = np.array([[-0.3, -0.4, 0.2], [-0.3, 0.4, 0.2], [-0.3, 0.4, 1.2]])
+    mesh = Mesh(corners, np.array([[0, 2, 1]], np.int32))
+    standing = way._replace(thing=way.thing._replace(box=sources.things[1].box))
+    assert p_dynamic_at(mesh, way, (0.15, 0.45), sources, 0.2) == 1.0
+    assert p_dynamic_at(mesh, standing, (0.15, 0.45), sources, 0.2) < 0.5
+
+
+def test_the_ground_does_not_count() -> None:
+    sources, mesh, way = _face(0.9)
+    low = _local(sources, way)[:, 2] < 0.1
+    assert (low & (np.abs(_local(sources, way)[:, 1]) < 0.4)).sum() > 10
+    assert p_dynamic_at(mesh, way, (0.0, 0.05), _set(sources, low, 1.0), 0.2) == 1.0
+    _, flat, _ = _face(0.04)
+    assert np.isnan(p_dynamic_at(flat, way, (0.0, 0.05), sources, 0.05))
+
+
+def test_flat_things_have_models_where_nobody_asks() -> None:
+    low = Car((8.0, 0.0), (0.0, 0.0), (0.6, 2.0, 0.09))
+    sources = street([low], [Part(0)], rows=200)
+    options = MoverOptions(height=0.0, least=0.0)
+    assert _shape(sources, options) is None
+    assert _shape(sources, dataclasses.replace(options, dynamic=0.0)) is not None

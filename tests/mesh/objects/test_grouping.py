@@ -1,0 +1,61 @@
+"""Which things are one, by how often they hang together."""
+
+import numpy as np
+
+from stillmap.mesh.objects import merging
+from stillmap.mesh.objects.merging import Pairs, Scan, grouped, pairs_of
+
+
+def _pairs(*rows: tuple[int, int, int, int]) -> Pairs:
+    table = np.array(rows, np.intp).reshape(-1, 4)
+    return Pairs(table[:, :2], table[:, 2], table[:, 3])
+
+
+def _wholes(pairs: Pairs, n: int, may: list[bool] | None = None) -> list[list[int]]:
+    allowed = np.ones(len(pairs.met), np.bool_) if may is None else np.array(may)
+    whole = grouped(pairs, allowed, n)
+    return [np.flatnonzero(whole == k).tolist() for k in np.unique(whole)]
+
+
+def test_pairs_are_counted_as_in_a_square_of_all(monkeypatch) -> None:
+    monkeypatch.setattr(merging, "_AT_ONCE", 3)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        n, scans = int(rng.integers(1, 12)), []
+        met, both = np.zeros((n, n), np.intp), np.zeros((n, n), np.intp)
+        for _ in range(int(rng.integers(0, 20))):
+            there = np.flatnonzero(rng.random(n) < 0.6)
+            piece, beams = rng.integers(0, 3, len(there)), rng.integers(1, 50, len(there))
+            scans.append(Scan(there, piece, beams))
+            fewer = np.minimum(beams[:, None], beams)
+            met[np.ix_(there, there)] += (piece[:, None] == piece) * fewer
+            both[np.ix_(there, there)] += fewer
+        pairs = pairs_of(scans, n)
+        ends = np.argwhere(np.triu(both > 0, 1))
+        np.testing.assert_array_equal(pairs.ends, ends)
+        np.testing.assert_array_equal(pairs.met, met[ends[:, 0], ends[:, 1]])
+        np.testing.assert_array_equal(pairs.both, both[ends[:, 0], ends[:, 1]])
+
+
+def test_what_always_hangs_together_is_one_however_long_the_chain() -> None:
+    assert _wholes(_pairs((0, 1, 9, 9), (1, 2, 8, 9), (2, 3, 9, 9)), 4) == [[0, 1, 2, 3]]
+
+
+def test_a_link_between_two_that_are_seen_apart_joins_the_one_it_is_nearer_to() -> None:
+    pairs = _pairs((0, 1, 0, 100), (0, 2, 30, 40), (1, 2, 20, 40))
+    assert _wholes(pairs, 3) == [[0, 2], [1]]
+    assert _wholes(pairs._replace(met=np.array([0, 20, 30])), 3) == [[0], [1, 2]]
+
+
+def test_wholes_are_weighed_against_each_other() -> None:
+    # 0 with 1 and 2 with 3 first; then 1 and 2 may, but 0 and 3 are apart
+    rows = [(0, 1, 50, 50), (2, 3, 40, 40), (1, 2, 30, 30), (0, 3, 0, 31)]
+    assert _wholes(_pairs(*rows), 4) == [[0, 1], [2, 3]]
+    rows[-1] = (0, 3, 0, 30)
+    assert _wholes(_pairs(*rows), 4) == [[0, 1, 2, 3]]
+
+
+def test_those_that_may_not_are_joined_by_nobody() -> None:
+    pairs = _pairs((0, 1, 9, 9), (0, 2, 9, 9))
+    assert _wholes(pairs, 3, [True, False]) == [[0, 1], [2]]
+    assert _wholes(_pairs(), 3) == [[0], [1], [2]]

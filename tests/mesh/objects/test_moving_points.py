@@ -1,0 +1,179 @@
+"""Colours of points on what moves: one board that is carried before a camera."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from stillmap.core.camera import Camera, Images
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.mesh.background import Ahead
+from stillmap.mesh.objects.segmentation import Moves
+from stillmap.mesh.options import MeshOptions, VisibleOptions
+from stillmap.mesh.place import Painted
+from stillmap.mesh.point_colors import Moving, tint_moving
+from stillmap.mesh.texture.atlas import GREY
+from stillmap.mesh.texture.occluders import Thing
+from stillmap.mesh.texture.views import View, colours_of
+from stillmap.mesh.triangle_mesh import Mesh
+from stillmap.tracking.boxes import Box
+
+SPEED, AHEAD = 2.0, 3.0  # m/s to the right, along x; m from the camera, along y
+BOARD = np.stack(np.meshgrid(np.arange(-0.5, 0.51, 0.05), np.arange(0.2, 1.81, 0.05)), -1)
+BOARD = BOARD.reshape(-1, 2)  # x, z
+INNER = (np.abs(BOARD - [0.0, 1.0]) < [0.2, 0.5]).all(axis=1)
+TIMES = (0.0, 0.1)  # s, of two scans that see all of it
+NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+K = np.array([[200.0, 0, 160], [0, 200.0, 120], [0, 0, 1]])
+CAMERA = Camera("camera", 320, 240, K, "", np.zeros(0), np.eye(4))
+T_CAMERA_MAP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 1], [0, 1, 0, 0], [0, 0, 0, 1]])  # 1 m high
+
+
+def thing(number: int, x: float, y: float, half: tuple[float, float], speed: float) -> Thing:
+    at = np.array([[x, y], [x + speed, y]])
+    ahead, velocity = np.tile([1.0, 0.0], (2, 1)), np.tile([speed, 0.0], (2, 1))
+    box = Box(number, np.array([0.0, 1.0]), at, ahead, velocity, half, 0.5)
+    return Thing(box, np.zeros(2), 2.0)
+
+
+def board_seen(*others: Thing) -> Moving:
+    n = len(BOARD)
+    ends = [
+        np.column_stack([BOARD[:, 0] + SPEED * t, np.full(n, AHEAD), BOARD[:, 1]]) for t in TIMES
+    ]
+    recording = Recording(
+        stamp_ns=np.array([round(1e9 * t) for t in TIMES]),
+        offset=np.array([0, n, 2 * n]),
+        points=np.concatenate(ends).astype(np.float32),
+        hit=np.ones(2 * n, np.bool_),
+        T_base_sensor=np.eye(4)[None],
+        sensor=np.zeros(2, np.int32),
+        T_odom_base=None,
+    )
+    sources = SimpleNamespace(
+        recording=recording,
+        seen=recording,
+        poses=np.tile(np.eye(4), (2, 1, 1)),
+        p_static=np.full(2 * n, 0.1, np.float32),
+        objects=[SimpleNamespace(id=7, beams=np.arange(2 * n))],
+        things=[thing(7, 0.0, AHEAD, (0.6, 0.2), SPEED), *others],
+        start_ns=0,
+    )
+    return Moving(sources, Moves.of(sources))
+
+
+def view(number: int, seconds: float) -> View:
+    return View(number, round(1e9 * seconds), CAMERA, T_CAMERA_MAP)
+
+
+def pictures(load) -> Images:
+    cameras = np.zeros(9, np.int32)
+    return Images(np.arange(9, dtype=np.int64), cameras, (CAMERA,), load)
+
+
+def columns(image: int) -> np.ndarray:
+    """Red and green say in which column of which picture one looks."""
+    out = np.zeros((240, 320, 3), np.uint8)
+    out[..., 0], out[..., 1], out[..., 2] = np.arange(320) // 2, 20 * image, 200
+    return out
+
+
+def tint(moving, views, load=columns, place=NOTHING, options=None):
+    n = moving.sources.recording.n_beams
+    out, late = np.full((n, 3), GREY[0], np.uint8), np.full(n, np.inf, np.float32)
+    images, none = pictures(load), np.full(len(place), -1)
+    still = Painted(place, none, np.zeros(len(place), np.float32), none < 0, none, none * 0.0)
+    ahead = Ahead(still, views, VisibleOptions(), lambda one: colours_of(images, one))
+    for number in range(len(views)):
+        tint_moving(out, late, moving, number, ahead, options or MeshOptions())
+    return out.reshape(2, -1, 3), late.reshape(2, -1)
+
+
+def test_points_are_looked_up_where_the_thing_has_gone_to():
+    colours, late = tint(board_seen(), [view(1, 0.3)])
+    for scan, time in enumerate(TIMES):
+        has = (colours[scan] != GREY).any(axis=1)
+        assert 0.3 < has.mean() < 1.0
+        assert late[scan, has] == pytest.approx(0.3 - time)
+        expected = 160.0 + 200.0 * (BOARD[:, 0] + SPEED * 0.3) / AHEAD
+        np.testing.assert_allclose(colours[scan, has, 0], expected[has] / 2.0, atol=1.0)
+        # its edge may show what is behind, the more the longer it went
+        inside = np.minimum(0.5 - np.abs(BOARD[:, 0]), 0.8 - np.abs(BOARD[:, 1] - 1.0))
+        needed = 0.02 + 0.1 * SPEED * (0.3 - time)
+        assert inside[has].min() > needed - 0.04
+        assert has[inside > needed + 0.04].all()
+
+
+def test_the_nearest_in_time_counts_whatever_the_order():
+    views = [view(1, -0.2), view(2, 0.04), view(3, 0.07), view(4, 0.4)]
+    for order in (views, views[::-1]):
+        colours, _ = tint(board_seen(), order)
+        assert set(colours[0, INNER, 1].tolist()) == {40}
+        assert set(colours[1, INNER, 1].tolist()) == {60}
+
+
+def test_pictures_long_before_or_after_do_not_count():
+    assert (tint(board_seen(), [view(1, 0.61), view(2, -0.51)])[0] == GREY).all()
+    options = MeshOptions()
+    options = dataclasses.replace(options, objects=dataclasses.replace(options.objects, near=0.7))
+    assert (tint(board_seen(), [view(1, 0.61)], options=options)[0] != GREY).any()
+
+
+def wall(y: float) -> Mesh:
+    """To the left of x = 0, facing the camera."""
+    corners = np.array([[-9.0, y, -9.0], [0.0, y, -9.0], [0.0, y, 9.0], [-9.0, y, 9.0]])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+
+
+def test_what_stands_still_hides_what_is_behind_it():
+    left = BOARD[:, 0] < -0.05
+    near, _ = tint(board_seen(), [view(1, 0.0)], place=wall(2.0))
+    assert (near[0, left] == GREY).all()
+    assert (near[0, ~left] != GREY).any()
+    behind, _ = tint(board_seen(), [view(1, 0.0)], place=wall(4.0))
+    assert (behind[0, left] != GREY).any()
+
+
+def test_another_thing_hides_what_is_behind_it():
+    other = thing(8, 0.0, 1.5, (0.05, 0.05), 0.0)
+    covered, _ = tint(board_seen(other), [view(1, 0.0)])
+    alone, _ = tint(board_seen(), [view(1, 0.0)])
+    assert (covered[0, INNER] == GREY).all()
+    assert (alone[0, INNER] != GREY).any()
+    far, _ = tint(board_seen(thing(8, 0.0, 4.5, (0.05, 0.05), 0.0)), [view(1, 0.0)])
+    np.testing.assert_array_equal(far, alone)
+
+
+def test_what_is_of_no_track_and_what_stands_still_are_left_alone():
+    moving = board_seen()
+    moving.sources.p_static[:100] = 0.9
+    moving.sources.objects[0].beams = np.arange(200, 2 * len(BOARD))
+    again = Moving(moving.sources, Moves.of(moving.sources))
+    colours, _ = tint(again, [view(1, 0.05)])
+    assert (colours[0, :200] == GREY).all()
+    assert (colours[0, 200:] != GREY).any()
+
+
+def test_a_damaged_picture_colours_nothing_and_another_one_takes_its_place():
+    def load(image):
+        if image == 2:
+            raise InputError("is damaged", where="2.png")
+        return columns(image)
+
+    colours, _ = tint(board_seen(), [view(1, 0.2), view(2, 0.0)], load)
+    assert set(colours[0, INNER, 1].tolist()) == {20}
+
+
+def test_a_picture_in_which_nothing_is_seen_is_not_read():
+    def load(image):
+        raise AssertionError(f"{image} is read")
+
+    away = dataclasses.replace(view(1, 0.0), T_camera_map=np.diag([1.0, -1, -1, 1]) @ T_CAMERA_MAP)
+    assert (tint(board_seen(), [away, view(2, 5.0)], load)[0] == GREY).all()
+
+
+def test_grey_pictures_give_a_grey_that_is_none_of_no_colour():
+    colours, _ = tint(board_seen(), [view(1, 0.0)], lambda _: np.full((240, 320, 3), 128, np.uint8))
+    assert (colours[0, INNER] == (128, 128, 127)).all()

@@ -1,0 +1,210 @@
+"""Which pictures paint what moved: a board that goes along a wall, seen by a camera before it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_up_rooms import looking, rectangle
+
+from stillmap.mesh.background import Ahead
+from stillmap.mesh.objects.frame import Way
+from stillmap.mesh.objects.reconstruction import Shape
+from stillmap.mesh.objects.texturing import dressed, when_in_view
+from stillmap.mesh.options import ChoiceOptions, MoverOptions, VisibleOptions
+from stillmap.mesh.place import Painted
+from stillmap.mesh.texture.occluders import Thing
+from stillmap.mesh.triangle_mesh import joined
+from stillmap.tracking.boxes import Box
+
+WALL = rectangle([-8.0, 4.0, -3.0], [16.0, 0, 0], [0, 0, 6.0], 24)
+BOARD = rectangle([-0.25, 0.0, 0.0], [0.5, 0, 0], [0, 0, 1.0], 10)
+OPTIONS = MoverOptions(rim=0.0, drift=0.0)
+WALLS, CLOTHES = (180, 170, 160), (200, 30, 40)
+SPEED = 1.0  # m/s along x
+
+
+def thing(id=3, y=2.0):
+    """A box of 0.5 by 0.2 m that is at x = 0 when time begins, and goes on."""
+    seconds = np.array([0.0, 4.0])
+    along = np.array([[0.0, y], [4.0 * SPEED, y]])
+    ahead = np.array([[1.0, 0.0]] * 2)
+    box = Box(id, seconds, along, ahead, SPEED * ahead, (0.25, 0.1), 0.5)
+    return Thing(box, np.array([-0.5, -0.5]), 1.0)
+
+
+def shape(seconds=0.0):
+    return Shape(3, BOARD, Way.of_track(thing()), False, seconds, (seconds, seconds))
+
+
+def view(number, seconds, place=(0.0, 0.0, 0.0)):
+    at = looking(place, np.add(place, [0.0, 1, 0]))
+    return replace(at, image=number, stamp_ns=round(1e9 * seconds))
+
+
+def place_of(mesh=WALL, painter=1):
+    n = len(mesh)
+    of_all = np.full(n, painter, np.int32)
+    p = np.ones(n, np.float32)
+    return Painted(mesh, of_all, p, np.ones(n, np.bool_), of_all, p)
+
+
+def pictures(gap=0.0, there=(0,), shift=0.0):
+    """The pictures of views: in those named the board is where it is when time begins, moved by
+    `shift` metres, with a gap in its middle through which the wall is seen."""
+
+    def colours(one):
+        out = np.full((300, 400, 3), WALLS, np.uint8)
+        if one.image in there:
+            x, z = (np.arange(400) - 199.5) / 150.0 - shift, (149.5 - np.arange(300)) / 150.0
+            board = (np.abs(x) <= 0.25) & (np.abs(x) >= gap)
+            out[np.ix_(np.abs(z) <= 0.5, board)] = CLOTHES
+        return out
+
+    return colours
+
+
+def dress(views, place=None, colours=None, options=OPTIONS, others=(), of=None):
+    limits = VisibleOptions()
+    ahead = Ahead(place or place_of(), views, limits, colours or pictures())
+    things = [thing(), *others]
+    return dressed(of or shape(), views, ahead, things, 0, options, ChoiceOptions(), limits)
+
+
+def area_painted(found):
+    areas = found.painted.mesh.areas()
+    return areas[found.painted.view >= 0].sum()
+
+
+def painted_at(found):
+    """x and z of what is painted."""
+    return found.painted.mesh.centres[found.painted.view >= 0][:, [0, 2]]
+
+
+def test_a_thing_is_painted_by_what_shows_it():
+    found = dress([view(0, 0.0), view(1, 30.0)])
+    assert area_painted(found) == pytest.approx(0.5)
+    assert [one.image for one in found.views] == [0]
+    # as if it had stood still
+    np.testing.assert_allclose(
+        found.views[0].in_camera(np.zeros((1, 3))), [[0.0, 0.5, 2.0]], atol=1e-9
+    )
+
+
+def test_what_lies_at_its_outline_is_not():
+    x, z = painted_at(dress([view(0, 0.0), view(1, 30.0)], options=replace(OPTIONS, rim=0.1))).T
+    assert 0.1 < np.abs(x).max() < 0.15
+    assert 0.1 < z.min() < z.max() < 0.9
+
+
+def test_and_more_of_it_the_farther_it_went():
+    options = replace(OPTIONS, rim=0.05, drift=0.25)
+    views, colours = [view(0, 0.0), view(1, 30.0)], pictures()
+    still = dress(views, colours=colours, options=options)
+    went = dress(views, colours=colours, options=options, of=shape(0.4))
+    assert 0.0 < area_painted(went) < 0.6 * area_painted(still)
+
+
+def test_what_looks_like_the_place_behind_is_not_painted():
+    found = dress([view(0, 0.0), view(1, 30.0)], colours=pictures(gap=0.1))
+    x = np.abs(painted_at(found)[:, 0])
+    assert 0.08 < x.min() < 0.13
+    assert area_painted(found) == pytest.approx(0.3, abs=0.04)
+    careless = replace(OPTIONS, differs=0.0)
+    found = dress([view(0, 0.0), view(1, 30.0)], colours=pictures(gap=0.1), options=careless)
+    assert area_painted(found) == pytest.approx(0.5)
+
+
+def test_the_place_behind_is_compared_where_it_is_seen_from_elsewhere():
+    """The wall has another colour right of x = 0.5 m; the other picture is taken from 1 m aside."""
+
+    def colours(one):
+        out, x = pictures()(one), 4.0 * (np.arange(400) - 199.5) / 300.0
+        wall = (x + (1.0 if one.image else 0.0) > 0.5)[None] & (out == WALLS).all(axis=2)
+        out[wall] = (20, 60, 90)
+        return out
+
+    views = [view(0, 0.0), view(1, 30.0, place=(1.0, 0.0, 0.0))]
+    ahead = Ahead(place_of(), views, VisibleOptions(), colours)
+    on_wall = np.array([[-1.0, 4.0, 0.3], [0.4, 4.0, 1.2], [0.7, 4.0, -0.9], [1.5, 4.0, 0.5]])
+    np.testing.assert_allclose(ahead.differs(0, 0.6 * on_wall), 0.0, atol=1e-3)
+    expected = np.linalg.norm(np.subtract(WALLS, CLOTHES))
+    np.testing.assert_allclose(ahead.differs(0, np.array([[0.1, 2.0, 0.2]])), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("why", ["grey", "by the same picture", "damaged", "nothing is there"])
+def test_where_nobody_knows_what_is_behind_it_lies_farther_within(why):
+    views, place, colours = [view(0, 0.0), view(1, 30.0)], place_of(), pictures()
+    if why == "grey":
+        place = place_of(painter=-1)
+    elif why == "by the same picture":
+        place = place_of(painter=0)
+    elif why == "damaged":
+        colours = lambda one: None if one.image else pictures()(one)  # noqa: E731
+    else:
+        place = place_of(rectangle([-8.0, 4.0, 2.0], [16.0, 0, 0], [0, 0, 1.0]))
+    found = dress(views, place, colours, replace(OPTIONS, unsure=0.1))
+    x, z = painted_at(found).T
+    assert 0.1 < np.abs(x).max() < 0.17
+    assert 0.08 < z.min() < z.max() < 0.92
+    never = replace(OPTIONS, unsure=10.0)
+    assert area_painted(dress(views, place, colours, never)) == 0.0
+    careless = replace(OPTIONS, differs=0.0)
+    assert area_painted(dress(views, place, colours, careless)) == pytest.approx(0.5)
+
+
+def test_what_the_place_hides_is_not_painted():
+    pillar = rectangle([-0.5, 1.0, -1.0], [0.5, 0, 0], [0, 0, 2.0])
+    found = dress([view(0, 0.0), view(1, 30.0)], place_of(joined([WALL, pillar])))
+    assert painted_at(found)[:, 0].min() > 0.0
+    assert area_painted(found) == pytest.approx(0.25, abs=0.03)
+
+
+def test_nor_is_what_another_thing_may_hide():
+    other = thing(id=4, y=1.0)
+    assert area_painted(dress([view(0, 0.0), view(1, 30.0)], others=[other])) == 0.0
+    behind = thing(id=4, y=3.5)
+    found = dress([view(0, 0.0), view(1, 30.0)], others=[behind])
+    assert area_painted(found) == pytest.approx(0.5)
+
+
+def test_pictures_taken_too_late_do_not_paint():
+    views = [view(0, 0.6), view(1, 30.0)]
+    colours = pictures(shift=0.6)
+    assert area_painted(dress(views, colours=colours)) == 0.0
+    longer = replace(OPTIONS, near=0.7)
+    assert area_painted(dress(views, colours=colours, options=longer)) == pytest.approx(0.5)
+
+
+def test_of_two_as_sharp_the_one_nearer_in_time_paints():
+    views = [view(0, 0.3), view(1, 30.0), view(2, 0.1), view(3, -0.2)]
+
+    def colours(one):
+        return pictures(there=(0, 2, 3), shift=1e-9 * one.stamp_ns)(one)
+
+    found = dress(views, colours=colours)
+    used = np.unique(found.painted.view[found.painted.view >= 0])
+    assert [found.views[k].image for k in used] == [2]
+
+
+def test_scraps_are_no_picture_of_it():
+    """Of a board behind a wall with a window."""
+
+    def seen_through(half):
+        walls = [
+            rectangle([-2.0, 1.0, -2.0], [2.0 - half, 0, 0], [0, 0, 4.0]),
+            rectangle([half, 1.0, -2.0], [2.0, 0, 0], [0, 0, 4.0]),
+            rectangle([-half, 1.0, -2.0], [2.0 * half, 0, 0], [0, 0, 2.0 - half]),
+            rectangle([-half, 1.0, half], [2.0 * half, 0, 0], [0, 0, 2.0]),
+        ]
+        return area_painted(dress([view(0, 0.0), view(1, 30.0)], place_of(joined([WALL, *walls]))))
+
+    assert seen_through(0.08) == pytest.approx(0.16**2 * 4, rel=0.4)
+    assert seen_through(0.03) == 0.0  # 2 %
+
+
+def test_when_it_is_in_view():
+    # at x = 2.5 m it is beyond the edge, 2 m ahead
+    views = [view(0, 0.0), view(1, 1.0), view(2, 2.5), view(3, 30.0), view(4, -0.4)]
+    np.testing.assert_allclose(
+        when_in_view(thing(), views, 0), [0.0, 1.0, np.nan, np.nan, -0.4], atol=1e-9
+    )

@@ -1,0 +1,79 @@
+"""How probably a picture shows what stands still: by beams, and by what is followed."""
+
+import numpy as np
+import pytest
+from made_up_rooms import looking, rectangle
+
+from stillmap.core.recording import Recording
+from stillmap.mesh.options import ChoiceOptions
+from stillmap.mesh.place import shown
+from stillmap.mesh.texture.occluders import Thing
+from stillmap.mesh.texture.occlusion import Beams
+from stillmap.tracking.boxes import Box
+
+# 4 m ahead of a camera at the origin; faces of 0.2 m
+WALL = rectangle([-1.0, 4.0, -1.0], [2.0, 0, 0], [0, 0, 2.0], 10)
+VIEW = looking([0.0, 0, 0], [0.0, 1, 0])
+OPTIONS = ChoiceOptions()
+
+
+def beams(ends, p, beside=0.3):
+    """One scan from a laser to the left of the camera."""
+    points = np.add(ends, [beside, 0.0, 0.0])
+    recording = Recording(
+        stamp_ns=np.zeros(1, np.int64),
+        offset=np.array([0, len(points)]),
+        points=points.astype(np.float32),
+        hit=np.ones(len(points), np.bool_),
+        T_base_sensor=np.eye(4)[None],
+        sensor=np.zeros(1, np.int32),
+        T_odom_base=None,
+    )
+    T = np.eye(4)[None].copy()
+    T[0, 0, 3] = -beside
+    return Beams(recording, recording, T, np.asarray(p, np.float32), [], [], 0)
+
+
+def person(x, y):
+    seconds = np.array([0.0, 1.0])
+    still, ahead = np.tile([x, y], (2, 1)), np.tile([1.0, 0.0], (2, 1))
+    box = Box(3, seconds, still, ahead, np.zeros((2, 2)), (0.2, 0.2), 0.5)
+    return Thing(box, np.full(2, -1.0), 2.0)
+
+
+def probabilities(found, things):
+    faces = np.arange(len(WALL))
+    return shown(WALL, faces, VIEW, found, things, OPTIONS)
+
+
+def on_wall():
+    x, z = np.meshgrid(np.arange(-1.4, 1.4, 0.03), np.arange(-1.4, 1.4, 0.03))
+    return np.column_stack([x.ravel(), np.full(x.size, 4.0), z.ravel()])
+
+
+def test_where_no_beam_tells_the_boxes_do():
+    x = WALL.centres[:, 0]
+    p = probabilities(beams([[9.0, 9.0, 0.0]], [1.0]), [person(0.0, 2.0)])
+    np.testing.assert_allclose(p[np.abs(x) > 0.95], OPTIONS.unseen, atol=0.02)
+    # 0.4 m wide, twice as far away
+    assert (p[np.abs(x) < 0.4] < 0.1).all()
+
+
+def test_beams_on_the_wall_speak_for_it_but_not_behind_a_thing():
+    """The laser sees past it what the camera does not."""
+    ends = on_wall()
+    p = probabilities(beams(ends, np.ones(len(ends))), [])
+    assert (p > 0.99).all()
+    p = probabilities(beams(ends, np.ones(len(ends))), [person(0.0, 2.0)])
+    x = np.abs(WALL.centres[:, 0])
+    assert (p[x < 0.25] < OPTIONS.least).all()
+    assert (p[x > 0.7] > 0.99).all()
+
+
+def test_beams_that_end_on_what_moves_are_believed_at_once():
+    p = probabilities(beams([[0.3, 2.0, 0.0]], [0.1]), [])
+    at = WALL.centres[:, [0, 2]]
+    near = np.hypot(at[:, 0] - 0.6, at[:, 1]) < 0.15
+    assert near.any()
+    np.testing.assert_allclose(p[near], 0.1, atol=1e-6)
+    assert p[np.hypot(at[:, 0] - 0.6, at[:, 1]) > 0.6] == pytest.approx(OPTIONS.unseen)

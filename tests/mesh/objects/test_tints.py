@@ -1,0 +1,162 @@
+"""Colours of points, from start to end: what was seen of a small room with people in it."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import stillmap
+from stillmap.cli.main import main
+from stillmap.core.camera import Images
+from stillmap.eval.mesh import colour_difference
+from stillmap.eval.model_readers import read_seen
+from stillmap.io import stillmap_folder
+from stillmap.io.trajectory import poses_from_tum
+from stillmap.mesh.texture.atlas import GREY
+from stillmap.results.export import point_cloud
+from stillmap.results.points import COLOURS, FIELDS
+from stillmap.sim import load_picture_truth
+from stillmap.sim.appearance import static_colour
+
+
+def beams_of(out, name="beams"):
+    """Hits, P(static), colours."""
+    return [np.load(out / name / f"{what}.npy") for what in ("hit", "p_static", "colour")]
+
+
+def rows_of(path, fields):
+    head, _, data = path.read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("prop")]
+    assert names == [name for name, _ in fields]
+    return np.frombuffer(data, fields)
+
+
+def rgb(rows):
+    return np.stack([rows[name] for name, _ in COLOURS], axis=1)
+
+
+def coloured(colours):
+    return (colours != GREY).any(axis=1)
+
+
+def test_colours_of_what_stands_still_are_the_true_ones(room, result):
+    hit, p_static, colours = beams_of(result)
+    seen, still = read_seen(room), hit & (p_static >= 0.5)
+    has = coloured(colours)
+    assert not has[~hit].any()
+    assert 0.1 < has[still].mean() < 0.5  # the lidar looks round about, the camera does not
+    use = np.flatnonzero(still & has & seen.truth.static())
+    _, places = seen.picture_truth.standing.nearest(seen.ends[use])
+    true = static_colour(places, seen.picture_truth.colour_seed)
+    difference = colour_difference(colours[use], true)
+    assert np.median(difference) < 5.0
+    mixed = colour_difference(colours[use], np.roll(true, len(true) // 3, axis=0))
+    assert np.median(mixed) > 3.0 * np.median(difference)
+
+
+@pytest.fixture(scope="module")
+def told(room) -> Callable[..., tuple[stillmap.Result, np.ndarray]]:
+    """The room with pictures of what is to be seen in place of colours: red is what moves; gives
+    which beams have the colour of something that moves, and which any."""
+    recording, truth = stillmap.read(room), load_picture_truth(room)
+    poses = poses_from_tum(room / "truth/trajectory.tum", recording)
+
+    def seen(image: int) -> np.ndarray:
+        moves = truth.mask(image) > 0
+        return np.stack([np.where(moves, 250, 10)] + 2 * [np.full(moves.shape, 30)], 2).astype("u1")
+
+    images = recording.images
+    of_masks = Images(images.stamp_ns, images.camera, images.cameras, seen)
+    recording = dataclasses.replace(recording, images=of_masks)
+    found = stillmap.build(recording, stillmap.Options(threads=1), poses=poses)
+
+    def tell(believe: bool):
+        mesh = found.options.mesh
+        mesh = dataclasses.replace(mesh, choice=dataclasses.replace(mesh.choice, believe=believe))
+        options = dataclasses.replace(found.options, mesh=mesh)
+        tints = stillmap.models_of(dataclasses.replace(found, options=options)).tints
+        return found, tints.colours
+
+    return tell
+
+
+def test_nobody_colours_what_stands_still_unless_beams_are_not_believed(told):
+    shares = []
+    for believe in (True, False):
+        found, colours = told(believe)
+        use = found.recording.hit & (found.p_static >= 0.5) & coloured(colours)
+        shares.append((colours[use, 0] > 130).mean())
+    assert shares[0] < 0.02
+    assert shares[1] > 0.06
+
+
+def test_what_moves_has_colours_of_what_moves(told, room):
+    found, colours = told(True)
+    use = found.recording.hit & (found.p_static < 0.5) & coloured(colours)
+    use &= np.load(room / "truth/mover.npy") >= 0
+    assert use.sum() > 100
+    assert (colours[use, 0] > 130).mean() > 0.9
+
+
+def test_the_files_say_the_same(room, result):
+    hit, p_static, colours = beams_of(result)
+    counts = json.loads((result / "run.json").read_text())["models"]["points"]
+    for part, of in (("static", p_static >= 0.5), ("dynamic", p_static < 0.5)):
+        rows = rows_of(result / f"{part}.ply", FIELDS + COLOURS)
+        np.testing.assert_array_equal(rgb(rows), colours[hit & of])
+        assert counts[part] == len(rows)
+        assert counts[f"{part}_coloured"] == coloured(rgb(rows)).sum() > 0
+    assert len(colours) == stillmap_folder.read(room).n_beams
+
+
+@pytest.mark.parametrize("only", [None, "static", "dynamic"])
+def test_a_cloud_in_another_form_has_them_too(result, tmp_path, only):
+    hit, p_static, colours = beams_of(result)
+    part = {None: hit, "static": hit & (p_static >= 0.5), "dynamic": hit & (p_static < 0.5)}[only]
+    words = ["convert", result, "-o", tmp_path / "a.ply", "--quiet"]
+    words += ["--only", only] if only else []
+    assert main([str(word) for word in words]) == 0
+    np.testing.assert_array_equal(rgb(rows_of(tmp_path / "a.ply", FIELDS + COLOURS)), colours[part])
+
+
+def test_other_colours_than_beams_are_refused(mapped, tmp_path, capsys):
+    out = mapped("damaged")
+    _, _, colours = beams_of(out)
+    for wrong in (colours[:-1], colours.astype(np.uint16)):
+        np.save(out / "beams/colour.npy", wrong)
+        assert main(["convert", str(out), "-o", str(tmp_path / "a.ply")]) == 2
+        assert "colour.npy: " in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_threads_and_another_time_change_no_bit(result, mapped):
+    again = mapped("again-points", "--threads", "2")
+    for name in ("static.ply", "dynamic.ply", "beams/colour.npy"):
+        assert (again / name).read_bytes() == (result / name).read_bytes()
+
+
+def test_without_them_the_clouds_are_as_ever(result, mapped):
+    plain = mapped("plain", "--set", "mesh.points.enabled=false")
+    assert not (plain / "beams/colour.npy").exists()
+    assert "points" not in json.loads((plain / "run.json").read_text())["models"]
+    for part in ("static", "dynamic"):
+        rows, more = rows_of(plain / f"{part}.ply", FIELDS), result / f"{part}.ply"
+        for name, _ in FIELDS:
+            np.testing.assert_array_equal(rows[name], rows_of(more, FIELDS + COLOURS)[name])
+
+
+def test_a_rig_has_them_beside_the_beams_of_the_laser_that_tilts(rig, mapped, tmp_path):
+    """Of the flat one nobody asks for a cloud."""
+    poses = ("--poses", rig / "horizontal/truth/trajectory.tum", "--tilting", rig / "tilting")
+    out = mapped("rig-points", *poses, source=rig / "horizontal")
+    assert not (out / "beams/colour.npy").exists()
+    hit, p_static, colours = beams_of(out, "tilting/beams")
+    static = rows_of(out / "static.ply", FIELDS + COLOURS)
+    np.testing.assert_array_equal(rgb(static), colours[hit & (p_static >= 0.5)])
+    assert coloured(rgb(static)).mean() > 0.2
+    assert point_cloud.cloud_in(out).coloured
+    assert main(["convert", str(out), "-o", str(tmp_path / "a.xyz"), "--quiet"]) == 0
+    found = np.loadtxt(tmp_path / "a.xyz", skiprows=1)
+    np.testing.assert_array_equal(found[: len(static), 4:], rgb(static))

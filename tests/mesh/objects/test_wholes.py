@@ -1,0 +1,119 @@
+"""Which tracks are of one thing."""
+
+import dataclasses
+import tracemalloc
+
+import numpy as np
+from made_up_street import Car, Part, street
+
+from stillmap.mesh.inputs import Sources
+from stillmap.mesh.objects import merging
+from stillmap.mesh.objects.merging import MOSTLY, followed_of, hanging_together, pairs_of, wholes_of
+from stillmap.mesh.objects.reconstruction import shape_of
+from stillmap.mesh.objects.segmentation import Moves
+from stillmap.mesh.options import MoverOptions
+from stillmap.mesh.texture.occluders import Thing
+from stillmap.tracking.boxes import box_of
+
+OPTIONS = MoverOptions()
+CAR = Car((6.0, -2.5), (6.0, 0.0))
+
+
+def _wholes(sources: Sources) -> list[list[int]]:
+    moves = Moves.of(sources)
+    followed = followed_of(sources, moves, OPTIONS)
+    found = wholes_of(followed, moves, sources, OPTIONS)
+    return [[one.object.id for one in whole] for whole in found]
+
+
+def test_front_and_rear_of_a_car_are_one() -> None:
+    parts = [Part(0, 0.0, 0.3), Part(0, 0.5, 1.0), Part(0, 0.3, 0.5, (2, 6))]
+    assert _wholes(street([CAR], parts)) == [[0, 1, 2]]
+
+
+def test_cars_one_behind_the_other_and_beside_are_two() -> None:
+    behind = [CAR, Car((13.0, -2.5), (6.0, 0.0))]
+    assert _wholes(street(behind, [Part(0), Part(1)])) == [[0], [1]]
+    beside = [CAR, Car((6.0, 2.5), (6.0, 0.0))]
+    assert _wholes(street(beside, [Part(0), Part(1)])) == [[0], [1]]
+
+
+def test_a_track_of_two_cars_does_not_make_them_one() -> None:
+    row = [Car((7.0, -4.0), (6.0, 0.0)), Car((15.0, -4.0), (6.0, 0.0))]
+    one_and_the_next = Part(0, 0.0, 0.2, (0, 3)), Part(1, 0.0, 0.2, (3, 8))
+    sources = street(row, [Part(0, 0.2, 1.0), Part(1, 0.2, 1.0), *one_and_the_next])
+    first, last = sources.objects[2:]
+    names = ("scan", "stamp_ns", "xy", "velocity", "beams", "z")
+    ways = {name: np.concatenate([getattr(one, name) for one in (first, last)]) for name in names}
+    both = dataclasses.replace(first, **ways)
+    thing = Thing(box_of(both, 0, 0.5), np.zeros(len(both.scan)), both.size[2])
+    objects, things = [*sources.objects[:2], both], [*sources.things[:2], thing]
+    sources = dataclasses.replace(sources, objects=objects, things=things)
+    moves = Moves.of(sources)
+    followed = followed_of(sources, moves, OPTIONS)
+    pairs = pairs_of(list(merging._scans(followed, moves, sources, OPTIONS)), 3)
+    hangs = pairs.met >= MOSTLY * pairs.both
+    assert pairs.ends[hangs].tolist() == [[0, 2], [1, 2]]  # by twos they are all one
+    assert sorted(_wholes(sources)) in ([[0, 2], [1]], [[0], [1, 2]])
+
+
+def test_cars_in_a_row_that_are_one_from_afar_are_two() -> None:
+    for scans, y in ((24, -4.0), (20, -4.0), (16, -3.0)):
+        row = [Car((20.0, y), (-8.0, 0.0)), Car((26.0, y), (-8.0, 0.0))]
+        assert _wholes(street(row, [Part(0), Part(1)], scans=scans)) == [[0], [1]]
+
+
+def test_cars_that_pass_each_other_are_two() -> None:
+    passing = [Car((8.0, -1.5), (6.0, 0.0)), Car((14.0, 1.5), (-6.0, 0.0))]
+    assert _wholes(street(passing, [Part(0), Part(1)])) == [[0], [1]]
+
+
+def test_people_stay_alone() -> None:
+    size = (0.4, 0.4, 1.7)
+    pair = [Car((6.0, 0.0), (1.0, 0.0), size), Car((6.0, 0.7), (1.0, 0.0), size)]
+    assert _wholes(street(pair, [Part(0), Part(1)])) == [[0], [1]]
+
+
+def test_what_is_left_over_of_a_car_is_no_thing() -> None:
+    stands = Part(0, 0.6, 0.8, (2, 6), drift=(-6.0, 0.0))
+    assert _wholes(street([CAR], [Part(0, 0.0, 0.6), stands])) == [[0]]
+
+
+def test_one_model_shows_all_of_a_car_that_was_followed_in_parts() -> None:
+    sources = street([CAR], [Part(0, 0.0, 0.3), Part(0, 0.3, 1.0)])
+    moves = Moves.of(sources)
+    followed = followed_of(sources, moves, OPTIONS)
+    (whole,) = wholes_of(followed, moves, sources, OPTIONS)
+    shape = shape_of(whole, sources, moves, OPTIONS, [np.zeros(0)] * len(whole))
+    assert shape is not None
+    assert shape.id in (0, 1)
+    T = shape.way.T_map_object(shape.seconds)
+    there = shape.mesh.vertices @ T[:3, :3].T + T[:3, 3]
+    rear = CAR.start[0] - 2.0 + 6.0 * shape.seconds
+    assert there[:, 0].min() < rear + 0.1
+    assert there[:, 0].max() > rear + 3.6
+
+
+def test_points_hang_together_as_far_as_beams_are_apart() -> None:
+    place = np.zeros(3)
+    for away, apart, together in ((5.0, 0.6, True), (5.0, 1.2, False), (45.0, 1.6, True)):
+        points = np.array([[away, 0.0, 0.0], [away, apart, 0.0]])
+        one, other = hanging_together(points, place, 0.5)
+        assert (one == other) == together
+    assert len(hanging_together(np.zeros((0, 3)), place, 0.5)) == 0
+
+
+def test_many_tracks_that_never_meet_need_no_room() -> None:
+    sources = street([CAR], [Part(0)])
+    moves = Moves.of(sources)
+    (one,) = followed_of(sources, moves, OPTIONS)
+    far = [
+        one._replace(object=dataclasses.replace(one.object, id=k, beams=one.object.beams[:0]))
+        for k in range(1, 3000)
+    ]
+    tracemalloc.start()
+    found = wholes_of([one, *far], moves, sources, OPTIONS)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(found) == 3000
+    assert most < 10e6

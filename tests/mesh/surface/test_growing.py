@@ -1,0 +1,119 @@
+"""Surfaces that grow as the sensor goes on: the same as of all at once, in less memory."""
+
+import numpy as np
+import pytest
+
+from stillmap import _core
+from stillmap.mesh import tsdf
+from stillmap.mesh.options import SurfaceOptions
+from stillmap.mesh.range_image import Patch, order_of
+from stillmap.mesh.resolution import Reach, reach_of
+from stillmap.mesh.tsdf import Growing, fused
+
+RAW = SurfaceOptions(error=0.0, island=0.0)
+VOXEL, SIZE = 0.1, 1.6  # m, with tiles of 16 voxels
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    monkeypatch.setattr("stillmap.mesh.marching_cubes.TILE", 16)
+    monkeypatch.setattr(tsdf, "_MORE", 0.0)
+
+
+def along_a_wall(n=12, noise=0.01):
+    """Patches of a wall, each seen two metres farther on, and how far they go."""
+    rng = np.random.default_rng(0)
+    patches = []
+    number = np.arange(60 * 30, dtype=np.int32).reshape(30, 60)
+    a, b, c = number[:-1, :-1].ravel(), number[:-1, 1:].ravel(), number[1:, :-1].ravel()
+    d = number[1:, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+    for k in range(n):
+        x, z = np.meshgrid(2.0 * k + np.linspace(-2.5, 2.5, 60), np.linspace(0.0, 2.0, 30))
+        y = 3.0 + rng.normal(0.0, noise, x.shape)
+        points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+        origin = np.tile([2.0 * k, 0.0, 1.0], (len(points), 1))
+        patch = Patch(points, faces, np.arange(len(points)), origin, points[:, 1] * 1.0)
+        patches.append((patch, np.ones(len(faces), np.float32)))
+    return patches, Reach(np.array([[2.0 * k, 0.0, 1.0] for k in range(n)]), np.full(n, 4.2))
+
+
+def as_set(mesh):
+    corners = np.round(mesh.corners, 4)
+    return {tuple(sorted(map(tuple, face.tolist()))) for face in corners}
+
+
+def test_the_surface_is_that_of_all_at_once():
+    patches, reach = along_a_wall()
+    whole, grown = fused(patches, VOXEL, RAW), fused(patches, VOXEL, RAW, reach=reach)
+    assert len(whole) == len(grown) > 5_000
+    assert as_set(whole) == as_set(grown)
+
+
+def test_voxels_behind_are_gone():
+    patches, reach = along_a_wall(24)
+    held = {"all": [], "near": []}
+    for name, most in held.items():
+        one = Growing(_core.SignedDistances(VOXEL, before=0.3, behind=0.2), RAW)
+        for done, (patch, weight) in enumerate(patches, start=1):
+            one.distances.add(
+                patch.points, patch.origin, patch.standoff, patch.faces, weight, threads=1
+            )
+            if name == "near":
+                one.let_go(reach, done)
+            most.append(one.distances.memory_bytes)
+    assert max(held["near"]) < 0.45 * max(held["all"])
+    # once under way it holds as much as before
+    assert max(held["near"][16:]) <= 1.1 * max(held["near"][8:16])
+
+
+def test_thinned_out_it_has_no_crack(monkeypatch):
+    monkeypatch.setattr(tsdf, "_BATCH", 500)
+    patches, reach = along_a_wall()
+    mesh = fused(patches, VOXEL, SurfaceOptions(error=0.02, island=0.0), reach=reach)
+    assert 20 < len(mesh) < 0.3 * len(fused(patches, VOXEL, RAW))
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    found, count = np.unique(edges, axis=0, return_counts=True)
+    ends = mesh.vertices[found[count == 1]].mean(axis=1)
+    inside = (ends[:, 0] > -1.5) & (ends[:, 0] < 22.5) & (np.abs(ends[:, 2] - 1.0) < 0.7)
+    assert inside.sum() == 0
+    assert np.abs(mesh.vertices[:, 1] - 3.0).max() < 0.06
+
+
+def test_the_budget_is_kept_on_the_way(monkeypatch):
+    monkeypatch.setattr(tsdf, "_BATCH", 500)
+    most = []
+    merge = Growing._merge
+
+    def watched(self):
+        merge(self)
+        most.append(len(self._mesh))
+
+    monkeypatch.setattr(Growing, "_merge", watched)
+    patches, reach = along_a_wall(40, noise=0.02)
+    mesh = fused(patches, VOXEL, SurfaceOptions(faces=600), reach=reach)
+    assert 100 < len(mesh) <= 600
+    # but for borders, which may go on
+    assert max(most) < 0.15 * len(fused(patches, VOXEL, RAW))
+    assert np.abs(mesh.vertices[:, 1] - 3.0).mean() < 0.02
+
+
+def test_reach_is_as_far_as_hits_are(room):
+    poses = room.standing(1, [0, 0, 0], [0.6, 0.3, 0.0])
+    recording = room.scans(room.lidar(90, 10), poses)
+    order = order_of(recording, np.arange(2), RAW)
+    reach = reach_of(recording, poses, order)
+    ends = [recording.end_points(np.arange(900) + 900 * t, poses) for t in range(2)]
+    for t in range(2):
+        away = np.linalg.norm(ends[t] - reach.place[t], axis=1)
+        assert reach.range[t] == pytest.approx(away.max(), rel=1e-5)
+    recording.hit[:900] = False
+    assert reach_of(recording, poses, order).range[0] == 0.0
+
+
+def test_settled_are_tiles_that_later_patches_do_not_come_to():
+    reach = Reach(np.array([[0.0, 0, 0], [10.0, 0, 0]]), np.array([5.0, 2.0]))
+    tiles = np.array([[0, 0, 0], [5, 0, 0], [9, 0, 0], [30, 0, 0]])
+    assert reach.settled(tiles, 1.0, 0).tolist() == [False, False, False, True]
+    assert reach.settled(tiles, 1.0, 1).tolist() == [True, False, False, True]
+    assert reach.settled(tiles, 1.0, 2).all()

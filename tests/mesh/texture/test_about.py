@@ -1,0 +1,114 @@
+"""Beams that were taken about when a picture was."""
+
+import numpy as np
+
+from stillmap.core.recording import Recording
+from stillmap.mesh.options import ChoiceOptions
+from stillmap.mesh.texture.occlusion import Beams
+from stillmap.tracking.boxes import Box
+
+
+def _recording(times: np.ndarray | None) -> Recording:
+    T, n = 4, 3
+    points = np.zeros((T * n, 3), np.float32)
+    points[:, 0] = np.arange(T * n) + 1.0
+    return Recording(
+        stamp_ns=np.arange(T) * 100_000_000,
+        offset=np.arange(T + 1, dtype=np.int64) * n,
+        points=points,
+        hit=np.ones(T * n, np.bool_),
+        T_base_sensor=np.eye(4)[None],
+        sensor=np.zeros(T, np.int32),
+        T_odom_base=None,
+        beam_time=times,
+    )
+
+
+def _beams(recording: Recording, boxes: list[Box], owned: list[np.ndarray]) -> Beams:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 1, 3] = [0.0, 10.0, 20.0, 30.0]
+    p = np.linspace(0.0, 1.0, 12).astype(np.float32)
+    return Beams(recording, recording, poses, p, boxes, owned, 0)
+
+
+def test_of_scans_taken_at_once_the_nearest_counts_at_least() -> None:
+    beams = _beams(_recording(None), [], [])
+    ends, p = beams.about(140_000_000, ChoiceOptions(window=0.01))
+    np.testing.assert_allclose(ends, [[4, 10, 0], [5, 10, 0], [6, 10, 0]])
+    np.testing.assert_allclose(p, np.arange(3, 6) / 11.0)
+    assert len(beams.about(150_000_000, ChoiceOptions(window=0.06))[0]) == 6
+
+
+def test_with_times_each_beam_counts_by_its_own() -> None:
+    times = np.tile(np.array([0.0, 0.03, 0.06], np.float32), 4)
+    beams = _beams(_recording(times), [], [])
+    ends, _ = beams.about(145_000_000, ChoiceOptions(window=0.02))
+    np.testing.assert_allclose(ends[:, 0], [5.0, 6.0])
+
+
+def test_what_is_of_a_thing_goes_on_with_it() -> None:
+    along = np.array([[0.0, 0.0], [1.0, 2.0]])
+    box = Box(
+        0,
+        np.array([0.0, 1.0]),
+        along,
+        np.array([[1.0, 0.0]] * 2),
+        np.array([[1.0, 2.0]] * 2),
+        (1.0, 1.0),
+        0.5,
+    )
+    beams = _beams(_recording(None), [box], [np.array([4, 9])])
+    ends, _ = beams.about(140_000_000, ChoiceOptions(window=0.01))
+    np.testing.assert_allclose(ends, [[4, 10, 0], [5.04, 10.08, 0], [6, 10, 0]], atol=1e-6)
+
+
+def test_beams_that_hit_nothing_say_nothing() -> None:
+    recording = _recording(None)
+    recording.hit[4] = False
+    ends, _ = _beams(recording, [], []).about(100_000_000, ChoiceOptions(window=0.01))
+    np.testing.assert_allclose(ends[:, 0], [4.0, 6.0])
+
+
+def test_there_may_be_none() -> None:
+    assert (
+        len(_beams(_recording(None), [], []).about(9_000_000_000, ChoiceOptions(window=0.1))[0])
+        == 0
+    )
+
+
+def _row(p: list[float], planar: bool) -> Beams:
+    """Four rows, 0.1 s apart; beams 0, 3, 6, 9 are of a thing that goes 1 m/s along y."""
+    box = Box(
+        0,
+        np.array([0.0, 1.0]),
+        np.array([[0.0, 0.0], [0.0, 1.0]]),
+        np.array([[0.0, 1.0]] * 2),
+        np.array([[0.0, 1.0]] * 2),
+        (1.0, 1.0),
+        0.5,
+    )
+    poses, of_all = np.tile(np.eye(4), (4, 1, 1)), np.ones(12, np.float32)
+    of_all[::3] = p
+    owned = [np.array([0, 3, 6, 9])]
+    return Beams(_recording(None), _recording(None), poses, of_all, [box], owned, 0, planar)
+
+
+def test_of_a_row_what_moves_is_told_longer_and_goes_on() -> None:
+    options = ChoiceOptions(window=0.01, rows=0.01, carried=0.15)
+    ends, p = _row([0.2, 0.3, 0.4, 0.1], planar=True).about(100_000_000, options)
+    np.testing.assert_allclose(ends[:, 0], [1.0, 4.0, 5.0, 6.0, 7.0])
+    np.testing.assert_allclose(ends[:, 1], [0.1, 0.0, 0.0, 0.0, -0.1], atol=1e-6)
+    np.testing.assert_allclose(p, [0.2, 0.3, 1.0, 1.0, 0.4])
+
+
+def test_what_rather_stands_still_is_not_carried() -> None:
+    options = ChoiceOptions(window=0.01, rows=0.01, carried=0.15)
+    ends, _ = _row([0.9, 0.3, 0.4, 0.1], planar=True).about(100_000_000, options)
+    np.testing.assert_allclose(ends[:, 0], [4.0, 5.0, 6.0, 7.0])
+
+
+def test_rows_have_a_window_of_their_own() -> None:
+    options = ChoiceOptions(window=0.01, rows=0.11, carried=0.0)
+    assert len(_row([0.2] * 4, planar=True).about(100_000_000, options)[0]) == 9
+    ends, _ = _row([0.2] * 4, planar=False).about(100_000_000, options)
+    np.testing.assert_allclose(ends[:, 0], [4.0, 5.0, 6.0])

@@ -1,0 +1,42 @@
+"""Pictures that differ from all others of a face."""
+
+import numpy as np
+from made_up_rooms import looking, rectangle
+
+from stillmap.mesh.texture.view_selection import Candidates, agreeing, colours_of_faces
+
+WALL = rectangle([-0.5, 4.0, -0.5], [1.0, 0, 0], [0, 0, 1.0], 2)
+
+
+def left(shades, odd=40.0):
+    views = [looking([0.0, 0, 0], [0.0, 1, 0], number) for number in range(len(shades))]
+    candidates, n = Candidates.none(len(WALL), 6), len(WALL)
+    for number in range(len(shades)):
+        p = np.full(n, 0.9)
+        candidates.add(number, np.arange(n), np.full(n, -float(number)), p)
+
+    def colours(view):
+        shade = shades[view.image]
+        return None if shade is None else np.full((300, 400, 3), shade, np.uint8)
+
+    found = agreeing(candidates, colours_of_faces(WALL, candidates, views, colours), odd)
+    assert (found.picture == found.picture[0]).all()
+    assert (np.isfinite(found.utility) == (found.picture >= 0)).all()
+    return [k for k in found.picture[0].tolist() if k >= 0]
+
+
+def test_one_that_most_contradict_is_left_out():
+    assert left([200, 100, 104, 98]) == [1, 2, 3]
+    assert left([100, 110, 104, 98]) == [0, 1, 2, 3]
+
+
+def test_of_two_nobody_knows():
+    assert left([200, 100]) == [0, 1]
+
+
+def test_where_most_do_not_agree_all_stay():
+    assert left([10, 80, 150, 220]) == [0, 1, 2, 3]
+
+
+def test_damaged_pictures_say_nothing():
+    assert left([200, 100, None]) == [0, 1, 2]

@@ -1,0 +1,163 @@
+"""Pictures on a mesh: the right colours at the right places."""
+
+import numpy as np
+import pytest
+from made_up_rooms import all_round, camera, colour, furnished, looking, photograph, rectangle
+from made_up_rooms import sharpest as best_of
+
+from stillmap import _core
+from stillmap.core.errors import InputError
+from stillmap.mesh.options import TextureOptions
+from stillmap.mesh.texture.atlas import GREY
+from stillmap.mesh.texture.baking import baked, bilinear, fill_gutters, halved
+from stillmap.mesh.triangle_mesh import Mesh
+
+pytest.importorskip("xatlas")
+SMALL = np.array([[200.0, 0, 139.5], [0, 200, 104.5], [0, 0, 1]])
+LENSES = {
+    "pinhole": {},
+    "barrel": {"model": "plumb_bob", "distortion": (-0.2, 0.04, 0.002, -0.001)},
+    "fisheye": {"model": "equidistant", "distortion": (0.02, -0.01, 0.0, 0.0)},
+}
+
+
+def errors(textured):
+    """Of every texel, how far the worst of three colours is from what its place is painted with."""
+    worst = []
+    for page, picture in enumerate(textured.pages):
+        h, w = picture.shape[:2]
+        mine = np.flatnonzero((textured.page == page) & (textured.view >= 0))
+        corners = textured.uv[textured.faces[mine]] * np.array([w, h], float)
+        texel, of, weight = _core.texels(corners, w, h)
+        a, b, c = np.moveaxis(textured.vertices[textured.faces[mine[of]]], 1, 0)
+        places = a + weight[:, :1] * (b - a) + weight[:, 1:] * (c - a)
+        found = picture.reshape(-1, 3)[texel].astype(float)
+        worst.append(np.abs(found - colour(places)).max(axis=1))
+    return np.concatenate(worst)
+
+
+@pytest.mark.parametrize("kind", LENSES)
+def test_every_texel_has_the_colour_of_its_place(kind):
+    mesh, views = furnished(), all_round(camera(280, 210, SMALL, **LENSES[kind]))
+    view = best_of(mesh, views)
+    reads = []
+
+    def read(image):
+        reads.append(image)
+        return photograph(mesh, views[image])
+
+    textured = baked(mesh, view, views, read, TextureOptions(page=1024, texel=1e-5))
+    assert reads == sorted(set(view[view >= 0].tolist()))  # each once
+    np.testing.assert_array_equal(textured.view, view)
+    np.testing.assert_array_equal(textured.vertices[textured.faces], mesh.corners)
+    assert 0.3 < np.mean(textured.page >= 0) < 1.0
+    error = errors(textured)
+    assert len(error) > 100_000
+    assert np.median(error) < 1.0
+    assert np.quantile(error, 0.99) < 4.0
+
+
+def test_coarse_texels_are_means_of_pixels():
+    wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2], 4)
+    views = [looking([0, 0, 0], [0, 1, 0])]
+    # columns, black and white: any single pixel is far from their mean
+    picture = np.zeros((300, 400, 3), np.uint8)
+    picture[:, ::2] = 200
+    options = TextureOptions(texel=0.04)  # four pixels each
+    textured = baked(wall, np.zeros(32, np.int32), views, lambda _: picture, options)
+    face = textured.face_of_texel(0)
+    assert 2000 < np.sum(face >= 0) < 3000
+    np.testing.assert_allclose(textured.pages[0][face >= 0], 100, atol=1)
+
+
+def test_coarse_texels_lie_where_fine_ones_do():
+    wall = rectangle([-0.4, 3.0, -0.4], [0.8, 0, 0], [0, 0, 0.8], 4)
+    views = [looking([0, 0, 0], [0, 1, 0])]
+    ramp = np.clip((np.arange(400) - 149.5) * 2.5, 0, 255).round().astype(np.uint8)
+    picture = np.broadcast_to(ramp[None, :, None], (300, 400, 3))
+    options = TextureOptions(texel=0.04)
+    textured = baked(wall, np.zeros(32, np.int32), views, lambda _: picture, options)
+    face = textured.face_of_texel(0)
+    row, column = np.nonzero(face >= 0)
+    # 0.8 m are 80 pixels, and 20 texels
+    left = textured.uv[:, 0].min() * face.shape[1]
+    at = 199.5 - 40 + 4.0 * (column + 0.5 - left)
+    np.testing.assert_allclose(textured.pages[0][row, column, 0], (at - 149.5) * 2.5, atol=1.1)
+
+
+def test_a_picture_that_cannot_be_read_leaves_grey():
+    mesh, views = furnished(), all_round()
+    view = best_of(mesh, views)
+
+    def read(image):
+        if image == 2:
+            raise InputError("is damaged", where="2.png")
+        return photograph(mesh, views[image]) if image != 4 else np.zeros((3, 3), np.uint16)
+
+    textured = baked(mesh, view, views, read)
+    assert len(textured.unread) == 2
+    assert "2.png" in textured.unread[0]
+    assert "picture 4 is (3, 3) uint16" in textured.unread[1]
+    np.testing.assert_array_equal(textured.view, np.where((view == 2) | (view == 4), -1, view))
+    of_texel = textured.face_of_texel(0)
+    lost = (of_texel >= 0) & (view[of_texel] == 2)
+    assert lost.sum() > 1000
+    assert (textured.pages[0][lost] == GREY).all()
+    assert np.median(errors(textured)) < 1.0
+
+
+def test_grey_pictures_have_three_colours():
+    wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2])
+    views = [looking([0, 0, 0], [0, 1, 0])]
+    picture = np.full((300, 400), 77, np.uint8)
+    textured = baked(wall, np.zeros(2, np.int32), views, lambda _: picture)
+    assert (textured.pages[0] == 77).all()
+
+
+def test_without_pictures_all_is_grey():
+    wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2])
+    textured = baked(wall, np.full(2, -1, np.int32), [], lambda _: None)
+    assert textured.pages == ()
+    assert (textured.page == -1).all()
+
+
+def test_what_is_refused():
+    wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2])
+    for of_face in (np.zeros(3, np.int32), np.zeros(2), np.full(2, 1, np.int32)):
+        with pytest.raises(ValueError, match="view_of_face"):
+            baked(wall, of_face, [looking([0, 0, 0], [0, 1, 0])], lambda _: None)
+
+
+def test_gutters_have_the_colours_beside_them():
+    page = np.zeros((20, 30, 3), np.uint8)
+    page[5:9, 4:9], page[12:15, 20:28] = (200, 10, 30), (20, 240, 90)
+    painted = page.any(axis=2)
+    fill_gutters(page, painted, 3)
+    assert (page[2:12, 1:12] == (200, 10, 30)).all()
+    assert (page[9:18, 17:30] == (20, 240, 90)).all()
+    assert painted.sum() == 10 * 11 + 9 * 13
+
+
+def test_between_pixels():
+    picture = np.zeros((2, 3, 3), np.uint8)
+    picture[0, 1], picture[1, 2] = 100, 200
+    at = np.array([[1.0, 0.0], [1.5, 0.0], [1.5, 0.5], [9.0, 9.0], [-3.0, 0.2]])
+    found = bilinear(picture, at)
+    np.testing.assert_allclose(found, np.array([100, 50, 75, 200, 0])[:, None].repeat(3, axis=1))
+    single = np.full((1, 1, 3), 9, np.uint8)
+    assert (bilinear(single, at) == 9).all()
+
+
+def test_halves_are_means_of_squares():
+    picture = np.arange(5 * 4 * 3).reshape(5, 4, 3).astype(np.uint8)
+    half = halved(picture, 1)
+    assert half.shape == (3, 2, 3)
+    np.testing.assert_allclose(half[0, 0], picture[:2, :2].mean(axis=(0, 1)))
+    np.testing.assert_allclose(half[2, 1], picture[4, 2:4].mean(axis=0))
+    assert halved(picture, 0).tolist() == picture.tolist()
+
+
+def test_nothing_to_paint_is_nothing_painted():
+    none = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+    model = baked(none, np.zeros(0, np.int32), [], lambda _: np.zeros(0))
+    assert len(model) == len(model.pages) == len(model.unread) == 0

@@ -1,0 +1,203 @@
+"""Points in pictures, against numbers by OpenCV 4 and formulas written out by hand."""
+
+import numpy as np
+import pytest
+
+from stillmap.core import camera as camera_module
+from stillmap.core.camera import Camera
+
+K = np.array([[500.0, 0.0, 320.5], [0.0, 480.0, 239.25], [0.0, 0.0, 1.0]])
+POINTS = np.array(
+    [
+        [0.2739233746429086, -0.4604265724722594, 1.7505322741355447],
+        [-0.9180529521276106, -0.9669447289429418, 2.1456551562825474],
+    ]
+)
+# cv2.projectPoints and cv2.fisheye.projectPoints of the two points above
+BY_OPENCV = [
+    (
+        "plumb_bob",
+        [-0.28, 0.09, 1e-3, -2e-3, 0.0],
+        [[396.5660463937175, 116.40177041527735], [126.26769260645202, 43.432529539154416]],
+    ),
+    (
+        "plumb_bob",
+        [0.2624, -0.9531, -0.0054, 0.0026, 1.1633],
+        [[400.4912467499093, 110.1278544739227], [100.90086891736871, 15.699165409979685]],
+    ),
+    (
+        "plumb_bob",
+        [-0.3, 0.1, 0.001, 0.002],
+        [[396.7116180603468, 116.46915591472167], [129.10551740660654, 45.52101058657777]],
+    ),
+    (
+        "rational_polynomial",
+        [0.8, -2.2, 5e-4, -3e-4, 1.4, 0.7, -2.0, 1.35],
+        [[399.26878291016135, 112.14655880965691], [104.17212907409237, 20.666574338258044]],
+    ),
+    (
+        "equidistant",
+        [-0.01, 0.02, -0.005, 0.001],
+        [[396.37052244636766, 116.82345476153054], [129.33375636340966, 45.956896852167574]],
+    ),
+    (
+        "equidistant",
+        [],
+        [[396.4259357096546, 116.7340385539461], [129.08134815223738, 45.70168042133042]],
+    ),
+]
+FOLDING = [  # models whose polynomials fall again
+    ("plumb_bob", [-0.3, 0.0, 0.0, 0.0]),
+    ("plumb_bob", [-0.4, 0.05, 0.02, -0.03, 0.0]),
+    ("plumb_bob", [0.0, 0.0, 0.05, 0.02]),
+    ("rational_polynomial", [-0.3, 0.0, 0.001, 0.0, 0.0, -0.2, 0.0, 0.0]),
+    ("equidistant", [-0.3, 0.0, 0.0, 0.0]),
+]
+
+
+def camera(model: str = "", distortion: tuple[float, ...] | list[float] = ()) -> Camera:
+    return Camera("c", 640, 480, K, model, np.array(distortion, np.float64), None)
+
+
+def fan(n: int = 41, widest: float = 88.0) -> np.ndarray:
+    """Points in all directions ahead, up to so many degrees from the axis."""
+    angle, around = np.meshgrid(
+        np.radians(np.linspace(0.0, widest, n)), np.linspace(0.0, 2.0 * np.pi, 33)
+    )
+    aside = np.sin(angle)
+    return np.stack(
+        [aside * np.cos(around), aside * np.sin(around), np.cos(angle)], axis=-1
+    ).reshape(-1, 3)
+
+
+@pytest.mark.parametrize(("model", "distortion", "expected"), BY_OPENCV)
+def test_pixels_are_those_of_opencv(model, distortion, expected):
+    uv, ok = camera_module.project(camera(model, distortion), POINTS)
+    assert ok.all()
+    np.testing.assert_allclose(uv, expected, atol=1e-9)
+
+
+def test_a_pinhole_camera_divides_by_the_way_ahead():
+    uv, ok = camera_module.project(camera(), np.array([[1.0, -0.5, 2.0], [0.0, 0.0, 7.0]]))
+    np.testing.assert_array_equal(uv, [[570.5, 119.25], [320.5, 239.25]])
+    assert ok.all()
+
+
+def test_zeros_for_parameters_are_no_distortion_but_a_fisheye_stays_one():
+    plain, _ = camera_module.project(camera(), POINTS)
+    np.testing.assert_array_equal(
+        camera_module.project(camera("plumb_bob", [0.0] * 5), POINTS)[0], plain
+    )
+    fisheye, _ = camera_module.project(
+        camera("equidistant", [0.0] * 4), np.array([[1.0, 0.0, 1.0]])
+    )
+    np.testing.assert_allclose(fisheye, [[320.5 + 500.0 * np.pi / 4.0, 239.25]])
+
+
+@pytest.mark.parametrize("model", ["", "plumb_bob", "rational_polynomial", "equidistant"])
+def test_what_lies_behind_or_beside_is_not_seen(model):
+    points = np.array(
+        [[0.1, 0.1, -1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [np.nan, 0.0, 1.0], [0.0, 0.0, np.nan]]
+    )
+    uv, ok = camera_module.project(camera(model), points)
+    assert not ok.any()
+    assert np.isnan(uv).all()
+
+
+def test_the_limit_of_one_coefficient_by_hand():
+    # r (1 - 0.3 r^2) rises up to r^2 = 1 / 0.9
+    folding = camera("plumb_bob", [-0.3, 0.0, 0.0, 0.0])
+    edge = np.sqrt(1.0 / 0.9)
+    _, ok = camera_module.project(
+        folding, np.array([[edge - 2e-3, 0.0, 1.0], [0.0, edge + 1e-6, 1.0]])
+    )
+    assert ok.tolist() == [True, False]
+    # the formula alone puts this one, 61 degrees from the axis, near the picture's centre
+    far = 1.8
+    assert abs(500.0 * far * (1.0 - 0.3 * far**2)) < 30.0
+    assert not camera_module.project(folding, np.array([[far, 0.0, 1.0]]))[1][0]
+
+
+@pytest.mark.parametrize(("model", "distortion"), FOLDING)
+def test_no_two_directions_share_a_pixel(model, distortion):
+    folding = camera(model, distortion)
+    points = fan(181)
+    uv, ok = camera_module.project(folding, points)
+    assert 0.1 < ok.mean() < 0.95
+    # within the limit, the way back is the way there
+    found = camera_module.rays(folding, uv[ok])
+    np.testing.assert_allclose(found[:, :2], points[ok][:, :2] / points[ok][:, 2:], atol=1e-4)
+
+
+@pytest.mark.parametrize(("model", "distortion"), FOLDING)
+def test_the_limit_is_no_narrower_than_needed(model, distortion):
+    # just outside of it, in some direction, a step out leads back in the picture
+    limit = camera_module._limit(*camera_module._lens(camera(model, distortion)))
+    r, around = np.tan(limit + np.radians([0.1, 0.12])), np.linspace(0.0, 2.0 * np.pi, 64)
+    u = np.column_stack([np.cos(around), np.sin(around)])
+    a, b = (
+        camera_module._distorted(camera_module._lens(camera(model, distortion)), one * u)
+        for one in r
+    )
+    assert (np.sum((b - a) * u, axis=1) < 1e-6).any()
+
+
+@pytest.mark.parametrize(("model", "distortion", "_"), [*BY_OPENCV, ("", [], [])])
+def test_rays_lead_through_their_pixels(model, distortion, _):
+    seen_by = camera(model, distortion)
+    columns, rows = np.meshgrid(np.arange(0, 640, 7.0), np.arange(0, 480, 7.0))
+    uv = np.column_stack([columns.ravel(), rows.ravel()])
+    directions = camera_module.rays(seen_by, uv)
+    np.testing.assert_array_equal(directions[:, 2], 1.0)
+    again, ok = camera_module.project(seen_by, 3.7 * directions)
+    assert ok.all()
+    np.testing.assert_allclose(again, uv, atol=1e-6)
+
+
+def test_pixels_beyond_the_fold_have_no_ray():
+    # the farthest that this lens shows is 2/3 sqrt(1/0.9) focal lengths from the centre
+    folding = camera("plumb_bob", [-0.3, 0.0, 0.0, 0.0])
+    reach = 500.0 * 2.0 / 3.0 * np.sqrt(1.0 / 0.9)
+    found = camera_module.rays(
+        folding, np.array([[320.5 + reach - 1.0, 239.25], [321.5 + reach, 239.25]])
+    )
+    assert np.isfinite(found[0]).all()
+    assert np.isnan(found[1]).all()
+
+
+def test_a_skewed_sensor():
+    skewed = K.copy()
+    skewed[0, 1] = 5.0
+    one = Camera("c", 640, 480, skewed, "plumb_bob", np.array([-0.2, 0.01, 0.0, 0.0]), None)
+    uv, _ = camera_module.project(one, POINTS)
+    straight, _ = camera_module.project(camera("plumb_bob", [-0.2, 0.01, 0.0, 0.0]), POINTS)
+    np.testing.assert_allclose(uv[:, 0] - straight[:, 0], 5.0 * (straight[:, 1] - 239.25) / 480.0)
+    np.testing.assert_allclose(
+        camera_module.rays(one, uv)[:, :2], POINTS[:, :2] / POINTS[:, 2:], atol=1e-9
+    )
+
+
+def test_a_picture_reaches_to_the_edges_of_its_outermost_pixels():
+    uv = np.array([[-0.5, 0.0], [639.49, 479.49], [639.5, 0.0], [0.0, -0.51], [np.nan, 0.0]])
+    assert camera_module.within(camera(), uv).tolist() == [True, True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        (Camera("c", 1, 1, None, "", np.zeros(0), None), "without calibration"),
+        (Camera("c", 1, 1, np.zeros((3, 3)), "", np.zeros(0), None), "calibration is none"),
+        (Camera("c", 1, 1, np.full((3, 3), np.nan), "", np.zeros(0), None), "calibration is none"),
+        (Camera("c", 1, 1, np.full((3, 3), 1e200), "", np.zeros(0), None), "calibration is none"),
+        (Camera("c", 1, 1, 1e-200 * np.eye(3), "", np.zeros(0), None), "calibration is none"),
+        (camera("plumb_bob", [0.1, 1e200, 0.0, 0.0]), "far too large"),
+        (camera("double_sphere", [0.1, 0.2]), "not known (double_sphere)"),
+        (camera("plumb_bob", [0.1, 0.2]), "2 parameters (plumb_bob)"),
+        (camera("", [0.1]), "1 parameters (none)"),
+        (camera("plumb_bob", [0.1, np.nan, 0.0, 0.0]), "not finite"),
+    ],
+)
+def test_what_cannot_be_used_says_why(given, why):
+    assert why in camera_module.unusable(given)
+    with pytest.raises(ValueError, match="c: a "):
+        camera_module.project(given, POINTS)

@@ -1,0 +1,209 @@
+"""Which pictures are used, and from where they were taken."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stillmap.core import se2, se3
+from stillmap.core.camera import Camera, Images
+from stillmap.core.errors import InputError
+from stillmap.core.recording import Recording
+from stillmap.mesh.texture.views import (
+    ViewOptions,
+    colours_of,
+    poses_at,
+    readable,
+    usable,
+    views_of,
+)
+
+S = 10**9
+K = np.array([[10.0, 0.0, 7.5], [0.0, 10.0, 5.5], [0.0, 0.0, 1.0]])
+# looks ahead from half a metre above the robot
+T_BASE_CAMERA = np.array(
+    [[0.0, 0.0, 1.0, 0.2], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0]]
+)
+CAMERA = Camera("front", 16, 12, K, "", np.zeros(0), T_BASE_CAMERA)
+OPTIONS = ViewOptions()
+TWIST = np.array([2.0, 0.3, 0.1, 0.05, -0.1, 0.4])  # m/s, rad/s
+
+
+def colours(image: int) -> np.ndarray:
+    return np.full((12, 16, 3), image, np.uint8)
+
+
+def images(seconds, cameras=(CAMERA,), camera=None, load=colours) -> Images:
+    stamp_ns = np.array([round(s * S) for s in seconds], np.int64)
+    number = np.zeros(len(stamp_ns)) if camera is None else np.array(camera)
+    return Images(stamp_ns, number.astype(np.int32), tuple(cameras), load)
+
+
+def recording(seconds, pictures: Images | None) -> Recording:
+    T = len(seconds)
+    return Recording(
+        stamp_ns=np.array([round(s * S) for s in seconds], np.int64),
+        offset=np.arange(T + 1, dtype=np.int64),
+        points=np.ones((T, 3), np.float32),
+        hit=np.ones(T, bool),
+        T_base_sensor=np.eye(4)[None],
+        sensor=np.zeros(T, np.int32),
+        T_odom_base=None,
+        images=pictures,
+    )
+
+
+def screw(seconds) -> np.ndarray:
+    """Poses of steady motion."""
+    return se3.exp(np.asarray(seconds, float)[:, None] * TWIST)
+
+
+def test_a_picture_between_scans_is_taken_from_between_their_poses():
+    scans = [0.0, 0.1, 0.25, 0.3]
+    taken = [0.0, 0.04, 0.1, 0.2, 0.3]
+    views, left_out = views_of(recording(scans, images(taken)), screw(scans))
+    assert left_out == {}
+    assert [view.image for view in views] == [0, 1, 2, 3, 4]
+    assert [view.stamp_ns for view in views] == [round(s * S) for s in taken]
+    for view, T in zip(views, screw(taken), strict=True):
+        np.testing.assert_allclose(se2.inverse(view.T_camera_map), T @ T_BASE_CAMERA, atol=1e-12)
+        # what is ahead of the robot is ahead of the camera, half a metre lower
+        ahead = (T @ [3.2, 0.0, 0.0, 1.0])[None, :3]
+        np.testing.assert_allclose(view.in_camera(ahead), [[0.0, 0.5, 3.0]], atol=1e-12)
+
+
+def test_shortly_before_and_after_the_scans_the_motion_goes_on():
+    scans = [1.0, 1.1, 1.2]
+    taken = [0.85, 0.92, 1.25, 1.31]
+    views, left_out = views_of(recording(scans, images(taken)), screw(scans))
+    assert [view.image for view in views] == [1, 2]
+    assert left_out == {"taken when nobody knows where the robot was": 2}
+    for view, T in zip(views, screw([0.92, 1.25]), strict=True):
+        np.testing.assert_allclose(se2.inverse(view.T_camera_map), T @ T_BASE_CAMERA, atol=1e-12)
+
+
+def test_over_a_pause_only_who_stood_is_known():
+    scans = [0.0, 0.1, 5.0, 5.1, 9.0]
+    poses = screw([0.0, 0.1, 0.4, 0.4, 0.4])
+    taken = [0.15, 2.0, 4.95, 7.0]
+    views, left_out = views_of(recording(scans, images(taken)), poses)
+    assert [view.image for view in views] == [0, 2, 3]
+    what = "taken in a pause of the scans, after which the robot was elsewhere"
+    assert left_out == {what: 1}
+    np.testing.assert_allclose(se2.inverse(views[2].T_camera_map), poses[3] @ T_BASE_CAMERA)
+    longer = ViewOptions(pause=10.0)
+    assert len(views_of(recording(scans, images(taken)), poses, longer)[0]) == 4
+
+
+def test_before_a_pause_nothing_is_told_of_the_time_before():
+    poses = screw([0.0, 1.0])
+    T, why = poses_at(np.array([0, 5 * S]), poses, np.array([-S // 20, 5 * S + S // 20]), OPTIONS)
+    assert why == ["", ""]
+    np.testing.assert_array_equal(T[0], poses[0])
+    np.testing.assert_allclose(T[1], poses[1], atol=1e-12)
+
+
+def test_where_poses_leap_only_the_scans_themselves_are_known():
+    scans = [0.0, 0.1, 0.2]
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[2, 0, 3] = 50.0
+    views, left_out = views_of(recording(scans, images([0.05, 0.15, 0.2])), poses)
+    assert [view.image for view in views] == [0, 2]
+    assert left_out == {"taken where the poses leap": 1}
+
+
+@pytest.mark.parametrize("stamps", [[7], [7, 7], [0, 0, 5, 5]])
+def test_scans_that_share_a_stamp(stamps):
+    stamp_ns = np.array(stamps, np.int64) * 10**7
+    poses = screw(stamp_ns / S)
+    T, why = poses_at(stamp_ns, poses, stamp_ns, OPTIONS)
+    assert not any(why)
+    np.testing.assert_allclose(T, poses, atol=1e-12)
+    around = np.array([stamp_ns[0] - 10**6, stamp_ns[-1] + 10**6])
+    T, why = poses_at(stamp_ns, poses, around, OPTIONS)
+    assert why == ["", ""]
+    seconds = around / S if len(set(stamps)) > 1 else stamp_ns[[0, -1]] / S
+    np.testing.assert_allclose(T, screw(seconds), atol=1e-12)
+
+
+def test_without_scans_or_pictures_there_are_no_views():
+    poses = np.empty((0, 4, 4))
+    what = {"taken when nobody knows where the robot was": 1}
+    assert views_of(recording([], images([0.0])), poses) == ([], what)
+    assert views_of(recording([], None), poses) == ([], {})
+    assert views_of(recording([0.0], images([])), screw([0.0])) == ([], {})
+
+
+UNUSABLE = [
+    (replace(CAMERA, K=None), colours, "a camera without calibration"),
+    (replace(CAMERA, T_base_camera=None), colours, "a camera of which nobody knows where it sits"),
+    (replace(CAMERA, T_base_camera=np.full((4, 4), np.nan)), colours, "whose place is not finite"),
+    (replace(CAMERA, model="omni"), colours, "a lens of a model that is not known (omni)"),
+    (CAMERA, lambda _: np.zeros((12, 16), np.uint16), "without colours (depth, or 16 bits)"),
+    (CAMERA, lambda _: np.zeros((12, 16), np.float32), "without colours (depth, or 16 bits)"),
+    (CAMERA, lambda _: np.zeros((24, 32, 3), np.uint8), "of 32 x 24 pixels, calibrated for 16 x"),
+]
+
+
+@pytest.mark.parametrize(("camera", "load", "why"), UNUSABLE)
+def test_cameras_whose_pictures_cannot_be_used(camera, load, why):
+    def either(image: int) -> np.ndarray:
+        return colours(image) if image == 1 else load(image)
+
+    both = images([0.0, 0.0, 0.1], (camera, CAMERA), [0, 1, 0], either)
+    views, left_out = views_of(recording([0.0, 0.1], both), screw([0.0, 0.1]))
+    assert [view.image for view in views] == [1]
+    ((reason, count),) = left_out.items()
+    assert why in reason
+    assert count == 2
+
+
+def test_damaged_pictures_are_found_when_they_are_wanted():
+    def load(image: int) -> np.ndarray:
+        if image in (0, 2):
+            raise InputError("is no picture")
+        return colours(image)[: 6 if image == 3 else 12]
+
+    pictures = images([0.0, 0.01, 0.02, 0.03], load=load)
+    views, left_out = views_of(recording([0.0, 0.1], pictures), screw([0.0, 0.1]))
+    assert len(views) == 4
+    assert left_out == {}
+    assert [colours_of(pictures, view) is None for view in views] == [True, False, True, True]
+    told = []
+    kept, unread = readable(pictures, views, lambda *done: told.append(done))
+    assert [view.image for view in kept] == [1]
+    assert unread[:2] == ["is no picture"] * 2
+    assert "picture 3 is (6, 16, 3)" in unread[2]
+    assert told == [(k, 4) for k in (1, 2, 3, 4)]
+    assert readable(None, []) == ([], [])
+
+    def never(image: int) -> np.ndarray:
+        raise InputError(f"{image} is no picture")
+
+    views, left_out = views_of(recording([0.0], images([0.0] * 9, load=never)), screw([0.0]))
+    assert (views, left_out) == ([], {"pictures that cannot be read": 9})
+
+
+def test_grey_pictures_have_colours_too_and_a_size_may_be_found():
+    grey = np.arange(192, dtype=np.uint8).reshape(12, 16)
+    unsized = replace(CAMERA, width=0, height=0)
+    pictures = images([0.0], (unsized,), load=lambda _: grey)
+    (view,), _ = views_of(recording([0.0], pictures), screw([0.0]))
+    assert (view.camera.width, view.camera.height) == (16, 12)
+    found = colours_of(pictures, view)
+    assert found is not None
+    np.testing.assert_array_equal(found, grey[..., None].repeat(3, axis=2))
+
+
+def test_what_could_be_used_is_known_without_poses():
+    both = images([0.0, 0.05, 0.1, 9.0], (CAMERA, replace(CAMERA, K=None)), [0, 1, 0, 0])
+    found, left_out = usable(recording([0.0, 0.1], both))
+    assert found.tolist() == [True, False, True, False]
+    assert sorted(left_out.values()) == [1, 1]
+    assert usable(recording([0.0], None))[1] == {}
+
+
+@pytest.mark.parametrize("given", [{"pause": 0.0}, {"beyond": -0.1}, {"pause": float("nan")}])
+def test_times_that_cannot_be(given):
+    with pytest.raises(ValueError, match="pause must be positive"):
+        ViewOptions(**given)

@@ -1,0 +1,133 @@
+"""The pose graph as others read it: a parser of its own, and GTSAM."""
+
+import dataclasses
+from collections import defaultdict
+
+import numpy as np
+import pytest
+
+from stillmap.core import se2
+from stillmap.results.pose_graph_g2o import write_g2o
+from stillmap.slam.pose_graph import Graph, Relation, misfits, optimised
+
+gtsam = pytest.importorskip("gtsam")
+
+
+def way(scans, rng):
+    """A winding way through these scans with loops, noisily measured; covariances of any shape."""
+    K = len(scans)
+    poses = se2.matrix(*np.cumsum(rng.normal([1, 0.2, 0.4], [0.3, 0.3, 0.5], (K, 3)), axis=0).T)
+    pairs = [(k, k + 1) for k in range(K - 1)] + [(0, K - 1), (2, K - 2), (1, K // 2)]
+    relations = []
+    for i, j in pairs:
+        root = rng.normal(size=(3, 3)) * [0.05, 0.02, 0.03]
+        covariance = root @ root.T + 1e-5 * np.eye(3)
+        noise = se2.matrix(*rng.multivariate_normal(np.zeros(3), covariance))
+        relations.append(Relation(i, j, se2.inverse(poses[i]) @ poses[j] @ noise, covariance))
+    found = optimised(poses, relations[: K - 1], relations[K - 1 :], None)
+    return Graph(np.array(scans), found, relations)
+
+
+@pytest.fixture
+def graph():
+    return way([0, 3, 4, 9, 12, 20, 21, 35, 36, 40], np.random.default_rng(3))
+
+
+def all_poses(graph, rng=None, spread=0.0):
+    """Poses of all scans, those of keyframes as the graph has them, or moved about."""
+    T = np.tile(se2.matrix(7.0, 7.0, 7.0), (graph.scans[-1] + 5, 1, 1))
+    T[graph.scans] = graph.poses
+    if rng is not None:
+        moves = rng.normal(scale=spread, size=(len(graph.scans), 3))
+        moves[0] = 0
+        T[graph.scans] = graph.poses @ se2.matrix(*moves.T)
+    return T
+
+
+def parsed(path):
+    """Lines by their first word, the rest as numbers."""
+    rows = defaultdict(list)
+    for line in path.read_text(encoding="ascii").splitlines():
+        tag, *numbers = line.split()
+        rows[tag].append([float(number) for number in numbers])
+    return rows
+
+
+def chi2(rows):
+    """Of g2o's EDGE_SE2: e = (Z^-1 (Xi^-1 Xj)) as a vector, e' I e, with plain trigonometry."""
+    at = {int(id_): (x, y, theta) for id_, x, y, theta in rows["VERTEX_SE2"]}
+
+    def seen_from(a, b):
+        c, s = np.cos(a[2]), np.sin(a[2])
+        dx, dy = b[0] - a[0], b[1] - a[1]
+        turn = b[2] - a[2]
+        return c * dx + s * dy, c * dy - s * dx, np.arctan2(np.sin(turn), np.cos(turn))
+
+    out = []
+    for i, j, x, y, theta, *upper in rows["EDGE_SE2"]:
+        information = np.zeros((3, 3))
+        information[np.triu_indices(3)] = upper
+        information = information + information.T - np.diag(np.diag(information))
+        e = np.array(seen_from((x, y, theta), seen_from(at[int(i)], at[int(j)])))
+        out.append(e @ information @ e)
+    return np.array(out)
+
+
+def test_what_is_written(tmp_path, graph):
+    write_g2o(tmp_path / "graph.g2o", graph, all_poses(graph))
+    rows = parsed(tmp_path / "graph.g2o")
+    assert set(rows) == {"VERTEX_SE2", "FIX", "EDGE_SE2"}
+    assert [row[0] for row in rows["VERTEX_SE2"]] == graph.scans.tolist()
+    vertices = np.array(rows["VERTEX_SE2"])[:, 1:]
+    np.testing.assert_array_equal(vertices, se2.parameters(graph.poses))
+    assert rows["FIX"] == [[0.0]]
+    for row, relation in zip(rows["EDGE_SE2"], graph.relations, strict=True):
+        assert row[:2] == [graph.scans[relation.first], graph.scans[relation.second]]
+        np.testing.assert_array_equal(row[2:5], se2.parameters(relation.T))
+        information = np.linalg.inv(relation.covariance)
+        expected = [information[a, b] for a in range(3) for b in range(a, 3)]
+        np.testing.assert_allclose(row[5:], expected, rtol=1e-9)
+
+
+def test_the_errors_that_g2o_sees_are_ours(tmp_path, graph):
+    poses = all_poses(graph, np.random.default_rng(1), 0.3)
+    write_g2o(tmp_path / "graph.g2o", graph, poses)
+    found = chi2(parsed(tmp_path / "graph.g2o"))
+    expected = misfits(poses[graph.scans], graph.relations)
+    assert expected.min() > 1
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_gtsam_reads_the_same_errors(tmp_path, graph):
+    # small ones: those of GTSAM go along the curve of a turn
+    exact = [
+        dataclasses.replace(r, T=se2.inverse(graph.poses[r.first]) @ graph.poses[r.second])
+        for r in graph.relations
+    ]
+    graph = dataclasses.replace(graph, relations=exact)
+    poses = all_poses(graph, np.random.default_rng(1), 1e-4)
+    write_g2o(tmp_path / "graph.g2o", graph, poses)
+    factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), False)
+    assert factors.size() == len(graph.relations)
+    errors = [2.0 * factors.at(k).error(values) for k in range(factors.size())]
+    np.testing.assert_allclose(errors, chi2(parsed(tmp_path / "graph.g2o")), rtol=1e-2)
+
+
+def test_gtsam_finds_the_poses_again(tmp_path, graph):
+    # the vertices are elsewhere: the edges alone have to say
+    poses = all_poses(graph, np.random.default_rng(2), 0.1)
+    write_g2o(tmp_path / "graph.g2o", graph, poses)
+    factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), False)
+    fixed = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
+    factors.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*se2.parameters(poses[0])), fixed))
+    found = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
+    at = [found.atPose2(int(scan)) for scan in graph.scans]
+    T = se2.matrix(*np.array([[p.x(), p.y(), p.theta()] for p in at]).T)
+    assert np.abs(poses[graph.scans] - graph.poses).max() > 0.05
+    np.testing.assert_allclose(T, graph.poses, atol=1e-4)
+
+
+def test_one_scan_is_a_graph_without_edges(tmp_path):
+    alone = Graph(np.array([0]), np.eye(3)[None], [])
+    write_g2o(tmp_path / "graph.g2o", alone, alone.poses)
+    assert (tmp_path / "graph.g2o").read_text() == "VERTEX_SE2 0 0.0 0.0 0.0\nFIX 0\n"

@@ -1,0 +1,63 @@
+import dataclasses
+import zipfile
+
+import numpy as np
+import pytest
+
+from stillmap.core.arrays import write_npz
+from stillmap.results.map_npz import write_map_npz
+
+
+def test_content(tmp_path, result):
+    write_map_npz(tmp_path / "map.npz", result.map)
+    with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
+        assert set(read) == {"p_occupied", "alpha", "beta", "changed", "origin", "resolution"}
+        np.testing.assert_array_equal(read["p_occupied"], result.map.p_occupied)
+        assert read["p_occupied"].dtype == np.float32
+        assert np.isnan(read["p_occupied"]).any()
+        for name in ("alpha", "beta"):
+            sums = np.asarray(getattr(result.map, name), np.float32)
+            np.testing.assert_array_equal(read[name], sums)
+            assert read[name].dtype == np.float32
+        np.testing.assert_array_equal(read["origin"], result.map.origin)
+        assert float(read["resolution"]) == result.map.resolution
+
+
+def test_the_looks_that_it_rests_on(tmp_path, result):
+    write_map_npz(tmp_path / "map.npz", result.map, (), result.evidence)
+    with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
+        more = {"looks": np.uint16, "clear_looks": np.uint16, "thin": np.bool_}
+        plain = {"p_occupied", "alpha", "beta", "changed", "origin", "resolution"}
+        assert set(read) == plain | set(more)
+        for name, dtype in more.items():
+            assert read[name].dtype == dtype
+            assert read[name].shape == result.map.p_occupied.shape
+        np.testing.assert_array_equal(read["looks"], result.evidence.looks)
+        np.testing.assert_array_equal(read["clear_looks"], result.evidence.clear)
+        np.testing.assert_array_equal(read["thin"], result.evidence.thin)
+
+
+def test_equal_maps_give_equal_bytes_whatever_their_layout(tmp_path, result):
+    write_map_npz(tmp_path / "a.npz", result.map)
+    other = dataclasses.replace(result.map, p_occupied=result.map.p_occupied.copy())
+    write_map_npz(tmp_path / "b.npz", other)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+
+
+@pytest.mark.parametrize("stopped", [KeyboardInterrupt, SystemExit, OSError("disk full")])
+@pytest.mark.parametrize("within", ["_get_compressor", "_ZipWriteFile.write"])
+def test_whatever_stops_it_is_what_is_said(tmp_path, monkeypatch, stopped, within):
+    # Ctrl-C while an array is half open must not turn into an error about that
+    done = []
+
+    def stop(*_):
+        done.append(True)
+        raise stopped
+
+    monkeypatch.setattr(f"zipfile.{within}", stop)
+    with pytest.raises(BaseException) as caught:  # noqa: PT011
+        write_npz(tmp_path / "a.npz", {"a": np.zeros(3), "b": np.zeros(3)})
+    assert caught.type is (stopped if isinstance(stopped, type) else type(stopped))
+    assert done == [True]

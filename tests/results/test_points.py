@@ -1,0 +1,100 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stillmap.core import arrays
+from stillmap.core.recording import Recording
+from stillmap.core.se2 import matrix
+from stillmap.mapping.beam_statistics import beam_counts, dynamic_points
+
+
+@pytest.fixture(params=[7, 1000, 1 << 20])
+def block(request, monkeypatch):
+    monkeypatch.setattr(arrays, "BLOCK", request.param)
+
+
+def expected_points(recording, poses, p_static):
+    """Beam by beam."""
+    found = []
+    for t in range(recording.n_scans):
+        T = poses[t] @ recording.T_base_sensor[recording.sensor[t]]
+        for n in range(recording.offset[t], recording.offset[t + 1]):
+            if recording.hit[n] and p_static[n] < 0.5:
+                found.append((T @ [*recording.points[n], 1])[:2])
+    return np.array(found)
+
+
+@pytest.fixture
+def ragged():
+    """Scans of different lengths, an empty one among them, from two mounted sensors."""
+    rng = np.random.default_rng(1)
+    lengths = [5, 0, 300, 1, 40]
+    M = sum(lengths)
+    recording = Recording(
+        stamp_ns=np.arange(5, dtype=np.int64),
+        offset=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        points=rng.normal(0, 5, (M, 2)).astype(np.float32),
+        hit=rng.random(M) < 0.7,
+        T_base_sensor=matrix([0.2, -0.3], [0.1, 0.0], [0.5, -2.0]),
+        sensor=np.array([0, 1, 0, 1, 1], np.int32),
+        T_odom_base=None,
+    )
+    p_static = rng.random(M).astype(np.float32)
+    poses = matrix(rng.normal(0, 9, 5), rng.normal(0, 9, 5), rng.normal(0, 2, 5))
+    return recording, poses, p_static
+
+
+@pytest.mark.usefixtures("block")
+def test_dynamic_points(ragged):
+    recording, poses, p_static = ragged
+    expected = expected_points(recording, poses, p_static)
+    found = dynamic_points(recording, poses, p_static)
+    assert found.dtype == np.float32
+    assert 50 < len(found) < recording.n_beams
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.usefixtures("block")
+def test_thinning_keeps_an_even_part_of_the_whole(ragged):
+    recording, poses, p_static = ragged
+    full = dynamic_points(recording, poses, p_static)
+    thin = dynamic_points(recording, poses, p_static, limit=10)
+    assert len(thin) == 10
+    at = [int(np.flatnonzero((full == point).all(axis=1))[0]) for point in thin]
+    assert at == [i * len(full) // 10 for i in range(10)]
+
+
+def test_none_dynamic(ragged):
+    recording, poses, p_static = ragged
+    assert dynamic_points(recording, poses, np.ones_like(p_static)).shape == (0, 2)
+    assert dynamic_points(recording, poses, p_static, limit=0).shape == (0, 2)
+
+
+@pytest.mark.usefixtures("block")
+def test_counts(result):
+    recording = result.recording
+    low_prior = np.where(recording.hit, result.p_static, np.float32(0.1))
+    unusable = int(np.isnan(recording.points[:, 0]).sum())
+    hits = int(recording.hit.sum())
+    assert unusable == 3
+    assert beam_counts(recording, low_prior) == {
+        "beams": recording.n_beams,
+        "hits": hits,
+        "max_range": recording.n_beams - hits - unusable,
+        "unusable": unusable,
+        # a maximum-range beam carries the prior, not a label, however low it is
+        "dynamic": int((recording.hit & (result.p_static < 0.5)).sum()),
+    }
+
+
+def test_counts_of_nothing(result):
+    none = dataclasses.replace(
+        result.recording,
+        stamp_ns=np.zeros(0, np.int64),
+        offset=np.zeros(1, np.int64),
+        points=np.zeros((0, 2), np.float32),
+        hit=np.zeros(0, bool),
+        sensor=np.zeros(0, np.int32),
+    )
+    assert set(beam_counts(none, np.zeros(0, np.float32)).values()) == {0}

@@ -1,0 +1,143 @@
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+
+from stillmap.core.json import jsonable, skipped_count
+from stillmap.results.save import write_run_json
+
+
+def no_constant(name):
+    raise AssertionError(f"{name} is not JSON")
+
+
+def written(tmp_path, result):
+    write_run_json(tmp_path / "run.json", result)
+    text = (tmp_path / "run.json").read_text(encoding="utf-8")
+    return json.loads(text, parse_constant=no_constant)
+
+
+def test_the_keys_that_scripts_rely_on(tmp_path, result):
+    run = written(tmp_path, result)
+    assert list(run) == [
+        "format_version",
+        "version",
+        "input",
+        "options",
+        "iterations",
+        "converged",
+        "best_iteration",
+        "seconds",
+        "cpu_seconds",
+        "peak_memory_bytes",
+        "counts",
+        "area",
+        "warnings",
+        "learned",
+        "doubts",
+        "changes",
+        "loops",
+    ]
+    assert run["format_version"] == 1
+    assert isinstance(run["version"], str)
+    assert run["input"]["path"] == "logs/hall <1>.clf"
+    assert run["options"]["em"] == {"prior": 0.9, "note": result.options.em.note, "seed": None}
+    band = {"low": 0.2, "high": 1.8}
+    shown = {"map_mode": "trinary", "map_state": "last", "band": band}
+    assert run["options"]["output"] == shown
+    assert (run["converged"], run["best_iteration"]) == (True, 3)
+    assert run["seconds"] == {"read": 0.21, "em": 7.1, "map": 0.02}
+    assert run["cpu_seconds"] == {"read": 0.2, "em": 13.5, "map": 0.02}
+    assert run["peak_memory_bytes"]["em"] == 96_000_000
+    assert run["warnings"] == result.warnings
+    assert run["learned"] == result.learned
+
+
+def test_areas(tmp_path, result):
+    area = written(tmp_path, result)["area"]
+    known = np.count_nonzero(~np.isnan(result.map.p_occupied))
+    assert area["known"] == round(0.01 * known, 6)
+    assert area["thin"] == round(0.01 * np.count_nonzero(result.evidence.thin), 6)
+    assert 0 < area["thin"] < area["known"]
+
+
+def test_iterations(tmp_path, result):
+    iterations = written(tmp_path, result)["iterations"]
+    assert iterations[1] == {
+        "number": 2,
+        "bound": -31500.5,
+        "expected_log_likelihood": -32100.25,
+        "held_out_log_likelihood": None,
+        "changed_share": 0.08,
+        "seconds": 1.8,
+    }
+    assert iterations[3]["bound"] is None  # not a number there
+
+
+def test_doubts(tmp_path, result):
+    assert written(tmp_path, result)["doubts"] == {
+        "odometry_disagrees": [7, 9],
+        "found_by_wider_search": [7],
+        "carried_before": [20],
+        "beside_the_map_from": [20],
+    }
+
+
+def test_loops(tmp_path, result):
+    loops = written(tmp_path, result)["loops"]
+    assert loops["accepted"] == [{"earlier": 2, "later": 40, "explained": 0.75}]
+    assert [one["why"] for one in loops["refused"]] == [
+        "explains too little",
+        "other loops disagree",
+        "explains too little",
+    ]
+    assert loops["refused"][1] == {
+        "earlier": 5,
+        "later": 44,
+        "explained": 0.9,
+        "why": "other loops disagree",
+    }
+
+
+def test_counts(tmp_path, result):
+    hit, points = result.recording.hit, result.recording.points
+    assert written(tmp_path, result)["counts"] == {
+        "scans": 60,
+        "beams": 60 * 181,
+        "hits": int(hit.sum()),
+        "max_range": int((~hit & np.isfinite(points[:, 0])).sum()),
+        "unusable": 3,
+        "skipped": 41,
+    }
+
+
+def test_values_of_every_kind_become_json(tmp_path, result):
+    source = {
+        "path": Path("a/b.bag"),
+        "odd": float("inf"),
+        "numpy": {"scalar": np.float32("nan"), "count": np.int64(3), "flag": np.bool_(True)},
+        "array": np.array([[1.0, np.nan]]),
+        "pair": (1, "ä"),
+        7: None,
+    }
+    recording = dataclasses.replace(result.recording, source=source)
+    assert written(tmp_path, dataclasses.replace(result, recording=recording))["input"] == {
+        "path": "a/b.bag",
+        "odd": None,
+        "numpy": {"scalar": None, "count": 3, "flag": True},
+        "array": [[1.0, None]],
+        "pair": [1, "ä"],
+        "7": None,
+    }
+
+
+def test_jsonable_keeps_the_kind_of_what_json_knows():
+    value = {"a": [True, 1, 1.5, "x", None]}
+    assert json.dumps(jsonable(value)) == json.dumps(value)
+
+
+def test_a_reader_that_skipped_nothing():
+    assert (
+        skipped_count({}) == skipped_count({"skipped": {}}) == skipped_count({"skipped": None}) == 0
+    )

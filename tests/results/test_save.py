@@ -1,0 +1,119 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from stillmap.core.errors import InputError
+from stillmap.io.trajectory import read_tum
+from stillmap.pipeline.options import OutputOptions
+from stillmap.results import save as save_module
+from stillmap.results.save import save
+from stillmap.tracking import ObjectOptions
+
+FILES = {
+    "map.pgm",
+    "map.yaml",
+    "map.npz",
+    "trajectory.tum",
+    "graph.g2o",
+    "beams/stamp_ns.npy",
+    "beams/offset.npy",
+    "beams/p_static.npy",
+    "beams/hit.npy",
+    "objects/objects.json",
+    "objects/0000.ply",
+    "objects/0001.ply",
+    "traffic.npz",
+    "report.html",
+    "run.json",
+}
+
+
+def contents(folder):
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_the_folder_is_complete_and_agrees_with_itself(tmp_path, result):
+    save(result, tmp_path / "out")
+    files = contents(tmp_path / "out")
+    assert set(files) == FILES
+    run = json.loads(files["run.json"])
+    stamps, _ = read_tum(tmp_path / "out/trajectory.tum")
+    np.testing.assert_array_equal(stamps, np.load(tmp_path / "out/beams/stamp_ns.npy"))
+    assert run["counts"]["scans"] == len(stamps)
+    assert run["counts"]["beams"] == len(np.load(tmp_path / "out/beams/hit.npy"))
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_no_graph_no_file(tmp_path, result):
+    save(dataclasses.replace(result, graph=None), tmp_path / "out")
+    assert set(contents(tmp_path / "out")) == FILES - {"graph.g2o"}
+
+
+def test_objects_that_were_not_asked_for_have_no_files(tmp_path, result):
+    options = dataclasses.replace(result.options, objects=ObjectOptions(enabled=False))
+    save(dataclasses.replace(result, options=options), tmp_path / "out")
+    left_out = {name for name in FILES if name.startswith(("objects/", "traffic"))}
+    assert set(contents(tmp_path / "out")) == FILES - left_out
+
+
+def test_same_result_same_bytes_except_for_timings(tmp_path, result):
+    slower = {name: {**stage, "seconds": 99.0} for name, stage in result.stages.items()}
+    save(result, tmp_path / "a")
+    save(result, tmp_path / "b")
+    save(dataclasses.replace(result, stages=slower), tmp_path / "c")
+    a, b, c = (contents(tmp_path / name) for name in "abc")
+    assert a == b
+    assert {name for name in FILES if a[name] != c[name]} == {"run.json", "report.html"}
+
+
+def test_map_mode_comes_from_the_options(tmp_path, result):
+    options = dataclasses.replace(result.options, output=OutputOptions(map_mode="scale"))
+    save(dataclasses.replace(result, options=options), tmp_path / "out")
+    assert set(contents(tmp_path / "out")) == FILES - {"map.pgm"} | {"map.png"}
+
+
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, RuntimeError, MemoryError])
+def test_a_save_that_fails_leaves_nothing(tmp_path, result, monkeypatch, kind):
+    def fail(*_):
+        raise kind
+
+    monkeypatch.setattr(save_module, "write_run_json", fail)
+    with pytest.raises(kind):
+        save(result, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_save_that_fails_keeps_what_was_there(tmp_path, result, monkeypatch):
+    save(result, tmp_path / "out")
+    before = contents(tmp_path / "out")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(save_module, "write_report", full)
+    with pytest.raises(InputError, match="No space left"):
+        save(result, tmp_path / "out", overwrite=True)
+    assert contents(tmp_path / "out") == before
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_overwriting_must_be_asked_for(tmp_path, result):
+    (tmp_path / "out").mkdir()
+    save(result, tmp_path / "out")  # an empty folder is as good as none
+    (tmp_path / "out" / "mine.txt").write_text("kept")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "mine.txt").write_text("kept")
+    with pytest.raises(InputError, match=r"other things: only a folder with run\.json"):
+        save(result, tmp_path / "mine", overwrite=True)
+    assert (tmp_path / "mine" / "mine.txt").read_text() == "kept"
+    with pytest.raises(InputError, match="already holds"):
+        save(result, tmp_path / "out")
+    assert (tmp_path / "out" / "mine.txt").read_text() == "kept"
+    save(result, tmp_path / "out", overwrite=True)
+    assert set(contents(tmp_path / "out")) == FILES

@@ -1,0 +1,174 @@
+"""A box cuts what it should, and nothing else."""
+
+import numpy as np
+import pytest
+
+from stillmap.core.config import replaced
+from stillmap.core.recording import Recording
+from stillmap.pipeline.options import Options
+from stillmap.rig.build import Flat, built_in_3d, with_boxes
+from stillmap.rig.options import RigOptions
+from stillmap.rig.removal import Cut, top_of
+from stillmap.tracking import MovingObject, ObjectOptions
+from stillmap.tracking.boxes import boxes_of
+
+MS = 1_000_000
+STAMPS = np.arange(0, 2001, 100, dtype=np.int64) * MS
+
+
+def walker(seconds, size=(0.6, 0.4)):
+    """Along y at 1 m/s through (2, 0) at one second."""
+    seconds = np.asarray(seconds, float)
+    xy = np.stack([np.full(len(seconds), 2.0), seconds - 1.0], axis=1)
+    return MovingObject(
+        id=7,
+        scan=np.round(10 * seconds).astype(np.intp),
+        stamp_ns=np.round(1e9 * seconds).astype(np.int64),
+        xy=xy,
+        velocity=np.tile([0.0, 1.0], (len(seconds), 1)),
+        size=size,
+        beams=np.arange(len(seconds)),
+        p_dynamic=0.9,
+    )
+
+
+def flat_recording(points, offset, stamps=STAMPS):
+    """Of a laser at the origin that stands."""
+    return Recording(
+        stamp_ns=stamps,
+        offset=np.asarray(offset, np.int64),
+        points=np.asarray(points, np.float32).reshape(-1, 2),
+        hit=np.ones(int(offset[-1]), bool),
+        T_base_sensor=np.eye(3)[None],
+        sensor=np.zeros(len(stamps), np.int32),
+        T_odom_base=None,
+    )
+
+
+def standing():
+    return np.tile(np.eye(3), (len(STAMPS), 1, 1))
+
+
+def box_of(one, hold=0.5):
+    empty = flat_recording(np.zeros((0, 2)), np.zeros(len(STAMPS) + 1))
+    options = ObjectOptions()
+    return boxes_of(empty, standing(), np.zeros(0, np.float32), [one], options, hold)[0]
+
+
+def test_a_box_goes_along_and_turns_with_its_thing():
+    box = box_of(walker([0.5, 1.0, 1.5]))
+    seconds = np.full(6, 1.25)
+    xy = [[2.0, 0.25], [2.0, 0.54], [2.19, 0.25], [2.0, 0.56], [2.21, 0.25], [2.0, -0.1]]
+    held = box.holds(seconds, np.array(xy), 0.0)
+    assert held.tolist() == [True, True, True, False, False, False]
+    assert box.holds(seconds, np.array(xy), 0.02).tolist()[:5] == [True] * 5
+
+
+def test_it_goes_on_for_a_while_only():
+    box = box_of(walker([0.5, 1.0, 1.5]), hold=0.3)
+    seconds = np.array([0.25, 1.75, 0.15, 1.85])
+    xy = np.stack([np.full(4, 2.0), seconds - 1.0], axis=1)
+    assert box.holds(seconds, xy, 0.0).tolist() == [True, True, False, False]
+
+
+def test_what_is_in_no_object_has_a_box_for_a_moment():
+    # two that belong together, and one alone: noise
+    points = [[3.0, 0.0], [3.0, 0.1], [5.0, 5.0]]
+    offset = np.where(np.arange(len(STAMPS) + 1) > 4, 3, 0)
+    p_static = np.full(3, 0.1, np.float32)
+    recording = flat_recording(points, offset)
+    boxes = boxes_of(recording, standing(), p_static, [], ObjectOptions(), 0.5)
+    assert [box.thing for box in boxes] == [-1]
+    assert boxes[0].holds(np.array([0.4, 0.8]), np.array([[3.0, 0.05]] * 2), 0.1).tolist() == [
+        True,
+        False,
+    ]
+    p_static[:] = 0.31  # P(dynamic) below 0.7
+    assert not boxes_of(recording, standing(), p_static, [], ObjectOptions(), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("above", "top"),
+    [
+        ([0.3, 1.2, 1.5, 1.7], 1.7),
+        ([0.3, 1.2, 1.5, 2.4], 1.5),  # a lamp
+        ([0.3, 0.6], 1.0),
+        ([1.9], 1.0),  # nothing connects it
+        ([1.3, 1.6, 1.9, 2.2], 1.9),
+        ([], 1.0),
+    ],
+)
+def test_things_reach_as_high_as_what_is_connected(above, top):
+    assert top_of(np.array(above), 2.0, 0.5) == top
+
+
+def built(points, ms, objects, **rig):
+    """P(static) of points seen one at a time by a laser at the origin that knows the floor."""
+    x, y = np.meshgrid(np.arange(-4.0, 4.0, 0.1), np.arange(-4.0, 4.0, 0.1))
+    floor = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.0)], axis=1)
+    stamps = np.concatenate([[0], np.asarray(ms, np.int64) * MS])
+    n = len(points)
+    recording = Recording(
+        stamp_ns=stamps,
+        offset=np.concatenate([[0], len(floor) + np.arange(n + 1)]).astype(np.int64),
+        points=np.concatenate([floor, np.asarray(points) - [0, 0, 1.0]]).astype(np.float32),
+        hit=np.ones(len(floor) + n, bool),
+        T_base_sensor=np.eye(4)[None] + np.eye(4, k=1)[None] * [[0], [0], [1.0], [0]],
+        sensor=np.zeros(n + 1, np.int32),
+        T_odom_base=None,
+    )
+    seen = flat_recording(np.zeros((0, 2)), np.zeros(len(STAMPS) + 1))
+    flat = Flat(seen, standing(), np.zeros(0, np.float32), objects, 0.9)
+    options = replaced(Options(), {"rig": {"evidence": False, "margin": 0.1, **rig}})
+    found = built_in_3d(flat, recording, options)
+    return found, found.p_static[-n:]
+
+
+PERSON = [[2.0, 0.0, 0.1], [2.1, 0.1, 0.6], [2.0, 0.3, 0.9], [2.0, 0.0, 1.3], [2.0, 0.0, 1.7]]
+BESIDE = [[2.4, 0.0, 1.0], [2.0, 0.5, 1.0], [2.0, 0.0, 0.0], [2.0, 0.0, 2.6]]
+
+
+def test_in_a_box_beams_are_dynamic_and_nowhere_else():
+    found, p_static = built(PERSON + BESIDE, [1000] * 9, [walker([0.5, 1.0, 1.5])])
+    assert (p_static[:5] < 0.5).all()
+    np.testing.assert_allclose(p_static[5:], 0.9, atol=1e-5)
+    (one,) = found.objects
+    assert found.boxes == 1
+    assert one.beams.tolist() == list(range(found.seen.n_beams - 9, found.seen.n_beams - 4))
+    assert len(one.size) == 3
+    assert one.size[2] == pytest.approx(1.7, abs=0.05)
+    assert one.z is not None
+    np.testing.assert_allclose(one.z, 0.85, atol=0.05)
+
+
+def test_evidence_and_boxes_multiply_their_odds():
+    o = RigOptions(inside=0.9, around=0.75)
+    share = 0.8
+    static = np.array([share, share, 0.999, 0.3, share], np.float32)  # of which two are in no box
+    core = Cut(np.array([0, 2]), np.array([True, True]))
+    margin = Cut(
+        np.array([0, 1]), np.array([False, False])
+    )  # the first is in the core of the other
+    found = with_boxes(static, [core, margin], share, o)
+    odds = 999 / 4 / 9
+    np.testing.assert_allclose(found, [0.1, 0.25, odds / (1 + odds), 0.3, share], rtol=1e-4)
+    assert static[0] == np.float32(share)
+
+
+def test_after_it_has_left_the_place_is_static():
+    _, p_static = built(PERSON, [2000] * 5, [walker([0.5, 1.0, 1.5])])
+    assert (p_static > 0.5).all()
+
+
+def test_what_is_long_may_be_high():
+    tall = [[2.0, 0.0, z] for z in (0.5, 0.9, 1.3, 1.7, 2.1, 2.5)]
+    _, as_person = built(tall, [1000] * 6, [walker([0.5, 1.0, 1.5])])
+    assert (as_person < 0.5).tolist() == [True] * 4 + [False] * 2
+    _, as_van = built(tall, [1000] * 6, [walker([0.5, 1.0, 1.5], (4.0, 1.8))])
+    assert (as_van < 0.5).all()
+
+
+def test_who_stands_looks_where_he_went():
+    one = walker([0.5, 1.0, 1.5])
+    one.velocity[1:] = 0.0
+    np.testing.assert_allclose(box_of(one).ahead, [[0.0, 1.0]] * 3)

@@ -1,0 +1,157 @@
+"""`stillmap map --tilting` from end to end on a small simulated rig."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from stillmap.cli.main import main
+from stillmap.io import stillmap_folder
+from stillmap.io.trajectory import read_tum
+from stillmap.results.report.objects import cut_sentences
+from stillmap.sim import load_truth, scene_by_name, simulate_rig, write_rig
+
+QUICK = ("--quiet", "--threads", "1", "--set", "em.max_iterations=1")
+QUICK += ("--set", "mesh.enabled=false")
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    """Folder of a hall with people for 12 s, seen by two lasers."""
+    path = tmp_path_factory.mktemp("rig") / "sim"
+    changes = {
+        "rig": {"tilts": True, "period": 2.0},
+        "laser": {"beams": 91, "sweep_time": 0.02, "max_range": 12.0},
+        "robot": {"scans": 300, "scan_rate": 25.0},
+        "crowd": {"people": 25},
+    }
+    write_rig(simulate_rig(scene_by_name("hall", changes), 5), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def mapped(rig, tmp_path_factory):
+    """What comes of it."""
+    out = tmp_path_factory.mktemp("mapped") / "out"
+    words = ("map", rig / "horizontal", "--tilting", rig / "tilting", "-o", out, *QUICK)
+    assert main([str(word) for word in words]) == 0
+    return out
+
+
+def test_labels_are_those_of_the_truth(rig, mapped):
+    p_static = np.load(mapped / "tilting/beams/p_static.npy")
+    hit, truth = np.load(rig / "tilting/hit.npy"), load_truth(rig / "tilting")
+    known = hit & ~np.isnan(p_static)
+    removed = p_static[known] < 0.5
+    static = truth.static[known]
+    assert (~static).sum() > 100
+    assert removed[~static].mean() > 0.85
+    assert removed[static].mean() < 0.01
+
+
+def test_the_files_belong_together(rig, mapped):
+    counts = {name: _vertices(mapped / f"{name}.ply") for name in ("static", "dynamic")}
+    record = json.loads((mapped / "run.json").read_text())["tilting"]
+    assert record["input"]["path"] == str(rig / "tilting")
+    assert counts["static"] + counts["dynamic"] == record["counts"]["hits"]
+    assert counts["dynamic"] == record["dynamic"] > 0
+    # the last scan goes on after the last pose is known
+    T, n = 300, 91
+    assert record["counts"]["left_out"] == record["counts"]["unusable"] > 0
+    assert record["counts"]["left_out"] < n
+    assert len(np.load(mapped / "tilting/beams/stamp_ns.npy")) == T
+    assert np.load(mapped / "tilting/beams/offset.npy")[-1] == T * n
+    stamps, poses = read_tum(mapped / "tilting/trajectory.tum")
+    np.testing.assert_array_equal(stamps, read_tum(mapped / "trajectory.tum")[0])
+    np.testing.assert_allclose(poses, read_tum(mapped / "trajectory.tum")[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("only", ["static", "dynamic", None])
+def test_the_cloud_of_the_second_laser_can_be_converted(mapped, tmp_path, only):
+    laspy, path = pytest.importorskip("laspy"), tmp_path / "a.laz"
+    more = () if only is None else ("--only", only)
+    assert main(["convert", str(mapped), "-o", str(path), "--quiet", *more]) == 0
+    parts = [only] if only else ["static", "dynamic"]
+    known = np.concatenate([trimesh.load(mapped / f"{part}.ply").vertices for part in parts])
+    found = laspy.read(path)
+    np.testing.assert_allclose(found.xyz, known, atol=0.6e-4)
+    assert (found["p_static"] < 0.5).any() == (only != "static")
+
+
+def test_the_report_says_what_was_cut_out(mapped):
+    text = (mapped / "report.html").read_text()
+    section = text.split("What the second laser built")[1].split("</section>")[0]
+    record = json.loads((mapped / "run.json").read_text())["tilting"]
+    share = 100 * record["dynamic"] / record["counts"]["hits"]
+    for said in (
+        f"{record['dynamic']:,} of these, {share:.1f} %, are dynamic",
+        f"by {record['boxes']:,} boxes",
+        f"{record['objects']:,} of the things that moved",
+        f"{record['counts']['left_out']:,} beams were left out",
+        "by what it saw itself",
+    ):
+        assert said in section
+    assert section.count("<img") == 2
+    assert "by what it saw itself" not in cut_sentences(record | {"learned": {}})
+
+
+def test_objects_have_a_height_and_points(mapped):
+    objects = json.loads((mapped / "tilting/objects/objects.json").read_text())
+    assert objects
+    flat = {one["id"] for one in json.loads((mapped / "objects/objects.json").read_text())}
+    for one in objects:
+        assert one["id"] in flat
+        assert len(one["size"]) == 3
+        assert 0.05 < one["size"][2] < 2.1
+        assert len(one["track"]["z"]) == len(one["track"]["x"])
+        assert _vertices(mapped / f"tilting/objects/{one['id']:04d}.ply") == one["beams"] >= 3
+    assert max(one["size"][2] for one in objects) > 1.2
+
+
+def test_the_flat_result_is_as_without_it(rig, mapped, tmp_path):
+    assert main(["map", str(rig / "horizontal"), "-o", str(tmp_path / "out"), *QUICK]) == 0
+    for name in ("map.pgm", "beams/p_static.npy", "objects/objects.json", "trajectory.tum"):
+        assert (tmp_path / "out" / name).read_bytes() == (mapped / name).read_bytes()
+    assert not (tmp_path / "out/tilting").exists()
+
+
+def refused(capsys, *words):
+    """The one line with which the command refuses."""
+    assert main([str(word) for word in (*words, *QUICK)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    return err
+
+
+def test_a_recording_of_another_time_is_refused(rig, tmp_path, capsys):
+    tilting = stillmap_folder.read(rig / "tilting")
+    later = replace(tilting, stamp_ns=tilting.stamp_ns + 3_600_000_000_000)
+    stillmap_folder.write(later, tmp_path / "later")
+    words = ("map", rig / "horizontal", "--tilting", tmp_path / "later", "-o", tmp_path / "out")
+    line = refused(capsys, *words)
+    assert "not recorded at the same time" in line
+    assert str(tmp_path / "later") in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_flat_ones_and_two_in_3d_are_refused(rig, tmp_path, capsys):
+    flat, tilting, out = rig / "horizontal", rig / "tilting", tmp_path / "out"
+    assert "is in 2D" in refused(capsys, "map", flat, "--tilting", flat, "-o", out)
+    assert "lies flat" in refused(capsys, "map", tilting, "--tilting", tilting, "-o", out)
+
+
+def test_wrong_options_and_places_are_refused(rig, tmp_path, capsys):
+    words = ("map", rig / "horizontal", "--tilting", rig / "tilting", "-o")
+    assert "rig.inside" in refused(capsys, *words, tmp_path / "out", "--set", "rig.inside=1.0")
+    assert "rig.margin" in refused(capsys, *words, tmp_path / "out", "--set", "rig.margin=-1")
+    assert "holds" in refused(capsys, *words, rig, "--overwrite")
+    nowhere = ("map", rig / "horizontal", "--tilting", tmp_path / "nowhere", "-o", tmp_path / "out")
+    assert "nowhere" in refused(capsys, *nowhere)
+
+
+def _vertices(path):
+    head = path.read_bytes().split(b"end_header")[0].decode()
+    return int(head.split("element vertex ")[1].split("\n")[0])

@@ -1,0 +1,227 @@
+"""Cameras in simulated worlds: what they show, when and from where, and the truth about it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stillmap import io as recordings
+from stillmap.core.errors import InputError
+from stillmap.sim import (
+    RigSimulation,
+    Scene,
+    Simulation,
+    load_picture_truth,
+    mover_points,
+    scene_by_name,
+    simulate,
+    simulate_rig,
+    static_colour,
+    write_rig,
+    write_simulation,
+)
+from stillmap.sim.camera import SKY, bent, looking, place_cameras
+from stillmap.sim.options import CameraOptions
+
+Float = NDArray[np.float64]
+
+SMALL = {"width": 96, "height": 72, "noise": 0.0}
+LENS = {"k1": -0.2, "k2": 0.05, "p1": 0.002, "p2": -0.001}
+
+
+def _scene(name: str, camera: dict[str, object], lidar: int = 8) -> Scene:
+    sensors = {"channels": lidar, "columns": 60}
+    looks = {"enabled": True, **SMALL, **camera}
+    return scene_by_name(name, {"lidar": sensors, "robot": {"scans": 12}, "camera": looks})
+
+
+@pytest.fixture(scope="module")
+def street() -> Simulation:
+    return simulate(_scene("street", {"count": 2, **LENS}), 4)
+
+
+@pytest.fixture(scope="module")
+def rig() -> RigSimulation:
+    changes = {
+        "rig": {"tilts": True},
+        "robot": {"scans": 60, "scan_rate": 37.5},
+        "crowd": {"people": 40},
+        "camera": {"enabled": True, **SMALL},
+    }
+    return simulate_rig(scene_by_name("hall", changes), 2)
+
+
+def _seen(one: Simulation, image: int) -> tuple[Float, NDArray[np.uint16]]:
+    """(h, w, 3) where the pixels' rays end in the world, and the mask."""
+    assert one.photographs is not None
+    assert one.recording.images is not None
+    shot, images = one.photographs.take(image), one.recording.images
+    T = one.photographs.T_world_camera[image]
+    rays = np.moveaxis(looking(images.cameras[images.camera[image]]), 0, -1) @ T[:3, :3].T
+    with np.errstate(invalid="ignore"):
+        return T[:3, 3] + shot.distance[..., None] * rays, shot.mask
+
+
+@pytest.mark.parametrize("which", ["street", "rig"])
+def test_pixels_show_the_true_surfaces_in_their_colours(
+    which: str, request: pytest.FixtureRequest
+) -> None:
+    made = request.getfixturevalue(which)
+    one = made.tilting if which == "rig" else made
+    assert one.surfaces is not None
+    assert one.recording.images is not None
+    movers = 0
+    for image in range(len(one.recording.images)):
+        places, mask = _seen(one, image)
+        static = places[mask == 0]
+        off, _ = one.surfaces.standing.nearest(static)
+        assert off.max() < 1e-4  # float32 of 100 m
+        near = np.linalg.norm(static - one.surfaces.T_world_camera[image, :3, 3], axis=1) < 3.0
+        shows = one.recording.images.read(image)[mask == 0][near].astype(float)
+        wanted = static_colour(static[near], one.surfaces.colour_seed).astype(float)
+        # but for places beside an edge of the texture, and what is averaged within a pixel
+        assert np.median(np.abs(shows - wanted)) <= 6.0
+        stamp = int(one.recording.images.stamp_ns[image])
+        for number in np.unique(mask[(mask > 0) & (mask != SKY)]).tolist():
+            points, _ = mover_points(one.surfaces.moving, number - 1, stamp, 0.02)
+            gaps = places[mask == number][:, None] - points
+            # 0.02 m from point to point, and a person's legs swing between two scans
+            assert np.linalg.norm(gaps, axis=2).min(axis=1).max() < 0.03
+            movers += 1
+    assert movers > 0
+
+
+def test_sky_is_where_no_ray_ends(street: Simulation) -> None:
+    assert street.photographs is not None
+    shot = street.photographs.take(0)
+    assert np.array_equal(shot.mask == SKY, np.isinf(shot.distance))
+    assert 0.1 < np.mean(shot.mask == SKY) < 0.7
+    r, _, b = np.median(shot.colour[shot.mask == SKY], axis=0)
+    assert b > 200
+    assert b > r
+
+
+def test_a_ring_of_cameras_looks_all_around(street: Simulation) -> None:
+    images = street.recording.images
+    assert images is not None
+    ahead, behind = images.cameras
+    assert ahead.T_base_camera is not None
+    assert behind.T_base_camera is not None
+    assert np.allclose(ahead.T_base_camera[:2, 2], -behind.T_base_camera[:2, 2])
+    assert ahead.model == "plumb_bob"
+    assert np.array_equal(ahead.distortion[:4], list(LENS.values()))
+    assert np.array_equal(images.camera[:4], [0, 1, 0, 1])
+    assert images.stamp_ns[0] == images.stamp_ns[1] < images.stamp_ns[2]
+
+
+def test_pictures_have_stamps_of_their_own(rig: RigSimulation) -> None:
+    images, stamps = rig.tilting.recording.images, rig.tilting.recording.stamp_ns
+    assert images is not None
+    assert rig.horizontal.recording.images is None
+    assert len(images) == 4
+    assert not np.isin(images.stamp_ns, stamps).any()
+    assert stamps[0] < images.stamp_ns[0]
+    assert images.stamp_ns[-1] < stamps[-1]
+    assert np.allclose(np.diff(images.stamp_ns), 0.5e9, atol=1)
+
+
+def test_the_lens_is_undone() -> None:
+    one = place_cameras(CameraOptions(enabled=True, width=64, height=48, **LENS))[0]
+    rays = looking(one)
+    assert np.allclose(np.linalg.norm(rays, axis=0), 1.0)
+    assert one.K is not None
+    shown = bent(rays[:2] / rays[2], one.distortion)
+    u, v = one.K[0, 0] * shown[0] + one.K[0, 2], one.K[1, 1] * shown[1] + one.K[1, 2]
+    assert np.allclose(u, np.arange(64)[None])
+    assert np.allclose(v, np.arange(48)[:, None])
+
+
+def test_a_lens_that_does_not_reach_the_corners_is_refused() -> None:
+    with pytest.raises(InputError, match="lens does not reach"):
+        looking(place_cameras(CameraOptions(enabled=True, k1=-0.4, fov=2.0))[0])
+
+
+def test_cameras_leave_everything_else_as_it_is() -> None:
+    with_camera = _scene("street", {})
+    seen = simulate(with_camera, 4)
+    blind = simulate(replace(with_camera, camera=CameraOptions()), 4)
+    assert np.array_equal(seen.recording.points, blind.recording.points)
+    assert np.array_equal(seen.recording.stamp_ns, blind.recording.stamp_ns)
+    assert np.array_equal(seen.truth.movers, blind.truth.movers, equal_nan=True)
+    assert blind.recording.images is None
+    assert blind.photographs is None
+    assert "camera" not in blind.truth.scene
+    assert "colour_seed" not in blind.truth.scene
+    assert seen.truth.scene["camera"]["width"] == 96
+
+
+def test_pictures_are_the_same_however_often_they_are_read() -> None:
+    scene = _scene("street", {"noise": 5.0, "exposure": 0.2})
+    images, others = simulate(scene, 4).recording.images, simulate(scene, 4).recording.images
+    assert images is not None
+    assert others is not None
+    assert np.array_equal(images.read(1), images.read(1))
+    assert np.array_equal(images.read(1), others.read(1))
+    brightness = [float(images.read(image).mean()) for image in range(len(images))]
+    assert max(brightness) > 1.05 * min(brightness)
+
+
+def test_several_rays_for_each_pixel_smooth_edges() -> None:
+    sharp = simulate(_scene("street", {}), 4).photographs
+    soft = simulate(_scene("street", {"antialias": 2}), 4).photographs
+    assert sharp is not None
+    assert soft is not None
+    one, other = sharp.take(0), soft.take(0)
+    rough = [np.abs(np.diff(shot.colour.astype(float), axis=1)).mean() for shot in (one, other)]
+    assert rough[1] < 0.9 * rough[0]
+    moves = [(shot.mask > 0) & (shot.mask != SKY) for shot in (one, other)]
+    assert (moves[1] | ~moves[0]).mean() > 0.99
+    assert moves[1].sum() >= moves[0].sum()
+
+
+def test_folders_hold_pictures_and_their_truth(rig: RigSimulation, tmp_path: Path) -> None:
+    write_rig(rig, tmp_path / "rig")
+    assert not (tmp_path / "rig/horizontal/images").exists()
+    images = recordings.read(tmp_path / "rig/tilting").images
+    truth, made = load_picture_truth(tmp_path / "rig/tilting"), rig.tilting
+    assert images is not None
+    assert made.recording.images is not None
+    assert made.surfaces is not None
+    assert np.array_equal(images.read(2), made.recording.images.read(2))
+    assert np.array_equal(truth.mask(2), made.surfaces.mask(2))
+    near = np.isfinite(truth.distance(2))
+    assert np.allclose(truth.distance(2)[near], made.surfaces.distance(2)[near], atol=6e-4)
+    assert np.array_equal(truth.T_world_camera, made.surfaces.T_world_camera)
+    assert truth.colour_seed == made.truth.scene["colour_seed"]
+    points = np.random.default_rng(0).uniform(-20, 20, (100, 3))
+    for found, wanted in zip(
+        truth.standing.nearest(points), made.surfaces.standing.nearest(points), strict=True
+    ):
+        assert np.array_equal(found, wanted)
+    stamp = int(images.stamp_ns[1])
+    for k in range(3):
+        found, _ = mover_points(truth.moving, k, stamp, 0.05)
+        assert np.array_equal(found, mover_points(made.surfaces.moving, k, stamp, 0.05)[0])
+
+
+def test_a_folder_without_pictures_has_no_truth_about_them(tmp_path: Path) -> None:
+    write_simulation(simulate(scene_by_name("hall", {"robot": {"scans": 2}}), 1), tmp_path / "sim")
+    with pytest.raises(InputError, match="no truth about pictures"):
+        load_picture_truth(tmp_path / "sim")
+
+
+def test_cameras_want_a_world_in_3d() -> None:
+    with pytest.raises(InputError, match="cameras want a world in 3D"):
+        scene_by_name("hall", {"camera": {"enabled": True}})
+
+
+def test_colours_go_on_smoothly_and_differ_from_place_to_place() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-20, 20, (4000, 3)) * (1, 1, 0.1) + (0, 0, 2.1)
+    colour = static_colour(points, 5).astype(float)
+    beside = static_colour(points + 0.005, 5).astype(float)
+    assert np.median(np.abs(colour - beside)) < 6.0
+    assert colour.std(axis=0).min() > 15.0
+    assert not np.array_equal(colour, static_colour(points, 6))

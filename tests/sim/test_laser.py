@@ -1,0 +1,198 @@
+"""The ray caster against one that tries every beam against everything, one at a time."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stillmap.sim import LaserOptions
+from stillmap.sim.laser import Movers, Outlines, Returns, beam_angles, cast, measure
+
+Float = NDArray[np.float64]
+
+
+def nearest_wall(origin: Float, direction: Float, walls: Float) -> tuple[float, int]:
+    best, which = math.inf, -1
+    for w, (x0, y0, x1, y1) in enumerate(walls):
+        # origin + r direction = start + s (end - start)
+        A = np.array([[direction[0], x0 - x1], [direction[1], y0 - y1]])
+        if abs(np.linalg.det(A)) < 1e-12:
+            continue
+        r, s = np.linalg.solve(A, np.array([x0, y0]) - origin)
+        if r > 0 and -1e-12 <= s <= 1 + 1e-12 and r < best:
+            best, which = r, w
+    return best, which
+
+
+def nearest_mover(origin: Float, direction: Float, movers: Movers, t: int) -> tuple[float, int]:
+    """By the quadratic form of each ellipse, (p - c)' Q (p - c) = 1."""
+    best, which = math.inf, -1
+    for q, axes in enumerate(movers.semi_axes):
+        c, s = math.cos(movers.heading[t, q]), math.sin(movers.heading[t, q])
+        R = np.array([[c, -s], [s, c]])
+        Q = R @ np.diag(axes**-2.0) @ R.T
+        o = origin - movers.xy[t, q]
+        roots = np.roots([direction @ Q @ direction, 2 * o @ Q @ direction, o @ Q @ o - 1])
+        real = roots[np.abs(roots.imag) < 1e-12].real
+        if len(real) and 0 < real.min() < best:
+            best, which = real.min(), int(movers.mover[q])
+    return best, which
+
+
+def by_brute_force(poses: Float, angles: Float, walls: Float, movers: Movers) -> Returns:
+    shape = (len(poses), len(angles))
+    out = Returns(np.empty(shape), np.full(shape, -1, np.int32), np.full(shape, -1, np.int32))
+    for t, (x, y, theta) in enumerate(poses):
+        for n, angle in enumerate(theta + angles):
+            ray = np.array([x, y]), np.array([math.cos(angle), math.sin(angle)])
+            wall, mover = nearest_wall(*ray, walls), nearest_mover(*ray, movers, t)
+            out.range[t, n] = min(wall[0], mover[0])
+            if mover[0] < wall[0]:
+                out.mover[t, n] = mover[1]
+            else:
+                out.wall[t, n] = wall[1]
+    return out
+
+
+def test_random_worlds_show_walls_and_movers() -> None:
+    """Else the comparison below would say little."""
+    angles = beam_angles(60, 2 * np.pi)
+    for seed in range(4):
+        walls, poses, movers = random_world(np.random.default_rng(seed))
+        found = by_brute_force(poses, angles, walls, movers)
+        assert (found.wall >= 0).mean() > 0.3
+        assert (found.mover >= 0).mean() > 0.05
+
+
+def random_world(rng: np.random.Generator) -> tuple[Float, Float, Movers]:
+    scans, parts = 6, 9
+    walls = rng.uniform(-6, 6, (12, 4))
+    poses = np.column_stack([rng.uniform(-4, 4, (scans, 2)), rng.uniform(-9, 9, scans)])
+    # nothing stands where the sensor is
+    away = rng.uniform(0, 2 * np.pi, (scans, parts))
+    distance = rng.uniform(0.5, 5, (scans, parts))
+    offset = distance[..., None] * np.stack([np.cos(away), np.sin(away)], axis=-1)
+    movers = Movers(
+        poses[:, None, :2] + offset,
+        rng.uniform(-4, 4, (scans, parts)),
+        rng.uniform(0.05, 0.4, (parts, 2)),
+        np.arange(parts, dtype=np.int32) // 2,
+    )
+    return walls, poses, movers
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("beams", "fov"), [(45, np.pi), (60, 2 * np.pi), (31, 1.2), (50, 4.7)])
+def test_agrees_with_brute_force(seed: int, beams: int, fov: float) -> None:
+    walls, poses, movers = random_world(np.random.default_rng(seed))
+    angles = beam_angles(beams, fov)
+    fast, slow = cast(poses, angles, walls, movers), by_brute_force(poses, angles, walls, movers)
+    np.testing.assert_allclose(fast.range, slow.range, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(fast.mover, slow.mover)
+    np.testing.assert_array_equal(fast.wall, slow.wall)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_moving_faces_agree_with_brute_force(seed: int) -> None:
+    """A face that moves is a wall that stands elsewhere in each scan."""
+    rng = np.random.default_rng(seed)
+    walls, poses, movers = random_world(rng)
+    faces, angles = rng.uniform(-6, 6, (len(poses), 7, 4)), beam_angles(60, 2 * np.pi)
+    outlines = Outlines(faces, np.arange(7, dtype=np.int32) // 2 + 20)
+    fast = cast(poses, angles, walls, movers, outlines)
+    for t in range(len(poses)):
+        now = Movers(movers.xy[t : t + 1], movers.heading[t : t + 1], *there(movers))
+        both = np.concatenate([walls, faces[t]])
+        slow = by_brute_force(poses[t : t + 1], angles, both, now)
+        face = slow.wall[0] - len(walls)
+        np.testing.assert_allclose(fast.range[t], slow.range[0], rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(fast.wall[t], np.where(face < 0, slow.wall[0], -1))
+        mover = np.where(face >= 0, outlines.mover[np.maximum(face, 0)], slow.mover[0])
+        np.testing.assert_array_equal(fast.mover[t], mover)
+    assert (fast.mover >= 20).mean() > 0.1
+
+
+def there(movers: Movers) -> tuple[Float, NDArray[np.int32]]:
+    return movers.semi_axes, movers.mover
+
+
+def test_no_ray_slips_through_the_corners_of_a_closed_polygon() -> None:
+    rng = np.random.default_rng(2)
+    turn = np.sort(rng.uniform(0, 2 * np.pi, 40))
+    corners = 5 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    walls = np.concatenate([corners, np.roll(corners, -1, axis=0)], axis=1)
+    angles = beam_angles(720, 2 * np.pi)
+    # beams that aim at the corners exactly
+    poses = np.column_stack([np.zeros((40, 2)), turn - angles[0]])
+    poses = np.concatenate([poses, np.column_stack([rng.uniform(-1, 1, (200, 2)), np.arange(200)])])
+    nobody = Movers(
+        np.empty((240, 0, 2)), np.empty((240, 0)), np.empty((0, 2)), np.empty(0, np.int32)
+    )
+    assert np.isfinite(cast(poses, angles, walls, nobody).range).all()
+
+
+def test_scans_beyond_one_chunk_see_their_own_movers() -> None:
+    scans = 2300
+    along = np.arange(scans) * 1e-3
+    movers = Movers(
+        np.stack([3.0 + along, np.zeros(scans)], axis=-1)[:, None],
+        np.zeros((scans, 1)),
+        np.array([[0.2, 0.2]]),
+        np.array([9], np.int32),
+    )
+    returns = cast(np.zeros((scans, 3)), beam_angles(3, 1.0), np.empty((0, 4)), movers)
+    np.testing.assert_allclose(returns.range[:, 1], 2.8 + along)
+    assert np.isinf(returns.range[:, [0, 2]]).all()
+    np.testing.assert_array_equal(returns.mover[:, 1], 9)
+
+
+@pytest.mark.parametrize(
+    ("beams", "fov", "first", "last"),
+    [
+        (180, 180, -90, 89),
+        (181, 180, -90, 90),
+        (361, 180, -90, 90),
+        (361, 360, -180, 180 - 360 / 361),
+    ],
+)
+def test_beams_point_where_sick_scanners_point_them(
+    beams: int, fov: float, first: float, last: float
+) -> None:
+    angles = np.degrees(beam_angles(beams, math.radians(fov)))
+    assert angles[0] == pytest.approx(first)
+    assert angles[-1] == pytest.approx(last)
+    np.testing.assert_allclose(np.diff(angles), angles[1] - angles[0])
+
+
+def exact(ranges: Float, wall: int) -> Returns:
+    return Returns(
+        ranges, np.full(ranges.shape, wall, np.int32), np.full(ranges.shape, -1, np.int32)
+    )
+
+
+def test_noise_has_its_standard_deviation_and_no_bias() -> None:
+    options = LaserOptions(range_noise=0.03, no_return_share=0.0)
+    true = np.full((200, 500), 4.0)
+    ranges, hit = measure(exact(true, 0), np.array([False]), options, np.random.default_rng(1))
+    assert hit.all()
+    assert (ranges - true).std() == pytest.approx(0.03, rel=0.01)
+    assert (ranges - true).mean() == pytest.approx(0.0, abs=5 * 0.03 / math.sqrt(true.size))
+
+
+def test_beams_get_lost_at_their_rates_and_end_at_maximum_range() -> None:
+    options = LaserOptions(max_range=20.0, no_return_share=0.01, glass_no_return_share=0.3)
+    true = np.full((400, 500), 4.0)
+    is_glass = np.array([False, True])
+    for wall, share in ((0, 0.01), (1, 0.31)):
+        ranges, hit = measure(exact(true, wall), is_glass, options, np.random.default_rng(4))
+        assert 1 - hit.mean() == pytest.approx(share, rel=0.1)
+        np.testing.assert_array_equal(ranges[~hit], 20.0)
+
+
+def test_what_lies_beyond_maximum_range_gives_no_return() -> None:
+    options = LaserOptions(max_range=8.0, no_return_share=0.0, range_noise=0.0)
+    true = np.array([[7.9, 8.0, 8.1, np.inf]])
+    ranges, hit = measure(exact(true, 0), np.array([False]), options, np.random.default_rng(4))
+    np.testing.assert_array_equal(hit, [[True, False, False, False]])
+    np.testing.assert_array_equal(ranges, [[7.9, 8.0, 8.0, 8.0]])

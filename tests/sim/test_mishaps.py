@@ -1,0 +1,193 @@
+"""Odometry and stamps that lie, and a robot that is carried elsewhere: only as asked for."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.config import replaced
+from stillmap.core.errors import InputError
+from stillmap.sim import OdometryOptions, Scene, Simulation, scene_by_name, simulate
+from stillmap.sim.odometry import reported, without_jump
+from stillmap.sim.walls import box
+
+Float = NDArray[np.float64]
+
+PERFECT = OdometryOptions(0.0, 0.0, 0.4, 0.0, 0.0, 0.0)
+SECONDS = np.arange(3001) * 0.2  # ten minutes
+
+
+def round_a_ring() -> Float:
+    turn = SECONDS * 0.1
+    return se2.matrix(5 * np.sin(turn), 5 - 5 * np.cos(turn), turn)
+
+
+def moves(T: Float) -> Float:
+    return se2.parameters(se2.inverse(T[:-1]) @ T[1:])
+
+
+def short(seed: int = 3, name: str = "hall", **changes: dict[str, object]) -> Simulation:
+    usual: dict[str, dict[str, object]] = {"robot": {"scans": 400}, "laser": {"beams": 30}}
+    return simulate(scene_by_name(name, {**usual, **changes}), seed)
+
+
+def test_odometry_that_neither_stalls_nor_resets_is_what_it_was() -> None:
+    T = round_a_ring()
+    options = OdometryOptions(stall_time=9.0)
+    assert reported(T, SECONDS, options, np.random.default_rng(0)) is T
+
+
+def test_a_stall_misses_what_the_robot_does_for_its_time() -> None:
+    T = round_a_ring()
+    options = dataclasses.replace(PERFECT, stall_rate=3.0, stall_time=4.0)
+    odometry = reported(T, SECONDS, options, np.random.default_rng(1))
+    np.testing.assert_array_equal(odometry[0], np.eye(3))
+    got, true = moves(odometry), moves(T)
+    lost = np.hypot(got[:, 0], got[:, 1]) < 1e-9
+    np.testing.assert_allclose(got[lost], 0.0, atol=1e-9)
+    np.testing.assert_allclose(got[~lost], true[~lost], atol=1e-9)
+    # 30 stalls of 4 s in 600 s, less what overlaps
+    assert 0.1 < lost.mean() < 0.25
+    starts = np.flatnonzero(np.diff(lost.astype(int)) == 1)
+    assert 15 <= len(starts) <= 40
+    ends = np.flatnonzero(np.diff(lost.astype(int)) == -1)
+    lasts = (ends[:10] - starts[:10])[ends[:10] > starts[:10]]
+    assert lasts.min() >= 20
+
+
+def test_a_reset_begins_again_at_the_origin() -> None:
+    T = round_a_ring()
+    options = dataclasses.replace(PERFECT, resets=3)
+    odometry = reported(T, SECONDS, options, np.random.default_rng(1))
+    again = np.flatnonzero(np.abs(odometry[1:] - np.eye(3)).max(axis=(1, 2)) < 1e-12)
+    assert len(again) == 3
+    got, true = moves(odometry), moves(T)
+    others = np.setdiff1d(np.arange(3000), again)
+    np.testing.assert_allclose(got[others], true[others], atol=1e-9)
+    assert np.hypot(*got[again, :2].T).max() > 1.0
+
+
+def test_more_resets_than_scans_are_as_many_as_there_can_be() -> None:
+    options = dataclasses.replace(PERFECT, resets=50)
+    odometry = reported(round_a_ring()[:4], SECONDS[:4], options, np.random.default_rng(1))
+    np.testing.assert_allclose(odometry[1:], np.eye(3)[None].repeat(3, axis=0), atol=1e-12)
+
+
+def test_nothing_but_the_odometry_changes_when_it_lies() -> None:
+    plain = short()
+    lies = {"stall_rate": 6.0, "stall_time": 3.0, "resets": 2}
+    lying = short(odometry=lies)
+    np.testing.assert_array_equal(plain.recording.points, lying.recording.points)
+    np.testing.assert_array_equal(plain.truth.T_world_base, lying.truth.T_world_base)
+    a, b = plain.recording.T_odom_base, lying.recording.T_odom_base
+    assert a is not None
+    assert b is not None
+    same = np.abs(moves(a) - moves(b)).max(axis=1) < 1e-9
+    assert 0.4 < same.mean() < 0.95
+
+
+def test_without_the_jump_the_robot_never_left() -> None:
+    T = round_a_ring()
+    carried = np.concatenate([T[:100], se2.matrix(7.0, -3.0, 2.0) @ T[100:]])
+    back = without_jump(carried, 100)
+    true = moves(T)
+    got = moves(back)
+    np.testing.assert_allclose(np.delete(got, 99, axis=0), np.delete(true, 99, axis=0), atol=1e-9)
+    np.testing.assert_allclose(got[99], 0.0, atol=1e-9)
+    assert without_jump(T, len(T)) is T
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_carried_robot_goes_on_elsewhere_and_odometry_knows_nothing(seed: int) -> None:
+    perfect = {"wheel_radius_error": 0.0, "wheel_base_error": 0.0, "translation_noise": 0.0,
+               "rotation_noise": 0.0, "drift_noise": 0.0}  # fmt: skip
+    run = short(seed, robot={"scans": 400, "carried_at": 0.6}, odometry=perfect)
+    T, odometry = run.truth.T_world_base, run.recording.T_odom_base
+    assert odometry is not None
+    scan = run.truth.scene["carried_at_scan"]
+    assert scan == 240
+    jump = moves(T)[scan - 1]
+    assert np.hypot(*jump[:2]) > 5.0
+    steps = np.hypot(*moves(T)[:, :2].T)
+    assert np.delete(steps, scan - 1).max() <= 0.1 + 1e-9
+    np.testing.assert_allclose(moves(odometry)[scan - 1], 0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        np.delete(moves(odometry), scan - 1, axis=0), np.delete(moves(T), scan - 1, axis=0),
+        atol=2e-3,  # odometry takes the way between two scans for an arc
+    )  # fmt: skip
+    gap = np.diff(run.recording.stamp_ns) / 1e9
+    assert gap[scan - 1] == pytest.approx(20.2)
+    np.testing.assert_allclose(np.delete(gap, scan - 1), 0.2)
+    # on its route again, and going on with it
+    after = T[scan:, :2, 2]
+    assert np.hypot(*np.diff(after, axis=0).T).sum() > 8.0
+
+
+def test_everybody_else_goes_on_while_the_robot_is_carried() -> None:
+    run = short(robot={"scans": 400, "carried_at": 0.5})
+    scan = run.truth.scene["carried_at_scan"]
+    step = np.hypot(*np.moveaxis(np.diff(run.truth.movers[..., :2], axis=0), -1, 0))
+    assert np.delete(step, scan - 1, axis=0).max() < 1.7 / 5
+    assert 2.0 < step[scan - 1].mean() < 1.6 * 20.2
+    robot = run.truth.T_world_base[:, None, :2, 2]
+    off = np.hypot(*np.moveaxis(run.truth.movers[..., :2] - robot, -1, 0))
+    assert off.min() > 0.22 + 0.25
+    before = short(robot={"scans": 400}).truth
+    np.testing.assert_array_equal(before.T_world_base[:scan], run.truth.T_world_base[:scan])
+
+
+def test_a_carried_robot_gets_to_the_end_of_its_route() -> None:
+    walls = tuple(box(0, 0, 40, 20))
+    route = ((-18.0, -8.0), (18.0, -8.0), (18.0, 8.0), (-18.0, 8.0))
+    scene = Scene(name="hall", walls=walls, route=route)
+    changes = {"robot": {"carried_at": 0.3}, "crowd": {"people": 0}, "laser": {"beams": 4}}
+    ends = []
+    for seed in range(6):
+        run = simulate(replaced(scene, changes), seed)
+        ends.append(np.hypot(*(run.truth.T_world_base[-1, :2, 2] - route[-1])))
+        assert run.recording.n_scans > run.truth.scene["carried_at_scan"] + 100
+    assert max(ends) < 0.2
+
+
+@pytest.mark.parametrize("tick", [0.1, 1.0, 0.03])
+def test_stamps_are_rounded(tick: float) -> None:
+    robot = {"scans": 100, "scan_rate": 7.0}
+    exact = short(robot=robot).recording.stamp_ns
+    rounded = short(robot={**robot, "stamp_rounding": tick}).recording.stamp_ns
+    assert np.all((rounded - exact[0]) % round(tick * 1e9) == 0)
+    assert np.abs(rounded - exact).max() <= tick * 1e9 / 2 + 1
+    assert np.abs(rounded - exact).max() > tick * 1e9 / 4
+    assert np.all(np.diff(rounded) >= 0)
+
+
+def test_where_stamps_are_missing_scans_are_counted() -> None:
+    run = short(robot={"scans": 30, "stamps_missing": True, "stamp_rounding": 0.3})
+    np.testing.assert_array_equal(run.recording.stamp_ns, np.arange(30) * 10**9)
+    plain = short(robot={"scans": 30})
+    np.testing.assert_array_equal(run.recording.points, plain.recording.points)
+
+
+def test_usually_nothing_of_the_kind_happens() -> None:
+    run = short(robot={"scans": 30})
+    assert run.truth.scene["carried_at_scan"] is None
+    assert run.scene.odometry.stall_rate == 0
+    assert run.scene.odometry.resets == 0
+    assert run.recording.stamp_ns[-1] - run.recording.stamp_ns[0] == 58 * 10**8
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value"),
+    [
+        ("robot", "carried_at", 0.0),
+        ("robot", "carried_at", 1.0),
+        ("robot", "stamp_rounding", -0.1),
+        ("odometry", "stall_rate", -1.0),
+        ("odometry", "stall_time", 0.0),
+        ("odometry", "resets", -1),
+    ],
+)
+def test_values_out_of_range_are_refused(section: str, key: str, value: float) -> None:
+    with pytest.raises(InputError, match=key):
+        scene_by_name("hall", {section: {key: value}})

@@ -1,0 +1,187 @@
+"""Ranges in 3D against formulas: ground, faces, boxes, cylinders, ellipsoids; nothing left out."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stillmap.sim import GroundOptions, LidarOptions, ray_casting
+from stillmap.sim.geometry import BOX, CYLINDER, ELLIPSOID, Faces, Ground, Solids
+from stillmap.sim.lidar import Pattern, looking, matrix
+from stillmap.sim.ray_casting import Echoes, Rays
+
+Float = NDArray[np.float64]
+
+NO_FACES = Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool))
+NO_PAVEMENT = np.empty((0, 4))
+
+
+def flat(kerb: float = 0.0, pavements: Float = NO_PAVEMENT) -> Ground:
+    return Ground.of(GroundOptions(kerb=kerb), pavements)
+
+
+def lidar(
+    x: float = 0.0, y: float = 0.0, z: float = 1.8, roll: float = 0.0, pitch: float = 0.0
+) -> tuple[Pattern, Rays]:
+    pattern = Pattern.of(LidarOptions(channels=40, columns=360, low=-0.6, high=0.3))
+    T = matrix(np.array([[x, y, z]]), *np.array([[roll], [pitch], [0.4]]))
+    return pattern, looking(pattern, T)
+
+
+def solid(form: int, pose: Float, half: tuple[float, float], z: tuple[float, float]) -> Solids:
+    mover = np.array([7], np.int32)
+    form_of = np.array([form], np.int8)
+    return Solids(np.reshape(pose, (1, 1, 4)), form_of, np.array([half]), np.array([z]), mover)
+
+
+def ends(beams: Rays, seen: Echoes, which: NDArray[np.bool_]) -> Float:
+    range = np.where(which, seen.range, 0.0)
+    return np.asarray((beams.origin + range * beams.direction)[:, which])
+
+
+def test_flat_ground_lies_as_far_as_the_elevation_says() -> None:
+    pattern, beams = lidar()
+    seen = ray_casting.cast(beams, NO_FACES, [], flat(), None)
+    down = pattern.elevation < 0
+    expected = 1.8 / np.sin(-pattern.elevation[down])
+    np.testing.assert_allclose(seen.range[:, down], np.tile(expected, (360, 1)))
+    assert np.isinf(seen.range[:, ~down]).all()
+
+
+def test_sloping_and_bent_ground_and_its_ceiling() -> None:
+    options = GroundOptions(slope_x=0.03, slope_y=-0.02, bend_x=0.002, bend_y=-0.001)
+    ground = Ground.of(options, NO_PAVEMENT)
+    _, beams = lidar(3.0, -2.0, z=float(ground.level(np.array(3.0), np.array(-2.0))) + 1.8)
+    seen = ray_casting.cast(beams, NO_FACES, [], ground, 4.0)
+    x, y, z = ends(beams, seen, np.isfinite(seen.range))
+    above = z - (0.03 * x - 0.02 * y + 0.001 * x**2 - 0.0005 * y**2)
+    near = np.minimum(np.abs(above), np.abs(above - 4.0))
+    assert near.max() < 1e-9 * 1e3
+    assert (np.abs(above) < 1e-6).sum() > 5000 < (np.abs(above - 4.0) < 1e-6).sum() + 4000
+
+
+def test_an_upright_face_has_a_lower_and_an_upper_edge() -> None:
+    face = Faces(np.array([[5.0, -9.0, 5.0, 9.0]]), np.array([[1.0, 2.5]]), np.array([True]))
+    _, beams = lidar()
+    seen = ray_casting.cast(beams, face, [], flat(), None)
+    x, y, z = ends(beams, seen, seen.on_glass)
+    np.testing.assert_allclose(x, 5.0)
+    assert 1.0 <= z.min() < 1.1
+    assert 2.4 < z.max() <= 2.5
+    assert np.abs(y).max() <= 9.0
+    hidden = ray_casting.cast(
+        beams, face, [solid(BOX, [3, 0, 0, 0], (0.5, 20), (0, 9))], flat(), None
+    )
+    assert not hidden.on_glass[seen.on_glass].any()
+    # below it one looks through to the ground behind
+    x, _, z = ends(beams, seen, ~seen.on_glass & np.isfinite(seen.range))
+    assert ((x > 5.5) & (np.abs(z) < 1e-9)).sum() > 30
+
+
+def test_a_cylinder_and_an_ellipse() -> None:
+    _, beams = lidar()
+    seen = ray_casting.cast(
+        beams, NO_FACES, [solid(CYLINDER, [4, 3, 0.5, 0.1], (0.3, 0.6), (0, 1.5))], flat(), None
+    )
+    x, y, z = ends(beams, seen, seen.mover == 7)
+    c, s = np.cos(0.5), np.sin(0.5)
+    u, v = ((x - 4) * c + (y - 3) * s) / 0.3, ((y - 3) * c - (x - 4) * s) / 0.6
+    np.testing.assert_allclose(u**2 + v**2 * 1.0, np.where(z < 1.6 - 1e-9, 1.0, u**2 + v**2))
+    assert 0.1 <= z.min() < 0.2
+    assert z.max() == pytest.approx(1.6, abs=0.1)
+    # straight ahead: as far as its surface
+    _, beams = lidar(z=0.8)
+    seen = ray_casting.cast(
+        beams, NO_FACES, [solid(CYLINDER, [0, 6, 0, 0], (0.5, 0.5), (0, 2))], flat(), None
+    )
+    assert seen.range[seen.mover == 7].min() == pytest.approx(5.5, abs=0.01)
+
+
+def test_a_box_has_sides_and_a_top() -> None:
+    _, beams = lidar(z=3.0)
+    seen = ray_casting.cast(
+        beams, NO_FACES, [solid(BOX, [5, -2, 0.3, 0.2], (2, 1), (0, 1))], flat(), None
+    )
+    x, y, z = ends(beams, seen, seen.mover == 7)
+    c, s = np.cos(0.3), np.sin(0.3)
+    u, v = (x - 5) * c + (y + 2) * s, (y + 2) * c - (x - 5) * s
+    off = np.abs(np.stack([np.abs(u) - 2, np.abs(v) - 1, z - 1.2]))
+    assert off.min(axis=0).max() < 1e-9
+    assert (off[2] < 1e-9).sum() > 50 < (off[1] < 1e-9).sum() + (off[0] < 1e-9).sum()
+    assert (np.abs(u) < 2 + 1e-9).all()
+    assert z.min() > 0.2 - 1e-9
+
+
+@pytest.mark.parametrize("form", [BOX, CYLINDER, ELLIPSOID])
+def test_level_beams_along_an_axis_meet_what_is_in_their_way(form: int) -> None:
+    pattern = Pattern.of(LidarOptions(channels=1, columns=4, low=0.0, high=0.0))
+    beams = looking(pattern, matrix(np.array([[0.0, 0.0, 1.0]]), *np.zeros((3, 1))))
+    seen = ray_casting.cast(
+        beams, NO_FACES, [solid(form, [5, 0, 0, 0], (1, 2), (0, 2))], flat(), None
+    )
+    np.testing.assert_allclose(seen.range[:, 0], [np.inf, np.inf, 4.0, np.inf])
+    above = solid(form, [5, 0, 0, 1.5], (1, 2), (0, 2))
+    assert np.isinf(ray_casting.cast(beams, NO_FACES, [above], flat(), None).range).all()
+
+
+def test_an_ellipsoid_hangs_above_what_passes_under_it() -> None:
+    _, beams = lidar()
+    crown = solid(ELLIPSOID, [8, 0, 0, 0], (2, 3), (2.2, 4.2))
+    seen = ray_casting.cast(beams, NO_FACES, [crown], flat(), None)
+    x, y, z = ends(beams, seen, seen.mover == 7)
+    np.testing.assert_allclose((x - 8) ** 2 / 4 + y**2 / 9 + (z - 3.2) ** 2, 1.0)
+    assert len(x) > 100
+
+
+def test_pavements_are_a_kerb_higher() -> None:
+    pavements = np.array([[-50.0, 3.0, 50.0, 9.0]])
+    edge = Faces(np.array([[-50.0, 3.0, 50.0, 3.0]]), np.array([[-0.5, 0.1]]), np.zeros(1, bool))
+    _, beams = lidar()
+    seen = ray_casting.cast(beams, edge, [], flat(0.1, pavements), None)
+    x, y, z = ends(beams, seen, np.isfinite(seen.range))
+    on = (y > 3 + 1e-6) & (y < 9) & (np.abs(x) < 50)
+    np.testing.assert_allclose(z[on], 0.1)
+    np.testing.assert_allclose(z[(y < 3 - 1e-6) | (y > 10)], 0.0, atol=1e-9)
+    kerb = np.abs(y - 3) < 1e-6
+    assert kerb.sum() > 20
+    assert ((z[kerb] > -1e-9) & (z[kerb] < 0.1 + 1e-9)).all()
+
+
+def clutter(rng: np.random.Generator, n: int, moving: bool) -> tuple[Faces, Solids]:
+    a, b = rng.uniform(-20, 20, (n, 2)), rng.uniform(-6, 6, (n, 2))
+    faces = Faces(np.hstack([a, a + b]), np.sort(rng.uniform(-1, 6, (n, 2))), rng.random(n) < 0.5)
+    pose = np.column_stack(
+        [rng.uniform(-20, 20, (n, 2)), rng.uniform(0, 6, n), rng.uniform(0, 1, n)]
+    )
+    poses = pose[None] + np.linspace(0, 1, 360)[:, None, None] * [1.0, -2.0, 0.1, 0] * moving
+    half, form = rng.uniform(0.1, 2, (n, 2)), rng.integers(0, 3, n).astype(np.int8)
+    z = np.sort(rng.uniform(0, 3, (n, 2)))
+    return faces, Solids(poses, form, half, z, np.arange(n, dtype=np.int32))
+
+
+def everything(beams: Rays, count: int) -> Iterator[tuple[int, slice, slice]]:
+    yield from ((k, slice(0, 360), slice(0, len(beams.elevation))) for k in range(count))
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.05, -0.2])
+@pytest.mark.parametrize("moving", [False, True])
+def test_nothing_is_missed(monkeypatch: pytest.MonkeyPatch, roll: float, moving: bool) -> None:
+    """Looking only where things may be gives what looking everywhere gives."""
+    rng = np.random.default_rng(5)
+    faces, solids = clutter(rng, 60, moving)
+    pattern = Pattern.of(LidarOptions(channels=24, columns=360, low=-0.7, high=0.4))
+    t = np.linspace(0, 1, 360)
+    xyz = np.stack([0.8 * t, -0.4 * t, 1.8 + 0.1 * t], axis=-1)
+    T = matrix(xyz, roll * np.ones(360), 0.5 * roll * t, 3.0 + 0.2 * t)
+    beams = looking(pattern, T)
+    ground = Ground.of(GroundOptions(slope_x=0.02, bend_y=0.003), NO_PAVEMENT)
+    fast = ray_casting.cast(beams, faces, [solids], ground, None)
+    monkeypatch.setattr(
+        ray_casting, "_windows_of_faces", lambda b, f, _: everything(b, len(f.ends))
+    )
+    monkeypatch.setattr(ray_casting, "_windows_of_solids", lambda b, s: everything(b, len(s.form)))
+    slow = ray_casting.cast(beams, faces, [solids], ground, None)
+    np.testing.assert_array_equal(fast.range, slow.range)
+    np.testing.assert_array_equal(fast.mover, slow.mover)
+    assert len(np.unique(fast.mover)) > 12

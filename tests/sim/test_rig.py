@@ -1,0 +1,126 @@
+"""A laser that lies flat and one that tilts: one world, one clock, two recordings."""
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillmap import io as recordings
+from stillmap.core.errors import InputError
+from stillmap.sim import (
+    RigOptions,
+    RigSimulation,
+    load_truth,
+    scene_by_name,
+    simulate,
+    simulate_rig,
+    write_rig,
+)
+from stillmap.sim.lidar import joint_angle
+from stillmap.sim.planner import distance_to_segment
+
+
+@functools.cache
+def run(sweep_time: float = 0.0) -> RigSimulation:
+    laser = {"range_noise": 0.0, "no_return_share": 0.0, "sweep_time": sweep_time}
+    robot = {"scans": 100, "scan_rate": 10.0}
+    return simulate_rig(
+        scene_by_name("hall", {"laser": laser, "robot": robot, "rig": {"tilts": True}}), 3
+    )
+
+
+def test_both_have_the_same_clock_robot_and_movers() -> None:
+    flat, tilting = run().horizontal, run().tilting
+    assert (flat.recording.dimension, tilting.recording.dimension) == (2, 3)
+    np.testing.assert_array_equal(flat.recording.stamp_ns, tilting.recording.stamp_ns)
+    np.testing.assert_array_equal(flat.truth.movers, tilting.truth.movers)
+    for a, b in (
+        (flat.truth.T_world_base, tilting.truth.T_world_base),
+        (flat.recording.T_odom_base, tilting.recording.T_odom_base),
+    ):
+        assert a is not None
+        assert b is not None
+        np.testing.assert_allclose(a[:, :2, 2], b[:, :2, 3])
+        np.testing.assert_allclose(a[:, :2, :2], b[:, :2, :2])
+
+
+def test_the_flat_one_sees_walls_where_they_are() -> None:
+    flat = run().horizontal
+    recording = flat.recording
+    scan = np.repeat(np.arange(recording.n_scans), np.diff(recording.offset))
+    T = recording.T_map_sensor(flat.truth.T_world_base)[scan]
+    xy = np.einsum("nij,nj->ni", T[:, :2, :2], recording.points.astype(float)) + T[:, :2, 2]
+    near = np.full(len(xy), np.inf)
+    for wall in flat.truth.walls:
+        np.minimum(near, distance_to_segment(xy, wall), out=near)
+    # columns are round here
+    assert near[flat.truth.static].max() < 0.04
+    assert flat.truth.static.mean() > 0.7
+    assert (flat.truth.mover >= 0).sum() > 100
+
+
+def test_each_scan_is_a_plane_at_the_angle_of_its_joint() -> None:
+    recording, angle = run().tilting.recording, run().joint_angle
+    points = recording.points.reshape(100, -1, 3)
+    off = points[..., 2] * np.cos(angle)[:, None] + points[..., 0] * np.sin(angle)[:, None]
+    assert np.abs(off).max() < 1e-5
+    rig = RigOptions()
+    assert angle[0] == pytest.approx(rig.middle)
+    assert angle.max() == pytest.approx(rig.middle + rig.amplitude)
+    assert angle.min() == pytest.approx(rig.middle - rig.amplitude)
+    assert np.abs(np.diff(angle)).max() == pytest.approx(4 * rig.amplitude / rig.period / 10)
+    np.testing.assert_allclose(angle[:40], angle[40:80], atol=1e-12)
+
+
+def test_floor_ceiling_and_walls_are_seen_in_3d() -> None:
+    tilting = run().tilting
+    recording, truth = tilting.recording, tilting.truth
+    scan = np.repeat(np.arange(100), np.diff(recording.offset))
+    T = recording.T_map_sensor(truth.T_world_base)[scan]
+    ends = np.einsum("nij,nj->ni", T[:, :3, :3], recording.points.astype(float)) + T[:, :3, 3]
+    z = ends[recording.hit, 2]
+    assert z.min() > -1e-4
+    assert z.max() < 6.0 + 1e-4
+    assert (np.abs(z) < 1e-4).mean() > 0.1
+    assert (np.abs(z - 6.0) < 1e-4).mean() > 0.02
+    person = truth.mover >= 0
+    assert person.sum() > 100
+    at = truth.movers[scan[person], truth.mover[person], :2]
+    assert np.hypot(*(ends[person, :2] - at).T).max() < 0.6
+
+
+def test_while_it_looks_the_joint_goes_on() -> None:
+    recording, rig = run(0.1).tilting.recording, RigOptions()
+    assert recording.beam_time is not None
+    scan = np.repeat(np.arange(100), np.diff(recording.offset))
+    angle = joint_angle(scan / 10 + recording.beam_time.astype(float), rig)
+    x, _, z = recording.points.T.astype(float)
+    assert np.abs(z * np.cos(angle) + x * np.sin(angle)).max() < 1e-4
+    still = run(0.1).joint_angle[scan]
+    assert np.abs(z * np.cos(still) + x * np.sin(still)).max() > 0.1
+
+
+def test_a_folder_of_both(tmp_path: Path) -> None:
+    write_rig(run(), tmp_path / "rig")
+    for name, one in (("horizontal", run().horizontal), ("tilting", run().tilting)):
+        read, truth = recordings.read(tmp_path / "rig" / name), load_truth(tmp_path / "rig" / name)
+        np.testing.assert_array_equal(read.points, one.recording.points)
+        np.testing.assert_array_equal(truth.mover, one.truth.mover)
+    np.testing.assert_array_equal(np.load(tmp_path / "rig/joint_angle.npy"), run().joint_angle)
+    with pytest.raises(InputError, match="already"):
+        write_rig(run(), tmp_path / "rig")
+    write_rig(run(), tmp_path / "rig", overwrite=True)
+
+
+def test_what_makes_no_rig_is_refused() -> None:
+    for changes in ({"lidar": {"channels": 16}}, {"laser": {"second_laser": True}}):
+        with pytest.raises(InputError):
+            scene_by_name("hall", {"rig": {"tilts": True}, **changes})
+    for wrong in ({"amplitude": 1.5}, {"period": 0.0}, {"pivot_z": 0.0}):
+        with pytest.raises(InputError):
+            scene_by_name("hall", {"rig": wrong})
+    with pytest.raises(InputError, match="simulate_rig"):
+        simulate(scene_by_name("hall", {"rig": {"tilts": True}}))
+    with pytest.raises(InputError, match="tilts"):
+        simulate_rig(scene_by_name("hall"))

@@ -1,0 +1,225 @@
+"""Things that are moved, brought and taken away, and a robot that stands overnight."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stillmap.core import se2
+from stillmap.core.config import replaced
+from stillmap.sim import (
+    Scene,
+    Simulation,
+    Stay,
+    Thing,
+    load_truth,
+    scene_by_name,
+    simulate,
+    write_simulation,
+)
+from stillmap.sim.objects import Things, standing
+from stillmap.sim.planner import distance_to_segment
+from stillmap.sim.walls import box
+
+Float = NDArray[np.float64]
+EndPoints = Callable[[Simulation], tuple[Float, NDArray[np.int64]]]
+
+CRATE = tuple(box(0, 0, 1.0, 0.6))
+MOVED = Thing(CRATE, (Stay(2.0, 1.0, until=20.05), Stay(-2.0, 1.0, 0.5, since=20.05)))
+TAKEN = Thing(CRATE, (Stay(0.0, 3.0, until=30.0),))
+BROUGHT = Thing(CRATE, (Stay(3.0, 3.0, since=10.0),))
+LEFT_ALONE = Thing(CRATE, (Stay(-3.0, 3.0),))
+THINGS = (MOVED, TAKEN, BROUGHT, LEFT_ALONE)
+NOBODY = {"crowd": {"people": 0}}
+
+
+def yard(
+    things: tuple[Thing, ...] = THINGS, speed: float = 0.001, **changes: dict[str, object]
+) -> Simulation:
+    """A robot that creeps along in the middle of a yard of 10 m, for 40 s."""
+    walls = tuple(box(0, 0, 10, 10))
+    scene = Scene(name="yard", walls=walls, route=((0.0, -3.0), (0.5, -3.0)), things=things)
+    usual: dict[str, dict[str, object]] = {
+        "robot": {"scans": 200, "speed": speed},
+        "laser": {"beams": 181, "fov": 2 * np.pi, "range_noise": 0.0, "no_return_share": 0.0},
+        **NOBODY,
+    }
+    merged = {key: {**usual.get(key, {}), **changes.get(key, {})} for key in {*usual, *changes}}
+    return simulate(replaced(scene, merged), 2)
+
+
+def seconds_of(run: Simulation) -> Float:
+    stamps = run.recording.stamp_ns
+    return np.asarray(1e-9 * (stamps - stamps[0]))
+
+
+def test_a_thing_is_where_it_stays_and_else_nowhere() -> None:
+    run = yard()
+    seconds, movers = seconds_of(run), run.truth.movers
+    assert run.truth.scene["mover_kinds"] == ["thing"] * 4
+    before = seconds < 20.05
+    np.testing.assert_array_equal(movers[before, 0], [[2.0, 1.0, 0.0]] * before.sum())
+    np.testing.assert_array_equal(movers[~before, 0], [[-2.0, 1.0, 0.5]] * (~before).sum())
+    np.testing.assert_array_equal(np.isnan(movers[:, 1, 0]), seconds >= 30.0)
+    np.testing.assert_array_equal(np.isnan(movers[:, 2, 0]), seconds < 10.0)
+    assert not np.isnan(movers[:, 3]).any()
+
+
+@pytest.mark.parametrize("sweep_time", [0.0, 0.2])
+def test_beams_meet_a_thing_only_where_it_stands(end_points: EndPoints, sweep_time: float) -> None:
+    run = yard(laser={"sweep_time": sweep_time})
+    xy, scan = end_points(run)
+    truth, seconds = run.truth, seconds_of(run)
+    for number, thing in enumerate((MOVED, TAKEN, BROUGHT)):
+        hits = truth.mover == number
+        assert hits.any()
+        for stay in thing.stays:
+            there = (seconds >= stay.since) & (seconds < (stay.until or np.inf))
+            faces = standing(thing, stay)
+            mine = xy[hits & there[scan]]
+            off = np.min([distance_to_segment(mine, face) for face in faces], axis=0)
+            assert off.max() < 1e-3
+            # nothing of it elsewhere: nobody sees it on the way
+            assert set(np.unique(scan[hits])) <= set(np.flatnonzero(~np.isnan(
+                truth.movers[:, number, 0])).tolist())  # fmt: skip
+            # and where it was, beams go on to the wall
+            gone = xy[~there[scan]]
+            inside = np.abs(gone - (stay.x, stay.y)) < (0.2, 0.2)
+            assert not inside.all(axis=1).any()
+    assert not truth.static[truth.mover >= 0].any()
+
+
+def test_what_is_there_at_the_end_lasts(tmp_path: Path) -> None:
+    run = yard()
+    faces = [standing(thing, thing.stays[-1]) for thing in (MOVED, BROUGHT)]
+    np.testing.assert_allclose(run.truth.lasting, np.concatenate(faces))
+    assert not len(yard(robot={"scans": 1}).truth.lasting)  # nothing has changed yet
+    write_simulation(run, tmp_path / "run")
+    np.testing.assert_array_equal(load_truth(tmp_path / "run").lasting, run.truth.lasting)
+    (tmp_path / "run/truth/lasting.npy").unlink()  # as where there are none
+    assert load_truth(tmp_path / "run").lasting.shape == (0, 4)
+
+
+def test_a_thing_that_never_changes_is_a_wall() -> None:
+    run = yard()
+    assert len(run.truth.walls) == 4 + 4
+    np.testing.assert_allclose(run.truth.walls[4:], standing(LEFT_ALONE, LEFT_ALONE.stays[0]))
+    assert not (run.truth.mover == 3).any()
+    early = yard(robot={"scans": 40})
+    # two have not changed yet, and one is not there yet
+    assert len(early.truth.walls) == 4 + 3 * 4
+    assert (early.truth.mover == -1).all()
+    assert np.isnan(early.truth.movers[:, 2]).all()
+
+
+def test_things_are_counted_after_all_others() -> None:
+    run = yard(crowd={"people": 3}, robot={"scans": 120})
+    assert run.truth.scene["mover_kinds"] == ["person"] * 3 + ["thing"] * 4
+    assert set(np.unique(run.truth.mover)) >= {3, 5}
+    assert (run.truth.mover < 7).all()
+
+
+def test_everybody_keeps_clear_of_every_place() -> None:
+    """At both ends of its way a thing is in the way throughout, also while it is not there."""
+    wide = tuple(box(0, 0, 9.0, 0.2))
+    later = Thing(wide, (Stay(0.0, 0.0, since=1e6),))
+    walls, route = tuple(box(0, 0, 10, 10)), ((0.0, -3.0), (0.0, 3.0))
+    scene = Scene(name="yard", walls=walls, route=route, things=(later,))
+    changes = {"crowd": {"people": 8}, "robot": {"scans": 400, "speed": 1.0}}
+    short = Thing(wide[:1], later.stays)
+    for things in ((later,), (short,)):
+        run = simulate(replaced(Scene(**{**vars(scene), "things": things}), changes), 1)
+        everybody = [run.truth.T_world_base[:, None, :2, 2], run.truth.movers[:, :8, :2]]
+        for face in Things(things).everywhere():
+            for xy in everybody:
+                assert distance_to_segment(xy, face).min() > 0.2
+
+
+def test_places_and_times_are_part_of_the_truth() -> None:
+    told = json.loads(json.dumps(yard(robot={"scans": 5}).truth.scene, allow_nan=False))
+    assert told["things"][1]["stays"] == [
+        {"x": 0.0, "y": 3.0, "yaw": 0.0, "since": 0.0, "until": 30.0}
+    ]
+    assert len(told["things"][0]["faces"]) == 4
+
+
+def test_stays_come_one_after_the_other() -> None:
+    with pytest.raises(ValueError, match="one after the other"):
+        Thing(CRATE, (Stay(0, 0, until=5.0), Stay(1, 0, since=4.0)))
+    with pytest.raises(ValueError, match="one after the other"):
+        Thing(CRATE, (Stay(0, 0), Stay(1, 0, since=4.0)))
+    with pytest.raises(ValueError, match="end after"):
+        Stay(0, 0, since=3.0, until=3.0)
+    with pytest.raises(ValueError, match="faces"):
+        Thing((), (Stay(0, 0),))
+
+
+def paused(pause: float, **changes: dict[str, object]) -> Simulation:
+    robot = {"scans": 300, "speed": 0.5, "pause_at": 20.0, "pause": pause}
+    return simulate(scene_by_name("hall", {"robot": robot, "laser": {"beams": 60}, **changes}), 4)
+
+
+def test_a_pause_is_a_leap_of_the_stamps_and_of_nothing_else() -> None:
+    run = paused(28_800.0)
+    gaps = np.diff(run.recording.stamp_ns)
+    first = run.truth.scene["paused_at_scan"]
+    assert first == 100
+    assert gaps[first - 1] == pytest.approx(28_800.2e9)
+    np.testing.assert_array_equal(np.delete(gaps, first - 1), 200_000_000)
+    T, odometry = run.truth.T_world_base, run.recording.T_odom_base
+    assert odometry is not None
+    for poses in (T, odometry):
+        way = np.hypot(*np.diff(poses[:, :2, 2], axis=0).T)
+        assert way.max() < 0.11
+
+
+def test_nobody_is_where_he_was_before_the_pause() -> None:
+    run, carries_on = paused(28_800.0), paused(0.0)
+    np.testing.assert_array_equal(run.truth.movers[:100], carries_on.truth.movers[:100])
+    way = np.hypot(*np.diff(run.truth.movers[..., :2], axis=0).transpose(2, 0, 1))
+    assert np.median(way[99]) > 2.0
+    assert np.delete(way, 99, axis=0).max() < 0.5
+
+
+def test_without_a_pause_nothing_is_told_of_one() -> None:
+    run = simulate(scene_by_name("hall", {"robot": {"scans": 5}}), 4)
+    assert run.truth.scene["paused_at_scan"] is None
+    late = simulate(scene_by_name("hall", {"robot": {"scans": 5, "pause_at": 20.0}}), 4)
+    assert late.truth.scene["paused_at_scan"] is None
+    np.testing.assert_array_equal(run.recording.points, late.recording.points)
+
+
+def test_nothing_goes_on_evenly_through_a_pause() -> None:
+    """The beams of the last scan before it meet people where they were then."""
+    still = paused(0.0, laser={"beams": 60, "sweep_time": 0.2, "range_noise": 0.0})
+    run = paused(3600.0, laser={"beams": 60, "sweep_time": 0.2, "range_noise": 0.0})
+    ranges = [np.hypot(*r.recording.points.T).reshape(300, 60) for r in (still, run)]
+    np.testing.assert_array_equal(ranges[0][:99], ranges[1][:99])
+    off = np.abs(ranges[0][99] - ranges[1][99])
+    assert np.mean(off > 0.1) < 0.1
+    scan = np.repeat(np.arange(300), 60)
+    hit = (run.truth.mover >= 0) & np.isin(scan, [99, 100])
+    T = run.recording.T_map_sensor(run.truth.T_world_base)[scan[hit]]
+    xy = np.einsum("nij,nj->ni", T[:, :2, :2], run.recording.points[hit]) + T[:, :2, 2]
+    centre = run.truth.movers[scan[hit], run.truth.mover[hit], :2]
+    assert hit.any()
+    assert np.hypot(*(xy - centre).T).max() < 0.48 + 0.2 * 1.6
+
+
+def test_what_changes_overnight_follows_the_clock() -> None:
+    night = Thing(CRATE, (Stay(2.0, 1.0, until=4 * 3600.0),))
+    run = yard((night,), robot={"pause_at": 20.0})
+    np.testing.assert_array_equal(np.isnan(run.truth.movers[:, 0, 0]), np.arange(200) >= 100)
+
+
+def test_odometry_goes_on_after_a_pause() -> None:
+    run = paused(28_800.0)
+    assert run.recording.T_odom_base is not None
+    true, got = (
+        se2.parameters(se2.inverse(T[:-1]) @ T[1:])
+        for T in (run.truth.T_world_base, run.recording.T_odom_base)
+    )
+    np.testing.assert_allclose(got[99], true[99], atol=0.02)

@@ -1,0 +1,163 @@
+"""The worlds: truth holds in all of them, with any sensor, and the empty ones are empty."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stillmap.sim import SCENES, Simulation, scene_by_name, simulate
+
+Float = NDArray[np.float64]
+Distance = Callable[[Float, Float], Float]
+EndPoints = Callable[[Simulation], tuple[Float, NDArray[np.int64]]]
+
+BARE = [name for name in SCENES if name.endswith("-empty")]
+
+
+def kinds(simulation: Simulation) -> NDArray[np.str_]:
+    return np.array(simulation.truth.scene["mover_kinds"])
+
+
+def test_there_is_an_empty_version_of_every_world() -> None:
+    worlds = {name for name in SCENES if not name.endswith(("-empty", "-crowd"))}
+    assert {name.removesuffix("-empty") for name in BARE} == worlds
+    assert {name.removesuffix("-crowd") for name in SCENES if "-crowd" in name} < worlds
+
+
+@pytest.mark.parametrize("name", BARE)
+def test_empty_worlds_have_no_movers_but_things_whose_time_comes_later(name: str) -> None:
+    changes = {"robot": {"scans": 60}, "laser": {"beams": 90}}
+    run = simulate(scene_by_name(name, changes), 1)
+    assert (run.truth.mover == -1).all()
+    things = len(run.scene.things)
+    assert (things > 0) == ("-moved" in name)
+    assert run.truth.movers.shape == (60, things, 3)
+    assert run.truth.scene["mover_kinds"] == ["thing"] * things
+    np.testing.assert_array_equal(run.truth.static, run.recording.hit)
+
+
+def test_crowds_are_crowds() -> None:
+    assert scene_by_name("hall-crowd").crowd.people == 60
+    assert scene_by_name("corridor-crowd").crowd.people == 40
+    assert scene_by_name("hall-crowd").walls == scene_by_name("hall").walls
+
+
+@pytest.mark.parametrize("name", [n for n in SCENES if not n.endswith(("-empty", "-crowd"))])
+@pytest.mark.parametrize(
+    ("beams", "degrees", "noise", "max_range"), [(1440, 360, 0.05, 5.0), (181, 90, 0.01, 80.0)]
+)
+def test_every_world_with_extreme_sensors(
+    name: str, beams: int, degrees: int, noise: float, max_range: float
+) -> None:
+    laser = {
+        "beams": beams, "fov": math.radians(degrees), "range_noise": noise, "max_range": max_range,
+    }  # fmt: skip
+    run = simulate(scene_by_name(name, {"laser": laser, "robot": {"scans": 8}}), 1)
+    assert run.recording.n_beams == 8 * beams
+    ranges = np.hypot(*run.recording.points.T)
+    assert ranges[run.recording.hit].max() < max_range
+    assert run.recording.hit.any()
+    np.testing.assert_allclose(ranges[~run.recording.hit], max_range, rtol=1e-6)
+
+
+def test_static_hits_lie_on_what_stands_still(
+    world: Simulation, end_points: EndPoints, wall_distance: Distance
+) -> None:
+    xy, _ = end_points(world)
+    static = np.flatnonzero(world.truth.static)
+    some = static[:: max(1, len(static) // 2000)]
+    assert wall_distance(xy[some], world.truth.walls).max() < 1e-4
+
+
+def test_hits_on_movers_lie_on_that_mover(world: Simulation, end_points: EndPoints) -> None:
+    xy, scan = end_points(world)
+    truth = world.truth
+    hit = np.flatnonzero(truth.mover >= 0)
+    x, y, heading = truth.movers[scan[hit], truth.mover[hit]].T
+    c, s = np.cos(heading), np.sin(heading)
+    dx, dy = xy[hit, 0] - x, xy[hit, 1] - y
+    ahead, aside = np.abs(c * dx + s * dy), np.abs(c * dy - s * dx)
+    kind = kinds(world)[truth.mover[hit]]
+    assert np.hypot(ahead, aside)[kind == "person"].max() < 0.48
+    # a leaf is a line through its middle
+    assert aside[kind == "door"].max(initial=0.0) < 1e-4
+    assert ahead[kind == "door"].max(initial=0.0) < 0.48 + 1e-4
+    for name, (length, width), spread in (
+        ("car", (4.4, 1.8), (5.6 * 1.06, 2.0 * 1.06)),
+        ("forklift", (2.4, 1.2), (2.4 * 1.06, 1.2 * 1.06)),
+    ):
+        u, v = ahead[kind == name], aside[kind == name]
+        assert u.max(initial=0.0) < spread[0] / 2 + 1e-4
+        assert v.max(initial=0.0) < spread[1] / 2 + 1e-4
+        # on the outline, not within it
+        assert np.all((u > 0.94 * length / 2 - 1e-4) | (v > 0.94 * width / 2 - 1e-4))
+
+
+def test_whoever_moves_is_not_labelled_static(world: Simulation) -> None:
+    truth = world.truth
+    np.testing.assert_array_equal(world.recording.hit, truth.static | (truth.mover >= 0))
+    moved = np.ptp(truth.movers, axis=0).max(axis=1) > 1e-6
+    assert truth.movers.shape[1] == len(kinds(world))
+    met = np.unique(truth.mover[truth.mover >= 0])
+    assert moved[met].all()
+    still = len(truth.walls) - len(world.scene.walls) - len(world.scene.glass)
+    stays = kinds(world)[~moved]
+    assert still == np.sum(stays == "door") + 4 * np.sum((stays == "car") | (stays == "forklift"))
+
+
+def test_what_each_world_is_for(run: Callable[[str], Simulation]) -> None:
+    shares = {}
+    for name, kind in (
+        ("office", "door"), ("warehouse", "forklift"), ("street", "car"), ("street-turn", "car"),
+        ("drive", "car"),
+    ):  # fmt: skip
+        world = run(name)
+        met = world.truth.mover[world.recording.hit]
+        shares[name] = np.isin(met, np.flatnonzero(kinds(world) == kind)).mean()
+        assert np.isin(met, np.flatnonzero(kinds(world) == "person")).any(), name
+    assert shares["office"] > 0.02
+    assert shares["warehouse"] > 0.0003  # its far end
+    assert shares["street"] > 0.05
+    assert shares["street-turn"] > 0.05
+    assert shares["drive"] > 0.05
+
+
+def test_waiting_cars_stand_still_while_in_view_and_drive_on_later(
+    run: Callable[[str], Simulation],
+) -> None:
+    world = run("street-turn")
+    truth, queues = world.truth, [lane for lane in world.scene.lanes if lane.waiting]
+    people = world.scene.crowd.people
+    waiting = people + np.arange(sum(lane.waiting for lane in queues))
+    scan = np.repeat(np.arange(world.recording.n_scans), np.diff(world.recording.offset))
+    seen = 0
+    for car in waiting:
+        poses = truth.movers[:, car]
+        stands = np.all(poses == poses[0], axis=1)
+        assert not stands[-1]
+        hits = scan[truth.mover == car]
+        seen += len(hits)
+        assert stands[hits].all()
+        assert np.all(np.diff(stands.astype(int)) <= 0)
+    assert seen > 300
+
+
+def test_the_robot_meets_nobody(world: Simulation) -> None:
+    robot, radius = world.truth.T_world_base[:, :2, 2], world.scene.robot.radius
+    off = np.hypot(*np.moveaxis(world.truth.movers[..., :2] - robot[:, None], -1, 0))
+    kind = kinds(world)
+    least = {"person": radius + 0.25, "door": 0.0, "car": radius + 0.9, "forklift": radius + 0.6}
+    for k, name in enumerate(kind.tolist()):
+        assert off[:, k].min() > least[name], name
+
+
+def test_people_keep_off_the_road(run: Callable[[str], Simulation]) -> None:
+    world = run("street")
+    people = world.truth.movers[:, kinds(world) == "person", 1]
+    assert np.abs(people).min() > 9.4 + 0.24
+    assert (people > 0).any()
+    assert (people < 0).any()
+    cars = world.truth.movers[:, kinds(world) == "car", 1]
+    assert np.abs(cars).max() < 7.0

@@ -1,0 +1,118 @@
+"""Things that are made up: whose each point is."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from made_up_ways import OPTIONS, one_each, watched
+
+from stillmap.tracking.association import followed
+from stillmap.tracking.tracklets import linked
+
+
+def found(points, options=OPTIONS):
+    return linked(points, followed(points, options), options)
+
+
+def straight(x, y, vx, vy):
+    return lambda t: (x + vx * t, y + vy * t)
+
+
+def test_one_thing_that_walks():
+    points, who = watched([straight(2, 1, 1.2, 0.1)])
+    assert one_each(followed(points, OPTIONS), who)
+    assert one_each(found(points), who)
+
+
+@pytest.mark.parametrize("apart", [0.8, 1.5])
+def test_two_that_walk_beside_one_another(apart):
+    points, who = watched([straight(2, 1, 1.0, 0.3), straight(2, 1 + apart, 1.0, 0.3)])
+    assert one_each(found(points), who)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_that_cross(seed):
+    # 0.4 m past one another
+    ways = [straight(3, -4, 0.0, 1.1), straight(7.0, 0.4, -1.1, 0.0)]
+    points, who = watched(ways, seed=seed)
+    assert one_each(found(points), who)
+
+
+def test_one_that_is_hidden_for_a_while():
+    way = straight(3, -4, 0.1, 1.0)
+    for hidden in (0.6, 1.4, 2.4):
+        points, who = watched([way], lambda _, t, hidden=hidden: not 3.0 < t < 3.0 + hidden)
+        assert one_each(found(points), who)
+
+
+def test_one_that_is_hidden_for_long_is_another():
+    points, _ = watched([straight(3, -4, 0.1, 1.0)], lambda _, t: not 2.0 < t < 6.0)
+    assert len(np.unique(found(points))) == 2
+
+
+def test_who_comes_out_from_behind_one_that_stands():
+    # the walker appears half a metre beside who stands there, and is one with it for a while
+    stands = straight(3.0, 0.0, 0.0, 0.0)
+    points, who = watched([stands, straight(3.2, -2.35, 0.0, 0.7)], lambda i, t: i == 0 or t > 2.7)
+    near = np.linalg.norm(points.xy[who == 1][0] - [3.0, 0.0])
+    assert near < 0.6
+    owner = found(points)
+    first = owner[(who == 0) & (points.scan == 0)][0]
+    assert (owner[who == 0] == first).mean() > 0.97
+    walker = owner[who == 1]
+    numbers, count = np.unique(walker[walker != first], return_counts=True)
+    assert count.max() > 0.9 * len(walker)
+    assert len(numbers) == 1
+
+
+def test_legs_are_one_thing():
+    # 0.5 m apart at most, and each hides the other at times
+    def leg(side):
+        return lambda t: (2 + 0.9 * t + side * 0.24 * np.sin(5.0 * t), 1.0 + side * 0.09)
+
+    def visible(i, t):
+        return (t * 2.3 + 0.5 * i) % 1.0 < 0.75
+
+    points, _ = watched([leg(1.0), leg(-1.0)], visible, points=2, radius=0.06)
+    owner = found(points)
+    assert len(np.unique(owner)) == 1
+
+
+def test_a_long_thing_is_one():
+    def part(dx):
+        return straight(-8 + dx, 6, 2.5, 0.0)
+
+    points, _ = watched([part(dx) for dx in np.arange(0.0, 4.0, 0.5)], points=4, radius=0.2)
+    assert len(np.unique(found(points))) == 1
+
+
+def test_what_is_seen_too_shortly_is_nothing():
+    points, _ = watched([straight(2, 1, 1.0, 0.0)], lambda _, t: t < 0.45)
+    assert (found(points) == -1).all()
+    patient = dataclasses.replace(OPTIONS, least_scans=2, least_seconds=0.3)
+    assert (found(points, patient) == 0).all()
+
+
+def test_many_things_each_get_their_own():
+    rng = np.random.default_rng(5)
+    start = np.array([(x, y) for x in range(3, 15, 3) for y in range(-9, 10, 3)], float)
+    speed = rng.uniform(-0.15, 0.15, start.shape)
+    ways = [straight(*p, *v) for p, v in zip(start, speed, strict=True)]
+    points, who = watched(ways, seconds=6.0)
+    assert one_each(found(points), who)
+
+
+def test_turned_and_moved_worlds_give_the_same():
+    ways = [straight(3, -4, 0.2, 1.1), straight(7.0, 0.4, -1.1, 0.1), straight(4, 3, 0.4, -0.8)]
+    points, _ = watched(ways)
+    c, s = np.cos(0.7), np.sin(0.7)
+    turned = points.xy @ np.array([[c, s], [-s, c]]) + [100.0, -50.0]
+    other = dataclasses.replace(points, xy=turned)
+    np.testing.assert_array_equal(found(other), found(points))
+
+
+def test_time_that_stands_still_is_no_trouble():
+    points, _ = watched([straight(2, 1, 0.2, 0.1)], seconds=3.0)
+    same = dataclasses.replace(points, seconds=np.zeros_like(points.seconds))
+    assert (followed(same, OPTIONS) == 0).all()
+    assert (found(same) == -1).all()  # nothing lasts
