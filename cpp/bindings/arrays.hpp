@@ -7,11 +7,11 @@
 #include <stdexcept>
 #include <string>
 
-#include "stillmap/beams.hpp"
+#include "stillmap/occupancy/beam_counting.hpp"
 
 namespace nb = nanobind;
 
-namespace stillmap::border {
+namespace stillmap::bindings {
 
 template <int D>
 using Points = nb::ndarray<const float, nb::numpy, nb::shape<-1, D>, nb::c_contig, nb::device::cpu>;
@@ -100,4 +100,4 @@ inline void require_probability(double p, const char* name) {
   require(p >= 0.0 && p <= 1.0, std::string(name) + ": expected a probability in [0, 1]");
 }
 
-}  // namespace stillmap::border
+}  // namespace stillmap::bindings

@@ -9,10 +9,10 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
-#include "box.hpp"
-#include "stillmap/grid.hpp"
+#include "cell_box.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
 
-namespace stillmap::border {
+namespace stillmap::bindings {
 namespace {
 
 template <int D>
@@ -172,4 +172,4 @@ void bind_grid(nb::module_& m) {
         "lengths (K,) in cells.");
 }
 
-}  // namespace stillmap::border
+}  // namespace stillmap::bindings

@@ -4,9 +4,9 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
-#include "stillmap/z_buffer.hpp"
+#include "stillmap/mesh/z_buffer.hpp"
 
-namespace stillmap::border {
+namespace stillmap::bindings {
 namespace {
 
 using Faces =
@@ -65,4 +65,4 @@ void bind_z_buffer(nb::module_& m) {
         "what is less than `near` metres ahead is not seen; faces have two sides.");
 }
 
-}  // namespace stillmap::border
+}  // namespace stillmap::bindings

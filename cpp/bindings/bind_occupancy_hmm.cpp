@@ -1,0 +1,306 @@
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <array>
+#include <limits>
+#include <optional>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "stillmap/occupancy/occupancy_hmm.hpp"
+
+namespace stillmap::bindings {
+namespace {
+
+template <int D>
+void add_end_points(Surface<D>& surface, const Points<D>& points, const Flat<bool>& hit,
+                    const Flat<int64_t>& offset, const Poses<D>& poses,
+                    const std::optional<Flat<int64_t>>& look, int threads) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  require(!look || look->shape(0) == scans.n_scans, "look: expected one number per scan");
+  for (size_t t = 0; look && t < scans.n_scans; ++t)
+    require(look->data()[t] >= 0 && look->data()[t] <= kLastLook, "look: out of range");
+  nb::gil_scoped_release released;
+  surface.add(scans, look ? look->data() : nullptr, threads);
+}
+
+// (E, 2) first and last look
+template <int D>
+auto spans(const Surface<D>& surface) {
+  std::vector<int32_t> out;
+  for (const Span& span : surface.hits()) out.insert(out.end(), {span.first, span.last});
+  const size_t n = surface.hits().size();
+  return owned(std::move(out), {n, 2});
+}
+
+template <int D>
+auto elements(const Surface<D>& surface, const Points<D>& points, const Flat<bool>& hit,
+              const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  std::vector<int32_t> out(points.shape(0));
+  {
+    nb::gil_scoped_release released;
+    elements_of<D>(surface, scans, threads, out.data());
+  }
+  const size_t n = out.size();
+  return owned(std::move(out), {n});
+}
+
+// Some of the elements: first, first + every, ..., n of them.
+struct Rows {
+  size_t first = 0, every = 1, n = 0;
+};
+using Slice = std::array<int64_t, 3>;  // first, last, every
+
+inline Rows rows_from(const std::optional<Slice>& rows, size_t size) {
+  if (!rows) return {0, 1, size};
+  const auto [first, last, every] = *rows;
+  require(0 <= first && first <= last && last <= static_cast<int64_t>(size) && every > 0,
+          "rows: expected some of the elements");
+  return {static_cast<size_t>(first), static_cast<size_t>(every),
+          static_cast<size_t>((last - first + every - 1) / every)};
+}
+
+// cells, means and normals (E, D), distances from the plane and beams (E,)
+template <int D>
+auto describe(const Surface<D>& surface, const std::optional<Slice>& rows) {
+  require(surface.fitted(), "surface: fit it first");
+  const auto [first, every, n] = rows_from(rows, surface.size());
+  const auto d = static_cast<size_t>(D);
+  std::vector<int64_t> cells(n * d), beams(n);
+  std::vector<double> means(n * d), normals(n * d), off_plane(n), prominence(n);
+  for (size_t i = 0; i < n; ++i) {
+    const auto k = static_cast<int32_t>(first + i * every);
+    for (int a = 0; a < D; ++a) {
+      const size_t at = i * d + static_cast<size_t>(a);
+      cells[at] = surface.cell(k)[a];
+      means[at] = surface.element(k).mean[a] * surface.resolution();
+      normals[at] = surface.element(k).normal[a];
+    }
+    beams[i] = surface.beams(k);
+    prominence[i] = surface.element(k).prominence;
+    off_plane[i] = surface.element(k).off_plane * surface.resolution();
+  }
+  return std::make_tuple(owned(std::move(cells), {n, d}), owned(std::move(means), {n, d}),
+                         owned(std::move(normals), {n, d}), owned(std::move(off_plane), {n}),
+                         owned(std::move(prominence), {n}), owned(std::move(beams), {n}));
+}
+
+template <int D>
+void add_looks(Dwell<D>& dwell, const Points<D>& points, const Flat<bool>& hit,
+               const Flat<int64_t>& offset, const Poses<D>& poses, const Flat<int64_t>& look,
+               int threads, const std::optional<Places<D>>& place) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  require(look.shape(0) == scans.n_scans, "look: expected one number per scan");
+  require(!place || place->shape(0) == scans.n_scans, "place: expected one per scan");
+  nb::gil_scoped_release released;
+  dwell.add(scans, look.data(), place ? place->data() : nullptr, threads);
+}
+
+template <int D>
+auto likelihoods(Dwell<D>& dwell, const std::optional<Flat<bool>>& among,
+                 const std::optional<Slice>& rows, int threads) {
+  std::vector<size_t> classes;
+  require(!among || among->shape(0) == dwell.classes(), "among: expected one per class");
+  for (size_t c = 0; c < dwell.classes(); ++c)
+    if (!among || among->data()[c]) classes.push_back(c);
+  require(!classes.empty(), "among: expected a class");
+  const auto [first, every, n] = rows_from(rows, dwell.surface().size());
+  const size_t C = classes.size();
+  std::vector<float> relative(n * C);
+  std::vector<double> log_best(n);
+  {
+    nb::gil_scoped_release released;
+    dwell.likelihood(classes, first, every, n, threads, relative.data(), log_best.data());
+  }
+  return std::make_tuple(owned(std::move(relative), {n, C}), owned(std::move(log_best), {n}));
+}
+
+// Of every element, see the docstring of `changes` below.
+template <int D>
+auto describe_changes(const Dwell<D>& dwell, const std::optional<Slice>& rows) {
+  const Changes& changes = dwell.changes();
+  require(changes.has_courses(), "changes: nobody asked for courses");
+  const auto [first, every, n] = rows_from(rows, changes.members());
+  std::vector<double> log_likelihood(n);
+  std::vector<float> p_last(n * 2), share(n);
+  std::vector<int32_t> count(n * 2), looks(n * 8);
+  {
+    nb::gil_scoped_release released;
+    for (size_t i = 0; i < n; ++i) {
+      const size_t k = first + i * every;
+      const Course& course = changes.course(k);
+      log_likelihood[i] = changes.log_likelihood(k);
+      share[i] = changes.occupied_share(k);
+      p_last[2 * i] = changes.p_at_last(k, Changes::kThing);
+      p_last[2 * i + 1] = 1.0f - changes.p_at_last(k, Changes::kNothing);
+      for (const auto& [turns, j] : {std::pair{&course.things, 2 * i}, {&course.any, 2 * i + 1}}) {
+        count[j] = turns->count;
+        looks[4 * j] = turns->first.before;
+        looks[4 * j + 1] = turns->first.after;
+        looks[4 * j + 2] = turns->last.before;
+        looks[4 * j + 3] = turns->last.after;
+      }
+    }
+  }
+  return std::make_tuple(owned(std::move(log_likelihood), {n}), owned(std::move(share), {n}),
+                         owned(std::move(p_last), {n, 2}), owned(std::move(count), {n, 2}),
+                         owned(std::move(looks), {n, 2, 2, 2}));
+}
+
+template <int D>
+auto log_changing(const Dwell<D>& dwell, const std::optional<Slice>& rows) {
+  const Changes& changes = dwell.changes();
+  const auto [first, every, n] = rows_from(rows, changes.members());
+  std::vector<double> values(n);
+  for (size_t i = 0; i < n; ++i) values[i] = changes.log_likelihood(first + i * every);
+  return owned(std::move(values), {n});
+}
+
+template <int D>
+auto lost_beams(const Dwell<D>& dwell, const Points<D>& points, const Flat<bool>& hit,
+                const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  nb::gil_scoped_release released;
+  const Lost lost = dwell.lost(scans, threads);
+  return std::make_tuple(lost.beams, lost.through_solid);
+}
+
+template <int D>
+auto solid_cells(const Dwell<D>& dwell) {
+  std::vector<int64_t> out;
+  for (const Cell<D>& cell : dwell.solid()) out.insert(out.end(), cell.data(), cell.data() + D);
+  const size_t n = out.size() / D;
+  return owned(std::move(out), {n, static_cast<size_t>(D)});
+}
+
+DwellClasses checked_classes(std::vector<double> rho, std::vector<double> tau,
+                             std::vector<double> turn, double detection) {
+  if (turn.empty()) turn.assign(rho.size(), std::numeric_limits<double>::infinity());
+  require(!rho.empty() && rho.size() == tau.size() && rho.size() == turn.size(),
+          "rho, tau, turn: expected one number per class");
+  require(rho.size() <= kMaxClasses, "rho, tau, turn: too many classes");
+  for (const double r : rho) require(r > 0.0 && r < 1.0, "rho: expected shares between 0 and 1");
+  for (const double t : tau) require(t > 0.0, "tau: expected positive times");
+  for (const double v : turn) require(v > 0.0, "turn: expected positive angles");
+  require(detection > 0.0 && detection < 1.0, "detection: expected a probability below 1");
+  return {std::move(rho), std::move(tau), std::move(turn), detection};
+}
+
+template <int D>
+void bind(nb::module_& m, const char* surface, const char* dwell) {
+  using S = Surface<D>;
+  nb::class_<S>(m, surface, "One element of surface per cell in which beams ended.")
+      .def(nb::init<double>(), nb::arg("resolution"))
+      .def_prop_ro("resolution", &S::resolution, "metres")
+      .def_prop_ro("dimension", [](const S&) { return D; })
+      .def_prop_ro("size", &S::size, "number of elements")
+      .def_prop_ro(
+          "scatter", [](const S& s) { return s.scatter() * s.resolution(); },
+          "metres: standard deviation of end points across surfaces; 0 before `fit`")
+      .def("add_end_points", &add_end_points<D>, nb::arg("points").noconvert(),
+           nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
+           nb::arg("T_map_sensor").noconvert(), nb::arg("look").noconvert() = nb::none(),
+           nb::arg("threads") = 1,
+           "Notes where beams ended, and in which looks (T,) int64 where all calls say so.")
+      .def_prop_ro("spans", &spans<D>, nb::rv_policy::move,
+                   "(E, 2) int32: first and last look at which beams ended in the cell of each "
+                   "element, once it is fitted; (0, 2) where nobody said.")
+      .def("fit", &S::fit, nb::arg("threads") = 1, nb::call_guard<nb::gil_scoped_release>(),
+           "Means, normals and scatter from all end points; none can be added any more.")
+      .def("elements", &describe<D>, nb::arg("rows") = nb::none(),
+           "cells (E, D) int64, means (E, D) in metres, normals (E, D) (zero: none), distance (E,) "
+           "of the cell's centre from the surface around it in metres (zero: none), prominence "
+           "(E,): its beams against those of the richest cell around, beams (E,). rows (first, "
+           "last, every): of some of the elements.")
+      .def("elements_of", &elements<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
+           nb::arg("threads") = 1, "(M,) int32: the element in which each beam ended, -1: none.");
+  using W = Dwell<D>;
+  nb::class_<W>(m, dwell,
+                "Likelihood of what was seen of each element, per class: occupied for a share rho, "
+                "correlated over tau seconds and over turn radians of the view (inf or none given: "
+                "however it turns).")
+      .def(
+          "__init__",
+          [](W* self, const S& s, std::vector<double> rho, std::vector<double> tau,
+             std::vector<double> turn, double detection, double seconds, double lateral,
+             double margin, double reach, double beyond, bool normals, int threads) {
+            for (const double x : {seconds, lateral, margin, reach, beyond})
+              require(x > 0.0 && std::isfinite(x), "looks: expected positive lengths and times");
+            const double r = s.resolution();
+            new (self)
+                W(s, checked_classes(std::move(rho), std::move(tau), std::move(turn), detection),
+                  {seconds, lateral / r, margin / r, reach / r, beyond / r, 1.0, normals}, threads);
+          },
+          nb::arg("surface"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"),
+          nb::arg("turn") = std::vector<double>{}, nb::arg("detection"), nb::arg("seconds"),
+          nb::arg("lateral"), nb::arg("margin"), nb::arg("reach"), nb::arg("beyond"),
+          nb::arg("normals") = true, nb::arg("threads") = 1, nb::keep_alive<1, 2>())
+      .def("add", &add_looks<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
+           nb::arg("look").noconvert(), nb::arg("threads") = 1,
+           nb::arg("place").noconvert() = nb::none(),
+           "Adds scans; look (T,) int64 numbers their looks and must not fall. All scans of one "
+           "look belong into one call. place (T, D): where the robot stood, metres; without, the "
+           "sensors' places are asked how far the view turned.")
+      .def("lost", &lost_beams<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
+           nb::arg("threads") = 1,
+           "Beams without a return that have such beams beside them, and how many of these cross "
+           "something solid.")
+      .def("solid", &solid_cells<D>,
+           "(S, D) int64 cells of surfaces on which many beams ended: the solid things.")
+      .def(
+          "trust",
+          [](W& w, double open) {
+            require(open >= 0.0 && open <= 1.0, "open: expected a share between 0 and 1");
+            w.trust(open);
+          },
+          nb::arg("open"),
+          "How far to trust beams without a return beyond the first solid thing in their way; all "
+          "the way at first.")
+      .def(
+          "watch",
+          [](W& w, double tau, double passing_occupied, double passing_tau, double detection,
+             bool courses) {
+            for (const double t : {tau, passing_tau})
+              require(t > 0.0 && std::isfinite(t), "tau: expected positive times");
+            for (const double p : {passing_occupied, detection})
+              require(p > 0.0 && p < 1.0, "expected probabilities between 0 and 1");
+            w.watch({tau, passing_occupied, passing_tau, detection}, courses);
+          },
+          nb::kw_only(), nb::arg("tau"), nb::arg("passing_occupied"), nb::arg("passing_tau"),
+          nb::arg("detection"), nb::arg("courses") = true,
+          "Asks, before the first look, which elements are of things that come to stay or leave: "
+          "correlation time in seconds; share of the time and correlation time of passers-by. "
+          "Without courses only `log_changing` is known of them.")
+      .def("log_changing", &log_changing<D>, nb::arg("rows") = nb::none(),
+           "(E,) the first of `changes`.")
+      .def("rest", &W::rest, "Lets go what only further looks would want; they make it anew.")
+      .def(
+          "changes", &describe_changes<D>, nb::arg("rows") = nb::none(),
+          "Of each element: (E,) logarithm of the likelihood of everything else that was seen, if "
+          "things come to stay and leave; of the most probable course (E,) float32 share of the "
+          "time in which it was not empty. Then, for things alone and for anything that was there: "
+          "(E, 2) float32 probability of it at the last look; (E, 2) int32 how often it came or "
+          "left; (E, 2, 2, 2) int32 looks before and after the first and the last time, -1: none. "
+          "rows (first, last, every): of some of the elements.")
+      .def("likelihood", &likelihoods<D>, nb::arg("among") = nb::none(),
+           nb::arg("rows") = nb::none(), nb::arg("threads") = 1,
+           "(E, C) float32 relative to the best class, (E,) logarithm of the best: of everything "
+           "else that was seen of the cell, given that a beam ended in it; under those of the "
+           "classes (bool, one per class) alone, as if there were no others. rows (first, last, "
+           "every): of some of the elements.");
+}
+
+}  // namespace
+
+void bind_occupancy_hmm(nb::module_& m) {
+  bind<2>(m, "Surface2D", "Dwell2D");
+  bind<3>(m, "Surface3D", "Dwell3D");
+}
+
+}  // namespace stillmap::bindings

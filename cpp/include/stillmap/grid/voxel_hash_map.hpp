@@ -1,0 +1,104 @@
+// Something for each cell that was ever asked for, in one table that can shed cells again.
+#pragma once
+
+#include <cstdint>
+#include <stdexcept>
+#include <utility>
+#include <vector>
+
+#include "stillmap/grid/occupancy_grid.hpp"
+
+namespace stillmap {
+
+// Open addressing with linear probing. Nothing is taken out singly: what is to go goes with a new
+// table, so that probing needs no tombstones and values keep the order in which they came.
+template <int D, class Value>
+class VoxelTable {
+ public:
+  // coordinates beyond would share keys
+  static constexpr int32_t kMaxCell = 1 << 20;
+
+  size_t size() const { return values_.size(); }
+  const Cell<D>& cell(size_t k) const { return cells_[k]; }
+  const Value& value(size_t k) const { return values_[k]; }
+
+  const Value* find(const Cell<D>& cell) const {
+    if (values_.empty()) return nullptr;
+    const uint64_t key = Grid<D>::key(cell);
+    for (size_t slot = hash_(key) & mask();; slot = (slot + 1) & mask()) {
+      const Slot& s = slots_[slot];
+      if (s.place < 0) return nullptr;
+      if (s.key == key) return &values_[static_cast<size_t>(s.place)];
+    }
+  }
+
+  // a new value is Value{}
+  Value& find_or_add(const Cell<D>& cell) {
+    for (int d = 0; d < D; ++d)
+      if (cell[d] <= -kMaxCell || cell[d] >= kMaxCell)
+        throw std::invalid_argument("point: too far away to be counted in cells");
+    if (2 * (values_.size() + 1) > slots_.size()) grow();
+    const uint64_t key = Grid<D>::key(cell);
+    Slot& s = slot_of(key);
+    if (s.place < 0) {
+      s = {key, static_cast<int32_t>(values_.size())};
+      cells_.push_back(cell);
+      values_.emplace_back();
+    }
+    return values_[static_cast<size_t>(s.place)];
+  }
+
+  // Keeps the cells that keep(cell) says.
+  template <class Keep>
+  void keep_if(Keep&& keep) {
+    size_t kept = 0;
+    for (size_t k = 0; k < values_.size(); ++k) {
+      if (!keep(cells_[k])) continue;
+      cells_[kept] = cells_[k];
+      values_[kept++] = std::move(values_[k]);
+    }
+    cells_.resize(kept);
+    values_.resize(kept);
+    size_t slots = kFewest;
+    while (slots < 4 * kept) slots *= 2;
+    place_all(slots);
+  }
+
+  size_t memory_bytes() const {
+    return values_.capacity() * sizeof(Value) + cells_.capacity() * sizeof(Cell<D>) +
+           slots_.capacity() * sizeof(Slot);
+  }
+
+ private:
+  static constexpr size_t kFewest = 64;
+
+  struct Slot {
+    uint64_t key = 0;
+    int32_t place = -1;  // in values_; -1: free
+  };
+
+  size_t mask() const { return slots_.size() - 1; }
+
+  Slot& slot_of(uint64_t key) {
+    size_t slot = hash_(key) & mask();
+    while (slots_[slot].place >= 0 && slots_[slot].key != key) slot = (slot + 1) & mask();
+    return slots_[slot];
+  }
+
+  void grow() { place_all(slots_.empty() ? kFewest : 2 * slots_.size()); }
+
+  void place_all(size_t slots) {
+    std::vector<Slot>(slots).swap(slots_);
+    for (size_t k = 0; k < cells_.size(); ++k) {
+      const uint64_t key = Grid<D>::key(cells_[k]);
+      slot_of(key) = {key, static_cast<int32_t>(k)};
+    }
+  }
+
+  typename Grid<D>::Hash hash_;
+  std::vector<Slot> slots_;
+  std::vector<Cell<D>> cells_;
+  std::vector<Value> values_;
+};
+
+}  // namespace stillmap

@@ -1,0 +1,289 @@
+// The places of a mesh that are nearest to points, on faces that are turned towards where these
+// were seen from.
+//
+// Faces lie in cells of several sizes, each in those a few of which span it: the larger a face, the
+// larger its cells. So the memory is bounded by the number of faces, whatever their sizes. A point
+// asks the cells of each size that are no farther off than the nearest place that it knows of.
+// Places on triangles: Ericson, Real-Time Collision Detection, 2005, Sect. 5.1.5.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <utility>
+#include <vector>
+
+#include "stillmap/grid/voxel_hash_map.hpp"
+#include "stillmap/util/parallel.hpp"
+
+namespace stillmap {
+
+struct NearPlaces {
+  std::vector<int32_t> face;   // -1: none is near
+  std::vector<double> weight;  // of its three corners
+};
+
+namespace near_faces {
+
+constexpr double kSliver = 1e-12;  // squared sine of the angle of a triangle without area
+constexpr double kLeast = 1e-300;
+
+using Triangle = std::array<Vec<3>, 3>;
+
+struct Foot {
+  std::array<double, 3> weight;
+  double square;  // of the distance to there
+};
+
+// in the order of the twin, so that both break ties alike
+inline double dot(const Vec<3>& a, const Vec<3>& b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+inline Vec<3> normal_of(const Triangle& t) {
+  const Vec<3> u = t[1] - t[0], v = t[2] - t[0];
+  return {u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]};
+}
+
+inline Foot at_weight(const Vec<3>& p, const Triangle& t, const std::array<double, 3>& w) {
+  double square = 0.0;
+  for (int d = 0; d < 3; ++d) {
+    const double off = p[d] - (w[0] * t[0][d] + w[1] * t[1][d] + w[2] * t[2][d]);
+    square += off * off;
+  }
+  return {w, square};
+}
+
+inline std::array<double, 3> on_edges(const Vec<3>& p, const Triangle& t) {
+  std::array<double, 3> weight{};
+  double least = std::numeric_limits<double>::infinity();
+  for (size_t first = 0; first < 3; ++first) {
+    const size_t second = (first + 1) % 3;
+    const Vec<3> along = t[second] - t[first], to = p - t[first];
+    const double share = std::clamp(dot(to, along) / std::max(dot(along, along), kLeast), 0.0, 1.0);
+    const Vec<3> left = to - share * along;
+    const double away = dot(left, left);
+    if (!(away < least)) continue;
+    least = away;
+    weight = {};
+    weight[first] = 1.0 - share, weight[second] = share;
+  }
+  return weight;
+}
+
+// The place of a triangle that is nearest to a point.
+inline Foot foot_of(const Vec<3>& p, const Triangle& t) {
+  const Vec<3> u = t[1] - t[0], v = t[2] - t[0], w = p - t[0];
+  const double uu = dot(u, u), uv = dot(u, v), vv = dot(v, v), wu = dot(w, u), wv = dot(w, v);
+  const double square = uu * vv - uv * uv;
+  if (square > kSliver * uu * vv) {
+    const double j = (vv * wu - uv * wv) / square, k = (uu * wv - uv * wu) / square;
+    if (j >= 0.0 && k >= 0.0 && j + k <= 1.0) return at_weight(p, t, {1.0 - j - k, j, k});
+  }
+  return at_weight(p, t, on_edges(p, t));
+}
+
+// Of the distance from a point to a box.
+inline double square_to_box(const Vec<3>& p, const Vec<3>& low, const Vec<3>& high) {
+  double square = 0.0;
+  for (int d = 0; d < 3; ++d) {
+    const double below = low[d] - p[d], above = p[d] - high[d];
+    const double more = below > above ? below : above, off = more > 0.0 ? more : 0.0;
+    square += off * off;
+  }
+  return square;
+}
+
+inline std::pair<Vec<3>, Vec<3>> bounds_of(const Triangle& t) {
+  Vec<3> low = t[0], high = t[0];
+  for (int d = 0; d < 3; ++d)
+    for (size_t i = 1; i < 3; ++i) {
+      low[d] = t[i][d] < low[d] ? t[i][d] : low[d];
+      high[d] = t[i][d] > high[d] ? t[i][d] : high[d];
+    }
+  return {low, high};
+}
+
+}  // namespace near_faces
+
+class NearFaces {
+ public:
+  // vertices (V, 3), faces (F, 3); reach: metres that a place may be away at most
+  NearFaces(const double* vertices, size_t V, const int32_t* faces, size_t F, double reach)
+      : reach_(reach), faces_(faces, faces + 3 * F) {
+    for (size_t i = 0; i < V; ++i)
+      vertices_.emplace_back(vertices[3 * i], vertices[3 * i + 1], vertices[3 * i + 2]);
+    for (const auto& at : vertices_) low_ = low_.cwiseMin(at), high_ = high_.cwiseMax(at);
+    edge_ = reach;
+    if (V) edge_ = std::max(edge_, (high_ - low_).maxCoeff() / kMostCells);
+    per_metre_ = 1.0 / edge_;
+    slack_ = kSlack * edge_;
+    put_in_cells();
+  }
+
+  double reach() const { return reach_; }
+  size_t size() const { return faces_.size() / 3; }
+
+  size_t memory_bytes() const {
+    size_t bytes = vertices_.capacity() * sizeof(Vec<3>) + faces_.capacity() * sizeof(int32_t);
+    for (const auto& level : levels_)
+      bytes += level.cells.memory_bytes() + level.faces.capacity() * sizeof(int32_t);
+    return bytes;
+  }
+
+  // points, origins (n, 3): where points are, and where each was seen from. Faces that have their
+  // back to there, or no area, do not count; of several at one distance the lowest number does.
+  NearPlaces nearest(const double* points, const double* origins, size_t n, int threads) const {
+    NearPlaces out{std::vector<int32_t>(n, -1), std::vector<double>(3 * n, 0.0)};
+    parallel_shares(even_shares(n, threads), [&](size_t, size_t first, size_t last) {
+      for (size_t i = first; i < last; ++i) {
+        const Vec<3> point(points + 3 * i), origin(origins + 3 * i);
+        Best best = {point, origin - point, -1, {{}, reach_ * reach_}, 0.0};
+        find(best);
+        out.face[i] = best.face;
+        std::copy_n(best.foot.weight.begin(), 3, out.weight.begin() + 3 * std::ptrdiff_t(i));
+      }
+    });
+    return out;
+  }
+
+ private:
+  static constexpr double kMostCells = 1 << 19;  // along an axis
+  static constexpr double kParts = 4.0;          // cells that a face is as long as, at most
+  static constexpr double kSlack = 1e-3;         // of a cell: more than is lost by rounding
+
+  struct Faces {
+    size_t first = 0, size = 0;  // among those of the level
+  };
+
+  struct Level {
+    int number;  // its cells are 2^number of the smallest ones long
+    double edge;
+    VoxelTable<3, Faces> cells;
+    std::vector<int32_t> faces;  // cell by cell, rising
+
+    Cell<3> cell_with(const Cell<3>& smallest) const {
+      return {smallest[0] >> number, smallest[1] >> number, smallest[2] >> number};
+    }
+  };
+
+  struct Best {
+    Vec<3> point, towards;  // where it was seen from, from there
+    int32_t face;
+    near_faces::Foot foot;
+    double farther;  // square of the distance beyond which nothing is nearer
+  };
+
+  near_faces::Triangle corners(int32_t face) const {
+    const int32_t* at = &faces_[3 * static_cast<size_t>(face)];
+    const auto vertex = [&](int i) { return vertices_[static_cast<size_t>(at[i])]; };
+    return {vertex(0), vertex(1), vertex(2)};
+  }
+
+  // the smallest one there
+  Cell<3> cell_at(const Vec<3>& place) const { return cell_of<3>((place - low_) * per_metre_); }
+
+  template <class Visit>
+  static void each_from_to(const Cell<3>& low, const Cell<3>& high, Visit&& visit) {
+    Cell<3> at;
+    for (at[2] = low[2]; at[2] <= high[2]; ++at[2])
+      for (at[1] = low[1]; at[1] <= high[1]; ++at[1])
+        for (at[0] = low[0]; at[0] <= high[0]; ++at[0]) visit(at);
+  }
+
+  void put_in_cells() {
+    std::vector<std::vector<int32_t>> of_level;
+    for (size_t f = 0; f < size(); ++f) {
+      const near_faces::Triangle t = corners(static_cast<int32_t>(f));
+      if (near_faces::normal_of(t).isZero(0.0)) continue;
+      const auto [low, high] = near_faces::bounds_of(t);
+      const double longest = (high - low).maxCoeff();
+      size_t level = 0;
+      for (double edge = edge_; kParts * edge < longest; edge *= 2.0) ++level;
+      if (of_level.size() <= level) of_level.resize(level + 1);
+      of_level[level].push_back(static_cast<int32_t>(f));
+    }
+    for (size_t k = 0; k < of_level.size(); ++k)
+      if (!of_level[k].empty()) levels_.push_back(level_of(static_cast<int>(k), of_level[k]));
+  }
+
+  // A face lies in the cells with a ball about them that reaches it.
+  Level level_of(int number, const std::vector<int32_t>& faces) const {
+    const double edge = std::ldexp(edge_, number);
+    Level level{number, edge, {}, {}};
+    const double radius = 0.5 * std::sqrt(3.0) * edge + slack_;
+    std::vector<std::pair<size_t, int32_t>> members;  // place of a cell, face
+    for (const int32_t f : faces) {
+      const near_faces::Triangle t = corners(f);
+      const auto [low, high] = near_faces::bounds_of(t);
+      each_from_to(
+          level.cell_with(cell_at(low)), level.cell_with(cell_at(high)), [&](const Cell<3>& cell) {
+            const Vec<3> middle = low_ + edge * (cell.cast<double>() + Vec<3>::Constant(0.5));
+            if (near_faces::foot_of(middle, t).square > radius * radius) return;
+            Faces& in = level.cells.find_or_add(cell);
+            if (in.size++ == 0) in.first = level.cells.size() - 1;
+            members.emplace_back(in.first, f);
+          });
+    }
+    std::vector<size_t> next(level.cells.size() + 1, 0);
+    for (const auto& member : members) ++next[member.first + 1];
+    for (size_t k = 1; k < next.size(); ++k) next[k] += next[k - 1];
+    for (size_t k = 0; k < level.cells.size(); ++k)
+      level.cells.find_or_add(level.cells.cell(k)).first = next[k];
+    level.faces.resize(members.size());
+    for (const auto& [place, f] : members) level.faces[next[place]++] = f;
+    return level;
+  }
+
+  void find(Best& best) const {
+    best.farther = (reach_ + slack_) * (reach_ + slack_);
+    if (near_faces::square_to_box(best.point, low_, high_) > best.farther) return;
+    const Cell<3> own = cell_at(best.point);
+    for (const Level& level : levels_) look_into(level, level.cell_with(own), best);
+    const Vec<3> about = Vec<3>::Constant(std::sqrt(best.farther));
+    const Cell<3> first = cell_at(best.point - about), last = cell_at(best.point + about);
+    for (const Level& level : levels_)
+      look_around(level, level.cell_with(own), level.cell_with(first), level.cell_with(last), best);
+  }
+
+  // Into the cells about its own.
+  void look_around(const Level& level, const Cell<3>& own, const Cell<3>& first,
+                   const Cell<3>& last, Best& best) const {
+    if (first == last) return;
+    each_from_to(first, last, [&](const Cell<3>& cell) {
+      if (cell == own) return;
+      const Vec<3> low = low_ + level.edge * cell.cast<double>();
+      const Vec<3> high = low + Vec<3>::Constant(level.edge);
+      if (near_faces::square_to_box(best.point, low, high) <= best.farther)
+        look_into(level, cell, best);
+    });
+  }
+
+  void look_into(const Level& level, const Cell<3>& cell, Best& best) const {
+    const Faces* in = level.cells.find(cell);
+    if (!in) return;
+    for (size_t i = in->first; i < in->first + in->size; ++i) {
+      const int32_t f = level.faces[i];
+      const near_faces::Triangle t = corners(f);
+      const auto [low, high] = near_faces::bounds_of(t);
+      if (near_faces::square_to_box(best.point, low, high) > best.farther) continue;
+      if (!(near_faces::dot(best.towards, near_faces::normal_of(t)) > 0.0)) continue;
+      const near_faces::Foot foot = near_faces::foot_of(best.point, t);
+      const bool as_near = foot.square == best.foot.square && best.face >= 0;
+      if (!(foot.square < best.foot.square || (as_near && f < best.face))) continue;
+      const double far = std::sqrt(foot.square) + slack_;
+      best.face = f, best.foot = foot, best.farther = far * far;
+    }
+  }
+
+  double reach_, edge_, per_metre_, slack_;
+  std::vector<Vec<3>> vertices_;
+  std::vector<int32_t> faces_;
+  Vec<3> low_ = Vec<3>::Constant(std::numeric_limits<double>::infinity());
+  Vec<3> high_ = -low_;
+  std::vector<Level> levels_;  // by rising edge
+};
+
+}  // namespace stillmap

@@ -1,0 +1,161 @@
+// What a pinhole camera sees of a mesh: for each pixel the nearest face and how far it is.
+// Edge functions in homogeneous coordinates (Olano and Greer, Triangle scan conversion using 2D
+// homogeneous coordinates, 1997): faces that reach behind the camera need not be cut.
+#pragma once
+
+#include <Eigen/Core>
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <vector>
+
+#include "stillmap/util/parallel.hpp"
+
+namespace stillmap {
+
+struct Pinhole {
+  Eigen::Matrix3d R;  // from the mesh's frame to the camera's: x right, y down, z ahead
+  Eigen::Vector3d t;
+  double fx, skew, cx, fy, cy;  // pixel centres have whole numbers
+  int32_t width, height;
+  double near;  // metres ahead, nothing before is seen
+};
+
+struct ZBuffer {
+  std::vector<float> depth;   // metres along the optical axis; infinity: nothing
+  std::vector<int32_t> face;  // -1: nothing
+};
+
+namespace z_buffer {
+
+// A face as the camera sees it: pixel (u, v) sees it where no edge function is negative, at depth
+// det / (sum of edge functions).
+struct Face {
+  std::array<Eigen::Vector3d, 3> edge;  // edge function = edge . (u, v, 1), turned to be positive
+  double det, nearest, farthest;
+  int32_t left, right, top, bottom;  // pixels that may see it
+};
+
+inline Eigen::Vector3d in_camera(const Pinhole& camera, const double* p) {
+  Eigen::Vector3d out;
+  for (int r = 0; r < 3; ++r)
+    out[r] = camera.R(r, 0) * p[0] + camera.R(r, 1) * p[1] + camera.R(r, 2) * p[2] + camera.t[r];
+  return out;
+}
+
+inline int32_t pixel(double at, int32_t size) {
+  return static_cast<int32_t>(std::clamp(at, -1.0, static_cast<double>(size)));
+}
+
+// Pixels within the bounds of what lies ahead of the near plane; false: none of the picture.
+inline bool bound(const Pinhole& c, const std::array<Eigen::Vector3d, 3>& corner, Face& face) {
+  double u0 = std::numeric_limits<double>::infinity(), v0 = u0, u1 = -u0, v1 = -u0;
+  const auto widen = [&](double x, double y, double z) {
+    const double u = (c.fx * x + c.skew * y) / z + c.cx, v = c.fy * y / z + c.cy;
+    u0 = std::min(u0, u), u1 = std::max(u1, u), v0 = std::min(v0, v), v1 = std::max(v1, v);
+  };
+  for (size_t i = 0; i < 3; ++i) {
+    const Eigen::Vector3d &a = corner[i], &b = corner[(i + 1) % 3];
+    if (a.z() >= c.near) widen(a.x(), a.y(), a.z());
+    if ((a.z() >= c.near) == (b.z() >= c.near)) continue;
+    const double s = (c.near - a.z()) / (b.z() - a.z());
+    widen(a.x() + s * (b.x() - a.x()), a.y() + s * (b.y() - a.y()), c.near);
+  }
+  if (!(u0 <= u1)) return false;
+  // a pixel more on every side: where edges are met exactly, the edge functions decide
+  face.left = std::max(pixel(std::floor(u0), c.width), 0);
+  face.right = std::min(pixel(std::ceil(u1), c.width), c.width - 1);
+  face.top = std::max(pixel(std::floor(v0), c.height), 0);
+  face.bottom = std::min(pixel(std::ceil(v1), c.height), c.height - 1);
+  return face.left <= face.right && face.top <= face.bottom;
+}
+
+// a x b, to the bit the opposite of b x a whatever the compiler makes of it: faces that share an
+// edge leave no gap
+inline Eigen::Vector3d cross(const Eigen::Vector3d& a, const Eigen::Vector3d& b, bool turned) {
+  const Eigen::Vector3d &p = turned ? b : a, &q = turned ? a : b;
+  const Eigen::Vector3d out(p.y() * q.z() - p.z() * q.y(), p.z() * q.x() - p.x() * q.z(),
+                            p.x() * q.y() - p.y() * q.x());
+  return turned ? Eigen::Vector3d(-out) : out;
+}
+
+// From a function of the ray (x, y, 1) to one of the pixel (u, v, 1).
+inline Eigen::Vector3d of_pixel(const Pinhole& c, const Eigen::Vector3d& n) {
+  const double u = n.x() / c.fx, v = (n.y() - u * c.skew) / c.fy;
+  return {u, v, n.z() - u * c.cx - v * c.cy};
+}
+
+// False: the camera sees none of it, or only its edge.
+inline bool set_up(const Pinhole& c, const Eigen::Vector3d* points, const int32_t* at, Face& face) {
+  std::array<Eigen::Vector3d, 3> corner;
+  for (size_t i = 0; i < 3; ++i) corner[i] = points[at[i]];
+  if (!bound(c, corner, face)) return false;
+  face.nearest = std::min({corner[0].z(), corner[1].z(), corner[2].z()});
+  face.farthest = std::max({corner[0].z(), corner[1].z(), corner[2].z()});
+  std::array<Eigen::Vector3d, 3> across;
+  for (size_t i = 0; i < 3; ++i) {
+    const size_t j = (i + 1) % 3, k = (i + 2) % 3;
+    across[i] = cross(corner[j], corner[k], at[j] > at[k]);
+  }
+  const Eigen::Vector3d &n = across[0], &p = corner[0];
+  face.det = n.x() * p.x() + n.y() * p.y() + n.z() * p.z();
+  if (!(face.det != 0.0)) return false;
+  const double sign = face.det > 0.0 ? 1.0 : -1.0;
+  for (size_t i = 0; i < 3; ++i) face.edge[i] = sign * of_pixel(c, across[i]);
+  face.det *= sign;
+  return true;
+}
+
+inline void fill(const Pinhole& c, const Face& face, int32_t number, int32_t first, int32_t last,
+                 ZBuffer& out) {
+  for (int32_t v = std::max(face.top, first); v <= std::min(face.bottom, last); ++v) {
+    std::array<double, 3> row;
+    for (size_t i = 0; i < 3; ++i) row[i] = face.edge[i].y() * v + face.edge[i].z();
+    const size_t begin = static_cast<size_t>(v) * static_cast<size_t>(c.width);
+    for (int32_t u = face.left; u <= face.right; ++u) {
+      const double e0 = face.edge[0].x() * u + row[0], e1 = face.edge[1].x() * u + row[1],
+                   e2 = face.edge[2].x() * u + row[2];
+      if (!(e0 >= 0.0 && e1 >= 0.0 && e2 >= 0.0)) continue;
+      const double sum = e0 + e1 + e2;
+      if (!(sum > 0.0)) continue;
+      // of faces seen at their edge little is left of the determinant
+      const double z = std::clamp(face.det / sum, face.nearest, face.farthest);
+      if (z < c.near) continue;
+      const size_t at = begin + static_cast<size_t>(u);
+      const auto depth = static_cast<float>(z);
+      if (depth < out.depth[at]) out.depth[at] = depth, out.face[at] = number;
+    }
+  }
+}
+
+}  // namespace z_buffer
+
+// vertices (V, 3), faces (F, 3). Both sides of a face are seen; of two at the same depth, to the
+// last bit of a float, the lower number is.
+inline ZBuffer z_buffer_of(const double* vertices, size_t V, const int32_t* faces, size_t F,
+                           const Pinhole& camera, int threads) {
+  std::vector<Eigen::Vector3d> points(V);
+  parallel_shares(even_shares(V, threads), [&](size_t, size_t first, size_t last) {
+    for (size_t i = first; i < last; ++i) points[i] = z_buffer::in_camera(camera, vertices + 3 * i);
+  });
+  const size_t rows = static_cast<size_t>(camera.height);
+  const size_t pixels = rows * static_cast<size_t>(camera.width);
+  ZBuffer out{std::vector<float>(pixels, std::numeric_limits<float>::infinity()),
+              std::vector<int32_t>(pixels, -1)};
+  // each thread has rows of its own, and meets the faces in their order
+  const size_t shares = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1, rows);
+  std::vector<size_t> bounds;
+  for (size_t i = 0; i <= shares; ++i) bounds.push_back(rows * i / shares);
+  parallel_shares(bounds, [&](size_t, size_t first, size_t last) {
+    const auto top = static_cast<int32_t>(first), bottom = static_cast<int32_t>(last) - 1;
+    z_buffer::Face face;
+    for (size_t f = 0; f < F; ++f)
+      if (z_buffer::set_up(camera, points.data(), faces + 3 * f, face))
+        z_buffer::fill(camera, face, static_cast<int32_t>(f), top, bottom, out);
+  });
+  return out;
+}
+
+}  // namespace stillmap

@@ -1,0 +1,84 @@
+// End points between those of neighbouring beams that met one flat surface. Far away and at a
+// slant beams leave gaps on a wall; a map of the bare end points would take their pattern for
+// features, and a scan that is laid on it would not slide along the wall as it should.
+#pragma once
+
+#include <cmath>
+
+#include "stillmap/occupancy/beam_counting.hpp"
+
+namespace stillmap {
+
+struct FillOptions {
+  double gap;        // metres between neighbouring end points, at most
+  double tolerance;  // metres by which three end points in a row may be off a straight line
+  double growth;     // the gap may be that many times as wide as the one beside it
+};
+
+template <int D>
+class Fill {
+ public:
+  Fill(Grid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign, const FillOptions& options)
+      : cursor_(grid),
+        scans_(scans),
+        e_(e),
+        sign_(sign),
+        options_(options),
+        resolution_(grid.resolution()) {}
+
+  void add() {
+    for (size_t t = 0; t < scans_.n_scans; ++t) {
+      first_ = scans_.offset[t];
+      last_ = scans_.offset[t + 1] - 1;
+      pose_ = pose_from<D>(scans_.poses + t * (D + 1) * (D + 1));
+      for (int64_t n = first_; n < last_; ++n)
+        if (is_hit(n) && is_hit(n + 1) &&
+            (continues(n, n + 1, n - 1) || continues(n + 1, n, n + 2)))
+          between(point(n), point(n + 1), std::min(probability(e_[n]), probability(e_[n + 1])));
+    }
+  }
+
+ private:
+  bool is_hit(int64_t n) const { return n >= first_ && n <= last_ && scans_.hit[n]; }
+  Vec<D> point(int64_t n) const { return point_at<D>(scans_.points + n * D); }
+
+  // whether the surface from `beside` to a goes straight on to b
+  bool continues(int64_t a, int64_t b, int64_t beside) const {
+    if (!is_hit(beside)) return false;
+    const Vec<D> step = point(b) - point(a), before = point(a) - point(beside);
+    const double gap = step.norm(), gap_before = before.norm();
+    if (gap > options_.gap || gap > options_.growth * gap_before) return false;
+    const double along = before.dot(step) / (gap > 0.0 ? gap : 1.0);
+    const double off = std::sqrt(std::max(before.squaredNorm() - along * along, 0.0));
+    return along > 0.0 && off < options_.tolerance;
+  }
+
+  void between(const Vec<D>& from, const Vec<D>& to, double weight) {
+    for (const Vec<D>& end : {from, to})
+      if (!all_below<D>((pose_ * end) / resolution_, Grid<D>::kMaxCell))
+        throw std::invalid_argument("beam: a pose or end point is not finite or too far away");
+    const auto steps = static_cast<int>(std::ceil((to - from).norm() / resolution_));
+    for (int i = 1; i < steps; ++i) {
+      const Vec<D> at =
+          (pose_ * (from + (to - from) * (static_cast<double>(i) / steps))) / resolution_;
+      const Cell<D> cell = cell_of<D>(at);
+      auto* block = cursor_.block(cell);
+      const auto local = static_cast<size_t>(Grid<D>::local_of(cell));
+      block->counts[local].alpha += sign_ * to_fixed(weight);
+      auto& moment = Grid<D>::moments_of(*block)[local];
+      for (int d = 0; d < D; ++d)
+        moment[static_cast<size_t>(d)] += sign_ * to_fixed(weight * (at[d] - cell[d]));
+    }
+  }
+
+  Cursor<Grid<D>> cursor_;
+  const Scans<D>& scans_;
+  const float* e_;
+  Fixed sign_;
+  FillOptions options_;
+  double resolution_;
+  int64_t first_ = 0, last_ = 0;
+  Pose<D> pose_;
+};
+
+}  // namespace stillmap
