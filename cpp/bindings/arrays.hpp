@@ -7,7 +7,10 @@
 #include <stdexcept>
 #include <string>
 
-#include "stillmap/occupancy/beam_counting.hpp"
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/scans.hpp"
+#include "stillmap/util/lie.hpp"
 
 namespace nb = nanobind;
 
@@ -64,7 +67,7 @@ Cell<D> cell_from(const Cells<D>& cells, size_t k) {
   Cell<D> cell;
   for (int d = 0; d < D; ++d) {
     const int64_t c = cells.data()[k * D + static_cast<size_t>(d)];
-    require(std::abs(c) < Grid<D>::kMaxCell, "cells: out of range");
+    require(std::abs(c) < BlockLayout<D>::kMaxCell, "cells: out of range");
     cell[d] = static_cast<int32_t>(c);
   }
   return cell;

@@ -1,5 +1,7 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
 #include "stillmap/occupancy/beam_counting.hpp"
 #include "stillmap/occupancy/no_return_beams.hpp"
 #include "stillmap/registration/endpoint_interpolation.hpp"
@@ -8,8 +10,9 @@ namespace stillmap::bindings {
 namespace {
 
 template <int D>
-void add(Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit, const Flat<float>& e,
-         const Flat<int64_t>& offset, const Poses<D>& poses, int threads, bool remove) {
+void add(OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+         const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses, int threads,
+         bool remove) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   const float* weights = per_beam(e, points.shape(0), "e");
   nb::gil_scoped_release released;
@@ -17,42 +20,42 @@ void add(Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit, const Fl
 }
 
 template <int D>
-void ends(Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit, const Flat<float>& e,
-          const Flat<int64_t>& offset, const Poses<D>& poses, bool remove) {
+void ends(OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+          const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses, bool remove) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   const float* weights = per_beam(e, points.shape(0), "e");
   nb::gil_scoped_release released;
-  add_ends<D>(grid, scans, weights, remove ? -1 : 1);
+  add_end_points<D>(grid, scans, weights, remove ? -1 : 1);
 }
 
 template <int D>
-void fill(Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit, const Flat<float>& e,
-          const Flat<int64_t>& offset, const Poses<D>& poses, double gap, double tolerance,
-          double growth, bool remove) {
+void fill(OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+          const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses, double gap,
+          double tolerance, double growth, bool remove) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   const float* weights = per_beam(e, points.shape(0), "e");
   require(gap >= 0.0 && tolerance >= 0.0 && growth >= 0.0,
           "gap, tolerance, growth: expected numbers that are not negative");
   nb::gil_scoped_release released;
-  Fill<D>(grid, scans, weights, remove ? -1 : 1, {gap, tolerance, growth}).add();
+  EndPointInterpolator<D>(grid, scans, weights, remove ? -1 : 1, {gap, tolerance, growth}).add();
 }
 
 template <int D>
-void add_no_return(Grid<D>& grid, Grid<D>& rest, const Points<D>& points, const Flat<bool>& hit,
-                   const Flat<int64_t>& offset, const Poses<D>& poses, const Cells<D>& stops,
-                   double beyond, int threads) {
+void add_no_return(OccupancyGrid<D>& grid, OccupancyGrid<D>& rest, const Points<D>& points,
+                   const Flat<bool>& hit, const Flat<int64_t>& offset, const Poses<D>& poses,
+                   const Cells<D>& stop_cells, double beyond, int threads) {
   require(&grid != &rest && grid.resolution() == rest.resolution(),
           "rest: expected another grid of the same resolution");
   require(beyond >= 0.0, "beyond: expected a length in metres that is not negative");
   const auto scans = scans_from<D>(points, hit, offset, poses);
   std::vector<Cell<D>> cells;
-  for (size_t k = 0; k < stops.shape(0); ++k) cells.push_back(cell_from<D>(stops, k));
+  for (size_t k = 0; k < stop_cells.shape(0); ++k) cells.push_back(cell_from<D>(stop_cells, k));
   nb::gil_scoped_release released;
-  add_lost<D>(grid, rest, scans, {cells, beyond / grid.resolution()}, threads);
+  add_no_return_beams<D>(grid, rest, scans, {cells, beyond / grid.resolution()}, threads);
 }
 
 template <int D>
-auto expectations(const Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+auto expectations(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
                   const Flat<int64_t>& offset, const Poses<D>& poses, double prior, int threads) {
   require_probability(prior, "prior");
   const auto scans = scans_from<D>(points, hit, offset, poses);
@@ -66,13 +69,13 @@ auto expectations(const Grid<D>& grid, const Points<D>& points, const Flat<bool>
 }
 
 template <int D>
-auto likelihood(const Grid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+auto likelihood(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
                 const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses,
                 double prior, int threads) {
   require_probability(prior, "prior");
   const auto scans = scans_from<D>(points, hit, offset, poses);
   const float* weights = per_beam(e, points.shape(0), "e");
-  std::vector<LogLikelihood> terms(scans.n_scans);
+  std::vector<LogLikelihoodTerms> terms(scans.n_scans);
   {
     nb::gil_scoped_release released;
     log_likelihood<D>(grid, scans, weights, prior, threads, terms.data());

@@ -2,8 +2,10 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
+#include "stillmap/grid/scans.hpp"
 #include "stillmap/occupancy/cluster_pooling.hpp"
 #include "stillmap/occupancy/ground_contact.hpp"
+#include "stillmap/occupancy/surfel_map.hpp"
 
 namespace stillmap::bindings {
 namespace {
@@ -13,10 +15,10 @@ using Values = nb::ndarray<const float, nb::numpy, nb::ndim<2>, nb::c_contig, nb
 constexpr float kMost = 1e6f;
 constexpr int kWidest = 1 << 20;  // cells
 
-void make(Bodies* self, const Surface<3>& surface, const Flat<bool>& stands, const Values& values,
-          int column, int64_t fewest) {
-  const size_t n = surface.size(), kinds = values.shape(1);
-  require(surface.fitted(), "surface: fit it first");
+void make(ClusterPooling* self, const SurfelMap<3>& surfel_map, const Flat<bool>& stands,
+          const Values& values, int column, int64_t fewest) {
+  const size_t n = surfel_map.size(), kinds = values.shape(1);
+  require(surfel_map.fitted(), "surface: fit it first");
   require(stands.shape(0) == n, "stands: expected one per element");
   require(values.shape(0) == n && kinds > 0, "values: expected a row per element");
   bool bounded = true;
@@ -24,35 +26,35 @@ void make(Bodies* self, const Surface<3>& surface, const Flat<bool>& stands, con
   require(bounded, "values: expected -1e6 to 1e6");
   require(column >= 1 && column <= kWidest, "column: expected 1 to 1048576 cells");
   require(fewest >= 1, "fewest: expected at least 1");
-  new (self) Bodies(surface, stands.data(), values.data(), kinds, {column, fewest});
+  new (self) ClusterPooling(surfel_map, stands.data(), values.data(), kinds, {column, fewest});
 }
 
-void add(Bodies& bodies, const Points<3>& points, const Flat<bool>& hit,
+void add(ClusterPooling& bodies, const Points<3>& points, const Flat<bool>& hit,
          const Flat<int64_t>& offset, const Poses<3>& poses, int threads) {
   const auto scans = scans_from<3>(points, hit, offset, poses);
   nb::gil_scoped_release released;
   bodies.add(scans, threads);
 }
 
-auto means(const Bodies& bodies) {
+auto means(const ClusterPooling& bodies) {
   auto out = bodies.means();
-  const size_t kinds = bodies.kinds(), n = out.size() / kinds;
+  const size_t kinds = bodies.n_values(), n = out.size() / kinds;
   return owned(std::move(out), {n, kinds});
 }
 
-auto feet(const Surface<3>& surface, const Points<3>& points, const Flat<bool>& hit,
-          const Flat<int64_t>& offset, const Poses<3>& poses, const Flat<int32_t>& element,
+auto feet(const SurfelMap<3>& surfel_map, const Points<3>& points, const Flat<bool>& hit,
+          const Flat<int64_t>& offset, const Poses<3>& poses, const Flat<int32_t>& surfel,
           const Flat<bool>& stands, const Flat<float>& p_static, const Flat<float>& ground,
           int column, double low, double least, int threads) {
   const auto scans = scans_from<3>(points, hit, offset, poses);
-  const size_t n = surface.size(), beams = points.shape(0);
-  require(surface.fitted(), "surface: fit it first");
-  require(element.shape(0) == beams, "element: expected one per beam");
+  const size_t n = surfel_map.size(), beams = points.shape(0);
+  require(surfel_map.fitted(), "surface: fit it first");
+  require(surfel.shape(0) == beams, "element: expected one per beam");
   bool in_range = true, usable_ones = true;
   for (size_t i = 0; i < beams; ++i) {
-    const int32_t k = element.data()[i];
-    in_range = in_range && k >= kNoElement && k < static_cast<int32_t>(n);
-    usable_ones = usable_ones && (k == kNoElement || usable<3>(points.data() + i * 3));
+    const int32_t k = surfel.data()[i];
+    in_range = in_range && k >= kNoSurfel && k < static_cast<int32_t>(n);
+    usable_ones = usable_ones && (k == kNoSurfel || usable<3>(points.data() + i * 3));
   }
   require(in_range, "element: out of range");
   require(usable_ones, "element: of an unusable beam");
@@ -72,8 +74,9 @@ auto feet(const Surface<3>& surface, const Points<3>& points, const Flat<bool>& 
   std::vector<float> out(beams);
   {
     nb::gil_scoped_release released;
-    const Feet feet(surface, {stands.data(), p_static.data(), ground.data(), column, low, least});
-    feet.find(scans, element.data(), threads, out.data());
+    const GroundContact feet(surfel_map,
+                             {stands.data(), p_static.data(), ground.data(), column, low, least});
+    feet.relabel(scans, surfel.data(), threads, out.data());
   }
   return owned(std::move(out), {beams});
 }
@@ -81,7 +84,8 @@ auto feet(const Surface<3>& surface, const Points<3>& points, const Flat<bool>& 
 }  // namespace
 
 void bind_cluster_pooling(nb::module_& m) {
-  nb::class_<Bodies>(m, "Bodies3D", "What stands apart in each sweep, and what is known of it.")
+  nb::class_<ClusterPooling>(m, "Bodies3D",
+                             "What stands apart in each sweep, and what is known of it.")
       .def("__init__", &make, nb::arg("surface"), nb::arg("stands").noconvert(),
            nb::arg("values").noconvert(), nb::kw_only(), nb::arg("column"), nb::arg("fewest"),
            nb::keep_alive<1, 2>(),

@@ -11,7 +11,7 @@ const bool* per_scan(const Flat<bool>& held, size_t n_scans) {
 }
 
 template <int D>
-void add_others(StaticShares<D>& shares, const Points<D>& points, const Flat<bool>& hit,
+void add_others(StaticFractionGrid<D>& shares, const Points<D>& points, const Flat<bool>& hit,
                 const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses,
                 const Flat<bool>& held) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
@@ -31,26 +31,26 @@ BeamModel checked(double stopping, double noise, double late, double delay, doub
 }
 
 template <int D>
-auto gains(const StaticShares<D>& shares, const Points<D>& points, const Flat<bool>& hit,
+auto gains(const StaticFractionGrid<D>& shares, const Points<D>& points, const Flat<bool>& hit,
            const Flat<int64_t>& offset, const Poses<D>& poses, const Flat<bool>& held,
            double stopping, double noise, double late, double delay, double outliers, int threads) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   const bool* left_out = per_scan(held, scans.n_scans);
   const BeamModel model = checked(stopping, noise, late, delay, outliers);
-  std::vector<HeldOut> sums(scans.n_scans);
+  std::vector<HeldOutScore> sums(scans.n_scans);
   {
     nb::gil_scoped_release released;
-    held_out<D>(shares, scans, left_out, model, threads, sums.data());
+    score_held_out<D>(shares, scans, left_out, model, threads, sums.data());
   }
   std::vector<double> out;
   out.reserve(2 * sums.size());
-  for (const auto& s : sums) out.insert(out.end(), {s.gain, s.beams});
+  for (const auto& s : sums) out.insert(out.end(), {s.log_likelihood_gain, s.beam_count});
   return owned(std::move(out), {scans.n_scans, 2});
 }
 
 template <int D>
 void bind(nb::module_& m, const char* name) {
-  using S = StaticShares<D>;
+  using S = StaticFractionGrid<D>;
   nb::class_<S>(m, name, "Mean e of the beams that ended in each cell; rates at which beams end.")
       .def(nb::init<double>(), nb::arg("resolution"))
       .def_prop_ro("resolution", &S::resolution, "metres")

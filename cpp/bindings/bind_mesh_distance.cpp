@@ -20,7 +20,8 @@ bool all_finite(const Places<3>& rows) {
   return sum == 0.0;
 }
 
-void make(NearFaces* self, const Places<3>& vertices, const FacesOf& faces, double reach) {
+void make(MeshDistance* self, const Places<3>& vertices, const FacesOf& faces,
+          double max_distance) {
   const size_t V = vertices.shape(0), F = faces.shape(0);
   for (size_t i = 0; i < 3 * V; ++i)
     require(std::abs(vertices.data()[i]) <= kFarthest, "vertices: not finite, or beyond 1e9 m");
@@ -29,37 +30,37 @@ void make(NearFaces* self, const Places<3>& vertices, const FacesOf& faces, doub
     const int32_t at = faces.data()[i];
     require(at >= 0 && static_cast<size_t>(at) < V, "faces: a vertex that is not there");
   }
-  require(reach >= 1e-6 && reach <= kFarthest, "reach: expected 1e-6 to 1e9 metres");
+  require(max_distance >= 1e-6 && max_distance <= kFarthest, "reach: expected 1e-6 to 1e9 metres");
   nb::gil_scoped_release released;
-  new (self) NearFaces(vertices.data(), V, faces.data(), F, reach);
+  new (self) MeshDistance(vertices.data(), V, faces.data(), F, max_distance);
 }
 
-auto nearest(const NearFaces& faces, const Places<3>& points, const Places<3>& origins,
+auto nearest(const MeshDistance& faces, const Places<3>& points, const Places<3>& origins,
              int threads) {
   const size_t n = points.shape(0);
   require(origins.shape(0) == n, "origins: expected a row per point");
   require(all_finite(points), "points: not finite");
   require(all_finite(origins), "origins: not finite");
-  NearPlaces out;
+  NearestPoints out;
   {
     nb::gil_scoped_release released;
     out = faces.nearest(points.data(), origins.data(), n, threads);
   }
-  return std::make_pair(owned(std::move(out.face), {n}), owned(std::move(out.weight), {n, 3}));
+  return std::make_pair(owned(std::move(out.face), {n}), owned(std::move(out.barycentric), {n, 3}));
 }
 
 }  // namespace
 
 void bind_mesh_distance(nb::module_& m) {
-  nb::class_<NearFaces>(m, "NearFaces",
-                        "The faces of a mesh, to be asked which of them is the nearest to a point.")
+  nb::class_<MeshDistance>(
+      m, "NearFaces", "The faces of a mesh, to be asked which of them is the nearest to a point.")
       .def("__init__", &make, nb::arg("vertices").noconvert(), nb::arg("faces").noconvert(),
            nb::kw_only(), nb::arg("reach"),
            "vertices (V, 3) float64, metres; faces (F, 3) int32, counter-clockwise from where they "
            "are seen; reach: metres to a face, beyond which it is not near.")
-      .def("__len__", &NearFaces::size)
-      .def_prop_ro("reach", &NearFaces::reach)
-      .def_prop_ro("memory_bytes", &NearFaces::memory_bytes)
+      .def("__len__", &MeshDistance::size)
+      .def_prop_ro("reach", &MeshDistance::max_distance)
+      .def_prop_ro("memory_bytes", &MeshDistance::memory_bytes)
       .def("nearest", &nearest, nb::arg("points").noconvert(), nb::arg("origins").noconvert(),
            nb::kw_only(), nb::arg("threads") = 1,
            "Which face (n,) int32 has the place nearest to each of points (n, 3) float64, less "

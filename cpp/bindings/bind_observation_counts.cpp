@@ -7,23 +7,26 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "cell_box.hpp"
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/occupancy/no_return_beams.hpp"
 #include "stillmap/occupancy/observation_counts.hpp"
 
 namespace stillmap::bindings {
 namespace {
 
 template <int D>
-std::shared_ptr<const LostBeams<D>> lost_beams(const std::optional<Cells<D>>& stops, double beyond,
-                                               double resolution) {
+std::shared_ptr<const NoReturnBeams<D>> no_return_beams(const std::optional<Cells<D>>& stop_cells,
+                                                        double beyond, double resolution) {
   require(beyond >= 0.0, "beyond: expected a length in metres that is not negative");
-  if (!stops) return nullptr;
+  if (!stop_cells) return nullptr;
   std::vector<Cell<D>> cells;
-  for (size_t k = 0; k < stops->shape(0); ++k) cells.push_back(cell_from<D>(*stops, k));
-  return std::make_shared<LostBeams<D>>(NoReturn<D>{cells, beyond / resolution});
+  for (size_t k = 0; k < stop_cells->shape(0); ++k) cells.push_back(cell_from<D>(*stop_cells, k));
+  return std::make_shared<NoReturnBeams<D>>(NoReturnLimits<D>{cells, beyond / resolution});
 }
 
 template <int D>
-void add(LookCounts<D>& counts, const Points<D>& points, const Flat<bool>& hit,
+void add(ObservationCounts<D>& counts, const Points<D>& points, const Flat<bool>& hit,
          const Flat<bool>& dynamic, const Flat<int64_t>& offset, const Poses<D>& poses,
          const Flat<int64_t>& look, int threads) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
@@ -36,18 +39,18 @@ void add(LookCounts<D>& counts, const Points<D>& points, const Flat<bool>& hit,
 }
 
 template <int D>
-auto dense(const LookCounts<D>& counts, const std::array<int64_t, D>& first_cell,
+auto dense(const ObservationCounts<D>& counts, const std::array<int64_t, D>& first_cell,
            const std::array<int64_t, D>& shape) {
   const Box<D> box(first_cell, shape);
   std::vector<uint16_t> looks(box.total(), 0), clear(box.total(), 0);
   for (const auto& block : counts.blocks()) {
-    if (!box.meets(Grid<D>::cell_at(block->origin, 0), Grid<D>::kEdge)) continue;
-    for (int i = 0; i < Grid<D>::kCells; ++i) {
-      const Cell<D> cell = Grid<D>::cell_at(block->origin, i);
+    if (!box.meets(BlockLayout<D>::cell_at(block->origin, 0), BlockLayout<D>::kEdge)) continue;
+    for (int i = 0; i < BlockLayout<D>::kCells; ++i) {
+      const Cell<D> cell = BlockLayout<D>::cell_at(block->origin, i);
       if (!box.holds(cell)) continue;
-      const Glances& glances = block->counts[static_cast<size_t>(i)];
-      looks[box.index(cell)] = glances.looks;
-      clear[box.index(cell)] = glances.clear;
+      const CellVisits& visits = block->values[static_cast<size_t>(i)];
+      looks[box.index(cell)] = visits.observed;
+      clear[box.index(cell)] = visits.clear;
     }
   }
   return std::make_tuple(box.shaped(std::move(looks)), box.shaped(std::move(clear)));
@@ -55,16 +58,16 @@ auto dense(const LookCounts<D>& counts, const std::array<int64_t, D>& first_cell
 
 template <int D>
 void bind(nb::module_& m, const char* name) {
-  using L = LookCounts<D>;
+  using L = ObservationCounts<D>;
   nb::class_<L>(
       m, name,
       "In how many looks a cell was looked at, and in how many of them nothing that moves "
       "was near.")
       .def(
           "__init__",
-          [](L* self, double resolution, double radius, const std::optional<Cells<D>>& stops,
+          [](L* self, double resolution, double radius, const std::optional<Cells<D>>& stop_cells,
              double beyond) {
-            new (self) L(resolution, radius, lost_beams<D>(stops, beyond, resolution));
+            new (self) L(resolution, radius, no_return_beams<D>(stop_cells, beyond, resolution));
           },
           nb::arg("resolution"), nb::kw_only(), nb::arg("radius"),
           nb::arg("stops").noconvert() = nb::none(), nb::arg("beyond") = 0.0,

@@ -9,40 +9,47 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/occupancy/change_hmm.hpp"
+#include "stillmap/occupancy/observation.hpp"
 #include "stillmap/occupancy/occupancy_hmm.hpp"
+#include "stillmap/occupancy/surfel.hpp"
+#include "stillmap/occupancy/surfel_map.hpp"
+#include "stillmap/occupancy/two_state_chains.hpp"
 
 namespace stillmap::bindings {
 namespace {
 
 template <int D>
-void add_end_points(Surface<D>& surface, const Points<D>& points, const Flat<bool>& hit,
+void add_end_points(SurfelMap<D>& surfel_map, const Points<D>& points, const Flat<bool>& hit,
                     const Flat<int64_t>& offset, const Poses<D>& poses,
-                    const std::optional<Flat<int64_t>>& look, int threads) {
+                    const std::optional<Flat<int64_t>>& time_bin, int threads) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
-  require(!look || look->shape(0) == scans.n_scans, "look: expected one number per scan");
-  for (size_t t = 0; look && t < scans.n_scans; ++t)
-    require(look->data()[t] >= 0 && look->data()[t] <= kLastLook, "look: out of range");
+  require(!time_bin || time_bin->shape(0) == scans.n_scans, "look: expected one number per scan");
+  for (size_t t = 0; time_bin && t < scans.n_scans; ++t)
+    require(time_bin->data()[t] >= 0 && time_bin->data()[t] <= kMaxTimeBin, "look: out of range");
   nb::gil_scoped_release released;
-  surface.add(scans, look ? look->data() : nullptr, threads);
+  surfel_map.add(scans, time_bin ? time_bin->data() : nullptr, threads);
 }
 
 // (E, 2) first and last look
 template <int D>
-auto spans(const Surface<D>& surface) {
+auto spans(const SurfelMap<D>& surfel_map) {
   std::vector<int32_t> out;
-  for (const Span& span : surface.hits()) out.insert(out.end(), {span.first, span.last});
-  const size_t n = surface.hits().size();
+  for (const TimeSpan& span : surfel_map.hit_spans())
+    out.insert(out.end(), {span.first, span.last});
+  const size_t n = surfel_map.hit_spans().size();
   return owned(std::move(out), {n, 2});
 }
 
 template <int D>
-auto elements(const Surface<D>& surface, const Points<D>& points, const Flat<bool>& hit,
-              const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
+auto surfels(const SurfelMap<D>& surfel_map, const Points<D>& points, const Flat<bool>& hit,
+             const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   std::vector<int32_t> out(points.shape(0));
   {
     nb::gil_scoped_release released;
-    elements_of<D>(surface, scans, threads, out.data());
+    associate_beams<D>(surfel_map, scans, threads, out.data());
   }
   const size_t n = out.size();
   return owned(std::move(out), {n});
@@ -50,134 +57,136 @@ auto elements(const Surface<D>& surface, const Points<D>& points, const Flat<boo
 
 // Some of the elements: first, first + every, ..., n of them.
 struct Rows {
-  size_t first = 0, every = 1, n = 0;
+  size_t first = 0, stride = 1, n = 0;
 };
 using Slice = std::array<int64_t, 3>;  // first, last, every
 
 inline Rows rows_from(const std::optional<Slice>& rows, size_t size) {
   if (!rows) return {0, 1, size};
-  const auto [first, last, every] = *rows;
-  require(0 <= first && first <= last && last <= static_cast<int64_t>(size) && every > 0,
+  const auto [first, last, stride] = *rows;
+  require(0 <= first && first <= last && last <= static_cast<int64_t>(size) && stride > 0,
           "rows: expected some of the elements");
-  return {static_cast<size_t>(first), static_cast<size_t>(every),
-          static_cast<size_t>((last - first + every - 1) / every)};
+  return {static_cast<size_t>(first), static_cast<size_t>(stride),
+          static_cast<size_t>((last - first + stride - 1) / stride)};
 }
 
 // cells, means and normals (E, D), distances from the plane and beams (E,)
 template <int D>
-auto describe(const Surface<D>& surface, const std::optional<Slice>& rows) {
-  require(surface.fitted(), "surface: fit it first");
-  const auto [first, every, n] = rows_from(rows, surface.size());
+auto describe_surfels(const SurfelMap<D>& surfel_map, const std::optional<Slice>& rows) {
+  require(surfel_map.fitted(), "surface: fit it first");
+  const auto [first, stride, n] = rows_from(rows, surfel_map.size());
   const auto d = static_cast<size_t>(D);
   std::vector<int64_t> cells(n * d), beams(n);
-  std::vector<double> means(n * d), normals(n * d), off_plane(n), prominence(n);
+  std::vector<double> means(n * d), normals(n * d), centre_to_plane(n), prominence(n);
   for (size_t i = 0; i < n; ++i) {
-    const auto k = static_cast<int32_t>(first + i * every);
+    const auto k = static_cast<int32_t>(first + i * stride);
     for (int a = 0; a < D; ++a) {
       const size_t at = i * d + static_cast<size_t>(a);
-      cells[at] = surface.cell(k)[a];
-      means[at] = surface.element(k).mean[a] * surface.resolution();
-      normals[at] = surface.element(k).normal[a];
+      cells[at] = surfel_map.cell(k)[a];
+      means[at] = surfel_map.surfel(k).mean[a] * surfel_map.resolution();
+      normals[at] = surfel_map.surfel(k).normal[a];
     }
-    beams[i] = surface.beams(k);
-    prominence[i] = surface.element(k).prominence;
-    off_plane[i] = surface.element(k).off_plane * surface.resolution();
+    beams[i] = surfel_map.beam_count(k);
+    prominence[i] = surfel_map.surfel(k).prominence;
+    centre_to_plane[i] = surfel_map.surfel(k).centre_to_plane * surfel_map.resolution();
   }
   return std::make_tuple(owned(std::move(cells), {n, d}), owned(std::move(means), {n, d}),
-                         owned(std::move(normals), {n, d}), owned(std::move(off_plane), {n}),
+                         owned(std::move(normals), {n, d}), owned(std::move(centre_to_plane), {n}),
                          owned(std::move(prominence), {n}), owned(std::move(beams), {n}));
 }
 
 template <int D>
-void add_looks(Dwell<D>& dwell, const Points<D>& points, const Flat<bool>& hit,
-               const Flat<int64_t>& offset, const Poses<D>& poses, const Flat<int64_t>& look,
-               int threads, const std::optional<Places<D>>& place) {
+void add_observations(OccupancyHmm<D>& hmm, const Points<D>& points, const Flat<bool>& hit,
+                      const Flat<int64_t>& offset, const Poses<D>& poses,
+                      const Flat<int64_t>& time_bin, int threads,
+                      const std::optional<Places<D>>& place) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
-  require(look.shape(0) == scans.n_scans, "look: expected one number per scan");
+  require(time_bin.shape(0) == scans.n_scans, "look: expected one number per scan");
   require(!place || place->shape(0) == scans.n_scans, "place: expected one per scan");
   nb::gil_scoped_release released;
-  dwell.add(scans, look.data(), place ? place->data() : nullptr, threads);
+  hmm.add(scans, time_bin.data(), place ? place->data() : nullptr, threads);
 }
 
 template <int D>
-auto likelihoods(Dwell<D>& dwell, const std::optional<Flat<bool>>& among,
+auto likelihoods(OccupancyHmm<D>& hmm, const std::optional<Flat<bool>>& among,
                  const std::optional<Slice>& rows, int threads) {
   std::vector<size_t> classes;
-  require(!among || among->shape(0) == dwell.classes(), "among: expected one per class");
-  for (size_t c = 0; c < dwell.classes(); ++c)
+  require(!among || among->shape(0) == hmm.classes(), "among: expected one per class");
+  for (size_t c = 0; c < hmm.classes(); ++c)
     if (!among || among->data()[c]) classes.push_back(c);
   require(!classes.empty(), "among: expected a class");
-  const auto [first, every, n] = rows_from(rows, dwell.surface().size());
+  const auto [first, stride, n] = rows_from(rows, hmm.surfel_map().size());
   const size_t C = classes.size();
   std::vector<float> relative(n * C);
   std::vector<double> log_best(n);
   {
     nb::gil_scoped_release released;
-    dwell.likelihood(classes, first, every, n, threads, relative.data(), log_best.data());
+    hmm.likelihood(classes, first, stride, n, threads, relative.data(), log_best.data());
   }
   return std::make_tuple(owned(std::move(relative), {n, C}), owned(std::move(log_best), {n}));
 }
 
 // Of every element, see the docstring of `changes` below.
 template <int D>
-auto describe_changes(const Dwell<D>& dwell, const std::optional<Slice>& rows) {
-  const Changes& changes = dwell.changes();
-  require(changes.has_courses(), "changes: nobody asked for courses");
-  const auto [first, every, n] = rows_from(rows, changes.members());
+auto describe_changes(const OccupancyHmm<D>& hmm, const std::optional<Slice>& rows) {
+  const ChangeHmm& changes = hmm.change_hmm();
+  require(changes.has_paths(), "changes: nobody asked for courses");
+  const auto [first, stride, n] = rows_from(rows, changes.members());
   std::vector<double> log_likelihood(n);
   std::vector<float> p_last(n * 2), share(n);
-  std::vector<int32_t> count(n * 2), looks(n * 8);
+  std::vector<int32_t> count(n * 2), change_bins(n * 8);
   {
     nb::gil_scoped_release released;
     for (size_t i = 0; i < n; ++i) {
-      const size_t k = first + i * every;
-      const Course& course = changes.course(k);
+      const size_t k = first + i * stride;
+      const StatePath& path = changes.most_probable_path(k);
       log_likelihood[i] = changes.log_likelihood(k);
-      share[i] = changes.occupied_share(k);
-      p_last[2 * i] = changes.p_at_last(k, Changes::kThing);
-      p_last[2 * i + 1] = 1.0f - changes.p_at_last(k, Changes::kNothing);
-      for (const auto& [turns, j] : {std::pair{&course.things, 2 * i}, {&course.any, 2 * i + 1}}) {
-        count[j] = turns->count;
-        looks[4 * j] = turns->first.before;
-        looks[4 * j + 1] = turns->first.after;
-        looks[4 * j + 2] = turns->last.before;
-        looks[4 * j + 3] = turns->last.after;
+      share[i] = changes.occupied_fraction(k);
+      p_last[2 * i] = changes.p_final(k, ChangeHmm::kObject);
+      p_last[2 * i + 1] = 1.0f - changes.p_final(k, ChangeHmm::kEmpty);
+      for (const auto& [summary, j] :
+           {std::pair{&path.object_changes, 2 * i}, {&path.occupancy_changes, 2 * i + 1}}) {
+        count[j] = summary->count;
+        change_bins[4 * j] = summary->first.before;
+        change_bins[4 * j + 1] = summary->first.after;
+        change_bins[4 * j + 2] = summary->last.before;
+        change_bins[4 * j + 3] = summary->last.after;
       }
     }
   }
   return std::make_tuple(owned(std::move(log_likelihood), {n}), owned(std::move(share), {n}),
                          owned(std::move(p_last), {n, 2}), owned(std::move(count), {n, 2}),
-                         owned(std::move(looks), {n, 2, 2, 2}));
+                         owned(std::move(change_bins), {n, 2, 2, 2}));
 }
 
 template <int D>
-auto log_changing(const Dwell<D>& dwell, const std::optional<Slice>& rows) {
-  const Changes& changes = dwell.changes();
-  const auto [first, every, n] = rows_from(rows, changes.members());
+auto log_changing(const OccupancyHmm<D>& hmm, const std::optional<Slice>& rows) {
+  const ChangeHmm& changes = hmm.change_hmm();
+  const auto [first, stride, n] = rows_from(rows, changes.members());
   std::vector<double> values(n);
-  for (size_t i = 0; i < n; ++i) values[i] = changes.log_likelihood(first + i * every);
+  for (size_t i = 0; i < n; ++i) values[i] = changes.log_likelihood(first + i * stride);
   return owned(std::move(values), {n});
 }
 
 template <int D>
-auto lost_beams(const Dwell<D>& dwell, const Points<D>& points, const Flat<bool>& hit,
-                const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
+auto no_return_stats(const OccupancyHmm<D>& hmm, const Points<D>& points, const Flat<bool>& hit,
+                     const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   nb::gil_scoped_release released;
-  const Lost lost = dwell.lost(scans, threads);
-  return std::make_tuple(lost.beams, lost.through_solid);
+  const NoReturnStats stats = hmm.no_return_stats(scans, threads);
+  return std::make_tuple(stats.beam_count, stats.through_solid);
 }
 
 template <int D>
-auto solid_cells(const Dwell<D>& dwell) {
+auto solid_cells(const OccupancyHmm<D>& hmm) {
   std::vector<int64_t> out;
-  for (const Cell<D>& cell : dwell.solid()) out.insert(out.end(), cell.data(), cell.data() + D);
+  for (const Cell<D>& cell : hmm.solid_cells()) out.insert(out.end(), cell.data(), cell.data() + D);
   const size_t n = out.size() / D;
   return owned(std::move(out), {n, static_cast<size_t>(D)});
 }
 
-DwellClasses checked_classes(std::vector<double> rho, std::vector<double> tau,
-                             std::vector<double> turn, double detection) {
+OccupancyClasses checked_classes(std::vector<double> rho, std::vector<double> tau,
+                                 std::vector<double> turn, double detection) {
   if (turn.empty()) turn.assign(rho.size(), std::numeric_limits<double>::infinity());
   require(!rho.empty() && rho.size() == tau.size() && rho.size() == turn.size(),
           "rho, tau, turn: expected one number per class");
@@ -190,15 +199,15 @@ DwellClasses checked_classes(std::vector<double> rho, std::vector<double> tau,
 }
 
 template <int D>
-void bind(nb::module_& m, const char* surface, const char* dwell) {
-  using S = Surface<D>;
-  nb::class_<S>(m, surface, "One element of surface per cell in which beams ended.")
+void bind(nb::module_& m, const char* surfel_map, const char* hmm) {
+  using S = SurfelMap<D>;
+  nb::class_<S>(m, surfel_map, "One element of surface per cell in which beams ended.")
       .def(nb::init<double>(), nb::arg("resolution"))
       .def_prop_ro("resolution", &S::resolution, "metres")
       .def_prop_ro("dimension", [](const S&) { return D; })
       .def_prop_ro("size", &S::size, "number of elements")
       .def_prop_ro(
-          "scatter", [](const S& s) { return s.scatter() * s.resolution(); },
+          "scatter", [](const S& s) { return s.noise_std() * s.resolution(); },
           "metres: standard deviation of end points across surfaces; 0 before `fit`")
       .def("add_end_points", &add_end_points<D>, nb::arg("points").noconvert(),
            nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
@@ -210,16 +219,16 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
                    "element, once it is fitted; (0, 2) where nobody said.")
       .def("fit", &S::fit, nb::arg("threads") = 1, nb::call_guard<nb::gil_scoped_release>(),
            "Means, normals and scatter from all end points; none can be added any more.")
-      .def("elements", &describe<D>, nb::arg("rows") = nb::none(),
+      .def("elements", &describe_surfels<D>, nb::arg("rows") = nb::none(),
            "cells (E, D) int64, means (E, D) in metres, normals (E, D) (zero: none), distance (E,) "
            "of the cell's centre from the surface around it in metres (zero: none), prominence "
            "(E,): its beams against those of the richest cell around, beams (E,). rows (first, "
            "last, every): of some of the elements.")
-      .def("elements_of", &elements<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+      .def("elements_of", &surfels<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            nb::arg("threads") = 1, "(M,) int32: the element in which each beam ended, -1: none.");
-  using W = Dwell<D>;
-  nb::class_<W>(m, dwell,
+  using W = OccupancyHmm<D>;
+  nb::class_<W>(m, hmm,
                 "Likelihood of what was seen of each element, per class: occupied for a share rho, "
                 "correlated over tau seconds and over turn radians of the view (inf or none given: "
                 "however it turns).")
@@ -239,14 +248,14 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
           nb::arg("turn") = std::vector<double>{}, nb::arg("detection"), nb::arg("seconds"),
           nb::arg("lateral"), nb::arg("margin"), nb::arg("reach"), nb::arg("beyond"),
           nb::arg("normals") = true, nb::arg("threads") = 1, nb::keep_alive<1, 2>())
-      .def("add", &add_looks<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+      .def("add", &add_observations<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            nb::arg("look").noconvert(), nb::arg("threads") = 1,
            nb::arg("place").noconvert() = nb::none(),
            "Adds scans; look (T,) int64 numbers their looks and must not fall. All scans of one "
            "look belong into one call. place (T, D): where the robot stood, metres; without, the "
            "sensors' places are asked how far the view turned.")
-      .def("lost", &lost_beams<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+      .def("lost", &no_return_stats<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            nb::arg("threads") = 1,
            "Beams without a return that have such beams beside them, and how many of these cross "
@@ -257,7 +266,7 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
           "trust",
           [](W& w, double open) {
             require(open >= 0.0 && open <= 1.0, "open: expected a share between 0 and 1");
-            w.trust(open);
+            w.set_trust_beyond_solid(open);
           },
           nb::arg("open"),
           "How far to trust beams without a return beyond the first solid thing in their way; all "
@@ -270,7 +279,7 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
               require(t > 0.0 && std::isfinite(t), "tau: expected positive times");
             for (const double p : {passing_occupied, detection})
               require(p > 0.0 && p < 1.0, "expected probabilities between 0 and 1");
-            w.watch({tau, passing_occupied, passing_tau, detection}, courses);
+            w.track_changes({tau, passing_occupied, passing_tau, detection}, courses);
           },
           nb::kw_only(), nb::arg("tau"), nb::arg("passing_occupied"), nb::arg("passing_tau"),
           nb::arg("detection"), nb::arg("courses") = true,
@@ -279,7 +288,8 @@ void bind(nb::module_& m, const char* surface, const char* dwell) {
           "Without courses only `log_changing` is known of them.")
       .def("log_changing", &log_changing<D>, nb::arg("rows") = nb::none(),
            "(E,) the first of `changes`.")
-      .def("rest", &W::rest, "Lets go what only further looks would want; they make it anew.")
+      .def("rest", &W::release_buffers,
+           "Lets go what only further looks would want; they make it anew.")
       .def(
           "changes", &describe_changes<D>, nb::arg("rows") = nb::none(),
           "Of each element: (E,) logarithm of the likelihood of everything else that was seen, if "

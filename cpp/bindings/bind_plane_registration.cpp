@@ -3,8 +3,12 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/scans.hpp"
 #include "stillmap/grid/voxel_downsampling.hpp"
+#include "stillmap/registration/ndt_map.hpp"
 #include "stillmap/registration/plane_registration.hpp"
+#include "stillmap/util/lie.hpp"
 
 namespace stillmap::bindings {
 namespace {
@@ -56,7 +60,7 @@ PlaneOptions plane_options(double least, double flat, double wide) {
 }
 
 template <int D>
-void add_points(SweepMap<D>& map, const Points<D>& points, const Flat<float>& weights,
+void add_points(NdtMap<D>& map, const Points<D>& points, const Flat<float>& weights,
                 const OnePose<D>& T) {
   const float* w = per_beam(weights, points.shape(0), "weights");
   require_weights(w, points.shape(0));
@@ -69,16 +73,16 @@ void add_points(SweepMap<D>& map, const Points<D>& points, const Flat<float>& we
 }
 
 template <int D>
-void keep_near(SweepMap<D>& map, const OnePose<D>& T, double radius) {
+void keep_near(NdtMap<D>& map, const OnePose<D>& T, double radius) {
   require(radius > 0.0, "radius: expected a positive length in metres");
   const Pose<D> pose = checked_pose<D>(T, "T_map_base");
   nb::gil_scoped_release released;
-  map.keep_near(pose.t, radius);
+  map.crop(pose.t, radius);
 }
 
 // Normals (N, D), offsets and variances (N,), and levels (N,), -1 where there is no surface.
 template <int D>
-auto planes(const SweepMap<D>& map, const Places<D>& places, int level, double least, double flat,
+auto planes(const NdtMap<D>& map, const Places<D>& places, int level, double least, double flat,
             double wide) {
   const PlaneOptions options = plane_options(least, flat, wide);
   require(level >= 0 && level < map.levels(), "level: there is none of that number");
@@ -90,7 +94,7 @@ auto planes(const SweepMap<D>& map, const Places<D>& places, int level, double l
     for (size_t i = 0; i < n; ++i) {
       const Vec<D> place = Eigen::Map<const Vec<D>>(places.data() + i * D);
       Plane<D> plane;
-      if (!map.plane(place, level, options, plane)) continue;
+      if (!map.fit_plane(place, level, options, plane)) continue;
       known[i] = 1;
       for (size_t d = 0; d < D; ++d) normals[i * D + d] = plane.normal[static_cast<int>(d)];
       offsets[i] = plane.offset;
@@ -117,7 +121,7 @@ auto vector_of(const Vector& v) {
 }
 
 template <int D>
-auto register_to_map(const SweepMap<D>& map, const Points<D>& points, const Flat<float>& weights,
+auto register_to_map(const NdtMap<D>& map, const Points<D>& points, const Flat<float>& weights,
                      const Flat<float>& times, const OnePose<D>& T_prior,
                      const Tangents<D>& twist_prior, const MovingSquare<D>& information,
                      const std::optional<OnePose<D>>& T_start,
@@ -128,50 +132,50 @@ auto register_to_map(const SweepMap<D>& map, const Points<D>& points, const Flat
           "sigma, kernel, gain: expected to be positive");
   require(start_level >= 0 && start_slack >= 0.0 && max_iterations >= 0 && tolerance > 0.0,
           "start_level, start_slack, max_iterations, tolerance: out of range");
-  const SweepOptions options{plane_options(least, flat, wide),
-                             sigma,
-                             kernel,
-                             gain,
-                             start_level,
-                             start_slack,
-                             max_iterations,
-                             tolerance};
+  const PlaneRegistrationOptions options{plane_options(least, flat, wide),
+                                         sigma,
+                                         kernel,
+                                         gain,
+                                         start_level,
+                                         start_slack,
+                                         max_iterations,
+                                         tolerance};
   const auto beams = timed_points<D>(points, weights, times);
   constexpr int n = 2 * Lie<D>::kDof;
-  MovingPrior<D> prior;
+  MotionPrior<D> prior;
   prior.mean = {checked_pose<D>(T_prior, "T_prior"), finite_tangent<D>(twist_prior, "twist_prior")};
   prior.information =
       Eigen::Map<const Eigen::Matrix<double, n, n, Eigen::RowMajor>>(information.data());
   require(prior.information.allFinite(), "information: not finite");
-  Moving<D> start = prior.mean;
+  MotionState<D> start = prior.mean;
   if (T_start) start.pose = checked_pose<D>(*T_start, "T_start");
   if (twist_start) start.twist = finite_tangent<D>(*twist_start, "twist_start");
-  SweepFound<D> found;
+  PlaneRegistrationResult<D> found;
   Eigen::Matrix<double, n, n> covariance;
   {
     nb::gil_scoped_release released;
     found = register_sweep<D>(map, beams, prior, start, options, threads);
     covariance = found.information.ldlt().solve(Eigen::Matrix<double, n, n>::Identity());
   }
-  return std::make_tuple(matrix_of<D>(found.moving.pose), vector_of(found.moving.twist),
-                         square_of(covariance), found.data.met, found.data.compared, found.data.all,
-                         found.iterations);
+  return std::make_tuple(matrix_of<D>(found.state.pose), vector_of(found.state.twist),
+                         square_of(covariance), found.model.inlier_weight,
+                         found.model.matched_weight, found.model.total_weight, found.iterations);
 }
 
 // Hessian, gradient, cost and the three weights of the data term at one pose and twist.
 template <int D>
-auto linearise_sweep(const SweepMap<D>& map, const Points<D>& points, const Flat<float>& weights,
+auto linearise_sweep(const NdtMap<D>& map, const Points<D>& points, const Flat<float>& weights,
                      const Flat<float>& times, const OnePose<D>& T, const Tangents<D>& twist,
                      double least, double flat, double wide, double sigma, double kernel, int level,
                      double slack) {
-  const SweepOptions options{
+  const PlaneRegistrationOptions options{
       plane_options(least, flat, wide), sigma, kernel, 1.0, level, slack, 0, 1.0};
   require(level >= 0 && level < map.levels(), "level: there is none of that number");
-  const Moving<D> at{checked_pose<D>(T, "T"), finite_tangent<D>(twist, "twist")};
+  const MotionState<D> at{checked_pose<D>(T, "T"), finite_tangent<D>(twist, "twist")};
   const auto q =
       linearise<D>(map, timed_points<D>(points, weights, times), at, level, slack, options, 1);
-  return std::make_tuple(square_of(q.hessian), vector_of(q.gradient), q.cost, q.met, q.compared,
-                         q.all);
+  return std::make_tuple(square_of(q.hessian), vector_of(q.gradient), q.cost, q.inlier_weight,
+                         q.matched_weight, q.total_weight);
 }
 
 template <int D>
@@ -184,7 +188,7 @@ auto carried_points(const Points<D>& points, const Flat<float>& times, const Tan
     nb::gil_scoped_release released;
     for (size_t i = 0; i < n; ++i) {
       const float* p = points.data() + i * D;
-      const Vec<D> moved = carried<D>(xi, static_cast<double>(tau[i]), point_at<D>(p));
+      const Vec<D> moved = transform_by_twist<D>(xi, static_cast<double>(tau[i]), point_at<D>(p));
       for (size_t d = 0; d < D; ++d)
         out[i * D + d] = static_cast<float>(moved[static_cast<int>(d)]);
     }
@@ -199,7 +203,7 @@ auto thinned(const Points<D>& points, const Flat<float>& weights, double edge) {
   std::vector<int64_t> kept;
   {
     nb::gil_scoped_release released;
-    kept = first_in_cells<D>(points.data(), w, points.shape(0), edge);
+    kept = voxel_downsample<D>(points.data(), w, points.shape(0), edge);
   }
   const size_t n = kept.size();
   return owned(std::move(kept), {n});
@@ -208,14 +212,14 @@ auto thinned(const Points<D>& points, const Flat<float>& weights, double edge) {
 // In the plane, scans are registered on the field of a grid.
 void bind_in_space(nb::module_& m) {
   constexpr int D = 3;
-  nb::class_<SweepMap<D>>(m, "SweepMap3D",
-                          "Moments of end points in cells of `edge` metres, and of twice, four "
-                          "times, ... that on further levels; a cell takes no more once it weighs "
-                          "`enough`.")
+  nb::class_<NdtMap<D>>(m, "SweepMap3D",
+                        "Moments of end points in cells of `edge` metres, and of twice, four "
+                        "times, ... that on further levels; a cell takes no more once it weighs "
+                        "`enough`.")
       .def(nb::init<double, int, double>(), nb::arg("edge"), nb::arg("levels"), nb::arg("enough"))
-      .def("__len__", &SweepMap<D>::size)
-      .def_prop_ro("levels", &SweepMap<D>::levels)
-      .def_prop_ro("memory_bytes", &SweepMap<D>::memory_bytes)
+      .def("__len__", &NdtMap<D>::size)
+      .def_prop_ro("levels", &NdtMap<D>::levels)
+      .def_prop_ro("memory_bytes", &NdtMap<D>::memory_bytes)
       .def("add", &add_points<D>, nb::arg("points").noconvert(), nb::arg("weights").noconvert(),
            nb::arg("T_map_base").noconvert(),
            "Takes in points (N, D) float32 in the moving frame, weights (N,) float32 = e.")

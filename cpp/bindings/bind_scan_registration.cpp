@@ -3,9 +3,13 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/scans.hpp"
 #include "stillmap/registration/correlative_search.hpp"
+#include "stillmap/registration/likelihood_field.hpp"
 #include "stillmap/registration/occlusion_check.hpp"
 #include "stillmap/registration/scan_registration.hpp"
+#include "stillmap/util/lie.hpp"
 
 namespace stillmap::bindings {
 namespace {
@@ -29,36 +33,37 @@ WeightedBeams<D> beams_from(const Points<D>& points, const Flat<float>& weights)
 }
 
 template <int D>
-auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
-                    const OnePose<D>& T_prior, const Square<D>& information, double sigma,
-                    int radius, double floor, double unknown, double gain, int max_iterations,
-                    double window_translation, double window_rotation, double search_range,
-                    int starts, const std::optional<OnePose<D>>& T_start) {
+auto register_beams(const OccupancyGrid<D>& grid, const Points<D>& points,
+                    const Flat<float>& weights, const OnePose<D>& T_prior,
+                    const Square<D>& information, double sigma, int radius, double floor,
+                    double unknown, double gain, int max_iterations, double window_translation,
+                    double window_rotation, double search_range, int starts,
+                    const std::optional<OnePose<D>>& T_start) {
   require(starts >= 1, "starts: expected at least one");
-  const RegisterOptions options{{sigma, radius, floor, unknown}, gain, max_iterations};
+  const ScanRegistrationOptions options{{sigma, radius, floor, unknown}, gain, max_iterations};
   require(gain > 0.0, "gain: expected a positive number");
   require(window_translation >= 0.0 && window_rotation >= 0.0 && window_rotation <= 3.2,
           "window: expected half widths, rotation at most pi");
   auto beams = beams_from<D>(points, weights);
-  Prior<D> prior{checked_pose<D>(T_prior, "T_prior"), {}};
+  PosePrior<D> prior{checked_pose<D>(T_prior, "T_prior"), {}};
   for (int r = 0; r < Lie<D>::kDof; ++r)
     for (int c = 0; c < Lie<D>::kDof; ++c) prior.information(r, c) = information(r, c);
   require(prior.information.allFinite(), "information: not finite");
   std::optional<Pose<D>> given;
   if (T_start) given = checked_pose<D>(*T_start, "T_start");
-  Registration<D> best;
+  ScanRegistrationResult<D> best;
   best.cost = std::numeric_limits<double>::infinity();
   size_t candidates = 0;
-  std::vector<Registration<D>> found;
+  std::vector<ScanRegistrationResult<D>> found;
   {
     nb::gil_scoped_release released;
-    Field<D> field(grid, options.field);
+    LikelihoodField<D> field(grid, options.field);
     const SearchWindow window{window_translation, window_rotation, search_range};
     CorrelativeSearch<D> search(grid, beams, prior, window, options);
     const auto candidates_found =
         given ? std::vector<Candidate<D>>{{*given, 0.0}} : search.best(static_cast<size_t>(starts));
     for (const auto& start : candidates_found) {
-      found.push_back(climb<D>(field, beams, prior, start.pose, options));
+      found.push_back(minimise_levenberg_marquardt<D>(field, beams, prior, start.pose, options));
       if (found.back().cost < best.cost) best = found.back();
     }
     candidates = search.poses_tried();
@@ -66,7 +71,7 @@ auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<flo
   constexpr size_t n = Lie<D>::kDof;
   std::vector<double> rivals;
   for (const auto& other : found) {
-    const typename Lie<D>::Tangent apart = other.pose.minus(best.pose);
+    const typename Lie<D>::Tangent apart = other.pose.boxminus(best.pose);
     rivals.insert(rivals.end(), apart.data(), apart.data() + n);
     rivals.push_back(other.cost - best.cost);
   }
@@ -79,35 +84,35 @@ auto register_beams(const Grid<D>& grid, const Points<D>& points, const Flat<flo
 }
 
 template <int D>
-double through(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
+double through(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<float>& weights,
                const OnePose<D>& T, const OnePose<D>& T_sensor, double margin, double occupied) {
   require(margin >= 0.0, "margin: expected a length in metres that is not negative");
   require_probability(occupied, "occupied");
   const auto beams = beams_from<D>(points, weights);
-  return share_through<D>(grid, beams.points, beams.weights, checked_pose<D>(T, "T"),
-                          checked_pose<D>(T_sensor, "T_sensor").t, margin, occupied);
+  return occluded_share<D>(grid, beams.points, beams.weights, checked_pose<D>(T, "T"),
+                           checked_pose<D>(T_sensor, "T_sensor").t, margin, occupied);
 }
 
 // The data term alone, as the tests' oracle has it: without the constant ln(floor + 1) of every
 // beam, without the prior.
 template <int D>
-Quadratic<D> data_term(const Grid<D>& grid, WeightedBeams<D> beams, const OnePose<D>& T,
-                       const FieldOptions& field_options) {
-  Field<D> field(grid, field_options);
+QuadraticModel<D> data_term(const OccupancyGrid<D>& grid, WeightedBeams<D> beams,
+                            const OnePose<D>& T, const LikelihoodFieldOptions& field_options) {
+  LikelihoodField<D> field(grid, field_options);
   auto q = linearise<D>(field, beams, checked_pose<D>(T, "T"), {field_options, 1.0, 0});
   for (const double w : beams.weights) q.cost -= w * std::log(field_options.floor + 1.0);
   return q;
 }
 
 template <int D>
-double cost_at(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
+double cost_at(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<float>& weights,
                const OnePose<D>& T, double sigma, int radius, double floor, double unknown) {
   return data_term<D>(grid, beams_from<D>(points, weights), T, {sigma, radius, floor, unknown})
       .cost;
 }
 
 template <int D>
-auto gradient_at(const Grid<D>& grid, const Points<D>& points, const Flat<float>& weights,
+auto gradient_at(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<float>& weights,
                  const OnePose<D>& T, double sigma, int radius, double floor, double unknown) {
   const auto q =
       data_term<D>(grid, beams_from<D>(points, weights), T, {sigma, radius, floor, unknown});

@@ -21,14 +21,14 @@ auto texels(const Corners& corners, int width, int height) {
   require(n < size_t{1} << 31, "corners: too many");
   require(width > 0 && width <= kLargest && height > 0 && height <= kLargest,
           "width, height: expected 1 to 32768 texels");
-  Texels out;
+  TexelCoverage out;
   {
     nb::gil_scoped_release released;
-    out = texels_of(corners.data(), n, width, height);
+    out = rasterise_triangles(corners.data(), n, width, height);
   }
   const size_t k = out.texel.size();
   return std::make_tuple(owned(std::move(out.texel), {k}), owned(std::move(out.face), {k}),
-                         owned(std::move(out.weight), {k, 2}));
+                         owned(std::move(out.barycentric), {k, 2}));
 }
 
 }  // namespace

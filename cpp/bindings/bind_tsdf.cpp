@@ -7,6 +7,8 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "cell_box.hpp"
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
 #include "stillmap/mesh/tsdf.hpp"
 
 namespace stillmap::bindings {
@@ -21,7 +23,7 @@ bool all_finite(const double* values, size_t n) {
   return sum == 0.0;
 }
 
-void add(SignedDistances& distances, const Places<3>& points, const Places<3>& origin,
+void add(TsdfVolume& distances, const Places<3>& points, const Places<3>& origin,
          const Flat<double>& standoff, const Faces& faces, const Flat<float>& weight, int threads) {
   const size_t n = points.shape(0), m = faces.shape(0);
   require(origin.shape(0) == n, "origin: expected a row per point");
@@ -39,11 +41,11 @@ void add(SignedDistances& distances, const Places<3>& points, const Places<3>& o
   require(known, "faces: a point that is not there");
   require(weighs, "weight: expected finite ones that are not negative");
   nb::gil_scoped_release released;
-  distances.add({points.data(), origin.data(), standoff.data(), faces.data(), weight.data(), m},
-                threads);
+  distances.integrate(
+      {points.data(), origin.data(), standoff.data(), faces.data(), weight.data(), m}, threads);
 }
 
-auto blocks(const SignedDistances& distances) {
+auto blocks(const TsdfVolume& distances) {
   std::vector<int64_t> out;
   out.reserve(3 * distances.blocks().size());
   for (const auto& block : distances.blocks())
@@ -52,26 +54,26 @@ auto blocks(const SignedDistances& distances) {
   return owned(std::move(out), {n, 3});
 }
 
-void forget(SignedDistances& distances, const Cells<3>& cells) {
+void remove_blocks(TsdfVolume& distances, const Cells<3>& cells) {
   std::vector<Cell<3>> gone(cells.shape(0));
   for (size_t k = 0; k < gone.size(); ++k) gone[k] = cell_from<3>(cells, k);
   nb::gil_scoped_release released;
-  distances.forget(gone);
+  distances.remove_blocks(gone);
 }
 
 // The voxels of a block within a box, x by x.
 template <class Visit>
-void each_within(const SignedDistances::Block& block, const Box<3>& box, Visit&& visit) {
-  for (int local = 0; local < SignedDistances::kCells; ++local) {
-    const Distances& voxel = block.counts[static_cast<size_t>(local)];
-    const Cell<3> cell = Grid<3>::cell_at(block.origin, local);
+void for_each_voxel(const TsdfVolume::Block& block, const Box<3>& box, Visit&& visit) {
+  for (int local = 0; local < TsdfVolume::kCells; ++local) {
+    const TsdfVoxel& voxel = block.values[static_cast<size_t>(local)];
+    const Cell<3> cell = BlockLayout<3>::cell_at(block.origin, local);
     if (voxel.weight > 0.0f && box.holds(cell)) visit(box.index(cell), voxel);
   }
 }
 
-auto dense(const SignedDistances& distances, const std::array<int64_t, 3>& first_cell,
+auto dense(const TsdfVolume& distances, const std::array<int64_t, 3>& first_cell,
            const std::array<int64_t, 3>& shape) {
-  constexpr int kEdge = SignedDistances::kEdge;
+  constexpr int kEdge = TsdfVolume::kEdge;
   const Box<3> box(first_cell, shape);
   std::vector<float> metres(box.total(), std::numeric_limits<float>::quiet_NaN());
   std::vector<float> weight(metres.size(), 0.0f);
@@ -80,10 +82,10 @@ auto dense(const SignedDistances& distances, const std::array<int64_t, 3>& first
     Cell<3> end = box.first;
     for (int d = 0; d < 3; ++d)
       end[d] += static_cast<int32_t>(box.size[static_cast<size_t>(d)]) - 1;
-    const Cell<3> low = SignedDistances::block_of(box.first), high = SignedDistances::block_of(end);
-    const auto write = [&](const SignedDistances::Block& block) {
-      each_within(block, box, [&](size_t at, const Distances& voxel) {
-        metres[at] = voxel.product / voxel.weight;
+    const Cell<3> low = TsdfVolume::block_of(box.first), high = TsdfVolume::block_of(end);
+    const auto write = [&](const TsdfVolume::Block& block) {
+      for_each_voxel(block, box, [&](size_t at, const TsdfVoxel& voxel) {
+        metres[at] = voxel.weighted_distance / voxel.weight;
         weight[at] = voxel.weight;
       });
     };
@@ -104,21 +106,20 @@ auto dense(const SignedDistances& distances, const std::array<int64_t, 3>& first
 }  // namespace
 
 void bind_tsdf(nb::module_& m) {
-  nb::class_<SignedDistances>(m, "SignedDistances",
-                              "Signed distances from the surfaces that scans saw, averaged in "
-                              "voxels. Voxel (0, 0, 0) has the origin as its lowest corner; its "
-                              "distance is that of its middle.")
+  nb::class_<TsdfVolume>(m, "SignedDistances",
+                         "Signed distances from the surfaces that scans saw, averaged in "
+                         "voxels. Voxel (0, 0, 0) has the origin as its lowest corner; its "
+                         "distance is that of its middle.")
       .def(nb::init<double, double, double>(), nb::arg("voxel"), nb::kw_only(), nb::arg("before"),
            nb::arg("behind"),
            "voxel: its edge in metres; before, behind: metres in front of surfaces and behind them "
            "up to which distances count.")
-      .def_prop_ro("voxel", &SignedDistances::voxel)
-      .def_prop_ro("before", &SignedDistances::before)
-      .def_prop_ro("behind", &SignedDistances::behind)
-      .def_prop_ro("memory_bytes", &SignedDistances::memory_bytes)
+      .def_prop_ro("voxel", &TsdfVolume::voxel)
+      .def_prop_ro("before", &TsdfVolume::truncation_front)
+      .def_prop_ro("behind", &TsdfVolume::truncation_back)
+      .def_prop_ro("memory_bytes", &TsdfVolume::memory_bytes)
       .def_prop_ro(
-          "edge", [](const SignedDistances&) { return SignedDistances::kEdge; },
-          "Voxels along a block.")
+          "edge", [](const TsdfVolume&) { return TsdfVolume::kEdge; }, "Voxels along a block.")
       .def("add", &add, nb::arg("points").noconvert(), nb::arg("origin").noconvert(),
            nb::arg("standoff").noconvert(), nb::arg("faces").noconvert(),
            nb::arg("weight").noconvert(), nb::arg("threads") = 1,
@@ -127,7 +128,7 @@ void bind_tsdf(nb::module_& m) {
            "(n,) metres from there to the surface's tangent plane at the point. Faces that are "
            "seen edge on, or whose standoff is not positive, tell nothing.")
       .def("blocks", &blocks, "(B, 3) int64, in blocks: those that were met, in their order.")
-      .def("forget", &forget, nb::arg("blocks").noconvert(),
+      .def("forget", &remove_blocks, nb::arg("blocks").noconvert(),
            "Voxels of these blocks (B, 3) int64 are as if never met, and their memory is free.")
       .def("dense", &dense, nb::arg("first_cell"), nb::arg("shape"),
            "float32 arrays [z, y, x] over a box of voxels: metres in front of the surface, NaN "

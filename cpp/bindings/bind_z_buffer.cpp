@@ -5,6 +5,7 @@
 #include "arrays.hpp"
 #include "bindings.hpp"
 #include "stillmap/mesh/z_buffer.hpp"
+#include "stillmap/util/lie.hpp"
 
 namespace stillmap::bindings {
 namespace {
@@ -47,7 +48,7 @@ auto z_buffer(const Places<3>& vertices, const Faces& faces, const Matrix& K,
   ZBuffer out;
   {
     nb::gil_scoped_release released;
-    out = z_buffer_of(vertices.data(), V, faces.data(), F, camera, threads);
+    out = render_z_buffer(vertices.data(), V, faces.data(), F, camera, threads);
   }
   const auto h = static_cast<size_t>(height), w = static_cast<size_t>(width);
   return std::make_tuple(owned(std::move(out.depth), {h, w}), owned(std::move(out.face), {h, w}));

@@ -7,30 +7,24 @@
 #include <utility>
 #include <vector>
 
-#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
 
 namespace stillmap {
 
 // A grid to walk through as Grid is, with values of another kind instead of counts.
 template <int D, class Value>
-class Blocks {
+class BlockMap : public BlockLayout<D> {
  public:
-  using G = Grid<D>;
-  static constexpr int kDimension = D;
-  static constexpr int kShift = G::kShift;
-  static constexpr int kEdge = G::kEdge;
-  static constexpr int kCells = G::kCells;
+  using BlockLayout<D>::kCells;
 
   struct Block {
     Cell<D> origin;                    // block coordinates
-    std::array<Value, kCells> counts;  // of each cell
+    std::array<Value, kCells> values;  // of each cell
   };
 
-  static Cell<D> block_of(const Cell<D>& cell) { return G::block_of(cell); }
-  static int local_of(const Cell<D>& cell) { return G::local_of(cell); }
-
   const Block* find(const Cell<D>& block) const {
-    const auto it = index_.find(G::key(block));
+    const auto it = index_.find(BlockLayout<D>::key(block));
     return it == index_.end() ? nullptr : blocks_[it->second].get();
   }
 
@@ -40,11 +34,11 @@ class Blocks {
  protected:
   Block* find_or_add(const Cell<D>& block, const Value& value) {
     if (last_ && last_->origin == block) return last_;
-    const auto [it, added] = index_.try_emplace(G::key(block), blocks_.size());
+    const auto [it, added] = index_.try_emplace(BlockLayout<D>::key(block), blocks_.size());
     if (added) {
       blocks_.push_back(std::make_unique<Block>());
       blocks_.back()->origin = block;
-      blocks_.back()->counts.fill(value);
+      blocks_.back()->values.fill(value);
     }
     last_ = blocks_[it->second].get();
     return last_;
@@ -56,7 +50,7 @@ class Blocks {
     last_ = nullptr;
     size_t kept = 0;
     for (size_t k = 0; k < blocks_.size(); ++k) {
-      const uint64_t key = G::key(blocks_[k]->origin);
+      const uint64_t key = BlockLayout<D>::key(blocks_[k]->origin);
       if (!keep(blocks_[k]->origin)) {
         index_.erase(key);
         continue;
@@ -71,7 +65,7 @@ class Blocks {
  private:
   std::vector<std::unique_ptr<Block>> blocks_;
   Block* last_ = nullptr;
-  std::unordered_map<uint64_t, size_t, typename G::Hash> index_;
+  std::unordered_map<uint64_t, size_t, typename BlockLayout<D>::Hash> index_;
 };
 
 }  // namespace stillmap

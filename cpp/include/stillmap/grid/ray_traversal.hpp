@@ -1,37 +1,22 @@
 // Cells and chord lengths along a segment: the l_j of the paper's last paragraph of Sect. 3.
 #pragma once
 
-#include <Eigen/Core>
 #include <cmath>
 #include <cstdint>
 #include <limits>
 #include <type_traits>
 
+#include "stillmap/grid/cell.hpp"
+
 namespace stillmap {
-
-template <int D>
-using Vec = Eigen::Matrix<double, D, 1>;
-template <int D>
-using Cell = Eigen::Matrix<int32_t, D, 1>;
-
-// NaN compares false, so it is refused like a coordinate that is too far away
-template <int D>
-inline bool all_below(const Vec<D>& x, double limit) {
-  return (x.array().abs() < limit).all();
-}
-
-template <int D>
-inline Cell<D> cell_of(const Vec<D>& point_in_cells) {
-  return point_in_cells.array().floor().template cast<int32_t>();
-}
 
 // Walks the cells of a segment in order. Points are given in units of cells, and so are the
 // lengths. The walker hears start(first cell), then for every border visit(length in the cell it
 // leaves) and step<axis>(+1 or -1); it ends in the end cell, whose chord is returned. Crossing a
 // corner passes through a cell of length zero, so that exactly sum |end - start| borders are
 // crossed and the walk always ends.
-template <int D, class Walker>
-inline double traverse(const Vec<D>& start, const Vec<D>& end, Walker& walker) {
+template <int D, class Visitor>
+inline double traverse(const Vec<D>& start, const Vec<D>& end, Visitor& visitor) {
   constexpr double inf = std::numeric_limits<double>::infinity();
   const Cell<D> first = cell_of<D>(start), last = cell_of<D>(end);
   const Vec<D> direction = end - start;
@@ -53,14 +38,14 @@ inline double traverse(const Vec<D>& start, const Vec<D>& end, Walker& walker) {
                cells ? length / std::abs(direction[d]) : inf, std::abs(cells), step};
     borders += axes[d].left;
   }
-  walker.start(first);
+  visitor.start(first);
   double travelled = 0.0;
   auto cross = [&](Axis& axis, auto which) {
     const double border = axis.next;
-    walker.visit(border > travelled ? border - travelled : 0.0);
+    visitor.visit(border > travelled ? border - travelled : 0.0);
     travelled = border > travelled ? border : travelled;
     axis.next = --axis.left ? border + axis.delta : inf;
-    walker.template step<decltype(which)::value>(axis.step);
+    visitor.template step<decltype(which)::value>(axis.step);
   };
   using X = std::integral_constant<int, 0>;
   using Y = std::integral_constant<int, 1>;

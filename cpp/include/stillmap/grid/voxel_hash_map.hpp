@@ -6,14 +6,15 @@
 #include <utility>
 #include <vector>
 
-#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
 
 namespace stillmap {
 
 // Open addressing with linear probing. Nothing is taken out singly: what is to go goes with a new
 // table, so that probing needs no tombstones and values keep the order in which they came.
 template <int D, class Value>
-class VoxelTable {
+class VoxelHashMap {
  public:
   // coordinates beyond would share keys
   static constexpr int32_t kMaxCell = 1 << 20;
@@ -24,11 +25,11 @@ class VoxelTable {
 
   const Value* find(const Cell<D>& cell) const {
     if (values_.empty()) return nullptr;
-    const uint64_t key = Grid<D>::key(cell);
+    const uint64_t key = BlockLayout<D>::key(cell);
     for (size_t slot = hash_(key) & mask();; slot = (slot + 1) & mask()) {
       const Slot& s = slots_[slot];
-      if (s.place < 0) return nullptr;
-      if (s.key == key) return &values_[static_cast<size_t>(s.place)];
+      if (s.index < 0) return nullptr;
+      if (s.key == key) return &values_[static_cast<size_t>(s.index)];
     }
   }
 
@@ -38,14 +39,14 @@ class VoxelTable {
       if (cell[d] <= -kMaxCell || cell[d] >= kMaxCell)
         throw std::invalid_argument("point: too far away to be counted in cells");
     if (2 * (values_.size() + 1) > slots_.size()) grow();
-    const uint64_t key = Grid<D>::key(cell);
+    const uint64_t key = BlockLayout<D>::key(cell);
     Slot& s = slot_of(key);
-    if (s.place < 0) {
+    if (s.index < 0) {
       s = {key, static_cast<int32_t>(values_.size())};
       cells_.push_back(cell);
       values_.emplace_back();
     }
-    return values_[static_cast<size_t>(s.place)];
+    return values_[static_cast<size_t>(s.index)];
   }
 
   // Keeps the cells that keep(cell) says.
@@ -59,9 +60,9 @@ class VoxelTable {
     }
     cells_.resize(kept);
     values_.resize(kept);
-    size_t slots = kFewest;
+    size_t slots = kMinSlots;
     while (slots < 4 * kept) slots *= 2;
-    place_all(slots);
+    rehash(slots);
   }
 
   size_t memory_bytes() const {
@@ -70,32 +71,32 @@ class VoxelTable {
   }
 
  private:
-  static constexpr size_t kFewest = 64;
+  static constexpr size_t kMinSlots = 64;
 
   struct Slot {
     uint64_t key = 0;
-    int32_t place = -1;  // in values_; -1: free
+    int32_t index = -1;  // in values_; -1: free
   };
 
   size_t mask() const { return slots_.size() - 1; }
 
   Slot& slot_of(uint64_t key) {
     size_t slot = hash_(key) & mask();
-    while (slots_[slot].place >= 0 && slots_[slot].key != key) slot = (slot + 1) & mask();
+    while (slots_[slot].index >= 0 && slots_[slot].key != key) slot = (slot + 1) & mask();
     return slots_[slot];
   }
 
-  void grow() { place_all(slots_.empty() ? kFewest : 2 * slots_.size()); }
+  void grow() { rehash(slots_.empty() ? kMinSlots : 2 * slots_.size()); }
 
-  void place_all(size_t slots) {
+  void rehash(size_t slots) {
     std::vector<Slot>(slots).swap(slots_);
     for (size_t k = 0; k < cells_.size(); ++k) {
-      const uint64_t key = Grid<D>::key(cells_[k]);
+      const uint64_t key = BlockLayout<D>::key(cells_[k]);
       slot_of(key) = {key, static_cast<int32_t>(k)};
     }
   }
 
-  typename Grid<D>::Hash hash_;
+  typename BlockLayout<D>::Hash hash_;
   std::vector<Slot> slots_;
   std::vector<Cell<D>> cells_;
   std::vector<Value> values_;

@@ -15,26 +15,27 @@
 #include <utility>
 #include <vector>
 
+#include "stillmap/grid/cell.hpp"
 #include "stillmap/grid/voxel_hash_map.hpp"
 #include "stillmap/util/parallel.hpp"
 
 namespace stillmap {
 
-struct NearPlaces {
-  std::vector<int32_t> face;   // -1: none is near
-  std::vector<double> weight;  // of its three corners
+struct NearestPoints {
+  std::vector<int32_t> face;        // -1: none is near
+  std::vector<double> barycentric;  // of its three corners
 };
 
-namespace near_faces {
+namespace mesh_distance {
 
 constexpr double kSliver = 1e-12;  // squared sine of the angle of a triangle without area
-constexpr double kLeast = 1e-300;
+constexpr double kMinSquaredLength = 1e-300;
 
 using Triangle = std::array<Vec<3>, 3>;
 
-struct Foot {
-  std::array<double, 3> weight;
-  double square;  // of the distance to there
+struct ClosestPoint {
+  std::array<double, 3> barycentric;
+  double squared_distance;  // of the distance to there
 };
 
 // in the order of the twin, so that both break ties alike
@@ -47,56 +48,58 @@ inline Vec<3> normal_of(const Triangle& t) {
   return {u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]};
 }
 
-inline Foot at_weight(const Vec<3>& p, const Triangle& t, const std::array<double, 3>& w) {
-  double square = 0.0;
+inline ClosestPoint point_at(const Vec<3>& p, const Triangle& t, const std::array<double, 3>& w) {
+  double squared_distance = 0.0;
   for (int d = 0; d < 3; ++d) {
     const double off = p[d] - (w[0] * t[0][d] + w[1] * t[1][d] + w[2] * t[2][d]);
-    square += off * off;
+    squared_distance += off * off;
   }
-  return {w, square};
+  return {w, squared_distance};
 }
 
-inline std::array<double, 3> on_edges(const Vec<3>& p, const Triangle& t) {
-  std::array<double, 3> weight{};
+inline std::array<double, 3> closest_on_edges(const Vec<3>& p, const Triangle& t) {
+  std::array<double, 3> barycentric{};
   double least = std::numeric_limits<double>::infinity();
   for (size_t first = 0; first < 3; ++first) {
     const size_t second = (first + 1) % 3;
-    const Vec<3> along = t[second] - t[first], to = p - t[first];
-    const double share = std::clamp(dot(to, along) / std::max(dot(along, along), kLeast), 0.0, 1.0);
-    const Vec<3> left = to - share * along;
-    const double away = dot(left, left);
-    if (!(away < least)) continue;
-    least = away;
-    weight = {};
-    weight[first] = 1.0 - share, weight[second] = share;
+    const Vec<3> along = t[second] - t[first], from_first = p - t[first];
+    const double fraction = std::clamp(
+        dot(from_first, along) / std::max(dot(along, along), kMinSquaredLength), 0.0, 1.0);
+    const Vec<3> rest = from_first - fraction * along;
+    const double squared = dot(rest, rest);
+    if (!(squared < least)) continue;
+    least = squared;
+    barycentric = {};
+    barycentric[first] = 1.0 - fraction, barycentric[second] = fraction;
   }
-  return weight;
+  return barycentric;
 }
 
 // The place of a triangle that is nearest to a point.
-inline Foot foot_of(const Vec<3>& p, const Triangle& t) {
+inline ClosestPoint closest_point(const Vec<3>& p, const Triangle& t) {
   const Vec<3> u = t[1] - t[0], v = t[2] - t[0], w = p - t[0];
   const double uu = dot(u, u), uv = dot(u, v), vv = dot(v, v), wu = dot(w, u), wv = dot(w, v);
-  const double square = uu * vv - uv * uv;
-  if (square > kSliver * uu * vv) {
-    const double j = (vv * wu - uv * wv) / square, k = (uu * wv - uv * wu) / square;
-    if (j >= 0.0 && k >= 0.0 && j + k <= 1.0) return at_weight(p, t, {1.0 - j - k, j, k});
+  const double squared_distance = uu * vv - uv * uv;
+  if (squared_distance > kSliver * uu * vv) {
+    const double j = (vv * wu - uv * wv) / squared_distance,
+                 k = (uu * wv - uv * wu) / squared_distance;
+    if (j >= 0.0 && k >= 0.0 && j + k <= 1.0) return point_at(p, t, {1.0 - j - k, j, k});
   }
-  return at_weight(p, t, on_edges(p, t));
+  return point_at(p, t, closest_on_edges(p, t));
 }
 
 // Of the distance from a point to a box.
-inline double square_to_box(const Vec<3>& p, const Vec<3>& low, const Vec<3>& high) {
-  double square = 0.0;
+inline double squared_distance_to_box(const Vec<3>& p, const Vec<3>& low, const Vec<3>& high) {
+  double squared_distance = 0.0;
   for (int d = 0; d < 3; ++d) {
     const double below = low[d] - p[d], above = p[d] - high[d];
     const double more = below > above ? below : above, off = more > 0.0 ? more : 0.0;
-    square += off * off;
+    squared_distance += off * off;
   }
-  return square;
+  return squared_distance;
 }
 
-inline std::pair<Vec<3>, Vec<3>> bounds_of(const Triangle& t) {
+inline std::pair<Vec<3>, Vec<3>> bounding_box(const Triangle& t) {
   Vec<3> low = t[0], high = t[0];
   for (int d = 0; d < 3; ++d)
     for (size_t i = 1; i < 3; ++i) {
@@ -106,24 +109,25 @@ inline std::pair<Vec<3>, Vec<3>> bounds_of(const Triangle& t) {
   return {low, high};
 }
 
-}  // namespace near_faces
+}  // namespace mesh_distance
 
-class NearFaces {
+class MeshDistance {
  public:
   // vertices (V, 3), faces (F, 3); reach: metres that a place may be away at most
-  NearFaces(const double* vertices, size_t V, const int32_t* faces, size_t F, double reach)
-      : reach_(reach), faces_(faces, faces + 3 * F) {
+  MeshDistance(const double* vertices, size_t V, const int32_t* faces, size_t F,
+               double max_distance)
+      : max_distance_(max_distance), faces_(faces, faces + 3 * F) {
     for (size_t i = 0; i < V; ++i)
       vertices_.emplace_back(vertices[3 * i], vertices[3 * i + 1], vertices[3 * i + 2]);
     for (const auto& at : vertices_) low_ = low_.cwiseMin(at), high_ = high_.cwiseMax(at);
-    edge_ = reach;
-    if (V) edge_ = std::max(edge_, (high_ - low_).maxCoeff() / kMostCells);
-    per_metre_ = 1.0 / edge_;
-    slack_ = kSlack * edge_;
-    put_in_cells();
+    edge_ = max_distance;
+    if (V) edge_ = std::max(edge_, (high_ - low_).maxCoeff() / kMaxCells);
+    inverse_edge_ = 1.0 / edge_;
+    margin_ = kRoundingMargin * edge_;
+    build_levels();
   }
 
-  double reach() const { return reach_; }
+  double max_distance() const { return max_distance_; }
   size_t size() const { return faces_.size() / 3; }
 
   size_t memory_bytes() const {
@@ -135,96 +139,99 @@ class NearFaces {
 
   // points, origins (n, 3): where points are, and where each was seen from. Faces that have their
   // back to there, or no area, do not count; of several at one distance the lowest number does.
-  NearPlaces nearest(const double* points, const double* origins, size_t n, int threads) const {
-    NearPlaces out{std::vector<int32_t>(n, -1), std::vector<double>(3 * n, 0.0)};
-    parallel_shares(even_shares(n, threads), [&](size_t, size_t first, size_t last) {
+  NearestPoints nearest(const double* points, const double* origins, size_t n, int threads) const {
+    NearestPoints out{std::vector<int32_t>(n, -1), std::vector<double>(3 * n, 0.0)};
+    parallel_for_ranges(split_evenly(n, threads), [&](size_t, size_t first, size_t last) {
       for (size_t i = first; i < last; ++i) {
         const Vec<3> point(points + 3 * i), origin(origins + 3 * i);
-        Best best = {point, origin - point, -1, {{}, reach_ * reach_}, 0.0};
-        find(best);
+        Best best = {point, origin - point, -1, {{}, max_distance_ * max_distance_}, 0.0};
+        search(best);
         out.face[i] = best.face;
-        std::copy_n(best.foot.weight.begin(), 3, out.weight.begin() + 3 * std::ptrdiff_t(i));
+        std::copy_n(best.closest.barycentric.begin(), 3,
+                    out.barycentric.begin() + 3 * std::ptrdiff_t(i));
       }
     });
     return out;
   }
 
  private:
-  static constexpr double kMostCells = 1 << 19;  // along an axis
-  static constexpr double kParts = 4.0;          // cells that a face is as long as, at most
-  static constexpr double kSlack = 1e-3;         // of a cell: more than is lost by rounding
+  static constexpr double kMaxCells = 1 << 19;     // along an axis
+  static constexpr double kMaxCellsPerFace = 4.0;  // cells that a face is as long as, at most
+  static constexpr double kRoundingMargin = 1e-3;  // of a cell: more than is lost by rounding
 
-  struct Faces {
+  struct FaceRange {
     size_t first = 0, size = 0;  // among those of the level
   };
 
   struct Level {
     int number;  // its cells are 2^number of the smallest ones long
     double edge;
-    VoxelTable<3, Faces> cells;
+    VoxelHashMap<3, FaceRange> cells;
     std::vector<int32_t> faces;  // cell by cell, rising
 
-    Cell<3> cell_with(const Cell<3>& smallest) const {
+    Cell<3> coarse_cell(const Cell<3>& smallest) const {
       return {smallest[0] >> number, smallest[1] >> number, smallest[2] >> number};
     }
   };
 
   struct Best {
-    Vec<3> point, towards;  // where it was seen from, from there
+    Vec<3> point, to_origin;  // where it was seen from, from there
     int32_t face;
-    near_faces::Foot foot;
-    double farther;  // square of the distance beyond which nothing is nearer
+    mesh_distance::ClosestPoint closest;
+    double squared_radius;  // square of the distance beyond which nothing is nearer
   };
 
-  near_faces::Triangle corners(int32_t face) const {
+  mesh_distance::Triangle corners(int32_t face) const {
     const int32_t* at = &faces_[3 * static_cast<size_t>(face)];
     const auto vertex = [&](int i) { return vertices_[static_cast<size_t>(at[i])]; };
     return {vertex(0), vertex(1), vertex(2)};
   }
 
   // the smallest one there
-  Cell<3> cell_at(const Vec<3>& place) const { return cell_of<3>((place - low_) * per_metre_); }
+  Cell<3> cell_at(const Vec<3>& place) const { return cell_of<3>((place - low_) * inverse_edge_); }
 
   template <class Visit>
-  static void each_from_to(const Cell<3>& low, const Cell<3>& high, Visit&& visit) {
+  static void for_each_cell(const Cell<3>& low, const Cell<3>& high, Visit&& visit) {
     Cell<3> at;
     for (at[2] = low[2]; at[2] <= high[2]; ++at[2])
       for (at[1] = low[1]; at[1] <= high[1]; ++at[1])
         for (at[0] = low[0]; at[0] <= high[0]; ++at[0]) visit(at);
   }
 
-  void put_in_cells() {
-    std::vector<std::vector<int32_t>> of_level;
+  void build_levels() {
+    std::vector<std::vector<int32_t>> faces_of_level;
     for (size_t f = 0; f < size(); ++f) {
-      const near_faces::Triangle t = corners(static_cast<int32_t>(f));
-      if (near_faces::normal_of(t).isZero(0.0)) continue;
-      const auto [low, high] = near_faces::bounds_of(t);
+      const mesh_distance::Triangle t = corners(static_cast<int32_t>(f));
+      if (mesh_distance::normal_of(t).isZero(0.0)) continue;
+      const auto [low, high] = mesh_distance::bounding_box(t);
       const double longest = (high - low).maxCoeff();
       size_t level = 0;
-      for (double edge = edge_; kParts * edge < longest; edge *= 2.0) ++level;
-      if (of_level.size() <= level) of_level.resize(level + 1);
-      of_level[level].push_back(static_cast<int32_t>(f));
+      for (double edge = edge_; kMaxCellsPerFace * edge < longest; edge *= 2.0) ++level;
+      if (faces_of_level.size() <= level) faces_of_level.resize(level + 1);
+      faces_of_level[level].push_back(static_cast<int32_t>(f));
     }
-    for (size_t k = 0; k < of_level.size(); ++k)
-      if (!of_level[k].empty()) levels_.push_back(level_of(static_cast<int>(k), of_level[k]));
+    for (size_t k = 0; k < faces_of_level.size(); ++k)
+      if (!faces_of_level[k].empty())
+        levels_.push_back(build_level(static_cast<int>(k), faces_of_level[k]));
   }
 
   // A face lies in the cells with a ball about them that reaches it.
-  Level level_of(int number, const std::vector<int32_t>& faces) const {
+  Level build_level(int number, const std::vector<int32_t>& faces) const {
     const double edge = std::ldexp(edge_, number);
     Level level{number, edge, {}, {}};
-    const double radius = 0.5 * std::sqrt(3.0) * edge + slack_;
+    const double radius = 0.5 * std::sqrt(3.0) * edge + margin_;
     std::vector<std::pair<size_t, int32_t>> members;  // place of a cell, face
     for (const int32_t f : faces) {
-      const near_faces::Triangle t = corners(f);
-      const auto [low, high] = near_faces::bounds_of(t);
-      each_from_to(
-          level.cell_with(cell_at(low)), level.cell_with(cell_at(high)), [&](const Cell<3>& cell) {
+      const mesh_distance::Triangle t = corners(f);
+      const auto [low, high] = mesh_distance::bounding_box(t);
+      for_each_cell(
+          level.coarse_cell(cell_at(low)), level.coarse_cell(cell_at(high)),
+          [&](const Cell<3>& cell) {
             const Vec<3> middle = low_ + edge * (cell.cast<double>() + Vec<3>::Constant(0.5));
-            if (near_faces::foot_of(middle, t).square > radius * radius) return;
-            Faces& in = level.cells.find_or_add(cell);
-            if (in.size++ == 0) in.first = level.cells.size() - 1;
-            members.emplace_back(in.first, f);
+            if (mesh_distance::closest_point(middle, t).squared_distance > radius * radius) return;
+            FaceRange& range = level.cells.find_or_add(cell);
+            if (range.size++ == 0) range.first = level.cells.size() - 1;
+            members.emplace_back(range.first, f);
           });
     }
     std::vector<size_t> next(level.cells.size() + 1, 0);
@@ -237,48 +244,53 @@ class NearFaces {
     return level;
   }
 
-  void find(Best& best) const {
-    best.farther = (reach_ + slack_) * (reach_ + slack_);
-    if (near_faces::square_to_box(best.point, low_, high_) > best.farther) return;
-    const Cell<3> own = cell_at(best.point);
-    for (const Level& level : levels_) look_into(level, level.cell_with(own), best);
-    const Vec<3> about = Vec<3>::Constant(std::sqrt(best.farther));
-    const Cell<3> first = cell_at(best.point - about), last = cell_at(best.point + about);
+  void search(Best& best) const {
+    best.squared_radius = (max_distance_ + margin_) * (max_distance_ + margin_);
+    if (mesh_distance::squared_distance_to_box(best.point, low_, high_) > best.squared_radius)
+      return;
+    const Cell<3> centre = cell_at(best.point);
+    for (const Level& level : levels_) search_cell(level, level.coarse_cell(centre), best);
+    const Vec<3> radius = Vec<3>::Constant(std::sqrt(best.squared_radius));
+    const Cell<3> first = cell_at(best.point - radius), last = cell_at(best.point + radius);
     for (const Level& level : levels_)
-      look_around(level, level.cell_with(own), level.cell_with(first), level.cell_with(last), best);
+      search_around(level, level.coarse_cell(centre), level.coarse_cell(first),
+                    level.coarse_cell(last), best);
   }
 
   // Into the cells about its own.
-  void look_around(const Level& level, const Cell<3>& own, const Cell<3>& first,
-                   const Cell<3>& last, Best& best) const {
+  void search_around(const Level& level, const Cell<3>& centre, const Cell<3>& first,
+                     const Cell<3>& last, Best& best) const {
     if (first == last) return;
-    each_from_to(first, last, [&](const Cell<3>& cell) {
-      if (cell == own) return;
+    for_each_cell(first, last, [&](const Cell<3>& cell) {
+      if (cell == centre) return;
       const Vec<3> low = low_ + level.edge * cell.cast<double>();
       const Vec<3> high = low + Vec<3>::Constant(level.edge);
-      if (near_faces::square_to_box(best.point, low, high) <= best.farther)
-        look_into(level, cell, best);
+      if (mesh_distance::squared_distance_to_box(best.point, low, high) <= best.squared_radius)
+        search_cell(level, cell, best);
     });
   }
 
-  void look_into(const Level& level, const Cell<3>& cell, Best& best) const {
-    const Faces* in = level.cells.find(cell);
-    if (!in) return;
-    for (size_t i = in->first; i < in->first + in->size; ++i) {
+  void search_cell(const Level& level, const Cell<3>& cell, Best& best) const {
+    const FaceRange* range = level.cells.find(cell);
+    if (!range) return;
+    for (size_t i = range->first; i < range->first + range->size; ++i) {
       const int32_t f = level.faces[i];
-      const near_faces::Triangle t = corners(f);
-      const auto [low, high] = near_faces::bounds_of(t);
-      if (near_faces::square_to_box(best.point, low, high) > best.farther) continue;
-      if (!(near_faces::dot(best.towards, near_faces::normal_of(t)) > 0.0)) continue;
-      const near_faces::Foot foot = near_faces::foot_of(best.point, t);
-      const bool as_near = foot.square == best.foot.square && best.face >= 0;
-      if (!(foot.square < best.foot.square || (as_near && f < best.face))) continue;
-      const double far = std::sqrt(foot.square) + slack_;
-      best.face = f, best.foot = foot, best.farther = far * far;
+      const mesh_distance::Triangle t = corners(f);
+      const auto [low, high] = mesh_distance::bounding_box(t);
+      if (mesh_distance::squared_distance_to_box(best.point, low, high) > best.squared_radius)
+        continue;
+      if (!(mesh_distance::dot(best.to_origin, mesh_distance::normal_of(t)) > 0.0)) continue;
+      const mesh_distance::ClosestPoint closest = mesh_distance::closest_point(best.point, t);
+      const bool is_tie =
+          closest.squared_distance == best.closest.squared_distance && best.face >= 0;
+      if (!(closest.squared_distance < best.closest.squared_distance || (is_tie && f < best.face)))
+        continue;
+      const double far = std::sqrt(closest.squared_distance) + margin_;
+      best.face = f, best.closest = closest, best.squared_radius = far * far;
     }
   }
 
-  double reach_, edge_, per_metre_, slack_;
+  double max_distance_, edge_, inverse_edge_, margin_;
   std::vector<Vec<3>> vertices_;
   std::vector<int32_t> faces_;
   Vec<3> low_ = Vec<3>::Constant(std::numeric_limits<double>::infinity());

@@ -9,13 +9,13 @@
 
 namespace stillmap {
 
-struct Texels {
+struct TexelCoverage {
   std::vector<int32_t> texel;  // row * width + column
   std::vector<int32_t> face;
-  std::vector<float> weight;  // of the second and third corner
+  std::vector<float> barycentric;  // of the second and third corner
 };
 
-namespace texels {
+namespace texel_raster {
 
 struct Triangle {
   double ax, ay, bx, by, cx, cy;
@@ -24,55 +24,57 @@ struct Triangle {
 };
 
 // The columns or rows whose centres lie between two places: first and last, of so many.
-inline std::array<int32_t, 2> centres(double low, double high, int32_t size) {
+inline std::array<int32_t, 2> covered_range(double low, double high, int32_t size) {
   const double first = std::ceil(low - 0.5), last = std::floor(high - 0.5);
   return {static_cast<int32_t>(std::clamp(first, 0.0, static_cast<double>(size))),
           static_cast<int32_t>(std::clamp(last, -1.0, static_cast<double>(size - 1)))};
 }
 
-inline void add(Texels& out, int32_t texel, int32_t face, double j, double k) {
+inline void append(TexelCoverage& out, int32_t texel, int32_t face, double j, double k) {
   out.texel.push_back(texel);
   out.face.push_back(face);
-  out.weight.push_back(static_cast<float>(j));
-  out.weight.push_back(static_cast<float>(k));
+  out.barycentric.push_back(static_cast<float>(j));
+  out.barycentric.push_back(static_cast<float>(k));
 }
 
-inline void cover(const Triangle& t, int32_t number, int32_t width, int32_t height, Texels& out) {
+inline void rasterise(const Triangle& t, int32_t number, int32_t width, int32_t height,
+                      TexelCoverage& out) {
   const double area = t.doubled_area();
   const size_t before = out.texel.size();
   const auto [left, right] =
-      centres(std::min({t.ax, t.bx, t.cx}), std::max({t.ax, t.bx, t.cx}), width);
+      covered_range(std::min({t.ax, t.bx, t.cx}), std::max({t.ax, t.bx, t.cx}), width);
   const auto [top, bottom] =
-      centres(std::min({t.ay, t.by, t.cy}), std::max({t.ay, t.by, t.cy}), height);
+      covered_range(std::min({t.ay, t.by, t.cy}), std::max({t.ay, t.by, t.cy}), height);
   if (area != 0.0)
     for (int32_t row = top; row <= bottom; ++row)
       for (int32_t column = left; column <= right; ++column) {
         const double x = column + 0.5 - t.ax, y = row + 0.5 - t.ay;
         const double j = (x * (t.cy - t.ay) - y * (t.cx - t.ax)) / area;
         const double k = ((t.bx - t.ax) * y - (t.by - t.ay) * x) / area;
-        if (j >= 0.0 && k >= 0.0 && j + k <= 1.0) add(out, row * width + column, number, j, k);
+        if (j >= 0.0 && k >= 0.0 && j + k <= 1.0) append(out, row * width + column, number, j, k);
       }
   if (out.texel.size() > before) return;
   // between the centres of texels: the one that holds its middle
   const auto within = [](double at, int32_t size) {
     return static_cast<int32_t>(std::clamp(std::floor(at), 0.0, static_cast<double>(size - 1)));
   };
-  add(out,
-      within((t.ay + t.by + t.cy) / 3.0, height) * width +
-          within((t.ax + t.bx + t.cx) / 3.0, width),
-      number, 1.0 / 3.0, 1.0 / 3.0);
+  append(out,
+         within((t.ay + t.by + t.cy) / 3.0, height) * width +
+             within((t.ax + t.bx + t.cx) / 3.0, width),
+         number, 1.0 / 3.0, 1.0 / 3.0);
 }
 
-}  // namespace texels
+}  // namespace texel_raster
 
 // Corners (n, 3, 2) in texels from the page's left and top edge; those on an edge that two
 // triangles share are of both.
-inline Texels texels_of(const double* corners, size_t n, int32_t width, int32_t height) {
-  Texels out;
+inline TexelCoverage rasterise_triangles(const double* corners, size_t n, int32_t width,
+                                         int32_t height) {
+  TexelCoverage out;
   for (size_t f = 0; f < n; ++f) {
     const double* c = corners + 6 * f;
-    texels::cover({c[0], c[1], c[2], c[3], c[4], c[5]}, static_cast<int32_t>(f), width, height,
-                  out);
+    texel_raster::rasterise({c[0], c[1], c[2], c[3], c[4], c[5]}, static_cast<int32_t>(f), width,
+                            height, out);
   }
   return out;
 }

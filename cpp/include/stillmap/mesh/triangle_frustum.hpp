@@ -11,12 +11,13 @@
 #include <stdexcept>
 #include <utility>
 
-#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
 
 namespace stillmap {
 
 // Triangles over points, as a sensor saw them.
-struct Triangles {
+struct TriangleBatch {
   const double* points;    // (n, 3) metres
   const double* origin;    // (n, 3) where the sensor was
   const double* standoff;  // (n,) metres from there to the surface's tangent plane at the point
@@ -26,12 +27,12 @@ struct Triangles {
 };
 
 // alpha + gradient . voxel: of how much something is more than nothing, at voxels' indices
-struct Linear {
+struct LinearForm {
   Vec<3> gradient = Vec<3>::Zero();
   double constant = 0.0;
-  double at(const Vec<3>& voxel) const { return gradient.dot(voxel) + constant; }
-  Linear plus(double c) const { return {gradient, constant + c}; }
-  Linear times(double c) const { return {c * gradient, c * constant}; }
+  double value(const Vec<3>& voxel) const { return gradient.dot(voxel) + constant; }
+  LinearForm plus(double c) const { return {gradient, constant + c}; }
+  LinearForm times(double c) const { return {c * gradient, c * constant}; }
 };
 
 // Voxels on the lines of sight through a triangle, as far before and behind it as asked for.
@@ -39,57 +40,59 @@ struct Linear {
 // With o where the sensor was, a voxel is v = o + sum_i mu_i (corner_i - o). All mu_i are positive
 // on lines of sight through the triangle, on which the triangle is met at v / k, k = sum mu_i. The
 // distance from the surface is (1 - k) h with h the standoff, which is exact for a plane.
-class Prism {
+class TriangleFrustum {
  public:
   static constexpr double kMargin = 0.01;  // of the triangle: none slips through between two
 
-  Prism(const Triangles& all, size_t face, double voxel, double before, double behind) {
+  TriangleFrustum(const TriangleBatch& triangles, size_t face, double voxel,
+                  double truncation_front, double truncation_back) {
     std::array<Vec<3>, 3> corner;
     Vec<3> o = Vec<3>::Zero();
     for (size_t i = 0; i < 3; ++i) {
-      const auto p = static_cast<size_t>(all.faces[3 * face + i]);
-      corner[i] = Eigen::Map<const Vec<3>>(all.points + 3 * p);
-      o += Eigen::Map<const Vec<3>>(all.origin + 3 * p) / 3.0;
-      standoff_[i] = all.standoff[p];
+      const auto p = static_cast<size_t>(triangles.faces[3 * face + i]);
+      corner[i] = Eigen::Map<const Vec<3>>(triangles.points + 3 * p);
+      o += Eigen::Map<const Vec<3>>(triangles.origin + 3 * p) / 3.0;
+      standoff_[i] = triangles.standoff[p];
     }
     const Vec<3> a = corner[0] - o, b = corner[1] - o, c = corner[2] - o;
     const double volume = a.dot(b.cross(c));
     const double h = (standoff_[0] + standoff_[1] + standoff_[2]) / 3.0;
     // seen edge on, or behind the sensor
-    if (!(std::abs(volume) > kFlat * a.norm() * b.norm() * c.norm()) || !(h > 0.0)) return;
+    if (!(std::abs(volume) > kMinVolumeRatio * a.norm() * b.norm() * c.norm()) || !(h > 0.0))
+      return;
     const std::array<Vec<3>, 3> inverse = {b.cross(c) / volume, c.cross(a) / volume,
                                            a.cross(b) / volume};
-    Linear k;
+    LinearForm scale;
     for (size_t i = 0; i < 3; ++i) {
       mu_[i].gradient = inverse[i] * voxel;
       mu_[i].constant = inverse[i].dot(Vec<3>::Constant(0.5 * voxel) - o);
-      k.gradient += mu_[i].gradient;
-      k.constant += mu_[i].constant;
-      border_[i] = mu_[i].plus(kMargin);
+      scale.gradient += mu_[i].gradient;
+      scale.constant += mu_[i].constant;
+      bounds_[i] = mu_[i].plus(kMargin);
     }
     // a plane that is met at next to no angle would be near for kilometres
-    const double per_metre = std::min(1.0 / h, 3.0 * kSlant / (a + b + c).norm());
-    nearest_ = std::max(1.0 - before * per_metre, kNearest);
-    farthest_ = 1.0 + behind * per_metre;
-    border_[3] = k.plus(-nearest_);
-    border_[4] = k.times(-1.0).plus(farthest_);
-    longest_ =
+    const double per_metre = std::min(1.0 / h, 3.0 * kMaxSlant / (a + b + c).norm());
+    nearest_ = std::max(1.0 - truncation_front * per_metre, kMinSensorShare);
+    farthest_ = 1.0 + truncation_back * per_metre;
+    bounds_[3] = scale.plus(-nearest_);
+    bounds_[4] = scale.times(-1.0).plus(farthest_);
+    longest_edge_ =
         std::sqrt(std::max({(a - b).squaredNorm(), (b - c).squaredNorm(), (c - a).squaredNorm()})) /
         voxel;
-    surround({a, b, c}, o, voxel);
+    compute_bounds({a, b, c}, o, voxel);
   }
 
   bool empty() const { return (high_.array() < low_.array()).any(); }
-  double longest() const { return longest_; }  // edge of the triangle, in voxels
+  double longest_edge() const { return longest_edge_; }  // edge of the triangle, in voxels
   const Cell<3>& low() const { return low_; }
   const Cell<3>& high() const { return high_; }
 
   // Whether none of a cube of voxels with this edge is in it, as far as one border tells.
-  bool misses(const Cell<3>& lowest, int edge) const {
+  bool misses_cube(const Cell<3>& lowest, int edge) const {
     const Vec<3> first = lowest.cast<double>();
-    for (const Linear& border : border_) {
-      double most = border.at(first);
-      for (int d = 0; d < 3; ++d) most += std::max(border.gradient[d], 0.0) * (edge - 1);
+    for (const LinearForm& bound : bounds_) {
+      double most = bound.value(first);
+      for (int d = 0; d < 3; ++d) most += std::max(bound.gradient[d], 0.0) * (edge - 1);
       if (most < 0.0) return true;
     }
     return false;
@@ -97,42 +100,43 @@ class Prism {
 
   // Calls visit(voxel, metres in front of the surface) for the voxels from low to high within.
   template <class Visit>
-  void each(const Cell<3>& low, const Cell<3>& high, Visit&& visit) const {
+  void for_each_voxel(const Cell<3>& low, const Cell<3>& high, Visit&& visit) const {
     const int a = axis_, b = (axis_ + 1) % 3, c = (axis_ + 2) % 3;
     Cell<3> at;
     for (at[a] = low[a]; at[a] <= high[a]; ++at[a]) {
-      const auto [first_b, last_b] = slice(at[a], b, low[b], high[b]);
-      const auto [first_c, last_c] = slice(at[a], c, low[c], high[c]);
+      const auto [first_b, last_b] = slice_range(at[a], b, low[b], high[b]);
+      const auto [first_c, last_c] = slice_range(at[a], c, low[c], high[c]);
       for (at[b] = first_b; at[b] <= last_b; ++at[b])
         for (at[c] = first_c; at[c] <= last_c; ++at[c]) {
-          double metres;
-          if (distance(at.cast<double>(), metres)) visit(at, metres);
+          double distance;
+          if (signed_distance(at.cast<double>(), distance)) visit(at, distance);
         }
     }
   }
 
  private:
   // Whether a voxel is within, and metres in front of the surface.
-  bool distance(const Vec<3>& voxel, double& metres) const {
-    double k = 0.0, sum = 0.0;
+  bool signed_distance(const Vec<3>& voxel, double& distance) const {
+    double scale = 0.0, sum = 0.0;
     for (size_t i = 0; i < 3; ++i) {
-      const double mu = mu_[i].at(voxel);
+      const double mu = mu_[i].value(voxel);
       if (mu < -kMargin) return false;
-      k += mu;
+      scale += mu;
       sum += mu * standoff_[i];
     }
-    if (!(k >= nearest_ && k <= farthest_)) return false;
-    metres = (1.0 - k) * sum / k;
+    if (!(scale >= nearest_ && scale <= farthest_)) return false;
+    distance = (1.0 - scale) * sum / scale;
     return true;
   }
 
   // Of the voxels low to high along an axis those that lines of sight cross at a slice.
-  std::pair<int32_t, int32_t> slice(int32_t number, int along, int32_t low, int32_t high) const {
-    if (wide_) return {low, high};
-    const double from = number - origin_[axis_];
+  std::pair<int32_t, int32_t> slice_range(int32_t slice_index, int axis, int32_t low,
+                                          int32_t high) const {
+    if (spreads_) return {low, high};
+    const double from = slice_index - origin_[axis_];
     double least = std::numeric_limits<double>::infinity(), most = -least;
-    for (const Vec<3>& slope : slope_) {
-      const double at = origin_[along] + from * slope[along];
+    for (const Vec<3>& slope : slopes_) {
+      const double at = origin_[axis] + from * slope[axis];
       least = std::min(least, at);
       most = std::max(most, at);
     }
@@ -141,13 +145,14 @@ class Prism {
             most < high ? static_cast<int32_t>(std::floor(std::max(most, low - 1.0))) : high};
   }
 
-  static constexpr double kFlat = 1e-12;
-  static constexpr double kNearest = 0.05;  // of the way from the sensor
-  static constexpr double kSlant = 100.0;   // times as far along a line of sight as off a surface
-  static constexpr double kSteep = 0.1;     // of its length that a line of sight goes along axis_
-  static constexpr double kFarthest = Grid<3>::kMaxCell;
+  static constexpr double kMinVolumeRatio = 1e-12;
+  static constexpr double kMinSensorShare = 0.05;  // of the way from the sensor
+  static constexpr double kMaxSlant = 100.0;  // times as far along a line of sight as off a surface
+  static constexpr double kMinAxisShare =
+      0.1;  // of its length that a line of sight goes along axis_
+  static constexpr double kMaxVoxel = BlockLayout<3>::kMaxCell;
 
-  void surround(const std::array<Vec<3>, 3>& corner, const Vec<3>& o, double voxel) {
+  void compute_bounds(const std::array<Vec<3>, 3>& corner, const Vec<3>& o, double voxel) {
     origin_ = o / voxel - Vec<3>::Constant(0.5);
     (corner[0] + corner[1] + corner[2]).cwiseAbs().maxCoeff(&axis_);
     Vec<3> low = Vec<3>::Constant(std::numeric_limits<double>::infinity()), high = -low;
@@ -155,31 +160,31 @@ class Prism {
       // mu is at least -margin for the two others
       const Vec<3> end =
           corner[i] + 2.0 * kMargin * (2.0 * corner[i] - corner[(i + 1) % 3] - corner[(i + 2) % 3]);
-      for (const double k : {nearest_, farthest_}) {
-        const Vec<3> at = origin_ + k * end / voxel;
+      for (const double scale : {nearest_, farthest_}) {
+        const Vec<3> at = origin_ + scale * end / voxel;
         low = low.cwiseMin(at);
         high = high.cwiseMax(at);
       }
-      slope_[i] = end / end[axis_];
+      slopes_[i] = end / end[axis_];
       // lines of sight that spread to both sides of a slice
-      wide_ = wide_ || !(std::abs(end[axis_]) > kSteep * end.norm()) ||
-              (end[axis_] > 0.0) != (corner[0][axis_] > 0.0);
+      spreads_ = spreads_ || !(std::abs(end[axis_]) > kMinAxisShare * end.norm()) ||
+                 (end[axis_] > 0.0) != (corner[0][axis_] > 0.0);
     }
-    if (!(low.minCoeff() > -kFarthest) || !(high.maxCoeff() < kFarthest))
+    if (!(low.minCoeff() > -kMaxVoxel) || !(high.maxCoeff() < kMaxVoxel))
       throw std::invalid_argument("points: too far away for voxels of this edge");
     low_ = low.array().floor().cast<int32_t>();
     high_ = high.array().ceil().cast<int32_t>();
   }
 
-  std::array<Linear, 3> mu_;
-  std::array<Linear, 5> border_;  // a voxel is within if all are positive
+  std::array<LinearForm, 3> mu_;
+  std::array<LinearForm, 5> bounds_;  // a voxel is within if all are positive
   std::array<double, 3> standoff_{};
   double nearest_ = 0.0, farthest_ = 0.0;  // of the way from the sensor to the surface
   Vec<3> origin_ = Vec<3>::Zero();         // of lines of sight, in voxels
-  std::array<Vec<3>, 3> slope_;            // of those through the corners, along `axis_`
-  double longest_ = 0.0;
+  std::array<Vec<3>, 3> slopes_;           // of those through the corners, along `axis_`
+  double longest_edge_ = 0.0;
   int axis_ = 0;  // along which they go most
-  bool wide_ = false;
+  bool spreads_ = false;
   Cell<3> low_ = Cell<3>::Ones(), high_ = Cell<3>::Zero();
 };
 

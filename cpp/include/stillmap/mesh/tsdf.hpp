@@ -11,7 +11,9 @@
 #include <unordered_set>
 #include <vector>
 
+#include "stillmap/grid/block_layout.hpp"
 #include "stillmap/grid/block_map.hpp"
+#include "stillmap/grid/cell.hpp"
 #include "stillmap/grid/voxel_hash_map.hpp"
 #include "stillmap/mesh/triangle_frustum.hpp"
 #include "stillmap/util/parallel.hpp"
@@ -19,167 +21,173 @@
 namespace stillmap {
 
 // Sums over the triangles that a voxel lies before or behind.
-struct Distances {
+struct TsdfVoxel {
   float weight = 0.0f;
-  float product = 0.0f;  // weight times metres in front of the surface
+  float weighted_distance = 0.0f;  // weight times metres in front of the surface
 };
 
-class SignedDistances : public Blocks<3, Distances> {
+class TsdfVolume : public BlockMap<3, TsdfVoxel> {
  public:
   // voxel: metres, its edge; distances are summed from `before` metres in front of surfaces to
   // `behind` metres behind them
-  SignedDistances(double voxel, double before, double behind)
-      : voxel_(voxel), before_(before), behind_(behind) {
+  TsdfVolume(double voxel, double truncation_front, double truncation_back)
+      : voxel_(voxel), truncation_front_(truncation_front), truncation_back_(truncation_back) {
     if (!(voxel > 0.0) || !std::isfinite(voxel))
       throw std::invalid_argument("voxel: expected a positive length in metres");
-    if (!(before > 0.0) || !(before <= kMostVoxels * voxel) || !(behind > 0.0) ||
-        !(behind <= kMostVoxels * voxel))
+    if (!(truncation_front > 0.0) || !(truncation_front <= kMaxTruncationVoxels * voxel) ||
+        !(truncation_back > 0.0) || !(truncation_back <= kMaxTruncationVoxels * voxel))
       throw std::invalid_argument("before, behind: expected above 0 to 64 voxels");
   }
 
-  SignedDistances(SignedDistances&&) noexcept = default;
-  SignedDistances& operator=(SignedDistances&&) noexcept = default;
-  SignedDistances(const SignedDistances&) = delete;
-  SignedDistances& operator=(const SignedDistances&) = delete;
+  TsdfVolume(TsdfVolume&&) noexcept = default;
+  TsdfVolume& operator=(TsdfVolume&&) noexcept = default;
+  TsdfVolume(const TsdfVolume&) = delete;
+  TsdfVolume& operator=(const TsdfVolume&) = delete;
 
   double voxel() const { return voxel_; }
-  double before() const { return before_; }
-  double behind() const { return behind_; }
+  double truncation_front() const { return truncation_front_; }
+  double truncation_back() const { return truncation_back_; }
 
   size_t memory_bytes() const { return blocks().size() * (sizeof(Block) + 64); }
 
   // Voxels of these blocks are as if never met.
-  void forget(const std::vector<Cell<3>>& blocks) {
-    std::unordered_set<uint64_t, Grid<3>::Hash> gone;
-    for (const Cell<3>& block : blocks) gone.insert(Grid<3>::key(block));
-    keep_if([&](const Cell<3>& block) { return gone.find(Grid<3>::key(block)) == gone.end(); });
+  void remove_blocks(const std::vector<Cell<3>>& blocks) {
+    std::unordered_set<uint64_t, BlockLayout<3>::Hash> removed;
+    for (const Cell<3>& block : blocks) removed.insert(BlockLayout<3>::key(block));
+    keep_if([&](const Cell<3>& block) {
+      return removed.find(BlockLayout<3>::key(block)) == removed.end();
+    });
   }
 
   // In batches, so that what waits to be summed stays small.
-  void add(const Triangles& triangles, int threads) {
-    const size_t batch = kBatch * static_cast<size_t>(std::clamp(threads, 1, 64));
-    std::vector<Share> shares;
-    for (size_t first = 0; first < triangles.size; first += batch) {
-      const auto bounds = even_shares(std::min(batch, triangles.size - first), threads);
-      if (shares.size() < bounds.size() - 1) shares.resize(bounds.size() - 1);
-      parallel_shares(bounds, [&](size_t share, size_t low, size_t high) {
-        shares[share].terms.clear();
+  void integrate(const TriangleBatch& triangles, int threads) {
+    const size_t batch_size = kFacesPerThread * static_cast<size_t>(std::clamp(threads, 1, 64));
+    std::vector<TermBatch> batches;
+    for (size_t first = 0; first < triangles.size; first += batch_size) {
+      const auto bounds = split_evenly(std::min(batch_size, triangles.size - first), threads);
+      if (batches.size() < bounds.size() - 1) batches.resize(bounds.size() - 1);
+      parallel_for_ranges(bounds, [&](size_t batch, size_t low, size_t high) {
+        batches[batch].terms.clear();
         for (size_t face = first + low; face < first + high; ++face)
-          meet(triangles, face, shares[share]);
+          collect_terms(triangles, face, batches[batch]);
       });
-      sum(triangles, shares, bounds.size() - 1);
+      accumulate_terms(triangles, batches, bounds.size() - 1);
     }
   }
 
  private:
-  static constexpr double kMostVoxels = 64.0;
-  static constexpr int64_t kMostBlocks = 1 << 20;  // around one triangle
-  static constexpr double kSmall = 16.0;           // voxels along an edge
-  static constexpr float kWhole = -1.0f;
+  static constexpr double kMaxTruncationVoxels = 64.0;
+  static constexpr int64_t kMaxBlocksPerFace = 1 << 20;  // around one triangle
+  static constexpr double kMaxDirectEdge = 16.0;         // voxels along an edge
+  static constexpr float kWholeBlock = -1.0f;
 
-  static constexpr size_t kBatch = 1 << 13;  // triangles for each thread
+  static constexpr size_t kFacesPerThread = 1 << 13;  // triangles for each thread
 
   // What a triangle adds to a voxel of a block; of a large triangle, all that it adds to the block.
   struct Term {
-    uint32_t block;   // as its share numbers them
-    uint32_t number;  // of the voxel in the block, or of the face
-    float weight;     // kWhole: of the face
-    float metres;
+    uint32_t block;  // as its share numbers them
+    uint32_t index;  // of the voxel in the block, or of the face
+    float weight;    // kWhole: of the face
+    float distance;
   };
   // What triangles that follow one another add, in their order.
-  struct Share {
+  struct TermBatch {
     std::vector<Term> terms;
-    VoxelTable<3, uint32_t> known;  // one more than the number of each block
-    std::vector<Block*> block;      // by its number
-    std::vector<size_t> owner;      // which thread sums it
+    VoxelHashMap<3, uint32_t> blocks_seen;  // one more than the number of each block
+    std::vector<Block*> block;              // by its number
+    std::vector<size_t> owner;              // which thread sums it
     Cell<3> last = Cell<3>::Zero();
     uint32_t last_number = 0;
 
-    uint32_t number_of(const Cell<3>& cell) {
-      if (known.size() && cell == last) return last_number;
-      uint32_t& place = known.find_or_add(cell);
-      if (place == 0) place = static_cast<uint32_t>(known.size());
+    uint32_t block_index(const Cell<3>& cell) {
+      if (blocks_seen.size() && cell == last) return last_number;
+      uint32_t& place = blocks_seen.find_or_add(cell);
+      if (place == 0) place = static_cast<uint32_t>(blocks_seen.size());
       last = cell;
       last_number = place - 1;
       return last_number;
     }
   };
 
-  Prism prism(const Triangles& triangles, size_t face) const {
-    return Prism(triangles, face, voxel_, before_, behind_);
+  TriangleFrustum frustum_of(const TriangleBatch& triangles, size_t face) const {
+    return TriangleFrustum(triangles, face, voxel_, truncation_front_, truncation_back_);
   }
 
   // less weight behind the surface, where there may be another one
-  Term term(uint32_t block, const Cell<3>& voxel, double metres, float weight) const {
+  Term make_term(uint32_t block, const Cell<3>& voxel, double distance, float weight) const {
     return {block, static_cast<uint32_t>(local_of(voxel)),
-            weight * static_cast<float>(std::min(1.0, 1.0 + metres / behind_)),
-            static_cast<float>(metres)};
+            weight * static_cast<float>(std::min(1.0, 1.0 + distance / truncation_back_)),
+            static_cast<float>(distance)};
   }
 
-  void meet(const Triangles& triangles, size_t face, Share& share) const {
+  void collect_terms(const TriangleBatch& triangles, size_t face, TermBatch& batch) const {
     const float weight = triangles.weight[face];
     if (!(weight > 0.0f)) return;
-    const Prism one = prism(triangles, face);
-    if (one.empty()) return;
-    if (one.longest() <= kSmall) {
-      one.each(one.low(), one.high(), [&](const Cell<3>& voxel, double metres) {
-        share.terms.push_back(term(share.number_of(block_of(voxel)), voxel, metres, weight));
-      });
+    const TriangleFrustum frustum = frustum_of(triangles, face);
+    if (frustum.empty()) return;
+    if (frustum.longest_edge() <= kMaxDirectEdge) {
+      frustum.for_each_voxel(
+          frustum.low(), frustum.high(), [&](const Cell<3>& voxel, double distance) {
+            batch.terms.push_back(
+                make_term(batch.block_index(block_of(voxel)), voxel, distance, weight));
+          });
       return;
     }
-    const Cell<3> low = block_of(one.low()), high = block_of(one.high());
+    const Cell<3> low = block_of(frustum.low()), high = block_of(frustum.high());
     int64_t blocks = 1;
-    for (int d = 0; d < 3; ++d) blocks *= std::min<int64_t>(high[d] - low[d] + 1, kMostBlocks + 1);
-    if (blocks > kMostBlocks || blocks < 1)
+    for (int d = 0; d < 3; ++d)
+      blocks *= std::min<int64_t>(high[d] - low[d] + 1, kMaxBlocksPerFace + 1);
+    if (blocks > kMaxBlocksPerFace || blocks < 1)
       throw std::invalid_argument("faces: one is too large for voxels of this edge");
     Cell<3> block;
     for (block[2] = low[2]; block[2] <= high[2]; ++block[2])
       for (block[1] = low[1]; block[1] <= high[1]; ++block[1])
         for (block[0] = low[0]; block[0] <= high[0]; ++block[0])
-          if (!one.misses(block * kEdge, kEdge))
-            share.terms.push_back(
-                {share.number_of(block), static_cast<uint32_t>(face), kWhole, 0.0f});
+          if (!frustum.misses_cube(block * kEdge, kEdge))
+            batch.terms.push_back(
+                {batch.block_index(block), static_cast<uint32_t>(face), kWholeBlock, 0.0f});
   }
 
   // Each thread has blocks of its own, and meets the terms in their order.
-  void sum(const Triangles& triangles, std::vector<Share>& shares, size_t n) {
+  void accumulate_terms(const TriangleBatch& triangles, std::vector<TermBatch>& batches, size_t n) {
     for (size_t i = 0; i < n; ++i)
-      for (size_t k = shares[i].block.size(); k < shares[i].known.size(); ++k) {
-        const Cell<3>& cell = shares[i].known.cell(k);
-        shares[i].block.push_back(find_or_add(cell, Distances{}));
-        shares[i].owner.push_back(static_cast<size_t>(Grid<3>::Hash{}(Grid<3>::key(cell))));
+      for (size_t k = batches[i].block.size(); k < batches[i].blocks_seen.size(); ++k) {
+        const Cell<3>& cell = batches[i].blocks_seen.cell(k);
+        batches[i].block.push_back(find_or_add(cell, TsdfVoxel{}));
+        batches[i].owner.push_back(
+            static_cast<size_t>(BlockLayout<3>::Hash{}(BlockLayout<3>::key(cell))));
       }
-    std::vector<size_t> each(n + 1);
-    for (size_t i = 0; i <= n; ++i) each[i] = i;
-    parallel_shares(each, [&](size_t mine, size_t, size_t) {
+    std::vector<size_t> for_each_voxel(n + 1);
+    for (size_t i = 0; i <= n; ++i) for_each_voxel[i] = i;
+    parallel_for_ranges(for_each_voxel, [&](size_t mine, size_t, size_t) {
       for (size_t i = 0; i < n; ++i)
-        for (const Term& one : shares[i].terms)
-          if (n == 1 || shares[i].owner[one.block] % n == mine)
-            sum(triangles, one, *shares[i].block[one.block]);
+        for (const Term& term : batches[i].terms)
+          if (n == 1 || batches[i].owner[term.block] % n == mine)
+            accumulate_term(triangles, term, *batches[i].block[term.block]);
     });
   }
 
-  void sum(const Triangles& triangles, const Term& of, Block& block) const {
-    if (of.weight != kWhole) {
-      add_to(block, of);
+  void accumulate_term(const TriangleBatch& triangles, const Term& term, Block& block) const {
+    if (term.weight != kWholeBlock) {
+      add_term(block, term);
       return;
     }
-    const Prism one = prism(triangles, of.number);
+    const TriangleFrustum frustum = frustum_of(triangles, term.index);
     const Cell<3> corner = block.origin * kEdge;
-    const Cell<3> low = one.low().cwiseMax(corner);
-    const Cell<3> high = one.high().cwiseMin((corner.array() + (kEdge - 1)).matrix());
-    one.each(low, high, [&](const Cell<3>& voxel, double metres) {
-      add_to(block, term(of.block, voxel, metres, triangles.weight[of.number]));
+    const Cell<3> low = frustum.low().cwiseMax(corner);
+    const Cell<3> high = frustum.high().cwiseMin((corner.array() + (kEdge - 1)).matrix());
+    frustum.for_each_voxel(low, high, [&](const Cell<3>& voxel, double distance) {
+      add_term(block, make_term(term.block, voxel, distance, triangles.weight[term.index]));
     });
   }
 
-  static void add_to(Block& block, const Term& one) {
-    Distances& voxel = block.counts[one.number];
-    voxel.weight += one.weight;
-    voxel.product += one.weight * one.metres;
+  static void add_term(Block& block, const Term& term) {
+    TsdfVoxel& voxel = block.values[term.index];
+    voxel.weight += term.weight;
+    voxel.weighted_distance += term.weight * term.distance;
   }
 
-  double voxel_, before_, behind_;
+  double voxel_, truncation_front_, truncation_back_;
 };
 
 }  // namespace stillmap

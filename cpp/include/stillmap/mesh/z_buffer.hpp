@@ -38,7 +38,7 @@ struct Face {
   int32_t left, right, top, bottom;  // pixels that may see it
 };
 
-inline Eigen::Vector3d in_camera(const Pinhole& camera, const double* p) {
+inline Eigen::Vector3d to_camera(const Pinhole& camera, const double* p) {
   Eigen::Vector3d out;
   for (int r = 0; r < 3; ++r)
     out[r] = camera.R(r, 0) * p[0] + camera.R(r, 1) * p[1] + camera.R(r, 2) * p[2] + camera.t[r];
@@ -50,18 +50,19 @@ inline int32_t pixel(double at, int32_t size) {
 }
 
 // Pixels within the bounds of what lies ahead of the near plane; false: none of the picture.
-inline bool bound(const Pinhole& c, const std::array<Eigen::Vector3d, 3>& corner, Face& face) {
+inline bool compute_pixel_bounds(const Pinhole& c, const std::array<Eigen::Vector3d, 3>& corner,
+                                 Face& face) {
   double u0 = std::numeric_limits<double>::infinity(), v0 = u0, u1 = -u0, v1 = -u0;
-  const auto widen = [&](double x, double y, double z) {
+  const auto include = [&](double x, double y, double z) {
     const double u = (c.fx * x + c.skew * y) / z + c.cx, v = c.fy * y / z + c.cy;
     u0 = std::min(u0, u), u1 = std::max(u1, u), v0 = std::min(v0, v), v1 = std::max(v1, v);
   };
   for (size_t i = 0; i < 3; ++i) {
     const Eigen::Vector3d &a = corner[i], &b = corner[(i + 1) % 3];
-    if (a.z() >= c.near) widen(a.x(), a.y(), a.z());
+    if (a.z() >= c.near) include(a.x(), a.y(), a.z());
     if ((a.z() >= c.near) == (b.z() >= c.near)) continue;
     const double s = (c.near - a.z()) / (b.z() - a.z());
-    widen(a.x() + s * (b.x() - a.x()), a.y() + s * (b.y() - a.y()), c.near);
+    include(a.x() + s * (b.x() - a.x()), a.y() + s * (b.y() - a.y()), c.near);
   }
   if (!(u0 <= u1)) return false;
   // a pixel more on every side: where edges are met exactly, the edge functions decide
@@ -74,42 +75,43 @@ inline bool bound(const Pinhole& c, const std::array<Eigen::Vector3d, 3>& corner
 
 // a x b, to the bit the opposite of b x a whatever the compiler makes of it: faces that share an
 // edge leave no gap
-inline Eigen::Vector3d cross(const Eigen::Vector3d& a, const Eigen::Vector3d& b, bool turned) {
-  const Eigen::Vector3d &p = turned ? b : a, &q = turned ? a : b;
+inline Eigen::Vector3d cross(const Eigen::Vector3d& a, const Eigen::Vector3d& b, bool swapped) {
+  const Eigen::Vector3d &p = swapped ? b : a, &q = swapped ? a : b;
   const Eigen::Vector3d out(p.y() * q.z() - p.z() * q.y(), p.z() * q.x() - p.x() * q.z(),
                             p.x() * q.y() - p.y() * q.x());
-  return turned ? Eigen::Vector3d(-out) : out;
+  return swapped ? Eigen::Vector3d(-out) : out;
 }
 
 // From a function of the ray (x, y, 1) to one of the pixel (u, v, 1).
-inline Eigen::Vector3d of_pixel(const Pinhole& c, const Eigen::Vector3d& n) {
+inline Eigen::Vector3d to_pixel_form(const Pinhole& c, const Eigen::Vector3d& n) {
   const double u = n.x() / c.fx, v = (n.y() - u * c.skew) / c.fy;
   return {u, v, n.z() - u * c.cx - v * c.cy};
 }
 
 // False: the camera sees none of it, or only its edge.
-inline bool set_up(const Pinhole& c, const Eigen::Vector3d* points, const int32_t* at, Face& face) {
+inline bool setup_face(const Pinhole& c, const Eigen::Vector3d* points, const int32_t* at,
+                       Face& face) {
   std::array<Eigen::Vector3d, 3> corner;
   for (size_t i = 0; i < 3; ++i) corner[i] = points[at[i]];
-  if (!bound(c, corner, face)) return false;
+  if (!compute_pixel_bounds(c, corner, face)) return false;
   face.nearest = std::min({corner[0].z(), corner[1].z(), corner[2].z()});
   face.farthest = std::max({corner[0].z(), corner[1].z(), corner[2].z()});
-  std::array<Eigen::Vector3d, 3> across;
+  std::array<Eigen::Vector3d, 3> edge_normals;
   for (size_t i = 0; i < 3; ++i) {
     const size_t j = (i + 1) % 3, k = (i + 2) % 3;
-    across[i] = cross(corner[j], corner[k], at[j] > at[k]);
+    edge_normals[i] = cross(corner[j], corner[k], at[j] > at[k]);
   }
-  const Eigen::Vector3d &n = across[0], &p = corner[0];
+  const Eigen::Vector3d &n = edge_normals[0], &p = corner[0];
   face.det = n.x() * p.x() + n.y() * p.y() + n.z() * p.z();
   if (!(face.det != 0.0)) return false;
   const double sign = face.det > 0.0 ? 1.0 : -1.0;
-  for (size_t i = 0; i < 3; ++i) face.edge[i] = sign * of_pixel(c, across[i]);
+  for (size_t i = 0; i < 3; ++i) face.edge[i] = sign * to_pixel_form(c, edge_normals[i]);
   face.det *= sign;
   return true;
 }
 
-inline void fill(const Pinhole& c, const Face& face, int32_t number, int32_t first, int32_t last,
-                 ZBuffer& out) {
+inline void rasterise(const Pinhole& c, const Face& face, int32_t number, int32_t first,
+                      int32_t last, ZBuffer& out) {
   for (int32_t v = std::max(face.top, first); v <= std::min(face.bottom, last); ++v) {
     std::array<double, 3> row;
     for (size_t i = 0; i < 3; ++i) row[i] = face.edge[i].y() * v + face.edge[i].z();
@@ -134,11 +136,11 @@ inline void fill(const Pinhole& c, const Face& face, int32_t number, int32_t fir
 
 // vertices (V, 3), faces (F, 3). Both sides of a face are seen; of two at the same depth, to the
 // last bit of a float, the lower number is.
-inline ZBuffer z_buffer_of(const double* vertices, size_t V, const int32_t* faces, size_t F,
-                           const Pinhole& camera, int threads) {
+inline ZBuffer render_z_buffer(const double* vertices, size_t V, const int32_t* faces, size_t F,
+                               const Pinhole& camera, int threads) {
   std::vector<Eigen::Vector3d> points(V);
-  parallel_shares(even_shares(V, threads), [&](size_t, size_t first, size_t last) {
-    for (size_t i = first; i < last; ++i) points[i] = z_buffer::in_camera(camera, vertices + 3 * i);
+  parallel_for_ranges(split_evenly(V, threads), [&](size_t, size_t first, size_t last) {
+    for (size_t i = first; i < last; ++i) points[i] = z_buffer::to_camera(camera, vertices + 3 * i);
   });
   const size_t rows = static_cast<size_t>(camera.height);
   const size_t pixels = rows * static_cast<size_t>(camera.width);
@@ -148,12 +150,12 @@ inline ZBuffer z_buffer_of(const double* vertices, size_t V, const int32_t* face
   const size_t shares = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1, rows);
   std::vector<size_t> bounds;
   for (size_t i = 0; i <= shares; ++i) bounds.push_back(rows * i / shares);
-  parallel_shares(bounds, [&](size_t, size_t first, size_t last) {
+  parallel_for_ranges(bounds, [&](size_t, size_t first, size_t last) {
     const auto top = static_cast<int32_t>(first), bottom = static_cast<int32_t>(last) - 1;
     z_buffer::Face face;
     for (size_t f = 0; f < F; ++f)
-      if (z_buffer::set_up(camera, points.data(), faces + 3 * f, face))
-        z_buffer::fill(camera, face, static_cast<int32_t>(f), top, bottom, out);
+      if (z_buffer::setup_face(camera, points.data(), faces + 3 * f, face))
+        z_buffer::rasterise(camera, face, static_cast<int32_t>(f), top, bottom, out);
   });
   return out;
 }

@@ -8,69 +8,25 @@
 #include <string>
 #include <vector>
 
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
 #include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/ray_traversal.hpp"
+#include "stillmap/grid/ray_walker.hpp"
+#include "stillmap/grid/scans.hpp"
 #include "stillmap/util/lie.hpp"
 #include "stillmap/util/parallel.hpp"
 
 namespace stillmap {
 
-// T scans of beams as flat arrays; nothing is owned.
-template <int D>
-struct Scans {
-  const float* points;    // (M, D), sensor frame; NaN: unusable
-  const bool* hit;        // (M,), false: maximum range (zeta = 1) or unusable
-  const int64_t* offset;  // (T + 1,), relative to points
-  const double* poses;    // (T, D + 1, D + 1), T_map_sensor
-  size_t n_scans;
-};
-
-template <int D>
-inline bool usable(const float* point) {
-  for (int d = 0; d < D; ++d)
-    if (!std::isfinite(point[d])) return false;
-  return true;
-}
-
-template <int D>
-inline Vec<D> point_at(const float* p) {
-  return Eigen::Map<const Eigen::Matrix<float, D, 1>>(p).template cast<double>();
-}
-
-// One beam in units of cells; refuses coordinates whose cells cannot be counted.
-template <int D>
-struct Segment {
-  Vec<D> start, end;
-
-  Segment(const Pose<D>& T_map_sensor, const float* point, double resolution)
-      : start(T_map_sensor.t / resolution), end((T_map_sensor * point_at<D>(point)) / resolution) {
-    if (!all_below<D>(start, Grid<D>::kMaxCell) || !all_below<D>(end, Grid<D>::kMaxCell))
-      throw std::invalid_argument("beam: a pose or end point is not finite or too far away");
-  }
-};
-
-inline double probability(float e) {
-  if (!(e >= 0.0f && e <= 1.0f)) throw std::invalid_argument("e: expected probabilities in [0, 1]");
-  return static_cast<double>(e);
-}
-
-// Calls work(scan, beam, pose) for every usable beam of the scans [first, last).
-template <int D, class Work>
-inline void for_each_beam(const Scans<D>& scans, size_t first, size_t last, Work&& work) {
-  for (size_t t = first; t < last; ++t) {
-    const Pose<D> pose = pose_from<D>(scans.poses + t * (D + 1) * (D + 1));
-    for (int64_t n = scans.offset[t]; n < scans.offset[t + 1]; ++n)
-      if (usable<D>(scans.points + n * D)) work(t, n, pose);
-  }
-}
-
 // Adds the lengths on the approach to an end point, without the end cell, as beta_j has them.
 template <int D>
-class Approach {
+class ApproachAccumulator {
  public:
-  Approach(Grid<D>& grid, Fixed sign)
+  ApproachAccumulator(OccupancyGrid<D>& grid, Fixed sign)
       : cursor_(grid), cells_(grid.approach() / grid.resolution()), sign_(sign) {}
 
-  void add(const Segment<D>& beam) {
+  void add(const BeamSegment<D>& beam) {
     if (cells_ <= 0.0) return;
     const Vec<D> back = beam.start - beam.end;
     const double length = back.norm();
@@ -80,8 +36,8 @@ class Approach {
 
   void start(const Cell<D>& first) { cell_ = first; }
   void visit(double length) {
-    auto& moments = Grid<D>::moments_of(*cursor_.block(cell_));
-    moments[static_cast<size_t>(Grid<D>::local_of(cell_))][D] += sign_ * to_fixed(length);
+    auto& moments = OccupancyGrid<D>::moments_of(*cursor_.block(cell_));
+    moments[static_cast<size_t>(BlockLayout<D>::local_of(cell_))][D] += sign_ * to_fixed(length);
   }
   template <int Axis>
   void step(int32_t direction) {
@@ -89,7 +45,7 @@ class Approach {
   }
 
  private:
-  Cursor<Grid<D>> cursor_;
+  BlockCursor<OccupancyGrid<D>> cursor_;
   double cells_;
   Fixed sign_;
   Cell<D> cell_ = Cell<D>::Zero();
@@ -97,61 +53,63 @@ class Approach {
 
 // A hit, static with some probability, in its end cell.
 template <int D>
-inline void add_end(typename Grid<D>::Block& block, const Cell<D>& cell, const Vec<D>& end,
-                    double static_share, Fixed sign) {
-  const auto local = static_cast<size_t>(Grid<D>::local_of(cell));
-  block.counts[local].alpha += sign * to_fixed(static_share);       // alpha_j
-  block.counts[local].beta += sign * to_fixed(1.0 - static_share);  // first sum of beta_j
-  auto& moment = Grid<D>::moments_of(block)[local];
+inline void add_end_point(typename OccupancyGrid<D>::Block& block, const Cell<D>& cell,
+                          const Vec<D>& end, double p_static, Fixed sign) {
+  const auto local = static_cast<size_t>(BlockLayout<D>::local_of(cell));
+  block.values[local].alpha += sign * to_fixed(p_static);       // alpha_j
+  block.values[local].beta += sign * to_fixed(1.0 - p_static);  // first sum of beta_j
+  auto& moment = OccupancyGrid<D>::moments_of(block)[local];
   for (int d = 0; d < D; ++d)
-    moment[static_cast<size_t>(d)] += sign * to_fixed(static_share * (end[d] - cell[d]));
+    moment[static_cast<size_t>(d)] += sign * to_fixed(p_static * (end[d] - cell[d]));
 }
 
 // alpha_j and beta_j of (10) for the scans [first, last). Sums are integers: with sign -1 scans
 // that were added before are taken out again without a trace.
 template <int D>
-inline void add_scans(Grid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign,
+inline void add_scans(OccupancyGrid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign,
                       size_t first, size_t last) {
-  Cursor<Grid<D>> cursor(grid);
+  BlockCursor<OccupancyGrid<D>> cursor(grid);
   // second sum of beta_j: the length by which the beam covers j, whatever e is
-  Walker walker(cursor, [=](Counts* j, double length) { j->beta += sign * to_fixed(length); });
-  Approach<D> approach(grid, sign);
+  RayWalker walker(cursor,
+                   [=](CellCounts* j, double length) { j->beta += sign * to_fixed(length); });
+  ApproachAccumulator<D> approach(grid, sign);
   for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
-    const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
+    const BeamSegment<D> beam(pose, scans.points + n * D, grid.resolution());
     traverse<D>(beam.start, beam.end, walker);
     if (!scans.hit[n]) return;  // (1 - zeta) = 0: the end cell of a maximum-range beam says nothing
     approach.add(beam);
-    add_end<D>(*walker.block(), walker.cell(), beam.end, probability(e[n]), sign);
+    add_end_point<D>(*walker.block(), walker.cell(), beam.end, checked_probability(e[n]), sign);
   });
 }
 
 // What of these sums depends on e: those of the end cells.
 template <int D>
-inline void add_ends(Grid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign) {
-  Cursor<Grid<D>> cursor(grid);
+inline void add_end_points(OccupancyGrid<D>& grid, const Scans<D>& scans, const float* e,
+                           Fixed sign) {
+  BlockCursor<OccupancyGrid<D>> cursor(grid);
   for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t, int64_t n, const Pose<D>& pose) {
     if (!scans.hit[n]) return;
-    const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
+    const BeamSegment<D> beam(pose, scans.points + n * D, grid.resolution());
     const Cell<D> end = cell_of<D>(beam.end);
-    add_end<D>(*cursor.block(end), end, beam.end, probability(e[n]), sign);
+    add_end_point<D>(*cursor.block(end), end, beam.end, checked_probability(e[n]), sign);
   });
 }
 
 template <int D>
-inline void add_beams(Grid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign,
+inline void add_beams(OccupancyGrid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign,
                       int threads) {
-  const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
-  std::vector<Grid<D>> others;
+  const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
+  std::vector<OccupancyGrid<D>> others;
   for (size_t i = 2; i < bounds.size(); ++i)
     others.emplace_back(grid.resolution(), grid.approach());
-  parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
+  parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
     add_scans<D>(i == 0 ? grid : others[i - 1], scans, e, sign, first, last);
   });
   for (const auto& other : others) grid.merge(other);
 }
 
 // (8): the probability that something static reflected a beam that ends in a cell of occupancy m.
-inline double expectation(double prior, double m) {
+inline double static_responsibility(double prior, double m) {
   const double hit = prior * m;
   const double total = hit + (1.0 - prior) * (1.0 - m);
   return total > 0.0 ? hit / total : prior;
@@ -160,25 +118,25 @@ inline double expectation(double prior, double m) {
 // (6), (8) for every beam: NaN when unusable, the prior at maximum range and where the end cell
 // was never looked at.
 template <int D>
-inline void e_step(const Grid<D>& grid, const Scans<D>& scans, double prior, int threads,
+inline void e_step(const OccupancyGrid<D>& grid, const Scans<D>& scans, double prior, int threads,
                    float* e) {
   std::fill(e + scans.offset[0], e + scans.offset[scans.n_scans],
             std::numeric_limits<float>::quiet_NaN());
-  const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
-  parallel_shares(bounds, [&](size_t, size_t first, size_t last) {
-    Cursor<const Grid<D>> cursor(grid);
+  const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
+  parallel_for_ranges(bounds, [&](size_t, size_t first, size_t last) {
+    BlockCursor<const OccupancyGrid<D>> cursor(grid);
     for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
       e[n] = static_cast<float>(prior);
       if (!scans.hit[n]) return;
-      const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
-      if (const Counts* c = cursor.seen(cell_of<D>(beam.end)))
-        e[n] = static_cast<float>(expectation(prior, occupancy(*c)));
+      const BeamSegment<D> beam(pose, scans.points + n * D, grid.resolution());
+      if (const CellCounts* c = cursor.find_observed(cell_of<D>(beam.end)))
+        e[n] = static_cast<float>(static_responsibility(prior, occupancy(*c)));
     });
   });
 }
 
 // Terms of the expected log likelihood of one scan.
-struct LogLikelihood {
+struct LogLikelihoodTerms {
   double end = 0.0;        // (5), first two rows
   double traversed = 0.0;  // (5), last row, weighted by the lengths l_j
   double gamma = 0.0;      // (7)
@@ -187,33 +145,33 @@ struct LogLikelihood {
 
 // ln with a floor, so that one impossible beam costs much but not everything
 inline double safe_log(double p) { return std::log(p > 1e-12 ? p : 1e-12); }
-inline double x_log(double x, double p) { return x > 0.0 ? x * safe_log(p) : 0.0; }
+inline double x_log_p(double x, double p) { return x > 0.0 ? x * safe_log(p) : 0.0; }
 
 // (5) and (7) scan by scan; with e in {0, 1} this is (4). Cells nobody looked at are unknown and
 // contribute nothing.
 template <int D>
-inline void log_likelihood(const Grid<D>& grid, const Scans<D>& scans, const float* e, double prior,
-                           int threads, LogLikelihood* terms) {
-  const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
-  parallel_shares(bounds, [&](size_t, size_t first, size_t last) {
-    Cursor<const Grid<D>> cursor(grid);
+inline void log_likelihood(const OccupancyGrid<D>& grid, const Scans<D>& scans, const float* e,
+                           double prior, int threads, LogLikelihoodTerms* terms) {
+  const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
+  parallel_for_ranges(bounds, [&](size_t, size_t first, size_t last) {
+    BlockCursor<const OccupancyGrid<D>> cursor(grid);
     double traversed = 0.0;
-    Walker walker(cursor, [&](const Counts* j, double length) {
+    RayWalker walker(cursor, [&](const CellCounts* j, double length) {
       if (j && j->alpha > 0) traversed += length * safe_log(1.0 - occupancy(*j));
     });
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
-      LogLikelihood& sum = terms[t];
-      const double en = probability(e[n]);
-      sum.gamma += x_log(en, prior) + x_log(1.0 - en, 1.0 - prior);
-      sum.entropy -= x_log(en, en) + x_log(1.0 - en, 1.0 - en);
-      const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
+      LogLikelihoodTerms& sum = terms[t];
+      const double en = checked_probability(e[n]);
+      sum.gamma += x_log_p(en, prior) + x_log_p(1.0 - en, 1.0 - prior);
+      sum.entropy -= x_log_p(en, en) + x_log_p(1.0 - en, 1.0 - en);
+      const BeamSegment<D> beam(pose, scans.points + n * D, grid.resolution());
       traversed = 0.0;
       traverse<D>(beam.start, beam.end, walker);
       sum.traversed += traversed;
-      const Counts* c = walker.counts();
+      const CellCounts* c = walker.value();
       if (!scans.hit[n] || !c || c->alpha + c->beta == 0) return;
       const double m = occupancy(*c);
-      sum.end += x_log(en, m) + x_log(1.0 - en, 1.0 - m);
+      sum.end += x_log_p(en, m) + x_log_p(1.0 - en, 1.0 - m);
     });
   });
 }

@@ -6,78 +6,82 @@
 #include <utility>
 #include <vector>
 
+#include "stillmap/grid/cell.hpp"
 #include "stillmap/occupancy/surfel_map.hpp"
 
 namespace stillmap {
 
-using Column = std::pair<int32_t, int32_t>;  // x, y
+using GroundColumn = std::pair<int32_t, int32_t>;  // x, y
 
 // edge: of a column, in cells
-inline Column column_of(const Cell<3>& cell, int32_t edge) {
-  const auto down = [edge](int32_t at) {
-    const int32_t rest = at % edge;
-    return (at - rest) / edge - (rest < 0 ? 1 : 0);
+inline GroundColumn ground_column(const Cell<3>& cell, int32_t column_cells) {
+  const auto floor_divide = [column_cells](int32_t at) {
+    const int32_t remainder = at % column_cells;
+    return (at - remainder) / column_cells - (remainder < 0 ? 1 : 0);
   };
-  return {down(cell[0]), down(cell[1])};
+  return {floor_divide(cell[0]), floor_divide(cell[1])};
 }
 
-class Columns {
+class GroundColumns {
  public:
-  Columns(const Surface<3>& surface, int32_t edge)
-      : surface_(surface), edge_(edge), seen_(surface.size(), -1) {}
+  GroundColumns(const SurfelMap<3>& surfel_map, int32_t column_cells)
+      : surfel_map_(surfel_map), column_cells_(column_cells), last_sweep_(surfel_map.size(), -1) {}
 
-  int32_t edge() const { return edge_; }
+  int32_t column_cells() const { return column_cells_; }
 
   // Begins a sweep.
-  void clear() {
+  void begin_sweep() {
     ++sweep_;
     members_.clear();
   }
 
   // Whether an element was not told of before in this sweep.
-  bool first_seen(int32_t element) {
-    return std::exchange(seen_[static_cast<size_t>(element)], sweep_) != sweep_;
+  bool first_seen(int32_t surfel) {
+    return std::exchange(last_sweep_[static_cast<size_t>(surfel)], sweep_) != sweep_;
   }
 
   // Once for each element of the sweep, however often it is told.
-  void add(int32_t element) {
-    if (first_seen(element))
-      members_.emplace_back(column_of(surface_.cell(element), edge_), static_cast<size_t>(element));
+  void add(int32_t surfel) {
+    if (first_seen(surfel))
+      members_.emplace_back(ground_column(surfel_map_.cell(surfel), column_cells_),
+                            static_cast<size_t>(surfel));
   }
 
   // After all were added: columns by x, then y, and the elements in each by their numbers.
   void sort() {
     std::sort(members_.begin(), members_.end());
-    first_.clear();
+    column_begin_.clear();
     for (size_t i = 0; i < members_.size(); ++i)
-      if (i == 0 || members_[i].first != members_[i - 1].first) first_.push_back(i);
-    first_.push_back(members_.size());
+      if (i == 0 || members_[i].first != members_[i - 1].first) column_begin_.push_back(i);
+    column_begin_.push_back(members_.size());
   }
 
-  size_t size() const { return first_.size() - 1; }
-  const Column& at(size_t c) const { return members_[first_[c]].first; }
+  size_t size() const { return column_begin_.size() - 1; }
+  const GroundColumn& at(size_t c) const { return members_[column_begin_[c]].first; }
 
   template <class Visit>
   void for_each_in(size_t c, Visit&& visit) const {
-    for (size_t i = first_[c]; i < first_[c + 1]; ++i) visit(members_[i].second);
+    for (size_t i = column_begin_[c]; i < column_begin_[c + 1]; ++i) visit(members_[i].second);
   }
 
   // The number of a column, size() where there is none.
-  size_t find(const Column& column) const {
-    const auto of = [this](size_t i, const Column& wanted) { return members_[i].first < wanted; };
-    const auto end = first_.end() - 1;
-    const auto found = std::lower_bound(first_.begin(), end, column, of);
+  size_t find_column(const GroundColumn& column) const {
+    const auto is_before = [this](size_t i, const GroundColumn& wanted) {
+      return members_[i].first < wanted;
+    };
+    const auto end = column_begin_.end() - 1;
+    const auto found = std::lower_bound(column_begin_.begin(), end, column, is_before);
     if (found == end || members_[*found].first != column) return size();
-    return static_cast<size_t>(found - first_.begin());
+    return static_cast<size_t>(found - column_begin_.begin());
   }
 
  private:
-  const Surface<3>& surface_;
-  int32_t edge_;
+  const SurfelMap<3>& surfel_map_;
+  int32_t column_cells_;
   int32_t sweep_ = 0;
-  std::vector<int32_t> seen_;                       // the last sweep in which each was added
-  std::vector<std::pair<Column, size_t>> members_;  // elements
-  std::vector<size_t> first_;                       // member of each column, and the end
+  std::vector<int32_t> last_sweep_;                       // the last sweep in which each was added
+  std::vector<std::pair<GroundColumn, size_t>> members_;  // elements
+  std::vector<size_t> column_begin_;                      // member of each column, and the end
 };
 
 }  // namespace stillmap

@@ -10,33 +10,40 @@
 #include <stdexcept>
 #include <vector>
 
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
 #include "stillmap/grid/cell_index.hpp"
-#include "stillmap/occupancy/beam_counting.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/ray_traversal.hpp"
+#include "stillmap/grid/ray_walker.hpp"
+#include "stillmap/grid/scans.hpp"
+#include "stillmap/util/lie.hpp"
+#include "stillmap/util/parallel.hpp"
 
 namespace stillmap {
 
 // Mean e of the beams that ended in each cell, and how often beams end at all.
 template <int D>
-class StaticShares : public CellIndex<D> {
+class StaticFractionGrid : public CellIndex<D> {
  public:
-  explicit StaticShares(double resolution) : resolution_(resolution) {
+  explicit StaticFractionGrid(double resolution) : resolution_(resolution) {
     if (!(resolution > 0.0) || !std::isfinite(resolution))
       throw std::invalid_argument("resolution: expected a positive length in metres");
   }
-  StaticShares(const StaticShares&) = delete;
-  StaticShares& operator=(const StaticShares&) = delete;
+  StaticFractionGrid(const StaticFractionGrid&) = delete;
+  StaticFractionGrid& operator=(const StaticFractionGrid&) = delete;
 
   double resolution() const { return resolution_; }
 
   // Beams of the scans that are not held out; e as of (8).
-  void add(const Scans<D>& scans, const float* e, const bool* held) {
+  void add(const Scans<D>& scans, const float* e, const bool* is_held_out) {
     for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t t, int64_t n, const Pose<D>& pose) {
-      if (held[t]) return;
-      const Segment<D> beam(pose, scans.points + n * D, resolution_);
+      if (is_held_out[t]) return;
+      const BeamSegment<D> beam(pose, scans.points + n * D, resolution_);
       length_ += to_fixed((beam.end - beam.start).norm() * resolution_);
       if (!scans.hit[n]) return;
-      const Fixed is_static = to_fixed(probability(e[n]));
-      Sums& sums = at(cell_of<D>(beam.end));
+      const Fixed is_static = to_fixed(checked_probability(e[n]));
+      CellSums& sums = sums_at(cell_of<D>(beam.end));
       sums.is_static += is_static;
       ++sums.hits;
       dynamic_ += to_fixed(1.0) - is_static;
@@ -44,8 +51,8 @@ class StaticShares : public CellIndex<D> {
     });
   }
 
-  double share(int32_t k) const {
-    const Sums& s = sums_[static_cast<size_t>(k)];
+  double static_fraction(int32_t k) const {
+    const CellSums& s = sums_[static_cast<size_t>(k)];
     return from_fixed(s.is_static) / static_cast<double>(s.hits);
   }
   // Per metre: of all ends, and of those at something that moves. One end at one metre more than
@@ -54,26 +61,26 @@ class StaticShares : public CellIndex<D> {
   double dynamic_rate() const { return per_metre(from_fixed(dynamic_)); }
 
  private:
-  struct Sums {
+  struct CellSums {
     Fixed is_static = 0;
     int64_t hits = 0;
   };
 
   double per_metre(double ends) const { return (ends + 1.0) / (from_fixed(length_) + 1.0); }
 
-  Sums& at(const Cell<D>& cell) {
-    int32_t& place = this->place_of(cell);
-    if (place == this->kNone) {
-      place = static_cast<int32_t>(sums_.size());
+  CellSums& sums_at(const Cell<D>& cell) {
+    int32_t& index = this->index_of(cell);
+    if (index == this->kNone) {
+      index = static_cast<int32_t>(sums_.size());
       sums_.emplace_back();
     }
-    return sums_[static_cast<size_t>(place)];
+    return sums_[static_cast<size_t>(index)];
   }
 
   double resolution_;
   Fixed length_ = 0, dynamic_ = 0;  // metres, expected number of hits
   int64_t hits_ = 0;
-  std::vector<Sums> sums_;
+  std::vector<CellSums> sums_;
 };
 
 struct BeamModel {
@@ -86,89 +93,100 @@ struct BeamModel {
 
 // Density of one beam's range; everything in metres.
 template <int D>
-class BeamDensity {
+class RangeDensity {
  public:
-  BeamDensity(const StaticShares<D>& shares, const BeamModel& model)
-      : shares_(shares), model_(model), dynamic_(shares.dynamic_rate()), cursor_(shares) {}
+  RangeDensity(const StaticFractionGrid<D>& fractions, const BeamModel& model)
+      : fractions_(fractions),
+        model_(model),
+        dynamic_(fractions.dynamic_rate()),
+        cursor_(fractions) {}
 
   // ln of the density of a hit, or of the probability that nothing stops the beam up to its end
-  double log_of(const Segment<D>& beam, double range, bool hit) {
-    before_ = 0.0;
+  double log_density(const BeamSegment<D>& beam, double range, bool hit) {
+    optical_depth_ = 0.0;
     density_ = 0.0;
-    at_ = -range;
+    position_ = -range;
     const double beyond = hit ? kDeviations * model_.noise / range : 0.0;
     const Vec<D> end = beam.end + (beam.end - beam.start) * beyond;
-    if (!all_below<D>(end, Grid<D>::kMaxCell))
+    if (!all_below<D>(end, BlockLayout<D>::kMaxCell))
       throw std::invalid_argument("beam: a pose or end point is not finite or too far away");
-    Walker walker(cursor_, [&](const int32_t* k, double length) { pass(k, length, hit); });
+    RayWalker walker(cursor_,
+                     [&](const int32_t* k, double length) { integrate_cell(k, length, hit); });
     const double last = traverse<D>(beam.start, end, walker);
-    pass(walker.counts(), last, hit);
-    return hit ? std::log(density_) : -before_;
+    integrate_cell(walker.value(), last, hit);
+    return hit ? std::log(density_) : -optical_depth_;
   }
 
  private:
   static constexpr double kDeviations = 5.0;  // of the noise behind a hit that still may matter
   static constexpr double kDelays = 30.0;     // before it
 
-  void pass(const int32_t* k, double cells, bool hit) {
-    const double length = cells * shares_.resolution();
+  void integrate_cell(const int32_t* k, double cells, bool hit) {
+    const double length = cells * fractions_.resolution();
     if (!(length > 0.0)) return;
-    const double share = k && *k != StaticShares<D>::kNone ? shares_.share(*k) : 0.0;
-    const double still = model_.stopping * share, rate = still + dynamic_;
-    const double from = at_, to = at_ + length;  // relative to where the beam ended
-    if (hit && from <= 0.0 && to > 0.0) density_ += dynamic_ * std::exp(-before_ + rate * from);
-    if (hit && share > 0.0 && to > -kDelays * model_.delay) {
-      const double stopped = std::exp(-before_) * -std::expm1(-rate * length) * still / rate;
-      density_ += stopped / length * ending(from, to);
+    const double static_fraction =
+        k && *k != StaticFractionGrid<D>::kNone ? fractions_.static_fraction(*k) : 0.0;
+    const double static_rate = model_.stopping * static_fraction, rate = static_rate + dynamic_;
+    const double from = position_, to = position_ + length;  // relative to where the beam ended
+    if (hit && from <= 0.0 && to > 0.0)
+      density_ += dynamic_ * std::exp(-optical_depth_ + rate * from);
+    if (hit && static_fraction > 0.0 && to > -kDelays * model_.delay) {
+      const double p_stopped =
+          std::exp(-optical_depth_) * -std::expm1(-rate * length) * static_rate / rate;
+      density_ += p_stopped / length * end_probability(from, to);
     }
-    before_ += rate * length;
-    at_ = to;
+    optical_depth_ += rate * length;
+    position_ = to;
   }
 
   // Probability, per metre of range, that a beam which met something static between two places ends
   // at 0; times the distance of the places.
-  double ending(double from, double to) const {
+  double end_probability(double from, double to) const {
     auto normal = [&](double x) { return 0.5 * std::erfc(-x / (model_.noise * std::sqrt(2.0))); };
-    auto later = [&](double x) { return x < 0.0 ? -std::expm1(x / model_.delay) : 0.0; };
+    auto delayed = [&](double x) { return x < 0.0 ? -std::expm1(x / model_.delay) : 0.0; };
     return (1.0 - model_.late) * (normal(to) - normal(from)) +
-           model_.late * (later(from) - later(to));
+           model_.late * (delayed(from) - delayed(to));
   }
 
-  const StaticShares<D>& shares_;
+  const StaticFractionGrid<D>& fractions_;
   BeamModel model_;
   double dynamic_;
-  Cursor<const StaticShares<D>> cursor_;
-  double before_ = 0.0;   // - ln of the probability of getting so far
-  double density_ = 0.0;  // at the end of the beam
-  double at_ = 0.0;       // place relative to it
+  BlockCursor<const StaticFractionGrid<D>> cursor_;
+  double optical_depth_ = 0.0;  // - ln of the probability of getting so far
+  double density_ = 0.0;        // at the end of the beam
+  double position_ = 0.0;       // place relative to it
 };
 
-struct HeldOut {
-  double gain = 0.0;  // nats above a world without a map
-  double beams = 0.0;
+struct HeldOutScore {
+  double log_likelihood_gain = 0.0;  // nats above a world without a map
+  double beam_count = 0.0;
 };
 
 // ln of the beams' density less ln of that of a world in which beams end at the same rate
 // everywhere, summed per held-out scan.
 template <int D>
-inline void held_out(const StaticShares<D>& shares, const Scans<D>& scans, const bool* held,
-                     const BeamModel& model, int threads, HeldOut* sums) {
-  const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
-  const double everywhere = shares.end_rate();
-  const double known = std::log1p(-model.outliers), unknown = std::log(model.outliers);
-  parallel_shares(bounds, [&](size_t, size_t first, size_t last) {
-    BeamDensity<D> density(shares, model);
+inline void score_held_out(const StaticFractionGrid<D>& fractions, const Scans<D>& scans,
+                           const bool* is_held_out, const BeamModel& model, int threads,
+                           HeldOutScore* sums) {
+  const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
+  const double reference_rate = fractions.end_rate();
+  const double log_inlier = std::log1p(-model.outliers), log_outlier = std::log(model.outliers);
+  parallel_for_ranges(bounds, [&](size_t, size_t first, size_t last) {
+    RangeDensity<D> density(fractions, model);
     for (size_t t = first; t < last; ++t) {
-      if (!held[t]) continue;
+      if (!is_held_out[t]) continue;
       for_each_beam<D>(scans, t, t + 1, [&](size_t, int64_t n, const Pose<D>& pose) {
-        const Segment<D> beam(pose, scans.points + n * D, shares.resolution());
-        const double range = (beam.end - beam.start).norm() * shares.resolution();
+        const BeamSegment<D> beam(pose, scans.points + n * D, fractions.resolution());
+        const double range = (beam.end - beam.start).norm() * fractions.resolution();
         if (!(range > 0.0)) return;
-        const double nothing = (scans.hit[n] ? std::log(everywhere) : 0.0) - everywhere * range;
-        const double seen = known + density.log_of(beam, range, scans.hit[n]) - nothing;
-        const double more = std::max(seen, unknown), less = std::min(seen, unknown);
-        sums[t].gain += more + std::log1p(std::exp(less - more));
-        sums[t].beams += 1.0;
+        const double log_reference =
+            (scans.hit[n] ? std::log(reference_rate) : 0.0) - reference_rate * range;
+        const double log_model =
+            log_inlier + density.log_density(beam, range, scans.hit[n]) - log_reference;
+        const double larger = std::max(log_model, log_outlier),
+                     smaller = std::min(log_model, log_outlier);
+        sums[t].log_likelihood_gain += larger + std::log1p(std::exp(smaller - larger));
+        sums[t].beam_count += 1.0;
       });
     }
   });

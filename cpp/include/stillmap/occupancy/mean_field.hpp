@@ -12,127 +12,133 @@
 #include <vector>
 
 #include "stillmap/grid/window_query.hpp"
+#include "stillmap/occupancy/surfel.hpp"
 #include "stillmap/occupancy/surfel_map.hpp"
 #include "stillmap/util/parallel.hpp"
 
 namespace stillmap {
 
-struct BesideOptions {
-  double radius;       // cells between those that speak for each other
-  double coplanar;     // cells: standard deviation of a mean from the plane of another
-  double for_static;   // log odds that static neighbours are worth, if there are no others
-  double for_dynamic;  // the same of dynamic ones
-  double least, most;  // log odds that an element's own looks are worth
-  double moved;        // change of a probability of which the neighbours want to know
-  int rounds;          // at most
+struct MeanFieldOptions {
+  double radius;            // cells between those that speak for each other
+  double coplanar_std;      // cells: standard deviation of a mean from the plane of another
+  double static_coupling;   // log odds that static neighbours are worth, if there are no others
+  double dynamic_coupling;  // the same of dynamic ones
+  double min_log_odds, max_log_odds;  // log odds that an element's own looks are worth
+  double tolerance;    // change of a probability of which the neighbours want to know
+  int max_iterations;  // at most
 };
 
 template <int D>
-class Beside {
+class MeanField {
  public:
   // log_odds: (E,) of being static, by an element's own looks; the surface knows when these hit
-  Beside(const Surface<D>& surface, const float* log_odds, const BesideOptions& options,
-         int threads)
-      : surface_(surface),
+  MeanField(const SurfelMap<D>& surfel_map, const float* log_odds, const MeanFieldOptions& options,
+            int threads)
+      : surfel_map_(surfel_map),
         options_(options),
         threads_(threads),
-        p_(surface.size()),
-        near_(rows_around<D>(options.radius, false)) {
-    rows_.reserve(surface.size());
-    for (size_t k = 0; k < surface.size(); ++k) {
-      rows_.push_back(row_of(static_cast<int32_t>(k), log_odds[k]));
-      p_[k] = probability(log_odds[k]);
+        p_static_(surfel_map.size()),
+        window_(window_rows<D>(options.radius, false)) {
+    nodes_.reserve(surfel_map.size());
+    for (size_t k = 0; k < surfel_map.size(); ++k) {
+      nodes_.push_back(node_of(static_cast<int32_t>(k), log_odds[k]));
+      p_static_[k] = sigmoid(log_odds[k]);
     }
   }
 
   // (E,) probability of being static, by what is beside as well.
-  const std::vector<float>& settle() {
-    std::vector<uint8_t> asked(p_.size(), 1);
-    for (int round = 0; round < options_.rounds; ++round) {
-      const std::vector<float> before = p_;
-      parallel_shares(even_shares(p_.size(), threads_), [&](size_t, size_t from, size_t to) {
-        Around<D> around(surface_);
-        for (size_t k = from; k < to; ++k)
-          if (asked[k]) p_[k] = opinion(around, k, before);
-      });
-      if (!pass_on(before, asked)) break;
+  const std::vector<float>& infer() {
+    std::vector<uint8_t> active(p_static_.size(), 1);
+    for (int iteration = 0; iteration < options_.max_iterations; ++iteration) {
+      const std::vector<float> previous = p_static_;
+      parallel_for_ranges(split_evenly(p_static_.size(), threads_),
+                          [&](size_t, size_t begin, size_t end) {
+                            WindowQuery<D> query(surfel_map_);
+                            for (size_t k = begin; k < end; ++k)
+                              if (active[k]) p_static_[k] = update(query, k, previous);
+                          });
+      if (!mark_neighbours_of_changed(previous, active)) break;
     }
-    return p_;
+    return p_static_;
   }
 
  private:
   using Vecf = Eigen::Matrix<float, D, 1>;
 
-  struct Row {
+  struct Node {
     Vecf mean, normal;  // cells; the normal of what is round is zero
-    Span hit;
-    float own;  // log odds
+    TimeSpan hit_span;
+    float unary;  // log odds
   };
 
-  Row row_of(int32_t k, float log_odds) const {
-    const Element<D>& e = surface_.element(k);
+  Node node_of(int32_t k, float log_odds) const {
+    const Surfel<D>& e = surfel_map_.surfel(k);
     return {e.mean.template cast<float>(), e.normal.template cast<float>(),
-            surface_.hits()[static_cast<size_t>(k)],
-            std::clamp(log_odds, static_cast<float>(options_.least),
-                       static_cast<float>(options_.most))};
+            surfel_map_.hit_spans()[static_cast<size_t>(k)],
+            std::clamp(log_odds, static_cast<float>(options_.min_log_odds),
+                       static_cast<float>(options_.max_log_odds))};
   }
 
-  static float probability(float log_odds) { return 1.0f / (1.0f + std::exp(-log_odds)); }
+  static float sigmoid(float log_odds) { return 1.0f / (1.0f + std::exp(-log_odds)); }
 
   template <class Visit>
-  void for_each_beside(Around<D>& around, size_t k, Visit&& visit) const {
-    around.each(surface_.cell(static_cast<int32_t>(k)), near_, [&](int32_t other) {
+  void for_each_neighbour(WindowQuery<D>& query, size_t k, Visit&& visit) const {
+    query.for_each(surfel_map_.cell(static_cast<int32_t>(k)), window_, [&](int32_t other) {
       if (static_cast<size_t>(other) != k) visit(static_cast<size_t>(other));
     });
   }
 
-  float opinion(Around<D>& around, size_t k, const std::vector<float>& p) const {
-    const Row& row = rows_[k];
-    float for_it = 0.0f, against = 0.0f, weight = 1.0f;
-    for_each_beside(around, k, [&](size_t other) {
-      const Row& beside = rows_[other];
-      const Span common{std::max(row.hit.first, beside.hit.first),
-                        std::min(row.hit.last, beside.hit.last)};
-      const int64_t both = common.looks();
-      if (both <= 0) return;
-      const bool is_static = p[other] > 0.5f;
-      const int64_t of = is_static ? row.hit.looks() + beside.hit.looks() - both : row.hit.looks();
-      const float w = together(row, beside) * static_cast<float>(both) / static_cast<float>(of);
+  float update(WindowQuery<D>& query, size_t k, const std::vector<float>& p_static) const {
+    const Node& node = nodes_[k];
+    float static_sum = 0.0f, dynamic_sum = 0.0f, weight = 1.0f;
+    for_each_neighbour(query, k, [&](size_t other) {
+      const Node& neighbour = nodes_[other];
+      const TimeSpan shared{std::max(node.hit_span.first, neighbour.hit_span.first),
+                            std::min(node.hit_span.last, neighbour.hit_span.last)};
+      const int64_t overlap = shared.n_bins();
+      if (overlap <= 0) return;
+      const bool is_static = p_static[other] > 0.5f;
+      const int64_t union_length =
+          is_static ? node.hit_span.n_bins() + neighbour.hit_span.n_bins() - overlap
+                    : node.hit_span.n_bins();
+      const float w = coplanarity(node, neighbour) * static_cast<float>(overlap) /
+                      static_cast<float>(union_length);
       weight += w;
-      (is_static ? for_it : against) += w * std::abs(2.0f * p[other] - 1.0f);
+      (is_static ? static_sum : dynamic_sum) += w * std::abs(2.0f * p_static[other] - 1.0f);
     });
-    const auto pull = static_cast<float>(options_.for_static) * for_it -
-                      static_cast<float>(options_.for_dynamic) * against;
-    return probability(row.own + pull / weight);
+    const auto message = static_cast<float>(options_.static_coupling) * static_sum -
+                         static_cast<float>(options_.dynamic_coupling) * dynamic_sum;
+    return sigmoid(node.unary + message / weight);
   }
 
   // How far two can be of one surface.
-  float together(const Row& a, const Row& b) const {
-    const Vecf apart = b.mean - a.mean;
-    const float off = std::max(std::abs(a.normal.dot(apart)), std::abs(b.normal.dot(apart)));
-    const float of = off / static_cast<float>(options_.coplanar);
-    return std::exp(-0.5f * of * of);
+  float coplanarity(const Node& a, const Node& b) const {
+    const Vecf offset = b.mean - a.mean;
+    const float distance = std::max(std::abs(a.normal.dot(offset)), std::abs(b.normal.dot(offset)));
+    const float union_length = distance / static_cast<float>(options_.coplanar_std);
+    return std::exp(-0.5f * union_length * union_length);
   }
 
   // Asks in the next round those beside whom somebody thinks otherwise than before.
-  bool pass_on(const std::vector<float>& before, std::vector<uint8_t>& asked) const {
-    std::fill(asked.begin(), asked.end(), uint8_t{0});
-    bool any = false;
-    Around<D> around(surface_);
-    for (size_t k = 0; k < p_.size(); ++k) {
-      if (!(std::abs(p_[k] - before[k]) > options_.moved)) continue;
-      for_each_beside(around, k, [&](size_t other) { asked[other] = 1; });
-      any = true;
+  bool mark_neighbours_of_changed(const std::vector<float>& previous,
+                                  std::vector<uint8_t>& active) const {
+    std::fill(active.begin(), active.end(), uint8_t{0});
+    bool changed = false;
+    WindowQuery<D> query(surfel_map_);
+    for (size_t k = 0; k < p_static_.size(); ++k) {
+      if (!(std::abs(p_static_[k] - previous[k]) > options_.tolerance)) continue;
+      for_each_neighbour(query, k, [&](size_t other) { active[other] = 1; });
+      changed = true;
     }
-    return any;
+    return changed;
   }
 
-  const Surface<D>& surface_;
-  BesideOptions options_;
+  const SurfelMap<D>& surfel_map_;
+  MeanFieldOptions options_;
   int threads_;
-  std::vector<float> p_;
-  std::vector<Row> rows_;
-  CellRows<D> near_;
+  std::vector<float> p_static_;
+  std::vector<Node> nodes_;
+  CellRows<D> window_;
 };
 
 }  // namespace stillmap

@@ -4,64 +4,74 @@
 #include <utility>
 #include <vector>
 
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
 #include "stillmap/grid/cell_index.hpp"
-#include "stillmap/occupancy/beam_counting.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/ray_traversal.hpp"
+#include "stillmap/grid/ray_walker.hpp"
+#include "stillmap/grid/scans.hpp"
+#include "stillmap/util/lie.hpp"
+#include "stillmap/util/parallel.hpp"
 
 namespace stillmap {
 
 // A single beam without a return got lost, whatever stands there; several in a row may tell.
 template <int D>
-inline bool in_a_row(const Scans<D>& scans, size_t t, int64_t n) {
-  constexpr int enough = 3;
-  auto lost = [&](int64_t m) {
+inline bool has_no_return_neighbours(const Scans<D>& scans, size_t t, int64_t n) {
+  constexpr int kMinRun = 3;
+  auto is_no_return = [&](int64_t m) {
     return m >= scans.offset[t] && m < scans.offset[t + 1] && !scans.hit[m] &&
            usable<D>(scans.points + m * D);
   };
-  int in_a_row = 1;
-  for (int64_t m = n - 1; in_a_row < enough && lost(m); --m) ++in_a_row;
-  for (int64_t m = n + 1; in_a_row < enough && lost(m); ++m) ++in_a_row;
-  return in_a_row >= enough;
+  int has_no_return_neighbours = 1;
+  for (int64_t m = n - 1; has_no_return_neighbours < kMinRun && is_no_return(m); --m)
+    ++has_no_return_neighbours;
+  for (int64_t m = n + 1; has_no_return_neighbours < kMinRun && is_no_return(m); ++m)
+    ++has_no_return_neighbours;
+  return has_no_return_neighbours >= kMinRun;
 }
 
 // How far beams without a return are believed.
 template <int D>
-struct NoReturn {
-  const std::vector<Cell<D>>& stops;  // cells from which on they say nothing
-  double beyond;                      // cells before their end from which on they say nothing
+struct NoReturnLimits {
+  const std::vector<Cell<D>>& stop_cells;  // cells from which on they say nothing
+  double end_margin;                       // cells before their end from which on they say nothing
 };
 
 // Adds the lengths that beams without a return cover, as add_scans does: what they are believed
 // about to one grid, the rest to another. Both together are the sums of (10), to the bit.
 template <int D>
-class LostBeams : private CellIndex<D> {
+class NoReturnBeams : private CellIndex<D> {
  public:
-  explicit LostBeams(const NoReturn<D>& no_return) : beyond_(no_return.beyond) {
-    for (const Cell<D>& cell : no_return.stops) this->place_of(cell) = 0;
+  explicit NoReturnBeams(const NoReturnLimits<D>& no_return) : end_margin_(no_return.end_margin) {
+    for (const Cell<D>& cell : no_return.stop_cells) this->index_of(cell) = 0;
   }
 
-  void add(Grid<D>& grid, Grid<D>& rest, const Scans<D>& scans, size_t first, size_t last) const {
-    Cursor<Grid<D>> believed_in(grid), not_in(rest);
-    Way way(*this, [&](const Cell<D>& cell, double length, bool believed) {
-      auto* block = (believed ? believed_in : not_in).block(cell);
-      block->counts[static_cast<size_t>(Grid<D>::local_of(cell))].beta += to_fixed(length);
+  void add(OccupancyGrid<D>& grid, OccupancyGrid<D>& rest, const Scans<D>& scans, size_t first,
+           size_t last) const {
+    BlockCursor<OccupancyGrid<D>> trusted_cursor(grid), rest_cursor(rest);
+    BeamWalk walk(*this, [&](const Cell<D>& cell, double length, bool trusted) {
+      auto* block = (trusted ? trusted_cursor : rest_cursor).block(cell);
+      block->values[static_cast<size_t>(BlockLayout<D>::local_of(cell))].beta += to_fixed(length);
     });
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
       if (scans.hit[n]) return;
-      const Segment<D> beam(pose, scans.points + n * D, grid.resolution());
-      way.follow(beam, in_a_row(scans, t, n));
+      const BeamSegment<D> beam(pose, scans.points + n * D, grid.resolution());
+      walk.traverse_beam(beam, has_no_return_neighbours(scans, t, n));
     });
   }
 
   // Walks along beams: visit(cell, length in it, whether it is believed in); a cell that is left
   // too late, or behind a stop, is not. Lone beams are not believed at all.
   template <class Visit>
-  class Way {
+  class BeamWalk {
    public:
-    Way(const LostBeams& lost, Visit visit)
-        : stops_(lost), beyond_(lost.beyond_), visit_(std::move(visit)) {}
+    BeamWalk(const NoReturnBeams& is_no_return, Visit visit)
+        : stops_(is_no_return), end_margin_(is_no_return.end_margin_), visit_(std::move(visit)) {}
 
-    void follow(const Segment<D>& beam, bool in_a_row) {
-      believed_ = in_a_row ? (beam.end - beam.start).norm() - beyond_ : 0.0;
+    void traverse_beam(const BeamSegment<D>& beam, bool has_no_return_neighbours) {
+      trusted_ = has_no_return_neighbours ? (beam.end - beam.start).norm() - end_margin_ : 0.0;
       travelled_ = 0.0;
       traverse<D>(beam.start, beam.end, *this);
     }
@@ -69,8 +79,8 @@ class LostBeams : private CellIndex<D> {
     void start(const Cell<D>& first) { cell_ = first; }
     void visit(double length) {
       travelled_ += length;
-      if (travelled_ > believed_ || stopped()) believed_ = 0.0;
-      visit_(cell_, length, believed_ > 0.0);
+      if (travelled_ > trusted_ || at_stop_cell()) trusted_ = 0.0;
+      visit_(cell_, length, trusted_ > 0.0);
     }
     template <int Axis>
     void step(int32_t direction) {
@@ -78,38 +88,40 @@ class LostBeams : private CellIndex<D> {
     }
 
    private:
-    bool stopped() {
+    bool at_stop_cell() {
       const auto* block = stops_.block(cell_);
-      return block &&
-             block->counts[static_cast<size_t>(Grid<D>::local_of(cell_))] != CellIndex<D>::kNone;
+      return block && block->values[static_cast<size_t>(BlockLayout<D>::local_of(cell_))] !=
+                          CellIndex<D>::kNone;
     }
 
-    Cursor<const CellIndex<D>> stops_;
-    double beyond_;
+    BlockCursor<const CellIndex<D>> stops_;
+    double end_margin_;
     Visit visit_;
     Cell<D> cell_ = Cell<D>::Zero();
-    double believed_ = 0.0, travelled_ = 0.0;
+    double trusted_ = 0.0, travelled_ = 0.0;
   };
 
  private:
-  double beyond_;
+  double end_margin_;
 };
 
 template <int D>
-inline void add_lost(Grid<D>& grid, Grid<D>& rest, const Scans<D>& scans,
-                     const NoReturn<D>& no_return, int threads) {
-  const LostBeams<D> lost(no_return);
-  const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
-  std::vector<Grid<D>> grids, rests;  // of the other threads
+inline void add_no_return_beams(OccupancyGrid<D>& grid, OccupancyGrid<D>& rest,
+                                const Scans<D>& scans, const NoReturnLimits<D>& no_return,
+                                int threads) {
+  const NoReturnBeams<D> is_no_return(no_return);
+  const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
+  std::vector<OccupancyGrid<D>> thread_grids, thread_rests;  // of the other threads
   for (size_t i = 2; i < bounds.size(); ++i) {
-    grids.emplace_back(grid.resolution(), grid.approach());
-    rests.emplace_back(rest.resolution(), rest.approach());
+    thread_grids.emplace_back(grid.resolution(), grid.approach());
+    thread_rests.emplace_back(rest.resolution(), rest.approach());
   }
-  parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
-    lost.add(i == 0 ? grid : grids[i - 1], i == 0 ? rest : rests[i - 1], scans, first, last);
+  parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
+    is_no_return.add(i == 0 ? grid : thread_grids[i - 1], i == 0 ? rest : thread_rests[i - 1],
+                     scans, first, last);
   });
-  for (const auto& other : grids) grid.merge(other);
-  for (const auto& other : rests) rest.merge(other);
+  for (const auto& other : thread_grids) grid.merge(other);
+  for (const auto& other : thread_rests) rest.merge(other);
 }
 
 }  // namespace stillmap

@@ -14,167 +14,179 @@
 #include <utility>
 #include <vector>
 
+#include "stillmap/grid/block_layout.hpp"
 #include "stillmap/grid/block_map.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/ray_traversal.hpp"
+#include "stillmap/grid/ray_walker.hpp"
+#include "stillmap/grid/scans.hpp"
 #include "stillmap/occupancy/no_return_beams.hpp"
-#include "stillmap/occupancy/surfel_map.hpp"
+#include "stillmap/util/lie.hpp"
+#include "stillmap/util/parallel.hpp"
 
 namespace stillmap {
 
 // Of one cell. Looks are numbered from 1 as they come.
-struct Glances {
-  uint32_t seen = 0;       // the last look that saw it
-  uint32_t disturbed = 0;  // the last look in which something that moves was near
-  uint16_t looks = 0;      // these count no further than they can
+struct CellVisits {
+  uint32_t last_seen = 0;       // the last look that saw it
+  uint32_t last_disturbed = 0;  // the last look in which something that moves was near
+  uint16_t observed = 0;        // these count no further than they can
   uint16_t clear = 0;
 };
 
 template <int D>
-class LookCounts : public Blocks<D, Glances> {
+class ObservationCounts : public BlockMap<D, CellVisits> {
  public:
-  using Block = typename Blocks<D, Glances>::Block;
-  static constexpr int kMaxReach = D == 2 ? 1024 : 128;  // cells
+  using Block = typename BlockMap<D, CellVisits>::Block;
+  static constexpr int kMaxRadiusCells = D == 2 ? 1024 : 128;  // cells
 
   // radius: metres around the end of a beam on something that moves within which a cell is not
   // clear, from the middle of the end cell to its own; lost: how far beams without a return are
   // believed, null: all of their way
-  LookCounts(double resolution, double radius, std::shared_ptr<const LostBeams<D>> lost)
+  ObservationCounts(double resolution, double radius,
+                    std::shared_ptr<const NoReturnBeams<D>> no_return)
       : resolution_(resolution),
         radius_(radius),
-        reach_(radius / resolution),
-        lost_(std::move(lost)) {
+        radius_cells_(radius / resolution),
+        no_return_(std::move(no_return)) {
     if (!(resolution > 0.0) || !std::isfinite(resolution))
       throw std::invalid_argument("resolution: expected a positive length in metres");
-    if (!(radius >= 0.0 && reach_ <= kMaxReach))
+    if (!(radius >= 0.0 && radius_cells_ <= kMaxRadiusCells))
       throw std::invalid_argument("radius: expected metres that are not negative, and at most " +
-                                  std::to_string(kMaxReach) + " cells");
+                                  std::to_string(kMaxRadiusCells) + " cells");
   }
 
-  LookCounts(LookCounts&&) noexcept = default;
-  LookCounts& operator=(LookCounts&&) noexcept = default;
-  LookCounts(const LookCounts&) = delete;
-  LookCounts& operator=(const LookCounts&) = delete;
+  ObservationCounts(ObservationCounts&&) noexcept = default;
+  ObservationCounts& operator=(ObservationCounts&&) noexcept = default;
+  ObservationCounts(const ObservationCounts&) = delete;
+  ObservationCounts& operator=(const ObservationCounts&) = delete;
 
   double resolution() const { return resolution_; }
   double radius() const { return radius_; }
 
   Block* find_or_add(const Cell<D>& block) {
-    return Blocks<D, Glances>::find_or_add(block, Glances{});
+    return BlockMap<D, CellVisits>::find_or_add(block, CellVisits{});
   }
 
   size_t memory_bytes() const { return this->blocks().size() * (sizeof(Block) + 64); }
 
   // dynamic (M,): which hits ended on something that moves. look (T,): number of each scan's look,
   // not falling, and all of them beyond those that were added before.
-  void add(const Scans<D>& scans, const bool* dynamic, const int64_t* look, int threads) {
+  void add(const Scans<D>& scans, const bool* dynamic, const int64_t* time_bin, int threads) {
     if (scans.n_scans == 0) return;
-    if (look[0] <= newest_) throw std::invalid_argument("look: was added to before, or falls");
+    if (time_bin[0] <= last_time_bin_)
+      throw std::invalid_argument("look: was added to before, or falls");
     for (size_t t = 1; t < scans.n_scans; ++t)
-      if (look[t] < look[t - 1]) throw std::invalid_argument("look: must not fall");
-    auto bounds = shares_of(scans.offset, scans.n_scans, threads);
+      if (time_bin[t] < time_bin[t - 1]) throw std::invalid_argument("look: must not fall");
+    auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
     for (size_t& t : bounds)  // no look is cut
-      while (t > 0 && t < scans.n_scans && look[t] == look[t - 1]) ++t;
-    std::vector<LookCounts> others;
-    for (size_t i = 2; i < bounds.size(); ++i) others.emplace_back(resolution_, radius_, lost_);
-    parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
-      (i == 0 ? *this : others[i - 1]).add_share(scans, dynamic, look, first, last);
+      while (t > 0 && t < scans.n_scans && time_bin[t] == time_bin[t - 1]) ++t;
+    std::vector<ObservationCounts> thread_counts;
+    for (size_t i = 2; i < bounds.size(); ++i)
+      thread_counts.emplace_back(resolution_, radius_, no_return_);
+    parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
+      (i == 0 ? *this : thread_counts[i - 1]).add_range(scans, dynamic, time_bin, first, last);
     });
-    for (const auto& other : others) merge(other);
-    newest_ = look[scans.n_scans - 1];
+    for (const auto& other : thread_counts) merge(other);
+    last_time_bin_ = time_bin[scans.n_scans - 1];
   }
 
  private:
-  static constexpr uint16_t kMost = std::numeric_limits<uint16_t>::max();
+  static constexpr uint16_t kMaxCount = std::numeric_limits<uint16_t>::max();
 
-  void add_share(const Scans<D>& scans, const bool* dynamic, const int64_t* look, size_t first,
+  void add_range(const Scans<D>& scans, const bool* dynamic, const int64_t* time_bin, size_t first,
                  size_t last) {
-    Cursor<LookCounts> cursor(*this);
+    BlockCursor<ObservationCounts> cursor(*this);
     for (size_t t = first; t < last;) {
       size_t end = t + 1;
-      while (end < last && look[end] == look[t]) ++end;
-      ++now_;
-      disturb(cursor, scans, dynamic, t, end);
-      glance(cursor, scans, t, end);
+      while (end < last && time_bin[end] == time_bin[t]) ++end;
+      ++bin_;
+      mark_dynamic(cursor, scans, dynamic, t, end);
+      count_observed(cursor, scans, t, end);
       t = end;
     }
   }
 
   // Marks the cells near the ends of beams on what moves.
-  void disturb(Cursor<LookCounts>& cursor, const Scans<D>& scans, const bool* dynamic, size_t first,
-               size_t last) {
+  void mark_dynamic(BlockCursor<ObservationCounts>& cursor, const Scans<D>& scans,
+                    const bool* dynamic, size_t first, size_t last) {
     std::vector<Cell<D>> ends;
     for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
       if (scans.hit[n] && dynamic[n])
-        ends.push_back(cell_of<D>(Segment<D>(pose, scans.points + n * D, resolution_).end));
+        ends.push_back(cell_of<D>(BeamSegment<D>(pose, scans.points + n * D, resolution_).end));
     });
-    const auto before = [](const Cell<D>& a, const Cell<D>& b) {
+    const auto less = [](const Cell<D>& a, const Cell<D>& b) {
       return std::lexicographical_compare(a.data(), a.data() + D, b.data(), b.data() + D);
     };
-    std::sort(ends.begin(), ends.end(), before);
+    std::sort(ends.begin(), ends.end(), less);
     ends.erase(std::unique(ends.begin(), ends.end()), ends.end());
-    const double farthest = reach_ * reach_ * (1.0 + 1e-9);  // whole numbers of cells are within
+    const double max_squared =
+        radius_cells_ * radius_cells_ * (1.0 + 1e-9);  // whole numbers of cells are within
     for (const Cell<D>& end : ends)
-      for_each_near<D>(end, static_cast<int>(reach_ + 1e-9), [&](const Cell<D>& cell) {
-        if ((cell - end).template cast<double>().squaredNorm() <= farthest)
-          at(cursor, cell).disturbed = now_;
+      for_each_in_cube<D>(end, static_cast<int>(radius_cells_ + 1e-9), [&](const Cell<D>& cell) {
+        if ((cell - end).template cast<double>().squaredNorm() <= max_squared)
+          visits_at(cursor, cell).last_disturbed = bin_;
       });
   }
 
   // Counts the cells that beams cross or end in, those that `add_scans` and `add_lost` add to.
-  void glance(Cursor<LookCounts>& cursor, const Scans<D>& scans, size_t first, size_t last) {
-    const auto tells = [](double length) { return to_fixed(length) != 0; };
-    Walker walker(cursor, [&](Glances* g, double length) {
-      if (g->seen != now_ && tells(length)) count(*g);
+  void count_observed(BlockCursor<ObservationCounts>& cursor, const Scans<D>& scans, size_t first,
+                      size_t last) {
+    const auto is_nonzero = [](double length) { return to_fixed(length) != 0; };
+    RayWalker walker(cursor, [&](CellVisits* visits, double length) {
+      if (visits->last_seen != bin_ && is_nonzero(length)) count(*visits);
     });
-    const auto believe = [&](const Cell<D>& cell, double length, bool believed) {
-      if (believed && tells(length)) count(at(cursor, cell));
+    const auto count_if_trusted = [&](const Cell<D>& cell, double length, bool trusted) {
+      if (trusted && is_nonzero(length)) count(visits_at(cursor, cell));
     };
-    using Way = typename LostBeams<D>::template Way<decltype(believe)>;
-    std::optional<Way> way;
-    if (lost_) way.emplace(*lost_, believe);
+    using BeamWalk = typename NoReturnBeams<D>::template BeamWalk<decltype(count_if_trusted)>;
+    std::optional<BeamWalk> walk;
+    if (no_return_) walk.emplace(*no_return_, count_if_trusted);
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
-      const Segment<D> beam(pose, scans.points + n * D, resolution_);
-      if (way && !scans.hit[n]) {
-        way->follow(beam, in_a_row(scans, t, n));
+      const BeamSegment<D> beam(pose, scans.points + n * D, resolution_);
+      if (walk && !scans.hit[n]) {
+        walk->traverse_beam(beam, has_no_return_neighbours(scans, t, n));
         return;
       }
       traverse<D>(beam.start, beam.end, walker);
-      if (scans.hit[n]) count(*walker.counts());
+      if (scans.hit[n]) count(*walker.value());
     });
   }
 
-  static Glances& at(Cursor<LookCounts>& cursor, const Cell<D>& cell) {
-    return cursor.block(cell)->counts[static_cast<size_t>(Grid<D>::local_of(cell))];
+  static CellVisits& visits_at(BlockCursor<ObservationCounts>& cursor, const Cell<D>& cell) {
+    return cursor.block(cell)->values[static_cast<size_t>(BlockLayout<D>::local_of(cell))];
   }
 
-  void count(Glances& cell) {
-    if (cell.seen == now_) return;
-    cell.seen = now_;
-    cell.looks = sum(cell.looks, 1);
-    if (cell.disturbed != now_) cell.clear = sum(cell.clear, 1);
+  void count(CellVisits& cell) {
+    if (cell.last_seen == bin_) return;
+    cell.last_seen = bin_;
+    cell.observed = saturating_add(cell.observed, 1);
+    if (cell.last_disturbed != bin_) cell.clear = saturating_add(cell.clear, 1);
   }
 
-  static uint16_t sum(uint16_t a, uint16_t b) {
-    return static_cast<uint16_t>(std::min<uint32_t>(uint32_t{a} + b, kMost));
+  static uint16_t saturating_add(uint16_t a, uint16_t b) {
+    return static_cast<uint16_t>(std::min<uint32_t>(uint32_t{a} + b, kMaxCount));
   }
 
   // looks of their own alone
-  void merge(const LookCounts& other) {
-    for (const auto& theirs : other.blocks()) {
-      Block* mine = find_or_add(theirs->origin);
-      for (size_t i = 0; i < mine->counts.size(); ++i) {
-        Glances& cell = mine->counts[i];
-        cell.looks = sum(cell.looks, theirs->counts[i].looks);
-        cell.clear = sum(cell.clear, theirs->counts[i].clear);
+  void merge(const ObservationCounts& other) {
+    for (const auto& source : other.blocks()) {
+      Block* target = find_or_add(source->origin);
+      for (size_t i = 0; i < target->values.size(); ++i) {
+        CellVisits& cell = target->values[i];
+        cell.observed = saturating_add(cell.observed, source->values[i].observed);
+        cell.clear = saturating_add(cell.clear, source->values[i].clear);
       }
     }
   }
 
   double resolution_;
   double radius_;
-  double reach_;  // the same in cells
-  std::shared_ptr<const LostBeams<D>> lost_;
-  uint32_t now_ = 0;
-  int64_t newest_ = std::numeric_limits<int64_t>::min();
+  double radius_cells_;  // the same in cells
+  std::shared_ptr<const NoReturnBeams<D>> no_return_;
+  uint32_t bin_ = 0;
+  int64_t last_time_bin_ = std::numeric_limits<int64_t>::min();
 };
 
 }  // namespace stillmap

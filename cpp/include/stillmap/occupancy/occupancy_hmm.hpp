@@ -16,217 +16,232 @@
 #include <stdexcept>
 #include <vector>
 
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/ray_walker.hpp"
+#include "stillmap/grid/scans.hpp"
 #include "stillmap/occupancy/change_hmm.hpp"
+#include "stillmap/occupancy/observation.hpp"
 #include "stillmap/occupancy/observation_collector.hpp"
+#include "stillmap/occupancy/surfel_bitmap.hpp"
+#include "stillmap/occupancy/surfel_map.hpp"
+#include "stillmap/occupancy/surfel_neighbours.hpp"
 #include "stillmap/occupancy/two_state_chains.hpp"
+#include "stillmap/util/lie.hpp"
+#include "stillmap/util/parallel.hpp"
 
 namespace stillmap {
 
 // The likelihood of everything seen of each element under each class, look after look. Memory is
 // that of the elements; looks come in the order of time.
 template <int D>
-class Dwell {
+class OccupancyHmm {
  public:
-  Dwell(const Surface<D>& surface, DwellClasses classes, const LookOptions& options,
-        int threads = 1)
-      : surface_(checked(surface)),
+  OccupancyHmm(const SurfelMap<D>& surfel_map, OccupancyClasses classes,
+               const ObservationOptions& options, int threads = 1)
+      : surfel_map_(require_fitted(surfel_map)),
         options_(options),
-        tables_(options.lateral),
-        neighbours_(surface, options.reach, threads),
-        beam_tiles_(surface),
-        chains_(places_of(surface), std::move(classes), options.seconds) {}
+        tables_(options.lateral_std),
+        neighbours_(surfel_map, options.hit_radius, threads),
+        bitmap_(surfel_map),
+        chains_(surfel_means(surfel_map), std::move(classes), options.bin_seconds) {}
 
-  Dwell(const Dwell&) = delete;  // what collects looks refers to it
-  Dwell& operator=(const Dwell&) = delete;
+  OccupancyHmm(const OccupancyHmm&) = delete;  // what collects looks refers to it
+  OccupancyHmm& operator=(const OccupancyHmm&) = delete;
 
   size_t classes() const { return chains_.size(); }
-  const Surface<D>& surface() const { return surface_; }
+  const SurfelMap<D>& surfel_map() const { return surfel_map_; }
 
   // Beams without a return, and those of them that cross something solid.
-  Lost lost(const Scans<D>& scans, int threads = 1) const {
-    const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
-    std::vector<Lost> shares(bounds.size() - 1);
-    parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
-      shares[i] = lost_of(surface_, beam_tiles_, options_, scans, first, last);
+  NoReturnStats no_return_stats(const Scans<D>& scans, int threads = 1) const {
+    const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
+    std::vector<NoReturnStats> shares(bounds.size() - 1);
+    parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
+      shares[i] = count_no_return_beams(surfel_map_, bitmap_, options_, scans, first, last);
     });
     for (size_t i = 1; i < shares.size(); ++i) {
-      shares[0].beams += shares[i].beams;
+      shares[0].beam_count += shares[i].beam_count;
       shares[0].through_solid += shares[i].through_solid;
     }
     return shares[0];
   }
   // The cells in which beams without a return meet something solid.
-  std::vector<Cell<D>> solid() const {
+  std::vector<Cell<D>> solid_cells() const {
     std::vector<Cell<D>> cells;
-    for (size_t i = 0; i < surface_.size(); ++i)
-      if (const auto k = static_cast<int32_t>(i); is_solid(surface_, k, options_.normals))
-        cells.push_back(surface_.cell(k));
+    for (size_t i = 0; i < surfel_map_.size(); ++i)
+      if (const auto k = static_cast<int32_t>(i); is_solid(surfel_map_, k, options_.use_normals))
+        cells.push_back(surfel_map_.cell(k));
     return cells;
   }
   // How far to trust them beyond the first solid element, from now on.
-  void trust(double open) {
-    options_.open = open;
-    rest();
+  void set_trust_beyond_solid(double trust_beyond_solid) {
+    options_.trust_beyond_solid = trust_beyond_solid;
+    release_buffers();
   }
   // From now on asks, too, which elements are of things that were put there or taken away.
   // courses: what became of each, too, not only how probable that is.
-  void watch(const ChangeModel& model, bool courses = true) {
-    if (newest_ != kNone) throw std::invalid_argument("watch: before the first look");
-    changes_.emplace(surface_.size(), model, options_.seconds, courses);
+  void track_changes(const ChangeOptions& model, bool with_paths = true) {
+    if (last_time_bin_ != kNoTimeBin) throw std::invalid_argument("watch: before the first look");
+    change_hmm_.emplace(surfel_map_.size(), model, options_.bin_seconds, with_paths);
   }
-  const Changes& changes() const {
-    if (!changes_) throw std::invalid_argument("changes: nobody asked to watch for them");
-    return *changes_;
+  const ChangeHmm& change_hmm() const {
+    if (!change_hmm_) throw std::invalid_argument("changes: nobody asked to watch for them");
+    return *change_hmm_;
   }
 
   // look (T,): number of each scan's look, not falling, and not below those added before. place
   // (T, D): in metres, where the robot stood; null: where the sensors did.
-  void add(const Scans<D>& scans, const int64_t* look, const double* place, int threads) {
+  void add(const Scans<D>& scans, const int64_t* time_bin, const double* positions, int threads) {
     const size_t T = scans.n_scans;
     for (size_t t = 0; t < T; ++t)
-      if (look[t] < (t ? look[t - 1] : newest_)) throw std::invalid_argument("look: must not fall");
-    if (changes_ && T && !(Changes::counts(look[0]) && Changes::counts(look[T - 1])))
+      if (time_bin[t] < (t ? time_bin[t - 1] : last_time_bin_))
+        throw std::invalid_argument("look: must not fall");
+    if (change_hmm_ && T &&
+        !(ChangeHmm::is_valid_time_bin(time_bin[0]) &&
+          ChangeHmm::is_valid_time_bin(time_bin[T - 1])))
       throw std::invalid_argument("look: expected 0 to 2147483647");
-    std::vector<size_t> starts;  // of looks
+    std::vector<size_t> bin_starts;  // of looks
     for (size_t t = 0; t < T; ++t)
-      if (t == 0 || look[t] != look[t - 1]) starts.push_back(t);
-    starts.push_back(T);
-    const size_t looks = starts.size() - 1;
+      if (t == 0 || time_bin[t] != time_bin[t - 1]) bin_starts.push_back(t);
+    bin_starts.push_back(T);
+    const size_t n_bins = bin_starts.size() - 1;
     const size_t n = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1,
-                                        std::max<size_t>(looks, 1));
+                                        std::max<size_t>(n_bins, 1));
     try {
-      collect_by(n);
-      follow(scans, look, place, starts, n);
+      make_collectors(n);
+      process(scans, time_bin, positions, bin_starts, n);
     } catch (...) {
-      rest();  // sheets are half written
+      release_buffers();  // sheets are half written
       throw;
     }
-    if (T) newest_ = look[T - 1];
+    if (T) last_time_bin_ = time_bin[T - 1];
   }
 
   // (n, among): likelihood of everything else that was seen of n of the cells, given that a beam
   // ended in each, under some of the classes, relative to the best of them; and the logarithm of
   // the best. The cells are first, first + every, ...
-  void likelihood(const std::vector<size_t>& among, size_t first, size_t every, size_t n,
+  void likelihood(const std::vector<size_t>& among, size_t first, size_t stride, size_t n,
                   int threads, float* relative, double* log_best) const {
-    parallel_shares(even_shares(n, threads), [&](size_t, size_t from, size_t to) {
+    parallel_for_ranges(split_evenly(n, threads), [&](size_t, size_t from, size_t to) {
       for (size_t i = from; i < to; ++i)
-        log_best[i] = chains_.likelihood(first + i * every, among, relative + i * among.size());
+        log_best[i] = chains_.likelihood(first + i * stride, among, relative + i * among.size());
     });
   }
 
   // Nothing is kept that only the next looks would want; they would make it anew.
-  void rest() { collectors_.clear(); }
+  void release_buffers() { collectors_.clear(); }
 
  private:
-  static constexpr size_t kWindow = 64;  // looks held at once
-  static constexpr int64_t kNone = std::numeric_limits<int64_t>::min();
+  static constexpr size_t kBatchBins = 64;  // looks held at once
+  static constexpr int64_t kNoTimeBin = std::numeric_limits<int64_t>::min();
 
-  static const Surface<D>& checked(const Surface<D>& surface) {
-    if (!surface.fitted()) throw std::invalid_argument("surface: fit it first");
-    return surface;
+  static const SurfelMap<D>& require_fitted(const SurfelMap<D>& surfel_map) {
+    if (!surfel_map.fitted()) throw std::invalid_argument("surface: fit it first");
+    return surfel_map;
   }
 
-  static std::vector<size_t> one_each(size_t n) {
+  static std::vector<size_t> one_per_thread(size_t n) {
     std::vector<size_t> bounds(n + 1);
     for (size_t i = 0; i <= n; ++i) bounds[i] = i;
     return bounds;
   }
 
-  static std::vector<Eigen::Vector3f> places_of(const Surface<D>& surface) {
-    std::vector<Eigen::Vector3f> places(surface.size(), Eigen::Vector3f::Zero());
-    for (size_t k = 0; k < places.size(); ++k)
-      places[k].template head<D>() =
-          surface.element(static_cast<int32_t>(k)).mean.template cast<float>();
-    return places;
+  static std::vector<Eigen::Vector3f> surfel_means(const SurfelMap<D>& surfel_map) {
+    std::vector<Eigen::Vector3f> means(surfel_map.size(), Eigen::Vector3f::Zero());
+    for (size_t k = 0; k < means.size(); ++k)
+      means[k].template head<D>() =
+          surfel_map.surfel(static_cast<int32_t>(k)).mean.template cast<float>();
+    return means;
   }
 
-  void collect_by(size_t n) {
-    const size_t made = collectors_.size();
-    if (made >= n) return;
+  void make_collectors(size_t n) {
+    const size_t existing = collectors_.size();
+    if (existing >= n) return;
     collectors_.resize(n);
-    parallel_shares(one_each(n - made), [&](size_t i, size_t, size_t) {
-      collectors_[made + i] =
-          std::make_unique<LookCollector<D>>(surface_, beam_tiles_, neighbours_, options_, tables_);
+    parallel_for_ranges(one_per_thread(n - existing), [&](size_t i, size_t, size_t) {
+      collectors_[existing + i] = std::make_unique<ObservationCollector<D>>(
+          surfel_map_, bitmap_, neighbours_, options_, tables_);
     });
   }
 
-  void follow(const Scans<D>& scans, const int64_t* look, const double* place,
-              const std::vector<size_t>& starts, size_t n) {
-    const size_t looks = starts.size() - 1;
-    std::vector<Seen> seen(kWindow);
-    for (size_t from = 0; from < starts.size() - 1; from += kWindow) {
-      const size_t to = std::min(from + kWindow, looks);
-      std::vector<int32_t> taken;
+  void process(const Scans<D>& scans, const int64_t* time_bin, const double* positions,
+               const std::vector<size_t>& bin_starts, size_t n) {
+    const size_t n_bins = bin_starts.size() - 1;
+    std::vector<ObservationBatch> batches(kBatchBins);
+    for (size_t from = 0; from < bin_starts.size() - 1; from += kBatchBins) {
+      const size_t to = std::min(from + kBatchBins, n_bins);
+      std::vector<int32_t> viewpoints;
       for (size_t l = from; l < to; ++l)
-        taken.push_back(
-            chains_.begin(look[starts[l]], taken_from(scans, place, starts[l], starts[l + 1])));
+        viewpoints.push_back(chains_.begin_observation(
+            time_bin[bin_starts[l]],
+            mean_position(scans, positions, bin_starts[l], bin_starts[l + 1])));
       std::atomic<size_t> next{from};
-      parallel_shares(one_each(n), [&](size_t i, size_t, size_t) {
+      parallel_for_ranges(one_per_thread(n), [&](size_t i, size_t, size_t) {
         for (size_t l = next++; l < to; l = next++) {
-          collectors_[i]->add(scans, starts[l], starts[l + 1]);
-          collectors_[i]->take(seen[l - from]);
+          collectors_[i]->add(scans, bin_starts[l], bin_starts[l + 1]);
+          collectors_[i]->take_batch(batches[l - from]);
         }
       });
       std::atomic<size_t> next_span{0};
-      parallel_shares(one_each(n), [&](size_t, size_t, size_t) {
-        for (size_t s = next_span++; s < Seen::spans(surface_.size()); s = next_span++)
+      parallel_for_ranges(one_per_thread(n), [&](size_t, size_t, size_t) {
+        for (size_t s = next_span++; s < ObservationBatch::n_spans(surfel_map_.size());
+             s = next_span++)
           for (size_t l = from; l < to; ++l)
-            apply(seen[l - from], s, look[starts[l]], taken[l - from]);
+            apply_batch(batches[l - from], s, time_bin[bin_starts[l]], viewpoints[l - from]);
       });
     }
   }
 
   // Mean place in those scans, in cells. Of several sensors in turn it would go to and fro.
-  Eigen::Vector3d taken_from(const Scans<D>& scans, const double* place, size_t first,
-                             size_t last) const {
-    using Place = Eigen::Matrix<double, D, 1>;
+  Eigen::Vector3d mean_position(const Scans<D>& scans, const double* positions, size_t first,
+                                size_t last) const {
+    using Position = Eigen::Matrix<double, D, 1>;
     Eigen::Vector3d sum = Eigen::Vector3d::Zero();
     for (size_t t = first; t < last; ++t)
-      sum.template head<D>() += place ? Place(Eigen::Map<const Place>(place + t * D))
-                                      : pose_from<D>(scans.poses + t * (D + 1) * (D + 1)).t;
+      sum.template head<D>() += positions ? Position(Eigen::Map<const Position>(positions + t * D))
+                                          : pose_from<D>(scans.poses + t * (D + 1) * (D + 1)).t;
     if (!sum.allFinite()) throw std::invalid_argument("T_map_sensor, place: expected finite poses");
-    return sum / (static_cast<double>(last - first) * surface_.resolution());
+    return sum / (static_cast<double>(last - first) * surfel_map_.resolution());
   }
 
-  void apply(const Seen& seen, size_t span, int64_t look, int32_t taken) {
-    for (size_t i = seen.begin[span]; i < seen.begin[span + 1]; ++i) {
-      const auto k = static_cast<size_t>(seen.looks[i].element);
-      const float reliability = seen.looks[i].seen_through;
-      if (reliability == Look::kHit) {
-        chains_.hit(k, taken);
-        if (changes_) changes_->hit(k, look);
+  void apply_batch(const ObservationBatch& batches, size_t span, int64_t time_bin,
+                   int32_t viewpoints) {
+    for (size_t i = batches.begin[span]; i < batches.begin[span + 1]; ++i) {
+      const auto k = static_cast<size_t>(batches.observations[i].surfel);
+      const float reliability = batches.observations[i].reliability;
+      if (reliability == Observation::kHit) {
+        chains_.hit(k, viewpoints);
+        if (change_hmm_) change_hmm_->hit(k, time_bin);
       } else {
-        chains_.seen_through(k, taken, reliability);
-        if (changes_) changes_->seen_through(k, look, reliability);
+        chains_.miss(k, viewpoints, reliability);
+        if (change_hmm_) change_hmm_->miss(k, time_bin, reliability);
       }
     }
   }
 
-  const Surface<D>& surface_;
-  LookOptions options_;
-  MeetingTables tables_;
-  Neighbours<D> neighbours_;
-  Tiles<D> beam_tiles_;
-  Chains<D == 2 ? 8 : 4> chains_;
-  std::optional<Changes> changes_;
+  const SurfelMap<D>& surfel_map_;
+  ObservationOptions options_;
+  IntersectionTables tables_;
+  SurfelNeighbours<D> neighbours_;
+  SurfelBitmap<D> bitmap_;
+  TwoStateChains<D == 2 ? 8 : 4> chains_;
+  std::optional<ChangeHmm> change_hmm_;
   // one for each thread; each has a sheet as large as the map
-  std::vector<std::unique_ptr<LookCollector<D>>> collectors_;
-  int64_t newest_ = kNone;
+  std::vector<std::unique_ptr<ObservationCollector<D>>> collectors_;
+  int64_t last_time_bin_ = kNoTimeBin;
 };
 
 // The element each beam ended in: kNoElement for those that were not hit or ended elsewhere.
 template <int D>
-inline void elements_of(const Surface<D>& surface, const Scans<D>& scans, int threads,
-                        int32_t* element) {
-  std::fill(element + scans.offset[0], element + scans.offset[scans.n_scans], kNoElement);
-  const auto bounds = shares_of(scans.offset, scans.n_scans, threads);
-  parallel_shares(bounds, [&](size_t, size_t first, size_t last) {
-    Cursor<const Surface<D>> cursor(surface);
+inline void associate_beams(const SurfelMap<D>& surfel_map, const Scans<D>& scans, int threads,
+                            int32_t* surfel) {
+  std::fill(surfel + scans.offset[0], surfel + scans.offset[scans.n_scans], kNoSurfel);
+  const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
+  parallel_for_ranges(bounds, [&](size_t, size_t first, size_t last) {
+    BlockCursor<const SurfelMap<D>> cursor(surfel_map);
     for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
       if (!scans.hit[n]) return;
-      const Segment<D> beam(pose, scans.points + n * D, surface.resolution());
-      element[n] = surface.owner(cursor, beam.end);
+      const BeamSegment<D> beam(pose, scans.points + n * D, surfel_map.resolution());
+      surfel[n] = surfel_map.associate(cursor, beam.end);
     });
   });
 }

@@ -6,12 +6,14 @@
 #include <type_traits>
 #include <vector>
 
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
 #include "stillmap/occupancy/surfel_map.hpp"
 
 namespace stillmap {
 
 // Bits that are set. What compilers have for it calls a library, for processors that cannot count.
-constexpr int32_t ones(uint64_t x) {
+constexpr int32_t popcount(uint64_t x) {
   x -= (x >> 1) & 0x5555555555555555u;
   x = (x & 0x3333333333333333u) + ((x >> 2) & 0x3333333333333333u);
   x = (x + (x >> 4)) & 0x0f0f0f0f0f0f0f0fu;
@@ -20,10 +22,10 @@ constexpr int32_t ones(uint64_t x) {
 
 // Of a tile of four cells a side, the cells in some of its slices across each axis.
 template <int D>
-using Across = std::array<std::array<uint64_t, 16>, D>;
+using SliceMasks = std::array<std::array<uint64_t, 16>, D>;
 template <int D>
-constexpr Across<D> across_tiles() {
-  Across<D> across{};
+constexpr SliceMasks<D> make_slice_masks() {
+  SliceMasks<D> across{};
   for (size_t d = 0; d < D; ++d)
     for (size_t slices = 0; slices < 16; ++slices)
       for (size_t cell = 0; cell < size_t{1} << (2 * D); ++cell)
@@ -31,144 +33,149 @@ constexpr Across<D> across_tiles() {
   return across;
 }
 template <int D>
-inline constexpr Across<D> kAcross = across_tiles<D>();
+inline constexpr SliceMasks<D> kSliceMasks = make_slice_masks<D>();
 
 // Blocks of a surface, cut into tiles of four cells a side; the elements of a tile have numbers in
 // a row, in the order of its bits.
 template <int D>
-class Tiles {
+class SurfelBitmap {
  public:
   using Mask = std::conditional_t<D == 2, uint16_t, uint64_t>;
   static constexpr int kShift = 2, kTileEdge = 1 << kShift;  // of a tile
-  static constexpr int kPerEdge = Surface<D>::kEdge >> kShift;
-  static constexpr int kPerBlock = Surface<D>::kCells >> (D * kShift);
-  using Slices = std::conditional_t<D == 2, uint32_t, uint8_t>;
+  static constexpr int kTilesPerEdge = SurfelMap<D>::kEdge >> kShift;
+  static constexpr int kTilesPerBlock = SurfelMap<D>::kCells >> (D * kShift);
+  using SliceMask = std::conditional_t<D == 2, uint32_t, uint8_t>;
   static constexpr int32_t kNone = -1;
 
   // Cells of a block.
-  class Marks {
+  class BlockBits {
    public:
-    std::array<Mask, kPerBlock> tiles{};
-    std::array<Slices, D> slices{};  // across each axis, that have any
+    std::array<Mask, kTilesPerBlock> tiles{};
+    std::array<SliceMask, D> slices{};  // across each axis, that have any
 
-    void mark(const Cell<D>& cell) {
+    void set(const Cell<D>& cell) {
       tiles[tile_of(cell)] |= bit(bit_of(cell));
       for (int d = 0; d < D; ++d)
         slices[static_cast<size_t>(d)] |=
-            static_cast<Slices>(Slices{1} << (cell[d] & (Surface<D>::kEdge - 1)));
+            static_cast<SliceMask>(SliceMask{1} << (cell[d] & (SurfelMap<D>::kEdge - 1)));
     }
-    void unmark(const Cell<D>& cell) {
+    void clear(const Cell<D>& cell) {
       tiles[tile_of(cell)] &= static_cast<Mask>(~bit(bit_of(cell)));
       for (int d = 0; d < D; ++d) {
-        const int at = cell[d] & (Surface<D>::kEdge - 1);
-        if (!any_across(d, at)) slices[static_cast<size_t>(d)] &= static_cast<Slices>(~(1u << at));
+        const int at = cell[d] & (SurfelMap<D>::kEdge - 1);
+        if (!any_in_slice(d, at))
+          slices[static_cast<size_t>(d)] &= static_cast<SliceMask>(~(1u << at));
       }
     }
 
     // Calls visit(tile, bit, cell in the block) for those in some of the slices across each axis.
     template <class Visit>
-    void each_in(const std::array<uint32_t, D>& wanted, Visit&& visit) const {
-      std::array<std::array<uint64_t, kPerEdge>, D> within;  // of the tiles along each axis
+    void for_each_in_slices(const std::array<uint32_t, D>& requested, Visit&& visit) const {
+      std::array<std::array<uint64_t, kTilesPerEdge>, D>
+          tile_masks;  // of the tiles along each axis
       for (size_t d = 0; d < D; ++d)
-        for (size_t i = 0; i < kPerEdge; ++i)
-          within[d][i] = kAcross<D>[d][wanted[d] >> (i << kShift) & 15u];
-      const auto along = [](size_t t, size_t d) { return (t >> (d * kTileBits)) & (kPerEdge - 1); };
+        for (size_t i = 0; i < kTilesPerEdge; ++i)
+          tile_masks[d][i] = kSliceMasks<D>[d][requested[d] >> (i << kShift) & 15u];
+      const auto tile_coordinate = [](size_t t, size_t d) {
+        return (t >> (d * kTileBits)) & (kTilesPerEdge - 1);
+      };
       for (size_t t = 0; t < tiles.size(); ++t) {
         uint64_t mask = tiles[t];
-        for (size_t d = 0; d < D; ++d) mask &= within[d][along(t, d)];
+        for (size_t d = 0; d < D; ++d) mask &= tile_masks[d][tile_coordinate(t, d)];
         for (; mask; mask &= mask - 1) {
           const auto number = static_cast<size_t>(__builtin_ctzll(mask));
           Cell<D> cell;
           for (size_t d = 0; d < D; ++d)
             cell[static_cast<int>(d)] = static_cast<int32_t>(
-                (along(t, d) << kShift) + ((number >> (d * kShift)) & (kTileEdge - 1)));
+                (tile_coordinate(t, d) << kShift) + ((number >> (d * kShift)) & (kTileEdge - 1)));
           visit(t, number, cell);
         }
       }
     }
 
    private:
-    bool any_across(int axis, int slice) const {
+    bool any_in_slice(int axis, int slice) const {
       const auto at = static_cast<size_t>(slice >> kShift);
-      const uint64_t of = kAcross<D>[static_cast<size_t>(axis)][1u << (slice & (kTileEdge - 1))];
+      const uint64_t of =
+          kSliceMasks<D>[static_cast<size_t>(axis)][1u << (slice & (kTileEdge - 1))];
       uint64_t any = 0;
       for (size_t t = 0; t < tiles.size(); ++t)
-        if (((t >> (axis * kTileBits)) & (kPerEdge - 1)) == at) any |= tiles[t] & of;
+        if (((t >> (axis * kTileBits)) & (kTilesPerEdge - 1)) == at) any |= tiles[t] & of;
       return any != 0;
     }
   };
 
-  explicit Tiles(const Surface<D>& surface) {
-    marks_.resize(surface.blocks().size());
-    first_.resize(surface.blocks().size());
-    for (size_t b = 0; b < marks_.size(); ++b) {
-      const auto& block = *surface.blocks()[b];
-      first_[b].fill(kNoElement);
-      for (int local = 0; local < Surface<D>::kCells; ++local) {
-        const int32_t k = block.counts[static_cast<size_t>(local)];
-        if (k == kNoElement) continue;
-        const Cell<D> cell = Grid<D>::cell_at(Cell<D>::Zero(), local);
-        marks_[b].mark(cell);
-        int32_t& first = first_[b][tile_of(cell)];
-        if (first == kNoElement || k < first) first = k;
+  explicit SurfelBitmap(const SurfelMap<D>& surfel_map) {
+    bits_.resize(surfel_map.blocks().size());
+    first_surfel_.resize(surfel_map.blocks().size());
+    for (size_t b = 0; b < bits_.size(); ++b) {
+      const auto& block = *surfel_map.blocks()[b];
+      first_surfel_[b].fill(kNoSurfel);
+      for (int local = 0; local < SurfelMap<D>::kCells; ++local) {
+        const int32_t k = block.values[static_cast<size_t>(local)];
+        if (k == kNoSurfel) continue;
+        const Cell<D> cell = BlockLayout<D>::cell_at(Cell<D>::Zero(), local);
+        bits_[b].set(cell);
+        int32_t& first = first_surfel_[b][tile_of(cell)];
+        if (first == kNoSurfel || k < first) first = k;
       }
-      number(block.origin, static_cast<int32_t>(b));
+      add_block(block.origin, static_cast<int32_t>(b));
     }
   }
 
   // number of a block; kNone where the surface has none
-  int32_t find(const Cell<D>& block) const {
+  int32_t block_number(const Cell<D>& block) const {
     const int32_t* page = page_of(block);
-    return page ? page[place_of(block)] : kNone;
+    return page ? page[index_in_page(block)] : kNone;
   }
   // 8 blocks a side; nullptr where there are none
   const int32_t* page_of(const Cell<D>& block) const {
     if (slots_.empty()) return nullptr;
-    const uint64_t key = Grid<D>::key(page_cell(block));
+    const uint64_t key = BlockLayout<D>::key(page_index(block));
     for (size_t slot = hash_(key) & (slots_.size() - 1);; slot = (slot + 1) & (slots_.size() - 1)) {
       if (slots_[slot].page < 0) return nullptr;
       if (slots_[slot].key == key) return pages_[static_cast<size_t>(slots_[slot].page)].data();
     }
   }
-  static Cell<D> page_cell(const Cell<D>& block) {
+  static Cell<D> page_index(const Cell<D>& block) {
     Cell<D> page;
     for (int d = 0; d < D; ++d) page[d] = block[d] >> kPageShift;
     return page;
   }
   static bool same_page(int32_t a, int32_t b) { return a >> kPageShift == b >> kPageShift; }
-  static size_t place_of(const Cell<D>& block) { return at<kPageShift>(block); }
+  static size_t index_in_page(const Cell<D>& block) { return linear_index<kPageShift>(block); }
 
   // of each block, where its elements are
-  const std::vector<Marks>& marks() const { return marks_; }
+  const std::vector<BlockBits>& bits() const { return bits_; }
 
   // of a cell within its block, and within its tile
   static size_t tile_of(const Cell<D>& cell) {
     Cell<D> tile;
     for (int d = 0; d < D; ++d) tile[d] = cell[d] >> kShift;
-    return at<kTileBits>(tile);
+    return linear_index<kTileBits>(tile);
   }
-  static size_t bit_of(const Cell<D>& cell) { return at<kShift>(cell); }
+  static size_t bit_of(const Cell<D>& cell) { return linear_index<kShift>(cell); }
   static Mask bit(size_t number) { return static_cast<Mask>(Mask{1} << number); }
 
   // kNoElement where there is none
-  int32_t element(const Cell<D>& cell) const {
-    return element(find(Grid<D>::block_of(cell)), cell);
+  int32_t surfel(const Cell<D>& cell) const {
+    return surfel(block_number(BlockLayout<D>::block_of(cell)), cell);
   }
   // the number of its block is known
-  int32_t element(int32_t block, const Cell<D>& cell) const {
-    if (block == kNone) return kNoElement;
+  int32_t surfel(int32_t block, const Cell<D>& cell) const {
+    if (block == kNone) return kNoSurfel;
     const size_t tile = tile_of(cell), number = bit_of(cell);
     const auto b = static_cast<size_t>(block);
-    return marks_[b].tiles[tile] & bit(number) ? element(b, tile, number) : kNoElement;
+    return bits_[b].tiles[tile] & bit(number) ? surfel(b, tile, number) : kNoSurfel;
   }
-  int32_t element(size_t block, size_t tile, size_t number) const {
-    const auto below = uint64_t{marks_[block].tiles[tile]} & ((uint64_t{1} << number) - 1);
-    return first_[block][tile] + ones(below);
+  int32_t surfel(size_t block, size_t tile, size_t number) const {
+    const auto below = uint64_t{bits_[block].tiles[tile]} & ((uint64_t{1} << number) - 1);
+    return first_surfel_[block][tile] + popcount(below);
   }
 
  private:
   static constexpr int kPageShift = 3;
-  static constexpr int kTileBits = Surface<D>::kShift - kShift;
+  static constexpr int kTileBits = SurfelMap<D>::kShift - kShift;
   using Page = std::array<int32_t, 1 << (D * kPageShift)>;
   struct Slot {
     uint64_t key = 0;
@@ -177,21 +184,21 @@ class Tiles {
 
   // x runs fastest
   template <int Shift>
-  static size_t at(const Cell<D>& cell) {
+  static size_t linear_index(const Cell<D>& cell) {
     constexpr int mask = (1 << Shift) - 1;
     int place = cell[D - 1] & mask;
     for (int d = D - 2; d >= 0; --d) place = (place << Shift) | (cell[d] & mask);
     return static_cast<size_t>(place);
   }
 
-  void number(const Cell<D>& block, int32_t number) {
+  void add_block(const Cell<D>& block, int32_t number) {
     if (2 * (pages_.size() + 1) > slots_.size()) grow();
-    Slot& slot = slot_of(Grid<D>::key(page_cell(block)));
+    Slot& slot = slot_of(BlockLayout<D>::key(page_index(block)));
     if (slot.page < 0) {
       slot.page = static_cast<int32_t>(pages_.size());
       pages_.emplace_back().fill(kNone);
     }
-    pages_[static_cast<size_t>(slot.page)][place_of(block)] = number;
+    pages_[static_cast<size_t>(slot.page)][index_in_page(block)] = number;
   }
   // a free one gets the key
   Slot& slot_of(uint64_t key) {
@@ -208,11 +215,11 @@ class Tiles {
       if (slot.page >= 0) slot_of(slot.key).page = slot.page;
   }
 
-  typename Grid<D>::Hash hash_;
+  typename BlockLayout<D>::Hash hash_;
   std::vector<Slot> slots_;
   std::vector<Page> pages_;
-  std::vector<Marks> marks_;  // of each block
-  std::vector<std::array<int32_t, kPerBlock>> first_;
+  std::vector<BlockBits> bits_;  // of each block
+  std::vector<std::array<int32_t, kTilesPerBlock>> first_surfel_;
 };
 
 }  // namespace stillmap

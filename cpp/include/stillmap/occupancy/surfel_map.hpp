@@ -12,79 +12,86 @@
 #include <utility>
 #include <vector>
 
+#include "stillmap/grid/cell.hpp"
 #include "stillmap/grid/cell_index.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/ray_walker.hpp"
+#include "stillmap/grid/scans.hpp"
 #include "stillmap/grid/window_query.hpp"
-#include "stillmap/occupancy/beam_counting.hpp"
 #include "stillmap/occupancy/surfel.hpp"
+#include "stillmap/util/lie.hpp"
+#include "stillmap/util/parallel.hpp"
 
 namespace stillmap {
 
-constexpr int32_t kNoElement = CellIndex<2>::kNone;
+constexpr int32_t kNoSurfel = CellIndex<2>::kNone;
 
 template <int D>
-class Surface : public CellIndex<D> {
+class SurfelMap : public CellIndex<D> {
  public:
   // In space things stand on surfaces, on the ground most of all; in a plane they stand beside
   // them, and what lies off a wall is most often the wall, seen from a pose that is off.
-  static constexpr bool kStandsOn = D == 3;
-  static constexpr double kOff = 2.0;     // standard deviations by which a cell is off a surface
-  static constexpr double kOffEnd = 3.0;  // scatters by which a single end point is
-  static constexpr double kNear = 0.2;    // cells; nearer is on it, however smooth it is
+  static constexpr bool kObjectsStandOnSurfaces = D == 3;
+  static constexpr double kOffPlaneSigmas =
+      2.0;  // standard deviations by which a cell is off a surface
+  static constexpr double kEndPointSigmas = 3.0;  // scatters by which a single end point is
+  static constexpr double kMinOffPlane = 0.2;     // cells; nearer is on it, however smooth it is
 
   using Block = typename CellIndex<D>::Block;
 
-  explicit Surface(double resolution) : resolution_(resolution) {
+  explicit SurfelMap(double resolution) : resolution_(resolution) {
     if (!(resolution > 0.0) || !std::isfinite(resolution))
       throw std::invalid_argument("resolution: expected a positive length in metres");
   }
-  Surface(const Surface&) = delete;
-  Surface& operator=(const Surface&) = delete;
+  SurfelMap(const SurfelMap&) = delete;
+  SurfelMap& operator=(const SurfelMap&) = delete;
 
   double resolution() const { return resolution_; }
   size_t size() const { return fitted_ ? cells_.size() : sums_.size(); }
   // standard deviation of end points across surfaces, in cells
-  double scatter() const { return scatter_; }
-  const Element<D>& element(int32_t k) const { return elements_[static_cast<size_t>(k)]; }
-  int64_t beams(int32_t k) const { return beams_[static_cast<size_t>(k)]; }
+  double noise_std() const { return noise_std_; }
+  const Surfel<D>& surfel(int32_t k) const { return surfels_[static_cast<size_t>(k)]; }
+  int64_t beam_count(int32_t k) const { return beam_counts_[static_cast<size_t>(k)]; }
   const Cell<D>& cell(int32_t k) const { return cells_[static_cast<size_t>(k)]; }
   // when beams ended in each cell, if looks were given
-  const std::vector<Span>& hits() const { return hits_; }
+  const std::vector<TimeSpan>& hit_spans() const { return hit_spans_; }
 
   // Notes the end points of all beams that were hit, and the looks of their scans if given.
-  void add(const Scans<D>& scans, const int64_t* look = nullptr, int threads = 1) {
+  void add(const Scans<D>& scans, const int64_t* time_bin = nullptr, int threads = 1) {
     if (fitted_) throw std::invalid_argument("surface: was fitted, and takes no more end points");
-    if (sums_.empty()) dated_ = look != nullptr;
-    if (dated_ != (look != nullptr)) throw std::invalid_argument("look: of all scans, or of none");
-    const std::vector<size_t> bounds = shares_of(scans.offset, scans.n_scans, threads);
-    std::deque<Surface> others;
-    for (size_t i = 2; i < bounds.size(); ++i) others.emplace_back(resolution_);
-    parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
-      (i == 0 ? *this : others[i - 1]).add_share(scans, look, first, last);
+    if (sums_.empty()) has_time_bins_ = time_bin != nullptr;
+    if (has_time_bins_ != (time_bin != nullptr))
+      throw std::invalid_argument("look: of all scans, or of none");
+    const std::vector<size_t> bounds = split_by_beams(scans.offset, scans.n_scans, threads);
+    std::deque<SurfelMap> thread_maps;
+    for (size_t i = 2; i < bounds.size(); ++i) thread_maps.emplace_back(resolution_);
+    parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
+      (i == 0 ? *this : thread_maps[i - 1]).add_range(scans, time_bin, first, last);
     });
     // blocks come in the order in which a single thread would have met them
-    for (const Surface& other : others)
-      for (const Sums<D>& sums : other.sums_) sums_of(sums.cell).add(sums);
+    for (const SurfelMap& thread_map : thread_maps)
+      for (const EndPointSums<D>& sums : thread_map.sums_) sums_at(sums.cell).add(sums);
   }
 
   // The element of a cell, or kNoElement.
-  int32_t at(Cursor<const Surface<D>>& cursor, const Cell<D>& cell) const {
+  int32_t surfel_at(BlockCursor<const SurfelMap<D>>& cursor, const Cell<D>& cell) const {
     const Block* block = cursor.block(cell);
-    return block ? block->counts[static_cast<size_t>(this->local_of(cell))] : kNoElement;
+    return block ? block->values[static_cast<size_t>(this->local_of(cell))] : kNoSurfel;
   }
 
   // The element that an end point is of: that of its cell, or where it lies off the surface there,
   // the nearest one beside it that it does not lie off.
-  int32_t owner(Cursor<const Surface<D>>& cursor, const Vec<D>& end) const {
+  int32_t associate(BlockCursor<const SurfelMap<D>>& cursor, const Vec<D>& end) const {
     const Cell<D> cell = cell_of<D>(end);
-    const int32_t own = at(cursor, cell);
-    if (!kStandsOn || own == kNoElement || !lies_off(own, end)) return own;
+    const int32_t own = surfel_at(cursor, cell);
+    if (!kObjectsStandOnSurfaces || own == kNoSurfel || !is_off_plane(own, end)) return own;
     int32_t nearest = own;
-    double least = std::numeric_limits<double>::infinity();
-    for_each_near<D>(cell, 1, [&](const Cell<D>& beside) {
-      const int32_t k = at(cursor, beside);
-      if (k == kNoElement || lies_off(k, end)) return;
-      const double apart = (element(k).mean - end).squaredNorm();
-      if (apart < least) least = apart, nearest = k;
+    double least_distance = std::numeric_limits<double>::infinity();
+    for_each_in_cube<D>(cell, 1, [&](const Cell<D>& beside) {
+      const int32_t k = surfel_at(cursor, beside);
+      if (k == kNoSurfel || is_off_plane(k, end)) return;
+      const double distance = (surfel(k).mean - end).squaredNorm();
+      if (distance < least_distance) least_distance = distance, nearest = k;
     });
     return nearest;
   }
@@ -92,41 +99,41 @@ class Surface : public CellIndex<D> {
   // Means, normals and scatter from all end points; a second time changes nothing.
   void fit(int threads = 1) {
     if (fitted_) return;
-    number_by_place();
-    elements_.assign(size(), {});
-    for (size_t k = 0; k < size(); ++k) elements_[k].mean = mean_of(sums_[k]);
+    renumber_by_tile();
+    surfels_.assign(size(), {});
+    for (size_t k = 0; k < size(); ++k) surfels_[k].mean = mean_of(sums_[k]);
     // noise as large as the window would hide every wall: then a wider one
     for (const int radius : {2, 4, 6})
       if (fit_normals(radius, threads) >= 0.5) break;
     cells_.reserve(size());
-    beams_.reserve(size());
-    if (dated_) hits_.reserve(size());
-    for (const Sums<D>& sums : sums_) {
+    beam_counts_.reserve(size());
+    if (has_time_bins_) hit_spans_.reserve(size());
+    for (const EndPointSums<D>& sums : sums_) {
       cells_.push_back(sums.cell);
-      beams_.push_back(sums.count);
-      if (dated_) hits_.push_back(sums.hit);
+      beam_counts_.push_back(sums.count);
+      if (has_time_bins_) hit_spans_.push_back(sums.hit_span);
     }
-    std::vector<Sums<D>>().swap(sums_);  // as large as all the rest
+    std::vector<EndPointSums<D>>().swap(sums_);  // as large as all the rest
     fitted_ = true;
   }
   bool fitted() const { return fitted_; }
 
  private:
-  bool lies_off(int32_t k, const Vec<D>& end) const {
-    const Element<D>& e = element(k);
-    return std::abs(e.normal.dot(end - e.centre)) > kOffEnd * scatter_ + kNear;
+  bool is_off_plane(int32_t k, const Vec<D>& end) const {
+    const Surfel<D>& e = surfel(k);
+    return std::abs(e.normal.dot(end - e.centre)) > kEndPointSigmas * noise_std_ + kMinOffPlane;
   }
 
   // Neighbours get neighbouring numbers, tile by tile, so that a beam in any direction finds them
   // close together in memory.
-  void number_by_place() {
-    std::vector<Sums<D>> sorted;
+  void renumber_by_tile() {
+    std::vector<EndPointSums<D>> sorted;
     sorted.reserve(sums_.size());
-    const std::vector<size_t> order = by_tiles();
+    const std::vector<size_t> order = tile_order();
     for (const auto& block : this->blocks())
       for (const size_t local : order) {
-        int32_t& k = block->counts[local];
-        if (k == kNoElement) continue;
+        int32_t& k = block->values[local];
+        if (k == kNoSurfel) continue;
         sorted.push_back(sums_[static_cast<size_t>(k)]);
         k = static_cast<int32_t>(sorted.size() - 1);
       }
@@ -134,7 +141,7 @@ class Surface : public CellIndex<D> {
   }
 
   // The cells of a block in the order of tiles of four cells a side.
-  static std::vector<size_t> by_tiles() {
+  static std::vector<size_t> tile_order() {
     constexpr int tile = 4;
     std::vector<std::pair<int64_t, size_t>> keyed;
     for (size_t local = 0; local < static_cast<size_t>(CellIndex<D>::kCells); ++local) {
@@ -153,20 +160,20 @@ class Surface : public CellIndex<D> {
     return order;
   }
 
-  void add_share(const Scans<D>& scans, const int64_t* look, size_t first, size_t last) {
+  void add_range(const Scans<D>& scans, const int64_t* time_bin, size_t first, size_t last) {
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
       if (!scans.hit[n]) return;
-      const Segment<D> beam(pose, scans.points + n * D, resolution_);
-      Sums<D>& sums = sums_of(cell_of<D>(beam.end));
+      const BeamSegment<D> beam(pose, scans.points + n * D, resolution_);
+      EndPointSums<D>& sums = sums_at(cell_of<D>(beam.end));
       sums.add(beam.end);
-      if (look) sums.hit.widen(look[t]);
+      if (time_bin) sums.hit_span.include(time_bin[t]);
     });
   }
 
   // Those of a cell, of no end point at first.
-  Sums<D>& sums_of(const Cell<D>& cell) {
-    int32_t& at = this->place_of(cell);
-    if (at == kNoElement) {
+  EndPointSums<D>& sums_at(const Cell<D>& cell) {
+    int32_t& at = this->index_of(cell);
+    if (at == kNoSurfel) {
       at = static_cast<int32_t>(sums_.size());
       sums_.emplace_back();
       sums_.back().cell = cell;
@@ -174,7 +181,7 @@ class Surface : public CellIndex<D> {
     return sums_[static_cast<size_t>(at)];
   }
 
-  static Vec<D> mean_of(const Sums<D>& s) {
+  static Vec<D> mean_of(const EndPointSums<D>& s) {
     Vec<D> mean;
     for (int d = 0; d < D; ++d)
       mean[d] =
@@ -187,63 +194,66 @@ class Surface : public CellIndex<D> {
   // Principal axes of the end points within `radius` cells of each element; returns the share of
   // the beams that ended on surfaces.
   double fit_normals(int radius, int threads) {
-    const std::vector<size_t> bounds = even_shares(size(), threads);
-    std::vector<Fitted> shares(bounds.size() - 1);
-    parallel_shares(bounds, [&](size_t i, size_t first, size_t last) {
+    const std::vector<size_t> bounds = split_evenly(size(), threads);
+    std::vector<NormalFit> shares(bounds.size() - 1);
+    parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
       shares[i] = fit_normals(radius, first, last);
     });
-    Fitted& total = shares.front();
+    NormalFit& total = shares.front();
     for (size_t i = 1; i < shares.size(); ++i) {
-      total.all += shares[i].all;
-      total.flat += shares[i].flat;
-      total.across.insert(total.across.end(), shares[i].across.begin(), shares[i].across.end());
+      total.total += shares[i].total;
+      total.planar += shares[i].planar;
+      total.deviations.insert(total.deviations.end(), shares[i].deviations.begin(),
+                              shares[i].deviations.end());
     }
-    scatter_ = weighted_median(total.across);
-    return total.all ? static_cast<double>(total.flat) / static_cast<double>(total.all) : 1.0;
+    noise_std_ = weighted_median(total.deviations);
+    return total.total ? static_cast<double>(total.planar) / static_cast<double>(total.total) : 1.0;
   }
 
   // Beams in all and on surfaces; smallest deviation and weight of each of these.
-  struct Fitted {
-    int64_t all = 0, flat = 0;
-    std::vector<std::pair<double, int64_t>> across;
+  struct NormalFit {
+    int64_t total = 0, planar = 0;
+    std::vector<std::pair<double, int64_t>> deviations;
   };
 
-  Fitted fit_normals(int radius, size_t first_element, size_t last_element) {
-    Fitted fitted;
-    auto& [all, flat, across] = fitted;
-    Around<D> around(*this);
-    const CellRows<D> window = rows_around<D>(radius, true);
+  NormalFit fit_normals(int radius, size_t first_element, size_t last_element) {
+    NormalFit fit_result;
+    auto& [total, planar, deviations] = fit_result;
+    WindowQuery<D> query(*this);
+    const CellRows<D> window = window_rows<D>(radius, true);
     for (size_t k = first_element; k < last_element; ++k) {
-      Spread<D> spread;
-      around.each(sums_[k].cell, window, [&](int32_t near) {
-        spread.add(sums_[static_cast<size_t>(near)], sums_[k].cell);
+      WindowMoments<D> spread;
+      query.for_each(sums_[k].cell, window, [&](int32_t neighbour) {
+        spread.add(sums_[static_cast<size_t>(neighbour)], sums_[k].cell);
       });
       const Eigen::SelfAdjointEigenSolver<Square> axes(spread.covariance());
       const Vec<D> variance = axes.eigenvalues().cwiseMax(0.0);  // rising
-      Element<D>& element = elements_[k];
-      element.normal.setZero();
-      element.off_plane = 0.0;
-      element.centre = element.mean;
-      element.half = 0.5;
-      element.prominence = static_cast<double>(sums_[k].count) / spread.most;
-      all += sums_[k].count;
-      const bool wide = variance[1] > 0.15 * radius * radius;  // over three cells of five
-      if (!wide || variance[0] >= 0.25 * variance[1]) continue;
+      Surfel<D>& surfel = surfels_[k];
+      surfel.normal.setZero();
+      surfel.centre_to_plane = 0.0;
+      surfel.centre = surfel.mean;
+      surfel.half_extent = 0.5;
+      surfel.prominence = static_cast<double>(sums_[k].count) / spread.max_count;
+      total += sums_[k].count;
+      const bool is_extended = variance[1] > 0.15 * radius * radius;  // over three cells of five
+      if (!is_extended || variance[0] >= 0.25 * variance[1]) continue;
       const Vec<D> normal = axes.eigenvectors().col(0);
-      const Vec<D> middle = sums_[k].cell.template cast<double>() + spread.mean();
+      const Vec<D> plane_point = sums_[k].cell.template cast<double>() + spread.mean();
       // feet, and wheels, are not of the ground that they stand on
-      const double apart = std::abs(normal.dot(element.mean - middle));
-      if (kStandsOn && apart > kNear && apart * apart > kOff * kOff * variance[0]) continue;
-      flat += sums_[k].count;
-      across.emplace_back(std::sqrt(variance[0]), sums_[k].count);
-      element.normal = normal;
-      element.centre = middle;
+      const double distance = std::abs(normal.dot(surfel.mean - plane_point));
+      if (kObjectsStandOnSurfaces && distance > kMinOffPlane &&
+          distance * distance > kOffPlaneSigmas * kOffPlaneSigmas * variance[0])
+        continue;
+      planar += sums_[k].count;
+      deviations.emplace_back(std::sqrt(variance[0]), sums_[k].count);
+      surfel.normal = normal;
+      surfel.centre = plane_point;
       // evenly spread points reach sqrt(3) deviations; the inner half is surely surface
-      element.half = 0.5 * std::sqrt(3.0 * variance[1]);
+      surfel.half_extent = 0.5 * std::sqrt(3.0 * variance[1]);
       const Vec<D> centre = Vec<D>::Constant(0.5);  // as seen from the cell's corner
-      element.off_plane = element.normal.dot(centre - spread.mean());
+      surfel.centre_to_plane = surfel.normal.dot(centre - spread.mean());
     }
-    return fitted;
+    return fit_result;
   }
 
   static double weighted_median(std::vector<std::pair<double, int64_t>>& values) {
@@ -257,14 +267,14 @@ class Surface : public CellIndex<D> {
   }
 
   double resolution_;
-  double scatter_ = 0.0;
+  double noise_std_ = 0.0;
   bool fitted_ = false;
-  bool dated_ = false;         // whether looks were given
-  std::vector<Sums<D>> sums_;  // until it is fitted
-  std::vector<Element<D>> elements_;
+  bool has_time_bins_ = false;         // whether looks were given
+  std::vector<EndPointSums<D>> sums_;  // until it is fitted
+  std::vector<Surfel<D>> surfels_;
   std::vector<Cell<D>> cells_;
-  std::vector<int64_t> beams_;
-  std::vector<Span> hits_;  // if dated
+  std::vector<int64_t> beam_counts_;
+  std::vector<TimeSpan> hit_spans_;  // if dated
 };
 
 }  // namespace stillmap

@@ -9,8 +9,11 @@
 #include <queue>
 #include <vector>
 
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
 #include "stillmap/registration/field_pyramid.hpp"
 #include "stillmap/registration/scan_registration.hpp"
+#include "stillmap/util/lie.hpp"
 
 namespace stillmap {
 
@@ -29,13 +32,14 @@ struct Candidate {
 template <int D>
 class CorrelativeSearch {
  public:
-  CorrelativeSearch(const Grid<D>& grid, const WeightedBeams<D>& beams, const Prior<D>& prior,
-                    const SearchWindow& window, const RegisterOptions& options)
+  CorrelativeSearch(const OccupancyGrid<D>& grid, const WeightedBeams<D>& beams,
+                    const PosePrior<D>& prior, const SearchWindow& window,
+                    const ScanRegistrationOptions& options)
       : grid_(grid), prior_(prior), options_(options) {
     // a wide window is searched in steps of two cells: the Newton steps bridge that
-    shift_ = window.translation > 4.0 * grid.resolution() ? 1 : 0;
-    step_ = grid.resolution() * (1 << shift_);
-    shifts_ = static_cast<int32_t>(std::ceil(window.translation / step_));
+    step_shift_ = window.translation > 4.0 * grid.resolution() ? 1 : 0;
+    step_ = grid.resolution() * (1 << step_shift_);
+    half_steps_ = static_cast<int32_t>(std::ceil(window.translation / step_));
     std::vector<double> ranges;
     for (size_t n = 0; n < beams.points.size(); ++n) {
       const double range = beams.points[n].norm();
@@ -46,48 +50,49 @@ class CorrelativeSearch {
     }
     if (ranges.empty()) return;
     // turn by no more than moves a typical far beam by one step
-    const auto far = ranges.begin() + static_cast<std::ptrdiff_t>((ranges.size() - 1) * 3 / 4);
-    std::nth_element(ranges.begin(), far, ranges.end());
-    angle_step_ = std::min(step_ / std::max(*far, step_), 0.035);
-    angles_ = static_cast<int>(std::ceil(window.rotation / angle_step_));
-    while (top_ < kLargestTop && (2 << top_) <= shifts_) ++top_;
+    const auto far_range =
+        ranges.begin() + static_cast<std::ptrdiff_t>((ranges.size() - 1) * 3 / 4);
+    std::nth_element(ranges.begin(), far_range, ranges.end());
+    angle_step_ = std::min(step_ / std::max(*far_range, step_), 0.035);
+    half_angles_ = static_cast<int>(std::ceil(window.rotation / angle_step_));
+    while (top_level_ < kMaxTopLevel && (2 << top_level_) <= half_steps_) ++top_level_;
     const Eigen::Matrix<double, D, D> A = prior.information.template topLeftCorner<D, D>();
     const Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> axes(A);
-    stiffness_ = std::max(axes.eigenvalues()[0], 0.0);
-    toward_ = A.ldlt().solve(prior.information.template topRightCorner<D, 1>());
+    min_shift_information_ = std::max(axes.eigenvalues()[0], 0.0);
+    shift_per_turn_ = A.ldlt().solve(prior.information.template topRightCorner<D, 1>());
   }
 
   // The best poses of the lattice, best first, no two of them in one basin, none much worse than
   // the best; the prior's mean when there is nothing to search.
-  std::vector<Candidate<D>> best(size_t wanted) {
-    if (points_.empty() || (shifts_ == 0 && angles_ == 0)) return {{prior_.pose, 0.0}};
-    lay_out();
-    std::vector<Candidate<D>> kept;
+  std::vector<Candidate<D>> best(size_t max_candidates) {
+    if (points_.empty() || (half_steps_ == 0 && half_angles_ == 0)) return {{prior_.pose, 0.0}};
+    build_pyramid();
+    std::vector<Candidate<D>> candidates;
     size_t limit = std::numeric_limits<size_t>::max();
-    while (!open_.empty() && kept.size() < wanted && poses_tried_ < limit) {
-      const Node node = open_.top();
-      open_.pop();
-      if (!kept.empty() && node.bound < 0.8 * kept.front().score) break;
+    while (!queue_.empty() && candidates.size() < max_candidates && poses_tried_ < limit) {
+      const Node node = queue_.top();
+      queue_.pop();
+      if (!candidates.empty() && node.bound < 0.8 * candidates.front().score) break;
       if (node.level > 0) {
         branch(node);
         continue;
       }
-      const Candidate<D> leaf{pose_at(node), node.bound};
-      if (std::any_of(kept.begin(), kept.end(),
-                      [&](const auto& other) { return near(leaf.pose, other.pose); }))
+      const Candidate<D> candidate{pose_at(node), node.bound};
+      if (std::any_of(candidates.begin(), candidates.end(),
+                      [&](const auto& other) { return is_same_basin(candidate.pose, other.pose); }))
         continue;
-      kept.push_back(leaf);
+      candidates.push_back(candidate);
       // the others may take as long as the best one did
-      if (kept.size() == 1) limit = 2 * poses_tried_;
+      if (candidates.size() == 1) limit = 2 * poses_tried_;
     }
-    return kept;
+    return candidates;
   }
 
   size_t poses_tried() const { return poses_tried_; }
 
  private:
   static constexpr double kWeight = 255.0;
-  static constexpr int kLargestTop = 6;
+  static constexpr int kMaxTopLevel = 6;
 
   // all shifts within 2^level steps of `low` along each axis, at one orientation
   struct Node {
@@ -101,33 +106,33 @@ class CorrelativeSearch {
     }
   };
 
-  bool near(const Pose<D>& a, const Pose<D>& b) const {
-    const typename Lie<D>::Tangent d = a.minus(b);
+  bool is_same_basin(const Pose<D>& a, const Pose<D>& b) const {
+    const typename Lie<D>::Tangent d = a.boxminus(b);
     return d.template head<D>().norm() < 3.0 * step_ &&
            d.template tail<Lie<D>::kRotation>().norm() < 3.0 * angle_step_;
   }
 
-  Pose<D> turned(int a) const {
+  Pose<D> rotated_prior(int a) const {
     typename Lie<D>::Tangent delta = Lie<D>::Tangent::Zero();
     delta[Lie<D>::kDof - 1] = a * angle_step_;
-    return prior_.pose.moved(delta);
+    return prior_.pose.boxplus(delta);
   }
 
   Pose<D> pose_at(const Node& node) const {
-    Pose<D> pose = turned(node.angle);
+    Pose<D> pose = rotated_prior(node.angle);
     pose.t += node.low.template cast<double>() * step_;
     return pose;
   }
 
   // the raster around everything that a pose of the window can see, and the widest nodes
-  void lay_out() {
-    const auto turns = static_cast<size_t>(2 * angles_ + 1);
+  void build_pyramid() {
+    const auto turns = static_cast<size_t>(2 * half_angles_ + 1);
     std::vector<Cell<D>> pixels;
     pixels.reserve(turns * points_.size());
     Cell<D> low = Cell<D>::Constant(std::numeric_limits<int32_t>::max());
     Cell<D> high = Cell<D>::Constant(std::numeric_limits<int32_t>::min());
-    for (int a = -angles_; a <= angles_; ++a) {
-      const Pose<D> pose = turned(a);
+    for (int a = -half_angles_; a <= half_angles_; ++a) {
+      const Pose<D> pose = rotated_prior(a);
       for (const auto& p : points_) {
         pixels.push_back(cell_of<D>((pose * p) / step_));
         low = low.cwiseMin(pixels.back());
@@ -135,13 +140,16 @@ class CorrelativeSearch {
       }
     }
     // a node may reach beyond the window
-    const Cell<D> before = Cell<D>::Constant(shifts_), after = Cell<D>::Constant(shifts_ + 1);
-    raster_.emplace(grid_, low - before, high - low + before + after, shift_, top_, options_.field);
-    for (const auto& pixel : pixels) indices_.push_back(raster_->index(pixel));
-    const Cell<D> tiles = Cell<D>::Constant(2 * shifts_ >> top_), none = Cell<D>::Zero();
-    for (int a = -angles_; a <= angles_; ++a)
-      for_each_in_box<D>(none, tiles, [&](const Cell<D>& tile) {
-        push(top_, a, (tile.array() * (1 << top_) - shifts_).matrix());
+    const Cell<D> before = Cell<D>::Constant(half_steps_),
+                  after = Cell<D>::Constant(half_steps_ + 1);
+    pyramid_.emplace(grid_, low - before, high - low + before + after, step_shift_, top_level_,
+                     options_.field);
+    for (const auto& pixel : pixels) pixel_indices_.push_back(pyramid_->index(pixel));
+    const Cell<D> last_node = Cell<D>::Constant(2 * half_steps_ >> top_level_),
+                  none = Cell<D>::Zero();
+    for (int a = -half_angles_; a <= half_angles_; ++a)
+      for_each_in_box<D>(none, last_node, [&](const Cell<D>& tile) {
+        push_node(top_level_, a, (tile.array() * (1 << top_level_) - half_steps_).matrix());
       });
   }
 
@@ -150,25 +158,27 @@ class CorrelativeSearch {
     for (int child = 0; child < 1 << D; ++child) {
       Cell<D> low = node.low;
       for (int d = 0; d < D; ++d) low[d] += (child >> d & 1) * half;
-      if ((low.array() <= shifts_).all()) push(node.level - 1, node.angle, low);
+      if ((low.array() <= half_steps_).all()) push_node(node.level - 1, node.angle, low);
     }
   }
 
-  void push(int level, int angle, const Cell<D>& low) {
+  void push_node(int level, int angle, const Cell<D>& low) {
     ++poses_tried_;
-    const int64_t shift = raster_->offset(low);
-    const uint8_t* from = raster_->level(level) + shift;
+    const int64_t shift = pyramid_->offset(low);
+    const uint8_t* from = pyramid_->level(level) + shift;
     const size_t n_points = points_.size();
-    const int64_t* at = indices_.data() + static_cast<size_t>(angle + angles_) * n_points;
+    const int64_t* at =
+        pixel_indices_.data() + static_cast<size_t>(angle + half_angles_) * n_points;
     int64_t sum = 0;
     for (size_t n = 0; n < n_points; ++n) sum += weights_[n] * from[at[n]];
-    const double fit = options_.gain * raster_->unit() / kWeight * static_cast<double>(sum);
-    open_.push({fit - least_penalty(level, angle, low), level, angle, low, poses_tried_});
+    const double data_score =
+        options_.gain * pyramid_->score_unit() / kWeight * static_cast<double>(sum);
+    queue_.push({data_score - prior_penalty(level, angle, low), level, angle, low, poses_tried_});
   }
 
   // 1/2 d^T Lambda d of a pose, or at most that of the poses of a node: with the turn given, what
   // is left is a quadratic form about some shift
-  double least_penalty(int level, int angle, const Cell<D>& low) const {
+  double prior_penalty(int level, int angle, const Cell<D>& low) const {
     constexpr int turn = Lie<D>::kDof - 1;
     const double theta = angle * angle_step_;
     Vec<D> shift = low.template cast<double>() * step_;
@@ -177,28 +187,28 @@ class CorrelativeSearch {
     if (level == 0)
       return 0.5 * (shift.dot(A * shift) + 2.0 * theta * shift.dot(b) +
                     theta * theta * prior_.information(turn, turn));
-    const Vec<D> across = shift.array() + ((1 << level) - 1) * step_;
-    const Vec<D> nearest = (-theta * toward_).cwiseMax(shift).cwiseMin(across);
-    return 0.5 * (stiffness_ * (nearest + theta * toward_).squaredNorm() +
-                  theta * theta * (prior_.information(turn, turn) - b.dot(toward_)));
+    const Vec<D> opposite = shift.array() + ((1 << level) - 1) * step_;
+    const Vec<D> nearest = (-theta * shift_per_turn_).cwiseMax(shift).cwiseMin(opposite);
+    return 0.5 * (min_shift_information_ * (nearest + theta * shift_per_turn_).squaredNorm() +
+                  theta * theta * (prior_.information(turn, turn) - b.dot(shift_per_turn_)));
   }
 
-  const Grid<D>& grid_;
-  const Prior<D>& prior_;
-  const RegisterOptions& options_;
+  const OccupancyGrid<D>& grid_;
+  const PosePrior<D>& prior_;
+  const ScanRegistrationOptions& options_;
   std::vector<Vec<D>> points_;
   std::vector<int32_t> weights_;
-  int shift_ = 0;  // a step is 2^shift cells
+  int step_shift_ = 0;  // a step is 2^shift cells
   double step_ = 0.0;
-  int32_t shifts_ = 0;
+  int32_t half_steps_ = 0;
   double angle_step_ = 0.0;
-  int angles_ = 0;
-  int top_ = 0;  // level of the widest nodes
-  std::optional<Raster<D>> raster_;
-  std::vector<int64_t> indices_;  // of every beam's pixel, orientation by orientation
-  std::priority_queue<Node> open_;
-  Vec<D> toward_;           // shift that the prior goes with a turn, negated, per radian
-  double stiffness_ = 0.0;  // its smallest information of a shift
+  int half_angles_ = 0;
+  int top_level_ = 0;  // level of the widest nodes
+  std::optional<FieldPyramid<D>> pyramid_;
+  std::vector<int64_t> pixel_indices_;  // of every beam's pixel, orientation by orientation
+  std::priority_queue<Node> queue_;
+  Vec<D> shift_per_turn_;  // shift that the prior goes with a turn, negated, per radian
+  double min_shift_information_ = 0.0;  // its smallest information of a shift
   size_t poses_tried_ = 0;
 };
 

@@ -5,20 +5,26 @@
 
 #include <cmath>
 
-#include "stillmap/occupancy/beam_counting.hpp"
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/ray_walker.hpp"
+#include "stillmap/grid/scans.hpp"
+#include "stillmap/util/lie.hpp"
 
 namespace stillmap {
 
-struct FillOptions {
-  double gap;        // metres between neighbouring end points, at most
-  double tolerance;  // metres by which three end points in a row may be off a straight line
-  double growth;     // the gap may be that many times as wide as the one beside it
+struct InterpolationOptions {
+  double max_gap;        // metres between neighbouring end points, at most
+  double tolerance;      // metres by which three end points in a row may be off a straight line
+  double max_gap_ratio;  // the gap may be that many times as wide as the one beside it
 };
 
 template <int D>
-class Fill {
+class EndPointInterpolator {
  public:
-  Fill(Grid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign, const FillOptions& options)
+  EndPointInterpolator(OccupancyGrid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign,
+                       const InterpolationOptions& options)
       : cursor_(grid),
         scans_(scans),
         e_(e),
@@ -33,8 +39,9 @@ class Fill {
       pose_ = pose_from<D>(scans_.poses + t * (D + 1) * (D + 1));
       for (int64_t n = first_; n < last_; ++n)
         if (is_hit(n) && is_hit(n + 1) &&
-            (continues(n, n + 1, n - 1) || continues(n + 1, n, n + 2)))
-          between(point(n), point(n + 1), std::min(probability(e_[n]), probability(e_[n + 1])));
+            (is_collinear(n, n + 1, n - 1) || is_collinear(n + 1, n, n + 2)))
+          interpolate(point(n), point(n + 1),
+                      std::min(checked_probability(e_[n]), checked_probability(e_[n + 1])));
     }
   }
 
@@ -43,39 +50,39 @@ class Fill {
   Vec<D> point(int64_t n) const { return point_at<D>(scans_.points + n * D); }
 
   // whether the surface from `beside` to a goes straight on to b
-  bool continues(int64_t a, int64_t b, int64_t beside) const {
-    if (!is_hit(beside)) return false;
-    const Vec<D> step = point(b) - point(a), before = point(a) - point(beside);
-    const double gap = step.norm(), gap_before = before.norm();
-    if (gap > options_.gap || gap > options_.growth * gap_before) return false;
-    const double along = before.dot(step) / (gap > 0.0 ? gap : 1.0);
-    const double off = std::sqrt(std::max(before.squaredNorm() - along * along, 0.0));
+  bool is_collinear(int64_t a, int64_t b, int64_t previous) const {
+    if (!is_hit(previous)) return false;
+    const Vec<D> step = point(b) - point(a), previous_step = point(a) - point(previous);
+    const double gap = step.norm(), previous_gap = previous_step.norm();
+    if (gap > options_.max_gap || gap > options_.max_gap_ratio * previous_gap) return false;
+    const double along = previous_step.dot(step) / (gap > 0.0 ? gap : 1.0);
+    const double off = std::sqrt(std::max(previous_step.squaredNorm() - along * along, 0.0));
     return along > 0.0 && off < options_.tolerance;
   }
 
-  void between(const Vec<D>& from, const Vec<D>& to, double weight) {
+  void interpolate(const Vec<D>& from, const Vec<D>& to, double weight) {
     for (const Vec<D>& end : {from, to})
-      if (!all_below<D>((pose_ * end) / resolution_, Grid<D>::kMaxCell))
+      if (!all_below<D>((pose_ * end) / resolution_, BlockLayout<D>::kMaxCell))
         throw std::invalid_argument("beam: a pose or end point is not finite or too far away");
-    const auto steps = static_cast<int>(std::ceil((to - from).norm() / resolution_));
-    for (int i = 1; i < steps; ++i) {
-      const Vec<D> at =
-          (pose_ * (from + (to - from) * (static_cast<double>(i) / steps))) / resolution_;
-      const Cell<D> cell = cell_of<D>(at);
+    const auto n_steps = static_cast<int>(std::ceil((to - from).norm() / resolution_));
+    for (int i = 1; i < n_steps; ++i) {
+      const Vec<D> point =
+          (pose_ * (from + (to - from) * (static_cast<double>(i) / n_steps))) / resolution_;
+      const Cell<D> cell = cell_of<D>(point);
       auto* block = cursor_.block(cell);
-      const auto local = static_cast<size_t>(Grid<D>::local_of(cell));
-      block->counts[local].alpha += sign_ * to_fixed(weight);
-      auto& moment = Grid<D>::moments_of(*block)[local];
+      const auto local = static_cast<size_t>(BlockLayout<D>::local_of(cell));
+      block->values[local].alpha += sign_ * to_fixed(weight);
+      auto& moment = OccupancyGrid<D>::moments_of(*block)[local];
       for (int d = 0; d < D; ++d)
-        moment[static_cast<size_t>(d)] += sign_ * to_fixed(weight * (at[d] - cell[d]));
+        moment[static_cast<size_t>(d)] += sign_ * to_fixed(weight * (point[d] - cell[d]));
     }
   }
 
-  Cursor<Grid<D>> cursor_;
+  BlockCursor<OccupancyGrid<D>> cursor_;
   const Scans<D>& scans_;
   const float* e_;
   Fixed sign_;
-  FillOptions options_;
+  InterpolationOptions options_;
   double resolution_;
   int64_t first_ = 0, last_ = 0;
   Pose<D> pose_;

@@ -64,7 +64,7 @@ struct Pose {
     return R * p + t;
   }
 
-  Pose moved(const typename Lie<D>::Tangent& delta) const {
+  Pose boxplus(const typename Lie<D>::Tangent& delta) const {
     Pose out;
     out.R = Lie<D>::exp_rotation(delta.template tail<Lie<D>::kRotation>()) * R;
     out.t = t + delta.template head<D>();
@@ -72,7 +72,7 @@ struct Pose {
   }
 
   // delta such that other.moved(delta) is this pose
-  typename Lie<D>::Tangent minus(const Pose& other) const {
+  typename Lie<D>::Tangent boxminus(const Pose& other) const {
     typename Lie<D>::Tangent delta;
     delta.template head<D>() = t - other.t;
     delta.template tail<Lie<D>::kRotation>() = Lie<D>::log_rotation(R * other.R.transpose());

@@ -12,7 +12,7 @@ namespace stillmap {
 // Calls work(thread, first, last) on contiguous shares whose bounds are given: bounds[i] to
 // bounds[i + 1].
 template <class Work>
-void parallel_shares(const std::vector<size_t>& bounds, Work&& work) {
+void parallel_for_ranges(const std::vector<size_t>& bounds, Work&& work) {
   const size_t n = bounds.size() - 1;
   std::vector<std::exception_ptr> errors(n);
   auto guarded = [&](size_t i) {
@@ -32,7 +32,7 @@ void parallel_shares(const std::vector<size_t>& bounds, Work&& work) {
 
 // Bounds that give each thread about the same number of beams; offset has one entry more than
 // there are scans.
-inline std::vector<size_t> shares_of(const int64_t* offset, size_t scans, int threads) {
+inline std::vector<size_t> split_by_beams(const int64_t* offset, size_t scans, int threads) {
   const size_t n =
       std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1, std::max<size_t>(scans, 1));
   std::vector<size_t> bounds{0};
@@ -47,7 +47,7 @@ inline std::vector<size_t> shares_of(const int64_t* offset, size_t scans, int th
 }
 
 // Bounds that give each thread about the same number of n things.
-inline std::vector<size_t> even_shares(size_t n, int threads) {
+inline std::vector<size_t> split_evenly(size_t n, int threads) {
   constexpr size_t few = 1 << 12;  // of which no thread is worth while
   const size_t shares = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1,
                                            std::max<size_t>(n / few, 1));
