@@ -1,4 +1,4 @@
-// Array types at the border and the checks between them.
+// Array types of the Python interface, and checks of their shapes and values.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -33,9 +33,9 @@ using Cells =
 template <class T>
 using Flat = nb::ndarray<const T, nb::numpy, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
-// A new array that owns its memory; the data is moved in.
+// NumPy array that owns the data of a vector.
 template <class T>
-nb::ndarray<nb::numpy, T> owned(std::vector<T>&& data, std::initializer_list<size_t> shape) {
+nb::ndarray<nb::numpy, T> to_numpy(std::vector<T>&& data, std::initializer_list<size_t> shape) {
   auto* held = new std::vector<T>(std::move(data));
   nb::capsule owner(held, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
   return nb::ndarray<nb::numpy, T>(held->data(), shape, owner);
@@ -89,7 +89,7 @@ auto matrix_of(const Pose<D>& pose) {
     T[r * (D + 1) + D] = pose.t[static_cast<int>(r)];
   }
   T.back() = 1.0;
-  return owned(std::move(T), {D + 1, D + 1});
+  return to_numpy(std::move(T), {D + 1, D + 1});
 }
 
 inline const float* per_beam(const Flat<float>& values, size_t n_beams, const char* name) {

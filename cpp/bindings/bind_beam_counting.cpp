@@ -65,7 +65,7 @@ auto expectations(const OccupancyGrid<D>& grid, const Points<D>& points, const F
     e_step<D>(grid, scans, prior, threads, e.data());
   }
   const size_t n = e.size();
-  return owned(std::move(e), {n});
+  return to_numpy(std::move(e), {n});
 }
 
 template <int D>
@@ -83,7 +83,7 @@ auto likelihood(const OccupancyGrid<D>& grid, const Points<D>& points, const Fla
   std::vector<double> out;
   out.reserve(4 * terms.size());
   for (const auto& t : terms) out.insert(out.end(), {t.end, t.traversed, t.gamma, t.entropy});
-  return owned(std::move(out), {scans.n_scans, 4});
+  return to_numpy(std::move(out), {scans.n_scans, 4});
 }
 
 template <int D>

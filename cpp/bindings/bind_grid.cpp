@@ -30,10 +30,10 @@ nb::ndarray<nb::numpy, double> alpha_beta(const OccupancyGrid<D>& grid, const Ce
       out[2 * k + 1] = from_fixed(c->beta);
     }
   }
-  return owned(std::move(out), {n, 2});
+  return to_numpy(std::move(out), {n, 2});
 }
 
-// visit(cell, counts) for the cells somebody looked at, in the blocks that wanted(block) says
+// Calls visit(cell, counts) for the observed cells of the blocks that pass in_range(block).
 template <int D, class Wanted, class Visit>
 void for_each_observed(const OccupancyGrid<D>& grid, Wanted&& in_range, Visit&& visit) {
   for (const auto& block : grid.blocks()) {
@@ -50,7 +50,7 @@ void for_each_observed(const OccupancyGrid<D>& grid, Visit&& visit) {
   for_each_observed(grid, [](const Cell<D>&) { return true; }, visit);
 }
 
-// The box around the cells somebody looked at.
+// Bounding box of the observed cells.
 template <int D>
 Box<D> box_around(const OccupancyGrid<D>& grid) {
   Cell<D> first = Cell<D>::Constant(std::numeric_limits<int32_t>::max());
@@ -76,16 +76,17 @@ auto box_of(const OccupancyGrid<D>& grid) {
 }
 
 template <int D>
-auto dense(const OccupancyGrid<D>& grid, const Given<D>& first_cell, const Given<D>& shape) {
+auto dense(const OccupancyGrid<D>& grid, const OptionalCell<D>& first_cell,
+           const OptionalCell<D>& shape) {
   if (first_cell.has_value() != shape.has_value())
     throw std::invalid_argument("first_cell, shape: expected both or neither");
   const Box<D> box = shape ? Box<D>(*first_cell, *shape) : box_around(grid);
   std::vector<double> alpha(box.total(), 0.0), beta(box.total(), 0.0);
-  const auto meets = [&](const Cell<D>& block) {
-    return box.meets(BlockLayout<D>::cell_at(block, 0), BlockLayout<D>::kEdge);
+  const auto overlaps = [&](const Cell<D>& block) {
+    return box.overlaps(BlockLayout<D>::cell_at(block, 0), BlockLayout<D>::kEdge);
   };
-  for_each_observed(grid, meets, [&](const Cell<D>& cell, const CellCounts& c) {
-    if (!box.holds(cell)) return;
+  for_each_observed(grid, overlaps, [&](const Cell<D>& cell, const CellCounts& c) {
+    if (!box.contains(cell)) return;
     alpha[box.index(cell)] = from_fixed(c.alpha);
     beta[box.index(cell)] = from_fixed(c.beta);
   });
@@ -126,7 +127,7 @@ void bind(nb::module_& m, const char* name) {
            "first_cell and uint8 over the same box: 1 where alpha + beta are not zero.");
 }
 
-// writes down the cells and lengths of a walk
+// Visitor that records the cells and chord lengths of a traversal.
 template <int D>
 struct Recorder {
   Cell<D> cell = Cell<D>::Zero();
@@ -154,8 +155,8 @@ auto cells_along(const Flat<double>& start, const Flat<double>& end, double reso
   const double last_length = traverse<D>(a, b, recorder);
   recorder.visit(last_length);
   const size_t n = recorder.lengths.size();
-  return std::make_tuple(owned(std::move(recorder.cells), {n, static_cast<size_t>(D)}),
-                         owned(std::move(recorder.lengths), {n}));
+  return std::make_tuple(to_numpy(std::move(recorder.cells), {n, static_cast<size_t>(D)}),
+                         to_numpy(std::move(recorder.lengths), {n}));
 }
 
 auto cells_along_any(const Flat<double>& start, const Flat<double>& end, double resolution) {

@@ -45,7 +45,7 @@ auto gains(const StaticFractionGrid<D>& shares, const Points<D>& points, const F
   std::vector<double> out;
   out.reserve(2 * sums.size());
   for (const auto& s : sums) out.insert(out.end(), {s.log_likelihood_gain, s.beam_count});
-  return owned(std::move(out), {scans.n_scans, 2});
+  return to_numpy(std::move(out), {scans.n_scans, 2});
 }
 
 template <int D>

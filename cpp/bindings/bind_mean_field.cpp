@@ -36,7 +36,7 @@ auto infer_p_static(const SurfelMap<D>& surfel_map, const Flat<float>& log_odds,
     nb::gil_scoped_release released;
     out = MeanField<D>(surfel_map, log_odds.data(), options, threads).infer();
   }
-  return owned(std::move(out), {n});
+  return to_numpy(std::move(out), {n});
 }
 
 template <int D>

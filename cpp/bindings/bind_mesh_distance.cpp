@@ -12,10 +12,10 @@ namespace {
 using FacesOf =
     nb::ndarray<const int32_t, nb::numpy, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 
-constexpr double kFarthest = 1e9;  // metres: nothing overflows
+constexpr double kFarthest = 1e9;  // metres, avoids overflow
 
 bool all_finite(const Places<3>& rows) {
-  double sum = 0.0;  // a product with 0 is 0 or NaN
+  double sum = 0.0;  // 0 * x is NaN unless x is finite
   for (size_t i = 0; i < 3 * rows.shape(0); ++i) sum += 0.0 * rows.data()[i];
   return sum == 0.0;
 }
@@ -46,7 +46,8 @@ auto nearest(const MeshDistance& faces, const Places<3>& points, const Places<3>
     nb::gil_scoped_release released;
     out = faces.nearest(points.data(), origins.data(), n, threads);
   }
-  return std::make_pair(owned(std::move(out.face), {n}), owned(std::move(out.barycentric), {n, 3}));
+  return std::make_pair(to_numpy(std::move(out.face), {n}),
+                        to_numpy(std::move(out.barycentric), {n, 3}));
 }
 
 }  // namespace

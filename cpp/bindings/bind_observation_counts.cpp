@@ -44,10 +44,10 @@ auto dense(const ObservationCounts<D>& counts, const std::array<int64_t, D>& fir
   const Box<D> box(first_cell, shape);
   std::vector<uint16_t> looks(box.total(), 0), clear(box.total(), 0);
   for (const auto& block : counts.blocks()) {
-    if (!box.meets(BlockLayout<D>::cell_at(block->origin, 0), BlockLayout<D>::kEdge)) continue;
+    if (!box.overlaps(BlockLayout<D>::cell_at(block->origin, 0), BlockLayout<D>::kEdge)) continue;
     for (int i = 0; i < BlockLayout<D>::kCells; ++i) {
       const Cell<D> cell = BlockLayout<D>::cell_at(block->origin, i);
-      if (!box.holds(cell)) continue;
+      if (!box.contains(cell)) continue;
       const CellVisits& visits = block->values[static_cast<size_t>(i)];
       looks[box.index(cell)] = visits.observed;
       clear[box.index(cell)] = visits.clear;

@@ -9,91 +9,16 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
+#include "row_slice.hpp"
 #include "stillmap/grid/cell.hpp"
 #include "stillmap/occupancy/change_hmm.hpp"
 #include "stillmap/occupancy/observation.hpp"
 #include "stillmap/occupancy/occupancy_hmm.hpp"
-#include "stillmap/occupancy/surfel.hpp"
 #include "stillmap/occupancy/surfel_map.hpp"
 #include "stillmap/occupancy/two_state_chains.hpp"
 
 namespace stillmap::bindings {
 namespace {
-
-template <int D>
-void add_end_points(SurfelMap<D>& surfel_map, const Points<D>& points, const Flat<bool>& hit,
-                    const Flat<int64_t>& offset, const Poses<D>& poses,
-                    const std::optional<Flat<int64_t>>& time_bin, int threads) {
-  const auto scans = scans_from<D>(points, hit, offset, poses);
-  require(!time_bin || time_bin->shape(0) == scans.n_scans, "look: expected one number per scan");
-  for (size_t t = 0; time_bin && t < scans.n_scans; ++t)
-    require(time_bin->data()[t] >= 0 && time_bin->data()[t] <= kMaxTimeBin, "look: out of range");
-  nb::gil_scoped_release released;
-  surfel_map.add(scans, time_bin ? time_bin->data() : nullptr, threads);
-}
-
-// (E, 2) first and last look
-template <int D>
-auto spans(const SurfelMap<D>& surfel_map) {
-  std::vector<int32_t> out;
-  for (const TimeSpan& span : surfel_map.hit_spans())
-    out.insert(out.end(), {span.first, span.last});
-  const size_t n = surfel_map.hit_spans().size();
-  return owned(std::move(out), {n, 2});
-}
-
-template <int D>
-auto surfels(const SurfelMap<D>& surfel_map, const Points<D>& points, const Flat<bool>& hit,
-             const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
-  const auto scans = scans_from<D>(points, hit, offset, poses);
-  std::vector<int32_t> out(points.shape(0));
-  {
-    nb::gil_scoped_release released;
-    associate_beams<D>(surfel_map, scans, threads, out.data());
-  }
-  const size_t n = out.size();
-  return owned(std::move(out), {n});
-}
-
-// Some of the elements: first, first + every, ..., n of them.
-struct Rows {
-  size_t first = 0, stride = 1, n = 0;
-};
-using Slice = std::array<int64_t, 3>;  // first, last, every
-
-inline Rows rows_from(const std::optional<Slice>& rows, size_t size) {
-  if (!rows) return {0, 1, size};
-  const auto [first, last, stride] = *rows;
-  require(0 <= first && first <= last && last <= static_cast<int64_t>(size) && stride > 0,
-          "rows: expected some of the elements");
-  return {static_cast<size_t>(first), static_cast<size_t>(stride),
-          static_cast<size_t>((last - first + stride - 1) / stride)};
-}
-
-// cells, means and normals (E, D), distances from the plane and beams (E,)
-template <int D>
-auto describe_surfels(const SurfelMap<D>& surfel_map, const std::optional<Slice>& rows) {
-  require(surfel_map.fitted(), "surface: fit it first");
-  const auto [first, stride, n] = rows_from(rows, surfel_map.size());
-  const auto d = static_cast<size_t>(D);
-  std::vector<int64_t> cells(n * d), beams(n);
-  std::vector<double> means(n * d), normals(n * d), centre_to_plane(n), prominence(n);
-  for (size_t i = 0; i < n; ++i) {
-    const auto k = static_cast<int32_t>(first + i * stride);
-    for (int a = 0; a < D; ++a) {
-      const size_t at = i * d + static_cast<size_t>(a);
-      cells[at] = surfel_map.cell(k)[a];
-      means[at] = surfel_map.surfel(k).mean[a] * surfel_map.resolution();
-      normals[at] = surfel_map.surfel(k).normal[a];
-    }
-    beams[i] = surfel_map.beam_count(k);
-    prominence[i] = surfel_map.surfel(k).prominence;
-    centre_to_plane[i] = surfel_map.surfel(k).centre_to_plane * surfel_map.resolution();
-  }
-  return std::make_tuple(owned(std::move(cells), {n, d}), owned(std::move(means), {n, d}),
-                         owned(std::move(normals), {n, d}), owned(std::move(centre_to_plane), {n}),
-                         owned(std::move(prominence), {n}), owned(std::move(beams), {n}));
-}
 
 template <int D>
 void add_observations(OccupancyHmm<D>& hmm, const Points<D>& points, const Flat<bool>& hit,
@@ -123,10 +48,10 @@ auto likelihoods(OccupancyHmm<D>& hmm, const std::optional<Flat<bool>>& among,
     nb::gil_scoped_release released;
     hmm.likelihood(classes, first, stride, n, threads, relative.data(), log_best.data());
   }
-  return std::make_tuple(owned(std::move(relative), {n, C}), owned(std::move(log_best), {n}));
+  return std::make_tuple(to_numpy(std::move(relative), {n, C}), to_numpy(std::move(log_best), {n}));
 }
 
-// Of every element, see the docstring of `changes` below.
+// Columns of `changes`, see its docstring.
 template <int D>
 auto describe_changes(const OccupancyHmm<D>& hmm, const std::optional<Slice>& rows) {
   const ChangeHmm& changes = hmm.change_hmm();
@@ -154,9 +79,9 @@ auto describe_changes(const OccupancyHmm<D>& hmm, const std::optional<Slice>& ro
       }
     }
   }
-  return std::make_tuple(owned(std::move(log_likelihood), {n}), owned(std::move(share), {n}),
-                         owned(std::move(p_last), {n, 2}), owned(std::move(count), {n, 2}),
-                         owned(std::move(change_bins), {n, 2, 2, 2}));
+  return std::make_tuple(to_numpy(std::move(log_likelihood), {n}), to_numpy(std::move(share), {n}),
+                         to_numpy(std::move(p_last), {n, 2}), to_numpy(std::move(count), {n, 2}),
+                         to_numpy(std::move(change_bins), {n, 2, 2, 2}));
 }
 
 template <int D>
@@ -165,7 +90,7 @@ auto log_changing(const OccupancyHmm<D>& hmm, const std::optional<Slice>& rows) 
   const auto [first, stride, n] = rows_from(rows, changes.members());
   std::vector<double> values(n);
   for (size_t i = 0; i < n; ++i) values[i] = changes.log_likelihood(first + i * stride);
-  return owned(std::move(values), {n});
+  return to_numpy(std::move(values), {n});
 }
 
 template <int D>
@@ -182,7 +107,7 @@ auto solid_cells(const OccupancyHmm<D>& hmm) {
   std::vector<int64_t> out;
   for (const Cell<D>& cell : hmm.solid_cells()) out.insert(out.end(), cell.data(), cell.data() + D);
   const size_t n = out.size() / D;
-  return owned(std::move(out), {n, static_cast<size_t>(D)});
+  return to_numpy(std::move(out), {n, static_cast<size_t>(D)});
 }
 
 OccupancyClasses checked_classes(std::vector<double> rho, std::vector<double> tau,
@@ -199,42 +124,15 @@ OccupancyClasses checked_classes(std::vector<double> rho, std::vector<double> ta
 }
 
 template <int D>
-void bind(nb::module_& m, const char* surfel_map, const char* hmm) {
-  using S = SurfelMap<D>;
-  nb::class_<S>(m, surfel_map, "One element of surface per cell in which beams ended.")
-      .def(nb::init<double>(), nb::arg("resolution"))
-      .def_prop_ro("resolution", &S::resolution, "metres")
-      .def_prop_ro("dimension", [](const S&) { return D; })
-      .def_prop_ro("size", &S::size, "number of elements")
-      .def_prop_ro(
-          "scatter", [](const S& s) { return s.noise_std() * s.resolution(); },
-          "metres: standard deviation of end points across surfaces; 0 before `fit`")
-      .def("add_end_points", &add_end_points<D>, nb::arg("points").noconvert(),
-           nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
-           nb::arg("T_map_sensor").noconvert(), nb::arg("look").noconvert() = nb::none(),
-           nb::arg("threads") = 1,
-           "Notes where beams ended, and in which looks (T,) int64 where all calls say so.")
-      .def_prop_ro("spans", &spans<D>, nb::rv_policy::move,
-                   "(E, 2) int32: first and last look at which beams ended in the cell of each "
-                   "element, once it is fitted; (0, 2) where nobody said.")
-      .def("fit", &S::fit, nb::arg("threads") = 1, nb::call_guard<nb::gil_scoped_release>(),
-           "Means, normals and scatter from all end points; none can be added any more.")
-      .def("elements", &describe_surfels<D>, nb::arg("rows") = nb::none(),
-           "cells (E, D) int64, means (E, D) in metres, normals (E, D) (zero: none), distance (E,) "
-           "of the cell's centre from the surface around it in metres (zero: none), prominence "
-           "(E,): its beams against those of the richest cell around, beams (E,). rows (first, "
-           "last, every): of some of the elements.")
-      .def("elements_of", &surfels<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
-           nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
-           nb::arg("threads") = 1, "(M,) int32: the element in which each beam ended, -1: none.");
+void bind(nb::module_& m, const char* name) {
   using W = OccupancyHmm<D>;
-  nb::class_<W>(m, hmm,
+  nb::class_<W>(m, name,
                 "Likelihood of what was seen of each element, per class: occupied for a share rho, "
                 "correlated over tau seconds and over turn radians of the view (inf or none given: "
                 "however it turns).")
       .def(
           "__init__",
-          [](W* self, const S& s, std::vector<double> rho, std::vector<double> tau,
+          [](W* self, const SurfelMap<D>& s, std::vector<double> rho, std::vector<double> tau,
              std::vector<double> turn, double detection, double seconds, double lateral,
              double margin, double reach, double beyond, bool normals, int threads) {
             for (const double x : {seconds, lateral, margin, reach, beyond})
@@ -309,8 +207,8 @@ void bind(nb::module_& m, const char* surfel_map, const char* hmm) {
 }  // namespace
 
 void bind_occupancy_hmm(nb::module_& m) {
-  bind<2>(m, "Surface2D", "Dwell2D");
-  bind<3>(m, "Surface3D", "Dwell3D");
+  bind<2>(m, "Dwell2D");
+  bind<3>(m, "Dwell3D");
 }
 
 }  // namespace stillmap::bindings

@@ -80,7 +80,7 @@ void keep_near(NdtMap<D>& map, const OnePose<D>& T, double radius) {
   map.crop(pose.t, radius);
 }
 
-// Normals (N, D), offsets and variances (N,), and levels (N,), -1 where there is no surface.
+// Normals (N, D), offsets and variances (N,), and validity (N,).
 template <int D>
 auto planes(const NdtMap<D>& map, const Places<D>& places, int level, double least, double flat,
             double wide) {
@@ -101,8 +101,9 @@ auto planes(const NdtMap<D>& map, const Places<D>& places, int level, double lea
       variances[i] = plane.variance;
     }
   }
-  return std::make_tuple(owned(std::move(normals), {n, size_t{D}}), owned(std::move(offsets), {n}),
-                         owned(std::move(variances), {n}), owned(std::move(known), {n}));
+  return std::make_tuple(to_numpy(std::move(normals), {n, size_t{D}}),
+                         to_numpy(std::move(offsets), {n}), to_numpy(std::move(variances), {n}),
+                         to_numpy(std::move(known), {n}));
 }
 
 template <class Matrix>
@@ -111,13 +112,13 @@ auto square_of(const Matrix& A) {
   std::vector<double> out(n * n);
   for (size_t r = 0; r < n; ++r)
     for (size_t c = 0; c < n; ++c) out[r * n + c] = A(static_cast<int>(r), static_cast<int>(c));
-  return owned(std::move(out), {n, n});
+  return to_numpy(std::move(out), {n, n});
 }
 
 template <class Vector>
 auto vector_of(const Vector& v) {
   const auto n = static_cast<size_t>(v.size());
-  return owned(std::vector<double>(v.data(), v.data() + n), {n});
+  return to_numpy(std::vector<double>(v.data(), v.data() + n), {n});
 }
 
 template <int D>
@@ -162,7 +163,7 @@ auto register_to_map(const NdtMap<D>& map, const Points<D>& points, const Flat<f
                          found.model.matched_weight, found.model.total_weight, found.iterations);
 }
 
-// Hessian, gradient, cost and the three weights of the data term at one pose and twist.
+// Hessian, gradient, cost and the three weights of the data term at one state.
 template <int D>
 auto linearise_sweep(const NdtMap<D>& map, const Points<D>& points, const Flat<float>& weights,
                      const Flat<float>& times, const OnePose<D>& T, const Tangents<D>& twist,
@@ -193,7 +194,7 @@ auto carried_points(const Points<D>& points, const Flat<float>& times, const Tan
         out[i * D + d] = static_cast<float>(moved[static_cast<int>(d)]);
     }
   }
-  return owned(std::move(out), {n, size_t{D}});
+  return to_numpy(std::move(out), {n, size_t{D}});
 }
 
 template <int D>
@@ -206,10 +207,10 @@ auto thinned(const Points<D>& points, const Flat<float>& weights, double edge) {
     kept = voxel_downsample<D>(points.data(), w, points.shape(0), edge);
   }
   const size_t n = kept.size();
-  return owned(std::move(kept), {n});
+  return to_numpy(std::move(kept), {n});
 }
 
-// In the plane, scans are registered on the field of a grid.
+// 3D only: in 2D scans are registered against a likelihood field.
 void bind_in_space(nb::module_& m) {
   constexpr int D = 3;
   nb::class_<NdtMap<D>>(m, "SweepMap3D",

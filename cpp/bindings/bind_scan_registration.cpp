@@ -60,27 +60,28 @@ auto register_beams(const OccupancyGrid<D>& grid, const Points<D>& points,
     LikelihoodField<D> field(grid, options.field);
     const SearchWindow window{window_translation, window_rotation, search_range};
     CorrelativeSearch<D> search(grid, beams, prior, window, options);
-    const auto candidates_found =
+    const auto starting_poses =
         given ? std::vector<Candidate<D>>{{*given, 0.0}} : search.best(static_cast<size_t>(starts));
-    for (const auto& start : candidates_found) {
+    for (const auto& start : starting_poses) {
       found.push_back(minimise_levenberg_marquardt<D>(field, beams, prior, start.pose, options));
       if (found.back().cost < best.cost) best = found.back();
     }
     candidates = search.poses_tried();
   }
   constexpr size_t n = Lie<D>::kDof;
-  std::vector<double> rivals;
+  std::vector<double> alternatives;
   for (const auto& other : found) {
     const typename Lie<D>::Tangent apart = other.pose.boxminus(best.pose);
-    rivals.insert(rivals.end(), apart.data(), apart.data() + n);
-    rivals.push_back(other.cost - best.cost);
+    alternatives.insert(alternatives.end(), apart.data(), apart.data() + n);
+    alternatives.push_back(other.cost - best.cost);
   }
   Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof, Eigen::RowMajor> covariance =
       best.information.ldlt().solve(decltype(best.information)::Identity());
   return std::make_tuple(
       matrix_of<D>(best.pose),
-      owned(std::vector<double>(covariance.data(), covariance.data() + n * n), {n, n}), best.cost,
-      best.inliers, best.iterations, candidates, owned(std::move(rivals), {found.size(), n + 1}));
+      to_numpy(std::vector<double>(covariance.data(), covariance.data() + n * n), {n, n}),
+      best.cost, best.inliers, best.iterations, candidates,
+      to_numpy(std::move(alternatives), {found.size(), n + 1}));
 }
 
 template <int D>
@@ -93,8 +94,7 @@ double through(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat
                            checked_pose<D>(T_sensor, "T_sensor").t, margin, occupied);
 }
 
-// The data term alone, as the tests' oracle has it: without the constant ln(floor + 1) of every
-// beam, without the prior.
+// Data term without the constant ln(floor + 1) per beam, as in the reference implementation.
 template <int D>
 QuadraticModel<D> data_term(const OccupancyGrid<D>& grid, WeightedBeams<D> beams,
                             const OnePose<D>& T, const LikelihoodFieldOptions& field_options) {
@@ -117,7 +117,7 @@ auto gradient_at(const OccupancyGrid<D>& grid, const Points<D>& points, const Fl
   const auto q =
       data_term<D>(grid, beams_from<D>(points, weights), T, {sigma, radius, floor, unknown});
   const size_t n = Lie<D>::kDof;
-  return owned(std::vector<double>(q.gradient.data(), q.gradient.data() + n), {n});
+  return to_numpy(std::vector<double>(q.gradient.data(), q.gradient.data() + n), {n});
 }
 
 template <int D>

@@ -27,8 +27,8 @@ auto texels(const Corners& corners, int width, int height) {
     out = rasterise_triangles(corners.data(), n, width, height);
   }
   const size_t k = out.texel.size();
-  return std::make_tuple(owned(std::move(out.texel), {k}), owned(std::move(out.face), {k}),
-                         owned(std::move(out.barycentric), {k, 2}));
+  return std::make_tuple(to_numpy(std::move(out.texel), {k}), to_numpy(std::move(out.face), {k}),
+                         to_numpy(std::move(out.barycentric), {k, 2}));
 }
 
 }  // namespace

@@ -18,7 +18,7 @@ using Faces =
     nb::ndarray<const int32_t, nb::numpy, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 
 bool all_finite(const double* values, size_t n) {
-  double sum = 0.0;  // a product with 0 is 0 or NaN
+  double sum = 0.0;  // 0 * x is NaN unless x is finite
   for (size_t i = 0; i < n; ++i) sum += 0.0 * values[i];
   return sum == 0.0;
 }
@@ -51,7 +51,7 @@ auto blocks(const TsdfVolume& distances) {
   for (const auto& block : distances.blocks())
     for (int d = 0; d < 3; ++d) out.push_back(block->origin[d]);
   const size_t n = out.size() / 3;
-  return owned(std::move(out), {n, 3});
+  return to_numpy(std::move(out), {n, 3});
 }
 
 void remove_blocks(TsdfVolume& distances, const Cells<3>& cells) {
@@ -61,13 +61,13 @@ void remove_blocks(TsdfVolume& distances, const Cells<3>& cells) {
   distances.remove_blocks(gone);
 }
 
-// The voxels of a block within a box, x by x.
+// Calls visit(index in the box, voxel) for the integrated voxels of a block, x fastest.
 template <class Visit>
 void for_each_voxel(const TsdfVolume::Block& block, const Box<3>& box, Visit&& visit) {
   for (int local = 0; local < TsdfVolume::kCells; ++local) {
     const TsdfVoxel& voxel = block.values[static_cast<size_t>(local)];
     const Cell<3> cell = BlockLayout<3>::cell_at(block.origin, local);
-    if (voxel.weight > 0.0f && box.holds(cell)) visit(box.index(cell), voxel);
+    if (voxel.weight > 0.0f && box.contains(cell)) visit(box.index(cell), voxel);
   }
 }
 
@@ -91,7 +91,7 @@ auto dense(const TsdfVolume& distances, const std::array<int64_t, 3>& first_cell
     };
     if (box.total() / static_cast<size_t>(kEdge) > 64 * distances.blocks().size()) {
       for (const auto& block : distances.blocks())
-        if (box.meets(block->origin * kEdge, kEdge)) write(*block);
+        if (box.overlaps(block->origin * kEdge, kEdge)) write(*block);
     } else if (box.total()) {
       Cell<3> at;
       for (at[2] = low[2]; at[2] <= high[2]; ++at[2])

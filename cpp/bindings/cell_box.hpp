@@ -1,4 +1,4 @@
-// Boxes of cells that are laid out as arrays.
+// Boxes of cells as dense arrays.
 #pragma once
 
 #include <array>
@@ -13,11 +13,11 @@
 
 namespace stillmap::bindings {
 
-// what Python says of a box: its first cell; its shape, with the axes in reverse order
+// first_cell or shape of a box as given by Python; the axes of a shape are in reverse order.
 template <int D>
-using Given = std::optional<std::array<int64_t, D>>;
+using OptionalCell = std::optional<std::array<int64_t, D>>;
 
-// A box of cells, to be laid out as [(z,) y, x].
+// Box of cells with the array layout [(z,) y, x].
 template <int D>
 struct Box {
   Cell<D> first = Cell<D>::Zero();
@@ -37,10 +37,10 @@ struct Box {
     }
   }
 
-  bool holds(const Cell<D>& cell) const { return meets(cell, 1); }
+  bool contains(const Cell<D>& cell) const { return overlaps(cell, 1); }
 
-  // whether any of the cells of a cube with this edge lies inside
-  bool meets(const Cell<D>& lowest, int edge) const {
+  // Whether a cube of cells overlaps the box.
+  bool overlaps(const Cell<D>& lowest, int edge) const {
     for (int d = 0; d < D; ++d) {
       const int64_t n = int64_t{lowest[d]} - first[d];
       if (n <= -edge || n >= static_cast<int64_t>(size[static_cast<size_t>(d)])) return false;
@@ -67,12 +67,12 @@ struct Box {
 
   auto first_cell() const {
     std::vector<int64_t> cell(first.data(), first.data() + D);
-    return owned(std::move(cell), {static_cast<size_t>(D)});
+    return to_numpy(std::move(cell), {static_cast<size_t>(D)});
   }
   template <class T>
   auto shaped(std::vector<T>&& values) const {
-    if constexpr (D == 2) return owned(std::move(values), {size[1], size[0]});
-    if constexpr (D == 3) return owned(std::move(values), {size[2], size[1], size[0]});
+    if constexpr (D == 2) return to_numpy(std::move(values), {size[1], size[0]});
+    if constexpr (D == 3) return to_numpy(std::move(values), {size[2], size[1], size[0]});
   }
 };
 

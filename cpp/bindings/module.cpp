@@ -3,7 +3,7 @@
 namespace nb = nanobind;
 
 NB_MODULE(_core, m) {
-  // a grid held by a traceback at exit is no leak that a user could act on
+  // grids held by a traceback at exit would be reported as leaks
   nb::set_leak_warnings(false);
   m.doc() =
       "Kernels on plain arrays. points (M, D) float32 in the sensor frame, hit (M,) bool, offset "
@@ -13,10 +13,12 @@ NB_MODULE(_core, m) {
   stillmap::bindings::bind_grid(m);
   stillmap::bindings::bind_beam_counting(m);
   stillmap::bindings::bind_scan_registration(m);
+  stillmap::bindings::bind_surfel_map(m);
   stillmap::bindings::bind_occupancy_hmm(m);
   stillmap::bindings::bind_tsdf(m);
   stillmap::bindings::bind_mean_field(m);
   stillmap::bindings::bind_cluster_pooling(m);
+  stillmap::bindings::bind_ground_contact(m);
   stillmap::bindings::bind_held_out_likelihood(m);
   stillmap::bindings::bind_observation_counts(m);
   stillmap::bindings::bind_mesh_distance(m);

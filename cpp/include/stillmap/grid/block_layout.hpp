@@ -1,5 +1,5 @@
-// Layout of block-sparse maps: cells come in cubic blocks, of 32 x 32 cells in 2D and 8 x 8 x 8 in
-// 3D.
+// Block layout shared by all block-sparse maps: cubic blocks of 32 x 32 cells in 2D and of 8 x 8 x
+// 8 cells in 3D.
 #pragma once
 
 #include <cstddef>
@@ -15,7 +15,8 @@ struct BlockLayout {
   static constexpr int kShift = D == 2 ? 5 : 3;
   static constexpr int kEdge = 1 << kShift;
   static constexpr int kCells = D == 2 ? kEdge * kEdge : kEdge * kEdge * kEdge;
-  // coordinates beyond are refused; block coordinates fit the 21 bits that a key has for each
+  // Largest cell coordinate that is accepted, so that a block coordinate fits the 21 bits of its
+  // key.
   static constexpr int32_t kMaxCell = D == 2 ? 1 << 24 : 1 << 23;
 
   static Cell<D> block_of(const Cell<D>& cell) {
@@ -24,7 +25,7 @@ struct BlockLayout {
     return block;
   }
 
-  // x runs fastest
+  // Index of a cell within its block, x fastest.
   static int local_of(const Cell<D>& cell) {
     constexpr int mask = kEdge - 1;
     int local = cell[D - 1] & mask;

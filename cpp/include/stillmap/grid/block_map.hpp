@@ -1,4 +1,4 @@
-// Something for each cell, sparsely: values in blocks of cells as Grid has them.
+// Block-sparse map from cells to values of any type.
 #pragma once
 
 #include <array>
@@ -12,15 +12,15 @@
 
 namespace stillmap {
 
-// A grid to walk through as Grid is, with values of another kind instead of counts.
+// Has the block layout of OccupancyGrid, so BlockCursor and RayWalker work on both.
 template <int D, class Value>
 class BlockMap : public BlockLayout<D> {
  public:
   using BlockLayout<D>::kCells;
 
   struct Block {
-    Cell<D> origin;                    // block coordinates
-    std::array<Value, kCells> values;  // of each cell
+    Cell<D> origin;                    // in blocks
+    std::array<Value, kCells> values;  // one per cell
   };
 
   const Block* find(const Cell<D>& block) const {
@@ -28,7 +28,7 @@ class BlockMap : public BlockLayout<D> {
     return it == index_.end() ? nullptr : blocks_[it->second].get();
   }
 
-  // in the order in which they were added
+  // In order of insertion.
   const std::vector<std::unique_ptr<Block>>& blocks() const { return blocks_; }
 
  protected:
@@ -44,22 +44,22 @@ class BlockMap : public BlockLayout<D> {
     return last_;
   }
 
-  // Keeps the blocks that keep(block coordinates) says, in their order.
+  // Removes the blocks for which keep(block coordinates) is false; the others keep their order.
   template <class Keep>
   void keep_if(Keep&& keep) {
     last_ = nullptr;
-    size_t kept = 0;
+    size_t n_kept = 0;
     for (size_t k = 0; k < blocks_.size(); ++k) {
       const uint64_t key = BlockLayout<D>::key(blocks_[k]->origin);
       if (!keep(blocks_[k]->origin)) {
         index_.erase(key);
         continue;
       }
-      index_[key] = kept;
-      if (kept != k) blocks_[kept] = std::move(blocks_[k]);
-      ++kept;
+      index_[key] = n_kept;
+      if (n_kept != k) blocks_[n_kept] = std::move(blocks_[k]);
+      ++n_kept;
     }
-    blocks_.resize(kept);
+    blocks_.resize(n_kept);
   }
 
  private:

@@ -11,7 +11,7 @@ using Vec = Eigen::Matrix<double, D, 1>;
 template <int D>
 using Cell = Eigen::Matrix<int32_t, D, 1>;
 
-// NaN compares false, so it is refused like a coordinate that is too far away
+// False for NaN as well, since comparisons with NaN are false.
 template <int D>
 inline bool all_below(const Vec<D>& x, double limit) {
   return (x.array().abs() < limit).all();
@@ -22,7 +22,7 @@ inline Cell<D> cell_of(const Vec<D>& point_in_cells) {
   return point_in_cells.array().floor().template cast<int32_t>();
 }
 
-// Calls visit(cell) for the cells of the cube of that radius around a cell.
+// Calls visit(cell) for all cells of the cube of edge 2 radius + 1 around a cell, x fastest.
 template <int D, class Visit>
 inline void for_each_in_cube(const Cell<D>& centre, int radius, Visit&& visit) {
   Cell<D> cell = centre.array() - radius;
@@ -41,13 +41,13 @@ inline void for_each_in_cube(const Cell<D>& centre, int radius, Visit&& visit) {
 template <int D, class Visit>
 inline void for_each_in_box(const Cell<D>& low, const Cell<D>& high, Visit&& visit) {
   if ((low.array() > high.array()).any()) return;
-  Cell<D> at = low;
+  Cell<D> cell = low;
   while (true) {
-    visit(at);
+    visit(cell);
     int d = 0;
     for (; d < D; ++d) {
-      if (++at[d] <= high[d]) break;
-      at[d] = low[d];
+      if (++cell[d] <= high[d]) break;
+      cell[d] = low[d];
     }
     if (d == D) return;
   }

@@ -1,4 +1,4 @@
-// Numbers the cells of which something is known, sparsely: int32 places in blocks of cells.
+// Block-sparse map from cells to int32 indices.
 #pragma once
 
 #include "stillmap/grid/block_layout.hpp"
@@ -7,14 +7,14 @@
 
 namespace stillmap {
 
-// A grid to walk through as Grid is, with the place of each cell, or kNone, instead of counts.
+// Cells without an entry have the index kNone. RayWalker can traverse it like an OccupancyGrid.
 template <int D>
 class CellIndex : public BlockMap<D, int32_t> {
  public:
   static constexpr int32_t kNone = -1;
 
  protected:
-  // kNone at first
+  // Index of a cell, kNone after insertion.
   int32_t& index_of(const Cell<D>& cell) {
     auto* block = this->find_or_add(BlockLayout<D>::block_of(cell), kNone);
     return block->values[static_cast<size_t>(BlockLayout<D>::local_of(cell))];

@@ -1,6 +1,6 @@
-// Block-sparse counts alpha, beta of (10), and what registration wants to know besides: the first
-// moments of the end points, and what beams crossed just before they ended.
-// Sums are integers (fixed point), so they do not depend on the order of the terms: scans, chunks,
+// Block-sparse counts alpha, beta of (10). For registration it also keeps the first moments of the
+// end points and the length that beams travelled just before their end points.
+// Sums are fixed-point integers and so do not depend on the order of the terms: scans, chunks,
 // threads and whole grids merge to the same bits.
 #pragma once
 
@@ -20,7 +20,7 @@
 namespace stillmap {
 
 using Fixed = int64_t;
-constexpr double kFixedOne = 16777216.0;  // 2^24: a float32 in [0, 1] keeps all of its bits
+constexpr double kFixedOne = 16777216.0;  // 2^24: exact for any float32 in [0, 1]
 
 inline Fixed to_fixed(double value) { return std::llrint(value * kFixedOne); }
 inline double from_fixed(Fixed value) { return static_cast<double>(value) / kFixedOne; }
@@ -30,7 +30,7 @@ struct CellCounts {
   Fixed beta = 0;   // expected number of dynamic hits + traversed length in cells
 };
 
-// m_j of (15); the caller excludes cells nobody looked at.
+// Occupancy m_j of (15); undefined for unobserved cells, which the caller excludes.
 inline double occupancy(const CellCounts& c) {
   return static_cast<double>(c.alpha) / static_cast<double>(c.alpha + c.beta);
 }
@@ -40,18 +40,19 @@ class OccupancyGrid : public BlockLayout<D> {
  public:
   using BlockLayout<D>::kCells;
 
-  // sum of e * (end point - cell corner), in cells; last, the length by which beams covered the
-  // cell on the approach to their end points
+  // Sum of e (end point - cell corner) in cells. The last entry is the length in cells that beams
+  // travelled through the cell on the approach to their end points.
   using Moment = std::array<Fixed, D + 1>;
 
   struct Block {
-    Cell<D> origin;  // block coordinates
+    Cell<D> origin;  // in blocks
     std::array<CellCounts, kCells> values{};
-    std::unique_ptr<std::array<Moment, kCells>> moments;  // only where something was hit, or nearly
+    // Allocated by the first end point or approach.
+    std::unique_ptr<std::array<Moment, kCells>> moments;
   };
 
-  // approach: metres before an end point in which a beam says nothing against what it crosses
-  // when scans are registered; (10) counts them all the same
+  // approach: length in metres before an end point whose traversal registration ignores; the counts
+  // of (10) include it.
   explicit OccupancyGrid(double resolution, double approach = 0.0)
       : resolution_(resolution), approach_(approach) {
     if (!(resolution > 0.0) || !std::isfinite(resolution))
@@ -62,7 +63,7 @@ class OccupancyGrid : public BlockLayout<D> {
 
   OccupancyGrid(OccupancyGrid&&) noexcept = default;
   OccupancyGrid& operator=(OccupancyGrid&&) noexcept = default;
-  OccupancyGrid(const OccupancyGrid&) = delete;  // grids are large: copies would be accidents
+  OccupancyGrid(const OccupancyGrid&) = delete;  // copies of large grids would be accidental
   OccupancyGrid& operator=(const OccupancyGrid&) = delete;
 
   double resolution() const { return resolution_; }
@@ -99,11 +100,12 @@ class OccupancyGrid : public BlockLayout<D> {
     }
   }
 
-  // m_j of (15) without the lengths on the approach: beams that graze a wall cross its cells before
-  // they end on it, and that says nothing against the wall. The block must have moments.
+  // Occupancy (15) without the traversals on the approach to an end point: beams at grazing
+  // incidence cross the cells of a wall before they end on it, which is no evidence against the
+  // wall. Requires moments in the block.
   static double occupancy_ignoring_approach(const Block& block, size_t local) {
     const CellCounts& c = block.values[local];
-    // the walk along the approach may differ from the whole walk by a rounding
+    // the two traversals may differ by rounding
     const Fixed passed = std::max<Fixed>(c.beta - (*block.moments)[local][D], 0);
     return static_cast<double>(c.alpha) / static_cast<double>(c.alpha + passed);
   }

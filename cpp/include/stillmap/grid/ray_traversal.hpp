@@ -1,4 +1,4 @@
-// Cells and chord lengths along a segment: the l_j of the paper's last paragraph of Sect. 3.
+// Grid traversal (Amanatides and Woo 1987) with the chord length in each cell: l_j of Sect. 3.
 #pragma once
 
 #include <cmath>
@@ -10,11 +10,11 @@
 
 namespace stillmap {
 
-// Walks the cells of a segment in order. Points are given in units of cells, and so are the
-// lengths. The walker hears start(first cell), then for every border visit(length in the cell it
-// leaves) and step<axis>(+1 or -1); it ends in the end cell, whose chord is returned. Crossing a
-// corner passes through a cell of length zero, so that exactly sum |end - start| borders are
-// crossed and the walk always ends.
+// Visits the cells of a segment in order. Points and lengths are in units of cells. Calls
+// visitor.start(first cell), then at every cell border visitor.visit(chord length in the cell it
+// leaves) and visitor.step<axis>(+1 or -1); returns the chord length in the end cell. At a corner
+// it passes through a cell with chord length zero, so exactly sum |end cell - start cell| borders
+// are crossed.
 template <int D, class Visitor>
 inline double traverse(const Vec<D>& start, const Vec<D>& end, Visitor& visitor) {
   constexpr double inf = std::numeric_limits<double>::infinity();
@@ -23,9 +23,9 @@ inline double traverse(const Vec<D>& start, const Vec<D>& end, Visitor& visitor)
   const double length = direction.norm();
 
   struct Axis {
-    double next;   // arc length at its next border
-    double delta;  // and between its borders
-    int32_t left;  // borders still to cross
+    double next;   // arc length at the next border
+    double delta;  // arc length between two borders
+    int32_t left;  // borders left to cross
     int32_t step;
   };
   Axis axes[D];

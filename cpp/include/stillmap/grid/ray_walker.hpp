@@ -1,4 +1,4 @@
-// Access to the cells of a block-sparse map: one after the other, or along a beam.
+// Access to the cells of a block-sparse map, cell by cell or along a beam.
 #pragma once
 
 #include <cstdint>
@@ -10,7 +10,7 @@
 
 namespace stillmap {
 
-// Finds cells quickly when neighbours are asked for in a row: remembers the last block.
+// Looks cells up and remembers the last block, which makes access to nearby cells fast.
 template <class GridType>
 class BlockCursor {
  public:
@@ -20,7 +20,7 @@ class BlockCursor {
 
   explicit BlockCursor(GridType& grid) : grid_(grid) {}
 
-  // A const grid yields nullptr where it has no block; others get the block they need.
+  // Block of a cell. nullptr if a const grid has none; a non-const grid adds it.
   Block* block(const Cell<D>& cell) {
     const Cell<D> index = GridType::block_of(cell);
     if (!valid_ || index != block_index_) {
@@ -35,7 +35,7 @@ class BlockCursor {
     return block_;
   }
 
-  // nullptr where nobody looked
+  // Counts of a cell; nullptr if it is unobserved.
   const CellCounts* find_observed(const Cell<D>& cell) {
     const auto* found = block(cell);
     if (!found) return nullptr;
@@ -50,9 +50,9 @@ class BlockCursor {
   bool valid_ = false;
 };
 
-// Follows a beam through a grid: `visit` gets the counts of each cell (nullptr where a const grid
-// has no block) and the length in it, or which cell it is. Only a step out of a block looks
-// anything up.
+// Visitor for `traverse` that calls visit(value pointer, chord length) or visit(value pointer,
+// cell) for each cell; the pointer is nullptr where a const grid has no block. It looks blocks up
+// only when the ray leaves one.
 template <class GridType, class Visit>
 class RayWalker {
  public:
@@ -88,7 +88,7 @@ class RayWalker {
     }
   }
 
-  // the cell it has reached
+  // Cell, block and value at the current position.
   const Cell<D>& cell() const { return cell_; }
   Block* block() const { return block_; }
   ValuePointer value() const { return value_; }
@@ -103,7 +103,7 @@ class RayWalker {
   BlockCursor<GridType>& cursor_;
   Visit visit_;
   Cell<D> cell_ = Cell<D>::Zero();
-  Cell<D> local_ = Cell<D>::Zero();  // within the block
+  Cell<D> local_ = Cell<D>::Zero();  // coordinates within the block
   Block* block_ = nullptr;
   ValuePointer value_ = nullptr;
 };

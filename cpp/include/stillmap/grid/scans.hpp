@@ -1,4 +1,4 @@
-// Scans of beams as arrays, and their beams in units of cells.
+// Scans as flat arrays, and single beams in units of cells.
 #pragma once
 
 #include <cmath>
@@ -12,13 +12,13 @@
 
 namespace stillmap {
 
-// T scans of beams as flat arrays; nothing is owned.
+// View of T scans with M beams in total.
 template <int D>
 struct Scans {
-  const float* points;    // (M, D), sensor frame; NaN: unusable
-  const bool* hit;        // (M,), false: maximum range (zeta = 1) or unusable
-  const int64_t* offset;  // (T + 1,), relative to points
-  const double* poses;    // (T, D + 1, D + 1), T_map_sensor
+  const float* points;    // (M, D) metres, sensor frame; NaN: unusable
+  const bool* hit;        // (M,); false: maximum range (zeta = 1) or unusable
+  const int64_t* offset;  // (T + 1,) first beam of each scan
+  const double* poses;    // (T, D + 1, D + 1) T_map_sensor, row-major
   size_t n_scans;
 };
 
@@ -34,7 +34,7 @@ inline Vec<D> point_at(const float* p) {
   return Eigen::Map<const Eigen::Matrix<float, D, 1>>(p).template cast<double>();
 }
 
-// One beam in units of cells; refuses coordinates whose cells cannot be counted.
+// One beam in units of cells; throws where its coordinates exceed kMaxCell.
 template <int D>
 struct BeamSegment {
   Vec<D> start, end;

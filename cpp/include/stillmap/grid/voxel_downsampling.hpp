@@ -1,4 +1,4 @@
-// Points that stand for all: the first one in each cell.
+// Voxel downsampling: keeps the first point of each voxel.
 #pragma once
 
 #include <vector>
@@ -9,8 +9,8 @@
 
 namespace stillmap {
 
-// Indices, rising, of the first usable points (N, D) with a positive weight in cells of an edge
-// of that many metres.
+// Ascending indices of the first usable point (N, D) with a positive weight (N,) in each voxel;
+// edge in metres.
 template <int D>
 inline std::vector<int64_t> voxel_downsample(const float* points, const float* weights, size_t n,
                                              double edge) {
@@ -22,9 +22,9 @@ inline std::vector<int64_t> voxel_downsample(const float* points, const float* w
     const Vec<D> x = point_at<D>(p) / edge;
     if (!all_below<D>(x, (VoxelHashMap<D, char>::kMaxCell)))
       throw std::invalid_argument("points: too far away to be counted in cells");
-    const size_t before = occupied.size();
+    const size_t n_before = occupied.size();
     occupied.find_or_add(cell_of<D>(x));
-    if (occupied.size() > before) indices.push_back(static_cast<int64_t>(i));
+    if (occupied.size() > n_before) indices.push_back(static_cast<int64_t>(i));
   }
   return indices;
 }

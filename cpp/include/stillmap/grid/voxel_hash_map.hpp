@@ -1,4 +1,4 @@
-// Something for each cell that was ever asked for, in one table that can shed cells again.
+// Hash map from voxels to values whose memory can be reclaimed.
 #pragma once
 
 #include <cstdint>
@@ -11,12 +11,12 @@
 
 namespace stillmap {
 
-// Open addressing with linear probing. Nothing is taken out singly: what is to go goes with a new
-// table, so that probing needs no tombstones and values keep the order in which they came.
+// Open addressing with linear probing. Entries are never erased one by one: keep_if rebuilds the
+// table, so probing needs no tombstones and values keep their order of insertion.
 template <int D, class Value>
 class VoxelHashMap {
  public:
-  // coordinates beyond would share keys
+  // Cells beyond would share keys.
   static constexpr int32_t kMaxCell = 1 << 20;
 
   size_t size() const { return values_.size(); }
@@ -33,7 +33,7 @@ class VoxelHashMap {
     }
   }
 
-  // a new value is Value{}
+  // Inserts Value{} if the voxel is new.
   Value& find_or_add(const Cell<D>& cell) {
     for (int d = 0; d < D; ++d)
       if (cell[d] <= -kMaxCell || cell[d] >= kMaxCell)
@@ -49,19 +49,19 @@ class VoxelHashMap {
     return values_[static_cast<size_t>(s.index)];
   }
 
-  // Keeps the cells that keep(cell) says.
+  // Removes the voxels for which keep(cell) is false.
   template <class Keep>
   void keep_if(Keep&& keep) {
-    size_t kept = 0;
+    size_t n_kept = 0;
     for (size_t k = 0; k < values_.size(); ++k) {
       if (!keep(cells_[k])) continue;
-      cells_[kept] = cells_[k];
-      values_[kept++] = std::move(values_[k]);
+      cells_[n_kept] = cells_[k];
+      values_[n_kept++] = std::move(values_[k]);
     }
-    cells_.resize(kept);
-    values_.resize(kept);
+    cells_.resize(n_kept);
+    values_.resize(n_kept);
     size_t slots = kMinSlots;
-    while (slots < 4 * kept) slots *= 2;
+    while (slots < 4 * n_kept) slots *= 2;
     rehash(slots);
   }
 
@@ -75,7 +75,7 @@ class VoxelHashMap {
 
   struct Slot {
     uint64_t key = 0;
-    int32_t index = -1;  // in values_; -1: free
+    int32_t index = -1;  // into values_; -1: free
   };
 
   size_t mask() const { return slots_.size() - 1; }

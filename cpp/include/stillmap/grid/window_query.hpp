@@ -1,5 +1,5 @@
-// The cells around one, by the blocks around its block: cells asked for one after the other share
-// most of these, so blocks are seldom looked for.
+// Queries of all indexed cells in a window around a cell. Caches the 3^D blocks around the block of
+// the window's centre, since successive queries are usually close together.
 #pragma once
 
 #include <algorithm>
@@ -12,26 +12,27 @@
 
 namespace stillmap {
 
-// Cells in a row along x, as seen from some cell.
+// Row of cells along x, relative to the window's centre.
 template <int D>
 struct CellRow {
   Cell<D> offset;
-  int32_t half_width;  // so many cells to either side of it
+  int32_t half_width;  // cells to either side of the row's middle
 };
 template <int D>
 using CellRows = std::vector<CellRow<D>>;
 
-// The rows, later axes last, of the cells whose centres lie within a radius of one; each a ball's
-// width, or all as wide as its cube.
+// Rows of a window, in order of the later axes: the ball of cells whose centres lie within a radius
+// (cells), or the cube around it.
 template <int D>
 inline CellRows<D> window_rows(double radius, bool cube) {
   const auto cells = static_cast<int>(std::floor(radius));
   CellRows<D> rows;
   for_each_in_cube<D>(Cell<D>::Zero(), cells, [&](const Cell<D>& off) {
     if (off[0] != 0) return;
-    const double left = radius * radius - off.template cast<double>().squaredNorm();
+    const double squared_rest = radius * radius - off.template cast<double>().squaredNorm();
     if (cube) rows.push_back({off, cells});
-    if (!cube && left >= 0.0) rows.push_back({off, static_cast<int32_t>(std::sqrt(left))});
+    if (!cube && squared_rest >= 0.0)
+      rows.push_back({off, static_cast<int32_t>(std::sqrt(squared_rest))});
   });
   return rows;
 }
@@ -41,8 +42,7 @@ class WindowQuery {
  public:
   explicit WindowQuery(const CellIndex<D>& index) : index_(index) {}
 
-  // Calls visit(place) for the cells of which something is known in rows around one, in their
-  // order.
+  // Calls visit(index) for the indexed cells of a window around a cell, row by row.
   template <class Visit>
   void for_each(const Cell<D>& centre, const CellRows<D>& rows, Visit&& visit) {
     cache_blocks(CellIndex<D>::block_of(centre));
@@ -71,7 +71,8 @@ class WindowQuery {
     centre_block_ = block;
     valid_ = true;
     size_t i = 0;
-    for_each_in_cube<D>(block, 1, [&](const Cell<D>& near) { blocks_[i++] = index_.find(near); });
+    for_each_in_cube<D>(block, 1,
+                        [&](const Cell<D>& neighbour) { blocks_[i++] = index_.find(neighbour); });
   }
 
   const Block* cached_block(const Cell<D>& block) const {

@@ -1,10 +1,9 @@
-// The places of a mesh that are nearest to points, on faces that are turned towards where these
-// were seen from.
+// Closest points on a mesh, among faces that are turned towards the viewpoint of each query.
 //
-// Faces lie in cells of several sizes, each in those a few of which span it: the larger a face, the
-// larger its cells. So the memory is bounded by the number of faces, whatever their sizes. A point
-// asks the cells of each size that are no farther off than the nearest place that it knows of.
-// Places on triangles: Ericson, Real-Time Collision Detection, 2005, Sect. 5.1.5.
+// Faces are sorted by size into levels of cells, each with cells of about the size of its faces, so
+// memory is proportional to the number of faces. A query searches the cells of each level that are
+// closer than the best result so far. Closest points on triangles: Ericson, Real-Time Collision
+// Detection, 2005, Sect. 5.1.5.
 #pragma once
 
 #include <algorithm>
@@ -22,23 +21,23 @@
 namespace stillmap {
 
 struct NearestPoints {
-  std::vector<int32_t> face;        // -1: none is near
+  std::vector<int32_t> face;        // -1: none within the distance
   std::vector<double> barycentric;  // of its three corners
 };
 
 namespace mesh_distance {
 
-constexpr double kSliver = 1e-12;  // squared sine of the angle of a triangle without area
+constexpr double kSliver = 1e-12;  // squared sine of the angle of a degenerate triangle
 constexpr double kMinSquaredLength = 1e-300;
 
 using Triangle = std::array<Vec<3>, 3>;
 
 struct ClosestPoint {
   std::array<double, 3> barycentric;
-  double squared_distance;  // of the distance to there
+  double squared_distance;  // to the query point
 };
 
-// in the order of the twin, so that both break ties alike
+// In the order of the reference implementation, so that both break ties alike.
 inline double dot(const Vec<3>& a, const Vec<3>& b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
@@ -59,7 +58,7 @@ inline ClosestPoint point_at(const Vec<3>& p, const Triangle& t, const std::arra
 
 inline std::array<double, 3> closest_on_edges(const Vec<3>& p, const Triangle& t) {
   std::array<double, 3> barycentric{};
-  double least = std::numeric_limits<double>::infinity();
+  double smallest = std::numeric_limits<double>::infinity();
   for (size_t first = 0; first < 3; ++first) {
     const size_t second = (first + 1) % 3;
     const Vec<3> along = t[second] - t[first], from_first = p - t[first];
@@ -67,28 +66,27 @@ inline std::array<double, 3> closest_on_edges(const Vec<3>& p, const Triangle& t
         dot(from_first, along) / std::max(dot(along, along), kMinSquaredLength), 0.0, 1.0);
     const Vec<3> rest = from_first - fraction * along;
     const double squared = dot(rest, rest);
-    if (!(squared < least)) continue;
-    least = squared;
+    if (!(squared < smallest)) continue;
+    smallest = squared;
     barycentric = {};
     barycentric[first] = 1.0 - fraction, barycentric[second] = fraction;
   }
   return barycentric;
 }
 
-// The place of a triangle that is nearest to a point.
+// Closest point on a triangle.
 inline ClosestPoint closest_point(const Vec<3>& p, const Triangle& t) {
   const Vec<3> u = t[1] - t[0], v = t[2] - t[0], w = p - t[0];
   const double uu = dot(u, u), uv = dot(u, v), vv = dot(v, v), wu = dot(w, u), wv = dot(w, v);
-  const double squared_distance = uu * vv - uv * uv;
-  if (squared_distance > kSliver * uu * vv) {
-    const double j = (vv * wu - uv * wv) / squared_distance,
-                 k = (uu * wv - uv * wu) / squared_distance;
+  const double determinant = uu * vv - uv * uv;
+  if (determinant > kSliver * uu * vv) {
+    const double j = (vv * wu - uv * wv) / determinant, k = (uu * wv - uv * wu) / determinant;
     if (j >= 0.0 && k >= 0.0 && j + k <= 1.0) return point_at(p, t, {1.0 - j - k, j, k});
   }
   return point_at(p, t, closest_on_edges(p, t));
 }
 
-// Of the distance from a point to a box.
+// From a point to a box.
 inline double squared_distance_to_box(const Vec<3>& p, const Vec<3>& low, const Vec<3>& high) {
   double squared_distance = 0.0;
   for (int d = 0; d < 3; ++d) {
@@ -113,13 +111,14 @@ inline std::pair<Vec<3>, Vec<3>> bounding_box(const Triangle& t) {
 
 class MeshDistance {
  public:
-  // vertices (V, 3), faces (F, 3); reach: metres that a place may be away at most
+  // vertices (V, 3) metres, faces (F, 3); max_distance in metres.
   MeshDistance(const double* vertices, size_t V, const int32_t* faces, size_t F,
                double max_distance)
       : max_distance_(max_distance), faces_(faces, faces + 3 * F) {
     for (size_t i = 0; i < V; ++i)
       vertices_.emplace_back(vertices[3 * i], vertices[3 * i + 1], vertices[3 * i + 2]);
-    for (const auto& at : vertices_) low_ = low_.cwiseMin(at), high_ = high_.cwiseMax(at);
+    for (const auto& vertex : vertices_)
+      low_ = low_.cwiseMin(vertex), high_ = high_.cwiseMax(vertex);
     edge_ = max_distance;
     if (V) edge_ = std::max(edge_, (high_ - low_).maxCoeff() / kMaxCells);
     inverse_edge_ = 1.0 / edge_;
@@ -137,8 +136,8 @@ class MeshDistance {
     return bytes;
   }
 
-  // points, origins (n, 3): where points are, and where each was seen from. Faces that have their
-  // back to there, or no area, do not count; of several at one distance the lowest number does.
+  // Closest faces to points (n, 3) that were seen from origins (n, 3). Back faces and faces without
+  // area are excluded; the lowest number wins ties.
   NearestPoints nearest(const double* points, const double* origins, size_t n, int threads) const {
     NearestPoints out{std::vector<int32_t>(n, -1), std::vector<double>(3 * n, 0.0)};
     parallel_for_ranges(split_evenly(n, threads), [&](size_t, size_t first, size_t last) {
@@ -156,18 +155,18 @@ class MeshDistance {
 
  private:
   static constexpr double kMaxCells = 1 << 19;     // along an axis
-  static constexpr double kMaxCellsPerFace = 4.0;  // cells that a face is as long as, at most
-  static constexpr double kRoundingMargin = 1e-3;  // of a cell: more than is lost by rounding
+  static constexpr double kMaxCellsPerFace = 4.0;  // along an axis
+  static constexpr double kRoundingMargin = 1e-3;  // of a cell, more than rounding errors
 
   struct FaceRange {
-    size_t first = 0, size = 0;  // among those of the level
+    size_t first = 0, size = 0;  // in Level::faces
   };
 
   struct Level {
-    int number;  // its cells are 2^number of the smallest ones long
+    int number;  // cells are 2^number times those of level 0
     double edge;
     VoxelHashMap<3, FaceRange> cells;
-    std::vector<int32_t> faces;  // cell by cell, rising
+    std::vector<int32_t> faces;  // by cell, ascending
 
     Cell<3> coarse_cell(const Cell<3>& smallest) const {
       return {smallest[0] >> number, smallest[1] >> number, smallest[2] >> number};
@@ -175,27 +174,27 @@ class MeshDistance {
   };
 
   struct Best {
-    Vec<3> point, to_origin;  // where it was seen from, from there
+    Vec<3> point, to_origin;  // query, and direction to its viewpoint
     int32_t face;
     mesh_distance::ClosestPoint closest;
-    double squared_radius;  // square of the distance beyond which nothing is nearer
+    double squared_radius;  // search radius
   };
 
   mesh_distance::Triangle corners(int32_t face) const {
-    const int32_t* at = &faces_[3 * static_cast<size_t>(face)];
-    const auto vertex = [&](int i) { return vertices_[static_cast<size_t>(at[i])]; };
+    const int32_t* indices = &faces_[3 * static_cast<size_t>(face)];
+    const auto vertex = [&](int i) { return vertices_[static_cast<size_t>(indices[i])]; };
     return {vertex(0), vertex(1), vertex(2)};
   }
 
-  // the smallest one there
-  Cell<3> cell_at(const Vec<3>& place) const { return cell_of<3>((place - low_) * inverse_edge_); }
+  // Cell of level 0.
+  Cell<3> cell_at(const Vec<3>& point) const { return cell_of<3>((point - low_) * inverse_edge_); }
 
   template <class Visit>
   static void for_each_cell(const Cell<3>& low, const Cell<3>& high, Visit&& visit) {
-    Cell<3> at;
-    for (at[2] = low[2]; at[2] <= high[2]; ++at[2])
-      for (at[1] = low[1]; at[1] <= high[1]; ++at[1])
-        for (at[0] = low[0]; at[0] <= high[0]; ++at[0]) visit(at);
+    Cell<3> cell;
+    for (cell[2] = low[2]; cell[2] <= high[2]; ++cell[2])
+      for (cell[1] = low[1]; cell[1] <= high[1]; ++cell[1])
+        for (cell[0] = low[0]; cell[0] <= high[0]; ++cell[0]) visit(cell);
   }
 
   void build_levels() {
@@ -215,12 +214,12 @@ class MeshDistance {
         levels_.push_back(build_level(static_cast<int>(k), faces_of_level[k]));
   }
 
-  // A face lies in the cells with a ball about them that reaches it.
+  // Inserts each face into the cells whose bounding sphere it touches.
   Level build_level(int number, const std::vector<int32_t>& faces) const {
     const double edge = std::ldexp(edge_, number);
     Level level{number, edge, {}, {}};
     const double radius = 0.5 * std::sqrt(3.0) * edge + margin_;
-    std::vector<std::pair<size_t, int32_t>> members;  // place of a cell, face
+    std::vector<std::pair<size_t, int32_t>> members;  // index of a cell, face
     for (const int32_t f : faces) {
       const mesh_distance::Triangle t = corners(f);
       const auto [low, high] = mesh_distance::bounding_box(t);
@@ -240,7 +239,7 @@ class MeshDistance {
     for (size_t k = 0; k < level.cells.size(); ++k)
       level.cells.find_or_add(level.cells.cell(k)).first = next[k];
     level.faces.resize(members.size());
-    for (const auto& [place, f] : members) level.faces[next[place]++] = f;
+    for (const auto& [index, f] : members) level.faces[next[index]++] = f;
     return level;
   }
 
@@ -257,7 +256,7 @@ class MeshDistance {
                     level.coarse_cell(last), best);
   }
 
-  // Into the cells about its own.
+  // Searches the cells around the query's own.
   void search_around(const Level& level, const Cell<3>& centre, const Cell<3>& first,
                      const Cell<3>& last, Best& best) const {
     if (first == last) return;
@@ -295,7 +294,7 @@ class MeshDistance {
   std::vector<int32_t> faces_;
   Vec<3> low_ = Vec<3>::Constant(std::numeric_limits<double>::infinity());
   Vec<3> high_ = -low_;
-  std::vector<Level> levels_;  // by rising edge
+  std::vector<Level> levels_;  // by ascending edge
 };
 
 }  // namespace stillmap

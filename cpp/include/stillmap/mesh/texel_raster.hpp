@@ -1,4 +1,4 @@
-// Which texels of a page each triangle covers, and where on the triangle they lie.
+// Rasterisation of triangles into the texels of an atlas page.
 #pragma once
 
 #include <algorithm>
@@ -23,7 +23,7 @@ struct Triangle {
   double doubled_area() const { return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax); }
 };
 
-// The columns or rows whose centres lie between two places: first and last, of so many.
+// Range [first, last] of the texel centres between two coordinates.
 inline std::array<int32_t, 2> covered_range(double low, double high, int32_t size) {
   const double first = std::ceil(low - 0.5), last = std::floor(high - 0.5);
   return {static_cast<int32_t>(std::clamp(first, 0.0, static_cast<double>(size))),
@@ -40,7 +40,7 @@ inline void append(TexelCoverage& out, int32_t texel, int32_t face, double j, do
 inline void rasterise(const Triangle& t, int32_t number, int32_t width, int32_t height,
                       TexelCoverage& out) {
   const double area = t.doubled_area();
-  const size_t before = out.texel.size();
+  const size_t n_before = out.texel.size();
   const auto [left, right] =
       covered_range(std::min({t.ax, t.bx, t.cx}), std::max({t.ax, t.bx, t.cx}), width);
   const auto [top, bottom] =
@@ -53,10 +53,11 @@ inline void rasterise(const Triangle& t, int32_t number, int32_t width, int32_t 
         const double k = ((t.bx - t.ax) * y - (t.by - t.ay) * x) / area;
         if (j >= 0.0 && k >= 0.0 && j + k <= 1.0) append(out, row * width + column, number, j, k);
       }
-  if (out.texel.size() > before) return;
-  // between the centres of texels: the one that holds its middle
-  const auto within = [](double at, int32_t size) {
-    return static_cast<int32_t>(std::clamp(std::floor(at), 0.0, static_cast<double>(size - 1)));
+  if (out.texel.size() > n_before) return;
+  // smaller than a texel: the texel that contains its centroid
+  const auto within = [](double coordinate, int32_t size) {
+    return static_cast<int32_t>(
+        std::clamp(std::floor(coordinate), 0.0, static_cast<double>(size - 1)));
   };
   append(out,
          within((t.ay + t.by + t.cy) / 3.0, height) * width +
@@ -66,8 +67,8 @@ inline void rasterise(const Triangle& t, int32_t number, int32_t width, int32_t 
 
 }  // namespace texel_raster
 
-// Corners (n, 3, 2) in texels from the page's left and top edge; those on an edge that two
-// triangles share are of both.
+// Rasterises triangles with corners (n, 3, 2) in texels from the left and top edge of the page.
+// Texels on a shared edge belong to both triangles.
 inline TexelCoverage rasterise_triangles(const double* corners, size_t n, int32_t width,
                                          int32_t height) {
   TexelCoverage out;

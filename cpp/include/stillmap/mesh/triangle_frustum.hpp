@@ -1,4 +1,4 @@
-// Voxels before and behind a triangle on the lines of sight through it.
+// Voxels in front of and behind a triangle along its lines of sight.
 #pragma once
 
 #include <Eigen/Geometry>
@@ -16,17 +16,17 @@
 
 namespace stillmap {
 
-// Triangles over points, as a sensor saw them.
+// Triangles over the end points of a scan.
 struct TriangleBatch {
   const double* points;    // (n, 3) metres
-  const double* origin;    // (n, 3) where the sensor was
-  const double* standoff;  // (n,) metres from there to the surface's tangent plane at the point
+  const double* origin;    // (n, 3) metres, sensor position of each point
+  const double* standoff;  // (n,) metres, sensor to the tangent plane at the point
   const int32_t* faces;    // (m, 3)
   const float* weight;     // (m,)
   size_t size;             // m
 };
 
-// alpha + gradient . voxel: of how much something is more than nothing, at voxels' indices
+// gradient . voxel + constant, at voxel indices.
 struct LinearForm {
   Vec<3> gradient = Vec<3>::Zero();
   double constant = 0.0;
@@ -35,14 +35,14 @@ struct LinearForm {
   LinearForm times(double c) const { return {c * gradient, c * constant}; }
 };
 
-// Voxels on the lines of sight through a triangle, as far before and behind it as asked for.
+// Frustum of the lines of sight through a triangle, truncated in front of and behind it.
 //
-// With o where the sensor was, a voxel is v = o + sum_i mu_i (corner_i - o). All mu_i are positive
-// on lines of sight through the triangle, on which the triangle is met at v / k, k = sum mu_i. The
-// distance from the surface is (1 - k) h with h the standoff, which is exact for a plane.
+// With the sensor at o, a voxel is v = o + sum_i mu_i (corner_i - o). All mu_i are positive on
+// lines of sight through the triangle, which they meet at v / k, k = sum mu_i. The distance from
+// the surface is (1 - k) h with the standoff h, exact for a plane.
 class TriangleFrustum {
  public:
-  static constexpr double kMargin = 0.01;  // of the triangle: none slips through between two
+  static constexpr double kMargin = 0.01;  // of the triangle, closes gaps to its neighbours
 
   TriangleFrustum(const TriangleBatch& triangles, size_t face, double voxel,
                   double truncation_front, double truncation_back) {
@@ -57,7 +57,7 @@ class TriangleFrustum {
     const Vec<3> a = corner[0] - o, b = corner[1] - o, c = corner[2] - o;
     const double volume = a.dot(b.cross(c));
     const double h = (standoff_[0] + standoff_[1] + standoff_[2]) / 3.0;
-    // seen edge on, or behind the sensor
+    // degenerate, or behind the sensor
     if (!(std::abs(volume) > kMinVolumeRatio * a.norm() * b.norm() * c.norm()) || !(h > 0.0))
       return;
     const std::array<Vec<3>, 3> inverse = {b.cross(c) / volume, c.cross(a) / volume,
@@ -70,7 +70,7 @@ class TriangleFrustum {
       scale.constant += mu_[i].constant;
       bounds_[i] = mu_[i].plus(kMargin);
     }
-    // a plane that is met at next to no angle would be near for kilometres
+    // limits the depth along lines of sight at grazing incidence
     const double per_metre = std::min(1.0 / h, 3.0 * kMaxSlant / (a + b + c).norm());
     nearest_ = std::max(1.0 - truncation_front * per_metre, kMinSensorShare);
     farthest_ = 1.0 + truncation_back * per_metre;
@@ -83,39 +83,39 @@ class TriangleFrustum {
   }
 
   bool empty() const { return (high_.array() < low_.array()).any(); }
-  double longest_edge() const { return longest_edge_; }  // edge of the triangle, in voxels
+  double longest_edge() const { return longest_edge_; }  // of the triangle, in voxels
   const Cell<3>& low() const { return low_; }
   const Cell<3>& high() const { return high_; }
 
-  // Whether none of a cube of voxels with this edge is in it, as far as one border tells.
+  // Conservative test: whether a cube of voxels lies outside of one bounding plane.
   bool misses_cube(const Cell<3>& lowest, int edge) const {
     const Vec<3> first = lowest.cast<double>();
     for (const LinearForm& bound : bounds_) {
-      double most = bound.value(first);
-      for (int d = 0; d < 3; ++d) most += std::max(bound.gradient[d], 0.0) * (edge - 1);
-      if (most < 0.0) return true;
+      double largest = bound.value(first);
+      for (int d = 0; d < 3; ++d) largest += std::max(bound.gradient[d], 0.0) * (edge - 1);
+      if (largest < 0.0) return true;
     }
     return false;
   }
 
-  // Calls visit(voxel, metres in front of the surface) for the voxels from low to high within.
+  // Calls visit(voxel, signed distance in metres) for the voxels between low and high inside.
   template <class Visit>
   void for_each_voxel(const Cell<3>& low, const Cell<3>& high, Visit&& visit) const {
     const int a = axis_, b = (axis_ + 1) % 3, c = (axis_ + 2) % 3;
-    Cell<3> at;
-    for (at[a] = low[a]; at[a] <= high[a]; ++at[a]) {
-      const auto [first_b, last_b] = slice_range(at[a], b, low[b], high[b]);
-      const auto [first_c, last_c] = slice_range(at[a], c, low[c], high[c]);
-      for (at[b] = first_b; at[b] <= last_b; ++at[b])
-        for (at[c] = first_c; at[c] <= last_c; ++at[c]) {
+    Cell<3> voxel;
+    for (voxel[a] = low[a]; voxel[a] <= high[a]; ++voxel[a]) {
+      const auto [first_b, last_b] = slice_range(voxel[a], b, low[b], high[b]);
+      const auto [first_c, last_c] = slice_range(voxel[a], c, low[c], high[c]);
+      for (voxel[b] = first_b; voxel[b] <= last_b; ++voxel[b])
+        for (voxel[c] = first_c; voxel[c] <= last_c; ++voxel[c]) {
           double distance;
-          if (signed_distance(at.cast<double>(), distance)) visit(at, distance);
+          if (signed_distance(voxel.cast<double>(), distance)) visit(voxel, distance);
         }
     }
   }
 
  private:
-  // Whether a voxel is within, and metres in front of the surface.
+  // Whether a voxel is inside, and its signed distance in metres, positive in front.
   bool signed_distance(const Vec<3>& voxel, double& distance) const {
     double scale = 0.0, sum = 0.0;
     for (size_t i = 0; i < 3; ++i) {
@@ -129,27 +129,26 @@ class TriangleFrustum {
     return true;
   }
 
-  // Of the voxels low to high along an axis those that lines of sight cross at a slice.
+  // Range of voxels along an axis that lines of sight cross at a slice.
   std::pair<int32_t, int32_t> slice_range(int32_t slice_index, int axis, int32_t low,
                                           int32_t high) const {
     if (spreads_) return {low, high};
     const double from = slice_index - origin_[axis_];
-    double least = std::numeric_limits<double>::infinity(), most = -least;
+    double smallest = std::numeric_limits<double>::infinity(), largest = -smallest;
     for (const Vec<3>& slope : slopes_) {
       const double at = origin_[axis] + from * slope[axis];
-      least = std::min(least, at);
-      most = std::max(most, at);
+      smallest = std::min(smallest, at);
+      largest = std::max(largest, at);
     }
     // a slice beside the sensor may be crossed far away
-    return {least > low ? static_cast<int32_t>(std::ceil(std::min(least, high + 1.0))) : low,
-            most < high ? static_cast<int32_t>(std::floor(std::max(most, low - 1.0))) : high};
+    return {smallest > low ? static_cast<int32_t>(std::ceil(std::min(smallest, high + 1.0))) : low,
+            largest < high ? static_cast<int32_t>(std::floor(std::max(largest, low - 1.0))) : high};
   }
 
   static constexpr double kMinVolumeRatio = 1e-12;
-  static constexpr double kMinSensorShare = 0.05;  // of the way from the sensor
-  static constexpr double kMaxSlant = 100.0;  // times as far along a line of sight as off a surface
-  static constexpr double kMinAxisShare =
-      0.1;  // of its length that a line of sight goes along axis_
+  static constexpr double kMinSensorShare = 0.05;  // of the way from the sensor to the surface
+  static constexpr double kMaxSlant = 100.0;       // depth along a line of sight / distance
+  static constexpr double kMinAxisShare = 0.1;     // of a line of sight's length along axis_
   static constexpr double kMaxVoxel = BlockLayout<3>::kMaxCell;
 
   void compute_bounds(const std::array<Vec<3>, 3>& corner, const Vec<3>& o, double voxel) {
@@ -157,7 +156,7 @@ class TriangleFrustum {
     (corner[0] + corner[1] + corner[2]).cwiseAbs().maxCoeff(&axis_);
     Vec<3> low = Vec<3>::Constant(std::numeric_limits<double>::infinity()), high = -low;
     for (size_t i = 0; i < 3; ++i) {
-      // mu is at least -margin for the two others
+      // mu is at least -margin for the other two corners
       const Vec<3> end =
           corner[i] + 2.0 * kMargin * (2.0 * corner[i] - corner[(i + 1) % 3] - corner[(i + 2) % 3]);
       for (const double scale : {nearest_, farthest_}) {
@@ -166,7 +165,7 @@ class TriangleFrustum {
         high = high.cwiseMax(at);
       }
       slopes_[i] = end / end[axis_];
-      // lines of sight that spread to both sides of a slice
+      // lines of sight on both sides of a slice
       spreads_ = spreads_ || !(std::abs(end[axis_]) > kMinAxisShare * end.norm()) ||
                  (end[axis_] > 0.0) != (corner[0][axis_] > 0.0);
     }
@@ -177,13 +176,13 @@ class TriangleFrustum {
   }
 
   std::array<LinearForm, 3> mu_;
-  std::array<LinearForm, 5> bounds_;  // a voxel is within if all are positive
+  std::array<LinearForm, 5> bounds_;  // inside if all are positive
   std::array<double, 3> standoff_{};
   double nearest_ = 0.0, farthest_ = 0.0;  // of the way from the sensor to the surface
-  Vec<3> origin_ = Vec<3>::Zero();         // of lines of sight, in voxels
-  std::array<Vec<3>, 3> slopes_;           // of those through the corners, along `axis_`
+  Vec<3> origin_ = Vec<3>::Zero();         // of the lines of sight, in voxels
+  std::array<Vec<3>, 3> slopes_;           // of the edges, per unit along axis_
   double longest_edge_ = 0.0;
-  int axis_ = 0;  // along which they go most
+  int axis_ = 0;  // main axis of the lines of sight
   bool spreads_ = false;
   Cell<3> low_ = Cell<3>::Ones(), high_ = Cell<3>::Zero();
 };

@@ -1,7 +1,7 @@
-// Signed distances from the surfaces that scans saw, averaged in voxels: Curless and Levoy, "A
-// Volumetric Method for Building Complex Models from Range Images", SIGGRAPH 1996.
-// Threads share blocks of voxels, not triangles: in each voxel the terms come in the triangles'
-// order, so the sums have the same bits whatever the number of threads.
+// TSDF integration: Curless and Levoy, "A Volumetric Method for Building Complex Models from Range
+// Images", SIGGRAPH 1996.
+// Threads own blocks of voxels, not triangles. The terms of each voxel are added in the order of
+// the triangles, so sums have the same bits for any number of threads.
 #pragma once
 
 #include <algorithm>
@@ -20,7 +20,7 @@
 
 namespace stillmap {
 
-// Sums over the triangles that a voxel lies before or behind.
+// Weighted sum of signed distances.
 struct TsdfVoxel {
   float weight = 0.0f;
   float weighted_distance = 0.0f;  // weight times metres in front of the surface
@@ -28,8 +28,8 @@ struct TsdfVoxel {
 
 class TsdfVolume : public BlockMap<3, TsdfVoxel> {
  public:
-  // voxel: metres, its edge; distances are summed from `before` metres in front of surfaces to
-  // `behind` metres behind them
+  // voxel: edge in metres; truncation_front, truncation_back: metres in front of and behind
+  // surfaces up to which distances are integrated.
   TsdfVolume(double voxel, double truncation_front, double truncation_back)
       : voxel_(voxel), truncation_front_(truncation_front), truncation_back_(truncation_back) {
     if (!(voxel > 0.0) || !std::isfinite(voxel))
@@ -50,7 +50,7 @@ class TsdfVolume : public BlockMap<3, TsdfVoxel> {
 
   size_t memory_bytes() const { return blocks().size() * (sizeof(Block) + 64); }
 
-  // Voxels of these blocks are as if never met.
+  // Removes blocks and frees their memory.
   void remove_blocks(const std::vector<Cell<3>>& blocks) {
     std::unordered_set<uint64_t, BlockLayout<3>::Hash> removed;
     for (const Cell<3>& block : blocks) removed.insert(BlockLayout<3>::key(block));
@@ -59,7 +59,7 @@ class TsdfVolume : public BlockMap<3, TsdfVoxel> {
     });
   }
 
-  // In batches, so that what waits to be summed stays small.
+  // Works in batches to bound the memory of pending terms.
   void integrate(const TriangleBatch& triangles, int threads) {
     const size_t batch_size = kFacesPerThread * static_cast<size_t>(std::clamp(threads, 1, 64));
     std::vector<TermBatch> batches;
@@ -77,34 +77,34 @@ class TsdfVolume : public BlockMap<3, TsdfVoxel> {
 
  private:
   static constexpr double kMaxTruncationVoxels = 64.0;
-  static constexpr int64_t kMaxBlocksPerFace = 1 << 20;  // around one triangle
-  static constexpr double kMaxDirectEdge = 16.0;         // voxels along an edge
+  static constexpr int64_t kMaxBlocksPerFace = 1 << 20;
+  static constexpr double kMaxDirectEdge = 16.0;  // voxels; larger faces get whole blocks
   static constexpr float kWholeBlock = -1.0f;
 
-  static constexpr size_t kFacesPerThread = 1 << 13;  // triangles for each thread
+  static constexpr size_t kFacesPerThread = 1 << 13;
 
-  // What a triangle adds to a voxel of a block; of a large triangle, all that it adds to the block.
+  // Contribution of a triangle to one voxel, or of a large triangle to a whole block.
   struct Term {
-    uint32_t block;  // as its share numbers them
+    uint32_t block;  // index in its batch
     uint32_t index;  // of the voxel in the block, or of the face
-    float weight;    // kWhole: of the face
+    float weight;    // kWholeBlock: all voxels of the block
     float distance;
   };
-  // What triangles that follow one another add, in their order.
+  // Terms of successive triangles, in their order.
   struct TermBatch {
     std::vector<Term> terms;
-    VoxelHashMap<3, uint32_t> blocks_seen;  // one more than the number of each block
-    std::vector<Block*> block;              // by its number
-    std::vector<size_t> owner;              // which thread sums it
+    VoxelHashMap<3, uint32_t> blocks_seen;  // index of each block + 1
+    std::vector<Block*> block;              // by index
+    std::vector<size_t> owner;              // thread that integrates it
     Cell<3> last = Cell<3>::Zero();
     uint32_t last_number = 0;
 
     uint32_t block_index(const Cell<3>& cell) {
       if (blocks_seen.size() && cell == last) return last_number;
-      uint32_t& place = blocks_seen.find_or_add(cell);
-      if (place == 0) place = static_cast<uint32_t>(blocks_seen.size());
+      uint32_t& number = blocks_seen.find_or_add(cell);
+      if (number == 0) number = static_cast<uint32_t>(blocks_seen.size());
       last = cell;
-      last_number = place - 1;
+      last_number = number - 1;
       return last_number;
     }
   };
@@ -113,7 +113,7 @@ class TsdfVolume : public BlockMap<3, TsdfVoxel> {
     return TriangleFrustum(triangles, face, voxel_, truncation_front_, truncation_back_);
   }
 
-  // less weight behind the surface, where there may be another one
+  // lower weight behind the surface, where there may be another one
   Term make_term(uint32_t block, const Cell<3>& voxel, double distance, float weight) const {
     return {block, static_cast<uint32_t>(local_of(voxel)),
             weight * static_cast<float>(std::min(1.0, 1.0 + distance / truncation_back_)),
@@ -148,7 +148,7 @@ class TsdfVolume : public BlockMap<3, TsdfVoxel> {
                 {batch.block_index(block), static_cast<uint32_t>(face), kWholeBlock, 0.0f});
   }
 
-  // Each thread has blocks of its own, and meets the terms in their order.
+  // Each thread owns some blocks and adds their terms in order.
   void accumulate_terms(const TriangleBatch& triangles, std::vector<TermBatch>& batches, size_t n) {
     for (size_t i = 0; i < n; ++i)
       for (size_t k = batches[i].block.size(); k < batches[i].blocks_seen.size(); ++k) {
@@ -157,9 +157,9 @@ class TsdfVolume : public BlockMap<3, TsdfVoxel> {
         batches[i].owner.push_back(
             static_cast<size_t>(BlockLayout<3>::Hash{}(BlockLayout<3>::key(cell))));
       }
-    std::vector<size_t> for_each_voxel(n + 1);
-    for (size_t i = 0; i <= n; ++i) for_each_voxel[i] = i;
-    parallel_for_ranges(for_each_voxel, [&](size_t mine, size_t, size_t) {
+    std::vector<size_t> bounds(n + 1);
+    for (size_t i = 0; i <= n; ++i) bounds[i] = i;
+    parallel_for_ranges(bounds, [&](size_t mine, size_t, size_t) {
       for (size_t i = 0; i < n; ++i)
         for (const Term& term : batches[i].terms)
           if (n == 1 || batches[i].owner[term.block] % n == mine)

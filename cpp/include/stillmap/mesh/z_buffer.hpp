@@ -1,6 +1,6 @@
-// What a pinhole camera sees of a mesh: for each pixel the nearest face and how far it is.
+// Z-buffer rendering of a mesh: depth and nearest face per pixel.
 // Edge functions in homogeneous coordinates (Olano and Greer, Triangle scan conversion using 2D
-// homogeneous coordinates, 1997): faces that reach behind the camera need not be cut.
+// homogeneous coordinates, 1997), so faces that reach behind the camera need no clipping.
 #pragma once
 
 #include <Eigen/Core>
@@ -16,26 +16,26 @@
 namespace stillmap {
 
 struct Pinhole {
-  Eigen::Matrix3d R;  // from the mesh's frame to the camera's: x right, y down, z ahead
+  Eigen::Matrix3d R;  // T_camera_map: x right, y down, z forward
   Eigen::Vector3d t;
-  double fx, skew, cx, fy, cy;  // pixel centres have whole numbers
+  double fx, skew, cx, fy, cy;  // pixel centres have integer coordinates
   int32_t width, height;
-  double near;  // metres ahead, nothing before is seen
+  double near;  // metres, near plane
 };
 
 struct ZBuffer {
-  std::vector<float> depth;   // metres along the optical axis; infinity: nothing
-  std::vector<int32_t> face;  // -1: nothing
+  std::vector<float> depth;   // metres along the optical axis; infinity: background
+  std::vector<int32_t> face;  // -1: background
 };
 
 namespace z_buffer {
 
-// A face as the camera sees it: pixel (u, v) sees it where no edge function is negative, at depth
-// det / (sum of edge functions).
+// A face in camera coordinates: it covers the pixels (u, v) at which no edge function is negative,
+// with depth det / (sum of edge functions).
 struct Face {
-  std::array<Eigen::Vector3d, 3> edge;  // edge function = edge . (u, v, 1), turned to be positive
+  std::array<Eigen::Vector3d, 3> edge;  // edge function = edge . (u, v, 1), positive inside
   double det, nearest, farthest;
-  int32_t left, right, top, bottom;  // pixels that may see it
+  int32_t left, right, top, bottom;  // bounding box in pixels
 };
 
 inline Eigen::Vector3d to_camera(const Pinhole& camera, const double* p) {
@@ -49,7 +49,7 @@ inline int32_t pixel(double at, int32_t size) {
   return static_cast<int32_t>(std::clamp(at, -1.0, static_cast<double>(size)));
 }
 
-// Pixels within the bounds of what lies ahead of the near plane; false: none of the picture.
+// Bounding box of the part in front of the near plane; false if it is outside the image.
 inline bool compute_pixel_bounds(const Pinhole& c, const std::array<Eigen::Vector3d, 3>& corner,
                                  Face& face) {
   double u0 = std::numeric_limits<double>::infinity(), v0 = u0, u1 = -u0, v1 = -u0;
@@ -65,7 +65,7 @@ inline bool compute_pixel_bounds(const Pinhole& c, const std::array<Eigen::Vecto
     include(a.x() + s * (b.x() - a.x()), a.y() + s * (b.y() - a.y()), c.near);
   }
   if (!(u0 <= u1)) return false;
-  // a pixel more on every side: where edges are met exactly, the edge functions decide
+  // one pixel more on every side; the edge functions decide
   face.left = std::max(pixel(std::floor(u0), c.width), 0);
   face.right = std::min(pixel(std::ceil(u1), c.width), c.width - 1);
   face.top = std::max(pixel(std::floor(v0), c.height), 0);
@@ -73,8 +73,7 @@ inline bool compute_pixel_bounds(const Pinhole& c, const std::array<Eigen::Vecto
   return face.left <= face.right && face.top <= face.bottom;
 }
 
-// a x b, to the bit the opposite of b x a whatever the compiler makes of it: faces that share an
-// edge leave no gap
+// a x b, exactly -(b x a): faces that share an edge leave no gap.
 inline Eigen::Vector3d cross(const Eigen::Vector3d& a, const Eigen::Vector3d& b, bool swapped) {
   const Eigen::Vector3d &p = swapped ? b : a, &q = swapped ? a : b;
   const Eigen::Vector3d out(p.y() * q.z() - p.z() * q.y(), p.z() * q.x() - p.x() * q.z(),
@@ -82,13 +81,13 @@ inline Eigen::Vector3d cross(const Eigen::Vector3d& a, const Eigen::Vector3d& b,
   return swapped ? Eigen::Vector3d(-out) : out;
 }
 
-// From a function of the ray (x, y, 1) to one of the pixel (u, v, 1).
+// Converts a linear function of the ray (x, y, 1) into one of the pixel (u, v, 1).
 inline Eigen::Vector3d to_pixel_form(const Pinhole& c, const Eigen::Vector3d& n) {
   const double u = n.x() / c.fx, v = (n.y() - u * c.skew) / c.fy;
   return {u, v, n.z() - u * c.cx - v * c.cy};
 }
 
-// False: the camera sees none of it, or only its edge.
+// False if the face is outside the image or seen edge on.
 inline bool setup_face(const Pinhole& c, const Eigen::Vector3d* points, const int32_t* at,
                        Face& face) {
   std::array<Eigen::Vector3d, 3> corner;
@@ -122,7 +121,7 @@ inline void rasterise(const Pinhole& c, const Face& face, int32_t number, int32_
       if (!(e0 >= 0.0 && e1 >= 0.0 && e2 >= 0.0)) continue;
       const double sum = e0 + e1 + e2;
       if (!(sum > 0.0)) continue;
-      // of faces seen at their edge little is left of the determinant
+      // the determinant is imprecise for faces seen edge on
       const double z = std::clamp(face.det / sum, face.nearest, face.farthest);
       if (z < c.near) continue;
       const size_t at = begin + static_cast<size_t>(u);
@@ -134,8 +133,8 @@ inline void rasterise(const Pinhole& c, const Face& face, int32_t number, int32_
 
 }  // namespace z_buffer
 
-// vertices (V, 3), faces (F, 3). Both sides of a face are seen; of two at the same depth, to the
-// last bit of a float, the lower number is.
+// Renders vertices (V, 3) and faces (F, 3), double-sided. At equal depth (float32) the lower face
+// number wins.
 inline ZBuffer render_z_buffer(const double* vertices, size_t V, const int32_t* faces, size_t F,
                                const Pinhole& camera, int threads) {
   std::vector<Eigen::Vector3d> points(V);
@@ -146,10 +145,10 @@ inline ZBuffer render_z_buffer(const double* vertices, size_t V, const int32_t* 
   const size_t pixels = rows * static_cast<size_t>(camera.width);
   ZBuffer out{std::vector<float>(pixels, std::numeric_limits<float>::infinity()),
               std::vector<int32_t>(pixels, -1)};
-  // each thread has rows of its own, and meets the faces in their order
-  const size_t shares = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1, rows);
+  // each thread owns some rows and renders the faces in order
+  const size_t n_threads = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1, rows);
   std::vector<size_t> bounds;
-  for (size_t i = 0; i <= shares; ++i) bounds.push_back(rows * i / shares);
+  for (size_t i = 0; i <= n_threads; ++i) bounds.push_back(rows * i / n_threads);
   parallel_for_ranges(bounds, [&](size_t, size_t first, size_t last) {
     const auto top = static_cast<int32_t>(first), bottom = static_cast<int32_t>(last) - 1;
     z_buffer::Face face;

@@ -1,4 +1,4 @@
-// The sums of (10), the E-step (8), the likelihood (1), (5).
+// Map M-step (10), E-step (8) and expected log likelihood (5), (7) of Haehnel et al. 2003.
 #pragma once
 
 #include <array>
@@ -19,7 +19,7 @@
 
 namespace stillmap {
 
-// Adds the lengths on the approach to an end point, without the end cell, as beta_j has them.
+// Sums the lengths on the approach to an end point, without the end cell.
 template <int D>
 class ApproachAccumulator {
  public:
@@ -51,7 +51,7 @@ class ApproachAccumulator {
   Cell<D> cell_ = Cell<D>::Zero();
 };
 
-// A hit, static with some probability, in its end cell.
+// Adds a return with P(static) = p_static to its end cell.
 template <int D>
 inline void add_end_point(typename OccupancyGrid<D>::Block& block, const Cell<D>& cell,
                           const Vec<D>& end, double p_static, Fixed sign) {
@@ -63,26 +63,27 @@ inline void add_end_point(typename OccupancyGrid<D>::Block& block, const Cell<D>
     moment[static_cast<size_t>(d)] += sign * to_fixed(p_static * (end[d] - cell[d]));
 }
 
-// alpha_j and beta_j of (10) for the scans [first, last). Sums are integers: with sign -1 scans
-// that were added before are taken out again without a trace.
+// Adds alpha_j and beta_j of (10) for the scans [first, last). With sign -1 it removes scans that
+// were added before, exactly, since sums are integers.
 template <int D>
 inline void add_scans(OccupancyGrid<D>& grid, const Scans<D>& scans, const float* e, Fixed sign,
                       size_t first, size_t last) {
   BlockCursor<OccupancyGrid<D>> cursor(grid);
-  // second sum of beta_j: the length by which the beam covers j, whatever e is
+  // second sum of beta_j: chord length of the beam in j, independent of e
   RayWalker walker(cursor,
                    [=](CellCounts* j, double length) { j->beta += sign * to_fixed(length); });
   ApproachAccumulator<D> approach(grid, sign);
   for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
     const BeamSegment<D> beam(pose, scans.points + n * D, grid.resolution());
     traverse<D>(beam.start, beam.end, walker);
-    if (!scans.hit[n]) return;  // (1 - zeta) = 0: the end cell of a maximum-range beam says nothing
+    if (!scans.hit[n])
+      return;  // (1 - zeta) = 0: the end cell of a maximum-range beam is not observed
     approach.add(beam);
     add_end_point<D>(*walker.block(), walker.cell(), beam.end, checked_probability(e[n]), sign);
   });
 }
 
-// What of these sums depends on e: those of the end cells.
+// Adds the part of the sums that depends on e: that of the end cells.
 template <int D>
 inline void add_end_points(OccupancyGrid<D>& grid, const Scans<D>& scans, const float* e,
                            Fixed sign) {
@@ -108,15 +109,15 @@ inline void add_beams(OccupancyGrid<D>& grid, const Scans<D>& scans, const float
   for (const auto& other : others) grid.merge(other);
 }
 
-// (8): the probability that something static reflected a beam that ends in a cell of occupancy m.
+// E-step (8): P(static | return in a cell of occupancy m).
 inline double static_responsibility(double prior, double m) {
   const double hit = prior * m;
   const double total = hit + (1.0 - prior) * (1.0 - m);
   return total > 0.0 ? hit / total : prior;
 }
 
-// (6), (8) for every beam: NaN when unusable, the prior at maximum range and where the end cell
-// was never looked at.
+// E-step (6), (8) for all beams: NaN if unusable, the prior at maximum range and where the end cell
+// is unobserved.
 template <int D>
 inline void e_step(const OccupancyGrid<D>& grid, const Scans<D>& scans, double prior, int threads,
                    float* e) {
@@ -140,15 +141,14 @@ struct LogLikelihoodTerms {
   double end = 0.0;        // (5), first two rows
   double traversed = 0.0;  // (5), last row, weighted by the lengths l_j
   double gamma = 0.0;      // (7)
-  double entropy = 0.0;    // of e: turns the expected log likelihood into the bound of EM
+  double entropy = 0.0;    // entropy of e: added to the others it gives the lower bound of EM
 };
 
-// ln with a floor, so that one impossible beam costs much but not everything
+// ln with a floor, so that one impossible beam has a finite cost
 inline double safe_log(double p) { return std::log(p > 1e-12 ? p : 1e-12); }
 inline double x_log_p(double x, double p) { return x > 0.0 ? x * safe_log(p) : 0.0; }
 
-// (5) and (7) scan by scan; with e in {0, 1} this is (4). Cells nobody looked at are unknown and
-// contribute nothing.
+// (5) and (7) per scan; with e in {0, 1} this is (4). Unobserved cells contribute nothing.
 template <int D>
 inline void log_likelihood(const OccupancyGrid<D>& grid, const Scans<D>& scans, const float* e,
                            double prior, int threads, LogLikelihoodTerms* terms) {

@@ -1,10 +1,10 @@
-// Things that are put somewhere or taken away while others pass: when, and what is there at last.
+// Change detection per cell: a three-state HMM (object, empty, passer-by) that finds objects that
+// were placed or removed, and when. See docs/estimator.md.
 //
-// A cell holds a thing, or nothing, or somebody who passes; see docs/estimator.md. Things stay for
-// very long, passers-by for seconds; a thing leaves the cell as it would be without it. All looks
-// together decide how probable that story is (forward algorithm) and which course of it is the most
-// probable (Viterbi). What is asked of that course is carried along with it, so nothing is kept of
-// the looks themselves.
+// Objects stay for a time tau, passers-by for seconds; when an object leaves, the cell is as if it
+// had never been there. The forward algorithm gives the likelihood of all observations, the Viterbi
+// algorithm the most probable state path. Summaries of the path are updated along with it, so no
+// observations are stored.
 #pragma once
 
 #include <algorithm>
@@ -17,44 +17,43 @@
 namespace stillmap {
 
 struct ChangeOptions {
-  double tau;            // seconds: things come and go with correlation exp(-dt / tau)
-  double passer_by_rho;  // share of the time in which somebody passes where no thing stands
-  double passer_by_tau;  // seconds, of them
-  double p_detection;    // probability that an occupied cell is seen to be so
+  double tau;            // seconds, correlation time of objects: exp(-dt / tau)
+  double passer_by_rho;  // share of time with a passer-by where there is no object
+  double passer_by_tau;  // seconds, correlation time of passers-by
+  double p_detection;    // P(return | occupied)
 };
 
-// Between which two looks something changed.
+// Two successive observations between which the state changed.
 struct ChangeInterval {
   static constexpr int32_t kNever = -1;
-  int32_t before = kNever;  // the last look that saw the cell as it was
-  int32_t after = kNever;   // the first that saw it otherwise
+  int32_t before = kNever;  // time bin of the last observation before the change
+  int32_t after = kNever;   // time bin of the first observation after it
 };
 
-// How often something changed, and when first and last.
+// Number of changes, the first and the last.
 struct ChangeSummary {
   int32_t count = 0;
   ChangeInterval first, last;
 
-  void record(int32_t before, int32_t now) {
-    if (count++ == 0) first = {before, now};
-    last = {before, now};
+  void record(int32_t previous, int32_t now) {
+    if (count++ == 0) first = {previous, now};
+    last = {previous, now};
   }
 };
 
-// The most probable course of a cell, as far as it is asked for.
+// Summary of the most probable state path of a cell.
 struct StatePath {
-  float log_probability = 0.0f;     // relative to the others of the cell
-  float occupied_bins = 0.0f;       // looks' time not empty; a change counts as half way between
-  ChangeSummary object_changes;     // things that come or leave
-  ChangeSummary occupancy_changes;  // from empty to not empty, and back
+  float log_probability = 0.0f;     // relative to the other paths of the cell
+  float occupied_bins = 0.0f;       // duration not empty; changes are half way between bins
+  ChangeSummary object_changes;     // object placed or removed
+  ChangeSummary occupancy_changes;  // from empty to occupied, and back
 };
 
 class ChangeHmm {
  public:
   enum State : size_t { kObject, kEmpty, kPasserBy, kStates };
 
-  // seconds: between successive looks; courses: whether they are asked for, or only how probable
-  // the story is
+  // bin_seconds: length of a time bin; with_paths: also track the most probable state paths.
   ChangeHmm(size_t members, const ChangeOptions& options, double bin_seconds,
             bool with_paths = true)
       : options_(options),
@@ -73,7 +72,7 @@ class ChangeHmm {
   size_t members() const { return states_.size(); }
   bool has_paths() const { return has_paths_; }
 
-  // Whether it can remember the number of a look.
+  // Whether a time bin can be stored.
   static bool is_valid_time_bin(int64_t time_bin) {
     return time_bin >= 0 && time_bin <= std::numeric_limits<int32_t>::max();
   }
@@ -87,42 +86,41 @@ class ChangeHmm {
     observe(k, time_bin, {missed, 1.0f, missed});
   }
 
-  // Logarithm of the likelihood of everything else that was seen of a member, given one hit.
+  // Log likelihood of all observations of a member, given that one of them is a hit.
   double log_likelihood(size_t k) const {
     const ForwardState& state = states_[k];
     const double hit = (0.5 + 0.5 * options_.passer_by_rho) * options_.p_detection;
     return state.log_scale + std::log(sum(state.weight)) - std::log(hit);
   }
-  // Probability that a thing, or nothing, is there at the last look.
+  // P(state at the last observation | all observations).
   float p_final(size_t k, State state) const {
     const auto& weight = states_[k].weight;
     return weight[state] / static_cast<float>(sum(weight));
   }
-  // The most probable course, and the share of the time from first to last look that it is not
-  // empty.
+  // Most probable state path, and the share of the time from first to last observation in which it
+  // is not empty.
   const StatePath& most_probable_path(size_t k) const { return *best(paths_[k]); }
   float occupied_fraction(size_t k) const {
     const ForwardState& state = states_[k];
-    const Paths& with_paths = paths_[k];
-    if (state.last == state.first)
-      return best(with_paths) == with_paths.data() + kEmpty ? 0.0f : 1.0f;
-    return best(with_paths)->occupied_bins / static_cast<float>(state.last - state.first);
+    const Paths& paths = paths_[k];
+    if (state.last == state.first) return best(paths) == paths.data() + kEmpty ? 0.0f : 1.0f;
+    return best(paths)->occupied_bins / static_cast<float>(state.last - state.first);
   }
 
  private:
   using Weights = std::array<float, kStates>;
-  using Paths = std::array<StatePath, kStates>;  // the most probable one to each state
+  using Paths = std::array<StatePath, kStates>;  // best path that ends in each state
   using Matrix = std::array<Weights, kStates>;   // [from][to]
   struct Transition {
     Matrix p, log;
   };
-  static constexpr int kTabulatedGaps = 64;         // gaps whose transitions are kept
-  static constexpr float kMinProbability = 1e-30f;  // no state is ever impossible
+  static constexpr int kTabulatedGaps = 64;         // gaps with tabulated transitions
+  static constexpr float kMinProbability = 1e-30f;  // floor: no state becomes impossible
   static constexpr float kRescaleBelow = 1e-12f;
 
   struct ForwardState {
-    int32_t first = ChangeInterval::kNever, last = ChangeInterval::kNever;  // looks
-    Weights weight;  // P(all looks so far, state), relative to exp(log_scale)
+    int32_t first = ChangeInterval::kNever, last = ChangeInterval::kNever;  // time bins
+    Weights weight;  // P(observations so far, state) / exp(log_scale)
     double log_scale = 0.0;
   };
 
@@ -130,11 +128,10 @@ class ChangeHmm {
     return static_cast<double>(w[kObject]) + static_cast<double>(w[kEmpty]) +
            static_cast<double>(w[kPasserBy]);
   }
-  static const StatePath* best(const Paths& with_paths) {
-    return std::max_element(with_paths.begin(), with_paths.end(),
-                            [](const StatePath& a, const StatePath& b) {
-                              return a.log_probability < b.log_probability;
-                            });
+  static const StatePath* best(const Paths& paths) {
+    return std::max_element(paths.begin(), paths.end(), [](const StatePath& a, const StatePath& b) {
+      return a.log_probability < b.log_probability;
+    });
   }
 
   Transition transitions(int64_t gap) const {
@@ -192,43 +189,43 @@ class ChangeHmm {
     state.weight = next;
   }
 
-  static void viterbi_step(Paths& with_paths, const Matrix& log, const Weights& likelihood,
-                           int32_t last, int32_t now) {
+  static void viterbi_step(Paths& paths, const Matrix& log, const Weights& likelihood, int32_t last,
+                           int32_t now) {
     Paths next;
     float largest = -std::numeric_limits<float>::infinity();
     for (size_t to = 0; to < kStates; ++to) {
       size_t best = 0;
       float best_log = -std::numeric_limits<float>::infinity();
       for (size_t from = 0; from < kStates; ++from) {
-        const float p = with_paths[from].log_probability + log[from][to];
+        const float p = paths[from].log_probability + log[from][to];
         if (p > best_log) {
           best_log = p;
           best = from;
         }
       }
-      next[to] = with_paths[best];
+      next[to] = paths[best];
       next[to].log_probability = best_log + logarithm(likelihood[to]);
       extend_path(next[to], best, to, last, now);
       largest = std::max(largest, next[to].log_probability);
     }
     for (StatePath& path : next) path.log_probability -= largest;
-    with_paths = next;
+    paths = next;
   }
 
-  static void extend_path(StatePath& path, size_t from, size_t to, int32_t before, int32_t now) {
-    if (before == now) return;  // at the first look nothing has changed
+  static void extend_path(StatePath& path, size_t from, size_t to, int32_t previous, int32_t now) {
+    if (previous == now) return;  // first observation
     const bool was_empty = from == kEmpty, is_empty = to == kEmpty;
-    path.occupied_bins += 0.5f * static_cast<float>(now - before) *
+    path.occupied_bins += 0.5f * static_cast<float>(now - previous) *
                           static_cast<float>(static_cast<int>(!was_empty) + !is_empty);
-    if ((from == kObject) != (to == kObject)) path.object_changes.record(before, now);
-    if (was_empty != is_empty) path.occupancy_changes.record(before, now);
+    if ((from == kObject) != (to == kObject)) path.object_changes.record(previous, now);
+    if (was_empty != is_empty) path.occupancy_changes.record(previous, now);
   }
 
   ChangeOptions options_;
   double bin_seconds_;
   bool has_paths_;
   std::vector<ForwardState> states_;
-  std::vector<Paths> paths_;  // of all, or of none
+  std::vector<Paths> paths_;  // empty without paths
   std::vector<Transition> transition_table_;
 };
 

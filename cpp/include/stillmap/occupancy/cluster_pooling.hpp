@@ -1,8 +1,7 @@
-// What stands apart from all else in a sweep is one body: what is known of its parts, on average.
+// Pools values of surfels, such as P(dynamic), over the connected clusters of each sweep.
 //
-// Elements that beams of a sweep ended in are of one body where the columns over the ground that
-// they stand in touch. Sums over sweeps are integers, so that their order does not matter. See
-// docs/space.md.
+// The surfels that a sweep hit belong to one cluster if their ground columns touch. Sums over
+// sweeps are integers and so do not depend on their order. See docs/space.md.
 #pragma once
 
 #include <algorithm>
@@ -24,13 +23,13 @@
 namespace stillmap {
 
 struct ClusterOptions {
-  int32_t column_cells;  // cells, edge of the columns
-  int64_t min_surfels;   // elements of a body: fewer tell nothing
+  int32_t column_cells;  // edge of a ground column, in cells
+  int64_t min_surfels;   // smaller clusters are ignored
 };
 
 class ClusterPooling {
  public:
-  // stands: (E,) of which elements bodies consist; values: (E, kinds) what is known of each
+  // is_obstacle (E,): surfels that may belong to clusters; values (E, n_values): what is pooled.
   ClusterPooling(const SurfelMap<3>& surfel_map, const bool* is_obstacle, const float* values,
                  size_t n_values, const ClusterOptions& options)
       : surfel_map_(surfel_map),
@@ -62,8 +61,8 @@ class ClusterPooling {
       }
   }
 
-  // (E, kinds) mean over the body around each element, mean over the sweeps that saw it; NaN where
-  // none did.
+  // (E, n_values) mean over the cluster of each surfel, averaged over the sweeps that hit it; NaN
+  // without any.
   std::vector<float> means() const {
     std::vector<float> out(sums_.size(), std::numeric_limits<float>::quiet_NaN());
     for (size_t i = 0; i < out.size(); ++i)
@@ -77,10 +76,10 @@ class ClusterPooling {
 
   struct PooledValues {
     std::vector<size_t> surfels;
-    std::vector<int64_t> means;  // of the body of each, in parts of kOne
+    std::vector<int64_t> means;  // (n, n_values) mean of the cluster of each surfel, fixed point
   };
 
-  // The elements that a scan's beams ended in.
+  // Columns of the obstacle surfels that one scan hit.
   void gather(const Scans<3>& scans, size_t t, GroundColumns& columns) const {
     columns.begin_sweep();
     BlockCursor<const SurfelMap<3>> cursor(surfel_map_);
@@ -93,7 +92,7 @@ class ClusterPooling {
     columns.sort();
   }
 
-  // What is known of the body of each element.
+  // Means over the clusters of one scan.
   void pool(const GroundColumns& columns, PooledValues& pooled) const {
     std::vector<size_t> root = connect_columns(columns);
     std::vector<double> sums(root.size() * n_values_, 0.0);
@@ -117,7 +116,8 @@ class ClusterPooling {
     }
   }
 
-  // Columns that touch, corners too: the next in the same row, and up to three in the row after.
+  // Unites touching columns (8-neighbourhood): the next in the same row and up to three in the next
+  // row.
   static std::vector<size_t> connect_columns(const GroundColumns& columns) {
     const size_t n = columns.size();
     std::vector<size_t> root(n);
@@ -149,8 +149,8 @@ class ClusterPooling {
   size_t n_values_;
   std::vector<uint8_t> is_obstacle_;
   std::vector<float> values_;
-  std::vector<int64_t> sums_;          // of means, in parts of kOne
-  std::vector<int32_t> sweep_counts_;  // in which each was of a body
+  std::vector<int64_t> sums_;          // of cluster means, fixed point
+  std::vector<int32_t> sweep_counts_;  // sweeps in which each surfel was in a cluster
 };
 
 }  // namespace stillmap

@@ -1,4 +1,4 @@
-// The elements that a sweep met, by the columns over the ground that they stand in.
+// Vertical columns over the ground that hold the surfels of one sweep.
 #pragma once
 
 #include <algorithm>
@@ -13,11 +13,11 @@ namespace stillmap {
 
 using GroundColumn = std::pair<int32_t, int32_t>;  // x, y
 
-// edge: of a column, in cells
+// Column of a cell; column_cells: edge of a column, in cells.
 inline GroundColumn ground_column(const Cell<3>& cell, int32_t column_cells) {
-  const auto floor_divide = [column_cells](int32_t at) {
-    const int32_t remainder = at % column_cells;
-    return (at - remainder) / column_cells - (remainder < 0 ? 1 : 0);
+  const auto floor_divide = [column_cells](int32_t coordinate) {
+    const int32_t remainder = coordinate % column_cells;
+    return (coordinate - remainder) / column_cells - (remainder < 0 ? 1 : 0);
   };
   return {floor_divide(cell[0]), floor_divide(cell[1])};
 }
@@ -29,25 +29,24 @@ class GroundColumns {
 
   int32_t column_cells() const { return column_cells_; }
 
-  // Begins a sweep.
   void begin_sweep() {
     ++sweep_;
     members_.clear();
   }
 
-  // Whether an element was not told of before in this sweep.
+  // Whether a surfel is new in this sweep.
   bool first_seen(int32_t surfel) {
     return std::exchange(last_sweep_[static_cast<size_t>(surfel)], sweep_) != sweep_;
   }
 
-  // Once for each element of the sweep, however often it is told.
+  // Adds a surfel once per sweep.
   void add(int32_t surfel) {
     if (first_seen(surfel))
       members_.emplace_back(ground_column(surfel_map_.cell(surfel), column_cells_),
                             static_cast<size_t>(surfel));
   }
 
-  // After all were added: columns by x, then y, and the elements in each by their numbers.
+  // Call after adding: orders columns by x, then y, and the surfels of each by number.
   void sort() {
     std::sort(members_.begin(), members_.end());
     column_begin_.clear();
@@ -64,7 +63,7 @@ class GroundColumns {
     for (size_t i = column_begin_[c]; i < column_begin_[c + 1]; ++i) visit(members_[i].second);
   }
 
-  // The number of a column, size() where there is none.
+  // Index of a column; size() if there is none.
   size_t find_column(const GroundColumn& column) const {
     const auto is_before = [this](size_t i, const GroundColumn& wanted) {
       return members_[i].first < wanted;
@@ -79,9 +78,9 @@ class GroundColumns {
   const SurfelMap<3>& surfel_map_;
   int32_t column_cells_;
   int32_t sweep_ = 0;
-  std::vector<int32_t> last_sweep_;                       // the last sweep in which each was added
-  std::vector<std::pair<GroundColumn, size_t>> members_;  // elements
-  std::vector<size_t> column_begin_;                      // member of each column, and the end
+  std::vector<int32_t> last_sweep_;                       // last sweep of each surfel
+  std::vector<std::pair<GroundColumn, size_t>> members_;  // column and surfel
+  std::vector<size_t> column_begin_;  // first member of each column, and the end
 };
 
 }  // namespace stillmap

@@ -1,7 +1,5 @@
-// Beams that end just above the ground where, in the same sweep, something stands that moves.
-//
-// Voxels on the ground hold the lower edges of wheels and soles, too, and are the ground's. See
-// docs/space.md.
+// Relabels beams that end just above the ground next to a moving object: a voxel on the ground also
+// holds the lower edges of wheels and shoes and would label them static. See docs/space.md.
 #pragma once
 
 #include <cmath>
@@ -19,27 +17,26 @@
 
 namespace stillmap {
 
-// What is known of each element.
+// Per-surfel labels (E,) and thresholds.
 struct GroundContactInput {
-  const bool* is_obstacle;     // whether it is of what stands on the ground, and not of the ground
-  const float* p_static;       // probability
-  const float* ground_height;  // m, height of the ground below it
-  int32_t column_cells;        // cells, edge of the columns over the ground
-  double max_ground_height;    // m above the ground up to where a mean is the ground's
-  double min_end_height;       // m above the ground from where on a beam did not end on it
+  const bool* is_obstacle;     // part of an obstacle, not of the ground
+  const float* p_static;       // P(static)
+  const float* ground_height;  // metres, height of the ground below
+  int32_t column_cells;        // edge of a ground column, in cells
+  double max_ground_height;    // metres above the ground up to which a mean counts as ground
+  double min_end_height;  // metres above the ground from which on an end point is off the ground
 };
 
 class GroundContact {
  public:
-  static constexpr double kFloorNormalZ =
-      0.85;  // cosine of the slope from which on a surface is no floor
+  static constexpr double kFloorNormalZ = 0.85;  // cosine of the largest slope of a floor
 
   GroundContact(const SurfelMap<3>& surfel_map, const GroundContactInput& input)
       : surfel_map_(surfel_map), input_(input) {}
 
-  // out (M,): mean probability of being static of what stands in the column of each beam that ends
-  // above a static element of the ground; NaN where more of it is static, and for all others.
-  // element (M,): in which each ended.
+  // p_static (M,) of each beam that ends above a static ground surfel: mean P(static) of the
+  // obstacles in its column; NaN where that is at least 0.5, and for all other beams. surfel (M,):
+  // associated surfel of each beam.
   void relabel(const Scans<3>& scans, const int32_t* surfel, int threads, float* out) const {
     const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
     parallel_for_ranges(bounds, [&](size_t, size_t first, size_t last) {
@@ -53,7 +50,7 @@ class GroundContact {
   }
 
  private:
-  // Mean probability in each column where something moves; `columns` has what moves alone.
+  // Mean P(static) per column; only columns with moving surfels are kept.
   void pool_moving_columns(const Scans<3>& scans, size_t t, const int32_t* surfel,
                            GroundColumns& columns, std::vector<double>& p_static) const {
     const auto for_each = [&](bool moving, auto&& visit) {
@@ -100,14 +97,14 @@ class GroundContact {
     }
   }
 
-  // Crowns and bridges are not.
+  // Excludes tree crowns and bridges.
   bool on_ground(int32_t k) const {
     const double z = surfel_map_.surfel(k).mean[2] * surfel_map_.resolution();
     return !input_.is_obstacle[k] &&
            z - static_cast<double>(input_.ground_height[k]) <= input_.max_ground_height;
   }
 
-  // Metres over the floor that an element is of, or else over the ground.
+  // Metres above the plane of a floor surfel, otherwise above the ground height.
   double height(int32_t k, const Vec<3>& end) const {
     const Surfel<3>& e = surfel_map_.surfel(k);
     const double normal_z = e.normal[2];

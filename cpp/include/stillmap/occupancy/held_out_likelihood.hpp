@@ -1,8 +1,8 @@
-// How well a map foresees the ranges of beams that it was not made from: a proper density over
-// range, relative to that of a world without a map.
+// Log likelihood of the ranges of held-out scans under a map, relative to a world without a map.
 //
-// On its way a beam meets things that stand still, at a rate per metre that follows from the labels
-// of the beams that ended in each cell, and things that do not, at the same rate everywhere.
+// Along a beam static objects stop it at a rate per metre that depends on the labels of the beams
+// that ended in each cell, dynamic objects at the same rate everywhere. The range density is
+// normalised.
 #pragma once
 
 #include <algorithm>
@@ -22,7 +22,7 @@
 
 namespace stillmap {
 
-// Mean e of the beams that ended in each cell, and how often beams end at all.
+// Mean e of the beams that ended in each cell, and mean rates of end points.
 template <int D>
 class StaticFractionGrid : public CellIndex<D> {
  public:
@@ -35,7 +35,7 @@ class StaticFractionGrid : public CellIndex<D> {
 
   double resolution() const { return resolution_; }
 
-  // Beams of the scans that are not held out; e as of (8).
+  // Adds the beams of scans that are not held out; e as in (8).
   void add(const Scans<D>& scans, const float* e, const bool* is_held_out) {
     for_each_beam<D>(scans, 0, scans.n_scans, [&](size_t t, int64_t n, const Pose<D>& pose) {
       if (is_held_out[t]) return;
@@ -55,8 +55,8 @@ class StaticFractionGrid : public CellIndex<D> {
     const CellSums& s = sums_[static_cast<size_t>(k)];
     return from_fixed(s.is_static) / static_cast<double>(s.hits);
   }
-  // Per metre: of all ends, and of those at something that moves. One end at one metre more than
-  // was seen, so that nothing is ever impossible.
+  // End points per metre of beam, all and dynamic ones. One end point and one metre are added, so
+  // that no rate is zero.
   double end_rate() const { return per_metre(static_cast<double>(hits_)); }
   double dynamic_rate() const { return per_metre(from_fixed(dynamic_)); }
 
@@ -78,20 +78,20 @@ class StaticFractionGrid : public CellIndex<D> {
   }
 
   double resolution_;
-  Fixed length_ = 0, dynamic_ = 0;  // metres, expected number of hits
+  Fixed length_ = 0, dynamic_ = 0;  // metres; expected number of dynamic hits
   int64_t hits_ = 0;
   std::vector<CellSums> sums_;
 };
 
 struct BeamModel {
-  double stopping;  // per metre: rate at which what is surely static stops a beam
-  double noise;     // metres, standard deviation of ranges, poses included
-  double late;      // share of the beams that end behind where they met something static
-  double delay;     // metres, their mean distance from there
-  double outliers;  // share of the beams of which the map says nothing
+  double stopping;  // 1/m, rate at which a certainly static cell stops a beam
+  double noise;     // metres, standard deviation of ranges, including pose error
+  double late;      // share of beams that end behind the static object they met
+  double delay;     // metres, mean distance behind it
+  double outliers;  // share of beams that the map does not explain
 };
 
-// Density of one beam's range; everything in metres.
+// Density of the range of one beam, per metre.
 template <int D>
 class RangeDensity {
  public:
@@ -101,7 +101,7 @@ class RangeDensity {
         dynamic_(fractions.dynamic_rate()),
         cursor_(fractions) {}
 
-  // ln of the density of a hit, or of the probability that nothing stops the beam up to its end
+  // ln of the density of a return, or of the probability of no return up to the end.
   double log_density(const BeamSegment<D>& beam, double range, bool hit) {
     optical_depth_ = 0.0;
     density_ = 0.0;
@@ -118,8 +118,8 @@ class RangeDensity {
   }
 
  private:
-  static constexpr double kDeviations = 5.0;  // of the noise behind a hit that still may matter
-  static constexpr double kDelays = 30.0;     // before it
+  static constexpr double kDeviations = 5.0;  // of the noise, considered behind a return
+  static constexpr double kDelays = 30.0;     // mean delays, considered before a return
 
   void integrate_cell(const int32_t* k, double cells, bool hit) {
     const double length = cells * fractions_.resolution();
@@ -127,7 +127,7 @@ class RangeDensity {
     const double static_fraction =
         k && *k != StaticFractionGrid<D>::kNone ? fractions_.static_fraction(*k) : 0.0;
     const double static_rate = model_.stopping * static_fraction, rate = static_rate + dynamic_;
-    const double from = position_, to = position_ + length;  // relative to where the beam ended
+    const double from = position_, to = position_ + length;  // relative to the end of the beam
     if (hit && from <= 0.0 && to > 0.0)
       density_ += dynamic_ * std::exp(-optical_depth_ + rate * from);
     if (hit && static_fraction > 0.0 && to > -kDelays * model_.delay) {
@@ -139,8 +139,8 @@ class RangeDensity {
     position_ = to;
   }
 
-  // Probability, per metre of range, that a beam which met something static between two places ends
-  // at 0; times the distance of the places.
+  // Probability density of a return at 0 for a beam that met a static object between two positions,
+  // times their distance.
   double end_probability(double from, double to) const {
     auto normal = [&](double x) { return 0.5 * std::erfc(-x / (model_.noise * std::sqrt(2.0))); };
     auto delayed = [&](double x) { return x < 0.0 ? -std::expm1(x / model_.delay) : 0.0; };
@@ -152,18 +152,18 @@ class RangeDensity {
   BeamModel model_;
   double dynamic_;
   BlockCursor<const StaticFractionGrid<D>> cursor_;
-  double optical_depth_ = 0.0;  // - ln of the probability of getting so far
+  double optical_depth_ = 0.0;  // -ln P(the beam gets this far)
   double density_ = 0.0;        // at the end of the beam
-  double position_ = 0.0;       // place relative to it
+  double position_ = 0.0;       // current position relative to it
 };
 
 struct HeldOutScore {
-  double log_likelihood_gain = 0.0;  // nats above a world without a map
+  double log_likelihood_gain = 0.0;  // nats, relative to a world without a map
   double beam_count = 0.0;
 };
 
-// ln of the beams' density less ln of that of a world in which beams end at the same rate
-// everywhere, summed per held-out scan.
+// Sums ln of the range density minus that of a world with a constant rate of end points, per
+// held-out scan.
 template <int D>
 inline void score_held_out(const StaticFractionGrid<D>& fractions, const Scans<D>& scans,
                            const bool* is_held_out, const BeamModel& model, int threads,

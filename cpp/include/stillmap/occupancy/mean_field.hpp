@@ -1,8 +1,8 @@
-// Things are larger than a cell: what the elements beside one say about it.
+// MRF smoothing of P(static) over neighbouring surfels by mean-field inference.
 //
-// Mean field of a random field over elements near each other. Static ones speak for an element as
-// far as both were hit in the same time, dynamic ones as far as it was hit while they were and at
-// no other time; both as far as the two can be of one surface. See docs/space.md.
+// A static neighbour counts by the share of time in which both surfels were hit, a dynamic
+// neighbour by the share of the surfel's own time; both by how coplanar the two surfels are. See
+// docs/space.md.
 #pragma once
 
 #include <algorithm>
@@ -19,19 +19,19 @@
 namespace stillmap {
 
 struct MeanFieldOptions {
-  double radius;            // cells between those that speak for each other
-  double coplanar_std;      // cells: standard deviation of a mean from the plane of another
-  double static_coupling;   // log odds that static neighbours are worth, if there are no others
-  double dynamic_coupling;  // the same of dynamic ones
-  double min_log_odds, max_log_odds;  // log odds that an element's own looks are worth
-  double tolerance;    // change of a probability of which the neighbours want to know
-  int max_iterations;  // at most
+  double radius;            // cells, neighbourhood
+  double coplanar_std;      // cells, standard deviation of a mean from a neighbour's plane
+  double static_coupling;   // log odds, weight of static neighbours
+  double dynamic_coupling;  // log odds, weight of dynamic neighbours
+  double min_log_odds, max_log_odds;  // clamp of a surfel's own log odds
+  double tolerance;  // change of P(static) that triggers an update of the neighbours
+  int max_iterations;
 };
 
 template <int D>
 class MeanField {
  public:
-  // log_odds: (E,) of being static, by an element's own looks; the surface knows when these hit
+  // log_odds (E,) of being static from each surfel's own observations.
   MeanField(const SurfelMap<D>& surfel_map, const float* log_odds, const MeanFieldOptions& options,
             int threads)
       : surfel_map_(surfel_map),
@@ -46,7 +46,7 @@ class MeanField {
     }
   }
 
-  // (E,) probability of being static, by what is beside as well.
+  // P(static) (E,) after convergence or max_iterations.
   const std::vector<float>& infer() {
     std::vector<uint8_t> active(p_static_.size(), 1);
     for (int iteration = 0; iteration < options_.max_iterations; ++iteration) {
@@ -66,9 +66,9 @@ class MeanField {
   using Vecf = Eigen::Matrix<float, D, 1>;
 
   struct Node {
-    Vecf mean, normal;  // cells; the normal of what is round is zero
+    Vecf mean, normal;  // cells; zero normal: isotropic
     TimeSpan hit_span;
-    float unary;  // log odds
+    float unary;  // own log odds
   };
 
   Node node_of(int32_t k, float log_odds) const {
@@ -111,15 +111,15 @@ class MeanField {
     return sigmoid(node.unary + message / weight);
   }
 
-  // How far two can be of one surface.
+  // Likelihood that two surfels lie on one surface.
   float coplanarity(const Node& a, const Node& b) const {
     const Vecf offset = b.mean - a.mean;
     const float distance = std::max(std::abs(a.normal.dot(offset)), std::abs(b.normal.dot(offset)));
-    const float union_length = distance / static_cast<float>(options_.coplanar_std);
-    return std::exp(-0.5f * union_length * union_length);
+    const float sigmas = distance / static_cast<float>(options_.coplanar_std);
+    return std::exp(-0.5f * sigmas * sigmas);
   }
 
-  // Asks in the next round those beside whom somebody thinks otherwise than before.
+  // Activates the neighbours of changed surfels; returns whether there are any.
   bool mark_neighbours_of_changed(const std::vector<float>& previous,
                                   std::vector<uint8_t>& active) const {
     std::fill(active.begin(), active.end(), uint8_t{0});

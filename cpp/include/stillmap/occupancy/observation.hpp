@@ -1,4 +1,4 @@
-// A look: what the beams of a short time say about the elements of a surface.
+// Observations of surfels: evidence of the beams of one time bin.
 #pragma once
 
 #include <algorithm>
@@ -10,41 +10,40 @@
 namespace stillmap {
 
 struct ObservationOptions {
-  double bin_seconds;         // between successive looks
-  double lateral_std;         // cells: how far a beam may pass beside where it seems to
-  double margin;              // cells: how far behind an element a beam must end to have passed it
-  double hit_radius;          // cells: hits so near to an element are hits of it
-  double end_margin;          // cells before its end up to which a maximum-range beam is trusted
-  double trust_beyond_solid;  // how far to trust a beam without a return beyond the first solid
-                              // element
-  bool use_normals;           // whether surfaces face somewhere; else every element is round
+  double bin_seconds;  // length of a time bin
+  double lateral_std;  // cells, standard deviation of a beam's lateral position
+  double margin;       // cells, distance by which a beam must end behind a surfel to be a miss
+  double hit_radius;   // cells, hits spread to neighbours within this radius
+  double end_margin;   // cells before the end of a beam without a return that do not count
+  double trust_beyond_solid;  // reliability of no-return beams behind the first solid surfel
+  bool use_normals;           // false: all surfels are isotropic
 };
 
-// Beams without a return that are not alone, and those of them that cross something solid.
+// Number of beams without a return in runs, and of those that cross a solid surfel.
 struct NoReturnStats {
   int64_t beam_count = 0, through_solid = 0;
 };
 
-// What one look says about one element.
+// Observation of one surfel in one time bin: a hit, or a miss with a reliability.
 struct Observation {
   static constexpr float kHit = 2.0f;
   int32_t surfel;
-  float reliability;  // probability in (0, 1] that some beam met the element's place, or kHit
+  float reliability;  // kHit, or P(some beam intersected the surfel's extent) in (0, 1]
 };
 
-// What one look says, sorted by spans of elements: what is known of the elements of a span fits a
-// cache, and many looks are applied to one span before the next.
+// Observations of one time bin, grouped by spans of surfels. The state of one span fits the cache,
+// so many bins are applied to a span before the next.
 struct ObservationBatch {
-  static constexpr int32_t kSpan = 2048;  // elements
+  static constexpr int32_t kSpan = 2048;  // surfels
   std::vector<Observation> observations;
-  std::vector<size_t> begin;  // of each span, and the end
+  std::vector<size_t> begin;  // first observation of each span, and the end
 
   static size_t span_of(int32_t surfel) { return static_cast<size_t>(surfel / kSpan); }
   static size_t n_spans(size_t surfels) { return (surfels + kSpan - 1) / kSpan; }
 };
 
-// Probability that a beam meets what extends `half` to both sides and which it seems to pass at a
-// distance, known up to `lateral`; from tables, for every beam asks for it in every cell.
+// Tabulated probability that a beam intersects an extent of +- half_extent when it passes at
+// `offset`, with Gaussian lateral noise. Lengths in cells.
 class IntersectionTables {
  public:
   explicit IntersectionTables(double lateral_std)
@@ -58,16 +57,15 @@ class IntersectionTables {
     }
   }
 
-  static constexpr double kIsotropicHalfExtent =
-      0.5;  // half extent of what is no surface, in cells
+  static constexpr double kIsotropicHalfExtent = 0.5;  // of a surfel without a plane, in cells
 
   float operator()(float half_extent, float offset) const {
     return cdf((half_extent - offset) * inverse_lateral_std_) -
            cdf((-half_extent - offset) * inverse_lateral_std_);
   }
   float isotropic(float offset_squared) const {
-    const float at = offset_squared * kPerSquaredUnit;
-    return at < kMaxSquared * kPerSquaredUnit ? isotropic_[static_cast<size_t>(at)] : 0.0f;
+    const float index = offset_squared * kPerSquaredUnit;
+    return index < kMaxSquared * kPerSquaredUnit ? isotropic_[static_cast<size_t>(index)] : 0.0f;
   }
 
  private:

@@ -1,4 +1,4 @@
-// Follows the beams of one look: which elements they hit, and which they saw through.
+// Ray casting of the beams of one time bin: which surfels they hit and which they missed.
 #pragma once
 
 #include <algorithm>
@@ -21,8 +21,7 @@
 
 namespace stillmap {
 
-// Whether an element is one of a surface on which many beams ended: it is there for sure, at least
-// at times.
+// Whether a surfel is part of a plane on which many beams ended.
 template <int D>
 inline bool is_solid(const SurfelMap<D>& surfel_map, int32_t k, bool use_normals) {
   constexpr int64_t kMinBeams = 10;
@@ -30,7 +29,7 @@ inline bool is_solid(const SurfelMap<D>& surfel_map, int32_t k, bool use_normals
          surfel_map.beam_count(k) >= kMinBeams;
 }
 
-// Where a beam stops being one that tells of free space; nothing, if it is too short to tell.
+// End of the free part of a beam; nullopt if there is none.
 template <int D>
 inline std::optional<Vec<D>> free_space_end(const BeamSegment<D>& beam, bool hit,
                                             double end_margin) {
@@ -41,22 +40,22 @@ inline std::optional<Vec<D>> free_space_end(const BeamSegment<D>& beam, bool hit
   return Vec<D>(beam.start + chord / length * usable);
 }
 
-// Of the beams of scans [first, last) without a return, what else is known of the surface.
+// Counts beams without a return in the scans [first, last).
 template <int D>
 inline NoReturnStats count_no_return_beams(const SurfelMap<D>& surfel_map,
-                                           const SurfelBitmap<D>& tiles,
+                                           const SurfelBitmap<D>& bitmap,
                                            const ObservationOptions& options, const Scans<D>& scans,
                                            size_t first, size_t last) {
   NoReturnStats stats;
-  SurfelTraversal<D> crossing(surfel_map, tiles);
+  SurfelTraversal<D> traversal(surfel_map, bitmap);
   for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
-    if (scans.hit[n] || !has_no_return_neighbours(scans, t, n)) return;
+    if (scans.hit[n] || !in_no_return_run(scans, t, n)) return;
     ++stats.beam_count;
     const BeamSegment<D> beam(pose, scans.points + n * D, surfel_map.resolution());
     const std::optional<Vec<D>> end = free_space_end(beam, false, options.end_margin);
     bool through = false;
     if (end)
-      crossing.traverse_marked(beam.start, *end, tiles.bits(), [&](const auto& crossing) {
+      traversal.traverse_marked(beam.start, *end, bitmap.bits(), [&](const auto& crossing) {
         through |= is_solid(surfel_map, crossing.surfel, options.use_normals);
       });
     stats.through_solid += through;
@@ -64,40 +63,40 @@ inline NoReturnStats count_no_return_beams(const SurfelMap<D>& surfel_map,
   return stats;
 }
 
-// Collects the beams of one look.
+// Collects the observations of one time bin.
 template <int D>
 class ObservationCollector {
  public:
-  ObservationCollector(const SurfelMap<D>& surfel_map, const SurfelBitmap<D>& tiles,
+  ObservationCollector(const SurfelMap<D>& surfel_map, const SurfelBitmap<D>& bitmap,
                        const SurfelNeighbours<D>& neighbours, const ObservationOptions& options,
                        const IntersectionTables& tables)
       : surfel_map_(surfel_map),
-        bitmap_(tiles),
+        bitmap_(bitmap),
         neighbours_(neighbours),
         options_(options),
         margin_(static_cast<float>(options.margin)),
         tables_(tables),
         states_(surfel_map.size()),
         touched_(ObservationBatch::n_spans(surfel_map.size())),
-        open_bits_(tiles.bits()),
-        crossing_(surfel_map, tiles) {
+        open_bits_(bitmap.bits()),
+        traversal_(surfel_map, bitmap) {
     for (size_t k = 0; k < states_.size(); ++k)
       states_[k] = state_of(surfel_map, static_cast<int32_t>(k), options.use_normals);
   }
 
   void add(const Scans<D>& scans, size_t first, size_t last) {
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
-      if (!scans.hit[n] && !has_no_return_neighbours(scans, t, n)) return;
+      if (!scans.hit[n] && !in_no_return_run(scans, t, n)) return;
       const BeamSegment<D> beam(pose, scans.points + n * D, surfel_map_.resolution());
       const bool has_length = record_pass(beam, scans.hit[n]);
       if (!scans.hit[n]) return;
       const Cell<D> end = cell_of<D>(beam.end);
-      const int32_t k = has_length ? crossing_.surfel_at_end(end) : bitmap_.surfel(end);
+      const int32_t k = has_length ? traversal_.surfel_at_end(end) : bitmap_.surfel(end);
       if (k != kNoSurfel && record_hit(k)) hit_surfels_.push_back(k);
     });
   }
 
-  // What the look says, and a clean sheet for the next one.
+  // Writes the observations to `out` and resets the collector.
   void take_batch(ObservationBatch& out) {
     spread_hits();
     out.observations.clear();
@@ -119,38 +118,40 @@ class ObservationCollector {
  private:
   using Vecf = Eigen::Matrix<float, D, 1>;
   static constexpr float kHitMark = -1.0f, kUntouched = 2.0f;
-  static constexpr float kSaturated = 0.05f;  // more beams of the same look would change nothing
+  static constexpr float kSaturated = 0.05f;  // further beams of the time bin are skipped
   static constexpr float kMaxMissed = 0.98f;
 
-  // What a beam has to know of an element, in few bytes: most of the time goes into fetching them.
+  // Per-surfel data in few bytes, since memory access dominates the run time.
   struct SurfelState {
-    float p_missed = kUntouched;    // probability that every beam of this look went past
-    std::array<int16_t, D> centre;  // seen from the cell's corner, in units of 1 / kUnit
-    std::array<int16_t, D> normal;  // likewise
-    int16_t half_extent;            // likewise; zero: no surface
-    bool is_solid;                  // a surface that many beams ended on
+    float p_missed = kUntouched;    // P(all beams of this time bin missed)
+    std::array<int16_t, D> centre;  // from the cell's corner, in units of 1 / kUnit
+    std::array<int16_t, D> normal;  // same unit; zero: isotropic
+    int16_t half_extent;            // same unit; zero: isotropic
+    bool is_solid;                  // see is_solid()
 
     static constexpr float kUnit = 4096.0f;
     static int16_t pack(double value) { return static_cast<int16_t>(std::lround(value * kUnit)); }
-    static Vecf unpack(const std::array<int16_t, D>& pack) {
+    static Vecf unpack(const std::array<int16_t, D>& packed) {
       Vecf v;
-      for (int d = 0; d < D; ++d) v[d] = pack[static_cast<size_t>(d)] * (1.0f / kUnit);
+      for (int d = 0; d < D; ++d) v[d] = packed[static_cast<size_t>(d)] * (1.0f / kUnit);
       return v;
     }
   };
 
   static SurfelState state_of(const SurfelMap<D>& surfel_map, int32_t k, bool use_normals) {
-    const Surfel<D>& e = surfel_map.surfel(k);
-    const bool planar = use_normals && !e.normal.isZero(0.0);
-    const Vec<D> centre = (planar ? e.centre : e.mean) - surfel_map.cell(k).template cast<double>();
+    const Surfel<D>& surfel = surfel_map.surfel(k);
+    const bool planar = use_normals && !surfel.normal.isZero(0.0);
+    const Vec<D> centre =
+        (planar ? surfel.centre : surfel.mean) - surfel_map.cell(k).template cast<double>();
     SurfelState state;
     for (int d = 0; d < D; ++d) {
       state.centre[static_cast<size_t>(d)] = SurfelState::pack(std::clamp(centre[d], -7.9, 7.9));
-      state.normal[static_cast<size_t>(d)] = planar ? SurfelState::pack(e.normal[d]) : int16_t{0};
+      state.normal[static_cast<size_t>(d)] =
+          planar ? SurfelState::pack(surfel.normal[d]) : int16_t{0};
     }
     state.is_solid = is_solid(surfel_map, k, use_normals);
     state.half_extent =
-        planar ? SurfelState::pack(std::clamp(e.half_extent, 1e-3, 7.0)) : int16_t{0};
+        planar ? SurfelState::pack(std::clamp(surfel.half_extent, 1e-3, 7.0)) : int16_t{0};
     return state;
   }
 
@@ -159,7 +160,7 @@ class ObservationCollector {
     return p_missed < kSaturated ? 1.0f : 1.0f - p_missed;
   }
 
-  // Whether that is news.
+  // Marks a hit; false if it was marked before.
   bool record_hit(int32_t k) {
     float& p_missed = states_[static_cast<size_t>(k)].p_missed;
     if (p_missed == kHitMark) return false;
@@ -172,14 +173,14 @@ class ObservationCollector {
     return true;
   }
 
-  // Of the element in a cell more beams of this look tell nothing.
+  // Excludes a cell from further traversals of this time bin.
   void close(size_t block, const Cell<D>& cell) {
     auto& bits_left = open_bits_[block];
     if (bits_left.tiles == bitmap_.bits()[block].tiles) closed_blocks_.push_back(block);
     bits_left.clear(cell);
   }
 
-  // A beam in single precision, from the corner of the cell in which it starts.
+  // Ray in single precision, relative to the corner of its start cell.
   struct LocalRay {
     Cell<D> corner;
     Vecf start, direction;
@@ -187,9 +188,8 @@ class ObservationCollector {
     bool hit;
   };
 
-  // Lists the elements whose cells a beam crosses before it ends, of which it may tell anything;
-  // returns whether it has a length. The end cell is not visited: an end in it is a hit, and free
-  // range stops before it.
+  // Lists the surfels along the free part of a beam that may still change; nullopt for a beam of no
+  // length. The end cell is not visited: a return in it is a hit, and the free part ends before it.
   std::optional<LocalRay> list_crossings(const BeamSegment<D>& beam, bool hit) {
     crossings_.clear();
     const Vec<D> chord = beam.end - beam.start;
@@ -197,20 +197,19 @@ class ObservationCollector {
     const std::optional<Vec<D>> end = free_space_end(beam, hit, options_.end_margin);
     if (!end || !(length > 0.0)) return std::nullopt;
     const Vec<D> direction = chord / length;
-    // what is solid stops one without a return, whether it is known to be there or not
-    crossing_.traverse_marked(beam.start, *end, hit ? open_bits_ : bitmap_.bits(),
-                              [&](const auto& crossing) {
-                                __builtin_prefetch(states_.data() + crossing.surfel, 1);
-                                crossings_.push_back(crossing);
-                              });
+    // solid surfels stop beams without a return, so these need all cells
+    traversal_.traverse_marked(beam.start, *end, hit ? open_bits_ : bitmap_.bits(),
+                               [&](const auto& crossing) {
+                                 __builtin_prefetch(states_.data() + crossing.surfel, 1);
+                                 crossings_.push_back(crossing);
+                               });
     const Cell<D> corner = cell_of<D>(beam.start);
     return LocalRay{corner, (beam.start - corner.template cast<double>()).template cast<float>(),
                     direction.template cast<float>(), static_cast<float>(length), hit};
   }
 
-  // Notes what the beam passed. One without a return passed what lies before the first solid
-  // element in its way; that it did not end there without an echo is only so sure. Returns whether
-  // it has a length.
+  // Updates p_missed of the surfels that a beam passed. Behind the first solid surfel a beam
+  // without a return counts by trust_beyond_solid. Returns false for a beam of no length.
   bool record_pass(const BeamSegment<D>& beam, bool hit) {
     const std::optional<LocalRay> ray = list_crossings(beam, hit);
     if (!ray) return false;
@@ -232,8 +231,7 @@ class ObservationCollector {
     return true;
   }
 
-  // Of the beam crossing the surface within the element, as far as `lateral` lets one tell: small
-  // at grazing angles.
+  // P(the beam intersects the surfel's extent) given the lateral noise; small at grazing incidence.
   float intersection_probability(const SurfelState& state, const Cell<D>& cell,
                                  const LocalRay& ray) const {
     const Vecf off =
@@ -266,14 +264,13 @@ class ObservationCollector {
   float margin_;
   const IntersectionTables& tables_;
   std::vector<SurfelState> states_;
-  std::vector<std::vector<int32_t>> touched_;  // by spans
+  std::vector<std::vector<int32_t>> touched_;  // by span
   std::vector<int32_t> hit_surfels_;
-  std::vector<typename SurfelTraversal<D>::Crossing>
-      crossings_;  // of one beam: fetched all at once, then looked at
+  std::vector<typename SurfelTraversal<D>::Crossing> crossings_;  // of one beam, prefetched
   std::vector<typename SurfelBitmap<D>::BlockBits>
-      open_bits_;                      // cells of which more beams of this look tell more
-  std::vector<size_t> closed_blocks_;  // blocks in which some do not
-  SurfelTraversal<D> crossing_;
+      open_bits_;                      // cells that further beams may change
+  std::vector<size_t> closed_blocks_;  // with excluded cells
+  SurfelTraversal<D> traversal_;
 };
 
 }  // namespace stillmap

@@ -1,6 +1,5 @@
-// In how many looks a cell was looked at, and in how many of them nothing that moves was near: what
-// was seen within a look tells no more than one glance, and where somebody stood at every glance
-// nothing is known of the place itself.
+// Per cell, the number of time bins in which it was observed, and in which it was observed without
+// a dynamic object nearby. Beams within a time bin count once, since they are correlated.
 #pragma once
 
 #include <algorithm>
@@ -27,11 +26,11 @@
 
 namespace stillmap {
 
-// Of one cell. Looks are numbered from 1 as they come.
+// Counts of one cell. Time bins are numbered from 1 in order of arrival.
 struct CellVisits {
-  uint32_t last_seen = 0;       // the last look that saw it
-  uint32_t last_disturbed = 0;  // the last look in which something that moves was near
-  uint16_t observed = 0;        // these count no further than they can
+  uint32_t last_seen = 0;       // last time bin that observed it
+  uint32_t last_disturbed = 0;  // last time bin with a dynamic object nearby
+  uint16_t observed = 0;        // saturates
   uint16_t clear = 0;
 };
 
@@ -39,11 +38,10 @@ template <int D>
 class ObservationCounts : public BlockMap<D, CellVisits> {
  public:
   using Block = typename BlockMap<D, CellVisits>::Block;
-  static constexpr int kMaxRadiusCells = D == 2 ? 1024 : 128;  // cells
+  static constexpr int kMaxRadiusCells = D == 2 ? 1024 : 128;
 
-  // radius: metres around the end of a beam on something that moves within which a cell is not
-  // clear, from the middle of the end cell to its own; lost: how far beams without a return are
-  // believed, null: all of their way
+  // radius: metres between the centres of a cell and of the end cell of a dynamic beam within which
+  // the cell is not clear; no_return: trusted range of beams without a return, null: all of it.
   ObservationCounts(double resolution, double radius,
                     std::shared_ptr<const NoReturnBeams<D>> no_return)
       : resolution_(resolution),
@@ -71,22 +69,22 @@ class ObservationCounts : public BlockMap<D, CellVisits> {
 
   size_t memory_bytes() const { return this->blocks().size() * (sizeof(Block) + 64); }
 
-  // dynamic (M,): which hits ended on something that moves. look (T,): number of each scan's look,
-  // not falling, and all of them beyond those that were added before.
-  void add(const Scans<D>& scans, const bool* dynamic, const int64_t* time_bin, int threads) {
+  // is_dynamic (M,): returns from moving objects. time_bin (T,): time bin of each scan,
+  // non-decreasing and later than in previous calls.
+  void add(const Scans<D>& scans, const bool* is_dynamic, const int64_t* time_bin, int threads) {
     if (scans.n_scans == 0) return;
     if (time_bin[0] <= last_time_bin_)
       throw std::invalid_argument("look: was added to before, or falls");
     for (size_t t = 1; t < scans.n_scans; ++t)
       if (time_bin[t] < time_bin[t - 1]) throw std::invalid_argument("look: must not fall");
     auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
-    for (size_t& t : bounds)  // no look is cut
+    for (size_t& t : bounds)  // keep the scans of a time bin together
       while (t > 0 && t < scans.n_scans && time_bin[t] == time_bin[t - 1]) ++t;
     std::vector<ObservationCounts> thread_counts;
     for (size_t i = 2; i < bounds.size(); ++i)
       thread_counts.emplace_back(resolution_, radius_, no_return_);
     parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
-      (i == 0 ? *this : thread_counts[i - 1]).add_range(scans, dynamic, time_bin, first, last);
+      (i == 0 ? *this : thread_counts[i - 1]).add_range(scans, is_dynamic, time_bin, first, last);
     });
     for (const auto& other : thread_counts) merge(other);
     last_time_bin_ = time_bin[scans.n_scans - 1];
@@ -95,25 +93,25 @@ class ObservationCounts : public BlockMap<D, CellVisits> {
  private:
   static constexpr uint16_t kMaxCount = std::numeric_limits<uint16_t>::max();
 
-  void add_range(const Scans<D>& scans, const bool* dynamic, const int64_t* time_bin, size_t first,
-                 size_t last) {
+  void add_range(const Scans<D>& scans, const bool* is_dynamic, const int64_t* time_bin,
+                 size_t first, size_t last) {
     BlockCursor<ObservationCounts> cursor(*this);
     for (size_t t = first; t < last;) {
       size_t end = t + 1;
       while (end < last && time_bin[end] == time_bin[t]) ++end;
       ++bin_;
-      mark_dynamic(cursor, scans, dynamic, t, end);
+      mark_dynamic(cursor, scans, is_dynamic, t, end);
       count_observed(cursor, scans, t, end);
       t = end;
     }
   }
 
-  // Marks the cells near the ends of beams on what moves.
+  // Marks the cells near the end points of dynamic beams.
   void mark_dynamic(BlockCursor<ObservationCounts>& cursor, const Scans<D>& scans,
-                    const bool* dynamic, size_t first, size_t last) {
+                    const bool* is_dynamic, size_t first, size_t last) {
     std::vector<Cell<D>> ends;
     for_each_beam<D>(scans, first, last, [&](size_t, int64_t n, const Pose<D>& pose) {
-      if (scans.hit[n] && dynamic[n])
+      if (scans.hit[n] && is_dynamic[n])
         ends.push_back(cell_of<D>(BeamSegment<D>(pose, scans.points + n * D, resolution_).end));
     });
     const auto less = [](const Cell<D>& a, const Cell<D>& b) {
@@ -121,8 +119,8 @@ class ObservationCounts : public BlockMap<D, CellVisits> {
     };
     std::sort(ends.begin(), ends.end(), less);
     ends.erase(std::unique(ends.begin(), ends.end()), ends.end());
-    const double max_squared =
-        radius_cells_ * radius_cells_ * (1.0 + 1e-9);  // whole numbers of cells are within
+    // the tolerance includes cells at exactly the radius
+    const double max_squared = radius_cells_ * radius_cells_ * (1.0 + 1e-9);
     for (const Cell<D>& end : ends)
       for_each_in_cube<D>(end, static_cast<int>(radius_cells_ + 1e-9), [&](const Cell<D>& cell) {
         if ((cell - end).template cast<double>().squaredNorm() <= max_squared)
@@ -130,7 +128,8 @@ class ObservationCounts : public BlockMap<D, CellVisits> {
       });
   }
 
-  // Counts the cells that beams cross or end in, those that `add_scans` and `add_lost` add to.
+  // Counts the cells that beams cross or end in, those that add_scans and add_no_return_beams
+  // update.
   void count_observed(BlockCursor<ObservationCounts>& cursor, const Scans<D>& scans, size_t first,
                       size_t last) {
     const auto is_nonzero = [](double length) { return to_fixed(length) != 0; };
@@ -146,7 +145,7 @@ class ObservationCounts : public BlockMap<D, CellVisits> {
     for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
       const BeamSegment<D> beam(pose, scans.points + n * D, resolution_);
       if (walk && !scans.hit[n]) {
-        walk->traverse_beam(beam, has_no_return_neighbours(scans, t, n));
+        walk->traverse_beam(beam, in_no_return_run(scans, t, n));
         return;
       }
       traverse<D>(beam.start, beam.end, walker);
@@ -169,7 +168,7 @@ class ObservationCounts : public BlockMap<D, CellVisits> {
     return static_cast<uint16_t>(std::min<uint32_t>(uint32_t{a} + b, kMaxCount));
   }
 
-  // looks of their own alone
+  // Adds the counts of disjoint time bins.
   void merge(const ObservationCounts& other) {
     for (const auto& source : other.blocks()) {
       Block* target = find_or_add(source->origin);
@@ -183,7 +182,7 @@ class ObservationCounts : public BlockMap<D, CellVisits> {
 
   double resolution_;
   double radius_;
-  double radius_cells_;  // the same in cells
+  double radius_cells_;  // radius in cells
   std::shared_ptr<const NoReturnBeams<D>> no_return_;
   uint32_t bin_ = 0;
   int64_t last_time_bin_ = std::numeric_limits<int64_t>::min();

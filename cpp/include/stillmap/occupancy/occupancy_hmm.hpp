@@ -1,11 +1,11 @@
-// How probable what was seen of a cell is, for things that stay for different times.
+// Occupancy HMM per surfel (Meyer-Delius et al. 2012): likelihood of its observations under classes
+// of objects that stay for different times.
 //
-// A cell is occupied or empty, a two-state Markov chain: occupied for a share rho of the time, with
-// correlation exp(-dt / tau); or, of what can be seen from some places only, from a share rho of
-// them, with a correlation over the view instead of the time. Each look at it sees something there,
-// which something occupying it must have caused; or sees through it, which an occupied cell lets
-// happen with probability 1 - detection * reliability. What stands still is the chain with rho near
-// one.
+// Each class is a two-state Markov chain (occupied, empty) with stationary probability rho of being
+// occupied and correlation exp(-dt / tau), or with a correlation over the viewing angle for what is
+// visible from some places only. An observation is a hit, which needs an occupied cell, or a miss,
+// which an occupied cell allows with probability 1 - p_detection * reliability. The static class is
+// the one with rho near one.
 #pragma once
 
 #include <algorithm>
@@ -31,8 +31,8 @@
 
 namespace stillmap {
 
-// The likelihood of everything seen of each element under each class, look after look. Memory is
-// that of the elements; looks come in the order of time.
+// Forward algorithm over the observations of all surfels. Memory is proportional to the number of
+// surfels; time bins arrive in order.
 template <int D>
 class OccupancyHmm {
  public:
@@ -45,26 +45,26 @@ class OccupancyHmm {
         bitmap_(surfel_map),
         chains_(surfel_means(surfel_map), std::move(classes), options.bin_seconds) {}
 
-  OccupancyHmm(const OccupancyHmm&) = delete;  // what collects looks refers to it
+  OccupancyHmm(const OccupancyHmm&) = delete;  // collectors refer to it
   OccupancyHmm& operator=(const OccupancyHmm&) = delete;
 
   size_t classes() const { return chains_.size(); }
   const SurfelMap<D>& surfel_map() const { return surfel_map_; }
 
-  // Beams without a return, and those of them that cross something solid.
+  // Counts beams without a return, and those of them that cross something solid.
   NoReturnStats no_return_stats(const Scans<D>& scans, int threads = 1) const {
     const auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
-    std::vector<NoReturnStats> shares(bounds.size() - 1);
+    std::vector<NoReturnStats> partial(bounds.size() - 1);
     parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
-      shares[i] = count_no_return_beams(surfel_map_, bitmap_, options_, scans, first, last);
+      partial[i] = count_no_return_beams(surfel_map_, bitmap_, options_, scans, first, last);
     });
-    for (size_t i = 1; i < shares.size(); ++i) {
-      shares[0].beam_count += shares[i].beam_count;
-      shares[0].through_solid += shares[i].through_solid;
+    for (size_t i = 1; i < partial.size(); ++i) {
+      partial[0].beam_count += partial[i].beam_count;
+      partial[0].through_solid += partial[i].through_solid;
     }
-    return shares[0];
+    return partial[0];
   }
-  // The cells in which beams without a return meet something solid.
+  // Cells in which a beam without a return meets a solid surfel.
   std::vector<Cell<D>> solid_cells() const {
     std::vector<Cell<D>> cells;
     for (size_t i = 0; i < surfel_map_.size(); ++i)
@@ -72,24 +72,23 @@ class OccupancyHmm {
         cells.push_back(surfel_map_.cell(k));
     return cells;
   }
-  // How far to trust them beyond the first solid element, from now on.
+  // Reliability of beams without a return behind the first solid surfel, for later scans.
   void set_trust_beyond_solid(double trust_beyond_solid) {
     options_.trust_beyond_solid = trust_beyond_solid;
     release_buffers();
   }
-  // From now on asks, too, which elements are of things that were put there or taken away.
-  // courses: what became of each, too, not only how probable that is.
-  void track_changes(const ChangeOptions& model, bool with_paths = true) {
+  // Also runs a ChangeHmm on all later observations; with_paths: including state paths.
+  void track_changes(const ChangeOptions& options, bool with_paths = true) {
     if (last_time_bin_ != kNoTimeBin) throw std::invalid_argument("watch: before the first look");
-    change_hmm_.emplace(surfel_map_.size(), model, options_.bin_seconds, with_paths);
+    change_hmm_.emplace(surfel_map_.size(), options, options_.bin_seconds, with_paths);
   }
   const ChangeHmm& change_hmm() const {
     if (!change_hmm_) throw std::invalid_argument("changes: nobody asked to watch for them");
     return *change_hmm_;
   }
 
-  // look (T,): number of each scan's look, not falling, and not below those added before. place
-  // (T, D): in metres, where the robot stood; null: where the sensors did.
+  // time_bin (T,): of each scan, non-decreasing over all calls. positions (T, D): robot positions
+  // in metres; null: those of the sensors.
   void add(const Scans<D>& scans, const int64_t* time_bin, const double* positions, int threads) {
     const size_t T = scans.n_scans;
     for (size_t t = 0; t < T; ++t)
@@ -99,7 +98,7 @@ class OccupancyHmm {
         !(ChangeHmm::is_valid_time_bin(time_bin[0]) &&
           ChangeHmm::is_valid_time_bin(time_bin[T - 1])))
       throw std::invalid_argument("look: expected 0 to 2147483647");
-    std::vector<size_t> bin_starts;  // of looks
+    std::vector<size_t> bin_starts;  // first scan of each time bin
     for (size_t t = 0; t < T; ++t)
       if (t == 0 || time_bin[t] != time_bin[t - 1]) bin_starts.push_back(t);
     bin_starts.push_back(T);
@@ -110,15 +109,15 @@ class OccupancyHmm {
       make_collectors(n);
       process(scans, time_bin, positions, bin_starts, n);
     } catch (...) {
-      release_buffers();  // sheets are half written
+      release_buffers();  // collectors are in an undefined state
       throw;
     }
     if (T) last_time_bin_ = time_bin[T - 1];
   }
 
-  // (n, among): likelihood of everything else that was seen of n of the cells, given that a beam
-  // ended in each, under some of the classes, relative to the best of them; and the logarithm of
-  // the best. The cells are first, first + every, ...
+  // Likelihood (n, among) of all observations of n surfels, given that one is a hit, under some of
+  // the classes, relative to the best of these, and its logarithm (n,). The surfels are first,
+  // first + stride, ...
   void likelihood(const std::vector<size_t>& among, size_t first, size_t stride, size_t n,
                   int threads, float* relative, double* log_best) const {
     parallel_for_ranges(split_evenly(n, threads), [&](size_t, size_t from, size_t to) {
@@ -127,11 +126,11 @@ class OccupancyHmm {
     });
   }
 
-  // Nothing is kept that only the next looks would want; they would make it anew.
+  // Frees the collectors; later scans allocate them again.
   void release_buffers() { collectors_.clear(); }
 
  private:
-  static constexpr size_t kBatchBins = 64;  // looks held at once
+  static constexpr size_t kBatchBins = 64;  // time bins per batch
   static constexpr int64_t kNoTimeBin = std::numeric_limits<int64_t>::min();
 
   static const SurfelMap<D>& require_fitted(const SurfelMap<D>& surfel_map) {
@@ -191,7 +190,7 @@ class OccupancyHmm {
     }
   }
 
-  // Mean place in those scans, in cells. Of several sensors in turn it would go to and fro.
+  // Mean position in cells over some scans: with several sensors it is smoother than their own.
   Eigen::Vector3d mean_position(const Scans<D>& scans, const double* positions, size_t first,
                                 size_t last) const {
     using Position = Eigen::Matrix<double, D, 1>;
@@ -203,16 +202,16 @@ class OccupancyHmm {
     return sum / (static_cast<double>(last - first) * surfel_map_.resolution());
   }
 
-  void apply_batch(const ObservationBatch& batches, size_t span, int64_t time_bin,
-                   int32_t viewpoints) {
-    for (size_t i = batches.begin[span]; i < batches.begin[span + 1]; ++i) {
-      const auto k = static_cast<size_t>(batches.observations[i].surfel);
-      const float reliability = batches.observations[i].reliability;
+  void apply_batch(const ObservationBatch& batch, size_t span, int64_t time_bin,
+                   int32_t viewpoint) {
+    for (size_t i = batch.begin[span]; i < batch.begin[span + 1]; ++i) {
+      const auto k = static_cast<size_t>(batch.observations[i].surfel);
+      const float reliability = batch.observations[i].reliability;
       if (reliability == Observation::kHit) {
-        chains_.hit(k, viewpoints);
+        chains_.hit(k, viewpoint);
         if (change_hmm_) change_hmm_->hit(k, time_bin);
       } else {
-        chains_.miss(k, viewpoints, reliability);
+        chains_.miss(k, viewpoint, reliability);
         if (change_hmm_) change_hmm_->miss(k, time_bin, reliability);
       }
     }
@@ -225,12 +224,12 @@ class OccupancyHmm {
   SurfelBitmap<D> bitmap_;
   TwoStateChains<D == 2 ? 8 : 4> chains_;
   std::optional<ChangeHmm> change_hmm_;
-  // one for each thread; each has a sheet as large as the map
+  // one per thread, each of the size of the map
   std::vector<std::unique_ptr<ObservationCollector<D>>> collectors_;
   int64_t last_time_bin_ = kNoTimeBin;
 };
 
-// The element each beam ended in: kNoElement for those that were not hit or ended elsewhere.
+// Surfel that each beam is associated with; kNoSurfel without a return or where there is none.
 template <int D>
 inline void associate_beams(const SurfelMap<D>& surfel_map, const Scans<D>& scans, int threads,
                             int32_t* surfel) {

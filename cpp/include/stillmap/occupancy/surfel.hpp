@@ -1,4 +1,4 @@
-// What is known of the cells in which beams ended.
+// Surfels and the sums over end points from which they are fitted.
 #pragma once
 
 #include <algorithm>
@@ -10,24 +10,24 @@
 
 namespace stillmap {
 
-// Everything in units of cells.
+// Surface element of one cell, in units of cells.
 template <int D>
 struct Surfel {
   Vec<D> mean = Vec<D>::Zero();    // of the end points in the cell
-  Vec<D> normal = Vec<D>::Zero();  // unit length; zero where the surroundings are no surface
-  double centre_to_plane = 0.0;    // of the cell's centre from the surface around it
-  double prominence = 1.0;         // its beams against those of the richest cell around
-  Vec<D> centre = Vec<D>::Zero();  // of the surface around it, else the mean
-  double half_extent = 0.5;        // how far it extends from there for sure
+  Vec<D> normal = Vec<D>::Zero();  // unit length; zero: isotropic, no plane was fitted
+  double centre_to_plane = 0.0;    // signed distance from the cell's centre to the plane
+  double prominence = 1.0;         // beams in the cell / beams in the fullest cell of the window
+  Vec<D> centre = Vec<D>::Zero();  // of the fitted plane patch; without a plane, the mean
+  double half_extent = 0.5;        // half extent of the plane patch
 };
 
 constexpr int64_t kMaxTimeBin = std::numeric_limits<int32_t>::max();
 
-// First and last look at which beams ended in a cell.
+// First and last time bin with a return in a cell.
 struct TimeSpan {
   int32_t first = static_cast<int32_t>(kMaxTimeBin), last = -1;
 
-  void include(int64_t time_bin) {
+  void extend(int64_t time_bin) {
     first = std::min(first, static_cast<int32_t>(time_bin));
     last = std::max(last, static_cast<int32_t>(time_bin));
   }
@@ -41,8 +41,8 @@ struct EndPointSums {
 
   Cell<D> cell;
   int64_t count = 0;
-  std::array<Fixed, D> first{};           // of end point - cell corner
-  std::array<Fixed, kProducts> second{};  // of its products, by rows of the upper triangle
+  std::array<Fixed, D> first{};           // sum of x = end point - cell corner
+  std::array<Fixed, kProducts> second{};  // sum of x x^T, upper triangle by rows
   TimeSpan hit_span;
 
   void add(const Vec<D>& end) {
@@ -54,7 +54,7 @@ struct EndPointSums {
       for (int j = i; j < D; ++j) second[product++] += to_fixed(x[i] * x[j]);
     }
   }
-  // those of other end points in the same cell
+  // Adds the sums over other end points in the same cell.
   void add(const EndPointSums& other) {
     count += other.count;
     for (size_t i = 0; i < first.size(); ++i) first[i] += other.first[i];
@@ -64,12 +64,12 @@ struct EndPointSums {
   }
 };
 
-// Count, mean and covariance of the end points in the cells around one.
+// Count, mean and covariance of the end points in a window of cells.
 template <int D>
 struct WindowMoments {
   using Square = Eigen::Matrix<double, D, D>;
 
-  double count = 0.0, max_count = 0.0;  // in all cells, in one
+  double count = 0.0, max_count = 0.0;  // total; largest of any cell
   Vec<D> first = Vec<D>::Zero();
   Square second = Square::Zero();
 

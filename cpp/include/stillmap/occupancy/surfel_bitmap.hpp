@@ -1,4 +1,5 @@
-// Where a surface has elements, as bits: a fraction of its index, which beams ask in every cell.
+// Bitmap of the cells that have surfels: a fraction of the size of the index, so rays can test it
+// in every cell.
 #pragma once
 
 #include <array>
@@ -12,7 +13,7 @@
 
 namespace stillmap {
 
-// Bits that are set. What compilers have for it calls a library, for processors that cannot count.
+// Number of set bits. The builtin calls a library function on processors without popcount.
 constexpr int32_t popcount(uint64_t x) {
   x -= (x >> 1) & 0x5555555555555555u;
   x = (x & 0x3333333333333333u) + ((x >> 2) & 0x3333333333333333u);
@@ -20,38 +21,39 @@ constexpr int32_t popcount(uint64_t x) {
   return static_cast<int32_t>((x * 0x0101010101010101u) >> 56);
 }
 
-// Of a tile of four cells a side, the cells in some of its slices across each axis.
+// Masks of the cells of a tile (4 cells a side) for each set of slices masks an axis: [axis][set
+// of slices].
 template <int D>
 using SliceMasks = std::array<std::array<uint64_t, 16>, D>;
 template <int D>
 constexpr SliceMasks<D> make_slice_masks() {
-  SliceMasks<D> across{};
+  SliceMasks<D> masks{};
   for (size_t d = 0; d < D; ++d)
     for (size_t slices = 0; slices < 16; ++slices)
       for (size_t cell = 0; cell < size_t{1} << (2 * D); ++cell)
-        if (slices >> ((cell >> (2 * d)) & 3) & 1) across[d][slices] |= uint64_t{1} << cell;
-  return across;
+        if (slices >> ((cell >> (2 * d)) & 3) & 1) masks[d][slices] |= uint64_t{1} << cell;
+  return masks;
 }
 template <int D>
 inline constexpr SliceMasks<D> kSliceMasks = make_slice_masks<D>();
 
-// Blocks of a surface, cut into tiles of four cells a side; the elements of a tile have numbers in
-// a row, in the order of its bits.
+// The blocks of a surfel map, cut into tiles of 4 cells a side. Surfels of a tile are numbered
+// consecutively in the order of its bits.
 template <int D>
 class SurfelBitmap {
  public:
   using Mask = std::conditional_t<D == 2, uint16_t, uint64_t>;
-  static constexpr int kShift = 2, kTileEdge = 1 << kShift;  // of a tile
+  static constexpr int kShift = 2, kTileEdge = 1 << kShift;  // edge of a tile, in cells
   static constexpr int kTilesPerEdge = SurfelMap<D>::kEdge >> kShift;
   static constexpr int kTilesPerBlock = SurfelMap<D>::kCells >> (D * kShift);
   using SliceMask = std::conditional_t<D == 2, uint32_t, uint8_t>;
   static constexpr int32_t kNone = -1;
 
-  // Cells of a block.
+  // Set of cells of one block.
   class BlockBits {
    public:
     std::array<Mask, kTilesPerBlock> tiles{};
-    std::array<SliceMask, D> slices{};  // across each axis, that have any
+    std::array<SliceMask, D> slices{};  // slices masks each axis that have set cells
 
     void set(const Cell<D>& cell) {
       tiles[tile_of(cell)] |= bit(bit_of(cell));
@@ -62,17 +64,18 @@ class SurfelBitmap {
     void clear(const Cell<D>& cell) {
       tiles[tile_of(cell)] &= static_cast<Mask>(~bit(bit_of(cell)));
       for (int d = 0; d < D; ++d) {
-        const int at = cell[d] & (SurfelMap<D>::kEdge - 1);
-        if (!any_in_slice(d, at))
-          slices[static_cast<size_t>(d)] &= static_cast<SliceMask>(~(1u << at));
+        const int slice = cell[d] & (SurfelMap<D>::kEdge - 1);
+        if (!any_in_slice(d, slice))
+          slices[static_cast<size_t>(d)] &= static_cast<SliceMask>(~(1u << slice));
       }
     }
 
-    // Calls visit(tile, bit, cell in the block) for those in some of the slices across each axis.
+    // Calls visit(tile, bit, cell in the block) for set cells within sets of slices masks each
+    // axis.
     template <class Visit>
     void for_each_in_slices(const std::array<uint32_t, D>& requested, Visit&& visit) const {
       std::array<std::array<uint64_t, kTilesPerEdge>, D>
-          tile_masks;  // of the tiles along each axis
+          tile_masks;  // of the tile coordinates along each axis
       for (size_t d = 0; d < D; ++d)
         for (size_t i = 0; i < kTilesPerEdge; ++i)
           tile_masks[d][i] = kSliceMasks<D>[d][requested[d] >> (i << kShift) & 15u];
@@ -95,12 +98,12 @@ class SurfelBitmap {
 
    private:
     bool any_in_slice(int axis, int slice) const {
-      const auto at = static_cast<size_t>(slice >> kShift);
-      const uint64_t of =
+      const auto tile = static_cast<size_t>(slice >> kShift);
+      const uint64_t mask =
           kSliceMasks<D>[static_cast<size_t>(axis)][1u << (slice & (kTileEdge - 1))];
       uint64_t any = 0;
       for (size_t t = 0; t < tiles.size(); ++t)
-        if (((t >> (axis * kTileBits)) & (kTilesPerEdge - 1)) == at) any |= tiles[t] & of;
+        if (((t >> (axis * kTileBits)) & (kTilesPerEdge - 1)) == tile) any |= tiles[t] & mask;
       return any != 0;
     }
   };
@@ -123,12 +126,12 @@ class SurfelBitmap {
     }
   }
 
-  // number of a block; kNone where the surface has none
+  // Number of a block; kNone if the map has no such block.
   int32_t block_number(const Cell<D>& block) const {
     const int32_t* page = page_of(block);
     return page ? page[index_in_page(block)] : kNone;
   }
-  // 8 blocks a side; nullptr where there are none
+  // Numbers of the blocks of a page (8 blocks a side); nullptr if it has none.
   const int32_t* page_of(const Cell<D>& block) const {
     if (slots_.empty()) return nullptr;
     const uint64_t key = BlockLayout<D>::key(page_index(block));
@@ -145,10 +148,10 @@ class SurfelBitmap {
   static bool same_page(int32_t a, int32_t b) { return a >> kPageShift == b >> kPageShift; }
   static size_t index_in_page(const Cell<D>& block) { return linear_index<kPageShift>(block); }
 
-  // of each block, where its elements are
+  // Cells with surfels, per block.
   const std::vector<BlockBits>& bits() const { return bits_; }
 
-  // of a cell within its block, and within its tile
+  // Index of a cell's tile within its block, and of a cell's bit within its tile.
   static size_t tile_of(const Cell<D>& cell) {
     Cell<D> tile;
     for (int d = 0; d < D; ++d) tile[d] = cell[d] >> kShift;
@@ -157,11 +160,11 @@ class SurfelBitmap {
   static size_t bit_of(const Cell<D>& cell) { return linear_index<kShift>(cell); }
   static Mask bit(size_t number) { return static_cast<Mask>(Mask{1} << number); }
 
-  // kNoElement where there is none
+  // Surfel of a cell; kNoSurfel if there is none.
   int32_t surfel(const Cell<D>& cell) const {
     return surfel(block_number(BlockLayout<D>::block_of(cell)), cell);
   }
-  // the number of its block is known
+  // The same with the number of its block.
   int32_t surfel(int32_t block, const Cell<D>& cell) const {
     if (block == kNone) return kNoSurfel;
     const size_t tile = tile_of(cell), number = bit_of(cell);
@@ -182,13 +185,13 @@ class SurfelBitmap {
     int32_t page = -1;  // -1: free
   };
 
-  // x runs fastest
+  // Index within a cube of 2^Shift cells a side, x fastest.
   template <int Shift>
   static size_t linear_index(const Cell<D>& cell) {
     constexpr int mask = (1 << Shift) - 1;
-    int place = cell[D - 1] & mask;
-    for (int d = D - 2; d >= 0; --d) place = (place << Shift) | (cell[d] & mask);
-    return static_cast<size_t>(place);
+    int index = cell[D - 1] & mask;
+    for (int d = D - 2; d >= 0; --d) index = (index << Shift) | (cell[d] & mask);
+    return static_cast<size_t>(index);
   }
 
   void add_block(const Cell<D>& block, int32_t number) {
@@ -200,7 +203,7 @@ class SurfelBitmap {
     }
     pages_[static_cast<size_t>(slot.page)][index_in_page(block)] = number;
   }
-  // a free one gets the key
+  // Slot of a key; assigns a free one to a new key.
   Slot& slot_of(uint64_t key) {
     size_t slot = hash_(key) & (slots_.size() - 1);
     while (slots_[slot].page >= 0 && slots_[slot].key != key)
@@ -209,16 +212,16 @@ class SurfelBitmap {
     return slots_[slot];
   }
   void grow() {
-    std::vector<Slot> before(slots_.empty() ? 64 : 2 * slots_.size());
-    before.swap(slots_);
-    for (const Slot& slot : before)
+    std::vector<Slot> old_slots(slots_.empty() ? 64 : 2 * slots_.size());
+    old_slots.swap(slots_);
+    for (const Slot& slot : old_slots)
       if (slot.page >= 0) slot_of(slot.key).page = slot.page;
   }
 
   typename BlockLayout<D>::Hash hash_;
   std::vector<Slot> slots_;
   std::vector<Page> pages_;
-  std::vector<BlockBits> bits_;  // of each block
+  std::vector<BlockBits> bits_;  // per block
   std::vector<std::array<int32_t, kTilesPerBlock>> first_surfel_;
 };
 

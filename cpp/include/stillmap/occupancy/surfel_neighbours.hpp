@@ -1,4 +1,4 @@
-// Which elements of a surface lie near each other.
+// Neighbouring surfels of each surfel.
 #pragma once
 
 #include <cmath>
@@ -11,8 +11,8 @@
 
 namespace stillmap {
 
-// The elements near each, by the distance of their means: pose and range noise move end points
-// about, so that a hit of one is a hit of all.
+// Surfels within a radius (cells) of each other, by the distance of their means. Pose and range
+// noise shift end points between them, so a hit of one is a hit of its neighbours.
 template <int D>
 class SurfelNeighbours {
  public:

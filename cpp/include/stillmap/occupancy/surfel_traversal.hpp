@@ -1,5 +1,6 @@
-// The cells that a segment crosses among some that are marked: those of `traverse`, in its order.
-// It is followed block by block; within a block the few marked cells are asked, not all on the way.
+// Traversal of the cells with surfels along a ray: the same cells as `traverse`, in the same order.
+// It proceeds block by block and tests the few set cells of a block instead of all cells along the
+// ray.
 #pragma once
 
 #include <algorithm>
@@ -20,27 +21,27 @@ namespace stillmap {
 template <int D>
 class SurfelTraversal {
  public:
-  static constexpr bool kUsesBits = true;  // else it visits all elements, marked or not
+  static constexpr bool kUsesBits = true;  // the 2D version visits all surfels
   using BlockBits = typename SurfelBitmap<D>::BlockBits;
 
-  // A marked cell that is crossed.
+  // Set cell on the ray.
   struct Crossing {
-    size_t block;  // numbered as in the tiles
+    size_t block;  // number in the bitmap
     int32_t surfel;
     Cell<D> cell;
   };
 
-  SurfelTraversal(const SurfelMap<D>&, const SurfelBitmap<D>& tiles) : bitmap_(tiles) {}
+  SurfelTraversal(const SurfelMap<D>&, const SurfelBitmap<D>& bitmap) : bitmap_(bitmap) {}
 
-  // Calls visit(place) for the cells marked in blocks that the segment leaves before it ends.
+  // Calls visit(crossing) for the set cells of `bits` that the ray leaves before its end.
   template <class Visit>
   void traverse_marked(const Vec<D>& start, const Vec<D>& end, const std::vector<BlockBits>& bits,
                        Visit&& visit) {
     compute_borders(start, end);
     Cell<D> block = BlockLayout<D>::block_of(first_);
     const int32_t* page = bitmap_.page_of(block);
-    std::array<int32_t, D> exit_border;  // border of each axis by which it may leave the block
-    std::array<double, D> exit_length;   // and the arc lengths there
+    std::array<int32_t, D> exit_border;  // index of the border at which each axis leaves the block
+    std::array<double, D> exit_length;   // arc length there
     for (int d = 0; d < D; ++d) {
       const int32_t local = first_[d] & (kEdge - 1);
       exit_border[to_size(d)] = step_[to_size(d)] > 0 ? kEdge - 1 - local : local;
@@ -59,13 +60,13 @@ class SurfelTraversal {
       enter_at = leave_at;
       exit_border[to_size(axis)] += kEdge;
       exit_length[to_size(axis)] = borders_[to_size(axis)][exit_border[to_size(axis)] + 1];
-      const int32_t before = block[axis];
-      block[axis] = before + step_[to_size(axis)];
-      if (!SurfelBitmap<D>::same_page(before, block[axis])) page = bitmap_.page_of(block);
+      const int32_t previous = block[axis];
+      block[axis] = previous + step_[to_size(axis)];
+      if (!SurfelBitmap<D>::same_page(previous, block[axis])) page = bitmap_.page_of(block);
     }
   }
 
-  // the element in the cell in which the segment ended
+  // Surfel in the end cell of the last ray.
   int32_t surfel_at_end(const Cell<D>& end) { return bitmap_.surfel(last_block_, end); }
 
  private:
@@ -74,8 +75,8 @@ class SurfelTraversal {
 
   static size_t to_size(int axis) { return static_cast<size_t>(axis); }
 
-  // Arc lengths at all borders of each axis, added up as `traverse` does; that of border i stands
-  // at i + 1, for what lies before the first is entered from the start.
+  // Arc lengths at the borders of each axis, accumulated as in `traverse`. Border i is at index i +
+  // 1; index 0 is the start.
   void compute_borders(const Vec<D>& start, const Vec<D>& end) {
     first_ = cell_of<D>(start);
     const Cell<D> cells = cell_of<D>(end) - first_;
@@ -102,19 +103,19 @@ class SurfelTraversal {
     }
   }
 
-  // The part of the segment between two arc lengths, which lies in a block.
+  // Visits the set cells of one block, which contains the ray between two arc lengths.
   template <class Visit>
   void visit_block(double from, double to, const Cell<D>& block, size_t number,
                    const std::vector<BlockBits>& bits, Visit&& visit) {
     const BlockBits& block_bits = bits[number];
-    std::array<uint32_t, D> slices;     // of the box around it, as far as they have marks
-    for (int d = D - 1; d >= 0; --d) {  // most beams pass above what is there
-      constexpr double margin = 1e-6;   // cells: more than any rounding
+    std::array<uint32_t, D> slices;     // set slices within the ray's bounding box
+    for (int d = D - 1; d >= 0; --d) {  // z first: most beams pass above all surfels
+      constexpr double margin = 1e-6;   // cells, more than rounding errors
       const double corner = start_[d] - block[d] * kEdge;
-      const double entry = corner + direction_[d] * from, out = corner + direction_[d] * to;
-      // one is added, as casts cut off towards zero
-      const int low = static_cast<int>(std::min(entry, out) - margin + 1.0) - 1;
-      const int high = static_cast<int>(std::max(entry, out) + margin);
+      const double entry = corner + direction_[d] * from, exit = corner + direction_[d] * to;
+      // the offset of one makes the cast round down
+      const int low = static_cast<int>(std::min(entry, exit) - margin + 1.0) - 1;
+      const int high = static_cast<int>(std::max(entry, exit) + margin);
       const uint64_t box = (uint64_t{2} << std::clamp(high, 0, kEdge - 1)) -
                            (uint64_t{1} << std::clamp(low, 0, kEdge - 1));
       slices[to_size(d)] = static_cast<uint32_t>(box) & block_bits.slices[to_size(d)];
@@ -125,7 +126,7 @@ class SurfelTraversal {
       const Cell<D> cell = block * kEdge + local;
       const int32_t steps = borders_before(cell);
       if (steps < 0) return;
-      size_t crossing = n_crossings++;  // in the order in which they are crossed
+      size_t crossing = n_crossings++;  // insertion sort by the order along the ray
       for (; crossing > 0 && crossings_[crossing - 1].first > steps; --crossing)
         crossings_[crossing] = crossings_[crossing - 1];
       crossings_[crossing] = {steps, {number, bitmap_.surfel(number, tile, bit), cell}};
@@ -133,24 +134,24 @@ class SurfelTraversal {
     for (size_t i = 0; i < n_crossings; ++i) visit(crossings_[i].second);
   }
 
-  // Number of borders that are crossed before a cell is, negative if it is not, or not left again.
-  // Of borders that are crossed at once, that of the first axis is crossed first.
+  // Number of borders before a cell; negative if the ray misses the cell or ends in it. At a corner
+  // the border of the lower axis comes first, as in `traverse`.
   int32_t borders_before(const Cell<D>& cell) const {
     int32_t steps = 0;
     std::array<double, D> entry;
-    double out = kInf;
+    double exit = kInf;
     int exit_axis = 0;
     for (int d = 0; d < D; ++d) {
       const int32_t i = (cell[d] - first_[d]) * step_[to_size(d)];
       if (i < 0) return -1;
       const double* border = borders_[to_size(d)] + i;
       entry[to_size(d)] = border[0];
-      if (border[1] < out) out = border[1], exit_axis = d;
+      if (border[1] < exit) exit = border[1], exit_axis = d;
       steps += i;
     }
-    bool crosses = out < kInf;
+    bool crosses = exit < kInf;
     for (int d = 0; d < D; ++d)
-      crosses &= (entry[to_size(d)] < out) | ((entry[to_size(d)] == out) & (d < exit_axis));
+      crosses &= (entry[to_size(d)] < exit) | ((entry[to_size(d)] == exit) & (d < exit_axis));
     return crosses ? steps : -1;
   }
 
@@ -165,7 +166,7 @@ class SurfelTraversal {
   std::array<std::pair<int32_t, Crossing>, D * kEdge> crossings_;
 };
 
-// In a plane things are seldom far from one another: all elements on the way, cell by cell.
+// In 2D surfels are dense along rays, so all cells are visited.
 template <>
 class SurfelTraversal<2> {
  public:
@@ -184,7 +185,7 @@ class SurfelTraversal<2> {
                        Visit&& visit) {
     const auto cells = (cell_of<2>(end) - cell_of<2>(start)).cwiseAbs().sum();
     crossings_.resize(std::max(crossings_.size(), static_cast<size_t>(cells) + 1));
-    // no branch on whether there is an element: nobody could foresee it
+    // branch-free, as the test is unpredictable
     Crossing* next = crossings_.data();
     RayWalker walker(cursor_, [&](const int32_t* k, const Cell<2>& cell) {
       const int32_t surfel = k ? *k : kNoSurfel;

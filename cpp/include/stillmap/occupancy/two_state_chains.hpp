@@ -1,7 +1,7 @@
-// Two-state Markov chains, many at once: how probable what was seen of each member is under each
-// class of chains, look after look. States are kept with correlation exp(-dt / tau - dv / turn)
-// from one look to the next: dt is the time between them, dv how far the robot moved against its
-// distance from the member: the angle by which the view turned, but for moves to and fro.
+// Bank of two-state Markov chains: forward algorithm for every member under every class. States
+// persist from one observation to the next with correlation exp(-dt / tau - dv / view_angle), dt
+// being the time between them and dv the viewing angle: displacement of the robot / its distance
+// from the member.
 #pragma once
 
 #include <Eigen/Core>
@@ -16,17 +16,17 @@ namespace stillmap {
 constexpr size_t kMaxClasses = 64;
 
 struct OccupancyClasses {
-  std::vector<double> rho;         // share of time occupied, in (0, 1)
-  std::vector<double> tau;         // seconds
-  std::vector<double> view_angle;  // of the view, radians
-  double p_detection;              // probability that an occupied cell is seen to be so
+  std::vector<double> rho;         // stationary probability of being occupied, in (0, 1)
+  std::vector<double> tau;         // seconds, correlation time
+  std::vector<double> view_angle;  // radians, correlation angle of the view
+  double p_detection;              // P(return | occupied)
 };
 
-// Width: classes that are worked on together.
+// Width: classes per SIMD packet.
 template <size_t Width>
 class TwoStateChains {
  public:
-  // places: of the members, in cells; seconds: between successive looks
+  // positions of the members, in cells; bin_seconds: length of a time bin.
   TwoStateChains(std::vector<Eigen::Vector3f> positions, OccupancyClasses classes,
                  double bin_seconds)
       : classes_(std::move(classes)),
@@ -55,9 +55,9 @@ class TwoStateChains {
   size_t size() const { return classes_.rho.size(); }
   size_t members() const { return last_observation_.size(); }
 
-  // Notes the next look: its number, and the place in cells from which it was taken. Returns which
-  // of the looks it is: what `hit` and `seen_through` want. Who stands is never quite at the same
-  // place: it counts as another one half a cell away.
+  // Registers the next viewpoint: its time bin and position in cells. Returns its index, the
+  // argument of `hit` and `miss`. Moves of less than half a cell are ignored: a standing robot has
+  // noise.
   int32_t begin_observation(int64_t time_bin, const Eigen::Vector3d& position) {
     const bool is_stationary =
         !viewpoints_.empty() && (position - viewpoints_.back().position).norm() < kMinMove;
@@ -65,15 +65,14 @@ class TwoStateChains {
     return static_cast<int32_t>(viewpoints_.size() - 1);
   }
 
-  // One step of the forward algorithm in every class, to a look that saw a hit, or saw through the
-  // member with a reliability.
+  // Forward step in every class for a hit, or for a miss with a reliability.
   void hit(size_t k, int32_t viewpoint) { forward_step(k, viewpoint, p_detection(), 0.0f); }
   void miss(size_t k, int32_t viewpoint, float reliability) {
     forward_step(k, viewpoint, 1.0f - p_detection() * reliability, 1.0f);
   }
 
-  // Likelihood under some of the classes of everything else that was seen of a member, given one
-  // hit, relative to the best of them; returns the logarithm of the best.
+  // Likelihood under some of the classes of all observations of a member, given that one is a hit,
+  // relative to the best class; returns the logarithm of the best.
   double likelihood(size_t k, const std::vector<size_t>& among, float* relative) const {
     std::vector<double> logs;
     for (const size_t c : among) logs.push_back(log_likelihood(k, c));
@@ -87,9 +86,9 @@ class TwoStateChains {
   static constexpr size_t kWidth = Width;
   using Packet = Eigen::Array<float, kWidth, 1>;
   static constexpr int32_t kNever = -1;
-  static constexpr int kTabulatedGaps = 64;  // gaps whose correlations are kept
+  static constexpr int kTabulatedGaps = 64;  // gaps with tabulated transitions
   static constexpr float kRescaleBelow = 1e-12f;
-  static constexpr float kMinProbability = 1e-30f;  // no state is ever impossible
+  static constexpr float kMinProbability = 1e-30f;  // floor: no state becomes impossible
   static constexpr double kMinMove = 0.5;           // cells
 
   struct Viewpoint {
@@ -97,7 +96,7 @@ class TwoStateChains {
     Eigen::Vector3d position;
   };
 
-  // what fills the last packet is like the first class
+  // lanes beyond the last class repeat the first one
   size_t class_of_lane(size_t lane) const { return lane < size() ? lane : 0; }
 
   double log_likelihood(size_t k, size_t c) const {
@@ -116,7 +115,7 @@ class TwoStateChains {
     return packets[c / kWidth][static_cast<int>(c % kWidth)];
   }
 
-  // For each packet: what flows in from both states together, then what stays.
+  // For each packet: inflow from both states, then persistence.
   void append_transitions(std::vector<Packet>& to, int64_t gap) const {
     for (size_t i = 0; i < packets_; ++i) {
       Packet inflow, persistence;
@@ -132,21 +131,21 @@ class TwoStateChains {
     }
   }
 
-  // Whoever stands in the place itself sees nothing of it.
-  static float view_rotation(const Viewpoint& before, const Viewpoint& now,
+  // Viewing angle between two positions, from a distance of at least one cell.
+  static float view_rotation(const Viewpoint& previous, const Viewpoint& now,
                              const Eigen::Vector3f& position) {
-    const double moved = (now.position - before.position).norm();
-    return static_cast<float>(moved /
+    const double displacement = (now.position - previous.position).norm();
+    return static_cast<float>(displacement /
                               std::max(1.0, (now.position - position.cast<double>()).norm()));
   }
 
-  // if_occupied, if_empty: probability of what was seen
+  // if_occupied, if_empty: probability of the observation in each state.
   void forward_step(size_t k, int32_t viewpoint, float if_occupied, float if_empty) {
     const Viewpoint& now = viewpoints_[static_cast<size_t>(viewpoint)];
-    const Viewpoint& before = viewpoints_[static_cast<size_t>(
+    const Viewpoint& previous = viewpoints_[static_cast<size_t>(
         last_observation_[k] == kNever ? viewpoint : last_observation_[k])];
-    const int64_t gap = now.time_bin - before.time_bin;
-    const float rotation = view_rotation(before, now, positions_[k]);
+    const int64_t gap = now.time_bin - previous.time_bin;
+    const float rotation = view_rotation(previous, now, positions_[k]);
     last_observation_[k] = viewpoint;
     std::vector<Packet> computed;
     const Packet* transition = transition_table_.data() + static_cast<size_t>(gap) * 2 * packets_;
@@ -156,7 +155,7 @@ class TwoStateChains {
     }
     Packet* occupied = state_.data() + k * 2 * packets_;
     Packet* empty = occupied + packets_;
-    Packet least = Packet::Ones();
+    Packet smallest = Packet::Ones();
     for (size_t i = 0; i < packets_; ++i) {
       const Packet total = occupied[i] + empty[i];
       Packet inflow = transition[2 * i], persistence = transition[2 * i + 1];
@@ -164,18 +163,17 @@ class TwoStateChains {
         persistence *= (-rotation * inverse_view_angle_[i]).exp();
         inflow = rho_[i] * (1.0f - persistence);
       }
-      const Packet before = (inflow * total + persistence * occupied[i]).max(kMinProbability);
-      occupied[i] = before * if_occupied;
-      empty[i] = (total - before).max(0.0f) * if_empty;
-      least = least.min(occupied[i] + empty[i]);
+      const Packet p_occupied = (inflow * total + persistence * occupied[i]).max(kMinProbability);
+      occupied[i] = p_occupied * if_occupied;
+      empty[i] = (total - p_occupied).max(0.0f) * if_empty;
+      smallest = smallest.min(occupied[i] + empty[i]);
     }
-    if (least.minCoeff() >= kRescaleBelow) return;
+    if (smallest.minCoeff() >= kRescaleBelow) return;
     for (size_t i = 0; i < packets_; ++i)
       rescale(occupied[i], empty[i], exponent_[k * packets_ + i]);
   }
 
-  // Each class by a power of two of its own: it may become the best one of those that are asked
-  // for.
+  // Scales each class by its own power of two.
   static void rescale(Packet& occupied, Packet& empty, Packet& exponent) {
     Packet total = occupied + empty;
     uint32_t bits[kWidth];
@@ -183,7 +181,7 @@ class TwoStateChains {
     std::memcpy(bits, total.data(), sizeof(bits));
     Packet factor;
     for (size_t lane = 0; lane < kWidth; ++lane) {
-      const uint32_t power = bits[lane] >> 23;  // biased; the sign of what is positive is zero
+      const uint32_t power = bits[lane] >> 23;  // biased exponent; the values are positive
       exponent[static_cast<int>(lane)] += static_cast<float>(power) - 127.0f;
       bits[lane] = (254u - power) << 23;
     }
@@ -197,11 +195,11 @@ class TwoStateChains {
   size_t packets_;
   std::vector<Packet> rho_;
   std::vector<Packet> inverse_view_angle_;
-  std::vector<bool> view_dependent_;  // packets in which some class knows from where it is seen
+  std::vector<bool> view_dependent_;  // packets with a finite view_angle
   std::vector<Eigen::Vector3f> positions_;
-  std::vector<int32_t> last_observation_;  // look at each member
-  std::vector<Packet> state_;     // (members, 2, packets): P(all looks so far, occupied or empty)
-  std::vector<Packet> exponent_;  // (members, packets): but for such a power of two
+  std::vector<int32_t> last_observation_;  // viewpoint of each member's last observation
+  std::vector<Packet> state_;  // (members, 2, packets): P(observations so far, state) / 2^exponent
+  std::vector<Packet> exponent_;          // (members, packets)
   std::vector<Packet> transition_table_;  // (gaps, packets, 2)
   std::vector<Viewpoint> viewpoints_;
 };

@@ -1,5 +1,5 @@
-// Correlative search: the best poses of a lattice around the prior, scored on a raster of the
-// smoothed field, by branch and bound. Finds the basins that the Newton steps then descend into.
+// Correlative scan matching (Olson 2009): best poses on a lattice around the prior, scored on a
+// pyramid of the likelihood field by branch and bound. They start the local optimisation.
 #pragma once
 
 #include <algorithm>
@@ -20,7 +20,7 @@ namespace stillmap {
 struct SearchWindow {
   double translation;  // metres, half width along each axis
   double rotation;     // radians, half width about the vertical axis
-  double max_range;    // metres, beams beyond are left out of the search
+  double max_range;    // metres, longer beams are ignored
 };
 
 template <int D>
@@ -36,7 +36,7 @@ class CorrelativeSearch {
                     const PosePrior<D>& prior, const SearchWindow& window,
                     const ScanRegistrationOptions& options)
       : grid_(grid), prior_(prior), options_(options) {
-    // a wide window is searched in steps of two cells: the Newton steps bridge that
+    // a wide window is searched in steps of two cells, within reach of the local optimisation
     step_shift_ = window.translation > 4.0 * grid.resolution() ? 1 : 0;
     step_ = grid.resolution() * (1 << step_shift_);
     half_steps_ = static_cast<int32_t>(std::ceil(window.translation / step_));
@@ -49,7 +49,7 @@ class CorrelativeSearch {
       ranges.push_back(range);
     }
     if (ranges.empty()) return;
-    // turn by no more than moves a typical far beam by one step
+    // angle step: moves a far beam (third quartile) by one step
     const auto far_range =
         ranges.begin() + static_cast<std::ptrdiff_t>((ranges.size() - 1) * 3 / 4);
     std::nth_element(ranges.begin(), far_range, ranges.end());
@@ -57,13 +57,13 @@ class CorrelativeSearch {
     half_angles_ = static_cast<int>(std::ceil(window.rotation / angle_step_));
     while (top_level_ < kMaxTopLevel && (2 << top_level_) <= half_steps_) ++top_level_;
     const Eigen::Matrix<double, D, D> A = prior.information.template topLeftCorner<D, D>();
-    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> axes(A);
-    min_shift_information_ = std::max(axes.eigenvalues()[0], 0.0);
+    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> eigen(A);
+    min_shift_information_ = std::max(eigen.eigenvalues()[0], 0.0);
     shift_per_turn_ = A.ldlt().solve(prior.information.template topRightCorner<D, 1>());
   }
 
-  // The best poses of the lattice, best first, no two of them in one basin, none much worse than
-  // the best; the prior's mean when there is nothing to search.
+  // Best lattice poses, best first, pairwise in different basins and none below 0.8 of the best
+  // score; the prior's mean if the window is empty.
   std::vector<Candidate<D>> best(size_t max_candidates) {
     if (points_.empty() || (half_steps_ == 0 && half_angles_ == 0)) return {{prior_.pose, 0.0}};
     build_pyramid();
@@ -82,7 +82,7 @@ class CorrelativeSearch {
                       [&](const auto& other) { return is_same_basin(candidate.pose, other.pose); }))
         continue;
       candidates.push_back(candidate);
-      // the others may take as long as the best one did
+      // the other candidates may take as many poses as the best one
       if (candidates.size() == 1) limit = 2 * poses_tried_;
     }
     return candidates;
@@ -94,13 +94,13 @@ class CorrelativeSearch {
   static constexpr double kWeight = 255.0;
   static constexpr int kMaxTopLevel = 6;
 
-  // all shifts within 2^level steps of `low` along each axis, at one orientation
+  // All shifts within 2^level steps of `low` along each axis, at one angle.
   struct Node {
-    double bound;  // no pose of it has a higher score; at level 0, the score
+    double bound;  // upper bound of the score; at level 0, the score
     int level;
     int angle;
     Cell<D> low;
-    size_t order;  // ties are broken by age: the same search takes the same way
+    size_t order;  // breaks ties by age, for determinism
     bool operator<(const Node& other) const {
       return bound != other.bound ? bound < other.bound : order > other.order;
     }
@@ -124,7 +124,8 @@ class CorrelativeSearch {
     return pose;
   }
 
-  // the raster around everything that a pose of the window can see, and the widest nodes
+  // Builds the pyramid over everything that a pose of the window can see, and pushes the root
+  // nodes.
   void build_pyramid() {
     const auto turns = static_cast<size_t>(2 * half_angles_ + 1);
     std::vector<Cell<D>> pixels;
@@ -139,7 +140,7 @@ class CorrelativeSearch {
         high = high.cwiseMax(pixels.back());
       }
     }
-    // a node may reach beyond the window
+    // root nodes may reach beyond the window
     const Cell<D> before = Cell<D>::Constant(half_steps_),
                   after = Cell<D>::Constant(half_steps_ + 1);
     pyramid_.emplace(grid_, low - before, high - low + before + after, step_shift_, top_level_,
@@ -148,8 +149,8 @@ class CorrelativeSearch {
     const Cell<D> last_node = Cell<D>::Constant(2 * half_steps_ >> top_level_),
                   none = Cell<D>::Zero();
     for (int a = -half_angles_; a <= half_angles_; ++a)
-      for_each_in_box<D>(none, last_node, [&](const Cell<D>& tile) {
-        push_node(top_level_, a, (tile.array() * (1 << top_level_) - half_steps_).matrix());
+      for_each_in_box<D>(none, last_node, [&](const Cell<D>& node) {
+        push_node(top_level_, a, (node.array() * (1 << top_level_) - half_steps_).matrix());
       });
   }
 
@@ -167,17 +168,17 @@ class CorrelativeSearch {
     const int64_t shift = pyramid_->offset(low);
     const uint8_t* from = pyramid_->level(level) + shift;
     const size_t n_points = points_.size();
-    const int64_t* at =
+    const int64_t* indices =
         pixel_indices_.data() + static_cast<size_t>(angle + half_angles_) * n_points;
     int64_t sum = 0;
-    for (size_t n = 0; n < n_points; ++n) sum += weights_[n] * from[at[n]];
+    for (size_t n = 0; n < n_points; ++n) sum += weights_[n] * from[indices[n]];
     const double data_score =
         options_.gain * pyramid_->score_unit() / kWeight * static_cast<double>(sum);
     queue_.push({data_score - prior_penalty(level, angle, low), level, angle, low, poses_tried_});
   }
 
-  // 1/2 d^T Lambda d of a pose, or at most that of the poses of a node: with the turn given, what
-  // is left is a quadratic form about some shift
+  // 1/2 d^T Lambda d of a pose; for a node a lower bound: at a given angle the rest is a quadratic
+  // form about some shift.
   double prior_penalty(int level, int angle, const Cell<D>& low) const {
     constexpr int turn = Lie<D>::kDof - 1;
     const double theta = angle * angle_step_;
@@ -198,17 +199,17 @@ class CorrelativeSearch {
   const ScanRegistrationOptions& options_;
   std::vector<Vec<D>> points_;
   std::vector<int32_t> weights_;
-  int step_shift_ = 0;  // a step is 2^shift cells
+  int step_shift_ = 0;  // a step is 2^step_shift_ cells
   double step_ = 0.0;
   int32_t half_steps_ = 0;
   double angle_step_ = 0.0;
   int half_angles_ = 0;
-  int top_level_ = 0;  // level of the widest nodes
+  int top_level_ = 0;  // level of the root nodes
   std::optional<FieldPyramid<D>> pyramid_;
-  std::vector<int64_t> pixel_indices_;  // of every beam's pixel, orientation by orientation
+  std::vector<int64_t> pixel_indices_;  // pixel of every beam, angle by angle
   std::priority_queue<Node> queue_;
-  Vec<D> shift_per_turn_;  // shift that the prior goes with a turn, negated, per radian
-  double min_shift_information_ = 0.0;  // its smallest information of a shift
+  Vec<D> shift_per_turn_;               // optimal shift per radian of rotation, negated
+  double min_shift_information_ = 0.0;  // smallest eigenvalue of the prior's
   size_t poses_tried_ = 0;
 };
 

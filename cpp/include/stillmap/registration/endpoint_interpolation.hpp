@@ -1,6 +1,6 @@
-// End points between those of neighbouring beams that met one flat surface. Far away and at a
-// slant beams leave gaps on a wall; a map of the bare end points would take their pattern for
-// features, and a scan that is laid on it would not slide along the wall as it should.
+// Interpolates end points between neighbouring beams on one flat surface. At long range and grazing
+// incidence beams leave gaps on a wall, and registration would lock on to the pattern of the gaps
+// instead of sliding along the wall.
 #pragma once
 
 #include <cmath>
@@ -15,9 +15,9 @@
 namespace stillmap {
 
 struct InterpolationOptions {
-  double max_gap;        // metres between neighbouring end points, at most
-  double tolerance;      // metres by which three end points in a row may be off a straight line
-  double max_gap_ratio;  // the gap may be that many times as wide as the one beside it
+  double max_gap;        // metres between neighbouring end points
+  double tolerance;      // metres, deviation of three successive end points from a line
+  double max_gap_ratio;  // of a gap to the gap next to it
 };
 
 template <int D>
@@ -49,7 +49,7 @@ class EndPointInterpolator {
   bool is_hit(int64_t n) const { return n >= first_ && n <= last_ && scans_.hit[n]; }
   Vec<D> point(int64_t n) const { return point_at<D>(scans_.points + n * D); }
 
-  // whether the surface from `beside` to a goes straight on to b
+  // Whether the surface from `previous` to a continues straight to b.
   bool is_collinear(int64_t a, int64_t b, int64_t previous) const {
     if (!is_hit(previous)) return false;
     const Vec<D> step = point(b) - point(a), previous_step = point(a) - point(previous);

@@ -1,5 +1,5 @@
-// A dense picture of the smoothed field for looking up many poses, and its maxima over windows of
-// 2, 4, 8, ... pixels: what any pose of a whole window can reach at most.
+// Multi-resolution raster of the likelihood field: maxima over windows of 2, 4, 8, ... pixels bound
+// the score of all poses in a window.
 #pragma once
 
 #include <algorithm>
@@ -15,9 +15,9 @@
 
 namespace stillmap {
 
-// ln((floor + F) / floor) at the pixels of a box in steps of `unit()`, F being the largest single
-// contribution. A pixel is 2^shift grid cells wide. Level h has at each pixel the maximum over the
-// 2^h pixels that begin there along each axis; beyond the box there is nothing.
+// Level 0 has ln((floor + F) / floor) at the pixels of a box, quantised in units of score_unit(); F
+// is the largest single Gaussian. A pixel is 2^shift cells wide. Level h has the maximum over the
+// 2^h pixels that start at a pixel along each axis; outside the box F is 0.
 template <int D>
 class FieldPyramid {
  public:
@@ -26,7 +26,7 @@ class FieldPyramid {
       : first_(first), size_(size), shift_(shift) {
     levels_.resize(static_cast<size_t>(levels) + 1);
     levels_[0].assign(static_cast<size_t>(size.template cast<int64_t>().prod()), 0);
-    // wider than the field that is climbed: a pixel stands for its whole area
+    // wider than the field of the optimiser, since a pixel stands for its whole area
     const double pixel = grid.resolution() * (1 << shift);
     splat_grid(grid, std::max(1.5 * options.sigma / pixel, 1.0));
     const double largest = std::log((options.floor + 1.0) / options.floor);
@@ -44,10 +44,10 @@ class FieldPyramid {
   double score_unit() const { return score_unit_; }
   const uint8_t* level(int h) const { return levels_[static_cast<size_t>(h)].data(); }
 
-  // x runs fastest; the pixel must lie in the box
+  // x fastest; the pixel must be inside the box.
   int64_t index(const Cell<D>& pixel) const { return offset(pixel - first_); }
 
-  // between the indices of two pixels that far apart
+  // Difference of the indices of two pixels.
   int64_t offset(const Cell<D>& difference) const {
     int64_t i = 0;
     for (int d = D - 1; d >= 0; --d) i = i * size_[d] + difference[d];
@@ -58,18 +58,18 @@ class FieldPyramid {
   using Block = typename OccupancyGrid<D>::Block;
   static constexpr double kMaxScore = 255.0;
 
-  // maxima over twice the window: each axis in turn
+  // Maxima over windows of twice the size, axis by axis.
   void max_pool(const std::vector<uint8_t>& source, int32_t radius,
                 std::vector<uint8_t>& target) const {
     target = source;
     int64_t stride = 1;
     for (int d = 0; d < D; ++d) {
       const int64_t line = stride * size_[d];
-      const int64_t kept = line - stride * std::min<int64_t>(radius, size_[d]);
-      for (int64_t at = 0; at < static_cast<int64_t>(target.size()); at += line) {
-        uint8_t* v = target.data() + at;
-        // ascending: what is read lies ahead of what was written
-        for (int64_t i = 0; i < kept; ++i) v[i] = std::max(v[i], v[i + stride * radius]);
+      const int64_t n_kept = line - stride * std::min<int64_t>(radius, size_[d]);
+      for (int64_t begin = 0; begin < static_cast<int64_t>(target.size()); begin += line) {
+        uint8_t* v = target.data() + begin;
+        // ascending: reads are ahead of writes
+        for (int64_t i = 0; i < n_kept; ++i) v[i] = std::max(v[i], v[i + stride * radius]);
       }
       stride = line;
     }
@@ -81,8 +81,8 @@ class FieldPyramid {
     return pixel;
   }
 
-  // visit(counts of kEdge cells along x, first of them) for all blocks within `margin` pixels of
-  // the box in which something was hit
+  // Calls visit(block, first local index, first cell) for each row along x of the blocks with end
+  // points within `margin` pixels of the box.
   template <class Visit>
   void for_each_row(const OccupancyGrid<D>& grid, int margin, Visit&& visit) const {
     const Cell<D> low = (first_.array() - margin) * (1 << shift_);
@@ -96,10 +96,10 @@ class FieldPyramid {
         });
   }
 
-  // max over cells of m_k exp(-|pixel - cell|^2 / (2 sigma^2)), sigma in pixels
+  // Maximum over cells of m_k exp(-|pixel - cell|^2 / (2 sigma^2)), sigma in pixels.
   void splat_grid(const OccupancyGrid<D>& grid, double sigma) {
     const int radius = static_cast<int>(std::ceil(2.0 * sigma)), kernel_size = 2 * radius + 1;
-    // along each axis, by the cell's place within its pixel and the pixel's distance
+    // per axis: [position of the cell in its pixel][distance of the pixel]
     std::vector<float> kernel;
     for (int subpixel = 0; subpixel < 1 << shift_; ++subpixel)
       for (int k = -radius; k <= radius; ++k) {
@@ -121,7 +121,7 @@ class FieldPyramid {
     const Cell<D> low = (pixel.array() - radius).max(first_.array());
     Cell<D> high = (pixel.array() + radius).min((first_ + size_).array() - 1);
     if ((low.array() > high.array()).any()) return;
-    std::array<const float*, D> axis_kernel;  // of each axis, at pixel low
+    std::array<const float*, D> axis_kernel;  // kernel of each axis at pixel low
     for (int d = 0; d < D; ++d)
       axis_kernel[static_cast<size_t>(d)] = kernel.data() +
                                             (cell[d] - pixel[d] * (1 << shift_)) * kernel_size +

@@ -1,6 +1,6 @@
-// The smoothed field that registration climbs: how probable it is that a static end point lies
-// near y, given the map so far. Each cell stands for a Gaussian at the mean of its end points,
-// weighted by its occupancy (15), so a cell that beams also passed through counts less.
+// Likelihood field (Thrun et al. 2005, ch. 6.4) as a mixture of Gaussians: one per cell at the mean
+// of its end points, weighted by its occupancy (15), so cells that beams also passed through weigh
+// less.
 #pragma once
 
 #include <Eigen/Eigenvalues>
@@ -18,36 +18,35 @@ namespace stillmap {
 constexpr double kPi = 3.14159265358979323846;
 
 struct LikelihoodFieldOptions {
-  double sigma;    // metres, width of the Gaussians
-  int radius;      // cells, how far neighbours are looked at
-  double floor;    // value of an end point in free space, relative to a wall's 1
-  double unknown;  // added where nobody looked: unknown is not free
+  double sigma;    // metres, standard deviation of the Gaussians
+  int radius;      // cells, radius of the window of Gaussians
+  double floor;    // value in free space; a wall has 1
+  double unknown;  // added to the floor in unobserved space
 };
 
 template <int D>
 struct FieldSample {
   double value = 0.0;     // F(y), about 1 on a wall
-  double baseline = 0.0;  // floor, more where unknown: an end point that nothing explains
-  Vec<D> log_gradient =
-      Vec<D>::Zero();  // mean of (mu_k - y) / sigma^2: the gradient of ln F, per metre
-  // spread of the pulls: what sigma^-2 loses along a wall, where F does not change
+  double baseline = 0.0;  // of an unexplained end point: floor (+ unknown if unobserved)
+  Vec<D> log_gradient = Vec<D>::Zero();  // gradient of ln F: mean of (mu_k - y) / sigma^2, 1/m
+  // Covariance of (mu_k - y) / sigma^2: cancels sigma^-2 along a wall, where F is constant.
   Eigen::Matrix<double, D, D> pull_covariance = Eigen::Matrix<double, D, D>::Zero();
 };
 
-// The Gaussians around one cell. A beam keeps its own while its end point stays in the cell.
+// Gaussians around one cell, cached for a beam while its end point stays in the cell.
 template <int D>
 struct GaussianWindow {
   struct Gaussian {
-    Vec<D> mean;    // in cells
-    double weight;  // occupancy m_k, as Grid::presence has it
+    Vec<D> mean;    // cells
+    double weight;  // m_k, OccupancyGrid::occupancy_ignoring_approach
   };
   Cell<D> centre = Cell<D>::Zero();
   bool valid = false;
   bool observed = false;
-  bool is_planar = false;               // whether the Gaussians lie on a line or plane
-  Vec<D> normal = Vec<D>::Zero();       // its normal
-  Vec<D> plane_point = Vec<D>::Zero();  // a point on it, in cells
-  double mean_occupancy = 0.0;          // mean occupancy of its cells
+  bool is_planar = false;               // the means lie on a line or plane
+  Vec<D> normal = Vec<D>::Zero();       // of that plane
+  Vec<D> plane_point = Vec<D>::Zero();  // on that plane, in cells
+  double mean_occupancy = 0.0;          // of the cells
   double baseline = 0.0;
   std::vector<Gaussian> gaussians;
 };
@@ -64,23 +63,23 @@ class LikelihoodField {
     if (options.radius < 0 || options.radius > 64)
       throw std::invalid_argument("radius: expected 0 to 64 cells");
     const double sigma_cells = options.sigma / resolution_;
-    // a Gaussian cut off at the radius has less variance than sigma^2; along a uniform wall the
-    // spread has to make up for sigma^-2 exactly
+    // The truncation at the radius reduces the variance below sigma^2; corrected so that the
+    // curvature along a uniform wall cancels exactly.
     const double cut = (options.radius + 0.5) / sigma_cells;
     const double density = std::exp(-0.5 * cut * cut) / std::sqrt(2.0 * kPi);
     truncated_variance_ = 1.0 - 2.0 * cut * density / std::erf(cut / std::sqrt(2.0));
     exponent_ = -0.5 / (sigma_cells * sigma_cells);
-    // a straight wall whose cells are all occupied gives F = 1
+    // F = 1 on a straight wall of fully occupied cells
     norm_ = 1.0 / std::pow(std::sqrt(2.0 * kPi) * sigma_cells, D - 1);
   }
 
-  FieldSample<D> evaluate(const Vec<D>& y_metres, GaussianWindow<D>& window) {
-    FieldSample<D> out;
-    out.baseline = options_.floor;
-    const Vec<D> y = y_metres / resolution_;
-    if (!all_below<D>(y, BlockLayout<D>::kMaxCell - 64)) return out;
+  FieldSample<D> evaluate(const Vec<D>& point, GaussianWindow<D>& window) {
+    FieldSample<D> sample;
+    sample.baseline = options_.floor;
+    const Vec<D> y = point / resolution_;
+    if (!all_below<D>(y, BlockLayout<D>::kMaxCell - 64)) return sample;
     gather_gaussians(cell_of<D>(y), window);
-    out.baseline = window.baseline;
+    sample.baseline = window.baseline;
     if (!window.observed && window.is_planar) return extrapolate(y, window);
     double sum = 0.0;
     Vec<D> first = Vec<D>::Zero();
@@ -92,31 +91,31 @@ class LikelihoodField {
       first += weight * to_mean;
       second.noalias() += weight * to_mean * to_mean.transpose();
     }
-    if (sum <= 0.0) return out;
+    if (sum <= 0.0) return sample;
     const double per_metre2 = 1.0 / (options_.sigma * options_.sigma);
     first /= sum;
-    out.value = sum * norm_;
-    out.log_gradient = first * (per_metre2 * resolution_);
+    sample.value = sum * norm_;
+    sample.log_gradient = first * (per_metre2 * resolution_);
     const double covariance_scale =
         per_metre2 * per_metre2 * resolution_ * resolution_ / truncated_variance_;
-    out.pull_covariance = (second / sum - first * first.transpose()) * covariance_scale;
-    return out;
+    sample.pull_covariance = (second / sum - first * first.transpose()) * covariance_scale;
+    return sample;
   }
 
  private:
-  // Where nobody looked a surface is taken to go on: its end, so far, says nothing of where a scan
-  // is along it.
+  // Extends a surface into unobserved space: the end of the mapped part must not pull scans along
+  // it.
   FieldSample<D> extrapolate(const Vec<D>& y, const GaussianWindow<D>& window) const {
-    FieldSample<D> out;
-    out.baseline = window.baseline;
+    FieldSample<D> sample;
+    sample.baseline = window.baseline;
     const double distance = window.normal.dot(window.plane_point - y);
     const double per_metre2 = 1.0 / (options_.sigma * options_.sigma);
-    out.value = window.mean_occupancy * std::exp(exponent_ * distance * distance);
-    out.log_gradient = window.normal * (distance * resolution_ * per_metre2);
-    out.pull_covariance.setIdentity();
-    out.pull_covariance -= window.normal * window.normal.transpose();
-    out.pull_covariance *= per_metre2;
-    return out;
+    sample.value = window.mean_occupancy * std::exp(exponent_ * distance * distance);
+    sample.log_gradient = window.normal * (distance * resolution_ * per_metre2);
+    sample.pull_covariance.setIdentity();
+    sample.pull_covariance -= window.normal * window.normal.transpose();
+    sample.pull_covariance *= per_metre2;
+    return sample;
   }
 
   void fit_plane(GaussianWindow<D>& window) const {
@@ -130,16 +129,16 @@ class LikelihoodField {
     }
     if (!(total > 0.0)) return;
     mean /= total;
-    Eigen::Matrix<double, D, D> pull_covariance = Eigen::Matrix<double, D, D>::Zero();
+    Eigen::Matrix<double, D, D> covariance = Eigen::Matrix<double, D, D>::Zero();
     for (const auto& g : window.gaussians)
-      pull_covariance += (g.weight / total) * (g.mean - mean) * (g.mean - mean).transpose();
-    Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> axes;
-    axes.computeDirect(pull_covariance);
-    const Vec<D> variance = axes.eigenvalues();
-    // a line in space lies on many planes
+      covariance += (g.weight / total) * (g.mean - mean) * (g.mean - mean).transpose();
+    Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> eigen;
+    eigen.computeDirect(covariance);
+    const Vec<D> variance = eigen.eigenvalues();
+    // a line in 3D lies on many planes
     window.is_planar =
         variance[0] < 0.1 * variance[1] && (D == 2 || variance[1] > 0.1 * variance[D - 1]);
-    window.normal = axes.eigenvectors().col(0);
+    window.normal = eigen.eigenvectors().col(0);
     window.plane_point = mean;
     window.mean_occupancy = total / static_cast<double>(window.gaussians.size());
   }
@@ -165,7 +164,7 @@ class LikelihoodField {
     if (!window.observed) fit_plane(window);
   }
 
-  // the cells of a row along x up to `last`, block by block
+  // Adds the Gaussians of a row of cells along x up to `last`, block by block.
   void gather_row(Cell<D> cell, int32_t last,
                   std::vector<typename GaussianWindow<D>::Gaussian>& gaussians) {
     while (cell[0] <= last) {
@@ -173,8 +172,8 @@ class LikelihoodField {
       const int32_t row_end = std::min(last, cell[0] | (BlockLayout<D>::kEdge - 1));
       if (block && block->moments) {
         auto local = static_cast<size_t>(BlockLayout<D>::local_of(cell));
-        for (Cell<D> at = cell; at[0] <= row_end; ++at[0], ++local)
-          if (block->values[local].alpha > 0) gaussians.push_back(gaussian(*block, local, at));
+        for (Cell<D> current = cell; current[0] <= row_end; ++current[0], ++local)
+          if (block->values[local].alpha > 0) gaussians.push_back(gaussian(*block, local, current));
       }
       cell[0] = row_end + 1;
     }

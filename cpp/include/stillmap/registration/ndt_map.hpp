@@ -1,5 +1,5 @@
-// The last stretch of a drive as moments of end points in cells of several sizes, and the surface
-// that they make anywhere: what sweeps of a spinning lidar are registered against.
+// Local map of weighted end-point moments in voxels of several sizes (NDT map), from which planes
+// are fitted anywhere.
 #pragma once
 
 #include <Eigen/Eigenvalues>
@@ -13,35 +13,35 @@
 
 namespace stillmap {
 
-// Sums over the end points in a cell, each weighing e; lengths in edges, about the cell's centre.
+// Weighted sums over the end points in a cell, relative to its centre, in units of its edge.
 template <int D>
 struct CellMoments {
   static constexpr size_t kProducts = D * (D + 1) / 2;
   double weight = 0.0;
   std::array<double, D> first{};
-  std::array<double, kProducts> second{};  // by rows of the upper triangle
+  std::array<double, kProducts> second{};  // upper triangle by rows
 };
 
-// When the end points around a place are a surface.
+// Conditions on a plane.
 struct PlaneOptions {
-  double min_weight;    // weight of the end points around, at least
-  double max_flatness;  // variance across it against the next one, at most
-  double min_extent;    // that next variance, in square edges, at least
+  double min_weight;    // smallest sum of weights
+  double max_flatness;  // largest variance across the plane / next variance
+  double min_extent;    // smallest next variance, in edges squared
 };
 
-// The surface near a place; metres.
+// Plane near a position; metres.
 template <int D>
 struct Plane {
   Vec<D> normal;
-  double offset;    // of the surface from the place, along the normal
-  double variance;  // of end points across it
+  double offset;    // signed distance from the position, along the normal
+  double variance;  // of end points across the plane
 };
 
 template <int D>
 class NdtMap {
  public:
-  // edge: metres, of the smallest cells; those of each further level are twice as large.
-  // enough: weight from which on a cell takes no more: its early poses are the better ones
+  // edge: metres, of the finest cells; each further level doubles it. max_weight: a cell accepts no
+  // more end points from there on, since early poses drift least.
   NdtMap(double edge, int levels, double max_weight) : edge_(edge), max_weight_(max_weight) {
     if (!(edge > 0.0) || !std::isfinite(edge))
       throw std::invalid_argument("edge: expected a positive length in metres");
@@ -78,7 +78,7 @@ class NdtMap {
     }
   }
 
-  // Forgets what lies farther than `radius` metres from a place.
+  // Removes the cells farther than `radius` metres from a position.
   void crop(const Vec<D>& position, double radius) {
     for (int level = 0; level < levels(); ++level)
       tables_[static_cast<size_t>(level)].keep_if([&](const Cell<D>& cell) {
@@ -86,10 +86,9 @@ class NdtMap {
       });
   }
 
-  // The plane through the end points around a place: moments of the 2^D cells whose centres
-  // surround it, each by its share in a linear interpolation, so that the plane changes steadily
-  // from place to place; its normal is the axis of the least variance. False where they are no
-  // surface.
+  // Fits a plane to the moments of the 2^D cells around a position, interpolated linearly, so that
+  // it varies continuously; its normal is the axis of least variance. False if the conditions are
+  // not met.
   bool fit_plane(const Vec<D>& position, int level, const PlaneOptions& options,
                  Plane<D>& plane) const {
     LocalMoments sum;
@@ -99,7 +98,7 @@ class NdtMap {
     const Square covariance = sum.second / sum.weight - mean * mean.transpose();
     Eigen::SelfAdjointEigenSolver<Square> eigen;
     eigen.computeDirect(covariance);
-    const Vec<D>& variance = eigen.eigenvalues();  // rising
+    const Vec<D>& variance = eigen.eigenvalues();  // ascending
     if (!(variance[1] >= options.min_extent) ||
         !(variance[0] <= options.max_flatness * variance[1]))
       return false;
@@ -113,7 +112,7 @@ class NdtMap {
  private:
   using Square = Eigen::Matrix<double, D, D>;
 
-  // Moments about the place asked for, in edges.
+  // Interpolated moments about a position, in edges.
   struct LocalMoments {
     double weight = 0.0;
     Vec<D> first = Vec<D>::Zero();
@@ -150,7 +149,7 @@ class NdtMap {
       for (int j = i; j < D; ++j) second(i, j) = second(j, i) = m.second[product++];
     sum.weight += weight * m.weight;
     sum.first += weight * (first + m.weight * to_centre);
-    // steiner: sum (x + c)(x + c)^T
+    // parallel axis theorem: sum (x + c)(x + c)^T
     sum.second += weight * (second + to_centre * first.transpose() + first * to_centre.transpose() +
                             m.weight * to_centre * to_centre.transpose());
   }

@@ -1,4 +1,4 @@
-// Whether a scan at some pose would have to look through what the map knows to be there.
+// Consistency check of a pose: share of the beams that would pass through occupied cells.
 #pragma once
 
 #include "stillmap/grid/block_layout.hpp"
@@ -10,8 +10,9 @@
 
 namespace stillmap {
 
-// Weighted share of the beams that cross a cell of at least that occupancy (15) more than `margin`
-// metres before they end. Points are end points in the moving frame, T_sensor where beams begin.
+// Weighted share of beams that cross a cell of at least min_occupancy (15) more than `margin`
+// metres before their end point. points: metres, moving frame; sensor: origin of the beams in that
+// frame.
 template <int D>
 inline double occluded_share(const OccupancyGrid<D>& grid, const std::vector<Vec<D>>& points,
                              const std::vector<double>& weights, const Pose<D>& pose,

@@ -1,8 +1,8 @@
-// One sweep of a spinning lidar against the map so far: pose and motion during the sweep together,
-// beams weighted by e, with a Gaussian prior on both. Minimises over T and the twist xi
+// Point-to-plane registration of a lidar sweep against an NDT map: pose T and twist xi together.
+// Minimises
 //   1/2 d^T Lambda d + gain sum_n e_n v_n rho(r_n^2 / v_n),  y_n = T Exp(tau_n xi) p_n,
-// r_n being the distance of y_n from the surface around it, v_n its variance, d = (T, xi) minus
-// the prior, all of it in the moving frame; rho(s) = 1/2 s / (1 + s / k^2), Geman and McClure's.
+// with r_n the distance of y_n from the plane around it, v_n its variance, d = (T, xi) boxminus the
+// prior in the moving frame, and rho(s) = 1/2 s / (1 + s / k^2) the Geman-McClure kernel.
 #pragma once
 
 #include <Eigen/Cholesky>
@@ -20,12 +20,12 @@ namespace stillmap {
 
 template <int D>
 struct TimedPoints {
-  std::vector<Vec<D>> points;  // in the moving frame at the time of each, metres
+  std::vector<Vec<D>> points;  // metres, moving frame at the time of each
   std::vector<double> weights;
-  std::vector<double> times;  // seconds from the pose
+  std::vector<double> times;  // seconds since the pose
 };
 
-// T_map_base and its motion: (velocity, rate of turn) in the moving frame.
+// T_map_base and the twist (velocity, angular velocity) in the moving frame.
 template <int D>
 struct MotionState {
   Pose<D> pose;
@@ -41,13 +41,13 @@ struct MotionPrior {
 
 struct PlaneRegistrationOptions {
   PlaneOptions plane;
-  double sigma;         // metres, of a range besides the scatter of the surface
-  double kernel_width;  // standard deviations at which a beam has a quarter of its weight
-  double gain;          // how much one beam counts: neighbours share the errors of one surface
+  double sigma;         // metres, range noise in addition to the plane's
+  double kernel_width;  // k, in standard deviations: a beam there has a quarter of its weight
+  double gain;          // information scale per beam: beams on one surface have correlated errors
   int start_level;
-  double start_slack;  // metres, how far off the surfaces may be at first
+  double start_slack;  // metres, additional standard deviation in the first iteration
   int max_iterations;
-  double tolerance;  // metres, and radians for a tenth of it, of the last step
+  double tolerance;  // of the last step: metres, and 10 times radians
 };
 
 template <int D>
@@ -56,8 +56,8 @@ struct MotionQuadratic {
   Eigen::Matrix<double, kSize, kSize> hessian = Eigen::Matrix<double, kSize, kSize>::Zero();
   Eigen::Matrix<double, kSize, 1> gradient = Eigen::Matrix<double, kSize, 1>::Zero();
   double cost = 0.0;
-  double inlier_weight = 0.0;   // weight of beams that lie on a surface
-  double matched_weight = 0.0;  // weight of those that are near one
+  double inlier_weight = 0.0;   // weight of beams within the kernel width of a plane
+  double matched_weight = 0.0;  // weight of beams with a plane
   double total_weight = 0.0;
 
   void add(const MotionQuadratic& other) {
@@ -74,16 +74,16 @@ template <int D>
 struct PlaneRegistrationResult {
   MotionState<D> state;
   Eigen::Matrix<double, 2 * Lie<D>::kDof, 2 * Lie<D>::kDof> information;
-  MotionQuadratic<D> model;  // where it ended
+  MotionQuadratic<D> model;  // data term at the result
   int iterations = 0;
 };
 
-// How far a steady motion leads: V(w) v with Exp(v, w) = [Exp(w), V(w) v].
+// V(w) v, the translation of Exp(v, w).
 template <int D>
 inline Vec<D> integrate_velocity(const Vec<D>& v,
                                  const Eigen::Matrix<double, Lie<D>::kRotation, 1>& w) {
   if constexpr (D == 2) {
-    // the chord of an arc points half the turn to the side and is shorter than the arc
+    // the chord of an arc is turned by half the angle and shorter than the arc
     const double half = 0.5 * w[0];
     const double chord_ratio = std::abs(half) > 1e-9 ? std::sin(half) / half : 1.0;
     return chord_ratio * (Lie<2>::exp_rotation(0.5 * w) * v);
@@ -97,7 +97,7 @@ inline Vec<D> integrate_velocity(const Vec<D>& v,
   }
 }
 
-// Where a point of the moving frame is carried by a twist within tau seconds: Exp(tau xi) p.
+// Exp(tau xi) p: a point carried along by a twist for tau seconds.
 template <int D>
 inline Vec<D> transform_by_twist(const typename Lie<D>::Tangent& twist, double tau,
                                  const Vec<D>& p) {
@@ -107,7 +107,7 @@ inline Vec<D> transform_by_twist(const typename Lie<D>::Tangent& twist, double t
   return Lie<D>::exp_rotation(w) * p + integrate_velocity<D>(tau * twist.template head<D>(), w);
 }
 
-// T moved in its own frame: t + R dt, R Exp(dr); the twist adds up.
+// Retraction in the moving frame: t + R dt, R Exp(dr); the twist is added.
 template <int D>
 inline MotionState<D> boxplus(const MotionState<D>& state,
                               const Eigen::Matrix<double, 2 * Lie<D>::kDof, 1>& step) {
@@ -119,7 +119,7 @@ inline MotionState<D> boxplus(const MotionState<D>& state,
   return out;
 }
 
-// d such that moved(from, d) = to
+// d with boxplus(from, d) = to.
 template <int D>
 inline Eigen::Matrix<double, 2 * Lie<D>::kDof, 1> boxminus(const MotionState<D>& to,
                                                            const MotionState<D>& from) {
@@ -131,7 +131,7 @@ inline Eigen::Matrix<double, 2 * Lie<D>::kDof, 1> boxminus(const MotionState<D>&
   return d;
 }
 
-// The surface around a place on the finest level, from `level` on, that has one.
+// Plane on the finest level that has one, starting at `level`.
 template <int D>
 inline bool find_finest_plane(const NdtMap<D>& map, const Vec<D>& position, int level,
                               const PlaneOptions& options, Plane<D>& plane) {
@@ -153,11 +153,11 @@ inline void add_beam(const NdtMap<D>& map, const Vec<D>& point, double weight, d
   const double v = plane.variance + options.sigma * options.sigma + slack * slack;
   const double k2 = options.kernel_width * options.kernel_width;
   const double s = r * r / v, kernel_weight = 1.0 / (1.0 + s / k2);
-  const double w = weight * kernel_weight * kernel_weight / v;  // d rho / d s, twice
-  // y = T p moves by R [1, -[p]x] delta with the moving frame: n^T of it is a row in that frame
+  const double w = weight * kernel_weight * kernel_weight / v;  // 2 d rho / d s
+  // d y = R [1, -[p]x] delta in the moving frame, so the row is n^T of it
   const Vec<D> normal = state.pose.R.transpose() * plane.normal;
   const typename Lie<D>::Tangent jacobian = Lie<D>::jacobian(p).transpose() * normal;
-  // the twist moves a beam tau times as far as the pose does, to first order in tau xi
+  // d y / d twist = tau d y / d pose, to first order in tau xi
   const Eigen::Matrix<double, n, n> H = w * jacobian * jacobian.transpose();
   model.hessian.template topLeftCorner<n, n>() += H;
   model.gradient.template head<n>() += (w * r) * jacobian;
@@ -171,8 +171,8 @@ inline void add_beam(const NdtMap<D>& map, const Vec<D>& point, double weight, d
   if (s < k2) model.inlier_weight += weight;
 }
 
-// The data term alone. Shares of fixed size are added up in order: the same bits from any number
-// of threads.
+// Normal equations of the data term. Chunks of fixed size are summed in order, so the result does
+// not depend on the number of threads.
 template <int D>
 inline MotionQuadratic<D> linearise(const NdtMap<D>& map, const TimedPoints<D>& beams,
                                     const MotionState<D>& state, int level, double slack,
@@ -198,8 +198,8 @@ inline MotionQuadratic<D> linearise(const NdtMap<D>& map, const TimedPoints<D>& 
   return sum;
 }
 
-// Gauss-Newton steps from `start`: on coarse levels and with slack first, as far as the prior may
-// be off; from step to step one level finer, with half the slack.
+// Gauss-Newton from `start`, coarse to fine: each iteration goes one level finer and halves the
+// slack.
 template <int D>
 inline PlaneRegistrationResult<D> register_sweep(const NdtMap<D>& map, const TimedPoints<D>& beams,
                                                  const MotionPrior<D>& prior,
@@ -229,7 +229,7 @@ inline PlaneRegistrationResult<D> register_sweep(const NdtMap<D>& map, const Tim
     level = std::max(level - 1, 0);
     slack = slack > options.sigma ? 0.5 * slack : 0.0;
   }
-  // a chain of products drifts away from rotations
+  // re-orthogonalise after a chain of products
   result.state.pose.R = Lie<D>::exp_rotation(Lie<D>::log_rotation(result.state.pose.R));
   return result;
 }

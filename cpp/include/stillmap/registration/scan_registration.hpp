@@ -1,7 +1,8 @@
-// (9): one scan against the map so far, beams weighted by e, with a Gaussian motion prior.
-// Minimises  J(x) = - gain sum_n e_n ln((base + F(y_n(x))) / (floor + 1)) + 1/2 |x - x_prior|^2
-// in the metric of the prior's information, by Newton steps on the smoothed field; base = floor in
-// seen space, floor + unknown elsewhere.
+// Registration of one scan against a likelihood field (9), beams weighted by e, with a Gaussian
+// prior. Minimises
+//   J(x) = - gain sum_n e_n ln((base + F(y_n(x))) / (floor + 1)) + 1/2 |x - x_prior|^2
+// in the metric of the prior's information; base = floor in observed space, floor + unknown
+// elsewhere.
 #pragma once
 
 #include <Eigen/Cholesky>
@@ -17,14 +18,14 @@ namespace stillmap {
 
 template <int D>
 struct WeightedBeams {
-  std::vector<Vec<D>> points;  // in the moving frame, metres
+  std::vector<Vec<D>> points;  // metres, moving frame
   std::vector<double> weights;
-  std::vector<GaussianWindow<D>> windows;  // what each saw of the field last
+  std::vector<GaussianWindow<D>> windows;  // cache, one per beam
 };
 
 struct ScanRegistrationOptions {
   LikelihoodFieldOptions field;
-  double gain;  // how much one beam counts: neighbouring beams are not independent
+  double gain;  // information scale per beam: neighbouring beams are not independent
   int max_iterations;
 };
 
@@ -52,7 +53,7 @@ struct QuadraticModel {
   double inliers = 0.0;
 };
 
-// A symmetric matrix without its negative part.
+// Projection of a symmetric matrix on to the positive semidefinite ones.
 template <int D>
 inline Eigen::Matrix<double, D, D> positive_part(const Eigen::Matrix<double, D, D>& A) {
   if constexpr (D == 2) {
@@ -71,8 +72,8 @@ inline Eigen::Matrix<double, D, D> positive_part(const Eigen::Matrix<double, D, 
   }
 }
 
-// The curvature of ln F across a wall and none along it: sigma^-2 minus the spread of the means,
-// without its negative part.
+// Negative Hessian of ln F, projected on to the positive semidefinite matrices: sigma^-2 minus the
+// covariance of (mu_k - y) / sigma^2, so zero along a wall.
 template <int D>
 inline Eigen::Matrix<double, D, D> curvature(const FieldSample<D>& sample, double sigma) {
   Eigen::Matrix<double, D, D> A = -sample.pull_covariance;
@@ -104,7 +105,7 @@ inline QuadraticModel<D> linearise(LikelihoodField<D>& field, WeightedBeams<D>& 
   return model;
 }
 
-// Damped Newton steps from `start`; never ends at a higher cost than it began.
+// Levenberg-Marquardt from `start`; never returns a higher cost than that of `start`.
 template <int D>
 inline ScanRegistrationResult<D> minimise_levenberg_marquardt(
     LikelihoodField<D>& field, WeightedBeams<D>& beams, const PosePrior<D>& prior,

@@ -1,5 +1,6 @@
-// SE(2) and SE(3): the only specialised pair. A small motion is delta = (translation, rotation),
-// applied as y = t + dt + Exp(dr) R p: the rotation turns about the sensor, not the map's origin.
+// SE(2) and SE(3), the only code that is specialised by dimension. The tangent vector is delta =
+// (translation dt, rotation dr) and acts as y = t + dt + Exp(dr) R p: the rotation is about the
+// sensor, not about the origin of the map.
 #pragma once
 
 #include <Eigen/Dense>
@@ -35,7 +36,7 @@ struct Lie {
     }
   }
 
-  // d y / d delta at delta = 0 for an end point `arm` away from the sensor, in the map frame
+  // d y / d delta at delta = 0 of an end point with lever arm R p, in the map frame.
   static Jacobian jacobian(const Vector& arm) {
     Jacobian J;
     J.template leftCols<D>().setIdentity();
@@ -71,7 +72,7 @@ struct Pose {
     return out;
   }
 
-  // delta such that other.moved(delta) is this pose
+  // delta with other.boxplus(delta) = *this.
   typename Lie<D>::Tangent boxminus(const Pose& other) const {
     typename Lie<D>::Tangent delta;
     delta.template head<D>() = t - other.t;
@@ -80,7 +81,7 @@ struct Pose {
   }
 };
 
-// from a row-major homogeneous matrix
+// From a row-major homogeneous matrix.
 template <int D>
 inline Pose<D> pose_from(const double* m) {
   Pose<D> pose;

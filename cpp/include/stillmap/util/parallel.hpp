@@ -1,4 +1,4 @@
-// Static division of work over threads; exceptions reach the caller.
+// Static partitioning of work over threads; exceptions are rethrown in the caller.
 #pragma once
 
 #include <algorithm>
@@ -9,8 +9,7 @@
 
 namespace stillmap {
 
-// Calls work(thread, first, last) on contiguous shares whose bounds are given: bounds[i] to
-// bounds[i + 1].
+// Calls work(thread, bounds[i], bounds[i + 1]) for each range i, in parallel.
 template <class Work>
 void parallel_for_ranges(const std::vector<size_t>& bounds, Work&& work) {
   const size_t n = bounds.size() - 1;
@@ -30,29 +29,28 @@ void parallel_for_ranges(const std::vector<size_t>& bounds, Work&& work) {
     if (error) std::rethrow_exception(error);
 }
 
-// Bounds that give each thread about the same number of beams; offset has one entry more than
-// there are scans.
+// Range bounds of scans with about the same number of beams each; offset (scans + 1,).
 inline std::vector<size_t> split_by_beams(const int64_t* offset, size_t scans, int threads) {
   const size_t n =
       std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1, std::max<size_t>(scans, 1));
   std::vector<size_t> bounds{0};
   for (size_t i = 1; i < n; ++i) {
-    const int64_t wanted =
+    const int64_t target =
         offset[0] + (offset[scans] - offset[0]) * static_cast<int64_t>(i) / static_cast<int64_t>(n);
-    const auto it = std::lower_bound(offset, offset + scans, wanted);
+    const auto it = std::lower_bound(offset, offset + scans, target);
     bounds.push_back(std::max(bounds.back(), static_cast<size_t>(it - offset)));
   }
   bounds.push_back(scans);
   return bounds;
 }
 
-// Bounds that give each thread about the same number of n things.
+// Range bounds that split n items evenly.
 inline std::vector<size_t> split_evenly(size_t n, int threads) {
-  constexpr size_t few = 1 << 12;  // of which no thread is worth while
-  const size_t shares = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1,
-                                           std::max<size_t>(n / few, 1));
+  constexpr size_t kMinItems = 1 << 12;  // items, fewer do not pay for a thread
+  const size_t n_ranges = std::clamp<size_t>(static_cast<size_t>(std::max(threads, 1)), 1,
+                                             std::max<size_t>(n / kMinItems, 1));
   std::vector<size_t> bounds;
-  for (size_t i = 0; i <= shares; ++i) bounds.push_back(n * i / shares);
+  for (size_t i = 0; i <= n_ranges; ++i) bounds.push_back(n * i / n_ranges);
   return bounds;
 }
 
