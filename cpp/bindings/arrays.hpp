@@ -1,4 +1,4 @@
-// Array types at the border and the checks between them.
+// Array types of the Python interface, and checks of their shapes and values.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -7,11 +7,14 @@
 #include <stdexcept>
 #include <string>
 
-#include "stillmap/beams.hpp"
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/scans.hpp"
+#include "stillmap/util/lie.hpp"
 
 namespace nb = nanobind;
 
-namespace stillmap::border {
+namespace stillmap::bindings {
 
 template <int D>
 using Points = nb::ndarray<const float, nb::numpy, nb::shape<-1, D>, nb::c_contig, nb::device::cpu>;
@@ -30,9 +33,9 @@ using Cells =
 template <class T>
 using Flat = nb::ndarray<const T, nb::numpy, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
-// A new array that owns its memory; the data is moved in.
+// NumPy array that owns the data of a vector.
 template <class T>
-nb::ndarray<nb::numpy, T> owned(std::vector<T>&& data, std::initializer_list<size_t> shape) {
+nb::ndarray<nb::numpy, T> to_numpy(std::vector<T>&& data, std::initializer_list<size_t> shape) {
   auto* held = new std::vector<T>(std::move(data));
   nb::capsule owner(held, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
   return nb::ndarray<nb::numpy, T>(held->data(), shape, owner);
@@ -64,7 +67,7 @@ Cell<D> cell_from(const Cells<D>& cells, size_t k) {
   Cell<D> cell;
   for (int d = 0; d < D; ++d) {
     const int64_t c = cells.data()[k * D + static_cast<size_t>(d)];
-    require(std::abs(c) < Grid<D>::kMaxCell, "cells: out of range");
+    require(std::abs(c) < BlockLayout<D>::kMaxCell, "cells: out of range");
     cell[d] = static_cast<int32_t>(c);
   }
   return cell;
@@ -86,7 +89,7 @@ auto matrix_of(const Pose<D>& pose) {
     T[r * (D + 1) + D] = pose.t[static_cast<int>(r)];
   }
   T.back() = 1.0;
-  return owned(std::move(T), {D + 1, D + 1});
+  return to_numpy(std::move(T), {D + 1, D + 1});
 }
 
 inline const float* per_beam(const Flat<float>& values, size_t n_beams, const char* name) {
@@ -100,4 +103,4 @@ inline void require_probability(double p, const char* name) {
   require(p >= 0.0 && p <= 1.0, std::string(name) + ": expected a probability in [0, 1]");
 }
 
-}  // namespace stillmap::border
+}  // namespace stillmap::bindings

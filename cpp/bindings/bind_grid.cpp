@@ -9,49 +9,53 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
-#include "box.hpp"
-#include "stillmap/grid.hpp"
+#include "cell_box.hpp"
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/ray_traversal.hpp"
+#include "stillmap/grid/ray_walker.hpp"
 
-namespace stillmap::border {
+namespace stillmap::bindings {
 namespace {
 
 template <int D>
-nb::ndarray<nb::numpy, double> alpha_beta(const Grid<D>& grid, const Cells<D>& cells) {
+nb::ndarray<nb::numpy, double> alpha_beta(const OccupancyGrid<D>& grid, const Cells<D>& cells) {
   const size_t n = cells.shape(0);
   std::vector<double> out(2 * n, 0.0);
-  Cursor<const Grid<D>> cursor(grid);
+  BlockCursor<const OccupancyGrid<D>> cursor(grid);
   for (size_t k = 0; k < n; ++k) {
-    if (const Counts* c = cursor.seen(cell_from<D>(cells, k))) {
+    if (const CellCounts* c = cursor.find_observed(cell_from<D>(cells, k))) {
       out[2 * k] = from_fixed(c->alpha);
       out[2 * k + 1] = from_fixed(c->beta);
     }
   }
-  return owned(std::move(out), {n, 2});
+  return to_numpy(std::move(out), {n, 2});
 }
 
-// visit(cell, counts) for the cells somebody looked at, in the blocks that wanted(block) says
+// Calls visit(cell, counts) for the observed cells of the blocks that pass in_range(block).
 template <int D, class Wanted, class Visit>
-void for_each_seen(const Grid<D>& grid, Wanted&& wanted, Visit&& visit) {
+void for_each_observed(const OccupancyGrid<D>& grid, Wanted&& in_range, Visit&& visit) {
   for (const auto& block : grid.blocks()) {
-    if (!wanted(block->origin)) continue;
-    for (int i = 0; i < Grid<D>::kCells; ++i) {
-      const Counts& c = block->counts[static_cast<size_t>(i)];
-      if (c.alpha + c.beta != 0) visit(Grid<D>::cell_at(block->origin, i), c);
+    if (!in_range(block->origin)) continue;
+    for (int i = 0; i < BlockLayout<D>::kCells; ++i) {
+      const CellCounts& c = block->values[static_cast<size_t>(i)];
+      if (c.alpha + c.beta != 0) visit(BlockLayout<D>::cell_at(block->origin, i), c);
     }
   }
 }
 
 template <int D, class Visit>
-void for_each_seen(const Grid<D>& grid, Visit&& visit) {
-  for_each_seen(grid, [](const Cell<D>&) { return true; }, visit);
+void for_each_observed(const OccupancyGrid<D>& grid, Visit&& visit) {
+  for_each_observed(grid, [](const Cell<D>&) { return true; }, visit);
 }
 
-// The box around the cells somebody looked at.
+// Bounding box of the observed cells.
 template <int D>
-Box<D> box_around(const Grid<D>& grid) {
+Box<D> box_around(const OccupancyGrid<D>& grid) {
   Cell<D> first = Cell<D>::Constant(std::numeric_limits<int32_t>::max());
   Cell<D> last = Cell<D>::Constant(std::numeric_limits<int32_t>::min());
-  for_each_seen(grid, [&](const Cell<D>& cell, const Counts&) {
+  for_each_observed(grid, [&](const Cell<D>& cell, const CellCounts&) {
     first = first.cwiseMin(cell);
     last = last.cwiseMax(cell);
   });
@@ -64,7 +68,7 @@ Box<D> box_around(const Grid<D>& grid) {
 }
 
 template <int D>
-auto box_of(const Grid<D>& grid) {
+auto box_of(const OccupancyGrid<D>& grid) {
   const Box<D> box = box_around(grid);
   std::array<int64_t, D> shape;
   for (size_t d = 0; d < D; ++d) shape[d] = static_cast<int64_t>(box.size[D - 1 - d]);
@@ -72,16 +76,17 @@ auto box_of(const Grid<D>& grid) {
 }
 
 template <int D>
-auto dense(const Grid<D>& grid, const Given<D>& first_cell, const Given<D>& shape) {
+auto dense(const OccupancyGrid<D>& grid, const OptionalCell<D>& first_cell,
+           const OptionalCell<D>& shape) {
   if (first_cell.has_value() != shape.has_value())
     throw std::invalid_argument("first_cell, shape: expected both or neither");
   const Box<D> box = shape ? Box<D>(*first_cell, *shape) : box_around(grid);
   std::vector<double> alpha(box.total(), 0.0), beta(box.total(), 0.0);
-  const auto meets = [&](const Cell<D>& block) {
-    return box.meets(Grid<D>::cell_at(block, 0), Grid<D>::kEdge);
+  const auto overlaps = [&](const Cell<D>& block) {
+    return box.overlaps(BlockLayout<D>::cell_at(block, 0), BlockLayout<D>::kEdge);
   };
-  for_each_seen(grid, meets, [&](const Cell<D>& cell, const Counts& c) {
-    if (!box.holds(cell)) return;
+  for_each_observed(grid, overlaps, [&](const Cell<D>& cell, const CellCounts& c) {
+    if (!box.contains(cell)) return;
     alpha[box.index(cell)] = from_fixed(c.alpha);
     beta[box.index(cell)] = from_fixed(c.beta);
   });
@@ -90,16 +95,17 @@ auto dense(const Grid<D>& grid, const Given<D>& first_cell, const Given<D>& shap
 }
 
 template <int D>
-auto seen(const Grid<D>& grid) {
+auto observed_mask(const OccupancyGrid<D>& grid) {
   const Box<D> box = box_around(grid);
   std::vector<uint8_t> cells(box.total(), 0);
-  for_each_seen(grid, [&](const Cell<D>& cell, const Counts&) { cells[box.index(cell)] = 1; });
+  for_each_observed(grid,
+                    [&](const Cell<D>& cell, const CellCounts&) { cells[box.index(cell)] = 1; });
   return std::make_tuple(box.first_cell(), box.shaped(std::move(cells)));
 }
 
 template <int D>
 void bind(nb::module_& m, const char* name) {
-  using G = Grid<D>;
+  using G = OccupancyGrid<D>;
   nb::class_<G>(m, name, "Block-sparse counts alpha, beta of (10); cell = floor(x / resolution).")
       .def(nb::init<double, double>(), nb::arg("resolution"), nb::arg("approach") = 0.0,
            "approach: metres before its end in which a beam says nothing against the cells it "
@@ -117,11 +123,11 @@ void bind(nb::module_& m, const char* name) {
       .def("dense", &dense<D>, nb::arg("first_cell") = nb::none(), nb::arg("shape") = nb::none(),
            "first_cell (D,) int64 and alpha, beta over a box of cells, or the one of those that "
            "were looked at; axes in reverse order, so that a 2D array is [row = y, column = x].")
-      .def("seen", &seen<D>,
+      .def("seen", &observed_mask<D>,
            "first_cell and uint8 over the same box: 1 where alpha + beta are not zero.");
 }
 
-// writes down the cells and lengths of a walk
+// Visitor that records the cells and chord lengths of a traversal.
 template <int D>
 struct Recorder {
   Cell<D> cell = Cell<D>::Zero();
@@ -143,14 +149,14 @@ template <int D>
 auto cells_along(const Flat<double>& start, const Flat<double>& end, double resolution) {
   const Vec<D> a = Eigen::Map<const Vec<D>>(start.data()) / resolution;
   const Vec<D> b = Eigen::Map<const Vec<D>>(end.data()) / resolution;
-  require(all_below<D>(a, Grid<D>::kMaxCell) && all_below<D>(b, Grid<D>::kMaxCell),
+  require(all_below<D>(a, BlockLayout<D>::kMaxCell) && all_below<D>(b, BlockLayout<D>::kMaxCell),
           "start, end: not finite or too far away");
   Recorder<D> recorder;
   const double last_length = traverse<D>(a, b, recorder);
   recorder.visit(last_length);
   const size_t n = recorder.lengths.size();
-  return std::make_tuple(owned(std::move(recorder.cells), {n, static_cast<size_t>(D)}),
-                         owned(std::move(recorder.lengths), {n}));
+  return std::make_tuple(to_numpy(std::move(recorder.cells), {n, static_cast<size_t>(D)}),
+                         to_numpy(std::move(recorder.lengths), {n}));
 }
 
 auto cells_along_any(const Flat<double>& start, const Flat<double>& end, double resolution) {
@@ -172,4 +178,4 @@ void bind_grid(nb::module_& m) {
         "lengths (K,) in cells.");
 }
 
-}  // namespace stillmap::border
+}  // namespace stillmap::bindings

@@ -4,9 +4,10 @@
 
 #include "arrays.hpp"
 #include "bindings.hpp"
-#include "stillmap/z_buffer.hpp"
+#include "stillmap/mesh/z_buffer.hpp"
+#include "stillmap/util/lie.hpp"
 
-namespace stillmap::border {
+namespace stillmap::bindings {
 namespace {
 
 using Faces =
@@ -14,7 +15,7 @@ using Faces =
 using Matrix = nb::ndarray<const double, nb::numpy, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
 
 constexpr int kLargest = 1 << 15;  // pixels along an edge of a picture
-constexpr double kFarthest = 1e9;  // metres, or pixels: nothing overflows
+constexpr double kFarthest = 1e9;  // metres or pixels, avoids overflow
 
 Pinhole checked(const Matrix& K, const OnePose<3>& T_camera_map, int width, int height,
                 double near) {
@@ -47,10 +48,11 @@ auto z_buffer(const Places<3>& vertices, const Faces& faces, const Matrix& K,
   ZBuffer out;
   {
     nb::gil_scoped_release released;
-    out = z_buffer_of(vertices.data(), V, faces.data(), F, camera, threads);
+    out = render_z_buffer(vertices.data(), V, faces.data(), F, camera, threads);
   }
   const auto h = static_cast<size_t>(height), w = static_cast<size_t>(width);
-  return std::make_tuple(owned(std::move(out.depth), {h, w}), owned(std::move(out.face), {h, w}));
+  return std::make_tuple(to_numpy(std::move(out.depth), {h, w}),
+                         to_numpy(std::move(out.face), {h, w}));
 }
 
 }  // namespace
@@ -65,4 +67,4 @@ void bind_z_buffer(nb::module_& m) {
         "what is less than `near` metres ahead is not seen; faces have two sides.");
 }
 
-}  // namespace stillmap::border
+}  // namespace stillmap::bindings

@@ -2,20 +2,22 @@
 
 #include <nanobind/nanobind.h>
 
-namespace stillmap::border {
+namespace stillmap::bindings {
 
 void bind_grid(nanobind::module_& m);
-void bind_beams(nanobind::module_& m);
-void bind_register(nanobind::module_& m);
-void bind_dwell(nanobind::module_& m);
-void bind_fusing(nanobind::module_& m);
-void bind_beside(nanobind::module_& m);
-void bind_bodies(nanobind::module_& m);
-void bind_held_out(nanobind::module_& m);
-void bind_look_counts(nanobind::module_& m);
-void bind_near_faces(nanobind::module_& m);
-void bind_sweep(nanobind::module_& m);
-void bind_texels(nanobind::module_& m);
+void bind_beam_counting(nanobind::module_& m);
+void bind_scan_registration(nanobind::module_& m);
+void bind_surfel_map(nanobind::module_& m);
+void bind_occupancy_hmm(nanobind::module_& m);
+void bind_tsdf(nanobind::module_& m);
+void bind_mean_field(nanobind::module_& m);
+void bind_cluster_pooling(nanobind::module_& m);
+void bind_ground_contact(nanobind::module_& m);
+void bind_held_out_likelihood(nanobind::module_& m);
+void bind_observation_counts(nanobind::module_& m);
+void bind_mesh_distance(nanobind::module_& m);
+void bind_plane_registration(nanobind::module_& m);
+void bind_texel_raster(nanobind::module_& m);
 void bind_z_buffer(nanobind::module_& m);
 
-}  // namespace stillmap::border
+}  // namespace stillmap::bindings

@@ -1,0 +1,137 @@
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/occupancy/beam_counting.hpp"
+#include "stillmap/occupancy/no_return_beams.hpp"
+#include "stillmap/registration/endpoint_interpolation.hpp"
+
+namespace stillmap::bindings {
+namespace {
+
+template <int D>
+void add(OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+         const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses, int threads,
+         bool remove) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  const float* weights = per_beam(e, points.shape(0), "e");
+  nb::gil_scoped_release released;
+  add_beams<D>(grid, scans, weights, remove ? -1 : 1, threads);
+}
+
+template <int D>
+void ends(OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+          const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses, bool remove) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  const float* weights = per_beam(e, points.shape(0), "e");
+  nb::gil_scoped_release released;
+  add_end_points<D>(grid, scans, weights, remove ? -1 : 1);
+}
+
+template <int D>
+void fill(OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+          const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses, double gap,
+          double tolerance, double growth, bool remove) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  const float* weights = per_beam(e, points.shape(0), "e");
+  require(gap >= 0.0 && tolerance >= 0.0 && growth >= 0.0,
+          "gap, tolerance, growth: expected numbers that are not negative");
+  nb::gil_scoped_release released;
+  EndPointInterpolator<D>(grid, scans, weights, remove ? -1 : 1, {gap, tolerance, growth}).add();
+}
+
+template <int D>
+void add_no_return(OccupancyGrid<D>& grid, OccupancyGrid<D>& rest, const Points<D>& points,
+                   const Flat<bool>& hit, const Flat<int64_t>& offset, const Poses<D>& poses,
+                   const Cells<D>& stop_cells, double beyond, int threads) {
+  require(&grid != &rest && grid.resolution() == rest.resolution(),
+          "rest: expected another grid of the same resolution");
+  require(beyond >= 0.0, "beyond: expected a length in metres that is not negative");
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  std::vector<Cell<D>> cells;
+  for (size_t k = 0; k < stop_cells.shape(0); ++k) cells.push_back(cell_from<D>(stop_cells, k));
+  nb::gil_scoped_release released;
+  add_no_return_beams<D>(grid, rest, scans, {cells, beyond / grid.resolution()}, threads);
+}
+
+template <int D>
+auto expectations(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+                  const Flat<int64_t>& offset, const Poses<D>& poses, double prior, int threads) {
+  require_probability(prior, "prior");
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  std::vector<float> e(points.shape(0));
+  {
+    nb::gil_scoped_release released;
+    e_step<D>(grid, scans, prior, threads, e.data());
+  }
+  const size_t n = e.size();
+  return to_numpy(std::move(e), {n});
+}
+
+template <int D>
+auto likelihood(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+                const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses,
+                double prior, int threads) {
+  require_probability(prior, "prior");
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  const float* weights = per_beam(e, points.shape(0), "e");
+  std::vector<LogLikelihoodTerms> terms(scans.n_scans);
+  {
+    nb::gil_scoped_release released;
+    log_likelihood<D>(grid, scans, weights, prior, threads, terms.data());
+  }
+  std::vector<double> out;
+  out.reserve(4 * terms.size());
+  for (const auto& t : terms) out.insert(out.end(), {t.end, t.traversed, t.gamma, t.entropy});
+  return to_numpy(std::move(out), {scans.n_scans, 4});
+}
+
+template <int D>
+void bind(nb::module_& m) {
+  m.def("add_beams", &add<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::arg("threads") = 1, nb::kw_only(),
+        nb::arg("remove") = false,
+        "Adds the sums alpha, beta of (10) of all beams to the grid; e (M,) float32. With remove "
+        "it subtracts what was added before, to the bit.");
+  m.def("add_ends", &ends<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("remove") = false,
+        "Adds what of the sums of `add_beams` depends on e, or subtracts it, to the bit: taken out "
+        "with one e and added with another, they are those of the other.");
+  m.def("fill_surfaces", &fill<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("gap"), nb::arg("tolerance"),
+        nb::arg("growth"), nb::arg("remove") = false,
+        "Adds end points a cell apart, with the smaller e of the two, between those of "
+        "neighbouring beams up to `gap` metres apart that go straight on, within `tolerance` "
+        "metres, from a third one at least 1 / `growth` of that gap away. Nothing passes through "
+        "cells for them. With remove it takes out what was added before, to the bit.");
+  m.def("add_lost", &add_no_return<D>, nb::arg("grid"), nb::arg("rest"),
+        nb::arg("points").noconvert(), nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::arg("stops").noconvert(), nb::arg("beyond"),
+        nb::arg("threads") = 1,
+        "Adds what `add_beams` adds for beams without a return, to the bit: to the grid as far as "
+        "they are believed, the rest to another one. Fewer than three in a row are not believed; "
+        "the others up to the first of the cells stops (S, D) int64, but for the last `beyond` "
+        "metres, which may be infinite.");
+  m.def("e_step", &expectations<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::arg("prior"), nb::arg("threads") = 1,
+        "(6), (8): e (M,) float32. NaN: unusable; the prior at maximum range and where the end "
+        "cell was never looked at.");
+  m.def("log_likelihood", &likelihood<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
+        nb::arg("T_map_sensor").noconvert(), nb::arg("prior"), nb::arg("threads") = 1,
+        "(T, 4) float64 per scan: end-point terms of (5), traversal terms of (5), gamma of (7), "
+        "entropy of e. Logarithms are floored at ln 1e-12.");
+}
+
+}  // namespace
+
+void bind_beam_counting(nb::module_& m) {
+  bind<2>(m);
+  bind<3>(m);
+}
+
+}  // namespace stillmap::bindings

@@ -1,0 +1,98 @@
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <memory>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "cell_box.hpp"
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/occupancy/no_return_beams.hpp"
+#include "stillmap/occupancy/observation_counts.hpp"
+
+namespace stillmap::bindings {
+namespace {
+
+template <int D>
+std::shared_ptr<const NoReturnBeams<D>> no_return_beams(const std::optional<Cells<D>>& stop_cells,
+                                                        double beyond, double resolution) {
+  require(beyond >= 0.0, "beyond: expected a length in metres that is not negative");
+  if (!stop_cells) return nullptr;
+  std::vector<Cell<D>> cells;
+  for (size_t k = 0; k < stop_cells->shape(0); ++k) cells.push_back(cell_from<D>(*stop_cells, k));
+  return std::make_shared<NoReturnBeams<D>>(NoReturnLimits<D>{cells, beyond / resolution});
+}
+
+template <int D>
+void add(ObservationCounts<D>& counts, const Points<D>& points, const Flat<bool>& hit,
+         const Flat<bool>& dynamic, const Flat<int64_t>& offset, const Poses<D>& poses,
+         const Flat<int64_t>& look, int threads) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  require(dynamic.shape(0) == points.shape(0),
+          "dynamic: expected " + std::to_string(points.shape(0)) +
+              " entries as points has rows, got " + std::to_string(dynamic.shape(0)));
+  require(look.shape(0) == scans.n_scans, "look: expected one number per scan");
+  nb::gil_scoped_release released;
+  counts.add(scans, dynamic.data(), look.data(), threads);
+}
+
+template <int D>
+auto dense(const ObservationCounts<D>& counts, const std::array<int64_t, D>& first_cell,
+           const std::array<int64_t, D>& shape) {
+  const Box<D> box(first_cell, shape);
+  std::vector<uint16_t> looks(box.total(), 0), clear(box.total(), 0);
+  for (const auto& block : counts.blocks()) {
+    if (!box.overlaps(BlockLayout<D>::cell_at(block->origin, 0), BlockLayout<D>::kEdge)) continue;
+    for (int i = 0; i < BlockLayout<D>::kCells; ++i) {
+      const Cell<D> cell = BlockLayout<D>::cell_at(block->origin, i);
+      if (!box.contains(cell)) continue;
+      const CellVisits& visits = block->values[static_cast<size_t>(i)];
+      looks[box.index(cell)] = visits.observed;
+      clear[box.index(cell)] = visits.clear;
+    }
+  }
+  return std::make_tuple(box.shaped(std::move(looks)), box.shaped(std::move(clear)));
+}
+
+template <int D>
+void bind(nb::module_& m, const char* name) {
+  using L = ObservationCounts<D>;
+  nb::class_<L>(
+      m, name,
+      "In how many looks a cell was looked at, and in how many of them nothing that moves "
+      "was near.")
+      .def(
+          "__init__",
+          [](L* self, double resolution, double radius, const std::optional<Cells<D>>& stop_cells,
+             double beyond) {
+            new (self) L(resolution, radius, no_return_beams<D>(stop_cells, beyond, resolution));
+          },
+          nb::arg("resolution"), nb::kw_only(), nb::arg("radius"),
+          nb::arg("stops").noconvert() = nb::none(), nb::arg("beyond") = 0.0,
+          "radius: metres around the end of a beam on something that moves within which a cell is "
+          "not clear, between the middles of cells. stops (S, D) int64, beyond: how far beams "
+          "without a return are believed, as `add_lost` has it; without stops all of their way.")
+      .def_prop_ro("resolution", &L::resolution, "metres")
+      .def_prop_ro("radius", &L::radius, "metres")
+      .def_prop_ro("dimension", [](const L&) { return D; })
+      .def_prop_ro("memory_bytes", &L::memory_bytes)
+      .def("add", &add<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("dynamic").noconvert(), nb::arg("offset").noconvert(),
+           nb::arg("T_map_sensor").noconvert(), nb::arg("look").noconvert(), nb::arg("threads") = 1,
+           "Adds scans; dynamic (M,) bool: the hits on something that moves. look (T,) int64 "
+           "numbers their looks, must not fall, and goes beyond those of earlier calls.")
+      .def("dense", &dense<D>, nb::arg("first_cell"), nb::arg("shape"),
+           "looks and clear, uint16 that stop at 65535, over a box of cells, axes in reverse "
+           "order as those of `Grid2D.dense`.");
+}
+
+}  // namespace
+
+void bind_observation_counts(nb::module_& m) {
+  bind<2>(m, "LookCounts2D");
+  bind<3>(m, "LookCounts3D");
+}
+
+}  // namespace stillmap::bindings

@@ -1,0 +1,264 @@
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/scans.hpp"
+#include "stillmap/grid/voxel_downsampling.hpp"
+#include "stillmap/registration/ndt_map.hpp"
+#include "stillmap/registration/plane_registration.hpp"
+#include "stillmap/util/lie.hpp"
+
+namespace stillmap::bindings {
+namespace {
+
+template <int D>
+using Tangents =
+    nb::ndarray<const double, nb::numpy, nb::shape<Lie<D>::kDof>, nb::c_contig, nb::device::cpu>;
+template <int D>
+using MovingSquare =
+    nb::ndarray<const double, nb::numpy, nb::shape<2 * Lie<D>::kDof, 2 * Lie<D>::kDof>,
+                nb::c_contig, nb::device::cpu>;
+
+template <int D>
+typename Lie<D>::Tangent finite_tangent(const Tangents<D>& twist, const char* name) {
+  const typename Lie<D>::Tangent out = Eigen::Map<const typename Lie<D>::Tangent>(twist.data());
+  require(out.allFinite(), std::string(name) + ": not finite");
+  return out;
+}
+
+void require_weights(const float* weights, size_t n) {
+  for (size_t i = 0; i < n; ++i)
+    require(weights[i] >= 0.0f && weights[i] <= 1.0f, "weights: expected values in [0, 1]");
+}
+
+template <int D>
+TimedPoints<D> timed_points(const Points<D>& points, const Flat<float>& weights,
+                            const Flat<float>& times) {
+  const size_t n = points.shape(0);
+  const float* w = per_beam(weights, n, "weights");
+  const float* tau = per_beam(times, n, "times");
+  require_weights(w, n);
+  TimedPoints<D> beams;
+  for (size_t i = 0; i < n; ++i) {
+    const float* p = points.data() + i * D;
+    require(std::isfinite(tau[i]), "times: expected finite seconds");
+    if (!usable<D>(p) || !(w[i] > 0.0f)) continue;
+    beams.points.push_back(point_at<D>(p));
+    beams.weights.push_back(static_cast<double>(w[i]));
+    beams.times.push_back(static_cast<double>(tau[i]));
+  }
+  return beams;
+}
+
+PlaneOptions plane_options(double least, double flat, double wide) {
+  require(least > 0.0, "least: expected a positive weight");
+  require(flat >= 0.0 && flat <= 1.0, "flat: expected a share in [0, 1]");
+  require(wide >= 0.0, "wide: expected a variance that is not negative");
+  return {least, flat, wide};
+}
+
+template <int D>
+void add_points(NdtMap<D>& map, const Points<D>& points, const Flat<float>& weights,
+                const OnePose<D>& T) {
+  const float* w = per_beam(weights, points.shape(0), "weights");
+  require_weights(w, points.shape(0));
+  const Pose<D> pose = checked_pose<D>(T, "T_map_base");
+  nb::gil_scoped_release released;
+  for (size_t i = 0; i < points.shape(0); ++i) {
+    const float* p = points.data() + i * D;
+    if (usable<D>(p) && w[i] > 0.0f) map.add(pose * point_at<D>(p), static_cast<double>(w[i]));
+  }
+}
+
+template <int D>
+void keep_near(NdtMap<D>& map, const OnePose<D>& T, double radius) {
+  require(radius > 0.0, "radius: expected a positive length in metres");
+  const Pose<D> pose = checked_pose<D>(T, "T_map_base");
+  nb::gil_scoped_release released;
+  map.crop(pose.t, radius);
+}
+
+// Normals (N, D), offsets and variances (N,), and validity (N,).
+template <int D>
+auto planes(const NdtMap<D>& map, const Places<D>& places, int level, double least, double flat,
+            double wide) {
+  const PlaneOptions options = plane_options(least, flat, wide);
+  require(level >= 0 && level < map.levels(), "level: there is none of that number");
+  const size_t n = places.shape(0);
+  std::vector<double> normals(n * D, 0.0), offsets(n, 0.0), variances(n, 0.0);
+  std::vector<int8_t> known(n, 0);
+  {
+    nb::gil_scoped_release released;
+    for (size_t i = 0; i < n; ++i) {
+      const Vec<D> place = Eigen::Map<const Vec<D>>(places.data() + i * D);
+      Plane<D> plane;
+      if (!map.fit_plane(place, level, options, plane)) continue;
+      known[i] = 1;
+      for (size_t d = 0; d < D; ++d) normals[i * D + d] = plane.normal[static_cast<int>(d)];
+      offsets[i] = plane.offset;
+      variances[i] = plane.variance;
+    }
+  }
+  return std::make_tuple(to_numpy(std::move(normals), {n, size_t{D}}),
+                         to_numpy(std::move(offsets), {n}), to_numpy(std::move(variances), {n}),
+                         to_numpy(std::move(known), {n}));
+}
+
+template <class Matrix>
+auto square_of(const Matrix& A) {
+  const auto n = static_cast<size_t>(A.rows());
+  std::vector<double> out(n * n);
+  for (size_t r = 0; r < n; ++r)
+    for (size_t c = 0; c < n; ++c) out[r * n + c] = A(static_cast<int>(r), static_cast<int>(c));
+  return to_numpy(std::move(out), {n, n});
+}
+
+template <class Vector>
+auto vector_of(const Vector& v) {
+  const auto n = static_cast<size_t>(v.size());
+  return to_numpy(std::vector<double>(v.data(), v.data() + n), {n});
+}
+
+template <int D>
+auto register_to_map(const NdtMap<D>& map, const Points<D>& points, const Flat<float>& weights,
+                     const Flat<float>& times, const OnePose<D>& T_prior,
+                     const Tangents<D>& twist_prior, const MovingSquare<D>& information,
+                     const std::optional<OnePose<D>>& T_start,
+                     const std::optional<Tangents<D>>& twist_start, double least, double flat,
+                     double wide, double sigma, double kernel, double gain, int start_level,
+                     double start_slack, int max_iterations, double tolerance, int threads) {
+  require(sigma > 0.0 && kernel > 0.0 && gain > 0.0,
+          "sigma, kernel, gain: expected to be positive");
+  require(start_level >= 0 && start_slack >= 0.0 && max_iterations >= 0 && tolerance > 0.0,
+          "start_level, start_slack, max_iterations, tolerance: out of range");
+  const PlaneRegistrationOptions options{plane_options(least, flat, wide),
+                                         sigma,
+                                         kernel,
+                                         gain,
+                                         start_level,
+                                         start_slack,
+                                         max_iterations,
+                                         tolerance};
+  const auto beams = timed_points<D>(points, weights, times);
+  constexpr int n = 2 * Lie<D>::kDof;
+  MotionPrior<D> prior;
+  prior.mean = {checked_pose<D>(T_prior, "T_prior"), finite_tangent<D>(twist_prior, "twist_prior")};
+  prior.information =
+      Eigen::Map<const Eigen::Matrix<double, n, n, Eigen::RowMajor>>(information.data());
+  require(prior.information.allFinite(), "information: not finite");
+  MotionState<D> start = prior.mean;
+  if (T_start) start.pose = checked_pose<D>(*T_start, "T_start");
+  if (twist_start) start.twist = finite_tangent<D>(*twist_start, "twist_start");
+  PlaneRegistrationResult<D> found;
+  Eigen::Matrix<double, n, n> covariance;
+  {
+    nb::gil_scoped_release released;
+    found = register_sweep<D>(map, beams, prior, start, options, threads);
+    covariance = found.information.ldlt().solve(Eigen::Matrix<double, n, n>::Identity());
+  }
+  return std::make_tuple(matrix_of<D>(found.state.pose), vector_of(found.state.twist),
+                         square_of(covariance), found.model.inlier_weight,
+                         found.model.matched_weight, found.model.total_weight, found.iterations);
+}
+
+// Hessian, gradient, cost and the three weights of the data term at one state.
+template <int D>
+auto linearise_sweep(const NdtMap<D>& map, const Points<D>& points, const Flat<float>& weights,
+                     const Flat<float>& times, const OnePose<D>& T, const Tangents<D>& twist,
+                     double least, double flat, double wide, double sigma, double kernel, int level,
+                     double slack) {
+  const PlaneRegistrationOptions options{
+      plane_options(least, flat, wide), sigma, kernel, 1.0, level, slack, 0, 1.0};
+  require(level >= 0 && level < map.levels(), "level: there is none of that number");
+  const MotionState<D> at{checked_pose<D>(T, "T"), finite_tangent<D>(twist, "twist")};
+  const auto q =
+      linearise<D>(map, timed_points<D>(points, weights, times), at, level, slack, options, 1);
+  return std::make_tuple(square_of(q.hessian), vector_of(q.gradient), q.cost, q.inlier_weight,
+                         q.matched_weight, q.total_weight);
+}
+
+template <int D>
+auto carried_points(const Points<D>& points, const Flat<float>& times, const Tangents<D>& twist) {
+  const size_t n = points.shape(0);
+  const float* tau = per_beam(times, n, "times");
+  const auto xi = finite_tangent<D>(twist, "twist");
+  std::vector<float> out(n * D);
+  {
+    nb::gil_scoped_release released;
+    for (size_t i = 0; i < n; ++i) {
+      const float* p = points.data() + i * D;
+      const Vec<D> moved = transform_by_twist<D>(xi, static_cast<double>(tau[i]), point_at<D>(p));
+      for (size_t d = 0; d < D; ++d)
+        out[i * D + d] = static_cast<float>(moved[static_cast<int>(d)]);
+    }
+  }
+  return to_numpy(std::move(out), {n, size_t{D}});
+}
+
+template <int D>
+auto thinned(const Points<D>& points, const Flat<float>& weights, double edge) {
+  require(edge > 0.0 && std::isfinite(edge), "edge: expected a positive length in metres");
+  const float* w = per_beam(weights, points.shape(0), "weights");
+  std::vector<int64_t> kept;
+  {
+    nb::gil_scoped_release released;
+    kept = voxel_downsample<D>(points.data(), w, points.shape(0), edge);
+  }
+  const size_t n = kept.size();
+  return to_numpy(std::move(kept), {n});
+}
+
+// 3D only: in 2D scans are registered against a likelihood field.
+void bind_in_space(nb::module_& m) {
+  constexpr int D = 3;
+  nb::class_<NdtMap<D>>(m, "SweepMap3D",
+                        "Moments of end points in cells of `edge` metres, and of twice, four "
+                        "times, ... that on further levels; a cell takes no more once it weighs "
+                        "`enough`.")
+      .def(nb::init<double, int, double>(), nb::arg("edge"), nb::arg("levels"), nb::arg("enough"))
+      .def("__len__", &NdtMap<D>::size)
+      .def_prop_ro("levels", &NdtMap<D>::levels)
+      .def_prop_ro("memory_bytes", &NdtMap<D>::memory_bytes)
+      .def("add", &add_points<D>, nb::arg("points").noconvert(), nb::arg("weights").noconvert(),
+           nb::arg("T_map_base").noconvert(),
+           "Takes in points (N, D) float32 in the moving frame, weights (N,) float32 = e.")
+      .def("keep_near", &keep_near<D>, nb::arg("T_map_base").noconvert(), nb::arg("radius"),
+           "Forgets what lies farther than that many metres from a pose.")
+      .def("planes", &planes<D>, nb::arg("places").noconvert(), nb::arg("level"), nb::kw_only(),
+           nb::arg("least"), nb::arg("flat"), nb::arg("wide"),
+           "Normals (N, D), offsets (N,) along them, variances (N,) across, and (N,) int8 whether "
+           "there is a surface around places (N, D) float64.");
+  m.def("register_sweep", &register_to_map<D>, nb::arg("map"), nb::arg("points").noconvert(),
+        nb::arg("weights").noconvert(), nb::arg("times").noconvert(),
+        nb::arg("T_prior").noconvert(), nb::arg("twist_prior").noconvert(),
+        nb::arg("information").noconvert(), nb::arg("T_start").noconvert() = nb::none(),
+        nb::arg("twist_start").noconvert() = nb::none(), nb::kw_only(), nb::arg("least"),
+        nb::arg("flat"), nb::arg("wide"), nb::arg("sigma"), nb::arg("kernel"), nb::arg("gain"),
+        nb::arg("start_level"), nb::arg("start_slack"), nb::arg("max_iterations"),
+        nb::arg("tolerance"), nb::arg("threads"),
+        "Pose and motion of one sweep against a map. points (N, D) float32 in the moving frame at "
+        "the time of each, times (N,) float32 seconds from the pose, weights (N,) float32 = e; "
+        "T_prior (D+1, D+1), twist_prior (dof,) = velocity and rate of turn in the moving frame, "
+        "information (2 dof, 2 dof) of both. Returns pose, twist, covariance (2 dof, 2 dof) in the "
+        "moving frame, the weights of beams that lie on surfaces, are near some, are at all, and "
+        "the number of steps.");
+  m.def("linearise_sweep", &linearise_sweep<D>, nb::arg("map"), nb::arg("points").noconvert(),
+        nb::arg("weights").noconvert(), nb::arg("times").noconvert(), nb::arg("T").noconvert(),
+        nb::arg("twist").noconvert(), nb::kw_only(), nb::arg("least"), nb::arg("flat"),
+        nb::arg("wide"), nb::arg("sigma"), nb::arg("kernel"), nb::arg("level"), nb::arg("slack"),
+        "Hessian, gradient and cost of its data term at one pose, and the three weights.");
+  m.def("carried", &carried_points<D>, nb::arg("points").noconvert(), nb::arg("times").noconvert(),
+        nb::arg("twist").noconvert(),
+        "Points (N, D) as seen at the time of the pose: Exp(time twist) p.");
+  m.def("first_in_cells", &thinned<D>, nb::arg("points").noconvert(),
+        nb::arg("weights").noconvert(), nb::arg("edge"),
+        "Indices, rising, of the first usable points with a weight in each cell of `edge` metres.");
+}
+
+}  // namespace
+
+void bind_plane_registration(nb::module_& m) { bind_in_space(m); }
+
+}  // namespace stillmap::bindings

@@ -1,0 +1,162 @@
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/scans.hpp"
+#include "stillmap/registration/correlative_search.hpp"
+#include "stillmap/registration/likelihood_field.hpp"
+#include "stillmap/registration/occlusion_check.hpp"
+#include "stillmap/registration/scan_registration.hpp"
+#include "stillmap/util/lie.hpp"
+
+namespace stillmap::bindings {
+namespace {
+
+template <int D>
+using Square = nb::ndarray<const double, nb::numpy, nb::shape<Lie<D>::kDof, Lie<D>::kDof>,
+                           nb::c_contig, nb::device::cpu>;
+
+template <int D>
+WeightedBeams<D> beams_from(const Points<D>& points, const Flat<float>& weights) {
+  const float* w = per_beam(weights, points.shape(0), "weights");
+  WeightedBeams<D> beams;
+  for (size_t n = 0; n < points.shape(0); ++n) {
+    const float* p = points.data() + n * D;
+    if (!usable<D>(p) || !(w[n] > 0.0f)) continue;
+    require(w[n] <= 1.0f, "weights: expected values in [0, 1]");
+    beams.points.push_back(point_at<D>(p));
+    beams.weights.push_back(static_cast<double>(w[n]));
+  }
+  return beams;
+}
+
+template <int D>
+auto register_beams(const OccupancyGrid<D>& grid, const Points<D>& points,
+                    const Flat<float>& weights, const OnePose<D>& T_prior,
+                    const Square<D>& information, double sigma, int radius, double floor,
+                    double unknown, double gain, int max_iterations, double window_translation,
+                    double window_rotation, double search_range, int starts,
+                    const std::optional<OnePose<D>>& T_start) {
+  require(starts >= 1, "starts: expected at least one");
+  const ScanRegistrationOptions options{{sigma, radius, floor, unknown}, gain, max_iterations};
+  require(gain > 0.0, "gain: expected a positive number");
+  require(window_translation >= 0.0 && window_rotation >= 0.0 && window_rotation <= 3.2,
+          "window: expected half widths, rotation at most pi");
+  auto beams = beams_from<D>(points, weights);
+  PosePrior<D> prior{checked_pose<D>(T_prior, "T_prior"), {}};
+  for (int r = 0; r < Lie<D>::kDof; ++r)
+    for (int c = 0; c < Lie<D>::kDof; ++c) prior.information(r, c) = information(r, c);
+  require(prior.information.allFinite(), "information: not finite");
+  std::optional<Pose<D>> given;
+  if (T_start) given = checked_pose<D>(*T_start, "T_start");
+  ScanRegistrationResult<D> best;
+  best.cost = std::numeric_limits<double>::infinity();
+  size_t candidates = 0;
+  std::vector<ScanRegistrationResult<D>> found;
+  {
+    nb::gil_scoped_release released;
+    LikelihoodField<D> field(grid, options.field);
+    const SearchWindow window{window_translation, window_rotation, search_range};
+    CorrelativeSearch<D> search(grid, beams, prior, window, options);
+    const auto starting_poses =
+        given ? std::vector<Candidate<D>>{{*given, 0.0}} : search.best(static_cast<size_t>(starts));
+    for (const auto& start : starting_poses) {
+      found.push_back(minimise_levenberg_marquardt<D>(field, beams, prior, start.pose, options));
+      if (found.back().cost < best.cost) best = found.back();
+    }
+    candidates = search.poses_tried();
+  }
+  constexpr size_t n = Lie<D>::kDof;
+  std::vector<double> alternatives;
+  for (const auto& other : found) {
+    const typename Lie<D>::Tangent apart = other.pose.boxminus(best.pose);
+    alternatives.insert(alternatives.end(), apart.data(), apart.data() + n);
+    alternatives.push_back(other.cost - best.cost);
+  }
+  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof, Eigen::RowMajor> covariance =
+      best.information.ldlt().solve(decltype(best.information)::Identity());
+  return std::make_tuple(
+      matrix_of<D>(best.pose),
+      to_numpy(std::vector<double>(covariance.data(), covariance.data() + n * n), {n, n}),
+      best.cost, best.inliers, best.iterations, candidates,
+      to_numpy(std::move(alternatives), {found.size(), n + 1}));
+}
+
+template <int D>
+double through(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<float>& weights,
+               const OnePose<D>& T, const OnePose<D>& T_sensor, double margin, double occupied) {
+  require(margin >= 0.0, "margin: expected a length in metres that is not negative");
+  require_probability(occupied, "occupied");
+  const auto beams = beams_from<D>(points, weights);
+  return occluded_share<D>(grid, beams.points, beams.weights, checked_pose<D>(T, "T"),
+                           checked_pose<D>(T_sensor, "T_sensor").t, margin, occupied);
+}
+
+// Data term without the constant ln(floor + 1) per beam, as in the reference implementation.
+template <int D>
+QuadraticModel<D> data_term(const OccupancyGrid<D>& grid, WeightedBeams<D> beams,
+                            const OnePose<D>& T, const LikelihoodFieldOptions& field_options) {
+  LikelihoodField<D> field(grid, field_options);
+  auto q = linearise<D>(field, beams, checked_pose<D>(T, "T"), {field_options, 1.0, 0});
+  for (const double w : beams.weights) q.cost -= w * std::log(field_options.floor + 1.0);
+  return q;
+}
+
+template <int D>
+double cost_at(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<float>& weights,
+               const OnePose<D>& T, double sigma, int radius, double floor, double unknown) {
+  return data_term<D>(grid, beams_from<D>(points, weights), T, {sigma, radius, floor, unknown})
+      .cost;
+}
+
+template <int D>
+auto gradient_at(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<float>& weights,
+                 const OnePose<D>& T, double sigma, int radius, double floor, double unknown) {
+  const auto q =
+      data_term<D>(grid, beams_from<D>(points, weights), T, {sigma, radius, floor, unknown});
+  const size_t n = Lie<D>::kDof;
+  return to_numpy(std::vector<double>(q.gradient.data(), q.gradient.data() + n), {n});
+}
+
+template <int D>
+void bind(nb::module_& m) {
+  m.def(
+      "register_beams", &register_beams<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+      nb::arg("weights").noconvert(), nb::arg("T_prior").noconvert(),
+      nb::arg("information").noconvert(), nb::kw_only(), nb::arg("sigma"), nb::arg("radius"),
+      nb::arg("floor"), nb::arg("unknown"), nb::arg("gain"), nb::arg("max_iterations"),
+      nb::arg("window_translation"), nb::arg("window_rotation"), nb::arg("search_range"),
+      nb::arg("starts"), nb::arg("T_start") = nb::none(),
+      "(9): the pose of one scan against the grid so far. points (N, D) float32 that were hit, in "
+      "the moving frame; weights (N,) float32 = e; T_prior (D+1, D+1) and its information "
+      "(dof, dof) of (translation, rotation about the moving frame's origin). Returns pose, "
+      "covariance, cost, the share of beams the map explains, Newton steps, lattice poses, and "
+      "(R, dof + 1) how far every start ended up from that pose and how much more it cost. With "
+      "T_start nothing is searched: Newton steps begin there.");
+  m.def("share_through", &through<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("T_sensor").noconvert(),
+        nb::kw_only(), nb::arg("margin"), nb::arg("occupied"),
+        "Weighted share of beams, from a sensor at T T_sensor to the points at T, that cross a "
+        "cell of at least that occupancy more than `margin` metres before their end.");
+  m.def("registration_cost", &cost_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
+        nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),
+        "-sum w ln(floor + unknown U + F) at one pose, F being the smoothed field, U = 1 where "
+        "nobody "
+        "looked.");
+  m.def("registration_gradient", &gradient_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
+        nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),
+        "Its derivative (dof,) by a small translation and a rotation about the sensor.");
+}
+
+}  // namespace
+
+void bind_scan_registration(nb::module_& m) {
+  bind<2>(m);
+  bind<3>(m);
+}
+
+}  // namespace stillmap::bindings

@@ -1,0 +1,117 @@
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <array>
+#include <optional>
+
+#include "arrays.hpp"
+#include "bindings.hpp"
+#include "row_slice.hpp"
+#include "stillmap/occupancy/occupancy_hmm.hpp"
+#include "stillmap/occupancy/surfel.hpp"
+#include "stillmap/occupancy/surfel_map.hpp"
+
+namespace stillmap::bindings {
+namespace {
+
+template <int D>
+void add_end_points(SurfelMap<D>& surfel_map, const Points<D>& points, const Flat<bool>& hit,
+                    const Flat<int64_t>& offset, const Poses<D>& poses,
+                    const std::optional<Flat<int64_t>>& time_bin, int threads) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  require(!time_bin || time_bin->shape(0) == scans.n_scans, "look: expected one number per scan");
+  for (size_t t = 0; time_bin && t < scans.n_scans; ++t)
+    require(time_bin->data()[t] >= 0 && time_bin->data()[t] <= kMaxTimeBin, "look: out of range");
+  nb::gil_scoped_release released;
+  surfel_map.add(scans, time_bin ? time_bin->data() : nullptr, threads);
+}
+
+// (E, 2) first and last time bin with a return
+template <int D>
+auto spans(const SurfelMap<D>& surfel_map) {
+  std::vector<int32_t> out;
+  for (const TimeSpan& span : surfel_map.hit_spans())
+    out.insert(out.end(), {span.first, span.last});
+  const size_t n = surfel_map.hit_spans().size();
+  return to_numpy(std::move(out), {n, 2});
+}
+
+template <int D>
+auto surfels(const SurfelMap<D>& surfel_map, const Points<D>& points, const Flat<bool>& hit,
+             const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
+  const auto scans = scans_from<D>(points, hit, offset, poses);
+  std::vector<int32_t> out(points.shape(0));
+  {
+    nb::gil_scoped_release released;
+    associate_beams<D>(surfel_map, scans, threads, out.data());
+  }
+  const size_t n = out.size();
+  return to_numpy(std::move(out), {n});
+}
+
+// Cells, means and normals (E, D), distances from the plane, prominences and beam counts (E,).
+template <int D>
+auto describe_surfels(const SurfelMap<D>& surfel_map, const std::optional<Slice>& rows) {
+  require(surfel_map.fitted(), "surface: fit it first");
+  const auto [first, stride, n] = rows_from(rows, surfel_map.size());
+  const auto d = static_cast<size_t>(D);
+  std::vector<int64_t> cells(n * d), beams(n);
+  std::vector<double> means(n * d), normals(n * d), centre_to_plane(n), prominence(n);
+  for (size_t i = 0; i < n; ++i) {
+    const auto k = static_cast<int32_t>(first + i * stride);
+    for (int a = 0; a < D; ++a) {
+      const size_t at = i * d + static_cast<size_t>(a);
+      cells[at] = surfel_map.cell(k)[a];
+      means[at] = surfel_map.surfel(k).mean[a] * surfel_map.resolution();
+      normals[at] = surfel_map.surfel(k).normal[a];
+    }
+    beams[i] = surfel_map.beam_count(k);
+    prominence[i] = surfel_map.surfel(k).prominence;
+    centre_to_plane[i] = surfel_map.surfel(k).centre_to_plane * surfel_map.resolution();
+  }
+  return std::make_tuple(to_numpy(std::move(cells), {n, d}), to_numpy(std::move(means), {n, d}),
+                         to_numpy(std::move(normals), {n, d}),
+                         to_numpy(std::move(centre_to_plane), {n}),
+                         to_numpy(std::move(prominence), {n}), to_numpy(std::move(beams), {n}));
+}
+
+template <int D>
+void bind(nb::module_& m, const char* name) {
+  using S = SurfelMap<D>;
+  nb::class_<S>(m, name, "One element of surface per cell in which beams ended.")
+      .def(nb::init<double>(), nb::arg("resolution"))
+      .def_prop_ro("resolution", &S::resolution, "metres")
+      .def_prop_ro("dimension", [](const S&) { return D; })
+      .def_prop_ro("size", &S::size, "number of elements")
+      .def_prop_ro(
+          "scatter", [](const S& s) { return s.noise_std() * s.resolution(); },
+          "metres: standard deviation of end points across surfaces; 0 before `fit`")
+      .def("add_end_points", &add_end_points<D>, nb::arg("points").noconvert(),
+           nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
+           nb::arg("T_map_sensor").noconvert(), nb::arg("look").noconvert() = nb::none(),
+           nb::arg("threads") = 1,
+           "Notes where beams ended, and in which looks (T,) int64 where all calls say so.")
+      .def_prop_ro("spans", &spans<D>, nb::rv_policy::move,
+                   "(E, 2) int32: first and last look at which beams ended in the cell of each "
+                   "element, once it is fitted; (0, 2) where nobody said.")
+      .def("fit", &S::fit, nb::arg("threads") = 1, nb::call_guard<nb::gil_scoped_release>(),
+           "Means, normals and scatter from all end points; none can be added any more.")
+      .def("elements", &describe_surfels<D>, nb::arg("rows") = nb::none(),
+           "cells (E, D) int64, means (E, D) in metres, normals (E, D) (zero: none), distance (E,) "
+           "of the cell's centre from the surface around it in metres (zero: none), prominence "
+           "(E,): its beams against those of the richest cell around, beams (E,). rows (first, "
+           "last, every): of some of the elements.")
+      .def("elements_of", &surfels<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
+           nb::arg("threads") = 1, "(M,) int32: the element in which each beam ended, -1: none.");
+}
+
+}  // namespace
+
+void bind_surfel_map(nb::module_& m) {
+  bind<2>(m, "Surface2D");
+  bind<3>(m, "Surface3D");
+}
+
+}  // namespace stillmap::bindings

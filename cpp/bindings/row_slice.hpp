@@ -1,0 +1,28 @@
+// Slices of rows, so that large results can be fetched in parts.
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <optional>
+
+#include "arrays.hpp"
+
+namespace stillmap::bindings {
+
+// The rows first, first + stride, ..., n in total.
+struct Rows {
+  size_t first = 0, stride = 1, n = 0;
+};
+using Slice = std::array<int64_t, 3>;  // first, last, stride
+
+inline Rows rows_from(const std::optional<Slice>& rows, size_t size) {
+  if (!rows) return {0, 1, size};
+  const auto [first, last, stride] = *rows;
+  require(0 <= first && first <= last && last <= static_cast<int64_t>(size) && stride > 0,
+          "rows: expected some of the elements");
+  return {static_cast<size_t>(first), static_cast<size_t>(stride),
+          static_cast<size_t>((last - first + stride - 1) / stride)};
+}
+
+}  // namespace stillmap::bindings

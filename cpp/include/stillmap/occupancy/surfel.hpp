@@ -1,0 +1,95 @@
+// Surfels and the sums over end points from which they are fitted.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <limits>
+
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
+
+namespace stillmap {
+
+// Surface element of one cell, in units of cells.
+template <int D>
+struct Surfel {
+  Vec<D> mean = Vec<D>::Zero();    // of the end points in the cell
+  Vec<D> normal = Vec<D>::Zero();  // unit length; zero: isotropic, no plane was fitted
+  double centre_to_plane = 0.0;    // signed distance from the cell's centre to the plane
+  double prominence = 1.0;         // beams in the cell / beams in the fullest cell of the window
+  Vec<D> centre = Vec<D>::Zero();  // of the fitted plane patch; without a plane, the mean
+  double half_extent = 0.5;        // half extent of the plane patch
+};
+
+constexpr int64_t kMaxTimeBin = std::numeric_limits<int32_t>::max();
+
+// First and last time bin with a return in a cell.
+struct TimeSpan {
+  int32_t first = static_cast<int32_t>(kMaxTimeBin), last = -1;
+
+  void extend(int64_t time_bin) {
+    first = std::min(first, static_cast<int32_t>(time_bin));
+    last = std::max(last, static_cast<int32_t>(time_bin));
+  }
+  int64_t n_bins() const { return int64_t{last} - first + 1; }
+};
+
+// Sums over the end points in a cell.
+template <int D>
+struct EndPointSums {
+  static constexpr int kProducts = D * (D + 1) / 2;
+
+  Cell<D> cell;
+  int64_t count = 0;
+  std::array<Fixed, D> first{};           // sum of x = end point - cell corner
+  std::array<Fixed, kProducts> second{};  // sum of x x^T, upper triangle by rows
+  TimeSpan hit_span;
+
+  void add(const Vec<D>& end) {
+    const Vec<D> x = end - cell.template cast<double>();
+    ++count;
+    size_t product = 0;
+    for (int i = 0; i < D; ++i) {
+      first[static_cast<size_t>(i)] += to_fixed(x[i]);
+      for (int j = i; j < D; ++j) second[product++] += to_fixed(x[i] * x[j]);
+    }
+  }
+  // Adds the sums over other end points in the same cell.
+  void add(const EndPointSums& other) {
+    count += other.count;
+    for (size_t i = 0; i < first.size(); ++i) first[i] += other.first[i];
+    for (size_t i = 0; i < second.size(); ++i) second[i] += other.second[i];
+    hit_span.first = std::min(hit_span.first, other.hit_span.first);
+    hit_span.last = std::max(hit_span.last, other.hit_span.last);
+  }
+};
+
+// Count, mean and covariance of the end points in a window of cells.
+template <int D>
+struct WindowMoments {
+  using Square = Eigen::Matrix<double, D, D>;
+
+  double count = 0.0, max_count = 0.0;  // total; largest of any cell
+  Vec<D> first = Vec<D>::Zero();
+  Square second = Square::Zero();
+
+  void add(const EndPointSums<D>& s, const Cell<D>& centre) {
+    const Vec<D> corner = (s.cell - centre).template cast<double>();
+    const double n = static_cast<double>(s.count);
+    Vec<D> sum;
+    for (int d = 0; d < D; ++d) sum[d] = from_fixed(s.first[static_cast<size_t>(d)]);
+    Square products;
+    size_t product = 0;
+    for (int i = 0; i < D; ++i)
+      for (int j = i; j < D; ++j) products(i, j) = products(j, i) = from_fixed(s.second[product++]);
+    count += n;
+    max_count = std::max(max_count, n);
+    first += sum + n * corner;
+    second += products + corner * sum.transpose() + sum * corner.transpose() +
+              n * corner * corner.transpose();
+  }
+  Vec<D> mean() const { return first / count; }
+  Square covariance() const { return second / count - mean() * mean().transpose(); }
+};
+
+}  // namespace stillmap

@@ -1,0 +1,280 @@
+// Surfel map: one surfel per cell with returns, which has the mean of its end points, the normal of
+// the surface around it and the standard deviation of end points across surfaces.
+#pragma once
+
+#include <Eigen/Eigenvalues>
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <deque>
+#include <limits>
+#include <stdexcept>
+#include <utility>
+#include <vector>
+
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/cell_index.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/ray_walker.hpp"
+#include "stillmap/grid/scans.hpp"
+#include "stillmap/grid/window_query.hpp"
+#include "stillmap/occupancy/surfel.hpp"
+#include "stillmap/util/lie.hpp"
+#include "stillmap/util/parallel.hpp"
+
+namespace stillmap {
+
+constexpr int32_t kNoSurfel = CellIndex<2>::kNone;
+
+template <int D>
+class SurfelMap : public CellIndex<D> {
+ public:
+  // In 3D objects stand on surfaces, above all on the ground, so end points off a plane belong to
+  // another object. In 2D objects stand neighbour walls, and end points off a wall are mostly the
+  // wall under pose error.
+  static constexpr bool kObjectsStandOnSurfaces = D == 3;
+  static constexpr double kOffPlaneSigmas = 2.0;  // of plane noise, for the mean of a cell
+  static constexpr double kEndPointSigmas = 3.0;  // of noise_std, for a single end point
+  static constexpr double kMinOffPlane = 0.2;     // cells: closer points are on the plane
+
+  using Block = typename CellIndex<D>::Block;
+
+  explicit SurfelMap(double resolution) : resolution_(resolution) {
+    if (!(resolution > 0.0) || !std::isfinite(resolution))
+      throw std::invalid_argument("resolution: expected a positive length in metres");
+  }
+  SurfelMap(const SurfelMap&) = delete;
+  SurfelMap& operator=(const SurfelMap&) = delete;
+
+  double resolution() const { return resolution_; }
+  size_t size() const { return fitted_ ? cells_.size() : sums_.size(); }
+  // Standard deviation of end points across surfaces, in cells; 0 before fit.
+  double noise_std() const { return noise_std_; }
+  const Surfel<D>& surfel(int32_t k) const { return surfels_[static_cast<size_t>(k)]; }
+  int64_t beam_count(int32_t k) const { return beam_counts_[static_cast<size_t>(k)]; }
+  const Cell<D>& cell(int32_t k) const { return cells_[static_cast<size_t>(k)]; }
+  // First and last return of each cell; empty without time bins.
+  const std::vector<TimeSpan>& hit_spans() const { return hit_spans_; }
+
+  // Adds the end points of all returns, and their time bins (T,) if given.
+  void add(const Scans<D>& scans, const int64_t* time_bin = nullptr, int threads = 1) {
+    if (fitted_) throw std::invalid_argument("surface: was fitted, and takes no more end points");
+    if (sums_.empty()) has_time_bins_ = time_bin != nullptr;
+    if (has_time_bins_ != (time_bin != nullptr))
+      throw std::invalid_argument("look: of all scans, or of none");
+    const std::vector<size_t> bounds = split_by_beams(scans.offset, scans.n_scans, threads);
+    std::deque<SurfelMap> thread_maps;
+    for (size_t i = 2; i < bounds.size(); ++i) thread_maps.emplace_back(resolution_);
+    parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
+      (i == 0 ? *this : thread_maps[i - 1]).add_range(scans, time_bin, first, last);
+    });
+    // sums are merged in the order in which a single thread would have met the cells
+    for (const SurfelMap& thread_map : thread_maps)
+      for (const EndPointSums<D>& sums : thread_map.sums_) sums_at(sums.cell).add(sums);
+  }
+
+  // Surfel of a cell, or kNoSurfel.
+  int32_t surfel_at(BlockCursor<const SurfelMap<D>>& cursor, const Cell<D>& cell) const {
+    const Block* block = cursor.block(cell);
+    return block ? block->values[static_cast<size_t>(this->local_of(cell))] : kNoSurfel;
+  }
+
+  // Surfel that an end point is associated with: that of its cell or, where the point lies off that
+  // plane, the nearest neighbouring one whose plane it fits.
+  int32_t associate(BlockCursor<const SurfelMap<D>>& cursor, const Vec<D>& end) const {
+    const Cell<D> cell = cell_of<D>(end);
+    const int32_t own = surfel_at(cursor, cell);
+    if (!kObjectsStandOnSurfaces || own == kNoSurfel || !is_off_plane(own, end)) return own;
+    int32_t nearest = own;
+    double min_distance = std::numeric_limits<double>::infinity();
+    for_each_in_cube<D>(cell, 1, [&](const Cell<D>& neighbour) {
+      const int32_t k = surfel_at(cursor, neighbour);
+      if (k == kNoSurfel || is_off_plane(k, end)) return;
+      const double distance = (surfel(k).mean - end).squaredNorm();
+      if (distance < min_distance) min_distance = distance, nearest = k;
+    });
+    return nearest;
+  }
+
+  // Fits means, normals and noise_std to all end points; further calls have no effect.
+  void fit(int threads = 1) {
+    if (fitted_) return;
+    renumber_by_tile();
+    surfels_.assign(size(), {});
+    for (size_t k = 0; k < size(); ++k) surfels_[k].mean = mean_of(sums_[k]);
+    // noise as large as the window hides every wall: enlarge the window
+    for (const int radius : {2, 4, 6})
+      if (fit_normals(radius, threads) >= 0.5) break;
+    cells_.reserve(size());
+    beam_counts_.reserve(size());
+    if (has_time_bins_) hit_spans_.reserve(size());
+    for (const EndPointSums<D>& sums : sums_) {
+      cells_.push_back(sums.cell);
+      beam_counts_.push_back(sums.count);
+      if (has_time_bins_) hit_spans_.push_back(sums.hit_span);
+    }
+    std::vector<EndPointSums<D>>().swap(sums_);  // frees the memory
+    fitted_ = true;
+  }
+  bool fitted() const { return fitted_; }
+
+ private:
+  bool is_off_plane(int32_t k, const Vec<D>& end) const {
+    const Surfel<D>& e = surfel(k);
+    return std::abs(e.normal.dot(end - e.centre)) > kEndPointSigmas * noise_std_ + kMinOffPlane;
+  }
+
+  // Numbers surfels tile by tile, so that surfels along a ray are close together in memory.
+  void renumber_by_tile() {
+    std::vector<EndPointSums<D>> sorted;
+    sorted.reserve(sums_.size());
+    const std::vector<size_t> order = tile_order();
+    for (const auto& block : this->blocks())
+      for (const size_t local : order) {
+        int32_t& k = block->values[local];
+        if (k == kNoSurfel) continue;
+        sorted.push_back(sums_[static_cast<size_t>(k)]);
+        k = static_cast<int32_t>(sorted.size() - 1);
+      }
+    sums_.swap(sorted);
+  }
+
+  // Local indices of the cells of a block, ordered by tiles of 4 cells a side.
+  static std::vector<size_t> tile_order() {
+    constexpr int tile = 4;
+    std::vector<std::pair<int64_t, size_t>> keyed;
+    for (size_t local = 0; local < static_cast<size_t>(CellIndex<D>::kCells); ++local) {
+      int64_t outer = 0, inner = 0;
+      for (int d = D - 1; d >= 0; --d) {
+        const auto coordinate = static_cast<int>((local >> (d * CellIndex<D>::kShift)) &
+                                                 static_cast<size_t>(CellIndex<D>::kEdge - 1));
+        outer = outer * CellIndex<D>::kEdge + coordinate / tile;
+        inner = inner * tile + coordinate % tile;
+      }
+      keyed.emplace_back(outer * 64 + inner, local);
+    }
+    std::sort(keyed.begin(), keyed.end());
+    std::vector<size_t> order;
+    for (const auto& entry : keyed) order.push_back(entry.second);
+    return order;
+  }
+
+  void add_range(const Scans<D>& scans, const int64_t* time_bin, size_t first, size_t last) {
+    for_each_beam<D>(scans, first, last, [&](size_t t, int64_t n, const Pose<D>& pose) {
+      if (!scans.hit[n]) return;
+      const BeamSegment<D> beam(pose, scans.points + n * D, resolution_);
+      EndPointSums<D>& sums = sums_at(cell_of<D>(beam.end));
+      sums.add(beam.end);
+      if (time_bin) sums.hit_span.extend(time_bin[t]);
+    });
+  }
+
+  // Sums of a cell, new if it has none.
+  EndPointSums<D>& sums_at(const Cell<D>& cell) {
+    int32_t& index = this->index_of(cell);
+    if (index == kNoSurfel) {
+      index = static_cast<int32_t>(sums_.size());
+      sums_.emplace_back();
+      sums_.back().cell = cell;
+    }
+    return sums_[static_cast<size_t>(index)];
+  }
+
+  static Vec<D> mean_of(const EndPointSums<D>& s) {
+    Vec<D> mean;
+    for (int d = 0; d < D; ++d)
+      mean[d] =
+          s.cell[d] + from_fixed(s.first[static_cast<size_t>(d)]) / static_cast<double>(s.count);
+    return mean;
+  }
+
+  using Square = Eigen::Matrix<double, D, D>;
+
+  // Fits planes to the end points within `radius` cells of each surfel by principal component
+  // analysis; returns the share of beams on planes.
+  double fit_normals(int radius, int threads) {
+    const std::vector<size_t> bounds = split_evenly(size(), threads);
+    std::vector<NormalFit> partial(bounds.size() - 1);
+    parallel_for_ranges(bounds, [&](size_t i, size_t first, size_t last) {
+      partial[i] = fit_normals(radius, first, last);
+    });
+    NormalFit& total = partial.front();
+    for (size_t i = 1; i < partial.size(); ++i) {
+      total.n_beams += partial[i].n_beams;
+      total.n_planar += partial[i].n_planar;
+      total.deviations.insert(total.deviations.end(), partial[i].deviations.begin(),
+                              partial[i].deviations.end());
+    }
+    noise_std_ = weighted_median(total.deviations);
+    return total.n_beams ? static_cast<double>(total.n_planar) / static_cast<double>(total.n_beams)
+                         : 1.0;
+  }
+
+  // Beams in total and on planes; smallest standard deviation and beam count of each plane.
+  struct NormalFit {
+    int64_t n_beams = 0, n_planar = 0;
+    std::vector<std::pair<double, int64_t>> deviations;
+  };
+
+  NormalFit fit_normals(int radius, size_t first_surfel, size_t last_surfel) {
+    NormalFit fit_result;
+    auto& [n_beams, n_planar, deviations] = fit_result;
+    WindowQuery<D> query(*this);
+    const CellRows<D> window = window_rows<D>(radius, true);
+    for (size_t k = first_surfel; k < last_surfel; ++k) {
+      WindowMoments<D> moments;
+      query.for_each(sums_[k].cell, window, [&](int32_t neighbour) {
+        moments.add(sums_[static_cast<size_t>(neighbour)], sums_[k].cell);
+      });
+      const Eigen::SelfAdjointEigenSolver<Square> eigen(moments.covariance());
+      const Vec<D> variance = eigen.eigenvalues().cwiseMax(0.0);  // ascending
+      Surfel<D>& surfel = surfels_[k];
+      surfel.normal.setZero();
+      surfel.centre_to_plane = 0.0;
+      surfel.centre = surfel.mean;
+      surfel.half_extent = 0.5;
+      surfel.prominence = static_cast<double>(sums_[k].count) / moments.max_count;
+      n_beams += sums_[k].count;
+      const bool is_extended = variance[1] > 0.15 * radius * radius;  // over 3 of 5 cells
+      if (!is_extended || variance[0] >= 0.25 * variance[1]) continue;
+      const Vec<D> normal = eigen.eigenvectors().col(0);
+      const Vec<D> plane_point = sums_[k].cell.template cast<double>() + moments.mean();
+      // feet and wheels are not part of the ground below them
+      const double distance = std::abs(normal.dot(surfel.mean - plane_point));
+      if (kObjectsStandOnSurfaces && distance > kMinOffPlane &&
+          distance * distance > kOffPlaneSigmas * kOffPlaneSigmas * variance[0])
+        continue;
+      n_planar += sums_[k].count;
+      deviations.emplace_back(std::sqrt(variance[0]), sums_[k].count);
+      surfel.normal = normal;
+      surfel.centre = plane_point;
+      // uniformly moments points reach sqrt(3) standard deviations; take the inner half
+      surfel.half_extent = 0.5 * std::sqrt(3.0 * variance[1]);
+      const Vec<D> centre = Vec<D>::Constant(0.5);  // from the cell's corner
+      surfel.centre_to_plane = surfel.normal.dot(centre - moments.mean());
+    }
+    return fit_result;
+  }
+
+  static double weighted_median(std::vector<std::pair<double, int64_t>>& values) {
+    int64_t total = 0;
+    for (const auto& v : values) total += v.second;
+    std::sort(values.begin(), values.end());
+    int64_t so_far = 0;
+    for (const auto& v : values)
+      if (2 * (so_far += v.second) >= total) return v.first;
+    return 0.0;
+  }
+
+  double resolution_;
+  double noise_std_ = 0.0;
+  bool fitted_ = false;
+  bool has_time_bins_ = false;
+  std::vector<EndPointSums<D>> sums_;  // cleared by fit
+  std::vector<Surfel<D>> surfels_;
+  std::vector<Cell<D>> cells_;
+  std::vector<int64_t> beam_counts_;
+  std::vector<TimeSpan> hit_spans_;  // empty without time bins
+};
+
+}  // namespace stillmap

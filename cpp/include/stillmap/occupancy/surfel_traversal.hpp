@@ -1,0 +1,210 @@
+// Traversal of the cells with surfels along a ray: the same cells as `traverse`, in the same order.
+// It proceeds block by block and tests the few set cells of a block instead of all cells along the
+// ray.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/ray_traversal.hpp"
+#include "stillmap/grid/ray_walker.hpp"
+#include "stillmap/occupancy/surfel_bitmap.hpp"
+#include "stillmap/occupancy/surfel_map.hpp"
+
+namespace stillmap {
+
+template <int D>
+class SurfelTraversal {
+ public:
+  static constexpr bool kUsesBits = true;  // the 2D version visits all surfels
+  using BlockBits = typename SurfelBitmap<D>::BlockBits;
+
+  // Set cell on the ray.
+  struct Crossing {
+    size_t block;  // number in the bitmap
+    int32_t surfel;
+    Cell<D> cell;
+  };
+
+  SurfelTraversal(const SurfelMap<D>&, const SurfelBitmap<D>& bitmap) : bitmap_(bitmap) {}
+
+  // Calls visit(crossing) for the set cells of `bits` that the ray leaves before its end.
+  template <class Visit>
+  void traverse_marked(const Vec<D>& start, const Vec<D>& end, const std::vector<BlockBits>& bits,
+                       Visit&& visit) {
+    compute_borders(start, end);
+    Cell<D> block = BlockLayout<D>::block_of(first_);
+    const int32_t* page = bitmap_.page_of(block);
+    std::array<int32_t, D> exit_border;  // index of the border at which each axis leaves the block
+    std::array<double, D> exit_length;   // arc length there
+    for (int d = 0; d < D; ++d) {
+      const int32_t local = first_[d] & (kEdge - 1);
+      exit_border[to_size(d)] = step_[to_size(d)] > 0 ? kEdge - 1 - local : local;
+      exit_length[to_size(d)] = borders_[to_size(d)][exit_border[to_size(d)] + 1];
+    }
+    double enter_at = 0.0;
+    for (;;) {
+      int axis = exit_length[1] < exit_length[0] ? 1 : 0;
+      if (D == 3 && exit_length[D - 1] < exit_length[to_size(axis)]) axis = D - 1;
+      const double leave_at = exit_length[to_size(axis)];
+      last_block_ = page ? page[SurfelBitmap<D>::index_in_page(block)] : SurfelBitmap<D>::kNone;
+      if (last_block_ != SurfelBitmap<D>::kNone)
+        visit_block(enter_at, std::min(leave_at, length_), block, static_cast<size_t>(last_block_),
+                    bits, visit);
+      if (!(leave_at < kInf)) return;
+      enter_at = leave_at;
+      exit_border[to_size(axis)] += kEdge;
+      exit_length[to_size(axis)] = borders_[to_size(axis)][exit_border[to_size(axis)] + 1];
+      const int32_t previous = block[axis];
+      block[axis] = previous + step_[to_size(axis)];
+      if (!SurfelBitmap<D>::same_page(previous, block[axis])) page = bitmap_.page_of(block);
+    }
+  }
+
+  // Surfel in the end cell of the last ray.
+  int32_t surfel_at_end(const Cell<D>& end) { return bitmap_.surfel(last_block_, end); }
+
+ private:
+  static constexpr int kEdge = SurfelMap<D>::kEdge;
+  static constexpr double kInf = std::numeric_limits<double>::infinity();
+
+  static size_t to_size(int axis) { return static_cast<size_t>(axis); }
+
+  // Arc lengths at the borders of each axis, accumulated as in `traverse`. Border i is at index i +
+  // 1; index 0 is the start.
+  void compute_borders(const Vec<D>& start, const Vec<D>& end) {
+    first_ = cell_of<D>(start);
+    const Cell<D> cells = cell_of<D>(end) - first_;
+    const Vec<D> direction = end - start;
+    const double length = direction.norm();
+    start_ = start;
+    length_ = length;
+    direction_ = direction * (1.0 / length);
+    for (int d = 0; d < D; ++d) {
+      const int32_t n = std::abs(cells[d]);
+      step_[to_size(d)] = cells[d] > 0 ? 1 : -1;
+      const size_t size = static_cast<size_t>(n) + kEdge + 2;
+      if (border_storage_[to_size(d)].size() < size) border_storage_[to_size(d)].resize(size);
+      double* out = border_storage_[to_size(d)].data();
+      borders_[to_size(d)] = out;
+      *out++ = -kInf;
+      if (n) {
+        const double to_border = first_[d] + (cells[d] > 0 ? 1 : 0) - start[d];
+        const double delta = length / std::abs(direction[d]);
+        double next = to_border / direction[d] * length;
+        for (int32_t i = 0; i < n; ++i, next += delta) *out++ = next;
+      }
+      std::fill_n(out, kEdge + 1, kInf);
+    }
+  }
+
+  // Visits the set cells of one block, which contains the ray between two arc lengths.
+  template <class Visit>
+  void visit_block(double from, double to, const Cell<D>& block, size_t number,
+                   const std::vector<BlockBits>& bits, Visit&& visit) {
+    const BlockBits& block_bits = bits[number];
+    std::array<uint32_t, D> slices;     // set slices within the ray's bounding box
+    for (int d = D - 1; d >= 0; --d) {  // z first: most beams pass above all surfels
+      constexpr double margin = 1e-6;   // cells, more than rounding errors
+      const double corner = start_[d] - block[d] * kEdge;
+      const double entry = corner + direction_[d] * from, exit = corner + direction_[d] * to;
+      // the offset of one makes the cast round down
+      const int low = static_cast<int>(std::min(entry, exit) - margin + 1.0) - 1;
+      const int high = static_cast<int>(std::max(entry, exit) + margin);
+      const uint64_t box = (uint64_t{2} << std::clamp(high, 0, kEdge - 1)) -
+                           (uint64_t{1} << std::clamp(low, 0, kEdge - 1));
+      slices[to_size(d)] = static_cast<uint32_t>(box) & block_bits.slices[to_size(d)];
+      if (!slices[to_size(d)]) return;
+    }
+    size_t n_crossings = 0;
+    block_bits.for_each_in_slices(slices, [&](size_t tile, size_t bit, const Cell<D>& local) {
+      const Cell<D> cell = block * kEdge + local;
+      const int32_t steps = borders_before(cell);
+      if (steps < 0) return;
+      size_t crossing = n_crossings++;  // insertion sort by the order along the ray
+      for (; crossing > 0 && crossings_[crossing - 1].first > steps; --crossing)
+        crossings_[crossing] = crossings_[crossing - 1];
+      crossings_[crossing] = {steps, {number, bitmap_.surfel(number, tile, bit), cell}};
+    });
+    for (size_t i = 0; i < n_crossings; ++i) visit(crossings_[i].second);
+  }
+
+  // Number of borders before a cell; negative if the ray misses the cell or ends in it. At a corner
+  // the border of the lower axis comes first, as in `traverse`.
+  int32_t borders_before(const Cell<D>& cell) const {
+    int32_t steps = 0;
+    std::array<double, D> entry;
+    double exit = kInf;
+    int exit_axis = 0;
+    for (int d = 0; d < D; ++d) {
+      const int32_t i = (cell[d] - first_[d]) * step_[to_size(d)];
+      if (i < 0) return -1;
+      const double* border = borders_[to_size(d)] + i;
+      entry[to_size(d)] = border[0];
+      if (border[1] < exit) exit = border[1], exit_axis = d;
+      steps += i;
+    }
+    bool crosses = exit < kInf;
+    for (int d = 0; d < D; ++d)
+      crosses &= (entry[to_size(d)] < exit) | ((entry[to_size(d)] == exit) & (d < exit_axis));
+    return crosses ? steps : -1;
+  }
+
+  const SurfelBitmap<D>& bitmap_;
+  Vec<D> start_, direction_;
+  double length_;
+  Cell<D> first_;
+  int32_t last_block_ = SurfelBitmap<D>::kNone;
+  std::array<int32_t, D> step_;
+  std::array<std::vector<double>, D> border_storage_;
+  std::array<const double*, D> borders_;
+  std::array<std::pair<int32_t, Crossing>, D * kEdge> crossings_;
+};
+
+// In 2D surfels are dense along rays, so all cells are visited.
+template <>
+class SurfelTraversal<2> {
+ public:
+  static constexpr bool kUsesBits = false;
+  using BlockBits = SurfelBitmap<2>::BlockBits;
+
+  struct Crossing {
+    int32_t surfel;
+    Cell<2> cell;
+  };
+
+  SurfelTraversal(const SurfelMap<2>& surfel_map, const SurfelBitmap<2>&) : cursor_(surfel_map) {}
+
+  template <class Visit>
+  void traverse_marked(const Vec<2>& start, const Vec<2>& end, const std::vector<BlockBits>&,
+                       Visit&& visit) {
+    const auto cells = (cell_of<2>(end) - cell_of<2>(start)).cwiseAbs().sum();
+    crossings_.resize(std::max(crossings_.size(), static_cast<size_t>(cells) + 1));
+    // branch-free, as the test is unpredictable
+    Crossing* next = crossings_.data();
+    RayWalker walker(cursor_, [&](const int32_t* k, const Cell<2>& cell) {
+      const int32_t surfel = k ? *k : kNoSurfel;
+      *next = {surfel, cell};
+      next += surfel != kNoSurfel;
+    });
+    traverse<2>(start, end, walker);
+    for (const Crossing* crossing = crossings_.data(); crossing != next; ++crossing)
+      visit(*crossing);
+  }
+
+  int32_t surfel_at_end(const Cell<2>& end) {
+    const auto* block = cursor_.block(end);
+    return block ? block->values[static_cast<size_t>(SurfelMap<2>::local_of(end))] : kNoSurfel;
+  }
+
+ private:
+  std::vector<Crossing> crossings_;
+  BlockCursor<const SurfelMap<2>> cursor_;
+};
+
+}  // namespace stillmap

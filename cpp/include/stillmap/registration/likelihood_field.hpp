@@ -1,0 +1,200 @@
+// Likelihood field (Thrun et al. 2005, ch. 6.4) as a mixture of Gaussians: one per cell at the mean
+// of its end points, weighted by its occupancy (15), so cells that beams also passed through weigh
+// less.
+#pragma once
+
+#include <Eigen/Eigenvalues>
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "stillmap/grid/block_layout.hpp"
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/grid/occupancy_grid.hpp"
+#include "stillmap/grid/ray_walker.hpp"
+
+namespace stillmap {
+
+constexpr double kPi = 3.14159265358979323846;
+
+struct LikelihoodFieldOptions {
+  double sigma;    // metres, standard deviation of the Gaussians
+  int radius;      // cells, radius of the window of Gaussians
+  double floor;    // value in free space; a wall has 1
+  double unknown;  // added to the floor in unobserved space
+};
+
+template <int D>
+struct FieldSample {
+  double value = 0.0;     // F(y), about 1 on a wall
+  double baseline = 0.0;  // of an unexplained end point: floor (+ unknown if unobserved)
+  Vec<D> log_gradient = Vec<D>::Zero();  // gradient of ln F: mean of (mu_k - y) / sigma^2, 1/m
+  // Covariance of (mu_k - y) / sigma^2: cancels sigma^-2 along a wall, where F is constant.
+  Eigen::Matrix<double, D, D> pull_covariance = Eigen::Matrix<double, D, D>::Zero();
+};
+
+// Gaussians around one cell, cached for a beam while its end point stays in the cell.
+template <int D>
+struct GaussianWindow {
+  struct Gaussian {
+    Vec<D> mean;    // cells
+    double weight;  // m_k, OccupancyGrid::occupancy_ignoring_approach
+  };
+  Cell<D> centre = Cell<D>::Zero();
+  bool valid = false;
+  bool observed = false;
+  bool is_planar = false;               // the means lie on a line or plane
+  Vec<D> normal = Vec<D>::Zero();       // of that plane
+  Vec<D> plane_point = Vec<D>::Zero();  // on that plane, in cells
+  double mean_occupancy = 0.0;          // of the cells
+  double baseline = 0.0;
+  std::vector<Gaussian> gaussians;
+};
+
+template <int D>
+class LikelihoodField {
+ public:
+  LikelihoodField(const OccupancyGrid<D>& grid, const LikelihoodFieldOptions& options)
+      : cursor_(grid), options_(options), resolution_(grid.resolution()) {
+    if (!(options.sigma > 0.0)) throw std::invalid_argument("sigma: expected a positive length");
+    if (!(options.floor > 0.0)) throw std::invalid_argument("floor: expected a positive number");
+    if (!(options.unknown >= 0.0))
+      throw std::invalid_argument("unknown: expected a number that is not negative");
+    if (options.radius < 0 || options.radius > 64)
+      throw std::invalid_argument("radius: expected 0 to 64 cells");
+    const double sigma_cells = options.sigma / resolution_;
+    // The truncation at the radius reduces the variance below sigma^2; corrected so that the
+    // curvature along a uniform wall cancels exactly.
+    const double cut = (options.radius + 0.5) / sigma_cells;
+    const double density = std::exp(-0.5 * cut * cut) / std::sqrt(2.0 * kPi);
+    truncated_variance_ = 1.0 - 2.0 * cut * density / std::erf(cut / std::sqrt(2.0));
+    exponent_ = -0.5 / (sigma_cells * sigma_cells);
+    // F = 1 on a straight wall of fully occupied cells
+    norm_ = 1.0 / std::pow(std::sqrt(2.0 * kPi) * sigma_cells, D - 1);
+  }
+
+  FieldSample<D> evaluate(const Vec<D>& point, GaussianWindow<D>& window) {
+    FieldSample<D> sample;
+    sample.baseline = options_.floor;
+    const Vec<D> y = point / resolution_;
+    if (!all_below<D>(y, BlockLayout<D>::kMaxCell - 64)) return sample;
+    gather_gaussians(cell_of<D>(y), window);
+    sample.baseline = window.baseline;
+    if (!window.observed && window.is_planar) return extrapolate(y, window);
+    double sum = 0.0;
+    Vec<D> first = Vec<D>::Zero();
+    Eigen::Matrix<double, D, D> second = Eigen::Matrix<double, D, D>::Zero();
+    for (const auto& gaussian : window.gaussians) {
+      const Vec<D> to_mean = gaussian.mean - y;
+      const double weight = gaussian.weight * std::exp(exponent_ * to_mean.squaredNorm());
+      sum += weight;
+      first += weight * to_mean;
+      second.noalias() += weight * to_mean * to_mean.transpose();
+    }
+    if (sum <= 0.0) return sample;
+    const double per_metre2 = 1.0 / (options_.sigma * options_.sigma);
+    first /= sum;
+    sample.value = sum * norm_;
+    sample.log_gradient = first * (per_metre2 * resolution_);
+    const double covariance_scale =
+        per_metre2 * per_metre2 * resolution_ * resolution_ / truncated_variance_;
+    sample.pull_covariance = (second / sum - first * first.transpose()) * covariance_scale;
+    return sample;
+  }
+
+ private:
+  // Extends a surface into unobserved space: the end of the mapped part must not pull scans along
+  // it.
+  FieldSample<D> extrapolate(const Vec<D>& y, const GaussianWindow<D>& window) const {
+    FieldSample<D> sample;
+    sample.baseline = window.baseline;
+    const double distance = window.normal.dot(window.plane_point - y);
+    const double per_metre2 = 1.0 / (options_.sigma * options_.sigma);
+    sample.value = window.mean_occupancy * std::exp(exponent_ * distance * distance);
+    sample.log_gradient = window.normal * (distance * resolution_ * per_metre2);
+    sample.pull_covariance.setIdentity();
+    sample.pull_covariance -= window.normal * window.normal.transpose();
+    sample.pull_covariance *= per_metre2;
+    return sample;
+  }
+
+  void fit_plane(GaussianWindow<D>& window) const {
+    window.is_planar = false;
+    if (window.gaussians.size() < D) return;
+    double total = 0.0;
+    Vec<D> mean = Vec<D>::Zero();
+    for (const auto& g : window.gaussians) {
+      total += g.weight;
+      mean += g.weight * g.mean;
+    }
+    if (!(total > 0.0)) return;
+    mean /= total;
+    Eigen::Matrix<double, D, D> covariance = Eigen::Matrix<double, D, D>::Zero();
+    for (const auto& g : window.gaussians)
+      covariance += (g.weight / total) * (g.mean - mean) * (g.mean - mean).transpose();
+    Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> eigen;
+    eigen.computeDirect(covariance);
+    const Vec<D> variance = eigen.eigenvalues();
+    // a line in 3D lies on many planes
+    window.is_planar =
+        variance[0] < 0.1 * variance[1] && (D == 2 || variance[1] > 0.1 * variance[D - 1]);
+    window.normal = eigen.eigenvectors().col(0);
+    window.plane_point = mean;
+    window.mean_occupancy = total / static_cast<double>(window.gaussians.size());
+  }
+
+  void gather_gaussians(const Cell<D>& centre, GaussianWindow<D>& window) {
+    if (window.valid && window.centre == centre) return;
+    window.centre = centre;
+    window.valid = true;
+    window.observed = cursor_.find_observed(centre) != nullptr;
+    window.baseline = options_.floor + (window.observed ? 0.0 : options_.unknown);
+    window.gaussians.clear();
+    const int radius = options_.radius;
+    Cell<D> row = centre.array() - radius;
+    while (true) {
+      gather_row(row, centre[0] + radius, window.gaussians);
+      int d = 1;
+      for (; d < D; ++d) {
+        if (++row[d] <= centre[d] + radius) break;
+        row[d] = centre[d] - radius;
+      }
+      if (d == D) break;
+    }
+    if (!window.observed) fit_plane(window);
+  }
+
+  // Adds the Gaussians of a row of cells along x up to `last`, block by block.
+  void gather_row(Cell<D> cell, int32_t last,
+                  std::vector<typename GaussianWindow<D>::Gaussian>& gaussians) {
+    while (cell[0] <= last) {
+      const auto* block = cursor_.block(cell);
+      const int32_t row_end = std::min(last, cell[0] | (BlockLayout<D>::kEdge - 1));
+      if (block && block->moments) {
+        auto local = static_cast<size_t>(BlockLayout<D>::local_of(cell));
+        for (Cell<D> current = cell; current[0] <= row_end; ++current[0], ++local)
+          if (block->values[local].alpha > 0) gaussians.push_back(gaussian(*block, local, current));
+      }
+      cell[0] = row_end + 1;
+    }
+  }
+
+  static typename GaussianWindow<D>::Gaussian gaussian(
+      const typename OccupancyGrid<D>::Block& block, size_t local, const Cell<D>& cell) {
+    const double per_hit = 1.0 / static_cast<double>(block.values[local].alpha);
+    Vec<D> mean;
+    for (int d = 0; d < D; ++d)
+      mean[d] =
+          cell[d] + per_hit * static_cast<double>((*block.moments)[local][static_cast<size_t>(d)]);
+    return {mean, OccupancyGrid<D>::occupancy_ignoring_approach(block, local)};
+  }
+
+  BlockCursor<const OccupancyGrid<D>> cursor_;
+  LikelihoodFieldOptions options_;
+  double resolution_;
+  double exponent_;
+  double truncated_variance_;
+  double norm_;
+};
+
+}  // namespace stillmap

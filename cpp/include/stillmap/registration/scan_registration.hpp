@@ -1,0 +1,149 @@
+// Registration of one scan against a likelihood field (9), beams weighted by e, with a Gaussian
+// prior. Minimises
+//   J(x) = - gain sum_n e_n ln((base + F(y_n(x))) / (floor + 1)) + 1/2 |x - x_prior|^2
+// in the metric of the prior's information; base = floor in observed space, floor + unknown
+// elsewhere.
+#pragma once
+
+#include <Eigen/Cholesky>
+#include <Eigen/Eigenvalues>
+#include <algorithm>
+#include <vector>
+
+#include "stillmap/grid/cell.hpp"
+#include "stillmap/registration/likelihood_field.hpp"
+#include "stillmap/util/lie.hpp"
+
+namespace stillmap {
+
+template <int D>
+struct WeightedBeams {
+  std::vector<Vec<D>> points;  // metres, moving frame
+  std::vector<double> weights;
+  std::vector<GaussianWindow<D>> windows;  // cache, one per beam
+};
+
+struct ScanRegistrationOptions {
+  LikelihoodFieldOptions field;
+  double gain;  // information scale per beam: neighbouring beams are not independent
+  int max_iterations;
+};
+
+template <int D>
+struct PosePrior {
+  Pose<D> pose;
+  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> information;
+};
+
+template <int D>
+struct ScanRegistrationResult {
+  Pose<D> pose;
+  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> information;  // of the posterior
+  double cost = 0.0;
+  double inliers = 0.0;  // weighted share of beams that the map explains
+  int iterations = 0;
+};
+
+template <int D>
+struct QuadraticModel {
+  typename Lie<D>::Tangent gradient = Lie<D>::Tangent::Zero();
+  Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof> hessian =
+      Eigen::Matrix<double, Lie<D>::kDof, Lie<D>::kDof>::Zero();
+  double cost = 0.0;
+  double inliers = 0.0;
+};
+
+// Projection of a symmetric matrix on to the positive semidefinite ones.
+template <int D>
+inline Eigen::Matrix<double, D, D> positive_part(const Eigen::Matrix<double, D, D>& A) {
+  if constexpr (D == 2) {
+    const double mean = 0.5 * (A(0, 0) + A(1, 1));
+    const double half = 0.5 * (A(0, 0) - A(1, 1));
+    const double half_gap = std::sqrt(half * half + A(0, 1) * A(0, 1));
+    const double low = mean - half_gap, high = mean + half_gap;
+    if (low >= 0.0) return A;
+    if (high <= 0.0) return Eigen::Matrix2d::Zero();
+    return (A - low * Eigen::Matrix2d::Identity()) * (high / (high - low));
+  } else {
+    Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, D, D>> eigen;
+    eigen.computeDirect(A);
+    const Vec<D> eigenvalues = eigen.eigenvalues().cwiseMax(0.0);
+    return eigen.eigenvectors() * eigenvalues.asDiagonal() * eigen.eigenvectors().transpose();
+  }
+}
+
+// Negative Hessian of ln F, projected on to the positive semidefinite matrices: sigma^-2 minus the
+// covariance of (mu_k - y) / sigma^2, so zero along a wall.
+template <int D>
+inline Eigen::Matrix<double, D, D> curvature(const FieldSample<D>& sample, double sigma) {
+  Eigen::Matrix<double, D, D> A = -sample.pull_covariance;
+  A.diagonal().array() += 1.0 / (sigma * sigma);
+  return positive_part<D>(A);
+}
+
+template <int D>
+inline QuadraticModel<D> linearise(LikelihoodField<D>& field, WeightedBeams<D>& beams,
+                                   const Pose<D>& pose, const ScanRegistrationOptions& options) {
+  QuadraticModel<D> model;
+  beams.windows.resize(beams.points.size());
+  double total = 0.0;
+  for (size_t n = 0; n < beams.points.size(); ++n) {
+    const double weight = options.gain * beams.weights[n];
+    const Vec<D> lever = pose.R * beams.points[n];
+    const FieldSample<D> sample = field.evaluate(pose.t + lever, beams.windows[n]);
+    total += beams.weights[n];
+    model.cost -= weight * std::log((sample.baseline + sample.value) / (options.field.floor + 1.0));
+    if (sample.value <= 0.0) continue;
+    const double p_explained = sample.value / (sample.baseline + sample.value);
+    const auto J = Lie<D>::jacobian(lever);
+    model.inliers += beams.weights[n] * p_explained;
+    model.gradient.noalias() -= weight * p_explained * (J.transpose() * sample.log_gradient);
+    model.hessian.noalias() +=
+        weight * p_explained * (J.transpose() * curvature<D>(sample, options.field.sigma) * J);
+  }
+  if (total > 0.0) model.inliers /= total;
+  return model;
+}
+
+// Levenberg-Marquardt from `start`; never returns a higher cost than that of `start`.
+template <int D>
+inline ScanRegistrationResult<D> minimise_levenberg_marquardt(
+    LikelihoodField<D>& field, WeightedBeams<D>& beams, const PosePrior<D>& prior,
+    const Pose<D>& start, const ScanRegistrationOptions& options) {
+  auto with_prior = [&](const Pose<D>& pose, double cost) {
+    const typename Lie<D>::Tangent difference = pose.boxminus(prior.pose);
+    return cost + 0.5 * difference.dot(prior.information * difference);
+  };
+  ScanRegistrationResult<D> result;
+  result.pose = start;
+  QuadraticModel<D> model = linearise<D>(field, beams, start, options);
+  result.cost = with_prior(start, model.cost);
+  double damping = 1e-3;
+  for (; result.iterations < options.max_iterations; ++result.iterations) {
+    auto H = (model.hessian + prior.information).eval();
+    H.diagonal() *= 1.0 + damping;
+    const typename Lie<D>::Tangent gradient =
+        model.gradient + prior.information * result.pose.boxminus(prior.pose);
+    const typename Lie<D>::Tangent delta = -H.ldlt().solve(gradient);
+    if (!delta.allFinite()) break;
+    const Pose<D> trial = result.pose.boxplus(delta);
+    QuadraticModel<D> trial_model = linearise<D>(field, beams, trial, options);
+    const double cost = with_prior(trial, trial_model.cost);
+    const bool converged = delta.template head<D>().norm() < 2e-4 &&
+                           delta.template tail<Lie<D>::kRotation>().norm() < 5e-5;
+    if (cost <= result.cost) {
+      result.pose = trial;
+      result.cost = cost;
+      model = trial_model;
+      damping = std::max(damping * 0.1, 1e-6);
+    } else {
+      damping = std::max(damping, 1e-3) * 10.0;
+    }
+    if (converged || damping > 1e6) break;
+  }
+  result.information = model.hessian + prior.information;
+  result.inliers = model.inliers;
+  return result;
+}
+
+}  // namespace stillmap
