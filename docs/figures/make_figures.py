@@ -200,6 +200,9 @@ def draw_bound(numbers: list[int], bounds: list[float], changed: list[float]) ->
     """The bound and the share of labels that changed, over the iterations."""
     figure, axes = plt.subplots(1, 2, figsize=(7.5, 2.6), layout="constrained")
     _draw_curve(axes[0], numbers, bounds, "bound, nats per hit")
+    best = int(np.argmax(bounds))
+    axes[0].plot(numbers[best], bounds[best], "o", mfc="none", mec=ORANGE, ms=11, label="kept")
+    axes[0].legend(fontsize=8)
     _draw_curve(axes[1], numbers, [100 * c for c in changed], "labels that changed, %")
     axes[1].set_yscale("log")
     figure.savefig(HERE / "bound.svg", metadata={"Date": None})
@@ -219,8 +222,8 @@ def main() -> None:
     """Simulate, map, draw."""
     mpl.rcParams["svg.hashsalt"] = "stillmap"
     changes = {
-        "crowd": {"people": 60},
-        "laser": {"max_range": 12.0},
+        "crowd": {"people": 40},
+        "laser": {"max_range": 8.0},
         "robot": {"scans": SCANS},
     }
     recording = simulate(scene_by_name("hall", changes), SEED).recording
