@@ -114,7 +114,7 @@ def _interest(times: np.ndarray, hits: np.ndarray, dynamic: bool) -> float:
 
 def draw_maps(result: stillmap.Result) -> None:
     """Raw map beside clean map, within the bounds of what stands still."""
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained", sharey=True)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained", sharey=True)
     static = end_points(result)[result.seen.hit & (result.p_static > 0.5)]
     low, high = static.min(axis=0) - 1, static.max(axis=0) + 1
     maps = (result.raw_map, result.map)
@@ -154,7 +154,7 @@ def draw_timeline(result: stillmap.Result) -> None:
         column[2].set_xlabel("time, s", fontsize=8)
     for axis, label in zip(axes[:, 0], ("", "P(occupied)", "P(static)"), strict=True):
         axis.set_ylabel(label, fontsize=9)
-    axes[1, 0].legend(fontsize=7, loc="center right")
+    axes[1, 1].legend(fontsize=7, loc="center right")
     figure.savefig(HERE / "cell-timeline.png", dpi=110)
     plt.close(figure)
 
