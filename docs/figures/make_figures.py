@@ -126,8 +126,13 @@ def draw_maps(result: stillmap.Result) -> None:
         ink = np.nan_to_num(one.p_occupied, nan=0.0).clip(0, 1) ** 0.4
         shown = np.where(np.isfinite(one.p_occupied), 1.0 - ink, 0.85)
         axis.imshow(
-            shown, origin="lower", extent=(x, x + width * r, y, y + height * r),
-            cmap="gray", vmin=0, vmax=1, interpolation="antialiased",
+            shown,
+            origin="lower",
+            extent=(x, x + width * r, y, y + height * r),
+            cmap="gray",
+            vmin=0,
+            vmax=1,
+            interpolation="antialiased",
         )
         axis.set_facecolor("0.85")
         axis.set_xlim(low[0], high[0])
@@ -143,7 +148,11 @@ def draw_maps(result: stillmap.Result) -> None:
 def draw_timeline(result: stillmap.Result) -> None:
     """Observations, filter and posterior of a wall cell and of a cell on the floor."""
     figure, axes = plt.subplots(
-        3, 2, figsize=(9, 4.6), layout="constrained", sharex="col",
+        3,
+        2,
+        figsize=(9, 4.6),
+        layout="constrained",
+        sharex="col",
         gridspec_kw={"height_ratios": (0.6, 1, 1)},
     )
     titles = ("a cell of a wall", "a cell of the floor, in which somebody stopped")
@@ -161,7 +170,10 @@ def draw_timeline(result: stillmap.Result) -> None:
 
 def _draw_cell(axes: np.ndarray, times: np.ndarray, hits: np.ndarray) -> None:
     axes[0].eventplot(
-        [times[~hits], times[hits]], colors=[BLUE, ORANGE], lineoffsets=[0, 1], linelengths=0.8,
+        [times[~hits], times[hits]],
+        colors=[BLUE, ORANGE],
+        lineoffsets=[0, 1],
+        linelengths=0.8,
         linewidths=1.0,
     )
     axes[0].set_yticks([0, 1], ["miss", "hit"])
