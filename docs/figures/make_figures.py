@@ -14,7 +14,7 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
 import stillmap
-from stillmap.simulation import scene_by_name, simulate
+from stillmap.sim import scene_by_name, simulate
 
 HERE = Path(__file__).parent
 SEED = 100
