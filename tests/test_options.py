@@ -11,9 +11,12 @@ from typing import Any, Literal
 import pytest
 
 from stillmap.core.config import (
-    field_with_doc,
+    Limits,
+    Section,
+    described,
     load_toml,
     merged,
+    option,
     parse_assignment,
     replaced,
     to_dict,
@@ -24,23 +27,23 @@ from stillmap.pipeline.options import Options
 
 
 @dataclass(frozen=True)
-class Inner:
-    """What is within."""
+class Inner(Section, section="inner"):
+    """The inner section."""
 
-    width: float = field_with_doc(0.5, "m, how wide")
-    limit: float | None = field_with_doc(None, "m, unset: none")
+    width: float = option(0.5, "Width in metres.", gt=0.0)
+    limit: float | None = option(None, "Limit in metres; unset: none.", ge=0.0, lt=1e301)
 
-    def __post_init__(self) -> None:
-        if self.width <= 0.0:
-            raise ValueError("'inner.width' wants a positive number")
+    def check(self) -> None:
+        if self.limit is not None and self.limit < self.width:
+            raise ValueError("'inner.limit' must be at least 'inner.width'")
 
 
 @dataclass(frozen=True)
 class Outer:
-    count: int = field_with_doc(3, "how many")
-    on: bool = field_with_doc(False, "whether")
-    name: str = field_with_doc('it\'s "quoted" \\ here', "a name")
-    shape: Literal["round", "square"] = field_with_doc("round", "one of two")
+    count: int = option(3, "how many")
+    on: bool = option(False, "whether")
+    name: str = option('it\'s "quoted" \\ here', "a name")
+    shape: Literal["round", "square"] = option("round", "one of two")
     inner: Inner = field(default=Inner())
 
 
@@ -78,8 +81,9 @@ def test_changes_reach_nested_sections_and_leave_the_rest() -> None:
         ({"inner": {"width": math.nan}}, "'inner.width' wants a finite number, got nan"),
         ({"inner": {"width": -math.inf}}, "'inner.width' wants a finite number, got -inf"),
         ({"inner": {"width": 10**400}}, "'inner.width' wants a finite number, got 1000"),
-        # a range that the section itself knows
-        ({"inner": {"width": -1.0}}, "'inner.width' wants a positive number"),
+        ({"inner": {"width": 0.0}}, "'inner.width' must be more than 0, got 0.0"),
+        ({"inner": {"limit": -1}}, "'inner.limit' must be at least 0 and less than 1e+301, got -1"),
+        ({"inner": {"limit": 0.4}}, "'inner.limit' must be at least 'inner.width'"),
     ],
 )
 def test_a_wrong_value_is_named_with_its_place(changes: dict[str, Any], wanted: str) -> None:
@@ -141,10 +145,10 @@ def test_toml_tells_what_is_not_set_and_what_everything_means() -> None:
         'name = "it\'s \\"quoted\\" \\\\ here"  # a name',
         'shape = "round"  # one of two (round | square)',
         "",
-        "# What is within.",
+        "# The inner section.",
         "[inner]",
-        "width = 0.5  # m, how wide",
-        "# limit is not set  # m, unset: none",
+        "width = 0.5  # Width in metres. (more than 0)",
+        "# limit is not set  # Limit in metres; unset: none. (at least 0 and less than 1e+301)",
     ]
 
 
@@ -178,6 +182,20 @@ def numbers() -> list[str]:
 def test_no_number_takes_what_is_no_number(name: str, value: str) -> None:
     with pytest.raises(InputError, match=f"'{name}'"):
         replaced(Options(), parse_assignment(f"{name}={value}"), "--set")
+
+
+LIMITS = [(one.name, one.limits) for one in described(Options()) if str(one.limits)]
+
+
+@pytest.mark.parametrize(("name", "limits"), LIMITS, ids=[name for name, _ in LIMITS])
+def test_values_beyond_the_limits_are_refused(name: str, limits: Limits) -> None:
+    outside = [limits.gt, limits.lt]
+    outside += [None if limits.ge is None else limits.ge - 1]
+    outside += [None if limits.le is None else limits.le + 1]
+    for value in outside:
+        if value is not None:
+            with pytest.raises(InputError, match=f"'{name}' must be {limits}"):
+                replaced(Options(), parse_assignment(f"{name}={value}"), "--set")
 
 
 @pytest.mark.parametrize(

@@ -125,6 +125,7 @@ def _by_name(options: "Options", only: str) -> dict[str, Any]:
             "default": one.default,
             "type": one.kind,
             "choices": list(one.choices) or None,
+            "range": str(one.limits) or None,
             "doc": one.doc,
         }
         for one in described(options)

@@ -9,7 +9,7 @@ import types
 import typing
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from stillmap.core.errors import InputError, nearest
 from stillmap.core.files import read_text
@@ -20,9 +20,84 @@ _INTEGERS_BELOW = 2**31  # the compiled core counts in 32 bits
 _LARGEST = 64 << 10  # bytes of a file: of nested keys, more take Python minutes
 
 
-def field_with_doc(default: Any, doc: str) -> Any:
-    """A dataclass field whose unit and meaning `stillmap config` prints."""
-    return dataclasses.field(default=default, metadata={"doc": doc})
+class Limits(NamedTuple):
+    """Range of a number: `ge` <= x <= `le`, `gt` < x < `lt`; None is no limit."""
+
+    ge: float | None = None
+    gt: float | None = None
+    le: float | None = None
+    lt: float | None = None
+
+    def contain(self, value: float) -> bool:
+        """Whether a number lies within the range; NaN lies in no range that has a limit."""
+        return (
+            (self.ge is None or value >= self.ge)
+            and (self.gt is None or value > self.gt)
+            and (self.le is None or value <= self.le)
+            and (self.lt is None or value < self.lt)
+        )
+
+    def __str__(self) -> str:
+        if self.ge is not None and self.le is not None:
+            return f"{self.ge:.10g} to {self.le:.10g}"
+        words = ("at least", "more than", "at most", "less than")
+        return " and ".join(
+            f"{word} {limit:.10g}"
+            for word, limit in zip(words, self, strict=True)
+            if limit is not None
+        )
+
+
+def option(
+    default: Any,
+    doc: str,
+    *,
+    ge: float | None = None,
+    gt: float | None = None,
+    le: float | None = None,
+    lt: float | None = None,
+) -> Any:
+    """A dataclass field with the meaning, unit and range that `stillmap config` prints.
+
+    Args:
+        default: the default value; None where the option may be unset.
+        doc: meaning and unit.
+        ge: smallest value allowed.
+        gt: the value must be greater.
+        le: largest value allowed.
+        lt: the value must be less.
+    """
+    return dataclasses.field(
+        default=default, metadata={"doc": doc, "limits": Limits(ge, gt, le, lt)}
+    )
+
+
+class Section:
+    """Base of the option dataclasses: checks the range of every `option` that is set.
+
+    `class EmOptions(Section, section="em")` names the section in messages.
+
+    Raises:
+        ValueError: a value is outside its range, or `check` refuses it.
+    """
+
+    _section: ClassVar[str] = ""
+
+    def __init_subclass__(cls, section: str = "", **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls._section = section
+
+    def __post_init__(self) -> None:
+        prefix = f"{self._section}." if self._section else ""
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            limits: Limits = field.metadata.get("limits", Limits())
+            value = getattr(self, field.name)
+            if value is not None and not limits.contain(value):
+                raise ValueError(f"'{prefix}{field.name}' must be {limits}, got {value!r}")
+        self.check()
+
+    def check(self) -> None:
+        """Checks relations between options; raises ValueError."""
 
 
 def replaced(options: T, changes: Mapping[str, Any], where: str = "") -> T:
@@ -160,13 +235,14 @@ def to_dict(options: Any) -> dict[str, Any]:
 
 
 class Described(NamedTuple):
-    """One option; `name` as in `em.prior`, `doc` with its unit and meaning."""
+    """One option; `name` as in `em.prior`, `doc` with its meaning and unit."""
 
     name: str
     value: Any
     default: Any
     kind: str
     choices: tuple[Any, ...]
+    limits: Limits
     doc: str
 
 
@@ -181,7 +257,8 @@ def described(options: Any, prefix: str = "") -> Iterator[Described]:
             "str" if _choices(one) else _type_name(one) for one in _alternatives(hint)
         )
         value, doc = getattr(options, f.name), f.metadata.get("doc", "")
-        yield Described(f"{prefix}{f.name}", value, f.default, kind, tuple(choices), doc)
+        limits = f.metadata.get("limits", Limits())
+        yield Described(f"{prefix}{f.name}", value, f.default, kind, tuple(choices), limits, doc)
     for f in sections:
         yield from described(getattr(options, f.name), f"{prefix}{f.name}.")
 
@@ -239,7 +316,8 @@ def _toml_lines(options: Any, only: str) -> Iterator[str]:
             yield from _heading(options, section)
         # what may be chosen stands in the meaning already where that says what each choice does
         listed = any(str(choice) not in one.doc for choice in one.choices)
-        doc = one.doc + (f" ({' | '.join(map(str, one.choices))})" if listed else "")
+        allowed = " | ".join(map(str, one.choices)) if listed else str(one.limits)
+        doc = one.doc + (f" ({allowed})" if allowed else "")
         # TOML has no null: an option that is unset stands as a comment
         yield (
             f"# {key} is not set  # {doc}"

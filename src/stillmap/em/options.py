@@ -6,7 +6,7 @@ How people are found and tracked.
 from dataclasses import dataclass, field
 from typing import Literal
 
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import option
 
 # of places that changed: as they were last, or as they were for most of the time
 MapState = Literal["last", "majority"]
@@ -16,23 +16,23 @@ MapState = Literal["last", "majority"]
 class TrackerOptions:
     """The tracking estimator; `docs/tracker.md` says how it works."""
 
-    jump: float = field_with_doc(0.3, "m of range between neighbouring beams: a feature's edge")
-    narrowest: float = field_with_doc(0.05, "m, width of a leg at least")
-    widest: float = field_with_doc(0.65, "m, width of a body at most")
-    sigma: float = field_with_doc(0.1, "m, a feature beside the middle of its person: legs swing")
-    sigma_speed: float = field_with_doc(1.0, "m/s, how fast people are when first seen")
-    acceleration: float = field_with_doc(0.5, "m2/s3, density of random acceleration")
-    gate: float = field_with_doc(2.5, "standard deviations within which features may be a person's")
-    detection: float = field_with_doc(0.9, "probability that a person in sight shows a feature")
-    clutter: float = field_with_doc(0.05, "features per m2 that are of nobody tracked")
-    lost: float = field_with_doc(1.0, "s without a feature after which a track ends")
-    moved: float = field_with_doc(0.5, "m from where it began: such a track is a person's")
-    look: float = field_with_doc(2.0, "s between scans in which a person has left its place")
-    changed: float = field_with_doc(
+    jump: float = option(0.3, "m of range between neighbouring beams: a feature's edge")
+    narrowest: float = option(0.05, "m, width of a leg at least")
+    widest: float = option(0.65, "m, width of a body at most")
+    sigma: float = option(0.1, "m, a feature beside the middle of its person: legs swing")
+    sigma_speed: float = option(1.0, "m/s, how fast people are when first seen")
+    acceleration: float = option(0.5, "m2/s3, density of random acceleration")
+    gate: float = option(2.5, "standard deviations within which features may be a person's")
+    detection: float = option(0.9, "probability that a person in sight shows a feature")
+    clutter: float = option(0.05, "features per m2 that are of nobody tracked")
+    lost: float = option(1.0, "s without a feature after which a track ends")
+    moved: float = option(0.5, "m from where it began: such a track is a person's")
+    look: float = option(2.0, "s between scans in which a person has left its place")
+    changed: float = option(
         0.2, "share of a person's features at least that stand where shortly there was nothing"
     )
-    least: int = field_with_doc(4, "scans with a feature that a person's track has at least")
-    box: float = field_with_doc(0.4, "m to each side of a person, in which beams are dropped")
+    least: int = option(4, "scans with a feature that a person's track has at least")
+    box: float = option(0.4, "m to each side of a person, in which beams are dropped")
 
     def __post_init__(self) -> None:
         for name, low, high in _LIMITS:
@@ -63,14 +63,14 @@ _LIMITS = (
 class DwellOptions:
     """The default estimator; lengths follow from the scatter of end points in the recording."""
 
-    look: float = field_with_doc(0.5, "s, beams within it tell no more of a cell than one")
-    detection: float = field_with_doc(0.97, "probability that an occupied cell is seen to be so")
-    lateral: float = field_with_doc(0.7, "scatters by which a beam may pass beside its place")
-    margin: float = field_with_doc(3.0, "scatters behind a surface at which a beam has passed it")
-    reach: float = field_with_doc(4.0, "scatters within which hits are hits of the same thing")
-    beyond: float = field_with_doc(0.3, "m, end of a maximum-range beam that says nothing")
-    normals: bool = field_with_doc(True, "know a surface seen at a slant from one seen face on")
-    views: bool = field_with_doc(
+    look: float = option(0.5, "s, beams within it tell no more of a cell than one")
+    detection: float = option(0.97, "probability that an occupied cell is seen to be so")
+    lateral: float = option(0.7, "scatters by which a beam may pass beside its place")
+    margin: float = option(3.0, "scatters behind a surface at which a beam has passed it")
+    reach: float = option(4.0, "scatters within which hits are hits of the same thing")
+    beyond: float = option(0.3, "m, end of a maximum-range beam that says nothing")
+    normals: bool = option(True, "know a surface seen at a slant from one seen face on")
+    views: bool = option(
         True, "after the loop, know things that are met from some places only from passers-by"
     )
 
@@ -90,17 +90,17 @@ class DwellOptions:
 class ChangeOptions:
     """Things that are put somewhere, taken away, or moved once."""
 
-    enabled: bool = field_with_doc(True, "look for them, and show the map in one of its states")
-    stays: float = field_with_doc(
+    enabled: bool = option(True, "look for them, and show the map in one of its states")
+    stays: float = option(
         2.0, "lengths of the recording for which a thing stays, and its place stays free"
     )
-    longest: float = field_with_doc(3600.0, "s, the same at most")
-    passing_occupied: float = field_with_doc(0.05, "share of the time in which others pass there")
-    passing_seconds: float = field_with_doc(12.0, "s, for how long they stay")
-    near: float = field_with_doc(0.5, "m, cells so near to each other that change are one place")
-    together: float = field_with_doc(2.0, "s, by which the cells of a place may change apart")
-    least: int = field_with_doc(4, "cells below which a place that changed is not listed")
-    in_space: bool = field_with_doc(False, "list them in 3D, too, which takes more time and memory")
+    longest: float = option(3600.0, "s, the same at most")
+    passing_occupied: float = option(0.05, "share of the time in which others pass there")
+    passing_seconds: float = option(12.0, "s, for how long they stay")
+    near: float = option(0.5, "m, cells so near to each other that change are one place")
+    together: float = option(2.0, "s, by which the cells of a place may change apart")
+    least: int = option(4, "cells below which a place that changed is not listed")
+    in_space: bool = option(False, "list them in 3D, too, which takes more time and memory")
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.stays <= 1000.0:
@@ -122,18 +122,16 @@ class ChangeOptions:
 class BesideOptions:
     """What the voxels beside one tell of it; 3D alone, see em.beside."""
 
-    enabled: bool = field_with_doc(True, "ask about the voxels beside each")
-    radius: float = field_with_doc(2.5, "voxels between two that are asked about each other")
-    coplanar: float = field_with_doc(
-        0.2, "voxels, standard deviation of one's mean from the other's plane"
-    )
-    for_static: float = field_with_doc(5.0, "nats that they are worth if all of them are static")
-    for_dynamic: float = field_with_doc(10.0, "nats that they are worth if none of them is")
-    least: float = field_with_doc(-4.0, "nats that its own looks are worth at least")
+    enabled: bool = option(True, "ask about the voxels beside each")
+    radius: float = option(2.5, "voxels between two that are asked about each other")
+    coplanar: float = option(0.2, "voxels, standard deviation of one's mean from the other's plane")
+    for_static: float = option(5.0, "nats that they are worth if all of them are static")
+    for_dynamic: float = option(10.0, "nats that they are worth if none of them is")
+    least: float = option(-4.0, "nats that its own looks are worth at least")
     # what was hit for ten seconds in a row is a wall, or waits
-    most: float = field_with_doc(3.0, "nats that its own looks are worth at most")
-    moved: float = field_with_doc(0.1, "change of a probability that those beside hear of")
-    rounds: int = field_with_doc(10, "rounds at most in which they ask each other")
+    most: float = option(3.0, "nats that its own looks are worth at most")
+    moved: float = option(0.1, "change of a probability that those beside hear of")
+    rounds: int = option(10, "rounds at most in which they ask each other")
 
     def __post_init__(self) -> None:
         if not 1.0 <= self.radius <= 8.0:
@@ -155,22 +153,20 @@ class BesideOptions:
 class BodyOptions:
     """What stands apart in a sweep moves as a whole; 3D alone, see em.bodies."""
 
-    enabled: bool = field_with_doc(True, "ask how much of the body around each voxel moves")
-    low: float = field_with_doc(0.2, "m above the ground from where on things are bodies")
-    high: float = field_with_doc(3.0, "m above the ground up to where they are")
-    foot: float = field_with_doc(
+    enabled: bool = option(True, "ask how much of the body around each voxel moves")
+    low: float = option(0.2, "m above the ground from where on things are bodies")
+    high: float = option(3.0, "m above the ground up to where they are")
+    foot: float = option(
         0.05, "m above the ground, and 2.5 scatters, that end points below what moves are not its"
     )
-    column: float = field_with_doc(
-        0.3, "m, edge of the columns that touch within a body, to whole voxels"
-    )
-    fewest: int = field_with_doc(5, "voxels of a body at least, in a sweep")
-    share: float = field_with_doc(0.3, "mean probability to move from where on all of it does")
-    change: float = field_with_doc(
+    column: float = option(0.3, "m, edge of the columns that touch within a body, to whole voxels")
+    fewest: int = option(5, "voxels of a body at least, in a sweep")
+    share: float = option(0.3, "mean probability to move from where on all of it does")
+    change: float = option(
         1.0, "nats, mean of its voxels, by which it came to stay, or left, from where on it did"
     )
-    slope: float = field_with_doc(20.0, "nats for all of it, for each unit above these two")
-    most: float = field_with_doc(4.0, "nats for it at most")
+    slope: float = option(20.0, "nats for all of it, for each unit above these two")
+    most: float = option(4.0, "nats for it at most")
 
     def __post_init__(self) -> None:
         if not -100.0 <= self.low < self.high <= 100.0:
@@ -192,10 +188,10 @@ class BodyOptions:
 class EvidenceOptions:
     """What a place has to be seen by to be known; see em.evidence."""
 
-    least: int = field_with_doc(
+    least: int = option(
         3, "clear looks, each of em.dwell.look: what has fewer rests on thin evidence"
     )
-    near: float = field_with_doc(
+    near: float = option(
         0.3, "m around the end of a beam on something that moves: no clear look at what is there"
     )
 
@@ -210,21 +206,19 @@ class EvidenceOptions:
 class EmOptions:
     """The loop of Fig. 2."""
 
-    prior: float = field_with_doc(
+    prior: float = option(
         0.9, "p(c = 1), share of beams thought static before anything was learned"
     )
-    max_iterations: int = field_with_doc(6, "iterations at most")
-    tolerance: float = field_with_doc(
-        1e-3, "nats per beam of the bound: the loop stops when it gains less"
-    )
-    settled: float = field_with_doc(
+    max_iterations: int = option(6, "iterations at most")
+    tolerance: float = option(1e-3, "nats per beam of the bound: the loop stops when it gains less")
+    settled: float = option(
         0.005, "share of the hits whose label moves by 0.1: the default loop stops when fewer do"
     )
-    patience: int = field_with_doc(2, "iterations without a better bound before the loop stops")
-    hit_ratio: float = field_with_doc(
+    patience: int = option(2, "iterations without a better bound before the loop stops")
+    hit_ratio: float = option(
         0.25, "hits / (hits + passes) below which mappers that count drop a cell"
     )
-    held_out: int = field_with_doc(
+    held_out: int = option(
         20, "every that many scans one is left out of the map and scored by it; 0: none"
     )
     dwell: DwellOptions = field(default=DwellOptions())

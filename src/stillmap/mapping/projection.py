@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from stillmap import em
 from stillmap.core import se2
-from stillmap.core.arrays import Column, finite, first_of_each
-from stillmap.core.config import field_with_doc
+from stillmap.core.arrays import ArrayBuilder, finite, first_of_each
+from stillmap.core.config import option
 from stillmap.core.parallel import in_order
 from stillmap.core.recording import Recording
 from stillmap.em import Ground
@@ -31,15 +31,15 @@ Index = NDArray[np.intp]
 class BandOptions:
     """Of 3D recordings the map shows what stands in a band above the ground."""
 
-    low: float = field_with_doc(0.2, "m above the ground from where on something is in the way")
-    high: float = field_with_doc(1.8, "m above the ground up to where something is in the way")
+    low: float = option(0.2, "m above the ground from where on something is in the way")
+    high: float = option(1.8, "m above the ground up to where something is in the way")
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.low < self.high <= 100.0:
             raise ValueError("'output.band' wants 0 <= low < high <= 100 metres")
 
 
-def flat_recording(
+def make_planar_recording(
     recording: Recording,
     points: NDArray[np.float32],
     hit: NDArray[np.bool_],
@@ -71,7 +71,7 @@ _ABOVE = 0.05  # m by which the band reaches above the sensor
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class PlanarProjection:
     """The planar recording of a 3D one, T scans with N beams.
 
     Attributes:
@@ -86,7 +86,7 @@ class Plan:
     beam: Index
 
 
-def plan_of(
+def project_to_plane(
     recording: Recording,
     poses: Float,
     ground: Ground,
@@ -94,7 +94,7 @@ def plan_of(
     cell: float,
     open_space: bool,
     threads: int = 1,
-) -> Plan:
+) -> PlanarProjection:
     """What the beams of a 3D recording say of the band above the ground.
 
     Of beams in the same direction that end nowhere in the band, the longest is kept; of those that
@@ -113,8 +113,8 @@ def plan_of(
     planar_poses = se2.planar(T_map_sensor)
     top = max(options.high, ground.sensor + _ABOVE)
     scratch, offset = recording.scratch, np.zeros(recording.n_scans + 1, np.int64)
-    ends, hits = Column(np.float32, (2,), scratch), Column(np.bool_, (), scratch)
-    numbers = Column(np.intp, (), scratch)
+    ends, hits = ArrayBuilder(np.float32, (2,), scratch), ArrayBuilder(np.bool_, (), scratch)
+    numbers = ArrayBuilder(np.intp, (), scratch)
 
     def of_scan(t: int) -> tuple[NDArray[np.float32], NDArray[np.bool_], Index]:
         beams = recording.beams_of(t)
@@ -131,8 +131,8 @@ def plan_of(
         hits.append(hit)
         numbers.append(number)
         offset[t + 1] = offset[t] + len(number)
-    flat = flat_recording(recording, ends.finished(), hits.finished(), offset)
-    return Plan(flat, planar_poses, numbers.finished())
+    flat = make_planar_recording(recording, ends.finished(), hits.finished(), offset)
+    return PlanarProjection(flat, planar_poses, numbers.finished())
 
 
 def _of_scan(
@@ -184,7 +184,7 @@ def _share_within(start: float, above: Float, low: float, top: float) -> Float:
     return np.clip(np.minimum(down, up), 0.0, 1.0)
 
 
-def columns_of(
+def project_cells(
     known: em.CellProbabilities, ground: Ground, options: BandOptions, cell: float
 ) -> em.CellProbabilities:
     """The columns of a plan in which something stands within the band.

@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Literal
 
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import Section, option
 from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
 from stillmap.em.options import MapState
@@ -23,24 +23,29 @@ MapMode = Literal["trinary", "scale", "raw"]
 class OutputOptions:
     """How the result folder is written."""
 
-    map_mode: MapMode = field_with_doc(
+    map_mode: MapMode = option(
         "trinary",
         "pixels of the map picture: trinary (occupied, unknown, free), scale (grey between the "
         "thresholds; a .png, as unknown needs transparency) or raw (percent occupied, 255 unknown)",
     )
-    map_state: MapState = field_with_doc(
+    map_state: MapState = option(
         "last", "of places that changed the map shows the last state, or the one held for longest"
     )
     band: BandOptions = field(default=BandOptions())
 
 
 @dataclass(frozen=True)
-class Options:
-    """Everything that can be chosen."""
+class Options(Section):
+    """All options of a run."""
 
-    threads: int = field_with_doc(0, "threads to use; 0: one per processor. Same result with any")
+    threads: int = option(
+        0,
+        "Number of threads; 0 uses every core. The result does not depend on it.",
+        ge=0,
+        le=1024,
+    )
     # spelled out: ruff takes the default for mutable under an alias
-    estimator: Literal["stillmap", "paper", "hit-ratio", "tracker"] = field_with_doc(
+    estimator: Literal["stillmap", "paper", "hit-ratio", "tracker"] = option(
         "stillmap",
         "what says which beams are static; paper: (8) as printed, hit-ratio: counting, "
         "tracker: all that are not on people who are tracked",
@@ -52,10 +57,6 @@ class Options:
     rig: RigOptions = field(default=RigOptions())
     mesh: MeshOptions = field(default=MeshOptions())
     output: OutputOptions = field(default=OutputOptions())
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.threads <= 1024:
-            raise ValueError("'threads' wants 0 to 1024")
 
 
 DEFAULTS = Options()

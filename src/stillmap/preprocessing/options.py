@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import option
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 
@@ -46,88 +46,84 @@ _NOTHING_GIVEN = GivenLaser(None, None, None, None, None)
 class ReadOptions:
     """Options of `stillmap.recording.read`; None means: found in the recording."""
 
-    min_range: float = field_with_doc(0.0, "m: nearer readings are unusable (the robot itself)")
-    max_range: float | None = field_with_doc(
+    min_range: float = option(0.0, "m: nearer readings are unusable (the robot itself)")
+    max_range: float | None = option(
         None, "m: readings at or above it are maximum range; unset: found from the readings"
     )
-    zero_means: Literal["auto", "unusable", "max-range"] = field_with_doc(
+    zero_means: Literal["auto", "unusable", "max-range"] = option(
         "auto", "what a reading of zero stands for: auto, unusable or max-range"
     )
-    free_range: float | None = field_with_doc(
+    free_range: float | None = option(
         None, "m: how much free space a maximum-range beam shows; unset: what the laser really sees"
     )
-    own_body: bool = field_with_doc(
+    own_body: bool = option(
         True,
         "leave out readings of the robot itself: beams that end at the same place wherever it is",
     )
-    spin: Literal["auto", "none", "clockwise", "counter-clockwise"] = field_with_doc(
+    spin: Literal["auto", "none", "clockwise", "counter-clockwise"] = option(
         "auto",
         "how a lidar whose beams have no times turns, seen from above: clockwise, "
         "counter-clockwise, none: beams count as taken at once; auto: clockwise for raw drives of "
         "KITTI, else none",
     )
-    spin_rate: float | None = field_with_doc(
+    spin_rate: float | None = option(
         None, "turns per second of that; unset: one from stamp to stamp"
     )
-    spin_start: float = field_with_doc(
+    spin_start: float = option(
         math.pi, "rad: direction in which its turns begin, 0 ahead, to the left; behind"
     )
-    spin_stamp: float | None = field_with_doc(
+    spin_stamp: float | None = option(
         None,
         "rad: direction in which it looks at a scan's stamp; unset: ahead for KITTI, else where "
         "turns begin",
     )
-    laser_x: float | None = field_with_doc(
+    laser_x: float | None = option(
         None, "m: first laser ahead of the robot's centre; unset: found in the recording"
     )
-    laser_y: float | None = field_with_doc(
+    laser_y: float | None = option(
         None, "m: first laser left of the robot's centre; unset: found in the recording"
     )
-    laser_theta: float | None = field_with_doc(
+    laser_theta: float | None = option(
         None, "rad: first laser turned on the robot; unset: found in the recording"
     )
-    laser_upside_down: bool | None = field_with_doc(
+    laser_upside_down: bool | None = option(
         None, "first laser's beams turn the other way round; unset: found in the recording"
     )
-    laser_fov: float | None = field_with_doc(
+    laser_fov: float | None = option(
         None, "rad: all beams of the first laser, of lines without angles; unset: half a circle"
     )
-    laser2_x: float | None = field_with_doc(None, "m: second laser ahead of the robot's centre")
-    laser2_y: float | None = field_with_doc(None, "m: second laser left of the robot's centre")
-    laser2_theta: float | None = field_with_doc(None, "rad: second laser turned on the robot")
-    laser2_upside_down: bool | None = field_with_doc(
-        None, "second laser's beams turn the other way round"
-    )
-    laser2_fov: float | None = field_with_doc(None, "rad: all beams of the second laser")
-    cameras: str | None = field_with_doc(
+    laser2_x: float | None = option(None, "m: second laser ahead of the robot's centre")
+    laser2_y: float | None = option(None, "m: second laser left of the robot's centre")
+    laser2_theta: float | None = option(None, "rad: second laser turned on the robot")
+    laser2_upside_down: bool | None = option(None, "second laser's beams turn the other way round")
+    laser2_fov: float | None = option(None, "rad: all beams of the second laser")
+    cameras: str | None = option(
         None, "file that says of cameras what the recording does not, and names further pictures"
     )
-    depth_step: int = field_with_doc(
-        2, "of depth pictures: every so many columns and rows become beams"
-    )
-    depth_max: float = field_with_doc(
+    depth_step: int = option(2, "of depth pictures: every so many columns and rows become beams")
+    depth_max: float = option(
         5.0,
         "m: readings of depth pictures from there on count as nothing there, if max_range is unset",
     )
-    depth_scale: float | None = field_with_doc(
+    depth_scale: float | None = option(
         None, "units of depth pictures per metre; unset: 1000, 5000 of TUM RGB-D"
     )
-    register: bool = field_with_doc(
+    register: bool = option(
         True, "find where the colour camera of a folder like 7-Scenes sits, by the edges of things"
     )
-    level: bool = field_with_doc(
+    level: bool = option(
         True, "turn the recorded poses of RGB-D folders so that z is up: their world lies anyhow"
     )
-    topic: str | None = field_with_doc(
+    topic: str | None = option(
         None, "of a bag: topics of the scans to use, with commas; unset: found by type and rate"
     )
-    tilting_topic: str | None = field_with_doc(
+    tilting_topic: str | None = option(
         None, "of a bag: scans of a laser that tilts or pans; they are not for the map"
     )
-    base_frame: str | None = field_with_doc(
+    base_frame: str | None = option(
         None, "of a bag: the robot's own frame; unset: found in the transforms"
     )
-    odom_frame: str | None = field_with_doc(
+    odom_frame: str | None = option(
         None, "of a bag: the frame in which odometry moves the robot; unset: found"
     )
 
@@ -217,7 +213,7 @@ def applied(recording: Recording, options: ReadOptions) -> Recording:
 def _narrowed(recording: Recording, options: ReadOptions) -> Recording:
     points = arrays.copied(recording.points, recording.scratch)
     hit = arrays.copied(recording.hit, recording.scratch)
-    for block in arrays.blocks(points, hit):
+    for block in arrays.iter_blocks(points, hit):
         _narrow(points[block], hit[block], options)
     return replace(recording, points=points, hit=hit)
 
@@ -251,6 +247,6 @@ def _mirrored(recording: Recording, number: int) -> Recording:
     """The beams of one laser turned the other way round."""
     points = arrays.copied(recording.points, recording.scratch)
     scans = np.flatnonzero(recording.sensor == number).tolist()
-    for t in arrays.in_turn(scans, lambda: arrays.let_go(points)):
+    for t in arrays.in_turn(scans, lambda: arrays.release_pages(points)):
         points[recording.beams_of(t), 1] *= -1.0
     return replace(recording, points=points)

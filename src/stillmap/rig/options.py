@@ -2,31 +2,31 @@
 
 from dataclasses import dataclass
 
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import option
 
 
 @dataclass(frozen=True)
 class RigOptions:
     """A second laser that builds in 3D while the flat one tells what moves; see docs/rig.md."""
 
-    margin: float = field_with_doc(0.15, "m around what the flat laser saw of a thing that moves")
-    low: float = field_with_doc(0.05, "m above the ground: what is lower is the floor itself")
-    height: float = field_with_doc(2.0, "m above the ground, up to where a thing reaches at most")
-    long: float = field_with_doc(1.5, "m, things at least so long may be higher: vehicles")
-    tallest: float = field_with_doc(4.0, "m above the ground, up to where these reach at most")
-    gap: float = field_with_doc(0.5, "m without any point: what is above belongs to something else")
-    hold: float = field_with_doc(
+    margin: float = option(0.15, "m around what the flat laser saw of a thing that moves")
+    low: float = option(0.05, "m above the ground: what is lower is the floor itself")
+    height: float = option(2.0, "m above the ground, up to where a thing reaches at most")
+    long: float = option(1.5, "m, things at least so long may be higher: vehicles")
+    tallest: float = option(4.0, "m above the ground, up to where these reach at most")
+    gap: float = option(0.5, "m without any point: what is above belongs to something else")
+    hold: float = option(
         0.5, "s for which a thing goes on before it is first seen and after it is last"
     )
-    inside: float = field_with_doc(
+    inside: float = option(
         0.99, "probability that what ends where the flat laser saw a thing is dynamic"
     )
-    around: float = field_with_doc(0.9, "the same within the margin around that")
-    evidence: bool = field_with_doc(
+    around: float = option(0.9, "the same within the margin around that")
+    evidence: bool = option(
         True, "what the second laser itself saw to come and go counts beside the boxes"
     )
-    voxel: float = field_with_doc(0.1, "m, edge of the voxels of that")
-    pause: float = field_with_doc(
+    voxel: float = option(0.1, "m, edge of the voxels of that")
+    pause: float = option(
         1.0, "s between two scans of the flat laser, over which nobody knows where the robot was"
     )
 

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import option
 
 Shape = Literal["legs", "bodies", "mixed"]
 
@@ -18,16 +18,16 @@ Shape = Literal["legs", "bodies", "mixed"]
 class CrowdOptions:
     """The people who walk about."""
 
-    people: int = field_with_doc(15, "how many people walk about")
+    people: int = option(15, "how many people walk about")
     # spelled out: ruff takes the default for mutable under an alias
-    shape: Literal["legs", "bodies", "mixed"] = field_with_doc(
+    shape: Literal["legs", "bodies", "mixed"] = option(
         "mixed", "what the laser sees of a person: legs, bodies, or one half of them each"
     )
-    min_speed: float = field_with_doc(0.4, "m/s, the slowest walker")
-    max_speed: float = field_with_doc(1.6, "m/s, the fastest walker")
-    stopping_share: float = field_with_doc(0.33, "share of the people who stop now and then")
-    min_stop: float = field_with_doc(2.0, "s, the shortest stop")
-    max_stop: float = field_with_doc(20.0, "s, the longest stop")
+    min_speed: float = option(0.4, "m/s, the slowest walker")
+    max_speed: float = option(1.6, "m/s, the fastest walker")
+    stopping_share: float = option(0.33, "share of the people who stop now and then")
+    min_stop: float = option(2.0, "s, the shortest stop")
+    max_stop: float = option(20.0, "s, the longest stop")
 
     def __post_init__(self) -> None:
         require(self.people >= 0, "people must not be negative")
@@ -40,11 +40,11 @@ class CrowdOptions:
 class DoorOptions:
     """How long doors stay as they are; durations are spread evenly in their logarithm."""
 
-    min_open: float = field_with_doc(4.0, "s, the shortest time that a door stays open")
-    max_open: float = field_with_doc(60.0, "s, the longest time that a door stays open")
-    min_closed: float = field_with_doc(5.0, "s, the shortest time that a door stays closed")
-    max_closed: float = field_with_doc(120.0, "s, the longest time that a door stays closed")
-    swing: float = field_with_doc(1.5, "s, from closed to open")
+    min_open: float = option(4.0, "s, the shortest time that a door stays open")
+    max_open: float = option(60.0, "s, the longest time that a door stays open")
+    min_closed: float = option(5.0, "s, the shortest time that a door stays closed")
+    max_closed: float = option(120.0, "s, the longest time that a door stays closed")
+    swing: float = option(1.5, "s, from closed to open")
 
     def __post_init__(self) -> None:
         for low, high in ((self.min_open, self.max_open), (self.min_closed, self.max_closed)):
@@ -56,13 +56,13 @@ class DoorOptions:
 class TrafficOptions:
     """The vehicles that drive about on a scene's lanes; queues are part of the lanes."""
 
-    vehicles: int = field_with_doc(10, "how many drive about, spread over the lanes")
-    min_speed: float = field_with_doc(7.0, "m/s, the slowest driver")
-    max_speed: float = field_with_doc(12.0, "m/s, the fastest driver")
-    van_share: float = field_with_doc(0.25, "share of vans among the cars")
-    stopping_share: float = field_with_doc(0.2, "share of the vehicles that stop now and then")
-    min_stop: float = field_with_doc(3.0, "s, the shortest stop")
-    max_stop: float = field_with_doc(12.0, "s, the longest stop")
+    vehicles: int = option(10, "how many drive about, spread over the lanes")
+    min_speed: float = option(7.0, "m/s, the slowest driver")
+    max_speed: float = option(12.0, "m/s, the fastest driver")
+    van_share: float = option(0.25, "share of vans among the cars")
+    stopping_share: float = option(0.2, "share of the vehicles that stop now and then")
+    min_stop: float = option(3.0, "s, the shortest stop")
+    max_stop: float = option(12.0, "s, the longest stop")
 
     def __post_init__(self) -> None:
         require(self.vehicles >= 0, "vehicles must not be negative")
@@ -76,23 +76,23 @@ class TrafficOptions:
 class LaserOptions:
     """The laser scanner and where it sits on the robot."""
 
-    beams: int = field_with_doc(180, "beams per scan")
-    fov: float = field_with_doc(math.pi, "rad, field of view, centred on the sensor's x axis")
-    max_range: float = field_with_doc(30.0, "m, what lies farther off gives no return")
-    range_noise: float = field_with_doc(0.02, "m, standard deviation of a range")
-    no_return_share: float = field_with_doc(0.002, "share of beams that get lost anywhere")
-    glass_no_return_share: float = field_with_doc(0.3, "share of beams that get lost on glass")
-    sweep_time: float = field_with_doc(
+    beams: int = option(180, "beams per scan")
+    fov: float = option(math.pi, "rad, field of view, centred on the sensor's x axis")
+    max_range: float = option(30.0, "m, what lies farther off gives no return")
+    range_noise: float = option(0.02, "m, standard deviation of a range")
+    no_return_share: float = option(0.002, "share of beams that get lost anywhere")
+    glass_no_return_share: float = option(0.3, "share of beams that get lost on glass")
+    sweep_time: float = option(
         0.0, "s, that it takes to look through its field of view; 0: all beams at once"
     )
-    x: float = field_with_doc(0.08, "m, sensor ahead of the base centre")
-    y: float = field_with_doc(0.0, "m, sensor to the left of the base centre")
-    yaw: float = field_with_doc(0.0, "rad, sensor against the base")
+    x: float = option(0.08, "m, sensor ahead of the base centre")
+    y: float = option(0.0, "m, sensor to the left of the base centre")
+    yaw: float = option(0.0, "rad, sensor against the base")
     # spelled out: see CrowdOptions.shape
-    upside_down: Literal["no", "known", "unknown"] = field_with_doc(
+    upside_down: Literal["no", "known", "unknown"] = option(
         "no", "it hangs upside down: no; known to the recorder; or unknown, which mirrors its scans"
     )
-    second_laser: bool = field_with_doc(
+    second_laser: bool = option(
         False, "another one like it looks backwards from the other side of the base centre"
     )
 
@@ -115,32 +115,30 @@ class LaserOptions:
 class RobotOptions:
     """How the robot drives and how often it scans."""
 
-    speed: float = field_with_doc(0.5, "m/s, on a free way")
-    acceleration: float | None = field_with_doc(
+    speed: float = option(0.5, "m/s, on a free way")
+    acceleration: float | None = option(
         None, "m/s^2, at most, gaining speed, braking, and sideways in curves; not set: no limit"
     )
-    turn_rate: float = field_with_doc(0.8, "rad/s, the fastest turn")
-    radius: float = field_with_doc(0.22, "m, the robot's footprint is a disc")
-    patience: float = field_with_doc(3.0, "s, wait for somebody in the way before creeping on")
-    scan_rate: float = field_with_doc(5.0, "Hz, scans per second of each laser")
-    scans: int | None = field_with_doc(
+    turn_rate: float = option(0.8, "rad/s, the fastest turn")
+    radius: float = option(0.22, "m, the robot's footprint is a disc")
+    patience: float = option(3.0, "s, wait for somebody in the way before creeping on")
+    scan_rate: float = option(5.0, "Hz, scans per second of each laser")
+    scans: int | None = option(
         None, "scans to take, the route again and again; not set: the route once"
     )
-    carried_at: float | None = field_with_doc(
+    carried_at: float | None = option(
         None,
         "share of the recording at which the robot is switched off, carried to another place of "
         "its route and put down anyhow; not set: never",
     )
-    pause_at: float | None = field_with_doc(
+    pause_at: float | None = option(
         None, "s of scanning, after which the robot stands for a while; not set: never"
     )
-    pause: float = field_with_doc(
-        28_800.0, "s, for which it then stands and records nothing: overnight"
-    )
-    stamp_rounding: float = field_with_doc(
+    pause: float = option(28_800.0, "s, for which it then stands and records nothing: overnight")
+    stamp_rounding: float = option(
         0.0, "s, stamps are rounded to multiples of it; 0: to the nanosecond"
     )
-    stamps_missing: bool = field_with_doc(False, "the scans' numbers stand for seconds")
+    stamps_missing: bool = option(False, "the scans' numbers stand for seconds")
 
     def __post_init__(self) -> None:
         require(self.speed > 0 and self.turn_rate > 0, "speed and turn_rate must be positive")
@@ -159,30 +157,26 @@ class RobotOptions:
 class OdometryOptions:
     """Errors of a differential drive's odometry; 0 everywhere gives perfect odometry."""
 
-    wheel_radius_error: float = field_with_doc(
-        0.0005, "relative, standard deviation per wheel, drawn once"
-    )
-    wheel_base_error: float = field_with_doc(0.01, "relative, standard deviation, drawn once")
-    wheel_base: float = field_with_doc(0.4, "m, distance between the wheels")
-    translation_noise: float = field_with_doc(
+    wheel_radius_error: float = option(0.0005, "relative, standard deviation per wheel, drawn once")
+    wheel_base_error: float = option(0.01, "relative, standard deviation, drawn once")
+    wheel_base: float = option(0.4, "m, distance between the wheels")
+    translation_noise: float = option(
         0.01, "m per sqrt(m) driven, standard deviation along the way"
     )
-    rotation_noise: float = field_with_doc(
+    rotation_noise: float = option(
         0.02, "rad per sqrt(rad) turned, standard deviation of the heading"
     )
-    drift_noise: float = field_with_doc(
-        0.008, "rad per sqrt(m) driven, standard deviation of the heading"
-    )
-    slip_rate: float = field_with_doc(0.0, "per metre driven, how often a wheel begins to slip")
-    slip: float = field_with_doc(
+    drift_noise: float = option(0.008, "rad per sqrt(m) driven, standard deviation of the heading")
+    slip_rate: float = option(0.0, "per metre driven, how often a wheel begins to slip")
+    slip: float = option(
         0.3, "relative, a slipping wheel turns farther by half to one and a half times this much"
     )
-    slip_length: float = field_with_doc(0.5, "m, the way on which it goes on slipping")
-    stall_rate: float = field_with_doc(
+    slip_length: float = option(0.5, "m, the way on which it goes on slipping")
+    stall_rate: float = option(
         0.0, "per minute, how often it begins to miss that the robot moves and turns"
     )
-    stall_time: float = field_with_doc(5.0, "s, for which it misses that")
-    resets: int = field_with_doc(0, "how often it begins again at its origin, at any time")
+    stall_time: float = option(5.0, "s, for which it misses that")
+    resets: int = option(0, "how often it begins again at its origin, at any time")
 
     def __post_init__(self) -> None:
         require(self.wheel_base > 0, "wheel_base must be positive")
@@ -209,28 +203,26 @@ _WIDEST = math.radians(150.0)
 class CameraOptions:
     """Cameras on the robot, all alike; each takes a whole picture at once."""
 
-    enabled: bool = field_with_doc(False, "there are cameras")
-    count: int = field_with_doc(1, "how many, spread evenly over the directions; all at once")
-    width: int = field_with_doc(640, "pixels")
-    height: int = field_with_doc(480, "pixels")
-    fov: float = field_with_doc(1.4, "rad, from the left edge of a picture to the right one")
-    rate: float = field_with_doc(2.0, "Hz, pictures per second of each camera")
-    x: float = field_with_doc(
-        0.1, "m, ahead of the base centre; ring: the circle on which they sit"
-    )
-    y: float = field_with_doc(0.0, "m, to the left of the base centre; likewise")
-    z: float = field_with_doc(1.2, "m, above the floor on which the robot stands")
-    yaw: float = field_with_doc(0.0, "rad, where the first camera looks, to the left of ahead")
-    pitch: float = field_with_doc(0.05, "rad, nose down")
-    k1: float = field_with_doc(0.0, "distortion of the lens as OpenCV has it (plumb_bob)")
-    k2: float = field_with_doc(0.0, "the same")
-    p1: float = field_with_doc(0.0, "the same")
-    p2: float = field_with_doc(0.0, "the same")
-    noise: float = field_with_doc(2.0, "of 255, standard deviation of each value of a pixel")
-    exposure: float = field_with_doc(
+    enabled: bool = option(False, "there are cameras")
+    count: int = option(1, "how many, spread evenly over the directions; all at once")
+    width: int = option(640, "pixels")
+    height: int = option(480, "pixels")
+    fov: float = option(1.4, "rad, from the left edge of a picture to the right one")
+    rate: float = option(2.0, "Hz, pictures per second of each camera")
+    x: float = option(0.1, "m, ahead of the base centre; ring: the circle on which they sit")
+    y: float = option(0.0, "m, to the left of the base centre; likewise")
+    z: float = option(1.2, "m, above the floor on which the robot stands")
+    yaw: float = option(0.0, "rad, where the first camera looks, to the left of ahead")
+    pitch: float = option(0.05, "rad, nose down")
+    k1: float = option(0.0, "distortion of the lens as OpenCV has it (plumb_bob)")
+    k2: float = option(0.0, "the same")
+    p1: float = option(0.0, "the same")
+    p2: float = option(0.0, "the same")
+    noise: float = option(2.0, "of 255, standard deviation of each value of a pixel")
+    exposure: float = option(
         0.0, "relative, standard deviation of how bright pictures are; 0: all alike"
     )
-    antialias: int = field_with_doc(1, "rays across and down each pixel")
+    antialias: int = option(1, "rays across and down each pixel")
 
     def __post_init__(self) -> None:
         require(1 <= self.count <= 16, "count must lie in [1, 16]")
@@ -268,38 +260,36 @@ _STEEPEST = math.radians(85.0)
 class LidarOptions:
     """A spinning lidar and where it sits on the robot; it takes the place of the planar laser."""
 
-    channels: int = field_with_doc(0, "beams above one another; 0: there is no lidar")
-    columns: int = field_with_doc(1875, "azimuths per turn, at each of which all channels look")
-    rate: float = field_with_doc(10.0, "Hz, turns per second")
-    low: float | None = field_with_doc(
+    channels: int = option(0, "beams above one another; 0: there is no lidar")
+    columns: int = option(1875, "azimuths per turn, at each of which all channels look")
+    rate: float = option(10.0, "Hz, turns per second")
+    low: float | None = option(
         None, "rad, elevation of the lowest channel; not set: as sensors of so many channels have"
     )
-    high: float | None = field_with_doc(None, "rad, elevation of the highest channel; likewise")
-    max_range: float = field_with_doc(100.0, "m, what lies farther off gives no return")
-    range_noise: float = field_with_doc(0.02, "m, standard deviation of a range")
-    no_return_share: float = field_with_doc(0.002, "share of beams that get lost anywhere")
-    glass_no_return_share: float = field_with_doc(0.3, "share of beams that get lost on glass")
+    high: float | None = option(None, "rad, elevation of the highest channel; likewise")
+    max_range: float = option(100.0, "m, what lies farther off gives no return")
+    range_noise: float = option(0.02, "m, standard deviation of a range")
+    no_return_share: float = option(0.002, "share of beams that get lost anywhere")
+    glass_no_return_share: float = option(0.3, "share of beams that get lost on glass")
     # spelled out: ruff takes the default for mutable under an alias
-    no_returns: Literal["kept", "left out"] = field_with_doc(
+    no_returns: Literal["kept", "left out"] = option(
         "kept", "beams without return: kept, at the maximum range, or left out as drivers do"
     )
-    sweep: bool = field_with_doc(
+    sweep: bool = option(
         True, "a turn takes its time, and everything moves meanwhile; false: all beams at once"
     )
-    x: float = field_with_doc(0.0, "m, sensor ahead of the base centre")
-    y: float = field_with_doc(0.0, "m, sensor to the left of the base centre")
-    z: float = field_with_doc(1.8, "m, sensor above the floor on which the robot stands")
-    yaw: float = field_with_doc(0.0, "rad, sensor against the base")
-    pitch: float = field_with_doc(0.0, "rad, the same, nose down")
-    vibration_roll: float = field_with_doc(0.0, "rad, standard deviation of the robot's roll")
-    vibration_pitch: float = field_with_doc(0.0, "rad, the same of its pitch")
-    vibration_z: float = field_with_doc(0.0, "m, the same of its height")
-    sees_robot: bool = field_with_doc(False, "some beams meet the robot's own roof")
-    roof_length: float | None = field_with_doc(
-        None, "m, of that roof; not set: twice the robot's radius"
-    )
-    roof_width: float | None = field_with_doc(None, "m; not set: 0.8 of that")
-    roof_below: float = field_with_doc(0.35, "m, from the sensor down to it")
+    x: float = option(0.0, "m, sensor ahead of the base centre")
+    y: float = option(0.0, "m, sensor to the left of the base centre")
+    z: float = option(1.8, "m, sensor above the floor on which the robot stands")
+    yaw: float = option(0.0, "rad, sensor against the base")
+    pitch: float = option(0.0, "rad, the same, nose down")
+    vibration_roll: float = option(0.0, "rad, standard deviation of the robot's roll")
+    vibration_pitch: float = option(0.0, "rad, the same of its pitch")
+    vibration_z: float = option(0.0, "m, the same of its height")
+    sees_robot: bool = option(False, "some beams meet the robot's own roof")
+    roof_length: float | None = option(None, "m, of that roof; not set: twice the robot's radius")
+    roof_width: float | None = option(None, "m; not set: 0.8 of that")
+    roof_below: float = option(0.35, "m, from the sensor down to it")
 
     def __post_init__(self) -> None:
         require(self.channels >= 0, "channels must not be negative")
@@ -329,13 +319,13 @@ class LidarOptions:
 class RigOptions:
     """Two lasers like `laser`: one lies flat, the other tilts about an axis from left to right."""
 
-    tilts: bool = field_with_doc(False, "there are two lasers, of which one tilts")
-    low_z: float = field_with_doc(0.35, "m, the laser that lies flat, above the floor")
-    pivot_x: float = field_with_doc(0.1, "m, the axis ahead of the base centre")
-    pivot_z: float = field_with_doc(0.9, "m, the same above the floor")
-    middle: float = field_with_doc(0.1, "rad, nose down, about which the laser tilts")
-    amplitude: float = field_with_doc(0.7, "rad, how far it tilts to either side of that")
-    period: float = field_with_doc(4.0, "s, for once up and down, at an even rate")
+    tilts: bool = option(False, "there are two lasers, of which one tilts")
+    low_z: float = option(0.35, "m, the laser that lies flat, above the floor")
+    pivot_x: float = option(0.1, "m, the axis ahead of the base centre")
+    pivot_z: float = option(0.9, "m, the same above the floor")
+    middle: float = option(0.1, "rad, nose down, about which the laser tilts")
+    amplitude: float = option(0.7, "rad, how far it tilts to either side of that")
+    period: float = option(4.0, "s, for once up and down, at an even rate")
 
     def __post_init__(self) -> None:
         require(self.low_z > 0 and self.pivot_z > 0, "heights must be positive")
@@ -348,11 +338,11 @@ class RigOptions:
 class GroundOptions:
     """The ground: a plane or a paraboloid, with pavements above it."""
 
-    slope_x: float = field_with_doc(0.0, "m per m, how much it rises to the east, at the origin")
-    slope_y: float = field_with_doc(0.0, "m per m, the same to the north")
-    bend_x: float = field_with_doc(0.0, "per m, what that slope grows by per metre to the east")
-    bend_y: float = field_with_doc(0.0, "per m, the same to the north")
-    kerb: float = field_with_doc(0.12, "m, pavements above the street")
+    slope_x: float = option(0.0, "m per m, how much it rises to the east, at the origin")
+    slope_y: float = option(0.0, "m per m, the same to the north")
+    bend_x: float = option(0.0, "per m, what that slope grows by per metre to the east")
+    bend_y: float = option(0.0, "per m, the same to the north")
+    kerb: float = option(0.12, "m, pavements above the street")
 
     def __post_init__(self) -> None:
         steep = max(abs(self.slope_x), abs(self.slope_y))
@@ -365,11 +355,11 @@ class GroundOptions:
 class HeightOptions:
     """How high things stand."""
 
-    ceiling: float | None = field_with_doc(2.8, "m; not set: the open sky")
-    walls: float = field_with_doc(9.0, "m, of walls under the open sky; else up to the ceiling")
-    doors: float = field_with_doc(2.05, "m, above it there is a lintel")
-    furniture: float = field_with_doc(1.0, "m, of whatever stands about")
-    panels: float = field_with_doc(2.0, "m, of furniture less than 0.2 m thick")
+    ceiling: float | None = option(2.8, "m; not set: the open sky")
+    walls: float = option(9.0, "m, of walls under the open sky; else up to the ceiling")
+    doors: float = option(2.05, "m, above it there is a lintel")
+    furniture: float = option(1.0, "m, of whatever stands about")
+    panels: float = option(2.0, "m, of furniture less than 0.2 m thick")
 
     def __post_init__(self) -> None:
         heights = (self.walls, self.doors, self.furniture, self.panels)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2, se3
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import option
 from stillmap.core.recording import Recording
 from stillmap.slam import constant_velocity
 from stillmap.slam.constant_velocity import State
@@ -90,25 +90,25 @@ _SHED = 0.1  # of the reach, after which the map is cut again
 class SpinningOptions:
     """Sweeps in space; `docs/registration3d.md` says what is minimised."""
 
-    edge: float = field_with_doc(0.4, "m, edge of the finest cells that surfaces are made from")
-    levels: int = field_with_doc(4, "sizes of cells, each twice the one before")
-    enough: float = field_with_doc(60.0, "beams that a cell takes in: what comes later has drifted")
-    reach: float = field_with_doc(100.0, "m from the robot to which the local map goes")
-    thin_map: float = field_with_doc(0.2, "m between the points of a sweep that go into the map")
-    thin: float = field_with_doc(0.35, "m between those that are registered, at least")
-    most: int = field_with_doc(4000, "points of a sweep that are registered, at most")
-    least: float = field_with_doc(5.0, "beams around a place that may be a surface, at least")
-    flat: float = field_with_doc(0.1, "variance across a surface against that along it, at most")
-    wide: float = field_with_doc(0.02, "square edges, variance along a surface, at least")
-    sigma: float = field_with_doc(0.03, "m, error of a beam besides the scatter of the surface")
-    kernel: float = field_with_doc(3.0, "standard deviations at which a beam counts a quarter")
-    gain: float = field_with_doc(0.5, "weight of one beam against the motion prior")
-    acceleration: float = field_with_doc(3.0, "m/s^2, how unsteady the motion is")
-    turn_acceleration: float = field_with_doc(3.0, "rad/s^2, likewise")
-    first_speed: float = field_with_doc(10.0, "m/s, standard deviation before anything is known")
-    first_turn: float = field_with_doc(1.0, "rad/s, likewise")
-    max_iterations: int = field_with_doc(30, "Gauss-Newton steps at most")
-    tolerance: float = field_with_doc(0.001, "m, and 10 rad, of the last step")
+    edge: float = option(0.4, "m, edge of the finest cells that surfaces are made from")
+    levels: int = option(4, "sizes of cells, each twice the one before")
+    enough: float = option(60.0, "beams that a cell takes in: what comes later has drifted")
+    reach: float = option(100.0, "m from the robot to which the local map goes")
+    thin_map: float = option(0.2, "m between the points of a sweep that go into the map")
+    thin: float = option(0.35, "m between those that are registered, at least")
+    most: int = option(4000, "points of a sweep that are registered, at most")
+    least: float = option(5.0, "beams around a place that may be a surface, at least")
+    flat: float = option(0.1, "variance across a surface against that along it, at most")
+    wide: float = option(0.02, "square edges, variance along a surface, at least")
+    sigma: float = option(0.03, "m, error of a beam besides the scatter of the surface")
+    kernel: float = option(3.0, "standard deviations at which a beam counts a quarter")
+    gain: float = option(0.5, "weight of one beam against the motion prior")
+    acceleration: float = option(3.0, "m/s^2, how unsteady the motion is")
+    turn_acceleration: float = option(3.0, "rad/s^2, likewise")
+    first_speed: float = option(10.0, "m/s, standard deviation before anything is known")
+    first_turn: float = option(1.0, "rad/s, likewise")
+    max_iterations: int = option(30, "Gauss-Newton steps at most")
+    tolerance: float = option(0.001, "m, and 10 rad, of the last step")
 
     def __post_init__(self) -> None:
         for name, low, high in _LIMITS:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2, se3
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import option
 from stillmap.core.recording import Recording
 from stillmap.slam import lidar_odometry, local_map, pose_graph
 from stillmap.slam.constant_velocity import State
@@ -30,29 +30,29 @@ _ANNEALING = 8
 class SpinningLoopOptions:
     """Loop closure in space; `docs/registration3d.md` says how."""
 
-    enabled: bool = field_with_doc(True, "close loops; without, poses are incremental only")
-    distance: float = field_with_doc(2.0, "m between keyframes")
-    turn: float = field_with_doc(0.5, "rad between keyframes")
-    gap: float = field_with_doc(40.0, "m of travel after which a place counts as seen again")
-    reach: float = field_with_doc(8.0, "m, how near a keyframe must come to an earlier one")
-    stretch: float = field_with_doc(15.0, "m of travel to either side that make a local map")
-    levels: int = field_with_doc(5, "sizes of its cells, as slam.spinning.levels")
-    drift_translation: float = field_with_doc(0.01, "m of drift per metre: how far to search")
-    drift_rotation: float = field_with_doc(0.0003, "rad of drift per metre: how far to search")
-    step_translation: float = field_with_doc(0.01, "m of random error, per root of a metre")
-    step_rotation: float = field_with_doc(0.0005, "rad of random error, per root of a metre")
-    sigma_translation: float = field_with_doc(0.03, "m, error of a closure at least")
-    sigma_rotation: float = field_with_doc(0.002, "rad, error of a closure at least")
-    compared: float = field_with_doc(
+    enabled: bool = option(True, "close loops; without, poses are incremental only")
+    distance: float = option(2.0, "m between keyframes")
+    turn: float = option(0.5, "rad between keyframes")
+    gap: float = option(40.0, "m of travel after which a place counts as seen again")
+    reach: float = option(8.0, "m, how near a keyframe must come to an earlier one")
+    stretch: float = option(15.0, "m of travel to either side that make a local map")
+    levels: int = option(5, "sizes of its cells, as slam.spinning.levels")
+    drift_translation: float = option(0.01, "m of drift per metre: how far to search")
+    drift_rotation: float = option(0.0003, "rad of drift per metre: how far to search")
+    step_translation: float = option(0.01, "m of random error, per root of a metre")
+    step_rotation: float = option(0.0005, "rad of random error, per root of a metre")
+    sigma_translation: float = option(0.03, "m, error of a closure at least")
+    sigma_rotation: float = option(0.002, "rad, error of a closure at least")
+    compared: float = option(
         0.75, "of the share that the local map explained, that the earlier map must explain"
     )
-    met: float = field_with_doc(
+    met: float = option(
         0.55, "share of surfaces that must meet earlier ones, those of every direction alike"
     )
-    through: float = field_with_doc(
+    through: float = option(
         0.1, "share of beams that pass through the earlier map, beyond those that did at that time"
     )
-    misfit: float = field_with_doc(25.0, "chi-square above which the graph refuses a closure")
+    misfit: float = option(25.0, "chi-square above which the graph refuses a closure")
 
     def __post_init__(self) -> None:
         for name, low, high in _LIMITS:

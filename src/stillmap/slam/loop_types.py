@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import option
 from stillmap.core.recording import Recording
 from stillmap.slam.local_map import Index
 from stillmap.slam.scan_matching import RegistrationOptions, SurfaceOptions
@@ -18,44 +18,44 @@ Float = NDArray[np.float64]
 class LoopOptions:
     """Loop closure; `docs/registration.md` says how."""
 
-    enabled: bool = field_with_doc(True, "close loops; without, poses are incremental only")
-    memory: float = field_with_doc(
+    enabled: bool = option(True, "close loops; without, poses are incremental only")
+    memory: float = option(
         25.0, "m of travel that scans are registered against before loops are closed"
     )
-    distance: float = field_with_doc(1.0, "m between keyframes")
-    turn: float = field_with_doc(0.5, "rad between keyframes")
-    gap: float = field_with_doc(15.0, "m of travel after which a place counts as seen again")
-    reach: float = field_with_doc(
+    distance: float = option(1.0, "m between keyframes")
+    turn: float = option(0.5, "rad between keyframes")
+    gap: float = option(15.0, "m of travel after which a place counts as seen again")
+    reach: float = option(
         6.0, "m, how near a keyframe, or where it looks, must come to an earlier one"
     )
-    stretch: float = field_with_doc(8.0, "m of travel to either side that make a local map")
-    view: float = field_with_doc(1.0, "m of travel to a scan on either side laid on it too")
-    drift_translation: float = field_with_doc(0.006, "m of drift per metre: how far to search")
-    drift_rotation: float = field_with_doc(0.0003, "rad of drift per metre: how far to search")
-    drift_until: float = field_with_doc(
+    stretch: float = option(8.0, "m of travel to either side that make a local map")
+    view: float = option(1.0, "m of travel to a scan on either side laid on it too")
+    drift_translation: float = option(0.006, "m of drift per metre: how far to search")
+    drift_rotation: float = option(0.0003, "rad of drift per metre: how far to search")
+    drift_until: float = option(
         1000.0, "m after which it is searched no farther: who drifts so far is lost"
     )
-    window: float = field_with_doc(2.0, "standard deviations of the drift that are searched")
-    stage: float = field_with_doc(
+    window: float = option(2.0, "standard deviations of the drift that are searched")
+    stage: float = option(
         40.0, "m of travel in which loops are looked for before the graph is solved, at least"
     )
-    stage_share: float = field_with_doc(0.05, "of the travel so far, at least")
-    step_translation: float = field_with_doc(0.03, "m of random error, per root of a metre")
-    step_rotation: float = field_with_doc(0.004, "rad of random error, per root of a metre")
-    sigma_translation: float = field_with_doc(0.03, "m, error of a closure at least")
-    sigma_rotation: float = field_with_doc(0.006, "rad, error of a closure at least")
-    before: float = field_with_doc(
+    stage_share: float = option(0.05, "of the travel so far, at least")
+    step_translation: float = option(0.03, "m of random error, per root of a metre")
+    step_rotation: float = option(0.004, "rad of random error, per root of a metre")
+    sigma_translation: float = option(0.03, "m, error of a closure at least")
+    sigma_rotation: float = option(0.006, "rad, error of a closure at least")
+    before: float = option(
         1.0, "m before its end where the earlier map must have looked, or a beam is not comparable"
     )
-    known: float = field_with_doc(0.4, "share of beams that must be comparable")
-    accept_above: float = field_with_doc(0.5, "share of those that the earlier map must explain")
-    compared: float = field_with_doc(0.8, "of the share that the map so far explains, at least")
-    agreeing: int = field_with_doc(2, "closures around that must ask for the same correction")
-    misfit: float = field_with_doc(16.0, "chi-square above which the graph refuses a closure")
-    annealing: int = field_with_doc(
+    known: float = option(0.4, "share of beams that must be comparable")
+    accept_above: float = option(0.5, "share of those that the earlier map must explain")
+    compared: float = option(0.8, "of the share that the map so far explains, at least")
+    agreeing: int = option(2, "closures around that must ask for the same correction")
+    misfit: float = option(16.0, "chi-square above which the graph refuses a closure")
+    annealing: int = option(
         8, "solutions in which the weights of closures grow sharp; 1: sharp at once"
     )
-    sweeps: int = field_with_doc(1, "times that all scans are registered against all others")
+    sweeps: int = option(1, "times that all scans are registered against all others")
 
     def __post_init__(self) -> None:
         for name, low, high in _LIMITS:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import option
 
 Float = NDArray[np.float64]
 
@@ -19,26 +19,26 @@ _PER_MOTION = ("_per_metre", "_per_radian")  # these may be zero, floors may not
 class MotionOptions:
     """Standard deviations of one odometry increment."""
 
-    translation_floor: float = field_with_doc(0.02, "m, error of an increment without motion")
-    translation_per_metre: float = field_with_doc(0.07, "m of error per metre travelled")
-    translation_per_radian: float = field_with_doc(0.05, "m of error per radian turned")
-    rotation_floor: float = field_with_doc(0.02, "rad, error of an increment without motion")
-    rotation_per_metre: float = field_with_doc(0.1, "rad of error per metre travelled")
-    rotation_per_radian: float = field_with_doc(0.3, "rad of error per radian turned")
-    without_odometry_translation: float = field_with_doc(
+    translation_floor: float = option(0.02, "m, error of an increment without motion")
+    translation_per_metre: float = option(0.07, "m of error per metre travelled")
+    translation_per_radian: float = option(0.05, "m of error per radian turned")
+    rotation_floor: float = option(0.02, "rad, error of an increment without motion")
+    rotation_per_metre: float = option(0.1, "rad of error per metre travelled")
+    rotation_per_radian: float = option(0.3, "rad of error per radian turned")
+    without_odometry_translation: float = option(
         0.5, "m, error of a guess without odometry, before anything was learned of it"
     )
-    without_odometry_rotation: float = field_with_doc(
+    without_odometry_rotation: float = option(
         0.5, "rad, error of a guess without odometry, before anything was learned of it"
     )
-    acceleration: float = field_with_doc(
+    acceleration: float = option(
         2.0, "m/s^2, that may come unannounced between two scans where there is no odometry"
     )
-    turn_acceleration: float = field_with_doc(4.0, "rad/s^2, likewise")
-    unannounced: float = field_with_doc(
+    turn_acceleration: float = option(4.0, "rad/s^2, likewise")
+    unannounced: float = option(
         0.15, "m and rad, how far that takes the robot until the next scan at most"
     )
-    steady_rate: float = field_with_doc(
+    steady_rate: float = option(
         0.1, "weight of the last motion in what is known of how steady it is"
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import option
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model, odometry_faults
 from stillmap.slam.lidar_odometry import SpinningOptions
@@ -38,16 +38,14 @@ _LATELY = 0.1  # weight of one scan in what the map usually explains
 class SlamOptions:
     """The M-step over poses and map."""
 
-    resolution: float = field_with_doc(0.05, "m, edge of a map cell")
-    voxel: float | None = field_with_doc(
+    resolution: float = option(0.05, "m, edge of a map cell")
+    voxel: float | None = option(
         None, "m, the same of 3D recordings; unset: 0.15, of depth cameras 0.05"
     )
-    spacing: float = field_with_doc(
+    spacing: float = option(
         0.2, "m, rad or 5 s between scans that later ones are registered against"
     )
-    deskew: bool = field_with_doc(
-        True, "take the motion during a scan out of it, where beams have times"
-    )
+    deskew: bool = option(True, "take the motion during a scan out of it, where beams have times")
     motion: MotionOptions = field(default=MotionOptions())
     registration: RegistrationOptions = field(default=RegistrationOptions())
     surface: SurfaceOptions = field(default=SurfaceOptions())

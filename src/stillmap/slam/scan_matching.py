@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import option
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model
 from stillmap.slam.motion_model import MotionPrior
@@ -24,9 +24,9 @@ Points = NDArray[np.float32]
 class SurfaceOptions:
     """Gaps between end points on one surface, which are filled before scans are laid on them."""
 
-    gap: float = field_with_doc(1.5, "m between neighbouring end points on a surface, at most")
-    straight: float = field_with_doc(0.1, "m by which three of them may be off a straight line")
-    growth: float = field_with_doc(3.0, "times the gap beside it that a gap may be wide")
+    gap: float = option(1.5, "m between neighbouring end points on a surface, at most")
+    straight: float = option(0.1, "m by which three of them may be off a straight line")
+    growth: float = option(3.0, "times the gap beside it that a gap may be wide")
 
     def __post_init__(self) -> None:
         for name in ("gap", "straight", "growth"):
@@ -103,38 +103,38 @@ _MARGIN, _WALL = 0.5, 0.4
 class RegistrationOptions:
     """How one scan is registered; `docs/registration.md` says what is maximised."""
 
-    sigma: float = field_with_doc(0.04, "m, width of the smoothed field around end points")
-    floor: float = field_with_doc(0.05, "field value of an end point the map cannot explain")
-    unknown: float = field_with_doc(0.2, "what unknown space adds to it: unknown is not free")
-    approach: float = field_with_doc(
+    sigma: float = option(0.04, "m, width of the smoothed field around end points")
+    floor: float = option(0.05, "field value of an end point the map cannot explain")
+    unknown: float = option(0.2, "what unknown space adds to it: unknown is not free")
+    approach: float = option(
         0.5, "m before its end in which a beam says nothing against what it crosses"
     )
-    gain: float = field_with_doc(0.2, "weight of one beam against the motion prior")
-    max_iterations: int = field_with_doc(20, "Newton steps at most")
-    window: float = field_with_doc(3.0, "standard deviations of the prior that are searched")
-    search_range: float = field_with_doc(20.0, "m, beams beyond are left out of the search")
-    starts: int = field_with_doc(3, "best poses of the search that are refined")
-    near: float = field_with_doc(
+    gain: float = option(0.2, "weight of one beam against the motion prior")
+    max_iterations: int = option(20, "Newton steps at most")
+    window: float = option(3.0, "standard deviations of the prior that are searched")
+    search_range: float = option(20.0, "m, beams beyond are left out of the search")
+    starts: int = option(3, "best poses of the search that are refined")
+    near: float = option(
         0.9, "of the usual share explained: then what lies downhill of odometry is taken"
     )
-    doubt_below: float = field_with_doc(
+    doubt_below: float = option(
         0.7, "of the usual share explained, below which a wider search is tried"
     )
-    lies: float = field_with_doc(
+    lies: float = option(
         10.0, "nats by which a scan must fit better elsewhere before odometry is disbelieved"
     )
-    disagree: float = field_with_doc(
+    disagree: float = option(
         3.0, "standard deviations off odometry from where on it says no more where a scan is"
     )
-    doubt_translation: float = field_with_doc(0.5, "m, half width of that search at least")
-    doubt_rotation: float = field_with_doc(0.5, "rad, half width of that search at least")
-    carried_below: float = field_with_doc(
+    doubt_translation: float = option(0.5, "m, half width of that search at least")
+    doubt_rotation: float = option(0.5, "rad, half width of that search at least")
+    carried_below: float = option(
         0.3, "of the usual share explained, below which a robot may have been carried elsewhere"
     )
-    through: float = field_with_doc(
+    through: float = option(
         0.2, "share of a scan's beams that may seem to go through walls, unless it is elsewhere"
     )
-    lost_translation: float = field_with_doc(
+    lost_translation: float = option(
         1.5,
         "m, half width of a last search over all headings, where odometry would lead through walls "
         "or there is none",

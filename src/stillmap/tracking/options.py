@@ -2,39 +2,37 @@
 
 from dataclasses import dataclass
 
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import option
 
 
 @dataclass(frozen=True)
 class ObjectOptions:
     """What moved; `docs/objects.md` says how it is found."""
 
-    enabled: bool = field_with_doc(True, "find what moved, and follow it")
-    dynamic: float = field_with_doc(
-        0.7, "a beam is of something that moves if it is so probable at least"
-    )
-    link: float = field_with_doc(0.35, "m between neighbouring end points on one thing")
-    link_slope: float = field_with_doc(0.02, "m more for each metre of range")
-    near: float = field_with_doc(0.2, "m from where a thing was expected, at most")
-    near_sigmas: float = field_with_doc(2.0, "standard deviations of that in addition")
-    far: float = field_with_doc(0.35, "m, the same for a thing that is nowhere else")
-    farthest: float = field_with_doc(1.2, "m, whatever the standard deviations")
-    apart: float = field_with_doc(0.7, "m between parts that are two things")
-    shape: float = field_with_doc(0.6, "s for which what was seen of a thing is its shape")
-    gap: float = field_with_doc(2.0, "s that a thing may be hidden")
-    gap_between: float = field_with_doc(
+    enabled: bool = option(True, "find what moved, and follow it")
+    dynamic: float = option(0.7, "a beam is of something that moves if it is so probable at least")
+    link: float = option(0.35, "m between neighbouring end points on one thing")
+    link_slope: float = option(0.02, "m more for each metre of range")
+    near: float = option(0.2, "m from where a thing was expected, at most")
+    near_sigmas: float = option(2.0, "standard deviations of that in addition")
+    far: float = option(0.35, "m, the same for a thing that is nowhere else")
+    farthest: float = option(1.2, "m, whatever the standard deviations")
+    apart: float = option(0.7, "m between parts that are two things")
+    shape: float = option(0.6, "s for which what was seen of a thing is its shape")
+    gap: float = option(2.0, "s that a thing may be hidden")
+    gap_between: float = option(
         3.0, "s that it may be hidden where its ways before and after fit together"
     )
-    sigma: float = field_with_doc(0.12, "m by which the middle of what is seen of a thing is off")
-    sigma_way: float = field_with_doc(
+    sigma: float = option(0.12, "m by which the middle of what is seen of a thing is off")
+    sigma_way: float = option(
         0.28, "m, the same where ways are smoothed: legs swing to and fro in time"
     )
-    sigma_speed: float = field_with_doc(1.0, "m/s, how fast things are when first seen")
-    acceleration: float = field_with_doc(1.0, "m2/s3, density of random acceleration")
-    beside: float = field_with_doc(0.55, "m between two things that always go together: one thing")
-    least_scans: int = field_with_doc(4, "scans that a thing must be seen in")
-    least_seconds: float = field_with_doc(0.6, "s from when it is first seen to when it is last")
-    least_extent: float = field_with_doc(
+    sigma_speed: float = option(1.0, "m/s, how fast things are when first seen")
+    acceleration: float = option(1.0, "m2/s3, density of random acceleration")
+    beside: float = option(0.55, "m between two things that always go together: one thing")
+    least_scans: int = option(4, "scans that a thing must be seen in")
+    least_seconds: float = option(0.6, "s from when it is first seen to when it is last")
+    least_extent: float = option(
         0.15, "m that it went and is long: an edge that flickers stays, and has no size"
     )
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
 from stillmap.core.camera import Camera, Images, unusable
-from stillmap.core.config import field_with_doc
+from stillmap.core.config import option
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.slam.deskew import FASTEST, FASTEST_TURN
@@ -72,10 +72,10 @@ _LEAP = "taken where the poses leap"
 class ViewOptions:
     """Which pictures are of a known place."""
 
-    pause: float = field_with_doc(
+    pause: float = option(
         1.0, "s: between scans farther apart, pictures are used only where the robot stood"
     )
-    beyond: float = field_with_doc(
+    beyond: float = option(
         0.1, "s: how long before or after a scan a picture may be taken where that is all there is"
     )
 
