@@ -22,11 +22,11 @@ from tables import Column, means_and_worst
 
 import stillmap
 from stillmap.core import se2
-from stillmap.core.profiling import Stages
+from stillmap.core.profiling import StageTimer
 from stillmap.eval.objects import object_scores, rank_correlation, sightings, true_traffic
 from stillmap.eval.trajectory import align
 from stillmap.sim import Simulation, simulate
-from stillmap.tracking import traffic
+from stillmap.tracking import compute_flow_map
 
 COLUMNS = (
     Column("sightings", "seen > 3 s", ".0f"),
@@ -53,7 +53,7 @@ def main() -> None:
 
 def _scored(run: Run) -> Scores:
     simulation = simulate(run.case.build(), run.seed)
-    stages = Stages()
+    stages = StageTimer()
     poses = simulation.truth.T_world_base if run.true_poses else None
     options = options_of("stillmap", run.settings)
     result = stillmap.build(simulation.recording, options, poses=poses, stages=stages)
@@ -92,7 +92,7 @@ def _of_traffic(
     true = true_traffic(seen, truth.movers, recording.stamp_ns, T_map_world, size)
     grid = grid_of(result.map)
     return rank_correlation(
-        traffic(result.objects, size), true, grid.centres(np.argwhere(grid.free))
+        compute_flow_map(result.objects, size), true, grid.centres(np.argwhere(grid.free))
     )
 
 

@@ -12,7 +12,7 @@ from stillmap import em
 from stillmap.em import changepoints as module
 from stillmap.em import observations
 from stillmap.em.changepoints import _as_wholes
-from stillmap.mapping import changed_places, relabelled
+from stillmap.mapping import detect_changes, relabel_changes
 
 WALLS = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
 CAME, LEFT, STANDS, STOOD, PASSED = 3, 4, 5, 6, 7
@@ -216,7 +216,9 @@ def last_e_step(seen, state="last", threads=1, **options):
     nobody = np.ones(seen.recording.n_beams, np.float32)
     before = em.CellProbabilities(found.cells, np.zeros(len(found.cells), np.float32), 0.2)
     places = [Everywhere(found.cells)]
-    shown = relabelled(seen.recording, seen.poses, nobody, before, found, places, state, threads)
+    shown = relabel_changes(
+        seen.recording, seen.poses, nobody, before, found, places, state, threads
+    )
     return shown, found
 
 
@@ -288,7 +290,7 @@ def test_every_probability_is_one(last, majority):
 
 
 def test_when_it_was(seen, last):
-    found = changed_places(last[1], seen.recording, RESOLUTION, 0.5, em.ChangeOptions())
+    found = detect_changes(last[1], seen.recording, RESOLUTION, 0.5, em.ChangeOptions())
     assert [one.kind for one in found] == ["came", "left"]
     assert [(one.before_ns, one.stamp_ns) for one in found] == [
         (119 * 10**9, 120 * 10**9),
@@ -313,7 +315,7 @@ def test_what_comes_and_goes_again_and_again():
     watched = watch([*WALLS, *gate, *passing(35, 1.2)], 300)
     (p_static, _), found = last_e_step(watched)
     assert np.median(watched.of(p_static, *range(3, 3 + len(gate)))) < 0.1
-    (one,) = changed_places(found, watched.recording, RESOLUTION, 0.5, em.ChangeOptions())
+    (one,) = detect_changes(found, watched.recording, RESOLUTION, 0.5, em.ChangeOptions())
     assert one.kind == "comes and goes"
     assert one.times == 11
     assert (one.stamp_ns, one.last_ns) == (25 * 10**9, 275 * 10**9)
@@ -348,7 +350,7 @@ def test_pieces_and_threads_change_no_bit(seen, last, monkeypatch, beams, thread
 def test_so_short_a_recording_shows_no_change(scans):
     watched = watch([*WALLS, Ball(2.2, 0.3, 0, 9, 0.5)], scans)
     (p_static, _), found = last_e_step(watched)
-    assert changed_places(found, watched.recording, RESOLUTION, 0.5, em.ChangeOptions()) == []
+    assert detect_changes(found, watched.recording, RESOLUTION, 0.5, em.ChangeOptions()) == []
     assert np.isfinite(p_static).all()
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from stillmap.eval.objects import object_scores, rank_correlation, sightings, true_traffic
-from stillmap.tracking import MovingObject, Traffic
-from stillmap.tracking.flow_map import traffic
+from stillmap.tracking import FlowMap, MovingObject
+from stillmap.tracking.flow_map import compute_flow_map
 
 T, N = 40, 4  # scans at 5 Hz; beams of each
 OFFSET = np.arange(T + 1) * N
@@ -96,7 +96,7 @@ def test_speed():
 
 def squares(crossings, origin=(0.0, 0.0, 0.0)):
     crossings = np.asarray(crossings, np.int32)
-    return Traffic(crossings, crossings.astype(np.float32), origin, 1.0)
+    return FlowMap(crossings, crossings.astype(np.float32), origin, 1.0)
 
 
 def floor(width, height):
@@ -112,7 +112,7 @@ def test_squares_are_compared_where_the_floor_is():
     assert np.isnan(rank_correlation(true, squares([[0, 0], [0, 0]]), floor(2, 2)))
     assert np.isnan(rank_correlation(true, true, floor(1, 1)))
     with pytest.raises(ValueError, match="resolution"):
-        rank_correlation(traffic([]), true, floor(2, 2))
+        rank_correlation(compute_flow_map([]), true, floor(2, 2))
 
 
 def test_true_crossings_lie_in_the_map():

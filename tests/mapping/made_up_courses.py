@@ -7,7 +7,7 @@ import numpy as np
 
 from stillmap import em
 from stillmap.core.recording import Recording
-from stillmap.mapping import Change, changed_places
+from stillmap.mapping import Change, detect_changes
 
 RESOLUTION = 0.1
 S = 10**9
@@ -82,7 +82,7 @@ def found(
     *parts: em.Courses, seen: Recording = EVERY_SECOND, look: float = 1.0, **options: Any
 ) -> list[Change]:
     """The places that changed, by default with a look in every second."""
-    return changed_places(together(*parts), seen, RESOLUTION, look, em.ChangeOptions(**options))
+    return detect_changes(together(*parts), seen, RESOLUTION, look, em.ChangeOptions(**options))
 
 
 def seconds(change: Change) -> tuple[float, float, float]:

@@ -9,8 +9,8 @@ from made_up_courses import EVERY_SECOND, S, course, recording, seconds, togethe
 from stillmap import em
 from stillmap.core.recording import Recording
 from stillmap.em.changepoints import changed_of
-from stillmap.mapping import Change, changed_things
-from stillmap.mapping.dwell_time import seconds_seen
+from stillmap.mapping import Change, detect_changes_3d
+from stillmap.mapping.dwell_time import measure_dwell_times
 
 VOXEL = 0.15
 CAR, GROUND = (20, 8, 9), (40, 20, 2)
@@ -45,7 +45,7 @@ def things(*parts, seen=None):
         seen = watching(courses.cells, (0, 99))
     poses = np.tile(np.eye(4), (seen.n_scans, 1, 1))
     changed = changed_of(courses)
-    return changed_things(changed, seen, poses, VOXEL, 1.0, em.ChangeOptions())
+    return detect_changes_3d(changed, seen, poses, VOXEL, 1.0, em.ChangeOptions())
 
 
 def test_a_car_that_left_is_one_place_in_space():
@@ -58,7 +58,7 @@ def test_a_car_that_left_is_one_place_in_space():
     assert one.times == 1
     plan = np.stack(np.meshgrid(np.arange(10, 30), np.arange(20, 28)), -1).reshape(-1, 2)
     assert set(map(tuple, one.cells)) == set(map(tuple, plan))
-    np.testing.assert_array_equal(one.swept, one.cells)
+    np.testing.assert_array_equal(one.swept_cells, one.cells)
 
 
 def test_one_that_came_and_left_is_two():
@@ -165,6 +165,6 @@ def test_how_long_things_at_the_same_place_were_seen():
                 shown = one.before_ns - at.min(initial=one.before_ns)
             spans.append(shown / S)
         expected.append(sorted(spans)[int(0.25 * (len(spans) - 1))])
-    assert seconds_seen(places, shifted, T, VOXEL) == pytest.approx(expected)
+    assert measure_dwell_times(places, shifted, T, VOXEL) == pytest.approx(expected)
     assert max(expected) > 5.0
-    assert seconds_seen([], shifted, T, VOXEL) == []
+    assert measure_dwell_times([], shifted, T, VOXEL) == []

@@ -5,7 +5,7 @@ import pytest
 from made_up_courses import RESOLUTION, block, course, found, recording, seconds
 
 from stillmap import em
-from stillmap.mapping import changed_places
+from stillmap.mapping import detect_changes
 
 BOX = block(10, 20, 4, 3)
 
@@ -24,7 +24,7 @@ def test_a_box_that_came():
     assert sorted(map(tuple, one.cells.tolist())) == sorted(map(tuple, BOX.tolist()))
     assert seconds(one) == (40, 43, 43)
     assert one.times == 1
-    np.testing.assert_array_equal(one.swept, one.cells)
+    np.testing.assert_array_equal(one.swept_cells, one.cells)
 
 
 def test_a_box_that_left():
@@ -227,7 +227,7 @@ def test_nothing_changed():
     assert found(course(BOX, True, count=0)) == []
     one = recording([0.0])
     nothing = course(np.empty((0, 2)), True)
-    assert changed_places(nothing, one, RESOLUTION, 0.5, em.ChangeOptions()) == []
+    assert detect_changes(nothing, one, RESOLUTION, 0.5, em.ChangeOptions()) == []
 
 
 def test_one_change_of_a_cell_alone():

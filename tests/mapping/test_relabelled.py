@@ -11,7 +11,7 @@ from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.em import observations
 from stillmap.em.observations import surface_of
-from stillmap.mapping import Change, relabelled
+from stillmap.mapping import Change, relabel_changes
 
 SCANS, BEAMS = 60, 20
 # around the origin, and with cells in which no beam ended
@@ -38,7 +38,7 @@ class Known:
 
     def relabelled(self, changes=CHANGES, state="last", threads=1, **other):
         said = {"occupied": self.occupied, "courses": self.courses} | other
-        return relabelled(
+        return relabel_changes(
             self.seen,
             self.poses,
             self.p_static,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from made_up_courses import RESOLUTION, block, course, found
 
-from stillmap.mapping import swept_cells
+from stillmap.mapping import compute_swept_cells
 from stillmap.mapping.doors import _sector
 
 LENGTH = 18.0  # cells
@@ -47,7 +47,7 @@ def inside(first, swing, margin, length=LENGTH):
 def test_a_door_sweeps_a_sector(first, swing):
     first, swing = np.radians([first, swing])
     cells = door(first, swing)
-    got = held(swept_cells(cells, LEAF))
+    got = held(compute_swept_cells(cells, LEAF))
     assert got >= held(cells)
     within, without = inside(first, swing, 2.0)
     assert len(within) > 50
@@ -63,22 +63,22 @@ def test_the_bow_is_swept_and_not_only_the_triangle(first):
     u = np.array([np.cos(middle), np.sin(middle)])
     bow = np.round(HINGE + (LENGTH - 2) * u).astype(int)
     cells = door(first, swing)
-    assert tuple(bow) in held(swept_cells(cells, LEAF))
+    assert tuple(bow) in held(compute_swept_cells(cells, LEAF))
     assert bow @ u > (cells @ u).max()  # beyond the line from tip to tip
 
 
 def test_where_the_cells_lie_and_their_order_change_nothing():
     cells = door(0.3, 1.4)
-    one = swept_cells(cells, LEAF)
+    one = compute_swept_cells(cells, LEAF)
     far = np.array([1000, -3000])
-    assert held(swept_cells(cells[::-1] + far, LEAF)) == held(one + far)
+    assert held(compute_swept_cells(cells[::-1] + far, LEAF)) == held(one + far)
     assert len(held(one)) == len(one)  # none twice
 
 
 def test_a_leaf_that_is_seen_on_its_way_now_and_then_is_still_a_door():
     cells = np.concatenate([door(0.0, np.pi / 2), leaf(0.7)[::5]])
     within, _ = inside(0.0, np.pi / 2, 2.0)
-    assert len(within - held(swept_cells(cells, LEAF))) <= 0.03 * len(within)
+    assert len(within - held(compute_swept_cells(cells, LEAF))) <= 0.03 * len(within)
 
 
 @pytest.mark.parametrize("length", [10.0, 18.0, 40.0])
@@ -87,14 +87,14 @@ def test_a_leaf_is_as_long_as_those_of_doors(length):
     assert _sector(cells).length == pytest.approx(length, abs=1.0)
 
     def sweeps(metres):
-        return len(swept_cells(cells, metres / length)) > len(cells)
+        return len(compute_swept_cells(cells, metres / length)) > len(cells)
 
     assert [sweeps(metres) for metres in (0.3, 0.5, 1.8, 2.3)] == [False, True, True, False]
 
 
 def alone(cells):
     """Nothing beside the cells, and they in their order."""
-    np.testing.assert_array_equal(swept_cells(cells, LEAF), cells)
+    np.testing.assert_array_equal(compute_swept_cells(cells, LEAF), cells)
     return True
 
 
@@ -146,6 +146,6 @@ def test_only_what_comes_and_goes_sweeps():
     cells = door(0.0, np.pi / 2, length=9.0)
     (often,) = found(course(cells, True, (10, 12), (80, 82), count=5))
     assert often.resolution == RESOLUTION
-    assert held(often.swept) == held(swept_cells(cells, RESOLUTION)) > held(cells)
+    assert held(often.swept_cells) == held(compute_swept_cells(cells, RESOLUTION)) > held(cells)
     (once,) = found(course(cells, True, (10, 12)))
-    assert held(once.swept) == held(cells)
+    assert held(once.swept_cells) == held(cells)

@@ -10,9 +10,9 @@ from stillmap.core.se2 import inverse, matrix
 from stillmap.em import Evidence
 from stillmap.pipeline.options import OutputOptions
 from stillmap.pipeline.snapshots import choose_window, extent, snapshot
-from stillmap.slam import Doubts
-from stillmap.slam.pose_graph import Graph, Relation
-from stillmap.tracking import MovingObject, ObjectOptions, Traffic, traffic
+from stillmap.slam import Diagnostics
+from stillmap.slam.pose_graph import PoseGraph, Constraint
+from stillmap.tracking import FlowMap, MovingObject, ObjectOptions, compute_flow_map
 
 RESOLUTION = 0.1
 ORIGIN = (-1.0, -2.0, 0.0)
@@ -92,10 +92,10 @@ class FakeResult:
     loops: list
     stages: dict
     objects: list = field(default_factory=list)
-    traffic: Traffic = field(default_factory=lambda: traffic([]))
+    traffic: FlowMap = field(default_factory=lambda: compute_flow_map([]))
     changes: list = field(default_factory=list)
-    graph: Graph | None = None
-    doubts: Doubts = field(default_factory=Doubts)
+    graph: PoseGraph | None = None
+    doubts: Diagnostics = field(default_factory=Diagnostics)
 
     @property
     def seen(self) -> Recording:
@@ -204,8 +204,8 @@ def _graph(poses):
     at = poses[scans]
     pairs = [(k, k + 1) for k in range(len(scans) - 1)] + [(0, len(scans) - 1)]
     spread = np.array([[4e-4, 1e-4, 2e-5], [1e-4, 2e-4, -1e-5], [2e-5, -1e-5, 1e-5]])
-    found = [Relation(i, j, inverse(at[i]) @ at[j], spread) for i, j in pairs]
-    return Graph(scans, at, found)
+    found = [Constraint(i, j, inverse(at[i]) @ at[j], spread) for i, j in pairs]
+    return PoseGraph(scans, at, found)
 
 
 def made_up_objects(recording, p_static, scan):
@@ -259,7 +259,7 @@ def result():
     objects = made_up_objects(recording, e.reshape(-1), np.repeat(np.arange(T), N))
     return FakeResult(
         objects=objects,
-        traffic=traffic(objects),
+        traffic=compute_flow_map(objects),
         recording=recording,
         options=FakeOptions(),
         iterations=[
@@ -287,7 +287,7 @@ def result():
             FakeLoop(6, 46, 0.25, "explains too little"),
         ],
         graph=_graph(poses),
-        doubts=Doubts(widened=[7], disagreeing=[7, 9], breaks=[20], apart=[20]),
+        doubts=Diagnostics(widened=[7], disagreeing=[7, 9], breaks=[20], apart=[20]),
         stages={
             "read": {"seconds": 0.21, "cpu_seconds": 0.2, "peak_memory_bytes": 41_000_000},
             "em": {"seconds": 7.1, "cpu_seconds": 13.5, "peak_memory_bytes": 96_000_000},

@@ -10,7 +10,7 @@ from stillmap.results.objects import write_objects, write_ply, write_traffic
 from stillmap.results.report.figures import map_image, shown_window
 from stillmap.results.report.objects import objects_section, traffic_image
 from stillmap.results.report.page import report_html
-from stillmap.tracking import ObjectOptions, traffic
+from stillmap.tracking import ObjectOptions, compute_flow_map
 
 
 def read_ply(path):
@@ -61,7 +61,7 @@ def test_the_points_lie_where_the_map_has_them(tmp_path, result):
 
 
 def test_nothing_moved(tmp_path, result):
-    nothing = dataclasses.replace(result, objects=[], traffic=traffic([]))
+    nothing = dataclasses.replace(result, objects=[], traffic=compute_flow_map([]))
     write_objects(tmp_path / "objects", nothing)
     assert json.loads((tmp_path / "objects/objects.json").read_text()) == []
     assert [path.name for path in (tmp_path / "objects").iterdir()] == ["objects.json"]

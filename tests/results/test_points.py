@@ -6,7 +6,7 @@ import pytest
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
 from stillmap.core.se2 import matrix
-from stillmap.mapping.beam_statistics import beam_counts, dynamic_points
+from stillmap.mapping.beam_statistics import count_beams, sample_dynamic_points
 
 
 @pytest.fixture(params=[7, 1000, 1 << 20])
@@ -49,7 +49,7 @@ def ragged():
 def test_dynamic_points(ragged):
     recording, poses, p_static = ragged
     expected = expected_points(recording, poses, p_static)
-    found = dynamic_points(recording, poses, p_static)
+    found = sample_dynamic_points(recording, poses, p_static)
     assert found.dtype == np.float32
     assert 50 < len(found) < recording.n_beams
     np.testing.assert_allclose(found, expected, atol=1e-5)
@@ -58,8 +58,8 @@ def test_dynamic_points(ragged):
 @pytest.mark.usefixtures("block")
 def test_thinning_keeps_an_even_part_of_the_whole(ragged):
     recording, poses, p_static = ragged
-    full = dynamic_points(recording, poses, p_static)
-    thin = dynamic_points(recording, poses, p_static, limit=10)
+    full = sample_dynamic_points(recording, poses, p_static)
+    thin = sample_dynamic_points(recording, poses, p_static, limit=10)
     assert len(thin) == 10
     at = [int(np.flatnonzero((full == point).all(axis=1))[0]) for point in thin]
     assert at == [i * len(full) // 10 for i in range(10)]
@@ -67,8 +67,8 @@ def test_thinning_keeps_an_even_part_of_the_whole(ragged):
 
 def test_none_dynamic(ragged):
     recording, poses, p_static = ragged
-    assert dynamic_points(recording, poses, np.ones_like(p_static)).shape == (0, 2)
-    assert dynamic_points(recording, poses, p_static, limit=0).shape == (0, 2)
+    assert sample_dynamic_points(recording, poses, np.ones_like(p_static)).shape == (0, 2)
+    assert sample_dynamic_points(recording, poses, p_static, limit=0).shape == (0, 2)
 
 
 @pytest.mark.usefixtures("block")
@@ -78,7 +78,7 @@ def test_counts(result):
     unusable = int(np.isnan(recording.points[:, 0]).sum())
     hits = int(recording.hit.sum())
     assert unusable == 3
-    assert beam_counts(recording, low_prior) == {
+    assert count_beams(recording, low_prior) == {
         "beams": recording.n_beams,
         "hits": hits,
         "max_range": recording.n_beams - hits - unusable,
@@ -97,4 +97,4 @@ def test_counts_of_nothing(result):
         hit=np.zeros(0, bool),
         sensor=np.zeros(0, np.int32),
     )
-    assert set(beam_counts(none, np.zeros(0, np.float32)).values()) == {0}
+    assert set(count_beams(none, np.zeros(0, np.float32)).values()) == {0}

@@ -10,7 +10,7 @@ from stillmap.rig.build import Flat, built_in_3d, with_boxes
 from stillmap.rig.options import RigOptions
 from stillmap.rig.removal import Cut, top_of
 from stillmap.tracking import MovingObject, ObjectOptions
-from stillmap.tracking.boxes import boxes_of
+from stillmap.tracking.boxes import fit_boxes
 
 MS = 1_000_000
 STAMPS = np.arange(0, 2001, 100, dtype=np.int64) * MS
@@ -52,23 +52,23 @@ def standing():
 def box_of(one, hold=0.5):
     empty = flat_recording(np.zeros((0, 2)), np.zeros(len(STAMPS) + 1))
     options = ObjectOptions()
-    return boxes_of(empty, standing(), np.zeros(0, np.float32), [one], options, hold)[0]
+    return fit_boxes(empty, standing(), np.zeros(0, np.float32), [one], options, hold)[0]
 
 
 def test_a_box_goes_along_and_turns_with_its_thing():
     box = box_of(walker([0.5, 1.0, 1.5]))
     seconds = np.full(6, 1.25)
     xy = [[2.0, 0.25], [2.0, 0.54], [2.19, 0.25], [2.0, 0.56], [2.21, 0.25], [2.0, -0.1]]
-    held = box.holds(seconds, np.array(xy), 0.0)
+    held = box.contains(seconds, np.array(xy), 0.0)
     assert held.tolist() == [True, True, True, False, False, False]
-    assert box.holds(seconds, np.array(xy), 0.02).tolist()[:5] == [True] * 5
+    assert box.contains(seconds, np.array(xy), 0.02).tolist()[:5] == [True] * 5
 
 
 def test_it_goes_on_for_a_while_only():
     box = box_of(walker([0.5, 1.0, 1.5]), hold=0.3)
     seconds = np.array([0.25, 1.75, 0.15, 1.85])
     xy = np.stack([np.full(4, 2.0), seconds - 1.0], axis=1)
-    assert box.holds(seconds, xy, 0.0).tolist() == [True, True, False, False]
+    assert box.contains(seconds, xy, 0.0).tolist() == [True, True, False, False]
 
 
 def test_what_is_in_no_object_has_a_box_for_a_moment():
@@ -77,14 +77,14 @@ def test_what_is_in_no_object_has_a_box_for_a_moment():
     offset = np.where(np.arange(len(STAMPS) + 1) > 4, 3, 0)
     p_static = np.full(3, 0.1, np.float32)
     recording = flat_recording(points, offset)
-    boxes = boxes_of(recording, standing(), p_static, [], ObjectOptions(), 0.5)
-    assert [box.thing for box in boxes] == [-1]
-    assert boxes[0].holds(np.array([0.4, 0.8]), np.array([[3.0, 0.05]] * 2), 0.1).tolist() == [
+    boxes = fit_boxes(recording, standing(), p_static, [], ObjectOptions(), 0.5)
+    assert [box.object_id for box in boxes] == [-1]
+    assert boxes[0].contains(np.array([0.4, 0.8]), np.array([[3.0, 0.05]] * 2), 0.1).tolist() == [
         True,
         False,
     ]
     p_static[:] = 0.31  # P(dynamic) below 0.7
-    assert not boxes_of(recording, standing(), p_static, [], ObjectOptions(), 0.5)
+    assert not fit_boxes(recording, standing(), p_static, [], ObjectOptions(), 0.5)
 
 
 @pytest.mark.parametrize(
@@ -171,4 +171,4 @@ def test_what_is_long_may_be_high():
 def test_who_stands_looks_where_he_went():
     one = walker([0.5, 1.0, 1.5])
     one.velocity[1:] = 0.0
-    np.testing.assert_allclose(box_of(one).ahead, [[0.0, 1.0]] * 3)
+    np.testing.assert_allclose(box_of(one).heading, [[0.0, 1.0]] * 3)

@@ -6,7 +6,7 @@ import pytest
 from stillmap import em
 from stillmap.core.recording import Recording
 from stillmap.em.ground import Ground
-from stillmap.mapping.projection import BandOptions, columns_of, plan_of
+from stillmap.mapping.projection import BandOptions, project_cells, project_to_plane
 
 BAND = BandOptions(low=0.2, high=1.8)
 SENSOR = 1.5
@@ -35,7 +35,7 @@ def sweep(ends, hit=None, z=0.0):
 
 def planned(ends, hit=None, z=0.0, open_space=False, sensor=SENSOR):
     recording, poses = sweep(ends, hit, z)
-    plan = plan_of(recording, poses, flat_ground(sensor, z), BAND, 0.1, open_space)
+    plan = project_to_plane(recording, poses, flat_ground(sensor, z), BAND, 0.1, open_space)
     order = np.argsort(plan.beam)
     points = plan.recording.points[order]
     return points, plan.recording.hit[order], plan.beam[order]
@@ -100,7 +100,7 @@ def test_a_column_is_as_occupied_as_what_is_surest_in_the_band():
     p = np.array([1.0, 0.3, 0.6, 1.0, 1.0], np.float32)
     known = em.CellProbabilities(cells, p, 0.2)
     # middles lie .05, .55, .95, 3.05 and .15 m above the ground
-    found = columns_of(known, flat_ground(), BAND, 0.1)
+    found = project_cells(known, flat_ground(), BAND, 0.1)
     assert found.cells.tolist() == [[3, 4]]
     assert found.p_occupied.tolist() == [pytest.approx(0.6)]
     assert found.free_prior == 0.2

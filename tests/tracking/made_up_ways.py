@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stillmap.tracking.clustering import MovingPoints, _clusters
+from stillmap.tracking.clustering import DynamicPoints, _clusters
 from stillmap.tracking.options import ObjectOptions
 
 OPTIONS = ObjectOptions()
@@ -44,7 +44,7 @@ def watched(ways, visible=None, seconds=8.0, points=5, radius=0.12, seed=0, opti
         who.append(mine[order])
     scan, xy, who = np.array(scan), np.concatenate(xy), np.concatenate(who)
     distance = np.linalg.norm(xy, axis=1)
-    made = MovingPoints(
+    made = DynamicPoints(
         t,
         scan,
         np.arange(len(scan)),

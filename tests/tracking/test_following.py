@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from made_up_ways import OPTIONS, one_each, watched
 
-from stillmap.tracking.association import followed
-from stillmap.tracking.tracklets import linked
+from stillmap.tracking.association import assign_tracks
+from stillmap.tracking.tracklets import stitch_tracklets
 
 
 def found(points, options=OPTIONS):
-    return linked(points, followed(points, options), options)
+    return stitch_tracklets(points, assign_tracks(points, options), options)
 
 
 def straight(x, y, vx, vy):
@@ -20,7 +20,7 @@ def straight(x, y, vx, vy):
 
 def test_one_thing_that_walks():
     points, who = watched([straight(2, 1, 1.2, 0.1)])
-    assert one_each(followed(points, OPTIONS), who)
+    assert one_each(assign_tracks(points, OPTIONS), who)
     assert one_each(found(points), who)
 
 
@@ -114,5 +114,5 @@ def test_turned_and_moved_worlds_give_the_same():
 def test_time_that_stands_still_is_no_trouble():
     points, _ = watched([straight(2, 1, 0.2, 0.1)], seconds=3.0)
     same = dataclasses.replace(points, seconds=np.zeros_like(points.seconds))
-    assert (followed(same, OPTIONS) == 0).all()
+    assert (assign_tracks(same, OPTIONS) == 0).all()
     assert (found(same) == -1).all()  # nothing lasts

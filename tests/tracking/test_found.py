@@ -10,8 +10,8 @@ from stillmap.core import arrays
 from stillmap.sim import RobotOptions, Scene, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
-from stillmap.tracking import ObjectOptions, moving_objects, tracklets, traffic
-from stillmap.tracking.objects import behind, box_size
+from stillmap.tracking import ObjectOptions, compute_flow_map, track_objects, tracklets
+from stillmap.tracking.objects import estimate_center_offset, measure_box
 
 OPTIONS = ObjectOptions()
 
@@ -35,7 +35,7 @@ def labels(simulation):
 
 
 def found(simulation, options=OPTIONS):
-    return moving_objects(
+    return track_objects(
         simulation.recording, simulation.truth.T_world_base, labels(simulation), options
     )
 
@@ -68,7 +68,7 @@ def test_people_are_found_and_followed(shape):
 def test_pieces_of_any_size_and_files_make_no_difference(monkeypatch, tmp_path, shape, block):
     simulation = room(shape=shape)
     whole = found(simulation)
-    monkeypatch.setattr(arrays, "IN_MEMORY", 0)
+    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
     monkeypatch.setattr(arrays, "BLOCK", block)
     monkeypatch.setattr(tracklets, "_TOGETHER_ENDS", 7)
     recording = dataclasses.replace(simulation.recording, scratch=tmp_path)
@@ -97,7 +97,7 @@ def test_what_an_object_says_of_itself():
 
 def test_nobody_there():
     assert found(room(people=0)) == []
-    assert traffic(found(room(people=0))).crossings.shape == (0, 0)
+    assert compute_flow_map(found(room(people=0))).crossings.shape == (0, 0)
 
 
 def test_they_can_be_left_out():
@@ -115,9 +115,9 @@ def test_an_edge_that_flickers_is_no_object():
     near = np.flatnonzero(recording.hit & (np.linalg.norm(xy - [2.7, 1.7], axis=1) < 0.03))
     p[near] = 0.05
     assert len(near) > 10
-    assert moving_objects(recording, poses, p, OPTIONS) == []
+    assert track_objects(recording, poses, p, OPTIONS) == []
     anything = dataclasses.replace(OPTIONS, least_extent=0.0)
-    assert len(moving_objects(recording, poses, p, anything)) > 0
+    assert len(track_objects(recording, poses, p, anything)) > 0
 
 
 def test_twice_the_same():
@@ -131,7 +131,7 @@ def test_lengths_that_disagree_are_refused():
     poses, p = simulation.truth.T_world_base, labels(simulation)
     for wrong in ((poses[:-1], p), (poses, p[:-1])):
         with pytest.raises(ValueError, match="poses, p_static: expected"):
-            moving_objects(simulation.recording, *wrong, OPTIONS)
+            track_objects(simulation.recording, *wrong, OPTIONS)
 
 
 @pytest.mark.parametrize("name", ["dynamic", "gap", "least_scans", "sigma"])
@@ -145,11 +145,11 @@ def test_a_box_by_hand():
     offset = rng.uniform([-2.0, -0.5], [2.0, 0.5], (4000, 2))
     walks = np.tile([1.0, 0.0], (4000, 1))
     # a twentieth is left out on either side
-    assert box_size(offset, walks) == pytest.approx((3.6, 0.9), abs=0.05)
-    assert box_size(offset, walks[:, ::-1]) == pytest.approx((0.9, 3.6), abs=0.05)
+    assert measure_box(offset, walks) == pytest.approx((3.6, 0.9), abs=0.05)
+    assert measure_box(offset, walks[:, ::-1]) == pytest.approx((0.9, 3.6), abs=0.05)
     c, s = np.cos(0.5), np.sin(0.5)
     turned = offset @ np.array([[c, s], [-s, c]])
-    assert box_size(turned, np.zeros_like(walks)) == pytest.approx((3.6, 0.9), abs=0.06)
+    assert measure_box(turned, np.zeros_like(walks)) == pytest.approx((3.6, 0.9), abs=0.06)
 
 
 def test_the_middle_of_a_disc_lies_behind_what_is_seen_of_it():
@@ -162,12 +162,12 @@ def test_the_middle_of_a_disc_lies_behind_what_is_seen_of_it():
         xy.append(centre + radius * np.column_stack([np.cos(angle), np.sin(angle)]))
         at += [k] * 401
     middle = np.array([points.mean(axis=0) for points in xy])
-    found = middle + behind(middle, sensor, np.concatenate(xy), np.array(at))
+    found = middle + estimate_center_offset(middle, sensor, np.concatenate(xy), np.array(at))
     np.testing.assert_allclose(found, [centre, centre], atol=2e-3)
 
 
 def test_no_thing_is_deeper_than_a_car():
     y = np.linspace(-10.0, 10.0, 50)
     xy = np.column_stack([np.full(50, 8.0), y])
-    found = behind(np.array([[8.0, 0.0]]), np.zeros((1, 2)), xy, np.zeros(50, int))
+    found = estimate_center_offset(np.array([[8.0, 0.0]]), np.zeros((1, 2)), xy, np.zeros(50, int))
     np.testing.assert_allclose(found, [[0.9, 0.0]])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
 
-from stillmap.tracking.smoother import smoothed
+from stillmap.tracking.smoother import smooth_track
 
 
 @pytest.mark.parametrize("n", [5, 6, 40, 300])
@@ -14,7 +14,7 @@ def test_it_is_the_smoothing_spline(n, sigma, acceleration):
     t = np.cumsum(rng.uniform(0.05, 0.6, n))
     t = np.sort(np.concatenate([t, t[[0, 2]], t[[2]], t[[-1]]]))  # some are seen twice at a time
     xy = rng.normal(size=(len(t), 2))
-    found, v = smoothed(t, xy, sigma, acceleration)
+    found, v = smooth_track(t, xy, sigma, acceleration)
     times, which, count = np.unique(t, return_inverse=True, return_counts=True)
     for d in (0, 1):
         mean = np.bincount(which, xy[:, d]) / count
@@ -27,14 +27,14 @@ def test_it_is_the_smoothing_spline(n, sigma, acceleration):
 def test_what_goes_straight_on_does(n):
     t = np.linspace(3.0, 9.0, n)
     xy = np.array([1.0, -2.0]) + t[:, None] * [0.7, -0.3]
-    found, v = smoothed(t, xy, 0.2, 1.0)
+    found, v = smooth_track(t, xy, 0.2, 1.0)
     np.testing.assert_allclose(found, xy, atol=1e-9)
     np.testing.assert_allclose(v, np.tile([0.7, -0.3], (n, 1)), atol=1e-9)
 
 
 @pytest.mark.parametrize("n", [1, 3])
 def test_what_is_seen_once_only_has_no_speed(n):
-    found, v = smoothed(np.full(n, 5.0), np.arange(2.0 * n).reshape(n, 2), 0.2, 1.0)
+    found, v = smooth_track(np.full(n, 5.0), np.arange(2.0 * n).reshape(n, 2), 0.2, 1.0)
     np.testing.assert_allclose(found, np.tile([n - 1.0, float(n)], (n, 1)))
     assert not v.any()
 
@@ -43,7 +43,7 @@ def test_noise_is_taken_out():
     rng = np.random.default_rng(0)
     t = np.arange(0.0, 30.0, 0.2)
     way = np.column_stack([t, 2.0 * np.sin(0.3 * t)])
-    found, v = smoothed(t, way + rng.normal(0.0, 0.1, way.shape), 0.28, 1.0)
+    found, v = smooth_track(t, way + rng.normal(0.0, 0.1, way.shape), 0.28, 1.0)
     assert np.sqrt(np.mean((found - way) ** 2)) < 0.05
     true = np.column_stack([np.ones(len(t)), 0.6 * np.cos(0.3 * t)])
     assert np.median(np.linalg.norm(v - true, axis=1)) < 0.1  # from place to place it would be 0.7

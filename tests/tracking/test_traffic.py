@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.tracking.flow_map import traffic
+from stillmap.tracking.flow_map import compute_flow_map
 from stillmap.tracking.objects import MovingObject
 
 
@@ -16,7 +16,7 @@ def went(xy, seconds, speed=1.0, number=0):
 
 
 def test_a_straight_way():
-    found = traffic([went([[0.1, 0.1], [3.9, 0.1]], [0.0, 3.8])], 1.0)
+    found = compute_flow_map([went([[0.1, 0.1], [3.9, 0.1]], [0.0, 3.8])], 1.0)
     assert found.origin == (0.0, 0.0, 0.0)
     assert found.resolution == 1.0
     np.testing.assert_array_equal(found.crossings, [[1, 1, 1, 1]])
@@ -28,7 +28,7 @@ def test_two_ways_and_what_nobody_crossed():
         went([[-0.9, 0.5], [1.5, 0.5]], [0, 2], 1.0),
         went([[0.5, -0.9], [0.5, 1.5]], [0, 2], 3.0),
     ]
-    found = traffic(ways, 1.0)
+    found = compute_flow_map(ways, 1.0)
     assert found.origin == (-1.0, -1.0, 0.0)
     np.testing.assert_array_equal(found.crossings, [[0, 1, 0], [1, 2, 1], [0, 1, 0]])
     expected = [[np.nan, 3, np.nan], [1, 2, 1], [np.nan, 3, np.nan]]
@@ -37,21 +37,21 @@ def test_two_ways_and_what_nobody_crossed():
 
 def test_who_stays_or_comes_right_back_has_crossed_once():
     to_and_fro = went([[0.5, 0.5], [1.2, 0.5], [0.8, 0.5], [1.2, 0.5]], [0, 1, 2, 3])
-    np.testing.assert_array_equal(traffic([to_and_fro], 1.0).crossings, [[1, 1]])
+    np.testing.assert_array_equal(compute_flow_map([to_and_fro], 1.0).crossings, [[1, 1]])
     stays = went([[0.5, 0.5]] * 50, np.arange(50))
-    np.testing.assert_array_equal(traffic([stays], 1.0).crossings, [[1]])
+    np.testing.assert_array_equal(compute_flow_map([stays], 1.0).crossings, [[1]])
 
 
 def test_who_comes_back_after_a_while_crosses_again():
     there_and_back = went([[0.5, 0.5], [9.5, 0.5], [0.5, 0.5]], [0, 9, 18])
     np.testing.assert_array_equal(
-        traffic([there_and_back], 1.0).crossings, [[2, 2, 2, 2, 2, 2, 2, 1, 1, 1]]
+        compute_flow_map([there_and_back], 1.0).crossings, [[2, 2, 2, 2, 2, 2, 2, 1, 1, 1]]
     )
 
 
 @pytest.mark.parametrize("objects", [[], [went([[0.2, 0.3]], [4.0])]])
 def test_little(objects):
-    found = traffic(objects)
+    found = compute_flow_map(objects)
     assert found.crossings.sum() == len(objects)
     assert found.crossings.dtype == np.int32
     assert found.speed.dtype == np.float32

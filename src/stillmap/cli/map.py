@@ -22,11 +22,11 @@ from stillmap.cli.parser import COMMANDS
 from stillmap.cli.rig import built, read_tilting, said
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.core.files import require_new
-from stillmap.core.profiling import Stages
+from stillmap.core.profiling import StageTimer
 from stillmap.core.recording import Recording
 from stillmap.io import read
 from stillmap.io.trajectory import poses_from_tum
-from stillmap.mapping.beam_statistics import beam_counts
+from stillmap.mapping.beam_statistics import count_beams
 from stillmap.mesh.build import Models
 from stillmap.pipeline.checkpoint import Damaged, Place, held
 from stillmap.pipeline.checkpoint_files import identity
@@ -194,7 +194,7 @@ def _mapped_and_saved(
     args: argparse.Namespace, options: Options, place: Place
 ) -> tuple[Result, Tilting | None]:
     """The whole job; how far it has come is kept after every iteration."""
-    stages = Stages()
+    stages = StageTimer()
     with stages.measure("read"):
         with shown_share(args.quiet, "reading") as tell:
             found = read(Path(args.input), options.read, progress=tell, scratch=place.folder)
@@ -230,7 +230,7 @@ def _mapped_and_saved(
 
 
 def _modelled(
-    result: Result, in_3d: Tilting | None, progress: Progress, stages: Stages
+    result: Result, in_3d: Tilting | None, progress: Progress, stages: StageTimer
 ) -> tuple[Models | None, Result]:
     """Models of what is in 3D, where they are wanted and can be made; and what the result says."""
     if not result.options.mesh.enabled or (in_3d is None and result.recording.dimension == 2):
@@ -256,7 +256,7 @@ def _resumed(
     place: Place,
     same: dict[str, Any],
     options: Options,
-    stages: Stages,
+    stages: StageTimer,
 ) -> Loop | None:
     """How far an interrupted run came, if it is to be gone on from."""
     if place.present is None:
@@ -339,7 +339,7 @@ def _summary(output: Path) -> dict[str, Any]:
 
 
 def _say(result: Result, in_3d: Tilting | None, output: Path) -> None:
-    counts = beam_counts(result.recording, result.p_static)
+    counts = count_beams(result.recording, result.p_static)
     end, n = "converged" if result.converged else "not converged", len(result.iterations)
     lines = [
         f"{result.recording.n_scans} scans, {counts['hits']} beams that hit something, "

@@ -8,12 +8,12 @@ import numpy as np
 
 from stillmap.cli.console import shown_share
 from stillmap.core.errors import InputError
-from stillmap.core.parallel import one_blas_thread, resolved_threads
+from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.recording import Recording
 from stillmap.io import read
 from stillmap.io.registry import format_of
 from stillmap.io.text_lines import Progress
-from stillmap.mapping.beam_statistics import beam_counts
+from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import Result
 from stillmap.rig.build import Flat, Tilting, built_in_3d, require_rig
@@ -68,15 +68,15 @@ def _of_topic(
         return read_tilting(path, read_as, tell, scratch)
 
 
-@one_blas_thread()
+@limit_blas_threads()
 def built(result: Result, tilting: Recording, options: Options) -> Tilting:
     """What that laser built, once the flat one knows what moves."""
-    return built_in_3d(Flat.of(result), tilting, options, resolved_threads(options.threads))
+    return built_in_3d(Flat.of(result), tilting, options, resolve_threads(options.threads))
 
 
 def said(tilting: Tilting) -> str:
     """A line about it."""
-    counts = beam_counts(tilting.seen, tilting.p_static)
+    counts = count_beams(tilting.seen, tilting.p_static)
     out = (
         f"in 3D {counts['hits']} beams that hit something, "
         f"{100.0 * counts['dynamic'] / max(counts['hits'], 1):.1f} % of them dynamic"

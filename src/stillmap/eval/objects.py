@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.tracking import MovingObject, traffic
-from stillmap.tracking.flow_map import Traffic
+from stillmap.tracking import MovingObject, compute_flow_map
+from stillmap.tracking.flow_map import FlowMap
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -188,7 +188,7 @@ def true_traffic(
     stamp_ns: NDArray[np.int64],
     T_map_world: Float,
     resolution: float,
-) -> Traffic:
+) -> FlowMap:
     """How often squares were crossed by movers while they were seen, in the map frame.
 
     Args:
@@ -207,10 +207,10 @@ def true_traffic(
         ways.append(
             MovingObject(0, one.scans, stamp_ns[one.scans], xy, velocity, (0.0, 0.0), none, 1.0)
         )
-    return traffic(ways, resolution)
+    return compute_flow_map(ways, resolution)
 
 
-def rank_correlation(found: Traffic, true: Traffic, points: Float) -> float:
+def rank_correlation(found: FlowMap, true: FlowMap, points: Float) -> float:
     """Spearman's correlation of how often squares were crossed; NaN where nothing ever was.
 
     Args:
@@ -228,7 +228,7 @@ def rank_correlation(found: Traffic, true: Traffic, points: Float) -> float:
     return float(spearmanr(a, b).statistic)
 
 
-def _crossings(one: Traffic, squares: NDArray[np.int64]) -> NDArray[np.int64]:
+def _crossings(one: FlowMap, squares: NDArray[np.int64]) -> NDArray[np.int64]:
     """(K,) crossings of squares, column and row from the origin of the map; 0 outside."""
     first = np.round(np.array(one.origin[:2]) / one.resolution).astype(np.int64)
     column, row = (squares - first).T

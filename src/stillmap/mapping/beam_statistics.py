@@ -3,16 +3,16 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import blocks
+from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
 
 DYNAMIC_BELOW = 0.5
 
 
-def beam_counts(recording: Recording, p_static: NDArray[np.float32]) -> dict[str, int]:
+def count_beams(recording: Recording, p_static: NDArray[np.float32]) -> dict[str, int]:
     """Numbers of `beams`, `hits`, `max_range`, `unusable`, `dynamic` (hits below 0.5)."""
     hits = unusable = dynamic = 0
-    for block in blocks(recording.points, recording.hit, p_static):
+    for block in iter_blocks(recording.points, recording.hit, p_static):
         hit = recording.hit[block]
         hits += int(np.count_nonzero(hit))
         unusable += int(np.count_nonzero(np.isnan(recording.points[block]).any(axis=1)))
@@ -27,7 +27,7 @@ def beam_counts(recording: Recording, p_static: NDArray[np.float32]) -> dict[str
     }
 
 
-def dynamic_points(
+def sample_dynamic_points(
     recording: Recording,
     poses: NDArray[np.float64],
     p_static: NDArray[np.float32],
@@ -59,14 +59,14 @@ def _dynamic_beams(
         return recording.hit[block] & (p_static[block] < threshold)
 
     arrays = recording.hit, p_static
-    counts = [int(np.count_nonzero(of_block(block))) for block in blocks(*arrays)]
+    counts = [int(np.count_nonzero(of_block(block))) for block in iter_blocks(*arrays)]
     total = sum(counts)
     kept = min(total, limit)
     # which of the dynamic beams are taken, counted over the whole recording
     wanted = np.arange(kept, dtype=np.int64) * total // max(kept, 1)
     before = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     parts = [np.zeros(0, np.int64)]
-    for block, start, end in zip(blocks(*arrays), before[:-1], before[1:], strict=True):
+    for block, start, end in zip(iter_blocks(*arrays), before[:-1], before[1:], strict=True):
         low, high = np.searchsorted(wanted, [start, end])
         found = np.flatnonzero(of_block(block))
         parts.append(block.start + found[wanted[low:high] - start])

@@ -7,12 +7,12 @@ import numpy as np
 import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import Column, blocks
+from stillmap.core.arrays import ArrayBuilder, iter_blocks
 from stillmap.core.recording import Recording
 from stillmap.em import ChangeOptions, look_numbers
 from stillmap.em.changepoints import OFTEN
 from stillmap.em.spatial_prior import components, pairs_near
-from stillmap.mapping.doors import swept_cells
+from stillmap.mapping.doors import compute_swept_cells
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -53,11 +53,11 @@ class Change:
     z: float | None = None
 
     @property
-    def swept(self) -> NDArray[np.int64]:
+    def swept_cells(self) -> NDArray[np.int64]:
         """(S, 2) cells of the whole place: of a door all that it sweeps."""
         if self.kind != "comes and goes":
             return self.cells
-        return swept_cells(self.cells, self.resolution)
+        return compute_swept_cells(self.cells, self.resolution)
 
     @property
     def appeared(self) -> bool:
@@ -82,7 +82,7 @@ class CoursesLike(Protocol):
     def between(self) -> NDArray[np.int32]: ...
 
 
-def beams_on_things(
+def find_changed_object_beams(
     recording: Recording,
     poses: Float,
     p_static: NDArray[np.float32],
@@ -96,10 +96,10 @@ def beams_on_things(
     things = [
         _Thing.of(one, changes)
         for one in changes
-        if one.kind != "comes and goes" or len(one.swept) != len(one.cells)
+        if one.kind != "comes and goes" or len(one.swept_cells) != len(one.cells)
     ]
-    found = Column(np.intp, (), recording.scratch)
-    for block in blocks(recording.hit, p_static) if things else ():
+    found = ArrayBuilder(np.intp, (), recording.scratch)
+    for block in iter_blocks(recording.hit, p_static) if things else ():
         beam = block.start + np.flatnonzero(recording.hit[block] & (p_static[block] < 0.5))
         ends, scan = recording.end_points(beam, poses), recording.scans_of(beam)
         at, stamp = np.floor(ends / resolution).astype(np.int64), recording.stamp_ns[scan]
@@ -172,7 +172,7 @@ class _Events(NamedTuple):
         )
 
 
-def changed_places(
+def detect_changes(
     courses: CoursesLike,
     recording: Recording,
     resolution: float,

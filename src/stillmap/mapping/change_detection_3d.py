@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
 from stillmap.em import Changed, ChangeOptions
-from stillmap.mapping.change_detection import Change, changed_places
-from stillmap.mapping.dwell_time import seconds_seen
+from stillmap.mapping.change_detection import Change, detect_changes
+from stillmap.mapping.dwell_time import measure_dwell_times
 
 _STAYS = 12.0  # s: what stands for less waits, and what is away for less is hidden
 _HIGH = 0.4  # m: what is lower is the ground, met in other lines from elsewhere
 _LARGE = 0.7  # m2 of surface that a thing shows at least
 
 
-def changed_things(
+def detect_changes_3d(
     changed: Changed,
     recording: Recording,
     poses: NDArray[np.float64],
@@ -31,7 +31,7 @@ def changed_things(
     """
     first, last = recording.stamp_ns[[0, -1]].tolist()
     cells = _Cells.of(changed, _STAYS / look, 1e-9 * (last - first) / look)
-    places = changed_places(cells, recording, resolution, look, options)
+    places = detect_changes(cells, recording, resolution, look, options)
     things = [
         one
         for one in places
@@ -39,7 +39,7 @@ def changed_things(
         and len(one.cells) * resolution**2 >= _LARGE
         and 1e-9 * min(one.stamp_ns - first, last - one.before_ns) >= _STAYS
     ]
-    seen = seconds_seen(things, recording, poses, resolution)
+    seen = measure_dwell_times(things, recording, poses, resolution)
     return [
         replace(one, cells=np.unique(one.cells[:, :2], axis=0))
         for one, seconds in zip(things, seen, strict=True)

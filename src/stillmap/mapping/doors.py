@@ -16,7 +16,7 @@ _NARROW, _WIDE = math.radians(20.0), math.radians(200.0)  # how far doors swing
 _FROM_HINGE = 0.5  # of the leaf: nearer to the hinge, directions say little
 
 
-def swept_cells(cells: Cells, resolution: float) -> Cells:
+def compute_swept_cells(cells: Cells, resolution: float) -> Cells:
     """(S, 2) these cells (K, 2) and, if a door is seen there open and shut, all that it sweeps."""
     sector = _sector(cells)
     if sector is None or not _SHORTEST <= sector.length * resolution <= _LONGEST:

@@ -15,7 +15,7 @@ Index = NDArray[np.intp]
 _MOST = 0.25  # share of a thing's voxels that may have been seen for less
 
 
-def seconds_seen(
+def measure_dwell_times(
     places: Sequence[Change], recording: Recording, poses: Float, resolution: float
 ) -> list[float]:
     """How long each thing was seen while it stood: three quarters of its voxels so long or longer.

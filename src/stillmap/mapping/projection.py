@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from stillmap import em
 from stillmap.core import se2
-from stillmap.core.arrays import ArrayBuilder, finite, first_of_each
+from stillmap.core.arrays import ArrayBuilder, finite_rows, first_index_per_group
 from stillmap.core.config import option
-from stillmap.core.parallel import in_order
+from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.em import Ground
 
@@ -110,7 +110,7 @@ def project_to_plane(
         threads: same result with any number.
     """
     T_map_sensor = recording.T_map_sensor(poses)
-    planar_poses = se2.planar(T_map_sensor)
+    planar_poses = se2.project_to_plane(T_map_sensor)
     top = max(options.high, ground.sensor + _ABOVE)
     scratch, offset = recording.scratch, np.zeros(recording.n_scans + 1, np.int64)
     ends, hits = ArrayBuilder(np.float32, (2,), scratch), ArrayBuilder(np.bool_, (), scratch)
@@ -126,7 +126,7 @@ def project_to_plane(
         return local.astype(np.float32), hit, beams.start + number
 
     in_turn = recording.in_turn(range(recording.n_scans))
-    for t, (local, hit, number) in enumerate(in_order(of_scan, in_turn, threads)):
+    for t, (local, hit, number) in enumerate(map_ordered(of_scan, in_turn, threads)):
         ends.append(local)
         hits.append(hit)
         numbers.append(number)
@@ -146,7 +146,7 @@ def _of_scan(
 ) -> tuple[Float, NDArray[np.bool_], Index]:
     """Ends (n, 2) in the map frame, whether something stands there, which beams these are."""
     low, high, top = heights
-    at = np.flatnonzero(finite(points) & (hit | open_space))
+    at = np.flatnonzero(finite_rows(points) & (hit | open_space))
     end: Float = points.take(at, axis=0).astype(np.float64) @ T[:3, :3].T + T[:3, 3]
     start = T[:3, 3] - [0.0, 0.0, ground.at(T[None, :2, 3])[0]]
     above: Float = end[:, 2] - ground.at(end[:, :2])
@@ -166,11 +166,11 @@ def _kept(direction: Index, length: Float, stands: NDArray[np.bool_], cell: floa
     rank = np.where(stands, 1 + np.floor(length / cell).astype(np.int64), 0)
     group = direction * (rank.max(initial=0) + 1) + rank
     hits, others = np.flatnonzero(stands), np.flatnonzero(~stands)
-    hits = hits[first_of_each(group[hits])]
+    hits = hits[first_index_per_group(group[hits])]
     longest = np.zeros(_DIRECTIONS)
     np.maximum.at(longest, direction[others], length[others])
     others = others[length[others] == longest[direction[others]]]
-    others = others[first_of_each(direction[others])]
+    others = others[first_index_per_group(direction[others])]
     kept = np.concatenate([others, hits])
     return np.asarray(kept[np.argsort(group[kept])])
 

@@ -15,7 +15,7 @@ Float = NDArray[np.float64]
 Labels = NDArray[np.float32]
 
 
-def relabelled(
+def relabel_changes(
     recording: Recording,
     poses: Float,
     p_static: Labels,
@@ -45,7 +45,7 @@ def relabelled(
     listed = np.isin(_keys(courses.cells), _keys(np.concatenate([one.cells for one in changes])))
     shown, out, T_map_sensor = (
         courses.shown(state),
-        arrays.copied(p_static, recording.scratch),
+        arrays.copy(p_static, recording.scratch),
         recording.T_map_sensor(poses),
     )
     for scans, beams, offset in chunks(recording, beside=[out]):

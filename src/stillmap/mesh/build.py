@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.camera import Images
-from stillmap.core.errors import extra
-from stillmap.core.profiling import Stages
+from stillmap.core.errors import import_extra
+from stillmap.core.profiling import StageTimer
 from stillmap.mesh.background import Ahead
 from stillmap.mesh.inputs import Sources
 from stillmap.mesh.objects.merging import Followed, followed_of, wholes_of
@@ -90,7 +90,7 @@ def require_extras() -> None:
         MissingExtra: a library of the extra `mesh` is not installed.
     """
     for module in _NEEDED:
-        extra(module, "mesh.glb", "made", group="mesh")
+        import_extra(module, "mesh.glb", "made", group="mesh")
 
 
 def models_of(
@@ -98,7 +98,7 @@ def models_of(
     options: MeshOptions,
     threads: int = 1,
     progress: Progress = silent,
-    stages: Stages | None = None,
+    stages: StageTimer | None = None,
 ) -> Models:
     """A surface from what stands still, and for each face the picture that most likely shows it.
 
@@ -112,7 +112,7 @@ def models_of(
     Raises:
         MissingExtra: a library of the extra `mesh` is not installed.
     """
-    stages = stages or Stages()
+    stages = stages or StageTimer()
 
     def tell(what: str) -> Tell:
         return lambda done, total: progress(what, 0, done, total)
@@ -239,7 +239,7 @@ def _mover(
         shape,
         views,
         place,
-        [thing for thing in sources.things if thing.box.thing not in parts],
+        [thing for thing in sources.things if thing.box.object_id not in parts],
         start,
         options.objects,
         options.choice,

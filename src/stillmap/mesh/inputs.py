@@ -6,9 +6,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.parallel import resolved_threads
+from stillmap.core.parallel import resolve_threads
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import longest_scan_ns
+from stillmap.core.timestamps import max_scan_duration_ns
 from stillmap.em import Ground, ground_of
 from stillmap.mesh.options import SurfaceOptions
 from stillmap.mesh.range_image import order_of
@@ -18,7 +18,7 @@ from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import Result
 from stillmap.rig.build import Tilting
 from stillmap.tracking import MovingObject
-from stillmap.tracking.boxes import Box, box_of, boxes_of
+from stillmap.tracking.boxes import Box, fit_box, fit_boxes
 
 Float = NDArray[np.float64]
 
@@ -50,19 +50,19 @@ class Sources:
     @cached_property
     def longest_scan_ns(self) -> int:
         """Nanoseconds that a scan takes at most, about."""
-        return longest_scan_ns(self.recording)
+        return max_scan_duration_ns(self.recording)
 
     def beams(self) -> Beams:
         """To be asked for by time."""
         owned = {one.id: one.beams for one in self.objects}
-        boxes = [one.box for one in self.things if one.box.thing in owned]
+        boxes = [one.box for one in self.things if one.box.object_id in owned]
         return Beams(
             self.recording,
             self.seen,
             self.seen.T_map_sensor(self.poses),
             self.p_static,
             boxes,
-            [owned[box.thing] for box in boxes],
+            [owned[box.object_id] for box in boxes],
             self.start_ns,
             order_of(self.seen, np.zeros(0, np.intp), SurfaceOptions()).planar,
         )
@@ -78,8 +78,8 @@ def sources_of(result: Result) -> Sources:
         if one.z is None:
             raise ValueError("objects: expected those of a recording in 3D")
         tall = float(one.size[2])
-        things.append(Thing(box_of(one, start, hold), one.z - 0.5 * tall, tall))
-    threads = resolved_threads(options.threads)
+        things.append(Thing(fit_box(one, start, hold), one.z - 0.5 * tall, tall))
+    threads = resolve_threads(options.threads)
     ground = ground_of(seen, result.poses, result.p_static, threads)
     return Sources(
         result.recording,
@@ -97,13 +97,13 @@ def sources_of_rig(result: Result, tilting: Tilting) -> Sources:
     """Of a laser that builds in 3D while another one, that lies flat, tells what moves."""
     options, flat = result.options, result.seen
     start = int(flat.stamp_ns[0])
-    threads = resolved_threads(options.threads)
+    threads = resolve_threads(options.threads)
     ground = ground_of(tilting.seen, tilting.poses, tilting.p_static, threads)
-    boxes = boxes_of(
+    boxes = fit_boxes(
         flat, result.poses, result.p_static, result.objects, options.objects, options.rig.hold
     )
     tall = {one.id: float(one.size[2]) for one in tilting.objects}
-    things = [_upright(box, tall.get(box.thing, 0.0), ground, options) for box in boxes]
+    things = [_upright(box, tall.get(box.object_id, 0.0), ground, options) for box in boxes]
     return Sources(
         tilting.recording,
         tilting.seen,
@@ -119,5 +119,5 @@ def sources_of_rig(result: Result, tilting: Tilting) -> Sources:
 def _upright(box: Box, tall: float, ground: Ground, options: Options) -> Thing:
     """As high as it was seen to be, and as things of its kind are at least."""
     o = options.rig
-    usual = o.height if 2.0 * max(box.half) < o.long else 0.0
+    usual = o.height if 2.0 * max(box.half_size) < o.long else 0.0
     return Thing(box, ground.at(box.xy), max(tall, usual))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.camera import project
-from stillmap.core.parallel import in_order
+from stillmap.core.parallel import map_ordered
 from stillmap.em.observations import Chunk, chunks
 from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
 from stillmap.mesh.background import Ahead
@@ -56,7 +56,7 @@ class Moving:
 
     def __init__(self, sources: Sources, moves: Moves) -> None:
         self.sources = sources
-        place = {one.box.thing: number for number, one in enumerate(sources.things)}
+        place = {one.box.object_id: number for number, one in enumerate(sources.things)}
         ids, of = np.unique(moves.owner, return_inverse=True)
         owner = np.array([place.get(int(one), NOBODY) for one in ids], np.intp)[of]
         kept = np.flatnonzero(moves.dynamic & (owner != NOBODY))
@@ -122,7 +122,7 @@ def _carried(seen: _Seen, things: Sequence[Thing], now: float) -> Float:
     out = seen.ends.copy()
     for number in np.unique(seen.owner).tolist():
         mine, box = seen.owner == number, things[number].box
-        out[mine, :2] += box.middle(np.array([now])) - box.middle(seen.seconds[mine])
+        out[mine, :2] += box.center_at(np.array([now])) - box.center_at(seen.seconds[mine])
     return out
 
 
@@ -152,7 +152,7 @@ def _within_outlines(
         x, y, z = local[mine].T
         inside = depth_inside(np.stack([x / z, y / z], axis=1) * np.median(z), options.points.apart)
         box = things[number].box
-        way = box.middle(np.array([now])) - box.middle(seen.seconds[mine])
+        way = box.center_at(np.array([now])) - box.center_at(seen.seconds[mine])
         gone = np.linalg.norm(way, axis=1)
         out[mine] = inside >= options.points.rim + options.objects.drift * gone
     return out
@@ -237,7 +237,7 @@ def tinted(
         if tell is not None:
             tell(chunk.scans.stop, n)
     late = recording.per_beam(np.float32)
-    for block in arrays.blocks(late):
+    for block in arrays.iter_blocks(late):
         late[block] = np.inf
     moving = Moving(sources, moves)
     for number in range(len(place.views)):
@@ -251,7 +251,7 @@ def tinted(
 def _counts(colours: Colours, sources: Sources) -> dict[str, int]:
     hit, p_static = sources.seen.hit, sources.p_static
     out = dict.fromkeys(("static", "static_coloured", "dynamic", "dynamic_coloured"), 0)
-    for block in arrays.blocks(hit, p_static, colours):
+    for block in arrays.iter_blocks(hit, p_static, colours):
         has, still = (colours[block] != GREY).any(axis=1), p_static[block] >= DYNAMIC_BELOW
         for name, part in (("static", hit[block] & still), ("dynamic", hit[block] & ~still)):
             out[name] += int(np.count_nonzero(part))
@@ -280,5 +280,5 @@ def _tint_static(
         ends = np.einsum("nij,nj->ni", T[:, :3, :3], local) + T[:, :3, 3]
         return part, *painted.colours(ends, T[:, :3, 3])
 
-    for part, colours, has in in_order(found, parts, threads):
+    for part, colours, has in map_ordered(found, parts, threads):
         out[beams.start + numbers[part][has]] = colours[has]

@@ -59,7 +59,7 @@ def changed_cells(occupancy: MapLike, changes: Sequence[ChangeLike]) -> NDArray[
     out = np.zeros((height, width), np.uint8)
     first = np.round(np.array(occupancy.origin[:2]) / occupancy.resolution).astype(np.int64)
     for change in sorted(changes, key=lambda one: one.last_ns):
-        column, row = (change.swept - first).T
+        column, row = (change.swept_cells - first).T
         inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
         out[row[inside], column[inside]] = CHANGED[change.kind]
     return out

@@ -254,7 +254,7 @@ class ChangeLike(Protocol):
         x, y, z: metres, its middle in the map frame; z is None in the plane.
         size: metres along x and y, and in space z.
         cells: (K, 2) int64 cells that changed.
-        swept: (S, 2) int64 cells of the whole place: of a door all that it sweeps.
+        swept_cells: (S, 2) int64 cells of the whole place: of a door all that it sweeps.
         before_ns, stamp_ns: last scan that saw it as it was, first that saw it otherwise.
         last_ns: first scan that saw the last change.
         times: how often it changed.
@@ -273,7 +273,7 @@ class ChangeLike(Protocol):
     @property
     def cells(self) -> NDArray[np.int64]: ...
     @property
-    def swept(self) -> NDArray[np.int64]: ...
+    def swept_cells(self) -> NDArray[np.int64]: ...
     @property
     def before_ns(self) -> int: ...
     @property

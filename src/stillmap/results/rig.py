@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.json import skipped_count
+from stillmap.core.json import count_skipped
 from stillmap.io.trajectory import write_tum
-from stillmap.mapping.beam_statistics import beam_counts
+from stillmap.mapping.beam_statistics import count_beams
 from stillmap.results.objects import write_objects_of
 from stillmap.results.points import write_beams_of, write_clouds
 from stillmap.results.protocols import TiltingLike
@@ -32,14 +32,14 @@ def write_tilting(
 
 def tilting_record(tilting: TiltingLike) -> dict[str, Any]:
     """What `run.json` says of it, JSON-able but for arrays."""
-    counts = beam_counts(tilting.seen, tilting.p_static)
+    counts = count_beams(tilting.seen, tilting.p_static)
     return {
         "input": tilting.recording.source,
         "counts": {
             "scans": tilting.recording.n_scans,
             **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
             "left_out": tilting.left_out,
-            "skipped": skipped_count(tilting.recording.source),
+            "skipped": count_skipped(tilting.recording.source),
         },
         "dynamic": counts["dynamic"],
         "boxes": tilting.boxes,

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from stillmap.core.config import to_dict
-from stillmap.core.files import new_folder
-from stillmap.core.json import jsonable, skipped_count, version
-from stillmap.core.parallel import resolved_threads
+from stillmap.core.files import atomic_folder
+from stillmap.core.json import count_skipped, to_jsonable, version
+from stillmap.core.parallel import resolve_threads
 from stillmap.io.trajectory import write_tum
-from stillmap.mapping.beam_statistics import beam_counts
+from stillmap.mapping.beam_statistics import count_beams
 from stillmap.results.map_npz import known_area, write_map_npz
 from stillmap.results.map_server import write_map_server
 from stillmap.results.model_protocols import ModelsLike
@@ -45,11 +45,11 @@ def run_record(result: ResultLike, more: Mapping[str, Any] | None = None) -> dic
 
     `more` are further keys with what they hold.
     """
-    counts = beam_counts(result.recording, result.p_static)
+    counts = count_beams(result.recording, result.p_static)
     counts = {
         "scans": result.recording.n_scans,
         **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
-        "skipped": skipped_count(result.recording.source),
+        "skipped": count_skipped(result.recording.source),
     }
     record = {
         "format_version": FORMAT_VERSION,
@@ -80,7 +80,7 @@ def run_record(result: ResultLike, more: Mapping[str, Any] | None = None) -> dic
         },
         **(more or {}),
     }
-    plain: dict[str, Any] = jsonable(record)
+    plain: dict[str, Any] = to_jsonable(record)
     return plain
 
 
@@ -146,7 +146,7 @@ def save(
         InputError: `path` is taken or cannot be written to.
     """
     colours = None if models is None or models.tints is None else models.tints.colours
-    with new_folder(path, RECORD, overwrite, within=within) as folder:
+    with atomic_folder(path, RECORD, overwrite, within=within) as folder:
         write_map_server(folder, result.map, result.options.output.map_mode)
         write_map_npz(folder / "map.npz", result.map, result.changes, result.evidence)
         write_tum(folder / "trajectory.tum", result.recording.stamp_ns, result.poses)
@@ -180,6 +180,6 @@ def _stills(models: ModelsLike, threads: int) -> Stills:
         models.unfiltered,
         np.array([view.T_camera_map for view in models.views]).reshape(-1, 4, 4),
         {one.shape.id: one.textured for one in models.movers},
-        resolved_threads(threads),
+        resolve_threads(threads),
         models.left_out,
     )

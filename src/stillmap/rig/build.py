@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em
-from stillmap.core.arrays import blocks, copied
+from stillmap.core.arrays import copy, iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.em import Ground, ground_of, occupancy_hmm
@@ -25,7 +25,7 @@ from stillmap.rig.options import RigOptions
 from stillmap.rig.removal import Cut, cut_out
 from stillmap.rig.trajectory import Ridden, ridden
 from stillmap.tracking import MovingObject
-from stillmap.tracking.boxes import Box, boxes_of
+from stillmap.tracking.boxes import Box, fit_boxes
 
 Float = NDArray[np.float64]
 
@@ -82,8 +82,8 @@ class Flat:
     def of(cls, result: Result) -> "Flat":
         """What the main job found out about a recording in 2D."""
         seen, p_static = result.seen, result.p_static
-        sums = [float(p_static[b][seen.hit[b]].sum(dtype=float)) for b in blocks(p_static)]
-        share = sum(sums) / max(sum(int(seen.hit[b].sum()) for b in blocks(seen.hit)), 1)
+        sums = [float(p_static[b][seen.hit[b]].sum(dtype=float)) for b in iter_blocks(p_static)]
+        share = sum(sums) / max(sum(int(seen.hit[b].sum()) for b in iter_blocks(seen.hit)), 1)
         return cls(seen, result.poses, p_static, result.objects, share)
 
 
@@ -115,7 +115,7 @@ def built_in_3d(flat: Flat, recording: Recording, options: Options, threads: int
     ground = _ground(on_way)
     found = _evidence(on_way, ground, options, threads) if o.evidence else None
     static = _prior(on_way.seen, flat.share) if found is None else found.p_static
-    boxes = boxes_of(flat.seen, flat.poses, flat.p_static, flat.objects, options.objects, o.hold)
+    boxes = fit_boxes(flat.seen, flat.poses, flat.p_static, flat.objects, options.objects, o.hold)
     cut = cut_out(boxes, recording, on_way, ground, int(flat.seen.stamp_ns[0]), o)
     share = flat.share if found is None else _learned_share(found)
     p_static = with_boxes(static, cut, share, o, recording.scratch)
@@ -170,7 +170,7 @@ def _learned_share(found: em.Expectations) -> float:
 def _prior(seen: Recording, share: float) -> NDArray[np.float32]:
     """(M,) the same for all that can be used."""
     out = seen.per_beam(np.float32)
-    for block in blocks(out, seen.points):
+    for block in iter_blocks(out, seen.points):
         out[block] = np.where(np.isnan(seen.points[block]).any(axis=1), np.nan, share)
     return out
 
@@ -194,7 +194,7 @@ def with_boxes(
         o: see RigOptions.
         scratch: folder for what is large.
     """
-    out = copied(static, scratch)
+    out = copy(static, scratch)
     all_cut = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in cut)])
     core = np.concatenate([np.zeros(0, np.bool_), *(one.core for one in cut)])
     beams, of = np.unique(all_cut, return_inverse=True)
@@ -219,11 +219,11 @@ def _objects(
     out = []
     for box, within in zip(boxes, cut, strict=True):
         beams = within.beams[p_static[within.beams] < _DYNAMIC]
-        if box.thing < 0 or len(beams) < _FEWEST:
+        if box.object_id < 0 or len(beams) < _FEWEST:
             continue
         xyz = on_way.seen.end_points(beams, on_way.poses)
         tall = float(np.percentile(xyz[:, 2] - ground.at(xyz[:, :2]), _EDGE))
-        one = by_id[box.thing]
+        one = by_id[box.object_id]
         out.append(
             dataclasses.replace(
                 one,

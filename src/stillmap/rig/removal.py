@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import blocks
+from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import beam_ns
+from stillmap.core.timestamps import beam_stamps_ns
 from stillmap.em import Ground
 from stillmap.rig.options import RigOptions
 from stillmap.rig.trajectory import Ridden
@@ -61,14 +61,16 @@ def cut_out(
         if beams.start == beams.stop:
             out.append(Cut(np.zeros(0, np.intp), np.zeros(0, np.bool_)))
             continue
-        at = np.asarray(1e-9 * (beam_ns(recording, slice(first, stop)) - start_ns), np.float64)
+        at = np.asarray(
+            1e-9 * (beam_stamps_ns(recording, slice(first, stop)) - start_ns), np.float64
+        )
         near = np.flatnonzero(_near(box, ends[beams], o.margin))
         xyz = np.asarray(ends[beams][near], np.float64)
-        within = box.holds(at[near], xyz[:, :2], o.margin)
+        within = box.contains(at[near], xyz[:, :2], o.margin)
         near, xyz = near[within], xyz[within]
-        core = box.holds(at[near], xyz[:, :2], 0.0)
+        core = box.contains(at[near], xyz[:, :2], 0.0)
         above = xyz[:, 2] - ground.at(xyz[:, :2])
-        tall = o.tallest if 2.0 * max(box.half) >= o.long else o.height
+        tall = o.tallest if 2.0 * max(box.half_size) >= o.long else o.height
         kept = (above > o.low) & (above <= top_of(above, tall, o.gap))
         out.append(Cut(beams.start + near[kept], core[kept]))
     return out
@@ -78,7 +80,7 @@ def _ends(on_way: Ridden) -> NDArray[np.float32]:
     """(M, 3) where hits ended in the map frame, NaN for others."""
     seen = on_way.seen
     ends = seen.per_beam(np.float32, (3,))
-    for block in blocks(ends, seen.hit):
+    for block in iter_blocks(ends, seen.hit):
         hits = block.start + np.flatnonzero(seen.hit[block])
         ends[block] = np.nan
         ends[hits] = seen.end_points(hits, on_way.poses)
@@ -90,14 +92,14 @@ def _span(recording: Recording) -> tuple[float, float]:
     times = recording.beam_time
     if times is None or not len(times):
         return 0.0, 0.0
-    parts = [(float(times[b].min()), float(times[b].max())) for b in blocks(times)]
+    parts = [(float(times[b].min()), float(times[b].max())) for b in iter_blocks(times)]
     return min(low for low, _ in parts), max(high for _, high in parts)
 
 
 def _near(box: Box, ends: NDArray[np.float32], margin: float) -> NDArray[np.bool_]:
     """(n,) whether ends lie where the box ever is; cheaper than to ask when."""
     gone = box.hold * float(np.linalg.norm(box.velocity[[0, -1]], axis=1).max())
-    reach = float(np.linalg.norm(box.half)) + 2.0 * margin + gone
+    reach = float(np.linalg.norm(box.half_size)) + 2.0 * margin + gone
     low, high = box.xy.min(axis=0) - reach, box.xy.max(axis=0) + reach
     return np.asarray(((ends[:, :2] >= low) & (ends[:, :2] <= high)).all(axis=1))
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays, kalman
-from stillmap.core.kalman import Motion
-from stillmap.tracking.clustering import MovingPoints
+from stillmap.core.kalman import TrackStates
+from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.options import ObjectOptions
 
 Float = NDArray[np.float64]
@@ -29,18 +29,18 @@ _REACH = 0.45  # m from the middle of a thing to its points
 
 
 @dataclass(frozen=True, eq=False)
-class Torn:
+class TrackSplit:
     """Points of who was there first, and of the other; in the scan, and before."""
 
-    older_now: Index
-    older_before: Index
-    newer_now: Index
-    newer_before: Index
+    older_current: Index
+    older_past: Index
+    newer_current: Index
+    newer_past: Index
 
 
 def split_track(
-    points: MovingPoints, owned: Index, one: Index, other: Index, options: ObjectOptions
-) -> Torn:
+    points: DynamicPoints, owned: Index, one: Index, other: Index, options: ObjectOptions
+) -> TrackSplit:
     """Whose the points of a thing were before it was seen to be two.
 
     Args:
@@ -52,30 +52,30 @@ def split_track(
     xy, seconds = points.xy, points.seconds[points.scan]
     at = float(seconds[one[0]])
     middles = np.array([xy[one].mean(axis=0), xy[other].mean(axis=0)])
-    motion = kalman.still(middles, options.sigma, options.sigma_speed)
+    motion = kalman.initialize(middles, options.sigma, options.sigma_speed)
     seen = np.array([at, at])
     shares: tuple[list[Index], list[Index]] = ([owned[:0]], [owned[:0]])
     owned = owned[seconds[owned] > at - BACK]
     for here in np.split(owned, np.flatnonzero(np.diff(points.scan[owned])) + 1)[::-1]:
         if len(here) == 0 or (seen - seconds[here[0]] > _MISSED).any():
             break
-        motion = kalman.predicted(motion, seconds[here[0]] - at, options.acceleration)
+        motion = kalman.predict(motion, seconds[here[0]] - at, options.acceleration)
         at = float(seconds[here[0]])
         share = _shared(xy[here], motion)
         count = np.bincount(share, minlength=2)
         sums = np.array([xy[here[share == i]].sum(axis=0) for i in (0, 1)])
         means = sums / np.maximum(count, 1)[:, None]
-        motion = kalman.updated(motion, count > 0, means, options.sigma)
+        motion = kalman.update(motion, count > 0, means, options.sigma)
         seen[count > 0] = at
         for i in (0, 1):
             shares[i].append(here[share == i])
     before = [np.concatenate(share) for share in shares]
     if seen[1] < seen[0]:
-        return Torn(other, before[1], one, before[0])
-    return Torn(one, before[0], other, before[1])
+        return TrackSplit(other, before[1], one, before[0])
+    return TrackSplit(one, before[0], other, before[1])
 
 
-def _shared(xy: Float, motion: kalman.Motion) -> Index:
+def _shared(xy: Float, motion: kalman.TrackStates) -> Index:
     """(n,) to which of two each point is nearer; neither gets any where none is near to it."""
     distance = np.linalg.norm(xy[:, None] - motion.x, axis=-1)
     share: Index = distance.argmin(axis=1)
@@ -86,7 +86,7 @@ def _shared(xy: Float, motion: kalman.Motion) -> Index:
     return share
 
 
-def velocity(points: MovingPoints, before: Index, now: float) -> Float:
+def estimate_velocity(points: DynamicPoints, before: Index, now: float) -> Float:
     """(2,) m/s of the points of a thing in the last second; 0 where there are too few."""
     seconds = points.seconds[points.scan[before]]
     before, seconds = before[seconds > now - _HORIZON], seconds[seconds > now - _HORIZON]
@@ -97,14 +97,14 @@ def velocity(points: MovingPoints, before: Index, now: float) -> Float:
     return np.asarray((off[:, None] * xy).sum(axis=0) / ((off**2).sum() + _STANDING**2))
 
 
-NOBODY = -1
+NO_TRACK = -1
 
 _SHAPE = 100  # points that a shape has at most: more of them say no more
 
 _PAIRS = 1 << 16  # distances that are looked at together: as many as a cache holds
 
 
-def followed(points: MovingPoints, options: ObjectOptions) -> Index:
+def assign_tracks(points: DynamicPoints, options: ObjectOptions) -> Index:
     """(N,) numbers of things, from 0 in the order in which they were first seen.
 
     What a thing looked like of late, moved to where it is expected, claims the end points nearest
@@ -116,7 +116,7 @@ def followed(points: MovingPoints, options: ObjectOptions) -> Index:
     """
     following = _Following(points, options)
     scans = np.flatnonzero(np.diff(points.first)).tolist()
-    for scan in arrays.in_turn(scans, lambda: points.let_go(following.owner)):
+    for scan in arrays.release_periodically(scans, lambda: points.release(following.owner)):
         following.take(scan)
     return following.owner
 
@@ -124,11 +124,11 @@ def followed(points: MovingPoints, options: ObjectOptions) -> Index:
 class _Following:
     """Things as they are followed: their motion, and what was seen of them of late."""
 
-    def __init__(self, points: MovingPoints, options: ObjectOptions) -> None:
+    def __init__(self, points: DynamicPoints, options: ObjectOptions) -> None:
         self.owner = arrays.empty((len(points.scan),), np.intp, points.scratch)
         self._points, self._options = points, options
         self._now, self._count = 0.0, 0
-        self._motion = kalman.still(np.zeros((0, 2)), 1.0, 1.0)
+        self._motion = kalman.initialize(np.zeros((0, 2)), 1.0, 1.0)
         self._id, self._last = np.zeros(0, np.intp), np.zeros(0)
         # what was seen of them: offsets from where they were, of which thing, when
         self._offset, self._of, self._when = np.zeros((0, 2)), np.zeros(0, np.intp), np.zeros(0)
@@ -139,10 +139,10 @@ class _Following:
         here = np.arange(points.first[scan], points.first[scan + 1])
         dt, self._now = points.seconds[scan] - self._now, float(points.seconds[scan])
         self._forget(self._now - self._last <= options.gap)
-        self._motion = kalman.predicted(self._motion, dt, options.acceleration)
+        self._motion = kalman.predict(self._motion, dt, options.acceleration)
         claims = self._claims(here)
-        for thing, kept, gone in torn_apart(points, here, claims, options):
-            claims[gone] = NOBODY
+        for thing, kept, gone in find_splits(points, here, claims, options):
+            claims[gone] = NO_TRACK
             self._tear(here, claims, thing, here[kept], here[gone])
         self._update(here, claims)
         self._begin(here, claims)
@@ -150,7 +150,7 @@ class _Following:
 
     def _claims(self, here: Index) -> Index:
         """Which thing claims each point."""
-        claims = np.full(len(here), NOBODY)
+        claims = np.full(len(here), NO_TRACK)
         if len(self._motion) == 0:
             return claims
         options, xy = self._options, self._points.xy[here]
@@ -162,12 +162,12 @@ class _Following:
         sigma = self._motion.sigma
         near = np.minimum(options.near + options.near_sigmas * sigma, options.farthest)
         claims = _cheapest(cost, squared < near**2)
-        if (claims == NOBODY).any():
+        if (claims == NO_TRACK).any():
             found = np.bincount(claims[claims >= 0], minlength=len(sigma)) > 0
             taken = np.bincount(cluster[claims >= 0], minlength=cluster[-1] + 1) > 0
             far = np.minimum(options.far + options.near_sigmas * sigma, options.farthest)
             allowed = (squared < far**2) & ~found & ~taken[cluster][:, None]
-            claims = np.where(claims == NOBODY, _cheapest(cost, allowed), claims)
+            claims = np.where(claims == NO_TRACK, _cheapest(cost, allowed), claims)
             claims = _whole_clusters(claims, cluster, len(sigma))
         return claims
 
@@ -192,18 +192,20 @@ class _Following:
         torn = split_track(points, owned, kept, gone, self._options)
         new = len(self._motion)
         for k, now, before in (
-            (thing, torn.older_now, torn.older_before),
-            (new, torn.newer_now, torn.newer_before),
+            (thing, torn.older_current, torn.older_past),
+            (new, torn.newer_current, torn.newer_past),
         ):
             claims[np.isin(here, now)] = k
-            self._set(k, now, velocity(points, before, self._now))
-        self.owner[torn.newer_before] = self._id[new]
+            self._set(k, now, estimate_velocity(points, before, self._now))
+        self.owner[torn.newer_past] = self._id[new]
 
     def _set(self, k: int, now: Index, velocity: Float) -> None:
         """Thing k is where these points are; a new one if there is none of that number."""
         xy = self._points.xy[now]
-        begun = kalman.still(xy.mean(axis=0)[None], self._options.sigma, self._options.sigma_speed)
-        begun = Motion(begun.x, velocity[None], begun.P)
+        begun = kalman.initialize(
+            xy.mean(axis=0)[None], self._options.sigma, self._options.sigma_speed
+        )
+        begun = TrackStates(begun.x, velocity[None], begun.P)
         if k == len(self._motion):
             self._append(begun)
         else:
@@ -218,7 +220,7 @@ class _Following:
         count = np.bincount(claims[got], minlength=len(self._motion))
         seen, xy = count > 0, self._points.xy[here][got]
         at = _means(xy, claims[got], count)
-        self._motion = kalman.updated(self._motion, seen, at, self._options.sigma)
+        self._motion = kalman.update(self._motion, seen, at, self._options.sigma)
         self._last[seen] = self._now
         # who is hidden keeps its shape
         self._forget_shape((self._now - self._when < self._options.shape) | ~seen[self._of])
@@ -226,18 +228,18 @@ class _Following:
 
     def _begin(self, here: Index, claims: Index) -> None:
         """What nobody claims: a new thing for each cluster."""
-        free = claims == NOBODY
+        free = claims == NO_TRACK
         if not free.any():
             return
         _, which = np.unique(self._points.cluster[here[free]], return_inverse=True)
         xy, first = self._points.xy[here[free]], len(self._motion)
         at = _means(xy, which, np.bincount(which))
-        self._append(kalman.still(at, self._options.sigma, self._options.sigma_speed))
+        self._append(kalman.initialize(at, self._options.sigma, self._options.sigma_speed))
         claims[free] = first + which
         self._see(xy, claims[free])
 
-    def _append(self, begun: Motion) -> None:
-        self._motion = kalman.joined(self._motion, begun)
+    def _append(self, begun: TrackStates) -> None:
+        self._motion = kalman.concatenate(self._motion, begun)
         numbers = self._count + np.arange(len(begun))
         self._id, self._count = np.concatenate([self._id, numbers]), self._count + len(begun)
         self._last = np.concatenate([self._last, np.full(len(begun), self._now)])
@@ -272,8 +274,8 @@ class _Following:
         )
 
 
-def torn_apart(
-    points: MovingPoints, here: Index, claims: Index, options: ObjectOptions
+def find_splits(
+    points: DynamicPoints, here: Index, claims: Index, options: ObjectOptions
 ) -> list[tuple[int, Index, Index]]:
     """Things of which parts lie too far from one another to be one.
 
@@ -320,7 +322,7 @@ def _cheapest(cost: Float, allowed: NDArray[np.bool_]) -> Index:
     """(n,) columns with the least cost of those allowed; NOBODY where none is."""
     cost = np.where(allowed, cost, np.inf)
     best = cost.argmin(axis=1)
-    return np.where(np.isfinite(cost[np.arange(len(cost)), best]), best, NOBODY)
+    return np.where(np.isfinite(cost[np.arange(len(cost)), best]), best, NO_TRACK)
 
 
 def _whole_clusters(claims: Index, cluster: Index, things: int) -> Index:
@@ -328,7 +330,7 @@ def _whole_clusters(claims: Index, cluster: Index, things: int) -> Index:
     votes = np.zeros((cluster[-1] + 1, things), np.intp)
     got = claims >= 0
     np.add.at(votes, (cluster[got], claims[got]), 1)
-    best = np.where(votes.max(axis=1) > 0, votes.argmax(axis=1), NOBODY)
+    best = np.where(votes.max(axis=1) > 0, votes.argmax(axis=1), NO_TRACK)
     return np.where(got, claims, best[cluster])
 
 
@@ -338,5 +340,5 @@ def _means(xy: Float, of: Index, count: Index) -> Float:
     return np.asarray(np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None])
 
 
-def _arrays(motion: Motion) -> tuple[Float, Float, Float]:
+def _arrays(motion: TrackStates) -> tuple[Float, Float, Float]:
     return motion.x, motion.v, motion.P

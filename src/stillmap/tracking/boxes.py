@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
 from stillmap.tracking import MovingObject, ObjectOptions
-from stillmap.tracking.clustering import moving_points
+from stillmap.tracking.clustering import extract_dynamic_points
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -32,15 +32,15 @@ class Box:
         hold: s before it was first seen, and after it was last, for which it goes on evenly.
     """
 
-    thing: int
+    object_id: int
     seconds: Float
     xy: Float
-    ahead: Float
+    heading: Float
     velocity: Float
-    half: tuple[float, float]
+    half_size: tuple[float, float]
     hold: float
 
-    def middle(self, seconds: Float) -> Float:
+    def center_at(self, seconds: Float) -> Float:
         """(n, 2) metres, where its middle is at times (n,); beyond its ends it goes on evenly."""
         early = np.minimum(seconds - self.seconds[0], 0.0)
         late = np.maximum(seconds - self.seconds[-1], 0.0)
@@ -48,20 +48,20 @@ class Box:
         middle += early[:, None] * self.velocity[0] + late[:, None] * self.velocity[-1]
         return middle
 
-    def holds(self, seconds: Float, xy: Float, margin: float) -> Bool:
+    def contains(self, seconds: Float, xy: Float, margin: float) -> Bool:
         """(n,) whether places (n, 2) lie in it, or within `margin` metres, at times (n,)."""
         early = np.minimum(seconds - self.seconds[0], 0.0)
         late = np.maximum(seconds - self.seconds[-1], 0.0)
-        middle = self.middle(seconds)
+        middle = self.center_at(seconds)
         at = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, None)
-        ahead, off = self.ahead[at], xy - middle
+        ahead, off = self.heading[at], xy - middle
         along = np.abs((off * ahead).sum(axis=1))
         across = np.abs(off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1])
-        near = (along <= self.half[0] + margin) & (across <= self.half[1] + margin)
+        near = (along <= self.half_size[0] + margin) & (across <= self.half_size[1] + margin)
         return np.asarray(near & (late - early <= self.hold))
 
 
-def boxes_of(
+def fit_boxes(
     recording: Recording,
     poses: Float,
     p_static: NDArray[np.float32],
@@ -80,12 +80,12 @@ def boxes_of(
         hold: s for which an object goes on before it was first seen, and after it was last.
     """
     start = int(recording.stamp_ns[0])
-    return [box_of(one, start, hold) for one in objects] + _of_others(
+    return [fit_box(one, start, hold) for one in objects] + _of_others(
         recording, poses, p_static, objects, options
     )
 
 
-def box_of(one: MovingObject, start: int, hold: float) -> Box:
+def fit_box(one: MovingObject, start: int, hold: float) -> Box:
     """The box of an object; its time begins at `start` ns, and it goes on for `hold` s."""
     seconds = np.asarray(1e-9 * (one.stamp_ns - start), np.float64)
     speed = np.linalg.norm(one.velocity, axis=1)
@@ -109,7 +109,7 @@ def _of_others(
     options: ObjectOptions,
 ) -> list[Box]:
     """Of neighbours in a scan that move and are of no object."""
-    points = moving_points(recording, poses, p_static, options)
+    points = extract_dynamic_points(recording, poses, p_static, options)
     owned = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in objects)])
     rest = ~np.isin(points.beam, owned)
     xy, scan = points.xy[rest], points.scan[rest]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
-from stillmap.core.arrays import Column
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.tracking.options import ObjectOptions
 
@@ -20,7 +20,7 @@ _NOTHING: _Last = np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros(0), -1
 
 
 @dataclass(frozen=True, eq=False)
-class MovingPoints:
+class DynamicPoints:
     """N end points, in the order of the recording.
 
     Attributes:
@@ -45,15 +45,15 @@ class MovingPoints:
     first: Index
     scratch: Path | None = None
 
-    def let_go(self, *more: NDArray[Any]) -> None:
+    def release(self, *more: NDArray[Any]) -> None:
         """What lies in memory of the points, and of other arrays, only because it was looked at."""
         for array in (self.scan, self.beam, self.xy, self.range, self.cluster, *more):
-            arrays.let_go(array)
+            arrays.release_pages(array)
 
 
-def moving_points(
+def extract_dynamic_points(
     recording: Recording, poses: Float, p_static: NDArray[np.float32], options: ObjectOptions
-) -> MovingPoints:
+) -> DynamicPoints:
     """The hits that are dynamic as probably as `options.dynamic`, and which belong together.
 
     Args:
@@ -65,11 +65,11 @@ def moving_points(
     # a scan's stamps may go backwards where clocks jump; time does not
     seconds = np.maximum.accumulate(1e-9 * (recording.stamp_ns - recording.stamp_ns[:1]))
     scratch = recording.scratch
-    scans, beams = Column(np.intp, (), scratch), Column(np.intp, (), scratch)
-    ends, distances = Column(np.float64, (2,), scratch), Column(np.float64, (), scratch)
-    clusters, count = Column(np.intp, (), scratch), np.zeros(recording.n_scans + 1, np.intp)
+    scans, beams = ArrayBuilder(np.intp, (), scratch), ArrayBuilder(np.intp, (), scratch)
+    ends, distances = ArrayBuilder(np.float64, (2,), scratch), ArrayBuilder(np.float64, (), scratch)
+    clusters, count = ArrayBuilder(np.intp, (), scratch), np.zeros(recording.n_scans + 1, np.intp)
     last = _NOTHING
-    for block in arrays.blocks(recording.hit, p_static):
+    for block in arrays.iter_blocks(recording.hit, p_static):
         dynamic = recording.hit[block] & (p_static[block] <= 1.0 - options.dynamic)
         beam = block.start + np.flatnonzero(dynamic)
         if len(beam) == 0:
@@ -83,7 +83,7 @@ def moving_points(
         ):  # fmt: skip
             column.append(part)
         count[scan[0] + 1 : scan[-1] + 2] += np.bincount(scan - scan[0])
-    return MovingPoints(
+    return DynamicPoints(
         seconds,
         scans.finished(),
         beams.finished(),

@@ -15,7 +15,7 @@ _AGAIN = 5.0  # s after which being in a square is crossing it again
 
 
 @dataclass(frozen=True, eq=False)
-class Traffic:
+class FlowMap:
     """Squares of the floor.
 
     Attributes:
@@ -31,7 +31,7 @@ class Traffic:
     resolution: float
 
 
-def traffic(objects: Sequence[MovingObject], resolution: float = 0.5) -> Traffic:
+def compute_flow_map(objects: Sequence[MovingObject], resolution: float = 0.5) -> FlowMap:
     """How often each square was crossed.
 
     Who stays in a square, or comes back to it within a few seconds, has crossed it once.
@@ -45,7 +45,7 @@ def traffic(objects: Sequence[MovingObject], resolution: float = 0.5) -> Traffic
     speeds = np.concatenate([np.zeros(0), *(speed for _, speed in visits)])
     if len(cells) == 0:
         none = np.zeros((0, 0), np.int32)
-        return Traffic(none, none.astype(np.float32), (0.0, 0.0, 0.0), resolution)
+        return FlowMap(none, none.astype(np.float32), (0.0, 0.0, 0.0), resolution)
     first = cells.min(axis=0)
     width, height = (cells.max(axis=0) - first + 1).tolist()
     column, row = (cells - first).T
@@ -54,7 +54,7 @@ def traffic(objects: Sequence[MovingObject], resolution: float = 0.5) -> Traffic
     total = np.bincount(flat, speeds, minlength=height * width)
     mean = np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0)
     x, y = (first * resolution).tolist()
-    return Traffic(
+    return FlowMap(
         count.astype(np.int32).reshape(height, width),
         mean.astype(np.float32).reshape(height, width),
         (x, y, 0.0),

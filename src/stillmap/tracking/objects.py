@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
-from stillmap.tracking.association import followed
-from stillmap.tracking.clustering import MovingPoints, moving_points
+from stillmap.tracking.association import assign_tracks
+from stillmap.tracking.clustering import DynamicPoints, extract_dynamic_points
 from stillmap.tracking.options import ObjectOptions
-from stillmap.tracking.smoother import smoothed
-from stillmap.tracking.tracklets import linked, middles, of_things
+from stillmap.tracking.smoother import smooth_track
+from stillmap.tracking.tracklets import compute_centroids, iterate_tracks, stitch_tracklets
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -52,7 +52,7 @@ class MovingObject:
     z: Float | None = None
 
 
-def moving_objects(
+def track_objects(
     recording: Recording,
     poses: Float,
     p_static: NDArray[np.float32],
@@ -78,17 +78,17 @@ def moving_objects(
         )
     if not options.enabled:
         return []
-    points = moving_points(recording, poses, p_static, options)
+    points = extract_dynamic_points(recording, poses, p_static, options)
     if len(points.scan) == 0:
         return []
-    owner = linked(points, followed(points, options), options)
+    owner = stitch_tracklets(points, assign_tracks(points, options), options)
     large = _Kept(recording.scratch)
-    for _, here in of_things(points, owner):
-        found = middles(points, owner, here)
+    for _, here in iterate_tracks(points, owner):
+        found = compute_centroids(points, owner, here)
         one = _object(points, here, found.scan, found.xy, recording, p_static, options)
         if _extent(one) >= options.least_extent:
             large.add(one)
-        arrays.let_go(p_static)
+        arrays.release_pages(p_static)
     objects = large.objects()
     objects.sort(key=lambda one: (one.scan[0], one.beams[0]))
     return [dataclasses.replace(one, id=number) for number, one in enumerate(objects)]
@@ -100,9 +100,9 @@ class _Kept:
     _OF_SCANS: ClassVar = {"scan": np.intp, "stamp_ns": np.int64, "xy": float, "velocity": float}
 
     def __init__(self, scratch: Path | None) -> None:
-        self._beams = arrays.Column(np.intp, (), scratch)
+        self._beams = arrays.ArrayBuilder(np.intp, (), scratch)
         self._columns = {
-            name: arrays.Column(dtype, (2,) if dtype is float else (), scratch)
+            name: arrays.ArrayBuilder(dtype, (2,) if dtype is float else (), scratch)
             for name, dtype in self._OF_SCANS.items()
         }
         self._rows: list[tuple[int, int, tuple[float, ...], float]] = []
@@ -132,7 +132,7 @@ def _extent(one: MovingObject) -> float:
 
 
 def _object(
-    points: MovingPoints,
+    points: DynamicPoints,
     here: Index,
     scan: Index,
     middle: Float,
@@ -142,8 +142,8 @@ def _object(
 ) -> MovingObject:
     seconds = points.seconds[scan]
     at = np.searchsorted(scan, points.scan[here])
-    middle = middle + behind(middle, points.sensor[scan], points.xy[here], at)
-    xy, velocity = smoothed(seconds, middle, options.sigma_way, options.acceleration)
+    middle = middle + estimate_center_offset(middle, points.sensor[scan], points.xy[here], at)
+    xy, velocity = smooth_track(seconds, middle, options.sigma_way, options.acceleration)
     beams = points.beam[here]
     return MovingObject(
         0,
@@ -151,13 +151,13 @@ def _object(
         recording.stamp_ns[scan],
         xy,
         velocity,
-        box_size(points.xy[here] - xy[at], velocity[at]),
+        measure_box(points.xy[here] - xy[at], velocity[at]),
         beams,
         float(1.0 - p_static[beams].mean(dtype=np.float64)),
     )
 
 
-def behind(middle: Float, sensor: Float, xy: Float, at: Index) -> Float:
+def estimate_center_offset(middle: Float, sensor: Float, xy: Float, at: Index) -> Float:
     """(L, 2) from the middle of what was seen to that of the thing: only one side is seen.
 
     Of a disc the end points lie pi / 4 of its radius before its middle. It is as wide as what was
@@ -180,7 +180,7 @@ def behind(middle: Float, sensor: Float, xy: Float, at: Index) -> Float:
     return min(np.pi / 4.0 * radius, _DEEPEST) * away
 
 
-def box_size(offset: Float, velocity: Float) -> tuple[float, float]:
+def measure_box(offset: Float, velocity: Float) -> tuple[float, float]:
     """Metres along and across the way it went; along and across its longer side if it stood.
 
     Args:

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.arrays import Column, rows_of
-from stillmap.core.parallel import in_order
+from stillmap.core.arrays import ArrayBuilder, take_rows
+from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.em import Ground
-from stillmap.mapping.projection import flat_recording
-from stillmap.tracking import MovingObject, ObjectOptions, moving_objects
+from stillmap.mapping.projection import make_planar_recording
+from stillmap.tracking import MovingObject, ObjectOptions, track_objects
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -24,7 +24,7 @@ _FEWEST = 3  # end points of a part: fewer are noise
 _EDGE = 2.0  # percent of the end points that lie lower than a thing, or higher
 
 
-def moving_in_space(
+def track_objects_3d(
     recording: Recording,
     poses: Float,
     p_static: NDArray[np.float32],
@@ -48,11 +48,11 @@ def moving_in_space(
     """
     if not options.enabled:
         return []
-    flat_poses = se2.planar(recording.T_map_sensor(poses))
+    flat_poses = se2.project_to_plane(recording.T_map_sensor(poses))
     found = _dynamic_parts(recording, poses, flat_poses, p_static, ground, options, threads)
     hit = np.ones(len(found.nearest), np.bool_)
-    flat = flat_recording(recording, found.points, hit, found.offset)
-    things = moving_objects(flat, flat_poses, p_static[found.nearest], options)
+    flat = make_planar_recording(recording, found.points, hit, found.offset)
+    things = track_objects(flat, flat_poses, p_static[found.nearest], options)
     owned = _of_parts(things, found.nearest, found.part, found.beam)
     return [
         _in_space(one, beams, recording, poses, p_static)
@@ -89,8 +89,8 @@ def _dynamic_parts(
 ) -> _Parts:
     T_map_sensor, T = recording.T_map_sensor(poses), recording.n_scans
     scratch, offset, parts = recording.scratch, np.zeros(T + 1, np.int64), 0
-    points, nearest = Column(np.float32, (2,), scratch), Column(np.intp, (), scratch)
-    part_of, beam = Column(np.int64, (), scratch), Column(np.intp, (), scratch)
+    points, nearest = ArrayBuilder(np.float32, (2,), scratch), ArrayBuilder(np.intp, (), scratch)
+    part_of, beam = ArrayBuilder(np.int64, (), scratch), ArrayBuilder(np.intp, (), scratch)
 
     def of_scan(t: int) -> tuple[Index, Index, Float, Index]:
         beams = recording.beams_of(t)
@@ -102,7 +102,7 @@ def _dynamic_parts(
         return number[kept], part[kept], local, _nearest(local)
 
     in_turn = recording.in_turn(range(T), p_static)
-    for t, (number, part, local, near) in enumerate(in_order(of_scan, in_turn, threads)):
+    for t, (number, part, local, near) in enumerate(map_ordered(of_scan, in_turn, threads)):
         points.append(local[near].astype(np.float32))
         nearest.append(number[near])
         part_of.append(parts + part)
@@ -202,5 +202,5 @@ def _in_space(
         beams=beams,
         z=middle,
         size=(*one.size[:2], float(top - bottom)),
-        p_dynamic=float(1.0 - rows_of(p_static, beams).mean(dtype=np.float64)),
+        p_dynamic=float(1.0 - take_rows(p_static, beams).mean(dtype=np.float64)),
     )

@@ -8,7 +8,9 @@ Float = NDArray[np.float64]
 _AT_ONCE = 1e-3  # s: over less, differences of places say nothing of speeds
 
 
-def smoothed(seconds: Float, xy: Float, sigma: float, acceleration: float) -> tuple[Float, Float]:
+def smooth_track(
+    seconds: Float, xy: Float, sigma: float, acceleration: float
+) -> tuple[Float, Float]:
     """(L, 2) places and (L, 2) velocities that are most probable, given all that was seen.
 
     A thing with white acceleration that is seen with white noise is most probably where a cubic

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
-from stillmap.tracking.clustering import MovingPoints
+from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.options import ObjectOptions
 
 Float = NDArray[np.float64]
@@ -22,7 +22,7 @@ _TOGETHER_ENDS = 1 << 12  # ends of tracks that are looked at together
 _STANDING = 0.15  # s by which few points are taken to stand still
 
 
-class Middles(NamedTuple):
+class Centroids(NamedTuple):
     """Where things are in each scan that sees them; in the order of things, then scans.
 
     Attributes:
@@ -32,13 +32,13 @@ class Middles(NamedTuple):
         ends: (L,) how many end points.
     """
 
-    thing: Index
+    track: Index
     scan: Index
     xy: Float
-    ends: Index
+    count: Index
 
 
-def middles(points: MovingPoints, owner: Index, here: slice | Index) -> Middles:
+def compute_centroids(points: DynamicPoints, owner: Index, here: slice | Index) -> Centroids:
     """Where things are by some points, all or none of a scan; those of nobody (-1) are left out."""
     thing, scan, xy = owner[here], points.scan[here], points.xy[here]
     own = np.flatnonzero(thing >= 0)
@@ -47,20 +47,20 @@ def middles(points: MovingPoints, owner: Index, here: slice | Index) -> Middles:
     begins = np.flatnonzero(np.diff(thing, prepend=-1) | np.diff(scan, prepend=-1))
     count = np.diff(begins, append=len(order))
     sums = np.add.reduceat(xy[order], begins) if len(begins) else np.zeros((0, 2))
-    return Middles(thing[begins], scan[begins], sums / count[:, None], count)
+    return Centroids(thing[begins], scan[begins], sums / count[:, None], count)
 
 
-def of_things(points: MovingPoints, owner: Index) -> Iterator[tuple[int, Index]]:
+def iterate_tracks(points: DynamicPoints, owner: Index) -> Iterator[tuple[int, Index]]:
     """Each thing's number, rising, and its points, rising."""
     count = np.zeros(0, np.intp)
-    for block in arrays.blocks(owner):
+    for block in arrays.iter_blocks(owner):
         here = np.bincount(owner[block][owner[block] >= 0], minlength=len(count))
         here[: len(count)] += count
         count = here
     first = np.cumsum(count) - count
     order = arrays.empty((int(count.sum()),), np.intp, points.scratch)
     free = first.copy()
-    for block in arrays.blocks(owner, order):
+    for block in arrays.iter_blocks(owner, order):
         own = np.flatnonzero(owner[block] >= 0)
         own = own[np.argsort(owner[block][own], kind="stable")]
         thing = owner[block][own]
@@ -74,11 +74,11 @@ def of_things(points: MovingPoints, owner: Index) -> Iterator[tuple[int, Index]]
         yield k, np.array(order[first[k] : first[k] + count[k]])
         seen += count[k]
         if seen > arrays.BLOCK:
-            points.let_go(owner, order)
+            points.release(owner, order)
             seen = 0
 
 
-def _blocks(points: MovingPoints, *beside: Index) -> Iterator[slice]:
+def _blocks(points: DynamicPoints, *beside: Index) -> Iterator[slice]:
     """Slices of points, of whole scans; what was looked at is let go."""
     first, at = points.first, 0
     while at < len(points.scan):
@@ -86,19 +86,19 @@ def _blocks(points: MovingPoints, *beside: Index) -> Iterator[slice]:
         if end <= at:  # one scan alone
             end = first[np.searchsorted(first, at, side="right")]
         yield slice(at, int(end))
-        points.let_go(*beside)
+        points.release(*beside)
         at = int(end)
 
 
-def _renamed(points: MovingPoints, owner: Index, name: Callable[[Index], Index]) -> Index:
+def _renamed(points: DynamicPoints, owner: Index, name: Callable[[Index], Index]) -> Index:
     """(N,) other numbers for the things."""
     out = arrays.empty(owner.shape, np.intp, points.scratch)
-    for block in arrays.blocks(owner, out):
+    for block in arrays.iter_blocks(owner, out):
         out[block] = name(owner[block])
     return out
 
 
-def linked(points: MovingPoints, owner: Index, options: ObjectOptions) -> Index:
+def stitch_tracklets(points: DynamicPoints, owner: Index, options: ObjectOptions) -> Index:
     """(N,) numbers of things after pieces of one thing have become one; -1: of nothing.
 
     Args:
@@ -111,19 +111,19 @@ def linked(points: MovingPoints, owner: Index, options: ObjectOptions) -> Index:
     return _confirmed(points, owner, options)
 
 
-def _side_by_side(points: MovingPoints, owner: Index, options: ObjectOptions) -> Index:
+def _side_by_side(points: DynamicPoints, owner: Index, options: ObjectOptions) -> Index:
     """Things that always go together, nearer than people do: legs that were taken for two."""
     from scipy.spatial import KDTree  # takes long to load
 
     parts, scans = list[tuple[Index, Index]](), np.zeros(0, np.intp)
     for here in _blocks(points, owner):
-        found = middles(points, owner, here)
+        found = compute_centroids(points, owner, here)
         # one more axis keeps scans apart
         apart = np.column_stack([found.xy, 100.0 * max(options.beside, 1.0) * found.scan])
         pairs = KDTree(apart).query_pairs(options.beside, output_type="ndarray")
-        pairs = np.sort(found.thing[pairs], axis=1)
+        pairs = np.sort(found.track[pairs], axis=1)
         parts.append(np.unique(pairs, axis=0, return_counts=True))
-        scans = _added(scans, np.bincount(found.thing))
+        scans = _added(scans, np.bincount(found.track))
     things, which = np.unique(
         np.concatenate([pairs for pairs, _ in parts]), axis=0, return_inverse=True
     )
@@ -144,7 +144,7 @@ def _added(one: Index, other: Index) -> Index:
     return out
 
 
-def _one_after_the_other(points: MovingPoints, owner: Index, options: ObjectOptions) -> Index:
+def _one_after_the_other(points: DynamicPoints, owner: Index, options: ObjectOptions) -> Index:
     """Things that were hidden for a while, and seen again where they were going."""
     from scipy.optimize import linear_sum_assignment  # takes long to load
 
@@ -183,11 +183,11 @@ class _Ends(NamedTuple):
     last_v: Float
 
 
-def _ends(points: MovingPoints, owner: Index) -> tuple[Index, _Ends]:
+def _ends(points: DynamicPoints, owner: Index) -> tuple[Index, _Ends]:
     """Numbers of the things (K,), and their ends."""
     things, rows = [], []
-    for thing, here in of_things(points, owner):
-        found = middles(points, owner, here)
+    for thing, here in iterate_tracks(points, owner):
+        found = compute_centroids(points, owner, here)
         t, xy = points.seconds[found.scan], found.xy
         things.append(thing)
         first, last = t <= t[0] + _HORIZON, t >= t[-1] - _HORIZON
@@ -237,18 +237,18 @@ def _fitting(
     return before[fits], after[fits], cost[fits]
 
 
-def _confirmed(points: MovingPoints, owner: Index, options: ObjectOptions) -> Index:
+def _confirmed(points: DynamicPoints, owner: Index, options: ObjectOptions) -> Index:
     """Things that were seen for long enough; -1 for all others."""
     scans = np.zeros(0, np.intp)
     first, last = np.full(0, np.inf), np.full(0, -np.inf)
     for here in _blocks(points, owner):
-        found = middles(points, owner, here)
-        scans = _added(scans, np.bincount(found.thing))
+        found = compute_centroids(points, owner, here)
+        scans = _added(scans, np.bincount(found.track))
         more = len(scans) - len(first)
         first = np.concatenate([first, np.full(more, np.inf)])
         last = np.concatenate([last, np.full(more, -np.inf)])
-        np.minimum.at(first, found.thing, points.seconds[found.scan])
-        np.maximum.at(last, found.thing, points.seconds[found.scan])
+        np.minimum.at(first, found.track, points.seconds[found.scan])
+        np.maximum.at(last, found.track, points.seconds[found.scan])
     if len(scans) == 0:
         return owner
     lasted = np.subtract(last, first, out=np.zeros(len(scans)), where=scans > 0)

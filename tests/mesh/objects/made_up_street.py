@@ -11,7 +11,7 @@ from stillmap.em import Ground
 from stillmap.mesh.inputs import Sources
 from stillmap.mesh.texture.occluders import Thing
 from stillmap.tracking import MovingObject
-from stillmap.tracking.boxes import box_of
+from stillmap.tracking.boxes import fit_box
 
 Float = NDArray[np.float64]
 
@@ -72,7 +72,9 @@ def street(
     poses[:, 2, 3] = 1.0
     met = np.concatenate(whose)
     objects = [_object(k, part, cars, recording, poses, met) for k, part in enumerate(parts)]
-    things = [Thing(box_of(one, 0, 0.5), one.z - 0.5 * one.size[2], one.size[2]) for one in objects]
+    things = [
+        Thing(fit_box(one, 0, 0.5), one.z - 0.5 * one.size[2], one.size[2]) for one in objects
+    ]
     ground = Ground(np.zeros((1, 1)), np.zeros(2), 1.0, True)
     p_static = np.where(met >= 0, 0.05, 0.95).astype(np.float32)
     return Sources(recording, recording, poses, p_static, objects, things, 0, ground)

@@ -160,8 +160,8 @@ def test_going_on_evenly() -> None:
     thing = street([CAR], [WRONG]).things[0]
     even = straight(thing, 0.25, 0.5)
     at = np.array([0.0, 0.25, 0.7])
-    np.testing.assert_allclose(even.box.middle(at), thing.box.middle(at), atol=1e-9)
-    np.testing.assert_array_equal(even.box.ahead[0], thing.box.ahead[2])
+    np.testing.assert_allclose(even.box.center_at(at), thing.box.center_at(at), atol=1e-9)
+    np.testing.assert_array_equal(even.box.heading[0], thing.box.heading[2])
     assert even.foot.tolist() == [thing.foot[2]] * 2
 
 

@@ -13,7 +13,7 @@ from stillmap.mesh.objects.reconstruction import shape_of
 from stillmap.mesh.objects.segmentation import Moves
 from stillmap.mesh.options import MoverOptions
 from stillmap.mesh.texture.occluders import Thing
-from stillmap.tracking.boxes import box_of
+from stillmap.tracking.boxes import fit_box
 
 OPTIONS = MoverOptions()
 CAR = Car((6.0, -2.5), (6.0, 0.0))
@@ -46,7 +46,7 @@ def test_a_track_of_two_cars_does_not_make_them_one() -> None:
     names = ("scan", "stamp_ns", "xy", "velocity", "beams", "z")
     ways = {name: np.concatenate([getattr(one, name) for one in (first, last)]) for name in names}
     both = dataclasses.replace(first, **ways)
-    thing = Thing(box_of(both, 0, 0.5), np.zeros(len(both.scan)), both.size[2])
+    thing = Thing(fit_box(both, 0, 0.5), np.zeros(len(both.scan)), both.size[2])
     objects, things = [*sources.objects[:2], both], [*sources.things[:2], thing]
     sources = dataclasses.replace(sources, objects=objects, things=things)
     moves = Moves.of(sources)

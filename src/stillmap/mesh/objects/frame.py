@@ -32,8 +32,8 @@ class Way(NamedTuple):
     def local(self, seconds: Float, points: Float) -> Float:
         """(n, 3) metres in its own frame, of points (n, 3) in the map frame at times (n,)."""
         box = self.thing.box
-        middle = box.middle(seconds)
-        ahead = box.ahead[_at(box.seconds, seconds)]
+        middle = box.center_at(seconds)
+        ahead = box.heading[_at(box.seconds, seconds)]
         off = points[:, :2] - middle
         foot = np.interp(seconds, box.seconds, self.thing.foot)
         at = np.stack(

@@ -159,7 +159,7 @@ class Followed(NamedTuple):
 
 def followed_of(sources: Sources, moves: Moves, options: MoverOptions) -> list[Followed]:
     """The objects that have a box, each with its beams."""
-    things = {thing.box.thing: thing for thing in sources.things}
+    things = {thing.box.object_id: thing for thing in sources.things}
     out = []
     for one in sources.objects:
         if one.id in things:

@@ -280,8 +280,8 @@ def straight(thing: Thing, now: float, reach: float) -> Thing:
     even = dataclasses.replace(
         box,
         seconds=seconds,
-        xy=box.middle(np.array([now])) + (seconds - now)[:, None] * velocity,
-        ahead=np.tile(box.ahead[at], (2, 1)),
+        xy=box.center_at(np.array([now])) + (seconds - now)[:, None] * velocity,
+        ahead=np.tile(box.heading[at], (2, 1)),
         velocity=np.tile(velocity, (2, 1)),
     )
     return Thing(even, np.full(2, np.interp(now, box.seconds, thing.foot)), thing.tall)

@@ -80,7 +80,7 @@ class Moves(NamedTuple):
 def _dynamic(hit: Bool, p_static: NDArray[np.float32]) -> Index:
     """The beams that hit something rather dynamic than static; little waits in memory."""
     found = [np.zeros(0, np.intp)]
-    for block in arrays.blocks(hit, p_static):
+    for block in arrays.iter_blocks(hit, p_static):
         moves = hit[block] & (p_static[block] < DYNAMIC_BELOW)
         found.append(block.start + np.flatnonzero(moves))
     return np.concatenate(found)
@@ -112,7 +112,7 @@ def fast(thing: Thing, options: MoverOptions) -> bool:
 
 def large(thing: Thing, options: MoverOptions) -> bool:
     """Whether it is longer or wider than people are."""
-    return 2.0 * max(thing.box.half) >= options.rigid
+    return 2.0 * max(thing.box.half_size) >= options.rigid
 
 
 def own_moves(
@@ -127,10 +127,10 @@ def own_moves(
     a = int(np.searchsorted(stamps, box.seconds[0] - box.hold))
     b = max(int(np.searchsorted(stamps, box.seconds[-1] + box.hold, side="right")), a)
     some = moves.between(int(offset[a]), int(offset[b]))
-    half = np.array(box.half) + options.margin
+    half = np.array(box.half_size) + options.margin
     # what is far from all of its way need not be asked where it was then
     reach = max(float(np.linalg.norm(half)) + options.margin, _REACH)
-    way = box.middle(np.concatenate([box.seconds, box.seconds[[0, -1]] + [-box.hold, box.hold]]))
+    way = box.center_at(np.concatenate([box.seconds, box.seconds[[0, -1]] + [-box.hold, box.hold]]))
     low, high = way.min(axis=0) - reach, way.max(axis=0) + reach
     x, y = moves.ends[some, 0], moves.ends[some, 1]
     near = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])

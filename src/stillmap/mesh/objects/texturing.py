@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from stillmap.core.camera import project, within
+from stillmap.core.camera import is_in_image, project
 from stillmap.mesh.background import Ahead, looked_up
 from stillmap.mesh.objects.reconstruction import Shape
 from stillmap.mesh.options import ChoiceOptions, MoverOptions, VisibleOptions
@@ -45,7 +45,7 @@ def when_in_view(thing: Thing, views: Sequence[View], start_ns: int) -> Float:
     for k, (view, now) in enumerate(zip(views, seconds.tolist(), strict=True)):
         for cuboid in at_time([thing], now):
             uv, ok = project(view.camera, view.in_camera(cuboid.middle[None]))
-            if ok[0] and within(view.camera, uv)[0]:
+            if ok[0] and is_in_image(view.camera, uv)[0]:
                 out[k] = now
     return out
 
@@ -78,7 +78,7 @@ def dressed(
     mesh, _ = divided(shape.mesh, min(choice.edge, options.edge))
     candidates = Candidates.none(len(mesh), choice.candidates)
     sharpest, own = Candidates.none(len(mesh), 1), list[View]()
-    others = [one for one in things if one.box.thing != shape.id]
+    others = [one for one in things if one.box.object_id != shape.id]
     seconds = when_in_view(shape.way.thing, views, start_ns)
     for number, (view, now) in enumerate(zip(views, seconds.tolist(), strict=True)):
         away = max(shape.span[0] - now, now - shape.span[1], 0.0)
@@ -129,7 +129,7 @@ def _shows_it(
 
 def _gone(shape: Shape, seconds: float) -> float:
     """Metres that a thing went from when its shape was seen to a time."""
-    there = shape.way.thing.box.middle(np.array([shape.seconds, seconds]))
+    there = shape.way.thing.box.center_at(np.array([shape.seconds, seconds]))
     return float(np.linalg.norm(there[1] - there[0]))
 
 

@@ -57,11 +57,11 @@ def at_time(things: Sequence[Thing], seconds: float) -> list[Cuboid]:
         late = max(seconds - box.seconds[-1], 0.0)
         if max(-early, late) > box.hold:
             continue
-        xy = box.middle(np.array([seconds]))[0]
+        xy = box.center_at(np.array([seconds]))[0]
         at = max(int(np.searchsorted(box.seconds, seconds, side="right")) - 1, 0)
         low = float(np.interp(seconds, box.seconds, foot))
         middle = np.array([xy[0], xy[1], low + 0.5 * tall])
-        out.append(Cuboid(middle, box.ahead[at], np.array([*box.half, 0.5 * tall])))
+        out.append(Cuboid(middle, box.heading[at], np.array([*box.half_size, 0.5 * tall])))
     return out
 
 

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from stillmap.core.camera import Camera, project
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import beam_ns, longest_scan_ns
+from stillmap.core.timestamps import beam_stamps_ns, max_scan_duration_ns
 from stillmap.mesh.options import ChoiceOptions
 from stillmap.mesh.texture.views import View
 from stillmap.tracking.boxes import Box
@@ -213,7 +213,7 @@ class Beams:
         if scans.stop <= scans.start:
             return np.zeros((0, 3)), np.zeros(0, np.float32)
         first, last = self.seen.offset[[scans.start, scans.stop]]
-        at_ns = beam_ns(self.recording, scans)
+        at_ns = beam_stamps_ns(self.recording, scans)
         apart = np.abs(at_ns - stamp_ns)
         # at least what is nearest, as where scans count as taken at once
         near = apart <= max(int(1e9 * window), int(apart.min(initial=_NEVER)))
@@ -240,7 +240,7 @@ class Beams:
     @cached_property
     def _longest(self) -> int:
         """Nanoseconds that a scan takes at most, about."""
-        return longest_scan_ns(self.recording)
+        return max_scan_duration_ns(self.recording)
 
     def _go_on(self, ends: Float, beams: Index, at_ns: NDArray[np.int64], stamp_ns: int) -> None:
         for box, owned in zip(self.boxes, self.owned, strict=True):
@@ -250,6 +250,6 @@ class Beams:
             mine = np.flatnonzero(owned[np.minimum(place, len(owned) - 1)] == beams)
             if not len(mine):
                 continue
-            then = box.middle(np.asarray(1e-9 * (at_ns[mine] - self.start_ns), np.float64))
-            now = box.middle(np.array([1e-9 * (stamp_ns - self.start_ns)]))
+            then = box.center_at(np.asarray(1e-9 * (at_ns[mine] - self.start_ns), np.float64))
+            now = box.center_at(np.array([1e-9 * (stamp_ns - self.start_ns)]))
             ends[mine, :2] += now - then

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.core import se2
-from stillmap.mapping.beam_statistics import dynamic_points
+from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.snapshots import Snapshot, Window
 from stillmap.results.map_npz import CHANGED, changed_cells, known_area
 from stillmap.results.protocols import ChangeLike, ResultLike
@@ -55,13 +55,13 @@ def maps_section(result: ResultLike) -> str:
     window = shown_window([result.raw_map, result.map])
     raw, filtered = map_image(result.raw_map, window), map_image(result.map, window)
     dots = dots_image(
-        dynamic_points(result.seen, result.poses, result.p_static)[:, :2],
+        sample_dynamic_points(result.seen, result.poses, result.p_static)[:, :2],
         window,
         filtered.size,
     )
     veil = thin_image(result.map, result.evidence.thin, window)
     path = _path(
-        se2.planar(result.poses) if result.recording.dimension == 3 else result.poses,
+        se2.project_to_plane(result.poses) if result.recording.dimension == 3 else result.poses,
         window,
         filtered.size,
     )

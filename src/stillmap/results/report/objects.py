@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from stillmap.mapping.beam_statistics import dynamic_points
+from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.snapshots import Window
 from stillmap.results.protocols import MovingObjectLike, ResultLike, TiltingLike, TrafficLike
 from stillmap.results.report.figures import dots_image, map_image, pixel_positions, shown_window
@@ -171,7 +171,7 @@ def _where(result: ResultLike, tilting: TiltingLike) -> str:
         return ""
     window = shown_window([result.map])
     picture = map_image(result.map, window)
-    ends = dynamic_points(tilting.seen, tilting.poses, tilting.p_static)[:, :2]
+    ends = sample_dynamic_points(tilting.seen, tilting.poses, tilting.p_static)[:, :2]
     reduced = picture.size[0] < round((window[2] - window[0]) / result.map.resolution)
     layers = [(picture, ""), (dots_image(ends, window, picture.size), "")]
     caption = "from above, in orange, on the flat laser's map"

@@ -10,8 +10,8 @@ from html import escape
 from pathlib import Path
 from string import Template
 
-from stillmap.core.json import jsonable, skipped_count, version
-from stillmap.mapping.beam_statistics import beam_counts
+from stillmap.core.json import count_skipped, to_jsonable, version
+from stillmap.mapping.beam_statistics import count_beams
 from stillmap.results.protocols import ResultLike, TiltingLike
 from stillmap.results.report.figures import likelihood_svg
 from stillmap.results.report.maps import changes_section, evolution_section, maps_section
@@ -239,7 +239,7 @@ def _header(result: ResultLike, name: str) -> str:
 
 def _headline(result: ResultLike) -> str:
     recording = result.recording
-    counts = beam_counts(recording, result.p_static)
+    counts = count_beams(recording, result.p_static)
     stamps = recording.stamp_ns
     seconds = float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
     took = sum(float(stage.get("seconds") or 0) for stage in result.stages.values())
@@ -277,7 +277,7 @@ def _per_scan(seconds: float, scans: int) -> str:
 
 
 def _skipped_note(result: ResultLike) -> str:
-    skipped = skipped_count(result.recording.source)
+    skipped = count_skipped(result.recording.source)
     return f"{skipped:,} damaged, skipped" if skipped else "none skipped"
 
 
@@ -319,9 +319,9 @@ def _curve(result: ResultLike) -> str:
 
 
 def _recording_section(result: ResultLike) -> str:
-    source = jsonable(result.recording.source)
+    source = to_jsonable(result.recording.source)
     skipped, odometry = source.pop("skipped", None), source.pop("skipped_odometry", None)
-    counts = beam_counts(result.recording, result.p_static)
+    counts = count_beams(result.recording, result.p_static)
     beams = (
         f"Of {counts['beams']:,} beams {counts['hits']:,} hit something, {counts['max_range']:,} "
         f"met nothing within range and {counts['unusable']:,} are unusable."

@@ -9,8 +9,8 @@ from html import escape
 from typing import Any
 
 from stillmap.core.config import to_dict
-from stillmap.core.json import jsonable
-from stillmap.mapping.beam_statistics import beam_counts
+from stillmap.core.json import to_jsonable
+from stillmap.mapping.beam_statistics import count_beams
 from stillmap.results.protocols import IterationRecordLike, ResultLike
 
 # a damaged file can have a remark on every line; run.json names them all
@@ -103,7 +103,7 @@ def options_table(options: Any) -> str:
     rows = [
         f'<tr><th scope="row"><code>{escape(name)}</code></th>'
         f"<td><code>{escape(_scalar(value))}</code></td></tr>"
-        for name, value in _flat(jsonable(to_dict(options)), "")
+        for name, value in _flat(to_jsonable(to_dict(options)), "")
     ]
     return _table(("option", "value"), rows)
 
@@ -201,7 +201,7 @@ def learned_section(result: ResultLike) -> str:
             _percent,
         )
     ]
-    moving = beam_counts(result.recording, result.p_static)["dynamic"]
+    moving = count_beams(result.recording, result.p_static)["dynamic"]
     if moving < _FEW:
         note = f"Only {moving:,} beams met something moving: too few to say how long it stays."
     else:
