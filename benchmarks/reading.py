@@ -18,13 +18,13 @@ import numpy as np
 from tables import markdown
 
 from stillmap import build
-from stillmap.core.profiling import Stages
+from stillmap.core.profiling import StageTimer
 from stillmap.core.recording import Recording
 from stillmap.io import read, writers
 from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.bag_types import ENDINGS
-from stillmap.io.ros.collect import content
-from stillmap.io.ros.topics import chosen_topics
+from stillmap.io.ros.collect import collect_messages
+from stillmap.io.ros.topics import select_topics
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.sim import scene_by_name, simulate
 
@@ -92,14 +92,14 @@ def _speeds(paths: list[Path], scans: int, repeats: int) -> str:
 
 def _gathered(path: Path) -> None:
     bag, options = open_bag(path, None, trusted=True), ReadOptions()
-    content(bag, chosen_topics(bag, options), options, None, None)
+    collect_messages(bag, select_topics(bag, options), options, None, None)
     bag.close()
 
 
 def _shares(paths: list[Path]) -> str:
     rows = []
     for path in paths:
-        stages = Stages()
+        stages = StageTimer()
         with stages.measure("read"):
             recording = read(path)
         build(recording, stages=stages)

@@ -7,7 +7,7 @@ import pytest
 
 from stillmap.core.errors import InputError
 from stillmap.io import read
-from stillmap.io.carmen.writer import code, write_filtered_log
+from stillmap.io.carmen.writer import find_no_return_code, write_filtered_log
 from stillmap.preprocessing.max_range import RangeRule
 
 # real readings, and a code that repeats in several directions
@@ -39,7 +39,7 @@ def test_all_other_bytes_stay(made, tmp_path):
     source, out = made(), tmp_path / "out.log"
     recording, done = blanked(source, out, [0, 2, 7])
     assert recording.n_scans == 3
-    assert (done.scans, done.beams, done.left_out) == (3, 3, 1)
+    assert (done.scans, done.beams, done.omitted) == (3, 3, 1)
     before, after = (path.read_text().splitlines() for path in (source, out))
     # time ran backwards there: nothing is known of its beams
     assert before.pop(7).split()[-3] == "0.25"
@@ -100,7 +100,7 @@ def test_newer_logs_keep_only_the_lines_that_were_read(log, tmp_path):
         lines.append(f"ROBOTLASER1 {header} {readings} 0 {pose} {k + 1} {host}")
     source, out = log(lines), tmp_path / "out.log"
     _, done = blanked(source, out, [2])
-    assert (done.scans, done.left_out) == (3, 3)
+    assert (done.scans, done.omitted) == (3, 3)
     written = out.read_text().splitlines()
     assert [line.split()[0] for line in written] == ["ROBOTLASER1"] * 3
     assert written[0].split()[9:13] == ["1.5", "81.83", "81.83", "4.0"]
@@ -130,4 +130,4 @@ def rule(threshold=None, zero="unusable", free=20.0):
     ],
 )
 def test_what_stands_for_nothing(readings, said, expected):
-    assert code(np.array(readings, np.float32), said) == expected
+    assert find_no_return_code(np.array(readings, np.float32), said) == expected

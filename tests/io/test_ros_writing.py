@@ -207,7 +207,7 @@ def test_a_bag_appears_whole_or_not_at_all(tmp_path, driven, kind, monkeypatch):
     path = tmp_path / KINDS[kind]
     write_recording(driven, path, kind)
     before = [(p, p.read_bytes()) for p in sorted(Path(tmp_path).rglob("*")) if p.is_file()]
-    monkeypatch.setattr(message_writer, "laser_scan", lambda *_: 1 / 0)
+    monkeypatch.setattr(message_writer, "make_laser_scan", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         write_recording(driven, path, kind, overwrite=True)
     assert [(p, p.read_bytes()) for p in sorted(tmp_path.rglob("*")) if p.is_file()] == before

@@ -8,7 +8,7 @@ import pytest
 
 from stillmap.core import arrays
 from stillmap.io import builder
-from stillmap.io.builder import Gathered
+from stillmap.io.builder import RecordingBuilder
 from stillmap.preprocessing.options import ReadOptions
 
 
@@ -19,12 +19,12 @@ def rng():
 
 @pytest.fixture(params=[0, 1 << 20], ids=["in files", "in memory"])
 def limit(request, monkeypatch):
-    monkeypatch.setattr(arrays, "IN_MEMORY", request.param)
+    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", request.param)
     return request.param
 
 
 def test_a_column_is_what_was_added(limit, tmp_path, rng):
-    column, parts = arrays.Column(np.float32, (3,), tmp_path), []
+    column, parts = arrays.ArrayBuilder(np.float32, (3,), tmp_path), []
     for n in (5, 0, 1, 70):
         parts.append(rng.normal(size=(n, 3)).astype(np.float32))
         column.append(parts[-1])
@@ -33,46 +33,46 @@ def test_a_column_is_what_was_added(limit, tmp_path, rng):
     np.testing.assert_array_equal(got, np.concatenate(parts))
     assert got.dtype == np.float32
     assert got.flags.writeable == (limit > 0)
-    arrays.let_go(got)
+    arrays.release_pages(got)
     np.testing.assert_array_equal(got, np.concatenate(parts))
     assert list(tmp_path.iterdir()) == []  # a file without a name leaves nothing behind
 
 
 def test_an_empty_column(limit, tmp_path):  # noqa: ARG001
-    assert arrays.Column(np.int32, (), tmp_path).finished().shape == (0,)
+    assert arrays.ArrayBuilder(np.int32, (), tmp_path).finished().shape == (0,)
 
 
 def test_wrong_rows_are_refused():
     with pytest.raises(ValueError, match=r"expected \(n, \*\(2,\)\)"):
-        arrays.Column(np.float32, (2,)).append(np.zeros((4, 3)))
+        arrays.ArrayBuilder(np.float32, (2,)).append(np.zeros((4, 3)))
 
 
 def test_new_arrays_keep_what_is_written(limit, tmp_path):  # noqa: ARG001
     values = arrays.empty((40, 2), np.float32, tmp_path)
     values[:] = np.arange(80).reshape(40, 2)
-    arrays.let_go(values)
+    arrays.release_pages(values)
     np.testing.assert_array_equal(values, np.arange(80).reshape(40, 2))
 
 
 def test_a_full_disk_is_an_error(monkeypatch):
-    monkeypatch.setattr(arrays, "IN_MEMORY", 0)
+    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
     full = Path("/dev/full")
     if not full.exists():
         pytest.skip("no /dev/full here")
     with full.open("r+b", buffering=0) as file:
         monkeypatch.setattr(arrays, "_nameless", lambda _: file)
         with pytest.raises(OSError, match="No space left"):
-            arrays.Column(np.float32).append(np.ones(3))
+            arrays.ArrayBuilder(np.float32).append(np.ones(3))
 
 
 @pytest.mark.parametrize("block", [4, 1 << 20])
 def test_scans_are_put_in_order(limit, tmp_path, rng, monkeypatch, block):  # noqa: ARG001
     monkeypatch.setattr(builder, "_BLOCK", block)
     scans = [rng.normal(size=(n, 3)).astype(np.float32) for n in (4, 0, 9)]
-    gathered = Gathered(3, ReadOptions(), beam_times=True, folder=tmp_path)
+    gathered = RecordingBuilder(3, ReadOptions(), beam_times=True, folder=tmp_path)
     for stamp, points in zip((30, 10, 20), scans, strict=True):
-        gathered.add(stamp, points, beam_time=np.full(len(points), stamp / 100.0))
-    found = gathered.recording(np.eye(4)[None], source={})
+        gathered.add_scan(stamp, points, beam_time=np.full(len(points), stamp / 100.0))
+    found = gathered.build(np.eye(4)[None], source={})
     np.testing.assert_array_equal(found.stamp_ns, [10, 20, 30])
     np.testing.assert_array_equal(found.offset, [0, 0, 9, 13])
     np.testing.assert_array_equal(found.points, np.concatenate([scans[2], scans[0]]))
@@ -80,10 +80,10 @@ def test_scans_are_put_in_order(limit, tmp_path, rng, monkeypatch, block):  # no
 
 
 def test_ranges_of_clouds():
-    gathered = Gathered(2, ReadOptions(min_range=1.0, max_range=4.0))
+    gathered = RecordingBuilder(2, ReadOptions(min_range=1.0, max_range=4.0))
     x = [0.5, 2.0, 8.0, np.nan, np.inf, 0.0]
-    gathered.add(0, np.stack([x, np.zeros(6)], axis=1))
-    found = gathered.recording(np.eye(3)[None], source={})
+    gathered.add_scan(0, np.stack([x, np.zeros(6)], axis=1))
+    found = gathered.build(np.eye(3)[None], source={})
     np.testing.assert_array_equal(found.hit, [False, True, False, False, False, False])
     np.testing.assert_array_equal(found.points[:, 0], [np.nan, 2.0, 4.0, np.nan, np.nan, np.nan])
 
@@ -97,11 +97,11 @@ def resident() -> int:
 
 
 def test_what_is_let_go_takes_no_memory(monkeypatch, tmp_path):
-    monkeypatch.setattr(arrays, "IN_MEMORY", 0)
+    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
     values = arrays.empty((64 << 20,), np.uint8, tmp_path)
     values[:] = 1
     held = resident()
-    arrays.let_go(values[100:].reshape(-1, 4))  # the whole file, whatever is made of it
+    arrays.release_pages(values[100:].reshape(-1, 4))  # the whole file, whatever is made of it
     assert resident() < held - (48 << 20)
     assert (values == 1).all()
 
@@ -110,20 +110,20 @@ def test_changes_of_a_copy_on_write_stay(tmp_path):
     np.arange(1 << 16).tofile(tmp_path / "values")
     values = np.memmap(tmp_path / "values", np.int64, mode="c")
     values[:] = 7
-    arrays.let_go(values[100:].reshape(-1, 4))
+    arrays.release_pages(values[100:].reshape(-1, 4))
     assert (values == 7).all()
 
 
 def test_blocks_are_all_rows_once(limit, tmp_path):  # noqa: ARG001
     values = arrays.empty((10, 2), np.int64, tmp_path)
-    for block in arrays.blocks(values, rows=4):
+    for block in arrays.iter_blocks(values, rows=4):
         values[block] = block.start
     assert values[:, 0].tolist() == [0] * 4 + [4] * 4 + [8] * 2
 
 
 def test_copies_are_apart(limit, tmp_path):  # noqa: ARG001
     values = np.arange(12.0).reshape(6, 2)
-    copy = arrays.copied(values, tmp_path)
+    copy = arrays.copy(values, tmp_path)
     copy[0] = 7.0
     np.testing.assert_array_equal(copy[1:], values[1:])
     assert values[0, 0] == 0.0
@@ -131,9 +131,9 @@ def test_copies_are_apart(limit, tmp_path):  # noqa: ARG001
 
 @pytest.mark.parametrize("items", [0, 1, 7])
 def test_items_in_turn_are_the_same(items, monkeypatch):
-    monkeypatch.setattr(arrays, "TOGETHER", 3)
+    monkeypatch.setattr(arrays, "ITEMS_PER_RELEASE", 3)
     got, let_go_after = [], []
-    for item in arrays.in_turn(range(items), lambda: let_go_after.append(len(got))):
+    for item in arrays.release_periodically(range(items), lambda: let_go_after.append(len(got))):
         got.append(item)
     assert got == list(range(items))
     # at first for what was looked at before, and what is left at the end
@@ -142,10 +142,10 @@ def test_items_in_turn_are_the_same(items, monkeypatch):
 
 @pytest.mark.parametrize(("rows", "together"), [(100.0, 5), (400.0, 2), (1e9, 1), (0.0, 5)])
 def test_of_large_items_fewer_are_held(rows, together, monkeypatch):
-    monkeypatch.setattr(arrays, "TOGETHER", 5)
+    monkeypatch.setattr(arrays, "ITEMS_PER_RELEASE", 5)
     monkeypatch.setattr(arrays, "BLOCK", 1000)
     got, let_go_after = [], []
-    for item in arrays.in_turn(range(11), lambda: let_go_after.append(len(got)), rows):
+    for item in arrays.release_periodically(range(11), lambda: let_go_after.append(len(got)), rows):
         got.append(item)
     assert let_go_after == [*range(0, 11, together), 11]
 
@@ -155,7 +155,7 @@ def test_what_is_looked_at_together_lies_together(monkeypatch, rng, rows):
     monkeypatch.setattr(arrays, "BLOCK", 100)
     for n in (0, 1, 250):
         numbers = np.flatnonzero(rng.random(1000) < n / 1000)
-        parts = [numbers[part] for part in arrays.near(numbers, rows)]
+        parts = [numbers[part] for part in arrays.split_by_block(numbers, rows)]
         assert np.concatenate([np.zeros(0, int), *parts]).tolist() == numbers.tolist()
         for part in parts:
             assert 0 < len(part) <= rows
@@ -164,9 +164,9 @@ def test_what_is_looked_at_together_lies_together(monkeypatch, rng, rows):
 
 def test_some_rows_are_those_of_the_array(limit, monkeypatch, tmp_path, rng):
     monkeypatch.setattr(arrays, "BLOCK", 100)
-    column = arrays.Column(np.float32, (2,), tmp_path)
+    column = arrays.ArrayBuilder(np.float32, (2,), tmp_path)
     column.append(rng.normal(size=(1000, 2)))
     array = column.finished()
     assert array.flags.writeable == (limit > 0)
     for numbers in (np.zeros(0, np.intp), np.array([0, 99, 100, 999]), np.arange(1000)):
-        np.testing.assert_array_equal(arrays.rows_of(array, numbers), array[numbers])
+        np.testing.assert_array_equal(arrays.take_rows(array, numbers), array[numbers])

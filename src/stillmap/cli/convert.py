@@ -29,8 +29,8 @@ from stillmap.core.files import require_new_file
 from stillmap.core.recording import Recording
 from stillmap.eval.readers import read_colours
 from stillmap.io import read, writers
-from stillmap.io.registry import format_of
-from stillmap.io.ros.bag_types import Kind
+from stillmap.io.registry import detect_format
+from stillmap.io.ros.bag_types import BagKind
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results import reader
@@ -114,7 +114,7 @@ def converted(args: argparse.Namespace) -> tuple[list[str], str]:
     if is_result(source):
         with parents_made(output):
             return _convert_result(args, source, output)
-    format_of(source)  # what is not there is told before what cannot be written
+    detect_format(source)  # what is not there is told before what cannot be written
     with parents_made(output):
         return _convert_recording(args, source, output)
 
@@ -127,14 +127,14 @@ def _convert_recording(
         raise InputError(f"{flag} is for results", where=str(source))
     read_options = config.replaced(ReadOptions(), read_changes(args).get("read", {}))
     require_apart(output, source)
-    writer = writers.writer_for(output, args.to)
+    writer = writers.find_writer(output, args.to)
     writers.require_free(output, writer, args.overwrite)
     with shown_share(args.quiet, "reading") as tell:
         recording = read(source, read_options, progress=tell, scratch=output.absolute().parent)
     if not recording.n_scans:
         raise InputError("holds no scan", where=str(source))
     lost = writers.write(recording, output, name=args.to, overwrite=args.overwrite)
-    return lost, f"{recording.n_scans} scans, {recording.n_beams} beams as {writer.about}"
+    return lost, f"{recording.n_scans} scans, {recording.n_beams} beams as {writer.description}"
 
 
 def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tuple[list[str], str]:
@@ -158,12 +158,12 @@ def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tup
         return [], f"{exported.recording.n_beams} beams"
     hint = f"a bag, .mcap for Foxglove, {_PARQUET}, or in 3D {_clouds()}, {obj.ENDING}"
     try:
-        writer = writers.writer_for(output, args.to)
+        writer = writers.find_writer(output, args.to)
     except InputError as error:
         raise InputError(error.what, where=str(output), hint=hint) from error
-    kind = next((kind for kind in get_args(Kind) if kind == writer.name), None)
+    kind = next((kind for kind in get_args(BagKind) if kind == writer.name), None)
     if kind is None:
-        text = f"a result cannot be written as {writer.about}"
+        text = f"a result cannot be written as {writer.description}"
         more = "; recordings come of `stillmap filter`"
         raise InputError(text, where=str(output), hint=hint + more)
     writers.require_free(output, writer, args.overwrite)
@@ -220,4 +220,4 @@ def _exported(mapped: Mapped) -> reader.Exported:
 def _seen(mapped: Mapped, recording: Recording, poses: NDArray[np.float64]) -> Recording:
     """The recording without the motion during its scans, as it was mapped."""
     how = slam.SlamOptions(deskew=is_deskewed(mapped.record))
-    return slam.deskewed(recording, poses, how)
+    return slam.deskew_recording(recording, poses, how)

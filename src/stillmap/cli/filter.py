@@ -20,8 +20,8 @@ from stillmap.core.files import require_new, require_new_file
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder, writers
 from stillmap.io.carmen import writer
-from stillmap.io.registry import format_of
-from stillmap.io.ros.bag_types import own_form
+from stillmap.io.registry import detect_format
+from stillmap.io.ros.bag_types import detect_kind
 
 _EPILOG = """examples:
   stillmap filter out -o clean.clf.gz
@@ -108,7 +108,7 @@ def filtered(
         InputError: the result or its recording is not there, or the output is taken.
     """
     mapped = found(result, given)
-    form = format_of(mapped.source) if mapped.source.exists() else None
+    form = detect_format(mapped.source) if mapped.source.exists() else None
     if form is not None:
         _require_ending(output, mapped.source, form.name)
     require_apart(output, mapped.source, mapped.folder)
@@ -126,7 +126,7 @@ def filtered(
     hits = blanked = 0
     scratch = output.absolute().parent
     blank = arrays.empty(recording.hit.shape, np.bool_, scratch)
-    for block in arrays.blocks(recording.hit, labels.p_static, blank):
+    for block in arrays.iter_blocks(recording.hit, labels.p_static, blank):
         hit = recording.hit[block]
         # NaN: unusable anyway
         blank[block] = hit & (labels.p_static[block] < below)
@@ -143,8 +143,8 @@ def _require_ending(output: Path, source: Path, form: str) -> None:
         InputError: the ending is that of another form.
     """
     own = {"CARMEN log": "carmen", "ROS bag": ""}.get(form, form)
-    said = writers.said_by_ending(output)
-    if said is not None and said != (own or own_form(source)[0]):
+    said = writers.format_of_ending(output)
+    if said is not None and said != (own or detect_kind(source)[0]):
         what = f"would be a {form} like {source.name}, which its ending does not say"
         raise InputError(what, where=str(output), hint="`stillmap convert` makes another form")
 
@@ -153,7 +153,7 @@ def _write(
     mapped: Mapped, output: Path, recording: Recording, blank: NDArray[np.bool_], overwrite: bool
 ) -> tuple[int, list[str], list[str]]:
     """How many scans, and which topics, are not in what was written; which are not filtered."""
-    form = format_of(mapped.source)
+    form = detect_format(mapped.source)
     if form.name == "ROS bag":
         from stillmap.io.ros import recording_writer
 
@@ -161,21 +161,21 @@ def _write(
         done = recording_writer.write_filtered_bag(
             mapped.source, output, recording, blank, options, overwrite=overwrite
         )
-        return done.left_out, done.topics, done.unfiltered
+        return done.omitted, done.omitted_topics, done.unfiltered_topics
     if form.name == "stillmap recording":
         stillmap_folder.write(
             _without(recording, blank, output.absolute().parent), output, overwrite=overwrite
         )
         return 0, [], []
     if form.name == "CARMEN log":
-        return writer.write_filtered_log(mapped.source, output, recording, blank).left_out, [], []
+        return writer.write_filtered_log(mapped.source, output, recording, blank).omitted, [], []
     hint = "`stillmap convert` makes a recording of another form that can be"
     raise InputError(f"a {form.name} cannot be written again", where=str(mapped.source), hint=hint)
 
 
 def _without(recording: Recording, blank: NDArray[np.bool_], scratch: Path) -> Recording:
     """Blanked beams went as far as they did, and met nothing."""
-    hit = arrays.copied(recording.hit, scratch)
-    for block in arrays.blocks(hit, blank):
+    hit = arrays.copy(recording.hit, scratch)
+    for block in arrays.iter_blocks(hit, blank):
         hit[block] &= ~blank[block]
     return dataclasses.replace(recording, hit=hit)

@@ -11,12 +11,12 @@ from stillmap.core.errors import InputError
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.recording import Recording
 from stillmap.io import read
-from stillmap.io.registry import format_of
+from stillmap.io.registry import detect_format
 from stillmap.io.text_lines import Progress
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import Result
-from stillmap.rig.build import Flat, Tilting, built_in_3d, require_rig
+from stillmap.rig.build import PlanarResult, TiltingResult, build_tilting, check_rig
 
 
 def read_tilting(
@@ -43,7 +43,7 @@ def read_tilting(
             read_as = dataclasses.replace(options.read, topic=None)
             found = read(Path(args.tilting), read_as, progress=tell, scratch=scratch)
     path = args.tilting or args.input
-    require_rig(flat, found, path)
+    check_rig(flat, found, path)
     return dataclasses.replace(found, source={**found.source, "path": path})
 
 
@@ -58,7 +58,7 @@ def _of_topic(
     """The laser that tilts, of the same bag as the flat one, on the same robot."""
     from stillmap.io.ros.reader import read_tilting  # types of messages take long to load
 
-    if format_of(path).name != "ROS bag":
+    if detect_format(path).name != "ROS bag":
         raise InputError("--tilting-topic is for bags", where=str(path))
     base = flat.source.get("base_frame")
     read_as = dataclasses.replace(
@@ -69,18 +69,20 @@ def _of_topic(
 
 
 @limit_blas_threads()
-def built(result: Result, tilting: Recording, options: Options) -> Tilting:
+def built(result: Result, tilting: Recording, options: Options) -> TiltingResult:
     """What that laser built, once the flat one knows what moves."""
-    return built_in_3d(Flat.of(result), tilting, options, resolve_threads(options.threads))
+    return build_tilting(
+        PlanarResult.of(result), tilting, options, resolve_threads(options.threads)
+    )
 
 
-def said(tilting: Tilting) -> str:
+def said(tilting: TiltingResult) -> str:
     """A line about it."""
-    counts = count_beams(tilting.seen, tilting.p_static)
+    counts = count_beams(tilting.deskewed, tilting.p_static)
     out = (
         f"in 3D {counts['hits']} beams that hit something, "
         f"{100.0 * counts['dynamic'] / max(counts['hits'], 1):.1f} % of them dynamic"
     )
-    if tilting.left_out:
-        out += f"; {tilting.left_out} left out: nobody knows where the robot was"
+    if tilting.unposed_beams:
+        out += f"; {tilting.unposed_beams} left out: nobody knows where the robot was"
     return out

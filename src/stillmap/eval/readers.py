@@ -18,11 +18,11 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
 from stillmap.core.recording import Recording
 from stillmap.io.carmen.log import CarmenLog, read_log
-from stillmap.io.registry import RIG
+from stillmap.io.registry import RIG_FOLDERS
 from stillmap.io.registry import read as recording_of
 from stillmap.io.stillmap_folder import read as read_folder
-from stillmap.io.text_lines import head
-from stillmap.io.trajectory import LARGEST, read_tum
+from stillmap.io.text_lines import read_head
+from stillmap.io.trajectory import MAX_BYTES, read_tum
 from stillmap.results.reader import shape_text
 
 Bool = NDArray[np.bool_]
@@ -93,7 +93,7 @@ def read_truth(path: Path, labels: Labels | None = None) -> Truth:
     folder = path.parent if path.name == "truth" and not (path / "truth").exists() else path
     if (folder / "truth").is_dir():
         return _truth(folder)
-    inside = [path / name for name in RIG]
+    inside = [path / name for name in RIG_FOLDERS]
     if not all((one / "truth").is_dir() for one in inside):
         raise InputError(
             "holds no truth", where=str(path), hint="a folder that 'stillmap simulate' wrote"
@@ -113,7 +113,7 @@ def _share_alike(labels: Labels, recording: Recording) -> float:
     """The share of beams that hit something in both, or in neither; -1 of other beams."""
     if labels.hit.shape != recording.hit.shape:
         return -1.0
-    blocks = arrays.blocks(labels.hit, recording.hit)
+    blocks = arrays.iter_blocks(labels.hit, recording.hit)
     same = sum(int((labels.hit[b] == recording.hit[b]).sum()) for b in blocks)
     return same / max(len(labels.hit), 1)
 
@@ -130,7 +130,7 @@ def read_labels(result: Path) -> Labels:
     beams = int(offset[-1])
     path = folder / "p_static.npy"
     p_static = _array(path, (beams,), "f")
-    for block in arrays.blocks(p_static):
+    for block in arrays.iter_blocks(p_static):
         wrong = np.flatnonzero((p_static[block] < 0) | (p_static[block] > 1))
         if len(wrong):
             beam = block.start + int(wrong[0])
@@ -297,7 +297,7 @@ class _FirstRow:
 def _first_row(path: Path, wanted: str) -> _FirstRow:
     """What the first row looks like: how many columns, and whether it starts with a word."""
     require_regular(path)
-    text = head(path, _HEAD).decode("utf-8", "replace")
+    text = read_head(path, _HEAD).decode("utf-8", "replace")
     for line in text.splitlines():
         words = line.split("#")[0].split()
         if words:
@@ -316,7 +316,7 @@ def _is_number(word: str) -> bool:
 def _rows(path: Path, columns: int, names: str) -> Float:
     """(N, columns) finite numbers; what follows a # is a comment."""
     try:
-        lines = read_text(path, LARGEST).splitlines()
+        lines = read_text(path, MAX_BYTES).splitlines()
     except UnicodeDecodeError as error:
         raise InputError("is not a text file", where=str(path)) from error
     rows = [

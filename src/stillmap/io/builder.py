@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import Column, empty
+from stillmap.core.arrays import ArrayBuilder, empty
 from stillmap.core.recording import Recording
-from stillmap.preprocessing.options import FARTHEST, ReadOptions
+from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions
 
 _BLOCK = 1 << 20  # points of a scan looked at together
 
 
-class Gathered:
+class RecordingBuilder:
     """Scans of point clouds, in any order; what does not fit into memory goes to files.
 
     Args:
@@ -39,14 +39,14 @@ class Gathered:
     ) -> None:
         self._options, self._folder = options, folder
         self._stamp_ns, self._length, self._sensor = array("q"), array("q"), array("i")
-        self._points = Column(np.float32, (dimension,), folder)
-        self._hit = Column(np.bool_, (), folder)
-        self._times = Column(np.float32, (), folder) if beam_times else None
+        self._points = ArrayBuilder(np.float32, (dimension,), folder)
+        self._hit = ArrayBuilder(np.bool_, (), folder)
+        self._times = ArrayBuilder(np.float32, (), folder) if beam_times else None
 
     def __len__(self) -> int:
         return len(self._stamp_ns)
 
-    def add(
+    def add_scan(
         self,
         stamp_ns: int,
         points: NDArray[Any],
@@ -65,7 +65,7 @@ class Gathered:
         """
         for start in range(0, len(points), _BLOCK):
             block = slice(start, start + _BLOCK)
-            known, hit = _understood(np.asarray(points[block], np.float32), self._options)
+            known, hit = _apply_range_limits(np.asarray(points[block], np.float32), self._options)
             self._points.append(known)
             self._hit.append(hit)
             if self._times is not None:
@@ -75,7 +75,7 @@ class Gathered:
         self._length.append(len(points))
         self._sensor.append(sensor)
 
-    def recording(
+    def build(
         self,
         T_base_sensor: NDArray[np.float64],
         *,
@@ -100,7 +100,7 @@ class Gathered:
         order = chosen[np.argsort(stamp_ns[chosen], kind="stable")]
         start = np.cumsum(length) - length
         columns = [
-            _ordered(column.finished(), start, length, order, self._folder)
+            _reorder(column.finished(), start, length, order, self._folder)
             for column in (self._points, self._hit, self._times)
             if column is not None
         ]
@@ -119,13 +119,13 @@ class Gathered:
         )
 
 
-def _understood(
+def _apply_range_limits(
     points: NDArray[np.float32], options: ReadOptions
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Points (n, D), NaN where unusable, and which of them something reflected."""
     # column by column: along rows of two or three numbers NumPy is slow
     length = np.sqrt(sum(column * column for column in points.T.astype(np.float64)))
-    usable = (length <= FARTHEST) & (length >= options.min_range) & (length > 0.0)
+    usable = (length <= MAX_POINT_DISTANCE) & (length >= options.min_range) & (length > 0.0)
     if options.max_range is None and usable.all():
         return points, usable
     out = np.where(usable[:, None], points, np.float32(np.nan))
@@ -137,7 +137,7 @@ def _understood(
     return out, usable & ~far
 
 
-def _ordered(
+def _reorder(
     values: NDArray[Any],
     start: NDArray[np.int64],
     length: NDArray[np.int64],
@@ -156,10 +156,10 @@ def _ordered(
     return out
 
 
-KEPT_LINES = 1000
+MAX_LINE_NUMBERS = 1000
 
 
-class Skipped:
+class SkippedRecords:
     """Counts of skipped records by reason; at most `KEPT_LINES` line numbers each."""
 
     def __init__(self) -> None:
@@ -173,17 +173,17 @@ class Skipped:
         for line in lines:
             self._count[reason] = self._count.get(reason, 0) + 1
             kept = self._lines.setdefault(reason, [])
-            if len(kept) < KEPT_LINES:
+            if len(kept) < MAX_LINE_NUMBERS:
                 kept.append(int(line))
 
-    def merged(self, *others: "Skipped") -> "Skipped":
+    def merge(self, *others: "SkippedRecords") -> "SkippedRecords":
         """These and the others' together; neither is changed."""
-        out = Skipped()
+        out = SkippedRecords()
         for part in (self, *others):
             for reason, count in part._count.items():
                 out._count[reason] = out._count.get(reason, 0) + count
                 lines = sorted(out._lines.get(reason, []) + part._lines[reason])
-                out._lines[reason] = lines[:KEPT_LINES]
+                out._lines[reason] = lines[:MAX_LINE_NUMBERS]
         return out
 
     @property

@@ -14,17 +14,17 @@ from stillmap.io import cameras, rgbd, stillmap_folder
 from stillmap.io.carmen import reader
 from stillmap.io.carmen.messages import SCAN_PARSERS
 from stillmap.io.point_cloud import e57, kitti, las, pcd, ply, threedtk
-from stillmap.io.point_cloud.files import holds_any, is_named
+from stillmap.io.point_cloud.files import contains_files, has_extension
 from stillmap.io.point_cloud.pcd import is_pcd
 from stillmap.io.ros import bag_types
-from stillmap.io.text_lines import Progress, head
+from stillmap.io.text_lines import Progress, read_head
 from stillmap.preprocessing import laser_scan, self_filter
-from stillmap.preprocessing.options import ReadOptions, applied
+from stillmap.preprocessing.options import ReadOptions, apply_options
 
 _HEAD = 1 << 16  # bytes looked at to tell what a file is
 _INSIDE = 1000  # entries of a folder that are looked at for recordings
 _NAMED = 3  # of them
-RIG = ("horizontal", "tilting")  # as `stillmap simulate` names the recordings of one robot
+RIG_FOLDERS = ("horizontal", "tilting")  # as `stillmap simulate` names the recordings of one robot
 
 Reader = Callable[[Path, ReadOptions, Progress | None, Path | None], Recording]
 
@@ -41,7 +41,7 @@ class Format(NamedTuple):
 
     name: str
     endings: tuple[str, ...]
-    is_one: Callable[[Path, bytes | None], bool]
+    matches: Callable[[Path, bytes | None], bool]
     read: Reader
 
 
@@ -51,7 +51,7 @@ def _is_carmen(path: Path, text: bytes | None) -> bool:  # noqa: ARG001
     return any(word in words for first in first_words for word in first)
 
 
-def _is_folder_of_ours(path: Path, text: bytes | None) -> bool:
+def _is_stillmap_folder(path: Path, text: bytes | None) -> bool:
     return (
         path.name == stillmap_folder.HEADER
         if text is not None
@@ -59,13 +59,13 @@ def _is_folder_of_ours(path: Path, text: bytes | None) -> bool:
     )
 
 
-def _read_folder_of_ours(
+def _read_stillmap_folder(
     path: Path,
     options: ReadOptions,
     progress: Progress | None,  # noqa: ARG001
     scratch: Path | None,  # noqa: ARG001
 ) -> Recording:
-    return applied(stillmap_folder.read(path if path.is_dir() else path.parent), options)
+    return apply_options(stillmap_folder.read(path if path.is_dir() else path.parent), options)
 
 
 def _read_bag(
@@ -78,34 +78,36 @@ def _read_bag(
 
 
 def _is_kitti(path: Path, head: bytes | None) -> bool:
-    return head is None and kitti.is_one(path)
+    return head is None and kitti.is_kitti_folder(path)
 
 
-def _clouds(
+def _point_cloud_format(
     name: str, endings: tuple[str, ...], is_one: Callable[[bytes], bool] | None, read: Reader
 ) -> Format:
     """A format of single files, known by their first bytes or by name, and of folders of them."""
 
     def found(path: Path, head: bytes | None) -> bool:
         if head is None:
-            return holds_any(path, endings)
-        return is_named(path, endings) and len(head) > 0 if is_one is None else is_one(head)
+            return contains_files(path, endings)
+        return has_extension(path, endings) and len(head) > 0 if is_one is None else is_one(head)
 
     return Format(name, endings, found, read)
 
 
 FORMATS = (
     Format(
-        "stillmap recording", (stillmap_folder.HEADER,), _is_folder_of_ours, _read_folder_of_ours
+        "stillmap recording", (stillmap_folder.HEADER,), _is_stillmap_folder, _read_stillmap_folder
     ),
     Format("ROS bag", bag_types.ENDINGS, bag_types.is_bag, _read_bag),
     Format("KITTI folder", ("velodyne/", "velodyne_points/"), _is_kitti, kitti.read),
-    Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), rgbd.is_one, rgbd.read),
-    _clouds("PCD", pcd.ENDINGS, is_pcd, pcd.read),
-    _clouds("3DTK", threedtk.ENDINGS, None, threedtk.read),
-    _clouds("E57", e57.ENDINGS, lambda head: head.startswith(e57.MAGIC), e57.read),
-    _clouds("LAS", las.ENDINGS, lambda head: head.startswith(las.MAGIC), las.read),
-    _clouds("PLY", ply.ENDINGS, lambda head: head.startswith((b"ply\n", b"ply\r")), ply.read),
+    Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), rgbd.is_rgbd_folder, rgbd.read),
+    _point_cloud_format("PCD", pcd.EXTENSIONS, is_pcd, pcd.read),
+    _point_cloud_format("3DTK", threedtk.EXTENSIONS, None, threedtk.read),
+    _point_cloud_format("E57", e57.EXTENSIONS, lambda head: head.startswith(e57.MAGIC), e57.read),
+    _point_cloud_format("LAS", las.EXTENSIONS, lambda head: head.startswith(las.MAGIC), las.read),
+    _point_cloud_format(
+        "PLY", ply.EXTENSIONS, lambda head: head.startswith((b"ply\n", b"ply\r")), ply.read
+    ),
     Format(
         "CARMEN log",
         (".log", ".clf", ".txt", ".log.gz", ".clf.gz", ".txt.gz", ".gz"),
@@ -139,9 +141,9 @@ def read(
         # what damaged numbers give is looked at: NumPy need not speak of them as well
         with np.errstate(over="ignore", invalid="ignore"):
             options = options or ReadOptions()
-            recording = format_of(path).read(path, options, progress, scratch)
+            recording = detect_format(path).read(path, options, progress, scratch)
             if recording.dimension == 3:
-                return _in_space(recording, options, scratch)
+                return _prepare_3d(recording, options, scratch)
         for name, given in (
             ("spin", options.spin not in ("auto", "none")),
             ("cameras", options.cameras),
@@ -158,16 +160,16 @@ def read(
         raise InputError("does not fit into memory", where=str(path)) from error
 
 
-def _in_space(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
+def _prepare_3d(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
     """What is found out alike of every 3D recording."""
-    recording = laser_scan.timed(replace(recording, scratch=scratch), options)
+    recording = laser_scan.add_beam_times(replace(recording, scratch=scratch), options)
     if options.cameras is not None:
-        recording = cameras.applied(recording, Path(options.cameras))
-    recording = cameras.doubted(recording)
-    return self_filter.left_out(recording) if options.own_body else recording
+        recording = cameras.apply_camera_file(recording, Path(options.cameras))
+    recording = cameras.add_calibration_warnings(recording)
+    return self_filter.remove_self_returns(recording) if options.own_body else recording
 
 
-def format_of(path: Path) -> Format:
+def detect_format(path: Path) -> Format:
     """The format of a file or folder: by content where it tells, else by name.
 
     Raises:
@@ -179,24 +181,24 @@ def format_of(path: Path) -> Format:
         raise InputError(f"is no usable path: {error}", where=repr(str(path))) from error
     if not is_folder and not is_file:
         what = "is no regular file" if path.exists() else "does not exist"
-        raise InputError(what, where=str(path), hint=_known())
-    start = head(path, _HEAD) if is_file else None
+        raise InputError(what, where=str(path), hint=_list_formats())
+    start = read_head(path, _HEAD) if is_file else None
     for known in FORMATS:
-        if known.is_one(path, start):
+        if known.matches(path, start):
             return known
     if start is None:
-        raise _no_recording(path)
-    return _by_name(path, start)
+        raise _no_recording_error(path)
+    return _detect_by_name(path, start)
 
 
-def _no_recording(path: Path) -> InputError:
+def _no_recording_error(path: Path) -> InputError:
     """What to say of a folder that is none: one of those inside may have been meant."""
-    inside = _recordings_in(path)
+    inside = _find_recordings(path)
     if not inside:
-        return InputError("is a folder without a recording", where=str(path), hint=_known())
+        return InputError("is a folder without a recording", where=str(path), hint=_list_formats())
     more = f" and {len(inside) - _NAMED} more" if len(inside) > _NAMED else ""
     shown = ", ".join(map(str, inside[:_NAMED])) + more
-    if tuple(one.name for one in inside) == RIG:
+    if tuple(one.name for one in inside) == RIG_FOLDERS:
         flat, tilting = inside
         hint = f"both: stillmap map {flat} --tilting {tilting} -o DIR"
     else:
@@ -205,7 +207,7 @@ def _no_recording(path: Path) -> InputError:
     return InputError(f"is no recording but holds {what}: {shown}", where=str(path), hint=hint)
 
 
-def _recordings_in(path: Path) -> list[Path]:
+def _find_recordings(path: Path) -> list[Path]:
     """Folders right in a folder that are recordings, by name; none of a result."""
     try:
         if (path / "run.json").exists():  # its objects are clouds
@@ -213,21 +215,21 @@ def _recordings_in(path: Path) -> list[Path]:
         folders = [one for one in islice(path.iterdir(), _INSIDE) if one.is_dir()]
     except OSError:
         return []
-    return [one for one in sorted(folders) if any(known.is_one(one, None) for known in FORMATS)]
+    return [one for one in sorted(folders) if any(known.matches(one, None) for known in FORMATS)]
 
 
-def _by_name(path: Path, start: bytes) -> Format:
+def _detect_by_name(path: Path, start: bytes) -> Format:
     if path.stat().st_size == 0:
-        raise InputError("is empty", where=str(path), hint=_known())
+        raise InputError("is empty", where=str(path), hint=_list_formats())
     if b"\0" in start:
         raise InputError(
-            "is binary, no recording that stillmap reads", where=str(path), hint=_known()
+            "is binary, no recording that stillmap reads", where=str(path), hint=_list_formats()
         )
     for known in FORMATS:
         if path.name.lower().endswith(known.endings):
             return known
-    raise InputError("is no recording that stillmap reads", where=str(path), hint=_known())
+    raise InputError("is no recording that stillmap reads", where=str(path), hint=_list_formats())
 
 
-def _known() -> str:
+def _list_formats() -> str:
     return "stillmap reads: " + "; ".join(f"{f.name} ({', '.join(f.endings)})" for f in FORMATS)

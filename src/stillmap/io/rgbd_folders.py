@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from stillmap.core import se2, se3
 from stillmap.core.errors import InputError
 from stillmap.core.timestamps import parse_ns
-from stillmap.io.point_cloud.files import transform
-from stillmap.io.text_lines import numbered_lines
+from stillmap.io.point_cloud.files import rigid_transform
+from stillmap.io.text_lines import read_lines
 from stillmap.io.trajectory import read_tum
 
 Float = NDArray[np.float64]
@@ -53,7 +53,7 @@ class Frames(NamedTuple):
     warnings: list[str]
 
 
-def kind_of(path: Path) -> str | None:
+def detect_layout(path: Path) -> str | None:
     """SCENES or TUM; None for other folders."""
     try:
         if (path / "depth.txt").is_file() and (path / "depth").is_dir():
@@ -65,13 +65,13 @@ def kind_of(path: Path) -> str | None:
         return None
 
 
-def found(path: Path) -> Frames:
+def list_frames(path: Path) -> Frames:
     """What lies in a folder.
 
     Raises:
         InputError: there are no depth pictures.
     """
-    return _of_tum(path) if kind_of(path) == TUM else _of_scenes(path)
+    return _of_tum(path) if detect_layout(path) == TUM else _of_scenes(path)
 
 
 def _of_scenes(path: Path) -> Frames:
@@ -104,7 +104,7 @@ def _pose(depth: Path) -> Float | None:
     """The pose in the file beside a depth picture; None where there is none that can be used."""
     numbers = _matrix(depth.with_name(depth.name.partition(".")[0] + ".pose.txt"), 16)
     try:
-        return None if numbers is None else transform(numbers[:3, :3], numbers[:3, 3])
+        return None if numbers is None else rigid_transform(numbers[:3, :3], numbers[:3, 3])
     except ValueError:  # what was lost is marked by numbers that are none
         return None
 
@@ -157,7 +157,7 @@ def _of_tum(path: Path) -> Frames:
 def _listed(path: Path, warnings: list[str]) -> list[tuple[int, Path]]:
     """Stamps and files of lines that name them; lines that are none are counted."""
     out, bad = [], 0
-    for line in numbered_lines(path):
+    for line in read_lines(path):
         words = line.text.decode("utf-8", "replace").split()
         if not words or words[0].startswith("#"):
             continue

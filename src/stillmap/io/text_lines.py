@@ -35,7 +35,7 @@ class Line(NamedTuple):
 
 def is_gzip(path: Path) -> bool:
     """Whether the file starts as gzip does; its name plays no part."""
-    with _opened(path) as file:
+    with _open(path) as file:
         return file.read(2) == _GZIP_MAGIC
 
 
@@ -45,7 +45,7 @@ def is_gzip_name(path: Path) -> bool:
 
 
 @contextmanager
-def opened_to_write(path: Path, *, packed: bool) -> Iterator[IO[bytes] | gzip.GzipFile]:
+def open_for_writing(path: Path, *, packed: bool) -> Iterator[IO[bytes] | gzip.GzipFile]:
     """A new file of bytes, gzip if `packed`; equal texts give equal bytes."""
     with path.open("wb") as file:
         if not packed:
@@ -56,9 +56,9 @@ def opened_to_write(path: Path, *, packed: bool) -> Iterator[IO[bytes] | gzip.Gz
             yield stream
 
 
-def head(path: Path, size: int) -> bytes:
+def read_head(path: Path, size: int) -> bytes:
     """The first `size` bytes of the text, unpacked where it is gzip, fewer where it is damaged."""
-    with _opened(path) as file:
+    with _open(path) as file:
         packed = file.read(2) == _GZIP_MAGIC
         file.seek(0)
         if not packed:
@@ -70,13 +70,13 @@ def head(path: Path, size: int) -> bytes:
             return b""
 
 
-def numbered_lines(path: Path, progress: Progress | None = None) -> Iterator[Line]:
+def read_lines(path: Path, progress: Progress | None = None) -> Iterator[Line]:
     """Every line of the file, read as a stream.
 
     Raises:
         InputError: the file cannot be opened or read.
     """
-    with _opened(path) as file:
+    with _open(path) as file:
         size = max(path.stat().st_size, 1)
         packed = file.read(2) == _GZIP_MAGIC
         file.seek(0)
@@ -114,7 +114,7 @@ def _skip_rest(stream: IO[bytes] | gzip.GzipFile, most: int) -> int:
     return skipped
 
 
-def _opened(path: Path) -> IO[bytes]:
+def _open(path: Path) -> IO[bytes]:
     try:
         return path.open("rb")
     except OSError as error:

@@ -12,7 +12,7 @@ from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 from stillmap.io.carmen.writer import write_log
 from stillmap.io.point_cloud import kitti, las, pcd, ply
-from stillmap.io.ros.bag_types import Kind
+from stillmap.io.ros.bag_types import BagKind
 from stillmap.io.ros.recording_writer import write_recording
 
 # of a recording, to a path, whether what is there is replaced: what could not be said
@@ -41,11 +41,11 @@ class Writer(NamedTuple):
     """
 
     name: str
-    about: str
+    description: str
     endings: tuple[str, ...]
-    mark: str
+    marker: str
     write: Write
-    holds: tuple[str, ...] = ()
+    fields: tuple[str, ...] = ()
 
 
 def _write_folder(recording: Recording, path: Path, overwrite: bool) -> list[str]:
@@ -57,7 +57,7 @@ def _write_carmen(recording: Recording, path: Path, overwrite: bool) -> list[str
     return write_log(recording, path)
 
 
-def _ros(kind: Kind) -> Write:
+def _ros(kind: BagKind) -> Write:
     def write(recording: Recording, path: Path, overwrite: bool) -> list[str]:
         return write_recording(recording, path, kind, overwrite=overwrite)
 
@@ -67,7 +67,7 @@ def _ros(kind: Kind) -> Write:
 def _in_folder(write: Callable[..., None]) -> Write:
     def written(recording: Recording, path: Path, overwrite: bool) -> list[str]:
         write(recording, path, overwrite=overwrite)
-        return _not_hits(recording)
+        return _count_non_returns(recording)
 
     return written
 
@@ -95,12 +95,12 @@ def _as_cloud(write: Callable[..., None]) -> Write:
             T = np.tile(np.eye(D + 1), (recording.n_scans, 1, 1))
             lost = ["there are no poses: all scans lie at one place"] if len(T) > 1 else []
         write(recording, path, T, overwrite=overwrite)
-        return [*lost, *_not_hits(recording)]
+        return [*lost, *_count_non_returns(recording)]
 
     return written
 
 
-def _not_hits(recording: Recording) -> list[str]:
+def _count_non_returns(recording: Recording) -> list[str]:
     n = recording.n_beams - int(np.count_nonzero(recording.hit))
     return [f"{n} beams that hit nothing are left out"] if n else []
 
@@ -133,19 +133,19 @@ WRITERS = (
 )
 
 
-def said_by_ending(path: Path) -> str | None:
+def format_of_ending(path: Path) -> str | None:
     """The name of the format that files with such an ending have; None: none in particular."""
     name = path.name.lower()
     return next((writer.name for writer in WRITERS if name.endswith(writer.endings)), None)
 
 
-def writer_for(path: Path, name: str | None = None) -> Writer:
+def find_writer(path: Path, name: str | None = None) -> Writer:
     """The writer of a format given by its name, else by the ending of the path.
 
     Raises:
         InputError: no format has such an ending.
     """
-    wanted = name or said_by_ending(path)
+    wanted = name or format_of_ending(path)
     for writer in WRITERS:
         if writer.name == wanted:
             return writer
@@ -177,12 +177,12 @@ def write(
         InputError: the path is taken or cannot be written to, or the format cannot hold such a
             recording.
     """
-    writer = writer_for(path, name)
+    writer = find_writer(path, name)
     require_free(path, writer, overwrite)
     if not recording.n_scans:
         raise InputError("holds no scan: there is nothing to write")
     try:
-        return [*_left_out(recording, writer), *writer.write(recording, path, overwrite)]
+        return [*_unsupported_fields(recording, writer), *writer.write(recording, path, overwrite)]
     except InputError as error:
         raise InputError(error.what, where=error.where or str(path), hint=error.hint) from error
 
@@ -193,15 +193,15 @@ def require_free(path: Path, writer: Writer, overwrite: bool) -> None:
     Raises:
         InputError: there is something, of another kind or not to be replaced.
     """
-    if writer.mark:
-        require_new(path, writer.mark, overwrite)
+    if writer.marker:
+        require_new(path, writer.marker, overwrite)
     else:
         require_new_file(path, overwrite)
 
 
-def _left_out(recording: Recording, writer: Writer) -> list[str]:
+def _unsupported_fields(recording: Recording, writer: Writer) -> list[str]:
     return [
         f"its {words} are left out"
         for field, words in _OPTIONAL.items()
-        if getattr(recording, field) is not None and field not in writer.holds
+        if getattr(recording, field) is not None and field not in writer.fields
     ]

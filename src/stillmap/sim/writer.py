@@ -7,10 +7,10 @@ from typing import Literal
 
 from stillmap.core.arrays import write_npy
 from stillmap.core.errors import InputError
-from stillmap.core.files import new_folder
+from stillmap.core.files import atomic_folder
 from stillmap.io import stillmap_folder
 from stillmap.io.carmen import writer
-from stillmap.io.registry import RIG
+from stillmap.io.registry import RIG_FOLDERS
 from stillmap.sim.scene import Scene
 from stillmap.sim.simulator import RigSimulation, Simulation
 from stillmap.sim.truth import FOLDER, write_truth
@@ -45,7 +45,7 @@ def write_simulation(
     """
     if format == "carmen":
         require_carmen(simulation.scene)
-    with new_folder(Path(path), MARK, overwrite) as work:
+    with atomic_folder(Path(path), MARK, overwrite) as work:
         if format == "carmen":
             _write_carmen(simulation, work / CARMEN_LOG)
             write_truth(simulation.truth, simulation.recording.stamp_ns, work)
@@ -62,8 +62,8 @@ def write_rig(rig: RigSimulation, path: str | Path, *, overwrite: bool = False) 
     Raises:
         InputError: the folder holds something already or cannot be written to.
     """
-    with new_folder(Path(path), RIG_MARK, overwrite) as work:
-        for name, one in zip(RIG, (rig.horizontal, rig.tilting), strict=True):
+    with atomic_folder(Path(path), RIG_MARK, overwrite) as work:
+        for name, one in zip(RIG_FOLDERS, (rig.horizontal, rig.tilting), strict=True):
             (work / name).mkdir()
             _write_folder(one, work / name)
         write_npy(work / "joint_angle.npy", rig.joint_angle)
@@ -102,13 +102,13 @@ def require_carmen(scene: Scene) -> None:
 
 
 def _write_carmen(simulation: Simulation, path: Path) -> None:
-    form = writer.Form(
-        lasers=(writer.Laser("FLASER"), writer.Laser("RLASER")),
-        fans=None,
+    form = writer.LogFormat(
+        lasers=(writer.LaserFormat("FLASER"), writer.LaserFormat("RLASER")),
+        scan_angles=None,
         params={},
         comment=f"stillmap simulate {simulation.scene.name}",
         host="simulated",
         digits=2,
     )
     with path.open("w", encoding="ascii", newline="\n") as file:
-        file.writelines(writer.lines(simulation.recording, form))
+        file.writelines(writer.format_lines(simulation.recording, form))

@@ -9,7 +9,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from stillmap.io.ros.messages import typestore
+from stillmap.io.ros.messages import load_typestore
 
 KINDS = ("bag", "db3", "mcap", "folder")
 
@@ -19,7 +19,7 @@ class Messages:
 
     def __init__(self, encoding: str) -> None:
         self.encoding = encoding
-        self.store = typestore(encoding)
+        self.store = load_typestore(encoding)
 
     def make(self, kind: str, *args: Any, **kwargs: Any) -> Any:
         return self.store.types[kind](*args, **kwargs)

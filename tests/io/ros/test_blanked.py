@@ -7,7 +7,7 @@ from small_bags import write_bag
 
 from stillmap.io import read
 from stillmap.io.ros import recording_writer
-from stillmap.io.ros.messages import typestore
+from stillmap.io.ros.messages import load_typestore
 from stillmap.preprocessing.options import ReadOptions
 
 START = 1_700_000_000_000_000_000
@@ -27,7 +27,7 @@ def scans(messages, n=6):
 
 
 def contents(path, messages):
-    with AnyReader([path], default_typestore=typestore(messages.encoding)) as reader:
+    with AnyReader([path], default_typestore=load_typestore(messages.encoding)) as reader:
         return [
             (c.topic, log_ns, reader.deserialize(raw, c.msgtype))
             for c, log_ns, raw in reader.messages()
@@ -41,7 +41,7 @@ def test_all_else_stays(bag, messages, tmp_path):
     blank[[1, 7, 8]] = True  # of the first and the second scan
     out = tmp_path / f"out{source.suffix}"
     done = recording_writer.write_filtered_bag(source, out, recording, blank, ReadOptions())
-    assert (done.scans, done.left_out, done.topics) == (5, 1, [])
+    assert (done.scans, done.omitted, done.omitted_topics) == (5, 1, [])
     before, after = contents(source, messages), contents(out, messages)
     damaged = [one for one in before if one[0] == "/scan"][2]
     before.remove(damaged)
@@ -94,7 +94,7 @@ def test_two_lasers_and_one_that_is_not_used(bag, messages, tmp_path):
     blank[recording.beams_of(3)] = True  # of the second laser
     out = tmp_path / f"out{source.suffix}"
     done = recording_writer.write_filtered_bag(source, out, recording, blank, ReadOptions())
-    assert done.unfiltered == ["/elsewhere"]
+    assert done.unfiltered_topics == ["/elsewhere"]
     infinite = [
         (topic, log_ns)
         for topic, log_ns, m in contents(out, messages)
@@ -120,7 +120,9 @@ def test_types_that_nobody_knows_are_copied(tmp_path, kind, messages):
         out = tmp_path / f"out{source.suffix}"
         blank = np.zeros(recording.n_beams, np.bool_)
         assert (
-            recording_writer.write_filtered_bag(source, out, recording, blank, ReadOptions()).topics
+            recording_writer.write_filtered_bag(
+                source, out, recording, blank, ReadOptions()
+            ).omitted_topics
             == []
         )
         things = [m for topic, _, m in contents(out, messages) if topic == "/thing"]

@@ -136,7 +136,7 @@ def test_damaged_clouds_are_counted(bag, messages, rng):
     recording = read(bag(content))
     assert recording.n_scans == 1
     found = {reason: one["count"] for reason, one in recording.source["skipped"].items()}
-    assert found == {point_cloud2.WRONG_SIZE: 5, point_cloud2.NO_PLACES: 1}
+    assert found == {point_cloud2.WRONG_SIZE: 5, point_cloud2.NO_COORDINATES: 1}
 
 
 def test_points_that_nothing_can_see(bag, messages, rng):

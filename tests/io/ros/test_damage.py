@@ -229,9 +229,11 @@ def test_names_that_addresses_would_misread(bag, messages):
     assert read(odd).n_scans == 5
 
 
-@pytest.mark.parametrize("unpack", [limits.bz2_unpacked, limits.lz4_unpacked, limits.zstd_unpacked])
+@pytest.mark.parametrize(
+    "unpack", [limits.decompress_bz2, limits.decompress_lz4, limits.decompress_zstd]
+)
 def test_bombs(unpack, monkeypatch):
-    monkeypatch.setattr(limits, "LIMIT", 1 << 20)
+    monkeypatch.setattr(limits, "MAX_CHUNK", 1 << 20)
     pack = {
         "bz2_unpacked": bz2.compress,
         "lz4_unpacked": lz4.frame.compress,

@@ -13,7 +13,7 @@ from small_bags import Messages, write_bag
 from stillmap.core.errors import InputError
 from stillmap.io import read
 from stillmap.io.ros import limits, scan_beams, sqlite_limits
-from stillmap.io.ros.laser_scan import Scans, Shape
+from stillmap.io.ros.laser_scan import LaserScans, ScanShape
 
 START = 1_700_000_000_000_000_000
 ENDLESS = "WITH RECURSIVE r(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM r) SELECT x AS id"
@@ -200,11 +200,11 @@ def test_list_in_a_list_in_a_list(tmp_path):
 
 def test_long_scan_among_many_short_ones(monkeypatch):
     monkeypatch.setattr(scan_beams, "_SAMPLE", 1000)
-    shapes = [Shape(0.0, 1e-4, n, 0.1, 9.0, 0.0) for n in (5000, 1)]
+    shapes = [ScanShape(0.0, 1e-4, n, 0.1, 9.0, 0.0) for n in (5000, 1)]
     shape = np.array([0] + [1] * 4000, np.int32)
     n = np.where(shape == 0, 5000, 1)
     stamps = np.arange(len(shape), dtype=np.int64)
     ranges = np.ones(n.sum(), np.float32)
     start = np.cumsum(n) - n
-    scans = Scans("/scan", "", "", stamps, stamps, start, shape, shapes, ranges, [])
-    assert scan_beams._sample(scans).size <= 5 * 1000
+    scans = LaserScans("/scan", "", "", stamps, stamps, start, shape, shapes, ranges, [])
+    assert scan_beams._sample_readings(scans).size <= 5 * 1000

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.io.carmen.log import LaserLog, param_number
-from stillmap.preprocessing.options import GivenLaser
+from stillmap.preprocessing.options import LaserOptions
 
 # differences between laser pose and robot pose that are one place on the robot: rounded to cm in
 # old logs; a corrected pose in the laser field differs by metres, and differently in each scan
@@ -33,7 +33,7 @@ class Extrinsics(NamedTuple):
         return self._asdict()
 
 
-def find(
+def find_extrinsics(
     laser: LaserLog, poses: NDArray[np.float64] | None, params: dict[str, str]
 ) -> tuple[Extrinsics, list[str]]:
     """Extrinsics of a laser, and warnings in words.
@@ -49,16 +49,16 @@ def find(
     """
     warnings: list[str] = []
     if poses is not None:
-        offset, alike = _offset(poses)
+        offset, alike = _median_offset(poses)
         x, y, theta = (round(float(value), 6) for value in offset)
-        if alike and is_told_by_lines(x, y, theta):
+        if alike and is_stated_by_lines(x, y, theta):
             return Extrinsics(x, y, theta, "scan lines"), warnings
         if not alike:
             warnings.append(
                 f"{laser.kind}: the laser poses on the scan lines do not keep to one place on the "
                 "robot (a corrected log?): not used"
             )
-    found = _from_params(laser.kind, params)
+    found = _extrinsics_from_params(laser.kind, params)
     if found is not None:
         return found, warnings
     if laser.kind == "RLASER":
@@ -68,13 +68,13 @@ def find(
     return Extrinsics(0.0, 0.0, 0.0, "robot centre assumed"), warnings
 
 
-def is_told_by_lines(x: float, y: float, theta: float) -> bool:
+def is_stated_by_lines(x: float, y: float, theta: float) -> bool:
     """Whether poses on scan lines tell a laser's place: on the robot, and not at its centre."""
     away = math.hypot(x, y)
     return away < _LARGEST_OFFSET and max(away, abs(theta)) > _SMALLEST
 
 
-def overridden(found: Extrinsics, given: GivenLaser) -> Extrinsics:
+def override(found: Extrinsics, given: LaserOptions) -> Extrinsics:
     """`found` with what the options name in its place."""
     if given.place == (None, None, None):
         return found
@@ -82,7 +82,7 @@ def overridden(found: Extrinsics, given: GivenLaser) -> Extrinsics:
     return Extrinsics(x, y, theta, "given")
 
 
-def upside_down(kind: str, params: dict[str, str], given: GivenLaser) -> tuple[bool, str]:
+def find_upside_down(kind: str, params: dict[str, str], given: LaserOptions) -> tuple[bool, str]:
     """Whether a laser's beams turn clockwise, for it hangs upside down; and who says so.
 
     CARMEN's own laser_..._flipped do not: its laser server turns such readings round before they
@@ -90,19 +90,19 @@ def upside_down(kind: str, params: dict[str, str], given: GivenLaser) -> tuple[b
     """
     if given.upside_down is not None:
         return given.upside_down, "given"
-    stated = param_number(params, f"robot_{position(kind, params)}laser_flipped")
+    stated = param_number(params, f"robot_{laser_position(kind, params)}laser_flipped")
     return (False, "assumed") if stated is None else (stated != 0.0, "PARAM")
 
 
-def field_of_view(kind: str, params: dict[str, str], given: GivenLaser) -> float | None:
+def find_field_of_view(kind: str, params: dict[str, str], given: LaserOptions) -> float | None:
     """Of a laser whose lines state no angles, in radians; None: nobody says."""
     if given.fov is not None:
         return given.fov
-    degrees = param_number(params, f"laser_{position(kind, params)}_laser_fov")
+    degrees = param_number(params, f"laser_{laser_position(kind, params)}_laser_fov")
     return math.radians(degrees) if degrees is not None and 0.0 < degrees <= 360.0 else None
 
 
-def position(kind: str, params: dict[str, str]) -> str:
+def laser_position(kind: str, params: dict[str, str]) -> str:
     """`front`, `rear` or the kind itself: lines with the same position show the same laser."""
     if kind in ("FLASER", "ROBOTLASER1"):
         return "front"
@@ -116,10 +116,10 @@ def position(kind: str, params: dict[str, str]) -> str:
     return kind
 
 
-def declared_max_range(laser: LaserLog, params: dict[str, str]) -> float | None:
+def find_max_range(laser: LaserLog, params: dict[str, str]) -> float | None:
     """The largest range that the log names for a laser, in metres: PARAM or header, the smaller."""
     in_headers = [config.max_range for config in laser.configs if config.max_range is not None]
-    in_params = param_number(params, f"robot_{position(laser.kind, params)}_laser_max")
+    in_params = param_number(params, f"robot_{laser_position(laser.kind, params)}_laser_max")
     # a header may be damaged in one line: the most cautious of what remains is the largest
     stated = [max(in_headers)] if in_headers else []
     if in_params is not None and in_params > 0.0:
@@ -127,7 +127,7 @@ def declared_max_range(laser: LaserLog, params: dict[str, str]) -> float | None:
     return min(stated) if stated else None
 
 
-def _offset(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+def _median_offset(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
     """Median (x, y, theta) of the laser in the robot's frame, and whether scans agree on it."""
     T_odom_sensor, T_odom_base = se2.matrix(*poses[:, :3].T), se2.matrix(*poses[:, 3:].T)
     offsets = se2.parameters(se2.inverse(T_odom_base) @ T_odom_sensor)
@@ -139,8 +139,8 @@ def _offset(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
     return middle, bool(alike) and bool(np.hypot(*middle[:2]) < _LARGEST_OFFSET)
 
 
-def _from_params(kind: str, params: dict[str, str]) -> Extrinsics | None:
-    place = position(kind, params)
+def _extrinsics_from_params(kind: str, params: dict[str, str]) -> Extrinsics | None:
+    place = laser_position(kind, params)
     names = [f"robot_{place}laser_{what}" for what in ("offset", "side_offset", "angular_offset")]
     x, y, theta = (param_number(params, name) for name in names)
     if x is None and y is None and theta is None:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
-from stillmap.io.builder import Skipped
+from stillmap.io.builder import SkippedRecords
 from stillmap.io.carmen.messages import SCAN_PARSERS, BadRecord, ScanConfig, ScanLine, parse_odom
-from stillmap.io.text_lines import Line, Progress, numbered_lines
+from stillmap.io.text_lines import Line, Progress, read_lines
 
 CUT_LINE = "cut last line"
 DAMAGED_STREAM = "damaged gzip stream"
@@ -46,11 +46,11 @@ class LaserLog:
             self.has_poses = True
             self.poses.extend(scan.laser_pose + scan.robot_pose)
 
-    def usual_count(self) -> int:
+    def typical_count(self) -> int:
         """The number of readings that most scans have; the larger of two as frequent."""
         return max(Counter(self.count).items(), key=lambda item: (item[1], item[0]))[0]
 
-    def readings(self, scans: NDArray[np.intp]) -> NDArray[np.float32]:
+    def stack_readings(self, scans: NDArray[np.intp]) -> NDArray[np.float32]:
         """(len(scans), n) float32 readings; all these scans have the same number of them."""
         count = np.asarray(self.count)
         start = np.concatenate([[0], np.cumsum(count)[:-1]])
@@ -71,9 +71,9 @@ class CarmenLog:
         self.params: dict[str, str] = {}
         self.records: Counter[str] = Counter()
         self.ignored: Counter[str] = Counter()
-        self.skipped = Skipped()  # lines of which it cannot be told what they were
-        self.skipped_scans: dict[str, Skipped] = {}  # by kind of line
-        self.skipped_odometry = Skipped()
+        self.skipped = SkippedRecords()  # lines of which it cannot be told what they were
+        self.skipped_scans: dict[str, SkippedRecords] = {}  # by kind of line
+        self.skipped_odometry = SkippedRecords()
         self.n_lines = 0
         self._stamp_fields: dict[bytes, int] = {}
 
@@ -103,7 +103,7 @@ class CarmenLog:
         if name == b"ODOM":
             skipped = self.skipped_odometry
         else:
-            skipped = self.skipped_scans.setdefault(_text(name), Skipped())
+            skipped = self.skipped_scans.setdefault(_text(name), SkippedRecords())
         try:
             stamp_fields = self._add_measured(line, name, fields)
         except BadRecord as bad:
@@ -147,7 +147,7 @@ def read_log(path: Path, progress: Progress | None = None) -> CarmenLog:
     """
     log = CarmenLog()
     known = 0
-    for line in numbered_lines(path, progress):
+    for line in read_lines(path, progress):
         log.add(line)
         if line.number % _MOST_OTHER == 0:
             before, known = known, log.records.total()

@@ -65,7 +65,7 @@ class OdometryLine(NamedTuple):
     stamp_fields: int
 
 
-def flaser_angles(n: int, fov: float = math.pi) -> ScanConfig:
+def flaser_config(n: int, fov: float = math.pi) -> ScanConfig:
     """Angles of a FLASER or RLASER line, which states none: half a circle from -90 degrees.
 
     180 and 181 readings are 1 degree apart, 360 and 361 half a degree: an even number leaves out
@@ -82,33 +82,33 @@ def parse_flaser(fields: list[bytes]) -> ScanLine:
     Raises:
         BadRecord: the line cannot be used.
     """
-    n = _count(fields, 0)
+    n = _parse_count(fields, 0)
     tail = fields[1 + n :]
     if not _is_stamp(tail[6:]):
         raise BadRecord(WRONG_COUNT)
-    ranges = _numbers(fields[1 : 1 + n])
-    stamp_ns = _stamp(tail[6])
-    poses = _pose(tail[0:3]), _pose(tail[3:6])
-    return ScanLine(stamp_ns, ranges, flaser_angles(n), *poses, *_stamp_form(tail[6:]))
+    ranges = _parse_numbers(fields[1 : 1 + n])
+    stamp_ns = _parse_stamp(tail[6])
+    poses = _parse_pose(tail[0:3]), _parse_pose(tail[3:6])
+    return ScanLine(stamp_ns, ranges, flaser_config(n), *poses, *_stamp_form(tail[6:]))
 
 
 def parse_rawlaser(fields: list[bytes]) -> ScanLine:
     """RAWLASER1-4, see `parse_flaser`."""
-    n = _count(fields, _HEADER_FIELDS)
-    tail = _after_remissions(fields[_HEADER_FIELDS + 1 + n :], 0)
-    config = _config(fields[:_HEADER_FIELDS], n)
-    ranges = _numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n])
-    return ScanLine(_stamp(tail[0]), ranges, config, None, None, *_stamp_form(tail))
+    n = _parse_count(fields, _HEADER_FIELDS)
+    tail = _skip_remissions(fields[_HEADER_FIELDS + 1 + n :], 0)
+    config = _parse_header(fields[:_HEADER_FIELDS], n)
+    ranges = _parse_numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n])
+    return ScanLine(_parse_stamp(tail[0]), ranges, config, None, None, *_stamp_form(tail))
 
 
 def parse_robotlaser(fields: list[bytes]) -> ScanLine:
     """ROBOTLASER1-2, see `parse_flaser`."""
-    n = _count(fields, _HEADER_FIELDS)
-    tail = _after_remissions(fields[_HEADER_FIELDS + 1 + n :], 11)
-    config = _config(fields[:_HEADER_FIELDS], n)
-    ranges = _numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n])
-    stamp_ns = _stamp(tail[11])
-    poses = _pose(tail[0:3]), _pose(tail[3:6])
+    n = _parse_count(fields, _HEADER_FIELDS)
+    tail = _skip_remissions(fields[_HEADER_FIELDS + 1 + n :], 11)
+    config = _parse_header(fields[:_HEADER_FIELDS], n)
+    ranges = _parse_numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n])
+    stamp_ns = _parse_stamp(tail[11])
+    poses = _parse_pose(tail[0:3]), _parse_pose(tail[3:6])
     return ScanLine(stamp_ns, ranges, config, *poses, *_stamp_form(tail[11:]))
 
 
@@ -120,8 +120,8 @@ def parse_odom(fields: list[bytes]) -> OdometryLine:
     """
     if not _is_stamp(fields[6:]):
         raise BadRecord("wrong number of fields")
-    stamp_ns = _stamp(fields[6])
-    return OdometryLine(stamp_ns, _pose(fields[0:3]), len(fields) - 6)
+    stamp_ns = _parse_stamp(fields[6])
+    return OdometryLine(stamp_ns, _parse_pose(fields[0:3]), len(fields) - 6)
 
 
 SCAN_PARSERS: dict[bytes, Callable[[list[bytes]], ScanLine]] = {
@@ -136,7 +136,7 @@ SCAN_PARSERS: dict[bytes, Callable[[list[bytes]], ScanLine]] = {
 }
 
 
-def _count(fields: list[bytes], at: int) -> int:
+def _parse_count(fields: list[bytes], at: int) -> int:
     """The stated number of readings, no larger than what the line can hold."""
     if len(fields) <= at:
         raise BadRecord(WRONG_COUNT)
@@ -148,7 +148,7 @@ def _count(fields: list[bytes], at: int) -> int:
     return n
 
 
-def _after_remissions(rest: list[bytes], fixed: int) -> list[bytes]:
+def _skip_remissions(rest: list[bytes], fixed: int) -> list[bytes]:
     """What follows the remissions: `fixed` fields, then the stamp."""
     if rest and rest[0].isdigit() and len(rest[0]) <= 9:
         tail = rest[1 + int(rest[0]) :]
@@ -186,7 +186,7 @@ def _is_number(field: bytes) -> bool:
     return True
 
 
-def _numbers(fields: list[bytes]) -> list[float]:
+def _parse_numbers(fields: list[bytes]) -> list[float]:
     try:
         values = [float(field) for field in fields]
     except ValueError as error:
@@ -196,27 +196,27 @@ def _numbers(fields: list[bytes]) -> list[float]:
     return values
 
 
-def _pose(fields: list[bytes]) -> tuple[float, float, float]:
-    x, y, theta = _numbers(fields)
+def _parse_pose(fields: list[bytes]) -> tuple[float, float, float]:
+    x, y, theta = _parse_numbers(fields)
     # written so that NaN fails too
     if not (abs(x) < _LARGEST_POSE and abs(y) < _LARGEST_POSE and abs(theta) < _LARGEST_POSE):
         raise BadRecord(BAD_POSE)
     return x, y, theta
 
 
-def _stamp(field: bytes) -> int:
+def _parse_stamp(field: bytes) -> int:
     try:
         return parse_ns(field.decode("ascii"))
     except ValueError as error:
         raise BadRecord(UNREADABLE) from error
 
 
-def _config(header: list[bytes], n: int) -> ScanConfig:
+def _parse_header(header: list[bytes], n: int) -> ScanConfig:
     """Start, step and declared maximum of a header; a missing step follows from the field of view.
 
     Only these four of its fields are read: the others matter to nobody here.
     """
-    start, fov, step, max_range = _numbers(header[1:5])
+    start, fov, step, max_range = _parse_numbers(header[1:5])
     stated_fov = fov if 0.0 < fov <= 2.1 * math.pi else None
     if not 0.0 < step < math.pi and stated_fov is not None:
         step = stated_fov / max(n - 1, 1)

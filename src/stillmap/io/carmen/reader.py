@@ -15,14 +15,14 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io import trajectory
-from stillmap.io.builder import Skipped
+from stillmap.io.builder import SkippedRecords
 from stillmap.io.carmen import extrinsics
 from stillmap.io.carmen.extrinsics import Extrinsics
 from stillmap.io.carmen.log import CarmenLog, LaserLog, read_log
-from stillmap.io.carmen.messages import SCAN_PARSERS, WRONG_COUNT, flaser_angles
+from stillmap.io.carmen.messages import SCAN_PARSERS, WRONG_COUNT, flaser_config
 from stillmap.io.text_lines import Progress, is_gzip
 from stillmap.preprocessing import max_range
-from stillmap.preprocessing.options import GivenLaser, ReadOptions
+from stillmap.preprocessing.options import LaserOptions, ReadOptions
 
 TIME_BACKWARDS = "time running backwards"
 
@@ -41,22 +41,22 @@ class Sensor:
     poses: NDArray[np.float64] | None  # (T, 6) laser and robot pose on the scan lines
 
 
-def used(log: CarmenLog) -> tuple[list[Sensor], list[str]]:
+def select_scans(log: CarmenLog) -> tuple[list[Sensor], list[str]]:
     """The scans of each laser that become a recording, and which others show the same laser."""
-    lasers, notes = _one_kind_per_laser(log)
-    return [_usable(laser, log) for laser in lasers], notes
+    lasers, notes = _select_lasers(log)
+    return [_select_usable_scans(laser, log) for laser in lasers], notes
 
 
-def in_order(sensors: list[Sensor]) -> NDArray[np.intp]:
+def scan_order(sensors: list[Sensor]) -> NDArray[np.intp]:
     """(T,) the order of a recording's scans, of all sensors' scans one after the other."""
     return np.argsort(np.concatenate([s.stamp_ns for s in sensors]), kind="stable")
 
 
-def _one_kind_per_laser(log: CarmenLog) -> tuple[list[LaserLog], list[str]]:
+def _select_lasers(log: CarmenLog) -> tuple[list[LaserLog], list[str]]:
     """The lasers to use: newer CARMEN logs hold each scan twice, raw and with the robot's pose."""
     places: dict[str, list[LaserLog]] = {}
     for laser in log.lasers.values():
-        places.setdefault(extrinsics.position(laser.kind, log.params), []).append(laser)
+        places.setdefault(extrinsics.laser_position(laser.kind, log.params), []).append(laser)
     used, notes = [], []
     for same in places.values():
         most = max(len(laser.line) for laser in same)
@@ -73,7 +73,7 @@ def _one_kind_per_laser(log: CarmenLog) -> tuple[list[LaserLog], list[str]]:
     return sorted(used, key=lambda laser: list(SCAN_PARSERS).index(laser.kind.encode())), notes
 
 
-def _usable(laser: LaserLog, log: CarmenLog) -> Sensor:
+def _select_usable_scans(laser: LaserLog, log: CarmenLog) -> Sensor:
     """The scans with the usual number of readings whose time does not run backwards.
 
     Of a laser's stamps a longest non-decreasing subsequence is kept, so a stamp that jumps ahead
@@ -82,7 +82,7 @@ def _usable(laser: LaserLog, log: CarmenLog) -> Sensor:
     count, line = np.asarray(laser.count), np.asarray(laser.line)
     shifted = np.asarray(laser.host_is_number, np.bool_)
     # a number for a host where others have names: the fields before it are not what they seem
-    usual = (count == laser.usual_count()) & ~(shifted & (shifted.mean() < 0.5))
+    usual = (count == laser.typical_count()) & ~(shifted & (shifted.mean() < 0.5))
     skipped = log.skipped_scans[laser.kind]
     skipped.add_all(WRONG_COUNT, line[~usual])
     scans = np.flatnonzero(usual)
@@ -95,7 +95,7 @@ def _usable(laser: LaserLog, log: CarmenLog) -> Sensor:
         laser,
         line[scans],
         stamp_ns[forward],
-        laser.readings(scans),
+        laser.stack_readings(scans),
         np.asarray(laser.config)[scans],
         poses,
     )
@@ -117,10 +117,10 @@ def read(
     """
     options = options or ReadOptions()
     log = read_log(path, progress)
-    sensors, notes = used(log)
+    sensors, notes = select_scans(log)
     if not sensors:
         raise _no_scan(path, log)
-    recording = _assembled(sensors, log, options)
+    recording = _build_recording(sensors, log, options)
     recording.source.update(path=str(path), format="carmen", gzip=is_gzip(path))
     recording.source["duplicates"] = notes
     return recording
@@ -128,7 +128,7 @@ def read(
 
 def _no_scan(path: Path, log: CarmenLog) -> InputError:
     kinds = ", ".join(name.decode() for name in SCAN_PARSERS)
-    skipped = log.skipped.merged(*log.skipped_scans.values())
+    skipped = log.skipped.merge(*log.skipped_scans.values())
     if skipped.total:
         what = f"holds no usable laser scan: {skipped.summary()}"
     else:
@@ -136,31 +136,31 @@ def _no_scan(path: Path, log: CarmenLog) -> InputError:
     return InputError(what, where=str(path), hint=f"a CARMEN log has lines of {kinds}")
 
 
-def _assembled(sensors: list[Sensor], log: CarmenLog, options: ReadOptions) -> Recording:
+def _build_recording(sensors: list[Sensor], log: CarmenLog, options: ReadOptions) -> Recording:
     """One recording of all lasers' scans in the order of their stamps."""
     options.require_lasers(len(sensors))
-    skipped = log.skipped.merged(*(log.skipped_scans[s.laser.kind] for s in sensors))
+    skipped = log.skipped.merge(*(log.skipped_scans[s.laser.kind] for s in sensors))
     warnings = _loss_warning(sensors, skipped)
     parts, places, infos = [], [], []
     for number, sensor in enumerate(sensors):
-        place, more = extrinsics.find(sensor.laser, sensor.poses, log.params)
+        place, more = extrinsics.find_extrinsics(sensor.laser, sensor.poses, log.params)
         given = options.laser(number)
-        place = extrinsics.overridden(place, given)
-        upside_down = extrinsics.upside_down(sensor.laser.kind, log.params, given)
-        angles = _angles(sensor, log, given, upside_down[0], more)
-        points, hit, rule = _points(sensor, angles, log, options, more)
+        place = extrinsics.override(place, given)
+        upside_down = extrinsics.find_upside_down(sensor.laser.kind, log.params, given)
+        angles = _find_angles(sensor, log, given, upside_down[0], more)
+        points, hit, rule = _convert_readings(sensor, angles, log, options, more)
         parts.append((points, hit))
         places.append(place)
         infos.append(_sensor_info(sensor, place, angles, upside_down, rule))
         warnings += more
-    poses, odometry_info = _odometry(sensors, log)
+    poses, odometry_info = _find_odometry(sensors, log)
     warnings += odometry_info.pop("warnings")
     sensor_of = np.repeat(np.arange(len(sensors)), [len(s.stamp_ns) for s in sensors])
     stamp_ns = np.concatenate([s.stamp_ns for s in sensors])
-    order = in_order(sensors)
+    order = scan_order(sensors)
     beams = np.array([s.ranges.shape[1] for s in sensors], np.int64)[sensor_of[order]]
     offset = np.concatenate([[0], np.cumsum(beams)]).astype(np.int64)
-    points, hit = _interleaved(parts, sensor_of[order], offset)
+    points, hit = _interleave(parts, sensor_of[order], offset)
     return Recording(
         stamp_ns=stamp_ns[order],
         offset=offset,
@@ -177,22 +177,22 @@ def _assembled(sensors: list[Sensor], log: CarmenLog, options: ReadOptions) -> R
     )
 
 
-def _angles(
-    sensor: Sensor, log: CarmenLog, given: GivenLaser, upside_down: bool, warnings: list[str]
+def _find_angles(
+    sensor: Sensor, log: CarmenLog, given: LaserOptions, upside_down: bool, warnings: list[str]
 ) -> NDArray[np.float64]:
     """(C, 2) first angle and step in radians, counterclockwise, of each of the laser's configs."""
     angles = np.array([config[:2] for config in sensor.laser.configs])
-    fov = extrinsics.field_of_view(sensor.laser.kind, log.params, given)
+    fov = extrinsics.find_field_of_view(sensor.laser.kind, log.params, given)
     if sensor.laser.kind in ("FLASER", "RLASER"):
         if fov is not None:
-            angles[:] = flaser_angles(sensor.ranges.shape[1], fov)[:2]
+            angles[:] = flaser_config(sensor.ranges.shape[1], fov)[:2]
     elif given.fov is not None:
         text = "its lines state their angles: the given field of view is not used"
         warnings.append(f"{sensor.laser.kind}: {text}")
     return -angles if upside_down else angles
 
 
-def _points(
+def _convert_readings(
     sensor: Sensor,
     angles: NDArray[np.float64],
     log: CarmenLog,
@@ -200,11 +200,11 @@ def _points(
     warnings: list[str],
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], max_range.RangeRule]:
     """End points (T, n, 2) in the sensor frame, hits (T, n), and how readings were understood."""
-    declared = extrinsics.declared_max_range(sensor.laser, log.params)
-    rule, more = max_range.decide(sensor.ranges, declared, options)
+    declared = extrinsics.find_max_range(sensor.laser, log.params)
+    rule, more = max_range.infer_range_rule(sensor.ranges, declared, options)
     more += _angle_warning(sensor)
     warnings += [f"{sensor.laser.kind}: {text}" for text in more]
-    length, hit = max_range.apply(sensor.ranges, rule)
+    length, hit = max_range.apply_range_rule(sensor.ranges, rule)
     angle = angles[:, :1] + angles[:, 1:] * np.arange(length.shape[1])
     points = np.empty((*length.shape, 2), np.float32)
     points[..., 0] = length * np.cos(angle)[sensor.config]
@@ -224,7 +224,7 @@ def _angle_warning(sensor: Sensor) -> list[str]:
     return []
 
 
-def _interleaved(
+def _interleave(
     parts: list[tuple[NDArray[np.float32], NDArray[np.bool_]]],
     sensor_of: NDArray[np.intp],
     offset: NDArray[np.int64],
@@ -240,7 +240,7 @@ def _interleaved(
     return points, hit
 
 
-def _odometry(
+def _find_odometry(
     sensors: list[Sensor], log: CarmenLog
 ) -> tuple[NDArray[np.float64] | None, dict[str, Any]]:
     """Robot poses (T, 3) at the scans of all sensors, one sensor after the other.
@@ -282,7 +282,7 @@ def _moves(poses: NDArray[np.float64]) -> bool:
     return bool(np.any(poses != poses[0]))
 
 
-def _loss_warning(sensors: list[Sensor], skipped: Skipped) -> list[str]:
+def _loss_warning(sensors: list[Sensor], skipped: SkippedRecords) -> list[str]:
     kept = sum(len(sensor.stamp_ns) for sensor in sensors)
     lost = skipped.total
     if lost <= _MANY * (kept + lost):

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.core.files import new_file
+from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import seconds_text
-from stillmap.io.carmen.extrinsics import is_told_by_lines
+from stillmap.core.timestamps import format_seconds
+from stillmap.io.carmen.extrinsics import is_stated_by_lines
 from stillmap.io.carmen.log import read_log
-from stillmap.io.carmen.messages import SCAN_PARSERS, flaser_angles
-from stillmap.io.carmen.reader import Sensor, in_order, used
-from stillmap.io.text_lines import is_gzip_name, numbered_lines, opened_to_write
+from stillmap.io.carmen.messages import SCAN_PARSERS, flaser_config
+from stillmap.io.carmen.reader import Sensor, scan_order, select_scans
+from stillmap.io.text_lines import is_gzip_name, open_for_writing, read_lines
 from stillmap.preprocessing import laser_scan
 from stillmap.preprocessing.max_range import FREQUENT_ZEROS, find_max_range
 from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
@@ -52,7 +52,7 @@ _ANOTHER = "write a bag or a recording folder instead"
 
 
 @dataclass(frozen=True)
-class Laser:
+class LaserFormat:
     """How the scans of one laser are written.
 
     Attributes:
@@ -68,7 +68,7 @@ class Laser:
 
 
 @dataclass(frozen=True, eq=False)
-class Form:
+class LogFormat:
     """How a recording is written.
 
     Attributes:
@@ -80,8 +80,8 @@ class Form:
         digits: of ranges in metres.
     """
 
-    lasers: tuple[Laser, ...]
-    fans: Float | None
+    lasers: tuple[LaserFormat, ...]
+    scan_angles: Float | None
     params: dict[str, str]
     comment: str
     host: str
@@ -101,36 +101,36 @@ def write_log(recording: Recording, path: Path) -> list[str]:
         InputError: such a log cannot hold the recording, or cannot be written.
     """
     form = _form(recording)
-    with new_file(path) as work, opened_to_write(work, packed=is_gzip_name(path)) as file:
-        for line in lines(recording, form):
+    with atomic_file(path) as work, open_for_writing(work, packed=is_gzip_name(path)) as file:
+        for line in format_lines(recording, form):
             file.write(line.encode("ascii"))
     if recording.beam_time is None:
         return []
     return ["when each beam was taken is left out: CARMEN logs cannot say it"]
 
 
-def lines(recording: Recording, form: Form) -> Iterator[str]:
+def format_lines(recording: Recording, form: LogFormat) -> Iterator[str]:
     """The lines of a log, each with its end: of every scan the odometry, then the scan."""
     yield f"# {form.comment}\n"
     if not recording.n_scans:
         return
     first = int(recording.stamp_ns[0])
     for name, value in form.params.items():
-        yield f"PARAM {name} {value} {seconds_text(first)} {form.host} {seconds_text(0)}\n"
+        yield f"PARAM {name} {value} {format_seconds(first)} {form.host} {format_seconds(0)}\n"
     base, laser = _poses(recording)
     for t in recording.in_turn(range(recording.n_scans)):
         stamp = int(recording.stamp_ns[t])
-        times = f"{seconds_text(stamp)} {form.host} {seconds_text(stamp - first)}\n"
+        times = f"{format_seconds(stamp)} {form.host} {format_seconds(stamp - first)}\n"
         if base is not None:
             yield f"ODOM {_pose(base[t])} 0 0 0 {times}"
         its = form.lasers[recording.sensor[t]]
-        readings = _readings(laser_scan.ranges(recording, t, its.no_return), its, form.digits)
+        readings = _readings(laser_scan.beam_ranges(recording, t, its.no_return), its, form.digits)
         if its.kind in _HALF_CIRCLE:
             assert base is not None
             yield f"{its.kind} {readings} {_pose(laser[t])} {_pose(base[t])} {times}"
             continue
-        assert form.fans is not None
-        header = _header(form.fans[t], int(np.diff(recording.offset[t : t + 2])[0]), its)
+        assert form.scan_angles is not None
+        header = _header(form.scan_angles[t], int(np.diff(recording.offset[t : t + 2])[0]), its)
         poses = f" {_pose(laser[t])} {_pose(base[t])} 0 0 0 0 0" if base is not None else ""
         yield f"{its.kind} {header} {readings} 0{poses} {times}"
 
@@ -143,13 +143,13 @@ def _poses(recording: Recording) -> tuple[Float | None, Float]:
     return se2.parameters(recording.T_odom_base), se2.parameters(T_odom_sensor)
 
 
-def _readings(ranges: Float, laser: Laser, digits: int) -> str:
+def _readings(ranges: Float, laser: LaserFormat, digits: int) -> str:
     ranges = np.where(np.isnan(ranges), laser.unusable, ranges)
     form = " ".join([f"%.{digits}f"] * len(ranges))
     return f"{len(ranges)} {form % tuple(ranges.tolist())}"
 
 
-def _header(fan: Float, n: int, laser: Laser) -> str:
+def _header(fan: Float, n: int, laser: LaserFormat) -> str:
     start, step = fan.tolist()
     return f"{_UNKNOWN_LASER} {start!r} {step * (n - 1)!r} {step!r} {laser.no_return!r} 0 0"
 
@@ -158,21 +158,21 @@ def _pose(pose: Float) -> str:
     return " ".join(f"{value:.6f}" for value in pose.tolist())
 
 
-def _form(recording: Recording) -> Form:
+def _form(recording: Recording) -> LogFormat:
     lasers = len(recording.T_base_sensor)
     if lasers > 2:
         raise InputError(f"CARMEN logs hold two lasers, here are {lasers}", hint=_ANOTHER)
     counts = np.diff(recording.offset)
     for number in range(lasers):
         _require_one_count(counts[recording.sensor == number])
-    fans = laser_scan.fans(recording)
+    fans = laser_scan.beam_angles(recording)
     params = {}
     for number, place in enumerate(_PLACES[:lasers]):
         its = recording.sensor == number
         if _is_upside_down(fans[its]):
             fans[its] *= -1.0
             params[f"robot_{place}laser_flipped"] = "1"
-    reaches = laser_scan.reaches(recording)
+    reaches = laser_scan.range_limits(recording)
     kinds = _WITHOUT_POSES
     if recording.T_odom_base is not None:
         near = all(round(reach.hit, _DIGITS) < _READS_AS_CODE for reach in reaches)
@@ -180,10 +180,10 @@ def _form(recording: Recording) -> Form:
     written = []
     for number, reach in enumerate(reaches):
         no_return = NO_RETURN if kinds is _HALF_CIRCLE else _declared(reach)
-        written.append(Laser(kinds[number], no_return, _unusable(recording, number)))
+        written.append(LaserFormat(kinds[number], no_return, _unusable(recording, number)))
         x, y, theta = se2.parameters(recording.T_base_sensor[number]).tolist()
         params |= _place(kinds[number], _PLACES[number], x, y, theta)
-    return Form(tuple(written), fans, params, "stillmap convert", "stillmap")
+    return LogFormat(tuple(written), fans, params, "stillmap convert", "stillmap")
 
 
 def _require_one_count(counts: NDArray[np.int64]) -> None:
@@ -210,13 +210,13 @@ def _is_upside_down(fans: Float) -> bool:
 
 def _are_half_circles(fans: Float, counts: NDArray[np.int64]) -> bool:
     """Whether first and last beams point where FLASER lines of as many readings have them."""
-    of = {int(n): flaser_angles(int(n))[:2] for n in np.unique(counts)}
+    of = {int(n): flaser_config(int(n))[:2] for n in np.unique(counts)}
     off = fans - np.array([of[n] for n in counts.tolist()]).reshape(-1, 2)
     off[:, 1] = off[:, 0] + (counts - 1) * off[:, 1]
     return bool(np.all(np.abs(off) < _SAME_ANGLE))
 
 
-def _declared(reach: laser_scan.Reach) -> float:
+def _declared(reach: laser_scan.RangeLimits) -> float:
     """A largest range that no reading of a hit reaches, with as many digits as readings have."""
     limit = round(reach.limit(), _DIGITS)
     return limit if round(reach.hit, _DIGITS) < limit else round(limit + 10**-_DIGITS, _DIGITS)
@@ -235,7 +235,7 @@ def _unusable(recording: Recording, number: int) -> float:
 def _place(kind: str, place: str, x: float, y: float, theta: float) -> dict[str, str]:
     """PARAMs that say where a laser sits, where nothing else does."""
     assumed = (0.0, 0.0, math.pi if kind == "RLASER" else 0.0)
-    told = kind not in _WITHOUT_POSES and is_told_by_lines(x, y, theta)
+    told = kind not in _WITHOUT_POSES and is_stated_by_lines(x, y, theta)
     if told or (x, y, theta) == assumed:
         return {}
     names = ("offset", "side_offset", "angular_offset")
@@ -255,7 +255,7 @@ _FIELD = re.compile(rb"\S+")
 
 
 @dataclass(frozen=True)
-class Blanked:
+class FilteredLog:
     """What was written.
 
     Attributes:
@@ -268,12 +268,12 @@ class Blanked:
 
     scans: int
     beams: int
-    left_out: int
+    omitted: int
 
 
 def write_filtered_log(
     source: Path, out: Path, recording: Recording, blank: NDArray[np.bool_]
-) -> Blanked:
+) -> FilteredLog:
     """Write a log with some readings replaced; all other bytes stay.
 
     Args:
@@ -285,26 +285,29 @@ def write_filtered_log(
     Raises:
         InputError: the log is not the one that was read, or cannot be written.
     """
-    sensors, _ = used(read_log(source))
+    sensors, _ = select_scans(read_log(source))
     scan_of = _scan_of_lines(source, sensors, recording)
     rules = (sensor["ranges"] for sensor in recording.source["sensors"])
-    codes = [code(sensor.ranges, rule) for sensor, rule in zip(sensors, rules, strict=True)]
+    codes = [
+        find_no_return_code(sensor.ranges, rule)
+        for sensor, rule in zip(sensors, rules, strict=True)
+    ]
     scans = left_out = 0
-    with new_file(out) as work, opened_to_write(work, packed=is_gzip_name(out)) as file:
-        for line in numbered_lines(source):
+    with atomic_file(out) as work, open_for_writing(work, packed=is_gzip_name(out)) as file:
+        for line in read_lines(source):
             t = scan_of.get(line.number)
             if t is not None:
                 beams = blank[recording.offset[t] : recording.offset[t + 1]]
-                file.write(_replaced(line.text, beams, codes[recording.sensor[t]]))
+                file.write(_blank_readings(line.text, beams, codes[recording.sensor[t]]))
                 scans += 1
             elif line.damaged or line.too_long or _is_scan(line.text):
                 left_out += 1
             else:
                 file.write(line.text)
-    return Blanked(scans, int(np.count_nonzero(blank)), left_out)
+    return FilteredLog(scans, int(np.count_nonzero(blank)), left_out)
 
 
-def code(readings: NDArray[np.float32], rule: dict[str, Any]) -> bytes:
+def find_no_return_code(readings: NDArray[np.float32], rule: dict[str, Any]) -> bytes:
     """What stands for "nothing came back" among the readings of a laser.
 
     Args:
@@ -329,7 +332,7 @@ def code(readings: NDArray[np.float32], rule: dict[str, Any]) -> bytes:
 def _scan_of_lines(source: Path, sensors: list[Sensor], recording: Recording) -> dict[int, int]:
     """Which scan of the recording each line is."""
     if sensors:
-        order = in_order(sensors)
+        order = scan_order(sensors)
         line = np.concatenate([sensor.line for sensor in sensors])[order]
         stamp_ns = np.concatenate([sensor.stamp_ns for sensor in sensors])[order]
         if np.array_equal(stamp_ns, recording.stamp_ns):
@@ -342,7 +345,7 @@ def _is_scan(text: bytes) -> bool:
     return bool(name) and name[0] in SCAN_PARSERS
 
 
-def _replaced(text: bytes, blank: NDArray[np.bool_], code: bytes) -> bytes:
+def _blank_readings(text: bytes, blank: NDArray[np.bool_], code: bytes) -> bytes:
     """A scan's line with the blanked readings replaced."""
     if not blank.any():
         return text

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
-from stillmap.io.text_lines import numbered_lines
+from stillmap.io.text_lines import read_lines
 
 _BLOCK = 1 << 18  # points read together
 _LARGEST_RECORD = 1 << 16  # bytes of one point
@@ -34,7 +34,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Layout:
+class TableLayout:
     """Where a file's points lie.
 
     Attributes:
@@ -72,7 +72,7 @@ class Layout:
         raise InputError(f"has no column '{name}'", where=str(self.path))
 
 
-def columns(layout: Layout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
+def read_columns(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
     """Values (k,) of the wanted columns, a block of points at a time; text comes as float64.
 
     Raises:
@@ -81,7 +81,7 @@ def columns(layout: Layout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]
     return _from_text(layout, wanted) if layout.text else _from_records(layout, wanted)
 
 
-def require_record(layout: Layout) -> None:
+def check_record_size(layout: TableLayout) -> None:
     """Refuse points of impossible size.
 
     Raises:
@@ -92,17 +92,17 @@ def require_record(layout: Layout) -> None:
         raise InputError(what, where=str(layout.path))
 
 
-def cut_short(path: Path, found: int, promised: int) -> InputError:
+def truncated_error(path: Path, found: int, promised: int) -> InputError:
     """The error for a file with fewer points than its header says."""
     return InputError(f"is cut short: {found} of {promised} points are there", where=str(path))
 
 
-def _from_records(layout: Layout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
-    require_record(layout)
+def _from_records(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
+    check_record_size(layout)
     places = [layout.place(name) for name in wanted]
     held = (layout.path.stat().st_size - layout.start) // layout.record
     if held < layout.rows:
-        raise cut_short(layout.path, max(held, 0), layout.rows)
+        raise truncated_error(layout.path, max(held, 0), layout.rows)
     names = [str(i) for i in range(len(places))]
     dtype = np.dtype(
         {
@@ -118,25 +118,25 @@ def _from_records(layout: Layout, wanted: Sequence[str]) -> Iterator[list[NDArra
             n = min(_BLOCK, layout.rows - first)
             rows = np.frombuffer(file.read(n * layout.record), np.uint8)
             if len(rows) < n * layout.record:
-                raise cut_short(layout.path, first + len(rows) // layout.record, layout.rows)
+                raise truncated_error(layout.path, first + len(rows) // layout.record, layout.rows)
             yield [rows.view(dtype)[name] for name in names]
 
 
-def _from_text(layout: Layout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
+def _from_text(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
     numbers = [layout.place(name)[2] for name in wanted]
     if max(numbers) >= _MOST_COLUMNS:
         raise InputError("is damaged: too many columns", where=str(layout.path))
-    lines = text_lines(layout.path, layout.lines)
+    lines = iter_text_lines(layout.path, layout.lines)
     for first in range(0, layout.rows, _BLOCK):
         n = min(_BLOCK, layout.rows - first)
-        block = numbers_in(lines, n, numbers, layout.path)
+        block = parse_numbers(lines, n, numbers, layout.path)
         if len(block):
             yield list(block.T)
         if len(block) < n:
-            raise cut_short(layout.path, first + len(block), layout.rows)
+            raise truncated_error(layout.path, first + len(block), layout.rows)
 
 
-def text_lines(path: Path, skip: int = 0, limit: int | None = None) -> Iterator[bytes]:
+def iter_text_lines(path: Path, skip: int = 0, limit: int | None = None) -> Iterator[bytes]:
     """Lines that are not empty, after the first `skip`; unpacked where the file is gzip.
 
     Args:
@@ -148,7 +148,7 @@ def text_lines(path: Path, skip: int = 0, limit: int | None = None) -> Iterator[
         InputError: a line is too long, a gzip stream is damaged, or there is more than `limit`.
     """
     size = 0
-    for line in numbered_lines(path):
+    for line in read_lines(path):
         size += len(line.text)
         if line.damaged:
             raise InputError("is a damaged gzip file", where=f"{path}:{line.number}")
@@ -162,7 +162,7 @@ def text_lines(path: Path, skip: int = 0, limit: int | None = None) -> Iterator[
             yield line.text
 
 
-def numbers_in(
+def parse_numbers(
     lines: Iterator[bytes], rows: int, use: Sequence[int] | None, path: Path
 ) -> NDArray[np.float64]:
     """(k, columns) numbers of up to `rows` lines.

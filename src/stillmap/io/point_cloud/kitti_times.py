@@ -7,7 +7,7 @@ from pathlib import Path
 
 from stillmap.core.errors import InputError
 from stillmap.core.timestamps import parse_ns
-from stillmap.io.text_lines import numbered_lines
+from stillmap.io.text_lines import read_lines
 
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d+)?")
 
@@ -21,7 +21,7 @@ def read_times(path: Path) -> list[int | None]:
         InputError: the file cannot be read.
     """
     out: list[int | None] = []
-    for line in numbered_lines(path):
+    for line in read_lines(path):
         out.append(_stamp(line.text.decode("ascii", "replace").strip()))
     texts_end = len(out)
     while texts_end and out[texts_end - 1] is None:
@@ -41,7 +41,7 @@ def _stamp(text: str) -> int | None:
         return None
 
 
-def rows_of(files: Sequence[Path], rows: int, where: Path) -> list[int | None]:
+def assign_rows(files: Sequence[Path], rows: int, where: Path) -> list[int | None]:
     """The line from 0 that belongs to each file; None: none does.
 
     Files whose names are numbers of lines take those, as where some sweeps are missing. Else

@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import Column
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.core.recording import Recording
-from stillmap.io.builder import Gathered, Skipped
-from stillmap.io.point_cloud.files import files_in, stamps_in, stem_of
-from stillmap.io.point_cloud.point_times import Clock, clock_of, since
+from stillmap.io.builder import RecordingBuilder, SkippedRecords
+from stillmap.io.point_cloud.files import list_files, stamps_from_names, strip_extension
+from stillmap.io.point_cloud.time_field import Clock, convert_times, detect_clock
 from stillmap.io.text_lines import Progress
-from stillmap.preprocessing.options import FARTHEST, ReadOptions
+from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions
 
 _NAMED = 5  # skipped files that are named
 
@@ -41,7 +41,7 @@ class Cloud(NamedTuple):
     stamp_ns: int | None = None
 
 
-class Source(NamedTuple):
+class CloudSource(NamedTuple):
     """A cloud that can be read: its name for people, its stamp if that is known before."""
 
     name: str
@@ -49,7 +49,7 @@ class Source(NamedTuple):
     stamp_ns: int | None = None
 
 
-class Known(NamedTuple):
+class DatasetInfo(NamedTuple):
     """What is known of a recording before its clouds are read.
 
     Attributes:
@@ -65,9 +65,9 @@ class Known(NamedTuple):
     single: bool = False
 
 
-def assembled(
-    sources: Sequence[Source],
-    known: Known,
+def build_recording(
+    sources: Sequence[CloudSource],
+    known: DatasetInfo,
     options: ReadOptions,
     progress: Progress | None = None,
     scratch: Path | None = None,
@@ -88,8 +88,8 @@ def assembled(
     Raises:
         InputError: not one can be read, or a library is missing.
     """
-    refuse_places(options)
-    skipped, scans = Skipped(), _Scans(sources, known, options, scratch)
+    reject_laser_poses(options)
+    skipped, scans = SkippedRecords(), _Scans(sources, known, options, scratch)
     lost: list[str] = []
     for number, source in enumerate(sources):
         try:
@@ -106,14 +106,14 @@ def assembled(
         if progress is not None:
             progress((number + 1) / len(sources))
     if not len(scans):
-        raise nothing_usable(known, skipped)
+        raise no_usable_scan_error(known, skipped)
     if lost:
         shown = ", ".join(lost[:_NAMED]) + (", ..." if len(lost) > _NAMED else "")
         known.warnings.append(f"skipped {len(lost)} of {len(sources)}: {shown}")
     return scans.recording(skipped, **more)
 
 
-def refuse_places(options: ReadOptions) -> None:
+def reject_laser_poses(options: ReadOptions) -> None:
     """Refuse options that place a laser on the robot.
 
     Raises:
@@ -125,13 +125,13 @@ def refuse_places(options: ReadOptions) -> None:
         raise InputError("the laser's place on the robot can be given for 2D recordings only")
 
 
-def nothing_usable(known: Known, skipped: Skipped) -> InputError:
+def no_usable_scan_error(known: DatasetInfo, skipped: SkippedRecords) -> InputError:
     """The error for a recording without a single scan that can be read."""
     what = f"holds no usable scan: {skipped.summary('file')}" if skipped.total else "holds no scan"
     return InputError(what, where=str(known.path))
 
 
-def narrowing(options: ReadOptions) -> dict[str, Any]:
+def range_options_note(options: ReadOptions) -> dict[str, Any]:
     """The options that change what is there, for Recording.source."""
     default = ReadOptions()
     names = ("min_range", "max_range", "free_range")
@@ -139,7 +139,7 @@ def narrowing(options: ReadOptions) -> dict[str, Any]:
     return {"read_options": given} if given else {}
 
 
-def _read(source: Source) -> Cloud:
+def _read(source: CloudSource) -> Cloud:
     try:
         return source.read()
     except MemoryError:
@@ -152,11 +152,15 @@ class _Scans:
     """Clouds on their way into a recording; the first one says whether points have times."""
 
     def __init__(
-        self, sources: Sequence[Source], known: Known, options: ReadOptions, scratch: Path | None
+        self,
+        sources: Sequence[CloudSource],
+        known: DatasetInfo,
+        options: ReadOptions,
+        scratch: Path | None,
     ) -> None:
         self._known, self._options, self._scratch = known, options, scratch
         self._period = _period(sources)
-        self._gathered: Gathered | None = None
+        self._gathered: RecordingBuilder | None = None
         self._clock: Clock | None = None
         self._poses: list[NDArray[np.float64] | None] = []
         self._counted = 0
@@ -168,29 +172,29 @@ class _Scans:
         points = cloud.points
         if self._gathered is None:
             self._clock = self._first_clock(cloud)
-            self._gathered = Gathered(
+            self._gathered = RecordingBuilder(
                 3, self._options, beam_times=self._clock is not None, folder=self._scratch
             )
         stamp_ns = cloud.stamp_ns if stamp_ns is None else stamp_ns
         beam_time = None
         if self._clock is not None and cloud.times is not None:
-            stamp_ns, beam_time = since(cloud.times, _usable(points), self._clock, stamp_ns)
+            stamp_ns, beam_time = convert_times(cloud.times, _usable(points), self._clock, stamp_ns)
         if stamp_ns is None:
             stamp_ns = number * 10**9
             self._counted += 1
-        self._gathered.add(stamp_ns, points, beam_time=beam_time)
+        self._gathered.add_scan(stamp_ns, points, beam_time=beam_time)
         self._poses.append(cloud.T)
 
     def _first_clock(self, cloud: Cloud) -> Clock | None:
         if cloud.times is None:
             return None
-        clock = clock_of(cloud.times[_usable(cloud.points)], self._period)
+        clock = detect_clock(cloud.times[_usable(cloud.points)], self._period)
         if clock is None:
             what = "the times of points are not used: no unit makes a sweep of them"
             self._known.warnings.append(what)
         return clock
 
-    def recording(self, skipped: Skipped, **more: Any) -> Recording:
+    def recording(self, skipped: SkippedRecords, **more: Any) -> Recording:
         assert self._gathered is not None
         known, warnings = self._known, self._known.warnings
         if self._counted and len(self) > 1:
@@ -202,9 +206,9 @@ class _Scans:
             "skipped": skipped.to_dict(),
             "skipped_unit": "file",
             "warnings": warnings,
-            **narrowing(self._options),
+            **range_options_note(self._options),
         }
-        return self._gathered.recording(
+        return self._gathered.build(
             np.eye(4)[None], source=source, **{"T_recorded_base": T, **more}
         )
 
@@ -219,7 +223,7 @@ class _Scans:
         return np.stack(found)
 
 
-def _period(sources: Sequence[Source]) -> float | None:
+def _period(sources: Sequence[CloudSource]) -> float | None:
     """Seconds from scan to scan as stamps have it."""
     stamps = [source.stamp_ns for source in sources if source.stamp_ns is not None]
     if len(stamps) < 2:
@@ -228,7 +232,7 @@ def _period(sources: Sequence[Source]) -> float | None:
 
 
 def _usable(points: NDArray[Any]) -> NDArray[np.bool_]:
-    meant = (np.abs(points) <= FARTHEST).all(axis=1)
+    meant = (np.abs(points) <= MAX_POINT_DISTANCE).all(axis=1)
     return np.asarray(meant & np.any(points != 0, axis=1))
 
 
@@ -277,12 +281,12 @@ def _origin_of(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return np.round(middle) if np.abs(middle).max() > _NEAR else np.zeros(3)
 
 
-class Growing:
+class PointBuffer:
     """(n, 3) points that come in blocks; in a file where they are many."""
 
     def __init__(self, origin: Origin, scratch: Path | None) -> None:
         self._origin = origin
-        self._points = Column(np.float32, (3,), scratch)
+        self._points = ArrayBuilder(np.float32, (3,), scratch)
 
     def add(self, points: NDArray[Any]) -> None:
         self._points.append(self._origin.moved(points))
@@ -291,14 +295,14 @@ class Growing:
         return self._points.finished()
 
 
-Reader = Callable[[Path, Origin, Path | None], Cloud]
+CloudReader = Callable[[Path, Origin, Path | None], Cloud]
 
 
-def surveyed(
+def read_clouds(
     path: Path,
     name: str,
     endings: tuple[str, ...],
-    cloud: Reader,
+    cloud: CloudReader,
     options: ReadOptions,
     progress: Progress | None,
     scratch: Path | None,
@@ -315,15 +319,15 @@ def surveyed(
     Raises:
         InputError: no cloud can be read.
     """
-    files = [path] if path.is_file() else files_in(path, endings)
-    stamps = stamps_in([stem_of(file.name, endings) for file in files])
+    files = [path] if path.is_file() else list_files(path, endings)
+    stamps = stamps_from_names([strip_extension(file.name, endings) for file in files])
     origin = Origin()
-    known = Known(path, name, [], single=path.is_file())
+    known = DatasetInfo(path, name, [], single=path.is_file())
     sources = [
-        Source(file.name, partial(cloud, file, origin, scratch), stamps[i] if stamps else None)
+        CloudSource(file.name, partial(cloud, file, origin, scratch), stamps[i] if stamps else None)
         for i, file in enumerate(files)
     ]
-    recording = assembled(sources, known, options, progress, scratch)
+    recording = build_recording(sources, known, options, progress, scratch)
     recording.source.update(origin.notes())
     recording.source["warnings"] += origin.warnings()
     return recording

@@ -8,7 +8,7 @@ import yaml
 
 from stillmap.core.errors import InputError
 from stillmap.core.files import require_regular
-from stillmap.io.builder import Skipped
+from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros import damaged_bag, indexed_bag
 from stillmap.io.ros.bag_types import (
     BAG1_MAGIC,
@@ -16,12 +16,12 @@ from stillmap.io.ros.bag_types import (
     MCAP_MAGIC,
     Bag,
     Channel,
-    DamagedError,
+    DamagedBagError,
     Message,
-    is_packed,
+    is_compressed,
     storage_files,
 )
-from stillmap.io.ros.limits import ZstdError, zstd_stream
+from stillmap.io.ros.limits import ZstdError, open_zstd
 
 _MAX_GROWTH, _SURELY_FINE = 100, 1 << 30  # of a packed file: times its size, bytes
 _MAX_METADATA = 256 << 10  # bytes: YAML takes two seconds for them
@@ -41,34 +41,34 @@ def open_bag(path: Path, scratch: Path | None, *, trusted: bool) -> Bag:
         InputError: no bag that can be read at all.
     """
     if not path.is_dir():
-        return _opened_file(path, scratch, trusted)
-    files = _listed(path)
+        return _open_file(path, scratch, trusted)
+    files = _list_files(path)
     bags: list[Bag] = []
     try:
         for file in files:
-            bags.append(_opened_file(file, scratch, trusted))
+            bags.append(_open_file(file, scratch, trusted))
     except BaseException:
         for bag in bags:
             bag.close()
         raise
-    return _Joined(bags)
+    return _JoinedBag(bags)
 
 
-def size_of(path: Path) -> int:
+def bag_size(path: Path) -> int:
     """Bytes of a bag, or of all files of a folder."""
-    files = _listed(path) if path.is_dir() else [path]
+    files = _list_files(path) if path.is_dir() else [path]
     return sum(file.stat().st_size for file in files)
 
 
-def _opened_file(path: Path, scratch: Path | None, trusted: bool) -> Bag:
+def _open_file(path: Path, scratch: Path | None, trusted: bool) -> Bag:
     require_regular(path)
     try:
         with path.open("rb") as file:
             start = file.read(32)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    if is_packed(path, start):
-        return _Unpacked(path, scratch, trusted)
+    if is_compressed(path, start):
+        return _CompressedBag(path, scratch, trusted)
     reader = indexed_bag if trusted else damaged_bag
     openers: dict[bytes, Callable[[Path], Bag]] = {
         b"#ROSBAG V2.0\n": reader.open_bag1,
@@ -93,10 +93,10 @@ def _opened(opener: Callable[[Path], Bag], path: Path) -> Bag:
     except PermissionError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
     except Exception as error:  # whatever a library makes of damaged bytes
-        raise DamagedError(str(error) or type(error).__name__) from error
+        raise DamagedBagError(str(error) or type(error).__name__) from error
 
 
-def _listed(folder: Path) -> list[Path]:
+def _list_files(folder: Path) -> list[Path]:
     """The files of a ROS 2 folder in their order; `metadata.yaml` need not be there."""
     there = storage_files(folder)
     try:
@@ -118,12 +118,12 @@ def _listed(folder: Path) -> list[Path]:
     return paths or there
 
 
-class _Joined:
+class _JoinedBag:
     """Several files as one bag."""
 
     def __init__(self, bags: list[Bag]) -> None:
         self._bags = bags
-        self.damage = Skipped().merged(*(bag.damage for bag in bags))
+        self.damage = SkippedRecords().merge(*(bag.damage for bag in bags))
         self.kind = f"ROS 2 folder ({bags[0].kind})"
         together: dict[tuple[str, str, str, str], Channel] = {}
         for bag in bags:
@@ -148,15 +148,15 @@ def _identity(channel: Channel) -> tuple[str, str, str, str]:
     return channel.topic, channel.type, channel.encoding, channel.digest
 
 
-class _Unpacked:
+class _CompressedBag:
     """A file that was packed as a whole: unpacked into a folder that goes when it is closed."""
 
     def __init__(self, path: Path, scratch: Path | None, trusted: bool) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix=".stillmap-", dir=scratch)
         try:
             file = Path(self._folder.name) / path.name.removesuffix(".zstd")
-            cut = _unpack(path, file)
-            self._bag = _opened_file(file, scratch, trusted and not cut)
+            cut = _decompress(path, file)
+            self._bag = _open_file(file, scratch, trusted and not cut)
         except BaseException:
             self._folder.cleanup()
             raise
@@ -174,11 +174,11 @@ class _Unpacked:
         self._folder.cleanup()
 
 
-def _unpack(path: Path, out: Path) -> bool:
+def _decompress(path: Path, out: Path) -> bool:
     """Unpack a file; whether the stream was cut or damaged, so that only its beginning is there."""
     limit = max(_MAX_GROWTH * path.stat().st_size, _SURELY_FINE)
     written = 0
-    with path.open("rb") as packed, zstd_stream(packed) as stream, out.open("wb") as file:
+    with path.open("rb") as packed, open_zstd(packed) as stream, out.open("wb") as file:
         try:
             while piece := stream.read(_PIECE):
                 written += len(piece)

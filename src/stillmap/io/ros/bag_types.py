@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
 from stillmap.core.errors import InputError
-from stillmap.io.builder import Skipped
+from stillmap.io.builder import SkippedRecords
 
-Kind = Literal["bag", "ros2", "db3", "mcap"]
+BagKind = Literal["bag", "ros2", "db3", "mcap"]
 
-LAST_NS = 2**63 - 1  # times of recording are counted in 64 bits
+MAX_STAMP_NS = 2**63 - 1  # times of recording are counted in 64 bits
 
 
-class DamagedError(Exception):
+class DamagedBagError(Exception):
     """A bag turned out not to be whole."""
 
 
@@ -62,7 +62,7 @@ class Bag(Protocol):
 
     kind: str
     channels: list[Channel]
-    damage: Skipped
+    damage: SkippedRecords
 
     def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
         """Messages on these topics, about in the order of their recording.
@@ -96,10 +96,10 @@ def is_bag(path: Path, start: bytes | None) -> bool:
     """Whether a file with these first bytes, or a folder (None), is a bag."""
     if start is None:
         return bool(storage_files(path))
-    return start.startswith((BAG1_MAGIC, MCAP_MAGIC, DB3_MAGIC)) or is_packed(path, start)
+    return start.startswith((BAG1_MAGIC, MCAP_MAGIC, DB3_MAGIC)) or is_compressed(path, start)
 
 
-def own_form(path: Path) -> tuple[Kind, bool]:
+def detect_kind(path: Path) -> tuple[BagKind, bool]:
     """What kind of bag a path is, and whether MCAP files are in it."""
     if path.is_dir():
         return "ros2", any(".mcap" in file.name for file in storage_files(path))
@@ -127,6 +127,6 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(d[:18]), "") for d in digits] + [(0, path.name)]
 
 
-def is_packed(path: Path, start: bytes) -> bool:
+def is_compressed(path: Path, start: bytes) -> bool:
     """Whether a file of a ROS 2 folder is packed as a whole."""
     return path.name.endswith((".db3.zstd", ".mcap.zstd")) and start.startswith(ZSTD_MAGIC)

@@ -21,8 +21,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import new_file, new_folder
-from stillmap.io.ros.bag_types import Channel, Kind
+from stillmap.core.files import atomic_file, atomic_folder
+from stillmap.io.ros.bag_types import BagKind, Channel
 
 Send = Callable[[int, Any], None]
 
@@ -51,11 +51,11 @@ class BagWriter:
         writer: of rosbags, open.
     """
 
-    def __init__(self, kind: Kind, writer: rosbag1.Writer | rosbag2.Writer) -> None:
+    def __init__(self, kind: BagKind, writer: rosbag1.Writer | rosbag2.Writer) -> None:
         self._kind, self._writer = kind, writer
         self._store = _store(kind)
 
-    def topic(self, name: str, type: str, *, latched: bool = False) -> Send:
+    def add_topic(self, name: str, type: str, *, latched: bool = False) -> Send:
         """A new topic: a function that sends a message at a stamp in nanoseconds.
 
         Args:
@@ -67,7 +67,7 @@ class BagWriter:
             return self._topic1(self._writer, name, type, latched)
         return self._topic2(self._writer, name, type, latched)
 
-    def copied_topic(self, channel: Channel) -> Callable[[int, bytes], None] | None:
+    def copy_topic(self, channel: Channel) -> Callable[[int, bytes], None] | None:
         """A topic like one of another bag: a function that sends bytes at a time in nanoseconds.
 
         None where nobody knows what its messages are made of.
@@ -89,7 +89,7 @@ class BagWriter:
         writer = self._writer
         return lambda stamp, raw: writer.write(connection, stamp, raw)
 
-    def serialized(self, message: Any, type: str) -> bytes:
+    def serialize(self, message: Any, type: str) -> bytes:
         """A message as the bytes of this kind of bag."""
         pack = self._store.serialize_ros1 if self.is_ros1 else self._store.serialize_cdr
         return bytes(pack(message, type))
@@ -143,7 +143,7 @@ def _digest(channel: Channel) -> str:
 
 @contextmanager
 def new_bag(
-    path: Path, kind: Kind, *, overwrite: bool = False, mcap: bool = False
+    path: Path, kind: BagKind, *, overwrite: bool = False, mcap: bool = False
 ) -> Iterator[BagWriter]:
     """A bag that lies at `path` once the block ends without an exception.
 
@@ -158,9 +158,9 @@ def new_bag(
     """
     with ExitStack() as stack:
         if kind == "ros2":
-            work = stack.enter_context(new_folder(path, "metadata.yaml", overwrite))
+            work = stack.enter_context(atomic_folder(path, "metadata.yaml", overwrite))
         else:
-            work = stack.enter_context(new_file(path))
+            work = stack.enter_context(atomic_file(path))
         if kind == "bag":
             work.unlink(missing_ok=True)  # of one that was killed: the writer refuses what is there
             with _told(path), rosbag1.Writer(work) as writer1:
@@ -184,7 +184,7 @@ def new_bag(
             shutil.move(named / f"{named.name}.{kind}", work)
 
 
-def require_stamps(first_ns: int, last_ns: int, kind: Kind) -> None:
+def require_stamps(first_ns: int, last_ns: int, kind: BagKind) -> None:
     """Refuses stamps that such a bag cannot hold.
 
     Raises:
@@ -197,7 +197,7 @@ def require_stamps(first_ns: int, last_ns: int, kind: Kind) -> None:
         )
 
 
-def _store(kind: Kind) -> Typestore:
+def _store(kind: BagKind) -> Typestore:
     if kind != "bag":
         return get_typestore(Stores.ROS2_HUMBLE)
     store = get_typestore(Stores.ROS1_NOETIC)

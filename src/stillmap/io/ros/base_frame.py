@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.io.builder import Skipped
-from stillmap.io.ros.messages import frame as frame_name
+from stillmap.io.builder import SkippedRecords
+from stillmap.io.ros.messages import frame_name as frame_name
 from stillmap.io.ros.messages import stamp_ns
-from stillmap.io.ros.tf import BAD_TRANSFORM, Transforms, is_pose
+from stillmap.io.ros.tf import BAD_TRANSFORM, TransformTree, is_pose
 from stillmap.preprocessing.options import ReadOptions
 
-TAKEN = "the sensor is taken for the robot: nothing says where it sits on one"
+SENSOR_IS_BASE = "the sensor is taken for the robot: nothing says where it sits on one"
 
 _NAMES = ("base_link", "base_footprint", "base")
 _GAP = 1.0  # s without odometry that is worth a word
@@ -29,7 +29,7 @@ class Odometry:
         self.frame, self.child = "", ""
         self.stamp_ns = array("q")
         self.values = array("d")
-        self.skipped = Skipped()
+        self.skipped = SkippedRecords()
         self._number = 0
 
     def add(self, message: Any) -> None:
@@ -46,7 +46,7 @@ class Odometry:
         self.values.extend(values)
 
 
-class Places(NamedTuple):
+class SensorPoses(NamedTuple):
     """Where sensors are on the robot.
 
     Attributes:
@@ -63,8 +63,8 @@ class Places(NamedTuple):
     moves: list[bool]
 
 
-def base_frame(
-    transforms: Transforms, sensors: list[str], odometry: list[Odometry], options: ReadOptions
+def find_base_frame(
+    transforms: TransformTree, sensors: list[str], odometry: list[Odometry], options: ReadOptions
 ) -> tuple[str, str]:
     """The frame of the robot, and how it was found.
 
@@ -77,7 +77,7 @@ def base_frame(
             known = ", ".join(sorted(transforms.frames | set(sensors))[:20])
             raise InputError(f"base frame {given!r} is not in the recording", hint=f"has: {known}")
         return given, "given"
-    path = transforms.path_up(sensors[0])
+    path = transforms.path_to_root(sensors[0])
     for one in odometry:
         if one.child and one.child in path:
             return one.child, f"{one.topic} names it"
@@ -86,35 +86,35 @@ def base_frame(
         if found:
             return found[0], "by its name"
     for below in path:
-        if transforms.changes(below):
+        if transforms.is_moving(below):
             if below == sensors[0]:
                 break
             return below, f"it moves in {transforms.parent(below)}"
-    if len(path) > 1 and not any(map(transforms.changes, path)):
+    if len(path) > 1 and not any(map(transforms.is_moving, path)):
         return path[-1], "all frames hang on it"
-    return sensors[0], TAKEN
+    return sensors[0], SENSOR_IS_BASE
 
 
-def places(
-    transforms: Transforms, base: tuple[str, str], sensors: list[tuple[str, NDArray[np.int64]]]
-) -> Places:
+def find_sensor_poses(
+    transforms: TransformTree, base: tuple[str, str], sensors: list[tuple[str, NDArray[np.int64]]]
+) -> SensorPoses:
     """Where sensors sit on the robot, each at its own times (N,)."""
     found, moves = [], []
     for name, at_ns in sensors:
-        located = transforms.located(base[0], name, at_ns)
+        located = transforms.lookup(base[0], name, at_ns)
         found.append(None if located is None else located.T)
         moves.append(located is not None and located.moves)
-    return Places(*base, found, moves)
+    return SensorPoses(*base, found, moves)
 
 
-def words(placed: Places) -> list[str]:
+def base_frame_warnings(placed: SensorPoses) -> list[str]:
     """A warning where the robot's frame is a makeshift."""
-    if placed.how != TAKEN:
+    if placed.how != SENSOR_IS_BASE:
         return []
     return [f"no transform says where {placed.base!r} sits on a robot: took the laser as the base"]
 
 
-def planar(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool, bool]:
+def project_to_plane(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool, bool]:
     """A level laser seen from above: (N, 3, 3), whether it hangs upside down, whether it tilts."""
     up = T[:, 2, 2]
     theta = np.arctan2(T[:, 1, 0], T[:, 0, 0])
@@ -122,8 +122,8 @@ def planar(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool, bool]:
     return flat, bool(np.median(up) < 0.0), bool(np.any(np.abs(up) < _TILTED))
 
 
-def odometry_at(
-    transforms: Transforms,
+def find_odometry(
+    transforms: TransformTree,
     base: str,
     odometry: list[Odometry],
     at_ns: NDArray[np.int64],
@@ -137,42 +137,44 @@ def odometry_at(
     frame = options.odom_frame
     if frame is not None and frame not in transforms.frames | {o.frame for o in odometry}:
         raise InputError(f"odometry frame {frame!r} is not in the recording")
-    named = _frame_above(transforms, base) if frame is None else frame
+    named = _find_odom_frame(transforms, base) if frame is None else frame
     if named in transforms.frames:
-        found = transforms.located(named, base, at_ns)
+        found = transforms.lookup(named, base, at_ns)
         if found is not None and found.moves:
             gap = _largest_gap(transforms.stamps_between(named, base), at_ns)
-            return found.T, *_told(f"TF from {named} to {base}", found.outside, gap)
+            return found.T, *_describe_odometry(f"TF from {named} to {base}", found.outside, gap)
     for one in sorted(odometry, key=lambda o: -len(o.stamp_ns)):
         if frame in (None, one.frame) and len(one.stamp_ns):
-            return _from_topic(one, transforms, base, at_ns)
+            return _odometry_from_topic(one, transforms, base, at_ns)
     return None, {"from": None, "outside": 0}, []
 
 
-def _from_topic(
-    one: Odometry, transforms: Transforms, base: str, at_ns: NDArray[np.int64]
+def _odometry_from_topic(
+    one: Odometry, transforms: TransformTree, base: str, at_ns: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], dict[str, Any], list[str]]:
-    alone = Transforms()
+    alone = TransformTree()
     stamps = list(one.stamp_ns)
     for stamp, values in zip(stamps, np.asarray(one.values).reshape(-1, 7).tolist(), strict=True):
-        alone.add_one("odometry", "robot", stamp, tuple(values), static=False)
-    found = alone.located("odometry", "robot", at_ns)
+        alone.add_transform("odometry", "robot", stamp, tuple(values), static=False)
+    found = alone.lookup("odometry", "robot", at_ns)
     assert found is not None
     T, more = found.T, []
-    on_robot = transforms.located(one.child, base, at_ns) if one.child != base else None
+    on_robot = transforms.lookup(one.child, base, at_ns) if one.child != base else None
     if on_robot is not None:
         T = T @ on_robot.T
     elif one.child not in ("", base):
         more = [f"{one.topic}: taken for {base}, though it speaks of {one.child}"]
-    told, warnings = _told(one.topic, found.outside, _largest_gap(np.array(stamps), at_ns))
+    told, warnings = _describe_odometry(
+        one.topic, found.outside, _largest_gap(np.array(stamps), at_ns)
+    )
     return T, told, more + warnings
 
 
-def _frame_above(transforms: Transforms, base: str) -> str:
+def _find_odom_frame(transforms: TransformTree, base: str) -> str:
     """The frame in which the robot moves first, on the way up."""
-    for name in transforms.path_up(base):
+    for name in transforms.path_to_root(base):
         above = transforms.parent(name)
-        if above is not None and transforms.changes(name):
+        if above is not None and transforms.is_moving(name):
             return above
     return ""
 
@@ -186,7 +188,7 @@ def _largest_gap(stamps: NDArray[np.int64], at_ns: NDArray[np.int64]) -> float:
     return float(np.diff(stamps).max(initial=0)) / 1e9
 
 
-def _told(origin: str, outside: int, gap: float) -> tuple[dict[str, Any], list[str]]:
+def _describe_odometry(origin: str, outside: int, gap: float) -> tuple[dict[str, Any], list[str]]:
     warnings = []
     if outside:
         warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")

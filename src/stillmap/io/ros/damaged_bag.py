@@ -17,9 +17,9 @@ from typing import IO, Any
 from rosbags.rosbag1.reader import Header, RecordType, normalize
 from rosbags.typesys.msg import normalize_msgtype
 
-from stillmap.io.builder import Skipped
+from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros import limits, sqlite_limits
-from stillmap.io.ros.bag_types import LAST_NS, Channel, Message
+from stillmap.io.ros.bag_types import MAX_STAMP_NS, Channel, Message
 
 CUT = "end that is no record"
 BAD_CHUNK = "chunk that cannot be unpacked"
@@ -28,12 +28,12 @@ BAD_ROWS = "rows that cannot be read"
 _UNPACKED: dict[str, Callable[[bytes], bytes]] = {
     "": bytes,
     "none": bytes,
-    "bz2": limits.bz2_unpacked,
-    "lz4": limits.lz4_unpacked,
-    "zstd": limits.zstd_unpacked,
+    "bz2": limits.decompress_bz2,
+    "lz4": limits.decompress_lz4,
+    "zstd": limits.decompress_zstd,
 }
 
-_Scan = Callable[[dict[int, Channel], Skipped], Iterator[tuple[int, int, bytes]]]
+_Scan = Callable[[dict[int, Channel], SkippedRecords], Iterator[tuple[int, int, bytes]]]
 
 
 class _CutError(Exception):
@@ -47,7 +47,7 @@ class DamagedBag:
     kind: str
     scan: _Scan
     channels: list[Channel] = dataclasses.field(default_factory=list)
-    damage: Skipped = dataclasses.field(default_factory=Skipped)
+    damage: SkippedRecords = dataclasses.field(default_factory=SkippedRecords)
 
     def __post_init__(self) -> None:
         found: dict[int, Channel] = {}
@@ -61,7 +61,7 @@ class DamagedBag:
         wanted = {c.id: c for c in self.channels if c.topic in topics}
         if not wanted:
             return
-        for channel, log_ns, raw in self.scan({}, Skipped()):
+        for channel, log_ns, raw in self.scan({}, SkippedRecords()):
             if channel in wanted and (since_ns is None or log_ns >= since_ns):
                 yield Message(wanted[channel], log_ns, raw)
 
@@ -85,7 +85,7 @@ def open_db3(path: Path) -> DamagedBag:
 
 
 def _scan_bag1(
-    path: Path, found: dict[int, Channel], damage: Skipped
+    path: Path, found: dict[int, Channel], damage: SkippedRecords
 ) -> Iterator[tuple[int, int, bytes]]:
     with path.open("rb") as file:
         file.readline(64)  # #ROSBAG V2.0
@@ -93,13 +93,13 @@ def _scan_bag1(
 
 
 def _bag1_records(
-    file: IO[bytes], found: dict[int, Channel], damage: Skipped, *, chunks: bool
+    file: IO[bytes], found: dict[int, Channel], damage: SkippedRecords, *, chunks: bool
 ) -> Iterator[tuple[int, int, bytes]]:
     """Records of a file, or of a chunk: none of these are `chunks` again."""
     end = _size(file)
     while file.tell() < end:
         at = file.tell()
-        limits.charge(limits.RECORD)
+        limits.count_output(limits.RECORD)
         header = Header.read(file)  # type: ignore[arg-type]
         kind, size = header.get_uint8("op"), _number(file, 4)
         if kind == RecordType.CHUNK and not chunks:
@@ -109,7 +109,7 @@ def _bag1_records(
         if kind == RecordType.CHUNK:
             try:
                 inner = BytesIO(_unpacked(header.get_string("compression"), data))
-            except limits.TooMuchError:
+            except limits.OutputLimitError:
                 raise
             except Exception:  # whatever a library makes of damaged bytes
                 damage.add(BAD_CHUNK, at)
@@ -132,7 +132,7 @@ def _bag1_channel(header: Header, data: bytes) -> Channel:
 
 
 def _scan_mcap(
-    path: Path, found: dict[int, Channel], damage: Skipped
+    path: Path, found: dict[int, Channel], damage: SkippedRecords
 ) -> Iterator[tuple[int, int, bytes]]:
     schemas: dict[int, str] = {}
     with path.open("rb") as file:
@@ -145,7 +145,7 @@ def _mcap_records(
     file: IO[bytes],
     schemas: dict[int, str],
     found: dict[int, Channel],
-    damage: Skipped,
+    damage: SkippedRecords,
     *,
     chunks: bool,
 ) -> Iterator[tuple[int, int, bytes]]:
@@ -153,7 +153,7 @@ def _mcap_records(
     end = _size(file)
     while file.tell() < end:
         at = file.tell()
-        limits.charge(limits.RECORD)
+        limits.count_output(limits.RECORD)
         kind = _number(file, 1)
         if kind == 0x89:  # the magic at the end
             return
@@ -173,7 +173,7 @@ def _mcap_records(
             found.setdefault(number, Channel(number, topic, name, encoding, 0, ""))
         elif kind == 0x05:
             number, _, log_ns, _ = struct.unpack("<HIQQ", _exactly(record, 22, len(data)))
-            yield number, min(log_ns, LAST_NS), data[22:]
+            yield number, min(log_ns, MAX_STAMP_NS), data[22:]
         elif kind == 0x06:
             if not chunks:
                 raise _CutError
@@ -182,7 +182,7 @@ def _mcap_records(
                 packing = _text(record)
                 size = min(_number(record, 8), len(data))
                 inner = BytesIO(_unpacked(packing, record.read(size)))
-            except limits.TooMuchError:
+            except limits.OutputLimitError:
                 raise
             except Exception:  # whatever a library makes of damaged bytes
                 damage.add(BAD_CHUNK, at)
@@ -192,11 +192,11 @@ def _mcap_records(
 
 
 def _scan_db3(
-    path: Path, found: dict[int, Channel], damage: Skipped
+    path: Path, found: dict[int, Channel], damage: SkippedRecords
 ) -> Iterator[tuple[int, int, bytes]]:
     rows = 0
     try:
-        with closing(sqlite_limits.opened(path)) as database:
+        with closing(sqlite_limits.open_database(path)) as database:
             for number, topic, kind, encoding in database.execute(
                 "SELECT id, name, type, serialization_format FROM topics"
             ):
@@ -214,14 +214,14 @@ def _scan_db3(
 
 def _until_cut(
     file: IO[bytes],
-    damage: Skipped,
+    damage: SkippedRecords,
     records: Iterator[tuple[int, int, bytes]],
     at: int | None = None,
 ) -> Iterator[tuple[int, int, bytes]]:
     """Records up to the first that makes no sense; `at` is where an outer chunk begins."""
     try:
         yield from records
-    except limits.TooMuchError:
+    except limits.OutputLimitError:
         raise
     except Exception:  # whatever a library makes of damaged bytes
         damage.add(CUT, file.tell() if at is None else at)

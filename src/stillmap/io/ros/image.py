@@ -15,11 +15,11 @@ from PIL import Image
 from stillmap.core import se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
-from stillmap.io.builder import Skipped
-from stillmap.io.point_cloud.files import transform
+from stillmap.io.builder import SkippedRecords
+from stillmap.io.point_cloud.files import rigid_transform
 from stillmap.io.ros.bag_types import Bag, Message
-from stillmap.io.ros.messages import CAMERA_INFO, COMPRESSED, decoded, frame, stamp_ns
-from stillmap.io.ros.tf import Transforms
+from stillmap.io.ros.messages import CAMERA_INFO, COMPRESSED_IMAGE, decode, frame_name, stamp_ns
+from stillmap.io.ros.tf import TransformTree
 
 _MAX_PIXELS = 1 << 27
 _RAW = {  # encoding: type, channels, where red, green and blue are
@@ -47,7 +47,7 @@ _RECTIFIED = re.compile(r"/image_rect(_color|_mono)?(/compressed)?$")
 _NONE = np.empty(0)
 
 
-class Pictures:
+class ImageCollector:
     """Where the pictures of a bag are."""
 
     def __init__(self) -> None:
@@ -55,14 +55,14 @@ class Pictures:
         self.topic: list[str] = []
         self.infos: dict[str, Any] = {}  # CameraInfo by topic
         self.frames: dict[str, str] = {}
-        self.skipped = Skipped()
+        self.skipped = SkippedRecords()
 
     def add(self, message: Message) -> None:
         """Take in a message; of pictures only the header is kept."""
         topic = message.channel.topic
         try:
-            content = decoded(message)
-            stamp, name = stamp_ns(content.header), frame(content.header.frame_id)
+            content = decode(message)
+            stamp, name = stamp_ns(content.header), frame_name(content.header.frame_id)
         except Exception:  # whatever the library makes of damaged bytes
             self.skipped.add(f"picture that cannot be decoded ({topic})", len(self.topic) + 1)
             return
@@ -74,11 +74,11 @@ class Pictures:
         self.topic.append(topic)
         self.frames.setdefault(topic, name)
 
-    def images(
-        self, transforms: Transforms, base: str, reopened: Callable[[], Bag]
+    def build_images(
+        self, transforms: TransformTree, base: str, reopened: Callable[[], Bag]
     ) -> Images | None:
         """The pictures as part of a recording, raw ones where a camera has both."""
-        chosen = _one_per_camera(sorted(self.frames))
+        chosen = _select_topics(sorted(self.frames))
         its = [k for k, topic in enumerate(self.topic) if topic in chosen]
         if not its:
             return None
@@ -87,7 +87,7 @@ class Pictures:
 
         def load(image: int) -> NDArray[Any]:
             k = its[image]
-            return _loaded(reopened(), self.topic[k], self.log_ns[k], self.stamp_ns[k])
+            return _load_image(reopened(), self.topic[k], self.log_ns[k], self.stamp_ns[k])
 
         return Images(
             np.array([self.stamp_ns[k] for k in its], np.int64),
@@ -96,18 +96,18 @@ class Pictures:
             load,
         )
 
-    def _camera(self, topic: str, transforms: Transforms, base: str) -> Camera:
-        info = self.infos.get(f"{_camera_of(topic)}/camera_info")
-        placed = transforms.located(base, self.frames[topic], np.zeros(1, np.int64))
+    def _camera(self, topic: str, transforms: TransformTree, base: str) -> Camera:
+        info = self.infos.get(f"{_camera_name(topic)}/camera_info")
+        placed = transforms.lookup(base, self.frames[topic], np.zeros(1, np.int64))
         T = None if placed is None or placed.moves else placed.T[0]
         if info is None:
             return Camera(topic, 0, 0, None, "", np.empty(0), T)
-        return _calibrated(
+        return _apply_camera_info(
             Camera(topic, int(info.width), int(info.height), None, "", _NONE, T), info
         )
 
 
-def _calibrated(camera: Camera, info: Any) -> Camera:
+def _apply_camera_info(camera: Camera, info: Any) -> Camera:
     """The camera with what a CameraInfo says: of raw pictures, or of those made from them that
     are rectified, by the name of their topic."""
     # ROS 1 names the fields with capitals
@@ -117,7 +117,7 @@ def _calibrated(camera: Camera, info: Any) -> Camera:
     )
     if _RECTIFIED.search(camera.name):
         K, D, model = P.reshape(-1)[[0, 1, 2, 4, 5, 6, 8, 9, 10]], _NONE, ""
-        camera = replace(camera, T_base_camera=_rectified(camera.T_base_camera, R))
+        camera = replace(camera, T_base_camera=_rectify_pose(camera.T_base_camera, R))
     else:
         model = str(info.distortion_model)
     usable = K.shape == (9,) and np.isfinite(K).all() and K[0] > 0.0
@@ -129,33 +129,35 @@ def _calibrated(camera: Camera, info: Any) -> Camera:
     )
 
 
-def _rectified(T: NDArray[np.float64] | None, R: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _rectify_pose(
+    T: NDArray[np.float64] | None, R: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
     """The place of a camera that is turned by R (9,); as it is where R is no rotation."""
     try:
-        turn = transform(R, np.zeros(3))
+        turn = rigid_transform(R, np.zeros(3))
     except ValueError:
         return T
     return None if T is None else T @ se2.inverse(turn)
 
 
-def _camera_of(topic: str) -> str:
+def _camera_name(topic: str) -> str:
     """/cam of /cam/image_raw and of /cam/image_raw/compressed."""
     return topic.removesuffix("/compressed").rpartition("/")[0]
 
 
-def _one_per_camera(topics: list[str]) -> list[str]:
+def _select_topics(topics: list[str]) -> list[str]:
     by_camera: dict[str, str] = {}
     for topic in sorted(topics, key=lambda t: (t.endswith("/compressed"), t)):
-        by_camera.setdefault(_camera_of(topic), topic)
+        by_camera.setdefault(_camera_name(topic), topic)
     return sorted(by_camera.values())
 
 
-def _loaded(bag: Bag, topic: str, log_ns: int, stamp: int) -> NDArray[Any]:
+def _load_image(bag: Bag, topic: str, log_ns: int, stamp: int) -> NDArray[Any]:
     try:
         for message in bag.messages({topic}, log_ns):
-            content = decoded(message)
+            content = decode(message)
             if stamp_ns(content.header) == stamp:
-                return pixels(content, message.channel.type == COMPRESSED)
+                return decode_pixels(content, message.channel.type == COMPRESSED_IMAGE)
     except InputError:
         raise
     except Exception as error:  # whatever a library makes of damaged bytes
@@ -165,14 +167,14 @@ def _loaded(bag: Bag, topic: str, log_ns: int, stamp: int) -> NDArray[Any]:
     raise InputError(f"the picture on {topic} at {stamp} ns is no longer there")
 
 
-def pixels(message: Any, compressed: bool) -> NDArray[Any]:
+def decode_pixels(message: Any, compressed: bool) -> NDArray[Any]:
     """(height, width, 3) uint8 red, green, blue, or (height, width) of one channel.
 
     Raises:
         InputError: it is damaged, too large, or of an unknown encoding.
     """
     if compressed:
-        return _unpacked(bytes(message.data))
+        return _decompress(bytes(message.data))
     height, width, step = int(message.height), int(message.width), int(message.step)
     encoding = str(message.encoding)
     kind, channels, order = _RAW.get(encoding, ("u1", 1, None))
@@ -185,12 +187,12 @@ def pixels(message: Any, compressed: bool) -> NDArray[Any]:
     strides = (step, channels * dtype.itemsize, dtype.itemsize)
     values = np.ndarray((height, width, channels), dtype, message.data, strides=strides)
     if encoding in _BAYER:
-        return _from_bayer(values[..., 0], _BAYER[encoding])
+        return _demosaic(values[..., 0], _BAYER[encoding])
     chosen = values[..., 0] if order is None else values[..., list(order)]
     return np.ascontiguousarray(chosen, dtype.newbyteorder("="))
 
 
-def _unpacked(data: bytes) -> NDArray[Any]:
+def _decompress(data: bytes) -> NDArray[Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP", "TIFF")) as image:
@@ -200,7 +202,7 @@ def _unpacked(data: bytes) -> NDArray[Any]:
             return np.array(whole)
 
 
-def _from_bayer(values: NDArray[Any], pattern: str) -> NDArray[Any]:
+def _demosaic(values: NDArray[Any], pattern: str) -> NDArray[Any]:
     """Colours from a Bayer mosaic: each square of four pixels has one, at half the resolution."""
     h, w = (values.shape[0] // 2) * 2, (values.shape[1] // 2) * 2
     quads = values[:h, :w].reshape(h // 2, 2, w // 2, 2).astype(np.uint16)

@@ -16,13 +16,13 @@ from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 from rosbags.rosbag2.metadata import parse_qos
 
 from stillmap.core.errors import InputError
-from stillmap.io.builder import Skipped
+from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros import limits, sqlite_limits
-from stillmap.io.ros.bag_types import LAST_NS, Channel, DamagedError, Message
+from stillmap.io.ros.bag_types import MAX_STAMP_NS, Channel, DamagedBagError, Message
 
 # the library unpacks whatever comes; its table is where it can be told to stop
-storage_mcap.DECOMPRESSORS["lz4"] = lambda data, _: limits.lz4_unpacked(data)
-storage_mcap.DECOMPRESSORS["zstd"] = lambda data, _: limits.zstd_unpacked(data)
+storage_mcap.DECOMPRESSORS["lz4"] = lambda data, _: limits.decompress_lz4(data)
+storage_mcap.DECOMPRESSORS["zstd"] = lambda data, _: limits.decompress_zstd(data)
 
 _MAX_PROFILES = 16 << 10  # bytes of YAML about how a topic was sent
 
@@ -36,8 +36,8 @@ for _module in (storage_mcap, storage_sqlite3):
     vars(_module).update(parse_qos=_profiles)
 
 _BOUNDED = {
-    rosbag1.decompressors["bz2"]: limits.bz2_unpacked,
-    rosbag1.decompressors["lz4"]: limits.lz4_unpacked,
+    rosbag1.decompressors["bz2"]: limits.decompress_bz2,
+    rosbag1.decompressors["lz4"]: limits.decompress_lz4,
 }
 
 
@@ -63,13 +63,13 @@ class _Bag1Reader(rosbag1.Reader):
 
 
 @dataclasses.dataclass
-class WholeBag:
+class IndexedBag:
     """See `Bag`."""
 
     kind: str
     reader: Any
     channels: list[Channel] = dataclasses.field(default_factory=list)
-    damage: Skipped = dataclasses.field(default_factory=Skipped)
+    damage: SkippedRecords = dataclasses.field(default_factory=SkippedRecords)
 
     def __post_init__(self) -> None:
         self.channels = [_channel(connection) for connection in self.reader.connections]
@@ -89,10 +89,10 @@ class WholeBag:
             except InputError:
                 raise
             except Exception as error:  # whatever the library makes of damaged bytes
-                raise DamagedError(str(error) or type(error).__name__) from error
+                raise DamagedBagError(str(error) or type(error).__name__) from error
             # a column of SQLite holds anything
-            if not (isinstance(log_ns, int) and log_ns <= LAST_NS and isinstance(raw, bytes)):
-                raise DamagedError("a message without time or content")
+            if not (isinstance(log_ns, int) and log_ns <= MAX_STAMP_NS and isinstance(raw, bytes)):
+                raise DamagedBagError("a message without time or content")
             yield Message(channels[connection.id], log_ns, raw)
 
     def close(self) -> None:
@@ -100,27 +100,27 @@ class WholeBag:
         self.reader.close()
 
 
-def open_bag1(path: Path) -> WholeBag:
+def open_bag1(path: Path) -> IndexedBag:
     """A ROS 1 bag with its index. Raises whatever the library says of one that is damaged."""
     reader = _Bag1Reader(path)
     reader.open()
-    return WholeBag("ROS 1 bag", reader)
+    return IndexedBag("ROS 1 bag", reader)
 
 
-def open_mcap(path: Path) -> WholeBag:
+def open_mcap(path: Path) -> IndexedBag:
     """An MCAP file of ROS 2. Raises whatever the library says of one that is damaged."""
     reader = storage_mcap.McapReader(path)
     reader.open()
-    return WholeBag("MCAP", reader)
+    return IndexedBag("MCAP", reader)
 
 
-def open_db3(path: Path) -> WholeBag:
+def open_db3(path: Path) -> IndexedBag:
     """A SQLite file of ROS 2. Raises whatever the library says of one that is damaged."""
     # the library makes an address of the path
-    reader = storage_sqlite3.Sqlite3Reader(Path(sqlite_limits.address(path)))
-    with sqlite_limits.bounded(path):
+    reader = storage_sqlite3.Sqlite3Reader(Path(sqlite_limits.database_uri(path)))
+    with sqlite_limits.limit_databases(path):
         reader.open()
-    return WholeBag("SQLite bag", reader)
+    return IndexedBag("SQLite bag", reader)
 
 
 def _channel(connection: Any) -> Channel:
@@ -135,7 +135,7 @@ def _channel(connection: Any) -> Channel:
     in_words = connection.msgdef.format == MessageDefinitionFormat.MSG
     words = connection.topic, connection.msgtype, encoding, connection.digest
     if not all(isinstance(word, str) for word in words):
-        raise DamagedError("a topic whose name or type is no text")
+        raise DamagedBagError("a topic whose name or type is no text")
     return Channel(
         connection.id,
         connection.topic,

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import Column
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.timestamps import longest_non_decreasing
-from stillmap.io.builder import Skipped
+from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros.bag_types import Message
-from stillmap.io.ros.messages import MULTI_ECHO, decoded, frame, stamp_ns
+from stillmap.io.ros.messages import MULTI_ECHO, decode, frame_name, stamp_ns
 
 UNREADABLE = "message that cannot be decoded"
 NO_READINGS = "scan without readings"
@@ -27,7 +27,7 @@ _MAX_READINGS = 1 << 20
 _TOGETHER = 256  # scans
 
 
-class Shape(NamedTuple):
+class ScanShape(NamedTuple):
     """What scans of one laser share. Radians, metres, seconds."""
 
     angle_min: float
@@ -37,7 +37,7 @@ class Shape(NamedTuple):
     range_max: float
     time_increment: float
 
-    def fault(self) -> str | None:
+    def find_fault(self) -> str | None:
         """Why such a scan cannot be used."""
         if self.n == 0 or self.n > _MAX_READINGS:
             return NO_READINGS
@@ -55,7 +55,7 @@ class Shape(NamedTuple):
         return self.angle_min + self.angle_increment * np.arange(self.n, dtype=np.float64)
 
 
-class LaserScans:
+class _ScanBuffer:
     """The scans of one laser on one topic, in the order of their recording.
 
     Attributes:
@@ -70,8 +70,8 @@ class LaserScans:
         self.topic, self.frame, self.kind = topic, frame, kind
         self.stamp_ns, self.log_ns, self.number = array("q"), array("q"), array("q")
         self.shape = array("i")
-        self.shapes: dict[Shape, int] = {}
-        self._ranges = Column(np.float32, (), scratch)
+        self.shapes: dict[ScanShape, int] = {}
+        self._ranges = ArrayBuilder(np.float32, (), scratch)
         self._waiting: list[NDArray[np.float32]] = []
 
     def __len__(self) -> int:
@@ -81,7 +81,7 @@ class LaserScans:
         self, message: Any, ranges: NDArray[np.float32], log_ns: int, number: int
     ) -> str | None:
         """Take in a scan; why not, if it cannot be used."""
-        shape = Shape(
+        shape = ScanShape(
             message.angle_min,
             message.angle_increment,
             len(ranges),
@@ -91,7 +91,7 @@ class LaserScans:
         )
         known = self.shapes.get(shape)
         if known is None:
-            fault = shape.fault()
+            fault = shape.find_fault()
             if fault is not None:
                 return fault
             known = self.shapes.setdefault(shape, len(self.shapes))
@@ -109,7 +109,7 @@ class LaserScans:
             self._ranges.append(np.concatenate(self._waiting))
             self._waiting = []
 
-    def finished(self, skipped: Skipped) -> "Scans":
+    def finish(self, skipped: SkippedRecords) -> "LaserScans":
         """All of them with time that does not run backwards; what falls out is counted."""
         self._pass_on()
         ranges = self._ranges.finished()
@@ -121,10 +121,10 @@ class LaserScans:
         keep = longest_non_decreasing(stamps.tolist())
         number = np.asarray(self.number)
         skipped.add_all(TIME_BACKWARDS, np.delete(number, keep))
-        again = _repeated(stamps, start, n, ranges, keep)
+        again = _find_repeats(stamps, start, n, ranges, keep)
         skipped.add_all(REPEATED, number[keep[again]])
         keep = keep[~again]
-        return Scans(
+        return LaserScans(
             self.topic,
             self.frame,
             self.kind,
@@ -144,7 +144,7 @@ class LaserScans:
         return log, [f"{self.topic}: headers have no stamps: the times of recording are used"]
 
 
-class Scans(NamedTuple):
+class LaserScans(NamedTuple):
     """T usable scans of one laser, by their stamps.
 
     Attributes:
@@ -165,7 +165,7 @@ class Scans(NamedTuple):
     number: NDArray[np.int64]
     start: NDArray[np.int64]
     shape: NDArray[np.int32]
-    shapes: list[Shape]
+    shapes: list[ScanShape]
     ranges: NDArray[np.float32]
     warnings: list[str]
 
@@ -179,7 +179,7 @@ class Scans(NamedTuple):
         return np.array([s.n for s in self.shapes], np.int64)[self.shape]
 
     @property
-    def usual(self) -> Shape:
+    def typical_shape(self) -> ScanShape:
         """The shape of most scans."""
         return self.shapes[int(np.bincount(self.shape, minlength=len(self.shapes)).argmax())]
 
@@ -190,13 +190,13 @@ class Scans(NamedTuple):
         return (self.n_scans - 1) / span if span > 0.0 else None
 
 
-class LaserTopics:
+class LaserCollector:
     """Every laser on the topics that are read: one topic may carry several, by frame."""
 
     def __init__(self, scratch: Path | None) -> None:
         self._scratch = scratch
-        self._lasers: dict[tuple[str, str], LaserScans] = {}
-        self._skipped: dict[str, Skipped] = {}
+        self._lasers: dict[tuple[str, str], _ScanBuffer] = {}
+        self._skipped: dict[str, SkippedRecords] = {}
         self._seen: dict[str, int] = {}
 
     def add(self, message: Message) -> None:
@@ -204,8 +204,8 @@ class LaserTopics:
         topic = message.channel.topic
         number = self._seen[topic] = self._seen.get(topic, 0) + 1
         try:
-            scan = decoded(message)
-            name = frame(scan.header.frame_id)
+            scan = decode(message)
+            name = frame_name(scan.header.frame_id)
             ranges = _first_echoes(scan) if message.channel.type == MULTI_ECHO else scan.ranges
         except Exception:  # whatever the library makes of damaged bytes
             self._skip(topic, UNREADABLE, number)
@@ -213,7 +213,7 @@ class LaserTopics:
         key = topic, name
         laser = self._lasers.get(key)
         if laser is None:
-            laser = LaserScans(topic, name, message.channel.type, self._scratch)
+            laser = _ScanBuffer(topic, name, message.channel.type, self._scratch)
         fault = laser.add(scan, ranges, message.log_ns, number)
         if fault is not None:
             self._skip(topic, fault, number)
@@ -221,12 +221,12 @@ class LaserTopics:
             self._lasers[key] = laser
 
     def _skip(self, topic: str, reason: str, number: int) -> None:
-        self._skipped.setdefault(topic, Skipped()).add(reason, number)
+        self._skipped.setdefault(topic, SkippedRecords()).add(reason, number)
 
-    def finished(self) -> tuple[list[Scans], dict[str, Skipped]]:
+    def finish(self) -> tuple[list[LaserScans], dict[str, SkippedRecords]]:
         """The lasers with at least one usable scan, and what was skipped on each topic."""
         found = [
-            laser.finished(self._skipped.setdefault(laser.topic, Skipped()))
+            laser.finish(self._skipped.setdefault(laser.topic, SkippedRecords()))
             for laser in self._lasers.values()
         ]
         return [scans for scans in found if scans.n_scans], self._skipped
@@ -237,7 +237,7 @@ def _first_echoes(scan: Any) -> NDArray[np.float32]:
     return np.array([e.echoes[0] if len(e.echoes) else np.nan for e in scan.ranges], np.float32)
 
 
-def _repeated(
+def _find_repeats(
     stamps: NDArray[np.int64],
     start: NDArray[np.int64],
     n: NDArray[np.int64],

@@ -16,7 +16,7 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-LIMIT = 256 << 20  # bytes of one chunk or message; recorders write chunks of about one megabyte
+MAX_CHUNK = 256 << 20  # bytes of one chunk or message; recorders write chunks of about one megabyte
 
 ZstdError = zstd.ZstdError
 
@@ -24,7 +24,7 @@ _MAX_GROWTH, _SURELY_FINE = 300, 512 << 20  # of a bag: times its size, bytes
 RECORD = 64  # bytes that a record counts for, though nothing be in it
 
 
-class TooMuchError(InputError):
+class OutputLimitError(InputError):
     """More comes out of a file than can have been put in."""
 
 
@@ -39,7 +39,7 @@ _left: ContextVar[_Left | None] = ContextVar("left", default=None)
 
 
 @contextmanager
-def bounded(size: int) -> Iterator[None]:
+def limit_output(size: int) -> Iterator[None]:
     """While this lasts, a bag of `size` bytes gives no more than a bag of that size can hold.
 
     Its index may name one message a million times, and parts that are small each may be many.
@@ -51,7 +51,7 @@ def bounded(size: int) -> Iterator[None]:
         _left.reset(token)
 
 
-def charge(count: int) -> None:
+def count_output(count: int) -> None:
     """Says that so many bytes came out.
 
     Raises:
@@ -62,25 +62,27 @@ def charge(count: int) -> None:
         return
     left.count -= count
     if left.count < 0:
-        raise TooMuchError(f"is damaged: more than {_MAX_GROWTH} times its size comes out of it")
+        raise OutputLimitError(
+            f"is damaged: more than {_MAX_GROWTH} times its size comes out of it"
+        )
 
 
-def bz2_unpacked(data: bytes) -> bytes:
+def decompress_bz2(data: bytes) -> bytes:
     """The content of a bz2 stream; see `_bounded` for errors."""
     return _bounded(bz2.BZ2Decompressor().decompress, data)
 
 
-def lz4_unpacked(data: bytes) -> bytes:
+def decompress_lz4(data: bytes) -> bytes:
     """The content of a lz4 frame; see `_bounded` for errors."""
     return _bounded(lz4.frame.LZ4FrameDecompressor().decompress, data)
 
 
-def zstd_unpacked(data: bytes) -> bytes:
+def decompress_zstd(data: bytes) -> bytes:
     """The content of a zstd frame; see `_bounded` for errors."""
     return _bounded(zstd.ZstdDecompressor().decompress, data)
 
 
-def zstd_stream(packed: IO[bytes]) -> Any:
+def open_zstd(packed: IO[bytes]) -> Any:
     """The content of a file of zstd frames, to be read piece by piece; a context manager."""
     return zstd.open(packed, "rb")
 
@@ -92,12 +94,12 @@ def _bounded(decompress: Callable[..., Any], data: bytes) -> bytes:
         InputError: there is more.
         Exception: whatever the library says of damaged data.
     """
-    charge(0)
-    out = bytes(decompress(data, LIMIT + 1))
-    charge(len(out))
-    if len(out) > LIMIT:
+    count_output(0)
+    out = bytes(decompress(data, MAX_CHUNK + 1))
+    count_output(len(out))
+    if len(out) > MAX_CHUNK:
         raise InputError(
-            f"a packed part is larger than {LIMIT >> 20} MiB",
+            f"a packed part is larger than {MAX_CHUNK >> 20} MiB",
             hint="a recording packed in smaller chunks can be read",
         )
     return out

@@ -22,7 +22,7 @@ _FLOAT32 = 7  # of sensor_msgs/PointField
 _NONE = np.empty(0, np.float32)
 
 
-def laser_scan(
+def make_laser_scan(
     bag: BagWriter,
     stamp_ns: int,
     frame: str,
@@ -58,7 +58,7 @@ def laser_scan(
     )
 
 
-def point_cloud(
+def make_point_cloud(
     bag: BagWriter,
     stamp_ns: int,
     frame: str,
@@ -88,7 +88,7 @@ def point_cloud(
     )
 
 
-def transforms(
+def make_transforms(
     bag: BagWriter, stamp_ns: int, placed: list[tuple[str, str, NDArray[np.float64]]]
 ) -> Any:
     """A TFMessage of parent, child and T_parent_child (D+1, D+1)."""
@@ -106,7 +106,7 @@ def transforms(
     )
 
 
-def odometry(bag: BagWriter, stamp_ns: int, T_odom_base: NDArray[np.float64]) -> Any:
+def make_odometry(bag: BagWriter, stamp_ns: int, T_odom_base: NDArray[np.float64]) -> Any:
     """An Odometry message: a pose; nothing is said of speed and errors."""
     zero = bag.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
     still = bag.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
@@ -116,13 +116,15 @@ def odometry(bag: BagWriter, stamp_ns: int, T_odom_base: NDArray[np.float64]) ->
         header=bag.header(stamp_ns, ODOM),
         child_frame_id=BASE,
         pose=bag.make(
-            "geometry_msgs/msg/PoseWithCovariance", pose=pose(bag, T_odom_base), covariance=unknown
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=make_pose(bag, T_odom_base),
+            covariance=unknown,
         ),
         twist=bag.make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=unknown),
     )
 
 
-def path(bag: BagWriter, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> Any:
+def make_path(bag: BagWriter, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> Any:
     """A Path in the map frame along T_map_base (T, D+1, D+1)."""
     stamps = stamp_ns.tolist()
     return bag.make(
@@ -130,14 +132,16 @@ def path(bag: BagWriter, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64]
         header=bag.header(stamps[0], MAP),
         poses=[
             bag.make(
-                "geometry_msgs/msg/PoseStamped", header=bag.header(stamp, MAP), pose=pose(bag, T)
+                "geometry_msgs/msg/PoseStamped",
+                header=bag.header(stamp, MAP),
+                pose=make_pose(bag, T),
             )
             for stamp, T in zip(stamps, poses, strict=True)
         ],
     )
 
 
-def occupancy_grid(
+def make_occupancy_grid(
     bag: BagWriter,
     stamp_ns: int,
     p_occupied: NDArray[np.floating[Any]],
@@ -157,13 +161,13 @@ def occupancy_grid(
         resolution=resolution,
         width=width,
         height=height,
-        origin=pose(bag, T_map_corner),
+        origin=make_pose(bag, T_map_corner),
     )
     data = percent.astype(np.int8).ravel()
     return bag.make(GRID, header=bag.header(stamp_ns, MAP), info=info, data=data)
 
 
-def pose(bag: BagWriter, T: NDArray[np.float64]) -> Any:
+def make_pose(bag: BagWriter, T: NDArray[np.float64]) -> Any:
     """A Pose of T (D+1, D+1)."""
     position, orientation = _split(bag, T, "Point")
     return bag.make("geometry_msgs/msg/Pose", position=position, orientation=orientation)

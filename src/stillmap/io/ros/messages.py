@@ -11,38 +11,38 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from stillmap.io.ros.bag_types import ZSTD_MAGIC, Channel, Message
-from stillmap.io.ros.limits import zstd_unpacked
+from stillmap.io.ros.limits import decompress_zstd
 
-LASER, MULTI_ECHO = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan"
-CLOUD = "sensor_msgs/msg/PointCloud2"
+LASER_SCAN, MULTI_ECHO = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 ODOMETRY = "nav_msgs/msg/Odometry"
-TF, OLD_TF = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
-IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+TF, ROS1_TF = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
+IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
 _TF_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
 
 
-def decoded(message: Message) -> Any:
+def decode(message: Message) -> Any:
     """The message as an object of its type.
 
     Raises:
         Exception: whatever the library says of bytes that are no such message.
     """
     channel, raw = message.channel, message.raw
-    store = typestore(channel.encoding)
+    store = load_typestore(channel.encoding)
     if channel.encoding == "ros1":
         return store.deserialize_ros1(raw, channel.type)
     if raw.startswith(ZSTD_MAGIC):  # packed one by one; others begin with a zero byte
-        raw = zstd_unpacked(raw)
+        raw = decompress_zstd(raw)
     return store.deserialize_cdr(raw, channel.type)
 
 
-def unknown(channel: Channel) -> str | None:
+def find_fault(channel: Channel) -> str | None:
     """Why messages of a channel cannot be decoded, None if they can."""
     if channel.encoding not in ("ros1", "cdr"):
         return f"encoded as {channel.encoding!r}"
-    if channel.type not in typestore(channel.encoding).fielddefs:
+    if channel.type not in load_typestore(channel.encoding).fielddefs:
         return f"of unknown type {channel.type}"
     if channel.digest and channel.digest not in ("*", _digest(channel.encoding, channel.type)):
         return f"its {channel.type} is defined otherwise than here"
@@ -50,19 +50,19 @@ def unknown(channel: Channel) -> str | None:
 
 
 @cache
-def typestore(encoding: str) -> Typestore:
+def load_typestore(encoding: str) -> Typestore:
     """The definitions of messages, by `ros1` or `cdr`."""
     if encoding != "ros1":
         return get_typestore(Stores.ROS2_HUMBLE)
     store = get_typestore(Stores.ROS1_NOETIC)
-    for name in (TF, OLD_TF):
+    for name in (TF, ROS1_TF):
         store.register(get_types_from_msg(_TF_DEFINITION, name))
     return store
 
 
 @cache
 def _digest(encoding: str, kind: str) -> str:
-    store = typestore(encoding)
+    store = load_typestore(encoding)
     return store.generate_msgdef(kind)[1] if encoding == "ros1" else store.hash_rihs01(kind)
 
 
@@ -71,6 +71,6 @@ def stamp_ns(header: Any) -> int:
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
 
 
-def frame(name: Any) -> str:
+def frame_name(name: Any) -> str:
     """A frame's name without the slash that old recordings write before it."""
     return str(name).removeprefix("/")

@@ -7,14 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.io.builder import Gathered, Skipped
-from stillmap.io.point_cloud import point_times
+from stillmap.io.builder import RecordingBuilder, SkippedRecords
+from stillmap.io.point_cloud import time_field
 from stillmap.io.ros.bag_types import Message
 from stillmap.io.ros.laser_scan import UNREADABLE
-from stillmap.io.ros.messages import decoded, frame, stamp_ns
+from stillmap.io.ros.messages import decode, frame_name, stamp_ns
 from stillmap.preprocessing.options import ReadOptions
 
-NO_PLACES = "cloud without x, y and z"
+NO_COORDINATES = "cloud without x, y and z"
 WRONG_SIZE = "cloud whose size is not what it states"
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -34,7 +34,7 @@ class Cloud(NamedTuple):
     times: NDArray[np.float64] | None
 
 
-def cloud(message: Any) -> Cloud | str:
+def parse_cloud(message: Any) -> Cloud | str:
     """The points of a PointCloud2 message, whatever the order of its fields; or why not."""
     fields = {str(f.name).lower(): f for f in message.fields}
     step, width, height = int(message.point_step), int(message.width), int(message.height)
@@ -44,11 +44,11 @@ def cloud(message: Any) -> Cloud | str:
     end = (height - 1) * row + width * step if width and height else 0
     if end > len(message.data):
         return WRONG_SIZE
-    time = point_times.column_of(fields)
+    time = time_field.find_time_column(fields)
     kept = [name for name in ("x", "y", "z", time) if name in fields]
     layout = {name: _layout(fields[name], bool(message.is_bigendian), step) for name in kept}
     if any(layout.get(name) is None for name in "xyz"):
-        return NO_PLACES
+        return NO_COORDINATES
     known = {name: where for name, where in layout.items() if where is not None}
     dtype = np.dtype(
         {
@@ -69,11 +69,11 @@ def cloud(message: Any) -> Cloud | str:
 def _times(
     values: NDArray[Any], points: NDArray[np.float32], stamp: int
 ) -> NDArray[np.float64] | None:
-    clock = point_times.clock_of(values, None)
+    clock = time_field.detect_clock(values, None)
     if clock is None:
         return None
     usable = np.asarray(np.isfinite(points).all(axis=1))
-    return point_times.since(values, usable, clock, stamp)[1]
+    return time_field.convert_times(values, usable, clock, stamp)[1]
 
 
 def _layout(field: Any, bigendian: bool, step: int) -> tuple[str, int] | None:
@@ -83,17 +83,17 @@ def _layout(field: Any, bigendian: bool, step: int) -> tuple[str, int] | None:
     return f"{'>' if bigendian else '<'}{kind}", int(field.offset)
 
 
-class CloudTopics:
+class CloudCollector:
     """Every cloud on the topics that are read: one topic may carry several sensors, by frame."""
 
     def __init__(self, options: ReadOptions, scratch: Path | None) -> None:
         self._seen: dict[str, int] = {}
-        self.skipped: dict[str, Skipped] = {}
+        self.skipped: dict[str, SkippedRecords] = {}
         self.sensors: dict[tuple[str, str], int] = {}  # topic and frame
         self.timed: set[int] = set()
         self.stamp_ns, self.sensor, self.number = array("q"), array("i"), array("q")
         self.beams = array("q")
-        self.scans = Gathered(3, options, beam_times=True, folder=scratch)
+        self.scans = RecordingBuilder(3, options, beam_times=True, folder=scratch)
 
     def add(self, message: Message) -> None:
         """Take in a message; what cannot be used is counted."""
@@ -102,26 +102,26 @@ class CloudTopics:
         name, stamp = "", 0
         found: Cloud | str
         try:
-            raw = decoded(message)
-            name, stamp = frame(raw.header.frame_id), stamp_ns(raw.header)
-            found = cloud(raw)
+            raw = decode(message)
+            name, stamp = frame_name(raw.header.frame_id), stamp_ns(raw.header)
+            found = parse_cloud(raw)
         except Exception:  # whatever the library makes of damaged bytes
             found = UNREADABLE
         if isinstance(found, str):
-            self.skipped.setdefault(topic, Skipped()).add(found, number)
+            self.skipped.setdefault(topic, SkippedRecords()).add(found, number)
             return
         stamp = stamp or message.log_ns  # drivers that leave it unset
         sensor = self.sensors.setdefault((topic, name), len(self.sensors))
         if found.times is not None:
             self.timed.add(sensor)
-        self.scans.add(stamp, found.points, sensor=sensor, beam_time=found.times)
+        self.scans.add_scan(stamp, found.points, sensor=sensor, beam_time=found.times)
         self.stamp_ns.append(stamp)
         self.sensor.append(sensor)
         self.number.append(number)
         self.beams.append(len(found.points))
 
 
-def chosen_scans(topics: CloudTopics, named: bool) -> tuple[list[int], list[str]]:
+def select_sensors(topics: CloudCollector, named: bool) -> tuple[list[int], list[str]]:
     """The sensors to use, and words on those that are left out.
 
     Of topics that show the same sensor (the same frame) the one with most points is used: others

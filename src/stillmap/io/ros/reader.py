@@ -18,27 +18,29 @@ from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import longest_non_decreasing
-from stillmap.io.builder import Skipped
+from stillmap.io.builder import SkippedRecords
 from stillmap.io.carmen import extrinsics
 from stillmap.io.carmen.extrinsics import Extrinsics
 from stillmap.io.ros import base_frame, scan_beams, tilting_laser
-from stillmap.io.ros.bag import open_bag, size_of
-from stillmap.io.ros.bag_types import Bag, DamagedError
-from stillmap.io.ros.collect import Content, content
-from stillmap.io.ros.laser_scan import TIME_BACKWARDS, Scans
-from stillmap.io.ros.limits import bounded
-from stillmap.io.ros.point_cloud2 import CloudTopics, chosen_scans
-from stillmap.io.ros.sensor_poses import loss_warning, used_lasers
-from stillmap.io.ros.topics import chosen_topics
+from stillmap.io.ros.bag import bag_size, open_bag
+from stillmap.io.ros.bag_types import Bag, DamagedBagError
+from stillmap.io.ros.collect import BagContent, collect_messages
+from stillmap.io.ros.laser_scan import TIME_BACKWARDS, LaserScans
+from stillmap.io.ros.limits import limit_output
+from stillmap.io.ros.point_cloud2 import CloudCollector, select_sensors
+from stillmap.io.ros.sensor_poses import loss_warning, select_lasers
+from stillmap.io.ros.topics import select_topics
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 
-OfLasers = Callable[[Content, ReadOptions, Path | None], Recording]
+OfLasers = Callable[[BagContent, ReadOptions, Path | None], Recording]
 
 ImagesOf = Callable[[str], Images | None]  # on a robot with this frame
 
 
-def cloud_recording(found: Content, options: ReadOptions, images_of: ImagesOf) -> Recording:
+def _build_cloud_recording(
+    found: BagContent, options: ReadOptions, images_of: ImagesOf
+) -> Recording:
     """The recording of all clouds that were read.
 
     Raises:
@@ -46,18 +48,18 @@ def cloud_recording(found: Content, options: ReadOptions, images_of: ImagesOf) -
     """
     topics = found.clouds
     if not len(topics.scans):
-        total = Skipped().merged(*topics.skipped.values())
+        total = SkippedRecords().merge(*topics.skipped.values())
         raise InputError(f"holds no usable cloud: {total.summary('message')}")
-    used, left_out = chosen_scans(topics, options.topic is not None)
+    used, left_out = select_sensors(topics, options.topic is not None)
     names = list(topics.sensors)
     stamps = np.asarray(topics.stamp_ns, np.int64)
-    scans = [_forward(topics, names[k][0], k, stamps) for k in used]
-    where = base_frame.base_frame(
+    scans = [_select_forward_scans(topics, names[k][0], k, stamps) for k in used]
+    where = base_frame.find_base_frame(
         found.transforms, [names[k][1] for k in used], found.odometry, options
     )
     asked = [(names[k][1], stamps[its]) for k, its in zip(used, scans, strict=True)]
-    placed = base_frame.places(found.transforms, where, asked)
-    warnings = base_frame.words(placed)
+    placed = base_frame.find_sensor_poses(found.transforms, where, asked)
+    warnings = base_frame.base_frame_warnings(placed)
     T = np.tile(np.eye(4), (len(names), 1, 1))
     kept: list[NDArray[np.intp]] = []
     for k, its, on_robot in zip(used, scans, placed.T_base_sensor, strict=True):
@@ -73,11 +75,11 @@ def cloud_recording(found: Content, options: ReadOptions, images_of: ImagesOf) -
             if np.abs(on_robot - on_robot[0]).max() > 1e-3:
                 warnings.append(f"{names[k][0]}: the sensor moves on the robot: its first place")
     chosen = np.sort(np.concatenate(kept))
-    odom, told, more = base_frame.odometry_at(
+    odom, told, more = base_frame.find_odometry(
         found.transforms, placed.base, found.odometry, stamps, options
     )
-    skipped = Skipped().merged(*topics.skipped.values())
-    made = topics.scans.recording(
+    skipped = SkippedRecords().merge(*topics.skipped.values())
+    made = topics.scans.build(
         T,
         chosen=chosen,
         T_odom_base=odom,
@@ -103,14 +105,16 @@ def cloud_recording(found: Content, options: ReadOptions, images_of: ImagesOf) -
     return made if timed else dataclasses.replace(made, beam_time=None)
 
 
-def _forward(
-    topics: CloudTopics, topic: str, sensor: int, stamps: NDArray[np.int64]
+def _select_forward_scans(
+    topics: CloudCollector, topic: str, sensor: int, stamps: NDArray[np.int64]
 ) -> NDArray[np.intp]:
     """The scans of a sensor whose time does not run backwards; others are counted."""
     its = np.flatnonzero(np.asarray(topics.sensor) == sensor)
     keep = longest_non_decreasing(stamps[its].tolist())
     number = np.asarray(topics.number)[its]
-    topics.skipped.setdefault(topic, Skipped()).add_all(TIME_BACKWARDS, np.delete(number, keep))
+    topics.skipped.setdefault(topic, SkippedRecords()).add_all(
+        TIME_BACKWARDS, np.delete(number, keep)
+    )
     return its[keep]
 
 
@@ -128,7 +132,7 @@ def read(
     Raises:
         InputError: it cannot be read, or holds no usable scan.
     """
-    return _read(path, options, progress, scratch, _of_lasers)
+    return _read(path, options, progress, scratch, _build_laser_recording)
 
 
 def read_tilting(
@@ -144,7 +148,7 @@ def read_tilting(
     Raises:
         InputError: it cannot be read, or nothing says how the laser moves.
     """
-    return _read(path, options, progress, scratch, tilting_laser.of_laser)
+    return _read(path, options, progress, scratch, tilting_laser.build_tilting_recording)
 
 
 def _read(
@@ -154,11 +158,11 @@ def _read(
     scratch: Path | None,
     of_lasers: OfLasers,
 ) -> Recording:
-    damaged, size = "", size_of(path)
+    damaged, size = "", bag_size(path)
     for trusted in (True, False):
         try:
-            with bounded(size), closing(open_bag(path, scratch, trusted=trusted)) as bag:
-                recording = _recording(
+            with limit_output(size), closing(open_bag(path, scratch, trusted=trusted)) as bag:
+                recording = _build_recording(
                     bag,
                     options,
                     progress,
@@ -166,7 +170,7 @@ def _read(
                     partial(open_bag, path, scratch, trusted=trusted),
                     of_lasers,
                 )
-        except DamagedError as error:
+        except DamagedBagError as error:
             damaged = str(error)
         except InputError as error:
             if damaged and not error.where:
@@ -184,24 +188,26 @@ def _read(
     raise InputError(f"is damaged: {damaged}", where=str(path))
 
 
-def origins(bag: Bag, options: ReadOptions, scratch: Path | None) -> list[tuple[str, int]]:
+def list_scan_messages(
+    bag: Bag, options: ReadOptions, scratch: Path | None
+) -> list[tuple[str, int]]:
     """(T,) the topic and the number of the message, from 1, that each scan of a bag is.
 
     Raises:
         DamagedError: the bag is not whole.
         InputError: it holds no usable scan.
     """
-    chosen = chosen_topics(bag, options)
+    chosen = select_topics(bag, options)
     if chosen.clouds:
         raise InputError("holds point clouds: beams of laser scans alone can be blanked")
-    found = content(bag, chosen, options, None, scratch)
-    used = used_lasers(found, options)[0]
+    found = collect_messages(bag, chosen, options, None, scratch)
+    used = select_lasers(found, options)[0]
     stamps = np.concatenate([scans.stamp_ns for scans in used])
     all_of_them = [(scans.topic, int(number)) for scans in used for number in scans.number]
     return [all_of_them[scan] for scan in np.argsort(stamps, kind="stable")]
 
 
-def _recording(
+def _build_recording(
     bag: Bag,
     options: ReadOptions,
     progress: Progress | None,
@@ -209,13 +215,13 @@ def _recording(
     reopened: Callable[[], Bag],
     of_lasers: OfLasers,
 ) -> Recording:
-    chosen = chosen_topics(bag, options)
-    found = content(bag, chosen, options, progress, scratch)
+    chosen = select_topics(bag, options)
+    found = collect_messages(bag, chosen, options, progress, scratch)
     if chosen.clouds:
-        recording = cloud_recording(
+        recording = _build_cloud_recording(
             found,
             options,
-            lambda base: found.pictures.images(found.transforms, base, reopened),
+            lambda base: found.images.build_images(found.transforms, base, reopened),
         )
     else:
         recording = of_lasers(found, options, scratch)
@@ -228,24 +234,26 @@ def _recording(
     return recording
 
 
-def _of_lasers(found: Content, options: ReadOptions, scratch: Path | None) -> Recording:
-    used, T, placed, skipped, left_out = used_lasers(found, options)
+def _build_laser_recording(
+    found: BagContent, options: ReadOptions, scratch: Path | None
+) -> Recording:
+    used, T, placed, skipped, left_out = select_lasers(found, options)
     options.require_lasers(len(used))
-    warnings = [w for s in used for w in s.warnings] + base_frame.words(placed)
-    T_base_sensor, sensor, mirrored, infos, more = _sensors(used, T, placed, options)
+    warnings = [w for s in used for w in s.warnings] + base_frame.base_frame_warnings(placed)
+    T_base_sensor, sensor, mirrored, infos, more = _find_mountings(used, T, placed, options)
     warnings += more
     rules = []
     for scans, info in zip(used, infos, strict=True):
-        rule, more = scan_beams.understood(scans, options)
+        rule, more = scan_beams.find_range_rule(scans, options)
         info["ranges"] = rule.to_dict()
         rules.append(rule)
         warnings += [f"{scans.topic}: {text}" for text in more]
-    all_beams = scan_beams.all_beams(used, rules, mirrored, scratch)
+    all_beams = scan_beams.convert_to_beams(used, rules, mirrored, scratch)
     stamp_ns = np.concatenate([s.stamp_ns for s in used])[all_beams.scan]
-    odom, told, more = base_frame.odometry_at(
+    odom, told, more = base_frame.find_odometry(
         found.transforms, placed.base, found.odometry, stamp_ns, options
     )
-    lost = Skipped().merged(*(skipped[topic] for topic in {s.topic for s in used}))
+    lost = SkippedRecords().merge(*(skipped[topic] for topic in {s.topic for s in used}))
     warnings += more + loss_warning(sum(s.n_scans for s in used), lost)
     return Recording(
         stamp_ns=stamp_ns,
@@ -254,7 +262,7 @@ def _of_lasers(found: Content, options: ReadOptions, scratch: Path | None) -> Re
         hit=all_beams.hit,
         T_base_sensor=T_base_sensor,
         sensor=sensor[all_beams.scan],
-        T_odom_base=None if odom is None else base_frame.planar(odom)[0],
+        T_odom_base=None if odom is None else base_frame.project_to_plane(odom)[0],
         beam_time=all_beams.beam_time,
         source={
             "sensors": infos,
@@ -268,10 +276,10 @@ def _of_lasers(found: Content, options: ReadOptions, scratch: Path | None) -> Re
     )
 
 
-def _sensors(
-    lasers: list[Scans],
+def _find_mountings(
+    lasers: list[LaserScans],
     T: list[NDArray[np.float64]],
-    placed: base_frame.Places,
+    placed: base_frame.SensorPoses,
     options: ReadOptions,
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], list[bool], list[dict[str, Any]], list[str]]:
     """Where the lasers sit, seen from above.
@@ -284,14 +292,16 @@ def _sensors(
     places, sensor, mirrored, infos, warnings = [], [], [], [], []
     count = 0
     for number, (scans, on_robot) in enumerate(zip(lasers, T, strict=True)):
-        flat, upside_down, tilts = base_frame.planar(on_robot)
+        flat, upside_down, tilts = base_frame.project_to_plane(on_robot)
         given = options.laser(number)
         if tilts:
             warnings.append(f"{scans.topic}: the laser is tilted; its scans are taken for level")
         if not _moves(flat) or given.place != (None, None, None):
             flat = flat[:1]
             x, y, theta = se2.parameters(flat)[0].tolist()
-            place = extrinsics.overridden(Extrinsics(x, y, theta, _how(scans, placed)), given)
+            place = extrinsics.override(
+                Extrinsics(x, y, theta, _describe_extrinsics(scans, placed)), given
+            )
             flat = place.matrix()[None]
         else:
             x, y, theta = se2.parameters(flat)[0].tolist()
@@ -302,7 +312,7 @@ def _sensors(
         places.append(flat)
         sensor.append((its + count).astype(np.int32))
         mirrored.append(upside_down)
-        infos.append({**_info(scans, place, upside_down, how), "places": len(flat)})
+        infos.append({**_describe_sensor(scans, place, upside_down, how), "places": len(flat)})
         count += len(flat)
     return np.concatenate(places), np.concatenate(sensor), mirrored, infos, warnings
 
@@ -313,14 +323,16 @@ def _moves(flat: NDArray[np.float64]) -> bool:
     return bool(np.abs(away[:, :2]).max() > metres or np.abs(away[:, 2]).max() > radians)
 
 
-def _how(scans: Scans, placed: base_frame.Places) -> str:
+def _describe_extrinsics(scans: LaserScans, placed: base_frame.SensorPoses) -> str:
     if scans.frame == placed.base:
         return "the laser is the robot's frame"
     return f"TF from {placed.base} to {scans.frame}"
 
 
-def _info(scans: Scans, place: Extrinsics, upside_down: bool, how: str) -> dict[str, Any]:
-    usual = scans.usual
+def _describe_sensor(
+    scans: LaserScans, place: Extrinsics, upside_down: bool, how: str
+) -> dict[str, Any]:
+    usual = scans.typical_shape
     sign = -1.0 if upside_down else 1.0
     return {
         "name": scans.topic,

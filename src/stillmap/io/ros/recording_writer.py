@@ -20,17 +20,17 @@ from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.bag_types import (
     ZSTD_MAGIC,
     Bag,
+    BagKind,
     Channel,
-    DamagedError,
-    Kind,
+    DamagedBagError,
     Message,
-    own_form,
+    detect_kind,
 )
 from stillmap.io.ros.bag_writer import BagWriter, new_bag, require_stamps
-from stillmap.io.ros.limits import zstd_unpacked
+from stillmap.io.ros.limits import decompress_zstd
 from stillmap.io.ros.message_writer import BASE, ODOM
-from stillmap.io.ros.messages import CLOUD, LASER, MULTI_ECHO, decoded, frame
-from stillmap.io.ros.reader import origins
+from stillmap.io.ros.messages import LASER_SCAN, MULTI_ECHO, POINT_CLOUD, decode, frame_name
+from stillmap.io.ros.reader import list_scan_messages
 from stillmap.preprocessing import laser_scan
 from stillmap.preprocessing.options import ReadOptions
 
@@ -38,7 +38,7 @@ Scan = Callable[[int], Any]  # the message of a scan, by its number
 
 
 def write_recording(
-    recording: Recording, path: Path, kind: Kind, *, overwrite: bool = False
+    recording: Recording, path: Path, kind: BagKind, *, overwrite: bool = False
 ) -> list[str]:
     """Write a recording as a ROS bag: scans, odometry, and where the sensors sit.
 
@@ -56,13 +56,13 @@ def write_recording(
     if recording.n_scans:
         require_stamps(int(stamps[0]), int(stamps[-1]), kind)
     planar_scans = recording.dimension == 2
-    lasers = Lasers(recording) if planar_scans else None
+    lasers = LaserScanEncoder(recording) if planar_scans else None
     with new_bag(path, kind, overwrite=overwrite) as bag:
-        frames = place_sensors(bag, recording)
+        frames = write_sensor_frames(bag, recording)
         name, type = (
             ("scan", message_writer.SCAN) if planar_scans else ("points", message_writer.POINTS)
         )
-        sends = [bag.topic(f"/{numbered}", type) for numbered in numbered(name, len(frames))]
+        sends = [bag.add_topic(f"/{one}", type) for one in number_names(name, len(frames))]
         drive = _driver(bag, recording)
         for t in recording.in_turn(range(recording.n_scans)):
             drive(t)
@@ -70,12 +70,12 @@ def write_recording(
             if lasers is None:
                 message = _cloud(bag, recording, t, frames[sensor])
             else:
-                message = lasers.message(bag, t, frames[sensor], lasers.ranges(t))
+                message = lasers.make_message(bag, t, frames[sensor], lasers.ranges(t))
             sends[sensor](stamp, message)
-    return lasers.left_out() if lasers is not None else list(_cloud_losses(recording))
+    return lasers.describe_losses() if lasers is not None else list(_cloud_losses(recording))
 
 
-class Lasers:
+class LaserScanEncoder:
     """The lasers of a recording in the plane, as LaserScan messages describe them.
 
     Raises:
@@ -84,17 +84,17 @@ class Lasers:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._fans = laser_scan.fans(recording)
-        self._range_max = [reach.limit() for reach in laser_scan.reaches(recording)]
+        self._fans = laser_scan.beam_angles(recording)
+        self._range_max = [reach.limit() for reach in laser_scan.range_limits(recording)]
         self._time_increments, self._uneven = laser_scan.time_increments(recording)
 
     def ranges(self, t: int) -> NDArray[np.float32]:
         """(n,) metres of a scan, +inf at maximum range, NaN where unusable."""
-        return laser_scan.ranges(self._recording, t, np.inf).astype(np.float32)
+        return laser_scan.beam_ranges(self._recording, t, np.inf).astype(np.float32)
 
-    def message(self, bag: BagWriter, t: int, frame: str, ranges: NDArray[np.float32]) -> Any:
+    def make_message(self, bag: BagWriter, t: int, frame: str, ranges: NDArray[np.float32]) -> Any:
         """A scan with these ranges (n,), see `messages.laser_scan`."""
-        return message_writer.laser_scan(
+        return message_writer.make_laser_scan(
             bag,
             int(self._recording.stamp_ns[t]),
             frame,
@@ -104,7 +104,7 @@ class Lasers:
             self._range_max[self._recording.sensor[t]],
         )
 
-    def left_out(self) -> list[str]:
+    def describe_losses(self) -> list[str]:
         """What the messages do not say, a sentence each."""
         if not self._uneven:
             return []
@@ -114,19 +114,19 @@ class Lasers:
         ]
 
 
-def place_sensors(bag: BagWriter, recording: Recording) -> list[str]:
+def write_sensor_frames(bag: BagWriter, recording: Recording) -> list[str]:
     """Says once where the sensors sit on the robot; returns their S frames."""
     S = len(recording.T_base_sensor)
-    frames = numbered("laser" if recording.dimension == 2 else "lidar", S)
-    send = bag.topic("/tf_static", message_writer.TRANSFORMS, latched=True)
+    frames = number_names("laser" if recording.dimension == 2 else "lidar", S)
+    send = bag.add_topic("/tf_static", message_writer.TRANSFORMS, latched=True)
     if recording.n_scans:
         first = int(recording.stamp_ns[0])
         placed = [(BASE, f, T) for f, T in zip(frames, recording.T_base_sensor, strict=True)]
-        send(first, message_writer.transforms(bag, first, placed))
+        send(first, message_writer.make_transforms(bag, first, placed))
     return frames
 
 
-def numbered(name: str, count: int) -> list[str]:
+def number_names(name: str, count: int) -> list[str]:
     return [name, *(f"{name}{k}" for k in range(2, count + 1))][:count]
 
 
@@ -135,15 +135,15 @@ def _driver(bag: BagWriter, recording: Recording) -> Callable[[int], None]:
     T_odom_base = recording.T_odom_base
     if T_odom_base is None:
         return lambda t: None  # noqa: ARG005
-    send_tf = bag.topic("/tf", message_writer.TRANSFORMS)
-    send_odometry = bag.topic("/odom", message_writer.ODOMETRY)
+    send_tf = bag.add_topic("/tf", message_writer.TRANSFORMS)
+    send_odometry = bag.add_topic("/odom", message_writer.ODOMETRY)
 
     def drive(t: int) -> None:
         stamp, T = int(recording.stamp_ns[t]), T_odom_base[t]
         if t and stamp == recording.stamp_ns[t - 1] and np.array_equal(T, T_odom_base[t - 1]):
             return  # two sensors at the same moment
-        send_tf(stamp, message_writer.transforms(bag, stamp, [(ODOM, BASE, T)]))
-        send_odometry(stamp, message_writer.odometry(bag, stamp, T))
+        send_tf(stamp, message_writer.make_transforms(bag, stamp, [(ODOM, BASE, T)]))
+        send_odometry(stamp, message_writer.make_odometry(bag, stamp, T))
 
     return drive
 
@@ -153,7 +153,7 @@ def _cloud(bag: BagWriter, recording: Recording, t: int, frame: str) -> Any:
     # a point at maximum range would be taken for a thing
     points = np.where(recording.hit[beams, None], recording.points[beams], np.float32(np.nan))
     times = None if recording.beam_time is None else recording.beam_time[beams]
-    return message_writer.point_cloud(bag, int(recording.stamp_ns[t]), frame, points, times)
+    return message_writer.make_point_cloud(bag, int(recording.stamp_ns[t]), frame, points, times)
 
 
 def _cloud_losses(recording: Recording) -> Iterator[str]:
@@ -170,7 +170,7 @@ _Send = Callable[[int, bytes], None]
 
 
 @dataclass(frozen=True)
-class Blanked:
+class FilteredBag:
     """What was written.
 
     Attributes:
@@ -182,9 +182,9 @@ class Blanked:
     """
 
     scans: int
-    left_out: int
-    topics: list[str]
-    unfiltered: list[str]
+    omitted: int
+    omitted_topics: list[str]
+    unfiltered_topics: list[str]
 
 
 def write_filtered_bag(
@@ -195,7 +195,7 @@ def write_filtered_bag(
     options: ReadOptions,
     *,
     overwrite: bool = False,
-) -> Blanked:
+) -> FilteredBag:
     """Write a bag with some readings of its scans replaced by what says that nothing came back.
 
     That is +inf (REP 117), zero for lasers that say it with zeros: more infinities would make
@@ -219,7 +219,7 @@ def write_filtered_bag(
                 return _write(bag, source, out, recording, blank, options, overwrite)
             finally:
                 bag.close()
-        except DamagedError:
+        except DamagedBagError:
             continue
     raise InputError("is damaged", where=str(source))
 
@@ -232,9 +232,11 @@ def _write(
     blank: NDArray[np.bool_],
     options: ReadOptions,
     overwrite: bool,
-) -> Blanked:
-    kind, mcap = own_form(source)
-    scan_of = {key: t for t, key in enumerate(origins(bag, options, out.absolute().parent))}
+) -> FilteredBag:
+    kind, mcap = detect_kind(source)
+    scan_of = {
+        key: t for t, key in enumerate(list_scan_messages(bag, options, out.absolute().parent))
+    }
     if len(scan_of) != recording.n_scans:
         raise InputError("is not the bag that was mapped: other scans", where=str(source))
     of_lasers = {topic for topic, _ in scan_of}
@@ -242,7 +244,7 @@ def _write(
     seen: dict[str, int] = {}
     scans = left_out = 0
     with writing.new_bag(out, kind, overwrite=overwrite, mcap=mcap) as copy:
-        send = {c.id: copy.copied_topic(c) for c in bag.channels}
+        send = {c.id: copy.copy_topic(c) for c in bag.channels}
         for message in bag.messages({c.topic for c in bag.channels}):
             topic = message.channel.topic
             to = send[message.channel.id]
@@ -255,12 +257,18 @@ def _write(
                 left_out += 1
                 continue
             beams = blank[recording.beams_of(t)]
-            raw = _replaced(message, beams, nothing, copy) if beams.any() else _unpacked(message)
+            raw = (
+                _blank_readings(message, beams, nothing, copy)
+                if beams.any()
+                else _unpacked(message)
+            )
             if to is not None:
                 to(message.log_ns, raw)
             scans += 1
-    unfiltered = {c.topic for c in bag.channels if c.type in (LASER, MULTI_ECHO, CLOUD)} - of_lasers
-    return Blanked(scans, left_out, _lost(bag.channels, send), sorted(unfiltered))
+    unfiltered = {
+        c.topic for c in bag.channels if c.type in (LASER_SCAN, MULTI_ECHO, POINT_CLOUD)
+    } - of_lasers
+    return FilteredBag(scans, left_out, _lost(bag.channels, send), sorted(unfiltered))
 
 
 def _no_return(recording: Recording) -> dict[tuple[str, str], float]:
@@ -283,21 +291,21 @@ def _lost(channels: list[Channel], send: dict[int, _Send | None]) -> list[str]:
 
 def _unpacked(message: Message) -> bytes:
     packed = message.channel.encoding != "ros1" and message.raw.startswith(ZSTD_MAGIC)
-    return zstd_unpacked(message.raw) if packed else message.raw
+    return decompress_zstd(message.raw) if packed else message.raw
 
 
-def _replaced(
+def _blank_readings(
     message: Message,
     blank: NDArray[np.bool_],
     no_return: dict[tuple[str, str], float],
     copy: writing.BagWriter,
 ) -> bytes:
     """A scan's message with the blanked readings replaced."""
-    scan: Any = decoded(message)
-    nothing = np.float32(no_return[message.channel.topic, frame(scan.header.frame_id)])
+    scan: Any = decode(message)
+    nothing = np.float32(no_return[message.channel.topic, frame_name(scan.header.frame_id)])
     if message.channel.type == MULTI_ECHO:
         for k in np.flatnonzero(blank):
             scan.ranges[k].echoes = np.array([nothing])
     else:
         scan.ranges = np.where(blank, nothing, scan.ranges)
-    return copy.serialized(scan, message.channel.type)
+    return copy.serialize(scan, message.channel.type)

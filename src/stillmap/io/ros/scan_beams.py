@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import Column, in_turn, let_go
-from stillmap.io.ros.laser_scan import Scans, Shape
+from stillmap.core.arrays import ArrayBuilder, release_pages, release_periodically
+from stillmap.io.ros.laser_scan import LaserScans, ScanShape
 from stillmap.preprocessing import max_range
 from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE, ReadOptions
 
@@ -38,13 +38,15 @@ class Beams(NamedTuple):
     beam_time: NDArray[np.float32] | None
 
 
-def understood(scans: Scans, options: ReadOptions) -> tuple[max_range.RangeRule, list[str]]:
+def find_range_rule(
+    scans: LaserScans, options: ReadOptions
+) -> tuple[max_range.RangeRule, list[str]]:
     """How a laser's readings are understood, and warnings in words."""
-    sample = _sample(scans)
-    usual = scans.usual
+    sample = _sample_readings(scans)
+    usual = scans.typical_shape
     warnings = []
     nearest = usual.range_min if 0.0 < usual.range_min < MAX_PLAUSIBLE_RANGE else 0.0
-    finite = sample[(sample >= max_range.ZERO_BELOW) & (sample < MAX_PLAUSIBLE_RANGE)]
+    finite = sample[(sample >= max_range.MAX_ZERO_RANGE) & (sample < MAX_PLAUSIBLE_RANGE)]
     if finite.size and np.mean(finite < nearest) > _MOST:
         warnings.append(f"range_min {nearest:g} m is beyond most readings: not heeded")
         nearest = 0.0
@@ -52,11 +54,11 @@ def understood(scans: Scans, options: ReadOptions) -> tuple[max_range.RangeRule,
     declared = usual.range_max if 0.0 < usual.range_max < MAX_PLAUSIBLE_RANGE else None
     if declared is not None and declared <= nearest:
         declared = None
-    rule, more = max_range.decide(sample, declared, options)
+    rule, more = max_range.infer_range_rule(sample, declared, options)
     return dataclasses.replace(rule, min_range=nearest), warnings + more
 
 
-def _sample(scans: Scans) -> NDArray[np.float32]:
+def _sample_readings(scans: LaserScans) -> NDArray[np.float32]:
     """(K, n) readings of scans evenly spread over the recording; short ones end in NaN."""
     lengths = scans.lengths
     # one long scan among many short ones makes all rows long
@@ -65,13 +67,15 @@ def _sample(scans: Scans) -> NDArray[np.float32]:
     chosen = np.arange(0, scans.n_scans, step)
     out = np.full((len(chosen), int(lengths[chosen].max(initial=1))), np.nan, np.float32)
     # a few of many: around each that is looked at the system maps a good deal more
-    for k, t in enumerate(in_turn(chosen.tolist(), lambda: let_go(scans.ranges))):
+    for k, t in enumerate(
+        release_periodically(chosen.tolist(), lambda: release_pages(scans.ranges))
+    ):
         out[k, : lengths[t]] = scans.ranges[scans.start[t] : scans.start[t] + lengths[t]]
     return out
 
 
-def all_beams(
-    lasers: list[Scans],
+def convert_to_beams(
+    lasers: list[LaserScans],
     rules: list[max_range.RangeRule],
     mirrored: list[bool],
     scratch: Path | None,
@@ -91,11 +95,11 @@ def all_beams(
     first = np.cumsum([0, *(scans.n_scans for scans in lasers)])
     laser = np.searchsorted(first, scan, side="right") - 1
     of_laser = scan - first[laser]  # which of its laser's scans each is
-    makers = [_Maker(*one) for one in zip(lasers, rules, mirrored, strict=True)]
-    points, hit = Column(np.float32, (2,), scratch), Column(np.bool_, (), scratch)
+    makers = [_BeamConverter(*one) for one in zip(lasers, rules, mirrored, strict=True)]
+    points, hit = ArrayBuilder(np.float32, (2,), scratch), ArrayBuilder(np.bool_, (), scratch)
     timed = any(np.any(maker.steps) for maker in makers)
-    times = Column(np.float32, (), scratch) if timed else None
-    for begin, end in _runs(lasers, laser, of_laser):
+    times = ArrayBuilder(np.float32, (), scratch) if timed else None
+    for begin, end in _split_into_runs(lasers, laser, of_laser):
         maker = makers[laser[begin]]
         its = slice(int(of_laser[begin]), int(of_laser[begin]) + end - begin)
         ends, hits = maker.beams(its)
@@ -107,8 +111,8 @@ def all_beams(
     return Beams(scan, offset, points.finished(), hit.finished(), beam_time)
 
 
-def _runs(
-    lasers: list[Scans], laser: NDArray[np.intp], of_laser: NDArray[np.intp]
+def _split_into_runs(
+    lasers: list[LaserScans], laser: NDArray[np.intp], of_laser: NDArray[np.intp]
 ) -> Iterator[tuple[int, int]]:
     """Scans in a row, in pieces: first and end, of one laser and shape, their readings together."""
     start, shape, length = (
@@ -136,15 +140,15 @@ def _per_scan(
     return out
 
 
-class _Maker:
+class _BeamConverter:
     """Makes beams of one laser's readings."""
 
-    def __init__(self, scans: Scans, rule: max_range.RangeRule, mirror: bool) -> None:
+    def __init__(self, scans: LaserScans, rule: max_range.RangeRule, mirror: bool) -> None:
         self._scans, self._rule, self._mirror = scans, rule, mirror
-        self._usual = scans.usual.n
+        self._usual = scans.typical_shape.n
         # which beams meet the robot is known of scans as most are
         self._other = dataclasses.replace(rule, own_body=())
-        self.steps = _steps(scans)
+        self.steps = _time_steps(scans)
         self._shape = -1
         self._directions = np.empty((0, 2), np.float32)
 
@@ -153,11 +157,13 @@ class _Maker:
         n = self._turned_to(its)
         at = int(self._scans.start[its.start])
         readings = self._scans.ranges[at : at + (its.stop - its.start) * n].reshape(-1, n)
-        length, hit = max_range.apply(readings, self._rule if n == self._usual else self._other)
+        length, hit = max_range.apply_range_rule(
+            readings, self._rule if n == self._usual else self._other
+        )
         points = np.empty((*length.shape, 2), np.float32)
         for axis in range(2):  # several times faster than one product of all
             np.multiply(length, self._directions[:, axis], out=points[..., axis])
-        let_go(self._scans.ranges)
+        release_pages(self._scans.ranges)
         return points.reshape(-1, 2), hit.reshape(-1)
 
     def times(self, its: slice) -> NDArray[np.float32]:
@@ -174,13 +180,13 @@ class _Maker:
         return self._scans.shapes[shape].n
 
 
-def _directions(shape: Shape, mirror: bool) -> NDArray[np.float32]:
+def _directions(shape: ScanShape, mirror: bool) -> NDArray[np.float32]:
     """(n, 2) unit vectors of the beams."""
     angle = -shape.angles() if mirror else shape.angles()
     return np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
 
 
-def _steps(scans: Scans) -> NDArray[np.float64]:
+def _time_steps(scans: LaserScans) -> NDArray[np.float64]:
     """Seconds between two beams, for each shape; 0 where none are told or none can be meant."""
     period = 1.0 / scans.rate_hz if scans.rate_hz else _LONGEST
     steps = np.array([s.time_increment for s in scans.shapes])

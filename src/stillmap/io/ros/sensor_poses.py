@@ -4,43 +4,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
-from stillmap.io.builder import Skipped
+from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros import base_frame
-from stillmap.io.ros.collect import Content
-from stillmap.io.ros.laser_scan import Scans
+from stillmap.io.ros.collect import BagContent
+from stillmap.io.ros.laser_scan import LaserScans
 from stillmap.io.ros.topics import chosen_lasers
 from stillmap.preprocessing.options import ReadOptions
 
 _MANY = 0.05  # share of scans whose loss is worth a warning
 
 
-def used_lasers(
-    found: Content, options: ReadOptions
+def select_lasers(
+    found: BagContent, options: ReadOptions
 ) -> tuple[
-    list[Scans], list[NDArray[np.float64]], base_frame.Places, dict[str, Skipped], list[str]
+    list[LaserScans],
+    list[NDArray[np.float64]],
+    base_frame.SensorPoses,
+    dict[str, SkippedRecords],
+    list[str],
 ]:
     """The lasers to use, T_base_sensor at their scans, the robot's frame, what was skipped by
     topic, and words on the lasers that are left out."""
-    lasers, skipped = found.lasers.finished()
+    lasers, skipped = found.lasers.finish()
     if not lasers:
-        total = Skipped().merged(*skipped.values())
+        total = SkippedRecords().merge(*skipped.values())
         raise InputError(f"holds no usable laser scan: {total.summary('message')}")
     used, left_out = chosen_lasers(lasers, options.topic is not None)
-    where = base_frame.base_frame(
+    where = base_frame.find_base_frame(
         found.transforms, [s.frame for s in used], found.odometry, options
     )
     asked = [(s.frame, s.stamp_ns) for s in used]
-    placed = base_frame.places(found.transforms, where, asked)
+    placed = base_frame.find_sensor_poses(found.transforms, where, asked)
     used, T, more = _connected(used, placed, given=options.base_frame is not None)
     left_out += more
     return used, T, placed, skipped, left_out
 
 
 def _connected(
-    lasers: list[Scans], placed: base_frame.Places, *, given: bool
-) -> tuple[list[Scans], list[NDArray[np.float64]], list[str]]:
+    lasers: list[LaserScans], placed: base_frame.SensorPoses, *, given: bool
+) -> tuple[list[LaserScans], list[NDArray[np.float64]], list[str]]:
     """The lasers of which it is known where they sit on the robot, and words on the others."""
-    used: list[Scans] = []
+    used: list[LaserScans] = []
     T: list[NDArray[np.float64]] = []
     left_out = []
     for scans, found in zip(lasers, placed.T_base_sensor, strict=True):
@@ -57,7 +61,7 @@ def _connected(
     return used, T, left_out
 
 
-def loss_warning(kept: int, lost: Skipped) -> list[str]:
+def loss_warning(kept: int, lost: SkippedRecords) -> list[str]:
     if lost.total <= _MANY * (kept + lost.total):
         return []
     return [

@@ -14,7 +14,7 @@ from urllib.parse import quote
 import apsw
 
 from stillmap.core.errors import InputError
-from stillmap.io.ros.limits import LIMIT
+from stillmap.io.ros.limits import MAX_CHUNK
 
 _TABLES = ("topics", "messages", "schema", "message_definitions")
 _STEP = 1000  # of SQLite's machine: so often it is looked at
@@ -22,21 +22,21 @@ _STEPS_PER_BYTE = 30  # a row takes some 20, and has as many bytes and more
 _SURELY_FINE = 1_000_000  # steps: a hundredth of a second
 
 
-def address(path: Path, more: str = "") -> str:
+def database_uri(path: Path, more: str = "") -> str:
     """The path as SQLite wants it: ?, # and % are its own, and names need not be text."""
     return quote(os.fsencode(path.resolve())) + more
 
 
-def opened(path: Path) -> sqlite3.Connection:
+def open_database(path: Path) -> sqlite3.Connection:
     """A database to be read, its tables checked.
 
     Raises:
         sqlite3.Error: it cannot be read.
         InputError: see `_require_tables`.
     """
-    database = sqlite3.connect(f"file:{address(path, '?immutable=1&mode=ro')}", uri=True)
+    database = sqlite3.connect(f"file:{database_uri(path, '?immutable=1&mode=ro')}", uri=True)
     try:
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LIMIT)
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK)
         database.set_progress_handler(_meter(path), _STEP)
         _require_tables(database)
     except BaseException:
@@ -46,16 +46,16 @@ def opened(path: Path) -> sqlite3.Connection:
 
 
 @contextmanager
-def bounded(path: Path) -> Iterator[None]:
+def limit_databases(path: Path) -> Iterator[None]:
     """The same for the databases that a library opens while this lasts.
 
     Raises:
         sqlite3.Error, InputError: see `opened`.
     """
-    opened(path).close()
+    open_database(path).close()
 
     def limited(database: apsw.Connection) -> None:
-        database.limit(apsw.SQLITE_LIMIT_LENGTH, LIMIT)
+        database.limit(apsw.SQLITE_LIMIT_LENGTH, MAX_CHUNK)
         database.set_progress_handler(_meter(path), _STEP)
 
     apsw.connection_hooks.append(limited)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stillmap.core import se2
-from stillmap.core.arrays import blocks
-from stillmap.io.builder import Skipped
-from stillmap.io.ros.messages import frame, stamp_ns
+from stillmap.core.arrays import iter_blocks
+from stillmap.io.builder import SkippedRecords
+from stillmap.io.ros.messages import frame_name, stamp_ns
 
 BAD_TRANSFORM = "transform that is none"
 
@@ -37,7 +37,7 @@ class _Edge:
         self.constant = False
 
 
-class Located(NamedTuple):
+class Lookup(NamedTuple):
     """Transforms at given times.
 
     Attributes:
@@ -51,25 +51,28 @@ class Located(NamedTuple):
     moves: bool
 
 
-class Transforms:
+class TransformTree:
     """A forest of frames. Transforms that never change hold for all times."""
 
     def __init__(self) -> None:
         self._edges: dict[str, dict[str, _Edge]] = {}  # by child, by parent
-        self.skipped = Skipped()
+        self.skipped = SkippedRecords()
         self._number = 0
         self._final: dict[str, _Edge] = {}
 
-    def add(self, message: Any, *, static: bool) -> None:
+    def add_message(self, message: Any, *, static: bool) -> None:
         """Take in a TFMessage."""
         for transform in message.transforms:
             self._number += 1
             t, q = transform.transform.translation, transform.transform.rotation
             values = (t.x, t.y, t.z, q.x, q.y, q.z, q.w)
-            parent, child = frame(transform.header.frame_id), frame(transform.child_frame_id)
-            self.add_one(parent, child, stamp_ns(transform.header), values, static=static)
+            parent, child = (
+                frame_name(transform.header.frame_id),
+                frame_name(transform.child_frame_id),
+            )
+            self.add_transform(parent, child, stamp_ns(transform.header), values, static=static)
 
-    def add_one(
+    def add_transform(
         self, parent: str, child: str, stamp: int, values: tuple[float, ...], *, static: bool
     ) -> None:
         """One transform: x y z in metres and a quaternion x y z w."""
@@ -95,33 +98,33 @@ class Transforms:
         edge = self._settled().get(child)
         return None if edge is None else edge.parent
 
-    def changes(self, child: str) -> bool:
+    def is_moving(self, child: str) -> bool:
         """Whether a frame moves in its parent."""
         edge = self._settled().get(child)
         return edge is not None and not edge.constant
 
-    def path_up(self, child: str) -> list[str]:
+    def path_to_root(self, child: str) -> list[str]:
         """A frame, its parent, and so on to the root."""
         path = [child]
         while (above := self.parent(path[-1])) is not None and above not in path:
             path.append(above)
         return path
 
-    def located(self, target: str, source: str, at_ns: NDArray[np.int64]) -> Located | None:
+    def lookup(self, target: str, source: str, at_ns: NDArray[np.int64]) -> Lookup | None:
         """Where `source` lies in `target` at times (N,); None if they do not hang together."""
-        up, down = self.path_up(source), self.path_up(target)
+        up, down = self.path_to_root(source), self.path_to_root(target)
         meet = next((name for name in up if name in down), None)
         if meet is None:
             return None
         rising, a, moves_a = self._along(up[: up.index(meet)], at_ns)
         falling, b, moves_b = self._along(down[: down.index(meet)], at_ns)
-        return Located(se2.inverse(falling) @ rising, max(a, b), moves_a or moves_b)
+        return Lookup(se2.inverse(falling) @ rising, max(a, b), moves_a or moves_b)
 
     def stamps_between(self, target: str, source: str) -> NDArray[np.int64]:
         """Times at which the slowest told of the moving frames on the way up was told."""
-        up = self.path_up(source)
+        up = self.path_to_root(source)
         end = up.index(target) if target in up else 0
-        moving = [self._settled()[child] for child in up[:end] if self.changes(child)]
+        moving = [self._settled()[child] for child in up[:end] if self.is_moving(child)]
         rarest = min(moving, key=lambda edge: len(edge.stamp_ns), default=None)
         return np.asarray(rarest.stamp_ns if rarest else [], np.int64)
 
@@ -133,7 +136,7 @@ class Transforms:
         outside, moves = 0, False
         for child in path:
             edge = self._settled()[child]
-            step, missed = _at(edge, at_ns)
+            step, missed = _interpolate(edge, at_ns)
             T, outside, moves = step @ T, max(outside, missed), moves or not edge.constant
         return T, outside, moves
 
@@ -142,11 +145,11 @@ class Transforms:
         if not self._final and self._edges:
             for child, parents in self._edges.items():
                 best = max(parents.values(), key=lambda e: (e.constant, len(e.stamp_ns)))
-                self._final[child] = _in_order(best)
+                self._final[child] = _sort_by_time(best)
         return self._final
 
 
-def _in_order(edge: _Edge) -> _Edge:
+def _sort_by_time(edge: _Edge) -> _Edge:
     """By time, one transform per time (the last one told); constant if it never changes."""
     stamps = np.asarray(edge.stamp_ns, np.int64)
     values = np.asarray(edge.values).reshape(-1, 7)
@@ -159,7 +162,7 @@ def _in_order(edge: _Edge) -> _Edge:
     return out
 
 
-def _turned(
+def _interpolate_rotations(
     known: NDArray[np.float64], quaternions: NDArray[np.float64], wanted: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Rotations (n, 3, 3) at times (n,) between those that are known, by the shortest turn."""
@@ -170,7 +173,7 @@ def _turned(
     return np.asarray((before * turn).as_matrix(), np.float64)
 
 
-def _at(edge: _Edge, at_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], int]:
+def _interpolate(edge: _Edge, at_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], int]:
     """Transforms (N, 4, 4) at times (N,), and how many of these are outside the edge's own."""
     stamps, values = np.asarray(edge.stamp_ns), np.asarray(edge.values).reshape(-1, 7)
     if edge.constant or len(stamps) == 1:
@@ -180,8 +183,8 @@ def _at(edge: _Edge, at_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], int
     # seconds since the first: nanoseconds since 1970 are no exact floating point numbers
     known, wanted = (stamps - stamps[0]) / 1e9, (inside - stamps[0]) / 1e9
     T = np.tile(np.eye(4), (len(at_ns), 1, 1))
-    for block in blocks(wanted, rows=_TOGETHER):
-        T[block, :3, :3] = _turned(known, values[:, 3:], wanted[block])
+    for block in iter_blocks(wanted, rows=_TOGETHER):
+        T[block, :3, :3] = _interpolate_rotations(known, values[:, 3:], wanted[block])
     for axis in range(3):
         T[:, axis, 3] = np.interp(wanted, known, values[:, axis])
     return T, int(np.count_nonzero(inside != at_ns))

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from stillmap.core import arrays, se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.io.builder import Skipped
+from stillmap.io.builder import SkippedRecords
 from stillmap.io.ros import scan_beams
-from stillmap.io.ros.collect import Content
-from stillmap.io.ros.laser_scan import Scans
-from stillmap.io.ros.sensor_poses import loss_warning, used_lasers
-from stillmap.io.ros.tf import Transforms
+from stillmap.io.ros.collect import BagContent
+from stillmap.io.ros.laser_scan import LaserScans
+from stillmap.io.ros.sensor_poses import loss_warning, select_lasers
+from stillmap.io.ros.tf import TransformTree
 from stillmap.preprocessing.options import ReadOptions
 
 Float = NDArray[np.float64]
@@ -23,7 +23,9 @@ _PAUSE = 500_000_000  # ns without a transform after which nobody knows how the 
 _TOGETHER = 1 << 14  # beams placed together
 
 
-def of_laser(found: Content, options: ReadOptions, scratch: Path | None) -> Recording:
+def build_tilting_recording(
+    found: BagContent, options: ReadOptions, scratch: Path | None
+) -> Recording:
     """The recording in 3D of the one laser that was read.
 
     Every scan has a sensor of its own, which sits as the laser did at the scan's stamp; a beam lies
@@ -32,25 +34,25 @@ def of_laser(found: Content, options: ReadOptions, scratch: Path | None) -> Reco
     Raises:
         InputError: there are several lasers, or this one does not move on its robot.
     """
-    used, T, placed, skipped, _ = used_lasers(found, options)
+    used, T, placed, skipped, _ = select_lasers(found, options)
     scans, T_base_sensor = used[0], T[0]
     if len(used) > 1:
         raise InputError(f"{scans.topic}: scans of several lasers: only one can tilt")
-    if _turn(T_base_sensor) < _STILL:
+    if _largest_rotation(T_base_sensor) < _STILL:
         raise InputError(
             f"{scans.topic}: {scans.frame!r} does not tilt in {placed.base!r}",
             hint="transforms must say how the joint moves, as robot_state_publisher does",
         )
-    rule, more = scan_beams.understood(scans, options)
-    flat = scan_beams.all_beams(used, [rule], [False], scratch)
-    points, lost = _in_space(found.transforms, placed.base, scans, flat, T_base_sensor, scratch)
-    hit = arrays.copied(flat.hit, scratch)
-    for block in arrays.blocks(hit, points):
+    rule, more = scan_beams.find_range_rule(scans, options)
+    flat = scan_beams.convert_to_beams(used, [rule], [False], scratch)
+    points, lost = _place_beams(found.transforms, placed.base, scans, flat, T_base_sensor, scratch)
+    hit = arrays.copy(flat.hit, scratch)
+    for block in arrays.iter_blocks(hit, points):
         hit[block] &= ~np.isnan(points[block, 0])
     warnings = [*scans.warnings, *(f"{scans.topic}: {text}" for text in more)]
     if lost:
         warnings.append(f"{lost} beams where transforms do not say how the laser is tilted")
-    damaged = Skipped().merged(skipped[scans.topic])
+    damaged = SkippedRecords().merge(skipped[scans.topic])
     return Recording(
         stamp_ns=scans.stamp_ns[flat.scan],
         offset=flat.offset,
@@ -78,16 +80,16 @@ def of_laser(found: Content, options: ReadOptions, scratch: Path | None) -> Reco
     )
 
 
-def _turn(T: Float) -> float:
+def _largest_rotation(T: Float) -> float:
     """rad, the largest turn between the first of poses (N, 4, 4) and another."""
     trace = np.einsum("ij,nij->n", T[0, :3, :3], T[:, :3, :3])
     return float(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)).max())
 
 
-def _in_space(
-    transforms: Transforms,
+def _place_beams(
+    transforms: TransformTree,
     base: str,
-    scans: Scans,
+    scans: LaserScans,
     flat: scan_beams.Beams,
     T_base_sensor: Float,
     scratch: Path | None,
@@ -105,19 +107,19 @@ def _in_space(
             at_ns = at_ns + np.round(1e9 * flat.beam_time[block].astype(np.float64)).astype(
                 np.int64
             )
-        located = transforms.located(base, scans.frame, at_ns)
+        located = transforms.lookup(base, scans.frame, at_ns)
         assert located is not None  # it hangs together with the base at the stamps
         T = se2.inverse(T_base_sensor[flat.scan[scan]]) @ located.T
         ends = np.einsum("nij,nj->ni", T[:, :3, :2], flat.points[block].astype(np.float64))
-        nobody_knows = _in_pause(known, at_ns)
+        nobody_knows = _find_pauses(known, at_ns)
         lost += int(np.count_nonzero(nobody_knows & np.isfinite(ends[:, 0])))
         ends = np.where(nobody_knows[:, None], np.nan, ends + T[:, :3, 3])
         points[block] = ends
-        arrays.let_go(points)
+        arrays.release_pages(points)
     return points, lost
 
 
-def _in_pause(known: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _find_pauses(known: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """(n,) which times lie in a pause of rising times, before the first or after the last."""
     after = np.searchsorted(known, at_ns)
     inside = (after > 0) & (after < len(known))

@@ -4,26 +4,26 @@ from typing import Any, NamedTuple
 
 from stillmap.core.errors import InputError
 from stillmap.io.ros.bag_types import Bag, Channel
-from stillmap.io.ros.laser_scan import Scans
+from stillmap.io.ros.laser_scan import LaserScans
 from stillmap.io.ros.messages import (
     CAMERA_INFO,
-    CLOUD,
-    COMPRESSED,
+    COMPRESSED_IMAGE,
     IMAGE,
-    LASER,
+    LASER_SCAN,
     MULTI_ECHO,
     ODOMETRY,
-    OLD_TF,
+    POINT_CLOUD,
+    ROS1_TF,
     TF,
-    unknown,
+    find_fault,
 )
 from stillmap.preprocessing.options import ReadOptions
 
-_SCANS = (LASER, MULTI_ECHO, CLOUD)
+_SCANS = (LASER_SCAN, MULTI_ECHO, POINT_CLOUD)
 _RARE = 0.25  # of the most frequent scans: rarer topics are no sensors of their own
 
 
-class Chosen(NamedTuple):
+class TopicSelection(NamedTuple):
     """Topics by what they are read for.
 
     Attributes:
@@ -44,39 +44,39 @@ class Chosen(NamedTuple):
         return self.lasers | self.clouds | self.tf | self.odometry | self.images
 
 
-def chosen_topics(bag: Bag, options: ReadOptions) -> Chosen:
+def select_topics(bag: Bag, options: ReadOptions) -> TopicSelection:
     """What to read.
 
     Raises:
         InputError: no topic has scans, or a topic that the options name has none.
     """
     channels = [c for c in bag.channels if c.n_messages]
-    usable = [c for c in channels if unknown(c) is None]
-    scans = _named(usable, bag, options) or [c for c in usable if c.type in _SCANS]
+    usable = [c for c in channels if find_fault(c) is None]
+    scans = _find_named(usable, bag, options) or [c for c in usable if c.type in _SCANS]
     tilting = _tilting(options)
     scans = [c for c in scans if c.topic not in tilting]
     if not scans:
         raise InputError(_no_scans(bag.channels), hint=_topics(bag.channels))
-    flat = {c.topic for c in scans if c.type != CLOUD}
-    clouds = {c.topic for c in scans if c.type == CLOUD} if not flat else set()
+    flat = {c.topic for c in scans if c.type != POINT_CLOUD}
+    clouds = {c.topic for c in scans if c.type == POINT_CLOUD} if not flat else set()
     of_3d = bool(clouds)
     by_type = {
         kind: {c.topic for c in usable if c.type == kind} for kind in {c.type for c in usable}
     }
-    pictures = by_type.get(IMAGE, set()) | by_type.get(COMPRESSED, set())
-    chosen = Chosen(
+    pictures = by_type.get(IMAGE, set()) | by_type.get(COMPRESSED_IMAGE, set())
+    chosen = TopicSelection(
         lasers=flat,
         clouds=clouds,
-        tf=by_type.get(TF, set()) | by_type.get(OLD_TF, set()),
+        tf=by_type.get(TF, set()) | by_type.get(ROS1_TF, set()),
         odometry=by_type.get(ODOMETRY, set()),
         images=pictures | by_type.get(CAMERA_INFO, set()) if of_3d else set(),
         notes=[],
     )
-    chosen.notes.extend(_note(c, chosen, tilting) for c in bag.channels)
+    chosen.notes.extend(_describe_topic(c, chosen, tilting) for c in bag.channels)
     return chosen
 
 
-def _named(usable: list[Channel], bag: Bag, options: ReadOptions) -> list[Channel]:
+def _find_named(usable: list[Channel], bag: Bag, options: ReadOptions) -> list[Channel]:
     if options.topic is None:
         return []
     found = []
@@ -85,11 +85,11 @@ def _named(usable: list[Channel], bag: Bag, options: ReadOptions) -> list[Channe
         of_name = [c for c in bag.channels if c.topic in wanted]
         usable_ones = [c for c in of_name if c in usable and c.type in _SCANS]
         if not usable_ones:
-            faults = [unknown(c) or f"has {c.type}, no scans" for c in of_name if c.n_messages]
+            faults = [find_fault(c) or f"has {c.type}, no scans" for c in of_name if c.n_messages]
             fault = faults[0] if faults else ("is empty" if of_name else "is not there")
             raise InputError(f"topic {name!r} {fault}", hint=_topics(bag.channels))
         found += usable_ones
-    if len({c.type == CLOUD for c in found}) > 1:
+    if len({c.type == POINT_CLOUD for c in found}) > 1:
         raise InputError("laser scans and point clouds cannot be used together", hint="name either")
     return found
 
@@ -102,7 +102,7 @@ def _tilting(options: ReadOptions) -> set[str]:
 
 def _no_scans(channels: list[Channel]) -> str:
     empty = [c.topic for c in channels if c.type in _SCANS and not c.n_messages]
-    odd = [f"{c.topic} {unknown(c)}" for c in channels if c.type in _SCANS and unknown(c)]
+    odd = [f"{c.topic} {find_fault(c)}" for c in channels if c.type in _SCANS and find_fault(c)]
     if odd:
         return f"holds no scans that can be read: {odd[0]}"
     return f"holds no scans: {empty[0]} is empty" if empty else "holds no scans"
@@ -118,7 +118,7 @@ def _topics(channels: list[Channel]) -> str:
     return f"topics with scans: {named}" if of_scans else f"it has {named}"
 
 
-def _note(channel: Channel, chosen: Chosen, tilting: set[str]) -> dict[str, Any]:
+def _describe_topic(channel: Channel, chosen: TopicSelection, tilting: set[str]) -> dict[str, Any]:
     """What became of a topic."""
     reasons = {
         "scans": chosen.lasers | chosen.clouds,
@@ -127,8 +127,8 @@ def _note(channel: Channel, chosen: Chosen, tilting: set[str]) -> dict[str, Any]
         "pictures": chosen.images,
     }
     used = [what for what, topics in reasons.items() if channel.topic in topics]
-    relevant = channel.type in (*_SCANS, ODOMETRY, TF, OLD_TF)
-    fault = unknown(channel) if relevant else None
+    relevant = channel.type in (*_SCANS, ODOMETRY, TF, ROS1_TF)
+    fault = find_fault(channel) if relevant else None
     if channel.n_messages == 0:
         why = "empty"
     elif used:
@@ -137,7 +137,7 @@ def _note(channel: Channel, chosen: Chosen, tilting: set[str]) -> dict[str, Any]
         why = fault
     elif channel.topic in tilting:
         why = "not for the map: its laser tilts"
-    elif channel.type == CLOUD:
+    elif channel.type == POINT_CLOUD:
         why = "not used: the laser scans are (name it to use it instead)"
     elif channel.type in _SCANS:
         why = "not used: others are named"
@@ -152,7 +152,7 @@ def _note(channel: Channel, chosen: Chosen, tilting: set[str]) -> dict[str, Any]
     }
 
 
-def chosen_lasers(found: list[Scans], named: bool) -> tuple[list[Scans], list[str]]:
+def chosen_lasers(found: list[LaserScans], named: bool) -> tuple[list[LaserScans], list[str]]:
     """The lasers to use, the busiest first, and words on those that are left out.
 
     Of topics that show the same laser (the same frame) the one with most scans is used, of equal
@@ -163,7 +163,7 @@ def chosen_lasers(found: list[Scans], named: bool) -> tuple[list[Scans], list[st
         named: whether the user named their topics: then only the same laser is used once.
     """
     order = sorted(found, key=lambda s: (-s.n_scans, -int(s.lengths[0]), s.topic))
-    used: list[Scans] = []
+    used: list[LaserScans] = []
     left_out = []
     for scans in order:
         same = next((u for u in used if u.frame == scans.frame), None)

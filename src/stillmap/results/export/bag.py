@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.io.ros import message_writer
-from stillmap.io.ros.bag_types import Kind
+from stillmap.io.ros.bag_types import BagKind
 from stillmap.io.ros.bag_writer import BagWriter, new_bag, require_stamps
 from stillmap.io.ros.message_writer import BASE, MAP
-from stillmap.io.ros.recording_writer import Lasers, numbered, place_sensors
+from stillmap.io.ros.recording_writer import LaserScanEncoder, number_names, write_sensor_frames
 from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
 from stillmap.results.reader import Exported, Track
 
@@ -21,7 +21,7 @@ _HEIGHT, _LEAST = 0.5, 0.1  # m, of the boxes
 _CUBE, _ADD, _DELETE_ALL = 1, 0, 3  # of visualization_msgs/Marker
 
 
-def write(result: Exported, path: Path, kind: Kind, *, overwrite: bool = False) -> list[str]:
+def write(result: Exported, path: Path, kind: BagKind, *, overwrite: bool = False) -> list[str]:
     """Write a result as a ROS bag.
 
     `/scan` holds the beams that something static reflected and those at maximum range,
@@ -36,42 +36,47 @@ def write(result: Exported, path: Path, kind: Kind, *, overwrite: bool = False) 
     """
     recording, stamps = result.recording, result.recording.stamp_ns.tolist()
     require_stamps(stamps[0], stamps[-1], kind)
-    lasers = Lasers(recording)
+    lasers = LaserScanEncoder(recording)
     with new_bag(path, kind, overwrite=overwrite) as bag:
-        frames = place_sensors(bag, recording)
+        frames = write_sensor_frames(bag, recording)
         _show_whole(bag, result)
-        names = [f"/{name}" for name in numbered("scan", len(frames))]
-        static = [bag.topic(name, message_writer.SCAN) for name in names]
-        dynamic = [bag.topic(f"{name}_dynamic", message_writer.SCAN) for name in names]
-        send_tf = bag.topic("/tf", message_writer.TRANSFORMS)
+        names = [f"/{name}" for name in number_names("scan", len(frames))]
+        static = [bag.add_topic(name, message_writer.SCAN) for name in names]
+        dynamic = [bag.add_topic(f"{name}_dynamic", message_writer.SCAN) for name in names]
+        send_tf = bag.add_topic("/tf", message_writer.TRANSFORMS)
         show_objects = _shown_objects(bag, result)
         for t in recording.in_turn(range(recording.n_scans), result.p_static):
             stamp = stamps[t]
-            send_tf(stamp, message_writer.transforms(bag, stamp, [(MAP, BASE, result.poses[t])]))
+            send_tf(
+                stamp, message_writer.make_transforms(bag, stamp, [(MAP, BASE, result.poses[t])])
+            )
             s = int(recording.sensor[t])
             beams, ranges = recording.beams_of(t), lasers.ranges(t)
             moves = recording.hit[beams] & (result.p_static[beams] < DYNAMIC_BELOW)
             for sends, its in ((static, ~moves), (dynamic, moves)):
                 apart = np.where(its, ranges, np.float32(np.nan))
-                sends[s](stamp, lasers.message(bag, t, frames[s], apart))
+                sends[s](stamp, lasers.make_message(bag, t, frames[s], apart))
             show_objects(t)
-    return lasers.left_out()
+    return lasers.describe_losses()
 
 
 def _show_whole(bag: BagWriter, result: Exported) -> None:
     """What holds for the whole recording, sent once."""
     stamp_ns, grid = result.recording.stamp_ns, result.map
     first = int(stamp_ns[0])
-    send = bag.topic("/map", message_writer.GRID, latched=True)
+    send = bag.add_topic("/map", message_writer.GRID, latched=True)
     corner = se2.matrix(*grid.origin)
-    send(first, message_writer.occupancy_grid(bag, first, grid.p_occupied, corner, grid.resolution))
-    send = bag.topic("/trajectory", message_writer.PATH, latched=True)
-    send(first, message_writer.path(bag, stamp_ns, result.poses))
+    send(
+        first,
+        message_writer.make_occupancy_grid(bag, first, grid.p_occupied, corner, grid.resolution),
+    )
+    send = bag.add_topic("/trajectory", message_writer.PATH, latched=True)
+    send(first, message_writer.make_path(bag, stamp_ns, result.poses))
 
 
 def _shown_objects(bag: BagWriter, result: Exported) -> Callable[[int], None]:
     """A function that shows where everything is that moves at a scan."""
-    send = bag.topic("/objects", message_writer.MARKERS)
+    send = bag.add_topic("/objects", message_writer.MARKERS)
     stamp_ns = result.recording.stamp_ns
     first = [int(np.searchsorted(stamp_ns, one.stamp_ns[0])) for one in result.tracks]
     last = [int(np.searchsorted(stamp_ns, one.stamp_ns[-1], "right")) for one in result.tracks]
@@ -120,7 +125,7 @@ def _marker(
         "id": number,
         "type": _CUBE,
         "action": action,
-        "pose": message_writer.pose(bag, np.eye(4) if T is None else T),
+        "pose": message_writer.make_pose(bag, np.eye(4) if T is None else T),
         "scale": bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
         "color": bag.make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a),
         "lifetime": bag.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
