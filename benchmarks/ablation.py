@@ -28,7 +28,7 @@ from prepared import RESOLUTION
 from tables import markdown
 
 from stillmap.em import EmOptions, occupancy_hmm
-from stillmap.em.observations import CLASSES, Classes
+from stillmap.em.observations import LOOP_CLASSES, HmmClasses
 from stillmap.eval.labels import LabelScores, label_scores
 from stillmap.sim import simulate
 
@@ -41,7 +41,7 @@ class Variant:
 
     without: str
     dwell: dict[str, float]
-    classes: Classes = CLASSES
+    classes: HmmClasses = LOOP_CLASSES
 
     def options(self, options: EmOptions) -> EmOptions:
         changed = dataclasses.replace(options.dwell, **self.dwell)  # type: ignore[arg-type]
@@ -55,10 +55,10 @@ VARIANTS = (
     Variant("room behind the surface", {"margin": _NONE}),
     Variant("hits of neighbours", {"reach": _NONE}),
     Variant("looks: every scan counts for itself", {"look": 0.01}),
-    Variant("people who stay: tau 0.5 s only", {}, Classes(mover_seconds=(0.5,))),
-    Variant("crowded places: rho 0.01 only", {}, Classes(mover_occupied=(0.01,))),
-    Variant("walls that are missed: rho 0.998 only", {}, Classes(static_occupied=(0.998,))),
-    Variant("a share that is missed for seconds only", {}, Classes(static_seconds=(1.0,))),
+    Variant("people who stay: tau 0.5 s only", {}, HmmClasses(mover_seconds=(0.5,))),
+    Variant("crowded places: rho 0.01 only", {}, HmmClasses(mover_occupied=(0.01,))),
+    Variant("walls that are missed: rho 0.998 only", {}, HmmClasses(static_occupied=(0.998,))),
+    Variant("a share that is missed for seconds only", {}, HmmClasses(static_seconds=(1.0,))),
 )
 
 

@@ -145,13 +145,13 @@ def poses_by(
         return last.poses
     if weights == "true labels" and static is not None:
         return poses_with(recording, options, static)
-    prior = em.initial_expectations(recording, options.estimator, options.em)
+    prior = em.initial_p_static(recording, options.estimator, options.em)
     return poses_with(recording, options, prior)
 
 
 def poses_with(recording: stillmap.Recording, options: stillmap.Options, e: Weights) -> Float:
     """Poses (T, 3, 3) of the last M-step of `stillmap.iterate` if every E-step found e (M,)."""
-    start: slam.Mapped | None = None
+    start: slam.MStepResult | None = None
     for number in range(1, options.em.max_iterations + 1):
         mapped = slam.m_step(
             recording, e, options.slam, None, options.threads, _silent, start=start

@@ -66,11 +66,11 @@ def kernels_of(recording: stillmap.Recording, poses: NDArray[np.float64]) -> dic
     scans = (recording.points, recording.hit, e, recording.offset, T_map_sensor)
     grid = _core.Grid2D(RESOLUTION)
     _core.add_beams(grid, *scans, 1)
-    surface = observations.surface_of(recording, T_map_sensor, RESOLUTION)
+    surface = observations.build_surfel_map(recording, T_map_sensor, RESOLUTION)
 
     def elements(threads: int) -> object:
-        seen = observations._dwell(surface, options.dwell, observations.CLASSES)
-        observations._look(recording, poses, seen, options.dwell.look, threads)
+        seen = observations.make_hmm(surface, options.dwell, observations.LOOP_CLASSES)
+        observations.add_observations(recording, poses, seen, options.dwell.look, threads)
         return seen.likelihood()
 
     return {

@@ -118,4 +118,4 @@ def _map_of(
 ) -> Grid:
     """The map of (15) at true poses."""
     weights, poses = static.astype(np.float32), sim.truth.T_world_base
-    return grid_of(em.occupancy_map(counts(sim.recording, points, hit, weights, poses)))
+    return grid_of(em.make_occupancy_map(counts(sim.recording, points, hit, weights, poses)))

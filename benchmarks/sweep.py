@@ -86,7 +86,7 @@ def sweep(work: Path, threads: int) -> dict[str, float]:
     """Seconds of the two steps and the peak memory of this process in MB, before and after."""
     recording, poses = stillmap.read(work / "recording"), np.load(work / _POSES)
     options = stillmap.Options().em
-    e = em.initial_expectations(recording, "stillmap", options)
+    e = em.initial_p_static(recording, "stillmap", options)
     loaded, started = peak_memory_bytes(), time.perf_counter()
     grid = _core.Grid2D(RESOLUTION)
     em.add_recording(grid, recording, poses, e, threads)

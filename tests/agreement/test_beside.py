@@ -6,7 +6,7 @@ import reference
 
 from stillmap import _core
 from stillmap.em.options import BesideOptions
-from stillmap.em.spatial_prior import arguments, with_those_beside
+from stillmap.em.spatial_prior import arguments, smooth_mean_field
 
 BESIDE = arguments(BesideOptions())
 
@@ -184,9 +184,9 @@ def test_options_that_make_no_sense(name, value):
 def test_those_beside_need_not_be_asked():
     core, _ = surfaces(0)
     p = np.linspace(0.0, 1.0, core.size).astype(np.float32)
-    assert with_those_beside(p, core, BesideOptions(enabled=False)) is p
-    asked = with_those_beside(p, core, BesideOptions())
+    assert smooth_mean_field(p, core, BesideOptions(enabled=False)) is p
+    asked = smooth_mean_field(p, core, BesideOptions())
     assert asked.dtype == np.float32
     assert np.isfinite(asked).all()
     with pytest.raises(TypeError, match="in space"):
-        with_those_beside(p, _core.Surface2D(0.3), BesideOptions())
+        smooth_mean_field(p, _core.Surface2D(0.3), BesideOptions())

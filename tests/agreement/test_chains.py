@@ -8,9 +8,9 @@ import pytest
 from reference.dwell import HIT, chain_log_likelihood
 
 from stillmap import _core
-from stillmap.em.observations import Classes
+from stillmap.em.observations import HmmClasses
 
-CLASSES = Classes(views_occupied=(0.65,)).grid()
+CLASSES = HmmClasses(views_occupied=(0.65,)).grid()
 
 
 def lane(seen, rho, tau, turn, detection, seconds=1.0, at=None):

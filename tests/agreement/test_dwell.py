@@ -10,9 +10,9 @@ import reference
 from reference.dwell import HIT, SURE
 
 from stillmap import _core
-from stillmap.em.observations import Classes
+from stillmap.em.observations import HmmClasses
 
-CLASSES = Classes(views_occupied=(0.65,)).grid()
+CLASSES = HmmClasses(views_occupied=(0.65,)).grid()
 
 
 @pytest.fixture(

@@ -32,10 +32,10 @@ def test_m_steps_are_those_of_the_loop_when_the_e_step_finds_nothing(
     recording = crowd.recording
     found = em.e_step
 
-    def same_as_ever(*args: object) -> em.Expectations:
+    def same_as_ever(*args: object) -> em.EStepResult:
         once = found(*args)
-        prior = em.initial_expectations(recording, "stillmap", _THREE.em)
-        return em.Expectations(prior, once.likelihood, once.occupied, once.learned)
+        prior = em.initial_p_static(recording, "stillmap", _THREE.em)
+        return em.EStepResult(prior, once.likelihood, once.occupied, once.learned)
 
     by_prior = poses_by("prior", recording, _THREE, None)
     weighted = poses_by("e", recording, _THREE, None)

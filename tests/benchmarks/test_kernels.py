@@ -28,7 +28,7 @@ def test_hall_is_seen_all_around_and_every_kernel_runs() -> None:
     assert any("element" in name for name in kernels)
     once, again = ([kernels["E-step"](n) for n in THREADS] for _ in range(2))
     for expectations in (*once, *again):
-        assert isinstance(expectations, em.Expectations)
+        assert isinstance(expectations, em.EStepResult)
         np.testing.assert_array_equal(expectations.p_static, once[0].p_static)
     likelihood, _ = kernels["E-step: element pass"](1)
     later, _ = kernels["E-step: element pass"](2)

@@ -21,7 +21,7 @@ def test_true_labels_at_true_poses_score_full_marks(run: Prepared) -> None:
     recording, truth = run.simulation.recording, run.simulation.truth
     labels = truth.static.astype(np.float32)
     grid = counts(recording, recording.points, recording.hit, labels, truth.T_world_base)
-    found = scores(labels, truth.T_world_base, em.occupancy_map(grid), run)
+    found = scores(labels, truth.T_world_base, em.make_occupancy_map(grid), run)
     assert found["ap"] == found["f1"] == found["walls_at_best"] == 1.0
     assert found["brier"] == found["ece"] == found["ghosts"] == 0.0
     assert found["ate"] == pytest.approx(0.0, abs=1e-9)
@@ -48,7 +48,7 @@ def test_what_ended_on_doors_and_things_is_left_out_of_the_scores_without_them(
     people_unsure = np.where(kinds == "person", 0.9, truth.static).astype(np.float32)
     grid = counts(recording, recording.points, recording.hit, people_unsure, truth.T_world_base)
     scored = [
-        scores(labels, truth.T_world_base, em.occupancy_map(grid), run)
+        scores(labels, truth.T_world_base, em.make_occupancy_map(grid), run)
         for labels in (doors_unsure, people_unsure)
     ]
     assert scored[0]["f1_no_doors"] == scored[0]["ap_no_doors"] == 1.0

@@ -86,7 +86,7 @@ class Watched:
 
     def e_step(
         self, resolution: float = RESOLUTION, estimator: em.Estimator = "stillmap", **options: Any
-    ) -> em.Expectations:
+    ) -> em.EStepResult:
         grid = self.grid(None, resolution)
         return em.e_step(self.recording, self.poses, grid, estimator, em.EmOptions(**options))
 

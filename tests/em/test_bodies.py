@@ -7,11 +7,16 @@ import pytest
 
 from stillmap import _core
 from stillmap.core.recording import Recording
-from stillmap.em.ground import Ground, ground_under
+from stillmap.em.ground import GroundMap, ground_from_surfels
 from stillmap.em.options import BodyOptions
-from stillmap.em.spatial_prior import feet_of, lowered, standing_on, with_bodies
+from stillmap.em.spatial_prior import (
+    apply_pooled_evidence,
+    make_ground_contact,
+    pool_clusters,
+    select_obstacles,
+)
 
-FLAT = Ground(np.zeros((40, 40)), np.array([-20.0, -20.0]), 1.8, True)
+FLAT = GroundMap(np.zeros((40, 40)), np.array([-20.0, -20.0]), 1.8, True)
 
 
 def box(x, y, length, width=1.6, height=1.4):
@@ -56,8 +61,8 @@ def labelled(surface, moving):
 
 def lowered_by(surface, p, change, recording, T, options, ground=FLAT):
     """P(static) by bodies on that ground."""
-    standing = standing_on(ground, surface, options)
-    return with_bodies(p, change, standing, recording, T, options)
+    standing = select_obstacles(ground, surface, options)
+    return pool_clusters(p, change, standing, recording, T, options)
 
 
 CAR, OTHER, WALL = box(2.0, 2.0, 4.0), box(-5.0, 2.0, 4.0), box(-6.0, -5.0, 13.0, height=2.5)
@@ -119,25 +124,27 @@ def test_left_out(options, ground):
     recording, T, surface = standing(CAR)
     p, _ = labelled(surface, front)
     assert lowered_by(surface, p, 0 * p, recording, T, options, ground) is p
-    assert feet_of(standing_on(ground, surface, options), p, options) is None
+    assert make_ground_contact(select_obstacles(ground, surface, options), p, options) is None
 
 
 def test_ground_and_crowns_are_no_bodies():
     crown = np.random.default_rng(0).uniform([-2, -2, 3.5], [2, 2, 5], (2000, 3))
     _, _, surface = standing(CAR, crown)
     z = surface.elements()[1][:, 2]
-    stands = standing_on(FLAT, surface, BodyOptions()).stands
+    stands = select_obstacles(FLAT, surface, BodyOptions()).stands
     np.testing.assert_array_equal(stands, (z > 0.2) & (z < 3.0))
     assert 100 < stands.sum() < len(z)
 
 
 def test_feet_are_off_the_ground_by_what_end_points_scatter():
     _, _, surface = standing(CAR)
-    standing_there = standing_on(FLAT, surface, BodyOptions())
+    standing_there = select_obstacles(FLAT, surface, BodyOptions())
     assert standing_there.column == 2  # of 0.15 m
     p = np.ones(surface.size, np.float32)
-    assert feet_of(standing_there, p, BodyOptions(foot=0.06)).least == 0.06
-    assert feet_of(standing_there, p, BodyOptions(foot=0.0)).least == 2.5 * surface.scatter
+    assert make_ground_contact(standing_there, p, BodyOptions(foot=0.06)).least == 0.06
+    assert (
+        make_ground_contact(standing_there, p, BodyOptions(foot=0.0)).least == 2.5 * surface.scatter
+    )
 
 
 def test_ground_under_what_stands_still():
@@ -145,11 +152,11 @@ def test_ground_under_what_stands_still():
     T[:, :3, 3] = [0.0, 0.0, 1.8]
     means = surface.elements()[1]
     low = means[:, 2] < 0.1
-    ground = ground_under(surface, np.ones(len(means), np.float32), T[:, :3, 3])
+    ground = ground_from_surfels(surface, np.ones(len(means), np.float32), T[:, :3, 3])
     assert ground.seen
     assert ground.sensor == pytest.approx(1.8, abs=0.02)
     np.testing.assert_allclose(ground.at(means[low, :2]), 0.0, atol=0.02)
-    unknown = ground_under(surface, np.where(low, 0.1, 1.0).astype(np.float32), T[:, :3, 3])
+    unknown = ground_from_surfels(surface, np.where(low, 0.1, 1.0).astype(np.float32), T[:, :3, 3])
     assert not unknown.seen or unknown.sensor < 1.0  # roofs at most
 
 
@@ -158,7 +165,9 @@ def test_how_far_it_is_lowered():
     moves = [np.nan, 0.2, 0.3, 1.0, 1.0, 0.25, 0.251, 0.0, 0.3, 1.0]
     change = [np.nan, 0.9, 0.0, -4.0, 4.0, 1.0, 0.0, 1.1, 4.0, 0.0]
     means = np.array([moves, change], np.float32).T
-    found = lowered(p, means, BodyOptions(share=0.25, change=1.0, slope=20.0, most=4.0))
+    found = apply_pooled_evidence(
+        p, means, BodyOptions(share=0.25, change=1.0, slope=20.0, most=4.0)
+    )
     nats = np.array([1.0, 4.0, 0.02, 2.0, 4.0])
     np.testing.assert_allclose(found[[2, 3, 6, 7, 8]], 1 / (1 + np.exp(nats)), rtol=1e-4)
     assert found[4] == pytest.approx(1 / (1 + np.exp(4.0)), rel=1e-4)

@@ -23,7 +23,7 @@ def ten_scans():
 
 def cuts(beams, monkeypatch, **which):
     monkeypatch.setattr(observations, "CHUNK_BEAMS", beams)
-    found = list(observations.chunks(ten_scans(), **which))
+    found = list(observations.iter_chunks(ten_scans(), **which))
     for chunk in found:
         assert chunk.beams == slice(100 * chunk.scans.start, 100 * chunk.scans.stop)
         assert chunk.offset.tolist() == [100 * k for k in range(len(chunk.offset))]

@@ -35,7 +35,7 @@ def courses(**changed):
         "share": 0.1,
         "surface": None,
     }
-    return em.Courses(**(usual | changed))
+    return em.CellHistories(**(usual | changed))
 
 
 def test_the_last_state():
@@ -74,7 +74,7 @@ def test_no_probability_exceeds_one(state):
 def row(p_changing, *, came=True, between=(10, 12), count=1, static=0.01, apart=1):
     """Cells in a row that changed alike."""
     n = len(p_changing)
-    return em.Courses(
+    return em.CellHistories(
         cells=np.column_stack([apart * np.arange(n), np.zeros(n)]).astype(np.int64),
         p_static=np.full(n, static, np.float32),
         p_views=np.zeros(n, np.float32),
@@ -172,8 +172,8 @@ def test_rounding_makes_nothing_impossible(monkeypatch):
         n_static=2,
     )
     monkeypatch.setattr(module, "coverage", lambda _: np.ones(20_000, np.float32))
-    found = module.courses_of(looks, em.EmOptions())
-    static, change, share = module.told_of(looks, em.EmOptions())
+    found = module.decode_histories(looks, em.EmOptions())
+    static, change, share = module.label_cells(looks, em.EmOptions())
     assert static.tobytes() == found.p_static.tobytes()
     assert share == found.share
     always = likelihood[:, 0]  # the only static class of these that is met from all around
@@ -212,7 +212,7 @@ class Everywhere(NamedTuple):
 def last_e_step(seen, state="last", threads=1, **options):
     """(p_static, occupied) of a map that shows it everywhere, and the courses."""
     chosen = em.EmOptions(**options)
-    _, found = em.last_e_step(seen.recording, seen.poses, RESOLUTION, chosen, threads)
+    _, found = em.final_e_step(seen.recording, seen.poses, RESOLUTION, chosen, threads)
     nobody = np.ones(seen.recording.n_beams, np.float32)
     before = em.CellProbabilities(found.cells, np.zeros(len(found.cells), np.float32), 0.2)
     places = [Everywhere(found.cells)]
@@ -272,7 +272,7 @@ def test_labels_follow_from_the_map(seen, last, majority, state):
 
 
 def test_both_maps_are_of_the_same_courses(last, majority):
-    for name in set(em.Courses.__dataclass_fields__) - {"surface", "share"}:
+    for name in set(em.CellHistories.__dataclass_fields__) - {"surface", "share"}:
         one, other = getattr(last[1], name), getattr(majority[1], name)
         np.testing.assert_array_equal(one, other)
 
@@ -364,7 +364,7 @@ def test_a_clock_that_leaps_by_decades_ends_nothing(seen):
     stamps = seen.recording.stamp_ns - seen.recording.stamp_ns[0]
     stamps[1:] += 17 * 10**17  # from 1970 on
     leaping = replace(seen.recording, stamp_ns=stamps)
-    assert em.look_numbers(leaping, 0.5).max() < 2**31
-    _, found = em.last_e_step(leaping, seen.poses, RESOLUTION, em.EmOptions())
+    assert em.time_bin_index(leaping, 0.5).max() < 2**31
+    _, found = em.final_e_step(leaping, seen.poses, RESOLUTION, em.EmOptions())
     assert np.isfinite(found.shown("last")).all()
     assert (found.count >= 0).all()

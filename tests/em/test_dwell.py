@@ -8,7 +8,7 @@ from made_up import RESOLUTION, Ball, Wall, Watched, cone, fan, watch
 
 from stillmap import _core, em
 from stillmap.em import observations, occupancy_hmm
-from stillmap.em.observations import CLASSES, surface_of
+from stillmap.em.observations import LOOP_CLASSES, build_surfel_map
 from stillmap.eval.labels import calibration_error, equal_width_bins
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box
@@ -117,8 +117,8 @@ def test_a_corner_that_beams_pass_closely_stays():
 
 def rows(seen, x, y, radius):
     """Cells near a place with the likelihood of every class."""
-    surface = surface_of(seen.recording, seen.poses, 0.1)
-    rho, tau, turn = CLASSES.grid()
+    surface = build_surfel_map(seen.recording, seen.poses, 0.1)
+    rho, tau, turn = LOOP_CLASSES.grid()
     chains = _core.Dwell2D(
         surface, rho=rho, tau=tau, turn=turn, detection=0.97, seconds=1.0,
         lateral=0.03, margin=0.1, reach=0.1, beyond=0.3,

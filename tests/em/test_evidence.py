@@ -7,7 +7,7 @@ from stillmap import _core, em
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.em import observations
-from stillmap.em.types import NoReturn
+from stillmap.em.types import NoReturnModel
 
 RESOLUTION = 0.1
 SECOND = 1_000_000_000
@@ -35,10 +35,10 @@ def evidence_of(recording, p_static, no_return=None, threads=1, **options):
     poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
     grid = _core.Grid2D(RESOLUTION)
     known = np.nan_to_num(p_static, nan=0.5)
-    seen = em.add_believed_first(grid, recording, poses, known, no_return)
-    occupancy = em.occupancy_map(grid, seen=seen)
+    seen = em.add_trusted_beams(grid, recording, poses, known, no_return)
+    occupancy = em.make_occupancy_map(grid, seen=seen)
     chosen = em.EmOptions(evidence=em.EvidenceOptions(**options))
-    found = em.evidence(recording, poses, p_static, occupancy, no_return, chosen, threads)
+    found = em.count_observations(recording, poses, p_static, occupancy, no_return, chosen, threads)
     assert found.looks.shape == found.clear.shape == found.thin.shape == occupancy.p_occupied.shape
     assert found.looks.dtype == found.clear.dtype == np.uint16
     return occupancy, found
@@ -117,8 +117,8 @@ def test_beams_without_a_return_count_as_far_as_they_are_believed():
     here = (3.0, 0.5), (3.85, 0.5)
     for no_return, expected in (
         (None, (5, 5)),
-        (NoReturn(np.zeros((0, 2), np.int64), 0.4), (5, 0)),
-        (NoReturn(np.zeros((0, 2), np.int64), np.inf), (0, 0)),
+        (NoReturnModel(np.zeros((0, 2), np.int64), 0.4), (5, 0)),
+        (NoReturnModel(np.zeros((0, 2), np.int64), np.inf), (0, 0)),
     ):
         occupancy, found = evidence_of(recording, e, no_return)
         np.testing.assert_array_equal(found.looks > 0, ~np.isnan(occupancy.p_occupied))

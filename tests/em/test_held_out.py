@@ -9,7 +9,7 @@ from stillmap import em
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.em import observations as chunking
-from stillmap.em.held_out import held_out_scans
+from stillmap.em.held_out import select_held_out_scans
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box
 
@@ -36,7 +36,7 @@ def figure(sim, e=None, poses=None, recording=None, every=EVERY, **more):
     e = truth.static.astype(np.float32) if e is None else e
     poses = truth.T_world_base if poses is None else poses
     recording = recording or sim.recording
-    return em.held_out_log_likelihood(recording, poses, e, RESOLUTION, every, **more)
+    return em.score_held_out_scans(recording, poses, e, RESOLUTION, every, **more)
 
 
 def test_true_labels_and_poses_foresee_best(room):
@@ -59,7 +59,7 @@ def test_true_labels_and_poses_foresee_best(room):
 
 
 def test_held_out_beams_are_not_in_the_map(room):
-    held = held_out_scans(room.recording.n_scans, EVERY)
+    held = select_held_out_scans(room.recording.n_scans, EVERY)
     of_held = np.repeat(held, np.diff(room.recording.offset))
     e = room.truth.static.astype(np.float32)
     assert figure(room, np.where(of_held, 1 - e, e)) == figure(room, e)
@@ -68,7 +68,7 @@ def test_held_out_beams_are_not_in_the_map(room):
 
 @pytest.mark.parametrize("every", [2, 7, 20, 120])
 def test_which_scans(every):
-    held = held_out_scans(120, every)
+    held = select_held_out_scans(120, every)
     assert held.sum() == 120 // every + (120 % every > every // 2)
     assert set(np.diff(np.flatnonzero(held))) <= {every}
     assert 0 < np.flatnonzero(held)[0] < every
@@ -106,8 +106,8 @@ def test_in_three_dimensions():
     )
     poses = np.tile(np.eye(4), (3, 1, 1))
     e = np.ones(len(points), np.float32)
-    good = em.held_out_log_likelihood(recording, poses, e, 0.2, 3)
+    good = em.score_held_out_scans(recording, poses, e, 0.2, 3)
     turned = poses.copy()
     turned[1, :3, :3] = [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]
-    assert good > em.held_out_log_likelihood(recording, turned, e, 0.2, 3) + 0.5
-    assert good > em.held_out_log_likelihood(recording, poses, 0 * e, 0.2, 3) + 0.5
+    assert good > em.score_held_out_scans(recording, turned, e, 0.2, 3) + 0.5
+    assert good > em.score_held_out_scans(recording, poses, 0 * e, 0.2, 3) + 0.5

@@ -47,7 +47,7 @@ def test_a_half_is_at_the_threshold(hits, passes, threshold):
         assert (found.p_static[:hits] > 0.5).all() == (ratio > threshold)
     else:
         assert found.p_static[:hits] == pytest.approx(0.5, abs=1e-6)
-    m = em.occupancy_map(grid, found.occupied)
+    m = em.make_occupancy_map(grid, found.occupied)
     row, column = -round(m.origin[1]), 3 - round(m.origin[0])
     assert m.p_occupied[row, column] == float(ratio >= threshold)
     assert found.occupied.cells.tolist() == [[3, 0]]
@@ -55,7 +55,7 @@ def test_a_half_is_at_the_threshold(hits, passes, threshold):
 
 def test_cells_that_were_only_passed_are_free():
     grid, found = counted(lane(1, 1), 0.25)
-    m = em.occupancy_map(grid, found.occupied)
+    m = em.make_occupancy_map(grid, found.occupied)
     known = m.alpha + m.beta > 0
     assert (m.p_occupied[known & (m.alpha == 0)] == 0).all()
     assert np.isnan(m.p_occupied[~known]).all()
@@ -71,10 +71,10 @@ def test_in_the_order_of_the_ratio():
 
 def test_one_iteration_and_all_believed():
     options = em.EmOptions()
-    assert em.iterations("hit-ratio", options) == 1
-    assert em.iterations("stillmap", options) == em.iterations("paper", options) == 6
+    assert em.max_iterations("hit-ratio", options) == 1
+    assert em.max_iterations("stillmap", options) == em.max_iterations("paper", options) == 6
     recording = lane(2, 1)
-    assert (em.initial_expectations(recording, "hit-ratio", options) == 1).all()
+    assert (em.initial_p_static(recording, "hit-ratio", options) == 1).all()
     for estimator in ("stillmap", "paper"):
-        e = em.initial_expectations(recording, estimator, options)
+        e = em.initial_p_static(recording, estimator, options)
         assert (e == np.float32(options.prior)).all()

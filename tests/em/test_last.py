@@ -47,7 +47,9 @@ def labels(at, met, **dwell):
     """(M,) p_static in the loop and in the last E-step, and which beams end on the post."""
     recording, T, on = seen(at, met)
     loop = em.e_step(recording, T, _core.Grid2D(0.05), "stillmap", em.EmOptions(), 1)
-    last, courses = em.last_e_step(recording, T, 0.05, em.EmOptions(dwell=em.DwellOptions(**dwell)))
+    last, courses = em.final_e_step(
+        recording, T, 0.05, em.EmOptions(dwell=em.DwellOptions(**dwell))
+    )
     assert on.sum() > 5
     assert courses is not None
     return loop.p_static, last and last.p_static, on
@@ -94,7 +96,7 @@ def test_without_views_labels_are_left_to_the_loop():
 def test_without_views_no_course_knows_of_them(views):
     recording, T, _ = seen(ROUNDS, by_views(ROUNDS))
     options = em.EmOptions(dwell=em.DwellOptions(views=views))
-    _, courses = em.last_e_step(recording, T, 0.05, options)
+    _, courses = em.final_e_step(recording, T, 0.05, options)
     assert (courses.p_views.max() > 0.9) == views
     assert (courses.p_views > 0.0).any() == views
 
@@ -119,7 +121,7 @@ def test_who_stands_with_two_lasers_stands():
     )
     T = np.tile(np.eye(3), (len(at), 1, 1))
     T[:, 0, 2] = at
-    last, _ = em.last_e_step(recording, T, 0.05, em.EmOptions())
+    last, _ = em.final_e_step(recording, T, 0.05, em.EmOptions())
     assert np.median(last.p_static[on]) < 0.1
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.em.mixture import fit_shares, posterior_static
+from stillmap.em.mixture import fit_weights, posterior_static
 
 N_STATIC = 2
 
@@ -29,7 +29,7 @@ def test_no_iteration_lowers_the_likelihood(seed, start):
         return float(np.log(likelihood.astype(float) @ shares.classes).sum()) + pseudo
 
     values = [
-        objective(fit_shares(likelihood, N_STATIC, start, iterations=n, tolerance=-1.0))
+        objective(fit_weights(likelihood, N_STATIC, start, iterations=n, tolerance=-1.0))
         for n in (1, 2, 3, 5, 8, 13, 50, 100)
     ]
     assert np.diff(values).min() > -1e-9 * abs(values[0])
@@ -39,7 +39,7 @@ def test_no_iteration_lowers_the_likelihood(seed, start):
 def test_known_shares_are_found():
     true = np.array([0.45, 0.3, 0.2, 0.05])
     likelihood, kind = members(np.random.default_rng(1), true, 40000, spread=2.5)
-    found = fit_shares(likelihood, N_STATIC, 0.5)
+    found = fit_weights(likelihood, N_STATIC, 0.5)
     assert found.classes == pytest.approx(true, abs=0.012)
     assert found.static == pytest.approx(0.75, abs=0.01)
     assert found.static == pytest.approx(found.classes[:N_STATIC].sum())
@@ -54,17 +54,17 @@ def test_known_shares_are_found():
 def test_it_stops_when_nothing_is_gained():
     likelihood, _ = members(np.random.default_rng(3), [0.5, 0.2, 0.2, 0.1], 500)
     enough, more = (
-        fit_shares(likelihood, N_STATIC, 0.5, iterations=n, tolerance=1e-4) for n in (200, 400)
+        fit_weights(likelihood, N_STATIC, 0.5, iterations=n, tolerance=1e-4) for n in (200, 400)
     )
     assert (enough.classes == more.classes).all()
-    longer = fit_shares(likelihood, N_STATIC, 0.5, iterations=400, tolerance=0.0)
+    longer = fit_weights(likelihood, N_STATIC, 0.5, iterations=400, tolerance=0.0)
     assert (longer.classes != more.classes).any()
     assert longer.log_likelihood >= more.log_likelihood
 
 
 @pytest.mark.parametrize("start", [0.3, 0.9])
 def test_without_members_it_knows_what_it_was_told(start):
-    found = fit_shares(np.zeros((0, 4), np.float32), N_STATIC, start)
+    found = fit_weights(np.zeros((0, 4), np.float32), N_STATIC, start)
     assert found.static == pytest.approx(start)
     assert found.classes.sum() == pytest.approx(1.0)
     assert np.isfinite(found.log_likelihood)
@@ -75,7 +75,7 @@ def test_without_members_it_knows_what_it_was_told(start):
 def test_members_all_of_one_kind(sure):
     likelihood = np.full((1, 4), 1e-30, np.float32)
     likelihood[0, sure] = 1.0
-    found = fit_shares(np.repeat(likelihood, 50, axis=0), N_STATIC, 0.5)
+    found = fit_weights(np.repeat(likelihood, 50, axis=0), N_STATIC, 0.5)
     assert (found.classes > 0).all()  # what was never seen is not impossible
     assert found.classes.sum() == pytest.approx(1.0)
     static = sure < N_STATIC
@@ -85,6 +85,6 @@ def test_members_all_of_one_kind(sure):
 
 
 def test_a_member_that_says_nothing_keeps_the_start():
-    found = fit_shares(np.ones((1, 4), np.float32), N_STATIC, 0.3)
+    found = fit_weights(np.ones((1, 4), np.float32), N_STATIC, 0.3)
     assert found.static == pytest.approx(0.3, abs=1e-9)
     assert found.log_likelihood == pytest.approx(0.0, abs=1e-9)

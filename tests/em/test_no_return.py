@@ -29,10 +29,10 @@ def known(seen, threads=1):
     found = seen.e_step()
     grid = _core.Grid2D(RESOLUTION)
     e, no_return = found.p_static, found.no_return
-    told = em.add_believed_first(grid, seen.recording, seen.poses, e, no_return, threads)
+    told = em.add_trusted_beams(grid, seen.recording, seen.poses, e, no_return, threads)
     for a, b in zip(grid.dense(), seen.grid(e).dense(), strict=True):
         np.testing.assert_array_equal(a, b)
-    m = em.occupancy_map(grid, found.occupied, told)
+    m = em.make_occupancy_map(grid, found.occupied, told)
     first = np.round(np.array(m.origin[:2]) / RESOLUTION)
 
     def p_occupied(*points):
@@ -110,5 +110,5 @@ def test_others_believe_every_beam(estimator):
     assert found.no_return is None
     grid = _core.Grid2D(RESOLUTION)
     e = found.p_static
-    assert em.add_believed_first(grid, seen.recording, seen.poses, e, None) is None
+    assert em.add_trusted_beams(grid, seen.recording, seen.poses, e, None) is None
     np.testing.assert_array_equal(grid.dense()[2], seen.grid(e).dense()[2])

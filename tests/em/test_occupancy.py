@@ -21,7 +21,7 @@ def laid_out(p_occupied, cells=((0, 0), (1, 0)), hits=1):
     occupied = em.CellProbabilities(
         np.array(cells, np.int64).reshape(-1, 2), np.array(p_occupied, np.float32), FREE
     )
-    return em.occupancy_map(grid, occupied)
+    return em.make_occupancy_map(grid, occupied)
 
 
 def odds_after(length):
@@ -44,7 +44,7 @@ def test_a_cell_is_occupied_by_what_stays_or_as_free_as_it_looks(p):
 
 
 def test_nothing_known_is_nothing_occupied():
-    m = em.occupancy_map(
+    m = em.make_occupancy_map(
         _core.Grid2D(1.0), em.CellProbabilities(np.zeros((0, 2), np.int64), np.zeros(0, "f4"), 0.2)
     )
     assert m.p_occupied.shape == (0, 0)
@@ -67,7 +67,7 @@ def a_room_with(wall):
     movers = [Ball(2.0, -1.4 + 0.4 * k, 20 + k, 21 + k) for k in range(8)]
     seen = watch([*walls, *movers, Ball(2.5, 1.5, 5, 20)], 60, noise=0.015)
     found = seen.e_step(RESOLUTION)
-    m = em.occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
+    m = em.make_occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
     return seen, seen.what >= len(walls), m
 
 
@@ -103,9 +103,9 @@ def test_noise_beside_a_thing_is_not_the_thing(y):
     post = Ball(2.08, y, 0, 60, radius=0.03)
     seen = watch([Wall((1, 0), 4.05), post], 60, fan(721, 90), noise=0.025)
     found = seen.e_step(RESOLUTION)
-    m = em.occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
+    m = em.make_occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
     near = around(m, 2.05, y)
-    hits = around(em.occupancy_map(seen.grid(None, RESOLUTION)), 2.05, y) > 0
+    hits = around(em.make_occupancy_map(seen.grid(None, RESOLUTION)), 2.05, y) > 0
     assert hits.sum() >= 3
     middle = np.arange(hits.size) == hits.size // 2
     assert near[middle] > 0.8
@@ -122,7 +122,7 @@ def test_thin_posts_stay(x, y, radius):
     seen = watch([Wall((1, 0), x + 0.4), post, *[Ball(1.0, k, k, k + 1) for k in (-1, 1)]], 60,
                  fan(721, 90), noise=0.01)  # fmt: skip
     found = seen.e_step(RESOLUTION)
-    m = em.occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
+    m = em.make_occupancy_map(seen.grid(found.p_static, RESOLUTION), found.occupied)
     there = np.unique(np.floor(seen.of(seen.recording.points, 1) / RESOLUTION), axis=0)
     assert (at(m, (there + 0.5) * RESOLUTION) > 0.8).any()
     ends = at(m, seen.of(seen.recording.points, 1))
@@ -133,7 +133,7 @@ def test_movers_leave_the_floor_free():
     seen, moves, m = a_room_with(4.05)
     ends = seen.recording.points[moves]
     assert (at(m, ends) < 0.3).mean() > 0.97
-    raw = em.occupancy_map(seen.grid(None, RESOLUTION))
+    raw = em.make_occupancy_map(seen.grid(None, RESOLUTION))
     assert np.median(at(m, ends)) < np.median(at(raw, ends))
     floor = np.column_stack([np.full(20, 1.0), np.linspace(-1, 1, 20)])
     assert (at(m, floor) < 0.05).all()
@@ -143,7 +143,7 @@ def test_movers_leave_the_floor_free():
 
 def test_without_more_knowledge_it_is_15():
     seen = watch([Wall((1, 0), 4.05)], 5)
-    m = em.occupancy_map(seen.grid())
+    m = em.make_occupancy_map(seen.grid())
     known = m.alpha + m.beta > 0
     np.testing.assert_allclose(
         m.p_occupied[known], m.alpha[known] / (m.alpha + m.beta)[known], 1e-6
@@ -158,12 +158,12 @@ def test_a_part_of_a_map_is_what_the_whole_has_there(printed, monkeypatch):
     if not printed:
         cells = np.array([[29, 0], [30, 1], [5, 0]])  # the last one outside the part
         occupied = em.CellProbabilities(cells, np.array([0.5, 0.9, 0.4], np.float32), FREE)
-    whole = em.occupancy_map(grid, occupied)
+    whole = em.make_occupancy_map(grid, occupied)
     first = np.round(np.array(whole.origin[:2]) / RESOLUTION).astype(int)
     monkeypatch.setattr("stillmap.em.occupancy_grid._TILE", 7)
-    again = em.occupancy_map(grid, occupied)
-    box = em.Box(first + np.array([20, -2]), (12, 15))
-    part = em.occupancy_map(grid, occupied, box=box)
+    again = em.make_occupancy_map(grid, occupied)
+    box = em.GridWindow(first + np.array([20, -2]), (12, 15))
+    part = em.make_occupancy_map(grid, occupied, box=box)
     assert part.origin == pytest.approx((*(box.first_cell * RESOLUTION), 0.0))
     for name, nothing in (("p_occupied", np.nan), ("alpha", 0.0), ("beta", 0.0)):
         all_of_it = getattr(whole, name)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.em.spatial_prior import components, pairs_near
+from stillmap.em.spatial_prior import connected_components, neighbor_pairs
 
 
 def held(pairs):
@@ -12,26 +12,26 @@ def held(pairs):
 
 def test_pairs_within_a_distance():
     cells = np.array([[0, 0], [3, 0], [3, 4], [-2, 0]])
-    assert held(pairs_near(cells, 3.0)) == {(0, 1), (0, 3)}
-    assert held(pairs_near(cells, 2.9)) == {(0, 3)}
-    assert held(pairs_near(cells, 5.0)) == {(0, 1), (0, 2), (0, 3), (1, 2), (1, 3)}
+    assert held(neighbor_pairs(cells, 3.0)) == {(0, 1), (0, 3)}
+    assert held(neighbor_pairs(cells, 2.9)) == {(0, 3)}
+    assert held(neighbor_pairs(cells, 5.0)) == {(0, 1), (0, 2), (0, 3), (1, 2), (1, 3)}
 
 
 def test_pairs_in_space():
     cells = np.array([[0, 0, 0], [0, 0, 2], [9, 9, 9]])
-    assert held(pairs_near(cells, 2.0)) == {(0, 1)}
+    assert held(neighbor_pairs(cells, 2.0)) == {(0, 1)}
 
 
 @pytest.mark.parametrize("n", [0, 1])
 def test_nobody_has_no_pairs(n):
-    pairs = pairs_near(np.empty((n, 2), np.int64), 3.0)
+    pairs = neighbor_pairs(np.empty((n, 2), np.int64), 3.0)
     assert pairs.shape == (0, 2)
-    assert [one.tolist() for one in components(pairs, n)] == [[0]] * n
+    assert [one.tolist() for one in connected_components(pairs, n)] == [[0]] * n
 
 
 def test_sets_are_those_that_pairs_connect():
     pairs = np.array([[4, 1], [1, 6], [5, 2]])
-    assert sorted(one.tolist() for one in components(pairs, 7)) == [
+    assert sorted(one.tolist() for one in connected_components(pairs, 7)) == [
         [0],
         [1, 4, 6],
         [2, 5],
@@ -42,7 +42,7 @@ def test_sets_are_those_that_pairs_connect():
 def test_every_member_is_in_one_set():
     rng = np.random.default_rng(0)
     pairs = rng.integers(0, 100, (60, 2))
-    sets = components(pairs, 100)
+    sets = connected_components(pairs, 100)
     assert sorted(np.concatenate(sets).tolist()) == list(range(100))
     number = np.empty(100, int)
     for k, one in enumerate(sets):

@@ -8,9 +8,9 @@ from made_up_scans import before, crossing, poses, recording, wall
 
 from stillmap import _core, em
 from stillmap.em.options import TrackerOptions
-from stillmap.em.people import on_people
-from stillmap.em.people.detector import features
-from stillmap.em.people.tracker import Places, in_boxes, people
+from stillmap.em.people import label_people
+from stillmap.em.people.detector import detect_segments
+from stillmap.em.people.tracker import Tracks, find_beams_in_boxes, track_people
 
 OPTIONS = TrackerOptions()
 TIMES = np.arange(0.0, 3.4, 0.2)
@@ -18,14 +18,14 @@ PILLAR = (2.0, 2.6, 0.15)
 
 
 def dropped(r, options=OPTIONS):
-    return on_people(r, poses(r), options).reshape(r.n_scans, -1)
+    return label_people(r, poses(r), options).reshape(r.n_scans, -1)
 
 
 def of(r, options=OPTIONS):
     """The tracks of people."""
-    found = features(r, poses(r), options)
+    found = detect_segments(r, poses(r), options)
     seconds = 1e-9 * (r.stamp_ns - r.stamp_ns[0])
-    return people(found, np.ones(len(found.scan), bool), seconds, options)
+    return track_people(found, np.ones(len(found.scan), bool), seconds, options)
 
 
 def test_a_walker_is_dropped_from_the_first_scan_and_walls_stay():
@@ -70,8 +70,8 @@ def test_only_hits_are_dropped():
     ranges[0, 90] = 20.0  # as far as the others, which end in the box with nothing
     r = recording(ranges)
     one = np.ones(1, bool)
-    somebody = Places(np.zeros(1, int), np.zeros(1, int), np.array([[20.0, 0.0]]), one, one)
-    assert in_boxes(r, poses(r), somebody, 1.0).nonzero()[0].tolist() == [90]
+    somebody = Tracks(np.zeros(1, int), np.zeros(1, int), np.array([[20.0, 0.0]]), one, one)
+    assert find_beams_in_boxes(r, poses(r), somebody, 1.0).nonzero()[0].tolist() == [90]
 
 
 def test_a_track_goes_on_while_somebody_is_hidden_and_ends_where_he_was_last_seen():
@@ -125,11 +125,11 @@ def test_next_to_nothing():
     none = dataclasses.replace(
         r, points=r.points[:0], hit=r.hit[:0], offset=np.zeros_like(r.offset)
     )
-    assert on_people(none, poses(none), OPTIONS).shape == (0,)
+    assert label_people(none, poses(none), OPTIONS).shape == (0,)
     few = dataclasses.replace(
         r, points=r.points[: 2 * 17], hit=r.hit[: 2 * 17], offset=2 * np.arange(18)
     )
-    assert not on_people(few, poses(few), OPTIONS).any()
+    assert not label_people(few, poses(few), OPTIONS).any()
 
 
 def e_step(r, threads=1, **options):
@@ -155,7 +155,7 @@ def test_labels_are_hard_and_the_map_counts_the_rest():
     # only cells that something else was hit in are known, and its ratio decides
     grid = _core.Grid2D(0.1)
     em.add_recording(grid, r, poses(r), found.p_static)
-    m = em.occupancy_map(grid, found.occupied)
+    m = em.make_occupancy_map(grid, found.occupied)
     x, y, _ = m.origin
     points = r.points[r.hit & (found.p_static == 0.0)]
     cells = np.floor((points - [x, y]) / 0.1).astype(int)[:, ::-1]
@@ -179,7 +179,7 @@ def test_the_same_to_the_bit_with_any_number_of_threads():
 
 def test_two_iterations_that_begin_with_all_believed():
     r = recording(wall())
-    assert em.iterations("tracker", em.EmOptions()) == 2
-    assert em.iterations("tracker", em.EmOptions(max_iterations=1)) == 1
+    assert em.max_iterations("tracker", em.EmOptions()) == 2
+    assert em.max_iterations("tracker", em.EmOptions(max_iterations=1)) == 1
     assert em.fixed_iterations("stillmap") is em.fixed_iterations("paper") is None
-    assert (em.initial_expectations(r, "tracker", em.EmOptions()) == 1).all()
+    assert (em.initial_p_static(r, "tracker", em.EmOptions()) == 1).all()

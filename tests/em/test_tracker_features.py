@@ -8,14 +8,14 @@ from made_up_scans import ANGLES, before, poses, recording, wall
 
 from stillmap.core import se2
 from stillmap.em.options import TrackerOptions
-from stillmap.em.people.detector import changed, features
+from stillmap.em.people.detector import detect_segments, find_changed
 
 OPTIONS = TrackerOptions()
 
 
 def found(ranges, options=OPTIONS):
     r = recording(ranges)
-    return features(r, poses(r), options)
+    return detect_segments(r, poses(r), options)
 
 
 def test_two_legs_before_a_wall():
@@ -29,7 +29,7 @@ def test_two_legs_before_a_wall():
 def test_in_the_frame_of_the_map():
     r = recording([wall(), before(wall(), (3.0, 0.0, 0.2))])
     T = np.stack([np.eye(3), se2.matrix(1.0, 2.0, np.pi / 2)])
-    seen = features(r, T, OPTIONS)
+    seen = detect_segments(r, T, OPTIONS)
     assert seen.scan.tolist() == [1]
     np.testing.assert_allclose(seen.xy, [(1.0, 4.85)], atol=0.05)
 
@@ -93,21 +93,21 @@ def test_a_place_that_was_seen_through(way):
     pillar = (3.0, 1.0, 0.2)
     scans = [before(wall(), pillar, (3.0, -1.0, 0.2))] + 9 * [before(wall(), pillar)]
     r = recording(scans[::way])
-    seen = features(r, poses(r), OPTIONS)
-    moved = changed(r, poses(r), seen, 1.0, 0.3)
+    seen = detect_segments(r, poses(r), OPTIONS)
+    moved = find_changed(r, poses(r), seen, 1.0, 0.3)
     mover = seen.xy[:, 1] < 0
     assert mover.sum() == 1
     np.testing.assert_array_equal(moved, mover)
-    assert not changed(r, poses(r), seen, 5.0, 0.3).any()  # no scan is so far away in time
-    assert not changed(r, poses(r), seen, 1.0, 4.0).any()  # the wall is not so far behind
+    assert not find_changed(r, poses(r), seen, 5.0, 0.3).any()  # no scan is so far away in time
+    assert not find_changed(r, poses(r), seen, 1.0, 4.0).any()  # the wall is not so far behind
 
 
 def test_before_or_after_is_enough():
     gone, there = wall(), before(wall(), (3.0, -1.0, 0.2))
     for scans, said in (((gone, there, there), [1, 0]), ((there, there, gone), [0, 1])):
         r = recording(scans, seconds=[0.0, 1.5, 3.0])
-        seen = features(r, poses(r), OPTIONS)
-        assert changed(r, poses(r), seen, 1.0, 0.3).tolist() == said
+        seen = detect_segments(r, poses(r), OPTIONS)
+        assert find_changed(r, poses(r), seen, 1.0, 0.3).tolist() == said
 
 
 def test_a_post_that_most_beams_miss_has_not_gone():
@@ -115,21 +115,21 @@ def test_a_post_that_most_beams_miss_has_not_gone():
     thick[90:92] = thin[91] = 3.0
     for second, said in ((thin, [False]), (wall(), [True])):
         r = recording([thick, second], seconds=[0.0, 1.5])
-        seen = features(r, poses(r), dataclasses.replace(OPTIONS, narrowest=0.08))
-        assert changed(r, poses(r), seen, 1.0, 0.3).tolist() == said
+        seen = detect_segments(r, poses(r), dataclasses.replace(OPTIONS, narrowest=0.08))
+        assert find_changed(r, poses(r), seen, 1.0, 0.3).tolist() == said
 
 
 def test_what_is_not_looked_at_has_not_gone():
     r = recording([before(wall(), (3.0, 0.0, 0.2)), wall()], seconds=[0.0, 1.5])
     for turned, said in ((0.0, True), (np.radians(80), True), (np.radians(120), False)):
         T = np.stack([np.eye(3), se2.matrix(0.0, 0.0, turned)])
-        seen = features(r, T, OPTIONS)
-        assert changed(r, T, seen, 1.0, 0.3).tolist() == [said]
+        seen = detect_segments(r, T, OPTIONS)
+        assert find_changed(r, T, seen, 1.0, 0.3).tolist() == [said]
 
 
 def test_only_the_same_laser_says_so():
     scans = [before(wall(), (3.0, -1.0, 0.2)), wall()]
     for sensors, said in (((0, 0), True), ((0, 1), False)):
         r = recording(scans, seconds=[0.0, 1.5], sensor=sensors)
-        seen = features(r, poses(r), OPTIONS)
-        assert changed(r, poses(r), seen, 1.0, 0.3).tolist() == [said]
+        seen = detect_segments(r, poses(r), OPTIONS)
+        assert find_changed(r, poses(r), seen, 1.0, 0.3).tolist() == [said]

@@ -29,11 +29,11 @@ def course(
     p: float = 0.9,
     share: float = 0.5,
     static: float = 0.05,
-) -> em.Courses:
+) -> em.CellHistories:
     """All cells alike: what is there at last, and looks before and after the changes."""
     n = len(cells)
     ends = [between[0], between[-1]] if between else [NEVER, NEVER]
-    return em.Courses(
+    return em.CellHistories(
         cells=np.asarray(cells, np.int64),
         p_static=np.full(n, static, np.float32),
         p_views=np.zeros(n, np.float32),
@@ -48,12 +48,12 @@ def course(
     )
 
 
-def together(*parts: em.Courses) -> em.Courses:
+def together(*parts: em.CellHistories) -> em.CellHistories:
     """One after the other."""
-    return em.Courses(
+    return em.CellHistories(
         **{
             name: np.concatenate([getattr(part, name) for part in parts])
-            for name in em.Courses.__dataclass_fields__
+            for name in em.CellHistories.__dataclass_fields__
             if name not in ("share", "surface")
         },
         share=0.1,
@@ -79,7 +79,7 @@ EVERY_SECOND = recording(range(100))
 
 
 def found(
-    *parts: em.Courses, seen: Recording = EVERY_SECOND, look: float = 1.0, **options: Any
+    *parts: em.CellHistories, seen: Recording = EVERY_SECOND, look: float = 1.0, **options: Any
 ) -> list[Change]:
     """The places that changed, by default with a look in every second."""
     return detect_changes(together(*parts), seen, RESOLUTION, look, em.ChangeOptions(**options))

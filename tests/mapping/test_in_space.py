@@ -8,7 +8,7 @@ from made_up_courses import EVERY_SECOND, S, course, recording, seconds, togethe
 
 from stillmap import em
 from stillmap.core.recording import Recording
-from stillmap.em.changepoints import changed_of
+from stillmap.em.changepoints import select_changed_cells
 from stillmap.mapping import Change, detect_changes_3d
 from stillmap.mapping.dwell_time import measure_dwell_times
 
@@ -44,7 +44,7 @@ def things(*parts, seen=None):
     if seen is None:
         seen = watching(courses.cells, (0, 99))
     poses = np.tile(np.eye(4), (seen.n_scans, 1, 1))
-    changed = changed_of(courses)
+    changed = select_changed_cells(courses)
     return detect_changes_3d(changed, seen, poses, VOXEL, 1.0, em.ChangeOptions())
 
 

@@ -10,7 +10,7 @@ from stillmap import em
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.em import observations
-from stillmap.em.observations import surface_of
+from stillmap.em.observations import build_surfel_map
 from stillmap.mapping import Change, relabel_changes
 
 SCANS, BEAMS = 60, 20
@@ -34,7 +34,7 @@ class Known:
     ends: np.ndarray  # (M, 2) cells
     p_static: np.ndarray
     occupied: em.CellProbabilities
-    courses: em.Courses
+    courses: em.CellHistories
 
     def relabelled(self, changes=CHANGES, state="last", threads=1, **other):
         said = {"occupied": self.occupied, "courses": self.courses} | other
@@ -62,7 +62,7 @@ def known():
     hit, usable = rng.random(M) < 0.8, rng.random(M) < 0.95
     points[~usable] = np.nan
     seen = replace(recording(range(SCANS), BEAMS), points=points, hit=hit & usable)
-    surface = surface_of(seen, seen.T_map_sensor(poses), RESOLUTION)
+    surface = build_surfel_map(seen, seen.T_map_sensor(poses), RESOLUTION)
     cells = surface.elements()[0]
     loop = rng.random(M).astype(np.float32)
     loop[~usable] = np.nan

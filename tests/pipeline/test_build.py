@@ -99,7 +99,7 @@ def test_the_map_follows_from_the_labels(room, fixed):
     assert np.isnan(e[100:110]).all()
     assert np.ptp(e[hit]) > 0.5
     assert result.changes == []
-    again, _ = em.last_e_step(recording, result.poses, m.resolution, result.options.em, threads=2)
+    again, _ = em.final_e_step(recording, result.poses, m.resolution, result.options.em, threads=2)
     np.testing.assert_array_equal(again.p_static, e)
     assert again.learned == {k: v for k, v in result.learned.items() if k != "changing"}
     assert 0.0 < result.learned["changing"] < 1.0

@@ -116,7 +116,9 @@ def test_labels_are_those_of_the_map_shown():
 
 def test_what_is_not_listed_stays_what_it_is_without_changes():
     result, without = built(), built(changes=False)
-    _, courses = em.last_e_step(result.seen, result.poses, result.map.resolution, result.options.em)
+    _, courses = em.final_e_step(
+        result.seen, result.poses, result.map.resolution, result.options.em
+    )
     cells = {tuple(cell) for one in result.changes for cell in one.cells.tolist()}
     element = courses.surface.elements_of(
         result.seen.points, result.seen.hit, result.seen.offset,

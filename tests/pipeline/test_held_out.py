@@ -25,7 +25,7 @@ def test_every_iteration_has_its_figure(room, tmp_path, estimator):
     figures = [it.held_out_log_likelihood for it in result.iterations]
     assert all(0 < figure < 10 for figure in figures)
     # it is that of the poses and labels which are written
-    expected = em.held_out_log_likelihood(
+    expected = em.score_held_out_scans(
         room.recording, result.poses, result.p_static, chosen.slam.resolution, 20
     )
     assert figures[result.best_iteration - 1] == expected

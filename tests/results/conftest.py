@@ -7,11 +7,11 @@ import pytest
 
 from stillmap.core.recording import Recording
 from stillmap.core.se2 import inverse, matrix
-from stillmap.em import Evidence
+from stillmap.em import Coverage
 from stillmap.pipeline.options import OutputOptions
 from stillmap.pipeline.snapshots import choose_window, extent, snapshot
 from stillmap.slam import Diagnostics
-from stillmap.slam.pose_graph import PoseGraph, Constraint
+from stillmap.slam.pose_graph import Constraint, PoseGraph
 from stillmap.tracking import FlowMap, MovingObject, ObjectOptions, compute_flow_map
 
 RESOLUTION = 0.1
@@ -84,7 +84,7 @@ class FakeResult:
     p_static: np.ndarray
     map: FakeMap
     raw_map: FakeMap
-    evidence: Evidence
+    evidence: Coverage
     best_iteration: int
     converged: bool
     warnings: list
@@ -227,7 +227,7 @@ def made_up_evidence(occupancy):
     """Looks that lengths and hits would make, every second one clear."""
     looks = np.ceil(occupancy.alpha + occupancy.beta).astype(np.uint16)
     clear = looks // 2
-    return Evidence(looks, clear, (clear < 3) & ~np.isnan(occupancy.p_occupied), 3, 0.3)
+    return Coverage(looks, clear, (clear < 3) & ~np.isnan(occupancy.p_occupied), 3, 0.3)
 
 
 @pytest.fixture(scope="session")
@@ -287,7 +287,7 @@ def result():
             FakeLoop(6, 46, 0.25, "explains too little"),
         ],
         graph=_graph(poses),
-        doubts=Diagnostics(widened=[7], disagreeing=[7, 9], breaks=[20], apart=[20]),
+        doubts=Diagnostics(widened=[7], odometry_faults=[7, 9], breaks=[20], unconnected=[20]),
         stages={
             "read": {"seconds": 0.21, "cpu_seconds": 0.2, "peak_memory_bytes": 41_000_000},
             "em": {"seconds": 7.1, "cpu_seconds": 13.5, "peak_memory_bytes": 96_000_000},

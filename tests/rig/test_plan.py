@@ -5,7 +5,7 @@ import pytest
 
 from stillmap import em
 from stillmap.core.recording import Recording
-from stillmap.em.ground import Ground
+from stillmap.em.ground import GroundMap
 from stillmap.mapping.projection import BandOptions, project_cells, project_to_plane
 
 BAND = BandOptions(low=0.2, high=1.8)
@@ -13,7 +13,7 @@ SENSOR = 1.5
 
 
 def flat_ground(sensor=SENSOR, z=0.0):
-    return Ground(np.full((40, 40), z), np.array([-20.0, -20.0]), sensor, True)
+    return GroundMap(np.full((40, 40), z), np.array([-20.0, -20.0]), sensor, True)
 
 
 def sweep(ends, hit=None, z=0.0):

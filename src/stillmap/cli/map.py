@@ -36,7 +36,7 @@ from stillmap.pipeline.options import Options, resolved
 from stillmap.pipeline.progress import Loop
 from stillmap.pipeline.result import Result, build
 from stillmap.results.save import RECORD, save
-from stillmap.rig.build import Tilting
+from stillmap.rig.build import TiltingResult
 
 _EPILOG = """examples:
   stillmap map log.clf.gz -o out
@@ -192,7 +192,7 @@ def mapped(args: argparse.Namespace, changes: dict[str, Any]) -> int:
 
 def _mapped_and_saved(
     args: argparse.Namespace, options: Options, place: Place
-) -> tuple[Result, Tilting | None]:
+) -> tuple[Result, TiltingResult | None]:
     """The whole job; how far it has come is kept after every iteration."""
     stages = StageTimer()
     with stages.measure("read"):
@@ -205,7 +205,7 @@ def _mapped_and_saved(
         options = resolved(options, recording)
         same = identity(recording, options, poses)
     loop = _resumed(args, place, same, options, stages)
-    with shown_progress(args.quiet, em.iterations(options.estimator, options.em)) as progress:
+    with shown_progress(args.quiet, em.max_iterations(options.estimator, options.em)) as progress:
         result = build(
             recording,
             options,
@@ -230,7 +230,7 @@ def _mapped_and_saved(
 
 
 def _modelled(
-    result: Result, in_3d: Tilting | None, progress: Progress, stages: StageTimer
+    result: Result, in_3d: TiltingResult | None, progress: Progress, stages: StageTimer
 ) -> tuple[Models | None, Result]:
     """Models of what is in 3D, where they are wanted and can be made; and what the result says."""
     if not result.options.mesh.enabled or (in_3d is None and result.recording.dimension == 2):
@@ -313,11 +313,11 @@ def _usable(recording: Recording, args: argparse.Namespace) -> Recording:
 
 def _require_known(recording: Recording, options: Options, args: argparse.Namespace) -> None:
     """Refuse an estimator that knows nothing of space before the work is done."""
-    if recording.dimension == 3 and options.estimator not in em.IN_SPACE:
+    if recording.dimension == 3 and options.estimator not in em.ESTIMATORS_3D:
         raise InputError(
             f"is 3D: estimator '{options.estimator}' knows 2D recordings alone",
             where=args.input,
-            hint=f"--estimator {' or '.join(em.IN_SPACE)}",
+            hint=f"--estimator {' or '.join(em.ESTIMATORS_3D)}",
         )
 
 
@@ -338,7 +338,7 @@ def _summary(output: Path) -> dict[str, Any]:
     }
 
 
-def _say(result: Result, in_3d: Tilting | None, output: Path) -> None:
+def _say(result: Result, in_3d: TiltingResult | None, output: Path) -> None:
     counts = count_beams(result.recording, result.p_static)
     end, n = "converged" if result.converged else "not converged", len(result.iterations)
     lines = [

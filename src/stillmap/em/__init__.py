@@ -1,63 +1,70 @@
 """What is static: the E-steps, the map that follows from them, and the likelihood. No I/O."""
 
-from stillmap.em.changepoints import Courses
-from stillmap.em.coverage import Evidence, evidence
+from stillmap.em.changepoints import CellHistories
+from stillmap.em.coverage import Coverage, count_observations
 from stillmap.em.estimator import (
-    IN_SPACE,
+    ESTIMATORS_3D,
     Estimator,
-    add_believed_first,
     add_recording,
+    add_trusted_beams,
     changed_share,
-    count_as_static,
     e_step,
-    empty_grid,
     fixed_iterations,
-    initial_expectations,
-    iterations,
+    initial_p_static,
+    make_grid,
+    max_iterations,
     needs_sums,
+    recount_as_static,
 )
-from stillmap.em.ground import Ground, ground_of
-from stillmap.em.held_out import held_out_log_likelihood
-from stillmap.em.observations import look_numbers
-from stillmap.em.occupancy_grid import Box, OccupancyMap, Seen, occupancy_map
-from stillmap.em.occupancy_hmm import last_e_step
+from stillmap.em.ground import GroundMap, estimate_ground
+from stillmap.em.held_out import score_held_out_scans
+from stillmap.em.observations import time_bin_index
+from stillmap.em.occupancy_grid import GridWindow, ObservedCells, OccupancyMap, make_occupancy_map
+from stillmap.em.occupancy_hmm import final_e_step
 from stillmap.em.options import ChangeOptions, DwellOptions, EmOptions, EvidenceOptions, MapState
-from stillmap.em.types import CellProbabilities, Changed, Expectations, Grid, Likelihood, NoReturn
+from stillmap.em.types import (
+    CellProbabilities,
+    ChangedCells,
+    EStepResult,
+    Grid,
+    Likelihood,
+    NoReturnModel,
+)
 
 __all__ = [
-    "IN_SPACE",
-    "Box",
+    "ESTIMATORS_3D",
+    "GridWindow",
     "CellProbabilities",
     "ChangeOptions",
-    "Changed",
-    "Courses",
+    "ChangedCells",
+    "CellHistories",
     "DwellOptions",
     "EmOptions",
     "Estimator",
-    "Evidence",
+    "Coverage",
     "EvidenceOptions",
-    "Expectations",
+    "EStepResult",
     "Grid",
-    "Ground",
+    "GroundMap",
     "Likelihood",
     "MapState",
-    "NoReturn",
+    "NoReturnModel",
     "OccupancyMap",
-    "Seen",
-    "add_believed_first",
+    "ObservedCells",
+    "add_trusted_beams",
     "add_recording",
     "changed_share",
-    "count_as_static",
+    "recount_as_static",
     "e_step",
-    "empty_grid",
-    "evidence",
+    "make_grid",
+    "count_observations",
     "fixed_iterations",
-    "ground_of",
-    "held_out_log_likelihood",
-    "initial_expectations",
-    "iterations",
-    "last_e_step",
-    "look_numbers",
+    "estimate_ground",
+    "score_held_out_scans",
+    "initial_p_static",
+    "max_iterations",
+    "final_e_step",
+    "time_bin_index",
     "needs_sums",
-    "occupancy_map",
+    "make_occupancy_map",
 ]

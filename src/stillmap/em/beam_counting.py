@@ -8,19 +8,19 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.recording import Recording
-from stillmap.em.observations import chunks
-from stillmap.em.types import CellProbabilities, Expectations, Grid, Likelihood, per_beam
+from stillmap.em.observations import iter_chunks
+from stillmap.em.types import CellProbabilities, EStepResult, Grid, Likelihood, fill_beams
 
 Float = NDArray[np.float64]
 
 
 def paper_e_step(
     recording: Recording, poses: Float, grid: Grid, prior: float, threads: int = 1
-) -> Expectations:
+) -> EStepResult:
     """e of (6), (8) for every beam, and (5) at the map of `grid`."""
     e = recording.per_beam(np.float32)
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in chunks(recording, beside=[e]):
+    for scans, beams, offset in iter_chunks(recording, beside=[e]):
         e[beams] = _core.e_step(
             grid,
             recording.points[beams],
@@ -30,7 +30,7 @@ def paper_e_step(
             prior,
             threads,
         )
-    return Expectations(e, log_likelihood(recording, poses, grid, e, prior, threads))
+    return EStepResult(e, log_likelihood(recording, poses, grid, e, prior, threads))
 
 
 def log_likelihood(
@@ -44,7 +44,7 @@ def log_likelihood(
     """(5) and the bound of EM, at the map of `grid`."""
     total = np.zeros(4)
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in chunks(recording, beside=[e]):
+    for scans, beams, offset in iter_chunks(recording, beside=[e]):
         per_scan = _core.log_likelihood(
             grid,
             recording.points[beams],
@@ -62,7 +62,7 @@ def log_likelihood(
 
 def hit_ratio_e_step(
     recording: Recording, poses: Float, grid: _core.Grid2D, threshold: float, threads: int = 1
-) -> Expectations:
+) -> EStepResult:
     """p_static by the hit ratio r of the end cell, 1/2 at the threshold.
 
     Args:
@@ -78,14 +78,14 @@ def hit_ratio_e_step(
     # (8) with prior 1 - threshold is exactly r (1 - threshold) / (r (1 - threshold) + ...)
     found = paper_e_step(recording, poses, grid, 1.0 - threshold, threads)
     p = found.p_static
-    for _, beams, _ in chunks(recording, beside=[p]):
-        p[beams] = per_beam(
+    for _, beams, _ in iter_chunks(recording, beside=[p]):
+        p[beams] = fill_beams(
             recording.points[beams], recording.hit[beams], p[beams], 1.0 - threshold
         )
-    return Expectations(p, found.likelihood, kept_cells(grid, threshold))
+    return EStepResult(p, found.likelihood, threshold_hit_ratio(grid, threshold))
 
 
-def kept_cells(grid: _core.Grid2D, threshold: float) -> CellProbabilities:
+def threshold_hit_ratio(grid: _core.Grid2D, threshold: float) -> CellProbabilities:
     """One where alpha / (alpha + beta) reaches the threshold, else zero."""
     first, alpha, beta = grid.dense()
     ratio = np.divide(alpha, alpha + beta, out=np.zeros_like(alpha), where=alpha + beta > 0.0)

@@ -11,21 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
-from stillmap.em.mixture import fit_shares
+from stillmap.em.mixture import fit_weights
 from stillmap.em.observations import (
-    OFTEN_OCCUPIED,
-    Dwell,
+    HALF_TIME_RHO,
+    ClassLikelihoods,
     Float,
-    Looks,
+    Observations,
+    OccupancyHmm,
     Rows,
-    Surface,
-    Table,
-    cells_of,
-    coverage,
+    SurfelMap,
+    probability_in_cell,
+    surfel_cells,
 )
 from stillmap.em.options import ChangeOptions, EmOptions, MapState
-from stillmap.em.spatial_prior import components, pairs_near
-from stillmap.em.types import Changed
+from stillmap.em.spatial_prior import connected_components, neighbor_pairs
+from stillmap.em.types import ChangedCells
 
 _STAY = 12.0  # s, who stays for longer came to stay
 
@@ -45,11 +45,11 @@ _WHOLE = 4  # cells that make a thing
 
 _DECIDE = 1.0 / 3.0  # share of its cells that decide whether it changed
 
-OFTEN = 3  # changes from which on a place is one that comes and goes, as doors do
+MIN_RECURRING_CHANGES = 3  # changes from which on a place is one that comes and goes, as doors do
 
 
 @dataclass(frozen=True, eq=False)
-class Courses:
+class CellHistories:
     """What became of E cells in which beams ended, each by its most probable course.
 
     Attributes:
@@ -78,7 +78,7 @@ class Courses:
     between: NDArray[np.int32]
     covered: NDArray[np.float32]
     share: float
-    surface: Surface
+    surface: SurfelMap
 
     @property
     def stands(self) -> NDArray[np.float32]:
@@ -91,13 +91,15 @@ class Courses:
         In its last state, what comes and goes is not there: nobody knows for how long. It is asked
         of places that are known to have changed, where it was not the view that did.
         """
-        last = np.where(self.count < OFTEN, self.p_thing, np.float32(0.0))
+        last = np.where(self.count < MIN_RECURRING_CHANGES, self.p_thing, np.float32(0.0))
         there = last if state == "last" else (self.occupied_share > 0.5).astype(np.float32)
         p = (self.p_static + self.p_changing * there) / np.maximum(1.0 - self.p_views, _POSSIBLE)
         return np.asarray(np.minimum(p, 1.0), np.float32)
 
 
-def watch(dwell: Dwell, recording: Recording, options: EmOptions, courses: bool = True) -> None:
+def track_changes(
+    dwell: OccupancyHmm, recording: Recording, options: EmOptions, courses: bool = True
+) -> None:
     """Asks, before the first look, for things that come to stay or leave.
 
     Without `courses` only for whether they do: `told_of` wants no more.
@@ -105,23 +107,23 @@ def watch(dwell: Dwell, recording: Recording, options: EmOptions, courses: bool 
     dwell.watch(**_model(recording, options), courses=courses)
 
 
-def courses_of(looks: Looks, options: EmOptions) -> Courses:
+def decode_histories(looks: Observations, options: EmOptions) -> CellHistories:
     """What became of each cell; `watch` was called before the looks."""
     groups, shares = _groups(looks), _shares(looks, options)
     found = [_of_rows(looks, rows, groups, shares) for rows in looks.blocks()]
     of_all = {name: np.concatenate([one[name] for one in found]) for name in found[0]}
     return _as_wholes(
-        Courses(
-            cells=cells_of(looks.surface),
+        CellHistories(
+            cells=surfel_cells(looks.surface),
             **of_all,
-            covered=coverage(looks.surface),
+            covered=probability_in_cell(looks.surface),
             share=float(shares[-1]),
             surface=looks.surface,
         )
     )
 
 
-class Told(NamedTuple):
+class CellLabels(NamedTuple):
     """What the looks at E elements say, each by itself.
 
     Attributes:
@@ -136,7 +138,7 @@ class Told(NamedTuple):
     share: float
 
 
-def told_of(looks: Looks, options: EmOptions) -> Told:
+def label_cells(looks: Observations, options: EmOptions) -> CellLabels:
     """What of the courses a label follows from; `watch` was called before the looks."""
     (static, *_, changing), shares = _groups(looks), _shares(looks, options)
     p, change = np.empty((2, looks.surface.size), np.float32)
@@ -146,7 +148,7 @@ def told_of(looks: Looks, options: EmOptions) -> Told:
         known = (_under(likelihood, shares, of) for of in (changing, static))
         came, stayed = (np.log(np.maximum(one, _LEAST)) for one in known)
         change[slice(*rows)] = np.clip(came - stayed, -_MOST_TOLD, _MOST_TOLD)
-    return Told(p, change, float(shares[-1]))
+    return CellLabels(p, change, float(shares[-1]))
 
 
 def _under(
@@ -157,34 +159,34 @@ def _under(
     return np.asarray(np.einsum("kc,c->k", likelihood, weights.astype(np.float32)), np.float32)
 
 
-def _kept(looks: Looks) -> NDArray[np.bool_]:
+def _kept(looks: Observations) -> NDArray[np.bool_]:
     """(C,) classes that leave room for things that stay."""
-    kept = (looks.tau <= _STAY) | (looks.rho == OFTEN_OCCUPIED)
+    kept = (looks.tau <= _STAY) | (looks.rho == HALF_TIME_RHO)
     kept[: looks.n_static] = True
     return np.asarray(kept)
 
 
-def _groups(looks: Looks) -> tuple[NDArray[np.bool_], ...]:
+def _groups(looks: Observations) -> tuple[NDArray[np.bool_], ...]:
     """(C + 1,) of those and of the changing class: static, by views, often, changing."""
     kept = _kept(looks)
     views = np.append(np.isfinite(looks.turn[kept]), False)
     static = np.arange(len(views)) < looks.n_static
-    often = np.append(looks.rho[kept] == OFTEN_OCCUPIED, False)
+    often = np.append(looks.rho[kept] == HALF_TIME_RHO, False)
     return static & ~views, views, often, np.arange(len(views)) == len(views) - 1
 
 
-def _likelihood(looks: Looks, rows: Rows) -> NDArray[np.float32]:
+def _likelihood(looks: Observations, rows: Rows) -> NDArray[np.float32]:
     """(n, C + 1) of some elements under each of these classes."""
     return _with_changing(looks.under(_kept(looks), rows), looks.dwell.log_changing(rows))
 
 
-def _shares(looks: Looks, options: EmOptions) -> Float:
+def _shares(looks: Observations, options: EmOptions) -> Float:
     """(C + 1,) of these classes."""
-    return fit_shares(_likelihood(looks, looks.sample()), looks.n_static, options.prior).classes
+    return fit_weights(_likelihood(looks, looks.sample()), looks.n_static, options.prior).classes
 
 
 def _of_rows(
-    looks: Looks, rows: Rows, groups: tuple[NDArray[np.bool_], ...], shares: Float
+    looks: Observations, rows: Rows, groups: tuple[NDArray[np.bool_], ...], shares: Float
 ) -> dict[str, NDArray[Any]]:
     """What Courses says of each of some elements."""
     likelihood = _likelihood(looks, rows)
@@ -215,21 +217,21 @@ def _posterior(
     return np.asarray(found / (found + others), np.float32)
 
 
-def _as_wholes(courses: Courses) -> Courses:
+def _as_wholes(courses: CellHistories) -> CellHistories:
     """Cells side by side that changed alike are of one thing: a third of them decides for all."""
     of = np.flatnonzero(
         (courses.count > 0)
-        & (courses.count < OFTEN)
+        & (courses.count < MIN_RECURRING_CHANGES)
         & (courses.p_changing > _POSSIBLE)
         & (courses.stands < 0.5)
     )
-    pairs = pairs_near(courses.cells[of], _BESIDE)
+    pairs = neighbor_pairs(courses.cells[of], _BESIDE)
     i, j = pairs.T
     before, after = courses.between[of, 1].T
     came = courses.p_thing[of] > 0.5
     at_once = np.maximum(before[i], before[j]) < np.minimum(after[i], after[j]) + _LOOKS_APART
     p_changing = courses.p_changing.copy()
-    for one in components(pairs[at_once & (came[i] == came[j])], len(of)):
+    for one in connected_components(pairs[at_once & (came[i] == came[j])], len(of)):
         if len(one) >= _WHOLE:
             cells = of[one]
             decided = np.quantile(p_changing[cells], 1.0 - _DECIDE, method="lower")
@@ -250,7 +252,7 @@ def _model(recording: Recording, options: EmOptions) -> dict[str, float]:
     }
 
 
-def _with_changing(seen: Table, log_changing: Float) -> NDArray[np.float32]:
+def _with_changing(seen: ClassLikelihoods, log_changing: Float) -> NDArray[np.float32]:
     """(E, C + 1) the likelihoods with that of the changing class last, relative as before."""
     above = np.minimum(log_changing - seen.log_best, _MOST_NATS)
     table = np.column_stack([seen.likelihood, np.exp(above).astype(np.float32)])
@@ -263,15 +265,19 @@ _TELLS = 1.0  # nats by which a change explains what was seen of a cell better t
 _SURE = 1e-6  # probabilities keep so far from 0 and 1
 
 
-def changed_of(courses: Courses) -> Changed:
+def select_changed_cells(courses: CellHistories) -> ChangedCells:
     """The cells that a change explains better, whatever share of all cells changed.
 
     A car that parks and leaves is some hundred cells among a million: each of them alone is more
     probably something that stands still and was missed for a while.
     """
     odds = _log_odds(courses.p_changing) - _log_odds(np.array([courses.share]))
-    of = np.flatnonzero((courses.count > 0) & (courses.count < OFTEN) & (odds > _TELLS))
-    return Changed(courses.cells[of], courses.p_thing[of], courses.count[of], courses.between[of])
+    of = np.flatnonzero(
+        (courses.count > 0) & (courses.count < MIN_RECURRING_CHANGES) & (odds > _TELLS)
+    )
+    return ChangedCells(
+        courses.cells[of], courses.p_thing[of], courses.count[of], courses.between[of]
+    )
 
 
 def _log_odds(p: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -7,16 +7,16 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.recording import Recording
-from stillmap.em.observations import chunks, look_numbers
+from stillmap.em.observations import iter_chunks, time_bin_index
 from stillmap.em.occupancy_grid import OccupancyMap
 from stillmap.em.options import EmOptions
-from stillmap.em.types import NoReturn
+from stillmap.em.types import NoReturnModel
 
 DYNAMIC_BELOW = 0.5  # P(c = 1) of what is taken for moving
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class Coverage:
     """What the cells of a map rest on, laid out as the map is.
 
     Attributes:
@@ -36,15 +36,15 @@ class Evidence:
     near: float
 
 
-def evidence(
+def count_observations(
     recording: Recording,
     poses: NDArray[np.float64],
     p_static: NDArray[np.float32],
     occupancy: OccupancyMap,
-    no_return: NoReturn | None,
+    no_return: NoReturnModel | None,
     options: EmOptions,
     threads: int = 1,
-) -> Evidence:
+) -> Coverage:
     """Counts the looks at every cell of a map.
 
     Args:
@@ -63,9 +63,9 @@ def evidence(
         stops=None if no_return is None else no_return.stops,
         beyond=0.0 if no_return is None else no_return.beyond,
     )
-    look = look_numbers(recording, options.dwell.look)
+    look = time_bin_index(recording, options.dwell.look)
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in chunks(recording, look, beside=[p_static]):
+    for scans, beams, offset in iter_chunks(recording, look, beside=[p_static]):
         counts.add(
             recording.points[beams],
             recording.hit[beams],
@@ -78,4 +78,4 @@ def evidence(
     box = occupancy.box
     looks, clear = counts.dense(box.first_cell.tolist(), box.shape)
     thin = (clear < least) & ~np.isnan(occupancy.p_occupied)
-    return Evidence(looks, clear, thin, least, near)
+    return Coverage(looks, clear, thin, least, near)

@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.arrays import blocks
+from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
 from stillmap.em import beam_counting, occupancy_hmm
 from stillmap.em.beam_counting import hit_ratio_e_step, log_likelihood, paper_e_step
-from stillmap.em.observations import chunks
-from stillmap.em.occupancy_grid import Seen
-from stillmap.em.occupancy_hmm import e_step_in_space
+from stillmap.em.observations import iter_chunks
+from stillmap.em.occupancy_grid import ObservedCells
+from stillmap.em.occupancy_hmm import e_step_3d
 from stillmap.em.options import EmOptions
-from stillmap.em.people import on_people
-from stillmap.em.types import Expectations, Grid, NoReturn, per_beam
+from stillmap.em.people import label_people
+from stillmap.em.types import EStepResult, Grid, NoReturnModel, fill_beams
 
 Float = NDArray[np.float64]
 Estimator = Literal["stillmap", "paper", "hit-ratio", "tracker"]
@@ -25,21 +25,21 @@ Estimator = Literal["stillmap", "paper", "hit-ratio", "tracker"]
 _FIXED: dict[Estimator, int] = {"hit-ratio": 1, "tracker": 2}
 
 
-IN_SPACE: tuple[Estimator, ...] = ("stillmap", "paper")  # those that know 3D recordings
+ESTIMATORS_3D: tuple[Estimator, ...] = ("stillmap", "paper")  # those that know 3D recordings
 
 
-def initial_expectations(
+def initial_p_static(
     recording: Recording, estimator: Estimator, options: EmOptions
 ) -> NDArray[np.float32]:
     """(M,) e := p(c = 1) for every beam: the start of Fig. 2. Mappers that count believe all."""
     prior = 1.0 if estimator in _FIXED else options.prior
     e = recording.per_beam(np.float32)
-    for block in blocks(e):
+    for block in iter_blocks(e):
         e[block] = prior
     return e
 
 
-def iterations(estimator: Estimator, options: EmOptions) -> int:
+def max_iterations(estimator: Estimator, options: EmOptions) -> int:
     """How often to iterate at most."""
     return min(fixed_iterations(estimator) or options.max_iterations, options.max_iterations)
 
@@ -49,7 +49,7 @@ def fixed_iterations(estimator: Estimator) -> int | None:
     return _FIXED.get(estimator)
 
 
-def empty_grid(dimension: int, resolution: float, approach: float = 0.0) -> Grid:
+def make_grid(dimension: int, resolution: float, approach: float = 0.0) -> Grid:
     """A grid without any sums."""
     kind = _core.Grid2D if dimension == 2 else _core.Grid3D
     return kind(resolution, approach)
@@ -67,12 +67,12 @@ def e_step(
     estimator: Estimator,
     options: EmOptions,
     threads: int = 1,
-) -> Expectations:
+) -> EStepResult:
     """What is static at these poses, and the likelihood of that."""
     if estimator == "paper":
         return paper_e_step(recording, poses, grid, options.prior, threads)
     if estimator == "stillmap" and recording.dimension == 3:
-        return e_step_in_space(recording, poses, grid.resolution, options, threads)
+        return e_step_3d(recording, poses, grid.resolution, options, threads)
     if estimator == "stillmap":
         return occupancy_hmm.e_step(recording, poses, grid.resolution, options, threads)
     if not isinstance(grid, _core.Grid2D):
@@ -84,16 +84,16 @@ def e_step(
 
 def _tracked(
     recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int
-) -> Expectations:
+) -> EStepResult:
     """Hits on people who are tracked are dynamic, all others static; the map counts the others."""
-    people, e = on_people(recording, poses, options.tracker), recording.per_beam(np.float32)
-    for _, beams, _ in chunks(recording, beside=[people, e]):
+    people, e = label_people(recording, poses, options.tracker), recording.per_beam(np.float32)
+    for _, beams, _ in iter_chunks(recording, beside=[people, e]):
         kept = (~people[beams]).astype(np.float32)
-        e[beams] = per_beam(recording.points[beams], recording.hit[beams], kept, options.prior)
+        e[beams] = fill_beams(recording.points[beams], recording.hit[beams], kept, options.prior)
     grid = _core.Grid2D(resolution)
     add_recording(grid, recording, poses, e, threads)
     likelihood = log_likelihood(recording, poses, grid, e, options.prior, threads)
-    return Expectations(e, likelihood, beam_counting.kept_cells(grid, options.hit_ratio))
+    return EStepResult(e, likelihood, beam_counting.threshold_hit_ratio(grid, options.hit_ratio))
 
 
 def add_recording(
@@ -110,7 +110,7 @@ def add_recording(
     With `hits_alone` beams without a return are left out.
     """
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in chunks(recording, beside=[] if e is None else [e]):
+    for scans, beams, offset in iter_chunks(recording, beside=[] if e is None else [e]):
         points, hit = recording.points[beams], recording.hit[beams]
         if hits_alone:
             points = np.where(hit[:, None], points, np.float32(np.nan))
@@ -118,23 +118,25 @@ def add_recording(
         _core.add_beams(grid, points, hit, weights, offset, T_map_sensor[scans], threads)
 
 
-def count_as_static(grid: Grid, recording: Recording, poses: Float, e: NDArray[np.float32]) -> None:
+def recount_as_static(
+    grid: Grid, recording: Recording, poses: Float, e: NDArray[np.float32]
+) -> None:
     """Makes sums that were added with e those of every hit counted as static, to the bit."""
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in chunks(recording, beside=[e]):
+    for scans, beams, offset in iter_chunks(recording, beside=[e]):
         points, hit, T = recording.points[beams], recording.hit[beams], T_map_sensor[scans]
         _core.add_ends(grid, points, hit, e[beams], offset, T, remove=True)
         _core.add_ends(grid, points, hit, np.ones(len(hit), np.float32), offset, T)
 
 
-def add_believed_first(
+def add_trusted_beams(
     grid: _core.Grid2D,
     recording: Recording,
     poses: Float,
     e: NDArray[np.float32],
-    no_return: NoReturn | None,
+    no_return: NoReturnModel | None,
     threads: int = 1,
-) -> Seen | None:
+) -> ObservedCells | None:
     """Adds the same sums as `add_recording` to an empty grid; says which cells beams tell of.
 
     Beams without a return only count as far as they are believed; None where all of them are.
@@ -145,7 +147,7 @@ def add_believed_first(
     add_recording(grid, recording, poses, e, threads, hits_alone=True)
     rest = _core.Grid2D(grid.resolution, grid.approach)
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in chunks(recording):
+    for scans, beams, offset in iter_chunks(recording):
         _core.add_lost(
             grid,
             rest,
@@ -159,7 +161,7 @@ def add_believed_first(
         )
     first_cell, cells = grid.seen()
     grid.merge(rest)
-    return Seen(first_cell, cells.view(np.bool_))
+    return ObservedCells(first_cell, cells.view(np.bool_))
 
 
 def changed_share(
@@ -167,7 +169,7 @@ def changed_share(
 ) -> float:
     """Share of the hits whose e moved by more than 0.1 between two iterations."""
     changed = hits = 0
-    for block in blocks(before, after, hit):
+    for block in iter_blocks(before, after, hit):
         moved = np.abs(after[block] - before[block])[hit[block]] > 0.1
         changed += int(np.count_nonzero(moved))
         hits += int(np.count_nonzero(hit[block]))

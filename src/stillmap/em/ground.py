@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.recording import Recording
-from stillmap.em.observations import Surface, blocks_of, chunks
+from stillmap.em.observations import SurfelMap, iter_chunks, iter_surfel_rows
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -24,7 +24,7 @@ _MARGIN = 2  # squares around all that is known
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class GroundMap:
     """The height of the ground, square by square.
 
     Attributes:
@@ -50,9 +50,9 @@ class Ground:
         return np.asarray(self.z.take(row * W + column))
 
 
-def ground_of(
+def estimate_ground(
     recording: Recording, poses: Float, p_static: NDArray[np.float32], threads: int = 1
-) -> Ground:
+) -> GroundMap:
     """The ground under a robot's way and around it.
 
     Args:
@@ -63,7 +63,7 @@ def ground_of(
     """
     T_map_sensor = recording.T_map_sensor(poses)
     surface = _core.Surface3D(_CELL)
-    for scans, beams, offset in chunks(recording, beside=[p_static]):
+    for scans, beams, offset in iter_chunks(recording, beside=[p_static]):
         static = recording.hit[beams] & (p_static[beams] >= _BELIEVED)
         surface.add_end_points(
             recording.points[beams], static, offset, T_map_sensor[scans], threads=threads
@@ -73,7 +73,7 @@ def ground_of(
     return ground_from(means, normals, T_map_sensor[:, :3, 3])
 
 
-def ground_under(surface: Surface, p_static: NDArray[np.float32], way: Float) -> Ground:
+def ground_from_surfels(surface: SurfelMap, p_static: NDArray[np.float32], way: Float) -> GroundMap:
     """The ground by the elements (E,) of a surface in space that stand still.
 
     Args:
@@ -82,14 +82,14 @@ def ground_under(surface: Surface, p_static: NDArray[np.float32], way: Float) ->
         way: (T, 3) where the sensors were, in the map frame whose z points up.
     """
     floor = [np.zeros((0, 3))]
-    for rows in blocks_of(surface):
+    for rows in iter_surfel_rows(surface):
         _, means, normals, *_ = surface.elements(rows)
         level = np.abs(normals[:, 2]) > _LEVEL
         floor.append(means[level & (p_static[slice(*rows)] >= _BELIEVED)])
     return _ground_by(np.concatenate(floor), way)
 
 
-def ground_from(means: Float, normals: Float, way: Float) -> Ground:
+def ground_from(means: Float, normals: Float, way: Float) -> GroundMap:
     """The ground under a robot's way and around it.
 
     Args:
@@ -99,7 +99,7 @@ def ground_from(means: Float, normals: Float, way: Float) -> Ground:
     return _ground_by(means[np.abs(normals[:, 2]) > _LEVEL], way)
 
 
-def _ground_by(floor: Float, way: Float) -> Ground:
+def _ground_by(floor: Float, way: Float) -> GroundMap:
     sensor = _height(floor, way)
     low, high = (np.vstack([getattr(one[:, :2], end)(axis=0) for one in (floor, way) if len(one)])
                  for end in ("min", "max"))  # fmt: skip
@@ -111,7 +111,7 @@ def _ground_by(floor: Float, way: Float) -> Ground:
     count = np.bincount(square, minlength=z.size)
     z.reshape(-1)[count > 0] = total[count > 0] / count[count > 0]
     _spread(z, corner, floor if sensor is not None else floor[:0])
-    return Ground(z, corner, sensor or 0.0, sensor is not None)
+    return GroundMap(z, corner, sensor or 0.0, sensor is not None)
 
 
 def _height(floor: Float, way: Float) -> float | None:

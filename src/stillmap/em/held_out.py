@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.recording import Recording
-from stillmap.em.observations import chunks
+from stillmap.em.observations import iter_chunks
 
 Float = NDArray[np.float64]
 
@@ -23,14 +23,14 @@ BEAM_MODEL = {
 }
 
 
-def held_out_scans(n_scans: int, every: int) -> NDArray[np.bool_]:
+def select_held_out_scans(n_scans: int, every: int) -> NDArray[np.bool_]:
     """(T,) the scans that are left out: one in the middle of every `every` in a row; 0: none."""
     if every == 0:
         return np.zeros(n_scans, dtype=np.bool_)
     return np.asarray(np.arange(n_scans) % every == every // 2, dtype=np.bool_)
 
 
-def held_out_log_likelihood(
+def score_held_out_scans(
     recording: Recording,
     poses: Float,
     e: NDArray[np.float32],
@@ -61,15 +61,15 @@ def held_out_log_likelihood(
     """
     if every == 0 or recording.n_scans < every:
         return None
-    held = held_out_scans(recording.n_scans, every)
+    held = select_held_out_scans(recording.n_scans, every)
     T_map_sensor = recording.T_map_sensor(poses)
     kind = _core.StaticShares2D if recording.dimension == 2 else _core.StaticShares3D
     shares = kind(resolution)
-    for scans, beams, offset in chunks(recording, beside=[e]):
+    for scans, beams, offset in iter_chunks(recording, beside=[e]):
         points, hit = recording.points[beams], recording.hit[beams]
         shares.add(points, hit, e[beams], offset, T_map_sensor[scans], held[scans])
     gain, count = 0.0, 0.0
-    for scans, beams, offset in chunks(recording):
+    for scans, beams, offset in iter_chunks(recording):
         points, hit = recording.points[beams], recording.hit[beams]
         per_scan = _core.held_out(
             shares, points, hit, offset, T_map_sensor[scans], held[scans], threads=threads,

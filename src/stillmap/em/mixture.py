@@ -13,7 +13,7 @@ _MOST_STATIC = 0.998  # a recording cannot show that nothing ever moves
 
 
 @dataclass(frozen=True, eq=False)
-class Shares:
+class MixtureWeights:
     """What a mixture is made of.
 
     Attributes:
@@ -27,13 +27,13 @@ class Shares:
     log_likelihood: float
 
 
-def fit_shares(
+def fit_weights(
     likelihood: NDArray[np.float32],
     n_static: int,
     start: float,
     iterations: int = 100,
     tolerance: float = 1e-6,
-) -> Shares:
+) -> MixtureWeights:
     """Maximise sum_k ln sum_c share_c likelihood_kc over the shares.
 
     Args:
@@ -60,7 +60,7 @@ def fit_shares(
         if now - last < tolerance:
             break
         last = now
-    return Shares(float(shares[:n_static].sum()), shares, now)
+    return MixtureWeights(float(shares[:n_static].sum()), shares, now)
 
 
 def _normalised(counts: Float, n_static: int, start: float) -> Float:

@@ -22,9 +22,9 @@ _EDGE = 0.15  # cells: how sharply a surface ends
 
 Float = NDArray[np.float64]
 
-Surface = _core.Surface2D | _core.Surface3D
+SurfelMap = _core.Surface2D | _core.Surface3D
 
-Dwell = _core.Dwell2D | _core.Dwell3D
+OccupancyHmm = _core.Dwell2D | _core.Dwell3D
 
 Rows = tuple[int, int, int]
 
@@ -47,7 +47,7 @@ class Chunk(NamedTuple):
     offset: NDArray[np.int64]
 
 
-def chunks(
+def iter_chunks(
     recording: Recording,
     group: NDArray[np.int64] | None = None,
     *,
@@ -83,7 +83,7 @@ def _after(group: NDArray[np.int64], offset: NDArray[np.int64], first: int, grou
     return first
 
 
-OFTEN_OCCUPIED = 0.5  # share of the time in which something is there that comes and goes often
+HALF_TIME_RHO = 0.5  # share of the time in which something is there that comes and goes often
 
 _LEAST = 0.3  # cells: no length is known better, whatever the scatter
 
@@ -97,7 +97,7 @@ _LAST_LOOK = 2**31 - 1  # as far as the core counts
 
 
 @dataclass(frozen=True)
-class Classes:
+class HmmClasses:
     """Grid over what a cell may hold: how much of the time it is occupied, and for how long.
 
     The shares of these classes are learned; the grid itself only has to be wide and fine enough.
@@ -129,15 +129,15 @@ class Classes:
         of = [(r, t, never) for t in self.static_seconds for r in self.static_occupied]
         of += [(r, never, self.views_turn) for r in self.views_occupied]
         of += [(r, t, never) for t in self.mover_seconds for r in self.mover_occupied]
-        of += [(OFTEN_OCCUPIED, t, never) for t in self.often_seconds]
+        of += [(HALF_TIME_RHO, t, never) for t in self.often_seconds]
         return [r for r, _, _ in of], [t for _, t, _ in of], [v for _, _, v in of]
 
 
-CLASSES = Classes()
+LOOP_CLASSES = HmmClasses()
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class ClassLikelihoods:
     """How likely what was seen of E elements is under each of C classes.
 
     Attributes:
@@ -154,7 +154,7 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
+class Observations:
     """What all looks say of E elements.
 
     Attributes:
@@ -165,8 +165,8 @@ class Looks:
         threads: same result with any number.
     """
 
-    surface: Surface
-    dwell: Dwell
+    surface: SurfelMap
+    dwell: OccupancyHmm
     trust: float
     rho: Float
     tau: Float
@@ -174,62 +174,66 @@ class Looks:
     n_static: int
     threads: int = 1
 
-    def under(self, kept: NDArray[np.bool_] | None = None, rows: Rows | None = None) -> Table:
+    def under(
+        self, kept: NDArray[np.bool_] | None = None, rows: Rows | None = None
+    ) -> ClassLikelihoods:
         """Of some of the classes (C,), all static ones among them, as if there were no others.
 
         rows: first, last, every: of some of the elements.
         """
         some = slice(None) if kept is None else kept
         found = self.dwell.likelihood(kept, rows, self.threads)
-        return Table(self.rho[some], self.tau[some], self.turn[some], self.n_static, *found)
+        return ClassLikelihoods(
+            self.rho[some], self.tau[some], self.turn[some], self.n_static, *found
+        )
 
     def blocks(self) -> Iterator[Rows]:
         """All elements: tables of all of them at once would be as large as what they are from."""
-        return blocks_of(self.surface)
+        return iter_surfel_rows(self.surface)
 
     def sample(self) -> Rows:
         """So many of them, evenly, that shares can be learned from."""
         return 0, self.surface.size, max(-(-self.surface.size // LEARN_FROM), 1)
 
 
-def looked_at(
+def collect_observations(
     recording: Recording,
     poses: Float,
     resolution: float,
     options: EmOptions,
     threads: int,
-    classes: Classes = CLASSES,
-    prepare: Callable[[Dwell], None] | None = None,
-) -> Looks:
+    classes: HmmClasses = LOOP_CLASSES,
+    prepare: Callable[[OccupancyHmm], None] | None = None,
+) -> Observations:
     """Follows all beams; `prepare` is called before the first look. See `e_step`."""
     T_map_sensor = recording.T_map_sensor(poses)
-    look = look_numbers(recording, options.dwell.look) if recording.dimension == 3 else None
-    surface = surface_of(recording, T_map_sensor, resolution, threads, look)
-    dwell = _dwell(surface, options.dwell, classes, threads)
-    trust = _open(recording, T_map_sensor, dwell, threads)
+    look = time_bin_index(recording, options.dwell.look) if recording.dimension == 3 else None
+    surface = build_surfel_map(recording, T_map_sensor, resolution, threads, look)
+    dwell = make_hmm(surface, options.dwell, classes, threads)
+    trust = _estimate_trust(recording, T_map_sensor, dwell, threads)
     dwell.trust(trust)
     if prepare is not None:
         prepare(dwell)
-    _look(recording, poses, dwell, options.dwell.look, threads)
+    add_observations(recording, poses, dwell, options.dwell.look, threads)
     dwell.rest()
     rho, tau, turn = (np.array(values) for values in classes.grid())
-    return Looks(surface, dwell, trust, rho, tau, turn, classes.n_static, threads)
+    return Observations(surface, dwell, trust, rho, tau, turn, classes.n_static, threads)
 
 
-def surface_of(
+def build_surfel_map(
     recording: Recording,
     T_map_sensor: Float,
     resolution: float,
     threads: int = 1,
     look: NDArray[np.int64] | None = None,
-) -> Surface:
+) -> SurfelMap:
     """Mean, normal and scatter of the end points in every cell where beams ended.
 
     With the look (T,) of each scan it also knows when they did.
     """
     kind = _core.Surface2D if recording.dimension == 2 else _core.Surface3D
     surface = kind(resolution)
-    for scans, beams, offset in chunks(recording):
+    for scans, beams, offset in iter_chunks(recording):
         points, hit = recording.points[beams], recording.hit[beams]
         of_scans = None if look is None else look[scans]
         surface.add_end_points(points, hit, offset, T_map_sensor[scans], of_scans, threads)
@@ -237,18 +241,18 @@ def surface_of(
     return surface
 
 
-def blocks_of(surface: Surface) -> Iterator[Rows]:
+def iter_surfel_rows(surface: SurfelMap) -> Iterator[Rows]:
     """All elements, some of them at a time; one empty block where there are none."""
     for first in range(0, max(surface.size, 1), _ROWS):
         yield first, min(first + _ROWS, surface.size), 1
 
 
-def cells_of(surface: Surface) -> NDArray[np.int64]:
+def surfel_cells(surface: SurfelMap) -> NDArray[np.int64]:
     """(E, D) of the elements."""
-    return np.concatenate([surface.elements(rows)[0] for rows in blocks_of(surface)])
+    return np.concatenate([surface.elements(rows)[0] for rows in iter_surfel_rows(surface)])
 
 
-def look_numbers(recording: Recording, seconds: float) -> NDArray[np.int64]:
+def time_bin_index(recording: Recording, seconds: float) -> NDArray[np.int64]:
     """(T,) the look of each scan: what was seen within it tells no more than a single glance.
 
     A clock that leaps by decades makes one look of what comes after.
@@ -258,12 +262,14 @@ def look_numbers(recording: Recording, seconds: float) -> NDArray[np.int64]:
     return np.asarray(np.minimum(number, _LAST_LOOK), dtype=np.int64)
 
 
-def _look(recording: Recording, poses: Float, dwell: Dwell, seconds: float, threads: int) -> None:
+def add_observations(
+    recording: Recording, poses: Float, dwell: OccupancyHmm, seconds: float, threads: int
+) -> None:
     """All looks at each element, one after the other."""
-    look, D = look_numbers(recording, seconds), recording.dimension
+    look, D = time_bin_index(recording, seconds), recording.dimension
     T_map_sensor = recording.T_map_sensor(poses)
     place = np.ascontiguousarray(poses[:, :D, D])
-    for scans, beams, offset in chunks(recording, look, groups=_LOOKS_EACH * threads):
+    for scans, beams, offset in iter_chunks(recording, look, groups=_LOOKS_EACH * threads):
         dwell.add(
             recording.points[beams],
             recording.hit[beams],
@@ -275,7 +281,9 @@ def _look(recording: Recording, poses: Float, dwell: Dwell, seconds: float, thre
         )
 
 
-def _dwell(surface: Surface, options: DwellOptions, classes: Classes, threads: int = 1) -> Dwell:
+def make_hmm(
+    surface: SurfelMap, options: DwellOptions, classes: HmmClasses, threads: int = 1
+) -> OccupancyHmm:
     rho, tau, turn = classes.grid()
     cell, scatter = surface.resolution, surface.scatter
     lengths = {
@@ -299,14 +307,16 @@ def _dwell(surface: Surface, options: DwellOptions, classes: Classes, threads: i
     return _core.Dwell3D(surface, **chosen)
 
 
-def _open(recording: Recording, T_map_sensor: Float, dwell: Dwell, threads: int) -> float:
+def _estimate_trust(
+    recording: Recording, T_map_sensor: Float, dwell: OccupancyHmm, threads: int
+) -> float:
     """How far beams without a return show that nothing is there, from 0 to 1.
 
     Where there is open space they cross nothing solid. Where most of them seem to go through walls,
     something swallows them.
     """
     lost = through = 0
-    for scans, beams, offset in chunks(recording):
+    for scans, beams, offset in iter_chunks(recording):
         counts = dwell.lost(
             recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans], threads
         )
@@ -314,12 +324,12 @@ def _open(recording: Recording, T_map_sensor: Float, dwell: Dwell, threads: int)
     return max(0.0, 1.0 - _SWALLOWED * through / lost) if lost else 0.0
 
 
-def coverage(surface: Surface) -> NDArray[np.float32]:
+def probability_in_cell(surface: SurfelMap) -> NDArray[np.float32]:
     """(E,) P(what is there runs through the cell itself): noise also fills cells beside it."""
     from scipy.special import ndtr  # takes long to load
 
     covered = np.empty(surface.size, np.float32)
-    for rows in blocks_of(surface):
+    for rows in iter_surfel_rows(surface):
         _, _, normals, off_plane, prominence, _ = surface.elements(rows)
         # of the cell, across the surface; a wall on the border of two cells belongs to both
         half = 0.5 * np.abs(normals).sum(axis=1) + _EDGE

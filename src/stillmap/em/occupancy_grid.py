@@ -18,7 +18,7 @@ Sums = NDArray[np.float64]
 _TILE = 2000
 
 
-class Seen(NamedTuple):
+class ObservedCells(NamedTuple):
     """Cells of which beams tell something, in a box; none outside.
 
     Attributes:
@@ -30,7 +30,7 @@ class Seen(NamedTuple):
     cells: NDArray[np.bool_]
 
 
-class Box(NamedTuple):
+class GridWindow(NamedTuple):
     """A part of a map.
 
     Attributes:
@@ -62,18 +62,18 @@ class OccupancyMap:
     resolution: float
 
     @property
-    def box(self) -> Box:
+    def box(self) -> GridWindow:
         """Which cells these are."""
         first_cell = np.round(np.array(self.origin[:2]) / self.resolution).astype(np.int64)
         height, width = self.p_occupied.shape
-        return Box(first_cell, (height, width))
+        return GridWindow(first_cell, (height, width))
 
 
-def occupancy_map(
+def make_occupancy_map(
     grid: Grid,
     occupied: CellProbabilities | None = None,
-    seen: Seen | None = None,
-    box: Box | None = None,
+    seen: ObservedCells | None = None,
+    box: GridWindow | None = None,
 ) -> OccupancyMap:
     """The closed-form maximum (15) of the counts in a grid, or an estimator's own probabilities.
 
@@ -88,7 +88,7 @@ def occupancy_map(
     if not isinstance(grid, _core.Grid2D):
         raise ValueError("grid: expected one of 2 dimensions")
     if seen is not None:
-        box = Box(seen.first_cell, seen.cells.shape)
+        box = GridWindow(seen.first_cell, seen.cells.shape)
     box = box or _whole(grid)
     p_occupied = np.full(box.shape, np.nan, np.float32)
     a, b = np.zeros(box.shape, np.float32), np.zeros(box.shape, np.float32)
@@ -102,12 +102,12 @@ def occupancy_map(
     return OccupancyMap(p_occupied, a, b, (x, y, 0.0), grid.resolution)
 
 
-def _whole(grid: _core.Grid2D) -> Box:
+def _whole(grid: _core.Grid2D) -> GridWindow:
     first_cell, (height, width) = grid.box()
-    return Box(first_cell, (height, width))
+    return GridWindow(first_cell, (height, width))
 
 
-def _tiles(grid: _core.Grid2D, box: Box) -> Iterator[tuple[tuple[slice, slice], Sums, Sums]]:
+def _tiles(grid: _core.Grid2D, box: GridWindow) -> Iterator[tuple[tuple[slice, slice], Sums, Sums]]:
     """Where in a box cells were crossed: rows and columns of a tile, and its alpha and beta."""
     height, width = box.shape
     for row, column in itertools.product(range(0, height, _TILE), range(0, width, _TILE)):

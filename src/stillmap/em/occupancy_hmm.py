@@ -18,26 +18,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
-from stillmap.em.changepoints import Courses, changed_of, courses_of, told_of, watch
-from stillmap.em.ground import ground_under
-from stillmap.em.mixture import Shares, fit_shares, posterior_static
+from stillmap.em.changepoints import (
+    CellHistories,
+    decode_histories,
+    label_cells,
+    select_changed_cells,
+    track_changes,
+)
+from stillmap.em.ground import ground_from_surfels
+from stillmap.em.mixture import MixtureWeights, fit_weights, posterior_static
 from stillmap.em.observations import (
-    CLASSES,
-    OFTEN_OCCUPIED,
-    Classes,
-    Dwell,
+    HALF_TIME_RHO,
+    LOOP_CLASSES,
+    ClassLikelihoods,
     Float,
-    Looks,
-    Surface,
-    Table,
-    cells_of,
-    chunks,
-    coverage,
-    looked_at,
+    HmmClasses,
+    Observations,
+    OccupancyHmm,
+    SurfelMap,
+    collect_observations,
+    iter_chunks,
+    probability_in_cell,
+    surfel_cells,
 )
 from stillmap.em.options import EmOptions
-from stillmap.em.spatial_prior import Feet, feet_of, standing_on, with_bodies, with_those_beside
-from stillmap.em.types import CellProbabilities, Expectations, Likelihood, NoReturn, per_beam
+from stillmap.em.spatial_prior import (
+    GroundContact,
+    make_ground_contact,
+    pool_clusters,
+    select_obstacles,
+    smooth_mean_field,
+)
+from stillmap.em.types import CellProbabilities, EStepResult, Likelihood, NoReturnModel, fill_beams
 
 _UNSEEN = 0.2  # probability that a cell is occupied in which no beam ended and none passed
 
@@ -50,8 +62,8 @@ def e_step(
     resolution: float,
     options: EmOptions,
     threads: int = 1,
-    classes: Classes = CLASSES,
-) -> Expectations:
+    classes: HmmClasses = LOOP_CLASSES,
+) -> EStepResult:
     """P(c = 1) of every beam: of its end cell being occupied by something that stays.
 
     Args:
@@ -62,20 +74,20 @@ def e_step(
         threads: same result with any number.
         classes: see Classes.
     """
-    looks = looked_at(recording, poses, resolution, options, threads, classes)
-    return expectations_of(looks, None, recording, poses, options, threads)
+    looks = collect_observations(recording, poses, resolution, options, threads, classes)
+    return label_beams(looks, None, recording, poses, options, threads)
 
 
-def expectations_of(
-    looks: Looks,
+def label_beams(
+    looks: Observations,
     kept: NDArray[np.bool_] | None,
     recording: Recording,
     poses: Float,
     options: EmOptions,
     threads: int,
     static: NDArray[np.float32] | None = None,
-    feet: Feet | None = None,
-) -> Expectations:
+    feet: GroundContact | None = None,
+) -> EStepResult:
     """What the looks say of every cell, and with that of every beam that ended in it.
 
     kept (C,): under which of the classes; None: all. static (E,) is what is known better of each
@@ -83,18 +95,20 @@ def expectations_of(
     ground below something that moves.
     """
     some = looks.under(kept, looks.sample())
-    shares = fit_shares(some.likelihood, some.n_static, options.prior)
+    shares = fit_weights(some.likelihood, some.n_static, options.prior)
     found, likelihood = _of_elements(looks, kept, shares)
     share = shares.static if static is None else _mean(static, shares.static)
     static = found if static is None else static
     surface, T_map_sensor = looks.surface, recording.T_map_sensor(poses)
     beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
-    return Expectations(
+    return EStepResult(
         p_static=_of_beams(recording, T_map_sensor, surface, static, share, threads, feet),
         likelihood=likelihood,
-        occupied=CellProbabilities(cells_of(surface), static * coverage(surface), _UNSEEN),
+        occupied=CellProbabilities(
+            surfel_cells(surface), static * probability_in_cell(surface), _UNSEEN
+        ),
         learned=_learned(looks, some, shares) | {"p_static": share},
-        no_return=NoReturn(looks.dwell.solid(), beyond),
+        no_return=NoReturnModel(looks.dwell.solid(), beyond),
     )
 
 
@@ -105,19 +119,19 @@ def _mean(static: NDArray[np.float32], of_none: float) -> float:
 def _of_beams(
     recording: Recording,
     T_map_sensor: Float,
-    surface: Surface,
+    surface: SurfelMap,
     static: NDArray[np.float32],
     prior: float,
     threads: int,
-    feet: Feet | None,
+    feet: GroundContact | None,
 ) -> NDArray[np.float32]:
     """(M,) what is known (E,) of the element that each beam ended in."""
     found = np.append(static, np.float32(prior))  # -1: no element
     e = recording.per_beam(np.float32)
-    for scans, beams, offset in chunks(recording, beside=[e]):
+    for scans, beams, offset in iter_chunks(recording, beside=[e]):
         points, hit = recording.points[beams], recording.hit[beams]
         element = surface.elements_of(points, hit, offset, T_map_sensor[scans], threads)
-        known = per_beam(points, hit, found.take(element), prior)
+        known = fill_beams(points, hit, found.take(element), prior)
         if feet is not None:
             over = feet.of(points, hit, offset, T_map_sensor[scans], element, threads)
             known = np.where(np.isnan(over), known, over)
@@ -126,7 +140,7 @@ def _of_beams(
 
 
 def _of_elements(
-    looks: Looks, kept: NDArray[np.bool_] | None, shares: Shares
+    looks: Observations, kept: NDArray[np.bool_] | None, shares: MixtureWeights
 ) -> tuple[NDArray[np.float32], Likelihood]:
     """(E,) P(static) by the classes alone, and the bound."""
     static, bound, entropy = np.empty(looks.surface.size, np.float32), 0.0, 0.0
@@ -141,7 +155,9 @@ def _of_elements(
     return static, Likelihood(expected=bound - entropy, bound=bound)
 
 
-def _learned(looks: Looks, table: Table, shares: Shares) -> dict[str, object]:
+def _learned(
+    looks: Observations, table: ClassLikelihoods, shares: MixtureWeights
+) -> dict[str, object]:
     static, movers = slice(None, table.n_static), slice(table.n_static, None)
     return {
         "scatter": looks.surface.scatter,
@@ -162,12 +178,12 @@ def _shares_of(values: Float, shares: Float) -> list[dict[str, float]]:
     ]
 
 
-_CLASSES_3D = Classes(mover_seconds=(0.5, 3.0, 6.0, 12.0), often_seconds=(8.0, 24.0))
+_CLASSES_3D = HmmClasses(mover_seconds=(0.5, 3.0, 6.0, 12.0), often_seconds=(8.0, 24.0))
 
 
-def e_step_in_space(
+def e_step_3d(
     recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int = 1
-) -> Expectations:
+) -> EStepResult:
     """P(c = 1) of every beam: of its end cell being occupied by something that was never away.
 
     Args: see `dwell.e_step`. Without `changes.enabled` it is that one. With `changes.in_space`
@@ -178,24 +194,26 @@ def e_step_in_space(
 
     listed = options.changes.in_space
 
-    def prepare(dwell: Dwell) -> None:
-        watch(dwell, recording, options, courses=listed)
+    def prepare(dwell: OccupancyHmm) -> None:
+        track_changes(dwell, recording, options, courses=listed)
 
-    looks = looked_at(recording, poses, resolution, options, threads, _CLASSES_3D, prepare)
-    told = told_of(looks, options)
-    static = with_those_beside(told.p_static, looks.surface, options.beside, threads)
+    looks = collect_observations(
+        recording, poses, resolution, options, threads, _CLASSES_3D, prepare
+    )
+    told = label_cells(looks, options)
+    static = smooth_mean_field(told.p_static, looks.surface, options.beside, threads)
     T_map_sensor = recording.T_map_sensor(poses)
-    ground = ground_under(looks.surface, static, T_map_sensor[:, :3, 3])
-    standing = standing_on(ground, looks.surface, options.bodies)
-    static = with_bodies(
+    ground = ground_from_surfels(looks.surface, static, T_map_sensor[:, :3, 3])
+    standing = select_obstacles(ground, looks.surface, options.bodies)
+    static = pool_clusters(
         static, told.change, standing, recording, T_map_sensor, options.bodies, threads
     )
-    feet = feet_of(standing, static, options.bodies)
-    found = expectations_of(looks, None, recording, poses, options, threads, static, feet)
+    feet = make_ground_contact(standing, static, options.bodies)
+    found = label_beams(looks, None, recording, poses, options, threads, static, feet)
     return replace(
         found,
         learned={**found.learned, "changing": round(told.share, 6)},
-        changed=changed_of(courses_of(looks, options)) if listed else None,
+        changed=select_changed_cells(decode_histories(looks, options)) if listed else None,
         ground=ground,
     )
 
@@ -206,7 +224,7 @@ _SECONDS = 3.0
 
 _WAITING = 6.0  # s, of no use for labels
 
-_FINAL_CLASSES = Classes(
+_FINAL_CLASSES = HmmClasses(
     views_occupied=(0.65,),
     mover_occupied=(0.01, 0.04, _CROWDED),
     mover_seconds=(0.5, _SECONDS, _WAITING, 12.0, 45.0),
@@ -214,9 +232,9 @@ _FINAL_CLASSES = Classes(
 )
 
 
-def last_e_step(
+def final_e_step(
     recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int = 1
-) -> tuple[Expectations | None, Courses | None]:
+) -> tuple[EStepResult | None, CellHistories | None]:
     """Labels with what is met from some places only, and what became of each cell.
 
     Args: see `dwell.e_step`.
@@ -226,22 +244,22 @@ def last_e_step(
         `changes.enabled`.
     """
 
-    def prepare(dwell: Dwell) -> None:
+    def prepare(dwell: OccupancyHmm) -> None:
         if options.changes.enabled:
-            watch(dwell, recording, options)
+            track_changes(dwell, recording, options)
 
     views = options.dwell.views
     classes = _FINAL_CLASSES if views else replace(_FINAL_CLASSES, views_occupied=())
-    looks = looked_at(recording, poses, resolution, options, threads, classes, prepare)
+    looks = collect_observations(recording, poses, resolution, options, threads, classes, prepare)
     found = None
     if views:
-        found = expectations_of(looks, _for_labels(looks), recording, poses, options, threads)
-    return found, courses_of(looks, options) if options.changes.enabled else None
+        found = label_beams(looks, _for_labels(looks), recording, poses, options, threads)
+    return found, decode_histories(looks, options) if options.changes.enabled else None
 
 
-def _for_labels(looks: Looks) -> NDArray[np.bool_]:
+def _for_labels(looks: Observations) -> NDArray[np.bool_]:
     """(C,) without crowds of some seconds: these are what a chair is that a robot passes."""
     crowds = (looks.rho == _CROWDED) & (looks.tau == _SECONDS)
-    kept = ~crowds & (looks.tau != _WAITING) & (looks.rho != OFTEN_OCCUPIED)
+    kept = ~crowds & (looks.tau != _WAITING) & (looks.rho != HALF_TIME_RHO)
     kept[: looks.n_static] = True
     return np.asarray(kept)

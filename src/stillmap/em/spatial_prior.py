@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.recording import Recording
-from stillmap.em.ground import Ground
-from stillmap.em.observations import Float, Surface, blocks_of, chunks
+from stillmap.em.ground import GroundMap
+from stillmap.em.observations import Float, SurfelMap, iter_chunks, iter_surfel_rows
 from stillmap.em.options import BesideOptions, BodyOptions
 
 Index = NDArray[np.intp]
@@ -23,8 +23,8 @@ Index = NDArray[np.intp]
 _CERTAIN = 1e-6
 
 
-def with_those_beside(
-    p_static: NDArray[np.float32], surface: Surface, options: BesideOptions, threads: int = 1
+def smooth_mean_field(
+    p_static: NDArray[np.float32], surface: SurfelMap, options: BesideOptions, threads: int = 1
 ) -> NDArray[np.float32]:
     """(E,) P(static) by the looks at each element alone (E,) and by the elements beside it.
 
@@ -52,7 +52,7 @@ _SCATTERS = 2.5  # of end points about their surface, within which a beam ended 
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class ObstacleSurfels:
     """Which of E elements are of what stands on the ground.
 
     Attributes:
@@ -68,27 +68,29 @@ class Standing:
     column: int
 
 
-def standing_on(ground: Ground, surface: Surface, options: BodyOptions) -> Standing | None:
+def select_obstacles(
+    ground: GroundMap, surface: SurfelMap, options: BodyOptions
+) -> ObstacleSurfels | None:
     """What stands on the ground; None where none was seen, and nobody knows, or wants to."""
     if not (options.enabled and ground.seen):
         return None
     if not isinstance(surface, _core.Surface3D):
         raise TypeError("surface: expected one in space")
     stands, height = np.empty(surface.size, np.bool_), np.empty(surface.size, np.float32)
-    for rows in blocks_of(surface):
+    for rows in iter_surfel_rows(surface):
         means = surface.elements(rows)[1]
         below = ground.at(means[:, :2])
         above = means[:, 2] - below
         stands[slice(*rows)] = (above > options.low) & (above < options.high)
         height[slice(*rows)] = below
     column = max(1, round(options.column / surface.resolution))
-    return Standing(surface, stands, height, column)
+    return ObstacleSurfels(surface, stands, height, column)
 
 
-def with_bodies(
+def pool_clusters(
     p_static: NDArray[np.float32],
     change: NDArray[np.float32],
-    standing: Standing | None,
+    standing: ObstacleSurfels | None,
     recording: Recording,
     T_map_sensor: Float,
     options: BodyOptions,
@@ -114,13 +116,13 @@ def with_bodies(
         column=standing.column,
         fewest=options.fewest,
     )
-    for scans, beams, offset in chunks(recording):
+    for scans, beams, offset in iter_chunks(recording):
         points, hit = recording.points[beams], recording.hit[beams]
         bodies.add(points, hit, offset, T_map_sensor[scans], threads)
-    return lowered(p_static, bodies.means(), options)
+    return apply_pooled_evidence(p_static, bodies.means(), options)
 
 
-def lowered(
+def apply_pooled_evidence(
     p_static: NDArray[np.float32], means: NDArray[np.float32], options: BodyOptions
 ) -> NDArray[np.float32]:
     """(E,) lowered to log odds of slope (least - mean), -most at least, where that is negative.
@@ -138,7 +140,7 @@ def lowered(
 
 
 @dataclass(frozen=True, eq=False)
-class Feet:
+class GroundContact:
     """Asks of beams that end on the ground whether they met the feet of something that moves.
 
     Attributes:
@@ -148,7 +150,7 @@ class Feet:
         least: m above the ground from where on a beam did not end on it.
     """
 
-    standing: Standing
+    standing: ObstacleSurfels
     p_static: NDArray[np.float32]
     low: float
     least: float
@@ -186,17 +188,17 @@ class Feet:
         )
 
 
-def feet_of(
-    standing: Standing | None, p_static: NDArray[np.float32], options: BodyOptions
-) -> Feet | None:
+def make_ground_contact(
+    standing: ObstacleSurfels | None, p_static: NDArray[np.float32], options: BodyOptions
+) -> GroundContact | None:
     """Feet, as far as end points that scatter can tell them from the ground."""
     if standing is None:
         return None
     least = max(options.foot, _SCATTERS * standing.surface.scatter)
-    return Feet(standing, p_static, options.low, least)
+    return GroundContact(standing, p_static, options.low, least)
 
 
-def pairs_near(cells: NDArray[np.int64], distance: float) -> Index:
+def neighbor_pairs(cells: NDArray[np.int64], distance: float) -> Index:
     """(P, 2) which of the cells (K, D) lie within a distance of each other, in cells."""
     if not len(cells):
         return np.empty((0, 2), np.intp)
@@ -205,7 +207,7 @@ def pairs_near(cells: NDArray[np.int64], distance: float) -> Index:
     )
 
 
-def components(pairs: Index, n: int) -> list[Index]:
+def connected_components(pairs: Index, n: int) -> list[Index]:
     """The members, rising, of every set of 0 to n - 1 that the pairs (P, 2) connect."""
     if n == 0:
         return []

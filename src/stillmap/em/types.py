@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.arrays import finite
+from stillmap.core.arrays import finite_rows
 
 if TYPE_CHECKING:
-    from stillmap.em.ground import Ground
+    from stillmap.em.ground import GroundMap
 
 
 @dataclass(frozen=True, eq=False)
-class Changed:
+class ChangedCells:
     """K cells; what each of them says is little, but many side by side may say the same.
 
     Attributes:
@@ -63,7 +63,7 @@ class CellProbabilities:
 
 
 @dataclass(frozen=True, eq=False)
-class NoReturn:
+class NoReturnModel:
     """How far beams without a return are believed; fewer than three in a row are not at all.
 
     Attributes:
@@ -76,7 +76,7 @@ class NoReturn:
 
 
 @dataclass(frozen=True, eq=False)
-class Expectations:
+class EStepResult:
     """One E-step.
 
     Attributes:
@@ -94,12 +94,12 @@ class Expectations:
     likelihood: Likelihood
     occupied: CellProbabilities | None = None
     learned: dict[str, object] = field(default_factory=dict)
-    no_return: NoReturn | None = None
-    changed: "Changed | None" = None
-    ground: "Ground | None" = None
+    no_return: NoReturnModel | None = None
+    changed: "ChangedCells | None" = None
+    ground: "GroundMap | None" = None
 
 
-def per_beam(
+def fill_beams(
     points: NDArray[np.float32],
     hit: NDArray[np.bool_],
     values: NDArray[np.float32],
@@ -107,5 +107,5 @@ def per_beam(
 ) -> NDArray[np.float32]:
     """(M,) `values` for the hits, the prior at maximum range, NaN for unusable beams."""
     e = np.where(hit, values, np.float32(prior)).astype(np.float32, copy=False)
-    e[~finite(points)] = np.nan
+    e[~finite_rows(points)] = np.nan
     return e

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import ArrayBuilder, iter_blocks
 from stillmap.core.recording import Recording
-from stillmap.em import ChangeOptions, look_numbers
-from stillmap.em.changepoints import OFTEN
-from stillmap.em.spatial_prior import components, pairs_near
+from stillmap.em import ChangeOptions, time_bin_index
+from stillmap.em.changepoints import MIN_RECURRING_CHANGES
+from stillmap.em.spatial_prior import connected_components, neighbor_pairs
 from stillmap.mapping.doors import compute_swept_cells
 
 Float = NDArray[np.float64]
@@ -189,7 +189,7 @@ def detect_changes(
         options: see ChangeOptions.
     """
     changed = np.flatnonzero((courses.p_changing > _SURE) & (courses.count > 0))
-    often = courses.count[changed] >= OFTEN
+    often = courses.count[changed] >= MIN_RECURRING_CHANGES
     stamps = _Stamps(recording, look)
     events = _events(courses, changed[~often], stamps)
     out = []
@@ -220,7 +220,7 @@ class _Stamps:
     """When looks were: their first and last scans."""
 
     def __init__(self, recording: Recording, look: float) -> None:
-        number = look_numbers(recording, look)
+        number = time_bin_index(recording, look)
         begins = np.flatnonzero(np.diff(number, prepend=number[:1] - 1))
         ends = np.append(begins[1:], len(number)) - 1
         self._number = number[begins]
@@ -249,12 +249,12 @@ def _groups(
 ) -> list[_Events]:
     """Events of the same kind near each other, at times that may be the same."""
     slack = round(options.together * 1e9)
-    pairs = pairs_near(courses.cells[events.cell], options.near / resolution)
+    pairs = neighbor_pairs(courses.cells[events.cell], options.near / resolution)
     i, j = pairs.T
     begin = np.maximum(events.before[i], events.before[j])
     end = np.minimum(events.after[i], events.after[j])
     fits = (events.came[i] == events.came[j]) & (begin < end + slack)
-    return [events.of(one) for one in components(pairs[fits], len(events.cell))]
+    return [events.of(one) for one in connected_components(pairs[fits], len(events.cell))]
 
 
 def _told_apart(
@@ -288,8 +288,8 @@ def _coming_and_going(
 ) -> list[Change]:
     """Places that changed again and again: doors, gates, bays that are filled and emptied."""
     out = []
-    pairs = pairs_near(courses.cells[often], options.near / resolution)
-    for one in components(pairs, len(often)):
+    pairs = neighbor_pairs(courses.cells[often], options.near / resolution)
+    for one in connected_components(pairs, len(often)):
         if len(one) < options.least:
             continue
         chosen = often[one]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
-from stillmap.em import Changed, ChangeOptions
+from stillmap.em import ChangedCells, ChangeOptions
 from stillmap.mapping.change_detection import Change, detect_changes
 from stillmap.mapping.dwell_time import measure_dwell_times
 
@@ -16,7 +16,7 @@ _LARGE = 0.7  # m2 of surface that a thing shows at least
 
 
 def detect_changes_3d(
-    changed: Changed,
+    changed: ChangedCells,
     recording: Recording,
     poses: NDArray[np.float64],
     resolution: float,
@@ -59,7 +59,7 @@ class _Cells:
     between: NDArray[np.int32]
 
     @classmethod
-    def of(cls, changed: Changed, least: float, looks: float) -> "_Cells":
+    def of(cls, changed: ChangedCells, least: float, looks: float) -> "_Cells":
         """Those that were as before, and otherwise, for so many looks of all of them at least."""
         before, after = changed.between[..., 0], changed.between[..., 1]
         once = (after[:, 1] >= least) & (looks - before[:, 1] >= least)

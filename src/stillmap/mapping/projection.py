@@ -20,7 +20,7 @@ from stillmap.core.arrays import ArrayBuilder, finite_rows, first_index_per_grou
 from stillmap.core.config import option
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
-from stillmap.em import Ground
+from stillmap.em import GroundMap
 
 Float = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ class PlanarProjection:
 def project_to_plane(
     recording: Recording,
     poses: Float,
-    ground: Ground,
+    ground: GroundMap,
     options: BandOptions,
     cell: float,
     open_space: bool,
@@ -139,7 +139,7 @@ def _of_scan(
     points: NDArray[np.float32],
     hit: NDArray[np.bool_],
     T: Float,
-    ground: Ground,
+    ground: GroundMap,
     heights: tuple[float, float, float],
     cell: float,
     open_space: bool,
@@ -185,7 +185,7 @@ def _share_within(start: float, above: Float, low: float, top: float) -> Float:
 
 
 def project_cells(
-    known: em.CellProbabilities, ground: Ground, options: BandOptions, cell: float
+    known: em.CellProbabilities, ground: GroundMap, options: BandOptions, cell: float
 ) -> em.CellProbabilities:
     """The columns of a plan in which something stands within the band.
 

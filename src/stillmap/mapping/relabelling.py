@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from stillmap import em
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
-from stillmap.em.observations import chunks
+from stillmap.em.observations import iter_chunks
 from stillmap.mapping.change_detection import Change
 
 Float = NDArray[np.float64]
@@ -20,7 +20,7 @@ def relabel_changes(
     poses: Float,
     p_static: Labels,
     occupied: em.CellProbabilities,
-    courses: em.Courses,
+    courses: em.CellHistories,
     changes: list[Change],
     state: em.MapState,
     threads: int = 1,
@@ -48,7 +48,7 @@ def relabel_changes(
         arrays.copy(p_static, recording.scratch),
         recording.T_map_sensor(poses),
     )
-    for scans, beams, offset in chunks(recording, beside=[out]):
+    for scans, beams, offset in iter_chunks(recording, beside=[out]):
         element = courses.surface.elements_of(
             recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans], threads
         )

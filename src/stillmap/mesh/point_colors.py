@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.camera import project
 from stillmap.core.parallel import map_ordered
-from stillmap.em.observations import Chunk, chunks
+from stillmap.em.observations import Chunk, iter_chunks
 from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
-from stillmap.mesh.background import Ahead
-from stillmap.mesh.inputs import Sources
-from stillmap.mesh.objects.segmentation import NOBODY, Moves
+from stillmap.mesh.background import Background
+from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.objects.segmentation import NO_OWNER, DynamicReturns
 from stillmap.mesh.options import MeshOptions
-from stillmap.mesh.texture.atlas import GREY, Textured
+from stillmap.mesh.texture.atlas import GRAY, Textured
 from stillmap.mesh.texture.baking import bilinear
-from stillmap.mesh.texture.occluders import Cuboid, Thing, at_time, in_the_way
+from stillmap.mesh.texture.occluders import OrientedBox, TrackedBox, boxes_at, occlusion_probability
 from stillmap.mesh.texture.point_colors import PaintedMesh, depth_inside, not_grey
 from stillmap.mesh.texture.views import View
 
@@ -51,15 +51,15 @@ class _Seen(NamedTuple):
     owner: NDArray[np.intp]
 
 
-class Moving:
+class TrackedReturns:
     """The dynamic beams on things that are followed, to be asked for by time."""
 
-    def __init__(self, sources: Sources, moves: Moves) -> None:
+    def __init__(self, sources: MeshInputs, moves: DynamicReturns) -> None:
         self.sources = sources
         place = {one.box.object_id: number for number, one in enumerate(sources.things)}
         ids, of = np.unique(moves.owner, return_inverse=True)
-        owner = np.array([place.get(int(one), NOBODY) for one in ids], np.intp)[of]
-        kept = np.flatnonzero(moves.dynamic & (owner != NOBODY))
+        owner = np.array([place.get(int(one), NO_OWNER) for one in ids], np.intp)[of]
+        kept = np.flatnonzero(moves.dynamic & (owner != NO_OWNER))
         kept = kept[np.argsort(moves.seconds[kept], kind="stable")]
         self._all = _Seen(moves.beam[kept], moves.ends[kept], moves.seconds[kept], owner[kept])
 
@@ -72,12 +72,12 @@ class Moving:
         return _Seen(seen.beam[then], seen.ends[then], seen.seconds[then], seen.owner[then])
 
 
-def tint_moving(
+def color_moving(
     out: Colours,
     late: NDArray[np.float32],
-    moving: Moving,
+    moving: TrackedReturns,
     number: int,
-    place: Ahead,
+    place: Background,
     options: MeshOptions,
 ) -> None:
     """Colours what moves and is seen in a picture, where none nearer in time shows it.
@@ -117,7 +117,7 @@ def tint_moving(
     late[seen.beam[shown]] = away[shown]
 
 
-def _carried(seen: _Seen, things: Sequence[Thing], now: float) -> Float:
+def _carried(seen: _Seen, things: Sequence[TrackedBox], now: float) -> Float:
     """(n, 3) where the ends are once each has gone on with its thing to a time."""
     out = seen.ends.copy()
     for number in np.unique(seen.owner).tolist():
@@ -130,7 +130,7 @@ def _within_outlines(
     seen: _Seen,
     local: Float,
     shown: Bool,
-    things: Sequence[Thing],
+    things: Sequence[TrackedBox],
     now: float,
     options: MeshOptions,
 ) -> Bool:
@@ -161,7 +161,7 @@ def _within_outlines(
 def _free(
     points: Float,
     owner: NDArray[np.intp],
-    things: Sequence[Thing],
+    things: Sequence[TrackedBox],
     view: View,
     now: float,
     options: MeshOptions,
@@ -172,15 +172,15 @@ def _free(
     """
     choice, free = options.choice, np.ones(len(points))
     for number, thing in enumerate(things):
-        for cuboid in at_time([thing], now):
+        for cuboid in boxes_at([thing], now):
             mine = (owner == number) | _inside(cuboid, points, choice.margin)
             rest = np.flatnonzero(~mine)
-            hidden = in_the_way([cuboid], view.place, points[rest], choice.margin, choice.sigma)
+            hidden = occlusion_probability([cuboid], view.place, points[rest], choice.margin, choice.sigma)
             free[rest] *= 1.0 - hidden
     return free >= choice.least
 
 
-def _inside(cuboid: Cuboid, points: Float, margin: float) -> Bool:
+def _inside(cuboid: OrientedBox, points: Float, margin: float) -> Bool:
     return np.asarray((np.abs(cuboid.local(points)) <= cuboid.half + margin).all(axis=1))
 
 
@@ -188,7 +188,7 @@ _TOGETHER = 1 << 16  # points
 
 
 @dataclass(frozen=True, eq=False)
-class Tints:
+class PointColors:
     """Colours of the ends of M beams.
 
     Attributes:
@@ -201,15 +201,15 @@ class Tints:
     counts: dict[str, int]
 
 
-def tinted(
-    sources: Sources,
+def color_points(
+    sources: MeshInputs,
     textured: Textured,
-    place: Ahead,
-    moves: Moves,
+    place: Background,
+    moves: DynamicReturns,
     options: MeshOptions,
     threads: int = 1,
     tell: Tell | None = None,
-) -> Tints:
+) -> PointColors:
     """The colour of each beam's end.
 
     What lies on the surface of the place has the colour that is painted there: of a picture that
@@ -231,28 +231,28 @@ def tinted(
     scans, n = recording.n_scans, recording.n_scans + len(place.views)
     painted = PaintedMesh(textured, options.points.off)
     T_map_sensor = sources.seen.T_map_sensor(sources.poses)
-    for chunk in chunks(sources.seen, beside=[sources.p_static, out]):
-        out[chunk.beams] = GREY
+    for chunk in iter_chunks(sources.seen, beside=[sources.p_static, out]):
+        out[chunk.beams] = GRAY
         _tint_static(out, chunk, sources, T_map_sensor, painted, threads)
         if tell is not None:
             tell(chunk.scans.stop, n)
     late = recording.per_beam(np.float32)
     for block in arrays.iter_blocks(late):
         late[block] = np.inf
-    moving = Moving(sources, moves)
+    moving = TrackedReturns(sources, moves)
     for number in range(len(place.views)):
-        tint_moving(out, late, moving, number, place, options)
+        color_moving(out, late, moving, number, place, options)
         sources.seen.let_go(sources.p_static, out, late)
         if tell is not None:
             tell(scans + number + 1, n)
-    return Tints(out, _counts(out, sources))
+    return PointColors(out, _counts(out, sources))
 
 
-def _counts(colours: Colours, sources: Sources) -> dict[str, int]:
+def _counts(colours: Colours, sources: MeshInputs) -> dict[str, int]:
     hit, p_static = sources.seen.hit, sources.p_static
     out = dict.fromkeys(("static", "static_coloured", "dynamic", "dynamic_coloured"), 0)
     for block in arrays.iter_blocks(hit, p_static, colours):
-        has, still = (colours[block] != GREY).any(axis=1), p_static[block] >= DYNAMIC_BELOW
+        has, still = (colours[block] != GRAY).any(axis=1), p_static[block] >= DYNAMIC_BELOW
         for name, part in (("static", hit[block] & still), ("dynamic", hit[block] & ~still)):
             out[name] += int(np.count_nonzero(part))
             out[f"{name}_coloured"] += int(np.count_nonzero(part & has))
@@ -262,7 +262,7 @@ def _counts(colours: Colours, sources: Sources) -> dict[str, int]:
 def _tint_static(
     out: Colours,
     chunk: Chunk,
-    sources: Sources,
+    sources: MeshInputs,
     T_map_sensor: Float,
     painted: PaintedMesh,
     threads: int,

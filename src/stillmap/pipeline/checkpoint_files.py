@@ -12,24 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em, slam
-from stillmap.core.arrays import blocks
+from stillmap.core.arrays import iter_blocks
 from stillmap.core.config import to_dict
 from stillmap.core.errors import InputError
-from stillmap.core.json import jsonable, version
+from stillmap.core.json import to_jsonable, version
 from stillmap.core.recording import Recording
 from stillmap.pipeline.em_loop import Reached
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.progress import Best, IterationRecord, Loop
 from stillmap.pipeline.snapshots import Snapshot
-from stillmap.slam.pose_graph import Relation
+from stillmap.slam.pose_graph import Constraint
 
 Arrays = dict[str, NDArray[Any]]
 
 Float = NDArray[np.float64]
 
-_CHANGED = [field.name for field in dataclasses.fields(em.Changed)]
+_CHANGED = [field.name for field in dataclasses.fields(em.ChangedCells)]
 
-_DOUBTS = [field.name for field in dataclasses.fields(slam.Doubts)]
+_DOUBTS = [field.name for field in dataclasses.fields(slam.Diagnostics)]
 
 
 def packed(loop: Loop) -> tuple[dict[str, Any], Arrays]:
@@ -60,7 +60,7 @@ def unpacked(
     best, reached = values["best"], values["reached"]
     way = _way("reached", reached, arrays)
     D = way["poses"].shape[-1] - 1
-    grid = em.empty_grid(D, options.slam.resolution)
+    grid = em.make_grid(D, options.slam.resolution)
     doubts = way.pop("doubts")
     lists = {name: getattr(doubts, name) for name in _DOUBTS}
     number = reached["number"]
@@ -71,7 +71,7 @@ def unpacked(
         window=None if values["window"] is None else tuple(values["window"]),
         best=_best(best, arrays),
         finished=values["finished"],
-        reached=Reached(number, arrays[f"e-{number}"], slam.Mapped(grid=grid, **way, **lists)),
+        reached=Reached(number, arrays[f"e-{number}"], slam.MStepResult(grid=grid, **way, **lists)),
     )
 
 
@@ -98,14 +98,14 @@ def _best(values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Best
         cells, p_occupied = arrays["best.cells"], arrays["best.p_occupied"]
         occupied = em.CellProbabilities(cells, p_occupied, values["free_prior"])
     if "beyond" in values:
-        no_return = em.NoReturn(arrays["best.stops"], values["beyond"])
+        no_return = em.NoReturnModel(arrays["best.stops"], values["beyond"])
     changed = None
     if f"best.changed.{_CHANGED[0]}" in arrays:
-        changed = em.Changed(**{name: arrays[f"best.changed.{name}"] for name in _CHANGED})
+        changed = em.ChangedCells(**{name: arrays[f"best.changed.{name}"] for name in _CHANGED})
     ground = None
     if "sensor_height" in values:
         z, corner = arrays["best.ground.z"], arrays["best.ground.corner"]
-        ground = em.Ground(z, corner, values["sensor_height"], values["ground_seen"])
+        ground = em.GroundMap(z, corner, values["sensor_height"], values["ground_seen"])
     return Best(
         number=number,
         bound=values["bound"],
@@ -120,7 +120,7 @@ def _best(values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Best
     )
 
 
-def _way_packed(name: str, way: Best | slam.Mapped, arrays: Arrays) -> dict[str, Any]:
+def _way_packed(name: str, way: Best | slam.MStepResult, arrays: Arrays) -> dict[str, Any]:
     """Poses, and what is known of them."""
     for part in ("poses", "covariance", "explained"):
         arrays[f"{name}.{part}"] = getattr(way, part)
@@ -131,15 +131,15 @@ def _way_packed(name: str, way: Best | slam.Mapped, arrays: Arrays) -> dict[str,
     arrays[f"{name}.loops.covariance"] = _stacked([c.covariance for c in way.loops], covariance)
     arrays[f"{name}.loops.explained"] = _stacked([c.explained for c in way.loops], ())
     if way.graph is not None:
-        relations = way.graph.relations
+        relations = way.graph.constraints
         between = [[r.first, r.second] for r in relations]
-        arrays[f"{name}.graph.scans"] = way.graph.scans
+        arrays[f"{name}.graph.scans"] = way.graph.keyframes
         arrays[f"{name}.graph.poses"] = way.graph.poses
         arrays[f"{name}.graph.between"] = _stacked(between, (2,), int)
         arrays[f"{name}.graph.T"] = _stacked([r.T for r in relations], pose)
         arrays[f"{name}.graph.covariance"] = _stacked([r.covariance for r in relations], covariance)
     return {
-        "doubts": {field: getattr(way.doubts, field) for field in _DOUBTS},
+        "doubts": {field: getattr(way.diagnostics, field) for field in _DOUBTS},
         "refused": [closure.refused for closure in way.loops],
         "has_graph": way.graph is not None,
     }
@@ -154,19 +154,19 @@ def _way(
     of_loops = rows("loops.scans", "loops.T", "loops.covariance", "loops.explained")
     graph = None
     if values["has_graph"]:
-        graph = slam.Graph(
+        graph = slam.PoseGraph(
             arrays[f"{name}.graph.scans"],
             arrays[f"{name}.graph.poses"],
             [
-                Relation(int(between[0]), int(between[1]), T, covariance)
+                Constraint(int(between[0]), int(between[1]), T, covariance)
                 for between, T, covariance in rows("graph.between", "graph.T", "graph.covariance")
             ],
         )
     return {
         **{part: arrays[f"{name}.{part}"] for part in ("poses", "covariance", "explained")},
-        "doubts": slam.Doubts(**values["doubts"]),
+        "doubts": slam.Diagnostics(**values["doubts"]),
         "loops": [
-            slam.Closure(int(scans[0]), int(scans[1]), T, covariance, float(explained), refused)
+            slam.LoopClosure(int(scans[0]), int(scans[1]), T, covariance, float(explained), refused)
             for (scans, T, covariance, explained), refused in zip(
                 of_loops, values["refused"], strict=True
             )
@@ -215,7 +215,7 @@ def identity(recording: Recording, options: Options, poses: Float | None) -> dic
     chosen = {name: value for name, value in to_dict(options).items() if name not in _NO_MATTER}
     return {
         "version": version(),
-        "options": jsonable(chosen),
+        "options": to_jsonable(chosen),
         "arrays": {name: None if a is None else _hash(a) for name, a in arrays.items()},
     }
 
@@ -247,7 +247,7 @@ def require_same(before: dict[str, Any], now: dict[str, Any], where: str) -> Non
 
 def _hash(array: NDArray[Any]) -> str:
     found = hashlib.blake2b(f"{array.dtype.str} {array.shape}".encode(), digest_size=16)
-    for block in blocks(array):
+    for block in iter_blocks(array):
         found.update(np.ascontiguousarray(array[block]).reshape(-1).view(np.uint8).data)
     return found.hexdigest()
 

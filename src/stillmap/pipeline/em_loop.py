@@ -3,115 +3,51 @@
 import dataclasses
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em, slam
-from stillmap.core.parallel import one_blas_thread, resolved_threads
-from stillmap.core.profiling import Stages
+from stillmap.core.parallel import limit_blas_threads, resolve_threads
+from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
+from stillmap.pipeline.estimate import EmState, Estimate, Iteration, IterationRecord
 from stillmap.pipeline.options import DEFAULTS, Options, resolved
 
 Float = NDArray[np.float64]
 
-# what, iteration (0: after the last), scans done, of how many (0: not counted)
-Progress = Callable[[str, int, int, int], None]
 
+def run_em(
+    recording: Recording,
+    state: EmState,
+    *,
+    poses: Float | None = None,
+    progress: Progress = no_progress,
+    stages: StageTimer | None = None,
+    checkpoint: Callable[[EmState], None] | None = None,
+) -> EmState:
+    """Iterates until the bound stops improving; `state` keeps the best estimate.
 
-def silent(what: str, iteration: int, done: int, total: int) -> None:
-    """Reports progress to nobody."""
-
-
-@dataclass(frozen=True, eq=False)
-class Reached:
-    """What an iteration leaves to the next one.
-
-    Attributes:
-        number: of the iteration, 0 before the first.
-        p_static: (M,) float32, e.
-        mapped: its M-step without the grid; None before the first.
+    Args:
+        recording, poses, progress, stages: see `iterate`.
+        state: of a new run, or of an interrupted one; updated in place.
+        checkpoint: called with the state after every iteration.
     """
-
-    number: int
-    p_static: NDArray[np.float32]
-    mapped: slam.Mapped | None
-
-
-@dataclass(frozen=True, eq=False)
-class Iteration:
-    """One M-step and one E-step.
-
-    Attributes:
-        number: from 1.
-        seen: the recording without the motion during its scans, as `poses` have it.
-        poses: (T, D+1, D+1) T_map_base.
-        covariance: (T, 3, 3) of x, y, heading against the map so far.
-        grid: the sums alpha, beta of (10).
-        weights: (M,) float32, the e that this M-step used; with `poses` they make `grid` again.
-        p_static: (M,) float32, e after this iteration's E-step.
-        likelihood: of the recording after this E-step, for the printed method (5) and its bound.
-        occupied: what the estimator knows of cells beyond the sums, see CellProbabilities.
-        learned: what it learned from the recording.
-        changed_share: share of hits whose e moved by more than 0.1.
-        explained: (T,) share of each scan's beams that the map so far explained.
-        doubts: scans where odometry and the map so far do not agree.
-        loops: attempts at closing loops, accepted or refused.
-        held_out: nats per beam, see `em.held_out_log_likelihood`; None where it is not computed.
-        seconds: wall clock.
-        graph: the pose graph of these loops; None where poses were given or none were looked for.
-        no_return, changed, ground: see `em.Expectations`.
-    """
-
-    number: int
-    seen: Recording
-    poses: Float
-    covariance: Float
-    grid: em.Grid
-    weights: NDArray[np.float32]
-    p_static: NDArray[np.float32]
-    likelihood: em.Likelihood
-    occupied: em.CellProbabilities | None
-    learned: dict[str, object]
-    changed_share: float
-    explained: Float
-    doubts: slam.Doubts
-    loops: list[slam.Closure]
-    held_out: float | None
-    seconds: float
-    graph: slam.Graph | None = None
-    no_return: em.NoReturn | None = None
-    changed: em.Changed | None = None
-    ground: em.Ground | None = None
-
-    @property
-    def reached(self) -> Reached:
-        """What the next one begins with."""
-        doubts = self.doubts
-        mapped = slam.Mapped(
-            self.poses,
-            self.covariance,
-            type(self.grid)(self.grid.resolution),  # grids are large
-            self.explained,
-            doubts.widened,
-            doubts.disagreeing,
-            doubts.breaks,
-            doubts.apart,
-            self.loops,
-            self.graph,
-        )
-        return Reached(self.number, self.p_static, mapped)
-
-    @property
-    def occupancy(self) -> em.OccupancyMap:
-        """The map of this iteration, made anew at every call; every beam is believed. 2D only."""
-        return em.occupancy_map(self.grid, self.occupied)
-
-    def part(self, box: em.Box) -> em.OccupancyMap:
-        """The cells of a box of that map."""
-        return em.occupancy_map(self.grid, self.occupied, box=box)
+    steps = iterate(
+        recording,
+        state.options,
+        poses=poses,
+        progress=progress,
+        stages=stages,
+        after=state.latest,
+    )
+    while not state.converged and (iteration := next(steps, None)) is not None:
+        state.update(iteration)
+        del iteration  # its grid is large
+        if checkpoint is not None:
+            checkpoint(state)
+    return state
 
 
 def iterate(
@@ -119,26 +55,28 @@ def iterate(
     options: Options = DEFAULTS,
     *,
     poses: Float | None = None,
-    progress: Progress = silent,
-    stages: Stages | None = None,
+    progress: Progress = no_progress,
+    stages: StageTimer | None = None,
     scratch: Path | None = None,
-    after: Reached | None = None,
+    after: Estimate | None = None,
 ) -> Iterator[Iteration]:
-    """Interleaves mapping and the estimation of what is static; the caller decides when to stop.
+    """Alternates the M-step and the E-step; the caller decides when to stop.
 
     Args:
         recording: at least one scan.
         options: see Options.
         poses: (T, D+1, D+1) T_map_base to keep instead of estimating them.
-        progress: called with what is done, the iteration, scans done, and of how many; these are 0
-            for what is not counted.
+        progress: called with the stage, the iteration, scans done, and of how many.
         stages: where time and memory per stage are noted.
-        scratch: folder for what is known of each beam where that is too large for memory; such
-            files have no name and are gone with the process. None: the system's temporary folder.
-        after: an iteration of the same recording, options and poses, to go on from.
+        scratch: folder for per-beam arrays too large for memory; the files have no name and vanish
+            with the process. None: the system's temporary folder.
+        after: estimate of an earlier iteration with the same arguments, to continue from.
 
     Yields:
-        one Iteration after the other, `options.em.max_iterations` of them at most.
+        at most `options.em.max_iterations` iterations.
+
+    Raises:
+        ValueError: poses of another shape.
     """
     D = recording.dimension
     if poses is not None and poses.shape != (recording.n_scans, D + 1, D + 1):
@@ -146,71 +84,70 @@ def iterate(
         raise ValueError(f"poses: expected {wanted}, got {poses.shape}")
     if scratch is not None:
         recording = dataclasses.replace(recording, scratch=scratch)
-    stages = stages or Stages()
-    options = resolved(options, recording)
-    threads = resolved_threads(options.threads)
-    if after is None:  # e := p(c = 1)
-        e = em.initial_expectations(recording, options.estimator, options.em)
-        after = Reached(0, e, None)
-    for number in range(after.number + 1, em.iterations(options.estimator, options.em) + 1):
+    stages, options = stages or StageTimer(), resolved(options, recording)
+    threads = resolve_threads(options.threads)
+    first = 1 if after is None else after.number + 1
+    for number in range(first, em.max_iterations(options.estimator, options.em) + 1):
         started = time.perf_counter()
-        e, before = after.p_static, after.mapped
-        # the first labels change most: from the second poses on, a sweep follows what is left
-        start = before if after.number > 1 else None
-        with stages.measure("m_step"), one_blas_thread():  # (9)-(15)
-            mapped = slam.m_step(
-                recording,
-                e,
-                options.slam,
-                poses,
-                threads,
-                _at(progress, number),
-                start=start,
-                before=None if before is None else before.poses,
-                sums=em.needs_sums(D, options.estimator),
-            )
-            seen = slam.deskewed(recording, mapped.poses, options.slam, threads)
+        if after is None:
+            e = em.initial_p_static(recording, options.estimator, options.em)  # e := p(c = 1)
+        else:
+            e = after.p_static
+        with stages.measure("m_step"), limit_blas_threads():  # (9)-(15)
+            m_step = _m_step(recording, e, after, options, poses, _tell(progress, number))
+            deskewed = slam.deskew_recording(recording, m_step.poses, options.slam, threads)
         progress("labelling beams", number, 0, 0)
         with stages.measure("e_step"):  # (6), (8) or its successor, and the bound
-            found = em.e_step(
-                seen, mapped.poses, mapped.grid, options.estimator, options.em, threads
+            e_step = em.e_step(
+                deskewed, m_step.poses, m_step.grid, options.estimator, options.em, threads
             )
         with stages.measure("held_out"):
-            held_out = em.held_out_log_likelihood(
-                seen,
-                mapped.poses,
-                found.p_static,
+            held_out = em.score_held_out_scans(
+                deskewed,
+                m_step.poses,
+                e_step.p_static,
                 options.slam.resolution,
-                options.em.held_out if D == 2 else 0,  # lengths through all voxels: too large
+                options.em.held_out if D == 2 else 0,  # path lengths in 3D need too much memory
                 threads,
             )
-        iteration = Iteration(
+        record = IterationRecord(
             number=number,
-            seen=seen,
-            poses=mapped.poses,
-            covariance=mapped.covariance,
-            grid=mapped.grid,
-            weights=e,
-            p_static=found.p_static,
-            likelihood=found.likelihood,
-            occupied=found.occupied,
-            learned=found.learned,
-            changed_share=em.changed_share(e, found.p_static, recording.hit),
-            explained=mapped.explained,
-            doubts=mapped.doubts,
-            loops=mapped.loops,
-            held_out=held_out,
+            expected_log_likelihood=e_step.likelihood.expected,  # (5)
+            bound=e_step.likelihood.bound,
+            changed_share=em.changed_share(e, e_step.p_static, recording.hit),
             seconds=time.perf_counter() - started,
-            graph=mapped.graph,
-            no_return=found.no_return,
-            changed=found.changed,
-            ground=found.ground,
+            held_out_log_likelihood=held_out,
         )
-        after = iteration.reached
-        del mapped, found, seen  # grids are large: only the caller decides how long one lives
+        iteration = Iteration(Estimate(number, e, m_step, e_step), record, deskewed)
+        after = iteration.estimate.for_next_iteration()
+        del m_step, e_step, deskewed  # grids are large: only the caller decides how long one lives
         yield iteration
         del iteration
 
 
-def _at(progress: Progress, number: int) -> slam.Told:
-    return lambda what, done, total: progress(what, number, done, total)
+def _m_step(
+    recording: Recording,
+    e: NDArray[np.float32],
+    before: Estimate | None,
+    options: Options,
+    poses: Float | None,
+    progress: slam.StepProgress,
+) -> slam.MStepResult:
+    """The most likely poses given e (9), and the sums of the map (10)-(15)."""
+    return slam.m_step(
+        recording,
+        e,
+        options.slam,
+        poses,
+        resolve_threads(options.threads),
+        progress,
+        # the first labels change most: from the second poses on, refinement is enough
+        start=before.m_step if before is not None and before.number > 1 else None,
+        before=None if before is None else before.poses,
+        sums=em.needs_sums(recording.dimension, options.estimator),
+    )
+
+
+def _tell(progress: Progress, number: int) -> slam.StepProgress:
+    """The progress of one iteration's M-step."""
+    return lambda stage, done, total: progress(stage, number, done, total)

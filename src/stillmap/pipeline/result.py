@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import em, slam
-from stillmap.core.parallel import one_blas_thread
-from stillmap.core.profiling import Progress, Stages, no_progress
+from stillmap.core.parallel import limit_blas_threads
+from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.mapping import Change
-from stillmap.pipeline.diagnostics import cautions
+from stillmap.pipeline.diagnostics import find_warnings
 from stillmap.pipeline.em_loop import run_em
 from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
@@ -81,7 +81,7 @@ class Result:
         return self.maps.raw
 
     @property
-    def evidence(self) -> em.Evidence:
+    def evidence(self) -> em.Coverage:
         """Observation counts of the same cells."""
         return self.maps.evidence
 
@@ -103,7 +103,7 @@ class Result:
     @property
     def doubts(self) -> slam.Diagnostics:
         """Scans where odometry and scan matching disagree."""
-        return self.estimate.m_step.doubts
+        return self.estimate.m_step.diagnostics
 
     @property
     def graph(self) -> slam.PoseGraph | None:
@@ -127,14 +127,14 @@ class Result:
         save(self, Path(path), overwrite, models=models)
 
 
-@one_blas_thread()
+@limit_blas_threads()
 def build(
     recording: Recording,
     options: Options = DEFAULTS,
     *,
     poses: Float | None = None,
     progress: Progress = no_progress,
-    stages: Stages | None = None,
+    stages: StageTimer | None = None,
     scratch: Path | None = None,
     resume: EmState | None = None,
     checkpoint: Callable[[EmState], None] | None = None,
@@ -154,7 +154,7 @@ def build(
         raise ValueError("recording: expected at least one scan")
     if scratch is not None:
         recording = dataclasses.replace(recording, scratch=scratch)
-    stages = stages or Stages()
+    stages = stages or StageTimer()
     options = resolved(options, recording)
     state = resume or EmState(options)
     # given poses leave nothing to iterate on in 3D, where the E-step does not depend on the labels
@@ -165,7 +165,7 @@ def build(
     return _finish(state, recording, progress, stages)
 
 
-def _finish(state: EmState, recording: Recording, progress: Progress, stages: Stages) -> Result:
+def _finish(state: EmState, recording: Recording, progress: Progress, stages: StageTimer) -> Result:
     """What follows from the best estimate: last labels, maps, objects, changes."""
     options = state.options
     progress("labelling beams", 0, 0, 0)
@@ -185,7 +185,7 @@ def _finish(state: EmState, recording: Recording, progress: Progress, stages: St
         estimate=estimate,
         maps=maps,
         converged=state.converged,
-        warnings=cautions(state.records, estimate, recording, options),
+        warnings=find_warnings(state.records, estimate, recording, options),
         objects=objects,
         traffic=crossings,
         changes=changes,

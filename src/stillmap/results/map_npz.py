@@ -11,13 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npz
-from stillmap.results.protocols import (
-    ChangeLike,
-    EvidenceLike,
-    MapLike,
-    OccupancyMapLike,
-    ResultLike,
-)
+from stillmap.em import Coverage, OccupancyMap
+from stillmap.mapping import Change
+from stillmap.pipeline.result import Result
 
 # what `changed` says of a cell
 CHANGED = {"came": 1, "left": 2, "comes and goes": 3}
@@ -25,9 +21,9 @@ CHANGED = {"came": 1, "left": 2, "comes and goes": 3}
 
 def write_map_npz(
     path: Path,
-    occupancy: OccupancyMapLike,
-    changes: Sequence[ChangeLike] = (),
-    evidence: EvidenceLike | None = None,
+    occupancy: OccupancyMap,
+    changes: Sequence[Change] = (),
+    evidence: Coverage | None = None,
 ) -> None:
     """Write `p_occupied`, `alpha`, `beta` (H, W), `origin` (x, y, yaw), `resolution` in metres.
 
@@ -53,7 +49,7 @@ def write_map_npz(
     write_npz(path, arrays)
 
 
-def changed_cells(occupancy: MapLike, changes: Sequence[ChangeLike]) -> NDArray[np.uint8]:
+def changed_cells(occupancy: OccupancyMap, changes: Sequence[Change]) -> NDArray[np.uint8]:
     """(H, W) how each cell changed, 0: it did not. The last change of several is told."""
     height, width = occupancy.p_occupied.shape
     out = np.zeros((height, width), np.uint8)
@@ -65,7 +61,7 @@ def changed_cells(occupancy: MapLike, changes: Sequence[ChangeLike]) -> NDArray[
     return out
 
 
-def known_area(result: ResultLike) -> dict[str, float]:
+def known_area(result: Result) -> dict[str, float]:
     """`known`: m2 of the map of which beams tell something; `thin`: of these on thin evidence."""
     cell = float(result.map.resolution) ** 2
     known = result.map.p_occupied.size - int(np.count_nonzero(np.isnan(result.map.p_occupied)))

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import blocks, write_npy
+from stillmap.core.arrays import iter_blocks, write_npy
 from stillmap.core.recording import Recording
-from stillmap.em.observations import chunks
+from stillmap.em.observations import iter_chunks
 from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
-from stillmap.results.protocols import ResultLike
+from stillmap.pipeline.result import Result
 
 FIELDS = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("p_static", "<f4")]
 
@@ -40,7 +40,7 @@ def write_clouds(
         colours: (M, 3), None: without.
     """
     hits = dynamic = 0
-    for block in blocks(seen.hit, p_static):
+    for block in iter_blocks(seen.hit, p_static):
         hit = seen.hit[block]
         hits += int(np.count_nonzero(hit))
         dynamic += int(np.count_nonzero(hit & (p_static[block] < DYNAMIC_BELOW)))
@@ -81,7 +81,7 @@ def _vertices(
     T_map_sensor = seen.T_map_sensor(poses)
     fields = FIELDS if colours is None else FIELDS + COLOURS
     beside: list[NDArray[Any]] = [p_static] if colours is None else [p_static, colours]
-    for scans, beams, offset in chunks(seen, beside=beside):
+    for scans, beams, offset in iter_chunks(seen, beside=beside):
         for t, first, last in zip(
             range(scans.start, scans.stop), offset[:-1], offset[1:], strict=True
         ):
@@ -97,7 +97,7 @@ def _vertices(
             yield vertices
 
 
-def write_beams(folder: Path, result: ResultLike, colours: NDArray[np.uint8] | None = None) -> None:
+def write_beams(folder: Path, result: Result, colours: NDArray[np.uint8] | None = None) -> None:
     """Write `stamp_ns` (T,), `offset` (T+1,), `p_static` (M,) and `hit` (M,) as .npy into `folder`.
 
     `folder` is made. Scan t owns the beams offset[t]:offset[t+1], in the recording's order. Where

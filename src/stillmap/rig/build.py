@@ -18,12 +18,12 @@ from stillmap import em
 from stillmap.core.arrays import copy, iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.em import Ground, ground_of, occupancy_hmm
+from stillmap.em import GroundMap, estimate_ground, occupancy_hmm
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.result import Result
 from stillmap.rig.options import RigOptions
-from stillmap.rig.removal import Cut, cut_out
-from stillmap.rig.trajectory import Ridden, ridden
+from stillmap.rig.removal import BoxBeams, select_box_beams
+from stillmap.rig.trajectory import PosedRecording, pose_recording
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import Box, fit_boxes
 
@@ -36,7 +36,7 @@ _DYNAMIC = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Tilting:
+class TiltingResult:
     """What is known of the recording that builds in 3D, T scans with M beams.
 
     Attributes:
@@ -51,17 +51,17 @@ class Tilting:
     """
 
     recording: Recording
-    seen: Recording
+    deskewed: Recording
     poses: Float
     p_static: NDArray[np.float32]
     objects: list[MovingObject]
-    left_out: int
+    unposed_beams: int
     boxes: int
     learned: dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
-class Flat:
+class PlanarResult:
     """What the flat laser found out, T scans with M beams.
 
     Attributes:
@@ -79,7 +79,7 @@ class Flat:
     share: float
 
     @classmethod
-    def of(cls, result: Result) -> "Flat":
+    def of(cls, result: Result) -> "PlanarResult":
         """What the main job found out about a recording in 2D."""
         seen, p_static = result.seen, result.p_static
         sums = [float(p_static[b][seen.hit[b]].sum(dtype=float)) for b in iter_blocks(p_static)]
@@ -87,7 +87,7 @@ class Flat:
         return cls(seen, result.poses, p_static, result.objects, share)
 
 
-def require_rig(flat: Recording, tilting: Recording, where: str) -> None:
+def check_rig(flat: Recording, tilting: Recording, where: str) -> None:
     """Whether two recordings can be of one rig.
 
     Raises:
@@ -101,7 +101,9 @@ def require_rig(flat: Recording, tilting: Recording, where: str) -> None:
         raise InputError("was not recorded at the same time as the other recording", where=where)
 
 
-def built_in_3d(flat: Flat, recording: Recording, options: Options, threads: int = 1) -> Tilting:
+def build_tilting(
+    flat: PlanarResult, recording: Recording, options: Options, threads: int = 1
+) -> TiltingResult:
     """P(static) of every beam of a laser that another one tells what moves.
 
     Args:
@@ -111,15 +113,15 @@ def built_in_3d(flat: Flat, recording: Recording, options: Options, threads: int
         threads: same result with any number.
     """
     o = options.rig
-    on_way = ridden(recording, flat.seen.stamp_ns, flat.poses, o.pause)
+    on_way = pose_recording(recording, flat.seen.stamp_ns, flat.poses, o.pause)
     ground = _ground(on_way)
     found = _evidence(on_way, ground, options, threads) if o.evidence else None
     static = _prior(on_way.seen, flat.share) if found is None else found.p_static
     boxes = fit_boxes(flat.seen, flat.poses, flat.p_static, flat.objects, options.objects, o.hold)
-    cut = cut_out(boxes, recording, on_way, ground, int(flat.seen.stamp_ns[0]), o)
+    cut = select_box_beams(boxes, recording, on_way, ground, int(flat.seen.stamp_ns[0]), o)
     share = flat.share if found is None else _learned_share(found)
-    p_static = with_boxes(static, cut, share, o, recording.scratch)
-    return Tilting(
+    p_static = apply_boxes(static, cut, share, o, recording.scratch)
+    return TiltingResult(
         recording,
         on_way.seen,
         on_way.poses,
@@ -131,24 +133,26 @@ def built_in_3d(flat: Flat, recording: Recording, options: Options, threads: int
     )
 
 
-def evidence_of(
-    flat: Flat, recording: Recording, options: Options, threads: int = 1
-) -> em.Expectations:
+def label_by_occupancy(
+    flat: PlanarResult, recording: Recording, options: Options, threads: int = 1
+) -> em.EStepResult:
     """What that laser itself says of its beams, from where the flat one knows it was.
 
     Arguments are those of `built_in_3d`.
     """
-    on_way = ridden(recording, flat.seen.stamp_ns, flat.poses, options.rig.pause)
+    on_way = pose_recording(recording, flat.seen.stamp_ns, flat.poses, options.rig.pause)
     return _evidence(on_way, _ground(on_way), options, threads)
 
 
-def _ground(on_way: Ridden) -> Ground:
+def _ground(on_way: PosedRecording) -> GroundMap:
     """By everything that is level: nobody knows yet what moves."""
     all_static = _prior(on_way.seen, 1.0)
-    return ground_of(on_way.seen, on_way.poses, all_static)
+    return estimate_ground(on_way.seen, on_way.poses, all_static)
 
 
-def _evidence(on_way: Ridden, ground: Ground, options: Options, threads: int) -> em.Expectations:
+def _evidence(
+    on_way: PosedRecording, ground: GroundMap, options: Options, threads: int
+) -> em.EStepResult:
     """What the laser itself saw to stay and to go.
 
     A border between voxels lies just above the floor: feet share none with it.
@@ -159,7 +163,7 @@ def _evidence(on_way: Ridden, ground: Ground, options: Options, threads: int) ->
     return occupancy_hmm.e_step(on_way.seen, poses, options.rig.voxel, options.em, threads)
 
 
-def _learned_share(found: em.Expectations) -> float:
+def _learned_share(found: em.EStepResult) -> float:
     """Of what beams ended on, that is static: what is known of a voxel nobody looked at twice."""
     share = found.learned["p_static"]
     if not isinstance(share, float):
@@ -175,9 +179,9 @@ def _prior(seen: Recording, share: float) -> NDArray[np.float32]:
     return out
 
 
-def with_boxes(
+def apply_boxes(
     static: NDArray[np.float32],
-    cut: Sequence[Cut],
+    cut: Sequence[BoxBeams],
     share: float,
     o: RigOptions,
     scratch: Path | None = None,
@@ -209,9 +213,9 @@ def with_boxes(
 def _objects(
     objects: Sequence[MovingObject],
     boxes: Sequence[Box],
-    cut: Sequence[Cut],
-    on_way: Ridden,
-    ground: Ground,
+    cut: Sequence[BoxBeams],
+    on_way: PosedRecording,
+    ground: GroundMap,
     p_static: NDArray[np.float32],
 ) -> list[MovingObject]:
     """What moved, of which there are points in 3D: with its height and these."""

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import beam_stamps_ns
-from stillmap.em import Ground
+from stillmap.em import GroundMap
 from stillmap.rig.options import RigOptions
-from stillmap.rig.trajectory import Ridden
+from stillmap.rig.trajectory import PosedRecording
 from stillmap.tracking.boxes import Box
 
 Float = NDArray[np.float64]
@@ -20,7 +20,7 @@ Index = NDArray[np.intp]
 _WAIST = 1.0  # m; the flat laser lies lower: what stands in a box so far up is what it saw
 
 
-class Cut(NamedTuple):
+class BoxBeams(NamedTuple):
     """What ended in a box.
 
     Attributes:
@@ -32,14 +32,14 @@ class Cut(NamedTuple):
     core: NDArray[np.bool_]
 
 
-def cut_out(
+def select_box_beams(
     boxes: Sequence[Box],
     recording: Recording,
-    on_way: Ridden,
-    ground: Ground,
+    on_way: PosedRecording,
+    ground: GroundMap,
     start_ns: int,
     o: RigOptions,
-) -> list[Cut]:
+) -> list[BoxBeams]:
     """Of each box the beams that ended in it or in its margin.
 
     Args:
@@ -59,7 +59,7 @@ def cut_out(
         stop = int(np.searchsorted(seconds, box.seconds[-1] + box.hold - early, side="right"))
         beams = slice(int(recording.offset[first]), int(recording.offset[stop]))
         if beams.start == beams.stop:
-            out.append(Cut(np.zeros(0, np.intp), np.zeros(0, np.bool_)))
+            out.append(BoxBeams(np.zeros(0, np.intp), np.zeros(0, np.bool_)))
             continue
         at = np.asarray(
             1e-9 * (beam_stamps_ns(recording, slice(first, stop)) - start_ns), np.float64
@@ -71,12 +71,12 @@ def cut_out(
         core = box.contains(at[near], xyz[:, :2], 0.0)
         above = xyz[:, 2] - ground.at(xyz[:, :2])
         tall = o.tallest if 2.0 * max(box.half_size) >= o.long else o.height
-        kept = (above > o.low) & (above <= top_of(above, tall, o.gap))
-        out.append(Cut(beams.start + near[kept], core[kept]))
+        kept = (above > o.low) & (above <= object_height(above, tall, o.gap))
+        out.append(BoxBeams(beams.start + near[kept], core[kept]))
     return out
 
 
-def _ends(on_way: Ridden) -> NDArray[np.float32]:
+def _ends(on_way: PosedRecording) -> NDArray[np.float32]:
     """(M, 3) where hits ended in the map frame, NaN for others."""
     seen = on_way.seen
     ends = seen.per_beam(np.float32, (3,))
@@ -104,7 +104,7 @@ def _near(box: Box, ends: NDArray[np.float32], margin: float) -> NDArray[np.bool
     return np.asarray(((ends[:, :2] >= low) & (ends[:, :2] <= high)).all(axis=1))
 
 
-def top_of(above: Float, tallest: float, gap: float) -> float:
+def object_height(above: Float, tallest: float, gap: float) -> float:
     """Metres above the ground up to where what is connected reaches, from the ground on.
 
     Args:

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from stillmap import em
 from stillmap.core.recording import Recording
 from stillmap.slam import lidar_odometry, loop_closure, loop_closure_3d, odometry_2d
-from stillmap.slam.deskew import deskewed
-from stillmap.slam.odometry_2d import Mapped, SlamOptions
-from stillmap.slam.refinement import sweep
+from stillmap.slam.deskew import deskew_recording
+from stillmap.slam.odometry_2d import MStepResult, SlamOptions
+from stillmap.slam.refinement import refine_poses
 
 Float = NDArray[np.float64]
-Told = Callable[[str, int, int], None]  # what, scans done, of how many
+StepProgress = Callable[[str, int, int], None]  # what, scans done, of how many
 
 
 def m_step(
@@ -24,12 +24,12 @@ def m_step(
     options: SlamOptions,
     poses: Float | None,
     threads: int,
-    progress: Told,
+    progress: StepProgress,
     *,
-    start: Mapped | None = None,
-    before: Float | None = None,
-    sums: bool = True,
-) -> Mapped:
+    start: MStepResult | None = None,
+    earlier_poses: Float | None = None,
+    with_grid: bool = True,
+) -> MStepResult:
     """The most likely poses and map given e: (9), (10)-(15).
 
     Args:
@@ -45,15 +45,15 @@ def m_step(
         sums: whether the sums of (10) are wanted.
     """
     if poses is not None:
-        mapped = _mapped_at(recording, e, options, poses, threads, sums=sums)
+        mapped = _mapped_at(recording, e, options, poses, threads, sums=with_grid)
         progress("mapping", recording.n_scans, recording.n_scans)
         return mapped
     if recording.dimension == 3:
         mapped = _driven(recording, e, options, progress, threads)
     else:
-        mapped = _estimated(recording, e, options, progress, start, before)
+        mapped = _estimated(recording, e, options, progress, start, earlier_poses)
     progress("drawing the map", 0, 0)
-    grid = _mapped_at(recording, e, options, mapped.poses, threads, sums=sums).grid
+    grid = _mapped_at(recording, e, options, mapped.poses, threads, sums=with_grid).grid
     return dataclasses.replace(mapped, grid=grid)
 
 
@@ -61,14 +61,14 @@ def _driven(
     recording: Recording,
     e: NDArray[np.float32],
     options: SlamOptions,
-    progress: Told,
+    progress: StepProgress,
     threads: int,
-) -> Mapped:
+) -> MStepResult:
     """The same of sweeps in space."""
-    local = lidar_odometry.build(
+    local = lidar_odometry.register_sweeps(
         recording, e, options.spinning, options.motion, partial(progress, "mapping"), threads
     )
-    driven, loops, graph = loop_closure_3d.closed(
+    driven, loops, graph = loop_closure_3d.close_loops_3d(
         recording,
         e,
         options.spinning,
@@ -77,8 +77,8 @@ def _driven(
         partial(progress, "closing loops"),
         threads,
     )
-    nothing = em.empty_grid(3, options.resolution)
-    return Mapped(
+    nothing = em.make_grid(3, options.resolution)
+    return MStepResult(
         driven.poses,
         driven.covariance,
         nothing,
@@ -93,10 +93,10 @@ def _estimated(
     recording: Recording,
     e: NDArray[np.float32],
     options: SlamOptions,
-    progress: Told,
-    start: Mapped | None,
+    progress: StepProgress,
+    start: MStepResult | None,
     before: Float | None,
-) -> Mapped:
+) -> MStepResult:
     """The most likely poses alone, see m_step."""
     if not options.loops.enabled:
         return _followed(recording, e, options, partial(progress, "mapping"), before)
@@ -104,8 +104,8 @@ def _estimated(
         mapped = _swept(recording, e, options, start, partial(progress, "mapping"))
         return dataclasses.replace(mapped, explained=start.explained)
     local = _followed(recording, e, options, partial(progress, "mapping"), before)
-    seen = deskewed(recording, local.poses, options)
-    closed = loop_closure.closed(seen, e, options, local, partial(progress, "closing loops"))
+    seen = deskew_recording(recording, local.poses, options)
+    closed = loop_closure.close_loops(seen, e, options, local, partial(progress, "closing loops"))
     mapped = _swept(recording, e, options, closed, partial(progress, "mapping again"))
     # a scan that went astray explains itself in the map of all: the map so far tells
     return dataclasses.replace(mapped, explained=local.explained)
@@ -117,28 +117,28 @@ def _followed(
     options: SlamOptions,
     progress: Callable[[int, int], None],
     before: Float | None,
-) -> Mapped:
+) -> MStepResult:
     """Poses one after the other, of scans without the motion during them as far as it is known."""
     memory = options.loops.memory if options.loops.enabled else np.inf
     known = recording.T_odom_base if before is None else before
     if known is None and options.deskew and recording.beam_time is not None:
         # scans as they were taken are alike enough to tell how the robot went
-        known = odometry_2d.build(recording, e, options, progress, memory).poses
-    seen = deskewed(recording, known, options)
-    return odometry_2d.build(seen, e, options, progress, memory)
+        known = odometry_2d.register_scans(recording, e, options, progress, memory).poses
+    seen = deskew_recording(recording, known, options)
+    return odometry_2d.register_scans(seen, e, options, progress, memory)
 
 
 def _swept(
     recording: Recording,
     e: NDArray[np.float32],
     options: SlamOptions,
-    mapped: Mapped,
+    mapped: MStepResult,
     progress: Callable[[int, int], None],
-) -> Mapped:
+) -> MStepResult:
     """Poses whose loops are closed, registered once more against all others."""
     for _ in range(options.loops.sweeps):
-        seen = deskewed(recording, mapped.poses, options)
-        mapped = sweep(seen, e, options, mapped, progress)
+        seen = deskew_recording(recording, mapped.poses, options)
+        mapped = refine_poses(seen, e, options, mapped, progress)
     return mapped
 
 
@@ -150,11 +150,13 @@ def _mapped_at(
     threads: int,
     *,
     sums: bool = True,
-) -> Mapped:
+) -> MStepResult:
     """The map of known poses (T, D+1, D+1)."""
     D, T = recording.dimension, recording.n_scans
-    grid = em.empty_grid(D, options.resolution, options.registration.approach)
+    grid = em.make_grid(D, options.resolution, options.registration.approach)
     if sums:
-        em.add_recording(grid, deskewed(recording, poses, options, threads), poses, e, threads)
+        em.add_recording(
+            grid, deskew_recording(recording, poses, options, threads), poses, e, threads
+        )
     freedom = D * (D + 1) // 2
-    return Mapped(poses, np.zeros((T, freedom, freedom)), grid, np.full(T, np.nan), [])
+    return MStepResult(poses, np.zeros((T, freedom, freedom)), grid, np.full(T, np.nan), [])

@@ -10,7 +10,7 @@ from stillmap.core import se2
 from stillmap.core.arrays import ArrayBuilder, take_rows
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
-from stillmap.em import Ground
+from stillmap.em import GroundMap
 from stillmap.mapping.projection import make_planar_recording
 from stillmap.tracking import MovingObject, ObjectOptions, track_objects
 
@@ -28,7 +28,7 @@ def track_objects_3d(
     recording: Recording,
     poses: Float,
     p_static: NDArray[np.float32],
-    ground: Ground,
+    ground: GroundMap,
     options: ObjectOptions,
     threads: int = 1,
 ) -> list[MovingObject]:
@@ -83,7 +83,7 @@ def _dynamic_parts(
     poses: Float,
     flat_poses: Float,
     p_static: NDArray[np.float32],
-    ground: Ground,
+    ground: GroundMap,
     options: ObjectOptions,
     threads: int,
 ) -> _Parts:
@@ -115,7 +115,7 @@ def _dynamic_parts(
 
 
 def _above_ground(
-    beams: slice, moves: NDArray[np.bool_], recording: Recording, T: Float, ground: Ground
+    beams: slice, moves: NDArray[np.bool_], recording: Recording, T: Float, ground: GroundMap
 ) -> tuple[Index, Float]:
     """Numbers and ends (n, 3) in the map frame of what moves over the ground."""
     number = beams.start + np.flatnonzero(moves)

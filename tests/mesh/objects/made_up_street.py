@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
-from stillmap.em import Ground
-from stillmap.mesh.inputs import Sources
-from stillmap.mesh.texture.occluders import Thing
+from stillmap.em import GroundMap
+from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import fit_box
 
@@ -42,7 +42,7 @@ class Part(NamedTuple):
 
 def street(
     cars: list[Car], parts: list[Part], scans: int = 8, noise: float = 0.0, rows: int = 21
-) -> Sources:
+) -> MeshInputs:
     """Everything that is known of such a recording; the sensor is 1 m above the ground."""
     rng = np.random.default_rng(0)
     turn, rise = np.radians(np.arange(-60.0, 60.0, 0.5)), np.radians(np.linspace(-12.0, 6.0, rows))
@@ -73,14 +73,14 @@ def street(
     met = np.concatenate(whose)
     objects = [_object(k, part, cars, recording, poses, met) for k, part in enumerate(parts)]
     things = [
-        Thing(fit_box(one, 0, 0.5), one.z - 0.5 * one.size[2], one.size[2]) for one in objects
+        TrackedBox(fit_box(one, 0, 0.5), one.z - 0.5 * one.size[2], one.size[2]) for one in objects
     ]
-    ground = Ground(np.zeros((1, 1)), np.zeros(2), 1.0, True)
+    ground = GroundMap(np.zeros((1, 1)), np.zeros(2), 1.0, True)
     p_static = np.where(met >= 0, 0.05, 0.95).astype(np.float32)
-    return Sources(recording, recording, poses, p_static, objects, things, 0, ground)
+    return MeshInputs(recording, recording, poses, p_static, objects, things, 0, ground)
 
 
-def by_several(sources: Sources, lidars: int, seconds: float = 0.09) -> Sources:
+def by_several(sources: MeshInputs, lidars: int, seconds: float = 0.09) -> MeshInputs:
     """The same, each scan by some lidars that begin at once and turn for so long; each sees a part
     of what is there."""
     r, T = sources.recording, sources.recording.n_scans

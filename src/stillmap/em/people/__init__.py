@@ -5,6 +5,6 @@ Environments*, IROS 2002; docs/tracker.md says what is theirs and what is simple
 """
 
 from stillmap.em.options import TrackerOptions
-from stillmap.em.people.tracker import on_people
+from stillmap.em.people.tracker import label_people
 
-__all__ = ["TrackerOptions", "on_people"]
+__all__ = ["TrackerOptions", "label_people"]

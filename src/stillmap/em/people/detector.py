@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.em.observations import Chunk, chunks
+from stillmap.em.observations import Chunk, iter_chunks
 from stillmap.em.options import TrackerOptions
 
 Float = NDArray[np.float64]
@@ -21,7 +21,7 @@ _NOTHING = 1e6  # m, range of a beam that met nothing: farther than anything
 
 
 @dataclass(frozen=True, eq=False)
-class Features:
+class Detections:
     """F narrow things, in the order of the scans.
 
     Attributes:
@@ -35,7 +35,9 @@ class Features:
     width: Float
 
 
-def features(recording: Recording, T_map_sensor: Float, options: TrackerOptions) -> Features:
+def detect_segments(
+    recording: Recording, T_map_sensor: Float, options: TrackerOptions
+) -> Detections:
     """What may be a leg or a body in any scan.
 
     Args:
@@ -47,13 +49,13 @@ def features(recording: Recording, T_map_sensor: Float, options: TrackerOptions)
     nor too wide and its neighbours on both sides lie farther away: what ends where something
     nearer hides the rest has an unknown width, and so has what a scan begins or ends with.
     """
-    parts = [_of_chunk(recording, chunk, options) for chunk in chunks(recording)]
+    parts = [_of_chunk(recording, chunk, options) for chunk in iter_chunks(recording)]
     if not parts:
-        return Features(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros(0))
-    found = Features(*(np.concatenate([getattr(p, n) for p in parts]) for n in _FIELDS))
+        return Detections(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros(0))
+    found = Detections(*(np.concatenate([getattr(p, n) for p in parts]) for n in _FIELDS))
     T = T_map_sensor[found.scan]
     xy = (T[:, :2, :2] * found.xy[:, None]).sum(axis=-1) + T[:, :2, 2]
-    return Features(found.scan, xy, found.width)
+    return Detections(found.scan, xy, found.width)
 
 
 _FIELDS = ("scan", "xy", "width")
@@ -64,7 +66,7 @@ def ranges(points: Float, hit: NDArray[np.bool_]) -> Float:
     return np.where(hit, np.hypot(*points.T), _NOTHING)
 
 
-def _of_chunk(recording: Recording, chunk: Chunk, options: TrackerOptions) -> Features:
+def _of_chunk(recording: Recording, chunk: Chunk, options: TrackerOptions) -> Detections:
     """The features of some scans, still in the frame of the sensor."""
     scan = np.repeat(np.arange(chunk.scans.start, chunk.scans.stop), np.diff(chunk.offset))
     points = recording.points[chunk.beams].astype(np.float64)
@@ -83,7 +85,7 @@ def _of_chunk(recording: Recording, chunk: Chunk, options: TrackerOptions) -> Fe
     first, last = first[chosen], last[chosen]
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(points, axis=0)])
     xy = (sums[last + 1] - sums[first]) / (last + 1 - first)[:, None]
-    return Features(scan[first], xy, width[chosen])
+    return Detections(scan[first], xy, width[chosen])
 
 
 def _segments(r: Float, jump: float) -> tuple[Index, Index]:
@@ -106,8 +108,8 @@ _BEAMS = 3  # next to a place in bearing: one alone may pass a thing by
 _ASIDE = 0.1  # rad by which they may miss it
 
 
-def changed(
-    recording: Recording, T_map_sensor: Float, found: Features, look: float, behind: float
+def find_changed(
+    recording: Recording, T_map_sensor: Float, found: Detections, look: float, behind: float
 ) -> NDArray[np.bool_]:
     """(F,) whether the same laser saw through a feature's place a while before, or after.
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import kalman
-from stillmap.core.arrays import blocks
-from stillmap.core.kalman import Motion
+from stillmap.core.arrays import iter_blocks
+from stillmap.core.kalman import TrackStates
 from stillmap.core.recording import Recording
 from stillmap.em.options import TrackerOptions
-from stillmap.em.people.detector import Features, changed, features
+from stillmap.em.people.detector import Detections, detect_segments, find_changed
 
 Index = NDArray[np.intp]
 
@@ -28,14 +28,14 @@ Mask = NDArray[np.bool_]
 Float = NDArray[np.float64]
 
 
-def gated(motion: Motion, at: Float, options: TrackerOptions) -> NDArray[np.bool_]:
+def gate(motion: TrackStates, at: Float, options: TrackerOptions) -> NDArray[np.bool_]:
     """(K, F) which features at (F, 2) may be of which track."""
     away = at[None] - motion.x[:, None]
     S = motion.P[:, 0] + options.sigma**2
     return np.asarray((away**2).sum(axis=-1) <= options.gate**2 * S[:, None])
 
 
-def weights(motion: Motion, at: Float, options: TrackerOptions) -> Float:
+def association_probabilities(motion: TrackStates, at: Float, options: TrackerOptions) -> Float:
     """(K, F) probability that a feature is the one of a track; the rest of a row: none is.
 
     Args:
@@ -46,13 +46,13 @@ def weights(motion: Motion, at: Float, options: TrackerOptions) -> Float:
     away = at[None] - motion.x[:, None]
     S = (motion.P[:, 0] + options.sigma**2)[:, None]
     density = np.exp(-0.5 * (away**2).sum(axis=-1) / S) / (2.0 * np.pi * S)
-    G = np.where(gated(motion, at, options), options.detection * density, 0.0)
+    G = np.where(gate(motion, at, options), options.detection * density, 0.0)
     in_gate = 1.0 - np.exp(-0.5 * options.gate**2)
     none = options.clutter * (1.0 - options.detection * in_gate)
     return np.asarray(G / (G.sum(axis=1, keepdims=True) + G.sum(axis=0) - G + none))
 
 
-def updated(motion: Motion, at: Float, beta: Float, sigma: float) -> Motion:
+def update_pda(motion: TrackStates, at: Float, beta: Float, sigma: float) -> TrackStates:
     """After a scan: moved by the mean innovation, less sure by how far innovations spread.
 
     Args:
@@ -72,7 +72,7 @@ def updated(motion: Motion, at: Float, beta: Float, sigma: float) -> Motion:
     P = np.stack(
         [xx - gain_x**2 * less, xv - gain_x * gain_v * less, vv - gain_v**2 * less], axis=-1
     )
-    return Motion(motion.x + gain_x[:, None] * mean, motion.v + gain_v[:, None] * mean, P)
+    return TrackStates(motion.x + gain_x[:, None] * mean, motion.v + gain_v[:, None] * mean, P)
 
 
 _SEEN = 0.5  # probability that one of the features was its own
@@ -80,7 +80,7 @@ _SEEN = 0.5  # probability that one of the features was its own
 _CHANGED = 0.25  # the same of features that changed: of two legs, one stands
 
 
-class Places(NamedTuple):
+class Tracks(NamedTuple):
     """Where tracks were, in the order of the scans; L entries.
 
     Attributes:
@@ -97,10 +97,10 @@ class Places(NamedTuple):
     seen: Mask
     changed: Mask
 
-    def of(self, chosen: Mask) -> "Places":
+    def of(self, chosen: Mask) -> "Tracks":
         """Some of them."""
         c = chosen
-        return Places(self.track[c], self.scan[c], self.xy[c], self.seen[c], self.changed[c])
+        return Tracks(self.track[c], self.scan[c], self.xy[c], self.seen[c], self.changed[c])
 
 
 class _Alive(NamedTuple):
@@ -113,7 +113,7 @@ class _Alive(NamedTuple):
         seen, changed: (K,) of the present scan, see Places.
     """
 
-    motion: Motion
+    motion: TrackStates
     track: Index
     last: Float
     seen: Mask
@@ -125,7 +125,9 @@ class _Alive(NamedTuple):
         return _Alive(motion.of(chosen), *rest)
 
 
-def people(found: Features, changed: Mask, seconds: Float, options: TrackerOptions) -> Places:
+def track_people(
+    found: Detections, changed: Mask, seconds: Float, options: TrackerOptions
+) -> Tracks:
     """The tracks that turned out to be of people, over all of their life.
 
     Args:
@@ -151,7 +153,7 @@ def people(found: Features, changed: Mask, seconds: Float, options: TrackerOptio
     return places.of(person[places.track] & (places.scan <= last[places.track]))
 
 
-def _followed(found: Features, changed: Mask, seconds: Float, options: TrackerOptions) -> Places:
+def _followed(found: Detections, changed: Mask, seconds: Float, options: TrackerOptions) -> Tracks:
     """All tracks, whatever they are of."""
     of_scan = np.searchsorted(found.scan, np.arange(len(seconds) + 1))
     alive = _new(np.zeros((0, 2)), np.zeros(0, bool), 0, 0.0, options)
@@ -161,23 +163,28 @@ def _followed(found: Features, changed: Mask, seconds: Float, options: TrackerOp
         here = slice(of_scan[t], of_scan[t + 1])
         at, moving = found.xy[here], changed[here]
         alive = alive.of(now - alive.last <= options.lost)
-        motion = kalman.predicted(alive.motion, now - before, options.acceleration)
-        others = ~gated(motion, at, options).any(axis=0)
+        motion = kalman.predict(alive.motion, now - before, options.acceleration)
+        others = ~gate(motion, at, options).any(axis=0)
         new = _new(at[others], moving[others], born, now, options)
         alive = _joined(_seen(alive, motion, at, moving, now, options), new)
         born, before = born + len(new.track), now
         out.append(_places(alive, t))
-    return Places(*(np.concatenate(parts) for parts in zip(*out, strict=True)))
+    return Tracks(*(np.concatenate(parts) for parts in zip(*out, strict=True)))
 
 
 def _seen(
-    alive: _Alive, motion: Motion, at: Float, changed: Mask, now: float, options: TrackerOptions
+    alive: _Alive,
+    motion: TrackStates,
+    at: Float,
+    changed: Mask,
+    now: float,
+    options: TrackerOptions,
 ) -> _Alive:
     """Tracks as predicted, after the features (F, 2) of a scan."""
-    beta = weights(motion, at, options)
+    beta = association_probabilities(motion, at, options)
     seen = beta.sum(axis=1) >= _SEEN
     return _Alive(
-        updated(motion, at, beta, options.sigma),
+        update_pda(motion, at, beta, options.sigma),
         alive.track,
         np.where(seen, now, alive.last),
         seen,
@@ -188,22 +195,22 @@ def _seen(
 def _new(at: Float, changed: Mask, born: int, now: float, options: TrackerOptions) -> _Alive:
     """A track at each (N, 2), numbered from `born`."""
     n = len(at)
-    motion = kalman.still(at, options.sigma, options.sigma_speed)
+    motion = kalman.initialize(at, options.sigma, options.sigma_speed)
     return _Alive(motion, born + np.arange(n), np.full(n, now), np.ones(n, bool), changed)
 
 
 def _joined(a: _Alive, b: _Alive) -> _Alive:
     """The tracks of both."""
     rest = (np.concatenate([p, q]) for p, q in zip(a[1:], b[1:], strict=True))
-    return _Alive(kalman.joined(a.motion, b.motion), *rest)
+    return _Alive(kalman.concatenate(a.motion, b.motion), *rest)
 
 
-def _places(alive: _Alive, scan: int) -> Places:
+def _places(alive: _Alive, scan: int) -> Tracks:
     scans = np.full(len(alive.track), scan)
-    return Places(alive.track, scans, alive.motion.x, alive.seen, alive.changed)
+    return Tracks(alive.track, scans, alive.motion.x, alive.seen, alive.changed)
 
 
-def on_people(recording: Recording, poses: Float, options: TrackerOptions) -> NDArray[np.bool_]:
+def label_people(recording: Recording, poses: Float, options: TrackerOptions) -> NDArray[np.bool_]:
     """(M,) which hits lie in the box of somebody who is tracked.
 
     Args:
@@ -213,18 +220,18 @@ def on_people(recording: Recording, poses: Float, options: TrackerOptions) -> ND
     """
     T_map_sensor = recording.T_map_sensor(poses)
     seconds = np.asarray(1e-9 * (recording.stamp_ns - recording.stamp_ns[:1]), np.float64)
-    found = features(recording, T_map_sensor, options)
-    moving = changed(recording, T_map_sensor, found, options.look, options.jump)
-    somebody = people(found, moving, seconds, options)
-    return in_boxes(recording, T_map_sensor, somebody, options.box)
+    found = detect_segments(recording, T_map_sensor, options)
+    moving = find_changed(recording, T_map_sensor, found, options.look, options.jump)
+    somebody = track_people(found, moving, seconds, options)
+    return find_beams_in_boxes(recording, T_map_sensor, somebody, options.box)
 
 
-def in_boxes(
-    recording: Recording, T_map_sensor: Float, somebody: Places, half: float
+def find_beams_in_boxes(
+    recording: Recording, T_map_sensor: Float, somebody: Tracks, half: float
 ) -> NDArray[np.bool_]:
     """(M,) which hits lie in boxes, along the axes of the map, `half` m to each side of people."""
     inside = recording.per_beam(np.bool_)
-    for block in blocks(inside):
+    for block in iter_blocks(inside):
         inside[block] = False
     scans, first = np.unique(somebody.scan, return_index=True)
     bounds = np.append(first, len(somebody.scan))

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from stillmap.core import arrays
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import beam_ns
-from stillmap.em.observations import Chunk, chunks
+from stillmap.core.timestamps import beam_stamps_ns
+from stillmap.em.observations import Chunk, iter_chunks
 from stillmap.io.point_cloud import ply
-from stillmap.io.point_cloud.binary_table import columns
+from stillmap.io.point_cloud.binary_table import read_columns
 from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
 
 Part = Literal["static", "dynamic"]
@@ -88,23 +88,23 @@ def cloud_of(
     """
     times = recording.beam_time
     earliest = 0.0
-    for block in () if times is None else arrays.blocks(times):
+    for block in () if times is None else arrays.iter_blocks(times):
         earliest = min(earliest, float(times[block].min()) if times is not None else 0.0)
     T_map_sensor = seen.T_map_sensor(poses)
 
     def made() -> Iterator[Block]:
         beside = [one for one in (p_static, times, colours) if one is not None]
-        for chunk in chunks(seen, beside=beside):
+        for chunk in iter_chunks(seen, beside=beside):
             hits = _wanted(seen.hit[chunk.beams], p_static[chunk.beams], only)
             points = _placed(seen, chunk, hits, T_map_sensor)
-            stamp_ns = beam_ns(recording, chunk.scans)[hits]
+            stamp_ns = beam_stamps_ns(recording, chunk.scans)[hits]
             its = None if colours is None else np.asarray(colours[chunk.beams][hits])
             yield Block(points, np.asarray(p_static[chunk.beams][hits]), stamp_ns, its)
 
     return Cloud(
         count=sum(
             int(np.count_nonzero(_wanted(seen.hit[block], p_static[block], only)))
-            for block in arrays.blocks(seen.hit, p_static)
+            for block in arrays.iter_blocks(seen.hit, p_static)
         ),
         origin=np.round(poses[0, :3, 3]),
         start_ns=int(recording.stamp_ns[0]) + int(np.floor(1e9 * earliest)),
@@ -119,13 +119,13 @@ def cloud_in(folder: Path, only: Part | None = None) -> Cloud:
     Raises:
         InputError: one of them is missing or damaged.
     """
-    layouts = [ply.layout_of(folder / f"{part}.ply") for part in PARTS if only in (part, None)]
+    layouts = [ply.read_layout(folder / f"{part}.ply") for part in PARTS if only in (part, None)]
     coloured = all(set(_COLOURS) <= {one.name for one in layout.fields} for layout in layouts)
     wanted = (*_FIELDS, *(_COLOURS if coloured else ()))
 
     def made() -> Iterator[Block]:
         for layout in layouts:
-            for values in columns(layout, wanted):
+            for values in read_columns(layout, wanted):
                 points = np.stack(values[:3], axis=1).astype(np.float64)
                 if not np.isfinite(points).all():
                     raise InputError("holds a point that is not finite", where=str(layout.path))

@@ -1,0 +1,196 @@
+"""The state of EM: the estimate of one iteration, and the history of a run."""
+
+import dataclasses
+import logging
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stillmap._core as _core
+from stillmap import em, slam
+from stillmap.core.recording import Recording
+from stillmap.mapping.beam_statistics import sample_dynamic_points
+from stillmap.pipeline.options import Options
+from stillmap.pipeline.snapshots import Snapshot, Window, choose_window, snapshot
+
+Float = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What one EM iteration estimated: the results of its M-step and of its E-step.
+
+    Attributes:
+        number: iteration, from 1.
+        weights: (M,) float32, the e that weighted the beams in the M-step; with the poses they
+            reproduce the grid to the bit.
+        m_step: poses, their covariance and diagnostics, loops, pose graph, and the sums of (10).
+        e_step: P(c = 1) of every beam, the likelihood, and what the estimator learned.
+    """
+
+    number: int
+    weights: NDArray[np.float32]
+    m_step: slam.MStepResult
+    e_step: em.EStepResult
+
+    @property
+    def poses(self) -> Float:
+        """(T, D+1, D+1) T_map_base."""
+        return self.m_step.poses
+
+    @property
+    def p_static(self) -> NDArray[np.float32]:
+        """(M,) P(c = 1)."""
+        return self.e_step.p_static
+
+    @property
+    def bound(self) -> float:
+        """Lower bound of the log likelihood, nats."""
+        return self.e_step.likelihood.bound
+
+    def without_grid(self) -> "Estimate":
+        """The same with an empty grid: grids are large, and poses and weights reproduce them."""
+        return dataclasses.replace(self, m_step=self.m_step.without_grid())
+
+    def for_next_iteration(self) -> "Estimate":
+        """What the next iteration starts from: poses and labels, without grid and cells."""
+        labels = em.EStepResult(self.p_static, self.e_step.likelihood)
+        return dataclasses.replace(self.without_grid(), e_step=labels)
+
+    def with_labels(self, **changes: object) -> "Estimate":
+        """The same with fields of the E-step replaced."""
+        return dataclasses.replace(self, e_step=dataclasses.replace(self.e_step, **changes))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class IterationRecord:
+    """The numbers of one iteration, as `run.json` lists them.
+
+    Attributes:
+        number: from 1.
+        expected_log_likelihood: (5), nats.
+        bound: expected_log_likelihood + entropy of the labels, nats.
+        changed_share: share of the hits whose e changed by more than 0.1.
+        seconds: wall clock.
+        held_out_log_likelihood: nats per beam of scans left out of the map; None: not computed.
+    """
+
+    number: int
+    expected_log_likelihood: float
+    bound: float
+    changed_share: float
+    seconds: float
+    held_out_log_likelihood: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Iteration:
+    """One M-step and one E-step.
+
+    Attributes:
+        estimate: see Estimate; its grid is filled.
+        record: its numbers.
+        deskewed: the recording without the motion during its scans, at these poses.
+    """
+
+    estimate: Estimate
+    record: IterationRecord
+    deskewed: Recording
+
+    @property
+    def occupancy(self) -> em.OccupancyMap:
+        """The map of this iteration, computed at every call; every beam counts. 2D only."""
+        return em.make_occupancy_map(self.estimate.m_step.grid, self.estimate.e_step.occupied)
+
+    def crop_occupancy(self, box: em.GridWindow) -> em.OccupancyMap:
+        """The cells of a box of that map."""
+        e_step = self.estimate.e_step
+        return em.make_occupancy_map(self.estimate.m_step.grid, e_step.occupied, box=box)
+
+
+@dataclass
+class EmState:
+    """The history of a run: the numbers of all iterations, the arrays of the best and the last.
+
+    Attributes:
+        options: resolved.
+        records: one per iteration.
+        snapshots: a part of the map at the first, second, best and last iteration (Fig. 8).
+        window: the part of the map that snapshots show, metres.
+        best: estimate with the highest bound so far, without its grid.
+        latest: what the next iteration starts from.
+        converged: whether a stopping rule holds.
+        single_pass: stop after the first iteration: given poses leave nothing to iterate on.
+    """
+
+    options: Options
+    records: list[IterationRecord] = field(default_factory=list)
+    snapshots: dict[int, Snapshot] = field(default_factory=dict)
+    window: Window | None = None
+    best: Estimate | None = None
+    latest: Estimate | None = None
+    converged: bool = False
+    single_pass: bool = False
+
+    def update(self, iteration: Iteration) -> None:
+        """Records an iteration, keeps its estimate if it is the best, applies the stopping rules."""
+        estimate, record, options = iteration.estimate, iteration.record, self.options.em
+        self.records.append(record)
+        gain = np.inf if self.best is None else estimate.bound - self.best.bound
+        fixed = em.fixed_iterations(self.options.estimator)
+        if gain > 0.0 or fixed:
+            self.best = estimate.without_grid()
+        self._take_snapshot(iteration)
+        self.latest = estimate.for_next_iteration()
+        converged = 0.0 <= gain < options.tolerance * iteration.deskewed.n_beams
+        if self.options.estimator == "stillmap":  # the labels of (8) keep changing slightly
+            converged |= record.number > 1 and record.changed_share < options.settled
+        out_of_patience = record.number - self.require_best().number >= options.patience
+        self.converged = (
+            record.number == fixed if fixed else converged or out_of_patience or self.single_pass
+        )
+        log.info(
+            "iteration %d: bound %.6g, %.2f %% of the beams changed",
+            record.number,
+            record.bound,
+            100.0 * record.changed_share,
+        )
+
+    def require_best(self) -> Estimate:
+        """The best estimate; RuntimeError before the first iteration."""
+        if self.best is None:
+            raise RuntimeError("no iteration has been run")
+        return self.best
+
+    def _take_snapshot(self, iteration: Iteration) -> None:
+        """Crops the map of Fig. 8 where the first iteration labelled most beams dynamic."""
+        estimate = iteration.estimate
+        grid = estimate.m_step.grid
+        if not isinstance(grid, _core.Grid2D):
+            return
+        points = sample_dynamic_points(iteration.deskewed, estimate.poses, estimate.p_static)
+        dynamic = np.zeros(len(points), dtype=np.float32)
+        if self.window is None:
+            self.window = choose_window(_extent(grid), grid.resolution, points, dynamic)
+        shown = {1, 2, self.require_best().number}  # and the last, whichever that will be
+        self.snapshots = {n: s for n, s in self.snapshots.items() if n in shown}
+        part = iteration.crop_occupancy(_cells(self.window, grid.resolution))
+        self.snapshots[estimate.number] = snapshot(
+            estimate.number, part, points, dynamic, self.window
+        )
+
+
+def _extent(grid: _core.Grid2D) -> Window:
+    """x0, y0, x1, y1 in metres of all cells that beams crossed."""
+    first_cell, (height, width) = grid.box()
+    last = first_cell + np.array([width, height])
+    x0, y0, x1, y1 = (np.concatenate([first_cell, last]) * grid.resolution).tolist()
+    return x0, y0, x1, y1
+
+
+def _cells(window: Window, resolution: float) -> em.GridWindow:
+    """The cells of a window whose edges lie between cells."""
+    x0, y0, x1, y1 = np.round(np.array(window) / resolution).astype(np.int64).tolist()
+    return em.GridWindow(np.array([x0, y0], np.int64), (y1 - y0, x1 - x0))

@@ -1,0 +1,177 @@
+"""After the loop: the last E-step, the maps, the objects, the changes, all of the best estimate."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stillmap._core as _core
+from stillmap import em, slam
+from stillmap.core.parallel import resolve_threads
+from stillmap.core.profiling import Progress, StageTimer
+from stillmap.core.recording import Recording
+from stillmap.em import GroundMap, estimate_ground
+from stillmap.mapping import Change, beams_on_things, changed_places, changed_things, relabelled
+from stillmap.mapping.projection import columns_of, plan_of
+from stillmap.pipeline.estimate import Estimate
+from stillmap.pipeline.options import Options
+from stillmap.tracking import MovingObject, moving_objects
+from stillmap.tracking.objects_3d import moving_in_space
+
+
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """Maps of the same cells.
+
+    Attributes:
+        filtered: of what is static.
+        raw: every hit counted as static, from the same poses.
+        evidence: observation counts of these cells.
+        ground: height of the ground; None in 2D.
+    """
+
+    filtered: em.OccupancyMap
+    raw: em.OccupancyMap
+    evidence: em.Coverage
+    ground: GroundMap | None
+
+
+def final_estimate(
+    recording: Recording, best: Estimate, options: Options
+) -> tuple[Recording, Estimate, list[Change]]:
+    """The last E-step: labels of the map as it is shown, and the places that changed.
+
+    Returns:
+        the recording without motion during its scans, the estimate with these labels, changes.
+    """
+    threads = resolve_threads(options.threads)
+    deskewed = slam.deskew_recording(recording, best.poses, options.slam, threads)
+    cell, look = options.slam.resolution, options.em.dwell.look
+    changed = best.e_step.changed
+    if changed is not None:  # 3D: every E-step knows of them
+        changes = changed_things(changed, deskewed, best.poses, cell, look, options.em.changes)
+        return deskewed, best, changes
+    if (
+        recording.dimension == 3
+        or options.estimator != "stillmap"
+        or not (options.em.dwell.views or options.em.changes.enabled)
+    ):
+        return deskewed, best, []
+    found, courses = em.final_e_step(deskewed, best.poses, cell, options.em, threads)
+    if found is not None:
+        best = best.with_labels(
+            p_static=found.p_static, occupied=found.occupied, learned=found.learned
+        )
+    if courses is None:
+        return deskewed, best, []
+    if best.e_step.occupied is None:
+        raise RuntimeError("the default estimator knows its cells")
+    changes = changed_places(courses, deskewed, cell, look, options.em.changes)
+    p_static, occupied = relabelled(
+        deskewed,
+        best.poses,
+        best.p_static,
+        best.e_step.occupied,
+        courses,
+        changes,
+        options.output.map_state,
+        threads,
+    )
+    learned = {**best.e_step.learned, "changing": round(courses.share, 6)}
+    return (
+        deskewed,
+        best.with_labels(p_static=p_static, occupied=occupied, learned=learned),
+        changes,
+    )
+
+
+def make_maps(
+    deskewed: Recording,
+    estimate: Estimate,
+    options: Options,
+    progress: Progress,
+    stages: StageTimer,
+) -> Maps:
+    """The maps of an estimate; of 3D recordings, of the obstacles projected to the plane."""
+    threads = resolve_threads(options.threads)
+    progress("making the map", 0, 0, 0)
+    with stages.measure("maps"):
+        planar, ground = deskewed, None
+        if deskewed.dimension == 3:
+            ground = estimate.e_step.ground or estimate_ground(
+                deskewed, estimate.poses, estimate.p_static, threads
+            )
+            planar, estimate = _project(deskewed, estimate, ground, options, threads)
+        filtered, raw = _occupancy_maps(planar, estimate, options, threads)
+    progress("counting looks", 0, 0, 0)
+    with stages.measure("evidence"):
+        evidence = em.count_observations(
+            planar,
+            estimate.poses,
+            estimate.p_static,
+            filtered,
+            estimate.e_step.no_return,
+            options.em,
+            threads,
+        )
+    return Maps(filtered, raw, evidence, ground)
+
+
+def _project(
+    deskewed: Recording, estimate: Estimate, ground: GroundMap, options: Options, threads: int
+) -> tuple[Recording, Estimate]:
+    """A 3D recording and its estimate as planar ones: the obstacles above the ground."""
+    cell, band = options.slam.resolution, options.output.band
+    plan = plan_of(deskewed, estimate.poses, ground, band, cell, open_space=False, threads=threads)
+    occupied = estimate.e_step.occupied
+    if occupied is not None:
+        occupied = columns_of(occupied, ground, band, cell)
+    planar = dataclasses.replace(
+        estimate,
+        weights=estimate.weights[plan.beam],
+        m_step=dataclasses.replace(estimate.m_step, poses=plan.poses),
+    )
+    p_static = estimate.p_static[plan.beam]
+    return plan.recording, planar.with_labels(p_static=p_static, occupied=occupied, no_return=None)
+
+
+def _occupancy_maps(
+    planar: Recording, estimate: Estimate, options: Options, threads: int
+) -> tuple[em.OccupancyMap, em.OccupancyMap]:
+    """The map, and the same cells with every hit counted as static.
+
+    Labels that follow from the sums go with the weights that made the sums; others make them.
+    """
+    e_step = estimate.e_step
+    labels_make_sums = options.estimator in ("stillmap", "tracker")
+    weights = estimate.p_static if labels_make_sums else estimate.weights
+    grid = _core.Grid2D(options.slam.resolution)
+    seen = em.add_trusted_beams(grid, planar, estimate.poses, weights, e_step.no_return, threads)
+    filtered = em.make_occupancy_map(grid, e_step.occupied, seen)
+    em.recount_as_static(grid, planar, estimate.poses, weights)
+    return filtered, em.make_occupancy_map(grid, box=filtered.box)
+
+
+def find_objects(
+    deskewed: Recording,
+    estimate: Estimate,
+    maps: Maps,
+    changes: list[Change],
+    options: Options,
+) -> list[MovingObject]:
+    """Moving objects; in 2D without those whose beams ended on what is listed as a change."""
+    poses, p_static = estimate.poses, estimate.p_static
+    if maps.ground is not None:
+        threads = resolve_threads(options.threads)
+        return moving_in_space(deskewed, poses, p_static, maps.ground, options.objects, threads)
+    objects = moving_objects(deskewed, poses, p_static, options.objects)
+    changed = beams_on_things(deskewed, poses, p_static, changes, maps.filtered.resolution)
+    moved = [one for one in objects if 2 * _count_common(one.beams, changed) <= len(one.beams)]
+    return [dataclasses.replace(one, id=k) for k, one in enumerate(moved)]
+
+
+def _count_common(one: NDArray[np.intp], other: NDArray[np.intp]) -> int:
+    """How many numbers two rising arrays have in common."""
+    at = np.searchsorted(other, one)
+    return int(np.count_nonzero(one[at < len(other)] == other[at[at < len(other)]]))
