@@ -21,7 +21,7 @@ from tables import Row, grouped, markdown
 
 import stillmap
 from stillmap.core import se2
-from stillmap.core.profiling import Stages
+from stillmap.core.profiling import StageTimer
 from stillmap.eval.map import GHOST_DISTANCE, distance_to_walls
 from stillmap.eval.trajectory import align
 
@@ -89,7 +89,7 @@ def _share(some: float, of: float) -> str:
 
 def _scored(run: Run) -> Scores:
     prepared = prepare(run.case, run.seed)
-    simulation, stages = prepared.simulation, Stages()
+    simulation, stages = prepared.simulation, StageTimer()
     poses = simulation.truth.T_world_base if run.true_poses else None
     options = options_of("stillmap", run.settings)
     result = stillmap.build(simulation.recording, options, poses=poses, stages=stages)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 import stillmap
 from stillmap.core import se2
-from stillmap.core.files import new_folder
+from stillmap.core.files import atomic_folder
 from stillmap.io.trajectory import write_tum
 
 Float = NDArray[np.float64]
@@ -76,7 +76,7 @@ def main() -> None:
         found = mapped(recording, args.karto_python)
     except KartoError as error:
         raise SystemExit(f"Karto: {error}") from error
-    with new_folder(args.output, args.overwrite) as folder:
+    with atomic_folder(args.output, args.overwrite) as folder:
         write_tum(folder / "trajectory.tum", recording.stamp_ns, found.poses)
     print(
         f"{recording.n_scans} scans, {found.taken} taken, loops closed after {found.closed}; "

@@ -73,7 +73,9 @@ def case_of(path: Path, odometry: bool, azimuth: bool) -> Case:
     if not odometry:
         recording = recording.without_odometry()
     if azimuth:
-        recording = laser_scan.timed(recording, ReadOptions(spin="clockwise", spin_stamp=0.0))
+        recording = laser_scan.add_beam_times(
+            recording, ReadOptions(spin="clockwise", spin_stamp=0.0)
+        )
     return Case(path.name, recording, truth, e)
 
 
@@ -109,7 +111,9 @@ def stillmap(
     """(T, 4, 4) poses at the stamps, and seconds per sweep."""
     started = time.perf_counter()
     slam = chosen.slam
-    found = lidar_odometry.build(case.recording, e, slam.spinning, slam.motion, _silent, threads)
+    found = lidar_odometry.register_sweeps(
+        case.recording, e, slam.spinning, slam.motion, _silent, threads
+    )
     return found.poses, (time.perf_counter() - started) / case.recording.n_scans
 
 

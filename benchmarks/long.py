@@ -26,7 +26,7 @@ from sweep import in_fresh_process
 from tables import markdown
 
 from stillmap.core import se2
-from stillmap.core.arrays import Column
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.io import stillmap_folder
 from stillmap.sim import SCENES, laser, odometry, scene_by_name, sweep
@@ -66,7 +66,7 @@ def simulated(world: str, scans: int, seed: int, work: Path) -> Recording:
     *rngs, laser_rng, odometry_rng = np.random.default_rng(seed).spawn(6)
     motion = move(scene, (rngs[0], rngs[1], rngs[2], rngs[3]), lambda _: None)
     T_odom_base = odometry.drifting(se2.matrix(*motion.robot.T), scene.odometry, odometry_rng)
-    points, hit = Column(np.float32, (2,), work), Column(np.bool_, (), work)
+    points, hit = ArrayBuilder(np.float32, (2,), work), ArrayBuilder(np.bool_, (), work)
     for first in range(0, scans, _CHUNK):
         seen, met = looked(scene, part_of(motion, slice(first, first + _CHUNK)), laser_rng)
         points.append(seen)

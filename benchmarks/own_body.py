@@ -54,7 +54,7 @@ def outcome(world: str, seed: int, lidar: dict[str, Any], robot: dict[str, Any])
     scene = scene_by_name(world, {"lidar": {"columns": _COLUMNS, **lidar}, "robot": robot})
     run = simulate(scene, seed)
     hit, own = run.recording.hit, run.truth.mover == ROBOT
-    gone = hit & ~self_filter.left_out(run.recording).hit
+    gone = hit & ~self_filter.remove_self_returns(run.recording).hit
     counts = (hit & own, gone & own, hit & ~own, gone & ~own)
     return Outcome(*(int(np.count_nonzero(one)) for one in counts))
 

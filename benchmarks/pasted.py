@@ -19,7 +19,7 @@ from scipy.ndimage import minimum_filter
 import stillmap
 from stillmap.core import camera as camera_module
 from stillmap.core.camera import Camera
-from stillmap.io.images import read_picture
+from stillmap.io.images import read_image
 from stillmap.preprocessing.options import ReadOptions
 
 Float = NDArray[np.float64]
@@ -55,7 +55,7 @@ def paste(source: Path, out: Path) -> Path:
     for number, file in enumerate(sorted(source.glob("frame-*.depth.png"))):
         name = file.name.partition(".")[0]
         shutil.copy(source / f"{name}.pose.txt", out)
-        millimetres, picture = read_picture(file), room.images.read(number)
+        millimetres, picture = read_image(file), room.images.read(number)
         at, T = _centre(room, number), room.T_recorded_base[number]
         beams = room.beams_of(number)
         scene = room.points[beams][room.hit[beams]]
@@ -106,7 +106,7 @@ def _seen(
     T = T_map_base @ camera.T_base_camera
     columns, rows = np.meshgrid(np.arange(w), np.arange(h))
     pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
-    rays = camera_module.rays(camera, pixels) @ T[:3, :3].T
+    rays = camera_module.unproject(camera, pixels) @ T[:3, :3].T
     # the ellipsoid is a ball of radius 1 where lengths are in its half axes
     ray, origin = rays / _HALF, (T[:3, 3] - centre) / _HALF
     a, b, c = np.sum(ray * ray, axis=1), ray @ origin, origin @ origin - 1.0
@@ -127,7 +127,7 @@ def _depth_of(camera: Camera, scene: NDArray[np.float32]) -> Float:
     R, t = camera.T_base_camera[:3, :3], camera.T_base_camera[:3, 3]
     points = (scene.astype(np.float64) - t) @ R
     uv, ok = camera_module.project(camera, points)
-    ok &= camera_module.within(camera, uv)
+    ok &= camera_module.is_in_image(camera, uv)
     column, row = np.round(uv[ok]).astype(np.intp).T
     out = np.full((camera.height, camera.width), np.inf)
     np.minimum.at(out, (row, column), points[ok, 2])

@@ -31,7 +31,7 @@ from tables import markdown
 
 import stillmap
 from stillmap.core import config
-from stillmap.core.profiling import Stages, peak_memory_bytes
+from stillmap.core.profiling import StageTimer, peak_memory_bytes
 from stillmap.io import stillmap_folder
 from stillmap.sim import SCENES, load_truth, scene_by_name, simulate, write_simulation
 
@@ -124,7 +124,7 @@ def cost_of(
     """Seconds per sweep and peak memory of the whole job, and of its stages."""
     recording, poses = stillmap_folder.read(first), np.load(first / _POSES)
     sweeps = recording.n_scans
-    stages, wall, cpu = Stages(), time.perf_counter(), time.process_time()
+    stages, wall, cpu = StageTimer(), time.perf_counter(), time.process_time()
     loaded = peak_memory_bytes()
     result = stillmap.build(recording, chosen, poses=poses, stages=stages)
     models = stillmap.models_of(result, stages=stages) if with_models else None

@@ -6,18 +6,18 @@ import pytest
 import scipy.linalg  # noqa: F401  (its BLAS is loaded before threads are counted)
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from stillmap.core.parallel import in_order, one_blas_thread
+from stillmap.core.parallel import limit_blas_threads, map_ordered
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_outcomes_keep_the_order_of_the_items(threads):
-    assert list(in_order(lambda i: i * i, range(100), threads)) == [i * i for i in range(100)]
-    assert list(in_order(str, [], threads)) == []
+    assert list(map_ordered(lambda i: i * i, range(100), threads)) == [i * i for i in range(100)]
+    assert list(map_ordered(str, [], threads)) == []
 
 
 def test_work_goes_on_side_by_side():
     both = threading.Barrier(2, timeout=30.0)  # one alone would never pass
-    assert len(list(in_order(lambda _: both.wait(), range(4), 2))) == 4
+    assert len(list(map_ordered(lambda _: both.wait(), range(4), 2))) == 4
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
@@ -29,7 +29,7 @@ def test_items_are_asked_for_when_they_are_due(threads):
             asked.append(i)
             yield i
 
-    outcomes = in_order(lambda i: i, items(), threads)
+    outcomes = map_ordered(lambda i: i, items(), threads)
     assert next(outcomes) == 0
     assert len(asked) <= threads + 1
 
@@ -41,7 +41,7 @@ def test_what_goes_wrong_is_told(threads):
             raise ValueError("the third")
         return i
 
-    outcomes = in_order(work, range(10), threads)
+    outcomes = map_ordered(work, range(10), threads)
     assert [next(outcomes) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(ValueError, match="the third"):
         next(outcomes)
@@ -55,6 +55,6 @@ def test_linear_algebra_is_done_by_one_thread_meanwhile():
     with threadpool_limits(2, "blas"):
         if blas_threads() != {2}:
             pytest.skip("this BLAS has one thread only")
-        with one_blas_thread():
+        with limit_blas_threads():
             assert blas_threads() == {1}
         assert blas_threads() == {2}

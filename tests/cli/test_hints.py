@@ -7,7 +7,7 @@ import pytest
 
 from stillmap.cli.main import main
 from stillmap.cli.parser import COMMANDS
-from stillmap.core.errors import InputError, nearest
+from stillmap.core.errors import InputError, closest_match
 
 
 def refusal(capsys, *words: object) -> str:
@@ -107,11 +107,11 @@ def test_a_variable_that_is_not_set_does_no_harm(capsys, tmp_path, monkeypatch, 
 
 
 def test_nearest():
-    assert nearest("resoluton", ["paper", "resolution"]) == "resolution"
-    assert nearest("PAPER", ["paper"]) == "paper"
-    assert nearest("xyz", ["paper"]) is None
-    assert nearest("xyz", ["paper"], least=0.0) == "paper"
-    assert nearest("x", []) is None
+    assert closest_match("resoluton", ["paper", "resolution"]) == "resolution"
+    assert closest_match("PAPER", ["paper"]) == "paper"
+    assert closest_match("xyz", ["paper"]) is None
+    assert closest_match("xyz", ["paper"], least=0.0) == "paper"
+    assert closest_match("x", []) is None
 
 
 def test_without_a_command_it_lists_them(stillmap):

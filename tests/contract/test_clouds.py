@@ -14,7 +14,7 @@ from stillmap.cli.main import main
 from stillmap.core.errors import InputError
 from stillmap.io import read, stillmap_folder
 from stillmap.io.point_cloud import pcd, ply
-from stillmap.io.point_cloud.binary_table import columns
+from stillmap.io.point_cloud.binary_table import read_columns
 from stillmap.results.export import point_cloud, point_cloud_files
 
 FIELDS = ("x", "y", "z", "p_static")
@@ -23,7 +23,7 @@ ROUNDED = 0.5001e-4  # m
 
 def of_ply(path: Path) -> np.ndarray:
     """(n, 4) FIELDS."""
-    blocks = [np.stack(block, 1) for block in columns(ply.layout_of(path), FIELDS)]
+    blocks = [np.stack(block, 1) for block in read_columns(ply.read_layout(path), FIELDS)]
     return np.concatenate([np.empty((0, 4), np.float32), *blocks])
 
 
@@ -50,7 +50,7 @@ def of_e57(path: Path) -> np.ndarray:
 
 
 def of_pcd(path: Path) -> np.ndarray:
-    return np.stack(pcd.values(pcd.header(path), list(FIELDS)), axis=1)
+    return np.stack(pcd.read_values(pcd.read_header(path), list(FIELDS)), axis=1)
 
 
 def of_xyz(path: Path) -> np.ndarray:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from stillmap.cli.recording_info import facts
 from stillmap.core.errors import InputError
 from stillmap.io import read, write
-from stillmap.io.camera_file import read as read_file
+from stillmap.io.camera_file import read_camera_file as read_file
 from stillmap.preprocessing.options import ReadOptions
 
 ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.io import read
-from stillmap.io.point_cloud.kitti_times import read_times, rows_of
+from stillmap.io.point_cloud.kitti_times import assign_rows, read_times
 
 # the laser's x is the camera's z: a rotation, and a place
 TR = "0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3"
@@ -205,7 +205,7 @@ def test_nothing_that_can_be_read(folder):
 
 def test_which_time_is_whose(tmp_path):
     def rows(names, n):
-        return rows_of([tmp_path / f"{name}.bin" for name in names], n, tmp_path)
+        return assign_rows([tmp_path / f"{name}.bin" for name in names], n, tmp_path)
 
     assert rows(["000000", "000001"], 2) == [0, 1]
     assert rows(["000000", "000002"], 3) == [0, 2]

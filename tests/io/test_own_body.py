@@ -18,7 +18,7 @@ def readings():
 
 
 def test_a_robot_that_sees_itself(readings):
-    ((first, last, limit),) = self_filter.find_body_2d(readings, 0.02)
+    ((first, last, limit),) = self_filter.find_self_sectors(readings, 0.02)
     assert (first, last) == (0, 6)
     assert limit == pytest.approx(0.4, abs=0.01)
 
@@ -26,31 +26,31 @@ def test_a_robot_that_sees_itself(readings):
 def test_its_readings_are_unusable(readings):
     readings[5:10, 3] = 2.0
     readings[:10, 30] = 0.35
-    rule, _ = max_range.decide(readings, None, ReadOptions())
-    length, hit = max_range.apply(readings, rule)
+    rule, _ = max_range.infer_range_rule(readings, None, ReadOptions())
+    length, hit = max_range.apply_range_rule(readings, rule)
     own = readings[:, :5] < 0.4
     assert np.isnan(length[:, :5][own]).all()
     assert not hit[:, :5][own].any()
     assert hit[5:10, 3].all()  # somebody beside the robot
     assert hit[:10, 30].all()  # near, where the robot is not
-    kept, _ = max_range.decide(readings, None, ReadOptions(own_body=False))
-    assert max_range.apply(readings, kept)[1][:, :5][own].all()
+    kept, _ = max_range.infer_range_rule(readings, None, ReadOptions(own_body=False))
+    assert max_range.apply_range_rule(readings, kept)[1][:, :5][own].all()
 
 
 def test_a_laser_that_stands_sees_everything_again(readings):
     readings[:] = readings[0]
-    assert self_filter.find_body_2d(readings, 0.02) == ()
+    assert self_filter.find_self_sectors(readings, 0.02) == ()
 
 
 def test_a_wall_along_the_way_is_no_robot(readings):
     """Half a metre beside the robot for half of the way."""
     readings[:50, 20:30] = 0.5
-    assert [part[:2] for part in self_filter.find_body_2d(readings, 0.02)] == [(0, 6)]
+    assert [part[:2] for part in self_filter.find_self_sectors(readings, 0.02)] == [(0, 6)]
 
 
 def test_few_scans_show_nothing(readings):
-    assert self_filter.find_body_2d(readings[:10], 0.02) == ()
+    assert self_filter.find_self_sectors(readings[:10], 0.02) == ()
 
 
 def test_nothing_but_silence():
-    assert self_filter.find_body_2d(np.full((50, 9), np.nan, np.float32), 0.02) == ()
+    assert self_filter.find_self_sectors(np.full((50, 9), np.nan, np.float32), 0.02) == ()

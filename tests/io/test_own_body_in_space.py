@@ -32,7 +32,7 @@ def drive() -> Simulation:
 
 def gone(recording: Recording) -> np.ndarray:
     """Hits that are left out."""
-    out = self_filter.left_out(recording)
+    out = self_filter.remove_self_returns(recording)
     lost = recording.hit & ~out.hit
     assert np.isnan(out.points[lost]).all()
     np.testing.assert_array_equal(out.points[~lost], recording.points[~lost])
@@ -46,7 +46,7 @@ def test_a_car_that_sees_its_roof(drive):
 
 
 def test_what_was_found_is_noted(drive):
-    out = self_filter.left_out(drive.recording)
+    out = self_filter.remove_self_returns(drive.recording)
     (noted,) = facts(out)["own_body"]
     assert noted["beams"] == np.count_nonzero(drive.recording.hit & ~out.hit)
     np.testing.assert_allclose(noted["low"], [-2.0, -0.85, -0.35], atol=0.25)
@@ -93,14 +93,14 @@ def test_a_small_robot_indoors(world):
 def test_where_nothing_of_the_robot_shows_nothing_is_lost(world, scans, lidar):
     """Level ground, ceilings and the walls of a corridor come back from one place, too."""
     recording = run(world, scans, **lidar).recording
-    assert self_filter.left_out(recording) is recording
+    assert self_filter.remove_self_returns(recording) is recording
 
 
 @pytest.mark.parametrize("world", ["street-jam", "hall"])
 def test_a_robot_that_stands_loses_nothing(world):
     """What stands near it could be a part of it."""
     recording = run(world, 60, speed=1e-3, **CAR).recording
-    assert self_filter.left_out(recording) is recording
+    assert self_filter.remove_self_returns(recording) is recording
 
 
 def test_a_few_scans_show_nothing(drive):
@@ -116,7 +116,7 @@ def test_a_few_scans_show_nothing(drive):
         T_odom_base=None,
         beam_time=None,
     )
-    assert self_filter.left_out(few) is few
+    assert self_filter.remove_self_returns(few) is few
 
 
 def test_a_fan_of_beams_is_no_sweep(drive):
@@ -125,12 +125,12 @@ def test_a_fan_of_beams_is_no_sweep(drive):
     points = np.array(r.points)
     points[:, 2] = 0.02 * points[:, 0]
     flat = replace(r, points=points)
-    assert self_filter.left_out(flat) is flat
+    assert self_filter.remove_self_returns(flat) is flat
 
 
 def test_recordings_without_any_hit():
     recording = run("street", 20, max_range=0.5).recording
-    assert self_filter.left_out(recording) is recording
+    assert self_filter.remove_self_returns(recording) is recording
 
 
 @pytest.mark.parametrize("form", ["kitti", "stillmap", "mcap"])

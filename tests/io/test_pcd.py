@@ -296,4 +296,4 @@ def test_mutations(tmp_path, data):
     except InputError:
         return
     assert np.isfinite(found.points[found.hit]).all()
-    assert pcd.header(path).layout.rows == found.n_beams
+    assert pcd.read_header(path).layout.rows == found.n_beams

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from stillmap.core.errors import InputError
-from stillmap.io.images import read_picture, size_of
+from stillmap.io.images import read_image, read_image_size
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def picture(tmp_path) -> Path:
 
 def said(path: Path) -> str:
     with pytest.raises(InputError) as caught:
-        read_picture(path)
+        read_image(path)
     return str(caught.value)
 
 
@@ -32,7 +32,7 @@ def test_what_is_no_picture_is_named_once(picture):
 
 def test_a_picture_that_is_cut(picture):
     picture.write_bytes(picture.read_bytes()[:1000])
-    assert size_of(picture) == (32, 32)
+    assert read_image_size(picture) == (32, 32)
     assert said(picture).startswith(f"{picture}: is no picture: ")
     assert said(picture).count(picture.name) == 1
 

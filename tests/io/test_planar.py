@@ -53,7 +53,7 @@ def test_angles_are_found_in_the_points(start, degrees, falling, n, seed):
     if np.diff(seen).min() * abs(step) > 3.0:
         return  # neighbours more than half a turn apart tell nothing
     angles = start + step * np.arange(n)
-    (first, found) = laser_scan.fans(recording([(angles, ranges)]))[0]
+    (first, found) = laser_scan.beam_angles(recording([(angles, ranges)]))[0]
     off = (first + found * seen - angles[seen] + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(off).max() < 1e-6
 
@@ -61,7 +61,7 @@ def test_angles_are_found_in_the_points(start, degrees, falling, n, seed):
 def test_what_the_reader_noted_comes_first():
     angles, noted = np.linspace(-1.0, 1.0, 21), {"start_angle": -1.0, "angle_step": 0.1}
     one = recording([(angles, np.full(21, 5.0))], sensors=[noted])
-    assert laser_scan.fans(one).tolist() == [[-1.0, 0.1]]
+    assert laser_scan.beam_angles(one).tolist() == [[-1.0, 0.1]]
 
 
 @pytest.mark.parametrize(
@@ -70,25 +70,27 @@ def test_what_the_reader_noted_comes_first():
 def test_notes_that_do_not_fit_are_not_believed(noted):
     angles = np.linspace(-1.0, 1.0, 21)
     one = recording([(angles, np.full(21, 5.0))], sensors=[noted])
-    np.testing.assert_allclose(laser_scan.fans(one), [[-1.0, 0.1]], atol=1e-7)
+    np.testing.assert_allclose(laser_scan.beam_angles(one), [[-1.0, 0.1]], atol=1e-7)
 
 
 def test_every_scan_may_have_its_own():
     scans = [(s + d * np.arange(n), np.full(n, 3.0)) for s, d, n in [(0, 0.1, 9), (1, -0.02, 9)]]
     scans += [(2 + 0.3 * np.arange(4), np.full(4, 3.0)), scans[0]]
-    found = laser_scan.fans(recording(scans))
+    found = laser_scan.beam_angles(recording(scans))
     np.testing.assert_allclose(found, [[0, 0.1], [1, -0.02], [2, 0.3], [0, 0.1]], atol=1e-6)
 
 
 def test_a_scan_that_tells_nothing_has_the_angles_of_the_others():
     angles, blind = np.linspace(-1.0, 1.0, 21), np.full(21, np.nan)
     scans = [(angles, blind), (angles, np.full(21, 5.0)), (angles, blind)]
-    np.testing.assert_allclose(laser_scan.fans(recording(scans)), [[-1.0, 0.1]] * 3, atol=1e-7)
+    np.testing.assert_allclose(
+        laser_scan.beam_angles(recording(scans)), [[-1.0, 0.1]] * 3, atol=1e-7
+    )
     lone = blind.copy()
     lone[3] = 2.0  # one beam, and no other scan: any angles that let it point there
-    first, step = laser_scan.fans(recording([(angles, lone)]))[0]
+    first, step = laser_scan.beam_angles(recording([(angles, lone)]))[0]
     assert np.isclose(first + 3 * step, angles[3])
-    assert np.isfinite(laser_scan.fans(recording([(angles, blind)]))).all()
+    assert np.isfinite(laser_scan.beam_angles(recording([(angles, blind)]))).all()
 
 
 def test_directions_that_no_driver_states_are_refused():
@@ -97,7 +99,7 @@ def test_directions_that_no_driver_states_are_refused():
     angles = angles.copy()
     angles[7] += 0.01
     with pytest.raises(InputError, match=r"scan 1: the directions .* not evenly spaced"):
-        laser_scan.fans(recording([even, (angles, np.full(21, 5.0))]))
+        laser_scan.beam_angles(recording([even, (angles, np.full(21, 5.0))]))
 
 
 def test_clouds_are_refused():
@@ -106,12 +108,12 @@ def test_clouds_are_refused():
         flat, points=np.ones((1, 3), np.float32), T_base_sensor=np.eye(4)[None]
     )
     with pytest.raises(InputError, match="3D"):
-        laser_scan.fans(cloud)
+        laser_scan.beam_angles(cloud)
 
 
 def test_ranges():
     one = recording([([0.0, 1.0, 2.0], [3.0, 7.0, np.nan])], hit=[True, False, False])
-    np.testing.assert_allclose(laser_scan.ranges(one, 0, np.inf), [3.0, np.inf, np.nan])
+    np.testing.assert_allclose(laser_scan.beam_ranges(one, 0, np.inf), [3.0, np.inf, np.nan])
 
 
 def test_how_far_lasers_see():
@@ -120,14 +122,14 @@ def test_how_far_lasers_see():
     one = recording(
         scans, hit=[True, False, True, True, False], sensor=[0, 1, 2], sensors=[{}, noted]
     )
-    first, second, third = laser_scan.reaches(one)
+    first, second, third = laser_scan.range_limits(one)
     assert first == (pytest.approx(3.0), pytest.approx(7.0))
     assert second.declared == 81.91
     assert third == (0.0, None)
     # a hit is never at the limit: readers take what reaches it for maximum range
     for reach, hit in ((first, 3.0), (second, 9.0)):
         assert np.float32(reach.limit()) > np.float32(hit)
-    clipped = laser_scan.Reach(5.0, 5.0)
+    clipped = laser_scan.RangeLimits(5.0, 5.0)
     assert np.float32(clipped.limit()) > np.float32(5.0)
     assert clipped.limit() < 5.00001
 

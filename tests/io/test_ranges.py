@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.preprocessing.max_range import apply, decide, find_max_range
+from stillmap.preprocessing.max_range import apply_range_rule, find_max_range, infer_range_rule
 from stillmap.preprocessing.options import ReadOptions
 
 T, N = 200, 181
@@ -76,7 +76,7 @@ def test_clipped_sensor(clip, noise):
     found = find_max_range(ranges)
     assert found.coded
     assert found.threshold == pytest.approx(clip)
-    _, hit = apply(ranges, decide(ranges, None, ReadOptions())[0])
+    _, hit = apply_range_rule(ranges, infer_range_rule(ranges, None, ReadOptions())[0])
     np.testing.assert_array_equal(hit, ranges < np.float32(clip))
 
 
@@ -108,9 +108,9 @@ def test_declared_maximum():
 def test_infinite_readings_are_maximum_range(value):
     ranges = np.random.default_rng(2).uniform(1.0, 5.0, (T, N)).astype(np.float32)
     ranges[:, ::7] = value
-    rule, _ = decide(ranges, None, ReadOptions())
+    rule, _ = infer_range_rule(ranges, None, ReadOptions())
     assert rule.threshold is None
-    length, hit = apply(ranges, rule)
+    length, hit = apply_range_rule(ranges, rule)
     assert not hit[:, ::7].any()
     assert hit.sum() == T * N - ranges[:, ::7].size
     assert np.all(length[:, ::7] == np.float32(rule.free_range))
@@ -142,9 +142,9 @@ def zeros_and_hits(share, code=None):
 )
 def test_what_zero_means(share, code, wanted, means):
     ranges = zeros_and_hits(share, code)
-    rule, _ = decide(ranges, None, ReadOptions(zero_means=wanted))
+    rule, _ = infer_range_rule(ranges, None, ReadOptions(zero_means=wanted))
     assert rule.zero_means == means
-    length, hit = apply(ranges, rule)
+    length, hit = apply_range_rule(ranges, rule)
     zero = ranges == 0.0
     assert not hit[zero].any()
     assert np.isnan(length[zero]).all() == (means == "unusable")
@@ -152,8 +152,8 @@ def test_what_zero_means(share, code, wanted, means):
 
 def test_unusable_readings():
     ranges = np.array([[np.nan, -np.inf, -1.0, 0.01, 0.5, 1.0]], np.float32)
-    length, hit = apply(
-        ranges, decide(ranges, None, ReadOptions(min_range=0.6, zero_means="unusable"))[0]
+    length, hit = apply_range_rule(
+        ranges, infer_range_rule(ranges, None, ReadOptions(min_range=0.6, zero_means="unusable"))[0]
     )
     assert hit.tolist() == [[False] * 5 + [True]]
     assert np.isnan(length[0, :5]).all()
@@ -162,28 +162,30 @@ def test_unusable_readings():
 def test_free_range_is_what_the_laser_really_sees():
     ranges = zeros_and_hits(0.0, 81.83)
     ranges[0, 0] = 60.0  # one far reading does not make the laser see 60 m
-    rule, _ = decide(ranges, None, ReadOptions())
+    rule, _ = infer_range_rule(ranges, None, ReadOptions())
     assert 4.9 < rule.free_range < 5.01
-    assert decide(ranges, None, ReadOptions(free_range=7.0))[0].free_range == 7.0
+    assert infer_range_rule(ranges, None, ReadOptions(free_range=7.0))[0].free_range == 7.0
     clipped = np.minimum(ranges, np.float32(3.0))
-    assert decide(clipped, None, ReadOptions())[0].free_range == pytest.approx(3.0, abs=0.01)
+    assert infer_range_rule(clipped, None, ReadOptions())[0].free_range == pytest.approx(
+        3.0, abs=0.01
+    )
 
 
 def test_given_maximum_range():
     ranges = zeros_and_hits(0.0, 81.83)
-    rule, warnings = decide(ranges, None, ReadOptions(max_range=4.0))
+    rule, warnings = infer_range_rule(ranges, None, ReadOptions(max_range=4.0))
     assert not warnings
     assert (rule.threshold, rule.threshold_how) == (4.0, "given")
     assert rule.free_range < 4.0
-    rule, warnings = decide(ranges, None, ReadOptions(max_range=90.0))
+    rule, warnings = infer_range_rule(ranges, None, ReadOptions(max_range=90.0))
     assert "81.83" in warnings[0]
 
 
 def test_no_reading_says_anything():
     ranges = np.full((2, 3), np.inf, np.float32)
-    rule, warnings = decide(ranges, None, ReadOptions())
+    rule, warnings = infer_range_rule(ranges, None, ReadOptions())
     assert warnings
-    assert np.isnan(apply(ranges, rule)[0]).all()
+    assert np.isnan(apply_range_rule(ranges, rule)[0]).all()
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import read
 from stillmap.io.rgbd import T_BASE_CAMERA
-from stillmap.io.rgbd_folders import SCENES, TUM, kind_of
+from stillmap.io.rgbd_folders import SCENES, TUM, detect_layout
 from stillmap.preprocessing.options import ReadOptions
 
 W, H = 64, 48
@@ -349,11 +349,11 @@ def test_tum_lists_lead_nowhere_else(tmp_path):
 
 
 def test_other_folders_are_none_of_these(tmp_path, scenes):
-    assert kind_of(scenes) == SCENES
-    assert kind_of(write_tum(tmp_path / "fr1")) == TUM
-    assert kind_of(tmp_path / "missing") is None
+    assert detect_layout(scenes) == SCENES
+    assert detect_layout(write_tum(tmp_path / "fr1")) == TUM
+    assert detect_layout(tmp_path / "missing") is None
     (tmp_path / "frame-1.color.png").touch()
-    assert kind_of(tmp_path) is None
+    assert detect_layout(tmp_path) is None
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def timeless(sweeps):
 
 
 def test_times_come_back(sweeps, timeless):
-    found = laser_scan.timed(timeless, LEFT).beam_time
+    found = laser_scan.add_beam_times(timeless, LEFT).beam_time
     usable = np.isfinite(sweeps.recording.points).all(axis=1)
     away = np.abs(found - sweeps.recording.beam_time)[usable]
     # beams of the very first column are as well those of the last
@@ -44,8 +44,8 @@ def test_sweeps_are_straightened_as_by_recorded_times(sweeps, timeless):
     chosen = Options().slam
     poses = sweeps.truth.T_world_base
     true, found, left = (
-        slam.deskewed(r, poses, chosen).points
-        for r in (sweeps.recording, laser_scan.timed(timeless, LEFT), timeless)
+        slam.deskew_recording(r, poses, chosen).points
+        for r in (sweeps.recording, laser_scan.add_beam_times(timeless, LEFT), timeless)
     )
     hit = sweeps.recording.hit
     error, before = (np.linalg.norm(p - true, axis=1)[hit] for p in (found, left))
@@ -67,30 +67,32 @@ def test_sweeps_are_straightened_as_by_recorded_times(sweeps, timeless):
 def test_turns(direction, start, stamp, azimuth, turns):
     chosen = ReadOptions(spin=direction, spin_start=start, spin_stamp=stamp)
     point = np.array([[3 * math.cos(azimuth), 3 * math.sin(azimuth), -1.0]], np.float32)
-    assert laser_scan.turns(point, chosen) == pytest.approx([turns], abs=1e-6)
+    assert laser_scan.rotation_since_stamp(point, chosen) == pytest.approx([turns], abs=1e-6)
 
 
 def test_unusable_beams_have_a_time_all_the_same():
-    assert laser_scan.turns(np.full((1, 3), np.nan, np.float32), LEFT).tolist() == [0.0]
+    assert laser_scan.rotation_since_stamp(np.full((1, 3), np.nan, np.float32), LEFT).tolist() == [
+        0.0
+    ]
 
 
 def test_the_rate_is_that_of_the_stamps_or_given(timeless):
-    last = laser_scan.timed(timeless, LEFT).beam_time.max()
+    last = laser_scan.add_beam_times(timeless, LEFT).beam_time.max()
     assert last == pytest.approx(0.1, abs=1e-3)
-    faster = laser_scan.timed(timeless, replace(LEFT, spin_rate=20.0))
+    faster = laser_scan.add_beam_times(timeless, replace(LEFT, spin_rate=20.0))
     assert faster.beam_time.max() == pytest.approx(last / 2, rel=1e-6)
     assert faster.source["spin"]["turns_per_second"] == [20.0]
 
 
 def test_recorded_times_are_kept(sweeps):
-    found = laser_scan.timed(sweeps.recording, LEFT)
+    found = laser_scan.add_beam_times(sweeps.recording, LEFT)
     assert found.beam_time is sweeps.recording.beam_time
     assert any("times of their own" in text for text in found.source["warnings"])
 
 
 def test_stamps_that_tell_no_rate(timeless):
     odd = replace(timeless, stamp_ns=timeless.stamp_ns * 100)
-    found = laser_scan.timed(odd, LEFT)
+    found = laser_scan.add_beam_times(odd, LEFT)
     assert found.beam_time is None
     assert any("spin_rate" in text for text in found.source["warnings"])
 
@@ -124,9 +126,11 @@ def test_raw_drives_of_kitti_turn_clockwise(tmp_path, timeless):
 
 
 def test_recordings_that_were_timed_so_are_read_again_as_they_are(tmp_path, timeless):
-    stillmap_folder.write(laser_scan.timed(timeless, LEFT), tmp_path / "a")
+    stillmap_folder.write(laser_scan.add_beam_times(timeless, LEFT), tmp_path / "a")
     again = read(tmp_path / "a", replace(LEFT, spin="clockwise"))
-    np.testing.assert_array_equal(again.beam_time, laser_scan.timed(timeless, LEFT).beam_time)
+    np.testing.assert_array_equal(
+        again.beam_time, laser_scan.add_beam_times(timeless, LEFT).beam_time
+    )
 
 
 def test_the_flag(tmp_path, timeless, capsys):

@@ -41,7 +41,7 @@ def files_of(recording, estimator: str, out: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_arrays_in_files_give_the_same_bytes(swept, estimator, tmp_path, monkeypatch):
     in_memory = files_of(swept, estimator, tmp_path / "in memory")
-    monkeypatch.setattr(arrays, "IN_MEMORY", 0)
+    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
     assert files_of(swept, estimator, tmp_path / "in files") == in_memory
     assert {path.name for path in tmp_path.iterdir()} == {"in memory", "in files"}
 
@@ -49,8 +49,8 @@ def test_arrays_in_files_give_the_same_bytes(swept, estimator, tmp_path, monkeyp
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_pieces_of_any_size_give_the_same_bytes(swept, estimator, tmp_path, monkeypatch):
     whole = files_of(swept, estimator, tmp_path / "whole")
-    monkeypatch.setattr(arrays, "IN_MEMORY", 0)
+    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
     monkeypatch.setattr(arrays, "BLOCK", 1000)
     monkeypatch.setattr(observations, "CHUNK_BEAMS", 700)
-    monkeypatch.setattr(arrays, "TOGETHER", 3)
+    monkeypatch.setattr(arrays, "ITEMS_PER_RELEASE", 3)
     assert files_of(swept, estimator, tmp_path / "pieces") == whole

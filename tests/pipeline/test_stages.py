@@ -1,6 +1,6 @@
 import time
 
-from stillmap.core.profiling import Stages
+from stillmap.core.profiling import StageTimer
 
 
 def busy(seconds):
@@ -10,7 +10,7 @@ def busy(seconds):
 
 
 def test_calls_of_a_stage_add_up_and_sleep_takes_no_processor_time():
-    stages = Stages()
+    stages = StageTimer()
     for _ in range(2):
         with stages.measure("work"):
             busy(0.05)

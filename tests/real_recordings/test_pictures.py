@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import stillmap
 from stillmap.core import camera
-from stillmap.mesh.texture.views import View, colours_of, views_of
+from stillmap.mesh.texture.views import View, read_color_image, find_views
 
 slow = pytest.mark.slow
 
@@ -38,7 +38,7 @@ def steepness(recording: stillmap.Recording, view: View, scan: int, turned: floa
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler("y", turned, degrees=True).as_matrix()
     view = replace(view, T_camera_map=turn @ view.T_camera_map)
-    picture = colours_of(recording.images, view)
+    picture = read_color_image(recording.images, view)
     assert picture is not None
     change = np.abs(np.gradient(picture.mean(axis=2), axis=1))
     change = maximum_filter1d(change, 5, axis=1)  # beams are two or three pixels apart
@@ -46,7 +46,7 @@ def steepness(recording: stillmap.Recording, view: View, scan: int, turned: floa
     beams = beams[recording.hit[beams]]
     points = view.in_camera(recording.end_points(beams, recording.T_recorded_base))
     uv, ok = camera.project(view.camera, points)
-    ok &= camera.within(view.camera, uv)
+    ok &= camera.is_in_image(view.camera, uv)
     depth, at = points[:, 2], np.round(np.where(ok[:, None], uv, 0.0)).astype(np.intp)
     # of beams one after the other, the one that ends much nearer
     both = np.flatnonzero(ok[:-1] & ok[1:])
@@ -57,7 +57,7 @@ def steepness(recording: stillmap.Recording, view: View, scan: int, turned: floa
 
 
 def test_the_street_is_seen_where_its_points_are(street):
-    views, left_out = views_of(street, street.T_recorded_base)
+    views, left_out = find_views(street, street.T_recorded_base)
     assert (len(views), left_out) == (5, {})
     for scan in (0, 4):
         right, *wrong = (steepness(street, views[scan], scan, by) for by in (0.0, -2.0, 2.0))
@@ -65,7 +65,7 @@ def test_the_street_is_seen_where_its_points_are(street):
 
 
 def test_the_room_is_seen_where_its_points_are(kitchen):
-    views, left_out = views_of(kitchen, kitchen.T_recorded_base)
+    views, left_out = find_views(kitchen, kitchen.T_recorded_base)
     assert (len(views), left_out) == (125, {})
     right = np.mean([steepness(kitchen, views[k], k, 0.0) for k in range(0, 125, 10)])
     for by in (-3.0, 3.0):

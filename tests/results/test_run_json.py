@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stillmap.core.json import jsonable, skipped_count
+from stillmap.core.json import count_skipped, to_jsonable
 from stillmap.results.save import write_run_json
 
 
@@ -134,10 +134,10 @@ def test_values_of_every_kind_become_json(tmp_path, result):
 
 def test_jsonable_keeps_the_kind_of_what_json_knows():
     value = {"a": [True, 1, 1.5, "x", None]}
-    assert json.dumps(jsonable(value)) == json.dumps(value)
+    assert json.dumps(to_jsonable(value)) == json.dumps(value)
 
 
 def test_a_reader_that_skipped_nothing():
     assert (
-        skipped_count({}) == skipped_count({"skipped": {}}) == skipped_count({"skipped": None}) == 0
+        count_skipped({}) == count_skipped({"skipped": {}}) == count_skipped({"skipped": None}) == 0
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.recording import Recording
-from stillmap.preprocessing.tilting_laser import sweeps, tilted
+from stillmap.preprocessing.tilting_laser import assemble_tilting_laser, sweep_indices
 from stillmap.sim import scene_by_name, simulate_rig
 
 
@@ -35,7 +35,9 @@ def test_a_simulated_rig_comes_back_from_its_planar_scans():
         T_odom_base=None,
         beam_time=whole.beam_time,
     )
-    found = tilted(flat, whole.stamp_ns, joint, (0.0, 1.0, 0.0), whole.T_base_sensor[0])
+    found = assemble_tilting_laser(
+        flat, whole.stamp_ns, joint, (0.0, 1.0, 0.0), whole.T_base_sensor[0]
+    )
     of_even = np.isin(whole.scans_of(np.arange(whole.n_beams)), even)
     of_even &= (
         whole.scans_of(np.arange(whole.n_beams)) < 59
@@ -58,17 +60,17 @@ def test_a_laser_beside_the_joint_goes_round_it():
     T = np.eye(4)
     T[0, 3] = 0.5
     angle = np.array([np.pi / 2])
-    pans = tilted(flat, flat.stamp_ns, angle, (0.0, 0.0, 1.0), np.eye(4), T)
+    pans = assemble_tilting_laser(flat, flat.stamp_ns, angle, (0.0, 0.0, 1.0), np.eye(4), T)
     np.testing.assert_allclose(pans.points, [[0.0, 2.5, 0.0]], atol=1e-6)
-    nods = tilted(flat, flat.stamp_ns, angle, (0.0, 1.0, 0.0), np.eye(4), T)
+    nods = assemble_tilting_laser(flat, flat.stamp_ns, angle, (0.0, 1.0, 0.0), np.eye(4), T)
     np.testing.assert_allclose(nods.points, [[0.0, 0.0, -2.5]], atol=1e-6)
     with pytest.raises(ValueError, match="1 stamps, 2 angles"):
-        tilted(flat, flat.stamp_ns, np.zeros(2), (0.0, 1.0, 0.0), np.eye(4))
+        assemble_tilting_laser(flat, flat.stamp_ns, np.zeros(2), (0.0, 1.0, 0.0), np.eye(4))
 
 
 def test_a_sweep_ends_where_the_joint_turns_round():
     joint = np.array([0.0, 0.1, 0.2, 0.195, 0.3, 0.2, 0.1, 0.0, 0.0, 0.1, 0.2])
-    assert sweeps(joint).tolist() == [0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2]
-    assert sweeps(np.zeros(4)).tolist() == [0, 0, 0, 0]
-    n = sweeps(rig().joint_angle)
+    assert sweep_indices(joint).tolist() == [0, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2]
+    assert sweep_indices(np.zeros(4)).tolist() == [0, 0, 0, 0]
+    n = sweep_indices(rig().joint_angle)
     assert (n.max(), np.diff(n).min()) == (1, 0)  # 3 s of a period of 4 s, from the middle on

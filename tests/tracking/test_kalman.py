@@ -16,15 +16,15 @@ def whole(motion, k):
 
 def some(rng, K=4):
     x = rng.normal(size=(K, 2))
-    motion = kalman.still(x, 0.2, 1.5)
-    motion = kalman.predicted(motion, 0.3, 0.7)  # place and speed depend on one another
-    return kalman.updated(motion, np.ones(K, bool), x + rng.normal(0, 0.3, x.shape), 0.1)
+    motion = kalman.initialize(x, 0.2, 1.5)
+    motion = kalman.predict(motion, 0.3, 0.7)  # place and speed depend on one another
+    return kalman.update(motion, np.ones(K, bool), x + rng.normal(0, 0.3, x.shape), 0.1)
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.2, 3.0, -0.5])
 def test_prediction(dt):
     motion = some(np.random.default_rng(0))
-    found, q, t = kalman.predicted(motion, dt, 0.7), 0.7, abs(dt)
+    found, q, t = kalman.predict(motion, dt, 0.7), 0.7, abs(dt)
     eye = np.eye(2)
     F = np.block([[eye, dt * eye], [0 * eye, eye]])
     Q = q * np.block([[t**3 / 3 * eye, dt * t / 2 * eye], [dt * t / 2 * eye, t * eye]])
@@ -39,7 +39,7 @@ def test_update():
     rng = np.random.default_rng(1)
     motion = some(rng)
     at, seen = rng.normal(size=(4, 2)), np.array([True, False, True, True])
-    found = kalman.updated(motion, seen, at, 0.12)
+    found = kalman.update(motion, seen, at, 0.12)
     H, R = np.eye(2, 4), 0.12**2 * np.eye(2)
     for k in range(4):
         state, P = whole(motion, k)
@@ -52,7 +52,7 @@ def test_update():
 
 
 def test_of_nothing():
-    none = kalman.still(np.zeros((0, 2)), 1.0, 1.0)
-    assert len(kalman.predicted(none, 1.0, 1.0)) == 0
-    assert len(kalman.updated(none, np.zeros(0, bool), np.zeros((0, 2)), 1.0)) == 0
-    assert len(kalman.joined(none, some(np.random.default_rng(0)))) == 4
+    none = kalman.initialize(np.zeros((0, 2)), 1.0, 1.0)
+    assert len(kalman.predict(none, 1.0, 1.0)) == 0
+    assert len(kalman.update(none, np.zeros(0, bool), np.zeros((0, 2)), 1.0)) == 0
+    assert len(kalman.concatenate(none, some(np.random.default_rng(0)))) == 4

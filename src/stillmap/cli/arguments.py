@@ -217,7 +217,7 @@ class Mapped:
             )
         if any(
             (recording.hit[b] != labels.hit[b]).any()
-            for b in arrays.blocks(recording.hit, labels.hit)
+            for b in arrays.iter_blocks(recording.hit, labels.hit)
         ):
             raise InputError(
                 "is not the recording that was mapped: other beams hit something",

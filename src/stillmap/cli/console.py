@@ -229,9 +229,9 @@ class _Lines:
 
 def print_json(content: dict[str, Any]) -> None:
     """One object on stdout; numbers that are not finite become null."""
-    from stillmap.core.json import jsonable
+    from stillmap.core.json import to_jsonable
 
-    print(json.dumps(jsonable(content), allow_nan=False))
+    print(json.dumps(to_jsonable(content), allow_nan=False))
 
 
 def files_in(folder: Path) -> list[str]:

@@ -95,9 +95,9 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
 
 
 def _time(time: dict[str, Any]) -> Iterator[str]:
-    from stillmap.core.timestamps import seconds_text
+    from stillmap.core.timestamps import format_seconds
 
-    first, last = (seconds_text(time[key]) for key in ("first_stamp_ns", "last_stamp_ns"))
+    first, last = (format_seconds(time[key]) for key in ("first_stamp_ns", "last_stamp_ns"))
     rate = f", {time['rate_hz']:.2f} scans/s" if time["rate_hz"] else ""
     gap = f", largest gap {time['largest_gap_s']:.2f} s" if time["largest_gap_s"] else ""
     yield _row("duration", f"{time['duration_s']:.2f} s{rate}{gap}")
@@ -113,13 +113,13 @@ def _odometry(odometry: dict[str, Any] | None) -> Iterator[str]:
         "odometry",
         f"path {odometry['path_length_m']:.2f} m, turned {odometry['turned_deg']:.0f} deg{origin}",
     )
-    from stillmap.core.timestamps import seconds_text
+    from stillmap.core.timestamps import format_seconds
 
     at = odometry["largest_step_at_ns"]
     if at is not None:
         yield _row(
             "largest step",
-            f"{odometry['largest_step_m']:.3f} m (after {seconds_text(at)}), "
+            f"{odometry['largest_step_m']:.3f} m (after {format_seconds(at)}), "
             f"{odometry['largest_step_deg']:.1f} deg",
         )
 

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 from stillmap.cli.console import EXIT_INTERRUPTED, EXIT_TERMINATED, fail, hear_signals, say
 from stillmap.cli.parser import COMMANDS, EXIT_INPUT, parser
-from stillmap.core.errors import InputError, nearest
+from stillmap.core.errors import InputError, closest_match
 
 EXIT_OURS = 1
 
@@ -106,7 +106,7 @@ def _with_similar_name(error: InputError, args: argparse.Namespace) -> InputErro
             names = [entry.name for entry, _ in zip(entries, range(_MANY), strict=False)]
     except (OSError, ValueError):
         return error
-    similar = nearest(path.name, names)
+    similar = closest_match(path.name, names)
     if similar is None:
         return error
     hint = f"did you mean '{path.with_name(similar)}'?"

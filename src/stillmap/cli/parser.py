@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from stillmap.cli.console import painted
-from stillmap.core.errors import nearest
+from stillmap.core.errors import closest_match
 
 EXIT_INPUT = 2
 
@@ -97,7 +97,7 @@ def _flags(words: list[str]) -> Iterable[str]:
 
 
 def _meant(word: str, known: Iterable[str]) -> str:
-    meant = nearest(word, known)
+    meant = closest_match(word, known)
     return f"did you mean '{meant}'?" if meant else ""
 
 

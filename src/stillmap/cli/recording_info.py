@@ -74,7 +74,9 @@ def _hit_ranges(recording: Recording) -> NDArray[np.float32]:
     step = -(-recording.n_beams // _SAMPLED)
     parts = [np.empty(0, np.float32)]
     for beams in (
-        arrays.blocks(recording.points, recording.hit) if step <= 1 else _scans(recording, step)
+        arrays.iter_blocks(recording.points, recording.hit)
+        if step <= 1
+        else _scans(recording, step)
     ):
         points = recording.points[beams][recording.hit[beams]]
         parts.append(np.linalg.norm(points.astype(np.float64), axis=1).astype(np.float32))
@@ -100,7 +102,7 @@ def _spread(values: NDArray[Any], wanted: tuple[str, ...]) -> dict[str, float] |
 
 def _counts(recording: Recording) -> dict[str, Any]:
     hits = unusable = 0
-    for block in arrays.blocks(recording.points, recording.hit):
+    for block in arrays.iter_blocks(recording.points, recording.hit):
         hits += int(np.count_nonzero(recording.hit[block]))
         unusable += int(np.count_nonzero(np.isnan(recording.points[block]).any(axis=1)))
     counts = {
@@ -131,7 +133,7 @@ def _spread_of_times(beam_time: NDArray[np.float32] | None) -> list[float] | Non
     """When after its scan's stamp the first and the last beam of any scan was taken."""
     if beam_time is None or not len(beam_time):
         return None
-    blocks = arrays.blocks(beam_time)
+    blocks = arrays.iter_blocks(beam_time)
     first, last = zip(*((beam_time[b].min(), beam_time[b].max()) for b in blocks), strict=True)
     return [float(min(first)), float(max(last))]
 
@@ -174,9 +176,9 @@ def _pictures(recording: Recording) -> dict[str, Any] | None:
     images = recording.images
     if images is None:
         return None
-    from stillmap.mesh.texture.views import usable  # takes long to load
+    from stillmap.mesh.texture.views import usable_images  # takes long to load
 
-    used, left_out = usable(recording)
+    used, left_out = usable_images(recording)
     taken = np.bincount(images.camera, minlength=len(images.cameras))
     return {
         "count": len(images),

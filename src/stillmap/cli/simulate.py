@@ -243,7 +243,7 @@ def _give_to_lidar(channels: str, changes: dict[str, dict[str, Any]]) -> None:
 
 def _summary(made: "list[Simulation]", output: Path) -> dict[str, Any]:
     """What there is of one recording, or of several taken at the same stamps."""
-    from stillmap.core.arrays import blocks
+    from stillmap.core.arrays import iter_blocks
 
     hits = [one.recording.hit for one in made]
     movers = [one.truth.mover for one in made]
@@ -253,6 +253,8 @@ def _summary(made: "list[Simulation]", output: Path) -> dict[str, Any]:
         "scene": made[0].scene.name,
         "scans": made[0].recording.n_scans,
         "beams": sum(one.recording.n_beams for one in made),
-        "hits": sum(int(hit[part].sum()) for hit in hits for part in blocks(hit)),
-        "dynamic": sum(int((mover[part] >= 0).sum()) for mover in movers for part in blocks(mover)),
+        "hits": sum(int(hit[part].sum()) for hit in hits for part in iter_blocks(hit)),
+        "dynamic": sum(
+            int((mover[part] >= 0).sum()) for mover in movers for part in iter_blocks(mover)
+        ),
     }

@@ -15,7 +15,7 @@ from pathlib import Path
 from stillmap.cli.arguments import Mapped, found, is_deskewed
 from stillmap.cli.console import say, shown_share
 from stillmap.cli.parser import COMMANDS
-from stillmap.core.errors import InputError, MissingExtra, extra
+from stillmap.core.errors import InputError, MissingExtra, import_extra
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.slam import SlamOptions
 from stillmap.viewer.scene import read_scene
@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         _show_report(report)
     else:
         try:
-            extra("viser", args.result, "shown over time", group="viewer")
+            import_extra("viser", args.result, "shown over time", group="viewer")
         except MissingExtra as error:
             say(f"{error}; the report is shown")
             _show_report(report)

@@ -45,18 +45,20 @@ def write_npz(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
         archive.close()
 
 
-IN_MEMORY = 32 << 20  # bytes of one array that are kept in memory
+MAX_BYTES_IN_MEMORY = 32 << 20  # bytes of one array that are kept in memory
 
 BLOCK = 1 << 20  # rows that are looked at together
 
-TOGETHER = 500  # items, as large as a planar scan, that are looked at before they are let go
+ITEMS_PER_RELEASE = (
+    500  # items, as large as a planar scan, that are looked at before they are let go
+)
 
 _Item = TypeVar("_Item")
 
 _BUFFER = 1 << 20  # bytes that are written to a file together: parts may be as small as one scan
 
 
-class Column:
+class ArrayBuilder:
     """An array that grows at its end.
 
     Args:
@@ -89,7 +91,9 @@ class Column:
         self._length += len(rows)
         self._parts.append(rows)
         self._bytes += rows.nbytes
-        if self._bytes > (IN_MEMORY if self._file is None else min(IN_MEMORY, _BUFFER)):
+        if self._bytes > (
+            MAX_BYTES_IN_MEMORY if self._file is None else min(MAX_BYTES_IN_MEMORY, _BUFFER)
+        ):
             self._write()
 
     def _write(self) -> None:
@@ -119,7 +123,7 @@ def empty(shape: tuple[int, ...], dtype: DTypeLike, folder: Path | None = None) 
     """
     dtype = np.dtype(dtype)
     size = int(np.prod(shape, dtype=object)) * dtype.itemsize
-    if size <= IN_MEMORY:
+    if size <= MAX_BYTES_IN_MEMORY:
         return np.empty(shape, dtype)
     with _nameless(folder) as file:
         # all of it now: a hole that no longer fits on the disk would kill the process
@@ -127,7 +131,7 @@ def empty(shape: tuple[int, ...], dtype: DTypeLike, folder: Path | None = None) 
         return _mapped(file, shape, dtype, writable=True)
 
 
-def let_go(array: NDArray[Any]) -> None:
+def release_pages(array: NDArray[Any]) -> None:
     """What of a mapped array lies in memory may go; it is read again where it is used again."""
     base: object = array
     while isinstance(base, np.ndarray | memoryview):
@@ -138,16 +142,16 @@ def let_go(array: NDArray[Any]) -> None:
         base.madvise(mmap.MADV_DONTNEED)
 
 
-def blocks(*arrays: NDArray[Any], rows: int | None = None) -> Iterator[slice]:
+def iter_blocks(*arrays: NDArray[Any], rows: int | None = None) -> Iterator[slice]:
     """Slices of so many rows (BLOCK), of arrays of one length; what was looked at is let go."""
     rows = rows or BLOCK
     for first in range(0, len(arrays[0]), rows):
         yield slice(first, min(first + rows, len(arrays[0])))
         for array in arrays:
-            let_go(array)
+            release_pages(array)
 
 
-def near(numbers: NDArray[np.intp], rows: int) -> Iterator[slice]:
+def split_by_block(numbers: NDArray[np.intp], rows: int) -> Iterator[slice]:
     """Slices of rising numbers (n,) of rows, so many at most, of which all are of one BLOCK.
 
     Few rows from all over a file bring nearly all of it into memory.
@@ -158,23 +162,23 @@ def near(numbers: NDArray[np.intp], rows: int) -> Iterator[slice]:
             yield slice(at, min(at + rows, stop))
 
 
-def rows_of(array: NDArray[Any], numbers: NDArray[np.intp]) -> NDArray[Any]:
+def take_rows(array: NDArray[Any], numbers: NDArray[np.intp]) -> NDArray[Any]:
     """(n, *row) some rows, by rising numbers (n,); what was looked at is let go on the way."""
     out = np.empty((len(numbers), *array.shape[1:]), array.dtype)
-    for part in near(numbers, BLOCK):
+    for part in split_by_block(numbers, BLOCK):
         out[part] = array[numbers[part]]
-        let_go(array)
+        release_pages(array)
     return out
 
 
-def in_turn(
+def release_periodically(
     items: Iterable[_Item], let_go: Callable[[], None], rows: float = 0.0
 ) -> Iterator[_Item]:
     """The same items; on the way what was looked at for them is let go now and then.
 
     `rows` says how many rows of the arrays an item takes, about: of large ones fewer are looked at.
     """
-    together = max(min(TOGETHER, int(BLOCK / max(rows, 1.0))), 1)
+    together = max(min(ITEMS_PER_RELEASE, int(BLOCK / max(rows, 1.0))), 1)
     for n, item in enumerate(items):
         if n % together == 0:
             let_go()
@@ -182,10 +186,10 @@ def in_turn(
     let_go()
 
 
-def copied(array: NDArray[Any], folder: Path | None = None) -> NDArray[Any]:
+def copy(array: NDArray[Any], folder: Path | None = None) -> NDArray[Any]:
     """A copy to write to, in a file where it is large."""
     out = empty(array.shape, array.dtype, folder)
-    for block in blocks(array, out):
+    for block in iter_blocks(array, out):
         out[block] = array[block]
     return out
 
@@ -227,11 +231,11 @@ def write_npy(path: Path, array: NDArray[Any]) -> None:
     header = np.lib.format.header_data_from_array_1_0(np.empty((0, *array.shape[1:]), array.dtype))
     with path.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, {**header, "shape": array.shape})
-        for block in blocks(array):
+        for block in iter_blocks(array):
             file.write(np.ascontiguousarray(array[block]).reshape(-1).view(np.uint8).data)
 
 
-def finite(points: NDArray[Any]) -> NDArray[np.bool_]:
+def finite_rows(points: NDArray[Any]) -> NDArray[np.bool_]:
     """(N,) whether every coordinate of points (N, D) is finite.
 
     Column by column: `all` over rows of two or three takes ten times as long.
@@ -242,7 +246,7 @@ def finite(points: NDArray[Any]) -> NDArray[np.bool_]:
     return out
 
 
-def first_of_each(group: NDArray[np.int64]) -> NDArray[np.int64]:
+def first_index_per_group(group: NDArray[np.int64]) -> NDArray[np.int64]:
     """Where each group occurs first, by rising groups: `np.unique(..., return_index=True)[1]`.
 
     Args:

@@ -111,7 +111,7 @@ _CLOSE = 1e-10  # error at which it ends, in units of the focal length
 _SOLVED = 1e-6  # error with which a solution counts as one
 
 
-def unusable(camera: Camera) -> str:
+def calibration_error(camera: Camera) -> str:
     """Why nothing can be said of where points fall in a camera's pictures; "" if it can."""
     if camera.K is None:
         return "a camera without calibration"
@@ -151,7 +151,7 @@ def project(camera: Camera, points: Float) -> tuple[Float, Mask]:
     return uv, ok
 
 
-def rays(camera: Camera, uv: Float) -> Float:
+def unproject(camera: Camera, uv: Float) -> Float:
     """(n, 3) directions into which pixels (n, 2) look, z = 1; NaN where the lens shows nothing.
 
     Args:
@@ -166,7 +166,7 @@ def rays(camera: Camera, uv: Float) -> Float:
     return out
 
 
-def within(camera: Camera, uv: Float) -> Mask:
+def is_in_image(camera: Camera, uv: Float) -> Mask:
     """(n,) whether pixels (n, 2) lie in the camera's pictures: up to the edges of the outermost."""
     size = np.array([camera.width, camera.height])
     return np.asarray(((uv >= -0.5) & (uv < size - 0.5)).all(axis=1))
@@ -174,7 +174,7 @@ def within(camera: Camera, uv: Float) -> Mask:
 
 def _lens(camera: Camera) -> Lens:
     """Model and parameters, with the zeros that may be left out."""
-    why = unusable(camera)
+    why = calibration_error(camera)
     if why:
         raise ValueError(f"{camera.name}: {why}")
     numbers = tuple(float(number) for number in camera.distortion)

@@ -42,7 +42,7 @@ def _short(text: str) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
-def nearest(word: str, known: Iterable[str], least: float = 0.6) -> str | None:
+def closest_match(word: str, known: Iterable[str], least: float = 0.6) -> str | None:
     """The known word most like `word`, for hints; None where none is like it.
 
     Args:
@@ -61,7 +61,7 @@ class MissingExtra(InputError):
     """A library is not there: no file at fault, and none that could be skipped for it."""
 
 
-def extra(module: str, path: object, to_be: str = "read", *, group: str = "io") -> Any:
+def import_extra(module: str, path: object, to_be: str = "read", *, group: str = "io") -> Any:
     """A module that comes with one of stillmap's extras.
 
     Args:

@@ -58,7 +58,7 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
 
 
 @contextmanager
-def new_folder(
+def atomic_folder(
     path: Path, mark: str, overwrite: bool = False, *, within: Path | None = None
 ) -> Iterator[Path]:
     """A temporary sibling folder that becomes `path` when the block ends without an exception.
@@ -92,7 +92,7 @@ def new_folder(
 
 
 @contextmanager
-def new_file(path: Path) -> Iterator[Path]:
+def atomic_file(path: Path) -> Iterator[Path]:
     """A temporary sibling file that becomes `path` when the block ends without an exception."""
     path = Path(os.path.abspath(path))
     work, free = path.with_name(f".{path.name}.{os.getpid()}.part"), not path.exists()

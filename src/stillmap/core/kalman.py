@@ -9,7 +9,7 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class TrackStates:
     """Where K things are, and how fast.
 
     Attributes:
@@ -30,22 +30,22 @@ class Motion:
         """(K,) standard deviation of the place on either axis, metres."""
         return np.asarray(np.sqrt(self.P[:, 0]))
 
-    def of(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "Motion":
+    def of(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "TrackStates":
         """Some of them."""
-        return Motion(self.x[chosen], self.v[chosen], self.P[chosen])
+        return TrackStates(self.x[chosen], self.v[chosen], self.P[chosen])
 
 
-def still(x: Float, sigma: float, sigma_speed: float) -> Motion:
+def initialize(x: Float, sigma: float, sigma_speed: float) -> TrackStates:
     """Things at (K, 2) of which nothing is known but that; metres, and metres per second."""
-    return Motion(x, np.zeros_like(x), np.tile([sigma**2, 0.0, sigma_speed**2], (len(x), 1)))
+    return TrackStates(x, np.zeros_like(x), np.tile([sigma**2, 0.0, sigma_speed**2], (len(x), 1)))
 
 
-def joined(a: Motion, b: Motion) -> Motion:
+def concatenate(a: TrackStates, b: TrackStates) -> TrackStates:
     """The things of both."""
-    return Motion(*(np.concatenate([p, q]) for p, q in ((a.x, b.x), (a.v, b.v), (a.P, b.P))))
+    return TrackStates(*(np.concatenate([p, q]) for p, q in ((a.x, b.x), (a.v, b.v), (a.P, b.P))))
 
 
-def predicted(motion: Motion, dt: float, acceleration: float) -> Motion:
+def predict(motion: TrackStates, dt: float, acceleration: float) -> TrackStates:
     """After so many seconds; back in time where they are negative.
 
     Args:
@@ -63,10 +63,10 @@ def predicted(motion: Motion, dt: float, acceleration: float) -> Motion:
         ],
         axis=-1,
     )
-    return Motion(motion.x + motion.v * dt, motion.v, P)
+    return TrackStates(motion.x + motion.v * dt, motion.v, P)
 
 
-def updated(motion: Motion, seen: NDArray[np.bool_], at: Float, sigma: float) -> Motion:
+def update(motion: TrackStates, seen: NDArray[np.bool_], at: Float, sigma: float) -> TrackStates:
     """After some things were seen.
 
     Args:
@@ -81,4 +81,4 @@ def updated(motion: Motion, seen: NDArray[np.bool_], at: Float, sigma: float) ->
     residual = np.where(seen[:, None], at - motion.x, 0.0)
     P = np.stack([xx * (1.0 - gain_x), xv * (1.0 - gain_x), vv - gain_v * xv], axis=-1)
     x, v = motion.x + gain_x[:, None] * residual, motion.v + gain_v[:, None] * residual
-    return Motion(x, v, P)
+    return TrackStates(x, v, P)

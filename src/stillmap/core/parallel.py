@@ -13,7 +13,7 @@ _Item = TypeVar("_Item")
 _Outcome = TypeVar("_Outcome")
 
 
-def resolved_threads(asked: int) -> int:
+def resolve_threads(asked: int) -> int:
     """`asked`, or the number of processors this process may use when that is 0."""
     if asked > 0:
         return asked
@@ -23,7 +23,7 @@ def resolved_threads(asked: int) -> int:
 
 
 @contextmanager
-def one_blas_thread() -> Iterator[None]:
+def limit_blas_threads() -> Iterator[None]:
     """Linear algebra by one thread meanwhile, in the whole process.
 
     Matrices are small here, and kernels have threads of their own. BLAS's wait for each other
@@ -36,7 +36,7 @@ def one_blas_thread() -> Iterator[None]:
         yield
 
 
-def in_order(
+def map_ordered(
     work: Callable[[_Item], _Outcome], items: Iterable[_Item], threads: int
 ) -> Iterator[_Outcome]:
     """`map` by several threads: what comes of the items, in their order.

@@ -1,14 +1,21 @@
-"""Time and memory of the stages of a run."""
+"""Progress, time and memory of the stages of a run."""
 
 import resource
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+# stage, iteration (0: outside the loop), scans done, of how many (0: not counted)
+Progress = Callable[[str, int, int, int], None]
 
-class Stages:
+
+def no_progress(stage: str, iteration: int, done: int, total: int) -> None:
+    """Reports progress to nobody."""
+
+
+class StageTimer:
     """Wall clock and CPU seconds per named stage, added up over calls; the peak memory when it
     last ended."""
 

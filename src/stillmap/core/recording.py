@@ -66,7 +66,7 @@ class Recording:
                 _check(name, getattr(self, name), (T, D + 1, D + 1), np.float64)
         if self.beam_time is not None:
             _check("beam_time", self.beam_time, (M,), np.float32)
-            for block in arrays.blocks(self.beam_time):
+            for block in arrays.iter_blocks(self.beam_time):
                 if not np.isfinite(self.beam_time[block]).all():
                     raise ValueError("beam_time: a time is not finite")
         if (
@@ -106,13 +106,13 @@ class Recording:
         """What lies in memory of the beams, and of other arrays, only because it was looked at."""
         for array in (self.points, self.hit, self.beam_time, *more):
             if array is not None:
-                arrays.let_go(array)
+                arrays.release_pages(array)
 
     def in_turn(self, scans: Iterable[int], *more: NDArray[Any]) -> Iterator[int]:
         """The same numbers of scans; what was looked at of the beams, and of other arrays, leaves
         memory on the way."""
         rows = self.n_beams / max(self.n_scans, 1)
-        return arrays.in_turn(scans, lambda: self.let_go(*more), rows)
+        return arrays.release_periodically(scans, lambda: self.let_go(*more), rows)
 
     def T_map_sensor(self, T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sensor poses (T, D+1, D+1) that belong to robot poses (T, D+1, D+1)."""
@@ -128,7 +128,7 @@ class Recording:
         """(n, D) where beams (n,), rising, ended: metres in the map frame, at robot poses
         (T, D+1, D+1)."""
         D, ends = self.dimension, np.empty((len(beams), self.dimension))
-        for part in arrays.near(beams, _ENDS):
+        for part in arrays.split_by_block(beams, _ENDS):
             scan = self.scans_of(beams[part])
             # beams may be few: only the scans that they are of
             T = T_map_base[scan] @ self.T_base_sensor[self.sensor[scan]]

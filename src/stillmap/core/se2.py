@@ -24,7 +24,7 @@ def parameters(T: Float) -> Float:
     return x
 
 
-def normalised(T: Float) -> Float:
+def normalize(T: Float) -> Float:
     """(..., 3, 3) the same poses with exact rotations: chains of products drift away from them."""
     return matrix(*np.moveaxis(parameters(T), -1, 0))
 
@@ -45,7 +45,7 @@ def log(T: Float) -> Float:
     half = 0.5 * theta
     c, s = np.cos(half), np.sin(half)
     # the chord points half the turn to the side and is shorter than the arc
-    arc = 1.0 / sine_over_angle(half, s)
+    arc = 1.0 / sinc(half, s)
     return np.stack([arc * (c * x + s * y), arc * (c * y - s * x), theta], axis=-1)
 
 
@@ -54,11 +54,11 @@ def exp(xi: Float) -> Float:
     x, y, theta = np.moveaxis(xi, -1, 0)
     half = 0.5 * theta
     c, s = np.cos(half), np.sin(half)
-    chord = sine_over_angle(half, s)
+    chord = sinc(half, s)
     return matrix(chord * (c * x - s * y), chord * (s * x + c * y), theta)
 
 
-def sine_over_angle(angle: Float, sine: Float) -> Float:
+def sinc(angle: Float, sine: Float) -> Float:
     """sin(angle) / angle, 1 at 0."""
     return np.divide(sine, angle, out=np.ones_like(sine), where=angle != 0.0)
 
@@ -68,7 +68,7 @@ def wrap(angle: ArrayLike) -> Float:
     return (np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi
 
 
-def turned(covariance: Float, T: Float) -> Float:
+def rotate_covariance(covariance: Float, T: Float) -> Float:
     """Covariances (..., 3, 3) of x, y, heading along the axes that poses (..., 3, 3) turn into."""
     R = np.zeros(T.shape)
     R[..., :2, :2] = T[..., :2, :2]
@@ -76,7 +76,7 @@ def turned(covariance: Float, T: Float) -> Float:
     return R @ covariance @ np.swapaxes(R, -1, -2)
 
 
-def planar(poses: Float) -> Float:
+def project_to_plane(poses: Float) -> Float:
     """(T, 3, 3) place and heading of poses (T, 4, 4) in space."""
     yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     return matrix(poses[:, 0, 3], poses[:, 1, 3], yaw)

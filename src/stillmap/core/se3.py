@@ -72,7 +72,7 @@ def adjoint(T: Float) -> Float:
     return out
 
 
-def normalised(T: Float) -> Float:
+def normalize(T: Float) -> Float:
     """(..., 4, 4) the same poses with exact rotations: chains of products drift away from them."""
     out = T.copy()
     U, _, Vt = np.linalg.svd(T[..., :3, :3])

@@ -35,7 +35,7 @@ def parse_ns(text: str) -> int:
     return int(seconds.scaleb(9).to_integral_value(ROUND_HALF_EVEN))
 
 
-def seconds_text(stamp_ns: int) -> str:
+def format_seconds(stamp_ns: int) -> str:
     """Seconds with nine decimals, exact."""
     whole, rest = divmod(abs(stamp_ns), 10**9)
     return f"{'-' if stamp_ns < 0 else ''}{whole}.{rest:09d}"
@@ -67,7 +67,7 @@ def longest_non_decreasing(values: Sequence[int]) -> NDArray[np.intp]:
     return out
 
 
-def beam_ns(recording: Recording, scans: slice) -> NDArray[np.int64]:
+def beam_stamps_ns(recording: Recording, scans: slice) -> NDArray[np.int64]:
     """(n,) when each beam of these scans was taken, in nanoseconds."""
     offset = recording.offset[scans.start : scans.stop + 1]
     stamps = np.repeat(recording.stamp_ns[scans], np.diff(offset))
@@ -77,7 +77,7 @@ def beam_ns(recording: Recording, scans: slice) -> NDArray[np.int64]:
     return np.asarray(stamps + np.round(1e9 * later).astype(np.int64))
 
 
-def longest_scan_ns(recording: Recording) -> int:
+def max_scan_duration_ns(recording: Recording) -> int:
     """Nanoseconds from a scan's stamp, at most, to the times of its beams; where these are not
     known, about as many as from one scan to the next.
 
@@ -86,6 +86,6 @@ def longest_scan_ns(recording: Recording) -> int:
     steps, times = np.diff(recording.stamp_ns), recording.beam_time
     longest = float(np.median(steps)) if len(steps) else 0.0
     if times is not None:
-        for block in arrays.blocks(times):
+        for block in arrays.iter_blocks(times):
             longest = max(longest, 1e9 * float(np.abs(times[block]).max()))
     return int(np.ceil(longest))

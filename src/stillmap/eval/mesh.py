@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.camera import Camera, project, within
-from stillmap.core.errors import extra
+from stillmap.core.camera import Camera, is_in_image, project
+from stillmap.core.errors import import_extra
 from stillmap.eval import mesh_distance
 from stillmap.eval.labels import Scores
 from stillmap.sim.appearance import static_colour
@@ -234,7 +234,7 @@ def colour_errors(
 
 def colour_difference(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float:
     """(n,) CIEDE2000 between colours (n, 3), sRGB."""
-    color = extra("skimage.color", "texture", "compared with the truth", group="mesh")
+    color = import_extra("skimage.color", "texture", "compared with the truth", group="mesh")
     labs = [color.rgb2lab(colour[None]) for colour in (one, other)]
     return np.asarray(color.deltaE_ciede2000(*labs)[0], np.float64)
 
@@ -247,7 +247,7 @@ def moved(T: Float, points: Float) -> Float:
 def _pixels(camera: Camera, points: Float) -> tuple[NDArray[np.int64], Bool]:
     """(n, 2) the pixels nearest to points in the camera's frame, and whether they are in it."""
     uv, ahead = project(camera, points)
-    inside = ahead & within(camera, uv)
+    inside = ahead & is_in_image(camera, uv)
     return np.rint(np.where(inside[:, None], uv, 0.0)).astype(np.int64), inside
 
 

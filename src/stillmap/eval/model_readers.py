@@ -9,14 +9,14 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.errors import InputError, extra
+from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import read_text, require_regular
 from stillmap.core.recording import Recording
 from stillmap.eval import mesh_distance, readers
 from stillmap.eval.mesh import SAMPLES, Coloured, Pictures, Record
 from stillmap.eval.object_models import Model, Sighted, Track
 from stillmap.sim.truth_images import PictureTruth, load_picture_truth
-from stillmap.slam.deskew import deskewed
+from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.odometry_2d import SlamOptions
 
 Float = NDArray[np.float64]
@@ -88,7 +88,7 @@ def read_seen(path: Path) -> Seen:
 
 
 def _ends(recording: Recording, T_world_base: Float) -> Float:
-    at_once = deskewed(recording, T_world_base, SlamOptions())
+    at_once = deskew_recording(recording, T_world_base, SlamOptions())
     return at_once.end_points(np.arange(recording.n_beams), T_world_base)
 
 
@@ -112,7 +112,7 @@ def read_glb(path: Path, n: int = SAMPLES) -> Glb:
         InputError: it is damaged, or trimesh is not installed.
     """
     require_regular(path)
-    trimesh = extra("trimesh", path, "compared with the truth", group="mesh")
+    trimesh = import_extra("trimesh", path, "compared with the truth", group="mesh")
     try:
         parts = list(_parts(trimesh.load_scene(path, process=False)))
         return _joined(parts, n)

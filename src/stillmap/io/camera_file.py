@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from stillmap.core.camera import Camera
 from stillmap.core.config import load_toml
-from stillmap.core.errors import InputError, nearest
-from stillmap.io.point_cloud.files import transform
+from stillmap.core.errors import InputError, closest_match
+from stillmap.io.point_cloud.files import rigid_transform
 
 Float = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ _MOST_PIXELS = 1 << 16  # aside
 
 
 @dataclass(frozen=True, eq=False)
-class GivenCamera:
+class CameraOverride:
     """What the file says of one camera; None: nothing.
 
     Attributes:
@@ -71,7 +71,7 @@ class GivenCamera:
         return replace(camera, **{n: v for n in names if (v := getattr(self, n)) is not None})
 
 
-def read(path: Path, known: Sequence[str] | None = None) -> dict[str, GivenCamera]:
+def read_camera_file(path: Path, known: Sequence[str] | None = None) -> dict[str, CameraOverride]:
     """The cameras of a file, by name.
 
     Args:
@@ -102,13 +102,15 @@ def read(path: Path, known: Sequence[str] | None = None) -> dict[str, GivenCamer
 def _hint(name: str, known: Sequence[str]) -> str:
     if not known:
         return "the recording has no pictures; folder = '...' adds some"
-    return f"nearest: '{nearest(name, known, least=0.0)}'; folder = '...' adds one"
+    return f"nearest: '{closest_match(name, known, least=0.0)}'; folder = '...' adds one"
 
 
-def _camera(table: Mapping[str, Any], beside: Path) -> GivenCamera:
+def _camera(table: Mapping[str, Any], beside: Path) -> CameraOverride:
     for key in table:
         if key not in _KEYS:
-            raise ValueError(f"unknown key '{key}' (nearest: '{nearest(key, _KEYS, least=0.0)}')")
+            raise ValueError(
+                f"unknown key '{key}' (nearest: '{closest_match(key, _KEYS, least=0.0)}')"
+            )
     model, distortion = _lens(table)
     width, height = (_pixels(table, key) for key in _SIZE)
     if (width is None) != (height is None):
@@ -116,7 +118,7 @@ def _camera(table: Mapping[str, Any], beside: Path) -> GivenCamera:
     if "times" in table and "folder" not in table:
         raise ValueError("'times' is for a 'folder' of pictures")
     offset = _numbers(table, "time_offset", ())
-    return GivenCamera(
+    return CameraOverride(
         K=_matrix(table),
         width=width,
         height=height,
@@ -180,18 +182,18 @@ def _place(table: Mapping[str, Any]) -> Float | None:
             raise ValueError(f"'T_base_camera' and '{given[1]}' exclude each other")
         if not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
             raise ValueError("the last row of 'T_base_camera' must be 0, 0, 0, 1")
-        return transform(T[:3, :3], T[:3, 3])
+        return rigid_transform(T[:3, :3], T[:3, 3])
     t = _numbers(table, "translation", (3,))
     q, rpy = _numbers(table, "quaternion", (4,)), _numbers(table, "rpy", (3,))
     if t is None or (q is None) == (rpy is None):
         raise ValueError("a place wants 'translation', and one of 'quaternion' and 'rpy'")
     rotation = scipy.spatial.transform.Rotation
     if rpy is not None:
-        return transform(rotation.from_euler("xyz", rpy).as_matrix(), t)
+        return rigid_transform(rotation.from_euler("xyz", rpy).as_matrix(), t)
     assert q is not None
     if not abs(np.linalg.norm(q) - 1.0) < 0.02:
         raise ValueError("'quaternion' (x, y, z, w) is not of length one")
-    return transform(rotation.from_quat(q).as_matrix(), t)
+    return rigid_transform(rotation.from_quat(q).as_matrix(), t)
 
 
 def _number(table: Mapping[str, Any], key: str) -> float:

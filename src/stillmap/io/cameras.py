@@ -14,15 +14,15 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import require_regular
 from stillmap.core.recording import Recording
 from stillmap.io import camera_file
-from stillmap.io.camera_file import GivenCamera
-from stillmap.io.images import ENDINGS, read_picture, size_of
-from stillmap.io.point_cloud.files import files_in, stamps_in, stem_of
-from stillmap.io.point_cloud.kitti_times import read_times, rows_of
+from stillmap.io.camera_file import CameraOverride
+from stillmap.io.images import EXTENSIONS, read_image, read_image_size
+from stillmap.io.point_cloud.files import list_files, stamps_from_names, strip_extension
+from stillmap.io.point_cloud.kitti_times import assign_rows, read_times
 
 _NO_IMAGES = Images(np.zeros(0, np.int64), np.zeros(0, np.int32), (), lambda _: np.zeros((0, 0)))
 
 
-def applied(recording: Recording, path: Path) -> Recording:
+def apply_camera_file(recording: Recording, path: Path) -> Recording:
     """The recording, with cameras as a file says, and the pictures that it names.
 
     Raises:
@@ -30,7 +30,7 @@ def applied(recording: Recording, path: Path) -> Recording:
     """
     images = recording.images or _NO_IMAGES
     known = [camera.name for camera in images.cameras]
-    given = camera_file.read(path, [*known, *depth_cameras(recording.source)])
+    given = camera_file.read_camera_file(path, [*known, *depth_camera_names(recording.source)])
     for name, one in given.items():
         if one.folder is not None and name in known:
             what = f"camera '{name}' has pictures in the recording: 'folder' is for others"
@@ -43,23 +43,23 @@ def applied(recording: Recording, path: Path) -> Recording:
             except InputError as error:
                 hint = error.hint or f"camera '{name}' of {path}"
                 raise InputError(error.what, where=error.where, hint=hint) from error
-    together = joined(parts)
+    together = merge_images(parts)
     return replace(recording, images=together if together.cameras else None)
 
 
-def doubted(recording: Recording) -> Recording:
+def add_calibration_warnings(recording: Recording) -> Recording:
     """The recording, with a warning for each camera whose calibration is hardly that of its
     pictures; one that it has already is not repeated."""
     of = recording.images.cameras if recording.images is not None else ()
     noted = recording.source.get("warnings")
     warnings = noted if isinstance(noted, list) else []
-    new = [what for camera in of if (what := doubt(camera)) and what not in warnings]
+    new = [what for camera in of if (what := validate_camera(camera)) and what not in warnings]
     if not new:
         return recording
     return replace(recording, source={**recording.source, "warnings": [*warnings, *new]})
 
 
-def doubt(camera: Camera) -> str:
+def validate_camera(camera: Camera) -> str:
     """Why a camera's calibration is hardly that of its pictures; "" where it may well be."""
     if camera.K is None or not np.isfinite(camera.K).all():
         return ""
@@ -72,14 +72,14 @@ def doubt(camera: Camera) -> str:
     )
 
 
-def depth_cameras(source: dict[str, Any]) -> list[str]:
+def depth_camera_names(source: dict[str, Any]) -> list[str]:
     """Names of the sensors of a recording that are cameras themselves: their scans are grids."""
     notes = source.get("sensors")
     sensors = notes if isinstance(notes, list) else []
     return [str(one.get("name")) for one in sensors if isinstance(one, dict) and one.get("grid")]
 
 
-def from_files(found: Sequence[tuple[int, Path]], camera: Camera) -> Images:
+def images_from_files(found: Sequence[tuple[int, Path]], camera: Camera) -> Images:
     """The pictures of one camera, in files of which the stamps are known, in any order."""
     ordered = sorted(found, key=lambda one: one[0])
     return Images(
@@ -90,7 +90,7 @@ def from_files(found: Sequence[tuple[int, Path]], camera: Camera) -> Images:
     )
 
 
-def joined(parts: Sequence[Images]) -> Images:
+def merge_images(parts: Sequence[Images]) -> Images:
     """All pictures of several cameras, or sets of cameras, in the order of their stamps."""
     if len(parts) == 1:
         return parts[0]
@@ -110,7 +110,7 @@ def joined(parts: Sequence[Images]) -> Images:
     return Images(stamp_ns[order], camera[order].astype(np.int32), cameras, load)
 
 
-def _changed(images: Images, given: dict[str, GivenCamera]) -> Images:
+def _changed(images: Images, given: dict[str, CameraOverride]) -> Images:
     """The recording's own pictures; with a time added, they may come in another order."""
     cameras, stamp_ns = list(images.cameras), images.stamp_ns.copy()
     for number, camera in enumerate(cameras):
@@ -126,18 +126,18 @@ def _changed(images: Images, given: dict[str, GivenCamera]) -> Images:
     return Images(stamp_ns[order], images.camera[order], tuple(cameras), load)
 
 
-def _added(name: str, given: GivenCamera, folder: Path, where: str) -> Images:
+def _added(name: str, given: CameraOverride, folder: Path, where: str) -> Images:
     """The pictures of a folder that the recording does not know of."""
-    files = files_in(folder, ENDINGS)
+    files = list_files(folder, EXTENSIONS)
     if not files:
         raise InputError("holds no pictures", where=str(folder))
     if given.times is not None:
         require_regular(given.times)
         times = read_times(given.times)
-        rows = rows_of(files, len(times), given.times)
+        rows = assign_rows(files, len(times), given.times)
         stamps = [None if row is None else times[row] for row in rows]
     else:
-        found = stamps_in([stem_of(file.name, ENDINGS) for file in files])
+        found = stamps_from_names([strip_extension(file.name, EXTENSIONS) for file in files])
         if found is None:
             hint = f"times = 'FILE' in camera '{name}' of {where}: a line of seconds for each"
             raise InputError(
@@ -147,10 +147,10 @@ def _added(name: str, given: GivenCamera, folder: Path, where: str) -> Images:
     used = [(s, f) for s, f in zip(stamps, files, strict=True) if s is not None]
     if not used:
         raise InputError("holds no usable time", where=str(given.times))
-    width, height = size_of(used[0][1])
+    width, height = read_image_size(used[0][1])
     camera = given.over(Camera(name, width, height, None, "", np.zeros(0), None))
-    return from_files([(stamp + given.time_offset_ns, file) for stamp, file in used], camera)
+    return images_from_files([(stamp + given.time_offset_ns, file) for stamp, file in used], camera)
 
 
 def _load(files: list[Path], image: int) -> NDArray[Any]:
-    return read_picture(files[image])
+    return read_image(files[image])

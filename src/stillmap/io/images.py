@@ -12,12 +12,12 @@ from PIL import Image, UnidentifiedImageError
 
 from stillmap.core.errors import InputError
 
-ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
+EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
 
 _DEEP = {"I;16", "I;16B", "I;16L", "I;16N", "I"}
 
 
-def size_of(path: Path) -> tuple[int, int]:
+def read_image_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, from the header alone.
 
     Raises:
@@ -27,7 +27,7 @@ def size_of(path: Path) -> tuple[int, int]:
         return int(image.size[0]), int(image.size[1])
 
 
-def read_picture(path: Path) -> NDArray[Any]:
+def read_image(path: Path) -> NDArray[Any]:
     """(height, width, 3) uint8, or (height, width) uint8, uint16 or float32; see Images.read.
 
     Raises:
@@ -43,7 +43,7 @@ def read_picture(path: Path) -> NDArray[Any]:
         return np.array(image.convert("RGB"))
 
 
-def write_picture(picture: NDArray[Any], path: Path) -> None:
+def write_png(picture: NDArray[Any], path: Path) -> None:
     """Write a PNG of a picture of whole numbers, see `read_picture`."""
     # a packing that is tried hard for takes ten times as long
     Image.fromarray(picture).save(path, format="PNG", compress_level=1)

@@ -18,11 +18,11 @@ from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.io import camera_file, cameras, rgbd_folders
-from stillmap.io.camera_file import GivenCamera
-from stillmap.io.depth_registration import registered
-from stillmap.io.images import read_picture, size_of
-from stillmap.io.point_cloud.scans import Cloud, Known, Source, assembled
-from stillmap.io.point_cloud.z_up import levelled
+from stillmap.io.camera_file import CameraOverride
+from stillmap.io.extrinsic_calibration import calibrate_color_camera
+from stillmap.io.images import read_image, read_image_size
+from stillmap.io.point_cloud.gravity_alignment import align_to_gravity
+from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording
 from stillmap.io.rgbd_folders import Frames
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
@@ -35,7 +35,7 @@ T_BASE_CAMERA = np.array(
 )
 COLOUR, DEPTH = "color", "depth"  # names of the cameras
 
-_NOTHING_GIVEN = GivenCamera()
+_NOTHING_GIVEN = CameraOverride()
 _LARGEST = 65535  # of 16 bits: 7-Scenes has it where nothing is known
 
 
@@ -56,9 +56,9 @@ class _Grid(NamedTuple):
     scale: float
 
 
-def is_one(path: Path, head: bytes | None) -> bool:
+def is_rgbd_folder(path: Path, head: bytes | None) -> bool:
     """Whether a folder looks like one of an RGB-D camera."""
-    return head is None and rgbd_folders.kind_of(path) is not None
+    return head is None and rgbd_folders.detect_layout(path) is not None
 
 
 def read(
@@ -75,11 +75,11 @@ def read(
     Raises:
         InputError: no depth picture can be read.
     """
-    frames = rgbd_folders.found(path)
+    frames = rgbd_folders.list_frames(path)
     given = {}
     if options.cameras is not None:
-        given = camera_file.read(Path(options.cameras), (DEPTH, COLOUR))
-    known = Known(path, frames.format, list(frames.warnings))
+        given = camera_file.read_camera_file(Path(options.cameras), (DEPTH, COLOUR))
+    known = DatasetInfo(path, frames.format, list(frames.warnings))
     depth = _depth_camera(frames, given, known.warnings)
     grid = _grid(depth, options, options.depth_scale or frames.scale)
     T_base_camera = depth.T_base_camera
@@ -89,22 +89,22 @@ def read(
     sources = []
     for (stamp_ns, file), T in zip(frames.depth, frames.T_world_camera, strict=True):
         if T is None and 2 * posed >= len(frames.depth):
-            sources.append(Source(file.name, partial(_no_pose, file), stamp_ns))
+            sources.append(CloudSource(file.name, partial(_no_pose, file), stamp_ns))
         else:
             pose = None if T is None else T @ T_camera_base
-            sources.append(Source(file.name, partial(_cloud, file, pose, grid), stamp_ns))
+            sources.append(CloudSource(file.name, partial(_cloud, file, pose, grid), stamp_ns))
     if options.max_range is None:
         options = replace(options, max_range=max(options.depth_max, options.min_range + 1e-3))
     may_register = options.register and frames.format == rgbd_folders.SCENES
     may_register &= given.keys().isdisjoint((COLOUR, DEPTH))
     images = _images(frames, depth, grid.scale if may_register else None, known.warnings)
-    recording = assembled(sources, known, options, progress, scratch, images=images)
+    recording = build_recording(sources, known, options, progress, scratch, images=images)
     rows, columns = grid.rays.shape[:2]
     recording.source["sensors"] = [{"name": DEPTH, "grid": [rows, columns]}]
-    return levelled(recording) if options.level else recording
+    return align_to_gravity(recording) if options.level else recording
 
 
-def _depth_camera(frames: Frames, given: dict[str, GivenCamera], warnings: list[str]) -> Camera:
+def _depth_camera(frames: Frames, given: dict[str, CameraOverride], warnings: list[str]) -> Camera:
     """The camera that took the depth pictures, by the first of them that can be read.
 
     Raises:
@@ -124,17 +124,17 @@ def _depth_camera(frames: Frames, given: dict[str, GivenCamera], warnings: list[
             f"no file says how the camera sees: a focal length of {fx:g} pixels and the centre at "
             f"{cx:g}, {cy:g} are taken, as is usual for {frames.format}; --cameras FILE has others"
         )
-    why = camera_module.unusable(camera)
+    why = camera_module.calibration_error(camera)
     if why:
         raise InputError(f"cannot be used: {why}", where=str(frames.depth[0][1]))
-    warnings += [said] if (said := cameras.doubt(camera)) else []
+    warnings += [said] if (said := cameras.validate_camera(camera)) else []
     return camera
 
 
 def _size(frames: Frames) -> tuple[int, int]:
     for _, file in frames.depth:
         try:
-            return size_of(file)
+            return read_image_size(file)
         except InputError:
             continue
     raise InputError("is no picture, nor is any other", where=str(frames.depth[0][1]))
@@ -144,13 +144,13 @@ def _grid(camera: Camera, options: ReadOptions, scale: float) -> _Grid:
     step = options.depth_step
     columns, rows = np.meshgrid(np.arange(0, camera.width, step), np.arange(0, camera.height, step))
     pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
-    rays = camera_module.rays(camera, pixels) @ T_BASE_CAMERA[:3, :3].T
+    rays = camera_module.unproject(camera, pixels) @ T_BASE_CAMERA[:3, :3].T
     shaped = rays.reshape(*columns.shape, 3).astype(np.float32)
     return _Grid(camera.width, camera.height, step, shaped, scale)
 
 
 def _cloud(file: Path, T: Float | None, grid: _Grid) -> Cloud:
-    picture = read_picture(file)
+    picture = read_image(file)
     if picture.ndim != 2 or picture.dtype != np.uint16:
         raise InputError("is no depth picture: 16 bits of one channel", where=str(file))
     if picture.shape != (grid.height, grid.width):
@@ -180,7 +180,7 @@ def _images(
     """
     for _, file in frames.colour:
         try:
-            width, height = size_of(file)
+            width, height = read_image_size(file)
         except InputError:
             continue
         camera = replace(depth, name=COLOUR, width=width, height=height)
@@ -193,8 +193,8 @@ def _images(
         elif scale is not None:
             colour = dict(frames.colour)
             pairs = [(file, colour[stamp]) for stamp, file in frames.depth if stamp in colour]
-            beside, said = registered(depth, scale, pairs)
+            beside, said = calibrate_color_camera(depth, scale, pairs)
             camera = replace(beside, name=COLOUR)
             warnings += [said] if said else []
-        return cameras.from_files(frames.colour, camera)
+        return cameras.images_from_files(frames.colour, camera)
     return None

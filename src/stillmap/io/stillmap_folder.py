@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import blocks, open_npy, write_npy
+from stillmap.core.arrays import iter_blocks, open_npy, write_npy
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
-from stillmap.core.files import new_folder, read_text, require_regular
+from stillmap.core.files import atomic_folder, read_text, require_regular
 from stillmap.core.recording import Recording
-from stillmap.io.images import read_picture, write_picture
-from stillmap.preprocessing.options import FARTHEST
+from stillmap.io.images import read_image, write_png
+from stillmap.preprocessing.options import MAX_POINT_DISTANCE
 
 FOLDER = "images"
 
@@ -51,7 +51,7 @@ def _write_one(picture: NDArray[Any], path: Path) -> None:
     if picture.dtype.kind == "f":
         np.save(path.with_suffix(".npy"), picture.astype(np.float32), allow_pickle=False)
     else:
-        write_picture(picture, path.with_suffix(".png"))
+        write_png(picture, path.with_suffix(".png"))
 
 
 def _described(camera: Camera) -> dict[str, Any]:
@@ -106,7 +106,7 @@ def _load(folder: Path, image: int) -> NDArray[Any]:
     path = folder / f"{image:06d}.npy"
     png = path.with_suffix(".png")
     if png.exists() or not path.exists():
-        return read_picture(png)
+        return read_image(png)
     picture = open_npy(path)
     if picture.dtype != np.float32 or picture.ndim != 2:
         raise InputError(f"is damaged: {picture.shape} {picture.dtype}", where=str(path))
@@ -128,7 +128,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     Raises:
         InputError: `path` holds something already, or cannot be written to.
     """
-    with new_folder(Path(path), HEADER, overwrite) as work:
+    with atomic_folder(Path(path), HEADER, overwrite) as work:
         write_into(recording, work)
 
 
@@ -279,13 +279,15 @@ def _require_offsets(path: Path, offset: NDArray[np.int64], M: int) -> None:
 
 
 def _require_sound_ends(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
-    for block in blocks(points, hit):
+    for block in iter_blocks(points, hit):
         chunk = points[block]
         usable = np.isfinite(chunk).all(axis=1)
         if np.any(hit[block] & ~usable) or np.any(np.isinf(chunk)):
             raise _damaged(path, "points", "a hit or a maximum-range beam ends nowhere")
-        if np.any(np.abs(chunk) > FARTHEST):
-            raise _damaged(path, "points", f"a beam ends farther than {FARTHEST:.0f} m away")
+        if np.any(np.abs(chunk) > MAX_POINT_DISTANCE):
+            raise _damaged(
+                path, "points", f"a beam ends farther than {MAX_POINT_DISTANCE:.0f} m away"
+            )
 
 
 def _damaged(path: Path, name: str, what: str) -> InputError:

@@ -13,13 +13,13 @@ import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.arrays import blocks
+from stillmap.core.arrays import iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import seconds_text
+from stillmap.core.timestamps import format_seconds
 
-LARGEST = 128 << 20  # bytes: four hours at 100 Hz
+MAX_BYTES = 128 << 20  # bytes: four hours at 100 Hz
 
 _COLUMNS = "stamp x y z qx qy qz qw"
 
@@ -40,11 +40,11 @@ def write_tum(path: Path, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64
     if len(stamp_ns) != len(poses):
         raise ValueError(f"poses: expected {len(stamp_ns)}, got {len(poses)}")
     with path.open("w", encoding="ascii", newline="\n") as file:
-        for part in blocks(poses, rows=_TOGETHER):
+        for part in iter_blocks(poses, rows=_TOGETHER):
             # + 0.0 turns the negative zeros that rounding leaves into zeros
             rows = np.round(_rows_of(poses[part]), 9) + 0.0
             for stamp, row in zip(stamp_ns[part].tolist(), rows.tolist(), strict=True):
-                file.write(f"{seconds_text(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
+                file.write(f"{format_seconds(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
 
 
 def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -90,7 +90,7 @@ def _rows_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return read_text(path, LARGEST).splitlines()
+        return read_text(path, MAX_BYTES).splitlines()
     except UnicodeDecodeError as error:
         raise InputError("is not a text file", where=str(path)) from error
 
@@ -155,7 +155,7 @@ def poses_from_tum(path: Path, recording: Recording) -> NDArray[np.float64]:
     """
     stamp_ns, poses = read_tum(path)
     if recording.dimension == 2:
-        poses = se2.planar(poses)
+        poses = se2.project_to_plane(poses)
     if np.array_equal(stamp_ns, recording.stamp_ns):
         return poses
     order = np.argsort(stamp_ns, kind="stable")

@@ -6,12 +6,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.camera import project, rays, within
+from stillmap.core.camera import is_in_image, project, unproject
 from stillmap.mesh.options import VisibleOptions
-from stillmap.mesh.place import Painted
+from stillmap.mesh.place import ViewAssignment
 from stillmap.mesh.texture.baking import bilinear
 from stillmap.mesh.texture.views import View
-from stillmap.mesh.texture.visibility import Depths, depths_of, ideal
+from stillmap.mesh.texture.visibility import DepthBuffer, render_depth, project_pinhole
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -24,7 +24,7 @@ _KEPT, _MOST = 8, 256  # pictures in memory, and small z-buffers
 _AROUND = [(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)]  # poses are off by a pixel
 
 
-class Ahead:
+class Background:
     """What stands still, as views show it: how far away, and in which colours.
 
     Args:
@@ -36,7 +36,7 @@ class Ahead:
 
     def __init__(
         self,
-        place: Painted,
+        place: ViewAssignment,
         views: Sequence[View],
         limits: VisibleOptions,
         colours: Callable[[View], Picture | None],
@@ -57,7 +57,7 @@ class Ahead:
         if not free.any() or not len(self._place.mesh):
             return free
         depths = self._depths(number)
-        free[free] = looked_up(depths.depth, depths, at[free]) > at[free, 2] - _BEHIND
+        free[free] = sample_buffer(depths.depth, depths, at[free]) > at[free, 2] - _BEHIND
         return free
 
     def differs(self, number: int, points: Float) -> Float32:
@@ -72,7 +72,7 @@ class Ahead:
         if mine is None or not len(points) or not len(self._place.mesh):
             return out
         depths = self._depths(number)
-        face = looked_up(depths.face, depths, at).astype(np.intp)
+        face = sample_buffer(depths.face, depths, at).astype(np.intp)
         painter = np.where(face >= 0, self._place.view[face], -1)
         here, ok = project(view.camera, at)
         painter[~ok | (painter == number)] = -1
@@ -80,33 +80,33 @@ class Ahead:
             picture, some = self.picture(other), np.flatnonzero(painter == other)
             if picture is None:
                 continue
-            z = looked_up(depths.depth, depths, at[some])
+            z = sample_buffer(depths.depth, depths, at[some])
             behind = _in_map(view, at[some] * (z / at[some, 2])[:, None])
             there, ok = project(self.views[other].camera, self.views[other].in_camera(behind))
-            ok &= within(self.views[other].camera, there)
+            ok &= is_in_image(self.views[other].camera, there)
             some, there = some[ok], there[ok]
             shown = bilinear(mine, here[some])
             off = [np.linalg.norm(shown - bilinear(picture, there + d), axis=1) for d in _AROUND]
             out[some] = np.min(off, axis=0)
         return out
 
-    def _depths_of(self, number: int) -> Depths:
+    def _depths_of(self, number: int) -> DepthBuffer:
         """A small z-buffer of all that a view shows."""
         view = self.views[number]
         across, down = np.meshgrid(
             np.linspace(0, view.camera.width - 1, _EDGE),
             np.linspace(0, view.camera.height - 1, _EDGE),
         )
-        shown = rays(view.camera, np.column_stack([across.ravel(), down.ravel()]))
+        shown = unproject(view.camera, np.column_stack([across.ravel(), down.ravel()]))
         shown = shown[np.isfinite(shown).all(axis=1)]
         scale = min(_SMALL / view.camera.width, self._limits.scale)
-        return depths_of(self._place.mesh, view, shown, scale, self._limits.near)
+        return render_depth(self._place.mesh, view, shown, scale, self._limits.near)
 
 
-def looked_up(values: NDArray[np.generic], depths: Depths, at: Float) -> Float:
+def sample_buffer(values: NDArray[np.generic], depths: DepthBuffer, at: Float) -> Float:
     """(...,) what an image (h, w) has where points (..., 3) of the camera's frame are seen."""
     h, w = values.shape
-    column, row = (np.rint(a).astype(np.intp) for a in ideal(depths.K, at.reshape(-1, 3).T))
+    column, row = (np.rint(a).astype(np.intp) for a in project_pinhole(depths.K, at.reshape(-1, 3).T))
     found = values[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
     return np.asarray(found.reshape(at.shape[:-1]), np.float64)
 

@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 from stillmap.core.camera import Images
 from stillmap.core.errors import import_extra
 from stillmap.core.profiling import StageTimer
-from stillmap.mesh.background import Ahead
-from stillmap.mesh.inputs import Sources
-from stillmap.mesh.objects.merging import Followed, followed_of, wholes_of
-from stillmap.mesh.objects.reconstruction import Shape, shape_of
-from stillmap.mesh.objects.segmentation import Moves
-from stillmap.mesh.objects.texturing import Dressed, dressed, when_in_view
+from stillmap.mesh.background import Background
+from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.objects.merging import ObjectTrack, collect_tracks, merge_tracks
+from stillmap.mesh.objects.reconstruction import ObjectShape, reconstruct_object
+from stillmap.mesh.objects.segmentation import DynamicReturns
+from stillmap.mesh.objects.texturing import TexturedViews, assign_object_views, times_in_view
 from stillmap.mesh.options import MeshOptions, VisibleOptions
-from stillmap.mesh.place import Painted, painted
-from stillmap.mesh.point_colors import Tints, tinted
-from stillmap.mesh.texture.atlas import Textured, replaced
+from stillmap.mesh.place import ViewAssignment, assign_views
+from stillmap.mesh.point_colors import PointColors, color_points
+from stillmap.mesh.texture.atlas import TexturedMesh, replaced
 from stillmap.mesh.texture.baking import baked
-from stillmap.mesh.texture.exposure import levelled
-from stillmap.mesh.texture.views import UNREAD, View, colours_of, readable, views_of
-from stillmap.mesh.tsdf import surface_of
+from stillmap.mesh.texture.exposure import apply_gains
+from stillmap.mesh.texture.views import UNREADABLE, View, read_color_image, filter_readable, find_views
+from stillmap.mesh.tsdf import build_surface
 from stillmap.pipeline.em_loop import Progress, silent
 
 Float = NDArray[np.float64]
@@ -35,7 +35,7 @@ _SPOILED = 0.5  # probability that a picture shows static things only, below whi
 
 
 @dataclass(frozen=True, eq=False)
-class MoverModel:
+class ObjectModel:
     """What moved, as a model in its own frame: x ahead, y left, z up, on the ground.
 
     Attributes:
@@ -47,9 +47,9 @@ class MoverModel:
         span_ns: from when to when what was seen of it is in the model.
     """
 
-    shape: Shape
-    dressed: Dressed
-    textured: Textured
+    shape: ObjectShape
+    dressed: TexturedViews
+    textured: TexturedMesh
     T_map_object: Float
     stamp_ns: int
     span_ns: tuple[int, int]
@@ -72,15 +72,15 @@ class Models:
         tints: colours of the beams' ends; None where there are no pictures, or nobody wants them.
     """
 
-    painted: Painted
-    textured: Textured
-    unfiltered: Textured | None
+    painted: ViewAssignment
+    textured: TexturedMesh
+    unfiltered: TexturedMesh | None
     views: list[View]
     left_out: dict[str, int]
     unread: list[str]
-    movers: list[MoverModel]
+    movers: list[ObjectModel]
     tried: int
-    tints: Tints | None = None
+    tints: PointColors | None = None
 
 
 def require_extras() -> None:
@@ -93,8 +93,8 @@ def require_extras() -> None:
         import_extra(module, "mesh.glb", "made", group="mesh")
 
 
-def models_of(
-    sources: Sources,
+def build_models(
+    sources: MeshInputs,
     options: MeshOptions,
     threads: int = 1,
     progress: Progress = silent,
@@ -118,7 +118,7 @@ def models_of(
         return lambda done, total: progress(what, 0, done, total)
 
     with stages.measure("surface"):
-        mesh = surface_of(
+        mesh = build_surface(
             sources.seen,
             sources.poses,
             sources.p_static,
@@ -129,7 +129,7 @@ def models_of(
     with stages.measure("painting"):
         views, left_out, unread = _usable(sources, tell("reading pictures"))
         limits = options.texture.visible
-        place, gain = painted(
+        place, gain = assign_views(
             mesh, views, sources, options.choice, limits, threads, tell("choosing pictures")
         )
         sources = _levelled(sources, views, gain)
@@ -140,39 +140,39 @@ def models_of(
         unfiltered = _unfiltered(textured, place, views, read, options)
     ahead = _ahead(place, views, sources.recording.images, limits)
     with stages.measure("movers"):
-        movers, moves = [], Moves.of(sources)
+        movers, moves = [], DynamicReturns.of(sources)
         if options.objects.enabled:
             movers = _movers(sources, moves, views, ahead, options, tell("building what moved"))
     tints = None
     if views and options.points.enabled:
         with stages.measure("points"):
             now = tell("colouring points")
-            tints = tinted(sources, textured, ahead, moves, options, threads, now)
+            tints = color_points(sources, textured, ahead, moves, options, threads, now)
     tried = len(sources.objects)
     return Models(place, textured, unfiltered, views, left_out, unread, movers, tried, tints)
 
 
-def _usable(sources: Sources, tell: Tell) -> tuple[list[View], dict[str, int], list[str]]:
+def _usable(sources: MeshInputs, tell: Tell) -> tuple[list[View], dict[str, int], list[str]]:
     """Pictures of a known place that can be read; how many cannot be used, and which not read."""
-    views, left_out = views_of(sources.recording, sources.poses)
-    views, unread = readable(sources.recording.images, views, tell)
+    views, left_out = find_views(sources.recording, sources.poses)
+    views, unread = filter_readable(sources.recording.images, views, tell)
     if unread:
-        left_out = {**left_out, UNREAD: left_out.get(UNREAD, 0) + len(unread)}
+        left_out = {**left_out, UNREADABLE: left_out.get(UNREADABLE, 0) + len(unread)}
     return views, left_out, unread
 
 
-def _levelled(sources: Sources, views: Sequence[View], gain: Float) -> Sources:
+def _levelled(sources: MeshInputs, views: Sequence[View], gain: Float) -> MeshInputs:
     """The same with pictures of one exposure."""
     images = sources.recording.images
     if images is None:
         return sources
-    recording = replace(sources.recording, images=levelled(images, views, gain))
+    recording = replace(sources.recording, images=apply_gains(images, views, gain))
     return replace(sources, recording=recording)
 
 
 def _unfiltered(
-    textured: Textured, place: Painted, views: list[View], read: Read, options: MeshOptions
-) -> Textured | None:
+    textured: TexturedMesh, place: ViewAssignment, views: list[View], read: Read, options: MeshOptions
+) -> TexturedMesh | None:
     """With the sharpest picture on the faces of which that probably shows something that moves."""
     spoiled = (place.sharpest >= 0) & (place.p_sharpest < _SPOILED)
     if not spoiled.any():
@@ -192,24 +192,24 @@ def _reader(images: Images | None) -> Read:
 
 
 def _ahead(
-    place: Painted, views: list[View], images: Images | None, limits: VisibleOptions
-) -> Ahead:
+    place: ViewAssignment, views: list[View], images: Images | None, limits: VisibleOptions
+) -> Background:
     def colours(view: View) -> NDArray[np.uint8] | None:
-        return None if images is None else colours_of(images, view)
+        return None if images is None else read_color_image(images, view)
 
-    return Ahead(place, views, limits, colours)
+    return Background(place, views, limits, colours)
 
 
 def _movers(
-    sources: Sources,
-    moves: Moves,
+    sources: MeshInputs,
+    moves: DynamicReturns,
     views: Sequence[View],
-    ahead: Ahead,
+    ahead: Background,
     options: MeshOptions,
     tell: Tell,
-) -> list[MoverModel]:
-    followed = followed_of(sources, moves, options.objects)
-    wholes = wholes_of(followed, moves, sources, options.objects)
+) -> list[ObjectModel]:
+    followed = collect_tracks(sources, moves, options.objects)
+    wholes = merge_tracks(followed, moves, sources, options.objects)
     out = []
     for number, whole in enumerate(wholes):
         model = _mover(whole, sources, moves, views, ahead, options)
@@ -220,22 +220,22 @@ def _movers(
 
 
 def _mover(
-    whole: Sequence[Followed],
-    sources: Sources,
-    moves: Moves,
+    whole: Sequence[ObjectTrack],
+    sources: MeshInputs,
+    moves: DynamicReturns,
     views: Sequence[View],
-    place: Ahead,
+    place: Background,
     options: MeshOptions,
-) -> MoverModel | None:
+) -> ObjectModel | None:
     """The model of what was followed as one or more objects; None where `shape_of` finds none."""
     start = sources.start_ns
-    seconds = [when_in_view(one.thing, views, start) for one in whole]
+    seconds = [times_in_view(one.thing, views, start) for one in whole]
     shown = [some[np.isfinite(some)] for some in seconds]
-    shape = shape_of(whole, sources, moves, options.objects, shown)
+    shape = reconstruct_object(whole, sources, moves, options.objects, shown)
     if shape is None:
         return None
     parts = {one.object.id for one in whole if one.object.id != shape.id}
-    dress = dressed(
+    dress = assign_object_views(
         shape,
         views,
         place,
@@ -251,4 +251,4 @@ def _mover(
     first, middle, last = (
         start + round(1e9 * seconds) for seconds in (shape.span[0], shape.seconds, shape.span[1])
     )
-    return MoverModel(shape, dress, textured, T, middle, (first, last))
+    return ObjectModel(shape, dress, textured, T, middle, (first, last))

@@ -9,8 +9,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 import stillmap._core as _core
-from stillmap.core.errors import extra
-from stillmap.mesh.triangle_mesh import Mesh, joined
+from stillmap.core.errors import import_extra
+from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes
 
 Float = NDArray[np.float64]
 
@@ -18,17 +18,17 @@ TILE = 64  # voxels along a tile, whole blocks
 _LEAP = 2.5  # voxels by which distances differ within a cube where there are two surfaces
 
 
-def tiles_of(distances: _core.SignedDistances) -> NDArray[np.int64]:
+def occupied_tiles(distances: _core.SignedDistances) -> NDArray[np.int64]:
     """(N, 3) tiles in which something is known, in the order of their numbers."""
-    return np.unique(distances.blocks() // blocks_along(distances), axis=0)
+    return np.unique(distances.blocks() // blocks_per_tile(distances), axis=0)
 
 
-def blocks_along(distances: _core.SignedDistances) -> int:
+def blocks_per_tile(distances: _core.SignedDistances) -> int:
     """Blocks along the edge of a tile."""
     return TILE // distances.edge
 
 
-def meshed(distances: _core.SignedDistances, tile: NDArray[np.int64], fewest: float) -> Mesh:
+def march_tile(distances: _core.SignedDistances, tile: NDArray[np.int64], fewest: float) -> Mesh:
     """The surface within one tile; vertices on its borders are those of the tile beside.
 
     There is no surface where a corner of a cube is not known, nor where distances leap: there
@@ -39,7 +39,7 @@ def meshed(distances: _core.SignedDistances, tile: NDArray[np.int64], fewest: fl
         tile: (3,) in tiles.
         fewest: weight that a voxel needs.
     """
-    measure: Any = extra("skimage.measure", "mesh.glb", "made", group="mesh")
+    measure: Any = import_extra("skimage.measure", "mesh.glb", "made", group="mesh")
     first = [int(c) * TILE for c in tile]
     metres, weight = distances.dense(first, [TILE + 1] * 3)
     known = weight > fewest
@@ -70,10 +70,10 @@ def _of_cubes(
     return values
 
 
-def extracted(distances: _core.SignedDistances, tile: NDArray[np.int64], fewest: float) -> Mesh:
+def extract_tile(distances: _core.SignedDistances, tile: NDArray[np.int64], fewest: float) -> Mesh:
     """The surface within one tile, in metres; see `meshed`."""
-    mesh = meshed(distances, tile, fewest)
-    return _in_metres(welded(mesh), distances.voxel) if len(mesh) else mesh
+    mesh = march_tile(distances, tile, fewest)
+    return _in_metres(weld(mesh), distances.voxel) if len(mesh) else mesh
 
 
 def _in_metres(mesh: Mesh, voxel: float) -> Mesh:
@@ -81,7 +81,7 @@ def _in_metres(mesh: Mesh, voxel: float) -> Mesh:
     return Mesh((mesh.vertices + 0.5) * voxel, mesh.faces)
 
 
-def welded(mesh: Mesh) -> Mesh:
+def weld(mesh: Mesh) -> Mesh:
     """Vertices at exactly the same place are one; faces without area are gone."""
     # + 0.0: zero has one sign
     rows = np.ascontiguousarray(mesh.vertices + 0.0).view(np.dtype((np.void, 24))).ravel()
@@ -94,7 +94,7 @@ def welded(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices[order], faces.astype(np.int32))
 
 
-def without_islands(mesh: Mesh, area: float) -> Mesh:
+def remove_small_components(mesh: Mesh, area: float) -> Mesh:
     """Without the connected pieces that have less area, in square metres."""
     if not len(mesh):
         return mesh
@@ -107,6 +107,6 @@ def without_islands(mesh: Mesh, area: float) -> Mesh:
     return mesh.part(areas[piece[a]] >= area)
 
 
-def joined_whole(parts: list[Mesh]) -> Mesh:
+def weld_meshes(parts: list[Mesh]) -> Mesh:
     """One mesh of the tiles', vertices on borders welded."""
-    return welded(joined(parts))
+    return weld(concatenate_meshes(parts))

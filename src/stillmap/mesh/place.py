@@ -9,22 +9,22 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from stillmap.core.camera import project
-from stillmap.core.parallel import in_order
-from stillmap.mesh.inputs import Sources
+from stillmap.core.parallel import map_ordered
+from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.options import ChoiceOptions, VisibleOptions
-from stillmap.mesh.simplification import divided
-from stillmap.mesh.texture.exposure import gains
-from stillmap.mesh.texture.occluders import Thing, at_time, in_the_way, within_or_behind
-from stillmap.mesh.texture.occlusion import Beams, told
+from stillmap.mesh.simplification import subdivide
+from stillmap.mesh.texture.exposure import estimate_gains
+from stillmap.mesh.texture.occluders import TrackedBox, boxes_at, occlusion_probability, is_in_or_behind_box
+from stillmap.mesh.texture.occlusion import LidarReturns, build_occlusion_mask
 from stillmap.mesh.texture.view_selection import (
     Candidates,
-    agreeing,
-    chosen,
-    colours_of_faces,
-    utility,
+    reject_inconsistent_views,
+    select_views,
+    sample_face_colors,
+    view_utility,
 )
-from stillmap.mesh.texture.views import View, colours_of
-from stillmap.mesh.texture.visibility import visible
+from stillmap.mesh.texture.views import View, read_color_image
+from stillmap.mesh.texture.visibility import find_visible_faces
 from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]
@@ -33,7 +33,7 @@ Tell = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Painted:
+class ViewAssignment:
     """A surface of F faces, and which of N views paints each.
 
     Attributes:
@@ -53,15 +53,15 @@ class Painted:
     p_sharpest: NDArray[np.float32]
 
 
-def painted(
+def assign_views(
     mesh: Mesh,
     views: Sequence[View],
-    sources: Sources,
+    sources: MeshInputs,
     options: ChoiceOptions,
     limits: VisibleOptions,
     threads: int = 1,
     tell: Tell | None = None,
-) -> tuple[Painted, Float]:
+) -> tuple[ViewAssignment, Float]:
     """Chooses for each face the view that most likely shows static things only (Sect. 4.4).
 
     Args:
@@ -78,36 +78,36 @@ def painted(
         exposure.
     """
     if views:
-        mesh, _ = divided(mesh, partial(longest_edge, views, options))
+        mesh, _ = subdivide(mesh, partial(max_edge_at, views, options))
     beams, areas = sources.beams(), mesh.areas()
     candidates = Candidates.none(len(mesh), min(options.candidates, max(len(views), 1)))
     sharpest = Candidates.none(len(mesh), 1)
 
     def looked_at(view: View) -> tuple[NDArray[np.intp], Float, Float]:
-        found = visible(mesh, view, limits)
+        found = find_visible_faces(mesh, view, limits)
         faces = np.flatnonzero(found.seen)
         p = np.zeros(0)
         if len(faces):
-            p = shown(mesh, faces, view, beams, sources.things, options)
+            p = p_unoccluded(mesh, faces, view, beams, sources.things, options)
         return faces, found.pixels[faces].astype(np.float64), p
 
-    for number, (faces, pixels, p) in enumerate(in_order(looked_at, views, threads)):
-        candidates.add(number, faces, utility(p, pixels, areas[faces], options), p)
+    for number, (faces, pixels, p) in enumerate(map_ordered(looked_at, views, threads)):
+        candidates.add(number, faces, view_utility(p, pixels, areas[faces], options), p)
         sharpest.add(number, faces, pixels, p)
         if tell is not None:
             tell(number + 1, len(views))
     images, gain = sources.recording.images, np.ones((len(views), 3))
     if views and images is not None and (options.level or (options.believe and options.odd > 0.0)):
-        found = colours_of_faces(mesh, candidates, views, partial(colours_of, images))
+        found = sample_face_colors(mesh, candidates, views, partial(read_color_image, images))
         if options.level:
-            gain = gains(candidates.picture, found, len(views))
+            gain = estimate_gains(candidates.picture, found, len(views))
             found *= gain[candidates.picture]  # of no picture, NaN stays
         if options.believe and options.odd > 0.0:
-            candidates = agreeing(candidates, found, options.odd)
-    return settled(mesh, candidates, sharpest, options.border), gain
+            candidates = reject_inconsistent_views(candidates, found, options.odd)
+    return resolve_assignment(mesh, candidates, sharpest, options.border), gain
 
 
-def longest_edge(views: Sequence[View], options: ChoiceOptions, points: Float) -> Float:
+def max_edge_at(views: Sequence[View], options: ChoiceOptions, points: Float) -> Float:
     """(n,) metres, how long edges may be that end at points (n, 3).
 
     `edge` metres, and where the nearest camera is far what is `edge_pixels` wide in its pictures.
@@ -118,7 +118,7 @@ def longest_edge(views: Sequence[View], options: ChoiceOptions, points: Float) -
     return np.asarray(np.maximum(options.edge, wide), np.float64)
 
 
-def settled(mesh: Mesh, candidates: Candidates, sharpest: Candidates, border: float) -> Painted:
+def resolve_assignment(mesh: Mesh, candidates: Candidates, sharpest: Candidates, border: float) -> ViewAssignment:
     """What paints each face once neighbours have settled.
 
     Args:
@@ -127,9 +127,9 @@ def settled(mesh: Mesh, candidates: Candidates, sharpest: Candidates, border: fl
         sharpest: of each the one that shows it in most pixels.
         border: what it costs where two views meet.
     """
-    view = chosen(candidates, mesh.pairs(), border)
+    view = select_views(candidates, mesh.pairs(), border)
     p_static = np.where(candidates.picture == view[:, None], candidates.p_static, 0.0).max(axis=1)
-    return Painted(
+    return ViewAssignment(
         mesh,
         view,
         np.where(view >= 0, p_static, 0.0).astype(np.float32),
@@ -139,12 +139,12 @@ def settled(mesh: Mesh, candidates: Candidates, sharpest: Candidates, border: fl
     )
 
 
-def shown(
+def p_unoccluded(
     mesh: Mesh,
     faces: NDArray[np.intp],
     view: View,
-    beams: Beams,
-    things: Sequence[Thing],
+    beams: LidarReturns,
+    things: Sequence[TrackedBox],
     options: ChoiceOptions,
 ) -> Float:
     """(n,) how probably a view shows static things only where it sees faces (n,).
@@ -156,12 +156,12 @@ def shown(
     part = mesh.part_of(faces)
     points = np.concatenate([part.vertices, part.centres])
     seconds = 1e-9 * (view.stamp_ns - beams.start_ns)
-    there = at_time(things, seconds)
-    free = 1.0 - in_the_way(there, view.place, points, options.margin, options.sigma)
+    there = boxes_at(things, seconds)
+    free = 1.0 - occlusion_probability(there, view.place, points, options.margin, options.sigma)
     ends, p_static = beams.about(view.stamp_ns, options)
     # a laser sees past a thing what the camera beside it does not see
-    speaks = (p_static < 0.5) | ~within_or_behind(there, view.place, ends)
-    found = told(view, ends[speaks], p_static[speaks], options.margin)
+    speaks = (p_static < 0.5) | ~is_in_or_behind_box(there, view.place, ends)
+    found = build_occlusion_mask(view, ends[speaks], p_static[speaks], options.margin)
     local = view.in_camera(points)
     uv, ok = project(view.camera, local)
     uv = np.where(ok[:, None], uv, 0.0)  # corners just outside: as at the edge

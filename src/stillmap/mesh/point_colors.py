@@ -20,7 +20,7 @@ from stillmap.mesh.background import Background
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.segmentation import NO_OWNER, DynamicReturns
 from stillmap.mesh.options import MeshOptions
-from stillmap.mesh.texture.atlas import GRAY, Textured
+from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
 from stillmap.mesh.texture.baking import bilinear
 from stillmap.mesh.texture.occluders import OrientedBox, TrackedBox, boxes_at, occlusion_probability
 from stillmap.mesh.texture.point_colors import PaintedMesh, depth_inside, not_grey
@@ -203,7 +203,7 @@ class PointColors:
 
 def color_points(
     sources: MeshInputs,
-    textured: Textured,
+    textured: TexturedMesh,
     place: Background,
     moves: DynamicReturns,
     options: MeshOptions,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.errors import extra
+from stillmap.core.errors import import_extra
 from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]
@@ -29,7 +29,7 @@ _MOST = 24  # times
 _LITTLE = 0.9  # of the triangles left: more error does not help
 
 
-def thinned(mesh: Mesh, error: float, *, whole_border: bool = True, most: int = 0) -> Mesh:
+def simplify(mesh: Mesh, error: float, *, whole_border: bool = True, most: int = 0) -> Mesh:
     """The mesh with fewer triangles; none is turned over.
 
     Garland and Heckbert, "Surface Simplification Using Quadric Error Metrics", SIGGRAPH 1997.
@@ -43,7 +43,7 @@ def thinned(mesh: Mesh, error: float, *, whole_border: bool = True, most: int = 
     """
     if len(mesh) <= most or not len(mesh) or error <= 0.0:
         return mesh
-    pyfqmr: Any = extra("pyfqmr", "mesh.glb", "made", group="mesh")
+    pyfqmr: Any = import_extra("pyfqmr", "mesh.glb", "made", group="mesh")
     work = pyfqmr.Simplify()
     work.setMesh(mesh.vertices, mesh.faces)
     work.simplify_mesh(
@@ -59,7 +59,7 @@ def thinned(mesh: Mesh, error: float, *, whole_border: bool = True, most: int = 
     return Mesh(np.array(vertices, np.float64), np.array(faces, np.int32).reshape(-1, 3))
 
 
-def within_budget(mesh: Mesh, error: float, most: int, *, whole_border: bool = False) -> Mesh:
+def simplify_to_budget(mesh: Mesh, error: float, most: int, *, whole_border: bool = False) -> Mesh:
     """The mesh with so many triangles at most, whatever the error; borders go last.
 
     With `whole_border` they stay, and there may be more triangles.
@@ -69,10 +69,10 @@ def within_budget(mesh: Mesh, error: float, most: int, *, whole_border: bool = F
         if before <= most:
             break
         error *= _AGAIN
-        mesh = thinned(mesh, error, most=most)
+        mesh = simplify(mesh, error, most=most)
         if not whole_border:
             # before the surface goes, which would have to make up for ragged borders
-            mesh = thinned(mesh, error, whole_border=False, most=most)
+            mesh = simplify(mesh, error, whole_border=False, most=most)
         elif len(mesh) > _LITTLE * before:
             break
     return mesh
@@ -81,7 +81,7 @@ def within_budget(mesh: Mesh, error: float, most: int, *, whole_border: bool = F
 _SUBDIVISION_ROUNDS = 12  # at most; each halves the longest edges
 
 
-def divided(mesh: Mesh, edge: float | Callable[[Float], Float]) -> tuple[Mesh, NDArray[np.intp]]:
+def subdivide(mesh: Mesh, edge: float | Callable[[Float], Float]) -> tuple[Mesh, NDArray[np.intp]]:
     """The same surface, all of whose edges are shorter; neighbours stay neighbours.
 
     Edges longer than `edge` metres are halved, and triangles with one, two or three such edges

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.parallel import in_order
+from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.mesh import marching_cubes
 from stillmap.mesh.options import SurfaceOptions
-from stillmap.mesh.range_image import Patch, order_of, patches_of
-from stillmap.mesh.resolution import Reach, reach_of, resolution_of
-from stillmap.mesh.simplification import thinned, within_budget
+from stillmap.mesh.range_image import Patch, find_scan_layout, triangulate_scans
+from stillmap.mesh.resolution import PatchExtents, patch_extents, choose_resolution
+from stillmap.mesh.simplification import simplify, simplify_to_budget
 from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]
@@ -37,7 +37,7 @@ _SPARE = 2  # times as many triangles as are asked for, meanwhile
 _BELOW = [way for way in product((-1, 0), repeat=3) if any(way)]
 
 
-class Growing:
+class StreamingSurface:
     """What is known of a surface: distances in voxels, and triangles where nothing more comes."""
 
     def __init__(self, distances: _core.SignedDistances, options: SurfaceOptions) -> None:
@@ -53,9 +53,9 @@ class Growing:
         """Whether so many voxels came since the last look that another one pays."""
         return self.distances.memory_bytes > self._held + _MORE
 
-    def let_go(self, reach: Reach, done: int) -> None:
+    def let_go(self, reach: PatchExtents, done: int) -> None:
         """Makes triangles of what patches from number `done` on do not come to."""
-        tiles = marching_cubes.tiles_of(self.distances)
+        tiles = marching_cubes.occupied_tiles(self.distances)
         edge = marching_cubes.TILE * self.distances.voxel
         self._take(tiles[reach.settled(tiles, edge, done)])
         self._forget()
@@ -63,19 +63,19 @@ class Growing:
 
     def finished(self, tell: Tell | None = None) -> Mesh:
         """All of it, within the budget; `tell`: what is done of the tiles that were left."""
-        self._take(marching_cubes.tiles_of(self.distances), tell)
+        self._take(marching_cubes.occupied_tiles(self.distances), tell)
         self._merge()
-        whole = marching_cubes.without_islands(self._mesh, self.options.island)
-        return within_budget(thinned(whole, self.error), self.error, self.options.faces)
+        whole = marching_cubes.remove_small_components(self._mesh, self.options.island)
+        return simplify_to_budget(simplify(whole, self.error), self.error, self.options.faces)
 
     def _take(self, tiles: NDArray[np.int64], tell: Tell | None = None) -> None:
         for done, tile in enumerate(tiles, start=1):
             key = _key(tile)
             if key not in self._taken:
                 self._taken.add(key)
-                part = marching_cubes.extracted(self.distances, tile, self.options.fewest)
+                part = marching_cubes.extract_tile(self.distances, tile, self.options.fewest)
                 if len(part):
-                    self._waiting.append(thinned(part, self.error))
+                    self._waiting.append(simplify(part, self.error))
             if sum(map(len, self._waiting)) > max(_BATCH, len(self._mesh)):
                 self._merge()
             if tell:
@@ -84,7 +84,7 @@ class Growing:
     def _forget(self) -> None:
         """Voxels of tiles that are triangles, but those on which tiles below still border."""
         blocks = self.distances.blocks()
-        of_block = [_key(tile) for tile in blocks // marching_cubes.blocks_along(self.distances)]
+        of_block = [_key(tile) for tile in blocks // marching_cubes.blocks_per_tile(self.distances)]
         there = set(of_block)
         gone = {
             (x, y, z)
@@ -95,12 +95,12 @@ class Growing:
 
     def _merge(self) -> None:
         """One mesh; its border stays as it is, as more may come to it."""
-        whole = marching_cubes.joined_whole([self._mesh, *self._waiting])
+        whole = marching_cubes.weld_meshes([self._mesh, *self._waiting])
         self._waiting = []
         if len(whole) > _BATCH:
-            whole = thinned(whole, self.error)
+            whole = simplify(whole, self.error)
             most = _SPARE * self.options.faces
-            whole = within_budget(whole, self.error, most, whole_border=True)
+            whole = simplify_to_budget(whole, self.error, most, whole_border=True)
         self._mesh = whole
 
 
@@ -116,7 +116,7 @@ _LEAST = 1e-3  # m, edge of the cells by which scans nearby are found
 _AROUND = list(product((-1, 0, 1), repeat=3))
 
 
-def surface_of(
+def build_surface(
     seen: Recording,
     poses: Float,
     p_static: NDArray[np.float32],
@@ -135,10 +135,10 @@ def surface_of(
         tell: called with what is done and what there is to do.
     """
     T = seen.T_map_sensor(poses)
-    chosen = chosen_scans(T, seen.sensor, usual_range(seen), options)
-    order = order_of(seen, chosen, options)
-    reach = reach_of(seen, poses, order)
-    voxel, stride = resolution_of(seen, poses, order, reach, options)
+    chosen = select_scans(T, seen.sensor, median_range(seen), options)
+    order = find_scan_layout(seen, chosen, options)
+    reach = patch_extents(seen, poses, order)
+    voxel, stride = choose_resolution(seen, poses, order, reach, options)
     order = order._replace(stride=stride)
     n, done = len(order.groups), 0
 
@@ -148,27 +148,27 @@ def surface_of(
 
     def each() -> Iterable[tuple[Patch, NDArray[np.float32]]]:
         nonlocal done
-        for one in in_order(weighed, patches_of(seen, poses, order, options), threads):
+        for one in map_ordered(weighed, triangulate_scans(seen, poses, order, options), threads):
             yield one
             done += 1
             if tell:
                 tell(done, 2 * n)
 
     later = partial(_second_half, tell, n) if tell else None
-    return fused(each(), voxel, options, threads, later, reach)
+    return integrate_patches(each(), voxel, options, threads, later, reach)
 
 
 def _second_half(tell: Tell, n: int, done: int, total: int) -> None:
     tell(n + n * done // total, 2 * n)
 
 
-def fused(
+def integrate_patches(
     patches: Iterable[tuple[Patch, NDArray[np.float32]]],
     voxel: float,
     options: SurfaceOptions,
     threads: int = 1,
     tell: Tell | None = None,
-    reach: Reach | None = None,
+    reach: PatchExtents | None = None,
 ) -> Mesh:
     """One surface of many patches, in the frame of their points.
 
@@ -181,7 +181,7 @@ def fused(
         reach: how far patches go; without it all voxels are kept to the end.
     """
     before, behind = options.before * voxel, options.behind * voxel
-    growing = Growing(_core.SignedDistances(voxel, before=before, behind=behind), options)
+    growing = StreamingSurface(_core.SignedDistances(voxel, before=before, behind=behind), options)
     for done, (patch, weight) in enumerate(patches, start=1):
         growing.distances.add(
             patch.points, patch.origin, patch.standoff, patch.faces, weight, threads=threads
@@ -201,7 +201,7 @@ def static_weights(
     return np.where(weight >= least, weight, 0.0).astype(np.float32)
 
 
-def usual_range(seen: Recording) -> float:
+def median_range(seen: Recording) -> float:
     """Median range in metres of the hits of some scans; 0 where there are none."""
     asked = np.unique(np.linspace(0, seen.n_scans - 1, min(seen.n_scans, _ASKED)).astype(np.intp))
     parts = [seen.points[b][seen.hit[b]] for b in map(seen.beams_of, asked)]
@@ -210,7 +210,7 @@ def usual_range(seen: Recording) -> float:
     return float(np.median(ranges)) if len(ranges) else 0.0
 
 
-def chosen_scans(
+def select_scans(
     T_map_sensor: Float, sensor: NDArray[np.int32], range: float, o: SurfaceOptions
 ) -> NDArray[np.intp]:
     """The scans that tell something new: so many from each place, and for each direction.

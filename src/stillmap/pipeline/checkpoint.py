@@ -19,9 +19,9 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import blocks, write_npy
+from stillmap.core.arrays import iter_blocks, write_npy
 from stillmap.core.errors import InputError
-from stillmap.core.profiling import Stages
+from stillmap.core.profiling import StageTimer
 from stillmap.pipeline.checkpoint_files import packed, require_same, unpacked
 from stillmap.pipeline.options import Options
 from stillmap.pipeline.progress import Loop
@@ -54,7 +54,9 @@ class Place:
         ]
         return self.folder / f"iteration-{max(numbers)}" if numbers else None
 
-    def load(self, identity: Mapping[str, Any], options: Options, stages: Stages) -> Loop | None:
+    def load(
+        self, identity: Mapping[str, Any], options: Options, stages: StageTimer
+    ) -> Loop | None:
         """How far the run came; None where there is no checkpoint.
 
         Args:
@@ -79,7 +81,7 @@ class Place:
         stages.add(state["stages"])
         return loop
 
-    def save(self, loop: Loop, identity: Mapping[str, Any], stages: Stages) -> None:
+    def save(self, loop: Loop, identity: Mapping[str, Any], stages: StageTimer) -> None:
         """Keep how far a run has come, instead of what is kept so far.
 
         Raises:
@@ -241,7 +243,7 @@ def _array(path: Path, about: Mapping[str, Any]) -> NDArray[Any]:
 
 def _checksum(array: NDArray[Any]) -> int:
     found = 0
-    for block in blocks(array):
+    for block in iter_blocks(array):
         part = np.ascontiguousarray(array[block]).reshape(-1)
         found = zlib.crc32(part.view(np.uint8).data, found)
     return found

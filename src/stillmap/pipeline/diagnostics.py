@@ -1,38 +1,31 @@
-"""What somebody should know before he trusts a result."""
+"""Warnings of a run: what limits the trust in its result."""
 
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillmap import em, slam
-from stillmap.core.json import skipped_count
+from stillmap.core.json import count_skipped
 from stillmap.core.recording import Recording
+from stillmap.pipeline.estimate import Estimate, IterationRecord
 from stillmap.pipeline.options import Options
-from stillmap.results.protocols import IterationRecordLike
 
 
-def cautions(
-    records: Sequence[IterationRecordLike],
-    kept: int,
-    explained: NDArray[np.float64],
-    doubts: slam.Doubts,
-    recording: Recording,
-    options: Options,
+def find_warnings(
+    records: Sequence[IterationRecord], best: Estimate, recording: Recording, options: Options
 ) -> list[str]:
-    """A sentence each, those of the reader first.
+    """One sentence per warning, those of the reader first.
 
     Args:
         records: the numbers of every iteration.
-        kept: the iteration that was kept; (T,) `explained` and `doubts` are of it.
-        explained: share of each scan's beams that the map so far explained; NaN: poses were given.
-        doubts: where odometry and scans do not agree.
-        recording: what all of it is about.
+        best: the estimate that was kept.
+        recording: the input.
         options: as resolved.
     """
-    out = _of_reading(recording.source)
+    explained = best.m_step.explained  # NaN: poses were given
+    out = _reader_warnings(recording.source)
     noise = options.em.tolerance * recording.n_beams
     dips = [
         after.number
@@ -42,12 +35,12 @@ def cautions(
     if dips and not em.fixed_iterations(options.estimator):
         out.append(
             f"the likelihood dipped at iteration {', '.join(map(str, dips))}: poses are estimated "
-            f"by matching, not by it; iteration {kept} is the best and was kept"
+            f"by matching, not by it; iteration {best.number} is the best and was kept"
         )
     given = len(explained) > 0 and bool(np.isnan(explained).all())
     if recording.T_odom_base is None and not given:
         out.append("no odometry: a constant velocity was assumed between scans")
-    out += _of_poses(doubts)
+    out += _pose_warnings(best.m_step.doubts)
     lost = np.flatnonzero(explained < 0.2)
     if len(lost):
         out.append(
@@ -57,23 +50,23 @@ def cautions(
     return out
 
 
-def _of_reading(source: Mapping[str, Any]) -> list[str]:
-    """What the reader noted; of strange folders anything may stand there."""
+def _reader_warnings(source: Mapping[str, Any]) -> list[str]:
+    """The reader's warnings; a foreign recording folder may hold anything there."""
     noted = source.get("warnings")
     out = [text for text in noted if isinstance(text, str)] if isinstance(noted, list) else []
-    skipped = skipped_count(source)
+    skipped = count_skipped(source)
     if skipped:
         out.append(f"scans left out while reading: {skipped} (`stillmap info` says why)")
     return out
 
 
-def _of_poses(doubts: slam.Doubts) -> list[str]:
+def _pose_warnings(doubts: slam.Diagnostics) -> list[str]:
     out = []
-    if doubts.disagreeing:
-        n = len(doubts.disagreeing)
+    if doubts.odometry_faults:
+        n = len(doubts.odometry_faults)
         out.append(
             f"odometry and scans disagree at {n} scan{'s' * (n > 1)} (wheels that slip or "
-            f"stall, odometry that begins again), first at scan {doubts.disagreeing[0]}: poses "
+            f"stall, odometry that begins again), first at scan {doubts.odometry_faults[0]}: poses "
             "follow the scans there"
         )
     if doubts.widened:
@@ -86,7 +79,7 @@ def _of_poses(doubts: slam.Doubts) -> list[str]:
             f"before scan {scan} the robot lost its way or was carried elsewhere: "
             + (
                 "nothing seen after it is known from before, so it stands beside the rest"
-                if scan in doubts.apart
+                if scan in doubts.unconnected
                 else "where it went on was found among the places known from before"
             )
         )

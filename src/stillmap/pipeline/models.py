@@ -1,22 +1,22 @@
 """Models of a result, as `stillmap map` makes them."""
 
-from stillmap.core.parallel import one_blas_thread, resolved_threads
-from stillmap.core.profiling import Stages
+from stillmap.core.parallel import limit_blas_threads, resolve_threads
+from stillmap.core.profiling import StageTimer
 from stillmap.mesh import build
 from stillmap.mesh.build import Models
 from stillmap.mesh.inputs import sources_of, sources_of_rig
 from stillmap.pipeline.em_loop import Progress, silent
 from stillmap.pipeline.result import Result
-from stillmap.rig.build import Tilting
+from stillmap.rig.build import TiltingResult
 
 
-@one_blas_thread()
+@limit_blas_threads()
 def models_of(
     result: Result,
     *,
-    tilting: Tilting | None = None,
+    tilting: TiltingResult | None = None,
     progress: Progress = silent,
-    stages: Stages | None = None,
+    stages: StageTimer | None = None,
 ) -> Models:
     """The surface of the place, painted, and models of what moved; `result.save` writes them.
 
@@ -34,5 +34,5 @@ def models_of(
         raise ValueError("result: expected one in 3D")
     build.require_extras()
     sources = sources_of(result) if tilting is None else sources_of_rig(result, tilting)
-    options, threads = result.options.mesh, resolved_threads(result.options.threads)
-    return build.models_of(sources, options, threads, progress, stages)
+    options, threads = result.options.mesh, resolve_threads(result.options.threads)
+    return build.build_models(sources, options, threads, progress, stages)

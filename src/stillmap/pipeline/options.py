@@ -8,7 +8,7 @@ from stillmap.core.config import Section, option
 from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
 from stillmap.em.options import MapState
-from stillmap.io.cameras import depth_cameras
+from stillmap.io.cameras import depth_camera_names
 from stillmap.mapping.projection import BandOptions
 from stillmap.mesh.options import MeshOptions
 from stillmap.preprocessing.options import ReadOptions
@@ -72,7 +72,9 @@ def resolved(options: Options, recording: Recording) -> Options:
     cells of 3D recordings are voxels.
     """
     if recording.dimension == 3:
-        voxel = options.slam.voxel or (_OF_DEPTH if depth_cameras(recording.source) else _VOXEL)
+        voxel = options.slam.voxel or (
+            _OF_DEPTH if depth_camera_names(recording.source) else _VOXEL
+        )
         slam_options = dataclasses.replace(options.slam, voxel=voxel, resolution=voxel)
         options = dataclasses.replace(options, slam=slam_options)
     if options.estimator != "paper":

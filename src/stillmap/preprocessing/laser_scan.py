@@ -27,7 +27,7 @@ _LONE_STEP = np.pi / 180  # rad, of a scan of one beam: any will do
 _ANOTHER = "a recording folder or a point cloud holds any directions"
 
 
-class Reach(NamedTuple):
+class RangeLimits(NamedTuple):
     """How far one laser sees, in metres.
 
     Attributes:
@@ -45,7 +45,7 @@ class Reach(NamedTuple):
         return above if self.declared is None else max(self.declared, above)
 
 
-def fans(recording: Recording) -> Float:
+def beam_angles(recording: Recording) -> Float:
     """(T, 2) first angle and step of every scan in radians, counterclockwise; the step is negative
     where angles fall from beam to beam.
 
@@ -85,7 +85,7 @@ def fans(recording: Recording) -> Float:
     return out
 
 
-def ranges(recording: Recording, scan: int, no_return: float) -> Float:
+def beam_ranges(recording: Recording, scan: int, no_return: float) -> Float:
     """(n,) metres of each beam of a scan: `no_return` at maximum range, NaN where unusable."""
     beams = recording.beams_of(scan)
     x, y = recording.points[beams].astype(np.float64).T
@@ -94,7 +94,7 @@ def ranges(recording: Recording, scan: int, no_return: float) -> Float:
     return np.where(known, length, no_return)
 
 
-def reaches(recording: Recording) -> list[Reach]:
+def range_limits(recording: Recording) -> list[RangeLimits]:
     """How far each of the S lasers sees."""
     hit, far = np.zeros((2, len(recording.T_base_sensor)))
     for t in recording.in_turn(range(recording.n_scans)):
@@ -104,7 +104,10 @@ def reaches(recording: Recording) -> list[Reach]:
         hit[s] = max(hit[s], length.max(where=is_hit, initial=0.0))
         far[s] = max(far[s], length.max(where=~is_hit & ~np.isnan(length), initial=0.0))
     noted = [_threshold(notes) for notes in _sensors(recording)]
-    return [Reach(float(h), n or float(f) or None) for h, f, n in zip(hit, far, noted, strict=True)]
+    return [
+        RangeLimits(float(h), n or float(f) or None)
+        for h, f, n in zip(hit, far, noted, strict=True)
+    ]
 
 
 def time_increments(recording: Recording) -> tuple[Float, int]:
@@ -190,7 +193,7 @@ def _any_that_fits(
     return (float(angle[0]) if angle else -np.pi), step
 
 
-NOTED = "spin"  # in the source, of recordings whose times are such
+SPIN_KEY = "spin"  # in the source, of recordings whose times are such
 
 _SENSE = {"clockwise": -1.0, "counter-clockwise": 1.0}
 
@@ -199,7 +202,7 @@ _TURN = 2.0 * math.pi
 _RATES = (0.5, 200.0)  # turns per second of lidars; stamps farther apart miss sweeps
 
 
-def timed(recording: Recording, options: ReadOptions) -> Recording:
+def add_beam_times(recording: Recording, options: ReadOptions) -> Recording:
     """The recording with beam times as the direction of the spin says.
 
     A turn takes from one stamp to the next, or as long as `spin_rate` says. Where it begins,
@@ -210,7 +213,7 @@ def timed(recording: Recording, options: ReadOptions) -> Recording:
             times, or there is no rate, with a warning.
         options: `spin`, `spin_rate`, `spin_start` and `spin_stamp`.
     """
-    if options.spin not in _SENSE or NOTED in recording.source:
+    if options.spin not in _SENSE or SPIN_KEY in recording.source:
         return recording
     if recording.beam_time is not None:
         return _warned(recording, "the spin is not used: beams have times of their own")
@@ -221,7 +224,7 @@ def timed(recording: Recording, options: ReadOptions) -> Recording:
     beam_time = recording.per_beam(np.float32)
     for t in recording.in_turn(range(recording.n_scans), beam_time):
         beams = recording.beams_of(t)
-        turned = turns(recording.points[beams], options)
+        turned = rotation_since_stamp(recording.points[beams], options)
         beam_time[beams] = turned / per_second[recording.sensor[t]]
     noted = {
         "direction": options.spin,
@@ -229,10 +232,10 @@ def timed(recording: Recording, options: ReadOptions) -> Recording:
         "start": options.spin_start,
         "stamp": options.spin_start if options.spin_stamp is None else options.spin_stamp,
     }
-    return replace(recording, beam_time=beam_time, source={**recording.source, NOTED: noted})
+    return replace(recording, beam_time=beam_time, source={**recording.source, SPIN_KEY: noted})
 
 
-def turns(points: NDArray[np.float32], options: ReadOptions) -> Float:
+def rotation_since_stamp(points: NDArray[np.float32], options: ReadOptions) -> Float:
     """(n,) turns from the stamp to each of points (n, 3) in the sensor's frame; 0 for unusable."""
     sense = _SENSE[options.spin]
     azimuth = np.arctan2(points[:, 1].astype(np.float64), points[:, 0].astype(np.float64))

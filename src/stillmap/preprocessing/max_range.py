@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from stillmap.preprocessing import self_filter
 from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE, ReadOptions
-from stillmap.preprocessing.self_filter import Part
+from stillmap.preprocessing.self_filter import SelfSector
 
-ZERO_BELOW = 0.02  # m: a laser's housing is larger, so such a reading stands for something else
+MAX_ZERO_RANGE = 0.02  # m: a laser's housing is larger, so such a reading stands for something else
 FREQUENT_ZEROS = 0.005  # share of zero readings that is no accident
 MORE_ZEROS = (
     10.0  # times as many as readings of a value of its own: drivers that have both use zero
@@ -53,7 +53,7 @@ class RangeRule:
     free_how: str
     min_range: float
     # first and last beam, and up to where their readings are of the robot itself
-    own_body: tuple[Part, ...] = ()
+    own_body: tuple[SelfSector, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         return {**asdict(self), "own_body": [list(part) for part in self.own_body]}
@@ -74,7 +74,7 @@ def find_max_range(ranges: NDArray[np.float32], declared: float | None = None) -
     ranges = np.atleast_2d(np.asarray(ranges, np.float32))
     if declared is not None and not 0.0 < declared < MAX_PLAUSIBLE_RANGE:
         declared = None
-    real = ranges[(ranges >= ZERO_BELOW) & (ranges < MAX_PLAUSIBLE_RANGE)]
+    real = ranges[(ranges >= MAX_ZERO_RANGE) & (ranges < MAX_PLAUSIBLE_RANGE)]
     found = _code(ranges, real) if real.size else None
     if declared is not None and (found is None or declared < found[0]):
         also = f"; {found[1]}" if found else ""
@@ -136,7 +136,7 @@ def _is_code(
     return count >= 30 and contrast >= 50.0
 
 
-def decide(
+def infer_range_rule(
     ranges: NDArray[np.float32], declared: float | None, options: ReadOptions
 ) -> tuple[RangeRule, list[str]]:
     """The rule for one laser's readings (T, n), and warnings in words."""
@@ -157,10 +157,10 @@ def decide(
     )
     share = float(no_return.mean()) if coded and ranges.size else 0.0
     zero_means, zero_how = _zero_meaning(ranges, share, options.zero_means)
-    is_hit = (ranges >= np.float32(max(options.min_range, ZERO_BELOW))) & ~no_return
+    is_hit = (ranges >= np.float32(max(options.min_range, MAX_ZERO_RANGE))) & ~no_return
     free, free_how = _free_range(ranges[is_hit], threshold, options.free_range)
-    shortest = max(options.min_range, ZERO_BELOW)
-    own = self_filter.find_body_2d(np.atleast_2d(ranges), shortest) if options.own_body else ()
+    shortest = max(options.min_range, MAX_ZERO_RANGE)
+    own = self_filter.find_self_sectors(np.atleast_2d(ranges), shortest) if options.own_body else ()
     rule = RangeRule(threshold, how, zero_means, zero_how, free, free_how, options.min_range, own)
     if free is None:
         warnings.append("no reading shows how far the laser sees: maximum-range beams are unusable")
@@ -173,7 +173,7 @@ def _zero_meaning(
     """What zero stands for where a share `own` of the readings is another value for no return."""
     if wanted != "auto":
         return wanted, "given"
-    share = float(np.mean((ranges >= 0.0) & (ranges < ZERO_BELOW))) if ranges.size else 0.0
+    share = float(np.mean((ranges >= 0.0) & (ranges < MAX_ZERO_RANGE))) if ranges.size else 0.0
     text = f"{100.0 * share:.2f} % of the readings are zero"
     if own > 0.0 and share <= MORE_ZEROS * own:
         return "unusable", f"{text}; no return has its own value"
@@ -202,16 +202,16 @@ def _free_range(
     return seen, f"{100.0 * FREE_QUANTILE:g} % of the hits are nearer"
 
 
-def apply(
+def apply_range_rule(
     ranges: NDArray[np.float32], rule: RangeRule
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Lengths of the beams (NaN: unusable) and whether each hit something, shaped as `ranges`."""
     threshold = np.float32(MAX_PLAUSIBLE_RANGE if rule.threshold is None else rule.threshold)
-    zero = (ranges >= 0.0) & (ranges < ZERO_BELOW)
+    zero = (ranges >= 0.0) & (ranges < MAX_ZERO_RANGE)
     no_return = (ranges >= threshold) | (zero & (rule.zero_means == "max-range"))
-    nearest: Any = np.float32(max(rule.min_range, ZERO_BELOW))
+    nearest: Any = np.float32(max(rule.min_range, MAX_ZERO_RANGE))
     if rule.own_body:
-        nearest = np.maximum(nearest, self_filter.limits(rule.own_body, ranges.shape[-1]))
+        nearest = np.maximum(nearest, self_filter.min_ranges(rule.own_body, ranges.shape[-1]))
     hit = (ranges >= nearest) & (ranges < threshold)
     free = np.nan if rule.free_range is None else rule.free_range
     length = np.where(no_return, np.float32(free), np.where(hit, ranges, np.float32(np.nan)))

@@ -19,12 +19,12 @@ MAX_PLAUSIBLE_RANGE = (
     1000.0  # m: no laser in the plane sees so far; drivers write 1e10 or FLT_MAX for +inf
 )
 
-FARTHEST = 1e5  # m: nothing at all sees so far; damaged numbers do
+MAX_POINT_DISTANCE = 1e5  # m: nothing at all sees so far; damaged numbers do
 
 _LARGEST = {"x": 1e3, "y": 1e3, "theta": 1e3, "fov": 2.0 * math.pi + 1e-6}  # m, m, rad, rad
 
 
-class GivenLaser(NamedTuple):
+class LaserOptions(NamedTuple):
     """What the options say of one laser; None: found in the recording. Metres and radians."""
 
     x: float | None
@@ -39,7 +39,7 @@ class GivenLaser(NamedTuple):
         return self.x, self.y, self.theta
 
 
-_NOTHING_GIVEN = GivenLaser(None, None, None, None, None)
+_NOTHING_GIVEN = LaserOptions(None, None, None, None, None)
 
 
 @dataclass(frozen=True)
@@ -165,12 +165,12 @@ class ReadOptions:
             if fov is not None and not fov > 0.0:
                 raise ValueError(f"{laser}_fov must be positive, got {fov}")
 
-    def laser(self, number: int) -> GivenLaser:
+    def laser(self, number: int) -> LaserOptions:
         """What is said of a laser, from 0."""
         if number > 1:
             return _NOTHING_GIVEN
         prefix = ("laser", "laser2")[number]
-        return GivenLaser(*(getattr(self, f"{prefix}_{name}") for name in GivenLaser._fields))
+        return LaserOptions(*(getattr(self, f"{prefix}_{name}") for name in LaserOptions._fields))
 
     def require_lasers(self, number: int) -> None:
         """Refuses options for a laser that is not there.
@@ -182,7 +182,7 @@ class ReadOptions:
             raise InputError("options speak of a second laser, and there is none (laser2_...)")
 
 
-def applied(recording: Recording, options: ReadOptions) -> Recording:
+def apply_options(recording: Recording, options: ReadOptions) -> Recording:
     """`recording` narrowed by the options; itself where they are the defaults.
 
     Nearer than `min_range`: unusable. From `max_range` on: maximum range, ending there. A
@@ -211,8 +211,8 @@ def applied(recording: Recording, options: ReadOptions) -> Recording:
 
 
 def _narrowed(recording: Recording, options: ReadOptions) -> Recording:
-    points = arrays.copied(recording.points, recording.scratch)
-    hit = arrays.copied(recording.hit, recording.scratch)
+    points = arrays.copy(recording.points, recording.scratch)
+    hit = arrays.copy(recording.hit, recording.scratch)
     for block in arrays.iter_blocks(points, hit):
         _narrow(points[block], hit[block], options)
     return replace(recording, points=points, hit=hit)
@@ -230,7 +230,7 @@ def _narrow(points: NDArray[np.float32], hit: NDArray[np.bool_], options: ReadOp
     points[near], hit[near] = np.nan, False
 
 
-def _with_laser(recording: Recording, number: int, given: GivenLaser) -> Recording:
+def _with_laser(recording: Recording, number: int, given: LaserOptions) -> Recording:
     if given.place == (None, None, None) and not given.upside_down:
         return recording
     if recording.dimension != 2:
@@ -245,8 +245,8 @@ def _with_laser(recording: Recording, number: int, given: GivenLaser) -> Recordi
 
 def _mirrored(recording: Recording, number: int) -> Recording:
     """The beams of one laser turned the other way round."""
-    points = arrays.copied(recording.points, recording.scratch)
+    points = arrays.copy(recording.points, recording.scratch)
     scans = np.flatnonzero(recording.sensor == number).tolist()
-    for t in arrays.in_turn(scans, lambda: arrays.release_pages(points)):
+    for t in arrays.release_periodically(scans, lambda: arrays.release_pages(points)):
         points[recording.beams_of(t), 1] *= -1.0
     return replace(recording, points=points)

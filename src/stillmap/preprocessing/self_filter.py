@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
-from stillmap.preprocessing.ground_context import (
-    PLACES,
+from stillmap.preprocessing.ground_segmentation import (
+    BODY_RADIUS,
+    MIN_SCANS,
+    PLANE_MARGIN,
     PROFILE_RANGE,
-    REACH,
-    SURFACE,
-    Levels,
-    different,
-    is_sweep,
-    levels_of,
-    look_at,
+    Planes,
+    fit_ground_and_ceiling,
+    is_3d_sweep,
+    sample_hits,
+    select_distinct_scans,
 )
 from stillmap.preprocessing.options import MAX_PLAUSIBLE_RANGE
 
@@ -33,7 +33,9 @@ Bool = NDArray[np.bool_]
 
 Index = NDArray[np.intp]
 
-Part = tuple[int, int, float]  # first and last beam, and up to where their readings are its own
+SelfSector = tuple[
+    int, int, float
+]  # first and last beam, and up to where their readings are its own
 
 _EDGE = 0.1  # m, of a cell in which returns are from one place
 
@@ -53,7 +55,7 @@ _GOES_ON = (4, 0.3)  # metres of eight that are filled, and in which share of pl
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class SelfMask:
     """What a sensor sees of its robot.
 
     Attributes:
@@ -67,14 +69,14 @@ class Body:
 
     def own(self, points: NDArray[np.float32], hit: Bool) -> Index:
         """Which of points (n, 3) in the sensor's frame are of the robot itself."""
-        near = np.flatnonzero(hit & _within(points, 2 * REACH))
+        near = np.flatnonzero(hit & _within(points, 2 * BODY_RADIUS))
         turned = points[near].astype(np.float64) @ self.R.T
-        inside = _within(turned, REACH)
+        inside = _within(turned, BODY_RADIUS)
         near, cell = near[inside], _cells(turned[inside], _EDGE)
         return np.asarray(near[self.cells[tuple(cell.T)]])
 
 
-def left_out(recording: Recording) -> Recording:
+def remove_self_returns(recording: Recording) -> Recording:
     """The recording without returns of the robot itself: they are unusable.
 
     `source["own_body"]` says of which sensors, how many beams, and where: from the sensor, along
@@ -83,14 +85,16 @@ def left_out(recording: Recording) -> Recording:
     Args:
         recording: 3D. It comes back as it is where nothing of the robot shows.
     """
-    bodies = {k: find_body_3d(recording, k) for k in range(len(recording.T_base_sensor))}
+    bodies = {k: find_self_mask(recording, k) for k in range(len(recording.T_base_sensor))}
     found = {k: body for k, body in bodies.items() if body is not None}
     if not found:
         return recording
-    points = arrays.copied(recording.points, recording.scratch)
-    hit = arrays.copied(recording.hit, recording.scratch)
+    points = arrays.copy(recording.points, recording.scratch)
+    hit = arrays.copy(recording.hit, recording.scratch)
     counts = dict.fromkeys(found, 0)
-    for scan in arrays.in_turn(range(recording.n_scans), lambda: _let_go(points, hit, recording)):
+    for scan in arrays.release_periodically(
+        range(recording.n_scans), lambda: _let_go(points, hit, recording)
+    ):
         sensor, beams = int(recording.sensor[scan]), recording.beams_of(scan)
         if sensor in found:
             own = beams.start + found[sensor].own(points[beams], hit[beams])
@@ -102,12 +106,12 @@ def left_out(recording: Recording) -> Recording:
 
 
 def _let_go(points: NDArray[np.float32], hit: Bool, recording: Recording) -> None:
-    arrays.let_go(points)
-    arrays.let_go(hit)
+    arrays.release_pages(points)
+    arrays.release_pages(hit)
     recording.let_go()
 
 
-def find_body_3d(recording: Recording, sensor: int) -> Body | None:
+def find_self_mask(recording: Recording, sensor: int) -> SelfMask | None:
     """What a sensor sees of its robot; None where nothing shows.
 
     Only a robot that moves far enough shows what moves with it, and only where the ground is seen.
@@ -118,26 +122,26 @@ def find_body_3d(recording: Recording, sensor: int) -> Body | None:
     """
     R = recording.T_base_sensor[sensor][:3, :3]
     scans = np.flatnonzero(recording.sensor == sensor)
-    if len(scans) < PLACES:
+    if len(scans) < MIN_SCANS:
         return None
     scans = scans[np.unique(np.linspace(0, len(scans) - 1, _LOOKED_AT).astype(np.intp))]
-    looks = [look_at(recording, scan, R) for scan in recording.in_turn(scans.tolist())]
-    levels = levels_of(np.concatenate([look.points for look in looks]))
-    if levels is None or not any(is_sweep(look.points) for look in looks):
+    looks = [sample_hits(recording, scan, R) for scan in recording.in_turn(scans.tolist())]
+    levels = fit_ground_and_ceiling(np.concatenate([look.points for look in looks]))
+    if levels is None or not any(is_3d_sweep(look.points) for look in looks):
         return None
-    places = different(looks, levels)
-    if len(places) < PLACES:
+    places = select_distinct_scans(looks, levels)
+    if len(places) < MIN_SCANS:
         return None
     # places that differ may lie close together, as where a robot turns round in a niche
     evenly = scans[:: max(1, len(scans) // _EVENLY)].tolist()
-    cells = _between(levels, SURFACE)
+    cells = _between(levels, PLANE_MARGIN)
     for some in (places, evenly):
         if cells.any():
             cells &= _always(recording, some, R)
         if cells.any():
             cells &= ~_goes_on(recording, some, R)
     cells = _held(cells)
-    return Body(cells & _between(levels, SURFACE - _EDGE), R) if cells.any() else None
+    return SelfMask(cells & _between(levels, PLANE_MARGIN - _EDGE), R) if cells.any() else None
 
 
 def _held(cells: Bool) -> Bool:
@@ -149,7 +153,7 @@ def _held(cells: Bool) -> Bool:
 
     around = scipy.ndimage.binary_dilation(cells, np.ones((3, 3, 3), np.bool_))
     parts, count = scipy.ndimage.label(around, np.ones((3, 3, 3)))
-    middle = _EDGE * (np.arange(len(cells)) + 0.5) - REACH
+    middle = _EDGE * (np.arange(len(cells)) + 0.5) - BODY_RADIUS
     near = np.hypot(middle[:, None], middle[None, :]) < _HELD
     held = np.zeros(count + 1, np.bool_)
     held[np.unique(parts[near])] = True
@@ -157,9 +161,9 @@ def _held(cells: Bool) -> Bool:
     return np.asarray(held[parts])
 
 
-def _between(levels: Levels, off: float) -> Bool:
+def _between(levels: Planes, off: float) -> Bool:
     """(n, n, n) which cells are so far above the ground and below the ceiling."""
-    middle = _EDGE * (np.arange(round(2 * REACH / _EDGE)) + 0.5) - REACH
+    middle = _EDGE * (np.arange(round(2 * BODY_RADIUS / _EDGE)) + 0.5) - BODY_RADIUS
     x, y, z = np.meshgrid(middle, middle, middle, indexing="ij", sparse=True)
     (a, b, c), (p, q, r) = levels
     return np.asarray((z - (a * x + b * y + c) > off) & (p * x + q * y + r - z > off))
@@ -191,11 +195,11 @@ def _and_beside(cells: Bool, axes: tuple[int, ...]) -> Bool:
 
 def _always(recording: Recording, scans: list[int], R: Float) -> Bool:
     """(n, n, n) cells from which something comes back in nearly all scans."""
-    n = round(2 * REACH / _EDGE)
+    n = round(2 * BODY_RADIUS / _EDGE)
     itself, near = np.zeros((n, n, n), np.int16), np.zeros((n, n, n), np.int16)
     for scan in recording.in_turn(scans):
-        points = _hits(recording, scan, R, REACH)
-        points = points[_within(points, REACH)]
+        points = _hits(recording, scan, R, BODY_RADIUS)
+        points = points[_within(points, BODY_RADIUS)]
         here = np.zeros((n, n, n), np.bool_)
         here[tuple(_cells(points, _EDGE).T)] = True
         itself += here
@@ -205,7 +209,7 @@ def _always(recording: Recording, scans: list[int], R: Float) -> Bool:
 
 def _goes_on(recording: Recording, scans: list[int], R: Float) -> Bool:
     """(n, n, n) cells on a line along an axis on which something goes on beyond the robot."""
-    m, each = round(2 * REACH / _LINE), round(_LINE / _EDGE)
+    m, each = round(2 * BODY_RADIUS / _LINE), round(_LINE / _EDGE)
     ahead, aside = np.zeros((m, m), np.int32), np.zeros((m, m), np.int32)
     for scan in recording.in_turn(scans):
         points = _hits(recording, scan, R, PROFILE_RANGE)
@@ -218,10 +222,10 @@ def _goes_on(recording: Recording, scans: list[int], R: Float) -> Bool:
 
 def _filled(ahead: Float, across: Float) -> Bool:
     """(m, m) where the profile across (n, 2) goes on ahead or behind, beyond the robot."""
-    m, metres = round(2 * REACH / _LINE), round(PROFILE_RANGE - REACH)
-    inside = (np.abs(ahead) >= REACH) & (np.abs(ahead) < PROFILE_RANGE)
-    inside &= (np.abs(across[:, 0]) < REACH) & (np.abs(across[:, 1]) < REACH)
-    at = np.floor(np.abs(ahead[inside]) - REACH).astype(np.intp)
+    m, metres = round(2 * BODY_RADIUS / _LINE), round(PROFILE_RANGE - BODY_RADIUS)
+    inside = (np.abs(ahead) >= BODY_RADIUS) & (np.abs(ahead) < PROFILE_RANGE)
+    inside &= (np.abs(across[:, 0]) < BODY_RADIUS) & (np.abs(across[:, 1]) < BODY_RADIUS)
+    at = np.floor(np.abs(ahead[inside]) - BODY_RADIUS).astype(np.intp)
     filled = np.zeros((2, metres, m, m), np.bool_)
     filled[((ahead[inside] < 0).astype(np.intp), at, *_cells(across[inside], _LINE).T)] = True
     filled = _and_beside(filled, (2, 3))
@@ -230,14 +234,14 @@ def _filled(ahead: Float, across: Float) -> Bool:
 
 def _cells(places: Float, edge: float) -> Index:
     """(n, d) numbers of the cells in which places (n, d) within REACH lie."""
-    last = round(2 * REACH / edge) - 1
-    return np.clip(np.floor((places + REACH) / edge).astype(np.intp), 0, last)
+    last = round(2 * BODY_RADIUS / edge) - 1
+    return np.clip(np.floor((places + BODY_RADIUS) / edge).astype(np.intp), 0, last)
 
 
 def _box(cells: Bool) -> dict[str, Any]:
     """Corners of what is the robot's own, metres."""
     at = np.argwhere(cells)
-    low, high = at.min(axis=0) * _EDGE - REACH, (at.max(axis=0) + 1) * _EDGE - REACH
+    low, high = at.min(axis=0) * _EDGE - BODY_RADIUS, (at.max(axis=0) + 1) * _EDGE - BODY_RADIUS
     return {"low": np.round(low, 3).tolist(), "high": np.round(high, 3).tolist()}
 
 
@@ -254,7 +258,7 @@ _AROUND = 2  # beams beside such ones that graze what they hit
 _BEHIND = 0.1  # m behind it: an edge is measured too far
 
 
-def find_body_2d(ranges: NDArray[np.float32], shortest: float) -> tuple[Part, ...]:
+def find_self_sectors(ranges: NDArray[np.float32], shortest: float) -> tuple[SelfSector, ...]:
     """The beams that end on the robot itself.
 
     Only a robot that moves shows what moves with it: of a laser that stands all beams end in the
@@ -290,7 +294,7 @@ def find_body_2d(ranges: NDArray[np.float32], shortest: float) -> tuple[Part, ..
     )
 
 
-def limits(parts: Any, n: int) -> NDArray[np.float32]:
+def min_ranges(parts: Any, n: int) -> NDArray[np.float32]:
     """(n,) metres: readings below are of the robot itself."""
     out = np.zeros(n, np.float32)
     for first, last, limit in parts:

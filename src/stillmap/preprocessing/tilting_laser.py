@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import beam_ns
+from stillmap.core.timestamps import beam_stamps_ns
 
 Float = NDArray[np.float64]
 
 _BLOCK = 1 << 16  # beams worked on together
 
 
-def tilted(
+def assemble_tilting_laser(
     recording: Recording,
     joint_ns: NDArray[np.int64],
     joint_angle: Float,
@@ -48,10 +48,12 @@ def tilted(
     for first in range(0, recording.n_scans, step):
         scans = slice(first, min(first + step, recording.n_scans))
         beams = slice(int(recording.offset[scans.start]), int(recording.offset[scans.stop]))
-        at = 1e-9 * (beam_ns(recording, scans) - joint_ns[0])
+        at = 1e-9 * (beam_stamps_ns(recording, scans) - joint_ns[0])
         flat = recording.points[beams].astype(np.float64)
         local = flat @ T[:3, :2].T + T[:3, 3]
-        points[beams] = turned(local, np.array(axis), np.interp(at, seconds, joint_angle))
+        points[beams] = rotate_about_axis(
+            local, np.array(axis), np.interp(at, seconds, joint_angle)
+        )
         recording.let_go(points)
     return replace(
         recording,
@@ -63,14 +65,14 @@ def tilted(
     )
 
 
-def turned(points: Float, axis: Float, angle: Float) -> Float:
+def rotate_about_axis(points: Float, axis: Float, angle: Float) -> Float:
     """(n, 3) points turned about an axis (3,) of length one by (n,) rad: Rodrigues' formula."""
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     along = (points @ axis)[:, None] * axis
     return np.asarray(along + c * (points - along) + s * np.cross(axis, points))
 
 
-def sweeps(joint_angle: Float, least: float = 0.02) -> NDArray[np.int64]:
+def sweep_indices(joint_angle: Float, least: float = 0.02) -> NDArray[np.int64]:
     """(T,) which sweep each scan is of: another one begins where the joint turns round.
 
     Args:

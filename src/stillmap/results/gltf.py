@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from stillmap.core.errors import InputError, extra
-from stillmap.core.files import new_file, new_folder, require_regular
+from stillmap.core.errors import InputError, import_extra
+from stillmap.core.files import atomic_file, atomic_folder, require_regular
 from stillmap.mesh.options import TextureOptions
-from stillmap.mesh.texture.atlas import GREY, Textured
+from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]
@@ -48,7 +48,7 @@ class Part(NamedTuple):
     uv: Float
 
 
-def write_glb(path: Path, mesh: Textured | Mesh, options: TextureOptions | None = None) -> None:
+def write_glb(path: Path, mesh: TexturedMesh | Mesh, options: TextureOptions | None = None) -> None:
     """Writes binary glTF: one mesh per page, unlit, so that colours are seen as they were
     photographed, and one of what is grey, lit, as without shades its form is not seen.
 
@@ -102,11 +102,11 @@ def write_glb(path: Path, mesh: Textured | Mesh, options: TextureOptions | None 
         buffer_postprocessor=put_pages,
         tree_postprocessor=finish,
     )
-    with new_file(path) as work:
+    with atomic_file(path) as work:
         work.write_bytes(data)
 
 
-def write_obj(folder: Path, mesh: Textured | Mesh, options: TextureOptions | None = None) -> None:
+def write_obj(folder: Path, mesh: TexturedMesh | Mesh, options: TextureOptions | None = None) -> None:
     """Writes `mesh.obj`, `mesh.mtl` and `page0.jpg`, ... into a new folder; see `write_glb`.
 
     Raises:
@@ -115,13 +115,13 @@ def write_obj(folder: Path, mesh: Textured | Mesh, options: TextureOptions | Non
     """
     _trimesh(folder)  # it is the folder that cannot be written without
     files = obj_files(mesh, options or TextureOptions())
-    with new_folder(folder, "mesh.obj") as work:
+    with atomic_folder(folder, "mesh.obj") as work:
         for name, data in files.items():
             (work / name).write_bytes(data)
 
 
 def obj_files(
-    mesh: Textured | Mesh, options: TextureOptions, name: str = "mesh", before: str = ""
+    mesh: TexturedMesh | Mesh, options: TextureOptions, name: str = "mesh", before: str = ""
 ) -> dict[str, bytes]:
     """`NAME.obj`, `NAME.mtl` and the pages, by their names.
 
@@ -140,7 +140,7 @@ def obj_files(
     scene = trimesh.Scene()
     for part in _parts(mesh):  # the grey one is the last: trimesh counts on uv for all before
         title = _name(part.page)
-        paint = 255 if part.page >= 0 else GREY[0]
+        paint = 255 if part.page >= 0 else GRAY[0]
         material = simple(
             image=_mark(part.page) if part.page >= 0 else None,
             diffuse=[paint, paint, paint, 255],
@@ -165,16 +165,16 @@ def obj_files(
 
 def _trimesh(path: Path) -> Any:
     for name in ("trimesh.exchange.gltf", "trimesh.exchange.obj", "trimesh.visual.material"):
-        extra(name, path, "written", group="mesh")
-    return extra("trimesh", path, "written", group="mesh")
+        import_extra(name, path, "written", group="mesh")
+    return import_extra("trimesh", path, "written", group="mesh")
 
 
-def _parts(mesh: Textured | Mesh) -> list[Part]:
+def _parts(mesh: TexturedMesh | Mesh) -> list[Part]:
     """By page, the grey one last."""
     if not len(mesh):
         raise ValueError("a mesh without faces")
-    uv_of_all = mesh.uv if isinstance(mesh, Textured) else np.zeros((len(mesh.vertices), 2))
-    of_face = mesh.page if isinstance(mesh, Textured) else np.full(len(mesh), -1, np.int32)
+    uv_of_all = mesh.uv if isinstance(mesh, TexturedMesh) else np.zeros((len(mesh.vertices), 2))
+    of_face = mesh.page if isinstance(mesh, TexturedMesh) else np.full(len(mesh), -1, np.int32)
     parts = []
     for page in sorted(np.unique(of_face).tolist(), key=lambda number: (number < 0, number)):
         used, faces = np.unique(mesh.faces[of_face == page], return_inverse=True)
@@ -208,7 +208,7 @@ def _mark(page: int) -> Image.Image:
 
 def _material(trimesh: Any, page: int) -> Any:
     """Of a page, or grey; colours that are no pictures are linear in glTF."""
-    linear = ((GREY[0] / 255.0 + 0.055) / 1.055) ** 2.4
+    linear = ((GRAY[0] / 255.0 + 0.055) / 1.055) ** 2.4
     return trimesh.visual.material.PBRMaterial(
         name=_name(page),
         baseColorTexture=_mark(page) if page >= 0 else None,
@@ -218,11 +218,11 @@ def _material(trimesh: Any, page: int) -> Any:
     )
 
 
-def _compressed(mesh: Textured | Mesh, options: TextureOptions) -> list[Page]:
-    return list(_each_compressed(mesh, options)) if isinstance(mesh, Textured) else []
+def _compressed(mesh: TexturedMesh | Mesh, options: TextureOptions) -> list[Page]:
+    return list(_each_compressed(mesh, options)) if isinstance(mesh, TexturedMesh) else []
 
 
-def _each_compressed(mesh: Textured, options: TextureOptions) -> Iterator[Page]:
+def _each_compressed(mesh: TexturedMesh, options: TextureOptions) -> Iterator[Page]:
     for page in mesh.pages:
         out = io.BytesIO()
         if options.quality:

@@ -11,13 +11,13 @@ from stillmap.io.trajectory import write_tum
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.results.objects import write_objects_of
 from stillmap.results.points import write_beams_of, write_clouds
-from stillmap.results.protocols import TiltingLike
+from stillmap.rig.build import Tilting
 
 FOLDER = "tilting"
 
 
 def write_tilting(
-    folder: Path, tilting: TiltingLike, colours: NDArray[np.uint8] | None = None
+    folder: Path, tilting: Tilting, colours: NDArray[np.uint8] | None = None
 ) -> None:
     """Write `static.ply`, `dynamic.ply` and `tilting/`: labels, poses and what moved, in 3D; with
     the colours (M, 3) of its beams' ends."""
@@ -30,7 +30,7 @@ def write_tilting(
     write_objects_of(inside / "objects", tilting.objects, seen, poses, p_static)
 
 
-def tilting_record(tilting: TiltingLike) -> dict[str, Any]:
+def tilting_record(tilting: Tilting) -> dict[str, Any]:
     """What `run.json` says of it, JSON-able but for arrays."""
     counts = count_beams(tilting.seen, tilting.p_static)
     return {

@@ -15,7 +15,10 @@ from stillmap.core.files import atomic_folder
 from stillmap.core.json import count_skipped, to_jsonable, version
 from stillmap.core.parallel import resolve_threads
 from stillmap.io.trajectory import write_tum
+from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import count_beams
+from stillmap.pipeline.estimate import IterationRecord
+from stillmap.pipeline.result import Result
 from stillmap.results.map_npz import known_area, write_map_npz
 from stillmap.results.map_server import write_map_server
 from stillmap.results.model_protocols import ModelsLike
@@ -23,24 +26,19 @@ from stillmap.results.object_models import models_record, write_models
 from stillmap.results.objects import write_objects, write_traffic
 from stillmap.results.points import write_beams, write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
-from stillmap.results.protocols import (
-    ChangeLike,
-    IterationRecordLike,
-    LoopLike,
-    ResultLike,
-    TiltingLike,
-)
-from stillmap.results.report.model import Stills, stills_of
+from stillmap.results.report.model import ModelPreviews, render_previews
 from stillmap.results.report.page import write_report
 from stillmap.results.rig import FOLDER as TILTING
 from stillmap.results.rig import tilting_record, write_tilting
+from stillmap.rig.build import Tilting
+from stillmap.slam import Closure
 
 FORMAT_VERSION = 1
 
 _MILLIMETRES = 3  # digits
 
 
-def run_record(result: ResultLike, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def run_record(result: Result, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """The content of `run.json` as JSON-able values; numbers that are not finite become None.
 
     `more` are further keys with what they hold.
@@ -68,10 +66,10 @@ def run_record(result: ResultLike, more: Mapping[str, Any] | None = None) -> dic
         "warnings": list(result.warnings),
         "learned": result.learned,
         "doubts": {
-            "odometry_disagrees": result.doubts.disagreeing,
+            "odometry_disagrees": result.doubts.odometry_faults,
             "found_by_wider_search": result.doubts.widened,
             "carried_before": result.doubts.breaks,
-            "beside_the_map_from": result.doubts.apart,
+            "beside_the_map_from": result.doubts.unconnected,
         },
         "changes": [_change(one) for one in result.changes],
         "loops": {
@@ -87,17 +85,17 @@ def run_record(result: ResultLike, more: Mapping[str, Any] | None = None) -> dic
 RECORD = "run.json"  # every result has it
 
 
-def write_run_json(path: Path, result: ResultLike, more: Mapping[str, Any] | None = None) -> None:
+def write_run_json(path: Path, result: Result, more: Mapping[str, Any] | None = None) -> None:
     """Write `run_record` to `path`."""
     text = json.dumps(run_record(result, more), indent=2, ensure_ascii=False, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
 
 
-def _loop(one: LoopLike) -> dict[str, Any]:
+def _loop(one: Closure) -> dict[str, Any]:
     return {"earlier": one.earlier, "later": one.later, "explained": one.explained}
 
 
-def _change(one: ChangeLike) -> dict[str, Any]:
+def _change(one: Change) -> dict[str, Any]:
     return {
         "kind": one.kind,
         "x": round(one.x, _MILLIMETRES),
@@ -112,7 +110,7 @@ def _change(one: ChangeLike) -> dict[str, Any]:
     }
 
 
-def _iteration(it: IterationRecordLike) -> dict[str, Any]:
+def _iteration(it: IterationRecord) -> dict[str, Any]:
     return {
         "number": it.number,
         "bound": it.bound,
@@ -124,12 +122,12 @@ def _iteration(it: IterationRecordLike) -> dict[str, Any]:
 
 
 def save(
-    result: ResultLike,
+    result: Result,
     path: Path,
     overwrite: bool = False,
     *,
     within: Path | None = None,
-    tilting: TiltingLike | None = None,
+    tilting: Tilting | None = None,
     models: ModelsLike | None = None,
 ) -> None:
     """Write `result` as the folder `path`: map, trajectory, pose graph, labels, objects, report.
@@ -173,9 +171,9 @@ def save(
         write_run_json(folder / RECORD, result, more)
 
 
-def _stills(models: ModelsLike, threads: int) -> Stills:
+def _stills(models: ModelsLike, threads: int) -> ModelPreviews:
     """What the report shows of models."""
-    return stills_of(
+    return render_previews(
         models.textured,
         models.unfiltered,
         np.array([view.T_camera_map for view in models.views]).reshape(-1, 4, 4),

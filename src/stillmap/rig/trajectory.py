@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import beam_ns
+from stillmap.core.timestamps import beam_stamps_ns
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -18,7 +18,7 @@ _FASTEST = 100.0  # m/s; what is faster is a leap, no motion
 
 
 @dataclass(frozen=True, eq=False)
-class Ridden:
+class PosedRecording:
     """A recording in 3D on the way that a planar one tells.
 
     Attributes:
@@ -33,7 +33,9 @@ class Ridden:
     left_out: int
 
 
-def poses_at(stamp_ns: Stamps, poses: Float, at_ns: Stamps, pause: float) -> tuple[Float, Bool]:
+def interpolate_poses(
+    stamp_ns: Stamps, poses: Float, at_ns: Stamps, pause: float
+) -> tuple[Float, Bool]:
     """Poses between those of scans: from one to the next the robot went on evenly along an arc.
 
     Args:
@@ -60,7 +62,9 @@ def poses_at(stamp_ns: Stamps, poses: Float, at_ns: Stamps, pause: float) -> tup
     return poses[before] @ se2.exp(share[:, None] * twist), known
 
 
-def ridden(recording: Recording, stamp_ns: Stamps, poses: Float, pause: float) -> Ridden:
+def pose_recording(
+    recording: Recording, stamp_ns: Stamps, poses: Float, pause: float
+) -> PosedRecording:
     """Every beam of a recording at its place, from where the robot was at its time.
 
     Args:
@@ -69,7 +73,7 @@ def ridden(recording: Recording, stamp_ns: Stamps, poses: Float, pause: float) -
         poses: (T, 3, 3) T_map_base of these.
         pause: s between two of them, over which nobody knows where the robot was.
     """
-    at_scan, known = poses_at(stamp_ns, poses, recording.stamp_ns, pause)
+    at_scan, known = interpolate_poses(stamp_ns, poses, recording.stamp_ns, pause)
     points, hit = recording.per_beam(np.float32, (3,)), recording.per_beam(np.bool_)
     left_out, step = 0, max(1, _BLOCK * recording.n_scans // max(recording.n_beams, 1))
     for first in range(0, recording.n_scans, step):
@@ -80,7 +84,7 @@ def ridden(recording: Recording, stamp_ns: Stamps, poses: Float, pause: float) -
         )
         moved, there = recording.points[beams], known[scan]
         if recording.beam_time is not None:
-            T, there = poses_at(stamp_ns, poses, beam_ns(recording, scans), pause)
+            T, there = interpolate_poses(stamp_ns, poses, beam_stamps_ns(recording, scans), pause)
             T_base_sensor = recording.T_base_sensor[recording.sensor[scan]]
             moved = _carried(moved, T_base_sensor, se2.inverse(at_scan[scan]) @ T)
         points[beams] = np.where(there[:, None], moved, np.nan)
@@ -88,10 +92,10 @@ def ridden(recording: Recording, stamp_ns: Stamps, poses: Float, pause: float) -
         left_out += int(np.count_nonzero(~there))
         recording.let_go(points, hit)
     seen = replace(recording, points=points, hit=hit, beam_time=None)
-    return Ridden(seen, lifted(at_scan), left_out)
+    return PosedRecording(seen, lift_poses(at_scan), left_out)
 
 
-def lifted(poses: Float) -> Float:
+def lift_poses(poses: Float) -> Float:
     """(T, 4, 4) upright poses in space at the height zero, of (T, 3, 3) in the plane."""
     out = np.zeros((len(poses), 4, 4))
     out[:, :2, :2], out[:, :2, 3] = poses[:, :2, :2], poses[:, :2, 2]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.arrays import Column
+from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.sim import lidar, ray_casting
 from stillmap.sim.dynamics import Progress
@@ -150,10 +150,13 @@ class _Beams:
 
     def __init__(self, sensor: Sensor, folder: Path | None) -> None:
         self._sensor = sensor
-        self._points = Column(np.float32, (sensor.dimension,), folder)
-        self._hit, self._static = Column(np.bool_, (), folder), Column(np.bool_, (), folder)
-        self._mover = Column(np.int32, (), folder)
-        self._time = Column(np.float32, (), folder) if sensor.takes_time else None
+        self._points = ArrayBuilder(np.float32, (sensor.dimension,), folder)
+        self._hit, self._static = (
+            ArrayBuilder(np.bool_, (), folder),
+            ArrayBuilder(np.bool_, (), folder),
+        )
+        self._mover = ArrayBuilder(np.int32, (), folder)
+        self._time = ArrayBuilder(np.float32, (), folder) if sensor.takes_time else None
         self._offset = [0]
 
     def add(self, exact: Echoes, pattern: Pattern, rng: np.random.Generator) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import open_npy, write_npy, write_npz
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
-from stillmap.io.images import read_picture, write_picture
+from stillmap.io.images import read_image, write_png
 from stillmap.sim.camera import Photographs
 from stillmap.sim.geometry import Faces, Ground, Solids
 from stillmap.sim.recorder import World
@@ -104,9 +104,9 @@ def writing_truth(photographs: Photographs, folder: Path) -> Images:
 
     def load(image: int) -> NDArray[np.uint8]:
         one = photographs.take(image)
-        write_picture(one.mask, inside / f"{image:06d}.png")
+        write_png(one.mask, inside / f"{image:06d}.png")
         near = np.where(one.distance < _FARTHEST, one.distance, 0.0)
-        write_picture(np.rint(1e3 * near).astype(np.uint16), inside / _distance(image))
+        write_png(np.rint(1e3 * near).astype(np.uint16), inside / _distance(image))
         return one.colour
 
     images = photographs.images
@@ -141,10 +141,10 @@ def load_picture_truth(path: str | Path) -> PictureTruth:
     inside = folder / _IMAGES
 
     def mask(image: int) -> NDArray[np.uint16]:
-        return read_picture(inside / f"{image:06d}.png")
+        return read_image(inside / f"{image:06d}.png")
 
     def distance(image: int) -> NDArray[np.float32]:
-        metres = read_picture(inside / _distance(image)).astype(np.float32) / 1e3
+        metres = read_image(inside / _distance(image)).astype(np.float32) / 1e3
         return np.where(metres > 0.0, metres, np.float32(np.inf))
 
     return PictureTruth(seed, standing, moving, T_world_camera, mask, distance)

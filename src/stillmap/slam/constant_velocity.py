@@ -35,13 +35,13 @@ class State:
     covariance: Float
 
 
-def at_first(twist: Float, speed: float, turn: float) -> State:
+def initial_state(twist: Float, speed: float, turn: float) -> State:
     """The first pose is the origin; its twist (6,) is known to m/s and rad/s."""
     sigma = np.array([_HELD] * 6 + [speed] * 3 + [turn] * 3)
     return State(np.eye(4), twist, np.diag(sigma**2))
 
 
-def predicted(state: State, seconds: float, acceleration: float, turn: float) -> State:
+def predict(state: State, seconds: float, acceleration: float, turn: float) -> State:
     """The state that many seconds later, if nothing but noise accelerates it.
 
     White acceleration (m/s^2, rad/s^2: how much the twist changes in one step, per second) makes
@@ -56,10 +56,12 @@ def predicted(state: State, seconds: float, acceleration: float, turn: float) ->
     a2 = np.diag(np.square([acceleration] * 3 + [turn] * 3))
     Q = np.block([[a2 * dt**4 / 3, a2 * dt**3 / 2], [a2 * dt**3 / 2, a2 * dt**2]])
     P = F @ state.covariance @ F.T + Q
-    return State(se3.normalised(state.T_map_base @ step), state.twist, P)
+    return State(se3.normalize(state.T_map_base @ step), state.twist, P)
 
 
-def told(state: State, increment: Float, seconds: float, options: MotionOptions) -> State:
+def update_with_odometry(
+    state: State, increment: Float, seconds: float, options: MotionOptions
+) -> State:
     """What odometry makes of the twist before a step: a Kalman update, gated.
 
     Args:
@@ -70,7 +72,7 @@ def told(state: State, increment: Float, seconds: float, options: MotionOptions)
     """
     dt = max(seconds, _LEAST)
     moved = se3.log(increment)
-    sigmas = motion_model.sigmas(
+    sigmas = motion_model.odometry_std(
         float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])), options
     )
     R = np.diag(np.square(np.repeat(sigmas, 3) / dt))
@@ -81,5 +83,5 @@ def told(state: State, increment: Float, seconds: float, options: MotionOptions)
         return state
     K = np.linalg.solve(S, P[6:]).T
     d = K @ innovation
-    T = se3.normalised(state.T_map_base @ se3.exp(d[:6]))
+    T = se3.normalize(state.T_map_base @ se3.exp(d[:6]))
     return State(T, state.twist + d[6:], P - K @ P[6:])

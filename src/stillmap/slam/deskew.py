@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core import se2, se3
-from stillmap.core.arrays import blocks, finite
-from stillmap.core.parallel import in_order
+from stillmap.core.arrays import finite_rows, iter_blocks
+from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model
 from stillmap.slam.odometry_2d import SlamOptions
@@ -17,12 +17,12 @@ Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _KNOWN = 0.5  # of the time that a scan takes: over less, poses tell of their own errors
-FASTEST_TURN = 12.0  # rad/s; what is faster is a leap, no motion
-FASTEST = 100.0  # m/s, likewise
+MAX_TURN_RATE = 12.0  # rad/s; what is faster is a leap, no motion
+MAX_SPEED = 100.0  # m/s, likewise
 _BLOCK = 1 << 14  # beams worked on together
 
 
-def deskewed(
+def deskew_recording(
     recording: Recording, poses: Float | None, options: SlamOptions, threads: int = 1
 ) -> Recording:
     """The recording as if every scan had been taken at once, at its stamp.
@@ -72,7 +72,7 @@ def _in_space(
         beams = recording.beams_of(t)
         T = recording.T_base_sensor[recording.sensor[t]]
         in_base = recording.points[beams] @ T[:3, :3].T + T[:3, 3]
-        usable = np.flatnonzero(finite(in_base))
+        usable = np.flatnonzero(finite_rows(in_base))
         carried = _core.carried(
             in_base.take(usable, axis=0).astype(np.float32), times[beams].take(usable), twists[t]
         )
@@ -81,7 +81,7 @@ def _in_space(
         return out
 
     in_turn = recording.in_turn(range(recording.n_scans), points)
-    for t, found in enumerate(in_order(of_scan, in_turn, threads)):
+    for t, found in enumerate(map_ordered(of_scan, in_turn, threads)):
         points[recording.beams_of(t)] = found
     return replace(recording, points=points, beam_time=None)
 
@@ -93,15 +93,15 @@ def _twists_in_space(stamp_ns: NDArray[np.int64], poses: Float) -> Float:
         return np.zeros((len(poses), 6))
     moved = se3.log(se2.inverse(poses[:-1]) @ poses[1:])
     twists = moved / np.where(seconds > 0.0, seconds, np.inf)[:, None]
-    leaps = np.linalg.norm(twists[:, :3], axis=1) > FASTEST
-    leaps |= np.linalg.norm(twists[:, 3:], axis=1) > FASTEST_TURN
+    leaps = np.linalg.norm(twists[:, :3], axis=1) > MAX_SPEED
+    leaps |= np.linalg.norm(twists[:, 3:], axis=1) > MAX_TURN_RATE
     twists[leaps] = 0.0
     return np.concatenate([twists, twists[-1:]])
 
 
 def _span(times: NDArray[np.float32]) -> tuple[float, float]:
     """Seconds after the stamp of the last beam of all, and before it of the first."""
-    parts = [(float(times[b].max()), -float(times[b].min())) for b in blocks(times)]
+    parts = [(float(times[b].max()), -float(times[b].min())) for b in iter_blocks(times)]
     longest, earliest = zip(*parts, strict=True)
     return max(longest), max(earliest)
 
@@ -145,7 +145,7 @@ def _twists(recording: Recording, poses: Float, first: Index, second: Index) -> 
     seconds = 1e-9 * (recording.stamp_ns[second] - recording.stamp_ns[first])
     moved = se2.log(se2.inverse(poses[first]) @ poses[second])
     twists = moved / np.where(seconds > 0.0, seconds, np.inf)[:, None]
-    twists[_leaps(poses, first, second) | (np.abs(twists[:, 2]) > FASTEST_TURN)] = 0.0
+    twists[_leaps(poses, first, second) | (np.abs(twists[:, 2]) > MAX_TURN_RATE)] = 0.0
     vx, vy, turn = _steadied(twists).T
     # off the centre of a robot that turns, a sensor goes along with the turn
     x, y, theta = se2.parameters(recording.T_base_sensor[recording.sensor]).T
@@ -156,7 +156,7 @@ def _twists(recording: Recording, poses: Float, first: Index, second: Index) -> 
 
 def _leaps(poses: Float, first: Index, second: Index) -> NDArray[np.bool_]:
     """(T,) whether there is a step between two scans that no robot goes."""
-    steps = motion_model.odometry_steps(poses)
+    steps = motion_model.compute_odometry_steps(poses)
     implausible = np.zeros(0, np.bool_) if steps is None else ~steps.plausible
     so_far = np.concatenate([[0], np.cumsum(implausible)])
     return np.asarray(so_far[second] > so_far[first])
@@ -178,7 +178,7 @@ def _carried(points: NDArray[np.float32], log_T: Float) -> NDArray[np.float32]:
     dx, dy, angle = log_T
     half = 0.5 * angle
     c, s = np.cos(half), np.sin(half)
-    chord = se2.sine_over_angle(half, s)
+    chord = se2.sinc(half, s)
     x, y = points.T.astype(np.float64)
     turned_c, turned_s = 1.0 - 2.0 * s * s, 2.0 * s * c
     out = np.empty_like(points)

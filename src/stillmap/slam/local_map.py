@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2, se3
 from stillmap.core.recording import Recording
-from stillmap.slam.scan_matching import SurfaceOptions, put
+from stillmap.slam.scan_matching import SurfaceOptions, add_scan
 
 Float = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ class LocalMap:
         """Scan t at a pose (3, 3), unless the last one of its sensor shows the same."""
         if not self._is_apart(t, T_map_base):
             return
-        put(self.grid, self._recording, self._e, t, T_map_base, self._surface)
+        add_scan(self.grid, self._recording, self._e, t, T_map_base, self._surface)
         self._kept.append((t, T_map_base, travelled))
 
     def has(self, sensor: int) -> bool:
@@ -59,13 +59,15 @@ class LocalMap:
         """Takes out what was seen before the robot had come that many metres."""
         while self._kept and self._kept[0][2] < travelled:
             t, T_map_base, _ = self._kept.popleft()
-            put(self.grid, self._recording, self._e, t, T_map_base, self._surface, remove=True)
+            add_scan(self.grid, self._recording, self._e, t, T_map_base, self._surface, remove=True)
 
     def forget_since(self, t: int) -> None:
         """Takes out scan t and what came after it."""
         while self._kept and self._kept[-1][0] >= t:
             last, T_map_base, _ = self._kept.pop()
-            put(self.grid, self._recording, self._e, last, T_map_base, self._surface, remove=True)
+            add_scan(
+                self.grid, self._recording, self._e, last, T_map_base, self._surface, remove=True
+            )
 
     def _is_apart(self, t: int, T_map_base: Float) -> bool:
         kept = self._last_of(self._recording.sensor[t])
@@ -83,13 +85,15 @@ class LocalMap:
         return next(of_sensor, None)
 
 
-def travel(poses: Float) -> Float:
+def travelled_distance(poses: Float) -> Float:
     """(T,) metres travelled up to each of the poses (T, D+1, D+1)."""
     steps = np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)
     return np.concatenate([[0.0], steps.cumsum()])
 
 
-def chosen(poses: Float, distance: float, turn: float, breaks: Sequence[int] = ()) -> Index:
+def select_keyframes(
+    poses: Float, distance: float, turn: float, breaks: Sequence[int] = ()
+) -> Index:
     """(K,) indices of scans about `distance` metres or `turn` radians apart.
 
     The first and the last one are among them, and those before and after each of the breaks.
@@ -116,17 +120,17 @@ def _turns(poses: Float) -> Float:
     return turns
 
 
-def chosen_of_each(
+def select_keyframes_per_sensor(
     poses: Float, sensor: NDArray[np.integer], distance: float, turn: float
 ) -> Index:
     """(K,) indices of scans chosen from those of each sensor (T,): each may see its own side."""
     of_each = [np.flatnonzero(sensor == s) for s in np.unique(sensor)]
     return np.sort(
-        np.concatenate([scans[chosen(poses[scans], distance, turn)] for scans in of_each])
+        np.concatenate([scans[select_keyframes(poses[scans], distance, turn)] for scans in of_each])
     )
 
 
-def spread(poses: Float, keyframes: Index, moved: Float) -> Float:
+def propagate_corrections(poses: Float, keyframes: Index, moved: Float) -> Float:
     """(T, D+1, D+1) all poses when the keyframes among them moved to (K, D+1, D+1).
 
     A scan between two keyframes is carried along by both; how far it is from each, in travel and
@@ -134,7 +138,7 @@ def spread(poses: Float, keyframes: Index, moved: Float) -> Float:
     """
     if len(keyframes) < 2:
         return poses
-    at = travel(poses) + 1e-6 * np.arange(len(poses))
+    at = travelled_distance(poses) + 1e-6 * np.arange(len(poses))
     right = np.clip(np.searchsorted(keyframes, np.arange(len(poses))), 1, len(keyframes) - 1)
     left = right - 1
     span = at[keyframes[right]] - at[keyframes[left]]
@@ -142,7 +146,7 @@ def spread(poses: Float, keyframes: Index, moved: Float) -> Float:
     correction = moved @ se2.inverse(poses[keyframes])
     one, other = correction[left] @ poses, correction[right] @ poses
     if poses.shape[-1] == 4:
-        return se3.normalised(one @ se3.exp(share * se3.log(se2.inverse(one) @ other)))
+        return se3.normalize(one @ se3.exp(share * se3.log(se2.inverse(one) @ other)))
     x = se2.parameters(one)
     difference = se2.parameters(other) - x
     difference[:, 2] = se2.wrap(difference[:, 2])

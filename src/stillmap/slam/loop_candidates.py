@@ -12,15 +12,22 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model
-from stillmap.slam.loop_types import Candidate, Closure, LoopOptions, Track, drift, refuse
+from stillmap.slam.loop_types import (
+    LoopCandidate,
+    LoopClosure,
+    LoopContext,
+    LoopOptions,
+    drift,
+    refuse,
+)
 from stillmap.slam.motion_model import MotionOptions
-from stillmap.slam.pose_graph import Relation
-from stillmap.slam.scan_matching import hits
+from stillmap.slam.pose_graph import Constraint
+from stillmap.slam.scan_matching import select_hits
 
 Float = NDArray[np.float64]
 
 
-def stages(track: Track) -> Iterator[tuple[int, int]]:
+def split_stages(track: LoopContext) -> Iterator[tuple[int, int]]:
     """Ranges first, last of keyframes: each a stage of travel, later ones longer."""
     options, travelled = track.options, track.travelled[track.keyframes]
     first = 0
@@ -32,7 +39,7 @@ def stages(track: Track) -> Iterator[tuple[int, int]]:
         first = last
 
 
-def metres_to(track: Track, k: int, ties: list[Closure]) -> Float:
+def graph_distances(track: LoopContext, k: int, ties: list[LoopClosure]) -> Float:
     """(k + 1,) metres of drift between the keyframes up to k and keyframe k.
 
     The shortest way through the graph: along the chain, or through a closure, which counts as the
@@ -56,27 +63,27 @@ def metres_to(track: Track, k: int, ties: list[Closure]) -> Float:
     return metres
 
 
-def _counted(ties: list[Closure], options: LoopOptions) -> Float:
+def _counted(ties: list[LoopClosure], options: LoopOptions) -> Float:
     """(L,) metres of drift that closures count as."""
     covariance = np.array([closure.covariance[:2, :2] for closure in ties])
     sigma: Float = np.sqrt(np.linalg.eigvalsh(covariance)[:, 1])
     return sigma / max(options.drift_translation, 1e-9)
 
 
-def looks(track: Track) -> Float:
+def view_centers(track: LoopContext) -> Float:
     """(K, 2) where the keyframes look: the mean of what each saw, in its frame."""
     out = np.zeros((len(track.keyframes), 2))
     keyframes = track.recording.in_turn(track.keyframes.tolist(), track.e)
     for k, t in enumerate(keyframes):
-        scan = hits(track.recording, track.e, t)
+        scan = select_hits(track.recording, track.e, t)
         if scan.weights.sum() > 0.0:
             out[k] = np.average(scan.points, axis=0, weights=scan.weights)
     return out
 
 
-def of_stage(
-    track: Track, poses: Float, looks: Float, first: int, last: int, ties: list[Closure]
-) -> Iterator[Candidate]:
+def propose_candidates(
+    track: LoopContext, poses: Float, looks: Float, first: int, last: int, ties: list[LoopClosure]
+) -> Iterator[LoopCandidate]:
     """Keyframes of a stage with the nearest of much earlier travel, where that lies within reach.
 
     If it does not, with the one that looked nearest to where it looks: who comes back on the other
@@ -91,7 +98,7 @@ def of_stage(
     """
     options, frames = track.options, track.keyframes
     x, travelled = se2.parameters(poses), track.travelled[frames]
-    metres = metres_to(track, first, ties)
+    metres = graph_distances(track, first, ties)
     looked_at = np.einsum("kij,kj->ki", poses[:, :2, :2], looks) + poses[:, :2, 2]
     for k in range(first, last):
         n = int(np.searchsorted(travelled, travelled[k] - options.gap))
@@ -108,7 +115,7 @@ def of_stage(
                 way = min(way, travelled[k] - travelled[first] + metres[i])
             if metres_off[i] < options.reach + drift(way, options)[0]:
                 T = se2.inverse(poses[i]) @ poses[k]
-                yield Candidate(int(frames[i]), int(frames[k]), T, float(way))
+                yield LoopCandidate(int(frames[i]), int(frames[k]), T, float(way))
                 break
 
 
@@ -119,7 +126,9 @@ _ANYWHERE = [1e3, 1e3, 10.0]  # m, m, rad: a step that nobody saw
 _LEAP = 3.0  # standard deviations of the motion prior beyond which an increment is a leap
 
 
-def relations(track: Track, options: MotionOptions, breaks: list[int]) -> list[Relation]:
+def odometry_constraints(
+    track: LoopContext, options: MotionOptions, breaks: list[int]
+) -> list[Constraint]:
     """Relations between successive keyframes, indices into the keyframes.
 
     Their covariances allow for drift, half as much across as along the way. Where odometry
@@ -135,10 +144,10 @@ def relations(track: Track, options: MotionOptions, breaks: list[int]) -> list[R
         for t in range(i + 1, j + 1):
             if leaps[t].any():
                 to_j = se2.inverse(poses[j]) @ poses[t]
-                covariance += se2.turned(np.outer(leaps[t], leaps[t]), to_j)
+                covariance += se2.rotate_covariance(np.outer(leaps[t], leaps[t]), to_j)
         if j in breaks:
             covariance = np.diag(np.square(_ANYWHERE))
-        chain.append(Relation(k, k + 1, T, covariance))
+        chain.append(Constraint(k, k + 1, T, covariance))
     return chain
 
 
@@ -158,14 +167,16 @@ def _leaps(recording: Recording, poses: Float, options: MotionOptions) -> Float:
     found = se2.inverse(poses[:-1]) @ poses[1:]
     difference = se2.parameters(se2.inverse(increments) @ found)
     for t, (increment, d) in enumerate(zip(increments, difference, strict=True), start=1):
-        prior = motion_model.from_odometry(np.eye(3), increment, options)
+        prior = motion_model.odometry_prior(np.eye(3), increment, options)
         sigma = np.array([prior.sigma_translation] * 2 + [prior.sigma_rotation])
         if np.linalg.norm(d / sigma) > _LEAP:
             leaps[t] = d
     return leaps
 
 
-def agreeing(track: Track, chain: list[Relation], found: list[Closure]) -> list[Closure]:
+def reject_inconsistent(
+    track: LoopContext, chain: list[Constraint], found: list[LoopClosure]
+) -> list[LoopClosure]:
     """Refuses closures whose correction the ones nearby do not ask for.
 
     Nearby: within four keyframes of travel on the later side, eight on the earlier one. At least
@@ -188,9 +199,13 @@ def agreeing(track: Track, chain: list[Relation], found: list[Closure]) -> list[
     return out
 
 
-def agreeing_since(
-    track: Track, chain: list[Relation], attempted: list[Closure], decided: list[Closure], k: int
-) -> list[Closure]:
+def reject_inconsistent_since(
+    track: LoopContext,
+    chain: list[Constraint],
+    attempted: list[LoopClosure],
+    decided: list[LoopClosure],
+    k: int,
+) -> list[LoopClosure]:
     """What `agreeing` makes of all attempts, when those from keyframe k on are new.
 
     Args:
@@ -203,19 +218,19 @@ def agreeing_since(
     near = _NEAR[1] * track.options.distance
     new, heard = np.searchsorted(later, track.travelled[track.keyframes[k]] - [near, 2 * near])
     # their votes reach back one neighbourhood, and what is there hears one more
-    return decided[:new] + agreeing(track, chain, attempted[heard:])[new - heard :]
+    return decided[:new] + reject_inconsistent(track, chain, attempted[heard:])[new - heard :]
 
 
-def _drifted(track: Track, chain: list[Relation]) -> Float:
+def _drifted(track: LoopContext, chain: list[Constraint]) -> Float:
     """(K, 3, 3) covariance that the steps to each keyframe add up to, along the axes of the map."""
     poses = track.poses[track.keyframes[1:]]
     steps = np.array([relation.covariance for relation in chain]).reshape(-1, 3, 3)
     out = np.zeros((len(track.keyframes), 3, 3))
-    np.cumsum(se2.turned(steps, poses), axis=0, out=out[1:])
+    np.cumsum(se2.rotate_covariance(steps, poses), axis=0, out=out[1:])
     return out
 
 
-def _agree(track: Track, drifted: Float, a: Closure, b: Closure) -> bool:
+def _agree(track: LoopContext, drifted: Float, a: LoopClosure, b: LoopClosure) -> bool:
     """Whether two closures put their later scans where the way between them allows."""
     a, b = (a, b) if a.later <= b.later else (b, a)
     P = track.poses
@@ -224,6 +239,6 @@ def _agree(track: Track, drifted: Float, a: Closure, b: Closure) -> bool:
     d = se2.parameters(se2.inverse(predicted) @ P[b.earlier] @ b.T)
     back = se2.inverse(P[b.later])
     i, j = np.searchsorted(track.keyframes, [a.later, b.later])
-    between = se2.turned(a.covariance, P[a.later]) + drifted[j] - drifted[i]
-    covariance = b.covariance + se2.turned(between, back)
+    between = se2.rotate_covariance(a.covariance, P[a.later]) + drifted[j] - drifted[i]
+    covariance = b.covariance + se2.rotate_covariance(between, back)
     return float(d @ np.linalg.solve(covariance, d)) < 9.0

@@ -9,9 +9,16 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.slam import motion_model, scan_matching
-from stillmap.slam.local_map import chosen_of_each
-from stillmap.slam.loop_types import Candidate, Closure, Track, drift
-from stillmap.slam.scan_matching import Points, RegistrationOptions, Scan, hits, in_frame, put
+from stillmap.slam.local_map import select_keyframes_per_sensor
+from stillmap.slam.loop_types import LoopCandidate, LoopClosure, LoopContext, drift
+from stillmap.slam.scan_matching import (
+    Points,
+    RegistrationOptions,
+    Scan,
+    add_scan,
+    select_hits,
+    transform_points,
+)
 
 Float = NDArray[np.float64]
 
@@ -24,34 +31,36 @@ _SHIFTS = (-0.6, -0.3, 0.3, 0.6)
 _ROUNDS, _SAME = 3, 0.05
 
 
-def attempts(track: Track, candidates: Iterable[Candidate]) -> list[Closure]:
+def verify_candidates(track: LoopContext, candidates: Iterable[LoopCandidate]) -> list[LoopClosure]:
     """Every candidate laid on the map of an earlier stretch; ordered by the later scan."""
-    of_stretch: dict[int, list[Candidate]] = {}
+    of_stretch: dict[int, list[LoopCandidate]] = {}
     for candidate in candidates:
         stretch = round(track.travelled[candidate.earlier] / track.options.stretch)
         of_stretch.setdefault(stretch, []).append(candidate)
     found = []
     for stretch, those in sorted(of_stretch.items()):
-        grid = local_map(track, stretch * track.options.stretch)
+        grid = build_submap(track, stretch * track.options.stretch)
         for candidate in those:
-            found.append(laid_on(track, grid, candidate, *drift(candidate.metres, track.options)))
+            found.append(
+                verify_candidate(track, grid, candidate, *drift(candidate.metres, track.options))
+            )
         track.recording.let_go(track.e)
     return sorted(found, key=lambda closure: closure.later)
 
 
-def local_map(track: Track, centre: float) -> _core.Grid2D:
+def build_submap(track: LoopContext, centre: float) -> _core.Grid2D:
     """Scans of one stretch of travel, and no others."""
     half = track.options.stretch
     first, last = np.searchsorted(track.travelled, [centre - half, centre + half])
     grid = _core.Grid2D(track.resolution, track.registration.approach)
     spacing = _DENSE * track.options.distance, _DENSE * track.options.turn
     sensor = track.recording.sensor[first:last]
-    for t in first + chosen_of_each(track.poses[first:last], sensor, *spacing):
-        put(grid, track.recording, track.e, t, track.poses[t], track.surface)
+    for t in first + select_keyframes_per_sensor(track.poses[first:last], sensor, *spacing):
+        add_scan(grid, track.recording, track.e, t, track.poses[t], track.surface)
     return grid
 
 
-def _view(track: Track, t: int) -> tuple[Scan, Points]:
+def _view(track: LoopContext, t: int) -> tuple[Scan, Points]:
     """What a keyframe and a scan to either side see, in its frame; and where beams were before.
 
     The latter are (N, 2): `LoopOptions.before` metres before their ends, or half way if that is
@@ -61,18 +70,19 @@ def _view(track: Track, t: int) -> tuple[Scan, Points]:
     first, last = np.searchsorted(track.travelled, [here - half, here + half], side="right")
     last = max(last - 1, t)
     shown = sorted({min(first, t), t, last})
-    seen = [hits(track.recording, track.e, s) for s in shown]
+    seen = [select_hits(track.recording, track.e, s) for s in shown]
     to_t = se2.inverse(track.poses[t]) @ track.poses[shown]
-    points = [in_frame(scan.points, T) for scan, T in zip(seen, to_t, strict=True)]
+    points = [transform_points(scan.points, T) for scan, T in zip(seen, to_t, strict=True)]
     before = [
-        in_frame(_before(scan, track.options.before), T) for scan, T in zip(seen, to_t, strict=True)
+        transform_points(_points_before_ends(scan, track.options.before), T)
+        for scan, T in zip(seen, to_t, strict=True)
     ]
     weights = np.concatenate([scan.weights for scan in seen])
     view = Scan(np.concatenate(points), weights, track.recording.T_base_sensor[0])
     return view, np.concatenate(before)
 
 
-def _before(scan: Scan, metres: float) -> Points:
+def _points_before_ends(scan: Scan, metres: float) -> Points:
     """(N, 2) where the beams of a scan were so far before their ends, in its frame."""
     origin = scan.T_base_sensor[:2, 2].astype(np.float32)
     beams = scan.points - origin
@@ -87,16 +97,20 @@ def _comparable(grid: _core.Grid2D, view: Scan, before: Points, T: Float) -> tup
     The rest says nothing of whether the view fits, and draws it astray: the back of a wall is not
     its front.
     """
-    cells = np.floor(in_frame(before, T) / grid.resolution).astype(np.int64)
+    cells = np.floor(transform_points(before, T) / grid.resolution).astype(np.int64)
     looked_at = grid.alpha_beta(cells).sum(axis=1) > 0.0
     part = np.where(looked_at, view.weights, np.float32(0.0))
     share = float(part.sum()) / max(float(view.weights.sum()), 1e-9)
     return dataclasses.replace(view, weights=part), share
 
 
-def laid_on(
-    track: Track, grid: _core.Grid2D, candidate: Candidate, sigma: float, sigma_turn: float
-) -> Closure:
+def verify_candidate(
+    track: LoopContext,
+    grid: _core.Grid2D,
+    candidate: LoopCandidate,
+    sigma: float,
+    sigma_turn: float,
+) -> LoopClosure:
     """The later view registered on the earlier map, as widely as it may have drifted.
 
     Args:
@@ -106,12 +120,12 @@ def laid_on(
         sigma, sigma_turn: standard deviations of that, in metres and radians.
     """
     options, earlier, later = track.options, candidate.earlier, candidate.later
-    prior = motion_model.guess_at(track.poses[earlier] @ candidate.T, sigma, sigma_turn)
+    prior = motion_model.gaussian_prior(track.poses[earlier] @ candidate.T, sigma, sigma_turn)
     view, before = _view(track, later)
     window = options.window * sigma, min(options.window * sigma_turn, np.pi)
     part, share = _comparable(grid, view, before, prior.T_map_base)
     for _ in range(_ROUNDS):
-        found = scan_matching.search(grid, part, prior, track.registration, *window)
+        found = scan_matching.search_pose(grid, part, prior, track.registration, *window)
         here, share = _comparable(grid, view, before, found.T_map_base)
         if np.abs(here.weights - part.weights).sum() < _SAME * view.weights.sum():
             break
@@ -125,18 +139,18 @@ def laid_on(
         # what the graph knows of the place is no second witness: the whole way bounds it here
         free = drift(track.travelled[later] - track.travelled[earlier], options)[0]
         covariance += _sliding(grid, part, found.T_map_base, covariance, free, track.registration)
-        covariance += _ambiguous(found.rivals)
-    return Closure(
+        covariance += _ambiguity_covariance(found.rivals)
+    return LoopClosure(
         earlier,
         later,
         se2.inverse(track.poses[earlier]) @ found.T_map_base,
-        se2.turned(covariance, se2.inverse(found.T_map_base)),
+        se2.rotate_covariance(covariance, se2.inverse(found.T_map_base)),
         found.explained,
         "explains too little" if too_little else "",
     )
 
 
-def _ambiguous(rivals: Float) -> Float:
+def _ambiguity_covariance(rivals: Float) -> Float:
     """Covariance (3, 3) to add where the view fits somewhere else about as well.
 
     That of a mixture about its best part, each part being as probable as its cost says.
@@ -172,7 +186,7 @@ def _sliding(
             view.weights,
             moved,
             sigma=options.sigma,
-            radius=scan_matching.radius(options, grid.resolution),
+            radius=scan_matching.field_radius(options, grid.resolution),
             floor=options.floor,
             unknown=options.unknown,
         )

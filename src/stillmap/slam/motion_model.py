@@ -79,7 +79,7 @@ class MotionPrior:
         return 0.5 * float(d @ self.information @ d)
 
 
-def sigmas(distance: float, turn: float, options: MotionOptions) -> tuple[float, float]:
+def odometry_std(distance: float, turn: float, options: MotionOptions) -> tuple[float, float]:
     """Standard deviations in metres and radians of an increment of so many metres and radians."""
     sigma_xy = (
         options.translation_floor
@@ -94,15 +94,15 @@ def sigmas(distance: float, turn: float, options: MotionOptions) -> tuple[float,
     return sigma_xy, sigma_theta
 
 
-def from_odometry(T_map_base: Float, increment: Float, options: MotionOptions) -> MotionPrior:
+def odometry_prior(T_map_base: Float, increment: Float, options: MotionOptions) -> MotionPrior:
     """The prior after moving by an odometry increment (3, 3) from a pose (3, 3)."""
     x, y, theta = se2.parameters(increment)
-    sigma_xy, sigma_theta = sigmas(float(np.hypot(x, y)), abs(float(theta)), options)
+    sigma_xy, sigma_theta = odometry_std(float(np.hypot(x, y)), abs(float(theta)), options)
     return _prior(T_map_base @ increment, sigma_xy, sigma_theta, measured=True)
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
+class OdometrySteps:
     """What odometry says of the way from each scan to the next.
 
     Attributes:
@@ -115,18 +115,18 @@ class Steps:
     plausible: NDArray[np.bool_]
 
 
-def odometry_steps(T_odom_base: Float | None) -> Steps | None:
+def compute_odometry_steps(T_odom_base: Float | None) -> OdometrySteps | None:
     """The steps of poses (T, 3, 3); None where there is no odometry."""
     if T_odom_base is None:
         return None
     increments = se2.inverse(T_odom_base[:-1]) @ T_odom_base[1:]
     metres = np.linalg.norm(increments[:, :2, 2], axis=1)
     usual = float(np.quantile(metres, 0.95)) if len(metres) else 0.0
-    return Steps(increments, metres <= max(_LEAST_LEAP, _FARTHER * usual))
+    return OdometrySteps(increments, metres <= max(_LEAST_LEAP, _FARTHER * usual))
 
 
 @dataclass(frozen=True)
-class Steadiness:
+class VelocityNoise:
     """How far guesses without odometry were off of late.
 
     Attributes:
@@ -137,7 +137,7 @@ class Steadiness:
     translation: float
     rotation: float
 
-    def after(self, d: Float, seconds: float, options: MotionOptions) -> "Steadiness":
+    def after(self, d: Float, seconds: float, options: MotionOptions) -> "VelocityNoise":
         """What is known of it once a guess was off by (3,) metres, metres, radians.
 
         Args:
@@ -148,7 +148,7 @@ class Steadiness:
         kept, new = 1.0 - options.steady_rate, options.steady_rate
         translation = np.sqrt(kept * self.translation**2 + new * 0.5 * (d[0] ** 2 + d[1] ** 2))
         rotation = np.sqrt(kept * self.rotation**2 + new * d[2] ** 2)
-        return Steadiness(
+        return VelocityNoise(
             max(float(translation), _unannounced(options.acceleration, seconds, options)),
             max(float(rotation), _unannounced(options.turn_acceleration, seconds, options)),
         )
@@ -158,13 +158,13 @@ def _unannounced(acceleration: float, seconds: float, options: MotionOptions) ->
     return min(max(0.5 * acceleration * seconds**2, options.translation_floor), options.unannounced)
 
 
-def unknown_steadiness(options: MotionOptions) -> Steadiness:
+def unknown_steadiness(options: MotionOptions) -> VelocityNoise:
     """Before anything moved."""
-    return Steadiness(options.without_odometry_translation, options.without_odometry_rotation)
+    return VelocityNoise(options.without_odometry_translation, options.without_odometry_rotation)
 
 
-def from_constant_velocity(
-    T_map_base: Float, T_map_base_before: Float, steadiness: Steadiness
+def constant_velocity_prior(
+    T_map_base: Float, T_map_base_before: Float, steadiness: VelocityNoise
 ) -> MotionPrior:
     """The prior without odometry: the last motion once more."""
     # not by BLAS, whose rounding is another one on other processors: along a corridor without ends
@@ -174,21 +174,23 @@ def from_constant_velocity(
     return _prior(mean, steadiness.translation, steadiness.rotation)
 
 
-def from_increment(
+def increment_prior(
     T_map_base: Float, increment: Float, options: MotionOptions, is_odometry: bool
 ) -> MotionPrior:
     """The prior one known or guessed increment (3, 3) from a pose (3, 3)."""
     if is_odometry:
-        return from_odometry(T_map_base, increment, options)
+        return odometry_prior(T_map_base, increment, options)
     return _prior(T_map_base @ increment, options.translation_floor, options.rotation_floor)
 
 
-def guess_at(T_map_base: Float, sigma_translation: float, sigma_rotation: float) -> MotionPrior:
+def gaussian_prior(
+    T_map_base: Float, sigma_translation: float, sigma_rotation: float
+) -> MotionPrior:
     """A prior about a pose (3, 3) that nobody measured."""
     return _prior(T_map_base, sigma_translation, sigma_rotation)
 
 
-def combined(a: MotionPrior, b: MotionPrior) -> MotionPrior:
+def fuse_priors(a: MotionPrior, b: MotionPrior) -> MotionPrior:
     """The product of two Gaussians on one pose."""
     information = a.information + b.information
     difference = se2.parameters(b.T_map_base) - se2.parameters(a.T_map_base)
@@ -199,7 +201,7 @@ def combined(a: MotionPrior, b: MotionPrior) -> MotionPrior:
     return MotionPrior(mean, information, float(sigma[:2].max()), float(sigma[2]))
 
 
-def widened(prior: MotionPrior, sigma_translation: float, sigma_rotation: float) -> MotionPrior:
+def widen_prior(prior: MotionPrior, sigma_translation: float, sigma_rotation: float) -> MotionPrior:
     """The same mean, trusted less: standard deviations of at least these."""
     return _prior(
         prior.T_map_base,
@@ -209,6 +211,6 @@ def widened(prior: MotionPrior, sigma_translation: float, sigma_rotation: float)
 
 
 def _prior(mean: Float, sigma_xy: float, sigma_theta: float, measured: bool = False) -> MotionPrior:
-    mean = se2.normalised(mean)
+    mean = se2.normalize(mean)
     information = np.diag([sigma_xy**-2, sigma_xy**-2, sigma_theta**-2])
     return MotionPrior(mean, information, sigma_xy, sigma_theta, measured)

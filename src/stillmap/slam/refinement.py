@@ -11,19 +11,19 @@ from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.slam import local_map, motion_model, scan_matching
 from stillmap.slam.motion_model import MotionPrior
-from stillmap.slam.odometry_2d import Mapped, SlamOptions
-from stillmap.slam.scan_matching import hits, put
+from stillmap.slam.odometry_2d import MStepResult, SlamOptions
+from stillmap.slam.scan_matching import add_scan, select_hits
 
 Float = NDArray[np.float64]
 
 
-def sweep(
+def refine_poses(
     recording: Recording,
     e: NDArray[np.float32],
     options: SlamOptions,
-    mapped: Mapped,
+    mapped: MStepResult,
     progress: Callable[[int, int], None],
-) -> Mapped:
+) -> MStepResult:
     """Poses, covariances and explained shares after a pass; the first pose stays.
 
     Args:
@@ -38,23 +38,25 @@ def sweep(
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
     increments = _increments(recording, poses)
     grid = _core.Grid2D(options.resolution, options.registration.approach)
-    kept = local_map.chosen_of_each(poses, recording.sensor, options.spacing, options.spacing)
+    kept = local_map.select_keyframes_per_sensor(
+        poses, recording.sensor, options.spacing, options.spacing
+    )
     for t in recording.in_turn(kept, e):
-        put(grid, recording, e, t, poses[t], options.surface)
+        add_scan(grid, recording, e, t, poses[t], options.surface)
     is_in_map = np.zeros(T, np.bool_)
     is_in_map[kept] = True
     for t in recording.in_turn(range(1, T), e):
         if is_in_map[t]:
-            put(grid, recording, e, t, poses[t], options.surface, remove=True)
+            add_scan(grid, recording, e, t, poses[t], options.surface, remove=True)
         prior = _between_neighbours(recording, poses, increments, mapped.breaks, t, options)
-        scan = hits(recording, e, t)
-        found = scan_matching.search(
+        scan = select_hits(recording, e, t)
+        found = scan_matching.search_pose(
             grid, scan, prior, options.registration, 0.0, 0.0, start=poses[t]
         )
-        poses[t] = se2.normalised(found.T_map_base)
+        poses[t] = se2.normalize(found.T_map_base)
         covariance[t], explained[t] = found.covariance, found.explained
         if is_in_map[t]:
-            put(grid, recording, e, t, poses[t], options.surface)
+            add_scan(grid, recording, e, t, poses[t], options.surface)
         progress(t + 1, T)
     return dataclasses.replace(mapped, poses=poses, covariance=covariance, explained=explained)
 
@@ -74,12 +76,12 @@ def _between_neighbours(
 ) -> MotionPrior:
     """What the motion from the scan before and to the scan after says of a pose."""
     known = recording.T_odom_base is not None
-    one = motion_model.from_increment(poses[t - 1], increments[t - 1], options.motion, known)
+    one = motion_model.increment_prior(poses[t - 1], increments[t - 1], options.motion, known)
     if t in breaks:  # nobody knows how it came here
-        one = motion_model.from_increment(poses[t], np.eye(3), options.motion, is_odometry=False)
+        one = motion_model.increment_prior(poses[t], np.eye(3), options.motion, is_odometry=False)
     if t + 1 == len(poses) or t + 1 in breaks:
         return one
     back = se2.inverse(increments[t])
-    return motion_model.combined(
-        one, motion_model.from_increment(poses[t + 1], back, options.motion, known)
+    return motion_model.fuse_priors(
+        one, motion_model.increment_prior(poses[t + 1], back, options.motion, known)
     )

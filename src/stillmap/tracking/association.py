@@ -1,6 +1,8 @@
-"""Moving things followed from scan to scan: which end point is of which thing.
+"""Data association: assign dynamic end points to tracks, scan by scan.
 
-Two things that were taken for one: seen apart at last, they are told apart back in time.
+A track is a constant-velocity Kalman filter and the shape seen lately: its recent end points
+relative to its position. A point goes to the track whose predicted shape is nearest. Where two
+objects that were tracked as one separate, the past points are split between them as well.
 """
 
 from dataclasses import dataclass
@@ -10,27 +12,34 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays, kalman
 from stillmap.core.kalman import TrackStates
-from stillmap.tracking.clustering import DynamicPoints
-from stillmap.tracking.options import ObjectOptions
+from stillmap.tracking.clustering import LINK_PER_METRE, DynamicPoints
 
 Float = NDArray[np.float64]
-
 Index = NDArray[np.intp]
 
-BACK = 6.0  # s that it is gone back in time
+NO_TRACK = -1
+HORIZON = 1.0  # s: points that determine a velocity
+SPLIT_WINDOW = 6.0  # s: how far back in time a track is split
+ACCELERATION = 1.0  # m2/s3: spectral density of the random acceleration
 
-_MISSED = 1.0  # s without any point after which one of them was not there yet
-
-_HORIZON = 1.0  # s of points that tell a velocity
-
-_STANDING = 0.3  # s by which few points are taken to stand still
-
-_REACH = 0.45  # m from the middle of a thing to its points
+_POSITION_STD = 0.12  # m: of the mean of an object's end points
+_SPEED_STD = 1.0  # m/s: of the initial speed
+_GATE = 0.2  # m: association distance
+_WIDE_GATE = 0.35  # m: the same for a track without any nearer point
+_GATE_SIGMAS = 2.0  # standard deviations of the prediction in addition
+_MAX_GATE = 1.2  # m
+_SPLIT_DISTANCE = 0.7  # m: distance between parts of two objects
+_SHAPE_WINDOW = 0.6  # s
+_MAX_SHAPE_POINTS = 100  # more of them add nothing
+_MAX_PAIRS = 1 << 16  # distances computed at once: they fit into the cache
+_MAX_UNSEEN = 1.0  # s without points after which one of two split tracks had not begun
+_REST_TIME = 0.3  # s: shrinks the speed of few points towards 0
+_MAX_RADIUS = 0.45  # m from the center of an object to its points
 
 
 @dataclass(frozen=True, eq=False)
 class TrackSplit:
-    """Points of who was there first, and of the other; in the scan, and before."""
+    """Points of the two objects of a split track, in the current scan and in the past."""
 
     older_current: Index
     older_past: Index
@@ -38,307 +47,297 @@ class TrackSplit:
     newer_past: Index
 
 
-def split_track(
-    points: DynamicPoints, owned: Index, one: Index, other: Index, options: ObjectOptions
-) -> TrackSplit:
-    """Whose the points of a thing were before it was seen to be two.
+def split_track(points: DynamicPoints, owned: Index, one: Index, other: Index) -> TrackSplit:
+    """Divide the past points of a track between the two objects that it turned out to be.
+
+    Both are tracked backwards in time from where they are seen apart.
 
     Args:
-        points: what moves.
-        owned: points of the thing in earlier scans, rising.
-        one, other: points of either in the scan where they are seen apart.
-        options: see ObjectOptions.
+        points: dynamic end points.
+        owned: past points of the track, rising.
+        one, other: points of either object in the current scan.
     """
     xy, seconds = points.xy, points.seconds[points.scan]
-    at = float(seconds[one[0]])
-    middles = np.array([xy[one].mean(axis=0), xy[other].mean(axis=0)])
-    motion = kalman.initialize(middles, options.sigma, options.sigma_speed)
-    seen = np.array([at, at])
+    now = float(seconds[one[0]])
+    centroids = np.array([xy[one].mean(axis=0), xy[other].mean(axis=0)])
+    states = kalman.initialize(centroids, _POSITION_STD, _SPEED_STD)
+    seen = np.array([now, now])
     shares: tuple[list[Index], list[Index]] = ([owned[:0]], [owned[:0]])
-    owned = owned[seconds[owned] > at - BACK]
+    owned = owned[seconds[owned] > now - SPLIT_WINDOW]
     for here in np.split(owned, np.flatnonzero(np.diff(points.scan[owned])) + 1)[::-1]:
-        if len(here) == 0 or (seen - seconds[here[0]] > _MISSED).any():
+        if len(here) == 0 or (seen - seconds[here[0]] > _MAX_UNSEEN).any():
             break
-        motion = kalman.predict(motion, seconds[here[0]] - at, options.acceleration)
-        at = float(seconds[here[0]])
-        share = _shared(xy[here], motion)
-        count = np.bincount(share, minlength=2)
-        sums = np.array([xy[here[share == i]].sum(axis=0) for i in (0, 1)])
+        states = kalman.predict(states, seconds[here[0]] - now, ACCELERATION)
+        now = float(seconds[here[0]])
+        nearest = _assign_to_nearest(xy[here], states)
+        count = np.bincount(nearest, minlength=2)
+        sums = np.array([xy[here[nearest == i]].sum(axis=0) for i in (0, 1)])
         means = sums / np.maximum(count, 1)[:, None]
-        motion = kalman.update(motion, count > 0, means, options.sigma)
-        seen[count > 0] = at
+        states = kalman.update(states, count > 0, means, _POSITION_STD)
+        seen[count > 0] = now
         for i in (0, 1):
-            shares[i].append(here[share == i])
-    before = [np.concatenate(share) for share in shares]
+            shares[i].append(here[nearest == i])
+    past = [np.concatenate(share) for share in shares]
     if seen[1] < seen[0]:
-        return TrackSplit(other, before[1], one, before[0])
-    return TrackSplit(one, before[0], other, before[1])
+        return TrackSplit(other, past[1], one, past[0])
+    return TrackSplit(one, past[0], other, past[1])
 
 
-def _shared(xy: Float, motion: kalman.TrackStates) -> Index:
-    """(n,) to which of two each point is nearer; neither gets any where none is near to it."""
-    distance = np.linalg.norm(xy[:, None] - motion.x, axis=-1)
-    share: Index = distance.argmin(axis=1)
+def _assign_to_nearest(xy: Float, states: TrackStates) -> Index:
+    """(n,) the nearer of two tracks; one without a point near it gets none."""
+    distance = np.linalg.norm(xy[:, None] - states.x, axis=-1)
+    nearest: Index = distance.argmin(axis=1)
     for i in (0, 1):
-        mine = share == i
-        if mine.any() and distance[mine, i].min() > _REACH + 2.0 * motion.sigma[i]:
-            share[mine] = 1 - i
-    return share
+        mine = nearest == i
+        if mine.any() and distance[mine, i].min() > _MAX_RADIUS + 2.0 * states.sigma[i]:
+            nearest[mine] = 1 - i
+    return nearest
 
 
-def estimate_velocity(points: DynamicPoints, before: Index, now: float) -> Float:
-    """(2,) m/s of the points of a thing in the last second; 0 where there are too few."""
-    seconds = points.seconds[points.scan[before]]
-    before, seconds = before[seconds > now - _HORIZON], seconds[seconds > now - _HORIZON]
-    if len(before) < 2:
+def estimate_velocity(points: DynamicPoints, past: Index, now: float) -> Float:
+    """(2,) m/s of a track's points of the last `HORIZON` seconds; 0 of fewer than two."""
+    seconds = points.seconds[points.scan[past]]
+    past, seconds = past[seconds > now - HORIZON], seconds[seconds > now - HORIZON]
+    if len(past) < 2:
         return np.zeros(2)
-    off = seconds - seconds.mean()
-    xy = points.xy[before] - points.xy[before].mean(axis=0)
-    return np.asarray((off[:, None] * xy).sum(axis=0) / ((off**2).sum() + _STANDING**2))
+    return regress_velocity(seconds, points.xy[past], _REST_TIME)
 
 
-NO_TRACK = -1
+def regress_velocity(seconds: Float, xy: Float, rest_time: float) -> Float:
+    """(2,) slope of the line through positions (n, 2) over times (n,), shrunk towards 0.
 
-_SHAPE = 100  # points that a shape has at most: more of them say no more
-
-_PAIRS = 1 << 16  # distances that are looked at together: as many as a cache holds
-
-
-def assign_tracks(points: DynamicPoints, options: ObjectOptions) -> Index:
-    """(N,) numbers of things, from 0 in the order in which they were first seen.
-
-    What a thing looked like of late, moved to where it is expected, claims the end points nearest
-    to it; what nothing claims begins a new thing, one for each cluster.
-
-    Args:
-        points: what moves.
-        options: see ObjectOptions.
+    `rest_time` is the spread of times, in seconds, of equally weighted evidence of rest.
     """
-    following = _Following(points, options)
+    offset = seconds - seconds.mean()
+    moment = (offset[:, None] * (xy - xy.mean(axis=0))).sum(axis=0)
+    return np.asarray(moment / ((offset**2).sum() + rest_time**2))
+
+
+def assign_tracks(points: DynamicPoints, max_gap: float) -> Index:
+    """(N,) track number of each point, from 0 in the order of first detections.
+
+    A track claims the end points nearest to its predicted shape; each unclaimed cluster begins a
+    new track. A track without points for `max_gap` seconds is terminated.
+    """
+    tracker = _Tracker(points, max_gap)
     scans = np.flatnonzero(np.diff(points.first)).tolist()
-    for scan in arrays.release_periodically(scans, lambda: points.release(following.owner)):
-        following.take(scan)
-    return following.owner
+    for scan in arrays.release_periodically(scans, lambda: points.release(tracker.owner)):
+        tracker.process(scan)
+    return tracker.owner
 
 
-class _Following:
-    """Things as they are followed: their motion, and what was seen of them of late."""
+class _Tracker:
+    """The active tracks: filter states and shapes, and the track of every point."""
 
-    def __init__(self, points: DynamicPoints, options: ObjectOptions) -> None:
+    def __init__(self, points: DynamicPoints, max_gap: float) -> None:
         self.owner = arrays.empty((len(points.scan),), np.intp, points.scratch)
-        self._points, self._options = points, options
+        self._points, self._max_gap = points, max_gap
         self._now, self._count = 0.0, 0
-        self._motion = kalman.initialize(np.zeros((0, 2)), 1.0, 1.0)
+        self._states = kalman.initialize(np.zeros((0, 2)), 1.0, 1.0)
         self._id, self._last = np.zeros(0, np.intp), np.zeros(0)
-        # what was seen of them: offsets from where they were, of which thing, when
+        # shape points: offset from the track's position, track (rising), time
         self._offset, self._of, self._when = np.zeros((0, 2)), np.zeros(0, np.intp), np.zeros(0)
 
-    def take(self, scan: int) -> None:
-        """Goes on to a scan, and says whose its points are."""
-        points, options = self._points, self._options
+    def process(self, scan: int) -> None:
+        """Predict, associate, split, update and begin tracks with the points of a scan."""
+        points = self._points
         here = np.arange(points.first[scan], points.first[scan + 1])
         dt, self._now = points.seconds[scan] - self._now, float(points.seconds[scan])
-        self._forget(self._now - self._last <= options.gap)
-        self._motion = kalman.predict(self._motion, dt, options.acceleration)
-        claims = self._claims(here)
-        for thing, kept, gone in find_splits(points, here, claims, options):
+        self._keep(self._now - self._last <= self._max_gap)
+        self._states = kalman.predict(self._states, dt, ACCELERATION)
+        claims = self._associate(here)
+        for track, kept, gone in find_splits(points, here, claims):
             claims[gone] = NO_TRACK
-            self._tear(here, claims, thing, here[kept], here[gone])
+            self._split(here, claims, track, here[kept], here[gone])
         self._update(here, claims)
         self._begin(here, claims)
         self.owner[here] = self._id[claims]
 
-    def _claims(self, here: Index) -> Index:
-        """Which thing claims each point."""
+    def _associate(self, here: Index) -> Index:
+        """The track that claims each point."""
         claims = np.full(len(here), NO_TRACK)
-        if len(self._motion) == 0:
+        if len(self._states) == 0:
             return claims
-        options, xy = self._options, self._points.xy[here]
+        xy = self._points.xy[here]
         cluster = self._points.cluster[here] - self._points.cluster[here[0]]
         squared = self._squared_distances(xy)
-        variance = options.sigma**2 + self._motion.P[:, 0]
-        # a Gaussian on two axes has twice the logarithm: who was hidden would get too little back
+        variance = _POSITION_STD**2 + self._states.P[:, 0]
+        # a 2D Gaussian has twice the logarithm, which would favor long occluded tracks too little
         cost = squared / variance + np.log(variance)
-        sigma = self._motion.sigma
-        near = np.minimum(options.near + options.near_sigmas * sigma, options.farthest)
-        claims = _cheapest(cost, squared < near**2)
+        sigma = self._states.sigma
+        gate = np.minimum(_GATE + _GATE_SIGMAS * sigma, _MAX_GATE)
+        claims = _argmin_allowed(cost, squared < gate**2)
         if (claims == NO_TRACK).any():
             found = np.bincount(claims[claims >= 0], minlength=len(sigma)) > 0
             taken = np.bincount(cluster[claims >= 0], minlength=cluster[-1] + 1) > 0
-            far = np.minimum(options.far + options.near_sigmas * sigma, options.farthest)
-            allowed = (squared < far**2) & ~found & ~taken[cluster][:, None]
-            claims = np.where(claims == NO_TRACK, _cheapest(cost, allowed), claims)
-            claims = _whole_clusters(claims, cluster, len(sigma))
+            wide_gate = np.minimum(_WIDE_GATE + _GATE_SIGMAS * sigma, _MAX_GATE)
+            allowed = (squared < wide_gate**2) & ~found & ~taken[cluster][:, None]
+            claims = np.where(claims == NO_TRACK, _argmin_allowed(cost, allowed), claims)
+            claims = _complete_clusters(claims, cluster, len(sigma))
         return claims
 
     def _squared_distances(self, xy: Float) -> Float:
-        """(n, K) of points to what was seen of each thing, where that is expected now."""
-        expected_x, expected_y = (self._motion.x[self._of] + self._offset).T
-        begin = np.searchsorted(self._of, np.arange(len(self._motion)))
+        """(n, K) from points to the nearest predicted shape point of each track."""
+        expected_x, expected_y = (self._states.x[self._of] + self._offset).T
+        begin = np.searchsorted(self._of, np.arange(len(self._states)))
         out = np.empty((len(xy), len(begin)))
-        step = max(1, _PAIRS // len(expected_x))
-        for first in range(0, len(xy), step):  # a crowd right before the laser is large
+        step = max(1, _MAX_PAIRS // len(expected_x))
+        for first in range(0, len(xy), step):  # a crowd close to the laser is large
             x, y = xy[first : first + step].T[:, :, None]
             squared = np.square(x - expected_x)
             squared += np.square(y - expected_y)
             out[first : first + step] = np.minimum.reduceat(squared, begin, axis=1)
         return out
 
-    def _tear(self, here: Index, claims: Index, thing: int, kept: Index, gone: Index) -> None:
-        """One thing turns out to be two: since when, and who of them was there before."""
+    def _split(self, here: Index, claims: Index, track: int, kept: Index, gone: Index) -> None:
+        """Split a track in two; the newer one gets a new number, in the past as well."""
         points = self._points
-        first = points.first[np.searchsorted(points.seconds, self._now - BACK)]
-        owned = first + np.flatnonzero(self.owner[first : here[0]] == self._id[thing])
-        torn = split_track(points, owned, kept, gone, self._options)
-        new = len(self._motion)
-        for k, now, before in (
-            (thing, torn.older_current, torn.older_past),
-            (new, torn.newer_current, torn.newer_past),
+        first = points.first[np.searchsorted(points.seconds, self._now - SPLIT_WINDOW)]
+        owned = first + np.flatnonzero(self.owner[first : here[0]] == self._id[track])
+        split = split_track(points, owned, kept, gone)
+        new = len(self._states)
+        for k, current, past in (
+            (track, split.older_current, split.older_past),
+            (new, split.newer_current, split.newer_past),
         ):
-            claims[np.isin(here, now)] = k
-            self._set(k, now, estimate_velocity(points, before, self._now))
-        self.owner[torn.newer_past] = self._id[new]
+            claims[np.isin(here, current)] = k
+            self._set(k, current, estimate_velocity(points, past, self._now))
+        self.owner[split.newer_past] = self._id[new]
 
-    def _set(self, k: int, now: Index, velocity: Float) -> None:
-        """Thing k is where these points are; a new one if there is none of that number."""
-        xy = self._points.xy[now]
-        begun = kalman.initialize(
-            xy.mean(axis=0)[None], self._options.sigma, self._options.sigma_speed
-        )
-        begun = TrackStates(begun.x, velocity[None], begun.P)
-        if k == len(self._motion):
-            self._append(begun)
+    def _set(self, k: int, current: Index, velocity: Float) -> None:
+        """Reset track k to these points and this velocity; append it where it is new."""
+        xy = self._points.xy[current]
+        begun = kalman.initialize(xy.mean(axis=0)[None], _POSITION_STD, _SPEED_STD)
+        if k == len(self._states):
+            self._append(TrackStates(begun.x, velocity[None], begun.P))
         else:
-            for ours, theirs in zip(_arrays(self._motion), _arrays(begun), strict=True):
-                ours[k] = theirs[0]
-        self._forget_shape(self._of != k)
-        self._see(xy, np.full(len(now), k))
+            for array, value in (
+                (self._states.x, begun.x[0]),
+                (self._states.v, velocity),
+                (self._states.P, begun.P[0]),
+            ):
+                array[k] = value
+        self._keep_shapes(self._of != k)
+        self._add_to_shapes(xy, np.full(len(current), k))
 
     def _update(self, here: Index, claims: Index) -> None:
-        """Things are where their points are."""
-        got = claims >= 0
-        count = np.bincount(claims[got], minlength=len(self._motion))
-        seen, xy = count > 0, self._points.xy[here][got]
-        at = _means(xy, claims[got], count)
-        self._motion = kalman.update(self._motion, seen, at, self._options.sigma)
+        """Update the tracks with the means of their points."""
+        claimed = claims >= 0
+        count = np.bincount(claims[claimed], minlength=len(self._states))
+        seen, xy = count > 0, self._points.xy[here][claimed]
+        means = _means(xy, claims[claimed], count)
+        self._states = kalman.update(self._states, seen, means, _POSITION_STD)
         self._last[seen] = self._now
-        # who is hidden keeps its shape
-        self._forget_shape((self._now - self._when < self._options.shape) | ~seen[self._of])
-        self._see(xy, claims[got])
+        # an occluded track keeps its shape
+        self._keep_shapes((self._now - self._when < _SHAPE_WINDOW) | ~seen[self._of])
+        self._add_to_shapes(xy, claims[claimed])
 
     def _begin(self, here: Index, claims: Index) -> None:
-        """What nobody claims: a new thing for each cluster."""
+        """Begin a track for each unclaimed cluster."""
         free = claims == NO_TRACK
         if not free.any():
             return
         _, which = np.unique(self._points.cluster[here[free]], return_inverse=True)
-        xy, first = self._points.xy[here[free]], len(self._motion)
-        at = _means(xy, which, np.bincount(which))
-        self._append(kalman.initialize(at, self._options.sigma, self._options.sigma_speed))
+        xy, first = self._points.xy[here[free]], len(self._states)
+        means = _means(xy, which, np.bincount(which))
+        self._append(kalman.initialize(means, _POSITION_STD, _SPEED_STD))
         claims[free] = first + which
-        self._see(xy, claims[free])
+        self._add_to_shapes(xy, claims[free])
 
     def _append(self, begun: TrackStates) -> None:
-        self._motion = kalman.concatenate(self._motion, begun)
+        self._states = kalman.concatenate(self._states, begun)
         numbers = self._count + np.arange(len(begun))
         self._id, self._count = np.concatenate([self._id, numbers]), self._count + len(begun)
         self._last = np.concatenate([self._last, np.full(len(begun), self._now)])
 
-    def _see(self, xy: Float, of: Index) -> None:
-        """Adds to the shapes; they lie in the order of things."""
+    def _add_to_shapes(self, xy: Float, of: Index) -> None:
+        """Add points of tracks `of` to their shapes, and thin shapes that grew too large."""
         of_all = np.concatenate([self._of, of])
         order = np.argsort(of_all, kind="stable")
-        self._offset = np.concatenate([self._offset, xy - self._motion.x[of]])[order]
+        self._offset = np.concatenate([self._offset, xy - self._states.x[of]])[order]
         self._when = np.concatenate([self._when, np.full(len(of), self._now)])[order]
         self._of = of_all[order]
-        count = np.bincount(self._of, minlength=len(self._motion))
-        if count.max(initial=0) > _SHAPE:
+        count = np.bincount(self._of, minlength=len(self._states))
+        if count.max(initial=0) > _MAX_SHAPE_POINTS:
             first = np.cumsum(count) - count
-            every = -(-count // _SHAPE)
-            self._forget_shape((np.arange(len(self._of)) - first[self._of]) % every[self._of] == 0)
+            every = -(-count // _MAX_SHAPE_POINTS)
+            self._keep_shapes((np.arange(len(self._of)) - first[self._of]) % every[self._of] == 0)
 
-    def _forget(self, kept: NDArray[np.bool_]) -> None:
-        """Things that are gone."""
+    def _keep(self, kept: NDArray[np.bool_]) -> None:
+        """Terminate all other tracks."""
         if kept.all():
             return
-        self._forget_shape(kept[self._of])
+        self._keep_shapes(kept[self._of])
         self._of = (np.cumsum(kept) - 1)[self._of]
-        self._motion, self._id = self._motion.of(kept), self._id[kept]
+        self._states, self._id = self._states.of(kept), self._id[kept]
         self._last = self._last[kept]
 
-    def _forget_shape(self, kept: NDArray[np.bool_]) -> None:
+    def _keep_shapes(self, kept: NDArray[np.bool_]) -> None:
         self._offset, self._of, self._when = (
-            self._offset[kept],
-            self._of[kept],
-            self._when[kept],
+            array[kept] for array in (self._offset, self._of, self._when)
         )
 
 
 def find_splits(
-    points: DynamicPoints, here: Index, claims: Index, options: ObjectOptions
+    points: DynamicPoints, here: Index, claims: Index
 ) -> list[tuple[int, Index, Index]]:
-    """Things of which parts lie too far from one another to be one.
+    """Find tracks whose points lie too far apart to be of one object.
 
     Args:
-        points: what moves.
+        points: dynamic end points.
         here: (n,) the points of a scan.
-        claims: (n,) whose they are.
-        options: see ObjectOptions.
+        claims: (n,) their tracks.
 
     Returns:
-        The thing, and indices into `here` of the parts that hold together around its largest
-        cluster, and of those that do not, of which only the largest cluster.
+        For each such track its number, and indices into `here` of the parts connected with its
+        largest cluster, and of the largest one of the others.
     """
     cluster = points.cluster[here]
     pairs = np.unique(np.column_stack([claims, cluster])[claims >= 0], axis=0)
     repeated = np.unique(pairs[1:, 0][np.diff(pairs[:, 0]) == 0])
     out = []
-    for thing in repeated.tolist():
-        own = np.flatnonzero(claims == thing)
+    for track in repeated.tolist():
+        own = np.flatnonzero(claims == track)
         parts = [own[cluster[own] == c] for c in np.unique(cluster[own])]
-        far = options.apart + options.link_slope * points.range[here[own]].min()
-        kept, gone = _held_together([points.xy[here[part]] for part in parts], far)
+        max_distance = _SPLIT_DISTANCE + LINK_PER_METRE * points.range[here[own]].min()
+        kept, gone = _connect([points.xy[here[part]] for part in parts], max_distance)
         if gone:
             largest = max(gone, key=lambda i: len(parts[i]))
-            out.append((thing, np.concatenate([parts[i] for i in kept]), parts[largest]))
+            out.append((track, np.concatenate([parts[i] for i in kept]), parts[largest]))
     return out
 
 
-def _held_together(parts: list[Float], far: float) -> tuple[list[int], list[int]]:
-    """Parts within `far` of the largest one, or of others that are; and the others."""
+def _connect(parts: list[Float], max_distance: float) -> tuple[list[int], list[int]]:
+    """Parts connected with the largest one by gaps below `max_distance`, and the others."""
     from scipy.spatial import KDTree  # takes long to load
 
     kept = [max(range(len(parts)), key=lambda i: len(parts[i]))]
     gone = [i for i in range(len(parts)) if i not in kept]
     for i in kept:  # grows as it goes
         for j in list(gone):
-            if np.min(KDTree(parts[i]).query(parts[j])[0]) < far:
+            if np.min(KDTree(parts[i]).query(parts[j])[0]) < max_distance:
                 kept.append(j)
                 gone.remove(j)
     return kept, gone
 
 
-def _cheapest(cost: Float, allowed: NDArray[np.bool_]) -> Index:
-    """(n,) columns with the least cost of those allowed; NOBODY where none is."""
+def _argmin_allowed(cost: Float, allowed: NDArray[np.bool_]) -> Index:
+    """(n,) columns of least cost among those allowed; NO_TRACK where none is."""
     cost = np.where(allowed, cost, np.inf)
     best = cost.argmin(axis=1)
     return np.where(np.isfinite(cost[np.arange(len(cost)), best]), best, NO_TRACK)
 
 
-def _whole_clusters(claims: Index, cluster: Index, things: int) -> Index:
-    """What nobody claims goes with who claims most of its cluster."""
-    votes = np.zeros((cluster[-1] + 1, things), np.intp)
-    got = claims >= 0
-    np.add.at(votes, (cluster[got], claims[got]), 1)
+def _complete_clusters(claims: Index, cluster: Index, tracks: int) -> Index:
+    """Give unclaimed points to the track that claims most of their cluster."""
+    votes = np.zeros((cluster[-1] + 1, tracks), np.intp)
+    claimed = claims >= 0
+    np.add.at(votes, (cluster[claimed], claims[claimed]), 1)
     best = np.where(votes.max(axis=1) > 0, votes.argmax(axis=1), NO_TRACK)
-    return np.where(got, claims, best[cluster])
+    return np.where(claimed, claims, best[cluster])
 
 
 def _means(xy: Float, of: Index, count: Index) -> Float:
-    """(K, 2) means of points by their numbers; 0 where there are none."""
+    """(K, 2) mean of the points of each of K groups; 0 of an empty one."""
     sums = [np.bincount(of, xy[:, d], minlength=len(count)) for d in (0, 1)]
     return np.asarray(np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None])
-
-
-def _arrays(motion: TrackStates) -> tuple[Float, Float, Float]:
-    return motion.x, motion.v, motion.P

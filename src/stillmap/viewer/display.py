@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.io.point_cloud import ply
-from stillmap.io.point_cloud.binary_table import columns
+from stillmap.io.point_cloud.binary_table import read_columns
 from stillmap.results.report.figures import ORANGE
 
 Colours = NDArray[np.uint8]
@@ -89,12 +89,12 @@ def points_in(path: Path, most: int) -> Points:
     Raises:
         InputError: it is missing or damaged.
     """
-    layout = ply.layout_of(path)
+    layout = ply.read_layout(path)
     painted = {"red", "green", "blue"} <= {field.name for field in layout.fields}
     wanted = ("x", "y", "z", *(("red", "green", "blue") if painted else ()))
     use, first = chosen(layout.rows, most), 0
     points, colours = np.empty((len(use), 3)), np.empty((len(use), 3), np.uint8)
-    for block in columns(layout, wanted):
+    for block in read_columns(layout, wanted):
         end = first + len(block[0])
         into = slice(*np.searchsorted(use, [first, end]).tolist())
         for n, values in enumerate(block):

@@ -308,7 +308,7 @@ def test_order_of_scans_does_not_depend_on_where_arrays_lie(bag, messages, monke
 
     path = bag(drive(messages, 40))
     before = read(path)
-    monkeypatch.setattr(arrays, "IN_MEMORY", 0)
+    monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
     after = read(path)
     np.testing.assert_array_equal(before.points, after.points)
     np.testing.assert_array_equal(before.hit, after.hit)

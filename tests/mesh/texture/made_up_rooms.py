@@ -8,8 +8,8 @@ from stillmap import _core
 from stillmap.core import camera as camera_module
 from stillmap.core.camera import Camera
 from stillmap.mesh.texture.views import View
-from stillmap.mesh.texture.visibility import visible
-from stillmap.mesh.triangle_mesh import Mesh, joined
+from stillmap.mesh.texture.visibility import find_visible_faces
+from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes
 
 K = np.array([[300.0, 0.0, 199.5], [0.0, 300.0, 149.5], [0.0, 0.0, 1.0]])
 
@@ -54,7 +54,7 @@ def box(low, high, n=1, inwards=False):
         rectangle(low, z, y, n),
         rectangle(low + x, y, z, n),
     ]
-    mesh = joined(sides)
+    mesh = concatenate_meshes(sides)
     return Mesh(mesh.vertices, mesh.faces[:, ::-1].copy()) if inwards else mesh
 
 
@@ -69,7 +69,7 @@ def colour(points):
 def rays_of(camera, finer):
     """(n, 3) the directions of all parts of a camera's pixels."""
     u, v = ((np.arange(n * finer) + 0.5) / finer - 0.5 for n in (camera.width, camera.height))
-    return camera_module.rays(camera, np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
+    return camera_module.unproject(camera, np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
 
 
 def photograph(mesh, view, finer=2):
@@ -96,7 +96,7 @@ def photograph(mesh, view, finer=2):
 
 def furnished():
     """A crumpled room of 4 by 5 by 2.6 m with a block in it; seen from inside."""
-    mesh = joined(
+    mesh = concatenate_meshes(
         [box([0, 0, 0], [4, 5, 2.6], 10, inwards=True), box([1.5, 2, 0], [2.3, 3, 0.9], 5)]
     )
     rng = np.random.default_rng(1)
@@ -119,7 +119,7 @@ def sharpest(mesh, views):
     """(F,) int32 the view that shows each face largest, -1: none."""
     best, most = np.full(len(mesh), -1, np.int32), np.zeros(len(mesh))
     for number, view in enumerate(views):
-        seen = visible(mesh, view)
+        seen = find_visible_faces(mesh, view)
         better = seen.seen & (seen.pixels > most)
         best[better], most[better] = number, seen.pixels[better]
     return best

@@ -12,15 +12,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.errors import InputError, extra
+from stillmap.core.errors import InputError, import_extra
 from stillmap.core.recording import Recording
-from stillmap.io.point_cloud.binary_table import cut_short
-from stillmap.io.point_cloud.files import files_in, from_quaternion, require_content
-from stillmap.io.point_cloud.scans import Cloud, Growing, Known, Origin, Source, assembled
+from stillmap.io.point_cloud.binary_table import truncated_error
+from stillmap.io.point_cloud.files import list_files, pose_from_quaternion, require_nonempty_file
+from stillmap.io.point_cloud.scans import (
+    Cloud,
+    CloudSource,
+    DatasetInfo,
+    Origin,
+    PointBuffer,
+    build_recording,
+)
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 
-ENDINGS = (".e57",)
+EXTENSIONS = (".e57",)
 MAGIC = b"ASTM-E57"
 
 _BLOCK = 1 << 14  # points read together; libe57 keeps the space for them where packets are bad
@@ -44,8 +51,8 @@ def read(
     Raises:
         InputError: no scan can be read, or pye57 is missing.
     """
-    extra("pye57.libe57", path)
-    files = [path] if path.is_file() else files_in(path, ENDINGS)
+    import_extra("pye57.libe57", path)
+    files = [path] if path.is_file() else list_files(path, EXTENSIONS)
     origin, sources = Origin(), []
     for file in files:
         try:
@@ -56,9 +63,9 @@ def read(
             count = 1  # it is found out again, and counted
         for scan in range(count):
             name = file.name if count == 1 else f"{file.name} scan {scan + 1}"
-            sources.append(Source(name, partial(_cloud, file, scan, origin, scratch)))
-    known = Known(path, "E57", [], single=path.is_file() and len(sources) == 1)
-    recording = assembled(sources, known, options, progress, scratch)
+            sources.append(CloudSource(name, partial(_cloud, file, scan, origin, scratch)))
+    known = DatasetInfo(path, "E57", [], single=path.is_file() and len(sources) == 1)
+    recording = build_recording(sources, known, options, progress, scratch)
     if recording.T_recorded_base is None:
         recording.source.update(origin.notes())
         recording.source["warnings"] += origin.warnings()
@@ -70,10 +77,10 @@ class _Opened:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.library = extra("pye57.libe57", path)
+        self.library = import_extra("pye57.libe57", path)
 
     def __enter__(self) -> Any:
-        require_content(self._path)
+        require_nonempty_file(self._path)
         if not str(self._path).isprintable():
             raise InputError("has a name that its library cannot open", where=str(self._path))
         _refuse_entities(self._path)
@@ -144,11 +151,11 @@ def _cloud(path: Path, scan: int, origin: Origin, scratch: Path | None) -> Cloud
         T = _pose(node)
         if T is not None and not np.array_equal(T, np.eye(4)):
             origin = Origin(np.zeros(3))
-        growing = Growing(origin, scratch)
+        growing = PointBuffer(origin, scratch)
         points, fields = node["points"], _fields(opened.library, node, path)
         promised, found = points.childCount(), 0
         if promised > 8 * path.stat().st_size:
-            raise cut_short(path, 0, promised)  # not even a bit for each
+            raise truncated_error(path, 0, promised)  # not even a bit for each
         values = {name: np.zeros(_BLOCK, kind) for name, kind in fields.items()}
         buffers = opened.library.VectorSourceDestBuffer()
         for name, array in values.items():
@@ -159,7 +166,7 @@ def _cloud(path: Path, scan: int, origin: Origin, scratch: Path | None) -> Cloud
                 found += n
         stamp_ns = _stamp_ns(node)
     if found < promised:
-        raise cut_short(path, found, promised)
+        raise truncated_error(path, found, promised)
     return Cloud(growing.finished(), T, stamp_ns=stamp_ns)
 
 
@@ -205,7 +212,7 @@ def _pose(node: Any) -> NDArray[np.float64] | None:
     if pose.isDefined("translation"):
         xyz = [pose["translation"][axis].value() for axis in "xyz"]
     try:
-        return from_quaternion(wxyz, xyz)
+        return pose_from_quaternion(wxyz, xyz)
     except ValueError:
         return None
 

@@ -25,33 +25,35 @@ _REPEATED = re.compile(r"(-?\d{19})_\d+")  # a second scan of one stamp, as we w
 _DIGITS_OF_NS = {19: 1, 16: 10**3, 13: 10**6}  # of ns, us, ms since 1970, or filled with zeros
 
 
-def files_in(folder: Path, endings: tuple[str, ...]) -> list[Path]:
+def list_files(folder: Path, endings: tuple[str, ...]) -> list[Path]:
     """Files of a folder with such names in the order of the numbers in them; no hidden ones.
 
     Raises:
         InputError: the folder cannot be read.
     """
     try:
-        entries = [e for e in folder.iterdir() if is_named(e, endings) and not e.is_dir()]
+        entries = [e for e in folder.iterdir() if has_extension(e, endings) and not e.is_dir()]
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(folder)) from error
     return sorted(entries, key=lambda entry: (_natural(entry.name), entry.name))
 
 
-def is_named(path: Path, endings: tuple[str, ...]) -> bool:
+def has_extension(path: Path, endings: tuple[str, ...]) -> bool:
     """Whether a file's name ends so, in small letters or large, and it is not hidden."""
     return path.name.lower().endswith(endings) and not path.name.startswith(".")
 
 
-def holds_any(folder: Path, endings: tuple[str, ...]) -> bool:
+def contains_files(folder: Path, endings: tuple[str, ...]) -> bool:
     """Whether a folder has such files; False where it cannot be read."""
     try:
-        return any(is_named(entry, endings) and not entry.is_dir() for entry in folder.iterdir())
+        return any(
+            has_extension(entry, endings) and not entry.is_dir() for entry in folder.iterdir()
+        )
     except OSError:
         return False
 
 
-def require_content(path: Path) -> None:
+def require_nonempty_file(path: Path) -> None:
     """Refuse what is no file or holds nothing.
 
     Raises:
@@ -67,7 +69,7 @@ def require_content(path: Path) -> None:
         raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
 
 
-def stem_of(name: str, endings: tuple[str, ...]) -> str:
+def strip_extension(name: str, endings: tuple[str, ...]) -> str:
     """The name without its ending."""
     for ending in endings:
         if name.lower().endswith(ending):
@@ -75,7 +77,7 @@ def stem_of(name: str, endings: tuple[str, ...]) -> str:
     return name
 
 
-def stamps_in(stems: Sequence[str]) -> list[int] | None:
+def stamps_from_names(stems: Sequence[str]) -> list[int] | None:
     """Nanoseconds, where all names end with a time of one kind; else None.
 
     Seconds have decimals; whole numbers have the digits of milli-, micro- or nanoseconds since
@@ -118,7 +120,7 @@ _TOLERANCE = 0.02  # what three decimals leave of a rotation is well within it
 _FAR = 1e9  # m
 
 
-def transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
+def rigid_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
     """(4, 4) of a rotation (3, 3), as good as it was printed, and a translation (3,) in metres.
 
     Raises:
@@ -136,17 +138,17 @@ def transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
     return T
 
 
-def from_row(row: ArrayLike) -> NDArray[np.float64]:
+def pose_from_row(row: ArrayLike) -> NDArray[np.float64]:
     """(4, 4) of the 12 numbers of its first three rows.
 
     Raises:
         ValueError: see `transform`; or another number of numbers.
     """
     upper = np.asarray(row, np.float64).reshape(3, 4)
-    return transform(upper[:, :3], upper[:, 3])
+    return rigid_transform(upper[:, :3], upper[:, 3])
 
 
-def from_quaternion(wxyz: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
+def pose_from_quaternion(wxyz: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
     """(4, 4) of a quaternion, its real part first, and a translation in metres.
 
     Raises:
@@ -155,16 +157,18 @@ def from_quaternion(wxyz: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
     q = np.asarray(wxyz, np.float64)
     if not abs(np.linalg.norm(q) - 1.0) < _TOLERANCE:
         raise ValueError("a quaternion is not of length one")
-    return transform(scipy.spatial.transform.Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix(), t)
+    return rigid_transform(
+        scipy.spatial.transform.Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix(), t
+    )
 
 
-def quaternion(T: NDArray[np.float64]) -> NDArray[np.float64]:
+def quaternion_from_pose(T: NDArray[np.float64]) -> NDArray[np.float64]:
     """(..., 4) w x y z of (..., 4, 4), w not negative."""
     xyzw = scipy.spatial.transform.Rotation.from_matrix(T[..., :3, :3]).as_quat(canonical=True)
     return np.asarray(xyzw)[..., [3, 0, 1, 2]]
 
 
-def in_space(T: NDArray[np.float64]) -> NDArray[np.float64]:
+def embed_in_3d(T: NDArray[np.float64]) -> NDArray[np.float64]:
     """(..., 4, 4) of poses (..., D+1, D+1); those of the plane lie at height 0."""
     if T.shape[-1] == 4:
         return T
@@ -185,7 +189,7 @@ _Number = TypeVar("_Number", np.float32, np.float64)
 _BLOCK = 1 << 20  # beams placed together
 
 
-def one_sensor(recording: Recording, where: str) -> None:
+def require_single_sensor(recording: Recording, where: str) -> None:
     """Refuse recordings of several sensors for formats that know of one.
 
     Raises:
@@ -201,10 +205,10 @@ def sensor_poses(
     recording: Recording, T_map_base: NDArray[np.float64] | None
 ) -> NDArray[np.float64] | None:
     """(T, 4, 4) of the sensors, of robot poses (T, D+1, D+1); None for none."""
-    return None if T_map_base is None else in_space(recording.T_map_sensor(T_map_base))
+    return None if T_map_base is None else embed_in_3d(recording.T_map_sensor(T_map_base))
 
 
-def hits_of(
+def scan_hits(
     recording: Recording, scan: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """(n, 3) hits of a scan in the sensor's frame, and (n,) their times if there are any."""
@@ -214,7 +218,9 @@ def hits_of(
     return _three(recording.points[beams][hit]), times
 
 
-def placed(recording: Recording, T_map_base: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+def iter_map_points(
+    recording: Recording, T_map_base: NDArray[np.float64]
+) -> Iterator[NDArray[np.float64]]:
     """All hits in the map frame, blocks (n, 3) in the recording's order.
 
     Args:

@@ -14,23 +14,23 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.core.files import new_folder
+from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording
-from stillmap.core.timestamps import seconds_text
+from stillmap.core.timestamps import format_seconds
 from stillmap.io.point_cloud import kitti_cameras
-from stillmap.io.point_cloud.binary_table import cut_short, numbers_in, text_lines
+from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers, truncated_error
 from stillmap.io.point_cloud.files import (
-    files_in,
-    from_row,
-    hits_of,
-    one_sensor,
-    require_content,
+    list_files,
+    pose_from_row,
+    require_nonempty_file,
+    require_single_sensor,
+    rigid_transform,
+    scan_hits,
     sensor_poses,
-    transform,
 )
 from stillmap.io.point_cloud.kitti_cameras import Calibration, find_images
-from stillmap.io.point_cloud.kitti_times import read_times, rows_of
-from stillmap.io.point_cloud.scans import Cloud, Known, Source, assembled
+from stillmap.io.point_cloud.kitti_times import assign_rows, read_times
+from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing import laser_scan
 from stillmap.preprocessing.options import ReadOptions
@@ -42,7 +42,7 @@ _EARTH = 6378137.0  # m
 _MOST = 10_000_000  # poses of a file
 
 
-def recorded(
+def read_poses(
     folder: Path, calibration: Calibration, lines: int, files: int
 ) -> tuple[dict[int, NDArray[np.float64]], list[str], bool]:
     """Poses of the laser, by line of the times or by file.
@@ -82,11 +82,11 @@ def _found(folder: Path, calibration: Calibration) -> tuple[Poses, str]:
 
 
 def _rows(path: Path) -> Poses:
-    numbers = numbers_in(text_lines(path), _MOST, range(12), path)
+    numbers = parse_numbers(iter_text_lines(path), _MOST, range(12), path)
     out = []
     for i, row in enumerate(numbers):
         try:
-            out.append(from_row(row))
+            out.append(pose_from_row(row))
         except ValueError as error:
             raise InputError(str(error), where=f"{path}:{i + 1}") from error
     return out
@@ -99,9 +99,9 @@ def _inertial(folder: Path) -> Poses:
     """
     out: Poses = []
     scale = first = None
-    for path in files_in(folder, (".txt",)):
-        require_content(path)
-        numbers = numbers_in(text_lines(path), 1, range(6), path)
+    for path in list_files(folder, (".txt",)):
+        require_nonempty_file(path)
+        numbers = parse_numbers(iter_text_lines(path), 1, range(6), path)
         if not len(numbers):
             raise InputError("is empty", where=str(path))
         latitude, longitude, height, *angles = numbers[0]
@@ -112,7 +112,7 @@ def _inertial(folder: Path) -> Poses:
             place = np.array([x, y, height])
             first = place if first is None else first
             R = scipy.spatial.transform.Rotation.from_euler("ZYX", angles[::-1]).as_matrix()
-            out.append(transform(R, place - first))
+            out.append(rigid_transform(R, place - first))
         except ValueError as error:
             raise InputError(f"is damaged: {error}", where=str(path)) from error
     return out
@@ -130,7 +130,7 @@ _LAYOUTS = (  # sweeps, their times
 )
 
 
-def is_one(path: Path) -> bool:
+def is_kitti_folder(path: Path) -> bool:
     """Whether a folder looks like one of KITTI."""
     return any((path / sweeps).is_dir() for sweeps, _ in _LAYOUTS)
 
@@ -150,38 +150,38 @@ def read(
         InputError: there are no times, or no sweep can be read.
     """
     sweeps, times_file = next(one for one in _LAYOUTS if (path / one[0]).is_dir())
-    files = files_in(path / sweeps, (".bin",))
+    files = list_files(path / sweeps, (".bin",))
     if not files:
         raise InputError("holds no sweep (*.bin)", where=str(path / sweeps))
     if not (path / times_file).is_file():
         hint = "one line for each sweep: its time in seconds"
         raise InputError("does not exist", where=str(path / times_file), hint=hint)
     times = read_times(path / times_file)
-    rows = rows_of(files, len(times), path / times_file)
+    rows = assign_rows(files, len(times), path / times_file)
     calibration = kitti_cameras.find_calibration(path)
-    poses, notes, by_line = recorded(path, calibration, len(times), len(files))
+    poses, notes, by_line = read_poses(path, calibration, len(times), len(files))
     images, more = find_images(path, calibration, times)
-    known = Known(path, "KITTI", [*calibration.warnings, *notes, *more])
+    known = DatasetInfo(path, "KITTI", [*calibration.warnings, *notes, *more])
     sources = []
     for number, (file, row) in enumerate(zip(files, rows, strict=True)):
         stamp_ns = None if row is None else times[row]
         at = row if by_line else number
         T = None if at is None else poses.get(at)
         cloud = partial(_sweep, file, T) if stamp_ns is not None else partial(_no_time, file)
-        sources.append(Source(file.name, cloud, stamp_ns))
-    recording = assembled(sources, known, options, progress, scratch, images=images)
+        sources.append(CloudSource(file.name, cloud, stamp_ns))
+    recording = build_recording(sources, known, options, progress, scratch, images=images)
     if options.spin_stamp is None:
         options = replace(options, spin_stamp=0.0)
     if options.spin == "auto" and sweeps == _RAW:
         options = replace(options, spin="clockwise")
-    return laser_scan.timed(recording, options)
+    return laser_scan.add_beam_times(recording, options)
 
 
 def _sweep(path: Path, T: NDArray[np.float64] | None) -> Cloud:
-    require_content(path)
+    require_nonempty_file(path)
     size = path.stat().st_size
     if size % _RECORD:
-        raise cut_short(path, size // _RECORD, size // _RECORD + 1)
+        raise truncated_error(path, size // _RECORD, size // _RECORD + 1)
     return Cloud(np.fromfile(path, "<f4").reshape(-1, 4)[:, :3], T)
 
 
@@ -197,18 +197,18 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     Raises:
         InputError: `path` is taken or cannot be written to, or there are several sensors.
     """
-    one_sensor(recording, str(path))
+    require_single_sensor(recording, str(path))
     T = recording.T_odom_base if recording.T_recorded_base is None else recording.T_recorded_base
     T = sensor_poses(recording, T)
     digits = max(6, len(str(recording.n_scans)))
-    with new_folder(Path(path), MARK, overwrite) as folder:
+    with atomic_folder(Path(path), MARK, overwrite) as folder:
         (folder / "velodyne").mkdir()
         for scan in recording.in_turn(range(recording.n_scans)):
-            points, _ = hits_of(recording, scan)
+            points, _ = scan_hits(recording, scan)
             rows = np.zeros((len(points), 4), "<f4")
             rows[:, :3] = points
             rows.tofile(folder / "velodyne" / f"{scan:0{digits}d}.bin")
-        stamps = (f"{seconds_text(stamp)}\n" for stamp in recording.stamp_ns.tolist())
+        stamps = (f"{format_seconds(stamp)}\n" for stamp in recording.stamp_ns.tolist())
         (folder / "times.txt").write_text("".join(stamps), encoding="ascii")
         identity = " ".join(f"{value:g}" for value in np.eye(4)[:3].ravel())
         (folder / "calib.txt").write_text(f"Tr: {identity}\n", encoding="ascii")

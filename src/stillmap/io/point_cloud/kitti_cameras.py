@@ -15,8 +15,8 @@ from stillmap.core import se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.io import cameras, images
-from stillmap.io.point_cloud.files import files_in, from_row, transform
-from stillmap.io.point_cloud.kitti_times import read_times, rows_of
+from stillmap.io.point_cloud.files import list_files, pose_from_row, rigid_transform
+from stillmap.io.point_cloud.kitti_times import assign_rows, read_times
 
 _LARGEST = 1 << 20  # bytes of a calibration file
 
@@ -38,7 +38,7 @@ class Calibration:
     warnings: tuple[str, ...] = ()
 
 
-class Lens(NamedTuple):
+class CameraParameters(NamedTuple):
     """A camera: its pinhole matrix (3, 3) and where it sits on the laser (4, 4), if known."""
 
     K: NDArray[np.float64] | None
@@ -58,30 +58,30 @@ def find_calibration(folder: Path) -> Calibration:
     return Calibration()
 
 
-def lens(calibration: Calibration, camera: int) -> Lens:
+def camera_parameters(calibration: Calibration, camera: int) -> CameraParameters:
     """What is known of a camera.
 
     P = K [I | t] projects what the first camera, rectified, sees: t is the way from it to here.
     """
     P = calibration.projection.get(camera)
     if P is None:
-        return Lens(None, None)
+        return CameraParameters(None, None)
     K = P[:, :3].copy()
     if calibration.T_camera_laser is None:
-        return Lens(K, None)
+        return CameraParameters(K, None)
     T = np.eye(4)
     try:
         T[:3, 3] = np.linalg.solve(K, P[:, 3])
     except np.linalg.LinAlgError:
-        return Lens(None, None)
-    return Lens(K, se2.inverse(T @ calibration.T_camera_laser))
+        return CameraParameters(None, None)
+    return CameraParameters(K, se2.inverse(T @ calibration.T_camera_laser))
 
 
 def _of_odometry(entries: dict[str, NDArray[np.float64]]) -> Calibration:
     Tr = next((entries[n] for n in ("Tr", "Tr_velo_cam", "Tr_velo_to_cam") if n in entries), None)
     projection = {n: entries[f"P{n}"] for n in range(4) if f"P{n}" in entries}
     try:
-        T = None if Tr is None else from_row(Tr)
+        T = None if Tr is None else pose_from_row(Tr)
         return Calibration(T, {n: _projection(P) for n, P in projection.items()})
     except ValueError as error:
         raise InputError(f"calib.txt: {error}") from error
@@ -90,15 +90,15 @@ def _of_odometry(entries: dict[str, NDArray[np.float64]]) -> Calibration:
 def _of_raw(folder: Path) -> Calibration:
     try:
         laser = _entries(folder / "calib_velo_to_cam.txt")
-        T, projection, T_laser_imu = transform(laser["R"], laser["T"]), {}, None
+        T, projection, T_laser_imu = rigid_transform(laser["R"], laser["T"]), {}, None
         if (folder / "calib_cam_to_cam.txt").is_file():
             cameras = _entries(folder / "calib_cam_to_cam.txt")
-            T = transform(cameras["R_rect_00"], np.zeros(3)) @ T
+            T = rigid_transform(cameras["R_rect_00"], np.zeros(3)) @ T
             named = {n: cameras.get(f"P_rect_{n:02d}") for n in range(4)}
             projection = {n: _projection(P) for n, P in named.items() if P is not None}
         if (folder / "calib_imu_to_velo.txt").is_file():
             imu = _entries(folder / "calib_imu_to_velo.txt")
-            T_laser_imu = transform(imu["R"], imu["T"])
+            T_laser_imu = rigid_transform(imu["R"], imu["T"])
         return Calibration(T, projection, T_laser_imu)
     except (ValueError, KeyError) as error:
         raise InputError(f"is damaged: {error}", where=str(folder)) from error
@@ -153,17 +153,17 @@ def find_images(
         except InputError as error:
             warnings.append(f"the pictures in {place.name} are not used: {error}")
             continue
-        parts.append(cameras.from_files(found, camera))
-    return cameras.joined(parts) if parts else None, warnings
+        parts.append(cameras.images_from_files(found, camera))
+    return cameras.merge_images(parts) if parts else None, warnings
 
 
 def _of_camera(place: Path, times: list[int | None]) -> list[tuple[int, Path]]:
     """Stamps and files of one camera's pictures."""
     inner = place / "data" if (place / "data").is_dir() else place
-    files = files_in(inner, images.ENDINGS)
+    files = list_files(inner, images.EXTENSIONS)
     own = place / "timestamps.txt"
     times = read_times(own) if own.is_file() else times
-    rows = rows_of(files, len(times), place) if files else []
+    rows = assign_rows(files, len(times), place) if files else []
     stamps = (None if row is None else times[row] for row in rows)
     return [(stamp, file) for stamp, file in zip(stamps, files, strict=True) if stamp is not None]
 
@@ -173,6 +173,6 @@ def _camera(
 ) -> Camera:
     if not found:
         raise InputError("there are none")
-    width, height = images.size_of(found[0][1])
-    K, T = lens(calibration, number)
+    width, height = images.read_image_size(found[0][1])
+    K, T = camera_parameters(calibration, number)
     return Camera(name, width, height, K, "", np.zeros(0), T)

@@ -11,16 +11,16 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.errors import InputError, extra
-from stillmap.core.files import new_file, require_new_file
+from stillmap.core.errors import InputError, import_extra
+from stillmap.core.files import atomic_file, require_new_file
 from stillmap.core.recording import Recording
-from stillmap.io.point_cloud.binary_table import cut_short
-from stillmap.io.point_cloud.files import placed, require_content
-from stillmap.io.point_cloud.scans import Cloud, Growing, Origin, surveyed
+from stillmap.io.point_cloud.binary_table import truncated_error
+from stillmap.io.point_cloud.files import iter_map_points, require_nonempty_file
+from stillmap.io.point_cloud.scans import Cloud, Origin, PointBuffer, read_clouds
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 
-ENDINGS = (".las", ".laz")
+EXTENSIONS = (".las", ".laz")
 MAGIC = b"LASF"
 
 _BLOCK, _BLOCK_BYTES = 1 << 16, 8 << 20  # points read together, bytes of them
@@ -43,21 +43,21 @@ def read(
     Raises:
         InputError: no cloud can be read, or laspy is missing.
     """
-    extra("laspy", path)
-    return surveyed(path, "LAS", ENDINGS, _cloud, options, progress, scratch)
+    import_extra("laspy", path)
+    return read_clouds(path, "LAS", EXTENSIONS, _cloud, options, progress, scratch)
 
 
 def _cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
-    require_content(path)
+    require_nonempty_file(path)
     _require_sound(path)
-    laspy = extra("laspy", path)
-    points, promised, found = Growing(origin, scratch), 0, 0
+    laspy = import_extra("laspy", path)
+    points, promised, found = PointBuffer(origin, scratch), 0, 0
     # one thread: the others believe the sizes of chunks
     backend = laspy.LazBackend.Lazrs
     with _refused(path), laspy.open(path, read_evlrs=False, laz_backend=backend) as reader:
         promised = reader.header.point_count
         if promised > max(_POINTS_PER_BYTE * path.stat().st_size, _SURELY_FINE):
-            raise cut_short(path, 0, promised)
+            raise truncated_error(path, 0, promised)
         rows = max(1, min(_BLOCK, _BLOCK_BYTES // reader.header.point_format.size))
         for block in reader.chunk_iterator(rows):
             if len(block) > rows:
@@ -65,7 +65,7 @@ def _cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
             points.add(np.stack([block.x, block.y, block.z], axis=1))
             found += len(block)
     if found < promised:
-        raise cut_short(path, found, promised)
+        raise truncated_error(path, found, promised)
     return Cloud(points.finished())
 
 
@@ -84,7 +84,7 @@ def _require_sound(path: Path) -> None:
         if not header_size + _EXTRA * extras <= start <= size:
             raise InputError("is damaged: its header", where=str(path))
         if kind & _PACKED:
-            extra("lazrs", path)
+            import_extra("lazrs", path)
         if kind & _PACKED and _chunks(file, start, size) > size // _SMALLEST_CHUNK:
             raise InputError("is damaged: its table of chunks", where=str(path))
 
@@ -136,17 +136,17 @@ def write(
     """
     path = Path(path)
     require_new_file(path, overwrite)
-    laspy = extra("laspy", path, "written")
+    laspy = import_extra("laspy", path, "written")
     head, packed = _header(laspy, poses), path.name.lower().endswith(".laz")
-    with new_file(path) as work, writer_to(work, laspy, head, packed) as writer:
-        for points in placed(recording, poses):
+    with atomic_file(path) as work, open_las_writer(work, laspy, head, packed) as writer:
+        for points in iter_map_points(recording, poses):
             block = laspy.ScaleAwarePointRecord.zeros(len(points), header=head)
             block.x, block.y, block.z = points.T
             writer.write_points(block)
 
 
 @contextmanager
-def writer_to(path: Path, laspy: Any, head: Any, packed: bool) -> Iterator[Any]:
+def open_las_writer(path: Path, laspy: Any, head: Any, packed: bool) -> Iterator[Any]:
     """A writer of laspy.
 
     Args:

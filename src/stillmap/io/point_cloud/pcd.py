@@ -15,23 +15,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.errors import InputError, extra
-from stillmap.core.files import new_folder
+from stillmap.core.errors import InputError, import_extra
+from stillmap.core.files import atomic_folder
 from stillmap.core.recording import Recording
-from stillmap.io.point_cloud.binary_table import Field, Layout, columns, cut_short, require_record
-from stillmap.io.point_cloud.files import (
-    files_in,
-    from_quaternion,
-    hits_of,
-    one_sensor,
-    quaternion,
-    require_content,
-    sensor_poses,
-    stamps_in,
-    stem_of,
+from stillmap.io.point_cloud.binary_table import (
+    Field,
+    TableLayout,
+    check_record_size,
+    read_columns,
+    truncated_error,
 )
-from stillmap.io.point_cloud.point_times import column_of
-from stillmap.io.point_cloud.scans import Cloud, Known, Origin, Source, assembled
+from stillmap.io.point_cloud.files import (
+    list_files,
+    pose_from_quaternion,
+    quaternion_from_pose,
+    require_nonempty_file,
+    require_single_sensor,
+    scan_hits,
+    sensor_poses,
+    stamps_from_names,
+    strip_extension,
+)
+from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, Origin, build_recording
+from stillmap.io.point_cloud.time_field import find_time_column
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 
@@ -49,7 +55,7 @@ _EXPANSION = 100  # what LZF can make of a byte at most, and a little more
 class PcdHeader(NamedTuple):
     """What a file says of itself: `T` is its VIEWPOINT (4, 4), None where that is no pose."""
 
-    layout: Layout
+    layout: TableLayout
     T: NDArray[np.float64] | None
     compressed: bool
 
@@ -65,13 +71,13 @@ def is_pcd(head: bytes) -> bool:
     return False
 
 
-def header(path: Path) -> PcdHeader:
+def read_header(path: Path) -> PcdHeader:
     """Read the header.
 
     Raises:
         InputError: there is none, or it cannot be meant.
     """
-    require_content(path)
+    require_nonempty_file(path)
     with path.open("rb") as file:
         head = file.read(_HEADER)
     if not is_pcd(head):
@@ -105,7 +111,7 @@ def _understood(path: Path, entries: dict[str, list[str]], start: int, lines: in
     kind = entries["DATA"][0].lower()
     if kind not in ("ascii", "binary", "binary_compressed"):
         raise ValueError(f"DATA {kind[:20]}")
-    layout = Layout(path, fields, rows, start, lines, kind == "ascii")
+    layout = TableLayout(path, fields, rows, start, lines, kind == "ascii")
     return PcdHeader(layout, _viewpoint(entries.get("VIEWPOINT")), kind == "binary_compressed")
 
 
@@ -114,7 +120,7 @@ def _viewpoint(words: list[str] | None) -> NDArray[np.float64] | None:
         return np.eye(4)
     try:
         x, y, z, *wxyz = (float(word) for word in words)
-        return from_quaternion(wxyz, (x, y, z))
+        return pose_from_quaternion(wxyz, (x, y, z))
     except (ValueError, IndexError):
         return None
 
@@ -125,7 +131,7 @@ def _field(name: str, kind: str, size: int, count: int) -> Field:
     return Field(name, np.dtype(f"<{_TYPES[kind]}{size}"), count)
 
 
-def values(head: PcdHeader, wanted: list[str]) -> list[NDArray[Any]]:
+def read_values(head: PcdHeader, wanted: list[str]) -> list[NDArray[Any]]:
     """(n,) of each of the wanted columns.
 
     Raises:
@@ -133,15 +139,15 @@ def values(head: PcdHeader, wanted: list[str]) -> list[NDArray[Any]]:
     """
     if head.compressed:
         return _unpacked(head.layout, wanted)
-    blocks = list(columns(head.layout, wanted))
+    blocks = list(read_columns(head.layout, wanted))
     if not blocks:
         return [np.empty(0) for _ in wanted]
     return [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
 
 
-def _unpacked(layout: Layout, wanted: list[str]) -> list[NDArray[Any]]:
+def _unpacked(layout: TableLayout, wanted: list[str]) -> list[NDArray[Any]]:
     """Columns that lie one after the other in one compressed piece."""
-    require_record(layout)
+    check_record_size(layout)
     places = [layout.place(name) for name in wanted]
     size = layout.rows * layout.record
     path = layout.path
@@ -158,12 +164,12 @@ def _unpacked(layout: Layout, wanted: list[str]) -> list[NDArray[Any]]:
     if len(packed) < packed_size or len(sizes) < 8:
         raise InputError("is cut short: its compressed part has no end", where=str(path))
     if unpacked_size < size:
-        raise cut_short(path, unpacked_size // layout.record, layout.rows)
+        raise truncated_error(path, unpacked_size // layout.record, layout.rows)
     if unpacked_size != size or size > _EXPANSION * packed_size:
         what = f"is damaged: {packed_size} bytes cannot be {unpacked_size} when unpacked"
         raise InputError(what, where=str(path))
     try:
-        data = extra("lzf", path).decompress(packed, size)
+        data = import_extra("lzf", path).decompress(packed, size)
     except ValueError:
         data = None
     if data is None or len(data) != size:
@@ -175,7 +181,7 @@ def _unpacked(layout: Layout, wanted: list[str]) -> list[NDArray[Any]]:
     return out
 
 
-ENDINGS = (".pcd",)
+EXTENSIONS = (".pcd",)
 
 MARK = "*.pcd"  # every such folder has one
 
@@ -196,18 +202,20 @@ def read(
     Raises:
         InputError: no scan can be read.
     """
-    files = [path] if path.is_file() else files_in(path, ENDINGS)
-    stamps = stamps_in([stem_of(file.name, ENDINGS) for file in files])
-    known = Known(path, "PCD", [], single=path.is_file())
+    files = [path] if path.is_file() else list_files(path, EXTENSIONS)
+    stamps = stamps_from_names([strip_extension(file.name, EXTENSIONS) for file in files])
+    known = DatasetInfo(path, "PCD", [], single=path.is_file())
     in_world = _lie_around_viewpoints(files)
     if in_world:
         known.warnings.append("points lie around their VIEWPOINT: taken back to the sensor's frame")
     origin = Origin()
     sources = [
-        Source(file.name, partial(_cloud, file, in_world, origin), stamps[i] if stamps else None)
+        CloudSource(
+            file.name, partial(_cloud, file, in_world, origin), stamps[i] if stamps else None
+        )
         for i, file in enumerate(files)
     ]
-    recording = assembled(sources, known, options, progress, scratch)
+    recording = build_recording(sources, known, options, progress, scratch)
     if notes := origin.notes():
         recording.source.update(notes)
         recording.source["warnings"] += origin.warnings()
@@ -215,9 +223,9 @@ def read(
 
 
 def _cloud(path: Path, in_world: bool, origin: Origin) -> Cloud:
-    head = header(path)
-    time = column_of(field.name for field in head.layout.fields)
-    found = values(head, ["x", "y", "z", *([time] if time else [])])
+    head = read_header(path)
+    time = find_time_column(field.name for field in head.layout.fields)
+    found = read_values(head, ["x", "y", "z", *([time] if time else [])])
     points = np.stack(found[:3], axis=1)
     if head.T is None or np.array_equal(head.T, np.eye(4)):
         points = origin.moved(points)
@@ -235,7 +243,7 @@ def _lie_around_viewpoints(files: list[Path]) -> bool:
     farthest, at = None, _FAR_ENOUGH
     for file in files:
         try:
-            T = header(file).T
+            T = read_header(file).T
         except (InputError, OSError):
             continue
         distance = 0.0 if T is None else float(np.linalg.norm(T[:3, 3]))
@@ -264,9 +272,9 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     Raises:
         InputError: `path` is taken or cannot be written to, or there are several sensors.
     """
-    one_sensor(recording, str(path))
+    require_single_sensor(recording, str(path))
     T = sensor_poses(recording, recording.T_recorded_base)
-    with new_folder(Path(path), MARK, overwrite) as folder:
+    with atomic_folder(Path(path), MARK, overwrite) as folder:
         repeats = 0
         for scan in recording.in_turn(range(recording.n_scans)):
             stamp = int(recording.stamp_ns[scan])
@@ -278,10 +286,10 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
 
 
 def _file(recording: Recording, scan: int, T: NDArray[np.float64]) -> bytes:
-    points, times = hits_of(recording, scan)
+    points, times = scan_hits(recording, scan)
     rows = points if times is None else np.column_stack([points, times])
     names = ["x", "y", "z", "time"][: rows.shape[1]]
-    viewpoint = " ".join(f"{value:.17g}" for value in (*T[:3, 3], *quaternion(T)))
+    viewpoint = " ".join(f"{value:.17g}" for value in (*T[:3, 3], *quaternion_from_pose(T)))
     header = (
         "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",

@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import new_file, require_new_file
+from stillmap.core.files import atomic_file, require_new_file
 from stillmap.core.recording import Recording
-from stillmap.io.point_cloud.binary_table import Field, Layout, columns
-from stillmap.io.point_cloud.files import placed, require_content
-from stillmap.io.point_cloud.scans import Cloud, Growing, Origin, surveyed
+from stillmap.io.point_cloud.binary_table import Field, TableLayout, read_columns
+from stillmap.io.point_cloud.files import iter_map_points, require_nonempty_file
+from stillmap.io.point_cloud.scans import Cloud, Origin, PointBuffer, read_clouds
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 
-ENDINGS = (".ply",)
+EXTENSIONS = (".ply",)
 
 _HEADER = 1 << 16  # bytes in which it must end
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -39,23 +39,23 @@ def read(
     Raises:
         InputError: no cloud can be read.
     """
-    return surveyed(path, "PLY", ENDINGS, _cloud, options, progress, scratch)
+    return read_clouds(path, "PLY", EXTENSIONS, _cloud, options, progress, scratch)
 
 
 def _cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
-    points = Growing(origin, scratch)
-    for block in columns(layout_of(path), ("x", "y", "z")):
+    points = PointBuffer(origin, scratch)
+    for block in read_columns(read_layout(path), ("x", "y", "z")):
         points.add(np.stack(block, axis=1))
     return Cloud(points.finished())
 
 
-def layout_of(path: Path) -> Layout:
+def read_layout(path: Path) -> TableLayout:
     """Where the vertices lie.
 
     Raises:
         InputError: no PLY file, or one whose vertices cannot be found.
     """
-    require_content(path)
+    require_nonempty_file(path)
     with path.open("rb") as file:
         head = file.read(_HEADER)
     lines, start = _header(head, path)
@@ -80,7 +80,7 @@ def _header(head: bytes, path: Path) -> tuple[list[list[str]], int]:
     return lines, at
 
 
-def _understood(path: Path, lines: list[list[str]], start: int) -> Layout:
+def _understood(path: Path, lines: list[list[str]], start: int) -> TableLayout:
     encoding, order = "", ""
     elements: list[tuple[str, int, list[Field | None]]] = []  # None: a list
     for words in lines[1:-1]:
@@ -100,7 +100,7 @@ def _understood(path: Path, lines: list[list[str]], start: int) -> Layout:
         if name == "vertex":
             if len(plain) < len(fields):
                 raise ValueError("its vertices hold lists")
-            return Layout(path, plain, rows, start, before, text)
+            return TableLayout(path, plain, rows, start, before, text)
         if len(plain) < len(fields) and not text:
             raise ValueError("lists come before its vertices")
         start += rows * sum(field.size for field in plain)
@@ -125,9 +125,9 @@ def write(
     path = Path(path)
     require_new_file(path, overwrite)
     n = int(np.count_nonzero(recording.hit))
-    with new_file(path) as work, work.open("wb") as file:
+    with atomic_file(path) as work, work.open("wb") as file:
         names = "".join(f"property double {name}\n" for name in "xyz")
         head = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{names}end_header\n"
         file.write(head.encode())
-        for points in placed(recording, poses):
+        for points in iter_map_points(recording, poses):
             file.write(points.astype("<f8").tobytes())

@@ -14,13 +14,18 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.io.point_cloud.binary_table import numbers_in, text_lines
-from stillmap.io.point_cloud.files import files_in, require_content, stem_of, transform
-from stillmap.io.point_cloud.scans import Cloud, Known, Source, assembled
+from stillmap.io.point_cloud.binary_table import iter_text_lines, parse_numbers
+from stillmap.io.point_cloud.files import (
+    list_files,
+    require_nonempty_file,
+    rigid_transform,
+    strip_extension,
+)
+from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 
-ENDINGS = (".3d", ".3d.gz")
+EXTENSIONS = (".3d", ".3d.gz")
 
 _LARGEST_UNPACKED = 1 << 30  # bytes
 _LARGEST_POSE = 1 << 12  # bytes
@@ -43,14 +48,14 @@ def read(
     Raises:
         InputError: no scan can be read.
     """
-    files = [path] if path.is_file() else files_in(path, ENDINGS)
-    known = Known(path, "3DTK", [], single=path.is_file())
+    files = [path] if path.is_file() else list_files(path, EXTENSIONS)
+    known = DatasetInfo(path, "3DTK", [], single=path.is_file())
     code = _code(files) if options.max_range is None else None
     if code is not None:
         known.warnings.append(f"nothing came back from {code:.2f} m on: a code of the laser")
         options = replace(options, max_range=code)
-    sources = [Source(file.name, partial(_cloud, file)) for file in files]
-    return assembled(sources, known, options, progress, scratch)
+    sources = [CloudSource(file.name, partial(_cloud, file)) for file in files]
+    return build_recording(sources, known, options, progress, scratch)
 
 
 def _code(files: list[Path]) -> float | None:
@@ -74,14 +79,14 @@ def _code(files: list[Path]) -> float | None:
 
 
 def _cloud(path: Path) -> Cloud:
-    require_content(path)
-    lines = text_lines(path, limit=_LARGEST_UNPACKED)
+    require_nonempty_file(path)
+    lines = iter_text_lines(path, limit=_LARGEST_UNPACKED)
     blocks = []
     # the first line may be a size or a heading
     first = next(lines, b"")
     if len(first.split()) >= 3 and not first.lstrip().startswith(b"#"):
-        blocks.append(numbers_in(iter([first]), 1, (0, 1, 2), path))
-    while len(block := numbers_in(lines, _BLOCK, (0, 1, 2), path)):
+        blocks.append(parse_numbers(iter([first]), 1, (0, 1, 2), path))
+    while len(block := parse_numbers(lines, _BLOCK, (0, 1, 2), path)):
         blocks.append(block)
     points = np.concatenate(blocks) if blocks else np.empty((0, 3))
     return Cloud(_METRES * points @ _AXES.T, _pose(path))
@@ -89,7 +94,7 @@ def _cloud(path: Path) -> Cloud:
 
 def _pose(path: Path) -> NDArray[np.float64] | None:
     """(4, 4) of the file beside a scan; None where there is none that can be used."""
-    file = path.with_name(stem_of(path.name, ENDINGS) + ".pose")
+    file = path.with_name(strip_extension(path.name, EXTENSIONS) + ".pose")
     try:
         if not file.is_file():
             return None
@@ -98,6 +103,6 @@ def _pose(path: Path) -> NDArray[np.float64] | None:
         numbers = np.array([float(word) for word in words[:6]])
         position, angles = numbers.reshape(2, 3)
         R = scipy.spatial.transform.Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
-        return transform(_AXES @ R @ _AXES.T, _METRES * _AXES @ position)
+        return rigid_transform(_AXES @ R @ _AXES.T, _METRES * _AXES @ position)
     except (OSError, ValueError):
         return None

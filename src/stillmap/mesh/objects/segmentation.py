@@ -11,18 +11,18 @@ from scipy.spatial import cKDTree
 from stillmap.core import arrays
 from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
 from stillmap.mesh import range_image
-from stillmap.mesh.inputs import Sources
-from stillmap.mesh.objects.frame import Way
-from stillmap.mesh.objects.sweep_surface import Look
+from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.objects.frame import ObjectFrame
+from stillmap.mesh.objects.sweep_surface import ObjectBeams
 from stillmap.mesh.options import MoverOptions
-from stillmap.mesh.texture.occluders import Thing
+from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.tracking import MovingObject
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 Index = NDArray[np.intp]
 
-NOBODY = -1
+NO_OWNER = -1
 _FAR = 1000.0  # m
 _OFTEN = 0.9  # of the time something is not faster
 _REACH = 3.0  # m, from the middle of a car to its ends
@@ -34,7 +34,7 @@ _BEYOND = 0.05  # rad beyond a thing, up to where beams are beside it
 SPACING = 0.025  # rad between beams, at most
 
 
-class Moves(NamedTuple):
+class DynamicReturns(NamedTuple):
     """The K beams of a recording that ended on what moves.
 
     Attributes:
@@ -54,19 +54,19 @@ class Moves(NamedTuple):
     planar: bool
 
     @classmethod
-    def of(cls, sources: Sources) -> "Moves":
+    def of(cls, sources: MeshInputs) -> "DynamicReturns":
         """All that moves, once for all things."""
         seen, objects = sources.seen, sources.objects
         owned = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in objects)])
         whose = np.repeat([one.id for one in objects], [len(one.beams) for one in objects])
         beam = np.union1d(_dynamic(seen.hit, sources.p_static), owned).astype(np.intp)
-        owner = np.full(len(beam), NOBODY, np.int32)
+        owner = np.full(len(beam), NO_OWNER, np.int32)
         owner[np.searchsorted(beam, owned)] = whose
         dynamic = seen.hit[beam] & (sources.p_static[beam] < DYNAMIC_BELOW)
-        seconds, ends = seconds_of(beam, sources), seen.end_points(beam, sources.poses)
+        seconds, ends = beam_seconds(beam, sources), seen.end_points(beam, sources.poses)
         asked = np.unique(np.linspace(0, seen.n_scans - 1, min(seen.n_scans, _ASKED)).astype(int))
         planar = [
-            range_image.is_planar(range_image.directions(seen.points[seen.beams_of(t)]))
+            range_image.is_planar(range_image.beam_directions(seen.points[seen.beams_of(t)]))
             for t in asked
         ]
         return cls(beam, seconds, ends, owner, dynamic, 2 * sum(planar) > len(planar))
@@ -86,7 +86,7 @@ def _dynamic(hit: Bool, p_static: NDArray[np.float32]) -> Index:
     return np.concatenate(found)
 
 
-def seconds_of(beams: Index, sources: Sources) -> Float:
+def beam_seconds(beams: Index, sources: MeshInputs) -> Float:
     """(n,) when beams (n,), rising, were taken, by the time of boxes."""
     recording = sources.recording
     times = recording.stamp_ns[recording.scans_of(beams)]
@@ -95,7 +95,7 @@ def seconds_of(beams: Index, sources: Sources) -> Float:
     return np.asarray(1e-9 * (times - sources.start_ns), np.float64)
 
 
-def scans_about(first: float, last: float, sources: Sources) -> slice:
+def scans_within(first: float, last: float, sources: MeshInputs) -> slice:
     """The scans that have beams of these times, and some others beside."""
     stamps = 1e-9 * (sources.seen.stamp_ns - sources.start_ns)
     reach = 1e-9 * sources.longest_scan_ns
@@ -104,19 +104,19 @@ def scans_about(first: float, last: float, sources: Sources) -> slice:
     return slice(max(a, 0), min(b, len(stamps)))
 
 
-def fast(thing: Thing, options: MoverOptions) -> bool:
+def is_fast(thing: TrackedBox, options: MoverOptions) -> bool:
     """Whether it is faster than people are."""
     speed = np.linalg.norm(thing.box.velocity, axis=1)
     return bool(np.quantile(speed, _OFTEN) > options.fast)
 
 
-def large(thing: Thing, options: MoverOptions) -> bool:
+def is_large(thing: TrackedBox, options: MoverOptions) -> bool:
     """Whether it is longer or wider than people are."""
     return 2.0 * max(thing.box.half_size) >= options.rigid
 
 
-def own_moves(
-    one: MovingObject, thing: Thing, moves: Moves, sources: Sources, options: MoverOptions
+def segment_object(
+    one: MovingObject, thing: TrackedBox, moves: DynamicReturns, sources: MeshInputs, options: MoverOptions
 ) -> Index:
     """(n,) of what moves that which ended on a thing: rising numbers within `moves`.
 
@@ -134,22 +134,22 @@ def own_moves(
     low, high = way.min(axis=0) - reach, way.max(axis=0) + reach
     x, y = moves.ends[some, 0], moves.ends[some, 1]
     near = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
-    near &= (moves.owner[some] == one.id) | (moves.owner[some] == NOBODY)
+    near &= (moves.owner[some] == one.id) | (moves.owner[some] == NO_OWNER)
     number = some.start + np.flatnonzero(near)
-    at = Way.of_track(thing).local(moves.seconds[number], moves.ends[number])
+    at = ObjectFrame.of_track(thing).local(moves.seconds[number], moves.ends[number])
     inside = (np.abs(at[:, :2]) <= half).all(axis=1)
     inside &= (at[:, 2] > options.low) & (at[:, 2] <= thing.tall + options.margin)
     # a track of somebody may take hold of who stands beside
     mine = (np.abs(at[:, :2]) <= half + options.margin).all(axis=1)
-    if large(thing, options) and not fast(thing, options):
+    if is_large(thing, options) and not is_fast(thing, options):
         # the middle of what is seen of it goes to and fro on it
         mine = np.linalg.norm(at[:, :2], axis=1) <= _REACH
     kept = np.where(moves.owner[number] == one.id, mine, inside)
     return np.asarray(number[kept], np.intp)
 
 
-def grown(
-    own: Index, within: Index, way: Way, place: Float, moves: Moves, options: MoverOptions
+def grow_segment(
+    own: Index, within: Index, way: ObjectFrame, place: Float, moves: DynamicReturns, options: MoverOptions
 ) -> Index:
     """(n,) of what moves that which hangs together with what is known to be of a thing.
 
@@ -174,21 +174,21 @@ def grown(
         return own
     away = float(np.median(np.linalg.norm(at - place, axis=1)))
     link = options.link + SPACING * away
-    piece = pieces_of_cells(at, _CELL, link)
+    piece = cluster_cells(at, _CELL, link)
     mine = np.isin(within, own)
     return np.union1d(own, within[np.isin(piece, piece[mine])])
 
 
-def pieces_of_cells(points: Float, edge: float, link: float) -> Index:
+def cluster_cells(points: Float, edge: float, link: float) -> Index:
     """(n,) which piece points (n, 3) are of: their cells are at most `link` metres apart."""
-    cells, of = distinct_cells(points, edge)
+    cells, of = unique_cells(points, edge)
     one, other = cKDTree(cells).query_pairs(link / edge, output_type="ndarray").T
     n = len(cells)
     graph = coo_matrix((np.ones(len(one), np.int8), (one, other)), (n, n))
     return np.asarray(connected_components(graph, directed=False)[1][of], np.intp)
 
 
-def distinct_cells(points: Float, edge: float) -> tuple[Float, Index]:
+def unique_cells(points: Float, edge: float) -> tuple[Float, Index]:
     """(m, 3) the cells that points (n, 3) lie in, numbers along each axis, and (n,) whose is which.
 
     Rising, as `np.unique` has them, which takes ten times as long for rows.
@@ -204,7 +204,7 @@ def distinct_cells(points: Float, edge: float) -> tuple[Float, Index]:
     return distinct.astype(np.float64), of
 
 
-def look_of(beams: Index, seconds: Float, way: Way, sources: Sources) -> Look:
+def beams_in_frame(beams: Index, seconds: Float, way: ObjectFrame, sources: MeshInputs) -> ObjectBeams:
     """Beams (n,), rising, taken at times (n,), in a thing's own frame.
 
     Those that came back from nowhere go on for a kilometre.
@@ -219,10 +219,10 @@ def look_of(beams: Index, seconds: Float, way: Way, sources: Sources) -> Look:
             _FAR / np.linalg.norm(ends - origin, axis=1, keepdims=True)
         )
     ends = np.where(seen.hit[beams][:, None], ends, far)
-    return Look.of(ends, origin, seconds, way)
+    return ObjectBeams.of(ends, origin, seconds, way)
 
 
-def about_as(mine: Index, beams: Index, sources: Sources) -> Bool:
+def in_viewing_cone(mine: Index, beams: Index, sources: MeshInputs) -> Bool:
     """(n,) which of beams (n,) look about where others, n > 0, ended; unknown ones do not."""
     seen = sources.seen
     middle = seen.end_points(mine, sources.poses).mean(axis=0)
@@ -231,7 +231,7 @@ def about_as(mine: Index, beams: Index, sources: Sources) -> Bool:
     return np.asarray(other >= np.cos(min(float(widest), np.pi)))
 
 
-def _towards(middle: Float, beams: Index, sources: Sources) -> Float:
+def _towards(middle: Float, beams: Index, sources: MeshInputs) -> Float:
     """(n,) cosine of the angle between beams and the way from the sensor to a place (3,)."""
     seen = sources.seen
     first, last = seen.scans_of(beams[[0, -1]]) if len(beams) else (0, -1)
@@ -239,5 +239,5 @@ def _towards(middle: Float, beams: Index, sources: Sources) -> Float:
     T = sources.poses[scans] @ seen.T_base_sensor[seen.sensor[scans]]
     axis = np.einsum("nji,nj->ni", T[:, :3, :3], middle - T[:, :3, 3])
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    looking = range_image.directions(seen.points[beams])
+    looking = range_image.beam_directions(seen.points[beams])
     return np.asarray(np.einsum("ni,ni->n", looking, axis[seen.scans_of(beams) - first]))

@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from stillmap.core.camera import is_in_image, project
-from stillmap.mesh.background import Ahead, looked_up
-from stillmap.mesh.objects.reconstruction import Shape
+from stillmap.mesh.background import Background, sample_buffer
+from stillmap.mesh.objects.reconstruction import ObjectShape
 from stillmap.mesh.options import ChoiceOptions, MoverOptions, VisibleOptions
-from stillmap.mesh.place import Painted, settled
-from stillmap.mesh.simplification import divided
-from stillmap.mesh.texture.occluders import Thing, at_time, in_the_way
-from stillmap.mesh.texture.view_selection import NONE, Candidates, utility
+from stillmap.mesh.place import ViewAssignment, resolve_assignment
+from stillmap.mesh.simplification import subdivide
+from stillmap.mesh.texture.occluders import TrackedBox, boxes_at, occlusion_probability
+from stillmap.mesh.texture.view_selection import NONE, Candidates, view_utility
 from stillmap.mesh.texture.views import View
-from stillmap.mesh.texture.visibility import depths_of, visible
+from stillmap.mesh.texture.visibility import render_depth, find_visible_faces
 from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]
@@ -26,7 +26,7 @@ _SCRAPS = 0.05  # of its area: less is no picture of it
 
 
 @dataclass(frozen=True, eq=False)
-class Dressed:
+class TexturedViews:
     """A moving thing's surface and what paints it, in the thing's own frame.
 
     Attributes:
@@ -34,32 +34,32 @@ class Dressed:
         views: pictures, as if the thing had stood still: `T_camera_map` is T_camera_object.
     """
 
-    painted: Painted
+    painted: ViewAssignment
     views: list[View]
 
 
-def when_in_view(thing: Thing, views: Sequence[View], start_ns: int) -> Float:
+def times_in_view(thing: TrackedBox, views: Sequence[View], start_ns: int) -> Float:
     """(N,) s, when views show the middle of a thing, by the time of its box; NaN: not."""
     seconds = np.array([1e-9 * (view.stamp_ns - start_ns) for view in views])
     out = np.full(len(views), np.nan)
     for k, (view, now) in enumerate(zip(views, seconds.tolist(), strict=True)):
-        for cuboid in at_time([thing], now):
+        for cuboid in boxes_at([thing], now):
             uv, ok = project(view.camera, view.in_camera(cuboid.middle[None]))
             if ok[0] and is_in_image(view.camera, uv)[0]:
                 out[k] = now
     return out
 
 
-def dressed(
-    shape: Shape,
+def assign_object_views(
+    shape: ObjectShape,
     views: Sequence[View],
-    place: Ahead,
-    things: Sequence[Thing],
+    place: Background,
+    things: Sequence[TrackedBox],
     start_ns: int,
     options: MoverOptions,
     choice: ChoiceOptions,
     limits: VisibleOptions,
-) -> Dressed:
+) -> TexturedViews:
     """Chooses for each face of what moved the view that shows it best.
 
     A view may paint a face if the place does not hide it, if no other thing is likely to, and if it
@@ -75,11 +75,11 @@ def dressed(
         start_ns: when the time of the things begins.
         options, choice, limits: see there.
     """
-    mesh, _ = divided(shape.mesh, min(choice.edge, options.edge))
+    mesh, _ = subdivide(shape.mesh, min(choice.edge, options.edge))
     candidates = Candidates.none(len(mesh), choice.candidates)
     sharpest, own = Candidates.none(len(mesh), 1), list[View]()
     others = [one for one in things if one.box.object_id != shape.id]
-    seconds = when_in_view(shape.way.thing, views, start_ns)
+    seconds = times_in_view(shape.way.thing, views, start_ns)
     for number, (view, now) in enumerate(zip(views, seconds.tolist(), strict=True)):
         away = max(shape.span[0] - now, now - shape.span[1], 0.0)
         if np.isnan(now) or (not shape.rigid and away > options.near):
@@ -87,7 +87,7 @@ def dressed(
         T_map_object = shape.way.T_map_object(now)
         rim = options.rim + options.drift * (0.0 if shape.rigid else _gone(shape, now))
         moved = replace(view, T_camera_map=view.T_camera_map @ T_map_object)
-        found = visible(mesh, moved, limits)
+        found = find_visible_faces(mesh, moved, limits)
         faces = np.flatnonzero(found.seen)
         within = _within(mesh, faces, moved, limits)
         points = mesh.centres[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
@@ -95,23 +95,23 @@ def dressed(
         faces, points = faces[own_colours], points[own_colours]
         if not len(faces):
             continue
-        hidden = in_the_way(at_time(others, now), view.place, points, choice.margin, choice.sigma)
+        hidden = occlusion_probability(boxes_at(others, now), view.place, points, choice.margin, choice.sigma)
         pixels = found.pixels[faces].astype(np.float64)
-        good = utility(1.0 - hidden, pixels, mesh.areas()[faces], replace(choice, believe=True))
+        good = view_utility(1.0 - hidden, pixels, mesh.areas()[faces], replace(choice, believe=True))
         if not shape.rigid:  # who walks looks otherwise a moment later
             good -= away / max(options.near, _LEAST)
         candidates.add(len(own), faces, good, 1.0 - hidden)
         sharpest.add(len(own), faces, pixels, 1.0 - hidden)
         own.append(moved)
-    painted = settled(mesh, candidates, sharpest, choice.border)
+    painted = resolve_assignment(mesh, candidates, sharpest, choice.border)
     areas = mesh.areas()
     if areas[painted.view >= 0].sum() < _SCRAPS * areas.sum():
         painted = replace(painted, view=np.full_like(painted.view, NONE))
-    return Dressed(painted, own)
+    return TexturedViews(painted, own)
 
 
 def _shows_it(
-    points: Float, within: Float, number: int, place: Ahead, options: MoverOptions
+    points: Float, within: Float, number: int, place: Background, options: MoverOptions
 ) -> NDArray[np.bool_]:
     """(n,) whether a view shows a thing where it has points (n, 3) in the map frame.
 
@@ -127,7 +127,7 @@ def _shows_it(
     return shown
 
 
-def _gone(shape: Shape, seconds: float) -> float:
+def _gone(shape: ObjectShape, seconds: float) -> float:
     """Metres that a thing went from when its shape was seen to a time."""
     there = shape.way.thing.box.center_at(np.array([shape.seconds, seconds]))
     return float(np.linalg.norm(there[1] - there[0]))
@@ -138,8 +138,8 @@ def _within(mesh: Mesh, faces: NDArray[np.intp], view: View, limits: VisibleOpti
     if not len(faces):
         return np.zeros(0)
     points = view.in_camera(mesh.vertices)
-    depths = depths_of(mesh, view, points[np.unique(mesh.faces[faces])], limits.scale, limits.near)
+    depths = render_depth(mesh, view, points[np.unique(mesh.faces[faces])], limits.scale, limits.near)
     far = ndimage.distance_transform_edt(np.pad(depths.face >= 0, 1))[1:-1, 1:-1]
     at = np.concatenate([points[mesh.faces[faces]], points[mesh.faces[faces]].mean(1)[:, None]], 1)
-    metres = looked_up(far, depths, at) * at[..., 2] / depths.K[0, 0]
+    metres = sample_buffer(far, depths, at) * at[..., 2] / depths.K[0, 0]
     return np.asarray(metres.min(axis=1))

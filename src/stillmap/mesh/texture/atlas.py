@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 import stillmap._core as _core
 from stillmap.core import camera
-from stillmap.core.errors import extra
+from stillmap.core.errors import import_extra
 from stillmap.mesh.options import TextureOptions
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.triangle_mesh import Mesh
@@ -37,7 +37,7 @@ _FULL = 0.6  # of the pages that charts fill, at first sight
 _SMALLER = 0.85  # scale after each time that they need more pages
 
 
-class Layout(NamedTuple):
+class AtlasLayout(NamedTuple):
     """Places of F faces on P pages.
 
     Attributes:
@@ -59,7 +59,7 @@ class Layout(NamedTuple):
     sizes: Number
 
 
-def laid_out(mesh: Mesh, view_of_face: Index, views: list[View], options: TextureOptions) -> Layout:
+def build_layout(mesh: Mesh, view_of_face: Index, views: list[View], options: TextureOptions) -> AtlasLayout:
     """Charts of all faces that a picture paints, on as many pages as they need.
 
     Args:
@@ -72,7 +72,7 @@ def laid_out(mesh: Mesh, view_of_face: Index, views: list[View], options: Textur
         MissingExtra: xatlas is not installed.
     """
     view, pixels = _in_pictures(mesh, view_of_face, views)
-    chart = charts_of(mesh, view)
+    chart = find_charts(mesh, view)
     painted = np.flatnonzero(chart >= 0)
     # a vertex of each chart: what charts share, they share no longer
     key = chart[painted, None] * np.int64(len(mesh.vertices)) + mesh.faces[painted]
@@ -86,7 +86,7 @@ def laid_out(mesh: Mesh, view_of_face: Index, views: list[View], options: Textur
     return _with_grey(mesh, view, painted, vertex, corner, placed, page, scale[of_chart], options)
 
 
-def charts_of(mesh: Mesh, view: Index) -> Number:
+def find_charts(mesh: Mesh, view: Index) -> Number:
     """(F,) int64 the chart of each face: faces side by side with one picture; -1 without one."""
     F = len(mesh)
     pairs = mesh.pairs()
@@ -177,7 +177,7 @@ def _places(
     """
     if not len(corner):
         return np.zeros((0, 2)), np.zeros(0, np.int64)
-    xatlas: Any = extra("xatlas", "mesh.glb", "textured", group="mesh")
+    xatlas: Any = import_extra("xatlas", "mesh.glb", "textured", group="mesh")
     atlas = xatlas.Atlas()
     atlas.add_uv_mesh(
         np.ascontiguousarray(local, np.float32),
@@ -208,7 +208,7 @@ def _with_grey(
     page: Number,
     scale: Float,
     options: TextureOptions,
-) -> Layout:
+) -> AtlasLayout:
     """The layout of all faces: those that have a place, and the others with vertices of their
     own."""
     there = (page[corner] >= 0).all(axis=1)
@@ -224,7 +224,7 @@ def _with_grey(
     grey = page_of_face < 0
     used, at = np.unique(mesh.faces[grey], return_inverse=True)
     faces[grey] = at.reshape(-1, 3) + len(vertex)
-    return Layout(
+    return AtlasLayout(
         np.concatenate([vertex, used]).astype(np.int32),
         faces.astype(np.int32),
         np.concatenate([placed, np.zeros((len(used), 2))]),
@@ -235,11 +235,11 @@ def _with_grey(
     )
 
 
-GREY = (128, 128, 128)  # what no picture shows
+GRAY = (128, 128, 128)  # what no picture shows
 
 
 @dataclass(frozen=True, eq=False)
-class Textured:
+class TexturedMesh:
     """F faces over U vertices, and P pages of texels.
 
     Where pieces of the texture meet, vertices stand there once for each piece.
@@ -279,7 +279,7 @@ class Textured:
         return out.reshape(h, w)
 
 
-def replaced(whole: Textured, of: NDArray[np.bool_], part: Textured) -> Textured:
+def replaced(whole: TexturedMesh, of: NDArray[np.bool_], part: TexturedMesh) -> TexturedMesh:
     """A mesh some of whose faces are painted otherwise.
 
     Args:
@@ -293,7 +293,7 @@ def replaced(whole: Textured, of: NDArray[np.bool_], part: Textured) -> Textured
     faces[of] = part.faces + np.int32(len(whole.vertices))
     page[of] = np.where(part.page >= 0, part.page + np.int32(len(whole.pages)), part.page)
     view[of] = part.view
-    return Textured(
+    return TexturedMesh(
         np.concatenate([whole.vertices, part.vertices]),
         faces,
         np.concatenate([whole.uv, part.uv]),

@@ -35,7 +35,7 @@ _NEAREST = 0.05  # m from the camera: what is nearer is the camera's own
 _RADII = 12  # cells at most, by which an end point is grown
 
 
-class Told(NamedTuple):
+class OcclusionMask(NamedTuple):
     """What beams say, on a grid of h by w cells over a picture.
 
     Attributes:
@@ -70,7 +70,7 @@ class Told(NamedTuple):
         return np.where(hidden, np.minimum(still, 1.0 - self.dynamic[row, column]), still)
 
 
-def told(view: View, points: Float, p_static: NDArray[np.float32], margin: float) -> Told:
+def build_occlusion_mask(view: View, points: Float, p_static: NDArray[np.float32], margin: float) -> OcclusionMask:
     """What beams say of a picture.
 
     Args:
@@ -94,7 +94,7 @@ def told(view: View, points: Float, p_static: NDArray[np.float32], margin: float
         first = _nearest_of_each(at, away)  # what lies behind in the same cell hides nothing more
         focal = _focal(camera) / cell
         _grow(depth, dynamic, at[first], away[first], p[first], focal, margin)
-    return Told(cell, depth, dynamic, support)
+    return OcclusionMask(cell, depth, dynamic, support)
 
 
 def _focal(camera: Camera) -> float:
@@ -167,7 +167,7 @@ _NEVER = np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True, eq=False)
-class Beams:
+class LidarReturns:
     """T scans with M beams of a recording in 3D, to be asked for by time.
 
     Attributes:

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2, se3
-from stillmap.core.camera import Camera, Images, unusable
+from stillmap.core.camera import Camera, Images, calibration_error
 from stillmap.core.config import option
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.slam.deskew import FASTEST, FASTEST_TURN
+from stillmap.slam.deskew import MAX_SPEED, MAX_TURN_RATE
 
 Index = NDArray[np.intp]
 
@@ -59,7 +59,7 @@ _TRIED = 5  # pictures of a camera that are looked at to find one that can be re
 
 _STILL = (0.02, np.radians(0.5))  # m, rad: who moved less over a pause stood
 
-UNREAD = "pictures that cannot be read"
+UNREADABLE = "pictures that cannot be read"
 
 _BEYOND = "taken when nobody knows where the robot was"
 
@@ -84,7 +84,7 @@ class ViewOptions:
             raise ValueError("pause must be positive, and beyond not negative")
 
 
-def views_of(
+def find_views(
     recording: Recording, poses: Float, options: ViewOptions | None = None
 ) -> tuple[list[View], dict[str, int]]:
     """Pictures with a calibrated lens and a known place, and why the others are left out.
@@ -106,7 +106,7 @@ def views_of(
         return [], {}
     options = options or ViewOptions()
     cameras = [_usable(images, number) for number in range(len(images.cameras))]
-    T_map_base, why_not = poses_at(recording.stamp_ns, poses, images.stamp_ns, options)
+    T_map_base, why_not = interpolate_poses(recording.stamp_ns, poses, images.stamp_ns, options)
     views, left_out = [], Counter[str]()
     for image, number in enumerate(images.camera.tolist()):
         camera, reason = cameras[number]
@@ -120,18 +120,18 @@ def views_of(
     return views, dict(left_out)
 
 
-def usable(recording: Recording) -> tuple[Mask, dict[str, int]]:
+def usable_images(recording: Recording) -> tuple[Mask, dict[str, int]]:
     """(N,) which images could be used, were the poses known; and how many could not, by reason."""
     out = np.zeros(0 if recording.images is None else len(recording.images), np.bool_)
     if recording.dimension != 3:
         return out, {"of a recording in 2D": len(out)} if len(out) else {}
     still = np.broadcast_to(np.eye(4), (recording.n_scans, 4, 4))
-    views, left_out = views_of(recording, still)
+    views, left_out = find_views(recording, still)
     out[[view.image for view in views]] = True
     return out, left_out
 
 
-def readable(
+def filter_readable(
     images: Images | None, views: Sequence[View], tell: Tell | None = None
 ) -> tuple[list[View], list[str]]:
     """The views whose pictures can be read, and for each of the others a line that says why not.
@@ -145,7 +145,7 @@ def readable(
     for number, view in enumerate(views):
         assert images is not None
         try:
-            of_colours(images.read(view.image), view)
+            as_color_image(images.read(view.image), view)
             kept.append(view)
         except InputError as error:
             unread.append(str(error))
@@ -154,15 +154,15 @@ def readable(
     return kept, unread
 
 
-def colours_of(images: Images, view: View) -> NDArray[np.uint8] | None:
+def read_color_image(images: Images, view: View) -> NDArray[np.uint8] | None:
     """(height, width, 3) the picture of a view; None where it is damaged, or no longer there."""
     try:
-        return of_colours(images.read(view.image), view)
+        return as_color_image(images.read(view.image), view)
     except InputError:
         return None
 
 
-def of_colours(picture: NDArray[Any], view: View) -> NDArray[np.uint8]:
+def as_color_image(picture: NDArray[Any], view: View) -> NDArray[np.uint8]:
     """(height, width, 3) the picture of a view with three colours.
 
     Args:
@@ -181,7 +181,7 @@ def of_colours(picture: NDArray[Any], view: View) -> NDArray[np.uint8]:
     return np.broadcast_to(picture[:, :, :3], (*picture.shape[:2], 3))
 
 
-def poses_at(
+def interpolate_poses(
     stamp_ns: NDArray[np.int64], poses: Float, wanted_ns: NDArray[np.int64], options: ViewOptions
 ) -> tuple[Float, list[str]]:
     """Where the robot was at other times than its scans'.
@@ -210,7 +210,7 @@ def poses_at(
     moved, turned = np.linalg.norm(twist[:, :3], axis=1), np.linalg.norm(twist[:, 3:], axis=1)
     pause = seconds > options.pause
     stood = (moved <= _STILL[0]) & (turned <= _STILL[1])
-    leap = (moved > FASTEST * seconds) | (turned > FASTEST_TURN * seconds)
+    leap = (moved > MAX_SPEED * seconds) | (turned > MAX_TURN_RATE * seconds)
     share = np.divide(
         1e-9 * (wanted_ns - stamp_ns[left]), seconds, out=np.zeros(n), where=seconds > 0.0
     )
@@ -247,7 +247,7 @@ def _pair(stamp_ns: NDArray[np.int64], left: Index, right: Index) -> tuple[Index
 def _usable(images: Images, number: int) -> tuple[Camera | None, str]:
     """The camera, its size as its pictures have it; or why its pictures cannot be used."""
     camera = images.cameras[number]
-    why = unusable(camera)
+    why = calibration_error(camera)
     if why:
         return None, why
     if camera.T_base_camera is None:
@@ -256,7 +256,7 @@ def _usable(images: Images, number: int) -> tuple[Camera | None, str]:
         return None, "a camera whose place is not finite"
     picture = _first(images, number)
     if picture is None:
-        return None, UNREAD
+        return None, UNREADABLE
     if picture.dtype != np.uint8 or picture.ndim not in (2, 3):
         return None, "pictures without colours (depth, or 16 bits)"
     height, width = picture.shape[:2]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.camera import Camera, project, rays
+from stillmap.core.camera import Camera, project, unproject
 from stillmap.mesh.options import VisibleOptions
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.triangle_mesh import Mesh
@@ -27,7 +27,7 @@ _BORDER = 33  # places along each edge of a picture that are asked how far aside
 _FINEST = 32  # parts that the edge of a large face is cut into, to look at each
 
 
-class Seen(NamedTuple):
+class VisibleFaces(NamedTuple):
     """What one picture shows of F faces.
 
     Attributes:
@@ -43,7 +43,7 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Depths:
+class DepthBuffer:
     """The z-buffer of a mesh in an ideal picture of a view.
 
     Attributes:
@@ -57,7 +57,7 @@ class Depths:
     face: NDArray[np.int32]
 
 
-def scaled(K: Float, scale: float) -> Float:
+def scale_intrinsics(K: Float, scale: float) -> Float:
     """(3, 3) of the same picture with `scale` times the pixels along each edge.
 
     Centres of pixels have whole numbers, so that edges lie half a pixel beside them.
@@ -68,9 +68,9 @@ def scaled(K: Float, scale: float) -> Float:
     return out
 
 
-def visible(
+def find_visible_faces(
     mesh: Mesh, view: View, options: VisibleOptions | None = None, threads: int = 1
-) -> Seen:
+) -> VisibleFaces:
     """Which faces a picture shows whole.
 
     Args:
@@ -94,10 +94,10 @@ def visible(
     if len(candidates):
         used = np.zeros(len(points), np.bool_)
         used[mesh.faces[candidates]] = True
-        depths = depths_of(mesh, view, points[used], options.scale, options.near, threads)
+        depths = render_depth(mesh, view, points[used], options.scale, options.near, threads)
         free = _unhidden(depths, corners, options)
         seen[candidates[free]], area[candidates[free]] = True, pixels[free]
-    return Seen(seen, area, cosine)
+    return VisibleFaces(seen, area, cosine)
 
 
 def _corners(points: Float, faces: NDArray[np.int32]) -> Float:
@@ -106,9 +106,9 @@ def _corners(points: Float, faces: NDArray[np.int32]) -> Float:
     return np.stack([columns[:, faces[:, k]] for k in range(3)])
 
 
-def depths_of(
+def render_depth(
     mesh: Mesh, view: View, shown: Float, scale: float, near: float, threads: int = 1
-) -> Depths:
+) -> DepthBuffer:
     """The z-buffer in an ideal picture that is just large enough.
 
     Args:
@@ -120,8 +120,8 @@ def depths_of(
         threads: the result does not depend on them.
     """
     assert view.camera.K is not None
-    K = scaled(_upright(view.camera.K), scale)
-    at = np.column_stack(ideal(K, shown.T))
+    K = scale_intrinsics(_upright(view.camera.K), scale)
+    at = np.column_stack(project_pinhole(K, shown.T))
     # wide lenses: what is 80 degrees aside is six times as far out as what is 45 degrees aside
     most = 2.0 * scale * np.array([view.camera.width, view.camera.height])
     middle = K[:2, 2]
@@ -141,7 +141,7 @@ def depths_of(
         threads=threads,
     )
     number = np.append(near_by, -1).astype(np.int32)
-    return Depths(K, depth, number[face])
+    return DepthBuffer(K, depth, number[face])
 
 
 def _within_frustum(mesh: Mesh, view: View, K: Float, width: int, height: int) -> Index:
@@ -162,7 +162,7 @@ def _upright(K: Float) -> Float:
     return np.array([[K[0, 0], K[0, 1], K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
 
 
-def ideal(K: Float, points: Float) -> tuple[Float, Float]:
+def project_pinhole(K: Float, points: Float) -> tuple[Float, Float]:
     """(n,) columns and rows of points (3, n) ahead of an ideal camera."""
     x, y = points[0] / points[2], points[1] / points[2]
     return K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]
@@ -189,7 +189,7 @@ def _reach(camera: Camera) -> float:
     low, high = np.zeros_like(t), np.ones_like(t)
     u, v = np.concatenate([t, t, low, high]), np.concatenate([low, high, t, t])
     size = np.array([camera.width - 1.0, camera.height - 1.0])
-    found = rays(camera, np.column_stack([u, v]) * size)
+    found = unproject(camera, np.column_stack([u, v]) * size)
     far = float(np.hypot(found[:, 0], found[:, 1]).max())
     return far if np.isfinite(far) else np.inf
 
@@ -223,7 +223,7 @@ def _areas(uv: Float, faces: NDArray[np.int32]) -> Float32:
     return np.asarray(0.5 * np.abs(au * bv - av * bu), np.float32)
 
 
-def _unhidden(depths: Depths, corners: Float, options: VisibleOptions) -> Mask:
+def _unhidden(depths: DepthBuffer, corners: Float, options: VisibleOptions) -> Mask:
     """(n,) whether nothing lies before triangles (3, 3, n) in the camera's frame."""
     free = np.ones(corners.shape[2], np.bool_)
     normal = _normals(corners)
@@ -252,13 +252,13 @@ def _nearest_around(depth: Float32, reach: int) -> Float32:
 
 
 def _samples(
-    depths: Depths, corners: Float, options: VisibleOptions
+    depths: DepthBuffer, corners: Float, options: VisibleOptions
 ) -> Iterator[tuple[Index, Float]]:
     """Faces by number, and the weights (k, 3) of their corners at the points to look at.
 
     The finer, the larger they are: `options.spacing` pixels apart along the longest edge.
     """
-    uv = [ideal(depths.K, corner) for corner in corners]
+    uv = [project_pinhole(depths.K, corner) for corner in corners]
     edges = [np.hypot(uv[k][0] - uv[k - 1][0], uv[k][1] - uv[k - 1][1]) for k in range(3)]
     edge = np.maximum(np.maximum(edges[0], edges[1]), edges[2])
     halvings = np.ceil(np.log2(np.maximum(edge / options.spacing, 1.0)))
@@ -273,7 +273,7 @@ def _samples(
 
 
 def _passes(
-    depths: Depths, around: Float32, points: Float, normals: Float, options: VisibleOptions
+    depths: DepthBuffer, around: Float32, points: Float, normals: Float, options: VisibleOptions
 ) -> Mask:
     """(n,) whether points (3, n) in the camera's frame are no farther than what is seen there,
     and not much farther than what is seen beside.
@@ -281,7 +281,7 @@ def _passes(
     Within its pixel a face may be nearer by the slope of depth along rows and columns.
     """
     h, w = around.shape
-    u, v = (np.rint(a).astype(np.int64) for a in ideal(depths.K, points))
+    u, v = (np.rint(a).astype(np.int64) for a in project_pinhole(depths.K, points))
     inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
     at = np.clip(v, 0, h - 1) * w + np.clip(u, 0, w - 1)
     z = points[2]

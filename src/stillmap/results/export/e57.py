@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.errors import InputError, extra
+from stillmap.core.errors import InputError, import_extra
 from stillmap.io.point_cloud.e57 import GPS_EPOCH_S
 from stillmap.results.export.point_cloud import Block, Cloud
 
@@ -34,7 +34,7 @@ def write(cloud: Cloud, path: Path, tell: Callable[[float], None] | None) -> Non
         InputError: pye57 is missing, or the file cannot be written or cannot hold the points.
         OSError: the file cannot be made.
     """
-    library = extra("pye57.libe57", path, "written")
+    library = import_extra("pye57.libe57", path, "written")
     if not str(path).isprintable():
         raise InputError("has a name that its library cannot open", where=str(path))
     path.open("wb").close()  # the library does not say why it cannot

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from stillmap.core.errors import InputError, extra
-from stillmap.core.files import new_file, require_new_file
+from stillmap.core.errors import InputError, import_extra
+from stillmap.core.files import atomic_file, require_new_file
 from stillmap.mesh.options import TextureOptions
-from stillmap.mesh.texture.atlas import Picture, Textured
+from stillmap.mesh.texture.atlas import Picture, TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.results.gltf import from_bottom, obj_files, require_whole, z_up
 from stillmap.results.reader import require_model
@@ -21,14 +21,14 @@ _MOST = 2 << 30  # bytes
 _PAGE = "page"
 
 
-def read_model(path: Path) -> Textured | Mesh:
+def read_model(path: Path) -> TexturedMesh | Mesh:
     """A model that stillmap wrote, z up.
 
     Raises:
         InputError: it is missing or damaged.
         MissingExtra: trimesh is not installed.
     """
-    trimesh = extra("trimesh", path, group="mesh")
+    trimesh = import_extra("trimesh", path, group="mesh")
     data = require_whole(path, _MOST)
     try:
         scene = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
@@ -39,7 +39,7 @@ def read_model(path: Path) -> Textured | Mesh:
         raise InputError(f"is damaged: {error!r}", where=str(path)) from error
 
 
-def _model(scene: Any) -> Textured | Mesh:
+def _model(scene: Any) -> TexturedMesh | Mesh:
     vertices, faces, uv, page, count = [], [], [], [], 0
     pages: list[Picture] = []
     for node in scene.graph.nodes_geometry:
@@ -59,7 +59,7 @@ def _model(scene: Any) -> Textured | Mesh:
     if not pages:
         return Mesh(points, corners)
     none = np.full(len(corners), -1, np.int32), np.full(count, -1, np.int32)
-    return Textured(points, corners, np.concatenate(uv), np.concatenate(page), tuple(pages), *none)
+    return TexturedMesh(points, corners, np.concatenate(uv), np.concatenate(page), tuple(pages), *none)
 
 
 def write_obj(folder: Path, output: Path, quality: int, overwrite: bool = False) -> tuple[int, int]:
@@ -88,5 +88,5 @@ def write_obj(folder: Path, output: Path, quality: int, overwrite: bool = False)
         require_new_file(one, overwrite)
     with ExitStack() as all_of_them:  # what is entered first appears last
         for one, data in named.items():
-            all_of_them.enter_context(new_file(one)).write_bytes(data)
-    return len(model), len(model.pages) if isinstance(model, Textured) else 0
+            all_of_them.enter_context(atomic_file(one)).write_bytes(data)
+    return len(model), len(model.pages) if isinstance(model, TexturedMesh) else 0

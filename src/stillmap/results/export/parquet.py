@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
-from stillmap.core.files import new_file
+from stillmap.core.files import atomic_file
 from stillmap.core.recording import Recording
 from stillmap.results.reader import Exported
 
@@ -58,7 +58,7 @@ def write(result: Exported, seen: Recording, path: Path) -> None:
     }
     schema = arrow.schema([arrow.field(name, kind, nullable=False) for name, kind in kinds.items()])
     with (
-        new_file(path) as work,
+        atomic_file(path) as work,
         parquet.ParquetWriter(str(work), schema, compression="zstd") as writer,
     ):
         for scans in _blocks(result.recording):

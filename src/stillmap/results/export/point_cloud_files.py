@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.errors import InputError, extra
-from stillmap.core.files import new_file
-from stillmap.io.point_cloud.las import writer_to
+from stillmap.core.errors import InputError, import_extra
+from stillmap.core.files import atomic_file
+from stillmap.io.point_cloud.las import open_las_writer
 from stillmap.results.export import e57
 from stillmap.results.export.point_cloud import Block, Cloud
 from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
@@ -61,7 +61,7 @@ def require_extras(form: Format, path: Path) -> None:
     """
     packed = path.suffix.lower() == ".laz"
     for module in (*form.needs, *(("lazrs",) if packed else ())):
-        extra(module, path, "written")
+        import_extra(module, path, "written")
 
 
 def write(cloud: Cloud, path: Path, form: Format, tell: Tell | None = None) -> None:
@@ -77,7 +77,7 @@ def write(cloud: Cloud, path: Path, form: Format, tell: Tell | None = None) -> N
         InputError: a library is missing, the file cannot be written or cannot hold the points.
     """
     require_extras(form, path)
-    with new_file(path) as work:
+    with atomic_file(path) as work:
         try:
             form.write(cloud, work, path.suffix.lower() == ".laz", tell)
         except InputError as error:
@@ -150,7 +150,7 @@ def _write_text(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
 
 
 def _write_las(cloud: Cloud, path: Path, packed: bool, tell: Tell | None) -> None:
-    laspy = extra("laspy", path, "written")
+    laspy = import_extra("laspy", path, "written")
     kind = _COLOURED if cloud.coloured else _POINTS
     head = laspy.LasHeader(point_format=kind, version="1.4")
     head.scales, head.offsets = np.full(3, _SCALE), cloud.origin
@@ -159,7 +159,7 @@ def _write_las(cloud: Cloud, path: Path, packed: bool, tell: Tell | None) -> Non
     head.generating_software = "stillmap"
     # the day of writing would make other bytes of the same result
     head.creation_date = date(1970, 1, 1)
-    with writer_to(path, laspy, head, packed) as writer:
+    with open_las_writer(path, laspy, head, packed) as writer:
         for block in cloud.told(tell):
             writer.write_points(_las_points(laspy, head, block))
 

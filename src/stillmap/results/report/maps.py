@@ -12,18 +12,19 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stillmap.core import se2
+from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import sample_dynamic_points
+from stillmap.pipeline.result import Result
 from stillmap.pipeline.snapshots import Snapshot, Window
 from stillmap.results.map_npz import CHANGED, changed_cells, known_area
-from stillmap.results.protocols import ChangeLike, ResultLike
 from stillmap.results.report.figures import (
-    dots_image,
-    map_image,
-    pixel_positions,
+    draw_map,
+    draw_points,
+    draw_poorly_observed,
+    draw_snapshot,
+    map_to_pixels,
+    map_window,
     png_uri,
-    shown_window,
-    snapshot_image,
-    thin_image,
 )
 from stillmap.results.report.tables import share_text
 
@@ -48,18 +49,18 @@ _TOGGLES = (
 _PATH_POINTS = 3000
 
 
-def maps_section(result: ResultLike) -> str:
+def maps_section(result: Result) -> str:
     """The raw map beside the filtered one."""
     if not result.map.p_occupied.size:
         return "<section><h2>The map</h2><p>It is empty: no beam could be used.</p></section>"
-    window = shown_window([result.raw_map, result.map])
-    raw, filtered = map_image(result.raw_map, window), map_image(result.map, window)
-    dots = dots_image(
+    window = map_window([result.raw_map, result.map])
+    raw, filtered = draw_map(result.raw_map, window), draw_map(result.map, window)
+    dots = draw_points(
         sample_dynamic_points(result.seen, result.poses, result.p_static)[:, :2],
         window,
         filtered.size,
     )
-    veil = thin_image(result.map, result.evidence.thin, window)
+    veil = draw_poorly_observed(result.map, result.evidence.thin, window)
     path = _path(
         se2.project_to_plane(result.poses) if result.recording.dimension == 3 else result.poses,
         window,
@@ -84,7 +85,7 @@ def maps_section(result: ResultLike) -> str:
     )
 
 
-def evidence_sentence(result: ResultLike) -> str:
+def evidence_sentence(result: Result) -> str:
     """How much of the known map few looks saw, or only while something moved there."""
     area, evidence = known_area(result), result.evidence
     if not area["thin"]:
@@ -100,7 +101,7 @@ def evidence_sentence(result: ResultLike) -> str:
 _LATER = " What is taken for dynamic in the end, after one more E-step, is in the map above."
 
 
-def evolution_section(result: ResultLike) -> str:
+def evolution_section(result: Result) -> str:
     """The part of the map with most movement at the first, second, best and last iteration."""
     if not result.snapshots or not result.snapshots[0].p_occupied.size:
         return ""
@@ -125,7 +126,7 @@ def _snapshot_figure(snapshot: Snapshot, best: int) -> str:
     return figure(
         f"Iteration {snapshot.number}{kept}",
         f"{len(snapshot.dynamic_points):,} dynamic ends",
-        [(snapshot_image(snapshot), "")],
+        [(draw_snapshot(snapshot), "")],
         "",
         window,
         False,
@@ -168,7 +169,7 @@ def _scale_bar(window: Window) -> str:
 def _path(poses: NDArray[np.float64], window: Window, size: tuple[int, int]) -> str:
     """The trajectory as a line over a map picture of `size` pixels."""
     every = max(1, math.ceil(len(poses) / _PATH_POINTS))
-    positions = pixel_positions(poses[::every, :2, -1], window, size)
+    positions = map_to_pixels(poses[::every, :2, -1], window, size)
     points = " ".join(f"{x:.1f},{y:.1f}" for x, y in positions.tolist())
     return (
         f'<svg class="path" aria-hidden="true" viewBox="0 0 {size[0]} {size[1]}" '
@@ -183,12 +184,12 @@ _COLOURS = {"came": (20, 120, 60), "left": (190, 40, 120), "comes and goes": (40
 _TITLES = ("middle, m", "size, m", "cells", "was as before until", "seen otherwise from", "times")
 
 
-def changes_section(result: ResultLike) -> str:
+def changes_section(result: Result) -> str:
     """Everything about places that changed; empty where none was found."""
     if not result.changes or not result.map.p_occupied.size:
         return ""
-    window = shown_window([result.raw_map, result.map])
-    picture = map_image(result.map, window)
+    window = map_window([result.raw_map, result.map])
+    picture = draw_map(result.map, window)
     reduced = picture.size[0] < round((window[2] - window[0]) / result.map.resolution)
     marks = _marks(result, window, picture.size)
     listed = _most(result.changes)
@@ -210,7 +211,7 @@ def changes_section(result: ResultLike) -> str:
     )
 
 
-def _shown(result: ResultLike) -> str:
+def _shown(result: Result) -> str:
     """What the map has of them."""
     if result.recording.dimension == 3:
         return "The map shows their places as the labels of single voxels have it."
@@ -220,13 +221,13 @@ def _shown(result: ResultLike) -> str:
     return f"The map shows each {shown}; what comes and goes it shows free{unless}."
 
 
-def _most(changes: Sequence[ChangeLike]) -> list[ChangeLike]:
+def _most(changes: Sequence[Change]) -> list[Change]:
     """The largest ones, in their order."""
     largest = sorted(range(len(changes)), key=lambda k: -len(changes[k].cells))[:_MOST_ROWS]
     return [changes[k] for k in sorted(largest)]
 
 
-def _summary(changes: Sequence[ChangeLike]) -> str:
+def _summary(changes: Sequence[Change]) -> str:
     kinds = [one.kind for one in changes]
     parts = [
         f"{count} where something {kind}" for kind in CHANGED if (count := kinds.count(kind)) > 0
@@ -243,7 +244,7 @@ def _key() -> str:
     return f'<p class="soft">{keys}</p>'
 
 
-def _marks(result: ResultLike, window: Window, size: tuple[int, int]) -> Image.Image:
+def _marks(result: Result, window: Window, size: tuple[int, int]) -> Image.Image:
     """The cells of all changes in their colours, on nothing, to lie over the map's picture."""
     width, height = size
     pixels = np.zeros((height, width), np.uint8)
@@ -251,8 +252,8 @@ def _marks(result: ResultLike, window: Window, size: tuple[int, int]) -> Image.I
     row, column = np.nonzero(changed)
     cell = result.map.resolution
     low = np.stack([column, row], axis=1) * cell + np.array(result.map.origin[:2])
-    left, bottom = pixel_positions(low, window, size).T
-    right, top = pixel_positions(low + cell, window, size).T
+    left, bottom = map_to_pixels(low, window, size).T
+    right, top = map_to_pixels(low + cell, window, size).T
     # a cell may be several pixels or a part of one
     steps = max(1, round(width * cell / (window[2] - window[0])))
     for k in range(steps):
@@ -267,10 +268,10 @@ def _marks(result: ResultLike, window: Window, size: tuple[int, int]) -> Image.I
     return image
 
 
-def _numbers(changes: Sequence[ChangeLike], window: Window, size: tuple[int, int]) -> str:
+def _numbers(changes: Sequence[Change], window: Window, size: tuple[int, int]) -> str:
     """The number of each change beside its place."""
     at = np.array([(one.x + one.size[0] / 2, one.y) for one in changes])
-    positions = pixel_positions(at, window, size)
+    positions = map_to_pixels(at, window, size)
     height = max(size) / 60
     texts = "".join(
         f'<text x="{x + height / 4:.1f}" y="{y:.1f}">{k}</text>'
@@ -282,7 +283,7 @@ def _numbers(changes: Sequence[ChangeLike], window: Window, size: tuple[int, int
     )
 
 
-def _table(changes: Sequence[ChangeLike], start: int) -> str:
+def _table(changes: Sequence[Change], start: int) -> str:
     rows = ""
     for k, one in enumerate(changes, 1):
         cells = (

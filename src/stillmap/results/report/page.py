@@ -12,10 +12,10 @@ from string import Template
 
 from stillmap.core.json import count_skipped, to_jsonable, version
 from stillmap.mapping.beam_statistics import count_beams
-from stillmap.results.protocols import ResultLike, TiltingLike
+from stillmap.pipeline.result import Result
 from stillmap.results.report.figures import likelihood_svg
 from stillmap.results.report.maps import changes_section, evolution_section, maps_section
-from stillmap.results.report.model import Stills, model_section
+from stillmap.results.report.model import ModelPreviews, model_section
 from stillmap.results.report.objects import objects_section, tilting_section
 from stillmap.results.report.tables import (
     bytes_text,
@@ -28,6 +28,7 @@ from stillmap.results.report.tables import (
     skipped_list,
     stages_table,
 )
+from stillmap.rig.build import Tilting
 
 PAGE = Template("""<!DOCTYPE html>
 <html lang="en">
@@ -140,16 +141,16 @@ _PRINTED = (
 
 def write_report(
     path: Path,
-    result: ResultLike,
-    tilting: TiltingLike | None = None,
-    stills: Stills | None = None,
+    result: Result,
+    tilting: Tilting | None = None,
+    stills: ModelPreviews | None = None,
 ) -> None:
     """Write the report as one HTML page of a few megabytes at most, whatever the map's size."""
-    path.write_text(report_html(result, tilting, stills), encoding="utf-8")
+    path.write_text(render_report(result, tilting, stills), encoding="utf-8")
 
 
-def report_html(
-    result: ResultLike, tilting: TiltingLike | None = None, stills: Stills | None = None
+def render_report(
+    result: Result, tilting: Tilting | None = None, stills: ModelPreviews | None = None
 ) -> str:
     """The page. All pictures lie in it; it holds no script and reads without one."""
     name = _name(result)
@@ -173,7 +174,7 @@ def report_html(
     return PAGE.substitute(title=escape(f"{name}: stillmap report"), style=STYLE, body=body)
 
 
-def likelihood_sentence(result: ResultLike) -> str:
+def likelihood_sentence(result: Result) -> str:
     """Whether and where the bound fell from one iteration to the next."""
     if len(result.iterations) < 2:
         return "There was one iteration only."
@@ -197,7 +198,7 @@ def likelihood_sentence(result: ResultLike) -> str:
     )
 
 
-def held_out_sentence(result: ResultLike) -> str:
+def held_out_sentence(result: Result) -> str:
     """How well the kept iteration foresees scans that were left out of its map."""
     figures = {it.number: it.held_out_log_likelihood for it in result.iterations}
     kept = figures.get(result.best_iteration)
@@ -209,7 +210,7 @@ def held_out_sentence(result: ResultLike) -> str:
     )
 
 
-def loops_sentence(result: ResultLike) -> str:
+def loops_sentence(result: Result) -> str:
     """How many loops were closed, and why others were not."""
     if not result.loops:
         return ""
@@ -222,12 +223,12 @@ def loops_sentence(result: ResultLike) -> str:
     return text + "."
 
 
-def _name(result: ResultLike) -> str:
+def _name(result: Result) -> str:
     path = str(result.recording.source.get("path", ""))
     return Path(path).name or "recording"
 
 
-def _header(result: ResultLike, name: str) -> str:
+def _header(result: Result, name: str) -> str:
     source = result.recording.source
     path, kind = str(source.get("path", "")), str(source.get("format", ""))
     details = ", ".join(text for text in (path, kind) if text)
@@ -237,7 +238,7 @@ def _header(result: ResultLike, name: str) -> str:
     )
 
 
-def _headline(result: ResultLike) -> str:
+def _headline(result: Result) -> str:
     recording = result.recording
     counts = count_beams(recording, result.p_static)
     stamps = recording.stamp_ns
@@ -276,19 +277,19 @@ def _per_scan(seconds: float, scans: int) -> str:
     return f"{milliseconds:.0f} ms" if milliseconds >= 10 else f"{milliseconds:.2g} ms"
 
 
-def _skipped_note(result: ResultLike) -> str:
+def _skipped_note(result: Result) -> str:
     skipped = count_skipped(result.recording.source)
     return f"{skipped:,} damaged, skipped" if skipped else "none skipped"
 
 
-def _warnings(result: ResultLike) -> str:
+def _warnings(result: Result) -> str:
     if not result.warnings:
         return ""
     items = "".join(f"<li>{escape(text)}</li>" for text in result.warnings)
     return f'<section class="warnings"><h2>Warnings</h2><ul>{items}</ul></section>'
 
 
-def _estimate_section(result: ResultLike) -> str:
+def _estimate_section(result: Result) -> str:
     if not result.iterations:
         return ""
     end = (
@@ -306,7 +307,7 @@ def _estimate_section(result: ResultLike) -> str:
     )
 
 
-def _curve(result: ResultLike) -> str:
+def _curve(result: Result) -> str:
     if len(result.iterations) < 2:
         return ""
     titles, caption = _DEFAULT if result.options.estimator == "stillmap" else _PRINTED
@@ -318,7 +319,7 @@ def _curve(result: ResultLike) -> str:
     )
 
 
-def _recording_section(result: ResultLike) -> str:
+def _recording_section(result: Result) -> str:
     source = to_jsonable(result.recording.source)
     skipped, odometry = source.pop("skipped", None), source.pop("skipped_odometry", None)
     counts = count_beams(result.recording, result.p_static)
@@ -337,7 +338,7 @@ def _recording_section(result: ResultLike) -> str:
     return text + "</section>"
 
 
-def _stages_section(result: ResultLike) -> str:
+def _stages_section(result: Result) -> str:
     if not result.stages:
         return ""
     return (
@@ -347,7 +348,7 @@ def _stages_section(result: ResultLike) -> str:
     )
 
 
-def _options_section(result: ResultLike) -> str:
+def _options_section(result: Result) -> str:
     return (
         "<section><h2>Options</h2><details><summary>Every option as this run used it</summary>"
         f"{options_table(result.options)}</details></section>"

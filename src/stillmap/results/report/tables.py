@@ -11,7 +11,8 @@ from typing import Any
 from stillmap.core.config import to_dict
 from stillmap.core.json import to_jsonable
 from stillmap.mapping.beam_statistics import count_beams
-from stillmap.results.protocols import IterationRecordLike, ResultLike
+from stillmap.pipeline.estimate import IterationRecord
+from stillmap.pipeline.result import Result
 
 # a damaged file can have a remark on every line; run.json names them all
 _MOST_ITEMS = 25
@@ -51,7 +52,7 @@ def number_text(value: float | None) -> str:
     return "-" if value is None or not math.isfinite(value) else f"{value:,.7g}"
 
 
-def iterations_table(iterations: Sequence[IterationRecordLike], best: int) -> str:
+def iterations_table(iterations: Sequence[IterationRecord], best: int) -> str:
     """One row per iteration, the best one marked."""
     names = ("iteration", "expected log likelihood", "bound", "held out", "changed", "time")
     rows = []
@@ -189,7 +190,7 @@ def _line(value: Any) -> str:
 _FEW = 100  # beams on moving things, of which less can be said than the bars would claim
 
 
-def learned_section(result: ResultLike) -> str:
+def learned_section(result: Result) -> str:
     """Shares, scatter and dwell times in plain words; empty where nothing was learned."""
     learned = result.learned
     if not learned:
@@ -239,7 +240,7 @@ def _static_sentence(learned: Mapping[str, Any]) -> str:
     return text
 
 
-def _changing_sentence(result: ResultLike) -> str:
+def _changing_sentence(result: Result) -> str:
     """In space what came to stay, or left, is dynamic; in the plane it is listed."""
     if result.recording.dimension == 2 or "changing" not in result.learned:
         return ""

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from stillmap.core.config import replaced
-from stillmap.core.errors import InputError, nearest
+from stillmap.core.errors import InputError, closest_match
 from stillmap.sim.scene import Scene
 from stillmap.sim.worlds.changed import office_moved, street_moved, warehouse_moved
 from stillmap.sim.worlds.crossing import crossing, street_turn
@@ -89,7 +89,7 @@ def scene_by_name(name: str, changes: Mapping[str, Any] | None = None) -> Scene:
     """
     if name not in SCENES:
         known = f"scenes: {', '.join(SCENES)}"
-        meant = nearest(name, SCENES)
+        meant = closest_match(name, SCENES)
         hint = f"did you mean '{meant}'? {known}" if meant else known
         raise InputError(f"there is no scene '{name}'", hint=hint)
     robot = (changes or {}).get("robot")

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from stillmap.core.recording import Recording
 
 Float = NDArray[np.float64]
-Levels = tuple[Float, Float]
+Planes = tuple[Float, Float]
 
-REACH = 4.0  # m: what is farther along an axis of the sensor is no part of the robot
+BODY_RADIUS = 4.0  # m: what is farther along an axis of the sensor is no part of the robot
 PROFILE_RANGE = 12.0  # m: up to there is looked for how things go on
-PLACES = 12  # fewer show nothing
-SURFACE = 0.25  # m to either side of the ground and the ceiling: theirs
+MIN_SCANS = 12  # fewer show nothing
+PLANE_MARGIN = 0.25  # m to either side of the ground and the ceiling: theirs
 
 _POINTS = 8000  # of each scan that tell how the surroundings look
 _LAYER = 0.1  # m, of those in which the ground is looked for
@@ -25,21 +25,21 @@ _COMPARED = 20  # directions at least
 _FLAT = 0.05  # rms of directions off a plane: a sweep is no fan
 
 
-class Place(NamedTuple):
+class ScanSample(NamedTuple):
     """A scan and some of its hits, turned as the robot is."""
 
     scan: int
     points: NDArray[np.float32]
 
 
-def look_at(recording: Recording, scan: int, R: Float) -> Place:
+def sample_hits(recording: Recording, scan: int, R: Float) -> ScanSample:
     beams = recording.beams_of(scan)
     points = recording.points[beams][recording.hit[beams]]
     points = points[:: max(1, len(points) // _POINTS)]
-    return Place(scan, (points @ R.T).astype(np.float32))
+    return ScanSample(scan, (points @ R.T).astype(np.float32))
 
 
-def is_sweep(points: NDArray[np.float32]) -> bool:
+def is_3d_sweep(points: NDArray[np.float32]) -> bool:
     """Whether the directions of points (n, 3) leave every plane through the sensor."""
     if len(points) < 3:
         return False
@@ -48,13 +48,13 @@ def is_sweep(points: NDArray[np.float32]) -> bool:
     return bool(np.sqrt(max(least, 0.0)) > _FLAT)
 
 
-def levels_of(points: NDArray[np.float32]) -> Levels | None:
+def fit_ground_and_ceiling(points: NDArray[np.float32]) -> Planes | None:
     """The ground and the ceiling, z = a x + b y + c, from points (n, 3) beyond the robot.
 
     The ceiling is at infinity where there is nothing above; None where no ground is.
     """
     away = np.hypot(points[:, 0], points[:, 1])
-    beyond = points[(away >= REACH) & (away < PROFILE_RANGE)].astype(np.float64)
+    beyond = points[(away >= BODY_RADIUS) & (away < PROFILE_RANGE)].astype(np.float64)
     ground = _level(beyond[beyond[:, 2] < -_LAYER])
     ceiling = _level(beyond[beyond[:, 2] > _LAYER])
     if ground is None:
@@ -64,7 +64,7 @@ def levels_of(points: NDArray[np.float32]) -> Levels | None:
 
 def _level(points: Float) -> Float | None:
     """The nearly level plane that most of points (n, 3) are on; None for a few."""
-    if len(points) < PLACES:
+    if len(points) < MIN_SCANS:
         return None
     bins = np.floor(points[:, 2] / _LAYER).astype(np.intp)
     lowest = int(bins.min())
@@ -72,14 +72,14 @@ def _level(points: Float) -> Float | None:
     plane = np.array([0.0, 0.0, (lowest + most + 0.5) * _LAYER])
     flat = np.column_stack([points[:, :2], np.ones(len(points))])
     for _ in range(3):
-        on = np.abs(points[:, 2] - flat @ plane) < SURFACE
+        on = np.abs(points[:, 2] - flat @ plane) < PLANE_MARGIN
         if np.count_nonzero(on) < 3:
             break
         plane = np.linalg.lstsq(flat[on], points[on, 2], rcond=None)[0]
     return plane
 
 
-def different(looks: list[Place], levels: Levels) -> list[int]:
+def select_distinct_scans(looks: list[ScanSample], levels: Planes) -> list[int]:
     """Scans from places that look different, each from the one before; [] where all look alike."""
     seen: list[tuple[int, Float]] = []
     for look in looks:
@@ -102,13 +102,13 @@ def _elsewhere(before: Float, ranges: Float) -> bool:
     return len(change) >= _COMPARED and bool(np.mean(change > _MOVED[0]) > _MOVED[1])
 
 
-def _ranges(points: NDArray[np.float32], levels: Levels) -> Float:
+def _ranges(points: NDArray[np.float32], levels: Planes) -> Float:
     """Median range in each direction of what stands on the ground farther away; NaN: nothing."""
     x, y, z = points.astype(np.float64).T
     range = np.linalg.norm(points, axis=1)
     (a, b, c), (p, q, r) = levels
-    stands = (range > REACH) & (z - a * x - b * y - c > SURFACE)
-    stands &= p * x + q * y + r - z > SURFACE
+    stands = (range > BODY_RADIUS) & (z - a * x - b * y - c > PLANE_MARGIN)
+    stands &= p * x + q * y + r - z > PLANE_MARGIN
     x, y, z, range = x[stands], y[stands], z[stands], range[stands]
     columns, rows = round(2 * np.pi / _DIRECTION), round(np.pi / _DIRECTION)
     column = np.minimum((np.arctan2(y, x) + np.pi) / _DIRECTION, columns - 1).astype(np.intp)

@@ -41,7 +41,7 @@ class _Edges(NamedTuple):
     steepness: NDArray[np.float32]
 
 
-def registered(
+def calibrate_color_camera(
     depth: Camera, scale: float, pairs: Sequence[tuple[Path, Path]]
 ) -> tuple[Camera, str]:
     """The colour camera, and what was found in words; depth's own and "" where it is laid over.
@@ -101,7 +101,7 @@ def _edges(K: Float, scale: float, pairs: Sequence[tuple[Path, Path]]) -> list[_
     out = []
     for pair in chosen.tolist():
         try:
-            depth, colours = (images.read_picture(file) for file in pairs[pair])
+            depth, colours = (images.read_image(file) for file in pairs[pair])
         except InputError:
             continue
         alike = depth.dtype == np.uint16 and depth.ndim == 2 and colours.shape[:2] == depth.shape

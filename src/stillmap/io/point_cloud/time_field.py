@@ -30,7 +30,7 @@ class Clock(NamedTuple):
     absolute: bool
 
 
-def column_of(names: Iterable[str]) -> str | None:
+def find_time_column(names: Iterable[str]) -> str | None:
     """The name among a cloud's that stands for time."""
     for name in names:
         if name.lower() in NAMES:
@@ -38,7 +38,7 @@ def column_of(names: Iterable[str]) -> str | None:
     return None
 
 
-def clock_of(values: NDArray[Any], period: float | None) -> Clock | None:
+def detect_clock(values: NDArray[Any], period: float | None) -> Clock | None:
     """The only unit that makes a sweep of a scan's times, or None.
 
     Args:
@@ -64,7 +64,7 @@ def _within(length: float, limits: tuple[float, float]) -> set[int]:
     return {unit for unit in _UNITS if limits[0] <= length / unit <= limits[1]}
 
 
-def since(
+def convert_times(
     values: NDArray[Any], usable: NDArray[np.bool_], clock: Clock, stamp_ns: int | None
 ) -> tuple[int | None, NDArray[np.float64]]:
     """A scan's stamp, and seconds from it to each point, NaN where unknown.

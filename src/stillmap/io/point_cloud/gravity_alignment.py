@@ -34,7 +34,7 @@ class _Surfaces(NamedTuple):
     normals: Float
 
 
-def levelled(recording: Recording) -> Recording:
+def align_to_gravity(recording: Recording) -> Recording:
     """The recording, its recorded poses turned about their origin so that z is up.
 
     `source["levelled"]` says by how much, and by what it was found.
