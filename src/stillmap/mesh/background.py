@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from stillmap.core.camera import is_in_image, project, unproject
 from stillmap.mesh.options import VisibleOptions
 from stillmap.mesh.place import ViewAssignment
-from stillmap.mesh.texture.baking import bilinear
+from stillmap.mesh.texture.baking import sample_bilinear
 from stillmap.mesh.texture.views import View
-from stillmap.mesh.texture.visibility import DepthBuffer, render_depth, project_pinhole
+from stillmap.mesh.texture.visibility import DepthBuffer, project_pinhole, render_depth
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -85,8 +85,10 @@ class Background:
             there, ok = project(self.views[other].camera, self.views[other].in_camera(behind))
             ok &= is_in_image(self.views[other].camera, there)
             some, there = some[ok], there[ok]
-            shown = bilinear(mine, here[some])
-            off = [np.linalg.norm(shown - bilinear(picture, there + d), axis=1) for d in _AROUND]
+            shown = sample_bilinear(mine, here[some])
+            off = [
+                np.linalg.norm(shown - sample_bilinear(picture, there + d), axis=1) for d in _AROUND
+            ]
             out[some] = np.min(off, axis=0)
         return out
 
@@ -106,7 +108,9 @@ class Background:
 def sample_buffer(values: NDArray[np.generic], depths: DepthBuffer, at: Float) -> Float:
     """(...,) what an image (h, w) has where points (..., 3) of the camera's frame are seen."""
     h, w = values.shape
-    column, row = (np.rint(a).astype(np.intp) for a in project_pinhole(depths.K, at.reshape(-1, 3).T))
+    column, row = (
+        np.rint(a).astype(np.intp) for a in project_pinhole(depths.K, at.reshape(-1, 3).T)
+    )
     found = values[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
     return np.asarray(found.reshape(at.shape[:-1]), np.float64)
 

@@ -19,10 +19,16 @@ from stillmap.mesh.objects.texturing import TexturedViews, assign_object_views, 
 from stillmap.mesh.options import MeshOptions, VisibleOptions
 from stillmap.mesh.place import ViewAssignment, assign_views
 from stillmap.mesh.point_colors import PointColors, color_points
-from stillmap.mesh.texture.atlas import TexturedMesh, replaced
-from stillmap.mesh.texture.baking import baked
+from stillmap.mesh.texture.atlas import TexturedMesh, replace_faces
+from stillmap.mesh.texture.baking import bake_texture
 from stillmap.mesh.texture.exposure import apply_gains
-from stillmap.mesh.texture.views import UNREADABLE, View, read_color_image, filter_readable, find_views
+from stillmap.mesh.texture.views import (
+    UNREADABLE,
+    View,
+    filter_readable,
+    find_views,
+    read_color_image,
+)
 from stillmap.mesh.tsdf import build_surface
 from stillmap.pipeline.em_loop import Progress, silent
 
@@ -136,7 +142,7 @@ def build_models(
     progress("putting pictures on the surface", 0, 0, 0)
     with stages.measure("texture"):
         read = _reader(sources.recording.images)
-        textured = baked(place.mesh, place.view, views, read, options.texture)
+        textured = bake_texture(place.mesh, place.view, views, read, options.texture)
         unfiltered = _unfiltered(textured, place, views, read, options)
     ahead = _ahead(place, views, sources.recording.images, limits)
     with stages.measure("movers"):
@@ -171,14 +177,20 @@ def _levelled(sources: MeshInputs, views: Sequence[View], gain: Float) -> MeshIn
 
 
 def _unfiltered(
-    textured: TexturedMesh, place: ViewAssignment, views: list[View], read: Read, options: MeshOptions
+    textured: TexturedMesh,
+    place: ViewAssignment,
+    views: list[View],
+    read: Read,
+    options: MeshOptions,
 ) -> TexturedMesh | None:
     """With the sharpest picture on the faces of which that probably shows something that moves."""
     spoiled = (place.sharpest >= 0) & (place.p_sharpest < _SPOILED)
     if not spoiled.any():
         return None
-    part = baked(place.mesh.part(spoiled), place.sharpest[spoiled], views, read, options.texture)
-    return replaced(textured, spoiled, part)
+    part = bake_texture(
+        place.mesh.part(spoiled), place.sharpest[spoiled], views, read, options.texture
+    )
+    return replace_faces(textured, spoiled, part)
 
 
 def _reader(images: Images | None) -> Read:
@@ -246,7 +258,9 @@ def _mover(
         options.texture.visible,
     )
     read = _reader(sources.recording.images)
-    textured = baked(dress.painted.mesh, dress.painted.view, dress.views, read, options.texture)
+    textured = bake_texture(
+        dress.painted.mesh, dress.painted.view, dress.views, read, options.texture
+    )
     T = shape.way.T_map_object(shape.seconds)
     first, middle, last = (
         start + round(1e9 * seconds) for seconds in (shape.span[0], shape.seconds, shape.span[1])

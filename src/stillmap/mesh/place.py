@@ -14,13 +14,18 @@ from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.options import ChoiceOptions, VisibleOptions
 from stillmap.mesh.simplification import subdivide
 from stillmap.mesh.texture.exposure import estimate_gains
-from stillmap.mesh.texture.occluders import TrackedBox, boxes_at, occlusion_probability, is_in_or_behind_box
+from stillmap.mesh.texture.occluders import (
+    TrackedBox,
+    boxes_at,
+    is_in_or_behind_box,
+    occlusion_probability,
+)
 from stillmap.mesh.texture.occlusion import LidarReturns, build_occlusion_mask
 from stillmap.mesh.texture.view_selection import (
     Candidates,
     reject_inconsistent_views,
-    select_views,
     sample_face_colors,
+    select_views,
     view_utility,
 )
 from stillmap.mesh.texture.views import View, read_color_image
@@ -118,7 +123,9 @@ def max_edge_at(views: Sequence[View], options: ChoiceOptions, points: Float) ->
     return np.asarray(np.maximum(options.edge, wide), np.float64)
 
 
-def resolve_assignment(mesh: Mesh, candidates: Candidates, sharpest: Candidates, border: float) -> ViewAssignment:
+def resolve_assignment(
+    mesh: Mesh, candidates: Candidates, sharpest: Candidates, border: float
+) -> ViewAssignment:
     """What paints each face once neighbours have settled.
 
     Args:

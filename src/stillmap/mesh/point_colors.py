@@ -21,9 +21,9 @@ from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.segmentation import NO_OWNER, DynamicReturns
 from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
-from stillmap.mesh.texture.baking import bilinear
+from stillmap.mesh.texture.baking import sample_bilinear
 from stillmap.mesh.texture.occluders import OrientedBox, TrackedBox, boxes_at, occlusion_probability
-from stillmap.mesh.texture.point_colors import PaintedMesh, depth_inside, not_grey
+from stillmap.mesh.texture.point_colors import TextureSampler, avoid_gray, outline_depth
 from stillmap.mesh.texture.views import View
 
 Tell = Callable[[int, int], None]
@@ -112,8 +112,8 @@ def color_moving(
     picture = place.picture(number)
     if picture is None:
         return
-    colours = np.rint(bilinear(np.ascontiguousarray(picture[..., :3]), uv[shown]))
-    out[seen.beam[shown]] = not_grey(colours.astype(np.uint8))
+    colours = np.rint(sample_bilinear(np.ascontiguousarray(picture[..., :3]), uv[shown]))
+    out[seen.beam[shown]] = avoid_gray(colours.astype(np.uint8))
     late[seen.beam[shown]] = away[shown]
 
 
@@ -150,7 +150,9 @@ def _within_outlines(
     for number in np.unique(seen.owner[shown]).tolist():
         mine = np.flatnonzero(shown & (seen.owner == number))
         x, y, z = local[mine].T
-        inside = depth_inside(np.stack([x / z, y / z], axis=1) * np.median(z), options.points.apart)
+        inside = outline_depth(
+            np.stack([x / z, y / z], axis=1) * np.median(z), options.points.apart
+        )
         box = things[number].box
         way = box.center_at(np.array([now])) - box.center_at(seen.seconds[mine])
         gone = np.linalg.norm(way, axis=1)
@@ -175,7 +177,9 @@ def _free(
         for cuboid in boxes_at([thing], now):
             mine = (owner == number) | _inside(cuboid, points, choice.margin)
             rest = np.flatnonzero(~mine)
-            hidden = occlusion_probability([cuboid], view.place, points[rest], choice.margin, choice.sigma)
+            hidden = occlusion_probability(
+                [cuboid], view.place, points[rest], choice.margin, choice.sigma
+            )
             free[rest] *= 1.0 - hidden
     return free >= choice.least
 
@@ -229,7 +233,7 @@ def color_points(
     recording = sources.recording
     out: Colours = recording.per_beam(np.uint8, (3,))
     scans, n = recording.n_scans, recording.n_scans + len(place.views)
-    painted = PaintedMesh(textured, options.points.off)
+    painted = TextureSampler(textured, options.points.off)
     T_map_sensor = sources.seen.T_map_sensor(sources.poses)
     for chunk in iter_chunks(sources.seen, beside=[sources.p_static, out]):
         out[chunk.beams] = GRAY
@@ -264,7 +268,7 @@ def _tint_static(
     chunk: Chunk,
     sources: MeshInputs,
     T_map_sensor: Float,
-    painted: PaintedMesh,
+    painted: TextureSampler,
     threads: int,
 ) -> None:
     """Colours what stands still of some scans."""

@@ -22,7 +22,12 @@ from scipy.spatial import Delaunay, QhullError
 
 from stillmap.core.recording import Recording
 from stillmap.mesh.options import SurfaceOptions
-from stillmap.mesh.triangulation import grid_faces, rows_of, strip_faces, surface_faces
+from stillmap.mesh.triangulation import (
+    filter_faces,
+    split_rows,
+    triangulate_grid,
+    triangulate_strips,
+)
 
 Float = NDArray[np.float64]
 
@@ -43,14 +48,14 @@ _FLAT = 0.04  # rad from a plane, of the beams of a planar laser: it may sit off
 _WIDE = 0.2  # rad, what these spread within the plane
 
 
-def directions(points: NDArray[np.floating]) -> Float:
+def beam_directions(points: NDArray[np.floating]) -> Float:
     """(n, 3) of length one, NaN where points (n, 3) are, or lie in the sensor."""
     wide = points.astype(np.float64)
     length = np.linalg.norm(wide, axis=1, keepdims=True)
     return np.asarray(wide / np.where(length > 0.0, length, np.nan))
 
 
-def row_length(looking: Float) -> int:
+def find_row_length(looking: Float) -> int:
     """How many beams each row of a range image has; 0: beams are in no such order.
 
     Between neighbours in a row directions change little, and across from row to row, at a right
@@ -94,7 +99,7 @@ def is_planar(looking: Float) -> bool:
     return bool(spread[0] < _FLAT and spread[1] > _WIDE)
 
 
-def apart(one: Float, other: Float) -> float:
+def median_angle(one: Float, other: Float) -> float:
     """rad, median angle between directions (n, 3) and (n, 3); NaN where none are known of both."""
     chord = np.linalg.norm(one - other, axis=1)
     known = chord[np.isfinite(chord)]
@@ -130,7 +135,7 @@ class Patch(NamedTuple):
     standoff: Float
 
 
-class Order(NamedTuple):
+class ScanLayout(NamedTuple):
     """In which order the beams of a recording come.
 
     Attributes:
@@ -144,7 +149,7 @@ class Order(NamedTuple):
     stride: int = 1
 
 
-def order_of(seen: Recording, chosen: Index, o: SurfaceOptions) -> Order:
+def find_scan_layout(seen: Recording, chosen: Index, o: SurfaceOptions) -> ScanLayout:
     """How the sensors look about.
 
     Args:
@@ -154,10 +159,10 @@ def order_of(seen: Recording, chosen: Index, o: SurfaceOptions) -> Order:
     """
     counts = np.diff(seen.offset)
     asked = np.unique(np.linspace(0, seen.n_scans - 1, min(seen.n_scans, 9)).astype(np.intp))
-    planar = [is_planar(directions(seen.points[seen.beams_of(t)])) for t in asked]
+    planar = [is_planar(beam_directions(seen.points[seen.beams_of(t)])) for t in asked]
     if sum(planar) * 2 > len(planar) and len(np.unique(counts[counts > 0])) == 1:
-        return Order(True, _sequences(seen, o.pause))
-    return Order(False, [np.array([t]) for t in chosen if counts[t]])
+        return ScanLayout(True, _sequences(seen, o.pause))
+    return ScanLayout(False, [np.array([t]) for t in chosen if counts[t]])
 
 
 def _sequences(seen: Recording, pause: float) -> list[Index]:
@@ -175,8 +180,8 @@ def _sequences(seen: Recording, pause: float) -> list[Index]:
     return sorted(out, key=lambda part: int(part[0]))
 
 
-def patches_of(
-    seen: Recording, poses: Float, order: Order, o: SurfaceOptions
+def triangulate_scans(
+    seen: Recording, poses: Float, order: ScanLayout, o: SurfaceOptions
 ) -> Iterator[Callable[[], Patch]]:
     """What makes each patch, in the order of the scans.
 
@@ -196,7 +201,7 @@ def _patch(
     seen: Recording,
     T_map_sensor: Float,
     scans: Index,
-    order: Order,
+    order: ScanLayout,
     lengths: dict[tuple[int, int], int],
     o: SurfaceOptions,
 ) -> Patch:
@@ -215,7 +220,7 @@ def _patch(
     x, y, z = points.T
     use = seen.hit[beam] & np.isfinite(x + y + z)
     points[~use] = 0.0  # nothing is made of these
-    looking = directions(local)
+    looking = beam_directions(local)
     if order.planar:
         turned = seen.T_base_sensor[seen.sensor[scans], :3, :3]
         looking = np.einsum("nij,nj->ni", turned[scan], looking)
@@ -224,9 +229,9 @@ def _patch(
     else:
         key = (int(seen.sensor[scans[0]]), len(beam))
         if key not in lengths:
-            lengths[key] = row_length(looking)
+            lengths[key] = find_row_length(looking)
         faces = _of_image(points, use, looking, lengths[key], order.stride, o)
-    kept = surface_faces(points, origin, faces, o)
+    kept = filter_faces(points, origin, faces, o)
     used = np.zeros(len(points), np.bool_)
     used[kept.faces] = True
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
@@ -237,7 +242,7 @@ def _between_rows(
     points: Float, use: NDArray[np.bool_], number: NDArray[np.int32], looking: Float
 ) -> NDArray[np.int32]:
     """Triangles between planar scans that follow one another, (R, W) numbers of their points."""
-    angle = np.array([apart(looking[a], looking[b]) for a, b in pairwise(number)])
+    angle = np.array([median_angle(looking[a], looking[b]) for a, b in pairwise(number)])
     usual = float(np.nanmedian(angle)) if np.isfinite(angle).any() else 0.0
     kept, gone = [0], 0.0
     breaks = []
@@ -250,7 +255,7 @@ def _between_rows(
         kept.append(row)
         gone = 0.0
     parts = np.split(number[kept], breaks)
-    faces = [grid_faces(points, use, part) for part in parts if len(part) > 1]
+    faces = [triangulate_grid(points, use, part) for part in parts if len(part) > 1]
     return np.concatenate([np.zeros((0, 3), np.int32), *faces])
 
 
@@ -266,13 +271,13 @@ def _of_image(
     if not length:
         return _in_any_order(use, looking, o)
     number = np.arange(len(points), dtype=np.int32).reshape(-1, length)
-    along = apart(looking[:-1], looking[1:])
-    across = apart(looking[:-length], looking[length:])
-    if apart(looking[number[:, -1]], looking[number[:, 0]]) < 2.0 * along:
+    along = median_angle(looking[:-1], looking[1:])
+    across = median_angle(looking[:-length], looking[length:])
+    if median_angle(looking[number[:, -1]], looking[number[:, 0]]) < 2.0 * along:
         number = np.concatenate([number, number[:, :1]], axis=1)
-    if len(number) > 2 and apart(looking[number[-1]], looking[number[0]]) < 2.0 * across:
+    if len(number) > 2 and median_angle(looking[number[-1]], looking[number[0]]) < 2.0 * across:
         number = np.concatenate([number, number[:1]])
-    return grid_faces(points, use, number[::stride, ::stride])
+    return triangulate_grid(points, use, number[::stride, ::stride])
 
 
 def _in_any_order(use: NDArray[np.bool_], looking: Float, o: SurfaceOptions) -> NDArray[np.int32]:
@@ -281,8 +286,8 @@ def _in_any_order(use: NDArray[np.bool_], looking: Float, o: SurfaceOptions) -> 
     if len(beams) < 3:
         return np.zeros((0, 3), np.int32)
     seen = looking[beams]
-    rows_found = rows_of(seen)
-    faces = delaunay_faces(seen) if rows_found is None else strip_faces(rows_found)
+    rows_found = split_rows(seen)
+    faces = triangulate_directions(seen) if rows_found is None else triangulate_strips(rows_found)
     if not len(faces):
         return faces
     chord = np.linalg.norm(seen[faces] - np.roll(seen[faces], 1, axis=1), axis=2).max(axis=1)
@@ -290,7 +295,7 @@ def _in_any_order(use: NDArray[np.bool_], looking: Float, o: SurfaceOptions) -> 
     return np.asarray(beams[faces], np.int32)
 
 
-def delaunay_faces(looking: Float) -> NDArray[np.int32]:
+def triangulate_directions(looking: Float) -> NDArray[np.int32]:
     """(m, 3) the Delaunay triangulation of directions (n, 3) of length one."""
     middle = looking.mean(axis=0)
     middle /= max(float(np.linalg.norm(middle)), 1e-12)

@@ -11,15 +11,15 @@ from scipy.spatial import cKDTree
 
 from stillmap.core.recording import Recording
 from stillmap.mesh.options import SurfaceOptions
-from stillmap.mesh.range_image import Order, Patch, patches_of
-from stillmap.mesh.triangulation import noise_of
+from stillmap.mesh.range_image import Patch, ScanLayout, triangulate_scans
+from stillmap.mesh.triangulation import range_std
 
 Float = NDArray[np.float64]
 
 _BESIDE = 2.9  # tiles from the middle of one to the farthest corner of those around, and a bit
 
 
-class Reach(NamedTuple):
+class PatchExtents(NamedTuple):
     """How far the patches of a recording go, in their order.
 
     Attributes:
@@ -39,7 +39,7 @@ class Reach(NamedTuple):
         return np.asarray(away > self.range[done:].max() + _BESIDE * edge)
 
 
-def reach_of(seen: Recording, poses: Float, order: Order) -> Reach:
+def patch_extents(seen: Recording, poses: Float, order: ScanLayout) -> PatchExtents:
     """How far the patches that come of these scans go.
 
     Args:
@@ -58,7 +58,7 @@ def reach_of(seen: Recording, poses: Float, order: Order) -> Reach:
             far = max(far, longest + float(np.linalg.norm(sensor[t] - place)))
         places.append(place)
         ranges.append(far)
-    return Reach(np.array(places).reshape(-1, 3), np.array(ranges))
+    return PatchExtents(np.array(places).reshape(-1, 3), np.array(ranges))
 
 
 _ASKED = 8  # patches
@@ -82,8 +82,8 @@ _LAYERS = 2.5  # blocks behind each other across a surface
 _EDGE, _BLOCK = 8, 4200  # voxels along a block, and its bytes
 
 
-def resolution_of(
-    seen: Recording, poses: Float, order: Order, reach: Reach, o: SurfaceOptions
+def choose_resolution(
+    seen: Recording, poses: Float, order: ScanLayout, reach: PatchExtents, o: SurfaceOptions
 ) -> tuple[float, int]:
     """m, the edge of a voxel, and of how many rows and columns of pictures one is enough.
 
@@ -101,18 +101,18 @@ def resolution_of(
     groups = order.groups
     asked = np.unique(np.linspace(0, len(groups) - 1, min(len(groups), _ASKED)).astype(np.intp))
     some = order._replace(groups=[groups[k] for k in asked])
-    parts = [make() for make in patches_of(seen, poses, some, o)]
+    parts = [make() for make in triangulate_scans(seen, poses, some, o)]
     parts = [one for one in parts if len(one.faces)]
     if not parts:
         return o.voxel or _COARSEST, 1
-    apart = float(np.median([spacing(one) for one in parts]))
-    noise = float(np.median([range_noise(one) for one in parts]))
+    apart = float(np.median([beam_spacing(one) for one in parts]))
+    noise = float(np.median([patch_range_std(one) for one in parts]))
     wanted = float(np.clip(max(apart, _NOISES * noise), _FINEST, _COARSEST))
-    voxel = o.voxel or max(wanted, least_voxel(seen, poses, reach))
+    voxel = o.voxel or max(wanted, min_voxel_size(seen, poses, reach))
     return voxel, max(int(_NEAR * voxel / apart), 1) if apart > 0.0 else 1
 
 
-def spacing(patch: Patch) -> float:
+def beam_spacing(patch: Patch) -> float:
     """m, median distance between neighbouring beams across the line of sight."""
     a, b, c = np.moveaxis(patch.points[patch.faces], 1, 0)
     sight = patch.origin[patch.faces[:, 0]] - a
@@ -120,12 +120,12 @@ def spacing(patch: Patch) -> float:
     return float(np.median(np.sqrt(np.maximum(across, 0.0))))
 
 
-def range_noise(patch: Patch) -> float:
+def patch_range_std(patch: Patch) -> float:
     """m, standard deviation of its ranges."""
-    return noise_of(np.linalg.norm(patch.points - patch.origin, axis=1), patch.faces)
+    return range_std(np.linalg.norm(patch.points - patch.origin, axis=1), patch.faces)
 
 
-def least_voxel(seen: Recording, poses: Float, reach: Reach) -> float:
+def min_voxel_size(seen: Recording, poses: Float, reach: PatchExtents) -> float:
     """m, the edge of voxels that fit into memory, by the cells in which beams end.
 
     Those count that are as near to where the sensor is at some time as it sees: voxels farther

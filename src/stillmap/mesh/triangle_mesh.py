@@ -90,7 +90,7 @@ class Mesh:
         return Mesh(self.vertices[used], number[faces].astype(np.int32))
 
 
-def joined(meshes: list[Mesh]) -> Mesh:
+def concatenate_meshes(meshes: list[Mesh]) -> Mesh:
     """All faces of several meshes; vertices are not merged."""
     first = np.cumsum([0, *(len(one.vertices) for one in meshes)])
     return Mesh(

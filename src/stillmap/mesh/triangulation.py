@@ -30,7 +30,7 @@ _HALF = (
 _NOISES = 5.0  # standard deviations between the farthest and the nearest of three corners
 
 
-class Kept(NamedTuple):
+class SurfaceFaces(NamedTuple):
     """Triangles that are surface.
 
     Attributes:
@@ -42,7 +42,7 @@ class Kept(NamedTuple):
     standoff: Float
 
 
-def grid_faces(points: Float, use: Bool, number: NDArray[np.int32]) -> Faces:
+def triangulate_grid(points: Float, use: Bool, number: NDArray[np.int32]) -> Faces:
     """Two triangles for each square of neighbours in a range image, one where a corner is missing.
 
     The diagonal is the shorter one.
@@ -81,7 +81,7 @@ def _squares(columns: Float, a: NDArray[np.int32], b: NDArray[np.int32]) -> Floa
     return np.asarray(sum((x[a] - x[b]) ** 2 for x in columns))
 
 
-def surface_faces(points: Float, origin: Float, faces: Faces, o: SurfaceOptions) -> Kept:
+def filter_faces(points: Float, origin: Float, faces: Faces, o: SurfaceOptions) -> SurfaceFaces:
     """The triangles that do not span holes or steps in depth.
 
     A triangle that is seen at a flat angle either belongs to a surface that is, as the floor far
@@ -108,21 +108,21 @@ def surface_faces(points: Float, origin: Float, faces: Faces, o: SurfaceOptions)
         [np.where(away, corners[2], corners[0]), corners[1], np.where(away, *corners[::2])]
     )
     cosine = np.abs(facing) / np.maximum(area * range, 1e-300)
-    level = is_level(_length(origin - points), faces)
+    level = has_equal_ranges(_length(origin - points), faces)
     limit = np.minimum(o.longest, o.longest_share * range)
     kept = (longest <= limit) & (level | (cosine >= np.cos(o.steepest))) & (area > 0.0)
     faces, cosine = faces[kept], cosine[kept]
     normals = spans[:, kept] * (np.where(away, -1.0, 1.0) / np.maximum(area, 1e-300))[kept]
     steep = np.flatnonzero((cosine < np.cos(o.steep)) & ~level[kept])
-    at_points = point_normals(normals, faces, len(points), 0)
+    at_points = vertex_normals(normals, faces, len(points), 0)
     along = [_dot(at_points[:, faces[steep, k]], normals[:, steep]) for k in (0, 1, 2)]
     fits = np.ones(len(faces), np.bool_)
     # at two corners: the third may lie in the edge of a room
     fits[steep] = _middle(*along) >= np.cos(o.bend)
     faces, normals = faces[fits], normals[:, fits]
-    smooth = point_normals(normals, faces, len(points), _SMOOTHING)
+    smooth = vertex_normals(normals, faces, len(points), _SMOOTHING)
     standoff = _dot(smooth, _columns(origin - points))
-    return Kept(faces.astype(np.int32), np.where(np.isfinite(standoff), standoff, 0.0))
+    return SurfaceFaces(faces.astype(np.int32), np.where(np.isfinite(standoff), standoff, 0.0))
 
 
 def _cross(a: Float, b: Float) -> Float:
@@ -140,7 +140,7 @@ def _middle(a: Float, b: Float, c: Float) -> Float:
     return np.asarray(np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)))
 
 
-def is_level(range: Float, faces: Faces) -> Bool:
+def has_equal_ranges(range: Float, faces: Faces) -> Bool:
     """(m,) whether the corners of triangles are as far away as each other, but for noise.
 
     Args:
@@ -149,10 +149,10 @@ def is_level(range: Float, faces: Faces) -> Bool:
     """
     a, b, c = (range[faces[:, k]] for k in (0, 1, 2))
     between = np.maximum(np.maximum(a, b), c) - np.minimum(np.minimum(a, b), c)
-    return np.asarray(between <= _NOISES * noise_of(range, faces))
+    return np.asarray(between <= _NOISES * range_std(range, faces))
 
 
-def noise_of(range: Float, faces: Faces) -> float:
+def range_std(range: Float, faces: Faces) -> float:
     """Standard deviation of ranges (n,) in metres, by what they are off those around.
 
     Half of the points are nearer to the mean of their neighbours than noise lets them be; 0 where
@@ -169,7 +169,7 @@ def noise_of(range: Float, faces: Faces) -> float:
     return float(np.median(np.abs(around - range[inside]))) / _HALF
 
 
-def point_normals(normals: Float, faces: Faces, n: int, rounds: int) -> Float:
+def vertex_normals(normals: Float, faces: Faces, n: int, rounds: int) -> Float:
     """(3, n) of length one at each point: the mean of those of the triangles around.
 
     Args:
@@ -228,7 +228,7 @@ class Rows(NamedTuple):
     closed: bool
 
 
-def rows_of(looking: Float) -> Rows | None:
+def split_rows(looking: Float) -> Rows | None:
     """Rows along which the azimuth, or the elevation, goes on, until it begins again.
 
     Args:
@@ -256,7 +256,7 @@ def rows_of(looking: Float) -> Rows | None:
     return None
 
 
-def strip_faces(rows: Rows) -> NDArray[np.int32]:
+def triangulate_strips(rows: Rows) -> NDArray[np.int32]:
     """(m, 3) triangles between each row and the next: from beam to beam on either side in turn.
 
     After the last row comes the first one, which may be far away.

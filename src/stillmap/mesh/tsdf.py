@@ -18,7 +18,7 @@ from stillmap.core.recording import Recording
 from stillmap.mesh import marching_cubes
 from stillmap.mesh.options import SurfaceOptions
 from stillmap.mesh.range_image import Patch, find_scan_layout, triangulate_scans
-from stillmap.mesh.resolution import PatchExtents, patch_extents, choose_resolution
+from stillmap.mesh.resolution import PatchExtents, choose_resolution, patch_extents
 from stillmap.mesh.simplification import simplify, simplify_to_budget
 from stillmap.mesh.triangle_mesh import Mesh
 

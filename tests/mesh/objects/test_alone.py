@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from made_up_street import Car, Part, street
 
-from stillmap.mesh.inputs import Sources
-from stillmap.mesh.objects.frame import Way
-from stillmap.mesh.objects.merging import followed_of
-from stillmap.mesh.objects.reconstruction import Shape, p_dynamic_at, shape_of
-from stillmap.mesh.objects.segmentation import Moves
+from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.objects.frame import ObjectFrame
+from stillmap.mesh.objects.merging import collect_tracks
+from stillmap.mesh.objects.reconstruction import ObjectShape, mean_p_dynamic, reconstruct_object
+from stillmap.mesh.objects.segmentation import DynamicReturns
 from stillmap.mesh.options import MoverOptions
 from stillmap.mesh.triangle_mesh import Mesh
 
@@ -18,13 +18,13 @@ OPTIONS = MoverOptions()
 STANDS = Car((8.0, 0.0), (0.0, 0.0), (0.6, 2.0, 1.5))
 
 
-def _shape(sources: Sources, options: MoverOptions = OPTIONS) -> Shape | None:
-    moves = Moves.of(sources)
-    followed = followed_of(sources, moves, options)
-    return shape_of(followed, sources, moves, options, [np.zeros(0)] * len(followed))
+def _shape(sources: MeshInputs, options: MoverOptions = OPTIONS) -> ObjectShape | None:
+    moves = DynamicReturns.of(sources)
+    followed = collect_tracks(sources, moves, options)
+    return reconstruct_object(followed, sources, moves, options, [np.zeros(0)] * len(followed))
 
 
-def _partly(sources: Sources, share: float) -> Sources:
+def _partly(sources: MeshInputs, share: float) -> MeshInputs:
     """The same, but what ended on the box in `share` of its width is static, and nobody's."""
     (one,) = sources.objects
     y = sources.seen.end_points(one.beams, sources.poses)[:, 1]
@@ -56,21 +56,21 @@ def test_static_things_farther_away_do_not_matter() -> None:
     assert _shape(sources, MoverOptions(about=1.0, dynamic=0.9)) is None
 
 
-def _face(height: float) -> tuple[Sources, Mesh, Way]:
+def _face(height: float) -> tuple[MeshInputs, Mesh, ObjectFrame]:
     """The front of the box, up to a height, in its own frame."""
     sources = street([STANDS], [Part(0)])
-    way = Way.of_track(sources.things[0])
+    way = ObjectFrame.of_track(sources.things[0])
     x, y = -0.3, 0.4
     corners = np.array([[x, -y, 0.0], [x, y, 0.0], [x, y, height], [x, -y, height]])
     return sources, Mesh(corners, np.array([[0, 2, 1], [0, 3, 2]], np.int32)), way
 
 
-def _set(sources: Sources, which: np.ndarray, p: float) -> Sources:
+def _set(sources: MeshInputs, which: np.ndarray, p: float) -> MeshInputs:
     p_static = np.where(which, np.float32(p), np.float32(0.0))
     return dataclasses.replace(sources, p_static=p_static)
 
 
-def _local(sources: Sources, way: Way) -> np.ndarray:
+def _local(sources: MeshInputs, way: ObjectFrame) -> np.ndarray:
     T = way.T_map_object(0.0)
     every = np.arange(sources.seen.n_beams)
     return np.asarray((sources.seen.end_points(every, sources.poses) - T[:3, 3]) @ T[:3, :3])
@@ -85,8 +85,8 @@ def test_the_mean_is_that_of_beams_near_the_surface(reach: float) -> None:
     far = (np.abs(at[:, 0] + 0.3) > reach) | (outside > reach)
     assert near.sum() > 100
     span = (0.0, 0.05)
-    assert p_dynamic_at(mesh, way, span, _set(sources, far, 1.0), reach) == 1.0
-    found = p_dynamic_at(mesh, way, span, _set(sources, near, 0.25), reach)
+    assert mean_p_dynamic(mesh, way, span, _set(sources, far, 1.0), reach) == 1.0
+    found = mean_p_dynamic(mesh, way, span, _set(sources, near, 0.25), reach)
     assert found == pytest.approx(0.75, abs=0.06)
     assert found > 0.7499
 
@@ -95,32 +95,32 @@ def test_other_times_do_not_count() -> None:
     sources, mesh, way = _face(0.9)
     later = np.arange(sources.seen.n_beams) >= sources.seen.offset[3]
     sources = _set(sources, later, 1.0)
-    assert p_dynamic_at(mesh, way, (0.0, 0.25), sources, 0.2) == 1.0
-    assert p_dynamic_at(mesh, way, (0.35, 0.65), sources, 0.2) == 0.0
-    assert p_dynamic_at(mesh, way, (0.15, 0.35), sources, 0.2) == pytest.approx(0.5)
+    assert mean_p_dynamic(mesh, way, (0.0, 0.25), sources, 0.2) == 1.0
+    assert mean_p_dynamic(mesh, way, (0.35, 0.65), sources, 0.2) == 0.0
+    assert mean_p_dynamic(mesh, way, (0.15, 0.35), sources, 0.2) == pytest.approx(0.5)
 
 
 def test_what_goes_on_leaves_what_it_passed_behind() -> None:
     goes = Car((8.0, -2.0), (0.0, 10.0), (0.6, 1.0, 1.5))
     wall = Car((9.0, -2.0), (0.0, 0.0), (0.6, 1.0, 1.5))
     sources = street([goes, wall], [Part(0), Part(1)], scans=6)
-    x = _local(sources, Way.of_track(sources.things[1]))[:, 0]
+    x = _local(sources, ObjectFrame.of_track(sources.things[1]))[:, 0]
     sources = _set(sources, np.abs(x + 0.3) < 0.05, 1.0)
-    way = Way.of_track(sources.things[0])
+    way = ObjectFrame.of_track(sources.things[0])
     corners = np.array([[-0.3, -0.4, 0.2], [-0.3, 0.4, 0.2], [-0.3, 0.4, 1.2]])
     mesh = Mesh(corners, np.array([[0, 2, 1]], np.int32))
     standing = way._replace(thing=way.thing._replace(box=sources.things[1].box))
-    assert p_dynamic_at(mesh, way, (0.15, 0.45), sources, 0.2) == 1.0
-    assert p_dynamic_at(mesh, standing, (0.15, 0.45), sources, 0.2) < 0.5
+    assert mean_p_dynamic(mesh, way, (0.15, 0.45), sources, 0.2) == 1.0
+    assert mean_p_dynamic(mesh, standing, (0.15, 0.45), sources, 0.2) < 0.5
 
 
 def test_the_ground_does_not_count() -> None:
     sources, mesh, way = _face(0.9)
     low = _local(sources, way)[:, 2] < 0.1
     assert (low & (np.abs(_local(sources, way)[:, 1]) < 0.4)).sum() > 10
-    assert p_dynamic_at(mesh, way, (0.0, 0.05), _set(sources, low, 1.0), 0.2) == 1.0
+    assert mean_p_dynamic(mesh, way, (0.0, 0.05), _set(sources, low, 1.0), 0.2) == 1.0
     _, flat, _ = _face(0.04)
-    assert np.isnan(p_dynamic_at(flat, way, (0.0, 0.05), sources, 0.05))
+    assert np.isnan(mean_p_dynamic(flat, way, (0.0, 0.05), sources, 0.05))
 
 
 def test_flat_things_have_models_where_nobody_asks() -> None:

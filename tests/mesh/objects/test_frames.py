@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from stillmap.mesh.objects.frame import Way
-from stillmap.mesh.texture.occluders import Thing
+from stillmap.mesh.objects.frame import ObjectFrame
+from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.tracking.boxes import Box
 
 
-def _way() -> Way:
+def _way() -> ObjectFrame:
     box = Box(
         3,
         np.array([0.0, 1.0, 2.0]),
@@ -17,12 +17,12 @@ def _way() -> Way:
         (1.0, 0.5),
         0.5,
     )
-    thing = Thing(box, np.array([0.0, 0.1, 0.3]), 1.5)
-    return Way(thing, np.array([0.0, 2.0]), np.array([[0.0, 0.0, 0.0], [0.2, -0.4, 0.1]]))
+    thing = TrackedBox(box, np.array([0.0, 0.1, 0.3]), 1.5)
+    return ObjectFrame(thing, np.array([0.0, 2.0]), np.array([[0.0, 0.0, 0.0], [0.2, -0.4, 0.1]]))
 
 
 def test_without_offsets_the_frame_is_that_of_the_track() -> None:
-    way = Way.of_track(_way().thing)
+    way = ObjectFrame.of_track(_way().thing)
     T = way.T_map_object(1.5)
     np.testing.assert_allclose(T[:3, 3], [2.0, 1.0, 0.2])
     np.testing.assert_allclose(T[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)
@@ -50,7 +50,7 @@ def test_each_point_goes_by_its_own_time() -> None:
 
 def test_offsets_are_those_of_the_frame() -> None:
     way = _way()
-    straight = Way.of_track(way.thing).local(np.array([2.0]), np.array([[2.0, 3.0, 0.3]]))
+    straight = ObjectFrame.of_track(way.thing).local(np.array([2.0]), np.array([[2.0, 3.0, 0.3]]))
     np.testing.assert_allclose(straight, [[1.0, 0.0, 0.0]], atol=1e-12)
     turned = way.local(np.array([2.0]), np.array([[2.0, 3.0, 0.3]]))
     np.testing.assert_allclose(turned, [[np.cos(0.1) + 0.2, np.sin(0.1) - 0.4, 0.0]], atol=1e-12)

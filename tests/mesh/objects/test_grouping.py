@@ -3,17 +3,17 @@
 import numpy as np
 
 from stillmap.mesh.objects import merging
-from stillmap.mesh.objects.merging import Pairs, Scan, grouped, pairs_of
+from stillmap.mesh.objects.merging import PairCounts, ScanClusters, count_pairs, group_tracks
 
 
-def _pairs(*rows: tuple[int, int, int, int]) -> Pairs:
+def _pairs(*rows: tuple[int, int, int, int]) -> PairCounts:
     table = np.array(rows, np.intp).reshape(-1, 4)
-    return Pairs(table[:, :2], table[:, 2], table[:, 3])
+    return PairCounts(table[:, :2], table[:, 2], table[:, 3])
 
 
-def _wholes(pairs: Pairs, n: int, may: list[bool] | None = None) -> list[list[int]]:
+def _wholes(pairs: PairCounts, n: int, may: list[bool] | None = None) -> list[list[int]]:
     allowed = np.ones(len(pairs.met), np.bool_) if may is None else np.array(may)
-    whole = grouped(pairs, allowed, n)
+    whole = group_tracks(pairs, allowed, n)
     return [np.flatnonzero(whole == k).tolist() for k in np.unique(whole)]
 
 
@@ -26,11 +26,11 @@ def test_pairs_are_counted_as_in_a_square_of_all(monkeypatch) -> None:
         for _ in range(int(rng.integers(0, 20))):
             there = np.flatnonzero(rng.random(n) < 0.6)
             piece, beams = rng.integers(0, 3, len(there)), rng.integers(1, 50, len(there))
-            scans.append(Scan(there, piece, beams))
+            scans.append(ScanClusters(there, piece, beams))
             fewer = np.minimum(beams[:, None], beams)
             met[np.ix_(there, there)] += (piece[:, None] == piece) * fewer
             both[np.ix_(there, there)] += fewer
-        pairs = pairs_of(scans, n)
+        pairs = count_pairs(scans, n)
         ends = np.argwhere(np.triu(both > 0, 1))
         np.testing.assert_array_equal(pairs.ends, ends)
         np.testing.assert_array_equal(pairs.met, met[ends[:, 0], ends[:, 1]])

@@ -3,22 +3,22 @@
 import numpy as np
 import pytest
 
-from stillmap.mesh.objects.sweep_surface import Look, best_moment, between_beams
+from stillmap.mesh.objects.sweep_surface import ObjectBeams, find_best_interval, triangulate_beams
 
 
-def _beams(hit_at: float, step: float, rows: int = 21) -> tuple[Look, Look]:
+def _beams(hit_at: float, step: float, rows: int = 21) -> tuple[ObjectBeams, ObjectBeams]:
     """A board 0.6 m wide and 1 m high before a wall at 6 m, seen from the origin."""
     angle = (np.arange(rows) - rows // 2) * step
     y, z = (a.ravel() for a in np.meshgrid(np.tan(angle), np.tan(angle)))
     looking = np.stack([np.ones(len(y)), y, z], axis=1)
     on = (np.abs(looking[:, 1] * hit_at) <= 0.3) & (np.abs(looking[:, 2] * hit_at) <= 0.5)
     zero = np.zeros((len(y), 3))
-    return Look(looking[on] * hit_at, zero[on]), Look(looking[~on] * 6.0, zero[~on])
+    return ObjectBeams(looking[on] * hit_at, zero[on]), ObjectBeams(looking[~on] * 6.0, zero[~on])
 
 
 def test_a_board_is_a_surface_that_faces_the_sensor() -> None:
     own, others = _beams(3.0, 0.02)
-    mesh = between_beams(own, others, 2.5, 0.6)
+    mesh = triangulate_beams(own, others, 2.5, 0.6)
     assert len(mesh.vertices) == len(own.points)
     np.testing.assert_allclose(mesh.vertices[:, 0], 3.0, atol=0.01)
     assert (mesh.normals()[:, 0] < -0.9).all()
@@ -30,18 +30,18 @@ def test_noise_along_the_line_of_sight_becomes_less() -> None:
     own, others = _beams(3.0, 0.02)
     noise = np.random.default_rng(0).normal(0.0, 0.02, len(own.points))
     noisy = own._replace(points=own.points * (1.0 + noise / 3.0)[:, None])
-    mesh = between_beams(noisy, others, 2.5, 0.6)
+    mesh = triangulate_beams(noisy, others, 2.5, 0.6)
     assert np.abs(mesh.vertices[:, 0] - 3.0).mean() < 0.6 * np.abs(noise).mean()
 
 
 def test_there_is_no_surface_where_beams_passed() -> None:
     own, others = _beams(3.0, 0.02)
     hole = np.linalg.norm(own.points[:, 1:], axis=1) < 0.1
-    through = Look(own.points[hole] * 2.0, own.origin[hole])
-    own = Look(own.points[~hole], own.origin[~hole])
-    both = Look(*(np.concatenate([a, b]) for a, b in zip(others, through, strict=True)))
-    with_hole = between_beams(own, both, 10.0, 0.6)
-    closed = between_beams(own, others, 10.0, 0.6)
+    through = ObjectBeams(own.points[hole] * 2.0, own.origin[hole])
+    own = ObjectBeams(own.points[~hole], own.origin[~hole])
+    both = ObjectBeams(*(np.concatenate([a, b]) for a, b in zip(others, through, strict=True)))
+    with_hole = triangulate_beams(own, both, 10.0, 0.6)
+    closed = triangulate_beams(own, others, 10.0, 0.6)
     assert np.linalg.norm(with_hole.centres[:, 1:], axis=1).min() > 0.06
     assert np.linalg.norm(closed.centres[:, 1:], axis=1).min() < 0.06
 
@@ -50,19 +50,21 @@ def test_steps_and_few_beams_are_no_surface() -> None:
     own, others = _beams(3.0, 0.02)
     far = own.points[:, 1] > 0.0
     step = own._replace(points=np.where(far[:, None], own.points * 1.5, own.points))
-    mesh = between_beams(step, others, 2.5, 0.6)
+    mesh = triangulate_beams(step, others, 2.5, 0.6)
     depth = mesh.corners[:, :, 0]
     assert (np.ptp(depth, axis=1) < 0.5).all()
-    assert len(between_beams(Look(own.points[:2], own.origin[:2]), others, 2.5, 0.6)) == 0
-    line = Look(own.points[:3], own.origin[:3])
+    assert (
+        len(triangulate_beams(ObjectBeams(own.points[:2], own.origin[:2]), others, 2.5, 0.6)) == 0
+    )
+    line = ObjectBeams(own.points[:3], own.origin[:3])
     line.points[:] = np.outer([1.0, 1.1, 1.2], [3.0, 0.0, 0.1])
-    assert len(between_beams(line, others, 2.5, 0.6)) == 0
+    assert len(triangulate_beams(line, others, 2.5, 0.6)) == 0
 
 
 def test_most_beams_count_and_a_picture_nearby() -> None:
     seconds = np.concatenate([np.full(10, 1.0), np.full(30, 2.0), np.full(20, 3.0)])
     look = np.repeat([4, 5, 9], [10, 30, 20])
     none = np.zeros(0)
-    assert best_moment(seconds, look, 0.0, 0.5, none) == (2.0, 2.0, 30.0)
-    assert best_moment(seconds, look, 0.0, 0.5, np.array([3.0])) == (3.0, 3.0, 20.0)
-    assert best_moment(seconds, look, 1.0, 0.5, none) == (2.0, 3.0, 50.0)
+    assert find_best_interval(seconds, look, 0.0, 0.5, none) == (2.0, 2.0, 30.0)
+    assert find_best_interval(seconds, look, 0.0, 0.5, np.array([3.0])) == (3.0, 3.0, 20.0)
+    assert find_best_interval(seconds, look, 1.0, 0.5, none) == (2.0, 3.0, 50.0)

@@ -9,14 +9,14 @@ import pytest
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.mesh.background import Ahead
-from stillmap.mesh.objects.segmentation import Moves
+from stillmap.mesh.background import Background
+from stillmap.mesh.objects.segmentation import DynamicReturns
 from stillmap.mesh.options import MeshOptions, VisibleOptions
-from stillmap.mesh.place import Painted
-from stillmap.mesh.point_colors import Moving, tint_moving
-from stillmap.mesh.texture.atlas import GREY
-from stillmap.mesh.texture.occluders import Thing
-from stillmap.mesh.texture.views import View, colours_of
+from stillmap.mesh.place import ViewAssignment
+from stillmap.mesh.point_colors import TrackedReturns, color_moving
+from stillmap.mesh.texture.atlas import GRAY
+from stillmap.mesh.texture.occluders import TrackedBox
+from stillmap.mesh.texture.views import View, read_color_image
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.tracking.boxes import Box
 
@@ -31,14 +31,14 @@ CAMERA = Camera("camera", 320, 240, K, "", np.zeros(0), np.eye(4))
 T_CAMERA_MAP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 1], [0, 1, 0, 0], [0, 0, 0, 1]])  # 1 m high
 
 
-def thing(number: int, x: float, y: float, half: tuple[float, float], speed: float) -> Thing:
+def thing(number: int, x: float, y: float, half: tuple[float, float], speed: float) -> TrackedBox:
     at = np.array([[x, y], [x + speed, y]])
     ahead, velocity = np.tile([1.0, 0.0], (2, 1)), np.tile([speed, 0.0], (2, 1))
     box = Box(number, np.array([0.0, 1.0]), at, ahead, velocity, half, 0.5)
-    return Thing(box, np.zeros(2), 2.0)
+    return TrackedBox(box, np.zeros(2), 2.0)
 
 
-def board_seen(*others: Thing) -> Moving:
+def board_seen(*others: TrackedBox) -> TrackedReturns:
     n = len(BOARD)
     ends = [
         np.column_stack([BOARD[:, 0] + SPEED * t, np.full(n, AHEAD), BOARD[:, 1]]) for t in TIMES
@@ -61,7 +61,7 @@ def board_seen(*others: Thing) -> Moving:
         things=[thing(7, 0.0, AHEAD, (0.6, 0.2), SPEED), *others],
         start_ns=0,
     )
-    return Moving(sources, Moves.of(sources))
+    return TrackedReturns(sources, DynamicReturns.of(sources))
 
 
 def view(number: int, seconds: float) -> View:
@@ -82,19 +82,21 @@ def columns(image: int) -> np.ndarray:
 
 def tint(moving, views, load=columns, place=NOTHING, options=None):
     n = moving.sources.recording.n_beams
-    out, late = np.full((n, 3), GREY[0], np.uint8), np.full(n, np.inf, np.float32)
+    out, late = np.full((n, 3), GRAY[0], np.uint8), np.full(n, np.inf, np.float32)
     images, none = pictures(load), np.full(len(place), -1)
-    still = Painted(place, none, np.zeros(len(place), np.float32), none < 0, none, none * 0.0)
-    ahead = Ahead(still, views, VisibleOptions(), lambda one: colours_of(images, one))
+    still = ViewAssignment(
+        place, none, np.zeros(len(place), np.float32), none < 0, none, none * 0.0
+    )
+    ahead = Background(still, views, VisibleOptions(), lambda one: read_color_image(images, one))
     for number in range(len(views)):
-        tint_moving(out, late, moving, number, ahead, options or MeshOptions())
+        color_moving(out, late, moving, number, ahead, options or MeshOptions())
     return out.reshape(2, -1, 3), late.reshape(2, -1)
 
 
 def test_points_are_looked_up_where_the_thing_has_gone_to():
     colours, late = tint(board_seen(), [view(1, 0.3)])
     for scan, time in enumerate(TIMES):
-        has = (colours[scan] != GREY).any(axis=1)
+        has = (colours[scan] != GRAY).any(axis=1)
         assert 0.3 < has.mean() < 1.0
         assert late[scan, has] == pytest.approx(0.3 - time)
         expected = 160.0 + 200.0 * (BOARD[:, 0] + SPEED * 0.3) / AHEAD
@@ -115,10 +117,10 @@ def test_the_nearest_in_time_counts_whatever_the_order():
 
 
 def test_pictures_long_before_or_after_do_not_count():
-    assert (tint(board_seen(), [view(1, 0.61), view(2, -0.51)])[0] == GREY).all()
+    assert (tint(board_seen(), [view(1, 0.61), view(2, -0.51)])[0] == GRAY).all()
     options = MeshOptions()
     options = dataclasses.replace(options, objects=dataclasses.replace(options.objects, near=0.7))
-    assert (tint(board_seen(), [view(1, 0.61)], options=options)[0] != GREY).any()
+    assert (tint(board_seen(), [view(1, 0.61)], options=options)[0] != GRAY).any()
 
 
 def wall(y: float) -> Mesh:
@@ -130,18 +132,18 @@ def wall(y: float) -> Mesh:
 def test_what_stands_still_hides_what_is_behind_it():
     left = BOARD[:, 0] < -0.05
     near, _ = tint(board_seen(), [view(1, 0.0)], place=wall(2.0))
-    assert (near[0, left] == GREY).all()
-    assert (near[0, ~left] != GREY).any()
+    assert (near[0, left] == GRAY).all()
+    assert (near[0, ~left] != GRAY).any()
     behind, _ = tint(board_seen(), [view(1, 0.0)], place=wall(4.0))
-    assert (behind[0, left] != GREY).any()
+    assert (behind[0, left] != GRAY).any()
 
 
 def test_another_thing_hides_what_is_behind_it():
     other = thing(8, 0.0, 1.5, (0.05, 0.05), 0.0)
     covered, _ = tint(board_seen(other), [view(1, 0.0)])
     alone, _ = tint(board_seen(), [view(1, 0.0)])
-    assert (covered[0, INNER] == GREY).all()
-    assert (alone[0, INNER] != GREY).any()
+    assert (covered[0, INNER] == GRAY).all()
+    assert (alone[0, INNER] != GRAY).any()
     far, _ = tint(board_seen(thing(8, 0.0, 4.5, (0.05, 0.05), 0.0)), [view(1, 0.0)])
     np.testing.assert_array_equal(far, alone)
 
@@ -150,10 +152,10 @@ def test_what_is_of_no_track_and_what_stands_still_are_left_alone():
     moving = board_seen()
     moving.sources.p_static[:100] = 0.9
     moving.sources.objects[0].beams = np.arange(200, 2 * len(BOARD))
-    again = Moving(moving.sources, Moves.of(moving.sources))
+    again = TrackedReturns(moving.sources, DynamicReturns.of(moving.sources))
     colours, _ = tint(again, [view(1, 0.05)])
-    assert (colours[0, :200] == GREY).all()
-    assert (colours[0, 200:] != GREY).any()
+    assert (colours[0, :200] == GRAY).all()
+    assert (colours[0, 200:] != GRAY).any()
 
 
 def test_a_damaged_picture_colours_nothing_and_another_one_takes_its_place():
@@ -171,7 +173,7 @@ def test_a_picture_in_which_nothing_is_seen_is_not_read():
         raise AssertionError(f"{image} is read")
 
     away = dataclasses.replace(view(1, 0.0), T_camera_map=np.diag([1.0, -1, -1, 1]) @ T_CAMERA_MAP)
-    assert (tint(board_seen(), [away, view(2, 5.0)], load)[0] == GREY).all()
+    assert (tint(board_seen(), [away, view(2, 5.0)], load)[0] == GRAY).all()
 
 
 def test_grey_pictures_give_a_grey_that_is_none_of_no_colour():

@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 from made_up_street import Car, Part, by_several, street
 
-from stillmap.mesh.objects.frame import Way
+from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.objects.segmentation import (
-    Moves,
-    about_as,
-    distinct_cells,
-    grown,
-    look_of,
-    own_moves,
-    pieces_of_cells,
-    scans_about,
-    seconds_of,
+    DynamicReturns,
+    beam_seconds,
+    beams_in_frame,
+    cluster_cells,
+    grow_segment,
+    in_viewing_cone,
+    scans_within,
+    segment_object,
+    unique_cells,
 )
 from stillmap.mesh.options import ChoiceOptions, MoverOptions
-from stillmap.mesh.point_colors import Moving
+from stillmap.mesh.point_colors import TrackedReturns
 
 OPTIONS = MoverOptions()
 TWO = [Car((8.0, -2.0), (6.0, 0.0)), Car((20.0, 4.0), (-4.0, 0.0))]
@@ -25,7 +25,7 @@ TWO = [Car((8.0, -2.0), (6.0, 0.0)), Car((20.0, 4.0), (-4.0, 0.0))]
 
 def test_all_that_moves_is_known_once() -> None:
     sources = street(TWO, [Part(0), Part(1)])
-    moves = Moves.of(sources)
+    moves = DynamicReturns.of(sources)
     np.testing.assert_array_equal(moves.beam, np.flatnonzero(sources.p_static < 0.5))
     np.testing.assert_array_equal(moves.ends, sources.seen.end_points(moves.beam, sources.poses))
     for one in sources.objects:
@@ -43,8 +43,8 @@ def test_beams_have_times_of_their_own() -> None:
     object.__setattr__(sources.recording, "beam_time", later)
     scan = sources.recording.scans_of(beams)
     expected = 1e-9 * sources.recording.stamp_ns[scan] + later[beams]
-    np.testing.assert_allclose(seconds_of(beams, sources), expected, atol=2e-9)
-    about = scans_about(0.3, 0.4, sources)
+    np.testing.assert_allclose(beam_seconds(beams, sources), expected, atol=2e-9)
+    about = scans_within(0.3, 0.4, sources)
     assert about.start <= 2
     assert about.stop >= 5
 
@@ -52,9 +52,9 @@ def test_beams_have_times_of_their_own() -> None:
 @pytest.mark.parametrize("lidars", [1, 2, 6])
 def test_beams_of_lidars_that_begin_at_once_are_found(lidars: int) -> None:
     sources = by_several(street(TWO, [Part(0)]), lidars)
-    seconds = seconds_of(np.arange(sources.recording.n_beams), sources)
+    seconds = beam_seconds(np.arange(sources.recording.n_beams), sources)
     for now in (0.28, 0.3, 0.389):
-        scans = scans_about(now, now, sources)
+        scans = scans_within(now, now, sources)
         about = sources.recording.offset[[scans.start, scans.stop]]
         then = np.flatnonzero(np.abs(seconds - now) < 1e-3)
         assert about[0] <= then[0]
@@ -62,7 +62,7 @@ def test_beams_of_lidars_that_begin_at_once_are_found(lidars: int) -> None:
     # of a picture, too
     ends, _ = sources.beams().about(280_000_000, ChoiceOptions())
     assert len(ends) == np.count_nonzero(np.abs(seconds - 0.28) <= 0.06)
-    moving = Moving(sources, Moves.of(sources))
+    moving = TrackedReturns(sources, DynamicReturns.of(sources))
     beams = sources.objects[0].beams
     found = moving.about(0.28, 0.07).beam
     np.testing.assert_array_equal(np.sort(found), beams[np.abs(seconds[beams] - 0.28) <= 0.07])
@@ -71,18 +71,18 @@ def test_beams_of_lidars_that_begin_at_once_are_found(lidars: int) -> None:
 
 def test_a_thing_has_what_ended_in_its_box_and_nothing_of_others() -> None:
     sources = street(TWO, [Part(0), Part(1)])
-    moves = Moves.of(sources)
+    moves = DynamicReturns.of(sources)
     for one, thing in zip(sources.objects, sources.things, strict=True):
-        own = own_moves(one, thing, moves, sources, OPTIONS)
+        own = segment_object(one, thing, moves, sources, OPTIONS)
         np.testing.assert_array_equal(moves.beam[own], one.beams)
 
 
 def test_what_is_followed_by_nobody_is_its_own_in_its_box() -> None:
     sources = street(TWO, [Part(0), Part(1)])
     one, thing = sources.objects[0], sources.things[0]
-    moves = Moves.of(sources)
+    moves = DynamicReturns.of(sources)
     free = moves._replace(owner=np.where(moves.owner == 0, -1, moves.owner).astype(np.int32))
-    own = own_moves(one, thing, free, sources, OPTIONS)
+    own = segment_object(one, thing, free, sources, OPTIONS)
     # but for the lowest row, which may be the ground's
     assert set(moves.beam[own]) <= set(one.beams)
     assert len(own) > 0.9 * len(one.beams)
@@ -91,13 +91,15 @@ def test_what_is_followed_by_nobody_is_its_own_in_its_box() -> None:
 def test_a_part_grows_to_the_whole_and_not_to_the_next_car() -> None:
     cars = [Car((12.0, -4.0), (3.0, 0.0)), Car((19.0, -4.0), (3.0, 0.0))]
     sources = street(cars, [Part(0, 0.0, 0.2), Part(1)])
-    moves = Moves.of(sources)
+    moves = DynamicReturns.of(sources)
     one, thing = sources.objects[0], sources.things[0]
-    own = own_moves(one, thing, moves, sources, OPTIONS)
+    own = segment_object(one, thing, moves, sources, OPTIONS)
     within = moves.between(0, int(sources.seen.offset[1]))
     every = np.arange(within.start, within.stop)
     own = own[own < within.stop]
-    whole = grown(own, every, Way.of_track(thing), np.array([-12.0, 4.0, 1.0]), moves, OPTIONS)
+    whole = grow_segment(
+        own, every, ObjectFrame.of_track(thing), np.array([-12.0, 4.0, 1.0]), moves, OPTIONS
+    )
     other = set(sources.objects[1].beams)
     assert len(whole) > 1.2 * len(own)
     assert not other & set(moves.beam[whole].tolist())
@@ -106,22 +108,22 @@ def test_a_part_grows_to_the_whole_and_not_to_the_next_car() -> None:
 
 def test_cells_are_those_of_numpy() -> None:
     points = np.random.default_rng(2).normal(0.0, 3.0, (500, 3))
-    cells, of = distinct_cells(points, 0.5)
+    cells, of = unique_cells(points, 0.5)
     expected, inverse = np.unique(np.floor(points / 0.5), axis=0, return_inverse=True)
     np.testing.assert_array_equal(cells, expected)
     np.testing.assert_array_equal(of, inverse.ravel())
     with pytest.raises(ValueError, match="too far apart"):
-        distinct_cells(np.array([[0.0, 0.0, 0.0], [1e9, 1e9, 1e9]]), 0.01)
+        unique_cells(np.array([[0.0, 0.0, 0.0], [1e9, 1e9, 1e9]]), 0.01)
 
 
 def test_pieces_are_as_far_apart_as_the_link_is_long() -> None:
     x = np.array([0.0, 0.3, 0.6, 2.0, 2.3])
     points = np.stack([x, np.zeros(5), np.zeros(5)], axis=1)
-    piece = pieces_of_cells(points, 0.1, 0.5)
+    piece = cluster_cells(points, 0.1, 0.5)
     assert len(set(piece[:3])) == 1
     assert len(set(piece[3:])) == 1
     assert piece[0] != piece[4]
-    assert len(set(pieces_of_cells(points, 0.1, 1.6))) == 1
+    assert len(set(cluster_cells(points, 0.1, 1.6))) == 1
 
 
 def test_beams_that_pass_beside_a_thing_are_found_among_all() -> None:
@@ -129,7 +131,7 @@ def test_beams_that_pass_beside_a_thing_are_found_among_all() -> None:
     mine = sources.objects[0].beams
     mine = mine[mine < sources.seen.offset[1]]
     beams = np.setdiff1d(np.arange(sources.seen.offset[1]), mine)
-    near = about_as(mine, beams, sources)
+    near = in_viewing_cone(mine, beams, sources)
     assert 0 < near.sum() < len(beams) / 2
     # no beam within the outline is lost
     turn = np.arctan2(sources.seen.points[:, 1], sources.seen.points[:, 0])
@@ -144,5 +146,5 @@ def test_beams_from_nowhere_go_on() -> None:
     sources = street(TWO, [Part(0)])
     lost = np.array([10])
     sources.seen.hit[lost] = False
-    look = look_of(lost, np.zeros(1), Way.of_track(sources.things[0]), sources)
+    look = beams_in_frame(lost, np.zeros(1), ObjectFrame.of_track(sources.things[0]), sources)
     assert np.linalg.norm(look.points - look.origin, axis=1) == pytest.approx(1000.0)

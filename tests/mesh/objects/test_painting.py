@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from made_up_rooms import looking, rectangle
 
-from stillmap.mesh.background import Ahead
-from stillmap.mesh.objects.frame import Way
-from stillmap.mesh.objects.reconstruction import Shape
-from stillmap.mesh.objects.texturing import dressed, when_in_view
+from stillmap.mesh.background import Background
+from stillmap.mesh.objects.frame import ObjectFrame
+from stillmap.mesh.objects.reconstruction import ObjectShape
+from stillmap.mesh.objects.texturing import assign_object_views, times_in_view
 from stillmap.mesh.options import ChoiceOptions, MoverOptions, VisibleOptions
-from stillmap.mesh.place import Painted
-from stillmap.mesh.texture.occluders import Thing
-from stillmap.mesh.triangle_mesh import joined
+from stillmap.mesh.place import ViewAssignment
+from stillmap.mesh.texture.occluders import TrackedBox
+from stillmap.mesh.triangle_mesh import concatenate_meshes
 from stillmap.tracking.boxes import Box
 
 WALL = rectangle([-8.0, 4.0, -3.0], [16.0, 0, 0], [0, 0, 6.0], 24)
@@ -29,11 +29,11 @@ def thing(id=3, y=2.0):
     along = np.array([[0.0, y], [4.0 * SPEED, y]])
     ahead = np.array([[1.0, 0.0]] * 2)
     box = Box(id, seconds, along, ahead, SPEED * ahead, (0.25, 0.1), 0.5)
-    return Thing(box, np.array([-0.5, -0.5]), 1.0)
+    return TrackedBox(box, np.array([-0.5, -0.5]), 1.0)
 
 
 def shape(seconds=0.0):
-    return Shape(3, BOARD, Way.of_track(thing()), False, seconds, (seconds, seconds))
+    return ObjectShape(3, BOARD, ObjectFrame.of_track(thing()), False, seconds, (seconds, seconds))
 
 
 def view(number, seconds, place=(0.0, 0.0, 0.0)):
@@ -45,7 +45,7 @@ def place_of(mesh=WALL, painter=1):
     n = len(mesh)
     of_all = np.full(n, painter, np.int32)
     p = np.ones(n, np.float32)
-    return Painted(mesh, of_all, p, np.ones(n, np.bool_), of_all, p)
+    return ViewAssignment(mesh, of_all, p, np.ones(n, np.bool_), of_all, p)
 
 
 def pictures(gap=0.0, there=(0,), shift=0.0):
@@ -65,9 +65,11 @@ def pictures(gap=0.0, there=(0,), shift=0.0):
 
 def dress(views, place=None, colours=None, options=OPTIONS, others=(), of=None):
     limits = VisibleOptions()
-    ahead = Ahead(place or place_of(), views, limits, colours or pictures())
+    ahead = Background(place or place_of(), views, limits, colours or pictures())
     things = [thing(), *others]
-    return dressed(of or shape(), views, ahead, things, 0, options, ChoiceOptions(), limits)
+    return assign_object_views(
+        of or shape(), views, ahead, things, 0, options, ChoiceOptions(), limits
+    )
 
 
 def area_painted(found):
@@ -124,7 +126,7 @@ def test_the_place_behind_is_compared_where_it_is_seen_from_elsewhere():
         return out
 
     views = [view(0, 0.0), view(1, 30.0, place=(1.0, 0.0, 0.0))]
-    ahead = Ahead(place_of(), views, VisibleOptions(), colours)
+    ahead = Background(place_of(), views, VisibleOptions(), colours)
     on_wall = np.array([[-1.0, 4.0, 0.3], [0.4, 4.0, 1.2], [0.7, 4.0, -0.9], [1.5, 4.0, 0.5]])
     np.testing.assert_allclose(ahead.differs(0, 0.6 * on_wall), 0.0, atol=1e-3)
     expected = np.linalg.norm(np.subtract(WALLS, CLOTHES))
@@ -154,7 +156,7 @@ def test_where_nobody_knows_what_is_behind_it_lies_farther_within(why):
 
 def test_what_the_place_hides_is_not_painted():
     pillar = rectangle([-0.5, 1.0, -1.0], [0.5, 0, 0], [0, 0, 2.0])
-    found = dress([view(0, 0.0), view(1, 30.0)], place_of(joined([WALL, pillar])))
+    found = dress([view(0, 0.0), view(1, 30.0)], place_of(concatenate_meshes([WALL, pillar])))
     assert painted_at(found)[:, 0].min() > 0.0
     assert area_painted(found) == pytest.approx(0.25, abs=0.03)
 
@@ -196,7 +198,9 @@ def test_scraps_are_no_picture_of_it():
             rectangle([-half, 1.0, -2.0], [2.0 * half, 0, 0], [0, 0, 2.0 - half]),
             rectangle([-half, 1.0, half], [2.0 * half, 0, 0], [0, 0, 2.0]),
         ]
-        return area_painted(dress([view(0, 0.0), view(1, 30.0)], place_of(joined([WALL, *walls]))))
+        return area_painted(
+            dress([view(0, 0.0), view(1, 30.0)], place_of(concatenate_meshes([WALL, *walls])))
+        )
 
     assert seen_through(0.08) == pytest.approx(0.16**2 * 4, rel=0.4)
     assert seen_through(0.03) == 0.0  # 2 %
@@ -206,5 +210,5 @@ def test_when_it_is_in_view():
     # at x = 2.5 m it is beyond the edge, 2 m ahead
     views = [view(0, 0.0), view(1, 1.0), view(2, 2.5), view(3, 30.0), view(4, -0.4)]
     np.testing.assert_allclose(
-        when_in_view(thing(), views, 0), [0.0, 1.0, np.nan, np.nan, -0.4], atol=1e-9
+        times_in_view(thing(), views, 0), [0.0, 1.0, np.nan, np.nan, -0.4], atol=1e-9
     )

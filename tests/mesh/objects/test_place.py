@@ -6,9 +6,9 @@ from made_up_rooms import looking, rectangle
 
 from stillmap.core.recording import Recording
 from stillmap.mesh.options import ChoiceOptions
-from stillmap.mesh.place import shown
-from stillmap.mesh.texture.occluders import Thing
-from stillmap.mesh.texture.occlusion import Beams
+from stillmap.mesh.place import p_unoccluded
+from stillmap.mesh.texture.occluders import TrackedBox
+from stillmap.mesh.texture.occlusion import LidarReturns
 from stillmap.tracking.boxes import Box
 
 # 4 m ahead of a camera at the origin; faces of 0.2 m
@@ -31,19 +31,19 @@ def beams(ends, p, beside=0.3):
     )
     T = np.eye(4)[None].copy()
     T[0, 0, 3] = -beside
-    return Beams(recording, recording, T, np.asarray(p, np.float32), [], [], 0)
+    return LidarReturns(recording, recording, T, np.asarray(p, np.float32), [], [], 0)
 
 
 def person(x, y):
     seconds = np.array([0.0, 1.0])
     still, ahead = np.tile([x, y], (2, 1)), np.tile([1.0, 0.0], (2, 1))
     box = Box(3, seconds, still, ahead, np.zeros((2, 2)), (0.2, 0.2), 0.5)
-    return Thing(box, np.full(2, -1.0), 2.0)
+    return TrackedBox(box, np.full(2, -1.0), 2.0)
 
 
 def probabilities(found, things):
     faces = np.arange(len(WALL))
-    return shown(WALL, faces, VIEW, found, things, OPTIONS)
+    return p_unoccluded(WALL, faces, VIEW, found, things, OPTIONS)
 
 
 def on_wall():

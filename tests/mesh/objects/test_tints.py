@@ -14,7 +14,7 @@ from stillmap.eval.mesh import colour_difference
 from stillmap.eval.model_readers import read_seen
 from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import poses_from_tum
-from stillmap.mesh.texture.atlas import GREY
+from stillmap.mesh.texture.atlas import GRAY
 from stillmap.results.export import point_cloud
 from stillmap.results.points import COLOURS, FIELDS
 from stillmap.sim import load_picture_truth
@@ -38,7 +38,7 @@ def rgb(rows):
 
 
 def coloured(colours):
-    return (colours != GREY).any(axis=1)
+    return (colours != GRAY).any(axis=1)
 
 
 def test_colours_of_what_stands_still_are_the_true_ones(room, result):

@@ -6,12 +6,19 @@ import numpy as np
 import pytest
 from made_up_street import Car, Part, by_several, street
 
-from stillmap.mesh.inputs import Sources
-from stillmap.mesh.objects.merging import followed_of, wholes_of
-from stillmap.mesh.objects.reconstruction import Shape, shape_of, straight
-from stillmap.mesh.objects.registration import Glimpse, Sweep, apart, motion_of, pose, surface_of
-from stillmap.mesh.objects.segmentation import Moves
-from stillmap.mesh.objects.sweep_surface import Look
+from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.objects.merging import collect_tracks, merge_tracks
+from stillmap.mesh.objects.reconstruction import ObjectShape, reconstruct_object, straighten_track
+from stillmap.mesh.objects.registration import (
+    PartialScan,
+    PartialSurface,
+    motion_transform,
+    register_surfaces,
+    surface_distance,
+    triangulate_partial_scan,
+)
+from stillmap.mesh.objects.segmentation import DynamicReturns
+from stillmap.mesh.objects.sweep_surface import ObjectBeams
 from stillmap.mesh.options import MoverOptions
 from stillmap.mesh.triangle_mesh import Mesh
 
@@ -36,13 +43,15 @@ def _corner(rng: np.random.Generator, n: int = 15) -> Mesh:
     return Mesh(mesh.vertices, np.where(wrong[:, None], mesh.faces[:, ::-1], mesh.faces))
 
 
-def _seen(rng: np.random.Generator, wrong: np.ndarray) -> list[Sweep]:
+def _seen(rng: np.random.Generator, wrong: np.ndarray) -> list[PartialSurface]:
     """Looks at it by a track that is wrong by a motion."""
     out = []
     for later in LATER:
-        mesh, (R, t) = _corner(rng), pose(wrong, later)
+        mesh, (R, t) = _corner(rng), motion_transform(wrong, later)
         out.append(
-            Sweep.of(Mesh((mesh.vertices - t) @ R, mesh.faces), np.array([-8.0, 6.0, 1.0]), later)
+            PartialSurface.of(
+                Mesh((mesh.vertices - t) @ R, mesh.faces), np.array([-8.0, 6.0, 1.0]), later
+            )
         )
     return out
 
@@ -52,12 +61,12 @@ def test_a_wrong_velocity_is_found(seed: int) -> None:
     rng = np.random.default_rng(seed)
     wrong = np.array([0.8, -0.3, 0.02, 0.06, 0.5, -0.4])
     sweeps = _seen(rng, wrong)
-    motion = motion_of(sweeps, 2)
+    motion = register_surfaces(sweeps, 2)
     np.testing.assert_allclose(motion[:2], wrong[:2], atol=0.06)
     assert motion[3] == pytest.approx(wrong[3], abs=0.02)
     moved = [one.moved(motion) for one in sweeps]
-    before = [apart(one, sweeps[2]) for one in sweeps]
-    after = [apart(one, moved[2]) for one in moved]
+    before = [surface_distance(one, sweeps[2]) for one in sweeps]
+    after = [surface_distance(one, moved[2]) for one in moved]
     assert max(before) > 0.1
     assert max(after) < 0.03
     assert after[2] == 0.0
@@ -69,15 +78,15 @@ def test_a_side_that_is_askew_is_not_moved_along_itself(
     wrong: tuple[float, float], turn: float
 ) -> None:
     rng = np.random.default_rng(0)
-    askew, _ = pose(np.array([0.0, 0.0, 0.0, turn, 0.0, 0.0]), 1.0)
+    askew, _ = motion_transform(np.array([0.0, 0.0, 0.0, turn, 0.0, 0.0]), 1.0)
     motion = np.array([*wrong, 0.0, 0.0, 0.0, 0.0])
     sweeps = []
     for later in LATER:
-        mesh, (R, t) = _corner(rng, 25), pose(motion, later)
+        mesh, (R, t) = _corner(rng, 25), motion_transform(motion, later)
         side = mesh.part(mesh.centres[:, 1] > 0.8)
         seen = Mesh((side.vertices @ askew.T - t) @ R, side.faces)
-        sweeps.append(Sweep.of(seen, np.array([0.5, 4.0, 1.0]), later))
-    np.testing.assert_allclose(motion_of(sweeps, 2)[:2], wrong, atol=0.03)
+        sweeps.append(PartialSurface.of(seen, np.array([0.5, 4.0, 1.0]), later))
+    np.testing.assert_allclose(register_surfaces(sweeps, 2)[:2], wrong, atol=0.03)
 
 
 def test_where_nothing_tells_the_track_counts() -> None:
@@ -86,8 +95,8 @@ def test_where_nothing_tells_the_track_counts() -> None:
         mesh = _corner(np.random.default_rng(k))
         side = mesh.part(mesh.centres[:, 1] > 0.8)
         moved = side.vertices + np.array([0.0, 0.2 * later, 0.0])
-        sweeps.append(Sweep.of(Mesh(moved, side.faces), np.array([0.0, 6.0, 1.0]), later))
-    motion = motion_of(sweeps, 2)
+        sweeps.append(PartialSurface.of(Mesh(moved, side.faces), np.array([0.0, 6.0, 1.0]), later))
+    motion = register_surfaces(sweeps, 2)
     assert abs(motion[0]) < 0.05
     assert motion[1] == pytest.approx(-0.2, abs=0.03)
 
@@ -95,11 +104,11 @@ def test_where_nothing_tells_the_track_counts() -> None:
 def test_few_points_say_nothing() -> None:
     rng = np.random.default_rng(5)
     few = Mesh(rng.normal(size=(5, 3)), np.array([[0, 1, 2], [2, 3, 4]], np.int32))
-    sweeps = [Sweep.of(few, np.zeros(3), later) for later in (-0.1, 0.0)]
-    np.testing.assert_array_equal(motion_of(sweeps, 1), 0.0)
-    assert np.isnan(apart(sweeps[0], sweeps[1]))
+    sweeps = [PartialSurface.of(few, np.zeros(3), later) for later in (-0.1, 0.0)]
+    np.testing.assert_array_equal(register_surfaces(sweeps, 1), 0.0)
+    assert np.isnan(surface_distance(sweeps[0], sweeps[1]))
     nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    assert np.isnan(apart(sweeps[0], Sweep.of(nothing, np.zeros(3), 0.0)))
+    assert np.isnan(surface_distance(sweeps[0], PartialSurface.of(nothing, np.zeros(3), 0.0)))
 
 
 def test_a_patch_knows_how_far_away_its_planes_are() -> None:
@@ -113,16 +122,16 @@ CAR = Car((7.0, -3.5), (5.0, 0.0))
 WRONG = Part(0, drift=(0.6, 0.2))
 
 
-def _shape(sources: Sources, options: MoverOptions) -> Shape:
-    moves = Moves.of(sources)
-    followed = followed_of(sources, moves, options)
-    (whole,) = wholes_of(followed, moves, sources, options)
-    shape = shape_of(whole, sources, moves, options, [np.zeros(0)] * len(whole))
+def _shape(sources: MeshInputs, options: MoverOptions) -> ObjectShape:
+    moves = DynamicReturns.of(sources)
+    followed = collect_tracks(sources, moves, options)
+    (whole,) = merge_tracks(followed, moves, sources, options)
+    shape = reconstruct_object(whole, sources, moves, options, [np.zeros(0)] * len(whole))
     assert shape is not None
     return shape
 
 
-def _off(shape: Shape) -> np.ndarray:
+def _off(shape: ObjectShape) -> np.ndarray:
     """How far the vertices of a model lie off the two sides of the car that are seen."""
     T = shape.way.T_map_object(shape.seconds)
     there = shape.mesh.vertices @ T[:3, :3].T + T[:3, 3]
@@ -158,7 +167,7 @@ def test_people_are_seen_at_once() -> None:
 
 def test_going_on_evenly() -> None:
     thing = street([CAR], [WRONG]).things[0]
-    even = straight(thing, 0.25, 0.5)
+    even = straighten_track(thing, 0.25, 0.5)
     at = np.array([0.0, 0.25, 0.7])
     np.testing.assert_allclose(even.box.center_at(at), thing.box.center_at(at), atol=1e-9)
     np.testing.assert_array_equal(even.box.heading[0], thing.box.heading[2])
@@ -171,11 +180,11 @@ def test_the_side_of_a_car_is_bridged_where_people_are_not() -> None:
     looking = np.stack([np.ones(len(turn)), turn - 0.2, rise], axis=1)
     points = looking * (2.0 / (0.2 - turn))[:, None]  # the plane y = -2
     zero = np.zeros((len(points), 3))
-    none = Look(np.zeros((0, 3)), np.zeros((0, 3)))
-    look = Glimpse(Look(points, zero), none, (0.0, 0.0))
-    assert len(surface_of(look, True, 3.0, OPTIONS)) == 36
-    assert len(surface_of(look, False, 3.0, OPTIONS)) < 36
-    assert len(surface_of(look, True, 0.3, OPTIONS)) < 36
+    none = ObjectBeams(np.zeros((0, 3)), np.zeros((0, 3)))
+    look = PartialScan(ObjectBeams(points, zero), none, (0.0, 0.0))
+    assert len(triangulate_partial_scan(look, True, 3.0, OPTIONS)) == 36
+    assert len(triangulate_partial_scan(look, False, 3.0, OPTIONS)) < 36
+    assert len(triangulate_partial_scan(look, True, 0.3, OPTIONS)) < 36
 
 
 def test_looks_of_several_lidars_follow_one_another() -> None:
@@ -201,6 +210,8 @@ def test_without_enough_of_a_surface_there_is_no_model(
     options: MoverOptions, any_model: bool
 ) -> None:
     sources = street([Car((8.0, -2.0), (6.0, 0.0))], [Part(0)])
-    moves = Moves.of(sources)
-    (whole,) = wholes_of(followed_of(sources, moves, options), moves, sources, options)
-    assert (shape_of(whole, sources, moves, options, [np.zeros(0)]) is not None) == any_model
+    moves = DynamicReturns.of(sources)
+    (whole,) = merge_tracks(collect_tracks(sources, moves, options), moves, sources, options)
+    assert (
+        reconstruct_object(whole, sources, moves, options, [np.zeros(0)]) is not None
+    ) == any_model

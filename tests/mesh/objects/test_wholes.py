@@ -6,23 +6,29 @@ import tracemalloc
 import numpy as np
 from made_up_street import Car, Part, street
 
-from stillmap.mesh.inputs import Sources
+from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects import merging
-from stillmap.mesh.objects.merging import MOSTLY, followed_of, hanging_together, pairs_of, wholes_of
-from stillmap.mesh.objects.reconstruction import shape_of
-from stillmap.mesh.objects.segmentation import Moves
+from stillmap.mesh.objects.merging import (
+    MAJORITY,
+    cluster_points,
+    collect_tracks,
+    count_pairs,
+    merge_tracks,
+)
+from stillmap.mesh.objects.reconstruction import reconstruct_object
+from stillmap.mesh.objects.segmentation import DynamicReturns
 from stillmap.mesh.options import MoverOptions
-from stillmap.mesh.texture.occluders import Thing
+from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.tracking.boxes import fit_box
 
 OPTIONS = MoverOptions()
 CAR = Car((6.0, -2.5), (6.0, 0.0))
 
 
-def _wholes(sources: Sources) -> list[list[int]]:
-    moves = Moves.of(sources)
-    followed = followed_of(sources, moves, OPTIONS)
-    found = wholes_of(followed, moves, sources, OPTIONS)
+def _wholes(sources: MeshInputs) -> list[list[int]]:
+    moves = DynamicReturns.of(sources)
+    followed = collect_tracks(sources, moves, OPTIONS)
+    found = merge_tracks(followed, moves, sources, OPTIONS)
     return [[one.object.id for one in whole] for whole in found]
 
 
@@ -46,13 +52,13 @@ def test_a_track_of_two_cars_does_not_make_them_one() -> None:
     names = ("scan", "stamp_ns", "xy", "velocity", "beams", "z")
     ways = {name: np.concatenate([getattr(one, name) for one in (first, last)]) for name in names}
     both = dataclasses.replace(first, **ways)
-    thing = Thing(fit_box(both, 0, 0.5), np.zeros(len(both.scan)), both.size[2])
+    thing = TrackedBox(fit_box(both, 0, 0.5), np.zeros(len(both.scan)), both.size[2])
     objects, things = [*sources.objects[:2], both], [*sources.things[:2], thing]
     sources = dataclasses.replace(sources, objects=objects, things=things)
-    moves = Moves.of(sources)
-    followed = followed_of(sources, moves, OPTIONS)
-    pairs = pairs_of(list(merging._scans(followed, moves, sources, OPTIONS)), 3)
-    hangs = pairs.met >= MOSTLY * pairs.both
+    moves = DynamicReturns.of(sources)
+    followed = collect_tracks(sources, moves, OPTIONS)
+    pairs = count_pairs(list(merging._scans(followed, moves, sources, OPTIONS)), 3)
+    hangs = pairs.met >= MAJORITY * pairs.both
     assert pairs.ends[hangs].tolist() == [[0, 2], [1, 2]]  # by twos they are all one
     assert sorted(_wholes(sources)) in ([[0, 2], [1]], [[0], [1, 2]])
 
@@ -81,10 +87,10 @@ def test_what_is_left_over_of_a_car_is_no_thing() -> None:
 
 def test_one_model_shows_all_of_a_car_that_was_followed_in_parts() -> None:
     sources = street([CAR], [Part(0, 0.0, 0.3), Part(0, 0.3, 1.0)])
-    moves = Moves.of(sources)
-    followed = followed_of(sources, moves, OPTIONS)
-    (whole,) = wholes_of(followed, moves, sources, OPTIONS)
-    shape = shape_of(whole, sources, moves, OPTIONS, [np.zeros(0)] * len(whole))
+    moves = DynamicReturns.of(sources)
+    followed = collect_tracks(sources, moves, OPTIONS)
+    (whole,) = merge_tracks(followed, moves, sources, OPTIONS)
+    shape = reconstruct_object(whole, sources, moves, OPTIONS, [np.zeros(0)] * len(whole))
     assert shape is not None
     assert shape.id in (0, 1)
     T = shape.way.T_map_object(shape.seconds)
@@ -98,21 +104,21 @@ def test_points_hang_together_as_far_as_beams_are_apart() -> None:
     place = np.zeros(3)
     for away, apart, together in ((5.0, 0.6, True), (5.0, 1.2, False), (45.0, 1.6, True)):
         points = np.array([[away, 0.0, 0.0], [away, apart, 0.0]])
-        one, other = hanging_together(points, place, 0.5)
+        one, other = cluster_points(points, place, 0.5)
         assert (one == other) == together
-    assert len(hanging_together(np.zeros((0, 3)), place, 0.5)) == 0
+    assert len(cluster_points(np.zeros((0, 3)), place, 0.5)) == 0
 
 
 def test_many_tracks_that_never_meet_need_no_room() -> None:
     sources = street([CAR], [Part(0)])
-    moves = Moves.of(sources)
-    (one,) = followed_of(sources, moves, OPTIONS)
+    moves = DynamicReturns.of(sources)
+    (one,) = collect_tracks(sources, moves, OPTIONS)
     far = [
         one._replace(object=dataclasses.replace(one.object, id=k, beams=one.object.beams[:0]))
         for k in range(1, 3000)
     ]
     tracemalloc.start()
-    found = wholes_of([one, *far], moves, sources, OPTIONS)
+    found = merge_tracks([one, *far], moves, sources, OPTIONS)
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(found) == 3000

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from stillmap.mesh.marching_cubes import without_islands
+from stillmap.mesh.marching_cubes import remove_small_components
 from stillmap.mesh.options import SurfaceOptions
-from stillmap.mesh.range_image import Patch, order_of, patches_of
-from stillmap.mesh.resolution import reach_of, resolution_of
+from stillmap.mesh.range_image import Patch, find_scan_layout, triangulate_scans
+from stillmap.mesh.resolution import choose_resolution, patch_extents
 from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.mesh.tsdf import chosen_scans, fused, static_weights, surface_of
+from stillmap.mesh.tsdf import build_surface, integrate_patches, select_scans, static_weights
 
 OPTIONS = SurfaceOptions(voxel=0.1, longest_share=1.0)
 
@@ -42,7 +42,7 @@ def walked(room):
 
 
 def test_the_room_is_where_it_is(room, walked):
-    mesh = surface_of(walked[0], walked[1], static(walked[0]), OPTIONS)
+    mesh = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
     at, face = samples(mesh)
     off = room.off_walls(at)
     assert off.mean() < 0.006
@@ -58,15 +58,15 @@ def test_a_nodding_laser_builds_the_room(room):
     poses = room.standing(120)
     poses[:, 0, 3] = 0.005 * np.arange(120)
     recording = room.scans(room.nodding(120, 121), poses, noise=0.01)
-    mesh = surface_of(recording, poses, static(recording), OPTIONS)
+    mesh = build_surface(recording, poses, static(recording), OPTIONS)
     off = room.off_walls(samples(mesh)[0])
     assert off.mean() < 0.01
     assert mesh.areas().sum() > 35.0
 
 
 def test_threads_do_not_change_a_bit(walked):
-    one = surface_of(walked[0], walked[1], static(walked[0]), OPTIONS)
-    two = surface_of(walked[0], walked[1], static(walked[0]), OPTIONS, threads=3)
+    one = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
+    two = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS, threads=3)
     assert one.vertices.tobytes() == two.vertices.tobytes()
     assert one.faces.tobytes() == two.faces.tobytes()
 
@@ -81,8 +81,8 @@ def test_what_moves_is_no_surface(room):
     with_it.points[half:] = without.points[half:]
     p = static(with_it)
     p[room.off_walls(with_it.points.astype(float)) > 0.05] = 0.2
-    cleaned = surface_of(with_it, poses, p, OPTIONS)
-    raw = surface_of(with_it, poses, static(with_it), OPTIONS)
+    cleaned = build_surface(with_it, poses, p, OPTIONS)
+    raw = build_surface(with_it, poses, static(with_it), OPTIONS)
 
     def on_box(mesh):
         at, _ = samples(mesh)
@@ -94,7 +94,7 @@ def test_what_moves_is_no_surface(room):
 
 def test_no_wall_behind_the_wall(room, walked):
     """Voxels behind a surface end without another one."""
-    mesh = surface_of(walked[0], walked[1], static(walked[0]), OPTIONS)
+    mesh = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
     assert room.off_walls(mesh.vertices).max() < 0.15
     outside = np.maximum(room.corners[0] - mesh.vertices, mesh.vertices - room.corners[1])
     assert outside.max() < 0.05
@@ -102,15 +102,15 @@ def test_no_wall_behind_the_wall(room, walked):
 
 def test_tiles_join_without_a_crack(walked, monkeypatch):
     thick = SurfaceOptions(voxel=0.1, longest_share=1.0, error=0.0, island=0.0)
-    whole = surface_of(walked[0], walked[1], static(walked[0]), thick)
+    whole = build_surface(walked[0], walked[1], static(walked[0]), thick)
     monkeypatch.setattr("stillmap.mesh.marching_cubes.TILE", 16)
-    tiled = surface_of(walked[0], walked[1], static(walked[0]), thick)
+    tiled = build_surface(walked[0], walked[1], static(walked[0]), thick)
     assert len(whole) == len(tiled)
     assert len(borders(whole)) == len(borders(tiled))
     assert len(whole.vertices) == len(tiled.vertices)
     # vertices are single precision within a tile
     assert cKDTree(whole.vertices).query(tiled.vertices)[0].max() < 1e-5
-    thinned = surface_of(walked[0], walked[1], static(walked[0]), OPTIONS)
+    thinned = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
     # no border but that of the surface: far from it everything is closed
     ends = thinned.vertices[borders(thinned)].mean(axis=1)
     inside = (np.abs(ends[:, 0] - 1.0) < 1.0) & (np.abs(ends[:, 2]) < 0.5)
@@ -120,14 +120,14 @@ def test_tiles_join_without_a_crack(walked, monkeypatch):
 
 def test_the_budget_is_kept(walked, room):
     few = SurfaceOptions(voxel=0.1, longest_share=1.0, faces=400)
-    mesh = surface_of(walked[0], walked[1], static(walked[0]), few)
+    mesh = build_surface(walked[0], walked[1], static(walked[0]), few)
     assert 50 < len(mesh) <= 400
     assert room.off_walls(samples(mesh)[0]).mean() < 0.05
 
 
 def test_progress_is_told(walked):
     heard = []
-    surface_of(walked[0], walked[1], static(walked[0]), OPTIONS, 1, lambda *at: heard.append(at))
+    build_surface(walked[0], walked[1], static(walked[0]), OPTIONS, 1, lambda *at: heard.append(at))
     done, total = np.array(heard).T
     assert (np.diff(done) >= 0).all()
     assert done[-1] == total[-1]
@@ -136,10 +136,10 @@ def test_progress_is_told(walked):
 
 def test_nothing_seen_is_an_empty_mesh(walked):
     for recording, poses in (walked, (walked[0], walked[1])):
-        mesh = surface_of(recording, poses, np.zeros(recording.n_beams, np.float32), OPTIONS)
+        mesh = build_surface(recording, poses, np.zeros(recording.n_beams, np.float32), OPTIONS)
         assert len(mesh) == 0
     p = np.full(walked[0].n_beams, np.nan, np.float32)
-    assert len(surface_of(*walked, p, OPTIONS)) == 0
+    assert len(build_surface(*walked, p, OPTIONS)) == 0
 
 
 def test_an_object_is_built_in_its_own_frame(room):
@@ -148,8 +148,8 @@ def test_an_object_is_built_in_its_own_frame(room):
     for k, x in enumerate((0.0, 0.5, 1.0)):
         box = np.array([[1.5, x - 1.0, -0.5], [2.2, x, 0.5]])
         recording = room.scans(room.picture(160, 120, 120.0), T[:1], box=box, noise=0.005, seed=k)
-        order = order_of(recording, np.arange(1), OPTIONS)
-        (patch,) = (make() for make in patches_of(recording, T[:1], order, OPTIONS))
+        order = find_scan_layout(recording, np.arange(1), OPTIONS)
+        (patch,) = (make() for make in triangulate_scans(recording, T[:1], order, OPTIONS))
         moved = np.array([1.85, x - 0.5, 0.0])
         own = Patch(
             patch.points - moved, patch.faces, patch.beam, patch.origin - moved, patch.standoff
@@ -157,7 +157,7 @@ def test_an_object_is_built_in_its_own_frame(room):
         on_it = np.zeros(recording.n_beams, np.float32)
         on_it[patch.beam] = (np.abs(own.points) < [0.4, 0.6, 0.6]).all(axis=1)
         parts.append((own, static_weights(own, on_it, 0.5)))
-    mesh = fused(parts, 0.04, OPTIONS)
+    mesh = integrate_patches(parts, 0.04, OPTIONS)
     front = np.abs(mesh.vertices[:, 0] + 0.35) < 0.02
     assert front.mean() > 0.5
     assert mesh.areas().sum() == pytest.approx(1.0, abs=0.35)
@@ -170,11 +170,11 @@ def test_scans_that_tell_nothing_new_are_left_out():
     T[20:, 0, 3] = np.arange(10)
     sensor = np.zeros(30, np.int32)
     o = SurfaceOptions(apart=0.1, turned=0.2, looks=2)
-    assert chosen_scans(T, sensor, 5.0, o).tolist() == [0, 1, *range(21, 30)]
+    assert select_scans(T, sensor, 5.0, o).tolist() == [0, 1, *range(21, 30)]
     T[5, :2, :2] = [[0, -1], [1, 0]]
-    assert 5 in chosen_scans(T, sensor, 5.0, o)
+    assert 5 in select_scans(T, sensor, 5.0, o)
     sensor[6:8] = 1
-    assert set(chosen_scans(T, sensor, 5.0, o)) >= {6, 7}
+    assert set(select_scans(T, sensor, 5.0, o)) >= {6, 7}
 
 
 def test_islands_are_dropped():
@@ -182,8 +182,8 @@ def test_islands_are_dropped():
     mesh = Mesh(
         np.concatenate([triangle, 5 + 0.1 * triangle]), np.arange(6, dtype=np.int32).reshape(2, 3)
     )
-    assert len(without_islands(mesh, 0.01)) == 1
-    assert len(without_islands(mesh, 0.001)) == 2
+    assert len(remove_small_components(mesh, 0.01)) == 1
+    assert len(remove_small_components(mesh, 0.001)) == 2
 
 
 @pytest.mark.parametrize("bad", [{"voxel": 0.0}, {"least": 1.5}, {"looks": 0}, {"faces": 1}])
@@ -196,7 +196,9 @@ FREE = SurfaceOptions(longest_share=1.0)
 
 
 def resolved(recording, poses, order, options):
-    return resolution_of(recording, poses, order, reach_of(recording, poses, order), options)
+    return choose_resolution(
+        recording, poses, order, patch_extents(recording, poses, order), options
+    )
 
 
 @pytest.mark.parametrize(
@@ -205,14 +207,14 @@ def resolved(recording, poses, order, options):
 )
 def test_voxels_are_as_fine_as_beams_tell(room, made, noise, low, high):
     recording = room.scans(room.lidar(*made), room.standing(2), noise=noise)
-    order = order_of(recording, np.arange(2), FREE)
+    order = find_scan_layout(recording, np.arange(2), FREE)
     voxel, _ = resolved(recording, room.standing(2), order, FREE)
     assert low < voxel < high
 
 
 def test_voxels_fit_into_memory(room, monkeypatch):
     recording = room.scans(room.lidar(720, 80), room.standing(2))
-    order = order_of(recording, np.arange(2), FREE)
+    order = find_scan_layout(recording, np.arange(2), FREE)
     fine, _ = resolved(recording, room.standing(2), order, FREE)
     monkeypatch.setattr("stillmap.mesh.resolution._MEMORY", 1e5)
     assert resolved(recording, room.standing(2), order, FREE)[0] > 2 * fine
@@ -220,12 +222,12 @@ def test_voxels_fit_into_memory(room, monkeypatch):
 
 def test_pictures_finer_than_voxels_are_thinned(room):
     recording = room.scans(room.picture(320, 240, 240.0), room.standing())
-    order = order_of(recording, np.arange(1), OPTIONS)
+    order = find_scan_layout(recording, np.arange(1), OPTIONS)
     voxel, stride = resolved(recording, room.standing(), order, OPTIONS)
     assert voxel == 0.1
     assert 3 <= stride <= 4
     thin = order._replace(stride=stride)
-    (patch,) = (make() for make in patches_of(recording, room.standing(), thin, OPTIONS))
+    (patch,) = (make() for make in triangulate_scans(recording, room.standing(), thin, OPTIONS))
     assert 0.8 < len(patch.points) / (320 * 240 / stride**2) < 1.05
-    mesh = surface_of(recording, room.standing(), static(recording), OPTIONS)
+    mesh = build_surface(recording, room.standing(), static(recording), OPTIONS)
     assert room.off_walls(samples(mesh)[0]).mean() < 0.005

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stillmap.mesh.simplification import divided
+from stillmap.mesh.simplification import subdivide
 from stillmap.mesh.triangle_mesh import Mesh
 
 
@@ -30,7 +30,7 @@ def _has_no_gaps(fine: Mesh) -> bool:
 
 def test_edges_become_short_and_the_surface_stays() -> None:
     mesh = _some(np.random.default_rng(3))
-    fine, of = divided(mesh, 0.3)
+    fine, of = subdivide(mesh, 0.3)
     lengths = np.linalg.norm(fine.corners - np.roll(fine.corners, 1, axis=1), axis=2)
     assert lengths.max() <= 0.3
     np.testing.assert_allclose(np.bincount(of, fine.areas()), mesh.areas(), rtol=1e-9)
@@ -40,21 +40,21 @@ def test_edges_become_short_and_the_surface_stays() -> None:
 
 def test_there_are_no_gaps_between_the_parts() -> None:
     mesh = _some(np.random.default_rng(4))
-    fine, _ = divided(mesh, 0.9)
+    fine, _ = subdivide(mesh, 0.9)
     assert len(fine) > len(mesh)
     assert _has_no_gaps(fine)
 
 
 def test_what_is_short_stays_as_it_is() -> None:
     mesh = _some(np.random.default_rng(5))
-    same, of = divided(mesh, 10.0)
+    same, of = subdivide(mesh, 10.0)
     np.testing.assert_array_equal(same.faces, mesh.faces)
     np.testing.assert_array_equal(of, np.arange(len(mesh)))
 
 
 def test_edges_may_be_longer_in_some_places_without_gaps() -> None:
     mesh = _some(np.random.default_rng(5))
-    fine, _ = divided(mesh, lambda points: 0.2 + 0.2 * points[:, 0])
+    fine, _ = subdivide(mesh, lambda points: 0.2 + 0.2 * points[:, 0])
     a, b = fine.vertices[fine.faces], fine.vertices[np.roll(fine.faces, -1, axis=1)]
     limit = 0.2 + 0.2 * np.minimum(a[..., 0], b[..., 0])
     assert (np.linalg.norm(a - b, axis=2) <= limit + 1e-9).all()

@@ -6,9 +6,9 @@ import pytest
 from stillmap import _core
 from stillmap.mesh import tsdf
 from stillmap.mesh.options import SurfaceOptions
-from stillmap.mesh.range_image import Patch, order_of
-from stillmap.mesh.resolution import Reach, reach_of
-from stillmap.mesh.tsdf import Growing, fused
+from stillmap.mesh.range_image import Patch, find_scan_layout
+from stillmap.mesh.resolution import PatchExtents, patch_extents
+from stillmap.mesh.tsdf import StreamingSurface, integrate_patches
 
 RAW = SurfaceOptions(error=0.0, island=0.0)
 VOXEL, SIZE = 0.1, 1.6  # m, with tiles of 16 voxels
@@ -35,7 +35,7 @@ def along_a_wall(n=12, noise=0.01):
         origin = np.tile([2.0 * k, 0.0, 1.0], (len(points), 1))
         patch = Patch(points, faces, np.arange(len(points)), origin, points[:, 1] * 1.0)
         patches.append((patch, np.ones(len(faces), np.float32)))
-    return patches, Reach(np.array([[2.0 * k, 0.0, 1.0] for k in range(n)]), np.full(n, 4.2))
+    return patches, PatchExtents(np.array([[2.0 * k, 0.0, 1.0] for k in range(n)]), np.full(n, 4.2))
 
 
 def as_set(mesh):
@@ -45,7 +45,10 @@ def as_set(mesh):
 
 def test_the_surface_is_that_of_all_at_once():
     patches, reach = along_a_wall()
-    whole, grown = fused(patches, VOXEL, RAW), fused(patches, VOXEL, RAW, reach=reach)
+    whole, grown = (
+        integrate_patches(patches, VOXEL, RAW),
+        integrate_patches(patches, VOXEL, RAW, reach=reach),
+    )
     assert len(whole) == len(grown) > 5_000
     assert as_set(whole) == as_set(grown)
 
@@ -54,7 +57,7 @@ def test_voxels_behind_are_gone():
     patches, reach = along_a_wall(24)
     held = {"all": [], "near": []}
     for name, most in held.items():
-        one = Growing(_core.SignedDistances(VOXEL, before=0.3, behind=0.2), RAW)
+        one = StreamingSurface(_core.SignedDistances(VOXEL, before=0.3, behind=0.2), RAW)
         for done, (patch, weight) in enumerate(patches, start=1):
             one.distances.add(
                 patch.points, patch.origin, patch.standoff, patch.faces, weight, threads=1
@@ -70,8 +73,8 @@ def test_voxels_behind_are_gone():
 def test_thinned_out_it_has_no_crack(monkeypatch):
     monkeypatch.setattr(tsdf, "_BATCH", 500)
     patches, reach = along_a_wall()
-    mesh = fused(patches, VOXEL, SurfaceOptions(error=0.02, island=0.0), reach=reach)
-    assert 20 < len(mesh) < 0.3 * len(fused(patches, VOXEL, RAW))
+    mesh = integrate_patches(patches, VOXEL, SurfaceOptions(error=0.02, island=0.0), reach=reach)
+    assert 20 < len(mesh) < 0.3 * len(integrate_patches(patches, VOXEL, RAW))
     edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     found, count = np.unique(edges, axis=0, return_counts=True)
     ends = mesh.vertices[found[count == 1]].mean(axis=1)
@@ -83,36 +86,36 @@ def test_thinned_out_it_has_no_crack(monkeypatch):
 def test_the_budget_is_kept_on_the_way(monkeypatch):
     monkeypatch.setattr(tsdf, "_BATCH", 500)
     most = []
-    merge = Growing._merge
+    merge = StreamingSurface._merge
 
     def watched(self):
         merge(self)
         most.append(len(self._mesh))
 
-    monkeypatch.setattr(Growing, "_merge", watched)
+    monkeypatch.setattr(StreamingSurface, "_merge", watched)
     patches, reach = along_a_wall(40, noise=0.02)
-    mesh = fused(patches, VOXEL, SurfaceOptions(faces=600), reach=reach)
+    mesh = integrate_patches(patches, VOXEL, SurfaceOptions(faces=600), reach=reach)
     assert 100 < len(mesh) <= 600
     # but for borders, which may go on
-    assert max(most) < 0.15 * len(fused(patches, VOXEL, RAW))
+    assert max(most) < 0.15 * len(integrate_patches(patches, VOXEL, RAW))
     assert np.abs(mesh.vertices[:, 1] - 3.0).mean() < 0.02
 
 
 def test_reach_is_as_far_as_hits_are(room):
     poses = room.standing(1, [0, 0, 0], [0.6, 0.3, 0.0])
     recording = room.scans(room.lidar(90, 10), poses)
-    order = order_of(recording, np.arange(2), RAW)
-    reach = reach_of(recording, poses, order)
+    order = find_scan_layout(recording, np.arange(2), RAW)
+    reach = patch_extents(recording, poses, order)
     ends = [recording.end_points(np.arange(900) + 900 * t, poses) for t in range(2)]
     for t in range(2):
         away = np.linalg.norm(ends[t] - reach.place[t], axis=1)
         assert reach.range[t] == pytest.approx(away.max(), rel=1e-5)
     recording.hit[:900] = False
-    assert reach_of(recording, poses, order).range[0] == 0.0
+    assert patch_extents(recording, poses, order).range[0] == 0.0
 
 
 def test_settled_are_tiles_that_later_patches_do_not_come_to():
-    reach = Reach(np.array([[0.0, 0, 0], [10.0, 0, 0]]), np.array([5.0, 2.0]))
+    reach = PatchExtents(np.array([[0.0, 0, 0], [10.0, 0, 0]]), np.array([5.0, 2.0]))
     tiles = np.array([[0, 0, 0], [5, 0, 0], [9, 0, 0], [30, 0, 0]])
     assert reach.settled(tiles, 1.0, 0).tolist() == [False, False, False, True]
     assert reach.settled(tiles, 1.0, 1).tolist() == [True, False, False, True]

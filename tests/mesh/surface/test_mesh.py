@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.mesh.triangle_mesh import Mesh, joined
+from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes
 
 SQUARE = Mesh(
     np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]]),
@@ -29,10 +29,10 @@ def test_a_part_has_the_vertices_that_it_uses() -> None:
 
 
 def test_joined_meshes_keep_their_faces() -> None:
-    both = joined([SQUARE, SQUARE])
+    both = concatenate_meshes([SQUARE, SQUARE])
     assert both.faces.tolist() == [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]
     assert both.pairs().tolist() == [[0, 1], [2, 3]]
-    assert len(joined([])) == 0
+    assert len(concatenate_meshes([])) == 0
 
 
 def test_more_than_two_faces_may_share_an_edge() -> None:

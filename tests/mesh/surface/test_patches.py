@@ -7,16 +7,16 @@ import pytest
 
 from stillmap.mesh import range_image
 from stillmap.mesh.options import SurfaceOptions
-from stillmap.mesh.range_image import order_of, patches_of
+from stillmap.mesh.range_image import find_scan_layout, triangulate_scans
 from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.mesh.triangulation import rows_of
+from stillmap.mesh.triangulation import split_rows
 
 LOOSE = SurfaceOptions(longest=5.0, longest_share=2.0)
 
 
 def patches(recording, poses, options=LOOSE):
-    order = order_of(recording, np.arange(recording.n_scans), options)
-    return order, [make() for make in patches_of(recording, poses, order, options)]
+    order = find_scan_layout(recording, np.arange(recording.n_scans), options)
+    return order, [make() for make in triangulate_scans(recording, poses, order, options)]
 
 
 def looks_back(patch):
@@ -39,17 +39,17 @@ def looks_back(patch):
 )
 def test_rows_are_found(room, sensor, made, length):
     looking = getattr(room, sensor)(*made)
-    assert range_image.row_length(looking) == length
+    assert range_image.find_row_length(looking) == length
     noisy = looking.copy()
     noisy[np.random.default_rng(0).random(len(noisy)) < 0.2] = np.nan
-    assert range_image.row_length(noisy) == length
+    assert range_image.find_row_length(noisy) == length
 
 
 def test_no_rows_where_there_is_no_order(room):
     rng = np.random.default_rng(1)
-    assert range_image.row_length(rng.permutation(room.lidar())) == 0
-    assert range_image.row_length(room.lidar()[rng.random(24 * 240) < 0.8][:4500]) == 0
-    assert range_image.row_length(np.full((1000, 3), np.nan)) == 0
+    assert range_image.find_row_length(rng.permutation(room.lidar())) == 0
+    assert range_image.find_row_length(room.lidar()[rng.random(24 * 240) < 0.8][:4500]) == 0
+    assert range_image.find_row_length(np.full((1000, 3), np.nan)) == 0
 
 
 def test_planar_lasers_are_told_from_others(room):
@@ -88,7 +88,7 @@ def test_rows_with_gaps_make_the_same_surface(room, rows_are, sense):
     rng = np.random.default_rng(0)
     sector = np.arctan2(looking[:, 1], looking[:, 0])
     looking = looking[(rng.random(len(looking)) < 0.95) & (np.abs(sector - 1.0) > 0.2)]
-    found = rows_of(looking)
+    found = split_rows(looking)
     assert len(found.first) - 1 == (240 - 15 if rows_are == "columns" else 40)
     recording = room.scans(looking, room.standing())
     _, (patch,) = patches(recording, room.standing())

@@ -4,7 +4,7 @@ import numpy as np
 
 from stillmap.core.recording import Recording
 from stillmap.mesh.options import ChoiceOptions
-from stillmap.mesh.texture.occlusion import Beams
+from stillmap.mesh.texture.occlusion import LidarReturns
 from stillmap.tracking.boxes import Box
 
 
@@ -24,11 +24,11 @@ def _recording(times: np.ndarray | None) -> Recording:
     )
 
 
-def _beams(recording: Recording, boxes: list[Box], owned: list[np.ndarray]) -> Beams:
+def _beams(recording: Recording, boxes: list[Box], owned: list[np.ndarray]) -> LidarReturns:
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 1, 3] = [0.0, 10.0, 20.0, 30.0]
     p = np.linspace(0.0, 1.0, 12).astype(np.float32)
-    return Beams(recording, recording, poses, p, boxes, owned, 0)
+    return LidarReturns(recording, recording, poses, p, boxes, owned, 0)
 
 
 def test_of_scans_taken_at_once_the_nearest_counts_at_least() -> None:
@@ -76,7 +76,7 @@ def test_there_may_be_none() -> None:
     )
 
 
-def _row(p: list[float], planar: bool) -> Beams:
+def _row(p: list[float], planar: bool) -> LidarReturns:
     """Four rows, 0.1 s apart; beams 0, 3, 6, 9 are of a thing that goes 1 m/s along y."""
     box = Box(
         0,
@@ -90,7 +90,7 @@ def _row(p: list[float], planar: bool) -> Beams:
     poses, of_all = np.tile(np.eye(4), (4, 1, 1)), np.ones(12, np.float32)
     of_all[::3] = p
     owned = [np.array([0, 3, 6, 9])]
-    return Beams(_recording(None), _recording(None), poses, of_all, [box], owned, 0, planar)
+    return LidarReturns(_recording(None), _recording(None), poses, of_all, [box], owned, 0, planar)
 
 
 def test_of_a_row_what_moves_is_told_longer_and_goes_on() -> None:

@@ -3,7 +3,11 @@
 import numpy as np
 from made_up_rooms import looking, rectangle
 
-from stillmap.mesh.texture.view_selection import Candidates, agreeing, colours_of_faces
+from stillmap.mesh.texture.view_selection import (
+    Candidates,
+    reject_inconsistent_views,
+    sample_face_colors,
+)
 
 WALL = rectangle([-0.5, 4.0, -0.5], [1.0, 0, 0], [0, 0, 1.0], 2)
 
@@ -19,7 +23,9 @@ def left(shades, odd=40.0):
         shade = shades[view.image]
         return None if shade is None else np.full((300, 400, 3), shade, np.uint8)
 
-    found = agreeing(candidates, colours_of_faces(WALL, candidates, views, colours), odd)
+    found = reject_inconsistent_views(
+        candidates, sample_face_colors(WALL, candidates, views, colours), odd
+    )
     assert (found.picture == found.picture[0]).all()
     assert (np.isfinite(found.utility) == (found.picture >= 0)).all()
     return [k for k in found.picture[0].tolist() if k >= 0]

@@ -8,8 +8,8 @@ from scipy import ndimage
 from stillmap import _core
 from stillmap.core import camera
 from stillmap.mesh.options import TextureOptions
-from stillmap.mesh.texture.atlas import charts_of, laid_out
-from stillmap.mesh.triangle_mesh import Mesh, joined
+from stillmap.mesh.texture.atlas import build_layout, find_charts
+from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes
 
 pytest.importorskip("xatlas")
 NO_LIMIT = TextureOptions(texel=1e-5)
@@ -36,7 +36,7 @@ def in_picture(mesh, views, view_of_face, faces):
 
 def test_texels_are_pixels(room):
     mesh, views, view = room
-    layout = laid_out(mesh, view, views, NO_LIMIT)
+    layout = build_layout(mesh, view, views, NO_LIMIT)
     painted = np.flatnonzero(view >= 0)
     assert len(painted) > 400
     np.testing.assert_array_equal(layout.view, view)
@@ -49,7 +49,7 @@ def test_texels_are_pixels(room):
     np.testing.assert_allclose(apart, np.rint(apart), atol=1e-6)
     # the corners of a face are moved alike, and so are faces of a chart
     np.testing.assert_allclose(apart, apart[:, :1].repeat(3, axis=1), atol=1e-6)
-    chart = charts_of(mesh, view)[painted]
+    chart = find_charts(mesh, view)[painted]
     for number in np.unique(chart):
         assert np.ptp(np.rint(apart[chart == number]), axis=(0, 1)).max() == 0
 
@@ -59,14 +59,14 @@ def chart_of_texel(mesh, layout, page):
     mine = np.flatnonzero(layout.page == page)
     texel, of, _ = _core.texels(layout.uv[layout.faces[mine]], int(w), int(h))
     out = np.full(w * h, -1)
-    out[texel] = charts_of(mesh, layout.view)[mine[of]]
+    out[texel] = find_charts(mesh, layout.view)[mine[of]]
     return out.reshape(h, w)
 
 
 @pytest.mark.parametrize("gutter", [2, 4])
 def test_charts_keep_apart(room, gutter):
     mesh, views, view = room
-    layout = laid_out(mesh, view, views, TextureOptions(gutter=gutter, page=512, texel=0.01))
+    layout = build_layout(mesh, view, views, TextureOptions(gutter=gutter, page=512, texel=0.01))
     charts = set()
     for page in range(len(layout.sizes)):
         chart = chart_of_texel(mesh, layout, page)
@@ -89,7 +89,7 @@ def test_pages_are_as_many_as_needed_and_no_more_than_allowed(room):
     before = None
     for pages in (20, 3, 1):
         options = TextureOptions(page=256, pages=pages, texel=1e-5)
-        layout = laid_out(mesh, view, views, options)
+        layout = build_layout(mesh, view, views, options)
         assert 1 <= len(layout.sizes) <= pages
         assert (layout.sizes <= 256).all()
         uv = layout.uv[layout.faces[painted]]
@@ -98,15 +98,15 @@ def test_pages_are_as_many_as_needed_and_no_more_than_allowed(room):
         scale = layout.scale[painted].max()
         assert before is None or scale < before
         before = scale
-    assert len(laid_out(mesh, view, views, NO_LIMIT).sizes) == 1
+    assert len(build_layout(mesh, view, views, NO_LIMIT).sizes) == 1
 
 
 def test_texels_are_no_finer_than_asked_for(room):
     mesh, views, view = room
-    layout = laid_out(mesh, view, views, TextureOptions(texel=0.02))
+    layout = build_layout(mesh, view, views, TextureOptions(texel=0.02))
     painted = view >= 0
     assert (layout.scale[painted] < 1.0).all()
-    chart = charts_of(mesh, view)
+    chart = find_charts(mesh, view)
     texels = np.bincount(chart[painted], areas(layout.uv[layout.faces[painted]]))
     metres = np.bincount(chart[painted], mesh.areas()[painted])
     np.testing.assert_allclose(np.sqrt(metres / texels), 0.02, rtol=1e-6)
@@ -116,9 +116,9 @@ def test_faces_that_their_picture_does_not_show_are_grey():
     wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2], 2)
     behind = rectangle([-1.0, -3.0, -1.0], [2, 0, 0], [0, 0, 2], 2)
     edge_on = rectangle([0.0, 1.0, 0.0], [0, 1, 0], [0, 2, 0], 1)
-    mesh = joined([wall, behind, edge_on])
+    mesh = concatenate_meshes([wall, behind, edge_on])
     view = looking([0, 0, 0], [0, 1, 0])
-    layout = laid_out(mesh, np.zeros(len(mesh), np.int32), [view], TextureOptions())
+    layout = build_layout(mesh, np.zeros(len(mesh), np.int32), [view], TextureOptions())
     assert (layout.page[: len(wall)] == 0).all()
     assert (layout.page[len(wall) :] == -1).all()
     assert (layout.view[len(wall) :] == -1).all()
@@ -132,8 +132,8 @@ def test_pictures_from_one_place_and_charts_that_touch_stay_apart():
     square = np.tile(np.arange(36), 2)
     view = ((square // 6 + square % 6) % 2).astype(np.int32)
     views = [looking([0, 0, 0], [0, 1, 0], i) for i in range(2)]
-    layout = laid_out(wall, view, views, TextureOptions())
-    assert len(np.unique(charts_of(wall, view))) == 36
+    layout = build_layout(wall, view, views, TextureOptions())
+    assert len(np.unique(find_charts(wall, view))) == 36
     assert (layout.page == 0).all()
     assert len(layout.vertex) == 36 * 4
     chart = chart_of_texel(wall, layout, 0)
@@ -143,15 +143,15 @@ def test_pictures_from_one_place_and_charts_that_touch_stay_apart():
 
 def test_no_faces_and_no_pictures():
     nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    layout = laid_out(nothing, np.zeros(0, np.int32), [], TextureOptions())
+    layout = build_layout(nothing, np.zeros(0, np.int32), [], TextureOptions())
     assert len(layout.faces) == len(layout.sizes) == 0
     wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2])
-    layout = laid_out(wall, np.full(2, -1, np.int32), [], TextureOptions())
+    layout = build_layout(wall, np.full(2, -1, np.int32), [], TextureOptions())
     np.testing.assert_array_equal(layout.vertex[layout.faces], wall.faces)
     assert len(layout.sizes) == 0
 
 
 def test_it_is_the_same_every_time(room):
     mesh, views, view = room
-    one, two = (laid_out(mesh, view, views, TextureOptions()) for _ in range(2))
+    one, two = (build_layout(mesh, view, views, TextureOptions()) for _ in range(2))
     assert all(a.tobytes() == b.tobytes() for a, b in zip(one, two, strict=True))

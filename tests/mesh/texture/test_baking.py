@@ -8,8 +8,8 @@ from made_up_rooms import sharpest as best_of
 from stillmap import _core
 from stillmap.core.errors import InputError
 from stillmap.mesh.options import TextureOptions
-from stillmap.mesh.texture.atlas import GREY
-from stillmap.mesh.texture.baking import baked, bilinear, fill_gutters, halved
+from stillmap.mesh.texture.atlas import GRAY
+from stillmap.mesh.texture.baking import bake_texture, downsample, fill_gutters, sample_bilinear
 from stillmap.mesh.triangle_mesh import Mesh
 
 pytest.importorskip("xatlas")
@@ -46,7 +46,7 @@ def test_every_texel_has_the_colour_of_its_place(kind):
         reads.append(image)
         return photograph(mesh, views[image])
 
-    textured = baked(mesh, view, views, read, TextureOptions(page=1024, texel=1e-5))
+    textured = bake_texture(mesh, view, views, read, TextureOptions(page=1024, texel=1e-5))
     assert reads == sorted(set(view[view >= 0].tolist()))  # each once
     np.testing.assert_array_equal(textured.view, view)
     np.testing.assert_array_equal(textured.vertices[textured.faces], mesh.corners)
@@ -64,7 +64,7 @@ def test_coarse_texels_are_means_of_pixels():
     picture = np.zeros((300, 400, 3), np.uint8)
     picture[:, ::2] = 200
     options = TextureOptions(texel=0.04)  # four pixels each
-    textured = baked(wall, np.zeros(32, np.int32), views, lambda _: picture, options)
+    textured = bake_texture(wall, np.zeros(32, np.int32), views, lambda _: picture, options)
     face = textured.face_of_texel(0)
     assert 2000 < np.sum(face >= 0) < 3000
     np.testing.assert_allclose(textured.pages[0][face >= 0], 100, atol=1)
@@ -76,7 +76,7 @@ def test_coarse_texels_lie_where_fine_ones_do():
     ramp = np.clip((np.arange(400) - 149.5) * 2.5, 0, 255).round().astype(np.uint8)
     picture = np.broadcast_to(ramp[None, :, None], (300, 400, 3))
     options = TextureOptions(texel=0.04)
-    textured = baked(wall, np.zeros(32, np.int32), views, lambda _: picture, options)
+    textured = bake_texture(wall, np.zeros(32, np.int32), views, lambda _: picture, options)
     face = textured.face_of_texel(0)
     row, column = np.nonzero(face >= 0)
     # 0.8 m are 80 pixels, and 20 texels
@@ -94,7 +94,7 @@ def test_a_picture_that_cannot_be_read_leaves_grey():
             raise InputError("is damaged", where="2.png")
         return photograph(mesh, views[image]) if image != 4 else np.zeros((3, 3), np.uint16)
 
-    textured = baked(mesh, view, views, read)
+    textured = bake_texture(mesh, view, views, read)
     assert len(textured.unread) == 2
     assert "2.png" in textured.unread[0]
     assert "picture 4 is (3, 3) uint16" in textured.unread[1]
@@ -102,7 +102,7 @@ def test_a_picture_that_cannot_be_read_leaves_grey():
     of_texel = textured.face_of_texel(0)
     lost = (of_texel >= 0) & (view[of_texel] == 2)
     assert lost.sum() > 1000
-    assert (textured.pages[0][lost] == GREY).all()
+    assert (textured.pages[0][lost] == GRAY).all()
     assert np.median(errors(textured)) < 1.0
 
 
@@ -110,13 +110,13 @@ def test_grey_pictures_have_three_colours():
     wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2])
     views = [looking([0, 0, 0], [0, 1, 0])]
     picture = np.full((300, 400), 77, np.uint8)
-    textured = baked(wall, np.zeros(2, np.int32), views, lambda _: picture)
+    textured = bake_texture(wall, np.zeros(2, np.int32), views, lambda _: picture)
     assert (textured.pages[0] == 77).all()
 
 
 def test_without_pictures_all_is_grey():
     wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2])
-    textured = baked(wall, np.full(2, -1, np.int32), [], lambda _: None)
+    textured = bake_texture(wall, np.full(2, -1, np.int32), [], lambda _: None)
     assert textured.pages == ()
     assert (textured.page == -1).all()
 
@@ -125,7 +125,7 @@ def test_what_is_refused():
     wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2])
     for of_face in (np.zeros(3, np.int32), np.zeros(2), np.full(2, 1, np.int32)):
         with pytest.raises(ValueError, match="view_of_face"):
-            baked(wall, of_face, [looking([0, 0, 0], [0, 1, 0])], lambda _: None)
+            bake_texture(wall, of_face, [looking([0, 0, 0], [0, 1, 0])], lambda _: None)
 
 
 def test_gutters_have_the_colours_beside_them():
@@ -142,22 +142,22 @@ def test_between_pixels():
     picture = np.zeros((2, 3, 3), np.uint8)
     picture[0, 1], picture[1, 2] = 100, 200
     at = np.array([[1.0, 0.0], [1.5, 0.0], [1.5, 0.5], [9.0, 9.0], [-3.0, 0.2]])
-    found = bilinear(picture, at)
+    found = sample_bilinear(picture, at)
     np.testing.assert_allclose(found, np.array([100, 50, 75, 200, 0])[:, None].repeat(3, axis=1))
     single = np.full((1, 1, 3), 9, np.uint8)
-    assert (bilinear(single, at) == 9).all()
+    assert (sample_bilinear(single, at) == 9).all()
 
 
 def test_halves_are_means_of_squares():
     picture = np.arange(5 * 4 * 3).reshape(5, 4, 3).astype(np.uint8)
-    half = halved(picture, 1)
+    half = downsample(picture, 1)
     assert half.shape == (3, 2, 3)
     np.testing.assert_allclose(half[0, 0], picture[:2, :2].mean(axis=(0, 1)))
     np.testing.assert_allclose(half[2, 1], picture[4, 2:4].mean(axis=0))
-    assert halved(picture, 0).tolist() == picture.tolist()
+    assert downsample(picture, 0).tolist() == picture.tolist()
 
 
 def test_nothing_to_paint_is_nothing_painted():
     none = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    model = baked(none, np.zeros(0, np.int32), [], lambda _: np.zeros(0))
+    model = bake_texture(none, np.zeros(0, np.int32), [], lambda _: np.zeros(0))
     assert len(model) == len(model.pages) == len(model.unread) == 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap.mesh.options import ChoiceOptions
-from stillmap.mesh.texture.view_selection import Candidates, chosen, utility
+from stillmap.mesh.texture.view_selection import Candidates, select_views, view_utility
 
 
 def test_the_best_pictures_of_each_face_are_kept() -> None:
@@ -28,15 +28,17 @@ def test_the_best_pictures_of_each_face_are_kept() -> None:
 def test_what_probably_shows_a_mover_is_not_used_however_sharp() -> None:
     o = ChoiceOptions()
     p = np.array([0.99, 0.95, 0.1])
-    u = utility(p, np.array([100.0, 100.0, 1e6]), np.ones(3), o)
+    u = view_utility(p, np.array([100.0, 100.0, 1e6]), np.ones(3), o)
     assert u[0] > u[1]
     assert u[2] == -np.inf
-    sharpest = utility(p, np.array([100.0, 100.0, 1e6]), np.ones(3), ChoiceOptions(believe=False))
+    sharpest = view_utility(
+        p, np.array([100.0, 100.0, 1e6]), np.ones(3), ChoiceOptions(believe=False)
+    )
     assert np.argmax(sharpest) == 2
 
 
 def test_twice_the_resolution_is_worth_its_logarithm() -> None:
-    u = utility(np.ones(2), np.array([100.0, 400.0]), np.ones(2), ChoiceOptions())
+    u = view_utility(np.ones(2), np.array([100.0, 400.0]), np.ones(2), ChoiceOptions())
     assert u[1] - u[0] == pytest.approx(np.log(2.0))
 
 
@@ -56,7 +58,7 @@ def test_on_a_strip_no_other_choice_costs_less(seed: int) -> None:
         c.add(k, faces, rng.normal(size=len(faces)), np.ones(len(faces)))
     c.add(9, np.arange(F), np.full(F, -3.0), np.ones(F))  # each has one at least
     pairs = np.stack([np.arange(F - 1), np.arange(1, F)], axis=1).astype(np.int32)
-    got = chosen(c, pairs, border)
+    got = select_views(c, pairs, border)
     label = np.argmax(c.picture == got[:, None], axis=1)
     counts = (c.picture != -1).sum(axis=1)
     least = min(
@@ -72,8 +74,8 @@ def test_neighbours_take_the_same_picture_where_little_is_lost() -> None:
     c.add(0, every, np.array([1.0, 1.0, 0.9, 1.0]), np.ones(4))
     c.add(1, every, np.array([0.0, 0.0, 1.0, 0.0]), np.ones(4))
     pairs = np.array([[0, 1], [1, 2], [2, 3]], np.int32)
-    assert chosen(c, pairs, 0.5).tolist() == [0, 0, 0, 0]
-    assert chosen(c, pairs, 0.0).tolist() == [0, 0, 1, 0]
+    assert select_views(c, pairs, 0.5).tolist() == [0, 0, 0, 0]
+    assert select_views(c, pairs, 0.0).tolist() == [0, 0, 1, 0]
 
 
 def test_a_face_without_a_picture_has_none_and_parts_its_neighbours() -> None:
@@ -81,4 +83,4 @@ def test_a_face_without_a_picture_has_none_and_parts_its_neighbours() -> None:
     c.add(5, np.array([0]), np.array([1.0]), np.ones(1))
     c.add(6, np.array([2]), np.array([1.0]), np.ones(1))
     pairs = np.array([[0, 1], [1, 2]], np.int32)
-    assert chosen(c, pairs, 10.0).tolist() == [5, -1, 6]
+    assert select_views(c, pairs, 10.0).tolist() == [5, -1, 6]

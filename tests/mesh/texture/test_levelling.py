@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.camera import Camera, Images
-from stillmap.mesh.texture.exposure import gains, levelled
+from stillmap.mesh.texture.exposure import apply_gains, estimate_gains
 from stillmap.mesh.texture.views import View
 
 CAMERA = Camera("front", 4, 3, np.eye(3), "", np.zeros(0), np.eye(4))
@@ -24,7 +24,7 @@ def seen(factors, faces=2000, noise=2.0, people=0.1, seed=1):
 
 
 def test_pictures_are_brightened_until_they_agree():
-    found = gains(*seen(FACTORS), len(FACTORS))
+    found = estimate_gains(*seen(FACTORS), len(FACTORS))
     level = found * FACTORS
     assert np.abs(level / level.mean(axis=0) - 1.0).max() < 0.02
     assert np.abs(np.log(found).mean(axis=0)).max() < 1e-6  # as bright as before on the whole
@@ -52,34 +52,37 @@ def test_they_are_those_of_least_squares():
     A = np.concatenate([w * np.array(rows), 0.1 * np.eye(4)])
     b = np.concatenate([w * np.array(right), np.zeros((4, 3))])
     expected = np.exp(np.linalg.lstsq(A, b)[0])
-    np.testing.assert_allclose(gains(picture, colours, 4), expected, rtol=1e-5)
+    np.testing.assert_allclose(estimate_gains(picture, colours, 4), expected, rtol=1e-5)
 
 
 def test_what_differs_for_other_reasons_stays_as_it_is():
     rng = np.random.default_rng(2)
     picture, colours = seen(np.ones((4, 3)))
-    assert (gains(picture, colours, 4) == 1.0).all()
+    assert (estimate_gains(picture, colours, 4) == 1.0).all()
     # a shadow that moves lies on a third of what each sees
     dark = rng.random(picture.shape) < 0.33
     colours[dark] *= 0.4
-    assert (gains(picture, colours, 4) == 1.0).all()
+    assert (estimate_gains(picture, colours, 4) == 1.0).all()
 
 
 def test_of_pictures_with_nothing_in_common_nothing_is_known():
     picture, colours = seen(FACTORS)
     colours[picture == 2] = np.nan  # damaged
-    found = gains(picture, colours, 5)  # the last one shows nothing
+    found = estimate_gains(picture, colours, 5)  # the last one shows nothing
     assert (found[[2, 4]] == 1.0).all()
     assert np.ptp((found * np.append(FACTORS, np.ones((1, 3)), axis=0))[[0, 1, 3]]) < 0.2
-    assert (gains(picture[:20], colours[:20], 5) == 1.0).all()
-    assert gains(np.zeros((0, 1), np.int32), np.zeros((0, 1, 3), np.float32), 0).shape == (0, 3)
-    assert (gains(picture[:, :1], colours[:, :1], 5) == 1.0).all()
+    assert (estimate_gains(picture[:20], colours[:20], 5) == 1.0).all()
+    assert estimate_gains(np.zeros((0, 1), np.int32), np.zeros((0, 1, 3), np.float32), 0).shape == (
+        0,
+        3,
+    )
+    assert (estimate_gains(picture[:, :1], colours[:, :1], 5) == 1.0).all()
 
 
 def test_nothing_is_cut_off_or_brightened_beyond_measure():
     picture, colours = seen(np.array([[1.0], [6.0], [0.15], [1.0]]) * np.ones(3), people=0.0)
     colours = np.clip(colours, 0.0, 255.0)
-    found = gains(picture, colours, 4)
+    found = estimate_gains(picture, colours, 4)
     assert found.min() >= 0.5
     assert found.max() <= 2.0
 
@@ -93,7 +96,7 @@ def test_pictures_are_read_so(channels):
         np.arange(3), np.zeros(3, np.int32), (CAMERA,), lambda k: deep if k == 2 else picture.copy()
     )
     views = [View(k, k, CAMERA, np.eye(4)) for k in (1, 2)]
-    found = levelled(images, views, np.array([[1.5, 1.0, 0.5], [2.0, 2.0, 2.0]]))
+    found = apply_gains(images, views, np.array([[1.5, 1.0, 0.5], [2.0, 2.0, 2.0]]))
     np.testing.assert_array_equal(found.read(0), picture)
     np.testing.assert_array_equal(found.read(2), deep)
     factors = np.array([1.5, 1.0, 0.5, 1.0])[: channels or 1]

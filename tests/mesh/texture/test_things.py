@@ -3,13 +3,13 @@
 import numpy as np
 
 from stillmap.mesh.texture.occluders import (
-    Cuboid,
-    Thing,
-    at_time,
-    in_the_way,
-    meets_box,
-    squares_to_segments,
-    within_or_behind,
+    OrientedBox,
+    TrackedBox,
+    boxes_at,
+    intersects_box,
+    is_in_or_behind_box,
+    occlusion_probability,
+    squared_segment_distances,
 )
 from stillmap.tracking.boxes import Box
 
@@ -28,7 +28,7 @@ def test_segments_meet_boxes_as_when_followed_point_by_point() -> None:
         # and along the axes
         ends[:2, 0] = start[0]
         ends[0, 1] = start[1]
-        meets = meets_box(start, ends, half)
+        meets = intersects_box(start, ends, half)
         expected = [_meets_by_sampling(start, end, half) for end in ends]
         np.testing.assert_array_equal(meets, expected)
         found += expected
@@ -38,11 +38,11 @@ def test_segments_meet_boxes_as_when_followed_point_by_point() -> None:
 def test_distances_to_segments() -> None:
     ends = np.array([[2.0, 0, 0], [0.5, 0, 0], [-1, 0, 0]])
     square = (ends**2).sum(axis=1)
-    d = np.sqrt(squares_to_segments(np.array([1.0, 1.0, 0.0]), ends.T, square))
+    d = np.sqrt(squared_segment_distances(np.array([1.0, 1.0, 0.0]), ends.T, square))
     np.testing.assert_allclose(d, [1.0, np.hypot(0.5, 1.0), np.sqrt(2.0)])
 
 
-def _walker() -> Thing:
+def _walker() -> TrackedBox:
     box = Box(
         0,
         np.array([0.0, 1.0, 2.0]),
@@ -52,26 +52,26 @@ def _walker() -> Thing:
         (0.2, 0.3),
         0.5,
     )
-    return Thing(box, np.array([0.0, 0.0, 0.2]), 1.8)
+    return TrackedBox(box, np.array([0.0, 0.0, 0.2]), 1.8)
 
 
 def test_a_thing_is_on_its_way_and_a_little_beyond() -> None:
-    (half_way,) = at_time([_walker()], 0.5)
+    (half_way,) = boxes_at([_walker()], 0.5)
     np.testing.assert_allclose(half_way.middle, [0.5, 0.0, 0.9])
     np.testing.assert_allclose(half_way.half, [0.2, 0.3, 0.9])
-    (later,) = at_time([_walker()], 2.4)
+    (later,) = boxes_at([_walker()], 2.4)
     np.testing.assert_allclose(later.middle, [1.0, 1.4, 1.1])
     np.testing.assert_allclose(later.ahead, [0.0, 1.0])
-    (before,) = at_time([_walker()], -0.3)
+    (before,) = boxes_at([_walker()], -0.3)
     np.testing.assert_allclose(before.middle, [-0.3, 0.0, 0.9])
-    assert at_time([_walker()], 2.6) == []
-    assert at_time([_walker()], -0.6) == []
+    assert boxes_at([_walker()], 2.6) == []
+    assert boxes_at([_walker()], -0.6) == []
 
 
 def test_who_stands_before_a_wall_hides_it_and_nobody_hides_what_is_nearer() -> None:
-    one = Cuboid(np.array([3.0, 0.0, 0.9]), np.array([1.0, 0.0]), np.array([0.2, 0.3, 0.9]))
+    one = OrientedBox(np.array([3.0, 0.0, 0.9]), np.array([1.0, 0.0]), np.array([0.2, 0.3, 0.9]))
     points = np.array([[5.0, 0, 1], [2.0, 0, 1], [5, 3, 1], [5.0, 0, 4.0], [5.0, 0.75, 1.0]])
-    p = in_the_way([one], np.array([0.0, 0.0, 1.0]), points, 0.1, 0.1)
+    p = occlusion_probability([one], np.array([0.0, 0.0, 1.0]), points, 0.1, 0.1)
     assert p[0] > 0.98
     np.testing.assert_array_equal(p[1:4], 0.0)
     # 0.75 * 3.1 / 5 = 0.47 to the side of its middle: within a sigma of the margin's edge
@@ -79,25 +79,25 @@ def test_who_stands_before_a_wall_hides_it_and_nobody_hides_what_is_nearer() -> 
 
 
 def test_two_things_hide_more_than_one() -> None:
-    near = Cuboid(np.array([2.0, 0.45, 0.9]), np.array([1.0, 0.0]), np.array([0.2, 0.2, 0.9]))
-    far = Cuboid(np.array([3.0, 0.6, 0.9]), np.array([0.0, 1.0]), np.array([0.2, 0.2, 0.9]))
+    near = OrientedBox(np.array([2.0, 0.45, 0.9]), np.array([1.0, 0.0]), np.array([0.2, 0.2, 0.9]))
+    far = OrientedBox(np.array([3.0, 0.6, 0.9]), np.array([0.0, 1.0]), np.array([0.2, 0.2, 0.9]))
     points, place = np.array([[6.0, 0.0, 1.0]]), np.array([0.0, 0.0, 1.0])
-    alone = [in_the_way([one], place, points, 0.1, 0.1)[0] for one in (near, far)]
-    both = in_the_way([near, far], place, points, 0.1, 0.1)[0]
+    alone = [occlusion_probability([one], place, points, 0.1, 0.1)[0] for one in (near, far)]
+    both = occlusion_probability([near, far], place, points, 0.1, 0.1)[0]
     assert min(alone) > 0.0
     assert max(alone) < both < 1.0
 
 
 def test_what_lies_behind_a_box_or_within_it() -> None:
-    box = Cuboid(np.array([2.0, 0.0, 1.0]), np.array([0.6, 0.8]), np.array([0.5, 0.2, 1.0]))
+    box = OrientedBox(np.array([2.0, 0.0, 1.0]), np.array([0.6, 0.8]), np.array([0.5, 0.2, 1.0]))
     rng = np.random.default_rng(3)
     place, points = np.array([0.0, 0.3, 1.2]), rng.uniform([0, -2, 0], [5, 2, 2], (400, 3))
-    found = within_or_behind([box], place, points)
+    found = is_in_or_behind_box([box], place, points)
     start, ends = box.local(place[None])[0], box.local(points)
     expected = [_meets_by_sampling(start, end, box.half) for end in ends]
     assert 20 < np.sum(expected) < 380
     assert np.mean(found != expected) <= 0.005  # grazed edges
     other = box._replace(middle=np.array([2.0, 1.5, 1.0]))
-    both = within_or_behind([box, other], place, points)
-    np.testing.assert_array_equal(both, found | within_or_behind([other], place, points))
-    assert not within_or_behind([], place, points).any()
+    both = is_in_or_behind_box([box, other], place, points)
+    np.testing.assert_array_equal(both, found | is_in_or_behind_box([other], place, points))
+    assert not is_in_or_behind_box([], place, points).any()

@@ -3,7 +3,7 @@
 import numpy as np
 
 from stillmap.core.camera import Camera
-from stillmap.mesh.texture.occlusion import told
+from stillmap.mesh.texture.occlusion import build_occlusion_mask
 from stillmap.mesh.texture.views import View
 
 CAMERA = Camera(
@@ -22,7 +22,7 @@ AHEAD = View(0, 0, CAMERA, np.eye(4))
 def _shown(
     points: np.ndarray, p: np.ndarray, asked: np.ndarray, margin: float = 0.15
 ) -> np.ndarray:
-    found = told(AHEAD, points, p.astype(np.float32), margin)
+    found = build_occlusion_mask(AHEAD, points, p.astype(np.float32), margin)
     uv = 400.0 * asked[:, :2] / asked[:, 2:] + [320.0, 240.0]
     return found.shown(uv, asked[:, 2], margin, np.full(len(asked), 0.9))
 
@@ -55,13 +55,13 @@ def test_beams_that_end_on_what_stands_still_speak_for_a_picture() -> None:
 
 def test_the_nearest_of_two_things_counts() -> None:
     two = np.array([[0.0, 0, 8.0], [0.0, 0, 3.0], [0.0, 0, 6.0]])
-    found = told(AHEAD, two, np.array([0.1, 0.2, 0.3], np.float32), 0.1)
+    found = build_occlusion_mask(AHEAD, two, np.array([0.1, 0.2, 0.3], np.float32), 0.1)
     at = tuple(int(x) for x in (240 / found.cell, 320 / found.cell))
     assert found.depth[at] == 3.0
     assert abs(found.dynamic[at] - 0.8) < 1e-6
 
 
 def test_what_is_behind_the_camera_says_nothing() -> None:
-    found = told(AHEAD, np.array([[0.0, 0, -3.0]]), np.zeros(1, np.float32), 0.1)
+    found = build_occlusion_mask(AHEAD, np.array([[0.0, 0, -3.0]]), np.zeros(1, np.float32), 0.1)
     assert np.isinf(found.depth).all()
     assert not found.support.any()

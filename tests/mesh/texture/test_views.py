@@ -11,11 +11,11 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.mesh.texture.views import (
     ViewOptions,
-    colours_of,
-    poses_at,
-    readable,
-    usable,
-    views_of,
+    filter_readable,
+    find_views,
+    interpolate_poses,
+    read_color_image,
+    usable_images,
 )
 
 S = 10**9
@@ -61,7 +61,7 @@ def screw(seconds) -> np.ndarray:
 def test_a_picture_between_scans_is_taken_from_between_their_poses():
     scans = [0.0, 0.1, 0.25, 0.3]
     taken = [0.0, 0.04, 0.1, 0.2, 0.3]
-    views, left_out = views_of(recording(scans, images(taken)), screw(scans))
+    views, left_out = find_views(recording(scans, images(taken)), screw(scans))
     assert left_out == {}
     assert [view.image for view in views] == [0, 1, 2, 3, 4]
     assert [view.stamp_ns for view in views] == [round(s * S) for s in taken]
@@ -75,7 +75,7 @@ def test_a_picture_between_scans_is_taken_from_between_their_poses():
 def test_shortly_before_and_after_the_scans_the_motion_goes_on():
     scans = [1.0, 1.1, 1.2]
     taken = [0.85, 0.92, 1.25, 1.31]
-    views, left_out = views_of(recording(scans, images(taken)), screw(scans))
+    views, left_out = find_views(recording(scans, images(taken)), screw(scans))
     assert [view.image for view in views] == [1, 2]
     assert left_out == {"taken when nobody knows where the robot was": 2}
     for view, T in zip(views, screw([0.92, 1.25]), strict=True):
@@ -86,18 +86,20 @@ def test_over_a_pause_only_who_stood_is_known():
     scans = [0.0, 0.1, 5.0, 5.1, 9.0]
     poses = screw([0.0, 0.1, 0.4, 0.4, 0.4])
     taken = [0.15, 2.0, 4.95, 7.0]
-    views, left_out = views_of(recording(scans, images(taken)), poses)
+    views, left_out = find_views(recording(scans, images(taken)), poses)
     assert [view.image for view in views] == [0, 2, 3]
     what = "taken in a pause of the scans, after which the robot was elsewhere"
     assert left_out == {what: 1}
     np.testing.assert_allclose(se2.inverse(views[2].T_camera_map), poses[3] @ T_BASE_CAMERA)
     longer = ViewOptions(pause=10.0)
-    assert len(views_of(recording(scans, images(taken)), poses, longer)[0]) == 4
+    assert len(find_views(recording(scans, images(taken)), poses, longer)[0]) == 4
 
 
 def test_before_a_pause_nothing_is_told_of_the_time_before():
     poses = screw([0.0, 1.0])
-    T, why = poses_at(np.array([0, 5 * S]), poses, np.array([-S // 20, 5 * S + S // 20]), OPTIONS)
+    T, why = interpolate_poses(
+        np.array([0, 5 * S]), poses, np.array([-S // 20, 5 * S + S // 20]), OPTIONS
+    )
     assert why == ["", ""]
     np.testing.assert_array_equal(T[0], poses[0])
     np.testing.assert_allclose(T[1], poses[1], atol=1e-12)
@@ -107,7 +109,7 @@ def test_where_poses_leap_only_the_scans_themselves_are_known():
     scans = [0.0, 0.1, 0.2]
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[2, 0, 3] = 50.0
-    views, left_out = views_of(recording(scans, images([0.05, 0.15, 0.2])), poses)
+    views, left_out = find_views(recording(scans, images([0.05, 0.15, 0.2])), poses)
     assert [view.image for view in views] == [0, 2]
     assert left_out == {"taken where the poses leap": 1}
 
@@ -116,11 +118,11 @@ def test_where_poses_leap_only_the_scans_themselves_are_known():
 def test_scans_that_share_a_stamp(stamps):
     stamp_ns = np.array(stamps, np.int64) * 10**7
     poses = screw(stamp_ns / S)
-    T, why = poses_at(stamp_ns, poses, stamp_ns, OPTIONS)
+    T, why = interpolate_poses(stamp_ns, poses, stamp_ns, OPTIONS)
     assert not any(why)
     np.testing.assert_allclose(T, poses, atol=1e-12)
     around = np.array([stamp_ns[0] - 10**6, stamp_ns[-1] + 10**6])
-    T, why = poses_at(stamp_ns, poses, around, OPTIONS)
+    T, why = interpolate_poses(stamp_ns, poses, around, OPTIONS)
     assert why == ["", ""]
     seconds = around / S if len(set(stamps)) > 1 else stamp_ns[[0, -1]] / S
     np.testing.assert_allclose(T, screw(seconds), atol=1e-12)
@@ -129,9 +131,9 @@ def test_scans_that_share_a_stamp(stamps):
 def test_without_scans_or_pictures_there_are_no_views():
     poses = np.empty((0, 4, 4))
     what = {"taken when nobody knows where the robot was": 1}
-    assert views_of(recording([], images([0.0])), poses) == ([], what)
-    assert views_of(recording([], None), poses) == ([], {})
-    assert views_of(recording([0.0], images([])), screw([0.0])) == ([], {})
+    assert find_views(recording([], images([0.0])), poses) == ([], what)
+    assert find_views(recording([], None), poses) == ([], {})
+    assert find_views(recording([0.0], images([])), screw([0.0])) == ([], {})
 
 
 UNUSABLE = [
@@ -151,7 +153,7 @@ def test_cameras_whose_pictures_cannot_be_used(camera, load, why):
         return colours(image) if image == 1 else load(image)
 
     both = images([0.0, 0.0, 0.1], (camera, CAMERA), [0, 1, 0], either)
-    views, left_out = views_of(recording([0.0, 0.1], both), screw([0.0, 0.1]))
+    views, left_out = find_views(recording([0.0, 0.1], both), screw([0.0, 0.1]))
     assert [view.image for view in views] == [1]
     ((reason, count),) = left_out.items()
     assert why in reason
@@ -165,22 +167,22 @@ def test_damaged_pictures_are_found_when_they_are_wanted():
         return colours(image)[: 6 if image == 3 else 12]
 
     pictures = images([0.0, 0.01, 0.02, 0.03], load=load)
-    views, left_out = views_of(recording([0.0, 0.1], pictures), screw([0.0, 0.1]))
+    views, left_out = find_views(recording([0.0, 0.1], pictures), screw([0.0, 0.1]))
     assert len(views) == 4
     assert left_out == {}
-    assert [colours_of(pictures, view) is None for view in views] == [True, False, True, True]
+    assert [read_color_image(pictures, view) is None for view in views] == [True, False, True, True]
     told = []
-    kept, unread = readable(pictures, views, lambda *done: told.append(done))
+    kept, unread = filter_readable(pictures, views, lambda *done: told.append(done))
     assert [view.image for view in kept] == [1]
     assert unread[:2] == ["is no picture"] * 2
     assert "picture 3 is (6, 16, 3)" in unread[2]
     assert told == [(k, 4) for k in (1, 2, 3, 4)]
-    assert readable(None, []) == ([], [])
+    assert filter_readable(None, []) == ([], [])
 
     def never(image: int) -> np.ndarray:
         raise InputError(f"{image} is no picture")
 
-    views, left_out = views_of(recording([0.0], images([0.0] * 9, load=never)), screw([0.0]))
+    views, left_out = find_views(recording([0.0], images([0.0] * 9, load=never)), screw([0.0]))
     assert (views, left_out) == ([], {"pictures that cannot be read": 9})
 
 
@@ -188,19 +190,19 @@ def test_grey_pictures_have_colours_too_and_a_size_may_be_found():
     grey = np.arange(192, dtype=np.uint8).reshape(12, 16)
     unsized = replace(CAMERA, width=0, height=0)
     pictures = images([0.0], (unsized,), load=lambda _: grey)
-    (view,), _ = views_of(recording([0.0], pictures), screw([0.0]))
+    (view,), _ = find_views(recording([0.0], pictures), screw([0.0]))
     assert (view.camera.width, view.camera.height) == (16, 12)
-    found = colours_of(pictures, view)
+    found = read_color_image(pictures, view)
     assert found is not None
     np.testing.assert_array_equal(found, grey[..., None].repeat(3, axis=2))
 
 
 def test_what_could_be_used_is_known_without_poses():
     both = images([0.0, 0.05, 0.1, 9.0], (CAMERA, replace(CAMERA, K=None)), [0, 1, 0, 0])
-    found, left_out = usable(recording([0.0, 0.1], both))
+    found, left_out = usable_images(recording([0.0, 0.1], both))
     assert found.tolist() == [True, False, True, False]
     assert sorted(left_out.values()) == [1, 1]
-    assert usable(recording([0.0], None))[1] == {}
+    assert usable_images(recording([0.0], None))[1] == {}
 
 
 @pytest.mark.parametrize("given", [{"pause": 0.0}, {"beyond": -0.1}, {"pause": float("nan")}])

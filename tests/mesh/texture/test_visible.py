@@ -9,8 +9,8 @@ from made_up_rooms import K, box, camera, looking, rectangle
 from stillmap import _core
 from stillmap.core import camera as camera_module
 from stillmap.mesh.options import VisibleOptions
-from stillmap.mesh.texture.visibility import scaled, visible
-from stillmap.mesh.triangle_mesh import Mesh, joined
+from stillmap.mesh.texture.visibility import find_visible_faces, scale_intrinsics
+from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes
 
 # seen from where y is less
 WALL = rectangle([-4.0, 4.0, -3.0], [8.0, 0, 0], [0, 0, 6.0], 24)
@@ -18,7 +18,7 @@ AHEAD = looking([0.0, 0, 0], [0.0, 1, 0])
 
 
 def test_a_wall_by_hand():
-    seen = visible(WALL, AHEAD)
+    seen = find_visible_faces(WALL, AHEAD)
     uv = (K @ AHEAD.in_camera(WALL.vertices).T).T
     uv = uv[:, :2] / uv[:, 2:]
     expected = ((uv >= 2) & (uv <= [397, 297])).all(axis=1)[WALL.faces].all(axis=1)
@@ -35,17 +35,17 @@ def test_a_wall_by_hand():
 
 def test_from_behind_nothing_is_seen():
     turned = Mesh(WALL.vertices, WALL.faces[:, ::-1].copy())
-    seen = visible(turned, AHEAD)
+    seen = find_visible_faces(turned, AHEAD)
     assert not seen.seen.any()
     assert (seen.cosine <= 0).all()
     assert (seen.cosine < 0).any()
     behind = looking([0.0, 0, 0], [0.0, -1, 0])
-    assert not visible(WALL, behind).seen.any()
+    assert not find_visible_faces(WALL, behind).seen.any()
 
 
 def hidden_share(mesh, view, first):
     """Of the first faces, the share of the area that is hidden, by a large picture."""
-    fine = scaled(view.camera.K, 4.0)
+    fine = scale_intrinsics(view.camera.K, 4.0)
     size = 4 * view.camera.width, 4 * view.camera.height
     _, with_all = _core.z_buffer(mesh.vertices, mesh.faces, fine, view.T_camera_map, *size, near=1)
     alone = mesh.faces[:first]
@@ -55,8 +55,8 @@ def hidden_share(mesh, view, first):
 
 
 def test_what_stands_before_a_wall_hides_it():
-    mesh = joined([WALL, box([-0.6, 2.0, -0.5], [0.4, 2.6, 0.7])])
-    alone, seen = visible(WALL, AHEAD).seen, visible(mesh, AHEAD)
+    mesh = concatenate_meshes([WALL, box([-0.6, 2.0, -0.5], [0.4, 2.6, 0.7])])
+    alone, seen = find_visible_faces(WALL, AHEAD).seen, find_visible_faces(mesh, AHEAD)
     hidden = hidden_share(mesh, AHEAD, len(WALL))
     of_wall = seen.seen[: len(WALL)]
     assert 40 < np.sum(hidden[alone] > 0.01) < 400
@@ -71,13 +71,13 @@ def test_a_pole_before_the_middle_of_a_large_face_hides_it():
     # neither corners nor centres of the two faces are behind it
     wall = rectangle([-2.0, 4.0, -1.5], [4.0, 0, 0], [0, 0, 3.0])
     pole = box([0.40, 2.0, -2.0], [0.45, 2.05, 2.0])
-    assert visible(wall, AHEAD).seen.all()
-    assert not visible(joined([wall, pole]), AHEAD).seen[:2].any()
+    assert find_visible_faces(wall, AHEAD).seen.all()
+    assert not find_visible_faces(concatenate_meshes([wall, pole]), AHEAD).seen[:2].any()
 
 
 def test_edges_are_known_to_a_pixel_only():
-    mesh = joined([WALL, box([-0.6, 2.0, -0.5], [0.4, 2.6, 0.7])])
-    close, wide = (visible(mesh, AHEAD, VisibleOptions(beside=b)).seen for b in (0, 1))
+    mesh = concatenate_meshes([WALL, box([-0.6, 2.0, -0.5], [0.4, 2.6, 0.7])])
+    close, wide = (find_visible_faces(mesh, AHEAD, VisibleOptions(beside=b)).seen for b in (0, 1))
     assert close[wide].all()
     lost = WALL.centres[np.flatnonzero(close & ~wide)]
     assert 10 < len(lost) < 200
@@ -88,9 +88,12 @@ def test_edges_are_known_to_a_pixel_only():
 
 def test_what_lies_flat_hides_what_is_under_it():
     floor = rectangle([-2.0, 1.0, -1.2], [4, 0, 0], [0, 5, 0], 50)
-    mesh = joined([floor, rectangle([-0.7, 2.2, -1.16], [1.4, 0, 0], [0, 1.5, 0], 4)])
+    mesh = concatenate_meshes([floor, rectangle([-0.7, 2.2, -1.16], [1.4, 0, 0], [0, 1.5, 0], 4)])
     view = looking([0.0, 0, 0], [0.0, 3, -1.0])
-    alone, seen = visible(floor, view).seen, visible(mesh, view).seen[: len(floor)]
+    alone, seen = (
+        find_visible_faces(floor, view).seen,
+        find_visible_faces(mesh, view).seen[: len(floor)],
+    )
     hidden = hidden_share(mesh, view, len(floor))
     assert np.sum(alone & (hidden > 0.9)) > 300
     assert not seen[hidden > 0.9].any()
@@ -102,7 +105,7 @@ def test_a_noisy_surface_does_not_hide_itself():
     floor = rectangle([-4.0, 0.5, -1.2], [8.0, 0, 0], [0, 8.0, 0], 80)
     noisy = Mesh(floor.vertices + rng.normal(0.0, 0.005, floor.vertices.shape), floor.faces)
     view = looking([0.0, 0, 0], [0.0, 3, -1.0])
-    flat, seen = visible(floor, view).seen, visible(noisy, view)
+    flat, seen = find_visible_faces(floor, view).seen, find_visible_faces(noisy, view)
     assert flat.sum() > 3000
     front = flat & (seen.cosine > 0.2)
     assert seen.seen[front].mean() > 0.95
@@ -111,7 +114,7 @@ def test_a_noisy_surface_does_not_hide_itself():
 def test_the_lens_decides_what_is_in_the_picture():
     barrel = camera(model="plumb_bob", distortion=(-0.25, 0.05, 0.0, 0.0))
     view = replace(AHEAD, camera=barrel)
-    seen, plain = visible(WALL, view), visible(WALL, AHEAD)
+    seen, plain = find_visible_faces(WALL, view), find_visible_faces(WALL, AHEAD)
     uv, ok = camera_module.project(barrel, view.in_camera(WALL.vertices))
     inside = ok & ((uv >= 2) & (uv <= [397, 297])).all(axis=1)
     np.testing.assert_array_equal(seen.seen, inside[WALL.faces].all(axis=1))
@@ -121,24 +124,26 @@ def test_the_lens_decides_what_is_in_the_picture():
 
 
 def test_the_margin():
-    far, near = (visible(WALL, AHEAD, VisibleOptions(margin=m)).seen for m in (60.0, 2.0))
+    far, near = (
+        find_visible_faces(WALL, AHEAD, VisibleOptions(margin=m)).seen for m in (60.0, 2.0)
+    )
     assert 0 < far.sum() < near.sum()
     assert near[far].all()
 
 
 def test_nothing_there():
-    seen = visible(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)), AHEAD)
+    seen = find_visible_faces(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)), AHEAD)
     assert len(seen.seen) == len(seen.pixels) == len(seen.cosine) == 0
 
 
 def test_threads_change_nothing():
-    mesh = joined([WALL, box([-0.6, 2.0, -0.5], [0.4, 2.6, 0.7], 4)])
-    once, again = visible(mesh, AHEAD), visible(mesh, AHEAD, threads=3)
+    mesh = concatenate_meshes([WALL, box([-0.6, 2.0, -0.5], [0.4, 2.6, 0.7], 4)])
+    once, again = find_visible_faces(mesh, AHEAD), find_visible_faces(mesh, AHEAD, threads=3)
     assert all(a.tobytes() == b.tobytes() for a, b in zip(once, again, strict=True))
 
 
 def test_a_scaled_picture_has_its_edges_where_they_were():
-    half = scaled(K, 0.5)
+    half = scale_intrinsics(K, 0.5)
     # the left edge of the picture, half a pixel beside the first centre, and the right one
     for u, u_ in ((-0.5, -0.5), (399.5, 199.5), (99.5, 49.5)):
         x = (u - K[0, 2]) / K[0, 0]

@@ -5,12 +5,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.mesh.texture.occluders import Thing
+from stillmap.mesh.texture.occluders import TrackedBox
 
 Float = NDArray[np.float64]
 
 
-class Way(NamedTuple):
+class ObjectFrame(NamedTuple):
     """Where a thing's own frame is at any time.
 
     Attributes:
@@ -20,12 +20,12 @@ class Way(NamedTuple):
             ahead and to the left, rad to the left.
     """
 
-    thing: Thing
+    thing: TrackedBox
     seconds: Float
     offset: Float
 
     @classmethod
-    def of_track(cls, thing: Thing) -> "Way":
+    def of_track(cls, thing: TrackedBox) -> "ObjectFrame":
         """As the track has it."""
         return cls(thing, thing.box.seconds[:1], np.zeros((1, 3)))
 

@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from stillmap.mesh.inputs import Sources
+from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.segmentation import (
     SPACING,
-    Moves,
-    fast,
-    large,
-    own_moves,
-    pieces_of_cells,
+    DynamicReturns,
+    cluster_cells,
+    is_fast,
+    is_large,
+    segment_object,
 )
 from stillmap.mesh.options import MoverOptions
-from stillmap.mesh.texture.occluders import Thing
+from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.tracking import MovingObject
 
 Float = NDArray[np.float64]
@@ -34,12 +34,12 @@ Bool = NDArray[np.bool_]
 
 Index = NDArray[np.intp]
 
-MOSTLY = 0.5  # of what is counted
+MAJORITY = 0.5  # of what is counted
 
 _AT_ONCE = 1000  # scans, after which their pairs are counted
 
 
-class Scan(NamedTuple):
+class ScanClusters(NamedTuple):
     """Which things a scan saw: (n,) numbers, the piece that most of each is of, and its beams."""
 
     there: Index
@@ -47,7 +47,7 @@ class Scan(NamedTuple):
     beams: Index
 
 
-class Pairs(NamedTuple):
+class PairCounts(NamedTuple):
     """Things that scans saw at once, as often as there are beams on the one that has fewer.
 
     Attributes:
@@ -61,7 +61,7 @@ class Pairs(NamedTuple):
     both: Index
 
 
-def pairs_of(scans: Sequence[Scan], n: int) -> Pairs:
+def count_pairs(scans: Sequence[ScanClusters], n: int) -> PairCounts:
     """All pairs of n things that some scan saw both of."""
     # of so many things most never meet: pairs that were seen, and no square of all
     key, met, both = (np.zeros(0, np.intp) for _ in range(3))
@@ -77,10 +77,10 @@ def pairs_of(scans: Sequence[Scan], n: int) -> Pairs:
         met, both = np.zeros(len(key), np.intp), np.zeros(len(key), np.intp)
         np.add.at(met, number, np.concatenate(together))
         np.add.at(both, number, np.concatenate(seen))
-    return Pairs(np.stack([key // n, key % n], axis=1), met, both)
+    return PairCounts(np.stack([key // n, key % n], axis=1), met, both)
 
 
-def grouped(pairs: Pairs, may: Bool, n: int) -> Index:
+def group_tracks(pairs: PairCounts, may: Bool, n: int) -> Index:
     """(n,) which whole each of n things is of.
 
     Pairs are asked in the order in which they hang together most, each once. Two wholes become one
@@ -105,7 +105,7 @@ def grouped(pairs: Pairs, may: Bool, n: int) -> Index:
         if a == b:
             continue
         met, both = links[a][b]
-        if met >= MOSTLY * both:
+        if met >= MAJORITY * both:
             _join(a, b, links)
             members[a] += members[b]
             whole[members[b]] = a
@@ -139,7 +139,7 @@ _FLAT = 2.0  # times as far apart along the line of sight: sides of cars, at fla
 _CELLS = 3.0  # of so many edges is the way between what hangs together
 
 
-class Followed(NamedTuple):
+class ObjectTrack(NamedTuple):
     """An object and what met it.
 
     Attributes:
@@ -151,27 +151,34 @@ class Followed(NamedTuple):
     """
 
     object: MovingObject
-    thing: Thing
+    thing: TrackedBox
     own: Index
     fast: bool
     large: bool
 
 
-def followed_of(sources: Sources, moves: Moves, options: MoverOptions) -> list[Followed]:
+def collect_tracks(
+    sources: MeshInputs, moves: DynamicReturns, options: MoverOptions
+) -> list[ObjectTrack]:
     """The objects that have a box, each with its beams."""
     things = {thing.box.object_id: thing for thing in sources.things}
     out = []
     for one in sources.objects:
         if one.id in things:
             thing = things[one.id]
-            own = own_moves(one, thing, moves, sources, options)
-            out.append(Followed(one, thing, own, fast(thing, options), large(thing, options)))
+            own = segment_object(one, thing, moves, sources, options)
+            out.append(
+                ObjectTrack(one, thing, own, is_fast(thing, options), is_large(thing, options))
+            )
     return out
 
 
-def wholes_of(
-    followed: Sequence[Followed], moves: Moves, sources: Sources, options: MoverOptions
-) -> list[list[Followed]]:
+def merge_tracks(
+    followed: Sequence[ObjectTrack],
+    moves: DynamicReturns,
+    sources: MeshInputs,
+    options: MoverOptions,
+) -> list[list[ObjectTrack]]:
     """The same, those together that are parts of one thing.
 
     Of two that are of one velocity, one of them faster than people, and mostly hang together in
@@ -184,20 +191,23 @@ def wholes_of(
     if moves.planar or not quick.any():
         return [[one] for one in followed]
     scans = list(_scans(followed, moves, sources, options))
-    pairs = pairs_of(scans, n)
+    pairs = count_pairs(scans, n)
     alike = quick[pairs.ends].any(axis=1) & (pairs.met > 0)
     some = np.flatnonzero(alike)
     alike[some] = [_alike(followed[a], followed[b]) for a, b in pairs.ends[some].tolist()]
-    whole = grouped(pairs, alike & (pairs.met >= MOSTLY * pairs.both), n)
-    groups: dict[int, list[Followed]] = {}
+    whole = group_tracks(pairs, alike & (pairs.met >= MAJORITY * pairs.both), n)
+    groups: dict[int, list[ObjectTrack]] = {}
     for k in np.flatnonzero(~_left_over(scans, whole, quick, pairs.ends[alike])).tolist():
         groups.setdefault(int(whole[k]), []).append(followed[k])
     return list(groups.values())
 
 
 def _scans(
-    followed: Sequence[Followed], moves: Moves, sources: Sources, options: MoverOptions
-) -> Iterator[Scan]:
+    followed: Sequence[ObjectTrack],
+    moves: DynamicReturns,
+    sources: MeshInputs,
+    options: MoverOptions,
+) -> Iterator[ScanClusters]:
     """The scans that saw something fast."""
     n, seen = len(followed), sources.seen
     quick = np.array([one.fast for one in followed], np.bool_)
@@ -208,14 +218,14 @@ def _scans(
         whose = number[moves.owner[some]]
         if not quick[whose[whose < n]].any():
             continue
-        piece = hanging_together(moves.ends[some], place, options.link)
+        piece = cluster_points(moves.ends[some], place, options.link)
         count = np.zeros((n + 1, int(piece.max()) + 1), np.intp)
         np.add.at(count, (whose, piece), 1)
         there = np.flatnonzero(count[:n].any(axis=1))
-        yield Scan(there, count[there].argmax(axis=1), count[there].max(axis=1))
+        yield ScanClusters(there, count[there].argmax(axis=1), count[there].max(axis=1))
 
 
-def _left_over(scans: Sequence[Scan], whole: Index, quick: Bool, alike: Index) -> Bool:
+def _left_over(scans: Sequence[ScanClusters], whole: Index, quick: Bool, alike: Index) -> Bool:
     """(n,) which ones in most scans hang together with more beams of another whole that is fast.
 
     Args:
@@ -235,10 +245,10 @@ def _left_over(scans: Sequence[Scan], whole: Index, quick: Bool, alike: Index) -
         more &= ~np.isin(there[:, None] * n + there, beside)
         less[there] += more.any(axis=1)
         times[there] += 1
-    return (less >= MOSTLY * times) & (times > 0)
+    return (less >= MAJORITY * times) & (times > 0)
 
 
-def hanging_together(points: Float, place: Float, link: float) -> Index:
+def cluster_points(points: Float, place: Float, link: float) -> Index:
     """(n,) which points (n, 3) hang together: no farther apart than beams are, and `link` metres.
 
     Args:
@@ -254,7 +264,7 @@ def hanging_together(points: Float, place: Float, link: float) -> Index:
         some = np.flatnonzero((away >= near - reach) & (away <= far + reach))
         if len(some):
             squeezed = place + (points[some] - place) * _squeeze(away[some], near, far)[:, None]
-            piece = pieces_of_cells(squeezed, reach / _CELLS, reach)
+            piece = cluster_cells(squeezed, reach / _CELLS, reach)
             rows.append(some)
             columns.append(first + piece)
             first += int(piece.max()) + 1
@@ -273,7 +283,7 @@ def _squeeze(away: Float, near: float, far: float) -> Float:
     return (halfway + (away - halfway) / _FLAT) / np.maximum(away, 1e-9)
 
 
-def _alike(one: Followed, other: Followed) -> bool:
+def _alike(one: ObjectTrack, other: ObjectTrack) -> bool:
     """Whether they are of one velocity when both are seen."""
     a, b = one.thing.box, other.thing.box
     first, last = max(a.seconds[0], b.seconds[0]), min(a.seconds[-1], b.seconds[-1])

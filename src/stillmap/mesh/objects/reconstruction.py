@@ -14,28 +14,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from stillmap.mesh.inputs import Sources
-from stillmap.mesh.objects.frame import Way
-from stillmap.mesh.objects.merging import Followed
+from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.objects.frame import ObjectFrame
+from stillmap.mesh.objects.merging import ObjectTrack
 from stillmap.mesh.objects.registration import (
     DEEPEST,
-    Glimpse,
-    Sweep,
-    apart,
-    between,
-    look_at,
-    motion_of,
-    pose,
-    surface_of,
+    PartialScan,
+    PartialSurface,
+    extract_partial_scan,
+    motion_transform,
+    register_surfaces,
+    surface_distance,
+    triangulate_partial_scan,
+    within_time,
 )
-from stillmap.mesh.objects.segmentation import Moves, scans_about, seconds_of
-from stillmap.mesh.objects.sweep_surface import best_moment
+from stillmap.mesh.objects.segmentation import DynamicReturns, beam_seconds, scans_within
+from stillmap.mesh.objects.sweep_surface import find_best_interval
 from stillmap.mesh.options import MoverOptions, SurfaceOptions
 from stillmap.mesh.range_image import Patch
-from stillmap.mesh.simplification import divided
-from stillmap.mesh.texture.occluders import Thing
+from stillmap.mesh.simplification import subdivide
+from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.mesh.tsdf import fused
+from stillmap.mesh.tsdf import integrate_patches
 
 Float = NDArray[np.float64]
 
@@ -46,8 +46,8 @@ _GROUND = 0.1  # m above the foot of a thing, up to where beams may have met the
 _FINE = 0.5  # of the distance that counts, between points of the surface
 
 
-def p_dynamic_at(
-    mesh: Mesh, way: Way, span: tuple[float, float], sources: Sources, reach: float
+def mean_p_dynamic(
+    mesh: Mesh, way: ObjectFrame, span: tuple[float, float], sources: MeshInputs, reach: float
 ) -> float:
     """Mean P(c = 0) of the beams that ended at a thing when it was seen, but for the ground's.
 
@@ -62,15 +62,15 @@ def p_dynamic_at(
         NaN where no beam ended there, 0.1 m above its foot or higher.
     """
     seen = sources.seen
-    fine, _ = divided(mesh, _FINE * reach)
+    fine, _ = subdivide(mesh, _FINE * reach)
     tree = cKDTree(fine.vertices)
     low, high = fine.vertices.min(axis=0) - reach, fine.vertices.max(axis=0) + reach
     low[2] = max(low[2], _GROUND)
     total, count = 0.0, 0
-    scans = scans_about(*span, sources)
+    scans = scans_within(*span, sources)
     for scan in range(scans.start, scans.stop):  # all of a second's would be too many at once
         beams = np.arange(seen.offset[scan], seen.offset[scan + 1])
-        seconds = seconds_of(beams, sources)
+        seconds = beam_seconds(beams, sources)
         then = (seconds >= span[0]) & (seconds <= span[1]) & seen.hit[beams]
         beams, seconds = beams[then], seconds[then]
         at = way.local(seconds, seen.end_points(beams, sources.poses))
@@ -102,7 +102,7 @@ _MOST = 0.5  # of the looks must fit, and of the best one's area be there
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class ObjectShape:
     """The surface of a thing that moved.
 
     Attributes:
@@ -117,19 +117,19 @@ class Shape:
 
     id: int
     mesh: Mesh
-    way: Way
+    way: ObjectFrame
     rigid: bool
     seconds: float
     span: tuple[float, float]
 
 
-def shape_of(
-    followed: Sequence[Followed],
-    sources: Sources,
-    moves: Moves,
+def reconstruct_object(
+    followed: Sequence[ObjectTrack],
+    sources: MeshInputs,
+    moves: DynamicReturns,
     options: MoverOptions,
     pictures: Sequence[Float],
-) -> Shape | None:
+) -> ObjectShape | None:
     """The surface of something that moved; None where too little of it was seen, or it stood still.
 
     Args:
@@ -147,11 +147,11 @@ def shape_of(
     # who is seen by few beams is looked at longer
     for moment in [k * options.sweep for k in _LONGER] if moves.planar else [0.0]:
         one, span = _best(followed, pictures, moment, sources, moves, options)
-        way = Way.of_track(one.thing)
-        look = look_at(own, span, way, fast, sources, moves, options)
+        way = ObjectFrame.of_track(one.thing)
+        look = extract_partial_scan(own, span, way, fast, sources, moves, options)
         if look is None:
             continue
-        mesh = surface_of(look, rigid, DEEPEST, options)
+        mesh = triangulate_partial_scan(look, rigid, DEEPEST, options)
         if not _enough(mesh, options.least, options):
             continue
         now = 0.5 * sum(look.span)
@@ -159,41 +159,41 @@ def shape_of(
             whole = _put_together(one, own, now, fast, sources, moves, options)
             if whole is not None:
                 return _moving(whole, sources, options)
-        shape = Shape(one.object.id, mesh, way, False, now, look.span)
+        shape = ObjectShape(one.object.id, mesh, way, False, now, look.span)
         return _moving(shape, sources, options)
     return None
 
 
-def _moving(shape: Shape, sources: Sources, options: MoverOptions) -> Shape | None:
+def _moving(shape: ObjectShape, sources: MeshInputs, options: MoverOptions) -> ObjectShape | None:
     """The shape; None where most of what is there stands still."""
     if options.dynamic == 0.0:
         return shape
-    p = p_dynamic_at(shape.mesh, shape.way, shape.span, sources, options.about)
+    p = mean_p_dynamic(shape.mesh, shape.way, shape.span, sources, options.about)
     return shape if p >= options.dynamic else None
 
 
 def _put_together(
-    one: Followed,
+    one: ObjectTrack,
     own: Index,
     now: float,
     fast: bool,
-    sources: Sources,
-    moves: Moves,
+    sources: MeshInputs,
+    moves: DynamicReturns,
     options: MoverOptions,
-) -> Shape | None:
+) -> ObjectShape | None:
     """What the looks about a time saw of a rigid thing; None: they do not lie over each other."""
-    way = Way.of_track(straight(one.thing, now, options.together))
+    way = ObjectFrame.of_track(straighten_track(one.thing, now, options.together))
     looks = _looks(own, now, way, fast, sources, moves, options)
     sweeps = [_sweep(look, now, options) for look in looks]
     if len(sweeps) < 2:
         return None
     best = int(np.argmin([abs(sweep.later) for sweep in sweeps]))
-    motion = motion_of(sweeps, best)
+    motion = register_surfaces(sweeps, best)
     moved = [sweep.moved(motion) for sweep in sweeps]
     kept = [
         k
         for k, sweep in enumerate(moved)
-        if k == best or apart(sweep, moved[best]) <= options.blurred
+        if k == best or surface_distance(sweep, moved[best]) <= options.blurred
     ]
     if len(kept) < max(2.0, _MOST * len(sweeps)):
         return None
@@ -202,9 +202,11 @@ def _put_together(
     if not _enough(mesh, least, options):
         return None
     later = np.array([sweeps[k].later for k in kept])
-    offset = np.array([_in_plane(*pose(motion, t)) for t in later.tolist()])
+    offset = np.array([_in_plane(*motion_transform(motion, t)) for t in later.tolist()])
     span = min(looks[k].span[0] for k in kept), max(looks[k].span[1] for k in kept)
-    return Shape(one.object.id, mesh, Way(way.thing, now + later, offset), True, now, span)
+    return ObjectShape(
+        one.object.id, mesh, ObjectFrame(way.thing, now + later, offset), True, now, span
+    )
 
 
 def _enough(mesh: Mesh, area: float, options: MoverOptions) -> bool:
@@ -217,29 +219,29 @@ def _enough(mesh: Mesh, area: float, options: MoverOptions) -> bool:
 def _looks(
     own: Index,
     now: float,
-    way: Way,
+    way: ObjectFrame,
     fast: bool,
-    sources: Sources,
-    moves: Moves,
+    sources: MeshInputs,
+    moves: DynamicReturns,
     options: MoverOptions,
-) -> list[Glimpse]:
+) -> list[PartialScan]:
     """At a thing about a time, one in each scan, in the order of their times."""
-    near = between(own, moves.seconds, now - options.together, now + options.together)
+    near = within_time(own, moves.seconds, now - options.together, now + options.together)
     scan = sources.seen.scans_of(moves.beam[near])
     out = []
     for part in np.split(near, np.flatnonzero(np.diff(scan)) + 1):
         if len(part):
             seconds = moves.seconds[part]
             span = float(seconds.min()), float(seconds.max())
-            look = look_at(own, span, way, fast, sources, moves, options)
+            look = extract_partial_scan(own, span, way, fast, sources, moves, options)
             out += [look] if look is not None else []
     # scans of several sensors overlap: which begins first may see it last
     return sorted(out, key=lambda look: look.span[0] + look.span[1])
 
 
-def _sweep(look: Glimpse, now: float, options: MoverOptions) -> Sweep:
-    mesh = surface_of(look, True, _DEEP, options)
-    return Sweep.of(mesh, look.own.origin.mean(axis=0), 0.5 * sum(look.span) - now)
+def _sweep(look: PartialScan, now: float, options: MoverOptions) -> PartialSurface:
+    mesh = triangulate_partial_scan(look, True, _DEEP, options)
+    return PartialSurface.of(mesh, look.own.origin.mean(axis=0), 0.5 * sum(look.span) - now)
 
 
 def _in_plane(R: Float, t: Float) -> list[float]:
@@ -249,7 +251,7 @@ def _in_plane(R: Float, t: Float) -> list[float]:
 
 def _fused(patches: Sequence[Patch], options: MoverOptions) -> Mesh:
     """One surface of several looks'."""
-    voxel = options.voxel or voxel_for(patches)
+    voxel = options.voxel or object_voxel_size(patches)
     limits = SurfaceOptions(
         before=_BEFORE,
         behind=_BEHIND,
@@ -257,10 +259,10 @@ def _fused(patches: Sequence[Patch], options: MoverOptions) -> Mesh:
         island=options.island,
     )
     weighed = [(patch, np.ones(len(patch.faces), np.float32)) for patch in patches]
-    return fused(weighed, voxel, limits)
+    return integrate_patches(weighed, voxel, limits)
 
 
-def voxel_for(patches: Sequence[Patch]) -> float:
+def object_voxel_size(patches: Sequence[Patch]) -> float:
     """Metres: a little less than beams lie apart on a thing, within bounds."""
     edges = [np.zeros(0)]
     for patch in patches:
@@ -271,7 +273,7 @@ def voxel_for(patches: Sequence[Patch]) -> float:
     return float(np.clip(_OF_SPACING * apart, _FINEST, _COARSEST))
 
 
-def straight(thing: Thing, now: float, reach: float) -> Thing:
+def straighten_track(thing: TrackedBox, now: float, reach: float) -> TrackedBox:
     """The same, going on evenly as it does at a time, from `reach` seconds before to after."""
     box = thing.box
     seconds = np.array([now - reach, now + reach])
@@ -284,22 +286,22 @@ def straight(thing: Thing, now: float, reach: float) -> Thing:
         ahead=np.tile(box.heading[at], (2, 1)),
         velocity=np.tile(velocity, (2, 1)),
     )
-    return Thing(even, np.full(2, np.interp(now, box.seconds, thing.foot)), thing.tall)
+    return TrackedBox(even, np.full(2, np.interp(now, box.seconds, thing.foot)), thing.tall)
 
 
 def _best(
-    followed: Sequence[Followed],
+    followed: Sequence[ObjectTrack],
     pictures: Sequence[Float],
     moment: float,
-    sources: Sources,
-    moves: Moves,
+    sources: MeshInputs,
+    moves: DynamicReturns,
     options: MoverOptions,
-) -> tuple[Followed, tuple[float, float]]:
+) -> tuple[ObjectTrack, tuple[float, float]]:
     """Which of some objects is seen best, and when."""
     found = []
     for one, shown in zip(followed, pictures, strict=True):
         if len(one.own):
             scans, seconds = sources.seen.scans_of(moves.beam[one.own]), moves.seconds[one.own]
-            found.append((one, best_moment(seconds, scans, moment, options.near, shown)))
+            found.append((one, find_best_interval(seconds, scans, moment, options.near, shown)))
     one, (first, last, _) = max(found, key=lambda each: each[1][2])
     return one, (first, last)

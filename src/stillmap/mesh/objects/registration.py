@@ -14,19 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from stillmap.mesh.inputs import Sources
-from stillmap.mesh.marching_cubes import without_islands
-from stillmap.mesh.objects.frame import Way
+from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.marching_cubes import remove_small_components
+from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.objects.segmentation import (
     SPACING,
-    Moves,
-    about_as,
-    grown,
-    look_of,
-    scans_about,
-    seconds_of,
+    DynamicReturns,
+    beam_seconds,
+    beams_in_frame,
+    grow_segment,
+    in_viewing_cone,
+    scans_within,
 )
-from stillmap.mesh.objects.sweep_surface import Look, between_beams
+from stillmap.mesh.objects.sweep_surface import ObjectBeams, triangulate_beams
 from stillmap.mesh.options import MoverOptions
 from stillmap.mesh.range_image import Patch
 from stillmap.mesh.triangle_mesh import Mesh
@@ -66,7 +66,7 @@ _TELL = 100.0  # points of a look that tell on their own: neighbours are off tog
 _SAME_SIDE = 0.5  # cosine between normals of one surface
 
 
-class Sweep(NamedTuple):
+class PartialSurface(NamedTuple):
     """What one look saw of a thing, in its own frame as its track has it.
 
     Attributes:
@@ -82,7 +82,7 @@ class Sweep(NamedTuple):
     later: float
 
     @classmethod
-    def of(cls, mesh: Mesh, place: Float, later: float) -> "Sweep":
+    def of(cls, mesh: Mesh, place: Float, later: float) -> "PartialSurface":
         """With the normals of the faces around each vertex."""
         spans = np.repeat(mesh.normals() * mesh.areas()[:, None], 3, axis=0)
         at, n = mesh.faces.ravel(), len(mesh.vertices)
@@ -90,9 +90,9 @@ class Sweep(NamedTuple):
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         return cls(mesh, normals / np.maximum(length, 1e-12), place, later)
 
-    def moved(self, motion: Float) -> "Sweep":
+    def moved(self, motion: Float) -> "PartialSurface":
         """As it lies where the thing went otherwise than its track by `motion` (6,)."""
-        R, t = pose(motion, self.later)
+        R, t = motion_transform(motion, self.later)
         mesh = Mesh(self.mesh.vertices @ R.T + t, self.mesh.faces)
         return self._replace(mesh=mesh, normals=self.normals @ R.T, place=R @ self.place + t)
 
@@ -112,16 +112,16 @@ class _Points(NamedTuple):
     later: float
 
     @classmethod
-    def of(cls, one: Sweep, most: int) -> "_Points":
+    def of(cls, one: PartialSurface, most: int) -> "_Points":
         every = max(1, len(one.mesh.vertices) // most)
         return cls(one.mesh.vertices[::every], one.normals[::every], one.later)
 
     def moved(self, motion: Float) -> "_Points":
-        R, t = pose(motion, self.later)
+        R, t = motion_transform(motion, self.later)
         return _Points(self.at @ R.T + t, self.facing @ R.T, self.later)
 
 
-def pose(motion: Float, later: float) -> tuple[Float, Float]:
+def motion_transform(motion: Float, later: float) -> tuple[Float, Float]:
     """(3, 3) and (3,) metres by which a look has to be moved.
 
     Args:
@@ -136,7 +136,7 @@ def pose(motion: Float, later: float) -> tuple[Float, Float]:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), t
 
 
-def motion_of(sweeps: Sequence[Sweep], best: int) -> Float:
+def register_surfaces(sweeps: Sequence[PartialSurface], best: int) -> Float:
     """(6,) how the thing went otherwise than its track, as `pose` has it.
 
     Point to plane against the best look, from the looks beside it to those far from it.
@@ -164,7 +164,7 @@ def motion_of(sweeps: Sequence[Sweep], best: int) -> Float:
 
 def _ends_meet(
     looks: Sequence[_Points],
-    known: Sweep,
+    known: PartialSurface,
     tree: "cKDTree[None]",
     motion: Float,
     speeds: tuple[float, ...],
@@ -199,7 +199,7 @@ def _ends_meet(
 
 def _better(
     looks: Sequence[_Points],
-    known: Sweep,
+    known: PartialSurface,
     tree: "cKDTree[None]",
     motion: Float,
     guess: Float,
@@ -216,7 +216,7 @@ def _better(
         T = one.later
         w = 1.0 / (1.0 + (residual / (3.0 * _SIGMA)) ** 2) ** 2 / _SIGMA**2
         w *= min(1.0, _TELL / len(at))
-        around = at - pose(motion, T)[1]
+        around = at - motion_transform(motion, T)[1]
         J = np.stack(
             [
                 T * n[:, 0],
@@ -233,7 +233,7 @@ def _better(
 
 
 def _off(
-    one: _Points, known: Sweep, tree: "cKDTree[None]", reach: float
+    one: _Points, known: PartialSurface, tree: "cKDTree[None]", reach: float
 ) -> tuple[Float, Float, Float]:
     """(n, 3) points that have a place on what is known, (n, 3) its normals, (n,) metres off it."""
     at, facing, _ = one
@@ -246,7 +246,7 @@ def _off(
     return at[near], normals, residual
 
 
-def apart(one: Sweep, known: Sweep) -> float:
+def surface_distance(one: PartialSurface, known: PartialSurface) -> float:
     """Metres, by which 3 of 4 places of a look lie off another one at most.
 
     NaN where they have little in common.
@@ -265,7 +265,7 @@ _MOSTLY = 0.1  # of what hangs together is of a track: else another one follows 
 DEEPEST = 3.0  # m, the side of a car from its middle to its end
 
 
-class Glimpse(NamedTuple):
+class PartialScan(NamedTuple):
     """What one look saw of a thing.
 
     Attributes:
@@ -274,20 +274,20 @@ class Glimpse(NamedTuple):
         span: s, from the first to the last.
     """
 
-    own: Look
-    others: Look
+    own: ObjectBeams
+    others: ObjectBeams
     span: tuple[float, float]
 
 
-def look_at(
+def extract_partial_scan(
     own: Index,
     span: tuple[float, float],
-    way: Way,
+    way: ObjectFrame,
     fast: bool,
-    sources: Sources,
-    moves: Moves,
+    sources: MeshInputs,
+    moves: DynamicReturns,
     options: MoverOptions,
-) -> Glimpse | None:
+) -> PartialScan | None:
     """What was seen of a thing at a time; None where most of that is of another one.
 
     Args:
@@ -300,29 +300,31 @@ def look_at(
     """
     around = _AROUND if fast else 0.0
     first, last = span[0] - around, span[1] + around
-    scans, offset = scans_about(first, last, sources), sources.seen.offset
+    scans, offset = scans_within(first, last, sources), sources.seen.offset
     beams = np.arange(offset[scans.start], offset[scans.stop])
-    seconds = seconds_of(beams, sources)
+    seconds = beam_seconds(beams, sources)
     then = (seconds >= first) & (seconds <= last)
     beams, seconds = beams[then], seconds[then]
-    mine = between(own, moves.seconds, first, last)
+    mine = within_time(own, moves.seconds, first, last)
     if fast:
         about = moves.between(int(beams[0]), int(beams[-1]) + 1)
-        every = between(np.arange(about.start, about.stop), moves.seconds, first, last)
-        place = look_of(beams[:1], seconds[:1], way, sources).origin[0]
-        whole = grown(mine, every, way, place, moves, options)
+        every = within_time(np.arange(about.start, about.stop), moves.seconds, first, last)
+        place = beams_in_frame(beams[:1], seconds[:1], way, sources).origin[0]
+        whole = grow_segment(mine, every, way, place, moves, options)
         if not len(whole) or len(mine) < _MOSTLY * len(whole):
             return None
         mine = whole
         span = float(moves.seconds[mine].min()), float(moves.seconds[mine].max())
-    seen = look_of(moves.beam[mine], moves.seconds[mine], way, sources)
+    seen = beams_in_frame(moves.beam[mine], moves.seconds[mine], way, sources)
     beside = ~np.isin(beams, moves.beam[mine], assume_unique=True)
     beams, seconds = beams[beside], seconds[beside]
-    near = about_as(moves.beam[mine], beams, sources)
-    return Glimpse(seen, look_of(beams[near], seconds[near], way, sources), span)
+    near = in_viewing_cone(moves.beam[mine], beams, sources)
+    return PartialScan(seen, beams_in_frame(beams[near], seconds[near], way, sources), span)
 
 
-def surface_of(look: Glimpse, rigid: bool, deepest: float, options: MoverOptions) -> Mesh:
+def triangulate_partial_scan(
+    look: PartialScan, rigid: bool, deepest: float, options: MoverOptions
+) -> Mesh:
     """Triangles between its beams.
 
     Args:
@@ -335,10 +337,10 @@ def surface_of(look: Glimpse, rigid: bool, deepest: float, options: MoverOptions
     if rigid:
         away = np.linalg.norm(look.own.points - look.own.origin, axis=1)
         stretch, longest = np.inf, max(longest, SPACING * float(np.median(away)))
-    mesh = between_beams(look.own, look.others, stretch, longest, deepest if rigid else 0.0)
-    return without_islands(mesh, options.island)
+    mesh = triangulate_beams(look.own, look.others, stretch, longest, deepest if rigid else 0.0)
+    return remove_small_components(mesh, options.island)
 
 
-def between(some: Index, seconds: Float, first: float, last: float) -> Index:
+def within_time(some: Index, seconds: Float, first: float, last: float) -> Index:
     """Those of numbers (n,) whose times lie between two."""
     return some[(seconds[some] >= first) & (seconds[some] <= last)]

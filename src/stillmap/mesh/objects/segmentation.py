@@ -116,7 +116,11 @@ def is_large(thing: TrackedBox, options: MoverOptions) -> bool:
 
 
 def segment_object(
-    one: MovingObject, thing: TrackedBox, moves: DynamicReturns, sources: MeshInputs, options: MoverOptions
+    one: MovingObject,
+    thing: TrackedBox,
+    moves: DynamicReturns,
+    sources: MeshInputs,
+    options: MoverOptions,
 ) -> Index:
     """(n,) of what moves that which ended on a thing: rising numbers within `moves`.
 
@@ -149,7 +153,12 @@ def segment_object(
 
 
 def grow_segment(
-    own: Index, within: Index, way: ObjectFrame, place: Float, moves: DynamicReturns, options: MoverOptions
+    own: Index,
+    within: Index,
+    way: ObjectFrame,
+    place: Float,
+    moves: DynamicReturns,
+    options: MoverOptions,
 ) -> Index:
     """(n,) of what moves that which hangs together with what is known to be of a thing.
 
@@ -204,7 +213,9 @@ def unique_cells(points: Float, edge: float) -> tuple[Float, Index]:
     return distinct.astype(np.float64), of
 
 
-def beams_in_frame(beams: Index, seconds: Float, way: ObjectFrame, sources: MeshInputs) -> ObjectBeams:
+def beams_in_frame(
+    beams: Index, seconds: Float, way: ObjectFrame, sources: MeshInputs
+) -> ObjectBeams:
     """Beams (n,), rising, taken at times (n,), in a thing's own frame.
 
     Those that came back from nowhere go on for a kilometre.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from stillmap.mesh.objects.frame import Way
+from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]
@@ -25,7 +25,7 @@ _OWN = 0.5  # of its range that a beam keeps in a round
 _STEP = 0.08  # m in range between neighbours that are smoothed together
 
 
-class Look(NamedTuple):
+class ObjectBeams(NamedTuple):
     """Beams in a thing's own frame.
 
     Attributes:
@@ -37,12 +37,12 @@ class Look(NamedTuple):
     origin: Float
 
     @classmethod
-    def of(cls, points: Float, origin: Float, seconds: Float, way: Way) -> "Look":
+    def of(cls, points: Float, origin: Float, seconds: Float, way: ObjectFrame) -> "ObjectBeams":
         """Beams in the map frame, each as it was at its time (n,)."""
         return cls(way.local(seconds, points), way.local(seconds, origin))
 
 
-def best_moment(
+def find_best_interval(
     seconds: Float, look: Index, moment: float, near: float, pictures: Float
 ) -> tuple[float, float, float]:
     """From when to when most beams met a thing, rather where a picture is; and how good that is.
@@ -70,8 +70,8 @@ def best_moment(
     return float(first[best]), float(last[best]), float(value[best])
 
 
-def between_beams(
-    own: Look, others: Look, stretch: float, longest: float, deepest: float = 0.0
+def triangulate_beams(
+    own: ObjectBeams, others: ObjectBeams, stretch: float, longest: float, deepest: float = 0.0
 ) -> Mesh:
     """The surface between beams that met a thing, as seen from the middle of where they came from.
 
@@ -136,7 +136,7 @@ def _seen_from(place: Float, middle: Float, points: Float) -> tuple[Float, NDArr
 
 
 def _passed(
-    found: Delaunay, points: Float, place: Float, middle: Float, others: Look
+    found: Delaunay, points: Float, place: Float, middle: Float, others: ObjectBeams
 ) -> NDArray[np.bool_]:
     """(m,) whether a beam went through a triangle and on behind it."""
     out = np.zeros(len(found.simplices), np.bool_)

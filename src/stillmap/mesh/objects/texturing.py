@@ -16,7 +16,7 @@ from stillmap.mesh.simplification import subdivide
 from stillmap.mesh.texture.occluders import TrackedBox, boxes_at, occlusion_probability
 from stillmap.mesh.texture.view_selection import NONE, Candidates, view_utility
 from stillmap.mesh.texture.views import View
-from stillmap.mesh.texture.visibility import render_depth, find_visible_faces
+from stillmap.mesh.texture.visibility import find_visible_faces, render_depth
 from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]
@@ -95,9 +95,13 @@ def assign_object_views(
         faces, points = faces[own_colours], points[own_colours]
         if not len(faces):
             continue
-        hidden = occlusion_probability(boxes_at(others, now), view.place, points, choice.margin, choice.sigma)
+        hidden = occlusion_probability(
+            boxes_at(others, now), view.place, points, choice.margin, choice.sigma
+        )
         pixels = found.pixels[faces].astype(np.float64)
-        good = view_utility(1.0 - hidden, pixels, mesh.areas()[faces], replace(choice, believe=True))
+        good = view_utility(
+            1.0 - hidden, pixels, mesh.areas()[faces], replace(choice, believe=True)
+        )
         if not shape.rigid:  # who walks looks otherwise a moment later
             good -= away / max(options.near, _LEAST)
         candidates.add(len(own), faces, good, 1.0 - hidden)
@@ -138,7 +142,9 @@ def _within(mesh: Mesh, faces: NDArray[np.intp], view: View, limits: VisibleOpti
     if not len(faces):
         return np.zeros(0)
     points = view.in_camera(mesh.vertices)
-    depths = render_depth(mesh, view, points[np.unique(mesh.faces[faces])], limits.scale, limits.near)
+    depths = render_depth(
+        mesh, view, points[np.unique(mesh.faces[faces])], limits.scale, limits.near
+    )
     far = ndimage.distance_transform_edt(np.pad(depths.face >= 0, 1))[1:-1, 1:-1]
     at = np.concatenate([points[mesh.faces[faces]], points[mesh.faces[faces]].mean(1)[:, None]], 1)
     metres = sample_buffer(far, depths, at) * at[..., 2] / depths.K[0, 0]

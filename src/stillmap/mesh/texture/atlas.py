@@ -59,7 +59,9 @@ class AtlasLayout(NamedTuple):
     sizes: Number
 
 
-def build_layout(mesh: Mesh, view_of_face: Index, views: list[View], options: TextureOptions) -> AtlasLayout:
+def build_layout(
+    mesh: Mesh, view_of_face: Index, views: list[View], options: TextureOptions
+) -> AtlasLayout:
     """Charts of all faces that a picture paints, on as many pages as they need.
 
     Args:
@@ -279,7 +281,7 @@ class TexturedMesh:
         return out.reshape(h, w)
 
 
-def replaced(whole: TexturedMesh, of: NDArray[np.bool_], part: TexturedMesh) -> TexturedMesh:
+def replace_faces(whole: TexturedMesh, of: NDArray[np.bool_], part: TexturedMesh) -> TexturedMesh:
     """A mesh some of whose faces are painted otherwise.
 
     Args:

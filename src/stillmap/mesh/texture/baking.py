@@ -15,8 +15,8 @@ import stillmap._core as _core
 from stillmap.core import camera
 from stillmap.core.errors import InputError
 from stillmap.mesh.options import TextureOptions
-from stillmap.mesh.texture.atlas import GREY, Layout, Textured, laid_out
-from stillmap.mesh.texture.views import View, of_colours
+from stillmap.mesh.texture.atlas import GRAY, AtlasLayout, TexturedMesh, build_layout
+from stillmap.mesh.texture.views import View, as_color_image
 from stillmap.mesh.triangle_mesh import Mesh
 
 Index = NDArray[np.int32]
@@ -68,7 +68,7 @@ def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return wide
 
 
-def halved(picture: NDArray[np.generic], times: int) -> Float32:
+def downsample(picture: NDArray[np.generic], times: int) -> Float32:
     """(h / 2^times, w / 2^times, 3) float32 means of squares; what is left at the edges counts as
     often as it takes to fill them."""
     out: Float32 = np.asarray(picture, np.float32)
@@ -79,7 +79,7 @@ def halved(picture: NDArray[np.generic], times: int) -> Float32:
     return out
 
 
-def bilinear(picture: NDArray[np.generic], uv: Float) -> Float32:
+def sample_bilinear(picture: NDArray[np.generic], uv: Float) -> Float32:
     """(n, 3) values of a picture (h, w, 3) at (n, 2) columns and rows, centres of pixels having
     whole numbers; beyond the outermost centres, of what is nearest there.
 
@@ -100,13 +100,13 @@ def bilinear(picture: NDArray[np.generic], uv: Float) -> Float32:
 _AT_ONCE = 1 << 17  # texels
 
 
-def baked(
+def bake_texture(
     mesh: Mesh,
     view_of_face: Index,
     views: list[View],
     read: Callable[[int], NDArray[Any]],
     options: TextureOptions | None = None,
-) -> Textured:
+) -> TexturedMesh:
     """A mesh with the pictures on it, one of which is in memory at a time.
 
     Args:
@@ -122,19 +122,19 @@ def baked(
     """
     options = options or TextureOptions()
     _check(mesh, view_of_face, len(views))
-    layout = laid_out(mesh, view_of_face, views, options)
-    pages = [np.full((h, w, 3), GREY[0], np.uint8) for w, h in layout.sizes.tolist()]
+    layout = build_layout(mesh, view_of_face, views, options)
+    pages = [np.full((h, w, 3), GRAY[0], np.uint8) for w, h in layout.sizes.tolist()]
     painted = [np.zeros(page.shape[:2], np.bool_) for page in pages]
     vertices, view = mesh.vertices[layout.vertex], layout.view.copy()
     unread: list[str] = []
     for number, faces in _by_view(layout):
         one = views[number]
         try:
-            picture = of_colours(read(one.image), one)
+            picture = as_color_image(read(one.image), one)
         except InputError as error:
             unread.append(str(error))
             view[faces] = -1
-            picture = np.broadcast_to(np.uint8(GREY[0]), (1, 1, 3))
+            picture = np.broadcast_to(np.uint8(GRAY[0]), (1, 1, 3))
         _paint(pages, painted, layout, vertices, faces, one, picture)
     for page, mask in zip(pages, painted, strict=True):
         fill_gutters(page, mask, options.gutter)
@@ -142,7 +142,7 @@ def baked(
     for page_number, size in enumerate(layout.sizes):
         on_page = np.unique(layout.faces[layout.page == page_number])
         uv[on_page] /= size
-    return Textured(
+    return TexturedMesh(
         vertices, layout.faces, uv, layout.page, tuple(pages), view, layout.vertex, tuple(unread)
     )
 
@@ -155,7 +155,7 @@ def _check(mesh: Mesh, view_of_face: Index, n_views: int) -> None:
         raise ValueError(f"view_of_face: a view that is not there, of {n_views}")
 
 
-def _by_view(layout: Layout) -> Iterator[tuple[int, NDArray[np.intp]]]:
+def _by_view(layout: AtlasLayout) -> Iterator[tuple[int, NDArray[np.intp]]]:
     """Views that paint anything, and the faces that they do, rising."""
     order = np.argsort(layout.view, kind="stable")
     numbers, first = np.unique(layout.view[order], return_index=True)
@@ -169,7 +169,7 @@ def _by_view(layout: Layout) -> Iterator[tuple[int, NDArray[np.intp]]]:
 def _paint(
     pages: list[NDArray[np.uint8]],
     painted: list[NDArray[np.bool_]],
-    layout: Layout,
+    layout: AtlasLayout,
     vertices: NDArray[np.float64],
     faces: NDArray[np.intp],
     view: View,
@@ -180,7 +180,7 @@ def _paint(
     if picture.size == 3:
         times[:] = 0
     for level in np.unique(times):
-        smaller = np.ascontiguousarray(picture) if level == 0 else halved(picture, int(level))
+        smaller = np.ascontiguousarray(picture) if level == 0 else downsample(picture, int(level))
         for number in np.unique(layout.page[faces]):
             mine = faces[(times == level) & (layout.page[faces] == number)]
             h, w = painted[number].shape
@@ -193,6 +193,6 @@ def _paint(
                 a, b, c = np.moveaxis(places[of[part]], 1, 0)
                 j, k = weight[part, :1], weight[part, 1:]
                 uv, _ = camera.project(view.camera, a + j * (b - a) + k * (c - a))
-                colour = bilinear(smaller, (uv + 0.5) * 0.5**level - 0.5)
+                colour = sample_bilinear(smaller, (uv + 0.5) * 0.5**level - 0.5)
                 flat[texel[part]] = np.rint(colour)
                 mask[texel[part]] = True

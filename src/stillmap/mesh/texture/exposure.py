@@ -25,7 +25,7 @@ _STAY = 0.01  # what it costs to brighten a picture, beside what it costs to dif
 _MOST = np.log(2.0)
 
 
-def gains(picture: NDArray[np.int32], colours: Colours, n: int) -> Float:
+def estimate_gains(picture: NDArray[np.int32], colours: Colours, n: int) -> Float:
     """(n, 3) factors for red, green and blue of n pictures, by which they agree best.
 
     A value of a pixel is about a power of the light, so a factor of exposure, or of the balance of
@@ -98,7 +98,7 @@ def _medians(of: NDArray[np.intp], values: Colours, count: NDArray[np.intp]) -> 
     return np.asarray(values[order[middle]], np.float64)
 
 
-def levelled(images: Images, views: Sequence[View], gain: Float) -> Images:
+def apply_gains(images: Images, views: Sequence[View], gain: Float) -> Images:
     """The same pictures, those of views (n,) times gains (n, 3); of 8 bits, cut off at 255."""
     of = {view.image: np.asarray(one) for view, one in zip(views, gain, strict=True)}
 

@@ -14,7 +14,7 @@ _GROWTHS = (0.0, 1.0, 2.0, 3.0)  # sigmas beyond the margin, up to which an outl
 _SURELY = 0.99  # that a thing is where its box is
 
 
-class Thing(NamedTuple):
+class TrackedBox(NamedTuple):
     """Something that moves.
 
     Attributes:
@@ -28,7 +28,7 @@ class Thing(NamedTuple):
     tall: float
 
 
-class Cuboid(NamedTuple):
+class OrientedBox(NamedTuple):
     """An upright box at one time.
 
     Attributes:
@@ -49,7 +49,7 @@ class Cuboid(NamedTuple):
         return np.stack([ahead, left, off[:, 2]], axis=1)
 
 
-def at_time(things: Sequence[Thing], seconds: float) -> list[Cuboid]:
+def boxes_at(things: Sequence[TrackedBox], seconds: float) -> list[OrientedBox]:
     """The things that are there at a time, in seconds as their boxes have them."""
     out = []
     for box, foot, tall in things:
@@ -61,12 +61,12 @@ def at_time(things: Sequence[Thing], seconds: float) -> list[Cuboid]:
         at = max(int(np.searchsorted(box.seconds, seconds, side="right")) - 1, 0)
         low = float(np.interp(seconds, box.seconds, foot))
         middle = np.array([xy[0], xy[1], low + 0.5 * tall])
-        out.append(Cuboid(middle, box.heading[at], np.array([*box.half_size, 0.5 * tall])))
+        out.append(OrientedBox(middle, box.heading[at], np.array([*box.half_size, 0.5 * tall])))
     return out
 
 
-def in_the_way(
-    cuboids: Sequence[Cuboid], place: Float, points: Float, margin: float, sigma: float
+def occlusion_probability(
+    cuboids: Sequence[OrientedBox], place: Float, points: Float, margin: float, sigma: float
 ) -> Float:
     """(n,) how probably some thing stands between a camera and points.
 
@@ -84,20 +84,24 @@ def in_the_way(
     square = np.maximum(along[0] ** 2 + along[1] ** 2 + along[2] ** 2, 1e-12)
     for one in cuboids:
         reach = float(np.linalg.norm(one.half)) + 2.0 * (margin + _GROWTHS[-1] * sigma)
-        near = np.flatnonzero(squares_to_segments(one.middle - place, along, square) <= reach**2)
+        near = np.flatnonzero(
+            squared_segment_distances(one.middle - place, along, square) <= reach**2
+        )
         if not len(near):
             continue
         start, ends = one.local(place[None])[0], one.local(points[near])
         shown = np.zeros(len(near))
         for growth in reversed(_GROWTHS):
             p = _SURELY * np.exp(-0.5 * growth**2)
-            meets = meets_box(start, ends, one.half + margin + growth * sigma)
+            meets = intersects_box(start, ends, one.half + margin + growth * sigma)
             shown[meets] = p
         free[near] *= 1.0 - shown
     return 1.0 - free
 
 
-def within_or_behind(cuboids: Sequence[Cuboid], place: Float, points: Float) -> NDArray[np.bool_]:
+def is_in_or_behind_box(
+    cuboids: Sequence[OrientedBox], place: Float, points: Float
+) -> NDArray[np.bool_]:
     """(n,) whether the line of sight from a camera to points meets the box of some thing.
 
     Args:
@@ -110,14 +114,14 @@ def within_or_behind(cuboids: Sequence[Cuboid], place: Float, points: Float) -> 
     square = np.maximum(along[0] ** 2 + along[1] ** 2 + along[2] ** 2, 1e-12)
     for one in cuboids:
         reach = float(one.half @ one.half)
-        near = np.flatnonzero(squares_to_segments(one.middle - place, along, square) <= reach)
+        near = np.flatnonzero(squared_segment_distances(one.middle - place, along, square) <= reach)
         if len(near):
             start, ends = one.local(place[None])[0], one.local(points[near])
-            out[near] |= meets_box(start, ends, one.half)
+            out[near] |= intersects_box(start, ends, one.half)
     return out
 
 
-def squares_to_segments(middle: Float, along: Float, square: Float) -> Float:
+def squared_segment_distances(middle: Float, along: Float, square: Float) -> Float:
     """(n,) squared metres from a point (3,) to segments from the origin to `along` (3, n).
 
     `square` (n,) are their squared lengths.
@@ -127,7 +131,7 @@ def squares_to_segments(middle: Float, along: Float, square: Float) -> Float:
     return np.asarray(middle @ middle + share * (share * square - 2.0 * dot))
 
 
-def meets_box(start: Float, ends: Float, half: Float) -> NDArray[np.bool_]:
+def intersects_box(start: Float, ends: Float, half: Float) -> NDArray[np.bool_]:
     """(n,) whether segments from a point (3,) to others (n, 3) meet a box around the origin.
 
     By slabs: a segment is within each pair of faces for an interval of its length.

@@ -70,7 +70,9 @@ class OcclusionMask(NamedTuple):
         return np.where(hidden, np.minimum(still, 1.0 - self.dynamic[row, column]), still)
 
 
-def build_occlusion_mask(view: View, points: Float, p_static: NDArray[np.float32], margin: float) -> OcclusionMask:
+def build_occlusion_mask(
+    view: View, points: Float, p_static: NDArray[np.float32], margin: float
+) -> OcclusionMask:
     """What beams say of a picture.
 
     Args:

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 import stillmap._core as _core
-from stillmap.mesh.texture.atlas import GREY, Textured
-from stillmap.mesh.texture.baking import bilinear
+from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
+from stillmap.mesh.texture.baking import sample_bilinear
 
 Colours = NDArray[np.uint8]
 
@@ -18,7 +18,7 @@ Float = NDArray[np.float64]
 _NOT_GREY = (128, 128, 127)  # what a picture shows as grey, so that grey means none
 
 
-class PaintedMesh:
+class TextureSampler:
     """A textured mesh, to be asked for the colours of points on it.
 
     Args:
@@ -26,7 +26,7 @@ class PaintedMesh:
         reach: metres, how far a point may lie off a face.
     """
 
-    def __init__(self, textured: Textured, reach: float) -> None:
+    def __init__(self, textured: TexturedMesh, reach: float) -> None:
         self._of = textured
         self._near = _core.NearFaces(textured.vertices, textured.faces, reach=reach)
         # -1 at the end: that of no face
@@ -51,13 +51,13 @@ class PaintedMesh:
             corner, share = self._of.faces[face[mine]], weight[mine]
             uv = sum(share[:, k, None] * self._of.uv[corner[:, k]] for k in range(3))
             h, w = texels.shape[:2]
-            out[mine] = np.rint(bilinear(texels, uv * np.array([w, h], np.float64) - 0.5))
-        return not_grey(out), found >= 0
+            out[mine] = np.rint(sample_bilinear(texels, uv * np.array([w, h], np.float64) - 0.5))
+        return avoid_gray(out), found >= 0
 
 
-def not_grey(colours: Colours) -> Colours:
+def avoid_gray(colours: Colours) -> Colours:
     """(n, 3) the same, but for GREY, which would mean that there is none."""
-    is_grey = (colours == GREY).all(axis=1, keepdims=True)
+    is_grey = (colours == GRAY).all(axis=1, keepdims=True)
     return np.where(is_grey, np.array(_NOT_GREY, np.uint8), colours)
 
 
@@ -66,7 +66,7 @@ _CELL = 0.01  # m
 _MOST_CELLS = 1 << 10  # along an edge, beyond which they are larger
 
 
-def depth_inside(points: Float, apart: float) -> Float:
+def outline_depth(points: Float, apart: float) -> Float:
     """(n,) metres from points (n, 2) to the edge of what they cover; 0: they are its edge.
 
     They cover discs of `apart` metres around each, and what these enclose, less a seam as wide.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.camera import project
 from stillmap.mesh.options import ChoiceOptions
-from stillmap.mesh.texture.baking import bilinear
+from stillmap.mesh.texture.baking import sample_bilinear
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.triangle_mesh import Mesh
 
@@ -71,7 +71,7 @@ class Candidates(NamedTuple):
             array[faces] = np.column_stack([array[faces], new])[row, order]
 
 
-def utility(p_static: Float, pixels: Float, area: Float, options: ChoiceOptions) -> Float:
+def view_utility(p_static: Float, pixels: Float, area: Float, options: ChoiceOptions) -> Float:
     """(n,) how good a picture is for faces, in e-folds of resolution; -inf: not to be used.
 
     Args:
@@ -87,7 +87,7 @@ def utility(p_static: Float, pixels: Float, area: Float, options: ChoiceOptions)
     return np.where(p_static >= options.least, sharp + sure, -np.inf)
 
 
-def chosen(candidates: Candidates, pairs: Index, border: float) -> Index:
+def select_views(candidates: Candidates, pairs: Index, border: float) -> Index:
     """(F,) the picture of each face, -1 where there is none.
 
     Minimises the sum of what is lost against each face's best picture, plus `border` for each
@@ -141,7 +141,7 @@ def _tell(picture: Index, belief: Float32, pairs: Index, told: Float32, border: 
 _FEWEST = 3  # pictures of a face: of two nobody knows which one is wrong
 
 
-def colours_of_faces(
+def sample_face_colors(
     mesh: Mesh,
     candidates: Candidates,
     views: Sequence[View],
@@ -161,11 +161,13 @@ def colours_of_faces(
         picture = colours(view) if len(face) else None
         if picture is not None:
             uv, ok = project(view.camera, view.in_camera(mesh.centres[face]))
-            found[face[ok], place[ok]] = bilinear(picture, uv[ok])
+            found[face[ok], place[ok]] = sample_bilinear(picture, uv[ok])
     return found
 
 
-def agreeing(candidates: Candidates, found: NDArray[np.float32], odd: float) -> Candidates:
+def reject_inconsistent_views(
+    candidates: Candidates, found: NDArray[np.float32], odd: float
+) -> Candidates:
     """Leaves out pictures that most others of a face contradict.
 
     Args:
