@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stillmap.mesh.texture.atlas import Textured
+from stillmap.mesh.texture.atlas import TexturedMesh
 
 SIZE = (6.0, 4.0, 3.0)
 
@@ -18,7 +18,7 @@ def together(quads, pages):
     n = len(quads)
     square = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     page = np.repeat([one for *_, one in quads], 2).astype(np.int32)
-    return Textured(
+    return TexturedMesh(
         vertices=np.concatenate([corners for corners, *_ in quads]),
         faces=np.concatenate([square + 4 * k for k in range(n)]).astype(np.int32),
         uv=np.concatenate([at for _, at, _ in quads]),
@@ -56,9 +56,9 @@ def room(person=False):
 
 def turning(n):
     """(n, 4, 4) T_camera_map of a camera that turns in the middle, 1.4 m high."""
-    from stillmap.results.report.renders import looking_at
+    from stillmap.results.report.renderer import look_at
 
     eye = np.array([0.0, 0.0, 1.4])
     angles = 2 * np.pi * np.arange(n) / n
     ahead = np.stack([np.cos(angles), np.sin(angles), np.zeros(n)], axis=1)
-    return np.array([looking_at(eye, eye + one) for one in ahead])
+    return np.array([look_at(eye, eye + one) for one in ahead])

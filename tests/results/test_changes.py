@@ -15,7 +15,7 @@ from stillmap.mapping import Change
 from stillmap.results.map_npz import changed_cells, write_map_npz
 from stillmap.results.report import maps
 from stillmap.results.report.maps import changes_section
-from stillmap.results.report.page import report_html
+from stillmap.results.report.page import render_report
 from stillmap.results.save import run_record
 
 S = 10**9
@@ -159,7 +159,7 @@ class Section(HTMLParser):
 
 def test_nothing_is_said_where_nothing_changed(result, changed):
     assert changes_section(result) == ""
-    assert "What changed" not in report_html(result)
+    assert "What changed" not in render_report(result)
     empty = dataclasses.replace(changed.map, p_occupied=np.zeros((0, 0), np.float32))
     assert changes_section(dataclasses.replace(changed, map=empty, raw_map=empty)) == ""
 
@@ -182,7 +182,7 @@ def test_the_table(changed):
 
 
 def test_it_is_in_the_report(changed):
-    page = report_html(changed)
+    page = render_report(changed)
     assert changes_section(changed) in page
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from stillmap.results.objects import write_objects, write_ply, write_traffic
-from stillmap.results.report.figures import map_image, shown_window
-from stillmap.results.report.objects import objects_section, traffic_image
-from stillmap.results.report.page import report_html
+from stillmap.results.report.figures import draw_map, map_window
+from stillmap.results.report.objects import draw_traffic, objects_section
+from stillmap.results.report.page import render_report
 from stillmap.tracking import ObjectOptions, compute_flow_map
 
 
@@ -68,7 +68,7 @@ def test_nothing_moved(tmp_path, result):
     write_traffic(tmp_path / "traffic.npz", nothing.traffic)
     with np.load(tmp_path / "traffic.npz", allow_pickle=False) as read:
         assert read["crossings"].shape == (0, 0)
-    assert "Nothing that could be followed" in report_html(nothing)
+    assert "Nothing that could be followed" in render_report(nothing)
 
 
 def test_empty_clouds_are_clouds(tmp_path):
@@ -96,9 +96,9 @@ def test_the_section_shows_every_way(result):
 
 
 def test_squares_are_darker_where_more_crossed(result):
-    window = shown_window([result.map])
-    picture = map_image(result.map, window)
-    image = np.array(traffic_image(result.traffic, picture, window).convert("RGB")).astype(int)
+    window = map_window([result.map])
+    picture = draw_map(result.map, window)
+    image = np.array(draw_traffic(result.traffic, picture, window).convert("RGB")).astype(int)
     plain = np.array(picture.convert("RGB")).astype(int)
     changed = (np.abs(image - plain).max(axis=2) > 30) & (image[..., 0] - image[..., 2] > 40)
     x0, _, _, y1 = window

@@ -14,14 +14,14 @@ from stillmap.results.report.figures import (
     UNKNOWN,
     VEIL,
     VIOLET,
-    dots_image,
+    draw_map,
+    draw_points,
+    draw_poorly_observed,
+    draw_snapshot,
     likelihood_svg,
-    map_image,
-    shown_window,
-    snapshot_image,
-    thin_image,
+    map_window,
 )
-from stillmap.results.report.page import likelihood_sentence, loops_sentence, report_html
+from stillmap.results.report.page import likelihood_sentence, loops_sentence, render_report
 from stillmap.results.report.tables import learned_section
 
 VOID = {"meta", "img", "input", "br", "link", "hr"}
@@ -57,7 +57,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def html(result):
-    return report_html(result)
+    return render_report(result)
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def small_map(result, p):
 
 def test_map_colours(result):
     p = np.array([[0, 1, np.nan], [np.nan, 0, 0]], np.float32)
-    pixels = np.asarray(map_image(small_map(result, p), (0, 0, 3, 2)).convert("RGB"))
+    pixels = np.asarray(draw_map(small_map(result, p), (0, 0, 3, 2)).convert("RGB"))
     white, black = (255, 255, 255), (0, 0, 0)
     np.testing.assert_array_equal(pixels, [[UNKNOWN, white, white], [white, black, UNKNOWN]])
 
@@ -136,24 +136,24 @@ def test_the_window_holds_every_occupied_cell_of_both_maps(result):
     other = np.zeros((50, 100), np.float32)
     other[10, 20] = 0.7
     b = dataclasses.replace(small_map(result, other), origin=(100.0, 30.0, 0.0))
-    assert shown_window([small_map(result, p), b]) == (44.0, 34.0, 125.0, 67.0)
+    assert map_window([small_map(result, p), b]) == (44.0, 34.0, 125.0, 67.0)
     # none occupied: what is known; nothing known: everything
     p[:] = np.nan
-    assert shown_window([small_map(result, p)]) == (0.0, 0.0, 300.0, 100.0)
+    assert map_window([small_map(result, p)]) == (0.0, 0.0, 300.0, 100.0)
     p[5, 6] = 0.1
-    assert shown_window([small_map(result, p)]) == (2.0, 1.0, 11.0, 10.0)
+    assert map_window([small_map(result, p)]) == (2.0, 1.0, 11.0, 10.0)
 
 
 def test_dots_lie_where_the_points_are():
     points = np.array([[0.5, 0.5], [2.5, 1.5], [9.0, 9.0], [-0.1, 0.5]], np.float32)
-    dots = np.asarray(dots_image(points, (0, 0, 3, 2), (3, 2)))
+    dots = np.asarray(draw_points(points, (0, 0, 3, 2), (3, 2)))
     np.testing.assert_array_equal(dots, [[0, 0, 1], [1, 0, 0]])
 
 
 def test_the_veil_lies_over_thin_places(result):
     p = np.array([[0, 1, np.nan], [np.nan, 0, 0]], np.float32)
     thin = np.array([[0, 1, 0], [0, 0, 1]], bool)
-    veil = np.asarray(thin_image(small_map(result, p), thin, (-1, 0, 3, 2)))
+    veil = np.asarray(draw_poorly_observed(small_map(result, p), thin, (-1, 0, 3, 2)))
     np.testing.assert_array_equal(veil, [[0, 0, 0, 1], [0, 0, 1, 0]])
 
 
@@ -164,8 +164,8 @@ def test_the_veil_is_reduced_as_the_map_is(result):
     thin[:2000, 0:1000:7] = thin[2000:, 1000:2000] = True
     thin[3000, 3000] = True
     occupancy, window = small_map(result, p), (0, 0, 4000, 4000)
-    image = thin_image(occupancy, thin, window)
-    assert image.size == map_image(occupancy, window).size
+    image = draw_poorly_observed(occupancy, thin, window)
+    assert image.size == draw_map(occupancy, window).size
     veil = np.asarray(image)
     middle = image.height // 2
     quarter = image.width // 4
@@ -183,12 +183,12 @@ def test_how_much_is_thin_is_said(page, result):
     assert f"{100 * thin / known:.1f} % of what is known" in text
     assert "fewer than 3 looks" in text
     nothing = dataclasses.replace(result.evidence, thin=np.zeros_like(result.evidence.thin))
-    text = report_html(dataclasses.replace(result, evidence=nothing))
+    text = render_report(dataclasses.replace(result, evidence=nothing))
     assert "No place that is known rests on thin evidence." in text
 
 
 def test_snapshot_shows_map_and_dots(result):
-    shown = np.asarray(snapshot_image(result.snapshots[-1]).convert("RGB"))
+    shown = np.asarray(draw_snapshot(result.snapshots[-1]).convert("RGB"))
     colours = set(map(tuple, shown.reshape(-1, 3).tolist()))
     assert {(255, 255, 255), UNKNOWN, ORANGE} <= colours
     assert min(colours)[0] < 50  # a wall
@@ -198,7 +198,7 @@ def test_large_maps_are_reduced_but_keep_thin_walls(result):
     p = np.zeros((4000, 4000), np.float32)
     p[:, 1777] = 1.0
     p[3000:] = np.nan
-    image = map_image(small_map(result, p), (0, 0, 4000, 4000))
+    image = draw_map(small_map(result, p), (0, 0, 4000, 4000))
     assert image.width * image.height <= 1_500_000
     pixels = np.asarray(image.convert("L")).astype(int)
     wall = 1777 * image.width // 4000
@@ -217,7 +217,7 @@ def test_a_report_of_a_large_map_stays_small(result):
         result.map, p_occupied=rng.random((4000, 4000), np.float32), resolution=0.05
     )
     evidence = dataclasses.replace(result.evidence, thin=rng.random((4000, 4000)) < 0.5)
-    text = report_html(dataclasses.replace(result, map=large, raw_map=large, evidence=evidence))
+    text = render_report(dataclasses.replace(result, map=large, raw_map=large, evidence=evidence))
     assert len(text.encode()) < 10_000_000
     Page(text)
 
@@ -261,17 +261,17 @@ def estimated_by(result, estimator):
 
 
 def test_the_curves_are_called_what_the_estimator_made_them(result):
-    default = report_html(result)
+    default = render_report(result)
     assert "Bound: log likelihood of the cells" in default
     assert "(5)" not in default
     for estimator in ("paper", "hit-ratio", "tracker"):
-        printed = report_html(estimated_by(result, estimator))
+        printed = render_report(estimated_by(result, estimator))
         assert "Expected log likelihood, (5)" in printed
         assert "log likelihood of the cells" not in printed
 
 
 def test_one_iteration_makes_no_curve(result):
-    one = report_html(dataclasses.replace(result, iterations=result.iterations[:1]))
+    one = render_report(dataclasses.replace(result, iterations=result.iterations[:1]))
     assert 'class="curve"' not in one
     assert "The numbers" in one
 
@@ -282,15 +282,15 @@ def test_loops_in_words(result):
         "Places seen again: 1 of 4 closed a loop; the rest was refused: explains too little (2), "
         "other loops disagree (1)."
     )
-    assert sentence in report_html(result)
+    assert sentence in render_report(result)
     closed = dataclasses.replace(result, loops=result.loops[:1])
     assert loops_sentence(closed) == "Places seen again: 1 of 1 closed a loop."
     assert loops_sentence(dataclasses.replace(result, loops=[])) == ""
 
 
 def test_one_snapshot_shows_no_evolution(result):
-    assert "How the map evolved" in report_html(result)
-    one = report_html(dataclasses.replace(result, snapshots=result.snapshots[:1]))
+    assert "How the map evolved" in render_report(result)
+    one = render_report(dataclasses.replace(result, snapshots=result.snapshots[:1]))
     assert "How the map evolved" not in one
     assert "Where most moved" in one
 
@@ -306,7 +306,7 @@ def test_what_was_learned_in_words(result):
     assert "0.5 s or less 60.0 % 3 s 30.0 % 45 s or more 10.0 %" in text
     assert "1 % or less 90.0 % 15 % or more 10.0 %" in text
     assert "90 % or less 25.0 % 99.8 % or more 75.0 %" in text  # the least first
-    assert learned_section(result) in report_html(result)
+    assert learned_section(result) in render_report(result)
 
 
 def test_nothing_is_told_that_was_not_learned(result):
@@ -326,18 +326,18 @@ def test_nothing_is_told_that_was_not_learned(result):
     ],
 )
 def test_a_report_of_less(result, change):
-    Page(report_html(dataclasses.replace(result, **change)))
+    Page(render_report(dataclasses.replace(result, **change)))
 
 
 def test_a_map_that_nobody_looked_at_and_one_without_cells(result):
     for p in (np.full((5, 5), np.nan, np.float32), np.zeros((0, 0), np.float32)):
         empty = small_map(result, p)
         none = dataclasses.replace(result.evidence, thin=np.zeros(p.shape, bool))
-        Page(report_html(dataclasses.replace(result, map=empty, raw_map=empty, evidence=none)))
+        Page(render_report(dataclasses.replace(result, map=empty, raw_map=empty, evidence=none)))
 
 
 def test_likelihoods_that_are_no_numbers_are_drawn_as_gaps(result):
-    Page(report_html(with_likelihoods(result, [float("nan"), float("-inf"), -3.0])))
+    Page(render_report(with_likelihoods(result, [float("nan"), float("-inf"), -3.0])))
 
 
 @pytest.mark.parametrize(

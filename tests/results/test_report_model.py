@@ -11,8 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stillmap.results.report.model import MOST_OBJECTS, model_section, object_stills, stills_of
-from stillmap.results.report.page import report_html
+from stillmap.results.report.page import render_report
+from stillmap.results.report.previews import (
+    MOST_OBJECTS,
+    model_section,
+    render_object,
+    render_previews,
+)
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -33,7 +38,7 @@ def thing():
 
 @pytest.fixture(scope="module")
 def stills(thing):
-    return stills_of(room(), room(person=True), turning(40), {7: thing})
+    return render_previews(room(), room(person=True), turning(40), {7: thing})
 
 
 def test_the_place_is_shown_where_somebody_stood(stills):
@@ -59,7 +64,7 @@ def test_how_much_is_grey_is_told(stills):
 
 
 def test_without_the_sharpest_there_is_one_picture_each():
-    stills = stills_of(room(), None, turning(40), {})
+    stills = render_previews(room(), None, turning(40), {})
     assert [one.sharpest for one in stills.place] == [None] * 3
     section = model_section(stills)
     assert section.count("<img") == 3
@@ -67,7 +72,7 @@ def test_without_the_sharpest_there_is_one_picture_each():
 
 
 def test_a_model_without_pictures_is_seen_from_above():
-    stills = stills_of(room(), None, np.zeros((0, 4, 4)), {})
+    stills = render_previews(room(), None, np.zeros((0, 4, 4)), {})
     assert [one.caption for one in stills.place] == ["from above"]
 
 
@@ -76,7 +81,7 @@ def cyan(picture):
 
 
 def test_objects_are_seen_from_their_fronts(thing):
-    stills = object_stills(7, thing)
+    stills = render_object(7, thing)
     assert list(stills.sides) == ["from ahead", "from its left"]
     ahead, left = (cyan(one) for one in stills.sides.values())
     assert ahead > 0.1
@@ -109,12 +114,12 @@ def box_with(sides):
     ],
 )
 def test_a_side_that_shows_backs_is_left_out(sides, shown):
-    assert list(object_stills(0, box_with(sides)).sides) == shown
+    assert list(render_object(0, box_with(sides)).sides) == shown
 
 
 def test_backs_are_never_drawn():
     """Else one would read a number plate from inside the car."""
-    stills = object_stills(0, box_with(["ahead", "left", "behind"]))
+    stills = render_object(0, box_with(["ahead", "left", "behind"]))
     red = {
         side: float(((one[..., 0] > 200) & (one[..., 1] < 60)).mean())
         for side, one in stills.sides.items()
@@ -124,7 +129,7 @@ def test_backs_are_never_drawn():
 
 
 def test_captions_say_how_large_an_object_is(stills):
-    text = model_section(replace(stills, objects=[object_stills(3, box_with(["right"]))]))
+    text = model_section(replace(stills, objects=[render_object(3, box_with(["right"]))]))
     assert "<b>Object 3</b>: 4.00 x 0.00 x 1.00 m, from ahead<" in text
     assert text.count("<b>Object 3</b>") == 3
 
@@ -139,7 +144,7 @@ def test_what_lies_far_out_makes_nothing_small():
     tiles = [floor(x, y, 2.0, 2.0, 0) for x in range(-20, 20, 2) for y in range(-5, 5, 2)]
     islands = [floor(150.0, 90.0, 1.0, 1.0, 0), floor(-160.0, -40.0, 1.0, 1.0, 0)]
     alone, all_ = (
-        stills_of(together(quads, [wall_page((250, 0, 0))]), None, turning(0), {}).place[-1]
+        render_previews(together(quads, [wall_page((250, 0, 0))]), None, turning(0), {}).place[-1]
         for quads in (tiles, tiles + islands)
     )
     share = [
@@ -165,7 +170,7 @@ def test_what_lies_far_out_makes_nothing_small():
 def test_without_pictures_nothing_is_called_filtered(left_out, unread, said):
     bare = replace(room(), page=np.full(12, -1, np.int32), pages=())
     bare = replace(bare, unread=tuple(["is damaged"] * unread))
-    text = model_section(stills_of(bare, None, turning(unread), {}, left_out=left_out))
+    text = model_section(render_previews(bare, None, turning(unread), {}, left_out=left_out))
     assert said in text
     assert "<b>Surface</b>: from above" in text
     assert "Filtered" not in text
@@ -174,26 +179,26 @@ def test_without_pictures_nothing_is_called_filtered(left_out, unread, said):
 
 def test_pictures_that_show_nothing_are_still_pictures():
     bare = replace(room(), page=np.full(12, -1, np.int32), pages=())
-    text = model_section(stills_of(bare, None, turning(3), {}, left_out={"a camera": 2}))
+    text = model_section(render_previews(bare, None, turning(3), {}, left_out={"a camera": 2}))
     assert "100.0 % of the surface" in text
     assert "It is grey:" not in text
 
 
 def test_some_objects_are_enough(thing):
     many = dict.fromkeys(range(MOST_OBJECTS + 3), thing)
-    stills = stills_of(room(), None, turning(4), many)
+    stills = render_previews(room(), None, turning(4), many)
     assert [one.number for one in stills.objects] == list(range(MOST_OBJECTS))
 
 
 def test_those_that_are_painted_most_come_first(thing):
     bare = replace(thing, page=np.full_like(thing.page, -1))
     large = replace(bare, vertices=2.0 * bare.vertices)
-    stills = stills_of(room(), None, turning(4), {1: bare, 2: large, 3: thing})
+    stills = render_previews(room(), None, turning(4), {1: bare, 2: large, 3: thing})
     assert [one.number for one in stills.objects] == [3, 2, 1]
 
 
 def test_the_pictures_lie_in_the_page(result, stills):
-    page = report_html(result, stills=stills)
+    page = render_report(result, stills=stills)
     assert "What it looks like" in page
     found = re.findall(r'class="still" src="data:image/jpeg;base64,([^"]+)"', page)
     assert len(found) == 2 * len(stills.place) + 2
@@ -213,7 +218,7 @@ def test_they_stay_small(stills):
         replace(one, filtered=noise(one.filtered), sharpest=noise(one.filtered))
         for one in stills.place
     ]
-    full = object_stills(0, box_with(["right"]))
+    full = render_object(0, box_with(["right"]))
     full = replace(full, sides={side: noise(one) for side, one in full.sides.items()})
     assert len(full.sides) == 3
     worst = replace(
@@ -224,4 +229,4 @@ def test_they_stay_small(stills):
 
 def test_without_models_nothing_is_said(result):
     assert model_section(None) == ""
-    assert "What it looks like" not in report_html(result)
+    assert "What it looks like" not in render_report(result)

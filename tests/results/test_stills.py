@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillmap.results.report.renders import (
+from stillmap.results.report.renderer import (
     BACKGROUND,
+    camera_matrix,
     covered_share,
-    holding,
-    looking_at,
-    mostly,
-    painted_share,
-    pinhole,
-    still,
+    fit_camera,
+    look_at,
+    main_corners,
+    render,
+    textured_share,
 )
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -32,18 +32,18 @@ def facing(page, distance=2.0, width=3.0, height=2.0):
 
 
 def ahead():
-    return looking_at(np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    return look_at(np.zeros(3), np.array([0.0, 1.0, 0.0]))
 
 
 def exactly(distance, width=3.0):
     """A picture whose edges are those of the quad."""
-    return pinhole(SIZE, 2 * np.arctan(0.5 * width / distance))
+    return camera_matrix(SIZE, 2 * np.arctan(0.5 * width / distance))
 
 
 def test_a_page_before_the_camera_is_seen_as_it_is():
     page = np.random.default_rng(0).integers(0, 255, (64, 96, 3)).astype(np.uint8)
     textured = together([facing(0)], [page])
-    seen = still(textured, ahead(), exactly(2.0), SIZE)
+    seen = render(textured, ahead(), exactly(2.0), SIZE)
     assert seen.shape == (64, 96, 3)
     # four samples a quarter of a texel beside its middle: each takes a quarter of its neighbours
     padded = np.pad(page.astype(float), ((1, 1), (1, 1), (0, 0)), mode="edge")
@@ -60,8 +60,8 @@ def test_what_is_aslant_is_seen_in_perspective():
     corners, at, number = floor
     along = np.stack([corners[:, 0] / 40.0, at[:, 1]], axis=1)
     textured = together([(corners, along, number)], [page])
-    T, K = looking_at(np.zeros(3), np.array([1.0, 0.0, -0.5])), pinhole(SIZE, 1.0)
-    seen = still(textured, T, K, SIZE)[..., 0].astype(float)
+    T, K = look_at(np.zeros(3), np.array([1.0, 0.0, -0.5])), camera_matrix(SIZE, 1.0)
+    seen = render(textured, T, K, SIZE)[..., 0].astype(float)
     v, u = np.mgrid[:64, :96]
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], -1)
     rays = rays @ T[:3, :3]
@@ -72,7 +72,7 @@ def test_what_is_aslant_is_seen_in_perspective():
 def test_what_is_nearer_hides_what_is_behind():
     pages = [np.full((2, 2, 3), 10, np.uint8), np.full((2, 2, 3), 200, np.uint8)]
     textured = together([facing(0, 2.0), facing(1, 4.0, 12.0, 8.0)], pages)
-    seen = still(textured, ahead(), pinhole(SIZE, 2 * np.arctan(1.5)), SIZE)
+    seen = render(textured, ahead(), camera_matrix(SIZE, 2 * np.arctan(1.5)), SIZE)
     assert (seen[32, 48] == 10).all()
     assert (seen[2, 2] == 200).all()
     assert (seen == 10).all(axis=2).mean() == pytest.approx(0.25, abs=0.01)
@@ -81,21 +81,21 @@ def test_what_is_nearer_hides_what_is_behind():
 def test_what_has_no_picture_is_grey_and_nothing_is_the_background():
     textured = together([facing(-1)], [])
     K = exactly(1.0)
-    seen = still(textured, ahead(), K, SIZE)
+    seen = render(textured, ahead(), K, SIZE)
     middle = seen[32, 48]
     assert len(set(middle.tolist())) == 1
     assert (seen[0, 0] == BACKGROUND).all()
-    assert painted_share(textured, ahead(), K, SIZE) == 0.0
+    assert textured_share(textured, ahead(), K, SIZE) == 0.0
     painted = replace(textured, page=textured.page + 1, pages=(wall_page((1, 2, 3)),))
-    assert painted_share(painted, ahead(), exactly(2.0), SIZE) == 1.0
+    assert textured_share(painted, ahead(), exactly(2.0), SIZE) == 1.0
 
 
 def test_without_backs_a_room_has_no_ceiling():
     inside = room()
-    T = looking_at(np.array([0.0, -0.1, 9.0]), np.zeros(3))
-    K = pinhole(SIZE, 1.0)
-    roof = still(inside, T, K, SIZE)
-    open_ = still(inside, T, K, SIZE, from_behind=False)
+    T = look_at(np.array([0.0, -0.1, 9.0]), np.zeros(3))
+    K = camera_matrix(SIZE, 1.0)
+    roof = render(inside, T, K, SIZE)
+    open_ = render(inside, T, K, SIZE, from_behind=False)
     reds = [(one[..., 0].astype(int) - one[..., 1] > 40).sum() for one in (roof, open_)]
     assert reds[0] == 0
     assert reds[1] > 50
@@ -104,12 +104,12 @@ def test_without_backs_a_room_has_no_ceiling():
 def test_a_model_without_faces_is_all_background():
     nothing = together([facing(0)], [wall_page((9, 9, 9))])
     empty = replace(nothing, faces=nothing.faces[:0], page=nothing.page[:0])
-    assert (still(empty, ahead(), exactly(2.0), SIZE) == BACKGROUND).all()
+    assert (render(empty, ahead(), exactly(2.0), SIZE) == BACKGROUND).all()
 
 
 def test_any_number_of_threads_gives_the_same():
-    T, K = looking_at(np.array([1.0, -1.0, 1.4]), np.array([0.0, 3.0, 1.0])), pinhole(SIZE, 1.4)
-    one, two = (still(room(), T, K, SIZE, threads=n) for n in (1, 3))
+    T, K = look_at(np.array([1.0, -1.0, 1.4]), np.array([0.0, 3.0, 1.0])), camera_matrix(SIZE, 1.4)
+    one, two = (render(room(), T, K, SIZE, threads=n) for n in (1, 3))
     assert np.array_equal(one, two)
 
 
@@ -131,17 +131,17 @@ def test_what_is_covered_is_counted():
 def test_what_is_mostly_there_leaves_islands_out():
     tiles = [quad([(x, 0, 0), (x + 1, 0, 0), (x + 1, 1, 0), (x, 1, 0)], -1) for x in range(98)]
     far = [quad([(x, 0, 0), (x + 1, 0, 0), (x + 1, 1, 0), (x, 1, 0)], -1) for x in (-900, 900)]
-    kept = mostly(together(tiles + far, []), np.array([0.0, 0.0, 1.0]), 0.011)
+    kept = main_corners(together(tiles + far, []), np.array([0.0, 0.0, 1.0]), 0.011)
     assert (kept[:, 0].min(), kept[:, 0].max()) == (0.0, 98.0)
-    away = mostly(together(tiles, []), np.array([0.0, 0.0, -1.0]), 0.01)
+    away = main_corners(together(tiles, []), np.array([0.0, 0.0, -1.0]), 0.01)
     assert len(away) == 3 * 2 * 98  # nothing is seen from below
 
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (-0.5, -0.7, 0.7), (0, 0, 1)])
 def test_all_that_is_to_be_seen_fills_the_picture(direction):
     points = np.random.default_rng(0).uniform((-9, -2, 0), (4, 3, 5), (50, 3))
-    K = pinhole(SIZE, 0.8)
-    T = holding(points, np.array(direction, float), K, SIZE)
+    K = camera_matrix(SIZE, 0.8)
+    T = fit_camera(points, np.array(direction, float), K, SIZE)
     seen = (points @ T[:3, :3].T + T[:3, 3]) @ K.T
     at = seen[:, :2] / seen[:, 2:]
     assert (seen[:, 2] > 0).all()
@@ -157,7 +157,7 @@ def test_all_that_is_to_be_seen_fills_the_picture(direction):
 @pytest.mark.parametrize("target", [(3, 1, 0), (0, 0, -5), (0.0, -2.0, 4.0)])
 def test_a_camera_looks_where_it_is_told(target):
     eye = np.array([0.5, 0.2, 1.0])
-    T = looking_at(eye, np.array(target, float))
+    T = look_at(eye, np.array(target, float))
     assert T[:3, :3] @ T[:3, :3].T == pytest.approx(np.eye(3))
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
     seen = T[:3, :3] @ target + T[:3, 3]

@@ -14,9 +14,9 @@ import pytest
 from PIL import Image
 
 from stillmap.mesh.options import TextureOptions
-from stillmap.mesh.texture.atlas import Textured
+from stillmap.mesh.texture.atlas import TexturedMesh
 from stillmap.results.gltf import write_glb
-from stillmap.results.report.renders import BACKGROUND
+from stillmap.results.report.renderer import BACKGROUND
 from stillmap.viewer.scene import read_scene
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
@@ -117,7 +117,7 @@ def tiled(path, tones):
     uv = np.tile([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]], (len(tones), 1))
     square = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     page = np.repeat(np.arange(len(tones), dtype=np.int32), 2)
-    textured = Textured(
+    textured = TexturedMesh(
         vertices=np.concatenate(corners).astype(float),
         faces=np.concatenate([square + 4 * n for n in range(len(tones))]).astype(np.int32),
         uv=uv,

@@ -26,8 +26,8 @@ from stillmap.results.object_models import models_record, write_models
 from stillmap.results.objects import write_objects, write_traffic
 from stillmap.results.points import write_beams, write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
-from stillmap.results.report.model import ModelPreviews, render_previews
 from stillmap.results.report.page import write_report
+from stillmap.results.report.previews import ModelPreviews, render_previews
 from stillmap.results.rig import FOLDER as TILTING
 from stillmap.results.rig import tilting_record, write_tilting
 from stillmap.rig.build import Tilting

@@ -8,7 +8,7 @@ import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 from stillmap.results import gltf
-from stillmap.results.report.renders import BACKGROUND
+from stillmap.results.report.renderer import BACKGROUND
 from stillmap.viewer import display, tracks
 from stillmap.viewer.display import chosen
 from stillmap.viewer.scene import Scene

@@ -14,11 +14,11 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import read_text
 from stillmap.core.se2 import inverse
 from stillmap.io.trajectory import read_tum
-from stillmap.mesh.texture.atlas import GREY
+from stillmap.mesh.texture.atlas import GRAY
 from stillmap.pipeline.snapshots import Window
 from stillmap.results import gltf
 from stillmap.results.reader import Track, read_grid, read_tracks
-from stillmap.results.report.figures import ORANGE, UNKNOWN, map_image, shown_window
+from stillmap.results.report.figures import ORANGE, UNKNOWN, draw_map, map_window
 from stillmap.viewer import display
 from stillmap.viewer.display import Points, points_in
 from stillmap.viewer.tracks import pose_at
@@ -161,8 +161,8 @@ def _plan(folder: Path, clear: bool) -> Plan | None:
     grid = read_grid(folder)
     if not grid.p_occupied.size:
         return None
-    window = shown_window([grid])
-    picture = np.array(map_image(grid, window).convert("RGBA"))
+    window = map_window([grid])
+    picture = np.array(draw_map(grid, window).convert("RGBA"))
     if clear:  # no shade of grey is that of what is unknown
         picture[(picture[..., :3] == UNKNOWN).all(axis=2), 3] = 0
     larger = max(1, _SHARP // max(picture.shape))
@@ -178,7 +178,7 @@ def _cloud(name: str, raw: Points, origin: Float) -> Cloud:
             z = raw.points[:, 2]
             painted = display.of_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
     elif name == "dynamic":  # grey would be taken for a part of the place
-        painted[(painted == GREY).all(axis=1)] = ORANGE
+        painted[(painted == GRAY).all(axis=1)] = ORANGE
     return Cloud((raw.points - origin).astype(np.float32), painted, raw.of)
 
 
@@ -195,7 +195,7 @@ def _ground(static: Points | None, poses: Float) -> float:
 
 
 def _surface(path: Path) -> bytes | None:
-    return gltf.require_whole(path, _MOST_SURFACE) if path.exists() else None
+    return gltf.read_glb(path, _MOST_SURFACE) if path.exists() else None
 
 
 def _models(folder: Path, tracks: list[Track], notes: list[str]) -> list[Model]:
@@ -212,7 +212,7 @@ def _models(folder: Path, tracks: list[Track], notes: list[str]) -> list[Model]:
 
 
 def _model(path: Path, track: Track, most: int) -> Model:
-    data = gltf.require_whole(path, most)
+    data = gltf.read_glb(path, most)
     place = path.with_suffix(".json")
     try:
         record = json.loads(read_text(place, _MOST_PLACE))

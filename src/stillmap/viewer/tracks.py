@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
 from stillmap.results.reader import Track
-from stillmap.slam.deskew import deskewed
+from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.odometry_2d import SlamOptions
 from stillmap.viewer.display import chosen
 
@@ -138,7 +138,7 @@ class Beams:
         """At most so many beams of a scan; only it and those beside it are read."""
         D, T = self.recording.dimension, self.recording.n_scans
         first, end = max(scan - _REACH[D], 0), min(scan + _REACH[D] + 1, T)
-        near = deskewed(part(self.recording, first, end), self.poses[first:end], self.slam)
+        near = deskew_recording(part(self.recording, first, end), self.poses[first:end], self.slam)
         beams, at = self.recording.beams_of(scan), near.beams_of(scan - first)
         use = np.flatnonzero(near.hit[at])
         use = use[chosen(len(use), most)]

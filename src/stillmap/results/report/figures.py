@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from stillmap.em import OccupancyMap
+from stillmap.pipeline.estimate import IterationRecord
 from stillmap.pipeline.snapshots import Snapshot, Window, cut, cut_layer, extent
 from stillmap.results.map_server import OCCUPIED_THRESH
-from stillmap.results.protocols import IterationRecordLike, MapLike
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +40,7 @@ _SHOWN_WIDTH = 600
 _UNKNOWN_INDEX, _ORANGE_INDEX = 101, 102
 
 
-def shown_window(maps: Sequence[MapLike]) -> Window:
+def map_window(maps: Sequence[OccupancyMap]) -> Window:
     """The smallest window that holds every occupied cell of `maps`, with a margin.
 
     Free space may reach far beyond, where beams met nothing. Without an occupied cell the window
@@ -55,14 +56,16 @@ def shown_window(maps: Sequence[MapLike]) -> Window:
     return extent(maps[0])
 
 
-def map_image(occupancy: MapLike, window: Window) -> Image.Image:
+def draw_map(occupancy: OccupancyMap, window: Window) -> Image.Image:
     """White free, grey unknown, black occupied; large maps are reduced to the pixel budget."""
     cells, _ = cut(occupancy, window)
     factor = _reduction(window, occupancy.resolution)
     return _with_palette(_levels(cells, factor)[::-1])
 
 
-def thin_image(occupancy: MapLike, thin: NDArray[np.bool_], window: Window) -> Image.Image:
+def draw_poorly_observed(
+    occupancy: OccupancyMap, thin: NDArray[np.bool_], window: Window
+) -> Image.Image:
     """A veil over the thin (H, W) cells, to lie over the `map_image` of that window."""
     factor = _reduction(window, occupancy.resolution)
     known, _ = cut_layer(occupancy, _known(occupancy), window, False)
@@ -75,11 +78,11 @@ def thin_image(occupancy: MapLike, thin: NDArray[np.bool_], window: Window) -> I
     return image
 
 
-def dots_image(points: NDArray[np.float32], window: Window, size: tuple[int, int]) -> Image.Image:
+def draw_points(points: NDArray[np.float32], window: Window, size: tuple[int, int]) -> Image.Image:
     """Orange dots on nothing, to lie over a `map_image` of `size` (width, height) pixels."""
     width, height = size
     pixels = np.zeros((height, width), np.uint8)
-    column, row = pixel_positions(points, window, size).T
+    column, row = map_to_pixels(points, window, size).T
     _put_dots(pixels, column, row, 1, max(1, round(width / _SHOWN_WIDTH)))
     image = Image.fromarray(pixels)
     image.putpalette([*UNKNOWN, *ORANGE])
@@ -87,7 +90,7 @@ def dots_image(points: NDArray[np.float32], window: Window, size: tuple[int, int
     return image
 
 
-def snapshot_image(snapshot: Snapshot) -> Image.Image:
+def draw_snapshot(snapshot: Snapshot) -> Image.Image:
     """The snapshot's part of the map with its dynamic end points in orange."""
     longest = max(snapshot.p_occupied.shape)
     levels = _levels(snapshot.p_occupied, max(1, math.ceil(longest / _SNAPSHOT_PIXELS)))[::-1]
@@ -96,12 +99,12 @@ def snapshot_image(snapshot: Snapshot) -> Image.Image:
     h, w = snapshot.p_occupied.shape
     x, y, _ = snapshot.origin
     window = (x, y, x + w * snapshot.resolution, y + h * snapshot.resolution)
-    column, row = pixel_positions(snapshot.dynamic_points, window, pixels.shape[::-1]).T
+    column, row = map_to_pixels(snapshot.dynamic_points, window, pixels.shape[::-1]).T
     _put_dots(pixels, column, row, _ORANGE_INDEX, 3)
     return _with_palette(pixels)
 
 
-def pixel_positions(
+def map_to_pixels(
     points: NDArray[np.float32] | NDArray[np.float64], window: Window, size: tuple[int, ...]
 ) -> NDArray[np.float64]:
     """(K, 2) column and row, as fractions of pixels from the top left, of (K, 2) map points."""
@@ -119,15 +122,15 @@ def png_uri(image: Image.Image) -> str:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _occupied(occupancy: MapLike) -> NDArray[np.bool_]:
+def _occupied(occupancy: OccupancyMap) -> NDArray[np.bool_]:
     return occupancy.p_occupied > OCCUPIED_THRESH
 
 
-def _known(occupancy: MapLike) -> NDArray[np.bool_]:
+def _known(occupancy: OccupancyMap) -> NDArray[np.bool_]:
     return ~np.isnan(occupancy.p_occupied)
 
 
-def _box(occupancy: MapLike, cells: NDArray[np.bool_]) -> Window | None:
+def _box(occupancy: OccupancyMap, cells: NDArray[np.bool_]) -> Window | None:
     """The window around the chosen cells, a margin of a twentieth included."""
     rows, columns = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
     if not len(rows):
@@ -219,7 +222,7 @@ _PAGE_COLOURS = {
 
 
 def likelihood_svg(
-    iterations: Sequence[IterationRecordLike], best: int, titles: tuple[str, str]
+    iterations: Sequence[IterationRecord], best: int, titles: tuple[str, str]
 ) -> str:
     """`<svg>` with the expected log likelihood and the bound, the best iteration marked."""
     # matplotlib is slow to load and needed nowhere else

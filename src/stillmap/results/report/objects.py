@@ -11,12 +11,14 @@ import numpy as np
 from PIL import Image
 
 from stillmap.mapping.beam_statistics import sample_dynamic_points
+from stillmap.pipeline.result import Result
 from stillmap.pipeline.snapshots import Window
-from stillmap.results.protocols import MovingObjectLike, ResultLike, TiltingLike, TrafficLike
-from stillmap.results.report.figures import dots_image, map_image, pixel_positions, shown_window
+from stillmap.results.report.figures import draw_map, draw_points, map_to_pixels, map_window
 from stillmap.results.report.maps import figure
 from stillmap.results.report.tables import duration_text, share_text
 from stillmap.results.rig import tilting_record
+from stillmap.rig.build import Tilting
+from stillmap.tracking import MovingObject, Traffic
 
 _MOST_WAYS, _MOST_ROWS = 500, 25
 
@@ -28,15 +30,15 @@ _PALE, _DARK = np.array([255.0, 226.0, 178.0]), np.array([150.0, 20.0, 10.0])
 _WALL = 90  # shades of grey up to which a pixel is a wall, and stays one
 
 
-def objects_section(result: ResultLike) -> str:
+def objects_section(result: Result) -> str:
     """Everything about what moved; empty where it was not asked for."""
     if not result.options.objects.enabled or not result.map.p_occupied.size:
         return ""
     objects = result.objects
     if not objects:
         return "<section><h2>What moved</h2><p>Nothing that could be followed.</p></section>"
-    window = shown_window([result.map])
-    picture = map_image(result.map, window)
+    window = map_window([result.map])
+    picture = draw_map(result.map, window)
     reduced = picture.size[0] < round((window[2] - window[0]) / result.map.resolution)
     ways, traffic = _ways(objects, window, picture.size), result.traffic
     most = f"the squares of {traffic.resolution:g} m crossed {int(traffic.crossings.max())} times "
@@ -47,7 +49,7 @@ def objects_section(result: ResultLike) -> str:
         + figure(
             "Traffic",
             f"how often it was crossed: dark, {most}at most",
-            [(traffic_image(traffic, picture, window), "")],
+            [(draw_traffic(traffic, picture, window), "")],
             "",
             window,
             reduced,
@@ -57,7 +59,7 @@ def objects_section(result: ResultLike) -> str:
     )
 
 
-def traffic_image(traffic: TrafficLike, picture: Image.Image, window: Window) -> Image.Image:
+def draw_traffic(traffic: Traffic, picture: Image.Image, window: Window) -> Image.Image:
     """Squares that were crossed, laid over the picture of the map in the same window."""
     image = np.array(picture.convert("RGB"))
     height, width = image.shape[:2]
@@ -76,15 +78,15 @@ def traffic_image(traffic: TrafficLike, picture: Image.Image, window: Window) ->
     return Image.fromarray(image).quantize(_COLOURS)
 
 
-def _seconds(one: MovingObjectLike) -> float:
+def _seconds(one: MovingObject) -> float:
     return 1e-9 * float(one.stamp_ns[-1] - one.stamp_ns[0])
 
 
-def _speed(one: MovingObjectLike) -> float:
+def _speed(one: MovingObject) -> float:
     return float(np.median(np.linalg.norm(one.velocity, axis=1)))
 
 
-def _summary(objects: Sequence[MovingObjectLike]) -> str:
+def _summary(objects: Sequence[MovingObject]) -> str:
     beams = sum(len(one.beams) for one in objects)
     seconds = float(np.median([_seconds(one) for one in objects]))
     things = f"{len(objects):,} things that moved were" if len(objects) > 1 else "One thing was"
@@ -95,21 +97,21 @@ def _summary(objects: Sequence[MovingObjectLike]) -> str:
     )
 
 
-def _longest(objects: Sequence[MovingObjectLike], most: int) -> list[MovingObjectLike]:
+def _longest(objects: Sequence[MovingObject], most: int) -> list[MovingObject]:
     return sorted(objects, key=_seconds, reverse=True)[:most]
 
 
-def _ways_caption(objects: Sequence[MovingObjectLike]) -> str:
+def _ways_caption(objects: Sequence[MovingObject]) -> str:
     if len(objects) <= _MOST_WAYS:
         return "where each of them went"
     return f"where the {_MOST_WAYS} of them went that were seen for longest"
 
 
-def _ways(objects: Sequence[MovingObjectLike], window: Window, size: tuple[int, int]) -> str:
+def _ways(objects: Sequence[MovingObject], window: Window, size: tuple[int, int]) -> str:
     """Lines over a map picture of `size` pixels."""
     lines = ""
     for one in _longest(objects, _MOST_WAYS):
-        positions = pixel_positions(one.xy, window, size)
+        positions = map_to_pixels(one.xy, window, size)
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in positions.tolist())
         lines += f'<polyline points="{points}"/>'
     return (
@@ -118,7 +120,7 @@ def _ways(objects: Sequence[MovingObjectLike], window: Window, size: tuple[int, 
     )
 
 
-def _table(objects: Sequence[MovingObjectLike]) -> str:
+def _table(objects: Sequence[MovingObject]) -> str:
     rows = ""
     for one in _longest(objects, _MOST_ROWS):
         cells = (
@@ -139,7 +141,7 @@ def _table(objects: Sequence[MovingObjectLike]) -> str:
     )
 
 
-def tilting_section(result: ResultLike, tilting: TiltingLike | None) -> str:
+def tilting_section(result: Result, tilting: Tilting | None) -> str:
     """How much was cut out and by what, and where; empty where there is no such laser."""
     if tilting is None:
         return ""
@@ -166,13 +168,13 @@ def cut_sentences(record: Mapping[str, Any]) -> str:
     return said
 
 
-def _where(result: ResultLike, tilting: TiltingLike) -> str:
+def _where(result: Result, tilting: Tilting) -> str:
     if not result.map.p_occupied.size:
         return ""
-    window = shown_window([result.map])
-    picture = map_image(result.map, window)
+    window = map_window([result.map])
+    picture = draw_map(result.map, window)
     ends = sample_dynamic_points(tilting.seen, tilting.poses, tilting.p_static)[:, :2]
     reduced = picture.size[0] < round((window[2] - window[0]) / result.map.resolution)
-    layers = [(picture, ""), (dots_image(ends, window, picture.size), "")]
+    layers = [(picture, ""), (draw_points(ends, window, picture.size), "")]
     caption = "from above, in orange, on the flat laser's map"
     return '<div class="row">' + figure("Cut out", caption, layers, "", window, reduced) + "</div>"

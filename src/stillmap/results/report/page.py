@@ -15,8 +15,8 @@ from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.result import Result
 from stillmap.results.report.figures import likelihood_svg
 from stillmap.results.report.maps import changes_section, evolution_section, maps_section
-from stillmap.results.report.model import ModelPreviews, model_section
 from stillmap.results.report.objects import objects_section, tilting_section
+from stillmap.results.report.previews import ModelPreviews, model_section
 from stillmap.results.report.tables import (
     bytes_text,
     duration_text,

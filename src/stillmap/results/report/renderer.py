@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.mesh.texture.atlas import Textured
-from stillmap.mesh.texture.baking import bilinear
+from stillmap.mesh.texture.atlas import TexturedMesh
+from stillmap.mesh.texture.baking import sample_bilinear
 from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]
@@ -22,7 +22,7 @@ _MARGIN = 1.05
 _BLOCK = 1 << 17  # pixels that are painted together
 
 
-def pinhole(size: tuple[int, int], field_of_view: float) -> Float:
+def camera_matrix(size: tuple[int, int], field_of_view: float) -> Float:
     """(3, 3) of a picture of (width, height) pixels that sees so many radians from left to right.
 
     Centres of pixels have whole numbers.
@@ -32,8 +32,8 @@ def pinhole(size: tuple[int, int], field_of_view: float) -> Float:
     return np.array([[f, 0.0, 0.5 * width - 0.5], [0.0, f, 0.5 * height - 0.5], [0.0, 0.0, 1.0]])
 
 
-def still(
-    textured: Textured,
+def render(
+    textured: TexturedMesh,
     T_camera_map: Float,
     K: Float,
     size: tuple[int, int],
@@ -74,8 +74,8 @@ def still(
     return np.rint(small).astype(np.uint8)
 
 
-def painted_share(
-    textured: Textured, T_camera_map: Float, K: Float, size: tuple[int, int], threads: int = 1
+def textured_share(
+    textured: TexturedMesh, T_camera_map: Float, K: Float, size: tuple[int, int], threads: int = 1
 ) -> float:
     """Share of the pixels of such a picture that some page paints."""
     face = _nearest(textured, np.arange(len(textured)), T_camera_map, K, size, threads)
@@ -83,7 +83,7 @@ def painted_share(
 
 
 def covered_share(
-    textured: Textured,
+    textured: TexturedMesh,
     T_camera_map: Float,
     K: Float,
     size: tuple[int, int],
@@ -96,7 +96,7 @@ def covered_share(
     return float((_nearest(textured, kept, T_camera_map, K, size, threads) >= 0).mean())
 
 
-def _drawn(textured: Textured, T_camera_map: Float, from_behind: bool) -> NDArray[np.intp]:
+def _drawn(textured: TexturedMesh, T_camera_map: Float, from_behind: bool) -> NDArray[np.intp]:
     """Faces that are drawn: all, or those whose front the camera sees."""
     if from_behind:
         return np.arange(len(textured))
@@ -106,7 +106,7 @@ def _drawn(textured: Textured, T_camera_map: Float, from_behind: bool) -> NDArra
 
 
 def _nearest(
-    textured: Textured,
+    textured: TexturedMesh,
     kept: NDArray[np.intp],
     T_camera_map: Float,
     K: Float,
@@ -128,7 +128,7 @@ def _rays(K: Float, column: NDArray[np.intp], row: NDArray[np.intp]) -> Float:
 
 
 def _planes(
-    textured: Textured, T: Float, kept: NDArray[np.intp], seen: NDArray[np.int32]
+    textured: TexturedMesh, T: Float, kept: NDArray[np.intp], seen: NDArray[np.int32]
 ) -> tuple[Float, NDArray[np.intp]]:
     """(k, 3, 3) of the faces that are seen, and (n,) which of them each pixel sees.
 
@@ -150,7 +150,7 @@ def _planes(
 
 
 def _painted(
-    textured: Textured, faces: NDArray[np.intp], planes: Float, rays: Float
+    textured: TexturedMesh, faces: NDArray[np.intp], planes: Float, rays: Float
 ) -> NDArray[np.float32]:
     """(n, 3) colours where rays meet the faces that they see.
 
@@ -171,7 +171,7 @@ def _painted(
         if len(on):
             corners = textured.uv[textured.faces[faces[on]]]
             uv = np.matmul(weights[on, None, :], corners)[:, 0]
-            colours[on] = bilinear(texture, uv * texture.shape[1::-1] - 0.5)
+            colours[on] = sample_bilinear(texture, uv * texture.shape[1::-1] - 0.5)
     return colours
 
 
@@ -183,7 +183,7 @@ def _shaded(normals: Float, rays: Float) -> NDArray[np.float32]:
     return np.repeat(grey[:, None], 3, axis=1).astype(np.float32)
 
 
-def holding(points: Float, direction: Float, K: Float, size: tuple[int, int]) -> Float:
+def fit_camera(points: Float, direction: Float, K: Float, size: tuple[int, int]) -> Float:
     """(4, 4) T_camera_map of a camera that sees from a direction (3,), as near as all points (n, 3)
     are in its picture, in the middle of it.
 
@@ -197,17 +197,17 @@ def holding(points: Float, direction: Float, K: Float, size: tuple[int, int]) ->
         K: (3, 3) of the picture, see `pinhole`.
         size: width and height in pixels.
     """
-    T = looking_at(direction, np.zeros(3))
+    T = look_at(direction, np.zeros(3))
     own = points @ T[:3, :3].T
     slopes = 0.5 * np.array(size) / np.array([K[0, 0], K[1, 1]]) / _MARGIN
     right = (own[:, :2] - slopes * own[:, 2:]).max(axis=0)
     left = (-own[:, :2] - slopes * own[:, 2:]).max(axis=0)
     ahead = min(float((-(left + right) / (2.0 * slopes)).min()), own[:, 2].min() - 2.0 * _NEAR)
     eye = T[:3, :3].T @ np.array([*(0.5 * (right - left)), ahead])
-    return looking_at(eye, eye - direction)
+    return look_at(eye, eye - direction)
 
 
-def mostly(textured: Textured, direction: Float, share: float) -> Float:
+def main_corners(textured: TexturedMesh, direction: Float, share: float) -> Float:
     """(n, 3) corners of the faces in which most is that is seen from a direction (3,).
 
     As seen from there, a share of the area lies farther left than any of them, and as much farther
@@ -219,7 +219,7 @@ def mostly(textured: Textured, direction: Float, share: float) -> Float:
     if not area.any():
         return mesh.corners.reshape(-1, 3)
     kept = area > 0.0
-    for place in (mesh.centres @ looking_at(direction, np.zeros(3))[:3, :3].T).T:
+    for place in (mesh.centres @ look_at(direction, np.zeros(3))[:3, :3].T).T:
         order = np.argsort(place, kind="stable")
         below = (np.cumsum(area[order]) - 0.5 * area[order]) / area.sum()
         first, last = np.searchsorted(below, [share, 1.0 - share])
@@ -227,7 +227,7 @@ def mostly(textured: Textured, direction: Float, share: float) -> Float:
     return mesh.corners[kept if kept.any() else area > 0.0].reshape(-1, 3)
 
 
-def looking_at(eye: Float, target: Float) -> Float:
+def look_at(eye: Float, target: Float) -> Float:
     """(4, 4) T_camera_map of a camera at `eye` (3,) that looks at `target` (3,), z of the map
     upwards in its picture, or y where it looks straight down."""
     ahead = (target - eye) / np.linalg.norm(target - eye)

@@ -11,17 +11,17 @@ from html import escape
 import numpy as np
 from PIL import Image
 
-from stillmap.mesh.texture.atlas import Textured
+from stillmap.mesh.texture.atlas import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.results.report.renders import (
+from stillmap.results.report.renderer import (
     Float,
     Picture,
+    camera_matrix,
     covered_share,
-    holding,
-    mostly,
-    painted_share,
-    pinhole,
-    still,
+    fit_camera,
+    main_corners,
+    render,
+    textured_share,
 )
 from stillmap.results.report.tables import share_text
 
@@ -49,7 +49,7 @@ _QUALITY = 85  # of JPEG: photographs, which as PNG would be several megabytes
 
 
 @dataclass(frozen=True, eq=False)
-class PlaceStill:
+class PlacePreview:
     """The place from one point.
 
     Attributes:
@@ -65,7 +65,7 @@ class PlaceStill:
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectStills:
+class ObjectPreviews:
     """What moved.
 
     Attributes:
@@ -80,7 +80,7 @@ class ObjectStills:
 
 
 @dataclass(frozen=True, eq=False)
-class Stills:
+class ModelPreviews:
     """What the report shows of models.
 
     Attributes:
@@ -90,20 +90,20 @@ class Stills:
         why_bare: why no picture paints anything, where none can; else empty.
     """
 
-    place: list[PlaceStill]
-    objects: list[ObjectStills]
+    place: list[PlacePreview]
+    objects: list[ObjectPreviews]
     unpainted: float
     why_bare: str = ""
 
 
-def stills_of(
-    filtered: Textured,
-    sharpest: Textured | None,
+def render_previews(
+    filtered: TexturedMesh,
+    sharpest: TexturedMesh | None,
     T_camera_map: Float,
-    objects: Mapping[int, Textured],
+    objects: Mapping[int, TexturedMesh],
     threads: int = 1,
     left_out: Mapping[str, int] | None = None,
-) -> Stills:
+) -> ModelPreviews:
     """Two stills along the way, one from above, and up to three of each of the objects of which
     most is painted.
 
@@ -115,16 +115,16 @@ def stills_of(
         threads: the result does not depend on them.
         left_out: how many other pictures there are, by why they cannot be used.
     """
-    areas, place = Mesh(filtered.vertices, filtered.faces).areas(), list[PlaceStill]()
+    areas, place = Mesh(filtered.vertices, filtered.faces).areas(), list[PlacePreview]()
 
-    def taken(caption: str, T: Float, angle: float, from_behind: bool) -> PlaceStill:
-        K = pinhole(PLACE_SIZE, angle)
+    def taken(caption: str, T: Float, angle: float, from_behind: bool) -> PlacePreview:
+        K = camera_matrix(PLACE_SIZE, angle)
         pictures = [
-            still(one, T, K, PLACE_SIZE, from_behind=from_behind, threads=threads)
+            render(one, T, K, PLACE_SIZE, from_behind=from_behind, threads=threads)
             for one in (filtered, sharpest)
             if one is not None
         ]
-        return PlaceStill(caption, pictures[0], pictures[1] if sharpest is not None else None)
+        return PlacePreview(caption, pictures[0], pictures[1] if sharpest is not None else None)
 
     if len(filtered):
         along = _along(filtered, sharpest, T_camera_map, threads)
@@ -132,9 +132,9 @@ def stills_of(
         place.append(taken("from above", _from_above(filtered), _NARROW, False))
     worth = {n: _extent(one) for n, one in objects.items() if len(one)}
     shown = sorted(worth, key=lambda n: worth[n], reverse=True)[:MOST_OBJECTS]
-    return Stills(
+    return ModelPreviews(
         place,
-        [object_stills(n, objects[n], threads) for n in shown],
+        [render_object(n, objects[n], threads) for n in shown],
         float(areas[filtered.page < 0].sum() / max(float(areas.sum()), 1e-12)),
         _why_bare(len(T_camera_map), len(filtered.unread), left_out or {}),
     )
@@ -151,20 +151,20 @@ def _why_bare(usable: int, unread: int, left_out: Mapping[str, int]) -> str:
     return f"none of the {sum(reasons.values()):,} pictures can be used ({listed})"
 
 
-def _extent(textured: Textured) -> tuple[float, float]:
+def _extent(textured: TexturedMesh) -> tuple[float, float]:
     """Square metres of a model that are painted, and all of them."""
     areas = Mesh(textured.vertices, textured.faces).areas()
     return float(areas[textured.page >= 0].sum()), float(areas.sum())
 
 
-def object_stills(number: int, textured: Textured, threads: int = 1) -> ObjectStills:
+def render_object(number: int, textured: TexturedMesh, threads: int = 1) -> ObjectPreviews:
     """An object from up to three sides, x ahead and z up in its frame: those from which most of it
     is seen, and more of its fronts than of its backs, as only fronts are drawn."""
-    used, K = textured.vertices[np.unique(textured.faces)], pinhole(OBJECT_SIZE, _NARROW)
+    used, K = textured.vertices[np.unique(textured.faces)], camera_matrix(OBJECT_SIZE, _NARROW)
     places, fronts, mostly_front = dict[str, Float](), dict[str, float](), list[str]()
     for side, angle in _SIDES.items():
         towards = np.array([math.cos(angle), math.sin(angle), math.tan(_RAISED)])
-        places[side] = T = holding(used, towards, K, OBJECT_SIZE)
+        places[side] = T = fit_camera(used, towards, K, OBJECT_SIZE)
         fronts[side], whole = (
             covered_share(textured, T, K, OBJECT_SIZE, from_behind=backs, threads=threads)
             for backs in (False, True)
@@ -175,14 +175,14 @@ def object_stills(number: int, textured: Textured, threads: int = 1) -> ObjectSt
     shown = [side for side in best if side in mostly_front][:_MOST_SIDES] or best[:1]
     length, width, height = np.ptp(used, axis=0).tolist()
     sides = {
-        side: still(textured, places[side], K, OBJECT_SIZE, from_behind=False, threads=threads)
+        side: render(textured, places[side], K, OBJECT_SIZE, from_behind=False, threads=threads)
         for side in _SIDES
         if side in shown
     }
-    return ObjectStills(number, (length, width, height), sides)
+    return ObjectPreviews(number, (length, width, height), sides)
 
 
-def model_section(stills: Stills | None) -> str:
+def model_section(stills: ModelPreviews | None) -> str:
     """Everything about models; empty where there are none."""
     if stills is None or not (stills.place or stills.objects):
         return ""
@@ -208,7 +208,7 @@ def jpeg_uri(picture: Picture) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _sentence(stills: Stills) -> str:
+def _sentence(stills: ModelPreviews) -> str:
     if stills.why_bare:
         return f"The surface that stands still. It is grey: {stills.why_bare}."
     grey = (
@@ -223,7 +223,7 @@ def _sentence(stills: Stills) -> str:
     return f"The surface that stands still, painted by pictures without what moves. {grey}"
 
 
-def _pair(one: PlaceStill, title: str) -> str:
+def _pair(one: PlacePreview, title: str) -> str:
     shown = [("Sharpest", one.sharpest), (title, one.filtered)]
     figures = "".join(
         _figure(title, one.caption, picture) for title, picture in shown if picture is not None
@@ -231,7 +231,7 @@ def _pair(one: PlaceStill, title: str) -> str:
     return f'<div class="pair">{figures}</div>'
 
 
-def _sides(one: ObjectStills) -> str:
+def _sides(one: ObjectPreviews) -> str:
     size = " x ".join(f"{metres:.2f}" for metres in one.size) + " m"
     figures = "".join(
         _figure(f"Object {one.number}", f"{size}, {side}", picture)
@@ -250,20 +250,20 @@ def _figure(title: str, caption: str, picture: Picture) -> str:
 
 
 def _along(
-    filtered: Textured, sharpest: Textured | None, T_camera_map: Float, threads: int
+    filtered: TexturedMesh, sharpest: TexturedMesh | None, T_camera_map: Float, threads: int
 ) -> list[Float]:
     """Two of the places, apart, from which most of the picture is painted, and most of all where
     somebody was taken out."""
     N = len(T_camera_map)
     tried = np.unique(np.linspace(0, N - 1, min(N, _TRIED)).astype(np.intp)).tolist()
     size = (PLACE_SIZE[0] // _SMALL, PLACE_SIZE[1] // _SMALL)
-    K = pinhole(size, _WIDE)
+    K = camera_matrix(size, _WIDE)
     worth = dict[int, float]()
     for n in tried:
         T = T_camera_map[n]
-        worth[n] = _LITTLE * painted_share(filtered, T, K, size, threads)
+        worth[n] = _LITTLE * textured_share(filtered, T, K, size, threads)
         if sharpest is not None:
-            a, b = (still(one, T, K, size, threads=threads) for one in (filtered, sharpest))
+            a, b = (render(one, T, K, size, threads=threads) for one in (filtered, sharpest))
             apart = np.abs(a.astype(np.int64) - b).sum(axis=2)
             worth[n] += float((apart > _DIFFERS).mean())
     chosen: list[int] = []
@@ -273,6 +273,6 @@ def _along(
     return [T_camera_map[n] for n in sorted(chosen)]
 
 
-def _from_above(textured: Textured) -> Float:
-    points = mostly(textured, _ABOVE, _OUTER)
-    return holding(points, _ABOVE, pinhole(PLACE_SIZE, _NARROW), PLACE_SIZE)
+def _from_above(textured: TexturedMesh) -> Float:
+    points = main_corners(textured, _ABOVE, _OUTER)
+    return fit_camera(points, _ABOVE, camera_matrix(PLACE_SIZE, _NARROW), PLACE_SIZE)
