@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.camera import Images
 from stillmap.core.errors import import_extra
-from stillmap.core.profiling import StageTimer
+from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.mesh.background import Background
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.merging import ObjectTrack, collect_tracks, merge_tracks
@@ -30,7 +30,6 @@ from stillmap.mesh.texture.views import (
     read_color_image,
 )
 from stillmap.mesh.tsdf import build_surface
-from stillmap.pipeline.em_loop import Progress, silent
 
 Float = NDArray[np.float64]
 Read = Callable[[int], NDArray[Any]]
@@ -103,7 +102,7 @@ def build_models(
     sources: MeshInputs,
     options: MeshOptions,
     threads: int = 1,
-    progress: Progress = silent,
+    progress: Progress = no_progress,
     stages: StageTimer | None = None,
 ) -> Models:
     """A surface from what stands still, and for each face the picture that most likely shows it.

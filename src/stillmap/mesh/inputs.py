@@ -1,59 +1,58 @@
-"""What models are made of: beams in space, what moves among them, and pictures."""
+"""Inputs of the mesh room: a posed and labelled 3D recording, its moving objects, the ground."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.parallel import resolve_threads
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import max_scan_duration_ns
-from stillmap.em import GroundMap, estimate_ground
+from stillmap.em import GroundMap
 from stillmap.mesh.options import SurfaceOptions
 from stillmap.mesh.range_image import find_scan_layout
 from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.mesh.texture.occlusion import LidarReturns
-from stillmap.pipeline.options import Options
-from stillmap.pipeline.result import Result
-from stillmap.rig.build import TiltingResult
 from stillmap.tracking import MovingObject
-from stillmap.tracking.boxes import Box, fit_box, fit_boxes
+from stillmap.tracking.boxes import Box, fit_box
 
 Float = NDArray[np.float64]
+
+_HOLD = 0.5  # s for which an object persists before its first and after its last detection
 
 
 @dataclass(frozen=True, eq=False)
 class MeshInputs:
-    """A recording in 3D, T scans with M beams, of which everything is known.
+    """A 3D recording of T scans and M beams with poses, labels and moving objects.
 
     Attributes:
-        recording: as it was read; its times and pictures count.
-        seen: without the motion during its scans.
+        recording: as it was read, with its times and images.
+        seen: the same, deskewed.
         poses: (T, 4, 4) T_map_base.
         p_static: (M,) P(c = 1).
-        objects: what moved, with the beams that ended on it.
-        things: the same as boxes, and what moved too shortly to be followed.
-        start_ns: when the time of these boxes begins.
-        ground: how high it is.
+        objects: moving objects with their beams.
+        things: boxes along their tracks, and boxes of detections too short for a track.
+        start_ns: stamp at which the seconds of these boxes begin.
+        ground: ground height.
     """
 
     recording: Recording
     seen: Recording
     poses: Float
     p_static: NDArray[np.float32]
-    objects: list[MovingObject]
-    things: list[TrackedBox]
+    objects: Sequence[MovingObject]
+    things: Sequence[TrackedBox]
     start_ns: int
     ground: GroundMap
 
     @cached_property
     def longest_scan_ns(self) -> int:
-        """Nanoseconds that a scan takes at most, about."""
+        """Approximate maximum duration of a scan in nanoseconds."""
         return max_scan_duration_ns(self.recording)
 
     def beams(self) -> LidarReturns:
-        """To be asked for by time."""
+        """The returns, indexed by time."""
         owned = {one.id: one.beams for one in self.objects}
         boxes = [one.box for one in self.things if one.box.object_id in owned]
         return LidarReturns(
@@ -68,56 +67,41 @@ class MeshInputs:
         )
 
 
-def sources_of(result: Result) -> MeshInputs:
-    """Of a recording in 3D."""
-    options, seen = result.options, result.seen
-    start = int(seen.stamp_ns[0])
-    hold = options.mesh.choice.hold
-    things = []
-    for one in result.objects:
+def box_objects(objects: Sequence[MovingObject], start_ns: int) -> list[TrackedBox]:
+    """Boxes along the tracks of objects of a 3D recording.
+
+    Raises:
+        ValueError: an object has no height.
+    """
+    boxes = []
+    for one in objects:
         if one.z is None:
             raise ValueError("objects: expected those of a recording in 3D")
-        tall = float(one.size[2])
-        things.append(TrackedBox(fit_box(one, start, hold), one.z - 0.5 * tall, tall))
-    threads = resolve_threads(options.threads)
-    ground = estimate_ground(seen, result.poses, result.p_static, threads)
-    return MeshInputs(
-        result.recording,
-        seen,
-        result.poses,
-        result.p_static,
-        list(result.objects),
-        things,
-        start,
-        ground,
-    )
+        height = float(one.size[2])
+        boxes.append(TrackedBox(fit_box(one, start_ns, _HOLD), one.z - 0.5 * height, height))
+    return boxes
 
 
-def sources_of_rig(result: Result, tilting: TiltingResult) -> MeshInputs:
-    """Of a laser that builds in 3D while another one, that lies flat, tells what moves."""
-    options, flat = result.options, result.seen
-    start = int(flat.stamp_ns[0])
-    threads = resolve_threads(options.threads)
-    ground = estimate_ground(tilting.deskewed, tilting.poses, tilting.p_static, threads)
-    boxes = fit_boxes(
-        flat, result.poses, result.p_static, result.objects, options.objects, options.rig.hold
-    )
-    tall = {one.id: float(one.size[2]) for one in tilting.objects}
-    things = [_upright(box, tall.get(box.object_id, 0.0), ground, options) for box in boxes]
-    return MeshInputs(
-        tilting.recording,
-        tilting.deskewed,
-        tilting.poses,
-        tilting.p_static,
-        tilting.objects,
-        things,
-        start,
-        ground,
-    )
+def extrude_boxes(
+    boxes: Sequence[Box],
+    objects: Sequence[MovingObject],
+    ground: GroundMap,
+    min_height: float,
+    long: float,
+) -> list[TrackedBox]:
+    """Planar boxes of a flat laser with the heights that a second laser measured.
 
-
-def _upright(box: Box, tall: float, ground: GroundMap, options: Options) -> TrackedBox:
-    """As high as it was seen to be, and as things of its kind are at least."""
-    o = options.rig
-    usual = o.height if 2.0 * max(box.half_size) < o.long else 0.0
-    return TrackedBox(box, ground.at(box.xy), max(tall, usual))
+    Args:
+        boxes: planar boxes.
+        objects: moving objects with heights, of the second laser.
+        ground: ground height below the boxes.
+        min_height: metres, minimum height of a box shorter than `long`.
+        long: metres.
+    """
+    heights = {one.id: float(one.size[2]) for one in objects}
+    out = []
+    for box in boxes:
+        usual = min_height if 2.0 * max(box.half_size) < long else 0.0
+        height = max(heights.get(box.object_id, 0.0), usual)
+        out.append(TrackedBox(box, ground.at(box.xy), height))
+    return out

@@ -231,7 +231,7 @@ def color_points(
         tell: called with what is done, and how much of it.
     """
     recording = sources.recording
-    out: Colours = recording.per_beam(np.uint8, (3,))
+    out: Colours = recording.allocate_per_beam(np.uint8, (3,))
     scans, n = recording.n_scans, recording.n_scans + len(place.views)
     painted = TextureSampler(textured, options.points.off)
     T_map_sensor = sources.seen.T_map_sensor(sources.poses)
@@ -240,13 +240,13 @@ def color_points(
         _tint_static(out, chunk, sources, T_map_sensor, painted, threads)
         if tell is not None:
             tell(chunk.scans.stop, n)
-    late = recording.per_beam(np.float32)
+    late = recording.allocate_per_beam(np.float32)
     for block in arrays.iter_blocks(late):
         late[block] = np.inf
     moving = TrackedReturns(sources, moves)
     for number in range(len(place.views)):
         color_moving(out, late, moving, number, place, options)
-        sources.seen.let_go(sources.p_static, out, late)
+        sources.seen.release_pages(sources.p_static, out, late)
         if tell is not None:
             tell(scans + number + 1, n)
     return PointColors(out, _counts(out, sources))

@@ -1,38 +1,72 @@
-"""Models of a result, as `stillmap map` makes them."""
+"""Builds the models of a result: the static surface and the moving objects."""
 
 from stillmap.core.parallel import limit_blas_threads, resolve_threads
-from stillmap.core.profiling import StageTimer
+from stillmap.core.profiling import Progress, StageTimer, no_progress
+from stillmap.em import estimate_ground
 from stillmap.mesh import build
 from stillmap.mesh.build import Models
-from stillmap.mesh.inputs import sources_of, sources_of_rig
-from stillmap.pipeline.em_loop import Progress, silent
+from stillmap.mesh.inputs import MeshInputs, box_objects, extrude_boxes
 from stillmap.pipeline.result import Result
 from stillmap.rig.build import TiltingResult
+from stillmap.tracking.boxes import fit_boxes
 
 
 @limit_blas_threads()
-def models_of(
+def build_models(
     result: Result,
     *,
     tilting: TiltingResult | None = None,
-    progress: Progress = silent,
+    progress: Progress = no_progress,
     stages: StageTimer | None = None,
 ) -> Models:
-    """The surface of the place, painted, and models of what moved; `result.save` writes them.
+    """Builds the textured surface and the object models; `result.save(models=...)` writes them.
 
     Args:
-        result: of a recording in 3D; its options `mesh` say how.
-        tilting: what a second laser built in 3D; then the result is of one that lies flat.
-        progress: called with what is done, 0, and how much of it.
-        stages: where time and memory per stage are noted.
+        result: of a 3D recording, or of the flat laser of a rig; `result.options.mesh` applies.
+        tilting: 3D data of the rig's second laser.
+        progress: called with the stage, 0, the work done and the total.
+        stages: records time and memory per stage.
 
     Raises:
-        ValueError: nothing is in 3D.
+        ValueError: the result is 2D and there is no `tilting`.
         MissingExtra: a library of the extra `mesh` is not installed.
     """
     if tilting is None and result.recording.dimension == 2:
         raise ValueError("result: expected one in 3D")
     build.require_extras()
-    sources = sources_of(result) if tilting is None else sources_of_rig(result, tilting)
-    options, threads = result.options.mesh, resolve_threads(result.options.threads)
-    return build.build_models(sources, options, threads, progress, stages)
+    threads = resolve_threads(result.options.threads)
+    inputs = (
+        _recording_inputs(result, threads)
+        if tilting is None
+        else _rig_inputs(result, tilting, threads)
+    )
+    return build.build_models(inputs, result.options.mesh, threads, progress, stages)
+
+
+def _recording_inputs(result: Result, threads: int) -> MeshInputs:
+    seen = result.seen
+    start = int(seen.stamp_ns[0])
+    boxes = box_objects(result.objects, start)
+    ground = estimate_ground(seen, result.poses, result.p_static, threads)
+    return MeshInputs(
+        result.recording, seen, result.poses, result.p_static, result.objects, boxes, start, ground
+    )
+
+
+def _rig_inputs(result: Result, tilting: TiltingResult, threads: int) -> MeshInputs:
+    """The flat laser gives the tracks, the tilting laser the 3D data."""
+    flat, o = result.seen, result.options.rig
+    ground = estimate_ground(tilting.deskewed, tilting.poses, tilting.p_static, threads)
+    boxes = fit_boxes(
+        flat, result.poses, result.p_static, result.objects, result.options.objects, o.hold
+    )
+    return MeshInputs(
+        tilting.recording,
+        tilting.deskewed,
+        tilting.poses,
+        tilting.p_static,
+        tilting.objects,
+        extrude_boxes(boxes, tilting.objects, ground, o.height, o.long),
+        int(flat.stamp_ns[0]),
+        ground,
+    )

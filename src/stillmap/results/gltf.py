@@ -78,7 +78,7 @@ def write_glb(path: Path, mesh: TexturedMesh | Mesh, options: TextureOptions | N
         made = trimesh.Trimesh(
             _y_up(part.vertices - shift),
             part.faces,
-            visual=visual(uv=from_bottom(part.uv) if part.page >= 0 else None, material=material),
+            visual=visual(uv=flip_v(part.uv) if part.page >= 0 else None, material=material),
             process=False,
         )
         scene.add_geometry(made, node_name=name, geom_name=name, transform=move)
@@ -106,7 +106,9 @@ def write_glb(path: Path, mesh: TexturedMesh | Mesh, options: TextureOptions | N
         work.write_bytes(data)
 
 
-def write_obj(folder: Path, mesh: TexturedMesh | Mesh, options: TextureOptions | None = None) -> None:
+def write_obj(
+    folder: Path, mesh: TexturedMesh | Mesh, options: TextureOptions | None = None
+) -> None:
     """Writes `mesh.obj`, `mesh.mtl` and `page0.jpg`, ... into a new folder; see `write_glb`.
 
     Raises:
@@ -114,13 +116,13 @@ def write_obj(folder: Path, mesh: TexturedMesh | Mesh, options: TextureOptions |
         MissingExtra: trimesh is not installed.
     """
     _trimesh(folder)  # it is the folder that cannot be written without
-    files = obj_files(mesh, options or TextureOptions())
+    files = encode_obj(mesh, options or TextureOptions())
     with atomic_folder(folder, "mesh.obj") as work:
         for name, data in files.items():
             (work / name).write_bytes(data)
 
 
-def obj_files(
+def encode_obj(
     mesh: TexturedMesh | Mesh, options: TextureOptions, name: str = "mesh", before: str = ""
 ) -> dict[str, bytes]:
     """`NAME.obj`, `NAME.mtl` and the pages, by their names.
@@ -147,7 +149,7 @@ def obj_files(
             specular=[0, 0, 0, 255],
         )
         material.name = title
-        uv = from_bottom(part.uv) if part.page >= 0 else None
+        uv = flip_v(part.uv) if part.page >= 0 else None
         visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
         made = trimesh.Trimesh(_y_up(part.vertices), part.faces, visual=visual, process=False)
         scene.add_geometry(made, node_name=title, geom_name=title)
@@ -191,12 +193,12 @@ def _y_up(points: Float) -> Float:
     return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
 
 
-def z_up(points: Float) -> Float:
+def to_z_up(points: Float) -> Float:
     """(..., 3) y up as z up."""
     return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
 
 
-def from_bottom(uv: Float) -> Float:
+def flip_v(uv: Float) -> Float:
     """As trimesh and OBJ count rows."""
     return np.column_stack([uv[:, 0], 1.0 - uv[:, 1]])
 
@@ -273,7 +275,7 @@ _MOST_JSON = 64 << 20
 _PACKED = "KHR_draco_mesh_compression"
 
 
-def require_whole(path: Path, most: int) -> bytes:
+def read_glb(path: Path, most: int) -> bytes:
     """A .glb file of at most so many bytes that needs nothing from anywhere else.
 
     Raises:

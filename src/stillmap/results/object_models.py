@@ -9,17 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npz
+from stillmap.mesh.build import Models
 from stillmap.mesh.options import TextureOptions
-from stillmap.mesh.texture.atlas import Textured
+from stillmap.mesh.place import ViewAssignment
+from stillmap.mesh.texture.atlas import TexturedMesh
+from stillmap.mesh.texture.views import View
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.results.gltf import write_glb
-from stillmap.results.model_protocols import ModelsLike, PaintedLike, ViewLike
 
 _MICROMETRES = 6  # digits
 _SQUARE_CENTIMETRES = 4
 
 
-def write_models(folder: Path, models: ModelsLike, n_images: int, options: TextureOptions) -> None:
+def write_models(folder: Path, models: Models, n_images: int, options: TextureOptions) -> None:
     """Write models into a new result folder, and beside each what painted its faces.
 
     Args:
@@ -50,15 +52,15 @@ def write_models(folder: Path, models: ModelsLike, n_images: int, options: Textu
         (objects / f"{name}.json").write_text(text + "\n", encoding="utf-8")
 
 
-def _seen(model: Textured) -> Textured | Mesh:
+def _seen(model: TexturedMesh) -> TexturedMesh | Mesh:
     """What no picture shows is lit: its form is seen."""
     return model if model.pages else Mesh(model.vertices, model.faces)
 
 
 def write_faces(
     path: Path,
-    painted: PaintedLike,
-    views: Sequence[ViewLike],
+    painted: ViewAssignment,
+    views: Sequence[View],
     n_images: int,
     frame: str,
 ) -> None:
@@ -83,7 +85,7 @@ def write_faces(
     )
 
 
-def models_record(models: ModelsLike) -> dict[str, Any]:
+def models_record(models: Models) -> dict[str, Any]:
     """What `run.json` says of them."""
     painted = models.painted
     areas = painted.mesh.areas()

@@ -17,11 +17,11 @@ from stillmap.core.parallel import resolve_threads
 from stillmap.io.trajectory import write_tum
 from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import count_beams
+from stillmap.mesh.build import Models
 from stillmap.pipeline.estimate import IterationRecord
 from stillmap.pipeline.result import Result
 from stillmap.results.map_npz import known_area, write_map_npz
 from stillmap.results.map_server import write_map_server
-from stillmap.results.model_protocols import ModelsLike
 from stillmap.results.object_models import models_record, write_models
 from stillmap.results.objects import write_objects, write_traffic
 from stillmap.results.points import write_beams, write_clouds
@@ -128,7 +128,7 @@ def save(
     *,
     within: Path | None = None,
     tilting: Tilting | None = None,
-    models: ModelsLike | None = None,
+    models: Models | None = None,
 ) -> None:
     """Write `result` as the folder `path`: map, trajectory, pose graph, labels, objects, report.
 
@@ -171,7 +171,7 @@ def save(
         write_run_json(folder / RECORD, result, more)
 
 
-def _stills(models: ModelsLike, threads: int) -> ModelPreviews:
+def _stills(models: Models, threads: int) -> ModelPreviews:
     """What the report shows of models."""
     return render_previews(
         models.textured,

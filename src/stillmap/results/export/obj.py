@@ -12,7 +12,7 @@ from stillmap.core.files import atomic_file, require_new_file
 from stillmap.mesh.options import TextureOptions
 from stillmap.mesh.texture.atlas import Picture, TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.results.gltf import from_bottom, obj_files, require_whole, z_up
+from stillmap.results.gltf import encode_obj, flip_v, read_glb, to_z_up
 from stillmap.results.reader import require_model
 
 ENDING = ".obj"
@@ -29,7 +29,7 @@ def read_model(path: Path) -> TexturedMesh | Mesh:
         MissingExtra: trimesh is not installed.
     """
     trimesh = import_extra("trimesh", path, group="mesh")
-    data = require_whole(path, _MOST)
+    data = read_glb(path, _MOST)
     try:
         scene = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
         return _model(scene)
@@ -45,11 +45,11 @@ def _model(scene: Any) -> TexturedMesh | Mesh:
     for node in scene.graph.nodes_geometry:
         T, name = scene.graph[node]
         part = scene.geometry[name]
-        vertices.append(z_up(np.asarray(part.vertices, np.float64) @ T[:3, :3].T + T[:3, 3]))
+        vertices.append(to_z_up(np.asarray(part.vertices, np.float64) @ T[:3, :3].T + T[:3, 3]))
         faces.append(np.asarray(part.faces, np.int32) + count)
         count += len(part.vertices)
         painted = name.startswith(_PAGE)
-        uv.append(from_bottom(part.visual.uv) if painted else np.zeros((len(part.vertices), 2)))
+        uv.append(flip_v(part.visual.uv) if painted else np.zeros((len(part.vertices), 2)))
         page.append(np.full(len(part.faces), len(pages) if painted else -1, np.int32))
         if painted:
             pages.append(np.asarray(part.visual.material.baseColorTexture.convert("RGB")))
@@ -59,7 +59,9 @@ def _model(scene: Any) -> TexturedMesh | Mesh:
     if not pages:
         return Mesh(points, corners)
     none = np.full(len(corners), -1, np.int32), np.full(count, -1, np.int32)
-    return TexturedMesh(points, corners, np.concatenate(uv), np.concatenate(page), tuple(pages), *none)
+    return TexturedMesh(
+        points, corners, np.concatenate(uv), np.concatenate(page), tuple(pages), *none
+    )
 
 
 def write_obj(folder: Path, output: Path, quality: int, overwrite: bool = False) -> tuple[int, int]:
@@ -82,7 +84,7 @@ def write_obj(folder: Path, output: Path, quality: int, overwrite: bool = False)
     """
     require_new_file(output, overwrite)
     model = read_model(require_model(folder))
-    files = obj_files(model, TextureOptions(quality=quality), output.stem, f"{output.stem}_")
+    files = encode_obj(model, TextureOptions(quality=quality), output.stem, f"{output.stem}_")
     named = {output.with_name(name): data for name, data in files.items()}
     for one in named:
         require_new_file(one, overwrite)
