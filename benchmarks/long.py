@@ -75,8 +75,8 @@ def simulated(world: str, scans: int, seed: int, work: Path) -> Recording:
     return Recording(
         stamp_ns=10**18 + np.round(motion.seconds * 1e9).astype(np.int64),
         offset=np.arange(scans + 1, dtype=np.int64) * o.beams,
-        points=points.finished(),
-        hit=hit.finished(),
+        points=points.finish(),
+        hit=hit.finish(),
         T_base_sensor=se2.matrix(o.x, o.y, o.yaw)[None],
         sensor=np.zeros(scans, np.int32),
         T_odom_base=T_odom_base,

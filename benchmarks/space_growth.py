@@ -107,7 +107,7 @@ def write_beginning(whole: Path, sweeps: int, first: Path) -> dict[str, float]:
 def size_of(recording: stillmap.Recording, poses: Float) -> dict[str, float]:
     """Metres driven, squares of a metre in which beams ended, and beams per sweep."""
     seen = np.zeros(0, np.int64)
-    for t in recording.in_turn(range(recording.n_scans)):
+    for t in recording.iter_scans(range(recording.n_scans)):
         beams = recording.beams_of(t)
         points = recording.points[beams][recording.hit[beams]].astype(float)
         T = (poses[t] @ recording.T_base_sensor[recording.sensor[t]])[:2]

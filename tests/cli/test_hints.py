@@ -110,7 +110,7 @@ def test_nearest():
     assert closest_match("resoluton", ["paper", "resolution"]) == "resolution"
     assert closest_match("PAPER", ["paper"]) == "paper"
     assert closest_match("xyz", ["paper"]) is None
-    assert closest_match("xyz", ["paper"], least=0.0) == "paper"
+    assert closest_match("xyz", ["paper"], min_similarity=0.0) == "paper"
     assert closest_match("x", []) is None
 
 

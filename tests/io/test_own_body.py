@@ -33,7 +33,7 @@ def test_its_readings_are_unusable(readings):
     assert not hit[:, :5][own].any()
     assert hit[5:10, 3].all()  # somebody beside the robot
     assert hit[:10, 30].all()  # near, where the robot is not
-    kept, _ = max_range.infer_range_rule(readings, None, ReadOptions(own_body=False))
+    kept, _ = max_range.infer_range_rule(readings, None, ReadOptions(self_filter=False))
     assert max_range.apply_range_rule(readings, kept)[1][:, :5][own].all()
 
 

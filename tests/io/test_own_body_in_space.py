@@ -138,7 +138,7 @@ def test_every_reader_leaves_it_out(tmp_path, drive, form):
     path = tmp_path / ("a.mcap" if form == "mcap" else "a")
     writers.write(drive.recording, path, name=form)
     own = np.count_nonzero((drive.truth.mover == -2) & drive.recording.hit)
-    everything = read(path, ReadOptions(own_body=False))
+    everything = read(path, ReadOptions(self_filter=False))
     assert np.count_nonzero(everything.hit) == np.count_nonzero(drive.recording.hit)
     assert np.count_nonzero(read(path).hit) == np.count_nonzero(drive.recording.hit) - own
 

@@ -128,10 +128,10 @@ def test_how_far_lasers_see():
     assert third == (0.0, None)
     # a hit is never at the limit: readers take what reaches it for maximum range
     for reach, hit in ((first, 3.0), (second, 9.0)):
-        assert np.float32(reach.limit()) > np.float32(hit)
+        assert np.float32(reach.max_range()) > np.float32(hit)
     clipped = laser_scan.RangeLimits(5.0, 5.0)
-    assert np.float32(clipped.limit()) > np.float32(5.0)
-    assert clipped.limit() < 5.00001
+    assert np.float32(clipped.max_range()) > np.float32(5.0)
+    assert clipped.max_range() < 5.00001
 
 
 def test_even_times_are_a_step_from_beam_to_beam():

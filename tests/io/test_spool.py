@@ -29,7 +29,7 @@ def test_a_column_is_what_was_added(limit, tmp_path, rng):
         parts.append(rng.normal(size=(n, 3)).astype(np.float32))
         column.append(parts[-1])
         parts[-1] = parts[-1].copy()
-    got = column.finished()
+    got = column.finish()
     np.testing.assert_array_equal(got, np.concatenate(parts))
     assert got.dtype == np.float32
     assert got.flags.writeable == (limit > 0)
@@ -39,7 +39,7 @@ def test_a_column_is_what_was_added(limit, tmp_path, rng):
 
 
 def test_an_empty_column(limit, tmp_path):  # noqa: ARG001
-    assert arrays.ArrayBuilder(np.int32, (), tmp_path).finished().shape == (0,)
+    assert arrays.ArrayBuilder(np.int32, (), tmp_path).finish().shape == (0,)
 
 
 def test_wrong_rows_are_refused():
@@ -166,7 +166,7 @@ def test_some_rows_are_those_of_the_array(limit, monkeypatch, tmp_path, rng):
     monkeypatch.setattr(arrays, "BLOCK", 100)
     column = arrays.ArrayBuilder(np.float32, (2,), tmp_path)
     column.append(rng.normal(size=(1000, 2)))
-    array = column.finished()
+    array = column.finish()
     assert array.flags.writeable == (limit > 0)
     for numbers in (np.zeros(0, np.intp), np.array([0, 99, 100, 999]), np.arange(1000)):
         np.testing.assert_array_equal(arrays.take_rows(array, numbers), array[numbers])

@@ -86,7 +86,7 @@ def _hit_ranges(recording: Recording) -> NDArray[np.float32]:
 def _scans(recording: Recording, step: int) -> Iterator[slice]:
     """Every so many scans; of the scans every so many beams where they are few and large."""
     every = step if recording.n_scans >= _FEW * step else 1
-    for scan in recording.in_turn(range(0, recording.n_scans, every)):
+    for scan in recording.iter_scans(range(0, recording.n_scans, every)):
         beams = recording.beams_of(scan)
         yield slice(beams.start, beams.stop, step // every)
 
@@ -261,7 +261,7 @@ def _field_of_view(
         lowest, highest = sorted([first, last])  # a laser upside down turns clockwise
         return [float(np.degrees(lowest)), float(np.degrees(highest))]
     lowest, highest = np.inf, -np.inf
-    for scan in recording.in_turn(scans.tolist()):
+    for scan in recording.iter_scans(scans.tolist()):
         points = recording.points[recording.beams_of(scan)]
         angle = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
         angle = angle[np.isfinite(angle)]

@@ -103,7 +103,7 @@ class ArrayBuilder:
             self._file.write(part.reshape(-1).view(np.uint8).data)
         self._parts, self._bytes = [], 0
 
-    def finished(self) -> NDArray[Any]:
+    def finish(self) -> NDArray[Any]:
         """The whole array (N, *row), read-only where it lies in a file. Nothing can be added."""
         shape = (self._length, *self._row)
         if self._file is None:
@@ -172,7 +172,7 @@ def take_rows(array: NDArray[Any], numbers: NDArray[np.intp]) -> NDArray[Any]:
 
 
 def release_periodically(
-    items: Iterable[_Item], let_go: Callable[[], None], rows: float = 0.0
+    items: Iterable[_Item], release: Callable[[], None], rows: float = 0.0
 ) -> Iterator[_Item]:
     """The same items; on the way what was looked at for them is let go now and then.
 
@@ -181,9 +181,9 @@ def release_periodically(
     together = max(min(ITEMS_PER_RELEASE, int(BLOCK / max(rows, 1.0))), 1)
     for n, item in enumerate(items):
         if n % together == 0:
-            let_go()
+            release()
         yield item
-    let_go()
+    release()
 
 
 def copy(array: NDArray[Any], folder: Path | None = None) -> NDArray[Any]:

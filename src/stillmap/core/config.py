@@ -121,7 +121,7 @@ def _replaced(options: T, changes: Mapping[str, Any], where: str, prefix: str, t
     for key, value in changes.items():
         if key not in fields:
             name = f"{prefix}{key}"
-            near = closest_match(name, names(top), least=0.0)
+            near = closest_match(name, names(top), min_similarity=0.0)
             raise InputError(f"unknown option '{name}'", where=where, hint=f"nearest: '{near}'")
         current = getattr(options, key)
         if dataclasses.is_dataclass(current):
@@ -301,7 +301,7 @@ def to_toml(options: Any, only: str = "") -> str:
     if only and only not in (known := list(names(options))):
         raise InputError(
             f"there is no option or section '{only}'",
-            hint=f"nearest: '{closest_match(only, known, least=0.0)}'",
+            hint=f"nearest: '{closest_match(only, known, min_similarity=0.0)}'",
         )
     return "\n".join(_toml_lines(options, only)).lstrip("\n") + "\n"
 

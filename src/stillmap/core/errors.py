@@ -42,7 +42,7 @@ def _short(text: str) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
-def closest_match(word: str, known: Iterable[str], least: float = 0.6) -> str | None:
+def closest_match(word: str, known: Iterable[str], min_similarity: float = 0.6) -> str | None:
     """The known word most like `word`, for hints; None where none is like it.
 
     Args:
@@ -53,7 +53,7 @@ def closest_match(word: str, known: Iterable[str], least: float = 0.6) -> str | 
     from difflib import get_close_matches  # only where something went wrong
 
     originals = {one.lower(): one for one in known}
-    found = get_close_matches(word.lower(), originals, n=1, cutoff=least)
+    found = get_close_matches(word.lower(), originals, n=1, cutoff=min_similarity)
     return originals[found[0]] if found else None
 
 
@@ -61,7 +61,7 @@ class MissingExtra(InputError):
     """A library is not there: no file at fault, and none that could be skipped for it."""
 
 
-def import_extra(module: str, path: object, to_be: str = "read", *, group: str = "io") -> Any:
+def import_extra(module: str, path: object, action: str = "read", *, group: str = "io") -> Any:
     """A module that comes with one of stillmap's extras.
 
     Args:
@@ -78,4 +78,4 @@ def import_extra(module: str, path: object, to_be: str = "read", *, group: str =
     except ImportError as error:
         package = module.partition(".")[0]
         hint = f"pip install 'stillmap[{group}]'"
-        raise MissingExtra(f"needs {package} to be {to_be}", where=str(path), hint=hint) from error
+        raise MissingExtra(f"needs {package} to be {action}", where=str(path), hint=hint) from error

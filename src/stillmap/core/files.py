@@ -13,7 +13,7 @@ from pathlib import Path
 from stillmap.core.errors import InputError
 
 
-def require_new(path: Path, mark: str, overwrite: bool = False) -> None:
+def require_new(path: Path, marker: str, overwrite: bool = False) -> None:
     """Refuse an output folder that already holds something, before any work is done.
 
     Args:
@@ -34,8 +34,8 @@ def require_new(path: Path, mark: str, overwrite: bool = False) -> None:
         raise InputError(
             "already holds something", where=str(path), hint="choose another or give --overwrite"
         )
-    if not any(path.glob(mark)):
-        what = f"holds other things: only a folder with {mark} is replaced"
+    if not any(path.glob(marker)):
+        what = f"holds other things: only a folder with {marker} is replaced"
         raise InputError(what, where=str(path), hint="choose another")
 
 
@@ -59,7 +59,7 @@ def require_new_file(path: Path, overwrite: bool = False) -> None:
 
 @contextmanager
 def atomic_folder(
-    path: Path, mark: str, overwrite: bool = False, *, within: Path | None = None
+    path: Path, marker: str, overwrite: bool = False, *, staging_folder: Path | None = None
 ) -> Iterator[Path]:
     """A temporary sibling folder that becomes `path` when the block ends without an exception.
 
@@ -72,18 +72,20 @@ def atomic_folder(
         InputError: `path` is taken or its parent cannot be written to.
     """
     path = Path(os.path.abspath(path))
-    require_new(path, mark, overwrite)
+    require_new(path, marker, overwrite)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         work = Path(
-            tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=within or path.parent)
+            tempfile.mkdtemp(
+                prefix=f".{path.name}.", suffix=".part", dir=staging_folder or path.parent
+            )
         )
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
     try:
         yield work
         work.chmod(0o777 & ~_umask())
-        require_new(path, mark, overwrite)  # it may have appeared meanwhile
+        require_new(path, marker, overwrite)  # it may have appeared meanwhile
         _move_into_place(work, path)
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
@@ -129,7 +131,7 @@ def _umask() -> int:
     return mask
 
 
-def read_text(path: Path, largest: int) -> str:
+def read_text(path: Path, max_bytes: int) -> str:
     """The text of a file in UTF-8, of `largest` bytes at most.
 
     Raises:
@@ -138,11 +140,11 @@ def read_text(path: Path, largest: int) -> str:
     """
     try:
         with path.open("rb") as file:
-            content = file.read(largest + 1)
+            content = file.read(max_bytes + 1)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    if len(content) > largest:
-        raise InputError(f"is too large: more than {largest >> 10} KiB", where=str(path))
+    if len(content) > max_bytes:
+        raise InputError(f"is too large: more than {max_bytes >> 10} KiB", where=str(path))
     return content.decode("utf-8")
 
 

@@ -26,18 +26,20 @@ class TrackStates:
         return len(self.x)
 
     @property
-    def sigma(self) -> Float:
+    def position_std(self) -> Float:
         """(K,) standard deviation of the place on either axis, metres."""
         return np.asarray(np.sqrt(self.P[:, 0]))
 
-    def of(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "TrackStates":
+    def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "TrackStates":
         """Some of them."""
         return TrackStates(self.x[chosen], self.v[chosen], self.P[chosen])
 
 
-def initialize(x: Float, sigma: float, sigma_speed: float) -> TrackStates:
+def initialize(x: Float, position_std: float, speed_std: float) -> TrackStates:
     """Things at (K, 2) of which nothing is known but that; metres, and metres per second."""
-    return TrackStates(x, np.zeros_like(x), np.tile([sigma**2, 0.0, sigma_speed**2], (len(x), 1)))
+    return TrackStates(
+        x, np.zeros_like(x), np.tile([position_std**2, 0.0, speed_std**2], (len(x), 1))
+    )
 
 
 def concatenate(a: TrackStates, b: TrackStates) -> TrackStates:
@@ -66,7 +68,9 @@ def predict(motion: TrackStates, dt: float, acceleration: float) -> TrackStates:
     return TrackStates(motion.x + motion.v * dt, motion.v, P)
 
 
-def update(motion: TrackStates, seen: NDArray[np.bool_], at: Float, sigma: float) -> TrackStates:
+def update(
+    motion: TrackStates, is_observed: NDArray[np.bool_], positions: Float, position_std: float
+) -> TrackStates:
     """After some things were seen.
 
     Args:
@@ -76,9 +80,9 @@ def update(motion: TrackStates, seen: NDArray[np.bool_], at: Float, sigma: float
         sigma: metres, of that.
     """
     xx, xv, vv = motion.P.T
-    innovation = np.where(seen, xx + sigma**2, np.inf)
+    innovation = np.where(is_observed, xx + position_std**2, np.inf)
     gain_x, gain_v = xx / innovation, xv / innovation
-    residual = np.where(seen[:, None], at - motion.x, 0.0)
+    residual = np.where(is_observed[:, None], positions - motion.x, 0.0)
     P = np.stack([xx * (1.0 - gain_x), xv * (1.0 - gain_x), vv - gain_v * xv], axis=-1)
     x, v = motion.x + gain_x[:, None] * residual, motion.v + gain_v[:, None] * residual
     return TrackStates(x, v, P)

@@ -13,10 +13,10 @@ _Item = TypeVar("_Item")
 _Outcome = TypeVar("_Outcome")
 
 
-def resolve_threads(asked: int) -> int:
+def resolve_threads(requested: int) -> int:
     """`asked`, or the number of processors this process may use when that is 0."""
-    if asked > 0:
-        return asked
+    if requested > 0:
+        return requested
     if hasattr(os, "sched_getaffinity"):
         return max(1, len(os.sched_getaffinity(0)))
     return max(1, os.cpu_count() or 1)

@@ -94,7 +94,7 @@ class Recording:
         """The beams of one scan, as a slice into `points`, `hit` and results per beam."""
         return slice(int(self.offset[scan]), int(self.offset[scan + 1]))
 
-    def per_beam(self, dtype: DTypeLike, row: tuple[int, ...] = ()) -> NDArray[Any]:
+    def allocate_per_beam(self, dtype: DTypeLike, row: tuple[int, ...] = ()) -> NDArray[Any]:
         """A new array (M, *row), its content not defined; in a file where it is large.
 
         Raises:
@@ -102,17 +102,17 @@ class Recording:
         """
         return arrays.empty((self.n_beams, *row), dtype, self.scratch)
 
-    def let_go(self, *more: NDArray[Any]) -> None:
+    def release_pages(self, *more: NDArray[Any]) -> None:
         """What lies in memory of the beams, and of other arrays, only because it was looked at."""
         for array in (self.points, self.hit, self.beam_time, *more):
             if array is not None:
                 arrays.release_pages(array)
 
-    def in_turn(self, scans: Iterable[int], *more: NDArray[Any]) -> Iterator[int]:
+    def iter_scans(self, scans: Iterable[int], *more: NDArray[Any]) -> Iterator[int]:
         """The same numbers of scans; what was looked at of the beams, and of other arrays, leaves
         memory on the way."""
         rows = self.n_beams / max(self.n_scans, 1)
-        return arrays.release_periodically(scans, lambda: self.let_go(*more), rows)
+        return arrays.release_periodically(scans, lambda: self.release_pages(*more), rows)
 
     def T_map_sensor(self, T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sensor poses (T, D+1, D+1) that belong to robot poses (T, D+1, D+1)."""
@@ -134,7 +134,7 @@ class Recording:
             T = T_map_base[scan] @ self.T_base_sensor[self.sensor[scan]]
             points = self.points[beams[part]].astype(np.float64)
             ends[part] = np.einsum("nij,nj->ni", T[:, :D, :D], points) + T[:, :D, D]
-            self.let_go()
+            self.release_pages()
         return ends
 
     def without_odometry(self) -> "Recording":

@@ -18,7 +18,7 @@ def paper_e_step(
     recording: Recording, poses: Float, grid: Grid, prior: float, threads: int = 1
 ) -> EStepResult:
     """e of (6), (8) for every beam, and (5) at the map of `grid`."""
-    e = recording.per_beam(np.float32)
+    e = recording.allocate_per_beam(np.float32)
     T_map_sensor = recording.T_map_sensor(poses)
     for scans, beams, offset in iter_chunks(recording, beside=[e]):
         e[beams] = _core.e_step(

@@ -33,7 +33,7 @@ def initial_p_static(
 ) -> NDArray[np.float32]:
     """(M,) e := p(c = 1) for every beam: the start of Fig. 2. Mappers that count believe all."""
     prior = 1.0 if estimator in _FIXED else options.prior
-    e = recording.per_beam(np.float32)
+    e = recording.allocate_per_beam(np.float32)
     for block in iter_blocks(e):
         e[block] = prior
     return e
@@ -86,7 +86,10 @@ def _tracked(
     recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int
 ) -> EStepResult:
     """Hits on people who are tracked are dynamic, all others static; the map counts the others."""
-    people, e = label_people(recording, poses, options.tracker), recording.per_beam(np.float32)
+    people, e = (
+        label_people(recording, poses, options.tracker),
+        recording.allocate_per_beam(np.float32),
+    )
     for _, beams, _ in iter_chunks(recording, beside=[people, e]):
         kept = (~people[beams]).astype(np.float32)
         e[beams] = fill_beams(recording.points[beams], recording.hit[beams], kept, options.prior)
@@ -155,8 +158,8 @@ def add_trusted_beams(
             recording.hit[beams],
             offset,
             T_map_sensor[scans],
-            no_return.stops,
-            no_return.beyond,
+            no_return.stop_cells,
+            no_return.end_margin,
             threads,
         )
     first_cell, cells = grid.seen()

@@ -70,7 +70,7 @@ def iter_chunks(
         beams = slice(int(offset[first]), int(offset[end]))
         within = np.ascontiguousarray(offset[first : end + 1] - offset[first])
         yield Chunk(slice(first, end), beams, within)
-        recording.let_go(*beside)
+        recording.release_pages(*beside)
         first = end
 
 

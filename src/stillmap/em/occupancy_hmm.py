@@ -127,7 +127,7 @@ def _of_beams(
 ) -> NDArray[np.float32]:
     """(M,) what is known (E,) of the element that each beam ended in."""
     found = np.append(static, np.float32(prior))  # -1: no element
-    e = recording.per_beam(np.float32)
+    e = recording.allocate_per_beam(np.float32)
     for scans, beams, offset in iter_chunks(recording, beside=[e]):
         points, hit = recording.points[beams], recording.hit[beams]
         element = surface.elements_of(points, hit, offset, T_map_sensor[scans], threads)

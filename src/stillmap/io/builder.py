@@ -100,7 +100,7 @@ class RecordingBuilder:
         order = chosen[np.argsort(stamp_ns[chosen], kind="stable")]
         start = np.cumsum(length) - length
         columns = [
-            _reorder(column.finished(), start, length, order, self._folder)
+            _reorder(column.finish(), start, length, order, self._folder)
             for column in (self._points, self._hit, self._times)
             if column is not None
         ]

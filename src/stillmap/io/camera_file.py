@@ -65,7 +65,7 @@ class CameraOverride:
     folder: Path | None = None
     times: Path | None = None
 
-    def over(self, camera: Camera) -> Camera:
+    def apply_to(self, camera: Camera) -> Camera:
         """The camera, with what the file says in place of what the recording does."""
         names = ("K", *_SIZE, "model", "distortion", "T_base_camera")
         return replace(camera, **{n: v for n in names if (v := getattr(self, n)) is not None})
@@ -102,14 +102,14 @@ def read_camera_file(path: Path, known: Sequence[str] | None = None) -> dict[str
 def _hint(name: str, known: Sequence[str]) -> str:
     if not known:
         return "the recording has no pictures; folder = '...' adds some"
-    return f"nearest: '{closest_match(name, known, least=0.0)}'; folder = '...' adds one"
+    return f"nearest: '{closest_match(name, known, min_similarity=0.0)}'; folder = '...' adds one"
 
 
 def _camera(table: Mapping[str, Any], beside: Path) -> CameraOverride:
     for key in table:
         if key not in _KEYS:
             raise ValueError(
-                f"unknown key '{key}' (nearest: '{closest_match(key, _KEYS, least=0.0)}')"
+                f"unknown key '{key}' (nearest: '{closest_match(key, _KEYS, min_similarity=0.0)}')"
             )
     model, distortion = _lens(table)
     width, height = (_pixels(table, key) for key in _SIZE)

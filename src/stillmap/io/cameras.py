@@ -116,7 +116,7 @@ def _changed(images: Images, given: dict[str, CameraOverride]) -> Images:
     for number, camera in enumerate(cameras):
         one = given.get(camera.name)
         if one is not None:
-            cameras[number] = one.over(camera)
+            cameras[number] = one.apply_to(camera)
             stamp_ns[images.camera == number] += one.time_offset_ns
     order = np.argsort(stamp_ns, kind="stable")
 
@@ -148,7 +148,7 @@ def _added(name: str, given: CameraOverride, folder: Path, where: str) -> Images
     if not used:
         raise InputError("holds no usable time", where=str(given.times))
     width, height = read_image_size(used[0][1])
-    camera = given.over(Camera(name, width, height, None, "", np.zeros(0), None))
+    camera = given.apply_to(Camera(name, width, height, None, "", np.zeros(0), None))
     return images_from_files([(stamp + given.time_offset_ns, file) for stamp, file in used], camera)
 
 

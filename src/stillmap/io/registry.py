@@ -166,7 +166,7 @@ def _prepare_3d(recording: Recording, options: ReadOptions, scratch: Path | None
     if options.cameras is not None:
         recording = cameras.apply_camera_file(recording, Path(options.cameras))
     recording = cameras.add_calibration_warnings(recording)
-    return self_filter.remove_self_returns(recording) if options.own_body else recording
+    return self_filter.remove_self_returns(recording) if options.self_filter else recording
 
 
 def detect_format(path: Path) -> Format:

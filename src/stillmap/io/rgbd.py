@@ -33,7 +33,7 @@ Float = NDArray[np.float64]
 T_BASE_CAMERA = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-COLOUR, DEPTH = "color", "depth"  # names of the cameras
+COLOR, DEPTH = "color", "depth"  # names of the cameras
 
 _NOTHING_GIVEN = CameraOverride()
 _LARGEST = 65535  # of 16 bits: 7-Scenes has it where nothing is known
@@ -78,7 +78,7 @@ def read(
     frames = rgbd_folders.list_frames(path)
     given = {}
     if options.cameras is not None:
-        given = camera_file.read_camera_file(Path(options.cameras), (DEPTH, COLOUR))
+        given = camera_file.read_camera_file(Path(options.cameras), (DEPTH, COLOR))
     known = DatasetInfo(path, frames.format, list(frames.warnings))
     depth = _depth_camera(frames, given, known.warnings)
     grid = _grid(depth, options, options.depth_scale or frames.scale)
@@ -96,7 +96,7 @@ def read(
     if options.max_range is None:
         options = replace(options, max_range=max(options.depth_max, options.min_range + 1e-3))
     may_register = options.register and frames.format == rgbd_folders.SCENES
-    may_register &= given.keys().isdisjoint((COLOUR, DEPTH))
+    may_register &= given.keys().isdisjoint((COLOR, DEPTH))
     images = _images(frames, depth, grid.scale if may_register else None, known.warnings)
     recording = build_recording(sources, known, options, progress, scratch, images=images)
     rows, columns = grid.rays.shape[:2]
@@ -113,13 +113,13 @@ def _depth_camera(frames: Frames, given: dict[str, CameraOverride], warnings: li
     width, height = _size(frames)
     found = Camera(DEPTH, width, height, frames.K, "", np.zeros(0), T_BASE_CAMERA)
     # depth is mostly laid over the colours: one camera for both
-    camera = given.get(DEPTH, given.get(COLOUR, _NOTHING_GIVEN)).over(found)
+    camera = given.get(DEPTH, given.get(COLOR, _NOTHING_GIVEN)).apply_to(found)
     if (camera.width, camera.height) != (width, height):
         what = f"pictures have {width} x {height} pixels, camera '{DEPTH}' is given others"
         raise InputError(what, where=str(frames.depth[0][1]))
     if camera.K is None:
-        camera = replace(camera, K=frames.usual_K)
-        fx, cx, cy = frames.usual_K[[0, 0, 1], [0, 2, 2]]
+        camera = replace(camera, K=frames.default_K)
+        fx, cx, cy = frames.default_K[[0, 0, 1], [0, 2, 2]]
         warnings.append(
             f"no file says how the camera sees: a focal length of {fx:g} pixels and the centre at "
             f"{cx:g}, {cy:g} are taken, as is usual for {frames.format}; --cameras FILE has others"
@@ -178,12 +178,12 @@ def _images(
         scale: units of depth per metre, if it is in question whether both are one; else None.
         warnings: more are added.
     """
-    for _, file in frames.colour:
+    for _, file in frames.color:
         try:
             width, height = read_image_size(file)
         except InputError:
             continue
-        camera = replace(depth, name=COLOUR, width=width, height=height)
+        camera = replace(depth, name=COLOR, width=width, height=height)
         if (width, height) != (depth.width, depth.height):
             warnings.append(
                 f"colour has {width} x {height} pixels, depth {depth.width} x {depth.height}: how "
@@ -191,10 +191,10 @@ def _images(
             )
             camera = replace(camera, K=None, model="", distortion=np.zeros(0))
         elif scale is not None:
-            colour = dict(frames.colour)
+            colour = dict(frames.color)
             pairs = [(file, colour[stamp]) for stamp, file in frames.depth if stamp in colour]
             beside, said = calibrate_color_camera(depth, scale, pairs)
-            camera = replace(beside, name=COLOUR)
+            camera = replace(beside, name=COLOR)
             warnings += [said] if said else []
-        return cameras.images_from_files(frames.colour, camera)
+        return cameras.images_from_files(frames.color, camera)
     return None

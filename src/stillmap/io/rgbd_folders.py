@@ -45,10 +45,10 @@ class Frames(NamedTuple):
 
     format: str
     depth: list[tuple[int, Path]]
-    colour: list[tuple[int, Path]]
+    color: list[tuple[int, Path]]
     T_world_camera: list[Float | None]
     K: Float | None
-    usual_K: Float
+    default_K: Float
     scale: float
     warnings: list[str]
 

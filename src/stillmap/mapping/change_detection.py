@@ -73,13 +73,13 @@ class CoursesLike(Protocol):
     @property
     def p_changing(self) -> NDArray[np.float32]: ...
     @property
-    def p_thing(self) -> NDArray[np.float32]: ...
+    def p_object(self) -> NDArray[np.float32]: ...
     @property
-    def stands(self) -> NDArray[np.float32]: ...
+    def p_unchanged(self) -> NDArray[np.float32]: ...
     @property
-    def count(self) -> NDArray[np.int32]: ...
+    def n_changes(self) -> NDArray[np.int32]: ...
     @property
-    def between(self) -> NDArray[np.int32]: ...
+    def change_bins(self) -> NDArray[np.int32]: ...
 
 
 def find_changed_object_beams(
@@ -108,7 +108,7 @@ def find_changed_object_beams(
             inside = np.flatnonzero(thing.holds(at, stamp))
             stood[inside] |= thing.near[tuple((at[inside] - thing.low).T)]
         found.append(beam[stood])
-    return found.finished()
+    return found.finish()
 
 
 class _Thing(NamedTuple):
@@ -188,8 +188,8 @@ def detect_changes(
         look: s, length of a look.
         options: see ChangeOptions.
     """
-    changed = np.flatnonzero((courses.p_changing > _SURE) & (courses.count > 0))
-    often = courses.count[changed] >= MIN_RECURRING_CHANGES
+    changed = np.flatnonzero((courses.p_changing > _SURE) & (courses.n_changes > 0))
+    often = courses.n_changes[changed] >= MIN_RECURRING_CHANGES
     stamps = _Stamps(recording, look)
     events = _events(courses, changed[~often], stamps)
     out = []
@@ -204,7 +204,7 @@ def _without_noise(
     changes: list[Change], courses: CoursesLike, options: ChangeOptions
 ) -> list[Change]:
     """The places that are more than noise: that of poses and ranges moves surfaces to and fro."""
-    stays = courses.cells[courses.stands > _SURE]
+    stays = courses.cells[courses.p_unchanged > _SURE]
     if not len(stays):
         return changes
     tree = scipy.spatial.cKDTree(stays)
@@ -235,12 +235,12 @@ class _Stamps:
 
 def _events(courses: CoursesLike, cells: Index, stamps: _Stamps) -> _Events:
     """The one or two changes of each of these cells."""
-    twice = np.flatnonzero(courses.count[cells] == 2)
+    twice = np.flatnonzero(courses.n_changes[cells] == 2)
     cell = np.concatenate([cells, cells[twice]])
     which = np.concatenate([np.ones(len(cells), np.intp), np.zeros(len(twice), np.intp)])
     # the last change made it what it is, the first of two what it no longer is
-    came = (courses.p_thing[cell] > 0.5) == (which == 1)
-    looks = courses.between[cell, which]
+    came = (courses.p_object[cell] > 0.5) == (which == 1)
+    looks = courses.change_bins[cell, which]
     return _Events(cell, came, stamps.last(looks[:, 0]), stamps.first(looks[:, 1]))
 
 
@@ -293,10 +293,10 @@ def _coming_and_going(
         if len(one) < options.least:
             continue
         chosen = often[one]
-        between = courses.between[chosen]
+        between = courses.change_bins[chosen]
         before, stamp = stamps.last(between[:, 0, 0]).max(), stamps.first(between[:, 0, 1]).min()
         last = stamps.first(between[:, 1, 1]).max()
-        times = int(np.median(courses.count[chosen]))
+        times = int(np.median(courses.n_changes[chosen]))
         cells = courses.cells[chosen]
         out.append(
             _change(

@@ -37,7 +37,7 @@ def measure_dwell_times(
     since = np.array([one.stamp_ns if one.appeared else ever.min for one in places])[voxels.place]
     until = np.array([ever.max if one.appeared else one.before_ns for one in places])[voxels.place]
     T_map_sensor = recording.T_map_sensor(poses)
-    for t in recording.in_turn(range(recording.n_scans)):
+    for t in recording.iter_scans(range(recording.n_scans)):
         stamp, beams, T = int(recording.stamp_ns[t]), recording.beams_of(t), T_map_sensor[t]
         points = recording.points[beams][recording.hit[beams]].astype(np.float64)
         ends = points @ T[:3, :3].T + T[:3, 3]

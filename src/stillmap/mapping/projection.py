@@ -125,14 +125,14 @@ def project_to_plane(
         local = (xy - planar_poses[t, :2, 2]) @ planar_poses[t, :2, :2]
         return local.astype(np.float32), hit, beams.start + number
 
-    in_turn = recording.in_turn(range(recording.n_scans))
+    in_turn = recording.iter_scans(range(recording.n_scans))
     for t, (local, hit, number) in enumerate(map_ordered(of_scan, in_turn, threads)):
         ends.append(local)
         hits.append(hit)
         numbers.append(number)
         offset[t + 1] = offset[t] + len(number)
-    flat = make_planar_recording(recording, ends.finished(), hits.finished(), offset)
-    return PlanarProjection(flat, planar_poses, numbers.finished())
+    flat = make_planar_recording(recording, ends.finish(), hits.finish(), offset)
+    return PlanarProjection(flat, planar_poses, numbers.finish())
 
 
 def _of_scan(

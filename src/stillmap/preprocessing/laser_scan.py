@@ -36,12 +36,12 @@ class RangeLimits(NamedTuple):
             beams without a return show; None where nothing tells.
     """
 
-    hit: float
+    longest_hit: float
     declared: float | None
 
-    def limit(self) -> float:
+    def max_range(self) -> float:
         """A largest range that all hits lie below, as float32 holds it."""
-        above = float(np.nextafter(np.float32(self.hit), np.float32(np.inf)))
+        above = float(np.nextafter(np.float32(self.longest_hit), np.float32(np.inf)))
         return above if self.declared is None else max(self.declared, above)
 
 
@@ -64,7 +64,7 @@ def beam_angles(recording: Recording) -> Float:
         for number, noted in enumerate(map(_noted, _sensors(recording)))
     }
     unclear = []
-    for t in recording.in_turn(range(recording.n_scans)):
+    for t in recording.iter_scans(range(recording.n_scans)):
         points = recording.points[recording.beams_of(t)].astype(np.float64)
         of_laser, n = known.setdefault(int(recording.sensor[t]), {}), len(points)
         usable = np.flatnonzero(np.isfinite(points[:, 0]))
@@ -97,7 +97,7 @@ def beam_ranges(recording: Recording, scan: int, no_return: float) -> Float:
 def range_limits(recording: Recording) -> list[RangeLimits]:
     """How far each of the S lasers sees."""
     hit, far = np.zeros((2, len(recording.T_base_sensor)))
-    for t in recording.in_turn(range(recording.n_scans)):
+    for t in recording.iter_scans(range(recording.n_scans)):
         beams, s = recording.beams_of(t), recording.sensor[t]
         x, y = recording.points[beams].astype(np.float64).T
         length, is_hit = np.hypot(x, y), recording.hit[beams]
@@ -119,7 +119,7 @@ def time_increments(recording: Recording) -> tuple[Float, int]:
     out, uneven = np.zeros(recording.n_scans), 0
     if recording.beam_time is None:
         return out, 0
-    for t in recording.in_turn(range(recording.n_scans)):
+    for t in recording.iter_scans(range(recording.n_scans)):
         times = recording.beam_time[recording.beams_of(t)].astype(np.float64)
         number = np.arange(len(times))
         step = float(times @ number) / max(float(number @ number), 1.0)
@@ -221,8 +221,8 @@ def add_beam_times(recording: Recording, options: ReadOptions) -> Recording:
     if not all(rates):
         return _warned(recording, "the spin is not used: stamps tell no rate, set read.spin_rate")
     per_second = np.array(rates, np.float64)
-    beam_time = recording.per_beam(np.float32)
-    for t in recording.in_turn(range(recording.n_scans), beam_time):
+    beam_time = recording.allocate_per_beam(np.float32)
+    for t in recording.iter_scans(range(recording.n_scans), beam_time):
         beams = recording.beams_of(t)
         turned = rotation_since_stamp(recording.points[beams], options)
         beam_time[beams] = turned / per_second[recording.sensor[t]]

@@ -53,10 +53,10 @@ class RangeRule:
     free_how: str
     min_range: float
     # first and last beam, and up to where their readings are of the robot itself
-    own_body: tuple[SelfSector, ...] = ()
+    self_filter: tuple[SelfSector, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        return {**asdict(self), "own_body": [list(part) for part in self.own_body]}
+        return {**asdict(self), "own_body": [list(part) for part in self.self_filter]}
 
 
 def find_max_range(ranges: NDArray[np.float32], declared: float | None = None) -> MaxRange:
@@ -160,7 +160,11 @@ def infer_range_rule(
     is_hit = (ranges >= np.float32(max(options.min_range, MAX_ZERO_RANGE))) & ~no_return
     free, free_how = _free_range(ranges[is_hit], threshold, options.free_range)
     shortest = max(options.min_range, MAX_ZERO_RANGE)
-    own = self_filter.find_self_sectors(np.atleast_2d(ranges), shortest) if options.own_body else ()
+    own = (
+        self_filter.find_self_sectors(np.atleast_2d(ranges), shortest)
+        if options.self_filter
+        else ()
+    )
     rule = RangeRule(threshold, how, zero_means, zero_how, free, free_how, options.min_range, own)
     if free is None:
         warnings.append("no reading shows how far the laser sees: maximum-range beams are unusable")
@@ -210,8 +214,8 @@ def apply_range_rule(
     zero = (ranges >= 0.0) & (ranges < MAX_ZERO_RANGE)
     no_return = (ranges >= threshold) | (zero & (rule.zero_means == "max-range"))
     nearest: Any = np.float32(max(rule.min_range, MAX_ZERO_RANGE))
-    if rule.own_body:
-        nearest = np.maximum(nearest, self_filter.min_ranges(rule.own_body, ranges.shape[-1]))
+    if rule.self_filter:
+        nearest = np.maximum(nearest, self_filter.min_ranges(rule.self_filter, ranges.shape[-1]))
     hit = (ranges >= nearest) & (ranges < threshold)
     free = np.nan if rule.free_range is None else rule.free_range
     length = np.where(no_return, np.float32(free), np.where(hit, ranges, np.float32(np.nan)))

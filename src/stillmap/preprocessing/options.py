@@ -34,7 +34,7 @@ class LaserOptions(NamedTuple):
     fov: float | None
 
     @property
-    def place(self) -> tuple[float | None, float | None, float | None]:
+    def pose(self) -> tuple[float | None, float | None, float | None]:
         """Where it sits on the robot."""
         return self.x, self.y, self.theta
 
@@ -56,7 +56,7 @@ class ReadOptions:
     free_range: float | None = option(
         None, "m: how much free space a maximum-range beam shows; unset: what the laser really sees"
     )
-    own_body: bool = option(
+    self_filter: bool = option(
         True,
         "leave out readings of the robot itself: beams that end at the same place wherever it is",
     )
@@ -172,7 +172,7 @@ class ReadOptions:
         prefix = ("laser", "laser2")[number]
         return LaserOptions(*(getattr(self, f"{prefix}_{name}") for name in LaserOptions._fields))
 
-    def require_lasers(self, number: int) -> None:
+    def check_laser_count(self, number: int) -> None:
         """Refuses options for a laser that is not there.
 
         Raises:
@@ -193,7 +193,7 @@ def apply_options(recording: Recording, options: ReadOptions) -> Recording:
         InputError: a laser's place on the robot is given, and the recording is 3D or has no such
             laser; a topic or frame is named.
     """
-    defaults = ReadOptions(zero_means=options.zero_means, own_body=options.own_body)
+    defaults = ReadOptions(zero_means=options.zero_means, self_filter=options.self_filter)
     if options == defaults:
         return recording
     given = {key: value for key, value in vars(options).items() if value != getattr(defaults, key)}
@@ -204,7 +204,7 @@ def apply_options(recording: Recording, options: ReadOptions) -> Recording:
     changed = replace(recording, source={**recording.source, "read_options": given})
     if options.min_range > 0 or options.max_range is not None or options.free_range is not None:
         changed = _narrowed(changed, options)
-    options.require_lasers(len(recording.T_base_sensor))
+    options.check_laser_count(len(recording.T_base_sensor))
     for number in range(min(len(recording.T_base_sensor), 2)):
         changed = _with_laser(changed, number, options.laser(number))
     return changed
@@ -231,13 +231,13 @@ def _narrow(points: NDArray[np.float32], hit: NDArray[np.bool_], options: ReadOp
 
 
 def _with_laser(recording: Recording, number: int, given: LaserOptions) -> Recording:
-    if given.place == (None, None, None) and not given.upside_down:
+    if given.pose == (None, None, None) and not given.upside_down:
         return recording
     if recording.dimension != 2:
         raise InputError("the laser's place on the robot can be given for 2D recordings only")
     T = np.array(recording.T_base_sensor)
     found = se2.parameters(T[number])
-    place = (f if w is None else w for f, w in zip(found, given.place, strict=True))
+    place = (f if w is None else w for f, w in zip(found, given.pose, strict=True))
     T[number] = se2.matrix(*place)
     changed = replace(recording, T_base_sensor=T)
     return _mirrored(changed, number) if given.upside_down else changed

@@ -67,7 +67,7 @@ class SelfMask:
     cells: Bool
     R: Float
 
-    def own(self, points: NDArray[np.float32], hit: Bool) -> Index:
+    def find_self_returns(self, points: NDArray[np.float32], hit: Bool) -> Index:
         """Which of points (n, 3) in the sensor's frame are of the robot itself."""
         near = np.flatnonzero(hit & _within(points, 2 * BODY_RADIUS))
         turned = points[near].astype(np.float64) @ self.R.T
@@ -97,7 +97,7 @@ def remove_self_returns(recording: Recording) -> Recording:
     ):
         sensor, beams = int(recording.sensor[scan]), recording.beams_of(scan)
         if sensor in found:
-            own = beams.start + found[sensor].own(points[beams], hit[beams])
+            own = beams.start + found[sensor].find_self_returns(points[beams], hit[beams])
             points[own], hit[own] = np.nan, False
             counts[sensor] += len(own)
     noted = [{"sensor": k, "beams": counts[k], **_box(body.cells)} for k, body in found.items()]
@@ -108,7 +108,7 @@ def remove_self_returns(recording: Recording) -> Recording:
 def _let_go(points: NDArray[np.float32], hit: Bool, recording: Recording) -> None:
     arrays.release_pages(points)
     arrays.release_pages(hit)
-    recording.let_go()
+    recording.release_pages()
 
 
 def find_self_mask(recording: Recording, sensor: int) -> SelfMask | None:
@@ -125,7 +125,7 @@ def find_self_mask(recording: Recording, sensor: int) -> SelfMask | None:
     if len(scans) < MIN_SCANS:
         return None
     scans = scans[np.unique(np.linspace(0, len(scans) - 1, _LOOKED_AT).astype(np.intp))]
-    looks = [sample_hits(recording, scan, R) for scan in recording.in_turn(scans.tolist())]
+    looks = [sample_hits(recording, scan, R) for scan in recording.iter_scans(scans.tolist())]
     levels = fit_ground_and_ceiling(np.concatenate([look.points for look in looks]))
     if levels is None or not any(is_3d_sweep(look.points) for look in looks):
         return None
@@ -197,7 +197,7 @@ def _always(recording: Recording, scans: list[int], R: Float) -> Bool:
     """(n, n, n) cells from which something comes back in nearly all scans."""
     n = round(2 * BODY_RADIUS / _EDGE)
     itself, near = np.zeros((n, n, n), np.int16), np.zeros((n, n, n), np.int16)
-    for scan in recording.in_turn(scans):
+    for scan in recording.iter_scans(scans):
         points = _hits(recording, scan, R, BODY_RADIUS)
         points = points[_within(points, BODY_RADIUS)]
         here = np.zeros((n, n, n), np.bool_)
@@ -211,7 +211,7 @@ def _goes_on(recording: Recording, scans: list[int], R: Float) -> Bool:
     """(n, n, n) cells on a line along an axis on which something goes on beyond the robot."""
     m, each = round(2 * BODY_RADIUS / _LINE), round(_LINE / _EDGE)
     ahead, aside = np.zeros((m, m), np.int32), np.zeros((m, m), np.int32)
-    for scan in recording.in_turn(scans):
+    for scan in recording.iter_scans(scans):
         points = _hits(recording, scan, R, PROFILE_RANGE)
         ahead += _filled(points[:, 0], points[:, 1:])
         aside += _filled(points[:, 1], points[:, ::2])

@@ -42,7 +42,7 @@ def assemble_tilting_laser(
     if len(joint_ns) != len(joint_angle) or not len(joint_ns):
         raise ValueError(f"joint: {len(joint_ns)} stamps, {len(joint_angle)} angles")
     T = np.eye(4) if T_joint_laser is None else T_joint_laser
-    points = recording.per_beam(np.float32, (3,))
+    points = recording.allocate_per_beam(np.float32, (3,))
     seconds = 1e-9 * (joint_ns - joint_ns[0])
     step = max(1, _BLOCK * recording.n_scans // max(recording.n_beams, 1))
     for first in range(0, recording.n_scans, step):
@@ -54,7 +54,7 @@ def assemble_tilting_laser(
         points[beams] = rotate_about_axis(
             local, np.array(axis), np.interp(at, seconds, joint_angle)
         )
-        recording.let_go(points)
+        recording.release_pages(points)
     return replace(
         recording,
         points=points,
@@ -72,7 +72,7 @@ def rotate_about_axis(points: Float, axis: Float, angle: Float) -> Float:
     return np.asarray(along + c * (points - along) + s * np.cross(axis, points))
 
 
-def sweep_indices(joint_angle: Float, least: float = 0.02) -> NDArray[np.int64]:
+def sweep_indices(joint_angle: Float, min_reversal: float = 0.02) -> NDArray[np.int64]:
     """(T,) which sweep each scan is of: another one begins where the joint turns round.
 
     Args:
@@ -85,7 +85,7 @@ def sweep_indices(joint_angle: Float, least: float = 0.02) -> NDArray[np.int64]:
         gone = float(joint_angle[t] - joint_angle[farthest])
         if direction * gone >= 0.0 and direction:
             farthest = t
-        elif abs(gone) >= least:
+        elif abs(gone) >= min_reversal:
             if direction:  # what came since the farthest scan is of the way back already
                 number += 1
                 out[farthest + 1 : t] = number

@@ -10,20 +10,21 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npz
 from stillmap.core.recording import Recording
+from stillmap.pipeline.result import Result
 from stillmap.results.points import ply_header
-from stillmap.results.protocols import MovingObjectLike, ResultLike, TrafficLike
+from stillmap.tracking import MovingObject, Traffic
 
 _MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
 
 
-def write_objects(folder: Path, result: ResultLike) -> None:
+def write_objects(folder: Path, result: Result) -> None:
     """Write `objects.json` and `NNNN.ply` of each object into a new folder."""
     write_objects_of(folder, result.objects, result.seen, result.poses, result.p_static)
 
 
 def write_objects_of(
     folder: Path,
-    objects: Sequence[MovingObjectLike],
+    objects: Sequence[MovingObject],
     recording: Recording,
     poses: NDArray[np.float64],
     p_static: NDArray[np.float32],
@@ -41,10 +42,10 @@ def write_objects_of(
         stamps = recording.stamp_ns[recording.scans_of(one.beams)]
         seconds = 1e-9 * (stamps - one.stamp_ns[0])
         write_ply(folder / f"{one.id:04d}.ply", ends, seconds, 1.0 - p_static[one.beams])
-        recording.let_go(p_static, one.beams)
+        recording.release_pages(p_static, one.beams)
 
 
-def object_record(one: MovingObjectLike) -> dict[str, Any]:
+def object_record(one: MovingObject) -> dict[str, Any]:
     """One entry of `objects.json`: metres, metres per second, nanoseconds."""
     columns = dict(zip("xy", one.xy.T, strict=True))
     if one.z is not None:
@@ -79,7 +80,7 @@ def write_ply(
     path.write_bytes(ply_header(fields, len(ends)) + vertices.tobytes())
 
 
-def write_traffic(path: Path, traffic: TrafficLike) -> None:
+def write_traffic(path: Path, traffic: Traffic) -> None:
     """Write `crossings`, `speed` (H, W), `origin` (x, y, yaw) and `resolution` in metres."""
     write_npz(
         path,

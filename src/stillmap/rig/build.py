@@ -173,7 +173,7 @@ def _learned_share(found: em.EStepResult) -> float:
 
 def _prior(seen: Recording, share: float) -> NDArray[np.float32]:
     """(M,) the same for all that can be used."""
-    out = seen.per_beam(np.float32)
+    out = seen.allocate_per_beam(np.float32)
     for block in iter_blocks(out, seen.points):
         out[block] = np.where(np.isnan(seen.points[block]).any(axis=1), np.nan, share)
     return out

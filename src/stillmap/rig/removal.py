@@ -79,7 +79,7 @@ def select_box_beams(
 def _ends(on_way: PosedRecording) -> NDArray[np.float32]:
     """(M, 3) where hits ended in the map frame, NaN for others."""
     seen = on_way.seen
-    ends = seen.per_beam(np.float32, (3,))
+    ends = seen.allocate_per_beam(np.float32, (3,))
     for block in iter_blocks(ends, seen.hit):
         hits = block.start + np.flatnonzero(seen.hit[block])
         ends[block] = np.nan

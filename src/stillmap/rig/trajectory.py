@@ -74,7 +74,10 @@ def pose_recording(
         pause: s between two of them, over which nobody knows where the robot was.
     """
     at_scan, known = interpolate_poses(stamp_ns, poses, recording.stamp_ns, pause)
-    points, hit = recording.per_beam(np.float32, (3,)), recording.per_beam(np.bool_)
+    points, hit = (
+        recording.allocate_per_beam(np.float32, (3,)),
+        recording.allocate_per_beam(np.bool_),
+    )
     left_out, step = 0, max(1, _BLOCK * recording.n_scans // max(recording.n_beams, 1))
     for first in range(0, recording.n_scans, step):
         scans = slice(first, min(first + step, recording.n_scans))
@@ -90,7 +93,7 @@ def pose_recording(
         points[beams] = np.where(there[:, None], moved, np.nan)
         hit[beams] = recording.hit[beams] & there
         left_out += int(np.count_nonzero(~there))
-        recording.let_go(points, hit)
+        recording.release_pages(points, hit)
     seen = replace(recording, points=points, hit=hit, beam_time=None)
     return PosedRecording(seen, lift_poses(at_scan), left_out)
 

@@ -178,9 +178,9 @@ class _Beams:
         """All of them; nothing can be added any more."""
         return _Recorded(
             offset=np.array(self._offset, np.int64),
-            points=self._points.finished(),
-            hit=self._hit.finished(),
-            beam_time=None if self._time is None else self._time.finished(),
-            static=self._static.finished(),
-            mover=self._mover.finished(),
+            points=self._points.finish(),
+            hit=self._hit.finish(),
+            beam_time=None if self._time is None else self._time.finish(),
+            static=self._static.finish(),
+            mover=self._mover.finish(),
         )

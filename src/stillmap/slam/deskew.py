@@ -46,7 +46,7 @@ def deskew_recording(
         return _in_space(recording, poses, times, threads)
     after, before = _pairs(recording.stamp_ns, *_span(times))
     later, earlier = (_twists(recording, poses, *pair) for pair in (after, before))
-    points = recording.per_beam(np.float32, (recording.dimension,))
+    points = recording.allocate_per_beam(np.float32, (recording.dimension,))
     scans = max(1, _BLOCK * recording.n_scans // len(times))
     for first in range(0, recording.n_scans, scans):
         offset = recording.offset[first : first + scans + 1]
@@ -57,7 +57,7 @@ def deskew_recording(
             back = earlier[:, first : first + scans].repeat(counts, axis=1)
             twist = np.where(tau < 0.0, back, twist)
         points[beams] = _carried(recording.points[beams], twist * tau)
-        recording.let_go(points)
+        recording.release_pages(points)
     return replace(recording, points=points, beam_time=None)
 
 
@@ -66,7 +66,7 @@ def _in_space(
 ) -> Recording:
     """The same of sweeps in space, which last from one stamp to the next."""
     twists = _twists_in_space(recording.stamp_ns, poses)
-    points = recording.per_beam(np.float32, (3,))
+    points = recording.allocate_per_beam(np.float32, (3,))
 
     def of_scan(t: int) -> NDArray[np.float32]:
         beams = recording.beams_of(t)
@@ -80,7 +80,7 @@ def _in_space(
         out[usable] = (carried - T[:3, 3]) @ T[:3, :3]
         return out
 
-    in_turn = recording.in_turn(range(recording.n_scans), points)
+    in_turn = recording.iter_scans(range(recording.n_scans), points)
     for t, found in enumerate(map_ordered(of_scan, in_turn, threads)):
         points[recording.beams_of(t)] = found
     return replace(recording, points=points, beam_time=None)

@@ -47,7 +47,7 @@ class Sweep:
         return np.asarray(_core.carried(self.points, self.times, twist))
 
 
-def sweep_of(
+def select_sweep(
     recording: Recording, e: NDArray[np.float32], t: int, reach: float, edge: float
 ) -> Sweep:
     """Sweep t within `reach` metres, the first of its hits in each cell of `edge` metres.
@@ -69,7 +69,7 @@ def sweep_of(
     return Sweep(np.ascontiguousarray(in_base), weights[kept], seconds)
 
 
-def thinned(sweep: Sweep, edge: float, most: int) -> Sweep:
+def downsample_sweep(sweep: Sweep, edge: float, most: int) -> Sweep:
     """The first point in each cell of `edge` metres, or of more where over `most` are left."""
     kept = _core.first_in_cells(sweep.points, sweep.weights, edge)
     while len(kept) > most:
@@ -140,7 +140,7 @@ _LIMITS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
+class LidarOdometry:
     """Poses in space.
 
     Attributes:
@@ -157,14 +157,14 @@ class Driven:
     explained: Float
 
 
-def build(
+def register_sweeps(
     recording: Recording,
     e: NDArray[np.float32],
     options: SpinningOptions,
     odometry: MotionOptions,
     progress: Callable[[int, int], None],
     threads: int,
-) -> Driven:
+) -> LidarOdometry:
     """Every sweep registered on the map of those before it, and then added to it.
 
     The first sweeps are gone through three times: before it is known how the robot moved during
@@ -185,12 +185,14 @@ def build(
         raise ValueError("recording: expected one in three dimensions")
     if recording.n_scans == 0:
         none = np.zeros((0, 6, 6))
-        return Driven(np.zeros((0, 4, 4)), none[:, 0], none, np.zeros(0))
-    start = constant_velocity.at_first(np.zeros(6), options.first_speed, options.first_turn)
+        return LidarOdometry(np.zeros((0, 4, 4)), none[:, 0], none, np.zeros(0))
+    start = constant_velocity.initial_state(np.zeros(6), options.first_speed, options.first_turn)
     drive = _Drive(recording, e, options, odometry, threads)
     for _ in range(_ROUNDS if recording.n_scans > 1 else 0):
         found = drive.followed(start, min(_FIRST, recording.n_scans), _silent)
-        start = constant_velocity.at_first(_first_twist(recording, found.poses), _FOUND, _FOUND)
+        start = constant_velocity.initial_state(
+            _first_twist(recording, found.poses), _FOUND, _FOUND
+        )
     return drive.followed(start, recording.n_scans, progress)
 
 
@@ -219,18 +221,18 @@ class _Drive:
     odometry: MotionOptions
     threads: int
 
-    def followed(self, state: State, n: int, progress: Callable[[int, int], None]) -> Driven:
+    def followed(self, state: State, n: int, progress: Callable[[int, int], None]) -> LidarOdometry:
         """The first n sweeps, from a state at the first one."""
         options, recording = self.options, self.recording
         local = _core.SweepMap3D(options.edge, options.levels, options.enough)
         poses, twists = np.tile(np.eye(4), (n, 1, 1)), np.zeros((n, 6))
         covariance, explained = np.zeros((n, 6, 6)), np.ones(n)
         shed = state.T_map_base[:3, 3]
-        for t in recording.in_turn(range(n), self.e):
-            sweep = sweep_of(recording, self.e, t, options.reach, options.thin_map)
+        for t in recording.iter_scans(range(n), self.e):
+            sweep = select_sweep(recording, self.e, t, options.reach, options.thin_map)
             if t:
-                few = thinned(sweep, options.thin, options.most)
-                state, explained[t] = registered(
+                few = downsample_sweep(sweep, options.thin, options.most)
+                state, explained[t] = register_sweep(
                     local, few, self._prior(state, t), options, self.threads
                 )
             poses[t], twists[t] = state.T_map_base, state.twist
@@ -240,7 +242,7 @@ class _Drive:
                 shed = poses[t, :3, 3].copy()
                 local.keep_near(poses[t], options.reach)
             progress(t + 1, n)
-        return Driven(poses, twists, covariance, explained)
+        return LidarOdometry(poses, twists, covariance, explained)
 
     def _prior(self, state: State, t: int) -> State:
         """Where sweep t ought to be."""
@@ -248,15 +250,15 @@ class _Drive:
         seconds = 1e-9 * float(recording.stamp_ns[t] - recording.stamp_ns[t - 1])
         if recording.T_odom_base is not None:
             before, after = recording.T_odom_base[t - 1 : t + 1]
-            state = constant_velocity.told(
+            state = constant_velocity.update_with_odometry(
                 state, se2.inverse(before) @ after, seconds, self.odometry
             )
-        return constant_velocity.predicted(
+        return constant_velocity.predict(
             state, seconds, options.acceleration, options.turn_acceleration
         )
 
 
-def registered(
+def register_sweep(
     local: _core.SweepMap3D, sweep: Sweep, prior: State, options: SpinningOptions, threads: int
 ) -> tuple[State, float]:
     """A sweep laid on a map: the state at its stamp, and the share of it that lies on surfaces."""

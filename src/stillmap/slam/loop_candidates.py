@@ -73,7 +73,7 @@ def _counted(ties: list[LoopClosure], options: LoopOptions) -> Float:
 def view_centers(track: LoopContext) -> Float:
     """(K, 2) where the keyframes look: the mean of what each saw, in its frame."""
     out = np.zeros((len(track.keyframes), 2))
-    keyframes = track.recording.in_turn(track.keyframes.tolist(), track.e)
+    keyframes = track.recording.iter_scans(track.keyframes.tolist(), track.e)
     for k, t in enumerate(keyframes):
         scan = select_hits(track.recording, track.e, t)
         if scan.weights.sum() > 0.0:

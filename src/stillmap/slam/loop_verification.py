@@ -44,7 +44,7 @@ def verify_candidates(track: LoopContext, candidates: Iterable[LoopCandidate]) -
             found.append(
                 verify_candidate(track, grid, candidate, *drift(candidate.metres, track.options))
             )
-        track.recording.let_go(track.e)
+        track.recording.release_pages(track.e)
     return sorted(found, key=lambda closure: closure.later)
 
 

@@ -14,19 +14,19 @@ from stillmap.slam import motion_model, odometry_faults
 from stillmap.slam.lidar_odometry import SpinningOptions
 from stillmap.slam.local_map import LocalMap
 from stillmap.slam.loop_closure_3d import SpinningLoopOptions
-from stillmap.slam.loop_types import Closure, LoopOptions
+from stillmap.slam.loop_types import LoopClosure, LoopOptions
 from stillmap.slam.motion_model import MotionOptions, MotionPrior
-from stillmap.slam.pose_graph import Graph
+from stillmap.slam.pose_graph import PoseGraph
 from stillmap.slam.scan_matching import (
-    Registration,
     RegistrationOptions,
     Scan,
+    ScanMatch,
     SurfaceOptions,
-    hits,
-    is_off,
-    register,
-    share_through_walls,
-    taken,
+    accept_prior,
+    is_inconsistent,
+    match_scan,
+    occluded_share,
+    select_hits,
 )
 
 Float = NDArray[np.float64]
@@ -63,17 +63,17 @@ class SlamOptions:
 
 
 @dataclass(frozen=True)
-class Doubts:
+class Diagnostics:
     """Where odometry and scans do not agree; numbers of scans, as Mapped has them."""
 
     widened: list[int] = field(default_factory=list)
-    disagreeing: list[int] = field(default_factory=list)
+    odometry_faults: list[int] = field(default_factory=list)
     breaks: list[int] = field(default_factory=list)
-    apart: list[int] = field(default_factory=list)
+    unconnected: list[int] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
-class Mapped:
+class MStepResult:
     """What the M-step found.
 
     Attributes:
@@ -97,29 +97,29 @@ class Mapped:
     grid: _core.Grid2D | _core.Grid3D
     explained: Float
     widened: list[int]
-    disagreeing: list[int] = field(default_factory=list)
+    odometry_faults: list[int] = field(default_factory=list)
     breaks: list[int] = field(default_factory=list)
-    apart: list[int] = field(default_factory=list)
-    loops: list[Closure] = field(default_factory=list)
-    graph: Graph | None = None
+    unconnected: list[int] = field(default_factory=list)
+    loops: list[LoopClosure] = field(default_factory=list)
+    graph: PoseGraph | None = None
 
     @property
-    def doubts(self) -> "Doubts":
+    def diagnostics(self) -> "Diagnostics":
         """Where odometry and scans do not agree."""
-        return Doubts(self.widened, self.disagreeing, self.breaks, self.apart)
+        return Diagnostics(self.widened, self.odometry_faults, self.breaks, self.unconnected)
 
-    def without_grid(self) -> "Mapped":
+    def without_grid(self) -> "MStepResult":
         """Poses and what is known of them alone: grids are large."""
         return dataclasses.replace(self, grid=type(self.grid)(self.grid.resolution))
 
 
-def build(
+def register_scans(
     recording: Recording,
     e: NDArray[np.float32],
     options: SlamOptions,
     progress: Callable[[int, int], None],
     memory: float = np.inf,
-) -> Mapped:
+) -> MStepResult:
     """Incremental maximum likelihood: register each scan (9), then add it to the map so far (10).
 
     The grid that comes back is empty: the map so far has no beams without a return, and of scans
@@ -136,25 +136,27 @@ def build(
     so_far = _empty(recording, e, options)
     way = _Way.of(T)
     steadiness = motion_model.unknown_steadiness(options.motion)
-    steps = motion_model.odometry_steps(recording.T_odom_base)
+    steps = motion_model.compute_odometry_steps(recording.T_odom_base)
     seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns))) if T > 1 else 0.0
-    watch = odometry_faults.Watch(None if steps is None else steps.increments, options.registration)
+    watch = odometry_faults.SlipDetector(
+        None if steps is None else steps.increments, options.registration
+    )
     travelled = 0.0
     usual = np.zeros(len(recording.T_base_sensor))  # each laser sees its own side
     usual[recording.sensor[0]] = 1.0
     so_far.add(0, way.poses[0], 0.0)
     progress(1, T)
-    for t in recording.in_turn(range(1, T), e):
+    for t in recording.iter_scans(range(1, T), e):
         last, guess = way.poses[t - 1], way.guess(t, steadiness)
         stalled = watch.stalled(t, last, guess)
         prior, other = _priors(last, steps, t, guess, stalled, options.motion)
-        scan, s = hits(recording, e, t), recording.sensor[t]
+        scan, s = select_hits(recording, e, t), recording.sensor[t]
         # without odometry, what a laser sees on its own side at first has nothing to lie on
         has_ground = prior.measured or so_far.has(s)
         if has_ground:
-            found = register(so_far.grid, scan, prior, other, options.registration, usual[s])
+            found = match_scan(so_far.grid, scan, prior, other, options.registration, usual[s])
         else:
-            found = taken(prior)
+            found = accept_prior(prior)
         gone_on = watch.look(t, last, guess, so_far.grid, scan, found)
         if gone_on is not None:
             so_far.forget_since(gone_on.first)  # they are not put back: those to come show the same
@@ -171,7 +173,9 @@ def build(
             so_far, usual[:] = _empty(recording, e, options), 0.0
             watch.forget()
         disbelieved = None if prior.measured else other
-        is_doubted = disbelieved is not None and is_off(disbelieved, found, options.registration)
+        is_doubted = disbelieved is not None and is_inconsistent(
+            disbelieved, found, options.registration
+        )
         way.take(t, found, doubted=is_doubted)
         if has_ground:
             # nothing is usual yet after the first scan
@@ -202,20 +206,20 @@ class _Way:
         none = np.zeros((2, T), np.bool_)
         return cls(poses, np.zeros((T, 3, 3)), np.ones(T), none[0], none[1])
 
-    def take(self, t: int, found: Registration, *, doubted: bool) -> None:
+    def take(self, t: int, found: ScanMatch, *, doubted: bool) -> None:
         self.poses[t], self.covariance[t] = found.T_map_base, found.covariance
         self.explained[t], self.widened[t] = found.explained, found.widened
         self.disagreeing[t] |= found.disagrees or doubted
 
-    def guess(self, t: int, steadiness: motion_model.Steadiness) -> MotionPrior:
+    def guess(self, t: int, steadiness: motion_model.VelocityNoise) -> MotionPrior:
         """The last motion once more; across a break there was none that is known."""
         before = t - 1 if t < 2 or t - 1 in self.breaks[-1:] else t - 2
-        return motion_model.from_constant_velocity(
+        return motion_model.constant_velocity_prior(
             self.poses[t - 1], self.poses[before], steadiness
         )
 
-    def mapped(self, grid: _core.Grid2D) -> Mapped:
-        return Mapped(
+    def mapped(self, grid: _core.Grid2D) -> MStepResult:
+        return MStepResult(
             self.poses,
             self.covariance,
             grid,
@@ -239,7 +243,7 @@ def _empty(recording: Recording, e: NDArray[np.float32], options: SlamOptions) -
 def _was_carried(
     so_far: LocalMap,
     scan: Scan,
-    found: Registration,
+    found: ScanMatch,
     usual: float,
     options: RegistrationOptions,
 ) -> bool:
@@ -249,13 +253,13 @@ def _was_carried(
     """
     if found.explained >= options.carried_below * usual or len(scan.points) == 0:
         return False
-    return share_through_walls(so_far.grid, scan, found) > options.through
+    return occluded_share(so_far.grid, scan, found) > options.through
 
 
 def _leapt(
     so_far: LocalMap,
     scan: Scan,
-    found: Registration,
+    found: ScanMatch,
     priors: tuple[MotionPrior, MotionPrior],
     options: RegistrationOptions,
 ) -> bool:
@@ -265,15 +269,15 @@ def _leapt(
     """
     if found.astray or not found.widened:
         return found.astray
-    if not all(is_off(prior, found, options) for prior in priors):
+    if not all(is_inconsistent(prior, found, options) for prior in priors):
         return False
     unmoved = dataclasses.replace(found, T_map_base=priors[0].T_map_base)
-    return share_through_walls(so_far.grid, scan, unmoved) > options.through
+    return occluded_share(so_far.grid, scan, unmoved) > options.through
 
 
 def _priors(
     T_map_base: Float,
-    steps: motion_model.Steps | None,
+    steps: motion_model.OdometrySteps | None,
     t: int,
     guess: MotionPrior,
     stalled: bool,
@@ -282,6 +286,6 @@ def _priors(
     """Where scan t ought to be after a pose (3, 3), and where else it may be."""
     if steps is None:
         return guess, None
-    measured = motion_model.from_odometry(T_map_base, steps.increments[t - 1], options)
+    measured = motion_model.odometry_prior(T_map_base, steps.increments[t - 1], options)
     is_true = steps.plausible[t - 1] and not stalled
     return (measured, guess) if is_true else (guess, measured)

@@ -41,11 +41,11 @@ def refine_poses(
     kept = local_map.select_keyframes_per_sensor(
         poses, recording.sensor, options.spacing, options.spacing
     )
-    for t in recording.in_turn(kept, e):
+    for t in recording.iter_scans(kept, e):
         add_scan(grid, recording, e, t, poses[t], options.surface)
     is_in_map = np.zeros(T, np.bool_)
     is_in_map[kept] = True
-    for t in recording.in_turn(range(1, T), e):
+    for t in recording.iter_scans(range(1, T), e):
         if is_in_map[t]:
             add_scan(grid, recording, e, t, poses[t], options.surface, remove=True)
         prior = _between_neighbours(recording, poses, increments, mapped.breaks, t, options)

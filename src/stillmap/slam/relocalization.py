@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.slam import loop_verification, motion_model, scan_matching
-from stillmap.slam.loop_types import Candidate, Closure, Track
-from stillmap.slam.scan_matching import hits, put
+from stillmap.slam.loop_types import LoopCandidate, LoopClosure, LoopContext
+from stillmap.slam.scan_matching import add_scan, select_hits
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -31,7 +31,7 @@ _BINS = np.geomspace(0.3, 30.0, 25)  # m, of the ranges by which scans are compa
 _BESIDE = 10.0  # m between pieces that nothing ties
 
 
-def separated(travelled: Float, breaks: list[int], metres: float) -> Float:
+def separate_segments(travelled: Float, breaks: list[int], metres: float) -> Float:
     """(T,) metres travelled, with so many more at each break: nothing reaches across."""
     out = travelled.copy()
     for t in breaks:
@@ -39,9 +39,9 @@ def separated(travelled: Float, breaks: list[int], metres: float) -> Float:
     return out
 
 
-def placed(
-    track: Track, breaks: list[int], nowhere: list[int]
-) -> tuple[Track, list[Closure], list[int]]:
+def relocalize_segments(
+    track: LoopContext, breaks: list[int], nowhere: list[int]
+) -> tuple[LoopContext, list[LoopClosure], list[int]]:
     """Pieces where they belong, the closures that say so, and breaks after which nothing did.
 
     Args:
@@ -50,7 +50,7 @@ def placed(
         nowhere: those of them that fit nowhere around; the others stay where they fit if nothing
             else is found.
     """
-    ties, apart = list[Closure](), list[int]()
+    ties, apart = list[LoopClosure](), list[int]()
     poses = track.poses.copy()
     for first, last in itertools.pairwise([*breaks, len(poses)]):
         track = dataclasses.replace(track, poses=poses)
@@ -64,7 +64,7 @@ def placed(
     return dataclasses.replace(track, poses=poses), ties, apart
 
 
-def _attempts(track: Track, first: int, last: int) -> Iterator[Closure]:
+def _attempts(track: LoopContext, first: int, last: int) -> Iterator[LoopClosure]:
     """Keyframes of a piece, each laid on the places before it that look most alike."""
     frames, options = track.keyframes, track.options
     piece = frames[(frames >= first) & (frames < last)]
@@ -76,12 +76,12 @@ def _attempts(track: Track, first: int, last: int) -> Iterator[Closure]:
         stretches = np.round(track.travelled[before] / options.stretch)
         for stretch in _best_of_each(stretches, unlike):
             if stretch not in grids:
-                grids[stretch] = loop_verification.local_map(track, stretch * options.stretch)
+                grids[stretch] = loop_verification.build_submap(track, stretch * options.stretch)
             same = np.flatnonzero(stretches == stretch)
             earlier = int(before[same[np.argmin(unlike[same])]])
-            here = Candidate(earlier, later, np.eye(3), 0.0)
+            here = LoopCandidate(earlier, later, np.eye(3), 0.0)
             sigma = options.reach / options.window, np.pi / options.window
-            closure = loop_verification.laid_on(track, grids[stretch], here, *sigma)
+            closure = loop_verification.verify_candidate(track, grids[stretch], here, *sigma)
             if not closure.refused:
                 yield closure
 
@@ -92,28 +92,30 @@ def _best_of_each(stretches: Float, unlike: Float) -> list[float]:
     return list(dict.fromkeys([*list(found)[:_ALIKE], float(stretches[-1])]))
 
 
-def _signature(track: Track, t: int) -> Float:
+def _signature(track: LoopContext, t: int) -> Float:
     """(24,) share of a scan's beams up to each range: it does not change when the robot turns."""
-    scan = hits(track.recording, track.e, t)
+    scan = select_hits(track.recording, track.e, t)
     ranges = np.linalg.norm(scan.points, axis=1)
     reached = np.histogram(ranges, _BINS, weights=scan.weights)[0].cumsum()
     shares: Float = reached / max(float(reached[-1]), 1e-9)
     return shares
 
 
-def _correction(track: Track, closure: Closure) -> Float:
+def _correction(track: LoopContext, closure: LoopClosure) -> Float:
     """(3, 3) by which a piece has to be moved for a closure to hold."""
     there = track.poses[closure.earlier] @ closure.T
     C: Float = there @ se2.inverse(track.poses[closure.later])
     return C
 
 
-def _agreed(track: Track, closures: list[Closure], first: int, last: int) -> list[Closure]:
+def _agreed(
+    track: LoopContext, closures: list[LoopClosure], first: int, last: int
+) -> list[LoopClosure]:
     """The closures that put a piece where most of it fits what was seen before; or none.
 
     Rooms look alike: what a place says counts only if the rest of the piece does not contradict it.
     """
-    best, most = list[Closure](), 0
+    best, most = list[LoopClosure](), 0
     before = _map_before(track, first)
     for closure in _one_of_each(track, closures):
         C = _correction(track, closure)
@@ -123,35 +125,35 @@ def _agreed(track: Track, closures: list[Closure], first: int, last: int) -> lis
     return best
 
 
-def _one_of_each(track: Track, closures: list[Closure]) -> list[Closure]:
+def _one_of_each(track: LoopContext, closures: list[LoopClosure]) -> list[LoopClosure]:
     """One closure for each place that a piece may be at."""
-    kept = list[Closure]()
+    kept = list[LoopClosure]()
     for closure in closures:
         if not any(_is_same(track, _correction(track, other), closure) for other in kept):
             kept.append(closure)
     return kept
 
 
-def _map_before(track: Track, first: int) -> _core.Grid2D:
+def _map_before(track: LoopContext, first: int) -> _core.Grid2D:
     grid = _core.Grid2D(track.resolution, track.registration.approach)
     before = track.keyframes[track.keyframes < first].tolist()
-    for t in track.recording.in_turn(before, track.e):
-        put(grid, track.recording, track.e, t, track.poses[t], track.surface)
+    for t in track.recording.iter_scans(before, track.e):
+        add_scan(grid, track.recording, track.e, t, track.poses[t], track.surface)
     return grid
 
 
 def _support(
-    track: Track, before: _core.Grid2D, C: Float, first: int, last: int
+    track: LoopContext, before: _core.Grid2D, C: Float, first: int, last: int
 ) -> tuple[int, int]:
     """Keyframes of a piece that fit a map when it is moved by C (3, 3), and that contradict it."""
     frames = track.keyframes[(track.keyframes >= first) & (track.keyframes < last)]
     fitting = contradicting = 0
     for t in _evenly(frames, _HEARD):
-        scan = hits(track.recording, track.e, t)
-        prior = motion_model.guess_at(C @ track.poses[t], _SAME_METRES, _SAME_RADIANS)
+        scan = select_hits(track.recording, track.e, t)
+        prior = motion_model.gaussian_prior(C @ track.poses[t], _SAME_METRES, _SAME_RADIANS)
         start = prior.T_map_base
-        found = scan_matching.search(before, scan, prior, track.registration, 0.0, 0.0, start)
-        if scan_matching.share_through_walls(before, scan, found) > track.registration.through:
+        found = scan_matching.search_pose(before, scan, prior, track.registration, 0.0, 0.0, start)
+        if scan_matching.occluded_share(before, scan, found) > track.registration.through:
             contradicting += 1
         elif found.explained >= track.options.accept_above:
             fitting += 1
@@ -165,17 +167,17 @@ def _evenly(frames: Index, most: int) -> list[int]:
     return out
 
 
-def _is_same(track: Track, correction: Float, closure: Closure) -> bool:
+def _is_same(track: LoopContext, correction: Float, closure: LoopClosure) -> bool:
     there = track.poses[closure.earlier] @ closure.T
     d = se2.parameters(se2.inverse(correction @ track.poses[closure.later]) @ there)
     return bool(np.hypot(d[0], d[1]) < _SAME_METRES and abs(d[2]) < _SAME_RADIANS)
 
 
-def _beside(track: Track, first: int) -> Float:
+def _beside(track: LoopContext, first: int) -> Float:
     """(3, 3) that moves what comes from scan `first` on to the right of all that was before."""
     reach = np.array(
         [
-            np.linalg.norm(hits(track.recording, track.e, t).points, axis=1).max(initial=0.0)
+            np.linalg.norm(select_hits(track.recording, track.e, t).points, axis=1).max(initial=0.0)
             for t in track.keyframes.tolist()
         ]
     )

@@ -89,7 +89,7 @@ def _assign_to_nearest(xy: Float, states: TrackStates) -> Index:
     nearest: Index = distance.argmin(axis=1)
     for i in (0, 1):
         mine = nearest == i
-        if mine.any() and distance[mine, i].min() > _MAX_RADIUS + 2.0 * states.sigma[i]:
+        if mine.any() and distance[mine, i].min() > _MAX_RADIUS + 2.0 * states.position_std[i]:
             nearest[mine] = 1 - i
     return nearest
 
@@ -164,7 +164,7 @@ class _Tracker:
         variance = _POSITION_STD**2 + self._states.P[:, 0]
         # a 2D Gaussian has twice the logarithm, which would favor long occluded tracks too little
         cost = squared / variance + np.log(variance)
-        sigma = self._states.sigma
+        sigma = self._states.position_std
         gate = np.minimum(_GATE + _GATE_SIGMAS * sigma, _MAX_GATE)
         claims = _argmin_allowed(cost, squared < gate**2)
         if (claims == NO_TRACK).any():
@@ -269,7 +269,7 @@ class _Tracker:
             return
         self._keep_shapes(kept[self._of])
         self._of = (np.cumsum(kept) - 1)[self._of]
-        self._states, self._id = self._states.of(kept), self._id[kept]
+        self._states, self._id = self._states.select(kept), self._id[kept]
         self._last = self._last[kept]
 
     def _keep_shapes(self, kept: NDArray[np.bool_]) -> None:

@@ -96,7 +96,7 @@ def extract_dynamic_points(
         sensor=recording.T_map_sensor(poses)[:, :2, 2],
         first=np.cumsum(count),
         scratch=scratch,
-        **{name: column.finished() for name, column in columns.items()},
+        **{name: column.finish() for name, column in columns.items()},
     )
 
 

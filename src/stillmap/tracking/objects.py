@@ -1,4 +1,4 @@
-"""Moving things as results: where each went, how fast, how large it is, and which beams saw it."""
+"""Moving objects: track, velocity, size and beams of each confirmed track."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.recording import Recording
-from stillmap.tracking.association import assign_tracks
+from stillmap.tracking.association import ACCELERATION, assign_tracks
 from stillmap.tracking.clustering import DynamicPoints, extract_dynamic_points
 from stillmap.tracking.options import ObjectOptions
 from stillmap.tracking.smoother import smooth_track
@@ -19,26 +19,29 @@ from stillmap.tracking.tracklets import compute_centroids, iterate_tracks, stitc
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_WALKS = 0.3  # m/s from where on a thing's velocity says where its front is
-_MOST = 0.8  # of the scans see no more of its width
-_DEEPEST = 0.9  # m, half the width of a car
-_EDGE = 5.0  # percent of its points on either side that a box leaves out: legs swing
+HEADING_SPEED = 0.3  # m/s: a faster object is heading where it moves
+
+_SMOOTHER_STD = 0.28  # m: of a center over time, more than at an instant because legs swing
+_WIDTH_QUANTILE = 0.8  # of the widths seen in single scans
+_MAX_OFFSET = 0.9  # m, half the width of a car
+_OUTLIERS = 5.0  # percent of the points on either side outside the box: legs swing
 
 
 @dataclass(frozen=True, eq=False)
 class MovingObject:
-    """Something that moved.
+    """A moving object.
 
     Attributes:
-        id: from 0, in the order in which they were first seen.
-        scan: (L,) scans that saw it, rising.
+        id: from 0 in the order of first detections.
+        scan: (L,) scans with detections, rising.
         stamp_ns: (L,) their stamps.
-        xy: (L, 2) metres, its middle in the map frame, smoothed; as if it were round.
+        xy: (L, 2) metres, smoothed center in the map frame, as if the object were round.
         velocity: (L, 2) metres per second.
-        size: metres along and across the way it went, and in 3D its height; of what was seen of it.
+        size: metres along and across the direction of motion, in 3D also height, of the visible
+            part.
         beams: (n,) beams of the recording that ended on it, rising.
-        p_dynamic: mean probability of these beams to be dynamic.
-        z: (L,) metres, how high its middle is in the map frame; None in 2D.
+        p_dynamic: mean P(dynamic) of these beams.
+        z: (L,) metres, height of the center in the map frame; None in 2D.
     """
 
     id: int
@@ -58,12 +61,12 @@ def track_objects(
     p_static: NDArray[np.float32],
     options: ObjectOptions,
 ) -> list[MovingObject]:
-    """What moved in a recording.
+    """Detect and track the moving objects of a recording.
 
     Args:
-        recording: 2D, M beams, without motion during its scans.
+        recording: 2D, M beams, deskewed.
         poses: (T, 3, 3) T_map_base.
-        p_static: (M,) probability that a static object reflected each beam.
+        p_static: (M,) P(c = 1) of each beam.
         options: see ObjectOptions.
 
     Raises:
@@ -78,24 +81,24 @@ def track_objects(
         )
     if not options.enabled:
         return []
-    points = extract_dynamic_points(recording, poses, p_static, options)
+    points = extract_dynamic_points(recording, poses, p_static, options.min_p_dynamic)
     if len(points.scan) == 0:
         return []
-    owner = stitch_tracklets(points, assign_tracks(points, options), options)
-    large = _Kept(recording.scratch)
+    owner = stitch_tracklets(points, assign_tracks(points, options.max_gap))
+    kept = _ObjectStore(recording.scratch)
     for _, here in iterate_tracks(points, owner):
         found = compute_centroids(points, owner, here)
-        one = _object(points, here, found.scan, found.xy, recording, p_static, options)
-        if _extent(one) >= options.least_extent:
-            large.add(one)
+        one = _make_object(points, here, found.scan, found.xy, recording, p_static)
+        if float(np.linalg.norm(np.ptp(one.xy, axis=0))) + max(one.size) >= options.min_extent:
+            kept.add(one)
         arrays.release_pages(p_static)
-    objects = large.objects()
+    objects = kept.objects()
     objects.sort(key=lambda one: (one.scan[0], one.beams[0]))
     return [dataclasses.replace(one, id=number) for number, one in enumerate(objects)]
 
 
-class _Kept:
-    """Objects whose arrays lie together, as parts of a few large ones."""
+class _ObjectStore:
+    """Objects whose arrays are slices of a few large, memory-mapped ones."""
 
     _OF_SCANS: ClassVar = {"scan": np.intp, "stamp_ns": np.int64, "xy": float, "velocity": float}
 
@@ -114,7 +117,7 @@ class _Kept:
             column.append(getattr(one, name))
 
     def objects(self) -> list[MovingObject]:
-        """All of them, without numbers; nothing can be added any more."""
+        """All objects, their ids 0; nothing can be added afterwards."""
         beams = self._beams.finished()
         columns = {name: column.finished() for name, column in self._columns.items()}
         out, scan, beam = [], 0, 0
@@ -126,24 +129,20 @@ class _Kept:
         return out
 
 
-def _extent(one: MovingObject) -> float:
-    """Metres that it went, and its length."""
-    return float(np.linalg.norm(np.ptp(one.xy, axis=0))) + max(one.size)
-
-
-def _object(
+def _make_object(
     points: DynamicPoints,
     here: Index,
     scan: Index,
-    middle: Float,
+    centroid: Float,
     recording: Recording,
     p_static: NDArray[np.float32],
-    options: ObjectOptions,
 ) -> MovingObject:
-    seconds = points.seconds[scan]
+    """The object of points `here` with these centroids (L, 2) in scans (L,)."""
     at = np.searchsorted(scan, points.scan[here])
-    middle = middle + estimate_center_offset(middle, points.sensor[scan], points.xy[here], at)
-    xy, velocity = smooth_track(seconds, middle, options.sigma_way, options.acceleration)
+    offset = estimate_center_offset(centroid, points.sensor[scan], points.xy[here], at)
+    xy, velocity = smooth_track(
+        points.seconds[scan], centroid + offset, _SMOOTHER_STD, ACCELERATION
+    )
     beams = points.beam[here]
     return MovingObject(
         0,
@@ -157,44 +156,44 @@ def _object(
     )
 
 
-def estimate_center_offset(middle: Float, sensor: Float, xy: Float, at: Index) -> Float:
-    """(L, 2) from the middle of what was seen to that of the thing: only one side is seen.
+def estimate_center_offset(centroid: Float, sensor: Float, xy: Float, at: Index) -> Float:
+    """(L, 2) from the centroid of the end points to the object's center: one side is visible.
 
-    Of a disc the end points lie pi / 4 of its radius before its middle. It is as wide as what was
-    seen of the thing across the beams, in most scans, and no larger than a car.
+    The end points on a disk lie on average pi / 4 of its radius before its center. The radius is
+    half the width seen across the beams in most scans, and at most that of a car.
 
     Args:
-        middle: (L, 2) of the end points in each scan.
-        sensor: (L, 2) where they were seen from.
+        centroid: (L, 2) of the end points in each scan.
+        sensor: (L, 2) position of the sensor.
         xy: (n, 2) the end points.
         at: (n,) which of the L scans each is of.
     """
-    away = middle - sensor
+    away = centroid - sensor
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    offset = xy - middle[at]
+    offset = xy - centroid[at]
     across = offset[:, 1] * away[at, 0] - offset[:, 0] * away[at, 1]
-    low, high = np.full(len(middle), np.inf), np.full(len(middle), -np.inf)
+    low, high = np.full(len(centroid), np.inf), np.full(len(centroid), -np.inf)
     np.minimum.at(low, at, across)
     np.maximum.at(high, at, across)
-    radius = 0.5 * float(np.quantile(high - low, _MOST))
-    return min(np.pi / 4.0 * radius, _DEEPEST) * away
+    radius = 0.5 * float(np.quantile(high - low, _WIDTH_QUANTILE))
+    return min(np.pi / 4.0 * radius, _MAX_OFFSET) * away
 
 
 def measure_box(offset: Float, velocity: Float) -> tuple[float, float]:
-    """Metres along and across the way it went; along and across its longer side if it stood.
+    """Extent in metres along and across the motion; of one at rest, along its principal axes.
 
     Args:
-        offset: (n, 2) end points from the middle.
-        velocity: (n, 2) then.
+        offset: (n, 2) end points from the center.
+        velocity: (n, 2) at that time.
     """
     speed = np.linalg.norm(velocity, axis=1)
-    if np.median(speed) > _WALKS:
-        ahead = velocity / np.maximum(speed, 1e-9)[:, None]
-        along = (offset * ahead).sum(axis=1)
-        across = offset[:, 1] * ahead[:, 0] - offset[:, 0] * ahead[:, 1]
+    if np.median(speed) > HEADING_SPEED:
+        heading = velocity / np.maximum(speed, 1e-9)[:, None]
+        along = (offset * heading).sum(axis=1)
+        across = offset[:, 1] * heading[:, 0] - offset[:, 0] * heading[:, 1]
     else:
         axes = np.linalg.eigh(offset.T @ offset)[1]
         across, along = (offset @ axes).T
-    low, high = np.percentile([along, across], [_EDGE, 100.0 - _EDGE], axis=1)
+    low, high = np.percentile([along, across], [_OUTLIERS, 100.0 - _OUTLIERS], axis=1)
     length, width = (high - low).tolist()
     return length, width

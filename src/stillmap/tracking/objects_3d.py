@@ -101,7 +101,7 @@ def _dynamic_parts(
         local = (end[kept, :2] - flat_poses[t, :2, 2]) @ flat_poses[t, :2, :2]
         return number[kept], part[kept], local, _nearest(local)
 
-    in_turn = recording.in_turn(range(T), p_static)
+    in_turn = recording.iter_scans(range(T), p_static)
     for t, (number, part, local, near) in enumerate(map_ordered(of_scan, in_turn, threads)):
         points.append(local[near].astype(np.float32))
         nearest.append(number[near])
@@ -109,9 +109,7 @@ def _dynamic_parts(
         beam.append(number)
         parts += int(part.max()) + 1 if len(part) else 0
         offset[t + 1] = offset[t] + len(near)
-    return _Parts(
-        points.finished(), nearest.finished(), offset, part_of.finished(), beam.finished()
-    )
+    return _Parts(points.finish(), nearest.finish(), offset, part_of.finish(), beam.finish())
 
 
 def _above_ground(

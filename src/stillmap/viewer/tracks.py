@@ -148,7 +148,7 @@ class Beams:
         ends[:, :D] = its @ T_map_sensor[:D, :D].T + T_map_sensor[:D, D]
         origin[:D] = T_map_sensor[:D, D]
         p_static = np.asarray(self.p_static[beams][use])
-        self.recording.let_go(self.p_static)
+        self.recording.release_pages(self.p_static)
         return Seen(ends, p_static, origin)
 
 

@@ -123,7 +123,7 @@ def find_changed(
     out = np.zeros(len(found.scan), bool)
     of_scan = np.searchsorted(found.scan, np.arange(recording.n_scans + 1))
     compared = _compared(recording, look)
-    for t in recording.in_turn(range(recording.n_scans)):
+    for t in recording.iter_scans(range(recording.n_scans)):
         here = slice(of_scan[t], of_scan[t + 1])
         if here.start == here.stop:
             continue

@@ -122,7 +122,7 @@ class _Alive(NamedTuple):
     def of(self, chosen: Mask) -> "_Alive":
         motion, track, last, seen, changed = self
         rest = track[chosen], last[chosen], seen[chosen], changed[chosen]
-        return _Alive(motion.of(chosen), *rest)
+        return _Alive(motion.select(chosen), *rest)
 
 
 def track_people(
@@ -230,12 +230,12 @@ def find_beams_in_boxes(
     recording: Recording, T_map_sensor: Float, somebody: Tracks, half: float
 ) -> NDArray[np.bool_]:
     """(M,) which hits lie in boxes, along the axes of the map, `half` m to each side of people."""
-    inside = recording.per_beam(np.bool_)
+    inside = recording.allocate_per_beam(np.bool_)
     for block in iter_blocks(inside):
         inside[block] = False
     scans, first = np.unique(somebody.scan, return_index=True)
     bounds = np.append(first, len(somebody.scan))
-    for n, t in enumerate(recording.in_turn(scans.tolist(), inside)):
+    for n, t in enumerate(recording.iter_scans(scans.tolist(), inside)):
         begin, end = bounds[n : n + 2]
         beams = recording.beams_of(t)
         T = T_map_sensor[t]

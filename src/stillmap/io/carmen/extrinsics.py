@@ -76,9 +76,9 @@ def is_stated_by_lines(x: float, y: float, theta: float) -> bool:
 
 def override(found: Extrinsics, given: LaserOptions) -> Extrinsics:
     """`found` with what the options name in its place."""
-    if given.place == (None, None, None):
+    if given.pose == (None, None, None):
         return found
-    x, y, theta = (f if w is None else w for f, w in zip(found[:3], given.place, strict=True))
+    x, y, theta = (f if w is None else w for f, w in zip(found[:3], given.pose, strict=True))
     return Extrinsics(x, y, theta, "given")
 
 

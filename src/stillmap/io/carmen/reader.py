@@ -138,7 +138,7 @@ def _no_scan(path: Path, log: CarmenLog) -> InputError:
 
 def _build_recording(sensors: list[Sensor], log: CarmenLog, options: ReadOptions) -> Recording:
     """One recording of all lasers' scans in the order of their stamps."""
-    options.require_lasers(len(sensors))
+    options.check_laser_count(len(sensors))
     skipped = log.skipped.merge(*(log.skipped_scans[s.laser.kind] for s in sensors))
     warnings = _loss_warning(sensors, skipped)
     parts, places, infos = [], [], []

@@ -118,7 +118,7 @@ def format_lines(recording: Recording, form: LogFormat) -> Iterator[str]:
     for name, value in form.params.items():
         yield f"PARAM {name} {value} {format_seconds(first)} {form.host} {format_seconds(0)}\n"
     base, laser = _poses(recording)
-    for t in recording.in_turn(range(recording.n_scans)):
+    for t in recording.iter_scans(range(recording.n_scans)):
         stamp = int(recording.stamp_ns[t])
         times = f"{format_seconds(stamp)} {form.host} {format_seconds(stamp - first)}\n"
         if base is not None:
@@ -175,7 +175,7 @@ def _form(recording: Recording) -> LogFormat:
     reaches = laser_scan.range_limits(recording)
     kinds = _WITHOUT_POSES
     if recording.T_odom_base is not None:
-        near = all(round(reach.hit, _DIGITS) < _READS_AS_CODE for reach in reaches)
+        near = all(round(reach.longest_hit, _DIGITS) < _READS_AS_CODE for reach in reaches)
         kinds = _HALF_CIRCLE if near and _are_half_circles(fans, counts) else _WITH_ANGLES
     written = []
     for number, reach in enumerate(reaches):
@@ -218,14 +218,16 @@ def _are_half_circles(fans: Float, counts: NDArray[np.int64]) -> bool:
 
 def _declared(reach: laser_scan.RangeLimits) -> float:
     """A largest range that no reading of a hit reaches, with as many digits as readings have."""
-    limit = round(reach.limit(), _DIGITS)
-    return limit if round(reach.hit, _DIGITS) < limit else round(limit + 10**-_DIGITS, _DIGITS)
+    limit = round(reach.max_range(), _DIGITS)
+    return (
+        limit if round(reach.longest_hit, _DIGITS) < limit else round(limit + 10**-_DIGITS, _DIGITS)
+    )
 
 
 def _unusable(recording: Recording, number: int) -> float:
     """Zero, as lasers say it; not a number where frequent zeros would mean maximum range."""
     beams = unusable = 0
-    for t in recording.in_turn(np.flatnonzero(recording.sensor == number).tolist()):
+    for t in recording.iter_scans(np.flatnonzero(recording.sensor == number).tolist()):
         points = recording.points[recording.beams_of(t)]
         beams += len(points)
         unusable += int(np.count_nonzero(np.isnan(points[:, 0])))

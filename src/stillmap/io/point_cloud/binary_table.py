@@ -58,7 +58,7 @@ class TableLayout:
         """Bytes of one point."""
         return sum(field.size for field in self.fields)
 
-    def place(self, name: str) -> tuple[Field, int, int]:
+    def find_column(self, name: str) -> tuple[Field, int, int]:
         """The first column of this name, the byte and the number of the value it begins with.
 
         Raises:
@@ -99,7 +99,7 @@ def truncated_error(path: Path, found: int, promised: int) -> InputError:
 
 def _from_records(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
     check_record_size(layout)
-    places = [layout.place(name) for name in wanted]
+    places = [layout.find_column(name) for name in wanted]
     held = (layout.path.stat().st_size - layout.start) // layout.record
     if held < layout.rows:
         raise truncated_error(layout.path, max(held, 0), layout.rows)
@@ -123,7 +123,7 @@ def _from_records(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[N
 
 
 def _from_text(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
-    numbers = [layout.place(name)[2] for name in wanted]
+    numbers = [layout.find_column(name)[2] for name in wanted]
     if max(numbers) >= _MOST_COLUMNS:
         raise InputError("is damaged: too many columns", where=str(layout.path))
     lines = iter_text_lines(layout.path, layout.lines)

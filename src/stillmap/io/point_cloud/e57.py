@@ -167,7 +167,7 @@ def _cloud(path: Path, scan: int, origin: Origin, scratch: Path | None) -> Cloud
         stamp_ns = _stamp_ns(node)
     if found < promised:
         raise truncated_error(path, found, promised)
-    return Cloud(growing.finished(), T, stamp_ns=stamp_ns)
+    return Cloud(growing.finish(), T, stamp_ns=stamp_ns)
 
 
 def _fields(library: Any, node: Any, path: Path) -> dict[str, str]:

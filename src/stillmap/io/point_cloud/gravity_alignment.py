@@ -66,7 +66,7 @@ def _surfaces(recording: Recording, T: Float) -> _Surfaces:
     apart = max(1, columns // _ACROSS)
     points, normals = [np.empty((0, 3))], [np.empty((0, 3))]
     scans = np.unique(np.linspace(0, recording.n_scans - 1, _SCANS).astype(np.intp))
-    for scan in recording.in_turn(scans.tolist()):
+    for scan in recording.iter_scans(scans.tolist()):
         grid = recording.points[recording.beams_of(scan)].reshape(rows, columns, 3)
         hit = recording.hit[recording.beams_of(scan)].reshape(rows, columns)
         corners = np.where(hit[..., None], grid, np.nan)[::apart, ::apart].astype(np.float64)

@@ -203,7 +203,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     digits = max(6, len(str(recording.n_scans)))
     with atomic_folder(Path(path), MARK, overwrite) as folder:
         (folder / "velodyne").mkdir()
-        for scan in recording.in_turn(range(recording.n_scans)):
+        for scan in recording.iter_scans(range(recording.n_scans)):
             points, _ = scan_hits(recording, scan)
             rows = np.zeros((len(points), 4), "<f4")
             rows[:, :3] = points

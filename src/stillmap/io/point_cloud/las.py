@@ -66,7 +66,7 @@ def _cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
             found += len(block)
     if found < promised:
         raise truncated_error(path, found, promised)
-    return Cloud(points.finished())
+    return Cloud(points.finish())
 
 
 def _require_sound(path: Path) -> None:

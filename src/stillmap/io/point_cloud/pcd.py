@@ -148,7 +148,7 @@ def read_values(head: PcdHeader, wanted: list[str]) -> list[NDArray[Any]]:
 def _unpacked(layout: TableLayout, wanted: list[str]) -> list[NDArray[Any]]:
     """Columns that lie one after the other in one compressed piece."""
     check_record_size(layout)
-    places = [layout.place(name) for name in wanted]
+    places = [layout.find_column(name) for name in wanted]
     size = layout.rows * layout.record
     path = layout.path
     if size == 0:
@@ -228,7 +228,7 @@ def _cloud(path: Path, in_world: bool, origin: Origin) -> Cloud:
     found = read_values(head, ["x", "y", "z", *([time] if time else [])])
     points = np.stack(found[:3], axis=1)
     if head.T is None or np.array_equal(head.T, np.eye(4)):
-        points = origin.moved(points)
+        points = origin.shift(points)
     elif in_world:
         T = se2.inverse(head.T)
         points = points.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
@@ -276,7 +276,7 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
     T = sensor_poses(recording, recording.T_recorded_base)
     with atomic_folder(Path(path), MARK, overwrite) as folder:
         repeats = 0
-        for scan in recording.in_turn(range(recording.n_scans)):
+        for scan in recording.iter_scans(range(recording.n_scans)):
             stamp = int(recording.stamp_ns[scan])
             before = scan > 0 and stamp == recording.stamp_ns[scan - 1]
             repeats = repeats + 1 if before else 0

@@ -46,7 +46,7 @@ def _cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
     points = PointBuffer(origin, scratch)
     for block in read_columns(read_layout(path), ("x", "y", "z")):
         points.add(np.stack(block, axis=1))
-    return Cloud(points.finished())
+    return Cloud(points.finish())
 
 
 def read_layout(path: Path) -> TableLayout:

@@ -119,9 +119,9 @@ def reject_laser_poses(options: ReadOptions) -> None:
     Raises:
         InputError: there are such.
     """
-    options.require_lasers(1)
+    options.check_laser_count(1)
     given = options.laser(0)
-    if given.place != (None, None, None) or given.upside_down or given.fov is not None:
+    if given.pose != (None, None, None) or given.upside_down or given.fov is not None:
         raise InputError("the laser's place on the robot can be given for 2D recordings only")
 
 
@@ -249,20 +249,24 @@ class Origin:
     """
 
     def __init__(self, at: NDArray[np.float64] | None = None) -> None:
-        self.at = at
+        self.position = at
 
-    def moved(self, points: NDArray[Any]) -> NDArray[np.float32]:
+    def shift(self, points: NDArray[Any]) -> NDArray[np.float32]:
         """(n, 3) as seen from here, of points (n, 3) in metres as recorded."""
         points = np.asarray(points, np.float64)
-        if self.at is None:
-            self.at = _origin_of(points)
+        if self.position is None:
+            self.position = _origin_of(points)
         with np.errstate(over="ignore"):
-            return (points - (0.0 if self.at is None else self.at)).astype(np.float32)
+            return (points - (0.0 if self.position is None else self.position)).astype(np.float32)
 
     def notes(self) -> dict[str, Any]:
         """For Recording.source; known after the first cloud."""
-        moved = self.at is not None and bool(np.any(self.at != 0.0))
-        return {"origin": [float(v) for v in self.at]} if moved and self.at is not None else {}
+        moved = self.position is not None and bool(np.any(self.position != 0.0))
+        return (
+            {"origin": [float(v) for v in self.position]}
+            if moved and self.position is not None
+            else {}
+        )
 
     def warnings(self) -> list[str]:
         """What was assumed."""
@@ -289,10 +293,10 @@ class PointBuffer:
         self._points = ArrayBuilder(np.float32, (3,), scratch)
 
     def add(self, points: NDArray[Any]) -> None:
-        self._points.append(self._origin.moved(points))
+        self._points.append(self._origin.shift(points))
 
-    def finished(self) -> NDArray[np.float32]:
-        return self._points.finished()
+    def finish(self) -> NDArray[np.float32]:
+        return self._points.finish()
 
 
 CloudReader = Callable[[Path, Origin, Path | None], Cloud]

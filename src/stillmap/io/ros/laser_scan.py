@@ -112,7 +112,7 @@ class _ScanBuffer:
     def finish(self, skipped: SkippedRecords) -> "LaserScans":
         """All of them with time that does not run backwards; what falls out is counted."""
         self._pass_on()
-        ranges = self._ranges.finished()
+        ranges = self._ranges.finish()
         shapes = list(self.shapes)
         shape = np.asarray(self.shape, np.int32)
         n = np.array([s.n for s in shapes], np.int64)[shape]

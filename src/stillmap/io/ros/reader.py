@@ -238,7 +238,7 @@ def _build_laser_recording(
     found: BagContent, options: ReadOptions, scratch: Path | None
 ) -> Recording:
     used, T, placed, skipped, left_out = select_lasers(found, options)
-    options.require_lasers(len(used))
+    options.check_laser_count(len(used))
     warnings = [w for s in used for w in s.warnings] + base_frame.base_frame_warnings(placed)
     T_base_sensor, sensor, mirrored, infos, more = _find_mountings(used, T, placed, options)
     warnings += more
@@ -296,7 +296,7 @@ def _find_mountings(
         given = options.laser(number)
         if tilts:
             warnings.append(f"{scans.topic}: the laser is tilted; its scans are taken for level")
-        if not _moves(flat) or given.place != (None, None, None):
+        if not _moves(flat) or given.pose != (None, None, None):
             flat = flat[:1]
             x, y, theta = se2.parameters(flat)[0].tolist()
             place = extrinsics.override(

@@ -64,7 +64,7 @@ def write_recording(
         )
         sends = [bag.add_topic(f"/{one}", type) for one in number_names(name, len(frames))]
         drive = _driver(bag, recording)
-        for t in recording.in_turn(range(recording.n_scans)):
+        for t in recording.iter_scans(range(recording.n_scans)):
             drive(t)
             stamp, sensor = int(stamps[t]), int(recording.sensor[t])
             if lasers is None:
@@ -85,7 +85,7 @@ class LaserScanEncoder:
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._fans = laser_scan.beam_angles(recording)
-        self._range_max = [reach.limit() for reach in laser_scan.range_limits(recording)]
+        self._range_max = [reach.max_range() for reach in laser_scan.range_limits(recording)]
         self._time_increments, self._uneven = laser_scan.time_increments(recording)
 
     def ranges(self, t: int) -> NDArray[np.float32]:
@@ -158,7 +158,7 @@ def _cloud(bag: BagWriter, recording: Recording, t: int, frame: str) -> Any:
 
 def _cloud_losses(recording: Recording) -> Iterator[str]:
     free = 0
-    for t in recording.in_turn(range(recording.n_scans)):
+    for t in recording.iter_scans(range(recording.n_scans)):
         beams = recording.beams_of(t)
         seen = recording.points[beams][~recording.hit[beams]]
         free += int(np.count_nonzero(~np.isnan(seen).any(axis=1)))

@@ -107,8 +107,8 @@ def convert_to_beams(
         hit.append(hits)
         if times is not None:
             times.append(maker.times(its))
-    beam_time = None if times is None else times.finished()
-    return Beams(scan, offset, points.finished(), hit.finished(), beam_time)
+    beam_time = None if times is None else times.finish()
+    return Beams(scan, offset, points.finish(), hit.finish(), beam_time)
 
 
 def _split_into_runs(

@@ -45,7 +45,7 @@ def write(result: Exported, path: Path, kind: BagKind, *, overwrite: bool = Fals
         dynamic = [bag.add_topic(f"{name}_dynamic", message_writer.SCAN) for name in names]
         send_tf = bag.add_topic("/tf", message_writer.TRANSFORMS)
         show_objects = _shown_objects(bag, result)
-        for t in recording.in_turn(range(recording.n_scans), result.p_static):
+        for t in recording.iter_scans(range(recording.n_scans), result.p_static):
             stamp = stamps[t]
             send_tf(
                 stamp, message_writer.make_transforms(bag, stamp, [(MAP, BASE, result.poses[t])])
