@@ -103,18 +103,18 @@ def scores_of(result: stillmap.Result, prepared: Prepared) -> Scores:
     evidence, ghosts = result.evidence, _ghosts(result, prepared)
     walls, missed = _walls(result, prepared)
     layers = {
-        "known": evidence.looks > 0,
+        "known": evidence.observations > 0,
         "occupied": grid_of(result.map).occupied,
         "ghosts": ghosts,
         "walls": walls,
         "missed": missed,
     }
     scores = {what: float(np.count_nonzero(layers[what])) for what in _COUNTED}
-    scores["thin"] = float(np.count_nonzero(evidence.thin))
+    scores["thin"] = float(np.count_nonzero(evidence.thinly_observed))
     for what in ("ghosts", "missed"):
-        scores[f"thin {what}"] = float(np.count_nonzero(layers[what] & evidence.thin))
+        scores[f"thin {what}"] = float(np.count_nonzero(layers[what] & evidence.thinly_observed))
     for first, end in _classes():
-        among = (evidence.clear >= first) & (evidence.clear < end)
+        among = (evidence.unobstructed >= first) & (evidence.unobstructed < end)
         for what, cells in layers.items():
             scores[f"{what} {first}"] = float(np.count_nonzero(cells & among))
     return scores

@@ -153,11 +153,11 @@ def test_ground_under_what_stands_still():
     means = surface.elements()[1]
     low = means[:, 2] < 0.1
     ground = ground_from_surfels(surface, np.ones(len(means), np.float32), T[:, :3, 3])
-    assert ground.seen
-    assert ground.sensor == pytest.approx(1.8, abs=0.02)
-    np.testing.assert_allclose(ground.at(means[low, :2]), 0.0, atol=0.02)
+    assert ground.observed
+    assert ground.sensor_height == pytest.approx(1.8, abs=0.02)
+    np.testing.assert_allclose(ground.height_at(means[low, :2]), 0.0, atol=0.02)
     unknown = ground_from_surfels(surface, np.where(low, 0.1, 1.0).astype(np.float32), T[:, :3, 3])
-    assert not unknown.seen or unknown.sensor < 1.0  # roofs at most
+    assert not unknown.observed or unknown.sensor_height < 1.0  # roofs at most
 
 
 def test_how_far_it_is_lowered():

@@ -40,27 +40,27 @@ def courses(**changed):
 
 def test_the_last_state():
     # what comes and goes is not there, whatever was seen at last
-    shown = courses().shown("last")
+    shown = courses().p_in_map("last")
     np.testing.assert_allclose(shown, [0.91, 0.9, 0.2, 0.05], atol=1e-6)
     assert shown.dtype == np.float32
-    twice = courses(count=np.array([0, 2, 2, 2], np.int32)).shown("last")
+    twice = courses(count=np.array([0, 2, 2, 2], np.int32)).p_in_map("last")
     np.testing.assert_allclose(twice, [0.91, 0.9, 0.2, 0.05 + 0.9 * 0.9], atol=1e-6)
 
 
 def test_the_state_that_held_for_longest():
-    shown = courses().shown("majority")
+    shown = courses().p_in_map("majority")
     np.testing.assert_allclose(shown, [0.92, 0.1, 0.9, 0.95], atol=1e-6)
-    half = courses(occupied_share=np.full(4, 0.5, np.float32)).shown("majority")
+    half = courses(occupied_share=np.full(4, 0.5, np.float32)).p_in_map("majority")
     np.testing.assert_allclose(half, courses().p_static)
 
 
 @pytest.mark.parametrize("state", STATES)
 def test_what_changed_is_not_what_the_view_hides(state):
     # where both may be, what is listed as a change is shown as one
-    shown = courses().shown(state)
+    shown = courses().p_in_map(state)
     half = {name: 0.5 * getattr(courses(), name) for name in ("p_static", "p_changing")}
     np.testing.assert_allclose(
-        courses(**half, p_views=np.full(4, 0.5, np.float32)).shown(state), shown, atol=1e-6
+        courses(**half, p_views=np.full(4, 0.5, np.float32)).p_in_map(state), shown, atol=1e-6
     )
 
 
@@ -68,7 +68,7 @@ def test_what_changed_is_not_what_the_view_hides(state):
 def test_no_probability_exceeds_one(state):
     p = np.full(4, 0.6, np.float32)
     one = courses(p_static=p, p_changing=p, p_thing=np.ones(4, np.float32))
-    assert one.shown(state).max() == 1.0
+    assert one.p_in_map(state).max() == 1.0
 
 
 def row(p_changing, *, came=True, between=(10, 12), count=1, static=0.01, apart=1):
@@ -77,15 +77,15 @@ def row(p_changing, *, came=True, between=(10, 12), count=1, static=0.01, apart=
     return em.CellHistories(
         cells=np.column_stack([apart * np.arange(n), np.zeros(n)]).astype(np.int64),
         p_static=np.full(n, static, np.float32),
-        p_views=np.zeros(n, np.float32),
+        p_view_dependent=np.zeros(n, np.float32),
         p_changing=np.array(p_changing, np.float32),
-        p_thing=np.full(n, 0.9 if came else 0.1, np.float32),
+        p_object=np.full(n, 0.9 if came else 0.1, np.float32),
         occupied_share=np.full(n, 0.5, np.float32),
-        count=np.full(n, count, np.int32),
-        between=np.tile(np.array([between, between], np.int32), (n, 1, 1)),
-        covered=np.ones(n, np.float32),
-        share=0.1,
-        surface=None,
+        n_changes=np.full(n, count, np.int32),
+        change_bins=np.tile(np.array([between, between], np.int32), (n, 1, 1)),
+        p_in_cell=np.ones(n, np.float32),
+        changing_weight=0.1,
+        surfel_map=None,
     )
 
 
@@ -121,7 +121,7 @@ def test_what_is_not_one_thing_is_left_alone():
 
 def test_cells_that_came_beside_cells_that_left_are_another_thing():
     one = row(THIRD)
-    p_thing = one.p_thing.copy()
+    p_thing = one.p_object.copy()
     p_thing[6:] = 0.1
     np.testing.assert_allclose(decided(replace(one, p_thing=p_thing)), [0.9] * 6 + [0.1] * 10)
 
@@ -130,7 +130,7 @@ def test_cells_that_came_beside_cells_that_left_are_another_thing():
 def test_cells_that_changed_at_other_times_are_another_thing(looks, apart):
     # 10 to 12, and `looks` later: within four looks it may have been the same
     one = row(THIRD)
-    between = one.between.copy()
+    between = one.change_bins.copy()
     between[6:] += looks
     expected = [0.9] * 6 + [0.1] * 10 if apart else 0.8
     np.testing.assert_allclose(decided(replace(one, between=between)), expected)
@@ -175,11 +175,11 @@ def test_rounding_makes_nothing_impossible(monkeypatch):
     found = module.decode_histories(looks, em.EmOptions())
     static, change, share = module.label_cells(looks, em.EmOptions())
     assert static.tobytes() == found.p_static.tobytes()
-    assert share == found.share
+    assert share == found.changing_weight
     always = likelihood[:, 0]  # the only static class of these that is met from all around
     np.testing.assert_allclose(change, np.clip(changes[0] - np.log(always), -4, 4), atol=1e-4)
     assert np.ptp(change) == 8.0
-    for p in (found.p_static, found.p_views, found.p_changing):
+    for p in (found.p_static, found.p_view_dependent, found.p_changing):
         assert p.dtype == np.float32
         assert p.min() >= 0.0
         assert p.max() <= 1.0
@@ -279,7 +279,7 @@ def test_both_maps_are_of_the_same_courses(last, majority):
 
 def test_every_probability_is_one(last, majority):
     for (p_static, _), found in (last, majority):
-        for p in (found.p_static, found.p_changing, found.p_thing, found.occupied_share):
+        for p in (found.p_static, found.p_changing, found.p_object, found.occupied_share):
             assert p.dtype == np.float32
             assert p.min() >= 0.0
             assert p.max() <= 1.0
@@ -303,9 +303,9 @@ def test_when_it_was(seen, last):
 
 def test_how_much_of_the_time_it_was_there(last):
     _, found = last
-    share = found.occupied_share[(found.p_changing > 0.5) & (found.p_thing > 0.5)]
+    share = found.occupied_share[(found.p_changing > 0.5) & (found.p_object > 0.5)]
     assert np.median(share) == pytest.approx(80 / SECONDS, abs=0.01)
-    share = found.occupied_share[(found.p_changing > 0.5) & (found.p_thing < 0.5)]
+    share = found.occupied_share[(found.p_changing > 0.5) & (found.p_object < 0.5)]
     assert np.median(share) == pytest.approx(140 / SECONDS, abs=0.03)
 
 
@@ -343,7 +343,7 @@ def test_pieces_and_threads_change_no_bit(seen, last, monkeypatch, beams, thread
     monkeypatch.setattr(observations, "CHUNK_BEAMS", beams)
     (p_static, _), found = last_e_step(seen, threads=threads)
     assert p_static.tobytes() == last[0][0].tobytes()
-    assert found.between.tobytes() == last[1].between.tobytes()
+    assert found.change_bins.tobytes() == last[1].between.tobytes()
 
 
 @pytest.mark.parametrize("scans", [1, 2])
@@ -356,7 +356,7 @@ def test_so_short_a_recording_shows_no_change(scans):
 
 def test_nothing_hit():
     (p_static, _), found = last_e_step(watch([], 10), prior=0.8)
-    assert len(found.cells) == len(found.shown("last")) == 0
+    assert len(found.cells) == len(found.p_in_map("last")) == 0
     np.testing.assert_array_equal(p_static, 1)
 
 
@@ -366,5 +366,5 @@ def test_a_clock_that_leaps_by_decades_ends_nothing(seen):
     leaping = replace(seen.recording, stamp_ns=stamps)
     assert em.time_bin_index(leaping, 0.5).max() < 2**31
     _, found = em.final_e_step(leaping, seen.poses, RESOLUTION, em.EmOptions())
-    assert np.isfinite(found.shown("last")).all()
-    assert (found.count >= 0).all()
+    assert np.isfinite(found.p_in_map("last")).all()
+    assert (found.n_changes >= 0).all()

@@ -36,11 +36,16 @@ def evidence_of(recording, p_static, no_return=None, threads=1, **options):
     grid = _core.Grid2D(RESOLUTION)
     known = np.nan_to_num(p_static, nan=0.5)
     seen = em.add_trusted_beams(grid, recording, poses, known, no_return)
-    occupancy = em.make_occupancy_map(grid, seen=seen)
+    occupancy = em.make_occupancy_map(grid, observed=seen)
     chosen = em.EmOptions(evidence=em.EvidenceOptions(**options))
     found = em.count_observations(recording, poses, p_static, occupancy, no_return, chosen, threads)
-    assert found.looks.shape == found.clear.shape == found.thin.shape == occupancy.p_occupied.shape
-    assert found.looks.dtype == found.clear.dtype == np.uint16
+    assert (
+        found.observations.shape
+        == found.unobstructed.shape
+        == found.thinly_observed.shape
+        == occupancy.p_occupied.shape
+    )
+    assert found.observations.dtype == found.unobstructed.dtype == np.uint16
     return occupancy, found
 
 
@@ -70,21 +75,21 @@ def test_where_somebody_stood_the_place_is_not_known(visitors):
         (1.2, 0.5): (20, 20),
     }
     for place, (looks, clear) in told.items():
-        assert at(occupancy, found.looks, *place) == looks
-        assert at(occupancy, found.clear, *place) == clear
-        assert at(occupancy, found.thin, *place) == (clear < 3)
-    assert (found.clear <= found.looks).all()
+        assert at(occupancy, found.observations, *place) == looks
+        assert at(occupancy, found.unobstructed, *place) == clear
+        assert at(occupancy, found.thinly_observed, *place) == (clear < 3)
+    assert (found.unobstructed <= found.observations).all()
     known = ~np.isnan(occupancy.p_occupied)
-    np.testing.assert_array_equal(found.looks > 0, known)
-    np.testing.assert_array_equal(found.thin, known & (found.clear < 3))
+    np.testing.assert_array_equal(found.observations > 0, known)
+    np.testing.assert_array_equal(found.thinly_observed, known & (found.unobstructed < 3))
 
 
 def test_options(visitors):
     occupancy, found = evidence_of(*visitors, least=2, near=1.0)
-    assert (found.least, found.near) == (2, 1.0)
-    assert not at(occupancy, found.thin, 4.0, 1.8)
-    assert at(occupancy, found.clear, 1.2, 0.5) == 2
-    assert not evidence_of(*visitors, least=0)[1].thin.any()
+    assert (found.min_observations, found.mover_radius) == (2, 1.0)
+    assert not at(occupancy, found.thinly_observed, 4.0, 1.8)
+    assert at(occupancy, found.unobstructed, 1.2, 0.5) == 2
+    assert not evidence_of(*visitors, least=0)[1].thinly_observed.any()
 
 
 def test_scans_of_half_a_second_are_one_look(visitors):
@@ -93,8 +98,8 @@ def test_scans_of_half_a_second_are_one_look(visitors):
     ranges = np.linalg.norm(recording.points, axis=1).reshape(T, N)
     at_once = recording_of(ranges, np.ones((T, N), bool), 0.02 * np.arange(T))
     occupancy, found = evidence_of(at_once, e)
-    assert found.looks.max() == 1
-    assert found.thin.sum() == (~np.isnan(occupancy.p_occupied)).sum()
+    assert found.observations.max() == 1
+    assert found.thinly_observed.sum() == (~np.isnan(occupancy.p_occupied)).sum()
 
 
 def test_threads_and_chunks_do_not_matter(visitors, monkeypatch):
@@ -121,10 +126,12 @@ def test_beams_without_a_return_count_as_far_as_they_are_believed():
         (NoReturnModel(np.zeros((0, 2), np.int64), np.inf), (0, 0)),
     ):
         occupancy, found = evidence_of(recording, e, no_return)
-        np.testing.assert_array_equal(found.looks > 0, ~np.isnan(occupancy.p_occupied))
-        np.testing.assert_array_equal(found.clear, found.looks)  # what got lost met nobody
+        np.testing.assert_array_equal(found.observations > 0, ~np.isnan(occupancy.p_occupied))
+        np.testing.assert_array_equal(
+            found.unobstructed, found.observations
+        )  # what got lost met nobody
         # the map may end before
-        room = np.pad(found.looks, ((0, 40), (0, 40)))
+        room = np.pad(found.observations, ((0, 40), (0, 40)))
         assert tuple(int(at(occupancy, room, *place)) for place in here) == expected
 
 

@@ -29,11 +29,11 @@ def way_over(height, sensor=1.5):
 def test_a_slope_is_followed_and_tables_are_none_of_it(height):
     means, normals, table = floor_with_tables(np.random.default_rng(0), height)
     ground = ground_from(means, normals, way_over(height))
-    assert ground.seen
-    assert ground.sensor == pytest.approx(1.5, abs=0.03)
-    error = ground.at(means[~table, :2]) - (slope(*means[~table, :2].T) + height)
+    assert ground.observed
+    assert ground.sensor_height == pytest.approx(1.5, abs=0.03)
+    error = ground.height_at(means[~table, :2]) - (slope(*means[~table, :2].T) + height)
     assert np.abs(error).max() < 0.06  # over half of a square
-    below = means[table, 2] - ground.at(means[table, :2])
+    below = means[table, 2] - ground.height_at(means[table, :2])
     assert np.abs(below - 0.8).max() < 0.1
 
 
@@ -41,13 +41,13 @@ def test_walls_tell_nothing_of_the_ground():
     rng = np.random.default_rng(1)
     means = rng.uniform([-5, 3, 0], [25, 3.1, 3], (500, 3))
     ground = ground_from(means, np.tile([0.0, 1.0, 0.0], (500, 1)), way_over(0.0))
-    assert not ground.seen
-    assert ground.sensor == 0.0
-    assert np.isfinite(ground.z).all()
+    assert not ground.observed
+    assert ground.sensor_height == 0.0
+    assert np.isfinite(ground.height).all()
 
 
 def test_beyond_the_edge_it_is_that_of_the_edge():
     means, normals, _ = floor_with_tables(np.random.default_rng(2))
     ground = ground_from(means, normals, way_over(0.0))
-    far = ground.at(np.array([[1e4, 0.0], [-1e4, 0.0]]))
+    far = ground.height_at(np.array([[1e4, 0.0], [-1e4, 0.0]]))
     assert far[0] > 1.0 > -0.2 > far[1]

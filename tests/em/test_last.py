@@ -97,8 +97,8 @@ def test_without_views_no_course_knows_of_them(views):
     recording, T, _ = seen(ROUNDS, by_views(ROUNDS))
     options = em.EmOptions(dwell=em.DwellOptions(views=views))
     _, courses = em.final_e_step(recording, T, 0.05, options)
-    assert (courses.p_views.max() > 0.9) == views
-    assert (courses.p_views > 0.0).any() == views
+    assert (courses.p_view_dependent.max() > 0.9) == views
+    assert (courses.p_view_dependent > 0.0).any() == views
 
 
 APART = 1.2  # m, of two lasers

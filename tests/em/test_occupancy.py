@@ -163,7 +163,7 @@ def test_a_part_of_a_map_is_what_the_whole_has_there(printed, monkeypatch):
     monkeypatch.setattr("stillmap.em.occupancy_grid._TILE", 7)
     again = em.make_occupancy_map(grid, occupied)
     box = em.GridWindow(first + np.array([20, -2]), (12, 15))
-    part = em.make_occupancy_map(grid, occupied, box=box)
+    part = em.make_occupancy_map(grid, occupied, window=box)
     assert part.origin == pytest.approx((*(box.first_cell * RESOLUTION), 0.0))
     for name, nothing in (("p_occupied", np.nan), ("alpha", 0.0), ("beta", 0.0)):
         all_of_it = getattr(whole, name)

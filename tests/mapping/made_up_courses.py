@@ -36,15 +36,15 @@ def course(
     return em.CellHistories(
         cells=np.asarray(cells, np.int64),
         p_static=np.full(n, static, np.float32),
-        p_views=np.zeros(n, np.float32),
+        p_view_dependent=np.zeros(n, np.float32),
         p_changing=np.full(n, p, np.float32),
-        p_thing=np.full(n, 0.97 if there else 0.02, np.float32),
+        p_object=np.full(n, 0.97 if there else 0.02, np.float32),
         occupied_share=np.full(n, share, np.float32),
-        count=np.full(n, len(between) if count is None else count, np.int32),
-        between=np.tile(np.array(ends, np.int32), (n, 1, 1)),
-        covered=np.ones(n, np.float32),
-        share=0.1,
-        surface=None,
+        n_changes=np.full(n, len(between) if count is None else count, np.int32),
+        change_bins=np.tile(np.array(ends, np.int32), (n, 1, 1)),
+        p_in_cell=np.ones(n, np.float32),
+        changing_weight=0.1,
+        surfel_map=None,
     )
 
 
@@ -56,8 +56,8 @@ def together(*parts: em.CellHistories) -> em.CellHistories:
             for name in em.CellHistories.__dataclass_fields__
             if name not in ("share", "surface")
         },
-        share=0.1,
-        surface=None,
+        changing_weight=0.1,
+        surfel_map=None,
     )
 
 

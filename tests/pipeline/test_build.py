@@ -131,21 +131,23 @@ def test_the_labels_written_follow_from_the_map_written(room, tmp_path):
 def test_the_looks_that_the_map_rests_on(room, estimator, tmp_path):
     result = stillmap.build(room.recording, options(estimator, max_iterations=1))
     found, known = result.evidence, ~np.isnan(result.map.p_occupied)
-    assert found.looks.shape == known.shape
+    assert found.observations.shape == known.shape
     # to the cell: what is known has been looked at, and nothing else has
-    np.testing.assert_array_equal(found.looks > 0, known)
-    np.testing.assert_array_equal(found.thin, known & (found.clear < 3))
-    assert (found.clear <= found.looks).all()
-    assert 0.01 < found.thin[known].mean() < 0.5
+    np.testing.assert_array_equal(found.observations > 0, known)
+    np.testing.assert_array_equal(found.thinly_observed, known & (found.unobstructed < 3))
+    assert (found.unobstructed <= found.observations).all()
+    assert 0.01 < found.thinly_observed[known].mean() < 0.5
     assert "evidence" in result.stages
     if estimator == "stillmap":  # the others call too few of the beams dynamic at first
-        assert (found.clear < found.looks).any()
+        assert (found.unobstructed < found.observations).any()
     threaded = stillmap.build(
         room.recording, dataclasses.replace(result.options, threads=3), poses=result.poses
     )
-    np.testing.assert_array_equal(found.clear, threaded.evidence.clear)
+    np.testing.assert_array_equal(found.unobstructed, threaded.evidence.unobstructed)
     result.save(tmp_path / "out")
-    np.testing.assert_array_equal(np.load(tmp_path / "out/map.npz")["clear_looks"], found.clear)
+    np.testing.assert_array_equal(
+        np.load(tmp_path / "out/map.npz")["clear_looks"], found.unobstructed
+    )
 
 
 @with_any_estimator

@@ -120,17 +120,17 @@ def test_what_is_not_listed_stays_what_it_is_without_changes():
         result.seen, result.poses, result.map.resolution, result.options.em
     )
     cells = {tuple(cell) for one in result.changes for cell in one.cells.tolist()}
-    element = courses.surface.elements_of(
+    element = courses.surfel_map.elements_of(
         result.seen.points, result.seen.hit, result.seen.offset,
         result.seen.T_map_sensor(result.poses),
     )  # fmt: skip
     of_cells = np.array([tuple(cell) in cells for cell in courses.cells.tolist()])
     there = (element >= 0) & of_cells[element]
     assert 0.01 < there.mean() < 0.3
-    shown = courses.shown("last")[element]
+    shown = courses.p_in_map("last")[element]
     np.testing.assert_array_equal(result.p_static, np.where(there, shown, without.p_static))
     assert (result.p_static != without.p_static).mean() > 0.01
-    assert result.learned == {**without.learned, "changing": round(courses.share, 6)}
+    assert result.learned == {**without.learned, "changing": round(courses.changing_weight, 6)}
 
 
 def test_a_crate_is_no_object_on_its_way_and_people_are():

@@ -32,9 +32,9 @@ def test_the_looks_that_it_rests_on(tmp_path, result):
         for name, dtype in more.items():
             assert read[name].dtype == dtype
             assert read[name].shape == result.map.p_occupied.shape
-        np.testing.assert_array_equal(read["looks"], result.evidence.looks)
-        np.testing.assert_array_equal(read["clear_looks"], result.evidence.clear)
-        np.testing.assert_array_equal(read["thin"], result.evidence.thin)
+        np.testing.assert_array_equal(read["looks"], result.evidence.observations)
+        np.testing.assert_array_equal(read["clear_looks"], result.evidence.unobstructed)
+        np.testing.assert_array_equal(read["thin"], result.evidence.thinly_observed)
 
 
 def test_equal_maps_give_equal_bytes_whatever_their_layout(tmp_path, result):

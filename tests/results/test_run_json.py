@@ -58,7 +58,7 @@ def test_areas(tmp_path, result):
     area = written(tmp_path, result)["area"]
     known = np.count_nonzero(~np.isnan(result.map.p_occupied))
     assert area["known"] == round(0.01 * known, 6)
-    assert area["thin"] == round(0.01 * np.count_nonzero(result.evidence.thin), 6)
+    assert area["thin"] == round(0.01 * np.count_nonzero(result.evidence.thinly_observed), 6)
     assert 0 < area["thin"] < area["known"]
 
 

@@ -20,7 +20,7 @@ def paper_e_step(
     """e of (6), (8) for every beam, and (5) at the map of `grid`."""
     e = recording.allocate_per_beam(np.float32)
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in iter_chunks(recording, beside=[e]):
+    for scans, beams, offset in iter_chunks(recording, release=[e]):
         e[beams] = _core.e_step(
             grid,
             recording.points[beams],
@@ -44,7 +44,7 @@ def log_likelihood(
     """(5) and the bound of EM, at the map of `grid`."""
     total = np.zeros(4)
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in iter_chunks(recording, beside=[e]):
+    for scans, beams, offset in iter_chunks(recording, release=[e]):
         per_scan = _core.log_likelihood(
             grid,
             recording.points[beams],
@@ -78,7 +78,7 @@ def hit_ratio_e_step(
     # (8) with prior 1 - threshold is exactly r (1 - threshold) / (r (1 - threshold) + ...)
     found = paper_e_step(recording, poses, grid, 1.0 - threshold, threads)
     p = found.p_static
-    for _, beams, _ in iter_chunks(recording, beside=[p]):
+    for _, beams, _ in iter_chunks(recording, release=[p]):
         p[beams] = fill_beams(
             recording.points[beams], recording.hit[beams], p[beams], 1.0 - threshold
         )

@@ -70,30 +70,32 @@ class CellHistories:
 
     cells: NDArray[np.int64]
     p_static: NDArray[np.float32]
-    p_views: NDArray[np.float32]
+    p_view_dependent: NDArray[np.float32]
     p_changing: NDArray[np.float32]
-    p_thing: NDArray[np.float32]
+    p_object: NDArray[np.float32]
     occupied_share: NDArray[np.float32]
-    count: NDArray[np.int32]
-    between: NDArray[np.int32]
-    covered: NDArray[np.float32]
-    share: float
-    surface: SurfelMap
+    n_changes: NDArray[np.int32]
+    change_bins: NDArray[np.int32]
+    p_in_cell: NDArray[np.float32]
+    changing_weight: float
+    surfel_map: SurfelMap
 
     @property
-    def stands(self) -> NDArray[np.float32]:
+    def p_unchanged(self) -> NDArray[np.float32]:
         """(E,) probability that what is there never left."""
-        return self.p_static + self.p_views
+        return self.p_static + self.p_view_dependent
 
-    def shown(self, state: MapState) -> NDArray[np.float32]:
+    def p_in_map(self, state: MapState) -> NDArray[np.float32]:
         """(E,) probability that the map has something there.
 
         In its last state, what comes and goes is not there: nobody knows for how long. It is asked
         of places that are known to have changed, where it was not the view that did.
         """
-        last = np.where(self.count < MIN_RECURRING_CHANGES, self.p_thing, np.float32(0.0))
+        last = np.where(self.n_changes < MIN_RECURRING_CHANGES, self.p_object, np.float32(0.0))
         there = last if state == "last" else (self.occupied_share > 0.5).astype(np.float32)
-        p = (self.p_static + self.p_changing * there) / np.maximum(1.0 - self.p_views, _POSSIBLE)
+        p = (self.p_static + self.p_changing * there) / np.maximum(
+            1.0 - self.p_view_dependent, _POSSIBLE
+        )
         return np.asarray(np.minimum(p, 1.0), np.float32)
 
 
@@ -116,9 +118,9 @@ def decode_histories(looks: Observations, options: EmOptions) -> CellHistories:
         CellHistories(
             cells=surfel_cells(looks.surface),
             **of_all,
-            covered=probability_in_cell(looks.surface),
-            share=float(shares[-1]),
-            surface=looks.surface,
+            p_in_cell=probability_in_cell(looks.surface),
+            changing_weight=float(shares[-1]),
+            surfel_map=looks.surface,
         )
     )
 
@@ -220,22 +222,22 @@ def _posterior(
 def _as_wholes(courses: CellHistories) -> CellHistories:
     """Cells side by side that changed alike are of one thing: a third of them decides for all."""
     of = np.flatnonzero(
-        (courses.count > 0)
-        & (courses.count < MIN_RECURRING_CHANGES)
+        (courses.n_changes > 0)
+        & (courses.n_changes < MIN_RECURRING_CHANGES)
         & (courses.p_changing > _POSSIBLE)
-        & (courses.stands < 0.5)
+        & (courses.p_unchanged < 0.5)
     )
     pairs = neighbor_pairs(courses.cells[of], _BESIDE)
     i, j = pairs.T
-    before, after = courses.between[of, 1].T
-    came = courses.p_thing[of] > 0.5
+    before, after = courses.change_bins[of, 1].T
+    came = courses.p_object[of] > 0.5
     at_once = np.maximum(before[i], before[j]) < np.minimum(after[i], after[j]) + _LOOKS_APART
     p_changing = courses.p_changing.copy()
     for one in connected_components(pairs[at_once & (came[i] == came[j])], len(of)):
         if len(one) >= _WHOLE:
             cells = of[one]
             decided = np.quantile(p_changing[cells], 1.0 - _DECIDE, method="lower")
-            p_changing[cells] = np.minimum(decided, 1.0 - courses.stands[cells])
+            p_changing[cells] = np.minimum(decided, 1.0 - courses.p_unchanged[cells])
     return dataclasses.replace(courses, p_changing=p_changing)
 
 
@@ -271,12 +273,12 @@ def select_changed_cells(courses: CellHistories) -> ChangedCells:
     A car that parks and leaves is some hundred cells among a million: each of them alone is more
     probably something that stands still and was missed for a while.
     """
-    odds = _log_odds(courses.p_changing) - _log_odds(np.array([courses.share]))
+    odds = _log_odds(courses.p_changing) - _log_odds(np.array([courses.changing_weight]))
     of = np.flatnonzero(
-        (courses.count > 0) & (courses.count < MIN_RECURRING_CHANGES) & (odds > _TELLS)
+        (courses.n_changes > 0) & (courses.n_changes < MIN_RECURRING_CHANGES) & (odds > _TELLS)
     )
     return ChangedCells(
-        courses.cells[of], courses.p_thing[of], courses.count[of], courses.between[of]
+        courses.cells[of], courses.p_object[of], courses.n_changes[of], courses.change_bins[of]
     )
 
 

@@ -29,11 +29,11 @@ class Coverage:
         near: metres, see EvidenceOptions.
     """
 
-    looks: NDArray[np.uint16]
-    clear: NDArray[np.uint16]
-    thin: NDArray[np.bool_]
-    least: int
-    near: float
+    observations: NDArray[np.uint16]
+    unobstructed: NDArray[np.uint16]
+    thinly_observed: NDArray[np.bool_]
+    min_observations: int
+    mover_radius: float
 
 
 def count_observations(
@@ -60,12 +60,12 @@ def count_observations(
     counts = _core.LookCounts2D(
         occupancy.resolution,
         radius=near,
-        stops=None if no_return is None else no_return.stops,
-        beyond=0.0 if no_return is None else no_return.beyond,
+        stops=None if no_return is None else no_return.stop_cells,
+        beyond=0.0 if no_return is None else no_return.end_margin,
     )
     look = time_bin_index(recording, options.dwell.look)
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in iter_chunks(recording, look, beside=[p_static]):
+    for scans, beams, offset in iter_chunks(recording, look, release=[p_static]):
         counts.add(
             recording.points[beams],
             recording.hit[beams],
@@ -75,7 +75,7 @@ def count_observations(
             look[scans],
             threads,
         )
-    box = occupancy.box
+    box = occupancy.window
     looks, clear = counts.dense(box.first_cell.tolist(), box.shape)
     thin = (clear < least) & ~np.isnan(occupancy.p_occupied)
     return Coverage(looks, clear, thin, least, near)

@@ -90,7 +90,7 @@ def _tracked(
         label_people(recording, poses, options.tracker),
         recording.allocate_per_beam(np.float32),
     )
-    for _, beams, _ in iter_chunks(recording, beside=[people, e]):
+    for _, beams, _ in iter_chunks(recording, release=[people, e]):
         kept = (~people[beams]).astype(np.float32)
         e[beams] = fill_beams(recording.points[beams], recording.hit[beams], kept, options.prior)
     grid = _core.Grid2D(resolution)
@@ -106,16 +106,16 @@ def add_recording(
     e: NDArray[np.float32] | None,
     threads: int = 1,
     *,
-    hits_alone: bool = False,
+    hits_only: bool = False,
 ) -> None:
     """Adds the sums of (10) of all scans at given poses; e = None counts every hit as static.
 
     With `hits_alone` beams without a return are left out.
     """
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in iter_chunks(recording, beside=[] if e is None else [e]):
+    for scans, beams, offset in iter_chunks(recording, release=[] if e is None else [e]):
         points, hit = recording.points[beams], recording.hit[beams]
-        if hits_alone:
+        if hits_only:
             points = np.where(hit[:, None], points, np.float32(np.nan))
         weights = np.ones(len(hit), np.float32) if e is None else e[beams]
         _core.add_beams(grid, points, hit, weights, offset, T_map_sensor[scans], threads)
@@ -126,7 +126,7 @@ def recount_as_static(
 ) -> None:
     """Makes sums that were added with e those of every hit counted as static, to the bit."""
     T_map_sensor = recording.T_map_sensor(poses)
-    for scans, beams, offset in iter_chunks(recording, beside=[e]):
+    for scans, beams, offset in iter_chunks(recording, release=[e]):
         points, hit, T = recording.points[beams], recording.hit[beams], T_map_sensor[scans]
         _core.add_ends(grid, points, hit, e[beams], offset, T, remove=True)
         _core.add_ends(grid, points, hit, np.ones(len(hit), np.float32), offset, T)
@@ -147,7 +147,7 @@ def add_trusted_beams(
     if no_return is None:
         add_recording(grid, recording, poses, e, threads)
         return None
-    add_recording(grid, recording, poses, e, threads, hits_alone=True)
+    add_recording(grid, recording, poses, e, threads, hits_only=True)
     rest = _core.Grid2D(grid.resolution, grid.approach)
     T_map_sensor = recording.T_map_sensor(poses)
     for scans, beams, offset in iter_chunks(recording):

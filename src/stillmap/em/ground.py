@@ -35,19 +35,19 @@ class GroundMap:
         seen: whether any ground was seen at all.
     """
 
-    z: Float
+    height: Float
     corner: Float
-    sensor: float
-    seen: bool
+    sensor_height: float
+    observed: bool
 
-    def at(self, xy: Float) -> Float:
+    def height_at(self, xy: Float) -> Float:
         """(N,) height at places (N, 2) in metres; beyond the edge that of the edge."""
-        H, W = self.z.shape
+        H, W = self.height.shape
         column, row = (  # one after the other: rows of two numbers are slow
             np.floor((x - corner) / _SQUARE).astype(np.int64).clip(0, last)
             for x, corner, last in zip(xy.T, self.corner, (W - 1, H - 1), strict=True)
         )
-        return np.asarray(self.z.take(row * W + column))
+        return np.asarray(self.height.take(row * W + column))
 
 
 def estimate_ground(
@@ -63,7 +63,7 @@ def estimate_ground(
     """
     T_map_sensor = recording.T_map_sensor(poses)
     surface = _core.Surface3D(_CELL)
-    for scans, beams, offset in iter_chunks(recording, beside=[p_static]):
+    for scans, beams, offset in iter_chunks(recording, release=[p_static]):
         static = recording.hit[beams] & (p_static[beams] >= _BELIEVED)
         surface.add_end_points(
             recording.points[beams], static, offset, T_map_sensor[scans], threads=threads

@@ -65,7 +65,7 @@ def score_held_out_scans(
     T_map_sensor = recording.T_map_sensor(poses)
     kind = _core.StaticShares2D if recording.dimension == 2 else _core.StaticShares3D
     shares = kind(resolution)
-    for scans, beams, offset in iter_chunks(recording, beside=[e]):
+    for scans, beams, offset in iter_chunks(recording, release=[e]):
         points, hit = recording.points[beams], recording.hit[beams]
         shares.add(points, hit, e[beams], offset, T_map_sensor[scans], held[scans])
     gain, count = 0.0, 0.0

@@ -51,8 +51,8 @@ def iter_chunks(
     recording: Recording,
     group: NDArray[np.int64] | None = None,
     *,
-    groups: int = 1,
-    beside: Sequence[NDArray[Any]] = (),
+    min_groups: int = 1,
+    release: Sequence[NDArray[Any]] = (),
 ) -> Iterator[Chunk]:
     """Chunks of about CHUNK_BEAMS beams; scans of equal `group` (T,), rising, stay together.
 
@@ -66,11 +66,11 @@ def iter_chunks(
         end = min(max(end, first + 1), recording.n_scans)
         if group is not None and end < recording.n_scans:
             start = int(np.searchsorted(group, group[end]))  # of the group that would be cut
-            end = max(start, _after(group, offset, first, max(groups, 1)))
+            end = max(start, _after(group, offset, first, max(min_groups, 1)))
         beams = slice(int(offset[first]), int(offset[end]))
         within = np.ascontiguousarray(offset[first : end + 1] - offset[first])
         yield Chunk(slice(first, end), beams, within)
-        recording.release_pages(*beside)
+        recording.release_pages(*release)
         first = end
 
 
@@ -269,7 +269,7 @@ def add_observations(
     look, D = time_bin_index(recording, seconds), recording.dimension
     T_map_sensor = recording.T_map_sensor(poses)
     place = np.ascontiguousarray(poses[:, :D, D])
-    for scans, beams, offset in iter_chunks(recording, look, groups=_LOOKS_EACH * threads):
+    for scans, beams, offset in iter_chunks(recording, look, min_groups=_LOOKS_EACH * threads):
         dwell.add(
             recording.points[beams],
             recording.hit[beams],

@@ -62,7 +62,7 @@ class OccupancyMap:
     resolution: float
 
     @property
-    def box(self) -> GridWindow:
+    def window(self) -> GridWindow:
         """Which cells these are."""
         first_cell = np.round(np.array(self.origin[:2]) / self.resolution).astype(np.int64)
         height, width = self.p_occupied.shape
@@ -72,8 +72,8 @@ class OccupancyMap:
 def make_occupancy_map(
     grid: Grid,
     occupied: CellProbabilities | None = None,
-    seen: ObservedCells | None = None,
-    box: GridWindow | None = None,
+    observed: ObservedCells | None = None,
+    window: GridWindow | None = None,
 ) -> OccupancyMap:
     """The closed-form maximum (15) of the counts in a grid, or an estimator's own probabilities.
 
@@ -87,18 +87,18 @@ def make_occupancy_map(
     """
     if not isinstance(grid, _core.Grid2D):
         raise ValueError("grid: expected one of 2 dimensions")
-    if seen is not None:
-        box = GridWindow(seen.first_cell, seen.cells.shape)
-    box = box or _whole(grid)
-    p_occupied = np.full(box.shape, np.nan, np.float32)
-    a, b = np.zeros(box.shape, np.float32), np.zeros(box.shape, np.float32)
-    for at, alpha, beta in _tiles(grid, box):
+    if observed is not None:
+        window = GridWindow(observed.first_cell, observed.cells.shape)
+    window = window or _whole(grid)
+    p_occupied = np.full(window.shape, np.nan, np.float32)
+    a, b = np.zeros(window.shape, np.float32), np.zeros(window.shape, np.float32)
+    for at, alpha, beta in _tiles(grid, window):
         p_occupied[at], a[at], b[at] = _probabilities(alpha, beta, occupied), alpha, beta
     if occupied is not None:
-        _lay_over(p_occupied, occupied, box.first_cell)
-    if seen is not None:
-        p_occupied[~seen.cells] = np.nan
-    x, y = (float(c) * grid.resolution for c in box.first_cell)
+        _lay_over(p_occupied, occupied, window.first_cell)
+    if observed is not None:
+        p_occupied[~observed.cells] = np.nan
+    x, y = (float(c) * grid.resolution for c in window.first_cell)
     return OccupancyMap(p_occupied, a, b, (x, y, 0.0), grid.resolution)
 
 

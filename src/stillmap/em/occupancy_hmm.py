@@ -128,7 +128,7 @@ def _of_beams(
     """(M,) what is known (E,) of the element that each beam ended in."""
     found = np.append(static, np.float32(prior))  # -1: no element
     e = recording.allocate_per_beam(np.float32)
-    for scans, beams, offset in iter_chunks(recording, beside=[e]):
+    for scans, beams, offset in iter_chunks(recording, release=[e]):
         points, hit = recording.points[beams], recording.hit[beams]
         element = surface.elements_of(points, hit, offset, T_map_sensor[scans], threads)
         known = fill_beams(points, hit, found.take(element), prior)
@@ -213,7 +213,7 @@ def e_step_3d(
     return replace(
         found,
         learned={**found.learned, "changing": round(told.share, 6)},
-        changed=select_changed_cells(decode_histories(looks, options)) if listed else None,
+        changed_cells=select_changed_cells(decode_histories(looks, options)) if listed else None,
         ground=ground,
     )
 

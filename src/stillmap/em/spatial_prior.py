@@ -72,14 +72,14 @@ def select_obstacles(
     ground: GroundMap, surface: SurfelMap, options: BodyOptions
 ) -> ObstacleSurfels | None:
     """What stands on the ground; None where none was seen, and nobody knows, or wants to."""
-    if not (options.enabled and ground.seen):
+    if not (options.enabled and ground.observed):
         return None
     if not isinstance(surface, _core.Surface3D):
         raise TypeError("surface: expected one in space")
     stands, height = np.empty(surface.size, np.bool_), np.empty(surface.size, np.float32)
     for rows in iter_surfel_rows(surface):
         means = surface.elements(rows)[1]
-        below = ground.at(means[:, :2])
+        below = ground.height_at(means[:, :2])
         above = means[:, 2] - below
         stands[slice(*rows)] = (above > options.low) & (above < options.high)
         height[slice(*rows)] = below

@@ -25,9 +25,9 @@ class ChangedCells:
     """
 
     cells: NDArray[np.int64]
-    p_thing: NDArray[np.float32]
-    count: NDArray[np.int32]
-    between: NDArray[np.int32]
+    p_object: NDArray[np.float32]
+    n_changes: NDArray[np.int32]
+    change_bins: NDArray[np.int32]
 
 
 Grid = _core.Grid2D | _core.Grid3D
@@ -71,8 +71,8 @@ class NoReturnModel:
         beyond: metres before their end from which on they say nothing; inf: all of their way.
     """
 
-    stops: NDArray[np.int64]
-    beyond: float
+    stop_cells: NDArray[np.int64]
+    end_margin: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class EStepResult:
     occupied: CellProbabilities | None = None
     learned: dict[str, object] = field(default_factory=dict)
     no_return: NoReturnModel | None = None
-    changed: "ChangedCells | None" = None
+    changed_cells: "ChangedCells | None" = None
     ground: "GroundMap | None" = None
 
 

@@ -53,23 +53,23 @@ class _Cells:
 
     cells: NDArray[np.int64]
     p_changing: NDArray[np.float32]
-    p_thing: NDArray[np.float32]
-    stands: NDArray[np.float32]
-    count: NDArray[np.int32]
-    between: NDArray[np.int32]
+    p_object: NDArray[np.float32]
+    p_unchanged: NDArray[np.float32]
+    n_changes: NDArray[np.int32]
+    change_bins: NDArray[np.int32]
 
     @classmethod
     def of(cls, changed: ChangedCells, least: float, looks: float) -> "_Cells":
         """Those that were as before, and otherwise, for so many looks of all of them at least."""
-        before, after = changed.between[..., 0], changed.between[..., 1]
+        before, after = changed.change_bins[..., 0], changed.change_bins[..., 1]
         once = (after[:, 1] >= least) & (looks - before[:, 1] >= least)
         twice = before[:, 1] - after[:, 0] >= least
-        kept = np.flatnonzero(np.where(changed.count == 1, once, twice))
+        kept = np.flatnonzero(np.where(changed.n_changes == 1, once, twice))
         return cls(
             cells=changed.cells[kept],
             p_changing=np.ones(len(kept), np.float32),
-            p_thing=changed.p_thing[kept],
-            stands=np.zeros(len(kept), np.float32),
-            count=changed.count[kept],
-            between=changed.between[kept],
+            p_object=changed.p_object[kept],
+            p_unchanged=np.zeros(len(kept), np.float32),
+            n_changes=changed.n_changes[kept],
+            change_bins=changed.change_bins[kept],
         )

@@ -65,7 +65,7 @@ def make_planar_recording(
     )
 
 
-_DIRECTIONS = 2048  # of the beams of a scan; at 50 m 15 cm apart
+DIRECTIONS = 2048  # of the beams of a scan; at 50 m 15 cm apart
 
 _ABOVE = 0.05  # m by which the band reaches above the sensor
 
@@ -111,7 +111,7 @@ def project_to_plane(
     """
     T_map_sensor = recording.T_map_sensor(poses)
     planar_poses = se2.project_to_plane(T_map_sensor)
-    top = max(options.high, ground.sensor + _ABOVE)
+    top = max(options.high, ground.sensor_height + _ABOVE)
     scratch, offset = recording.scratch, np.zeros(recording.n_scans + 1, np.int64)
     ends, hits = ArrayBuilder(np.float32, (2,), scratch), ArrayBuilder(np.bool_, (), scratch)
     numbers = ArrayBuilder(np.intp, (), scratch)
@@ -148,14 +148,14 @@ def _of_scan(
     low, high, top = heights
     at = np.flatnonzero(finite_rows(points) & (hit | open_space))
     end: Float = points.take(at, axis=0).astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-    start = T[:3, 3] - [0.0, 0.0, ground.at(T[None, :2, 3])[0]]
-    above: Float = end[:, 2] - ground.at(end[:, :2])
+    start = T[:3, 3] - [0.0, 0.0, ground.height_at(T[None, :2, 3])[0]]
+    above: Float = end[:, 2] - ground.height_at(end[:, :2])
     stands = hit[at] & (above >= low) & (above <= high)
     share = _share_within(start[2], above, low, top)
     way = (end[:, :2] - T[:2, 3]) * share[:, None]
     length = np.sqrt(np.square(way[:, 0]) + np.square(way[:, 1]))
-    direction = np.floor(np.arctan2(way[:, 1], way[:, 0]) * (_DIRECTIONS / (2.0 * np.pi)))
-    direction = direction.astype(np.int64) % _DIRECTIONS
+    direction = np.floor(np.arctan2(way[:, 1], way[:, 0]) * (DIRECTIONS / (2.0 * np.pi)))
+    direction = direction.astype(np.int64) % DIRECTIONS
     kept = _kept(direction, length, stands, cell)
     return T[:2, 3] + way[kept], stands[kept], at[kept]
 
@@ -167,7 +167,7 @@ def _kept(direction: Index, length: Float, stands: NDArray[np.bool_], cell: floa
     group = direction * (rank.max(initial=0) + 1) + rank
     hits, others = np.flatnonzero(stands), np.flatnonzero(~stands)
     hits = hits[first_index_per_group(group[hits])]
-    longest = np.zeros(_DIRECTIONS)
+    longest = np.zeros(DIRECTIONS)
     np.maximum.at(longest, direction[others], length[others])
     others = others[length[others] == longest[direction[others]]]
     others = others[first_index_per_group(direction[others])]
@@ -195,7 +195,7 @@ def project_cells(
         cell: metres of one cell.
     """
     middle = np.asarray((known.cells + 0.5) * cell, np.float64)
-    above = middle[:, 2] - ground.at(middle[:, :2])
+    above = middle[:, 2] - ground.height_at(middle[:, :2])
     inside = (above >= options.low) & (above <= options.high)
     columns, of = np.unique(known.cells[inside, :2], axis=0, return_inverse=True)
     p = np.zeros(len(columns), np.float32)

@@ -44,18 +44,18 @@ def relabel_changes(
         raise ValueError("occupied: expected the cells of the last E-step")
     listed = np.isin(_keys(courses.cells), _keys(np.concatenate([one.cells for one in changes])))
     shown, out, T_map_sensor = (
-        courses.shown(state),
+        courses.p_in_map(state),
         arrays.copy(p_static, recording.scratch),
         recording.T_map_sensor(poses),
     )
-    for scans, beams, offset in iter_chunks(recording, beside=[out]):
-        element = courses.surface.elements_of(
+    for scans, beams, offset in iter_chunks(recording, release=[out]):
+        element = courses.surfel_map.elements_of(
             recording.points[beams], recording.hit[beams], offset, T_map_sensor[scans], threads
         )
         ended = np.flatnonzero(element >= 0)
         ended = ended[listed[element[ended]]]
         out[beams][ended] = shown[element[ended]]
-    p_occupied = np.where(listed, shown * courses.covered, occupied.p_occupied)
+    p_occupied = np.where(listed, shown * courses.p_in_cell, occupied.p_occupied)
     return out, dataclasses.replace(occupied, p_occupied=p_occupied)
 
 

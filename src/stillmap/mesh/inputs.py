@@ -38,32 +38,32 @@ class MeshInputs:
     """
 
     recording: Recording
-    seen: Recording
+    deskewed: Recording
     poses: Float
     p_static: NDArray[np.float32]
     objects: Sequence[MovingObject]
-    things: Sequence[TrackedBox]
+    boxes: Sequence[TrackedBox]
     start_ns: int
     ground: GroundMap
 
     @cached_property
-    def longest_scan_ns(self) -> int:
+    def max_scan_ns(self) -> int:
         """Approximate maximum duration of a scan in nanoseconds."""
         return max_scan_duration_ns(self.recording)
 
-    def beams(self) -> LidarReturns:
+    def index_returns(self) -> LidarReturns:
         """The returns, indexed by time."""
         owned = {one.id: one.beams for one in self.objects}
-        boxes = [one.box for one in self.things if one.box.object_id in owned]
+        boxes = [one.box for one in self.boxes if one.box.object_id in owned]
         return LidarReturns(
             self.recording,
-            self.seen,
-            self.seen.T_map_sensor(self.poses),
+            self.deskewed,
+            self.deskewed.T_map_sensor(self.poses),
             self.p_static,
             boxes,
             [owned[box.object_id] for box in boxes],
             self.start_ns,
-            find_scan_layout(self.seen, np.zeros(0, np.intp), SurfaceOptions()).planar,
+            find_scan_layout(self.deskewed, np.zeros(0, np.intp), SurfaceOptions()).is_planar,
         )
 
 
@@ -103,5 +103,5 @@ def extrude_boxes(
     for box in boxes:
         usual = min_height if 2.0 * max(box.half_size) < long else 0.0
         height = max(heights.get(box.object_id, 0.0), usual)
-        out.append(TrackedBox(box, ground.at(box.xy), height))
+        out.append(TrackedBox(box, ground.height_at(box.xy), height))
     return out

@@ -56,14 +56,14 @@ class TrackedReturns:
 
     def __init__(self, sources: MeshInputs, moves: DynamicReturns) -> None:
         self.sources = sources
-        place = {one.box.object_id: number for number, one in enumerate(sources.things)}
+        place = {one.box.object_id: number for number, one in enumerate(sources.boxes)}
         ids, of = np.unique(moves.owner, return_inverse=True)
         owner = np.array([place.get(int(one), NO_OWNER) for one in ids], np.intp)[of]
-        kept = np.flatnonzero(moves.dynamic & (owner != NO_OWNER))
+        kept = np.flatnonzero(moves.is_dynamic & (owner != NO_OWNER))
         kept = kept[np.argsort(moves.seconds[kept], kind="stable")]
         self._all = _Seen(moves.beam[kept], moves.ends[kept], moves.seconds[kept], owner[kept])
 
-    def about(self, now: float, near: float) -> _Seen:
+    def near_time(self, now: float, near: float) -> _Seen:
         """Those that ended within `near` seconds of a time."""
         seen = self._all
         first = int(np.searchsorted(seen.seconds, now - near))
@@ -93,23 +93,23 @@ def color_moving(
     sources, limits = moving.sources, options.texture.visible
     view = place.views[number]
     now = 1e-9 * (view.stamp_ns - sources.start_ns)
-    seen = moving.about(now, options.objects.near)
+    seen = moving.near_time(now, options.objects.near)
     away = np.abs(seen.seconds - now).astype(np.float32)
-    ends = _carried(seen, sources.things, now)
-    local = view.in_camera(ends)
+    ends = _carried(seen, sources.boxes, now)
+    local = view.to_camera(ends)
     uv, ok = project(view.camera, local)
     size, m = np.array([view.camera.width, view.camera.height]), limits.margin
     with np.errstate(invalid="ignore"):  # NaN: nowhere
         ok &= ((uv >= m) & (uv <= size - 1.0 - m)).all(axis=1)
     ok &= local[:, 2] > limits.near
-    ok &= _within_outlines(seen, local, ok, sources.things, now, options)
+    ok &= _within_outlines(seen, local, ok, sources.boxes, now, options)
     ok &= away < late[seen.beam]
     shown = np.flatnonzero(ok)
-    shown = shown[place.free(number, ends[shown])] if len(shown) else shown
-    shown = shown[_free(ends[shown], seen.owner[shown], sources.things, view, now, options)]
+    shown = shown[place.is_unoccluded(number, ends[shown])] if len(shown) else shown
+    shown = shown[_free(ends[shown], seen.owner[shown], sources.boxes, view, now, options)]
     if not len(shown):
         return
-    picture = place.picture(number)
+    picture = place.image(number)
     if picture is None:
         return
     colours = np.rint(sample_bilinear(np.ascontiguousarray(picture[..., :3]), uv[shown]))
@@ -178,14 +178,14 @@ def _free(
             mine = (owner == number) | _inside(cuboid, points, choice.margin)
             rest = np.flatnonzero(~mine)
             hidden = occlusion_probability(
-                [cuboid], view.place, points[rest], choice.margin, choice.sigma
+                [cuboid], view.position, points[rest], choice.margin, choice.sigma
             )
             free[rest] *= 1.0 - hidden
     return free >= choice.least
 
 
 def _inside(cuboid: OrientedBox, points: Float, margin: float) -> Bool:
-    return np.asarray((np.abs(cuboid.local(points)) <= cuboid.half + margin).all(axis=1))
+    return np.asarray((np.abs(cuboid.local(points)) <= cuboid.half_size + margin).all(axis=1))
 
 
 _TOGETHER = 1 << 16  # points
@@ -201,7 +201,7 @@ class PointColors:
             `static_coloured`, `dynamic_coloured`.
     """
 
-    colours: Colours
+    colors: Colours
     counts: dict[str, int]
 
 
@@ -234,8 +234,8 @@ def color_points(
     out: Colours = recording.allocate_per_beam(np.uint8, (3,))
     scans, n = recording.n_scans, recording.n_scans + len(place.views)
     painted = TextureSampler(textured, options.points.off)
-    T_map_sensor = sources.seen.T_map_sensor(sources.poses)
-    for chunk in iter_chunks(sources.seen, beside=[sources.p_static, out]):
+    T_map_sensor = sources.deskewed.T_map_sensor(sources.poses)
+    for chunk in iter_chunks(sources.deskewed, release=[sources.p_static, out]):
         out[chunk.beams] = GRAY
         _tint_static(out, chunk, sources, T_map_sensor, painted, threads)
         if tell is not None:
@@ -246,14 +246,14 @@ def color_points(
     moving = TrackedReturns(sources, moves)
     for number in range(len(place.views)):
         color_moving(out, late, moving, number, place, options)
-        sources.seen.release_pages(sources.p_static, out, late)
+        sources.deskewed.release_pages(sources.p_static, out, late)
         if tell is not None:
             tell(scans + number + 1, n)
     return PointColors(out, _counts(out, sources))
 
 
 def _counts(colours: Colours, sources: MeshInputs) -> dict[str, int]:
-    hit, p_static = sources.seen.hit, sources.p_static
+    hit, p_static = sources.deskewed.hit, sources.p_static
     out = dict.fromkeys(("static", "static_coloured", "dynamic", "dynamic_coloured"), 0)
     for block in arrays.iter_blocks(hit, p_static, colours):
         has, still = (colours[block] != GRAY).any(axis=1), p_static[block] >= DYNAMIC_BELOW
@@ -273,16 +273,16 @@ def _tint_static(
 ) -> None:
     """Colours what stands still of some scans."""
     beams = chunk.beams
-    still = sources.seen.hit[beams] & (sources.p_static[beams] >= DYNAMIC_BELOW)
+    still = sources.deskewed.hit[beams] & (sources.p_static[beams] >= DYNAMIC_BELOW)
     numbers = np.flatnonzero(still)
     scan = np.searchsorted(chunk.offset, numbers, side="right") - 1 + chunk.scans.start
     parts = [slice(k, k + _TOGETHER) for k in range(0, len(numbers), _TOGETHER)]
 
     def found(part: slice) -> tuple[slice, Colours, Bool]:
         T = T_map_sensor[scan[part]]
-        local = sources.seen.points[beams.start + numbers[part]].astype(np.float64)
+        local = sources.deskewed.points[beams.start + numbers[part]].astype(np.float64)
         ends = np.einsum("nij,nj->ni", T[:, :3, :3], local) + T[:, :3, 3]
-        return part, *painted.colours(ends, T[:, :3, 3])
+        return part, *painted.colors(ends, T[:, :3, 3])
 
     for part, colours, has in map_ordered(found, parts, threads):
         out[beams.start + numbers[part][has]] = colours[has]

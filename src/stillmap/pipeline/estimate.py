@@ -107,7 +107,7 @@ class Iteration:
     def crop_occupancy(self, box: em.GridWindow) -> em.OccupancyMap:
         """The cells of a box of that map."""
         e_step = self.estimate.e_step
-        return em.make_occupancy_map(self.estimate.m_step.grid, e_step.occupied, box=box)
+        return em.make_occupancy_map(self.estimate.m_step.grid, e_step.occupied, window=box)
 
 
 @dataclass

@@ -12,12 +12,18 @@ from stillmap.core.parallel import resolve_threads
 from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
 from stillmap.em import GroundMap, estimate_ground
-from stillmap.mapping import Change, beams_on_things, changed_places, changed_things, relabelled
-from stillmap.mapping.projection import columns_of, plan_of
+from stillmap.mapping import (
+    Change,
+    detect_changes,
+    detect_changes_3d,
+    find_changed_object_beams,
+    relabel_changes,
+)
+from stillmap.mapping.projection import project_cells, project_to_plane
 from stillmap.pipeline.estimate import Estimate
 from stillmap.pipeline.options import Options
-from stillmap.tracking import MovingObject, moving_objects
-from stillmap.tracking.objects_3d import moving_in_space
+from stillmap.tracking import MovingObject, track_objects
+from stillmap.tracking.objects_3d import track_objects_3d
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +54,9 @@ def final_estimate(
     threads = resolve_threads(options.threads)
     deskewed = slam.deskew_recording(recording, best.poses, options.slam, threads)
     cell, look = options.slam.resolution, options.em.dwell.look
-    changed = best.e_step.changed
+    changed = best.e_step.changed_cells
     if changed is not None:  # 3D: every E-step knows of them
-        changes = changed_things(changed, deskewed, best.poses, cell, look, options.em.changes)
+        changes = detect_changes_3d(changed, deskewed, best.poses, cell, look, options.em.changes)
         return deskewed, best, changes
     if (
         recording.dimension == 3
@@ -67,8 +73,8 @@ def final_estimate(
         return deskewed, best, []
     if best.e_step.occupied is None:
         raise RuntimeError("the default estimator knows its cells")
-    changes = changed_places(courses, deskewed, cell, look, options.em.changes)
-    p_static, occupied = relabelled(
+    changes = detect_changes(courses, deskewed, cell, look, options.em.changes)
+    p_static, occupied = relabel_changes(
         deskewed,
         best.poses,
         best.p_static,
@@ -78,7 +84,7 @@ def final_estimate(
         options.output.map_state,
         threads,
     )
-    learned = {**best.e_step.learned, "changing": round(courses.share, 6)}
+    learned = {**best.e_step.learned, "changing": round(courses.changing_weight, 6)}
     return (
         deskewed,
         best.with_labels(p_static=p_static, occupied=occupied, learned=learned),
@@ -123,10 +129,12 @@ def _project(
 ) -> tuple[Recording, Estimate]:
     """A 3D recording and its estimate as planar ones: the obstacles above the ground."""
     cell, band = options.slam.resolution, options.output.band
-    plan = plan_of(deskewed, estimate.poses, ground, band, cell, open_space=False, threads=threads)
+    plan = project_to_plane(
+        deskewed, estimate.poses, ground, band, cell, open_space=False, threads=threads
+    )
     occupied = estimate.e_step.occupied
     if occupied is not None:
-        occupied = columns_of(occupied, ground, band, cell)
+        occupied = project_cells(occupied, ground, band, cell)
     planar = dataclasses.replace(
         estimate,
         weights=estimate.weights[plan.beam],
@@ -150,7 +158,7 @@ def _occupancy_maps(
     seen = em.add_trusted_beams(grid, planar, estimate.poses, weights, e_step.no_return, threads)
     filtered = em.make_occupancy_map(grid, e_step.occupied, seen)
     em.recount_as_static(grid, planar, estimate.poses, weights)
-    return filtered, em.make_occupancy_map(grid, box=filtered.box)
+    return filtered, em.make_occupancy_map(grid, window=filtered.window)
 
 
 def find_objects(
@@ -164,9 +172,11 @@ def find_objects(
     poses, p_static = estimate.poses, estimate.p_static
     if maps.ground is not None:
         threads = resolve_threads(options.threads)
-        return moving_in_space(deskewed, poses, p_static, maps.ground, options.objects, threads)
-    objects = moving_objects(deskewed, poses, p_static, options.objects)
-    changed = beams_on_things(deskewed, poses, p_static, changes, maps.filtered.resolution)
+        return track_objects_3d(deskewed, poses, p_static, maps.ground, options.objects, threads)
+    objects = track_objects(deskewed, poses, p_static, options.objects)
+    changed = find_changed_object_beams(
+        deskewed, poses, p_static, changes, maps.filtered.resolution
+    )
     moved = [one for one in objects if 2 * _count_common(one.beams, changed) <= len(one.beams)]
     return [dataclasses.replace(one, id=k) for k, one in enumerate(moved)]
 

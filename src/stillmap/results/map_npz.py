@@ -38,9 +38,9 @@ def write_map_npz(
     }
     if evidence is not None:
         arrays |= {
-            "looks": np.asarray(evidence.looks, np.uint16),
-            "clear_looks": np.asarray(evidence.clear, np.uint16),
-            "thin": np.asarray(evidence.thin, np.bool_),
+            "looks": np.asarray(evidence.observations, np.uint16),
+            "clear_looks": np.asarray(evidence.unobstructed, np.uint16),
+            "thin": np.asarray(evidence.thinly_observed, np.bool_),
         }
     arrays |= {
         "origin": np.asarray(occupancy.origin, np.float64),
@@ -67,5 +67,5 @@ def known_area(result: Result) -> dict[str, float]:
     known = result.map.p_occupied.size - int(np.count_nonzero(np.isnan(result.map.p_occupied)))
     return {
         "known": round(cell * known, 6),
-        "thin": round(cell * int(np.count_nonzero(result.evidence.thin)), 6),
+        "thin": round(cell * int(np.count_nonzero(result.evidence.thinly_observed)), 6),
     }

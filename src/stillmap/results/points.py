@@ -81,7 +81,7 @@ def _vertices(
     T_map_sensor = seen.T_map_sensor(poses)
     fields = FIELDS if colours is None else FIELDS + COLOURS
     beside: list[NDArray[Any]] = [p_static] if colours is None else [p_static, colours]
-    for scans, beams, offset in iter_chunks(seen, beside=beside):
+    for scans, beams, offset in iter_chunks(seen, release=beside):
         for t, first, last in zip(
             range(scans.start, scans.stop), offset[:-1], offset[1:], strict=True
         ):

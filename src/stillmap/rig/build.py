@@ -117,7 +117,9 @@ def build_tilting(
     ground = _ground(on_way)
     found = _evidence(on_way, ground, options, threads) if o.evidence else None
     static = _prior(on_way.seen, flat.share) if found is None else found.p_static
-    boxes = fit_boxes(flat.seen, flat.poses, flat.p_static, flat.objects, options.objects, o.hold)
+    boxes = fit_boxes(
+        flat.seen, flat.poses, flat.p_static, flat.objects, options.objects.min_p_dynamic, o.hold
+    )
     cut = select_box_beams(boxes, recording, on_way, ground, int(flat.seen.stamp_ns[0]), o)
     share = flat.share if found is None else _learned_share(found)
     p_static = apply_boxes(static, cut, share, o, recording.scratch)
@@ -157,7 +159,7 @@ def _evidence(
 
     A border between voxels lies just above the floor: feet share none with it.
     """
-    floor = float(np.median(ground.at(on_way.poses[:, :2, 3])))
+    floor = float(np.median(ground.height_at(on_way.poses[:, :2, 3])))
     poses = on_way.poses.copy()
     poses[:, 2, 3] -= floor + options.rig.low
     return occupancy_hmm.e_step(on_way.seen, poses, options.rig.voxel, options.em, threads)
@@ -226,13 +228,13 @@ def _objects(
         if box.object_id < 0 or len(beams) < _FEWEST:
             continue
         xyz = on_way.seen.end_points(beams, on_way.poses)
-        tall = float(np.percentile(xyz[:, 2] - ground.at(xyz[:, :2]), _EDGE))
+        tall = float(np.percentile(xyz[:, 2] - ground.height_at(xyz[:, :2]), _EDGE))
         one = by_id[box.object_id]
         out.append(
             dataclasses.replace(
                 one,
                 beams=beams,
-                z=ground.at(one.xy) + 0.5 * tall,
+                z=ground.height_at(one.xy) + 0.5 * tall,
                 size=(*one.size[:2], tall),
                 p_dynamic=float(1.0 - p_static[beams].mean(dtype=np.float64)),
             )

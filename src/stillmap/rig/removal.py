@@ -69,7 +69,7 @@ def select_box_beams(
         within = box.contains(at[near], xyz[:, :2], o.margin)
         near, xyz = near[within], xyz[within]
         core = box.contains(at[near], xyz[:, :2], 0.0)
-        above = xyz[:, 2] - ground.at(xyz[:, :2])
+        above = xyz[:, 2] - ground.height_at(xyz[:, :2])
         tall = o.tallest if 2.0 * max(box.half_size) >= o.long else o.height
         kept = (above > o.low) & (above <= object_height(above, tall, o.gap))
         out.append(BoxBeams(beams.start + near[kept], core[kept]))

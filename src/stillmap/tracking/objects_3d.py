@@ -1,4 +1,8 @@
-"""What moves in a 3D recording: seen from above, followed on the ground, given its height back."""
+"""Bird's-eye-view tracking of 3D recordings.
+
+The dynamic end points above the ground are projected to the plane and tracked like planar scans;
+the tracks get all beams of the object, and its height, back afterwards.
+"""
 
 import dataclasses
 from typing import NamedTuple
@@ -11,17 +15,16 @@ from stillmap.core.arrays import ArrayBuilder, take_rows
 from stillmap.core.parallel import map_ordered
 from stillmap.core.recording import Recording
 from stillmap.em import GroundMap
-from stillmap.mapping.projection import make_planar_recording
+from stillmap.mapping.projection import DIRECTIONS, make_planar_recording
 from stillmap.tracking import MovingObject, ObjectOptions, track_objects
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_LOWEST, _HIGHEST = 0.2, 3.0  # m above the ground, between which things move
-_DIRECTIONS = 2048  # in which the nearest end point of a scan is looked for
-_COLUMN = 0.3  # m, edge of the columns that neighbouring end points fill
-_FEWEST = 3  # end points of a part: fewer are noise
-_EDGE = 2.0  # percent of the end points that lie lower than a thing, or higher
+_MIN_HEIGHT, _MAX_HEIGHT = 0.2, 3.0  # m above the ground
+_COLUMN = 0.3  # m, edge of the columns whose connected components are segments
+_MIN_POINTS = 3  # of a segment: fewer are noise
+_OUTLIERS = 2.0  # percent of the end points below the box, and above
 
 
 def track_objects_3d(
@@ -32,99 +35,103 @@ def track_objects_3d(
     options: ObjectOptions,
     threads: int = 1,
 ) -> list[MovingObject]:
-    """What moved, each with the height of its track and its box.
+    """Detect and track the moving objects of a 3D recording, with the height of track and box.
 
-    End points that are dynamic and lie in neighbouring columns over the ground are a part of one
-    thing. The nearest ones in each direction are what a planar laser would see, and followed as
-    such; the rest of a part belongs to the thing that most of those are of.
+    Dynamic end points in connected columns above the ground are one segment. The nearest point in
+    each direction, which a planar laser would see, is tracked; the other points of a segment
+    belong to the object that owns most of its tracked ones.
 
     Args:
-        recording: 3D, M beams without motion during its scans.
+        recording: 3D, M beams, deskewed.
         poses: (T, 4, 4) T_map_base.
         p_static: (M,) P(c = 1) of every beam.
-        ground: how high it is.
+        ground: height of the ground.
         options: see ObjectOptions.
-        threads: same result with any number.
+        threads: number of threads; the result does not depend on it.
     """
     if not options.enabled:
         return []
-    flat_poses = se2.project_to_plane(recording.T_map_sensor(poses))
-    found = _dynamic_parts(recording, poses, flat_poses, p_static, ground, options, threads)
+    planar_poses = se2.planar(recording.T_map_sensor(poses))
+    found = _segment_scans(
+        recording, poses, planar_poses, p_static, ground, options.min_p_dynamic, threads
+    )
     hit = np.ones(len(found.nearest), np.bool_)
-    flat = make_planar_recording(recording, found.points, hit, found.offset)
-    things = track_objects(flat, flat_poses, p_static[found.nearest], options)
-    owned = _of_parts(things, found.nearest, found.part, found.beam)
+    planar = make_planar_recording(recording, found.points, hit, found.offset)
+    objects = track_objects(planar, planar_poses, p_static[found.nearest], options)
+    owned = _collect_beams(objects, found.nearest, found.segment, found.beam)
     return [
-        _in_space(one, beams, recording, poses, p_static)
-        for one, beams in zip(things, owned, strict=True)
+        _add_height(one, beams, recording, poses, p_static)
+        for one, beams in zip(objects, owned, strict=True)
     ]
 
 
-class _Parts(NamedTuple):
-    """What is dynamic over the ground.
+class _Segments(NamedTuple):
+    """Segments of dynamic end points above the ground.
 
     Attributes:
         points: (N, 2) metres, the nearest in each direction, in the planar frame of each sensor.
         nearest: (N,) their beams.
-        offset: (T + 1,) where those of each scan begin.
-        part: (K,) of each dynamic beam, rising from scan to scan.
+        offset: (T + 1,) scan t has offset[t]:offset[t + 1] of them.
+        segment: (K,) segment of each dynamic beam, rising from scan to scan.
         beam: (K,) their numbers, rising.
     """
 
     points: NDArray[np.float32]
     nearest: Index
     offset: NDArray[np.int64]
-    part: Index
+    segment: Index
     beam: Index
 
 
-def _dynamic_parts(
+def _segment_scans(
     recording: Recording,
     poses: Float,
-    flat_poses: Float,
+    planar_poses: Float,
     p_static: NDArray[np.float32],
     ground: GroundMap,
-    options: ObjectOptions,
+    min_p_dynamic: float,
     threads: int,
-) -> _Parts:
+) -> _Segments:
     T_map_sensor, T = recording.T_map_sensor(poses), recording.n_scans
-    scratch, offset, parts = recording.scratch, np.zeros(T + 1, np.int64), 0
+    scratch, offset, segments = recording.scratch, np.zeros(T + 1, np.int64), 0
     points, nearest = ArrayBuilder(np.float32, (2,), scratch), ArrayBuilder(np.intp, (), scratch)
-    part_of, beam = ArrayBuilder(np.int64, (), scratch), ArrayBuilder(np.intp, (), scratch)
+    segment_of, beam = ArrayBuilder(np.int64, (), scratch), ArrayBuilder(np.intp, (), scratch)
 
-    def of_scan(t: int) -> tuple[Index, Index, Float, Index]:
+    def process(t: int) -> tuple[Index, Index, Float, Index]:
         beams = recording.beams_of(t)
-        moves = recording.hit[beams] & (p_static[beams] <= 1.0 - options.dynamic)
-        number, end = _above_ground(beams, moves, recording, T_map_sensor[t], ground)
-        part = _parts(end[:, :2])
-        kept = np.bincount(part, minlength=1)[part] >= _FEWEST
-        local = (end[kept, :2] - flat_poses[t, :2, 2]) @ flat_poses[t, :2, :2]
-        return number[kept], part[kept], local, _nearest(local)
+        dynamic = recording.hit[beams] & (p_static[beams] <= 1.0 - min_p_dynamic)
+        number, end = _select_above_ground(beams, dynamic, recording, T_map_sensor[t], ground)
+        segment = _connect_columns(end[:, :2])
+        kept = np.bincount(segment, minlength=1)[segment] >= _MIN_POINTS
+        local = (end[kept, :2] - planar_poses[t, :2, 2]) @ planar_poses[t, :2, :2]
+        return number[kept], segment[kept], local, _nearest_per_direction(local)
 
-    in_turn = recording.iter_scans(range(T), p_static)
-    for t, (number, part, local, near) in enumerate(map_ordered(of_scan, in_turn, threads)):
+    scans = recording.iter_scans(range(T), p_static)
+    for t, (number, segment, local, near) in enumerate(map_ordered(process, scans, threads)):
         points.append(local[near].astype(np.float32))
         nearest.append(number[near])
-        part_of.append(parts + part)
+        segment_of.append(segments + segment)
         beam.append(number)
-        parts += int(part.max()) + 1 if len(part) else 0
+        segments += int(segment.max()) + 1 if len(segment) else 0
         offset[t + 1] = offset[t] + len(near)
-    return _Parts(points.finish(), nearest.finish(), offset, part_of.finish(), beam.finish())
+    return _Segments(
+        points.finished(), nearest.finished(), offset, segment_of.finished(), beam.finished()
+    )
 
 
-def _above_ground(
-    beams: slice, moves: NDArray[np.bool_], recording: Recording, T: Float, ground: GroundMap
+def _select_above_ground(
+    beams: slice, dynamic: NDArray[np.bool_], recording: Recording, T: Float, ground: GroundMap
 ) -> tuple[Index, Float]:
-    """Numbers and ends (n, 3) in the map frame of what moves over the ground."""
-    number = beams.start + np.flatnonzero(moves)
+    """Numbers and end points (n, 3), in the map frame, of the dynamic beams above the ground."""
+    number = beams.start + np.flatnonzero(dynamic)
     end = recording.points[number].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
     above = end[:, 2] - ground.at(end[:, :2])
-    kept = (above > _LOWEST) & (above < _HIGHEST)
+    kept = (above > _MIN_HEIGHT) & (above < _MAX_HEIGHT)
     return number[kept], end[kept]
 
 
-def _parts(xy: Float) -> Index:
-    """(n,) which connected set of columns each place (n, 2) lies in."""
+def _connect_columns(xy: Float) -> Index:
+    """(n,) connected component of columns that each position (n, 2) lies in."""
     import scipy  # its parts load when they are first used
 
     if not len(xy):
@@ -135,70 +142,72 @@ def _parts(xy: Float) -> Index:
     flat, of = np.unique(x * wide + y, return_inverse=True)  # faster than that of rows
     cells = np.stack(np.divmod(flat, wide), axis=1)
     pairs = scipy.spatial.cKDTree(cells).query_pairs(1.5, output_type="ndarray")
-    near = scipy.sparse.coo_array(
+    graph = scipy.sparse.coo_array(
         (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells),) * 2
     )
-    part = scipy.sparse.csgraph.connected_components(near, directed=False)[1]
-    return np.asarray(part[of.reshape(-1)], np.intp)
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    return np.asarray(label[of.reshape(-1)], np.intp)
 
 
-def _nearest(local: Float) -> Index:
-    """The nearest of places (n, 2) in each direction, one direction after the other."""
-    direction = np.floor(np.arctan2(local[:, 1], local[:, 0]) * (_DIRECTIONS / (2.0 * np.pi)))
+def _nearest_per_direction(local: Float) -> Index:
+    """Indices of the nearest of positions (n, 2) in each direction, in the order of directions."""
+    direction = np.floor(np.arctan2(local[:, 1], local[:, 0]) * (DIRECTIONS / (2.0 * np.pi)))
     order = np.lexsort((np.linalg.norm(local, axis=1), direction))
     return order[np.diff(direction[order], prepend=-np.inf) > 0]
 
 
-def _of_parts(things: list[MovingObject], nearest: Index, part: Index, beam: Index) -> list[Index]:
-    """Of each thing all beams: its own, and those of the parts that are mostly its own.
+def _collect_beams(
+    objects: list[MovingObject], nearest: Index, segment: Index, beam: Index
+) -> list[Index]:
+    """All beams of each object: its own, and those of the segments it owns most of.
 
     Args:
-        things: their beams are numbers of the nearest ones.
-        nearest: beams that were followed, rising within a scan's directions.
-        part: of each moving beam, rising from scan to scan.
+        objects: their beams are indices into `nearest`.
+        nearest: tracked beams.
+        segment: of each dynamic beam, rising from scan to scan.
         beam: their numbers, rising.
     """
     if not len(beam):
-        return [nearest[one.beams] for one in things]
-    part_of = part[np.searchsorted(beam, nearest)]
-    owner = np.full(len(nearest), len(things), np.int64)
-    for k, one in enumerate(things):
+        return [nearest[one.beams] for one in objects]
+    segment_of = segment[np.searchsorted(beam, nearest)]
+    owner = np.full(len(nearest), len(objects), np.int64)
+    for k, one in enumerate(objects):
         owner[one.beams] = k
-    pairs, counts = np.unique(np.stack([part_of, owner], axis=1), axis=0, return_counts=True)
+    pairs, counts = np.unique(np.stack([segment_of, owner], axis=1), axis=0, return_counts=True)
     order = np.lexsort((-counts, pairs[:, 0]))
     first = np.diff(pairs[order, 0], prepend=-1) > 0
-    of_part = np.full(int(part.max()) + 1, len(things))
-    of_part[pairs[order[first], 0]] = pairs[order[first], 1]
-    of_beam = of_part[part]
+    of_segment = np.full(int(segment.max()) + 1, len(objects))
+    of_segment[pairs[order[first], 0]] = pairs[order[first], 1]
+    of_beam = of_segment[segment]
     rank = np.argsort(of_beam, kind="stable")
-    ends = np.searchsorted(of_beam[rank], np.arange(len(things) + 1))
+    ends = np.searchsorted(of_beam[rank], np.arange(len(objects) + 1))
     return [
         np.union1d(beam[rank[a:b]], nearest[one.beams])
-        for one, a, b in zip(things, ends[:-1], ends[1:], strict=True)
+        for one, a, b in zip(objects, ends[:-1], ends[1:], strict=True)
     ]
 
 
-def _in_space(
+def _add_height(
     one: MovingObject,
     beams: Index,
     recording: Recording,
     poses: Float,
     p_static: NDArray[np.float32],
 ) -> MovingObject:
-    """The same with all its beams, the height of its middle at each scan, and of its box."""
+    """The object with all its beams, the height of its center in each scan, and of its box."""
     z = recording.end_points(beams, poses)[:, 2]
     at = np.searchsorted(one.scan, recording.scans_of(beams)).clip(0, len(one.scan) - 1)
     low, high = np.full(len(one.scan), np.inf), np.full(len(one.scan), -np.inf)
     np.minimum.at(low, at, z)
     np.maximum.at(high, at, z)
-    middle = 0.5 * (low + high)
-    known = np.isfinite(middle)
-    middle = np.interp(np.arange(len(middle)), np.flatnonzero(known), middle[known])
-    bottom, top = np.percentile(z - middle[at], [_EDGE, 100.0 - _EDGE])
+    center = 0.5 * (low + high)
+    known = np.isfinite(center)
+    center = np.interp(np.arange(len(center)), np.flatnonzero(known), center[known])
+    bottom, top = np.percentile(z - center[at], [_OUTLIERS, 100.0 - _OUTLIERS])
     return dataclasses.replace(
         one,
         beams=beams,
-        z=middle,
+        z=center,
         size=(*one.size[:2], float(top - bottom)),
         p_dynamic=float(1.0 - take_rows(p_static, beams).mean(dtype=np.float64)),
     )

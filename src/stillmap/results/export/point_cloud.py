@@ -94,7 +94,7 @@ def cloud_of(
 
     def made() -> Iterator[Block]:
         beside = [one for one in (p_static, times, colours) if one is not None]
-        for chunk in iter_chunks(seen, beside=beside):
+        for chunk in iter_chunks(seen, release=beside):
             hits = _wanted(seen.hit[chunk.beams], p_static[chunk.beams], only)
             points = _placed(seen, chunk, hits, T_map_sensor)
             stamp_ns = beam_stamps_ns(recording, chunk.scans)[hits]

@@ -60,7 +60,7 @@ def maps_section(result: Result) -> str:
         window,
         filtered.size,
     )
-    veil = draw_poorly_observed(result.map, result.evidence.thin, window)
+    veil = draw_poorly_observed(result.map, result.evidence.thinly_observed, window)
     path = _path(
         se2.project_to_plane(result.poses) if result.recording.dimension == 3 else result.poses,
         window,
@@ -93,8 +93,8 @@ def evidence_sentence(result: Result) -> str:
     share = share_text(area["thin"] / area["known"])
     return (
         f"{area['thin']:,.1f} m² of the filtered map, {share} of what is known, rest on thin "
-        f"evidence: fewer than {evidence.least} looks saw these places while nothing that moves "
-        f"was within {evidence.near:g} m of them."
+        f"evidence: fewer than {evidence.min_observations} looks saw these places while nothing that moves "
+        f"was within {evidence.mover_radius:g} m of them."
     )
 
 
