@@ -29,7 +29,7 @@ from stillmap.eval import mesh_distance
 from stillmap.eval.mesh import GREY, SAMPLES, Pictures, Record, shown
 from stillmap.eval.model_readers import RECORD, read_record
 from stillmap.mesh.texture.views import View
-from stillmap.mesh.texture.visibility import visible
+from stillmap.mesh.texture.visibility import find_visible_faces
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.preprocessing.options import ReadOptions
 
@@ -101,8 +101,8 @@ def _free(record: Record, at: mesh_distance.Samples, images: Images, people: Mas
             continue
         camera = images.cameras[images.camera[image]]
         view = View(image, int(images.stamp_ns[image]), camera, T)
-        some = np.flatnonzero(~out & visible(mesh, view).seen[at.face])
-        column, row = np.rint(camera_module.project(camera, view.in_camera(at.points[some]))[0].T)
+        some = np.flatnonzero(~out & find_visible_faces(mesh, view).visible[at.face])
+        column, row = np.rint(camera_module.project(camera, view.to_camera(at.points[some]))[0].T)
         out[some] = ~people[image][row.astype(np.intp), column.astype(np.intp)]
     return out
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import stillmap
 from stillmap.core import camera
-from stillmap.mesh.texture.views import View, read_color_image, find_views
+from stillmap.mesh.texture.views import View, find_views, read_color_image
 
 slow = pytest.mark.slow
 
@@ -44,7 +44,7 @@ def steepness(recording: stillmap.Recording, view: View, scan: int, turned: floa
     change = maximum_filter1d(change, 5, axis=1)  # beams are two or three pixels apart
     beams = np.arange(*recording.offset[[scan, scan + 1]])
     beams = beams[recording.hit[beams]]
-    points = view.in_camera(recording.end_points(beams, recording.T_recorded_base))
+    points = view.to_camera(recording.end_points(beams, recording.T_recorded_base))
     uv, ok = camera.project(view.camera, points)
     ok &= camera.is_in_image(view.camera, uv)
     depth, at = points[:, 2], np.round(np.where(ok[:, None], uv, 0.0)).astype(np.intp)

@@ -22,18 +22,17 @@ from stillmap.cli.parser import COMMANDS
 from stillmap.cli.rig import built, read_tilting, said
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.core.files import require_new
-from stillmap.core.profiling import StageTimer
+from stillmap.core.profiling import Progress, StageTimer
 from stillmap.core.recording import Recording
 from stillmap.io import read
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.mesh.build import Models
-from stillmap.pipeline.checkpoint import Damaged, Place, held
-from stillmap.pipeline.checkpoint_files import identity
-from stillmap.pipeline.em_loop import Progress
-from stillmap.pipeline.models import models_of
+from stillmap.pipeline.checkpoint import CheckpointFolder, DamagedCheckpoint, lock_checkpoints
+from stillmap.pipeline.checkpoint_files import identify_run
+from stillmap.pipeline.estimate import EmState
+from stillmap.pipeline.models import build_models
 from stillmap.pipeline.options import Options, resolved
-from stillmap.pipeline.progress import Loop
 from stillmap.pipeline.result import Result, build
 from stillmap.results.save import RECORD, save
 from stillmap.rig.build import TiltingResult
@@ -171,17 +170,21 @@ def mapped(args: argparse.Namespace, changes: dict[str, Any]) -> int:
     if args.tilting:
         require_apart(output, Path(args.tilting))
     _require_writable(output)
-    with held(output) as place:
+    with lock_checkpoints(output) as checkpoints:
         try:
-            result, in_3d = _mapped_and_saved(args, options, place)
-            place.forget()
+            result, in_3d = _mapped_and_saved(args, options, checkpoints)
+            checkpoints.clear()
         except OSError as error:
             if error.errno not in _FULL:
                 raise
-            raise InputError(f"cannot go on: {error.strerror}", where=str(place.folder)) from error
+            raise InputError(
+                f"cannot go on: {error.strerror}", where=str(checkpoints.folder)
+            ) from error
         except (KeyboardInterrupt, SystemExit):
-            if place.present is not None:
-                _tell(args, f"{place.folder} keeps how far it came: --resume goes on from there")
+            if checkpoints.newest is not None:
+                _tell(
+                    args, f"{checkpoints.folder} keeps how far it came: --resume goes on from there"
+                )
             raise
     if not args.quiet:
         _say(result, in_3d, output)
@@ -191,20 +194,20 @@ def mapped(args: argparse.Namespace, changes: dict[str, Any]) -> int:
 
 
 def _mapped_and_saved(
-    args: argparse.Namespace, options: Options, place: Place
+    args: argparse.Namespace, options: Options, checkpoints: CheckpointFolder
 ) -> tuple[Result, TiltingResult | None]:
     """The whole job; how far it has come is kept after every iteration."""
     stages = StageTimer()
     with stages.measure("read"):
         with shown_share(args.quiet, "reading") as tell:
-            found = read(Path(args.input), options.read, progress=tell, scratch=place.folder)
+            found = read(Path(args.input), options.read, progress=tell, scratch=checkpoints.folder)
         recording = _usable(found, args)
         poses = _given_poses(recording, args)
-        tilting = read_tilting(args, recording, options, place.folder)
+        tilting = read_tilting(args, recording, options, checkpoints.folder)
         _require_known(recording, options, args)
         options = resolved(options, recording)
-        same = identity(recording, options, poses)
-    loop = _resumed(args, place, same, options, stages)
+        same = identify_run(recording, options, poses)
+    state = _resumed(args, checkpoints, same, options, stages)
     with shown_progress(args.quiet, em.max_iterations(options.estimator, options.em)) as progress:
         result = build(
             recording,
@@ -212,9 +215,9 @@ def _mapped_and_saved(
             poses=poses,
             progress=progress,
             stages=stages,
-            scratch=place.folder,
-            go_on=loop,
-            keep=lambda loop: place.save(loop, same, stages),
+            scratch=checkpoints.folder,
+            resume=state,
+            checkpoint=lambda state: checkpoints.save(state, same, stages),
         )
         in_3d = None
         if tilting is not None:
@@ -225,7 +228,14 @@ def _mapped_and_saved(
         models, result = _modelled(result, in_3d, progress, stages)
         progress("writing", 0, 0, 0)
         replace = args.overwrite or args.resume
-        save(result, Path(args.output), replace, within=place.folder, tilting=in_3d, models=models)
+        save(
+            result,
+            Path(args.output),
+            replace,
+            staging_folder=checkpoints.folder,
+            tilting=in_3d,
+            models=models,
+        )
     return result, in_3d
 
 
@@ -236,12 +246,12 @@ def _modelled(
     if not result.options.mesh.enabled or (in_3d is None and result.recording.dimension == 2):
         return None, result
     try:
-        models = models_of(result, tilting=in_3d, progress=progress, stages=stages)
+        models = build_models(result, tilting=in_3d, progress=progress, stages=stages)
     except MissingExtra as error:
         warning = f"no models: {error}"
         return None, dataclasses.replace(result, warnings=[*result.warnings, warning])
     warnings = [*result.warnings]
-    if not len(models.painted.mesh):
+    if not len(models.assignment.mesh):
         warnings.append("no model of the place: hardly any beams lie side by side on it")
     if count := len(models.unread):
         what = (
@@ -253,27 +263,27 @@ def _modelled(
 
 def _resumed(
     args: argparse.Namespace,
-    place: Place,
+    checkpoints: CheckpointFolder,
     same: dict[str, Any],
     options: Options,
     stages: StageTimer,
-) -> Loop | None:
+) -> EmState | None:
     """How far an interrupted run came, if it is to be gone on from."""
-    if place.present is None:
+    if checkpoints.newest is None:
         return None
     if not args.resume:
         _tell(args, "an earlier run was interrupted: begins anew, --resume would go on from it")
-        place.forget()
+        checkpoints.clear()
         return None
     try:
-        loop = place.load(same, options, stages)
-    except Damaged as error:
+        state = checkpoints.load(same, options, stages)
+    except DamagedCheckpoint as error:
         say(f"warning: {error}; begins anew")
-        place.forget()
+        checkpoints.clear()
         return None
-    if loop is not None:
-        _tell(args, f"goes on after iteration {len(loop.records)}")
-    return loop
+    if state is not None:
+        _tell(args, f"goes on after iteration {len(state.records)}")
+    return state
 
 
 def _tell(args: argparse.Namespace, line: str) -> None:

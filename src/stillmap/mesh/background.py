@@ -45,14 +45,14 @@ class Background:
         self._depths = lru_cache(_MOST)(self._depths_of)
         self._read = lru_cache(_KEPT)(lambda number: colours(views[number]))
 
-    def picture(self, number: int) -> Picture | None:
+    def image(self, number: int) -> Picture | None:
         """(h, w, 3) of a view; None: it is damaged."""
         return self._read(number)
 
-    def free(self, number: int, points: Float) -> NDArray[np.bool_]:
+    def is_unoccluded(self, number: int, points: Float) -> NDArray[np.bool_]:
         """(n,) whether nothing of it lies before points (n, 3) in the map frame, in a view."""
         view = self.views[number]
-        at = view.in_camera(points)
+        at = view.to_camera(points)
         free = at[:, 2] > self._limits.near
         if not free.any() or not len(self._place.mesh):
             return free
@@ -60,15 +60,15 @@ class Background:
         free[free] = sample_buffer(depths.depth, depths, at[free]) > at[free, 2] - _BEHIND
         return free
 
-    def differs(self, number: int, points: Float) -> Float32:
+    def color_difference(self, number: int, points: Float) -> Float32:
         """(n,) by how much a view's colours at points (n, 3) in the map frame differ from those of
         the place behind, as other pictures show it: 0 to 442, the length of (r, g, b).
 
         NaN where no other picture shows what is behind without something that moves.
         """
         view, out = self.views[number], np.full(len(points), np.nan, np.float32)
-        at = view.in_camera(points)
-        mine = self.picture(number)
+        at = view.to_camera(points)
+        mine = self.image(number)
         if mine is None or not len(points) or not len(self._place.mesh):
             return out
         depths = self._depths(number)
@@ -77,7 +77,7 @@ class Background:
         here, ok = project(view.camera, at)
         painter[~ok | (painter == number)] = -1
         for other in np.unique(painter[painter >= 0]).tolist():
-            picture, some = self.picture(other), np.flatnonzero(painter == other)
+            picture, some = self.image(other), np.flatnonzero(painter == other)
             if picture is None:
                 continue
             z = sample_buffer(depths.depth, depths, at[some])

@@ -53,7 +53,7 @@ class ObjectModel:
     """
 
     shape: ObjectShape
-    dressed: TexturedViews
+    face_views: TexturedViews
     textured: TexturedMesh
     T_map_object: Float
     stamp_ns: int
@@ -77,15 +77,15 @@ class Models:
         tints: colours of the beams' ends; None where there are no pictures, or nobody wants them.
     """
 
-    painted: ViewAssignment
+    assignment: ViewAssignment
     textured: TexturedMesh
     unfiltered: TexturedMesh | None
     views: list[View]
     left_out: dict[str, int]
     unread: list[str]
-    movers: list[ObjectModel]
-    tried: int
-    tints: PointColors | None = None
+    objects: list[ObjectModel]
+    n_objects: int
+    point_colors: PointColors | None = None
 
 
 def require_extras() -> None:
@@ -124,7 +124,7 @@ def build_models(
 
     with stages.measure("surface"):
         mesh = build_surface(
-            sources.seen,
+            sources.deskewed,
             sources.poses,
             sources.p_static,
             options.surface,
@@ -145,7 +145,7 @@ def build_models(
         unfiltered = _unfiltered(textured, place, views, read, options)
     ahead = _ahead(place, views, sources.recording.images, limits)
     with stages.measure("movers"):
-        movers, moves = [], DynamicReturns.of(sources)
+        movers, moves = [], DynamicReturns.collect(sources)
         if options.objects.enabled:
             movers = _movers(sources, moves, views, ahead, options, tell("building what moved"))
     tints = None
@@ -187,7 +187,7 @@ def _unfiltered(
     if not spoiled.any():
         return None
     part = bake_texture(
-        place.mesh.part(spoiled), place.sharpest[spoiled], views, read, options.texture
+        place.mesh.select(spoiled), place.sharpest[spoiled], views, read, options.texture
     )
     return replace_faces(textured, spoiled, part)
 
@@ -240,7 +240,7 @@ def _mover(
 ) -> ObjectModel | None:
     """The model of what was followed as one or more objects; None where `shape_of` finds none."""
     start = sources.start_ns
-    seconds = [times_in_view(one.thing, views, start) for one in whole]
+    seconds = [times_in_view(one.box, views, start) for one in whole]
     shown = [some[np.isfinite(some)] for some in seconds]
     shape = reconstruct_object(whole, sources, moves, options.objects, shown)
     if shape is None:
@@ -250,7 +250,7 @@ def _mover(
         shape,
         views,
         place,
-        [thing for thing in sources.things if thing.box.object_id not in parts],
+        [thing for thing in sources.boxes if thing.box.object_id not in parts],
         start,
         options.objects,
         options.choice,
@@ -258,9 +258,9 @@ def _mover(
     )
     read = _reader(sources.recording.images)
     textured = bake_texture(
-        dress.painted.mesh, dress.painted.view, dress.views, read, options.texture
+        dress.assignment.mesh, dress.assignment.view, dress.views, read, options.texture
     )
-    T = shape.way.T_map_object(shape.seconds)
+    T = shape.frame.T_map_object(shape.seconds)
     first, middle, last = (
         start + round(1e9 * seconds) for seconds in (shape.span[0], shape.seconds, shape.span[1])
     )

@@ -104,7 +104,7 @@ def remove_small_components(mesh: Mesh, area: float) -> Mesh:
     graph = coo_matrix((ones, (np.concatenate([a, b]), np.concatenate([b, c]))), (V, V))
     count, piece = connected_components(graph, directed=False)
     areas = np.bincount(piece[a], mesh.areas(), count)
-    return mesh.part(areas[piece[a]] >= area)
+    return mesh.select(areas[piece[a]] >= area)
 
 
 def weld_meshes(parts: list[Mesh]) -> Mesh:

@@ -53,7 +53,7 @@ class ViewAssignment:
     mesh: Mesh
     view: Index
     p_static: NDArray[np.float32]
-    seen: NDArray[np.bool_]
+    visible: NDArray[np.bool_]
     sharpest: Index
     p_sharpest: NDArray[np.float32]
 
@@ -84,16 +84,16 @@ def assign_views(
     """
     if views:
         mesh, _ = subdivide(mesh, partial(max_edge_at, views, options))
-    beams, areas = sources.beams(), mesh.areas()
-    candidates = Candidates.none(len(mesh), min(options.candidates, max(len(views), 1)))
-    sharpest = Candidates.none(len(mesh), 1)
+    beams, areas = sources.index_returns(), mesh.areas()
+    candidates = Candidates.empty(len(mesh), min(options.candidates, max(len(views), 1)))
+    sharpest = Candidates.empty(len(mesh), 1)
 
     def looked_at(view: View) -> tuple[NDArray[np.intp], Float, Float]:
         found = find_visible_faces(mesh, view, limits)
-        faces = np.flatnonzero(found.seen)
+        faces = np.flatnonzero(found.visible)
         p = np.zeros(0)
         if len(faces):
-            p = p_unoccluded(mesh, faces, view, beams, sources.things, options)
+            p = p_unoccluded(mesh, faces, view, beams, sources.boxes, options)
         return faces, found.pixels[faces].astype(np.float64), p
 
     for number, (faces, pixels, p) in enumerate(map_ordered(looked_at, views, threads)):
@@ -105,8 +105,8 @@ def assign_views(
     if views and images is not None and (options.level or (options.believe and options.odd > 0.0)):
         found = sample_face_colors(mesh, candidates, views, partial(read_color_image, images))
         if options.level:
-            gain = estimate_gains(candidates.picture, found, len(views))
-            found *= gain[candidates.picture]  # of no picture, NaN stays
+            gain = estimate_gains(candidates.view, found, len(views))
+            found *= gain[candidates.view]  # of no picture, NaN stays
         if options.believe and options.odd > 0.0:
             candidates = reject_inconsistent_views(candidates, found, options.odd)
     return resolve_assignment(mesh, candidates, sharpest, options.border), gain
@@ -117,7 +117,7 @@ def max_edge_at(views: Sequence[View], options: ChoiceOptions, points: Float) ->
 
     `edge` metres, and where the nearest camera is far what is `edge_pixels` wide in its pictures.
     """
-    away, nearest = cKDTree(np.array([view.place for view in views])).query(points)
+    away, nearest = cKDTree(np.array([view.position for view in views])).query(points)
     focal = np.array([0.0 if view.camera.K is None else view.camera.K[0, 0] for view in views])
     wide = options.edge_pixels * away / np.maximum(focal[nearest], 1.0)
     return np.asarray(np.maximum(options.edge, wide), np.float64)
@@ -134,14 +134,14 @@ def resolve_assignment(
         sharpest: of each the one that shows it in most pixels.
         border: what it costs where two views meet.
     """
-    view = select_views(candidates, mesh.pairs(), border)
-    p_static = np.where(candidates.picture == view[:, None], candidates.p_static, 0.0).max(axis=1)
+    view = select_views(candidates, mesh.adjacent_faces(), border)
+    p_static = np.where(candidates.view == view[:, None], candidates.p_static, 0.0).max(axis=1)
     return ViewAssignment(
         mesh,
         view,
         np.where(view >= 0, p_static, 0.0).astype(np.float32),
-        sharpest.picture[:, 0] >= 0,
-        sharpest.picture[:, 0],
+        sharpest.view[:, 0] >= 0,
+        sharpest.view[:, 0],
         sharpest.p_static[:, 0],
     )
 
@@ -160,18 +160,18 @@ def p_unoccluded(
     stands before it; where one does, nothing behind it speaks against that. Of the corners of a
     face and its middle the least counts.
     """
-    part = mesh.part_of(faces)
-    points = np.concatenate([part.vertices, part.centres])
+    part = mesh.subset(faces)
+    points = np.concatenate([part.vertices, part.centers])
     seconds = 1e-9 * (view.stamp_ns - beams.start_ns)
     there = boxes_at(things, seconds)
-    free = 1.0 - occlusion_probability(there, view.place, points, options.margin, options.sigma)
-    ends, p_static = beams.about(view.stamp_ns, options)
+    free = 1.0 - occlusion_probability(there, view.position, points, options.margin, options.sigma)
+    ends, p_static = beams.near_time(view.stamp_ns, options)
     # a laser sees past a thing what the camera beside it does not see
-    speaks = (p_static < 0.5) | ~is_in_or_behind_box(there, view.place, ends)
+    speaks = (p_static < 0.5) | ~is_in_or_behind_box(there, view.position, ends)
     found = build_occlusion_mask(view, ends[speaks], p_static[speaks], options.margin)
-    local = view.in_camera(points)
+    local = view.to_camera(points)
     uv, ok = project(view.camera, local)
     uv = np.where(ok[:, None], uv, 0.0)  # corners just outside: as at the edge
-    p = found.shown(uv, local[:, 2], options.margin, options.unseen * free)
+    p = found.p_unoccluded(uv, local[:, 2], options.margin, options.unseen * free)
     a, b, c = (p[part.faces[:, k]] for k in range(3))
     return np.minimum(np.minimum(a, b), np.minimum(c, p[len(part.vertices) :]))

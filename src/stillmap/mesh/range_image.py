@@ -144,7 +144,7 @@ class ScanLayout(NamedTuple):
         stride: of pictures only each so many-th row and column is used.
     """
 
-    planar: bool
+    is_planar: bool
     groups: list[Index]
     stride: int = 1
 
@@ -221,7 +221,7 @@ def _patch(
     use = seen.hit[beam] & np.isfinite(x + y + z)
     points[~use] = 0.0  # nothing is made of these
     looking = beam_directions(local)
-    if order.planar:
+    if order.is_planar:
         turned = seen.T_base_sensor[seen.sensor[scans], :3, :3]
         looking = np.einsum("nij,nj->ni", turned[scan], looking)
         number = np.arange(len(beam), dtype=np.int32).reshape(len(scans), -1)

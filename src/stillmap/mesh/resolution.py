@@ -27,15 +27,15 @@ class PatchExtents(NamedTuple):
         range: (n,) metres from there, in which all of a patch lies.
     """
 
-    place: Float
+    position: Float
     range: Float
 
-    def settled(self, tiles: NDArray[np.int64], edge: float, done: int) -> NDArray[np.bool_]:
+    def is_complete(self, tiles: NDArray[np.int64], edge: float, done: int) -> NDArray[np.bool_]:
         """(N,) which tiles, metres along an edge, and none beside them, later patches come to."""
-        if done >= len(self.place):
+        if done >= len(self.position):
             return np.ones(len(tiles), np.bool_)
         middle = (tiles + 0.5) * edge
-        away = np.asarray(cKDTree(self.place[done:]).query(middle)[0], np.float64)
+        away = np.asarray(cKDTree(self.position[done:]).query(middle)[0], np.float64)
         return np.asarray(away > self.range[done:].max() + _BESIDE * edge)
 
 
@@ -135,10 +135,10 @@ def min_voxel_size(seen: Recording, poses: Float, reach: PatchExtents) -> float:
     beams = beams[seen.hit[beams]]
     ends = seen.end_points(beams, poses)
     cells = np.unique(np.floor(ends[np.isfinite(ends).all(axis=1)] / _CELL), axis=0) * _CELL
-    asked = np.unique(np.linspace(0, len(reach.place) - 1, _PLACES).astype(np.intp))
+    asked = np.unique(np.linspace(0, len(reach.position) - 1, _PLACES).astype(np.intp))
     most = max(
         int(np.count_nonzero(np.linalg.norm(cells - place, axis=1) <= reach.range.max()))
-        for place in reach.place[asked]
+        for place in reach.position[asked]
     )
     bytes_of_one = _LAYERS * _BLOCK * most * (_CELL / _EDGE) ** 2
     return float(np.sqrt(bytes_of_one / _MEMORY))

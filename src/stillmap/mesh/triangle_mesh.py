@@ -39,7 +39,7 @@ class Mesh:
         return self.vertices[self.faces]
 
     @property
-    def centres(self) -> Float:
+    def centers(self) -> Float:
         """(F, 3) metres."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         return np.asarray((a + b + c) / 3.0)
@@ -61,7 +61,7 @@ class Mesh:
             [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
         )
 
-    def pairs(self) -> Index:
+    def adjacent_faces(self) -> Index:
         """(N, 2) faces that share an edge, the lower number first, each pair once, rising.
 
         Of an edge that more than two share, each is beside the next.
@@ -77,11 +77,11 @@ class Mesh:
         both = np.unique((low * F + high)[low < high])
         return np.column_stack([both // F, both % F]).astype(np.int32)
 
-    def part(self, kept: NDArray[np.bool_]) -> "Mesh":
+    def select(self, kept: NDArray[np.bool_]) -> "Mesh":
         """The faces (F,) that are kept, with the vertices that they use, in their order."""
-        return self.part_of(np.flatnonzero(kept))
+        return self.subset(np.flatnonzero(kept))
 
-    def part_of(self, numbers: NDArray[np.intp]) -> "Mesh":
+    def subset(self, numbers: NDArray[np.intp]) -> "Mesh":
         """The faces with these numbers (n,), with the vertices that they use, in their order."""
         faces = self.faces[numbers]
         used = np.zeros(len(self.vertices), np.bool_)

@@ -57,7 +57,7 @@ class StreamingSurface:
         """Makes triangles of what patches from number `done` on do not come to."""
         tiles = marching_cubes.occupied_tiles(self.distances)
         edge = marching_cubes.TILE * self.distances.voxel
-        self._take(tiles[reach.settled(tiles, edge, done)])
+        self._take(tiles[reach.is_complete(tiles, edge, done)])
         self._forget()
         self._held = self.distances.memory_bytes
 

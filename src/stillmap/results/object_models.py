@@ -32,14 +32,14 @@ def write_models(folder: Path, models: Models, n_images: int, options: TextureOp
     """
     if len(models.textured):
         write_glb(folder / "mesh.glb", _seen(models.textured), options)
-        write_faces(folder / "mesh_faces.npz", models.painted, models.views, n_images, "map")
+        write_faces(folder / "mesh_faces.npz", models.assignment, models.views, n_images, "map")
     objects = folder / "objects"
-    if models.movers:
+    if models.objects:
         objects.mkdir(exist_ok=True)
-    for one in models.movers:
+    for one in models.objects:
         name = f"{one.shape.id:04d}"
         write_glb(objects / f"{name}.glb", _seen(one.textured), options)
-        painted, views = one.dressed.painted, one.dressed.views
+        painted, views = one.face_views.assignment, one.face_views.views
         write_faces(objects / f"{name}_faces.npz", painted, views, n_images, "object")
         record = {
             "stamp_ns": one.stamp_ns,
@@ -87,18 +87,18 @@ def write_faces(
 
 def models_record(models: Models) -> dict[str, Any]:
     """What `run.json` says of them."""
-    painted = models.painted
+    painted = models.assignment
     areas = painted.mesh.areas()
 
     def area(of: NDArray[np.bool_]) -> float:
         return round(float(areas[of].sum()), _SQUARE_CENTIMETRES)
 
-    points = {} if models.tints is None else {"points": dict(models.tints.counts)}
+    points = {} if models.point_colors is None else {"points": dict(models.point_colors.counts)}
     used = {view.image for k, view in enumerate(models.views) if (painted.view == k).any()}
     return {
         "faces": len(areas),
         "area": area(np.ones(len(areas), np.bool_)),
-        "area_seen": area(painted.seen),
+        "area_seen": area(painted.visible),
         "area_painted": area(painted.view >= 0),
         "pictures": {
             "used": len(used),
@@ -107,6 +107,6 @@ def models_record(models: Models) -> dict[str, Any]:
             "unread": [*models.unread, *models.textured.unread],
         },
         "pages": [list(page.shape[:2]) for page in models.textured.pages],
-        "objects": {"found": models.tried, "modelled": len(models.movers)},
+        "objects": {"found": models.n_objects, "modelled": len(models.objects)},
         **points,
     }

@@ -30,8 +30,8 @@ from stillmap.results.report.page import write_report
 from stillmap.results.report.previews import ModelPreviews, render_previews
 from stillmap.results.rig import FOLDER as TILTING
 from stillmap.results.rig import tilting_record, write_tilting
-from stillmap.rig.build import Tilting
-from stillmap.slam import Closure
+from stillmap.rig.build import TiltingResult
+from stillmap.slam import LoopClosure
 
 FORMAT_VERSION = 1
 
@@ -91,7 +91,7 @@ def write_run_json(path: Path, result: Result, more: Mapping[str, Any] | None = 
     path.write_text(text + "\n", encoding="utf-8")
 
 
-def _loop(one: Closure) -> dict[str, Any]:
+def _loop(one: LoopClosure) -> dict[str, Any]:
     return {"earlier": one.earlier, "later": one.later, "explained": one.explained}
 
 
@@ -126,8 +126,8 @@ def save(
     path: Path,
     overwrite: bool = False,
     *,
-    within: Path | None = None,
-    tilting: Tilting | None = None,
+    staging_folder: Path | None = None,
+    tilting: TiltingResult | None = None,
     models: Models | None = None,
 ) -> None:
     """Write `result` as the folder `path`: map, trajectory, pose graph, labels, objects, report.
@@ -136,15 +136,15 @@ def save(
         result: what the pipeline found.
         path: the folder; it must not exist or be empty unless `overwrite` is given.
         overwrite: replace an earlier result, once the new folder is whole.
-        within: where the new folder is made until then; None: beside `path`.
+        staging_folder: where the new folder is written until then; None: beside `path`.
         tilting: what a second laser built in 3D.
         models: of the place and of what moved; see `stillmap.models`.
 
     Raises:
         InputError: `path` is taken or cannot be written to.
     """
-    colours = None if models is None or models.tints is None else models.tints.colours
-    with atomic_folder(path, RECORD, overwrite, within=within) as folder:
+    colours = None if models is None or models.point_colors is None else models.point_colors.colors
+    with atomic_folder(path, RECORD, overwrite, staging_folder=within) as folder:
         write_map_server(folder, result.map, result.options.output.map_mode)
         write_map_npz(folder / "map.npz", result.map, result.changes, result.evidence)
         write_tum(folder / "trajectory.tum", result.recording.stamp_ns, result.poses)
@@ -177,7 +177,7 @@ def _stills(models: Models, threads: int) -> ModelPreviews:
         models.textured,
         models.unfiltered,
         np.array([view.T_camera_map for view in models.views]).reshape(-1, 4, 4),
-        {one.shape.id: one.textured for one in models.movers},
+        {one.shape.id: one.textured for one in models.objects},
         resolve_threads(threads),
         models.left_out,
     )

@@ -19,7 +19,7 @@ STANDS = Car((8.0, 0.0), (0.0, 0.0), (0.6, 2.0, 1.5))
 
 
 def _shape(sources: MeshInputs, options: MoverOptions = OPTIONS) -> ObjectShape | None:
-    moves = DynamicReturns.of(sources)
+    moves = DynamicReturns.collect(sources)
     followed = collect_tracks(sources, moves, options)
     return reconstruct_object(followed, sources, moves, options, [np.zeros(0)] * len(followed))
 
@@ -27,7 +27,7 @@ def _shape(sources: MeshInputs, options: MoverOptions = OPTIONS) -> ObjectShape 
 def _partly(sources: MeshInputs, share: float) -> MeshInputs:
     """The same, but what ended on the box in `share` of its width is static, and nobody's."""
     (one,) = sources.objects
-    y = sources.seen.end_points(one.beams, sources.poses)[:, 1]
+    y = sources.deskewed.end_points(one.beams, sources.poses)[:, 1]
     static = one.beams[y < -1.0 + 2.0 * share]
     p_static = sources.p_static.copy()
     p_static[static] = 0.95
@@ -48,8 +48,8 @@ def test_a_part_of_what_stands_still_has_none() -> None:
 def test_static_things_farther_away_do_not_matter() -> None:
     beside = Car((8.0, 1.5), (0.0, 0.0), (0.6, 0.4, 1.5))
     sources = street([STANDS, beside], [Part(0)])
-    every = np.arange(sources.seen.n_beams)
-    met = np.abs(sources.seen.end_points(every, sources.poses)[:, 1] - 1.5) < 0.25
+    every = np.arange(sources.deskewed.n_beams)
+    met = np.abs(sources.deskewed.end_points(every, sources.poses)[:, 1] - 1.5) < 0.25
     p_static = np.where(met, np.float32(0.95), sources.p_static)
     sources = dataclasses.replace(sources, p_static=p_static)
     assert _shape(sources) is not None
@@ -59,7 +59,7 @@ def test_static_things_farther_away_do_not_matter() -> None:
 def _face(height: float) -> tuple[MeshInputs, Mesh, ObjectFrame]:
     """The front of the box, up to a height, in its own frame."""
     sources = street([STANDS], [Part(0)])
-    way = ObjectFrame.of_track(sources.things[0])
+    way = ObjectFrame.from_track(sources.boxes[0])
     x, y = -0.3, 0.4
     corners = np.array([[x, -y, 0.0], [x, y, 0.0], [x, y, height], [x, -y, height]])
     return sources, Mesh(corners, np.array([[0, 2, 1], [0, 3, 2]], np.int32)), way
@@ -72,8 +72,8 @@ def _set(sources: MeshInputs, which: np.ndarray, p: float) -> MeshInputs:
 
 def _local(sources: MeshInputs, way: ObjectFrame) -> np.ndarray:
     T = way.T_map_object(0.0)
-    every = np.arange(sources.seen.n_beams)
-    return np.asarray((sources.seen.end_points(every, sources.poses) - T[:3, 3]) @ T[:3, :3])
+    every = np.arange(sources.deskewed.n_beams)
+    return np.asarray((sources.deskewed.end_points(every, sources.poses) - T[:3, 3]) @ T[:3, :3])
 
 
 @pytest.mark.parametrize("reach", [0.05, 0.2])
@@ -93,7 +93,7 @@ def test_the_mean_is_that_of_beams_near_the_surface(reach: float) -> None:
 
 def test_other_times_do_not_count() -> None:
     sources, mesh, way = _face(0.9)
-    later = np.arange(sources.seen.n_beams) >= sources.seen.offset[3]
+    later = np.arange(sources.deskewed.n_beams) >= sources.deskewed.offset[3]
     sources = _set(sources, later, 1.0)
     assert mean_p_dynamic(mesh, way, (0.0, 0.25), sources, 0.2) == 1.0
     assert mean_p_dynamic(mesh, way, (0.35, 0.65), sources, 0.2) == 0.0
@@ -104,12 +104,12 @@ def test_what_goes_on_leaves_what_it_passed_behind() -> None:
     goes = Car((8.0, -2.0), (0.0, 10.0), (0.6, 1.0, 1.5))
     wall = Car((9.0, -2.0), (0.0, 0.0), (0.6, 1.0, 1.5))
     sources = street([goes, wall], [Part(0), Part(1)], scans=6)
-    x = _local(sources, ObjectFrame.of_track(sources.things[1]))[:, 0]
+    x = _local(sources, ObjectFrame.from_track(sources.boxes[1]))[:, 0]
     sources = _set(sources, np.abs(x + 0.3) < 0.05, 1.0)
-    way = ObjectFrame.of_track(sources.things[0])
+    way = ObjectFrame.from_track(sources.boxes[0])
     corners = np.array([[-0.3, -0.4, 0.2], [-0.3, 0.4, 0.2], [-0.3, 0.4, 1.2]])
     mesh = Mesh(corners, np.array([[0, 2, 1]], np.int32))
-    standing = way._replace(thing=way.thing._replace(box=sources.things[1].box))
+    standing = way._replace(thing=way.box._replace(box=sources.boxes[1].box))
     assert mean_p_dynamic(mesh, way, (0.15, 0.45), sources, 0.2) == 1.0
     assert mean_p_dynamic(mesh, standing, (0.15, 0.45), sources, 0.2) < 0.5
 

@@ -22,7 +22,7 @@ def _way() -> ObjectFrame:
 
 
 def test_without_offsets_the_frame_is_that_of_the_track() -> None:
-    way = ObjectFrame.of_track(_way().thing)
+    way = ObjectFrame.from_track(_way().box)
     T = way.T_map_object(1.5)
     np.testing.assert_allclose(T[:3, 3], [2.0, 1.0, 0.2])
     np.testing.assert_allclose(T[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)
@@ -34,7 +34,7 @@ def test_points_go_there_and_back() -> None:
     points = rng.normal(size=(20, 3))
     for seconds in (-0.2, 0.5, 1.0, 1.7, 2.3):
         T = way.T_map_object(seconds)
-        local = way.local(np.full(20, seconds), points)
+        local = way.to_object(np.full(20, seconds), points)
         np.testing.assert_allclose(local @ T[:3, :3].T + T[:3, 3], points, atol=1e-9)
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
 
@@ -42,15 +42,17 @@ def test_points_go_there_and_back() -> None:
 def test_each_point_goes_by_its_own_time() -> None:
     way = _way()
     points = np.array([[0.4, 0.3, 1.0], [2.0, 1.9, 0.5]])
-    both = way.local(np.array([0.2, 1.9]), points)
+    both = way.to_object(np.array([0.2, 1.9]), points)
     for k, seconds in enumerate((0.2, 1.9)):
-        alone = way.local(np.array([seconds]), points[k : k + 1])
+        alone = way.to_object(np.array([seconds]), points[k : k + 1])
         np.testing.assert_allclose(both[k], alone[0])
 
 
 def test_offsets_are_those_of_the_frame() -> None:
     way = _way()
-    straight = ObjectFrame.of_track(way.thing).local(np.array([2.0]), np.array([[2.0, 3.0, 0.3]]))
+    straight = ObjectFrame.from_track(way.box).to_object(
+        np.array([2.0]), np.array([[2.0, 3.0, 0.3]])
+    )
     np.testing.assert_allclose(straight, [[1.0, 0.0, 0.0]], atol=1e-12)
-    turned = way.local(np.array([2.0]), np.array([[2.0, 3.0, 0.3]]))
+    turned = way.to_object(np.array([2.0]), np.array([[2.0, 3.0, 0.3]]))
     np.testing.assert_allclose(turned, [[np.cos(0.1) + 0.2, np.sin(0.1) - 0.4, 0.0]], atol=1e-12)

@@ -12,7 +12,7 @@ def _pairs(*rows: tuple[int, int, int, int]) -> PairCounts:
 
 
 def _wholes(pairs: PairCounts, n: int, may: list[bool] | None = None) -> list[list[int]]:
-    allowed = np.ones(len(pairs.met), np.bool_) if may is None else np.array(may)
+    allowed = np.ones(len(pairs.connected), np.bool_) if may is None else np.array(may)
     whole = group_tracks(pairs, allowed, n)
     return [np.flatnonzero(whole == k).tolist() for k in np.unique(whole)]
 
@@ -32,9 +32,9 @@ def test_pairs_are_counted_as_in_a_square_of_all(monkeypatch) -> None:
             both[np.ix_(there, there)] += fewer
         pairs = count_pairs(scans, n)
         ends = np.argwhere(np.triu(both > 0, 1))
-        np.testing.assert_array_equal(pairs.ends, ends)
-        np.testing.assert_array_equal(pairs.met, met[ends[:, 0], ends[:, 1]])
-        np.testing.assert_array_equal(pairs.both, both[ends[:, 0], ends[:, 1]])
+        np.testing.assert_array_equal(pairs.pairs, ends)
+        np.testing.assert_array_equal(pairs.connected, met[ends[:, 0], ends[:, 1]])
+        np.testing.assert_array_equal(pairs.observed, both[ends[:, 0], ends[:, 1]])
 
 
 def test_what_always_hangs_together_is_one_however_long_the_chain() -> None:

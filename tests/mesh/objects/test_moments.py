@@ -42,8 +42,8 @@ def test_there_is_no_surface_where_beams_passed() -> None:
     both = ObjectBeams(*(np.concatenate([a, b]) for a, b in zip(others, through, strict=True)))
     with_hole = triangulate_beams(own, both, 10.0, 0.6)
     closed = triangulate_beams(own, others, 10.0, 0.6)
-    assert np.linalg.norm(with_hole.centres[:, 1:], axis=1).min() > 0.06
-    assert np.linalg.norm(closed.centres[:, 1:], axis=1).min() < 0.06
+    assert np.linalg.norm(with_hole.centers[:, 1:], axis=1).min() > 0.06
+    assert np.linalg.norm(closed.centers[:, 1:], axis=1).min() < 0.06
 
 
 def test_steps_and_few_beams_are_no_surface() -> None:

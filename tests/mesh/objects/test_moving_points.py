@@ -61,7 +61,7 @@ def board_seen(*others: TrackedBox) -> TrackedReturns:
         things=[thing(7, 0.0, AHEAD, (0.6, 0.2), SPEED), *others],
         start_ns=0,
     )
-    return TrackedReturns(sources, DynamicReturns.of(sources))
+    return TrackedReturns(sources, DynamicReturns.collect(sources))
 
 
 def view(number: int, seconds: float) -> View:
@@ -152,7 +152,7 @@ def test_what_is_of_no_track_and_what_stands_still_are_left_alone():
     moving = board_seen()
     moving.sources.p_static[:100] = 0.9
     moving.sources.objects[0].beams = np.arange(200, 2 * len(BOARD))
-    again = TrackedReturns(moving.sources, DynamicReturns.of(moving.sources))
+    again = TrackedReturns(moving.sources, DynamicReturns.collect(moving.sources))
     colours, _ = tint(again, [view(1, 0.05)])
     assert (colours[0, :200] == GRAY).all()
     assert (colours[0, 200:] != GRAY).any()

@@ -25,14 +25,16 @@ TWO = [Car((8.0, -2.0), (6.0, 0.0)), Car((20.0, 4.0), (-4.0, 0.0))]
 
 def test_all_that_moves_is_known_once() -> None:
     sources = street(TWO, [Part(0), Part(1)])
-    moves = DynamicReturns.of(sources)
+    moves = DynamicReturns.collect(sources)
     np.testing.assert_array_equal(moves.beam, np.flatnonzero(sources.p_static < 0.5))
-    np.testing.assert_array_equal(moves.ends, sources.seen.end_points(moves.beam, sources.poses))
+    np.testing.assert_array_equal(
+        moves.ends, sources.deskewed.end_points(moves.beam, sources.poses)
+    )
     for one in sources.objects:
         np.testing.assert_array_equal(moves.beam[moves.owner == one.id], one.beams)
-    assert not moves.planar
-    assert moves.dynamic.all()
-    some = moves.between(5000, 9000)
+    assert not moves.is_planar
+    assert moves.is_dynamic.all()
+    some = moves.in_beam_range(5000, 9000)
     np.testing.assert_array_equal(moves.beam[some], [b for b in moves.beam if 5000 <= b < 9000])
 
 
@@ -60,27 +62,27 @@ def test_beams_of_lidars_that_begin_at_once_are_found(lidars: int) -> None:
         assert about[0] <= then[0]
         assert then[-1] < about[1]
     # of a picture, too
-    ends, _ = sources.beams().about(280_000_000, ChoiceOptions())
+    ends, _ = sources.index_returns().near_time(280_000_000, ChoiceOptions())
     assert len(ends) == np.count_nonzero(np.abs(seconds - 0.28) <= 0.06)
-    moving = TrackedReturns(sources, DynamicReturns.of(sources))
+    moving = TrackedReturns(sources, DynamicReturns.collect(sources))
     beams = sources.objects[0].beams
-    found = moving.about(0.28, 0.07).beam
+    found = moving.near_time(0.28, 0.07).beam
     np.testing.assert_array_equal(np.sort(found), beams[np.abs(seconds[beams] - 0.28) <= 0.07])
     assert len(found) > 0
 
 
 def test_a_thing_has_what_ended_in_its_box_and_nothing_of_others() -> None:
     sources = street(TWO, [Part(0), Part(1)])
-    moves = DynamicReturns.of(sources)
-    for one, thing in zip(sources.objects, sources.things, strict=True):
+    moves = DynamicReturns.collect(sources)
+    for one, thing in zip(sources.objects, sources.boxes, strict=True):
         own = segment_object(one, thing, moves, sources, OPTIONS)
         np.testing.assert_array_equal(moves.beam[own], one.beams)
 
 
 def test_what_is_followed_by_nobody_is_its_own_in_its_box() -> None:
     sources = street(TWO, [Part(0), Part(1)])
-    one, thing = sources.objects[0], sources.things[0]
-    moves = DynamicReturns.of(sources)
+    one, thing = sources.objects[0], sources.boxes[0]
+    moves = DynamicReturns.collect(sources)
     free = moves._replace(owner=np.where(moves.owner == 0, -1, moves.owner).astype(np.int32))
     own = segment_object(one, thing, free, sources, OPTIONS)
     # but for the lowest row, which may be the ground's
@@ -91,14 +93,14 @@ def test_what_is_followed_by_nobody_is_its_own_in_its_box() -> None:
 def test_a_part_grows_to_the_whole_and_not_to_the_next_car() -> None:
     cars = [Car((12.0, -4.0), (3.0, 0.0)), Car((19.0, -4.0), (3.0, 0.0))]
     sources = street(cars, [Part(0, 0.0, 0.2), Part(1)])
-    moves = DynamicReturns.of(sources)
-    one, thing = sources.objects[0], sources.things[0]
+    moves = DynamicReturns.collect(sources)
+    one, thing = sources.objects[0], sources.boxes[0]
     own = segment_object(one, thing, moves, sources, OPTIONS)
-    within = moves.between(0, int(sources.seen.offset[1]))
+    within = moves.in_beam_range(0, int(sources.deskewed.offset[1]))
     every = np.arange(within.start, within.stop)
     own = own[own < within.stop]
     whole = grow_segment(
-        own, every, ObjectFrame.of_track(thing), np.array([-12.0, 4.0, 1.0]), moves, OPTIONS
+        own, every, ObjectFrame.from_track(thing), np.array([-12.0, 4.0, 1.0]), moves, OPTIONS
     )
     other = set(sources.objects[1].beams)
     assert len(whole) > 1.2 * len(own)
@@ -129,13 +131,13 @@ def test_pieces_are_as_far_apart_as_the_link_is_long() -> None:
 def test_beams_that_pass_beside_a_thing_are_found_among_all() -> None:
     sources = street(TWO, [Part(0), Part(1)])
     mine = sources.objects[0].beams
-    mine = mine[mine < sources.seen.offset[1]]
-    beams = np.setdiff1d(np.arange(sources.seen.offset[1]), mine)
+    mine = mine[mine < sources.deskewed.offset[1]]
+    beams = np.setdiff1d(np.arange(sources.deskewed.offset[1]), mine)
     near = in_viewing_cone(mine, beams, sources)
     assert 0 < near.sum() < len(beams) / 2
     # no beam within the outline is lost
-    turn = np.arctan2(sources.seen.points[:, 1], sources.seen.points[:, 0])
-    rise = sources.seen.points[:, 2] / np.linalg.norm(sources.seen.points, axis=1)
+    turn = np.arctan2(sources.deskewed.points[:, 1], sources.deskewed.points[:, 0])
+    rise = sources.deskewed.points[:, 2] / np.linalg.norm(sources.deskewed.points, axis=1)
     within = (turn[beams] >= turn[mine].min()) & (turn[beams] <= turn[mine].max())
     within &= (rise[beams] >= rise[mine].min()) & (rise[beams] <= rise[mine].max())
     assert near[within].all()
@@ -145,6 +147,6 @@ def test_beams_that_pass_beside_a_thing_are_found_among_all() -> None:
 def test_beams_from_nowhere_go_on() -> None:
     sources = street(TWO, [Part(0)])
     lost = np.array([10])
-    sources.seen.hit[lost] = False
-    look = beams_in_frame(lost, np.zeros(1), ObjectFrame.of_track(sources.things[0]), sources)
+    sources.deskewed.hit[lost] = False
+    look = beams_in_frame(lost, np.zeros(1), ObjectFrame.from_track(sources.boxes[0]), sources)
     assert np.linalg.norm(look.points - look.origin, axis=1) == pytest.approx(1000.0)

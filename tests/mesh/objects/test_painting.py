@@ -33,7 +33,9 @@ def thing(id=3, y=2.0):
 
 
 def shape(seconds=0.0):
-    return ObjectShape(3, BOARD, ObjectFrame.of_track(thing()), False, seconds, (seconds, seconds))
+    return ObjectShape(
+        3, BOARD, ObjectFrame.from_track(thing()), False, seconds, (seconds, seconds)
+    )
 
 
 def view(number, seconds, place=(0.0, 0.0, 0.0)):
@@ -88,7 +90,7 @@ def test_a_thing_is_painted_by_what_shows_it():
     assert [one.image for one in found.views] == [0]
     # as if it had stood still
     np.testing.assert_allclose(
-        found.views[0].in_camera(np.zeros((1, 3))), [[0.0, 0.5, 2.0]], atol=1e-9
+        found.views[0].to_camera(np.zeros((1, 3))), [[0.0, 0.5, 2.0]], atol=1e-9
     )
 
 
@@ -128,9 +130,11 @@ def test_the_place_behind_is_compared_where_it_is_seen_from_elsewhere():
     views = [view(0, 0.0), view(1, 30.0, place=(1.0, 0.0, 0.0))]
     ahead = Background(place_of(), views, VisibleOptions(), colours)
     on_wall = np.array([[-1.0, 4.0, 0.3], [0.4, 4.0, 1.2], [0.7, 4.0, -0.9], [1.5, 4.0, 0.5]])
-    np.testing.assert_allclose(ahead.differs(0, 0.6 * on_wall), 0.0, atol=1e-3)
+    np.testing.assert_allclose(ahead.color_difference(0, 0.6 * on_wall), 0.0, atol=1e-3)
     expected = np.linalg.norm(np.subtract(WALLS, CLOTHES))
-    np.testing.assert_allclose(ahead.differs(0, np.array([[0.1, 2.0, 0.2]])), expected, rtol=1e-5)
+    np.testing.assert_allclose(
+        ahead.color_difference(0, np.array([[0.1, 2.0, 0.2]])), expected, rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("why", ["grey", "by the same picture", "damaged", "nothing is there"])
@@ -184,7 +188,7 @@ def test_of_two_as_sharp_the_one_nearer_in_time_paints():
         return pictures(there=(0, 2, 3), shift=1e-9 * one.stamp_ns)(one)
 
     found = dress(views, colours=colours)
-    used = np.unique(found.painted.view[found.painted.view >= 0])
+    used = np.unique(found.assignment.view[found.assignment.view >= 0])
     assert [found.views[k].image for k in used] == [2]
 
 

@@ -52,7 +52,7 @@ def on_wall():
 
 
 def test_where_no_beam_tells_the_boxes_do():
-    x = WALL.centres[:, 0]
+    x = WALL.centers[:, 0]
     p = probabilities(beams([[9.0, 9.0, 0.0]], [1.0]), [person(0.0, 2.0)])
     np.testing.assert_allclose(p[np.abs(x) > 0.95], OPTIONS.unseen, atol=0.02)
     # 0.4 m wide, twice as far away
@@ -65,14 +65,14 @@ def test_beams_on_the_wall_speak_for_it_but_not_behind_a_thing():
     p = probabilities(beams(ends, np.ones(len(ends))), [])
     assert (p > 0.99).all()
     p = probabilities(beams(ends, np.ones(len(ends))), [person(0.0, 2.0)])
-    x = np.abs(WALL.centres[:, 0])
+    x = np.abs(WALL.centers[:, 0])
     assert (p[x < 0.25] < OPTIONS.least).all()
     assert (p[x > 0.7] > 0.99).all()
 
 
 def test_beams_that_end_on_what_moves_are_believed_at_once():
     p = probabilities(beams([[0.3, 2.0, 0.0]], [0.1]), [])
-    at = WALL.centres[:, [0, 2]]
+    at = WALL.centers[:, [0, 2]]
     near = np.hypot(at[:, 0] - 0.6, at[:, 1]) < 0.15
     assert near.any()
     np.testing.assert_allclose(p[near], 0.1, atol=1e-6)

@@ -38,7 +38,7 @@ def _corner(rng: np.random.Generator, n: int = 15) -> Mesh:
     one = np.concatenate([np.stack([k, k + 1, k + n], 1), np.stack([k + 1, k + n + 1, k + n], 1)])
     faces = np.concatenate([one, one[:, ::-1] + n * n])
     mesh = Mesh(points + rng.normal(0.0, 0.01, points.shape), faces.astype(np.int32))
-    towards = np.array([-8.0, 6.0, 1.0]) - mesh.centres
+    towards = np.array([-8.0, 6.0, 1.0]) - mesh.centers
     wrong = (mesh.normals() * towards).sum(axis=1) < 0.0
     return Mesh(mesh.vertices, np.where(wrong[:, None], mesh.faces[:, ::-1], mesh.faces))
 
@@ -49,7 +49,7 @@ def _seen(rng: np.random.Generator, wrong: np.ndarray) -> list[PartialSurface]:
     for later in LATER:
         mesh, (R, t) = _corner(rng), motion_transform(wrong, later)
         out.append(
-            PartialSurface.of(
+            PartialSurface.from_mesh(
                 Mesh((mesh.vertices - t) @ R, mesh.faces), np.array([-8.0, 6.0, 1.0]), later
             )
         )
@@ -64,7 +64,7 @@ def test_a_wrong_velocity_is_found(seed: int) -> None:
     motion = register_surfaces(sweeps, 2)
     np.testing.assert_allclose(motion[:2], wrong[:2], atol=0.06)
     assert motion[3] == pytest.approx(wrong[3], abs=0.02)
-    moved = [one.moved(motion) for one in sweeps]
+    moved = [one.transform(motion) for one in sweeps]
     before = [surface_distance(one, sweeps[2]) for one in sweeps]
     after = [surface_distance(one, moved[2]) for one in moved]
     assert max(before) > 0.1
@@ -83,9 +83,9 @@ def test_a_side_that_is_askew_is_not_moved_along_itself(
     sweeps = []
     for later in LATER:
         mesh, (R, t) = _corner(rng, 25), motion_transform(motion, later)
-        side = mesh.part(mesh.centres[:, 1] > 0.8)
+        side = mesh.select(mesh.centers[:, 1] > 0.8)
         seen = Mesh((side.vertices @ askew.T - t) @ R, side.faces)
-        sweeps.append(PartialSurface.of(seen, np.array([0.5, 4.0, 1.0]), later))
+        sweeps.append(PartialSurface.from_mesh(seen, np.array([0.5, 4.0, 1.0]), later))
     np.testing.assert_allclose(register_surfaces(sweeps, 2)[:2], wrong, atol=0.03)
 
 
@@ -93,9 +93,11 @@ def test_where_nothing_tells_the_track_counts() -> None:
     sweeps = []
     for k, later in enumerate(LATER):
         mesh = _corner(np.random.default_rng(k))
-        side = mesh.part(mesh.centres[:, 1] > 0.8)
+        side = mesh.select(mesh.centers[:, 1] > 0.8)
         moved = side.vertices + np.array([0.0, 0.2 * later, 0.0])
-        sweeps.append(PartialSurface.of(Mesh(moved, side.faces), np.array([0.0, 6.0, 1.0]), later))
+        sweeps.append(
+            PartialSurface.from_mesh(Mesh(moved, side.faces), np.array([0.0, 6.0, 1.0]), later)
+        )
     motion = register_surfaces(sweeps, 2)
     assert abs(motion[0]) < 0.05
     assert motion[1] == pytest.approx(-0.2, abs=0.03)
@@ -104,15 +106,17 @@ def test_where_nothing_tells_the_track_counts() -> None:
 def test_few_points_say_nothing() -> None:
     rng = np.random.default_rng(5)
     few = Mesh(rng.normal(size=(5, 3)), np.array([[0, 1, 2], [2, 3, 4]], np.int32))
-    sweeps = [PartialSurface.of(few, np.zeros(3), later) for later in (-0.1, 0.0)]
+    sweeps = [PartialSurface.from_mesh(few, np.zeros(3), later) for later in (-0.1, 0.0)]
     np.testing.assert_array_equal(register_surfaces(sweeps, 1), 0.0)
     assert np.isnan(surface_distance(sweeps[0], sweeps[1]))
     nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    assert np.isnan(surface_distance(sweeps[0], PartialSurface.of(nothing, np.zeros(3), 0.0)))
+    assert np.isnan(
+        surface_distance(sweeps[0], PartialSurface.from_mesh(nothing, np.zeros(3), 0.0))
+    )
 
 
 def test_a_patch_knows_how_far_away_its_planes_are() -> None:
-    patch = _seen(np.random.default_rng(6), np.zeros(6))[2].patch()
+    patch = _seen(np.random.default_rng(6), np.zeros(6))[2].to_patch()
     rear = np.flatnonzero(patch.points[:, 0] < -1.9)
     assert np.median(patch.standoff[rear]) == pytest.approx(6.0, abs=0.2)
     np.testing.assert_array_equal(patch.origin, np.tile([-8.0, 6.0, 1.0], (len(patch.points), 1)))
@@ -123,7 +127,7 @@ WRONG = Part(0, drift=(0.6, 0.2))
 
 
 def _shape(sources: MeshInputs, options: MoverOptions) -> ObjectShape:
-    moves = DynamicReturns.of(sources)
+    moves = DynamicReturns.collect(sources)
     followed = collect_tracks(sources, moves, options)
     (whole,) = merge_tracks(followed, moves, sources, options)
     shape = reconstruct_object(whole, sources, moves, options, [np.zeros(0)] * len(whole))
@@ -133,7 +137,7 @@ def _shape(sources: MeshInputs, options: MoverOptions) -> ObjectShape:
 
 def _off(shape: ObjectShape) -> np.ndarray:
     """How far the vertices of a model lie off the two sides of the car that are seen."""
-    T = shape.way.T_map_object(shape.seconds)
+    T = shape.frame.T_map_object(shape.seconds)
     there = shape.mesh.vertices @ T[:3, :3].T + T[:3, 3]
     rear = CAR.start[0] + CAR.velocity[0] * shape.seconds - 0.5 * CAR.size[0]
     side = CAR.start[1] + 0.5 * CAR.size[1]
@@ -150,7 +154,7 @@ def test_several_looks_are_better_than_one() -> None:
     assert shape.mesh.areas().sum() > 0.8 * alone.mesh.areas().sum()
     assert _off(shape).mean() < 0.8 * _off(alone).mean()
     # the way is the car's, not that of its track
-    T = [shape.way.T_map_object(shape.seconds + later)[:3, 3] for later in (0.0, 0.4)]
+    T = [shape.frame.T_map_object(shape.seconds + later)[:3, 3] for later in (0.0, 0.4)]
     np.testing.assert_allclose((T[1] - T[0])[:2] / 0.4, CAR.velocity, atol=0.25)
 
 
@@ -166,12 +170,12 @@ def test_people_are_seen_at_once() -> None:
 
 
 def test_going_on_evenly() -> None:
-    thing = street([CAR], [WRONG]).things[0]
+    thing = street([CAR], [WRONG]).boxes[0]
     even = straighten_track(thing, 0.25, 0.5)
     at = np.array([0.0, 0.25, 0.7])
     np.testing.assert_allclose(even.box.center_at(at), thing.box.center_at(at), atol=1e-9)
     np.testing.assert_array_equal(even.box.heading[0], thing.box.heading[2])
-    assert even.foot.tolist() == [thing.foot[2]] * 2
+    assert even.bottom.tolist() == [thing.bottom[2]] * 2
 
 
 def test_the_side_of_a_car_is_bridged_where_people_are_not() -> None:
@@ -192,8 +196,8 @@ def test_looks_of_several_lidars_follow_one_another() -> None:
     sources = by_several(street([Car((14.0, 0.0), (-6.0, 0.0))], [Part(0)], noise=0.01), 2)
     shape = _shape(sources, OPTIONS)
     assert shape.rigid
-    assert len(shape.way.seconds) > 8
-    assert (np.diff(shape.way.seconds) >= 0.0).all()
+    assert len(shape.frame.seconds) > 8
+    assert (np.diff(shape.frame.seconds) >= 0.0).all()
 
 
 @pytest.mark.parametrize(
@@ -210,7 +214,7 @@ def test_without_enough_of_a_surface_there_is_no_model(
     options: MoverOptions, any_model: bool
 ) -> None:
     sources = street([Car((8.0, -2.0), (6.0, 0.0))], [Part(0)])
-    moves = DynamicReturns.of(sources)
+    moves = DynamicReturns.collect(sources)
     (whole,) = merge_tracks(collect_tracks(sources, moves, options), moves, sources, options)
     assert (
         reconstruct_object(whole, sources, moves, options, [np.zeros(0)]) is not None

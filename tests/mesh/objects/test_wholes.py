@@ -26,7 +26,7 @@ CAR = Car((6.0, -2.5), (6.0, 0.0))
 
 
 def _wholes(sources: MeshInputs) -> list[list[int]]:
-    moves = DynamicReturns.of(sources)
+    moves = DynamicReturns.collect(sources)
     followed = collect_tracks(sources, moves, OPTIONS)
     found = merge_tracks(followed, moves, sources, OPTIONS)
     return [[one.object.id for one in whole] for whole in found]
@@ -53,13 +53,13 @@ def test_a_track_of_two_cars_does_not_make_them_one() -> None:
     ways = {name: np.concatenate([getattr(one, name) for one in (first, last)]) for name in names}
     both = dataclasses.replace(first, **ways)
     thing = TrackedBox(fit_box(both, 0, 0.5), np.zeros(len(both.scan)), both.size[2])
-    objects, things = [*sources.objects[:2], both], [*sources.things[:2], thing]
+    objects, things = [*sources.objects[:2], both], [*sources.boxes[:2], thing]
     sources = dataclasses.replace(sources, objects=objects, things=things)
-    moves = DynamicReturns.of(sources)
+    moves = DynamicReturns.collect(sources)
     followed = collect_tracks(sources, moves, OPTIONS)
     pairs = count_pairs(list(merging._scans(followed, moves, sources, OPTIONS)), 3)
-    hangs = pairs.met >= MAJORITY * pairs.both
-    assert pairs.ends[hangs].tolist() == [[0, 2], [1, 2]]  # by twos they are all one
+    hangs = pairs.connected >= MAJORITY * pairs.observed
+    assert pairs.pairs[hangs].tolist() == [[0, 2], [1, 2]]  # by twos they are all one
     assert sorted(_wholes(sources)) in ([[0, 2], [1]], [[0], [1, 2]])
 
 
@@ -87,13 +87,13 @@ def test_what_is_left_over_of_a_car_is_no_thing() -> None:
 
 def test_one_model_shows_all_of_a_car_that_was_followed_in_parts() -> None:
     sources = street([CAR], [Part(0, 0.0, 0.3), Part(0, 0.3, 1.0)])
-    moves = DynamicReturns.of(sources)
+    moves = DynamicReturns.collect(sources)
     followed = collect_tracks(sources, moves, OPTIONS)
     (whole,) = merge_tracks(followed, moves, sources, OPTIONS)
     shape = reconstruct_object(whole, sources, moves, OPTIONS, [np.zeros(0)] * len(whole))
     assert shape is not None
     assert shape.id in (0, 1)
-    T = shape.way.T_map_object(shape.seconds)
+    T = shape.frame.T_map_object(shape.seconds)
     there = shape.mesh.vertices @ T[:3, :3].T + T[:3, 3]
     rear = CAR.start[0] - 2.0 + 6.0 * shape.seconds
     assert there[:, 0].min() < rear + 0.1
@@ -111,7 +111,7 @@ def test_points_hang_together_as_far_as_beams_are_apart() -> None:
 
 def test_many_tracks_that_never_meet_need_no_room() -> None:
     sources = street([CAR], [Part(0)])
-    moves = DynamicReturns.of(sources)
+    moves = DynamicReturns.collect(sources)
     (one,) = collect_tracks(sources, moves, OPTIONS)
     far = [
         one._replace(object=dataclasses.replace(one.object, id=k, beams=one.object.beams[:0]))

@@ -58,7 +58,7 @@ def test_edges_may_be_longer_in_some_places_without_gaps() -> None:
     a, b = fine.vertices[fine.faces], fine.vertices[np.roll(fine.faces, -1, axis=1)]
     limit = 0.2 + 0.2 * np.minimum(a[..., 0], b[..., 0])
     assert (np.linalg.norm(a - b, axis=2) <= limit + 1e-9).all()
-    here = fine.centres[:, 0]
+    here = fine.centers[:, 0]
     assert (here < 1.0).sum() > 2 * ((here > 5.0) & (here < 6.0)).sum()
     np.testing.assert_allclose(fine.areas().sum(), mesh.areas().sum(), rtol=1e-9)
     assert _has_no_gaps(fine)

@@ -108,7 +108,7 @@ def test_reach_is_as_far_as_hits_are(room):
     reach = patch_extents(recording, poses, order)
     ends = [recording.end_points(np.arange(900) + 900 * t, poses) for t in range(2)]
     for t in range(2):
-        away = np.linalg.norm(ends[t] - reach.place[t], axis=1)
+        away = np.linalg.norm(ends[t] - reach.position[t], axis=1)
         assert reach.range[t] == pytest.approx(away.max(), rel=1e-5)
     recording.hit[:900] = False
     assert patch_extents(recording, poses, order).range[0] == 0.0
@@ -117,6 +117,6 @@ def test_reach_is_as_far_as_hits_are(room):
 def test_settled_are_tiles_that_later_patches_do_not_come_to():
     reach = PatchExtents(np.array([[0.0, 0, 0], [10.0, 0, 0]]), np.array([5.0, 2.0]))
     tiles = np.array([[0, 0, 0], [5, 0, 0], [9, 0, 0], [30, 0, 0]])
-    assert reach.settled(tiles, 1.0, 0).tolist() == [False, False, False, True]
-    assert reach.settled(tiles, 1.0, 1).tolist() == [True, False, False, True]
-    assert reach.settled(tiles, 1.0, 2).all()
+    assert reach.is_complete(tiles, 1.0, 0).tolist() == [False, False, False, True]
+    assert reach.is_complete(tiles, 1.0, 1).tolist() == [True, False, False, True]
+    assert reach.is_complete(tiles, 1.0, 2).all()

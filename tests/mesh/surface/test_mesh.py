@@ -14,7 +14,7 @@ SQUARE = Mesh(
 def test_a_square_is_two_triangles_that_share_an_edge() -> None:
     np.testing.assert_allclose(SQUARE.areas(), [1.0, 1.0])
     np.testing.assert_allclose(SQUARE.normals(), [[0, 0, 1], [0, 0, 1]])
-    assert SQUARE.pairs().tolist() == [[0, 1]]
+    assert SQUARE.adjacent_faces().tolist() == [[0, 1]]
 
 
 def test_a_face_without_area_has_no_normal() -> None:
@@ -23,7 +23,7 @@ def test_a_face_without_area_has_no_normal() -> None:
 
 
 def test_a_part_has_the_vertices_that_it_uses() -> None:
-    part = SQUARE.part(np.array([False, True]))
+    part = SQUARE.select(np.array([False, True]))
     assert part.faces.tolist() == [[0, 1, 2]]
     np.testing.assert_array_equal(part.vertices, SQUARE.vertices[[0, 2, 3]])
 
@@ -31,7 +31,7 @@ def test_a_part_has_the_vertices_that_it_uses() -> None:
 def test_joined_meshes_keep_their_faces() -> None:
     both = concatenate_meshes([SQUARE, SQUARE])
     assert both.faces.tolist() == [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]
-    assert both.pairs().tolist() == [[0, 1], [2, 3]]
+    assert both.adjacent_faces().tolist() == [[0, 1], [2, 3]]
     assert len(concatenate_meshes([])) == 0
 
 
@@ -40,7 +40,7 @@ def test_more_than_two_faces_may_share_an_edge() -> None:
         np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0]]),
         np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]], np.int32),
     )
-    assert fan.pairs().tolist() == [[0, 1], [1, 2]]
+    assert fan.adjacent_faces().tolist() == [[0, 1], [1, 2]]
 
 
 def test_a_vertex_that_is_not_there_is_refused() -> None:

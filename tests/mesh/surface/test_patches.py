@@ -112,7 +112,7 @@ def test_scans_of_a_nodding_laser_are_rows_while_the_robot_drives(room):
     poses[:, 0, 3] = 0.01 * np.arange(60)
     recording = room.scans(room.nodding(), poses)
     order, (patch,) = patches(recording, poses)
-    assert order.planar
+    assert order.is_planar
     assert len(patch.faces) > 0.85 * 2 * 59 * 60
     assert looks_back(patch).all()
     scan = patch.beam[patch.faces] // 61

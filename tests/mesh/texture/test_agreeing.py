@@ -14,7 +14,7 @@ WALL = rectangle([-0.5, 4.0, -0.5], [1.0, 0, 0], [0, 0, 1.0], 2)
 
 def left(shades, odd=40.0):
     views = [looking([0.0, 0, 0], [0.0, 1, 0], number) for number in range(len(shades))]
-    candidates, n = Candidates.none(len(WALL), 6), len(WALL)
+    candidates, n = Candidates.empty(len(WALL), 6), len(WALL)
     for number in range(len(shades)):
         p = np.full(n, 0.9)
         candidates.add(number, np.arange(n), np.full(n, -float(number)), p)
@@ -26,9 +26,9 @@ def left(shades, odd=40.0):
     found = reject_inconsistent_views(
         candidates, sample_face_colors(WALL, candidates, views, colours), odd
     )
-    assert (found.picture == found.picture[0]).all()
-    assert (np.isfinite(found.utility) == (found.picture >= 0)).all()
-    return [k for k in found.picture[0].tolist() if k >= 0]
+    assert (found.view == found.view[0]).all()
+    assert (np.isfinite(found.utility) == (found.view >= 0)).all()
+    return [k for k in found.view[0].tolist() if k >= 0]
 
 
 def test_one_that_most_contradict_is_left_out():

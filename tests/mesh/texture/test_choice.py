@@ -14,14 +14,14 @@ def test_the_best_pictures_of_each_face_are_kept() -> None:
     F, K, pictures = 50, 3, 11
     utilities = rng.normal(size=(pictures, F))
     sees = rng.random((pictures, F)) < 0.5
-    kept = Candidates.none(F, K)
+    kept = Candidates.empty(F, K)
     for k in range(pictures):
         faces = np.flatnonzero(sees[k])
         kept.add(k, faces, utilities[k, faces], np.full(len(faces), 0.01 * k))
     for f in range(F):
         mine = [k for k in np.argsort(-utilities[:, f]) if sees[k, f]][:K]
         expected = mine + [-1] * (K - len(mine))
-        assert kept.picture[f].tolist() == expected
+        assert kept.view[f].tolist() == expected
         np.testing.assert_allclose(kept.p_static[f, : len(mine)], 0.01 * np.array(mine), rtol=1e-6)
 
 
@@ -44,7 +44,7 @@ def test_twice_the_resolution_is_worth_its_logarithm() -> None:
 
 def _energy(c: Candidates, pairs: np.ndarray, border: float, label: np.ndarray) -> float:
     lost = c.utility.max(axis=1) - c.utility[np.arange(len(label)), label]
-    picture = c.picture[np.arange(len(label)), label]
+    picture = c.view[np.arange(len(label)), label]
     return float(lost.sum() + border * (picture[pairs[:, 0]] != picture[pairs[:, 1]]).sum())
 
 
@@ -52,15 +52,15 @@ def _energy(c: Candidates, pairs: np.ndarray, border: float, label: np.ndarray) 
 def test_on_a_strip_no_other_choice_costs_less(seed: int) -> None:
     rng = np.random.default_rng(seed)
     F, K, border = 6, 3, 0.7
-    c = Candidates.none(F, K)
+    c = Candidates.empty(F, K)
     for k in range(4):
         faces = np.flatnonzero(rng.random(F) < 0.7)
         c.add(k, faces, rng.normal(size=len(faces)), np.ones(len(faces)))
     c.add(9, np.arange(F), np.full(F, -3.0), np.ones(F))  # each has one at least
     pairs = np.stack([np.arange(F - 1), np.arange(1, F)], axis=1).astype(np.int32)
     got = select_views(c, pairs, border)
-    label = np.argmax(c.picture == got[:, None], axis=1)
-    counts = (c.picture != -1).sum(axis=1)
+    label = np.argmax(c.view == got[:, None], axis=1)
+    counts = (c.view != -1).sum(axis=1)
     least = min(
         _energy(c, pairs, border, np.array(labels))
         for labels in itertools.product(*(range(n) for n in counts))
@@ -69,7 +69,7 @@ def test_on_a_strip_no_other_choice_costs_less(seed: int) -> None:
 
 
 def test_neighbours_take_the_same_picture_where_little_is_lost() -> None:
-    c = Candidates.none(4, 2)
+    c = Candidates.empty(4, 2)
     every = np.arange(4)
     c.add(0, every, np.array([1.0, 1.0, 0.9, 1.0]), np.ones(4))
     c.add(1, every, np.array([0.0, 0.0, 1.0, 0.0]), np.ones(4))
@@ -79,7 +79,7 @@ def test_neighbours_take_the_same_picture_where_little_is_lost() -> None:
 
 
 def test_a_face_without_a_picture_has_none_and_parts_its_neighbours() -> None:
-    c = Candidates.none(3, 2)
+    c = Candidates.empty(3, 2)
     c.add(5, np.array([0]), np.array([1.0]), np.ones(1))
     c.add(6, np.array([2]), np.array([1.0]), np.ones(1))
     pairs = np.array([[0, 1], [1, 2]], np.int32)

@@ -40,7 +40,7 @@ def gradient() -> np.ndarray:
 def test_points_have_the_colour_beneath_them(gradient):
     rng = np.random.default_rng(3)
     points = np.column_stack([rng.uniform(0.02, 0.98, (500, 2)), rng.uniform(-0.04, 0.04, 500)])
-    colours, has = TextureSampler(square(gradient), 0.05).colours(points, from_above(points))
+    colours, has = TextureSampler(square(gradient), 0.05).colors(points, from_above(points))
     assert has.all()
     np.testing.assert_allclose(colours[:, 0], 200.0 * points[:, 0] - 0.5, atol=0.51)
     np.testing.assert_allclose(colours[:, 1], 2.0 * (100.0 * points[:, 1] - 0.5), atol=0.51)
@@ -49,9 +49,9 @@ def test_points_have_the_colour_beneath_them(gradient):
 def test_what_is_too_far_off_or_seen_from_behind_has_none(gradient):
     points = np.array([[0.5, 0.5, 0.049], [0.5, 0.5, 0.051], [1.04, 0.5, 0.0], [1.06, 0.5, 0.0]])
     painted = TextureSampler(square(gradient), 0.05)
-    _, has = painted.colours(points, from_above(points))
+    _, has = painted.colors(points, from_above(points))
     assert has.tolist() == [True, False, True, False]
-    _, has = painted.colours(points, from_above(points) * [1.0, 1.0, -1.0])
+    _, has = painted.colors(points, from_above(points) * [1.0, 1.0, -1.0])
     assert not has.any()
 
 
@@ -70,23 +70,23 @@ def test_the_side_that_was_seen_counts_though_the_other_one_is_nearer():
     )
     points = np.array([[0.5, 0.3, 0.0], [0.5, 0.3, 0.02]])
     painted = TextureSampler(whole, 0.05)
-    assert painted.colours(points, from_above(points))[0].tolist() == [[200, 0, 0]] * 2
+    assert painted.colors(points, from_above(points))[0].tolist() == [[200, 0, 0]] * 2
     below = from_above(points) * [1.0, 1.0, -1.0]
-    assert painted.colours(points, below)[0].tolist() == [[0, 200, 0]] * 2
+    assert painted.colors(points, below)[0].tolist() == [[0, 200, 0]] * 2
 
 
 def test_grey_faces_give_no_colour_and_grey_texels_one_beside_grey():
     grey = np.full((8, 8, 3), GRAY, np.uint8)
     points = np.array([[0.5, 0.3, 0.0]])
-    colours, has = TextureSampler(square(grey), 0.05).colours(points, from_above(points))
+    colours, has = TextureSampler(square(grey), 0.05).colors(points, from_above(points))
     assert has.all()
     assert colours.tolist() == [[128, 128, 127]]
     assert (
-        not TextureSampler(square(grey, view=-1), 0.05).colours(points, from_above(points))[1].any()
+        not TextureSampler(square(grey, view=-1), 0.05).colors(points, from_above(points))[1].any()
     )
     unread = square(grey)
     unread.view[:] = -1  # its picture turned out to be damaged
-    assert not TextureSampler(unread, 0.05).colours(points, from_above(points))[1].any()
+    assert not TextureSampler(unread, 0.05).colors(points, from_above(points))[1].any()
     some = np.array([[128, 128, 128], [128, 128, 127], [0, 128, 128]], np.uint8)
     assert avoid_gray(some).tolist() == [[128, 128, 127], [128, 128, 127], [0, 128, 128]]
 
@@ -103,4 +103,4 @@ def test_nothing_is_not_painted():
         np.zeros(0, np.int32),
     )
     points = np.zeros((4, 3))
-    assert not TextureSampler(empty, 0.1).colours(points, points + 1.0)[1].any()
+    assert not TextureSampler(empty, 0.1).colors(points, points + 1.0)[1].any()

@@ -57,13 +57,13 @@ def _walker() -> TrackedBox:
 
 def test_a_thing_is_on_its_way_and_a_little_beyond() -> None:
     (half_way,) = boxes_at([_walker()], 0.5)
-    np.testing.assert_allclose(half_way.middle, [0.5, 0.0, 0.9])
-    np.testing.assert_allclose(half_way.half, [0.2, 0.3, 0.9])
+    np.testing.assert_allclose(half_way.center, [0.5, 0.0, 0.9])
+    np.testing.assert_allclose(half_way.half_size, [0.2, 0.3, 0.9])
     (later,) = boxes_at([_walker()], 2.4)
-    np.testing.assert_allclose(later.middle, [1.0, 1.4, 1.1])
+    np.testing.assert_allclose(later.center, [1.0, 1.4, 1.1])
     np.testing.assert_allclose(later.ahead, [0.0, 1.0])
     (before,) = boxes_at([_walker()], -0.3)
-    np.testing.assert_allclose(before.middle, [-0.3, 0.0, 0.9])
+    np.testing.assert_allclose(before.center, [-0.3, 0.0, 0.9])
     assert boxes_at([_walker()], 2.6) == []
     assert boxes_at([_walker()], -0.6) == []
 
@@ -94,7 +94,7 @@ def test_what_lies_behind_a_box_or_within_it() -> None:
     place, points = np.array([0.0, 0.3, 1.2]), rng.uniform([0, -2, 0], [5, 2, 2], (400, 3))
     found = is_in_or_behind_box([box], place, points)
     start, ends = box.local(place[None])[0], box.local(points)
-    expected = [_meets_by_sampling(start, end, box.half) for end in ends]
+    expected = [_meets_by_sampling(start, end, box.half_size) for end in ends]
     assert 20 < np.sum(expected) < 380
     assert np.mean(found != expected) <= 0.005  # grazed edges
     other = box._replace(middle=np.array([2.0, 1.5, 1.0]))

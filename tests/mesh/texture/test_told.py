@@ -24,7 +24,7 @@ def _shown(
 ) -> np.ndarray:
     found = build_occlusion_mask(AHEAD, points, p.astype(np.float32), margin)
     uv = 400.0 * asked[:, :2] / asked[:, 2:] + [320.0, 240.0]
-    return found.shown(uv, asked[:, 2], margin, np.full(len(asked), 0.9))
+    return found.p_unoccluded(uv, asked[:, 2], margin, np.full(len(asked), 0.9))
 
 
 def test_behind_what_moves_nothing_is_seen_and_before_it_all() -> None:

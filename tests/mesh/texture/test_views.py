@@ -69,7 +69,7 @@ def test_a_picture_between_scans_is_taken_from_between_their_poses():
         np.testing.assert_allclose(se2.inverse(view.T_camera_map), T @ T_BASE_CAMERA, atol=1e-12)
         # what is ahead of the robot is ahead of the camera, half a metre lower
         ahead = (T @ [3.2, 0.0, 0.0, 1.0])[None, :3]
-        np.testing.assert_allclose(view.in_camera(ahead), [[0.0, 0.5, 3.0]], atol=1e-12)
+        np.testing.assert_allclose(view.to_camera(ahead), [[0.0, 0.5, 3.0]], atol=1e-12)
 
 
 def test_shortly_before_and_after_the_scans_the_motion_goes_on():

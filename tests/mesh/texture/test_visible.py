@@ -19,16 +19,16 @@ AHEAD = looking([0.0, 0, 0], [0.0, 1, 0])
 
 def test_a_wall_by_hand():
     seen = find_visible_faces(WALL, AHEAD)
-    uv = (K @ AHEAD.in_camera(WALL.vertices).T).T
+    uv = (K @ AHEAD.to_camera(WALL.vertices).T).T
     uv = uv[:, :2] / uv[:, 2:]
     expected = ((uv >= 2) & (uv <= [397, 297])).all(axis=1)[WALL.faces].all(axis=1)
     assert 0.3 < expected.mean() < 0.9
-    np.testing.assert_array_equal(seen.seen, expected)
+    np.testing.assert_array_equal(seen.visible, expected)
     # legs of 8/24 m and 6/24 m, 4 m away
     area = 0.5 * (8 / 24) * (6 / 24) * (300 / 4) ** 2
     np.testing.assert_allclose(seen.pixels[expected], area, rtol=1e-5)
     assert not seen.pixels[~expected].any()
-    straight = 4.0 / np.linalg.norm(WALL.centres, axis=1)
+    straight = 4.0 / np.linalg.norm(WALL.centers, axis=1)
     np.testing.assert_allclose(seen.cosine[expected], straight[expected], rtol=1e-6)
     assert not seen.cosine[~expected].any()
 
@@ -36,11 +36,11 @@ def test_a_wall_by_hand():
 def test_from_behind_nothing_is_seen():
     turned = Mesh(WALL.vertices, WALL.faces[:, ::-1].copy())
     seen = find_visible_faces(turned, AHEAD)
-    assert not seen.seen.any()
+    assert not seen.visible.any()
     assert (seen.cosine <= 0).all()
     assert (seen.cosine < 0).any()
     behind = looking([0.0, 0, 0], [0.0, -1, 0])
-    assert not find_visible_faces(WALL, behind).seen.any()
+    assert not find_visible_faces(WALL, behind).visible.any()
 
 
 def hidden_share(mesh, view, first):
@@ -56,30 +56,32 @@ def hidden_share(mesh, view, first):
 
 def test_what_stands_before_a_wall_hides_it():
     mesh = concatenate_meshes([WALL, box([-0.6, 2.0, -0.5], [0.4, 2.6, 0.7])])
-    alone, seen = find_visible_faces(WALL, AHEAD).seen, find_visible_faces(mesh, AHEAD)
+    alone, seen = find_visible_faces(WALL, AHEAD).visible, find_visible_faces(mesh, AHEAD)
     hidden = hidden_share(mesh, AHEAD, len(WALL))
-    of_wall = seen.seen[: len(WALL)]
+    of_wall = seen.visible[: len(WALL)]
     assert 40 < np.sum(hidden[alone] > 0.01) < 400
     assert not of_wall[hidden > 0.01].any()
     # little more than what is hidden is given up: what is a pixel of the small picture beside it
     assert np.mean(of_wall[alone & (hidden == 0.0)]) > 0.93
     # the side of the box that faces the camera
-    assert seen.seen[len(WALL) :].sum() == 2
+    assert seen.visible[len(WALL) :].sum() == 2
 
 
 def test_a_pole_before_the_middle_of_a_large_face_hides_it():
     # neither corners nor centres of the two faces are behind it
     wall = rectangle([-2.0, 4.0, -1.5], [4.0, 0, 0], [0, 0, 3.0])
     pole = box([0.40, 2.0, -2.0], [0.45, 2.05, 2.0])
-    assert find_visible_faces(wall, AHEAD).seen.all()
-    assert not find_visible_faces(concatenate_meshes([wall, pole]), AHEAD).seen[:2].any()
+    assert find_visible_faces(wall, AHEAD).visible.all()
+    assert not find_visible_faces(concatenate_meshes([wall, pole]), AHEAD).visible[:2].any()
 
 
 def test_edges_are_known_to_a_pixel_only():
     mesh = concatenate_meshes([WALL, box([-0.6, 2.0, -0.5], [0.4, 2.6, 0.7])])
-    close, wide = (find_visible_faces(mesh, AHEAD, VisibleOptions(beside=b)).seen for b in (0, 1))
+    close, wide = (
+        find_visible_faces(mesh, AHEAD, VisibleOptions(beside=b)).visible for b in (0, 1)
+    )
     assert close[wide].all()
-    lost = WALL.centres[np.flatnonzero(close & ~wide)]
+    lost = WALL.centers[np.flatnonzero(close & ~wide)]
     assert 10 < len(lost) < 200
     # the box's shadow on the wall, and one face more
     low, high = np.array([-1.2, -1.0]) - 0.4, np.array([0.8, 1.4]) + 0.4
@@ -91,8 +93,8 @@ def test_what_lies_flat_hides_what_is_under_it():
     mesh = concatenate_meshes([floor, rectangle([-0.7, 2.2, -1.16], [1.4, 0, 0], [0, 1.5, 0], 4)])
     view = looking([0.0, 0, 0], [0.0, 3, -1.0])
     alone, seen = (
-        find_visible_faces(floor, view).seen,
-        find_visible_faces(mesh, view).seen[: len(floor)],
+        find_visible_faces(floor, view).visible,
+        find_visible_faces(mesh, view).visible[: len(floor)],
     )
     hidden = hidden_share(mesh, view, len(floor))
     assert np.sum(alone & (hidden > 0.9)) > 300
@@ -105,27 +107,27 @@ def test_a_noisy_surface_does_not_hide_itself():
     floor = rectangle([-4.0, 0.5, -1.2], [8.0, 0, 0], [0, 8.0, 0], 80)
     noisy = Mesh(floor.vertices + rng.normal(0.0, 0.005, floor.vertices.shape), floor.faces)
     view = looking([0.0, 0, 0], [0.0, 3, -1.0])
-    flat, seen = find_visible_faces(floor, view).seen, find_visible_faces(noisy, view)
+    flat, seen = find_visible_faces(floor, view).visible, find_visible_faces(noisy, view)
     assert flat.sum() > 3000
     front = flat & (seen.cosine > 0.2)
-    assert seen.seen[front].mean() > 0.95
+    assert seen.visible[front].mean() > 0.95
 
 
 def test_the_lens_decides_what_is_in_the_picture():
     barrel = camera(model="plumb_bob", distortion=(-0.25, 0.05, 0.0, 0.0))
     view = replace(AHEAD, camera=barrel)
     seen, plain = find_visible_faces(WALL, view), find_visible_faces(WALL, AHEAD)
-    uv, ok = camera_module.project(barrel, view.in_camera(WALL.vertices))
+    uv, ok = camera_module.project(barrel, view.to_camera(WALL.vertices))
     inside = ok & ((uv >= 2) & (uv <= [397, 297])).all(axis=1)
-    np.testing.assert_array_equal(seen.seen, inside[WALL.faces].all(axis=1))
-    assert seen.seen.sum() > 1.1 * plain.seen.sum()  # it shows more, and it smaller
-    corner = np.argmin(np.where(plain.seen, uv[WALL.faces].sum(axis=(1, 2)), np.inf))
+    np.testing.assert_array_equal(seen.visible, inside[WALL.faces].all(axis=1))
+    assert seen.visible.sum() > 1.1 * plain.visible.sum()  # it shows more, and it smaller
+    corner = np.argmin(np.where(plain.visible, uv[WALL.faces].sum(axis=(1, 2)), np.inf))
     assert seen.pixels[corner] < 0.9 * plain.pixels[corner]
 
 
 def test_the_margin():
     far, near = (
-        find_visible_faces(WALL, AHEAD, VisibleOptions(margin=m)).seen for m in (60.0, 2.0)
+        find_visible_faces(WALL, AHEAD, VisibleOptions(margin=m)).visible for m in (60.0, 2.0)
     )
     assert 0 < far.sum() < near.sum()
     assert near[far].all()
@@ -133,7 +135,7 @@ def test_the_margin():
 
 def test_nothing_there():
     seen = find_visible_faces(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)), AHEAD)
-    assert len(seen.seen) == len(seen.pixels) == len(seen.cosine) == 0
+    assert len(seen.visible) == len(seen.pixels) == len(seen.cosine) == 0
 
 
 def test_threads_change_nothing():

@@ -20,22 +20,22 @@ class ObjectFrame(NamedTuple):
             ahead and to the left, rad to the left.
     """
 
-    thing: TrackedBox
+    box: TrackedBox
     seconds: Float
     offset: Float
 
     @classmethod
-    def of_track(cls, thing: TrackedBox) -> "ObjectFrame":
+    def from_track(cls, thing: TrackedBox) -> "ObjectFrame":
         """As the track has it."""
         return cls(thing, thing.box.seconds[:1], np.zeros((1, 3)))
 
-    def local(self, seconds: Float, points: Float) -> Float:
+    def to_object(self, seconds: Float, points: Float) -> Float:
         """(n, 3) metres in its own frame, of points (n, 3) in the map frame at times (n,)."""
-        box = self.thing.box
+        box = self.box.box
         middle = box.center_at(seconds)
         ahead = box.heading[_at(box.seconds, seconds)]
         off = points[:, :2] - middle
-        foot = np.interp(seconds, box.seconds, self.thing.foot)
+        foot = np.interp(seconds, box.seconds, self.box.bottom)
         at = np.stack(
             [
                 (off * ahead).sum(axis=1),
@@ -53,7 +53,7 @@ class ObjectFrame(NamedTuple):
         """(4, 4) its own frame at a time."""
         # three points and what `local` makes of them say all of it
         corners = np.vstack([np.zeros(3), np.eye(3)])
-        at = self.local(np.full(4, seconds), corners)
+        at = self.to_object(np.full(4, seconds), corners)
         T_object_map = np.eye(4)
         T_object_map[:3, :3] = (at[1:] - at[0]).T
         T_object_map[:3, 3] = at[0]

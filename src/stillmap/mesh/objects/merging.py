@@ -42,8 +42,8 @@ _AT_ONCE = 1000  # scans, after which their pairs are counted
 class ScanClusters(NamedTuple):
     """Which things a scan saw: (n,) numbers, the piece that most of each is of, and its beams."""
 
-    there: Index
-    piece: Index
+    objects: Index
+    cluster: Index
     beams: Index
 
 
@@ -56,9 +56,9 @@ class PairCounts(NamedTuple):
         both: (m,) how often both were seen.
     """
 
-    ends: Index
-    met: Index
-    both: Index
+    pairs: Index
+    connected: Index
+    observed: Index
 
 
 def count_pairs(scans: Sequence[ScanClusters], n: int) -> PairCounts:
@@ -96,12 +96,12 @@ def group_tracks(pairs: PairCounts, may: Bool, n: int) -> Index:
     # of each whole, with which others it was seen, and how often they hung together
     links: list[dict[int, tuple[int, int]]] = [{} for _ in range(n)]
     for (a, b), met, both in zip(
-        pairs.ends.tolist(), pairs.met.tolist(), pairs.both.tolist(), strict=True
+        pairs.pairs.tolist(), pairs.connected.tolist(), pairs.observed.tolist(), strict=True
     ):
         links[a][b] = links[b][a] = met, both
-    candidates = np.flatnonzero(may & (pairs.met > 0))
-    for k in candidates[np.argsort(-pairs.met[candidates], kind="stable")].tolist():
-        a, b = sorted(whole[pairs.ends[k]].tolist())
+    candidates = np.flatnonzero(may & (pairs.connected > 0))
+    for k in candidates[np.argsort(-pairs.connected[candidates], kind="stable")].tolist():
+        a, b = sorted(whole[pairs.pairs[k]].tolist())
         if a == b:
             continue
         met, both = links[a][b]
@@ -151,17 +151,17 @@ class ObjectTrack(NamedTuple):
     """
 
     object: MovingObject
-    thing: TrackedBox
-    own: Index
-    fast: bool
-    large: bool
+    box: TrackedBox
+    returns: Index
+    is_fast: bool
+    is_large: bool
 
 
 def collect_tracks(
     sources: MeshInputs, moves: DynamicReturns, options: MoverOptions
 ) -> list[ObjectTrack]:
     """The objects that have a box, each with its beams."""
-    things = {thing.box.object_id: thing for thing in sources.things}
+    things = {thing.box.object_id: thing for thing in sources.boxes}
     out = []
     for one in sources.objects:
         if one.id in things:
@@ -187,17 +187,17 @@ def merge_tracks(
     what was left over of those that passed: it is left out.
     """
     n = len(followed)
-    quick = np.array([one.fast for one in followed], np.bool_)
-    if moves.planar or not quick.any():
+    quick = np.array([one.is_fast for one in followed], np.bool_)
+    if moves.is_planar or not quick.any():
         return [[one] for one in followed]
     scans = list(_scans(followed, moves, sources, options))
     pairs = count_pairs(scans, n)
-    alike = quick[pairs.ends].any(axis=1) & (pairs.met > 0)
+    alike = quick[pairs.pairs].any(axis=1) & (pairs.connected > 0)
     some = np.flatnonzero(alike)
-    alike[some] = [_alike(followed[a], followed[b]) for a, b in pairs.ends[some].tolist()]
-    whole = group_tracks(pairs, alike & (pairs.met >= MAJORITY * pairs.both), n)
+    alike[some] = [_alike(followed[a], followed[b]) for a, b in pairs.pairs[some].tolist()]
+    whole = group_tracks(pairs, alike & (pairs.connected >= MAJORITY * pairs.observed), n)
     groups: dict[int, list[ObjectTrack]] = {}
-    for k in np.flatnonzero(~_left_over(scans, whole, quick, pairs.ends[alike])).tolist():
+    for k in np.flatnonzero(~_left_over(scans, whole, quick, pairs.pairs[alike])).tolist():
         groups.setdefault(int(whole[k]), []).append(followed[k])
     return list(groups.values())
 
@@ -209,12 +209,12 @@ def _scans(
     options: MoverOptions,
 ) -> Iterator[ScanClusters]:
     """The scans that saw something fast."""
-    n, seen = len(followed), sources.seen
-    quick = np.array([one.fast for one in followed], np.bool_)
+    n, seen = len(followed), sources.deskewed
+    quick = np.array([one.is_fast for one in followed], np.bool_)
     number = np.full(max(one.object.id for one in followed) + 2, n, np.intp)  # last: nobody
     number[[one.object.id for one in followed]] = np.arange(n)
     for scan, place in enumerate(seen.T_map_sensor(sources.poses)[:, :3, 3]):
-        some = moves.between(int(seen.offset[scan]), int(seen.offset[scan + 1]))
+        some = moves.in_beam_range(int(seen.offset[scan]), int(seen.offset[scan + 1]))
         whose = number[moves.owner[some]]
         if not quick[whose[whose < n]].any():
             continue
@@ -285,7 +285,7 @@ def _squeeze(away: Float, near: float, far: float) -> Float:
 
 def _alike(one: ObjectTrack, other: ObjectTrack) -> bool:
     """Whether they are of one velocity when both are seen."""
-    a, b = one.thing.box, other.thing.box
+    a, b = one.box.box, other.box.box
     first, last = max(a.seconds[0], b.seconds[0]), min(a.seconds[-1], b.seconds[-1])
     if first > last:
         first = last = 0.5 * (first + last)

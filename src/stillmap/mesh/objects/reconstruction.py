@@ -61,7 +61,7 @@ def mean_p_dynamic(
     Returns:
         NaN where no beam ended there, 0.1 m above its foot or higher.
     """
-    seen = sources.seen
+    seen = sources.deskewed
     fine, _ = subdivide(mesh, _FINE * reach)
     tree = cKDTree(fine.vertices)
     low, high = fine.vertices.min(axis=0) - reach, fine.vertices.max(axis=0) + reach
@@ -73,7 +73,7 @@ def mean_p_dynamic(
         seconds = beam_seconds(beams, sources)
         then = (seconds >= span[0]) & (seconds <= span[1]) & seen.hit[beams]
         beams, seconds = beams[then], seconds[then]
-        at = way.local(seconds, seen.end_points(beams, sources.poses))
+        at = way.to_object(seconds, seen.end_points(beams, sources.poses))
         some = np.flatnonzero(((at > low) & (at < high)).all(axis=1))
         off = tree.query(at[some], distance_upper_bound=reach)[0]
         near = sources.p_static[beams[some[np.isfinite(off)]]]
@@ -117,7 +117,7 @@ class ObjectShape:
 
     id: int
     mesh: Mesh
-    way: ObjectFrame
+    frame: ObjectFrame
     rigid: bool
     seconds: float
     span: tuple[float, float]
@@ -139,15 +139,15 @@ def reconstruct_object(
         options: see MoverOptions.
         pictures: of each (N,) s, when pictures show it, by the time of its box.
     """
-    own = np.unique(np.concatenate([one.own for one in followed]))
+    own = np.unique(np.concatenate([one.returns for one in followed]))
     if not len(own):
         return None
-    fast = any(one.fast for one in followed)
-    rigid = fast or any(one.large for one in followed)
+    fast = any(one.is_fast for one in followed)
+    rigid = fast or any(one.is_large for one in followed)
     # who is seen by few beams is looked at longer
-    for moment in [k * options.sweep for k in _LONGER] if moves.planar else [0.0]:
+    for moment in [k * options.sweep for k in _LONGER] if moves.is_planar else [0.0]:
         one, span = _best(followed, pictures, moment, sources, moves, options)
-        way = ObjectFrame.of_track(one.thing)
+        way = ObjectFrame.from_track(one.box)
         look = extract_partial_scan(own, span, way, fast, sources, moves, options)
         if look is None:
             continue
@@ -155,7 +155,7 @@ def reconstruct_object(
         if not _enough(mesh, options.least, options):
             continue
         now = 0.5 * sum(look.span)
-        if rigid and not moves.planar and len(mesh.vertices) >= _TOLD:
+        if rigid and not moves.is_planar and len(mesh.vertices) >= _TOLD:
             whole = _put_together(one, own, now, fast, sources, moves, options)
             if whole is not None:
                 return _moving(whole, sources, options)
@@ -168,7 +168,7 @@ def _moving(shape: ObjectShape, sources: MeshInputs, options: MoverOptions) -> O
     """The shape; None where most of what is there stands still."""
     if options.dynamic == 0.0:
         return shape
-    p = mean_p_dynamic(shape.mesh, shape.way, shape.span, sources, options.about)
+    p = mean_p_dynamic(shape.mesh, shape.frame, shape.span, sources, options.about)
     return shape if p >= options.dynamic else None
 
 
@@ -182,14 +182,14 @@ def _put_together(
     options: MoverOptions,
 ) -> ObjectShape | None:
     """What the looks about a time saw of a rigid thing; None: they do not lie over each other."""
-    way = ObjectFrame.of_track(straighten_track(one.thing, now, options.together))
+    way = ObjectFrame.from_track(straighten_track(one.box, now, options.together))
     looks = _looks(own, now, way, fast, sources, moves, options)
     sweeps = [_sweep(look, now, options) for look in looks]
     if len(sweeps) < 2:
         return None
-    best = int(np.argmin([abs(sweep.later) for sweep in sweeps]))
+    best = int(np.argmin([abs(sweep.time_offset) for sweep in sweeps]))
     motion = register_surfaces(sweeps, best)
-    moved = [sweep.moved(motion) for sweep in sweeps]
+    moved = [sweep.transform(motion) for sweep in sweeps]
     kept = [
         k
         for k, sweep in enumerate(moved)
@@ -197,15 +197,15 @@ def _put_together(
     ]
     if len(kept) < max(2.0, _MOST * len(sweeps)):
         return None
-    mesh = _fused([moved[k].patch() for k in kept], options)
+    mesh = _fused([moved[k].to_patch() for k in kept], options)
     least = max(options.least, _MOST * sweeps[best].mesh.areas().sum())
     if not _enough(mesh, least, options):
         return None
-    later = np.array([sweeps[k].later for k in kept])
+    later = np.array([sweeps[k].time_offset for k in kept])
     offset = np.array([_in_plane(*motion_transform(motion, t)) for t in later.tolist()])
     span = min(looks[k].span[0] for k in kept), max(looks[k].span[1] for k in kept)
     return ObjectShape(
-        one.object.id, mesh, ObjectFrame(way.thing, now + later, offset), True, now, span
+        one.object.id, mesh, ObjectFrame(way.box, now + later, offset), True, now, span
     )
 
 
@@ -227,7 +227,7 @@ def _looks(
 ) -> list[PartialScan]:
     """At a thing about a time, one in each scan, in the order of their times."""
     near = within_time(own, moves.seconds, now - options.together, now + options.together)
-    scan = sources.seen.scans_of(moves.beam[near])
+    scan = sources.deskewed.scans_of(moves.beam[near])
     out = []
     for part in np.split(near, np.flatnonzero(np.diff(scan)) + 1):
         if len(part):
@@ -241,7 +241,7 @@ def _looks(
 
 def _sweep(look: PartialScan, now: float, options: MoverOptions) -> PartialSurface:
     mesh = triangulate_partial_scan(look, True, _DEEP, options)
-    return PartialSurface.of(mesh, look.own.origin.mean(axis=0), 0.5 * sum(look.span) - now)
+    return PartialSurface.from_mesh(mesh, look.own.origin.mean(axis=0), 0.5 * sum(look.span) - now)
 
 
 def _in_plane(R: Float, t: Float) -> list[float]:
@@ -283,10 +283,10 @@ def straighten_track(thing: TrackedBox, now: float, reach: float) -> TrackedBox:
         box,
         seconds=seconds,
         xy=box.center_at(np.array([now])) + (seconds - now)[:, None] * velocity,
-        ahead=np.tile(box.heading[at], (2, 1)),
+        heading=np.tile(box.heading[at], (2, 1)),
         velocity=np.tile(velocity, (2, 1)),
     )
-    return TrackedBox(even, np.full(2, np.interp(now, box.seconds, thing.foot)), thing.tall)
+    return TrackedBox(even, np.full(2, np.interp(now, box.seconds, thing.bottom)), thing.height)
 
 
 def _best(
@@ -300,8 +300,11 @@ def _best(
     """Which of some objects is seen best, and when."""
     found = []
     for one, shown in zip(followed, pictures, strict=True):
-        if len(one.own):
-            scans, seconds = sources.seen.scans_of(moves.beam[one.own]), moves.seconds[one.own]
+        if len(one.returns):
+            scans, seconds = (
+                sources.deskewed.scans_of(moves.beam[one.returns]),
+                moves.seconds[one.returns],
+            )
             found.append((one, find_best_interval(seconds, scans, moment, options.near, shown)))
     one, (first, last, _) = max(found, key=lambda each: each[1][2])
     return one, (first, last)

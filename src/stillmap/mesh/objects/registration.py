@@ -78,11 +78,11 @@ class PartialSurface(NamedTuple):
 
     mesh: Mesh
     normals: Float
-    place: Float
-    later: float
+    sensor: Float
+    time_offset: float
 
     @classmethod
-    def of(cls, mesh: Mesh, place: Float, later: float) -> "PartialSurface":
+    def from_mesh(cls, mesh: Mesh, place: Float, later: float) -> "PartialSurface":
         """With the normals of the faces around each vertex."""
         spans = np.repeat(mesh.normals() * mesh.areas()[:, None], 3, axis=0)
         at, n = mesh.faces.ravel(), len(mesh.vertices)
@@ -90,16 +90,16 @@ class PartialSurface(NamedTuple):
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         return cls(mesh, normals / np.maximum(length, 1e-12), place, later)
 
-    def moved(self, motion: Float) -> "PartialSurface":
+    def transform(self, motion: Float) -> "PartialSurface":
         """As it lies where the thing went otherwise than its track by `motion` (6,)."""
-        R, t = motion_transform(motion, self.later)
+        R, t = motion_transform(motion, self.time_offset)
         mesh = Mesh(self.mesh.vertices @ R.T + t, self.mesh.faces)
-        return self._replace(mesh=mesh, normals=self.normals @ R.T, place=R @ self.place + t)
+        return self._replace(mesh=mesh, normals=self.normals @ R.T, place=R @ self.sensor + t)
 
-    def patch(self) -> Patch:
+    def to_patch(self) -> Patch:
         """To be fused."""
         points = self.mesh.vertices
-        origin = np.tile(self.place, (len(points), 1))
+        origin = np.tile(self.sensor, (len(points), 1))
         standoff = ((origin - points) * self.normals).sum(axis=1)
         return Patch(points, self.mesh.faces, np.arange(len(points)), origin, standoff)
 
@@ -114,7 +114,7 @@ class _Points(NamedTuple):
     @classmethod
     def of(cls, one: PartialSurface, most: int) -> "_Points":
         every = max(1, len(one.mesh.vertices) // most)
-        return cls(one.mesh.vertices[::every], one.normals[::every], one.later)
+        return cls(one.mesh.vertices[::every], one.normals[::every], one.time_offset)
 
     def moved(self, motion: Float) -> "_Points":
         R, t = motion_transform(motion, self.later)
@@ -151,7 +151,7 @@ def register_surfaces(sweeps: Sequence[PartialSurface], best: int) -> Float:
     motion = _ends_meet(beside, known, tree, motion, _GUESSES, _PER_SPEED)
     guess = motion * np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # of the rest the track tells more
     others = [k for k in range(len(sweeps)) if k != best]
-    farthest = max(abs(one.later) for one in sweeps)
+    farthest = max(abs(one.time_offset) for one in sweeps)
     for part, reach in zip((0.4, 0.7, 1.0), _REACHES, strict=True):
         near = [some[k] for k in others if abs(some[k].later) <= part * farthest + 1e-9]
         for _ in range(_ROUNDS):
@@ -300,14 +300,14 @@ def extract_partial_scan(
     """
     around = _AROUND if fast else 0.0
     first, last = span[0] - around, span[1] + around
-    scans, offset = scans_within(first, last, sources), sources.seen.offset
+    scans, offset = scans_within(first, last, sources), sources.deskewed.offset
     beams = np.arange(offset[scans.start], offset[scans.stop])
     seconds = beam_seconds(beams, sources)
     then = (seconds >= first) & (seconds <= last)
     beams, seconds = beams[then], seconds[then]
     mine = within_time(own, moves.seconds, first, last)
     if fast:
-        about = moves.between(int(beams[0]), int(beams[-1]) + 1)
+        about = moves.in_beam_range(int(beams[0]), int(beams[-1]) + 1)
         every = within_time(np.arange(about.start, about.stop), moves.seconds, first, last)
         place = beams_in_frame(beams[:1], seconds[:1], way, sources).origin[0]
         whole = grow_segment(mine, every, way, place, moves, options)

@@ -50,13 +50,13 @@ class DynamicReturns(NamedTuple):
     seconds: Float
     ends: Float
     owner: NDArray[np.int32]
-    dynamic: Bool
-    planar: bool
+    is_dynamic: Bool
+    is_planar: bool
 
     @classmethod
-    def of(cls, sources: MeshInputs) -> "DynamicReturns":
+    def collect(cls, sources: MeshInputs) -> "DynamicReturns":
         """All that moves, once for all things."""
-        seen, objects = sources.seen, sources.objects
+        seen, objects = sources.deskewed, sources.objects
         owned = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in objects)])
         whose = np.repeat([one.id for one in objects], [len(one.beams) for one in objects])
         beam = np.union1d(_dynamic(seen.hit, sources.p_static), owned).astype(np.intp)
@@ -71,7 +71,7 @@ class DynamicReturns(NamedTuple):
         ]
         return cls(beam, seconds, ends, owner, dynamic, 2 * sum(planar) > len(planar))
 
-    def between(self, first: int, last: int) -> slice:
+    def in_beam_range(self, first: int, last: int) -> slice:
         """Those with numbers from the first to before the last."""
         a, b = np.searchsorted(self.beam, [first, last])
         return slice(int(a), int(b))
@@ -97,8 +97,8 @@ def beam_seconds(beams: Index, sources: MeshInputs) -> Float:
 
 def scans_within(first: float, last: float, sources: MeshInputs) -> slice:
     """The scans that have beams of these times, and some others beside."""
-    stamps = 1e-9 * (sources.seen.stamp_ns - sources.start_ns)
-    reach = 1e-9 * sources.longest_scan_ns
+    stamps = 1e-9 * (sources.deskewed.stamp_ns - sources.start_ns)
+    reach = 1e-9 * sources.max_scan_ns
     a = int(np.searchsorted(stamps, first - reach)) - _BESIDE
     b = int(np.searchsorted(stamps, last + reach, side="right")) + _BESIDE
     return slice(max(a, 0), min(b, len(stamps)))
@@ -126,11 +126,11 @@ def segment_object(
 
     That is what is rather dynamic than static, in the box around it, and of no other thing.
     """
-    box, offset = thing.box, sources.seen.offset
-    stamps = 1e-9 * (sources.seen.stamp_ns - sources.start_ns)
+    box, offset = thing.box, sources.deskewed.offset
+    stamps = 1e-9 * (sources.deskewed.stamp_ns - sources.start_ns)
     a = int(np.searchsorted(stamps, box.seconds[0] - box.hold))
     b = max(int(np.searchsorted(stamps, box.seconds[-1] + box.hold, side="right")), a)
-    some = moves.between(int(offset[a]), int(offset[b]))
+    some = moves.in_beam_range(int(offset[a]), int(offset[b]))
     half = np.array(box.half_size) + options.margin
     # what is far from all of its way need not be asked where it was then
     reach = max(float(np.linalg.norm(half)) + options.margin, _REACH)
@@ -140,9 +140,9 @@ def segment_object(
     near = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
     near &= (moves.owner[some] == one.id) | (moves.owner[some] == NO_OWNER)
     number = some.start + np.flatnonzero(near)
-    at = ObjectFrame.of_track(thing).local(moves.seconds[number], moves.ends[number])
+    at = ObjectFrame.from_track(thing).to_object(moves.seconds[number], moves.ends[number])
     inside = (np.abs(at[:, :2]) <= half).all(axis=1)
-    inside &= (at[:, 2] > options.low) & (at[:, 2] <= thing.tall + options.margin)
+    inside &= (at[:, 2] > options.low) & (at[:, 2] <= thing.height + options.margin)
     # a track of somebody may take hold of who stands beside
     mine = (np.abs(at[:, :2]) <= half + options.margin).all(axis=1)
     if is_large(thing, options) and not is_fast(thing, options):
@@ -173,11 +173,11 @@ def grow_segment(
         moves: all that moves.
         options: see MoverOptions.
     """
-    within = within[moves.dynamic[within]]
-    at = way.local(moves.seconds[within], moves.ends[within])
+    within = within[moves.is_dynamic[within]]
+    at = way.to_object(moves.seconds[within], moves.ends[within])
     some = (at[:, 2] > options.low) & (np.linalg.norm(at[:, :2], axis=1) <= _CAR)
     within, at = within[some], at[some]
-    there = way.local(moves.seconds[own], moves.ends[own])
+    there = way.to_object(moves.seconds[own], moves.ends[own])
     own = own[np.linalg.norm(there[:, :2], axis=1) <= _CAR]
     if not len(within):
         return own
@@ -220,7 +220,7 @@ def beams_in_frame(
 
     Those that came back from nowhere go on for a kilometre.
     """
-    seen = sources.seen
+    seen = sources.deskewed
     ends = seen.end_points(beams, sources.poses)
     scan = seen.scans_of(beams)
     T = sources.poses[scan] @ seen.T_base_sensor[seen.sensor[scan]]
@@ -230,12 +230,12 @@ def beams_in_frame(
             _FAR / np.linalg.norm(ends - origin, axis=1, keepdims=True)
         )
     ends = np.where(seen.hit[beams][:, None], ends, far)
-    return ObjectBeams.of(ends, origin, seconds, way)
+    return ObjectBeams.from_map(ends, origin, seconds, way)
 
 
 def in_viewing_cone(mine: Index, beams: Index, sources: MeshInputs) -> Bool:
     """(n,) which of beams (n,) look about where others, n > 0, ended; unknown ones do not."""
-    seen = sources.seen
+    seen = sources.deskewed
     middle = seen.end_points(mine, sources.poses).mean(axis=0)
     own, other = (_towards(middle, some, sources) for some in (mine, beams))
     widest = np.arccos(np.clip(own.min(), -1.0, 1.0)) + _BEYOND
@@ -244,7 +244,7 @@ def in_viewing_cone(mine: Index, beams: Index, sources: MeshInputs) -> Bool:
 
 def _towards(middle: Float, beams: Index, sources: MeshInputs) -> Float:
     """(n,) cosine of the angle between beams and the way from the sensor to a place (3,)."""
-    seen = sources.seen
+    seen = sources.deskewed
     first, last = seen.scans_of(beams[[0, -1]]) if len(beams) else (0, -1)
     scans = np.arange(first, last + 1)
     T = sources.poses[scans] @ seen.T_base_sensor[seen.sensor[scans]]

@@ -37,9 +37,11 @@ class ObjectBeams(NamedTuple):
     origin: Float
 
     @classmethod
-    def of(cls, points: Float, origin: Float, seconds: Float, way: ObjectFrame) -> "ObjectBeams":
+    def from_map(
+        cls, points: Float, origin: Float, seconds: Float, way: ObjectFrame
+    ) -> "ObjectBeams":
         """Beams in the map frame, each as it was at its time (n,)."""
-        return cls(way.local(seconds, points), way.local(seconds, origin))
+        return cls(way.to_object(seconds, points), way.to_object(seconds, origin))
 
 
 def find_best_interval(

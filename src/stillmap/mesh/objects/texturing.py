@@ -34,7 +34,7 @@ class TexturedViews:
         views: pictures, as if the thing had stood still: `T_camera_map` is T_camera_object.
     """
 
-    painted: ViewAssignment
+    assignment: ViewAssignment
     views: list[View]
 
 
@@ -44,7 +44,7 @@ def times_in_view(thing: TrackedBox, views: Sequence[View], start_ns: int) -> Fl
     out = np.full(len(views), np.nan)
     for k, (view, now) in enumerate(zip(views, seconds.tolist(), strict=True)):
         for cuboid in boxes_at([thing], now):
-            uv, ok = project(view.camera, view.in_camera(cuboid.middle[None]))
+            uv, ok = project(view.camera, view.to_camera(cuboid.center[None]))
             if ok[0] and is_in_image(view.camera, uv)[0]:
                 out[k] = now
     return out
@@ -76,27 +76,27 @@ def assign_object_views(
         options, choice, limits: see there.
     """
     mesh, _ = subdivide(shape.mesh, min(choice.edge, options.edge))
-    candidates = Candidates.none(len(mesh), choice.candidates)
-    sharpest, own = Candidates.none(len(mesh), 1), list[View]()
+    candidates = Candidates.empty(len(mesh), choice.candidates)
+    sharpest, own = Candidates.empty(len(mesh), 1), list[View]()
     others = [one for one in things if one.box.object_id != shape.id]
-    seconds = times_in_view(shape.way.thing, views, start_ns)
+    seconds = times_in_view(shape.frame.box, views, start_ns)
     for number, (view, now) in enumerate(zip(views, seconds.tolist(), strict=True)):
         away = max(shape.span[0] - now, now - shape.span[1], 0.0)
         if np.isnan(now) or (not shape.rigid and away > options.near):
             continue
-        T_map_object = shape.way.T_map_object(now)
+        T_map_object = shape.frame.T_map_object(now)
         rim = options.rim + options.drift * (0.0 if shape.rigid else _gone(shape, now))
         moved = replace(view, T_camera_map=view.T_camera_map @ T_map_object)
         found = find_visible_faces(mesh, moved, limits)
-        faces = np.flatnonzero(found.seen)
+        faces = np.flatnonzero(found.visible)
         within = _within(mesh, faces, moved, limits)
-        points = mesh.centres[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
+        points = mesh.centers[faces] @ T_map_object[:3, :3].T + T_map_object[:3, 3]
         own_colours = _shows_it(points, within - rim, number, place, options)
         faces, points = faces[own_colours], points[own_colours]
         if not len(faces):
             continue
         hidden = occlusion_probability(
-            boxes_at(others, now), view.place, points, choice.margin, choice.sigma
+            boxes_at(others, now), view.position, points, choice.margin, choice.sigma
         )
         pixels = found.pixels[faces].astype(np.float64)
         good = view_utility(
@@ -123,9 +123,9 @@ def _shows_it(
     before them, and the view's colours are not those of the place behind.
     """
     shown = within >= 0.0
-    shown[shown] = place.free(number, points[shown])
+    shown[shown] = place.is_unoccluded(number, points[shown])
     if options.differs > 0.0 and shown.any():
-        off = place.differs(number, points[shown])
+        off = place.color_difference(number, points[shown])
         unsure = np.isnan(off) & (within[shown] >= options.unsure)
         shown[shown] = unsure | (off >= options.differs)
     return shown
@@ -133,7 +133,7 @@ def _shows_it(
 
 def _gone(shape: ObjectShape, seconds: float) -> float:
     """Metres that a thing went from when its shape was seen to a time."""
-    there = shape.way.thing.box.center_at(np.array([shape.seconds, seconds]))
+    there = shape.frame.box.box.center_at(np.array([shape.seconds, seconds]))
     return float(np.linalg.norm(there[1] - there[0]))
 
 
@@ -141,7 +141,7 @@ def _within(mesh: Mesh, faces: NDArray[np.intp], view: View, limits: VisibleOpti
     """(n,) metres by which faces (n,) lie within the outline of a mesh."""
     if not len(faces):
         return np.zeros(0)
-    points = view.in_camera(mesh.vertices)
+    points = view.to_camera(mesh.vertices)
     depths = render_depth(
         mesh, view, points[np.unique(mesh.faces[faces])], limits.scale, limits.near
     )

@@ -91,7 +91,7 @@ def build_layout(
 def find_charts(mesh: Mesh, view: Index) -> Number:
     """(F,) int64 the chart of each face: faces side by side with one picture; -1 without one."""
     F = len(mesh)
-    pairs = mesh.pairs()
+    pairs = mesh.adjacent_faces()
     pairs = pairs[(view[pairs[:, 0]] == view[pairs[:, 1]]) & (view[pairs[:, 0]] >= 0)]
     beside = coo_array((np.ones(len(pairs), np.bool_), (pairs[:, 0], pairs[:, 1])), shape=(F, F))
     chart = connected_components(beside, directed=False)[1].astype(np.int64) if F else view
@@ -112,7 +112,7 @@ def _in_pictures(mesh: Mesh, view_of_face: Index, views: list[View]) -> tuple[In
     for number, one in enumerate(views):
         mine = order[bounds[number] : bounds[number + 1]]
         used, at = np.unique(mesh.faces[mine], return_inverse=True)
-        uv, ok = camera.project(one.camera, one.in_camera(mesh.vertices[used]))
+        uv, ok = camera.project(one.camera, one.to_camera(mesh.vertices[used]))
         corners = uv[at.reshape(-1, 3)]
         shown = ok[at.reshape(-1, 3)].all(axis=1) & (_areas(corners) > _LEAST)
         pixels[mine[shown]] = corners[shown]

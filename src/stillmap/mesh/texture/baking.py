@@ -186,7 +186,7 @@ def _paint(
             h, w = painted[number].shape
             corners = layout.faces[mine]
             texel, of, weight = _core.texels(layout.uv[corners], w, h)
-            places = view.in_camera(vertices[corners].reshape(-1, 3)).reshape(-1, 3, 3)
+            places = view.to_camera(vertices[corners].reshape(-1, 3)).reshape(-1, 3, 3)
             flat, mask = pages[number].reshape(-1, 3), painted[number].reshape(-1)
             for first in range(0, len(texel), _AT_ONCE):
                 part = slice(first, first + _AT_ONCE)

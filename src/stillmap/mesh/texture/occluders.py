@@ -24,8 +24,8 @@ class TrackedBox(NamedTuple):
     """
 
     box: Box
-    foot: Float
-    tall: float
+    bottom: Float
+    height: float
 
 
 class OrientedBox(NamedTuple):
@@ -37,13 +37,13 @@ class OrientedBox(NamedTuple):
         half: (3,) metres to the front, to the side, upwards.
     """
 
-    middle: Float
+    center: Float
     ahead: Float
-    half: Float
+    half_size: Float
 
     def local(self, points: Float) -> Float:
         """(n, 3) metres ahead, to the left and above its middle, of points (n, 3)."""
-        off = points - self.middle
+        off = points - self.center
         ahead = off[:, :2] @ self.ahead
         left = off[:, 1] * self.ahead[0] - off[:, 0] * self.ahead[1]
         return np.stack([ahead, left, off[:, 2]], axis=1)
@@ -83,9 +83,9 @@ def occlusion_probability(
     along = np.ascontiguousarray((points - place).T)
     square = np.maximum(along[0] ** 2 + along[1] ** 2 + along[2] ** 2, 1e-12)
     for one in cuboids:
-        reach = float(np.linalg.norm(one.half)) + 2.0 * (margin + _GROWTHS[-1] * sigma)
+        reach = float(np.linalg.norm(one.half_size)) + 2.0 * (margin + _GROWTHS[-1] * sigma)
         near = np.flatnonzero(
-            squared_segment_distances(one.middle - place, along, square) <= reach**2
+            squared_segment_distances(one.center - place, along, square) <= reach**2
         )
         if not len(near):
             continue
@@ -93,7 +93,7 @@ def occlusion_probability(
         shown = np.zeros(len(near))
         for growth in reversed(_GROWTHS):
             p = _SURELY * np.exp(-0.5 * growth**2)
-            meets = intersects_box(start, ends, one.half + margin + growth * sigma)
+            meets = intersects_box(start, ends, one.half_size + margin + growth * sigma)
             shown[meets] = p
         free[near] *= 1.0 - shown
     return 1.0 - free
@@ -113,11 +113,11 @@ def is_in_or_behind_box(
     along = np.ascontiguousarray((points - place).T)
     square = np.maximum(along[0] ** 2 + along[1] ** 2 + along[2] ** 2, 1e-12)
     for one in cuboids:
-        reach = float(one.half @ one.half)
-        near = np.flatnonzero(squared_segment_distances(one.middle - place, along, square) <= reach)
+        reach = float(one.half_size @ one.half_size)
+        near = np.flatnonzero(squared_segment_distances(one.center - place, along, square) <= reach)
         if len(near):
             start, ends = one.local(place[None])[0], one.local(points[near])
-            out[near] |= intersects_box(start, ends, one.half)
+            out[near] |= intersects_box(start, ends, one.half_size)
     return out
 
 

@@ -50,7 +50,7 @@ class OcclusionMask(NamedTuple):
     dynamic: Float
     support: Float
 
-    def shown(self, uv: Float, depth: Float, margin: float, unseen: Float) -> Float:
+    def p_unoccluded(self, uv: Float, depth: Float, margin: float, unseen: Float) -> Float:
         """(n,) how probably the picture shows what stands still.
 
         What is known otherwise, as that somebody is about there, counts where no beam tells: each
@@ -84,7 +84,7 @@ def build_occlusion_mask(
     camera = view.camera
     cell = camera.width / _CELLS
     shape = max(round(camera.height / cell), 1), _CELLS
-    local = view.in_camera(points)
+    local = view.to_camera(points)
     uv, ok = project(camera, local)
     ok &= local[:, 2] > _NEAREST
     moves = p_static < 0.5
@@ -184,7 +184,7 @@ class LidarReturns:
     """
 
     recording: Recording
-    seen: Recording
+    deskewed: Recording
     T_map_sensor: Float
     p_static: NDArray[np.float32]
     boxes: Sequence[Box]
@@ -200,7 +200,7 @@ class LidarReturns:
             out[owned] = self.p_static[owned] < 0.5
         return out
 
-    def about(self, stamp_ns: int, options: ChoiceOptions) -> tuple[Float, NDArray[np.float32]]:
+    def near_time(self, stamp_ns: int, options: ChoiceOptions) -> tuple[Float, NDArray[np.float32]]:
         """Where hits ended about a time, had things that move been where they are then.
 
         Those within `options.window` seconds; of planar scans those within `options.rows`, and
@@ -214,20 +214,20 @@ class LidarReturns:
         scans = self._scans(stamp_ns, carried)
         if scans.stop <= scans.start:
             return np.zeros((0, 3)), np.zeros(0, np.float32)
-        first, last = self.seen.offset[[scans.start, scans.stop]]
+        first, last = self.deskewed.offset[[scans.start, scans.stop]]
         at_ns = beam_stamps_ns(self.recording, scans)
         apart = np.abs(at_ns - stamp_ns)
         # at least what is nearest, as where scans count as taken at once
         near = apart <= max(int(1e9 * window), int(apart.min(initial=_NEVER)))
         if carried > window:
             near |= (apart <= int(1e9 * carried)) & self._moving[first:last]
-        kept = np.flatnonzero(self.seen.hit[first:last] & near)
+        kept = np.flatnonzero(self.deskewed.hit[first:last] & near)
         beams = int(first) + kept
         ends = np.empty((len(beams), 3))
-        bounds = np.searchsorted(beams, self.seen.offset[scans.start : scans.stop + 1])
+        bounds = np.searchsorted(beams, self.deskewed.offset[scans.start : scans.stop + 1])
         for scan, (low, high) in zip(range(scans.start, scans.stop), pairwise(bounds), strict=True):
             T = self.T_map_sensor[scan]
-            ends[low:high] = self.seen.points[beams[low:high]] @ T[:3, :3].T + T[:3, 3]
+            ends[low:high] = self.deskewed.points[beams[low:high]] @ T[:3, :3].T + T[:3, 3]
         self._go_on(ends, beams, at_ns[kept], stamp_ns)
         return ends, self.p_static[beams]
 

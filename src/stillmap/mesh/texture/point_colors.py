@@ -32,7 +32,7 @@ class TextureSampler:
         # -1 at the end: that of no face
         self._page = np.append(np.where(textured.view >= 0, textured.page, -1), -1)
 
-    def colours(self, points: Float, origins: Float) -> tuple[Colours, NDArray[np.bool_]]:
+    def colors(self, points: Float, origins: Float) -> tuple[Colours, NDArray[np.bool_]]:
         """(n, 3) uint8 colours, none of them GREY, and whether (n,) there are any.
 
         That of a point is painted at the place nearest to it on faces that face where it was seen

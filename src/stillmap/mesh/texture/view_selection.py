@@ -44,12 +44,12 @@ class Candidates(NamedTuple):
         p_static: (F, K) how probably each shows static things only.
     """
 
-    picture: Index
+    view: Index
     utility: Float32
     p_static: Float32
 
     @classmethod
-    def none(cls, faces: int, most: int) -> "Candidates":
+    def empty(cls, faces: int, most: int) -> "Candidates":
         """Nothing known yet of so many faces."""
         shape = faces, most
         return cls(
@@ -66,7 +66,7 @@ class Candidates(NamedTuple):
         utilities = np.column_stack([self.utility[faces], utility[better].astype(np.float32)])
         order = np.argsort(-utilities, axis=1, kind="stable")[:, :-1]
         self.utility[faces] = utilities[row, order]
-        for array, value in ((self.picture, picture), (self.p_static, p_static[better])):
+        for array, value in ((self.view, picture), (self.p_static, p_static[better])):
             new = np.broadcast_to(np.asarray(value, array.dtype), (len(faces),))
             array[faces] = np.column_stack([array[faces], new])[row, order]
 
@@ -98,7 +98,7 @@ def select_views(candidates: Candidates, pairs: Index, border: float) -> Index:
         pairs: (N, 2) faces side by side.
         border: what it costs where two pictures meet.
     """
-    F, K = candidates.picture.shape
+    F, K = candidates.view.shape
     best = candidates.utility.max(axis=1, keepdims=True, initial=-np.inf)
     painted = np.isfinite(best[:, 0])
     with np.errstate(invalid="ignore"):
@@ -109,13 +109,13 @@ def select_views(candidates: Candidates, pairs: Index, border: float) -> Index:
     for _ in range(_ROUNDS):
         for first in range(0, len(pairs), _TOGETHER):
             part = slice(first, first + _TOGETHER)
-            _tell(candidates.picture, belief, pairs[part], told[:, part], border)
+            _tell(candidates.view, belief, pairs[part], told[:, part], border)
         belief = cost.copy()
         for way, taker in enumerate(pairs.T[::-1]):
             for k in range(K):
                 belief[:, k] += np.bincount(taker, told[way, :, k], minlength=F)
     label = np.argmin(belief, axis=1)
-    return np.where(painted, candidates.picture[np.arange(F), label], NONE).astype(np.int32)
+    return np.where(painted, candidates.view[np.arange(F), label], NONE).astype(np.int32)
 
 
 def _tell(picture: Index, belief: Float32, pairs: Index, told: Float32, border: float) -> None:
@@ -155,12 +155,12 @@ def sample_face_colors(
         views: the pictures.
         colours: (h, w, 3) the picture of a view; None: it is damaged.
     """
-    found = np.full((*candidates.picture.shape, 3), np.nan, np.float32)
+    found = np.full((*candidates.view.shape, 3), np.nan, np.float32)
     for number, view in enumerate(views):
-        face, place = np.nonzero(candidates.picture == number)
+        face, place = np.nonzero(candidates.view == number)
         picture = colours(view) if len(face) else None
         if picture is not None:
-            uv, ok = project(view.camera, view.in_camera(mesh.centres[face]))
+            uv, ok = project(view.camera, view.to_camera(mesh.centers[face]))
             found[face[ok], place[ok]] = sample_bilinear(picture, uv[ok])
     return found
 
@@ -178,7 +178,7 @@ def reject_inconsistent_views(
     """
     known = np.isfinite(found[..., 0]).sum(axis=1)
     asked = np.flatnonzero(known >= _FEWEST)
-    off = np.full(candidates.picture.shape, np.nan, np.float32)
+    off = np.full(candidates.view.shape, np.nan, np.float32)
     median = np.nanmedian(found[asked], axis=1, keepdims=True)
     off[asked] = np.linalg.norm(found[asked] - median, axis=2)
     most = 2 * (off < 0.5 * odd).sum(axis=1) > known
@@ -186,7 +186,7 @@ def reject_inconsistent_views(
     utility = np.where(out, np.float32(-np.inf), candidates.utility)
     order, row = np.argsort(-utility, axis=1, kind="stable"), np.arange(len(utility))[:, None]
     return Candidates(
-        np.where(out, np.int32(NONE), candidates.picture)[row, order],
+        np.where(out, np.int32(NONE), candidates.view)[row, order],
         utility[row, order],
         np.where(out, np.float32(0.0), candidates.p_static)[row, order],
     )

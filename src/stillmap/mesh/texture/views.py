@@ -45,12 +45,12 @@ class View:
     T_camera_map: Float
 
     @property
-    def place(self) -> Float:
+    def position(self) -> Float:
         """(3,) metres, where the camera was in the map frame."""
         R, t = self.T_camera_map[:3, :3], self.T_camera_map[:3, 3]
         return np.asarray(-R.T @ t)
 
-    def in_camera(self, points: Float) -> Float:
+    def to_camera(self, points: Float) -> Float:
         """(n, 3) metres in the camera's frame, of points (n, 3) in the map frame."""
         return np.asarray(points @ self.T_camera_map[:3, :3].T + self.T_camera_map[:3, 3])
 

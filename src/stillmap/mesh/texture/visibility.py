@@ -37,7 +37,7 @@ class VisibleFaces(NamedTuple):
             below 0 from behind; 0 where it is not all in the picture.
     """
 
-    seen: Mask
+    visible: Mask
     pixels: Float32
     cosine: Float32
 
@@ -80,7 +80,7 @@ def find_visible_faces(
         threads: the result does not depend on them.
     """
     options = options or VisibleOptions()
-    points = view.in_camera(mesh.vertices)
+    points = view.to_camera(mesh.vertices)
     uv, inside = _in_picture(view, points, options.margin)
     a, b, c = mesh.faces.T
     candidates = np.flatnonzero(inside[a] & inside[b] & inside[c])
@@ -146,7 +146,7 @@ def render_depth(
 
 def _within_frustum(mesh: Mesh, view: View, K: Float, width: int, height: int) -> Index:
     """The faces that are not beyond one edge of a picture, or behind it, with all their corners."""
-    x, y, z = np.ascontiguousarray(view.in_camera(mesh.vertices).T)
+    x, y, z = np.ascontiguousarray(view.to_camera(mesh.vertices).T)
     u, v = K[0, 0] * x + K[0, 1] * y + K[0, 2] * z, K[1, 1] * y + K[1, 2] * z
     # a pixel more: edges are met exactly elsewhere
     sides = (u < -z, v < -z, u > width * z, v > height * z, z < 0.0)

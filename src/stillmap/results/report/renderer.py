@@ -102,7 +102,7 @@ def _drawn(textured: TexturedMesh, T_camera_map: Float, from_behind: bool) -> ND
         return np.arange(len(textured))
     mesh = Mesh(textured.vertices, textured.faces)
     eye = -T_camera_map[:3, :3].T @ T_camera_map[:3, 3]
-    return np.flatnonzero(np.einsum("ij,ij->i", eye - mesh.centres, mesh.normals()) > 0.0)
+    return np.flatnonzero(np.einsum("ij,ij->i", eye - mesh.centers, mesh.normals()) > 0.0)
 
 
 def _nearest(
@@ -219,7 +219,7 @@ def main_corners(textured: TexturedMesh, direction: Float, share: float) -> Floa
     if not area.any():
         return mesh.corners.reshape(-1, 3)
     kept = area > 0.0
-    for place in (mesh.centres @ look_at(direction, np.zeros(3))[:3, :3].T).T:
+    for place in (mesh.centers @ look_at(direction, np.zeros(3))[:3, :3].T).T:
         order = np.argsort(place, kind="stable")
         below = (np.cumsum(area[order]) - 0.5 * area[order]) / area.sum()
         first, last = np.searchsorted(below, [share, 1.0 - share])
