@@ -43,7 +43,7 @@ from stillmap.core import se2
 from stillmap.core.profiling import peak_memory_bytes
 from stillmap.eval.trajectory import absolute_errors
 from stillmap.sim import load_truth, simulate, write_simulation
-from stillmap.slam.local_map import travel
+from stillmap.slam.local_map import travelled_distance
 
 Float = NDArray[np.float64]
 
@@ -196,7 +196,7 @@ def scores_and_cost(
 
 def pose_scores(stamp_ns: NDArray[np.int64], poses: Float, truth: Float) -> Scores:
     """Relation errors, ATE and drift of poses (T, 3, 3)."""
-    positions, travelled = truth[:, :2, 2], travel(truth)
+    positions, travelled = truth[:, :2, 2], travelled_distance(truth)
     first, second = near_pairs(positions, np.random.default_rng(0))
     again = travelled[second] - travelled[first] > AGAIN
     ends = np.array([0]), np.array([len(truth) - 1])
@@ -217,7 +217,7 @@ def pose_scores(stamp_ns: NDArray[np.int64], poses: Float, truth: Float) -> Scor
     }
 
 
-def loop_scores(loops: Sequence[slam.Closure], truth: Float) -> Scores:
+def loop_scores(loops: Sequence[slam.LoopClosure], truth: Float) -> Scores:
     """How many were accepted, how many refused, and how many of the accepted are false."""
     accepted = [loop for loop in loops if not loop.refused]
     return {
@@ -227,7 +227,7 @@ def loop_scores(loops: Sequence[slam.Closure], truth: Float) -> Scores:
     }
 
 
-def is_false(loop: slam.Closure, truth: Float) -> bool:
+def is_false(loop: slam.LoopClosure, truth: Float) -> bool:
     true = se2.inverse(truth[loop.earlier]) @ truth[loop.later]
     d = se2.parameters(se2.inverse(true) @ loop.T)
     is_off = np.hypot(d[0], d[1]) > FALSE_METRES or abs(np.degrees(d[2])) > FALSE_DEGREES

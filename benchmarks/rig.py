@@ -24,7 +24,7 @@ from tables import Column, means_and_worst
 import stillmap
 from stillmap.core import config
 from stillmap.eval.labels import label_scores
-from stillmap.rig.build import Flat, Tilting, built_in_3d, evidence_of
+from stillmap.rig.build import PlanarResult, TiltingResult, build_tilting, label_by_occupancy
 from stillmap.sim import RigSimulation, scene_by_name, simulate_rig
 
 WORLDS: dict[str, dict[str, Any]] = {
@@ -93,20 +93,20 @@ def rows(job: Job) -> dict[str, Scores]:
     return {way: scores(rig, p_static) for way, p_static in labels.items()}
 
 
-def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, Tilting]]:
+def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, TiltingResult]]:
     """A rig, P(static) of tilting beams by their own evidence alone, and with the flat laser."""
     scene = scene_by_name(job.world, config.merged(WORLDS[job.world], _COMMON))
     rig = simulate_rig(scene, job.seed)
     chosen = options_of("stillmap", job.settings)
-    flat = Flat.of(stillmap.build(rig.horizontal.recording, chosen))
+    flat = PlanarResult.of(stillmap.build(rig.horizontal.recording, chosen))
     tilting = rig.tilting.recording
     built = {
-        way: built_in_3d(
+        way: build_tilting(
             flat, tilting, config.replaced(chosen, {"rig": {"evidence": way == WAYS[1]}})
         )
         for way in WAYS[:2]
     }
-    return rig, evidence_of(flat, tilting, chosen).p_static, built
+    return rig, label_by_occupancy(flat, tilting, chosen).p_static, built
 
 
 def scores(rig: RigSimulation, p_static: NDArray[np.float32]) -> Scores:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.rig.build import Tilting
+from stillmap.rig.build import TiltingResult
 from stillmap.sim import RigSimulation
 from stillmap.tracking import MovingObject
 
@@ -19,7 +19,7 @@ _SHOWN = 6  # objects
 _ENOUGH = 100  # points, from which on a picture is none the better for more
 
 
-def draw(folder: Path, world: str, rig: RigSimulation, built: Tilting) -> None:
+def draw(folder: Path, world: str, rig: RigSimulation, built: TiltingResult) -> None:
     """Write `WORLD-fig11.png` and `WORLD-fig12.png`.
 
     Args:
@@ -32,13 +32,15 @@ def draw(folder: Path, world: str, rig: RigSimulation, built: Tilting) -> None:
 
     matplotlib.use("Agg")
     folder.mkdir(parents=True, exist_ok=True)
-    hits = np.flatnonzero(built.seen.hit)
-    ends = built.seen.end_points(hits, built.poses)
+    hits = np.flatnonzero(built.deskewed.hit)
+    ends = built.deskewed.end_points(hits, built.poses)
     below = ends[:, 2] < _HIGHEST
     hits, ends = hits[below], ends[below]
-    seconds = 1e-9 * (built.seen.stamp_ns - built.seen.stamp_ns[0])[built.seen.scans_of(hits)]
+    seconds = (
+        1e-9 * (built.deskewed.stamp_ns - built.deskewed.stamp_ns[0])[built.deskewed.scans_of(hits)]
+    )
     _fig11(folder / f"{world}-fig11.png", ends, built.p_static[hits] < 0.5)
-    number = np.full(built.seen.n_beams, -1)
+    number = np.full(built.deskewed.n_beams, -1)
     number[hits] = np.arange(len(hits))
     _fig12(folder / f"{world}-fig12.png", ends, seconds, number, built)
     dynamic = ~rig.tilting.truth.static[hits]
@@ -69,7 +71,9 @@ def _fig11(path: Path, ends: Float, moves: NDArray[np.bool_]) -> None:
     plt.close(figure)
 
 
-def _fig12(path: Path, ends: Float, seconds: Float, at: NDArray[np.int64], built: Tilting) -> None:
+def _fig12(
+    path: Path, ends: Float, seconds: Float, at: NDArray[np.int64], built: TiltingResult
+) -> None:
     """Objects, each within one nod and without its motion meanwhile, black; what stays, grey."""
     from matplotlib import pyplot as plt
 
@@ -95,7 +99,7 @@ def _fig12(path: Path, ends: Float, seconds: Float, at: NDArray[np.int64], built
 
 
 def _moment(
-    one: MovingObject, ends: Float, seconds: Float, at: NDArray[np.int64], built: Tilting
+    one: MovingObject, ends: Float, seconds: Float, at: NDArray[np.int64], built: TiltingResult
 ) -> tuple[Float, float]:
     """Points (n, 3) of an object in the nod that has most, where they were then, and when."""
     own = at[one.beams]
@@ -105,14 +109,14 @@ def _moment(
     first = int(within.argmax()) if len(t) else 0
     own, t = own[first : first + within[first]], t[first : first + within[first]]
     when = float(t.mean())
-    track = 1e-9 * (one.stamp_ns - built.seen.stamp_ns[0])
+    track = 1e-9 * (one.stamp_ns - built.deskewed.stamp_ns[0])
     xyz = ends[own].copy()
     for k in range(2):
         xyz[:, k] += np.interp(when, track, one.xy[:, k]) - np.interp(t, track, one.xy[:, k])
     return xyz, when
 
 
-def _place(built: Tilting, when: float) -> Float:
+def _place(built: TiltingResult, when: float) -> Float:
     """x, y of the robot."""
-    t = 1e-9 * (built.seen.stamp_ns - built.seen.stamp_ns[0])
+    t = 1e-9 * (built.deskewed.stamp_ns - built.deskewed.stamp_ns[0])
     return np.asarray(built.poses[min(int(np.searchsorted(t, when)), len(t) - 1), :2, 3])

@@ -169,7 +169,7 @@ def write_given(
     ones nobody is given: points at the sensor itself spoil all labels of DUFOMap. Those beyond
     FARTHEST help it, as they show free space.
     """
-    seen = slam.deskewed(recording, poses, stillmap.Options().slam)
+    seen = slam.deskew_recording(recording, poses, stillmap.Options().slam)
     beams: list[NDArray[np.int64]] = []
     near: list[NDArray[np.bool_]] = []
     with (work / "points.bin").open("wb") as file:

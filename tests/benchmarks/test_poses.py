@@ -20,7 +20,7 @@ from poses import (
 )
 
 from stillmap.core import se2
-from stillmap.slam import Closure
+from stillmap.slam import LoopClosure
 
 
 def there_and_back(T: int) -> np.ndarray:
@@ -31,8 +31,8 @@ def there_and_back(T: int) -> np.ndarray:
 
 def loop(
     earlier: int, later: int, T: np.ndarray, refused: str = "", sigma: float = 0.02
-) -> Closure:
-    return Closure(earlier, later, T, sigma**2 * np.eye(3), 0.9, refused)
+) -> LoopClosure:
+    return LoopClosure(earlier, later, T, sigma**2 * np.eye(3), 0.9, refused)
 
 
 def test_cases_and_variants_are_there() -> None:

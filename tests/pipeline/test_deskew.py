@@ -69,7 +69,7 @@ def test_map_and_labels_are_made_of_the_same_points(room, swept, estimator, give
     chosen = replaced(options(estimator, max_iterations=3), {"slam": {"loops": {"enabled": loops}}})
     poses = room.truth.T_world_base if given else None
     for it in stillmap.iterate(swept, chosen, poses=poses):
-        points = slam.deskewed(swept, it.poses, chosen.slam).points
+        points = slam.deskew_recording(swept, it.poses, chosen.slam).points
         np.testing.assert_array_equal(it.seen.points, points)
         assert not np.array_equal(points, swept.points)
         grid = _core.Grid2D(RESOLUTION, chosen.slam.registration.approach)
@@ -92,20 +92,20 @@ def test_map_and_labels_are_made_of_the_same_points(room, swept, estimator, give
 @pytest.mark.parametrize("odometry", [True, False])
 def test_what_tells_of_the_motion(swept, monkeypatch, odometry):
     """Odometry, or else poses of the scans as they were taken; then the poses so far."""
-    built, found, plain = [], [], odometry_2d.build
+    built, found, plain = [], [], odometry_2d.register_scans
 
     def noted(recording, *rest):
         built.append(recording)
         found.append(plain(recording, *rest))
         return found[-1]
 
-    monkeypatch.setattr(odometry_2d, "build", noted)
+    monkeypatch.setattr(odometry_2d, "register_scans", noted)
     recording = swept if odometry else swept.without_odometry()
     chosen = options(max_iterations=2)
     first, _ = stillmap.iterate(recording, chosen)
     known = [swept.T_odom_base] if odometry else [None, found[0].poses]
     for seen, poses in zip(built, [*known, first.poses], strict=True):
-        expected = slam.deskewed(recording, poses, chosen.slam)
+        expected = slam.deskew_recording(recording, poses, chosen.slam)
         np.testing.assert_array_equal(seen.points, expected.points)
 
 

@@ -64,7 +64,7 @@ def made_up(recording, number, bound, changed_share) -> Iteration:
         learned={"number": number},
         changed_share=changed_share,
         explained=np.ones(T),
-        doubts=slam.Doubts(),
+        doubts=slam.Diagnostics(),
         loops=[],
         held_out=None,
         seconds=float(number),

@@ -45,7 +45,7 @@ def leaping(room):
 def of_iteration(it):
     d = it.doubts
     doubts = d.widened, d.disagreeing, d.breaks, d.apart
-    return slam.Mapped(it.poses, it.covariance, it.grid, it.explained, *doubts)
+    return slam.MStepResult(it.poses, it.covariance, it.grid, it.explained, *doubts)
 
 
 def test_from_the_third_on_poses_are_those_of_the_one_before_swept(leaping):

@@ -8,7 +8,7 @@ import pytest
 
 from stillmap.core import se2
 from stillmap.results.pose_graph_g2o import write_g2o
-from stillmap.slam.pose_graph import Graph, Relation, misfits, optimised
+from stillmap.slam.pose_graph import Constraint, PoseGraph, optimize_poses, squared_mahalanobis
 
 gtsam = pytest.importorskip("gtsam")
 
@@ -23,9 +23,9 @@ def way(scans, rng):
         root = rng.normal(size=(3, 3)) * [0.05, 0.02, 0.03]
         covariance = root @ root.T + 1e-5 * np.eye(3)
         noise = se2.matrix(*rng.multivariate_normal(np.zeros(3), covariance))
-        relations.append(Relation(i, j, se2.inverse(poses[i]) @ poses[j] @ noise, covariance))
-    found = optimised(poses, relations[: K - 1], relations[K - 1 :], None)
-    return Graph(np.array(scans), found, relations)
+        relations.append(Constraint(i, j, se2.inverse(poses[i]) @ poses[j] @ noise, covariance))
+    found = optimize_poses(poses, relations[: K - 1], relations[K - 1 :], None)
+    return PoseGraph(np.array(scans), found, relations)
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_the_errors_that_g2o_sees_are_ours(tmp_path, graph):
     poses = all_poses(graph, np.random.default_rng(1), 0.3)
     write_g2o(tmp_path / "graph.g2o", graph, poses)
     found = chi2(parsed(tmp_path / "graph.g2o"))
-    expected = misfits(poses[graph.scans], graph.relations)
+    expected = squared_mahalanobis(poses[graph.scans], graph.relations)
     assert expected.min() > 1
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
@@ -128,6 +128,6 @@ def test_gtsam_finds_the_poses_again(tmp_path, graph):
 
 
 def test_one_scan_is_a_graph_without_edges(tmp_path):
-    alone = Graph(np.array([0]), np.eye(3)[None], [])
+    alone = PoseGraph(np.array([0]), np.eye(3)[None], [])
     write_g2o(tmp_path / "graph.g2o", alone, alone.poses)
     assert (tmp_path / "graph.g2o").read_text() == "VERTEX_SE2 0 0.0 0.0 0.0\nFIX 0\n"

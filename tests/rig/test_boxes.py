@@ -6,10 +6,10 @@ import pytest
 from stillmap.core.config import replaced
 from stillmap.core.recording import Recording
 from stillmap.pipeline.options import Options
-from stillmap.rig.build import Flat, built_in_3d, with_boxes
+from stillmap.rig.build import PlanarResult, apply_boxes, build_tilting
 from stillmap.rig.options import RigOptions
-from stillmap.rig.removal import Cut, top_of
-from stillmap.tracking import MovingObject, ObjectOptions
+from stillmap.rig.removal import BoxBeams, object_height
+from stillmap.tracking import MovingObject
 from stillmap.tracking.boxes import fit_boxes
 
 MS = 1_000_000
@@ -51,8 +51,7 @@ def standing():
 
 def box_of(one, hold=0.5):
     empty = flat_recording(np.zeros((0, 2)), np.zeros(len(STAMPS) + 1))
-    options = ObjectOptions()
-    return fit_boxes(empty, standing(), np.zeros(0, np.float32), [one], options, hold)[0]
+    return fit_boxes(empty, standing(), np.zeros(0, np.float32), [one], 0.7, hold)[0]
 
 
 def test_a_box_goes_along_and_turns_with_its_thing():
@@ -77,14 +76,14 @@ def test_what_is_in_no_object_has_a_box_for_a_moment():
     offset = np.where(np.arange(len(STAMPS) + 1) > 4, 3, 0)
     p_static = np.full(3, 0.1, np.float32)
     recording = flat_recording(points, offset)
-    boxes = fit_boxes(recording, standing(), p_static, [], ObjectOptions(), 0.5)
+    boxes = fit_boxes(recording, standing(), p_static, [], 0.7, 0.5)
     assert [box.object_id for box in boxes] == [-1]
     assert boxes[0].contains(np.array([0.4, 0.8]), np.array([[3.0, 0.05]] * 2), 0.1).tolist() == [
         True,
         False,
     ]
     p_static[:] = 0.31  # P(dynamic) below 0.7
-    assert not fit_boxes(recording, standing(), p_static, [], ObjectOptions(), 0.5)
+    assert not fit_boxes(recording, standing(), p_static, [], 0.7, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +98,7 @@ def test_what_is_in_no_object_has_a_box_for_a_moment():
     ],
 )
 def test_things_reach_as_high_as_what_is_connected(above, top):
-    assert top_of(np.array(above), 2.0, 0.5) == top
+    assert object_height(np.array(above), 2.0, 0.5) == top
 
 
 def built(points, ms, objects, **rig):
@@ -118,9 +117,9 @@ def built(points, ms, objects, **rig):
         T_odom_base=None,
     )
     seen = flat_recording(np.zeros((0, 2)), np.zeros(len(STAMPS) + 1))
-    flat = Flat(seen, standing(), np.zeros(0, np.float32), objects, 0.9)
+    flat = PlanarResult(seen, standing(), np.zeros(0, np.float32), objects, 0.9)
     options = replaced(Options(), {"rig": {"evidence": False, "margin": 0.1, **rig}})
-    found = built_in_3d(flat, recording, options)
+    found = build_tilting(flat, recording, options)
     return found, found.p_static[-n:]
 
 
@@ -134,7 +133,7 @@ def test_in_a_box_beams_are_dynamic_and_nowhere_else():
     np.testing.assert_allclose(p_static[5:], 0.9, atol=1e-5)
     (one,) = found.objects
     assert found.boxes == 1
-    assert one.beams.tolist() == list(range(found.seen.n_beams - 9, found.seen.n_beams - 4))
+    assert one.beams.tolist() == list(range(found.deskewed.n_beams - 9, found.deskewed.n_beams - 4))
     assert len(one.size) == 3
     assert one.size[2] == pytest.approx(1.7, abs=0.05)
     assert one.z is not None
@@ -145,11 +144,11 @@ def test_evidence_and_boxes_multiply_their_odds():
     o = RigOptions(inside=0.9, around=0.75)
     share = 0.8
     static = np.array([share, share, 0.999, 0.3, share], np.float32)  # of which two are in no box
-    core = Cut(np.array([0, 2]), np.array([True, True]))
-    margin = Cut(
+    core = BoxBeams(np.array([0, 2]), np.array([True, True]))
+    margin = BoxBeams(
         np.array([0, 1]), np.array([False, False])
     )  # the first is in the core of the other
-    found = with_boxes(static, [core, margin], share, o)
+    found = apply_boxes(static, [core, margin], share, o)
     odds = 999 / 4 / 9
     np.testing.assert_allclose(found, [0.1, 0.25, odds / (1 + odds), 0.3, share], rtol=1e-4)
     assert static[0] == np.float32(share)

@@ -6,7 +6,7 @@ from stillmap.core import se2
 from stillmap.sim import RobotOptions, Scene, simulate
 from stillmap.sim.options import CrowdOptions, OdometryOptions
 from stillmap.slam import SlamOptions, local_map
-from stillmap.slam.loop_types import Track
+from stillmap.slam.loop_types import LoopContext
 
 OPTIONS = SlamOptions()
 
@@ -25,13 +25,13 @@ def driven(walls, route, laser, speed=1.0):
     simulation = simulate(scene, 0)
     truth = simulation.truth.T_world_base
     poses = se2.inverse(truth[0]) @ truth
-    return Track(
+    return LoopContext(
         simulation.recording,
         np.full(simulation.recording.n_beams, 0.9, np.float32),
         poses,
-        local_map.travel(poses),
+        local_map.travelled_distance(poses),
         np.ones(len(poses)),
-        local_map.chosen(poses, 1.0, 0.5),
+        local_map.select_keyframes(poses, 1.0, 0.5),
         0.05,
         OPTIONS.registration,
         OPTIONS.surface,

@@ -12,8 +12,14 @@ from stillmap.core import se2
 from stillmap.sim.options import LaserOptions
 from stillmap.sim.walls import box
 from stillmap.slam import loop_candidates
-from stillmap.slam.loop_types import Candidate
-from stillmap.slam.loop_verification import _before, _comparable, attempts, laid_on, local_map
+from stillmap.slam.loop_types import LoopCandidate
+from stillmap.slam.loop_verification import (
+    _comparable,
+    _points_before_ends,
+    build_submap,
+    verify_candidate,
+    verify_candidates,
+)
 from stillmap.slam.scan_matching import Scan
 
 
@@ -31,11 +37,11 @@ def over_the_wall(track, before):
     x, off, chi = se2.parameters(track.poses), [], []
     south = [k for k in track.keyframes if track.travelled[k] < 16.0]
     north = [k for k in track.keyframes if track.travelled[k] > 28.0]
-    grid = local_map(track, 8.0)
+    grid = build_submap(track, 8.0)
     for k in north:
         i = min(south, key=lambda i: np.linalg.norm(x[i, :2] - x[k, :2]))
         T = se2.inverse(track.poses[i]) @ track.poses[k]
-        closure = laid_on(track, grid, Candidate(i, k, T, 0.0), 0.2, 0.02)
+        closure = verify_candidate(track, grid, LoopCandidate(i, k, T, 0.0), 0.2, 0.02)
         if not closure.refused:
             d = se2.parameters(se2.inverse(T) @ closure.T)
             off.append(d)
@@ -76,13 +82,15 @@ def street():
 
 def test_who_comes_back_on_the_other_side_of_a_street_has_seen_it_before():
     track = street()
-    looks = loop_candidates.looks(track)
+    looks = loop_candidates.view_centers(track)
     asked = list(
-        loop_candidates.of_stage(track, track.poses[track.keyframes], looks, 0, len(looks), [])
+        loop_candidates.propose_candidates(
+            track, track.poses[track.keyframes], looks, 0, len(looks), []
+        )
     )
     # never nearer than that
     assert min(np.linalg.norm(c.T[:2, 2]) for c in asked if track.travelled[c.later] > 90.0) > 9.9
-    found = [c for c in attempts(track, asked) if not c.refused]
+    found = [c for c in verify_candidates(track, asked) if not c.refused]
     assert len(found) > 20
     for closure in found:
         T = se2.inverse(track.poses[closure.earlier]) @ track.poses[closure.later]
@@ -97,7 +105,9 @@ def test_where_a_keyframe_looks_by_hand():
     hit = track.recording.hit[beams]
     # weights are all alike; the laser sits 8 cm ahead of the middle of the robot
     expected = track.recording.points[beams][hit].mean(axis=0)
-    np.testing.assert_allclose(loop_candidates.looks(track)[k] - (0.08, 0.0), expected, atol=1e-4)
+    np.testing.assert_allclose(
+        loop_candidates.view_centers(track)[k] - (0.08, 0.0), expected, atol=1e-4
+    )
 
 
 def test_comparable_is_what_was_looked_at_from_the_same_side():
@@ -125,6 +135,10 @@ def test_where_beams_were_before_their_ends():
         se2.matrix(1.0, 1.0, 0.3),
     )
     # 1 m back towards the sensor; half way where that would be farther
-    np.testing.assert_allclose(_before(scan, 1.0), [[4.0, 1.0], [1.0, 3.0], [1.0, 1.5]], atol=1e-6)
-    np.testing.assert_allclose(_before(scan, 3.0), [[3.0, 1.0], [1.0, 2.5], [1.0, 1.5]], atol=1e-6)
-    np.testing.assert_allclose(_before(scan, 0.0), scan.points)
+    np.testing.assert_allclose(
+        _points_before_ends(scan, 1.0), [[4.0, 1.0], [1.0, 3.0], [1.0, 1.5]], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        _points_before_ends(scan, 3.0), [[3.0, 1.0], [1.0, 2.5], [1.0, 1.5]], atol=1e-6
+    )
+    np.testing.assert_allclose(_points_before_ends(scan, 0.0), scan.points)

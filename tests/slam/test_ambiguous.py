@@ -9,8 +9,8 @@ from driven import driven
 from stillmap.core import se2
 from stillmap.sim.options import LaserOptions
 from stillmap.sim.walls import box
-from stillmap.slam.loop_types import Candidate
-from stillmap.slam.loop_verification import _ambiguous, laid_on, local_map
+from stillmap.slam.loop_types import LoopCandidate
+from stillmap.slam.loop_verification import _ambiguity_covariance, build_submap, verify_candidate
 
 
 @functools.cache
@@ -27,8 +27,8 @@ def closed(track, sigma):
     earlier = int(np.searchsorted(track.travelled, 13.0))
     later = earlier + 3
     T = se2.inverse(track.poses[earlier]) @ track.poses[later]
-    grid = local_map(track, float(track.travelled[earlier]))
-    closure = laid_on(track, grid, Candidate(earlier, later, T, 0.0), sigma, 0.05)
+    grid = build_submap(track, float(track.travelled[earlier]))
+    closure = verify_candidate(track, grid, LoopCandidate(earlier, later, T, 0.0), sigma, 0.05)
     assert closure.refused == ""
     off = se2.parameters(se2.inverse(T) @ closure.T)
     return np.sqrt(np.diag(closure.covariance)), float(off[0])
@@ -58,9 +58,9 @@ def test_one_thing_that_is_nowhere_else_settles_it():
 def test_a_mixture_by_hand():
     # 2 m ahead, ln 3 nats worse: a quarter of the probability, 0.25 * 2^2 of the variance
     rivals = np.array([[0.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, np.log(3.0)]])
-    np.testing.assert_allclose(_ambiguous(rivals), np.diag([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(_ambiguity_covariance(rivals), np.diag([1.0, 0.0, 0.0]))
     # as good as the best: half; a hopeless one: nothing
     rivals = np.array([[0, 0, 0, 0], [0.0, 2.0, 0.2, 0.0], [9.0, 9.0, 3.0, 500.0]])
     d = np.array([0.0, 2.0, 0.2])
-    np.testing.assert_allclose(_ambiguous(rivals), 0.5 * np.outer(d, d), atol=1e-12)
-    np.testing.assert_array_equal(_ambiguous(np.zeros((1, 4))), np.zeros((3, 3)))
+    np.testing.assert_allclose(_ambiguity_covariance(rivals), 0.5 * np.outer(d, d), atol=1e-12)
+    np.testing.assert_array_equal(_ambiguity_covariance(np.zeros((1, 4))), np.zeros((3, 3)))

@@ -15,17 +15,17 @@ from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
 from stillmap.slam import SlamOptions, local_map, loop_types, loop_verification, scan_matching
 from stillmap.slam.loop_candidates import (
-    agreeing,
-    agreeing_since,
-    looks,
-    metres_to,
-    of_stage,
-    relations,
-    stages,
+    graph_distances,
+    odometry_constraints,
+    propose_candidates,
+    reject_inconsistent,
+    reject_inconsistent_since,
+    split_stages,
+    view_centers,
 )
-from stillmap.slam.loop_closure import closed
-from stillmap.slam.loop_types import Closure, LoopOptions, Track
-from stillmap.slam.odometry_2d import Mapped
+from stillmap.slam.loop_closure import close_loops
+from stillmap.slam.loop_types import LoopClosure, LoopContext, LoopOptions
+from stillmap.slam.odometry_2d import MStepResult
 
 OPTIONS = SlamOptions()
 # as sure as 5 m of travel
@@ -45,7 +45,7 @@ def track_of(poses, options=OPTIONS.loops):
         T_odom_base=None,
         source={},
     )
-    return Track(
+    return LoopContext(
         recording,
         np.zeros(0, np.float32),
         poses,
@@ -69,21 +69,21 @@ def laps(n):
 
 
 def tie(earlier, later, covariance=SURE, T=None):
-    return Closure(earlier, later, np.eye(3) if T is None else T, covariance, 1.0)
+    return LoopClosure(earlier, later, np.eye(3) if T is None else T, covariance, 1.0)
 
 
 def test_without_closures_metres_are_those_of_travel():
-    np.testing.assert_array_equal(metres_to(straight(50), 30, []), np.arange(30, -1, -1))
+    np.testing.assert_array_equal(graph_distances(straight(50), 30, []), np.arange(30, -1, -1))
 
 
 def test_the_way_through_a_closure_counts_where_it_is_shorter():
-    metres = metres_to(straight(50), 41, [tie(10, 31)])
+    metres = graph_distances(straight(50), 41, [tie(10, 31)])
     np.testing.assert_allclose(metres[[10, 0, 20, 31, 41]], [15, 25, 21, 10, 0])
 
 
 def test_loops_in_two_rooms_leave_the_way_between_as_it_is():
     rooms = [tie(0, 20), tie(60, 80)]
-    metres = metres_to(straight(81), 80, rooms)
+    metres = graph_distances(straight(81), 80, rooms)
     assert metres[60] == pytest.approx(5.0)  # the same room
     assert metres[20] == pytest.approx(5.0 + 40.0)  # the other, and the way there
     assert metres[0] == pytest.approx(5.0 + 40.0 + 5.0)
@@ -93,7 +93,7 @@ def test_a_closure_that_may_slide_ties_less():
     sliding = SURE + np.diag([0.6**2, 0.0, 0.0])
     across = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     for covariance in (sliding, across @ sliding @ across.T):
-        metres = metres_to(straight(301), 300, [tie(50, 280, covariance)])
+        metres = graph_distances(straight(301), 300, [tie(50, 280, covariance)])
         expected = 20.0 + np.hypot(0.6, 0.03) / OPTIONS.loops.drift_translation
         assert metres[50] == pytest.approx(expected)
 
@@ -102,12 +102,17 @@ def test_candidates_are_as_unsure_as_the_graph():
     track = laps(3)
     ties = [tie(k, 21 + k) for k in range(21)]
     # the third time, as unsure as the way from the start of the lap
-    third = {c.later: c for c in of_stage(track, track.poses, looks(track), 42, 63, ties)}
+    third = {
+        c.later: c
+        for c in propose_candidates(track, track.poses, view_centers(track), 42, 63, ties)
+    }
     assert set(third) == set(range(42, 63))
     for later, candidate in third.items():
         assert candidate.metres <= later - 42 + 1 + 20 + 5
         assert candidate.metres <= later - candidate.earlier
-    alone = {c.later: c for c in of_stage(track, track.poses, looks(track), 42, 63, [])}
+    alone = {
+        c.later: c for c in propose_candidates(track, track.poses, view_centers(track), 42, 63, [])
+    }
     assert alone[50].metres == 50 - alone[50].earlier
 
 
@@ -116,15 +121,15 @@ def test_candidates_are_found_where_the_graph_puts_them():
     drifted = track_of(se2.matrix(np.arange(float(n)), 0.0, 0.0))
     there_and_back = np.concatenate([np.arange(30.0), np.arange(30.0)])
     corrected = se2.matrix(there_and_back, 0.3, 0.0)
-    assert list(of_stage(drifted, drifted.poses, looks(drifted), 30, 60, [])) == []
-    found = list(of_stage(drifted, corrected, looks(drifted), 30, 60, []))
+    assert list(propose_candidates(drifted, drifted.poses, view_centers(drifted), 30, 60, [])) == []
+    found = list(propose_candidates(drifted, corrected, view_centers(drifted), 30, 60, []))
     assert [(c.earlier, c.later) for c in found] == [(k, 30 + k) for k in range(30)]
     np.testing.assert_allclose([c.T for c in found], np.tile(np.eye(3), (30, 1, 1)), atol=1e-12)
 
 
 @pytest.mark.parametrize("n", [1, 2, 41, 500])
 def test_stages_leave_out_nothing(n):
-    ranges = list(stages(straight(n)))
+    ranges = list(split_stages(straight(n)))
     assert ranges[0][0] == 0
     assert ranges[-1][1] == n
     assert all(one[1] == other[0] for one, other in pairwise(ranges))
@@ -132,7 +137,7 @@ def test_stages_leave_out_nothing(n):
 
 
 def test_stages_grow_with_the_way():
-    ranges = list(stages(straight(20000)))
+    ranges = list(split_stages(straight(20000)))
     length = np.diff(ranges, axis=1).ravel()
     assert length[0] == OPTIONS.loops.stage
     assert length[:-1].max() > 0.04 * 20000
@@ -141,17 +146,17 @@ def test_stages_grow_with_the_way():
 
 def test_stage_by_stage_agrees_like_all_at_once():
     track = laps(2)
-    way = relations(track, OPTIONS.motion, [])
+    way = odometry_constraints(track, OPTIONS.motion, [])
     rng = np.random.default_rng(3)
     shifts = rng.choice([0.2, 0.2, -0.3], 21)
     found = [tie(k, 21 + k, T=se2.matrix(shift, 0.0, 0.0)) for k, shift in enumerate(shifts)]
-    at_once = [c.refused for c in agreeing(track, way, found)]
+    at_once = [c.refused for c in reject_inconsistent(track, way, found)]
     assert {bool(reason) for reason in at_once} == {True, False}
     for stage in (1, 2, 3, 7):
-        decided: list[Closure] = []
+        decided: list[LoopClosure] = []
         for first in range(0, 21, stage):
             new = found[: first + stage]
-            decided = agreeing_since(track, way, new, decided, 21 + first)
+            decided = reject_inconsistent_since(track, way, new, decided, 21 + first)
         assert [c.refused for c in decided] == at_once
 
 
@@ -183,7 +188,7 @@ def rounds(drift=1.0):
 
 def local(poses):
     n = len(poses)
-    return Mapped(poses, np.zeros((n, 3, 3)), _core.Grid2D(0.05), np.ones(n), [])
+    return MStepResult(poses, np.zeros((n, 3, 3)), _core.Grid2D(0.05), np.ones(n), [])
 
 
 def missed(T, truth, candidate):
@@ -194,18 +199,18 @@ def missed(T, truth, candidate):
 
 def test_loops_are_looked_for_where_those_before_put_them(monkeypatch):
     asked = []
-    attempts = loop_verification.attempts
+    attempts = loop_verification.verify_candidates
 
     def recorded(track, candidates):
         asked.append(list(candidates))
         return attempts(track, asked[-1])
 
-    monkeypatch.setattr(loop_verification, "attempts", recorded)
+    monkeypatch.setattr(loop_verification, "verify_candidates", recorded)
     recording, truth, poses = rounds(drift=4.0)
     e = np.full(recording.n_beams, 0.9, np.float32)
     told = []
     options = dataclasses.replace(OPTIONS, loops=LoopOptions(stage=8.0))
-    closed(recording, e, options, local(poses), lambda *at: told.append(at))
+    close_loops(recording, e, options, local(poses), lambda *at: told.append(at))
     assert len(told) > 3
     assert told == sorted(told)
     assert {total for _, total in told} == {recording.n_scans}
@@ -218,31 +223,33 @@ def test_loops_are_looked_for_where_those_before_put_them(monkeypatch):
 
 def test_a_scan_is_laid_where_the_candidate_says():
     recording, truth, poses = rounds(drift=4.0)
-    frames = local_map.chosen(poses, 1.0, 0.5)
-    later = int(frames[np.searchsorted(local_map.travel(poses)[frames], 60.0)])
+    frames = local_map.select_keyframes(poses, 1.0, 0.5)
+    later = int(frames[np.searchsorted(local_map.travelled_distance(poses)[frames], 60.0)])
     earlier = min(range(200), key=lambda t: np.linalg.norm(truth[t] - truth[later]))
     track = dataclasses.replace(
         track_of(poses),
         recording=recording,
         e=np.full(recording.n_beams, 0.9, np.float32),
-        travelled=local_map.travel(poses),
+        travelled=local_map.travelled_distance(poses),
         keyframes=frames,
     )
     T = se2.inverse(truth[earlier]) @ truth[later]
-    (found,) = loop_verification.attempts(track, [loop_types.Candidate(earlier, later, T, 0.0)])
+    (found,) = loop_verification.verify_candidates(
+        track, [loop_types.LoopCandidate(earlier, later, T, 0.0)]
+    )
     assert missed(se2.inverse(poses[earlier]) @ poses[later], truth, found) > 0.5
     assert missed(found.T, truth, found) < 0.05  # though no more than 0.2 m are searched
 
 
 def test_a_round_passed_again_is_not_searched_more_widely(monkeypatch):
     windows = []
-    search = scan_matching.search
+    search = scan_matching.search_pose
 
     def recorded(grid, scan, prior, options, translation, rotation):
         windows.append(translation)
         return search(grid, scan, prior, options, translation, rotation)
 
-    monkeypatch.setattr(scan_matching, "search", recorded)
+    monkeypatch.setattr(scan_matching, "search_pose", recorded)
     recording, truth, poses = rounds()
     e = np.full(recording.n_beams, 0.9, np.float32)
 
@@ -250,7 +257,7 @@ def test_a_round_passed_again_is_not_searched_more_widely(monkeypatch):
         windows.clear()
         options = LoopOptions(drift_translation=0.012, stage=stage)
         options = dataclasses.replace(OPTIONS, loops=options)
-        found = closed(recording, e, options, local(poses), lambda *_: None)
+        found = close_loops(recording, e, options, local(poses), lambda *_: None)
         assert absolute_errors(found.poses, truth).rmse < 0.4 * absolute_errors(poses, truth).rmse
         return np.array(windows)
 

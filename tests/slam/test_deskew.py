@@ -9,7 +9,7 @@ from scipy.linalg import expm
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.slam import SlamOptions, deskewed
+from stillmap.slam import SlamOptions, deskew_recording
 
 Float = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def laid(recording: Recording, poses: Float) -> Float:
 @pytest.mark.parametrize(("first", "last"), [(0.0, 0.1), (-0.1, 0.0), (-0.05, 0.05), (0.0, 0.03)])
 def test_what_stands_still_is_where_it_is(twist, place, first, last):
     recording, poses, posts = even(twist, np.linspace(first, last, 12), place)
-    seen = deskewed(recording, poses, OPTIONS)
+    seen = deskew_recording(recording, poses, OPTIONS)
     np.testing.assert_allclose(laid(seen, poses), posts, atol=2e-5)
     if any(twist):
         assert np.abs(laid(recording, poses) - posts).max() > 0.02
@@ -103,13 +103,13 @@ def test_numbers_by_hand():
     # 2 m/s ahead: what lies 5 m ahead 0.1 s after the stamp was 5.2 m away at it
     recording, poses, _ = even((2.0, 0.0, 0.0), np.array([0.0, 0.1]), T=3)
     points = np.tile(np.array([[5.0, 1.0]], np.float32), (6, 1))
-    seen = deskewed(replace(recording, points=points), poses, OPTIONS)
+    seen = deskew_recording(replace(recording, points=points), poses, OPTIONS)
     np.testing.assert_allclose(seen.points, [[5.0, 1.0], [5.2, 1.0]] * 3, atol=1e-6)
     # a quarter turn to the left in 0.1 s: what is ahead at its end was to the left
     recording, poses, _ = even((0.0, 0.0, 5 * np.pi), np.array([0.0, 0.1]), T=3)
     slower = replace(recording, stamp_ns=(recording.stamp_ns - 10**18) * 2)
     times = slower.beam_time * 2
-    seen = deskewed(replace(slower, points=points, beam_time=times), poses, OPTIONS)
+    seen = deskew_recording(replace(slower, points=points, beam_time=times), poses, OPTIONS)
     np.testing.assert_allclose(seen.points, [[5.0, 1.0], [-1.0, 5.0]] * 3, atol=1e-6)
 
 
@@ -119,7 +119,7 @@ def test_nothing_else_changes():
     points[7] = np.nan
     recording = replace(recording, points=points, T_odom_base=poses, source={"a": 1})
     before = points.copy()
-    seen = deskewed(recording, poses, OPTIONS)
+    seen = deskew_recording(recording, poses, OPTIONS)
     np.testing.assert_array_equal(recording.points, before)
     assert np.isnan(seen.points[7]).all()
     assert np.isfinite(np.delete(seen.points, 7, axis=0)).all()
@@ -127,23 +127,23 @@ def test_nothing_else_changes():
     for name in ("stamp_ns", "offset", "hit", "T_base_sensor", "sensor", "T_odom_base", "source"):
         assert getattr(seen, name) is getattr(recording, name)
     # the frame of the poses says nothing
-    elsewhere = deskewed(recording, se2.matrix(30.0, -7.0, 2.0) @ poses, OPTIONS)
+    elsewhere = deskew_recording(recording, se2.matrix(30.0, -7.0, 2.0) @ poses, OPTIONS)
     np.testing.assert_allclose(elsewhere.points, seen.points, atol=1e-5)
 
 
 def test_it_is_left_as_it_is_where_nothing_is_known_or_wanted():
     recording, poses, _ = even((5.0, 0.0, 1.0), np.linspace(0.0, 0.1, 12))
-    assert deskewed(recording, None, OPTIONS) is recording
-    assert deskewed(recording, poses, SlamOptions(deskew=False)) is recording
+    assert deskew_recording(recording, None, OPTIONS) is recording
+    assert deskew_recording(recording, poses, SlamOptions(deskew=False)) is recording
     at_once = replace(recording, beam_time=None)
-    assert deskewed(at_once, poses, OPTIONS) is at_once
+    assert deskew_recording(at_once, poses, OPTIONS) is at_once
 
 
 def test_errors_that_alternate_do_not_feed_themselves():
     """A pose that lies ahead must not pull its own scan back, and the one before ahead."""
     recording, poses, posts = even((5.0, 0.0, 0.0), np.linspace(0.0, 0.1, 12), T=9)
     off = poses @ se2.matrix(0.03 * (-1.0) ** np.arange(9), 0.0, 0.0)
-    seen = deskewed(recording, off, OPTIONS)
+    seen = deskew_recording(recording, off, OPTIONS)
     errors = np.abs(laid(seen, poses) - posts).reshape(9, -1)
     assert errors[1:-2].max() < 1e-4  # the first and the last two have fewer neighbours
 
@@ -160,7 +160,7 @@ def test_two_lasers_in_turns(early):
     recording, posts = made(stamps, way, places, [0, 1] * (T // 2), times)
     poses = moved(twist, stamps)
     off = poses @ se2.matrix(0.005 * (-1.0) ** np.arange(T), 0.0, 0.0)
-    seen = deskewed(recording, off, OPTIONS)
+    seen = deskew_recording(recording, off, OPTIONS)
     assert np.abs(laid(seen, poses) - posts).max() < 0.012
     assert np.abs(laid(recording, poses) - posts).max() > 0.25
 
@@ -170,7 +170,7 @@ def test_a_leap_is_no_motion(leap):
     recording, poses, posts = even((1.0, 0.0, 0.0), np.linspace(0.0, 0.1, 12), T=30)
     leaping, leap = poses.copy(), poses[4] @ se2.matrix(*leap) @ se2.inverse(poses[4])
     leaping[4:] = leap @ leaping[4:]
-    seen = deskewed(recording, leaping, OPTIONS)
+    seen = deskew_recording(recording, leaping, OPTIONS)
     errors = np.abs(laid(seen, poses) - posts).reshape(30, -1).max(axis=1)
     np.testing.assert_allclose(np.delete(errors, [2, 3, 4]), 0.0, atol=1e-5)
     # the scan before it stays as it was taken, half of its motion lends to those beside it
@@ -180,9 +180,11 @@ def test_a_leap_is_no_motion(leap):
 def test_scans_in_one_instant_one_scan_and_none():
     recording, poses, _ = even((5.0, 0.0, 1.0), np.linspace(0.0, 0.1, 12))
     together = replace(recording, stamp_ns=np.full(5, 10**18))
-    np.testing.assert_array_equal(deskewed(together, poses, OPTIONS).points, recording.points)
+    np.testing.assert_array_equal(
+        deskew_recording(together, poses, OPTIONS).points, recording.points
+    )
     one, pose, _ = even((5.0, 0.0, 1.0), np.linspace(-0.1, 0.1, 12), T=1)
-    np.testing.assert_array_equal(deskewed(one, pose, OPTIONS).points, one.points)
+    np.testing.assert_array_equal(deskew_recording(one, pose, OPTIONS).points, one.points)
     empty = replace(
         recording,
         offset=np.zeros(6, np.int64),
@@ -190,7 +192,7 @@ def test_scans_in_one_instant_one_scan_and_none():
         hit=recording.hit[:0],
         beam_time=recording.beam_time[:0],
     )
-    assert deskewed(empty, poses, OPTIONS).n_beams == 0
+    assert deskew_recording(empty, poses, OPTIONS).n_beams == 0
 
 
 def test_scans_without_beams_among_others():
@@ -204,11 +206,11 @@ def test_scans_without_beams_among_others():
         hit=recording.hit[kept],
         beam_time=recording.beam_time[kept],
     )
-    seen = deskewed(fewer, poses, OPTIONS)
+    seen = deskew_recording(fewer, poses, OPTIONS)
     np.testing.assert_allclose(laid(seen, poses), posts[kept], atol=2e-5)
 
 
 def test_more_beams_than_are_worked_on_at_a_time():
     recording, poses, posts = even((5.0, 0.3, 1.0), np.linspace(-0.02, 0.08, 500), T=40)
-    seen = deskewed(recording, poses, OPTIONS)
+    seen = deskew_recording(recording, poses, OPTIONS)
     np.testing.assert_allclose(laid(seen, poses), posts, atol=5e-5)

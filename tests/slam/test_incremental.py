@@ -28,7 +28,9 @@ def prior(recording):
 
 
 def build(recording, e=None):
-    return odometry_2d.build(recording, prior(recording) if e is None else e, OPTIONS, silent)
+    return odometry_2d.register_scans(
+        recording, prior(recording) if e is None else e, OPTIONS, silent
+    )
 
 
 @functools.cache
@@ -235,7 +237,7 @@ def test_one_scan():
 def test_progress_counts_every_scan():
     recording = small_room(scans=10).recording
     told = []
-    odometry_2d.build(recording, prior(recording), OPTIONS, lambda *at: told.append(at))
+    odometry_2d.register_scans(recording, prior(recording), OPTIONS, lambda *at: told.append(at))
     assert told == [(t, 10) for t in range(1, 11)]
 
 

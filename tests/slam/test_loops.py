@@ -13,10 +13,10 @@ from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
 from stillmap.slam import SlamOptions, local_map, loop_types, m_step, odometry_2d
-from stillmap.slam.loop_candidates import agreeing, relations
-from stillmap.slam.loop_closure import closed
-from stillmap.slam.loop_types import Closure, LoopOptions, Track
-from stillmap.slam.odometry_2d import Mapped
+from stillmap.slam.loop_candidates import odometry_constraints, reject_inconsistent
+from stillmap.slam.loop_closure import close_loops
+from stillmap.slam.loop_types import LoopClosure, LoopContext, LoopOptions
+from stillmap.slam.odometry_2d import MStepResult
 
 OPTIONS = SlamOptions()
 OPEN = dataclasses.replace(OPTIONS, loops=dataclasses.replace(OPTIONS.loops, enabled=False))
@@ -96,10 +96,10 @@ def test_a_square_with_drift_closes():
     for step in steps:
         poses.append(poses[-1] @ step)
     n = len(poses)
-    drifted = Mapped(np.array(poses), np.zeros((n, 3, 3)), _core.Grid2D(0.05), np.ones(n), [])
+    drifted = MStepResult(np.array(poses), np.zeros((n, 3, 3)), _core.Grid2D(0.05), np.ones(n), [])
     before = absolute_errors(drifted.poses, truth)
     e = np.full(simulation.recording.n_beams, 0.9, np.float32)
-    found = closed(simulation.recording, e, OPTIONS, drifted, silent)
+    found = close_loops(simulation.recording, e, OPTIONS, drifted, silent)
     metres, chi2 = errors(found.loops, simulation).T
     assert np.count_nonzero(metres < 0.1) >= 4
     assert chi2.max() < 11.3  # 99 %
@@ -154,7 +154,7 @@ def track_of(recording, poses, travelled, frames):
     """What loops are looked for in; all of it is explained, and no beam is believed."""
     e, explained = np.zeros(recording.n_beams, np.float32), np.ones(len(poses))
     steering = OPTIONS.registration, OPTIONS.surface, OPTIONS.loops
-    return Track(recording, e, poses, travelled, explained, frames, 0.05, *steering)
+    return LoopContext(recording, e, poses, travelled, explained, frames, 0.05, *steering)
 
 
 def straight_track():
@@ -169,34 +169,34 @@ def closures(shifts):
     """The second time at keyframe k is the first time there, moved by shift."""
     covariance = np.diag([0.03**2, 0.03**2, 0.006**2])
     return [
-        Closure(k, 21 + k, se2.matrix(shift, 0.0, 0.0), covariance, 1.0)
+        LoopClosure(k, 21 + k, se2.matrix(shift, 0.0, 0.0), covariance, 1.0)
         for k, shift in enumerate(shifts)
     ]
 
 
 def test_one_closure_that_wants_something_else_is_refused():
     track = straight_track()
-    way = relations(track, OPTIONS.motion, [])
+    way = odometry_constraints(track, OPTIONS.motion, [])
     shifts = [0.5] * 8
     shifts[4] = -0.5
-    refused = [c.refused for c in agreeing(track, way, closures(shifts))]
+    refused = [c.refused for c in reject_inconsistent(track, way, closures(shifts))]
     assert refused == ["closures around disagree" if k == 4 else "" for k in range(8)]
 
 
 def test_a_closure_on_its_own_is_refused():
     track = straight_track()
-    way = relations(track, OPTIONS.motion, [])
-    assert [bool(c.refused) for c in agreeing(track, way, closures([0.1]))] == [True]
+    way = odometry_constraints(track, OPTIONS.motion, [])
+    assert [bool(c.refused) for c in reject_inconsistent(track, way, closures([0.1]))] == [True]
 
 
 def test_a_way_that_odometry_contradicts_is_loose():
     simulation = square()
     recording, poses = simulation.recording, simulation.truth.T_world_base.copy()
-    frames = local_map.chosen(poses, 1.0, 0.5)
+    frames = local_map.select_keyframes(poses, 1.0, 0.5)
     at = int(frames[5]) + 1
     poses[at:] = se2.matrix(0.0, 0.8, 0.0) @ poses[at:]  # a leap of 0.8 m in the map's y
-    track = track_of(recording, poses, local_map.travel(poses), frames)
-    way = relations(track, OPTIONS.motion, [])
+    track = track_of(recording, poses, local_map.travelled_distance(poses), frames)
+    way = odometry_constraints(track, OPTIONS.motion, [])
     widths = np.array([np.sqrt(np.linalg.eigvalsh(r.covariance[:2, :2]).max()) for r in way])
     assert widths[5] == pytest.approx(0.8, abs=0.1)
     assert np.delete(widths, 5).max() < 0.1
@@ -206,7 +206,7 @@ def test_corrections_spread_between_keyframes():
     poses = se2.matrix(np.arange(11.0), 0.0, 0.0)
     frames = np.array([0, 10])
     moved = se2.matrix(np.array([0.0, 10.0]), np.array([0.0, 1.0]), 0.0)
-    spread = se2.parameters(local_map.spread(poses, frames, moved))
+    spread = se2.parameters(local_map.propagate_corrections(poses, frames, moved))
     np.testing.assert_allclose(spread[:, 1], np.arange(11) / 10, atol=1e-5)
     np.testing.assert_allclose(spread[:, 0], np.arange(11), atol=1e-9)
 
@@ -214,18 +214,18 @@ def test_corrections_spread_between_keyframes():
 def test_keyframes_by_hand():
     # a metre a scan, two scans turning by 0.3 rad each, one on the spot
     x = se2.matrix([0, 1, 2, 2, 2, 2], 0.0, [0, 0, 0, 0.3, 0.6, 0.6])
-    assert local_map.chosen(x, 1.0, 0.5).tolist() == [0, 1, 2, 4, 5]
-    assert local_map.chosen(x[:1], 1.0, 0.5).tolist() == [0]
-    assert local_map.travel(x).tolist() == [0, 1, 2, 2, 2, 2]
+    assert local_map.select_keyframes(x, 1.0, 0.5).tolist() == [0, 1, 2, 4, 5]
+    assert local_map.select_keyframes(x[:1], 1.0, 0.5).tolist() == [0]
+    assert local_map.travelled_distance(x).tolist() == [0, 1, 2, 2, 2, 2]
 
 
 def test_scans_of_each_laser_are_chosen_by_themselves():
     x = np.tile(np.eye(3), (8, 1, 1))
     x[:, 0, 2] = 0.3 * np.arange(8)
     sensor = np.array([0, 1, 0, 1, 0, 1, 0, 1])
-    frames = local_map.chosen_of_each(x, sensor, 1.0, 0.5)
+    frames = local_map.select_keyframes_per_sensor(x, sensor, 1.0, 0.5)
     assert frames.tolist() == [0, 1, 4, 5, 6, 7]
-    assert local_map.chosen_of_each(x, 0 * sensor, 1.0, 0.5).tolist() == [0, 4, 7]
+    assert local_map.select_keyframes_per_sensor(x, 0 * sensor, 1.0, 0.5).tolist() == [0, 4, 7]
 
 
 def test_the_grid_is_what_the_poses_make():
@@ -248,9 +248,9 @@ def test_twice_and_with_any_number_of_threads_the_same(threads):
         np.testing.assert_array_equal(a.T, b.T)
         np.testing.assert_array_equal(a.covariance, b.covariance)
         assert (a.earlier, a.later, a.refused) == (b.earlier, b.later, b.refused)
-    np.testing.assert_array_equal(one.graph.scans, two.graph.scans)
+    np.testing.assert_array_equal(one.graph.keyframes, two.graph.keyframes)
     np.testing.assert_array_equal(one.graph.poses, two.graph.poses)
-    for r, s in zip(one.graph.relations, two.graph.relations, strict=True):
+    for r, s in zip(one.graph.constraints, two.graph.constraints, strict=True):
         assert (r.first, r.second) == (s.first, s.second)
         np.testing.assert_array_equal(r.T, s.T)
         np.testing.assert_array_equal(r.covariance, s.covariance)
@@ -261,12 +261,12 @@ def test_twice_and_with_any_number_of_threads_the_same(threads):
 def test_the_graph_is_what_was_found():
     found = mapped(square())
     graph, accepted = found.graph, [c for c in found.loops if not c.refused]
-    K = len(graph.scans)
-    assert len(graph.relations) == K - 1 + len(accepted)
-    along = [(r.first, r.second) for r in graph.relations[: K - 1]]
+    K = len(graph.keyframes)
+    assert len(graph.constraints) == K - 1 + len(accepted)
+    along = [(r.first, r.second) for r in graph.constraints[: K - 1]]
     assert along == [(k, k + 1) for k in range(K - 1)]
-    for relation, closure in zip(graph.relations[K - 1 :], accepted, strict=True):
-        ends = graph.scans[[relation.first, relation.second]]
+    for relation, closure in zip(graph.constraints[K - 1 :], accepted, strict=True):
+        ends = graph.keyframes[[relation.first, relation.second]]
         assert ends.tolist() == [closure.earlier, closure.later]
         np.testing.assert_array_equal(relation.T, closure.T)
 
@@ -274,7 +274,7 @@ def test_the_graph_is_what_was_found():
 def test_without_loops_poses_are_incremental():
     simulation = square()
     e = np.full(simulation.recording.n_beams, 0.9, np.float32)
-    plain = odometry_2d.build(simulation.recording, e, OPEN, silent)
+    plain = odometry_2d.register_scans(simulation.recording, e, OPEN, silent)
     found = mapped(simulation, OPEN)
     np.testing.assert_array_equal(found.poses, plain.poses)
     assert found.loops == []

@@ -10,7 +10,7 @@ from stillmap.core import se2, se3
 from stillmap.eval.trajectory import absolute_errors
 from stillmap.slam import lidar_odometry, loop_closure_3d
 from stillmap.slam.motion_model import MotionOptions
-from stillmap.slam.pose_graph import Relation, Robust, misfits, optimised
+from stillmap.slam.pose_graph import Constraint, Robust, optimize_poses, squared_mahalanobis
 
 LIDAR = Lidar(rings=16, columns=180, period=0.2, reach=40.0)
 SPEED = 3.0
@@ -40,7 +40,7 @@ def drive():
     """A recording, its true poses, e, and what odometry without any error would find."""
     recording, truth, e = recorded(block(), LIDAR, round_the_block(), 200, seed=1)
     options = lidar_odometry.SpinningOptions()
-    driven = lidar_odometry.build(recording, e, options, MotionOptions(), _silent, 1)
+    driven = lidar_odometry.register_sweeps(recording, e, options, MotionOptions(), _silent, 1)
     assert absolute_errors(driven.poses, truth).rmse < 0.1
     return recording, truth, e, driven
 
@@ -61,7 +61,7 @@ def drifted(driven, per_step):
 def closed(drive, driven, **changes):
     recording, _, e, _ = drive
     options = replace(loop_closure_3d.SpinningLoopOptions(), **changes)
-    return loop_closure_3d.closed(
+    return loop_closure_3d.close_loops_3d(
         recording, e, lidar_odometry.SpinningOptions(), options, driven, _silent, 1
     )
 
@@ -78,7 +78,7 @@ def test_drift_is_taken_out(drive):
     for loop in accepted:
         true = se2.inverse(truth[loop.earlier]) @ truth[loop.later]
         assert np.linalg.norm((se2.inverse(true) @ loop.T)[:3, 3]) < 0.15
-    assert len(graph.relations) == len(graph.scans) - 1 + len(accepted)
+    assert len(graph.constraints) == len(graph.keyframes) - 1 + len(accepted)
 
 
 def test_places_that_only_seem_near_are_refused(drive):
@@ -108,7 +108,7 @@ def test_a_street_is_not_every_street():
     twists = np.zeros((400, 6))
     twists[:, 0] = 4.0
     recording, truth, e = recorded(Boxes.of(rows), LIDAR, Way(np.eye(4), twists, 0.1), 110, seed=2)
-    straight = lidar_odometry.Driven(
+    straight = lidar_odometry.LidarOdometry(
         truth, np.tile(twists[0], (110, 1)), np.zeros((110, 6, 6)), np.full(110, 0.8)
     )
     wrong = truth.copy()
@@ -129,14 +129,14 @@ def test_graph_in_space():
     """Two steps said to be 1.2 m long, yet the end is known to be at 2 m."""
     step = se3.exp(np.array([1.2, 0, 0, 0, 0, 0.0]))
     covariance = np.diag([1e-2] * 3 + [1e-4] * 3)
-    chain = [Relation(0, 1, step, covariance), Relation(1, 2, step, covariance)]
+    chain = [Constraint(0, 1, step, covariance), Constraint(1, 2, step, covariance)]
     start = np.array([np.eye(4), step, step @ step])
-    loop = Relation(0, 2, se3.exp(np.array([2.0, 0, 0, 0, 0, 0])), 1e-8 * np.eye(6))
-    found = optimised(start, chain, [loop], None)
+    loop = Constraint(0, 2, se3.exp(np.array([2.0, 0, 0, 0, 0, 0])), 1e-8 * np.eye(6))
+    found = optimize_poses(start, chain, [loop], None)
     assert found[:, 0, 3] == pytest.approx([0.0, 1.0, 2.0], abs=1e-4)
-    assert misfits(found, chain) == pytest.approx([4.0, 4.0], rel=1e-3)
-    false = Relation(0, 2, se3.exp(np.array([9.0, 0, 0, 0, 0, 1.0])), 1e-2 * np.eye(6))
-    robust = optimised(start, chain, [loop, false], Robust(25.0, 8))
+    assert squared_mahalanobis(found, chain) == pytest.approx([4.0, 4.0], rel=1e-3)
+    false = Constraint(0, 2, se3.exp(np.array([9.0, 0, 0, 0, 0, 1.0])), 1e-2 * np.eye(6))
+    robust = optimize_poses(start, chain, [loop, false], Robust(25.0, 8))
     assert robust[2, 0, 3] == pytest.approx(2.0, abs=0.01)
 
 
@@ -145,10 +145,10 @@ def test_covariance_turns_as_gtsam_has_it():
     turned = se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))
     ahead = se3.exp(np.array([1.0, 0, 0, 0, 0, 0]))
     tight, loose = np.diag([1e-6] * 6), np.diag([1e-2, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6])
-    chain = [Relation(0, 1, turned, tight), Relation(1, 2, ahead, loose)]
+    chain = [Constraint(0, 1, turned, tight), Constraint(1, 2, ahead, loose)]
     start = np.array([np.eye(4), turned, turned @ ahead])
     end = turned @ ahead
     end[1, 3] += 0.3
-    found = optimised(start, chain, [Relation(0, 2, end, np.diag([1e-8] * 6))], None)
+    found = optimize_poses(start, chain, [Constraint(0, 2, end, np.diag([1e-8] * 6))], None)
     assert found[2, :3, 3] == pytest.approx([0.0, 1.3, 0.0], abs=1e-3)
     assert found[1, :3, 3] == pytest.approx([0.0, 0.0, 0.0], abs=1e-3)

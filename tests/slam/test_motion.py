@@ -7,7 +7,7 @@ import pytest
 
 from stillmap.core import se2
 from stillmap.slam import motion_model
-from stillmap.slam.motion_model import MotionOptions, Steadiness
+from stillmap.slam.motion_model import MotionOptions, VelocityNoise
 
 OPTIONS = MotionOptions()
 T0 = se2.matrix(3.0, -1.0, 2.0)
@@ -15,13 +15,13 @@ T0 = se2.matrix(3.0, -1.0, 2.0)
 
 def test_odometry_moves_from_the_last_pose():
     increment = se2.matrix(0.4, 0.1, 0.2)
-    prior = motion_model.from_odometry(T0, increment, OPTIONS)
+    prior = motion_model.odometry_prior(T0, increment, OPTIONS)
     np.testing.assert_allclose(prior.T_map_base, T0 @ increment, atol=1e-14)
 
 
 def test_a_constant_velocity_repeats_the_last_motion():
     step = se2.matrix(0.3, 0.0, 0.1)
-    prior = motion_model.from_constant_velocity(T0 @ step, T0, Steadiness(0.2, 0.3))
+    prior = motion_model.constant_velocity_prior(T0 @ step, T0, VelocityNoise(0.2, 0.3))
     np.testing.assert_allclose(prior.T_map_base, T0 @ step @ step, atol=1e-14)
     assert prior.sigma_translation == 0.2
     assert prior.sigma_rotation == 0.3
@@ -31,7 +31,7 @@ def test_a_constant_velocity_repeats_the_last_motion():
 def test_how_steady_the_motion_is_by_hand():
     # 0.75 * 0.4^2 + 0.25 * (0.2^2 + 0.4^2) / 2 = 0.145 m^2, 0.75 * 0.2^2 + 0.25 * 0.6^2 rad^2
     options = MotionOptions(steady_rate=0.25)
-    after = Steadiness(0.4, 0.2).after(np.array([0.2, -0.4, 0.6]), 0.1, options)
+    after = VelocityNoise(0.4, 0.2).after(np.array([0.2, -0.4, 0.6]), 0.1, options)
     assert after.translation == pytest.approx(np.sqrt(0.145))
     assert after.rotation == pytest.approx(np.sqrt(0.12))
 
@@ -43,7 +43,7 @@ def test_how_steady_the_motion_is_by_hand():
 )
 def test_a_robot_that_was_steady_may_still_turn(seconds, metres, radians):
     found = motion_model.unknown_steadiness(OPTIONS)
-    assert found == Steadiness(
+    assert found == VelocityNoise(
         OPTIONS.without_odometry_translation, OPTIONS.without_odometry_rotation
     )
     for _ in range(200):
@@ -54,33 +54,33 @@ def test_a_robot_that_was_steady_may_still_turn(seconds, metres, radians):
 
 def test_steps_that_nobody_made_are_told_from_the_others():
     x = np.cumsum([0.0, *[0.3] * 30, 40.0, *[0.3] * 30])
-    steps = motion_model.odometry_steps(se2.matrix(x, 0 * x, 0 * x))
+    steps = motion_model.compute_odometry_steps(se2.matrix(x, 0 * x, 0 * x))
     np.testing.assert_array_equal(np.flatnonzero(~steps.plausible), [30])
     np.testing.assert_allclose(steps.increments[:, 0, 2], np.diff(x))
-    assert motion_model.odometry_steps(None) is None
-    assert motion_model.odometry_steps(T0[None]).plausible.shape == (0,)
+    assert motion_model.compute_odometry_steps(None) is None
+    assert motion_model.compute_odometry_steps(T0[None]).plausible.shape == (0,)
 
 
 def test_widths_by_hand():
     # 0.5 m and 0.4 rad: 0.01 + 0.2 * 0.5 + 0.3 * 0.4 = 0.23 m, 0.02 + 0.1 * 0.5 + 0.5 * 0.4 rad
     options = MotionOptions(0.01, 0.2, 0.3, 0.02, 0.1, 0.5)
-    prior = motion_model.from_odometry(T0, se2.matrix(0.3, 0.4, -0.4), options)
+    prior = motion_model.odometry_prior(T0, se2.matrix(0.3, 0.4, -0.4), options)
     assert prior.sigma_translation == pytest.approx(0.23)
     assert prior.sigma_rotation == pytest.approx(0.27)
     np.testing.assert_allclose(prior.information, np.diag([0.23**-2, 0.23**-2, 0.27**-2]))
 
 
 def test_standing_still_is_the_surest():
-    still = motion_model.from_odometry(T0, np.eye(3), OPTIONS)
+    still = motion_model.odometry_prior(T0, np.eye(3), OPTIONS)
     for increment in (se2.matrix(0.1, 0, 0), se2.matrix(0, 0, -0.1), se2.matrix(-0.1, 0, 0)):
-        moving = motion_model.from_odometry(T0, increment, OPTIONS)
+        moving = motion_model.odometry_prior(T0, increment, OPTIONS)
         assert moving.sigma_translation > still.sigma_translation > 0
         assert moving.sigma_rotation > still.sigma_rotation > 0
 
 
 def test_widened_is_never_narrower():
-    prior = motion_model.from_odometry(T0, se2.matrix(0.5, 0, 0), OPTIONS)
-    wide = motion_model.widened(prior, 10 * prior.sigma_translation, 0.1 * prior.sigma_rotation)
+    prior = motion_model.odometry_prior(T0, se2.matrix(0.5, 0, 0), OPTIONS)
+    wide = motion_model.widen_prior(prior, 10 * prior.sigma_translation, 0.1 * prior.sigma_rotation)
     assert wide.sigma_translation == pytest.approx(10 * prior.sigma_translation)
     assert wide.sigma_rotation == prior.sigma_rotation
     np.testing.assert_allclose(wide.T_map_base, prior.T_map_base, atol=1e-15)
@@ -93,8 +93,8 @@ def test_poses_stay_poses_however_long_the_chain():
     by_odometry, step = T0, se2.matrix(0.1, 0.01, 0.3)
     unsure = motion_model.unknown_steadiness(OPTIONS)
     for _ in range(300):
-        before, now = now, motion_model.from_constant_velocity(now, before, unsure).T_map_base
-        by_odometry = motion_model.from_odometry(by_odometry, step, OPTIONS).T_map_base
+        before, now = now, motion_model.constant_velocity_prior(now, before, unsure).T_map_base
+        by_odometry = motion_model.odometry_prior(by_odometry, step, OPTIONS).T_map_base
     for T in (now, by_odometry):
         np.testing.assert_allclose(T[:2, :2] @ T[:2, :2].T, np.eye(2), atol=1e-12)
     # a circle of radius 0.1 / 0.3: the chain stays on it
@@ -109,11 +109,11 @@ def test_every_width_can_be_chosen():
         more = dataclasses.replace(OPTIONS, **{name: 2 * getattr(OPTIONS, name)})
         if name.startswith("without"):
             a, b = (
-                motion_model.from_constant_velocity(T0, T0, motion_model.unknown_steadiness(o))
+                motion_model.constant_velocity_prior(T0, T0, motion_model.unknown_steadiness(o))
                 for o in (OPTIONS, more)
             )
         else:
-            a, b = (motion_model.from_odometry(T0, increment, o) for o in (OPTIONS, more))
+            a, b = (motion_model.odometry_prior(T0, increment, o) for o in (OPTIONS, more))
         rotation = "rotation" in name
         assert (b.sigma_rotation > a.sigma_rotation) == rotation
         assert (b.sigma_translation > a.sigma_translation) != rotation

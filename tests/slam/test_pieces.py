@@ -11,7 +11,7 @@ from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box, pillar
 from stillmap.slam import SlamOptions, m_step
-from stillmap.slam.relocalization import separated
+from stillmap.slam.relocalization import separate_segments
 
 OPTIONS = SlamOptions()
 
@@ -29,7 +29,7 @@ def carried(world, seed, beams, **robot):
 def assert_noticed_and_placed(simulation):
     found = mapped(simulation.recording)
     assert found.breaks == [simulation.truth.scene["carried_at_scan"]]
-    assert found.apart == []
+    assert found.unconnected == []
     assert absolute_errors(found.poses, simulation.truth.T_world_base).rmse < 0.1
 
 
@@ -113,10 +113,10 @@ def test_a_place_that_has_nothing_in_common_is_put_beside(rooms):
     one, other, recording = rooms
     found = mapped(recording)
     assert found.breaks == [60]
-    assert found.apart == [60]
+    assert found.unconnected == [60]
     # nobody knows how the robot came there: no loop says so, and the step itself says nothing
     assert all(closure.refused for closure in found.loops if closure.later >= 60 > closure.earlier)
-    across = [r for r in found.graph.relations if found.graph.scans[r.second] == 60]
+    across = [r for r in found.graph.constraints if found.graph.keyframes[r.second] == 60]
     assert [np.linalg.eigvalsh(r.covariance).min() > 90.0 for r in across] == [True]
     # each room is as good as alone, and the two maps have 10 m between them
     assert absolute_errors(found.poses[:60], one.truth.T_world_base).rmse < 0.01
@@ -129,7 +129,7 @@ def test_a_place_that_has_nothing_in_common_is_put_beside(rooms):
 def test_pieces_beside_one_another_are_ever_the_same(rooms):
     one, other = mapped(rooms[2]), mapped(rooms[2])
     np.testing.assert_array_equal(one.poses, other.poses)
-    assert one.apart == other.apart
+    assert one.unconnected == other.unconnected
 
 
 def test_the_same_room_again_is_the_same_room(rooms):
@@ -138,13 +138,13 @@ def test_the_same_room_again_is_the_same_room(rooms):
     again = one_after_the_other(one.recording, one.recording)
     found = mapped(again)
     assert found.breaks == [60]
-    assert found.apart == []
+    assert found.unconnected == []
     truth = np.concatenate([one.truth.T_world_base] * 2)
     assert absolute_errors(found.poses, truth).rmse < 0.02
 
 
 def test_nothing_reaches_across_a_break():
     travelled = np.arange(6.0)
-    got = separated(travelled, [2, 5], 30.0)
+    got = separate_segments(travelled, [2, 5], 30.0)
     np.testing.assert_array_equal(got, [0, 1, 32, 33, 34, 65])
     np.testing.assert_array_equal(travelled, np.arange(6.0))

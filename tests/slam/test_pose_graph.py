@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
-from stillmap.slam.pose_graph import Relation, Robust, misfits, optimised
+from stillmap.slam.pose_graph import Constraint, Robust, optimize_poses, squared_mahalanobis
 
 SURE = np.diag([1e-4, 1e-4, 1e-6])
 STEP = np.diag([1e-2, 1e-2, 1e-4])
@@ -23,7 +23,7 @@ def square(side=10):
 def chain_of(poses, drift=None):
     drift = np.eye(3) if drift is None else drift
     steps = se2.inverse(poses[:-1]) @ poses[1:] @ drift
-    return [Relation(k, k + 1, T, STEP) for k, T in enumerate(steps)]
+    return [Constraint(k, k + 1, T, STEP) for k, T in enumerate(steps)]
 
 
 def dead_reckoned(chain):
@@ -39,31 +39,31 @@ def apart(a, b):
 
 def test_an_error_is_shared_evenly_along_the_way():
     # four steps said to be 1.1 m long, yet the end is known to be at 4 m: 1 m each
-    chain = [Relation(k, k + 1, se2.matrix(1.1, 0, 0), STEP) for k in range(4)]
-    loop = Relation(0, 4, se2.matrix(4.0, 0, 0), 1e-6 * np.eye(3))
-    x = se2.parameters(optimised(dead_reckoned(chain), chain, [loop], None))
+    chain = [Constraint(k, k + 1, se2.matrix(1.1, 0, 0), STEP) for k in range(4)]
+    loop = Constraint(0, 4, se2.matrix(4.0, 0, 0), 1e-6 * np.eye(3))
+    x = se2.parameters(optimize_poses(dead_reckoned(chain), chain, [loop], None))
     np.testing.assert_allclose(x[:, 0], [0, 1, 2, 3, 4], atol=1e-4)
     np.testing.assert_allclose(x[:, 1:], 0, atol=1e-6)
 
 
 def test_a_looser_step_takes_more_of_it():
     chain = [
-        Relation(0, 1, se2.matrix(1, 0, 0), STEP),
-        Relation(1, 2, se2.matrix(1, 0, 0), 3 * STEP),
+        Constraint(0, 1, se2.matrix(1, 0, 0), STEP),
+        Constraint(1, 2, se2.matrix(1, 0, 0), 3 * STEP),
     ]
-    loop = Relation(0, 2, se2.matrix(2.4, 0, 0), 1e-8 * np.eye(3))
-    x = se2.parameters(optimised(dead_reckoned(chain), chain, [loop], None))
+    loop = Constraint(0, 2, se2.matrix(2.4, 0, 0), 1e-8 * np.eye(3))
+    x = se2.parameters(optimize_poses(dead_reckoned(chain), chain, [loop], None))
     np.testing.assert_allclose(x[:, 0], [0, 1.1, 2.4], atol=1e-4)
 
 
 def test_covariances_hold_in_the_frame_of_the_second_pose():
     # the robot has turned left; loose along its x, which is the map's y
     chain = [
-        Relation(0, 1, se2.matrix(0, 0, np.pi / 2), 1e-8 * np.eye(3)),
-        Relation(1, 2, se2.matrix(1, 0, 0), np.diag([1.0, 1e-6, 1e-6])),
+        Constraint(0, 1, se2.matrix(0, 0, np.pi / 2), 1e-8 * np.eye(3)),
+        Constraint(1, 2, se2.matrix(1, 0, 0), np.diag([1.0, 1e-6, 1e-6])),
     ]
-    loop = Relation(0, 2, se2.matrix(0.5, 1.5, np.pi / 2), np.diag([1e-4, 1.0, 1e-4]))
-    x = se2.parameters(optimised(dead_reckoned(chain), chain, [loop], None))
+    loop = Constraint(0, 2, se2.matrix(0.5, 1.5, np.pi / 2), np.diag([1e-4, 1.0, 1e-4]))
+    x = se2.parameters(optimize_poses(dead_reckoned(chain), chain, [loop], None))
     np.testing.assert_allclose(x[2, :2], [0.0, 1.5], atol=0.01)
 
 
@@ -72,8 +72,8 @@ def test_a_square_with_drift_closes():
     chain = chain_of(truth, drift=se2.matrix(0.01, 0.002, 0.004))
     start = dead_reckoned(chain)
     assert apart(start, truth)[-1] > 0.5
-    loop = Relation(0, len(truth) - 1, np.eye(3), SURE)
-    found = optimised(start, chain, [loop], None)
+    loop = Constraint(0, len(truth) - 1, np.eye(3), SURE)
+    found = optimize_poses(start, chain, [loop], None)
     assert apart(found, truth)[-1] < 0.02
     assert apart(found, truth).max() < 0.35 * apart(start, truth).max()
     np.testing.assert_array_equal(found[0], np.eye(3))
@@ -84,36 +84,36 @@ def test_one_false_loop_is_survived():
     chain = chain_of(truth, drift=se2.matrix(0.01, 0.002, 0.004))
     n = len(truth) - 1
     true = [
-        Relation(k, n - 3 + k, se2.inverse(truth[k]) @ truth[n - 3 + k], SURE) for k in range(4)
+        Constraint(k, n - 3 + k, se2.inverse(truth[k]) @ truth[n - 3 + k], SURE) for k in range(4)
     ]
-    false = Relation(5, 25, np.eye(3), SURE)  # opposite sides of the square
-    plain = optimised(dead_reckoned(chain), chain, [*true, false], None)
-    robust = optimised(dead_reckoned(chain), chain, [*true, false], ROBUST)
+    false = Constraint(5, 25, np.eye(3), SURE)  # opposite sides of the square
+    plain = optimize_poses(dead_reckoned(chain), chain, [*true, false], None)
+    robust = optimize_poses(dead_reckoned(chain), chain, [*true, false], ROBUST)
     assert apart(plain, truth).max() > 1.0
     assert apart(robust, truth).max() < 0.2
     # and what is left of it tells it from the others
-    assert misfits(robust, [false])[0] > 1000
-    assert misfits(robust, true).max() < 16
+    assert squared_mahalanobis(robust, [false])[0] > 1000
+    assert squared_mahalanobis(robust, true).max() < 16
 
 
 def test_misfit_by_hand():
     poses = np.array([np.eye(3), se2.matrix(2.0, 0.0, 0.0)])
-    relation = Relation(0, 1, se2.matrix(1.7, 0.4, 0.0), np.diag([0.01, 0.04, 1.0]))
-    fits = Relation(0, 1, poses[1], np.eye(3))
+    relation = Constraint(0, 1, se2.matrix(1.7, 0.4, 0.0), np.diag([0.01, 0.04, 1.0]))
+    fits = Constraint(0, 1, poses[1], np.eye(3))
     expected = [0.3**2 / 0.01 + 0.4**2 / 0.04, 0.0]
-    np.testing.assert_allclose(misfits(poses, [relation, fits]), expected, atol=1e-12)
-    assert misfits(poses, []).shape == (0,)
+    np.testing.assert_allclose(squared_mahalanobis(poses, [relation, fits]), expected, atol=1e-12)
+    assert squared_mahalanobis(poses, []).shape == (0,)
 
 
 def test_without_loops_nothing_moves():
     truth = square()
-    np.testing.assert_allclose(optimised(truth, chain_of(truth), [], None), truth, atol=1e-9)
+    np.testing.assert_allclose(optimize_poses(truth, chain_of(truth), [], None), truth, atol=1e-9)
 
 
 def test_the_same_to_the_bit():
     chain = chain_of(square(), drift=se2.matrix(0.01, 0.002, 0.004))
-    loop = Relation(0, 40, np.eye(3), SURE)
-    a, b = (optimised(dead_reckoned(chain), chain, [loop], ROBUST) for _ in range(2))
+    loop = Constraint(0, 40, np.eye(3), SURE)
+    a, b = (optimize_poses(dead_reckoned(chain), chain, [loop], ROBUST) for _ in range(2))
     np.testing.assert_array_equal(a, b)
 
 
@@ -134,7 +134,7 @@ def rounds(rng, laps, false):
 
     def seen(i, j, covariance):
         noise = se2.matrix(*(np.sqrt(np.diag(covariance)) * rng.standard_normal(3)))
-        return Relation(i, j, se2.inverse(truth[i]) @ truth[j] @ noise, covariance)
+        return Constraint(i, j, se2.inverse(truth[i]) @ truth[j] @ noise, covariance)
 
     chain = [seen(k, k + 1, STEP_ERROR) for k in range(len(truth) - 1)]
     later = rng.integers(100, len(truth), 60).tolist()
@@ -142,21 +142,21 @@ def rounds(rng, laps, false):
     for _ in range(false):
         i, j = sorted(rng.choice(len(truth), 2, replace=False).tolist())
         anywhere = se2.matrix(*rng.uniform([-2, -2, -np.pi], [2, 2, np.pi]))
-        loops.append(Relation(i, j, anywhere, LOOP_ERROR))
+        loops.append(Constraint(i, j, anywhere, LOOP_ERROR))
     return truth, chain, loops
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_one_false_loop_in_ten_is_survived_by_annealing(seed):
     truth, chain, loops = rounds(np.random.default_rng(seed), laps=3, false=6)
-    found = optimised(dead_reckoned(chain), chain, loops, ROBUST)
-    misfit = misfits(found, loops)
+    found = optimize_poses(dead_reckoned(chain), chain, loops, ROBUST)
+    misfit = squared_mahalanobis(found, loops)
     assert misfit[:60].max() < ROBUST.misfit
     assert misfit[60:].min() > ROBUST.misfit
     # as good as without the false ones
-    clean = apart(optimised(dead_reckoned(chain), chain, loops[:60], None), truth).max()
+    clean = apart(optimize_poses(dead_reckoned(chain), chain, loops[:60], None), truth).max()
     assert apart(found, truth).max() < 1.1 * clean + 0.01
-    assert apart(optimised(dead_reckoned(chain), chain, loops, None), truth).max() > 5.0
+    assert apart(optimize_poses(dead_reckoned(chain), chain, loops, None), truth).max() > 5.0
 
 
 def false_alone():
@@ -165,18 +165,18 @@ def false_alone():
     rng = np.random.default_rng(0)
     noise = np.sqrt(np.diag(STEP_ERROR)) * rng.standard_normal((400, 3))
     moves = se2.inverse(truth[:-1]) @ truth[1:] @ se2.matrix(*noise.T)
-    chain = [Relation(k, k + 1, T, STEP_ERROR) for k, T in enumerate(moves)]
+    chain = [Constraint(k, k + 1, T, STEP_ERROR) for k, T in enumerate(moves)]
     true = [
-        Relation(k, 396 + k, se2.inverse(truth[k]) @ truth[396 + k], LOOP_ERROR) for k in range(4)
+        Constraint(k, 396 + k, se2.inverse(truth[k]) @ truth[396 + k], LOOP_ERROR) for k in range(4)
     ]
-    return truth, chain, [*true, Relation(50, 250, np.eye(3), LOOP_ERROR)]
+    return truth, chain, [*true, Constraint(50, 250, np.eye(3), LOOP_ERROR)]
 
 
 def test_steps_of_annealing_decide_less_by_the_start_than_one():
     truth, chain, loops = false_alone()
     start = dead_reckoned(chain)
-    annealed = apart(optimised(start, chain, loops, ROBUST), truth).max()
-    at_once = apart(optimised(start, chain, loops, Robust(16.0, 1)), truth).max()
+    annealed = apart(optimize_poses(start, chain, loops, ROBUST), truth).max()
+    at_once = apart(optimize_poses(start, chain, loops, Robust(16.0, 1)), truth).max()
     assert annealed < 3.0
     assert at_once > 3.0 * annealed
 
@@ -184,20 +184,20 @@ def test_steps_of_annealing_decide_less_by_the_start_than_one():
 def test_one_step_is_sharp_at_once():
     # from the plain solution one more with the weights of Geman and McClure's loss there
     _, chain, loops = false_alone()
-    plain = optimised(dead_reckoned(chain), chain, loops, None)
-    weights = (16.0 / (misfits(plain, loops) + 16.0)) ** 2
+    plain = optimize_poses(dead_reckoned(chain), chain, loops, None)
+    weights = (16.0 / (squared_mahalanobis(plain, loops) + 16.0)) ** 2
     weighted = [
-        Relation(r.first, r.second, r.T, r.covariance / w)
+        Constraint(r.first, r.second, r.T, r.covariance / w)
         for r, w in zip(loops, weights, strict=True)
     ]
-    expected = optimised(plain, chain, weighted, None)
-    found = optimised(dead_reckoned(chain), chain, loops, Robust(16.0, 1))
+    expected = optimize_poses(plain, chain, weighted, None)
+    found = optimize_poses(dead_reckoned(chain), chain, loops, Robust(16.0, 1))
     np.testing.assert_allclose(found, expected, atol=1e-7)  # it starts from there, to rounding
 
 
 def test_loops_that_agree_keep_all_their_weight():
     _, chain, loops = rounds(np.random.default_rng(1), laps=2, false=0)
-    plain = optimised(dead_reckoned(chain), chain, loops, None)
-    robust = optimised(dead_reckoned(chain), chain, loops, ROBUST)
-    assert misfits(plain, loops).max() < ROBUST.misfit
+    plain = optimize_poses(dead_reckoned(chain), chain, loops, None)
+    robust = optimize_poses(dead_reckoned(chain), chain, loops, ROBUST)
+    assert squared_mahalanobis(plain, loops).max() < ROBUST.misfit
     np.testing.assert_array_equal(robust, plain)

@@ -8,7 +8,7 @@ import pytest
 from stillmap import _core
 from stillmap.core import se2
 from stillmap.slam.motion_model import MotionPrior
-from stillmap.slam.scan_matching import RegistrationOptions, Scan, register, search
+from stillmap.slam.scan_matching import RegistrationOptions, Scan, match_scan, search_pose
 
 OPTIONS = RegistrationOptions()
 
@@ -20,7 +20,7 @@ def prior_at(pose, translation=0.1, rotation=0.1):
 
 def placed(grid, points, weights, prior, options=OPTIONS, other=None, usual=1.0):
     """The registration of one scan; `usual` of its beams are explained of late."""
-    return register(grid, Scan(points, weights, np.eye(3)), prior, other, options, usual)
+    return match_scan(grid, Scan(points, weights, np.eye(3)), prior, other, options, usual)
 
 
 def ones(points):
@@ -106,7 +106,7 @@ def test_a_robot_is_found_metres_away_and_in_any_direction(room, mapped, scan, s
     points = scan(room, truth, seed=seed)
     wrong = prior_at(truth + rng.uniform(-1, 1, 3) * [2.9, 2.9, np.pi], 3.0, 3.0)
     seen = Scan(points, ones(points), np.eye(3))
-    found = search(mapped(room), seen, wrong, OPTIONS, 3.0, np.pi)
+    found = search_pose(mapped(room), seen, wrong, OPTIONS, 3.0, np.pi)
     distance, turn = off(found, truth)
     assert distance < 0.02
     assert turn < np.radians(0.4)

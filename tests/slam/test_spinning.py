@@ -38,7 +38,7 @@ def _silent(*_):
 def built(recording, e=None, threads=1, **changes):
     e = np.ones(recording.n_beams, np.float32) if e is None else e
     options = replace(lidar_odometry.SpinningOptions(), **changes)
-    return lidar_odometry.build(recording, e, options, MotionOptions(), _silent, threads)
+    return lidar_odometry.register_sweeps(recording, e, options, MotionOptions(), _silent, threads)
 
 
 @pytest.fixture(scope="module")
@@ -117,11 +117,13 @@ def test_odometry_holds_where_nothing_is_seen():
 
 
 def test_odometry_that_lies_is_disbelieved():
-    state = constant_velocity.at_first(np.array([1.0, 0, 0, 0, 0, 0]), 0.2, 0.2)
+    state = constant_velocity.initial_state(np.array([1.0, 0, 0, 0, 0, 0]), 0.2, 0.2)
     options = MotionOptions()
     leap = se3.exp(np.array([3.0, 0, 0, 0, 0, 0]))
-    assert constant_velocity.told(state, leap, 0.1, options) is state
-    true = constant_velocity.told(state, se3.exp(np.array([0.12, 0, 0, 0, 0, 0])), 0.1, options)
+    assert constant_velocity.update_with_odometry(state, leap, 0.1, options) is state
+    true = constant_velocity.update_with_odometry(
+        state, se3.exp(np.array([0.12, 0, 0, 0, 0, 0])), 0.1, options
+    )
     assert 1.0 < true.twist[0] < 1.2
 
 
@@ -143,7 +145,7 @@ def test_memory_is_bounded_by_the_reach():
     sizes = []
     for t, x in enumerate(np.arange(0.0, 120.0, 3.0)):
         T = se3.exp(np.array([x, 0, 0, 0, 0, 0]))
-        sweep = lidar_odometry.sweep_of(recording, e, t, 20.0, 0.2)
+        sweep = lidar_odometry.select_sweep(recording, e, t, 20.0, 0.2)
         local.add(sweep.points, sweep.weights, T)
         local.keep_near(T, 20.0)
         sizes.append(len(local))

@@ -7,7 +7,7 @@ import pytest
 
 from stillmap.io import read
 from stillmap.io.trajectory import poses_from_tum
-from stillmap.slam import SlamOptions, deskewed
+from stillmap.slam import SlamOptions, deskew_recording
 from stillmap.viewer.tracks import Beams, part
 
 
@@ -22,7 +22,7 @@ def beams(request, result_of):
 
 
 def test_they_end_where_those_of_the_result_end(beams):
-    whole = deskewed(beams.recording, beams.poses, beams.slam)
+    whole = deskew_recording(beams.recording, beams.poses, beams.slam)
     for scan in range(whole.n_scans):
         seen, own = beams.at(scan), whole.beams_of(scan)
         use = np.flatnonzero(whole.hit[own]) + own.start

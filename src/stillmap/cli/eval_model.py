@@ -15,7 +15,7 @@ from stillmap.eval.model_readers import Seen
 from stillmap.eval.object_models import MoverScores, mover_of, mover_scores
 from stillmap.eval.trajectory import paired
 from stillmap.results.reader import require_model, require_there
-from stillmap.rig.trajectory import lifted
+from stillmap.rig.trajectory import lift_poses
 from stillmap.sim.truth import load_truth
 
 Float = NDArray[np.float64]
@@ -52,7 +52,7 @@ def of_model(args: argparse.Namespace) -> tuple[dict[str, Any], Iterable[str]]:
 def _alignment(result: Path, seen: Seen) -> Float:
     """(4, 4) T_world_map."""
     T = trajectory.align(*trajectory.to_plane_where_flat(*paired(result, seen.truth)))
-    return T if len(T) == 4 else lifted(T[None])[0]
+    return T if len(T) == 4 else lift_poses(T[None])[0]
 
 
 def _movers(result: Path, seen: Seen, T_world_map: Float) -> MoverScores:

@@ -40,7 +40,7 @@ def find_warnings(
     given = len(explained) > 0 and bool(np.isnan(explained).all())
     if recording.T_odom_base is None and not given:
         out.append("no odometry: a constant velocity was assumed between scans")
-    out += _pose_warnings(best.m_step.doubts)
+    out += _pose_warnings(best.m_step.diagnostics)
     lost = np.flatnonzero(explained < 0.2)
     if len(lost):
         out.append(
@@ -60,26 +60,26 @@ def _reader_warnings(source: Mapping[str, Any]) -> list[str]:
     return out
 
 
-def _pose_warnings(doubts: slam.Diagnostics) -> list[str]:
+def _pose_warnings(diagnostics: slam.Diagnostics) -> list[str]:
     out = []
-    if doubts.odometry_faults:
-        n = len(doubts.odometry_faults)
+    if diagnostics.odometry_faults:
+        n = len(diagnostics.odometry_faults)
         out.append(
             f"odometry and scans disagree at {n} scan{'s' * (n > 1)} (wheels that slip or "
-            f"stall, odometry that begins again), first at scan {doubts.odometry_faults[0]}: poses "
+            f"stall, odometry that begins again), first at scan {diagnostics.odometry_faults[0]}: poses "
             "follow the scans there"
         )
-    if doubts.widened:
+    if diagnostics.widened:
         out.append(
-            f"{len(doubts.widened)} scans lay outside what odometry allows and were found by a "
-            f"wider search, the first is scan {doubts.widened[0]}"
+            f"{len(diagnostics.widened)} scans lay outside what odometry allows and were found by a "
+            f"wider search, the first is scan {diagnostics.widened[0]}"
         )
-    for scan in doubts.breaks:
+    for scan in diagnostics.breaks:
         out.append(
             f"before scan {scan} the robot lost its way or was carried elsewhere: "
             + (
                 "nothing seen after it is known from before, so it stands beside the rest"
-                if scan in doubts.unconnected
+                if scan in diagnostics.unconnected
                 else "where it went on was found among the places known from before"
             )
         )

@@ -143,8 +143,8 @@ def _m_step(
         progress,
         # the first labels change most: from the second poses on, refinement is enough
         start=before.m_step if before is not None and before.number > 1 else None,
-        before=None if before is None else before.poses,
-        sums=em.needs_sums(recording.dimension, options.estimator),
+        earlier_poses=None if before is None else before.poses,
+        with_grid=em.needs_sums(recording.dimension, options.estimator),
     )
 
 

@@ -58,7 +58,12 @@ def _rig_inputs(result: Result, tilting: TiltingResult, threads: int) -> MeshInp
     flat, o = result.seen, result.options.rig
     ground = estimate_ground(tilting.deskewed, tilting.poses, tilting.p_static, threads)
     boxes = fit_boxes(
-        flat, result.poses, result.p_static, result.objects, result.options.objects, o.hold
+        flat,
+        result.poses,
+        result.p_static,
+        result.objects,
+        result.options.objects.min_p_dynamic,
+        o.hold,
     )
     return MeshInputs(
         tilting.recording,

@@ -20,7 +20,7 @@ from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
 from stillmap.pipeline.options import DEFAULTS, Options, resolved
 from stillmap.pipeline.snapshots import Snapshot
-from stillmap.tracking import MovingObject, Traffic, traffic
+from stillmap.tracking import FlowMap, MovingObject, compute_flow_map
 
 if TYPE_CHECKING:
     from stillmap.mesh.build import Models
@@ -56,7 +56,7 @@ class Result:
     converged: bool
     warnings: list[str]
     objects: list[MovingObject]
-    traffic: Traffic
+    traffic: FlowMap
     changes: list[Change]
     stages: Mapping[str, Mapping[str, Any]]
 
@@ -121,7 +121,7 @@ class Result:
     def save(
         self, path: str | Path, *, overwrite: bool = False, models: "Models | None" = None
     ) -> None:
-        """Writes the result folder, complete or not at all; with the meshes of `models_of`."""
+        """Writes the result folder, complete or not at all; with the meshes of `build_models`."""
         from stillmap.results.save import save
 
         save(self, Path(path), overwrite, models=models)
@@ -175,7 +175,7 @@ def _finish(state: EmState, recording: Recording, progress: Progress, stages: St
     progress("following what moves", 0, 0, 0)
     with stages.measure("objects"):
         objects = find_objects(deskewed, estimate, maps, changes, options)
-        crossings = traffic(objects)
+        crossings = compute_flow_map(objects)
         del deskewed
     return Result(
         recording=recording,

@@ -13,9 +13,15 @@ from stillmap.core.config import option
 from stillmap.core.recording import Recording
 from stillmap.slam import lidar_odometry, local_map, pose_graph
 from stillmap.slam.constant_velocity import State
-from stillmap.slam.lidar_odometry import Driven, SpinningOptions, Sweep, sweep_of, thinned
-from stillmap.slam.loop_types import Closure, refuse
-from stillmap.slam.pose_graph import Graph, Relation, Robust
+from stillmap.slam.lidar_odometry import (
+    LidarOdometry,
+    SpinningOptions,
+    Sweep,
+    downsample_sweep,
+    select_sweep,
+)
+from stillmap.slam.loop_types import LoopClosure, refuse
+from stillmap.slam.pose_graph import Constraint, PoseGraph, Robust
 
 Float = NDArray[np.float64]
 
@@ -88,7 +94,7 @@ class _Drive:
 
     recording: Recording
     e: NDArray[np.float32]
-    driven: Driven
+    driven: LidarOdometry
     travelled: Float
     keyframes: NDArray[np.intp]
     spinning: SpinningOptions
@@ -98,19 +104,19 @@ class _Drive:
     def sweep(self, t: int) -> Sweep:
         """What sweep t is registered with."""
         options = self.spinning
-        fine = sweep_of(self.recording, self.e, t, options.reach, options.thin_map)
-        return thinned(fine, options.thin, options.most)
+        fine = select_sweep(self.recording, self.e, t, options.reach, options.thin_map)
+        return downsample_sweep(fine, options.thin, options.most)
 
 
-def closed(
+def close_loops_3d(
     recording: Recording,
     e: NDArray[np.float32],
     spinning_options: SpinningOptions,
     options: SpinningLoopOptions,
-    driven: Driven,
+    driven: LidarOdometry,
     progress: Callable[[int, int], None],
     threads: int,
-) -> tuple[Driven, list[Closure], Graph | None]:
+) -> tuple[LidarOdometry, list[LoopClosure], PoseGraph | None]:
     """Poses after loop closure, all attempts at closing a loop, and the graph.
 
     Args:
@@ -123,8 +129,8 @@ def closed(
     """
     if not options.enabled or len(driven.poses) < 2:
         return driven, [], None
-    travelled = local_map.travel(driven.poses)
-    frames = local_map.chosen(driven.poses, options.distance, options.turn)
+    travelled = local_map.travelled_distance(driven.poses)
+    frames = local_map.select_keyframes(driven.poses, options.distance, options.turn)
     drive = _Drive(recording, e, driven, travelled, frames, spinning_options, options, threads)
     found = _attempted(drive, progress)
     way = _way(drive)
@@ -132,43 +138,47 @@ def closed(
     relations = [_relation(drive, closure) for closure in found]
     accepted = [r for r, c in zip(relations, found, strict=True) if not c.refused]
     if not accepted:
-        return driven, found, Graph(frames, start, way)
-    moved = pose_graph.optimised(start, way, accepted, Robust(options.misfit, _ANNEALING))
-    misfits = pose_graph.misfits(moved, relations)
+        return driven, found, PoseGraph(frames, start, way)
+    moved = pose_graph.optimize_poses(start, way, accepted, Robust(options.misfit, _ANNEALING))
+    misfits = pose_graph.squared_mahalanobis(moved, relations)
     found = [
         refuse(c, "other loops disagree") if not c.refused and m > options.misfit else c
         for c, m in zip(found, misfits, strict=True)
     ]
     accepted = [r for r, c in zip(relations, found, strict=True) if not c.refused]
-    moved = pose_graph.optimised(moved, way, accepted, None)
-    poses = local_map.spread(driven.poses, frames, moved)
-    return dataclasses.replace(driven, poses=poses), found, Graph(frames, moved, [*way, *accepted])
+    moved = pose_graph.optimize_poses(moved, way, accepted, None)
+    poses = local_map.propagate_corrections(driven.poses, frames, moved)
+    return (
+        dataclasses.replace(driven, poses=poses),
+        found,
+        PoseGraph(frames, moved, [*way, *accepted]),
+    )
 
 
-def _way(drive: _Drive) -> list[Relation]:
+def _way(drive: _Drive) -> list[Constraint]:
     """Successive keyframes: a random walk that grows with the root of the way."""
-    options, frames, out = drive.options, drive.keyframes, list[Relation]()
+    options, frames, out = drive.options, drive.keyframes, list[Constraint]()
     poses = drive.driven.poses[frames]
     steps = se2.inverse(poses[:-1]) @ poses[1:]
     metres = np.diff(drive.travelled[frames]) + 0.05  # standing still is not free of error either
     for k, (T, way) in enumerate(zip(steps, metres, strict=True)):
         sigma = [options.step_translation] * 3 + [options.step_rotation] * 3
-        out.append(Relation(k, k + 1, T, way * np.diag(np.square(sigma))))
+        out.append(Constraint(k, k + 1, T, way * np.diag(np.square(sigma))))
     return out
 
 
-def _relation(drive: _Drive, closure: Closure) -> Relation:
+def _relation(drive: _Drive, closure: LoopClosure) -> Constraint:
     first, second = np.searchsorted(drive.keyframes, [closure.earlier, closure.later])
-    return Relation(int(first), int(second), closure.T, closure.covariance)
+    return Constraint(int(first), int(second), closure.T, closure.covariance)
 
 
-def _attempted(drive: _Drive, progress: Callable[[int, int], None]) -> list[Closure]:
+def _attempted(drive: _Drive, progress: Callable[[int, int], None]) -> list[LoopClosure]:
     """Every keyframe with the nearest one of much earlier travel, where that is within reach.
 
     What a closure corrects is carried along to the keyframes that follow, and drift is counted
     from there on.
     """
-    poses, options, found = drive.driven.poses, drive.options, list[Closure]()
+    poses, options, found = drive.driven.poses, drive.options, list[LoopClosure]()
     carried, since = np.eye(4), 0.0
     corrected = poses[drive.keyframes].copy()
     for k, t in enumerate(drive.keyframes.tolist()):
@@ -202,7 +212,7 @@ def _drift(metres: float, options: SpinningLoopOptions) -> tuple[float, float]:
 
 def _laid_on(
     drive: _Drive, earlier: int, later: int, T: Float, sigma: float, sigma_turn: float
-) -> Closure:
+) -> LoopClosure:
     """The later sweep registered on the map of an earlier stretch of travel.
 
     Args:
@@ -216,10 +226,12 @@ def _laid_on(
     sweep = drive.sweep(later)
     covariance = np.diag(np.square([sigma] * 3 + [sigma_turn] * 3 + [_TWIST] * 6))
     prior = State(driven.poses[earlier] @ T, driven.twists[later], covariance)
-    state, explained = lidar_odometry.registered(local, sweep, prior, drive.spinning, drive.threads)
+    state, explained = lidar_odometry.register_sweep(
+        local, sweep, prior, drive.spinning, drive.threads
+    )
     found = se2.inverse(driven.poses[earlier]) @ state.T_map_base
     least = [options.sigma_translation] * 3 + [options.sigma_rotation] * 3
-    closure = Closure(
+    closure = LoopClosure(
         earlier, later, found, state.covariance[:6, :6] + np.diag(np.square(least)), explained
     )
     if explained < options.compared * driven.explained[later]:
@@ -244,9 +256,9 @@ def _local_map(drive: _Drive, earlier: int) -> tuple[_core.SweepMap3D, _core.Gri
     local = _core.SweepMap3D(options.edge, drive.options.levels, options.enough)
     solid = _core.Grid3D(_CELL, 0.0)
     for t in around.tolist():
-        fine = sweep_of(drive.recording, drive.e, t, options.reach, options.thin_map)
+        fine = select_sweep(drive.recording, drive.e, t, options.reach, options.thin_map)
         local.add(fine.at_its_stamp(driven.twists[t]), fine.weights, driven.poses[t])
-        few = thinned(fine, options.thin, options.most)
+        few = downsample_sweep(fine, options.thin, options.most)
         X = drive.recording.T_base_sensor[drive.recording.sensor[t]]
         points = few.at_its_stamp(driven.twists[t]) @ X[:3, :3] - X[:3, 3] @ X[:3, :3]
         _core.add_beams(

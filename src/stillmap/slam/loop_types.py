@@ -93,7 +93,7 @@ _LIMITS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class LoopCandidate:
     """Two scans that may see the same place.
 
     Attributes:
@@ -109,7 +109,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Closure:
+class LoopClosure:
     """One attempt at closing a loop.
 
     Attributes:
@@ -130,7 +130,7 @@ class Closure:
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class LoopContext:
     """What loops are looked for in: a recording, its weights and the poses so far.
 
     Attributes:
@@ -162,6 +162,6 @@ def drift(metres: float, options: LoopOptions) -> tuple[float, float]:
     )
 
 
-def refuse(closure: Closure, reason: str) -> Closure:
+def refuse(closure: LoopClosure, reason: str) -> LoopClosure:
     """The same, not accepted."""
     return dataclasses.replace(closure, refused=reason)

@@ -14,7 +14,7 @@ import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.motion_model import MotionPrior
-from stillmap.slam.scan_matching import Registration, RegistrationOptions, Scan
+from stillmap.slam.scan_matching import RegistrationOptions, Scan, ScanMatch
 
 Float = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ _LONGEST = 500  # scans in which it has to become clear
 
 
 @dataclass(frozen=True, eq=False)
-class GoingOn:
+class SlipHypothesis:
     """The robot as if it had gone on.
 
     Attributes:
@@ -36,11 +36,11 @@ class GoingOn:
 
     first: int
     before: Float
-    found: list[Registration]
+    found: list[ScanMatch]
     gain: float
 
 
-class Watch:
+class SlipDetector:
     """Follows a robot whose odometry may stall, scan by scan."""
 
     def __init__(self, increments: Float | None, options: RegistrationOptions) -> None:
@@ -56,7 +56,7 @@ class Watch:
     def forget(self) -> None:
         """The robot is elsewhere: nothing of how it moved before tells how it goes on."""
         self._stalled = False
-        self._going: GoingOn | None = None
+        self._going: SlipHypothesis | None = None
 
     def stalled(self, t: int, last: Float, guess: MotionPrior) -> bool:
         """Whether odometry has been found to stall and still does on the way to scan t.
@@ -78,8 +78,8 @@ class Watch:
         guess: MotionPrior,
         grid: _core.Grid2D,
         scan: Scan,
-        found: Registration,
-    ) -> GoingOn | None:
+        found: ScanMatch,
+    ) -> SlipHypothesis | None:
         """How the robot went on, once the scans leave no doubt that it did.
 
         Args:
@@ -95,7 +95,7 @@ class Watch:
             self._going = None
         else:
             start = onwards.T_map_base
-            moved = scan_matching.search(grid, scan, onwards, self._options, 0.0, 0.0, start)
+            moved = scan_matching.search_pose(grid, scan, onwards, self._options, 0.0, 0.0, start)
             self._add(t, last, moved, found.misfit - moved.misfit)
         if self._going is not None and self._going.gain > self._options.lies:
             gone_on, self._going, self._stalled = self._going, None, True
@@ -114,13 +114,15 @@ class Watch:
                 return None
             before, last = [going.before, *(f.T_map_base for f in going.found[-2:])][-2:]
             ahead = last @ se2.inverse(before) @ last
-            guess = motion_model.guess_at(ahead, guess.sigma_translation, guess.sigma_rotation)
+            guess = motion_model.gaussian_prior(
+                ahead, guess.sigma_translation, guess.sigma_rotation
+            )
         elif guess.sigma_translation > _size(se2.inverse(last) @ guess.T_map_base):
             return None  # nobody can tell how it would go on
         return guess if self._stands_still(t, last, guess.T_map_base) else None
 
-    def _add(self, t: int, last: Float, moved: Registration, gain: float) -> None:
-        going = self._going or GoingOn(t, last, [], 0.0)
+    def _add(self, t: int, last: Float, moved: ScanMatch, gain: float) -> None:
+        going = self._going or SlipHypothesis(t, last, [], 0.0)
         gain += going.gain
         going.found.append(moved)
         stopped = gain < -self._options.lies

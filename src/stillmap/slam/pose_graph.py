@@ -20,7 +20,7 @@ _EXACT, _ROUGH = 1e-7, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Relation:
+class Constraint:
     """T_first_second as somebody measured it.
 
     Attributes:
@@ -50,7 +50,7 @@ class Robust:
 
 
 @dataclass(frozen=True, eq=False)
-class Graph:
+class PoseGraph:
     """What is known of the keyframes of a recording.
 
     Attributes:
@@ -59,13 +59,13 @@ class Graph:
         relations: along the way first, then the loops that were accepted; between keyframes.
     """
 
-    scans: NDArray[np.intp]
+    keyframes: NDArray[np.intp]
     poses: Float
-    relations: list[Relation]
+    constraints: list[Constraint]
 
 
-def optimised(
-    poses: Float, chain: list[Relation], loops: list[Relation], robust: Robust | None
+def optimize_poses(
+    poses: Float, chain: list[Constraint], loops: list[Constraint], robust: Robust | None
 ) -> Float:
     """(K, D+1, D+1) poses of least squares; the first one stays where it is.
 
@@ -84,9 +84,9 @@ def optimised(
     out = _poses(found, poses[0])
     if robust is None or not loops:
         return out
-    chi2 = misfits(out, loops)
+    chi2 = squared_mahalanobis(out, loops)
     # a loop that is sure fits well even if it is false: then the way had to bend for it
-    if np.append(chi2, misfits(out, chain)).max() <= robust.misfit:
+    if np.append(chi2, squared_mahalanobis(out, chain)).max() <= robust.misfit:
         return out  # nothing contradicts anything
     blunt = 2.0 * chi2.max() / robust.misfit
     for step in range(robust.steps):
@@ -95,7 +95,7 @@ def optimised(
         tolerance = _EXACT if step + 1 == robust.steps else _ROUGH
         found = _least_squares(problem, found, loops, weights, tolerance)
         out = _poses(found, poses[0])
-        chi2 = misfits(out, loops)
+        chi2 = squared_mahalanobis(out, loops)
     return out
 
 
@@ -107,7 +107,7 @@ class _Problem:
     start: Any
 
 
-def _problem(poses: Float, chain: list[Relation]) -> _Problem:
+def _problem(poses: Float, chain: list[Constraint]) -> _Problem:
     import gtsam  # takes long to load
 
     start, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
@@ -125,7 +125,7 @@ def _problem(poses: Float, chain: list[Relation]) -> _Problem:
 
 
 def _least_squares(
-    problem: _Problem, start: Any, loops: list[Relation], weights: Float, tolerance: float
+    problem: _Problem, start: Any, loops: list[Constraint], weights: Float, tolerance: float
 ) -> Any:
     """The poses as GTSAM's values, to a relative tolerance of the cost."""
     import gtsam
@@ -152,7 +152,7 @@ def _poses(found: Any, first: Float) -> Float:
     return out
 
 
-def misfits(poses: Float, relations: list[Relation]) -> Float:
+def squared_mahalanobis(poses: Float, relations: list[Constraint]) -> Float:
     """(L,) squared Mahalanobis distances of relations to the poses: chi-square, 3 or 6 degrees."""
     if not relations:
         return np.zeros(0)
@@ -165,7 +165,7 @@ def misfits(poses: Float, relations: list[Relation]) -> Float:
     return out
 
 
-def _factor(relation: Relation, weight: float) -> Any:
+def _factor(relation: Constraint, weight: float) -> Any:
     import gtsam
 
     covariance = relation.covariance / weight

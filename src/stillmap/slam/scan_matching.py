@@ -34,7 +34,7 @@ class SurfaceOptions:
                 raise ValueError(f"'slam.surface.{name}' wants 0 to 1000")
 
 
-def put(
+def add_scan(
     grid: _core.Grid2D,
     recording: Recording,
     e: NDArray[np.float32],
@@ -81,16 +81,16 @@ class Scan:
     T_base_sensor: Float
 
 
-def hits(recording: Recording, e: NDArray[np.float32], t: int) -> Scan:
+def select_hits(recording: Recording, e: NDArray[np.float32], t: int) -> Scan:
     """The hits of scan t."""
     beams = recording.beams_of(t)
     hit = recording.hit[beams]
     T_base_sensor = recording.T_base_sensor[recording.sensor[t]]
-    points = in_frame(recording.points[beams][hit], T_base_sensor)
+    points = transform_points(recording.points[beams][hit], T_base_sensor)
     return Scan(points, e[beams][hit], T_base_sensor)
 
 
-def in_frame(points: Points, T: Float) -> Points:
+def transform_points(points: Points, T: Float) -> Points:
     """Points (N, D) float32 carried over by a transform (D+1, D+1)."""
     return np.ascontiguousarray(points @ T[:-1, :-1].T + T[:-1, -1], dtype=np.float32)
 
@@ -169,7 +169,7 @@ _LIMITS = (
 
 
 @dataclass(frozen=True)
-class Registration:
+class ScanMatch:
     """What came of one scan.
 
     Attributes:
@@ -194,14 +194,14 @@ class Registration:
     disagrees: bool = False
 
 
-def register(
+def match_scan(
     grid: _core.Grid2D,
     scan: Scan,
     prior: MotionPrior,
     other: MotionPrior | None,
     options: RegistrationOptions,
     usual: float,
-) -> Registration:
+) -> ScanMatch:
     """The most likely pose of a scan given the map so far and the motion prior, (9).
 
     Args:
@@ -219,26 +219,26 @@ def register(
     windows = [(options.doubt_translation, options.doubt_rotation)]
     if found.explained < doubtful and (
         # odometry that is right takes a robot to places that are new
-        not prior.measured or share_through_walls(grid, scan, found) > options.through
+        not prior.measured or occluded_share(grid, scan, found) > options.through
     ):
         windows.append((options.lost_translation, np.pi))
     for mean in (prior, other):
         if mean is not None and found.explained < doubtful:
             found = _farther(grid, scan, mean, options, found, doubtful, windows)
-    if prior.measured and is_off(prior, found, options):
+    if prior.measured and is_inconsistent(prior, found, options):
         # a mean that far off is no mean: it would only draw the pose towards itself
-        looser = motion_model.widened(prior, *_off_by(prior, found))
-        again = search(grid, scan, looser, options, 0.0, 0.0, start=found.T_map_base)
+        looser = motion_model.widen_prior(prior, *_off_by(prior, found))
+        again = search_pose(grid, scan, looser, options, 0.0, 0.0, start=found.T_map_base)
         if again.misfit <= found.misfit:
             found = dataclasses.replace(again, widened=found.widened, astray=found.astray)
-        found = dataclasses.replace(found, disagrees=is_off(prior, found, options))
+        found = dataclasses.replace(found, disagrees=is_inconsistent(prior, found, options))
     return found
 
 
-def taken(prior: MotionPrior) -> Registration:
+def accept_prior(prior: MotionPrior) -> ScanMatch:
     """The pose where a prior has it, of a scan that has nothing to lie on; its covariance too."""
     covariance = np.diag(1.0 / np.diag(prior.information))
-    return Registration(prior.T_map_base, covariance, 1.0, 0.0, np.zeros((0, 4)))
+    return ScanMatch(prior.T_map_base, covariance, 1.0, 0.0, np.zeros((0, 4)))
 
 
 def _within(
@@ -247,15 +247,15 @@ def _within(
     prior: MotionPrior,
     options: RegistrationOptions,
     usual: float,
-) -> Registration:
+) -> ScanMatch:
     """The best pose that the prior allows."""
     if prior.measured:
-        near = search(grid, scan, prior, options, 0.0, 0.0, start=prior.T_map_base)
+        near = search_pose(grid, scan, prior, options, 0.0, 0.0, start=prior.T_map_base)
         if near.explained >= options.near * usual:
             return near
     translation = options.window * prior.sigma_translation
     rotation = options.window * prior.sigma_rotation
-    return search(grid, scan, prior, options, translation, rotation)
+    return search_pose(grid, scan, prior, options, translation, rotation)
 
 
 def _farther(
@@ -263,39 +263,39 @@ def _farther(
     scan: Scan,
     prior: MotionPrior,
     options: RegistrationOptions,
-    found: Registration,
+    found: ScanMatch,
     doubtful: float,
     windows: list[tuple[float, float]],
-) -> Registration:
+) -> ScanMatch:
     """What lies beyond the prior's window, where the scan fits much better there.
 
     A place that only looks alike would have the robot look through walls.
     """
     for least_translation, least_rotation in windows:
-        wide = motion_model.widened(prior, least_translation / 3.0, least_rotation / 3.0)
+        wide = motion_model.widen_prior(prior, least_translation / 3.0, least_rotation / 3.0)
         window = options.window * wide.sigma_translation, options.window * wide.sigma_rotation
-        wider = search(grid, scan, wide, options, *window)
+        wider = search_pose(grid, scan, wide, options, *window)
         fits = wider.misfit < found.misfit - options.lies
-        if fits and share_through_walls(grid, scan, wider) <= options.through:
+        if fits and occluded_share(grid, scan, wider) <= options.through:
             found = dataclasses.replace(wider, widened=True, astray=least_rotation == np.pi)
         if found.explained >= doubtful:
             break
     return found
 
 
-def _off_by(prior: MotionPrior, found: Registration) -> tuple[float, float]:
+def _off_by(prior: MotionPrior, found: ScanMatch) -> tuple[float, float]:
     d = prior.shift_to(found.T_map_base)
     return float(np.hypot(d[0], d[1])), abs(float(d[2]))
 
 
-def is_off(prior: MotionPrior, found: Registration, options: RegistrationOptions) -> bool:
+def is_inconsistent(prior: MotionPrior, found: ScanMatch, options: RegistrationOptions) -> bool:
     """Whether a pose is so far off a prior's mean that the prior says no more where it is."""
     metres, radians = _off_by(prior, found)
     off = max(metres / prior.sigma_translation, radians / prior.sigma_rotation)
     return off > options.disagree
 
 
-def search(
+def search_pose(
     grid: _core.Grid2D,
     scan: Scan,
     prior: MotionPrior,
@@ -303,7 +303,7 @@ def search(
     translation: float,
     rotation: float,
     start: Float | None = None,
-) -> Registration:
+) -> ScanMatch:
     """The best pose in a window around the prior's mean; no doubts.
 
     Args:
@@ -319,7 +319,7 @@ def search(
         prior.T_map_base,
         prior.information,
         sigma=options.sigma,
-        radius=radius(options, grid.resolution),
+        radius=field_radius(options, grid.resolution),
         floor=options.floor,
         unknown=options.unknown,
         gain=options.gain,
@@ -330,10 +330,10 @@ def search(
         starts=options.starts,
         T_start=start,
     )
-    return Registration(T, covariance, explained, cost - prior.penalty(T), rivals)
+    return ScanMatch(T, covariance, explained, cost - prior.penalty(T), rivals)
 
 
-def share_through_walls(grid: _core.Grid2D, scan: Scan, found: Registration) -> float:
+def occluded_share(grid: _core.Grid2D, scan: Scan, found: ScanMatch) -> float:
     """Share of the beams that would have to go through walls that the map knows."""
     return _core.share_through(
         grid,
@@ -346,6 +346,6 @@ def share_through_walls(grid: _core.Grid2D, scan: Scan, found: Registration) -> 
     )
 
 
-def radius(options: RegistrationOptions, resolution: float) -> int:
+def field_radius(options: RegistrationOptions, resolution: float) -> int:
     """Cells within which the field is summed up."""
     return max(1, round(2.0 * options.sigma / resolution))
