@@ -5,11 +5,13 @@ import time
 
 import numpy as np
 import pytest
-from made_up_ways import OPTIONS, watched
+from synthetic_tracks import watched
 
 from stillmap.tracking.association import assign_tracks
 from stillmap.tracking.clustering import DynamicPoints
 from stillmap.tracking.smoother import smooth_track
+
+MAX_GAP = 2.0
 
 
 @pytest.mark.parametrize("apart", [0.0, 1e-9, 1e-8, 1e-6, 1e-4])
@@ -26,7 +28,7 @@ def test_scans_nearly_at_once_are_one(apart):
 def test_a_gap_of_hours_is_no_trouble():
     points, _ = watched([lambda t: (2.0 + 0.5 * t, 1.0)])
     late = np.where(points.seconds > 4.0, points.seconds + 20_000.0, points.seconds)
-    owner = assign_tracks(dataclasses.replace(points, seconds=late), OPTIONS)
+    owner = assign_tracks(dataclasses.replace(points, seconds=late), MAX_GAP)
     assert len(np.unique(owner)) == 2
 
 
@@ -46,7 +48,7 @@ def test_large_crowds_take_a_while_and_little_memory():
         np.arange(scans + 1) * n,
     )
     began = time.process_time()
-    assert assign_tracks(points, OPTIONS).min() >= 0
+    assert assign_tracks(points, MAX_GAP).min() >= 0
     assert time.process_time() - began < 30.0
 
 
@@ -54,5 +56,5 @@ def test_time_that_stands_still_forgets_no_less():
     points, _ = watched([lambda t: (2.0 + 0.01 * t, 1.0)], seconds=400.0, points=20)
     same = dataclasses.replace(points, seconds=np.zeros_like(points.seconds))
     began = time.process_time()
-    assign_tracks(same, OPTIONS)
+    assign_tracks(same, MAX_GAP)
     assert time.process_time() - began < 10.0

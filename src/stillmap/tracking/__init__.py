@@ -1,7 +1,7 @@
-"""What moved: end points of moving things, put together to things and followed over time."""
+"""Tracking of moving objects: clusters of dynamic end points, associated over time."""
 
 from stillmap.tracking.flow_map import FlowMap, compute_flow_map
 from stillmap.tracking.objects import MovingObject, track_objects
 from stillmap.tracking.options import ObjectOptions
 
-__all__ = ["MovingObject", "ObjectOptions", "FlowMap", "track_objects", "compute_flow_map"]
+__all__ = ["FlowMap", "MovingObject", "ObjectOptions", "compute_flow_map", "track_objects"]

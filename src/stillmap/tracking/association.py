@@ -273,9 +273,8 @@ class _Tracker:
         self._last = self._last[kept]
 
     def _keep_shapes(self, kept: NDArray[np.bool_]) -> None:
-        self._offset, self._of, self._when = (
-            array[kept] for array in (self._offset, self._of, self._when)
-        )
+        self._offset, self._of = self._offset[kept], self._of[kept]
+        self._when = self._when[kept]
 
 
 def find_splits(

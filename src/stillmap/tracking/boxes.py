@@ -1,4 +1,4 @@
-"""Boxes in the plane around what a flat laser sees to move, at any time."""
+"""Boxes in the plane around moving objects, at any time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,29 +7,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
-from stillmap.tracking import MovingObject, ObjectOptions
+from stillmap.tracking import MovingObject
 from stillmap.tracking.clustering import extract_dynamic_points
+from stillmap.tracking.objects import HEADING_SPEED
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-_WALKS = 0.3  # m/s from where on a thing's velocity says where its front is
-_FEWEST = 2  # end points of something that is in no track: fewer are noise
-_MOMENT = 0.1  # s for which these stand where they were seen
+_MIN_POINTS = 2  # end points of a cluster without a track: fewer are noise
+_CLUSTER_HOLD = 0.1  # s for which the box of such a cluster persists
 
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A rectangle that goes along with a thing.
+    """A rectangle that moves with an object.
 
     Attributes:
-        thing: number of the object; -1: it was seen too shortly to be one.
-        seconds: (L,) when it was seen, rising.
-        xy: (L, 2) metres, its middle in the map frame.
-        ahead: (L, 2) of length one, where its front is.
+        object_id: id of the object; -1: a cluster without a track.
+        seconds: (L,) times of the detections, rising.
+        xy: (L, 2) metres, center in the map frame.
+        heading: (L, 2) unit vectors to the front.
         velocity: (L, 2) metres per second.
-        half: metres to the front and to the side, half its size.
-        hold: s before it was first seen, and after it was last, for which it goes on evenly.
+        half_size: metres from the center to the front and to the side.
+        hold: s for which the box persists before its first and after its last detection.
     """
 
     object_id: int
@@ -41,22 +41,24 @@ class Box:
     hold: float
 
     def center_at(self, seconds: Float) -> Float:
-        """(n, 2) metres, where its middle is at times (n,); beyond its ends it goes on evenly."""
+        """(n, 2) metres, center at times (n,), extrapolated at constant velocity."""
+        early, late = self._outside(seconds)
+        center = np.stack([np.interp(seconds, self.seconds, c) for c in self.xy.T], axis=1)
+        center += early[:, None] * self.velocity[0] + late[:, None] * self.velocity[-1]
+        return center
+
+    def _outside(self, seconds: Float) -> tuple[Float, Float]:
+        """Seconds before the first detection, negative, and after the last one; else 0."""
         early = np.minimum(seconds - self.seconds[0], 0.0)
-        late = np.maximum(seconds - self.seconds[-1], 0.0)
-        middle = np.stack([np.interp(seconds, self.seconds, c) for c in self.xy.T], axis=1)
-        middle += early[:, None] * self.velocity[0] + late[:, None] * self.velocity[-1]
-        return middle
+        return early, np.maximum(seconds - self.seconds[-1], 0.0)
 
     def contains(self, seconds: Float, xy: Float, margin: float) -> Bool:
-        """(n,) whether places (n, 2) lie in it, or within `margin` metres, at times (n,)."""
-        early = np.minimum(seconds - self.seconds[0], 0.0)
-        late = np.maximum(seconds - self.seconds[-1], 0.0)
-        middle = self.center_at(seconds)
+        """(n,) whether positions (n, 2) at times (n,) lie within `margin` metres of the box."""
+        early, late = self._outside(seconds)
         at = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, None)
-        ahead, off = self.heading[at], xy - middle
-        along = np.abs((off * ahead).sum(axis=1))
-        across = np.abs(off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1])
+        heading, offset = self.heading[at], xy - self.center_at(seconds)
+        along = np.abs((offset * heading).sum(axis=1))
+        across = np.abs(offset[:, 1] * heading[:, 0] - offset[:, 0] * heading[:, 1])
         near = (along <= self.half_size[0] + margin) & (across <= self.half_size[1] + margin)
         return np.asarray(near & (late - early <= self.hold))
 
@@ -66,69 +68,64 @@ def fit_boxes(
     poses: Float,
     p_static: NDArray[np.float32],
     objects: Sequence[MovingObject],
-    options: ObjectOptions,
+    min_p_dynamic: float,
     hold: float,
 ) -> list[Box]:
-    """Boxes around all beams that are dynamic as probably as `options.dynamic`.
+    """Boxes around all beams whose P(dynamic) is at least `min_p_dynamic`.
 
     Args:
-        recording: 2D, M beams, without motion during its scans.
+        recording: 2D, M beams, deskewed.
         poses: (T, 3, 3) T_map_base.
         p_static: (M,) P(c = 1) of every beam.
-        objects: what moved.
-        options: see ObjectOptions.
-        hold: s for which an object goes on before it was first seen, and after it was last.
+        objects: the moving objects.
+        min_p_dynamic: threshold of 1 - p_static.
+        hold: s for which an object persists before its first and after its last detection.
     """
     start = int(recording.stamp_ns[0])
-    return [fit_box(one, start, hold) for one in objects] + _of_others(
-        recording, poses, p_static, objects, options
-    )
-
-
-def fit_box(one: MovingObject, start: int, hold: float) -> Box:
-    """The box of an object; its time begins at `start` ns, and it goes on for `hold` s."""
-    seconds = np.asarray(1e-9 * (one.stamp_ns - start), np.float64)
-    speed = np.linalg.norm(one.velocity, axis=1)
-    walks = np.flatnonzero(speed > _WALKS)
-    half = (0.5 * one.size[0], 0.5 * one.size[1])
-    if not len(walks):  # nobody knows where its front is
-        ahead = np.tile([1.0, 0.0], (len(seconds), 1))
-        return Box(one.id, seconds, one.xy, ahead, one.velocity, (max(half), max(half)), hold)
-    # who stands looks where he went
-    at = walks[np.clip(np.searchsorted(walks, np.arange(len(speed)), "right") - 1, 0, None)]
-    return Box(
-        one.id, seconds, one.xy, one.velocity[at] / speed[at, None], one.velocity, half, hold
-    )
-
-
-def _of_others(
-    recording: Recording,
-    poses: Float,
-    p_static: NDArray[np.float32],
-    objects: Sequence[MovingObject],
-    options: ObjectOptions,
-) -> list[Box]:
-    """Of neighbours in a scan that move and are of no object."""
-    points = extract_dynamic_points(recording, poses, p_static, options)
+    points = extract_dynamic_points(recording, poses, p_static, min_p_dynamic)
     owned = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in objects)])
     rest = ~np.isin(points.beam, owned)
     xy, scan = points.xy[rest], points.scan[rest]
+    out = [fit_box(one, start, hold) for one in objects]
     _, first, count = np.unique(points.cluster[rest], return_index=True, return_counts=True)
-    out = []
     for a, n in zip(first.tolist(), count.tolist(), strict=True):
-        if n < _FEWEST:
-            continue
-        low, high = xy[a : a + n].min(axis=0), xy[a : a + n].max(axis=0)
-        half = 0.5 * (high - low)
-        out.append(
-            Box(
-                -1,
-                1e-9 * (recording.stamp_ns[scan[a : a + 1]] - recording.stamp_ns[0]),
-                0.5 * (low + high)[None],
-                np.array([[1.0, 0.0]]),
-                np.zeros((1, 2)),
-                (float(half[0]), float(half[1])),
-                _MOMENT,
-            )
-        )
+        if n >= _MIN_POINTS:
+            seconds = 1e-9 * (recording.stamp_ns[scan[a : a + 1]] - recording.stamp_ns[0])
+            out.append(_fit_static_box(xy[a : a + n], seconds))
     return out
+
+
+def fit_box(one: MovingObject, start: int, hold: float) -> Box:
+    """The box of an object.
+
+    Args:
+        one: the object.
+        start: ns, time 0 of the box.
+        hold: s for which it persists before its first and after its last detection.
+    """
+    seconds = np.asarray(1e-9 * (one.stamp_ns - start), np.float64)
+    speed = np.linalg.norm(one.velocity, axis=1)
+    moving = np.flatnonzero(speed > HEADING_SPEED)
+    half = (0.5 * one.size[0], 0.5 * one.size[1])
+    if not len(moving):  # its heading is unknown
+        heading = np.tile([1.0, 0.0], (len(seconds), 1))
+        return Box(one.id, seconds, one.xy, heading, one.velocity, (max(half), max(half)), hold)
+    # at rest it keeps the heading of its last motion
+    at = moving[np.clip(np.searchsorted(moving, np.arange(len(speed)), "right") - 1, 0, None)]
+    heading = one.velocity[at] / speed[at, None]
+    return Box(one.id, seconds, one.xy, heading, one.velocity, half, hold)
+
+
+def _fit_static_box(xy: Float, seconds: Float) -> Box:
+    """The box at rest around the points (n, 2) of a cluster at one time (1,)."""
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    half = 0.5 * (high - low)
+    return Box(
+        object_id=-1,
+        seconds=seconds,
+        xy=0.5 * (low + high)[None],
+        heading=np.array([[1.0, 0.0]]),
+        velocity=np.zeros((1, 2)),
+        half_size=(float(half[0]), float(half[1])),
+        hold=_CLUSTER_HOLD,
+    )

@@ -1,4 +1,4 @@
-"""Where things move: how often each square of the floor was crossed, and how fast."""
+"""Flow map: number of crossings and mean speed of moving objects per square of the floor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from stillmap.tracking.objects import MovingObject
 
 Float = NDArray[np.float64]
 
-_STEP = 0.25  # of a square: points along a way that are asked which square they are in
-_AGAIN = 5.0  # s after which being in a square is crossing it again
+_STEP = 0.25  # of a square: spacing of the samples along a track
+_MIN_ABSENCE = 5.0  # s after which a return to a square is another crossing
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,8 +19,8 @@ class FlowMap:
     """Squares of the floor.
 
     Attributes:
-        crossings: (H, W) int32, how often something crossed each; row 0 has the lowest y.
-        speed: (H, W) float32, metres per second, the mean of those that crossed; NaN: none did.
+        crossings: (H, W) int32, number of crossings; row 0 has the lowest y.
+        speed: (H, W) float32, mean speed of the crossings in metres per second; NaN without any.
         origin: x, y (metres) and yaw of the lower-left corner of the lower-left square.
         resolution: metres.
     """
@@ -32,17 +32,17 @@ class FlowMap:
 
 
 def compute_flow_map(objects: Sequence[MovingObject], resolution: float = 0.5) -> FlowMap:
-    """How often each square was crossed.
+    """Count the crossings of each square.
 
-    Who stays in a square, or comes back to it within a few seconds, has crossed it once.
+    An object that stays in a square, or returns to it within a few seconds, crosses it once.
 
     Args:
-        objects: what moved.
+        objects: moving objects.
         resolution: metres, edge of a square.
     """
-    visits = [_visits(one, resolution) for one in objects]
-    cells = np.concatenate([np.zeros((0, 2), np.int64), *(cell for cell, _ in visits)])
-    speeds = np.concatenate([np.zeros(0), *(speed for _, speed in visits)])
+    crossings = [_crossings(one, resolution) for one in objects]
+    cells = np.concatenate([np.zeros((0, 2), np.int64), *(cell for cell, _ in crossings)])
+    speeds = np.concatenate([np.zeros(0), *(speed for _, speed in crossings)])
     if len(cells) == 0:
         none = np.zeros((0, 0), np.int32)
         return FlowMap(none, none.astype(np.float32), (0.0, 0.0, 0.0), resolution)
@@ -62,26 +62,26 @@ def compute_flow_map(objects: Sequence[MovingObject], resolution: float = 0.5) -
     )
 
 
-def _visits(one: MovingObject, resolution: float) -> tuple[NDArray[np.int64], Float]:
-    """(V, 2) squares that a thing crossed, column and row, and its speed (V,) there."""
+def _crossings(one: MovingObject, resolution: float) -> tuple[NDArray[np.int64], Float]:
+    """Squares (V, 2) that an object crosses, column and row, and its mean speed (V,) there."""
     seconds = 1e-9 * (one.stamp_ns - one.stamp_ns[0])
-    xy, t = _between(one.xy, seconds, _STEP * resolution)
+    xy, t = _resample(one.xy, seconds, _STEP * resolution)
     speed = np.interp(t, seconds, np.linalg.norm(one.velocity, axis=1))
     cell = np.floor(xy / resolution).astype(np.int64)
-    # in the order of squares, then time: a visit begins with a new square, or after a while
+    # in the order of squares, then time: a crossing begins with a new square, or after a while
     order = np.lexsort((t, cell[:, 0], cell[:, 1]))
     cell, t, speed = cell[order], t[order], speed[order]
-    begins = (np.diff(cell, axis=0) != 0).any(axis=1) | (np.diff(t) > _AGAIN)
+    begins = (np.diff(cell, axis=0) != 0).any(axis=1) | (np.diff(t) > _MIN_ABSENCE)
     begins = np.flatnonzero(np.concatenate([[True], begins]))
     count = np.diff(begins, append=len(t))
     return cell[begins], np.add.reduceat(speed, begins) / count
 
 
-def _between(xy: Float, seconds: Float, step: float) -> tuple[Float, Float]:
-    """Points (n, 2) no farther apart than `step` along a way, and when (n,)."""
+def _resample(xy: Float, seconds: Float, step: float) -> tuple[Float, Float]:
+    """Points (n, 2) at most `step` apart along a track, and their times (n,)."""
     length = np.linalg.norm(np.diff(xy, axis=0), axis=1)
     pieces = np.maximum(np.ceil(length / step), 1.0)
-    whole = np.concatenate([[0.0], np.cumsum(pieces)])
-    at = np.arange(int(whole[-1]) + 1)
-    t = np.interp(at, whole, seconds)
-    return np.stack([np.interp(at, whole, xy[:, d]) for d in (0, 1)], axis=-1), t
+    ends = np.concatenate([[0.0], np.cumsum(pieces)])
+    at = np.arange(int(ends[-1]) + 1)
+    t = np.interp(at, ends, seconds)
+    return np.stack([np.interp(at, ends, xy[:, d]) for d in (0, 1)], axis=-1), t

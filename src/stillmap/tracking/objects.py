@@ -118,8 +118,8 @@ class _ObjectStore:
 
     def objects(self) -> list[MovingObject]:
         """All objects, their ids 0; nothing can be added afterwards."""
-        beams = self._beams.finished()
-        columns = {name: column.finished() for name, column in self._columns.items()}
+        beams = self._beams.finish()
+        columns = {name: column.finish() for name, column in self._columns.items()}
         out, scan, beam = [], 0, 0
         for n_scans, n_beams, size, p_dynamic in self._rows:
             part = {name: column[scan : scan + n_scans] for name, column in columns.items()}

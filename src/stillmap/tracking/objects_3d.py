@@ -51,7 +51,7 @@ def track_objects_3d(
     """
     if not options.enabled:
         return []
-    planar_poses = se2.planar(recording.T_map_sensor(poses))
+    planar_poses = se2.project_to_plane(recording.T_map_sensor(poses))
     found = _segment_scans(
         recording, poses, planar_poses, p_static, ground, options.min_p_dynamic, threads
     )
@@ -114,9 +114,7 @@ def _segment_scans(
         beam.append(number)
         segments += int(segment.max()) + 1 if len(segment) else 0
         offset[t + 1] = offset[t] + len(near)
-    return _Segments(
-        points.finished(), nearest.finished(), offset, segment_of.finished(), beam.finished()
-    )
+    return _Segments(points.finish(), nearest.finish(), offset, segment_of.finish(), beam.finish())
 
 
 def _select_above_ground(
@@ -125,7 +123,7 @@ def _select_above_ground(
     """Numbers and end points (n, 3), in the map frame, of the dynamic beams above the ground."""
     number = beams.start + np.flatnonzero(dynamic)
     end = recording.points[number].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-    above = end[:, 2] - ground.at(end[:, :2])
+    above = end[:, 2] - ground.height_at(end[:, :2])
     kept = (above > _MIN_HEIGHT) & (above < _MAX_HEIGHT)
     return number[kept], end[kept]
 

@@ -1,50 +1,50 @@
-"""Ways of moving things, smoothed: as of Kalman filters that also know what comes later."""
+"""Cubic smoothing splines of tracks, equivalent to a Kalman (RTS) smoother."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
-_AT_ONCE = 1e-3  # s: over less, differences of places say nothing of speeds
+_MIN_INTERVAL = 1e-3  # s: over less, differences of positions say nothing of speeds
 
 
 def smooth_track(
-    seconds: Float, xy: Float, sigma: float, acceleration: float
+    seconds: Float, xy: Float, noise_std: float, acceleration: float
 ) -> tuple[Float, Float]:
-    """(L, 2) places and (L, 2) velocities that are most probable, given all that was seen.
+    """Most probable positions (L, 2) and velocities (L, 2) given all detections.
 
-    A thing with white acceleration that is seen with white noise is most probably where a cubic
-    smoothing spline is: it has the least sum of squared residuals over sigma^2 and of squared
-    acceleration over its density. The spline by Reinsch's equations (Numer. Math. 10, 1967), which
-    are banded: twenty times as fast as scipy's for the short ways of people.
+    Under white acceleration and white detection noise the most probable path is the cubic
+    smoothing spline: it minimises the sum of squared residuals over noise_std^2 and of squared
+    acceleration over its density. Reinsch's equations (Numer. Math. 10, 1967) are banded, and for
+    short tracks twenty times as fast as scipy's spline.
 
     Args:
-        seconds: (L,) not falling, L >= 1; what was seen within 1 ms counts as its mean.
-        xy: (L, 2) metres, where it was seen.
-        sigma: metres.
-        acceleration: m2/s3, density of the acceleration.
+        seconds: (L,) not falling, L >= 1; detections within 1 ms count as their mean.
+        xy: (L, 2) detected positions, metres.
+        noise_std: metres.
+        acceleration: m2/s3, spectral density of the acceleration.
     """
-    which = np.cumsum(np.diff(seconds, prepend=seconds[:1]) > _AT_ONCE)
+    which = np.cumsum(np.diff(seconds, prepend=seconds[:1]) > _MIN_INTERVAL)
     count = np.bincount(which).astype(np.float64)
     t = np.bincount(which, seconds) / count
     y = np.stack([np.bincount(which, xy[:, d]) for d in (0, 1)], axis=-1) / count[:, None]
     if len(t) == 1:
         return y[which], np.zeros_like(xy)
     h = np.diff(t)[:, None]
-    bends = np.zeros_like(y)  # second derivatives; none at the ends
+    second = np.zeros_like(y)  # second derivatives; 0 at the ends
     if len(t) > 2:
-        bends[1:-1], change = _bends(h[:, 0], y, sigma**2 / acceleration / count)
-        y = y - change
+        second[1:-1], residual = _solve(h[:, 0], y, noise_std**2 / acceleration / count)
+        y = y - residual
     slope = np.diff(y, axis=0) / h
-    ahead = slope - h / 6.0 * (2.0 * bends[:-1] + bends[1:])
-    last = slope[-1:] + h[-1:] / 6.0 * (bends[-2:-1] + 2.0 * bends[-1:])
-    return y[which], np.concatenate([ahead, last])[which]
+    forward = slope - h / 6.0 * (2.0 * second[:-1] + second[1:])
+    last = slope[-1:] + h[-1:] / 6.0 * (second[-2:-1] + 2.0 * second[-1:])
+    return y[which], np.concatenate([forward, last])[which]
 
 
-def _bends(h: Float, y: Float, weight: Float) -> tuple[Float, Float]:
-    """(n - 2, 2) second derivatives inside, and by how much (n, 2) is off the spline.
+def _solve(h: Float, y: Float, weight: Float) -> tuple[Float, Float]:
+    """Second derivatives (n - 2, 2) at the inner knots, and residuals (n, 2).
 
-    (R + Q^T W Q) bends = Q^T y, and the spline is y - W Q bends: Q takes second differences, R
+    (R + Q^T W Q) second = Q^T y, and the spline is y - W Q second: Q takes second differences, R
     has the integrals of hat functions.
     """
     from scipy.linalg import solveh_banded  # takes long to load
@@ -56,9 +56,9 @@ def _bends(h: Float, y: Float, weight: Float) -> tuple[Float, Float]:
     banded[0] = (h[:-1] + h[1:]) / 3.0 + before * a**2 + here * b**2 + after * c**2
     banded[1, :-1] = h[1:-1] / 6.0 + here[:-1] * b[:-1] * a[1:] + after[:-1] * c[:-1] * b[1:]
     banded[2, :-2] = after[:-2] * c[:-2] * a[2:]
-    bends = solveh_banded(banded, np.diff(np.diff(y, axis=0) / h[:, None], axis=0), lower=True)
-    off = np.zeros_like(y)
-    off[:-2] += a[:, None] * bends
-    off[1:-1] += b[:, None] * bends
-    off[2:] += c[:, None] * bends
-    return bends, weight[:, None] * off
+    second = solveh_banded(banded, np.diff(np.diff(y, axis=0) / h[:, None], axis=0), lower=True)
+    residual = np.zeros_like(y)
+    residual[:-2] += a[:, None] * second
+    residual[1:-1] += b[:, None] * second
+    residual[2:] += c[:, None] * second
+    return second, weight[:, None] * residual

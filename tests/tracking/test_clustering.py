@@ -1,16 +1,14 @@
 """Which end points are of moving things, where they lie, and which belong together."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from stillmap.core import arrays, se2
 from stillmap.core.recording import Recording
+from stillmap.tracking import clustering
 from stillmap.tracking.clustering import extract_dynamic_points
-from stillmap.tracking.options import ObjectOptions
 
-OPTIONS = ObjectOptions()
+MIN_P_DYNAMIC = 0.7
 
 
 def recording(ranges, hit=None, stamps=None):
@@ -35,7 +33,7 @@ def test_by_hand():
     r = recording([[2, 2, 2, 5, 5], [2, 2, 2, 2, 2]], [[1, 1, 1, 1, 0], [1, 1, 1, 1, 1]])
     p = np.array([[0.1, 0.2, 0.9, 0.1, 0.1], [0.9, 0.29, 0.31, np.nan, 0.0]], np.float32)
     poses = se2.matrix(np.array([0.0, 1.0]), np.array([0.0, 3.0]), np.array([0.0, np.pi / 2]))
-    found = extract_dynamic_points(r, poses, p.reshape(-1), OPTIONS)
+    found = extract_dynamic_points(r, poses, p.reshape(-1), MIN_P_DYNAMIC)
     assert found.beam.tolist() == [0, 1, 3, 6, 9]
     assert found.scan.tolist() == [0, 0, 0, 1, 1]
     assert found.first.tolist() == [0, 3, 5]
@@ -53,25 +51,25 @@ def test_pieces_of_any_size_make_no_difference(monkeypatch, block):
     rng = np.random.default_rng(5)
     r = recording(rng.choice([2.0, 2.1, 5.0], (6, 5)), rng.random((6, 5)) < 0.9)
     p, poses = rng.choice([0.1, 0.9], 30).astype(np.float32), np.tile(np.eye(3), (6, 1, 1))
-    whole = extract_dynamic_points(r, poses, p, OPTIONS)
+    whole = extract_dynamic_points(r, poses, p, MIN_P_DYNAMIC)
     monkeypatch.setattr(arrays, "BLOCK", block)
-    pieces = extract_dynamic_points(r, poses, p, OPTIONS)
+    pieces = extract_dynamic_points(r, poses, p, MIN_P_DYNAMIC)
     for name in ("scan", "beam", "xy", "range", "cluster", "first"):
         np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
 
 
-def test_farther_off_neighbours_lie_farther_apart():
+def test_distance_between_neighbors_grows_with_range(monkeypatch):
     r = recording([[8.0] * 5])  # 0.8 m apart
     p, poses = np.zeros(5, np.float32), np.eye(3)[None]
-    assert extract_dynamic_points(r, poses, p, OPTIONS).cluster.tolist() == [0, 1, 2, 3, 4]
-    wider = dataclasses.replace(OPTIONS, link_slope=0.06)
-    assert extract_dynamic_points(r, poses, p, wider).cluster.tolist() == [0] * 5
+    assert extract_dynamic_points(r, poses, p, MIN_P_DYNAMIC).cluster.tolist() == [0, 1, 2, 3, 4]
+    monkeypatch.setattr(clustering, "LINK_PER_METRE", 0.06)
+    assert extract_dynamic_points(r, poses, p, MIN_P_DYNAMIC).cluster.tolist() == [0] * 5
 
 
 def test_time_never_goes_back():
     r = recording([[2.0]] * 4, stamps=[5 * 10**9, 7 * 10**9, 6 * 10**9, 9 * 10**9])
     poses = np.tile(np.eye(3), (4, 1, 1))
-    found = extract_dynamic_points(r, poses, np.zeros(4, np.float32), OPTIONS)
+    found = extract_dynamic_points(r, poses, np.zeros(4, np.float32), MIN_P_DYNAMIC)
     assert found.seconds.tolist() == [0.0, 2.0, 2.0, 4.0]
 
 
@@ -79,6 +77,6 @@ def test_time_never_goes_back():
 def test_nothing_that_moves(n):
     r = recording(np.full((n, 4), 2.0))
     poses = np.tile(np.eye(3), (n, 1, 1))
-    found = extract_dynamic_points(r, poses, np.ones(4 * n, np.float32), OPTIONS)
+    found = extract_dynamic_points(r, poses, np.ones(4 * n, np.float32), MIN_P_DYNAMIC)
     assert len(found.beam) == len(found.cluster) == len(found.xy) == 0
     assert found.first.tolist() == [0] * (n + 1)

@@ -4,14 +4,17 @@ import dataclasses
 
 import numpy as np
 import pytest
-from made_up_ways import OPTIONS, one_each, watched
+from synthetic_tracks import one_each, watched
 
+from stillmap.tracking import tracklets
 from stillmap.tracking.association import assign_tracks
 from stillmap.tracking.tracklets import stitch_tracklets
 
+MAX_GAP = 2.0
 
-def found(points, options=OPTIONS):
-    return stitch_tracklets(points, assign_tracks(points, options), options)
+
+def found(points):
+    return stitch_tracklets(points, assign_tracks(points, MAX_GAP))
 
 
 def straight(x, y, vx, vy):
@@ -20,7 +23,7 @@ def straight(x, y, vx, vy):
 
 def test_one_thing_that_walks():
     points, who = watched([straight(2, 1, 1.2, 0.1)])
-    assert one_each(assign_tracks(points, OPTIONS), who)
+    assert one_each(assign_tracks(points, MAX_GAP), who)
     assert one_each(found(points), who)
 
 
@@ -86,11 +89,12 @@ def test_a_long_thing_is_one():
     assert len(np.unique(found(points))) == 1
 
 
-def test_what_is_seen_too_shortly_is_nothing():
+def test_short_tracks_are_not_confirmed(monkeypatch):
     points, _ = watched([straight(2, 1, 1.0, 0.0)], lambda _, t: t < 0.45)
     assert (found(points) == -1).all()
-    patient = dataclasses.replace(OPTIONS, least_scans=2, least_seconds=0.3)
-    assert (found(points, patient) == 0).all()
+    monkeypatch.setattr(tracklets, "MIN_TRACK_SCANS", 2)
+    monkeypatch.setattr(tracklets, "_MIN_DURATION", 0.3)
+    assert (found(points) == 0).all()
 
 
 def test_many_things_each_get_their_own():
@@ -114,5 +118,5 @@ def test_turned_and_moved_worlds_give_the_same():
 def test_time_that_stands_still_is_no_trouble():
     points, _ = watched([straight(2, 1, 0.2, 0.1)], seconds=3.0)
     same = dataclasses.replace(points, seconds=np.zeros_like(points.seconds))
-    assert (assign_tracks(same, OPTIONS) == 0).all()
+    assert (assign_tracks(same, MAX_GAP) == 0).all()
     assert (found(same) == -1).all()  # nothing lasts

@@ -2,14 +2,12 @@
 
 import numpy as np
 
-from stillmap.tracking.clustering import DynamicPoints, _clusters
-from stillmap.tracking.options import ObjectOptions
+from stillmap.tracking.clustering import DynamicPoints, _cluster
 
-OPTIONS = ObjectOptions()
 RATE = 5.0
 
 
-def watched(ways, visible=None, seconds=8.0, points=5, radius=0.12, seed=0, options=OPTIONS):
+def watched(ways, visible=None, seconds=8.0, points=5, radius=0.12, seed=0):
     """What is seen of things that go their ways.
 
     Args:
@@ -51,7 +49,7 @@ def watched(ways, visible=None, seconds=8.0, points=5, radius=0.12, seed=0, opti
         xy,
         distance,
         np.zeros((len(t), 2)),
-        _clusters(scan, xy, distance, options),
+        _cluster(scan, xy, distance),
         np.searchsorted(scan, np.arange(len(t) + 1)),
     )
     return made, who
