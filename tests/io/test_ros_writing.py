@@ -174,7 +174,7 @@ def test_without_odometry_there_is_none(tmp_path, driven):
 def test_times_that_a_scan_cannot_state_are_left_out(tmp_path, driven):
     late = dataclasses.replace(driven, beam_time=driven.beam_time - np.float32(0.05))
     [lost] = write_recording(late, tmp_path / "a.mcap", "mcap")
-    assert lost.startswith("when beams were taken is left out of 12 scans")
+    assert lost.startswith("beam times of 12 scans are left out")
     assert decoded(tmp_path / "a.mcap")[0]["/scan"][0][1].time_increment == 0.0
 
 

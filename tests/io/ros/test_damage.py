@@ -230,18 +230,18 @@ def test_names_that_addresses_would_misread(bag, messages):
 
 
 @pytest.mark.parametrize(
-    "unpack", [limits.decompress_bz2, limits.decompress_lz4, limits.decompress_zstd]
+    "decompress", [limits.decompress_bz2, limits.decompress_lz4, limits.decompress_zstd]
 )
-def test_bombs(unpack, monkeypatch):
+def test_decompression_bombs(decompress, monkeypatch):
     monkeypatch.setattr(limits, "MAX_CHUNK", 1 << 20)
     pack = {
-        "bz2_unpacked": bz2.compress,
-        "lz4_unpacked": lz4.frame.compress,
-        "zstd_unpacked": limits.zstd.compress,
-    }[unpack.__name__]
-    assert unpack(pack(bytes(1 << 20))) == bytes(1 << 20)
+        "decompress_bz2": bz2.compress,
+        "decompress_lz4": lz4.frame.compress,
+        "decompress_zstd": limits.zstd.compress,
+    }[decompress.__name__]
+    assert decompress(pack(bytes(1 << 20))) == bytes(1 << 20)
     with pytest.raises(InputError, match="larger than 1 MiB"):
-        unpack(pack(bytes((1 << 20) + 1)))
+        decompress(pack(bytes((1 << 20) + 1)))
 
 
 @pytest.mark.parametrize(

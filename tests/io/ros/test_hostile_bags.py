@@ -12,7 +12,7 @@ from small_bags import Messages, write_bag
 
 from stillmap.core.errors import InputError
 from stillmap.io import read
-from stillmap.io.ros import limits, scan_beams, sqlite_limits
+from stillmap.io.ros import limits, scan_beams
 from stillmap.io.ros.laser_scan import LaserScans, ScanShape
 
 START = 1_700_000_000_000_000_000
@@ -91,8 +91,8 @@ def test_values_of_other_types(db3):
 
 
 def test_tree_in_which_one_page_stands_for_millions(db3, monkeypatch):
-    monkeypatch.setattr(sqlite_limits, "_SURELY_FINE", 0)
-    monkeypatch.setattr(sqlite_limits, "_STEPS_PER_BYTE", 3)
+    monkeypatch.setattr(limits, "_MIN_STEPS", 0)
+    monkeypatch.setattr(limits, "_STEPS_PER_BYTE", 3)
     path, size = db3(), 4096
     content = bytearray(path.read_bytes())
     root = sqlite3.connect(path).execute(

@@ -1,4 +1,4 @@
-"""Opens bags of every kind; which kind shows in their first bytes."""
+"""Opens bags of every kind, told apart by their first bytes."""
 
 import tempfile
 from collections.abc import Callable, Iterator
@@ -23,9 +23,9 @@ from stillmap.io.ros.bag_types import (
 )
 from stillmap.io.ros.limits import ZstdError, open_zstd
 
-_MAX_GROWTH, _SURELY_FINE = 100, 1 << 30  # of a packed file: times its size, bytes
-_MAX_METADATA = 256 << 10  # bytes: YAML takes two seconds for them
-_PIECE = 1 << 20
+_MAX_RATIO, _MIN_LIMIT = 100, 1 << 30  # of a compressed file: times its size; bytes
+_MAX_METADATA = 256 << 10  # bytes of YAML, which take two seconds to parse
+_PIECE = 1 << 20  # bytes
 
 
 def open_bag(path: Path, scratch: Path | None, *, trusted: bool) -> Bag:
@@ -33,19 +33,18 @@ def open_bag(path: Path, scratch: Path | None, *, trusted: bool) -> Bag:
 
     Args:
         path: a file or a folder of files.
-        scratch: folder for files that have to be unpacked; None: the system's.
-        trusted: read with the index; else from the front, as far as it goes.
+        scratch: folder for files that have to be decompressed; None: the system's.
+        trusted: read with the index; else recover what is there, from the front.
 
     Raises:
-        DamagedError: `trusted`, and the bag is not indexed_bag.
-        InputError: no bag that can be read at all.
+        DamagedBagError: `trusted`, and the bag is damaged or has no index.
+        InputError: no readable bag.
     """
     if not path.is_dir():
         return _open_file(path, scratch, trusted)
-    files = _list_files(path)
     bags: list[Bag] = []
     try:
-        for file in files:
+        for file in _list_files(path):
             bags.append(_open_file(file, scratch, trusted))
     except BaseException:
         for bag in bags:
@@ -77,7 +76,7 @@ def _open_file(path: Path, scratch: Path | None, trusted: bool) -> Bag:
     }
     for magic, opener in openers.items():
         if start.startswith(magic):
-            return _opened(opener, path)
+            return _open(opener, path)
     if start.startswith(BAG1_MAGIC):
         version = start[8:13].decode("ascii", "replace").strip()
         hint = "`rosbag fix` or `rosbag reindex` of ROS 1 makes a V2.0 of it"
@@ -85,54 +84,55 @@ def _open_file(path: Path, scratch: Path | None, trusted: bool) -> Bag:
     raise InputError("is no bag, in spite of its name", where=str(path))
 
 
-def _opened(opener: Callable[[Path], Bag], path: Path) -> Bag:
+def _open(opener: Callable[[Path], Bag], path: Path) -> Bag:
     try:
         return opener(path)
     except InputError as error:
         raise InputError(error.what, where=str(path), hint=error.hint) from error
     except PermissionError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    except Exception as error:  # whatever a library makes of damaged bytes
+    except Exception as error:  # any error of a library about damaged bytes
         raise DamagedBagError(str(error) or type(error).__name__) from error
 
 
 def _list_files(folder: Path) -> list[Path]:
-    """The files of a ROS 2 folder in their order; `metadata.yaml` need not be there."""
-    there = storage_files(folder)
+    """The files of a ROS 2 folder in the order of `metadata.yaml`, if there is one."""
+    present = storage_files(folder)
     try:
         file = folder / "metadata.yaml"
-        fine = file.is_file() and file.stat().st_size <= _MAX_METADATA
-        text = file.read_text("utf-8") if fine else ""
-        named = yaml.safe_load(text)["rosbag2_bagfile_information"]["relative_file_paths"]
-        # a list in a list in a list is short as YAML, and has no end as text
-        paths = [folder / Path(name).name for name in named if isinstance(name, str)]
+        usable = file.is_file() and file.stat().st_size <= _MAX_METADATA
+        text = file.read_text("utf-8") if usable else ""
+        names = yaml.safe_load(text)["rosbag2_bagfile_information"]["relative_file_paths"]
+        # YAML aliases can nest lists without end
+        paths = [folder / Path(name).name for name in names if isinstance(name, str)]
     except (OSError, ValueError, LookupError, TypeError, RecursionError, yaml.YAMLError):
-        return there
-    missing = [path.name for path in paths if path not in there]
+        return present
+    missing = [path.name for path in paths if path not in present]
     if missing:
         raise InputError(
             f"lacks the file {missing[0]!r} that its metadata.yaml names",
             where=str(folder),
             hint="without metadata.yaml the files that are there are read",
         )
-    return paths or there
+    return paths or present
 
 
 class _JoinedBag:
-    """Several files as one bag."""
+    """The files of a folder as one bag; equal channels become one."""
 
     def __init__(self, bags: list[Bag]) -> None:
         self._bags = bags
         self.damage = SkippedRecords().merge(*(bag.damage for bag in bags))
         self.kind = f"ROS 2 folder ({bags[0].kind})"
-        together: dict[tuple[str, str, str, str], Channel] = {}
+        self._channels: dict[tuple[str, str, str, str], Channel] = {}
         for bag in bags:
             for channel in bag.channels:
                 key = _identity(channel)
-                first = together.get(key, channel._replace(id=len(together), n_messages=0))
-                together[key] = first._replace(n_messages=first.n_messages + channel.n_messages)
-        self._channels = together
-        self.channels = list(together.values())
+                new = channel._replace(id=len(self._channels), n_messages=0)
+                first = self._channels.get(key, new)
+                n_messages = first.n_messages + channel.n_messages
+                self._channels[key] = first._replace(n_messages=n_messages)
+        self.channels = list(self._channels.values())
 
     def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
         for bag in self._bags:
@@ -149,25 +149,20 @@ def _identity(channel: Channel) -> tuple[str, str, str, str]:
 
 
 class _CompressedBag:
-    """A file that was packed as a whole: unpacked into a folder that goes when it is closed."""
+    """A file compressed as a whole, decompressed into a folder that lives until `close`."""
 
     def __init__(self, path: Path, scratch: Path | None, trusted: bool) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix=".stillmap-", dir=scratch)
         try:
             file = Path(self._folder.name) / path.name.removesuffix(".zstd")
-            cut = _decompress(path, file)
-            self._bag = _open_file(file, scratch, trusted and not cut)
+            is_whole = _decompress(path, file)
+            self._bag = _open_file(file, scratch, trusted and is_whole)
         except BaseException:
             self._folder.cleanup()
             raise
-        self.kind, self.channels, self.damage = (
-            f"{self._bag.kind}, packed",
-            self._bag.channels,
-            self._bag.damage,
-        )
-
-    def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
-        return self._bag.messages(topics, since_ns)
+        self.kind = f"{self._bag.kind}, compressed"
+        self.channels, self.damage = self._bag.channels, self._bag.damage
+        self.messages = self._bag.messages
 
     def close(self) -> None:
         self._bag.close()
@@ -175,18 +170,17 @@ class _CompressedBag:
 
 
 def _decompress(path: Path, out: Path) -> bool:
-    """Unpack a file; whether the stream was cut or damaged, so that only its beginning is there."""
-    limit = max(_MAX_GROWTH * path.stat().st_size, _SURELY_FINE)
+    """Decompress a file; False if the stream is damaged, so that only its beginning is there."""
+    limit = max(_MAX_RATIO * path.stat().st_size, _MIN_LIMIT)
     written = 0
-    with path.open("rb") as packed, open_zstd(packed) as stream, out.open("wb") as file:
+    with path.open("rb") as compressed, open_zstd(compressed) as stream, out.open("wb") as file:
         try:
             while piece := stream.read(_PIECE):
                 written += len(piece)
                 if written > limit:
-                    raise InputError(
-                        f"unpacks to more than {_MAX_GROWTH} times its size", where=str(path)
-                    )
+                    what = f"decompresses to more than {_MAX_RATIO} times its size"
+                    raise InputError(what, where=str(path))
                 file.write(piece)
         except (ZstdError, EOFError):
-            return True
-    return False
+            return False
+    return True

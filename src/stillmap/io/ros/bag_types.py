@@ -1,7 +1,4 @@
-"""What bags of all kinds have in common: channels with messages as bytes.
-
-Which files and folders are bags: shown by their first bytes and names, without reading them.
-"""
+"""What bags of all kinds share: channels of messages as bytes, and how bags are recognized."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,11 +9,16 @@ from stillmap.io.builder import SkippedRecords
 
 BagKind = Literal["bag", "ros2", "db3", "mcap"]
 
-MAX_STAMP_NS = 2**63 - 1  # times of recording are counted in 64 bits
+ENDINGS = (".bag", ".db3", ".mcap")
+BAG1_MAGIC = b"#ROSBAG V"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+DB3_MAGIC = b"SQLite format 3\0"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+MAX_STAMP_NS = 2**63 - 1  # log times are 64 bit
 
 
 class DamagedBagError(Exception):
-    """A bag turned out not to be whole."""
+    """A bag turned out to be damaged or without its index."""
 
 
 class Channel(NamedTuple):
@@ -24,13 +26,13 @@ class Channel(NamedTuple):
 
     Attributes:
         id: within its bag.
-        topic: its name.
+        topic: name.
         type: of its messages, as `sensor_msgs/msg/LaserScan`.
         encoding: `ros1` or `cdr`.
-        n_messages: how many there are.
-        digest: of the type's definition, "" where the bag has none.
-        definition: of the type in words, "" where the bag has none.
-        latched: whether who listens late still gets the last message.
+        n_messages: number of messages.
+        digest: hash of the type definition, "" where the bag has none.
+        definition: text of the type definition, "" where the bag has none.
+        latched: late subscribers still get the last message.
     """
 
     id: int
@@ -44,7 +46,7 @@ class Channel(NamedTuple):
 
 
 class Message(NamedTuple):
-    """One message: where it belongs, when it was recorded, and its bytes."""
+    """One message: channel, log time in ns, content."""
 
     channel: Channel
     log_ns: int
@@ -52,12 +54,12 @@ class Message(NamedTuple):
 
 
 class Bag(Protocol):
-    """A bag that is open.
+    """An open bag.
 
     Attributes:
-        kind: for people.
-        channels: what is in it.
-        damage: what could not be read, by reason; numbers are byte positions.
+        kind: readable name.
+        channels: all channels.
+        damage: unreadable parts by reason and byte position.
     """
 
     kind: str
@@ -65,31 +67,16 @@ class Bag(Protocol):
     damage: SkippedRecords
 
     def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
-        """Messages on these topics, about in the order of their recording.
-
-        Args:
-            topics: their names.
-            since_ns: only those recorded then or later; None: all.
+        """Messages of these topics, roughly by log time; with `since_ns` no earlier ones.
 
         Raises:
-            DamagedError: what was taken for whole is not.
+            DamagedBagError: an indexed bag is damaged.
         """
         ...
 
     def close(self) -> None:
-        """Let the files go."""
+        """Close the files."""
         ...
-
-
-BAG1_MAGIC = b"#ROSBAG V"
-
-MCAP_MAGIC = b"\x89MCAP0\r\n"
-
-DB3_MAGIC = b"SQLite format 3\0"
-
-ENDINGS = (".bag", ".db3", ".mcap")
-
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
 def is_bag(path: Path, start: bytes | None) -> bool:
@@ -99,34 +86,33 @@ def is_bag(path: Path, start: bytes | None) -> bool:
     return start.startswith((BAG1_MAGIC, MCAP_MAGIC, DB3_MAGIC)) or is_compressed(path, start)
 
 
+def is_compressed(path: Path, start: bytes) -> bool:
+    """Whether a file of a ROS 2 folder is compressed as a whole."""
+    return path.name.endswith((".db3.zstd", ".mcap.zstd")) and start.startswith(ZSTD_MAGIC)
+
+
 def detect_kind(path: Path) -> tuple[BagKind, bool]:
-    """What kind of bag a path is, and whether MCAP files are in it."""
+    """The kind of a bag, and whether it stores messages as MCAP."""
     if path.is_dir():
         return "ros2", any(".mcap" in file.name for file in storage_files(path))
     with path.open("rb") as file:
         start = file.read(len(DB3_MAGIC))
     if start.startswith(BAG1_MAGIC):
         return "bag", False
-    return (
-        ("mcap", True) if ".mcap" in path.name or start.startswith(MCAP_MAGIC) else ("db3", False)
-    )
+    is_mcap = ".mcap" in path.name or start.startswith(MCAP_MAGIC)
+    return ("mcap", True) if is_mcap else ("db3", False)
 
 
 def storage_files(folder: Path) -> list[Path]:
-    """The files of a ROS 2 folder that hold messages, in their order."""
+    """The files of a ROS 2 folder that hold messages, in natural order."""
     try:
-        names = sorted(folder.iterdir(), key=_natural)
+        files = sorted(folder.iterdir(), key=_natural_order)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(folder)) from error
-    return [f for f in names if f.name.removesuffix(".zstd").endswith((".db3", ".mcap"))]
+    return [f for f in files if f.name.removesuffix(".zstd").endswith((".db3", ".mcap"))]
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """bag_2 before bag_10."""
+def _natural_order(path: Path) -> list[tuple[int, str]]:
+    """Sort key: bag_2 before bag_10."""
     digits = "".join(c if c.isdigit() else " " for c in path.name).split()
     return [(int(d[:18]), "") for d in digits] + [(0, path.name)]
-
-
-def is_compressed(path: Path, start: bytes) -> bool:
-    """Whether a file of a ROS 2 folder is packed as a whole."""
-    return path.name.endswith((".db3.zstd", ".mcap.zstd")) and start.startswith(ZSTD_MAGIC)

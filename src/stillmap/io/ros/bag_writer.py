@@ -1,4 +1,4 @@
-"""A new ROS bag of any kind, written message by message."""
+"""Writes a new ROS bag of any kind, message by message."""
 
 import shutil
 import sqlite3
@@ -18,81 +18,74 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from stillmap.core.errors import InputError
 from stillmap.core.files import atomic_file, atomic_folder
 from stillmap.io.ros.bag_types import BagKind, Channel
+from stillmap.io.ros.messages import load_typestore
 
-Send = Callable[[int, Any], None]
+Send = Callable[[int, Any], None]  # stamp in ns, message
+SendRaw = Callable[[int, bytes], None]
 
-# the oldest form that says what its messages are made of: ROS 2 before Jazzy reads no newer one
+# the oldest version that stores message definitions: ROS 2 before Jazzy reads no newer one
 _VERSION: Literal[8] = 8
-_SECONDS = {"bag": 1 << 32, "ros2": 1 << 31, "db3": 1 << 31, "mcap": 1 << 31}  # that stamps hold
-_EVER = QosTime(9223372036, 854775807)
-_TRANSIENT = Qos(
+_MAX_SECONDS = {"bag": 1 << 32, "ros2": 1 << 31, "db3": 1 << 31, "mcap": 1 << 31}  # of stamps
+_FOREVER = QosTime(9223372036, 854775807)
+_TRANSIENT_LOCAL = Qos(
     QosHistory.KEEP_LAST,
     1,
     QosReliability.RELIABLE,
     QosDurability.TRANSIENT_LOCAL,
-    _EVER,
-    _EVER,
+    _FOREVER,
+    _FOREVER,
     QosLiveliness.AUTOMATIC,
-    _EVER,
+    _FOREVER,
     False,
 )
 
 
 class BagWriter:
-    """A bag that is being written.
-
-    Args:
-        kind: what it is.
-        writer: of rosbags, open.
-    """
+    """An open bag of a kind, written through an open writer of rosbags."""
 
     def __init__(self, kind: BagKind, writer: rosbag1.Writer | rosbag2.Writer) -> None:
-        self._kind, self._writer = kind, writer
-        self._store = _store(kind)
+        self.is_ros1 = kind == "bag"
+        self._writer = writer
+        self._store = store = load_typestore("ros1" if self.is_ros1 else "cdr")
+        self._serialize = store.serialize_ros1 if self.is_ros1 else store.serialize_cdr
 
     def add_topic(self, name: str, type: str, *, latched: bool = False) -> Send:
-        """A new topic: a function that sends a message at a stamp in nanoseconds.
+        """Add a topic; returns a function that writes a message at a stamp in nanoseconds.
 
         Args:
             name: with its slash.
-            type: `sensor_msgs/msg/LaserScan`.
-            latched: whoever listens later still gets the last message.
+            type: as `sensor_msgs/msg/LaserScan`.
+            latched: late subscribers still get the last message.
         """
-        if isinstance(self._writer, rosbag1.Writer):
-            return self._topic1(self._writer, name, type, latched)
-        return self._topic2(self._writer, name, type, latched)
+        writer, serialize = self._writer, self._serialize
+        connection = self._add_connection(name, type, latched, typestore=self._store)
+        return lambda stamp, message: writer.write(connection, stamp, serialize(message, type))
 
-    def copy_topic(self, channel: Channel) -> Callable[[int, bytes], None] | None:
-        """A topic like one of another bag: a function that sends bytes at a time in nanoseconds.
+    def copy_topic(self, channel: Channel) -> SendRaw | None:
+        """Add a topic like one of another bag; returns a function that writes raw messages.
 
-        None where nobody knows what its messages are made of.
+        None where the definition of its type is not known.
         """
+        definition: dict[str, Any] = {"typestore": self._store}
         digest = channel.digest or _digest(channel)
-        if not (channel.definition and digest) and channel.type not in self._store.fielddefs:
+        if channel.definition and digest:
+            hash_name = "md5sum" if self.is_ros1 else "rihs01"
+            definition = {"msgdef": channel.definition, hash_name: digest}
+        elif channel.type not in self._store.fielddefs:
             return None
-        hashed = "md5sum" if isinstance(self._writer, rosbag1.Writer) else "rihs01"
-        about: dict[str, Any] = (
-            {"msgdef": channel.definition, hashed: digest}
-            if channel.definition and digest
-            else {"typestore": self._store}
-        )
-        if isinstance(self._writer, rosbag1.Writer):
-            about |= {"callerid": "/stillmap", "latching": int(channel.latched)}
-        else:
-            about |= {"offered_qos_profiles": [_TRANSIENT] if channel.latched else []}
-        connection = self._writer.add_connection(channel.topic, channel.type, **about)
         writer = self._writer
+        connection = self._add_connection(
+            channel.topic, channel.type, channel.latched, **definition
+        )
         return lambda stamp, raw: writer.write(connection, stamp, raw)
 
     def serialize(self, message: Any, type: str) -> bytes:
-        """A message as the bytes of this kind of bag."""
-        pack = self._store.serialize_ros1 if self.is_ros1 else self._store.serialize_cdr
-        return bytes(pack(message, type))
+        """The bytes of a message in this kind of bag."""
+        return bytes(self._serialize(message, type))
 
     def make(self, type: str, /, **fields: Any) -> Any:
         """A message or a part of one."""
@@ -105,39 +98,27 @@ class BagWriter:
 
     def header(self, stamp_ns: int, frame: str) -> Any:
         """The header of a message."""
-        numbered = {"seq": 0} if self._kind == "bag" else {}
+        seq = {"seq": 0} if self.is_ros1 else {}
         stamp = self.time(stamp_ns)
-        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **numbered)
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **seq)
 
-    @property
-    def is_ros1(self) -> bool:
-        return self._kind == "bag"
-
-    def _topic1(self, writer: rosbag1.Writer, name: str, type: str, latched: bool) -> Send:
-        connection = writer.add_connection(
-            name, type, typestore=self._store, callerid="/stillmap", latching=int(latched)
-        )
-        serialize = self._store.serialize_ros1
-        return lambda stamp, message: writer.write(connection, stamp, serialize(message, type))
-
-    def _topic2(self, writer: rosbag2.Writer, name: str, type: str, latched: bool) -> Send:
-        qos = [_TRANSIENT] if latched else []
-        connection = writer.add_connection(
-            name, type, typestore=self._store, offered_qos_profiles=qos
-        )
-        serialize = self._store.serialize_cdr
-        return lambda stamp, message: writer.write(connection, stamp, serialize(message, type))
+    def _add_connection(self, topic: str, type: str, latched: bool, **options: Any) -> Any:
+        if self.is_ros1:
+            options |= {"callerid": "/stillmap", "latching": int(latched)}
+        else:
+            options |= {"offered_qos_profiles": [_TRANSIENT_LOCAL] if latched else []}
+        return self._writer.add_connection(topic, type, **options)
 
 
 def _digest(channel: Channel) -> str:
-    """The hash of a ROS 2 type from its definition; "" where that cannot be understood."""
+    """The hash of a ROS 2 type from its definition; "" where that is missing or invalid."""
     if channel.encoding == "ros1" or not channel.definition:
         return ""
     store = get_typestore(Stores.EMPTY)
     try:
         store.register(get_types_from_msg(channel.definition, channel.type))
         return store.hash_rihs01(channel.type)
-    except Exception:  # whatever the library makes of a text that is no definition
+    except Exception:  # any error of rosbags about a text that is no definition
         return ""
 
 
@@ -145,13 +126,13 @@ def _digest(channel: Channel) -> str:
 def new_bag(
     path: Path, kind: BagKind, *, overwrite: bool = False, mcap: bool = False
 ) -> Iterator[BagWriter]:
-    """A bag that lies at `path` once the block ends without an exception.
+    """Write a bag, which lies at `path` once the block ends without an exception.
 
     Args:
         path: a file, or the folder of kind "ros2".
         kind: ROS 1 `bag`; `ros2`, a folder with `metadata.yaml`; its file alone: `db3` or `mcap`.
-        overwrite: replace the folder that is there; a file is replaced in any case.
-        mcap: the file in a folder of kind "ros2" is an MCAP file.
+        overwrite: replace an existing folder; a file is replaced in any case.
+        mcap: store messages of kind "ros2" as MCAP.
 
     Raises:
         InputError: it cannot be written.
@@ -162,61 +143,51 @@ def new_bag(
         else:
             work = stack.enter_context(atomic_file(path))
         if kind == "bag":
-            work.unlink(missing_ok=True)  # of one that was killed: the writer refuses what is there
-            with _told(path), rosbag1.Writer(work) as writer1:
+            work.unlink(missing_ok=True)  # left by a killed run: rosbags refuses existing files
+            with _sqlite_errors(path), rosbag1.Writer(work) as writer1:
                 yield BagWriter(kind, writer1)
             return
-        # a ROS 2 writer makes a folder of its own, and names its files after it
-        inside = stack.enter_context(_scratch(path))
+        # the ROS 2 writer of rosbags creates a folder, and names its files after it
+        scratch = stack.enter_context(_scratch_folder(path))
         mcap |= kind == "mcap"
         plugin = rosbag2.StoragePlugin.MCAP if mcap else rosbag2.StoragePlugin.SQLITE3
-        named = inside / (path.stem if kind != "ros2" else path.name)
-        writer2 = rosbag2.Writer(named, version=_VERSION, storage_plugin=plugin)
+        folder = scratch / (path.stem if kind != "ros2" else path.name)
+        writer2 = rosbag2.Writer(folder, version=_VERSION, storage_plugin=plugin)
         if mcap:
             compression = rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
             writer2.set_compression(*compression)
-        with _told(path), writer2:
+        with _sqlite_errors(path), writer2:
             yield BagWriter(kind, writer2)
         if kind == "ros2":
-            for file in named.iterdir():
+            for file in folder.iterdir():
                 shutil.move(file, work / file.name)
         else:
-            shutil.move(named / f"{named.name}.{kind}", work)
+            shutil.move(folder / f"{folder.name}.{kind}", work)
 
 
 def require_stamps(first_ns: int, last_ns: int, kind: BagKind) -> None:
-    """Refuses stamps that such a bag cannot hold.
+    """Refuse stamps that such a bag cannot hold.
 
     Raises:
         InputError: they are negative or too late.
     """
-    if first_ns < 0 or last_ns >= _SECONDS[kind] * 10**9:
+    if first_ns < 0 or last_ns >= _MAX_SECONDS[kind] * 10**9:
         raise InputError(
             f"stamps from {first_ns / 1e9:.0f} to {last_ns / 1e9:.0f} s do not fit into a ROS bag",
-            hint=f"0 to {_SECONDS[kind]} s",
+            hint=f"0 to {_MAX_SECONDS[kind]} s",
         )
 
 
-def _store(kind: BagKind) -> Typestore:
-    if kind != "bag":
-        return get_typestore(Stores.ROS2_HUMBLE)
-    store = get_typestore(Stores.ROS1_NOETIC)
-    # of the usual messages the one that rosbags does not have
-    text = "geometry_msgs/TransformStamped[] transforms\n"
-    store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
-    return store
-
-
 @contextmanager
-def _scratch(path: Path) -> Iterator[Path]:
-    """A folder beside `path`, on the same disk, gone at the end."""
+def _scratch_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder beside `path`, on the same disk."""
     where = path.absolute().parent
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=".part", dir=where) as name:
         yield Path(name)
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _sqlite_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except sqlite3.Error as error:  # a full disk

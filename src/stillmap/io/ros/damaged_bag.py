@@ -1,7 +1,7 @@
-"""Bags that are cut, damaged or without index: read from the front, as far as they go.
+"""Recovery of bags that are cut, damaged or without an index: read sequentially from the front.
 
-A chunk that cannot be unpacked is skipped and counted; where the records themselves no longer
-make sense, reading ends and what came before is kept.
+A chunk that cannot be decompressed is skipped and counted; at the first invalid record reading
+ends and everything before it is kept.
 """
 
 import dataclasses
@@ -10,6 +10,7 @@ import sqlite3
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
@@ -18,22 +19,25 @@ from rosbags.rosbag1.reader import Header, RecordType, normalize
 from rosbags.typesys.msg import normalize_msgtype
 
 from stillmap.io.builder import SkippedRecords
-from stillmap.io.ros import limits, sqlite_limits
+from stillmap.io.ros import limits
 from stillmap.io.ros.bag_types import MAX_STAMP_NS, Channel, Message
 
 CUT = "end that is no record"
-BAD_CHUNK = "chunk that cannot be unpacked"
+BAD_CHUNK = "chunk that cannot be decompressed"
 BAD_ROWS = "rows that cannot be read"
 
-_UNPACKED: dict[str, Callable[[bytes], bytes]] = {
+_DECOMPRESS: dict[str, Callable[[bytes], bytes]] = {
     "": bytes,
     "none": bytes,
     "bz2": limits.decompress_bz2,
     "lz4": limits.decompress_lz4,
     "zstd": limits.decompress_zstd,
 }
+_MCAP_SCHEMA, _MCAP_CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK = 0x03, 0x04, 0x05, 0x06
+_MCAP_MAGIC_BYTE = 0x89
 
-_Scan = Callable[[dict[int, Channel], SkippedRecords], Iterator[tuple[int, int, bytes]]]
+Records = Iterator[tuple[int, int, bytes]]  # channel id, log time in ns, content
+_Scan = Callable[[dict[int, Channel], SkippedRecords], Records]
 
 
 class _CutError(Exception):
@@ -42,7 +46,7 @@ class _CutError(Exception):
 
 @dataclasses.dataclass
 class DamagedBag:
-    """See `Bag`. `scan` yields channel id, log time and bytes, and enters channels it meets."""
+    """See `Bag`. `scan` yields records and enters the channels that it meets."""
 
     kind: str
     scan: _Scan
@@ -70,75 +74,69 @@ class DamagedBag:
 
 
 def open_bag1(path: Path) -> DamagedBag:
-    """What can be read of a ROS 1 bag."""
+    """Recover a ROS 1 bag."""
     return DamagedBag("ROS 1 bag", lambda found, damage: _scan_bag1(path, found, damage))
 
 
 def open_mcap(path: Path) -> DamagedBag:
-    """What can be read of an MCAP file."""
+    """Recover an MCAP file."""
     return DamagedBag("MCAP", lambda found, damage: _scan_mcap(path, found, damage))
 
 
 def open_db3(path: Path) -> DamagedBag:
-    """What can be read of a SQLite file."""
+    """Recover a SQLite file."""
     return DamagedBag("SQLite bag", lambda found, damage: _scan_db3(path, found, damage))
 
 
-def _scan_bag1(
-    path: Path, found: dict[int, Channel], damage: SkippedRecords
-) -> Iterator[tuple[int, int, bytes]]:
+def _scan_bag1(path: Path, found: dict[int, Channel], damage: SkippedRecords) -> Records:
     with path.open("rb") as file:
         file.readline(64)  # #ROSBAG V2.0
-        yield from _until_cut(file, damage, _bag1_records(file, found, damage, chunks=True))
+        yield from _until_cut(file, damage, _bag1_records(file, found, damage))
 
 
 def _bag1_records(
-    file: IO[bytes], found: dict[int, Channel], damage: SkippedRecords, *, chunks: bool
-) -> Iterator[tuple[int, int, bytes]]:
-    """Records of a file, or of a chunk: none of these are `chunks` again."""
+    file: IO[bytes], found: dict[int, Channel], damage: SkippedRecords, *, in_chunk: bool = False
+) -> Records:
+    """Records of a file, or of a decompressed chunk, which holds no further chunks."""
     end = _size(file)
     while file.tell() < end:
         at = file.tell()
-        limits.count_output(limits.RECORD)
+        limits.count_output(limits.RECORD_COST)
         header = Header.read(file)  # type: ignore[arg-type]
-        kind, size = header.get_uint8("op"), _number(file, 4)
-        if kind == RecordType.CHUNK and not chunks:
-            raise _CutError
-        # of a chunk that is cut the beginning can be unpacked
-        data = file.read(size) if kind == RecordType.CHUNK else _exactly(file, size, end)
+        kind, size = header.get_uint8("op"), _read_number(file, 4)
         if kind == RecordType.CHUNK:
-            try:
-                inner = BytesIO(_unpacked(header.get_string("compression"), data))
-            except limits.OutputLimitError:
-                raise
-            except Exception:  # whatever a library makes of damaged bytes
-                damage.add(BAD_CHUNK, at)
-                continue
-            records = _bag1_records(inner, found, damage, chunks=False)
-            yield from _until_cut(inner, damage, records, at)
-        elif kind == RecordType.CONNECTION:
+            if in_chunk:
+                raise _CutError
+            # the beginning of a cut chunk can be decompressed
+            read = partial(_bag1_chunk, header, file.read(size))
+            inner = _decompress_chunk(read, damage, at)
+            if inner is not None:
+                records = _bag1_records(inner, found, damage, in_chunk=True)
+                yield from _until_cut(inner, damage, records, at)
+            continue
+        data = _read_exactly(file, size, end)
+        if kind == RecordType.CONNECTION:
             channel = _bag1_channel(header, data)
             found.setdefault(channel.id, channel)
         elif kind == RecordType.MSGDATA:
             yield header.get_uint32("conn"), header.get_time("time"), data
 
 
+def _bag1_chunk(header: Header, data: bytes) -> tuple[str, bytes]:
+    return header.get_string("compression"), data
+
+
 def _bag1_channel(header: Header, data: bytes) -> Channel:
-    packed = BytesIO(struct.pack("<I", len(data)) + data)
-    more = Header.read(packed)
-    kind = normalize_msgtype(more.get_string("type"))
+    fields = Header.read(BytesIO(struct.pack("<I", len(data)) + data))
+    kind = normalize_msgtype(fields.get_string("type"))
     topic = normalize(header.get_string("topic"))
-    return Channel(header.get_uint32("conn"), topic, kind, "ros1", 0, more.get_string("md5sum"))
+    return Channel(header.get_uint32("conn"), topic, kind, "ros1", 0, fields.get_string("md5sum"))
 
 
-def _scan_mcap(
-    path: Path, found: dict[int, Channel], damage: SkippedRecords
-) -> Iterator[tuple[int, int, bytes]]:
-    schemas: dict[int, str] = {}
+def _scan_mcap(path: Path, found: dict[int, Channel], damage: SkippedRecords) -> Records:
     with path.open("rb") as file:
         file.read(8)  # magic
-        records = _mcap_records(file, schemas, found, damage, chunks=True)
-        yield from _until_cut(file, damage, records)
+        yield from _until_cut(file, damage, _mcap_records(file, {}, found, damage))
 
 
 def _mcap_records(
@@ -147,56 +145,66 @@ def _mcap_records(
     found: dict[int, Channel],
     damage: SkippedRecords,
     *,
-    chunks: bool,
-) -> Iterator[tuple[int, int, bytes]]:
+    in_chunk: bool = False,
+) -> Records:
     """See `_bag1_records`."""
     end = _size(file)
     while file.tell() < end:
         at = file.tell()
-        limits.count_output(limits.RECORD)
-        kind = _number(file, 1)
-        if kind == 0x89:  # the magic at the end
+        limits.count_output(limits.RECORD_COST)
+        kind = _read_number(file, 1)
+        if kind == _MCAP_MAGIC_BYTE:  # of the footer
             return
-        if kind == 0:
+        if kind == 0 or (kind == _MCAP_CHUNK and in_chunk):
             raise _CutError
-        size = min(_number(file, 8), end)
-        # of a chunk that is cut the beginning can be unpacked
-        data = file.read(size) if kind == 0x06 else _exactly(file, size, end)
+        size = min(_read_number(file, 8), end)
+        if kind == _MCAP_CHUNK:
+            # the beginning of a cut chunk can be decompressed
+            inner = _decompress_chunk(partial(_mcap_chunk, file.read(size)), damage, at)
+            if inner is not None:
+                records = _mcap_records(inner, schemas, found, damage, in_chunk=True)
+                yield from _until_cut(inner, damage, records, at)
+            continue
+        data = _read_exactly(file, size, end)
         record = BytesIO(data)
-        if kind == 0x03:
-            number = _number(record, 2)
-            schemas[number] = _text(record)
-        elif kind == 0x04:
-            number, schema = _number(record, 2), _number(record, 2)
-            topic, encoding = _text(record), _text(record)
+        if kind == _MCAP_SCHEMA:
+            number = _read_number(record, 2)
+            schemas[number] = _read_text(record)
+        elif kind == _MCAP_CHANNEL:
+            number, schema = _read_number(record, 2), _read_number(record, 2)
+            topic, encoding = _read_text(record), _read_text(record)
             name = schemas.get(schema, "")
             found.setdefault(number, Channel(number, topic, name, encoding, 0, ""))
-        elif kind == 0x05:
-            number, _, log_ns, _ = struct.unpack("<HIQQ", _exactly(record, 22, len(data)))
+        elif kind == _MCAP_MESSAGE:
+            number, _, log_ns, _ = struct.unpack("<HIQQ", _read_exactly(record, 22, len(data)))
             yield number, min(log_ns, MAX_STAMP_NS), data[22:]
-        elif kind == 0x06:
-            if not chunks:
-                raise _CutError
-            try:
-                record.seek(28)
-                packing = _text(record)
-                size = min(_number(record, 8), len(data))
-                inner = BytesIO(_unpacked(packing, record.read(size)))
-            except limits.OutputLimitError:
-                raise
-            except Exception:  # whatever a library makes of damaged bytes
-                damage.add(BAD_CHUNK, at)
-                continue
-            records = _mcap_records(inner, schemas, found, damage, chunks=False)
-            yield from _until_cut(inner, damage, records, at)
 
 
-def _scan_db3(
-    path: Path, found: dict[int, Channel], damage: SkippedRecords
-) -> Iterator[tuple[int, int, bytes]]:
+def _mcap_chunk(data: bytes) -> tuple[str, bytes]:
+    record = BytesIO(data)
+    record.seek(28)
+    compression = _read_text(record)
+    return compression, record.read(min(_read_number(record, 8), len(data)))
+
+
+def _decompress_chunk(
+    read: Callable[[], tuple[str, bytes]], damage: SkippedRecords, at: int
+) -> IO[bytes] | None:
+    """The records of a chunk of (compression, data); None, and counted, if it is damaged."""
+    try:
+        compression, data = read()
+        return BytesIO(_DECOMPRESS[compression](data))
+    except limits.OutputLimitError:
+        raise
+    except Exception:  # any error of a library about damaged bytes
+        damage.add(BAD_CHUNK, at)
+        return None
+
+
+def _scan_db3(path: Path, found: dict[int, Channel], damage: SkippedRecords) -> Records:
     rows = 0
     try:
-        with closing(sqlite_limits.open_database(path)) as database:
+        with closing(limits.open_database(path)) as database:
             for number, topic, kind, encoding in database.execute(
                 "SELECT id, name, type, serialization_format FROM topics"
             ):
@@ -213,22 +221,15 @@ def _scan_db3(
 
 
 def _until_cut(
-    file: IO[bytes],
-    damage: SkippedRecords,
-    records: Iterator[tuple[int, int, bytes]],
-    at: int | None = None,
-) -> Iterator[tuple[int, int, bytes]]:
-    """Records up to the first that makes no sense; `at` is where an outer chunk begins."""
+    file: IO[bytes], damage: SkippedRecords, records: Records, at: int | None = None
+) -> Records:
+    """Records up to the first invalid one; `at` is the position of the enclosing chunk."""
     try:
         yield from records
     except limits.OutputLimitError:
         raise
-    except Exception:  # whatever a library makes of damaged bytes
+    except Exception:  # any error of a library about damaged bytes
         damage.add(CUT, file.tell() if at is None else at)
-
-
-def _unpacked(packing: str, data: bytes) -> bytes:
-    return _UNPACKED[packing](data)
 
 
 def _size(file: IO[bytes]) -> int:
@@ -238,21 +239,21 @@ def _size(file: IO[bytes]) -> int:
     return end
 
 
-def _exactly(file: IO[bytes], size: int, end: int) -> bytes:
+def _read_exactly(file: IO[bytes], size: int, end: int) -> bytes:
     if size > end - file.tell():
         raise _CutError
     return file.read(size)
 
 
-def _number(file: IO[bytes], size: int) -> int:
+def _read_number(file: IO[bytes], size: int) -> int:
     data = file.read(size)
     if len(data) != size:
         raise _CutError
     return int.from_bytes(data, "little")
 
 
-def _text(file: IO[Any]) -> str:
-    size = _number(file, 4)
+def _read_text(file: IO[Any]) -> str:
+    size = _read_number(file, 4)
     data: bytes = file.read(size)
     if len(data) != size:
         raise _CutError

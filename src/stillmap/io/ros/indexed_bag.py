@@ -1,39 +1,33 @@
-"""Bags that are whole, read by the library with their index."""
+"""Undamaged bags, read by rosbags with their index."""
 
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import (
-    ConnectionExtRosbag2,
-    MessageDefinitionFormat,
-    Qos,
-    QosDurability,
-)
+from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinitionFormat, Qos, QosDurability
 from rosbags.rosbag1 import reader as rosbag1
 from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 from rosbags.rosbag2.metadata import parse_qos
 
 from stillmap.core.errors import InputError
 from stillmap.io.builder import SkippedRecords
-from stillmap.io.ros import limits, sqlite_limits
+from stillmap.io.ros import limits
 from stillmap.io.ros.bag_types import MAX_STAMP_NS, Channel, DamagedBagError, Message
 
-# the library unpacks whatever comes; its table is where it can be told to stop
+# rosbags decompresses without a limit; its table is where one can be set
 storage_mcap.DECOMPRESSORS["lz4"] = lambda data, _: limits.decompress_lz4(data)
 storage_mcap.DECOMPRESSORS["zstd"] = lambda data, _: limits.decompress_zstd(data)
 
-_MAX_PROFILES = 16 << 10  # bytes of YAML about how a topic was sent
+_MAX_QOS_TEXT = 16 << 10  # bytes of YAML: a megabyte takes rosbags half a minute
 
 
-def _profiles(said: Any) -> list[Qos]:
-    return [] if isinstance(said, str) and len(said) > _MAX_PROFILES else parse_qos(said)
+def _parse_qos(text: Any) -> list[Qos]:
+    return [] if isinstance(text, str) and len(text) > _MAX_QOS_TEXT else parse_qos(text)
 
 
-# a megabyte of YAML takes the library half a minute
 for _module in (storage_mcap, storage_sqlite3):
-    vars(_module).update(parse_qos=_profiles)
+    vars(_module).update(parse_qos=_parse_qos)
 
 _BOUNDED = {
     rosbag1.decompressors["bz2"]: limits.decompress_bz2,
@@ -42,7 +36,7 @@ _BOUNDED = {
 
 
 class _Bag1Reader(rosbag1.Reader):
-    """The library's, with limits on what is unpacked, and on an index that repeats itself."""
+    """The reader of rosbags with limits on decompression and on an index that repeats itself."""
 
     def open(self) -> None:
         self._index_left = self.path.stat().st_size
@@ -58,8 +52,8 @@ class _Bag1Reader(rosbag1.Reader):
 
     def read_chunk(self) -> rosbag1.Chunk:
         chunk = super().read_chunk()
-        unpacked = _BOUNDED.get(chunk.decompressor, chunk.decompressor)
-        return chunk._replace(decompressor=unpacked)
+        decompress = _BOUNDED.get(chunk.decompressor, chunk.decompressor)
+        return chunk._replace(decompressor=decompress)
 
 
 @dataclasses.dataclass
@@ -76,11 +70,11 @@ class IndexedBag:
 
     def messages(self, topics: set[str], since_ns: int | None = None) -> Iterator[Message]:
         """See `Bag`."""
-        chosen = [c for c in self.reader.connections if c.topic in topics]
-        if not chosen:
+        connections = [c for c in self.reader.connections if c.topic in topics]
+        if not connections:
             return
         channels = {c.id: c for c in self.channels}
-        source = self.reader.messages(chosen, start=since_ns)
+        source = self.reader.messages(connections, start=since_ns)
         while True:
             try:
                 connection, log_ns, raw = next(source)
@@ -88,9 +82,9 @@ class IndexedBag:
                 return
             except InputError:
                 raise
-            except Exception as error:  # whatever the library makes of damaged bytes
+            except Exception as error:  # any error of rosbags about damaged bytes
                 raise DamagedBagError(str(error) or type(error).__name__) from error
-            # a column of SQLite holds anything
+            # SQLite columns are not typed
             if not (isinstance(log_ns, int) and log_ns <= MAX_STAMP_NS and isinstance(raw, bytes)):
                 raise DamagedBagError("a message without time or content")
             yield Message(channels[connection.id], log_ns, raw)
@@ -101,24 +95,24 @@ class IndexedBag:
 
 
 def open_bag1(path: Path) -> IndexedBag:
-    """A ROS 1 bag with its index. Raises whatever the library says of one that is damaged."""
+    """Open a ROS 1 bag. Any error of rosbags means damage; likewise below."""
     reader = _Bag1Reader(path)
     reader.open()
     return IndexedBag("ROS 1 bag", reader)
 
 
 def open_mcap(path: Path) -> IndexedBag:
-    """An MCAP file of ROS 2. Raises whatever the library says of one that is damaged."""
+    """Open an MCAP file of ROS 2."""
     reader = storage_mcap.McapReader(path)
     reader.open()
     return IndexedBag("MCAP", reader)
 
 
 def open_db3(path: Path) -> IndexedBag:
-    """A SQLite file of ROS 2. Raises whatever the library says of one that is damaged."""
-    # the library makes an address of the path
-    reader = storage_sqlite3.Sqlite3Reader(Path(sqlite_limits.database_uri(path)))
-    with sqlite_limits.limit_databases(path):
+    """Open a SQLite file of ROS 2."""
+    # rosbags builds a URI from the path without quoting it
+    reader = storage_sqlite3.Sqlite3Reader(Path(limits.database_path(path)))
+    with limits.limit_databases(path):
         reader.open()
     return IndexedBag("SQLite bag", reader)
 
@@ -132,10 +126,10 @@ def _channel(connection: Any) -> Channel:
         )
     else:
         encoding, latched = "ros1", bool(ext.latching)
-    in_words = connection.msgdef.format == MessageDefinitionFormat.MSG
-    words = connection.topic, connection.msgtype, encoding, connection.digest
-    if not all(isinstance(word, str) for word in words):
+    names = connection.topic, connection.msgtype, encoding, connection.digest
+    if not all(isinstance(name, str) for name in names):
         raise DamagedBagError("a topic whose name or type is no text")
+    is_text = connection.msgdef.format == MessageDefinitionFormat.MSG
     return Channel(
         connection.id,
         connection.topic,
@@ -143,6 +137,6 @@ def _channel(connection: Any) -> Channel:
         encoding,
         connection.msgcount,
         connection.digest,
-        connection.msgdef.data if in_words else "",
+        connection.msgdef.data if is_text else "",
         latched,
     )

@@ -1,12 +1,22 @@
-"""Unpacking that stops at a limit: a few bytes may claim to be terabytes."""
+"""Limits on what a bag may expand to: a few bytes can claim to be terabytes.
+
+Decompression stops at `MAX_CHUNK`, the output of a whole bag at a multiple of its size. A SQLite
+file can hold views that never end, generated columns, and trees in which one page occurs a million
+times: its tables have to be plain tables, and the steps that a query may take are bounded.
+"""
 
 import bz2
+import os
+import sqlite3
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from pathlib import Path
 from typing import IO, Any
+from urllib.parse import quote
 
+import apsw
 import lz4.frame  # type: ignore[import-untyped]
 
 from stillmap.core.errors import InputError
@@ -17,89 +27,154 @@ else:
     from backports import zstd
 
 MAX_CHUNK = 256 << 20  # bytes of one chunk or message; recorders write chunks of about one megabyte
-
+RECORD_COST = 64  # bytes that a record counts for, even an empty one
 ZstdError = zstd.ZstdError
 
-_MAX_GROWTH, _SURELY_FINE = 300, 512 << 20  # of a bag: times its size, bytes
-RECORD = 64  # bytes that a record counts for, though nothing be in it
+_MAX_RATIO, _MIN_LIMIT = 300, 512 << 20  # output of a bag: times its size; bytes
+
+_TABLES = ("topics", "messages", "schema", "message_definitions")
+_STEP_INTERVAL = 1000  # virtual machine steps between two calls of the progress handler
+_STEPS_PER_BYTE = 30  # a row takes about 20 steps, and has at least as many bytes
+_MIN_STEPS = 1_000_000  # a hundredth of a second
 
 
 class OutputLimitError(InputError):
-    """More comes out of a file than can have been put in."""
+    """More data comes out of a file than can have been put in."""
 
 
-class _Left:
-    """How many bytes may still come out."""
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-
-
-_left: ContextVar[_Left | None] = ContextVar("left", default=None)
+_bytes_left: ContextVar[list[int] | None] = ContextVar("bytes_left", default=None)
 
 
 @contextmanager
 def limit_output(size: int) -> Iterator[None]:
-    """While this lasts, a bag of `size` bytes gives no more than a bag of that size can hold.
+    """Within this context a bag of `size` bytes yields no more than such a bag can hold.
 
-    Its index may name one message a million times, and parts that are small each may be many.
+    Its index may name one message a million times, and many small parts add up.
     """
-    token = _left.set(_Left(max(_MAX_GROWTH * size, _SURELY_FINE)))
+    token = _bytes_left.set([max(_MAX_RATIO * size, _MIN_LIMIT)])
     try:
         yield
     finally:
-        _left.reset(token)
+        _bytes_left.reset(token)
 
 
 def count_output(count: int) -> None:
-    """Says that so many bytes came out.
+    """Count bytes of output.
 
     Raises:
-        TooMuchError: that is more than there can be.
+        OutputLimitError: the limit is exceeded.
     """
-    left = _left.get()
+    left = _bytes_left.get()
     if left is None:
         return
-    left.count -= count
-    if left.count < 0:
-        raise OutputLimitError(
-            f"is damaged: more than {_MAX_GROWTH} times its size comes out of it"
-        )
+    left[0] -= count
+    if left[0] < 0:
+        raise OutputLimitError(f"is damaged: it expands to more than {_MAX_RATIO} times its size")
 
 
 def decompress_bz2(data: bytes) -> bytes:
-    """The content of a bz2 stream; see `_bounded` for errors."""
-    return _bounded(bz2.BZ2Decompressor().decompress, data)
+    """Decompress a bz2 stream; errors as of `_decompress`."""
+    return _decompress(bz2.BZ2Decompressor().decompress, data)
 
 
 def decompress_lz4(data: bytes) -> bytes:
-    """The content of a lz4 frame; see `_bounded` for errors."""
-    return _bounded(lz4.frame.LZ4FrameDecompressor().decompress, data)
+    """Decompress a lz4 frame; errors as of `_decompress`."""
+    return _decompress(lz4.frame.LZ4FrameDecompressor().decompress, data)
 
 
 def decompress_zstd(data: bytes) -> bytes:
-    """The content of a zstd frame; see `_bounded` for errors."""
-    return _bounded(zstd.ZstdDecompressor().decompress, data)
+    """Decompress a zstd frame; errors as of `_decompress`."""
+    return _decompress(zstd.ZstdDecompressor().decompress, data)
 
 
-def open_zstd(packed: IO[bytes]) -> Any:
-    """The content of a file of zstd frames, to be read piece by piece; a context manager."""
-    return zstd.open(packed, "rb")
+def open_zstd(compressed: IO[bytes]) -> Any:
+    """A readable stream over a file of zstd frames; a context manager."""
+    return zstd.open(compressed, "rb")
 
 
-def _bounded(decompress: Callable[..., Any], data: bytes) -> bytes:
-    """What `decompress` gives, up to `LIMIT` bytes.
+def _decompress(decompress: Callable[..., Any], data: bytes) -> bytes:
+    """Decompress up to `MAX_CHUNK` bytes.
 
     Raises:
-        InputError: there is more.
-        Exception: whatever the library says of damaged data.
+        InputError: there are more.
+        Exception: any error of the library about damaged data.
     """
     count_output(0)
     out = bytes(decompress(data, MAX_CHUNK + 1))
     count_output(len(out))
     if len(out) > MAX_CHUNK:
         raise InputError(
-            f"a packed part is larger than {MAX_CHUNK >> 20} MiB",
-            hint="a recording packed in smaller chunks can be read",
+            f"a compressed part is larger than {MAX_CHUNK >> 20} MiB",
+            hint="a recording compressed in smaller chunks can be read",
         )
     return out
+
+
+def database_path(path: Path) -> str:
+    """The path quoted for a SQLite URI, in which ?, # and % have a meaning."""
+    return quote(os.fsencode(path.resolve()))
+
+
+def open_database(path: Path) -> sqlite3.Connection:
+    """Open a SQLite file for reading, with checked tables and bounded queries.
+
+    Raises:
+        sqlite3.Error: it cannot be read.
+        InputError: see `_require_plain_tables`.
+    """
+    database = sqlite3.connect(f"file:{database_path(path)}?immutable=1&mode=ro", uri=True)
+    try:
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK)
+        database.set_progress_handler(_step_counter(path), _STEP_INTERVAL)
+        _require_plain_tables(database)
+    except BaseException:
+        database.close()
+        raise
+    return database
+
+
+@contextmanager
+def limit_databases(path: Path) -> Iterator[None]:
+    """Apply the limits of `open_database` to databases that rosbags opens in this context.
+
+    Raises:
+        sqlite3.Error, InputError: see `open_database`.
+    """
+    open_database(path).close()
+
+    def limit(database: apsw.Connection) -> None:
+        database.limit(apsw.SQLITE_LIMIT_LENGTH, MAX_CHUNK)
+        database.set_progress_handler(_step_counter(path), _STEP_INTERVAL)
+
+    apsw.connection_hooks.append(limit)
+    try:
+        yield
+    finally:
+        apsw.connection_hooks.remove(limit)
+
+
+def _step_counter(path: Path) -> Callable[[], bool]:
+    """A progress handler that returns True, which aborts the query, after too many steps."""
+    left = _MIN_STEPS + _STEPS_PER_BYTE * path.stat().st_size
+
+    def exceeded() -> bool:
+        nonlocal left
+        left -= _STEP_INTERVAL
+        return left < 0
+
+    return exceeded
+
+
+def _require_plain_tables(database: sqlite3.Connection) -> None:
+    """Refuse views, virtual tables and generated columns.
+
+    Raises:
+        InputError: there is one.
+    """
+    for table in _TABLES:
+        query = "SELECT type, sql FROM sqlite_master WHERE name = ? COLLATE NOCASE"
+        for kind, sql in database.execute(query, (table,)).fetchall():
+            plain = kind == "table" and str(sql).upper().startswith("CREATE TABLE")
+            columns = database.execute(f"PRAGMA table_xinfo({table})").fetchall() if plain else []
+            if not plain or any(column[-1] for column in columns):
+                raise InputError(f"is no bag: its {table} are no plain table")

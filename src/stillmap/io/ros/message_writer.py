@@ -1,4 +1,4 @@
-"""ROS messages from arrays."""
+"""Builds ROS messages from arrays."""
 
 from typing import Any
 
@@ -7,13 +7,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stillmap.io.ros.bag_writer import BagWriter
+from stillmap.io.ros.messages import LASER_SCAN, ODOMETRY, POINT_CLOUD, TF
 
 BASE, ODOM, MAP = "base_link", "odom", "map"
 
-SCAN = "sensor_msgs/msg/LaserScan"
-POINTS = "sensor_msgs/msg/PointCloud2"
-ODOMETRY = "nav_msgs/msg/Odometry"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
 PATH = "nav_msgs/msg/Path"
 GRID = "nav_msgs/msg/OccupancyGrid"
 MARKERS = "visualization_msgs/msg/MarkerArray"
@@ -27,24 +24,24 @@ def make_laser_scan(
     stamp_ns: int,
     frame: str,
     ranges: NDArray[np.float32],
-    fan: tuple[float, float],
+    angles: tuple[float, float],
     time_increment: float,
     range_max: float,
 ) -> Any:
     """A LaserScan.
 
     Args:
-        bag: where it will go.
-        stamp_ns: when its first beam was taken.
+        bag: whose message types are used.
+        stamp_ns: time of the first beam.
         frame: of the laser.
-        ranges: (n,) metres, +inf where nothing came back, NaN where unusable (REP 117).
-        fan: first angle and step in radians, counterclockwise.
-        time_increment: seconds from beam to beam, 0 where all count as taken at once.
+        ranges: (n,) metres, +inf for no return, NaN for unusable (REP 117).
+        angles: first angle and step in radians, counterclockwise.
+        time_increment: seconds from beam to beam, 0 for none.
         range_max: metres, above all finite ranges.
     """
-    start, step = fan
+    start, step = angles
     return bag.make(
-        SCAN,
+        LASER_SCAN,
         header=bag.header(stamp_ns, frame),
         angle_min=start,
         angle_max=start + step * max(len(ranges) - 1, 0),
@@ -65,8 +62,8 @@ def make_point_cloud(
     points: NDArray[np.float32],
     times: NDArray[np.float32] | None,
 ) -> Any:
-    """A PointCloud2 of points (n, 3) in metres, with `t`, seconds after the stamp, if times (n,)
-    are given."""
+    """A PointCloud2 of points (n, 3) in metres, with field `t` where times (n,), in seconds after
+    the stamp, are given."""
     columns = points if times is None else np.column_stack([points, times])
     names = "xyz" if times is None else "xyzt"
     fields = [
@@ -75,7 +72,7 @@ def make_point_cloud(
     ]
     data = np.ascontiguousarray(columns, "<f4").view(np.uint8).ravel()
     return bag.make(
-        POINTS,
+        POINT_CLOUD,
         header=bag.header(stamp_ns, frame),
         height=1,
         width=len(points),
@@ -89,11 +86,11 @@ def make_point_cloud(
 
 
 def make_transforms(
-    bag: BagWriter, stamp_ns: int, placed: list[tuple[str, str, NDArray[np.float64]]]
+    bag: BagWriter, stamp_ns: int, poses: list[tuple[str, str, NDArray[np.float64]]]
 ) -> Any:
-    """A TFMessage of parent, child and T_parent_child (D+1, D+1)."""
+    """A TFMessage of transforms (parent, child, T_parent_child (D+1, D+1))."""
     return bag.make(
-        TRANSFORMS,
+        TF,
         transforms=[
             bag.make(
                 "geometry_msgs/msg/TransformStamped",
@@ -101,15 +98,15 @@ def make_transforms(
                 child_frame_id=child,
                 transform=_transform(bag, T),
             )
-            for parent, child, T in placed
+            for parent, child, T in poses
         ],
     )
 
 
 def make_odometry(bag: BagWriter, stamp_ns: int, T_odom_base: NDArray[np.float64]) -> Any:
-    """An Odometry message: a pose; nothing is said of speed and errors."""
+    """An Odometry message with the pose alone: velocities and covariances are 0."""
     zero = bag.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    still = bag.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+    twist = bag.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
     unknown = np.zeros(36)
     return bag.make(
         ODOMETRY,
@@ -120,7 +117,7 @@ def make_odometry(bag: BagWriter, stamp_ns: int, T_odom_base: NDArray[np.float64
             pose=make_pose(bag, T_odom_base),
             covariance=unknown,
         ),
-        twist=bag.make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=unknown),
+        twist=bag.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=unknown),
     )
 
 

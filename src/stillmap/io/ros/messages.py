@@ -1,7 +1,6 @@
-"""Messages from their bytes, by definitions of our own.
+"""Message types that are read, and decoding of their bytes.
 
-A bag brings definitions of its types; here they only have to agree with the known ones, for what a
-file says is never made into code.
+Definitions in a bag are only compared with the known ones, never turned into code.
 """
 
 from functools import cache
@@ -27,15 +26,20 @@ def decode(message: Message) -> Any:
     """The message as an object of its type.
 
     Raises:
-        Exception: whatever the library says of bytes that are no such message.
+        Exception: any error of rosbags about bytes that are no such message.
     """
-    channel, raw = message.channel, message.raw
+    channel = message.channel
     store = load_typestore(channel.encoding)
     if channel.encoding == "ros1":
-        return store.deserialize_ros1(raw, channel.type)
-    if raw.startswith(ZSTD_MAGIC):  # packed one by one; others begin with a zero byte
-        raw = decompress_zstd(raw)
-    return store.deserialize_cdr(raw, channel.type)
+        return store.deserialize_ros1(message.raw, channel.type)
+    return store.deserialize_cdr(decompress(message), channel.type)
+
+
+def decompress(message: Message) -> bytes:
+    """The content of a message, which ROS 2 may have compressed one by one."""
+    # a CDR message begins with a zero byte
+    compressed = message.channel.encoding != "ros1" and message.raw.startswith(ZSTD_MAGIC)
+    return decompress_zstd(message.raw) if compressed else message.raw
 
 
 def find_fault(channel: Channel) -> str | None:
@@ -51,11 +55,11 @@ def find_fault(channel: Channel) -> str | None:
 
 @cache
 def load_typestore(encoding: str) -> Typestore:
-    """The definitions of messages, by `ros1` or `cdr`."""
+    """The message definitions of an encoding, `ros1` or `cdr`."""
     if encoding != "ros1":
         return get_typestore(Stores.ROS2_HUMBLE)
     store = get_typestore(Stores.ROS1_NOETIC)
-    for name in (TF, ROS1_TF):
+    for name in (TF, ROS1_TF):  # missing in the store
         store.register(get_types_from_msg(_TF_DEFINITION, name))
     return store
 
@@ -72,5 +76,5 @@ def stamp_ns(header: Any) -> int:
 
 
 def frame_name(name: Any) -> str:
-    """A frame's name without the slash that old recordings write before it."""
+    """A frame without the leading slash of old recordings."""
     return str(name).removeprefix("/")

@@ -147,7 +147,7 @@ class _BeamConverter:
         self._scans, self._rule, self._mirror = scans, rule, mirror
         self._usual = scans.typical_shape.n
         # which beams meet the robot is known of scans as most are
-        self._other = dataclasses.replace(rule, own_body=())
+        self._other = dataclasses.replace(rule, self_filter=())
         self.steps = _time_steps(scans)
         self._shape = -1
         self._directions = np.empty((0, 2), np.float32)

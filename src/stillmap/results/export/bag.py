@@ -12,6 +12,7 @@ from stillmap.io.ros import message_writer
 from stillmap.io.ros.bag_types import BagKind
 from stillmap.io.ros.bag_writer import BagWriter, new_bag, require_stamps
 from stillmap.io.ros.message_writer import BASE, MAP
+from stillmap.io.ros.messages import LASER_SCAN, TF
 from stillmap.io.ros.recording_writer import LaserScanEncoder, number_names, write_sensor_frames
 from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
 from stillmap.results.reader import Exported, Track
@@ -41,9 +42,9 @@ def write(result: Exported, path: Path, kind: BagKind, *, overwrite: bool = Fals
         frames = write_sensor_frames(bag, recording)
         _show_whole(bag, result)
         names = [f"/{name}" for name in number_names("scan", len(frames))]
-        static = [bag.add_topic(name, message_writer.SCAN) for name in names]
-        dynamic = [bag.add_topic(f"{name}_dynamic", message_writer.SCAN) for name in names]
-        send_tf = bag.add_topic("/tf", message_writer.TRANSFORMS)
+        static = [bag.add_topic(name, LASER_SCAN) for name in names]
+        dynamic = [bag.add_topic(f"{name}_dynamic", LASER_SCAN) for name in names]
+        send_tf = bag.add_topic("/tf", TF)
         show_objects = _shown_objects(bag, result)
         for t in recording.iter_scans(range(recording.n_scans), result.p_static):
             stamp = stamps[t]
