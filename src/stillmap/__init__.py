@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from stillmap.core.recording import Recording
     from stillmap.io import read
     from stillmap.mesh.build import Models
-    from stillmap.pipeline.em_loop import Iteration, iterate
-    from stillmap.pipeline.models import models_of
+    from stillmap.pipeline.em_loop import iterate
+    from stillmap.pipeline.estimate import Iteration
+    from stillmap.pipeline.models import build_models
     from stillmap.pipeline.options import Options
     from stillmap.pipeline.result import Result, build
 
@@ -30,15 +31,15 @@ __all__ = [
     "Result",
     "__version__",
     "build",
+    "build_models",
     "iterate",
-    "models_of",
     "read",
 ]
 
 # loaded when they are first used: `stillmap --help` has no use for them, and they take long
 _MODULES = {
     "InputError": "core.errors",
-    "Iteration": "pipeline.em_loop",
+    "Iteration": "pipeline.estimate",
     "Models": "mesh.build",
     "Options": "pipeline.options",
     "Recording": "core.recording",

@@ -26,6 +26,7 @@ from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results import reader as result_reader
+from stillmap.results.labels import read_labels
 from stillmap.results.reader import read_tracks
 from stillmap.sim import load_truth
 
@@ -198,7 +199,7 @@ def _result(data: bytes, folder: Path) -> None:
     for reader in (
         lambda: arguments.found(place, None).read_options,
         lambda: arguments.found(place, str(place)).read(),
-        lambda: readers.read_labels(place),
+        lambda: read_labels(place),
         lambda: result_reader.read_grid(place),
         lambda: read_tracks(place / "objects.json"),
         lambda: readers.read_truth(place).static_hits(),

@@ -11,7 +11,8 @@ from stillmap import io as recordings
 from stillmap.core import se2
 from stillmap.core.arrays import write_npz
 from stillmap.io.trajectory import write_tum
-from stillmap.results.points import write_beams, write_clouds
+from stillmap.results.labels import write_labels
+from stillmap.results.points import write_clouds
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # for what the tests share
 
@@ -20,12 +21,6 @@ from made_up_models import triangle_glb
 SCANS = 6
 STAMPS = 1_700_000_000_000_000_000 + 500_000_000 * np.arange(SCANS)
 
-
-class _Labelled:
-    """What the writers of beams ask for."""
-
-    def __init__(self, recording, p_static):
-        self.recording, self.p_static = recording, p_static
 
 
 @pytest.fixture
@@ -75,7 +70,7 @@ def result_of(tmp_path):
 
 def _written(out, recording, poses, p_static, log):
     write_tum(out / "trajectory.tum", recording.stamp_ns, poses)
-    write_beams(out / "beams", _Labelled(recording, p_static))
+    write_labels(out / "beams", recording, p_static)
     if recording.dimension == 3:
         write_clouds(out, recording, poses, p_static)
     p_occupied = np.full((60, 80), np.nan, np.float32)

@@ -25,7 +25,7 @@ from types import CodeType, FrameType
 from typing import IO, TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from stillmap.pipeline.em_loop import Progress
+    from stillmap.core.profiling import Progress
 
 
 _STYLES = {"error": "1;31", "warning": "33"}  # bold red, yellow
@@ -83,9 +83,9 @@ def _write(line: str) -> None:
 def shown_progress(quiet: bool, iterations: int) -> "Iterator[Progress]":
     """A Progress that shows step, iteration, scans, rate and time left."""
     if quiet or sys.stderr is None:  # None: it was closed before we began
-        from stillmap.pipeline.em_loop import silent
+        from stillmap.core.profiling import no_progress
 
-        yield silent
+        yield no_progress
     elif is_terminal(sys.stderr):
         with _bar(iterations) as progress:
             yield progress

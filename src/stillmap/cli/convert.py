@@ -11,23 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap import slam
-from stillmap.cli.arguments import (
-    Mapped,
-    add_read_flags,
-    found,
-    is_deskewed,
-    is_result,
-    parents_made,
-    read_changes,
-    require_apart,
-)
+from stillmap.cli.arguments import add_read_flags, parents_made, read_changes, require_apart
 from stillmap.cli.console import say, shown_share
 from stillmap.cli.parser import COMMANDS
 from stillmap.core import config
 from stillmap.core.errors import InputError
 from stillmap.core.files import require_new_file
 from stillmap.core.recording import Recording
-from stillmap.eval.readers import read_colours
 from stillmap.io import read, writers
 from stillmap.io.registry import detect_format
 from stillmap.io.ros.bag_types import BagKind
@@ -35,6 +25,8 @@ from stillmap.io.trajectory import poses_from_tum
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.results import reader
 from stillmap.results.export import bag, obj, parquet, point_cloud, point_cloud_files
+from stillmap.results.folder import ResultFolder, is_deskewed, is_result, open_result
+from stillmap.results.labels import read_colors
 from stillmap.results.rig import FOLDER as TILTING
 
 # stillmap.recording.writers has them too, and takes long to load
@@ -91,8 +83,6 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: it cannot be read, or FILE cannot hold it.
     """
-    pass  # DROPPED  # takes long to load
-
     lost, what = converted(args)
     if not args.quiet:
         for sentence in lost:
@@ -141,7 +131,7 @@ def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tup
     if read_changes(args):
         text = "a result's recording is read as it was when it was mapped: no flags for reading it"
         raise InputError(text, where=str(folder))
-    mapped = found(folder, args.recording)
+    mapped = open_result(folder, args.recording)
     require_apart(output, mapped.source, folder)
     if (form := point_cloud_files.format_for(output, args.to)) is not None:
         return [], _convert_to_cloud(args, mapped, output, form)
@@ -172,7 +162,7 @@ def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tup
     return lost, f"{exported.recording.n_scans} scans, map, way and {len(exported.tracks)} objects"
 
 
-def _convert_to_obj(args: argparse.Namespace, mapped: Mapped, output: Path) -> str:
+def _convert_to_obj(args: argparse.Namespace, mapped: ResultFolder, output: Path) -> str:
     faces, pages = obj.write_obj(
         mapped.folder, output, mapped.texture_options.quality, args.overwrite
     )
@@ -184,7 +174,7 @@ def _clouds() -> str:
 
 
 def _convert_to_cloud(
-    args: argparse.Namespace, mapped: Mapped, output: Path, form: point_cloud_files.Format
+    args: argparse.Namespace, mapped: ResultFolder, output: Path, form: point_cloud_files.Format
 ) -> str:
     require_new_file(output, args.overwrite)
     point_cloud_files.require_extras(form, output)
@@ -197,7 +187,7 @@ def _convert_to_cloud(
     return f"{points.count} points as {form.about}"
 
 
-def _cloud_of(args: argparse.Namespace, mapped: Mapped, output: Path) -> point_cloud.Cloud:
+def _cloud_of(args: argparse.Namespace, mapped: ResultFolder, output: Path) -> point_cloud.Cloud:
     with shown_share(args.quiet, "reading") as tell:
         recording, labels = mapped.read(tell, output.absolute().parent)
     if recording.dimension != 3:
@@ -208,16 +198,16 @@ def _cloud_of(args: argparse.Namespace, mapped: Mapped, output: Path) -> point_c
         )
     poses = poses_from_tum(mapped.folder / "trajectory.tum", recording)
     seen = _seen(mapped, recording, poses)
-    colours = read_colours(mapped.folder, recording.n_beams)
+    colours = read_colors(mapped.folder, recording.n_beams)
     return point_cloud.cloud_of(recording, seen, poses, labels.p_static, args.only, colours)
 
 
-def _exported(mapped: Mapped) -> reader.Exported:
+def _exported(mapped: ResultFolder) -> reader.Exported:
     recording, labels = mapped.read()
     return reader.read(mapped.folder, recording, labels.p_static)
 
 
-def _seen(mapped: Mapped, recording: Recording, poses: NDArray[np.float64]) -> Recording:
+def _seen(mapped: ResultFolder, recording: Recording, poses: NDArray[np.float64]) -> Recording:
     """The recording without the motion during its scans, as it was mapped."""
     how = slam.SlamOptions(deskew=is_deskewed(mapped.record))
     return slam.deskew_recording(recording, poses, how)

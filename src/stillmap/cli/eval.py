@@ -18,9 +18,10 @@ from stillmap.core.errors import InputError
 from stillmap.eval import readers, trajectory
 from stillmap.eval.labels import LabelScores, label_scores
 from stillmap.eval.map import MapScores, map_scores, wall_cells_of_hits, wall_cells_of_map
-from stillmap.eval.readers import Truth, read_labels, read_truth, require_same_beams
+from stillmap.eval.readers import Truth, read_truth, require_same_beams
 from stillmap.eval.relations import RelationErrors, relation_errors
 from stillmap.eval.trajectory import paired
+from stillmap.results.labels import read_labels
 from stillmap.results.reader import read_grid, require_there
 
 Float = NDArray[np.float64]

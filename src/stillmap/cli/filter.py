@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.cli.arguments import Mapped, found, parents_made, require_apart
+from stillmap.cli.arguments import parents_made, require_apart
 from stillmap.cli.console import print_json, say
 from stillmap.cli.parser import COMMANDS
 from stillmap.core import arrays
@@ -22,6 +22,7 @@ from stillmap.io import stillmap_folder, writers
 from stillmap.io.carmen import writer
 from stillmap.io.registry import detect_format
 from stillmap.io.ros.bag_types import detect_kind
+from stillmap.results.folder import ResultFolder, open_result
 
 _EPILOG = """examples:
   stillmap filter out -o clean.clf.gz
@@ -59,8 +60,6 @@ def run(args: argparse.Namespace) -> int:
     """Reads labels and recording, writes the recording without dynamic beams."""
     if not 0.0 <= args.below <= 1.0:
         raise InputError(f"--below wants 0 to 1, got {args.below:g}")
-    pass  # DROPPED  # takes long to load
-
     output = Path(args.output)
     with parents_made(output):
         done = filtered(Path(args.result), output, args.input, args.below, args.overwrite)
@@ -107,7 +106,7 @@ def filtered(
     Raises:
         InputError: the result or its recording is not there, or the output is taken.
     """
-    mapped = found(result, given)
+    mapped = open_result(result, given)
     form = detect_format(mapped.source) if mapped.source.exists() else None
     if form is not None:
         _require_ending(output, mapped.source, form.name)
@@ -150,7 +149,11 @@ def _require_ending(output: Path, source: Path, form: str) -> None:
 
 
 def _write(
-    mapped: Mapped, output: Path, recording: Recording, blank: NDArray[np.bool_], overwrite: bool
+    mapped: ResultFolder,
+    output: Path,
+    recording: Recording,
+    blank: NDArray[np.bool_],
+    overwrite: bool,
 ) -> tuple[int, list[str], list[str]]:
     """How many scans, and which topics, are not in what was written; which are not filtered."""
     form = detect_format(mapped.source)

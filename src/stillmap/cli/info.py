@@ -89,7 +89,7 @@ def _text(found: dict[str, Any]) -> Iterator[str]:
         yield _row("robot's frame", f"{found['base_frame']} ({found['base_frame_how']})")
     for sensor in found["sensors"]:
         yield from _sensor(sensor)
-    for own in found["own_body"]:
+    for own in found["self_filter"]:
         yield _row("robot itself", _own(own, found))
     yield from _notes(found)
 
@@ -168,7 +168,7 @@ def _sensor(sensor: dict[str, Any]) -> Iterator[str]:
                 "  shown free",
                 f"{rule['free_range']:g} m by a maximum-range beam: {rule['free_how']}",
             )
-        for first, last, limit in rule.get("own_body", ()):
+        for first, last, limit in rule.get("self_filter", ()):
             text = f"beams {first} to {last} end on it: unusable up to {limit:g} m"
             yield _row("  robot itself", text)
         yield _row("  zero means", f"{rule['zero_means']}: {rule['zero_how']}")

@@ -1,6 +1,6 @@
-"""`stillmap map`: the main job, recording in, folder out.
+"""`stillmap map`: the main job: parse, read, build, save.
 
-What `stillmap map` does once it is known what is wanted.
+Imports that take long are made inside the functions, so that `--help` and completion are quick.
 """
 
 import argparse
@@ -8,34 +8,29 @@ import dataclasses
 import errno
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from stillmap import em
 from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
 from stillmap.cli.config import add_option_flags, resolved_options
 from stillmap.cli.console import files_in, print_json, say, shown_progress, shown_share
 from stillmap.cli.parser import COMMANDS
-from stillmap.cli.rig import built, read_tilting, said
 from stillmap.core.errors import InputError, MissingExtra
-from stillmap.core.files import require_new
-from stillmap.core.profiling import Progress, StageTimer
-from stillmap.core.recording import Recording
-from stillmap.io import read
-from stillmap.io.trajectory import poses_from_tum
-from stillmap.mapping.beam_statistics import count_beams
-from stillmap.mesh.build import Models
-from stillmap.pipeline.checkpoint import CheckpointFolder, DamagedCheckpoint, lock_checkpoints
-from stillmap.pipeline.checkpoint_files import identify_run
-from stillmap.pipeline.estimate import EmState
-from stillmap.pipeline.models import build_models
-from stillmap.pipeline.options import Options, resolved
-from stillmap.pipeline.result import Result, build
-from stillmap.results.save import RECORD, save
-from stillmap.rig.build import TiltingResult
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stillmap.core.profiling import Progress, StageTimer
+    from stillmap.core.recording import Recording
+    from stillmap.mesh.build import Models
+    from stillmap.pipeline.checkpoint import CheckpointFolder
+    from stillmap.pipeline.estimate import EmState
+    from stillmap.pipeline.options import Options
+    from stillmap.pipeline.result import Result
+    from stillmap.rig.build import TiltingResult
 
 _EPILOG = """examples:
   stillmap map log.clf.gz -o out
@@ -126,14 +121,59 @@ def _add_map_flags(p: argparse._ArgumentGroup) -> None:
     )
 
 
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seconds", "warnings")
+
+
+class _Inputs(NamedTuple):
+    """What is mapped: the recording, poses to keep, and the second laser of a rig."""
+
+    recording: "Recording"
+    poses: "NDArray[np.float64] | None"
+    tilting: "Recording | None"
+
+
+class _Built(NamedTuple):
+    """The result, with the 3D data of a rig's second laser and the meshes where there are any."""
+
+    result: "Result"
+    tilting: "TiltingResult | None"
+    models: "Models | None"
+
+
 def run(args: argparse.Namespace) -> int:
-    """Reads, maps, writes, says what came of it."""
-    pass  # DROPPED  # takes long to load
+    """Maps a recording into a folder."""
+    from stillmap.core.profiling import StageTimer
+    from stillmap.pipeline.checkpoint import lock_checkpoints
+    from stillmap.results.save import save
 
-    return mapped(args, _changes(args))
+    options = resolved_options(args, read_changes(args), _option_changes(args))
+    output, replace = Path(args.output), args.overwrite or args.resume
+    _require_usable_output(args, output, replace)
+    stages = StageTimer()
+    with lock_checkpoints(output) as checkpoints, _explain_failure(args, checkpoints):
+        inputs, options = _read(args, options, checkpoints.folder, stages)
+        with shown_progress(args.quiet, options.em.max_iterations) as progress:
+            built = _build(args, inputs, options, checkpoints, progress, stages)
+            progress("writing", 0, 0, 0)
+            save(
+                built.result,
+                output,
+                replace,
+                staging_folder=checkpoints.folder,
+                tilting=built.tilting,
+                models=built.models,
+            )
+        checkpoints.clear()
+    if not args.quiet:
+        _print_summary(built, output)
+    if args.json:
+        print_json(_summary(output))
+    return 0
 
 
-def _changes(args: argparse.Namespace) -> dict[str, Any]:
+def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
+    """The options that flags of this command set."""
     changes: dict[str, Any] = {}
     if args.paper and args.estimator not in (None, "paper"):
         raise InputError(f"--paper and --estimator {args.estimator} exclude each other")
@@ -151,147 +191,77 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
     return changes
 
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+def _require_usable_output(args: argparse.Namespace, output: Path, replace: bool) -> None:
+    """Refuses an output that is taken, holds an input or cannot be written, before any work."""
+    from stillmap.core.files import require_new
+    from stillmap.results.save import RECORD
 
-_IN_SUMMARY = ("version", "converged", "best_iteration", "counts", "area", "seconds", "warnings")
-
-
-def mapped(args: argparse.Namespace, changes: dict[str, Any]) -> int:
-    """Reads, maps, writes, says what came of it.
-
-    Args:
-        args: the flags.
-        changes: of the options, by them.
-    """
-    options = resolved_options(args, read_changes(args), changes)
-    output, replace = Path(args.output), args.overwrite or args.resume
     require_new(output, RECORD, replace)
-    require_apart(output, Path(args.input))
-    if args.tilting:
-        require_apart(output, Path(args.tilting))
-    _require_writable(output)
-    with lock_checkpoints(output) as checkpoints:
-        try:
-            result, in_3d = _mapped_and_saved(args, options, checkpoints)
-            checkpoints.clear()
-        except OSError as error:
-            if error.errno not in _FULL:
-                raise
-            raise InputError(
-                f"cannot go on: {error.strerror}", where=str(checkpoints.folder)
-            ) from error
-        except (KeyboardInterrupt, SystemExit):
-            if checkpoints.newest is not None:
-                _tell(
-                    args, f"{checkpoints.folder} keeps how far it came: --resume goes on from there"
-                )
+    for source in filter(None, (args.input, args.tilting)):
+        require_apart(output, Path(source))
+    parent = Path(os.path.abspath(output)).parent
+    while not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise InputError(f"cannot be written: {parent} is not writable", where=str(output))
+
+
+@contextmanager
+def _explain_failure(args: argparse.Namespace, checkpoints: "CheckpointFolder") -> Iterator[None]:
+    """A full disk becomes one line; an interruption names the checkpoint to resume from."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _DISK_FULL:
             raise
-    if not args.quiet:
-        _say(result, in_3d, output)
-    if args.json:
-        print_json(_summary(output))
-    return 0
+        where = str(checkpoints.folder)
+        raise InputError(f"cannot continue: {error.strerror}", where=where) from error
+    except (KeyboardInterrupt, SystemExit):
+        if checkpoints.newest is not None:
+            _tell(args, f"{checkpoints.folder} has the last checkpoint: --resume continues there")
+        raise
 
 
-def _mapped_and_saved(
-    args: argparse.Namespace, options: Options, checkpoints: CheckpointFolder
-) -> tuple[Result, TiltingResult | None]:
-    """The whole job; how far it has come is kept after every iteration."""
-    stages = StageTimer()
+def _read(
+    args: argparse.Namespace, options: "Options", scratch: Path, stages: "StageTimer"
+) -> "tuple[_Inputs, Options]":
+    """The inputs, and the options resolved for them."""
+    from stillmap.cli.rig import read_tilting
+    from stillmap.io import read
+    from stillmap.pipeline.options import resolved
+
     with stages.measure("read"):
         with shown_share(args.quiet, "reading") as tell:
-            found = read(Path(args.input), options.read, progress=tell, scratch=checkpoints.folder)
-        recording = _usable(found, args)
+            recording = read(Path(args.input), options.read, progress=tell, scratch=scratch)
+        recording = _prepare(recording, options, args)
         poses = _given_poses(recording, args)
-        tilting = read_tilting(args, recording, options, checkpoints.folder)
-        _require_known(recording, options, args)
-        options = resolved(options, recording)
-        same = identify_run(recording, options, poses)
-    state = _resumed(args, checkpoints, same, options, stages)
-    with shown_progress(args.quiet, em.max_iterations(options.estimator, options.em)) as progress:
-        result = build(
-            recording,
-            options,
-            poses=poses,
-            progress=progress,
-            stages=stages,
-            scratch=checkpoints.folder,
-            resume=state,
-            checkpoint=lambda state: checkpoints.save(state, same, stages),
+        tilting = read_tilting(args, recording, options, scratch)
+        return _Inputs(recording, poses, tilting), resolved(options, recording)
+
+
+def _prepare(recording: "Recording", options: "Options", args: argparse.Namespace) -> "Recording":
+    """Refuses what cannot be mapped; notes where the recording is; drops odometry if asked to."""
+    from stillmap import em
+
+    if recording.n_scans == 0:
+        raise InputError("holds no scan that can be used", where=args.input)
+    if recording.dimension == 3 and options.estimator not in em.ESTIMATORS_3D:
+        raise InputError(
+            f"is 3D: estimator '{options.estimator}' is for 2D recordings",
+            where=args.input,
+            hint=f"--estimator {' or '.join(em.ESTIMATORS_3D)}",
         )
-        in_3d = None
-        if tilting is not None:
-            progress("cutting out what moves", 0, 0, 0)
-            with stages.measure("tilting"):
-                in_3d = built(result, tilting, options)
-            result = dataclasses.replace(result, stages=stages.to_dict())
-        models, result = _modelled(result, in_3d, progress, stages)
-        progress("writing", 0, 0, 0)
-        replace = args.overwrite or args.resume
-        save(
-            result,
-            Path(args.output),
-            replace,
-            staging_folder=checkpoints.folder,
-            tilting=in_3d,
-            models=models,
-        )
-    return result, in_3d
+    original = recording.source.get("path", args.input)
+    source = {**recording.source, "path": args.input}
+    if original != args.input:
+        source["made_from"] = original
+    recording = dataclasses.replace(recording, source=source)
+    return recording.without_odometry() if args.no_odometry else recording
 
 
-def _modelled(
-    result: Result, in_3d: TiltingResult | None, progress: Progress, stages: StageTimer
-) -> tuple[Models | None, Result]:
-    """Models of what is in 3D, where they are wanted and can be made; and what the result says."""
-    if not result.options.mesh.enabled or (in_3d is None and result.recording.dimension == 2):
-        return None, result
-    try:
-        models = build_models(result, tilting=in_3d, progress=progress, stages=stages)
-    except MissingExtra as error:
-        warning = f"no models: {error}"
-        return None, dataclasses.replace(result, warnings=[*result.warnings, warning])
-    warnings = [*result.warnings]
-    if not len(models.assignment.mesh):
-        warnings.append("no model of the place: hardly any beams lie side by side on it")
-    if count := len(models.unread):
-        what = (
-            "a picture is not used" if count == 1 else f"{count} pictures are not used, the first"
-        )
-        warnings.append(f"{what}: {models.unread[0]}")
-    return models, dataclasses.replace(result, warnings=warnings, stages=stages.to_dict())
+def _given_poses(recording: "Recording", args: argparse.Namespace) -> "NDArray[np.float64] | None":
+    from stillmap.io.trajectory import poses_from_tum
 
-
-def _resumed(
-    args: argparse.Namespace,
-    checkpoints: CheckpointFolder,
-    same: dict[str, Any],
-    options: Options,
-    stages: StageTimer,
-) -> EmState | None:
-    """How far an interrupted run came, if it is to be gone on from."""
-    if checkpoints.newest is None:
-        return None
-    if not args.resume:
-        _tell(args, "an earlier run was interrupted: begins anew, --resume would go on from it")
-        checkpoints.clear()
-        return None
-    try:
-        state = checkpoints.load(same, options, stages)
-    except DamagedCheckpoint as error:
-        say(f"warning: {error}; begins anew")
-        checkpoints.clear()
-        return None
-    if state is not None:
-        _tell(args, f"goes on after iteration {len(state.records)}")
-    return state
-
-
-def _tell(args: argparse.Namespace, line: str) -> None:
-    if not args.quiet:
-        say(line)
-
-
-def _given_poses(recording: Recording, args: argparse.Namespace) -> NDArray[np.float64] | None:
     if not args.poses:
         return None
     if args.poses != "recording":
@@ -305,36 +275,93 @@ def _given_poses(recording: Recording, args: argparse.Namespace) -> NDArray[np.f
     return recording.T_recorded_base
 
 
-def _require_writable(output: Path) -> None:
-    """Refuse a place that cannot be written to before the work is done, not after."""
-    parent = Path(os.path.abspath(output)).parent
-    while not parent.exists():
-        parent = parent.parent
-    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        raise InputError(f"cannot be written: nothing can be put into {parent}", where=str(output))
+def _build(
+    args: argparse.Namespace,
+    inputs: _Inputs,
+    options: "Options",
+    checkpoints: "CheckpointFolder",
+    progress: "Progress",
+    stages: "StageTimer",
+) -> _Built:
+    """EM with a checkpoint per iteration, then the rig's second laser and the meshes."""
+    from stillmap.cli.rig import built
+    from stillmap.pipeline.checkpoint_files import identify_run
+    from stillmap.pipeline.result import build
+
+    with stages.measure("read"):
+        run_id = identify_run(inputs.recording, options, inputs.poses)
+    result = build(
+        inputs.recording,
+        options,
+        poses=inputs.poses,
+        progress=progress,
+        stages=stages,
+        scratch=checkpoints.folder,
+        resume=_load_checkpoint(args, checkpoints, run_id, options, stages),
+        checkpoint=lambda state: checkpoints.save(state, run_id, stages),
+    )
+    tilting = None
+    if inputs.tilting is not None:
+        progress("cutting out what moves", 0, 0, 0)
+        with stages.measure("tilting"):
+            tilting = built(result, inputs.tilting, options)
+    models, warnings = _build_models(result, tilting, progress, stages)
+    warnings = [*result.warnings, *warnings]
+    result = dataclasses.replace(result, warnings=warnings, stages=stages.to_dict())
+    return _Built(result, tilting, models)
 
 
-def _usable(recording: Recording, args: argparse.Namespace) -> Recording:
-    if recording.n_scans == 0:
-        raise InputError("holds no scan that can be used", where=args.input)
-    recording = dataclasses.replace(recording, source=_found_at(recording.source, args.input))
-    return recording.without_odometry() if args.no_odometry else recording
+def _build_models(
+    result: "Result", tilting: "TiltingResult | None", progress: "Progress", stages: "StageTimer"
+) -> "tuple[Models | None, list[str]]":
+    """The meshes of a 3D recording, where they are wanted and can be built; and warnings."""
+    from stillmap.pipeline.models import build_models
+
+    if not result.options.mesh.enabled or (tilting is None and result.recording.dimension == 2):
+        return None, []
+    try:
+        models = build_models(result, tilting=tilting, progress=progress, stages=stages)
+    except MissingExtra as error:
+        return None, [f"no models: {error}"]
+    warnings = []
+    if not len(models.assignment.mesh):
+        warnings.append("no mesh of the place: hardly any beams are neighbours on a surface")
+    if count := len(models.unread):
+        what = "an image is not used" if count == 1 else f"{count} images are not used, the first"
+        warnings.append(f"{what}: {models.unread[0]}")
+    return models, warnings
 
 
-def _require_known(recording: Recording, options: Options, args: argparse.Namespace) -> None:
-    """Refuse an estimator that knows nothing of space before the work is done."""
-    if recording.dimension == 3 and options.estimator not in em.ESTIMATORS_3D:
-        raise InputError(
-            f"is 3D: estimator '{options.estimator}' knows 2D recordings alone",
-            where=args.input,
-            hint=f"--estimator {' or '.join(em.ESTIMATORS_3D)}",
-        )
+def _load_checkpoint(
+    args: argparse.Namespace,
+    checkpoints: "CheckpointFolder",
+    run_id: dict[str, Any],
+    options: "Options",
+    stages: "StageTimer",
+) -> "EmState | None":
+    """The state of an interrupted run, where there is one and it is to be resumed."""
+    from stillmap.pipeline.checkpoint import DamagedCheckpoint
+
+    if checkpoints.newest is None:
+        return None
+    if not args.resume:
+        _tell(args, "an earlier run was interrupted: starts anew; --resume would continue it")
+        checkpoints.clear()
+        return None
+    try:
+        state = checkpoints.load(run_id, options, stages)
+    except DamagedCheckpoint as error:
+        say(f"warning: {error}; starts anew")
+        checkpoints.clear()
+        return None
+    if state is not None:
+        _tell(args, f"continues after iteration {len(state.records)}")
+    return state
 
 
-def _found_at(source: dict[str, Any], path: str) -> dict[str, Any]:
-    """The source as run.json tells it: where the recording is now, and what it was made from."""
-    made_from = source.get("path", path)
-    return {**source, "path": path} | ({} if made_from == path else {"made_from": made_from})
+def _tell(args: argparse.Namespace, line: str) -> None:
+    if not args.quiet:
+        say(line)
 
 
 def _summary(output: Path) -> dict[str, Any]:
@@ -348,15 +375,19 @@ def _summary(output: Path) -> dict[str, Any]:
     }
 
 
-def _say(result: Result, in_3d: TiltingResult | None, output: Path) -> None:
+def _print_summary(built: _Built, output: Path) -> None:
+    from stillmap.cli.rig import said
+    from stillmap.mapping.beam_statistics import count_beams
+
+    result, n = built.result, len(built.result.iterations)
     counts = count_beams(result.recording, result.p_static)
-    end, n = "converged" if result.converged else "not converged", len(result.iterations)
     lines = [
         f"{result.recording.n_scans} scans, {counts['hits']} beams that hit something, "
         f"{100.0 * counts['dynamic'] / max(counts['hits'], 1):.1f} % of them dynamic",
-        f"{n} iteration{'s' if n > 1 else ''}, {end}, the best is {result.best_iteration}",
-        *_changed(result),
-        *([] if in_3d is None else [said(in_3d)]),
+        f"{n} iteration{'s' * (n > 1)}, {'' if result.converged else 'not '}converged, "
+        f"the best is {result.best_iteration}",
+        *_changes_line(result),
+        *([] if built.tilting is None else [said(built.tilting)]),
         *(f"warning: {warning}" for warning in result.warnings),
         f"wrote {output}: open {output / 'report.html'}",
     ]
@@ -364,10 +395,9 @@ def _say(result: Result, in_3d: TiltingResult | None, output: Path) -> None:
         say(line)
 
 
-def _changed(result: Result) -> list[str]:
-    n = len(result.changes)
+def _changes_line(result: "Result") -> list[str]:
+    n, last = len(result.changes), result.options.output.map_state == "last"
     if not n:
         return []
-    state = "as it was last seen" if result.options.output.map_state == "last" else "as it was most"
-    each = "it" if n == 1 else "each"
-    return [f"{n} place{'s' * (n > 1)} changed meanwhile, the map shows {each} {state}"]
+    state = "in its last state" if last else "in the state that it was in for longest"
+    return [f"{n} place{'s' * (n > 1)} changed, the map shows {'it' if n == 1 else 'each'} {state}"]

@@ -44,7 +44,7 @@ def facts(recording: Recording) -> dict[str, Any]:
         "recorded_poses": _way(recording.T_recorded_base),
         "images": _pictures(recording),
         "sensors": _sensors(recording, source["sensors"]),
-        "own_body": [noted for noted in source["own_body"] if _is_box(noted)],
+        "self_filter": [noted for noted in source["self_filter"] if _is_box(noted)],
         **{key: source[key] for key in (*_DAMAGE, "skipped_unit", *_TABLES, *_LISTS, *_WORDS)},
     }
 
@@ -53,7 +53,7 @@ def _notes(source: dict[str, Any]) -> dict[str, Any]:
     """What the reader noted; notes of another shape than expected (other writers) are left out."""
     tables = {key: source.get(key) for key in (*_DAMAGE, *_TABLES, "odometry", "spin")}
     notes: dict[str, Any] = {k: v if isinstance(v, dict) else {} for k, v in tables.items()}
-    lists = {key: source.get(key) for key in (*_LISTS, "sensors", "own_body")}
+    lists = {key: source.get(key) for key in (*_LISTS, "sensors", "self_filter")}
     notes.update({k: v if isinstance(v, list) else [] for k, v in lists.items()})
     for key in _DAMAGE:
         notes[key] = {
@@ -231,9 +231,9 @@ def _sensor(recording: Recording, numbers: range, noted: dict[str, Any]) -> dict
 def _is_rule(noted: Any) -> bool:
     return (
         isinstance(noted, dict)
-        and set(noted) | {"own_body"} == _RULE  # older recordings do not have it
+        and set(noted) | {"self_filter"} == _RULE  # older recordings do not have it
         and all(isinstance(noted[k], float | int | None) for k in ("threshold", "free_range"))
-        and all(_is_part(part) for part in noted.get("own_body", ()))
+        and all(_is_part(part) for part in noted.get("self_filter", ()))
     )
 
 

@@ -12,11 +12,11 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 
-from stillmap.cli.arguments import Mapped, found, is_deskewed
 from stillmap.cli.console import say, shown_share
 from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError, MissingExtra, import_extra
 from stillmap.io.trajectory import poses_from_tum
+from stillmap.results.folder import ResultFolder, is_deskewed, open_result
 from stillmap.slam import SlamOptions
 from stillmap.viewer.scene import read_scene
 from stillmap.viewer.tracks import Beams
@@ -102,9 +102,7 @@ def run(args: argparse.Namespace) -> int:
             say(f"{error}; the report is shown")
             _show_report(report)
             return 0
-        pass  # DROPPED  # takes long to load
-
-        viewed(args, Path(args.result))
+            viewed(args, Path(args.result))
     return 0
 
 
@@ -129,7 +127,7 @@ def viewed(args: argparse.Namespace, folder: Path) -> None:
     Raises:
         InputError: a file of the result is damaged, or the recording that was named is another.
     """
-    mapped = found(folder, args.input)
+    mapped = open_result(folder, args.input)
     scene = read_scene(folder)
     try:
         beams = None if args.no_beams else _beams(mapped, args.quiet)
@@ -152,7 +150,7 @@ def viewed(args: argparse.Namespace, folder: Path) -> None:
         window.close()
 
 
-def _beams(mapped: Mapped, quiet: bool) -> Beams:
+def _beams(mapped: ResultFolder, quiet: bool) -> Beams:
     with shown_share(quiet, "reading") as tell:
         recording, labels = mapped.read(tell)
     poses = poses_from_tum(mapped.folder / "trajectory.tum", recording)

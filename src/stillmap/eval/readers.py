@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays, se2
-from stillmap.core.arrays import open_npy
 from stillmap.core.errors import InputError
 from stillmap.core.files import read_text, require_regular
 from stillmap.core.recording import Recording
@@ -23,21 +22,11 @@ from stillmap.io.registry import read as recording_of
 from stillmap.io.stillmap_folder import read as read_folder
 from stillmap.io.text_lines import read_head
 from stillmap.io.trajectory import MAX_BYTES, read_tum
-from stillmap.results.reader import shape_text
+from stillmap.results.labels import Labels, read_array
 
 Bool = NDArray[np.bool_]
 
 Float = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Labels:
-    """`beams/` of a result: see the contract of `stillmap map`."""
-
-    stamp_ns: NDArray[np.int64]
-    offset: NDArray[np.int64]
-    p_static: NDArray[np.float32]
-    hit: Bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +38,14 @@ class Truth:
 
     def static(self) -> Bool:
         """(M,) True where something static reflected the beam; meaningful where it hit."""
-        return _array(self.folder / "truth/static.npy", (self.recording.n_beams,), "b")
+        return read_array(self.folder / "truth/static.npy", (self.recording.n_beams,), "b")
 
     def walls(self) -> Float:
         """(W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1; of planar recordings."""
         if self.recording.dimension != 2:
             raise InputError("is no planar recording", where=str(self.folder))
         path = self.folder / "truth/walls.npy"
-        walls = _finite(path, _array(path, (None, 4), "f"))
+        walls = _finite(path, read_array(path, (None, 4), "f"))
         if not len(walls):
             raise InputError("holds no walls", where=str(path))
         return walls
@@ -66,13 +55,13 @@ class Truth:
         path = self.folder / "truth/lasting.npy"
         if not path.exists():
             return np.empty((0, 4))
-        return _finite(path, _array(path, (None, 4), "f"))
+        return _finite(path, read_array(path, (None, 4), "f"))
 
     def poses(self) -> Float:
         """(T, D+1, D+1) T_world_base."""
         path = self.folder / "truth/T_world_base.npy"
         n = self.recording.dimension + 1
-        return _finite(path, _array(path, (self.recording.n_scans, n, n), "f"))
+        return _finite(path, read_array(path, (self.recording.n_scans, n, n), "f"))
 
     def static_hits(self) -> Float:
         """(N, D) end points in the world frame, at true poses, of the static beams that hit."""
@@ -118,41 +107,6 @@ def _share_alike(labels: Labels, recording: Recording) -> float:
     return same / max(len(labels.hit), 1)
 
 
-def read_labels(result: Path) -> Labels:
-    """The labels of a result folder.
-
-    Raises:
-        InputError: they are missing, damaged, or of lengths that do not go together.
-    """
-    folder = result / "beams"
-    stamp_ns = _array(folder / "stamp_ns.npy", (None,), "i")
-    offset = _array(folder / "offset.npy", (len(stamp_ns) + 1,), "i")
-    beams = int(offset[-1])
-    path = folder / "p_static.npy"
-    p_static = _array(path, (beams,), "f")
-    for block in arrays.iter_blocks(p_static):
-        wrong = np.flatnonzero((p_static[block] < 0) | (p_static[block] > 1))
-        if len(wrong):
-            beam = block.start + int(wrong[0])
-            raise InputError(f"beam {beam} has no probability in [0, 1]", where=str(path))
-    return Labels(stamp_ns, offset, p_static, _array(folder / "hit.npy", (beams,), "b"))
-
-
-def read_colours(result: Path, beams: int) -> NDArray[np.uint8] | None:
-    """(M, 3) colours of the ends of a result's beams, so many; None where it has none.
-
-    Raises:
-        InputError: they are damaged, or others.
-    """
-    path = result / "beams" / "colour.npy"
-    if not path.exists():
-        return None
-    colours = _array(path, (beams, 3), "u")
-    if colours.dtype != np.uint8:
-        raise InputError(f"holds {colours.dtype}", where=str(path))
-    return colours
-
-
 def require_same_beams(labels: Labels, truth: Truth, result: Path) -> None:
     """Labels and truth speak of the same beams.
 
@@ -177,18 +131,6 @@ def require_same_beams(labels: Labels, truth: Truth, result: Path) -> None:
             where=str(result / "beams"),
             hint="is it the result of another recording?",
         )
-
-
-def _array(path: Path, shape: tuple[int | None, ...], kinds: str) -> NDArray[Any]:
-    """An .npy array of this shape (None: any length) and one of these kinds of dtype."""
-    array = open_npy(path)
-    if len(array.shape) != len(shape) or any(
-        want not in (None, got) for got, want in zip(array.shape, shape, strict=True)
-    ):
-        raise InputError(f"is {shape_text(array.shape)}, not {shape_text(shape)}", where=str(path))
-    if array.dtype.kind not in kinds:
-        raise InputError(f"holds {array.dtype}", where=str(path))
-    return array
 
 
 def _finite(path: Path, array: NDArray[Any]) -> Float:

@@ -1,4 +1,4 @@
-"""The folder beside a result in which a run keeps how far it has come, and which is its alone.
+"""The folder beside a result in which a run keeps its checkpoints, locked while it runs.
 
 `.NAME.resume/` beside NAME holds `lock`, and `iteration-K/` once iteration K is finished: flat
 arrays and `state.json`, which knows the checksum of each. A checkpoint is written beside the one
@@ -22,31 +22,31 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import iter_blocks, write_npy
 from stillmap.core.errors import InputError
 from stillmap.core.profiling import StageTimer
-from stillmap.pipeline.checkpoint_files import packed, require_same, unpacked
+from stillmap.pipeline.checkpoint_files import pack_state, require_same_run, unpack_state
+from stillmap.pipeline.estimate import EmState
 from stillmap.pipeline.options import Options
-from stillmap.pipeline.progress import Loop
 
-_FORMAT_VERSION = 1
+_FORMAT_VERSION = 2
 _STATE, _LOCK = "state.json", "lock"
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 _LARGEST_STATE = 1 << 30  # bytes
 _IN_MEMORY = 1 << 20  # bytes of an array that is read at once instead of mapped
 
 
-class Damaged(Exception):
-    """A checkpoint that cannot be used; says which file and why."""
+class DamagedCheckpoint(Exception):
+    """A checkpoint that cannot be used; names the file and the reason."""
 
 
-class Place:
-    """Where one run keeps how far it has come; see `held`."""
+class CheckpointFolder:
+    """The checkpoints of one run; see `lock_checkpoints`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._whole: dict[str, int] = {}  # checksums of the arrays in the present checkpoint
 
     @property
-    def present(self) -> Path | None:
-        """The last checkpoint that is whole; None where there is none."""
+    def newest(self) -> Path | None:
+        """The last complete checkpoint; None where there is none."""
         numbers = [
             int(path.name.removeprefix("iteration-"))
             for path in self.folder.iterdir()
@@ -56,49 +56,52 @@ class Place:
 
     def load(
         self, identity: Mapping[str, Any], options: Options, stages: StageTimer
-    ) -> Loop | None:
-        """How far the run came; None where there is no checkpoint.
+    ) -> EmState | None:
+        """The state of the run at its last checkpoint; None where there is none.
 
         Args:
-            identity: what is to be mapped, and how.
-            options: the same as a whole.
-            stages: gets the time that the run took so far.
+            identity: of the run, see `identify_run`.
+            options: of the run, resolved.
+            stages: the time that the run took so far is added here.
 
         Raises:
             InputError: it is of another recording or other options.
-            Damaged: a file of it is not what was written.
+            DamagedCheckpoint: a file differs from what was written.
         """
-        if self.present is None:
+        if self.newest is None:
             return None
-        state = _state(self.present / _STATE)
-        require_same(state["identity"], dict(identity), str(self.folder))
+        state = _state(self.newest / _STATE)
+        require_same_run(state["identity"], dict(identity), str(self.folder))
         arrays = {
-            name: _array(self.present / f"{name}.npy", about)
+            name: _array(self.newest / f"{name}.npy", about)
             for name, about in state["arrays"].items()
         }
-        loop = unpacked(state["loop"], arrays, options)
+        try:
+            run = unpack_state(state["state"], arrays, options)
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise DamagedCheckpoint(f"{self.newest / _STATE}: {error!r}") from error
         self._whole = {name: about["crc32"] for name, about in state["arrays"].items()}
         stages.add(state["stages"])
-        return loop
+        return run
 
-    def save(self, loop: Loop, identity: Mapping[str, Any], stages: StageTimer) -> None:
-        """Keep how far a run has come, instead of what is kept so far.
+    def save(self, run: EmState, identity: Mapping[str, Any], stages: StageTimer) -> None:
+        """Writes a checkpoint, which replaces the one before.
 
         Raises:
-            InputError: the disk is full, or the like; what was kept so far still is.
+            InputError: it cannot be written, e.g. the disk is full; the checkpoint before remains.
         """
-        before, number = self.present, len(loop.records)
+        before, number = self.newest, len(run.records)
         work, final = self.folder / "new.part", self.folder / f"iteration-{number}"
         try:
             self._clear(work)
             work.mkdir()
-            values, arrays = packed(loop)
+            values, arrays = pack_state(run)
             checksums = {n: self._put(work, before, n, array) for n, array in arrays.items()}
             about = {
                 name: {"crc32": checksums[name], "shape": a.shape, "dtype": a.dtype.str}
                 for name, a in arrays.items()
             }
-            state = {"identity": dict(identity), "arrays": about, "loop": values}
+            state = {"identity": dict(identity), "arrays": about, "state": values}
             _write_state(work / _STATE, {**state, "stages": stages.to_dict()})
             _sync(work)
             os.rename(work, final)
@@ -121,12 +124,12 @@ class Place:
         _sync(work / f"{name}.npy")
         return _checksum(array)
 
-    def forget(self) -> None:
-        """What is left of earlier runs goes."""
+    def clear(self) -> None:
+        """Removes what earlier runs left."""
         self._clear(*(path for path in self.folder.iterdir() if path.name != _LOCK))
 
-    def clean(self, output: Path) -> None:
-        """What a run left that was killed goes; an earlier result that it moved aside goes back."""
+    def recover(self, output: Path) -> None:
+        """Removes the leftovers of a killed run; an earlier result that it moved aside goes back."""
         for path in list(self.folder.iterdir()):
             if path.name.endswith(".old") and not output.exists():
                 os.rename(path, output)
@@ -137,7 +140,7 @@ class Place:
         for path in paths:
             if path.is_dir() and not path.is_symlink():
                 if not path.name.endswith(".part"):
-                    # who is stopped in the middle leaves no half of a checkpoint
+                    # an interruption in the middle must not leave half a checkpoint
                     path = path.rename(self.folder / f"{path.name}.gone.part")
                 shutil.rmtree(path, ignore_errors=True)
             else:
@@ -145,13 +148,13 @@ class Place:
 
 
 @contextmanager
-def held(output: Path) -> Iterator[Place]:
-    """The place beside a result folder, for as long as the block runs; no other run may have it.
+def lock_checkpoints(output: Path) -> Iterator[CheckpointFolder]:
+    """The checkpoint folder of a result folder, locked against other runs while the block runs.
 
-    It goes when there is nothing in it to go on from.
+    It is removed when it holds no checkpoint.
 
     Raises:
-        InputError: another run has it, or it cannot be made.
+        InputError: another run holds the lock, or the folder cannot be made.
     """
     output = Path(os.path.abspath(output))
     folder = output.parent / f".{output.name}.resume"
@@ -160,12 +163,12 @@ def held(output: Path) -> Iterator[Place]:
         file = _locked(folder, output)
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(output)) from error
-    place = Place(folder)
+    checkpoints = CheckpointFolder(folder)
     try:
-        place.clean(output)
-        yield place
+        checkpoints.recover(output)
+        yield checkpoints
     finally:
-        if place.present is None:
+        if checkpoints.newest is None:
             shutil.rmtree(folder, ignore_errors=True)
             for path in reversed(made):
                 with suppress(OSError):
@@ -174,7 +177,7 @@ def held(output: Path) -> Iterator[Place]:
 
 
 def _locked(folder: Path, output: Path) -> IO[bytes]:
-    """The open lock file of a place, which the kernel unlocks when this process ends."""
+    """The open lock file, which the kernel unlocks when this process ends."""
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         try:
@@ -213,31 +216,33 @@ def _write_state(path: Path, state: Mapping[str, Any]) -> None:
 def _state(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > _LARGEST_STATE:
-            raise Damaged(f"{path}: too large")
+            raise DamagedCheckpoint(f"{path}: too large")
         whole = json.loads(path.read_text(encoding="utf-8"))
         text = whole["text"]
         if zlib.crc32(text.encode()) != whole["crc32"]:
-            raise Damaged(f"{path}: its checksum differs")
+            raise DamagedCheckpoint(f"{path}: its checksum differs")
         state: dict[str, Any] = json.loads(text)
     except (OSError, ValueError, KeyError, TypeError, RecursionError, AttributeError) as error:
-        raise Damaged(f"{path}: {error!r}") from error
+        raise DamagedCheckpoint(f"{path}: {error!r}") from error
     if state["format_version"] != _FORMAT_VERSION:
-        raise Damaged(f"{path}: format_version {state['format_version']!r} is unknown here")
+        raise DamagedCheckpoint(
+            f"{path}: format_version {state['format_version']!r} is unknown here"
+        )
     return state
 
 
 def _array(path: Path, about: Mapping[str, Any]) -> NDArray[Any]:
     if not _NAME.fullmatch(path.name):
-        raise Damaged(f"{path}: no name of an array")
+        raise DamagedCheckpoint(f"{path}: no name of an array")
     try:
         # np.load would also open archives and pickles
         found = np.lib.format.open_memmap(path, mode="r")
     except Exception as error:  # whatever NumPy's parser makes of damaged bytes
-        raise Damaged(f"{path}: {error!r}") from error
+        raise DamagedCheckpoint(f"{path}: {error!r}") from error
     if list(found.shape) != about["shape"] or found.dtype.str != about["dtype"]:
-        raise Damaged(f"{path}: not the array that was written")
+        raise DamagedCheckpoint(f"{path}: not the array that was written")
     if _checksum(found) != about["crc32"]:
-        raise Damaged(f"{path}: its checksum differs")
+        raise DamagedCheckpoint(f"{path}: its checksum differs")
     return np.array(found) if found.nbytes < _IN_MEMORY else np.asarray(found)
 
 

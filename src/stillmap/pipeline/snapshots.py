@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
 
 if TYPE_CHECKING:
-    from stillmap.results.protocols import MapLike
+    from stillmap.em import OccupancyMap
 
 Window = tuple[float, float, float, float]
 Value = TypeVar("Value", np.float32, np.bool_)
@@ -35,7 +35,7 @@ class Snapshot:
     dynamic_points: NDArray[np.float32]
 
 
-def extent(occupancy: "MapLike") -> Window:
+def extent(occupancy: "OccupancyMap") -> Window:
     """x0, y0, x1, y1 of the whole map in metres, in the map frame."""
     x, y, yaw = occupancy.origin
     if yaw != 0:
@@ -78,7 +78,7 @@ def choose_window(
 
 def snapshot(
     number: int,
-    occupancy: "MapLike",
+    occupancy: "OccupancyMap",
     points_world: NDArray[np.float64] | NDArray[np.float32],
     p_static: NDArray[np.float32],
     window: Window,
@@ -98,14 +98,14 @@ def snapshot(
 
 
 def cut(
-    occupancy: "MapLike", window: Window
+    occupancy: "OccupancyMap", window: Window
 ) -> tuple[NDArray[np.float32], tuple[float, float, float]]:
     """The cells (h, w) in `window` and their origin; NaN where the window leaves the map."""
     return cut_layer(occupancy, occupancy.p_occupied, window, np.nan)
 
 
 def cut_layer(
-    occupancy: "MapLike", layer: NDArray[Value], window: Window, outside: float
+    occupancy: "OccupancyMap", layer: NDArray[Value], window: Window, outside: float
 ) -> tuple[NDArray[Value], tuple[float, float, float]]:
     """The same of any (H, W) layer of a map; `outside` where the window leaves it."""
     x, y, _, _ = extent(occupancy)

@@ -11,7 +11,7 @@ from PIL import Image
 from stillmap.pipeline.options import MapMode
 
 if TYPE_CHECKING:
-    from stillmap.results.protocols import MapLike
+    from stillmap.em import OccupancyMap
 
 OCCUPIED_THRESH = 0.65
 
@@ -54,7 +54,7 @@ def raw_pixels(p_occupied: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.where(known, np.rint(100 * np.where(known, p_occupied, 0)), 255).astype(np.uint8)
 
 
-def write_map_server(folder: Path, occupancy: "MapLike", mode: MapMode = "trinary") -> None:
+def write_map_server(folder: Path, occupancy: "OccupancyMap", mode: MapMode = "trinary") -> None:
     """Write `map.pgm` (`map.png` in scale mode) and `map.yaml` into `folder`.
 
     The picture's top row is the map's highest y; the origin is the lower-left pixel's pose.

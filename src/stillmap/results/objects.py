@@ -12,7 +12,7 @@ from stillmap.core.arrays import write_npz
 from stillmap.core.recording import Recording
 from stillmap.pipeline.result import Result
 from stillmap.results.points import ply_header
-from stillmap.tracking import MovingObject, Traffic
+from stillmap.tracking import FlowMap, MovingObject
 
 _MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
 
@@ -80,7 +80,7 @@ def write_ply(
     path.write_bytes(ply_header(fields, len(ends)) + vertices.tobytes())
 
 
-def write_traffic(path: Path, traffic: Traffic) -> None:
+def write_traffic(path: Path, traffic: FlowMap) -> None:
     """Write `crossings`, `speed` (H, W), `origin` (x, y, yaw) and `resolution` in metres."""
     write_npz(
         path,

@@ -13,6 +13,7 @@ from stillmap.core.errors import InputError
 from stillmap.core.files import require_regular
 from stillmap.core.recording import Recording
 from stillmap.io.trajectory import poses_from_tum
+from stillmap.results.labels import shape_text
 
 Float = NDArray[np.float64]
 
@@ -220,10 +221,6 @@ def _track(one: dict[str, Any]) -> Track:
     if not np.isfinite([*numbers.ravel(), *size, *([] if z is None else z)]).all():
         raise ValueError("a number is not finite")
     return Track(int(one["id"]), size, stamp_ns, numbers[:, :2], numbers[:, 2:], z)
-
-
-def shape_text(shape: tuple[int | None, ...]) -> str:
-    return f"({', '.join('any' if n is None else str(n) for n in shape)})"
 
 
 def read_failure(error: OSError) -> str:

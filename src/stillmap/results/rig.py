@@ -9,36 +9,37 @@ from numpy.typing import NDArray
 from stillmap.core.json import count_skipped
 from stillmap.io.trajectory import write_tum
 from stillmap.mapping.beam_statistics import count_beams
+from stillmap.results.labels import write_labels
 from stillmap.results.objects import write_objects_of
-from stillmap.results.points import write_beams_of, write_clouds
-from stillmap.rig.build import Tilting
+from stillmap.results.points import write_clouds
+from stillmap.rig.build import TiltingResult
 
 FOLDER = "tilting"
 
 
 def write_tilting(
-    folder: Path, tilting: Tilting, colours: NDArray[np.uint8] | None = None
+    folder: Path, tilting: TiltingResult, colours: NDArray[np.uint8] | None = None
 ) -> None:
     """Write `static.ply`, `dynamic.ply` and `tilting/`: labels, poses and what moved, in 3D; with
     the colours (M, 3) of its beams' ends."""
-    seen, poses, p_static = tilting.seen, tilting.poses, tilting.p_static
+    seen, poses, p_static = tilting.deskewed, tilting.poses, tilting.p_static
     write_clouds(folder, seen, poses, p_static, colours)
     inside = folder / FOLDER
     inside.mkdir()
-    write_beams_of(inside / "beams", tilting.recording, p_static, colours)
+    write_labels(inside / "beams", tilting.recording, p_static, colours)
     write_tum(inside / "trajectory.tum", tilting.recording.stamp_ns, poses)
     write_objects_of(inside / "objects", tilting.objects, seen, poses, p_static)
 
 
-def tilting_record(tilting: Tilting) -> dict[str, Any]:
+def tilting_record(tilting: TiltingResult) -> dict[str, Any]:
     """What `run.json` says of it, JSON-able but for arrays."""
-    counts = count_beams(tilting.seen, tilting.p_static)
+    counts = count_beams(tilting.deskewed, tilting.p_static)
     return {
         "input": tilting.recording.source,
         "counts": {
             "scans": tilting.recording.n_scans,
             **{name: counts[name] for name in ("beams", "hits", "max_range", "unusable")},
-            "left_out": tilting.left_out,
+            "left_out": tilting.unposed_beams,
             "skipped": count_skipped(tilting.recording.source),
         },
         "dynamic": counts["dynamic"],

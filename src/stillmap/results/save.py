@@ -20,11 +20,12 @@ from stillmap.mapping.beam_statistics import count_beams
 from stillmap.mesh.build import Models
 from stillmap.pipeline.estimate import IterationRecord
 from stillmap.pipeline.result import Result
+from stillmap.results.labels import write_labels
 from stillmap.results.map_npz import known_area, write_map_npz
 from stillmap.results.map_server import write_map_server
 from stillmap.results.object_models import models_record, write_models
 from stillmap.results.objects import write_objects, write_traffic
-from stillmap.results.points import write_beams, write_clouds
+from stillmap.results.points import write_clouds
 from stillmap.results.pose_graph_g2o import write_g2o
 from stillmap.results.report.page import write_report
 from stillmap.results.report.previews import ModelPreviews, render_previews
@@ -144,14 +145,16 @@ def save(
         InputError: `path` is taken or cannot be written to.
     """
     colours = None if models is None or models.point_colors is None else models.point_colors.colors
-    with atomic_folder(path, RECORD, overwrite, staging_folder=within) as folder:
+    with atomic_folder(path, RECORD, overwrite, staging_folder=staging_folder) as folder:
         write_map_server(folder, result.map, result.options.output.map_mode)
         write_map_npz(folder / "map.npz", result.map, result.changes, result.evidence)
         write_tum(folder / "trajectory.tum", result.recording.stamp_ns, result.poses)
         if result.graph is not None:
             write_g2o(folder / "graph.g2o", result.graph, result.poses)
         in_space = result.recording.dimension == 3
-        write_beams(folder / "beams", result, colours if in_space else None)
+        write_labels(
+            folder / "beams", result.recording, result.p_static, colours if in_space else None
+        )
         if in_space:
             write_clouds(folder, result.seen, result.poses, result.p_static, colours)
         if result.options.objects.enabled:

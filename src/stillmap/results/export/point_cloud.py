@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import arrays
+from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import beam_stamps_ns
-from stillmap.em.observations import Chunk, iter_chunks
 from stillmap.io.point_cloud import ply
 from stillmap.io.point_cloud.binary_table import read_columns
 from stillmap.mapping.beam_statistics import DYNAMIC_BELOW

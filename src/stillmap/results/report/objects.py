@@ -17,8 +17,8 @@ from stillmap.results.report.figures import draw_map, draw_points, map_to_pixels
 from stillmap.results.report.maps import figure
 from stillmap.results.report.tables import duration_text, share_text
 from stillmap.results.rig import tilting_record
-from stillmap.rig.build import Tilting
-from stillmap.tracking import MovingObject, Traffic
+from stillmap.rig.build import TiltingResult
+from stillmap.tracking import FlowMap, MovingObject
 
 _MOST_WAYS, _MOST_ROWS = 500, 25
 
@@ -47,7 +47,7 @@ def objects_section(result: Result) -> str:
         '<div class="pair">'
         + figure("Ways", _ways_caption(objects), [(picture, "")], ways, window, reduced)
         + figure(
-            "Traffic",
+            "FlowMap",
             f"how often it was crossed: dark, {most}at most",
             [(draw_traffic(traffic, picture, window), "")],
             "",
@@ -59,7 +59,7 @@ def objects_section(result: Result) -> str:
     )
 
 
-def draw_traffic(traffic: Traffic, picture: Image.Image, window: Window) -> Image.Image:
+def draw_traffic(traffic: FlowMap, picture: Image.Image, window: Window) -> Image.Image:
     """Squares that were crossed, laid over the picture of the map in the same window."""
     image = np.array(picture.convert("RGB"))
     height, width = image.shape[:2]
@@ -141,7 +141,7 @@ def _table(objects: Sequence[MovingObject]) -> str:
     )
 
 
-def tilting_section(result: Result, tilting: Tilting | None) -> str:
+def tilting_section(result: Result, tilting: TiltingResult | None) -> str:
     """How much was cut out and by what, and where; empty where there is no such laser."""
     if tilting is None:
         return ""
@@ -168,7 +168,7 @@ def cut_sentences(record: Mapping[str, Any]) -> str:
     return said
 
 
-def _where(result: Result, tilting: Tilting) -> str:
+def _where(result: Result, tilting: TiltingResult) -> str:
     if not result.map.p_occupied.size:
         return ""
     window = map_window([result.map])

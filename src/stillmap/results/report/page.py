@@ -28,7 +28,7 @@ from stillmap.results.report.tables import (
     skipped_list,
     stages_table,
 )
-from stillmap.rig.build import Tilting
+from stillmap.rig.build import TiltingResult
 
 PAGE = Template("""<!DOCTYPE html>
 <html lang="en">
@@ -142,7 +142,7 @@ _PRINTED = (
 def write_report(
     path: Path,
     result: Result,
-    tilting: Tilting | None = None,
+    tilting: TiltingResult | None = None,
     stills: ModelPreviews | None = None,
 ) -> None:
     """Write the report as one HTML page of a few megabytes at most, whatever the map's size."""
@@ -150,7 +150,7 @@ def write_report(
 
 
 def render_report(
-    result: Result, tilting: Tilting | None = None, stills: ModelPreviews | None = None
+    result: Result, tilting: TiltingResult | None = None, stills: ModelPreviews | None = None
 ) -> str:
     """The page. All pictures lie in it; it holds no script and reads without one."""
     name = _name(result)

@@ -1,13 +1,11 @@
-import dataclasses
-
 import numpy as np
 import pytest
 
-from stillmap.results.points import write_beams
+from stillmap.results.labels import write_labels
 
 
 def test_arrays_can_be_mapped_and_hold_the_labels(tmp_path, result):
-    write_beams(tmp_path / "beams", result)
+    write_labels(tmp_path / "beams", result.recording, result.p_static)
     read = {
         path.stem: np.load(path, mmap_mode="r", allow_pickle=False)
         for path in (tmp_path / "beams").iterdir()
@@ -29,4 +27,4 @@ def test_arrays_can_be_mapped_and_hold_the_labels(tmp_path, result):
 
 def test_labels_of_another_recording_are_refused(tmp_path, result):
     with pytest.raises(ValueError, match="p_static"):
-        write_beams(tmp_path / "beams", dataclasses.replace(result, p_static=result.p_static[1:]))
+        write_labels(tmp_path / "beams", result.recording, result.p_static[1:])
