@@ -64,7 +64,7 @@ def kernels_of(recording: stillmap.Recording, poses: NDArray[np.float64]) -> dic
     options = stillmap.Options().em
     e = np.full(recording.n_beams, options.prior, np.float32)
     scans = (recording.points, recording.hit, e, recording.offset, T_map_sensor)
-    grid = _core.Grid2D(RESOLUTION)
+    grid = _core.OccupancyGrid2D(RESOLUTION)
     _core.add_beams(grid, *scans, 1)
     surface = observations.build_surfel_map(recording, T_map_sensor, RESOLUTION)
 
@@ -74,7 +74,9 @@ def kernels_of(recording: stillmap.Recording, poses: NDArray[np.float64]) -> dic
         return seen.likelihood()
 
     return {
-        "M-step: sums of (10)": lambda n: _core.add_beams(_core.Grid2D(RESOLUTION), *scans, n),
+        "M-step: sums of (10)": lambda n: _core.add_beams(
+            _core.OccupancyGrid2D(RESOLUTION), *scans, n
+        ),
         "likelihood (5)": lambda n: _core.log_likelihood(grid, *scans, options.prior, n),
         "E-step: element pass": elements,
         "E-step": lambda n: occupancy_hmm.e_step(recording, poses, RESOLUTION, options, n),

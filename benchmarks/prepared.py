@@ -103,9 +103,9 @@ def counts(
     hit: NDArray[np.bool_],
     weights: NDArray[np.float32],
     poses: Float,
-) -> _core.Grid2D:
+) -> _core.OccupancyGrid2D:
     """The sums of (10) of these beams, taken at the recording's scans."""
-    grid = _core.Grid2D(RESOLUTION)
+    grid = _core.OccupancyGrid2D(RESOLUTION)
     _core.add_beams(grid, points, hit, weights, recording.offset, recording.T_map_sensor(poses), 1)
     return grid
 

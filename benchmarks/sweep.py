@@ -88,7 +88,7 @@ def sweep(work: Path, threads: int) -> dict[str, float]:
     options = stillmap.Options().em
     e = em.initial_p_static(recording, "stillmap", options)
     loaded, started = peak_memory_bytes(), time.perf_counter()
-    grid = _core.Grid2D(RESOLUTION)
+    grid = _core.OccupancyGrid2D(RESOLUTION)
     em.add_recording(grid, recording, poses, e, threads)
     summed = time.perf_counter()
     em.e_step(recording, poses, grid, "stillmap", options, threads)

@@ -30,28 +30,30 @@ void ends(OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit
 
 template <int D>
 void fill(OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
-          const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses, double gap,
-          double tolerance, double growth, bool remove) {
+          const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses, double max_gap,
+          double tolerance, double max_gap_ratio, bool remove) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   const float* weights = per_beam(e, points.shape(0), "e");
-  require(gap >= 0.0 && tolerance >= 0.0 && growth >= 0.0,
-          "gap, tolerance, growth: expected numbers that are not negative");
+  require(max_gap >= 0.0 && tolerance >= 0.0 && max_gap_ratio >= 0.0,
+          "max_gap, tolerance, max_gap_ratio: expected numbers that are not negative");
   nb::gil_scoped_release released;
-  EndPointInterpolator<D>(grid, scans, weights, remove ? -1 : 1, {gap, tolerance, growth}).add();
+  EndPointInterpolator<D>(grid, scans, weights, remove ? -1 : 1,
+                          {max_gap, tolerance, max_gap_ratio})
+      .add();
 }
 
 template <int D>
 void add_no_return(OccupancyGrid<D>& grid, OccupancyGrid<D>& rest, const Points<D>& points,
                    const Flat<bool>& hit, const Flat<int64_t>& offset, const Poses<D>& poses,
-                   const Cells<D>& stop_cells, double beyond, int threads) {
+                   const Cells<D>& stop_cells, double end_margin, int threads) {
   require(&grid != &rest && grid.resolution() == rest.resolution(),
           "rest: expected another grid of the same resolution");
-  require(beyond >= 0.0, "beyond: expected a length in metres that is not negative");
+  require(end_margin >= 0.0, "end_margin: expected a length in metres that is not negative");
   const auto scans = scans_from<D>(points, hit, offset, poses);
   std::vector<Cell<D>> cells;
   for (size_t k = 0; k < stop_cells.shape(0); ++k) cells.push_back(cell_from<D>(stop_cells, k));
   nb::gil_scoped_release released;
-  add_no_return_beams<D>(grid, rest, scans, {cells, beyond / grid.resolution()}, threads);
+  add_no_return_beams<D>(grid, rest, scans, {cells, end_margin / grid.resolution()}, threads);
 }
 
 template <int D>
@@ -94,26 +96,28 @@ void bind(nb::module_& m) {
         nb::arg("remove") = false,
         "Adds the sums alpha, beta of (10) of all beams to the grid; e (M,) float32. With remove "
         "it subtracts what was added before, to the bit.");
-  m.def("add_ends", &ends<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+  m.def("add_end_points", &ends<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("remove") = false,
         "Adds what of the sums of `add_beams` depends on e, or subtracts it, to the bit: taken out "
         "with one e and added with another, they are those of the other.");
-  m.def("fill_surfaces", &fill<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+  m.def("interpolate_end_points", &fill<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
-        nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("gap"), nb::arg("tolerance"),
-        nb::arg("growth"), nb::arg("remove") = false,
+        nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("max_gap"),
+        nb::arg("tolerance"), nb::arg("max_gap_ratio"), nb::arg("remove") = false,
         "Adds end points a cell apart, with the smaller e of the two, between those of "
-        "neighbouring beams up to `gap` metres apart that go straight on, within `tolerance` "
-        "metres, from a third one at least 1 / `growth` of that gap away. Nothing passes through "
+        "neighbouring beams up to `max_gap` metres apart that go straight on, within `tolerance` "
+        "metres, from a third one at least 1 / `max_gap_ratio` of that gap away. Nothing passes "
+        "through "
         "cells for them. With remove it takes out what was added before, to the bit.");
-  m.def("add_lost", &add_no_return<D>, nb::arg("grid"), nb::arg("rest"),
+  m.def("add_no_return_beams", &add_no_return<D>, nb::arg("grid"), nb::arg("rest"),
         nb::arg("points").noconvert(), nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
-        nb::arg("T_map_sensor").noconvert(), nb::arg("stops").noconvert(), nb::arg("beyond"),
-        nb::arg("threads") = 1,
+        nb::arg("T_map_sensor").noconvert(), nb::arg("stop_cells").noconvert(),
+        nb::arg("end_margin"), nb::arg("threads") = 1,
         "Adds what `add_beams` adds for beams without a return, to the bit: to the grid as far as "
         "they are believed, the rest to another one. Fewer than three in a row are not believed; "
-        "the others up to the first of the cells stops (S, D) int64, but for the last `beyond` "
+        "the others up to the first of the cells stop_cells (S, D) int64, but for the last "
+        "`end_margin` "
         "metres, which may be infinite.");
   m.def("e_step", &expectations<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),

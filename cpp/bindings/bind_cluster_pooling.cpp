@@ -13,19 +13,21 @@ using Values = nb::ndarray<const float, nb::numpy, nb::ndim<2>, nb::c_contig, nb
 constexpr float kMaxValue = 1e6f;
 constexpr int kMaxColumnCells = 1 << 20;
 
-void make(ClusterPooling* self, const SurfelMap<3>& surfel_map, const Flat<bool>& stands,
-          const Values& values, int column, int64_t fewest) {
+void make(ClusterPooling* self, const SurfelMap<3>& surfel_map, const Flat<bool>& is_obstacle,
+          const Values& values, int column_cells, int64_t min_surfels) {
   const size_t n = surfel_map.size(), kinds = values.shape(1);
-  require(surfel_map.fitted(), "surface: fit it first");
-  require(stands.shape(0) == n, "stands: expected one per element");
+  require(surfel_map.fitted(), "surfel_map: fit it first");
+  require(is_obstacle.shape(0) == n, "is_obstacle: expected one per element");
   require(values.shape(0) == n && kinds > 0, "values: expected a row per element");
   bool bounded = true;
   for (size_t i = 0; i < n * kinds; ++i)
     bounded = bounded && std::abs(values.data()[i]) <= kMaxValue;
   require(bounded, "values: expected -1e6 to 1e6");
-  require(column >= 1 && column <= kMaxColumnCells, "column: expected 1 to 1048576 cells");
-  require(fewest >= 1, "fewest: expected at least 1");
-  new (self) ClusterPooling(surfel_map, stands.data(), values.data(), kinds, {column, fewest});
+  require(column_cells >= 1 && column_cells <= kMaxColumnCells,
+          "column_cells: expected 1 to 1048576 cells");
+  require(min_surfels >= 1, "min_surfels: expected at least 1");
+  new (self) ClusterPooling(surfel_map, is_obstacle.data(), values.data(), kinds,
+                            {column_cells, min_surfels});
 }
 
 void add(ClusterPooling& bodies, const Points<3>& points, const Flat<bool>& hit,
@@ -44,12 +46,13 @@ auto means(const ClusterPooling& bodies) {
 }  // namespace
 
 void bind_cluster_pooling(nb::module_& m) {
-  nb::class_<ClusterPooling>(m, "Bodies3D",
+  nb::class_<ClusterPooling>(m, "ClusterPooling3D",
                              "What stands apart in each sweep, and what is known of it.")
-      .def("__init__", &make, nb::arg("surface"), nb::arg("stands").noconvert(),
-           nb::arg("values").noconvert(), nb::kw_only(), nb::arg("column"), nb::arg("fewest"),
-           nb::keep_alive<1, 2>(),
-           "stands (E,): of which elements bodies consist; values (E, K) float32: what is known of "
+      .def("__init__", &make, nb::arg("surfel_map"), nb::arg("is_obstacle").noconvert(),
+           nb::arg("values").noconvert(), nb::kw_only(), nb::arg("column_cells"),
+           nb::arg("min_surfels"), nb::keep_alive<1, 2>(),
+           "is_obstacle (E,): of which elements bodies consist; values (E, K) float32: what is "
+           "known of "
            "each. Columns of that many cells touch within a body, which has that many elements at "
            "least.")
       .def("add", &add, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),

@@ -117,13 +117,13 @@ void bind(nb::module_& m, const char* name) {
       .def("merge", &G::merge, nb::arg("other"), "Adds the sums of another grid.")
       .def("alpha_beta", &alpha_beta<D>, nb::arg("cells").noconvert(),
            "(K, 2) float64 sums of (K, D) int64 cells; 0, 0 where nobody looked.")
-      .def("box", &box_of<D>,
+      .def("bounding_box", &box_of<D>,
            "first_cell (D,) int64 and shape of the box of cells that were looked at, as `dense` "
            "has them.")
       .def("dense", &dense<D>, nb::arg("first_cell") = nb::none(), nb::arg("shape") = nb::none(),
            "first_cell (D,) int64 and alpha, beta over a box of cells, or the one of those that "
            "were looked at; axes in reverse order, so that a 2D array is [row = y, column = x].")
-      .def("seen", &observed_mask<D>,
+      .def("observed_mask", &observed_mask<D>,
            "first_cell and uint8 over the same box: 1 where alpha + beta are not zero.");
 }
 
@@ -170,8 +170,8 @@ auto cells_along_any(const Flat<double>& start, const Flat<double>& end, double 
 }  // namespace
 
 void bind_grid(nb::module_& m) {
-  bind<2>(m, "Grid2D");
-  bind<3>(m, "Grid3D");
+  bind<2>(m, "OccupancyGrid2D");
+  bind<3>(m, "OccupancyGrid3D");
   m.def("traverse", &cells_along_any, nb::arg("start").noconvert(), nb::arg("end").noconvert(),
         nb::arg("resolution"),
         "Cells (K, D) int64 of a segment (D,) to (D,) in order, end cell last, and the chord "

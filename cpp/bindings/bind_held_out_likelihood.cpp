@@ -5,42 +5,47 @@
 namespace stillmap::bindings {
 namespace {
 
-const bool* per_scan(const Flat<bool>& held, size_t n_scans) {
-  require(held.shape(0) == n_scans, "held: expected one entry per scan");
-  return held.data();
+const bool* per_scan(const Flat<bool>& is_held_out, size_t n_scans) {
+  require(is_held_out.shape(0) == n_scans, "is_held_out: expected one entry per scan");
+  return is_held_out.data();
 }
 
 template <int D>
-void add_others(StaticFractionGrid<D>& shares, const Points<D>& points, const Flat<bool>& hit,
+void add_others(StaticFractionGrid<D>& fractions, const Points<D>& points, const Flat<bool>& hit,
                 const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses,
-                const Flat<bool>& held) {
+                const Flat<bool>& is_held_out) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   const float* weights = per_beam(e, points.shape(0), "e");
-  const bool* left_out = per_scan(held, scans.n_scans);
+  const bool* left_out = per_scan(is_held_out, scans.n_scans);
   nb::gil_scoped_release released;
-  shares.add(scans, weights, left_out);
+  fractions.add(scans, weights, left_out);
 }
 
-BeamModel checked(double stopping, double noise, double late, double delay, double outliers) {
-  require(stopping > 0.0 && std::isfinite(stopping), "stopping: expected a positive rate");
-  require(noise > 0.0 && noise <= 1e3, "noise: expected a positive length in metres");
-  require(delay > 0.0 && delay <= 1e3, "delay: expected a positive length in metres");
-  require_probability(late, "late");
-  require(outliers > 0.0 && outliers < 1.0, "outliers: expected a share between 0 and 1");
-  return {stopping, noise, late, delay, outliers};
+BeamModel checked(double stopping_rate, double range_std, double late_share, double mean_delay,
+                  double outlier_share) {
+  require(stopping_rate > 0.0 && std::isfinite(stopping_rate),
+          "stopping_rate: expected a positive rate");
+  require(range_std > 0.0 && range_std <= 1e3, "range_std: expected a positive length in metres");
+  require(mean_delay > 0.0 && mean_delay <= 1e3,
+          "mean_delay: expected a positive length in metres");
+  require_probability(late_share, "late_share");
+  require(outlier_share > 0.0 && outlier_share < 1.0,
+          "outlier_share: expected a share between 0 and 1");
+  return {stopping_rate, range_std, late_share, mean_delay, outlier_share};
 }
 
 template <int D>
-auto gains(const StaticFractionGrid<D>& shares, const Points<D>& points, const Flat<bool>& hit,
-           const Flat<int64_t>& offset, const Poses<D>& poses, const Flat<bool>& held,
-           double stopping, double noise, double late, double delay, double outliers, int threads) {
+auto gains(const StaticFractionGrid<D>& fractions, const Points<D>& points, const Flat<bool>& hit,
+           const Flat<int64_t>& offset, const Poses<D>& poses, const Flat<bool>& is_held_out,
+           double stopping_rate, double range_std, double late_share, double mean_delay,
+           double outlier_share, int threads) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
-  const bool* left_out = per_scan(held, scans.n_scans);
-  const BeamModel model = checked(stopping, noise, late, delay, outliers);
+  const bool* left_out = per_scan(is_held_out, scans.n_scans);
+  const BeamModel model = checked(stopping_rate, range_std, late_share, mean_delay, outlier_share);
   std::vector<HeldOutScore> sums(scans.n_scans);
   {
     nb::gil_scoped_release released;
-    score_held_out<D>(shares, scans, left_out, model, threads, sums.data());
+    score_held_out<D>(fractions, scans, left_out, model, threads, sums.data());
   }
   std::vector<double> out;
   out.reserve(2 * sums.size());
@@ -58,13 +63,13 @@ void bind(nb::module_& m, const char* name) {
       .def_prop_ro("dynamic_rate", &S::dynamic_rate, "ends at what moves, per metre")
       .def("add", &add_others<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
-           nb::arg("T_map_sensor").noconvert(), nb::arg("held").noconvert(),
+           nb::arg("T_map_sensor").noconvert(), nb::arg("is_held_out").noconvert(),
            "Adds the beams of the scans that are not held (T,); e (M,) float32.");
-  m.def("held_out", &gains<D>, nb::arg("shares"), nb::arg("points").noconvert(),
+  m.def("score_held_out", &gains<D>, nb::arg("fractions"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
-        nb::arg("T_map_sensor").noconvert(), nb::arg("held").noconvert(), nb::kw_only(),
-        nb::arg("stopping"), nb::arg("noise"), nb::arg("late"), nb::arg("delay"),
-        nb::arg("outliers"), nb::arg("threads") = 1,
+        nb::arg("T_map_sensor").noconvert(), nb::arg("is_held_out").noconvert(), nb::kw_only(),
+        nb::arg("stopping_rate"), nb::arg("range_std"), nb::arg("late_share"),
+        nb::arg("mean_delay"), nb::arg("outlier_share"), nb::arg("threads") = 1,
         "(T, 2) float64 per scan, zeros where it is not held: log likelihood of its ranges above "
         "that of a world in which beams end at the same rate everywhere, in nats; beams.");
 }
@@ -72,8 +77,8 @@ void bind(nb::module_& m, const char* name) {
 }  // namespace
 
 void bind_held_out_likelihood(nb::module_& m) {
-  bind<2>(m, "StaticShares2D");
-  bind<3>(m, "StaticShares3D");
+  bind<2>(m, "StaticFractionGrid2D");
+  bind<3>(m, "StaticFractionGrid3D");
 }
 
 }  // namespace stillmap::bindings

@@ -8,29 +8,36 @@
 namespace stillmap::bindings {
 namespace {
 
-MeanFieldOptions checked(double radius, double coplanar, double for_static, double for_dynamic,
-                         double least, double most, double moved, int rounds) {
+MeanFieldOptions checked(double radius, double coplanar_std, double static_coupling,
+                         double dynamic_coupling, double min_log_odds, double max_log_odds,
+                         double tolerance, int max_iterations) {
   require(radius >= 1.0 && radius <= 8.0, "radius: expected 1 to 8 cells");
-  require(coplanar > 0.0 && std::isfinite(coplanar), "coplanar: expected a positive length");
-  for (const double odds : {for_static, for_dynamic})
-    require(odds >= 0.0 && std::isfinite(odds), "expected log odds of at least 0");
-  require(std::isfinite(least) && std::isfinite(most) && least <= most, "expected least <= most");
-  require_probability(moved, "moved");
-  require(rounds >= 0, "rounds: expected no negative number");
-  return {radius, coplanar, for_static, for_dynamic, least, most, moved, rounds};
+  require(coplanar_std > 0.0 && std::isfinite(coplanar_std),
+          "coplanar_std: expected a positive length");
+  for (const double odds : {static_coupling, dynamic_coupling})
+    require(odds >= 0.0 && std::isfinite(odds),
+            "static_coupling, dynamic_coupling: expected log odds of at least 0");
+  require(
+      std::isfinite(min_log_odds) && std::isfinite(max_log_odds) && min_log_odds <= max_log_odds,
+      "min_log_odds, max_log_odds: expected min_log_odds <= max_log_odds");
+  require_probability(tolerance, "tolerance");
+  require(max_iterations >= 0, "max_iterations: expected no negative number");
+  return {radius,       coplanar_std, static_coupling, dynamic_coupling,
+          min_log_odds, max_log_odds, tolerance,       max_iterations};
 }
 
 template <int D>
 auto infer_p_static(const SurfelMap<D>& surfel_map, const Flat<float>& log_odds, double radius,
-                    double coplanar, double for_static, double for_dynamic, double least,
-                    double most, double moved, int rounds, int threads) {
+                    double coplanar_std, double static_coupling, double dynamic_coupling,
+                    double min_log_odds, double max_log_odds, double tolerance, int max_iterations,
+                    int threads) {
   const size_t n = surfel_map.size();
-  require(surfel_map.fitted(), "surface: fit it first");
-  require(surfel_map.hit_spans().size() == n, "surface: expected the looks of its end points");
+  require(surfel_map.fitted(), "surfel_map: fit it first");
+  require(surfel_map.hit_spans().size() == n, "surfel_map: expected the looks of its end points");
   require(log_odds.shape(0) == n, "log_odds: expected one per element");
   for (size_t k = 0; k < n; ++k) require(!std::isnan(log_odds.data()[k]), "log_odds: not a number");
-  const MeanFieldOptions options =
-      checked(radius, coplanar, for_static, for_dynamic, least, most, moved, rounds);
+  const MeanFieldOptions options = checked(radius, coplanar_std, static_coupling, dynamic_coupling,
+                                           min_log_odds, max_log_odds, tolerance, max_iterations);
   std::vector<float> out;
   {
     nb::gil_scoped_release released;
@@ -41,10 +48,11 @@ auto infer_p_static(const SurfelMap<D>& surfel_map, const Flat<float>& log_odds,
 
 template <int D>
 void bind(nb::module_& m) {
-  m.def("settled", &infer_p_static<D>, nb::arg("surface"), nb::arg("log_odds").noconvert(),
-        nb::kw_only(), nb::arg("radius"), nb::arg("coplanar"), nb::arg("for_static"),
-        nb::arg("for_dynamic"), nb::arg("least"), nb::arg("most"), nb::arg("moved"),
-        nb::arg("rounds"), nb::arg("threads") = 1,
+  m.def("smooth_mean_field", &infer_p_static<D>, nb::arg("surfel_map"),
+        nb::arg("log_odds").noconvert(), nb::kw_only(), nb::arg("radius"), nb::arg("coplanar_std"),
+        nb::arg("static_coupling"), nb::arg("dynamic_coupling"), nb::arg("min_log_odds"),
+        nb::arg("max_log_odds"), nb::arg("tolerance"), nb::arg("max_iterations"),
+        nb::arg("threads") = 1,
         "(E,) float32 probability of being static, from log odds (E,) float32 that the looks at "
         "each element alone give and from the elements within a radius (cells) of it.");
 }

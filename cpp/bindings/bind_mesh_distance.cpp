@@ -30,13 +30,14 @@ void make(MeshDistance* self, const Places<3>& vertices, const FacesOf& faces,
     const int32_t at = faces.data()[i];
     require(at >= 0 && static_cast<size_t>(at) < V, "faces: a vertex that is not there");
   }
-  require(max_distance >= 1e-6 && max_distance <= kFarthest, "reach: expected 1e-6 to 1e9 metres");
+  require(max_distance >= 1e-6 && max_distance <= kFarthest,
+          "max_distance: expected 1e-6 to 1e9 metres");
   nb::gil_scoped_release released;
   new (self) MeshDistance(vertices.data(), V, faces.data(), F, max_distance);
 }
 
-auto nearest(const MeshDistance& faces, const Places<3>& points, const Places<3>& origins,
-             int threads) {
+auto closest_faces(const MeshDistance& faces, const Places<3>& points, const Places<3>& origins,
+                   int threads) {
   const size_t n = points.shape(0);
   require(origins.shape(0) == n, "origins: expected a row per point");
   require(all_finite(points), "points: not finite");
@@ -54,18 +55,19 @@ auto nearest(const MeshDistance& faces, const Places<3>& points, const Places<3>
 
 void bind_mesh_distance(nb::module_& m) {
   nb::class_<MeshDistance>(
-      m, "NearFaces", "The faces of a mesh, to be asked which of them is the nearest to a point.")
+      m, "MeshDistance",
+      "The faces of a mesh, to be asked which of them is the nearest to a point.")
       .def("__init__", &make, nb::arg("vertices").noconvert(), nb::arg("faces").noconvert(),
-           nb::kw_only(), nb::arg("reach"),
+           nb::kw_only(), nb::arg("max_distance"),
            "vertices (V, 3) float64, metres; faces (F, 3) int32, counter-clockwise from where they "
-           "are seen; reach: metres to a face, beyond which it is not near.")
+           "are seen; max_distance: metres to a face, beyond which it is not near.")
       .def("__len__", &MeshDistance::size)
-      .def_prop_ro("reach", &MeshDistance::max_distance)
+      .def_prop_ro("max_distance", &MeshDistance::max_distance)
       .def_prop_ro("memory_bytes", &MeshDistance::memory_bytes)
-      .def("nearest", &nearest, nb::arg("points").noconvert(), nb::arg("origins").noconvert(),
-           nb::kw_only(), nb::arg("threads") = 1,
+      .def("closest_faces", &closest_faces, nb::arg("points").noconvert(),
+           nb::arg("origins").noconvert(), nb::kw_only(), nb::arg("threads") = 1,
            "Which face (n,) int32 has the place nearest to each of points (n, 3) float64, less "
-           "than the reach away, -1 where there is none; and the weights (n, 3) float64 of its "
+           "than max_distance away, -1 where there is none; and the weights (n, 3) float64 of its "
            "corners there, 0 where there is none. Faces without area do not count, nor those that "
            "have their back to where the point was seen from, origins (n, 3) float64; of several "
            "at one distance the lowest number does.");

@@ -17,25 +17,25 @@ namespace {
 
 template <int D>
 std::shared_ptr<const NoReturnBeams<D>> no_return_beams(const std::optional<Cells<D>>& stop_cells,
-                                                        double beyond, double resolution) {
-  require(beyond >= 0.0, "beyond: expected a length in metres that is not negative");
+                                                        double end_margin, double resolution) {
+  require(end_margin >= 0.0, "end_margin: expected a length in metres that is not negative");
   if (!stop_cells) return nullptr;
   std::vector<Cell<D>> cells;
   for (size_t k = 0; k < stop_cells->shape(0); ++k) cells.push_back(cell_from<D>(*stop_cells, k));
-  return std::make_shared<NoReturnBeams<D>>(NoReturnLimits<D>{cells, beyond / resolution});
+  return std::make_shared<NoReturnBeams<D>>(NoReturnLimits<D>{cells, end_margin / resolution});
 }
 
 template <int D>
 void add(ObservationCounts<D>& counts, const Points<D>& points, const Flat<bool>& hit,
-         const Flat<bool>& dynamic, const Flat<int64_t>& offset, const Poses<D>& poses,
-         const Flat<int64_t>& look, int threads) {
+         const Flat<bool>& is_dynamic, const Flat<int64_t>& offset, const Poses<D>& poses,
+         const Flat<int64_t>& time_bin, int threads) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
-  require(dynamic.shape(0) == points.shape(0),
-          "dynamic: expected " + std::to_string(points.shape(0)) +
-              " entries as points has rows, got " + std::to_string(dynamic.shape(0)));
-  require(look.shape(0) == scans.n_scans, "look: expected one number per scan");
+  require(is_dynamic.shape(0) == points.shape(0),
+          "is_dynamic: expected " + std::to_string(points.shape(0)) +
+              " entries as points has rows, got " + std::to_string(is_dynamic.shape(0)));
+  require(time_bin.shape(0) == scans.n_scans, "time_bin: expected one number per scan");
   nb::gil_scoped_release released;
-  counts.add(scans, dynamic.data(), look.data(), threads);
+  counts.add(scans, is_dynamic.data(), time_bin.data(), threads);
 }
 
 template <int D>
@@ -66,33 +66,38 @@ void bind(nb::module_& m, const char* name) {
       .def(
           "__init__",
           [](L* self, double resolution, double radius, const std::optional<Cells<D>>& stop_cells,
-             double beyond) {
-            new (self) L(resolution, radius, no_return_beams<D>(stop_cells, beyond, resolution));
+             double end_margin) {
+            new (self)
+                L(resolution, radius, no_return_beams<D>(stop_cells, end_margin, resolution));
           },
           nb::arg("resolution"), nb::kw_only(), nb::arg("radius"),
-          nb::arg("stops").noconvert() = nb::none(), nb::arg("beyond") = 0.0,
+          nb::arg("stop_cells").noconvert() = nb::none(), nb::arg("end_margin") = 0.0,
           "radius: metres around the end of a beam on something that moves within which a cell is "
-          "not clear, between the middles of cells. stops (S, D) int64, beyond: how far beams "
-          "without a return are believed, as `add_lost` has it; without stops all of their way.")
+          "not clear, between the middles of cells. stop_cells (S, D) int64, end_margin: how far "
+          "beams "
+          "without a return are believed, as `add_no_return_beams` has it; without stop_cells all "
+          "of their way.")
       .def_prop_ro("resolution", &L::resolution, "metres")
       .def_prop_ro("radius", &L::radius, "metres")
       .def_prop_ro("dimension", [](const L&) { return D; })
       .def_prop_ro("memory_bytes", &L::memory_bytes)
-      .def("add", &add<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
-           nb::arg("dynamic").noconvert(), nb::arg("offset").noconvert(),
-           nb::arg("T_map_sensor").noconvert(), nb::arg("look").noconvert(), nb::arg("threads") = 1,
-           "Adds scans; dynamic (M,) bool: the hits on something that moves. look (T,) int64 "
-           "numbers their looks, must not fall, and goes beyond those of earlier calls.")
+      .def(
+          "add", &add<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+          nb::arg("is_dynamic").noconvert(), nb::arg("offset").noconvert(),
+          nb::arg("T_map_sensor").noconvert(), nb::arg("time_bin").noconvert(),
+          nb::arg("threads") = 1,
+          "Adds scans; is_dynamic (M,) bool: the hits on something that moves. time_bin (T,) int64 "
+          "numbers their looks, must not fall, and goes beyond those of earlier calls.")
       .def("dense", &dense<D>, nb::arg("first_cell"), nb::arg("shape"),
            "looks and clear, uint16 that stop at 65535, over a box of cells, axes in reverse "
-           "order as those of `Grid2D.dense`.");
+           "order as those of `OccupancyGrid2D.dense`.");
 }
 
 }  // namespace
 
 void bind_observation_counts(nb::module_& m) {
-  bind<2>(m, "LookCounts2D");
-  bind<3>(m, "LookCounts3D");
+  bind<2>(m, "ObservationCounts2D");
+  bind<3>(m, "ObservationCounts3D");
 }
 
 }  // namespace stillmap::bindings

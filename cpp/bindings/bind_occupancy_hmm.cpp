@@ -26,8 +26,8 @@ void add_observations(OccupancyHmm<D>& hmm, const Points<D>& points, const Flat<
                       const Flat<int64_t>& time_bin, int threads,
                       const std::optional<Places<D>>& place) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
-  require(time_bin.shape(0) == scans.n_scans, "look: expected one number per scan");
-  require(!place || place->shape(0) == scans.n_scans, "place: expected one per scan");
+  require(time_bin.shape(0) == scans.n_scans, "time_bin: expected one number per scan");
+  require(!place || place->shape(0) == scans.n_scans, "positions: expected one per scan");
   nb::gil_scoped_release released;
   hmm.add(scans, time_bin.data(), place ? place->data() : nullptr, threads);
 }
@@ -36,10 +36,10 @@ template <int D>
 auto likelihoods(OccupancyHmm<D>& hmm, const std::optional<Flat<bool>>& among,
                  const std::optional<Slice>& rows, int threads) {
   std::vector<size_t> classes;
-  require(!among || among->shape(0) == hmm.classes(), "among: expected one per class");
+  require(!among || among->shape(0) == hmm.classes(), "classes: expected one per class");
   for (size_t c = 0; c < hmm.classes(); ++c)
     if (!among || among->data()[c]) classes.push_back(c);
-  require(!classes.empty(), "among: expected a class");
+  require(!classes.empty(), "classes: expected a class");
   const auto [first, stride, n] = rows_from(rows, hmm.surfel_map().size());
   const size_t C = classes.size();
   std::vector<float> relative(n * C);
@@ -55,7 +55,7 @@ auto likelihoods(OccupancyHmm<D>& hmm, const std::optional<Flat<bool>>& among,
 template <int D>
 auto describe_changes(const OccupancyHmm<D>& hmm, const std::optional<Slice>& rows) {
   const ChangeHmm& changes = hmm.change_hmm();
-  require(changes.has_paths(), "changes: nobody asked for courses");
+  require(changes.has_paths(), "changes: expected track_changes with paths before");
   const auto [first, stride, n] = rows_from(rows, changes.members());
   std::vector<double> log_likelihood(n);
   std::vector<float> p_last(n * 2), share(n);
@@ -85,7 +85,7 @@ auto describe_changes(const OccupancyHmm<D>& hmm, const std::optional<Slice>& ro
 }
 
 template <int D>
-auto log_changing(const OccupancyHmm<D>& hmm, const std::optional<Slice>& rows) {
+auto change_log_likelihood(const OccupancyHmm<D>& hmm, const std::optional<Slice>& rows) {
   const ChangeHmm& changes = hmm.change_hmm();
   const auto [first, stride, n] = rows_from(rows, changes.members());
   std::vector<double> values(n);
@@ -114,12 +114,12 @@ OccupancyClasses checked_classes(std::vector<double> rho, std::vector<double> ta
                                  std::vector<double> turn, double detection) {
   if (turn.empty()) turn.assign(rho.size(), std::numeric_limits<double>::infinity());
   require(!rho.empty() && rho.size() == tau.size() && rho.size() == turn.size(),
-          "rho, tau, turn: expected one number per class");
-  require(rho.size() <= kMaxClasses, "rho, tau, turn: too many classes");
+          "rho, tau, view_angle: expected one number per class");
+  require(rho.size() <= kMaxClasses, "rho, tau, view_angle: too many classes");
   for (const double r : rho) require(r > 0.0 && r < 1.0, "rho: expected shares between 0 and 1");
   for (const double t : tau) require(t > 0.0, "tau: expected positive times");
-  for (const double v : turn) require(v > 0.0, "turn: expected positive angles");
-  require(detection > 0.0 && detection < 1.0, "detection: expected a probability below 1");
+  for (const double v : turn) require(v > 0.0, "view_angle: expected positive angles");
+  require(detection > 0.0 && detection < 1.0, "p_detection: expected a probability below 1");
   return {std::move(rho), std::move(tau), std::move(turn), detection};
 }
 
@@ -136,57 +136,61 @@ void bind(nb::module_& m, const char* name) {
              std::vector<double> turn, double detection, double seconds, double lateral,
              double margin, double reach, double beyond, bool normals, int threads) {
             for (const double x : {seconds, lateral, margin, reach, beyond})
-              require(x > 0.0 && std::isfinite(x), "looks: expected positive lengths and times");
+              require(x > 0.0 && std::isfinite(x),
+                      "bin_seconds, lateral_std, margin, hit_radius, end_margin: expected positive "
+                      "numbers");
             const double r = s.resolution();
             new (self)
                 W(s, checked_classes(std::move(rho), std::move(tau), std::move(turn), detection),
                   {seconds, lateral / r, margin / r, reach / r, beyond / r, 1.0, normals}, threads);
           },
-          nb::arg("surface"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"),
-          nb::arg("turn") = std::vector<double>{}, nb::arg("detection"), nb::arg("seconds"),
-          nb::arg("lateral"), nb::arg("margin"), nb::arg("reach"), nb::arg("beyond"),
-          nb::arg("normals") = true, nb::arg("threads") = 1, nb::keep_alive<1, 2>())
+          nb::arg("surfel_map"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"),
+          nb::arg("view_angle") = std::vector<double>{}, nb::arg("p_detection"),
+          nb::arg("bin_seconds"), nb::arg("lateral_std"), nb::arg("margin"), nb::arg("hit_radius"),
+          nb::arg("end_margin"), nb::arg("use_normals") = true, nb::arg("threads") = 1,
+          nb::keep_alive<1, 2>())
       .def("add", &add_observations<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
-           nb::arg("look").noconvert(), nb::arg("threads") = 1,
-           nb::arg("place").noconvert() = nb::none(),
+           nb::arg("time_bin").noconvert(), nb::arg("threads") = 1,
+           nb::arg("positions").noconvert() = nb::none(),
            "Adds scans; look (T,) int64 numbers their looks and must not fall. All scans of one "
            "look belong into one call. place (T, D): where the robot stood, metres; without, the "
            "sensors' places are asked how far the view turned.")
-      .def("lost", &no_return_stats<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
-           nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
-           nb::arg("threads") = 1,
+      .def("count_no_return_beams", &no_return_stats<D>, nb::arg("points").noconvert(),
+           nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
+           nb::arg("T_map_sensor").noconvert(), nb::arg("threads") = 1,
            "Beams without a return that have such beams beside them, and how many of these cross "
            "something solid.")
-      .def("solid", &solid_cells<D>,
+      .def("solid_cells", &solid_cells<D>,
            "(S, D) int64 cells of surfaces on which many beams ended: the solid things.")
       .def(
-          "trust",
-          [](W& w, double open) {
-            require(open >= 0.0 && open <= 1.0, "open: expected a share between 0 and 1");
-            w.set_trust_beyond_solid(open);
+          "set_trust_beyond_solid",
+          [](W& w, double trust) {
+            require(trust >= 0.0 && trust <= 1.0, "trust: expected a share between 0 and 1");
+            w.set_trust_beyond_solid(trust);
           },
-          nb::arg("open"),
+          nb::arg("trust"),
           "How far to trust beams without a return beyond the first solid thing in their way; all "
           "the way at first.")
       .def(
-          "watch",
-          [](W& w, double tau, double passing_occupied, double passing_tau, double detection,
+          "track_changes",
+          [](W& w, double tau, double passer_by_rho, double passer_by_tau, double detection,
              bool courses) {
-            for (const double t : {tau, passing_tau})
-              require(t > 0.0 && std::isfinite(t), "tau: expected positive times");
-            for (const double p : {passing_occupied, detection})
-              require(p > 0.0 && p < 1.0, "expected probabilities between 0 and 1");
-            w.track_changes({tau, passing_occupied, passing_tau, detection}, courses);
+            for (const double t : {tau, passer_by_tau})
+              require(t > 0.0 && std::isfinite(t), "tau, passer_by_tau: expected positive times");
+            for (const double p : {passer_by_rho, detection})
+              require(p > 0.0 && p < 1.0,
+                      "passer_by_rho, p_detection: expected probabilities between 0 and 1");
+            w.track_changes({tau, passer_by_rho, passer_by_tau, detection}, courses);
           },
-          nb::kw_only(), nb::arg("tau"), nb::arg("passing_occupied"), nb::arg("passing_tau"),
-          nb::arg("detection"), nb::arg("courses") = true,
+          nb::kw_only(), nb::arg("tau"), nb::arg("passer_by_rho"), nb::arg("passer_by_tau"),
+          nb::arg("p_detection"), nb::arg("with_paths") = true,
           "Asks, before the first look, which elements are of things that come to stay or leave: "
           "correlation time in seconds; share of the time and correlation time of passers-by. "
-          "Without courses only `log_changing` is known of them.")
-      .def("log_changing", &log_changing<D>, nb::arg("rows") = nb::none(),
+          "Without courses only `change_log_likelihood` is known of them.")
+      .def("change_log_likelihood", &change_log_likelihood<D>, nb::arg("rows") = nb::none(),
            "(E,) the first of `changes`.")
-      .def("rest", &W::release_buffers,
+      .def("release_buffers", &W::release_buffers,
            "Lets go what only further looks would want; they make it anew.")
       .def(
           "changes", &describe_changes<D>, nb::arg("rows") = nb::none(),
@@ -196,7 +200,7 @@ void bind(nb::module_& m, const char* name) {
           "(E, 2) float32 probability of it at the last look; (E, 2) int32 how often it came or "
           "left; (E, 2, 2, 2) int32 looks before and after the first and the last time, -1: none. "
           "rows (first, last, every): of some of the elements.")
-      .def("likelihood", &likelihoods<D>, nb::arg("among") = nb::none(),
+      .def("likelihood", &likelihoods<D>, nb::arg("classes") = nb::none(),
            nb::arg("rows") = nb::none(), nb::arg("threads") = 1,
            "(E, C) float32 relative to the best class, (E,) logarithm of the best: of everything "
            "else that was seen of the cell, given that a beam ended in it; under those of the "
@@ -207,8 +211,8 @@ void bind(nb::module_& m, const char* name) {
 }  // namespace
 
 void bind_occupancy_hmm(nb::module_& m) {
-  bind<2>(m, "Dwell2D");
-  bind<3>(m, "Dwell3D");
+  bind<2>(m, "OccupancyHmm2D");
+  bind<3>(m, "OccupancyHmm3D");
 }
 
 }  // namespace stillmap::bindings

@@ -52,11 +52,11 @@ TimedPoints<D> timed_points(const Points<D>& points, const Flat<float>& weights,
   return beams;
 }
 
-PlaneOptions plane_options(double least, double flat, double wide) {
-  require(least > 0.0, "least: expected a positive weight");
-  require(flat >= 0.0 && flat <= 1.0, "flat: expected a share in [0, 1]");
-  require(wide >= 0.0, "wide: expected a variance that is not negative");
-  return {least, flat, wide};
+PlaneOptions plane_options(double min_weight, double max_flatness, double min_extent) {
+  require(min_weight > 0.0, "min_weight: expected a positive weight");
+  require(max_flatness >= 0.0 && max_flatness <= 1.0, "max_flatness: expected a share in [0, 1]");
+  require(min_extent >= 0.0, "min_extent: expected a variance that is not negative");
+  return {min_weight, max_flatness, min_extent};
 }
 
 template <int D>
@@ -73,7 +73,7 @@ void add_points(NdtMap<D>& map, const Points<D>& points, const Flat<float>& weig
 }
 
 template <int D>
-void keep_near(NdtMap<D>& map, const OnePose<D>& T, double radius) {
+void crop(NdtMap<D>& map, const OnePose<D>& T, double radius) {
   require(radius > 0.0, "radius: expected a positive length in metres");
   const Pose<D> pose = checked_pose<D>(T, "T_map_base");
   nb::gil_scoped_release released;
@@ -82,17 +82,17 @@ void keep_near(NdtMap<D>& map, const OnePose<D>& T, double radius) {
 
 // Normals (N, D), offsets and variances (N,), and validity (N,).
 template <int D>
-auto planes(const NdtMap<D>& map, const Places<D>& places, int level, double least, double flat,
-            double wide) {
-  const PlaneOptions options = plane_options(least, flat, wide);
+auto fit_planes(const NdtMap<D>& map, const Places<D>& positions, int level, double min_weight,
+                double max_flatness, double min_extent) {
+  const PlaneOptions options = plane_options(min_weight, max_flatness, min_extent);
   require(level >= 0 && level < map.levels(), "level: there is none of that number");
-  const size_t n = places.shape(0);
+  const size_t n = positions.shape(0);
   std::vector<double> normals(n * D, 0.0), offsets(n, 0.0), variances(n, 0.0);
   std::vector<int8_t> known(n, 0);
   {
     nb::gil_scoped_release released;
     for (size_t i = 0; i < n; ++i) {
-      const Vec<D> place = Eigen::Map<const Vec<D>>(places.data() + i * D);
+      const Vec<D> place = Eigen::Map<const Vec<D>>(positions.data() + i * D);
       Plane<D> plane;
       if (!map.fit_plane(place, level, options, plane)) continue;
       known[i] = 1;
@@ -126,17 +126,18 @@ auto register_to_map(const NdtMap<D>& map, const Points<D>& points, const Flat<f
                      const Flat<float>& times, const OnePose<D>& T_prior,
                      const Tangents<D>& twist_prior, const MovingSquare<D>& information,
                      const std::optional<OnePose<D>>& T_start,
-                     const std::optional<Tangents<D>>& twist_start, double least, double flat,
-                     double wide, double sigma, double kernel, double gain, int start_level,
-                     double start_slack, int max_iterations, double tolerance, int threads) {
-  require(sigma > 0.0 && kernel > 0.0 && gain > 0.0,
-          "sigma, kernel, gain: expected to be positive");
+                     const std::optional<Tangents<D>>& twist_start, double min_weight,
+                     double max_flatness, double min_extent, double range_std, double kernel_width,
+                     double information_scale, int start_level, double start_slack,
+                     int max_iterations, double tolerance, int threads) {
+  require(range_std > 0.0 && kernel_width > 0.0 && information_scale > 0.0,
+          "range_std, kernel_width, information_scale: expected to be positive");
   require(start_level >= 0 && start_slack >= 0.0 && max_iterations >= 0 && tolerance > 0.0,
           "start_level, start_slack, max_iterations, tolerance: out of range");
-  const PlaneRegistrationOptions options{plane_options(least, flat, wide),
-                                         sigma,
-                                         kernel,
-                                         gain,
+  const PlaneRegistrationOptions options{plane_options(min_weight, max_flatness, min_extent),
+                                         range_std,
+                                         kernel_width,
+                                         information_scale,
                                          start_level,
                                          start_slack,
                                          max_iterations,
@@ -167,10 +168,16 @@ auto register_to_map(const NdtMap<D>& map, const Points<D>& points, const Flat<f
 template <int D>
 auto linearise_sweep(const NdtMap<D>& map, const Points<D>& points, const Flat<float>& weights,
                      const Flat<float>& times, const OnePose<D>& T, const Tangents<D>& twist,
-                     double least, double flat, double wide, double sigma, double kernel, int level,
-                     double slack) {
-  const PlaneRegistrationOptions options{
-      plane_options(least, flat, wide), sigma, kernel, 1.0, level, slack, 0, 1.0};
+                     double min_weight, double max_flatness, double min_extent, double range_std,
+                     double kernel_width, int level, double slack) {
+  const PlaneRegistrationOptions options{plane_options(min_weight, max_flatness, min_extent),
+                                         range_std,
+                                         kernel_width,
+                                         1.0,
+                                         level,
+                                         slack,
+                                         0,
+                                         1.0};
   require(level >= 0 && level < map.levels(), "level: there is none of that number");
   const MotionState<D> at{checked_pose<D>(T, "T"), finite_tangent<D>(twist, "twist")};
   const auto q =
@@ -180,7 +187,7 @@ auto linearise_sweep(const NdtMap<D>& map, const Points<D>& points, const Flat<f
 }
 
 template <int D>
-auto carried_points(const Points<D>& points, const Flat<float>& times, const Tangents<D>& twist) {
+auto transform_points(const Points<D>& points, const Flat<float>& times, const Tangents<D>& twist) {
   const size_t n = points.shape(0);
   const float* tau = per_beam(times, n, "times");
   const auto xi = finite_tangent<D>(twist, "twist");
@@ -198,13 +205,14 @@ auto carried_points(const Points<D>& points, const Flat<float>& times, const Tan
 }
 
 template <int D>
-auto thinned(const Points<D>& points, const Flat<float>& weights, double edge) {
-  require(edge > 0.0 && std::isfinite(edge), "edge: expected a positive length in metres");
+auto downsample(const Points<D>& points, const Flat<float>& weights, double voxel_size) {
+  require(voxel_size > 0.0 && std::isfinite(voxel_size),
+          "voxel_size: expected a positive length in metres");
   const float* w = per_beam(weights, points.shape(0), "weights");
   std::vector<int64_t> kept;
   {
     nb::gil_scoped_release released;
-    kept = voxel_downsample<D>(points.data(), w, points.shape(0), edge);
+    kept = voxel_downsample<D>(points.data(), w, points.shape(0), voxel_size);
   }
   const size_t n = kept.size();
   return to_numpy(std::move(kept), {n});
@@ -213,31 +221,32 @@ auto thinned(const Points<D>& points, const Flat<float>& weights, double edge) {
 // 3D only: in 2D scans are registered against a likelihood field.
 void bind_in_space(nb::module_& m) {
   constexpr int D = 3;
-  nb::class_<NdtMap<D>>(m, "SweepMap3D",
+  nb::class_<NdtMap<D>>(m, "NdtMap3D",
                         "Moments of end points in cells of `edge` metres, and of twice, four "
                         "times, ... that on further levels; a cell takes no more once it weighs "
-                        "`enough`.")
-      .def(nb::init<double, int, double>(), nb::arg("edge"), nb::arg("levels"), nb::arg("enough"))
+                        "`max_weight`.")
+      .def(nb::init<double, int, double>(), nb::arg("edge"), nb::arg("levels"),
+           nb::arg("max_weight"))
       .def("__len__", &NdtMap<D>::size)
       .def_prop_ro("levels", &NdtMap<D>::levels)
       .def_prop_ro("memory_bytes", &NdtMap<D>::memory_bytes)
       .def("add", &add_points<D>, nb::arg("points").noconvert(), nb::arg("weights").noconvert(),
            nb::arg("T_map_base").noconvert(),
            "Takes in points (N, D) float32 in the moving frame, weights (N,) float32 = e.")
-      .def("keep_near", &keep_near<D>, nb::arg("T_map_base").noconvert(), nb::arg("radius"),
+      .def("crop", &crop<D>, nb::arg("T_map_base").noconvert(), nb::arg("radius"),
            "Forgets what lies farther than that many metres from a pose.")
-      .def("planes", &planes<D>, nb::arg("places").noconvert(), nb::arg("level"), nb::kw_only(),
-           nb::arg("least"), nb::arg("flat"), nb::arg("wide"),
+      .def("fit_planes", &fit_planes<D>, nb::arg("positions").noconvert(), nb::arg("level"),
+           nb::kw_only(), nb::arg("min_weight"), nb::arg("max_flatness"), nb::arg("min_extent"),
            "Normals (N, D), offsets (N,) along them, variances (N,) across, and (N,) int8 whether "
-           "there is a surface around places (N, D) float64.");
+           "there is a surface around positions (N, D) float64.");
   m.def("register_sweep", &register_to_map<D>, nb::arg("map"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("times").noconvert(),
         nb::arg("T_prior").noconvert(), nb::arg("twist_prior").noconvert(),
         nb::arg("information").noconvert(), nb::arg("T_start").noconvert() = nb::none(),
-        nb::arg("twist_start").noconvert() = nb::none(), nb::kw_only(), nb::arg("least"),
-        nb::arg("flat"), nb::arg("wide"), nb::arg("sigma"), nb::arg("kernel"), nb::arg("gain"),
-        nb::arg("start_level"), nb::arg("start_slack"), nb::arg("max_iterations"),
-        nb::arg("tolerance"), nb::arg("threads"),
+        nb::arg("twist_start").noconvert() = nb::none(), nb::kw_only(), nb::arg("min_weight"),
+        nb::arg("max_flatness"), nb::arg("min_extent"), nb::arg("range_std"),
+        nb::arg("kernel_width"), nb::arg("information_scale"), nb::arg("start_level"),
+        nb::arg("start_slack"), nb::arg("max_iterations"), nb::arg("tolerance"), nb::arg("threads"),
         "Pose and motion of one sweep against a map. points (N, D) float32 in the moving frame at "
         "the time of each, times (N,) float32 seconds from the pose, weights (N,) float32 = e; "
         "T_prior (D+1, D+1), twist_prior (dof,) = velocity and rate of turn in the moving frame, "
@@ -246,15 +255,17 @@ void bind_in_space(nb::module_& m) {
         "the number of steps.");
   m.def("linearise_sweep", &linearise_sweep<D>, nb::arg("map"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("times").noconvert(), nb::arg("T").noconvert(),
-        nb::arg("twist").noconvert(), nb::kw_only(), nb::arg("least"), nb::arg("flat"),
-        nb::arg("wide"), nb::arg("sigma"), nb::arg("kernel"), nb::arg("level"), nb::arg("slack"),
+        nb::arg("twist").noconvert(), nb::kw_only(), nb::arg("min_weight"), nb::arg("max_flatness"),
+        nb::arg("min_extent"), nb::arg("range_std"), nb::arg("kernel_width"), nb::arg("level"),
+        nb::arg("slack"),
         "Hessian, gradient and cost of its data term at one pose, and the three weights.");
-  m.def("carried", &carried_points<D>, nb::arg("points").noconvert(), nb::arg("times").noconvert(),
-        nb::arg("twist").noconvert(),
+  m.def("transform_by_twist", &transform_points<D>, nb::arg("points").noconvert(),
+        nb::arg("times").noconvert(), nb::arg("twist").noconvert(),
         "Points (N, D) as seen at the time of the pose: Exp(time twist) p.");
-  m.def("first_in_cells", &thinned<D>, nb::arg("points").noconvert(),
-        nb::arg("weights").noconvert(), nb::arg("edge"),
-        "Indices, rising, of the first usable points with a weight in each cell of `edge` metres.");
+  m.def("voxel_downsample", &downsample<D>, nb::arg("points").noconvert(),
+        nb::arg("weights").noconvert(), nb::arg("voxel_size"),
+        "Indices, rising, of the first usable points with a weight in each cell of `voxel_size` "
+        "metres.");
 }
 
 }  // namespace

@@ -33,15 +33,16 @@ WeightedBeams<D> beams_from(const Points<D>& points, const Flat<float>& weights)
 }
 
 template <int D>
-auto register_beams(const OccupancyGrid<D>& grid, const Points<D>& points,
-                    const Flat<float>& weights, const OnePose<D>& T_prior,
-                    const Square<D>& information, double sigma, int radius, double floor,
-                    double unknown, double gain, int max_iterations, double window_translation,
-                    double window_rotation, double search_range, int starts,
-                    const std::optional<OnePose<D>>& T_start) {
-  require(starts >= 1, "starts: expected at least one");
-  const ScanRegistrationOptions options{{sigma, radius, floor, unknown}, gain, max_iterations};
-  require(gain > 0.0, "gain: expected a positive number");
+auto register_scan(const OccupancyGrid<D>& grid, const Points<D>& points,
+                   const Flat<float>& weights, const OnePose<D>& T_prior,
+                   const Square<D>& information, double sigma, int radius, double floor,
+                   double unknown, double information_scale, int max_iterations,
+                   double window_translation, double window_rotation, double search_range,
+                   int max_candidates, const std::optional<OnePose<D>>& T_start) {
+  require(max_candidates >= 1, "max_candidates: expected at least one");
+  const ScanRegistrationOptions options{
+      {sigma, radius, floor, unknown}, information_scale, max_iterations};
+  require(information_scale > 0.0, "information_scale: expected a positive number");
   require(window_translation >= 0.0 && window_rotation >= 0.0 && window_rotation <= 3.2,
           "window: expected half widths, rotation at most pi");
   auto beams = beams_from<D>(points, weights);
@@ -60,8 +61,8 @@ auto register_beams(const OccupancyGrid<D>& grid, const Points<D>& points,
     LikelihoodField<D> field(grid, options.field);
     const SearchWindow window{window_translation, window_rotation, search_range};
     CorrelativeSearch<D> search(grid, beams, prior, window, options);
-    const auto starting_poses =
-        given ? std::vector<Candidate<D>>{{*given, 0.0}} : search.best(static_cast<size_t>(starts));
+    const auto starting_poses = given ? std::vector<Candidate<D>>{{*given, 0.0}}
+                                      : search.best(static_cast<size_t>(max_candidates));
     for (const auto& start : starting_poses) {
       found.push_back(minimise_levenberg_marquardt<D>(field, beams, prior, start.pose, options));
       if (found.back().cost < best.cost) best = found.back();
@@ -85,13 +86,14 @@ auto register_beams(const OccupancyGrid<D>& grid, const Points<D>& points,
 }
 
 template <int D>
-double through(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<float>& weights,
-               const OnePose<D>& T, const OnePose<D>& T_sensor, double margin, double occupied) {
+double occluded_share_at(const OccupancyGrid<D>& grid, const Points<D>& points,
+                         const Flat<float>& weights, const OnePose<D>& T,
+                         const OnePose<D>& T_sensor, double margin, double min_occupancy) {
   require(margin >= 0.0, "margin: expected a length in metres that is not negative");
-  require_probability(occupied, "occupied");
+  require_probability(min_occupancy, "min_occupancy");
   const auto beams = beams_from<D>(points, weights);
   return occluded_share<D>(grid, beams.points, beams.weights, checked_pose<D>(T, "T"),
-                           checked_pose<D>(T_sensor, "T_sensor").t, margin, occupied);
+                           checked_pose<D>(T_sensor, "T_sensor").t, margin, min_occupancy);
 }
 
 // Data term without the constant ln(floor + 1) per beam, as in the reference implementation.
@@ -123,21 +125,21 @@ auto gradient_at(const OccupancyGrid<D>& grid, const Points<D>& points, const Fl
 template <int D>
 void bind(nb::module_& m) {
   m.def(
-      "register_beams", &register_beams<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+      "register_scan", &register_scan<D>, nb::arg("grid"), nb::arg("points").noconvert(),
       nb::arg("weights").noconvert(), nb::arg("T_prior").noconvert(),
       nb::arg("information").noconvert(), nb::kw_only(), nb::arg("sigma"), nb::arg("radius"),
-      nb::arg("floor"), nb::arg("unknown"), nb::arg("gain"), nb::arg("max_iterations"),
+      nb::arg("floor"), nb::arg("unknown"), nb::arg("information_scale"), nb::arg("max_iterations"),
       nb::arg("window_translation"), nb::arg("window_rotation"), nb::arg("search_range"),
-      nb::arg("starts"), nb::arg("T_start") = nb::none(),
+      nb::arg("max_candidates"), nb::arg("T_start") = nb::none(),
       "(9): the pose of one scan against the grid so far. points (N, D) float32 that were hit, in "
       "the moving frame; weights (N,) float32 = e; T_prior (D+1, D+1) and its information "
       "(dof, dof) of (translation, rotation about the moving frame's origin). Returns pose, "
       "covariance, cost, the share of beams the map explains, Newton steps, lattice poses, and "
       "(R, dof + 1) how far every start ended up from that pose and how much more it cost. With "
       "T_start nothing is searched: Newton steps begin there.");
-  m.def("share_through", &through<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+  m.def("occluded_share", &occluded_share_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("T_sensor").noconvert(),
-        nb::kw_only(), nb::arg("margin"), nb::arg("occupied"),
+        nb::kw_only(), nb::arg("margin"), nb::arg("min_occupancy"),
         "Weighted share of beams, from a sensor at T T_sensor to the points at T, that cross a "
         "cell of at least that occupancy more than `margin` metres before their end.");
   m.def("registration_cost", &cost_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),

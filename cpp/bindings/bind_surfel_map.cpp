@@ -20,9 +20,11 @@ void add_end_points(SurfelMap<D>& surfel_map, const Points<D>& points, const Fla
                     const Flat<int64_t>& offset, const Poses<D>& poses,
                     const std::optional<Flat<int64_t>>& time_bin, int threads) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
-  require(!time_bin || time_bin->shape(0) == scans.n_scans, "look: expected one number per scan");
+  require(!time_bin || time_bin->shape(0) == scans.n_scans,
+          "time_bin: expected one number per scan");
   for (size_t t = 0; time_bin && t < scans.n_scans; ++t)
-    require(time_bin->data()[t] >= 0 && time_bin->data()[t] <= kMaxTimeBin, "look: out of range");
+    require(time_bin->data()[t] >= 0 && time_bin->data()[t] <= kMaxTimeBin,
+            "time_bin: out of range");
   nb::gil_scoped_release released;
   surfel_map.add(scans, time_bin ? time_bin->data() : nullptr, threads);
 }
@@ -53,7 +55,7 @@ auto surfels(const SurfelMap<D>& surfel_map, const Points<D>& points, const Flat
 // Cells, means and normals (E, D), distances from the plane, prominences and beam counts (E,).
 template <int D>
 auto describe_surfels(const SurfelMap<D>& surfel_map, const std::optional<Slice>& rows) {
-  require(surfel_map.fitted(), "surface: fit it first");
+  require(surfel_map.fitted(), "surfel_map: fit it first");
   const auto [first, stride, n] = rows_from(rows, surfel_map.size());
   const auto d = static_cast<size_t>(D);
   std::vector<int64_t> cells(n * d), beams(n);
@@ -85,33 +87,34 @@ void bind(nb::module_& m, const char* name) {
       .def_prop_ro("dimension", [](const S&) { return D; })
       .def_prop_ro("size", &S::size, "number of elements")
       .def_prop_ro(
-          "scatter", [](const S& s) { return s.noise_std() * s.resolution(); },
+          "noise_std", [](const S& s) { return s.noise_std() * s.resolution(); },
           "metres: standard deviation of end points across surfaces; 0 before `fit`")
       .def("add_end_points", &add_end_points<D>, nb::arg("points").noconvert(),
            nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
-           nb::arg("T_map_sensor").noconvert(), nb::arg("look").noconvert() = nb::none(),
+           nb::arg("T_map_sensor").noconvert(), nb::arg("time_bin").noconvert() = nb::none(),
            nb::arg("threads") = 1,
            "Notes where beams ended, and in which looks (T,) int64 where all calls say so.")
-      .def_prop_ro("spans", &spans<D>, nb::rv_policy::move,
+      .def_prop_ro("hit_spans", &spans<D>, nb::rv_policy::move,
                    "(E, 2) int32: first and last look at which beams ended in the cell of each "
                    "element, once it is fitted; (0, 2) where nobody said.")
       .def("fit", &S::fit, nb::arg("threads") = 1, nb::call_guard<nb::gil_scoped_release>(),
            "Means, normals and scatter from all end points; none can be added any more.")
-      .def("elements", &describe_surfels<D>, nb::arg("rows") = nb::none(),
+      .def("surfels", &describe_surfels<D>, nb::arg("rows") = nb::none(),
            "cells (E, D) int64, means (E, D) in metres, normals (E, D) (zero: none), distance (E,) "
            "of the cell's centre from the surface around it in metres (zero: none), prominence "
            "(E,): its beams against those of the richest cell around, beams (E,). rows (first, "
            "last, every): of some of the elements.")
-      .def("elements_of", &surfels<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
-           nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
-           nb::arg("threads") = 1, "(M,) int32: the element in which each beam ended, -1: none.");
+      .def("associate_beams", &surfels<D>, nb::arg("points").noconvert(),
+           nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
+           nb::arg("T_map_sensor").noconvert(), nb::arg("threads") = 1,
+           "(M,) int32: the element in which each beam ended, -1: none.");
 }
 
 }  // namespace
 
 void bind_surfel_map(nb::module_& m) {
-  bind<2>(m, "Surface2D");
-  bind<3>(m, "Surface3D");
+  bind<2>(m, "SurfelMap2D");
+  bind<3>(m, "SurfelMap3D");
 }
 
 }  // namespace stillmap::bindings

@@ -14,7 +14,7 @@ using Corners =
 
 constexpr int kLargest = 1 << 15;  // texels along an edge of a page
 
-auto texels(const Corners& corners, int width, int height) {
+auto rasterise_texels(const Corners& corners, int width, int height) {
   const size_t n = corners.shape(0);
   for (size_t i = 0; i < 6 * n; ++i)
     require(std::isfinite(corners.data()[i]), "corners: not finite");
@@ -34,7 +34,8 @@ auto texels(const Corners& corners, int width, int height) {
 }  // namespace
 
 void bind_texel_raster(nb::module_& m) {
-  m.def("texels", &texels, nb::arg("corners").noconvert(), nb::arg("width"), nb::arg("height"),
+  m.def("rasterise_texels", &rasterise_texels, nb::arg("corners").noconvert(), nb::arg("width"),
+        nb::arg("height"),
         "The texels of a page whose centres triangles cover, corners (n, 3, 2) float64 in texels "
         "from its left and top edge: texel (k,) int32 = row * width + column, triangle (k,) int32, "
         "rising, and the weights (k, 2) float32 of its second and third corner there. Of a "

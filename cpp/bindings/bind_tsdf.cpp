@@ -23,8 +23,9 @@ bool all_finite(const double* values, size_t n) {
   return sum == 0.0;
 }
 
-void add(TsdfVolume& distances, const Places<3>& points, const Places<3>& origin,
-         const Flat<double>& standoff, const Faces& faces, const Flat<float>& weight, int threads) {
+void integrate(TsdfVolume& distances, const Places<3>& points, const Places<3>& origin,
+               const Flat<double>& standoff, const Faces& faces, const Flat<float>& weight,
+               int threads) {
   const size_t n = points.shape(0), m = faces.shape(0);
   require(origin.shape(0) == n, "origin: expected a row per point");
   require(standoff.shape(0) == n, "standoff: expected one per point");
@@ -106,21 +107,23 @@ auto dense(const TsdfVolume& distances, const std::array<int64_t, 3>& first_cell
 }  // namespace
 
 void bind_tsdf(nb::module_& m) {
-  nb::class_<TsdfVolume>(m, "SignedDistances",
+  nb::class_<TsdfVolume>(m, "TsdfVolume",
                          "Signed distances from the surfaces that scans saw, averaged in "
                          "voxels. Voxel (0, 0, 0) has the origin as its lowest corner; its "
                          "distance is that of its middle.")
-      .def(nb::init<double, double, double>(), nb::arg("voxel"), nb::kw_only(), nb::arg("before"),
-           nb::arg("behind"),
-           "voxel: its edge in metres; before, behind: metres in front of surfaces and behind them "
+      .def(nb::init<double, double, double>(), nb::arg("voxel"), nb::kw_only(),
+           nb::arg("truncation_front"), nb::arg("truncation_back"),
+           "voxel: its edge in metres; truncation_front, truncation_back: metres in front of "
+           "surfaces and behind them "
            "up to which distances count.")
       .def_prop_ro("voxel", &TsdfVolume::voxel)
-      .def_prop_ro("before", &TsdfVolume::truncation_front)
-      .def_prop_ro("behind", &TsdfVolume::truncation_back)
+      .def_prop_ro("truncation_front", &TsdfVolume::truncation_front)
+      .def_prop_ro("truncation_back", &TsdfVolume::truncation_back)
       .def_prop_ro("memory_bytes", &TsdfVolume::memory_bytes)
       .def_prop_ro(
-          "edge", [](const TsdfVolume&) { return TsdfVolume::kEdge; }, "Voxels along a block.")
-      .def("add", &add, nb::arg("points").noconvert(), nb::arg("origin").noconvert(),
+          "block_edge", [](const TsdfVolume&) { return TsdfVolume::kEdge; },
+          "Voxels along a block.")
+      .def("integrate", &integrate, nb::arg("points").noconvert(), nb::arg("origin").noconvert(),
            nb::arg("standoff").noconvert(), nb::arg("faces").noconvert(),
            nb::arg("weight").noconvert(), nb::arg("threads") = 1,
            "Voxels on lines of sight through faces (m, 3) int32, by their weight (m,) float32. "
@@ -128,7 +131,7 @@ void bind_tsdf(nb::module_& m) {
            "(n,) metres from there to the surface's tangent plane at the point. Faces that are "
            "seen edge on, or whose standoff is not positive, tell nothing.")
       .def("blocks", &blocks, "(B, 3) int64, in blocks: those that were met, in their order.")
-      .def("forget", &remove_blocks, nb::arg("blocks").noconvert(),
+      .def("remove_blocks", &remove_blocks, nb::arg("blocks").noconvert(),
            "Voxels of these blocks (B, 3) int64 are as if never met, and their memory is free.")
       .def("dense", &dense, nb::arg("first_cell"), nb::arg("shape"),
            "float32 arrays [z, y, x] over a box of voxels: metres in front of the surface, NaN "

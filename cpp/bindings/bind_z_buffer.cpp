@@ -34,8 +34,8 @@ Pinhole checked(const Matrix& K, const OnePose<3>& T_camera_map, int width, int 
   return {pose.R, pose.t, k[0], k[1], k[2], k[4], k[5], width, height, near};
 }
 
-auto z_buffer(const Places<3>& vertices, const Faces& faces, const Matrix& K,
-              const OnePose<3>& T_camera_map, int width, int height, double near, int threads) {
+auto render(const Places<3>& vertices, const Faces& faces, const Matrix& K,
+            const OnePose<3>& T_camera_map, int width, int height, double near, int threads) {
   const size_t V = vertices.shape(0), F = faces.shape(0);
   for (size_t i = 0; i < 3 * V; ++i)
     require(std::abs(vertices.data()[i]) <= kFarthest, "vertices: not finite, or beyond 1e9 m");
@@ -58,7 +58,7 @@ auto z_buffer(const Places<3>& vertices, const Faces& faces, const Matrix& K,
 }  // namespace
 
 void bind_z_buffer(nb::module_& m) {
-  m.def("z_buffer", &z_buffer, nb::arg("vertices").noconvert(), nb::arg("faces").noconvert(),
+  m.def("render_z_buffer", &render, nb::arg("vertices").noconvert(), nb::arg("faces").noconvert(),
         nb::arg("K").noconvert(), nb::arg("T_camera_map").noconvert(), nb::arg("width"),
         nb::arg("height"), nb::kw_only(), nb::arg("near"), nb::arg("threads") = 1,
         "What an ideal pinhole camera sees of a mesh, vertices (V, 3) float64 and faces (F, 3) "

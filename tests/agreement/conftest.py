@@ -33,7 +33,9 @@ class Beams:
         return grid
 
     def empty_grid(self, kernels: ModuleType) -> Any:
-        return (kernels.Grid2D if self.dimension == 2 else kernels.Grid3D)(self.resolution)
+        return (kernels.OccupancyGrid2D if self.dimension == 2 else kernels.OccupancyGrid3D)(
+            self.resolution
+        )
 
     @property
     def arguments(self) -> tuple[Any, ...]:
@@ -93,7 +95,7 @@ class Room:
     lengths: dict[str, float]
 
     def surface(self, kernels: ModuleType) -> Any:
-        surface = (kernels.Surface2D, kernels.Surface3D)[self.beams.dimension - 2](
+        surface = (kernels.SurfelMap2D, kernels.SurfelMap3D)[self.beams.dimension - 2](
             self.beams.resolution
         )
         surface.add_end_points(*self.beams.arguments)
@@ -106,17 +108,17 @@ class Room:
         surface: Any,
         rho: list[float],
         tau: list[float],
-        turn: list[float] | None = None,
-        detection: float = 0.8,
+        view_angle: list[float] | None = None,
+        p_detection: float = 0.8,
         **changes: float,
     ) -> Any:
-        return (kernels.Dwell2D, kernels.Dwell3D)[self.beams.dimension - 2](
+        return (kernels.OccupancyHmm2D, kernels.OccupancyHmm3D)[self.beams.dimension - 2](
             surface,
             rho=rho,
             tau=tau,
-            turn=turn or [],
-            detection=detection,
-            seconds=1.0,
+            view_angle=view_angle or [],
+            p_detection=p_detection,
+            bin_seconds=1.0,
             **{**self.lengths, **changes},
         )
 
@@ -163,10 +165,10 @@ def make_room(
         ),
         look=np.cumsum(step),
         lengths={
-            "lateral": 0.4 * resolution,
+            "lateral_std": 0.4 * resolution,
             "margin": 1.2 * resolution,
-            "reach": 0.9 * resolution,
-            "beyond": 0.35,
+            "hit_radius": 0.9 * resolution,
+            "end_margin": 0.35,
         },
     )
 

@@ -42,8 +42,8 @@ def pose(seed):
 def test_core_and_twin_agree(seed):
     vertices, faces = soup(seed)
     T = pose(seed)
-    depth, face = _core.z_buffer(vertices, faces, K, T, 64, 48, near=0.1)
-    depth_, face_ = reference.z_buffer(vertices, faces, K, T, 64, 48, near=0.1)
+    depth, face = _core.render_z_buffer(vertices, faces, K, T, 64, 48, near=0.1)
+    depth_, face_ = reference.render_z_buffer(vertices, faces, K, T, 64, 48, near=0.1)
     assert depth.dtype == np.float32
     assert face.dtype == np.int32
     assert len(np.unique(face_)) > 5
@@ -56,13 +56,13 @@ def test_core_and_twin_agree(seed):
 def test_faces_that_share_an_edge_leave_no_gap():
     for seed in range(20):
         vertices, faces = sheet(seed=seed)
-        _, face = _core.z_buffer(vertices, faces, K, np.eye(4), 64, 48, near=0.1)
+        _, face = _core.render_z_buffer(vertices, faces, K, np.eye(4), 64, 48, near=0.1)
         assert (face >= 0).all()
     # edges along rows of pixel centres, and corners on them
     vertices, faces = sheet(17)
     vertices[:, 2] = 4.0
     straight = np.array([[64.0, 0, 32], [0, 64.0, 24], [0, 0, 1]])
-    _, face = _core.z_buffer(vertices, faces, straight, np.eye(4), 64, 48, near=0.1)
+    _, face = _core.render_z_buffer(vertices, faces, straight, np.eye(4), 64, 48, near=0.1)
     assert (face >= 0).all()
 
 
@@ -71,7 +71,7 @@ def test_a_face_through_the_near_plane_by_hand():
     floor = np.array([[-90.0, 1, -2], [90, 1, -2], [90, 1, 50], [-90, 1, 50]])
     faces = np.array([[0, 2, 1], [0, 3, 2]], np.int32)
     at = np.array([[100.0, 0, 50], [0, 100, 20], [0, 0, 1]])
-    depth, face = _core.z_buffer(floor, faces, at, np.eye(4), 101, 121, near=1.25)
+    depth, face = _core.render_z_buffer(floor, faces, at, np.eye(4), 101, 121, near=1.25)
     seen = np.arange(121) - 20
     expected = np.full(121, np.inf)
     expected[seen >= 2] = 100.0 / seen[seen >= 2]
@@ -85,7 +85,7 @@ def test_a_face_through_the_near_plane_by_hand():
 def test_of_two_at_one_depth_the_lower_number_is_seen():
     corners = np.array([[-1.0, -1, 2], [1, -1, 2], [0, 2, 2]])
     faces = np.array([[0, 1, 2], [2, 1, 0], [1, 2, 0]], np.int32)
-    _, face = _core.z_buffer(corners, faces, K, np.eye(4), 64, 48, near=0.1)
+    _, face = _core.render_z_buffer(corners, faces, K, np.eye(4), 64, 48, near=0.1)
     assert set(np.unique(face)) == {-1, 0}
 
 
@@ -93,13 +93,13 @@ def test_faces_seen_at_their_edge_and_without_area_are_nothing():
     vertices = np.array([[0.0, 0, 1], [0, 0, 5], [0, 1, 3], [1, 1, 2]])
     faces = np.array([[0, 1, 2], [3, 3, 3], [3, 3, 2]], np.int32)
     at = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
-    _, face = _core.z_buffer(vertices, faces, at, np.eye(4), 64, 48, near=0.1)
+    _, face = _core.render_z_buffer(vertices, faces, at, np.eye(4), 64, 48, near=0.1)
     assert (face < 0).all()
 
 
 def test_nothing_there():
     none = np.zeros((0, 3)), np.zeros((0, 3), np.int32)
-    depth, face = _core.z_buffer(*none, K, np.eye(4), 5, 4, near=0.1)
+    depth, face = _core.render_z_buffer(*none, K, np.eye(4), 5, 4, near=0.1)
     assert depth.shape == face.shape == (4, 5)
     assert np.isinf(depth).all()
     assert (face == -1).all()
@@ -108,10 +108,10 @@ def test_nothing_there():
 def test_threads_change_nothing():
     vertices, faces = soup(9, 6000, 0.1)
     larger = np.diag([5.0, 5.0, 1.0]) @ K
-    once = _core.z_buffer(vertices, faces, larger, np.eye(4), 301, 203, near=0.1)
+    once = _core.render_z_buffer(vertices, faces, larger, np.eye(4), 301, 203, near=0.1)
     assert len(np.unique(once[1])) > 100
     for threads in (2, 3, 500):
-        again = _core.z_buffer(
+        again = _core.render_z_buffer(
             vertices, faces, larger, np.eye(4), 301, 203, near=0.1, threads=threads
         )
         assert all(a.tobytes() == b.tobytes() for a, b in zip(once, again, strict=True))
@@ -145,12 +145,12 @@ def test_what_is_refused(changes, said):
         "height": 6,
         "near": 0.1,
     }
-    _core.z_buffer(**given)
+    _core.render_z_buffer(**given)
     with pytest.raises(ValueError, match=said):
-        _core.z_buffer(**{**given, **changes})
+        _core.render_z_buffer(**{**given, **changes})
 
 
 def test_wrong_types_are_refused():
     faces = np.array([[0, 1, 2]], np.int64)
     with pytest.raises(TypeError):
-        _core.z_buffer(np.eye(3), faces, K, np.eye(4), 8, 6, near=0.1)
+        _core.render_z_buffer(np.eye(3), faces, K, np.eye(4), 8, 6, near=0.1)

@@ -79,7 +79,7 @@ class Watched:
     def grid(self, e: Any = None, resolution: float = RESOLUTION) -> Any:
         """The sums of (10); every hit counts as static without e."""
         D = self.recording.dimension
-        grid = (_core.Grid2D, _core.Grid3D)[D - 2](resolution)
+        grid = (_core.OccupancyGrid2D, _core.OccupancyGrid3D)[D - 2](resolution)
         if D == 2:
             em.add_recording(grid, self.recording, self.poses, e)
         return grid

@@ -7,7 +7,7 @@ import pytest
 
 from stillmap import _core
 from stillmap.core.recording import Recording
-from stillmap.em.ground import GroundMap, ground_from_surfels
+from stillmap.em.ground import ground_from_surfels
 from stillmap.em.options import BodyOptions
 from stillmap.em.spatial_prior import (
     apply_pooled_evidence,
@@ -15,6 +15,7 @@ from stillmap.em.spatial_prior import (
     pool_clusters,
     select_obstacles,
 )
+from stillmap.em.types import GroundMap
 
 FLAT = GroundMap(np.zeros((40, 40)), np.array([-20.0, -20.0]), 1.8, True)
 
@@ -47,7 +48,7 @@ def standing(*things, scans=3):
         T_odom_base=None,
     )
     T = np.tile(np.eye(4), (scans, 1, 1))
-    surface = _core.Surface3D(0.15)
+    surface = _core.SurfelMap3D(0.15)
     surface.add_end_points(recording.points, recording.hit, recording.offset, T)
     surface.fit()
     return recording, T, surface

@@ -7,7 +7,8 @@ import pytest
 from made_up import RESOLUTION, Ball, Wall, Watched, cone, fan, watch
 
 from stillmap import _core, em
-from stillmap.em import observations, occupancy_hmm
+from stillmap.core import chunks
+from stillmap.em import occupancy_hmm
 from stillmap.em.observations import LOOP_CLASSES, build_surfel_map
 from stillmap.eval.labels import calibration_error, equal_width_bins
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
@@ -119,9 +120,9 @@ def rows(seen, x, y, radius):
     """Cells near a place with the likelihood of every class."""
     surface = build_surfel_map(seen.recording, seen.poses, 0.1)
     rho, tau, turn = LOOP_CLASSES.grid()
-    chains = _core.Dwell2D(
-        surface, rho=rho, tau=tau, turn=turn, detection=0.97, seconds=1.0,
-        lateral=0.03, margin=0.1, reach=0.1, beyond=0.3,
+    chains = _core.OccupancyHmm2D(
+        surface, rho=rho, tau=tau, view_angle=turn, p_detection=0.97, bin_seconds=1.0,
+        lateral_std=0.03, margin=0.1, hit_radius=0.1, end_margin=0.3,
     )  # fmt: skip
     r = seen.recording
     chains.add(r.points, r.hit, r.offset, seen.poses, np.arange(r.n_scans))
@@ -168,10 +169,10 @@ def test_a_look_may_be_many_scans(busy, known):
 
 @pytest.mark.parametrize("beams", [1, 1000, 5000])
 def test_pieces_and_threads_change_no_bit(busy, known, monkeypatch, beams):
-    monkeypatch.setattr(observations, "CHUNK_BEAMS", beams)
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
     for threads in (1, 3):
         options = em.EmOptions()
-        grid = _core.Grid2D(0.1)
+        grid = _core.OccupancyGrid2D(0.1)
         found = em.e_step(busy.recording, busy.poses, grid, "stillmap", options, threads)
         assert found.p_static.tobytes() == known.p_static.tobytes()
         assert found.likelihood == known.likelihood

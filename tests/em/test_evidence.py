@@ -6,6 +6,7 @@ import pytest
 from stillmap import _core, em
 from stillmap.core import se2
 from stillmap.core.recording import Recording
+from stillmap.core import chunks
 from stillmap.em import observations
 from stillmap.em.types import NoReturnModel
 
@@ -33,7 +34,7 @@ def recording_of(ranges, hit, seconds):
 def evidence_of(recording, p_static, no_return=None, threads=1, **options):
     """Of the map of (15)."""
     poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
-    grid = _core.Grid2D(RESOLUTION)
+    grid = _core.OccupancyGrid2D(RESOLUTION)
     known = np.nan_to_num(p_static, nan=0.5)
     seen = em.add_trusted_beams(grid, recording, poses, known, no_return)
     occupancy = em.make_occupancy_map(grid, observed=seen)
@@ -105,7 +106,7 @@ def test_scans_of_half_a_second_are_one_look(visitors):
 def test_threads_and_chunks_do_not_matter(visitors, monkeypatch):
     _, found = evidence_of(*visitors)
     _, threaded = evidence_of(*visitors, threads=3)
-    monkeypatch.setattr(observations, "CHUNK_BEAMS", 500)
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", 500)
     _, chunked = evidence_of(*visitors, threads=2)
     for name in ("looks", "clear", "thin"):
         np.testing.assert_array_equal(getattr(found, name), getattr(threaded, name))

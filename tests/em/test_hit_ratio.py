@@ -27,7 +27,7 @@ def lane(hits, passes):
 def counted(recording, threshold):
     poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
     poses[:, :2, 2] = 0.5
-    grid = _core.Grid2D(1.0)
+    grid = _core.OccupancyGrid2D(1.0)
     em.add_recording(grid, recording, poses, None)
     return grid, em.e_step(
         recording, poses, grid, "hit-ratio", em.EmOptions(hit_ratio=threshold), threads=1

@@ -46,7 +46,7 @@ def seen(at, met):
 def labels(at, met, **dwell):
     """(M,) p_static in the loop and in the last E-step, and which beams end on the post."""
     recording, T, on = seen(at, met)
-    loop = em.e_step(recording, T, _core.Grid2D(0.05), "stillmap", em.EmOptions(), 1)
+    loop = em.e_step(recording, T, _core.OccupancyGrid2D(0.05), "stillmap", em.EmOptions(), 1)
     last, courses = em.final_e_step(
         recording, T, 0.05, em.EmOptions(dwell=em.DwellOptions(**dwell))
     )

@@ -7,7 +7,7 @@ import pytest
 from made_up import FAR, RESOLUTION, Wall, fan, watch
 
 from stillmap import _core, em
-from stillmap.em import observations
+from stillmap.core import chunks
 
 
 def with_lost(seen, lost, length=FAR):
@@ -27,7 +27,7 @@ def room_with(beams=181, seconds=20):
 def known(seen, threads=1):
     """The map, what looks up values at points, and how far rows of lost beams are trusted."""
     found = seen.e_step()
-    grid = _core.Grid2D(RESOLUTION)
+    grid = _core.OccupancyGrid2D(RESOLUTION)
     e, no_return = found.p_static, found.no_return
     told = em.add_trusted_beams(grid, seen.recording, seen.poses, e, no_return, threads)
     for a, b in zip(grid.dense(), seen.grid(e).dense(), strict=True):
@@ -99,7 +99,7 @@ def test_pieces_and_threads_change_no_bit(monkeypatch, threads, beams):
     lost = np.random.default_rng(1).random(len(seen.what)) < 0.2
     seen = with_lost(seen, lost)
     once = known(seen)[3].p_occupied
-    monkeypatch.setattr(observations, "CHUNK_BEAMS", beams)
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
     np.testing.assert_array_equal(known(seen, threads)[3].p_occupied, once)
 
 
@@ -108,7 +108,7 @@ def test_others_believe_every_beam(estimator):
     seen = room_with()
     found = seen.e_step(estimator=estimator)
     assert found.no_return is None
-    grid = _core.Grid2D(RESOLUTION)
+    grid = _core.OccupancyGrid2D(RESOLUTION)
     e = found.p_static
     assert em.add_trusted_beams(grid, seen.recording, seen.poses, e, None) is None
     np.testing.assert_array_equal(grid.dense()[2], seen.grid(e).dense()[2])

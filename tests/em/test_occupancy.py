@@ -12,7 +12,7 @@ FREE = 0.2
 
 def laid_out(p_occupied, cells=((0, 0), (1, 0)), hits=1):
     """A lane of five cells: hits end in cell 3, cell 4 and all beside it stay unknown."""
-    grid = _core.Grid2D(1.0)
+    grid = _core.OccupancyGrid2D(1.0)
     T = np.eye(3)[None].copy()
     T[0, :2, 2] = 0.5
     points = np.tile(np.array([[3, 0]], np.float32), (hits, 1))
@@ -45,7 +45,8 @@ def test_a_cell_is_occupied_by_what_stays_or_as_free_as_it_looks(p):
 
 def test_nothing_known_is_nothing_occupied():
     m = em.make_occupancy_map(
-        _core.Grid2D(1.0), em.CellProbabilities(np.zeros((0, 2), np.int64), np.zeros(0, "f4"), 0.2)
+        _core.OccupancyGrid2D(1.0),
+        em.CellProbabilities(np.zeros((0, 2), np.int64), np.zeros(0, "f4"), 0.2),
     )
     assert m.p_occupied.shape == (0, 0)
 

@@ -133,7 +133,7 @@ def test_next_to_nothing():
 
 
 def e_step(r, threads=1, **options):
-    grid = _core.Grid2D(0.1)
+    grid = _core.OccupancyGrid2D(0.1)
     em.add_recording(grid, r, poses(r), None)
     chosen = em.EmOptions(**options)
     return em.e_step(r, poses(r), grid, "tracker", chosen, threads=threads)
@@ -153,7 +153,7 @@ def test_labels_are_hard_and_the_map_counts_the_rest():
     assert np.isnan(e[:, 175]).all()
     assert not (off & ~hit).any()
     # only cells that something else was hit in are known, and its ratio decides
-    grid = _core.Grid2D(0.1)
+    grid = _core.OccupancyGrid2D(0.1)
     em.add_recording(grid, r, poses(r), found.p_static)
     m = em.make_occupancy_map(grid, found.occupied)
     x, y, _ = m.origin

@@ -27,7 +27,7 @@ class Lane:
         return len(self.T_map_sensor) - 1
 
     def grid(self) -> Any:
-        make = self.impl.Grid2D if self.dimension == 2 else self.impl.Grid3D
+        make = self.impl.OccupancyGrid2D if self.dimension == 2 else self.impl.OccupancyGrid3D
         return make(self.resolution)
 
     def points(self, ranges: Any) -> Any:

@@ -79,7 +79,7 @@ def test_through_a_corner(impl):
 
 def test_slanted_beam_counts_by_length(impl):
     # the beam of the triangle: 5/8 of beta in each cell before the end cell, which gets e
-    grid = impl.Grid2D(1.0)
+    grid = impl.OccupancyGrid2D(1.0)
     points, hit = np.array([[2, 1.5]], np.float32), np.array([True])
     T = np.array([[[1, 0, 0.5], [0, 1, 0.25], [0, 0, 1]]])
     offset = np.array([0, 1])
@@ -91,7 +91,7 @@ def test_slanted_beam_counts_by_length(impl):
 def test_likelihood_weighs_cells_by_length(impl):
     # product of (1 - m_j)^{l_j}: m = 1/2 in cell (1, 1) (a hit against one whole passage), which
     # the beam of the triangle covers on 5/8, and nothing elsewhere
-    grid = impl.Grid2D(1.0)
+    grid = impl.OccupancyGrid2D(1.0)
     T = np.array([[[1, 0, 0], [0, 1, 1.5], [0, 0, 1]]], float)
     points = np.array([[1.5, 0], [2.5, 0]], np.float32)
     hit, offset = np.array([True, False]), np.array([0, 2])

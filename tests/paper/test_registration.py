@@ -4,7 +4,7 @@ from math import exp, log, pi, sqrt
 
 import numpy as np
 import pytest
-from reference.field import moved
+from reference.likelihood_field import moved
 
 FLOOR, SIGMA = 0.01, 0.5
 
@@ -22,7 +22,7 @@ def grid_of(impl, points, e, start):
     D = points.shape[1]
     T = np.eye(D + 1)[None].copy()
     T[0, :D, D] = start
-    grid = (impl.Grid2D if D == 2 else impl.Grid3D)(1.0)
+    grid = (impl.OccupancyGrid2D if D == 2 else impl.OccupancyGrid3D)(1.0)
     hit, offset = np.ones(len(points), bool), np.array([0, len(points)])
     impl.add_beams(grid, points - np.float32(start), hit, np.array(e, np.float32), offset, T)
     return grid
@@ -77,7 +77,7 @@ def test_unknown_is_not_free(impl):
 def test_straight_wall_gives_about_one(impl):
     # every cell along y = 1/2 occupied: the Gaussians along the wall add up to sqrt(2 pi) sigma
     points = [[x + 0.5, 0.5] for x in range(-10, 10)]
-    grid = impl.Grid2D(1.0)
+    grid = impl.OccupancyGrid2D(1.0)
     for point in points:
         T = np.array([[[1, 0, point[0]], [0, 1, 0.5], [0, 0, 1]]])
         one = np.ones(1, np.float32)

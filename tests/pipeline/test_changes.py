@@ -120,7 +120,7 @@ def test_what_is_not_listed_stays_what_it_is_without_changes():
         result.seen, result.poses, result.map.resolution, result.options.em
     )
     cells = {tuple(cell) for one in result.changes for cell in one.cells.tolist()}
-    element = courses.surfel_map.elements_of(
+    element = courses.surfel_map.associate_beams(
         result.seen.points, result.seen.hit, result.seen.offset,
         result.seen.T_map_sensor(result.poses),
     )  # fmt: skip

@@ -41,7 +41,7 @@ def swept(room):
 
 
 def outcome(result):
-    arrays = (result.poses, result.covariance, result.p_static)
+    arrays = (result.poses, result.estimate.m_step.covariance, result.p_static)
     maps = [m for o in (result.map, result.raw_map) for m in (o.p_occupied, o.alpha, o.beta)]
     return [it.bound for it in result.iterations], [a.tobytes() for a in (*arrays, *maps)]
 
@@ -59,7 +59,7 @@ def test_it_can_be_left_and_the_printed_method_leaves_it(room, swept, estimator)
 
 def test_where_all_beams_come_at_once_nothing_is_made_anew(room):
     for it in stillmap.iterate(room.recording, options(max_iterations=2)):
-        assert it.seen is room.recording
+        assert it.deskewed is room.recording
 
 
 @pytest.mark.parametrize("estimator", ["stillmap", "hit-ratio", "tracker"])
@@ -69,18 +69,18 @@ def test_map_and_labels_are_made_of_the_same_points(room, swept, estimator, give
     chosen = replaced(options(estimator, max_iterations=3), {"slam": {"loops": {"enabled": loops}}})
     poses = room.truth.T_world_base if given else None
     for it in stillmap.iterate(swept, chosen, poses=poses):
-        points = slam.deskew_recording(swept, it.poses, chosen.slam).points
-        np.testing.assert_array_equal(it.seen.points, points)
+        points = slam.deskew_recording(swept, it.estimate.poses, chosen.slam).points
+        np.testing.assert_array_equal(it.deskewed.points, points)
         assert not np.array_equal(points, swept.points)
-        grid = _core.Grid2D(RESOLUTION, chosen.slam.registration.approach)
-        em.add_recording(grid, it.seen, it.poses, it.weights)
-        for ours, theirs in zip(it.grid.dense(), grid.dense(), strict=True):
+        grid = _core.OccupancyGrid2D(RESOLUTION, chosen.slam.registration.approach)
+        em.add_recording(grid, it.deskewed, it.estimate.poses, it.estimate.weights)
+        for ours, theirs in zip(it.estimate.m_step.grid.dense(), grid.dense(), strict=True):
             np.testing.assert_array_equal(ours, theirs)
-        found = em.e_step(it.seen, it.poses, grid, estimator, chosen.em)
-        np.testing.assert_array_equal(it.p_static, found.p_static)
+        found = em.e_step(it.deskewed, it.estimate.poses, grid, estimator, chosen.em)
+        np.testing.assert_array_equal(it.estimate.p_static, found.p_static)
     result = stillmap.build(swept, chosen, poses=poses)
     assert result.recording is swept
-    raw = _core.Grid2D(RESOLUTION)
+    raw = _core.OccupancyGrid2D(RESOLUTION)
     em.add_recording(raw, result.seen, result.poses, None)
     m = result.raw_map
     first_cell = np.round(np.array(m.origin[:2]) / RESOLUTION).astype(int).tolist()
@@ -104,7 +104,7 @@ def test_what_tells_of_the_motion(swept, monkeypatch, odometry):
     chosen = options(max_iterations=2)
     first, _ = stillmap.iterate(recording, chosen)
     known = [swept.T_odom_base] if odometry else [None, found[0].poses]
-    for seen, poses in zip(built, [*known, first.poses], strict=True):
+    for seen, poses in zip(built, [*known, first.estimate.poses], strict=True):
         expected = slam.deskew_recording(recording, poses, chosen.slam)
         np.testing.assert_array_equal(seen.points, expected.points)
 

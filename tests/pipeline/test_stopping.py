@@ -10,7 +10,7 @@ from stillmap import _core, em, slam
 from stillmap.core import se2
 from stillmap.core.config import replaced
 from stillmap.pipeline import em_loop
-from stillmap.pipeline.em_loop import Iteration
+from stillmap.pipeline.estimate import Estimate, Iteration, IterationRecord
 from stillmap.pipeline.options import Options
 
 
@@ -49,26 +49,15 @@ def made_up(recording, number, bound, changed_share) -> Iteration:
     T = recording.n_scans
     poses = np.tile(se2.matrix(0.01 * number, 0, 0), (T, 1, 1))
     e = np.full(recording.n_beams, number / 100, np.float32)
-    grid = _core.Grid2D(0.1)
+    grid = _core.OccupancyGrid2D(0.1)
     em.add_recording(grid, recording, poses, e)
-    return Iteration(
-        number=number,
-        seen=recording,
-        poses=poses,
-        covariance=np.full((T, 3, 3), float(number)),
-        grid=grid,
-        weights=e / 2,
-        p_static=e,
-        likelihood=em.Likelihood(expected=bound - 1.0, bound=bound),
-        occupied=None,
-        learned={"number": number},
-        changed_share=changed_share,
-        explained=np.ones(T),
-        doubts=slam.Diagnostics(),
-        loops=[],
-        held_out=None,
-        seconds=float(number),
+    m_step = slam.MStepResult(
+        poses, np.full((T, 3, 3), float(number)), grid, np.ones(T), [], loops=[]
     )
+    likelihood = em.Likelihood(expected=bound - 1.0, bound=bound)
+    e_step = em.EStepResult(e, likelihood, learned={"number": number})
+    record = IterationRecord(number, bound - 1.0, bound, changed_share, float(number))
+    return Iteration(Estimate(number, e / 2, m_step, e_step), record, recording)
 
 
 def assert_kept(result, number):
@@ -76,13 +65,13 @@ def assert_kept(result, number):
     assert result.best_iteration == number
     np.testing.assert_array_equal(result.p_static, np.float32(number / 100))
     np.testing.assert_array_equal(result.poses[:, 0, 2], 0.01 * number)
-    np.testing.assert_array_equal(result.covariance, float(number))
+    np.testing.assert_array_equal(result.estimate.m_step.covariance, float(number))
     assert result.learned == {"number": number}
     alpha = result.map.alpha.sum()
     made_from = 200 if result.options.estimator == "paper" else 100  # weights, or labels
     assert alpha == pytest.approx(recording.hit.sum() * number / made_from, rel=1e-5)
     assert result.raw_map.alpha.sum() == recording.hit.sum()
-    grid = _core.Grid2D(0.1)
+    grid = _core.OccupancyGrid2D(0.1)
     em.add_recording(grid, recording, result.poses, None)
     np.testing.assert_array_equal(result.raw_map.alpha, grid.dense()[1])
 
@@ -227,7 +216,7 @@ def test_snapshots_show_first_second_best_and_last(build, bounds):
 def test_iterate_ends_at_the_limit_and_leaves_stopping_to_the_caller(short):
     # with any share of labels settled in effect, build stops at 2; iterate does not
     chosen = options(max_iterations=3, settled=1.0)
-    assert [it.number for it in stillmap.iterate(short.recording, chosen)] == [1, 2, 3]
+    assert [it.record.number for it in stillmap.iterate(short.recording, chosen)] == [1, 2, 3]
     result = stillmap.build(short.recording, chosen)
     assert result.converged
     assert len(result.iterations) == 2
@@ -245,10 +234,10 @@ def test_iterations_feed_on_the_labels_of_the_last(short):
     # e enters as weight: with fixed poses the second map is that of the first labels
     poses = short.truth.T_world_base
     first, second = list(stillmap.iterate(short.recording, options(max_iterations=2), poses=poses))
-    grid = _core.Grid2D(0.1)
-    em.add_recording(grid, short.recording, poses, first.p_static)
-    for ours, theirs in zip(second.grid.dense(), grid.dense(), strict=True):
+    grid = _core.OccupancyGrid2D(0.1)
+    em.add_recording(grid, short.recording, poses, first.estimate.p_static)
+    for ours, theirs in zip(second.estimate.m_step.grid.dense(), grid.dense(), strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    moved = np.abs(second.p_static - first.p_static)[short.recording.hit] > 0.1
-    assert second.changed_share == pytest.approx(moved.mean())
+    moved = np.abs(second.estimate.p_static - first.estimate.p_static)[short.recording.hit] > 0.1
+    assert second.record.changed_share == pytest.approx(moved.mean())
     assert dataclasses.is_dataclass(second)

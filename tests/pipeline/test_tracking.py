@@ -28,14 +28,14 @@ def test_the_second_iterate_is_kept_and_registered_without_people(room, tracked)
     assert [it.number for it in tracked.iterations] == [1, 2]
     assert (tracked.best_iteration, tracked.converged) == (2, True)
     first, second = list(stillmap.iterate(room.recording, options("tracker")))
-    assert (first.weights == 1).all()
-    np.testing.assert_array_equal(second.weights, first.p_static)
-    np.testing.assert_array_equal(tracked.poses, second.poses)
-    np.testing.assert_array_equal(tracked.p_static, second.p_static)
+    assert (first.estimate.weights == 1).all()
+    np.testing.assert_array_equal(second.estimate.weights, first.estimate.p_static)
+    np.testing.assert_array_equal(tracked.poses, second.estimate.poses)
+    np.testing.assert_array_equal(tracked.p_static, second.estimate.p_static)
 
 
 def test_the_map_counts_hits_that_are_on_nobody(room, tracked):
-    grid = _core.Grid2D(RESOLUTION)
+    grid = _core.OccupancyGrid2D(RESOLUTION)
     em.add_recording(grid, room.recording, tracked.poses, tracked.p_static)
     _, alpha, beta = grid.dense()
     np.testing.assert_array_equal(tracked.map.alpha, alpha.astype(np.float32))

@@ -41,7 +41,9 @@ class World:
         return grid
 
     def empty_grid(self, kernels: Any) -> Any:
-        return (kernels.Grid2D if self.points.shape[1] == 2 else kernels.Grid3D)(1.0)
+        return (kernels.OccupancyGrid2D if self.points.shape[1] == 2 else kernels.OccupancyGrid3D)(
+            1.0
+        )
 
     def cells(self) -> Any:
         """(K, D) all cells anywhere near."""

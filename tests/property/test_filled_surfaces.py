@@ -29,12 +29,12 @@ def one_scan(distance: float, slant: float, noise: float, seed: int, D: int) -> 
 def costs_along(points: Any, slant: float, T: Any, is_filled: bool) -> Any:
     """Nats per beam that a scan costs when it is laid on itself, shifted along the wall."""
     n, D = points.shape
-    grid = (_core.Grid2D if D == 2 else _core.Grid3D)(0.05, 0.5)
+    grid = (_core.OccupancyGrid2D if D == 2 else _core.OccupancyGrid3D)(0.05, 0.5)
     ones, hit, offset = np.ones(n, np.float32), np.ones(n, bool), np.array([0, n])
     _core.add_beams(grid, points, hit, ones, offset, T[None])
     if is_filled:
-        _core.fill_surfaces(
-            grid, points, hit, ones, offset, T[None], gap=1.5, tolerance=0.1, growth=3.0
+        _core.interpolate_end_points(
+            grid, points, hit, ones, offset, T[None], max_gap=1.5, tolerance=0.1, max_gap_ratio=3.0
         )
     # shifted, all of them still lie beside others
     inner = np.ascontiguousarray(points[2:-2])

@@ -6,7 +6,14 @@ import pytest
 from stillmap import _core
 from stillmap.core import se3
 
-FIT = {"least": 4.0, "flat": 0.2, "wide": 0.02, "sigma": 0.03, "kernel": 3.0, "gain": 0.5}
+FIT = {
+    "min_weight": 4.0,
+    "max_flatness": 0.2,
+    "min_extent": 0.02,
+    "range_std": 0.03,
+    "kernel_width": 3.0,
+    "information_scale": 0.5,
+}
 STEPS = {"start_level": 1, "start_slack": 0.1, "max_iterations": 20, "tolerance": 1e-6}
 
 
@@ -18,7 +25,7 @@ def corner(seed):
 
 
 def registered(world):
-    local = _core.SweepMap3D(0.5, 3, 100.0)
+    local = _core.NdtMap3D(0.5, 3, 100.0)
     points, weights = corner(1), np.ones(4000, np.float32)
     local.add(points, weights, world)
     prior = world @ se3.exp(np.array([0.05, -0.04, 0.03, 0.01, -0.02, 0.015]))

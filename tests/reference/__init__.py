@@ -10,82 +10,93 @@ without a thought for speed. Where beams are taken:
 - scan t owns the beams `offset[t]:offset[t + 1]`, and `T_map_sensor[t]` (D+1, D+1) is its pose.
 """
 
-from reference.beams import add_beams, add_ends, e_step, log_likelihood
-from reference.beside import settled
-from reference.bodies import Bodies3D, feet
-from reference.changes import ChangeModel, Course, course
-from reference.dwell import Dwell, Dwell2D, Dwell3D, Reading, look_at
+from reference.beam_counting import add_beams, add_end_points, e_step, log_likelihood
+from reference.change_hmm import ChangeModel, Course, course
+from reference.cluster_pooling import ClusterPooling3D, relabel_ground_contact
+from reference.correlative_search import Lattice, search_lattice
 from reference.em import EmStep, em_fixed_poses, m_step_map
-from reference.field import (
+from reference.endpoint_interpolation import interpolate_end_points
+from reference.held_out_likelihood import (
+    StaticFractionGrid,
+    StaticFractionGrid2D,
+    StaticFractionGrid3D,
+    score_held_out,
+)
+from reference.likelihood_field import (
     field,
     registration_cost,
     registration_curvature,
     registration_gradient,
 )
-from reference.fill import fill_surfaces
-from reference.fusing import SignedDistances
-from reference.grid import Grid, Grid2D, Grid3D, occupancy
-from reference.held_out import StaticShares, StaticShares2D, StaticShares3D, held_out
-from reference.look_counts import LookCounts, LookCounts2D, LookCounts3D
-from reference.near_faces import NearFaces
-from reference.no_return import add_lost
-from reference.search import Lattice, search_lattice
-from reference.surface import Surface, Surface2D, Surface3D
-from reference.sweep_map import SweepMap3D, carried, first_in_cells, linearise_sweep, register_sweep
-from reference.texels import texels
-from reference.traverse import cell_of, traverse
-from reference.z_buffer import z_buffer
+from reference.mean_field import smooth_mean_field
+from reference.mesh_distance import MeshDistance
+from reference.ndt_map import (
+    NdtMap3D,
+    linearise_sweep,
+    register_sweep,
+    transform_by_twist,
+    voxel_downsample,
+)
+from reference.no_return_beams import add_no_return_beams
+from reference.observation_counts import ObservationCounts, ObservationCounts2D, ObservationCounts3D
+from reference.occupancy_grid import OccupancyGrid, OccupancyGrid2D, OccupancyGrid3D, occupancy
+from reference.occupancy_hmm import OccupancyHmm, OccupancyHmm2D, OccupancyHmm3D, Reading, look_at
+from reference.ray_traversal import cell_of, traverse
+from reference.surfel_map import SurfelMap, SurfelMap2D, SurfelMap3D
+from reference.texel_raster import rasterise_texels
+from reference.tsdf import TsdfVolume
+from reference.z_buffer import render_z_buffer
 
 __all__ = [
-    "Bodies3D",
     "ChangeModel",
+    "ClusterPooling3D",
     "Course",
-    "Dwell",
-    "Dwell2D",
-    "Dwell3D",
     "EmStep",
-    "Grid",
-    "Grid2D",
-    "Grid3D",
     "Lattice",
-    "LookCounts",
-    "LookCounts2D",
-    "LookCounts3D",
-    "NearFaces",
+    "MeshDistance",
+    "NdtMap3D",
+    "ObservationCounts",
+    "ObservationCounts2D",
+    "ObservationCounts3D",
+    "OccupancyGrid",
+    "OccupancyGrid2D",
+    "OccupancyGrid3D",
+    "OccupancyHmm",
+    "OccupancyHmm2D",
+    "OccupancyHmm3D",
     "Reading",
-    "SignedDistances",
-    "StaticShares",
-    "StaticShares2D",
-    "StaticShares3D",
-    "Surface",
-    "Surface2D",
-    "Surface3D",
-    "SweepMap3D",
+    "StaticFractionGrid",
+    "StaticFractionGrid2D",
+    "StaticFractionGrid3D",
+    "SurfelMap",
+    "SurfelMap2D",
+    "SurfelMap3D",
+    "TsdfVolume",
     "add_beams",
-    "add_ends",
-    "add_lost",
-    "carried",
+    "add_end_points",
+    "add_no_return_beams",
     "cell_of",
     "course",
     "e_step",
     "em_fixed_poses",
-    "feet",
     "field",
-    "fill_surfaces",
-    "first_in_cells",
-    "held_out",
+    "interpolate_end_points",
     "linearise_sweep",
     "log_likelihood",
     "look_at",
     "m_step_map",
     "occupancy",
+    "rasterise_texels",
     "register_sweep",
     "registration_cost",
     "registration_curvature",
     "registration_gradient",
+    "relabel_ground_contact",
+    "render_z_buffer",
+    "score_held_out",
     "search_lattice",
-    "settled",
-    "texels",
+    "smooth_mean_field",
+    "transform_by_twist",
     "traverse",
-    "z_buffer",
+    "voxel_downsample",
 ]

@@ -31,7 +31,9 @@ def m_step_map(
 ) -> Any:
     """Equations (10) to (15) for fixed poses: the grid whose m_j maximises (5)."""
     k = kernels or reference
-    grid = k.Grid2D(resolution) if np.shape(points)[1] == 2 else k.Grid3D(resolution)
+    grid = (
+        k.OccupancyGrid2D(resolution) if np.shape(points)[1] == 2 else k.OccupancyGrid3D(resolution)
+    )
     k.add_beams(grid, points, hit, e, offset, T_map_sensor)
     return grid
 

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 
 
-def z_buffer(
+def render_z_buffer(
     vertices: Float,
     faces: NDArray[np.int32],
     K: Float,

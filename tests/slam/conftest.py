@@ -57,11 +57,11 @@ def scan() -> Callable[..., Points]:
 
 
 @pytest.fixture
-def mapped(scan: Callable[..., Points]) -> Callable[..., _core.Grid2D]:
+def mapped(scan: Callable[..., Points]) -> Callable[..., _core.OccupancyGrid2D]:
     """A map of a room, from scans taken around its origin."""
 
-    def build(walls: Float, seed: int = 100, resolution: float = 0.05) -> _core.Grid2D:
-        grid = _core.Grid2D(resolution)
+    def build(walls: Float, seed: int = 100, resolution: float = 0.05) -> _core.OccupancyGrid2D:
+        grid = _core.OccupancyGrid2D(resolution)
         stands = [(0, 0, 0), (0.6, 0.3, 0.4), (-0.5, 0.5, -1), (0.2, -0.7, 2), (0.9, -0.4, 3)]
         for k, stand in enumerate(stands):
             add(grid, scan(walls, stand, seed + k), stand)
@@ -76,10 +76,12 @@ def put() -> Callable[..., None]:
     return add
 
 
-def add(grid: _core.Grid2D, points: Points, pose: Float, e: float = 1.0) -> None:
+def add(grid: _core.OccupancyGrid2D, points: Points, pose: Float, e: float = 1.0) -> None:
     n = len(points)
     weights = np.full(n, e, np.float32)
     beams = points, np.ones(n, bool), weights, np.array([0, n]), se2.matrix(*pose)[None]
     _core.add_beams(grid, *beams)
     gaps = SurfaceOptions()
-    _core.fill_surfaces(grid, *beams, gap=gaps.gap, tolerance=gaps.straight, growth=gaps.growth)
+    _core.interpolate_end_points(
+        grid, *beams, max_gap=gaps.gap, tolerance=gaps.straight, max_gap_ratio=gaps.growth
+    )

@@ -112,7 +112,7 @@ def test_where_a_keyframe_looks_by_hand():
 
 def test_comparable_is_what_was_looked_at_from_the_same_side():
     # one beam along x that ends at 5 m: the wall is seen from the left
-    grid = _core.Grid2D(0.1, 0.5)
+    grid = _core.OccupancyGrid2D(0.1, 0.5)
     T = np.eye(3)[None]
     end = np.array([[5.05, 0.05]], np.float32)
     one = np.array([True]), np.ones(1, np.float32), np.array([0, 1])

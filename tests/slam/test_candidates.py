@@ -188,7 +188,7 @@ def rounds(drift=1.0):
 
 def local(poses):
     n = len(poses)
-    return MStepResult(poses, np.zeros((n, 3, 3)), _core.Grid2D(0.05), np.ones(n), [])
+    return MStepResult(poses, np.zeros((n, 3, 3)), _core.OccupancyGrid2D(0.05), np.ones(n), [])
 
 
 def missed(T, truth, candidate):

@@ -105,7 +105,7 @@ def test_the_grid_is_what_the_poses_make():
     open_ends = dataclasses.replace(OPTIONS, loops=LoopOptions(enabled=False))
     mapped = m_step(recording, e, open_ends, None, 1, silent)
     np.testing.assert_array_equal(mapped.poses, so_far.poses)
-    grid = _core.Grid2D(OPTIONS.resolution)
+    grid = _core.OccupancyGrid2D(OPTIONS.resolution)
     em.add_recording(grid, recording, mapped.poses, e)
     for ours, theirs in zip(mapped.grid.dense(), grid.dense(), strict=True):
         np.testing.assert_array_equal(ours, theirs)  # to the bit: nobody has to keep the grid
@@ -251,7 +251,7 @@ def test_given_poses_are_not_touched():
         for threads in (1, 2)
     ]
     assert told == [("mapping", 60, 60)] * 2
-    grid = _core.Grid2D(OPTIONS.resolution)
+    grid = _core.OccupancyGrid2D(OPTIONS.resolution)
     em.add_recording(grid, recording, poses, e)
     for one in mapped:
         assert one.poses is poses

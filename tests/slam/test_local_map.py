@@ -22,7 +22,7 @@ def hall():
 def empty(e=None, spacing=OPTIONS.spacing):
     recording = hall().recording
     e = np.full(recording.n_beams, 0.9, np.float32) if e is None else e
-    grid = _core.Grid2D(OPTIONS.resolution, OPTIONS.registration.approach)
+    grid = _core.OccupancyGrid2D(OPTIONS.resolution, OPTIONS.registration.approach)
     return LocalMap(grid, recording, e, spacing, OPTIONS.surface)
 
 
@@ -119,7 +119,9 @@ def test_each_laser_has_its_own_scans():
     recording, T = simulation.recording, simulation.truth.T_world_base
     assert recording.sensor[:4].tolist() == [0, 1, 0, 1]
     e = np.full(recording.n_beams, 0.9, np.float32)
-    so_far = LocalMap(_core.Grid2D(0.05, 0.5), recording, e, OPTIONS.spacing, OPTIONS.surface)
+    so_far = LocalMap(
+        _core.OccupancyGrid2D(0.05, 0.5), recording, e, OPTIONS.spacing, OPTIONS.surface
+    )
     so_far.add(0, T[0], 0.0)
     assert so_far.has(0)
     assert not so_far.has(1)

@@ -96,7 +96,9 @@ def test_a_square_with_drift_closes():
     for step in steps:
         poses.append(poses[-1] @ step)
     n = len(poses)
-    drifted = MStepResult(np.array(poses), np.zeros((n, 3, 3)), _core.Grid2D(0.05), np.ones(n), [])
+    drifted = MStepResult(
+        np.array(poses), np.zeros((n, 3, 3)), _core.OccupancyGrid2D(0.05), np.ones(n), []
+    )
     before = absolute_errors(drifted.poses, truth)
     e = np.full(simulation.recording.n_beams, 0.9, np.float32)
     found = close_loops(simulation.recording, e, OPTIONS, drifted, silent)
@@ -231,7 +233,7 @@ def test_scans_of_each_laser_are_chosen_by_themselves():
 def test_the_grid_is_what_the_poses_make():
     found = mapped(square())
     e = np.full(square().recording.n_beams, 0.9, np.float32)
-    grid = _core.Grid2D(OPTIONS.resolution)
+    grid = _core.OccupancyGrid2D(OPTIONS.resolution)
     em.add_recording(grid, square().recording, found.poses, e)
     for ours, theirs in zip(found.grid.dense(), grid.dense(), strict=True):
         np.testing.assert_array_equal(ours, theirs)

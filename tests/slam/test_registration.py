@@ -147,7 +147,7 @@ def corridor(x_of_walker=None):
 
 def test_a_mover_that_is_known_as_one_has_no_pull(scan, put):
     # the walker ahead of the robot has gone on by 0.25 m since the map was made
-    grid = _core.Grid2D(0.05)
+    grid = _core.OccupancyGrid2D(0.05)
     for k, x in enumerate(np.linspace(-0.6, 0.6, 9)):
         put(grid, scan(corridor(3.0), (x, 0, 0), k), (x, 0, 0))
     there = scan(corridor(3.25), (0, 0, 0), 50)
@@ -167,7 +167,7 @@ def test_a_mover_that_is_known_as_one_has_no_pull(scan, put):
 @pytest.mark.parametrize("turned", [0.0, 0.6, np.pi / 2])
 def test_covariance_is_long_along_a_corridor(scan, put, turned):
     along, across = [np.cos(turned), np.sin(turned)], [-np.sin(turned), np.cos(turned)]
-    grid = _core.Grid2D(0.05)
+    grid = _core.OccupancyGrid2D(0.05)
     for k, x in enumerate(np.linspace(0.0, 1.5, 40)):
         put(grid, scan(corridor(), (x, 0, 0), k), (x * along[0], x * along[1], turned))
     points = scan(corridor(), (0.7, 0, 0), 9)
@@ -195,7 +195,7 @@ def test_covariance_shrinks_with_what_is_seen(hall, mapped, scan):
 def test_without_a_beam_the_prior_is_the_answer(hall, mapped):
     nothing = np.zeros((0, 2), np.float32)
     prior = prior_at((1.0, -2.0, 2.5), 0.2, 0.1)
-    for grid in (mapped(hall), _core.Grid2D(0.05)):
+    for grid in (mapped(hall), _core.OccupancyGrid2D(0.05)):
         found = placed(grid, nothing, np.zeros(0, np.float32), prior)
         np.testing.assert_array_equal(found.T_map_base, prior.T_map_base)
         np.testing.assert_allclose(found.covariance, np.linalg.inv(prior.information))
@@ -204,7 +204,7 @@ def test_without_a_beam_the_prior_is_the_answer(hall, mapped):
 
 def test_in_an_empty_map_the_prior_is_the_answer(hall, scan):
     points, prior = scan(hall, (0, 0, 0)), prior_at((1.0, -2.0, 2.5), 0.2, 0.1)
-    found = placed(_core.Grid2D(0.05), points, ones(points), prior)
+    found = placed(_core.OccupancyGrid2D(0.05), points, ones(points), prior)
     np.testing.assert_allclose(found.T_map_base, prior.T_map_base, atol=1e-12)
 
 

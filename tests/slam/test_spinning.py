@@ -141,13 +141,13 @@ def test_empty_sweeps_go_on_as_before(room):
 def test_memory_is_bounded_by_the_reach():
     street = Boxes.of([[0.0, 0.0, 1.0, 4000.0, 12.0, 5.0, 0, 0, 0]])
     recording, _, e = recorded(street, SPARSE, wobbling(40, speed=30.0, turn=0.0), 40, seed=4)
-    local = _core.SweepMap3D(0.4, 4, 60.0)
+    local = _core.NdtMap3D(0.4, 4, 60.0)
     sizes = []
     for t, x in enumerate(np.arange(0.0, 120.0, 3.0)):
         T = se3.exp(np.array([x, 0, 0, 0, 0, 0]))
         sweep = lidar_odometry.select_sweep(recording, e, t, 20.0, 0.2)
         local.add(sweep.points, sweep.weights, T)
-        local.keep_near(T, 20.0)
+        local.crop(T, 20.0)
         sizes.append(len(local))
     assert max(sizes[20:]) < 1.2 * max(sizes[10:20])
 

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
-from stillmap.em.observations import iter_chunks
 from stillmap.em.types import CellProbabilities, EStepResult, Grid, Likelihood, fill_beams
 
 Float = NDArray[np.float64]
@@ -61,7 +61,11 @@ def log_likelihood(
 
 
 def hit_ratio_e_step(
-    recording: Recording, poses: Float, grid: _core.Grid2D, threshold: float, threads: int = 1
+    recording: Recording,
+    poses: Float,
+    grid: _core.OccupancyGrid2D,
+    threshold: float,
+    threads: int = 1,
 ) -> EStepResult:
     """p_static by the hit ratio r of the end cell, 1/2 at the threshold.
 
@@ -85,7 +89,7 @@ def hit_ratio_e_step(
     return EStepResult(p, found.likelihood, threshold_hit_ratio(grid, threshold))
 
 
-def threshold_hit_ratio(grid: _core.Grid2D, threshold: float) -> CellProbabilities:
+def threshold_hit_ratio(grid: _core.OccupancyGrid2D, threshold: float) -> CellProbabilities:
     """One where alpha / (alpha + beta) reaches the threshold, else zero."""
     first, alpha, beta = grid.dense()
     ratio = np.divide(alpha, alpha + beta, out=np.zeros_like(alpha), where=alpha + beta > 0.0)

@@ -106,7 +106,7 @@ def track_changes(
 
     Without `courses` only for whether they do: `told_of` wants no more.
     """
-    dwell.watch(**_model(recording, options), courses=courses)
+    dwell.track_changes(**_model(recording, options), with_paths=courses)
 
 
 def decode_histories(looks: Observations, options: EmOptions) -> CellHistories:
@@ -179,7 +179,7 @@ def _groups(looks: Observations) -> tuple[NDArray[np.bool_], ...]:
 
 def _likelihood(looks: Observations, rows: Rows) -> NDArray[np.float32]:
     """(n, C + 1) of some elements under each of these classes."""
-    return _with_changing(looks.under(_kept(looks), rows), looks.dwell.log_changing(rows))
+    return _with_changing(looks.under(_kept(looks), rows), looks.dwell.change_log_likelihood(rows))
 
 
 def _shares(looks: Observations, options: EmOptions) -> Float:
@@ -248,15 +248,15 @@ def _model(recording: Recording, options: EmOptions) -> dict[str, float]:
     return {
         # a thing stays for 2 tau on average, and its place is free as long
         "tau": 0.5 * stays,
-        "passing_occupied": changes.passing_occupied,
-        "passing_tau": changes.passing_seconds,
-        "detection": options.dwell.detection,
+        "passer_by_rho": changes.passing_occupied,
+        "passer_by_tau": changes.passing_seconds,
+        "p_detection": options.dwell.detection,
     }
 
 
-def _with_changing(seen: ClassLikelihoods, log_changing: Float) -> NDArray[np.float32]:
+def _with_changing(seen: ClassLikelihoods, change_log_likelihood: Float) -> NDArray[np.float32]:
     """(E, C + 1) the likelihoods with that of the changing class last, relative as before."""
-    above = np.minimum(log_changing - seen.log_best, _MOST_NATS)
+    above = np.minimum(change_log_likelihood - seen.log_best, _MOST_NATS)
     table = np.column_stack([seen.likelihood, np.exp(above).astype(np.float32)])
     table /= np.exp(np.maximum(above, 0.0)).astype(np.float32)[:, None]
     return table

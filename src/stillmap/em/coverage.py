@@ -6,8 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
-from stillmap.em.observations import iter_chunks, time_bin_index
+from stillmap.em.observations import (
+    time_bin_index,
+)
 from stillmap.em.occupancy_grid import OccupancyMap
 from stillmap.em.options import EmOptions
 from stillmap.em.types import NoReturnModel
@@ -57,11 +60,11 @@ def count_observations(
         threads: same result with any number.
     """
     least, near = options.evidence.least, options.evidence.near
-    counts = _core.LookCounts2D(
+    counts = _core.ObservationCounts2D(
         occupancy.resolution,
         radius=near,
-        stops=None if no_return is None else no_return.stop_cells,
-        beyond=0.0 if no_return is None else no_return.end_margin,
+        stop_cells=None if no_return is None else no_return.stop_cells,
+        end_margin=0.0 if no_return is None else no_return.end_margin,
     )
     look = time_bin_index(recording, options.dwell.look)
     T_map_sensor = recording.T_map_sensor(poses)

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 import stillmap._core as _core
 from stillmap.core.arrays import iter_blocks
+from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
 from stillmap.em import beam_counting, occupancy_hmm
 from stillmap.em.beam_counting import hit_ratio_e_step, log_likelihood, paper_e_step
-from stillmap.em.observations import iter_chunks
 from stillmap.em.occupancy_grid import ObservedCells
 from stillmap.em.occupancy_hmm import e_step_3d
 from stillmap.em.options import EmOptions
@@ -51,7 +51,7 @@ def fixed_iterations(estimator: Estimator) -> int | None:
 
 def make_grid(dimension: int, resolution: float, approach: float = 0.0) -> Grid:
     """A grid without any sums."""
-    kind = _core.Grid2D if dimension == 2 else _core.Grid3D
+    kind = _core.OccupancyGrid2D if dimension == 2 else _core.OccupancyGrid3D
     return kind(resolution, approach)
 
 
@@ -75,7 +75,7 @@ def e_step(
         return e_step_3d(recording, poses, grid.resolution, options, threads)
     if estimator == "stillmap":
         return occupancy_hmm.e_step(recording, poses, grid.resolution, options, threads)
-    if not isinstance(grid, _core.Grid2D):
+    if not isinstance(grid, _core.OccupancyGrid2D):
         raise ValueError(f"estimator: {estimator} knows 2D recordings alone")
     if estimator == "hit-ratio":
         return hit_ratio_e_step(recording, poses, grid, options.hit_ratio, threads)
@@ -93,7 +93,7 @@ def _tracked(
     for _, beams, _ in iter_chunks(recording, release=[people, e]):
         kept = (~people[beams]).astype(np.float32)
         e[beams] = fill_beams(recording.points[beams], recording.hit[beams], kept, options.prior)
-    grid = _core.Grid2D(resolution)
+    grid = _core.OccupancyGrid2D(resolution)
     add_recording(grid, recording, poses, e, threads)
     likelihood = log_likelihood(recording, poses, grid, e, options.prior, threads)
     return EStepResult(e, likelihood, beam_counting.threshold_hit_ratio(grid, options.hit_ratio))
@@ -128,12 +128,12 @@ def recount_as_static(
     T_map_sensor = recording.T_map_sensor(poses)
     for scans, beams, offset in iter_chunks(recording, release=[e]):
         points, hit, T = recording.points[beams], recording.hit[beams], T_map_sensor[scans]
-        _core.add_ends(grid, points, hit, e[beams], offset, T, remove=True)
-        _core.add_ends(grid, points, hit, np.ones(len(hit), np.float32), offset, T)
+        _core.add_end_points(grid, points, hit, e[beams], offset, T, remove=True)
+        _core.add_end_points(grid, points, hit, np.ones(len(hit), np.float32), offset, T)
 
 
 def add_trusted_beams(
-    grid: _core.Grid2D,
+    grid: _core.OccupancyGrid2D,
     recording: Recording,
     poses: Float,
     e: NDArray[np.float32],
@@ -148,10 +148,10 @@ def add_trusted_beams(
         add_recording(grid, recording, poses, e, threads)
         return None
     add_recording(grid, recording, poses, e, threads, hits_only=True)
-    rest = _core.Grid2D(grid.resolution, grid.approach)
+    rest = _core.OccupancyGrid2D(grid.resolution, grid.approach)
     T_map_sensor = recording.T_map_sensor(poses)
     for scans, beams, offset in iter_chunks(recording):
-        _core.add_lost(
+        _core.add_no_return_beams(
             grid,
             rest,
             recording.points[beams],
@@ -162,7 +162,7 @@ def add_trusted_beams(
             no_return.end_margin,
             threads,
         )
-    first_cell, cells = grid.seen()
+    first_cell, cells = grid.observed_mask()
     grid.merge(rest)
     return ObservedCells(first_cell, cells.view(np.bool_))
 

@@ -7,19 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
-from stillmap.em.observations import iter_chunks
 
 Float = NDArray[np.float64]
 
 # The same for every recording: rates and widths learned from it would excuse what is to be found
 # out, a blurred map above all.
 BEAM_MODEL = {
-    "stopping": 15.0,  # per metre, by what is surely static
-    "noise": 0.1,  # m, of range and pose: less would see little but the poses' errors
-    "late": 0.6,  # share of the beams that graze, or pass an edge, and end somewhere behind it
-    "delay": 0.3,  # m, how far behind it on average
-    "outliers": 0.01,
+    "stopping_rate": 15.0,  # per metre, by what is surely static
+    "range_std": 0.1,  # m, of range and pose: less would see little but the poses' errors
+    "late_share": 0.6,  # share of beams that graze, or pass an edge, and end somewhere behind it
+    "mean_delay": 0.3,  # m, how far behind it on average
+    "outlier_share": 0.01,
 }
 
 
@@ -52,18 +52,18 @@ def score_held_out_scans(
         The mean over beams of ln p(z) - ln q(z); None where fewer than `every` scans or no usable
         beams are there.
 
-    With s_j the mean e of the other scans' hits in cell j, a beam meets what is static at
-    h_j = stopping s_j per metre and what moves at lambda = sum (1 - e) / sum of lengths. The range
+    With s_j the mean e of the other scans' hits in cell j, a beam meets what is static at h_j =
+    stopping_rate s_j per metre and what moves at lambda = sum (1 - e) / sum of lengths. The range
     density of what it meets after the way r is H(r) = (h_j + lambda) exp(-integral of it up to r);
-    what is static is measured at z = r + noise, or at r + Exp(delay). q is the density of a world
-    without a map, in which beams end at the same rate everywhere; a share `outliers` of p is q.
-    Both integrate to one over z, together with the probability that nothing stops the beam.
+    what is static is measured at z = r + noise, or at r + Exp(mean_delay). q is the density of a
+    world without a map, in which beams end at the same rate everywhere; a share `outlier_share` of
+    p is q. Both integrate to one over z, together with the probability that nothing stops the beam.
     """
     if every == 0 or recording.n_scans < every:
         return None
     held = select_held_out_scans(recording.n_scans, every)
     T_map_sensor = recording.T_map_sensor(poses)
-    kind = _core.StaticShares2D if recording.dimension == 2 else _core.StaticShares3D
+    kind = _core.StaticFractionGrid2D if recording.dimension == 2 else _core.StaticFractionGrid3D
     shares = kind(resolution)
     for scans, beams, offset in iter_chunks(recording, release=[e]):
         points, hit = recording.points[beams], recording.hit[beams]
@@ -71,7 +71,7 @@ def score_held_out_scans(
     gain, count = 0.0, 0.0
     for scans, beams, offset in iter_chunks(recording):
         points, hit = recording.points[beams], recording.hit[beams]
-        per_scan = _core.held_out(
+        per_scan = _core.score_held_out(
             shares, points, hit, offset, T_map_sensor[scans], held[scans], threads=threads,
             **BEAM_MODEL,
         )  # fmt: skip

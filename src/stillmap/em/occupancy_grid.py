@@ -85,7 +85,7 @@ def make_occupancy_map(
             that beams crossed.
         box: which cells are wanted, instead.
     """
-    if not isinstance(grid, _core.Grid2D):
+    if not isinstance(grid, _core.OccupancyGrid2D):
         raise ValueError("grid: expected one of 2 dimensions")
     if observed is not None:
         window = GridWindow(observed.first_cell, observed.cells.shape)
@@ -102,12 +102,14 @@ def make_occupancy_map(
     return OccupancyMap(p_occupied, a, b, (x, y, 0.0), grid.resolution)
 
 
-def _whole(grid: _core.Grid2D) -> GridWindow:
-    first_cell, (height, width) = grid.box()
+def _whole(grid: _core.OccupancyGrid2D) -> GridWindow:
+    first_cell, (height, width) = grid.bounding_box()
     return GridWindow(first_cell, (height, width))
 
 
-def _tiles(grid: _core.Grid2D, box: GridWindow) -> Iterator[tuple[tuple[slice, slice], Sums, Sums]]:
+def _tiles(
+    grid: _core.OccupancyGrid2D, box: GridWindow
+) -> Iterator[tuple[tuple[slice, slice], Sums, Sums]]:
     """Where in a box cells were crossed: rows and columns of a tile, and its alpha and beta."""
     height, width = box.shape
     for row, column in itertools.product(range(0, height, _TILE), range(0, width, _TILE)):

@@ -1,15 +1,9 @@
-"""The default E-step: what stands still is what never leaves. `docs/estimator.md` derives it.
+"""E-step of the occupancy HMM: a forward filter per cell under several classes.
 
-The E-step in 3D: the default one, to which what came to stay, or left, is dynamic as well.
-
-A recording of streets lasts for minutes, and a car that waits at a light for half of them, then
-goes on, is no wall. Whoever removes what moves from a cloud wants the car out, and its place free.
-
-The last E-step, at the poses that are kept: labels, and things that came to stay or left.
-
-It knows more classes than the loop does, and each of the two questions has its own ones of them.
-In the loop, what is met from some places only would explain walls that are drawn twice, and hold
-the scans to them.
+In 3D objects that arrived or left are dynamic as well, and neighbouring voxels are labelled
+together. The final E-step, at the poses that are kept, has more classes than the loop: within the
+loop, view-dependent surface would explain walls that are drawn twice and hold the scans to them.
+`docs/estimator.md` derives the equations.
 """
 
 from dataclasses import replace
@@ -17,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
 from stillmap.em.changepoints import (
     CellHistories,
@@ -30,14 +25,13 @@ from stillmap.em.mixture import MixtureWeights, fit_weights, posterior_static
 from stillmap.em.observations import (
     HALF_TIME_RHO,
     LOOP_CLASSES,
+    MAX_RANGE_MARGIN,
     ClassLikelihoods,
-    Float,
     HmmClasses,
     Observations,
     OccupancyHmm,
     SurfelMap,
     collect_observations,
-    iter_chunks,
     probability_in_cell,
     surfel_cells,
 )
@@ -49,11 +43,29 @@ from stillmap.em.spatial_prior import (
     select_obstacles,
     smooth_mean_field,
 )
-from stillmap.em.types import CellProbabilities, EStepResult, Likelihood, NoReturnModel, fill_beams
+from stillmap.em.types import (
+    CellProbabilities,
+    EStepResult,
+    Float,
+    Likelihood,
+    NoReturnModel,
+    fill_beams,
+)
 
-_UNSEEN = 0.2  # probability that a cell is occupied in which no beam ended and none passed
+_FREE_PRIOR = 0.2  # occupancy probability of a cell in which no beam ended and none passed
+_MIN_TRUST = 0.5  # in beams without a return, from which on they show free space
+_VIEW_CLASSES = True  # the final E-step has view-dependent static classes
 
-_BELIEVED = 0.5  # trust in beams without a return from which on they show free space
+_CLASSES_3D = HmmClasses(dynamic_tau=(0.5, 3.0, 6.0, 12.0), half_time_tau=(8.0, 24.0))
+
+_CROWD_RHO, _CROWD_TAU = 0.15, 3.0  # where many people pass, some seconds each
+_WAITING_TAU = 6.0  # s, of changes only
+_FINAL_CLASSES = HmmClasses(
+    view_rho=(0.65,),
+    dynamic_rho=(0.01, 0.04, _CROWD_RHO),
+    dynamic_tau=(0.5, _CROWD_TAU, _WAITING_TAU, 12.0, 45.0),
+    half_time_tau=(8.0, 24.0),
+)
 
 
 def e_step(
@@ -64,202 +76,195 @@ def e_step(
     threads: int = 1,
     classes: HmmClasses = LOOP_CLASSES,
 ) -> EStepResult:
-    """P(c = 1) of every beam: of its end cell being occupied by something that stays.
+    """P(c = 1) of every beam: the probability that its end cell holds something that stays.
 
     Args:
         recording: 2D or 3D.
         poses: (T, D+1, D+1) T_map_base.
-        resolution: m, edge of a cell.
+        resolution: edge of a cell, metres.
         options: see EmOptions.
-        threads: same result with any number.
-        classes: see Classes.
+        threads: does not change the result.
+        classes: of the HMM.
     """
-    looks = collect_observations(recording, poses, resolution, options, threads, classes)
-    return label_beams(looks, None, recording, poses, options, threads)
-
-
-def label_beams(
-    looks: Observations,
-    kept: NDArray[np.bool_] | None,
-    recording: Recording,
-    poses: Float,
-    options: EmOptions,
-    threads: int,
-    static: NDArray[np.float32] | None = None,
-    feet: GroundContact | None = None,
-) -> EStepResult:
-    """What the looks say of every cell, and with that of every beam that ended in it.
-
-    kept (C,): under which of the classes; None: all. static (E,) is what is known better of each
-    cell than these say, and with that of all cells. feet: what is known of beams that end on the
-    ground below something that moves.
-    """
-    some = looks.under(kept, looks.sample())
-    shares = fit_weights(some.likelihood, some.n_static, options.prior)
-    found, likelihood = _of_elements(looks, kept, shares)
-    share = shares.static if static is None else _mean(static, shares.static)
-    static = found if static is None else static
-    surface, T_map_sensor = looks.surface, recording.T_map_sensor(poses)
-    beyond = options.dwell.beyond if looks.trust >= _BELIEVED else float("inf")
-    return EStepResult(
-        p_static=_of_beams(recording, T_map_sensor, surface, static, share, threads, feet),
-        likelihood=likelihood,
-        occupied=CellProbabilities(
-            surfel_cells(surface), static * probability_in_cell(surface), _UNSEEN
-        ),
-        learned=_learned(looks, some, shares) | {"p_static": share},
-        no_return=NoReturnModel(looks.dwell.solid(), beyond),
-    )
-
-
-def _mean(static: NDArray[np.float32], of_none: float) -> float:
-    return float(np.mean(static, dtype=np.float64)) if len(static) else of_none
-
-
-def _of_beams(
-    recording: Recording,
-    T_map_sensor: Float,
-    surface: SurfelMap,
-    static: NDArray[np.float32],
-    prior: float,
-    threads: int,
-    feet: GroundContact | None,
-) -> NDArray[np.float32]:
-    """(M,) what is known (E,) of the element that each beam ended in."""
-    found = np.append(static, np.float32(prior))  # -1: no element
-    e = recording.allocate_per_beam(np.float32)
-    for scans, beams, offset in iter_chunks(recording, release=[e]):
-        points, hit = recording.points[beams], recording.hit[beams]
-        element = surface.elements_of(points, hit, offset, T_map_sensor[scans], threads)
-        known = fill_beams(points, hit, found.take(element), prior)
-        if feet is not None:
-            over = feet.of(points, hit, offset, T_map_sensor[scans], element, threads)
-            known = np.where(np.isnan(over), known, over)
-        e[beams] = known
-    return e
-
-
-def _of_elements(
-    looks: Observations, kept: NDArray[np.bool_] | None, shares: MixtureWeights
-) -> tuple[NDArray[np.float32], Likelihood]:
-    """(E,) P(static) by the classes alone, and the bound."""
-    static, bound, entropy = np.empty(looks.surface.size, np.float32), 0.0, 0.0
-    for rows in looks.blocks():
-        table = looks.under(kept, rows)
-        static[slice(*rows)] = posterior_static(table.likelihood, shares.classes, table.n_static)
-        joint = table.likelihood * shares.classes
-        evidence = joint.sum(axis=1)
-        r = joint / evidence[:, None]
-        entropy -= float(np.sum(r * np.log(np.maximum(r, 1e-30))))
-        bound += float(np.sum(np.log(evidence) + table.log_best))
-    return static, Likelihood(expected=bound - entropy, bound=bound)
-
-
-def _learned(
-    looks: Observations, table: ClassLikelihoods, shares: MixtureWeights
-) -> dict[str, object]:
-    static, movers = slice(None, table.n_static), slice(table.n_static, None)
-    return {
-        "scatter": looks.surface.scatter,
-        "p_static": shares.static,
-        "no_return_trusted": round(looks.trust, 6),
-        "static_occupied": _shares_of(table.rho[static], shares.classes[static]),
-        "mover_occupied": _shares_of(table.rho[movers], shares.classes[movers]),
-        "mover_seconds": _shares_of(table.tau[movers], shares.classes[movers]),
-    }
-
-
-def _shares_of(values: Float, shares: Float) -> list[dict[str, float]]:
-    """The share of each value among these classes."""
-    of = shares / shares.sum()
-    return [
-        {"value": float(v), "share": round(float(of[values == v].sum()), 6)}
-        for v in dict.fromkeys(values.tolist())
-    ]
-
-
-_CLASSES_3D = HmmClasses(mover_seconds=(0.5, 3.0, 6.0, 12.0), often_seconds=(8.0, 24.0))
+    seen = collect_observations(recording, poses, resolution, options, threads, classes)
+    return label_beams(seen, None, recording, poses, options)
 
 
 def e_step_3d(
     recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int = 1
 ) -> EStepResult:
-    """P(c = 1) of every beam: of its end cell being occupied by something that was never away.
+    """P(c = 1) of every beam of a 3D recording; what arrived or left is dynamic.
 
-    Args: see `dwell.e_step`. Without `changes.enabled` it is that one. With `changes.in_space`
-    it also says where things came or left.
+    Args: see `e_step`, which it is without `change_detection`. With `change_detection_3d` the
+    result lists the cells that changed.
     """
-    if not options.changes.enabled:
+    if not options.change_detection:
         return e_step(recording, poses, resolution, options, threads)
 
-    listed = options.changes.in_space
+    def prepare(hmm: OccupancyHmm) -> None:
+        track_changes(hmm, recording, options, with_paths=options.change_detection_3d)
 
-    def prepare(dwell: OccupancyHmm) -> None:
-        track_changes(dwell, recording, options, courses=listed)
-
-    looks = collect_observations(
+    seen = collect_observations(
         recording, poses, resolution, options, threads, _CLASSES_3D, prepare
     )
-    told = label_cells(looks, options)
-    static = smooth_mean_field(told.p_static, looks.surface, options.beside, threads)
+    cells = label_cells(seen, options)
+    p_static = smooth_mean_field(cells.p_static, seen.surfel_map, threads)
     T_map_sensor = recording.T_map_sensor(poses)
-    ground = ground_from_surfels(looks.surface, static, T_map_sensor[:, :3, 3])
-    standing = select_obstacles(ground, looks.surface, options.bodies)
-    static = pool_clusters(
-        static, told.change, standing, recording, T_map_sensor, options.bodies, threads
-    )
-    feet = make_ground_contact(standing, static, options.bodies)
-    found = label_beams(looks, None, recording, poses, options, threads, static, feet)
+    ground = ground_from_surfels(seen.surfel_map, p_static, T_map_sensor[:, :3, 3])
+    obstacles = select_obstacles(ground, seen.surfel_map)
+    contact = None
+    if obstacles is not None:
+        p_static = pool_clusters(
+            p_static, cells.change, obstacles, recording, T_map_sensor, threads
+        )
+        contact = make_ground_contact(obstacles, p_static)
+    found = label_beams(seen, None, recording, poses, options, p_static, contact)
+    changed_cells = None
+    if options.change_detection_3d:
+        changed_cells = select_changed_cells(decode_histories(seen, options))
     return replace(
         found,
-        learned={**found.learned, "changing": round(told.share, 6)},
-        changed_cells=select_changed_cells(decode_histories(looks, options)) if listed else None,
+        learned={**found.learned, "changing": round(cells.changing_weight, 6)},
+        changed_cells=changed_cells,
         ground=ground,
     )
 
 
-_CROWDED = 0.15  # share of the time in which somebody is where many pass
-
-_SECONDS = 3.0
-
-_WAITING = 6.0  # s, of no use for labels
-
-_FINAL_CLASSES = HmmClasses(
-    views_occupied=(0.65,),
-    mover_occupied=(0.01, 0.04, _CROWDED),
-    mover_seconds=(0.5, _SECONDS, _WAITING, 12.0, 45.0),
-    often_seconds=(8.0, 24.0),
-)
+def has_final_e_step(options: EmOptions) -> bool:
+    """Whether labels or changes need a final E-step in 2D."""
+    return _VIEW_CLASSES or options.change_detection
 
 
 def final_e_step(
     recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int = 1
 ) -> tuple[EStepResult | None, CellHistories | None]:
-    """Labels with what is met from some places only, and what became of each cell.
+    """E-step at the final poses, with view-dependent and half-time classes.
 
-    Args: see `dwell.e_step`.
+    Args: see `e_step`.
 
     Returns:
-        what is static, None without `dwell.views`; the courses of the same cells, None without
-        `changes.enabled`.
+        labels, None without view classes; histories of the same cells, None without
+        `change_detection`.
     """
 
-    def prepare(dwell: OccupancyHmm) -> None:
-        if options.changes.enabled:
-            track_changes(dwell, recording, options)
+    def prepare(hmm: OccupancyHmm) -> None:
+        if options.change_detection:
+            track_changes(hmm, recording, options)
 
-    views = options.dwell.views
-    classes = _FINAL_CLASSES if views else replace(_FINAL_CLASSES, views_occupied=())
-    looks = collect_observations(recording, poses, resolution, options, threads, classes, prepare)
-    found = None
-    if views:
-        found = label_beams(looks, _for_labels(looks), recording, poses, options, threads)
-    return found, decode_histories(looks, options) if options.changes.enabled else None
+    classes = _FINAL_CLASSES if _VIEW_CLASSES else replace(_FINAL_CLASSES, view_rho=())
+    seen = collect_observations(recording, poses, resolution, options, threads, classes, prepare)
+    labels = None
+    if _VIEW_CLASSES:
+        labels = label_beams(seen, _label_classes(seen), recording, poses, options)
+    return labels, decode_histories(seen, options) if options.change_detection else None
 
 
-def _for_labels(looks: Observations) -> NDArray[np.bool_]:
-    """(C,) without crowds of some seconds: these are what a chair is that a robot passes."""
-    crowds = (looks.rho == _CROWDED) & (looks.tau == _SECONDS)
-    kept = ~crowds & (looks.tau != _WAITING) & (looks.rho != HALF_TIME_RHO)
-    kept[: looks.n_static] = True
+def _label_classes(seen: Observations) -> NDArray[np.bool_]:
+    """(C,) classes for labels: without crowds of some seconds, which a chair resembles."""
+    crowds = (seen.rho == _CROWD_RHO) & (seen.tau == _CROWD_TAU)
+    kept = ~crowds & (seen.tau != _WAITING_TAU) & (seen.rho != HALF_TIME_RHO)
+    kept[: seen.n_static] = True
     return np.asarray(kept)
+
+
+def label_beams(
+    seen: Observations,
+    classes: NDArray[np.bool_] | None,
+    recording: Recording,
+    poses: Float,
+    options: EmOptions,
+    p_static: NDArray[np.float32] | None = None,
+    contact: GroundContact | None = None,
+) -> EStepResult:
+    """Fits the mixture weights and labels each beam by the cell in which it ended.
+
+    Args:
+        seen: E surfels with their observations.
+        classes: (C,) classes to use; None: all.
+        recording, poses, options: see `e_step`.
+        p_static: (E,) P(static) of each surfel to use instead of the posterior.
+        contact: relabels beams that end on the ground below something that moves.
+    """
+    sample = seen.likelihoods(classes, seen.sample_rows())
+    weights = fit_weights(sample.likelihood, sample.n_static, options.prior)
+    posterior, likelihood = _surfel_posterior(seen, classes, weights)
+    prior = weights.static
+    if p_static is None:
+        p_static = posterior
+    elif len(p_static):
+        prior = float(np.mean(p_static, dtype=np.float64))
+    surfel_map = seen.surfel_map
+    end_margin = MAX_RANGE_MARGIN if seen.trust >= _MIN_TRUST else float("inf")
+    return EStepResult(
+        p_static=_beam_labels(recording, poses, surfel_map, p_static, prior, seen.threads, contact),
+        likelihood=likelihood,
+        occupied=CellProbabilities(
+            surfel_cells(surfel_map), p_static * probability_in_cell(surfel_map), _FREE_PRIOR
+        ),
+        learned=_learned(seen, sample, weights) | {"p_static": prior},
+        no_return=NoReturnModel(seen.hmm.solid_cells(), end_margin),
+    )
+
+
+def _beam_labels(
+    recording: Recording,
+    poses: Float,
+    surfel_map: SurfelMap,
+    p_static: NDArray[np.float32],
+    prior: float,
+    threads: int,
+    contact: GroundContact | None,
+) -> NDArray[np.float32]:
+    """(M,) P(static) of the surfel (E,) in which each beam ended."""
+    with_prior = np.append(p_static, np.float32(prior))  # surfel -1: none
+    e = recording.per_beam(np.float32)
+    T_map_sensor = recording.T_map_sensor(poses)
+    for scans, beams, offset in iter_chunks(recording, release=[e]):
+        points, hit, T = recording.points[beams], recording.hit[beams], T_map_sensor[scans]
+        surfel = surfel_map.associate_beams(points, hit, offset, T, threads)
+        labels = fill_beams(points, hit, with_prior.take(surfel), prior)
+        if contact is not None:
+            above = contact.label_above(points, hit, offset, T, surfel, threads)
+            labels = np.where(np.isnan(above), labels, above)
+        e[beams] = labels
+    return e
+
+
+def _surfel_posterior(
+    seen: Observations, classes: NDArray[np.bool_] | None, weights: MixtureWeights
+) -> tuple[NDArray[np.float32], Likelihood]:
+    """(E,) P(static) of each surfel, and the bound sum ln sum_c w_c L_c."""
+    p_static, bound, entropy = np.empty(seen.surfel_map.size, np.float32), 0.0, 0.0
+    for rows in seen.iter_rows():
+        table = seen.likelihoods(classes, rows)
+        p_static[slice(*rows)] = posterior_static(table.likelihood, weights.classes, table.n_static)
+        joint = table.likelihood * weights.classes
+        evidence = joint.sum(axis=1)
+        r = joint / evidence[:, None]
+        entropy -= float(np.sum(r * np.log(np.maximum(r, 1e-30))))
+        bound += float(np.sum(np.log(evidence) + table.log_best))
+    return p_static, Likelihood(expected=bound - entropy, bound=bound)
+
+
+def _learned(
+    seen: Observations, table: ClassLikelihoods, weights: MixtureWeights
+) -> dict[str, object]:
+    """The fitted parameters, as `run.json` lists them."""
+    static, dynamic = slice(None, table.n_static), slice(table.n_static, None)
+    return {
+        "scatter": seen.surfel_map.noise_std,
+        "p_static": weights.static,
+        "no_return_trusted": round(seen.trust, 6),
+        "static_occupied": _weight_by_value(table.rho[static], weights.classes[static]),
+        "mover_occupied": _weight_by_value(table.rho[dynamic], weights.classes[dynamic]),
+        "mover_seconds": _weight_by_value(table.tau[dynamic], weights.classes[dynamic]),
+    }
+
+
+def _weight_by_value(values: Float, weights: Float) -> list[dict[str, float]]:
+    """Share of each value among some classes."""
+    shares = weights / weights.sum()
+    return [
+        {"value": float(v), "share": round(float(shares[values == v].sum()), 6)}
+        for v in dict.fromkeys(values.tolist())
+    ]

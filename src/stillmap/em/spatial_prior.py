@@ -5,7 +5,7 @@ What stands apart from all else moves as a whole, or stands still. See `docs/spa
 Which cells belong together.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,10 +13,15 @@ import scipy  # its parts load when they are first used
 from numpy.typing import NDArray
 
 import stillmap._core as _core
+from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
-from stillmap.em.ground import GroundMap
-from stillmap.em.observations import Float, SurfelMap, iter_chunks, iter_surfel_rows
+from stillmap.em.observations import (
+    Float,
+    SurfelMap,
+    iter_surfel_rows,
+)
 from stillmap.em.options import BesideOptions, BodyOptions
+from stillmap.em.types import GroundMap
 
 Index = NDArray[np.intp]
 
@@ -36,16 +41,25 @@ def smooth_mean_field(
     """
     if not options.enabled:
         return p_static
-    if not isinstance(surface, _core.Surface3D):
+    if not isinstance(surface, _core.SurfelMap3D):
         raise TypeError("surface: expected one in space")
     p = np.clip(p_static, _CERTAIN, 1.0 - _CERTAIN)
     log_odds = np.log(p / (1.0 - p)).astype(np.float32)
-    return _core.settled(surface, log_odds, **arguments(options), threads=threads)
+    return _core.smooth_mean_field(surface, log_odds, **arguments(options), threads=threads)
 
 
 def arguments(options: BesideOptions) -> dict[str, Any]:
-    """Those of the kernel."""
-    return {name: value for name, value in asdict(options).items() if name != "enabled"}
+    """Keyword arguments of `_core.smooth_mean_field`."""
+    return {
+        "radius": options.radius,
+        "coplanar_std": options.coplanar,
+        "static_coupling": options.for_static,
+        "dynamic_coupling": options.for_dynamic,
+        "min_log_odds": options.least,
+        "max_log_odds": options.most,
+        "tolerance": options.moved,
+        "max_iterations": options.rounds,
+    }
 
 
 _SCATTERS = 2.5  # of end points about their surface, within which a beam ended on it
@@ -62,7 +76,7 @@ class ObstacleSurfels:
         column: cells, edge of the columns over the ground that touch within a body.
     """
 
-    surface: _core.Surface3D
+    surface: _core.SurfelMap3D
     stands: NDArray[np.bool_]
     ground: NDArray[np.float32]
     column: int
@@ -74,11 +88,11 @@ def select_obstacles(
     """What stands on the ground; None where none was seen, and nobody knows, or wants to."""
     if not (options.enabled and ground.observed):
         return None
-    if not isinstance(surface, _core.Surface3D):
+    if not isinstance(surface, _core.SurfelMap3D):
         raise TypeError("surface: expected one in space")
     stands, height = np.empty(surface.size, np.bool_), np.empty(surface.size, np.float32)
     for rows in iter_surfel_rows(surface):
-        means = surface.elements(rows)[1]
+        means = surface.surfels(rows)[1]
         below = ground.height_at(means[:, :2])
         above = means[:, 2] - below
         stands[slice(*rows)] = (above > options.low) & (above < options.high)
@@ -109,12 +123,12 @@ def pool_clusters(
     """
     if standing is None:
         return p_static
-    bodies = _core.Bodies3D(
+    bodies = _core.ClusterPooling3D(
         standing.surface,
         standing.stands,
         np.stack([1.0 - p_static, change], axis=1),
-        column=standing.column,
-        fewest=options.fewest,
+        column_cells=standing.column,
+        min_surfels=options.fewest,
     )
     for scans, beams, offset in iter_chunks(recording):
         points, hit = recording.points[beams], recording.hit[beams]
@@ -171,19 +185,19 @@ class GroundContact:
             element: (M,) in which each ended, -1: none.
             threads: same result with any number.
         """
-        return _core.feet(
+        return _core.relabel_ground_contact(
             self.standing.surface,
             points,
             hit,
             offset,
             T_map_sensor,
             element,
-            stands=self.standing.stands,
+            is_obstacle=self.standing.stands,
             p_static=self.p_static,
-            ground=self.standing.ground,
-            column=self.standing.column,
-            low=self.low,
-            least=self.least,
+            ground_height=self.standing.ground,
+            column_cells=self.standing.column,
+            max_ground_height=self.low,
+            min_end_height=self.least,
             threads=threads,
         )
 
@@ -194,7 +208,7 @@ def make_ground_contact(
     """Feet, as far as end points that scatter can tell them from the ground."""
     if standing is None:
         return None
-    least = max(options.foot, _SCATTERS * standing.surface.scatter)
+    least = max(options.foot, _SCATTERS * standing.surface.noise_std)
     return GroundContact(standing, p_static, options.low, least)
 
 

@@ -1,46 +1,31 @@
-"""What an E-step finds out, whichever estimator made it."""
+"""Results of an E-step, common to all estimators."""
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.arrays import finite_rows
+from stillmap.core.arrays import finite
 
-if TYPE_CHECKING:
-    from stillmap.em.ground import GroundMap
+Float = NDArray[np.float64]
 
+Grid = _core.OccupancyGrid2D | _core.OccupancyGrid3D
 
-@dataclass(frozen=True, eq=False)
-class ChangedCells:
-    """K cells; what each of them says is little, but many side by side may say the same.
+DYNAMIC_BELOW = 0.5  # P(c = 1) below which a beam is labelled dynamic
+MIN_PROBABILITY = 1e-6  # probabilities are kept this far from 0 and 1 before taking log odds
 
-    Attributes:
-        cells: (K, D) int64.
-        p_thing: (K,) float32, that a thing stood there at the last look.
-        count: (K,) int32, how often one came or left: once or twice.
-        between: (K, 2, 2) int32, looks before and after the first and the last of these changes.
-    """
-
-    cells: NDArray[np.int64]
-    p_object: NDArray[np.float32]
-    n_changes: NDArray[np.int32]
-    change_bins: NDArray[np.int32]
-
-
-Grid = _core.Grid2D | _core.Grid3D
+GROUND_SQUARE = 1.0  # m, edge of a square of the ground map
 
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Terms of the log likelihood, summed over all beams, in nats.
+    """Log likelihood of a recording in nats, summed over all beams or cells.
 
     Attributes:
-        expected: the expected complete-data log likelihood, for the printed method (5) with gamma
-            (7): the curve of Fig. 5.
-        bound: expected + entropy of the posterior: what no EM iteration with fixed poses lowers.
+        expected: expected complete-data log likelihood; for the printed method (5) with gamma (7),
+            the curve of Fig. 5.
+        bound: expected + entropy of the posterior, which EM at fixed poses never lowers.
     """
 
     expected: float
@@ -49,12 +34,12 @@ class Likelihood:
 
 @dataclass(frozen=True, eq=False)
 class CellProbabilities:
-    """Occupancy of single cells, as an estimator knows it better than by counting.
+    """Occupancy probabilities of single cells.
 
     Attributes:
         cells: (K, D) int64 cells in which beams ended.
         p_occupied: (K,) float32.
-        free_prior: probability that any other cell is occupied, before beams passed through it.
+        free_prior: occupancy probability of every other cell before beams passed through it.
     """
 
     cells: NDArray[np.int64]
@@ -64,11 +49,11 @@ class CellProbabilities:
 
 @dataclass(frozen=True, eq=False)
 class NoReturnModel:
-    """How far beams without a return are believed; fewer than three in a row are not at all.
+    """Free space shown by beams without a return; fewer than three neighbours show none.
 
     Attributes:
-        stops: (S, D) int64 cells from the first of which on they say nothing.
-        beyond: metres before their end from which on they say nothing; inf: all of their way.
+        stop_cells: (S, D) int64 solid cells; such a beam shows nothing from the first of them on.
+        end_margin: metres before its end from which on it shows nothing; inf: it shows nothing.
     """
 
     stop_cells: NDArray[np.int64]
@@ -76,18 +61,63 @@ class NoReturnModel:
 
 
 @dataclass(frozen=True, eq=False)
-class EStepResult:
-    """One E-step.
+class ChangedCells:
+    """K candidate cells of objects that arrived or left; only groups of them are significant.
 
     Attributes:
-        p_static: (M,) float32, e = P(c = 1); NaN: unusable, the prior at maximum range.
-        likelihood: at the map it was made from.
-        occupied: cells it knows more of than alpha / (alpha + beta) says.
-        learned: what was learned from the recording, JSON-able.
-        no_return: how far beams without a return are believed; None: all of their way.
-        ground: how high the ground is, where the estimator knows; None in the plane.
-        changed: cells that tell of something that came or left; None in the plane, where the
-            last E-step finds them.
+        cells: (K, D) int64.
+        p_object: (K,) float32, probability that an object stood there at the last observation.
+        n_changes: (K,) int32, number of arrivals and departures: one or two.
+        change_bins: (K, 2, 2) int32, time bins of the observations before and after the first and
+            the last change.
+    """
+
+    cells: NDArray[np.int64]
+    p_object: NDArray[np.float32]
+    n_changes: NDArray[np.int32]
+    change_bins: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class GroundMap:
+    """Height of the ground in squares of one metre.
+
+    Attributes:
+        height: (H, W) metres in the map frame, row 0 at the lowest y; squares without observations
+            are filled from their neighbours.
+        corner: (2,) x, y of the lower-left corner of the lowest square.
+        sensor_height: metres of the sensors above the ground.
+        observed: whether any ground was observed.
+    """
+
+    height: Float
+    corner: Float
+    sensor_height: float
+    observed: bool
+
+    def height_at(self, xy: Float) -> Float:
+        """(N,) height at positions (N, 2) in metres; outside, that of the nearest edge square."""
+        H, W = self.height.shape
+        column, row = (  # one after the other: rows of two numbers are slow
+            np.floor((x - corner) / GROUND_SQUARE).astype(np.int64).clip(0, last)
+            for x, corner, last in zip(xy.T, self.corner, (W - 1, H - 1), strict=True)
+        )
+        return np.asarray(self.height.take(row * W + column))
+
+
+@dataclass(frozen=True, eq=False)
+class EStepResult:
+    """Result of an E-step.
+
+    Attributes:
+        p_static: (M,) float32 responsibilities e_n = P(c_n = 1); NaN for unusable beams, the prior
+            for maximum-range beams.
+        likelihood: at the map that the E-step used.
+        occupied: occupancy of cells in which beams ended; None: alpha / (alpha + beta), (15).
+        learned: fitted parameters, JSON-able.
+        no_return: free space shown by beams without a return; None: they count at full length.
+        changed_cells: cells of objects that arrived or left, in 3D with `change_detection_3d`.
+        ground: height of the ground, in 3D where the estimator needs it.
     """
 
     p_static: NDArray[np.float32]
@@ -95,8 +125,8 @@ class EStepResult:
     occupied: CellProbabilities | None = None
     learned: dict[str, object] = field(default_factory=dict)
     no_return: NoReturnModel | None = None
-    changed_cells: "ChangedCells | None" = None
-    ground: "GroundMap | None" = None
+    changed_cells: ChangedCells | None = None
+    ground: GroundMap | None = None
 
 
 def fill_beams(
@@ -105,7 +135,7 @@ def fill_beams(
     values: NDArray[np.float32],
     prior: float,
 ) -> NDArray[np.float32]:
-    """(M,) `values` for the hits, the prior at maximum range, NaN for unusable beams."""
+    """(M,) `values` for hits, the prior for maximum-range beams, NaN for unusable ones."""
     e = np.where(hit, values, np.float32(prior)).astype(np.float32, copy=False)
-    e[~finite_rows(points)] = np.nan
+    e[~finite(points)] = np.nan
     return e

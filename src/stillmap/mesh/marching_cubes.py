@@ -18,17 +18,17 @@ TILE = 64  # voxels along a tile, whole blocks
 _LEAP = 2.5  # voxels by which distances differ within a cube where there are two surfaces
 
 
-def occupied_tiles(distances: _core.SignedDistances) -> NDArray[np.int64]:
+def occupied_tiles(distances: _core.TsdfVolume) -> NDArray[np.int64]:
     """(N, 3) tiles in which something is known, in the order of their numbers."""
     return np.unique(distances.blocks() // blocks_per_tile(distances), axis=0)
 
 
-def blocks_per_tile(distances: _core.SignedDistances) -> int:
+def blocks_per_tile(distances: _core.TsdfVolume) -> int:
     """Blocks along the edge of a tile."""
-    return TILE // distances.edge
+    return TILE // distances.block_edge
 
 
-def march_tile(distances: _core.SignedDistances, tile: NDArray[np.int64], fewest: float) -> Mesh:
+def march_tile(distances: _core.TsdfVolume, tile: NDArray[np.int64], fewest: float) -> Mesh:
     """The surface within one tile; vertices on its borders are those of the tile beside.
 
     There is no surface where a corner of a cube is not known, nor where distances leap: there
@@ -70,7 +70,7 @@ def _of_cubes(
     return values
 
 
-def extract_tile(distances: _core.SignedDistances, tile: NDArray[np.int64], fewest: float) -> Mesh:
+def extract_tile(distances: _core.TsdfVolume, tile: NDArray[np.int64], fewest: float) -> Mesh:
     """The surface within one tile, in metres; see `meshed`."""
     mesh = march_tile(distances, tile, fewest)
     return _in_metres(weld(mesh), distances.voxel) if len(mesh) else mesh

@@ -40,7 +40,7 @@ _BELOW = [way for way in product((-1, 0), repeat=3) if any(way)]
 class StreamingSurface:
     """What is known of a surface: distances in voxels, and triangles where nothing more comes."""
 
-    def __init__(self, distances: _core.SignedDistances, options: SurfaceOptions) -> None:
+    def __init__(self, distances: _core.TsdfVolume, options: SurfaceOptions) -> None:
         self.distances = distances
         self.options = options
         self.error = options.error_for(distances.voxel)
@@ -91,7 +91,7 @@ class StreamingSurface:
             for x, y, z in there & self._taken
             if not any((x + i, y + j, z + k) in there - self._taken for i, j, k in _BELOW)
         }
-        self.distances.forget(blocks[[key in gone for key in of_block]])
+        self.distances.remove_blocks(blocks[[key in gone for key in of_block]])
 
     def _merge(self) -> None:
         """One mesh; its border stays as it is, as more may come to it."""
@@ -181,9 +181,11 @@ def integrate_patches(
         reach: how far patches go; without it all voxels are kept to the end.
     """
     before, behind = options.before * voxel, options.behind * voxel
-    growing = StreamingSurface(_core.SignedDistances(voxel, before=before, behind=behind), options)
+    growing = StreamingSurface(
+        _core.TsdfVolume(voxel, truncation_front=before, truncation_back=behind), options
+    )
     for done, (patch, weight) in enumerate(patches, start=1):
-        growing.distances.add(
+        growing.distances.integrate(
             patch.points, patch.origin, patch.standoff, patch.faces, weight, threads=threads
         )
         if reach is not None and growing.is_large():

@@ -23,7 +23,7 @@ from stillmap.pipeline.options import Options
 Arrays = dict[str, NDArray[Any]]
 Float = NDArray[np.float64]
 
-_GRIDS = {2: _core.Grid2D, 3: _core.Grid3D}
+_GRIDS = {2: _core.OccupancyGrid2D, 3: _core.OccupancyGrid3D}
 _NO_MATTER = ("threads",)  # options on which no byte of the result depends
 
 
@@ -58,8 +58,8 @@ def _pack(value: Any, name: str, arrays: Arrays, labels: Mapping[int, str]) -> A
         name = labels.get(id(value), name)
         arrays[name] = value
         return name
-    if isinstance(value, _core.Grid2D | _core.Grid3D):  # always empty here
-        return [2 if isinstance(value, _core.Grid2D) else 3, value.resolution]
+    if isinstance(value, _core.OccupancyGrid2D | _core.OccupancyGrid3D):  # always empty here
+        return [2 if isinstance(value, _core.OccupancyGrid2D) else 3, value.resolution]
     if dataclasses.is_dataclass(value):
         return {
             field.name: _pack(getattr(value, field.name), f"{name}.{field.name}", arrays, labels)

@@ -168,7 +168,7 @@ class EmState:
         """Crops the map of Fig. 8 where the first iteration labelled most beams dynamic."""
         estimate = iteration.estimate
         grid = estimate.m_step.grid
-        if not isinstance(grid, _core.Grid2D):
+        if not isinstance(grid, _core.OccupancyGrid2D):
             return
         points = sample_dynamic_points(iteration.deskewed, estimate.poses, estimate.p_static)
         dynamic = np.zeros(len(points), dtype=np.float32)
@@ -182,9 +182,9 @@ class EmState:
         )
 
 
-def _extent(grid: _core.Grid2D) -> Window:
+def _extent(grid: _core.OccupancyGrid2D) -> Window:
     """x0, y0, x1, y1 in metres of all cells that beams crossed."""
-    first_cell, (height, width) = grid.box()
+    first_cell, (height, width) = grid.bounding_box()
     last = first_cell + np.array([width, height])
     x0, y0, x1, y1 = (np.concatenate([first_cell, last]) * grid.resolution).tolist()
     return x0, y0, x1, y1

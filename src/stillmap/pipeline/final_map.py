@@ -154,7 +154,7 @@ def _occupancy_maps(
     e_step = estimate.e_step
     labels_make_sums = options.estimator in ("stillmap", "tracker")
     weights = estimate.p_static if labels_make_sums else estimate.weights
-    grid = _core.Grid2D(options.slam.resolution)
+    grid = _core.OccupancyGrid2D(options.slam.resolution)
     seen = em.add_trusted_beams(grid, planar, estimate.poses, weights, e_step.no_return, threads)
     filtered = em.make_occupancy_map(grid, e_step.occupied, seen)
     em.recount_as_static(grid, planar, estimate.poses, weights)

@@ -73,7 +73,7 @@ def _in_space(
         T = recording.T_base_sensor[recording.sensor[t]]
         in_base = recording.points[beams] @ T[:3, :3].T + T[:3, 3]
         usable = np.flatnonzero(finite_rows(in_base))
-        carried = _core.carried(
+        carried = _core.transform_by_twist(
             in_base.take(usable, axis=0).astype(np.float32), times[beams].take(usable), twists[t]
         )
         out = np.full(in_base.shape, np.nan, np.float32)

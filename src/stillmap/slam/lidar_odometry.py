@@ -44,7 +44,7 @@ class Sweep:
 
     def at_its_stamp(self, twist: Float) -> Points:
         """(N, 3) float32 as seen from where the base was at the stamp, moving by a twist (6,)."""
-        return np.asarray(_core.carried(self.points, self.times, twist))
+        return np.asarray(_core.transform_by_twist(self.points, self.times, twist))
 
 
 def select_sweep(
@@ -61,7 +61,7 @@ def select_sweep(
     with np.errstate(invalid="ignore"):
         near = np.einsum("ni,ni->n", points, points) <= reach * reach
     weights = np.where(recording.hit[beams] & near, e[beams], np.float32(0.0))
-    kept = _core.first_in_cells(points, weights, edge)
+    kept = _core.voxel_downsample(points, weights, edge)
     T = recording.T_base_sensor[recording.sensor[t]]
     in_base = (points[kept] @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
     times = recording.beam_time
@@ -71,10 +71,10 @@ def select_sweep(
 
 def downsample_sweep(sweep: Sweep, edge: float, most: int) -> Sweep:
     """The first point in each cell of `edge` metres, or of more where over `most` are left."""
-    kept = _core.first_in_cells(sweep.points, sweep.weights, edge)
+    kept = _core.voxel_downsample(sweep.points, sweep.weights, edge)
     while len(kept) > most:
         edge *= _COARSER
-        kept = _core.first_in_cells(sweep.points, sweep.weights, edge)
+        kept = _core.voxel_downsample(sweep.points, sweep.weights, edge)
     return sweep.part(kept)
 
 
@@ -224,7 +224,7 @@ class _Drive:
     def followed(self, state: State, n: int, progress: Callable[[int, int], None]) -> LidarOdometry:
         """The first n sweeps, from a state at the first one."""
         options, recording = self.options, self.recording
-        local = _core.SweepMap3D(options.edge, options.levels, options.enough)
+        local = _core.NdtMap3D(options.edge, options.levels, options.enough)
         poses, twists = np.tile(np.eye(4), (n, 1, 1)), np.zeros((n, 6))
         covariance, explained = np.zeros((n, 6, 6)), np.ones(n)
         shed = state.T_map_base[:3, 3]
@@ -240,7 +240,7 @@ class _Drive:
             local.add(sweep.at_its_stamp(state.twist), sweep.weights, state.T_map_base)
             if np.linalg.norm(poses[t, :3, 3] - shed) > _SHED * options.reach:
                 shed = poses[t, :3, 3].copy()
-                local.keep_near(poses[t], options.reach)
+                local.crop(poses[t], options.reach)
             progress(t + 1, n)
         return LidarOdometry(poses, twists, covariance, explained)
 
@@ -259,7 +259,7 @@ class _Drive:
 
 
 def register_sweep(
-    local: _core.SweepMap3D, sweep: Sweep, prior: State, options: SpinningOptions, threads: int
+    local: _core.NdtMap3D, sweep: Sweep, prior: State, options: SpinningOptions, threads: int
 ) -> tuple[State, float]:
     """A sweep laid on a map: the state at its stamp, and the share of it that lies on surfaces."""
     slack = how_far_off(prior.covariance)
@@ -273,12 +273,12 @@ def register_sweep(
         prior.T_map_base,
         prior.twist,
         information,
-        least=options.least,
-        flat=options.flat,
-        wide=options.wide,
-        sigma=options.sigma,
-        kernel=options.kernel,
-        gain=options.gain,
+        min_weight=options.least,
+        max_flatness=options.flat,
+        min_extent=options.wide,
+        range_std=options.sigma,
+        kernel_width=options.kernel,
+        information_scale=options.gain,
         start_level=level,
         start_slack=slack,
         max_iterations=options.max_iterations,

@@ -24,7 +24,7 @@ class LocalMap:
 
     def __init__(
         self,
-        grid: _core.Grid2D,
+        grid: _core.OccupancyGrid2D,
         recording: Recording,
         e: NDArray[np.float32],
         spacing: float,

@@ -246,15 +246,15 @@ def _laid_on(
     return closure
 
 
-def _local_map(drive: _Drive, earlier: int) -> tuple[_core.SweepMap3D, _core.Grid3D, float]:
+def _local_map(drive: _Drive, earlier: int) -> tuple[_core.NdtMap3D, _core.OccupancyGrid3D, float]:
     """Keyframes of one stretch as surfaces, as cells that stop beams, and the share of beams of
     the one in the middle that pass through these all the same."""
     options, driven, travelled = drive.spinning, drive.driven, drive.travelled
     half = drive.options.stretch
     frames = drive.keyframes
     around = frames[np.abs(travelled[frames] - travelled[earlier]) <= half]
-    local = _core.SweepMap3D(options.edge, drive.options.levels, options.enough)
-    solid = _core.Grid3D(_CELL, 0.0)
+    local = _core.NdtMap3D(options.edge, drive.options.levels, options.enough)
+    solid = _core.OccupancyGrid3D(_CELL, 0.0)
     for t in around.tolist():
         fine = select_sweep(drive.recording, drive.e, t, options.reach, options.thin_map)
         local.add(fine.at_its_stamp(driven.twists[t]), fine.weights, driven.poses[t])
@@ -274,7 +274,7 @@ def _local_map(drive: _Drive, earlier: int) -> tuple[_core.SweepMap3D, _core.Gri
 
 
 def _share_met(
-    drive: _Drive, local: _core.SweepMap3D, sweep: Sweep, later: int, state: State
+    drive: _Drive, local: _core.NdtMap3D, sweep: Sweep, later: int, state: State
 ) -> float:
     """Share of the surfaces around a later sweep that lie on earlier ones.
 
@@ -295,26 +295,28 @@ def _share_met(
 
 
 def _surfaces(
-    options: SpinningOptions, local: _core.SweepMap3D, points: Float, T: Float
+    options: SpinningOptions, local: _core.NdtMap3D, points: Float, T: Float
 ) -> tuple[Float, NDArray[np.bool_]]:
     """Normals (N, 3) in the frame of the base where points (N, 3) at a pose T lie on surfaces of
     the finest cells, and where they do (N,)."""
     places = np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3])
-    normals, offsets, variances, known = local.planes(
-        places, 0, least=options.least, flat=options.flat, wide=options.wide
+    normals, offsets, variances, known = local.fit_planes(
+        places, 0, min_weight=options.least, max_flatness=options.flat, min_extent=options.wide
     )
     near = offsets**2 < options.kernel**2 * (options.sigma**2 + variances)
     return normals @ T[:3, :3], (known == 1) & near
 
 
-def _through(drive: _Drive, solid: _core.Grid3D, sweep: Sweep, t: int, state: State) -> float:
+def _through(
+    drive: _Drive, solid: _core.OccupancyGrid3D, sweep: Sweep, t: int, state: State
+) -> float:
     """Share of the beams of sweep t, at a state, that pass through what is there."""
-    return _core.share_through(
+    return _core.occluded_share(
         solid,
         sweep.at_its_stamp(state.twist),
         sweep.weights,
         state.T_map_base,
         drive.recording.T_base_sensor[drive.recording.sensor[t]],
         margin=_MARGIN,
-        occupied=_SOLID,
+        min_occupancy=_SOLID,
     )

@@ -48,11 +48,11 @@ def verify_candidates(track: LoopContext, candidates: Iterable[LoopCandidate]) -
     return sorted(found, key=lambda closure: closure.later)
 
 
-def build_submap(track: LoopContext, centre: float) -> _core.Grid2D:
+def build_submap(track: LoopContext, centre: float) -> _core.OccupancyGrid2D:
     """Scans of one stretch of travel, and no others."""
     half = track.options.stretch
     first, last = np.searchsorted(track.travelled, [centre - half, centre + half])
-    grid = _core.Grid2D(track.resolution, track.registration.approach)
+    grid = _core.OccupancyGrid2D(track.resolution, track.registration.approach)
     spacing = _DENSE * track.options.distance, _DENSE * track.options.turn
     sensor = track.recording.sensor[first:last]
     for t in first + select_keyframes_per_sensor(track.poses[first:last], sensor, *spacing):
@@ -91,7 +91,9 @@ def _points_before_ends(scan: Scan, metres: float) -> Points:
     return before
 
 
-def _comparable(grid: _core.Grid2D, view: Scan, before: Points, T: Float) -> tuple[Scan, float]:
+def _comparable(
+    grid: _core.OccupancyGrid2D, view: Scan, before: Points, T: Float
+) -> tuple[Scan, float]:
     """What of a view the map has looked at from the same side, and its share of the view.
 
     The rest says nothing of whether the view fits, and draws it astray: the back of a wall is not
@@ -106,7 +108,7 @@ def _comparable(grid: _core.Grid2D, view: Scan, before: Points, T: Float) -> tup
 
 def verify_candidate(
     track: LoopContext,
-    grid: _core.Grid2D,
+    grid: _core.OccupancyGrid2D,
     candidate: LoopCandidate,
     sigma: float,
     sigma_turn: float,
@@ -163,7 +165,7 @@ def _ambiguity_covariance(rivals: Float) -> Float:
 
 
 def _sliding(
-    grid: _core.Grid2D,
+    grid: _core.OccupancyGrid2D,
     view: Scan,
     T: Float,
     covariance: Float,

@@ -94,7 +94,7 @@ class MStepResult:
 
     poses: Float
     covariance: Float
-    grid: _core.Grid2D | _core.Grid3D
+    grid: _core.OccupancyGrid2D | _core.OccupancyGrid3D
     explained: Float
     widened: list[int]
     odometry_faults: list[int] = field(default_factory=list)
@@ -185,7 +185,7 @@ def register_scans(
         so_far.add(t, found.T_map_base, travelled)
         so_far.forget(travelled - memory)
         progress(t + 1, T)
-    return way.mapped(_core.Grid2D(options.resolution))
+    return way.mapped(_core.OccupancyGrid2D(options.resolution))
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +218,7 @@ class _Way:
             self.poses[t - 1], self.poses[before], steadiness
         )
 
-    def mapped(self, grid: _core.Grid2D) -> MStepResult:
+    def mapped(self, grid: _core.OccupancyGrid2D) -> MStepResult:
         return MStepResult(
             self.poses,
             self.covariance,
@@ -236,7 +236,7 @@ def _metres(poses: Float) -> float:
 
 
 def _empty(recording: Recording, e: NDArray[np.float32], options: SlamOptions) -> LocalMap:
-    grid = _core.Grid2D(options.resolution, options.registration.approach)
+    grid = _core.OccupancyGrid2D(options.resolution, options.registration.approach)
     return LocalMap(grid, recording, e, options.spacing, options.surface)
 
 

@@ -76,7 +76,7 @@ class SlipDetector:
         t: int,
         last: Float,
         guess: MotionPrior,
-        grid: _core.Grid2D,
+        grid: _core.OccupancyGrid2D,
         scan: Scan,
         found: ScanMatch,
     ) -> SlipHypothesis | None:

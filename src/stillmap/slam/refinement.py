@@ -37,7 +37,7 @@ def refine_poses(
     T = len(poses)
     covariance, explained = np.zeros((T, 3, 3)), np.ones(T)
     increments = _increments(recording, poses)
-    grid = _core.Grid2D(options.resolution, options.registration.approach)
+    grid = _core.OccupancyGrid2D(options.resolution, options.registration.approach)
     kept = local_map.select_keyframes_per_sensor(
         poses, recording.sensor, options.spacing, options.spacing
     )

@@ -134,8 +134,8 @@ def _one_of_each(track: LoopContext, closures: list[LoopClosure]) -> list[LoopCl
     return kept
 
 
-def _map_before(track: LoopContext, first: int) -> _core.Grid2D:
-    grid = _core.Grid2D(track.resolution, track.registration.approach)
+def _map_before(track: LoopContext, first: int) -> _core.OccupancyGrid2D:
+    grid = _core.OccupancyGrid2D(track.resolution, track.registration.approach)
     before = track.keyframes[track.keyframes < first].tolist()
     for t in track.recording.iter_scans(before, track.e):
         add_scan(grid, track.recording, track.e, t, track.poses[t], track.surface)
@@ -143,7 +143,7 @@ def _map_before(track: LoopContext, first: int) -> _core.Grid2D:
 
 
 def _support(
-    track: LoopContext, before: _core.Grid2D, C: Float, first: int, last: int
+    track: LoopContext, before: _core.OccupancyGrid2D, C: Float, first: int, last: int
 ) -> tuple[int, int]:
     """Keyframes of a piece that fit a map when it is moved by C (3, 3), and that contradict it."""
     frames = track.keyframes[(track.keyframes >= first) & (track.keyframes < last)]

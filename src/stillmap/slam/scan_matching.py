@@ -35,7 +35,7 @@ class SurfaceOptions:
 
 
 def add_scan(
-    grid: _core.Grid2D,
+    grid: _core.OccupancyGrid2D,
     recording: Recording,
     e: NDArray[np.float32],
     t: int,
@@ -52,16 +52,16 @@ def add_scan(
     T_map_sensor = (T_map_base @ recording.T_base_sensor[recording.sensor[t]])[None]
     all_hit, offset = hit[hit], np.array([0, np.count_nonzero(hit)])
     _core.add_beams(grid, points[hit], all_hit, weights[hit], offset, T_map_sensor, remove=remove)
-    _core.fill_surfaces(
+    _core.interpolate_end_points(
         grid,
         points,
         hit,
         weights,
         np.array([0, len(hit)]),
         T_map_sensor,
-        gap=options.gap,
+        max_gap=options.gap,
         tolerance=options.straight,
-        growth=options.growth,
+        max_gap_ratio=options.growth,
         remove=remove,
     )
 
@@ -195,7 +195,7 @@ class ScanMatch:
 
 
 def match_scan(
-    grid: _core.Grid2D,
+    grid: _core.OccupancyGrid2D,
     scan: Scan,
     prior: MotionPrior,
     other: MotionPrior | None,
@@ -242,7 +242,7 @@ def accept_prior(prior: MotionPrior) -> ScanMatch:
 
 
 def _within(
-    grid: _core.Grid2D,
+    grid: _core.OccupancyGrid2D,
     scan: Scan,
     prior: MotionPrior,
     options: RegistrationOptions,
@@ -259,7 +259,7 @@ def _within(
 
 
 def _farther(
-    grid: _core.Grid2D,
+    grid: _core.OccupancyGrid2D,
     scan: Scan,
     prior: MotionPrior,
     options: RegistrationOptions,
@@ -296,7 +296,7 @@ def is_inconsistent(prior: MotionPrior, found: ScanMatch, options: RegistrationO
 
 
 def search_pose(
-    grid: _core.Grid2D,
+    grid: _core.OccupancyGrid2D,
     scan: Scan,
     prior: MotionPrior,
     options: RegistrationOptions,
@@ -312,7 +312,7 @@ def search_pose(
         rotation: radians, half width of the window.
         start: (3, 3) where Newton steps begin instead of searching the window.
     """
-    T, covariance, cost, explained, _, _, rivals = _core.register_beams(
+    T, covariance, cost, explained, _, _, rivals = _core.register_scan(
         grid,
         scan.points,
         scan.weights,
@@ -322,27 +322,27 @@ def search_pose(
         radius=field_radius(options, grid.resolution),
         floor=options.floor,
         unknown=options.unknown,
-        gain=options.gain,
+        information_scale=options.gain,
         max_iterations=options.max_iterations,
         window_translation=translation,
         window_rotation=min(rotation, float(np.pi)),
         search_range=options.search_range,
-        starts=options.starts,
+        max_candidates=options.starts,
         T_start=start,
     )
     return ScanMatch(T, covariance, explained, cost - prior.penalty(T), rivals)
 
 
-def occluded_share(grid: _core.Grid2D, scan: Scan, found: ScanMatch) -> float:
+def occluded_share(grid: _core.OccupancyGrid2D, scan: Scan, found: ScanMatch) -> float:
     """Share of the beams that would have to go through walls that the map knows."""
-    return _core.share_through(
+    return _core.occluded_share(
         grid,
         scan.points,
         scan.weights,
         found.T_map_base,
         scan.T_base_sensor,
         margin=_MARGIN,
-        occupied=_WALL,
+        min_occupancy=_WALL,
     )
 
 

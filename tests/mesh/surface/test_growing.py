@@ -57,7 +57,9 @@ def test_voxels_behind_are_gone():
     patches, reach = along_a_wall(24)
     held = {"all": [], "near": []}
     for name, most in held.items():
-        one = StreamingSurface(_core.SignedDistances(VOXEL, before=0.3, behind=0.2), RAW)
+        one = StreamingSurface(
+            _core.TsdfVolume(VOXEL, truncation_front=0.3, truncation_back=0.2), RAW
+        )
         for done, (patch, weight) in enumerate(patches, start=1):
             one.distances.add(
                 patch.points, patch.origin, patch.standoff, patch.faces, weight, threads=1

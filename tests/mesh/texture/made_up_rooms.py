@@ -82,7 +82,9 @@ def photograph(mesh, view, finer=2):
     wide = np.array([[2.0 * of.K[0, 0], 0, 2.0 * of.width], [0, 0, 0], [0, 0, 1]])
     wide[1, 1:] = 2.0 * of.K[1, 1], 2.0 * of.height
     size = 4 * of.width, 4 * of.height
-    _, face = _core.z_buffer(mesh.vertices, mesh.faces, wide, view.T_camera_map, *size, near=0.01)
+    _, face = _core.render_z_buffer(
+        mesh.vertices, mesh.faces, wide, view.T_camera_map, *size, near=0.01
+    )
     column, row = np.rint(rays[:, :2] @ wide[:2, :2].T + wide[:2, 2]).astype(int).T
     seen = face[np.clip(row, 0, size[1] - 1), np.clip(column, 0, size[0] - 1)]
     corners = view.in_camera(mesh.vertices)[mesh.faces[seen]]

@@ -57,7 +57,7 @@ def test_texels_are_pixels(room):
 def chart_of_texel(mesh, layout, page):
     w, h = layout.sizes[page]
     mine = np.flatnonzero(layout.page == page)
-    texel, of, _ = _core.texels(layout.uv[layout.faces[mine]], int(w), int(h))
+    texel, of, _ = _core.rasterise_texels(layout.uv[layout.faces[mine]], int(w), int(h))
     out = np.full(w * h, -1)
     out[texel] = find_charts(mesh, layout.view)[mine[of]]
     return out.reshape(h, w)

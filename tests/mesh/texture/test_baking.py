@@ -28,7 +28,7 @@ def errors(textured):
         h, w = picture.shape[:2]
         mine = np.flatnonzero((textured.page == page) & (textured.view >= 0))
         corners = textured.uv[textured.faces[mine]] * np.array([w, h], float)
-        texel, of, weight = _core.texels(corners, w, h)
+        texel, of, weight = _core.rasterise_texels(corners, w, h)
         a, b, c = np.moveaxis(textured.vertices[textured.faces[mine[of]]], 1, 0)
         places = a + weight[:, :1] * (b - a) + weight[:, 1:] * (c - a)
         found = picture.reshape(-1, 3)[texel].astype(float)

@@ -47,9 +47,13 @@ def hidden_share(mesh, view, first):
     """Of the first faces, the share of the area that is hidden, by a large picture."""
     fine = scale_intrinsics(view.camera.K, 4.0)
     size = 4 * view.camera.width, 4 * view.camera.height
-    _, with_all = _core.z_buffer(mesh.vertices, mesh.faces, fine, view.T_camera_map, *size, near=1)
+    _, with_all = _core.render_z_buffer(
+        mesh.vertices, mesh.faces, fine, view.T_camera_map, *size, near=1
+    )
     alone = mesh.faces[:first]
-    _, of_first = _core.z_buffer(mesh.vertices, alone, fine, view.T_camera_map, *size, near=1)
+    _, of_first = _core.render_z_buffer(
+        mesh.vertices, alone, fine, view.T_camera_map, *size, near=1
+    )
     counts = [np.bincount(f[(f >= 0) & (f < first)], minlength=first) for f in (with_all, of_first)]
     return 1.0 - counts[0] / np.maximum(counts[1], 1)
 

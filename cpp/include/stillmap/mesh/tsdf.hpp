@@ -36,7 +36,8 @@ class TsdfVolume : public BlockMap<3, TsdfVoxel> {
       throw std::invalid_argument("voxel: expected a positive length in metres");
     if (!(truncation_front > 0.0) || !(truncation_front <= kMaxTruncationVoxels * voxel) ||
         !(truncation_back > 0.0) || !(truncation_back <= kMaxTruncationVoxels * voxel))
-      throw std::invalid_argument("before, behind: expected above 0 to 64 voxels");
+      throw std::invalid_argument(
+          "truncation_front, truncation_back: expected above 0 to 64 voxels");
   }
 
   TsdfVolume(TsdfVolume&&) noexcept = default;

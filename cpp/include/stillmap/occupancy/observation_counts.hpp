@@ -74,9 +74,9 @@ class ObservationCounts : public BlockMap<D, CellVisits> {
   void add(const Scans<D>& scans, const bool* is_dynamic, const int64_t* time_bin, int threads) {
     if (scans.n_scans == 0) return;
     if (time_bin[0] <= last_time_bin_)
-      throw std::invalid_argument("look: was added to before, or falls");
+      throw std::invalid_argument("time_bin: must not fall, nor repeat in a later call");
     for (size_t t = 1; t < scans.n_scans; ++t)
-      if (time_bin[t] < time_bin[t - 1]) throw std::invalid_argument("look: must not fall");
+      if (time_bin[t] < time_bin[t - 1]) throw std::invalid_argument("time_bin: must not fall");
     auto bounds = split_by_beams(scans.offset, scans.n_scans, threads);
     for (size_t& t : bounds)  // keep the scans of a time bin together
       while (t > 0 && t < scans.n_scans && time_bin[t] == time_bin[t - 1]) ++t;

@@ -79,11 +79,12 @@ class OccupancyHmm {
   }
   // Also runs a ChangeHmm on all later observations; with_paths: including state paths.
   void track_changes(const ChangeOptions& options, bool with_paths = true) {
-    if (last_time_bin_ != kNoTimeBin) throw std::invalid_argument("watch: before the first look");
+    if (last_time_bin_ != kNoTimeBin)
+      throw std::invalid_argument("track_changes: expected before the first observation");
     change_hmm_.emplace(surfel_map_.size(), options, options_.bin_seconds, with_paths);
   }
   const ChangeHmm& change_hmm() const {
-    if (!change_hmm_) throw std::invalid_argument("changes: nobody asked to watch for them");
+    if (!change_hmm_) throw std::invalid_argument("changes: expected track_changes before");
     return *change_hmm_;
   }
 
@@ -93,11 +94,11 @@ class OccupancyHmm {
     const size_t T = scans.n_scans;
     for (size_t t = 0; t < T; ++t)
       if (time_bin[t] < (t ? time_bin[t - 1] : last_time_bin_))
-        throw std::invalid_argument("look: must not fall");
+        throw std::invalid_argument("time_bin: must not fall");
     if (change_hmm_ && T &&
         !(ChangeHmm::is_valid_time_bin(time_bin[0]) &&
           ChangeHmm::is_valid_time_bin(time_bin[T - 1])))
-      throw std::invalid_argument("look: expected 0 to 2147483647");
+      throw std::invalid_argument("time_bin: expected 0 to 2147483647");
     std::vector<size_t> bin_starts;  // first scan of each time bin
     for (size_t t = 0; t < T; ++t)
       if (t == 0 || time_bin[t] != time_bin[t - 1]) bin_starts.push_back(t);
@@ -134,7 +135,7 @@ class OccupancyHmm {
   static constexpr int64_t kNoTimeBin = std::numeric_limits<int64_t>::min();
 
   static const SurfelMap<D>& require_fitted(const SurfelMap<D>& surfel_map) {
-    if (!surfel_map.fitted()) throw std::invalid_argument("surface: fit it first");
+    if (!surfel_map.fitted()) throw std::invalid_argument("surfel_map: fit it first");
     return surfel_map;
   }
 
@@ -198,7 +199,8 @@ class OccupancyHmm {
     for (size_t t = first; t < last; ++t)
       sum.template head<D>() += positions ? Position(Eigen::Map<const Position>(positions + t * D))
                                           : pose_from<D>(scans.poses + t * (D + 1) * (D + 1)).t;
-    if (!sum.allFinite()) throw std::invalid_argument("T_map_sensor, place: expected finite poses");
+    if (!sum.allFinite())
+      throw std::invalid_argument("T_map_sensor, positions: expected finite poses");
     return sum / (static_cast<double>(last - first) * surfel_map_.resolution());
   }
 

@@ -58,10 +58,11 @@ class SurfelMap : public CellIndex<D> {
 
   // Adds the end points of all returns, and their time bins (T,) if given.
   void add(const Scans<D>& scans, const int64_t* time_bin = nullptr, int threads = 1) {
-    if (fitted_) throw std::invalid_argument("surface: was fitted, and takes no more end points");
+    if (fitted_)
+      throw std::invalid_argument("surfel_map: already fitted, takes no more end points");
     if (sums_.empty()) has_time_bins_ = time_bin != nullptr;
     if (has_time_bins_ != (time_bin != nullptr))
-      throw std::invalid_argument("look: of all scans, or of none");
+      throw std::invalid_argument("time_bin: expected in all calls, or in none");
     const std::vector<size_t> bounds = split_by_beams(scans.offset, scans.n_scans, threads);
     std::deque<SurfelMap> thread_maps;
     for (size_t i = 2; i < bounds.size(); ++i) thread_maps.emplace_back(resolution_);

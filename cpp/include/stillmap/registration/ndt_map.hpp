@@ -46,7 +46,7 @@ class NdtMap {
     if (!(edge > 0.0) || !std::isfinite(edge))
       throw std::invalid_argument("edge: expected a positive length in metres");
     if (levels < 1 || levels > 8) throw std::invalid_argument("levels: expected 1 to 8");
-    if (!(max_weight > 0.0)) throw std::invalid_argument("enough: expected a positive weight");
+    if (!(max_weight > 0.0)) throw std::invalid_argument("max_weight: expected a positive weight");
     tables_.resize(static_cast<size_t>(levels));
   }
 

@@ -276,7 +276,7 @@ class TexturedMesh:
         out = np.full(h * w, -1, np.int32)
         mine = np.flatnonzero(self.page == page)
         corners = self.uv[self.faces[mine]] * np.array([w, h], float)
-        texel, of, _ = _core.texels(corners, w, h)
+        texel, of, _ = _core.rasterise_texels(corners, w, h)
         out[texel] = mine[of]
         return out.reshape(h, w)
 

@@ -185,7 +185,7 @@ def _paint(
             mine = faces[(times == level) & (layout.page[faces] == number)]
             h, w = painted[number].shape
             corners = layout.faces[mine]
-            texel, of, weight = _core.texels(layout.uv[corners], w, h)
+            texel, of, weight = _core.rasterise_texels(layout.uv[corners], w, h)
             places = view.to_camera(vertices[corners].reshape(-1, 3)).reshape(-1, 3, 3)
             flat, mask = pages[number].reshape(-1, 3), painted[number].reshape(-1)
             for first in range(0, len(texel), _AT_ONCE):

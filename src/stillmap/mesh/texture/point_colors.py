@@ -28,7 +28,7 @@ class TextureSampler:
 
     def __init__(self, textured: TexturedMesh, reach: float) -> None:
         self._of = textured
-        self._near = _core.NearFaces(textured.vertices, textured.faces, reach=reach)
+        self._near = _core.MeshDistance(textured.vertices, textured.faces, max_distance=reach)
         # -1 at the end: that of no face
         self._page = np.append(np.where(textured.view >= 0, textured.page, -1), -1)
 
@@ -43,7 +43,7 @@ class TextureSampler:
             origins: (n, 3) from where each was seen.
         """
         places = np.ascontiguousarray(points), np.ascontiguousarray(origins)
-        face, weight = self._near.nearest(*places)
+        face, weight = self._near.closest_faces(*places)
         found = self._page[face]
         out = np.zeros((len(points), 3), np.uint8)
         for page, texels in enumerate(self._of.pages):

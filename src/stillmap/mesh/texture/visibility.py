@@ -130,7 +130,7 @@ def render_depth(
     K[:2, 2] -= low
     width, height = (int(size) for size in np.maximum(high - low + 1.0, 1.0))
     near_by = _within_frustum(mesh, view, K, width, height)
-    depth, face = _core.z_buffer(
+    depth, face = _core.render_z_buffer(
         np.ascontiguousarray(mesh.vertices),
         np.ascontiguousarray(mesh.faces[near_by]),
         K,

@@ -1,4 +1,4 @@
-"""Pictures of a textured model, by its z-buffer: what the report shows of it."""
+"""Render textured meshes with a z-buffer, unlit."""
 
 import math
 
@@ -14,18 +14,17 @@ Float = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 BACKGROUND = (236, 238, 241)
-_FINER = 2  # pixels along an edge that are drawn for one that is shown: textures are finer still
-_NEAR = 0.05  # m
-_GREY = 150.0  # of faces without a picture, seen straight
-_SLANTED = 70.0  # their grey seen along them: edges show
-_MARGIN = 1.05
-_BLOCK = 1 << 17  # pixels that are painted together
+_SUPERSAMPLING = 2  # pixels along each edge that are averaged into one
+_NEAR = 0.05  # m, near plane
+_GREY_FACING, _GREY_GRAZING = 150.0, 70.0  # of faces without texture, by the viewing angle
+_MARGIN = 1.05  # around fitted points
+_BLOCK = 1 << 17  # pixels shaded at a time
 
 
 def camera_matrix(size: tuple[int, int], field_of_view: float) -> Float:
-    """(3, 3) of a picture of (width, height) pixels that sees so many radians from left to right.
+    """K (3, 3) of a (width, height) image with a horizontal field of view in rad.
 
-    Centres of pixels have whole numbers.
+    Pixel centers have integer coordinates.
     """
     width, height = size
     f = 0.5 * width / math.tan(0.5 * field_of_view)
@@ -38,38 +37,39 @@ def render(
     K: Float,
     size: tuple[int, int],
     *,
-    from_behind: bool = True,
+    back_faces: bool = True,
     threads: int = 1,
 ) -> Picture:
-    """What an ideal camera would see of a model, unlit: its textures, grey where it has none.
+    """Render a model: its textures, shaded grey where it has none.
 
     Args:
         textured: the model.
-        T_camera_map: (4, 4), x right, y down, z ahead in the camera.
-        K: (3, 3) of the picture, see `pinhole`.
+        T_camera_map: (4, 4), x right, y down, z forward in the camera.
+        K: (3, 3) camera matrix.
         size: width and height in pixels.
-        from_behind: show faces whose back is seen, too; without them rooms have no ceiling.
+        back_faces: draw faces seen from behind as well; without them rooms have no ceiling.
         threads: the result does not depend on them.
 
     Returns:
         (height, width, 3) uint8.
     """
-    width, height = (_FINER * n for n in size)
+    width, height = (_SUPERSAMPLING * n for n in size)
     fine = K.copy()
-    fine[:2] *= _FINER
-    fine[:2, 2] += 0.5 * _FINER - 0.5
-    kept, T = _drawn(textured, T_camera_map, from_behind), np.ascontiguousarray(T_camera_map)
-    face = _nearest(textured, kept, T, fine, (width, height), threads)
+    fine[:2] *= _SUPERSAMPLING
+    fine[:2, 2] += 0.5 * _SUPERSAMPLING - 0.5
+    drawn, T = _select_faces(textured, T_camera_map, back_faces), np.ascontiguousarray(T_camera_map)
+    face = _rasterize(textured, drawn, T, fine, (width, height), threads)
     picture = np.empty((height * width, 3), np.float32)
     picture[:] = BACKGROUND
     seen = np.flatnonzero(face >= 0)
-    planes, which = _planes(textured, T, kept, face.ravel()[seen])
+    planes, which = _edge_functions(textured, T, drawn, face.ravel()[seen])
     for first in range(0, len(seen), _BLOCK):
         at = slice(first, first + _BLOCK)
         row, column = np.divmod(seen[at], width)
-        whose = kept[face.ravel()[seen[at]]]
-        picture[seen[at]] = _painted(textured, whose, planes[which[at]], _rays(fine, column, row))
-    parts = picture.reshape(size[1], _FINER, size[0], _FINER, 3)
+        ids = drawn[face.ravel()[seen[at]]]
+        rays = _pixel_rays(fine, column, row)
+        picture[seen[at]] = _sample_colors(textured, ids, planes[which[at]], rays)
+    parts = picture.reshape(size[1], _SUPERSAMPLING, size[0], _SUPERSAMPLING, 3)
     small: NDArray[np.float32] = parts.mean(axis=(1, 3))
     return np.rint(small).astype(np.uint8)
 
@@ -77,8 +77,8 @@ def render(
 def textured_share(
     textured: TexturedMesh, T_camera_map: Float, K: Float, size: tuple[int, int], threads: int = 1
 ) -> float:
-    """Share of the pixels of such a picture that some page paints."""
-    face = _nearest(textured, np.arange(len(textured)), T_camera_map, K, size, threads)
+    """Share of the pixels of the rendered image that show a texture; see `render`."""
+    face = _rasterize(textured, np.arange(len(textured)), T_camera_map, K, size, threads)
     return float((textured.page[face[face >= 0]] >= 0).sum() / face.size)
 
 
@@ -88,131 +88,131 @@ def covered_share(
     K: Float,
     size: tuple[int, int],
     *,
-    from_behind: bool = True,
+    back_faces: bool = True,
     threads: int = 1,
 ) -> float:
-    """Share of the pixels of such a picture that show any of the model, see `still`."""
-    kept = _drawn(textured, T_camera_map, from_behind)
-    return float((_nearest(textured, kept, T_camera_map, K, size, threads) >= 0).mean())
+    """Share of the pixels of the rendered image that show the model; see `render`."""
+    drawn = _select_faces(textured, T_camera_map, back_faces)
+    return float((_rasterize(textured, drawn, T_camera_map, K, size, threads) >= 0).mean())
 
 
-def _drawn(textured: TexturedMesh, T_camera_map: Float, from_behind: bool) -> NDArray[np.intp]:
-    """Faces that are drawn: all, or those whose front the camera sees."""
-    if from_behind:
+def _select_faces(
+    textured: TexturedMesh, T_camera_map: Float, back_faces: bool
+) -> NDArray[np.intp]:
+    """Indices of the faces to draw: all, or those that face the camera."""
+    if back_faces:
         return np.arange(len(textured))
     mesh = Mesh(textured.vertices, textured.faces)
     eye = -T_camera_map[:3, :3].T @ T_camera_map[:3, 3]
     return np.flatnonzero(np.einsum("ij,ij->i", eye - mesh.centers, mesh.normals()) > 0.0)
 
 
-def _nearest(
+def _rasterize(
     textured: TexturedMesh,
-    kept: NDArray[np.intp],
+    drawn: NDArray[np.intp],
     T_camera_map: Float,
     K: Float,
     size: tuple[int, int],
     threads: int,
 ) -> NDArray[np.int32]:
-    """(height, width) which of the faces that are drawn each pixel sees, -1: none."""
+    """(height, width) index into `drawn` of the face in each pixel; -1: none."""
     vertices, T = np.ascontiguousarray(textured.vertices), np.ascontiguousarray(T_camera_map)
-    faces = np.ascontiguousarray(textured.faces[kept])
-    _, face = _core.z_buffer(vertices, faces, K, T, *size, near=_NEAR, threads=threads)
+    faces = np.ascontiguousarray(textured.faces[drawn])
+    _, face = _core.render_z_buffer(vertices, faces, K, T, *size, near=_NEAR, threads=threads)
     return face
 
 
-def _rays(K: Float, column: NDArray[np.intp], row: NDArray[np.intp]) -> Float:
-    """(n, 3) through the middles of pixels, one ahead."""
+def _pixel_rays(K: Float, column: NDArray[np.intp], row: NDArray[np.intp]) -> Float:
+    """(n, 3) rays through pixel centers, z = 1."""
     y = (row - K[1, 2]) / K[1, 1]
     x = (column - K[0, 2] - K[0, 1] * y) / K[0, 0]
     return np.stack([x, y, np.ones(len(x))], axis=1)
 
 
-def _planes(
-    textured: TexturedMesh, T: Float, kept: NDArray[np.intp], seen: NDArray[np.int32]
+def _edge_functions(
+    textured: TexturedMesh, T: Float, drawn: NDArray[np.intp], seen: NDArray[np.int32]
 ) -> tuple[Float, NDArray[np.intp]]:
-    """(k, 3, 3) of the faces that are seen, and (n,) which of them each pixel sees.
+    """Edge functions (k, 3, 3) of the visible faces, and (n,) the row for each pixel.
 
-    A ray meets a face a, b, c where its products with b x c, c x a and a x b say how near it is to
-    a, b and c: see reference/z_buffer.py.
+    The products of a ray with b x c, c x a and a x b are proportional to the barycentric
+    coordinates of its intersection with the face a, b, c.
 
     Args:
         textured: the model.
         T: (4, 4) T_camera_map.
-        kept: (F',) faces that were drawn.
-        seen: (n,) which of these each pixel sees.
+        drawn: (F',) faces that were drawn.
+        seen: (n,) index into `drawn` for each pixel.
     """
-    used = np.zeros(len(kept), np.bool_)
+    used = np.zeros(len(drawn), np.bool_)
     used[seen] = True
     number = np.cumsum(used) - 1
-    places = textured.vertices[textured.faces[kept[used]]] @ T[:3, :3].T + T[:3, 3]
-    a, b, c = (places[:, k] for k in range(3))
+    corners = textured.vertices[textured.faces[drawn[used]]] @ T[:3, :3].T + T[:3, 3]
+    a, b, c = (corners[:, k] for k in range(3))
     return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1), number[seen]
 
 
-def _painted(
+def _sample_colors(
     textured: TexturedMesh, faces: NDArray[np.intp], planes: Float, rays: Float
 ) -> NDArray[np.float32]:
-    """(n, 3) colours where rays meet the faces that they see.
+    """(n, 3) colors at the intersections of rays with their faces.
 
     Args:
         textured: the model.
         faces: (n,).
-        planes: (n, 3, 3), see `_planes`.
-        rays: (n, 3) in the camera's frame.
+        planes: (n, 3, 3), see `_edge_functions`.
+        rays: (n, 3) in the camera frame.
     """
-    across = np.matmul(planes, rays[:, :, None])[..., 0]
-    total = across.sum(axis=1, keepdims=True)
-    weights = np.clip(across / np.where(total == 0.0, 1.0, total), 0.0, 1.0)
-    page, colours = textured.page[faces], np.empty((len(faces), 3), np.float32)
-    plain = np.flatnonzero(page < 0)
-    colours[plain] = _shaded(planes[plain].sum(axis=1), rays[plain])
+    products = np.matmul(planes, rays[:, :, None])[..., 0]
+    total = products.sum(axis=1, keepdims=True)
+    weights = np.clip(products / np.where(total == 0.0, 1.0, total), 0.0, 1.0)
+    page, colors = textured.page[faces], np.empty((len(faces), 3), np.float32)
+    bare = np.flatnonzero(page < 0)
+    colors[bare] = _shade_grey(planes[bare].sum(axis=1), rays[bare])
     for number, texture in enumerate(textured.pages):
         on = np.flatnonzero(page == number)
         if len(on):
             corners = textured.uv[textured.faces[faces[on]]]
             uv = np.matmul(weights[on, None, :], corners)[:, 0]
-            colours[on] = sample_bilinear(texture, uv * texture.shape[1::-1] - 0.5)
-    return colours
+            colors[on] = sample_bilinear(texture, uv * texture.shape[1::-1] - 0.5)
+    return colors
 
 
-def _shaded(normals: Float, rays: Float) -> NDArray[np.float32]:
-    """(n, 3) greys of faces with normals (n, 3) of any length, the darker the more aslant."""
+def _shade_grey(normals: Float, rays: Float) -> NDArray[np.float32]:
+    """(n, 3) grey of faces with normals (n, 3) of any length, darker at grazing angles."""
     lengths = np.linalg.norm(normals, axis=1) * np.linalg.norm(rays, axis=1)
     cosine = np.abs(np.einsum("ij,ij->i", normals, rays)) / np.where(lengths == 0.0, 1.0, lengths)
-    grey = _SLANTED + (_GREY - _SLANTED) * cosine
+    grey = _GREY_GRAZING + (_GREY_FACING - _GREY_GRAZING) * cosine
     return np.repeat(grey[:, None], 3, axis=1).astype(np.float32)
 
 
 def fit_camera(points: Float, direction: Float, K: Float, size: tuple[int, int]) -> Float:
-    """(4, 4) T_camera_map of a camera that sees from a direction (3,), as near as all points (n, 3)
-    are in its picture, in the middle of it.
+    """T_camera_map (4, 4) of the closest camera whose image contains all points (n, 3), centered.
 
-    A point (x, y, z) in the camera's axes is left of the right edge of what an eye at e sees where
-    x - e_x <= s (z - e_z), and right of the left edge where e_x - x <= s (z - e_z). Of the points
-    that lie outermost both together say how far ahead e_z may be; likewise up and down.
+    In camera axes, with s the slope of the edge of the field of view, a point (x, y, z) is inside
+    the right edge of a camera at e if x - e_x <= s (z - e_z), and inside the left edge if
+    e_x - x <= s (z - e_z). The extreme points of both conditions bound e_z; likewise for y.
 
     Args:
-        points: metres.
-        direction: from them towards the camera.
-        K: (3, 3) of the picture, see `pinhole`.
+        points: m.
+        direction: (3,) from the points towards the camera.
+        K: (3, 3) camera matrix.
         size: width and height in pixels.
     """
     T = look_at(direction, np.zeros(3))
-    own = points @ T[:3, :3].T
+    local = points @ T[:3, :3].T
     slopes = 0.5 * np.array(size) / np.array([K[0, 0], K[1, 1]]) / _MARGIN
-    right = (own[:, :2] - slopes * own[:, 2:]).max(axis=0)
-    left = (-own[:, :2] - slopes * own[:, 2:]).max(axis=0)
-    ahead = min(float((-(left + right) / (2.0 * slopes)).min()), own[:, 2].min() - 2.0 * _NEAR)
-    eye = T[:3, :3].T @ np.array([*(0.5 * (right - left)), ahead])
+    right = (local[:, :2] - slopes * local[:, 2:]).max(axis=0)
+    left = (-local[:, :2] - slopes * local[:, 2:]).max(axis=0)
+    z = min(float((-(left + right) / (2.0 * slopes)).min()), local[:, 2].min() - 2.0 * _NEAR)
+    eye = T[:3, :3].T @ np.array([*(0.5 * (right - left)), z])
     return look_at(eye, eye - direction)
 
 
 def main_corners(textured: TexturedMesh, direction: Float, share: float) -> Float:
-    """(n, 3) corners of the faces in which most is that is seen from a direction (3,).
+    """Corners (n, 3) of the faces visible from `direction` (3,), without outlying ones.
 
-    As seen from there, a share of the area lies farther left than any of them, and as much farther
-    right, higher, lower, nearer and farther away: islands far out do not count. Where nothing is
-    seen from there these are all corners.
+    In that view a share of the visible area is cut off at each end of the three axes, so that
+    distant islands do not count. All corners where no face is visible.
     """
     mesh, towards = Mesh(textured.vertices, textured.faces), direction / np.linalg.norm(direction)
     area = mesh.areas() * np.maximum(mesh.normals() @ towards, 0.0)
@@ -228,13 +228,15 @@ def main_corners(textured: TexturedMesh, direction: Float, share: float) -> Floa
 
 
 def look_at(eye: Float, target: Float) -> Float:
-    """(4, 4) T_camera_map of a camera at `eye` (3,) that looks at `target` (3,), z of the map
-    upwards in its picture, or y where it looks straight down."""
-    ahead = (target - eye) / np.linalg.norm(target - eye)
-    up = np.array([0.0, 0.0, 1.0]) if abs(ahead[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
-    right = np.cross(ahead, up)
+    """T_camera_map (4, 4) of a camera at `eye` (3,) that looks at `target` (3,).
+
+    Up in the image is z of the map, or y for a camera that looks straight down.
+    """
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     T = np.eye(4)
-    T[:3, :3] = right, np.cross(ahead, right), ahead
+    T[:3, :3] = right, np.cross(forward, right), forward
     T[:3, 3] = -T[:3, :3] @ eye
     return T

@@ -1,0 +1,260 @@
+"""Sums, E-step and likelihoods of the core against the plain twin on random beams."""
+
+import numpy as np
+import pytest
+import reference
+
+from stillmap import _core
+
+STEP = 2.0**-24  # the core counts in integer multiples of this
+
+
+def all_cells(*grids):
+    """(K, D) every cell of the bounding boxes of the grids, and one layer more."""
+    boxes = [(first, alpha.shape[::-1]) for first, alpha, _ in (grid.dense() for grid in grids)]
+    low = np.min([first for first, _ in boxes], axis=0) - 1
+    high = np.max([first + shape for first, shape in boxes], axis=0) + 1
+    axes = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+
+def sums(grid, cells):
+    return grid.alpha_beta(np.ascontiguousarray(cells, np.int64))
+
+
+def test_sums(beams):
+    core, plain = beams.grid(_core), beams.grid(reference)
+    cells = all_cells(core, plain)
+    expected = sums(plain, cells)
+    assert expected.sum() > 100
+    # each of the beams that touch a cell is rounded once or twice, to half a step
+    assert np.abs(sums(core, cells) - expected).max() <= len(beams.hit) * STEP
+
+
+def test_alpha_is_exact_when_e_is(beams):
+    e = np.random.default_rng(0).integers(0, 4097, len(beams.hit)) / np.float32(4096)
+    beams = beams.with_(e=e.astype(np.float32))
+    core, plain = beams.grid(_core), beams.grid(reference)
+    cells = all_cells(core, plain)
+    assert (sums(core, cells)[:, 0] == sums(plain, cells)[:, 0]).all()
+
+
+def test_ends_with_another_e_are_sums_with_it(beams):
+    other = beams.with_(e=np.ones(len(beams.hit), np.float32))
+    points, hit, offset, T = beams.arguments
+    grids = []
+    for kernels in (_core, reference):
+        grid = beams.grid(kernels)
+        kernels.add_end_points(grid, points, hit, beams.e, offset, T, remove=True)
+        kernels.add_end_points(grid, points, hit, other.e, offset, T)
+        grids.append(grid)
+    cells = all_cells(*grids)
+    assert (sums(grids[0], cells) == sums(other.grid(_core), cells)).all()
+    np.testing.assert_allclose(sums(grids[1], cells), sums(other.grid(reference), cells), atol=1e-9)
+
+
+def test_untouched_cells_are_unknown_in_both(beams):
+    core, plain = beams.grid(_core), beams.grid(reference)
+    cells = all_cells(core, plain)
+    touched = sums(plain, cells).sum(axis=1)
+    clear = (touched == 0) | (touched > STEP)  # shorter chords the core may round to nothing
+    assert (touched == 0).any()
+    assert ((sums(core, cells).sum(axis=1) > 0) == (touched > 0))[clear].all()
+
+
+def test_dense_lays_the_same_sums_out(beams):
+    for kernels in (_core, reference):
+        grid = beams.grid(kernels)
+        first, alpha, beta = grid.dense()
+        assert first.dtype == np.int64
+        assert alpha.shape == beta.shape
+        index = np.stack(np.meshgrid(*map(np.arange, alpha.shape), indexing="ij"), axis=-1)
+        cells = first + index.reshape(-1, alpha.ndim)[:, ::-1]  # [row = y, column = x]
+        expected = sums(grid, cells)
+        assert (alpha.ravel() == expected[:, 0]).all()
+        assert (beta.ravel() == expected[:, 1]).all()
+        assert alpha.sum() + beta.sum() == pytest.approx(sums(grid, all_cells(grid)).sum())
+
+
+def test_dense_of_an_empty_grid(beams):
+    for kernels in (_core, reference):
+        grid = beams.empty_grid(kernels)
+        first, alpha, beta = grid.dense()
+        assert first.tolist() == [0] * beams.dimension
+        assert alpha.shape == beta.shape == (0,) * beams.dimension
+        first, seen = grid.observed_mask()
+        assert first.tolist() == [0] * beams.dimension
+        assert seen.shape == alpha.shape
+
+
+def test_part_of_a_dense_grid(beams):
+    rng = np.random.default_rng(3)
+    for kernels in (_core, reference):
+        grid = beams.grid(kernels)
+        first, shape = grid.bounding_box()
+        whole_first, *whole = grid.dense()
+        assert first.tolist() == whole_first.tolist()
+        assert tuple(shape) == whole[0].shape
+        # boxes that hang over the edge, lie beside the cells, or hold nothing
+        for _ in range(20):
+            low = rng.integers(-20, np.array(shape[::-1]) + 20)
+            size = rng.integers(0, 30, len(shape))
+            found_first, *found = grid.dense((first + low).tolist(), size[::-1].tolist())
+            assert found_first.tolist() == (first + low).tolist()
+            for part, of in zip(found, whole, strict=True):
+                padded = np.pad(of, 60)
+                lowest = low[::-1] + 60
+                at = tuple(map(slice, lowest.tolist(), (lowest + size[::-1]).tolist()))
+                np.testing.assert_array_equal(part, padded[at])
+
+
+@pytest.mark.parametrize(
+    ("first", "shape"),
+    [
+        ((0, 0), None),
+        (None, (3, 3)),
+        ((0, 2**40), (3, 3)),
+        ((0, 0), (-1, 3)),
+        ((-(2**63), 0), (1, 1)),
+    ],
+)
+def test_boxes_that_cannot_be_are_refused(first, shape):
+    with pytest.raises(ValueError, match="first_cell, shape"):
+        _core.OccupancyGrid2D(0.1).dense(first, shape)
+
+
+def test_seen(beams):
+    for kernels in (_core, reference):
+        grid = beams.grid(kernels)
+        first, alpha, beta = grid.dense()
+        first_seen, seen = grid.observed_mask()
+        assert first_seen.tolist() == first.tolist()
+        assert seen.dtype == np.uint8
+        np.testing.assert_array_equal(seen, alpha + beta > 0)
+        assert 0 < seen.mean() < 1
+
+
+@pytest.mark.parametrize("prior", [0.05, 0.5, 0.9, 0.0, 1.0])
+def test_e_step(beams, prior):
+    core, plain = beams.grid(_core), beams.grid(reference)
+    # half of the beams are the map's own, half end where others may never have been
+    moved = beams.T_map_sensor.copy()
+    moved[::2, 0, -1] += 1.5
+    looks = beams.with_(T_map_sensor=moved)
+    e = _core.e_step(core, *looks.arguments, prior)
+    expected = reference.e_step(plain, *looks.arguments, prior)
+    assert e.dtype == expected.dtype == np.float32
+    assert (np.isnan(e) == np.isnan(beams.points).any(axis=1)).all()
+    np.testing.assert_allclose(e, expected, rtol=0, atol=1e-6)
+    if 0 < prior < 1:
+        unknown = (expected == np.float32(prior)) & beams.hit
+        assert unknown.any()
+        assert len(np.unique(expected[beams.hit])) > 30
+
+
+@pytest.mark.parametrize("prior", [0.05, 0.5, 0.9])
+def test_log_likelihood(beams, prior):
+    core, plain = beams.grid(_core), beams.grid(reference)
+    e = np.random.default_rng(1).uniform(0, 1, len(beams.hit)).astype(np.float32)
+    e[::7], e[1::7] = 0, 1
+    looks = beams.points, beams.hit, e, beams.offset, beams.T_map_sensor
+    terms = _core.log_likelihood(core, *looks, prior)
+    expected = reference.log_likelihood(plain, *looks, prior)
+    assert terms.shape == (len(beams.T_map_sensor), 4)
+    assert (np.abs(expected).sum(axis=0) > 1).all()
+    assert not expected[:2].any()  # empty scans
+    np.testing.assert_allclose(terms[:, 2:], expected[:, 2:], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(terms[:, :2], expected[:, :2], rtol=1e-6, atol=1e-5)
+
+
+def test_log_likelihood_of_another_map(beams):
+    # a map of the other half of the beams: unknown cells, cells with m = 0 and with m = 1
+    M = len(beams.hit)
+    half = np.arange(M) < M // 2
+    seen = beams.with_(
+        points=np.where(half[:, None], beams.points, np.float32(np.nan)),
+        e=np.round(beams.e),
+    )
+    core, plain = seen.grid(_core), seen.grid(reference)
+    looks = beams.points, beams.hit, beams.e, beams.offset, beams.T_map_sensor
+    terms = _core.log_likelihood(core, *looks, 0.8)
+    expected = reference.log_likelihood(plain, *looks, 0.8)
+    assert expected[:, 0].min() < -27  # ln of the floor 1e-12
+    # where m = 1 but for a chord of almost no length, ln(1 - m) hangs on the core's rounding
+    np.testing.assert_allclose(terms, expected, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 64])
+def test_threads_change_no_bit(beams, threads):
+    one, many = beams.grid(_core, 1), beams.grid(_core, threads)
+    for a, b in zip(one.dense(), many.dense(), strict=True):
+        assert (a == b).all()
+    e_one, e_many = (_core.e_step(one, *beams.arguments, 0.8, threads=n) for n in (1, threads))
+    assert e_one.tobytes() == e_many.tobytes()
+    looks = beams.points, beams.hit, beams.e, beams.offset, beams.T_map_sensor
+    one_terms, many_terms = (
+        _core.log_likelihood(one, *looks, 0.8, threads=n) for n in (1, threads)
+    )
+    assert one_terms.tobytes() == many_terms.tobytes()
+
+
+def test_order_of_scans_changes_no_bit(beams):
+    whole, piecewise = beams.grid(_core), beams.empty_grid(_core)
+    for t in range(len(beams.T_map_sensor) - 1, -1, -1):
+        a, b = beams.offset[t], beams.offset[t + 1]
+        one = np.array([0, b - a])
+        _core.add_beams(
+            piecewise, beams.points[a:b], beams.hit[a:b], beams.e[a:b], one,
+            beams.T_map_sensor[t : t + 1],
+        )  # fmt: skip
+    for a, b in zip(whole.dense(), piecewise.dense(), strict=True):
+        assert (a == b).all()
+    points, weights = beams.points, beams.e  # the moments too
+    T = beams.T_map_sensor[-1]
+    costs = [
+        _core.registration_cost(grid, points, weights, T, 0.3, 2, 0.01, 0.1)
+        for grid in (whole, piecewise)
+    ]
+    assert costs[0] == costs[1]
+
+
+def test_five_rounds_of_em(beams):
+    ours = reference.em_fixed_poses(*beams.arguments, 0.8, beams.resolution, 5, _core)
+    plain = reference.em_fixed_poses(*beams.arguments, 0.8, beams.resolution, 5)
+    for a, b in zip(ours, plain, strict=True):
+        np.testing.assert_allclose(a.e, b.e, atol=2e-5)
+        assert a.bound == pytest.approx(b.bound, abs=1e-2)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_no_beams_and_no_scans(dimension):
+    nothing = np.zeros((0, dimension), np.float32), np.zeros(0, bool)
+    no_e = np.zeros(0, np.float32)
+    for scans in (0, 3):
+        offset = np.zeros(scans + 1, np.int64)
+        T = np.tile(np.eye(dimension + 1), (scans, 1, 1))
+        for kernels in (_core, reference):
+            grid = (kernels.OccupancyGrid2D if dimension == 2 else kernels.OccupancyGrid3D)(0.1)
+            kernels.add_beams(grid, *nothing, no_e, offset, T, 2)
+            assert kernels.e_step(grid, *nothing, offset, T, 0.5, 2).shape == (0,)
+            terms = kernels.log_likelihood(grid, *nothing, no_e, offset, T, 0.5, 2)
+            assert terms.tolist() == [[0.0] * 4] * scans
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_cells_far_apart_stay_apart(dimension):
+    # one end point 2^22 cells out: none of its powers-of-two neighbours may be taken for it
+    far = 2**22 + 2**21 + 5
+    points = np.zeros((1, dimension), np.float32)
+    T = np.eye(dimension + 1)[None].copy()
+    T[0, :dimension, dimension] = 0.5
+    T[0, 0, dimension] += far
+    grid = (_core.OccupancyGrid2D if dimension == 2 else _core.OccupancyGrid3D)(1.0)
+    one = np.ones(1, np.float32)
+    _core.add_beams(grid, points, np.array([True]), one, np.array([0, 1]), T)
+    cells = np.zeros((24, dimension), np.int64)
+    cells[:, 0] = far
+    cells[1:, 0] -= 2 ** np.arange(1, 24)
+    expected = np.zeros((24, 2))
+    expected[0, 0] = 1
+    assert (grid.alpha_beta(cells) == expected).all()

@@ -1,0 +1,305 @@
+"""Bodies of sweeps: the core against its plain twin, and by hand."""
+
+import itertools
+
+import numpy as np
+import pytest
+import reference
+
+from stillmap import _core
+
+IDENTITY = np.eye(4)[None]
+
+
+def scattered(seed, n=900, scans=6):
+    """Ends in clumps, on both sides of zero, as many as there are in scans that turn."""
+    rng = np.random.default_rng(seed)
+    middle = rng.uniform(-4, 4, (25, 3)) * [1, 1, 0.3]
+    ends = middle[rng.integers(0, 25, n)] + rng.normal(0, 0.3, (n, 3))
+    T = np.tile(np.eye(4), (scans, 1, 1))
+    T[:, :3, 3] = rng.uniform(-1, 1, (scans, 3))
+    offset = np.linspace(0, n, scans + 1).astype(np.int64)
+    points = ends - np.repeat(T[:, :3, 3], np.diff(offset), axis=0)
+    points[rng.random(n) < 0.02] = np.nan
+    return points.astype(np.float32), rng.random(n) < 0.9, offset, T
+
+
+def surfaces(beams, resolution=0.2):
+    made = []
+    for kernels in (_core, reference):
+        surface = kernels.SurfelMap3D(resolution)
+        surface.add_end_points(*beams)
+        surface.fit()
+        made.append(surface)
+    return made
+
+
+def order(surface):
+    return np.lexsort(surface.surfels()[0].T)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("column", "fewest"), [(1, 1), (2, 5), (3, 12)])
+def test_core_and_twin_agree(seed, column, fewest):
+    beams = scattered(seed)
+    core, plain = surfaces(beams)
+    of_core, of_plain = order(core), order(plain)
+    rng = np.random.default_rng(seed + 9)
+    stands, values = rng.random(plain.size) < 0.8, rng.normal(0, 2, (plain.size, 2))
+    shares = []
+    for kernels, surface, of in ((_core, core, of_core), (reference, plain, of_plain)):
+        mine = np.empty(plain.size, bool), np.empty((plain.size, 2), np.float32)
+        mine[0][of], mine[1][of] = stands, values
+        bodies = kernels.ClusterPooling3D(surface, *mine, column_cells=column, min_surfels=fewest)
+        bodies.add(*beams)
+        shares.append(bodies.means()[of])
+    assert shares[0].dtype == np.float32
+    np.testing.assert_allclose(shares[0], shares[1], atol=3e-6)
+    known = np.isfinite(shares[1]).all(axis=1)
+    assert not known[~stands].any()
+    assert known.mean() > 0.3
+    assert np.std(shares[1][known]) > 0.02  # bodies differ
+
+
+def test_threads_and_chunks_change_nothing():
+    points, hit, offset, T = scattered(4, 30000, 60)
+    surface = _core.SurfelMap3D(0.2)
+    surface.add_end_points(points, hit, offset, T)
+    surface.fit()
+    values = np.random.default_rng(1).random((surface.size, 1)).astype(np.float32)
+    stands = np.ones(surface.size, bool)
+    found = []
+    for threads, cuts in ((1, (0, 60)), (3, (0, 60)), (2, (0, 7, 31, 60))):
+        bodies = _core.ClusterPooling3D(surface, stands, values, column_cells=1, min_surfels=2)
+        for a, b in itertools.pairwise(cuts):
+            beams = slice(offset[a], offset[b])
+            within = offset[a : b + 1] - offset[a]
+            bodies.add(points[beams], hit[beams], within, T[a:b], threads)
+        found.append(bodies.means())
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0], found[2])
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("column", "least"), [(2, 0.02), (3, 0.0)])
+def test_feet_of_core_and_twin_agree(seed, column, least):
+    rng = np.random.default_rng(seed + 40)
+    xy = rng.uniform(-2.5, 2.5, (1600, 2))
+    floor = np.column_stack([xy, rng.normal(0.1, 0.01, 1600) * np.sign(rng.normal(2, 1, 1600))])
+    points, hit, offset, T = scattered(seed, 800)
+    points = np.concatenate([points, floor.astype(np.float32)])[rng.permutation(2400)]
+    beams = points, np.tile(hit, 3), 3 * offset, np.tile(np.eye(4), (len(T), 1, 1))
+    core, plain = surfaces(beams)
+    of_core, of_plain = order(core), order(plain)
+    low = rng.random(plain.size) < 0.5
+    p, ground = rng.random(plain.size), rng.normal(0.0, 0.05, plain.size)
+    found = []
+    for kernels, surface, of in ((_core, core, of_core), (reference, plain, of_plain)):
+        stands = np.empty(plain.size, bool)
+        mine = np.empty((2, plain.size), np.float32)
+        stands[of], mine[0][of], mine[1][of] = ~low, np.where(low, 0.5 + p / 2, 0.6 * p), ground
+        known = {"is_obstacle": stands, "p_static": mine[0], "ground_height": mine[1]}
+        element = surface.associate_beams(*beams)
+        for threads in (1, 3):
+            found.append(
+                kernels.relabel_ground_contact(
+                    surface,
+                    *beams,
+                    element,
+                    **known,
+                    column_cells=column,
+                    max_ground_height=0.15,
+                    min_end_height=least,
+                    threads=threads,
+                )
+            )
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_allclose(found[0], found[2], atol=1e-6)
+    assert 5 <= np.isfinite(found[2]).sum() < 700
+    assert np.nanmax(found[2]) < 0.5
+
+
+def feet_of(points, *, is_obstacle, p_static, ground=0.0, least=0.05, scans=1):
+    """Beams that end in cells of a metre, as feet; elements by rising x, then z."""
+    points = np.array(points, np.float32)
+    hit, offset = np.ones(len(points), bool), np.linspace(0, len(points), scans + 1).astype(int)
+    T = np.repeat(IDENTITY, scans, axis=0)
+    surface = _core.SurfelMap3D(1.0)
+    surface.add_end_points(points, hit, offset, T)
+    surface.fit()
+    of = np.lexsort(surface.surfels()[0].T[[2, 1, 0]])
+    values = np.empty((3, surface.size), np.float32)
+    values[0][of], values[1][of], values[2][of] = is_obstacle, p_static, ground
+    element = surface.associate_beams(points, hit, offset, T)
+    known = {
+        "is_obstacle": values[0].astype(bool),
+        "p_static": values[1],
+        "ground_height": values[2],
+    }
+    return _core.relabel_ground_contact(
+        surface,
+        points,
+        hit,
+        offset,
+        T,
+        element,
+        **known,
+        column_cells=1,
+        max_ground_height=0.3,
+        min_end_height=least,
+    )
+
+
+def test_a_sole_under_a_leg_that_moves():
+    leg, sole, below, beside = [0.5, 0.5, 1.2], [0.5, 0.5, 0.07], [0.5, 0.5, 0.04], [1.5, 0.5, 0.9]
+    given = {"is_obstacle": [0, 1, 0], "p_static": [0.9, 0.2, 0.9]}
+    found = feet_of([leg, sole, below, beside], **given)
+    np.testing.assert_array_equal(found, np.array([np.nan, 0.2, np.nan, np.nan], np.float32))
+    assert np.isnan(feet_of([leg, sole, below, beside], **given, ground=0.03)).all()
+    static = {**given, "p_static": [0.9, 0.6, 0.9]}
+    assert np.isnan(feet_of([leg, sole, below, beside], **static)).all()
+    known = {**given, "p_static": [0.4, 0.2, 0.9]}  # the foot's own element moves
+    assert np.isnan(feet_of([leg, sole, below, beside], **known)).all()
+
+
+def test_crowns_over_what_moves_are_no_feet():
+    leg, sole, crown = [0.5, 0.5, 1.2], [0.5, 0.5, 0.07], [0.5, 0.5, 4.2]
+    found = feet_of([leg, sole, crown], is_obstacle=[0, 1, 0], p_static=[0.9, 0.2, 0.9])
+    assert np.isfinite(found).tolist() == [False, True, False]
+
+
+def test_feet_are_of_the_same_sweep():
+    leg, sole = [0.5, 0.5, 1.2], [0.5, 0.5, 0.07]
+    given = {"is_obstacle": [0, 1], "p_static": [0.9, 0.2]}
+    assert np.isnan(feet_of([leg, sole], **given, scans=2)).all()
+    assert np.isfinite(feet_of([leg, sole], **given)[1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"surfel": np.array([0], np.int32)}, "surfel: expected one per beam"),
+        ({"surfel": np.array([0, 2], np.int32)}, "surfel: out of range"),
+        ({"surfel": np.array([0, -2], np.int32)}, "surfel: out of range"),
+        ({"is_obstacle": np.ones(1, bool)}, "is_obstacle: expected one per element"),
+        ({"p_static": np.ones(3, np.float32)}, "p_static: expected one per element"),
+        ({"ground_height": np.ones(1, np.float32)}, "ground_height: expected one per element"),
+        ({"p_static": np.array([0.5, 1.5], np.float32)}, "p_static: expected a probability"),
+        ({"ground_height": np.array([0.0, np.nan], np.float32)}, "ground_height: not finite"),
+        ({"column_cells": 0}, "column_cells"),
+        ({"max_ground_height": np.inf}, "max_ground_height"),
+        ({"min_end_height": -1.0}, "min_end_height"),
+    ],
+)
+def test_feet_refuse(changes, match):
+    beams = row_of(0, 1), np.ones(2, bool), np.array([0, 2]), IDENTITY
+    surface = _core.SurfelMap3D(1.0)
+    surface.add_end_points(*beams)
+    surface.fit()
+    given = {
+        "surfel": np.array([0, 1], np.int32),
+        "is_obstacle": np.ones(2, bool),
+        "p_static": np.ones(2, np.float32),
+        "ground_height": np.zeros(2, np.float32),
+        "column_cells": 1,
+        "max_ground_height": 0.2,
+        "min_end_height": 0.0,
+    }
+    assert np.isnan(_core.relabel_ground_contact(surface, *beams, **given)).all()
+    with pytest.raises(ValueError, match=match):
+        _core.relabel_ground_contact(surface, *beams, **{**given, **changes})
+
+
+def test_feet_refuse_unusable_beams():
+    points = row_of(0, 1)
+    surface = _core.SurfelMap3D(1.0)
+    surface.add_end_points(points, np.ones(2, bool), np.array([0, 2]), IDENTITY)
+    surface.fit()
+    points[1] = np.nan
+    one = np.ones(2, np.float32)
+    with pytest.raises(ValueError, match="unusable"):
+        _core.relabel_ground_contact(
+            surface,
+            points,
+            np.ones(2, bool),
+            np.array([0, 2]),
+            IDENTITY,
+            np.array([0, 1], np.int32),
+            is_obstacle=one.astype(bool),
+            p_static=one,
+            ground_height=one,
+            column_cells=1,
+            max_ground_height=0.2,
+            min_end_height=0.0,
+        )
+
+
+def row_of(*x):
+    """Ends side by side, one in the middle of each cell of a metre."""
+    return np.array([[v + 0.5, 0.5, 0.5] for v in x], np.float32)
+
+
+def share_of(scans, moving, column=1, fewest=1):
+    """By x of each cell: the share of the bodies around it."""
+    points, offset = np.concatenate(scans), np.cumsum([0, *map(len, scans)])
+    hit, T = np.ones(len(points), bool), np.repeat(IDENTITY, len(scans), axis=0)
+    surface = _core.SurfelMap3D(1.0)
+    surface.add_end_points(points, hit, offset, T)
+    surface.fit()
+    x = surface.surfels()[0][:, 0]
+    moves = np.isin(x, moving).astype(np.float32)[:, None]
+    bodies = _core.ClusterPooling3D(
+        surface, np.ones(len(x), bool), moves, column_cells=column, min_surfels=fewest
+    )
+    bodies.add(points, hit, offset, T)
+    return dict(zip(x.tolist(), bodies.means()[:, 0].tolist(), strict=True))
+
+
+def test_what_is_apart_says_nothing():
+    share = share_of([row_of(0, 1, 2, 3, 5, 6)], moving=[3])
+    assert share == {0: 0.25, 1: 0.25, 2: 0.25, 3: 0.25, 5: 0.0, 6: 0.0}
+
+
+def test_columns_wider_than_a_cell_reach_farther_on_both_sides_of_zero():
+    assert share_of([row_of(-5, -3, -1)], moving=[-5]) == pytest.approx({-5: 1, -3: 0, -1: 0})
+    share = share_of([row_of(-5, -3, -1)], moving=[-5], column=2)
+    assert share == pytest.approx({-5: 1 / 3, -3: 1 / 3, -1: 1 / 3}, abs=1e-6)
+
+
+def test_each_sweep_has_the_same_say():
+    share = share_of([row_of(0, 1), row_of(0), row_of(0), row_of(0)], moving=[1])
+    assert share == {0: 0.125, 1: 0.5}
+
+
+def test_small_bodies_tell_nothing():
+    share = share_of([row_of(0, 1, 2), row_of(0, 1)], moving=[1, 2], fewest=3)
+    assert share == pytest.approx({0: 2 / 3, 1: 2 / 3, 2: 2 / 3}, abs=1e-6)
+    assert np.isnan(list(share_of([row_of(0, 1)], moving=[1], fewest=3).values())).all()
+
+
+def bad(**changes):
+    surface = _core.SurfelMap3D(1.0)
+    surface.add_end_points(row_of(0, 1), np.ones(2, bool), np.array([0, 2]), IDENTITY)
+    if not changes.pop("raw", False):
+        surface.fit()
+    given = {"is_obstacle": np.ones(2, bool), "values": np.ones((2, 1), np.float32)}
+    return _core.ClusterPooling3D(
+        surface, **{**given, "column_cells": 1, "min_surfels": 1, **changes}
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"raw": True}, "fit it first"),
+        ({"is_obstacle": np.ones(3, bool)}, "is_obstacle: expected one per element"),
+        ({"values": np.ones((1, 2), np.float32)}, "values: expected a row per element"),
+        ({"values": np.ones((2, 0), np.float32)}, "values: expected a row per element"),
+        ({"values": np.array([[0.5], [np.nan]], np.float32)}, "values: expected -1e6"),
+        ({"column_cells": 0}, "column_cells"),
+        ({"min_surfels": 0}, "min_surfels"),
+    ],
+)
+def test_refusals(changes, match):
+    with pytest.raises(ValueError, match=match):
+        bad(**changes)

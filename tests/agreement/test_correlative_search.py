@@ -1,0 +1,204 @@
+"""The core's branch and bound finds the best pose of the lattice that brute force finds."""
+
+import numpy as np
+import pytest
+import reference
+from reference.likelihood_field import moved
+
+from stillmap import _core
+
+FLOOR, GAIN = 0.05, 0.2
+# a step of the raster more or less for two beams: rounding may fall either way
+TIED = 2 * GAIN * np.log((1 + FLOOR) / FLOOR) / 255
+
+
+class World:
+    """A map of three scans in a slanted room, and a fourth one to be laid on it."""
+
+    def __init__(self, a_room, seed, dimension, beams=60):
+        self.beams = a_room(seed, dimension, (0.1, 0.2)[dimension - 2], 4, 150).beams
+        b, self.seed, self.dof = self.beams, seed, (3, 6)[dimension - 2]
+        self.T = b.T_map_sensor[3]
+        mapped = b.with_(hit=b.hit & (np.arange(len(b.hit)) < b.offset[3]))
+        self.core, self.plain = mapped.grid(_core), mapped.grid(reference)
+        last = slice(b.offset[3], b.offset[4])
+        seen = b.hit[last] & np.isfinite(b.points[last]).all(axis=1)
+        self.points = np.ascontiguousarray(b.points[last][seen][:beams])
+        self.weights = np.random.default_rng(seed).uniform(0, 1, beams).astype(np.float32)
+        self.weights[::7] = 0
+        self.sigma = b.resolution
+
+    def prior(self, translation, rotation):
+        """A pose somewhere in the window around the true one."""
+        d = np.zeros(self.dof)
+        D = self.beams.dimension
+        rng = np.random.default_rng(self.seed)
+        d[:D], d[-1] = translation * rng.uniform(-1, 1, D), rotation * rng.uniform(-1, 1)
+        return moved(self.T, d)
+
+    def core_found(self, T_prior, information, window, starts=1, iterations=0):
+        return _core.register_scan(
+            self.core,
+            self.points,
+            self.weights,
+            T_prior,
+            information,
+            sigma=self.sigma,
+            radius=2,
+            floor=FLOOR,
+            unknown=0.05,
+            information_scale=GAIN,
+            max_iterations=iterations,
+            window_translation=window[0],
+            window_rotation=window[1],
+            search_range=2.0,
+            max_candidates=starts,
+        )
+
+    def lattice(self, T_prior, information, window):
+        return reference.search_lattice(
+            self.plain,
+            self.points,
+            self.weights,
+            T_prior,
+            information,
+            sigma=self.sigma,
+            floor=FLOOR,
+            information_scale=GAIN,
+            window_translation=window[0],
+            window_rotation=window[1],
+            search_range=2.0,
+        )
+
+
+def information(kind, dof, seed):
+    """Inverse covariances of a prior: (dof, dof)."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(dof, dof))
+    return {
+        "none": np.zeros((dof, dof)),
+        "even": np.diag([20.0] * dof),
+        "one way only": np.diag([50.0, *[0.0] * (dof - 1)]),
+        "correlated": 5 * A @ A.T,
+        # as after a way along a curve: turn and shift go together, across it hardly anything goes
+        "narrow": 400 * np.outer(A[0], A[0]) + np.eye(dof),
+        "singular": 100 * np.outer(A[0], A[0]),
+    }[kind]
+
+
+WINDOWS = {
+    2: [(0.3, 0.4), (0.45, 0.2), (0.37, 0.0), (0.0, 0.4), (1.0, 1.0)],
+    3: [(0.5, 0.2), (0.9, 0.2), (0.6, 0.0)],
+}
+
+
+def assert_finds_the_best(world, kind, window):
+    T_prior, Lambda = world.prior(*window), information(kind, world.dof, world.seed)
+    T, _, _, _, _, tried, _ = world.core_found(T_prior, Lambda, window)
+    lattice = world.lattice(T_prior, Lambda, window)
+    off, index = lattice.index_of(T)
+    assert np.abs(off).max() < 1e-6
+    best = lattice.scores.max()
+    assert lattice.scores[index] >= best - TIED
+    # it is worth finding: the others are worse
+    assert best > np.median(lattice.scores) + 0.5
+    return lattice, tried
+
+
+@pytest.mark.parametrize(
+    "kind", ["none", "even", "one way only", "correlated", "narrow", "singular"]
+)
+@pytest.mark.parametrize(
+    ("dimension", "window"), [(D, window) for D, windows in WINDOWS.items() for window in windows]
+)
+def test_the_best_of_the_lattice(a_room, dimension, window, kind):
+    for seed in range(3 if dimension == 2 else 1):
+        assert_finds_the_best(World(a_room, seed, dimension), kind, window)
+
+
+@pytest.mark.parametrize(("dimension", "window"), [(2, (3.0, np.pi)), (3, (1.7, 0.5))])
+@pytest.mark.parametrize("kind", ["even", "correlated"])
+def test_wide_windows_are_not_gone_through_pose_by_pose(a_room, dimension, window, kind):
+    lattice, tried = assert_finds_the_best(World(a_room, 4, dimension, 40), kind, window)
+    assert lattice.scores.size > 4e4
+    assert tried < 0.2 * lattice.scores.size
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_more_starts_are_never_worse(a_room, dimension, seed):
+    world, window = World(a_room, seed, dimension), (0.5, 0.5)
+    T_prior, Lambda = world.prior(*window), information("correlated", world.dof, seed)
+    for iterations in (0, 20):
+        costs = [
+            world.core_found(T_prior, Lambda, window, starts, iterations)[2]
+            for starts in (1, 3, 10)
+        ]
+        assert costs[0] >= costs[1] >= costs[2]
+
+
+def test_the_raster_by_hand():
+    # one end point in cell (2, 0) of a metre, passed cells 0 and 1: m = 1 there, sigma 1 m
+    grid = reference.OccupancyGrid2D(1.0)
+    T = np.eye(3)[None].copy()
+    T[0, :2, 2] = 0.5
+    hit = np.ones(1, bool), np.ones(1, np.float32), np.array([0, 1])
+    reference.add_beams(grid, np.array([[2.0, 0.0]]), *hit, T)
+    lattice = reference.search_lattice(
+        grid, np.array([[2.0, 0.0]]), np.ones(1), T[0], np.diag([2.0, 2.0, 0.0]), sigma=2 / 3,
+        floor=1.0, information_scale=1.0, window_translation=2.0, window_rotation=0.0,
+        search_range=9.0,
+    )  # fmt: skip
+    assert lattice.step == 1.0
+    assert lattice.scores.shape == (1, 5, 5)
+    for x, y in ((0, 0), (1, 0), (2, 0), (-1, 2)):
+        d = x**2 + y**2
+        F = np.exp(-d / 2)
+        score = lattice.scores[0, 2 + x, 2 + y]
+        assert score == pytest.approx(np.log(1 + F) - d, abs=1.5 * np.log(2) / 255)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("points", np.ones((5, 2)), TypeError),
+        ("points", np.ones((5, 3), np.float32), TypeError),
+        ("weights", np.ones(4, np.float32), ValueError),
+        ("weights", np.full(5, 2, np.float32), ValueError),
+        ("T_prior", np.eye(4), TypeError),
+        ("T_prior", np.full((3, 3), np.nan), ValueError),
+        ("T_start", np.full((3, 3), np.inf), ValueError),
+        ("information", np.eye(6), TypeError),
+        ("information", np.full((3, 3), np.nan), ValueError),
+        ("information_scale", 0.0, ValueError),
+        ("max_candidates", 0, ValueError),
+        ("window_translation", -0.1, ValueError),
+        ("window_translation", np.nan, ValueError),
+        ("window_rotation", -0.1, ValueError),
+        ("window_rotation", 3.3, ValueError),
+        ("sigma", 0.0, ValueError),
+        ("floor", 0.0, ValueError),
+    ],
+)
+def test_refusals(name, value, error):
+    good = {
+        "grid": _core.OccupancyGrid2D(0.5),
+        "points": np.ones((5, 2), np.float32),
+        "weights": np.ones(5, np.float32),
+        "T_prior": np.eye(3),
+        "information": np.eye(3),
+        "sigma": 0.5,
+        "radius": 2,
+        "floor": FLOOR,
+        "unknown": 0.1,
+        "information_scale": GAIN,
+        "max_iterations": 5,
+        "window_translation": 1.0,
+        "window_rotation": 0.5,
+        "search_range": 9.0,
+        "max_candidates": 2,
+        "T_start": np.eye(3),
+    }
+    _core.register_scan(**good)
+    with pytest.raises(error, match=name.removesuffix("_translation").removesuffix("_rotation")):
+        _core.register_scan(**{**good, name: value})

@@ -1,0 +1,262 @@
+"""End points between neighbouring ones on a flat surface: the core against the plain twin."""
+
+import numpy as np
+import pytest
+import reference
+
+from stillmap import _core
+
+OPTIONS = {"max_gap": 1.5, "tolerance": 0.1, "max_gap_ratio": 3.0}
+LOOSE = {"max_gap": 0.6, "tolerance": 0.15, "max_gap_ratio": 1.6}  # for random points
+
+
+def filled(kernels, beams, options=OPTIONS):
+    """A grid of nothing but what fills the gaps."""
+    grid = beams.empty_grid(kernels)
+    kernels.interpolate_end_points(
+        grid, beams.points, beams.hit, beams.e, beams.offset, beams.T_map_sensor, **options
+    )
+    return grid
+
+
+def assert_agree(core, plain, n):
+    """Sums and what registration sees of them; each of n end points is rounded once."""
+    first, alpha, beta = core.dense()
+    first_plain, alpha_plain, beta_plain = plain.dense()
+    np.testing.assert_array_equal(first, first_plain)
+    np.testing.assert_allclose(alpha, alpha_plain, rtol=0, atol=n * 2.0**-24)
+    assert not beta.any()  # nothing passes through cells for them
+    assert not beta_plain.any()
+    cells = np.array(list(plain.alpha), np.int64)
+    # end points to the side of the cells' centres: the moments count
+    look = ((cells + 0.2) * plain.resolution).astype(np.float32)
+    weights, T = np.ones(len(look), np.float32), np.eye(look.shape[1] + 1)
+    options = 0.6 * plain.resolution, 2, 0.02, 0.3
+    costs = [
+        kernels.registration_cost(grid, look, weights, T, *options)
+        for kernels, grid in ((_core, core), (reference, plain))
+    ]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-5, abs=1e-4)
+
+
+@pytest.fixture
+def wandering(beams):
+    """Ragged scans whose end points wander about, now straight on, now not, near and far apart."""
+    rng = np.random.default_rng(7)
+    points, v = np.zeros_like(beams.points), np.zeros(beams.dimension)
+    for n in range(1, len(points)):
+        v = 0.85 * v - 0.05 * points[n - 1] + rng.normal(scale=0.15, size=len(v))
+        points[n] = points[n - 1] + rng.lognormal(sigma=0.6) * v
+    there = points + 0 * beams.points  # what was not finite is not
+    return beams.with_(points=there, resolution=0.05)
+
+
+def test_random_scans(wandering):
+    core, plain = filled(_core, wandering, LOOSE), filled(reference, wandering, LOOSE)
+    assert len(plain.alpha) > 40
+    assert_agree(core, plain, 2000)
+
+
+@pytest.mark.parametrize("name", ["max_gap", "tolerance", "max_gap_ratio"])
+def test_every_option_bounds_what_is_filled(wandering, name):
+    sizes = []
+    for factor in (0.0, 0.5, 1.0, 2.0):
+        options = {**LOOSE, name: factor * LOOSE[name]}
+        core, plain = (filled(kernels, wandering, options) for kernels in (_core, reference))
+        if plain.alpha:
+            assert_agree(core, plain, 2000)
+        assert core.dense()[1].any() == bool(plain.alpha)
+        sizes.append(len(plain.alpha))
+    assert sizes[0] == 0
+    assert 0 < sizes[1] < sizes[2] < sizes[3]
+
+
+def ranges_to(walls, angles):
+    """Along rays from the origin to the nearest of half planes (normal, distance)."""
+    rays = np.column_stack([np.cos(angles), np.sin(angles)])
+    with np.errstate(divide="ignore"):
+        found = np.array([d / (rays @ np.asarray(n)) for n, d in walls])
+    return rays, np.where(found > 0, found, np.inf).min(axis=0)
+
+
+SLANTED = [((0.1, 1.0), 2.3)]  # from near to far away
+SURFACES = {
+    "wall": SLANTED,
+    "corner": [((1.0, 0.0), 4.1), ((0.0, 1.0), 3.3)],
+    "jump": [*SLANTED, ((0.1, 1.0), 1.61)],
+    "missing": SLANTED,
+}
+
+
+def scene(kind):
+    """End points (N, 2) of one scan, and which of them are hits."""
+    angles = np.radians(np.arange(12.0, 168.0, 3.0))
+    rays, ranges = ranges_to(SURFACES["corner" if kind == "corner" else "wall"], angles)
+    if kind == "jump":  # a case before the wall
+        ranges = np.where((angles > 1.2) & (angles < 1.9), 0.7 * ranges, ranges)
+    hit = ranges < 7.0
+    if kind == "missing":
+        hit &= np.random.default_rng(0).random(len(hit)) < 0.7
+    return rays * np.minimum(ranges, 7.0)[:, None], hit
+
+
+@pytest.fixture(params=[2, 3], ids=["2D", "3D"])
+def laid(request, a_room):
+    """Lays flat scenes into a map of some dimension; several scans, each from a pose of its own."""
+    room = a_room(5, request.param, (0.05, 0.07)[request.param - 2], 3, 4).beams
+
+    def lay(*kinds):
+        scenes = [scene(kind) for kind in kinds]
+        flat = np.concatenate([points for points, _ in scenes])
+        points = np.zeros((len(flat), request.param), np.float32)
+        points[:, :2] = flat
+        return room.with_(
+            points=points,
+            hit=np.concatenate([hit for _, hit in scenes]),
+            offset=np.cumsum([0, *(len(hit) for _, hit in scenes)]),
+            T_map_sensor=room.T_map_sensor[: len(kinds)],
+            e=np.random.default_rng(1).uniform(0.1, 1, len(points)).astype(np.float32),
+        )
+
+    return lay
+
+
+@pytest.mark.parametrize("kind", list(SURFACES))
+def test_scenes(laid, kind):
+    beams = laid(kind)
+    core, plain = filled(_core, beams), filled(reference, beams)
+    assert len(plain.alpha) > 40
+    assert_agree(core, plain, 2000)
+
+
+@pytest.mark.parametrize("kind", list(SURFACES))
+def test_what_is_added_lies_on_the_surfaces(laid, kind):
+    beams = laid(kind)
+    plain = filled(reference, beams)
+    added = np.array([plain.moment[cell] / plain.alpha[cell] for cell in plain.alpha])
+    D, T = beams.dimension, beams.T_map_sensor[0]
+    there = (added - T[:D, D]) @ T[:D, :D]  # in the frame of the sensor
+    assert np.abs(there[:, 2:]).max(initial=0) < 1e-6
+    off = [np.abs(there[:, :2] @ n - d) / np.linalg.norm(n) for n, d in SURFACES[kind]]
+    assert np.min(off, axis=0).max() < (0.05 if kind == "corner" else 1e-5)
+    for distances in off:
+        assert (distances < 1e-5).sum() > 10
+
+
+def test_a_wall_far_away_is_left_without_a_gap(laid):
+    beams = laid("wall")
+    plain = filled(reference, beams)
+    added = np.array([plain.moment[cell] / plain.alpha[cell] for cell in plain.alpha])
+    D, T = beams.dimension, beams.T_map_sensor[0]
+    seen = beams.points[beams.hit]
+    along = np.sort(np.concatenate([seen, (added - T[:D, D]) @ T[:D, :D]])[:, 0])
+    assert np.abs(np.diff(seen[:, 0])).max() > 0.8
+    # end points that share a cell are one mean there
+    assert np.diff(along).max() < 2 * beams.resolution
+
+
+def test_several_scans_do_not_touch_one_another(laid):
+    kinds = "wall", "jump", "missing"
+    beams = laid(*kinds)
+    core, plain = filled(_core, beams), filled(reference, beams)
+    assert_agree(core, plain, 6000)
+    apart = beams.empty_grid(_core)
+    for t in range(len(kinds)):
+        part = slice(beams.offset[t], beams.offset[t + 1])
+        one = beams.with_(
+            points=beams.points[part],
+            hit=beams.hit[part],
+            e=beams.e[part],
+            offset=np.array([0, part.stop - part.start]),
+            T_map_sensor=beams.T_map_sensor[t : t + 1],
+        )
+        apart.merge(filled(_core, one))
+    for a, b in zip(core.dense(), apart.dense(), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("kind", list(SURFACES))
+def test_remove_takes_everything_out_to_the_bit(laid, kind):
+    beams = laid(kind, "wall")
+    filling = beams.points, beams.hit, beams.e, beams.offset, beams.T_map_sensor
+    grid, never = beams.grid(_core), beams.grid(_core)
+    before = [a.tobytes() for a in grid.dense()]
+    _core.interpolate_end_points(grid, *filling, **OPTIONS)
+    assert [a.tobytes() for a in grid.dense()] != before
+    _core.interpolate_end_points(grid, *filling, **OPTIONS, remove=True)
+    assert [a.tobytes() for a in grid.dense()] == before
+    look, weights = beams.points, np.ones(len(beams.points), np.float32)
+    costs = [
+        _core.registration_cost(g, look, weights, beams.T_map_sensor[0], 0.04, 2, 0.05, 0.05)
+        for g in (grid, never)
+    ]
+    assert costs[0] == costs[1]  # the moments too
+
+
+# by hand: which gaps are filled, on cells of 0.1 m
+
+
+def between(kernels, points, hit=None, e=None, **changes):
+    """{cell along x: alpha} of what is added."""
+    points = np.array(points, np.float32).reshape(-1, 2) + np.float32([0, 0.05])
+    n = len(points)
+    grid = kernels.OccupancyGrid2D(0.1)
+    kernels.interpolate_end_points(
+        grid,
+        points,
+        np.ones(n, bool) if hit is None else np.array(hit, bool),
+        np.ones(n, np.float32) if e is None else np.array(e, np.float32),
+        np.array([0, n]),
+        np.eye(3)[None],
+        **{**OPTIONS, **changes},
+    )
+    first, alpha, _ = grid.dense()
+    columns = alpha.sum(axis=0)
+    return {int(first[0] + x): pytest.approx(columns[x]) for x in np.flatnonzero(columns)}
+
+
+both = pytest.mark.parametrize("kernels", [reference, _core])
+
+
+@both
+def test_the_cells_between_by_hand(kernels):
+    # from 0.06 on over 0.38 m in four steps: 0.155, 0.25, 0.345; then 0.27 m in three: 0.53, 0.62
+    there = [(0.06, 0), (0.44, 0), (0.71, 0)]
+    assert between(kernels, there) == {1: 1, 2: 1, 3: 1, 5: 1, 6: 1}
+    assert between(kernels, there[::-1]) == {1: 1, 2: 1, 3: 1, 5: 1, 6: 1}
+    assert between(kernels, there, e=[0.5, 0.75, 0.25]) == {
+        1: 0.5,
+        2: 0.5,
+        3: 0.5,
+        5: 0.25,
+        6: 0.25,
+    }
+    assert between(kernels, there, e=[0, 1, 1]) == {5: 1, 6: 1}
+
+
+@both
+def test_two_are_not_a_surface(kernels):
+    assert between(kernels, [(0.06, 0), (0.44, 0)]) == {}
+    assert between(kernels, []) == {}
+    assert between(kernels, [(0.06, 0), (0.44, 0), (0.71, 0)], hit=[1, 1, 0]) == {}
+    assert between(kernels, [(0.06, 0), (0.44, 0), (np.nan, 0)]) == {}
+    assert between(kernels, [(0.06, 0), (0.44, 0), (0.44, 0)]) == {}
+
+
+@both
+def test_a_gap_is_not_much_wider_than_the_one_beside_it(kernels):
+    # 0.1 m, then 0.35 m: more than three times as wide, and the other way round less
+    there = [(0.06, 0), (0.16, 0), (0.51, 0)]
+    assert between(kernels, there) == {}
+    assert between(kernels, there, max_gap_ratio=3.6) == {2: 1, 3: 1, 4: 1}
+    assert between(kernels, there, max_gap_ratio=3.6, max_gap=0.34) == {}
+
+
+@both
+def test_a_surface_that_turns_back_or_bends_is_none(kernels):
+    assert between(kernels, [(0.06, 0), (0.44, 0), (0.11, 0)]) == {}
+    # the last one is 0.11 m off the line of the others, the first one 0.14 m
+    bend = [(0.06, 0), (0.44, 0), (0.71, 0.11)]
+    assert between(kernels, bend, tolerance=0.1) == {}
+    assert list(between(kernels, bend, tolerance=0.13)) == [1, 2, 3]
+    assert list(between(kernels, bend, tolerance=0.16)) == [1, 2, 3, 5, 6]

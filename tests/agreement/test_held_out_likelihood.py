@@ -1,0 +1,173 @@
+"""The density of held-out ranges: core against the plain twin, and that it is a density."""
+
+import numpy as np
+import pytest
+import reference
+
+from stillmap import _core
+
+MODEL = {
+    "stopping_rate": 4.0,
+    "range_std": 0.08,
+    "late_share": 0.4,
+    "mean_delay": 0.2,
+    "outlier_share": 0.02,
+}
+
+
+def shares_of(kernels, dimension, resolution):
+    kind = kernels.StaticFractionGrid2D if dimension == 2 else kernels.StaticFractionGrid3D
+    return kind(resolution)
+
+
+@pytest.fixture
+def held(beams):
+    return np.arange(len(beams.T_map_sensor)) % 3 == 2
+
+
+def filled(kernels, beams, held):
+    shares = shares_of(kernels, beams.dimension, beams.resolution)
+    shares.add(beams.points, beams.hit, beams.e, beams.offset, beams.T_map_sensor, held)
+    return shares
+
+
+def test_rates(beams, held):
+    core, plain = filled(_core, beams, held), filled(reference, beams, held)
+    assert core.resolution == plain.resolution
+    assert core.end_rate == pytest.approx(plain.end_rate, rel=1e-6)
+    assert core.dynamic_rate == pytest.approx(plain.dynamic_rate, rel=1e-6)
+    assert 0 < core.dynamic_rate < core.end_rate
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"late_share": 0.0}, {"late_share": 1.0}, {"range_std": 0.5}]
+)
+def test_gains(beams, held, changes):
+    core, plain = filled(_core, beams, held), filled(reference, beams, held)
+    looks = *beams.arguments, held
+    model = {**MODEL, **changes}
+    ours = _core.score_held_out(core, *looks, **model)
+    expected = reference.score_held_out(plain, *looks, **model)
+    assert ours.shape == expected.shape == (len(held), 2)
+    assert not ours[~held].any()
+    assert expected[:, 1].sum() > 20
+    assert np.ptp(expected[held, 0]) > 1
+    np.testing.assert_allclose(ours, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 64])
+def test_threads_change_no_bit(beams, held, threads):
+    shares, looks = filled(_core, beams, held), (*beams.arguments, held)
+    one, many = (_core.score_held_out(shares, *looks, **MODEL, threads=n) for n in (1, threads))
+    assert one.tobytes() == many.tobytes()
+
+
+def test_order_of_scans_changes_no_bit(beams, held):
+    whole = filled(_core, beams, held)
+    piecewise = shares_of(_core, beams.dimension, beams.resolution)
+    for t in reversed(range(len(held))):
+        a, b = beams.offset[t], beams.offset[t + 1]
+        piecewise.add(
+            beams.points[a:b], beams.hit[a:b], beams.e[a:b], np.array([0, b - a]),
+            beams.T_map_sensor[t : t + 1], held[t : t + 1],
+        )  # fmt: skip
+    looks = *beams.arguments, held
+    gains = [_core.score_held_out(shares, *looks, **MODEL) for shares in (whole, piecewise)]
+    assert gains[0].tobytes() == gains[1].tobytes()
+
+
+def wall_and_clutter(kernels, dimension):
+    """Hits around 3 m and 4 m along the first axis, of e = 0.7 and 1, and movers before them."""
+    rng = np.random.default_rng(8)
+    x = np.concatenate([rng.normal(3, 0.1, 40), rng.normal(4, 0.1, 40), rng.uniform(1, 3, 20)])
+    points = np.zeros((len(x), dimension), np.float32)
+    points[:, 0] = x
+    points[:, 1:] = rng.normal(scale=0.05, size=(len(x), dimension - 1))
+    e = np.repeat([0.7, 1.0, 0.0], [40, 40, 20]).astype(np.float32)
+    shares = shares_of(kernels, dimension, 0.1)
+    hit, offset, T = np.ones(len(x), bool), np.array([0, len(x)]), np.eye(dimension + 1)[None]
+    shares.add(points, hit, e, offset, T, np.array([False]))
+    return shares
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(
+    "model", [MODEL, {**MODEL, "stopping_rate": 30.0}, {**MODEL, "late_share": 1.0}]
+)
+def test_ranges_have_a_density_that_integrates_to_one(dimension, model):
+    shares = wall_and_clutter(_core, dimension)
+    step, longest = 0.002, 12.0
+    z = np.append(np.arange(step / 2, longest, step), longest)
+    direction = np.array([1.0, 0.02, 0.01][:dimension])
+    points = (z[:, None] * direction / np.linalg.norm(direction)).astype(np.float32)
+    hit = np.append(np.ones(len(z) - 1, bool), False)
+    n = len(z)
+    gain, count = _core.score_held_out(
+        shares, points, hit, np.arange(n + 1), np.tile(np.eye(dimension + 1), (n, 1, 1)),
+        np.ones(n, bool), **model,
+    ).T  # fmt: skip
+    assert (count == 1).all()
+    q = shares.end_rate
+    log_q = np.where(hit, np.log(q), 0.0) - q * np.linalg.norm(points, axis=1)
+    p = np.exp(gain + log_q)
+    assert p[:-1].sum() * step + p[-1] == pytest.approx(1.0, abs=2e-3)
+    assert p[:-1].max() > 3 * np.exp(log_q[:-1]).max()  # the map says something
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("kernels", [_core, reference])
+def test_a_world_of_which_nothing_is_known_gains_nothing(kernels, dimension):
+    # no beam seen: everything ends at one end per metre, in the map and without it
+    shares = shares_of(kernels, dimension, 0.1)
+    points = np.full((3, dimension), 0.7, np.float32)
+    points[2] = 0.0  # of no length
+    args = points, np.array([True, False, True]), np.array([0, 3]), np.eye(dimension + 1)[None]
+    gain, beams = kernels.score_held_out(shares, *args, np.array([True]), **MODEL)[0]
+    assert gain == pytest.approx(0.0, abs=1e-12)
+    assert beams == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("stopping_rate", 0.0),
+        ("stopping_rate", float("inf")),
+        ("range_std", 0.0),
+        ("range_std", float("nan")),
+        ("mean_delay", -1.0),
+        ("late_share", 1.1),
+        ("outlier_share", 0.0),
+        ("outlier_share", 1.0),
+        ("is_held_out", np.zeros(1, bool)),
+        ("offset", np.array([0, 5])),
+    ],
+)
+def test_refusals(name, value):
+    good = {
+        "points": np.ones((5, 2), np.float32),
+        "hit": np.ones(5, bool),
+        "offset": np.array([0, 2, 5]),
+        "T_map_sensor": np.tile(np.eye(3), (2, 1, 1)),
+        "is_held_out": np.array([False, True]),
+    }
+    shares = _core.StaticFractionGrid2D(0.1)
+    _core.score_held_out(shares, **good, **MODEL)
+    with pytest.raises(ValueError, match=name):
+        _core.score_held_out(shares, **{**good, **MODEL, name: value})
+
+
+@pytest.mark.parametrize("e", [-0.1, 1.5, np.nan])
+def test_expectations_of_others_are_probabilities(e):
+    scan = np.ones((1, 2), np.float32), np.array([True]), np.array([e], np.float32)
+    at = np.array([0, 1]), np.eye(3)[None]
+    _core.StaticFractionGrid2D(0.1).add(*scan, *at, np.array([True]))  # held out: not looked at
+    with pytest.raises(ValueError, match="e: "):
+        _core.StaticFractionGrid2D(0.1).add(*scan, *at, np.array([False]))
+
+
+def test_hits_at_the_end_of_the_world():
+    # the walk goes on behind a hit, but not beyond where cells can be counted
+    points = np.array([[2.0**24 - 1, 0.5]], np.float32)
+    args = points, np.array([True]), np.array([0, 1]), np.eye(3)[None], np.array([True])
+    with pytest.raises(ValueError, match="too far"):
+        _core.score_held_out(_core.StaticFractionGrid2D(1.0), *args, **{**MODEL, "range_std": 10.0})

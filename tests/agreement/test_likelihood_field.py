@@ -1,0 +1,142 @@
+"""The registration field of the core against the plain twin."""
+
+import numpy as np
+import pytest
+import reference
+from reference.likelihood_field import moved
+
+from stillmap import _core
+
+FLOOR, UNKNOWN = 0.02, 0.3
+
+
+def scan(beams):
+    """The largest scan."""
+    t = int(np.argmax(np.diff(beams.offset)))
+    a, b = beams.offset[t], beams.offset[t + 1]
+    return np.ascontiguousarray(beams.points[a:b]), beams.e[a:b], beams.T_map_sensor[t]
+
+
+@pytest.fixture
+def grids(beams):
+    return beams.grid(_core), beams.grid(reference)
+
+
+@pytest.mark.parametrize(("sigma", "radius"), [(0.5, 2), (1.0, 3), (0.3, 1), (1.0, 0)])
+def test_cost(beams, grids, sigma, radius):
+    points, weights, T = scan(beams)
+    assert len(points) > 5
+    costs = []
+    for i in range(4):
+        delta = np.random.default_rng(i).normal(scale=0.2, size=3 if beams.dimension == 2 else 6)
+        pose = moved(T, delta)
+        options = sigma * beams.resolution, radius, FLOOR, UNKNOWN
+        core, plain = (
+            k.registration_cost(g, points, weights, pose, *options)
+            for k, g in zip((_core, reference), grids, strict=True)
+        )
+        assert core == pytest.approx(plain, rel=1e-6)
+        costs.append(plain)
+    assert np.ptp(costs) > 1e-2
+
+
+def test_field_is_the_cost_of_one_point(beams, grids):
+    rng = np.random.default_rng(2)
+    values = []
+    for y in rng.normal(size=(20, beams.dimension)).astype(np.float32):
+        cost = _core.registration_cost(
+            grids[0], y[None], np.ones(1, np.float32), np.eye(len(y) + 1), 0.2, 2, FLOOR, 0.0
+        )
+        values.append(reference.field(grids[1], y.astype(float), 0.2, 2))
+        assert np.exp(-cost) - FLOOR == pytest.approx(values[-1], rel=1e-5, abs=1e-6)
+    assert max(values) > 0.05
+
+
+def test_gradient(beams, grids):
+    points, weights, T = scan(beams)
+    for i in range(3):
+        delta = np.random.default_rng(i).normal(scale=0.1, size=3 if beams.dimension == 2 else 6)
+        pose = moved(T, delta)
+        options = 0.6 * beams.resolution, 3, FLOOR, UNKNOWN
+        core, plain = (
+            k.registration_gradient(g, points, weights, pose, *options)
+            for k, g in zip((_core, reference), grids, strict=True)
+        )
+        assert core.shape == delta.shape
+        assert np.abs(plain).max() > 1
+        assert core == pytest.approx(plain, rel=1e-4, abs=1e-3 * np.abs(plain).max())
+
+
+def test_a_line_in_space_is_no_plane_that_goes_on():
+    # beams along x from x = 0: around the line nobody looked, and all sides of it are alike
+    points = np.zeros((12, 3), np.float32)
+    points[:, 0] = np.linspace(0.3, 1.4, 12)
+    T = np.eye(4)[None].copy()
+    T[0, :3, 3] = 0.0, 0.05, 0.05
+    hit, e, offset = np.ones(12, bool), np.ones(12, np.float32), np.array([0, 12])
+    sides = np.array([(1, 0), (0, 1), (-1, 0), (0, -1), (0.7, 0.7), (0.7, -0.7), (-0.7, 0.7)])
+    there = np.column_stack([np.full(len(sides), 0.85), 0.05 + 0.08 * sides]).astype(np.float32)
+    for kernels in (_core, reference):
+        grid = kernels.OccupancyGrid3D(0.1)
+        kernels.add_beams(grid, points, hit, e, offset, T)
+        costs = [
+            kernels.registration_cost(
+                grid, y[None], np.ones(1, np.float32), np.eye(4), 0.05, 2, FLOOR, 0.0
+            )
+            for y in there
+        ]
+        assert np.ptp(costs) < 0.05
+        assert costs[0] < -np.log(FLOOR) - 0.2
+
+
+def curvature_of(grid, points, weights, T, sigma, radius):
+    """The core's, out of the covariance at a pose that no step is made from."""
+    prior = np.eye(3 if len(T) == 3 else 6)
+    _, covariance, *_ = _core.register_scan(
+        grid, points, weights, T, prior, sigma=sigma, radius=radius, floor=FLOOR, unknown=UNKNOWN,
+        information_scale=1.0, max_iterations=0, window_translation=0.0, window_rotation=0.0,
+        search_range=9.0, max_candidates=1, T_start=T,
+    )  # fmt: skip
+    return np.linalg.inv(covariance) - prior
+
+
+@pytest.mark.parametrize(("sigma", "radius"), [(0.5, 2), (1.0, 3), (0.3, 1)])
+def test_curvature(beams, grids, sigma, radius):
+    points, weights, T = scan(beams)
+    options = sigma * beams.resolution, radius
+    core = curvature_of(grids[0], points, weights, T, *options)
+    plain = reference.registration_curvature(grids[1], points, weights, T, *options, FLOOR, UNKNOWN)
+    assert core.shape == plain.shape
+    assert np.linalg.eigvalsh(plain).min() > 1
+    np.testing.assert_allclose(core, plain, rtol=0, atol=1e-6 * np.abs(plain).max())
+
+
+def test_curvature_has_no_negative_part(beams, grids):
+    # beam by beam: where means are spread wider than the Gaussians, F is convex there
+    D, sigma = beams.dimension, 0.5 * beams.resolution
+    rng = np.random.default_rng(3)
+    ends = beams.T_map_sensor[5, :D, D] + rng.normal(scale=0.7, size=(150, D))
+    kept, kinds = np.ones(1, np.float32), set()
+    for y in ends.astype(np.float32):
+        core = curvature_of(grids[0], y[None], kept, np.eye(D + 1), sigma, 2)
+        plain = reference.registration_curvature(
+            grids[1], y[None], kept, np.eye(D + 1), sigma, 2, FLOOR, UNKNOWN
+        )
+        np.testing.assert_allclose(core, plain, rtol=0, atol=1e-5 * sigma**-2)
+        values = np.linalg.eigvalsh(plain[:D, :D])
+        assert values.min() > -1e-6
+        kinds.add(int((values > 1e-3).sum()))
+    assert kinds == set(range(D + 1))  # from nowhere to everywhere
+
+
+def test_far_from_everything(beams, grids):
+    points, weights, T = scan(beams)
+    T = T.copy()
+    T[0, -1] += 1000
+    usable = np.isfinite(points).all(axis=1)
+    for k, g in zip((_core, reference), grids, strict=True):
+        cost = k.registration_cost(g, points, weights, T, 0.2, 2, FLOOR, UNKNOWN)
+        assert cost == pytest.approx(
+            -weights[usable].sum(dtype=float) * np.log(FLOOR + UNKNOWN), rel=1e-6
+        )
+        assert not k.registration_gradient(g, points, weights, T, 0.2, 2, FLOOR, UNKNOWN).any()

@@ -1,0 +1,195 @@
+"""What elements say of those beside them: the core against its plain twin, and by hand."""
+
+import numpy as np
+import pytest
+import reference
+
+from stillmap import _core
+from stillmap.em.options import BesideOptions
+from stillmap.em.spatial_prior import arguments, smooth_mean_field
+
+BESIDE = arguments(BesideOptions())
+
+
+def surfaces(seed):
+    """A wall, the ground and stray points, hit at random looks; the same for both."""
+    rng = np.random.default_rng(seed)
+    wall = np.column_stack([rng.normal(4.0, 0.02, 400), *rng.uniform(-1.5, 1.5, (2, 400))])
+    ground = np.column_stack([*rng.uniform(-1.5, 1.5, (2, 300)), rng.normal(-1.5, 0.02, 300)])
+    ends = np.concatenate([wall, ground, rng.uniform(-2, 4, (60, 3))]).astype(np.float32)
+    look = np.sort(rng.integers(0, 30, len(ends)))
+    T = np.tile(np.eye(4), (len(ends), 1, 1))
+    beams = rng.permutation(ends), np.ones(len(ends), bool), np.arange(len(ends) + 1), T
+    made = []
+    for kernels in (_core, reference):
+        surface = kernels.SurfelMap3D(0.3)
+        surface.add_end_points(*beams, look)
+        surface.fit()
+        made.append(surface)
+    return made
+
+
+def order(surface):
+    return np.lexsort(surface.surfels()[0].T)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("changes", [{}, {"radius": 1.0, "tolerance": 0.0}, {"max_iterations": 1}])
+def test_core_and_twin_agree(seed, changes):
+    core, plain = surfaces(seed)
+    own = np.random.default_rng(seed + 7).normal(1.0, 3.0, plain.size).astype(np.float32)
+    of_core, of_plain = order(core), order(plain)
+    np.testing.assert_array_equal(core.hit_spans[of_core], plain.hit_spans[of_plain])
+    log_odds = np.empty(plain.size, np.float32)
+    log_odds[of_core] = own[of_plain]
+    found = _core.smooth_mean_field(core, log_odds, **{**BESIDE, **changes})
+    expected = reference.smooth_mean_field(plain, own, **{**BESIDE, **changes})
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found[of_core], expected[of_plain], atol=2e-5)
+    assert np.mean((expected > 0.5) != (own > 0.0)) > 0.02  # somebody changed its mind
+
+
+def test_threads_change_nothing():
+    rng = np.random.default_rng(3)
+    ends = rng.uniform(-9, 9, (60000, 3)).astype(np.float32)
+    T = np.tile(np.eye(4), (100, 1, 1))
+    offset, look = np.arange(0, 60001, 600), np.arange(100)
+    surface = _core.SurfelMap3D(0.4)
+    surface.add_end_points(ends, np.ones(60000, bool), offset, T, look)
+    surface.fit()
+    assert surface.size > 20000  # enough for threads to be used
+    own = rng.normal(1.0, 2.0, surface.size).astype(np.float32)
+    once = _core.smooth_mean_field(surface, own, **BESIDE)
+    for threads in (2, 3):
+        assert (
+            _core.smooth_mean_field(surface, own, **BESIDE, threads=threads).tobytes()
+            == once.tobytes()
+        )
+
+
+def car_beside_wall(at_car, at_wall):
+    """The side of a car of 3 m before a wall; each hit in the given looks, in every cell.
+
+    Returns the surface and which elements are of the car; element i is in column x.
+    """
+    surface = _core.SurfelMap3D(0.2)
+    x, z = (a.ravel() for a in np.meshgrid(np.arange(15) * 0.2 + 0.1, np.arange(8) * 0.2 + 0.1))
+    for y, looks in ((2.1, at_car), (4.1, at_wall)):
+        ends = np.column_stack([x, np.full_like(x, y), z]).astype(np.float32)
+        for look in looks:
+            one = np.array([look])
+            surface.add_end_points(
+                ends, np.ones(len(ends), bool), np.array([0, len(ends)]), np.eye(4)[None], one
+            )
+    surface.fit()
+    cells = surface.surfels()[0]
+    return surface, cells[:, 1] == 10, cells[:, 0]
+
+
+def test_what_has_no_evidence_follows_its_neighbours():
+    # both ends of a side were seen to come, of the middle nobody knows
+    surface, car, x = car_beside_wall([5, 6, 7], [0, 9])
+    own = np.where(car, np.where(abs(x - 7) > 2, -4.0, 1.5), 4.0).astype(np.float32)
+    p = _core.smooth_mean_field(surface, own, **BESIDE)
+    assert (p[car] < 0.5).all()
+    assert (p[~car] > 0.9).all()
+
+
+def test_those_hit_at_other_times_are_not_asked():
+    # the same, but the rest of the side was hit before what moves came
+    surface, car, x = car_beside_wall([5, 6, 7], [0, 9])
+    other = _core.SurfelMap3D(0.2)
+    cells = surface.surfels()[0]
+    for early in (False, True):
+        of = (car & (x >= 4)) if early else (car & (x < 4))
+        ends = ((cells[of] + 0.5) * 0.2).astype(np.float32)
+        for look in [0, 4] if early else [5, 6, 7]:
+            other.add_end_points(
+                ends,
+                np.ones(len(ends), bool),
+                np.array([0, len(ends)]),
+                np.eye(4)[None],
+                np.array([look]),
+            )
+    other.fit()
+    x = other.surfels()[0][:, 0]
+    own = np.where(x < 4, -4.0, 1.5).astype(np.float32)
+    p = _core.smooth_mean_field(other, own, **BESIDE)
+    np.testing.assert_array_equal(p > 0.5, x >= 4)
+
+
+def test_one_that_lies_off_the_surface_does_not_speak_for_it():
+    # a wheel that rolled by stands on the ground: 0.2 m above it, in the next cell
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(0, 3, (2000, 2)), np.full(2000, 0.1)])
+    wheel = np.column_stack([np.full(40, 1.5), np.full(40, 1.5), np.full(40, 0.33)])
+    ends = np.concatenate([ground, wheel]).astype(np.float32)
+    surface = _core.SurfelMap3D(0.2)
+    surface.add_end_points(
+        ends, np.ones(2040, bool), np.array([0, 2040]), np.eye(4)[None], np.array([3])
+    )
+    surface.fit()
+    off = surface.surfels()[0][:, 2] > 0
+    assert off.sum() == 1
+    p = _core.smooth_mean_field(surface, np.where(off, -4.0, 0.5).astype(np.float32), **BESIDE)
+    np.testing.assert_array_equal(p < 0.5, off)
+
+
+def test_refusals():
+    core, _ = surfaces(0)
+    own = np.zeros(core.size, np.float32)
+    with pytest.raises(ValueError, match="log_odds: expected one per element"):
+        _core.smooth_mean_field(core, own[1:], **BESIDE)
+    with pytest.raises(ValueError, match="log_odds: not a number"):
+        _core.smooth_mean_field(core, own + np.float32(np.nan), **BESIDE)
+    with pytest.raises(TypeError):
+        _core.smooth_mean_field(core, own.astype(float), **BESIDE)
+    for name, value in (
+        ("radius", 0.5), ("radius", 9.0), ("coplanar_std", 0.0), ("tolerance", 2.0),
+        ("max_iterations", -1), ("min_log_odds", 4.0), ("static_coupling", -1.0),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=name):
+            _core.smooth_mean_field(core, own, **{**BESIDE, name: value})
+    unfit, dateless = _core.SurfelMap3D(0.3), _core.SurfelMap3D(0.3)
+    with pytest.raises(ValueError, match="fit it first"):
+        _core.smooth_mean_field(unfit, own, **BESIDE)
+    one = np.ones((1, 3), np.float32), np.ones(1, bool), np.array([0, 1]), np.eye(4)[None]
+    dateless.add_end_points(*one)
+    with pytest.raises(ValueError, match="time_bin: expected in all calls, or in none"):
+        dateless.add_end_points(*one, np.array([1]))
+    dateless.fit()
+    with pytest.raises(ValueError, match="surfel_map: expected"):
+        _core.smooth_mean_field(dateless, own[:1], **BESIDE)
+    for look in ([1, 2], [-1], [2**31]):
+        with pytest.raises(ValueError, match="time_bin"):
+            _core.SurfelMap3D(0.3).add_end_points(*one, np.array(look))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("radius", 0.5),
+        ("radius", 9.0),
+        ("coplanar", 0.0),
+        ("for_static", -1.0),
+        ("for_dynamic", 101.0),
+        ("least", 4.0),
+        ("most", 101.0),
+        ("moved", 1.5),
+        ("rounds", -1),
+    ],
+)
+def test_options_that_make_no_sense(name, value):
+    with pytest.raises(ValueError, match=rf"em\.beside\.{name}"):
+        BesideOptions(**{name: value})
+
+
+def test_those_beside_need_not_be_asked():
+    core, _ = surfaces(0)
+    p = np.linspace(0.0, 1.0, core.size).astype(np.float32)
+    assert smooth_mean_field(p, core, BesideOptions(enabled=False)) is p
+    asked = smooth_mean_field(p, core, BesideOptions())
+    assert asked.dtype == np.float32
+    assert np.isfinite(asked).all()
+    with pytest.raises(TypeError, match="in space"):
+        smooth_mean_field(p, _core.SurfelMap2D(0.3), BesideOptions())

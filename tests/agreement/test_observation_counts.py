@@ -1,0 +1,260 @@
+"""In how many looks cells were looked at: the core against its twin, by hand, and refusals."""
+
+import numpy as np
+import pytest
+import reference
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stillmap import _core
+
+KERNELS = (_core, reference)
+
+
+def empty(kernels, dimension, resolution, **options):
+    kind = kernels.ObservationCounts2D if dimension == 2 else kernels.ObservationCounts3D
+    return kind(resolution, **{"radius": 2.3 * resolution, **options})
+
+
+def counted(kernels, beams, look, dynamic, threads=1, **options):
+    counts = empty(kernels, beams.dimension, beams.resolution, **options)
+    points, hit, offset, T = beams.arguments
+    counts.add(points, hit, dynamic, offset, T, look, threads)
+    return counts
+
+
+def box_of(beams):
+    """A box around all beams, with some room."""
+    first, shape = beams.grid(_core).bounding_box()
+    return (first - 3).tolist(), tuple(n + 6 for n in shape)
+
+
+def looks_of(beams, seed):
+    """Looks of one scan to five, with gaps, and who moves."""
+    rng = np.random.default_rng(seed)
+    look = np.cumsum(rng.choice([0, 0, 1, 7], len(beams.T_map_sensor))).astype(np.int64)
+    return look, rng.random(len(beams.points)) < 0.1
+
+
+BELIEF = [
+    {},
+    {"end_margin": 0.2},
+    {"stop_cells": 5, "end_margin": 0.2},
+    {"stop_cells": 0, "end_margin": np.inf},
+]
+
+
+@pytest.mark.parametrize("belief", BELIEF, ids=str)
+def test_the_core_counts_as_its_twin(beams, belief):
+    look, dynamic = looks_of(beams, 1)
+    options = dict(belief)
+    if "stop_cells" in options:
+        cells = np.array(list(beams.grid(reference).alpha), np.int64)
+        some = cells[:: 1 + len(cells) // 5][: belief["stop_cells"]]
+        options["stop_cells"] = np.ascontiguousarray(some)
+    for a, b in zip(
+        *(counted(k, beams, look, dynamic, **options).dense(*box_of(beams)) for k in KERNELS),
+        strict=True,
+    ):
+        assert a.dtype == np.uint16
+        assert a.max() > 2
+        # chords of length zero, and cells that are left just where belief ends
+        assert (a != b).mean() < 1e-3
+        assert np.abs(a.astype(int) - b).max() <= 1
+
+
+def test_clear_looks_are_some_of_the_looks(beams):
+    look, dynamic = looks_of(beams, 2)
+    box = box_of(beams)
+    looks, clear = counted(_core, beams, look, dynamic).dense(*box)
+    assert (clear <= looks).all()
+    assert 0.05 < (clear < looks)[looks > 0].mean() < 0.9
+    for a, b in zip(
+        counted(_core, beams, look, 0 * dynamic == 1).dense(*box), (looks, looks), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+    wider = counted(_core, beams, look, dynamic, radius=4 * beams.resolution).dense(*box)[1]
+    assert (wider <= clear).all()
+    assert wider.sum() < clear.sum()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]), st.integers(2, 9))
+def test_threads_and_calls_do_not_matter(some_beams, seed, dimension, threads):
+    beams = some_beams(seed, dimension)
+    look, dynamic = looks_of(beams, seed)
+    box = box_of(beams)
+    options = {"stop_cells": np.zeros((1, dimension), np.int64), "end_margin": 0.1}
+    whole = counted(_core, beams, look, dynamic, **options)
+    others = [counted(_core, beams, look, dynamic, threads, **options)]
+    others.append(empty(_core, dimension, beams.resolution, **options))
+    starts = np.flatnonzero(np.diff(look, prepend=look[0] - 1))
+    for first, last in zip(starts, [*starts[1:], len(look)], strict=True):
+        part = slice(beams.offset[first], beams.offset[last])
+        offset = beams.offset[first : last + 1] - beams.offset[first]
+        T = beams.T_map_sensor[first:last]
+        points, hit, moves = beams.points[part], beams.hit[part], dynamic[part]
+        others[-1].add(points, hit, moves, offset, T, look[first:last], threads)
+    for other in others:
+        for a, b in zip(whole.dense(*box), other.dense(*box), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("believed", [False, True])
+def test_looked_at_is_where_something_is_added_to_the_sums(beams, believed):
+    grid, rest = beams.empty_grid(_core), beams.empty_grid(_core)
+    look, dynamic = looks_of(beams, 3)
+    options = {}
+    if believed:
+        stops = np.ones((1, beams.dimension), np.int64)
+        options = {"stop_cells": stops, "end_margin": 0.15}
+        _core.add_no_return_beams(grid, rest, *beams.arguments, stops, 0.15)
+        hits = np.where(beams.hit[:, None], beams.points, np.float32(np.nan)).astype(np.float32)
+        grid.merge(beams.with_(points=hits).grid(_core))
+    else:
+        grid = beams.grid(_core)
+    looks, _ = counted(_core, beams, look, dynamic, **options).dense(*box_of(beams))
+    _, alpha, beta = grid.dense(*box_of(beams))
+    np.testing.assert_array_equal(looks > 0, alpha + beta > 0)
+
+
+ROW = np.array([[x, 0] for x in range(8)])
+
+
+def row_of(kernels, scans, **options):
+    """Looks and clear ones of eight cells of 1 m along x, (range, hit, dynamic, look) by scan."""
+    counts = kernels.ObservationCounts2D(1.0, **{"radius": 1.0, **options})
+    reach, hit, dynamic, look = (np.array(column) for column in zip(*scans, strict=True))
+    points = np.stack([reach, np.zeros(len(reach))], axis=1).astype(np.float32)
+    T = np.tile(np.eye(3), (len(scans), 1, 1))
+    T[:, :2, 2] = 0.5
+    counts.add(points, hit, dynamic, np.arange(len(scans) + 1), T, look)
+    return [rows.ravel().tolist() for rows in counts.dense([0, 0], (1, 8))]
+
+
+@pytest.mark.parametrize("kernels", KERNELS, ids=["core", "reference"])
+def test_by_hand(kernels):
+    wall, walker = (6.0, True, False), (4.0, True, True)
+    # scans of one look count once
+    scans = [(*wall, 3), (*wall, 3), (*wall, 5)]
+    assert row_of(kernels, scans) == [[2] * 7 + [0]] * 2
+    # somebody in cell 4: nobody knows what is there or beside it, the place before it is clear
+    assert row_of(kernels, [(*walker, 0)]) == [[1] * 5 + [0] * 3, [1, 1, 1, 0, 0, 0, 0, 0]]
+    assert row_of(kernels, [(*walker, 0)], radius=2.5)[1] == [1, 1, 0, 0, 0, 0, 0, 0]
+    assert row_of(kernels, [(*walker, 0)], radius=0.0)[1] == [1, 1, 1, 1, 0, 0, 0, 0]
+    # whoever leaves within a look has been there
+    both = [(*walker, 0), (*wall, 0), (*wall, 1)]
+    assert row_of(kernels, both) == [[2] * 7 + [0], [2, 2, 2, 1, 1, 1, 2, 0]]
+    # what did not come back says nothing of its end, and moves never
+    assert row_of(kernels, [(4.0, False, True, 0)]) == [[1] * 4 + [0] * 4] * 2
+    # alone it is not believed where beams without a return have to be
+    stops = np.zeros((0, 2), np.int64)
+    assert row_of(kernels, [(4.0, False, False, 0)], stop_cells=stops) == [[0] * 8] * 2
+
+
+@pytest.mark.parametrize("kernels", KERNELS, ids=["core", "reference"])
+def test_a_radius_of_whole_cells_reaches_so_many(kernels):
+    assert 0.3 / 0.1 < 3.0  # as doubles have it
+    counts = kernels.ObservationCounts2D(0.1, radius=0.3)
+    points, T = np.array([[0.75, 0.0]], np.float32), np.eye(3)[None].copy()
+    T[0, :2, 2] = 0.05
+    one = np.ones(1, bool)
+    counts.add(points, one, one, np.array([0, 1]), T, np.zeros(1, np.int64))
+    assert counts.dense([0, 0], (1, 9))[1].ravel().tolist() == [1] * 5 + [0] * 4
+
+
+def test_counts_stop_where_they_are_full():
+    counts = _core.ObservationCounts2D(1.0, radius=0.4)
+    n = 70_000
+    points, T = np.tile(np.float32([[1.0, 0.0]]), (n, 1)), np.tile(np.eye(3), (n, 1, 1))
+    T[:, :2, 2] = 0.5
+    hit, none = np.ones(n, bool), np.zeros(n, bool)
+    counts.add(points, hit, none, np.arange(n + 1), T, np.arange(n), 3)
+    assert [rows.tolist() for rows in counts.dense([0, 0], [1, 2])] == [[[65535] * 2]] * 2
+
+
+def arguments():
+    return {
+        "points": np.ones((5, 2), np.float32),
+        "hit": np.ones(5, bool),
+        "is_dynamic": np.zeros(5, bool),
+        "offset": np.array([0, 2, 5]),
+        "T_map_sensor": np.tile(np.eye(3), (2, 1, 1)),
+        "time_bin": np.array([3, 4]),
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("points", np.ones((5, 2)), TypeError),
+        ("points", np.ones((5, 3), np.float32), TypeError),
+        ("points", np.full((5, 2), 1e30, np.float32), ValueError),
+        ("hit", np.ones(4, bool), ValueError),
+        ("hit", np.ones(5, np.uint8), TypeError),
+        ("is_dynamic", np.ones(4, bool), ValueError),
+        ("is_dynamic", np.ones(6, bool), ValueError),
+        ("is_dynamic", np.ones(5, np.float32), TypeError),
+        ("is_dynamic", np.ones((5, 1), bool), TypeError),
+        ("offset", np.array([0, 2, 4]), ValueError),
+        ("offset", np.array([0, 5]), ValueError),
+        ("T_map_sensor", np.tile(np.eye(3), (3, 1, 1)), ValueError),
+        ("T_map_sensor", np.tile(np.eye(4), (2, 1, 1)), TypeError),
+        ("T_map_sensor", np.full((2, 3, 3), np.nan), ValueError),
+        ("time_bin", np.array([3]), ValueError),
+        ("time_bin", np.array([3, 2]), ValueError),
+        ("time_bin", np.array([3, 4], np.int32), TypeError),
+    ],
+)
+@pytest.mark.usefixtures("bounded_memory")
+def test_refusals(name, value, error):
+    what = {"points": "end point|points", "T_map_sensor": "pose|T_map_sensor"}.get(name, name)
+    for threads in (1, 2):
+        counts = _core.ObservationCounts2D(0.5, radius=0.3)
+        with pytest.raises(error, match=what):
+            counts.add(**{**arguments(), name: value}, threads=threads)
+
+
+def test_looks_that_were_added_to_before():
+    counts = _core.ObservationCounts2D(0.5, radius=0.3)
+    counts.add(**arguments())
+    for look in ([4, 5], [3, 5], [-1, 9]):
+        with pytest.raises(ValueError, match="time_bin"):
+            counts.add(**{**arguments(), "time_bin": np.array(look)})
+    counts.add(**{**arguments(), "time_bin": np.array([5, 5])})
+    assert counts.dense([2, 2], [1, 1])[0].item() == 3
+    nothing = {"points": np.zeros((0, 2), np.float32), "hit": np.zeros(0, bool)}
+    nothing |= {"is_dynamic": nothing["hit"], "offset": np.zeros(1, np.int64)}
+    counts.add(**nothing, T_map_sensor=np.zeros((0, 3, 3)), time_bin=np.zeros(0, np.int64))
+
+
+@pytest.mark.parametrize("make", [_core.ObservationCounts2D, _core.ObservationCounts3D])
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"resolution": 0.0}, "resolution"),
+        ({"resolution": -1.0}, "resolution"),
+        ({"resolution": np.nan}, "resolution"),
+        ({"radius": -0.1}, "radius"),
+        ({"radius": np.nan}, "radius"),
+        ({"radius": 1e9}, "radius"),
+        ({"end_margin": -0.1}, "end_margin"),
+        ({"end_margin": np.nan}, "end_margin"),
+    ],
+)
+def test_counts_that_cannot_be(make, options, what):
+    with pytest.raises(ValueError, match=what):
+        make(**{"resolution": 0.1, "radius": 0.3, **options})
+
+
+def test_stops_and_boxes_that_cannot_be():
+    with pytest.raises(TypeError):
+        _core.ObservationCounts2D(0.1, radius=0.3, stop_cells=np.zeros((1, 3), np.int64))
+    with pytest.raises(ValueError, match="cells"):
+        _core.ObservationCounts2D(0.1, radius=0.3, stop_cells=np.array([[2**40, 0]]))
+    counts = _core.ObservationCounts2D(0.1, radius=0.3)
+    assert (counts.resolution, counts.radius, counts.dimension) == (0.1, 0.3, 2)
+    for box in (([2**40, 0], [1, 1]), ([0, 0], [-1, 1])):
+        with pytest.raises(ValueError, match="first_cell"):
+            counts.dense(*box)
+    assert counts.dense([0, 0], [0, 4])[0].shape == (0, 4)

@@ -1,0 +1,297 @@
+"""Elements and looks of the core against the plain twin on small rooms."""
+
+from dataclasses import replace
+from itertools import pairwise
+from math import inf
+
+import numpy as np
+import pytest
+import reference
+from reference.occupancy_hmm import HIT, SURE
+
+from stillmap import _core
+from stillmap.em.observations import HmmClasses
+
+CLASSES = HmmClasses(views_occupied=(0.65,)).grid()
+
+
+@pytest.fixture(
+    scope="module",
+    params=[(2, 0, 0.1, 24, 70), (2, 1, 0.07, 24, 70), (3, 2, 0.4, 16, 150)],
+    ids=["2D-0", "2D-1", "3D"],
+)
+def room(request, a_room):
+    dimension, seed, resolution, scans, beams = request.param
+    return a_room(seed, dimension, resolution, scans, beams)
+
+
+def order(surface):
+    """The elements by cell, whatever order they are numbered in."""
+    return np.lexsort(surface.surfels()[0].T)
+
+
+def assert_same_surface(core, plain):
+    of_core, of_plain = order(core), order(plain)
+    assert core.size == plain.size == len(of_core) > 50
+    cells, means, normals, off_plane, prominence, beams = (a[of_core] for a in core.surfels())
+    expected = tuple(a[of_plain] for a in plain.surfels())
+    np.testing.assert_array_equal(cells, expected[0])
+    np.testing.assert_array_equal(beams, expected[5])
+    np.testing.assert_allclose(prominence, expected[4], rtol=1e-12)
+    assert prominence.max() == 1  # the richest cell of its own window
+    assert prominence.min() < 0.5
+    np.testing.assert_allclose(means, expected[1], atol=1e-6)
+    flat = expected[2].any(axis=1)
+    assert 0.4 < flat.mean() < 1
+    np.testing.assert_array_equal(normals.any(axis=1), flat)
+    side = np.where(np.einsum("kd,kd->k", normals, expected[2]) < 0, -1.0, 1.0)
+    np.testing.assert_allclose(normals * side[:, None], expected[2], atol=1e-4)
+    np.testing.assert_allclose(off_plane * side, expected[3], atol=1e-4)
+    assert np.abs(expected[3]).max() > 0.2 * core.resolution
+    assert core.noise_std == pytest.approx(plain.noise_std, rel=1e-3)
+
+
+def test_elements(room):
+    core, plain = room.surface(_core), room.surface(reference)
+    assert_same_surface(core, plain)
+    assert 0.005 < plain.noise_std < 0.6 * room.beams.resolution
+
+
+@pytest.mark.parametrize(("noise", "least"), [(0.07, 0.04), (0.1, 0.06)])
+def test_noise_widens_the_window(a_room, noise, least):
+    loud = a_room(5, 2, 0.05, 24, 120, noise=noise)
+    core, plain = loud.surface(_core), loud.surface(reference)
+    assert_same_surface(core, plain)
+    assert plain.noise_std > least  # a window of two cells to each side would see less
+
+
+def test_elements_of(room, a_room):
+    core, plain = room.surface(_core), room.surface(reference)
+    other = a_room(9, room.beams.dimension, room.beams.resolution, 8, 60).beams
+    for beams in (room.beams, other):
+        found = core.associate_beams(*beams.arguments)
+        expected = plain.associate_beams(*beams.arguments)
+        cells = [s.surfels()[0] for s in (core, plain)]
+        assert found.dtype == expected.dtype == np.int32
+        np.testing.assert_array_equal(found < 0, expected < 0)
+        some = found >= 0
+        np.testing.assert_array_equal(cells[0][found[some]], cells[1][expected[some]])
+        assert found.tobytes() == core.associate_beams(*beams.arguments, 3).tobytes()
+    assert (expected >= 0).any()
+    assert (expected[other.hit] < 0).any()
+    np.testing.assert_array_equal(core.associate_beams(*room.beams.arguments) >= 0, room.beams.hit)
+
+
+def reliability(dwell):
+    """What one look said of each element: HIT, 0 for nothing, else how surely it saw through.
+
+    One class with rho = a = 1/2: a hit has probability 1/4, seeing through 1 - R / 4.
+    """
+    _, log_best = dwell.likelihood()
+    p = np.exp(log_best) / 4
+    return np.where(p < 0.5, HIT, np.round(4 * (1 - p), 6))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"use_normals": False}, {"margin": 0.25}, {"use_normals": False, "lateral_std": 0.01}],
+)
+def test_what_a_look_says(room, changes):
+    surfaces = room.surface(_core), room.surface(reference)
+    seen = hits = partly = silent = 0
+    for t in range(0, len(room.look), 2):
+        found = []
+        for kernels, surface in zip((_core, reference), surfaces, strict=True):
+            dwell = room.dwell(kernels, surface, [0.5], [1.0], p_detection=0.5, **changes)
+            dwell.add(*room.scans(t, t + 2), np.array([7, 7]))
+            found.append(reliability(dwell)[order(surface)])
+        core, plain = found
+        np.testing.assert_array_equal(core == HIT, plain == HIT)
+        # what nearly is sure or nearly nothing may be rounded to it or not
+        edge = (np.abs(plain - SURE) < 0.012) | (plain < 0.03) & (core < 0.03)
+        sure = (plain == 1.0) & (core > SURE - 0.012)
+        np.testing.assert_allclose(core[~(edge | sure)], plain[~(edge | sure)], atol=0.012)
+        hits += (plain == HIT).sum()
+        seen += (plain == 1.0).sum()
+        partly += ((plain > 0.05) & (plain < 0.9)).sum()
+        silent += (plain == 0.0).sum()
+    assert min(hits, silent) > 20
+    assert partly + seen > 10
+    assert seen > 5 or "lateral_std" not in changes
+
+
+@pytest.fixture(scope="module")
+def swallowed(room):
+    """The room with some beams in a row without a return, through walls and past them."""
+    beams = room.beams
+    hit, points = beams.hit.copy(), beams.points.copy()
+    for start in beams.offset[:-1]:
+        row = slice(start + 20, start + 26)
+        hit[row] = False
+        points[row] *= 1.8
+    return replace(room, beams=beams.with_(hit=hit, points=points))
+
+
+def test_lost_beams_through_what_is_solid(room, swallowed):
+    counts = []
+    for kernels in (_core, reference):
+        dwell = room.dwell(kernels, room.surface(kernels), *CLASSES)
+        counts.append(
+            [dwell.count_no_return_beams(*some.beams.arguments) for some in (room, swallowed)]
+        )
+    assert counts[0] == counts[1]
+    (few, few_through), (more, through) = counts[0]
+    assert more >= few + 3 * len(room.look)
+    assert 20 < through - few_through < more
+
+
+@pytest.mark.parametrize("trusted", [0.0, 0.4, 1.0])
+def test_lost_beams_are_trusted_so_far(room, swallowed, trusted):
+    points, hit, offset, T = swallowed.scans(4, 14)
+    points = np.where(hit[:, None], np.float32(np.nan), points)  # no hit wins over them
+    found = {}
+    for kernels in (_core, reference):
+        surface = room.surface(kernels)
+        for how in (trusted, 1.0):
+            dwell = room.dwell(kernels, surface, [0.5], [1.0], p_detection=0.5)
+            dwell.set_trust_beyond_solid(how)
+            dwell.add(points, hit, offset, T, np.full(10, 7))
+            found[kernels, how] = reliability(dwell)[order(surface)]
+    core, plain, all_the_way = found[_core, trusted], found[reference, trusted], found[_core, 1.0]
+    edge = (np.abs(plain - SURE) < 0.012) | (np.abs(plain) < 0.03) & (np.abs(core) < 0.03)
+    sure = (plain == 1.0) & (core > SURE - 0.012)
+    np.testing.assert_allclose(core[~(edge | sure)], plain[~(edge | sure)], atol=0.012)
+    assert (all_the_way - core >= -1e-9).all()
+    assert ((all_the_way - core).max() > 0.05) == (trusted < 1.0)
+
+
+@pytest.mark.parametrize("moves", [None, 0.2, 0.7])
+def test_likelihood(room, moves):
+    rho, tau = [0.998, 0.6, 0.05, 0.15, 0.5, 0.8], [25.0, 5.0, 0.5, 45.0, inf, 9.0]
+    turn = [inf] * 4 + [0.1, 0.7]
+    found = []
+    for kernels in (_core, reference):
+        surface = room.surface(kernels)
+        dwell = room.dwell(kernels, surface, rho, tau, turn)
+        place = None
+        if moves is not None:  # the robot, of which the sensors sit anywhere
+            steps = np.random.default_rng(1).normal(size=(len(room.look), surface.dimension))
+            place = moves * surface.resolution * steps.cumsum(axis=0)
+        dwell.add(*room.beams.arguments, room.look, positions=place)
+        relative, log_best = dwell.likelihood()
+        assert relative.dtype == np.float32
+        assert relative.max(axis=1) == pytest.approx(1.0)
+        values = np.log(np.maximum(relative, 1e-30)) + log_best[:, None]
+        found.append(values[order(surface)])
+    core, plain = found
+    error = np.abs(core - plain)
+    assert np.quantile(error, 0.9) < 0.03
+    assert error.max() < 0.3  # a few looks at the edge of being sure
+    assert np.abs(np.diff(plain, axis=1)).max() > 5
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5, 100])
+@pytest.mark.parametrize("cuts", [[], [3], [1, 2, 7, 8, 15]])
+@pytest.mark.parametrize("dated", [False, True])
+def test_elements_are_the_same_and_in_order_with_any_threads(room, threads, cuts, dated):
+    surfaces = [type(room.surface(_core))(room.beams.resolution) for _ in range(2)]
+    for surface, pieces, many in zip(surfaces, ([], cuts), (1, threads), strict=True):
+        for first, last in pairwise([0, *pieces, len(room.look)]):
+            look = room.look[first:last] if dated else None
+            surface.add_end_points(*room.scans(first, last), look, many)
+        surface.fit()
+    whole, shared = surfaces
+    assert whole.noise_std == shared.noise_std
+    for a, b in zip(whole.surfels(), shared.surfels(), strict=True):
+        assert a.tobytes() == b.tobytes()
+    assert len(whole.hit_spans) == (whole.size if dated else 0)
+    assert whole.hit_spans.tobytes() == shared.hit_spans.tobytes()
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("cuts", [[], [3], [1, 2, 7, 8, 15]])
+def test_threads_and_pieces_change_no_bit(room, threads, cuts):
+    surface = room.surface(_core)
+    whole = room.dwell(_core, surface, *CLASSES, 0.97)
+    whole.add(*room.beams.arguments, room.look)
+    pieces = room.dwell(_core, surface, *CLASSES, 0.97)
+    bounds = [0, *(int(np.searchsorted(room.look, room.look[c])) for c in cuts), len(room.look)]
+    for first, last in pairwise(bounds):  # looks stay whole
+        pieces.add(*room.scans(first, last), room.look[first:last], threads)
+    for a, b in zip(whole.likelihood(), pieces.likelihood(), strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_asking_on_the_way_changes_nothing(room):
+    surface = room.surface(_core)
+    whole, asked = (room.dwell(_core, surface, *CLASSES, 0.97) for _ in range(2))
+    whole.add(*room.beams.arguments, np.arange(len(room.look)))
+    for t in range(len(room.look)):
+        asked.add(*room.scans(t, t + 1), np.array([t]))
+        asked.likelihood()
+    for a, b in zip(whole.likelihood(), asked.likelihood(), strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_the_order_of_the_beams_of_a_look_does_not_matter(room):
+    surface = room.surface(_core)
+    values = []
+    for flip in (False, True):
+        dwell = room.dwell(_core, surface, *CLASSES, 0.97)
+        points, hit, offset, T = room.beams.arguments
+        if flip:
+            points, hit = points.copy(), hit.copy()
+            for a, b in pairwise(offset):
+                points[a:b], hit[a:b] = points[a:b][::-1].copy(), hit[a:b][::-1].copy()
+        dwell.add(points, hit, offset, T, room.look)
+        values.append(dwell.likelihood())
+    for a, b in zip(*values, strict=True):
+        np.testing.assert_allclose(a, b, rtol=2e-2, atol=2e-2)
+        assert (a == b).mean() > 0.9  # the first to be nearly sure stops the search
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_nothing_was_ever_hit(a_room, dimension):
+    far = a_room(1, dimension, 0.2, 4, 20)
+    beams = far.beams.with_(hit=np.zeros(len(far.beams.hit), bool))
+    nothing = replace(far, beams=beams)
+    for kernels in (_core, reference):
+        surface = nothing.surface(kernels)
+        assert (surface.size, surface.noise_std) == (0, 0.0)
+        dwell = nothing.dwell(kernels, surface, *CLASSES)
+        dwell.add(*beams.arguments, nothing.look)
+        relative, log_best = dwell.likelihood()
+        assert (relative.shape, log_best.shape) == ((0, len(CLASSES[0])), (0,))
+        assert (surface.associate_beams(*beams.arguments) == -1).all()
+
+
+def test_lost_beams_say_nothing():
+    # two without a return side by side are lost; three are not, unless a scan ends between them
+    surface = _core.SurfelMap2D(0.1), reference.SurfelMap2D(0.1)
+    T = np.tile(np.eye(3), (2, 1, 1))
+    end, none = np.array([[1.05, 0.05]], np.float32), np.array([[4, 0.2]], np.float32)
+    for s in surface:
+        s.add_end_points(end, np.ones(1, bool), np.array([0, 1]), T[:1])
+        s.fit()
+    seen = {}
+    for name, hits, offset in (
+        ("two", [1, 0, 0, 1], [0, 4, 4]),
+        ("three", [1, 0, 0, 0, 1], [0, 5, 5]),
+        ("three at the end", [1, 1, 0, 0, 0], [0, 5, 5]),
+        ("cut", [0, 0, 0], [0, 2, 3]),
+        ("next to what is not usable", [0, 0, 0, 0], [0, 4, 4]),
+    ):
+        hit = np.array(hits, bool)
+        points = np.where(hit[:, None], np.float32([-1, 0]), none).astype(np.float32)
+        if "usable" in name:
+            points[2] = np.nan
+        for kernels, s in zip((_core, reference), surface, strict=True):
+            dwell = kernels.OccupancyHmm2D(
+                s, rho=[0.5], tau=[1.0], p_detection=0.5, bin_seconds=1.0,
+                lateral_std=0.01, margin=0.1, hit_radius=0.05, end_margin=0.3,
+            )  # fmt: skip
+            dwell.add(points, hit, np.array(offset), T, np.array([3, 3]))
+            seen.setdefault(name, []).append(bool(reliability(dwell)[0]))
+    expected = {"two": False, "three": True, "three at the end": True, "cut": False}
+    expected["next to what is not usable"] = False
+    assert seen == {name: [says, says] for name, says in expected.items()}

@@ -1,0 +1,178 @@
+"""Sweeps on maps of moments: the core against the plain twin."""
+
+import numpy as np
+import pytest
+import reference
+
+from stillmap import _core
+from stillmap.core import se3
+
+PLANE = {"min_weight": 4.0, "max_flatness": 0.2, "min_extent": 0.02}
+FIT = {**PLANE, "range_std": 0.03, "kernel_width": 3.0}
+
+
+def cloud(seed, n=1500):
+    """Points on three walls of a corner, a few of them not finite; their weights; their times."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-2.0, 3.0, (n, 3))
+    wall = rng.integers(0, 3, n)
+    points[np.arange(n), wall] = -2.0 + rng.normal(0.0, 0.02, n)
+    points[::97] = np.nan
+    weights = rng.choice([0.0, 0.3, 1.0], n, p=[0.1, 0.2, 0.7])
+    times = rng.uniform(-0.05, 0.05, n)
+    return points.astype(np.float32), weights.astype(np.float32), times.astype(np.float32)
+
+
+def pose(seed, size):
+    return se3.exp(np.random.default_rng(seed).normal(0.0, size, 6))
+
+
+@pytest.fixture
+def maps():
+    both = _core.NdtMap3D(0.5, 3, 40.0), reference.NdtMap3D(0.5, 3, 40.0)
+    for seed in range(3):
+        points, weights, _ = cloud(seed)
+        for one in both:
+            one.add(points, weights, pose(seed, 0.05))
+    return both
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_planes(maps, level):
+    core, plain = maps
+    places = np.random.default_rng(7).uniform(-2.5, 3.0, (300, 3))
+    normals, offsets, variances, known = core.fit_planes(places, level, **PLANE)
+    assert 30 < known.sum() < 300
+    for k, place in enumerate(places):
+        expected = plain.plane(place, level, **PLANE)
+        assert bool(known[k]) == (expected is not None)
+        if expected is not None:
+            normal, offset, variance = expected
+            flip = np.sign(normals[k] @ normal)
+            assert normals[k] == pytest.approx(flip * normal, abs=1e-6)
+            assert offsets[k] == pytest.approx(flip * offset, abs=1e-8)
+            assert variances[k] == pytest.approx(variance, abs=1e-9)
+
+
+def test_what_is_far_is_forgotten(maps):
+    core, plain = maps
+    before = len(core)
+    for one in maps:
+        one.crop(pose(3, 0.1), 2.5)
+    assert 0 < len(core) == len(plain.cells[0]) < before
+    places = np.random.default_rng(8).uniform(-2.5, 3.0, (200, 3))
+    known = core.fit_planes(places, 0, **PLANE)[3]
+    assert known.tolist() == [plain.plane(place, 0, **PLANE) is not None for place in places]
+
+
+@pytest.mark.parametrize(("level", "slack"), [(0, 0.0), (1, 0.2)])
+def test_linearised(maps, level, slack):
+    points, weights, times = cloud(5, 400)
+    T, twist = pose(6, 0.03), np.array([1.0, -0.5, 0.2, 0.3, -0.2, 1.5])
+    core, plain = (
+        k.linearise_sweep(m, points, weights, times, T, twist, **FIT, level=level, slack=slack)
+        for k, m in zip((_core, reference), maps, strict=True)
+    )
+    hessian, gradient, *sums = core
+    assert hessian == pytest.approx(plain.hessian, rel=1e-6, abs=1e-6 * plain.hessian.max())
+    assert gradient == pytest.approx(plain.gradient, rel=1e-6, abs=1e-5)
+    assert sums == pytest.approx([plain.cost, plain.met, plain.compared, plain.all], rel=1e-6)
+    assert 0.0 < plain.met <= plain.compared < plain.all
+
+
+def test_gradient_is_that_of_the_cost(maps):
+    """Nearly: that planes change from place to place is left out of it."""
+    points, weights, _ = cloud(5)
+    times, T = np.zeros(len(points), np.float32), pose(6, 0.01)
+
+    def at(pose):
+        fit = {**FIT, "level": 2, "slack": 0.3}
+        return _core.linearise_sweep(maps[0], points, weights, times, pose, np.zeros(6), **fit)
+
+    gradient = at(T)[1][:6]
+    steps = np.eye(6) * 1e-3
+    slope = [(at(T @ se3.exp(d))[2] - at(T @ se3.exp(-d))[2]) / 2e-3 for d in steps]
+    assert np.linalg.norm(slope - gradient) < 0.3 * np.linalg.norm(gradient)
+
+
+def test_registered(maps):
+    points, weights, times = cloud(9, 600)
+    prior, twist = pose(10, 0.03), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.4])
+    information = np.diag([100.0] * 3 + [400.0] * 3 + [10.0] * 6)
+    steps = {
+        "information_scale": 0.5,
+        "start_level": 2,
+        "start_slack": 0.1,
+        "max_iterations": 6,
+        "tolerance": 1e-4,
+    }
+    last = {_core: {"threads": 2}, reference: {}}
+    core, plain = (
+        k.register_sweep(
+            m, points, weights, times, prior, twist, information, **FIT, **steps, **last[k]
+        )
+        for k, m in zip((_core, reference), maps, strict=True)
+    )
+    for found, expected in zip(core[:3], plain, strict=False):
+        assert found == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    assert np.linalg.norm(core[0][:3, 3] - prior[:3, 3]) > 0.005
+
+
+def test_threads_do_not_matter(maps):
+    points, weights, times = cloud(9, 5000)
+    information = np.eye(12)
+
+    def found(threads):
+        return _core.register_sweep(
+            maps[0], points, weights, times, pose(10, 0.03), np.zeros(6), information,
+            **FIT, information_scale=0.5, start_level=1, start_slack=0.1, max_iterations=10,
+            tolerance=1e-4, threads=threads,
+        )  # fmt: skip
+
+    one = found(1)
+    for threads in (2, 3, 8):
+        for a, b in zip(one, found(threads), strict=True):
+            assert np.array_equal(a, b)
+
+
+def test_carried_and_first_in_cells():
+    points, weights, times = cloud(11)
+    twist = np.array([3.0, -1.0, 0.5, 0.4, -2.0, 5.0])
+    moved = _core.transform_by_twist(points, times, twist)
+    assert np.array_equal(np.isnan(moved), np.isnan(points))
+    plain = reference.transform_by_twist(points, times, twist)
+    assert np.nan_to_num(moved) == pytest.approx(np.nan_to_num(plain), abs=1e-5)
+    for edge in (0.1, 0.7):
+        kept = _core.voxel_downsample(points, weights, edge)
+        assert kept.tolist() == reference.voxel_downsample(points, weights, edge).tolist()
+
+
+def test_refusals(maps):
+    points, weights, times = cloud(1, 20)
+    core = maps[0]
+    eye, zeros, information = np.eye(4), np.zeros(6), np.eye(12)
+    with pytest.raises(ValueError, match="weights: expected 20 entries"):
+        core.add(points, weights[:5], eye)
+    with pytest.raises(ValueError, match=r"weights: expected values in \[0, 1\]"):
+        core.add(points, weights + 1.0, eye)
+    with pytest.raises(ValueError, match="T_map_base: not finite"):
+        core.add(points, weights, eye * np.nan)
+    with pytest.raises(ValueError, match="too far away"):
+        core.add(points + np.float32(1e9), weights, eye)
+    fit = {**FIT, "information_scale": 1.0, "start_level": 0, "start_slack": 0.0}
+    fit |= {"max_iterations": 3, "tolerance": 1e-3, "threads": 1}
+    with pytest.raises(ValueError, match="times: expected 20 entries"):
+        _core.register_sweep(core, points, weights, times[:3], eye, zeros, information, **fit)
+    with pytest.raises(ValueError, match="times: expected finite"):
+        _core.register_sweep(
+            core, points, weights, times * np.float32(np.nan), eye, zeros, information, **fit
+        )
+    with pytest.raises(ValueError, match="level"):
+        core.fit_planes(np.zeros((1, 3)), 3, **PLANE)
+    with pytest.raises(TypeError):
+        core.add(points.astype(float), weights, eye)
+    with pytest.raises(ValueError, match="voxel_size"):
+        _core.voxel_downsample(points, weights, 0.0)
+    for arguments in ((0.0, 3, 1.0), (0.5, 0, 1.0), (0.5, 3, 0.0)):
+        with pytest.raises(ValueError, match="expected"):
+            _core.NdtMap3D(*arguments)

@@ -1,0 +1,192 @@
+"""Signed distances: the core against its plain twin, and by hand."""
+
+import numpy as np
+import pytest
+import reference
+
+from stillmap import _core
+
+VOXEL, REACH = 0.1, {"truncation_front": 0.3, "truncation_back": 0.2}
+
+
+def seen(seed, n=60, m=80, size=0.6):
+    """Triangles of any shape around the origin, on all sides of where the sensor was."""
+    rng = np.random.default_rng(seed)
+    middle = rng.uniform(-2.0, 2.0, (n, 3))
+    points = middle + rng.normal(0.0, 0.05, (n, 3))
+    near = np.argsort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)
+    faces = np.array([near[i, [0, *rng.choice(np.arange(1, 7), 2, False)]] for i in range(n)])
+    faces = np.concatenate([faces, faces[:, [1, 0, 2]]])[:m].astype(np.int32)
+    origin = np.array([0.3, -0.2, 0.1]) + rng.normal(0.0, size / 60, (n, 3))
+    standoff = rng.uniform(0.4, 1.0, n) * np.linalg.norm(points - origin, axis=1)
+    weight = rng.choice([0.0, 0.6, 1.0], m).astype(np.float32)
+    return points, origin, standoff, faces, weight
+
+
+def box(distances):
+    blocks = distances.blocks() * distances.block_edge
+    low, high = blocks.min(axis=0), blocks.max(axis=0) + distances.block_edge
+    return [int(v) for v in low], [int(v) for v in (high - low)[::-1]]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_core_and_twin_agree(seed):
+    both = [kernels.TsdfVolume(VOXEL, **REACH) for kernels in (_core, reference)]
+    for one in both:
+        one.integrate(*seen(seed))
+        one.integrate(*seen(seed + 50))
+    where = box(both[0])
+    (metres, weight), (plain_metres, plain_weight) = (one.dense(*where) for one in both)
+    # a voxel may lie on a border but for rounding
+    differs = (weight > 0) != (plain_weight > 0)
+    assert differs.sum() <= 2
+    known = (weight > 0) & (plain_weight > 0)
+    assert known.sum() > 1000
+    close = np.isclose(weight, plain_weight, rtol=1e-5, atol=1e-6)
+    assert (~close[known]).sum() <= 2
+    same = known & close
+    np.testing.assert_allclose(metres[same], plain_metres[same], atol=2e-6)
+    assert np.isnan(metres[weight == 0]).all()
+    assert {tuple(b) for b in both[1].blocks()} <= {tuple(b) for b in both[0].blocks()}
+
+
+def test_what_is_forgotten_is_as_if_never_met():
+    both = [kernels.TsdfVolume(VOXEL, **REACH) for kernels in (_core, reference)]
+    for one in both:
+        one.integrate(*seen(1))
+    where, before = box(both[0]), len(both[0].blocks())
+    gone = np.array([b for b in both[0].blocks().tolist() if b[0] >= 0 or b[2] > 0])
+    held = both[0].memory_bytes
+    for one in both:
+        one.remove_blocks(np.vstack([gone, [[900, 0, 0]]]))
+    assert len(both[0].blocks()) == before - len(gone) > 10
+    assert both[0].memory_bytes < held
+    metres, weight = both[0].dense(*where)
+    plain_metres, plain_weight = both[1].dense(*where)
+    assert np.sum((weight > 0) != (plain_weight > 0)) <= 2
+    assert np.nanmax(np.abs(metres - plain_metres)) < 2e-6
+    # in its place there is what comes later, and nothing else
+    fresh = _core.TsdfVolume(VOXEL, **REACH)
+    for one in (both[0], fresh):
+        one.integrate(*seen(2))
+    first, shape = [int(v) * 8 for v in gone[0]], [8, 8, 8]
+    for one, other in zip(both[0].dense(first, shape), fresh.dense(first, shape), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 7])
+def test_bits_do_not_depend_on_threads(threads):
+    rng = np.random.default_rng(5)
+    number = np.arange(200 * 150, dtype=np.int32).reshape(200, 150)
+    y, z = np.meshgrid(np.linspace(-2, 2, 150), np.linspace(-1, 1, 200))
+    points = np.stack([4.0 + rng.normal(0, 0.02, y.shape), y, z], axis=-1).reshape(-1, 3)
+    a, b, c = number[:-1, :-1].ravel(), number[:-1, 1:].ravel(), number[1:, :-1].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([b, c + 1, c], 1)])
+    rest = (np.zeros_like(points), np.full(len(points), 4.0), faces.astype(np.int32))
+    weight = rng.random(len(faces)).astype(np.float32)
+    out = []
+    for n in (1, threads):
+        distances = _core.TsdfVolume(0.07, truncation_front=0.2, truncation_back=0.2)
+        distances.integrate(points, *rest, weight, threads=n)
+        out.append((distances.blocks(), *distances.dense(*box(distances))))
+    for one, other in zip(*out, strict=True):
+        assert one.tobytes() == other.tobytes()
+    assert np.isfinite(out[0][1]).sum() > 9_000
+
+
+def wall(distance=2.0, half=1.0):
+    corners = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+    points = np.column_stack([np.full(4, distance), corners])
+    faces = np.array([[0, 2, 1], [0, 3, 2]], np.int32)
+    return points, np.zeros((4, 3)), np.full(4, distance), faces, np.ones(2, np.float32)
+
+
+def test_distances_from_a_wall_are_exact():
+    distances = _core.TsdfVolume(VOXEL, **REACH)
+    distances.integrate(*wall())
+    metres, weight = distances.dense([0, 0, 0], [8, 8, 30])
+    x = (np.arange(30) + 0.5) * VOXEL
+    inside = metres[2, 3]
+    known = (x > 1.7 - 1e-9) & (x < 2.2 - 1e-9)
+    np.testing.assert_array_equal(np.isfinite(inside), known)
+    np.testing.assert_allclose(inside[known], 2.0 - x[known], atol=1e-6)
+    behind = np.clip(1.0 + (2.0 - x) / 0.2, 0.0, 1.0)
+    np.testing.assert_allclose(weight[2, 3][known], behind[known], atol=1e-6)
+
+
+def test_a_wall_seen_at_a_flat_angle_is_as_far_as_one_seen_from_the_front():
+    points, origin, _, faces, weight = wall()
+    origin = origin + np.array([1.6, -6.0, 0.0])
+    distances = _core.TsdfVolume(VOXEL, **REACH)
+    distances.integrate(points, origin, np.full(4, 0.4), faces, weight)
+    metres, _ = distances.dense([15, -5, -5], [10, 10, 8])
+    x = (np.arange(15, 23) + 0.5) * VOXEL
+    known = np.isfinite(metres)
+    assert known.sum() > 100
+    np.testing.assert_allclose(
+        metres[known], np.broadcast_to(2.0 - x, metres.shape)[known], atol=1e-6
+    )
+
+
+def test_nothing_is_known_from_triangles_edge_on_or_behind():
+    points, origin, standoff, faces, weight = wall()
+    distances = _core.TsdfVolume(VOXEL, **REACH)
+    distances.integrate(points, origin + np.array([2.0, 5.0, 0.0]), standoff, faces, weight)
+    distances.integrate(points, origin, -standoff, faces, weight)
+    distances.integrate(points, origin, standoff, faces, np.zeros(2, np.float32))
+    assert len(distances.blocks()) == 0
+
+
+def test_wrong_arrays_are_refused():
+    good = wall()
+
+    def refused(place, value, match):
+        bad = [*good]
+        bad[place] = value
+        with pytest.raises(ValueError, match=match):
+            _core.TsdfVolume(VOXEL, **REACH).integrate(*bad)
+
+    refused(0, good[0] * np.nan, "points: not finite")
+    refused(1, good[1][:3], "origin: expected a row per point")
+    refused(2, good[2][:3], "standoff: expected one per point")
+    refused(2, good[2] * np.inf, "standoff: not finite")
+    refused(3, np.full((2, 3), 4, np.int32), "faces: a point that is not there")
+    refused(3, np.full((2, 3), -1, np.int32), "faces: a point that is not there")
+    refused(4, good[4][:1], "weight: expected one per face")
+    refused(4, -good[4], "weight: expected finite ones")
+    refused(4, good[4] * np.nan, "weight: expected finite ones")
+    refused(0, good[0] * 1e7, "points: too far away")
+    for bad in (
+        {"voxel": 0.0},
+        {"voxel": np.nan},
+        {"truncation_front": 0.0},
+        {"truncation_back": 10.0},
+    ):
+        with pytest.raises(ValueError, match=next(iter(bad))):
+            _core.TsdfVolume(**{"voxel": VOXEL, **REACH, **bad})
+
+
+def test_too_large_a_triangle_is_refused():
+    points, origin, standoff, faces, weight = wall(2000.0, 1900.0)
+    with pytest.raises(ValueError, match="too large"):
+        _core.TsdfVolume(0.01, truncation_front=0.03, truncation_back=0.02).integrate(
+            points, origin, standoff, faces, weight
+        )
+
+
+@pytest.mark.parametrize("standoff", [1e-3, 1e-9, 1e-300])
+def test_a_surface_that_is_met_at_next_to_no_angle_ends(standoff):
+    points, origin, _, faces, weight = wall(20.0, 0.1)
+    both = [
+        k.TsdfVolume(0.03, truncation_front=0.18, truncation_back=0.15) for k in (_core, reference)
+    ]
+    for one in both:
+        one.integrate(points, origin, np.full(4, standoff), faces, weight)
+        x = one.blocks()[:, 0] * one.block_edge * 0.03
+        assert 20.0 - 18.3 < x.min() < 20.0 - 15.0
+        assert 20.0 + 14.7 < x.max() < 20.0 + 15.0
+    (metres, weights), (plain, plain_weights) = (d.dense([600, -4, -4], [8, 8, 60]) for d in both)
+    assert (weights > 0.0).sum() > 2000
+    np.testing.assert_allclose(weights, plain_weights, rtol=1e-5)
+    off = 1e-6 * standoff + 1e-38  # float32
+    np.testing.assert_allclose(metres, plain, rtol=1e-4, atol=off)

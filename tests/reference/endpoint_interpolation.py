@@ -1,0 +1,88 @@
+"""End points between those of neighbouring beams that met one flat surface."""
+
+from collections.abc import Iterator
+from math import ceil
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reference.beam_counting import Beam, per_beam, usable_beams
+from reference.occupancy_grid import OccupancyGrid
+from reference.ray_traversal import cell_of
+
+Float = NDArray[np.float64]
+
+
+def interpolate_end_points(
+    grid: OccupancyGrid,
+    points: ArrayLike,
+    hit: ArrayLike,
+    e: ArrayLike,
+    offset: ArrayLike,
+    T_map_sensor: ArrayLike,
+    *,
+    max_gap: float,
+    tolerance: float,
+    max_gap_ratio: float,
+) -> None:
+    """Add end points between those of neighbouring beams, where a surface goes straight on.
+
+    Two neighbouring hits of one scan are on one surface when the next one, before or behind them,
+    leads straight from one to the other. Between them end points are added, as few as leave no
+    two more than a cell apart, each with the smaller e of the two. Nothing passes through cells
+    for them.
+
+    Args:
+        grid: changed in place.
+        points: (M, D) metres, sensor frame.
+        hit: (M,) bool.
+        e: (M,) expectation of c, looked at where something is added.
+        offset: (T+1,).
+        T_map_sensor: (T, D+1, D+1).
+        max_gap: metres between two neighbours at most.
+        tolerance: metres by which the third one may be off their line.
+        max_gap_ratio: the gap may be that many times as wide as that to the third one.
+    """
+    for name, value in (
+        ("max_gap", max_gap),
+        ("tolerance", tolerance),
+        ("max_gap_ratio", max_gap_ratio),
+    ):
+        if not value >= 0:
+            raise ValueError(f"{name}: expected a number that is not negative, got {value}")
+    expectation = per_beam(e, points)
+    hits = [b for b in usable_beams(grid.dimension, points, hit, offset, T_map_sensor) if b.hit]
+    for a, b, others in _neighbours(hits):
+        if any(_goes_on(a, b, other, max_gap, tolerance, max_gap_ratio) for other in others):
+            both = expectation[[a.number, b.number]]
+            if not ((both >= 0) & (both <= 1)).all():
+                raise ValueError(f"e: expected probabilities in [0, 1], got {both}")
+            steps = ceil(float(np.linalg.norm(b.end - a.end)) / grid.resolution)
+            for i in range(1, steps):
+                end = a.end + (b.end - a.end) * (i / steps)
+                cell = tuple(cell_of(end, grid.resolution).tolist())
+                grid.add(cell, float(both.min()), 0.0, end)
+
+
+def _neighbours(hits: list[Beam]) -> Iterator[tuple[Beam, Beam, list[Beam]]]:
+    """Hits side by side in one scan, and the ones before and behind them that are hits as well."""
+    numbered = {(beam.scan, beam.number): beam for beam in hits}
+    for (scan, n), a in numbered.items():
+        b = numbered.get((scan, n + 1))
+        if b is not None:
+            around = numbered.get((scan, n - 1)), numbered.get((scan, n + 2))
+            yield a, b, [other for other in around if other is not None]
+
+
+def _goes_on(
+    a: Beam, b: Beam, other: Beam, max_gap: float, tolerance: float, max_gap_ratio: float
+) -> bool:
+    """Whether the surface goes straight on from `other` to the nearer of a, b and the farther."""
+    near, far = (a, b) if other.number < a.number else (b, a)
+    before, step = near.end - other.end, far.end - near.end
+    wide = float(np.linalg.norm(step))
+    if not 0 < wide <= min(max_gap, max_gap_ratio * float(np.linalg.norm(before))):
+        return False
+    along = float(before @ step) / wide
+    off = float(np.linalg.norm(before - along * step / wide))
+    return along > 0 and off < tolerance

@@ -1,0 +1,205 @@
+"""The smoothed field that registration climbs: stillmap's practical form of (9)."""
+
+from itertools import product
+from math import erf, exp, isnan, log, pi, sqrt
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reference.occupancy_grid import OccupancyGrid
+from reference.ray_traversal import cell_of
+
+Float = NDArray[np.float64]
+
+
+def field(grid: OccupancyGrid, y: ArrayLike, sigma: float, radius: int) -> float:
+    """F(y): occupancy around a point, smoothed; about 1 on a straight, fully occupied wall.
+
+    The sum over cells k within `radius` cells of that of y (largest coordinate difference) of
+    m_k exp(-|y - mu_k|^2 / (2 sigma^2)), with mu_k the mean of the end points in cell k weighted
+    with e, divided by (sqrt(2 pi) sigma / resolution)^(D-1). In a cell that nobody looked at, when
+    those means lie on a line or plane, this surface is taken to go on: the mean of the m_k, times
+    exp(-d^2 / (2 sigma^2)) at a distance d from it.
+
+    Args:
+        grid: the map.
+        y: (D,) metres, map frame.
+        sigma: metres.
+        radius: cells.
+    """
+    point = np.asarray(y, float)
+    centre = cell_of(point, grid.resolution)
+    means, m = _around(grid, centre, radius)
+    if isnan(grid.occupancy_of(tuple(centre.tolist()))) and len(m) >= grid.dimension:
+        mean, normal, is_flat = _plane(means, m)
+        if is_flat:
+            return float(m.mean() * exp(-((normal @ (mean - point)) ** 2) / (2 * sigma**2)))
+    total = 0.0
+    for mu, m_k in zip(means, m, strict=True):
+        away = point - mu
+        total += m_k * exp(-float(away @ away) / (2 * sigma**2))
+    return total / (sqrt(2 * pi) * sigma / grid.resolution) ** (grid.dimension - 1)
+
+
+def _around(grid: OccupancyGrid, centre: NDArray[np.int64], radius: int) -> tuple[Float, Float]:
+    """Means (K, D) of the end points in the cells around, and their occupancies (K,)."""
+    means, m = [], []
+    for step in product(range(-radius, radius + 1), repeat=grid.dimension):
+        cell = tuple((centre + step).tolist())
+        alpha = grid.alpha.get(cell, 0.0)
+        if alpha > 0:
+            means.append(grid.moment[cell] / alpha)
+            m.append(grid.occupancy_of(cell))
+    return np.array(means).reshape(-1, grid.dimension), np.array(m)
+
+
+def _plane(means: Float, m: Float) -> tuple[Float, Float, bool]:
+    """A point (D,) and the normal (D,) of the plane through weighted points, and if it is one."""
+    weights = m / m.sum()
+    mean = weights @ means
+    apart = means - mean
+    variance, axes = np.linalg.eigh((weights[:, None] * apart).T @ apart)
+    is_flat = variance[0] < 0.1 * variance[1] and (
+        len(mean) == 2 or variance[1] > 0.1 * variance[2]
+    )
+    return mean, axes[:, 0], bool(is_flat)
+
+
+def registration_cost(
+    grid: OccupancyGrid,
+    points: ArrayLike,
+    weights: ArrayLike,
+    T: ArrayLike,
+    sigma: float,
+    radius: int,
+    floor: float,
+    unknown: float,
+) -> float:
+    """- sum of w_n ln(floor + unknown U(T p_n) + F(T p_n)) over the points that are finite.
+
+    U is 1 in cells that nobody looked at, 0 elsewhere: unknown is not free.
+
+    Args:
+        grid: the map.
+        points: (N, D) metres, sensor frame.
+        weights: (N,).
+        T: (D+1, D+1) T_map_sensor.
+        sigma: metres.
+        radius: cells.
+        floor: value of an end point in free space, where a wall has 1.
+        unknown: what is added to it where nobody looked.
+    """
+    pose, D = np.asarray(T, float), grid.dimension
+    cost = 0.0
+    for p, w in zip(np.asarray(points, float), np.asarray(weights, float), strict=True):
+        if np.isfinite(p).all():
+            y = pose[:D, :D] @ p + pose[:D, D]
+            cost -= w * log(_base(grid, y, floor, unknown) + field(grid, y, sigma, radius))
+    return float(cost)
+
+
+def _base(grid: OccupancyGrid, y: Float, floor: float, unknown: float) -> float:
+    unseen = isnan(grid.occupancy_of(tuple(cell_of(y, grid.resolution).tolist())))
+    return floor + (unknown if unseen else 0.0)
+
+
+def registration_gradient(
+    grid: OccupancyGrid,
+    points: ArrayLike,
+    weights: ArrayLike,
+    T: ArrayLike,
+    sigma: float,
+    radius: int,
+    floor: float,
+    unknown: float,
+    step: float = 1e-6,
+) -> Float:
+    """Gradient of `registration_cost` by central differences.
+
+    Returns:
+        (3,) with respect to x, y, theta, or (6,) to x, y, z and a rotation vector: metres and
+        radians along the axes of the map, the sensor turning about its own position.
+    """
+    pose = np.asarray(T, float)
+    gradient = []
+    for i in range(3 if grid.dimension == 2 else 6):
+        delta = np.zeros(3 if grid.dimension == 2 else 6)
+        delta[i] = step
+        above, below = (
+            registration_cost(grid, points, weights, moved(pose, d), sigma, radius, floor, unknown)
+            for d in (delta, -delta)
+        )
+        gradient.append((above - below) / (2 * step))
+    return np.array(gradient)
+
+
+def registration_curvature(
+    grid: OccupancyGrid,
+    points: ArrayLike,
+    weights: ArrayLike,
+    T: ArrayLike,
+    sigma: float,
+    radius: int,
+    floor: float,
+    unknown: float,
+) -> Float:
+    """What the Newton steps take for the second derivative of `registration_cost`.
+
+    The sum of w_n s_n J_n^T A_n J_n: s = F / (base + F) is the share of a beam that the map
+    explains, J the derivative of T p_n by the pose, and A the curvature of -ln F, see
+    `_curvature`.
+
+    Returns:
+        (3, 3) or (6, 6), order and units as the gradient's.
+    """
+    pose, D = np.asarray(T, float), grid.dimension
+    H = np.zeros((3, 3) if D == 2 else (6, 6))
+    for p, w in zip(np.asarray(points, float), np.asarray(weights, float), strict=True):
+        if np.isfinite(p).all():
+            y = pose[:D, :D] @ p + pose[:D, D]
+            F = field(grid, y, sigma, radius)
+            arm = y - pose[:D, D]
+            turning = [[-arm[1]], [arm[0]]] if D == 2 else np.cross(np.eye(3), arm).T
+            J = np.hstack([np.eye(D), turning])
+            explained = F / (_base(grid, y, floor, unknown) + F)
+            if F > 0:
+                H += w * explained * J.T @ _curvature(grid, y, sigma, radius) @ J
+    return H
+
+
+def _curvature(grid: OccupancyGrid, y: Float, sigma: float, radius: int) -> Float:
+    """(D, D) sigma^-2 I - sigma^-4 C / v without its negative part.
+
+    C is the spread of the means mu_k around y, each weighted with its part of F, and v the
+    variance that is left to a Gaussian of variance 1 cut off where the sum ends. Where a surface
+    is taken to go on, sigma^-2 across it and nothing along it.
+    """
+    centre = cell_of(y, grid.resolution)
+    means, m = _around(grid, centre, radius)
+    if isnan(grid.occupancy_of(tuple(centre.tolist()))) and len(m) >= grid.dimension:
+        _, normal, is_flat = _plane(means, m)
+        if is_flat:
+            return np.outer(normal, normal) / sigma**2
+    parts = m * np.exp(-((y - means) ** 2).sum(axis=1) / (2 * sigma**2))
+    apart = means - parts @ means / parts.sum()
+    spread = (parts[:, None] * apart).T @ apart / parts.sum()
+    cut = (radius + 0.5) * grid.resolution / sigma
+    v = 1.0 - sqrt(2 / pi) * cut * exp(-(cut**2) / 2) / erf(cut / sqrt(2))
+    values, axes = np.linalg.eigh(np.eye(grid.dimension) / sigma**2 - spread / (v * sigma**4))
+    kept: Float = axes @ np.diag(np.maximum(values, 0.0)) @ axes.T
+    return kept
+
+
+def moved(T: Float, delta: Float) -> Float:
+    """T_map_sensor shifted by delta[:D] and turned by delta[D:] about its own position."""
+    D = len(T) - 1
+    axis = np.array([0.0, 0.0, delta[2]]) if D == 2 else delta[3:]
+    angle = float(np.linalg.norm(axis))
+    out = T.copy()
+    out[:D, D] += delta[:D]
+    if angle > 0:
+        x, y, z = axis / angle
+        K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)  # Rodrigues
+        out[:D, :D] = R[:D, :D] @ T[:D, :D]
+    return out
