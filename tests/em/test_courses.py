@@ -10,7 +10,7 @@ from made_up import RESOLUTION, Ball, Wall, watch
 
 from stillmap import em
 from stillmap.em import changepoints as module
-from stillmap.em import observations
+from stillmap.core import chunks
 from stillmap.em.changepoints import _as_wholes
 from stillmap.mapping import detect_changes, relabel_changes
 
@@ -159,7 +159,7 @@ def test_rounding_makes_nothing_impossible(monkeypatch):
         surface=SimpleNamespace(size=20_000, elements=lambda rows: (grid[slice(*rows)],)),
         dwell=SimpleNamespace(
             changes=lambda rows: [one[slice(*rows)] for one in changes],
-            log_changing=lambda rows: changes[0][slice(*rows)],
+            change_log_likelihood=lambda rows: changes[0][slice(*rows)],
             likelihood=lambda kept, rows, _: (
                 likelihood[slice(*rows)][:, kept].astype(np.float32),
                 np.zeros(len(range(*rows))),
@@ -290,7 +290,7 @@ def test_every_probability_is_one(last, majority):
 
 
 def test_when_it_was(seen, last):
-    found = detect_changes(last[1], seen.recording, RESOLUTION, 0.5, em.ChangeOptions())
+    found = detect_changes(last[1], seen.recording, RESOLUTION, 0.5)
     assert [one.kind for one in found] == ["came", "left"]
     assert [(one.before_ns, one.stamp_ns) for one in found] == [
         (119 * 10**9, 120 * 10**9),
@@ -315,7 +315,7 @@ def test_what_comes_and_goes_again_and_again():
     watched = watch([*WALLS, *gate, *passing(35, 1.2)], 300)
     (p_static, _), found = last_e_step(watched)
     assert np.median(watched.of(p_static, *range(3, 3 + len(gate)))) < 0.1
-    (one,) = detect_changes(found, watched.recording, RESOLUTION, 0.5, em.ChangeOptions())
+    (one,) = detect_changes(found, watched.recording, RESOLUTION, 0.5)
     assert one.kind == "comes and goes"
     assert one.times == 11
     assert (one.stamp_ns, one.last_ns) == (25 * 10**9, 275 * 10**9)
@@ -340,7 +340,7 @@ def test_cells_decide_together_before_anything_is_shown(seen, monkeypatch):
 @pytest.mark.parametrize("beams", [1000, 5000])
 @pytest.mark.parametrize("threads", [1, 3])
 def test_pieces_and_threads_change_no_bit(seen, last, monkeypatch, beams, threads):
-    monkeypatch.setattr(observations, "CHUNK_BEAMS", beams)
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
     (p_static, _), found = last_e_step(seen, threads=threads)
     assert p_static.tobytes() == last[0][0].tobytes()
     assert found.change_bins.tobytes() == last[1].between.tobytes()
@@ -350,7 +350,7 @@ def test_pieces_and_threads_change_no_bit(seen, last, monkeypatch, beams, thread
 def test_so_short_a_recording_shows_no_change(scans):
     watched = watch([*WALLS, Ball(2.2, 0.3, 0, 9, 0.5)], scans)
     (p_static, _), found = last_e_step(watched)
-    assert detect_changes(found, watched.recording, RESOLUTION, 0.5, em.ChangeOptions()) == []
+    assert detect_changes(found, watched.recording, RESOLUTION, 0.5) == []
     assert np.isfinite(p_static).all()
 
 

@@ -1,4 +1,4 @@
-"""Puts the courses that these tests make up where the tests can import them."""
+"""Makes the helpers of these tests importable."""
 
 import sys
 from pathlib import Path

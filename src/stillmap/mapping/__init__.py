@@ -1,15 +1,16 @@
-"""Places that changed while the robot recorded: things put there, taken away, moved, and doors."""
+"""Changed places, doors, and the projection of 3D recordings onto the plane."""
 
-from stillmap.mapping.change_detection import Change, detect_changes, find_changed_object_beams
+from stillmap.mapping.change_detection import Change, detect_changes
 from stillmap.mapping.change_detection_3d import detect_changes_3d
+from stillmap.mapping.changed_objects import find_changed_object_beams
 from stillmap.mapping.doors import compute_swept_cells
 from stillmap.mapping.relabelling import relabel_changes
 
 __all__ = [
     "Change",
-    "find_changed_object_beams",
+    "compute_swept_cells",
     "detect_changes",
     "detect_changes_3d",
+    "find_changed_object_beams",
     "relabel_changes",
-    "compute_swept_cells",
 ]

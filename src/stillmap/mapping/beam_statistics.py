@@ -1,4 +1,4 @@
-"""Counts and end points over all beams, a block at a time: a recording may be long."""
+"""Counts and samples over all beams, block by block: recordings may be larger than memory."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ DYNAMIC_BELOW = 0.5
 
 
 def count_beams(recording: Recording, p_static: NDArray[np.float32]) -> dict[str, int]:
-    """Numbers of `beams`, `hits`, `max_range`, `unusable`, `dynamic` (hits below 0.5)."""
+    """Count `beams`, `hits`, `max_range`, `unusable`, and `dynamic` (hits with p_static < 0.5)."""
     hits = unusable = dynamic = 0
     for block in iter_blocks(recording.points, recording.hit, p_static):
         hit = recording.hit[block]
@@ -34,14 +34,14 @@ def sample_dynamic_points(
     threshold: float = DYNAMIC_BELOW,
     limit: int = 200_000,
 ) -> NDArray[np.float32]:
-    """End points in the map frame of the hits with p_static below `threshold`.
+    """Sample the end points, in the map frame, of the hits with p_static below `threshold`.
 
     Args:
         recording: T scans with M beams in D dimensions.
         poses: (T, D+1, D+1) float64, T_map_base.
         p_static: (M,) float32.
-        threshold: the probability below which a beam counts as dynamic.
-        limit: where there are more, this many are taken, evenly spread over the recording.
+        threshold: of p_static.
+        limit: maximum number of points; of more, evenly spaced ones are taken.
 
     Returns:
         (K, D) float32 in metres, in the recording's order, K <= limit.
@@ -53,21 +53,20 @@ def sample_dynamic_points(
 def _dynamic_beams(
     recording: Recording, p_static: NDArray[np.float32], threshold: float, limit: int
 ) -> NDArray[np.int64]:
-    """(K,) indices of the dynamic beams; every n-th, not the first ones, beyond `limit`."""
+    """(K,) indices of at most `limit` dynamic beams, evenly spaced."""
 
-    def of_block(block: slice) -> NDArray[np.bool_]:
+    def is_dynamic(block: slice) -> NDArray[np.bool_]:
         return recording.hit[block] & (p_static[block] < threshold)
 
     arrays = recording.hit, p_static
-    counts = [int(np.count_nonzero(of_block(block))) for block in iter_blocks(*arrays)]
+    counts = [int(np.count_nonzero(is_dynamic(block))) for block in iter_blocks(*arrays)]
     total = sum(counts)
     kept = min(total, limit)
-    # which of the dynamic beams are taken, counted over the whole recording
-    wanted = np.arange(kept, dtype=np.int64) * total // max(kept, 1)
+    chosen = np.arange(kept, dtype=np.int64) * total // max(kept, 1)
     before = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     parts = [np.zeros(0, np.int64)]
     for block, start, end in zip(iter_blocks(*arrays), before[:-1], before[1:], strict=True):
-        low, high = np.searchsorted(wanted, [start, end])
-        found = np.flatnonzero(of_block(block))
-        parts.append(block.start + found[wanted[low:high] - start])
+        low, high = np.searchsorted(chosen, [start, end])
+        found = np.flatnonzero(is_dynamic(block))
+        parts.append(block.start + found[chosen[low:high] - start])
     return np.concatenate(parts)

@@ -1,18 +1,18 @@
-"""Things that came to stay, or left, in space: so many cells that say the same are one."""
+"""Objects that arrived or departed in 3D recordings."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core.recording import Recording
-from stillmap.em import ChangedCells, ChangeOptions
-from stillmap.mapping.change_detection import Change, detect_changes
+from stillmap.em import ChangedCells
+from stillmap.mapping.change_detection import Change, group_changes
 from stillmap.mapping.dwell_time import measure_dwell_times
 
-_STAYS = 12.0  # s: what stands for less waits, and what is away for less is hidden
-_HIGH = 0.4  # m: what is lower is the ground, met in other lines from elsewhere
-_LARGE = 0.7  # m2 of surface that a thing shows at least
+_MIN_STAY = 12.0  # s: a shorter stay is a wait, a shorter absence an occlusion
+_MIN_HEIGHT = 0.4  # m: anything lower is ground observed along other beams
+_MIN_AREA = 0.7  # m2 of visible surface
 
 
 def detect_changes_3d(
@@ -20,56 +20,46 @@ def detect_changes_3d(
     recording: Recording,
     poses: NDArray[np.float64],
     resolution: float,
-    look: float,
-    options: ChangeOptions,
+    time_bin: float,
 ) -> list[Change]:
-    """Cells near each other that changed at the same time, as far as they are things that stood.
+    """Changed places that are objects at rest: high, large and present for long enough.
 
-    Of each the `cells` are those of a plan (K, 2), `size` has three lengths, and `z` is known.
+    `cells` of each are those of the plane (K, 2), `size` has three lengths, and `z` is known.
 
-    Args: see `changed_places`; poses are (T, 4, 4) T_map_base, `resolution` is the edge of a voxel.
+    Args:
+        changed: candidate voxels.
+        recording: 3D, deskewed.
+        poses: (T, 4, 4) T_map_base.
+        resolution: m, edge of a voxel.
+        time_bin: s, width of a time bin.
     """
     first, last = recording.stamp_ns[[0, -1]].tolist()
-    cells = _Cells.of(changed, _STAYS / look, 1e-9 * (last - first) / look)
-    places = detect_changes(cells, recording, resolution, look, options)
-    things = [
+    lasting = _select_lasting(changed, _MIN_STAY / time_bin, 1e-9 * (last - first) / time_bin)
+    unchanged = np.zeros((0, 3), np.int64)  # large objects need no test against noise
+    objects = [
         one
-        for one in places
-        if one.size[2] >= _HIGH
-        and len(one.cells) * resolution**2 >= _LARGE
-        and 1e-9 * min(one.stamp_ns - first, last - one.before_ns) >= _STAYS
+        for one in group_changes(lasting, unchanged, recording, resolution, time_bin)
+        if one.size[2] >= _MIN_HEIGHT
+        and len(one.cells) * resolution**2 >= _MIN_AREA
+        and 1e-9 * min(one.stamp_ns - first, last - one.before_ns) >= _MIN_STAY
     ]
-    seen = measure_dwell_times(things, recording, poses, resolution)
+    dwell_times = measure_dwell_times(objects, recording, poses, resolution)
     return [
         replace(one, cells=np.unique(one.cells[:, :2], axis=0))
-        for one, seconds in zip(things, seen, strict=True)
-        if seconds >= _STAYS
+        for one, seconds in zip(objects, dwell_times, strict=True)
+        if seconds >= _MIN_STAY
     ]
 
 
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """Cells all of which are asked for, and nothing that stands beside them: see `Courses`."""
-
-    cells: NDArray[np.int64]
-    p_changing: NDArray[np.float32]
-    p_object: NDArray[np.float32]
-    p_unchanged: NDArray[np.float32]
-    n_changes: NDArray[np.int32]
-    change_bins: NDArray[np.int32]
-
-    @classmethod
-    def of(cls, changed: ChangedCells, least: float, looks: float) -> "_Cells":
-        """Those that were as before, and otherwise, for so many looks of all of them at least."""
-        before, after = changed.change_bins[..., 0], changed.change_bins[..., 1]
-        once = (after[:, 1] >= least) & (looks - before[:, 1] >= least)
-        twice = before[:, 1] - after[:, 0] >= least
-        kept = np.flatnonzero(np.where(changed.n_changes == 1, once, twice))
-        return cls(
-            cells=changed.cells[kept],
-            p_changing=np.ones(len(kept), np.float32),
-            p_object=changed.p_object[kept],
-            p_unchanged=np.zeros(len(kept), np.float32),
-            n_changes=changed.n_changes[kept],
-            change_bins=changed.change_bins[kept],
-        )
+def _select_lasting(changed: ChangedCells, min_bins: float, bins: float) -> ChangedCells:
+    """The cells that kept each state for at least `min_bins` of all `bins` time bins."""
+    before, after = changed.change_bins[..., 0], changed.change_bins[..., 1]
+    once = (after[:, 1] >= min_bins) & (bins - before[:, 1] >= min_bins)
+    twice = before[:, 1] - after[:, 0] >= min_bins
+    kept = np.flatnonzero(np.where(changed.n_changes == 1, once, twice))
+    return ChangedCells(
+        changed.cells[kept],
+        changed.p_object[kept],
+        changed.n_changes[kept],
+        changed.change_bins[kept],
+    )

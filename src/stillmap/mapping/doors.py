@@ -1,4 +1,4 @@
-"""The area that a door takes."""
+"""Doors: the sector that a leaf sweeps, fitted to the cells where it was observed."""
 
 import math
 
@@ -8,92 +8,96 @@ from numpy.typing import NDArray
 Cells = NDArray[np.int64]
 Float = NDArray[np.float64]
 
-_BESIDE = 2.0  # cells beside an end of its way at which a leaf may be seen
-_LEAF = 0.8  # share of the cells that must lie at the ends of its way
-_HINGES = 400  # cells at most that are tried
-_SHORTEST, _LONGEST = 0.4, 2.0  # m, of leaves
-_NARROW, _WIDE = math.radians(20.0), math.radians(200.0)  # how far doors swing
-_FROM_HINGE = 0.5  # of the leaf: nearer to the hinge, directions say little
+_TOLERANCE = 2.0  # cells between the leaf and a cell on it
+_MIN_INLIERS = 0.8  # share of the cells on the leaf in its end positions
+_MAX_HINGES = 400  # candidates that are tried
+_MIN_LENGTH, _MAX_LENGTH = 0.4, 2.0  # m, of leaves
+_MIN_ANGLE, _MAX_ANGLE = math.radians(20.0), math.radians(200.0)  # of the swing
+_NEAR_HINGE = 0.5  # of the leaf: cells nearer to the hinge have uncertain directions
 
 
 def compute_swept_cells(cells: Cells, resolution: float) -> Cells:
-    """(S, 2) these cells (K, 2) and, if a door is seen there open and shut, all that it sweeps."""
-    sector = _sector(cells)
-    if sector is None or not _SHORTEST <= sector.length * resolution <= _LONGEST:
+    """(S, 2) the cells (K, 2) and, if they are a door both open and shut, those that it sweeps."""
+    sector = _fit_sector(cells)
+    if sector is None or not _MIN_LENGTH <= sector.length * resolution <= _MAX_LENGTH:
         return cells
-    reach = math.ceil(sector.length)
-    square = np.arange(-reach, reach + 1)
+    radius = math.ceil(sector.length)
+    square = np.arange(-radius, radius + 1)
     around = sector.hinge + np.stack(np.meshgrid(square, square), axis=-1).reshape(-1, 2)
-    return np.unique(np.concatenate([cells, around[sector.holds(around)]]), axis=0)
+    return np.unique(np.concatenate([cells, around[sector.contains(around)]]), axis=0)
 
 
 class _Sector:
-    """Where a leaf of a length, in cells, swings about a hinge from one direction to another."""
+    """A leaf of `length` cells that swings about a hinge between two end directions."""
 
     def __init__(self, hinge: Cells, cells: Cells) -> None:
         self.hinge = hinge
         distance, angle = self._polar(cells)
         self.length = float(distance.max())
-        far = distance > _FROM_HINGE * self.length
-        # directions seen from the middle one, so that none jumps by a whole turn
+        far = distance > _NEAR_HINGE * self.length
+        # relative to the mean direction, so that none wraps around
         at = angle[far]
-        self._middle = float(np.angle(np.mean(np.exp(1j * at))))
-        turned = np.angle(np.exp(1j * (at - self._middle)))
+        self._mean = float(np.angle(np.mean(np.exp(1j * at))))
+        turned = np.angle(np.exp(1j * (at - self._mean)))
         half = 0.5 * (turned.min() + turned.max())
         self._low = float(np.median(turned[turned <= half]))
         self._high = float(np.median(turned[turned >= half]))
 
     @property
     def angle(self) -> float:
-        """Radians, by which the leaf swings."""
+        """Radians of the swing."""
         return self._high - self._low
 
     def _polar(self, cells: Cells) -> tuple[Float, Float]:
         x, y = (cells - self.hinge).T
         return np.hypot(x, y), np.arctan2(y, x)
 
-    def _turned(self, cells: Cells) -> tuple[Float, Float]:
+    def _relative_polar(self, cells: Cells) -> tuple[Float, Float]:
         distance, angle = self._polar(cells)
-        return distance, np.asarray(np.angle(np.exp(1j * (angle - self._middle))))
+        return distance, np.asarray(np.angle(np.exp(1j * (angle - self._mean))))
 
-    def holds(self, cells: Cells) -> NDArray[np.bool_]:
+    def contains(self, cells: Cells) -> NDArray[np.bool_]:
         """(N,) whether the leaf sweeps over cells (N, 2)."""
-        distance, turned = self._turned(cells)
+        distance, turned = self._relative_polar(cells)
         between = (turned >= self._low) & (turned <= self._high)
         return np.asarray((distance <= self.length) & between)
 
-    def at_its_ends(self, cells: Cells) -> float:
-        """Share of cells that lie along the leaf where it begins to swing, or stops."""
-        distance, turned = self._turned(cells)
+    def inlier_share(self, cells: Cells) -> float:
+        """Share of the cells that lie on the leaf in either end position."""
+        distance, turned = self._relative_polar(cells)
         aside = np.minimum(np.abs(turned - self._low), np.abs(turned - self._high))
-        return float(np.mean(distance * np.sin(np.minimum(aside, math.pi / 2)) <= _BESIDE))
+        return float(np.mean(distance * np.sin(np.minimum(aside, math.pi / 2)) <= _TOLERANCE))
 
-    def fills_both(self, cells: Cells) -> bool:
-        """Whether the leaf was seen at both ends, each along most of its length."""
-        distance, turned = self._turned(cells)
+    def covers_both_ends(self, cells: Cells) -> bool:
+        """Whether cells cover more than half of the leaf in both end positions."""
+        distance, turned = self._relative_polar(cells)
         for end in (self._low, self._high):
-            along = distance[distance * np.abs(np.sin(turned - end)) <= _BESIDE]
+            along = distance[distance * np.abs(np.sin(turned - end)) <= _TOLERANCE]
             if len(np.unique(np.round(along))) < 0.5 * self.length:
                 return False
         return True
 
 
-def _sector(cells: Cells) -> _Sector | None:
+def _fit_sector(cells: Cells) -> _Sector | None:
     """The door, if it is one: cells along two lines from one of them, the hinge."""
-    if _breadth(cells) <= 2.0 * _BESIDE + 1.0:
-        return None  # straight: two leaves that point away from each other would look alike
-    best, most = None, (_LEAF, -math.inf)
-    for hinge in cells[:: math.ceil(len(cells) / _HINGES)]:
+    if _width(cells) <= 2.0 * _TOLERANCE + 1.0:
+        return None  # straight: two opposite leaves would look alike
+    best, best_score = None, (_MIN_INLIERS, -math.inf)
+    for hinge in cells[:: math.ceil(len(cells) / _MAX_HINGES)]:
         sector = _Sector(hinge, cells)
-        # beside the hinge of a door that swings far, others explain as much with longer leaves
-        now = (sector.at_its_ends(cells), -sector.length)
-        if _NARROW < sector.angle < _WIDE and now > most and sector.fills_both(cells):
-            best, most = sector, now
+        # cells beside the hinge of a wide swing fit as many cells with longer leaves
+        score = (sector.inlier_share(cells), -sector.length)
+        if (
+            _MIN_ANGLE < sector.angle < _MAX_ANGLE
+            and score > best_score
+            and sector.covers_both_ends(cells)
+        ):
+            best, best_score = sector, score
     return best
 
 
-def _breadth(cells: Cells) -> float:
-    """Cells, across the direction in which they spread most."""
+def _width(cells: Cells) -> float:
+    """Width in cells across the principal direction."""
     x, y = (cells - cells.mean(axis=0)).T
     along = 0.5 * math.atan2(2.0 * float(np.sum(x * y)), float(np.sum(x * x - y * y)))
     return float(np.ptp(y * math.cos(along) - x * math.sin(along)))

@@ -1,4 +1,4 @@
-"""For how long things in space were seen to stand where they came to stay, or left from."""
+"""Dwell times: how long objects were observed where they arrived, or before they departed."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,57 +12,60 @@ from stillmap.mapping.change_detection import Change
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_MOST = 0.25  # share of a thing's voxels that may have been seen for less
+_QUANTILE = 0.25  # of the observed times of an object's voxels
 
 
 def measure_dwell_times(
     places: Sequence[Change], recording: Recording, poses: Float, resolution: float
 ) -> list[float]:
-    """How long each thing was seen while it stood: three quarters of its voxels so long or longer.
+    """Seconds for which three quarters of each object's voxels were hit while it stood there.
 
-    Who drives along, or is hidden soon after, came as well; but each voxel is met for a moment.
+    A passing vehicle, or an object occluded soon after, arrives as well; but each of its voxels is
+    hit for a moment only.
 
     Args:
-        places: where something came or left; `cells` are (K, 3) voxels.
-        recording: 3D, M beams without the motion during its scans.
+        places: changed places; `cells` are (K, 3) voxels.
+        recording: 3D, M beams, deskewed.
         poses: (T, 4, 4) T_map_base.
         resolution: metres, edge of a voxel.
     """
     if not places:
         return []
-    voxels = _Voxels.of(places)
-    ever = np.iinfo(np.int64)
-    first = np.full(len(voxels.place), ever.max)
-    last = np.full(len(voxels.place), ever.min)
-    since = np.array([one.stamp_ns if one.appeared else ever.min for one in places])[voxels.place]
-    until = np.array([ever.max if one.appeared else one.before_ns for one in places])[voxels.place]
+    voxels = _Voxels.from_places(places)
+    limits = np.iinfo(np.int64)
+    first = np.full(len(voxels.place), limits.max)
+    last = np.full(len(voxels.place), limits.min)
+    since = np.array([one.stamp_ns if one.appeared else limits.min for one in places])[voxels.place]
+    until = np.array([limits.max if one.appeared else one.before_ns for one in places])[
+        voxels.place
+    ]
     T_map_sensor = recording.T_map_sensor(poses)
     for t in recording.iter_scans(range(recording.n_scans)):
         stamp, beams, T = int(recording.stamp_ns[t]), recording.beams_of(t), T_map_sensor[t]
         points = recording.points[beams][recording.hit[beams]].astype(np.float64)
         ends = points @ T[:3, :3].T + T[:3, 3]
-        met = voxels.met(np.floor(ends / resolution).astype(np.int64))
-        met = met[(since[met] <= stamp) & (stamp <= until[met])]
-        first[met] = np.minimum(first[met], stamp)
-        last[met] = np.maximum(last[met], stamp)
+        hit = voxels.find(np.floor(ends / resolution).astype(np.int64))
+        hit = hit[(since[hit] <= stamp) & (stamp <= until[hit])]
+        first[hit] = np.minimum(first[hit], stamp)
+        last[hit] = np.maximum(last[hit], stamp)
     out = []
     for number, one in enumerate(places):
         its = voxels.place == number
         known = last[its] >= first[its]
         shown = last[its] - one.stamp_ns if one.appeared else one.before_ns - first[its]
         seconds = np.where(known, 1e-9 * np.where(known, shown, 0), 0.0)
-        out.append(float(np.quantile(seconds, _MOST, method="lower")))
+        out.append(float(np.quantile(seconds, _QUANTILE, method="lower")))
     return out
 
 
 class _Voxels(NamedTuple):
-    """The N voxels of all places; one in several places is there several times.
+    """The N voxels of all places; a voxel of several places is there several times.
 
     Attributes:
-        place: (N,) which place each is of.
-        low, shape: (3,) the lowest and how many there are along each axis around all of them.
-        key: (U,) rising, one for each that is different.
-        copies: (C, U) where these are among the N; -1: there are no more.
+        place: (N,) place of each voxel.
+        low, shape: (3,) lowest voxel and extent of the bounding box.
+        key: (U,) rising keys of the distinct voxels.
+        copies: (C, U) their indices among the N; -1 where there are fewer than C.
     """
 
     place: Index
@@ -72,7 +75,7 @@ class _Voxels(NamedTuple):
     copies: Index
 
     @classmethod
-    def of(cls, places: Sequence[Change]) -> "_Voxels":
+    def from_places(cls, places: Sequence[Change]) -> "_Voxels":
         cells = np.concatenate([one.cells for one in places])
         place = np.repeat(np.arange(len(places)), [len(one.cells) for one in places])
         low = cells.min(axis=0)
@@ -85,8 +88,8 @@ class _Voxels(NamedTuple):
         copies[rank, of[order]] = order
         return cls(place, low, shape, key, copies)
 
-    def met(self, cells: NDArray[np.int64]) -> Index:
-        """Which of the N voxels are among cells (K, 3)."""
+    def find(self, cells: NDArray[np.int64]) -> Index:
+        """Indices of the N voxels that are among cells (K, 3)."""
         inside = ((cells >= self.low) & (cells < self.low + self.shape)).all(axis=1)
         key = np.unique(_keys(cells[inside] - self.low, self.shape))
         at = np.minimum(np.searchsorted(self.key, key), len(self.key) - 1)

@@ -56,7 +56,7 @@ def final_estimate(
     cell, look = options.slam.resolution, options.em.dwell.look
     changed = best.e_step.changed_cells
     if changed is not None:  # 3D: every E-step knows of them
-        changes = detect_changes_3d(changed, deskewed, best.poses, cell, look, options.em.changes)
+        changes = detect_changes_3d(changed, deskewed, best.poses, cell, look)
         return deskewed, best, changes
     if (
         recording.dimension == 3
@@ -73,7 +73,7 @@ def final_estimate(
         return deskewed, best, []
     if best.e_step.occupied is None:
         raise RuntimeError("the default estimator knows its cells")
-    changes = detect_changes(courses, deskewed, cell, look, options.em.changes)
+    changes = detect_changes(courses, deskewed, cell, look)
     p_static, occupied = relabel_changes(
         deskewed,
         best.poses,
@@ -128,7 +128,8 @@ def _project(
     deskewed: Recording, estimate: Estimate, ground: GroundMap, options: Options, threads: int
 ) -> tuple[Recording, Estimate]:
     """A 3D recording and its estimate as planar ones: the obstacles above the ground."""
-    cell, band = options.slam.resolution, options.output.band
+    cell, output = options.slam.resolution, options.output
+    band = (output.min_obstacle_height, output.max_obstacle_height)
     plan = project_to_plane(
         deskewed, estimate.poses, ground, band, cell, open_space=False, threads=threads
     )

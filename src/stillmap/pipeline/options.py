@@ -9,7 +9,6 @@ from stillmap.core.recording import Recording
 from stillmap.em import EmOptions
 from stillmap.em.options import MapState
 from stillmap.io.cameras import depth_camera_names
-from stillmap.mapping.projection import BandOptions
 from stillmap.mesh.options import MeshOptions
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.rig.options import RigOptions
@@ -20,7 +19,7 @@ MapMode = Literal["trinary", "scale", "raw"]
 
 
 @dataclass(frozen=True)
-class OutputOptions:
+class OutputOptions(Section, section="output"):
     """How the result folder is written."""
 
     map_mode: MapMode = option(
@@ -31,7 +30,22 @@ class OutputOptions:
     map_state: MapState = option(
         "last", "of places that changed the map shows the last state, or the one held for longest"
     )
-    band: BandOptions = field(default=BandOptions())
+    min_obstacle_height: float = option(
+        0.2,
+        "Lowest height above the ground, in metres, that counts as an obstacle in the 2D map of 3D "
+        "recordings.",
+        ge=0.0,
+    )
+    max_obstacle_height: float = option(
+        1.8, "Greatest height above the ground, in metres, that counts as an obstacle.", le=100.0
+    )
+
+    def check(self) -> None:
+        """Refuses an empty band of heights."""
+        if not self.min_obstacle_height < self.max_obstacle_height:
+            raise ValueError(
+                "'output.min_obstacle_height' must be less than 'output.max_obstacle_height'"
+            )
 
 
 @dataclass(frozen=True)

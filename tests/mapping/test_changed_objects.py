@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_up_courses import RESOLUTION, block, course, found, recording
+from synthetic_histories import RESOLUTION, block, course, found, recording
 
 from stillmap.core import se2
 from stillmap.mapping import find_changed_object_beams

@@ -4,9 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from made_up_courses import EVERY_SECOND, S, course, recording, seconds, together
+from synthetic_histories import EVERY_SECOND, S, course, recording, seconds, together
 
-from stillmap import em
 from stillmap.core.recording import Recording
 from stillmap.em.changepoints import select_changed_cells
 from stillmap.mapping import Change, detect_changes_3d
@@ -45,7 +44,7 @@ def things(*parts, seen=None):
         seen = watching(courses.cells, (0, 99))
     poses = np.tile(np.eye(4), (seen.n_scans, 1, 1))
     changed = select_changed_cells(courses)
-    return detect_changes_3d(changed, seen, poses, VOXEL, 1.0, em.ChangeOptions())
+    return detect_changes_3d(changed, seen, poses, VOXEL, 1.0)
 
 
 def test_a_car_that_left_is_one_place_in_space():

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from made_up_courses import RESOLUTION, block, course, found, recording, seconds
+from synthetic_histories import RESOLUTION, block, course, found, recording, seconds
 
-from stillmap import em
 from stillmap.mapping import detect_changes
 
 BOX = block(10, 20, 4, 3)
@@ -227,7 +226,7 @@ def test_nothing_changed():
     assert found(course(BOX, True, count=0)) == []
     one = recording([0.0])
     nothing = course(np.empty((0, 2)), True)
-    assert detect_changes(nothing, one, RESOLUTION, 0.5, em.ChangeOptions()) == []
+    assert detect_changes(nothing, one, RESOLUTION, 0.5) == []
 
 
 def test_one_change_of_a_cell_alone():

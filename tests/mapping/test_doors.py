@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from made_up_courses import RESOLUTION, block, course, found
+from synthetic_histories import RESOLUTION, block, course, found
 
 from stillmap.mapping import compute_swept_cells
 from stillmap.mapping.doors import _sector

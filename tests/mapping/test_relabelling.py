@@ -4,12 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from made_up_courses import RESOLUTION, block, course, recording
+from synthetic_histories import RESOLUTION, block, course, recording
 
 from stillmap import em
-from stillmap.core import se2
+from stillmap.core import chunks, se2
 from stillmap.core.recording import Recording
-from stillmap.em import observations
 from stillmap.em.observations import build_surfel_map
 from stillmap.mapping import Change, relabel_changes
 
@@ -128,7 +127,7 @@ def test_what_it_is_given_stays_as_it_was(known):
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_pieces_and_threads_change_no_bit(known, monkeypatch, beams, threads):
     one, of_one = known.relabelled()
-    monkeypatch.setattr(observations, "CHUNK_BEAMS", beams)
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
     other, of_other = known.relabelled(threads=threads)
     assert one.tobytes() == other.tobytes()
     assert of_one.p_occupied.tobytes() == of_other.p_occupied.tobytes()

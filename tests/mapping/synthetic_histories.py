@@ -2,16 +2,18 @@
 
 from collections.abc import Sequence
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
 from stillmap import em
 from stillmap.core.recording import Recording
-from stillmap.mapping import Change, detect_changes
+from stillmap.mapping import Change, change_detection, detect_changes
 
 RESOLUTION = 0.1
 S = 10**9
 NEVER = (-1, -1)
+_CONSTANTS = {"near": "_LINK_DISTANCE", "together": "_MAX_TIME_GAP", "least": "_MIN_CELLS"}
 Between = tuple[int, int]
 
 
@@ -54,7 +56,7 @@ def together(*parts: em.CellHistories) -> em.CellHistories:
         **{
             name: np.concatenate([getattr(part, name) for part in parts])
             for name in em.CellHistories.__dataclass_fields__
-            if name not in ("share", "surface")
+            if name not in ("changing_weight", "surfel_map")
         },
         changing_weight=0.1,
         surfel_map=None,
@@ -81,8 +83,10 @@ EVERY_SECOND = recording(range(100))
 def found(
     *parts: em.CellHistories, seen: Recording = EVERY_SECOND, look: float = 1.0, **options: Any
 ) -> list[Change]:
-    """The places that changed, by default with a look in every second."""
-    return detect_changes(together(*parts), seen, RESOLUTION, look, em.ChangeOptions(**options))
+    """The changed places, by default with a time bin per second; `options` name constants."""
+    constants = {_CONSTANTS[name]: value for name, value in options.items()}
+    with mock.patch.multiple(change_detection, **constants):
+        return detect_changes(together(*parts), seen, RESOLUTION, look)
 
 
 def seconds(change: Change) -> tuple[float, float, float]:

@@ -1,0 +1,90 @@
+"""Beams that ended on objects which arrived or departed, while those stood there."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # its parts load when they are first used
+from numpy.typing import NDArray
+
+from stillmap.core.arrays import ArrayBuilder, iter_blocks
+from stillmap.core.recording import Recording
+from stillmap.mapping.change_detection import Change
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+def find_changed_object_beams(
+    recording: Recording,
+    poses: Float,
+    p_static: NDArray[np.float32],
+    changes: list[Change],
+    resolution: float,
+) -> Index:
+    """(n,) dynamic beams, rising, that ended on an object while it stood in a changed place.
+
+    Recurring changes other than doors are left out: they may be people who wait there.
+    """
+    stays = [
+        _Stay.from_change(one, changes)
+        for one in changes
+        if one.kind != "comes and goes" or len(one.swept_cells) != len(one.cells)
+    ]
+    found = ArrayBuilder(np.intp, (), recording.scratch)
+    for block in iter_blocks(recording.hit, p_static) if stays else ():
+        beam = block.start + np.flatnonzero(recording.hit[block] & (p_static[block] < 0.5))
+        ends, scan = recording.end_points(beam, poses), recording.scans_of(beam)
+        cells, stamp = np.floor(ends / resolution).astype(np.int64), recording.stamp_ns[scan]
+        on_object = np.zeros(len(beam), bool)
+        for stay in stays:
+            inside = np.flatnonzero(stay.bounds(cells, stamp))
+            on_object[inside] |= stay.mask[tuple((cells[inside] - stay.low).T)]
+        found.append(beam[on_object])
+    return found.finish()
+
+
+class _Stay(NamedTuple):
+    """An object at rest: after `since` and until `until` (ns), in a mask of cells from `low` on."""
+
+    since: int
+    until: int
+    low: NDArray[np.int64]
+    mask: NDArray[np.bool_]
+
+    @classmethod
+    def from_change(cls, change: Change, changes: list[Change]) -> "_Stay":
+        low, high = change.cells.min(axis=0) - 1, change.cells.max(axis=0) + 2
+        mask = np.zeros(tuple((high - low).tolist()), bool)
+        mask[tuple((change.cells - low).T)] = True
+        grown = scipy.ndimage.binary_dilation(mask, np.ones((3, 3), bool))
+        return cls(*_stay_span(change, changes), low, grown)
+
+    def bounds(self, cells: NDArray[np.int64], stamp: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(n,) whether cells (n, 2) at stamps (n,) lie within the mask's box during the stay."""
+        inside = ((cells >= self.low) & (cells < self.low + self.mask.shape)).all(axis=1)
+        return np.asarray(inside & (stamp > self.since) & (stamp <= self.until))
+
+
+def _stay_span(change: Change, changes: list[Change]) -> tuple[int, int]:
+    """The stamps after which and until which an object stood there, as far as is known."""
+    limits = np.iinfo(np.int64)
+    since, until = limits.min, limits.max
+    if change.kind == "came":
+        since = change.before_ns
+        left = [one.before_ns for one in changes if one.kind == "left" and _overlap(one, change)]
+        until = min((stamp for stamp in left if stamp > since), default=until)
+    elif change.kind == "left":
+        until = change.before_ns
+        came = [one.before_ns for one in changes if one.kind == "came" and _overlap(one, change)]
+        since = max((stamp for stamp in came if stamp < until), default=since)
+    return since, until
+
+
+def _overlap(one: Change, other: Change) -> bool:
+    """Whether the larger of two places holds more than half of the smaller."""
+    distance = np.abs([one.x - other.x, one.y - other.y])
+    if np.any(distance > np.array(one.size) + np.array(other.size)):
+        return False
+    smaller, larger = sorted((one.cells, other.cells), key=len)
+    distances, _ = scipy.spatial.cKDTree(larger).query(smaller)
+    return bool(np.mean(distances < 0.5) > 0.5)
