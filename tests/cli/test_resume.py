@@ -14,9 +14,9 @@ import time
 import numpy as np
 import pytest
 
-from stillmap.pipeline import checkpoint, result
+from stillmap.pipeline import checkpoint, em_loop
 from stillmap.pipeline.em_loop import iterate
-from stillmap.results import points as points_module
+from stillmap.results import labels
 
 WORDS = ("--set", "em.max_iterations=4", "--set", "em.patience=9", "--set", "em.tolerance=0")
 WORDS += ("--set", "em.settled=0", "--threads", "1")
@@ -61,14 +61,14 @@ def stop_after(monkeypatch):
                     raise KeyboardInterrupt
                 yield iteration
 
-        monkeypatch.setattr(result.pipeline, "iterate", stopped if number < ALL else iterate)
+        monkeypatch.setattr(em_loop, "iterate", stopped if number < ALL else iterate)
 
     return stop
 
 
 @pytest.fixture
 def interrupted(call, room, tmp_path, stop_after):
-    """The place of a run that was stopped after two iterations."""
+    """The checkpoint folder of a run that was stopped after two iterations."""
     stop_after(2)
     done = call("map", room, "-o", tmp_path / "out", *WORDS)
     assert done.returncode == 130
@@ -87,7 +87,7 @@ def test_the_result_is_that_of_a_run_nobody_stopped(
     stop_after(ALL)
     done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
     assert done.returncode == 0, done.stderr
-    assert f"goes on after iteration {number}" in done.stderr
+    assert f"continues after iteration {number}" in done.stderr
     assert contents(tmp_path / "out") == whole
     assert os.listdir(tmp_path) == ["out"]
 
@@ -137,7 +137,7 @@ def test_nothing_to_resume_simply_starts(call, room, tmp_path, whole):
 def test_without_resume_it_begins_anew_and_says_so(call, room, tmp_path, interrupted, whole):
     done = call("map", room, "-o", tmp_path / "out", *WORDS)
     assert done.returncode == 0
-    assert "begins anew" in done.stderr
+    assert "starts anew" in done.stderr
     assert not interrupted.exists()
     assert contents(tmp_path / "out") == whole
 
@@ -174,7 +174,7 @@ def test_the_same_recording_elsewhere_will_do(call, room, tmp_path, interrupted)
     shutil.copytree(room, tmp_path / "moved")
     done = call("map", tmp_path / "moved", "-o", tmp_path / "out", "--resume", *WORDS)
     assert done.returncode == 0
-    assert "goes on after iteration 2" in done.stderr
+    assert "continues after iteration 2" in done.stderr
     assert not interrupted.exists()
 
 
@@ -198,7 +198,7 @@ def cut(path) -> None:
 
 
 @pytest.mark.parametrize("damage", [flip, cut, os.remove])
-@pytest.mark.parametrize("name", ["state.json", "best.poses.npy", "e-2.npy"])
+@pytest.mark.parametrize("name", ["state.json", "best.m_step.poses.npy", "e-2.npy"])
 def test_a_damaged_checkpoint_is_named_and_begun_anew(
     call, room, tmp_path, interrupted, whole, damage, name
 ):
@@ -206,7 +206,7 @@ def test_a_damaged_checkpoint_is_named_and_begun_anew(
     done = call("map", room, "-o", tmp_path / "out", "--resume", *WORDS)
     assert done.returncode == 0
     assert f"iteration-2/{name}" in done.stderr
-    assert "begins anew" in done.stderr
+    assert "starts anew" in done.stderr
     assert contents(tmp_path / "out") == whole
 
 
@@ -260,7 +260,7 @@ def test_a_full_disk_leaves_the_earlier_result(call, room, tmp_path, whole, monk
     out.mkdir()
     (out / "run.json").write_text("old")
     with monkeypatch.context() as here:
-        here.setattr(points_module, "write_npy", _Full(points_module.write_npy, 2))
+        here.setattr(labels, "write_npy", _Full(labels.write_npy, 2))
         done = call("map", room, "-o", out, "--overwrite", "--quiet", *WORDS)
     assert done.returncode == 2
     assert "No space left" in done.stderr

@@ -267,9 +267,9 @@ def test_fixed_poses_are_kept_and_the_bound_never_falls(room, estimator):
     previous = -np.inf
     bounds = []
     for it in stillmap.iterate(room.recording, options(estimator, max_iterations=8), poses=poses):
-        np.testing.assert_array_equal(it.poses, poses)
-        assert it.likelihood.bound >= previous - 1e-6 * abs(previous)
-        previous = it.likelihood.bound
+        np.testing.assert_array_equal(it.estimate.poses, poses)
+        assert it.estimate.bound >= previous - 1e-6 * abs(previous)
+        previous = it.estimate.bound
         bounds.append(previous)
     assert len(bounds) == 8
     if estimator == "stillmap":  # looks only at where beams ended: poses are all that matters
@@ -295,7 +295,7 @@ def test_one_e_step_of_all_ones_is_the_raw_map(room):
 def same(a, b):
     for x, y in (
         (a.poses, b.poses),
-        (a.covariance, b.covariance),
+        (a.estimate.m_step.covariance, b.estimate.m_step.covariance),
         (a.p_static, b.p_static),
         (a.map.alpha, b.map.alpha),
         (a.map.beta, b.map.beta),

@@ -9,7 +9,7 @@ import pytest
 import stillmap
 from stillmap.core import arrays
 from stillmap.core.config import replaced
-from stillmap.em import observations
+from stillmap.core import chunks
 from stillmap.results.save import save
 
 ESTIMATORS = ("stillmap", "paper", "hit-ratio", "tracker")
@@ -51,6 +51,6 @@ def test_pieces_of_any_size_give_the_same_bytes(swept, estimator, tmp_path, monk
     whole = files_of(swept, estimator, tmp_path / "whole")
     monkeypatch.setattr(arrays, "MAX_BYTES_IN_MEMORY", 0)
     monkeypatch.setattr(arrays, "BLOCK", 1000)
-    monkeypatch.setattr(observations, "CHUNK_BEAMS", 700)
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", 700)
     monkeypatch.setattr(arrays, "ITEMS_PER_RELEASE", 3)
     assert files_of(swept, estimator, tmp_path / "pieces") == whole

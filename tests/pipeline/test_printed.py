@@ -6,8 +6,7 @@ import pytest
 import stillmap
 from stillmap import em, slam
 from stillmap.core.config import replaced
-from stillmap.pipeline import em_loop
-from stillmap.pipeline.options import Options
+from stillmap.pipeline.options import Options, resolved
 
 SLAM = slam.SlamOptions()
 
@@ -24,7 +23,7 @@ def options(estimator="paper", loops=True, **registration):
 
 def everything(result):
     numbers = [(it.bound, it.expected_log_likelihood, it.changed_share) for it in result.iterations]
-    arrays = (result.poses, result.covariance, result.p_static)
+    arrays = (result.poses, result.estimate.m_step.covariance, result.p_static)
     maps = [m for o in (result.map, result.raw_map) for m in (o.p_occupied, o.alpha, o.beta)]
     return numbers, result.best_iteration, [a.tobytes() for a in (*arrays, *maps)]
 
@@ -57,13 +56,13 @@ def test_it_is_the_loop_of_fig_2(room):
     n = 0
     for it in stillmap.iterate(r, chosen):
         mapped = slam.m_step(r, e, plain, None, 1, lambda *_: None)
-        np.testing.assert_array_equal(it.poses, mapped.poses)
-        np.testing.assert_array_equal(it.covariance, mapped.covariance)
-        for ours, theirs in zip(it.grid.dense(), mapped.grid.dense(), strict=True):
+        np.testing.assert_array_equal(it.estimate.poses, mapped.poses)
+        np.testing.assert_array_equal(it.estimate.m_step.covariance, mapped.covariance)
+        for ours, theirs in zip(it.estimate.m_step.grid.dense(), mapped.grid.dense(), strict=True):
             np.testing.assert_array_equal(ours, theirs)
         found = em.e_step(r, mapped.poses, mapped.grid, "paper", chosen.em)
-        np.testing.assert_array_equal(it.p_static, found.p_static)
-        assert it.likelihood == found.likelihood
+        np.testing.assert_array_equal(it.estimate.p_static, found.p_static)
+        assert it.estimate.e_step.likelihood == found.likelihood
         e = found.p_static
         n += 1
     assert n == 3
@@ -83,4 +82,4 @@ def test_the_options_that_are_kept_are_those_that_were_used(printed):
     }
     assert replaced(printed.options, {"slam": rest}) == options()
     for estimator in ("stillmap", "hit-ratio", "tracker"):
-        assert em_loop.resolved(options(estimator), printed.recording) == options(estimator)
+        assert resolved(options(estimator), printed.recording) == options(estimator)

@@ -42,30 +42,24 @@ def leaping(room):
     return dataclasses.replace(room.recording, T_odom_base=T)
 
 
-def of_iteration(it):
-    d = it.doubts
-    doubts = d.widened, d.disagreeing, d.breaks, d.apart
-    return slam.MStepResult(it.poses, it.covariance, it.grid, it.explained, *doubts)
-
-
 def test_from_the_third_on_poses_are_those_of_the_one_before_swept(leaping):
     before = None
     for it in stillmap.iterate(leaping, CHOSEN):
-        start = of_iteration(before) if it.number > 2 else None
+        start = before.estimate.m_step if it.estimate.number > 2 else None
         mapped = slam.m_step(
-            leaping, it.weights, CHOSEN.slam, None, 1, lambda *_: None, start=start
+            leaping, it.estimate.weights, CHOSEN.slam, None, 1, lambda *_: None, start=start
         )
-        np.testing.assert_array_equal(it.poses, mapped.poses)
-        np.testing.assert_array_equal(it.covariance, mapped.covariance)
+        np.testing.assert_array_equal(it.estimate.poses, mapped.poses)
+        np.testing.assert_array_equal(it.estimate.m_step.covariance, mapped.covariance)
         before = it
 
 
 def test_what_was_hard_to_place_is_still_told_after_a_sweep(leaping):
-    found = list(stillmap.iterate(leaping, CHOSEN))
+    found = [it.estimate for it in stillmap.iterate(leaping, CHOSEN)]
     assert len(found) == 4
-    assert 30 in found[1].doubts.widened
-    assert found[1].loops
+    assert 30 in found[1].m_step.diagnostics.widened
+    assert found[1].m_step.loops
     for it in found[2:]:
-        assert it.doubts.widened == found[1].doubts.widened
-        assert it.loops == found[1].loops
-        np.testing.assert_array_equal(it.explained, found[1].explained)
+        assert it.m_step.diagnostics.widened == found[1].m_step.diagnostics.widened
+        assert it.m_step.loops == found[1].m_step.loops
+        np.testing.assert_array_equal(it.m_step.explained, found[1].m_step.explained)
