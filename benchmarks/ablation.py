@@ -29,7 +29,7 @@ from tables import markdown
 
 from stillmap.em import EmOptions, occupancy_hmm
 from stillmap.em.observations import LOOP_CLASSES, HmmClasses
-from stillmap.eval.labels import LabelScores, label_scores
+from stillmap.eval.labels import LabelScores, score_labels
 from stillmap.sim import simulate
 
 _NONE = 1e-6  # scatters: as good as none; half a cell remains where noise is not the reason
@@ -85,7 +85,7 @@ def scores_of(run: Run) -> list[LabelScores]:
         occupancy_hmm.e_step(recording, poses, RESOLUTION, v.options(options.em), 1, v.classes)
         for v in VARIANTS
     )
-    return [label_scores(e.p_static, truth.static, scored) for e in found]
+    return [score_labels(e.p_static, truth.static, scored) for e in found]
 
 
 def table(runs: Sequence[Sequence[LabelScores]]) -> str:

@@ -23,7 +23,7 @@ from prepared import RESOLUTION, counts
 from tables import grouped, markdown
 
 from stillmap.core.recording import Recording
-from stillmap.eval.labels import UNSURE, calibration_error, equal_mass_bins
+from stillmap.eval.labels import UNSURE, assign_equal_mass_bins, compute_calibration_error
 from stillmap.sim import simulate
 
 Float = NDArray[np.float64]
@@ -156,7 +156,7 @@ def _tables(beams: Beams) -> Iterator[str]:
     yield _split_table("P(static)", beams, beams.p, FIXED)
     unsure = beams.of(_is_unsure(beams.p))
     yield f"Equal-mass bins of the {len(unsure.p)} unsure beams, {UNSURE[0]} < P < {UNSURE[1]}:"
-    of_bin = equal_mass_bins(unsure.p) if len(unsure.p) else np.empty(0, np.intp)
+    of_bin = assign_equal_mass_bins(unsure.p) if len(unsure.p) else np.empty(0, np.intp)
     lines = [_line(str(k + 1), unsure.of(of_bin == k)) for k in np.unique(of_bin).tolist()]
     yield markdown(_HEADER, lines)
     for title, name, edges in SPLITS:
@@ -208,7 +208,7 @@ def _is_unsure(p: Float) -> NDArray[np.bool_]:
 
 
 def _ece(beams: Beams) -> float:
-    return calibration_error(beams.p, beams.static, equal_mass_bins(beams.p))
+    return compute_calibration_error(beams.p, beams.static, assign_equal_mass_bins(beams.p))
 
 
 def if_calibrated(beams: Beams, rng: np.random.Generator) -> float:
@@ -216,8 +216,8 @@ def if_calibrated(beams: Beams, rng: np.random.Generator) -> float:
     cells, cell = np.unique(beams.cell, return_inverse=True)
     mean = np.bincount(cell, beams.p) / np.bincount(cell)
     drawn = (rng.random((_DRAWS, len(cells))) < mean)[:, cell]
-    of_bin = equal_mass_bins(beams.p)
-    return float(np.mean([calibration_error(beams.p, static, of_bin) for static in drawn]))
+    of_bin = assign_equal_mass_bins(beams.p)
+    return float(np.mean([compute_calibration_error(beams.p, static, of_bin) for static in drawn]))
 
 
 def _by_run(runs: Sequence[tuple[str, Beams]]) -> Iterator[str]:

@@ -23,8 +23,8 @@ from prepared import grid_of
 from tables import Column, means_and_worst
 
 import stillmap
-from stillmap.eval.changes import Beams, Stay, change_scores, change_time_errors, true_changes
-from stillmap.eval.trajectory import absolute_errors, align
+from stillmap.eval.changes import Beams, Stay, list_true_changes, score_change_times, score_changes
+from stillmap.eval.trajectory import align, compute_absolute_errors
 from stillmap.mapping import Change
 from stillmap.results.reader import moved
 from stillmap.sim import Simulation, simulate
@@ -65,16 +65,16 @@ def scores_of(result: stillmap.Result, simulation: Simulation) -> Scores:
     """Scores of the map and the changes of one result."""
     truth, stays, beams = simulation.truth, stays_of(simulation), beams_of(simulation)
     T_world_map = align(result.poses, truth.T_world_base)
-    of_map = change_scores(grid_of(result.map), stays, beams, truth.walls, T_world_map)
+    of_map = score_changes(grid_of(result.map), stays, beams, truth.walls, T_world_map)
     found = _of_things(result.changes, simulation, T_world_map)
-    times = change_time_errors(found, true_changes(stays, beams), T_world_map)
+    times = score_change_times(found, list_true_changes(stays, beams), T_world_map)
     off = np.array(times.errors)
     return {
         **asdict(of_map),
         **{name: getattr(times, name) for name in ("seen", "found", "missed", "false")},
         "in_time": float(np.mean(off <= _IN_TIME)) if len(off) else float("nan"),
         "largest_error": float(off.max()) if len(off) else float("nan"),
-        "ate": absolute_errors(result.poses, truth.T_world_base).rmse,
+        "ate": compute_absolute_errors(result.poses, truth.T_world_base).rmse,
     }
 
 
@@ -98,7 +98,7 @@ def stays_of(simulation: Simulation) -> list[Stay]:
     return [
         Stay(
             mover=number,
-            middle=np.array([stay.x, stay.y]),
+            center=np.array([stay.x, stay.y]),
             faces=standing(thing, stay),
             since_ns=None if stay.since <= 0 else begin + round(1e9 * stay.since),
             until_ns=None if stay.until is None else begin + round(1e9 * stay.until),

@@ -20,9 +20,9 @@ from seeds import REPORTING, TUNING
 import stillmap
 from stillmap import em
 from stillmap.core import config
-from stillmap.eval.labels import label_scores
-from stillmap.eval.map import map_scores
-from stillmap.eval.trajectory import absolute_errors, align
+from stillmap.eval.labels import score_labels
+from stillmap.eval.map import score_map
+from stillmap.eval.trajectory import align, compute_absolute_errors
 
 METHODS: dict[str, dict[str, Any]] = {
     "stillmap": {"estimator": "stillmap"},
@@ -161,10 +161,10 @@ def scores(
 ) -> Scores:
     """Labels against the truth, the map against the true walls, poses against the true ones."""
     truth, hit = run.simulation.truth, run.simulation.recording.hit
-    labels = label_scores(p_static, truth.static, hit)
+    labels = score_labels(p_static, truth.static, hit)
     T_world_map, grid = align(poses, truth.T_world_base), grid_of(occupancy)
-    on_map = map_scores(grid, truth.walls, run.walls_without_people, T_world_map)
-    at_best = map_scores(grid, truth.walls, run.walls_at_best, T_world_map)
+    on_map = score_map(grid, truth.walls, run.walls_without_people, T_world_map)
+    at_best = score_map(grid, truth.walls, run.walls_at_best, T_world_map)
     return {
         **_by_mover(p_static, run),
         "ap": labels.average_precision,
@@ -182,7 +182,7 @@ def scores(
         "walls_at_best": at_best.walls_kept,
         "ghosts_of_truth": run.of_truth.ghosts_per_100_m2,
         "walls_of_truth": run.of_truth.walls_kept,
-        "ate": absolute_errors(poses, truth.T_world_base).rmse,
+        "ate": compute_absolute_errors(poses, truth.T_world_base).rmse,
         "called_dynamic": labels.share_called_dynamic,
         "dynamic": labels.dynamic / max(labels.hits, 1),
     }
@@ -192,7 +192,7 @@ def _by_mover(p_static: NDArray[np.floating], run: Prepared) -> Scores:
     """Recall by what moved, and scores without the beams on what stands still for long."""
     truth, hit = run.simulation.truth, run.simulation.recording.hit
     kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
-    without = label_scores(p_static, truth.static, hit & ~np.isin(kinds, LASTING))
+    without = score_labels(p_static, truth.static, hit & ~np.isin(kinds, LASTING))
     found = p_static < 0.5
     named = {"people": ["person"], "doors": ["door"], "vehicles": _VEHICLES, "things": ["thing"]}
     recall = {

@@ -27,7 +27,7 @@ from tables import Column, Row, grouped, markdown
 
 import stillmap
 from stillmap import em, slam
-from stillmap.eval.relations import relation_errors
+from stillmap.eval.relations import compute_relation_errors
 from stillmap.pipeline import em_loop
 from stillmap.sim import simulate
 
@@ -125,7 +125,7 @@ def _log_scores(recording: stillmap.Recording, log: Path) -> Callable[[Float], R
     relations = known_relations(log, recording.stamp_ns)
 
     def scores(poses: Float) -> Row:
-        errors = relation_errors(timed_poses(recording.stamp_ns, poses), relations)
+        errors = compute_relation_errors(timed_poses(recording.stamp_ns, poses), relations)
         t, r = errors.translation, errors.rotation
         means = {"translation": t.mean, "rotation": r.mean}
         return {**means, "translation_max": t.max, "rotation_max": r.max}

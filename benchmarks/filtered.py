@@ -24,7 +24,7 @@ from prepared import Prepared, grid_of, prepare
 from tables import Column, Row, grouped, markdown
 
 import stillmap
-from stillmap.eval.map import map_scores
+from stillmap.eval.map import score_map
 from stillmap.eval.trajectory import align
 
 COLUMNS = (
@@ -107,7 +107,7 @@ def _scores(result: stillmap.Result, run: Prepared) -> Scores:
     truth = run.simulation.truth
     T_world_map = align(result.poses, truth.T_world_base)
     grid = grid_of(result.map)
-    on_map = map_scores(grid, truth.walls, run.walls_without_people, T_world_map)
+    on_map = score_map(grid, truth.walls, run.walls_without_people, T_world_map)
     stamps = run.simulation.recording.stamp_ns
     return {
         **pose_scores(stamps, result.poses, truth.T_world_base),

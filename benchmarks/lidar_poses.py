@@ -32,11 +32,11 @@ from tables import markdown
 
 from stillmap.core import config, se2, se3
 from stillmap.core.recording import Recording
-from stillmap.eval.trajectory import absolute_errors, relative_errors
+from stillmap.eval.trajectory import compute_absolute_errors, compute_relative_errors
 from stillmap.io.registry import read
 from stillmap.pipeline.options import Options
-from stillmap.preprocessing import laser_scan
 from stillmap.preprocessing.options import ReadOptions
+from stillmap.preprocessing.scan_timing import add_beam_times
 from stillmap.sim import load_truth
 from stillmap.sim.truth import FOLDER
 from stillmap.slam import lidar_odometry
@@ -73,9 +73,7 @@ def case_of(path: Path, odometry: bool, azimuth: bool) -> Case:
     if not odometry:
         recording = recording.without_odometry()
     if azimuth:
-        recording = laser_scan.add_beam_times(
-            recording, ReadOptions(spin="clockwise", spin_stamp=0.0)
-        )
+        recording = add_beam_times(recording, "clockwise", stamp_azimuth=0.0)
     return Case(path.name, recording, truth, e)
 
 
@@ -160,12 +158,12 @@ def row(case: Case, method: str, poses: Float, seconds: float, after: float) -> 
     """The figures of poses (T, 4, 4) at times `after` the stamps."""
     recording = case.recording
     truth = later(case.truth, recording.stamp_ns, after) if after else case.truth
-    relative = relative_errors(poses, truth)
+    relative = compute_relative_errors(poses, truth)
     across = scatter(recording, poses) if recording.beam_time is None else float("nan")
     return [
         case.name,
         method,
-        f"{absolute_errors(poses, truth).rmse:.4f}",
+        f"{compute_absolute_errors(poses, truth).rmse:.4f}",
         f"{relative.translation.rmse:.4f}",
         f"{relative.rotation.rmse:.3f}",
         "" if np.isnan(across) else f"{1e3 * across:.1f}",

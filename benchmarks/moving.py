@@ -23,7 +23,12 @@ from tables import Column, means_and_worst
 import stillmap
 from stillmap.core import se2
 from stillmap.core.profiling import StageTimer
-from stillmap.eval.objects import object_scores, rank_correlation, sightings, true_traffic
+from stillmap.eval.objects import (
+    compute_rank_correlation,
+    compute_true_flow_map,
+    find_sightings,
+    score_objects,
+)
 from stillmap.eval.trajectory import align
 from stillmap.sim import Simulation, simulate
 from stillmap.tracking import compute_flow_map
@@ -67,7 +72,7 @@ def scores_of(result: stillmap.Result, simulation: Simulation) -> Scores:
     seconds = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
     kinds = np.array(truth.scene["mover_kinds"], dtype=object)
     people = np.flatnonzero(kinds == "person").tolist()
-    found = object_scores(
+    found = score_objects(
         result.objects, truth.mover, truth.movers, recording.offset, seconds, people
     )
     way = np.linalg.norm(np.diff(truth.T_world_base[:, :2, 2], axis=0), axis=1).sum()
@@ -88,10 +93,10 @@ def _of_traffic(
     T_map_world = se2.inverse(align(result.poses, truth.T_world_base))
     # things do not go anywhere
     everyone = [k for k, kind in enumerate(truth.scene["mover_kinds"]) if kind != "thing"]
-    seen = sightings(truth.mover, recording.offset, seconds, everyone, _SEEN)
-    true = true_traffic(seen, truth.movers, recording.stamp_ns, T_map_world, size)
+    seen = find_sightings(truth.mover, recording.offset, seconds, everyone, _SEEN)
+    true = compute_true_flow_map(seen, truth.movers, recording.stamp_ns, T_map_world, size)
     grid = grid_of(result.map)
-    return rank_correlation(
+    return compute_rank_correlation(
         compute_flow_map(result.objects, size), true, grid.centres(np.argwhere(grid.free))
     )
 

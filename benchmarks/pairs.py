@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from stillmap.core import se2
-from stillmap.eval.readers import read_relations, seconds
-from stillmap.eval.relations import RelationErrors, relation_errors
+from stillmap.eval.readers import read_relations, to_seconds
+from stillmap.eval.relations import RelationErrors, compute_relation_errors
 from stillmap.sim import load_truth
 from stillmap.sim.truth import FOLDER
 
@@ -46,7 +46,7 @@ def near_pairs(
 
 def timed_poses(stamp_ns: NDArray[np.int64], poses: Float) -> Float:
     """(T, 4) t, x, y, theta in seconds, metres, radians."""
-    return np.column_stack([seconds(stamp_ns), se2.parameters(poses)])
+    return np.column_stack([to_seconds(stamp_ns), se2.parameters(poses)])
 
 
 def relations_of(stamp_ns: NDArray[np.int64], truth: Float, first: Index, second: Index) -> Float:
@@ -61,7 +61,7 @@ def errors_of(
 ) -> RelationErrors:
     """What poses (T, 3, 3) make of the true displacements between scans."""
     relations = relations_of(stamp_ns, truth, first, second)
-    return relation_errors(timed_poses(stamp_ns, poses), relations)
+    return compute_relation_errors(timed_poses(stamp_ns, poses), relations)
 
 
 def name_of(recording: Path) -> str:

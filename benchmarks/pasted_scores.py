@@ -26,7 +26,7 @@ from stillmap.core import camera as camera_module
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.eval import mesh_distance
-from stillmap.eval.mesh import GREY, SAMPLES, Pictures, Record, shown
+from stillmap.eval.mesh import GREY, SAMPLES, TextureRecord, TrueImages, look_up_texture_source
 from stillmap.eval.model_readers import RECORD, read_record
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.texture.visibility import find_visible_faces
@@ -65,7 +65,7 @@ class Scores(NamedTuple):
     person: float
 
 
-def scores(record: Record, images: Images, people: Mask) -> Scores:
+def scores(record: TextureRecord, images: Images, people: Mask) -> Scores:
     """Score what paints a mesh.
 
     Args:
@@ -80,12 +80,14 @@ def scores(record: Record, images: Images, people: Mask) -> Scores:
     def distance(image: int) -> NDArray[np.float32]:
         raise NotImplementedError("how far pixels see is not looked up")
 
-    at = mesh_distance.samples(record.vertices, record.faces, SAMPLES)
+    at = mesh_distance.sample_surface(record.vertices, record.faces, SAMPLES)
     places = np.full((len(images), 4, 4), np.nan)
-    shows = shown(record, at, Pictures(images.cameras, images.camera, places, mask, distance))
+    shows = look_up_texture_source(
+        record, at, TrueImages(images.cameras, images.camera, places, mask, distance)
+    )
     painted, free = shows != GREY, _free(record, at, images, people)
     return Scores(
-        area=float(mesh_distance.areas(record.vertices, record.faces).sum()),
+        area=float(mesh_distance.triangle_areas(record.vertices, record.faces).sum()),
         painted=_mean(painted),
         free=_mean(free),
         covered=_mean(painted[free]),
@@ -93,7 +95,9 @@ def scores(record: Record, images: Images, people: Mask) -> Scores:
     )
 
 
-def _free(record: Record, at: mesh_distance.Samples, images: Images, people: Mask) -> Mask:
+def _free(
+    record: TextureRecord, at: mesh_distance.SurfaceSamples, images: Images, people: Mask
+) -> Mask:
     """(n,) whether a picture that sees a sample's whole face shows no person there."""
     out, mesh = np.zeros(len(at.face), bool), Mesh(record.vertices, record.faces)
     for image, T in enumerate(record.T_camera_model):

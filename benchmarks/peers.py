@@ -31,8 +31,8 @@ from real_logs import split
 from tables import markdown
 
 import stillmap
-from stillmap.eval.readers import read_planar
-from stillmap.eval.relations import RelationErrors, relation_errors
+from stillmap.eval.readers import read_planar_trajectory
+from stillmap.eval.relations import RelationErrors, compute_relation_errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ def by_stillmap(recording: Path, out: Path, flags: Sequence[str]) -> Found:
     command = [sys.executable, "-m", "stillmap", "map", str(recording), "-o", str(out)]
     _, cpu = timed([*command, "--overwrite", "--quiet", "--threads", "1", *flags])
     run = json.loads((out / "run.json").read_text())
-    return Found(read_planar(out / "trajectory.tum"), run["cpu_seconds"]["m_step"], cpu)
+    return Found(read_planar_trajectory(out / "trajectory.tum"), run["cpu_seconds"]["m_step"], cpu)
 
 
 def table(logs: Sequence[Path], some: dict[str, Method], rounds: int, work: Path) -> str:
@@ -101,7 +101,7 @@ def table(logs: Sequence[Path], some: dict[str, Method], rounds: int, work: Path
             failed = next(one for one in of_rounds if not isinstance(one, Found))
             lines.append([*about, str(failed), *["-"] * (len(_HEADER) - 4)])
             continue
-        errors = relation_errors(done[0].trajectory, known_relations(log, stamp_ns))
+        errors = compute_relation_errors(done[0].trajectory, known_relations(log, stamp_ns))
         cpu = [[one.poses_cpu for one in done], [one.process_cpu for one in done]]
         per_scan = [f"{1e3 * statistics.median(s) / len(stamp_ns):.2f}" for s in cpu]
         lines.append([*about, *shown(errors), *per_scan])

@@ -41,7 +41,7 @@ import stillmap
 from stillmap import slam
 from stillmap.core import se2
 from stillmap.core.profiling import peak_memory_bytes
-from stillmap.eval.trajectory import absolute_errors
+from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.sim import load_truth, simulate, write_simulation
 from stillmap.slam.local_map import travelled_distance
 
@@ -211,7 +211,7 @@ def pose_scores(stamp_ns: NDArray[np.int64], poses: Float, truth: Float) -> Scor
         "again": errors(first[again], second[again]).translation.mean,
         "rotation": near.rotation.mean,
         "rotation_max": near.rotation.max,
-        "ate": absolute_errors(poses, truth).rmse,
+        "ate": compute_absolute_errors(poses, truth).rmse,
         "drift": 100 * errors(*ends).translation.max / max(travelled[-1], 1e-9),
         "metres": float(travelled[-1]),
     }

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stillmap import _core, em
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.eval.map import MapScores, map_scores, wall_cells_of_map
+from stillmap.eval.map import MapScores, extract_wall_cells, score_map
 from stillmap.results.reader import Grid
 from stillmap.sim import Simulation, laser, simulate
 from stillmap.sim.objects import faces_at
@@ -43,9 +43,9 @@ def prepare(case: Case, seed: int) -> Prepared:
     walls, recording = sim.truth.walls, sim.recording
     empty = _map_of(sim, *without_people(sim, np.random.default_rng([seed, 1])))
     truth = _map_of(sim, recording.points, recording.hit, sim.truth.static)
-    without = wall_cells_of_map(empty, walls, np.eye(3))
-    at_best = wall_cells_of_map(truth, walls, np.eye(3))
-    return Prepared(sim, without, at_best, map_scores(truth, walls, without, np.eye(3)))
+    without = extract_wall_cells(empty, walls, np.eye(3))
+    at_best = extract_wall_cells(truth, walls, np.eye(3))
+    return Prepared(sim, without, at_best, score_map(truth, walls, without, np.eye(3)))
 
 
 def without_people(

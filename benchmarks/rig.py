@@ -23,7 +23,7 @@ from tables import Column, means_and_worst
 
 import stillmap
 from stillmap.core import config
-from stillmap.eval.labels import label_scores
+from stillmap.eval.labels import score_labels
 from stillmap.rig.build import PlanarResult, TiltingResult, build_tilting, label_by_occupancy
 from stillmap.sim import RigSimulation, scene_by_name, simulate_rig
 
@@ -114,7 +114,7 @@ def scores(rig: RigSimulation, p_static: NDArray[np.float32]) -> Scores:
     truth, hit = rig.tilting.truth, rig.tilting.recording.hit & ~np.isnan(p_static)
     kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
     some = hit & (kinds != "door")
-    labels = label_scores(p_static, truth.static, some)
+    labels = score_labels(p_static, truth.static, some)
     sa, da, ha = kept_and_removed(p_static, truth.static, some)
     _, da_all, ha_all = kept_and_removed(p_static, truth.static, hit)
     return {

@@ -34,8 +34,8 @@ from stillmap import io
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.eval.readers import read_planar
-from stillmap.eval.trajectory import absolute_errors
+from stillmap.eval.readers import read_planar_trajectory
+from stillmap.eval.trajectory import compute_absolute_errors
 
 Float = NDArray[np.float64]
 
@@ -199,7 +199,7 @@ def row(ring: Ring, out: Path, flags: list[str]) -> list[str]:
     _, cpu = stillmap(*arguments, "--overwrite", "--quiet", *flags)
     run = json.loads((out / "map" / "run.json").read_text())
     p_static = np.load(out / "map" / "beams" / "p_static.npy")
-    trajectory = read_planar(out / "map" / "trajectory.tum")
+    trajectory = read_planar_trajectory(out / "map" / "trajectory.tum")
     scans = ring.recording.n_scans
     return [
         f"{np.degrees(ring.elevation):.2f}",
@@ -224,7 +224,7 @@ def pose_columns(ring: Ring, trajectory: Float) -> list[str]:
     path = np.linalg.norm(np.diff(known[:, 1:3], axis=0), axis=1).sum()
     ways = [se2.inverse(T[0]) @ T[-1] for T in (poses, ring.reference)]
     drift = np.linalg.norm(ways[0][:2, 2] - ways[1][:2, 2])
-    ate = absolute_errors(poses, ring.reference).rmse
+    ate = compute_absolute_errors(poses, ring.reference).rmse
     return [f"{path:.1f}", f"{ate:.3f}", f"{100 * drift / path:.2f}"]
 
 

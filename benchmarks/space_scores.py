@@ -7,7 +7,7 @@ from common import Scores
 from numpy.typing import NDArray
 from space_cases import LASTING, NOBODY, Known, known_of_given
 
-from stillmap.eval.labels import label_scores
+from stillmap.eval.labels import score_labels
 
 _NAN = float("nan")
 
@@ -49,7 +49,7 @@ def scores(p_static: NDArray[np.floating], known: Known, certain: bool) -> Score
         out["ha_moved"] = accuracies(p[~rested], static[~rested])["ha"]
         out["rested"] = 100.0 * float(np.mean(rested[~static]))
     if not certain:
-        labels = label_scores(p, static, np.ones(len(p), np.bool_))
+        labels = score_labels(p, static, np.ones(len(p), np.bool_))
         out |= {
             "ap": labels.average_precision,
             "brier": labels.brier,

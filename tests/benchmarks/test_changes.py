@@ -10,7 +10,7 @@ from common import Run
 from tables import means_and_worst
 
 from stillmap.core.se2 import inverse, matrix
-from stillmap.eval.changes import true_changes
+from stillmap.eval.changes import list_true_changes
 from stillmap.sim import Simulation, scene_by_name, simulate
 
 SHORT = {"robot": {"scans": 1000}}
@@ -29,13 +29,13 @@ def test_stays_are_those_of_the_things(street: Simulation) -> None:
     assert len(stays) == 5 + 1 + 2  # five cars leave, one of them for another place; two come
     beams = beams_of(street)
     for stay in stays:
-        ends = beams.end[beams.on(stay)]
-        assert np.hypot(*(ends - stay.middle).T).max(initial=0.0) < 2.7
+        ends = beams.end[beams.hits_on(stay)]
+        assert np.hypot(*(ends - stay.center).T).max(initial=0.0) < 2.7
     early = simulate(scene_by_name("street-moved", {"robot": {"scans": 520}}), 0)
     # two have driven off within 52 s; the others are walls, or not there yet
-    changes = true_changes(stays_of(early), beams_of(early))
+    changes = list_true_changes(stays_of(early), beams_of(early))
     assert [c.appeared for c in changes] == [False, False]
-    assert {c.appeared for c in true_changes(stays, beams)} == {False, True}
+    assert {c.appeared for c in list_true_changes(stays, beams)} == {False, True}
 
 
 def perfect(simulation: Simulation, state: str) -> SimpleNamespace:
@@ -45,18 +45,18 @@ def perfect(simulation: Simulation, state: str) -> SimpleNamespace:
     shape = np.ceil((beams.end.max(axis=0) + 1.0 - low) / resolution).astype(int)[::-1]
     p = np.full(shape, 0.1, np.float32)
     for stay in stays:
-        if stay.holds(simulation.recording.stamp_ns[-1:])[0] == (state == "last"):
-            cells = np.floor((beams.end[beams.on(stay)] - low) / resolution).astype(int)
+        if stay.contains(simulation.recording.stamp_ns[-1:])[0] == (state == "last"):
+            cells = np.floor((beams.end[beams.hits_on(stay)] - low) / resolution).astype(int)
             p[cells[:, 1], cells[:, 0]] = 0.9
     occupancy = SimpleNamespace(
         p_occupied=p, origin=(float(low[0]), float(low[1]), 0.0), resolution=resolution
     )
     found = [
         SimpleNamespace(
-            kind="came" if c.appeared else "left", appeared=c.appeared, stamp_ns=c.look_ns,
-            x=float(c.stay.middle[0]), y=float(c.stay.middle[1]),
+            kind="came" if c.appeared else "left", appeared=c.appeared, stamp_ns=c.observed_ns,
+            x=float(c.stay.center[0]), y=float(c.stay.center[1]),
         )
-        for c in true_changes(stays, beams) if c.look_ns is not None
+        for c in list_true_changes(stays, beams) if c.observed_ns is not None
     ]  # fmt: skip
     return SimpleNamespace(poses=truth.T_world_base, map=occupancy, changes=found)
 

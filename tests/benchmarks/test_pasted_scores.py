@@ -5,7 +5,7 @@ import pytest
 from pasted_scores import scores
 
 from stillmap.core.camera import Camera, Images
-from stillmap.eval.mesh import Record
+from stillmap.eval.mesh import TextureRecord
 from stillmap.io.rgbd import T_BASE_CAMERA
 
 K = np.array([[100.0, 0.0, 49.5], [0.0, 100.0, 49.5], [0.0, 0.0, 1.0]])
@@ -19,7 +19,7 @@ FACES = np.concatenate([np.array([[0, 1, 2], [0, 2, 3]], np.int32) + 4 * k for k
 
 def record(image):
     places = np.tile(np.linalg.inv(T_BASE_CAMERA), (2, 1, 1))
-    return Record(WALLS, FACES, np.repeat(np.array(image, np.int32), 2), places)
+    return TextureRecord(WALLS, FACES, np.repeat(np.array(image, np.int32), 2), places)
 
 
 def test_the_share_that_shows_people():

@@ -10,7 +10,7 @@ from stillmap import _core, em
 from stillmap.core import chunks
 from stillmap.em import occupancy_hmm
 from stillmap.em.observations import LOOP_CLASSES, build_surfel_map
-from stillmap.eval.labels import calibration_error, equal_width_bins
+from stillmap.eval.labels import assign_equal_width_bins, compute_calibration_error
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box
 
@@ -252,6 +252,6 @@ def test_it_knows_how_sure_it_is(crowd):
     found = occupancy_hmm.e_step(r, crowd.truth.T_world_base, 0.05, em.EmOptions())
     p, static = found.p_static[r.hit].astype(float), crowd.truth.static[r.hit]
     assert 0.01 < 1 - static.mean() < 0.4
-    assert calibration_error(p, static, equal_width_bins(p)) < 0.01
+    assert compute_calibration_error(p, static, assign_equal_width_bins(p)) < 0.01
     assert p[static].mean() > 0.97
     assert p[~static].mean() < 0.15

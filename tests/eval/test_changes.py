@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
-from stillmap.eval.changes import Beams, Stay, change_scores, change_time_errors, true_changes
+from stillmap.eval.changes import Beams, Stay, list_true_changes, score_change_times, score_changes
 from stillmap.results.reader import Grid
 from stillmap.sim.walls import box
 
@@ -37,9 +37,9 @@ def looks(stays: list[Stay], seconds: list[float], wall: float = 4.0) -> Beams:
     for t, when in enumerate(seconds):
         x, who = np.full(len(y), wall), np.full(len(y), -1)
         for one in stays:
-            if one.holds(np.array([round(when * S)]))[0]:
-                met = np.abs(y - one.middle[1]) < 0.2
-                x[met], who[met] = one.middle[0] - 0.1 + 0.001, one.mover
+            if one.contains(np.array([round(when * S)]))[0]:
+                met = np.abs(y - one.center[1]) < 0.2
+                x[met], who[met] = one.center[0] - 0.1 + 0.001, one.mover
         start.append(np.column_stack([np.full(len(y), 0.01), y]))
         end.append(np.column_stack([x, y]))
         mover.append(who)
@@ -68,22 +68,22 @@ NEW = [(row, 19) for row in (28, 29, 30, 31)]
 
 
 def test_a_map_of_the_end_is_perfect_and_one_of_the_beginning_is_not():
-    last = change_scores(grid_with(NEW), MOVED, TEN, WALLS, HERE)
+    last = score_changes(grid_with(NEW), MOVED, TEN, WALLS, HERE)
     assert (last.new_cells, last.new_kept, last.old_cells, last.old_occupied) == (4, 1.0, 4, 0.0)
-    first = change_scores(grid_with(OLD), MOVED, TEN, WALLS, HERE)
+    first = score_changes(grid_with(OLD), MOVED, TEN, WALLS, HERE)
     assert (first.new_kept, first.old_occupied) == (0.0, 1.0)
 
 
 def test_new_cells_may_be_off_by_one_and_old_ones_may_not():
     aside = [(row, column + 1) for row, column in (*NEW, *OLD)]
-    s = change_scores(grid_with(aside), MOVED, TEN, WALLS, HERE)
+    s = score_changes(grid_with(aside), MOVED, TEN, WALLS, HERE)
     assert (s.new_kept, s.old_occupied) == (1.0, 0.0)
-    s = change_scores(grid_with([*NEW[:1], *OLD[:1]]), MOVED, TEN, WALLS, HERE)
+    s = score_changes(grid_with([*NEW[:1], *OLD[:1]]), MOVED, TEN, WALLS, HERE)
     assert (s.new_kept, s.old_occupied) == (0.5, 0.25)
 
 
 def test_cells_hit_less_than_three_times_do_not_count():
-    s = change_scores(grid_with([]), MOVED, looks(MOVED, [3, 4, 5, 6]), WALLS, HERE)
+    s = score_changes(grid_with([]), MOVED, looks(MOVED, [3, 4, 5, 6]), WALLS, HERE)
     assert (s.new_cells, s.old_cells) == (0, 0)
     assert math.isnan(s.new_kept)
     plain = s.to_dict()
@@ -94,102 +94,102 @@ def test_cells_hit_less_than_three_times_do_not_count():
 def test_old_cells_must_have_been_seen_again():
     # twice afterwards only; or three times, but something else stands before them
     assert (
-        change_scores(grid_with([]), MOVED, looks(MOVED, [0, 1, 2, 5, 6]), WALLS, HERE).old_cells
+        score_changes(grid_with([]), MOVED, looks(MOVED, [0, 1, 2, 5, 6]), WALLS, HERE).old_cells
         == 0
     )
     hidden = [MOVED[0], stay(1.0, 1.0, 4.5, None, 1)]
     assert (
-        change_scores(grid_with([]), hidden, looks(hidden, list(range(10))), WALLS, HERE).old_cells
+        score_changes(grid_with([]), hidden, looks(hidden, list(range(10))), WALLS, HERE).old_cells
         == 0
     )
 
 
 def test_old_cells_near_walls_or_what_came_instead_do_not_count():
     near = np.array([[1.8, 0.85, 1.8, 0.86]])  # 17 cm from two of them, so to say
-    s = change_scores(grid_with([]), MOVED, TEN, np.concatenate([WALLS, near]), HERE)
+    s = score_changes(grid_with([]), MOVED, TEN, np.concatenate([WALLS, near]), HERE)
     assert s.old_cells == 2
     instead = [MOVED[0], stay(2.3, 1.0, 4.5, None, 1)]
-    s = change_scores(grid_with([]), instead, looks(instead, list(range(10))), WALLS, HERE)
+    s = score_changes(grid_with([]), instead, looks(instead, list(range(10))), WALLS, HERE)
     assert (s.new_cells, s.old_cells) == (4, 4)  # its faces are 25 cm away
     nearer = [MOVED[0], stay(2.2, 1.0, 4.5, None, 1)]
-    s = change_scores(grid_with([]), nearer, looks(nearer, list(range(10))), WALLS, HERE)
+    s = score_changes(grid_with([]), nearer, looks(nearer, list(range(10))), WALLS, HERE)
     assert (s.new_cells, s.old_cells) == (4, 0)
 
 
 def test_what_was_there_for_a_while_only_is_old():
     while_ = [stay(2.0, 1.0, 2.5, 6.5)]
-    s = change_scores(grid_with([]), while_, looks(while_, list(range(10))), WALLS, HERE)
+    s = score_changes(grid_with([]), while_, looks(while_, list(range(10))), WALLS, HERE)
     assert (s.new_cells, s.old_cells) == (0, 4)
 
 
 def test_the_frame_of_the_map_does_not_matter():
     T_world_map = se2.matrix(5.0, -3.0, 2.2)
     origin = tuple(se2.parameters(se2.inverse(T_world_map)))
-    s = change_scores(grid_with([*NEW, *OLD[:1]], origin), MOVED, TEN, WALLS, T_world_map)
+    s = score_changes(grid_with([*NEW, *OLD[:1]], origin), MOVED, TEN, WALLS, T_world_map)
     assert (s.new_cells, s.new_kept, s.old_cells, s.old_occupied) == (4, 1.0, 4, 0.25)
 
 
 def test_cells_beyond_the_map_are_not_occupied():
     small = Grid(np.full((5, 5), 0.9), (0.0, 0.0, 0.0), R)
-    s = change_scores(small, MOVED, TEN, WALLS, HERE)
+    s = score_changes(small, MOVED, TEN, WALLS, HERE)
     assert (s.new_kept, s.old_occupied) == (0.0, 0.0)
 
 
 def test_true_changes_and_the_first_look_after_each():
     beams = looks(MOVED, [0, 1, 2, 3, 4, 7.5, 9])
-    came, went = sorted(true_changes(MOVED, beams), key=lambda c: not c.appeared)
+    came, went = sorted(list_true_changes(MOVED, beams), key=lambda c: not c.appeared)
     assert (came.appeared, went.appeared) == (True, False)
     assert came.stamp_ns == went.stamp_ns == 4.5 * S
-    assert came.look_ns == went.look_ns == 7.5 * S
+    assert came.observed_ns == went.observed_ns == 7.5 * S
 
 
 def test_a_change_that_nobody_saw_both_sides_of_is_known_to_nobody():
     # a wall of fog at 1 m: nothing behind it is ever seen
     fog = looks([], list(range(10)), wall=1.0)
-    assert [c.look_ns for c in true_changes(MOVED, fog)] == [None, None]
+    assert [c.observed_ns for c in list_true_changes(MOVED, fog)] == [None, None]
     late = looks(MOVED, [5, 6, 7])  # it had happened: no changes of this recording
-    assert true_changes(MOVED, late) == []
+    assert list_true_changes(MOVED, late) == []
 
 
 def test_two_beams_are_no_look():
     few = looks(MOVED, list(range(10)))
     kept = np.isin(np.arange(len(few.scan)) % 40, [8, 9, 28, 29])
     thin = Beams(*(a[kept] for a in (few.start, few.end, few.mover, few.scan)), few.stamp_ns)
-    assert [c.look_ns for c in true_changes(MOVED, thin)] == [None, None]
+    assert [c.observed_ns for c in list_true_changes(MOVED, thin)] == [None, None]
 
 
 def test_errors_are_zero_between_the_change_and_the_first_look():
-    true = true_changes(MOVED, looks(MOVED, [0, 1, 2, 3, 4, 7.5, 9]))
+    true = list_true_changes(MOVED, looks(MOVED, [0, 1, 2, 3, 4, 7.5, 9]))
     for stamp, error in ((4.5, 0.0), (7.5, 0.0), (6.0, 0.0), (3.0, 1.5), (9.0, 1.5)):
-        s = change_time_errors([Found(1.9, 3.0, True, round(stamp * S))], true, HERE)
+        s = score_change_times([Found(1.9, 3.0, True, round(stamp * S))], true, HERE)
         assert (s.seen, s.found, s.missed, s.false) == (2, 1, 1, 0)
         assert s.errors == pytest.approx((error,))
 
 
 def test_changes_are_matched_by_kind_and_place():
-    true = true_changes(MOVED, TEN)
+    true = list_true_changes(MOVED, TEN)
     gone = Found(2.0, 1.0, False, 5 * S)
     wrong = [Found(2.0, 1.0, True, 5 * S), Found(3.0, 3.0, True, 5 * S)]  # a kind; 0.9 m off
-    s = change_time_errors([gone, *wrong], true, HERE)
+    s = score_change_times([gone, *wrong], true, HERE)
     assert (s.found, s.missed, s.false) == (1, 1, 2)
     nearest = [Found(2.4, 3.0, True, 9 * S), Found(2.1, 3.0, True, 5 * S)]
-    s = change_time_errors([gone, *nearest], true, HERE)
+    s = score_change_times([gone, *nearest], true, HERE)
     assert (s.found, s.missed, s.false, s.errors) == (2, 0, 0, (0.0, 0.0))
-    assert change_time_errors([], true, HERE).missed == 2
-    assert change_time_errors([gone], [], HERE).false == 1
+    assert score_change_times([], true, HERE).missed == 2
+    assert score_change_times([gone], [], HERE).false == 1
 
 
 def test_a_large_thing_is_found_by_its_side():
     car = Stay(0, np.array([2.0, 3.0]), np.array(box(2.0, 3.0, 1.0, 4.0)), None, 9 * S)
-    true = true_changes([car], looks([], [8.0, 10.0]))
-    assert change_time_errors([Found(1.2, 1.5, False, 9 * S)], true, HERE).false == 0
-    assert change_time_errors([Found(0.9, 1.5, False, 9 * S)], true, HERE).false == 1
+    true = list_true_changes([car], looks([], [8.0, 10.0]))
+    assert score_change_times([Found(1.2, 1.5, False, 9 * S)], true, HERE).false == 0
+    assert score_change_times([Found(0.9, 1.5, False, 9 * S)], true, HERE).false == 1
 
 
 def test_found_changes_are_in_the_frame_of_the_map():
     T_world_map = se2.matrix(5.0, -3.0, 2.2)
     T = se2.inverse(T_world_map)
     x, y = (T[:2, :2] @ [2.0, 1.0] + T[:2, 2]).tolist()
-    true = true_changes(MOVED, TEN)
-    assert change_time_errors([Found(x, y, False, 5 * S)], true, T_world_map).found == 1
-    assert change_time_errors([Found(2.0, 1.0, False, 5 * S)], true, T_world_map).found == 0
+    true = list_true_changes(MOVED, TEN)
+    assert score_change_times([Found(x, y, False, 5 * S)], true, T_world_map).found == 1
+    assert score_change_times([Found(2.0, 1.0, False, 5 * S)], true, T_world_map).found == 0

@@ -8,10 +8,10 @@ from stillmap.core.errors import InputError
 from stillmap.core.timestamps import parse_ns
 from stillmap.eval.readers import (
     read_odometry,
-    read_planar,
+    read_planar_trajectory,
     read_relations,
     read_trajectory,
-    seconds,
+    to_seconds,
 )
 from stillmap.io.trajectory import write_tum
 
@@ -25,8 +25,8 @@ def test_rows_in_the_plane_and_tum_rows_read_alike(tmp_path):
     stamps = (rows[:, 0] * 1e9).astype(np.int64)
     write_tum(tmp_path / "rows.tum", stamps, se2.matrix(*rows[:, 1:].T))
     wanted = rows[::-1]  # sorted by time
-    np.testing.assert_allclose(read_planar(tmp_path / "rows.txt"), wanted, atol=1e-12)
-    np.testing.assert_allclose(read_planar(tmp_path / "rows.tum"), wanted, atol=1e-8)
+    np.testing.assert_allclose(read_planar_trajectory(tmp_path / "rows.txt"), wanted, atol=1e-12)
+    np.testing.assert_allclose(read_planar_trajectory(tmp_path / "rows.tum"), wanted, atol=1e-8)
     in_space = read_trajectory(tmp_path / "rows.txt").poses
     np.testing.assert_allclose(in_space, read_trajectory(tmp_path / "rows.tum").poses, atol=1e-8)
 
@@ -35,7 +35,7 @@ def test_seconds_are_those_of_the_text():
     text = [f"976052{n:03d}.{n:06d}" for n in range(100, 1000, 7)] + ["1700000000.123456789"]
     stamps = np.array([parse_ns(t) for t in text], np.int64)
     assert (stamps / 1e9).tolist() != [float(t) for t in text]  # what the exactness is for
-    assert seconds(stamps).tolist() == [float(t) for t in text]
+    assert to_seconds(stamps).tolist() == [float(t) for t in text]
 
 
 @pytest.mark.parametrize(

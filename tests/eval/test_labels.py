@@ -7,19 +7,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stillmap.eval.labels import (
-    average_precision,
-    calibration_error,
-    equal_mass_bins,
-    equal_width_bins,
-    label_scores,
-    log_loss,
+    assign_equal_mass_bins,
+    assign_equal_width_bins,
+    compute_average_precision,
+    compute_calibration_error,
+    compute_log_loss,
+    score_labels,
 )
 
 
 def scores(p_dynamic, dynamic, hit=None):
     p = np.array(p_dynamic, np.float64)
     known = np.ones(len(p), bool) if hit is None else np.array(hit, bool)
-    return label_scores(1 - p, ~np.array(dynamic, bool), known)
+    return score_labels(1 - p, ~np.array(dynamic, bool), known)
 
 
 def precision_area(score, positive) -> float:
@@ -37,21 +37,21 @@ def precision_area(score, positive) -> float:
 def test_average_precision_by_hand():
     # scikit-learn's documented example has 0.8333...
     score, positive = np.array([0.1, 0.4, 0.35, 0.8]), np.array([0, 0, 1, 1], bool)
-    assert average_precision(score, positive) == pytest.approx(1 / 2 + 1 / 2 * 2 / 3)
+    assert compute_average_precision(score, positive) == pytest.approx(1 / 2 + 1 / 2 * 2 / 3)
 
 
 def test_ties_share_a_threshold():
     # all equal: one threshold, precision = share of positives, whatever the order
     score = np.full(4, 0.3)
     for positive in ([1, 0, 0, 0], [0, 0, 0, 1]):
-        assert average_precision(score, np.array(positive, bool)) == 0.25
+        assert compute_average_precision(score, np.array(positive, bool)) == 0.25
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.booleans()), min_size=1, max_size=30))
 def test_average_precision_follows_its_definition(pairs):
     score = np.array([s for s, _ in pairs], float)
     positive = np.array([y for _, y in pairs])
-    got = average_precision(score, positive)
+    got = compute_average_precision(score, positive)
     if positive.any():
         assert got == pytest.approx(precision_area(score.tolist(), positive.tolist()))
     else:
@@ -60,7 +60,7 @@ def test_average_precision_follows_its_definition(pairs):
 
 def test_labels_that_differ_only_near_one_are_still_ranked():
     p_static = np.array([1e-30, 1e-20, 1e-10], np.float32)
-    s = label_scores(p_static, np.array([False, True, True]), np.ones(3, bool))
+    s = score_labels(p_static, np.array([False, True, True]), np.ones(3, bool))
     assert s.average_precision == 1.0
 
 
@@ -95,35 +95,37 @@ def test_nothing_dynamic_leaves_ranking_undefined():
         assert plain[name] is None
     assert s.brier == pytest.approx(0.005)
     assert plain["unsure"] == 1
-    empty = label_scores(np.zeros(0, np.float32), np.zeros(0, bool), np.zeros(0, bool))
+    empty = score_labels(np.zeros(0, np.float32), np.zeros(0, bool), np.zeros(0, bool))
     assert empty.to_dict()["log_loss"] is None
     json.dumps(empty.to_dict(), allow_nan=False)
 
 
 def test_certain_mistakes_cost_what_is_documented():
     positive = np.array([True])
-    assert log_loss(np.array([0.0]), positive) == pytest.approx(-math.log(1e-6))
-    assert log_loss(np.array([1.0]), positive) == pytest.approx(0.0, abs=2e-6)
+    assert compute_log_loss(np.array([0.0]), positive) == pytest.approx(-math.log(1e-6))
+    assert compute_log_loss(np.array([1.0]), positive) == pytest.approx(0.0, abs=2e-6)
 
 
 def test_calibration_error_of_one_bin():
     p, positive = np.array([0.70, 0.72, 0.71, 0.71]), np.array([1, 0, 0, 1], bool)
-    assert calibration_error(p, positive, equal_width_bins(p)) == pytest.approx(0.21)
+    assert compute_calibration_error(p, positive, assign_equal_width_bins(p)) == pytest.approx(0.21)
 
 
 def test_equal_width_bins_have_their_edges():
     p = np.array([0.0, 0.066, 0.067, 0.999, 1.0])
-    assert equal_width_bins(p).tolist() == [0, 0, 1, 14, 14]
+    assert assign_equal_width_bins(p).tolist() == [0, 0, 1, 14, 14]
 
 
 def test_equal_mass_bins_are_filled_alike_and_keep_ties_together():
     rng = np.random.default_rng(0)
     p = rng.beta(0.3, 2, 3000)
-    assert np.bincount(equal_mass_bins(p)).tolist() == [200] * 15
+    assert np.bincount(assign_equal_mass_bins(p)).tolist() == [200] * 15
     tied = np.repeat([0.1, 0.2, 0.9], [1000, 10, 5])
-    assert len(set(equal_mass_bins(tied)[:1000].tolist())) == 1
+    assert len(set(assign_equal_mass_bins(tied)[:1000].tolist())) == 1
     order = rng.permutation(len(tied))
-    np.testing.assert_array_equal(equal_mass_bins(tied)[order], equal_mass_bins(tied[order]))
+    np.testing.assert_array_equal(
+        assign_equal_mass_bins(tied)[order], assign_equal_mass_bins(tied[order])
+    )
 
 
 def test_calibrated_labels_have_a_small_error_and_shifted_ones_have_not():
@@ -147,4 +149,4 @@ def test_what_is_no_probability_or_fits_nothing_is_refused():
     with pytest.raises(ValueError, match="0, 1"):
         scores([1.5], [1])
     with pytest.raises(ValueError, match="lengths differ"):
-        label_scores(np.zeros(3), np.zeros(2, bool), np.zeros(3, bool))
+        score_labels(np.zeros(3), np.zeros(2, bool), np.zeros(3, bool))

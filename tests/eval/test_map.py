@@ -5,7 +5,12 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
-from stillmap.eval.map import distance_to_walls, map_scores, wall_cells_of_hits, wall_cells_of_map
+from stillmap.eval.map import (
+    distance_to_walls,
+    extract_wall_cells,
+    extract_wall_cells_from_hits,
+    score_map,
+)
 from stillmap.results.reader import Grid
 
 R = 0.1
@@ -29,8 +34,8 @@ def with_cells(grid: Grid, cells, value: float) -> Grid:
 
 def test_a_perfect_map():
     grid = room()
-    reference = wall_cells_of_map(grid, WALLS, HERE)
-    s = map_scores(grid, WALLS, reference, HERE)
+    reference = extract_wall_cells(grid, WALLS, HERE)
+    s = score_map(grid, WALLS, reference, HERE)
     assert (s.ghost_cells, s.walls_kept, s.reference_wall_cells) == (0, 1.0, 79)
     assert s.free_area == pytest.approx(39 * 39 * R**2)
     assert s.T_world_map == (0.0, 0.0, 0.0)
@@ -39,7 +44,7 @@ def test_a_perfect_map():
 def test_ghosts_are_occupied_cells_more_than_two_cells_from_a_wall():
     # rows are counted from the wall's centre line: row 2 lies two cells off, row 3 three
     grid = with_cells(room(), [(2, 10), (3, 20), (30, 30)], 0.66)
-    s = map_scores(grid, WALLS, np.zeros((0, 2)), HERE)
+    s = score_map(grid, WALLS, np.zeros((0, 2)), HERE)
     assert s.ghost_cells == 2
     assert s.ghosts_per_100_m2 == pytest.approx(100 * 2 / (s.free_area))
     assert s.occupied_cells == 79 + 3
@@ -49,28 +54,28 @@ def test_thresholds_are_those_of_the_map_server():
     grid = with_cells(room(), [(20, 20), (20, 21)], 0.65)
     grid = with_cells(grid, [(25, 25)], 0.196)
     grid = with_cells(grid, [(30, 30)], math.nan)
-    s = map_scores(grid, WALLS, np.zeros((0, 2)), HERE)
+    s = score_map(grid, WALLS, np.zeros((0, 2)), HERE)
     assert s.ghost_cells == 0
     assert s.free_area == pytest.approx((39 * 39 - 4) * R**2)
 
 
 def test_a_wall_is_kept_where_a_neighbour_is_occupied():
-    reference = wall_cells_of_map(room(), WALLS, HERE)
+    reference = extract_wall_cells(room(), WALLS, HERE)
     # a hole of three cells: its ends still have an occupied neighbour
     holed = with_cells(room(), [(0, 20), (0, 21), (0, 22)], 0.1)
-    assert map_scores(holed, WALLS, reference, HERE).walls_kept == pytest.approx(78 / 79)
+    assert score_map(holed, WALLS, reference, HERE).walls_kept == pytest.approx(78 / 79)
     # one row further on is near enough, two are not
     for shift, kept in ((1, 1.0), (2, 0.0)):
         p = np.roll(room().p_occupied, (shift, shift), (0, 1))
-        s = map_scores(Grid(p, (0, 0, 0), R), WALLS[:1], reference[reference[:, 1] < R], HERE)
+        s = score_map(Grid(p, (0, 0, 0), R), WALLS[:1], reference[reference[:, 1] < R], HERE)
         assert s.walls_kept == pytest.approx(kept, abs=0.1)
 
 
 def test_walls_beyond_the_map_are_lost():
-    reference = wall_cells_of_map(room(), WALLS, HERE)
+    reference = extract_wall_cells(room(), WALLS, HERE)
     grid = room()
     cropped = Grid(grid.p_occupied[:, :20], grid.origin, R)
-    assert map_scores(cropped, WALLS, reference, HERE).walls_kept == pytest.approx(60 / 79)
+    assert score_map(cropped, WALLS, reference, HERE).walls_kept == pytest.approx(60 / 79)
 
 
 def test_the_frame_of_the_map_does_not_matter():
@@ -79,10 +84,10 @@ def test_the_frame_of_the_map_does_not_matter():
     origin = tuple(se2.parameters(se2.inverse(T_world_map)))
     there = with_cells(room(origin), [(30, 30)], 0.9)
     here = with_cells(room(), [(30, 30)], 0.9)
-    reference = wall_cells_of_map(here, WALLS, HERE)
-    np.testing.assert_allclose(wall_cells_of_map(there, WALLS, T_world_map), reference, atol=1e-12)
-    a = map_scores(here, WALLS, reference, HERE)
-    b = map_scores(there, WALLS, reference, T_world_map)
+    reference = extract_wall_cells(here, WALLS, HERE)
+    np.testing.assert_allclose(extract_wall_cells(there, WALLS, T_world_map), reference, atol=1e-12)
+    a = score_map(here, WALLS, reference, HERE)
+    b = score_map(there, WALLS, reference, T_world_map)
     assert (b.ghost_cells, b.walls_kept) == (a.ghost_cells, a.walls_kept) == (1, 1.0)
     assert b.T_world_map == pytest.approx((5.0, -3.0, 2.2))
 
@@ -90,15 +95,15 @@ def test_the_frame_of_the_map_does_not_matter():
 def test_reference_from_hits_needs_several_and_a_wall():
     T_world_map = se2.matrix(5.0, -3.0, 0.0)
     hits = np.array([[1.05, 0.05]] * 3 + [[2.05, 0.05]] * 2 + [[2.05, 2.05]] * 9)
-    centres = wall_cells_of_hits(hits, WALLS, room((-5.0, 3.0, 0.0)), T_world_map)
+    centres = extract_wall_cells_from_hits(hits, WALLS, room((-5.0, 3.0, 0.0)), T_world_map)
     np.testing.assert_allclose(centres, [[1.05, 0.05]], atol=1e-12)
 
 
 def test_hits_outside_the_map_count_as_walls_that_are_not_kept():
     walls = np.array([[-9.0, 0.05, 3.95, 0.05]])
     hits = np.array([[-5.05, 0.05]] * 3 + [[1.05, 0.05]] * 3)
-    reference = wall_cells_of_hits(hits, walls, room(), HERE)
-    assert map_scores(room(), walls, reference, HERE).walls_kept == 0.5
+    reference = extract_wall_cells_from_hits(hits, walls, room(), HERE)
+    assert score_map(room(), walls, reference, HERE).walls_kept == 0.5
 
 
 def test_reference_on_another_lattice():
@@ -108,9 +113,9 @@ def test_reference_on_another_lattice():
                            np.column_stack([np.full_like(along, 0.05), along])])  # fmt: skip
     T_world_map = se2.matrix(0.4, 0.2, 0.7)
     lattice = Grid(np.zeros((90, 90), np.float32), (-2.03, -4.04, 0.0), R)
-    reference = wall_cells_of_hits(hits, WALLS, lattice, T_world_map)
-    assert map_scores(lattice, WALLS, reference, T_world_map).walls_kept == 0.0
-    assert map_scores(room(), WALLS, reference, HERE).walls_kept == 1.0
+    reference = extract_wall_cells_from_hits(hits, WALLS, lattice, T_world_map)
+    assert score_map(lattice, WALLS, reference, T_world_map).walls_kept == 0.0
+    assert score_map(room(), WALLS, reference, HERE).walls_kept == 1.0
 
 
 def test_distance_to_walls():
@@ -124,7 +129,7 @@ def test_distance_to_walls():
 
 def test_a_map_of_nothing_leaves_shares_undefined():
     grid = Grid(np.full((3, 3), np.nan, np.float32), (0.0, 0.0, 0.0), R)
-    plain = map_scores(grid, WALLS, np.zeros((0, 2)), HERE).to_dict()
+    plain = score_map(grid, WALLS, np.zeros((0, 2)), HERE).to_dict()
     assert plain["ghosts_per_100_m2"] is None
     assert plain["walls_kept"] is None
     json.dumps(plain, allow_nan=False)

@@ -5,7 +5,7 @@ import pytest
 
 from stillmap.eval import mesh_distance
 from stillmap.eval.model_readers import read_glb
-from stillmap.mesh.texture.atlas import Textured
+from stillmap.mesh.texture.atlas import TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.results.gltf import write_glb
 
@@ -22,7 +22,7 @@ def test_colours_stay_where_they_are(tmp_path):
     level = np.rint((np.arange(n) + 0.5) / n * 255)
     red, green = np.meshgrid(level, level)
     page = np.stack([red, green, np.zeros_like(red)], axis=-1).astype(np.uint8)
-    model = Textured(
+    model = TexturedMesh(
         vertices,
         np.array([(0, 1, 2), (0, 2, 3), (0, 1, 4)], np.int32),
         uv,
@@ -35,16 +35,16 @@ def test_colours_stay_where_they_are(tmp_path):
     found = read_glb(tmp_path / "mesh.glb", n=2000)
     assert len(found.faces) == 3
     assert np.allclose(
-        mesh_distance.areas(found.vertices, found.faces).sum(),
-        mesh_distance.areas(vertices, model.faces).sum(),
+        mesh_distance.triangle_areas(found.vertices, found.faces).sum(),
+        mesh_distance.triangle_areas(vertices, model.faces).sum(),
     )
-    assert 1900 < len(found.coloured.points) <= 2000
+    assert 1900 < len(found.colored.points) <= 2000
     basis = np.stack([along, up, np.cross(along, up)], axis=1)
-    u, v, off = np.linalg.solve(basis, (found.coloured.points - corner).T)
+    u, v, off = np.linalg.solve(basis, (found.colored.points - corner).T)
     assert np.allclose(off, 0.0, atol=1e-6)
     # pages may be compressed
-    assert np.abs(found.coloured.colour[:, 0] - 255 * u).mean() < 4.0
-    assert np.abs(found.coloured.colour[:, 1] - 255 * v).mean() < 4.0
+    assert np.abs(found.colored.color[:, 0] - 255 * u).mean() < 4.0
+    assert np.abs(found.colored.color[:, 1] - 255 * v).mean() < 4.0
 
 
 def test_a_model_without_texture_has_no_colours(tmp_path):
@@ -52,6 +52,6 @@ def test_a_model_without_texture_has_no_colours(tmp_path):
     faces = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
     write_glb(tmp_path / "mesh.glb", Mesh(square, faces))
     found = read_glb(tmp_path / "mesh.glb")
-    assert len(found.coloured.points) == 0
+    assert len(found.colored.points) == 0
     assert np.allclose(found.vertices[:, 2], 1.0)
     assert np.allclose(np.ptp(found.vertices, axis=0), (2.0, 1.0, 0.0))

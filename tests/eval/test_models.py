@@ -8,26 +8,26 @@ from stillmap.core.camera import Camera
 from stillmap.eval.mesh import (
     GREY,
     NOTHING,
-    Coloured,
-    Pictures,
-    Record,
-    colour_difference,
-    colour_errors,
-    seen_freely,
-    shown,
-    surface_scores,
-    texture_scores,
+    ColoredPoints,
+    TextureRecord,
+    TrueImages,
+    compute_color_difference,
+    compute_color_errors,
+    find_visible_samples,
+    look_up_texture_source,
+    score_surface,
+    score_texture,
 )
-from stillmap.eval.mesh_distance import samples
+from stillmap.eval.mesh_distance import sample_surface
 from stillmap.eval.object_models import (
     Model,
-    Sighted,
+    MoverHits,
     Track,
+    collect_observed_points,
+    count_max_beams,
     distance_to_solids,
-    most_beams,
-    mover_of,
-    mover_scores,
-    places_seen,
+    match_mover,
+    score_object_models,
 )
 from stillmap.sim.appearance import static_colour
 from stillmap.sim.camera import SKY
@@ -69,16 +69,18 @@ def _floor(x: tuple[float, float], y: tuple[float, float], z: float = 0.0, n: in
     return world @ T_MAP_WORLD[:3, :3].T + T_MAP_WORLD[:3, 3], faces.astype(np.int32)
 
 
-def _pictures(mask: NDArray[np.uint16], off: float = 0.0) -> Pictures:
+def _pictures(mask: NDArray[np.uint16], off: float = 0.0) -> TrueImages:
     v, u = np.mgrid[:30, :40]
     rays = np.stack([(u - 19.5) / 30, (v - 14.5) / 30, np.ones(u.shape)])
     distance = (3.0 * np.linalg.norm(rays, axis=0) + off).astype(np.float32)
-    return Pictures([CAMERA], np.zeros(1, np.int32), DOWN[None], lambda _: mask, lambda _: distance)
+    return TrueImages(
+        [CAMERA], np.zeros(1, np.int32), DOWN[None], lambda _: mask, lambda _: distance
+    )
 
 
-def _record(vertices: Float, faces: NDArray[np.int32]) -> Record:
+def _record(vertices: Float, faces: NDArray[np.int32]) -> TextureRecord:
     image = np.zeros(len(faces), np.int32)
-    return Record(vertices, faces, image, (np.linalg.inv(DOWN) @ T_WORLD_MAP)[None])
+    return TextureRecord(vertices, faces, image, (np.linalg.inv(DOWN) @ T_WORLD_MAP)[None])
 
 
 @pytest.mark.parametrize("up", [0.0, 0.03, -0.03, 0.07])
@@ -86,7 +88,7 @@ def test_a_shifted_surface_is_off_by_its_shift(up: float) -> None:
     vertices, faces = _floor((-2, 2), (-2, 2), up)
     rng = np.random.default_rng(0)
     places = np.column_stack([rng.uniform(-1.9, 1.9, (500, 2)), np.zeros(500)])
-    found = surface_scores(vertices, faces, FLOOR, places, T_WORLD_MAP)
+    found = score_surface(vertices, faces, FLOOR, places, T_WORLD_MAP)
     assert np.allclose([found.mean, found.p95], abs(up), atol=1e-9)
     assert found.complete == (1.0 if abs(up) <= 0.05 else 0.0)
     assert found.area == pytest.approx(16.0)
@@ -97,14 +99,14 @@ def test_a_surface_with_holes_is_less_complete() -> None:
     vertices, faces = _floor((-2, 0), (-2, 2))
     rng = np.random.default_rng(0)
     places = np.column_stack([rng.uniform(-2, 2, (20_000, 2)), np.zeros(20_000)])
-    found = surface_scores(vertices, faces, FLOOR, places, T_WORLD_MAP)
+    found = score_surface(vertices, faces, FLOOR, places, T_WORLD_MAP)
     assert found.mean < 1e-9
     assert found.complete == pytest.approx((2.0 + 0.05) / 4.0, abs=0.01)
 
 
 def test_no_surface_has_no_score_and_shows_nothing() -> None:
     none = np.empty((0, 3)), np.empty((0, 3), np.int32)
-    found = surface_scores(*none, FLOOR, np.zeros((3, 3)), T_WORLD_MAP)
+    found = score_surface(*none, FLOOR, np.zeros((3, 3)), T_WORLD_MAP)
     assert np.isnan(found.mean)
     assert found.complete == 0.0
 
@@ -114,8 +116,8 @@ def test_texture_shows_what_the_pictures_do() -> None:
     mask[:, :10], mask[:, 30:35] = 5, SKY  # a quarter and an eighth of what the picture shows
     record = _record(*_floor((-2, 2), (-1.5, 1.5)))
     record.image[: len(record.image) // 2 : 2] = -1
-    of_mesh = samples(record.vertices, record.faces, 40_000)
-    shows = shown(record, of_mesh, _pictures(mask))
+    of_mesh = sample_surface(record.vertices, record.faces, 40_000)
+    shows = look_up_texture_source(record, of_mesh, _pictures(mask))
     assert np.mean(shows == GREY) == pytest.approx(0.25, abs=0.01)
     painted = shows[shows != GREY]
     assert np.mean(painted == 4) == pytest.approx(0.25, abs=0.01)
@@ -125,9 +127,9 @@ def test_texture_shows_what_the_pictures_do() -> None:
 
 def test_what_a_picture_does_not_reach_is_grey() -> None:
     record = _record(*_floor((2.5, 4), (-1.5, 1.5)))
-    shows = shown(
+    shows = look_up_texture_source(
         record,
-        samples(record.vertices, record.faces, 100),
+        sample_surface(record.vertices, record.faces, 100),
         _pictures(np.zeros((30, 40), np.uint16)),
     )
     assert (shows == GREY).all()
@@ -148,17 +150,17 @@ def test_what_pictures_see_without_movers(z: float, turned: bool, off: float, sh
     mask[:, :10] = 5
     vertices, faces = _floor((-2, 2), (-1.5, 1.5), z)
     record = _record(vertices, faces[:, ::-1] if turned else faces)
-    free = seen_freely(
-        record, samples(vertices, record.faces, 20_000), _pictures(mask, off), T_WORLD_MAP
+    free = find_visible_samples(
+        record, sample_surface(vertices, record.faces, 20_000), _pictures(mask, off), T_WORLD_MAP
     )
     assert free.mean() == pytest.approx(share, abs=0.02)
 
 
 def test_what_pictures_see_from_far_away_does_not_count() -> None:
     record = _record(*_floor((-2, 2), (-1.5, 1.5)))
-    of_mesh = samples(record.vertices, record.faces, 20_000)
+    of_mesh = sample_surface(record.vertices, record.faces, 20_000)
     none = _pictures(np.zeros((30, 40), np.uint16))
-    free = seen_freely(record, of_mesh, none, T_WORLD_MAP, farthest=10**0.5)
+    free = find_visible_samples(record, of_mesh, none, T_WORLD_MAP, farthest=10**0.5)
     assert free.mean() == pytest.approx(np.pi / 12, abs=0.01)  # a circle of 1 m
 
 
@@ -171,8 +173,8 @@ def test_texture_scores_of_a_half_painted_floor() -> None:
     record.image[right[:, 0] < 0] = -1  # and with it all of the mover
     places = np.column_stack([np.random.default_rng(2).uniform(-1, 1, (500, 2)), np.zeros(500)])
     in_map = places @ T_MAP_WORLD[:3, :3].T + T_MAP_WORLD[:3, 3] + (0, 0, 0.02)
-    coloured = Coloured(in_map, static_colour(places, 3))
-    found = texture_scores(record, coloured, _pictures(mask), FLOOR, 3, T_WORLD_MAP)
+    coloured = ColoredPoints(in_map, static_colour(places, 3))
+    found = score_texture(record, coloured, _pictures(mask), FLOOR, 3, T_WORLD_MAP)
     assert found.textured == pytest.approx(0.5, abs=0.01)
     assert found.mover == found.nothing == found.colour_median == found.colour_p95 == 0.0
     assert found.in_view == pytest.approx(0.75, abs=0.01)
@@ -185,16 +187,16 @@ def test_colours_that_differ_are_told() -> None:
     in_map = places @ T_MAP_WORLD[:3, :3].T + T_MAP_WORLD[:3, 3]
     right = static_colour(places, 3)
     darker = (0.9 * right).astype(np.uint8)
-    errors = colour_errors(Coloured(in_map, darker), FLOOR, 3, T_WORLD_MAP)
-    assert np.array_equal(errors, colour_difference(darker, right))
+    errors = compute_color_errors(ColoredPoints(in_map, darker), FLOOR, 3, T_WORLD_MAP)
+    assert np.array_equal(errors, compute_color_difference(darker, right))
     assert 2.0 < np.median(errors) < 6.0
 
 
 def test_differences_of_colours() -> None:
     pytest.importorskip("skimage")
     black, white = np.zeros((1, 3), np.uint8), np.full((1, 3), 255, np.uint8)
-    assert colour_difference(black, white) == pytest.approx(100.0, abs=1e-3)
-    assert colour_difference(white, white) == 0.0
+    assert compute_color_difference(black, white) == pytest.approx(100.0, abs=1e-3)
+    assert compute_color_difference(white, white) == 0.0
 
 
 # a box of 2 x 1 x 1 m that drives along x at 1 m/s
@@ -225,13 +227,13 @@ def _box(grown: float) -> Float:
     return _CUBE * (1.0 + grown, 0.5 + grown, 0.5 + grown) + (0, 0, 0.5)
 
 
-def _seen_box() -> Sighted:
+def _seen_box() -> MoverHits:
     """Beams all over its left side, at 0.5 s."""
     rng = np.random.default_rng(1)
     local = np.column_stack([rng.uniform(-1, 1, 500), np.full(500, 0.5), rng.uniform(0, 1, 500)])
     stamps = np.full(500, 5 * 10**8)
     noisy = local + np.array([0.5, 0.01, 0.0])
-    return Sighted(np.zeros(500, np.int32), stamps, noisy)
+    return MoverHits(np.zeros(500, np.int32), stamps, noisy)
 
 
 @pytest.mark.parametrize("grown", [0.0, 0.03, 0.08])
@@ -242,7 +244,7 @@ def test_a_model_that_is_too_large_is_off_by_that(grown: float) -> None:
     none = _pictures(np.zeros((30, 40), np.uint16))
     tracked = {7: 0, 8: -1}
     models = {7: (0, model), 8: (-1, model)}
-    found = mover_scores(tracked, models, ["car"], DRIVES, _seen_box(), none, T_WORLD_MAP)
+    found = score_object_models(tracked, models, ["car"], DRIVES, _seen_box(), none, T_WORLD_MAP)
     (one,) = found.models
     assert found.nothing == 1
     assert (one.id, one.mover, one.kind) == (7, 0, "car")
@@ -255,11 +257,11 @@ def test_a_model_that_is_too_large_is_off_by_that(grown: float) -> None:
 
 
 def test_what_was_seen_goes_with_the_mover() -> None:
-    places = places_seen(DRIVES, 0, 2 * 10**9, (0, 10**9), _seen_box())
+    places = collect_observed_points(DRIVES, 0, 2 * 10**9, (0, 10**9), _seen_box())
     assert np.allclose(places[:, 1], 0.5)  # without the noise
     assert 1.0 <= places[:, 0].min() < 1.1
     assert 2.9 < places[:, 0].max() <= 3.0
-    assert not len(places_seen(DRIVES, 0, 0, (10**9, 2 * 10**9), _seen_box()))
+    assert not len(collect_observed_points(DRIVES, 0, 0, (10**9, 2 * 10**9), _seen_box()))
 
 
 def test_background_on_a_mover_is_told() -> None:
@@ -269,9 +271,14 @@ def test_background_on_a_mover_is_told() -> None:
     roof = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
     T = np.linalg.inv(DOWN)[None]
     model = Model(
-        corners, roof, T_MAP_WORLD, 0, (0, 0), Record(corners, roof, np.zeros(2, np.int32), T)
+        corners,
+        roof,
+        T_MAP_WORLD,
+        0,
+        (0, 0),
+        TextureRecord(corners, roof, np.zeros(2, np.int32), T),
     )
-    found = mover_scores(
+    found = score_object_models(
         {1: 0}, {1: (0, model)}, ["car"], DRIVES, _seen_box(), _pictures(mask), T_WORLD_MAP
     )
     assert found.background == pytest.approx(0.5, abs=0.01)
@@ -288,7 +295,7 @@ def test_tracks_are_those_of_the_movers_they_follow() -> None:
 
     def follows(x: float, y: float) -> int:
         xy = np.stack([x + np.arange(3.0), np.full(3, y)], 1)
-        return mover_of(Track(0, stamps, xy), stamps, movers, length)
+        return match_mover(Track(0, stamps, xy), stamps, movers, length)
 
     assert follows(0.1, 0.5) == 0
     assert follows(-0.5, 3.0) == 1  # 2 m beside the middle of what is 4 m long
@@ -302,18 +309,18 @@ def test_a_model_is_of_whom_the_track_was_on_then() -> None:
     xy = np.array([(0.0, 0.0), (0, 0), (0, 0), (5, 0)])
     track = Track(0, stamps, xy)
     length = np.full(2, np.nan)
-    assert mover_of(track, stamps, movers, length) == 0
-    assert mover_of(track.within((3 * 10**9, 4 * 10**9)), stamps, movers, length) == 1
+    assert match_mover(track, stamps, movers, length) == 0
+    assert match_mover(track.within((3 * 10**9, 4 * 10**9)), stamps, movers, length) == 1
     assert track.within((12 * 10**8, 13 * 10**8)).stamp_ns.tolist() == [10**9]
     assert len(track.within((-(2**62), 2**62)).xy) == 4
 
 
 def test_movers_seen_well_are_met_by_many_beams_at_once() -> None:
     stamps = np.arange(500) * 10**8  # ten in a second, one more where the next begins
-    rare = Sighted(np.zeros(500, np.int32), stamps, np.zeros((500, 3)))
-    assert most_beams(rare, 0) == 11
-    assert most_beams(rare, 1) == 0
-    found = mover_scores(
+    rare = MoverHits(np.zeros(500, np.int32), stamps, np.zeros((500, 3)))
+    assert count_max_beams(rare, 0) == 11
+    assert count_max_beams(rare, 1) == 0
+    found = score_object_models(
         {1: 0}, {}, ["car"], DRIVES, rare, _pictures(np.zeros((30, 40), np.uint16)), T_WORLD_MAP
     )
     assert (found.tracked, found.modelled, found.seen_well) == (1, 0.0, 0)

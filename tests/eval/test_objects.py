@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from stillmap.eval.objects import object_scores, rank_correlation, sightings, true_traffic
+from stillmap.eval.objects import (
+    compute_rank_correlation,
+    compute_true_flow_map,
+    find_sightings,
+    score_objects,
+)
 from stillmap.tracking import FlowMap, MovingObject
 from stillmap.tracking.flow_map import compute_flow_map
 
@@ -43,17 +48,17 @@ def beams_of(mover, first=0, last=T):
 
 
 def scores(*objects, chosen=(0, 1)):
-    return object_scores(objects, walkers(), where(), OFFSET, SECONDS, chosen)
+    return score_objects(objects, walkers(), where(), OFFSET, SECONDS, chosen)
 
 
 def test_a_mover_that_was_not_seen_for_a_while_is_seen_anew():
-    found = sightings(walkers(), OFFSET, SECONDS, (0, 1), least=1.0)
+    found = find_sightings(walkers(), OFFSET, SECONDS, (0, 1), min_seconds=1.0)
     assert [(one.mover, len(one.scans), len(one.beams)) for one in found] == [
         (0, 40, 80),
         (1, 20, 20),
         (1, 7, 7),
     ]
-    assert len(sightings(walkers(), OFFSET, SECONDS, (0, 1))) == 2  # 7 scans are 1.4 s
+    assert len(find_sightings(walkers(), OFFSET, SECONDS, (0, 1))) == 2  # 7 scans are 1.4 s
 
 
 def test_all_right():
@@ -105,20 +110,22 @@ def floor(width, height):
 
 def test_squares_are_compared_where_the_floor_is():
     true = squares([[1, 2], [3, 4]])
-    assert rank_correlation(true, true, floor(2, 2)) == pytest.approx(1.0)
-    assert rank_correlation(squares([[4, 3], [2, 1]]), true, floor(2, 2)) == pytest.approx(-1.0)
+    assert compute_rank_correlation(true, true, floor(2, 2)) == pytest.approx(1.0)
+    assert compute_rank_correlation(squares([[4, 3], [2, 1]]), true, floor(2, 2)) == pytest.approx(
+        -1.0
+    )
     moved = squares([[2], [4]], (1.0, 0.0, 0.0))  # its first column was never crossed
-    assert 0.5 < rank_correlation(moved, true, floor(2, 2)) < 1.0
-    assert np.isnan(rank_correlation(true, squares([[0, 0], [0, 0]]), floor(2, 2)))
-    assert np.isnan(rank_correlation(true, true, floor(1, 1)))
+    assert 0.5 < compute_rank_correlation(moved, true, floor(2, 2)) < 1.0
+    assert np.isnan(compute_rank_correlation(true, squares([[0, 0], [0, 0]]), floor(2, 2)))
+    assert np.isnan(compute_rank_correlation(true, true, floor(1, 1)))
     with pytest.raises(ValueError, match="resolution"):
-        rank_correlation(compute_flow_map([]), true, floor(2, 2))
+        compute_rank_correlation(compute_flow_map([]), true, floor(2, 2))
 
 
 def test_true_crossings_lie_in_the_map():
-    seen = sightings(walkers(), OFFSET, SECONDS, (0,))
+    seen = find_sightings(walkers(), OFFSET, SECONDS, (0,))
     stamps = (1e9 * SECONDS).astype(np.int64)
     T_map_world = np.array([[1.0, 0.0, 10.0], [0.0, 1.0, 3.0], [0.0, 0.0, 1.0]])
-    found = true_traffic(seen, where(), stamps, T_map_world, 1.0)
+    found = compute_true_flow_map(seen, where(), stamps, T_map_world, 1.0)
     assert found.origin == (10.0, 3.0, 0.0)
     np.testing.assert_array_equal(found.crossings, [[1] * 8])

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillmap.eval.readers import read_odometry, read_planar, read_relations
-from stillmap.eval.relations import RelationErrors, relation_errors
+from stillmap.eval.readers import read_odometry, read_planar_trajectory, read_relations
+from stillmap.eval.relations import RelationErrors, compute_relation_errors
 
 
 def relation(t1: float, t2: float, x: float, y: float, yaw: float) -> list[float]:
@@ -33,7 +33,7 @@ def test_one_relation_by_hand():
     # from (1, 2) heading north to (1, 5) heading west: 3 m ahead, a quarter turn to the left
     trajectory = np.array([[0.0, 1.0, 2.0, math.pi / 2], [1.0, 1.0, 5.0, math.pi]])
     wanted = np.array([relation(0, 1, 2.6, 0.3, math.pi / 2 - 0.1)])
-    errors = relation_errors(trajectory, wanted)
+    errors = compute_relation_errors(trajectory, wanted)
     assert errors.used == 1
     assert errors.translation.mean == pytest.approx(0.5)  # 0.4 ahead, 0.3 aside
     assert errors.translation.squared_mean == pytest.approx(0.25)
@@ -44,7 +44,7 @@ def test_one_relation_by_hand():
 def test_statistics_by_hand():
     trajectory = np.array([[float(k), float(k), 0.0, 0.0] for k in range(5)])
     wanted = np.array([relation(0, k, k - off, 0, 0) for k, off in ((1, 0.1), (2, 0.2), (3, 0.6))])
-    spread = relation_errors(trajectory, wanted).translation
+    spread = compute_relation_errors(trajectory, wanted).translation
     assert spread.mean == pytest.approx(0.3)
     assert spread.median == pytest.approx(0.2)
     assert spread.max == pytest.approx(0.6)
@@ -54,7 +54,7 @@ def test_statistics_by_hand():
 
 def test_rotation_errors_take_the_short_way_round():
     trajectory = np.array([[0.0, 0, 0, 0], [1.0, 0, 0, -math.pi + 0.01]])
-    errors = relation_errors(trajectory, np.array([relation(0, 1, 0, 0, math.pi - 0.01)]))
+    errors = compute_relation_errors(trajectory, np.array([relation(0, 1, 0, 0, math.pi - 0.01)]))
     assert errors.rotation.mean == pytest.approx(math.degrees(0.02))
 
 
@@ -62,7 +62,9 @@ def test_composed_error_is_seen_from_the_reference():
     # the difference of components, (1, 0), is (0, -1) in a frame that heads north: the same length
     trajectory = np.array([[0.0, 0, 0, 0], [1.0, 3.0, 0, math.pi / 2]])
     wanted = np.array([relation(0, 1, 2.0, 0, math.pi / 2 - 0.1)])
-    plain, composed = (relation_errors(trajectory, wanted, compose=c) for c in (False, True))
+    plain, composed = (
+        compute_relation_errors(trajectory, wanted, compose=c) for c in (False, True)
+    )
     assert composed.translation.mean == pytest.approx(1.0)
     assert composed.translation.mean == pytest.approx(plain.translation.mean)
     assert composed.rotation.mean == pytest.approx(math.degrees(0.1))
@@ -72,10 +74,10 @@ def test_composed_error_is_seen_from_the_reference():
 def test_nearest_pose_within_the_limit_stands_for_a_time():
     trajectory = np.array([[0.0, 0, 0, 0], [1.0, 1, 0, 0], [2.0, 2, 0, 0]])
     wanted = np.array([relation(0.05, 1.9, 2, 0, 0), relation(0, 1.5, 1, 0, 0)])
-    errors = relation_errors(trajectory, wanted, max_dt=0.101)
+    errors = compute_relation_errors(trajectory, wanted, max_dt=0.101)
     assert (errors.relations, errors.used, errors.stamps) == (2, 1, 4)
     assert errors.translation.max == 0.0
-    assert relation_errors(trajectory, wanted, max_dt=0.5).used == 2
+    assert compute_relation_errors(trajectory, wanted, max_dt=0.5).used == 2
 
 
 def test_odometry_reaches_times_without_a_pose():
@@ -83,14 +85,14 @@ def test_odometry_reaches_times_without_a_pose():
     trajectory = np.array([[0.0, 0, 0, math.pi / 2], [10.0, 0, 9, math.pi / 2]])
     odometry = np.array([[float(k), float(k), 5.0, 0.0] for k in range(11)])
     wanted = np.array([relation(0, 3, 3, 0, 0), relation(3, 8, 4.0, 0, 0)])
-    errors = relation_errors(trajectory, wanted, odometry)
+    errors = compute_relation_errors(trajectory, wanted, odometry)
     assert (errors.used, errors.stamps_by_odometry) == (2, 2)
     # 3 s: 3 m after the first pose; 8 s: 2 m before the last, at 7 m
     assert errors.translation.max == pytest.approx(0.0, abs=1e-12)
 
 
 def test_no_relation_used_gives_no_numbers():
-    errors = relation_errors(np.zeros((1, 4)), np.array([relation(5, 6, 1, 0, 0)]))
+    errors = compute_relation_errors(np.zeros((1, 4)), np.array([relation(5, 6, 1, 0, 0)]))
     assert errors.used == 0
     assert errors.to_dict()["translation"]["mean"] is None
 
@@ -105,7 +107,7 @@ def test_global_motion_changes_nothing():
     moved[:, 3] += 2.0
     t = trajectory[:, 0]
     wanted = np.array([relation(t[k], t[k + 7], 1, 0, 0) for k in range(40)])
-    a, b = relation_errors(trajectory, wanted), relation_errors(moved, wanted)
+    a, b = compute_relation_errors(trajectory, wanted), compute_relation_errors(moved, wanted)
     assert b.translation.mean == pytest.approx(a.translation.mean)
     assert b.rotation.max == pytest.approx(a.rotation.max)
 
@@ -167,7 +169,9 @@ def test_random_data_against_the_stand_alone_evaluator(tmp_path, judge, compose,
     assert theirs["used"] > 0
     assert (theirs["used"] == 150) == with_odometry
     odom = read_odometry(o) if with_odometry else None
-    ours = relation_errors(read_planar(t), read_relations(r), odom, compose=compose)
+    ours = compute_relation_errors(
+        read_planar_trajectory(t), read_relations(r), odom, compose=compose
+    )
     assert_same(ours, theirs)
 
 
@@ -181,7 +185,7 @@ def test_reference_trajectories_against_the_stand_alone_evaluator(
     log = folder / f"{name}.clf.gz"
     unpacked = tmp_path / "log.clf"
     unpacked.write_bytes(gzip.decompress(log.read_bytes()))
-    planar, wanted = read_planar(trajectory), read_relations(relations)
-    assert_same(relation_errors(planar, wanted), judge(trajectory, relations))
-    ours = relation_errors(planar, wanted, read_odometry(log), compose=True)
+    planar, wanted = read_planar_trajectory(trajectory), read_relations(relations)
+    assert_same(compute_relation_errors(planar, wanted), judge(trajectory, relations))
+    ours = compute_relation_errors(planar, wanted, read_odometry(log), compose=True)
     assert_same(ours, judge(trajectory, relations, "--odom", unpacked, "--compose"))

@@ -7,13 +7,13 @@ from scipy.spatial.transform import Rotation
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.eval.trajectory import (
-    absolute_errors,
     align,
     align_points,
-    associate,
+    associate_trajectories,
+    compute_absolute_errors,
+    compute_relative_errors,
     planar,
-    relative_errors,
-    to_plane_where_flat,
+    project_flat_trajectories,
 )
 
 with warnings.catch_warnings():
@@ -68,9 +68,9 @@ def test_absolute_errors_agree_with_evo(flat):
     est.align(ref)
     ape = metrics.APE(metrics.PoseRelation.translation_part)
     ape.process_data((ref, est))
-    P, Q = to_plane_where_flat(estimate, reference)
+    P, Q = project_flat_trajectories(estimate, reference)
     assert P.shape[-1] == (3 if flat else 4)
-    assert_stats(absolute_errors(P, Q), ape)
+    assert_stats(compute_absolute_errors(P, Q), ape)
 
 
 @pytest.mark.parametrize("flat", [False, True])
@@ -79,8 +79,8 @@ def test_relative_errors_agree_with_evo(flat, delta, unit):
     rng = np.random.default_rng(2)
     reference = in_space(rng, 120, flat)
     estimate = disturbed(rng, reference, flat)
-    P, Q = to_plane_where_flat(estimate, reference)
-    ours = relative_errors(P, Q, delta, unit)
+    P, Q = project_flat_trajectories(estimate, reference)
+    ours = compute_relative_errors(P, Q, delta, unit)
     for relation, stats in (
         (metrics.PoseRelation.translation_part, ours.translation),
         (metrics.PoseRelation.rotation_angle_deg, ours.rotation),
@@ -107,7 +107,7 @@ def test_association_agrees_with_evo(sizes):
     theirs = evo_sync.associate_trajectories(
         evo_trajectory(T[0], a), evo_trajectory(T[1], b), max_diff=0.03
     )
-    i, j = associate(a, b, 0.03)
+    i, j = associate_trajectories(a, b, 0.03)
     assert 5 < len(i) < 50
     assert a[i].tolist() == theirs[0].timestamps.tolist()
     assert b[j].tolist() == theirs[1].timestamps.tolist()
@@ -115,12 +115,12 @@ def test_association_agrees_with_evo(sizes):
 
 def test_no_common_time_is_an_error():
     with pytest.raises(InputError, match=r"within 0\.02 s"):
-        associate(np.array([0.0, 1.0]), np.array([1.5]), 0.02)
+        associate_trajectories(np.array([0.0, 1.0]), np.array([1.5]), 0.02)
 
 
 def test_the_same_stamps_belong_together_one_by_one_though_they_repeat():
     stamps = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 2.0])
-    i, j = associate(stamps, stamps, 0.02)
+    i, j = associate_trajectories(stamps, stamps, 0.02)
     np.testing.assert_array_equal(i, np.arange(6))
     np.testing.assert_array_equal(j, np.arange(6))
 
@@ -130,7 +130,7 @@ def test_absolute_error_by_hand():
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]], float)
     truth = se2.matrix(*corners.T, 0.0)
     pushed = se2.matrix(corners[:, 0] * 1.1, corners[:, 1], 0.0)
-    stats = absolute_errors(pushed, truth)
+    stats = compute_absolute_errors(pushed, truth)
     assert (stats.rmse, stats.max) == pytest.approx((0.1, 0.1))
 
 
@@ -168,31 +168,31 @@ def test_align_trusts_a_long_path_more_than_headings():
 def test_a_flat_trajectory_stays_flat():
     rng = np.random.default_rng(6)
     flat, tilted = in_space(rng, 10, flat=True), in_space(rng, 10)
-    assert to_plane_where_flat(flat, tilted)[0] is flat
-    np.testing.assert_array_equal(to_plane_where_flat(flat, flat)[1], planar(flat))
+    assert project_flat_trajectories(flat, tilted)[0] is flat
+    np.testing.assert_array_equal(project_flat_trajectories(flat, flat)[1], planar(flat))
 
 
 def test_relative_errors_by_hand():
     x = np.arange(6.0)
     truth = se2.matrix(x, 0.0, 0.0)
     scaled = se2.matrix(1.1 * x, 0.0, 0.01 * x)
-    errors = relative_errors(scaled, truth, 2, "frames")
+    errors = compute_relative_errors(scaled, truth, 2, "frames")
     assert errors.pairs == 4
     assert errors.rotation.max == pytest.approx(np.degrees(0.02))
     assert errors.rotation.rmse == pytest.approx(np.degrees(0.02))
-    assert relative_errors(scaled, truth, 2.0, "m") == errors
+    assert compute_relative_errors(scaled, truth, 2.0, "m") == errors
 
 
 def test_a_standing_robot_has_no_pairs_a_metre_apart():
     still = np.tile(np.eye(3), (5, 1, 1))
-    errors = relative_errors(still, still, 1.0, "m")
+    errors = compute_relative_errors(still, still, 1.0, "m")
     assert errors.pairs == 0
     assert errors.to_dict()["rotation"]["rmse"] is None
     spatial = np.tile(np.eye(4), (3, 1, 1))
-    assert relative_errors(spatial, spatial, 5, "frames").pairs == 0
+    assert compute_relative_errors(spatial, spatial, 5, "frames").pairs == 0
 
 
 @pytest.mark.parametrize(("delta", "unit"), [(0, "frames"), (1.5, "frames"), (0.0, "m")])
 def test_impossible_steps_are_refused(delta, unit):
     with pytest.raises(InputError, match="a step of"):
-        relative_errors(np.eye(3)[None], np.eye(3)[None], delta, unit)
+        compute_relative_errors(np.eye(3)[None], np.eye(3)[None], delta, unit)

@@ -182,7 +182,7 @@ def _rows(data: bytes, folder: Path) -> None:
         warnings.simplefilter("error")
         for reader in (
             read_tum,
-            readers.read_planar,
+            readers.read_planar_trajectory,
             readers.read_relations,
             readers.read_odometry,
         ):

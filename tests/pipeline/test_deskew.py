@@ -10,7 +10,7 @@ from choices import RESOLUTION, options
 import stillmap
 from stillmap import _core, em, slam
 from stillmap.core.config import replaced
-from stillmap.eval.trajectory import absolute_errors
+from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
 from stillmap.slam import odometry_2d
 
@@ -120,6 +120,6 @@ def test_poses_at_speed(world, odometry):
     ate = []
     for changes in ({}, AT_ONCE):
         result = stillmap.build(recording, replaced(options(max_iterations=4), changes))
-        ate.append(absolute_errors(result.poses, truth).rmse)
+        ate.append(compute_absolute_errors(result.poses, truth).rmse)
     assert ate[0] < 0.4 * ate[1]
     assert ate[0] < {"office": 0.015, "street": 0.03}[world]

@@ -6,7 +6,7 @@ from choices import RESOLUTION, options
 
 import stillmap
 from stillmap import _core, em
-from stillmap.eval.labels import label_scores
+from stillmap.eval.labels import score_labels
 
 
 @pytest.fixture
@@ -16,8 +16,8 @@ def tracked(room):
 
 def test_labels_are_better_than_calling_everything_static(room, tracked):
     hit, static = room.recording.hit, room.truth.static
-    labels = label_scores(tracked.p_static, static, hit)
-    everything = label_scores(np.ones(len(hit), np.float32), static, hit)
+    labels = score_labels(tracked.p_static, static, hit)
+    everything = score_labels(np.ones(len(hit), np.float32), static, hit)
     assert labels.brier < 0.6 * everything.brier
     assert labels.precision > 0.7
     assert labels.recall > 0.5

@@ -6,8 +6,8 @@ import pytest
 import stillmap
 from stillmap.core import se2
 from stillmap.core.config import replaced
-from stillmap.eval.readers import read_odometry, read_relations, seconds
-from stillmap.eval.relations import relation_errors
+from stillmap.eval.readers import read_odometry, read_relations, to_seconds
+from stillmap.eval.relations import compute_relation_errors
 from stillmap.pipeline.options import Options
 
 slow = pytest.mark.slow
@@ -36,10 +36,10 @@ def errors(folder, name, result):
         for path in (folder / f"{name}.relations", folder / f"{name}.pseudo.relations")
         if path.exists()
     ]
-    times = seconds(result.recording.stamp_ns)
+    times = to_seconds(result.recording.stamp_ns)
     trajectory = np.column_stack([times, se2.parameters(result.poses)])
     odometry = read_odometry(folder / f"{name}.clf.gz")
-    return relation_errors(trajectory, read_relations(relations), odometry)
+    return compute_relation_errors(trajectory, read_relations(relations), odometry)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 from stillmap import _core
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.eval.trajectory import absolute_errors
+from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.sim import RobotOptions, Scene, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
@@ -258,7 +258,10 @@ def test_a_round_passed_again_is_not_searched_more_widely(monkeypatch):
         options = LoopOptions(drift_translation=0.012, stage=stage)
         options = dataclasses.replace(OPTIONS, loops=options)
         found = close_loops(recording, e, options, local(poses), lambda *_: None)
-        assert absolute_errors(found.poses, truth).rmse < 0.4 * absolute_errors(poses, truth).rmse
+        assert (
+            compute_absolute_errors(found.poses, truth).rmse
+            < 0.4 * compute_absolute_errors(poses, truth).rmse
+        )
         return np.array(windows)
 
     staged, at_once = searched(10.0), searched(1e9)

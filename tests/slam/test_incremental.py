@@ -9,7 +9,7 @@ import pytest
 from stillmap import _core, em
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.eval.trajectory import absolute_errors
+from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
@@ -52,7 +52,7 @@ def small_room(laser=None, scans=60, people=0, seed=2):
 
 
 def ate(mapped, simulation):
-    return absolute_errors(mapped.poses, simulation.truth.T_world_base).rmse
+    return compute_absolute_errors(mapped.poses, simulation.truth.T_world_base).rmse
 
 
 def assert_poses(mapped):
@@ -80,7 +80,9 @@ def test_a_populated_place_is_followed(scene, odometry):
 
 def test_it_is_better_than_odometry_alone():
     simulation = run_through("hall")
-    odometry = absolute_errors(simulation.recording.T_odom_base, simulation.truth.T_world_base)
+    odometry = compute_absolute_errors(
+        simulation.recording.T_odom_base, simulation.truth.T_world_base
+    )
     assert ate(build(simulation.recording), simulation) < 0.25 * odometry.rmse
 
 

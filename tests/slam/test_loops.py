@@ -8,7 +8,7 @@ import pytest
 
 from stillmap import _core, em
 from stillmap.core import se2
-from stillmap.eval.trajectory import absolute_errors
+from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
@@ -34,7 +34,7 @@ def mapped(simulation, options=OPTIONS, threads=1, start=None):
 
 
 def ate(found, simulation):
-    return absolute_errors(found.poses, simulation.truth.T_world_base).rmse
+    return compute_absolute_errors(found.poses, simulation.truth.T_world_base).rmse
 
 
 @functools.cache
@@ -99,13 +99,13 @@ def test_a_square_with_drift_closes():
     drifted = MStepResult(
         np.array(poses), np.zeros((n, 3, 3)), _core.OccupancyGrid2D(0.05), np.ones(n), []
     )
-    before = absolute_errors(drifted.poses, truth)
+    before = compute_absolute_errors(drifted.poses, truth)
     e = np.full(simulation.recording.n_beams, 0.9, np.float32)
     found = close_loops(simulation.recording, e, OPTIONS, drifted, silent)
     metres, chi2 = errors(found.loops, simulation).T
     assert np.count_nonzero(metres < 0.1) >= 4
     assert chi2.max() < 11.3  # 99 %
-    assert absolute_errors(found.poses, truth).rmse < 0.5 * before.rmse
+    assert compute_absolute_errors(found.poses, truth).rmse < 0.5 * before.rmse
     end = se2.parameters(se2.inverse(truth[-1]) @ found.poses[-1])
     assert np.hypot(*end[:2]) < 0.08
     assert np.hypot(*se2.parameters(se2.inverse(truth[-1]) @ drifted.poses[-1])[:2]) > 0.2

@@ -7,7 +7,7 @@ import pytest
 from boxes import Boxes, Lidar, Way, recorded
 
 from stillmap.core import se2, se3
-from stillmap.eval.trajectory import absolute_errors
+from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.slam import lidar_odometry, loop_closure_3d
 from stillmap.slam.motion_model import MotionOptions
 from stillmap.slam.pose_graph import Constraint, Robust, optimize_poses, squared_mahalanobis
@@ -41,7 +41,7 @@ def drive():
     recording, truth, e = recorded(block(), LIDAR, round_the_block(), 200, seed=1)
     options = lidar_odometry.SpinningOptions()
     driven = lidar_odometry.register_sweeps(recording, e, options, MotionOptions(), _silent, 1)
-    assert absolute_errors(driven.poses, truth).rmse < 0.1
+    assert compute_absolute_errors(driven.poses, truth).rmse < 0.1
     return recording, truth, e, driven
 
 
@@ -70,7 +70,7 @@ def test_drift_is_taken_out(drive):
     truth = drive[1]
     driven = drifted(drive[3], [0.005, 0.0, 0.005, 0.0, 0.0, 0.0005])
     found, loops, graph = closed(drive, driven)
-    before, after = (absolute_errors(d.poses, truth).rmse for d in (driven, found))
+    before, after = (compute_absolute_errors(d.poses, truth).rmse for d in (driven, found))
     assert before > 0.2
     assert after < 0.35 * before
     accepted = [loop for loop in loops if not loop.refused]

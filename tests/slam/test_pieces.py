@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
-from stillmap.eval.trajectory import absolute_errors
+from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box, pillar
@@ -30,7 +30,7 @@ def assert_noticed_and_placed(simulation):
     found = mapped(simulation.recording)
     assert found.breaks == [simulation.truth.scene["carried_at_scan"]]
     assert found.unconnected == []
-    assert absolute_errors(found.poses, simulation.truth.T_world_base).rmse < 0.1
+    assert compute_absolute_errors(found.poses, simulation.truth.T_world_base).rmse < 0.1
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -119,8 +119,8 @@ def test_a_place_that_has_nothing_in_common_is_put_beside(rooms):
     across = [r for r in found.graph.constraints if found.graph.keyframes[r.second] == 60]
     assert [np.linalg.eigvalsh(r.covariance).min() > 90.0 for r in across] == [True]
     # each room is as good as alone, and the two maps have 10 m between them
-    assert absolute_errors(found.poses[:60], one.truth.T_world_base).rmse < 0.01
-    assert absolute_errors(found.poses[60:], other.truth.T_world_base).rmse < 0.01
+    assert compute_absolute_errors(found.poses[:60], one.truth.T_world_base).rmse < 0.01
+    assert compute_absolute_errors(found.poses[60:], other.truth.T_world_base).rmse < 0.01
     left = ends(recording, found.poses, range(60))
     right = ends(recording, found.poses, range(60, 120))
     assert right[:, 0].min() > left[:, 0].max() + 5.0
@@ -140,7 +140,7 @@ def test_the_same_room_again_is_the_same_room(rooms):
     assert found.breaks == [60]
     assert found.unconnected == []
     truth = np.concatenate([one.truth.T_world_base] * 2)
-    assert absolute_errors(found.poses, truth).rmse < 0.02
+    assert compute_absolute_errors(found.poses, truth).rmse < 0.02
 
 
 def test_nothing_reaches_across_a_break():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stillmap.core import se2
-from stillmap.eval.trajectory import absolute_errors
+from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
@@ -45,7 +45,7 @@ def survived(T_odom_base):
     """The scans where odometry was disbelieved; poses are as good as ever."""
     recording = dataclasses.replace(room().recording, T_odom_base=T_odom_base)
     found = followed(recording)
-    assert absolute_errors(found.poses, room().truth.T_world_base).rmse < 0.01
+    assert compute_absolute_errors(found.poses, room().truth.T_world_base).rmse < 0.01
     assert found.breaks == []
     return found.odometry_faults
 
@@ -98,7 +98,7 @@ def test_stalls_in_the_corridors_of_an_office(seed):
     simulation = simulate(scene_by_name("office", options), seed)
     recording, T = simulation.recording, simulation.truth.T_world_base
     assert metres(T)[metres(recording.T_odom_base) == 0.0].sum() > 3.0
-    assert absolute_errors(followed(recording).poses, T).rmse < 0.05
+    assert compute_absolute_errors(followed(recording).poses, T).rmse < 0.05
 
 
 def metres(T):
@@ -123,7 +123,7 @@ def test_a_robot_that_stops_between_bare_walls_has_stopped():
     again = dataclasses.replace(again, points=again.points + noise)
     found = followed(again)
     assert found.odometry_faults == []
-    assert absolute_errors(found.poses, T[stood]).rmse < 0.1
+    assert compute_absolute_errors(found.poses, T[stood]).rmse < 0.1
 
 
 def test_a_robot_that_was_carried_and_put_down_stands():
@@ -137,7 +137,7 @@ def test_a_robot_that_was_carried_and_put_down_stands():
     found = followed(dataclasses.replace(recording, T_odom_base=odom))
     assert found.breaks == [30]
     assert found.odometry_faults == [30]
-    assert absolute_errors(found.poses[30:], T[30:]).rmse < 0.02
+    assert compute_absolute_errors(found.poses[30:], T[30:]).rmse < 0.02
 
 
 def test_nothing_is_followed_by_scans_that_hit_nothing():
@@ -175,7 +175,7 @@ def picked(recording, scans):
 def error(recording, T_world_base):
     e = np.full(recording.n_beams, 0.9, np.float32)
     found = m_step(recording, e, OPTIONS, None, 1, silent)
-    return absolute_errors(found.poses, T_world_base).rmse
+    return compute_absolute_errors(found.poses, T_world_base).rmse
 
 
 @functools.cache

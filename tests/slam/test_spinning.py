@@ -8,7 +8,7 @@ from boxes import Boxes, Lidar, Way, at_once, recorded
 
 from stillmap import _core
 from stillmap.core import se2, se3
-from stillmap.eval.trajectory import absolute_errors, relative_errors
+from stillmap.eval.trajectory import compute_absolute_errors, compute_relative_errors
 from stillmap.slam import constant_velocity, lidar_odometry
 from stillmap.slam.motion_model import MotionOptions
 
@@ -49,8 +49,8 @@ def room():
 def test_poses_and_motion_in_a_room(room):
     recording, truth, e = room
     found = built(recording, e)
-    assert absolute_errors(found.poses, truth).rmse < 0.01
-    relative = relative_errors(found.poses, truth, 1, "frames")
+    assert compute_absolute_errors(found.poses, truth).rmse < 0.01
+    relative = compute_relative_errors(found.poses, truth, 1, "frames")
     assert relative.translation.rmse < 0.01
     assert relative.rotation.rmse < 0.2  # degrees
     true_twists = se3.log(se2.inverse(truth[:-1]) @ truth[1:]) / 0.1
@@ -67,7 +67,9 @@ def test_what_moves_does_not_pull():
     lidar = Lidar(rings=16, columns=360)
     recording, truth, e = recorded(Boxes.of(rows), lidar, wobbling(25, turn=0.0), 25, seed=2)
     assert 0.5 < 1.0 - e.mean() < 0.8
-    known, unknown = (absolute_errors(built(recording, x).poses, truth).rmse for x in (e, None))
+    known, unknown = (
+        compute_absolute_errors(built(recording, x).poses, truth).rmse for x in (e, None)
+    )
     assert known < 0.02
     assert unknown > 0.3
 
@@ -77,7 +79,9 @@ def test_beam_times_are_used(room):
     recording, truth, e = room
     bent = built(at_once(recording), e)
     straight = built(recording, e)
-    errors = [relative_errors(f.poses, truth, 1, "frames").rotation.rmse for f in (bent, straight)]
+    errors = [
+        compute_relative_errors(f.poses, truth, 1, "frames").rotation.rmse for f in (bent, straight)
+    ]
     assert errors[1] < 0.5 * errors[0]
 
 
@@ -112,7 +116,7 @@ def test_odometry_holds_where_nothing_is_seen():
     corridor = Boxes.of([[0.0, 0.0, 1.0, 400.0, 2.6, 3.0, 0, 0, 0]])
     recording, truth, e = recorded(corridor, SPARSE, wobbling(25, turn=0.0), 25, seed=4)
     told = replace(recording, T_odom_base=np.ascontiguousarray(truth))
-    errors = [absolute_errors(built(r, e).poses, truth).rmse for r in (told, recording)]
+    errors = [compute_absolute_errors(built(r, e).poses, truth).rmse for r in (told, recording)]
     assert errors[0] < 0.6 * errors[1], errors
 
 
@@ -132,7 +136,7 @@ def test_empty_sweeps_go_on_as_before(room):
     gone = recording.hit.copy()
     gone[recording.beams_of(15)] = False
     found = built(replace(recording, hit=gone), e)
-    assert absolute_errors(found.poses, truth).rmse < 0.02
+    assert compute_absolute_errors(found.poses, truth).rmse < 0.02
     assert found.explained[15] == 0.0
     nothing = built(replace(recording, hit=np.zeros_like(gone)), e)
     assert np.abs(nothing.poses - np.eye(4)).max() < 1e-9

@@ -6,25 +6,23 @@ What `stillmap eval` computes: each score as a dictionary and as lines to read.
 import argparse
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from stillmap.cli.console import print_json
-from stillmap.cli.eval_model import of_model
 from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError
-from stillmap.eval import readers, trajectory
-from stillmap.eval.labels import LabelScores, label_scores
-from stillmap.eval.map import MapScores, map_scores, wall_cells_of_hits, wall_cells_of_map
-from stillmap.eval.readers import Truth, read_truth, require_same_beams
-from stillmap.eval.relations import RelationErrors, relation_errors
-from stillmap.eval.trajectory import paired
-from stillmap.results.labels import read_labels
-from stillmap.results.reader import read_grid, require_there
 
-Float = NDArray[np.float64]
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stillmap.eval import trajectory
+    from stillmap.eval.labels import LabelScores
+    from stillmap.eval.map import MapScores
+    from stillmap.eval.readers import Truth
+    from stillmap.eval.relations import RelationErrors
+
+
 
 Scores = tuple[dict[str, Any], Iterable[str]]
 
@@ -227,8 +225,11 @@ def _positive(text: str) -> float:
 
 def of_relations(args: argparse.Namespace) -> Scores:
     """Errors of known displacements."""
-    errors = relation_errors(
-        readers.read_planar(args.trajectory),
+    from stillmap.eval import readers
+    from stillmap.eval.relations import compute_relation_errors
+
+    errors = compute_relation_errors(
+        readers.read_planar_trajectory(args.trajectory),
         readers.read_relations(args.relations),
         readers.read_odometry(args.odom) if args.odom else None,
         args.max_dt,
@@ -243,7 +244,7 @@ def of_relations(args: argparse.Namespace) -> Scores:
     return errors.to_dict(), _relation_lines(errors)
 
 
-def _relation_lines(errors: RelationErrors) -> Iterable[str]:
+def _relation_lines(errors: "RelationErrors") -> Iterable[str]:
     yield (
         f"relations    {errors.relations}, used {errors.used} "
         f"(stamps {errors.stamps}, by odometry {errors.stamps_by_odometry})"
@@ -260,15 +261,17 @@ def _relation_lines(errors: RelationErrors) -> Iterable[str]:
 
 def of_trajectory(args: argparse.Namespace) -> Scores:
     """ATE and RPE."""
+    from stillmap.eval import readers, trajectory
+
     estimated = readers.read_trajectory(args.trajectory)
     reference = readers.read_trajectory(args.reference)
     try:
-        i, j = trajectory.associate(estimated.stamp_s, reference.stamp_s, args.max_dt)
+        i, j = trajectory.associate_trajectories(estimated.stamp_s, reference.stamp_s, args.max_dt)
     except InputError as error:
         raise InputError(error.what, where=str(args.trajectory), hint=error.hint) from error
-    P, Q = trajectory.to_plane_where_flat(estimated.poses[i], reference.poses[j])
-    absolute = trajectory.absolute_errors(P, Q)
-    relative = trajectory.relative_errors(P, Q, args.delta, args.delta_unit)
+    P, Q = trajectory.project_flat_trajectories(estimated.poses[i], reference.poses[j])
+    absolute = trajectory.compute_absolute_errors(P, Q)
+    relative = trajectory.compute_relative_errors(P, Q, args.delta, args.delta_unit)
     scores = {
         "poses": len(i),
         "dimension": P.shape[-1] - 1,
@@ -285,21 +288,26 @@ def of_trajectory(args: argparse.Namespace) -> Scores:
     return scores, lines
 
 
-def _stats(e: trajectory.ErrorStats, unit: str) -> str:
+def _stats(e: "trajectory.ErrorStats", unit: str) -> str:
     return f"rmse {e.rmse:.4f} {unit}, mean {e.mean:.4f}, median {e.median:.4f}, max {e.max:.4f}"
 
 
 def of_labels(args: argparse.Namespace) -> Scores:
     """Static or dynamic, per beam."""
+    from stillmap.eval.labels import score_labels
+    from stillmap.eval.readers import read_truth, require_same_beams
+    from stillmap.results.labels import read_labels
+    from stillmap.results.reader import require_there
+
     require_there(args.result, args.truth)
     labels = read_labels(args.result)
     truth = read_truth(args.truth, labels)
     require_same_beams(labels, truth, args.result)
-    scores = label_scores(labels.p_static, truth.static(), labels.hit & truth.recording.hit)
+    scores = score_labels(labels.p_static, truth.static(), labels.hit & truth.recording.hit)
     return scores.to_dict(), _label_lines(scores)
 
 
-def _label_lines(s: LabelScores) -> Iterable[str]:
+def _label_lines(s: "LabelScores") -> Iterable[str]:
     yield f"beams that hit     {s.hits}, {s.dynamic} dynamic, {s.unlabelled} more without a label"
     yield f"average precision  {s.average_precision:.4f}"
     yield f"at 1/2             F1 {s.f1:.4f}, precision {s.precision:.4f}, recall {s.recall:.4f}"
@@ -311,31 +319,42 @@ def _label_lines(s: LabelScores) -> Iterable[str]:
 
 def of_map(args: argparse.Namespace) -> Scores:
     """Ghosts and walls."""
+    import numpy as np
+
+    from stillmap.eval.map import extract_wall_cells, extract_wall_cells_from_hits, score_map
+    from stillmap.eval.readers import read_truth
+    from stillmap.results.reader import read_grid, require_there
+
     others = [path for path in (args.reference, args.reference_truth) if path is not None]
     require_there(args.result, args.truth, *others)
     truth = read_truth(args.truth)
     grid, walls = read_grid(args.result), truth.walls()
     T_world_map = _alignment(args.result, truth)
     if args.reference is None:
-        wanted = wall_cells_of_hits(truth.static_hits(), walls, grid, T_world_map)
+        wanted = extract_wall_cells_from_hits(truth.static_hits(), walls, grid, T_world_map)
     else:
         other = read_truth(args.reference_truth) if args.reference_truth else truth
-        wanted = wall_cells_of_map(
+        wanted = extract_wall_cells(
             read_grid(args.reference), walls, _alignment(args.reference, other)
         )
     # what was brought and is still there is no ghost
     solid = np.concatenate([walls, truth.lasting()])
-    scores = map_scores(grid, solid, wanted, T_world_map)
+    scores = score_map(grid, solid, wanted, T_world_map)
     return scores.to_dict(), _map_lines(scores)
 
 
-def _alignment(result: Path, truth: Truth) -> Float:
+def _alignment(result: Path, truth: "Truth") -> "NDArray[np.float64]":
     """T_world_map of a result: the map frame is where its trajectory started, not the world's."""
-    poses, true_poses = paired(result, truth)
+    from stillmap.eval import trajectory
+    from stillmap.eval.trajectory import read_paired_poses
+
+    poses, true_poses = read_paired_poses(result, truth)
     return trajectory.align(trajectory.planar(poses), true_poses)
 
 
-def _map_lines(s: MapScores) -> Iterable[str]:
+def _map_lines(s: "MapScores") -> Iterable[str]:
+    import numpy as np
+
     x, y, theta = s.T_world_map
     yield f"alignment    {x:.3f} m, {y:.3f} m, {np.degrees(theta):.3f} deg (map to world)"
     yield (

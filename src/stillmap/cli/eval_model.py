@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.eval import model_readers, trajectory
-from stillmap.eval.mesh import SurfaceScores, TextureScores, surface_scores, texture_scores
-from stillmap.eval.model_readers import Seen
-from stillmap.eval.object_models import MoverScores, mover_of, mover_scores
-from stillmap.eval.trajectory import paired
+from stillmap.eval.mesh import SurfaceScores, TextureScores, score_surface, score_texture
+from stillmap.eval.model_readers import CameraSimulation
+from stillmap.eval.object_models import MoverScores, match_mover, score_object_models
+from stillmap.eval.trajectory import read_paired_poses
 from stillmap.results.reader import require_model, require_there
 from stillmap.rig.trajectory import lift_poses
 from stillmap.sim.truth import load_truth
@@ -24,55 +24,57 @@ Float = NDArray[np.float64]
 def of_model(args: argparse.Namespace) -> tuple[dict[str, Any], Iterable[str]]:
     """Surface, texture, and models of what moved; what a result does not have is left out."""
     require_there(args.result, args.truth)
-    seen = model_readers.read_seen(args.truth)
+    seen = model_readers.read_camera_simulation(args.truth)
     T_world_map = _alignment(args.result, seen)
     scores: dict[str, Any] = {"alignment": T_world_map.tolist()}
     lines: list[str] = []
     glb = model_readers.read_glb(require_model(args.result))
-    standing, places = seen.picture_truth.standing, seen.places(args.within)
-    surface = surface_scores(glb.vertices, glb.faces, standing, places, T_world_map)
+    standing, places = seen.image_truth.standing, seen.observed_places(args.within)
+    surface = score_surface(glb.vertices, glb.faces, standing, places, T_world_map)
     scores["surface"] = surface.to_dict()
     lines += _surface_lines(surface)
-    n = len(seen.pictures.camera)
+    n = len(seen.images.camera)
     record = model_readers.read_record(args.result / model_readers.RECORD, n)
     if record is not None:
-        seed = seen.picture_truth.colour_seed
-        texture = texture_scores(
-            record, glb.coloured, seen.pictures, standing, seed, T_world_map, args.within
+        seed = seen.image_truth.colour_seed
+        texture = score_texture(
+            record, glb.colored, seen.images, standing, seed, T_world_map, args.within
         )
         scores["texture"] = texture.to_dict()
         lines += _texture_lines(texture)
-    if (model_readers.objects_of(args.result) / "objects.json").exists():
+    if (model_readers.find_objects_folder(args.result) / "objects.json").exists():
         movers = _movers(args.result, seen, T_world_map)
         scores["movers"] = movers.to_dict()
         lines += _mover_lines(movers)
     return scores, lines
 
 
-def _alignment(result: Path, seen: Seen) -> Float:
+def _alignment(result: Path, seen: CameraSimulation) -> Float:
     """(4, 4) T_world_map."""
-    T = trajectory.align(*trajectory.to_plane_where_flat(*paired(result, seen.truth)))
+    T = trajectory.align(
+        *trajectory.project_flat_trajectories(*read_paired_poses(result, seen.truth))
+    )
     return T if len(T) == 4 else lift_poses(T[None])[0]
 
 
-def _movers(result: Path, seen: Seen, T_world_map: Float) -> MoverScores:
-    truth, folder = load_truth(seen.truth.folder), model_readers.objects_of(result)
+def _movers(result: Path, seen: CameraSimulation, T_world_map: Float) -> MoverScores:
+    truth, folder = load_truth(seen.truth.folder), model_readers.find_objects_folder(result)
     kinds, sizes = truth.scene["mover_kinds"], truth.scene["mover_sizes"]
     length = np.array([np.nan if size[0] is None else size[0] for size in sizes], float)
-    stamps = seen.picture_truth.moving.stamp_ns
+    stamps = seen.image_truth.moving.stamp_ns
     tracks = [one for one in model_readers.read_tracks(folder, T_world_map) if len(one.xy)]
-    tracked = {one.id: mover_of(one, stamps, truth.movers, length) for one in tracks}
+    tracked = {one.id: match_mover(one, stamps, truth.movers, length) for one in tracks}
     models = {}
     for one in tracks:
         mover = tracked[one.id]
         rigid = mover >= 0 and kinds[mover] != "person"
-        model = model_readers.read_model(folder, one.id, rigid, len(seen.pictures.camera))
+        model = model_readers.read_model(folder, one.id, rigid, len(seen.images.camera))
         if model is not None:
             # a track may pass from one mover to another
-            shows = mover_of(one.within(model.span_ns), stamps, truth.movers, length)
+            shows = match_mover(one.within(model.span_ns), stamps, truth.movers, length)
             models[one.id] = shows, model
-    moving, sighted = seen.picture_truth.moving, seen.sighted()
-    return mover_scores(tracked, models, kinds, moving, sighted, seen.pictures, T_world_map)
+    moving, sighted = seen.image_truth.moving, seen.mover_hits()
+    return score_object_models(tracked, models, kinds, moving, sighted, seen.images, T_world_map)
 
 
 def _surface_lines(s: SurfaceScores) -> Iterable[str]:

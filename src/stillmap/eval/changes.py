@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core.se2 import inverse
 from stillmap.eval.labels import Scores
-from stillmap.eval.map import GHOST_DISTANCE, MIN_HITS, distance_to_walls, near_occupied
+from stillmap.eval.map import GHOST_DISTANCE, MIN_HITS, distance_to_walls, is_near_occupied
 from stillmap.results.reader import Grid, moved
 
 Float = NDArray[np.float64]
@@ -33,12 +33,12 @@ class Stay:
     """
 
     mover: int
-    middle: Float
+    center: Float
     faces: Float
     since_ns: int | None
     until_ns: int | None
 
-    def holds(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def contains(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(N,) whether it stands there at stamps (N,)."""
         since = -np.inf if self.since_ns is None else self.since_ns
         until = np.inf if self.until_ns is None else self.until_ns
@@ -62,9 +62,9 @@ class Beams:
     scan: Index
     stamp_ns: NDArray[np.int64]
 
-    def on(self, stay: Stay) -> Index:
+    def hits_on(self, stay: Stay) -> Index:
         """The beams that a thing reflected during a stay."""
-        return np.flatnonzero((self.mover == stay.mover) & stay.holds(self.stamp_ns)[self.scan])
+        return np.flatnonzero((self.mover == stay.mover) & stay.contains(self.stamp_ns)[self.scan])
 
     def near(self, point: Float, distance: float) -> Index:
         """The beams that come as near as that to a point (2,), metres."""
@@ -93,7 +93,7 @@ class ChangeScores(Scores):
     old_occupied: float
 
 
-class Detected(Protocol):
+class DetectedChange(Protocol):
     """A change that was found: where, in metres of the map frame, what, and when."""
 
     @property
@@ -121,7 +121,7 @@ class TrueChange:
     stay: Stay
     appeared: bool
     stamp_ns: int
-    look_ns: int | None
+    observed_ns: int | None
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class ChangeTimes(Scores):
     errors: tuple[float, ...]
 
 
-def change_scores(
+def score_changes(
     grid: Grid, stays: Sequence[Stay], beams: Beams, walls: Float, T_world_map: Float
 ) -> ChangeScores:
     """Score a map that shall show what is there at the end.
@@ -157,9 +157,9 @@ def change_scores(
         T_world_map: (3, 3), see `trajectory.align`.
     """
     T_map_world = inverse(T_world_map)
-    lasting = [stay for stay in stays if stay.holds(beams.stamp_ns[-1:])[0]]
-    ended = [stay for stay in stays if not stay.holds(beams.stamp_ns[-1:])[0]]
-    shown = [_cells(grid, beams.end[beams.on(stay)], T_map_world) for stay in lasting]
+    lasting = [stay for stay in stays if stay.contains(beams.stamp_ns[-1:])[0]]
+    ended = [stay for stay in stays if not stay.contains(beams.stamp_ns[-1:])[0]]
+    shown = [_cells(grid, beams.end[beams.hits_on(stay)], T_map_world) for stay in lasting]
     left = [_left_cells(grid, stay, beams, T_world_map) for stay in ended]
     new, old = _union(shown), _union(left)
     solid = np.concatenate([walls, *(stay.faces for stay in lasting)])
@@ -167,18 +167,18 @@ def change_scores(
     old = old[distance_to_walls(centres, solid) > GHOST_DISTANCE * grid.resolution]
     return ChangeScores(
         new_cells=len(new),
-        new_kept=_mean(near_occupied(grid, grid.centres(new))),
+        new_kept=_mean(is_near_occupied(grid, grid.centres(new))),
         old_cells=len(old),
         old_occupied=_mean(_occupied(grid, old)),
     )
 
 
-def true_changes(stays: Iterable[Stay], beams: Beams) -> list[TrueChange]:
+def list_true_changes(stays: Iterable[Stay], beams: Beams) -> list[TrueChange]:
     """Every beginning and end of a stay within the recording, in no order."""
     first, last = beams.stamp_ns[[0, -1]].tolist()
     changes = []
     for stay in stays:
-        on, through = _looks(beams.on(stay), beams), _looks(_through(stay, beams), beams)
+        on, through = _looks(beams.hits_on(stay), beams), _looks(_through(stay, beams), beams)
         for stamp, before, after in ((stay.since_ns, through, on), (stay.until_ns, on, through)):
             if stamp is not None and first < stamp <= last:
                 later = after[after >= stamp]
@@ -188,8 +188,8 @@ def true_changes(stays: Iterable[Stay], beams: Beams) -> list[TrueChange]:
     return changes
 
 
-def change_time_errors(
-    changes: Sequence[Detected], true: Sequence[TrueChange], T_world_map: Float
+def score_change_times(
+    changes: Sequence[DetectedChange], true: Sequence[TrueChange], T_world_map: Float
 ) -> ChangeTimes:
     """Compare changes that were found with true ones: each of these with the nearest of its kind.
 
@@ -206,10 +206,10 @@ def change_time_errors(
     for one in true:
         distance = np.where(appeared == one.appeared, _distance(xy, one.stay), np.inf)
         known |= distance <= NEAR
-        if one.look_ns is not None and distance.min(initial=np.inf) <= NEAR:
+        if one.observed_ns is not None and distance.min(initial=np.inf) <= NEAR:
             stamp = changes[int(distance.argmin())].stamp_ns
-            errors.append(1e-9 * max(one.stamp_ns - stamp, stamp - one.look_ns, 0))
-    seen = sum(one.look_ns is not None for one in true)
+            errors.append(1e-9 * max(one.stamp_ns - stamp, stamp - one.observed_ns, 0))
+    seen = sum(one.observed_ns is not None for one in true)
     return ChangeTimes(
         seen=seen,
         found=len(errors),
@@ -227,8 +227,8 @@ def _cells(grid: Grid, points: Float, T_map_world: Float) -> NDArray[np.int64]:
 
 def _left_cells(grid: Grid, stay: Stay, beams: Beams, T_world_map: Float) -> NDArray[np.int64]:
     """The cells of a stay that ended, as far as enough scans saw through them afterwards."""
-    cells = _cells(grid, beams.end[beams.on(stay)], inverse(T_world_map))
-    near = beams.near(stay.middle, _radius(stay) + 2 * grid.resolution)
+    cells = _cells(grid, beams.end[beams.hits_on(stay)], inverse(T_world_map))
+    near = beams.near(stay.center, _radius(stay) + 2 * grid.resolution)
     near = near[beams.stamp_ns[beams.scan[near]] >= (stay.until_ns or 0)]
     start, along = beams.start[near], beams.end[near] - beams.start[near]
     length = np.maximum(np.hypot(*along.T), np.finfo(float).tiny)
@@ -256,8 +256,8 @@ def _occupied(grid: Grid, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 def _through(stay: Stay, beams: Beams) -> Index:
     """The beams that go through the faces of a thing while it is not there."""
-    near = beams.near(stay.middle, _radius(stay))
-    near = near[~stay.holds(beams.stamp_ns[beams.scan[near]])]
+    near = beams.near(stay.center, _radius(stay))
+    near = near[~stay.contains(beams.stamp_ns[beams.scan[near]])]
     a, b = beams.start[near], beams.end[near]
     crossed = np.zeros(len(near), bool)
     for face in stay.faces:
@@ -279,12 +279,12 @@ def _looks(some: Index, beams: Beams) -> NDArray[np.int64]:
 
 
 def _radius(stay: Stay) -> float:
-    return float(np.hypot(*(stay.faces.reshape(-1, 2) - stay.middle).T).max())
+    return float(np.hypot(*(stay.faces.reshape(-1, 2) - stay.center).T).max())
 
 
 def _distance(xy: Float, stay: Stay) -> Float:
     """(N,) metres from points to a thing's middle or, if nearer, its faces."""
-    return np.minimum(np.hypot(*(xy - stay.middle).T), distance_to_walls(xy, stay.faces))
+    return np.minimum(np.hypot(*(xy - stay.center).T), distance_to_walls(xy, stay.faces))
 
 
 def _mean(values: NDArray[np.bool_]) -> float:

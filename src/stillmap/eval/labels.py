@@ -76,7 +76,7 @@ class LabelScores(Scores):
     share_called_dynamic: float
 
 
-def label_scores(p_static: NDArray[np.floating], static: Bool, hit: Bool) -> LabelScores:
+def score_labels(p_static: NDArray[np.floating], static: Bool, hit: Bool) -> LabelScores:
     """Score labels (M,) against truth.
 
     Args:
@@ -93,26 +93,28 @@ def label_scores(p_static: NDArray[np.floating], static: Bool, hit: Bool) -> Lab
     y = ~static[labelled]
     q = 1.0 - p
     unsure = (q > UNSURE[0]) & (q < UNSURE[1])
-    precision, recall, f1 = precision_recall_f1(p < 0.5, y)
+    precision, recall, f1 = compute_precision_recall_f1(p < 0.5, y)
     return LabelScores(
         hits=len(p),
         dynamic=int(y.sum()),
         unlabelled=int(np.count_nonzero(hit & ~labelled)),
         # ranked by p itself: 1 - p would tie labels that differ by less than 1e-16
-        average_precision=average_precision(-p, y),
+        average_precision=compute_average_precision(-p, y),
         precision=precision,
         recall=recall,
         f1=f1,
         brier=_mean((q - y) ** 2),
-        log_loss=log_loss(q, y),
-        ece=calibration_error(q, y, equal_width_bins(q)),
+        log_loss=compute_log_loss(q, y),
+        ece=compute_calibration_error(q, y, assign_equal_width_bins(q)),
         unsure=int(unsure.sum()),
-        ece_unsure=calibration_error(q[unsure], y[unsure], equal_mass_bins(q[unsure])),
+        ece_unsure=compute_calibration_error(
+            q[unsure], y[unsure], assign_equal_mass_bins(q[unsure])
+        ),
         share_called_dynamic=_mean((p < 0.5).astype(np.float64)),
     )
 
 
-def average_precision(score: Float, positive: Bool) -> float:
+def compute_average_precision(score: Float, positive: Bool) -> float:
     """Step-wise sum of (R_n - R_{n-1}) P_n, n over the distinct scores from high to low.
 
     Equal scores share one threshold, so their order cannot matter. NaN without a positive.
@@ -127,7 +129,7 @@ def average_precision(score: Float, positive: Bool) -> float:
     return float(np.sum(np.diff(true_positives, prepend=0) * precision) / n_positive)
 
 
-def precision_recall_f1(called: Bool, positive: Bool) -> tuple[float, float, float]:
+def compute_precision_recall_f1(called: Bool, positive: Bool) -> tuple[float, float, float]:
     """Of beams called positive; NaN where a denominator is zero."""
     both, n_called, n_positive = (
         int(np.count_nonzero(mask)) for mask in (called & positive, called, positive)
@@ -139,25 +141,25 @@ def precision_recall_f1(called: Bool, positive: Bool) -> tuple[float, float, flo
     )
 
 
-def log_loss(p: Float, positive: Bool, eps: float = LOG_LOSS_EPS) -> float:
+def compute_log_loss(p: Float, positive: Bool, eps: float = LOG_LOSS_EPS) -> float:
     """Mean of -ln P(truth), in nats, P clipped to [eps, 1 - eps]."""
     p = np.clip(p, eps, 1.0 - eps)
     return _mean(-np.log(np.where(positive, p, 1.0 - p)))
 
 
-def equal_width_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
+def assign_equal_width_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
     """Bin of each probability: [0, 1/bins), ..., [1 - 1/bins, 1]."""
     return np.minimum((p * bins).astype(np.intp), bins - 1)
 
 
-def equal_mass_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
+def assign_equal_mass_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
     """Bin of each probability, as many in each bin as ties allow: equal ones stay together."""
     _, group, size = np.unique(p, return_inverse=True, return_counts=True)
     middle = np.cumsum(size) - size / 2
     return (middle * bins / max(len(p), 1)).astype(np.intp)[group]
 
 
-def calibration_error(p: Float, positive: Bool, bin_of: NDArray[np.intp]) -> float:
+def compute_calibration_error(p: Float, positive: Bool, bin_of: NDArray[np.intp]) -> float:
     """Mean over all beams of |share of positives - mean p| of their bin (Naeini et al. 2015)."""
     if not len(p):
         return _NAN

@@ -40,7 +40,7 @@ class MapScores(Scores):
     T_world_map: tuple[float, float, float]
 
 
-def map_scores(grid: Grid, walls: Float, reference: Float, T_world_map: Float) -> MapScores:
+def score_map(grid: Grid, walls: Float, reference: Float, T_world_map: Float) -> MapScores:
     """Score a map.
 
     Args:
@@ -53,7 +53,7 @@ def map_scores(grid: Grid, walls: Float, reference: Float, T_world_map: Float) -
     occupied = moved(T_world_map, grid.centres(np.argwhere(grid.occupied)))
     ghosts = int(np.sum(distance_to_walls(occupied, walls) > GHOST_DISTANCE * grid.resolution))
     free_area = float(np.count_nonzero(grid.free)) * grid.resolution**2
-    kept = near_occupied(grid, moved(se2.inverse(T_world_map), reference))
+    kept = is_near_occupied(grid, moved(se2.inverse(T_world_map), reference))
     x, y, theta = se2.parameters(T_world_map).tolist()
     return MapScores(
         resolution=grid.resolution,
@@ -67,13 +67,15 @@ def map_scores(grid: Grid, walls: Float, reference: Float, T_world_map: Float) -
     )
 
 
-def wall_cells_of_map(grid: Grid, walls: Float, T_world_map: Float) -> Float:
+def extract_wall_cells(grid: Grid, walls: Float, T_world_map: Float) -> Float:
     """(K, 2) centres, in the world frame, of a map's occupied cells within one cell of a wall."""
     centres = moved(T_world_map, grid.centres(np.argwhere(grid.occupied)))
     return centres[distance_to_walls(centres, walls) <= WALL_DISTANCE * grid.resolution]
 
 
-def wall_cells_of_hits(hits: Float, walls: Float, grid: Grid, T_world_map: Float) -> Float:
+def extract_wall_cells_from_hits(
+    hits: Float, walls: Float, grid: Grid, T_world_map: Float
+) -> Float:
     """(K, 2) centres, in the world frame, of the cells that true static hits show to be wall.
 
     The cells are those of the lattice of `grid`, within one cell of a wall, hit MIN_HITS times.
@@ -102,7 +104,7 @@ def distance_to_walls(points: Float, walls: Float, chunk: int = 1 << 20) -> Floa
     return out
 
 
-def near_occupied(grid: Grid, points: Float) -> NDArray[np.bool_]:
+def is_near_occupied(grid: Grid, points: Float) -> NDArray[np.bool_]:
     """Whether the cell of each (N, 2) point of the map frame, or a neighbour of it, is occupied."""
     near = scipy.ndimage.binary_dilation(np.pad(grid.occupied, 1), np.ones((3, 3), bool))
     cells = grid.cells(points) + 1

@@ -71,7 +71,7 @@ class TextureScores(Scores):
     colour_p95: float
 
 
-class Record(NamedTuple):
+class TextureRecord(NamedTuple):
     """Which picture paints each triangle of a model.
 
     Attributes:
@@ -87,7 +87,7 @@ class Record(NamedTuple):
     T_camera_model: Float
 
 
-class Pictures(NamedTuple):
+class TrueImages(NamedTuple):
     """N pictures and the truth about them.
 
     Attributes:
@@ -104,14 +104,14 @@ class Pictures(NamedTuple):
     distance: Callable[[int], NDArray[np.float32]]
 
 
-class Coloured(NamedTuple):
+class ColoredPoints(NamedTuple):
     """Points (n, 3) of a texture, in the map frame, and their colours (n, 3) uint8."""
 
     points: Float
-    colour: NDArray[np.uint8]
+    color: NDArray[np.uint8]
 
 
-def surface_scores(
+def score_surface(
     vertices: Float, faces: Index, standing: Standing, places: Float, T_world_map: Float
 ) -> SurfaceScores:
     """Score a surface.
@@ -122,12 +122,16 @@ def surface_scores(
         places: (n, 3) on them, in the world, that the sensor saw.
         T_world_map: (4, 4).
     """
-    on_mesh = moved(T_world_map, mesh_distance.samples(vertices, faces, SAMPLES).points)
+    on_mesh = transform_points(
+        T_world_map, mesh_distance.sample_surface(vertices, faces, SAMPLES).points
+    )
     off, _ = standing.nearest(on_mesh)
-    gaps = mesh_distance.distance_to_mesh(places, moved(T_world_map, vertices), faces, COMPLETE)
+    gaps = mesh_distance.distance_to_mesh(
+        places, transform_points(T_world_map, vertices), faces, COMPLETE
+    )
     return SurfaceScores(
         faces=len(faces),
-        area=float(mesh_distance.areas(vertices, faces).sum()),
+        area=float(mesh_distance.triangle_areas(vertices, faces).sum()),
         mean=_mean(off),
         p95=float(np.percentile(off, 95)) if len(off) else _NAN,
         complete=_mean(gaps <= COMPLETE),
@@ -135,10 +139,10 @@ def surface_scores(
     )
 
 
-def texture_scores(
-    record: Record,
-    coloured: Coloured,
-    pictures: Pictures,
+def score_texture(
+    record: TextureRecord,
+    coloured: ColoredPoints,
+    pictures: TrueImages,
     standing: Standing,
     colour_seed: int,
     T_world_map: Float,
@@ -154,11 +158,11 @@ def texture_scores(
         T_world_map: (4, 4).
         farthest: metres, from beyond a picture does not count as seeing anything.
     """
-    on_mesh = mesh_distance.samples(record.vertices, record.faces, SAMPLES)
-    shows = shown(record, on_mesh, pictures)
-    in_view = seen_freely(record, on_mesh, pictures, T_world_map, farthest)
+    on_mesh = mesh_distance.sample_surface(record.vertices, record.faces, SAMPLES)
+    shows = look_up_texture_source(record, on_mesh, pictures)
+    in_view = find_visible_samples(record, on_mesh, pictures, T_world_map, farthest)
     textured = shows != GREY
-    error = colour_errors(coloured, standing, colour_seed, T_world_map)
+    error = compute_color_errors(coloured, standing, colour_seed, T_world_map)
     return TextureScores(
         textured=_mean(textured),
         mover=_mean(shows[textured] >= 0),
@@ -170,7 +174,9 @@ def texture_scores(
     )
 
 
-def shown(record: Record, samples: mesh_distance.Samples, pictures: Pictures) -> NDArray[np.int64]:
+def look_up_texture_source(
+    record: TextureRecord, samples: mesh_distance.SurfaceSamples, pictures: TrueImages
+) -> NDArray[np.int64]:
     """(n,) what the texture shows: the number of a mover, STATIC, NOTHING, or GREY for no picture.
 
     Also GREY: where a picture was to paint what lies outside of it.
@@ -178,7 +184,7 @@ def shown(record: Record, samples: mesh_distance.Samples, pictures: Pictures) ->
     image, out = record.image[samples.face], np.full(len(samples.face), GREY)
     for number in np.unique(image[image >= 0]).tolist():
         some = np.flatnonzero(image == number)
-        points = moved(record.T_camera_model[number], samples.points[some])
+        points = transform_points(record.T_camera_model[number], samples.points[some])
         pixel, inside = _pixels(pictures.cameras[pictures.camera[number]], points)
         column, row = pixel[inside].T
         value = pictures.mask(number)[row, column].astype(np.int64)
@@ -187,10 +193,10 @@ def shown(record: Record, samples: mesh_distance.Samples, pictures: Pictures) ->
     return out
 
 
-def seen_freely(
-    record: Record,
-    samples: mesh_distance.Samples,
-    pictures: Pictures,
+def find_visible_samples(
+    record: TextureRecord,
+    samples: mesh_distance.SurfaceSamples,
+    pictures: TrueImages,
     T_world_map: Float,
     farthest: float = float("inf"),
 ) -> Bool:
@@ -199,8 +205,10 @@ def seen_freely(
     The surface faces the camera, at no more than 80 degrees from upright, from no farther than
     `farthest` metres, and no more than 5 cm and a pixel lie between it and what the pixel shows.
     """
-    points = moved(T_world_map, samples.points)
-    upright = mesh_distance.normals(moved(T_world_map, record.vertices), record.faces)[samples.face]
+    points = transform_points(T_world_map, samples.points)
+    upright = mesh_distance.triangle_normals(
+        transform_points(T_world_map, record.vertices), record.faces
+    )[samples.face]
     out = np.zeros(len(points), bool)
     for number, T_world_camera in enumerate(pictures.T_world_camera):
         camera, centre = pictures.cameras[pictures.camera[number]], T_world_camera[:3, 3]
@@ -211,7 +219,9 @@ def seen_freely(
         cosine = (towards * upright[left]).sum(axis=1) / np.maximum(away, 1e-9)
         use = (cosine >= _STEEP) & (away <= farthest)
         left, away, cosine = left[use], away[use], cosine[use]
-        pixel, inside = _pixels(camera, moved(np.linalg.inv(T_world_camera), points[left]))
+        pixel, inside = _pixels(
+            camera, transform_points(np.linalg.inv(T_world_camera), points[left])
+        )
         column, row = pixel[inside].T
         left, away, cosine = left[inside], away[inside], cosine[inside]
         off = np.abs(pictures.distance(number)[row, column] - away)
@@ -220,26 +230,26 @@ def seen_freely(
     return out
 
 
-def colour_errors(
-    coloured: Coloured, standing: Standing, colour_seed: int, T_world_map: Float
+def compute_color_errors(
+    coloured: ColoredPoints, standing: Standing, colour_seed: int, T_world_map: Float
 ) -> Float:
     """(n,) CIEDE2000 between a texture and the true colour of the nearest place that stands still.
 
     Raises:
         MissingExtra: scikit-image is not installed.
     """
-    _, places = standing.nearest(moved(T_world_map, coloured.points))
-    return colour_difference(coloured.colour, static_colour(places, colour_seed))
+    _, places = standing.nearest(transform_points(T_world_map, coloured.points))
+    return compute_color_difference(coloured.color, static_colour(places, colour_seed))
 
 
-def colour_difference(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float:
+def compute_color_difference(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float:
     """(n,) CIEDE2000 between colours (n, 3), sRGB."""
     color = import_extra("skimage.color", "texture", "compared with the truth", group="mesh")
     labs = [color.rgb2lab(colour[None]) for colour in (one, other)]
     return np.asarray(color.deltaE_ciede2000(*labs)[0], np.float64)
 
 
-def moved(T: Float, points: Float) -> Float:
+def transform_points(T: Float, points: Float) -> Float:
     """(n, 3) points moved by T (4, 4)."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 

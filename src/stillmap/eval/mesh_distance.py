@@ -15,7 +15,7 @@ _MOST_POINTS = 1 << 24  # that a mesh is looked at
 _TILE, _BESIDE = 20.0, 2.0  # m, edge of a part of a large mesh, and how much beside it counts too
 
 
-class Samples(NamedTuple):
+class SurfaceSamples(NamedTuple):
     """n points on triangles.
 
     Attributes:
@@ -29,36 +29,36 @@ class Samples(NamedTuple):
     weight: Float
 
 
-def areas(vertices: Float, faces: Index) -> Float:
+def triangle_areas(vertices: Float, faces: Index) -> Float:
     """(F,) square metres."""
     return 0.5 * np.asarray(np.linalg.norm(_across(vertices, faces), axis=1))
 
 
-def normals(vertices: Float, faces: Index) -> Float:
+def triangle_normals(vertices: Float, faces: Index) -> Float:
     """(F, 3) of length one; zero of triangles without area."""
     across = _across(vertices, faces)
     length = np.linalg.norm(across, axis=1, keepdims=True)
     return np.asarray(across / np.where(length > 0.0, length, 1.0))
 
 
-def samples(vertices: Float, faces: Index, n: int, seed: int = 0) -> Samples:
+def sample_surface(vertices: Float, faces: Index, n: int, seed: int = 0) -> SurfaceSamples:
     """n points, as many on each square metre: the same ones at every call.
 
     Triangles are met in their order at even steps of area, so that shares of areas come out to
     about one over the points, and not to the root of that.
     """
-    total = np.cumsum(areas(vertices, faces))
+    total = np.cumsum(triangle_areas(vertices, faces))
     if not len(total) or not total[-1] > 0.0:
-        return Samples(np.empty((0, 3)), np.empty(0, np.intp), np.empty((0, 3)))
+        return SurfaceSamples(np.empty((0, 3)), np.empty(0, np.intp), np.empty((0, 3)))
     rng = np.random.default_rng(seed)
     at = (np.arange(n) + rng.random(n)) * (total[-1] / n)
     face = np.minimum(np.searchsorted(total, at, side="right"), len(faces) - 1)
     root, share = np.sqrt(rng.random(n)), rng.random(n)
     weight = np.stack([1.0 - root, root * (1.0 - share), root * share], axis=1)
-    return Samples(_at(vertices, faces, face, weight), face, weight)
+    return SurfaceSamples(_at(vertices, faces, face, weight), face, weight)
 
 
-def lattice(vertices: Float, faces: Index, spacing: float) -> Samples:
+def sample_lattice(vertices: Float, faces: Index, spacing: float) -> SurfaceSamples:
     """Points on a lattice within each triangle, no farther than `spacing` from one to the next."""
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -71,7 +71,7 @@ def lattice(vertices: Float, faces: Index, spacing: float) -> Samples:
         of_face.append(np.repeat(some, len(cell)))
         weights.append(np.tile(cell, (len(some), 1)))
     face, weight = np.concatenate(of_face), np.concatenate(weights)
-    return Samples(_at(vertices, faces, face, weight), face, weight)
+    return SurfaceSamples(_at(vertices, faces, face, weight), face, weight)
 
 
 def distance_to_mesh(points: Float, vertices: Float, faces: Index, reach: float) -> Float:
@@ -102,7 +102,7 @@ def _to_mesh(points: Float, vertices: Float, faces: Index, reach: float) -> Floa
     out = np.full(len(points), np.inf)
     if not len(faces):
         return out
-    of_mesh = lattice(vertices, faces, reach)
+    of_mesh = sample_lattice(vertices, faces, reach)
     tree = scipy.spatial.cKDTree(of_mesh.points)
     few = min(_FEW, len(of_mesh.points))
     for first in range(0, len(points), _BLOCK):
@@ -114,7 +114,7 @@ def _to_mesh(points: Float, vertices: Float, faces: Index, reach: float) -> Floa
     return out
 
 
-def thinned(points: Float, size: float) -> NDArray[np.intp]:
+def first_per_voxel(points: Float, size: float) -> NDArray[np.intp]:
     """Which points are the first ones within cubes of that size, rising."""
     _, first = np.unique(np.floor(points / size).astype(np.int64), axis=0, return_index=True)
     return np.sort(first)

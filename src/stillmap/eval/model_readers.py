@@ -13,8 +13,8 @@ from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import read_text, require_regular
 from stillmap.core.recording import Recording
 from stillmap.eval import mesh_distance, readers
-from stillmap.eval.mesh import SAMPLES, Coloured, Pictures, Record
-from stillmap.eval.object_models import Model, Sighted, Track
+from stillmap.eval.mesh import SAMPLES, ColoredPoints, TextureRecord, TrueImages
+from stillmap.eval.object_models import Model, MoverHits, Track
 from stillmap.sim.truth_images import PictureTruth, load_picture_truth
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.odometry_2d import SlamOptions
@@ -27,7 +27,7 @@ _SPAN_NS = 10**9  # before and after a person's model: he walks on
 _MAX_JSON = 1 << 28  # bytes
 
 
-class Seen(NamedTuple):
+class CameraSimulation(NamedTuple):
     """A simulated recording with cameras, and what is true of it.
 
     Attributes:
@@ -38,11 +38,11 @@ class Seen(NamedTuple):
     """
 
     truth: readers.Truth
-    pictures: Pictures
-    picture_truth: PictureTruth
-    ends: Float
+    images: TrueImages
+    image_truth: PictureTruth
+    end_points: Float
 
-    def places(self, farthest: float) -> Float:
+    def observed_places(self, farthest: float) -> Float:
         """(n, 3) true places of what stands still that the sensor saw, one in each 5 cm.
 
         Args:
@@ -51,10 +51,10 @@ class Seen(NamedTuple):
         recording = self.truth.recording
         use = recording.hit & self.truth.static()
         use &= np.linalg.norm(recording.points, axis=1) <= farthest
-        _, places = self.picture_truth.standing.nearest(self.ends[use])
-        return places[mesh_distance.thinned(places, _PLACES)]
+        _, places = self.image_truth.standing.nearest(self.end_points[use])
+        return places[mesh_distance.first_per_voxel(places, _PLACES)]
 
-    def sighted(self) -> Sighted:
+    def mover_hits(self) -> MoverHits:
         """The beams on movers."""
         recording = self.truth.recording
         mover = np.load(self.truth.folder / "truth/mover.npy", allow_pickle=False)
@@ -62,10 +62,10 @@ class Seen(NamedTuple):
         stamps = recording.stamp_ns[recording.scans_of(beams)]
         if recording.beam_time is not None:
             stamps = stamps + np.rint(1e9 * recording.beam_time[beams].astype(float)).astype(int)
-        return Sighted(mover[beams], stamps, self.ends[beams])
+        return MoverHits(mover[beams], stamps, self.end_points[beams])
 
 
-def read_seen(path: Path) -> Seen:
+def read_camera_simulation(path: Path) -> CameraSimulation:
     """A simulation with cameras; of a rig's folder the recording that has them.
 
     Raises:
@@ -77,14 +77,14 @@ def read_seen(path: Path) -> Seen:
     recording, images = truth.recording, truth.recording.images
     if images is None or len(images) != len(picture_truth.T_world_camera):
         raise InputError("has other pictures than its truth", where=str(path))
-    pictures = Pictures(
+    pictures = TrueImages(
         images.cameras,
         images.camera,
         picture_truth.T_world_camera,
         picture_truth.mask,
         picture_truth.distance,
     )
-    return Seen(truth, pictures, picture_truth, _ends(recording, truth.poses()))
+    return CameraSimulation(truth, pictures, picture_truth, _ends(recording, truth.poses()))
 
 
 def _ends(recording: Recording, T_world_base: Float) -> Float:
@@ -92,7 +92,7 @@ def _ends(recording: Recording, T_world_base: Float) -> Float:
     return at_once.end_points(np.arange(recording.n_beams), T_world_base)
 
 
-class Glb(NamedTuple):
+class GlbContent(NamedTuple):
     """The content of a GLB file, z up.
 
     Attributes:
@@ -102,10 +102,10 @@ class Glb(NamedTuple):
 
     vertices: Float
     faces: NDArray[np.int32]
-    coloured: Coloured
+    colored: ColoredPoints
 
 
-def read_glb(path: Path, n: int = SAMPLES) -> Glb:
+def read_glb(path: Path, n: int = SAMPLES) -> GlbContent:
     """A GLB file, with n points of its textures.
 
     Raises:
@@ -143,22 +143,24 @@ def _parts(scene: Any) -> Iterator[_Part]:
             yield _Part(vertices, faces, np.asarray(uv, float), np.asarray(image.convert("RGB")))
 
 
-def _joined(parts: list[_Part], n: int) -> Glb:
+def _joined(parts: list[_Part], n: int) -> GlbContent:
     vertices, faces, first = [np.empty((0, 3))], [np.empty((0, 3), np.int32)], 0
     points, colour = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
-    area = [float(mesh_distance.areas(one.vertices, one.faces).sum()) for one in parts]
+    area = [float(mesh_distance.triangle_areas(one.vertices, one.faces).sum()) for one in parts]
     total = sum(a for a, one in zip(area, parts, strict=True) if one.uv is not None)
     for a, one in zip(area, parts, strict=True):
         vertices.append(one.vertices)
         faces.append(one.faces + np.int32(first))
         first += len(one.vertices)
         if one.uv is not None and one.picture is not None and a > 0.0:
-            some = mesh_distance.samples(one.vertices, one.faces, max(1, round(n * a / total)))
+            some = mesh_distance.sample_surface(
+                one.vertices, one.faces, max(1, round(n * a / total))
+            )
             uv = np.einsum("nk,nkd->nd", some.weight, one.uv[one.faces[some.face]])
             points.append(some.points)
             colour.append(_texels(one.picture, uv))
-    coloured = Coloured(np.concatenate(points), np.concatenate(colour))
-    return Glb(np.concatenate(vertices), np.concatenate(faces), coloured)
+    coloured = ColoredPoints(np.concatenate(points), np.concatenate(colour))
+    return GlbContent(np.concatenate(vertices), np.concatenate(faces), coloured)
 
 
 def _texels(picture: NDArray[np.uint8], uv: Float) -> NDArray[np.uint8]:
@@ -176,7 +178,7 @@ def _texels(picture: NDArray[np.uint8], uv: Float) -> NDArray[np.uint8]:
     return out
 
 
-def read_record(path: Path, n_pictures: int, frame: str = "map") -> Record | None:
+def read_record(path: Path, n_pictures: int, frame: str = "map") -> TextureRecord | None:
     """`mesh_faces.npz` or `NNNN_faces.npz`; None: there is none.
 
     Args:
@@ -205,10 +207,10 @@ def read_record(path: Path, n_pictures: int, frame: str = "map") -> Record | Non
         raise InputError("is damaged: a vertex that is not there", where=str(path))
     if not np.isfinite(T[np.unique(image[image >= 0])]).all():
         raise InputError("is damaged: a picture from nowhere paints", where=str(path))
-    return Record(vertices, faces, image, T)
+    return TextureRecord(vertices, faces, image, T)
 
 
-def objects_of(result: Path) -> Path:
+def find_objects_folder(result: Path) -> Path:
     """The folder of the objects that a result has models of: of a rig, those of what tilts."""
     tilting = result / "tilting/objects"
     has_models = any((result / "objects").glob("[0-9]*.glb"))

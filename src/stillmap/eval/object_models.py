@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 
 from stillmap.eval import mesh_distance
 from stillmap.eval.labels import Scores
-from stillmap.eval.mesh import GREY, Pictures, Record, moved, shown
+from stillmap.eval.mesh import (
+    GREY,
+    TextureRecord,
+    TrueImages,
+    look_up_texture_source,
+    transform_points,
+)
 from stillmap.sim.geometry import Solids
 from stillmap.sim.truth_surfaces import Moving, nearest_on_solid, to_local, to_world
 
@@ -57,7 +63,7 @@ class Model(NamedTuple):
     T_map_object: Float
     stamp_ns: int
     span_ns: tuple[int, int]
-    record: Record | None
+    record: TextureRecord | None
 
 
 @dataclass(frozen=True)
@@ -110,7 +116,7 @@ class MoverScores(Scores):
     models: tuple[ModelScores, ...]
 
 
-class Sighted(NamedTuple):
+class MoverHits(NamedTuple):
     """What the sensor saw of movers: B beams.
 
     Attributes:
@@ -124,7 +130,7 @@ class Sighted(NamedTuple):
     points: Float
 
 
-def mover_of(track: Track, stamp_ns: NDArray[np.int64], movers: Float, sizes: Float) -> int:
+def match_mover(track: Track, stamp_ns: NDArray[np.int64], movers: Float, sizes: Float) -> int:
     """The mover that an object is; -1: none.
 
     Args:
@@ -139,13 +145,13 @@ def mover_of(track: Track, stamp_ns: NDArray[np.int64], movers: Float, sizes: Fl
     return int(near.argmin()) if near.size and near.min() <= 0.0 else -1
 
 
-def mover_scores(
+def score_object_models(
     tracked: Mapping[int, int],
     models: Mapping[int, tuple[int, Model]],
     kinds: Sequence[str],
     moving: Moving,
-    sighted: Sighted,
-    pictures: Pictures,
+    sighted: MoverHits,
+    pictures: TrueImages,
     T_world_map: Float,
 ) -> MoverScores:
     """Score models.
@@ -162,9 +168,9 @@ def mover_scores(
     """
     movers = {mover for mover in tracked.values() if mover >= 0}
     have = {tracked.get(id, -1) for id in models}
-    well = {mover for mover in movers if most_beams(sighted, mover) >= _WELL}
+    well = {mover for mover in movers if count_max_beams(sighted, mover) >= _WELL}
     scores = tuple(
-        model_scores(id, mover, kinds[mover], model, moving, sighted, pictures, T_world_map)
+        score_model(id, mover, kinds[mover], model, moving, sighted, pictures, T_world_map)
         for id, (mover, model) in sorted(models.items())
         if mover >= 0
     )
@@ -182,35 +188,41 @@ def mover_scores(
     )
 
 
-def most_beams(sighted: Sighted, mover: int) -> int:
+def count_max_beams(sighted: MoverHits, mover: int) -> int:
     """How many beams met a mover within a second, at most."""
     stamps = np.sort(sighted.stamp_ns[sighted.mover == mover])
     last = np.searchsorted(stamps, stamps + 10**9, side="right")
     return int((last - np.arange(len(stamps))).max(initial=0))
 
 
-def model_scores(
+def score_model(
     id: int,
     mover: int,
     kind: str,
     model: Model,
     moving: Moving,
-    sighted: Sighted,
-    pictures: Pictures,
+    sighted: MoverHits,
+    pictures: TrueImages,
     T_world_map: Float,
 ) -> ModelScores:
     """Score one model; arguments are those of `mover_scores`."""
     solids = moving.at(moving.parts(mover), model.stamp_ns)
     T = T_world_map @ model.T_map_object
-    on_model = moved(T, mesh_distance.samples(model.vertices, model.faces, _SAMPLES).points)
+    on_model = transform_points(
+        T, mesh_distance.sample_surface(model.vertices, model.faces, _SAMPLES).points
+    )
     accuracy = _mean(distance_to_solids(on_model, solids))
-    places = places_seen(moving, mover, model.stamp_ns, model.span_ns, sighted)
-    gaps = mesh_distance.distance_to_mesh(places, moved(T, model.vertices), model.faces, _REACH)
+    places = collect_observed_points(moving, mover, model.stamp_ns, model.span_ns, sighted)
+    gaps = mesh_distance.distance_to_mesh(
+        places, transform_points(T, model.vertices), model.faces, _REACH
+    )
     completeness = _mean(gaps)
     textured = background = _NAN
     if model.record is not None:
-        of_record = mesh_distance.samples(model.record.vertices, model.record.faces, _SAMPLES)
-        shows = shown(model.record, of_record, pictures)
+        of_record = mesh_distance.sample_surface(
+            model.record.vertices, model.record.faces, _SAMPLES
+        )
+        shows = look_up_texture_source(model.record, of_record, pictures)
         textured = _mean(shows != GREY)
         background = _mean(shows[shows != GREY] != mover)
     chamfer = (accuracy + completeness) / 2
@@ -226,8 +238,8 @@ def distance_to_solids(points: Float, solids: Solids) -> Float:
     return out
 
 
-def places_seen(
-    moving: Moving, mover: int, stamp_ns: int, span_ns: tuple[int, int], sighted: Sighted
+def collect_observed_points(
+    moving: Moving, mover: int, stamp_ns: int, span_ns: tuple[int, int], sighted: MoverHits
 ) -> Float:
     """(n, 3) the places of a mover that the sensor saw, where they are at a stamp; in the world.
 
@@ -251,7 +263,7 @@ def places_seen(
         goes_with = to_world(to_local(on, then.pose[:, k]), now.pose[:, k])
         nearest[better], found[better] = off[better], goes_with[better]
     found = found[np.isfinite(found).all(axis=1)]
-    return np.asarray(found[mesh_distance.thinned(found, _THIN)])
+    return np.asarray(found[mesh_distance.first_per_voxel(found, _THIN)])
 
 
 def _known(values: Sequence[float]) -> Float:

@@ -59,12 +59,12 @@ class ObjectScores:
     speed_error: float
 
 
-def sightings(
+def find_sightings(
     mover: NDArray[np.int32],
     offset: NDArray[np.int64],
     seconds: Float,
     chosen: Sequence[int],
-    least: float = 3.0,
+    min_seconds: float = 3.0,
 ) -> list[Sighting]:
     """When movers were seen, for more than `least` seconds: as many scans as that.
 
@@ -84,12 +84,12 @@ def sightings(
         gaps = np.flatnonzero(np.diff(seconds[scan]) > _GAP) + 1
         for some in np.split(np.arange(len(beams)), gaps):
             scans = np.unique(scan[some])
-            if len(np.unique(seconds[scans])) * period > least:
+            if len(np.unique(seconds[scans])) * period > min_seconds:
                 out.append(Sighting(int(number), beams[some], scans))
     return out
 
 
-def object_scores(
+def score_objects(
     objects: Sequence[MovingObject],
     mover: NDArray[np.int32],
     movers: Float,
@@ -109,7 +109,7 @@ def object_scores(
     owner = np.full(len(mover), -1)
     for number, one in enumerate(objects):
         owner[one.beams] = number
-    seen = sightings(mover, offset, seconds, chosen)
+    seen = find_sightings(mover, offset, seconds, chosen)
     failed = np.array([_failures(one, owner, mover, offset) for one in seen]).reshape(-1, 3)
     most = [_most(mover[one.beams]) for one in objects]
     return ObjectScores(
@@ -182,7 +182,7 @@ def _speed_error(
     return float(np.median(np.concatenate(off))) if off else float("nan")
 
 
-def true_traffic(
+def compute_true_flow_map(
     seen: Sequence[Sighting],
     movers: Float,
     stamp_ns: NDArray[np.int64],
@@ -210,7 +210,7 @@ def true_traffic(
     return compute_flow_map(ways, resolution)
 
 
-def rank_correlation(found: FlowMap, true: FlowMap, points: Float) -> float:
+def compute_rank_correlation(found: FlowMap, true: FlowMap, points: Float) -> float:
     """Spearman's correlation of how often squares were crossed; NaN where nothing ever was.
 
     Args:

@@ -170,12 +170,12 @@ def read_trajectory(path: Path) -> Trajectory:
         stamps = rows[:, 0]
     else:
         stamp_ns, poses = read_tum(path)
-        stamps = seconds(stamp_ns)
+        stamps = to_seconds(stamp_ns)
     order = np.argsort(stamps, kind="stable")
     return Trajectory(stamps[order], poses[order])
 
 
-def read_planar(path: Path) -> Float:
+def read_planar_trajectory(path: Path) -> Float:
     """The same file as (N, 4) t, x, y, theta; of a pose in space the yaw is taken."""
     trajectory = read_trajectory(path)
     T = trajectory.poses
@@ -201,7 +201,7 @@ def read_odometry(path: Path) -> Float:
         InputError: the file cannot be read or holds no odometry.
     """
     if not _first_row(path, f"a CARMEN log or {_POSE}").is_log:
-        return read_planar(path)
+        return read_planar_trajectory(path)
     log = read_log(path)
     if log.skipped_odometry.total:
         _log.warning("%s: odometry skipped: %s", path, log.skipped_odometry.summary())
@@ -211,7 +211,7 @@ def read_odometry(path: Path) -> Float:
     return rows[np.argsort(rows[:, 0], kind="stable")]
 
 
-def seconds(stamp_ns: NDArray[np.int64]) -> Float:
+def to_seconds(stamp_ns: NDArray[np.int64]) -> Float:
     """The double nearest to each stamp, as if parsed from its decimal text.
 
     Dividing the array would round twice, and move stamps of our century by up to 2e-7 s.
@@ -222,11 +222,11 @@ def seconds(stamp_ns: NDArray[np.int64]) -> Float:
 def _log_rows(log: CarmenLog) -> Float:
     if len(log.odom_stamp_ns):
         stamps, poses = np.asarray(log.odom_stamp_ns), np.asarray(log.odom_poses).reshape(-1, 3)
-        return np.column_stack([seconds(stamps), poses])
+        return np.column_stack([to_seconds(stamps), poses])
     for laser in log.lasers.values():
         if laser.has_poses:
             poses = np.asarray(laser.poses).reshape(-1, 6)[:, 3:]
-            return np.column_stack([seconds(np.asarray(laser.stamp_ns)), poses])
+            return np.column_stack([to_seconds(np.asarray(laser.stamp_ns)), poses])
     return np.zeros((0, 4))
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.eval.labels import Scores
-from stillmap.eval.trajectory import nearest
+from stillmap.eval.trajectory import nearest_index
 
 Float = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ class RelationErrors(Scores):
     rotation: Spread
 
 
-def relation_errors(
+def compute_relation_errors(
     trajectory: Float,
     relations: Float,
     odometry: Float | None = None,
@@ -94,13 +94,13 @@ def relation_errors(
 def _poses_at(
     times: Float, trajectory: Float, odometry: Float | None, max_dt: float
 ) -> tuple[Float, NDArray[np.bool_], int]:
-    index, distance = nearest(trajectory[:, 0], times)
+    index, distance = nearest_index(trajectory[:, 0], times)
     poses = trajectory[index, 1:]
     far = distance > max_dt
     if odometry is None:
         return poses, ~far, 0
-    start, _ = nearest(odometry[:, 0], trajectory[index[far], 0])
-    end, _ = nearest(odometry[:, 0], times[far])
+    start, _ = nearest_index(odometry[:, 0], trajectory[index[far], 0])
+    end, _ = nearest_index(odometry[:, 0], times[far])
     poses[far] = _moved(poses[far], _displacement(odometry[start, 1:], odometry[end, 1:]))
     return poses, np.ones(len(times), bool), int(far.sum())
 

@@ -28,7 +28,7 @@ Float = NDArray[np.float64]
 Unit = Literal["m", "frames"]
 
 
-def nearest(
+def nearest_index(
     stamps: NDArray[np.float64], at: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Index of the nearest of the sorted `stamps` (N >= 1) for each of `at`, and how far it is.
@@ -65,7 +65,7 @@ class RelativeErrors(Scores):
     rotation: ErrorStats
 
 
-def associate(
+def associate_trajectories(
     estimated_s: Float, reference_s: Float, max_dt: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Indices of poses that belong together by their stamps.
@@ -83,7 +83,7 @@ def associate(
         return np.arange(len(estimated_s)), np.arange(len(estimated_s))
     swap = len(estimated_s) > len(reference_s)
     few, many = (reference_s, estimated_s) if swap else (estimated_s, reference_s)
-    partner, distance = nearest(many, few)
+    partner, distance = nearest_index(many, few)
     near = np.flatnonzero(distance <= max_dt)
     if not len(near):
         raise InputError(
@@ -93,7 +93,7 @@ def associate(
     return (partner[near], near) if swap else (near, partner[near])
 
 
-def to_plane_where_flat(a: Float, b: Float) -> tuple[Float, Float]:
+def project_flat_trajectories(a: Float, b: Float) -> tuple[Float, Float]:
     """Both trajectories (N, 4, 4) as (N, 3, 3) when neither leaves the plane z = 0.
 
     An alignment in space may turn a flat trajectory over; one in the plane may not.
@@ -142,7 +142,7 @@ def _arms(T: Float, lever: float) -> Float:
     return np.concatenate([origin + axes, origin - axes], axis=1).reshape(-1, D)
 
 
-def absolute_errors(estimated: Float, reference: Float) -> ErrorStats:
+def compute_absolute_errors(estimated: Float, reference: Float) -> ErrorStats:
     """ATE in metres: distances between positions after the best rigid alignment.
 
     Args:
@@ -151,10 +151,10 @@ def absolute_errors(estimated: Float, reference: Float) -> ErrorStats:
     D = estimated.shape[-1] - 1
     source, target = estimated[:, :D, D], reference[:, :D, D]
     T = align_points(source, target)
-    return error_stats(np.linalg.norm(target - (source @ T[:D, :D].T + T[:D, D]), axis=1))
+    return summarize_errors(np.linalg.norm(target - (source @ T[:D, :D].T + T[:D, D]), axis=1))
 
 
-def relative_errors(
+def compute_relative_errors(
     estimated: Float, reference: Float, delta: float = 1.0, unit: Unit = "m"
 ) -> RelativeErrors:
     """RPE: (Q_i^-1 Q_j)^-1 (P_i^-1 P_j) over all pairs i, j that lie `delta` apart.
@@ -172,8 +172,8 @@ def relative_errors(
     D = error.shape[-1] - 1
     return RelativeErrors(
         pairs=len(i),
-        translation=error_stats(np.linalg.norm(error[:, :D, D], axis=1)),
-        rotation=error_stats(np.degrees(_angle(error[:, :D, :D]))),
+        translation=summarize_errors(np.linalg.norm(error[:, :D, D], axis=1)),
+        rotation=summarize_errors(np.degrees(_angle(error[:, :D, :D]))),
     )
 
 
@@ -188,7 +188,7 @@ def _pairs(reference: Float, delta: float, unit: Unit) -> tuple[NDArray[np.intp]
         raise InputError(f"a step of {delta:g} m leads nowhere")
     position = reference[:, :-1, -1]
     path = np.concatenate([[0.0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
-    second, off = nearest(path, path + delta)
+    second, off = nearest_index(path, path + delta)
     first = np.flatnonzero(off <= _PATH_TOLERANCE * delta)
     return first, second[first]
 
@@ -204,7 +204,7 @@ def _angle(R: Float) -> Float:
     )
 
 
-def error_stats(error: Float) -> ErrorStats:
+def summarize_errors(error: Float) -> ErrorStats:
     """Summary of (N,) errors."""
     if not len(error):
         return ErrorStats(*[float("nan")] * 4)
@@ -219,16 +219,18 @@ def error_stats(error: Float) -> ErrorStats:
 _STAMP_TOLERANCE = 1e-6  # seconds: a result carries the stamps of its recording
 
 
-def paired(result: Path, truth: Truth) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def read_paired_poses(
+    result: Path, truth: Truth
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Poses (N, 4, 4) of a result's trajectory, and the true ones (N, D+1, D+1) at their stamps.
 
     Raises:
         InputError: the trajectory is missing or damaged, or is of another recording.
     """
     estimated = readers.read_trajectory(result / "trajectory.tum")
-    stamps = readers.seconds(truth.recording.stamp_ns)
+    stamps = readers.to_seconds(truth.recording.stamp_ns)
     try:
-        i, j = associate(estimated.stamp_s, stamps, _STAMP_TOLERANCE)
+        i, j = associate_trajectories(estimated.stamp_s, stamps, _STAMP_TOLERANCE)
     except InputError as error:
         what = f"is not of the recording in {truth.folder}: they have no stamp in common"
         raise InputError(what, where=str(result)) from error

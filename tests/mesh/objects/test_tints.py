@@ -10,8 +10,8 @@ import pytest
 import stillmap
 from stillmap.cli.main import main
 from stillmap.core.camera import Images
-from stillmap.eval.mesh import colour_difference
-from stillmap.eval.model_readers import read_seen
+from stillmap.eval.mesh import compute_color_difference
+from stillmap.eval.model_readers import read_camera_simulation
 from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.mesh.texture.atlas import GRAY
@@ -43,16 +43,16 @@ def coloured(colours):
 
 def test_colours_of_what_stands_still_are_the_true_ones(room, result):
     hit, p_static, colours = beams_of(result)
-    seen, still = read_seen(room), hit & (p_static >= 0.5)
+    seen, still = read_camera_simulation(room), hit & (p_static >= 0.5)
     has = coloured(colours)
     assert not has[~hit].any()
     assert 0.1 < has[still].mean() < 0.5  # the lidar looks round about, the camera does not
     use = np.flatnonzero(still & has & seen.truth.static())
-    _, places = seen.picture_truth.standing.nearest(seen.ends[use])
-    true = static_colour(places, seen.picture_truth.colour_seed)
-    difference = colour_difference(colours[use], true)
+    _, places = seen.image_truth.standing.nearest(seen.end_points[use])
+    true = static_colour(places, seen.image_truth.colour_seed)
+    difference = compute_color_difference(colours[use], true)
     assert np.median(difference) < 5.0
-    mixed = colour_difference(colours[use], np.roll(true, len(true) // 3, axis=0))
+    mixed = compute_color_difference(colours[use], np.roll(true, len(true) // 3, axis=0))
     assert np.median(mixed) > 3.0 * np.median(difference)
 
 
