@@ -1,33 +1,25 @@
-"""`stillmap convert`: a recording in another format, a result in the forms of other programs.
+"""`stillmap convert`: a recording in another format, a result for other programs.
 
-What `stillmap convert` does once it is known what is wanted.
+Imports that take long are made inside the functions, so that `--help` and completion are quick.
 """
 
 import argparse
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
-import numpy as np
-from numpy.typing import NDArray
-
-from stillmap import slam
 from stillmap.cli.arguments import add_read_flags, parents_made, read_changes, require_apart
 from stillmap.cli.console import say, shown_share
 from stillmap.cli.parser import COMMANDS
-from stillmap.core import config
 from stillmap.core.errors import InputError
-from stillmap.core.files import require_new_file
-from stillmap.core.recording import Recording
-from stillmap.io import read, writers
-from stillmap.io.registry import detect_format
-from stillmap.io.ros.bag_types import BagKind
-from stillmap.io.trajectory import poses_from_tum
-from stillmap.preprocessing.options import ReadOptions
-from stillmap.results import reader
-from stillmap.results.export import bag, obj, parquet, point_cloud, point_cloud_files
-from stillmap.results.folder import ResultFolder, is_deskewed, is_result, open_result
-from stillmap.results.labels import read_colors
-from stillmap.results.rig import FOLDER as TILTING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stillmap.core.recording import Recording
+    from stillmap.results import reader
+    from stillmap.results.export import point_cloud, point_cloud_files
+    from stillmap.results.folder import ResultFolder
 
 # stillmap.recording.writers has them too, and takes long to load
 ENDINGS = (
@@ -100,6 +92,9 @@ def converted(args: argparse.Namespace) -> tuple[list[str], str]:
     Raises:
         InputError: it cannot be read, or the output cannot hold it.
     """
+    from stillmap.io.registry import detect_format
+    from stillmap.results.folder import is_result
+
     source, output = Path(args.input), Path(args.output)
     if is_result(source):
         with parents_made(output):
@@ -112,6 +107,10 @@ def converted(args: argparse.Namespace) -> tuple[list[str], str]:
 def _convert_recording(
     args: argparse.Namespace, source: Path, output: Path
 ) -> tuple[list[str], str]:
+    from stillmap.core import config
+    from stillmap.io import read, writers
+    from stillmap.preprocessing.options import ReadOptions
+
     if args.recording or args.only:
         flag = "--input" if args.recording else "--only"
         raise InputError(f"{flag} is for results", where=str(source))
@@ -128,6 +127,12 @@ def _convert_recording(
 
 
 def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tuple[list[str], str]:
+    from stillmap.core.files import require_new_file
+    from stillmap.io import writers
+    from stillmap.io.ros.bag_types import BagKind
+    from stillmap.results.export import bag, obj, parquet, point_cloud_files
+    from stillmap.results.folder import open_result
+
     if read_changes(args):
         text = "a result's recording is read as it was when it was mapped: no flags for reading it"
         raise InputError(text, where=str(folder))
@@ -162,7 +167,9 @@ def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tup
     return lost, f"{exported.recording.n_scans} scans, map, way and {len(exported.tracks)} objects"
 
 
-def _convert_to_obj(args: argparse.Namespace, mapped: ResultFolder, output: Path) -> str:
+def _convert_to_obj(args: argparse.Namespace, mapped: "ResultFolder", output: Path) -> str:
+    from stillmap.results.export import obj
+
     faces, pages = obj.write_obj(
         mapped.folder, output, mapped.texture_options.quality, args.overwrite
     )
@@ -170,12 +177,18 @@ def _convert_to_obj(args: argparse.Namespace, mapped: ResultFolder, output: Path
 
 
 def _clouds() -> str:
+    from stillmap.results.export import point_cloud_files
+
     return ", ".join(end for form in point_cloud_files.FORMATS for end in form.endings)
 
 
 def _convert_to_cloud(
-    args: argparse.Namespace, mapped: ResultFolder, output: Path, form: point_cloud_files.Format
+    args: argparse.Namespace, mapped: "ResultFolder", output: Path, form: "point_cloud_files.Format"
 ) -> str:
+    from stillmap.core.files import require_new_file
+    from stillmap.results.export import point_cloud, point_cloud_files
+    from stillmap.results.rig import FOLDER as TILTING
+
     require_new_file(output, args.overwrite)
     point_cloud_files.require_extras(form, output)
     if isinstance(mapped.record.get(TILTING), dict):
@@ -187,7 +200,13 @@ def _convert_to_cloud(
     return f"{points.count} points as {form.about}"
 
 
-def _cloud_of(args: argparse.Namespace, mapped: ResultFolder, output: Path) -> point_cloud.Cloud:
+def _cloud_of(
+    args: argparse.Namespace, mapped: "ResultFolder", output: Path
+) -> "point_cloud.Cloud":
+    from stillmap.io.trajectory import poses_from_tum
+    from stillmap.results.export import point_cloud
+    from stillmap.results.labels import read_colors
+
     with shown_share(args.quiet, "reading") as tell:
         recording, labels = mapped.read(tell, output.absolute().parent)
     if recording.dimension != 3:
@@ -202,12 +221,19 @@ def _cloud_of(args: argparse.Namespace, mapped: ResultFolder, output: Path) -> p
     return point_cloud.cloud_of(recording, seen, poses, labels.p_static, args.only, colours)
 
 
-def _exported(mapped: ResultFolder) -> reader.Exported:
+def _exported(mapped: "ResultFolder") -> "reader.Exported":
+    from stillmap.results import reader
+
     recording, labels = mapped.read()
     return reader.read(mapped.folder, recording, labels.p_static)
 
 
-def _seen(mapped: ResultFolder, recording: Recording, poses: NDArray[np.float64]) -> Recording:
+def _seen(
+    mapped: "ResultFolder", recording: "Recording", poses: "NDArray[np.float64]"
+) -> "Recording":
     """The recording without the motion during its scans, as it was mapped."""
+    from stillmap import slam
+    from stillmap.results.folder import is_deskewed
+
     how = slam.SlamOptions(deskew=is_deskewed(mapped.record))
     return slam.deskew_recording(recording, poses, how)

@@ -1,6 +1,6 @@
 """`stillmap eval`: scores of trajectories, labels, maps and models, as text or as JSON.
 
-What `stillmap eval` computes: each score as a dictionary and as lines to read.
+Imports that take long are made inside the functions, so that `--help` and completion are quick.
 """
 
 import argparse
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from stillmap.eval.map import MapScores
     from stillmap.eval.readers import Truth
     from stillmap.eval.relations import RelationErrors
-
 
 
 Scores = tuple[dict[str, Any], Iterable[str]]
@@ -199,9 +198,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: a file is missing, damaged, or does not go with the others.
     """
-    pass  # DROPPED  # takes long to load
-
-    scores, lines = SCORES[args.score](args)
+    scores, lines = _SCORES[args.score](args)
     if args.json:
         print_json(scores)
     else:
@@ -223,7 +220,7 @@ def _positive(text: str) -> float:
     return value
 
 
-def of_relations(args: argparse.Namespace) -> Scores:
+def _score_relations(args: argparse.Namespace) -> Scores:
     """Errors of known displacements."""
     from stillmap.eval import readers
     from stillmap.eval.relations import compute_relation_errors
@@ -259,7 +256,7 @@ def _relation_lines(errors: "RelationErrors") -> Iterable[str]:
         )
 
 
-def of_trajectory(args: argparse.Namespace) -> Scores:
+def _score_trajectory(args: argparse.Namespace) -> Scores:
     """ATE and RPE."""
     from stillmap.eval import readers, trajectory
 
@@ -292,7 +289,7 @@ def _stats(e: "trajectory.ErrorStats", unit: str) -> str:
     return f"rmse {e.rmse:.4f} {unit}, mean {e.mean:.4f}, median {e.median:.4f}, max {e.max:.4f}"
 
 
-def of_labels(args: argparse.Namespace) -> Scores:
+def _score_labels(args: argparse.Namespace) -> Scores:
     """Static or dynamic, per beam."""
     from stillmap.eval.labels import score_labels
     from stillmap.eval.readers import read_truth, require_same_beams
@@ -317,7 +314,7 @@ def _label_lines(s: "LabelScores") -> Iterable[str]:
     yield f"ECE                {s.ece:.4f}, {s.ece_unsure:.4f} over the {s.unsure} unsure ones"
 
 
-def of_map(args: argparse.Namespace) -> Scores:
+def _score_map(args: argparse.Namespace) -> Scores:
     """Ghosts and walls."""
     import numpy as np
 
@@ -364,10 +361,16 @@ def _map_lines(s: "MapScores") -> Iterable[str]:
     yield f"walls kept   {100 * s.walls_kept:.2f} % of {s.reference_wall_cells} cells"
 
 
-SCORES = {
-    "relations": of_relations,
-    "trajectory": of_trajectory,
-    "labels": of_labels,
-    "map": of_map,
-    "model": of_model,
+def _score_model(args: argparse.Namespace) -> Scores:
+    from stillmap.cli.eval_model import of_model
+
+    return of_model(args)
+
+
+_SCORES = {
+    "relations": _score_relations,
+    "trajectory": _score_trajectory,
+    "labels": _score_labels,
+    "map": _score_map,
+    "model": _score_model,
 }

@@ -1,28 +1,24 @@
-"""`stillmap filter`: the recording again, without the beams that met something moving.
+"""`stillmap filter`: the recording again, without beams that ended on something moving.
 
-What `stillmap filter` does once it is known what is wanted.
+Imports that take long are made inside the functions, so that `--help` and completion are quick.
 """
 
 import argparse
 import dataclasses
 from pathlib import Path
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, NamedTuple
 
 from stillmap.cli.arguments import parents_made, require_apart
 from stillmap.cli.console import print_json, say
 from stillmap.cli.parser import COMMANDS
-from stillmap.core import arrays
 from stillmap.core.errors import InputError
-from stillmap.core.files import require_new, require_new_file
-from stillmap.core.recording import Recording
-from stillmap.io import stillmap_folder, writers
-from stillmap.io.carmen import writer
-from stillmap.io.registry import detect_format
-from stillmap.io.ros.bag_types import detect_kind
-from stillmap.results.folder import ResultFolder, open_result
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stillmap.core.recording import Recording
+    from stillmap.results.folder import ResultFolder
 
 _EPILOG = """examples:
   stillmap filter out -o clean.clf.gz
@@ -106,6 +102,14 @@ def filtered(
     Raises:
         InputError: the result or its recording is not there, or the output is taken.
     """
+    import numpy as np
+
+    from stillmap.core import arrays
+    from stillmap.core.files import require_new, require_new_file
+    from stillmap.io import stillmap_folder
+    from stillmap.io.registry import detect_format
+    from stillmap.results.folder import open_result
+
     mapped = open_result(result, given)
     form = detect_format(mapped.source) if mapped.source.exists() else None
     if form is not None:
@@ -141,6 +145,9 @@ def _require_ending(output: Path, source: Path, form: str) -> None:
     Raises:
         InputError: the ending is that of another form.
     """
+    from stillmap.io import writers
+    from stillmap.io.ros.bag_types import detect_kind
+
     own = {"CARMEN log": "carmen", "ROS bag": ""}.get(form, form)
     said = writers.format_of_ending(output)
     if said is not None and said != (own or detect_kind(source)[0]):
@@ -149,13 +156,17 @@ def _require_ending(output: Path, source: Path, form: str) -> None:
 
 
 def _write(
-    mapped: ResultFolder,
+    mapped: "ResultFolder",
     output: Path,
-    recording: Recording,
-    blank: NDArray[np.bool_],
+    recording: "Recording",
+    blank: "NDArray[np.bool_]",
     overwrite: bool,
 ) -> tuple[int, list[str], list[str]]:
     """How many scans, and which topics, are not in what was written; which are not filtered."""
+    from stillmap.io import stillmap_folder
+    from stillmap.io.carmen import writer
+    from stillmap.io.registry import detect_format
+
     form = detect_format(mapped.source)
     if form.name == "ROS bag":
         from stillmap.io.ros import recording_writer
@@ -176,8 +187,10 @@ def _write(
     raise InputError(f"a {form.name} cannot be written again", where=str(mapped.source), hint=hint)
 
 
-def _without(recording: Recording, blank: NDArray[np.bool_], scratch: Path) -> Recording:
+def _without(recording: "Recording", blank: "NDArray[np.bool_]", scratch: Path) -> "Recording":
     """Blanked beams went as far as they did, and met nothing."""
+    from stillmap.core import arrays
+
     hit = arrays.copy(recording.hit, scratch)
     for block in arrays.iter_blocks(hit, blank):
         hit[block] &= ~blank[block]

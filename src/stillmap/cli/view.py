@@ -1,8 +1,6 @@
-"""`stillmap view DIR`: look at a result.
+"""`stillmap view DIR`: a result in the browser, or its report.
 
-The browser of whoever sits here.
-
-What `stillmap view` does once it is known what is wanted: a page that shows a result.
+Imports that take long are made inside the functions, so that `--help` and completion are quick.
 """
 
 import argparse
@@ -11,16 +9,15 @@ import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stillmap.cli.console import say, shown_share
 from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError, MissingExtra, import_extra
-from stillmap.io.trajectory import poses_from_tum
-from stillmap.results.folder import ResultFolder, is_deskewed, open_result
-from stillmap.slam import SlamOptions
-from stillmap.viewer.scene import read_scene
-from stillmap.viewer.tracks import Beams
-from stillmap.viewer.window import Window
+
+if TYPE_CHECKING:
+    from stillmap.results.folder import ResultFolder
+    from stillmap.viewer.tracks import Beams
 
 
 def has_screen() -> bool:
@@ -127,6 +124,10 @@ def viewed(args: argparse.Namespace, folder: Path) -> None:
     Raises:
         InputError: a file of the result is damaged, or the recording that was named is another.
     """
+    from stillmap.results.folder import open_result
+    from stillmap.viewer.scene import read_scene
+    from stillmap.viewer.window import Window
+
     mapped = open_result(folder, args.input)
     scene = read_scene(folder)
     try:
@@ -150,7 +151,12 @@ def viewed(args: argparse.Namespace, folder: Path) -> None:
         window.close()
 
 
-def _beams(mapped: ResultFolder, quiet: bool) -> Beams:
+def _beams(mapped: "ResultFolder", quiet: bool) -> "Beams":
+    from stillmap.io.trajectory import poses_from_tum
+    from stillmap.results.folder import is_deskewed
+    from stillmap.slam import SlamOptions
+    from stillmap.viewer.tracks import Beams
+
     with shown_share(quiet, "reading") as tell:
         recording, labels = mapped.read(tell)
     poses = poses_from_tum(mapped.folder / "trajectory.tum", recording)
