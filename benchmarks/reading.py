@@ -23,8 +23,7 @@ from stillmap.core.recording import Recording
 from stillmap.io import read, writers
 from stillmap.io.ros.bag import open_bag
 from stillmap.io.ros.bag_types import ENDINGS
-from stillmap.io.ros.collect import collect_messages
-from stillmap.io.ros.topics import select_topics
+from stillmap.io.ros.collect import collect_messages, select_topics
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.sim import scene_by_name, simulate
 

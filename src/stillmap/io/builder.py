@@ -82,7 +82,7 @@ class RecordingBuilder:
         source: dict[str, Any],
         T_odom_base: NDArray[np.float64] | None = None,
         T_recorded_base: NDArray[np.float64] | None = None,
-        chosen: NDArray[np.intp] | None = None,
+        selection: NDArray[np.intp] | None = None,
         **more: Any,
     ) -> Recording:
         """The recording of scans by their stamps; nothing can be added any more.
@@ -91,13 +91,13 @@ class RecordingBuilder:
             T_base_sensor: (S, D+1, D+1).
             source: see Recording.
             T_odom_base, T_recorded_base: (T, D+1, D+1) in the order in which scans were added.
-            chosen: which of the scans; None: all.
+            selection: which of the scans; None: all.
             more: other fields of the Recording.
         """
         stamp_ns = np.asarray(self._stamp_ns, np.int64)
         length = np.asarray(self._length, np.int64)
-        chosen = np.arange(len(stamp_ns)) if chosen is None else np.sort(chosen)
-        order = chosen[np.argsort(stamp_ns[chosen], kind="stable")]
+        selection = np.arange(len(stamp_ns)) if selection is None else np.sort(selection)
+        order = selection[np.argsort(stamp_ns[selection], kind="stable")]
         start = np.cumsum(length) - length
         columns = [
             _reorder(column.finish(), start, length, order, self._folder)
@@ -158,6 +158,8 @@ def _reorder(
 
 MAX_LINE_NUMBERS = 1000
 
+_MAX_LOSS = 0.05  # share of scans that may be skipped without a warning
+
 
 class SkippedRecords:
     """Counts of skipped records by reason; at most `KEPT_LINES` line numbers each."""
@@ -201,6 +203,15 @@ class SkippedRecords:
             shown = ", ".join(str(line) for line in sorted(self._lines[reason])[:3])
             parts.append(f"{count} x {reason} ({unit} {shown}{', ...' if count > 3 else ''})")
         return "; ".join(parts)
+
+    def loss_warnings(self, kept: int, unit: str = "line") -> list[str]:
+        """A warning where more than a few of the scans were skipped, of which `kept` remain."""
+        if self.total <= _MAX_LOSS * (kept + self.total):
+            return []
+        return [
+            f"{self.total} of {kept + self.total} scans are damaged and were skipped: "
+            f"{self.summary(unit)}"
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         return {

@@ -139,7 +139,7 @@ def test_headers_without_stamps(bag, messages):
     ]
     recording = read(bag(content))
     np.testing.assert_array_equal(recording.stamp_ns, START + np.arange(3) * SECOND)
-    assert "times of recording are used" in recording.source["warnings"][0]
+    assert "log times are used" in recording.source["warnings"][0]
 
 
 def test_transforms_that_are_none(bag, messages):

@@ -143,15 +143,15 @@ def test_chunks_in_chunks(tmp_path):
 
 
 def test_parts_that_unpack_to_too_much(tmp_path, monkeypatch):
-    monkeypatch.setattr(limits, "_SURELY_FINE", 1 << 20)
+    monkeypatch.setattr(limits, "_MIN_LIMIT", 1 << 20)
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + _chunk(b"\0" * (1 << 20)) * 30)
     with pytest.raises(InputError, match="more than 300 times its size"):
         read(tmp_path / "a.bag")
 
 
 def test_index_that_names_one_message_many_times(tmp_path, monkeypatch):
-    monkeypatch.setattr(limits, "_SURELY_FINE", 1 << 20)
-    monkeypatch.setattr(limits, "_MAX_GROWTH", 10)
+    monkeypatch.setattr(limits, "_MIN_LIMIT", 1 << 20)
+    monkeypatch.setattr(limits, "_MAX_RATIO", 10)
     messages = Messages("ros1")
     scan = messages.scan(START, np.ones(4000), angle_increment=1e-5)
     path = write_bag(tmp_path, "bag", messages, [("/scan", START, scan)])
@@ -206,5 +206,5 @@ def test_long_scan_among_many_short_ones(monkeypatch):
     stamps = np.arange(len(shape), dtype=np.int64)
     ranges = np.ones(n.sum(), np.float32)
     start = np.cumsum(n) - n
-    scans = LaserScans("/scan", "", "", stamps, stamps, start, shape, shapes, ranges, [])
+    scans = LaserScans("/scan", "", stamps, stamps, start, shape, shapes, ranges, [])
     assert scan_beams._sample_readings(scans).size <= 5 * 1000

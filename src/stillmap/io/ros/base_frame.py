@@ -1,6 +1,5 @@
-"""Which frame is the robot, where its lasers sit on it, and where it was by its odometry."""
+"""Finds the base frame of a robot, its sensors' poses, and its odometry in the transform tree."""
 
-from array import array
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,178 +8,207 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.io.builder import SkippedRecords
-from stillmap.io.ros.messages import frame_name as frame_name
-from stillmap.io.ros.messages import stamp_ns
-from stillmap.io.ros.tf import BAD_TRANSFORM, TransformTree, is_pose
+from stillmap.io.ros.collect import BagContent
+from stillmap.io.ros.laser_scan import LaserScans
+from stillmap.io.ros.tf import Odometry, TransformTree
 from stillmap.preprocessing.options import ReadOptions
+
+Float = NDArray[np.float64]
 
 SENSOR_IS_BASE = "the sensor is taken for the robot: nothing says where it sits on one"
 
-_NAMES = ("base_link", "base_footprint", "base")
-_GAP = 1.0  # s without odometry that is worth a word
-_TILTED = 0.9  # cosine of the largest tilt of a laser whose scans are taken for level
-
-
-class Odometry:
-    """The messages of one Odometry topic: where a frame of the robot was."""
-
-    def __init__(self, topic: str) -> None:
-        self.topic = topic
-        self.frame, self.child = "", ""
-        self.stamp_ns = array("q")
-        self.values = array("d")
-        self.skipped = SkippedRecords()
-        self._number = 0
-
-    def add(self, message: Any) -> None:
-        """Take in a message; a pose that is none is counted."""
-        self._number += 1
-        p, q = message.pose.pose.position, message.pose.pose.orientation
-        values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-        if not is_pose(values):
-            self.skipped.add(BAD_TRANSFORM, self._number)
-            return
-        self.frame = frame_name(message.header.frame_id)
-        self.child = frame_name(message.child_frame_id)
-        self.stamp_ns.append(stamp_ns(message.header))
-        self.values.extend(values)
+_BASE_NAMES = ("base_link", "base_footprint", "base")
+_MAX_GAP = 1.0  # s without odometry before a warning
+_MIN_UPRIGHT = 0.9  # cosine of the largest tilt of a laser that counts as level
+_MIN_SHARE = 0.25  # of the most frequent laser's scans: rarer topics are no sensors of their own
 
 
 class SensorPoses(NamedTuple):
-    """Where sensors are on the robot.
+    """Poses of sensors on the robot.
 
     Attributes:
-        base: the frame of the robot.
-        how: why that one, in words.
-        T_base_sensor: for each frame that was asked for (N, 4, 4) at its scans; None where a
-            frame does not hang together with the base.
-        moves: for each whether it moves on the robot.
+        base: base frame.
+        how: how it was found.
+        T_base_sensor: for each sensor (N, 4, 4) at its scans; None where its frame is not
+            connected with the base.
+        warnings: sentences.
     """
 
     base: str
     how: str
-    T_base_sensor: list[NDArray[np.float64] | None]
-    moves: list[bool]
+    T_base_sensor: list[Float | None]
+    warnings: list[str]
 
 
-def find_base_frame(
-    transforms: TransformTree, sensors: list[str], odometry: list[Odometry], options: ReadOptions
-) -> tuple[str, str]:
-    """The frame of the robot, and how it was found.
+def find_sensor_poses(
+    content: BagContent, sensors: list[tuple[str, NDArray[np.int64]]], options: ReadOptions
+) -> SensorPoses:
+    """Find the base frame, and the poses of sensors (frame, stamps (N,)) in it.
 
     Raises:
         InputError: the options name a frame that is not there.
     """
+    tree = content.transforms
+    base, how = _find_base_frame(tree, [frame for frame, _ in sensors], content.odometry, options)
+    found = [tree.lookup(base, frame, at_ns) for frame, at_ns in sensors]
+    warning = f"no transform says where {base!r} sits on a robot: took the laser as the base"
+    warnings = [warning] if how == SENSOR_IS_BASE else []
+    return SensorPoses(base, how, [None if f is None else f.T for f in found], warnings)
+
+
+def _find_base_frame(
+    tree: TransformTree, sensors: list[str], odometry: list[Odometry], options: ReadOptions
+) -> tuple[str, str]:
+    """The base frame, and how it was found."""
     given = options.base_frame
     if given is not None:
-        if given not in transforms.frames and given not in sensors:
-            known = ", ".join(sorted(transforms.frames | set(sensors))[:20])
+        if given not in tree.frames and given not in sensors:
+            known = ", ".join(sorted(tree.frames | set(sensors))[:20])
             raise InputError(f"base frame {given!r} is not in the recording", hint=f"has: {known}")
         return given, "given"
-    path = transforms.path_to_root(sensors[0])
+    path = tree.path_to_root(sensors[0])
     for one in odometry:
         if one.child and one.child in path:
             return one.child, f"{one.topic} names it"
-    for name in _NAMES:
+    for name in _BASE_NAMES:
         found = [above for above in path[1:] if above.rpartition("/")[2] == name]
         if found:
             return found[0], "by its name"
-    for below in path:
-        if transforms.is_moving(below):
-            if below == sensors[0]:
-                break
-            return below, f"it moves in {transforms.parent(below)}"
-    if len(path) > 1 and not any(map(transforms.is_moving, path)):
+    lowest = next((frame for frame in path if tree.is_moving(frame)), None)
+    if lowest is not None and lowest != sensors[0]:
+        return lowest, f"it moves in {tree.parent(lowest)}"
+    if lowest is None and len(path) > 1:
         return path[-1], "all frames hang on it"
     return sensors[0], SENSOR_IS_BASE
 
 
-def find_sensor_poses(
-    transforms: TransformTree, base: tuple[str, str], sensors: list[tuple[str, NDArray[np.int64]]]
-) -> SensorPoses:
-    """Where sensors sit on the robot, each at its own times (N,)."""
-    found, moves = [], []
-    for name, at_ns in sensors:
-        located = transforms.lookup(base[0], name, at_ns)
-        found.append(None if located is None else located.T)
-        moves.append(located is not None and located.moves)
-    return SensorPoses(*base, found, moves)
+class LaserSelection(NamedTuple):
+    """The lasers to use.
+
+    Attributes:
+        scans: of each laser.
+        T_base_sensor: (T, 4, 4) of each laser at its scans.
+        poses: base frame and warnings.
+        skipped: messages that were skipped, by topic.
+        omitted: sentences on lasers that are not used.
+    """
+
+    scans: list[LaserScans]
+    T_base_sensor: list[Float]
+    poses: SensorPoses
+    skipped: dict[str, SkippedRecords]
+    omitted: list[str]
 
 
-def base_frame_warnings(placed: SensorPoses) -> list[str]:
-    """A warning where the robot's frame is a makeshift."""
-    if placed.how != SENSOR_IS_BASE:
-        return []
-    return [f"no transform says where {placed.base!r} sits on a robot: took the laser as the base"]
+def select_lasers(content: BagContent, options: ReadOptions) -> LaserSelection:
+    """Select the lasers whose pose on the robot is known.
+
+    Raises:
+        InputError: there is none.
+    """
+    lasers, skipped = content.lasers.finish()
+    if not lasers:
+        total = SkippedRecords().merge(*skipped.values())
+        raise InputError(f"holds no usable laser scan: {total.summary('message')}")
+    lasers, omitted = _drop_duplicates(lasers, options.topic is not None)
+    poses = find_sensor_poses(content, [(s.frame, s.stamp_ns) for s in lasers], options)
+    used: list[LaserScans] = []
+    T: list[Float] = []
+    for scans, found in zip(lasers, poses.T_base_sensor, strict=True):
+        if found is None and options.base_frame is not None and not used:
+            raise InputError(f"nothing says where {scans.frame!r} is in {poses.base!r}")
+        if found is None and used:
+            omitted.append(
+                f"{scans.topic}: {scans.n_scans} scans, nothing says where {scans.frame!r} is on "
+                f"the robot beside {used[0].frame!r} (--topic {scans.topic} takes it instead)"
+            )
+            continue
+        used.append(scans)
+        T.append(np.tile(np.eye(4), (scans.n_scans, 1, 1)) if found is None else found)
+    return LaserSelection(used, T, poses, skipped, omitted)
 
 
-def project_to_plane(T: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool, bool]:
-    """A level laser seen from above: (N, 3, 3), whether it hangs upside down, whether it tilts."""
+def _drop_duplicates(lasers: list[LaserScans], named: bool) -> tuple[list[LaserScans], list[str]]:
+    """The lasers in order of their number of scans, and sentences on those that are dropped.
+
+    Of topics in the same frame, which show the same laser, the one with most scans is kept, of
+    equal ones the one with most beams, then the first by name. Topics with few scans are dropped
+    unless the user `named` the topics.
+    """
+    order = sorted(lasers, key=lambda s: (-s.n_scans, -int(s.lengths[0]), s.topic))
+    used: list[LaserScans] = []
+    dropped = []
+    for scans in order:
+        same = next((u for u in used if u.frame == scans.frame), None)
+        prefix = f"{scans.topic}: {scans.n_scans} scans"
+        if same is not None:
+            dropped.append(f"{prefix}, {same.topic} shows the same laser")
+        elif not named and used and scans.n_scans < _MIN_SHARE * used[0].n_scans:
+            dropped.append(f"{prefix} are too few beside {used[0].topic}")
+        else:
+            used.append(scans)
+    return used, dropped
+
+
+def project_to_plane(T: Float) -> tuple[Float, bool, bool]:
+    """2D poses (N, 3, 3) of a laser, whether it is mounted upside down, whether it is tilted."""
     up = T[:, 2, 2]
     theta = np.arctan2(T[:, 1, 0], T[:, 0, 0])
     flat = se2.matrix(T[:, 0, 3], T[:, 1, 3], theta)
-    return flat, bool(np.median(up) < 0.0), bool(np.any(np.abs(up) < _TILTED))
+    return flat, bool(np.median(up) < 0.0), bool(np.any(np.abs(up) < _MIN_UPRIGHT))
 
 
 def find_odometry(
-    transforms: TransformTree,
-    base: str,
-    odometry: list[Odometry],
-    at_ns: NDArray[np.int64],
-    options: ReadOptions,
-) -> tuple[NDArray[np.float64] | None, dict[str, Any], list[str]]:
-    """Odometry (T, 4, 4) at the scans, where it is from (for `source`), and warnings in words.
+    content: BagContent, base: str, at_ns: NDArray[np.int64], options: ReadOptions
+) -> tuple[Float | None, dict[str, Any], list[str]]:
+    """Odometry (T, 4, 4) at the scans, its origin (for `source`), and warnings.
+
+    Transforms to a frame in which the base moves come first, then Odometry topics.
 
     Raises:
         InputError: the options name a frame that is not there.
     """
-    frame = options.odom_frame
-    if frame is not None and frame not in transforms.frames | {o.frame for o in odometry}:
+    tree, odometry, frame = content.transforms, content.odometry, options.odom_frame
+    if frame is not None and frame not in tree.frames | {o.frame for o in odometry}:
         raise InputError(f"odometry frame {frame!r} is not in the recording")
-    named = _find_odom_frame(transforms, base) if frame is None else frame
-    if named in transforms.frames:
-        found = transforms.lookup(named, base, at_ns)
+    odom = _find_odom_frame(tree, base) if frame is None else frame
+    if odom in tree.frames:
+        found = tree.lookup(odom, base, at_ns)
         if found is not None and found.moves:
-            gap = _largest_gap(transforms.stamps_between(named, base), at_ns)
-            return found.T, *_describe_odometry(f"TF from {named} to {base}", found.outside, gap)
+            gap = _largest_gap(tree.stamps_between(odom, base), at_ns)
+            return found.T, *_describe_odometry(f"TF from {odom} to {base}", found.outside, gap)
     for one in sorted(odometry, key=lambda o: -len(o.stamp_ns)):
-        if frame in (None, one.frame) and len(one.stamp_ns):
-            return _odometry_from_topic(one, transforms, base, at_ns)
+        if frame in (None, one.frame):
+            return _odometry_from_topic(one, tree, base, at_ns)
     return None, {"from": None, "outside": 0}, []
 
 
 def _odometry_from_topic(
-    one: Odometry, transforms: TransformTree, base: str, at_ns: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], dict[str, Any], list[str]]:
-    alone = TransformTree()
-    stamps = list(one.stamp_ns)
-    for stamp, values in zip(stamps, np.asarray(one.values).reshape(-1, 7).tolist(), strict=True):
-        alone.add_transform("odometry", "robot", stamp, tuple(values), static=False)
-    found = alone.lookup("odometry", "robot", at_ns)
-    assert found is not None
-    T, more = found.T, []
-    on_robot = transforms.lookup(one.child, base, at_ns) if one.child != base else None
-    if on_robot is not None:
-        T = T @ on_robot.T
+    one: Odometry, tree: TransformTree, base: str, at_ns: NDArray[np.int64]
+) -> tuple[Float, dict[str, Any], list[str]]:
+    found = one.poses_at(at_ns)
+    T, warnings = found.T, []
+    T_child_base = tree.lookup(one.child, base, at_ns) if one.child != base else None
+    if T_child_base is not None:
+        T = T @ T_child_base.T
     elif one.child not in ("", base):
-        more = [f"{one.topic}: taken for {base}, though it speaks of {one.child}"]
-    told, warnings = _describe_odometry(
-        one.topic, found.outside, _largest_gap(np.array(stamps), at_ns)
-    )
-    return T, told, more + warnings
+        warnings = [f"{one.topic}: taken for {base}, though it is of {one.child}"]
+    gap = _largest_gap(np.asarray(one.stamp_ns), at_ns)
+    origin, more = _describe_odometry(one.topic, found.outside, gap)
+    return T, origin, warnings + more
 
 
-def _find_odom_frame(transforms: TransformTree, base: str) -> str:
-    """The frame in which the robot moves first, on the way up."""
-    for name in transforms.path_to_root(base):
-        above = transforms.parent(name)
-        if above is not None and transforms.is_moving(name):
-            return above
+def _find_odom_frame(tree: TransformTree, base: str) -> str:
+    """The nearest frame above the base in which it moves, "" if there is none."""
+    for name in tree.path_to_root(base):
+        parent = tree.parent(name)
+        if parent is not None and tree.is_moving(name):
+            return parent
     return ""
 
 
 def _largest_gap(stamps: NDArray[np.int64], at_ns: NDArray[np.int64]) -> float:
-    """s: the longest time without odometry during the scans."""
+    """The longest time without odometry during the scans, in seconds."""
     stamps = np.sort(stamps)
     if not len(at_ns) or not len(stamps):
         return 0.0
@@ -192,6 +220,6 @@ def _describe_odometry(origin: str, outside: int, gap: float) -> tuple[dict[str,
     warnings = []
     if outside:
         warnings.append(f"{outside} scans outside the time of the odometry: nearest pose")
-    if gap > _GAP:
+    if gap > _MAX_GAP:
         warnings.append(f"no odometry for {gap:.1f} s: interpolated over the gap")
     return {"from": origin, "outside": outside}, warnings

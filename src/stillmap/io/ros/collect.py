@@ -1,28 +1,163 @@
-"""One pass through a bag: every message goes where it belongs."""
+"""Selects the topics of a bag that make a recording, and collects their messages in one pass."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, NamedTuple
 
+from stillmap.core.errors import InputError
 from stillmap.io.builder import SkippedRecords
-from stillmap.io.ros.bag_types import Bag, Message
-from stillmap.io.ros.base_frame import Odometry
+from stillmap.io.ros.bag_types import Bag, Channel, Message
 from stillmap.io.ros.image import ImageCollector
-from stillmap.io.ros.laser_scan import LaserCollector
+from stillmap.io.ros.laser_scan import UNREADABLE, LaserCollector
 from stillmap.io.ros.limits import count_output
-from stillmap.io.ros.messages import decode
+from stillmap.io.ros.messages import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    LASER_SCAN,
+    MULTI_ECHO,
+    ODOMETRY,
+    POINT_CLOUD,
+    ROS1_TF,
+    TF,
+    decode,
+    find_fault,
+)
 from stillmap.io.ros.point_cloud2 import CloudCollector
-from stillmap.io.ros.tf import TransformTree
-from stillmap.io.ros.topics import TopicSelection
+from stillmap.io.ros.tf import Odometry, TransformTree
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import ReadOptions
 
-_UNREADABLE = "message that cannot be decoded"
-_TELL_EVERY = 2000  # messages
+_SCAN_TYPES = (LASER_SCAN, MULTI_ECHO, POINT_CLOUD)
+_PROGRESS_INTERVAL = 2000  # messages
+
+
+class TopicSelection(NamedTuple):
+    """Topics by their use.
+
+    Attributes:
+        lasers, clouds: topics of scans; one of the two is empty.
+        tf, odometry, images: further topics.
+        notes: type, number of messages and use of every topic of the bag.
+    """
+
+    lasers: set[str]
+    clouds: set[str]
+    tf: set[str]
+    odometry: set[str]
+    images: set[str]
+    notes: list[dict[str, Any]]
+
+    @property
+    def all(self) -> set[str]:
+        return self.lasers | self.clouds | self.tf | self.odometry | self.images
+
+
+def select_topics(bag: Bag, options: ReadOptions) -> TopicSelection:
+    """Select the topics to read: laser scans, else point clouds, and what belongs to them.
+
+    Raises:
+        InputError: no topic has scans, or a topic that the options name has none.
+    """
+    usable = [c for c in bag.channels if c.n_messages and find_fault(c) is None]
+    name = options.tilting_topic
+    tilting = set() if name is None else {name, f"/{name}"}
+    scans = _find_named(usable, bag, options) or [c for c in usable if c.type in _SCAN_TYPES]
+    scans = [c for c in scans if c.topic not in tilting]
+    if not scans:
+        raise InputError(_describe_lack_of_scans(bag.channels), hint=_list_topics(bag.channels))
+
+    def topics(*types: str) -> set[str]:
+        return {c.topic for c in usable if c.type in types}
+
+    lasers = {c.topic for c in scans if c.type != POINT_CLOUD}
+    clouds = set() if lasers else {c.topic for c in scans}
+    selection = TopicSelection(
+        lasers=lasers,
+        clouds=clouds,
+        tf=topics(TF, ROS1_TF),
+        odometry=topics(ODOMETRY),
+        images=topics(IMAGE, COMPRESSED_IMAGE, CAMERA_INFO) if clouds else set(),
+        notes=[],
+    )
+    selection.notes.extend(_describe_topic(c, selection, tilting) for c in bag.channels)
+    return selection
+
+
+def _find_named(usable: list[Channel], bag: Bag, options: ReadOptions) -> list[Channel]:
+    if options.topic is None:
+        return []
+    found = []
+    for name in (part.strip() for part in options.topic.split(",")):
+        of_name = [c for c in bag.channels if c.topic in (name, f"/{name}")]
+        scans = [c for c in of_name if c in usable and c.type in _SCAN_TYPES]
+        if not scans:
+            faults = [find_fault(c) or f"has {c.type}, no scans" for c in of_name if c.n_messages]
+            fault = faults[0] if faults else ("is empty" if of_name else "is not there")
+            raise InputError(f"topic {name!r} {fault}", hint=_list_topics(bag.channels))
+        found += scans
+    if len({c.type == POINT_CLOUD for c in found}) > 1:
+        raise InputError("laser scans and point clouds cannot be used together", hint="name either")
+    return found
+
+
+def _describe_lack_of_scans(channels: list[Channel]) -> str:
+    of_scans = [c for c in channels if c.type in _SCAN_TYPES]
+    for channel in of_scans:
+        if fault := find_fault(channel):
+            return f"holds no scans that can be read: {channel.topic} {fault}"
+    empty = [c.topic for c in of_scans if not c.n_messages]
+    return f"holds no scans: {empty[0]} is empty" if empty else "holds no scans"
+
+
+def _list_topics(channels: list[Channel]) -> str:
+    if not channels:
+        return "it has no topics"
+    of_scans = [c for c in channels if c.type in _SCAN_TYPES and c.n_messages]
+    listed = ", ".join(
+        f"{c.topic} ({c.type.rpartition('/')[2]})" for c in (of_scans or channels)[:12]
+    )
+    return f"topics with scans: {listed}" if of_scans else f"it has {listed}"
+
+
+def _describe_topic(
+    channel: Channel, selection: TopicSelection, tilting: set[str]
+) -> dict[str, Any]:
+    uses = {
+        "scans": selection.lasers | selection.clouds,
+        "transforms": selection.tf,
+        "odometry": selection.odometry,
+        "pictures": selection.images,
+    }
+    use = next((use for use, topics in uses.items() if channel.topic in topics), None)
+    is_relevant = channel.type in (*_SCAN_TYPES, ODOMETRY, TF, ROS1_TF)
+    fault = find_fault(channel) if is_relevant else None
+    if channel.n_messages == 0:
+        why = "empty"
+    elif use is not None:
+        why = f"read for {use}"
+    elif fault:
+        why = fault
+    elif channel.topic in tilting:
+        why = "not for the map: its laser tilts"
+    elif channel.type == POINT_CLOUD:
+        why = "not used: the laser scans are (name it to use it instead)"
+    elif channel.type in _SCAN_TYPES:
+        why = "not used: others are named"
+    else:
+        why = "not used"
+    return {
+        "topic": channel.topic,
+        "type": channel.type,
+        "messages": channel.n_messages,
+        "used": use is not None,
+        "why": why,
+    }
 
 
 @dataclass
 class BagContent:
-    """What the chosen topics hold."""
+    """The content of the selected topics."""
 
     lasers: LaserCollector
     clouds: CloudCollector
@@ -33,7 +168,7 @@ class BagContent:
 
     @property
     def odometry(self) -> list[Odometry]:
-        """The Odometry topics that say anything."""
+        """The Odometry topics with at least one pose."""
         return [one for one in self.odometry_by_topic.values() if len(one.stamp_ns)]
 
     @property
@@ -46,41 +181,46 @@ class BagContent:
 
 def collect_messages(
     bag: Bag,
-    chosen: TopicSelection,
+    selection: TopicSelection,
     options: ReadOptions,
     progress: Progress | None,
     scratch: Path | None,
 ) -> BagContent:
-    """Read everything that was chosen.
+    """Read the selected topics.
 
     Raises:
-        DamagedError: the bag is not whole.
+        DamagedBagError: an indexed bag is damaged.
     """
-    found = BagContent(LaserCollector(scratch), CloudCollector(options, scratch), ImageCollector())
-    total = sum(c.n_messages for c in bag.channels if c.topic in chosen.all)
-    for number, message in enumerate(bag.messages(chosen.all), start=1):
+    content = BagContent(
+        LaserCollector(scratch), CloudCollector(options, scratch), ImageCollector()
+    )
+    total = sum(c.n_messages for c in bag.channels if c.topic in selection.all)
+    for number, message in enumerate(bag.messages(selection.all), start=1):
         topic = message.channel.topic
         count_output(len(message.raw))
-        if topic in chosen.lasers:
-            found.lasers.add(message)
-        elif topic in chosen.clouds:
-            found.clouds.add(message)
-        elif topic in chosen.images:
-            found.images.add(message)
+        if topic in selection.lasers:
+            content.lasers.add_message(message)
+        elif topic in selection.clouds:
+            content.clouds.add_message(message)
+        elif topic in selection.images:
+            content.images.add_message(message)
         else:
-            _add_pose(found, message, chosen, number)
-        if progress is not None and number % _TELL_EVERY == 0:
+            _add_pose(content, message, selection, number)
+        if progress is not None and number % _PROGRESS_INTERVAL == 0:
             progress(min(number / max(total, 1), 1.0))
-    return found
+    return content
 
 
-def _add_pose(found: BagContent, message: Message, chosen: TopicSelection, number: int) -> None:
+def _add_pose(
+    content: BagContent, message: Message, selection: TopicSelection, number: int
+) -> None:
     topic = message.channel.topic
     try:
-        if topic in chosen.tf:
+        if topic in selection.tf:
             static = topic.rpartition("/")[2] == "tf_static"
-            found.transforms.add_message(decode(message), static=static)
+            content.transforms.add_message(decode(message), static=static)
         else:
-            found.odometry_by_topic.setdefault(topic, Odometry(topic)).add(decode(message))
-    except Exception:  # whatever the library makes of damaged bytes
-        found.unreadable.add(f"{_UNREADABLE} ({topic})", number)
+            odometry = content.odometry_by_topic.setdefault(topic, Odometry(topic))
+            odometry.add_message(decode(message))
+    except Exception:  # any error of rosbags about damaged bytes
+        content.unreadable.add(f"{UNREADABLE} ({topic})", number)

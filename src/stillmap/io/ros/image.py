@@ -1,4 +1,4 @@
-"""Image, CompressedImage and CameraInfo messages: found while reading, loaded when asked for."""
+"""Collects the headers of Image, CompressedImage and CameraInfo; decodes pixels on demand."""
 
 import io
 import re
@@ -15,14 +15,13 @@ from PIL import Image
 from stillmap.core import se2
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
-from stillmap.io.builder import SkippedRecords
 from stillmap.io.point_cloud.files import rigid_transform
 from stillmap.io.ros.bag_types import Bag, Message
 from stillmap.io.ros.messages import CAMERA_INFO, COMPRESSED_IMAGE, decode, frame_name, stamp_ns
 from stillmap.io.ros.tf import TransformTree
 
 _MAX_PIXELS = 1 << 27
-_RAW = {  # encoding: type, channels, where red, green and blue are
+_RAW = {  # encoding: type, channels, indices of red, green and blue
     "rgb8": ("u1", 3, (0, 1, 2)),
     "rgba8": ("u1", 4, (0, 1, 2)),
     "bgr8": ("u1", 3, (2, 1, 0)),
@@ -34,83 +33,73 @@ _RAW = {  # encoding: type, channels, where red, green and blue are
     "16UC1": ("u2", 1, None),
     "32FC1": ("f4", 1, None),
 }
-# Bayer: which colour the first two pixels of the first two rows have
-_BAYER = {
-    "bayer_rggb8": "rggb",
-    "bayer_bggr8": "bggr",
-    "bayer_gbrg8": "gbrg",
-    "bayer_grbg8": "grbg",
-}
-
+# colors of the first two pixels of the first two rows
+_BAYER = {f"bayer_{pattern}8": pattern for pattern in ("rggb", "bggr", "gbrg", "grbg")}
 
 _RECTIFIED = re.compile(r"/image_rect(_color|_mono)?(/compressed)?$")
 _NONE = np.empty(0)
 
 
 class ImageCollector:
-    """Where the pictures of a bag are."""
+    """Collects the headers of images, and the cameras' calibrations."""
 
     def __init__(self) -> None:
-        self.stamp_ns, self.log_ns = array("q"), array("q")
-        self.topic: list[str] = []
-        self.infos: dict[str, Any] = {}  # CameraInfo by topic
-        self.frames: dict[str, str] = {}
-        self.skipped = SkippedRecords()
+        self._stamp_ns, self._log_ns = array("q"), array("q")
+        self._topic: list[str] = []
+        self._infos: dict[str, Any] = {}  # CameraInfo by topic
+        self._frames: dict[str, str] = {}
 
-    def add(self, message: Message) -> None:
-        """Take in a message; of pictures only the header is kept."""
+    def add_message(self, message: Message) -> None:
+        """Add a message; one that cannot be decoded is ignored."""
         topic = message.channel.topic
         try:
             content = decode(message)
-            stamp, name = stamp_ns(content.header), frame_name(content.header.frame_id)
-        except Exception:  # whatever the library makes of damaged bytes
-            self.skipped.add(f"picture that cannot be decoded ({topic})", len(self.topic) + 1)
+            stamp, frame = stamp_ns(content.header), frame_name(content.header.frame_id)
+        except Exception:  # any error of rosbags about damaged bytes
             return
         if message.channel.type == CAMERA_INFO:
-            self.infos.setdefault(topic, content)
+            self._infos.setdefault(topic, content)
             return
-        self.stamp_ns.append(stamp)
-        self.log_ns.append(message.log_ns)
-        self.topic.append(topic)
-        self.frames.setdefault(topic, name)
+        self._stamp_ns.append(stamp)
+        self._log_ns.append(message.log_ns)
+        self._topic.append(topic)
+        self._frames.setdefault(topic, frame)
 
     def build_images(
-        self, transforms: TransformTree, base: str, reopened: Callable[[], Bag]
+        self, tree: TransformTree, base: str, reopen: Callable[[], Bag]
     ) -> Images | None:
-        """The pictures as part of a recording, raw ones where a camera has both."""
-        chosen = _select_topics(sorted(self.frames))
-        its = [k for k, topic in enumerate(self.topic) if topic in chosen]
-        if not its:
+        """The images of a recording, raw ones where a camera has both; None without any."""
+        topics = _select_topics(sorted(self._frames))
+        order = [k for k, topic in enumerate(self._topic) if topic in topics]
+        if not order:
             return None
-        its.sort(key=lambda k: self.stamp_ns[k])
-        cameras = tuple(self._camera(topic, transforms, base) for topic in chosen)
+        order.sort(key=lambda k: self._stamp_ns[k])
+        cameras = tuple(self._camera(topic, tree, base) for topic in topics)
 
         def load(image: int) -> NDArray[Any]:
-            k = its[image]
-            return _load_image(reopened(), self.topic[k], self.log_ns[k], self.stamp_ns[k])
+            k = order[image]
+            return _load_image(reopen(), self._topic[k], self._log_ns[k], self._stamp_ns[k])
 
         return Images(
-            np.array([self.stamp_ns[k] for k in its], np.int64),
-            np.array([chosen.index(self.topic[k]) for k in its], np.int32),
+            np.array([self._stamp_ns[k] for k in order], np.int64),
+            np.array([topics.index(self._topic[k]) for k in order], np.int32),
             cameras,
             load,
         )
 
-    def _camera(self, topic: str, transforms: TransformTree, base: str) -> Camera:
-        info = self.infos.get(f"{_camera_name(topic)}/camera_info")
-        placed = transforms.lookup(base, self.frames[topic], np.zeros(1, np.int64))
-        T = None if placed is None or placed.moves else placed.T[0]
+    def _camera(self, topic: str, tree: TransformTree, base: str) -> Camera:
+        info = self._infos.get(f"{_camera_name(topic)}/camera_info")
+        found = tree.lookup(base, self._frames[topic], np.zeros(1, np.int64))
+        T = None if found is None or found.moves else found.T[0]
         if info is None:
-            return Camera(topic, 0, 0, None, "", np.empty(0), T)
-        return _apply_camera_info(
-            Camera(topic, int(info.width), int(info.height), None, "", _NONE, T), info
-        )
+            return Camera(topic, 0, 0, None, "", _NONE, T)
+        camera = Camera(topic, int(info.width), int(info.height), None, "", _NONE, T)
+        return _apply_camera_info(camera, info)
 
 
 def _apply_camera_info(camera: Camera, info: Any) -> Camera:
-    """The camera with what a CameraInfo says: of raw pictures, or of those made from them that
-    are rectified, by the name of their topic."""
-    # ROS 1 names the fields with capitals
+    """Calibrate a camera of raw images, or of rectified ones, which the topic's name tells."""
+    # ROS 1 writes the field names in capitals
     K, D, R, P = (
         np.asarray(getattr(info, name if hasattr(info, name) else name.upper()), float)
         for name in "kdrp"
@@ -132,7 +121,7 @@ def _apply_camera_info(camera: Camera, info: Any) -> Camera:
 def _rectify_pose(
     T: NDArray[np.float64] | None, R: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """The place of a camera that is turned by R (9,); as it is where R is no rotation."""
+    """Rotate a camera pose (4, 4) by R (9,); unchanged where R is no rotation."""
     try:
         turn = rigid_transform(R, np.zeros(3))
     except ValueError:
@@ -141,7 +130,7 @@ def _rectify_pose(
 
 
 def _camera_name(topic: str) -> str:
-    """/cam of /cam/image_raw and of /cam/image_raw/compressed."""
+    """`/cam` for `/cam/image_raw` and `/cam/image_raw/compressed`."""
     return topic.removesuffix("/compressed").rpartition("/")[0]
 
 
@@ -160,7 +149,7 @@ def _load_image(bag: Bag, topic: str, log_ns: int, stamp: int) -> NDArray[Any]:
                 return decode_pixels(content, message.channel.type == COMPRESSED_IMAGE)
     except InputError:
         raise
-    except Exception as error:  # whatever a library makes of damaged bytes
+    except Exception as error:  # any error of a library about damaged bytes
         raise InputError(f"a picture on {topic} cannot be decoded: {error}") from error
     finally:
         bag.close()
@@ -168,7 +157,7 @@ def _load_image(bag: Bag, topic: str, log_ns: int, stamp: int) -> NDArray[Any]:
 
 
 def decode_pixels(message: Any, compressed: bool) -> NDArray[Any]:
-    """(height, width, 3) uint8 red, green, blue, or (height, width) of one channel.
+    """Decode an image: (height, width, 3) uint8 RGB, or (height, width) of one channel.
 
     Raises:
         InputError: it is damaged, too large, or of an unknown encoding.
@@ -203,13 +192,13 @@ def _decompress(data: bytes) -> NDArray[Any]:
 
 
 def _demosaic(values: NDArray[Any], pattern: str) -> NDArray[Any]:
-    """Colours from a Bayer mosaic: each square of four pixels has one, at half the resolution."""
+    """RGB from a Bayer mosaic; each square of four pixels gets one color."""
     h, w = (values.shape[0] // 2) * 2, (values.shape[1] // 2) * 2
     quads = values[:h, :w].reshape(h // 2, 2, w // 2, 2).astype(np.uint16)
     parts = {c: np.zeros((h // 2, w // 2), np.uint16) for c in "rgb"}
-    for k, colour in enumerate(pattern):
-        parts[colour] += quads[:, k // 2, :, k % 2]
+    for k, color in enumerate(pattern):
+        parts[color] += quads[:, k // 2, :, k % 2]
     parts["g"] //= 2
     small = np.stack([parts[c] for c in "rgb"], axis=-1).astype(np.uint8)
-    # each pixel of the square gets its colour: the picture keeps its size, and its pinhole matrix
+    # full size, so that the camera matrix stays valid
     return np.repeat(np.repeat(small, 2, axis=0), 2, axis=1)

@@ -1,7 +1,8 @@
-"""LaserScan and MultiEchoLaserScan messages, gathered topic by topic."""
+"""Collects LaserScan and MultiEchoLaserScan messages by topic and frame."""
 
 import math
 from array import array
+from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,11 +25,11 @@ REPEATED = "scan that was recorded twice"
 
 _TURN = 2.0 * math.pi
 _MAX_READINGS = 1 << 20
-_TOGETHER = 256  # scans
+_BUFFER = 256  # scans
 
 
 class ScanShape(NamedTuple):
-    """What scans of one laser share. Radians, metres, seconds."""
+    """Beam geometry that scans of one laser share, in radians, metres and seconds."""
 
     angle_min: float
     angle_increment: float
@@ -45,42 +46,38 @@ class ScanShape(NamedTuple):
             return NO_ANGLES
         if self.angle_increment == 0.0 and self.n > 1:
             return NO_STEP
-        # a full turn may come with its first beam once more at its end, or a few steps over
+        # a full turn may repeat its first beam at the end, or go a few steps further
         if (self.n - 4) * abs(self.angle_increment) > _TURN:
             return MANY_TURNS
         return None
 
     def angles(self) -> NDArray[np.float64]:
-        """(n,) of the beams."""
+        """(n,) beam angles."""
         return self.angle_min + self.angle_increment * np.arange(self.n, dtype=np.float64)
 
 
 class _ScanBuffer:
-    """The scans of one laser on one topic, in the order of their recording.
+    """The scans of one laser on one topic, in recorded order.
 
     Attributes:
-        topic, frame: where they came from.
-        kind: of the messages.
-        stamp_ns, log_ns: (T,) of the headers, and when they were recorded.
-        number: (T,) which message on the topic each was, from 1.
-        shape: (T,) which of `shapes` each has.
+        topic, frame: of the messages.
+        stamp_ns, log_ns: (T,) header stamps and log times.
+        number: (T,) number of the message on its topic, from 1.
+        shape: (T,) index into `shapes`.
     """
 
-    def __init__(self, topic: str, frame: str, kind: str, scratch: Path | None) -> None:
-        self.topic, self.frame, self.kind = topic, frame, kind
+    def __init__(self, topic: str, frame: str, scratch: Path | None) -> None:
+        self.topic, self.frame = topic, frame
         self.stamp_ns, self.log_ns, self.number = array("q"), array("q"), array("q")
         self.shape = array("i")
         self.shapes: dict[ScanShape, int] = {}
         self._ranges = ArrayBuilder(np.float32, (), scratch)
-        self._waiting: list[NDArray[np.float32]] = []
-
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
+        self._pending: list[NDArray[np.float32]] = []
 
     def add(
         self, message: Any, ranges: NDArray[np.float32], log_ns: int, number: int
     ) -> str | None:
-        """Take in a scan; why not, if it cannot be used."""
+        """Add a scan; returns the reason if it cannot be used."""
         shape = ScanShape(
             message.angle_min,
             message.angle_increment,
@@ -89,29 +86,27 @@ class _ScanBuffer:
             message.range_max,
             message.time_increment,
         )
-        known = self.shapes.get(shape)
-        if known is None:
+        if shape not in self.shapes:
             fault = shape.find_fault()
             if fault is not None:
                 return fault
-            known = self.shapes.setdefault(shape, len(self.shapes))
-        self.shape.append(known)
+        self.shape.append(self.shapes.setdefault(shape, len(self.shapes)))
         self.stamp_ns.append(stamp_ns(message.header))
         self.log_ns.append(log_ns)
         self.number.append(number)
-        self._waiting.append(ranges)
-        if len(self._waiting) >= _TOGETHER:
-            self._pass_on()
+        self._pending.append(ranges)
+        if len(self._pending) >= _BUFFER:
+            self._flush()
         return None
 
-    def _pass_on(self) -> None:
-        if self._waiting:
-            self._ranges.append(np.concatenate(self._waiting))
-            self._waiting = []
+    def _flush(self) -> None:
+        if self._pending:
+            self._ranges.append(np.concatenate(self._pending))
+            self._pending = []
 
     def finish(self, skipped: SkippedRecords) -> "LaserScans":
-        """All of them with time that does not run backwards; what falls out is counted."""
-        self._pass_on()
+        """The scans with non-decreasing stamps, without repeated ones; others are counted."""
+        self._flush()
         ranges = self._ranges.finish()
         shapes = list(self.shapes)
         shape = np.asarray(self.shape, np.int32)
@@ -121,13 +116,12 @@ class _ScanBuffer:
         keep = longest_non_decreasing(stamps.tolist())
         number = np.asarray(self.number)
         skipped.add_all(TIME_BACKWARDS, np.delete(number, keep))
-        again = _find_repeats(stamps, start, n, ranges, keep)
-        skipped.add_all(REPEATED, number[keep[again]])
-        keep = keep[~again]
+        repeated = _find_repeats(stamps, start, n, ranges, keep)
+        skipped.add_all(REPEATED, number[keep[repeated]])
+        keep = keep[~repeated]
         return LaserScans(
             self.topic,
             self.frame,
-            self.kind,
             stamps[keep],
             number[keep],
             start[keep],
@@ -141,26 +135,25 @@ class _ScanBuffer:
         stamps, log = np.asarray(self.stamp_ns, np.int64), np.asarray(self.log_ns, np.int64)
         if np.mean(stamps == 0) <= 0.5:
             return stamps, []
-        return log, [f"{self.topic}: headers have no stamps: the times of recording are used"]
+        return log, [f"{self.topic}: headers have no stamps: log times are used"]
 
 
 class LaserScans(NamedTuple):
-    """T usable scans of one laser, by their stamps.
+    """T usable scans of one laser, ordered by their stamps.
 
     Attributes:
-        topic, frame, kind: see LaserScans.
+        topic, frame: of the messages.
         stamp_ns: (T,) int64.
-        number: (T,) int64, which message on the topic each was, from 1.
-        start: (T,) int64, where the readings of each begin in `ranges`.
-        shape: (T,) int32 into `shapes`.
-        shapes: what scans share.
-        ranges: (N,) float32 metres, of all scans; maybe on disk.
-        warnings: in words.
+        number: (T,) int64 number of the message on its topic, from 1.
+        start: (T,) int64 index of the first reading of each in `ranges`.
+        shape: (T,) int32 index into `shapes`.
+        shapes: distinct beam geometries.
+        ranges: (N,) float32 metres, of all scans; may be memory-mapped.
+        warnings: sentences.
     """
 
     topic: str
     frame: str
-    kind: str
     stamp_ns: NDArray[np.int64]
     number: NDArray[np.int64]
     start: NDArray[np.int64]
@@ -175,7 +168,7 @@ class LaserScans(NamedTuple):
 
     @property
     def lengths(self) -> NDArray[np.int64]:
-        """(T,) how many beams each scan has."""
+        """(T,) number of beams of each scan."""
         return np.array([s.n for s in self.shapes], np.int64)[self.shape]
 
     @property
@@ -191,40 +184,36 @@ class LaserScans(NamedTuple):
 
 
 class LaserCollector:
-    """Every laser on the topics that are read: one topic may carry several, by frame."""
+    """Collects the scans of all lasers: one topic may carry several, by frame."""
 
     def __init__(self, scratch: Path | None) -> None:
         self._scratch = scratch
         self._lasers: dict[tuple[str, str], _ScanBuffer] = {}
         self._skipped: dict[str, SkippedRecords] = {}
-        self._seen: dict[str, int] = {}
+        self._count: Counter[str] = Counter()  # messages by topic
 
-    def add(self, message: Message) -> None:
-        """Take in a message; what cannot be used is counted."""
+    def add_message(self, message: Message) -> None:
+        """Add a message; one that cannot be used is counted."""
         topic = message.channel.topic
-        number = self._seen[topic] = self._seen.get(topic, 0) + 1
+        self._count[topic] += 1
         try:
             scan = decode(message)
-            name = frame_name(scan.header.frame_id)
+            frame = frame_name(scan.header.frame_id)
             ranges = _first_echoes(scan) if message.channel.type == MULTI_ECHO else scan.ranges
-        except Exception:  # whatever the library makes of damaged bytes
-            self._skip(topic, UNREADABLE, number)
-            return
-        key = topic, name
-        laser = self._lasers.get(key)
-        if laser is None:
-            laser = _ScanBuffer(topic, name, message.channel.type, self._scratch)
-        fault = laser.add(scan, ranges, message.log_ns, number)
-        if fault is not None:
-            self._skip(topic, fault, number)
+        except Exception:  # any error of rosbags about damaged bytes
+            fault: str | None = UNREADABLE
         else:
-            self._lasers[key] = laser
-
-    def _skip(self, topic: str, reason: str, number: int) -> None:
-        self._skipped.setdefault(topic, SkippedRecords()).add(reason, number)
+            known = self._lasers.get((topic, frame))
+            laser = known or _ScanBuffer(topic, frame, self._scratch)
+            fault = laser.add(scan, ranges, message.log_ns, self._count[topic])
+            if fault is None:
+                self._lasers[topic, frame] = laser
+        if fault is not None:
+            skipped = self._skipped.setdefault(topic, SkippedRecords())
+            skipped.add(fault, self._count[topic])
 
     def finish(self) -> tuple[list[LaserScans], dict[str, SkippedRecords]]:
-        """The lasers with at least one usable scan, and what was skipped on each topic."""
+        """The lasers with at least one usable scan, and the messages skipped by topic."""
         found = [
             laser.finish(self._skipped.setdefault(laser.topic, SkippedRecords()))
             for laser in self._lasers.values()
@@ -233,7 +222,7 @@ class LaserCollector:
 
 
 def _first_echoes(scan: Any) -> NDArray[np.float32]:
-    """The nearest thing that each beam met: behind glass and rain more may come back."""
+    """(n,) the first echo of each beam: glass and rain return further ones."""
     return np.array([e.echoes[0] if len(e.echoes) else np.nan for e in scan.ranges], np.float32)
 
 
@@ -244,10 +233,10 @@ def _find_repeats(
     ranges: NDArray[np.float32],
     keep: NDArray[np.intp],
 ) -> NDArray[np.bool_]:
-    """(len(keep),) which scans have stamp and readings of the one before."""
-    again = np.zeros(len(keep), np.bool_)
+    """(len(keep),) which scans have the stamp and the readings of the previous one."""
+    repeated = np.zeros(len(keep), np.bool_)
     for k in np.flatnonzero(np.diff(stamps[keep]) == 0) + 1:
         a, b = keep[k - 1], keep[k]
         one, other = ranges[start[a] : start[a] + n[a]], ranges[start[b] : start[b] + n[b]]
-        again[k] = np.array_equal(one, other, equal_nan=True)
-    return again
+        repeated[k] = np.array_equal(one, other, equal_nan=True)
+    return repeated

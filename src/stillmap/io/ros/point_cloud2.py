@@ -1,6 +1,7 @@
-"""PointCloud2 messages as scans."""
+"""Collects PointCloud2 messages by topic and frame."""
 
 from array import array
+from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,15 +20,15 @@ WRONG_SIZE = "cloud whose size is not what it states"
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MAX_STEP = 1 << 16  # bytes of one point
-_RARE = 0.25
+_MIN_SHARE = 0.25  # of the most frequent sensor's scans: rarer topics are no sensors of their own
 
 
 class Cloud(NamedTuple):
     """The points of one message.
 
     Attributes:
-        points: (n, 3) float32 metres; not finite where nothing came back.
-        times: (n,) seconds after the stamp, None where no field tells.
+        points: (n, 3) float32 metres; not finite for no return.
+        times: (n,) seconds after the stamp, None without a time field.
     """
 
     points: NDArray[np.float32]
@@ -35,7 +36,7 @@ class Cloud(NamedTuple):
 
 
 def parse_cloud(message: Any) -> Cloud | str:
-    """The points of a PointCloud2 message, whatever the order of its fields; or why not."""
+    """The points of a PointCloud2 message with fields in any order, or why it cannot be used."""
     fields = {str(f.name).lower(): f for f in message.fields}
     step, width, height = int(message.point_step), int(message.width), int(message.height)
     row = int(message.row_step) or width * step
@@ -84,66 +85,70 @@ def _layout(field: Any, bigendian: bool, step: int) -> tuple[str, int] | None:
 
 
 class CloudCollector:
-    """Every cloud on the topics that are read: one topic may carry several sensors, by frame."""
+    """Collects the scans of all sensors: one topic may carry several, by frame.
+
+    Attributes:
+        sensors: number of each sensor, by topic and frame.
+        timed: sensors with beam times.
+        stamp_ns, sensor, number, beams: (T,) per scan; number counts messages of the topic from 1.
+        scans: points.
+        skipped: messages that were skipped, by topic.
+    """
 
     def __init__(self, options: ReadOptions, scratch: Path | None) -> None:
-        self._seen: dict[str, int] = {}
+        self._count: Counter[str] = Counter()  # messages by topic
         self.skipped: dict[str, SkippedRecords] = {}
-        self.sensors: dict[tuple[str, str], int] = {}  # topic and frame
+        self.sensors: dict[tuple[str, str], int] = {}
         self.timed: set[int] = set()
         self.stamp_ns, self.sensor, self.number = array("q"), array("i"), array("q")
         self.beams = array("q")
         self.scans = RecordingBuilder(3, options, beam_times=True, folder=scratch)
 
-    def add(self, message: Message) -> None:
-        """Take in a message; what cannot be used is counted."""
+    def add_message(self, message: Message) -> None:
+        """Add a message; one that cannot be used is counted."""
         topic = message.channel.topic
-        number = self._seen[topic] = self._seen.get(topic, 0) + 1
-        name, stamp = "", 0
-        found: Cloud | str
+        self._count[topic] += 1
+        frame, stamp = "", 0
+        cloud: Cloud | str
         try:
             raw = decode(message)
-            name, stamp = frame_name(raw.header.frame_id), stamp_ns(raw.header)
-            found = parse_cloud(raw)
-        except Exception:  # whatever the library makes of damaged bytes
-            found = UNREADABLE
-        if isinstance(found, str):
-            self.skipped.setdefault(topic, SkippedRecords()).add(found, number)
+            frame, stamp = frame_name(raw.header.frame_id), stamp_ns(raw.header)
+            cloud = parse_cloud(raw)
+        except Exception:  # any error of rosbags about damaged bytes
+            cloud = UNREADABLE
+        if isinstance(cloud, str):
+            self.skipped.setdefault(topic, SkippedRecords()).add(cloud, self._count[topic])
             return
-        stamp = stamp or message.log_ns  # drivers that leave it unset
-        sensor = self.sensors.setdefault((topic, name), len(self.sensors))
-        if found.times is not None:
+        stamp = stamp or message.log_ns  # some drivers leave it unset
+        sensor = self.sensors.setdefault((topic, frame), len(self.sensors))
+        if cloud.times is not None:
             self.timed.add(sensor)
-        self.scans.add_scan(stamp, found.points, sensor=sensor, beam_time=found.times)
+        self.scans.add_scan(stamp, cloud.points, sensor=sensor, beam_time=cloud.times)
         self.stamp_ns.append(stamp)
         self.sensor.append(sensor)
-        self.number.append(number)
-        self.beams.append(len(found.points))
+        self.number.append(self._count[topic])
+        self.beams.append(len(cloud.points))
 
 
-def select_sensors(topics: CloudCollector, named: bool) -> tuple[list[int], list[str]]:
-    """The sensors to use, and words on those that are left out.
+def select_sensors(clouds: CloudCollector, named: bool) -> tuple[list[int], list[str]]:
+    """The sensors to use, and sentences on those that are dropped.
 
-    Of topics that show the same sensor (the same frame) the one with most points is used: others
-    are made from it. Topics with few scans are left out.
-
-    Args:
-        topics: what was read.
-        named: whether the user named their topics.
+    Of topics in the same frame, which show the same sensor, the one with most points is kept: the
+    others are derived from it. Topics with few scans are dropped unless the user `named` them.
     """
-    sensor, beams = np.asarray(topics.sensor), np.asarray(topics.beams)
-    names = list(topics.sensors)
+    sensor, beams = np.asarray(clouds.sensor), np.asarray(clouds.beams)
+    names = list(clouds.sensors)
     scans = [int(np.count_nonzero(sensor == k)) for k in range(len(names))]
     points = [int(beams[sensor == k].sum()) for k in range(len(names))]
     used: list[int] = []
-    left_out = []
+    dropped = []
     for k in sorted(range(len(names)), key=lambda k: (-points[k], names[k])):
         same = next((u for u in used if names[u][1] == names[k][1]), None)
+        prefix = f"{names[k][0]}: {scans[k]} clouds"
         if same is not None:
-            text = f"{scans[k]} clouds, {names[same][0]} shows the same sensor"
-            left_out.append(f"{names[k][0]}: {text}")
-        elif not named and scans[k] < _RARE * max(scans):
-            left_out.append(f"{names[k][0]}: {scans[k]} clouds are too few")
+            dropped.append(f"{prefix}, {names[same][0]} shows the same sensor")
+        elif not named and scans[k] < _MIN_SHARE * max(scans):
+            dropped.append(f"{prefix} are too few")
         else:
             used.append(k)
-    return used, left_out
+    return used, dropped
