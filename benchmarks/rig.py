@@ -98,7 +98,8 @@ def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, Tilting
     scene = scene_by_name(job.world, config.merged(WORLDS[job.world], _COMMON))
     rig = simulate_rig(scene, job.seed)
     chosen = options_of("stillmap", job.settings)
-    flat = PlanarResult.of(stillmap.build(rig.horizontal.recording, chosen))
+    result = stillmap.build(rig.horizontal.recording, chosen)
+    flat = PlanarResult.from_labels(result.seen, result.poses, result.p_static, result.objects)
     tilting = rig.tilting.recording
     built = {
         way: build_tilting(

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stillmap.pipeline.estimate import Iteration
     from stillmap.pipeline.models import build_models
     from stillmap.pipeline.options import Options
-    from stillmap.pipeline.result import Result, build
+    from stillmap.results.result import Result, build
 
     __version__: str
 
@@ -43,10 +43,10 @@ _MODULES = {
     "Models": "mesh.build",
     "Options": "pipeline.options",
     "Recording": "core.recording",
-    "Result": "pipeline.result",
-    "build": "pipeline.result",
+    "Result": "results.result",
+    "build": "results.result",
     "iterate": "pipeline.em_loop",
-    "models_of": "pipeline.models",
+    "build_models": "pipeline.models",
     "read": "io",
 }
 _ROOMS = (

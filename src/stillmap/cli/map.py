@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from stillmap.pipeline.checkpoint import CheckpointFolder
     from stillmap.pipeline.estimate import EmState
     from stillmap.pipeline.options import Options
-    from stillmap.pipeline.result import Result
+    from stillmap.results.result import Result
     from stillmap.rig.build import TiltingResult
 
 _EPILOG = """examples:
@@ -286,7 +286,7 @@ def _build(
     """EM with a checkpoint per iteration, then the rig's second laser and the meshes."""
     from stillmap.cli.rig import built
     from stillmap.pipeline.checkpoint_files import identify_run
-    from stillmap.pipeline.result import build
+    from stillmap.results.result import build
 
     with stages.measure("read"):
         run_id = identify_run(inputs.recording, options, inputs.poses)

@@ -15,7 +15,7 @@ from stillmap.io.registry import detect_format
 from stillmap.io.text_lines import Progress
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.pipeline.options import Options
-from stillmap.pipeline.result import Result
+from stillmap.results.result import Result
 from stillmap.rig.build import PlanarResult, TiltingResult, build_tilting, check_rig
 
 
@@ -71,9 +71,8 @@ def _of_topic(
 @limit_blas_threads()
 def built(result: Result, tilting: Recording, options: Options) -> TiltingResult:
     """What that laser built, once the flat one knows what moves."""
-    return build_tilting(
-        PlanarResult.of(result), tilting, options, resolve_threads(options.threads)
-    )
+    flat = PlanarResult.from_labels(result.seen, result.poses, result.p_static, result.objects)
+    return build_tilting(flat, tilting, options, resolve_threads(options.threads))
 
 
 def said(tilting: TiltingResult) -> str:

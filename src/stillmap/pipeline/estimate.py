@@ -146,7 +146,7 @@ class EmState:
         self.latest = estimate.for_next_iteration()
         converged = 0.0 <= gain < options.tolerance * iteration.deskewed.n_beams
         if self.options.estimator == "stillmap":  # the labels of (8) keep changing slightly
-            converged |= record.number > 1 and record.changed_share < options.settled
+            converged |= record.number > 1 and record.changed_share < options.label_tolerance
         out_of_patience = record.number - self.require_best().number >= options.patience
         self.converged = (
             record.number == fixed if fixed else converged or out_of_patience or self.single_pass

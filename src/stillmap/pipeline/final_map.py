@@ -53,7 +53,7 @@ def final_estimate(
     """
     threads = resolve_threads(options.threads)
     deskewed = slam.deskew_recording(recording, best.poses, options.slam, threads)
-    cell, look = options.slam.resolution, options.em.dwell.look
+    cell, look = options.slam.resolution, options.em.time_bin
     changed = best.e_step.changed_cells
     if changed is not None:  # 3D: every E-step knows of them
         changes = detect_changes_3d(changed, deskewed, best.poses, cell, look)
@@ -61,7 +61,7 @@ def final_estimate(
     if (
         recording.dimension == 3
         or options.estimator != "stillmap"
-        or not (options.em.dwell.views or options.em.changes.enabled)
+        or not em.has_final_e_step(options.em)
     ):
         return deskewed, best, []
     found, courses = em.final_e_step(deskewed, best.poses, cell, options.em, threads)

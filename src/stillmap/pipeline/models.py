@@ -6,14 +6,14 @@ from stillmap.em import estimate_ground
 from stillmap.mesh import build
 from stillmap.mesh.build import Models
 from stillmap.mesh.inputs import MeshInputs, box_objects, extrude_boxes
-from stillmap.pipeline.result import Result
+from stillmap.pipeline.result import MappingResult
 from stillmap.rig.build import TiltingResult
 from stillmap.tracking.boxes import fit_boxes
 
 
 @limit_blas_threads()
 def build_models(
-    result: Result,
+    result: MappingResult,
     *,
     tilting: TiltingResult | None = None,
     progress: Progress = no_progress,
@@ -43,7 +43,7 @@ def build_models(
     return build.build_models(inputs, result.options.mesh, threads, progress, stages)
 
 
-def _recording_inputs(result: Result, threads: int) -> MeshInputs:
+def _recording_inputs(result: MappingResult, threads: int) -> MeshInputs:
     seen = result.seen
     start = int(seen.stamp_ns[0])
     boxes = box_objects(result.objects, start)
@@ -53,7 +53,7 @@ def _recording_inputs(result: Result, threads: int) -> MeshInputs:
     )
 
 
-def _rig_inputs(result: Result, tilting: TiltingResult, threads: int) -> MeshInputs:
+def _rig_inputs(result: MappingResult, tilting: TiltingResult, threads: int) -> MeshInputs:
     """The flat laser gives the tracks, the tilting laser the 3D data."""
     flat, o = result.seen, result.options.rig
     ground = estimate_ground(tilting.deskewed, tilting.poses, tilting.p_static, threads)

@@ -1,10 +1,10 @@
-"""The main job, and its result: EM to convergence, then everything that follows from the best estimate."""
+"""The main job and its result: EM to convergence, then all that follows from the best estimate."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +22,12 @@ from stillmap.pipeline.options import DEFAULTS, Options, resolved
 from stillmap.pipeline.snapshots import Snapshot
 from stillmap.tracking import FlowMap, MovingObject, compute_flow_map
 
-if TYPE_CHECKING:
-    from stillmap.mesh.build import Models
-
 Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
-    """A mapped recording of T scans with M beams.
+class MappingResult:
+    """A mapped recording of T scans with M beams; `stillmap.Result` adds saving.
 
     Attributes:
         recording: the input.
@@ -118,17 +115,9 @@ class Result:
         """
         return slam.deskew_recording(self.recording, self.poses, self.options.slam)
 
-    def save(
-        self, path: str | Path, *, overwrite: bool = False, models: "Models | None" = None
-    ) -> None:
-        """Writes the result folder, complete or not at all; with the meshes of `build_models`."""
-        from stillmap.results.save import save
-
-        save(self, Path(path), overwrite, models=models)
-
 
 @limit_blas_threads()
-def build(
+def map_recording(
     recording: Recording,
     options: Options = DEFAULTS,
     *,
@@ -138,7 +127,7 @@ def build(
     scratch: Path | None = None,
     resume: EmState | None = None,
     checkpoint: Callable[[EmState], None] | None = None,
-) -> Result:
+) -> MappingResult:
     """Maps a recording: EM until the bound stops improving, then maps, changes and objects.
 
     Args:
@@ -165,7 +154,9 @@ def build(
     return _finish(state, recording, progress, stages)
 
 
-def _finish(state: EmState, recording: Recording, progress: Progress, stages: StageTimer) -> Result:
+def _finish(
+    state: EmState, recording: Recording, progress: Progress, stages: StageTimer
+) -> MappingResult:
     """What follows from the best estimate: last labels, maps, objects, changes."""
     options = state.options
     progress("labelling beams", 0, 0, 0)
@@ -177,7 +168,7 @@ def _finish(state: EmState, recording: Recording, progress: Progress, stages: St
         objects = find_objects(deskewed, estimate, maps, changes, options)
         crossings = compute_flow_map(objects)
         del deskewed
-    return Result(
+    return MappingResult(
         recording=recording,
         options=options,
         iterations=state.records,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stillmap.core.arrays import write_npz
 from stillmap.em import Coverage, OccupancyMap
 from stillmap.mapping import Change
-from stillmap.pipeline.result import Result
+from stillmap.pipeline.result import MappingResult
 
 # what `changed` says of a cell
 CHANGED = {"came": 1, "left": 2, "comes and goes": 3}
@@ -61,7 +61,7 @@ def changed_cells(occupancy: OccupancyMap, changes: Sequence[Change]) -> NDArray
     return out
 
 
-def known_area(result: Result) -> dict[str, float]:
+def known_area(result: MappingResult) -> dict[str, float]:
     """`known`: m2 of the map of which beams tell something; `thin`: of these on thin evidence."""
     cell = float(result.map.resolution) ** 2
     known = result.map.p_occupied.size - int(np.count_nonzero(np.isnan(result.map.p_occupied)))

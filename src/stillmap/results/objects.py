@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npz
 from stillmap.core.recording import Recording
-from stillmap.pipeline.result import Result
+from stillmap.pipeline.result import MappingResult
 from stillmap.results.points import ply_header
 from stillmap.tracking import FlowMap, MovingObject
 
 _MILLIMETRES = 3  # digits: finer is noise, and makes the file twice as long
 
 
-def write_objects(folder: Path, result: Result) -> None:
+def write_objects(folder: Path, result: MappingResult) -> None:
     """Write `objects.json` and `NNNN.ply` of each object into a new folder."""
     write_objects_of(folder, result.objects, result.seen, result.poses, result.p_static)
 

@@ -19,7 +19,7 @@ from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import count_beams
 from stillmap.mesh.build import Models
 from stillmap.pipeline.estimate import IterationRecord
-from stillmap.pipeline.result import Result
+from stillmap.pipeline.result import MappingResult
 from stillmap.results.labels import write_labels
 from stillmap.results.map_npz import known_area, write_map_npz
 from stillmap.results.map_server import write_map_server
@@ -39,7 +39,7 @@ FORMAT_VERSION = 1
 _MILLIMETRES = 3  # digits
 
 
-def run_record(result: Result, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def run_record(result: MappingResult, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """The content of `run.json` as JSON-able values; numbers that are not finite become None.
 
     `more` are further keys with what they hold.
@@ -86,7 +86,9 @@ def run_record(result: Result, more: Mapping[str, Any] | None = None) -> dict[st
 RECORD = "run.json"  # every result has it
 
 
-def write_run_json(path: Path, result: Result, more: Mapping[str, Any] | None = None) -> None:
+def write_run_json(
+    path: Path, result: MappingResult, more: Mapping[str, Any] | None = None
+) -> None:
     """Write `run_record` to `path`."""
     text = json.dumps(run_record(result, more), indent=2, ensure_ascii=False, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
@@ -123,7 +125,7 @@ def _iteration(it: IterationRecord) -> dict[str, Any]:
 
 
 def save(
-    result: Result,
+    result: MappingResult,
     path: Path,
     overwrite: bool = False,
     *,

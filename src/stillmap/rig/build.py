@@ -20,7 +20,6 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.em import GroundMap, estimate_ground, occupancy_hmm
 from stillmap.pipeline.options import Options
-from stillmap.pipeline.result import Result
 from stillmap.rig.options import RigOptions
 from stillmap.rig.removal import BoxBeams, select_box_beams
 from stillmap.rig.trajectory import PosedRecording, pose_recording
@@ -79,12 +78,18 @@ class PlanarResult:
     share: float
 
     @classmethod
-    def of(cls, result: Result) -> "PlanarResult":
-        """What the main job found out about a recording in 2D."""
-        seen, p_static = result.seen, result.p_static
-        sums = [float(p_static[b][seen.hit[b]].sum(dtype=float)) for b in iter_blocks(p_static)]
-        share = sum(sums) / max(sum(int(seen.hit[b].sum()) for b in iter_blocks(seen.hit)), 1)
-        return cls(seen, result.poses, p_static, result.objects, share)
+    def from_labels(
+        cls,
+        deskewed: Recording,
+        poses: Float,
+        p_static: NDArray[np.float32],
+        objects: Sequence[MovingObject],
+    ) -> "PlanarResult":
+        """The same with the share of static hits computed from the labels."""
+        hit = deskewed.hit
+        sums = [float(p_static[b][hit[b]].sum(dtype=float)) for b in iter_blocks(p_static)]
+        share = sum(sums) / max(sum(int(hit[b].sum()) for b in iter_blocks(hit)), 1)
+        return cls(deskewed, poses, p_static, objects, share)
 
 
 def check_rig(flat: Recording, tilting: Recording, where: str) -> None:
