@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.recording import Recording
+from stillmap.core import chunks
 from stillmap.em import observations
 
 LOOKS = np.array([0, 0, 0, 1, 1, 4, 5, 5, 5, 5])
@@ -22,7 +23,7 @@ def ten_scans():
 
 
 def cuts(beams, monkeypatch, **which):
-    monkeypatch.setattr(observations, "CHUNK_BEAMS", beams)
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
     found = list(observations.iter_chunks(ten_scans(), **which))
     for chunk in found:
         assert chunk.beams == slice(100 * chunk.scans.start, 100 * chunk.scans.stop)

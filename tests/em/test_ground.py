@@ -1,11 +1,15 @@
-"""How high the ground is, from surface that somebody drives over."""
+"""The ground map fitted to level surface."""
 
 import numpy as np
 import pytest
 
-from stillmap.em.ground import ground_from
+from stillmap.em.ground import fit_ground
 
 UP = np.array([0.0, 0.0, 1.0])
+
+
+def level(means, normals):
+    return means[np.abs(normals[:, 2]) > 0.85]
 
 
 def slope(x, y):
@@ -28,7 +32,7 @@ def way_over(height, sensor=1.5):
 @pytest.mark.parametrize("height", [0.0, -30.0])
 def test_a_slope_is_followed_and_tables_are_none_of_it(height):
     means, normals, table = floor_with_tables(np.random.default_rng(0), height)
-    ground = ground_from(means, normals, way_over(height))
+    ground = fit_ground(level(means, normals), way_over(height))
     assert ground.observed
     assert ground.sensor_height == pytest.approx(1.5, abs=0.03)
     error = ground.height_at(means[~table, :2]) - (slope(*means[~table, :2].T) + height)
@@ -40,7 +44,7 @@ def test_a_slope_is_followed_and_tables_are_none_of_it(height):
 def test_walls_tell_nothing_of_the_ground():
     rng = np.random.default_rng(1)
     means = rng.uniform([-5, 3, 0], [25, 3.1, 3], (500, 3))
-    ground = ground_from(means, np.tile([0.0, 1.0, 0.0], (500, 1)), way_over(0.0))
+    ground = fit_ground(level(means, np.tile([0.0, 1.0, 0.0], (500, 1))), way_over(0.0))
     assert not ground.observed
     assert ground.sensor_height == 0.0
     assert np.isfinite(ground.height).all()
@@ -48,6 +52,6 @@ def test_walls_tell_nothing_of_the_ground():
 
 def test_beyond_the_edge_it_is_that_of_the_edge():
     means, normals, _ = floor_with_tables(np.random.default_rng(2))
-    ground = ground_from(means, normals, way_over(0.0))
+    ground = fit_ground(level(means, normals), way_over(0.0))
     far = ground.height_at(np.array([[1e4, 0.0], [-1e4, 0.0]]))
     assert far[0] > 1.0 > -0.2 > far[1]

@@ -8,7 +8,7 @@ import pytest
 from stillmap import em
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.em import observations as chunking
+from stillmap.core import chunks
 from stillmap.em.held_out import select_held_out_scans
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box
@@ -86,7 +86,7 @@ def test_no_figure_where_there_is_nothing_to_hold_out(room):
 def test_threads_and_chunks_change_nothing(room, monkeypatch):
     one = figure(room)
     assert figure(room, threads=3) == one
-    monkeypatch.setattr(chunking, "CHUNK_BEAMS", 1000)
+    monkeypatch.setattr(chunks, "CHUNK_BEAMS", 1000)
     assert figure(room) == pytest.approx(one, rel=1e-12)
 
 

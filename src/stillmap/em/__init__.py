@@ -1,4 +1,4 @@
-"""What is static: the E-steps, the map that follows from them, and the likelihood. No I/O."""
+"""The E-step: labels of beams, the occupancy map and the likelihood. No I/O."""
 
 from stillmap.em.changepoints import CellHistories
 from stillmap.em.coverage import Coverage, count_observations
@@ -16,55 +16,54 @@ from stillmap.em.estimator import (
     needs_sums,
     recount_as_static,
 )
-from stillmap.em.ground import GroundMap, estimate_ground
+from stillmap.em.ground import estimate_ground
 from stillmap.em.held_out import score_held_out_scans
 from stillmap.em.observations import time_bin_index
 from stillmap.em.occupancy_grid import GridWindow, ObservedCells, OccupancyMap, make_occupancy_map
-from stillmap.em.occupancy_hmm import final_e_step
-from stillmap.em.options import ChangeOptions, DwellOptions, EmOptions, EvidenceOptions, MapState
+from stillmap.em.occupancy_hmm import final_e_step, has_final_e_step
+from stillmap.em.options import EmOptions, MapState
 from stillmap.em.types import (
     CellProbabilities,
     ChangedCells,
     EStepResult,
     Grid,
+    GroundMap,
     Likelihood,
     NoReturnModel,
 )
 
 __all__ = [
     "ESTIMATORS_3D",
-    "GridWindow",
-    "CellProbabilities",
-    "ChangeOptions",
-    "ChangedCells",
     "CellHistories",
-    "DwellOptions",
+    "CellProbabilities",
+    "ChangedCells",
+    "Coverage",
+    "EStepResult",
     "EmOptions",
     "Estimator",
-    "Coverage",
-    "EvidenceOptions",
-    "EStepResult",
     "Grid",
+    "GridWindow",
     "GroundMap",
     "Likelihood",
     "MapState",
     "NoReturnModel",
-    "OccupancyMap",
     "ObservedCells",
-    "add_trusted_beams",
+    "OccupancyMap",
     "add_recording",
+    "add_trusted_beams",
     "changed_share",
-    "recount_as_static",
-    "e_step",
-    "make_grid",
     "count_observations",
-    "fixed_iterations",
+    "e_step",
     "estimate_ground",
-    "score_held_out_scans",
-    "initial_p_static",
-    "max_iterations",
     "final_e_step",
-    "time_bin_index",
-    "needs_sums",
+    "fixed_iterations",
+    "has_final_e_step",
+    "initial_p_static",
+    "make_grid",
     "make_occupancy_map",
+    "max_iterations",
+    "needs_sums",
+    "recount_as_static",
+    "score_held_out_scans",
+    "time_bin_index",
 ]

@@ -1,4 +1,4 @@
-"""The E-step by whichever estimator was chosen, and the sums of (10) over whole recordings."""
+"""Dispatch of the E-step by estimator, and the counts (10) of whole recordings."""
 
 from typing import Literal
 
@@ -10,29 +10,28 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
 from stillmap.em import beam_counting, occupancy_hmm
-from stillmap.em.beam_counting import hit_ratio_e_step, log_likelihood, paper_e_step
+from stillmap.em.beam_counting import MIN_HIT_RATIO, log_likelihood, threshold_hit_ratio
 from stillmap.em.occupancy_grid import ObservedCells
-from stillmap.em.occupancy_hmm import e_step_3d
 from stillmap.em.options import EmOptions
 from stillmap.em.people import label_people
-from stillmap.em.types import EStepResult, Grid, NoReturnModel, fill_beams
+from stillmap.em.types import EStepResult, Float, Grid, NoReturnModel, fill_beams
 
-Float = NDArray[np.float64]
 Estimator = Literal["stillmap", "paper", "hit-ratio", "tracker"]
 
-# iterations of those that do not follow a likelihood upwards: counting has nothing to iterate,
-# tracking is done once to register without people, and once more on those better poses
-_FIXED: dict[Estimator, int] = {"hit-ratio": 1, "tracker": 2}
+ESTIMATORS_3D: tuple[Estimator, ...] = ("stillmap", "paper")
 
+# Iterations of estimators without a likelihood: counting has nothing to iterate; tracking runs
+# once to register without people, and once more on those better poses.
+_FIXED_ITERATIONS: dict[Estimator, int] = {"hit-ratio": 1, "tracker": 2}
 
-ESTIMATORS_3D: tuple[Estimator, ...] = ("stillmap", "paper")  # those that know 3D recordings
+_LABEL_CHANGE = 0.1  # change of P(static) that counts in `changed_share`
 
 
 def initial_p_static(
     recording: Recording, estimator: Estimator, options: EmOptions
 ) -> NDArray[np.float32]:
-    """(M,) e := p(c = 1) for every beam: the start of Fig. 2. Mappers that count believe all."""
-    prior = 1.0 if estimator in _FIXED else options.prior
+    """(M,) e := p(c = 1) for every beam (start of Fig. 2); 1 for estimators that count."""
+    prior = 1.0 if estimator in _FIXED_ITERATIONS else options.prior
     e = recording.allocate_per_beam(np.float32)
     for block in iter_blocks(e):
         e[block] = prior
@@ -40,23 +39,23 @@ def initial_p_static(
 
 
 def max_iterations(estimator: Estimator, options: EmOptions) -> int:
-    """How often to iterate at most."""
+    """Maximum number of EM iterations."""
     return min(fixed_iterations(estimator) or options.max_iterations, options.max_iterations)
 
 
 def fixed_iterations(estimator: Estimator) -> int | None:
-    """How often estimators iterate of which the last iterate counts; None: the likelihood tells."""
-    return _FIXED.get(estimator)
+    """Number of iterations of estimators without a likelihood; None for the others."""
+    return _FIXED_ITERATIONS.get(estimator)
 
 
 def make_grid(dimension: int, resolution: float, approach: float = 0.0) -> Grid:
-    """A grid without any sums."""
+    """An empty grid."""
     kind = _core.OccupancyGrid2D if dimension == 2 else _core.OccupancyGrid3D
     return kind(resolution, approach)
 
 
 def needs_sums(dimension: int, estimator: Estimator) -> bool:
-    """Whether the M-step has to make the sums of (10): in 3D they are large."""
+    """Whether the M-step has to make the counts (10), which are large in 3D."""
     return dimension == 2 or estimator == "paper"
 
 
@@ -68,35 +67,45 @@ def e_step(
     options: EmOptions,
     threads: int = 1,
 ) -> EStepResult:
-    """What is static at these poses, and the likelihood of that."""
+    """Labels of all beams at given poses, and their likelihood.
+
+    Args:
+        recording: M beams.
+        poses: (T, D+1, D+1) T_map_base.
+        grid: counts (10); the occupancy HMM and the tracker need its resolution only.
+        estimator: how beams are labelled.
+        options: see EmOptions.
+        threads: does not change the result.
+
+    Raises:
+        ValueError: the estimator does not know 3D recordings.
+    """
     if estimator == "paper":
-        return paper_e_step(recording, poses, grid, options.prior, threads)
-    if estimator == "stillmap" and recording.dimension == 3:
-        return e_step_3d(recording, poses, grid.resolution, options, threads)
+        return beam_counting.paper_e_step(recording, poses, grid, options.prior, threads)
     if estimator == "stillmap":
-        return occupancy_hmm.e_step(recording, poses, grid.resolution, options, threads)
+        occupancy_e_step = (
+            occupancy_hmm.e_step if recording.dimension == 2 else occupancy_hmm.e_step_3d
+        )
+        return occupancy_e_step(recording, poses, grid.resolution, options, threads)
     if not isinstance(grid, _core.OccupancyGrid2D):
-        raise ValueError(f"estimator: {estimator} knows 2D recordings alone")
+        raise ValueError(f"estimator: {estimator} knows 2D recordings only")
     if estimator == "hit-ratio":
-        return hit_ratio_e_step(recording, poses, grid, options.hit_ratio, threads)
-    return _tracked(recording, poses, grid.resolution, options, threads)
+        return beam_counting.hit_ratio_e_step(recording, poses, grid, threads=threads)
+    return _tracker_e_step(recording, poses, grid.resolution, options, threads)
 
 
-def _tracked(
+def _tracker_e_step(
     recording: Recording, poses: Float, resolution: float, options: EmOptions, threads: int
 ) -> EStepResult:
-    """Hits on people who are tracked are dynamic, all others static; the map counts the others."""
-    people, e = (
-        label_people(recording, poses, options.tracker),
-        recording.allocate_per_beam(np.float32),
-    )
-    for _, beams, _ in iter_chunks(recording, release=[people, e]):
-        kept = (~people[beams]).astype(np.float32)
-        e[beams] = fill_beams(recording.points[beams], recording.hit[beams], kept, options.prior)
+    """Labels hits on tracked people dynamic, all others static; the map counts the others."""
+    on_people, e = label_people(recording, poses), recording.allocate_per_beam(np.float32)
+    for _, beams, _ in iter_chunks(recording, release=[on_people, e]):
+        labels = (~on_people[beams]).astype(np.float32)
+        e[beams] = fill_beams(recording.points[beams], recording.hit[beams], labels, options.prior)
     grid = _core.OccupancyGrid2D(resolution)
     add_recording(grid, recording, poses, e, threads)
     likelihood = log_likelihood(recording, poses, grid, e, options.prior, threads)
-    return EStepResult(e, likelihood, beam_counting.threshold_hit_ratio(grid, options.hit_ratio))
+    return EStepResult(e, likelihood, threshold_hit_ratio(grid, MIN_HIT_RATIO))
 
 
 def add_recording(
@@ -108,9 +117,15 @@ def add_recording(
     *,
     hits_only: bool = False,
 ) -> None:
-    """Adds the sums of (10) of all scans at given poses; e = None counts every hit as static.
+    """Adds the counts (10) of all scans to a grid.
 
-    With `hits_alone` beams without a return are left out.
+    Args:
+        grid: to add to.
+        recording: M beams.
+        poses: (T, D+1, D+1) T_map_base.
+        e: (M,) weights; None counts every hit as static.
+        threads: does not change the result.
+        hits_only: leaves out beams without a return.
     """
     T_map_sensor = recording.T_map_sensor(poses)
     for scans, beams, offset in iter_chunks(recording, release=[] if e is None else [e]):
@@ -124,7 +139,7 @@ def add_recording(
 def recount_as_static(
     grid: Grid, recording: Recording, poses: Float, e: NDArray[np.float32]
 ) -> None:
-    """Makes sums that were added with e those of every hit counted as static, to the bit."""
+    """Turns counts that were added with e into those with e = 1, to the bit."""
     T_map_sensor = recording.T_map_sensor(poses)
     for scans, beams, offset in iter_chunks(recording, release=[e]):
         points, hit, T = recording.points[beams], recording.hit[beams], T_map_sensor[scans]
@@ -140,9 +155,10 @@ def add_trusted_beams(
     no_return: NoReturnModel | None,
     threads: int = 1,
 ) -> ObservedCells | None:
-    """Adds the same sums as `add_recording` to an empty grid; says which cells beams tell of.
+    """Adds the same counts as `add_recording` to an empty grid, and finds the observed cells.
 
-    Beams without a return only count as far as they are believed; None where all of them are.
+    Beams without a return observe cells as far as `no_return` says. Returns None where they all
+    count at full length.
     """
     if no_return is None:
         add_recording(grid, recording, poses, e, threads)
@@ -162,18 +178,18 @@ def add_trusted_beams(
             no_return.end_margin,
             threads,
         )
-    first_cell, cells = grid.observed_mask()
+    first_cell, mask = grid.observed_mask()
     grid.merge(rest)
-    return ObservedCells(first_cell, cells.view(np.bool_))
+    return ObservedCells(first_cell, mask.view(np.bool_))
 
 
 def changed_share(
     before: NDArray[np.float32], after: NDArray[np.float32], hit: NDArray[np.bool_]
 ) -> float:
-    """Share of the hits whose e moved by more than 0.1 between two iterations."""
-    changed = hits = 0
+    """Share of the hits whose P(static) changed by more than 0.1 between two iterations."""
+    n_changed = n_hits = 0
     for block in iter_blocks(before, after, hit):
-        moved = np.abs(after[block] - before[block])[hit[block]] > 0.1
-        changed += int(np.count_nonzero(moved))
-        hits += int(np.count_nonzero(hit[block]))
-    return changed / max(hits, 1)
+        changed = np.abs(after[block] - before[block])[hit[block]] > _LABEL_CHANGE
+        n_changed += int(np.count_nonzero(changed))
+        n_hits += int(np.count_nonzero(hit[block]))
+    return n_changed / max(n_hits, 1)

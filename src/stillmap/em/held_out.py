@@ -1,6 +1,6 @@
-"""How good a map is, without truth: how well it foresees scans that it was not made from.
+"""Held-out score of a map: the likelihood of scans that it was not made from.
 
-`docs/quality.md` says what the figure means, and what it was found to be worth.
+`docs/quality.md` says what the score means and how it was validated.
 """
 
 import numpy as np
@@ -9,22 +9,20 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
+from stillmap.em.types import Float
 
-Float = NDArray[np.float64]
-
-# The same for every recording: rates and widths learned from it would excuse what is to be found
-# out, a blurred map above all.
+# The same for every recording: learned rates and widths would excuse a blurred map.
 BEAM_MODEL = {
-    "stopping_rate": 15.0,  # per metre, by what is surely static
-    "range_std": 0.1,  # m, of range and pose: less would see little but the poses' errors
-    "late_share": 0.6,  # share of beams that graze, or pass an edge, and end somewhere behind it
-    "mean_delay": 0.3,  # m, how far behind it on average
+    "stopping_rate": 15.0,  # per metre, of surely static cells
+    "range_std": 0.1,  # m, of range and pose: less would measure little but pose errors
+    "late_share": 0.6,  # of the beams that graze or pass an edge and end somewhere behind it
+    "mean_delay": 0.3,  # m, how far behind
     "outlier_share": 0.01,
 }
 
 
 def select_held_out_scans(n_scans: int, every: int) -> NDArray[np.bool_]:
-    """(T,) the scans that are left out: one in the middle of every `every` in a row; 0: none."""
+    """(T,) mask of held-out scans: the middle one of every `every`; 0: none."""
     if every == 0:
         return np.zeros(n_scans, dtype=np.bool_)
     return np.asarray(np.arange(n_scans) % every == every // 2, dtype=np.bool_)
@@ -38,41 +36,41 @@ def score_held_out_scans(
     every: int,
     threads: int = 1,
 ) -> float | None:
-    """Log likelihood of held-out ranges at the map that the other scans make, in nats per beam.
+    """Log likelihood of held-out ranges given the map of the other scans, in nats per beam.
 
     Args:
         recording: 2D or 3D.
         poses: (T, D+1, D+1) T_map_base.
         e: (M,) P(c = 1) of every beam.
-        resolution: m, edge of a cell.
-        every: one of so many scans is held out; 0: none.
-        threads: same result with any number.
+        resolution: edge of a cell, metres.
+        every: one scan in so many is held out; 0: none.
+        threads: does not change the result.
 
     Returns:
-        The mean over beams of ln p(z) - ln q(z); None where fewer than `every` scans or no usable
-        beams are there.
+        mean over beams of ln p(z) - ln q(z); None where there are fewer than `every` scans or no
+        usable beams.
 
-    With s_j the mean e of the other scans' hits in cell j, a beam meets what is static at h_j =
-    stopping_rate s_j per metre and what moves at lambda = sum (1 - e) / sum of lengths. The range
-    density of what it meets after the way r is H(r) = (h_j + lambda) exp(-integral of it up to r);
-    what is static is measured at z = r + noise, or at r + Exp(mean_delay). q is the density of a
-    world without a map, in which beams end at the same rate everywhere; a share `outlier_share` of
-    p is q. Both integrate to one over z, together with the probability that nothing stops the beam.
+    With s_j the mean e of the other scans' hits in cell j, static surface stops a beam at the rate
+    h_j = stopping_rate * s_j per metre, and movers at lambda = sum (1 - e) / sum of lengths. At
+    distance r the density of the stop is H(r) = (h_j + lambda) exp(-integral of it up to r); static
+    surface is measured at z = r + noise, or at r + Exp(mean_delay). q is the density of a world
+    without a map, in which beams end at the same rate everywhere; a share `outlier_share` of p is
+    q. Both integrate to one over z, together with the probability that nothing stops the beam.
     """
     if every == 0 or recording.n_scans < every:
         return None
-    held = select_held_out_scans(recording.n_scans, every)
+    held_out = select_held_out_scans(recording.n_scans, every)
     T_map_sensor = recording.T_map_sensor(poses)
     kind = _core.StaticFractionGrid2D if recording.dimension == 2 else _core.StaticFractionGrid3D
-    shares = kind(resolution)
+    fractions = kind(resolution)
     for scans, beams, offset in iter_chunks(recording, release=[e]):
         points, hit = recording.points[beams], recording.hit[beams]
-        shares.add(points, hit, e[beams], offset, T_map_sensor[scans], held[scans])
+        fractions.add(points, hit, e[beams], offset, T_map_sensor[scans], held_out[scans])
     gain, count = 0.0, 0.0
     for scans, beams, offset in iter_chunks(recording):
         points, hit = recording.points[beams], recording.hit[beams]
         per_scan = _core.score_held_out(
-            shares, points, hit, offset, T_map_sensor[scans], held[scans], threads=threads,
+            fractions, points, hit, offset, T_map_sensor[scans], held_out[scans], threads=threads,
             **BEAM_MODEL,
         )  # fmt: skip
         gain += float(per_scan[:, 0].sum())

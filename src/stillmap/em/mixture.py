@@ -1,25 +1,25 @@
-"""Shares of the classes of a mixture, by expectation maximisation."""
+"""Mixture weights of the HMM classes, fitted by expectation maximisation."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from stillmap.em.types import Float
 
-LEARN_FROM = 100_000  # members that shares are learned from: more change no digit that matters
-_PSEUDO = 1.0  # members that each class starts with, so that none is ever impossible
-_MOST_STATIC = 0.998  # a recording cannot show that nothing ever moves
+MAX_FIT_ROWS = 100_000  # rows that weights are fitted to: more change no digit that matters
+_PSEUDO_COUNT = 1.0  # per class, so that none becomes impossible
+_MAX_STATIC_WEIGHT = 0.998  # a recording cannot show that nothing ever moves
 
 
 @dataclass(frozen=True, eq=False)
 class MixtureWeights:
-    """What a mixture is made of.
+    """A fitted mixture.
 
     Attributes:
-        static: share of the static classes taken together.
-        classes: (C,) shares of all classes, static ones first; they sum to one.
-        log_likelihood: mean over the members, in nats.
+        static: total weight of the static classes.
+        classes: (C,) weights of all classes, static ones first; they sum to one.
+        log_likelihood: mean over the rows, in nats.
     """
 
     static: float
@@ -30,52 +30,66 @@ class MixtureWeights:
 def fit_weights(
     likelihood: NDArray[np.float32],
     n_static: int,
-    start: float,
-    iterations: int = 100,
+    initial_static: float,
+    max_iterations: int = 100,
     tolerance: float = 1e-6,
 ) -> MixtureWeights:
-    """Maximise sum_k ln sum_c share_c likelihood_kc over the shares.
+    """Maximises sum_k ln sum_c w_c L_kc over the weights w.
 
     Args:
-        likelihood: (K, C), each row relative to its best class.
-        n_static: the first so many classes are static.
-        start: share of the static classes to begin with.
-        iterations: at most.
-        tolerance: nats per member: stops when an iteration gains less.
+        likelihood: (K, C) L, each row relative to its best class.
+        n_static: number of static classes, which come first.
+        initial_static: total weight of the static classes to start from.
+        max_iterations: of EM.
+        tolerance: nats per row; stops when an iteration gains less.
 
-    Sums are those of NumPy's own loops, not of a linear algebra library that would split them
-    among threads: the result does not depend on the machine's number of processors.
+    Sums use NumPy's own loops, not a linear algebra library that would split them among threads:
+    the result does not depend on the number of processors.
     """
     K, C = likelihood.shape
-    rows = likelihood[:: max(-(-K // LEARN_FROM), 1)].astype(np.float64)
-    shares = np.empty(C)
-    shares[:n_static] = start / n_static
-    shares[n_static:] = (1.0 - start) / (C - n_static)
+    rows = likelihood[:: max(-(-K // MAX_FIT_ROWS), 1)].astype(np.float64)
+    weights = np.empty(C)
+    weights[:n_static] = initial_static / n_static
+    weights[n_static:] = (1.0 - initial_static) / (C - n_static)
     last = -np.inf
-    for _ in range(iterations):
-        evidence = np.einsum("kc,c->k", rows, shares)
-        now = float(np.sum(np.log(evidence))) / max(len(rows), 1)
-        counts = shares * np.einsum("kc,k->c", rows, 1.0 / evidence)  # expected members per class
-        shares = _normalised(counts, n_static, start)
-        if now - last < tolerance:
+    for _ in range(max_iterations):
+        evidence = np.einsum("kc,c->k", rows, weights)
+        log_likelihood = float(np.sum(np.log(evidence))) / max(len(rows), 1)
+        counts = weights * np.einsum("kc,k->c", rows, 1.0 / evidence)  # expected rows per class
+        weights = _normalize(counts, n_static, initial_static)
+        if log_likelihood - last < tolerance:
             break
-        last = now
-    return MixtureWeights(float(shares[:n_static].sum()), shares, now)
+        last = log_likelihood
+    return MixtureWeights(float(weights[:n_static].sum()), weights, log_likelihood)
 
 
-def _normalised(counts: Float, n_static: int, start: float) -> Float:
-    static, movers = counts[:n_static] + _PSEUDO, counts[n_static:] + _PSEUDO
+def _normalize(counts: Float, n_static: int, initial_static: float) -> Float:
+    static, dynamic = counts[:n_static] + _PSEUDO_COUNT, counts[n_static:] + _PSEUDO_COUNT
     total = counts.sum()
-    share = counts[:n_static].sum() / total if total > 0.0 else start
-    share = float(np.clip(share, 1.0 - _MOST_STATIC, _MOST_STATIC))
-    return np.concatenate([share * static / static.sum(), (1.0 - share) * movers / movers.sum()])
+    weight = counts[:n_static].sum() / total if total > 0.0 else initial_static
+    weight = float(np.clip(weight, 1.0 - _MAX_STATIC_WEIGHT, _MAX_STATIC_WEIGHT))
+    return np.concatenate(
+        [weight * static / static.sum(), (1.0 - weight) * dynamic / dynamic.sum()]
+    )
 
 
 def posterior_static(
-    likelihood: NDArray[np.float32], shares: Float, n_static: int
+    likelihood: NDArray[np.float32], weights: Float, n_static: int
 ) -> NDArray[np.float32]:
-    """(K,) probability that each member belongs to one of the static classes."""
-    weights = shares.astype(np.float32)
-    static = np.einsum("kc,c->k", likelihood[:, :n_static], weights[:n_static])
-    movers = np.einsum("kc,c->k", likelihood[:, n_static:], weights[n_static:])
-    return np.asarray(static / (static + movers), dtype=np.float32)
+    """(K,) responsibility of the static classes for each row (K, C)."""
+    w = weights.astype(np.float32)
+    static = np.einsum("kc,c->k", likelihood[:, :n_static], w[:n_static])
+    dynamic = np.einsum("kc,c->k", likelihood[:, n_static:], w[n_static:])
+    return np.asarray(static / (static + dynamic), dtype=np.float32)
+
+
+def posterior(
+    likelihood: NDArray[np.float32], weights: Float, among: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """(K,) responsibility of some classes (C,) for each row (K, C)."""
+    w = weights.astype(np.float32)
+    inside, outside = (
+        np.einsum("kc,c->k", likelihood, np.where(some, w, np.float32(0.0)))
+        for some in (among, ~among)
+    )
+    return np.asarray(inside / (inside + outside), np.float32)

@@ -217,7 +217,7 @@ def _beam_labels(
 ) -> NDArray[np.float32]:
     """(M,) P(static) of the surfel (E,) in which each beam ended."""
     with_prior = np.append(p_static, np.float32(prior))  # surfel -1: none
-    e = recording.per_beam(np.float32)
+    e = recording.allocate_per_beam(np.float32)
     T_map_sensor = recording.T_map_sensor(poses)
     for scans, beams, offset in iter_chunks(recording, release=[e]):
         points, hit, T = recording.points[beams], recording.hit[beams], T_map_sensor[scans]

@@ -1,12 +1,10 @@
-"""Things are larger than a voxel: what is beside an element tells of it. See `docs/space.md`.
+"""Spatial coupling of surfels in 3D: mean field, cluster pooling and ground contact.
 
-What stands apart from all else moves as a whole, or stands still. See `docs/space.md`.
-
-Which cells belong together.
+Objects are larger than a voxel, so neighbouring voxels and the clusters of a sweep are labelled
+together. `docs/estimator/spatial.md` has the equations.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are first used
@@ -15,214 +13,209 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
-from stillmap.em.observations import (
-    Float,
-    SurfelMap,
-    iter_surfel_rows,
-)
-from stillmap.em.options import BesideOptions, BodyOptions
-from stillmap.em.types import GroundMap
+from stillmap.em.observations import SurfelMap, iter_surfel_rows
+from stillmap.em.types import MIN_PROBABILITY, Float, GroundMap
 
 Index = NDArray[np.intp]
 
-_CERTAIN = 1e-6
+_MEAN_FIELD = {
+    "radius": 2.5,  # voxels
+    "coplanar_std": 0.2,  # voxels, of a mean from the plane of a neighbour
+    "static_coupling": 5.0,  # nats if all neighbours are static
+    "dynamic_coupling": 10.0,  # nats if all are dynamic
+    "min_log_odds": -4.0,  # of a surfel's own observations
+    "max_log_odds": 3.0,  # the same: ten seconds of hits in a row are a wall or somebody who waits
+    "tolerance": 0.1,  # change of a probability that neighbours are told
+    "max_iterations": 10,
+}
+
+_MIN_CLUSTER_HEIGHT, _MAX_CLUSTER_HEIGHT = 0.2, 3.0  # m above the ground, of obstacles
+_COLUMN = 0.3  # m, edge of the columns that touch within a cluster, rounded to voxels
+_MIN_CLUSTER_SURFELS = 5  # in a sweep
+_POOLED_P_DYNAMIC = 0.3  # mean P(dynamic) above which a whole cluster is dynamic
+_POOLED_CHANGE = 1.0  # nats, mean evidence of a change above which it is
+_POOLING_SLOPE = 20.0  # nats per unit above these two
+_MAX_POOLED = 4.0  # nats
+_GROUND_CLEARANCE = 0.05  # m, and this many noise_std, below which end points are ground:
+_CLEARANCE_STD = 2.5
 
 
 def smooth_mean_field(
-    p_static: NDArray[np.float32], surface: SurfelMap, options: BesideOptions, threads: int = 1
+    p_static: NDArray[np.float32], surfel_map: SurfelMap, threads: int = 1
 ) -> NDArray[np.float32]:
-    """(E,) P(static) by the looks at each element alone (E,) and by the elements beside it.
+    """(E,) P(static) of each surfel given its own observations and its neighbours.
 
     Args:
-        p_static: (E,) by the looks alone.
-        surface: the elements, in space; it knows the looks of its end points.
-        options: see BesideOptions.
-        threads: same result with any number.
+        p_static: (E,) given each surfel's own observations.
+        surfel_map: E surfels in 3D, with the time bins of their end points.
+        threads: does not change the result.
+
+    Mean field of a Potts model:
+    log odds_i = clip(o_i, -4, 3) + (5 S_i - 10 M_i) / (1 + W_i).
     """
-    if not options.enabled:
-        return p_static
-    if not isinstance(surface, _core.SurfelMap3D):
-        raise TypeError("surface: expected one in space")
-    p = np.clip(p_static, _CERTAIN, 1.0 - _CERTAIN)
+    p = np.clip(p_static, MIN_PROBABILITY, 1.0 - MIN_PROBABILITY)
     log_odds = np.log(p / (1.0 - p)).astype(np.float32)
-    return _core.smooth_mean_field(surface, log_odds, **arguments(options), threads=threads)
+    return _core.smooth_mean_field(
+        _require_3d(surfel_map),
+        log_odds,
+        **_MEAN_FIELD,  # type: ignore[arg-type]
+        threads=threads,
+    )
 
 
-def arguments(options: BesideOptions) -> dict[str, Any]:
-    """Keyword arguments of `_core.smooth_mean_field`."""
-    return {
-        "radius": options.radius,
-        "coplanar_std": options.coplanar,
-        "static_coupling": options.for_static,
-        "dynamic_coupling": options.for_dynamic,
-        "min_log_odds": options.least,
-        "max_log_odds": options.most,
-        "tolerance": options.moved,
-        "max_iterations": options.rounds,
-    }
-
-
-_SCATTERS = 2.5  # of end points about their surface, within which a beam ended on it
+def _require_3d(surfel_map: SurfelMap) -> _core.SurfelMap3D:
+    if not isinstance(surfel_map, _core.SurfelMap3D):
+        raise TypeError("surfel_map: expected a 3D one")
+    return surfel_map
 
 
 @dataclass(frozen=True, eq=False)
 class ObstacleSurfels:
-    """Which of E elements are of what stands on the ground.
+    """Surfels above the ground.
 
     Attributes:
-        surface: the elements, in space.
-        stands: (E,) bool.
-        ground: (E,) float32 metres, height of the ground below each.
-        column: cells, edge of the columns over the ground that touch within a body.
+        surfel_map: E surfels in 3D.
+        is_obstacle: (E,) bool, 0.2 to 3 m above the ground.
+        ground_height: (E,) float32 metres, of the ground below each surfel.
+        column_cells: voxels, edge of the columns that touch within a cluster.
     """
 
-    surface: _core.SurfelMap3D
-    stands: NDArray[np.bool_]
-    ground: NDArray[np.float32]
-    column: int
+    surfel_map: _core.SurfelMap3D
+    is_obstacle: NDArray[np.bool_]
+    ground_height: NDArray[np.float32]
+    column_cells: int
 
 
-def select_obstacles(
-    ground: GroundMap, surface: SurfelMap, options: BodyOptions
-) -> ObstacleSurfels | None:
-    """What stands on the ground; None where none was seen, and nobody knows, or wants to."""
-    if not (options.enabled and ground.observed):
+def select_obstacles(ground: GroundMap, surfel_map: SurfelMap) -> ObstacleSurfels | None:
+    """The surfels of obstacles on the ground; None where no ground was observed."""
+    if not ground.observed:
         return None
-    if not isinstance(surface, _core.SurfelMap3D):
-        raise TypeError("surface: expected one in space")
-    stands, height = np.empty(surface.size, np.bool_), np.empty(surface.size, np.float32)
-    for rows in iter_surfel_rows(surface):
-        means = surface.surfels(rows)[1]
+    surfels = _require_3d(surfel_map)
+    is_obstacle = np.empty(surfels.size, np.bool_)
+    ground_height = np.empty(surfels.size, np.float32)
+    for rows in iter_surfel_rows(surfels):
+        means = surfels.surfels(rows)[1]
         below = ground.height_at(means[:, :2])
         above = means[:, 2] - below
-        stands[slice(*rows)] = (above > options.low) & (above < options.high)
-        height[slice(*rows)] = below
-    column = max(1, round(options.column / surface.resolution))
-    return ObstacleSurfels(surface, stands, height, column)
+        is_obstacle[slice(*rows)] = (above > _MIN_CLUSTER_HEIGHT) & (above < _MAX_CLUSTER_HEIGHT)
+        ground_height[slice(*rows)] = below
+    column_cells = max(1, round(_COLUMN / surfels.resolution))
+    return ObstacleSurfels(surfels, is_obstacle, ground_height, column_cells)
 
 
 def pool_clusters(
     p_static: NDArray[np.float32],
     change: NDArray[np.float32],
-    standing: ObstacleSurfels | None,
+    obstacles: ObstacleSurfels,
     recording: Recording,
     T_map_sensor: Float,
-    options: BodyOptions,
     threads: int = 1,
 ) -> NDArray[np.float32]:
-    """(E,) P(static), lowered for elements of bodies that move, or came or left.
+    """(E,) P(static), lowered for surfels of clusters that move, arrived or left.
 
     Args:
-        p_static: (E,) by what is known of each element and of those right beside it.
-        change: (E,) nats by which the looks at it say that a thing came or left; see `Told`.
-        standing: what stands on the ground.
-        recording: 3D, M beams without motion during its scans.
+        p_static: (E,) after `smooth_mean_field`.
+        change: (E,) nats, log likelihood ratio of changed to static; see `CellLabels`.
+        obstacles: the surfels that form clusters.
+        recording: 3D, M beams, deskewed.
         T_map_sensor: (T, 4, 4).
-        options: see BodyOptions.
-        threads: same result with any number.
+        threads: does not change the result.
     """
-    if standing is None:
-        return p_static
-    bodies = _core.ClusterPooling3D(
-        standing.surface,
-        standing.stands,
+    pooling = _core.ClusterPooling3D(
+        obstacles.surfel_map,
+        obstacles.is_obstacle,
         np.stack([1.0 - p_static, change], axis=1),
-        column_cells=standing.column,
-        min_surfels=options.fewest,
+        column_cells=obstacles.column_cells,
+        min_surfels=_MIN_CLUSTER_SURFELS,
     )
     for scans, beams, offset in iter_chunks(recording):
         points, hit = recording.points[beams], recording.hit[beams]
-        bodies.add(points, hit, offset, T_map_sensor[scans], threads)
-    return apply_pooled_evidence(p_static, bodies.means(), options)
+        pooling.add(points, hit, offset, T_map_sensor[scans], threads)
+    return apply_pooled_evidence(p_static, pooling.means())
 
 
 def apply_pooled_evidence(
-    p_static: NDArray[np.float32], means: NDArray[np.float32], options: BodyOptions
+    p_static: NDArray[np.float32], means: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(E,) lowered to log odds of slope (least - mean), -most at least, where that is negative.
+    """(E,) log odds = min(own, -min(20 max(a - 0.3, b - 1), 4)).
 
     Args:
-        p_static: (E,).
-        means: (E, 2) of the bodies around each: probability to move, nats for a change; NaN: of
-            none.
-        options: `share` and `change` are the least values of these that tell.
+        p_static: (E,) own.
+        means: (E, 2) a and b of each surfel's clusters: mean P(dynamic), and mean evidence of a
+            change in nats; NaN where it is in no cluster.
     """
-    above = np.nan_to_num(means - np.array([options.share, options.change], np.float32), nan=-1.0)
-    nats = np.minimum(options.slope * above.max(axis=1), options.most)
+    above = np.nan_to_num(
+        means - np.array([_POOLED_P_DYNAMIC, _POOLED_CHANGE], np.float32), nan=-1.0
+    )
+    nats = np.minimum(_POOLING_SLOPE * above.max(axis=1), _MAX_POOLED)
     lower = np.where(nats > 0.0, 1.0 / (1.0 + np.exp(nats)), 1.0)
     return np.minimum(p_static, lower.astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
 class GroundContact:
-    """Asks of beams that end on the ground whether they met the feet of something that moves.
+    """Labels beams that end just above the ground by what moves in the same column.
 
     Attributes:
-        standing: what stands on the ground.
-        p_static: (E,) of each element.
-        low: m above the ground up to where an element's mean is the ground's.
-        least: m above the ground from where on a beam did not end on it.
+        obstacles: the surfels above the ground.
+        p_static: (E,) of each surfel.
+        min_end_height: metres above the ground from which on a beam did not end on it.
     """
 
-    standing: ObstacleSurfels
+    obstacles: ObstacleSurfels
     p_static: NDArray[np.float32]
-    low: float
-    least: float
+    min_end_height: float
 
-    def of(
+    def label_above(
         self,
         points: NDArray[np.float32],
         hit: NDArray[np.bool_],
         offset: NDArray[np.int64],
         T_map_sensor: Float,
-        element: NDArray[np.int32],
+        surfel: NDArray[np.int32],
         threads: int = 1,
     ) -> NDArray[np.float32]:
-        """(M,) P(static) of what moves over the end of each beam in its sweep; NaN: nothing does.
+        """(M,) P(static) of what moves above the end of each beam in its sweep; NaN: nothing.
 
         Args:
             points, hit, offset, T_map_sensor: M beams of some scans.
-            element: (M,) in which each ended, -1: none.
-            threads: same result with any number.
+            surfel: (M,) in which each ended, -1: none.
+            threads: does not change the result.
         """
         return _core.relabel_ground_contact(
-            self.standing.surface,
+            self.obstacles.surfel_map,
             points,
             hit,
             offset,
             T_map_sensor,
-            element,
-            is_obstacle=self.standing.stands,
+            surfel,
+            is_obstacle=self.obstacles.is_obstacle,
             p_static=self.p_static,
-            ground_height=self.standing.ground,
-            column_cells=self.standing.column,
-            max_ground_height=self.low,
-            min_end_height=self.least,
+            ground_height=self.obstacles.ground_height,
+            column_cells=self.obstacles.column_cells,
+            max_ground_height=_MIN_CLUSTER_HEIGHT,
+            min_end_height=self.min_end_height,
             threads=threads,
         )
 
 
-def make_ground_contact(
-    standing: ObstacleSurfels | None, p_static: NDArray[np.float32], options: BodyOptions
-) -> GroundContact | None:
-    """Feet, as far as end points that scatter can tell them from the ground."""
-    if standing is None:
-        return None
-    least = max(options.foot, _SCATTERS * standing.surface.noise_std)
-    return GroundContact(standing, p_static, options.low, least)
+def make_ground_contact(obstacles: ObstacleSurfels, p_static: NDArray[np.float32]) -> GroundContact:
+    """Ground contact of obstacles, with the clearance that the noise of end points allows."""
+    min_end_height = max(_GROUND_CLEARANCE, _CLEARANCE_STD * obstacles.surfel_map.noise_std)
+    return GroundContact(obstacles, p_static, min_end_height)
 
 
-def neighbor_pairs(cells: NDArray[np.int64], distance: float) -> Index:
-    """(P, 2) which of the cells (K, D) lie within a distance of each other, in cells."""
+def neighbor_pairs(cells: NDArray[np.int64], max_distance: float) -> Index:
+    """(P, 2) pairs of cells (K, D) within a distance of each other, in cells."""
     if not len(cells):
         return np.empty((0, 2), np.intp)
     return np.asarray(
-        scipy.spatial.cKDTree(cells).query_pairs(distance, output_type="ndarray"), np.intp
+        scipy.spatial.cKDTree(cells).query_pairs(max_distance, output_type="ndarray"), np.intp
     )
 
 
 def connected_components(pairs: Index, n: int) -> list[Index]:
-    """The members, rising, of every set of 0 to n - 1 that the pairs (P, 2) connect."""
+    """Members, rising, of each connected component of a graph of n nodes with edges (P, 2)."""
     if n == 0:
         return []
     graph = scipy.sparse.coo_array(

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.arrays import finite
+from stillmap.core.arrays import finite_rows
 
 Float = NDArray[np.float64]
 
@@ -137,5 +137,5 @@ def fill_beams(
 ) -> NDArray[np.float32]:
     """(M,) `values` for hits, the prior for maximum-range beams, NaN for unusable ones."""
     e = np.where(hit, values, np.float32(prior)).astype(np.float32, copy=False)
-    e[~finite(points)] = np.nan
+    e[~finite_rows(points)] = np.nan
     return e

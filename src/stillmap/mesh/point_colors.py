@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from stillmap.core import arrays
 from stillmap.core.camera import project
+from stillmap.core.chunks import Chunk, iter_chunks
 from stillmap.core.parallel import map_ordered
-from stillmap.em.observations import Chunk, iter_chunks
 from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
 from stillmap.mesh.background import Background
 from stillmap.mesh.inputs import MeshInputs

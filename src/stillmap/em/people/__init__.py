@@ -1,10 +1,9 @@
-"""People found as features and tracked, and the beams on them: the method before the paper's.
+"""People tracked in 2D scans, and the beams on them: a baseline.
 
 After D. Haehnel, D. Schulz, W. Burgard, *Map Building with Mobile Robots in Populated
-Environments*, IROS 2002; docs/tracker.md says what is theirs and what is simpler here.
+Environments*, IROS 2002; docs/tracker.md lists what is simpler here.
 """
 
-from stillmap.em.options import TrackerOptions
 from stillmap.em.people.tracker import label_people
 
-__all__ = ["TrackerOptions", "label_people"]
+__all__ = ["label_people"]
