@@ -249,7 +249,7 @@ def test_records_of_other_pictures_are_refused(result, simulated, capsys) -> Non
     arrays["T_camera_map"] = arrays["T_camera_map"][:1]
     np.savez(result / "mesh_faces.npz", **arrays)
     assert main(["eval", "model", str(result), str(simulated)]) == 2
-    assert "speaks of 1 pictures" in capsys.readouterr().err
+    assert "has 1 images" in capsys.readouterr().err
 
 
 def test_a_simulation_without_cameras_is_refused(result, simulated, capsys) -> None:

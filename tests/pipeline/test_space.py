@@ -15,7 +15,7 @@ from stillmap.cli.main import main
 from stillmap.core.recording import Recording
 from stillmap.io.trajectory import read_tum
 from stillmap.pipeline.options import Options
-from stillmap.results.report.tables import learned_section
+from stillmap.results.report.page import render_report
 from stillmap.sim import scene_by_name, simulate
 from stillmap.sim.writer import write_simulation
 
@@ -98,11 +98,15 @@ def test_what_was_learned_is_of_all_classes(street, mapped):
     assert 0.0 < mapped.learned["changing"] < 0.2
     missed = ~recording.hit & np.isfinite(mapped.p_static)
     assert mapped.p_static[missed] == pytest.approx(mapped.learned["p_static"])
-    said = learned_section(mapped)
-    assert f"{100 * mapped.learned['p_static']:.1f} % hold something that stands still" in said
-    assert "came to stay or left, which counts as moving" in said
+    report = render_report(mapped)
+    assert (
+        f"{100 * mapped.learned['p_static']:.1f} % of the cells in which beams ended are static"
+        in report
+    )
+    assert "put down or taken away" in " ".join(report.split())
     unasked = {k: v for k, v in mapped.learned.items() if k != "changing"}
-    assert "came to stay" not in learned_section(dataclasses.replace(mapped, learned=unasked))
+    estimate = mapped.estimate.with_labels(learned=unasked)
+    assert "put down" not in render_report(dataclasses.replace(mapped, estimate=estimate))
 
 
 @pytest.mark.parametrize("threads", [2, 3])
@@ -161,7 +165,7 @@ def test_labels_in_space_are_scored_and_plans_are_not(street, mapped, tmp_path, 
     assert scores["dynamic"] == moving.sum()
     assert scores["recall"] == pytest.approx((mapped.p_static[moving] < 0.5).mean(), abs=1e-6)
     assert main(["eval", "map", *words]) == 2
-    assert "is no planar recording" in capsys.readouterr().err
+    assert "is not a planar recording" in capsys.readouterr().err
 
 
 def test_other_estimators_of_the_plane_are_refused(street):

@@ -1,1 +1,1 @@
-"""Scores of trajectories, labels and maps: they read arrays; `files` and `folders` read files."""
+"""Scores of trajectories, labels, maps, objects and models against truth."""

@@ -1,4 +1,4 @@
-"""Scores of what a map says of things that were moved, brought or taken away while it was made."""
+"""Scores of a map with objects that were moved, brought or taken away during the recording."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,21 +15,21 @@ from stillmap.results.reader import Grid, moved
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-LOOK = 3  # beams of a scan on a thing, or through its place: less is not looking at it
-AGAIN = 3  # scans that must have seen through a cell for its state to be known
-NEAR = 0.5  # m from a thing, within which a change is taken for that of the thing
+MIN_BEAMS = 3  # of a scan on an object, or through its place: an observation
+MIN_PASSES = 3  # scans with a beam through a cell that show it to be free
+MAX_DISTANCE = 0.5  # m between a detected change and its object
 
 
 @dataclass(frozen=True, eq=False)
 class Stay:
-    """A thing at one of its places, in the world.
+    """An object at rest at one place, in the world.
 
     Attributes:
         mover: its number.
         middle: (2,) metres.
         faces: (K, 4) segments x0, y0, x1, y1 in metres.
-        since_ns: when it came; None: it was there before.
-        until_ns: when it was gone; None: never.
+        since_ns: arrival; None: before the recording.
+        until_ns: departure; None: never.
     """
 
     mover: int
@@ -39,7 +39,7 @@ class Stay:
     until_ns: int | None
 
     def contains(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(N,) whether it stands there at stamps (N,)."""
+        """(N,) whether the object is there at stamps (N,)."""
         since = -np.inf if self.since_ns is None else self.since_ns
         until = np.inf if self.until_ns is None else self.until_ns
         return np.asarray((stamp_ns >= since) & (stamp_ns < until))
@@ -51,7 +51,7 @@ class Beams:
 
     Attributes:
         start, end: (M, 2) metres in the world.
-        mover: (M,) number of what reflected each, -1: nothing that moves.
+        mover: (M,) number of the mover that reflected each, -1: none.
         scan: (M,) rising.
         stamp_ns: (T,) of the scans.
     """
@@ -63,11 +63,11 @@ class Beams:
     stamp_ns: NDArray[np.int64]
 
     def hits_on(self, stay: Stay) -> Index:
-        """The beams that a thing reflected during a stay."""
+        """Beams that the object reflected during a stay."""
         return np.flatnonzero((self.mover == stay.mover) & stay.contains(self.stamp_ns)[self.scan])
 
     def near(self, point: Float, distance: float) -> Index:
-        """The beams that come as near as that to a point (2,), metres."""
+        """Beams that pass a point (2,) within `distance` metres."""
         along = self.end - self.start
         length = np.maximum(np.sum(along**2, axis=1), np.finfo(float).tiny)
         share = np.clip(np.sum((point - self.start) * along, axis=1) / length, 0.0, 1.0)
@@ -80,10 +80,10 @@ class ChangeScores(Scores):
     """NaN where there is no cell.
 
     Attributes:
-        new_cells: cells that show what was brought and is still there: hit MIN_HITS times.
-        new_kept: share of these with an occupied cell among themselves and their 8 neighbours.
-        old_cells: cells that showed what was taken away, far from walls and all that is still
-            there, and seen through again in AGAIN scans.
+        new_cells: cells with MIN_HITS hits on objects that were brought and are still there.
+        new_kept: share of these that are occupied, or one of whose 8 neighbours is.
+        old_cells: cells of objects taken away, far from walls and all objects still there, that
+            beams of MIN_PASSES scans passed through afterwards.
         old_occupied: share of these that are occupied.
     """
 
@@ -94,7 +94,7 @@ class ChangeScores(Scores):
 
 
 class DetectedChange(Protocol):
-    """A change that was found: where, in metres of the map frame, what, and when."""
+    """A detected change: position in the map frame in metres, kind and time."""
 
     @property
     def x(self) -> float: ...
@@ -108,7 +108,7 @@ class DetectedChange(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class TrueChange:
-    """A thing that came or went.
+    """An arrival or departure.
 
     Attributes:
         stay: the stay that began or ended.
@@ -126,15 +126,15 @@ class TrueChange:
 
 @dataclass(frozen=True)
 class ChangeTimes(Scores):
-    """How well changes were found that could be.
+    """Scores of detected changes.
 
     Attributes:
-        seen: true changes whose place was looked at before and afterwards.
-        found: of these, how many have a found change of their kind within NEAR of the thing.
+        seen: true changes whose place was observed before and after.
+        found: those with a detected change of their kind within MAX_DISTANCE of the object.
         missed: all others.
-        false: found changes near no true one of their kind, seen or not.
-        errors: s, one for each of `found`: how far the stamp is from the time between the change
-            and the first look afterwards.
+        false: detected changes without a true one of their kind, seen or not, nearby.
+        errors: s, one per `found`: distance of the stamp from the interval between the change and
+            the first observation afterwards.
     """
 
     seen: int
@@ -147,20 +147,20 @@ class ChangeTimes(Scores):
 def score_changes(
     grid: Grid, stays: Sequence[Stay], beams: Beams, walls: Float, T_world_map: Float
 ) -> ChangeScores:
-    """Score a map that shall show what is there at the end.
+    """Score a map that shows the last state.
 
     Args:
         grid: the map.
-        stays: all stays of things that change.
+        stays: all stays of movable objects.
         beams: of the whole recording.
-        walls: (W, 4) segments in the world, of what never changes.
+        walls: (W, 4) segments of the static world.
         T_world_map: (3, 3), see `trajectory.align`.
     """
     T_map_world = inverse(T_world_map)
     lasting = [stay for stay in stays if stay.contains(beams.stamp_ns[-1:])[0]]
     ended = [stay for stay in stays if not stay.contains(beams.stamp_ns[-1:])[0]]
     shown = [_cells(grid, beams.end[beams.hits_on(stay)], T_map_world) for stay in lasting]
-    left = [_left_cells(grid, stay, beams, T_world_map) for stay in ended]
+    left = [_vacated_cells(grid, stay, beams, T_world_map) for stay in ended]
     new, old = _union(shown), _union(left)
     solid = np.concatenate([walls, *(stay.faces for stay in lasting)])
     centres = moved(T_world_map, grid.centres(old))
@@ -174,11 +174,14 @@ def score_changes(
 
 
 def list_true_changes(stays: Iterable[Stay], beams: Beams) -> list[TrueChange]:
-    """Every beginning and end of a stay within the recording, in no order."""
+    """List every begin and end of a stay within the recording, in no order."""
     first, last = beams.stamp_ns[[0, -1]].tolist()
     changes = []
     for stay in stays:
-        on, through = _looks(beams.hits_on(stay), beams), _looks(_through(stay, beams), beams)
+        on, through = (
+            _observation_stamps(beams.hits_on(stay), beams),
+            _observation_stamps(_beams_through(stay, beams), beams),
+        )
         for stamp, before, after in ((stay.since_ns, through, on), (stay.until_ns, on, through)):
             if stamp is not None and first < stamp <= last:
                 later = after[after >= stamp]
@@ -191,13 +194,13 @@ def list_true_changes(stays: Iterable[Stay], beams: Beams) -> list[TrueChange]:
 def score_change_times(
     changes: Sequence[DetectedChange], true: Sequence[TrueChange], T_world_map: Float
 ) -> ChangeTimes:
-    """Compare changes that were found with true ones: each of these with the nearest of its kind.
+    """Compare each true change with the nearest detected one of its kind.
 
-    One that was found may stand for several things side by side, and several for one large thing.
+    One detected change may match several objects side by side, and several one large object.
 
     Args:
-        changes: what was found.
-        true: from `true_changes`.
+        changes: detected changes.
+        true: from `list_true_changes`.
         T_world_map: (3, 3), see `trajectory.align`.
     """
     xy = moved(T_world_map, np.array([(c.x, c.y) for c in changes], float).reshape(-1, 2))
@@ -205,8 +208,8 @@ def score_change_times(
     errors, known = [], np.zeros(len(changes), bool)
     for one in true:
         distance = np.where(appeared == one.appeared, _distance(xy, one.stay), np.inf)
-        known |= distance <= NEAR
-        if one.observed_ns is not None and distance.min(initial=np.inf) <= NEAR:
+        known |= distance <= MAX_DISTANCE
+        if one.observed_ns is not None and distance.min(initial=np.inf) <= MAX_DISTANCE:
             stamp = changes[int(distance.argmin())].stamp_ns
             errors.append(1e-9 * max(one.stamp_ns - stamp, stamp - one.observed_ns, 0))
     seen = sum(one.observed_ns is not None for one in true)
@@ -220,27 +223,27 @@ def score_change_times(
 
 
 def _cells(grid: Grid, points: Float, T_map_world: Float) -> NDArray[np.int64]:
-    """(N, 2) row and column of the cells that hold MIN_HITS of the points."""
+    """(N, 2) row and column of the cells with MIN_HITS of the points."""
     cells, count = np.unique(grid.cells(moved(T_map_world, points)), axis=0, return_counts=True)
     return np.asarray(cells[count >= MIN_HITS].reshape(-1, 2))
 
 
-def _left_cells(grid: Grid, stay: Stay, beams: Beams, T_world_map: Float) -> NDArray[np.int64]:
-    """The cells of a stay that ended, as far as enough scans saw through them afterwards."""
+def _vacated_cells(grid: Grid, stay: Stay, beams: Beams, T_world_map: Float) -> NDArray[np.int64]:
+    """Cells of a stay that ended that MIN_PASSES scans passed through afterwards."""
     cells = _cells(grid, beams.end[beams.hits_on(stay)], inverse(T_world_map))
     near = beams.near(stay.center, _radius(stay) + 2 * grid.resolution)
     near = near[beams.stamp_ns[beams.scan[near]] >= (stay.until_ns or 0)]
     start, along = beams.start[near], beams.end[near] - beams.start[near]
     length = np.maximum(np.hypot(*along.T), np.finfo(float).tiny)
     along = along / length[:, None]
-    again = np.zeros(len(cells), bool)
+    passed = np.zeros(len(cells), bool)
     for k, centre in enumerate(moved(T_world_map, grid.centres(cells))):
         delta = centre - start
         ahead = np.sum(delta * along, axis=1)
         off = np.abs(along[:, 0] * delta[:, 1] - along[:, 1] * delta[:, 0])
         through = (off < grid.resolution / 2) & (ahead > 0) & (ahead < length - grid.resolution)
-        again[k] = len(np.unique(beams.scan[near[through]])) >= AGAIN
-    return cells[again]
+        passed[k] = len(np.unique(beams.scan[near[through]])) >= MIN_PASSES
+    return cells[passed]
 
 
 def _union(cells: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
@@ -254,8 +257,8 @@ def _occupied(grid: Grid, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     return out
 
 
-def _through(stay: Stay, beams: Beams) -> Index:
-    """The beams that go through the faces of a thing while it is not there."""
+def _beams_through(stay: Stay, beams: Beams) -> Index:
+    """Beams that cross the faces of an object while it is not there."""
     near = beams.near(stay.center, _radius(stay))
     near = near[~stay.contains(beams.stamp_ns[beams.scan[near]])]
     a, b = beams.start[near], beams.end[near]
@@ -272,18 +275,19 @@ def _side(a: Float, b: Float, c: Float) -> Float:
     return np.asarray(along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0])
 
 
-def _looks(some: Index, beams: Beams) -> NDArray[np.int64]:
-    """Stamps, rising, of the scans with LOOK of the beams `some`."""
+def _observation_stamps(some: Index, beams: Beams) -> NDArray[np.int64]:
+    """Stamps, rising, of the scans with MIN_BEAMS of the beams `some`."""
     scan, count = np.unique(beams.scan[some], return_counts=True)
-    return np.asarray(np.sort(beams.stamp_ns[scan[count >= LOOK]]))
+    return np.asarray(np.sort(beams.stamp_ns[scan[count >= MIN_BEAMS]]))
 
 
 def _radius(stay: Stay) -> float:
+    """Metres from the center of an object to its farthest corner."""
     return float(np.hypot(*(stay.faces.reshape(-1, 2) - stay.center).T).max())
 
 
 def _distance(xy: Float, stay: Stay) -> Float:
-    """(N,) metres from points to a thing's middle or, if nearer, its faces."""
+    """(N,) metres from points to an object's center or, if nearer, its faces."""
     return np.minimum(np.hypot(*(xy - stay.center).T), distance_to_walls(xy, stay.faces))
 
 

@@ -1,7 +1,4 @@
-"""Scores of P(static) per beam against the truth. The positive class is *dynamic*.
-
-What all scores have in common: plain numbers, ready for JSON.
-"""
+"""Scores of P(static) per beam against the truth. The positive class is *dynamic*."""
 
 import dataclasses
 import math
@@ -18,7 +15,7 @@ Bool = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Scores:
-    """Base of all results. NaN stands for a score that its input leaves undefined."""
+    """Base of all scores. NaN marks an undefined score."""
 
     def to_dict(self) -> dict[str, Any]:
         """Nested dictionaries of plain numbers; NaN becomes None, since JSON has no NaN."""
@@ -33,24 +30,23 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-# One certain mistake costs 13.8 nats. Labels are float32, so anything below 6e-8 would be lost
-# near 1 anyway; the result depends on this number where an estimator claims certainty.
+# One certain error costs 13.8 nats. Labels are float32: anything below 6e-8 is lost near 1 anyway.
 LOG_LOSS_EPS = 1e-6
 
 ECE_BINS = 15
 
-UNSURE = (0.05, 0.95)  # P(dynamic) strictly between: where calibration means something
+UNSURE = (0.05, 0.95)  # P(dynamic) strictly between counts as unsure
 
 _NAN = float("nan")
 
 
 @dataclass(frozen=True)
 class LabelScores(Scores):
-    """Scores over the beams that hit something and carry a label. NaN: undefined.
+    """Scores over the labelled hits. NaN: undefined.
 
     Attributes:
         hits: beams scored; `dynamic` of them are truly dynamic.
-        unlabelled: beams that hit something but have no P(static).
+        unlabelled: hits without P(static).
         average_precision: sum of (R_n - R_{n-1}) P_n over falling thresholds.
         precision, recall, f1: for P(dynamic) > 1/2.
         brier: mean squared error of P(dynamic).
@@ -81,8 +77,8 @@ def score_labels(p_static: NDArray[np.floating], static: Bool, hit: Bool) -> Lab
 
     Args:
         p_static: (M,) P(c = 1) in [0, 1]; NaN where there is no label.
-        static: (M,) truth, True where something static reflected the beam.
-        hit: (M,) beams that something reflected and whose truth is known.
+        static: (M,) truth, True where a static object reflected the beam.
+        hit: (M,) returns whose truth is known.
     """
     if not p_static.shape == static.shape == hit.shape or p_static.ndim != 1:
         raise ValueError(f"lengths differ: {p_static.shape}, {static.shape}, {hit.shape}")
@@ -130,7 +126,7 @@ def compute_average_precision(score: Float, positive: Bool) -> float:
 
 
 def compute_precision_recall_f1(called: Bool, positive: Bool) -> tuple[float, float, float]:
-    """Of beams called positive; NaN where a denominator is zero."""
+    """Precision, recall and F1 of the mask `called`; NaN where a denominator is zero."""
     both, n_called, n_positive = (
         int(np.count_nonzero(mask)) for mask in (called & positive, called, positive)
     )
@@ -153,7 +149,7 @@ def assign_equal_width_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
 
 
 def assign_equal_mass_bins(p: Float, bins: int = ECE_BINS) -> NDArray[np.intp]:
-    """Bin of each probability, as many in each bin as ties allow: equal ones stay together."""
+    """Quantile bin of each probability; equal ones share a bin."""
     _, group, size = np.unique(p, return_inverse=True, return_counts=True)
     middle = np.cumsum(size) - size / 2
     return (middle * bins / max(len(p), 1)).astype(np.intp)[group]

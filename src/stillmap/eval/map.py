@@ -1,4 +1,4 @@
-"""Scores of an occupancy map against the true walls: what should not be there, what is missing."""
+"""Scores of an occupancy map against the true walls: ghost cells, and share of walls kept."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ GHOST_DISTANCE = 2.0  # cells from the nearest wall
 
 WALL_DISTANCE = 1.0  # cells
 
-MIN_HITS = 3  # fewer are noise on a neighbouring cell, or a wall seen in passing
+MIN_HITS = 3  # fewer are noise from a neighbouring cell, or a wall hardly observed
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ class MapScores(Scores):
     """NaN where a denominator is zero.
 
     Attributes:
-        ghost_cells: occupied cells whose centre lies more than two cells from any wall.
+        ghost_cells: occupied cells whose center lies more than two cells from any wall.
         free_area: m2 of free cells.
         ghosts_per_100_m2: ghost cells per 100 m2 of free area.
-        reference_wall_cells: wall cells that should be there.
-        walls_kept: share of these with an occupied cell among themselves and their 8 neighbours.
+        reference_wall_cells: wall cells that the map should show.
+        walls_kept: share of these that are occupied, or one of whose 8 neighbours is.
         T_world_map: x, y, theta of the alignment used.
     """
 
@@ -45,9 +45,9 @@ def score_map(grid: Grid, walls: Float, reference: Float, T_world_map: Float) ->
 
     Args:
         grid: the map.
-        walls: (W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1: all that the map may show.
-        reference: (K, 2) centres, in the world frame, of wall cells that should be there: from
-            `wall_cells_of_map` or `wall_cells_of_hits`.
+        walls: (W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1.
+        reference: (K, 2) centers, in the world frame, of the wall cells that the map should show:
+            from `extract_wall_cells` or `extract_wall_cells_from_hits`.
         T_world_map: (3, 3), see `trajectory.align`.
     """
     occupied = moved(T_world_map, grid.centres(np.argwhere(grid.occupied)))
@@ -68,7 +68,7 @@ def score_map(grid: Grid, walls: Float, reference: Float, T_world_map: Float) ->
 
 
 def extract_wall_cells(grid: Grid, walls: Float, T_world_map: Float) -> Float:
-    """(K, 2) centres, in the world frame, of a map's occupied cells within one cell of a wall."""
+    """(K, 2) centers, in the world frame, of a map's occupied cells within one cell of a wall."""
     centres = moved(T_world_map, grid.centres(np.argwhere(grid.occupied)))
     return centres[distance_to_walls(centres, walls) <= WALL_DISTANCE * grid.resolution]
 
@@ -76,12 +76,13 @@ def extract_wall_cells(grid: Grid, walls: Float, T_world_map: Float) -> Float:
 def extract_wall_cells_from_hits(
     hits: Float, walls: Float, grid: Grid, T_world_map: Float
 ) -> Float:
-    """(K, 2) centres, in the world frame, of the cells that true static hits show to be wall.
-
-    The cells are those of the lattice of `grid`, within one cell of a wall, hit MIN_HITS times.
+    """(K, 2) centers, in the world frame, of cells beside walls with MIN_HITS hits.
 
     Args:
-        hits: (N, 2) end points in the world frame, at true poses, of static beams alone.
+        hits: (N, 2) end points of static beams in the world frame, at true poses.
+        walls: (W, 4) segments.
+        grid: the map, for its lattice.
+        T_world_map: (3, 3).
     """
     cells, count = np.unique(
         grid.cells(moved(se2.inverse(T_world_map), hits)), axis=0, return_counts=True
@@ -105,7 +106,7 @@ def distance_to_walls(points: Float, walls: Float, chunk: int = 1 << 20) -> Floa
 
 
 def is_near_occupied(grid: Grid, points: Float) -> NDArray[np.bool_]:
-    """Whether the cell of each (N, 2) point of the map frame, or a neighbour of it, is occupied."""
+    """(N,) whether the cell of each point (N, 2) of the map frame, or a neighbour, is occupied."""
     near = scipy.ndimage.binary_dilation(np.pad(grid.occupied, 1), np.ones((3, 3), bool))
     cells = grid.cells(points) + 1
     inside = np.all((cells >= 0) & (cells < near.shape), axis=1)

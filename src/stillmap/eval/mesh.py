@@ -1,6 +1,6 @@
-"""Scores of a textured model against a simulation's truth: its surface, and what paints it.
+"""Scores of a textured mesh against a simulation: its surface, and the sources of its texture.
 
-Shares are of areas, counted at points that lie as densely on every square metre.
+Shares are of areas, estimated at points that are uniform over the area.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,21 +24,21 @@ Bool = NDArray[np.bool_]
 
 SAMPLES = 200_000
 COMPLETE = 0.05  # m
-GREY, STATIC, NOTHING = -3, -1, -2  # what a sample shows, if no mover
-_STEEP = 0.17  # cosine of 80 degrees: what is seen at a smaller angle is not seen
-_CLOSE, _FARTHEST = 0.05, 0.5  # m, by which a surface may lie before what the pixel shows
+GREY, STATIC, NOTHING = -3, -1, -2  # source of a sample without texture, no mover, or the sky
+_MIN_COSINE = 0.17  # of the viewing angle: 80 degrees
+_TOLERANCE, _MAX_TOLERANCE = 0.05, 0.5  # m between a surface and the depth of its pixel
 _NAN = float("nan")
 
 
 @dataclass(frozen=True)
 class SurfaceScores(Scores):
-    """How well triangles lie on what stands still; metres. NaN: there is nothing to compare.
+    """Distances between a mesh and the static surfaces, metres. NaN: nothing to compare.
 
     Attributes:
         faces, area: of the mesh, square metres.
         mean, p95: distance of its points from the true surface.
-        complete: share of the places that the sensor saw that lie within 5 cm of the mesh.
-        places: how many these are.
+        complete: share of the observed surface points within 5 cm of the mesh.
+        places: number of observed surface points.
     """
 
     faces: int
@@ -51,15 +51,15 @@ class SurfaceScores(Scores):
 
 @dataclass(frozen=True)
 class TextureScores(Scores):
-    """What paints a mesh. NaN where there is nothing to compare.
+    """Sources and colors of a texture. NaN where there is nothing to compare.
 
     Attributes:
-        textured: share of its area that has a texture.
-        mover: share of that which shows something that moves.
-        nothing: share of that which shows the sky.
-        in_view: share of the area that some picture sees, and no mover before it.
-        covered: share of that which has a texture.
-        colour_median, colour_p95: CIEDE2000 between texture and true colour.
+        textured: share of the area with a texture.
+        mover: share of the textured area that shows a mover.
+        nothing: share of the textured area that shows the sky.
+        in_view: share of the area that some image shows, not occluded by a mover.
+        covered: share of the area in view with a texture.
+        colour_median, colour_p95: CIEDE2000 between texture and true color.
     """
 
     textured: float
@@ -72,13 +72,13 @@ class TextureScores(Scores):
 
 
 class TextureRecord(NamedTuple):
-    """Which picture paints each triangle of a model.
+    """The source image of each triangle of a model.
 
     Attributes:
-        vertices: (V, 3) metres, in the model's frame: of the map, or of an object.
+        vertices: (V, 3) metres, in the frame of the model: the map, or an object.
         faces: (F, 3).
-        image: (F,) number of the picture; -1: none.
-        T_camera_model: (N, 4, 4) from that frame to the camera's, NaN of pictures without use.
+        image: (F,) image number; -1: none.
+        T_camera_model: (N, 4, 4) from that frame to the camera's, NaN of unused images.
     """
 
     vertices: Float
@@ -88,13 +88,13 @@ class TextureRecord(NamedTuple):
 
 
 class TrueImages(NamedTuple):
-    """N pictures and the truth about them.
+    """N images with their truth.
 
     Attributes:
         cameras: the cameras.
-        camera: (N,) which took each.
-        T_world_camera: (N, 4, 4) the true places.
-        mask, distance: of a picture, as `PictureTruth` has them.
+        camera: (N,) camera of each.
+        T_world_camera: (N, 4, 4) true poses.
+        mask, distance: of an image, see `sim.truth_images`.
     """
 
     cameras: Sequence[Camera]
@@ -105,7 +105,7 @@ class TrueImages(NamedTuple):
 
 
 class ColoredPoints(NamedTuple):
-    """Points (n, 3) of a texture, in the map frame, and their colours (n, 3) uint8."""
+    """Points (n, 3) of a texture, in the map frame, and their colors (n, 3) uint8."""
 
     points: Float
     color: NDArray[np.uint8]
@@ -119,21 +119,21 @@ def score_surface(
     Args:
         vertices, faces: (V, 3) metres in the map frame, (F, 3).
         standing: the true surfaces.
-        places: (n, 3) on them, in the world, that the sensor saw.
+        places: (n, 3) observed points on them, in the world.
         T_world_map: (4, 4).
     """
     on_mesh = transform_points(
         T_world_map, mesh_distance.sample_surface(vertices, faces, SAMPLES).points
     )
-    off, _ = standing.nearest(on_mesh)
+    distance, _ = standing.nearest(on_mesh)
     gaps = mesh_distance.distance_to_mesh(
         places, transform_points(T_world_map, vertices), faces, COMPLETE
     )
     return SurfaceScores(
         faces=len(faces),
         area=float(mesh_distance.triangle_areas(vertices, faces).sum()),
-        mean=_mean(off),
-        p95=float(np.percentile(off, 95)) if len(off) else _NAN,
+        mean=_mean(distance),
+        p95=float(np.percentile(distance, 95)) if len(distance) else _NAN,
         complete=_mean(gaps <= COMPLETE),
         places=len(places),
     )
@@ -146,27 +146,27 @@ def score_texture(
     standing: Standing,
     colour_seed: int,
     T_world_map: Float,
-    farthest: float = float("inf"),
+    max_distance: float = float("inf"),
 ) -> TextureScores:
-    """Score what paints a surface.
+    """Score the texture of a surface.
 
     Args:
         record: of the model in the map frame.
         coloured: points of its texture.
-        pictures: that may paint it.
-        standing, colour_seed: the true surfaces and their colours.
+        pictures: the images.
+        standing, colour_seed: the true surfaces and their colors.
         T_world_map: (4, 4).
-        farthest: metres, from beyond a picture does not count as seeing anything.
+        max_distance: metres, beyond which an image does not show a surface.
     """
     on_mesh = mesh_distance.sample_surface(record.vertices, record.faces, SAMPLES)
-    shows = look_up_texture_source(record, on_mesh, pictures)
-    in_view = find_visible_samples(record, on_mesh, pictures, T_world_map, farthest)
-    textured = shows != GREY
+    source = look_up_texture_source(record, on_mesh, pictures)
+    in_view = find_visible_samples(record, on_mesh, pictures, T_world_map, max_distance)
+    textured = source != GREY
     error = compute_color_errors(coloured, standing, colour_seed, T_world_map)
     return TextureScores(
         textured=_mean(textured),
-        mover=_mean(shows[textured] >= 0),
-        nothing=_mean(shows[textured] == NOTHING),
+        mover=_mean(source[textured] >= 0),
+        nothing=_mean(source[textured] == NOTHING),
         in_view=_mean(in_view),
         covered=_mean(textured[in_view]),
         colour_median=float(np.median(error)) if len(error) else _NAN,
@@ -177,9 +177,9 @@ def score_texture(
 def look_up_texture_source(
     record: TextureRecord, samples: mesh_distance.SurfaceSamples, pictures: TrueImages
 ) -> NDArray[np.int64]:
-    """(n,) what the texture shows: the number of a mover, STATIC, NOTHING, or GREY for no picture.
+    """(n,) what the texture shows: a mover's number, STATIC, NOTHING (the sky) or GREY (no image).
 
-    Also GREY: where a picture was to paint what lies outside of it.
+    Samples outside of their image are GREY as well.
     """
     image, out = record.image[samples.face], np.full(len(samples.face), GREY)
     for number in np.unique(image[image >= 0]).tolist():
@@ -198,26 +198,26 @@ def find_visible_samples(
     samples: mesh_distance.SurfaceSamples,
     pictures: TrueImages,
     T_world_map: Float,
-    farthest: float = float("inf"),
+    max_distance: float = float("inf"),
 ) -> Bool:
-    """(n,) whether some picture truly sees a sample's place, without a mover before it.
+    """(n,) whether some image shows a sample, not occluded by a mover.
 
-    The surface faces the camera, at no more than 80 degrees from upright, from no farther than
-    `farthest` metres, and no more than 5 cm and a pixel lie between it and what the pixel shows.
+    The surface faces the camera within 80 degrees and `max_distance` metres, and its distance
+    agrees with the true depth of the pixel to 5 cm and a pixel.
     """
     points = transform_points(T_world_map, samples.points)
-    upright = mesh_distance.triangle_normals(
+    normals = mesh_distance.triangle_normals(
         transform_points(T_world_map, record.vertices), record.faces
     )[samples.face]
     out = np.zeros(len(points), bool)
     for number, T_world_camera in enumerate(pictures.T_world_camera):
-        camera, centre = pictures.cameras[pictures.camera[number]], T_world_camera[:3, 3]
+        camera, center = pictures.cameras[pictures.camera[number]], T_world_camera[:3, 3]
         assert camera.K is not None
         left = np.flatnonzero(~out)
-        towards = centre - points[left]
+        towards = center - points[left]
         away = np.linalg.norm(towards, axis=1)
-        cosine = (towards * upright[left]).sum(axis=1) / np.maximum(away, 1e-9)
-        use = (cosine >= _STEEP) & (away <= farthest)
+        cosine = (towards * normals[left]).sum(axis=1) / np.maximum(away, 1e-9)
+        use = (cosine >= _MIN_COSINE) & (away <= max_distance)
         left, away, cosine = left[use], away[use], cosine[use]
         pixel, inside = _pixels(
             camera, transform_points(np.linalg.inv(T_world_camera), points[left])
@@ -225,7 +225,7 @@ def find_visible_samples(
         column, row = pixel[inside].T
         left, away, cosine = left[inside], away[inside], cosine[inside]
         off = np.abs(pictures.distance(number)[row, column] - away)
-        limit = np.minimum((_CLOSE + away / camera.K[0, 0]) / cosine, _FARTHEST)
+        limit = np.minimum((_TOLERANCE + away / camera.K[0, 0]) / cosine, _MAX_TOLERANCE)
         out[left] = (pictures.mask(number)[row, column] == 0) & (off <= limit)
     return out
 
@@ -233,7 +233,7 @@ def find_visible_samples(
 def compute_color_errors(
     coloured: ColoredPoints, standing: Standing, colour_seed: int, T_world_map: Float
 ) -> Float:
-    """(n,) CIEDE2000 between a texture and the true colour of the nearest place that stands still.
+    """(n,) CIEDE2000 between a texture and the true color of the nearest static surface.
 
     Raises:
         MissingExtra: scikit-image is not installed.
@@ -243,19 +243,19 @@ def compute_color_errors(
 
 
 def compute_color_difference(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float:
-    """(n,) CIEDE2000 between colours (n, 3), sRGB."""
+    """(n,) CIEDE2000 between sRGB colors (n, 3)."""
     color = import_extra("skimage.color", "texture", "compared with the truth", group="mesh")
     labs = [color.rgb2lab(colour[None]) for colour in (one, other)]
     return np.asarray(color.deltaE_ciede2000(*labs)[0], np.float64)
 
 
 def transform_points(T: Float, points: Float) -> Float:
-    """(n, 3) points moved by T (4, 4)."""
+    """(n, 3) points transformed by T (4, 4)."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
 
 def _pixels(camera: Camera, points: Float) -> tuple[NDArray[np.int64], Bool]:
-    """(n, 2) the pixels nearest to points in the camera's frame, and whether they are in it."""
+    """Nearest pixels (n, 2) of points in the camera frame, and whether they lie in the image."""
     uv, ahead = project(camera, points)
     inside = ahead & is_in_image(camera, uv)
     return np.rint(np.where(inside[:, None], uv, 0.0)).astype(np.int64), inside

@@ -1,4 +1,4 @@
-"""Folders that scores of models are computed from."""
+"""Readers of simulations with cameras, and of models in result folders."""
 
 import json
 from collections.abc import Iterator
@@ -22,19 +22,18 @@ from stillmap.slam.odometry_2d import SlamOptions
 Float = NDArray[np.float64]
 
 RECORD = "mesh_faces.npz"
-_PLACES = 0.05  # m, of cubes in each of which one place counts
-_SPAN_NS = 10**9  # before and after a person's model: he walks on
+_VOXEL = 0.05  # m, for thinning the observed surface points
+_SPAN_NS = 10**9  # before and after the model of a person, who walks on
 _MAX_JSON = 1 << 28  # bytes
 
 
 class CameraSimulation(NamedTuple):
-    """A simulated recording with cameras, and what is true of it.
+    """A simulated recording with cameras, and its truth.
 
     Attributes:
         truth: its folder, recording and truth about beams.
-        pictures, picture_truth: the same about pictures and surfaces.
-        ends: (M, 3) where its beams ended in the world, with their noise, each from where the
-            robot truly was at its time.
+        images, image_truth: the images, and the truth about them and about surfaces.
+        end_points: (M, 3) measured end points in the world, at true poses.
     """
 
     truth: readers.Truth
@@ -42,20 +41,20 @@ class CameraSimulation(NamedTuple):
     image_truth: PictureTruth
     end_points: Float
 
-    def observed_places(self, farthest: float) -> Float:
-        """(n, 3) true places of what stands still that the sensor saw, one in each 5 cm.
+    def observed_places(self, max_range: float) -> Float:
+        """(n, 3) observed points of the true static surfaces, one per voxel of 5 cm.
 
         Args:
-            farthest: metres, beams that are longer do not count.
+            max_range: metres, longer beams are ignored.
         """
         recording = self.truth.recording
         use = recording.hit & self.truth.static()
-        use &= np.linalg.norm(recording.points, axis=1) <= farthest
+        use &= np.linalg.norm(recording.points, axis=1) <= max_range
         _, places = self.image_truth.standing.nearest(self.end_points[use])
-        return places[mesh_distance.first_per_voxel(places, _PLACES)]
+        return places[mesh_distance.first_per_voxel(places, _VOXEL)]
 
     def mover_hits(self) -> MoverHits:
-        """The beams on movers."""
+        """The hits on movers."""
         recording = self.truth.recording
         mover = np.load(self.truth.folder / "truth/mover.npy", allow_pickle=False)
         beams = np.flatnonzero(recording.hit & (mover >= 0))
@@ -66,7 +65,7 @@ class CameraSimulation(NamedTuple):
 
 
 def read_camera_simulation(path: Path) -> CameraSimulation:
-    """A simulation with cameras; of a rig's folder the recording that has them.
+    """Read a simulation with cameras; of a rig the recording with them.
 
     Raises:
         InputError: it is none.
@@ -76,7 +75,7 @@ def read_camera_simulation(path: Path) -> CameraSimulation:
     truth, picture_truth = readers.read_truth(path), load_picture_truth(path)
     recording, images = truth.recording, truth.recording.images
     if images is None or len(images) != len(picture_truth.T_world_camera):
-        raise InputError("has other pictures than its truth", where=str(path))
+        raise InputError("has other images than its truth", where=str(path))
     pictures = TrueImages(
         images.cameras,
         images.camera,
@@ -106,7 +105,7 @@ class GlbContent(NamedTuple):
 
 
 def read_glb(path: Path, n: int = SAMPLES) -> GlbContent:
-    """A GLB file, with n points of its textures.
+    """Read a GLB file, with n points of its textures.
 
     Raises:
         InputError: it is damaged, or trimesh is not installed.
@@ -115,7 +114,7 @@ def read_glb(path: Path, n: int = SAMPLES) -> GlbContent:
     trimesh = import_extra("trimesh", path, "compared with the truth", group="mesh")
     try:
         parts = list(_parts(trimesh.load_scene(path, process=False)))
-        return _joined(parts, n)
+        return _concatenate(parts, n)
     except Exception as error:  # whatever trimesh makes of damaged bytes
         raise InputError(f"is damaged: {error}", where=str(path)) from error
 
@@ -143,7 +142,7 @@ def _parts(scene: Any) -> Iterator[_Part]:
             yield _Part(vertices, faces, np.asarray(uv, float), np.asarray(image.convert("RGB")))
 
 
-def _joined(parts: list[_Part], n: int) -> GlbContent:
+def _concatenate(parts: list[_Part], n: int) -> GlbContent:
     vertices, faces, first = [np.empty((0, 3))], [np.empty((0, 3), np.int32)], 0
     points, colour = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
     area = [float(mesh_distance.triangle_areas(one.vertices, one.faces).sum()) for one in parts]
@@ -164,7 +163,7 @@ def _joined(parts: list[_Part], n: int) -> GlbContent:
 
 
 def _texels(picture: NDArray[np.uint8], uv: Float) -> NDArray[np.uint8]:
-    """(n, 3) colours between four texels; the origin of (n, 2) is the lower left corner."""
+    """(n, 3) bilinear colors at (n, 2); the origin is the lower left corner."""
     height, width, _ = picture.shape
     at = np.stack([uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5], axis=1)
     at = np.clip(at, 0.0, (width - 1, height - 1))
@@ -179,15 +178,15 @@ def _texels(picture: NDArray[np.uint8], uv: Float) -> NDArray[np.uint8]:
 
 
 def read_record(path: Path, n_pictures: int, frame: str = "map") -> TextureRecord | None:
-    """`mesh_faces.npz` or `NNNN_faces.npz`; None: there is none.
+    """Read `mesh_faces.npz` or `NNNN_faces.npz`; None if it does not exist.
 
     Args:
         path: the file.
-        n_pictures: how many the recording has.
+        n_pictures: number of images of the recording.
         frame: of the model, "map" or "object".
 
     Raises:
-        InputError: it is damaged, or speaks of other pictures.
+        InputError: it is damaged, or of other images.
     """
     if not path.exists():
         return None
@@ -201,33 +200,33 @@ def read_record(path: Path, n_pictures: int, frame: str = "map") -> TextureRecor
     except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
     if len(T) != n_pictures or image.max(initial=-1) >= n_pictures or image.min(initial=0) < -1:
-        what = f"speaks of {len(T)} pictures, the recording has {n_pictures}"
+        what = f"has {len(T)} images, the recording {n_pictures}"
         raise InputError(what, where=str(path), hint="is it the result of another recording?")
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise InputError("is damaged: a vertex that is not there", where=str(path))
+        raise InputError("is damaged: no such vertex", where=str(path))
     if not np.isfinite(T[np.unique(image[image >= 0])]).all():
-        raise InputError("is damaged: a picture from nowhere paints", where=str(path))
+        raise InputError("is damaged: a texture image without a pose", where=str(path))
     return TextureRecord(vertices, faces, image, T)
 
 
 def find_objects_folder(result: Path) -> Path:
-    """The folder of the objects that a result has models of: of a rig, those of what tilts."""
+    """The folder of the objects with models; of a rig, those of the tilting laser."""
     tilting = result / "tilting/objects"
     has_models = any((result / "objects").glob("[0-9]*.glb"))
     return tilting if tilting.is_dir() and not has_models else result / "objects"
 
 
 def read_tracks(folder: Path, T_world_map: Float) -> list[Track]:
-    """`objects.json`, in the world.
+    """Read `objects.json`, transformed to the world.
 
     Raises:
         InputError: it is missing or damaged.
     """
     path = folder / "objects.json"
-    out, said = [], _json(path)
-    if not isinstance(said, list):
+    out, content = [], _json(path)
+    if not isinstance(content, list):
         raise InputError("is damaged: no list of objects", where=str(path))
-    for one in said:
+    for one in content:
         try:
             track = one["track"]
             xy = np.column_stack([track["x"], track["y"]]).astype(float)
@@ -240,14 +239,14 @@ def read_tracks(folder: Path, T_world_map: Float) -> list[Track]:
 
 
 def read_model(folder: Path, id: int, rigid: bool, n_pictures: int) -> Model | None:
-    """The model of an object; None: there is none.
+    """Read the model of an object; None if it does not exist.
 
     Args:
         folder: `objects/`.
-        id: its number.
-        rigid: whether what was seen of it at all times may be in its model, where
-            `NNNN.json` does not say.
-        n_pictures: of the recording.
+        id: of the object.
+        rigid: whether its model may hold observations of all times, where `NNNN.json` does not
+            say.
+        n_pictures: number of images of the recording.
 
     Raises:
         InputError: a file is damaged.
@@ -257,11 +256,11 @@ def read_model(folder: Path, id: int, rigid: bool, n_pictures: int) -> Model | N
         return None
     glb, about = read_glb(path, n=1), path.with_suffix(".json")
     try:
-        said = _json(about)
-        T, stamp = np.array(said["T_map_object"], float).reshape(4, 4), int(said["stamp_ns"])
-        first, last = said.get("first_stamp_ns"), said.get("last_stamp_ns")
+        content = _json(about)
+        T, stamp = np.array(content["T_map_object"], float).reshape(4, 4), int(content["stamp_ns"])
+        first, last = content.get("first_stamp_ns"), content.get("last_stamp_ns")
         if first is None or last is None:
-            rigid = bool(said.get("rigid", rigid))
+            rigid = bool(content.get("rigid", rigid))
             first, last = (-(2**62), 2**62) if rigid else (stamp - _SPAN_NS, stamp + _SPAN_NS)
         span = int(first), int(last)
     except (KeyError, TypeError, ValueError, AttributeError) as error:

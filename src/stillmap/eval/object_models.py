@@ -1,4 +1,4 @@
-"""Scores of the models of what moved, against the true shapes of a simulation's movers."""
+"""Scores of object models against the true shapes of a simulation's movers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,23 +23,23 @@ Float = NDArray[np.float64]
 Index = NDArray[np.int32]
 
 _SAMPLES = 20_000
-_THIN = 0.02  # m, of the places that the sensor saw
-_REACH = 0.03  # m, between points of a model's lattice
-_OFF = 0.75  # m, from a track to the middle of who left it; of what is long, half its length too
-GOOD = 0.05  # m
-_WELL = 100  # beams
+_VOXEL = 0.02  # m, for thinning the observed points
+_SPACING = 0.03  # m, of the lattice of a model
+_MAX_OFFSET = 0.75  # m from a track to its mover's center, plus half the mover's length
+GOOD = 0.05  # m, chamfer distance
+_MIN_BEAMS = 100  # within a second, of a well observed mover
 _NAN = float("nan")
 
 
 class Track(NamedTuple):
-    """Where an object was: (L,) stamps, (L, 2) metres in the world."""
+    """Track of an object: (L,) stamps, (L, 2) metres in the world."""
 
     id: int
     stamp_ns: NDArray[np.int64]
     xy: Float
 
     def within(self, span_ns: tuple[int, int]) -> "Track":
-        """The part between two times, or what comes nearest to their middle."""
+        """The part between two times, or the detection nearest to their mean."""
         first, last = span_ns
         use = np.flatnonzero((self.stamp_ns >= first) & (self.stamp_ns <= last))
         if not len(use):
@@ -52,10 +52,10 @@ class Model(NamedTuple):
 
     Attributes:
         vertices, faces: (V, 3) metres in the object's frame, z up, and (F, 3).
-        T_map_object: (4, 4) where the object stood.
-        stamp_ns: when.
-        span_ns: from when to when what was seen of it is in the model.
-        record: what paints it; None: unknown, or nothing does.
+        T_map_object: (4, 4) pose of the object at `stamp_ns`.
+        stamp_ns: time of the model.
+        span_ns: first and last time of the observations in the model.
+        record: sources of its texture; None: unknown, or no texture.
     """
 
     vertices: Float
@@ -68,15 +68,15 @@ class Model(NamedTuple):
 
 @dataclass(frozen=True)
 class ModelScores(Scores):
-    """One model; metres. NaN where there is nothing to compare.
+    """Scores of one model; metres. NaN where there is nothing to compare.
 
     Attributes:
-        id, mover, kind: of the object, and whose model it is.
+        id, mover, kind: of the object, and its mover.
         accuracy: mean distance of the model from the true shape.
-        completeness: mean distance from what the sensor saw of that to the model.
-        chamfer: the mean of both.
-        textured: share of its area that has a texture.
-        background: share of that which shows anything but the mover.
+        completeness: mean distance of the observed points of the true shape from the model.
+        chamfer: mean of both.
+        textured: share of the area with a texture.
+        background: share of the textured area that does not show the mover.
     """
 
     id: int
@@ -91,18 +91,18 @@ class ModelScores(Scores):
 
 @dataclass(frozen=True)
 class MoverScores(Scores):
-    """All of them. NaN where there is nothing to compare.
+    """Scores of all models. NaN where there is nothing to compare.
 
     Attributes:
-        tracked: movers that were tracked.
-        modelled: share of them of which there is a model.
-        seen_well: those tracked movers that 100 beams met within a second, once at least.
-        modelled_well: share of these of which there is a model.
+        tracked: number of tracked movers.
+        modelled: share of them with a model.
+        seen_well: tracked movers with 100 beams within some second.
+        modelled_well: share of these with a model.
         chamfer: mean over models, metres.
         good: share of models with a chamfer distance of at most 5 cm.
         background: mean over models with a texture.
-        nothing: models of what is no mover.
-        models: each of the others.
+        nothing: models of no mover.
+        models: all others.
     """
 
     tracked: int
@@ -117,12 +117,12 @@ class MoverScores(Scores):
 
 
 class MoverHits(NamedTuple):
-    """What the sensor saw of movers: B beams.
+    """B hits on movers.
 
     Attributes:
-        mover: (B,) whom each met.
-        stamp_ns: (B,) when.
-        points: (B, 3) where, in the world.
+        mover: (B,) mover.
+        stamp_ns: (B,) time.
+        points: (B, 3) end point in the world.
     """
 
     mover: Index
@@ -131,17 +131,17 @@ class MoverHits(NamedTuple):
 
 
 def match_mover(track: Track, stamp_ns: NDArray[np.int64], movers: Float, sizes: Float) -> int:
-    """The mover that an object is; -1: none.
+    """The mover nearest to an object's track; -1: none.
 
     Args:
-        track: the object's.
-        stamp_ns, movers: (T,) and (T, P, 3) where movers are; x, y in metres.
-        sizes: (P,) metres, how long each is; NaN of people and of what has no such measure.
+        track: of the object.
+        stamp_ns, movers: (T,) stamps and (T, P, 3) poses of the movers; x, y in metres.
+        sizes: (P,) metres, lengths; NaN where undefined, as of people.
     """
     scan = np.clip(np.searchsorted(stamp_ns, track.stamp_ns), 0, len(stamp_ns) - 1)
     off = np.linalg.norm(movers[scan, :, :2] - track.xy[:, None], axis=2)
     off = np.median(np.where(np.isnan(off), np.inf, off), axis=0)
-    near = off - _OFF - np.nan_to_num(sizes) / 2
+    near = off - _MAX_OFFSET - np.nan_to_num(sizes) / 2
     return int(near.argmin()) if near.size and near.min() <= 0.0 else -1
 
 
@@ -154,21 +154,21 @@ def score_object_models(
     pictures: TrueImages,
     T_world_map: Float,
 ) -> MoverScores:
-    """Score models.
+    """Score the models of objects.
 
     Args:
-        tracked: the mover that each object is, by the objects' numbers; -1: none.
-        models: by the same numbers, and the mover that each shows: that which the object was then.
-            Those of none are only counted.
+        tracked: mover of each object, by object id; -1: none.
+        models: mover at the time of the model, and model, by object id. Models of no mover are only
+            counted.
         kinds: of movers.
         moving: the true shapes.
-        sighted: what the sensor saw of them.
-        pictures: that paint the models.
+        sighted: hits on movers.
+        pictures: the images.
         T_world_map: (4, 4).
     """
     movers = {mover for mover in tracked.values() if mover >= 0}
     have = {tracked.get(id, -1) for id in models}
-    well = {mover for mover in movers if count_max_beams(sighted, mover) >= _WELL}
+    well = {mover for mover in movers if count_max_beams(sighted, mover) >= _MIN_BEAMS}
     scores = tuple(
         score_model(id, mover, kinds[mover], model, moving, sighted, pictures, T_world_map)
         for id, (mover, model) in sorted(models.items())
@@ -189,7 +189,7 @@ def score_object_models(
 
 
 def count_max_beams(sighted: MoverHits, mover: int) -> int:
-    """How many beams met a mover within a second, at most."""
+    """Maximum number of beams on a mover within a second."""
     stamps = np.sort(sighted.stamp_ns[sighted.mover == mover])
     last = np.searchsorted(stamps, stamps + 10**9, side="right")
     return int((last - np.arange(len(stamps))).max(initial=0))
@@ -205,7 +205,7 @@ def score_model(
     pictures: TrueImages,
     T_world_map: Float,
 ) -> ModelScores:
-    """Score one model; arguments are those of `mover_scores`."""
+    """Score one model; for arguments see `score_object_models`."""
     solids = moving.at(moving.parts(mover), model.stamp_ns)
     T = T_world_map @ model.T_map_object
     on_model = transform_points(
@@ -214,7 +214,7 @@ def score_model(
     accuracy = _mean(distance_to_solids(on_model, solids))
     places = collect_observed_points(moving, mover, model.stamp_ns, model.span_ns, sighted)
     gaps = mesh_distance.distance_to_mesh(
-        places, transform_points(T, model.vertices), model.faces, _REACH
+        places, transform_points(T, model.vertices), model.faces, _SPACING
     )
     completeness = _mean(gaps)
     textured = background = _NAN
@@ -222,9 +222,9 @@ def score_model(
         of_record = mesh_distance.sample_surface(
             model.record.vertices, model.record.faces, _SAMPLES
         )
-        shows = look_up_texture_source(model.record, of_record, pictures)
-        textured = _mean(shows != GREY)
-        background = _mean(shows[shows != GREY] != mover)
+        source = look_up_texture_source(model.record, of_record, pictures)
+        textured = _mean(source != GREY)
+        background = _mean(source[source != GREY] != mover)
     chamfer = (accuracy + completeness) / 2
     return ModelScores(id, mover, kind, accuracy, completeness, chamfer, textured, background)
 
@@ -241,14 +241,14 @@ def distance_to_solids(points: Float, solids: Solids) -> Float:
 def collect_observed_points(
     moving: Moving, mover: int, stamp_ns: int, span_ns: tuple[int, int], sighted: MoverHits
 ) -> Float:
-    """(n, 3) the places of a mover that the sensor saw, where they are at a stamp; in the world.
+    """Observed points (n, 3) of a mover, moved to where they are at a stamp; in the world.
 
-    Each beam's end, put on the part that it is nearest to at its own time, goes with that part.
+    Each end point is projected to the part nearest to it at its own time, and moves with it.
 
     Args:
-        moving, mover, sighted: see `mover_scores`.
-        stamp_ns: when they are wanted.
-        span_ns: from when to when beams count.
+        moving, mover, sighted: see `score_object_models`.
+        stamp_ns: time of the points.
+        span_ns: first and last time of the beams used.
     """
     first, last = span_ns
     use = (sighted.mover == mover) & (sighted.stamp_ns >= first) & (sighted.stamp_ns <= last)
@@ -260,10 +260,10 @@ def collect_observed_points(
         on = nearest_on_solid(points, then, k)
         off = np.linalg.norm(on - points, axis=1)
         better = off < nearest
-        goes_with = to_world(to_local(on, then.pose[:, k]), now.pose[:, k])
-        nearest[better], found[better] = off[better], goes_with[better]
+        moved = to_world(to_local(on, then.pose[:, k]), now.pose[:, k])
+        nearest[better], found[better] = off[better], moved[better]
     found = found[np.isfinite(found).all(axis=1)]
-    return np.asarray(found[mesh_distance.first_per_voxel(found, _THIN)])
+    return np.asarray(found[mesh_distance.first_per_voxel(found, _VOXEL)])
 
 
 def _known(values: Sequence[float]) -> Float:

@@ -1,4 +1,4 @@
-"""Scores of what moved against the truth of a simulation."""
+"""Scores of tracked objects against the movers of a simulation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,18 +13,18 @@ from stillmap.tracking.flow_map import FlowMap
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_GAP = 2.0  # s without a beam on somebody, after which he is seen anew
-_TOO_MUCH = 0.2  # share of beams with another object, or of something else
+_MAX_GAP = 2.0  # s without a beam within a sighting
+_MAX_FOREIGN = 0.2  # share of beams with another object, or on another mover
 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A mover while it is seen without a long gap.
+    """A mover observed without a long gap.
 
     Attributes:
         mover: its number.
         beams: (n,) beams on it, rising.
-        scans: (L,) scans that saw it, rising.
+        scans: (L,) scans with these beams, rising.
     """
 
     mover: int
@@ -37,15 +37,14 @@ class ObjectScores:
     """How well objects agree with movers.
 
     Attributes:
-        sightings: of movers that were seen for long enough.
-        whole: how many of them are one object: it has more than half of their beams, no more than
-            a fifth of them is with other objects, and no more than a fifth of its beams then is of
-            anything else.
-        lost, split, merged: how many fail in the first, second, third of these; some in two.
-        switches: times that the object with most beams of a sighting changed from scan to scan.
-        objects: how many were found.
-        false: those with most beams on what is static.
-        speed_error: m/s, median over all scans that saw a mover of the sightings' kind.
+        sightings: number of sightings of movers.
+        whole: sightings that are one object: it has more than half of the beams, other objects have
+            at most a fifth of them, and at most a fifth of its beams then is not on the mover.
+        lost, split, merged: sightings that fail the first, second, third condition; some fail two.
+        switches: changes, from scan to scan, of the object with most beams of a sighting.
+        objects: number of tracked objects.
+        false: those with most beams on static objects.
+        speed_error: m/s, median over all detections of the chosen movers.
     """
 
     sightings: int
@@ -66,14 +65,14 @@ def find_sightings(
     chosen: Sequence[int],
     min_seconds: float = 3.0,
 ) -> list[Sighting]:
-    """When movers were seen, for more than `least` seconds: as many scans as that.
+    """Find the sightings of movers that last for more than `min_seconds` seconds of scans.
 
     Args:
-        mover: (M,) number of what reflected each beam, -1: nothing that moves.
+        mover: (M,) number of the mover that reflected each beam, -1: none.
         offset: (T + 1,) scan t has the beams offset[t]:offset[t + 1].
-        seconds: (T,) when.
+        seconds: (T,) times of the scans.
         chosen: numbers of movers.
-        least: seconds that a mover must be seen for.
+        min_seconds: minimum duration.
     """
     times = np.unique(seconds)  # lasers may scan at once
     period = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
@@ -81,7 +80,7 @@ def find_sightings(
     for number in chosen:
         beams = np.flatnonzero(mover == number)
         scan = np.searchsorted(offset, beams, side="right") - 1
-        gaps = np.flatnonzero(np.diff(seconds[scan]) > _GAP) + 1
+        gaps = np.flatnonzero(np.diff(seconds[scan]) > _MAX_GAP) + 1
         for some in np.split(np.arange(len(beams)), gaps):
             scans = np.unique(scan[some])
             if len(np.unique(seconds[scans])) * period > min_seconds:
@@ -97,13 +96,13 @@ def score_objects(
     seconds: Float,
     chosen: Sequence[int],
 ) -> ObjectScores:
-    """Scores of objects.
+    """Score tracked objects.
 
     Args:
-        objects: what was found.
-        mover: (M,) number of what reflected each beam, -1: nothing that moves.
-        movers: (T, P, 3) where each mover is at each scan; x, y in metres.
-        offset, seconds: of the recording, as `sightings` has them.
+        objects: tracked objects.
+        mover: (M,) number of the mover that reflected each beam, -1: none.
+        movers: (T, P, 3) pose of each mover at each scan; x, y in metres.
+        offset, seconds: of the recording, see `find_sightings`.
         chosen: numbers of the movers that are scored: people.
     """
     owner = np.full(len(mover), -1)
@@ -111,7 +110,7 @@ def score_objects(
         owner[one.beams] = number
     seen = find_sightings(mover, offset, seconds, chosen)
     failed = np.array([_failures(one, owner, mover, offset) for one in seen]).reshape(-1, 3)
-    most = [_most(mover[one.beams]) for one in objects]
+    main = [_most_frequent(mover[one.beams]) for one in objects]
     return ObjectScores(
         sightings=len(seen),
         whole=int(np.sum(~failed.any(axis=1))),
@@ -120,12 +119,12 @@ def score_objects(
         merged=int(failed[:, 2].sum()),
         switches=sum(_switches(one, owner, offset) for one in seen),
         objects=len(objects),
-        false=sum(number < 0 for number in most),
-        speed_error=_speed_error(objects, most, movers, seconds, set(chosen)),
+        false=sum(number < 0 for number in main),
+        speed_error=_speed_error(objects, main, movers, seconds, set(chosen)),
     )
 
 
-def _most(numbers: NDArray[np.int32]) -> int:
+def _most_frequent(numbers: NDArray[np.int32]) -> int:
     values, count = np.unique(numbers, return_counts=True)
     return int(values[count.argmax()])
 
@@ -143,13 +142,13 @@ def _failures(
     of_main = mover[first:last][owner[first:last] == main]
     return (
         bool(count[main] <= 0.5 * n),
-        bool(len(with_objects) - count[main] > _TOO_MUCH * n),
-        bool(np.mean(of_main != one.mover) > _TOO_MUCH),
+        bool(len(with_objects) - count[main] > _MAX_FOREIGN * n),
+        bool(np.mean(of_main != one.mover) > _MAX_FOREIGN),
     )
 
 
 def _switches(one: Sighting, owner: Index, offset: NDArray[np.int64]) -> int:
-    """How often the object with most beams on a mover changes."""
+    """Number of changes, from scan to scan, of the object with most beams on a mover."""
     scan = np.searchsorted(offset, one.beams, side="right") - 1
     found = owner[one.beams] >= 0
     pairs, count = np.unique(
@@ -162,7 +161,7 @@ def _switches(one: Sighting, owner: Index, offset: NDArray[np.int64]) -> int:
 
 def _speed_error(
     objects: Sequence[MovingObject],
-    most: list[int],
+    main: list[int],
     movers: Float,
     seconds: Float,
     chosen: set[int],
@@ -176,7 +175,7 @@ def _speed_error(
             np.linalg.norm(one.velocity, axis=1)
             - np.linalg.norm(velocity[one.scan, number], axis=1)
         )
-        for one, number in zip(objects, most, strict=True)
+        for one, number in zip(objects, main, strict=True)
         if number in chosen
     ]
     return float(np.median(np.concatenate(off))) if off else float("nan")
@@ -189,33 +188,33 @@ def compute_true_flow_map(
     T_map_world: Float,
     resolution: float,
 ) -> FlowMap:
-    """How often squares were crossed by movers while they were seen, in the map frame.
+    """Flow map of the true movers during their sightings, in the map frame.
 
     Args:
-        seen: from `sightings`.
+        seen: from `find_sightings`.
         movers: (T, P, 3) x, y, heading in the world.
         stamp_ns: (T,) of the scans.
         T_map_world: (3, 3).
         resolution: metres.
     """
     none = np.zeros(0, np.intp)
-    ways = []
+    objects = []
     for one in seen:
         x, y, _ = movers[one.scans, one.mover].T
         xy = se2.parameters(T_map_world @ se2.matrix(x, y, np.zeros_like(x)))[:, :2]
         velocity = np.zeros_like(xy)
-        ways.append(
+        objects.append(
             MovingObject(0, one.scans, stamp_ns[one.scans], xy, velocity, (0.0, 0.0), none, 1.0)
         )
-    return compute_flow_map(ways, resolution)
+    return compute_flow_map(objects, resolution)
 
 
 def compute_rank_correlation(found: FlowMap, true: FlowMap, points: Float) -> float:
-    """Spearman's correlation of how often squares were crossed; NaN where nothing ever was.
+    """Spearman's rank correlation of the crossings of squares; NaN where all are equal.
 
     Args:
-        found, true: with squares of the same size.
-        points: (n, 2) metres, points of the floor that was looked at: their squares are compared.
+        found, true: flow maps of one resolution.
+        points: (n, 2) metres, points of the observed floor: their squares are compared.
     """
     from scipy.stats import spearmanr  # takes long to load
 

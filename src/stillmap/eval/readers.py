@@ -1,7 +1,4 @@
-"""Folders that scores are computed from: results of `stillmap map`, simulated recordings.
-
-Text files that scores are computed from: trajectories, relations, odometry.
-"""
+"""Readers of what scores are computed from: simulations, trajectories, relations, odometry."""
 
 import logging
 import math
@@ -31,19 +28,19 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A simulated recording and its truth. Arrays of truth are read when asked for."""
+    """A simulated recording and its truth, whose arrays are read on demand."""
 
     folder: Path
     recording: Recording
 
     def static(self) -> Bool:
-        """(M,) True where something static reflected the beam; meaningful where it hit."""
+        """(M,) True where a static object reflected the beam; meaningful for hits."""
         return read_array(self.folder / "truth/static.npy", (self.recording.n_beams,), "b")
 
     def walls(self) -> Float:
         """(W, 4) segments x0, y0, x1, y1 in the world frame, W >= 1; of planar recordings."""
         if self.recording.dimension != 2:
-            raise InputError("is no planar recording", where=str(self.folder))
+            raise InputError("is not a planar recording", where=str(self.folder))
         path = self.folder / "truth/walls.npy"
         walls = _finite(path, read_array(path, (None, 4), "f"))
         if not len(walls):
@@ -51,7 +48,7 @@ class Truth:
         return walls
 
     def lasting(self) -> Float:
-        """(K, 4) the same of things that were moved or brought and are there at the end."""
+        """(K, 4) segments of moved or added objects that are there at the end."""
         path = self.folder / "truth/lasting.npy"
         if not path.exists():
             return np.empty((0, 4))
@@ -70,14 +67,14 @@ class Truth:
 
 
 def read_truth(path: Path, labels: Labels | None = None) -> Truth:
-    """A simulated recording, given by its folder or by the `truth` folder inside.
+    """Read a simulated recording, given its folder or the `truth` folder inside.
 
     Args:
-        path: the folder. Of one with the two recordings of a rig the flat laser's is taken.
-        labels: of the two the one with their beams is taken.
+        path: the folder. Of a rig with two recordings, that of the flat laser is read.
+        labels: of the two, the recording with these beams is read.
 
     Raises:
-        InputError: it is none. The arrays of truth can still fail later.
+        InputError: it is not a simulation. The arrays of truth can still fail later.
     """
     folder = path.parent if path.name == "truth" and not (path / "truth").exists() else path
     if (folder / "truth").is_dir():
@@ -89,8 +86,8 @@ def read_truth(path: Path, labels: Labels | None = None) -> Truth:
         )
     if labels is None:
         return _truth(inside[0])
-    # both lasers may scan at the same times, as many beams each: where these ended differs
-    return max(map(_truth, inside), key=lambda truth: _share_alike(labels, truth.recording))
+    # both lasers may have equal stamps and numbers of beams; their hits differ
+    return max(map(_truth, inside), key=lambda truth: _matching_share(labels, truth.recording))
 
 
 def _truth(folder: Path) -> Truth:
@@ -98,8 +95,8 @@ def _truth(folder: Path) -> Truth:
     return Truth(folder, recording_of(log) if log.exists() else read_folder(folder))
 
 
-def _share_alike(labels: Labels, recording: Recording) -> float:
-    """The share of beams that hit something in both, or in neither; -1 of other beams."""
+def _matching_share(labels: Labels, recording: Recording) -> float:
+    """Share of beams with equal hits; -1 if the numbers of beams differ."""
     if labels.hit.shape != recording.hit.shape:
         return -1.0
     blocks = arrays.iter_blocks(labels.hit, recording.hit)
@@ -108,7 +105,7 @@ def _share_alike(labels: Labels, recording: Recording) -> float:
 
 
 def require_same_beams(labels: Labels, truth: Truth, result: Path) -> None:
-    """Labels and truth speak of the same beams.
+    """Check that labels and truth are of the same beams.
 
     Raises:
         InputError: scans, beams or stamps differ.
@@ -127,7 +124,7 @@ def require_same_beams(labels: Labels, truth: Truth, result: Path) -> None:
     differ |= labels.offset[1:] != truth.recording.offset[1:]
     if differ.any():
         raise InputError(
-            f"scan {int(np.argmax(differ))} is another one than in {truth.folder}",
+            f"scan {int(np.argmax(differ))} differs from that in {truth.folder}",
             where=str(result / "beams"),
             hint="is it the result of another recording?",
         )
@@ -143,7 +140,7 @@ _RELATION = "t1 t2 x y z roll pitch yaw"
 
 _POSE = "t x y theta, or stamp x y z qx qy qz qw"
 
-_HEAD = 1 << 16  # bytes: what stands before the first row
+_HEAD = 1 << 16  # bytes, of the lines before the first row
 
 _log = logging.getLogger(__name__)
 
@@ -157,10 +154,10 @@ class Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Rows `t x y theta` or TUM rows, whichever the file holds.
+    """Read rows `t x y theta` or TUM rows.
 
     Raises:
-        InputError: the file cannot be read, or a line of it is no pose.
+        InputError: the file cannot be read, or a line is not a pose.
     """
     if _first_row(path, _POSE).count == 4:
         rows = _rows(path, 4, "t x y theta")
@@ -176,7 +173,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def read_planar_trajectory(path: Path) -> Float:
-    """The same file as (N, 4) t, x, y, theta; of a pose in space the yaw is taken."""
+    """Read a trajectory as (N, 4) t, x, y, theta; of 3D poses the yaw is taken."""
     trajectory = read_trajectory(path)
     T = trajectory.poses
     yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
@@ -184,18 +181,18 @@ def read_planar_trajectory(path: Path) -> Float:
 
 
 def read_relations(path: Path) -> Float:
-    """(R, 8) rows t1, t2, x, y, z, roll, pitch, yaw.
+    """Read relations (R, 8): t1, t2, x, y, z, roll, pitch, yaw.
 
     Raises:
-        InputError: the file cannot be read, or a line of it is no relation.
+        InputError: the file cannot be read, or a line is not a relation.
     """
     return _rows(path, 8, _RELATION)
 
 
 def read_odometry(path: Path) -> Float:
-    """(K, 4) t, x, y, theta of a CARMEN log, plain or gzip, or of a trajectory file.
+    """Read odometry (K, 4) t, x, y, theta of a CARMEN log, plain or gzip, or a trajectory file.
 
-    Of a log the ODOM lines count; where it has none, the robot poses of its laser lines do.
+    Of a log the ODOM lines are read or, without any, the robot poses of its laser lines.
 
     Raises:
         InputError: the file cannot be read or holds no odometry.
@@ -214,7 +211,7 @@ def read_odometry(path: Path) -> Float:
 def to_seconds(stamp_ns: NDArray[np.int64]) -> Float:
     """The double nearest to each stamp, as if parsed from its decimal text.
 
-    Dividing the array would round twice, and move stamps of our century by up to 2e-7 s.
+    Dividing the array would round twice, which moves current stamps by up to 2e-7 s.
     """
     return np.array([stamp / 10**9 for stamp in stamp_ns.tolist()], np.float64)
 
@@ -237,7 +234,7 @@ class _FirstRow:
 
 
 def _first_row(path: Path, wanted: str) -> _FirstRow:
-    """What the first row looks like: how many columns, and whether it starts with a word."""
+    """Number of columns of the first row, and whether it starts with a word."""
     require_regular(path)
     text = read_head(path, _HEAD).decode("utf-8", "replace")
     for line in text.splitlines():
@@ -256,7 +253,7 @@ def _is_number(word: str) -> bool:
 
 
 def _rows(path: Path, columns: int, names: str) -> Float:
-    """(N, columns) finite numbers; what follows a # is a comment."""
+    """(N, columns) finite numbers; # begins a comment."""
     try:
         lines = read_text(path, MAX_BYTES).splitlines()
     except UnicodeDecodeError as error:
@@ -277,7 +274,7 @@ def _row(words: list[str], columns: int, names: str, where: str) -> list[float]:
     try:
         row = [float(word) for word in words]
     except ValueError as error:
-        raise InputError("holds something that is no number", where=where, hint=names) from error
+        raise InputError("holds a word that is not a number", where=where, hint=names) from error
     if not all(math.isfinite(value) for value in row):
         raise InputError("holds a number that is not finite", where=where)
     return row

@@ -1,10 +1,9 @@
 """Relation errors of a trajectory in the plane.
 
 Kuemmerle et al., "On measuring the accuracy of SLAM algorithms", Autonomous Robots 27 (2009):
-a trajectory is judged by how well it reproduces known displacements between pairs of its poses,
-so that neither the choice of the map frame nor one early turn decides the score. Where their
-program and their text differ, the default follows the program, whose numbers are the published
-ones.
+a trajectory is scored by known displacements between pairs of its poses, which are independent of
+the map frame. Where their program and their text differ, the default follows the program, which
+produced the published numbers.
 """
 
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ MAX_DT = 0.1  # seconds, as in the authors' program
 
 @dataclass(frozen=True)
 class Spread(Scores):
-    """Mean and sample standard deviation of absolute and of squared errors, median, largest."""
+    """Mean and sample standard deviation of absolute and squared errors, median and maximum."""
 
     mean: float
     std: float
@@ -35,13 +34,13 @@ class Spread(Scores):
 
 @dataclass(frozen=True)
 class RelationErrors(Scores):
-    """Errors over the relations that could be used.
+    """Errors over the usable relations.
 
     Attributes:
-        relations: all that were given.
+        relations: number of relations.
         used: those with a pose at both ends.
-        stamps: different times that the relations name.
-        stamps_by_odometry: of these, times that only odometry could reach.
+        stamps: number of distinct times of the relations.
+        stamps_by_odometry: those whose pose is extrapolated by odometry.
         translation: metres. rotation: degrees. NaN where no relation was used.
     """
 
@@ -62,20 +61,19 @@ def compute_relation_errors(
 ) -> RelationErrors:
     """Compare the displacements of a trajectory with known ones.
 
-    The pose at a time is the nearest one within `max_dt`. Beyond it the nearest pose is moved by
-    the odometry between the two times (nearest odometry rows); without odometry, the relation is
-    left out.
+    The pose at a time is the nearest one within `max_dt`; beyond it, the nearest pose plus the
+    odometry between the two times. Without odometry such a relation is left out.
 
     Args:
         trajectory: (N, 4) t, x, y, theta in seconds, metres, radians; N >= 1, sorted by t.
         relations: (R, 8) t1, t2, x, y, z, roll, pitch, yaw; only x, y and yaw are compared.
         odometry: (K, 4) as `trajectory`, K >= 1.
         max_dt: seconds.
-        compose: error as the displacement that leads from the reference to the estimate, as in
-            the paper's equation; otherwise the difference of the components, as in its program.
+        compose: error as the displacement from the reference to the estimate, as in the paper's
+            equation; else the difference of the components, as in its program.
     """
     times, index = np.unique(relations[:, :2].ravel(), return_inverse=True)
-    poses, known, by_odometry = _poses_at(times, trajectory, odometry, max_dt)
+    poses, known, by_odometry = _look_up_poses(times, trajectory, odometry, max_dt)
     first, second = index.reshape(-1, 2).T
     used = known[first] & known[second]
     estimate = _displacement(poses[first[used]], poses[second[used]])
@@ -86,12 +84,12 @@ def compute_relation_errors(
         used=int(used.sum()),
         stamps=len(times),
         stamps_by_odometry=by_odometry,
-        translation=_spread(np.hypot(error[:, 0], error[:, 1])),
-        rotation=_spread(np.degrees(np.abs(se2.wrap(error[:, 2])))),
+        translation=_summarize(np.hypot(error[:, 0], error[:, 1])),
+        rotation=_summarize(np.degrees(np.abs(se2.wrap(error[:, 2])))),
     )
 
 
-def _poses_at(
+def _look_up_poses(
     times: Float, trajectory: Float, odometry: Float | None, max_dt: float
 ) -> tuple[Float, NDArray[np.bool_], int]:
     index, distance = nearest_index(trajectory[:, 0], times)
@@ -101,7 +99,7 @@ def _poses_at(
         return poses, ~far, 0
     start, _ = nearest_index(odometry[:, 0], trajectory[index[far], 0])
     end, _ = nearest_index(odometry[:, 0], times[far])
-    poses[far] = _moved(poses[far], _displacement(odometry[start, 1:], odometry[end, 1:]))
+    poses[far] = _apply(poses[far], _displacement(odometry[start, 1:], odometry[end, 1:]))
     return poses, np.ones(len(times), bool), int(far.sum())
 
 
@@ -110,12 +108,12 @@ def _displacement(a: Float, b: Float) -> Float:
     return se2.parameters(se2.inverse(se2.matrix(*a.T)) @ se2.matrix(*b.T))
 
 
-def _moved(a: Float, step: Float) -> Float:
+def _apply(a: Float, step: Float) -> Float:
     """a step for (N, 3) poses."""
     return se2.parameters(se2.matrix(*a.T) @ se2.matrix(*step.T))
 
 
-def _spread(error: Float) -> Spread:
+def _summarize(error: Float) -> Spread:
     if not len(error):
         return Spread(*[float("nan")] * 6)
     squared = error**2

@@ -1,12 +1,8 @@
-"""Absolute and relative errors of a trajectory, in the plane or in space.
+"""Absolute and relative errors of a trajectory, in 2D or 3D.
 
 Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012. Alignment: the
 rigid case of Umeyama, "Least-squares estimation of transformation parameters between two point
 patterns", PAMI 13 (1991); the scale is never estimated, since a laser measures it.
-
-Poses of a result beside those that are true.
-
-Which of a list of times lies nearest to another time.
 """
 
 from dataclasses import dataclass
@@ -31,9 +27,9 @@ Unit = Literal["m", "frames"]
 def nearest_index(
     stamps: NDArray[np.float64], at: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Index of the nearest of the sorted `stamps` (N >= 1) for each of `at`, and how far it is.
+    """Index of the nearest of sorted `stamps` (N >= 1) to each of `at`, and the distance to it.
 
-    Of two as near the earlier one is taken. Any unit; also used for distances along a path.
+    Of two equally near ones the earlier. Any unit; also used for distances along a path.
     """
     after = np.searchsorted(stamps, at).clip(0, len(stamps) - 1)
     before = (after - 1).clip(0)
@@ -41,14 +37,14 @@ def nearest_index(
     return index, np.abs(stamps[index] - at)
 
 
-_PLANAR = 1e-6  # metres and sines: what is left of a plane after text and quaternions
-
-_PATH_TOLERANCE = 0.1  # of the distance asked for
+_PLANAR_TOLERANCE = 1e-6  # metres and sines: rounding of text and quaternions
+_PATH_TOLERANCE = 0.1  # of the distance between the poses of a pair
+_STAMP_TOLERANCE = 1e-6  # s: a result carries the stamps of its recording
 
 
 @dataclass(frozen=True)
 class ErrorStats(Scores):
-    """NaN where there was nothing to measure."""
+    """Summary of errors; NaN of none."""
 
     rmse: float
     mean: float
@@ -68,16 +64,16 @@ class RelativeErrors(Scores):
 def associate_trajectories(
     estimated_s: Float, reference_s: Float, max_dt: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Indices of poses that belong together by their stamps.
+    """Indices of matching poses by their stamps.
 
-    The very same stamps belong together one by one. Else each pose of the trajectory with fewer of
-    them takes the nearest of the other one, when it lies within `max_dt` seconds.
+    Equal arrays of stamps match one to one. Else each pose of the shorter trajectory is matched
+    with the nearest one of the other within `max_dt` seconds.
 
     Args:
         estimated_s, reference_s: (N,) and (K,) seconds, sorted, N, K >= 1.
 
     Raises:
-        InputError: no two stamps lie that near.
+        InputError: no two stamps are that close.
     """
     if np.array_equal(estimated_s, reference_s):  # stamps may repeat
         return np.arange(len(estimated_s)), np.arange(len(estimated_s))
@@ -94,21 +90,21 @@ def associate_trajectories(
 
 
 def project_flat_trajectories(a: Float, b: Float) -> tuple[Float, Float]:
-    """Both trajectories (N, 4, 4) as (N, 3, 3) when neither leaves the plane z = 0.
+    """Both trajectories (N, 4, 4) as (N, 3, 3) if both lie in the plane z = 0.
 
-    An alignment in space may turn a flat trajectory over; one in the plane may not.
+    A 3D alignment may flip a flat trajectory; a 2D one cannot.
     """
     return (planar(a), planar(b)) if _is_flat(a) and _is_flat(b) else (a, b)
 
 
 def planar(T: Float) -> Float:
-    """(N, 3, 3) from flat poses (N, 4, 4)."""
+    """(N, 3, 3) of flat poses (N, 4, 4)."""
     keep = np.array([0, 1, 3])
     return T[:, keep[:, None], keep]
 
 
 def _is_flat(T: Float) -> bool:
-    return bool(np.all(np.abs(T[:, 2, :] - (0.0, 0.0, 1.0, 0.0)) < _PLANAR))
+    return bool(np.all(np.abs(T[:, 2, :] - (0.0, 0.0, 1.0, 0.0)) < _PLANAR_TOLERANCE))
 
 
 def align_points(source: Float, target: Float) -> Float:
@@ -116,7 +112,7 @@ def align_points(source: Float, target: Float) -> Float:
     centre_source, centre_target = source.mean(0), target.mean(0)
     U, _, Vt = np.linalg.svd((target - centre_target).T @ (source - centre_source))
     D = source.shape[1]
-    # the last axis is the one whose reversal costs least: it keeps R a rotation
+    # keep R a rotation: the last axis costs least to reverse
     flip = np.ones(D)
     flip[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
     T = np.eye(D + 1)
@@ -126,11 +122,11 @@ def align_points(source: Float, target: Float) -> Float:
 
 
 def align(estimated: Float, truth: Float, lever: float = 1.0) -> Float:
-    """T_truth_estimated that lays estimated poses on true ones, (N, D+1, D+1) each, N >= 1.
+    """T_truth_estimated that aligns estimated with true poses, (N, D+1, D+1) each, N >= 1.
 
-    Every pose counts as points `lever` metres from its origin along both directions of each of
-    its axes. So headings settle what positions leave open, the turn of a robot that stood still
-    or drove straight, and weigh little against a path much longer than the lever.
+    Every pose counts as points `lever` metres from its origin in both directions of each axis. So
+    headings determine the rotation where positions do not (a robot at rest, or on a straight
+    line), and weigh little against a path much longer than the lever.
     """
     return align_points(_arms(estimated, lever), _arms(truth, lever))
 
@@ -146,7 +142,7 @@ def compute_absolute_errors(estimated: Float, reference: Float) -> ErrorStats:
     """ATE in metres: distances between positions after the best rigid alignment.
 
     Args:
-        estimated, reference: (N, D+1, D+1) poses that belong together, N >= 1.
+        estimated, reference: (N, D+1, D+1) associated poses, N >= 1.
     """
     D = estimated.shape[-1] - 1
     source, target = estimated[:, :D, D], reference[:, :D, D]
@@ -163,12 +159,12 @@ def compute_relative_errors(
     path comes nearest to delta; a pair more than a tenth off is left out.
 
     Args:
-        estimated, reference: (N, D+1, D+1) poses P and Q that belong together.
-        delta: > 0; a whole number when the unit is frames.
+        estimated, reference: (N, D+1, D+1) associated poses P and Q.
+        delta: > 0; an integer where the unit is frames.
     """
     i, j = _pairs(reference, delta, unit)
-    wanted = se2.inverse(reference[i]) @ reference[j]
-    error = se2.inverse(wanted) @ se2.inverse(estimated[i]) @ estimated[j]
+    true_step = se2.inverse(reference[i]) @ reference[j]
+    error = se2.inverse(true_step) @ se2.inverse(estimated[i]) @ estimated[j]
     D = error.shape[-1] - 1
     return RelativeErrors(
         pairs=len(i),
@@ -181,11 +177,11 @@ def _pairs(reference: Float, delta: float, unit: Unit) -> tuple[NDArray[np.intp]
     if unit == "frames":
         step = round(delta)
         if step != delta or step < 1:
-            raise InputError(f"a step of {delta:g} frames is no whole number of them")
+            raise InputError(f"a step of {delta:g} frames is not a positive integer")
         first = np.arange(max(len(reference) - step, 0))
         return first, first + step
     if not delta > 0:
-        raise InputError(f"a step of {delta:g} m leads nowhere")
+        raise InputError(f"a step of {delta:g} m is not positive")
     position = reference[:, :-1, -1]
     path = np.concatenate([[0.0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
     second, off = nearest_index(path, path + delta)
@@ -194,14 +190,12 @@ def _pairs(reference: Float, delta: float, unit: Unit) -> tuple[NDArray[np.intp]
 
 
 def _angle(R: Float) -> Float:
+    """(N,) rad of rotations (N, D, D)."""
     if R.shape[-1] == 2:
         return np.abs(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
-    # scipy < 1.15 refuses an empty stack
-    return (
-        np.asarray(scipy.spatial.transform.Rotation.from_matrix(R).magnitude())
-        if len(R)
-        else np.zeros(0)
-    )
+    if not len(R):  # scipy < 1.15 refuses an empty stack
+        return np.zeros(0)
+    return np.asarray(scipy.spatial.transform.Rotation.from_matrix(R).magnitude())
 
 
 def summarize_errors(error: Float) -> ErrorStats:
@@ -216,22 +210,19 @@ def summarize_errors(error: Float) -> ErrorStats:
     )
 
 
-_STAMP_TOLERANCE = 1e-6  # seconds: a result carries the stamps of its recording
-
-
 def read_paired_poses(
     result: Path, truth: Truth
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Poses (N, 4, 4) of a result's trajectory, and the true ones (N, D+1, D+1) at their stamps.
+    """Poses (N, 4, 4) of a result and true ones (N, D+1, D+1) at the same stamps.
 
     Raises:
-        InputError: the trajectory is missing or damaged, or is of another recording.
+        InputError: the trajectory is missing, damaged, or of another recording.
     """
     estimated = readers.read_trajectory(result / "trajectory.tum")
     stamps = readers.to_seconds(truth.recording.stamp_ns)
     try:
         i, j = associate_trajectories(estimated.stamp_s, stamps, _STAMP_TOLERANCE)
     except InputError as error:
-        what = f"is not of the recording in {truth.folder}: they have no stamp in common"
+        what = f"is not of the recording in {truth.folder}: no stamp in common"
         raise InputError(what, where=str(result)) from error
     return estimated.poses[i], truth.poses()[j]

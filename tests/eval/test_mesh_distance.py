@@ -94,7 +94,7 @@ def test_a_large_mesh_is_looked_at_in_parts():
         [np.stack([k, k + 1, k + n], axis=1), np.stack([k + 1, k + n + 1, k + n], axis=1)]
     ).astype(np.int32)
     points = rng.uniform([1, 1, -0.3], [57, 57, 0.6], (400, 3))
-    whole = mesh_distance._to_mesh(points, vertices, faces, 0.3)
+    whole = mesh_distance._distance_to_tile(points, vertices, faces, 0.3)
     np.testing.assert_allclose(mesh_distance.distance_to_mesh(points, vertices, faces, 0.3), whole)
     far = np.array([[500.0, 0.0, 0.0]])
     assert np.isinf(mesh_distance.distance_to_mesh(far, vertices, faces, 0.3)).all()

@@ -160,7 +160,7 @@ def test_what_pictures_see_from_far_away_does_not_count() -> None:
     record = _record(*_floor((-2, 2), (-1.5, 1.5)))
     of_mesh = sample_surface(record.vertices, record.faces, 20_000)
     none = _pictures(np.zeros((30, 40), np.uint16))
-    free = find_visible_samples(record, of_mesh, none, T_WORLD_MAP, farthest=10**0.5)
+    free = find_visible_samples(record, of_mesh, none, T_WORLD_MAP, max_distance=10**0.5)
     assert free.mean() == pytest.approx(np.pi / 12, abs=0.01)  # a circle of 1 m
 
 

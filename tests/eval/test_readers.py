@@ -44,7 +44,7 @@ def test_seconds_are_those_of_the_text():
         ("", "", "no rows"),
         ("# only words\n\n", "", "no rows"),
         ("0 1 2 3\n1 2 3\n", ":2", "3 columns"),
-        ("0 1 2 3\n\n# x\n1 2 three 4\n", ":4", "no number"),
+        ("0 1 2 3\n\n# x\n1 2 three 4\n", ":4", "not a number"),
         ("0 1 2 3\n1 nan 2 3\n", ":2", "not finite"),
         ("0 1 2 3\n1 2 inf 3\n", ":2", "not finite"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1\n", ":2", "7 columns"),
