@@ -1,5 +1,6 @@
 """A made-up result: a fake hall with walkers, its maps counted by dense sampling along beams."""
 
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -228,6 +229,17 @@ def made_up_evidence(occupancy):
     looks = np.ceil(occupancy.alpha + occupancy.beta).astype(np.uint16)
     clear = looks // 2
     return Coverage(looks, clear, (clear < 3) & ~np.isnan(occupancy.p_occupied), 3, 0.3)
+
+
+@pytest.fixture(scope="session")
+def section():
+    """A function: the section of a report with a heading; empty where there is none."""
+
+    def cut(html, heading):
+        found = re.search(f"<section><h2>{heading}</h2>.*?</section>", html, re.DOTALL)
+        return found[0] if found else ""
+
+    return cut
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ import pytest
 
 from stillmap.results.objects import write_objects, write_ply, write_traffic
 from stillmap.results.report.figures import draw_map, map_window
-from stillmap.results.report.objects import draw_traffic, objects_section
+from stillmap.results.report.objects import draw_traffic
 from stillmap.results.report.page import render_report
 from stillmap.tracking import ObjectOptions, compute_flow_map
 
@@ -68,7 +68,7 @@ def test_nothing_moved(tmp_path, result):
     write_traffic(tmp_path / "traffic.npz", nothing.traffic)
     with np.load(tmp_path / "traffic.npz", allow_pickle=False) as read:
         assert read["crossings"].shape == (0, 0)
-    assert "Nothing that could be followed" in render_report(nothing)
+    assert "No moving object was tracked" in render_report(nothing)
 
 
 def test_empty_clouds_are_clouds(tmp_path):
@@ -86,13 +86,14 @@ def test_traffic_file(tmp_path, result):
         assert float(read["resolution"]) == 0.5
 
 
-def test_the_section_shows_every_way(result):
-    text = objects_section(result)
+def test_report_shows_every_track(result, section):
+    text = section(render_report(result), "Moving objects")
     assert text.count("<polyline") == len(result.objects)
     assert text.count("<tr>") == 1 + len(result.objects)
-    assert "2 things that moved were followed" in text
+    assert "2 objects were tracked" in text
     off = dataclasses.replace(result.options, objects=ObjectOptions(enabled=False))
-    assert objects_section(dataclasses.replace(result, options=off)) == ""
+    html = render_report(dataclasses.replace(result, options=off))
+    assert section(html, "Moving objects") == ""
 
 
 def test_squares_are_darker_where_more_crossed(result):

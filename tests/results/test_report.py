@@ -8,21 +8,20 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stillmap.results.report import tables
+from stillmap.results.report import formatting
+from stillmap.results.report.curves import curve_of, round_down
 from stillmap.results.report.figures import (
     ORANGE,
     UNKNOWN,
-    VEIL,
+    VEIL_ALPHA,
     VIOLET,
     draw_map,
     draw_points,
-    draw_poorly_observed,
     draw_snapshot,
-    likelihood_svg,
+    draw_thinly_observed,
     map_window,
 )
-from stillmap.results.report.page import likelihood_sentence, loops_sentence, render_report
-from stillmap.results.report.tables import learned_section
+from stillmap.results.report.page import render_report
 
 VOID = {"meta", "img", "input", "br", "link", "hr"}
 
@@ -71,7 +70,7 @@ def picture(attrs):
     return Image.open(io.BytesIO(base64.b64decode(data)))
 
 
-def test_nothing_is_fetched_from_anywhere(html, page):
+def test_page_makes_no_request(html, page):
     for tag, attrs in page.tags:
         assert tag not in {"script", "link", "iframe", "object", "embed", "base"}
         for name in ("src", "href", "xlink:href", "srcset", "action", "poster"):
@@ -82,7 +81,7 @@ def test_nothing_is_fetched_from_anywhere(html, page):
     assert set(re.findall(r"url\(([^)])", html)) <= {"#"}
 
 
-def test_what_came_from_files_is_text_only(page):
+def test_text_from_files_is_escaped(page):
     text = "".join(page.text)
     for foreign in (
         "hall <1>.clf",
@@ -97,23 +96,23 @@ def test_headline_figures(page):
     text = "|".join(page.text)
     for value in ("60", "10,860", "12.4 %", "7.3 s", "97 MB", "12 s"):
         assert f"|{value}|" in text
-    assert "number 3 kept; converged" in text
+    assert "iteration 3 kept, converged" in text
     assert "lines 203, 204," in text
     assert "15 more" in text
 
 
-def test_pictures_have_words_and_show_the_maps(page, result):
+def test_images_have_alt_texts_and_show_the_maps(page, result):
     images = page.named("img")
-    # raw, filtered, a veil and the dots over it, ways, traffic, three iterations
+    # raw, filtered with two layers over it, tracks, traffic, three iterations
     assert [bool(image["alt"]) for image in images] == [True, True, False, False] + [True] * 5
     for image in images:
         assert picture(image).size == (int(image["width"]), int(image["height"]))
     raw, filtered = (np.asarray(picture(image).convert("RGB")) for image in images[:2])
     assert raw.shape == filtered.shape
-    # the ghosts that the walkers leave are in the raw map alone
+    # the traces of the walkers are in the raw map only
     assert (raw.astype(int) + 20 < filtered).all(axis=2).sum() > 500
-    veil = np.asarray(picture(images[2]).convert("RGBA"))
-    assert set(map(tuple, veil.reshape(-1, 4))) == {(*VIOLET, VEIL), (*UNKNOWN, 0)}
+    layer = np.asarray(picture(images[2]).convert("RGBA"))
+    assert set(map(tuple, layer.reshape(-1, 4))) == {(*VIOLET, VEIL_ALPHA), (*UNKNOWN, 0)}
     dots = np.asarray(picture(images[3]).convert("RGBA"))
     assert set(map(tuple, dots.reshape(-1, 4))) == {(*ORANGE, 255), (*UNKNOWN, 0)}
     assert len(page.named("polyline")[0]["points"].split()) == result.recording.n_scans
@@ -130,61 +129,61 @@ def test_map_colours(result):
     np.testing.assert_array_equal(pixels, [[UNKNOWN, white, white], [white, black, UNKNOWN]])
 
 
-def test_the_window_holds_every_occupied_cell_of_both_maps(result):
+def test_window_contains_every_occupied_cell_of_both_maps(result):
     p = np.zeros((100, 300), np.float32)
     p[40, 50] = p[60, 90] = 0.7
     other = np.zeros((50, 100), np.float32)
     other[10, 20] = 0.7
     b = dataclasses.replace(small_map(result, other), origin=(100.0, 30.0, 0.0))
     assert map_window([small_map(result, p), b]) == (44.0, 34.0, 125.0, 67.0)
-    # none occupied: what is known; nothing known: everything
+    # none occupied: the known cells; none known: the whole map
     p[:] = np.nan
     assert map_window([small_map(result, p)]) == (0.0, 0.0, 300.0, 100.0)
     p[5, 6] = 0.1
     assert map_window([small_map(result, p)]) == (2.0, 1.0, 11.0, 10.0)
 
 
-def test_dots_lie_where_the_points_are():
+def test_points_are_drawn_at_their_positions():
     points = np.array([[0.5, 0.5], [2.5, 1.5], [9.0, 9.0], [-0.1, 0.5]], np.float32)
     dots = np.asarray(draw_points(points, (0, 0, 3, 2), (3, 2)))
     np.testing.assert_array_equal(dots, [[0, 0, 1], [1, 0, 0]])
 
 
-def test_the_veil_lies_over_thin_places(result):
+def test_layer_covers_thinly_observed_cells(result):
     p = np.array([[0, 1, np.nan], [np.nan, 0, 0]], np.float32)
     thin = np.array([[0, 1, 0], [0, 0, 1]], bool)
-    veil = np.asarray(draw_poorly_observed(small_map(result, p), thin, (-1, 0, 3, 2)))
-    np.testing.assert_array_equal(veil, [[0, 0, 0, 1], [0, 0, 1, 0]])
+    layer = np.asarray(draw_thinly_observed(small_map(result, p), thin, (-1, 0, 3, 2)))
+    np.testing.assert_array_equal(layer, [[0, 0, 0, 1], [0, 0, 1, 0]])
 
 
-def test_the_veil_is_reduced_as_the_map_is(result):
+def test_layer_of_thinly_observed_cells_is_reduced_as_the_map_is(result):
     p, thin = np.zeros((4000, 4000), np.float32), np.zeros((4000, 4000), bool)
-    p[:2000] = np.nan  # of a square that is hardly known the known cells count
+    p[:2000] = np.nan  # only known cells of a square count
     p[:2000, ::7] = 0.0
     thin[:2000, 0:1000:7] = thin[2000:, 1000:2000] = True
     thin[3000, 3000] = True
     occupancy, window = small_map(result, p), (0, 0, 4000, 4000)
-    image = draw_poorly_observed(occupancy, thin, window)
+    image = draw_thinly_observed(occupancy, thin, window)
     assert image.size == draw_map(occupancy, window).size
-    veil = np.asarray(image)
+    layer = np.asarray(image)
     middle = image.height // 2
     quarter = image.width // 4
-    assert veil[: middle - 1, quarter + 1 : 2 * quarter - 1].all()
-    assert not veil[: middle - 1, 2 * quarter + 1 :].any()
-    columns = np.flatnonzero(veil[middle + 1 :].all(axis=0))
+    assert layer[: middle - 1, quarter + 1 : 2 * quarter - 1].all()
+    assert not layer[: middle - 1, 2 * quarter + 1 :].any()
+    columns = np.flatnonzero(layer[middle + 1 :].all(axis=0))
     assert 0 < columns.max() <= quarter
-    assert not veil[middle + 1 :, :quarter][:, columns.max() + 1 :].any()
+    assert not layer[middle + 1 :, :quarter][:, columns.max() + 1 :].any()
 
 
-def test_how_much_is_thin_is_said(page, result):
+def test_thinly_observed_area(page, result):
     text = " ".join("".join(page.text).split())
-    thin, known = (np.count_nonzero(one) for one in (result.evidence.thin, result.map.beta > 0))
+    thin, known = (np.count_nonzero(one) for one in (result.evidence.thinly_observed, result.map.beta > 0))
     assert f"{0.01 * thin:,.1f} m² of the filtered map" in text
-    assert f"{100 * thin / known:.1f} % of what is known" in text
-    assert "fewer than 3 looks" in text
-    nothing = dataclasses.replace(result.evidence, thin=np.zeros_like(result.evidence.thin))
+    assert f"{100 * thin / known:.1f} % of the known area" in text
+    assert "fewer than 3 observations" in text
+    nothing = dataclasses.replace(result.evidence, thinly_observed=np.zeros_like(result.evidence.thinly_observed))
     text = render_report(dataclasses.replace(result, evidence=nothing))
-    assert "No place that is known rests on thin evidence." in text
+    assert "All of the known area is well observed." in text
 
 
 def test_snapshot_shows_map_and_dots(result):
@@ -210,28 +209,49 @@ def test_large_maps_are_reduced_but_keep_thin_walls(result):
     assert (pixels[image.height // 4 + 2 :, : wall - 2] == 255).all()
 
 
-def test_a_report_of_a_large_map_stays_small(result):
+def test_report_of_a_large_map_stays_small(result):
     rng = np.random.default_rng(0)
-    # noise is the worst that PNG can be given
+    # noise is the worst case for PNG
     large = dataclasses.replace(
         result.map, p_occupied=rng.random((4000, 4000), np.float32), resolution=0.05
     )
-    evidence = dataclasses.replace(result.evidence, thin=rng.random((4000, 4000)) < 0.5)
+    evidence = dataclasses.replace(result.evidence, thinly_observed=rng.random((4000, 4000)) < 0.5)
     text = render_report(dataclasses.replace(result, map=large, raw_map=large, evidence=evidence))
     assert len(text.encode()) < 10_000_000
     Page(text)
 
 
-def test_curve_is_the_same_every_time_and_marks_the_best(result):
-    titles = ("one curve", "the other")
-    svg = likelihood_svg(result.iterations, 3, titles)
-    assert svg == likelihood_svg(result.iterations, 3, titles)
-    assert svg != likelihood_svg(result.iterations, 2, titles)
-    assert all(title in svg for title in titles)
-    assert "http" not in svg
-    assert not re.search(r"#01020\d", svg)
-    for colour in ("--ink", "--accent", "--orange"):
-        assert f"var({colour})" in svg
+def test_curve_marks_the_best_and_spans_the_axes():
+    curve = curve_of([1, 2, 3], [-30.0, -20.0, -25.0], best=2)
+    left, top, right, bottom = curve.box
+    assert curve.best == curve.dots[1]
+    x, y = np.transpose(curve.dots)
+    assert (np.diff(x) > 0).all()
+    assert y.argmin() == 1
+    assert left <= x.min() <= x.max() <= right
+    assert top <= y.min() <= y.max() <= bottom
+    assert [label for _, label in curve.x_ticks] == ["1", "2", "3"]
+    ticks = np.array([float(label) for _, label in curve.y_ticks])
+    heights = np.array([height for height, _ in curve.y_ticks])
+    # ticks lie where their values would
+    np.testing.assert_allclose(np.interp(-25.0, ticks, heights), curve.dots[2][1], atol=0.2)
+
+
+def test_curve_has_gaps_where_values_are_not_finite():
+    values = [-4.0, -3.0, float("nan"), -2.0, float("-inf"), -1.5, -1.0]
+    curve = curve_of(range(1, 8), values, best=3)
+    assert curve.best is None
+    assert len(curve.dots) == 5
+    assert [len(line.split()) for line in curve.lines] == [2, 2]
+    assert curve_of([1, 2], [float("nan")] * 2, best=1).dots == []
+    assert len(curve_of([1, 2], [-5e9, -5e9], best=1).y_ticks) > 1
+
+
+@pytest.mark.parametrize(
+    ("value", "rounded"), [(1.0, 1.0), (4.9, 2.0), (73.0, 50.0), (0.5, 0.5), (0.0019, 0.001)]
+)
+def test_round_down(value, rounded):
+    assert round_down(value) == pytest.approx(rounded)
 
 
 def with_likelihoods(result, values):
@@ -242,17 +262,18 @@ def with_likelihoods(result, values):
     return dataclasses.replace(result, iterations=records)
 
 
-def test_the_report_says_where_the_likelihood_fell(result):
-    def sentence(values):
-        return likelihood_sentence(with_likelihoods(result, values))
+def test_report_names_iterations_where_the_bound_decreased(result, section):
+    def text(values):
+        html = render_report(with_likelihoods(result, values))
+        return " ".join(section(html, "Convergence").split())
 
-    assert "never fell" in sentence([-100, -90, -90])
-    assert "fell at iteration 3 (by 2.2 %)" in sentence([-100, -90, -92, -80])
-    assert "fell at iterations 2, 4 (most, by 3.0 %, at iteration 4)" in sentence(
+    assert "never decreased" in text([-100, -90, -90])
+    assert "decreased at iteration 3 (by 2.2 %)" in text([-100, -90, -92, -80])
+    assert "decreased at iterations 2, 4 (most at iteration 4, by 3.0 %)" in text(
         [-100, -101, -100, -103]
     )
-    assert "one iteration only" in sentence([-5])
-    assert "fell at iteration 3 (by 3.0 %)" in sentence([-100, float("nan"), -103])
+    assert "There was one iteration." in text([-5])
+    assert "decreased at iteration 3 (by 3.0 %)" in text([-100, float("nan"), -103])
 
 
 def estimated_by(result, estimator):
@@ -260,7 +281,7 @@ def estimated_by(result, estimator):
     return dataclasses.replace(result, options=options)
 
 
-def test_the_curves_are_called_what_the_estimator_made_them(result):
+def test_curve_titles_depend_on_the_estimator(result):
     default = render_report(result)
     assert "Bound: log likelihood of the cells" in default
     assert "(5)" not in default
@@ -273,49 +294,54 @@ def test_the_curves_are_called_what_the_estimator_made_them(result):
 def test_one_iteration_makes_no_curve(result):
     one = render_report(dataclasses.replace(result, iterations=result.iterations[:1]))
     assert 'class="curve"' not in one
-    assert "The numbers" in one
+    assert "Table of iterations" in one
+    assert render_report(result).count('class="curve"') == 2
 
 
-def test_loops_in_words(result):
-    sentence = loops_sentence(result)
-    assert sentence == (
-        "Places seen again: 1 of 4 closed a loop; the rest was refused: explains too little (2), "
-        "other loops disagree (1)."
-    )
-    assert sentence in render_report(result)
-    closed = dataclasses.replace(result, loops=result.loops[:1])
-    assert loops_sentence(closed) == "Places seen again: 1 of 1 closed a loop."
-    assert loops_sentence(dataclasses.replace(result, loops=[])) == ""
+def test_loop_closures(result, section):
+    def text(loops):
+        html = render_report(dataclasses.replace(result, loops=loops))
+        return section(html, "Convergence")
+
+    assert (
+        "Loop closure: 1 of 4 candidates accepted; "
+        "rejected: explains too little (2), other loops disagree (1)."
+    ) in text(result.loops)
+    assert "Loop closure: 1 of 1 candidates accepted." in text(result.loops[:1])
+    assert "Loop closure" not in text([])
 
 
 def test_one_snapshot_shows_no_evolution(result):
-    assert "How the map evolved" in render_report(result)
+    assert "Map over the iterations" in render_report(result)
     one = render_report(dataclasses.replace(result, snapshots=result.snapshots[:1]))
-    assert "How the map evolved" not in one
-    assert "Where most moved" in one
+    assert "Map over the iterations" not in one
+    assert "Part with most dynamic returns" in one
 
 
-def learned_text(result):
-    return re.sub(r"\s+", " ", " ".join(Page(learned_section(result)).text))
+@pytest.fixture
+def fitted(section):
+    """A function: the words of the section on fitted parameters."""
+    return lambda result: re.sub(
+        r"\s+", " ", " ".join(Page(section(render_report(result), "Fitted parameters")).text)
+    )
 
 
-def test_what_was_learned_in_words(result):
-    text = learned_text(result)
-    assert "87.3 % hold something that stands still" in text
-    assert "scatter by 1.7 cm" in text
+def test_fitted_parameters(result, fitted):
+    text = fitted(result)
+    assert "87.3 % of the cells in which beams ended are static" in text
+    assert "noise is 1.7 cm" in text
     assert "0.5 s or less 60.0 % 3 s 30.0 % 45 s or more 10.0 %" in text
     assert "1 % or less 90.0 % 15 % or more 10.0 %" in text
-    assert "90 % or less 25.0 % 99.8 % or more 75.0 %" in text  # the least first
-    assert learned_section(result) in render_report(result)
+    assert "90 % or less 25.0 % 99.8 % or more 75.0 %" in text  # in rising order
 
 
-def test_nothing_is_told_that_was_not_learned(result):
-    assert learned_section(dataclasses.replace(result, learned={})) == ""
-    still = dataclasses.replace(result, p_static=np.ones_like(result.p_static))
-    assert "Only 0 beams met something moving" in learned_text(still)
-    assert "or less 60.0 %" not in learned_text(still)
-    uneven = dataclasses.replace(result, learned={**result.learned, "scatter": 0.0})
-    assert "scatter" not in learned_text(uneven)
+def test_parameters_that_were_not_fitted_are_not_shown(result, fitted):
+    assert fitted(dataclasses.replace(result, learned={})) == ""
+    static = dataclasses.replace(result, p_static=np.ones_like(result.p_static))
+    assert "only 0 dynamic returns" in fitted(static)
+    assert "or less 60.0 %" not in fitted(static)
+    noiseless = dataclasses.replace(result, learned={**result.learned, "scatter": 0.0})
+    assert "noise" not in fitted(noiseless)
 
 
 @pytest.mark.parametrize(
@@ -325,45 +351,48 @@ def test_nothing_is_told_that_was_not_learned(result):
         {"stages": {"read": {"seconds": None, "peak_memory_bytes": None}}},
     ],
 )
-def test_a_report_of_less(result, change):
+def test_report_of_an_incomplete_result(result, change):
     Page(render_report(dataclasses.replace(result, **change)))
 
 
-def test_a_map_that_nobody_looked_at_and_one_without_cells(result):
+def test_maps_without_known_cells_and_without_cells(result):
     for p in (np.full((5, 5), np.nan, np.float32), np.zeros((0, 0), np.float32)):
         empty = small_map(result, p)
-        none = dataclasses.replace(result.evidence, thin=np.zeros(p.shape, bool))
+        none = dataclasses.replace(result.evidence, thinly_observed=np.zeros(p.shape, bool))
         Page(render_report(dataclasses.replace(result, map=empty, raw_map=empty, evidence=none)))
 
 
-def test_likelihoods_that_are_no_numbers_are_drawn_as_gaps(result):
+def test_likelihoods_that_are_not_finite(result):
     Page(render_report(with_likelihoods(result, [float("nan"), float("-inf"), -3.0])))
 
 
 @pytest.mark.parametrize(
     ("function", "value", "text"),
     [
-        ("duration_text", 0.0123, "0.012 s"),
-        ("duration_text", 42.4, "42 s"),
-        ("duration_text", 1.7e-5, "under 1 ms"),
-        ("duration_text", 192.0, "3 min 12 s"),
-        ("duration_text", 59.9, "1 min 0 s"),
-        ("duration_text", 7260.0, "2 h 1 min"),
-        ("share_text", 0.0, "0.0 %"),
-        ("share_text", 0.00123, "0.12 %"),
-        ("share_text", 0.1235, "12.3 %"),
-        ("share_text", float("nan"), "unknown"),
-        ("bytes_text", 45_600_000, "46 MB"),
-        ("bytes_text", 2_345_000_000, "2.35 GB"),
-        ("bytes_text", 0, "unknown"),
-        ("number_text", None, "-"),
+        ("format_duration", 0.0123, "0.012 s"),
+        ("format_duration", 42.4, "42 s"),
+        ("format_duration", 1.7e-5, "under 1 ms"),
+        ("format_duration", 192.0, "3 min 12 s"),
+        ("format_duration", 59.9, "1 min 0 s"),
+        ("format_duration", 7260.0, "2 h 1 min"),
+        ("format_share", 0.0, "0.0 %"),
+        ("format_share", 0.00123, "0.12 %"),
+        ("format_share", 0.1235, "12.3 %"),
+        ("format_share", float("nan"), "unknown"),
+        ("format_bytes", 45_600_000, "46 MB"),
+        ("format_bytes", 2_345_000_000, "2.35 GB"),
+        ("format_bytes", 0, "unknown"),
+        ("format_number", None, "-"),
+        ("format_clock", 3_723_400_000_000, "1:02:03.4"),
+        ("format_scalar", True, "yes"),
+        ("format_scalar", None, "not set"),
     ],
 )
-def test_numbers_in_words(function, value, text):
-    assert getattr(tables, function)(value) == text
+def test_numbers_as_text(function, value, text):
+    assert getattr(formatting, function)(value) == text
 
 
-def test_what_was_guessed_is_told(page):
+def test_details_of_the_recording(page):
     text = "".join(page.text)
     assert "threshold how: 12 m repeats (919 x)" in text
     assert "bearings: -1.5708, 1.5708" in text

@@ -1,12 +1,12 @@
-"""The report's part on models: stills of the place as it was, and without its people (Fig. 11), and
-of what moved (Fig. 13)."""
+"""Rendered previews of the models: the place with and without moving objects (Fig. 11), and the
+objects (Fig. 13)."""
 
 import base64
 import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -23,40 +23,41 @@ from stillmap.results.report.renderer import (
     render,
     textured_share,
 )
-from stillmap.results.report.tables import share_text
 
 PLACE_SIZE, OBJECT_SIZE = (640, 400), (300, 225)  # pixels
-MOST_OBJECTS = 8
-_TRIED = 24  # places along the way from which a still may be taken
-_SMALL = 8  # pixels along an edge for one that is tried
-_DIFFERS = 60  # of 3 x 255: somebody stood there
-_LITTLE = 0.1  # a pixel that is painted counts as this many in which somebody stood
-_APART = 0.2  # of the way between two stills along it
-_WIDE, _NARROW = math.radians(80.0), math.radians(45.0)  # of a still along the way, of the others
-_ABOVE = np.array([-0.5, -0.75, 0.7])  # from where the whole is seen
-_OUTER = 0.02  # of the area of what is seen then that may lie beyond each edge
-# of things, turned left from ahead
+MAX_OBJECTS = 8
+_MAX_CANDIDATES = 24  # camera poses tried for the views of the place
+_REDUCTION = 8  # of the image size while trying
+_MIN_DIFFERENCE = 60  # sum over RGB from which a pixel differs between the two textures
+_TEXTURED_WEIGHT = 0.1  # of textured pixels against differing ones
+_MIN_SEPARATION = 0.2  # of the two views, as a share of the camera poses
+_WIDE, _NARROW = (
+    math.radians(80.0),
+    math.radians(45.0),
+)  # field of view: place, overview and objects
+_OVERVIEW = np.array([-0.5, -0.75, 0.7])  # from the place to the camera
+_OUTLIERS = 0.02  # share of the visible area beyond each side of the overview
+# yaw of the camera around an object that looks along x
 _SIDES = {
-    "from ahead": math.radians(-35.0),
-    "from its left": math.radians(85.0),
-    "from behind": math.radians(205.0),
-    "from its right": math.radians(-95.0),
+    "front": math.radians(-35.0),
+    "left": math.radians(85.0),
+    "rear": math.radians(205.0),
+    "right": math.radians(-95.0),
 }
-_MOST_SIDES = 3
-_FRONTS = 0.5  # of what there is to be seen from a side, where the rest are backs
-_RAISED = math.radians(20.0)
-_QUALITY = 85  # of JPEG: photographs, which as PNG would be several megabytes
+_ELEVATION = math.radians(20.0)
+_MAX_SIDES = 3
+_MIN_FRONT_FACES = 0.5  # share of a view's pixels; the rest would be back faces
+_JPEG_QUALITY = 85
 
 
 @dataclass(frozen=True, eq=False)
 class PlacePreview:
-    """The place from one point.
+    """The place from one camera pose.
 
     Attributes:
-        caption: from where.
-        filtered: (h, w, 3) uint8.
-        sharpest: the same with every face painted by its sharpest picture, whoever stood there;
-            None where nobody asked for it.
+        caption: which view it is.
+        filtered: (h, w, 3) uint8, textured without moving objects.
+        sharpest: the same, each face textured from its sharpest image; None where not computed.
     """
 
     caption: str
@@ -66,12 +67,12 @@ class PlacePreview:
 
 @dataclass(frozen=True, eq=False)
 class ObjectPreviews:
-    """What moved.
+    """A moving object.
 
     Attributes:
-        number: of the object.
-        size: metres, length, width and height of its model.
-        sides: by side, (h, w, 3) uint8.
+        number: its id.
+        size: length, width and height of its model in m.
+        sides: (h, w, 3) uint8 by side.
     """
 
     number: int
@@ -81,19 +82,19 @@ class ObjectPreviews:
 
 @dataclass(frozen=True, eq=False)
 class ModelPreviews:
-    """What the report shows of models.
+    """All previews.
 
     Attributes:
-        place: of the place.
-        objects: of what moved.
-        unpainted: share of the surface that no picture shows without somebody before it.
-        why_bare: why no picture paints anything, where none can; else empty.
+        place: of the static surface.
+        objects: of moving objects.
+        untextured: share of the surface without texture.
+        untextured_reason: why no image could texture anything; empty where one could.
     """
 
     place: list[PlacePreview]
     objects: list[ObjectPreviews]
-    unpainted: float
-    why_bare: str = ""
+    untextured: float
+    untextured_reason: str = ""
 
 
 def render_previews(
@@ -102,177 +103,149 @@ def render_previews(
     T_camera_map: Float,
     objects: Mapping[int, TexturedMesh],
     threads: int = 1,
-    left_out: Mapping[str, int] | None = None,
+    unusable: Mapping[str, int] | None = None,
 ) -> ModelPreviews:
-    """Two stills along the way, one from above, and up to three of each of the objects of which
-    most is painted.
+    """Two views from the robot's cameras, an overview, and up to three sides of each object.
 
     Args:
-        filtered: the place, painted without its people.
-        sharpest: the same, each face by its sharpest picture.
-        T_camera_map: (N, 4, 4) of pictures that were taken on the way, in order.
-        objects: what moved, by number, x ahead and z up in its own frame.
+        filtered: the place, textured without moving objects.
+        sharpest: the place, each face textured from its sharpest image.
+        T_camera_map: (N, 4, 4) camera poses of the usable images, in order of time.
+        objects: by id, x ahead and z up in their own frames; the best textured ones are shown.
         threads: the result does not depend on them.
-        left_out: how many other pictures there are, by why they cannot be used.
+        unusable: number of other images by the reason why they cannot be used.
     """
-    areas, place = Mesh(filtered.vertices, filtered.faces).areas(), list[PlacePreview]()
+    place = list[PlacePreview]()
 
-    def taken(caption: str, T: Float, angle: float, from_behind: bool) -> PlacePreview:
-        K = camera_matrix(PLACE_SIZE, angle)
+    def add(caption: str, T: Float, field_of_view: float, back_faces: bool) -> None:
+        K = camera_matrix(PLACE_SIZE, field_of_view)
         pictures = [
-            render(one, T, K, PLACE_SIZE, from_behind=from_behind, threads=threads)
+            render(one, T, K, PLACE_SIZE, back_faces=back_faces, threads=threads)
             for one in (filtered, sharpest)
             if one is not None
         ]
-        return PlacePreview(caption, pictures[0], pictures[1] if sharpest is not None else None)
+        place.append(
+            PlacePreview(caption, pictures[0], pictures[1] if sharpest is not None else None)
+        )
 
     if len(filtered):
-        along = _along(filtered, sharpest, T_camera_map, threads)
-        place += [taken("where the robot looked", T, _WIDE, True) for T in along]
-        place.append(taken("from above", _from_above(filtered), _NARROW, False))
-    worth = {n: _extent(one) for n, one in objects.items() if len(one)}
-    shown = sorted(worth, key=lambda n: worth[n], reverse=True)[:MOST_OBJECTS]
+        for T in _choose_views(filtered, sharpest, T_camera_map, threads):
+            add("view of the robot's camera", T, _WIDE, True)
+        points = main_corners(filtered, _OVERVIEW, _OUTLIERS)
+        K = camera_matrix(PLACE_SIZE, _NARROW)
+        add("overview", fit_camera(points, _OVERVIEW, K, PLACE_SIZE), _NARROW, False)
+    rank = {n: _areas(one) for n, one in objects.items() if len(one)}
+    shown = sorted(rank, key=lambda n: rank[n], reverse=True)[:MAX_OBJECTS]
+    textured, total = _areas(filtered)
     return ModelPreviews(
         place,
         [render_object(n, objects[n], threads) for n in shown],
-        float(areas[filtered.page < 0].sum() / max(float(areas.sum()), 1e-12)),
-        _why_bare(len(T_camera_map), len(filtered.unread), left_out or {}),
+        (total - textured) / max(total, 1e-12),
+        _untextured_reason(len(T_camera_map), len(filtered.unread), unusable or {}),
     )
 
 
-def _why_bare(usable: int, unread: int, left_out: Mapping[str, int]) -> str:
-    """Why there is no picture that could paint anything; empty where there is one."""
+def _untextured_reason(usable: int, unread: int, unusable: Mapping[str, int]) -> str:
     if usable > unread:
         return ""
-    reasons = dict(left_out) | ({"damaged": unread} if unread else {})
+    reasons = dict(unusable) | ({"damaged": unread} if unread else {})
     if not reasons:
-        return "there are no pictures"
+        return "there are no images"
     listed = "; ".join(f"{count:,}: {why}" for why, count in reasons.items())
-    return f"none of the {sum(reasons.values()):,} pictures can be used ({listed})"
+    return f"none of the {sum(reasons.values()):,} images can be used ({listed})"
 
 
-def _extent(textured: TexturedMesh) -> tuple[float, float]:
-    """Square metres of a model that are painted, and all of them."""
+def _areas(textured: TexturedMesh) -> tuple[float, float]:
+    """Textured and total area in m^2."""
     areas = Mesh(textured.vertices, textured.faces).areas()
     return float(areas[textured.page >= 0].sum()), float(areas.sum())
 
 
+def _choose_views(
+    filtered: TexturedMesh, sharpest: TexturedMesh | None, T_camera_map: Float, threads: int
+) -> list[Float]:
+    """Two camera poses, apart in time, with most pixels that differ between both textures."""
+    N = len(T_camera_map)
+    candidates = np.unique(np.linspace(0, N - 1, min(N, _MAX_CANDIDATES)).astype(np.intp)).tolist()
+    size = (PLACE_SIZE[0] // _REDUCTION, PLACE_SIZE[1] // _REDUCTION)
+    K = camera_matrix(size, _WIDE)
+    score = dict[int, float]()
+    for n in candidates:
+        T = T_camera_map[n]
+        score[n] = _TEXTURED_WEIGHT * textured_share(filtered, T, K, size, threads)
+        if sharpest is not None:
+            a, b = (render(one, T, K, size, threads=threads) for one in (filtered, sharpest))
+            difference = np.abs(a.astype(np.int64) - b).sum(axis=2)
+            score[n] += float((difference > _MIN_DIFFERENCE).mean())
+    chosen: list[int] = []
+    for n in sorted(score, key=lambda n: (-score[n], n)):
+        if len(chosen) < 2 and all(abs(n - other) >= _MIN_SEPARATION * N for other in chosen):
+            chosen.append(n)
+    return [T_camera_map[n] for n in sorted(chosen)]
+
+
 def render_object(number: int, textured: TexturedMesh, threads: int = 1) -> ObjectPreviews:
-    """An object from up to three sides, x ahead and z up in its frame: those from which most of it
-    is seen, and more of its fronts than of its backs, as only fronts are drawn."""
+    """The up to three sides that show most of an object's front faces.
+
+    Back faces are not drawn; a side that would show mostly back faces is left out.
+    """
     used, K = textured.vertices[np.unique(textured.faces)], camera_matrix(OBJECT_SIZE, _NARROW)
-    places, fronts, mostly_front = dict[str, Float](), dict[str, float](), list[str]()
-    for side, angle in _SIDES.items():
-        towards = np.array([math.cos(angle), math.sin(angle), math.tan(_RAISED)])
-        places[side] = T = fit_camera(used, towards, K, OBJECT_SIZE)
-        fronts[side], whole = (
-            covered_share(textured, T, K, OBJECT_SIZE, from_behind=backs, threads=threads)
-            for backs in (False, True)
+    poses, front, eligible = dict[str, Float](), dict[str, float](), list[str]()
+    for side, yaw in _SIDES.items():
+        direction = np.array([math.cos(yaw), math.sin(yaw), math.tan(_ELEVATION)])
+        poses[side] = T = fit_camera(used, direction, K, OBJECT_SIZE)
+        front[side], both = (
+            covered_share(textured, T, K, OBJECT_SIZE, back_faces=back_faces, threads=threads)
+            for back_faces in (False, True)
         )
-        if fronts[side] >= _FRONTS * whole:
-            mostly_front.append(side)
-    best = sorted(fronts, key=lambda side: fronts[side], reverse=True)
-    shown = [side for side in best if side in mostly_front][:_MOST_SIDES] or best[:1]
+        if front[side] >= _MIN_FRONT_FACES * both:
+            eligible.append(side)
+    ranked = sorted(front, key=lambda side: front[side], reverse=True)
+    shown = [side for side in ranked if side in eligible][:_MAX_SIDES] or ranked[:1]
     length, width, height = np.ptp(used, axis=0).tolist()
     sides = {
-        side: render(textured, places[side], K, OBJECT_SIZE, from_behind=False, threads=threads)
+        side: render(textured, poses[side], K, OBJECT_SIZE, back_faces=False, threads=threads)
         for side in _SIDES
         if side in shown
     }
     return ObjectPreviews(number, (length, width, height), sides)
 
 
-def model_section(stills: ModelPreviews | None) -> str:
-    """Everything about models; empty where there are none."""
-    if stills is None or not (stills.place or stills.objects):
-        return ""
-    text = "<section><h2>What it looks like</h2>"
-    if stills.place:
-        text += f"<p>{escape(_sentence(stills))}</p>"
-        title = "Surface" if stills.why_bare else "Filtered"
-        text += "".join(_pair(one, title) for one in stills.place)
-    if stills.objects:
-        text += (
-            f"<p>What moved, each from up to {_MOST_SIDES} sides, with length, width and height of "
-            "its model; all are in <code>objects/</code>. Surfaces have one side, that which was "
-            "seen: where more backs than fronts would be in the picture, it is left out.</p>"
-        )
-        text += "".join(_sides(one) for one in stills.objects)
-    return text + "</section>"
+def models_data(previews: ModelPreviews | None) -> dict[str, Any] | None:
+    """The previews as rows of figures for the report; None where there are none."""
+    if previews is None or not (previews.place or previews.objects):
+        return None
+    filtered = "Surface" if previews.untextured_reason else "Filtered"
+    return {
+        "place": [
+            [
+                _figure(title, one.caption, picture)
+                for title, picture in (("Sharpest image", one.sharpest), (filtered, one.filtered))
+                if picture is not None
+            ]
+            for one in previews.place
+        ],
+        "compared": any(one.sharpest is not None for one in previews.place),
+        "untextured": previews.untextured,
+        "untextured_reason": previews.untextured_reason,
+        "objects": [
+            [
+                _figure(
+                    f"Object {one.number}",
+                    " x ".join(f"{v:.2f}" for v in one.size) + f" m, {side}",
+                    picture,
+                )
+                for side, picture in one.sides.items()
+            ]
+            for one in previews.objects
+        ],
+        "max_sides": _MAX_SIDES,
+    }
 
 
-def jpeg_uri(picture: Picture) -> str:
-    """The picture as a `data:` address."""
+def _figure(title: str, caption: str, picture: Picture) -> tuple[str, str, str, tuple[int, ...]]:
+    """Title, caption, JPEG as a `data:` URI, width and height."""
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "JPEG", quality=_QUALITY)
-    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
-def _sentence(stills: ModelPreviews) -> str:
-    if stills.why_bare:
-        return f"The surface that stands still. It is grey: {stills.why_bare}."
-    grey = (
-        f"Grey is what no picture shows with nobody before it, {share_text(stills.unpainted)} of "
-        "the surface."
-    )
-    if any(one.sharpest is not None for one in stills.place):
-        return (
-            "The surface that stands still: left as the sharpest pictures would paint it, right by "
-            f"those in which nothing that moves is before it. {grey}"
-        )
-    return f"The surface that stands still, painted by pictures without what moves. {grey}"
-
-
-def _pair(one: PlacePreview, title: str) -> str:
-    shown = [("Sharpest", one.sharpest), (title, one.filtered)]
-    figures = "".join(
-        _figure(title, one.caption, picture) for title, picture in shown if picture is not None
-    )
-    return f'<div class="pair">{figures}</div>'
-
-
-def _sides(one: ObjectPreviews) -> str:
-    size = " x ".join(f"{metres:.2f}" for metres in one.size) + " m"
-    figures = "".join(
-        _figure(f"Object {one.number}", f"{size}, {side}", picture)
-        for side, picture in one.sides.items()
-    )
-    return f'<div class="row sides">{figures}</div>'
-
-
-def _figure(title: str, caption: str, picture: Picture) -> str:
-    height, width = picture.shape[:2]
-    return (
-        f"<figure><figcaption><b>{escape(title)}</b>: {escape(caption)}</figcaption>"
-        f'<img class="still" src="{jpeg_uri(picture)}" alt="{escape(f"{title}: {caption}")}" '
-        f'width="{width}" height="{height}"></figure>'
-    )
-
-
-def _along(
-    filtered: TexturedMesh, sharpest: TexturedMesh | None, T_camera_map: Float, threads: int
-) -> list[Float]:
-    """Two of the places, apart, from which most of the picture is painted, and most of all where
-    somebody was taken out."""
-    N = len(T_camera_map)
-    tried = np.unique(np.linspace(0, N - 1, min(N, _TRIED)).astype(np.intp)).tolist()
-    size = (PLACE_SIZE[0] // _SMALL, PLACE_SIZE[1] // _SMALL)
-    K = camera_matrix(size, _WIDE)
-    worth = dict[int, float]()
-    for n in tried:
-        T = T_camera_map[n]
-        worth[n] = _LITTLE * textured_share(filtered, T, K, size, threads)
-        if sharpest is not None:
-            a, b = (render(one, T, K, size, threads=threads) for one in (filtered, sharpest))
-            apart = np.abs(a.astype(np.int64) - b).sum(axis=2)
-            worth[n] += float((apart > _DIFFERS).mean())
-    chosen: list[int] = []
-    for n in sorted(worth, key=lambda n: (-worth[n], n)):
-        if len(chosen) < 2 and all(abs(n - other) >= _APART * N for other in chosen):
-            chosen.append(n)
-    return [T_camera_map[n] for n in sorted(chosen)]
-
-
-def _from_above(textured: TexturedMesh) -> Float:
-    points = main_corners(textured, _ABOVE, _OUTER)
-    return fit_camera(points, _ABOVE, camera_matrix(PLACE_SIZE, _NARROW), PLACE_SIZE)
+    Image.fromarray(picture).save(buffer, "JPEG", quality=_JPEG_QUALITY)
+    uri = "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return title, caption, uri, picture.shape[1::-1]

@@ -1,0 +1,70 @@
+"""Numbers as text: the filters of the report's templates."""
+
+import math
+
+
+def format_share(share: float) -> str:
+    """A share in percent, with one decimal or two significant digits."""
+    percent = 100 * share
+    if not math.isfinite(percent):
+        return "unknown"
+    return f"{percent:.1f} %" if percent >= 1 or percent == 0 else f"{percent:.2g} %"
+
+
+def format_duration(seconds: float) -> str:
+    """Seconds as ms, s, min or h."""
+    if 0 < seconds < 0.001:
+        return "under 1 ms"
+    if seconds < 10:
+        return f"{seconds:.2g} s"
+    if seconds < 59.5:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s"
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def format_milliseconds(seconds: float) -> str:
+    """Seconds in ms, with two significant digits below 10 ms."""
+    milliseconds = 1e3 * seconds
+    return f"{milliseconds:.0f} ms" if milliseconds >= 10 else f"{milliseconds:.2g} ms"
+
+
+def format_bytes(size: float) -> str:
+    """A number of bytes in MB or GB (powers of ten)."""
+    if not size:
+        return "unknown"
+    return f"{size / 1e6:,.0f} MB" if size < 1e9 else f"{size / 1e9:.2f} GB"
+
+
+def format_number(value: float | None) -> str:
+    """A number with seven significant digits; a dash for None and for what is not finite."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:,.7g}"
+
+
+def format_clock(ns: int) -> str:
+    """Nanoseconds as hours:minutes:seconds with tenths."""
+    tenths = round(ns / 10**8)
+    return f"{tenths // 36000}:{tenths // 600 % 60:02}:{tenths % 600 / 10:04.1f}"
+
+
+def format_scalar(value: object) -> str:
+    """A JSON scalar."""
+    if value is None:
+        return "not set"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.7g}" if isinstance(value, float) else str(value)
+
+
+FILTERS = {
+    "share": format_share,
+    "duration": format_duration,
+    "milliseconds": format_milliseconds,
+    "bytes": format_bytes,
+    "number": format_number,
+    "clock": format_clock,
+    "scalar": format_scalar,
+    "comma": "{:,}".format,
+}
