@@ -15,6 +15,8 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 JUNK = re.compile(r"\.(so|pyc|egg-info)$|__pycache__|/(build|dist|demo|\.venv|\.ci|\.git\w*)(/|$)")
 
+TEMPLATES = [str(path.relative_to(ROOT / "src")) for path in (ROOT / "src").rglob("*.j2")]
+
 
 def run(*command, cwd):
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
@@ -54,6 +56,7 @@ def test_source_archive_is_whole(sdist):
     for folder in ("src", "cpp", "tests"):
         sources = (ROOT / folder).rglob("*.[ch]pp" if folder == "cpp" else "*.py")
         assert {str(path.relative_to(ROOT)) for path in sources} <= set(names)
+    assert {f"src/{name}" for name in TEMPLATES} <= set(names)
     top = {"CMakeLists.txt", "pyproject.toml", "Makefile", "LICENSE", "README.md", "CHANGELOG.md"}
     assert top <= set(names)
 
@@ -65,7 +68,7 @@ def test_wheel_holds_the_package_alone(wheel):
     assert {name.split("/")[0] for name in names} == {"stillmap", info}
     assert [name for name in names if name.endswith(".pyi")] == ["stillmap/_core.pyi"]
     assert len([name for name in names if name.endswith(".so")]) == 1
-    assert "stillmap/py.typed" in names
+    assert {"stillmap/py.typed", *TEMPLATES} <= set(names)
     assert f"{info}/licenses/LICENSE" in names
 
 
