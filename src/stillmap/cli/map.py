@@ -182,7 +182,7 @@ def _option_changes(args: argparse.Namespace) -> dict[str, Any]:
     if args.threads is not None:
         changes["threads"] = args.threads
     if args.resolution is not None:
-        changes["slam"] = {"resolution": args.resolution, "voxel": args.resolution}
+        changes["slam"] = {"resolution": args.resolution, "voxel_size": args.resolution}
     if args.tilting_topic is not None:
         changes["read"] = {"tilting_topic": args.tilting_topic}
     output = {"map_mode": args.map_mode, "map_state": args.map_state}

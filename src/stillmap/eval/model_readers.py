@@ -17,7 +17,7 @@ from stillmap.eval.mesh import SAMPLES, ColoredPoints, TextureRecord, TrueImages
 from stillmap.eval.object_models import Model, MoverHits, Track
 from stillmap.sim.truth_images import PictureTruth, load_picture_truth
 from stillmap.slam.deskew import deskew_recording
-from stillmap.slam.odometry_2d import SlamOptions
+from stillmap.slam.options import SlamOptions
 
 Float = NDArray[np.float64]
 

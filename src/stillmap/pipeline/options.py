@@ -86,18 +86,12 @@ def resolved(options: Options, recording: Recording) -> Options:
     cells of 3D recordings are voxels.
     """
     if recording.dimension == 3:
-        voxel = options.slam.voxel or (
+        voxel = options.slam.voxel_size or (
             _OF_DEPTH if depth_camera_names(recording.source) else _VOXEL
         )
-        slam_options = dataclasses.replace(options.slam, voxel=voxel, resolution=voxel)
+        slam_options = dataclasses.replace(options.slam, voxel_size=voxel, resolution=voxel)
         options = dataclasses.replace(options, slam=slam_options)
     if options.estimator != "paper":
         return options
-    slam_options = dataclasses.replace(
-        options.slam,
-        loops=dataclasses.replace(options.slam.loops, enabled=False),
-        spinning_loops=dataclasses.replace(options.slam.spinning_loops, enabled=False),
-        registration=dataclasses.replace(options.slam.registration, approach=0.0),
-        deskew=False,
-    )
+    slam_options = dataclasses.replace(options.slam, loop_closure=False, deskew=False)
     return dataclasses.replace(options, slam=slam_options)

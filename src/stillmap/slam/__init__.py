@@ -1,12 +1,14 @@
-"""The M-step: poses and the map that they make. Uses e as weights, never changes it."""
+"""The M-step: poses, loops and map given P(static) of every beam, which is only read."""
 
 from stillmap.slam.deskew import deskew_recording
-from stillmap.slam.loop_types import LoopClosure
 from stillmap.slam.m_step import StepProgress, m_step
-from stillmap.slam.odometry_2d import Diagnostics, MStepResult, SlamOptions
+from stillmap.slam.options import SlamOptions
 from stillmap.slam.pose_graph import PoseGraph
+from stillmap.slam.scan_matching import FREE_SPACE_MARGIN
+from stillmap.slam.types import Diagnostics, LoopClosure, MStepResult
 
 __all__ = [
+    "FREE_SPACE_MARGIN",
     "Diagnostics",
     "LoopClosure",
     "MStepResult",

@@ -1,7 +1,4 @@
-"""The map of the last stretch of travel, which scans are registered against as they come.
-
-Keyframes along the way, and how what is found out about them spreads to the other scans.
-"""
+"""The local map that 2D scans are matched against, and keyframes along a trajectory."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -12,71 +9,64 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2, se3
 from stillmap.core.recording import Recording
-from stillmap.slam.scan_matching import SurfaceOptions, add_scan
+from stillmap.slam.scan_matching import add_scan
 
 Float = NDArray[np.float64]
-
 Index = NDArray[np.intp]
+
+SCAN_SPACING = 0.2  # m or rad between scans that are added to a map; 5 s count as 1 m
+_SPACING_PER_SECOND = 0.2
+KEYFRAME_ANGLE = 0.5  # rad between keyframes
 
 
 class LocalMap:
-    """Scans that lie a little apart, as long as the robot has not gone on too far."""
+    """A map of spaced scans along the last stretch of travel.
+
+    Args:
+        grid: the sums; only this class may change it.
+        recording: 2D.
+        e: (M,) P(static) of every beam.
+    """
 
     def __init__(
-        self,
-        grid: _core.OccupancyGrid2D,
-        recording: Recording,
-        e: NDArray[np.float32],
-        spacing: float,
-        surface: SurfaceOptions,
+        self, grid: _core.OccupancyGrid2D, recording: Recording, e: NDArray[np.float32]
     ) -> None:
-        """An empty one.
-
-        Args:
-            grid: where the sums go; nobody else may change it.
-            recording: 2D.
-            e: (M,) probability that each beam was reflected by something static.
-            spacing: metres or radians between scans that are kept; 5 s count as one of them.
-            surface: how gaps are filled.
-        """
         self.grid = grid
-        self._recording, self._e, self._spacing = recording, e, spacing
-        self._surface = surface
-        self._kept: deque[tuple[int, Float, float]] = deque()  # scan, pose, metres travelled
+        self._recording, self._e = recording, e
+        self._kept: deque[tuple[int, Float, float]] = deque()  # scan, pose, m travelled
 
     def add(self, t: int, T_map_base: Float, travelled: float) -> None:
-        """Scan t at a pose (3, 3), unless the last one of its sensor shows the same."""
-        if not self._is_apart(t, T_map_base):
-            return
-        add_scan(self.grid, self._recording, self._e, t, T_map_base, self._surface)
-        self._kept.append((t, T_map_base, travelled))
+        """Adds scan t at a pose (3, 3), unless it is too close to the last one of its sensor."""
+        if self._is_spaced(t, T_map_base):
+            add_scan(self.grid, self._recording, self._e, t, T_map_base)
+            self._kept.append((t, T_map_base, travelled))
 
-    def has(self, sensor: int) -> bool:
-        """Whether there is a scan of a sensor in it."""
+    def has_sensor(self, sensor: int) -> bool:
+        """Whether it holds a scan of a sensor."""
         return self._last_of(sensor) is not None
 
-    def forget(self, travelled: float) -> None:
-        """Takes out what was seen before the robot had come that many metres."""
+    def remove_before(self, travelled: float) -> None:
+        """Removes the scans taken before that many metres of travel."""
         while self._kept and self._kept[0][2] < travelled:
-            t, T_map_base, _ = self._kept.popleft()
-            add_scan(self.grid, self._recording, self._e, t, T_map_base, self._surface, remove=True)
+            self._remove(*self._kept.popleft()[:2])
 
-    def forget_since(self, t: int) -> None:
-        """Takes out scan t and what came after it."""
+    def remove_since(self, t: int) -> None:
+        """Removes scan t and later ones."""
         while self._kept and self._kept[-1][0] >= t:
-            last, T_map_base, _ = self._kept.pop()
-            add_scan(
-                self.grid, self._recording, self._e, last, T_map_base, self._surface, remove=True
-            )
+            self._remove(*self._kept.pop()[:2])
 
-    def _is_apart(self, t: int, T_map_base: Float) -> bool:
+    def _remove(self, t: int, T_map_base: Float) -> None:
+        add_scan(self.grid, self._recording, self._e, t, T_map_base, remove=True)
+
+    def _is_spaced(self, t: int, T_map_base: Float) -> bool:
         kept = self._last_of(self._recording.sensor[t])
         if kept is None:
             return True
         last, T_last, _ = kept
         x, y, theta = se2.parameters(se2.inverse(T_last) @ T_map_base)
         seconds = 1e-9 * float(self._recording.stamp_ns[t] - self._recording.stamp_ns[last])
-        return float(np.hypot(x, y) + abs(theta) + 0.2 * seconds) >= self._spacing
+        spacing = float(np.hypot(x, y) + abs(theta) + _SPACING_PER_SECOND * seconds)
+        return spacing >= SCAN_SPACING
 
     def _last_of(self, sensor: int) -> tuple[int, Float, float] | None:
         of_sensor = (
@@ -86,21 +76,19 @@ class LocalMap:
 
 
 def travelled_distance(poses: Float) -> Float:
-    """(T,) metres travelled up to each of the poses (T, D+1, D+1)."""
-    steps = np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)
-    return np.concatenate([[0.0], steps.cumsum()])
+    """(T,) m of travel up to each of the poses (T, D+1, D+1)."""
+    return np.concatenate([[0.0], _step_lengths(poses).cumsum()])
 
 
 def select_keyframes(
-    poses: Float, distance: float, turn: float, breaks: Sequence[int] = ()
+    poses: Float, distance: float, angle: float, breaks: Sequence[int] = ()
 ) -> Index:
-    """(K,) indices of scans about `distance` metres or `turn` radians apart.
+    """(K,) scans about `distance` m or `angle` rad apart.
 
-    The first and the last one are among them, and those before and after each of the breaks.
+    Includes the first and the last scan, and those before and after each break.
     """
-    metres = np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)
     kept, since = [0], 0.0
-    for t, step in enumerate(metres / distance + _turns(poses) / turn, start=1):
+    for t, step in enumerate(_step_lengths(poses) / distance + _turns(poses) / angle, start=1):
         since += step
         if since >= 1.0:
             kept.append(t)
@@ -111,8 +99,26 @@ def select_keyframes(
     return np.unique(np.array([*kept, *beside], np.intp))
 
 
+def select_keyframes_per_sensor(
+    poses: Float, sensor: NDArray[np.integer], distance: float, angle: float
+) -> Index:
+    """(K,) keyframes selected from the scans of each sensor (T,) separately."""
+    of_each = [np.flatnonzero(sensor == s) for s in np.unique(sensor)]
+    return np.sort(
+        np.concatenate(
+            [scans[select_keyframes(poses[scans], distance, angle)] for scans in of_each]
+        )
+    )
+
+
+def _step_lengths(poses: Float) -> Float:
+    """(T-1,) m between successive poses."""
+    lengths: Float = np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)
+    return lengths
+
+
 def _turns(poses: Float) -> Float:
-    """(T-1,) radians from each pose to the next one."""
+    """(T-1,) rad between successive poses."""
     if poses.shape[-1] == 3:
         return np.abs(se2.wrap(np.diff(se2.parameters(poses)[:, 2])))
     steps = se3.log_rotation(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
@@ -120,21 +126,10 @@ def _turns(poses: Float) -> Float:
     return turns
 
 
-def select_keyframes_per_sensor(
-    poses: Float, sensor: NDArray[np.integer], distance: float, turn: float
-) -> Index:
-    """(K,) indices of scans chosen from those of each sensor (T,): each may see its own side."""
-    of_each = [np.flatnonzero(sensor == s) for s in np.unique(sensor)]
-    return np.sort(
-        np.concatenate([scans[select_keyframes(poses[scans], distance, turn)] for scans in of_each])
-    )
+def propagate_corrections(poses: Float, keyframes: Index, corrected: Float) -> Float:
+    """(T, D+1, D+1) all poses after the keyframes (K,) among them moved to (K, D+1, D+1).
 
-
-def propagate_corrections(poses: Float, keyframes: Index, moved: Float) -> Float:
-    """(T, D+1, D+1) all poses when the keyframes among them moved to (K, D+1, D+1).
-
-    A scan between two keyframes is carried along by both; how far it is from each, in travel and
-    then in time, says how the two are blended.
+    The corrections of the two keyframes around a scan are blended by travel, then by time.
     """
     if len(keyframes) < 2:
         return poses
@@ -143,7 +138,7 @@ def propagate_corrections(poses: Float, keyframes: Index, moved: Float) -> Float
     left = right - 1
     span = at[keyframes[right]] - at[keyframes[left]]
     share = ((at - at[keyframes[left]]) / span)[:, None]
-    correction = moved @ se2.inverse(poses[keyframes])
+    correction = corrected @ se2.inverse(poses[keyframes])
     one, other = correction[left] @ poses, correction[right] @ poses
     if poses.shape[-1] == 4:
         return se3.normalize(one @ se3.exp(share * se3.log(se2.inverse(one) @ other)))

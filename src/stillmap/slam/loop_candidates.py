@@ -1,7 +1,4 @@
-"""Which keyframes may see again what was seen much earlier, and how sure the graph is of where.
-
-The chain of keyframes: how sure the way from one to the next is, and what loops make of it.
-"""
+"""Loop candidates, odometry constraints between keyframes, and consistency of loop closures."""
 
 import itertools
 from collections.abc import Iterator
@@ -12,154 +9,165 @@ from numpy.typing import NDArray
 from stillmap.core import se2
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model
-from stillmap.slam.loop_types import (
-    LoopCandidate,
-    LoopClosure,
-    LoopContext,
-    LoopOptions,
-    drift,
-    refuse,
-)
-from stillmap.slam.motion_model import MotionOptions
+from stillmap.slam.options import OdometryOptions
 from stillmap.slam.pose_graph import Constraint
 from stillmap.slam.scan_matching import select_hits
+from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 Float = NDArray[np.float64]
 
+MIN_LOOP_TRAVEL = 15.0  # m after which a place counts as revisited
+# loops are searched in stages of travel, after each of which the graph is solved: m, share of the
+# travel so far
+_MIN_STAGE, _STAGE_SHARE = 40.0, 0.05
+# drift per m, which sets the search window: m, rad, at least, and m after which it stops growing
+_DRIFT_TRANSLATION, DRIFT_ROTATION = 0.006, 0.0003
+_MIN_DRIFT, _MAX_DRIFT_TRAVEL = (0.1, 0.02), 1000.0
+_STEP_TRANSLATION, _STEP_ROTATION = 0.03, 0.004  # random walk, m and rad per root of a metre
+_NO_ODOMETRY = [1e3, 1e3, 10.0]  # m, m, rad: std of a step across a break
+_LEAP_STDS = 3.0  # standard deviations of the motion prior beyond which an increment is a leap
+# consistency: keyframe distances on the earlier and the later side that count as nearby, closures
+# nearby that must agree, chi-square up to which two agree
+_NEARBY = np.array([8.0, 4.0])
+_MIN_AGREEING, _MAX_AGREEMENT_CHI2 = 2, 9.0
 
-def split_stages(track: LoopContext) -> Iterator[tuple[int, int]]:
-    """Ranges first, last of keyframes: each a stage of travel, later ones longer."""
-    options, travelled = track.options, track.travelled[track.keyframes]
+
+def drift_std(metres: float) -> tuple[float, float]:
+    """Standard deviations of position (m) and heading (rad) after that much travel."""
+    metres = min(metres, _MAX_DRIFT_TRAVEL)
+    return (
+        float(np.hypot(_MIN_DRIFT[0], _DRIFT_TRANSLATION * metres)),
+        float(np.hypot(_MIN_DRIFT[1], DRIFT_ROTATION * metres)),
+    )
+
+
+def split_stages(context: LoopContext) -> Iterator[tuple[int, int]]:
+    """Ranges (first, last) of keyframes, one per stage of travel; later stages are longer."""
+    travelled = context.travelled[context.keyframes]
     first = 0
     while first < len(travelled):
         here = travelled[first]
-        until = here + max(options.stage, options.stage_share * here)
+        until = here + max(_MIN_STAGE, _STAGE_SHARE * here)
         last = max(first + 1, int(np.searchsorted(travelled, until)))
         yield first, last
         first = last
 
 
-def graph_distances(track: LoopContext, k: int, ties: list[LoopClosure]) -> Float:
-    """(k + 1,) metres of drift between the keyframes up to k and keyframe k.
+def graph_distances(context: LoopContext, k: int, closures: list[LoopClosure]) -> Float:
+    """(k + 1,) m of drift between the keyframes up to k and keyframe k.
 
-    The shortest way through the graph: along the chain, or through a closure, which counts as the
-    metres that drift as much as it may be wrong. A loop closed elsewhere shortens no way here.
+    The shortest path through the graph: along the chain, or through closures, each of which counts
+    as the travel whose drift equals its standard deviation.
     """
     from scipy import sparse
-    from scipy.sparse import csgraph  # takes long to load
+    from scipy.sparse import csgraph  # loading it takes long
 
-    travelled = track.travelled[track.keyframes[: k + 1]]
-    ties = [closure for closure in ties if closure.later <= track.keyframes[k]]
-    if not ties:
+    travelled = context.travelled[context.keyframes[: k + 1]]
+    closures = [closure for closure in closures if closure.later <= context.keyframes[k]]
+    if not closures:
         along: Float = travelled[k] - travelled
         return along
-    scans = np.array([[closure.earlier, closure.later] for closure in ties])
-    first, second = np.searchsorted(track.keyframes, scans).T
-    # no edge may weigh zero: that would be none
-    weights = np.concatenate([np.diff(travelled), _counted(ties, track.options)]).clip(1e-9)
+    scans = np.array([[closure.earlier, closure.later] for closure in closures])
+    first, second = np.searchsorted(context.keyframes, scans).T
+    covariance = np.array([closure.covariance[:2, :2] for closure in closures])
+    std: Float = np.sqrt(np.linalg.eigvalsh(covariance)[:, 1])
+    lengths = std / max(_DRIFT_TRANSLATION, 1e-9)
+    # an edge of weight zero would be no edge
+    weights = np.concatenate([np.diff(travelled), lengths]).clip(1e-9)
     ends = np.append(np.arange(k), first), np.append(np.arange(1, k + 1), second)
     graph = sparse.csr_array((weights, ends), shape=(k + 1, k + 1))
     metres: Float = csgraph.dijkstra(graph, directed=False, indices=[k])[0]
     return metres
 
 
-def _counted(ties: list[LoopClosure], options: LoopOptions) -> Float:
-    """(L,) metres of drift that closures count as."""
-    covariance = np.array([closure.covariance[:2, :2] for closure in ties])
-    sigma: Float = np.sqrt(np.linalg.eigvalsh(covariance)[:, 1])
-    return sigma / max(options.drift_translation, 1e-9)
-
-
-def view_centers(track: LoopContext) -> Float:
-    """(K, 2) where the keyframes look: the mean of what each saw, in its frame."""
-    out = np.zeros((len(track.keyframes), 2))
-    keyframes = track.recording.iter_scans(track.keyframes.tolist(), track.e)
+def view_centers(context: LoopContext) -> Float:
+    """(K, 2) weighted mean of the end points of each keyframe, in its frame."""
+    out = np.zeros((len(context.keyframes), 2))
+    keyframes = context.recording.iter_scans(context.keyframes.tolist(), context.e)
     for k, t in enumerate(keyframes):
-        scan = select_hits(track.recording, track.e, t)
+        scan = select_hits(context.recording, context.e, t)
         if scan.weights.sum() > 0.0:
             out[k] = np.average(scan.points, axis=0, weights=scan.weights)
     return out
 
 
 def propose_candidates(
-    track: LoopContext, poses: Float, looks: Float, first: int, last: int, ties: list[LoopClosure]
+    context: LoopContext,
+    poses: Float,
+    centers: Float,
+    first: int,
+    last: int,
+    closures: list[LoopClosure],
 ) -> Iterator[LoopCandidate]:
-    """Keyframes of a stage with the nearest of much earlier travel, where that lies within reach.
+    """Each keyframe of a stage with the nearest one of much earlier travel, if near enough.
 
-    If it does not, with the one that looked nearest to where it looks: who comes back on the other
-    side of a street is never near where it was.
+    Otherwise with the one whose view center is nearest: a robot that returns on the other side of a
+    street sees the same place from elsewhere.
 
     Args:
-        track: where loops are looked for.
-        poses: (K, 3, 3) the keyframes as far as they are corrected.
-        looks: (K, 2) where they look, in their frames.
-        first, last: the stage.
-        ties: closures of earlier stages that are taken for true.
+        context: the trajectory.
+        poses: (K, 3, 3) keyframes, corrected so far.
+        centers: (K, 2) their view centers, in their frames.
+        first, last: range of keyframes of the stage.
+        closures: accepted ones of earlier stages.
     """
-    options, frames = track.options, track.keyframes
-    x, travelled = se2.parameters(poses), track.travelled[frames]
-    metres = graph_distances(track, first, ties)
-    looked_at = np.einsum("kij,kj->ki", poses[:, :2, :2], looks) + poses[:, :2, 2]
+    keyframes, travelled = context.keyframes, context.travelled[context.keyframes]
+    x = se2.parameters(poses)
+    metres = graph_distances(context, first, closures)
+    in_map = np.einsum("kij,kj->ki", poses[:, :2, :2], centers) + poses[:, :2, 2]
     for k in range(first, last):
-        n = int(np.searchsorted(travelled, travelled[k] - options.gap))
+        n = int(np.searchsorted(travelled, travelled[k] - MIN_LOOP_TRAVEL))
         if n == 0:
             continue
         distance = np.linalg.norm(x[:n, :2] - x[k, :2], axis=1)
-        turned = np.abs(se2.wrap(x[:n, 2] - x[k, 2]))
-        across = np.linalg.norm(looked_at[:n] - looked_at[k], axis=1)
-        # seen from the same side, where there is a choice
-        for cost, metres_off in ((distance + turned, distance), (across, across)):
+        turn = np.abs(se2.wrap(x[:n, 2] - x[k, 2]))
+        view_distance = np.linalg.norm(in_map[:n] - in_map[k], axis=1)
+        # where there is a choice, a keyframe with the same heading
+        for cost, off in ((distance + turn, distance), (view_distance, view_distance)):
             i = int(np.argmin(cost))
-            way = travelled[k] - travelled[i]
+            drift = travelled[k] - travelled[i]
             if i < first:
-                way = min(way, travelled[k] - travelled[first] + metres[i])
-            if metres_off[i] < options.reach + drift(way, options)[0]:
+                drift = min(drift, travelled[k] - travelled[first] + metres[i])
+            if off[i] < context.search_distance + drift_std(drift)[0]:
                 T = se2.inverse(poses[i]) @ poses[k]
-                yield LoopCandidate(int(frames[i]), int(frames[k]), T, float(way))
+                yield LoopCandidate(int(keyframes[i]), int(keyframes[k]), T, float(drift))
                 break
 
 
-_NEAR = np.array([8.0, 4.0])  # keyframes on the earlier and on the later side that count as nearby
-
-_ANYWHERE = [1e3, 1e3, 10.0]  # m, m, rad: a step that nobody saw
-
-_LEAP = 3.0  # standard deviations of the motion prior beyond which an increment is a leap
-
-
 def odometry_constraints(
-    track: LoopContext, options: MotionOptions, breaks: list[int]
+    context: LoopContext, options: OdometryOptions, breaks: list[int]
 ) -> list[Constraint]:
-    """Relations between successive keyframes, indices into the keyframes.
+    """Constraints between successive keyframes, indexed by keyframe.
 
-    Their covariances allow for drift, half as much across as along the way. Where odometry
-    contradicts the poses by a leap, the way may be wrong by as much. A step across a break, from
-    the scan before it, says nothing.
+    Their covariance is that of a random walk, half as wide across as along the motion. Where
+    odometry contradicts the poses by a leap, the difference is added. A step across a break is
+    unconstrained.
     """
-    frames, poses = track.keyframes, track.poses
-    leaps = _leaps(track.recording, poses, options)
+    keyframes, poses = context.keyframes, context.poses
+    leaps = _find_leaps(context.recording, poses, options)
     chain = []
-    for k, (i, j) in enumerate(itertools.pairwise(frames)):
+    for k, (i, j) in enumerate(itertools.pairwise(keyframes)):
         T = se2.inverse(poses[i]) @ poses[j]
-        covariance = _drift(T, float(track.travelled[j] - track.travelled[i]), track.options)
+        covariance = _step_covariance(T, float(context.travelled[j] - context.travelled[i]))
         for t in range(i + 1, j + 1):
             if leaps[t].any():
                 to_j = se2.inverse(poses[j]) @ poses[t]
                 covariance += se2.rotate_covariance(np.outer(leaps[t], leaps[t]), to_j)
         if j in breaks:
-            covariance = np.diag(np.square(_ANYWHERE))
+            covariance = np.diag(np.square(_NO_ODOMETRY))
         chain.append(Constraint(k, k + 1, T, covariance))
     return chain
 
 
-def _drift(T: Float, metres: float, options: LoopOptions) -> Float:
-    # turning on the spot and standing still are not free of error either
+def _step_covariance(T: Float, metres: float) -> Float:
+    # rotation on the spot and standing still are not free of error either
     root = np.sqrt(metres + abs(float(se2.parameters(T)[2])) + 0.05)
-    xy, theta = options.step_translation * root, options.step_rotation * root
+    xy, theta = _STEP_TRANSLATION * root, _STEP_ROTATION * root
     return np.diag([xy**2, (0.5 * xy) ** 2, theta**2])
 
 
-def _leaps(recording: Recording, poses: Float, options: MotionOptions) -> Float:
-    """(T, 3) by how much the motion to each scan contradicts odometry; 0 where it hardly does."""
+def _find_leaps(recording: Recording, poses: Float, options: OdometryOptions) -> Float:
+    """(T, 3) difference of the motion to each scan from odometry; 0 where it is plausible."""
     leaps = np.zeros((len(poses), 3))
     if recording.T_odom_base is None:
         return leaps
@@ -168,77 +176,78 @@ def _leaps(recording: Recording, poses: Float, options: MotionOptions) -> Float:
     difference = se2.parameters(se2.inverse(increments) @ found)
     for t, (increment, d) in enumerate(zip(increments, difference, strict=True), start=1):
         prior = motion_model.odometry_prior(np.eye(3), increment, options)
-        sigma = np.array([prior.sigma_translation] * 2 + [prior.sigma_rotation])
-        if np.linalg.norm(d / sigma) > _LEAP:
+        std = np.array([prior.translation_std] * 2 + [prior.rotation_std])
+        if np.linalg.norm(d / std) > _LEAP_STDS:
             leaps[t] = d
     return leaps
 
 
 def reject_inconsistent(
-    track: LoopContext, chain: list[Constraint], found: list[LoopClosure]
+    context: LoopContext, chain: list[Constraint], closures: list[LoopClosure]
 ) -> list[LoopClosure]:
-    """Refuses closures whose correction the ones nearby do not ask for.
+    """Refuses closures whose correction those nearby do not share.
 
-    Nearby: within four keyframes of travel on the later side, eight on the earlier one. At least
-    `agreeing` of them and half of them all have to agree.
+    At least `_MIN_AGREEING` closures nearby and half of them all must agree.
     """
-    options, travelled = track.options, track.travelled
-    candidates = [closure for closure in found if not closure.refused]
-    at = np.array([[travelled[c.earlier], travelled[c.later]] for c in candidates]).reshape(-1, 2)
-    far = _NEAR * options.distance
-    drifted = _drifted(track, chain)
+    travelled = context.travelled
+    accepted = [closure for closure in closures if not closure.refused]
+    at = np.array([[travelled[c.earlier], travelled[c.later]] for c in accepted]).reshape(-1, 2)
+    nearby = _NEARBY * context.keyframe_distance
+    accumulated = _accumulate_covariance(context, chain)
     out = []
-    for closure in found:
+    for closure in closures:
         if not closure.refused:
-            apart = np.abs(at - [travelled[closure.earlier], travelled[closure.later]])
-            near = [candidates[n] for n in np.flatnonzero((apart < far).all(axis=1))]
-            votes = [_agree(track, drifted, closure, c) for c in near if c is not closure]
-            if sum(votes) < max(options.agreeing, len(votes) / 2):
-                closure = refuse(closure, "closures around disagree")
+            off = np.abs(at - [travelled[closure.earlier], travelled[closure.later]])
+            others = [accepted[n] for n in np.flatnonzero((off < nearby).all(axis=1))]
+            votes = [_agree(context, accumulated, closure, c) for c in others if c is not closure]
+            if sum(votes) < max(_MIN_AGREEING, len(votes) / 2):
+                closure = closure.refuse("closures around disagree")
         out.append(closure)
     return out
 
 
 def reject_inconsistent_since(
-    track: LoopContext,
+    context: LoopContext,
     chain: list[Constraint],
     attempted: list[LoopClosure],
     decided: list[LoopClosure],
     k: int,
 ) -> list[LoopClosure]:
-    """What `agreeing` makes of all attempts, when those from keyframe k on are new.
+    """`reject_inconsistent` of all attempts, when those from keyframe k on are new.
 
     Args:
-        track, chain: as `agreeing` has them.
-        attempted: all, by the later scan.
-        decided: what it made of those before.
+        context, chain: as of `reject_inconsistent`.
+        attempted: all attempts, by the later scan.
+        decided: the result of those before keyframe k.
         k: index into the keyframes.
     """
-    later = [track.travelled[closure.later] for closure in attempted]
-    near = _NEAR[1] * track.options.distance
-    new, heard = np.searchsorted(later, track.travelled[track.keyframes[k]] - [near, 2 * near])
-    # their votes reach back one neighbourhood, and what is there hears one more
-    return decided[:new] + reject_inconsistent(track, chain, attempted[heard:])[new - heard :]
+    later = [context.travelled[closure.later] for closure in attempted]
+    near = _NEARBY[1] * context.keyframe_distance
+    # new votes reach back one neighbourhood, whose closures depend on one more
+    here = context.travelled[context.keyframes[k]]
+    changed, relevant = np.searchsorted(later, here - [near, 2 * near])
+    again = reject_inconsistent(context, chain, attempted[relevant:])
+    return decided[:changed] + again[changed - relevant :]
 
 
-def _drifted(track: LoopContext, chain: list[Constraint]) -> Float:
-    """(K, 3, 3) covariance that the steps to each keyframe add up to, along the axes of the map."""
-    poses = track.poses[track.keyframes[1:]]
-    steps = np.array([relation.covariance for relation in chain]).reshape(-1, 3, 3)
-    out = np.zeros((len(track.keyframes), 3, 3))
+def _accumulate_covariance(context: LoopContext, chain: list[Constraint]) -> Float:
+    """(K, 3, 3) sum of the covariances of the steps to each keyframe, along the map's axes."""
+    poses = context.poses[context.keyframes[1:]]
+    steps = np.array([constraint.covariance for constraint in chain]).reshape(-1, 3, 3)
+    out = np.zeros((len(context.keyframes), 3, 3))
     np.cumsum(se2.rotate_covariance(steps, poses), axis=0, out=out[1:])
     return out
 
 
-def _agree(track: LoopContext, drifted: Float, a: LoopClosure, b: LoopClosure) -> bool:
-    """Whether two closures put their later scans where the way between them allows."""
+def _agree(context: LoopContext, accumulated: Float, a: LoopClosure, b: LoopClosure) -> bool:
+    """Whether two closures are consistent with the motion between their later scans."""
     a, b = (a, b) if a.later <= b.later else (b, a)
-    P = track.poses
+    P = context.poses
     here = P[a.earlier] @ a.T
     predicted = here @ se2.inverse(P[a.later]) @ P[b.later]
     d = se2.parameters(se2.inverse(predicted) @ P[b.earlier] @ b.T)
     back = se2.inverse(P[b.later])
-    i, j = np.searchsorted(track.keyframes, [a.later, b.later])
-    between = se2.rotate_covariance(a.covariance, P[a.later]) + drifted[j] - drifted[i]
+    i, j = np.searchsorted(context.keyframes, [a.later, b.later])
+    between = se2.rotate_covariance(a.covariance, P[a.later]) + accumulated[j] - accumulated[i]
     covariance = b.covariance + se2.rotate_covariance(between, back)
-    return float(d @ np.linalg.solve(covariance, d)) < 9.0
+    return float(d @ np.linalg.solve(covariance, d)) < _MAX_AGREEMENT_CHI2

@@ -1,142 +1,152 @@
-"""Loop closure: find candidates, verify them, solve the graph, spread what it says."""
+"""Loop closure in 2D: propose candidates, verify them, solve the pose graph stage by stage."""
 
 import dataclasses
 import itertools
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.core.recording import Recording
-from stillmap.slam import (
-    local_map,
-    loop_candidates,
-    loop_verification,
-    pose_graph,
-    relocalization,
-)
-from stillmap.slam import (
-    loop_candidates as loop_candidates_module,
-)
-from stillmap.slam.loop_types import LoopClosure, LoopContext, refuse
-from stillmap.slam.odometry_2d import MStepResult, SlamOptions
-from stillmap.slam.pose_graph import Constraint, PoseGraph, Robust
+from stillmap.slam import local_map, loop_candidates, loop_verification, pose_graph, relocalization
+from stillmap.slam.options import SlamOptions
+from stillmap.slam.pose_graph import Constraint, PoseGraph
+from stillmap.slam.types import Index, LoopClosure, LoopContext, MStepResult, ScanProgress
 
 Float = NDArray[np.float64]
+
+_KEYFRAME_DISTANCE, _SEARCH_DISTANCE = 1.0, 6.0  # m, defaults of the options
+_MAX_CHI2 = 16.0  # 3 degrees of freedom; above it the graph rejects a loop
 
 
 def close_loops(
     recording: Recording,
     e: NDArray[np.float32],
     options: SlamOptions,
-    mapped: MStepResult,
-    progress: Callable[[int, int], None],
+    odometry: MStepResult,
+    progress: ScanProgress,
 ) -> MStepResult:
-    """Poses after loop closure, all attempts at closing a loop, and the graph.
+    """Poses after loop closure, all attempted closures, and the pose graph.
 
     Args:
         recording: 2D.
-        e: (M,) probability that each beam was reflected by something static.
+        e: (M,) P(static) of every beam.
         options: see SlamOptions.
-        mapped: the incremental result; its grid is not looked at.
+        odometry: result of incremental scan matching; its grid is not used.
         progress: called with the number of scans done and their total.
     """
-    track, ties, apart = _track(recording, e, options, mapped)
-    way = loop_candidates_module.odometry_constraints(track, options.motion, mapped.breaks)
-    moved, found = track.poses[track.keyframes], ties
+    context, ties, unconnected = _make_context(recording, e, options, odometry)
+    breaks = odometry.diagnostics.breaks
+    chain = loop_candidates.odometry_constraints(context, options.odometry, breaks)
+    poses, found = context.poses[context.keyframes], ties
     attempted, fitting = list[LoopClosure](), ties
-    looks = loop_candidates.view_centers(track)
-    for first, last in loop_candidates.split_stages(track):
-        progress(int(track.keyframes[first]), recording.n_scans)
-        asked = loop_candidates.propose_candidates(track, moved, looks, first, last, fitting)
-        new = loop_verification.verify_candidates(track, asked)
+    centers = loop_candidates.view_centers(context)
+    for first, last in loop_candidates.split_stages(context):
+        progress(int(context.keyframes[first]), recording.n_scans)
+        candidates = loop_candidates.propose_candidates(
+            context, poses, centers, first, last, fitting
+        )
+        new = loop_verification.verify_candidates(context, candidates)
         attempted += new
         if all(closure.refused for closure in new):
             found = found + new
             continue
-        found = ties + loop_candidates_module.reject_inconsistent_since(
-            track, way, attempted, found[len(ties) :], first
+        found = ties + loop_candidates.reject_inconsistent_since(
+            context, chain, attempted, found[len(ties) :], first
         )
-        moved, fitting = _corrected(track, way, moved, last, found)
-    moved, found = _solved(track, way, moved, found)
-    accepted = [_relation(track, closure) for closure in found if not closure.refused]
+        poses, fitting = _correct_stage(context, chain, poses, last, found)
+    poses, found = solve_graph(context.keyframes, chain, poses, found, _MAX_CHI2)
+    accepted = accepted_constraints(context.keyframes, found)
     return dataclasses.replace(
-        mapped,
-        poses=local_map.propagate_corrections(track.poses, track.keyframes, moved),
+        odometry,
+        poses=local_map.propagate_corrections(context.poses, context.keyframes, poses),
         loops=found,
-        graph=PoseGraph(track.keyframes, moved, [*way, *accepted]),
-        apart=apart,
+        graph=PoseGraph(context.keyframes, poses, [*chain, *accepted]),
+        diagnostics=dataclasses.replace(odometry.diagnostics, unconnected=unconnected),
     )
 
 
-def _track(
-    recording: Recording, e: NDArray[np.float32], options: SlamOptions, mapped: MStepResult
+def _make_context(
+    recording: Recording, e: NDArray[np.float32], options: SlamOptions, odometry: MStepResult
 ) -> tuple[LoopContext, list[LoopClosure], list[int]]:
-    """What loops are looked for in, with all pieces in their places; see `pieces.placed`."""
-    poses, breaks = mapped.poses, mapped.breaks
-    travelled = local_map.travelled_distance(poses)
-    distance = options.loops.gap + 2.0 * options.loops.stretch
-    track = LoopContext(
+    """The trajectory with all segments relocalized; see `relocalize_segments`."""
+    poses, breaks = odometry.poses, odometry.diagnostics.breaks
+    keyframe_distance = options.keyframe_distance or _KEYFRAME_DISTANCE
+    search = options.loop_search_distance
+    gap = loop_candidates.MIN_LOOP_TRAVEL + 2.0 * loop_verification.SUBMAP_TRAVEL
+    context = LoopContext(
         recording,
         e,
         poses,
-        relocalization.separate_segments(travelled, breaks, distance),
-        mapped.explained,
-        local_map.select_keyframes(poses, options.loops.distance, options.loops.turn, breaks),
+        relocalization.separate_segments(local_map.travelled_distance(poses), breaks, gap),
+        odometry.explained,
+        local_map.select_keyframes(poses, keyframe_distance, local_map.KEYFRAME_ANGLE, breaks),
         options.resolution,
-        options.registration,
-        options.surface,
-        options.loops,
+        keyframe_distance,
+        _SEARCH_DISTANCE if search is None else search,
     )
-    return relocalization.relocalize_segments(track, breaks, mapped.unconnected)
+    return relocalization.relocalize_segments(context, breaks, odometry.diagnostics.unconnected)
 
 
-def _relation(track: LoopContext, closure: LoopClosure) -> Constraint:
-    first, second = np.searchsorted(track.keyframes, [closure.earlier, closure.later])
-    return Constraint(int(first), int(second), closure.T, closure.covariance)
-
-
-def _robust(track: LoopContext) -> Robust:
-    return Robust(track.options.misfit, track.options.annealing)
-
-
-def _corrected(
-    track: LoopContext, way: list[Constraint], poses: Float, last: int, found: list[LoopClosure]
+def _correct_stage(
+    context: LoopContext,
+    chain: list[Constraint],
+    poses: Float,
+    last: int,
+    found: list[LoopClosure],
 ) -> tuple[Float, list[LoopClosure]]:
-    """Keyframes (K, 3, 3), those before `last` by the graph so far; and the loops that fit it.
+    """Keyframes (K, 3, 3) with those before `last` optimised, and the closures that fit them.
 
-    Later ones are carried along.
+    Later keyframes move rigidly with the last optimised one.
     """
     accepted = [closure for closure in found if not closure.refused]
     if not accepted:
         return poses, []
-    relations = [_relation(track, closure) for closure in accepted]
+    loops = accepted_constraints(context.keyframes, found)
     out = poses.copy()
-    inside = [relation for relation in relations if relation.second < last]
-    out[:last] = pose_graph.optimize_poses(poses[:last], way[: last - 1], inside, _robust(track))
-    carried = out[last - 1] @ se2.inverse(poses[last - 1]) @ poses[last:]
-    out[last:] = se2.normalize(carried)  # what they are off would double with every stage
-    fit = pose_graph.squared_mahalanobis(out, relations) <= track.options.misfit
-    return out, list(itertools.compress(accepted, fit))
+    inside = [loop for loop in loops if loop.second < last]
+    out[:last] = pose_graph.optimize_poses(poses[:last], chain[: last - 1], inside, _MAX_CHI2)
+    moved = out[last - 1] @ se2.inverse(poses[last - 1]) @ poses[last:]
+    out[last:] = se2.normalize(moved)  # rounding errors would double with every stage
+    fits = pose_graph.squared_mahalanobis(out, loops) <= _MAX_CHI2
+    return out, list(itertools.compress(accepted, fits))
 
 
-def _solved(
-    track: LoopContext, way: list[Constraint], start: Float, found: list[LoopClosure]
+def solve_graph(
+    keyframes: Index,
+    chain: list[Constraint],
+    start: Float,
+    closures: list[LoopClosure],
+    max_chi2: float,
 ) -> tuple[Float, list[LoopClosure]]:
-    """Keyframes (K, 3, 3) after the graph, and the closures with those that it refused."""
-    accepted = [_relation(track, c) for c in found if not c.refused]
+    """Optimised keyframes (K, D+1, D+1), and the closures with those that the graph rejects.
+
+    Args:
+        keyframes: (K,) scans.
+        chain: odometry constraints between them.
+        start: (K, D+1, D+1).
+        closures: accepted and refused.
+        max_chi2: chi-square above which a closure is rejected.
+    """
+    accepted = accepted_constraints(keyframes, closures)
     if not accepted:
-        return start, found
-    robust = pose_graph.optimize_poses(start, way, accepted, _robust(track))
-    misfits = pose_graph.squared_mahalanobis(
-        robust, [_relation(track, closure) for closure in found]
-    )
-    found = [
-        refuse(closure, "other loops disagree")
-        if not closure.refused and misfit > track.options.misfit
-        else closure
-        for closure, misfit in zip(found, misfits, strict=True)
+        return start, closures
+    robust = pose_graph.optimize_poses(start, chain, accepted, max_chi2)
+    loops = [_to_constraint(keyframes, closure) for closure in closures]
+    chi2 = pose_graph.squared_mahalanobis(robust, loops)
+    closures = [
+        c.refuse("other loops disagree") if not c.refused and x > max_chi2 else c
+        for c, x in zip(closures, chi2, strict=True)
     ]
-    accepted = [_relation(track, c) for c in found if not c.refused]
-    return pose_graph.optimize_poses(robust, way, accepted, None), found
+    accepted = accepted_constraints(keyframes, closures)
+    return pose_graph.optimize_poses(robust, chain, accepted), closures
+
+
+def accepted_constraints(keyframes: Index, closures: list[LoopClosure]) -> list[Constraint]:
+    """Constraints between keyframes, of the accepted closures."""
+    return [_to_constraint(keyframes, closure) for closure in closures if not closure.refused]
+
+
+def _to_constraint(keyframes: Index, closure: LoopClosure) -> Constraint:
+    first, second = np.searchsorted(keyframes, [closure.earlier, closure.later])
+    return Constraint(int(first), int(second), closure.T, closure.covariance)

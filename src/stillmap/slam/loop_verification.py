@@ -1,4 +1,4 @@
-"""A keyframe laid on the map of an earlier stretch: whether it fits, and where that puts it."""
+"""Loop verification in 2D: a keyframe is matched with a submap of earlier travel."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -9,81 +9,133 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.slam import motion_model, scan_matching
-from stillmap.slam.local_map import select_keyframes_per_sensor
-from stillmap.slam.loop_types import LoopCandidate, LoopClosure, LoopContext, drift
-from stillmap.slam.scan_matching import (
-    Points,
-    RegistrationOptions,
-    Scan,
-    add_scan,
-    select_hits,
-    transform_points,
-)
+from stillmap.slam.local_map import KEYFRAME_ANGLE, select_keyframes_per_sensor
+from stillmap.slam.loop_candidates import drift_std
+from stillmap.slam.scan_matching import Points, Scan, add_scan, select_hits, transform_points
+from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext
 
 Float = NDArray[np.float64]
 
-# of the way between keyframes: a local map of scans nearer than that takes longer, and says no more
-_DENSE = 0.25
-# metres by which a view is shifted to see whether it could slide along a wall
-_SHIFTS = (-0.6, -0.3, 0.3, 0.6)
-# times that a view is laid on a map, at most: again if, where it came to lie, other beams than
-# before are comparable; and the share of them that does not count
-_ROUNDS, _SAME = 3, 0.05
+SUBMAP_TRAVEL = 8.0  # m of travel to either side that forms a submap
+_SUBMAP_SPACING = 0.25  # of that between keyframes; denser takes longer without being better
+_VIEW_TRAVEL = 1.0  # m of travel to a scan on either side that is matched along with a keyframe
+SEARCH_STDS = 2.0  # half width of the search window in standard deviations of the drift
+# a beam is comparable if the submap was observed so many m before its end; share of beams that must
+# be comparable
+_OBSERVED_MARGIN, _MIN_COMPARABLE = 1.0, 0.4
+# share of the comparable beams that the submap must explain, and of the share that the local map
+# explained
+MIN_EXPLAINED, _MIN_EXPLAINED_RATIO = 0.5, 0.8
+CLOSURE_TRANSLATION, _CLOSURE_ROTATION = 0.03, 0.006  # m, rad: min std of a closure
+# a view is matched again while the comparable beams change by more than this share, at most
+_MAX_ROUNDS, _MAX_CHANGE = 3, 0.05
+_SHIFTS = (-0.6, -0.3, 0.3, 0.6)  # m, to test whether a view could slide along a wall
 
 
-def verify_candidates(track: LoopContext, candidates: Iterable[LoopCandidate]) -> list[LoopClosure]:
-    """Every candidate laid on the map of an earlier stretch; ordered by the later scan."""
-    of_stretch: dict[int, list[LoopCandidate]] = {}
+def verify_candidates(
+    context: LoopContext, candidates: Iterable[LoopCandidate]
+) -> list[LoopClosure]:
+    """Each candidate matched with the submap of its earlier scan; ordered by the later scan."""
+    by_stretch: dict[int, list[LoopCandidate]] = {}
     for candidate in candidates:
-        stretch = round(track.travelled[candidate.earlier] / track.options.stretch)
-        of_stretch.setdefault(stretch, []).append(candidate)
+        stretch = round(context.travelled[candidate.earlier] / SUBMAP_TRAVEL)
+        by_stretch.setdefault(stretch, []).append(candidate)
     found = []
-    for stretch, those in sorted(of_stretch.items()):
-        grid = build_submap(track, stretch * track.options.stretch)
-        for candidate in those:
-            found.append(
-                verify_candidate(track, grid, candidate, *drift(candidate.metres, track.options))
-            )
-        track.recording.release_pages(track.e)
+    for stretch, of_stretch in sorted(by_stretch.items()):
+        submap = build_submap(context, stretch * SUBMAP_TRAVEL)
+        found += [
+            verify_candidate(context, submap, one, *drift_std(one.drift_distance))
+            for one in of_stretch
+        ]
+        context.recording.release_pages(context.e)
     return sorted(found, key=lambda closure: closure.later)
 
 
-def build_submap(track: LoopContext, centre: float) -> _core.OccupancyGrid2D:
-    """Scans of one stretch of travel, and no others."""
-    half = track.options.stretch
-    first, last = np.searchsorted(track.travelled, [centre - half, centre + half])
-    grid = _core.OccupancyGrid2D(track.resolution, track.registration.approach)
-    spacing = _DENSE * track.options.distance, _DENSE * track.options.turn
-    sensor = track.recording.sensor[first:last]
-    for t in first + select_keyframes_per_sensor(track.poses[first:last], sensor, *spacing):
-        add_scan(grid, track.recording, track.e, t, track.poses[t], track.surface)
+def build_submap(context: LoopContext, centre: float) -> _core.OccupancyGrid2D:
+    """Map of the scans around `centre` m of travel."""
+    first, last = np.searchsorted(
+        context.travelled, [centre - SUBMAP_TRAVEL, centre + SUBMAP_TRAVEL]
+    )
+    grid = _core.OccupancyGrid2D(context.resolution, scan_matching.FREE_SPACE_MARGIN)
+    spacing = _SUBMAP_SPACING * context.keyframe_distance, _SUBMAP_SPACING * KEYFRAME_ANGLE
+    sensor = context.recording.sensor[first:last]
+    for t in first + select_keyframes_per_sensor(context.poses[first:last], sensor, *spacing):
+        add_scan(grid, context.recording, context.e, t, context.poses[t])
     return grid
 
 
-def _view(track: LoopContext, t: int) -> tuple[Scan, Points]:
-    """What a keyframe and a scan to either side see, in its frame; and where beams were before.
+def verify_candidate(
+    context: LoopContext,
+    submap: _core.OccupancyGrid2D,
+    candidate: LoopCandidate,
+    translation_std: float,
+    rotation_std: float,
+) -> LoopClosure:
+    """The view of the later scan matched with a submap, within its drift.
 
-    The latter are (N, 2): `LoopOptions.before` metres before their ends, or half way if that is
-    farther out.
+    Args:
+        context: the trajectory.
+        submap: map around the earlier scan.
+        candidate: the scans and their relative pose.
+        translation_std, rotation_std: of that pose, m and rad.
     """
-    here, half = track.travelled[t], track.options.view
-    first, last = np.searchsorted(track.travelled, [here - half, here + half], side="right")
+    earlier, later = candidate.earlier, candidate.later
+    mean = context.poses[earlier] @ candidate.T
+    prior = motion_model.gaussian_prior(mean, translation_std, rotation_std)
+    view, before = _collect_view(context, later)
+    window = SEARCH_STDS * translation_std, min(SEARCH_STDS * rotation_std, np.pi)
+    part, share = _select_comparable(submap, view, before, prior.T_map_base)
+    for _ in range(_MAX_ROUNDS):
+        match = scan_matching.search_pose(submap, part, prior, *window)
+        here, share = _select_comparable(submap, view, before, match.T_map_base)
+        if np.abs(here.weights - part.weights).sum() < _MAX_CHANGE * view.weights.sum():
+            break
+        part = here
+    floor = [CLOSURE_TRANSLATION] * 2 + [_CLOSURE_ROTATION]
+    covariance = match.covariance + np.diag(np.square(floor))
+    too_little = share < _MIN_COMPARABLE or match.explained < max(
+        MIN_EXPLAINED, _MIN_EXPLAINED_RATIO * context.explained[later]
+    )
+    if not too_little:
+        # bounded by the drift over the whole way: the graph is no independent measurement
+        free = drift_std(context.travelled[later] - context.travelled[earlier])[0]
+        covariance += _sliding_covariance(submap, part, match.T_map_base, covariance, free)
+        covariance += _ambiguity_covariance(match.alternatives)
+    return LoopClosure(
+        earlier,
+        later,
+        se2.inverse(context.poses[earlier]) @ match.T_map_base,
+        se2.rotate_covariance(covariance, se2.inverse(match.T_map_base)),
+        match.explained,
+        "explains too little" if too_little else "",
+    )
+
+
+def _collect_view(context: LoopContext, t: int) -> tuple[Scan, Points]:
+    """Hits of a keyframe and of a scan to either side, in its frame; and points before their ends.
+
+    The latter are (N, 2), see `_points_before_ends`.
+    """
+    here = context.travelled[t]
+    first, last = np.searchsorted(
+        context.travelled, [here - _VIEW_TRAVEL, here + _VIEW_TRAVEL], side="right"
+    )
     last = max(last - 1, t)
-    shown = sorted({min(first, t), t, last})
-    seen = [select_hits(track.recording, track.e, s) for s in shown]
-    to_t = se2.inverse(track.poses[t]) @ track.poses[shown]
+    scans = sorted({min(first, t), t, last})
+    seen = [select_hits(context.recording, context.e, s) for s in scans]
+    to_t = se2.inverse(context.poses[t]) @ context.poses[scans]
     points = [transform_points(scan.points, T) for scan, T in zip(seen, to_t, strict=True)]
     before = [
-        transform_points(_points_before_ends(scan, track.options.before), T)
+        transform_points(_points_before_ends(scan, _OBSERVED_MARGIN), T)
         for scan, T in zip(seen, to_t, strict=True)
     ]
     weights = np.concatenate([scan.weights for scan in seen])
-    view = Scan(np.concatenate(points), weights, track.recording.T_base_sensor[0])
+    view = Scan(np.concatenate(points), weights, context.recording.T_base_sensor[0])
     return view, np.concatenate(before)
 
 
 def _points_before_ends(scan: Scan, metres: float) -> Points:
-    """(N, 2) where the beams of a scan were so far before their ends, in its frame."""
+    """(N, 2) points so far before the ends of the beams, or half way if that is farther out."""
     origin = scan.T_base_sensor[:2, 2].astype(np.float32)
     beams = scan.points - origin
     length = np.linalg.norm(beams, axis=1, keepdims=True).clip(1e-6)
@@ -91,111 +143,50 @@ def _points_before_ends(scan: Scan, metres: float) -> Points:
     return before
 
 
-def _comparable(
-    grid: _core.OccupancyGrid2D, view: Scan, before: Points, T: Float
+def _select_comparable(
+    submap: _core.OccupancyGrid2D, view: Scan, before: Points, T_map_base: Float
 ) -> tuple[Scan, float]:
-    """What of a view the map has looked at from the same side, and its share of the view.
+    """The part of a view that the submap observed from the same side, and its share.
 
-    The rest says nothing of whether the view fits, and draws it astray: the back of a wall is not
-    its front.
+    The other beams are no evidence and would bias the match: the back of a wall is not its front.
     """
-    cells = np.floor(transform_points(before, T) / grid.resolution).astype(np.int64)
-    looked_at = grid.alpha_beta(cells).sum(axis=1) > 0.0
-    part = np.where(looked_at, view.weights, np.float32(0.0))
+    cells = np.floor(transform_points(before, T_map_base) / submap.resolution).astype(np.int64)
+    observed = submap.alpha_beta(cells).sum(axis=1) > 0.0
+    part = np.where(observed, view.weights, np.float32(0.0))
     share = float(part.sum()) / max(float(view.weights.sum()), 1e-9)
     return dataclasses.replace(view, weights=part), share
 
 
-def verify_candidate(
-    track: LoopContext,
-    grid: _core.OccupancyGrid2D,
-    candidate: LoopCandidate,
-    sigma: float,
-    sigma_turn: float,
-) -> LoopClosure:
-    """The later view registered on the earlier map, as widely as it may have drifted.
+def _ambiguity_covariance(alternatives: Float) -> Float:
+    """Covariance (3, 3) to add where the view fits elsewhere about as well.
 
-    Args:
-        track: where loops are looked for.
-        grid: the map of an earlier stretch.
-        candidate: the scans, and where the later one is looked for.
-        sigma, sigma_turn: standard deviations of that, in metres and radians.
+    Spread of a mixture about its best component, weighted by exp(-cost).
     """
-    options, earlier, later = track.options, candidate.earlier, candidate.later
-    prior = motion_model.gaussian_prior(track.poses[earlier] @ candidate.T, sigma, sigma_turn)
-    view, before = _view(track, later)
-    window = options.window * sigma, min(options.window * sigma_turn, np.pi)
-    part, share = _comparable(grid, view, before, prior.T_map_base)
-    for _ in range(_ROUNDS):
-        found = scan_matching.search_pose(grid, part, prior, track.registration, *window)
-        here, share = _comparable(grid, view, before, found.T_map_base)
-        if np.abs(here.weights - part.weights).sum() < _SAME * view.weights.sum():
-            break
-        part = here
-    least = [options.sigma_translation] * 2 + [options.sigma_rotation]
-    covariance = found.covariance + np.diag(np.square(least))
-    too_little = share < options.known or found.explained < max(
-        options.accept_above, options.compared * track.explained[later]
-    )
-    if not too_little:
-        # what the graph knows of the place is no second witness: the whole way bounds it here
-        free = drift(track.travelled[later] - track.travelled[earlier], options)[0]
-        covariance += _sliding(grid, part, found.T_map_base, covariance, free, track.registration)
-        covariance += _ambiguity_covariance(found.rivals)
-    return LoopClosure(
-        earlier,
-        later,
-        se2.inverse(track.poses[earlier]) @ found.T_map_base,
-        se2.rotate_covariance(covariance, se2.inverse(found.T_map_base)),
-        found.explained,
-        "explains too little" if too_little else "",
-    )
-
-
-def _ambiguity_covariance(rivals: Float) -> Float:
-    """Covariance (3, 3) to add where the view fits somewhere else about as well.
-
-    That of a mixture about its best part, each part being as probable as its cost says.
-    """
-    p = np.exp(-rivals[:, 3])
+    p = np.exp(-alternatives[:, 3])
     p /= p.sum()
-    apart = rivals[:, :3]
-    spread: Float = np.einsum("r,ri,rj->ij", p, apart, apart)
+    offset = alternatives[:, :3]
+    spread: Float = np.einsum("r,ri,rj->ij", p, offset, offset)
     return spread
 
 
-def _sliding(
-    grid: _core.OccupancyGrid2D,
-    view: Scan,
-    T: Float,
-    covariance: Float,
-    sigma: float,
-    options: RegistrationOptions,
+def _sliding_covariance(
+    submap: _core.OccupancyGrid2D, view: Scan, T_map_base: Float, covariance: Float, max_std: float
 ) -> Float:
-    """Covariance (3, 3) to add where a view could slide along a wall and fit as well.
+    """Covariance (3, 3) to add where a view could slide along a wall.
 
-    The curvature at the optimum takes the pattern of end points on a bare wall for information.
-    What the fit loses some way off cannot be taken in like that.
+    The curvature at the optimum mistakes the pattern of end points on a bare wall for information;
+    the cost some way off does not.
     """
-    along = np.linalg.eigh(covariance[:2, :2])[1][:, 1]  # the direction that is known least
+    along = np.linalg.eigh(covariance[:2, :2])[1][:, 1]  # the least certain direction
 
     def cost(shift: float) -> float:
-        moved = T.copy()
+        moved = T_map_base.copy()
         moved[:2, 2] += shift * along
-        return options.gain * _core.registration_cost(
-            grid,
-            view.points,
-            view.weights,
-            moved,
-            sigma=options.sigma,
-            radius=scan_matching.field_radius(options, grid.resolution),
-            floor=options.floor,
-            unknown=options.unknown,
-        )
+        return scan_matching.registration_cost(submap, view, moved)
 
     best = cost(0.0)
-    # a Gaussian of this variance loses as much there
+    # a Gaussian of this variance costs as much there
     variances = [0.5 * shift**2 / max(cost(shift) - best, 1e-9) for shift in _SHIFTS]
     added = np.zeros((3, 3))
-    added[:2, :2] = min(max(variances), sigma**2) * np.outer(along, along)
+    added[:2, :2] = min(max(variances), max_std**2) * np.outer(along, along)
     return added

@@ -1,4 +1,4 @@
-"""The M-step over poses and map: incremental registration, loop closure, one more pass."""
+"""The M-step over poses and map: scan matching, loop closure, refinement, (9) and (10)-(15)."""
 
 import dataclasses
 from collections.abc import Callable
@@ -9,13 +9,21 @@ from numpy.typing import NDArray
 
 from stillmap import em
 from stillmap.core.recording import Recording
-from stillmap.slam import lidar_odometry, loop_closure, loop_closure_3d, odometry_2d
 from stillmap.slam.deskew import deskew_recording
-from stillmap.slam.odometry_2d import MStepResult, SlamOptions
+from stillmap.slam.lidar_odometry import register_sweeps
+from stillmap.slam.loop_closure import close_loops
+from stillmap.slam.loop_closure_3d import close_loops_3d
+from stillmap.slam.odometry_2d import register_scans
+from stillmap.slam.options import SlamOptions
 from stillmap.slam.refinement import refine_poses
+from stillmap.slam.scan_matching import FREE_SPACE_MARGIN
+from stillmap.slam.types import MStepResult, ScanProgress
 
 Float = NDArray[np.float64]
-StepProgress = Callable[[str, int, int], None]  # what, scans done, of how many
+StepProgress = Callable[[str, int, int], None]  # step, scans done, total; 0: not counted
+
+_LOCAL_MAP_TRAVEL = 25.0  # m after which scans leave the local map if loops are closed afterwards
+_REFINEMENT_PASSES = 1
 
 
 def m_step(
@@ -29,134 +37,107 @@ def m_step(
     start: MStepResult | None = None,
     earlier_poses: Float | None = None,
     with_grid: bool = True,
+    free_space_margin: float = FREE_SPACE_MARGIN,
 ) -> MStepResult:
     """The most likely poses and map given e: (9), (10)-(15).
 
     Args:
-        recording: as it was taken: the motion during its scans is taken out of them here.
-        e: (M,) probability that each beam was reflected by something static.
+        recording: as taken; its scans are deskewed here.
+        e: (M,) P(static) of every beam.
         options: see SlamOptions.
-        poses: (T, D+1, D+1) T_map_base when they are known: then only the map is made.
-        threads: for maps of poses that are known already; the result does not depend on it.
-        progress: called with what is done, the number of scans done and their total.
-        start: an M-step whose loops are closed already: its poses are only swept again.
-        before: (T, 3, 3) earlier poses, which tell how the robot moved during its scans better than
-            odometry does.
-        sums: whether the sums of (10) are wanted.
+        poses: (T, D+1, D+1) known T_map_base: only the map is computed.
+        threads: of the 3D registration and of the map; the result does not depend on it.
+        progress: called with the step, the number of scans done and their total.
+        start: an M-step with closed loops: its poses are only refined. 2D only.
+        earlier_poses: (T, 3, 3) estimate that is better than odometry for deskewing. 2D only.
+        with_grid: whether to compute the sums of (10).
+        free_space_margin: m before its end in which a beam is not used as free space; (10) as
+            printed has 0.
     """
+    D, T = recording.dimension, recording.n_scans
     if poses is not None:
-        mapped = _mapped_at(recording, e, options, poses, threads, sums=with_grid)
-        progress("mapping", recording.n_scans, recording.n_scans)
-        return mapped
-    if recording.dimension == 3:
-        mapped = _driven(recording, e, options, progress, threads)
+        freedom = D * (D + 1) // 2
+        empty = em.make_grid(D, options.resolution)
+        found = MStepResult(poses, np.zeros((T, freedom, freedom)), empty, np.full(T, np.nan))
+    elif D == 3:
+        found = _estimate_poses_3d(recording, e, options, progress, threads)
     else:
-        mapped = _estimated(recording, e, options, progress, start, earlier_poses)
-    progress("drawing the map", 0, 0)
-    grid = _mapped_at(recording, e, options, mapped.poses, threads, sums=with_grid).grid
-    return dataclasses.replace(mapped, grid=grid)
+        found = _estimate_poses_2d(
+            recording, e, options, progress, start, earlier_poses, free_space_margin
+        )
+    if poses is None:
+        progress("drawing the map", 0, 0)
+    grid = em.make_grid(D, options.resolution, free_space_margin)
+    if with_grid:
+        deskewed = deskew_recording(recording, found.poses, options, threads)
+        em.add_recording(grid, deskewed, found.poses, e, threads)
+    if poses is not None:
+        progress("mapping", T, T)
+    return dataclasses.replace(found, grid=grid)
 
 
-def _driven(
+def _estimate_poses_3d(
     recording: Recording,
     e: NDArray[np.float32],
     options: SlamOptions,
     progress: StepProgress,
     threads: int,
 ) -> MStepResult:
-    """The same of sweeps in space."""
-    local = lidar_odometry.register_sweeps(
-        recording, e, options.spinning, options.motion, partial(progress, "mapping"), threads
+    """Lidar odometry and loop closure; the grid is empty."""
+    odometry = register_sweeps(
+        recording, e, options.odometry, partial(progress, "mapping"), threads
     )
-    driven, loops, graph = loop_closure_3d.close_loops_3d(
-        recording,
-        e,
-        options.spinning,
-        options.spinning_loops,
-        local,
-        partial(progress, "closing loops"),
-        threads,
-    )
-    nothing = em.make_grid(3, options.resolution)
-    return MStepResult(
-        driven.poses,
-        driven.covariance,
-        nothing,
-        local.explained,
-        widened=[],
-        loops=loops,
-        graph=graph,
-    )
+    empty = em.make_grid(3, options.resolution)
+    found = MStepResult(odometry.poses, odometry.covariance, empty, odometry.explained)
+    if not options.loop_closure:
+        return found
+    closing = partial(progress, "closing loops")
+    poses, loops, graph = close_loops_3d(recording, e, options, odometry, closing, threads)
+    return dataclasses.replace(found, poses=poses, loops=loops, graph=graph)
 
 
-def _estimated(
+def _estimate_poses_2d(
     recording: Recording,
     e: NDArray[np.float32],
     options: SlamOptions,
     progress: StepProgress,
     start: MStepResult | None,
-    before: Float | None,
+    earlier_poses: Float | None,
+    free_space_margin: float,
 ) -> MStepResult:
-    """The most likely poses alone, see m_step."""
-    if not options.loops.enabled:
-        return _followed(recording, e, options, partial(progress, "mapping"), before)
-    if start is not None:
-        mapped = _swept(recording, e, options, start, partial(progress, "mapping"))
-        return dataclasses.replace(mapped, explained=start.explained)
-    local = _followed(recording, e, options, partial(progress, "mapping"), before)
-    seen = deskew_recording(recording, local.poses, options)
-    closed = loop_closure.close_loops(seen, e, options, local, partial(progress, "closing loops"))
-    mapped = _swept(recording, e, options, closed, partial(progress, "mapping again"))
-    # a scan that went astray explains itself in the map of all: the map so far tells
-    return dataclasses.replace(mapped, explained=local.explained)
+    """Scan matching, loop closure and refinement; the grid is empty."""
+    mapping = partial(progress, "mapping")
+    if start is None or not options.loop_closure:
+        found = _match_scans(recording, e, options, mapping, earlier_poses, free_space_margin)
+        if not options.loop_closure:
+            return found
+        deskewed = deskew_recording(recording, found.poses, options)
+        closing = partial(progress, "closing loops")
+        start = close_loops(deskewed, e, options, found, closing)
+        mapping = partial(progress, "mapping again")
+    refined = start
+    for _ in range(_REFINEMENT_PASSES):
+        deskewed = deskew_recording(recording, refined.poses, options)
+        refined = refine_poses(deskewed, e, options, refined, mapping)
+    # in the map of all scans, one that went astray explains itself: keep the local map's share
+    return dataclasses.replace(refined, explained=start.explained)
 
 
-def _followed(
+def _match_scans(
     recording: Recording,
     e: NDArray[np.float32],
     options: SlamOptions,
-    progress: Callable[[int, int], None],
-    before: Float | None,
+    progress: ScanProgress,
+    earlier_poses: Float | None,
+    free_space_margin: float,
 ) -> MStepResult:
-    """Poses one after the other, of scans without the motion during them as far as it is known."""
-    memory = options.loops.memory if options.loops.enabled else np.inf
-    known = recording.T_odom_base if before is None else before
-    if known is None and options.deskew and recording.beam_time is not None:
-        # scans as they were taken are alike enough to tell how the robot went
-        known = odometry_2d.register_scans(recording, e, options, progress, memory).poses
-    seen = deskew_recording(recording, known, options)
-    return odometry_2d.register_scans(seen, e, options, progress, memory)
+    """Incremental scan matching of scans deskewed as well as their motion is known."""
+    max_travel = _LOCAL_MAP_TRAVEL if options.loop_closure else np.inf
 
+    def match(scans: Recording) -> MStepResult:
+        return register_scans(scans, e, options, progress, max_travel, free_space_margin)
 
-def _swept(
-    recording: Recording,
-    e: NDArray[np.float32],
-    options: SlamOptions,
-    mapped: MStepResult,
-    progress: Callable[[int, int], None],
-) -> MStepResult:
-    """Poses whose loops are closed, registered once more against all others."""
-    for _ in range(options.loops.sweeps):
-        seen = deskew_recording(recording, mapped.poses, options)
-        mapped = refine_poses(seen, e, options, mapped, progress)
-    return mapped
-
-
-def _mapped_at(
-    recording: Recording,
-    e: NDArray[np.float32],
-    options: SlamOptions,
-    poses: Float,
-    threads: int,
-    *,
-    sums: bool = True,
-) -> MStepResult:
-    """The map of known poses (T, D+1, D+1)."""
-    D, T = recording.dimension, recording.n_scans
-    grid = em.make_grid(D, options.resolution, options.registration.approach)
-    if sums:
-        em.add_recording(
-            grid, deskew_recording(recording, poses, options, threads), poses, e, threads
-        )
-    freedom = D * (D + 1) // 2
-    return MStepResult(poses, np.zeros((T, freedom, freedom)), grid, np.full(T, np.nan), [])
+    motion = recording.T_odom_base if earlier_poses is None else earlier_poses
+    if motion is None and options.deskew and recording.beam_time is not None:
+        motion = match(recording).poses  # distorted scans are similar enough to tell the motion
+    return match(deskew_recording(recording, motion, options))

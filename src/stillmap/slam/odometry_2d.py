@@ -1,291 +1,203 @@
-"""The M-step of the paper: poses one after the other (9), and the map they make (10)-(15)."""
-
-import dataclasses
-from collections.abc import Callable
-from dataclasses import dataclass, field
+"""Incremental scan matching in 2D: each scan is matched (9), then added to the local map (10)."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.config import option
 from stillmap.core.recording import Recording
-from stillmap.slam import motion_model, odometry_faults
-from stillmap.slam.lidar_odometry import SpinningOptions
+from stillmap.slam import motion_model
 from stillmap.slam.local_map import LocalMap
-from stillmap.slam.loop_closure_3d import SpinningLoopOptions
-from stillmap.slam.loop_types import LoopClosure, LoopOptions
-from stillmap.slam.motion_model import MotionOptions, MotionPrior
-from stillmap.slam.pose_graph import PoseGraph
+from stillmap.slam.motion_model import MotionPrior, VelocityNoise
+from stillmap.slam.odometry_faults import SlipDetector, SlipHypothesis
+from stillmap.slam.options import SlamOptions
 from stillmap.slam.scan_matching import (
-    RegistrationOptions,
+    FREE_SPACE_MARGIN,
+    MAX_OCCLUDED,
     Scan,
     ScanMatch,
-    SurfaceOptions,
     accept_prior,
     is_inconsistent,
     match_scan,
     occluded_share,
     select_hits,
 )
+from stillmap.slam.types import Diagnostics, MStepResult, ScanProgress
 
 Float = NDArray[np.float64]
 
-_LATELY = 0.1  # weight of one scan in what the map usually explains
-
-
-@dataclass(frozen=True)
-class SlamOptions:
-    """The M-step over poses and map."""
-
-    resolution: float = option(0.05, "m, edge of a map cell")
-    voxel: float | None = option(
-        None, "m, the same of 3D recordings; unset: 0.15, of depth cameras 0.05"
-    )
-    spacing: float = option(
-        0.2, "m, rad or 5 s between scans that later ones are registered against"
-    )
-    deskew: bool = option(True, "take the motion during a scan out of it, where beams have times")
-    motion: MotionOptions = field(default=MotionOptions())
-    registration: RegistrationOptions = field(default=RegistrationOptions())
-    surface: SurfaceOptions = field(default=SurfaceOptions())
-    loops: LoopOptions = field(default=LoopOptions())
-    spinning: SpinningOptions = field(default=SpinningOptions())
-    spinning_loops: SpinningLoopOptions = field(default=SpinningLoopOptions())
-
-    def __post_init__(self) -> None:
-        if not 0.005 <= self.resolution <= 10.0:
-            raise ValueError("'slam.resolution' wants 0.005 to 10 metres")
-        if self.voxel is not None and not 0.005 <= self.voxel <= 10.0:
-            raise ValueError("'slam.voxel' wants 0.005 to 10 metres")
-        if not 0.0 <= self.spacing <= 100.0:
-            raise ValueError("'slam.spacing' wants 0 to 100 metres")
-
-
-@dataclass(frozen=True)
-class Diagnostics:
-    """Where odometry and scans do not agree; numbers of scans, as Mapped has them."""
-
-    widened: list[int] = field(default_factory=list)
-    odometry_faults: list[int] = field(default_factory=list)
-    breaks: list[int] = field(default_factory=list)
-    unconnected: list[int] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class MStepResult:
-    """What the M-step found.
-
-    Attributes:
-        poses: (T, 3, 3) T_map_base; the map frame is the first scan's base.
-        covariance: (T, 3, 3) of each pose against the map so far, or with loops closed against
-            the map of all others: x, y, heading. That of the guess where there was no map yet.
-        grid: the sums alpha, beta of (10) of all scans.
-        explained: (T,) share of each scan's beams that the map so far explained; the map of all
-            others where poses were swept only.
-        widened: indices of the scans that a wider search had to find.
-        disagreeing: indices of the scans where odometry was disbelieved.
-        breaks: scans before which the robot went astray, or was carried elsewhere.
-        apart: those of them from which on no place was seen that is known from before; until loops
-            are looked for, those that fit nowhere around.
-        loops: attempts at closing loops, accepted or refused.
-        graph: the keyframes and what is known of them; None without loop closure.
-    """
-
-    poses: Float
-    covariance: Float
-    grid: _core.OccupancyGrid2D | _core.OccupancyGrid3D
-    explained: Float
-    widened: list[int]
-    odometry_faults: list[int] = field(default_factory=list)
-    breaks: list[int] = field(default_factory=list)
-    unconnected: list[int] = field(default_factory=list)
-    loops: list[LoopClosure] = field(default_factory=list)
-    graph: PoseGraph | None = None
-
-    @property
-    def diagnostics(self) -> "Diagnostics":
-        """Where odometry and scans do not agree."""
-        return Diagnostics(self.widened, self.odometry_faults, self.breaks, self.unconnected)
-
-    def without_grid(self) -> "MStepResult":
-        """Poses and what is known of them alone: grids are large."""
-        return dataclasses.replace(self, grid=type(self.grid)(self.grid.resolution))
+_EXPLAINED_RATE = 0.1  # weight of one scan in the running average of the explained share
+_KIDNAPPED_BELOW = 0.3  # of that average: the robot may have been carried elsewhere
 
 
 def register_scans(
     recording: Recording,
     e: NDArray[np.float32],
     options: SlamOptions,
-    progress: Callable[[int, int], None],
-    memory: float = np.inf,
+    progress: ScanProgress,
+    max_travel: float = np.inf,
+    free_space_margin: float = FREE_SPACE_MARGIN,
 ) -> MStepResult:
-    """Incremental maximum likelihood: register each scan (9), then add it to the map so far (10).
+    """Poses by incremental maximum likelihood.
 
-    The grid that comes back is empty: the map so far has no beams without a return, and of scans
-    that show the same only one.
+    The grid of the result is empty: the local map lacks beams without a return and most scans.
 
     Args:
         recording: 2D.
-        e: (M,) probability that each beam was reflected by something static.
+        e: (M,) P(static) of every beam.
         options: see SlamOptions.
         progress: called with the number of scans done and their total.
-        memory: metres of travel after which a scan is taken out of the map again.
+        max_travel: m of travel after which a scan leaves the local map.
+        free_space_margin: m before its end in which a beam is not used as free space.
     """
     T = recording.n_scans
-    so_far = _empty(recording, e, options)
-    way = _Way.of(T)
-    steadiness = motion_model.unknown_steadiness(options.motion)
-    steps = motion_model.compute_odometry_steps(recording.T_odom_base)
-    seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns))) if T > 1 else 0.0
-    watch = odometry_faults.SlipDetector(
-        None if steps is None else steps.increments, options.registration
-    )
-    travelled = 0.0
-    usual = np.zeros(len(recording.T_base_sensor))  # each laser sees its own side
-    usual[recording.sensor[0]] = 1.0
-    so_far.add(0, way.poses[0], 0.0)
+    odometry = _ScanOdometry(recording, e, options, max_travel, free_space_margin)
     progress(1, T)
     for t in recording.iter_scans(range(1, T), e):
-        last, guess = way.poses[t - 1], way.guess(t, steadiness)
-        stalled = watch.stalled(t, last, guess)
-        prior, other = _priors(last, steps, t, guess, stalled, options.motion)
-        scan, s = select_hits(recording, e, t), recording.sensor[t]
-        # without odometry, what a laser sees on its own side at first has nothing to lie on
-        has_ground = prior.measured or so_far.has(s)
-        if has_ground:
-            found = match_scan(so_far.grid, scan, prior, other, options.registration, usual[s])
-        else:
-            found = accept_prior(prior)
-        gone_on = watch.look(t, last, guess, so_far.grid, scan, found)
-        if gone_on is not None:
-            so_far.forget_since(gone_on.first)  # they are not put back: those to come show the same
-            for since, found in enumerate(gone_on.found, gone_on.first):
-                way.take(since, found, doubted=True)
-            travelled += _metres(way.poses[gone_on.first - 1 : t])
-            guess = way.guess(t, steadiness)
-        fits_nowhere = _was_carried(so_far, scan, found, usual[s], options.registration)
-        leapt = _leapt(so_far, scan, found, (prior, other or guess), options.registration)
-        if fits_nowhere or (leapt and steps is not None):
-            way.breaks.append(t)
-            if fits_nowhere:
-                way.nowhere.append(t)
-            so_far, usual[:] = _empty(recording, e, options), 0.0
-            watch.forget()
-        disbelieved = None if prior.measured else other
-        is_doubted = disbelieved is not None and is_inconsistent(
-            disbelieved, found, options.registration
-        )
-        way.take(t, found, doubted=is_doubted)
-        if has_ground:
-            # nothing is usual yet after the first scan
-            usual[s] += (_LATELY if usual[s] > 0.0 else 1.0) * (found.explained - usual[s])
-            steadiness = steadiness.after(guess.shift_to(found.T_map_base), seconds, options.motion)
-        travelled += _metres(way.poses[t - 1 : t + 1])
-        so_far.add(t, found.T_map_base, travelled)
-        so_far.forget(travelled - memory)
+        odometry.register(t)
         progress(t + 1, T)
-    return way.mapped(_core.OccupancyGrid2D(options.resolution))
+    return odometry.result()
 
 
-@dataclass(frozen=True, eq=False)
-class _Way:
-    """What was found of each scan so far; Mapped says what it is."""
+class _ScanOdometry:
+    """State of incremental scan matching; arguments as of `register_scans`."""
 
-    poses: Float
-    covariance: Float
-    explained: Float
-    widened: NDArray[np.bool_]
-    disagreeing: NDArray[np.bool_]
-    breaks: list[int] = field(default_factory=list)
-    nowhere: list[int] = field(default_factory=list)
+    def __init__(
+        self,
+        recording: Recording,
+        e: NDArray[np.float32],
+        options: SlamOptions,
+        max_travel: float,
+        free_space_margin: float,
+    ) -> None:
+        T = recording.n_scans
+        self.recording, self.e, self.options = recording, e, options
+        self.max_travel, self.free_space_margin = max_travel, free_space_margin
+        self.poses = np.tile(np.eye(3), (T, 1, 1))
+        self.covariance, self.explained = np.zeros((T, 3, 3)), np.ones(T)
+        self.widened, self.odometry_faults = np.zeros((2, T), np.bool_)
+        self.breaks, self.unconnected = list[int](), list[int]()
+        self.steps = motion_model.compute_odometry_steps(recording.T_odom_base)
+        self.slip = SlipDetector(None if self.steps is None else self.steps.increments)
+        self.noise = VelocityNoise()
+        self.seconds = 1e-9 * float(np.median(np.diff(recording.stamp_ns))) if T > 1 else 0.0
+        self.travelled = 0.0
+        # running average of the explained share, per sensor: each sees its own side
+        self.usual = np.zeros(len(recording.T_base_sensor))
+        self.usual[recording.sensor[0]] = 1.0
+        self.local_map = self._empty_map()
+        self.local_map.add(0, self.poses[0], 0.0)
 
-    @classmethod
-    def of(cls, T: int) -> "_Way":
-        poses = np.tile(np.eye(3), (T, 1, 1))
-        none = np.zeros((2, T), np.bool_)
-        return cls(poses, np.zeros((T, 3, 3)), np.ones(T), none[0], none[1])
+    def _empty_map(self) -> LocalMap:
+        grid = _core.OccupancyGrid2D(self.options.resolution, self.free_space_margin)
+        return LocalMap(grid, self.recording, self.e)
 
-    def take(self, t: int, found: ScanMatch, *, doubted: bool) -> None:
-        self.poses[t], self.covariance[t] = found.T_map_base, found.covariance
-        self.explained[t], self.widened[t] = found.explained, found.widened
-        self.disagreeing[t] |= found.disagrees or doubted
+    def register(self, t: int) -> None:
+        """Matches scan t and adds it to the local map."""
+        last, guess = self.poses[t - 1], self._predict(t)
+        prior, other = self._priors(t, guess, self.slip.is_slipping(t, last, guess))
+        scan, s = select_hits(self.recording, self.e, t), self.recording.sensor[t]
+        # without odometry, the first scan of a sensor with another view has nothing to match
+        has_map = prior.is_odometry or self.local_map.has_sensor(s)
+        if has_map:
+            match = match_scan(self.local_map.grid, scan, prior, other, self.usual[s])
+        else:
+            match = accept_prior(prior)
+        slip = self.slip.detect(t, last, guess, self.local_map.grid, scan, match)
+        if slip is not None:
+            match = self._accept_slip(t, slip)
+            guess = self._predict(t)
+        self._detect_break(t, scan, match, (prior, other or guess))
+        rejected = None if prior.is_odometry else other
+        is_fault = rejected is not None and is_inconsistent(rejected, match.T_map_base)
+        self._record(t, match, is_fault=is_fault)
+        if has_map:
+            rate = _EXPLAINED_RATE if self.usual[s] > 0.0 else 1.0  # 0: the first scan of a map
+            self.usual[s] += rate * (match.explained - self.usual[s])
+            self.noise = self.noise.update(guess.residual(match.T_map_base), self.seconds)
+        self.travelled += _length(self.poses[t - 1 : t + 1])
+        self.local_map.add(t, match.T_map_base, self.travelled)
+        self.local_map.remove_before(self.travelled - self.max_travel)
 
-    def guess(self, t: int, steadiness: motion_model.VelocityNoise) -> MotionPrior:
-        """The last motion once more; across a break there was none that is known."""
+    def _predict(self, t: int) -> MotionPrior:
+        """Constant velocity; no motion where it is unknown, after a break."""
         before = t - 1 if t < 2 or t - 1 in self.breaks[-1:] else t - 2
         return motion_model.constant_velocity_prior(
-            self.poses[t - 1], self.poses[before], steadiness
+            self.poses[t - 1], self.poses[before], self.noise
         )
 
-    def mapped(self, grid: _core.OccupancyGrid2D) -> MStepResult:
-        return MStepResult(
-            self.poses,
-            self.covariance,
-            grid,
-            self.explained,
+    def _priors(
+        self, t: int, guess: MotionPrior, is_slipping: bool
+    ) -> tuple[MotionPrior, MotionPrior | None]:
+        """The prior of scan t and the alternative to it: odometry and prediction."""
+        if self.steps is None:
+            return guess, None
+        increment = self.steps.increments[t - 1]
+        measured = motion_model.odometry_prior(self.poses[t - 1], increment, self.options.odometry)
+        is_valid = self.steps.plausible[t - 1] and not is_slipping
+        return (measured, guess) if is_valid else (guess, measured)
+
+    def _accept_slip(self, t: int, slip: SlipHypothesis) -> ScanMatch:
+        """Replaces the poses since odometry stopped; returns the match of scan t."""
+        # the scans are not added again: those to come show the same
+        self.local_map.remove_since(slip.first)
+        for k, match in enumerate(slip.matches, slip.first):
+            self._record(k, match, is_fault=True)
+        self.travelled += _length(self.poses[slip.first - 1 : t])
+        return slip.matches[-1]
+
+    def _detect_break(
+        self, t: int, scan: Scan, match: ScanMatch, priors: tuple[MotionPrior, MotionPrior]
+    ) -> None:
+        """Starts a new local map if the robot was carried elsewhere before scan t."""
+        fits_nowhere = self._is_unexplained(t, scan, match)
+        if not fits_nowhere and not (self.steps is not None and self._is_leap(scan, match, priors)):
+            return
+        self.breaks.append(t)
+        if fits_nowhere:
+            self.unconnected.append(t)
+        self.local_map, self.usual[:] = self._empty_map(), 0.0
+        self.slip.reset()
+
+    def _is_unexplained(self, t: int, scan: Scan, match: ScanMatch) -> bool:
+        """Whether a scan contradicts the map wherever the robot may have moved by itself.
+
+        A scan of a new place is explained as little, but its beams do not pass through walls.
+        """
+        usual = self.usual[self.recording.sensor[t]]
+        if match.explained >= _KIDNAPPED_BELOW * usual or len(scan.points) == 0:
+            return False
+        return occluded_share(self.local_map.grid, scan, match.T_map_base) > MAX_OCCLUDED
+
+    def _is_leap(
+        self, scan: Scan, match: ScanMatch, priors: tuple[MotionPrior, MotionPrior]
+    ) -> bool:
+        """Whether a scan fits only where neither odometry nor the prediction lead.
+
+        It may look alike there. Unless the robot was carried, the scan at the pose of odometry
+        does not pass through walls.
+        """
+        if match.all_headings or not match.widened:
+            return match.all_headings
+        if not all(is_inconsistent(prior, match.T_map_base) for prior in priors):
+            return False
+        return occluded_share(self.local_map.grid, scan, priors[0].T_map_base) > MAX_OCCLUDED
+
+    def _record(self, t: int, match: ScanMatch, *, is_fault: bool) -> None:
+        self.poses[t], self.covariance[t] = match.T_map_base, match.covariance
+        self.explained[t], self.widened[t] = match.explained, match.widened
+        self.odometry_faults[t] |= match.contradicts_odometry or is_fault
+
+    def result(self) -> MStepResult:
+        """Poses and diagnostics of all scans."""
+        diagnostics = Diagnostics(
             np.flatnonzero(self.widened).tolist(),
-            np.flatnonzero(self.disagreeing).tolist(),
+            np.flatnonzero(self.odometry_faults).tolist(),
             self.breaks,
-            self.nowhere,
+            self.unconnected,
         )
+        grid = _core.OccupancyGrid2D(self.options.resolution)
+        return MStepResult(self.poses, self.covariance, grid, self.explained, diagnostics)
 
 
-def _metres(poses: Float) -> float:
+def _length(poses: Float) -> float:
     return float(np.linalg.norm(np.diff(poses[:, :2, 2], axis=0), axis=1).sum())
-
-
-def _empty(recording: Recording, e: NDArray[np.float32], options: SlamOptions) -> LocalMap:
-    grid = _core.OccupancyGrid2D(options.resolution, options.registration.approach)
-    return LocalMap(grid, recording, e, options.spacing, options.surface)
-
-
-def _was_carried(
-    so_far: LocalMap,
-    scan: Scan,
-    found: ScanMatch,
-    usual: float,
-    options: RegistrationOptions,
-) -> bool:
-    """Whether a scan contradicts the map, wherever the robot may have moved by itself.
-
-    A scan of a place that is new is explained as little, but it does not look through walls.
-    """
-    if found.explained >= options.carried_below * usual or len(scan.points) == 0:
-        return False
-    return occluded_share(so_far.grid, scan, found) > options.through
-
-
-def _leapt(
-    so_far: LocalMap,
-    scan: Scan,
-    found: ScanMatch,
-    priors: tuple[MotionPrior, MotionPrior],
-    options: RegistrationOptions,
-) -> bool:
-    """Whether a scan fits only where neither odometry nor its motion so far takes the robot.
-
-    It may look alike there. A robot that was not carried would not look through walls without it.
-    """
-    if found.astray or not found.widened:
-        return found.astray
-    if not all(is_inconsistent(prior, found, options) for prior in priors):
-        return False
-    unmoved = dataclasses.replace(found, T_map_base=priors[0].T_map_base)
-    return occluded_share(so_far.grid, scan, unmoved) > options.through
-
-
-def _priors(
-    T_map_base: Float,
-    steps: motion_model.OdometrySteps | None,
-    t: int,
-    guess: MotionPrior,
-    stalled: bool,
-    options: MotionOptions,
-) -> tuple[MotionPrior, MotionPrior | None]:
-    """Where scan t ought to be after a pose (3, 3), and where else it may be."""
-    if steps is None:
-        return guess, None
-    measured = motion_model.odometry_prior(T_map_base, steps.increments[t - 1], options)
-    is_true = steps.plausible[t - 1] and not stalled
-    return (measured, guess) if is_true else (guess, measured)

@@ -1,7 +1,8 @@
-"""Odometry that stands still while the robot goes on: wheels, or what counts them, may stall.
+"""Detection of wheel slip: odometry that stands still while the robot moves on.
 
-Between two walls a scan fits well enough where odometry leaves it. So the robot is also followed as
-if it had gone on, for as long as odometry stands still; what the scans say for that adds up.
+Between two walls a scan fits well enough where odometry leaves it. While odometry stands still, a
+second hypothesis therefore follows the robot at constant velocity, and its gain in log likelihood
+is summed over the scans.
 """
 
 import dataclasses
@@ -14,130 +15,129 @@ import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.slam import motion_model, scan_matching
 from stillmap.slam.motion_model import MotionPrior
-from stillmap.slam.scan_matching import RegistrationOptions, Scan, ScanMatch
+from stillmap.slam.scan_matching import ODOMETRY_FAULT, Scan, ScanMatch
 
 Float = NDArray[np.float64]
 
-_LEAST = 0.02  # m and rad, of a step: slower robots may as well have stopped
-_STILL = 0.2  # of the step before: what is shorter is none
-_LONGEST = 500  # scans in which it has to become clear
+_MIN_STEP = 0.02  # m and rad between scans: a slower robot may as well have stopped
+_STILL_RATIO = 0.2  # of the predicted step: shorter odometry steps count as standing still
+_MAX_SCANS = 500  # of one hypothesis
 
 
 @dataclass(frozen=True, eq=False)
 class SlipHypothesis:
-    """The robot as if it had gone on.
+    """The robot at constant velocity while odometry stands still.
 
     Attributes:
-        first: the scan at which odometry stopped.
+        first: scan at which odometry stopped.
         before: (3, 3) T_map_base of the scan before it.
-        found: where each scan from the first on lies then.
-        gain: nats by which they fit better than where odometry leaves them.
+        matches: of each scan from the first on.
+        gain: nats by which they fit better than the poses by odometry.
     """
 
     first: int
     before: Float
-    found: list[ScanMatch]
+    matches: list[ScanMatch]
     gain: float
 
 
 class SlipDetector:
-    """Follows a robot whose odometry may stall, scan by scan."""
+    """Tests for wheel slip scan by scan.
 
-    def __init__(self, increments: Float | None, options: RegistrationOptions) -> None:
-        """Before the second scan.
+    Args:
+        increments: (T - 1, 3, 3) of odometry; None: no odometry, no slip.
+    """
 
-        Args:
-            increments: (T - 1, 3, 3) of odometry; None: nothing can stall.
-            options: see RegistrationOptions.
-        """
-        self._increments, self._options = increments, options
-        self.forget()
+    def __init__(self, increments: Float | None) -> None:
+        self._increments = increments
+        self.reset()
 
-    def forget(self) -> None:
-        """The robot is elsewhere: nothing of how it moved before tells how it goes on."""
-        self._stalled = False
-        self._going: SlipHypothesis | None = None
+    def reset(self) -> None:
+        """Discards the past motion, after the robot was carried elsewhere."""
+        self._is_slipping = False
+        self._hypothesis: SlipHypothesis | None = None
 
-    def stalled(self, t: int, last: Float, guess: MotionPrior) -> bool:
-        """Whether odometry has been found to stall and still does on the way to scan t.
+    def is_slipping(self, t: int, last: Float, guess: MotionPrior) -> bool:
+        """Whether a detected slip still holds on the way to scan t.
 
         Args:
             t: the scan.
             last: (3, 3) T_map_base of the scan before.
-            guess: the last motion once more.
+            guess: constant-velocity prior of scan t.
         """
-        if self._stalled:  # a robot that stands meanwhile does not make its odometry true again
-            step = max(_size(se2.inverse(last) @ guess.T_map_base), _LEAST)
-            self._stalled = self._moved(t) < _STILL * step
-        return self._stalled
+        if self._is_slipping:  # a robot that pauses does not make its odometry valid again
+            step = max(_step_size(se2.inverse(last) @ guess.T_map_base), _MIN_STEP)
+            self._is_slipping = self._odometry_step(t) < _STILL_RATIO * step
+        return self._is_slipping
 
-    def look(
+    def detect(
         self,
         t: int,
         last: Float,
         guess: MotionPrior,
         grid: _core.OccupancyGrid2D,
         scan: Scan,
-        found: ScanMatch,
+        match: ScanMatch,
     ) -> SlipHypothesis | None:
-        """How the robot went on, once the scans leave no doubt that it did.
+        """The slip hypothesis, at the scan that confirms it.
 
         Args:
-            t, last, guess: as `stalled` has them.
-            grid: the map so far.
-            scan: what was seen.
-            found: where it lies by the prior, which is odometry's unless that is implausible.
+            t, last, guess: as of `is_slipping`.
+            grid: the local map.
+            scan: scan t.
+            match: its match by the prior, which is odometry unless that is implausible.
         """
-        if self._stalled:
+        if self._is_slipping:
             return None
-        onwards = self._onwards(t, last, guess) if len(scan.points) else None
-        if onwards is None:
-            self._going = None
+        onward = self._predict(t, last, guess) if len(scan.points) else None
+        if onward is None:
+            self._hypothesis = None
         else:
-            start = onwards.T_map_base
-            moved = scan_matching.search_pose(grid, scan, onwards, self._options, 0.0, 0.0, start)
-            self._add(t, last, moved, found.misfit - moved.misfit)
-        if self._going is not None and self._going.gain > self._options.lies:
-            gone_on, self._going, self._stalled = self._going, None, True
-            return gone_on
-        # a turn is seen at once
-        self._stalled = found.disagrees and self._stands_still(t, last, found.T_map_base)
-        if self._stalled:
-            self._going = None
+            moved = scan_matching.refine_pose(grid, scan, onward, onward.T_map_base)
+            self._extend(t, last, moved, match.cost - moved.cost)
+        if self._hypothesis is not None and self._hypothesis.gain > ODOMETRY_FAULT:
+            confirmed, self._hypothesis, self._is_slipping = self._hypothesis, None, True
+            return confirmed
+        # rotation shows at once
+        self._is_slipping = match.contradicts_odometry and self._stands_still(
+            t, last, match.T_map_base
+        )
+        if self._is_slipping:
+            self._hypothesis = None
         return None
 
-    def _onwards(self, t: int, last: Float, guess: MotionPrior) -> MotionPrior | None:
-        """Where the robot is if it goes on; None where it moved as odometry says."""
-        going = self._going
-        if going is not None:
-            if len(going.found) == _LONGEST:
+    def _predict(self, t: int, last: Float, guess: MotionPrior) -> MotionPrior | None:
+        """Prior of scan t at constant velocity; None if odometry moves or velocity is unknown."""
+        hypothesis = self._hypothesis
+        if hypothesis is not None:
+            if len(hypothesis.matches) == _MAX_SCANS:
                 return None
-            before, last = [going.before, *(f.T_map_base for f in going.found[-2:])][-2:]
+            recent = (m.T_map_base for m in hypothesis.matches[-2:])
+            before, last = [hypothesis.before, *recent][-2:]
             ahead = last @ se2.inverse(before) @ last
-            guess = motion_model.gaussian_prior(
-                ahead, guess.sigma_translation, guess.sigma_rotation
-            )
-        elif guess.sigma_translation > _size(se2.inverse(last) @ guess.T_map_base):
-            return None  # nobody can tell how it would go on
+            guess = motion_model.gaussian_prior(ahead, guess.translation_std, guess.rotation_std)
+        elif guess.translation_std > _step_size(se2.inverse(last) @ guess.T_map_base):
+            return None
         return guess if self._stands_still(t, last, guess.T_map_base) else None
 
-    def _add(self, t: int, last: Float, moved: ScanMatch, gain: float) -> None:
-        going = self._going or SlipHypothesis(t, last, [], 0.0)
-        gain += going.gain
-        going.found.append(moved)
-        stopped = gain < -self._options.lies
-        self._going = None if stopped else dataclasses.replace(going, gain=gain)
+    def _extend(self, t: int, last: Float, moved: ScanMatch, gain: float) -> None:
+        """Adds the match of scan t to the hypothesis, or rejects it where the robot stopped."""
+        hypothesis = self._hypothesis or SlipHypothesis(t, last, [], 0.0)
+        gain += hypothesis.gain
+        hypothesis.matches.append(moved)
+        has_stopped = gain < -ODOMETRY_FAULT
+        self._hypothesis = None if has_stopped else dataclasses.replace(hypothesis, gain=gain)
 
     def _stands_still(self, t: int, last: Float, T_map_base: Float) -> bool:
-        """Whether odometry has no motion to scan t where a pose (3, 3) of it means some."""
-        step = _size(se2.inverse(last) @ T_map_base)
-        return step > _LEAST and self._moved(t) < _STILL * step
+        """Whether odometry stands still on the way to scan t at a pose (3, 3) that moved."""
+        step = _step_size(se2.inverse(last) @ T_map_base)
+        return step > _MIN_STEP and self._odometry_step(t) < _STILL_RATIO * step
 
-    def _moved(self, t: int) -> float:
-        """How far odometry came on the way to scan t."""
-        return np.inf if self._increments is None else _size(self._increments[t - 1])
+    def _odometry_step(self, t: int) -> float:
+        """Size of the odometry step to scan t."""
+        return np.inf if self._increments is None else _step_size(self._increments[t - 1])
 
 
-def _size(increment: Float) -> float:
+def _step_size(increment: Float) -> float:
     x, y, theta = se2.parameters(increment)
     return float(np.hypot(x, y) + abs(theta))

@@ -1,8 +1,8 @@
-"""Pieces of the way: when a robot was carried elsewhere, where it was put down.
+"""Relocalization after the robot was carried elsewhere (kidnapped robot).
 
-What comes after is a piece by itself until places are seen again that were known before. Those are
-looked for everywhere and in all directions, among the scans that look most alike; then the whole
-piece has to fit there. A piece that nothing ties to the others is put beside them.
+The trajectory breaks into segments. Keyframes of a segment are matched, over all headings, with the
+earlier places that look most alike; then the whole segment must fit there. A segment without a
+match is put beside the others.
 """
 
 import dataclasses
@@ -15,24 +15,23 @@ from numpy.typing import NDArray
 import stillmap._core as _core
 from stillmap.core import se2
 from stillmap.slam import loop_verification, motion_model, scan_matching
-from stillmap.slam.loop_types import LoopCandidate, LoopClosure, LoopContext
 from stillmap.slam.scan_matching import add_scan, select_hits
+from stillmap.slam.types import Index, LoopCandidate, LoopClosure, LoopContext
 
 Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
-_ASKED = 20  # keyframes of a piece that are looked for
-_HEARD = 60  # keyframes of it that are asked whether they fit where it would be
-_OUTWEIGH = 4  # keyframes that fit, for each that contradicts
-_ALIKE = 8  # places that each of them is compared with
-_SAME_METRES, _SAME_RADIANS = 0.5, 0.1  # two answers are one within that
-_AGREEING = 3  # keyframes that have to fit
-_BINS = np.geomspace(0.3, 30.0, 25)  # m, of the ranges by which scans are compared
-_BESIDE = 10.0  # m between pieces that nothing ties
+_MAX_QUERIES = 20  # keyframes of a segment that are matched
+_MAX_PLACES = 8  # places that each of them is matched with
+_RANGE_BINS = np.geomspace(0.3, 30.0, 25)  # m, of the range histogram that compares scans
+_MAX_TESTED = 60  # keyframes of a segment that test a hypothesis
+# keyframes that must fit, in all and for each one that contradicts
+_MIN_SUPPORT, _MIN_SUPPORT_RATIO = 3, 4
+_SAME_DISTANCE, _SAME_ANGLE = 0.5, 0.1  # m, rad within which two hypotheses are one
+_SEGMENT_SPACING = 10.0  # m between unconnected segments
 
 
 def separate_segments(travelled: Float, breaks: list[int], metres: float) -> Float:
-    """(T,) metres travelled, with so many more at each break: nothing reaches across."""
+    """(T,) m travelled with `metres` more at each break, so that no submap reaches across."""
     out = travelled.copy()
     for t in breaks:
         out[t:] += metres
@@ -40,148 +39,153 @@ def separate_segments(travelled: Float, breaks: list[int], metres: float) -> Flo
 
 
 def relocalize_segments(
-    track: LoopContext, breaks: list[int], nowhere: list[int]
+    context: LoopContext, breaks: list[int], unexplained: list[int]
 ) -> tuple[LoopContext, list[LoopClosure], list[int]]:
-    """Pieces where they belong, the closures that say so, and breaks after which nothing did.
+    """Segments at their places, the closures that connect them, and the unconnected breaks.
 
     Args:
-        track: where loops are looked for.
-        breaks: first scans of the pieces but for the first.
-        nowhere: those of them that fit nowhere around; the others stay where they fit if nothing
-            else is found.
+        context: the trajectory.
+        breaks: first scans of all segments but the first.
+        unexplained: those whose scan fits nowhere nearby; without a match the other segments stay.
     """
-    ties, apart = list[LoopClosure](), list[int]()
-    poses = track.poses.copy()
+    closures, unconnected = list[LoopClosure](), list[int]()
+    poses = context.poses.copy()
     for first, last in itertools.pairwise([*breaks, len(poses)]):
-        track = dataclasses.replace(track, poses=poses)
-        agreed = _agreed(track, list(_attempts(track, first, last)), first, last)
-        if agreed:
-            poses[first:last] = _correction(track, agreed[0]) @ poses[first:last]
-            ties += agreed
-        elif first in nowhere:
-            poses[first:last] = _beside(track, first) @ poses[first:last]
-            apart.append(first)
-    return dataclasses.replace(track, poses=poses), ties, apart
+        context = dataclasses.replace(context, poses=poses)
+        attempts = list(_match_segment(context, first, last))
+        consistent = _select_consistent(context, attempts, first, last)
+        if consistent:
+            poses[first:last] = _correction(context, consistent[0]) @ poses[first:last]
+            closures += consistent
+        elif first in unexplained:
+            poses[first:last] = _offset_beside(context, first) @ poses[first:last]
+            unconnected.append(first)
+    return dataclasses.replace(context, poses=poses), closures, unconnected
 
 
-def _attempts(track: LoopContext, first: int, last: int) -> Iterator[LoopClosure]:
-    """Keyframes of a piece, each laid on the places before it that look most alike."""
-    frames, options = track.keyframes, track.options
-    piece = frames[(frames >= first) & (frames < last)]
-    before = frames[frames < first]
-    known = np.array([_signature(track, t) for t in before])
-    grids = {}
-    for later in _evenly(piece, _ASKED):
-        unlike = np.abs(known - _signature(track, later)).sum(axis=1)
-        stretches = np.round(track.travelled[before] / options.stretch)
-        for stretch in _best_of_each(stretches, unlike):
-            if stretch not in grids:
-                grids[stretch] = loop_verification.build_submap(track, stretch * options.stretch)
+def _match_segment(context: LoopContext, first: int, last: int) -> Iterator[LoopClosure]:
+    """Keyframes of a segment, each matched with the earlier places that look most alike."""
+    keyframes, length = context.keyframes, loop_verification.SUBMAP_TRAVEL
+    segment = keyframes[(keyframes >= first) & (keyframes < last)]
+    before = keyframes[keyframes < first]
+    signatures = np.array([_range_signature(context, t) for t in before])
+    window = context.search_distance, np.pi
+    std = [half / loop_verification.SEARCH_STDS for half in window]
+    submaps = {}
+    for later in _select_evenly(segment, _MAX_QUERIES):
+        distance = np.abs(signatures - _range_signature(context, later)).sum(axis=1)
+        stretches = np.round(context.travelled[before] / length)
+        for stretch in _nearest_stretches(stretches, distance):
+            if stretch not in submaps:
+                submaps[stretch] = loop_verification.build_submap(context, stretch * length)
             same = np.flatnonzero(stretches == stretch)
-            earlier = int(before[same[np.argmin(unlike[same])]])
-            here = LoopCandidate(earlier, later, np.eye(3), 0.0)
-            sigma = options.reach / options.window, np.pi / options.window
-            closure = loop_verification.verify_candidate(track, grids[stretch], here, *sigma)
+            earlier = int(before[same[np.argmin(distance[same])]])
+            candidate = LoopCandidate(earlier, later, np.eye(3), 0.0)
+            closure = loop_verification.verify_candidate(context, submaps[stretch], candidate, *std)
             if not closure.refused:
                 yield closure
 
 
-def _best_of_each(stretches: Float, unlike: Float) -> list[float]:
-    """The stretches with the scans that look most alike, the best first, and the last one."""
-    found = dict.fromkeys(stretches[np.argsort(unlike, kind="stable")].tolist())
-    return list(dict.fromkeys([*list(found)[:_ALIKE], float(stretches[-1])]))
+def _nearest_stretches(stretches: Float, distance: Float) -> list[float]:
+    """The stretches with the most similar scans, the best first, and the last one."""
+    found = dict.fromkeys(stretches[np.argsort(distance, kind="stable")].tolist())
+    return list(dict.fromkeys([*list(found)[:_MAX_PLACES], float(stretches[-1])]))
 
 
-def _signature(track: LoopContext, t: int) -> Float:
-    """(24,) share of a scan's beams up to each range: it does not change when the robot turns."""
-    scan = select_hits(track.recording, track.e, t)
+def _range_signature(context: LoopContext, t: int) -> Float:
+    """(24,) cumulative range histogram of a scan, which is invariant to rotation."""
+    scan = select_hits(context.recording, context.e, t)
     ranges = np.linalg.norm(scan.points, axis=1)
-    reached = np.histogram(ranges, _BINS, weights=scan.weights)[0].cumsum()
-    shares: Float = reached / max(float(reached[-1]), 1e-9)
+    total = np.histogram(ranges, _RANGE_BINS, weights=scan.weights)[0].cumsum()
+    shares: Float = total / max(float(total[-1]), 1e-9)
     return shares
 
 
-def _correction(track: LoopContext, closure: LoopClosure) -> Float:
-    """(3, 3) by which a piece has to be moved for a closure to hold."""
-    there = track.poses[closure.earlier] @ closure.T
-    C: Float = there @ se2.inverse(track.poses[closure.later])
+def _correction(context: LoopContext, closure: LoopClosure) -> Float:
+    """(3, 3) motion of a segment that satisfies a closure."""
+    there = context.poses[closure.earlier] @ closure.T
+    C: Float = there @ se2.inverse(context.poses[closure.later])
     return C
 
 
-def _agreed(
-    track: LoopContext, closures: list[LoopClosure], first: int, last: int
+def _select_consistent(
+    context: LoopContext, closures: list[LoopClosure], first: int, last: int
 ) -> list[LoopClosure]:
-    """The closures that put a piece where most of it fits what was seen before; or none.
+    """The closures of the hypothesis at which most keyframes of the segment fit; or none.
 
-    Rooms look alike: what a place says counts only if the rest of the piece does not contradict it.
+    Rooms look alike: a hypothesis counts only if the rest of the segment does not contradict it.
     """
     best, most = list[LoopClosure](), 0
-    before = _map_before(track, first)
-    for closure in _one_of_each(track, closures):
-        C = _correction(track, closure)
-        fitting, contradicting = _support(track, before, C, first, last)
-        if fitting >= max(_AGREEING, _OUTWEIGH * contradicting) and fitting > most:
-            best, most = [c for c in closures if _is_same(track, C, c)], fitting
+    before = _build_map_before(context, first)
+    for closure in _deduplicate(context, closures):
+        C = _correction(context, closure)
+        fitting, contradicting = _count_support(context, before, C, first, last)
+        if fitting >= max(_MIN_SUPPORT, _MIN_SUPPORT_RATIO * contradicting) and fitting > most:
+            best, most = [c for c in closures if _is_same(context, C, c)], fitting
     return best
 
 
-def _one_of_each(track: LoopContext, closures: list[LoopClosure]) -> list[LoopClosure]:
-    """One closure for each place that a piece may be at."""
+def _deduplicate(context: LoopContext, closures: list[LoopClosure]) -> list[LoopClosure]:
+    """One closure per hypothesis."""
     kept = list[LoopClosure]()
     for closure in closures:
-        if not any(_is_same(track, _correction(track, other), closure) for other in kept):
+        if not any(_is_same(context, _correction(context, other), closure) for other in kept):
             kept.append(closure)
     return kept
 
 
-def _map_before(track: LoopContext, first: int) -> _core.OccupancyGrid2D:
-    grid = _core.OccupancyGrid2D(track.resolution, track.registration.approach)
-    before = track.keyframes[track.keyframes < first].tolist()
-    for t in track.recording.iter_scans(before, track.e):
-        add_scan(grid, track.recording, track.e, t, track.poses[t], track.surface)
+def _build_map_before(context: LoopContext, first: int) -> _core.OccupancyGrid2D:
+    """Map of the keyframes before scan `first`."""
+    grid = _core.OccupancyGrid2D(context.resolution, scan_matching.FREE_SPACE_MARGIN)
+    before = context.keyframes[context.keyframes < first].tolist()
+    for t in context.recording.iter_scans(before, context.e):
+        add_scan(grid, context.recording, context.e, t, context.poses[t])
     return grid
 
 
-def _support(
-    track: LoopContext, before: _core.OccupancyGrid2D, C: Float, first: int, last: int
+def _count_support(
+    context: LoopContext, before: _core.OccupancyGrid2D, C: Float, first: int, last: int
 ) -> tuple[int, int]:
-    """Keyframes of a piece that fit a map when it is moved by C (3, 3), and that contradict it."""
-    frames = track.keyframes[(track.keyframes >= first) & (track.keyframes < last)]
+    """Keyframes of a segment moved by C (3, 3) that fit a map, and that contradict it."""
+    keyframes = context.keyframes[(context.keyframes >= first) & (context.keyframes < last)]
     fitting = contradicting = 0
-    for t in _evenly(frames, _HEARD):
-        scan = select_hits(track.recording, track.e, t)
-        prior = motion_model.gaussian_prior(C @ track.poses[t], _SAME_METRES, _SAME_RADIANS)
-        start = prior.T_map_base
-        found = scan_matching.search_pose(before, scan, prior, track.registration, 0.0, 0.0, start)
-        if scan_matching.occluded_share(before, scan, found) > track.registration.through:
+    for t in _select_evenly(keyframes, _MAX_TESTED):
+        scan = select_hits(context.recording, context.e, t)
+        prior = motion_model.gaussian_prior(C @ context.poses[t], _SAME_DISTANCE, _SAME_ANGLE)
+        match = scan_matching.refine_pose(before, scan, prior, prior.T_map_base)
+        occluded = scan_matching.occluded_share(before, scan, match.T_map_base)
+        if occluded > scan_matching.MAX_OCCLUDED:
             contradicting += 1
-        elif found.explained >= track.options.accept_above:
+        elif match.explained >= loop_verification.MIN_EXPLAINED:
             fitting += 1
     return fitting, contradicting
 
 
-def _evenly(frames: Index, most: int) -> list[int]:
-    """At most so many of them, evenly spread."""
-    which = np.unique(np.linspace(0, len(frames) - 1, most).round().astype(int))
-    out: list[int] = frames[which].tolist()
+def _select_evenly(keyframes: Index, max_count: int) -> list[int]:
+    """At most `max_count` of them, evenly spread."""
+    which = np.unique(np.linspace(0, len(keyframes) - 1, max_count).round().astype(int))
+    out: list[int] = keyframes[which].tolist()
     return out
 
 
-def _is_same(track: LoopContext, correction: Float, closure: LoopClosure) -> bool:
-    there = track.poses[closure.earlier] @ closure.T
-    d = se2.parameters(se2.inverse(correction @ track.poses[closure.later]) @ there)
-    return bool(np.hypot(d[0], d[1]) < _SAME_METRES and abs(d[2]) < _SAME_RADIANS)
+def _is_same(context: LoopContext, correction: Float, closure: LoopClosure) -> bool:
+    """Whether a closure asks for that correction (3, 3) of its segment."""
+    there = context.poses[closure.earlier] @ closure.T
+    d = se2.parameters(se2.inverse(correction @ context.poses[closure.later]) @ there)
+    return bool(np.hypot(d[0], d[1]) < _SAME_DISTANCE and abs(d[2]) < _SAME_ANGLE)
 
 
-def _beside(track: LoopContext, first: int) -> Float:
-    """(3, 3) that moves what comes from scan `first` on to the right of all that was before."""
-    reach = np.array(
+def _offset_beside(context: LoopContext, first: int) -> Float:
+    """(3, 3) that moves the scans from `first` on to the right of all earlier ones."""
+    max_range = np.array(
         [
-            np.linalg.norm(select_hits(track.recording, track.e, t).points, axis=1).max(initial=0.0)
-            for t in track.keyframes.tolist()
+            np.linalg.norm(select_hits(context.recording, context.e, t).points, axis=1).max(
+                initial=0.0
+            )
+            for t in context.keyframes.tolist()
         ]
     )
-    x, is_new = track.poses[track.keyframes, 0, 2], track.keyframes >= first
-    right = (x + reach)[~is_new].max()
-    left = (x - reach)[is_new].min()
-    return se2.matrix(right - left + _BESIDE, 0.0, 0.0)
+    x, is_new = context.poses[context.keyframes, 0, 2], context.keyframes >= first
+    right = (x + max_range)[~is_new].max()
+    left = (x - max_range)[is_new].min()
+    return se2.matrix(right - left + _SEGMENT_SPACING, 0.0, 0.0)

@@ -1,6 +1,7 @@
-"""(9) for one scan: the pose that the map so far and the motion prior make most likely.
+"""Scan matching in 2D, (9): the pose of one scan given the map so far and the motion prior.
 
-Single scans of a recording, into a map and out of it again.
+Likelihood field around end points, correlative search, Newton refinement; what is maximised is in
+`docs/registration.md`. Also adds single scans to such maps and removes them again.
 """
 
 import dataclasses
@@ -10,28 +11,89 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stillmap._core as _core
-from stillmap.core.config import option
 from stillmap.core.recording import Recording
 from stillmap.slam import motion_model
 from stillmap.slam.motion_model import MotionPrior
 
 Float = NDArray[np.float64]
-
 Points = NDArray[np.float32]
+
+FREE_SPACE_MARGIN = 0.5  # m before its end in which a beam is not used as free space
+# gaps between neighbouring end points on a surface that are filled: at most m wide, m that three of
+# them may be off a straight line, times the gap beside it
+_MAX_GAP, _STRAIGHTNESS, _MAX_GAP_RATIO = 1.5, 0.1, 3.0
+# likelihood field: m, std around end points; value of an unexplained end point; value added in
+# unknown space, which is not free; weight of one beam against the motion prior
+_FIELD_STD, _FLOOR, _UNKNOWN, _INFORMATION_SCALE = 0.04, 0.05, 0.2, 0.2
+_MAX_ITERATIONS = 20  # Newton
+_MAX_SEARCH_RANGE = 20.0  # m; longer beams are left out of the correlative search
+_MAX_CANDIDATES = 3  # poses of the correlative search that are refined
+_SEARCH_STDS = 3.0  # half width of the search window in standard deviations of the prior
+# of the usual explained share: enough for the optimum next to odometry; too little without a wider
+# search
+_LOCAL_SHARE, _WIDEN_BELOW = 0.9, 0.7
+_WIDE_TRANSLATION, _WIDE_ROTATION = 0.5, 0.5  # m, rad: min half width of the wider search
+_LOST_TRANSLATION = 1.5  # m, half width of the last search, over all headings
+ODOMETRY_FAULT = 10.0  # nats of gain from which odometry is rejected
+_INCONSISTENT_STDS = 3.0  # standard deviations from a prior's mean: it no longer holds
+MAX_OCCLUDED = 0.2  # share of a scan's beams that may seem to pass through walls
+# a wall: occupancy, m before the end of the beam
+WALL_OCCUPANCY, _WALL_MARGIN = 0.4, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """The hits of one scan, or of several.
+
+    Attributes:
+        points: (N, 2) float32, end points in the base frame.
+        weights: (N,) float32, e.
+        T_base_sensor: (3, 3) origin of the beams.
+    """
+
+    points: Points
+    weights: NDArray[np.float32]
+    T_base_sensor: Float
 
 
 @dataclass(frozen=True)
-class SurfaceOptions:
-    """Gaps between end points on one surface, which are filled before scans are laid on them."""
+class ScanMatch:
+    """Result of matching one scan.
 
-    gap: float = option(1.5, "m between neighbouring end points on a surface, at most")
-    straight: float = option(0.1, "m by which three of them may be off a straight line")
-    growth: float = option(3.0, "times the gap beside it that a gap may be wide")
+    Attributes:
+        T_map_base: (3, 3).
+        covariance: (3, 3) of x, y (map frame) and heading: inverse curvature of the cost.
+        explained: weighted share of the beams that the map explains, in [0, 1].
+        cost: nats, of the beams without the prior.
+        alternatives: (R, 4) optima of the other candidates: x, y, heading from the pose, and their
+            additional cost in nats.
+        widened: found only by a wider search than the prior's window.
+        all_headings: found only by the search over all headings.
+        contradicts_odometry: odometry was rejected.
+    """
 
-    def __post_init__(self) -> None:
-        for name in ("gap", "straight", "growth"):
-            if not 0.0 <= getattr(self, name) <= 1000.0:
-                raise ValueError(f"'slam.surface.{name}' wants 0 to 1000")
+    T_map_base: Float
+    covariance: Float
+    explained: float
+    cost: float
+    alternatives: Float
+    widened: bool = False
+    all_headings: bool = False
+    contradicts_odometry: bool = False
+
+
+def transform_points(points: Points, T: Float) -> Points:
+    """Points (N, D) float32 transformed by (D+1, D+1)."""
+    return np.ascontiguousarray(points @ T[:-1, :-1].T + T[:-1, -1], dtype=np.float32)
+
+
+def select_hits(recording: Recording, e: NDArray[np.float32], t: int) -> Scan:
+    """The hits of scan t."""
+    beams = recording.beams_of(t)
+    hit = recording.hit[beams]
+    T_base_sensor = recording.T_base_sensor[recording.sensor[t]]
+    points = transform_points(recording.points[beams][hit], T_base_sensor)
+    return Scan(points, e[beams][hit], T_base_sensor)
 
 
 def add_scan(
@@ -40,12 +102,12 @@ def add_scan(
     e: NDArray[np.float32],
     t: int,
     T_map_base: Float,
-    options: SurfaceOptions,
+    *,
     remove: bool = False,
 ) -> None:
-    """Adds the hits of scan t at a pose (3, 3) to a map to register against, or takes them out.
+    """Adds the hits of scan t at a pose (3, 3) to a map for registration, or removes them.
 
-    What returned nothing may have met glass as well as nothing: it says little against a surface.
+    Beams without a return may have met glass: they are no evidence against a surface.
     """
     beams = recording.beams_of(t)
     points, hit, weights = recording.points[beams], recording.hit[beams], e[beams]
@@ -59,139 +121,11 @@ def add_scan(
         weights,
         np.array([0, len(hit)]),
         T_map_sensor,
-        max_gap=options.gap,
-        tolerance=options.straight,
-        max_gap_ratio=options.growth,
+        max_gap=_MAX_GAP,
+        tolerance=_STRAIGHTNESS,
+        max_gap_ratio=_MAX_GAP_RATIO,
         remove=remove,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Scan:
-    """The hits of a scan, or of several.
-
-    Attributes:
-        points: (N, 2) float32, end points in the frame of the robot base.
-        weights: (N,) float32, e: how probable it is that each was static.
-        T_base_sensor: (3, 3) where the beams begin.
-    """
-
-    points: Points
-    weights: NDArray[np.float32]
-    T_base_sensor: Float
-
-
-def select_hits(recording: Recording, e: NDArray[np.float32], t: int) -> Scan:
-    """The hits of scan t."""
-    beams = recording.beams_of(t)
-    hit = recording.hit[beams]
-    T_base_sensor = recording.T_base_sensor[recording.sensor[t]]
-    points = transform_points(recording.points[beams][hit], T_base_sensor)
-    return Scan(points, e[beams][hit], T_base_sensor)
-
-
-def transform_points(points: Points, T: Float) -> Points:
-    """Points (N, D) float32 carried over by a transform (D+1, D+1)."""
-    return np.ascontiguousarray(points @ T[:-1, :-1].T + T[:-1, -1], dtype=np.float32)
-
-
-# a wall between a beam and its end: so far before it, and so much of a cell occupied
-_MARGIN, _WALL = 0.5, 0.4
-
-
-@dataclass(frozen=True)
-class RegistrationOptions:
-    """How one scan is registered; `docs/registration.md` says what is maximised."""
-
-    sigma: float = option(0.04, "m, width of the smoothed field around end points")
-    floor: float = option(0.05, "field value of an end point the map cannot explain")
-    unknown: float = option(0.2, "what unknown space adds to it: unknown is not free")
-    approach: float = option(
-        0.5, "m before its end in which a beam says nothing against what it crosses"
-    )
-    gain: float = option(0.2, "weight of one beam against the motion prior")
-    max_iterations: int = option(20, "Newton steps at most")
-    window: float = option(3.0, "standard deviations of the prior that are searched")
-    search_range: float = option(20.0, "m, beams beyond are left out of the search")
-    starts: int = option(3, "best poses of the search that are refined")
-    near: float = option(
-        0.9, "of the usual share explained: then what lies downhill of odometry is taken"
-    )
-    doubt_below: float = option(
-        0.7, "of the usual share explained, below which a wider search is tried"
-    )
-    lies: float = option(
-        10.0, "nats by which a scan must fit better elsewhere before odometry is disbelieved"
-    )
-    disagree: float = option(
-        3.0, "standard deviations off odometry from where on it says no more where a scan is"
-    )
-    doubt_translation: float = option(0.5, "m, half width of that search at least")
-    doubt_rotation: float = option(0.5, "rad, half width of that search at least")
-    carried_below: float = option(
-        0.3, "of the usual share explained, below which a robot may have been carried elsewhere"
-    )
-    through: float = option(
-        0.2, "share of a scan's beams that may seem to go through walls, unless it is elsewhere"
-    )
-    lost_translation: float = option(
-        1.5,
-        "m, half width of a last search over all headings, where odometry would lead through walls "
-        "or there is none",
-    )
-
-    def __post_init__(self) -> None:
-        for name, low, high in _LIMITS:
-            if not low <= getattr(self, name) <= high:
-                raise ValueError(f"'slam.registration.{name}' wants {low:g} to {high:g}")
-
-
-_LIMITS = (
-    ("sigma", 0.005, 1.0),
-    ("floor", 1e-6, 10.0),
-    ("unknown", 0.0, 10.0),
-    ("approach", 0.0, 100.0),
-    ("gain", 1e-6, 1e3),
-    ("max_iterations", 1, 1000),
-    ("window", 0.0, 10.0),
-    ("search_range", 0.1, 1000.0),
-    ("starts", 1, 100),
-    ("near", 0.0, 10.0),
-    ("doubt_below", 0.0, 1.0),
-    ("lies", 0.0, 1e6),
-    ("disagree", 0.1, 1e6),
-    ("carried_below", 0.0, 1.0),
-    ("through", 0.0, 1.0),
-    ("doubt_translation", 0.0, 5.0),
-    ("doubt_rotation", 0.0, 3.2),
-    ("lost_translation", 0.0, 5.0),
-)
-
-
-@dataclass(frozen=True)
-class ScanMatch:
-    """What came of one scan.
-
-    Attributes:
-        T_map_base: (3, 3) the pose.
-        covariance: (3, 3) of x, y (map frame) and heading: the inverse curvature of the cost.
-        explained: weighted share of the beams that the map explains, in [0, 1].
-        misfit: nats, the cost of the beams alone.
-        rivals: (R, 4) where the other starts ended up: x, y, heading from the pose, and by how
-            many nats they cost more.
-        widened: whether a wider search than the prior asked for found the pose.
-        astray: whether only a search in all directions did.
-        disagrees: whether odometry was disbelieved.
-    """
-
-    T_map_base: Float
-    covariance: Float
-    explained: float
-    misfit: float
-    rivals: Float
-    widened: bool = False
-    astray: bool = False
-    disagrees: bool = False
 
 
 def match_scan(
@@ -199,153 +133,168 @@ def match_scan(
     scan: Scan,
     prior: MotionPrior,
     other: MotionPrior | None,
-    options: RegistrationOptions,
     usual: float,
 ) -> ScanMatch:
     """The most likely pose of a scan given the map so far and the motion prior, (9).
 
     Args:
         grid: the map so far.
-        scan: what was seen.
-        prior: where odometry says the robot is; or, without it, where it ought to be.
-        other: what else it may be, should the scan not fit there.
-        options: see RegistrationOptions.
-        usual: share of a scan that the map explained of late.
+        scan: its hits.
+        prior: from odometry, else from the constant-velocity model.
+        other: a second prior, tried where the scan fits badly by the first.
+        usual: recent average of the explained share.
     """
-    found = _within(grid, scan, prior, options, usual)
+    match = _match_within_prior(grid, scan, prior, usual)
     if len(scan.points) == 0:
-        return found
-    doubtful = options.doubt_below * usual
-    windows = [(options.doubt_translation, options.doubt_rotation)]
-    if found.explained < doubtful and (
-        # odometry that is right takes a robot to places that are new
-        not prior.measured or occluded_share(grid, scan, found) > options.through
+        return match
+    threshold = _WIDEN_BELOW * usual
+    windows = [(_WIDE_TRANSLATION, _WIDE_ROTATION)]
+    if match.explained < threshold and (
+        # correct odometry may lead to new places, but not through walls
+        not prior.is_odometry or occluded_share(grid, scan, match.T_map_base) > MAX_OCCLUDED
     ):
-        windows.append((options.lost_translation, np.pi))
+        windows.append((_LOST_TRANSLATION, np.pi))
     for mean in (prior, other):
-        if mean is not None and found.explained < doubtful:
-            found = _farther(grid, scan, mean, options, found, doubtful, windows)
-    if prior.measured and is_inconsistent(prior, found, options):
-        # a mean that far off is no mean: it would only draw the pose towards itself
-        looser = motion_model.widen_prior(prior, *_off_by(prior, found))
-        again = search_pose(grid, scan, looser, options, 0.0, 0.0, start=found.T_map_base)
-        if again.misfit <= found.misfit:
-            found = dataclasses.replace(again, widened=found.widened, astray=found.astray)
-        found = dataclasses.replace(found, disagrees=is_inconsistent(prior, found, options))
-    return found
+        if mean is not None and match.explained < threshold:
+            match = _widen_search(grid, scan, mean, match, threshold, windows)
+    if prior.is_odometry and is_inconsistent(prior, match.T_map_base):
+        # a mean that far off would only pull the pose towards itself
+        looser = motion_model.widen_prior(prior, *_distance(prior, match.T_map_base))
+        again = refine_pose(grid, scan, looser, match.T_map_base)
+        if again.cost <= match.cost:
+            match = dataclasses.replace(
+                again, widened=match.widened, all_headings=match.all_headings
+            )
+        contradicts = is_inconsistent(prior, match.T_map_base)
+        match = dataclasses.replace(match, contradicts_odometry=contradicts)
+    return match
 
 
 def accept_prior(prior: MotionPrior) -> ScanMatch:
-    """The pose where a prior has it, of a scan that has nothing to lie on; its covariance too."""
+    """The prior's mean and covariance, for a scan without a map to match."""
     covariance = np.diag(1.0 / np.diag(prior.information))
     return ScanMatch(prior.T_map_base, covariance, 1.0, 0.0, np.zeros((0, 4)))
 
 
-def _within(
-    grid: _core.OccupancyGrid2D,
-    scan: Scan,
-    prior: MotionPrior,
-    options: RegistrationOptions,
-    usual: float,
+def _match_within_prior(
+    grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior, usual: float
 ) -> ScanMatch:
-    """The best pose that the prior allows."""
-    if prior.measured:
-        near = search_pose(grid, scan, prior, options, 0.0, 0.0, start=prior.T_map_base)
-        if near.explained >= options.near * usual:
-            return near
-    translation = options.window * prior.sigma_translation
-    rotation = options.window * prior.sigma_rotation
-    return search_pose(grid, scan, prior, options, translation, rotation)
+    """The best pose within the prior's window; the optimum next to odometry if good enough."""
+    if prior.is_odometry:
+        local = refine_pose(grid, scan, prior, prior.T_map_base)
+        if local.explained >= _LOCAL_SHARE * usual:
+            return local
+    translation = _SEARCH_STDS * prior.translation_std
+    rotation = _SEARCH_STDS * prior.rotation_std
+    return search_pose(grid, scan, prior, translation, rotation)
 
 
-def _farther(
+def _widen_search(
     grid: _core.OccupancyGrid2D,
     scan: Scan,
     prior: MotionPrior,
-    options: RegistrationOptions,
-    found: ScanMatch,
-    doubtful: float,
+    match: ScanMatch,
+    threshold: float,
     windows: list[tuple[float, float]],
 ) -> ScanMatch:
-    """What lies beyond the prior's window, where the scan fits much better there.
+    """Replaces a match by one outside the prior's window that fits much better.
 
-    A place that only looks alike would have the robot look through walls.
+    At a place that only looks alike, beams would pass through walls.
     """
-    for least_translation, least_rotation in windows:
-        wide = motion_model.widen_prior(prior, least_translation / 3.0, least_rotation / 3.0)
-        window = options.window * wide.sigma_translation, options.window * wide.sigma_rotation
-        wider = search_pose(grid, scan, wide, options, *window)
-        fits = wider.misfit < found.misfit - options.lies
-        if fits and occluded_share(grid, scan, wider) <= options.through:
-            found = dataclasses.replace(wider, widened=True, astray=least_rotation == np.pi)
-        if found.explained >= doubtful:
+    for translation, rotation in windows:
+        wide = motion_model.widen_prior(prior, translation / 3.0, rotation / 3.0)
+        window = _SEARCH_STDS * wide.translation_std, _SEARCH_STDS * wide.rotation_std
+        wider = search_pose(grid, scan, wide, *window)
+        fits = wider.cost < match.cost - ODOMETRY_FAULT
+        if fits and occluded_share(grid, scan, wider.T_map_base) <= MAX_OCCLUDED:
+            match = dataclasses.replace(wider, widened=True, all_headings=rotation == np.pi)
+        if match.explained >= threshold:
             break
-    return found
+    return match
 
 
-def _off_by(prior: MotionPrior, found: ScanMatch) -> tuple[float, float]:
-    d = prior.shift_to(found.T_map_base)
+def _distance(prior: MotionPrior, T_map_base: Float) -> tuple[float, float]:
+    d = prior.residual(T_map_base)
     return float(np.hypot(d[0], d[1])), abs(float(d[2]))
 
 
-def is_inconsistent(prior: MotionPrior, found: ScanMatch, options: RegistrationOptions) -> bool:
-    """Whether a pose is so far off a prior's mean that the prior says no more where it is."""
-    metres, radians = _off_by(prior, found)
-    off = max(metres / prior.sigma_translation, radians / prior.sigma_rotation)
-    return off > options.disagree
+def is_inconsistent(prior: MotionPrior, T_map_base: Float) -> bool:
+    """Whether a pose (3, 3) is too far from a prior's mean for the prior to hold."""
+    metres, radians = _distance(prior, T_map_base)
+    off = max(metres / prior.translation_std, radians / prior.rotation_std)
+    return off > _INCONSISTENT_STDS
 
 
 def search_pose(
+    grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior, translation: float, rotation: float
+) -> ScanMatch:
+    """The best pose in a window of half widths `translation` (m) and `rotation` (rad)."""
+    return _register(grid, scan, prior, translation, min(rotation, float(np.pi)), None)
+
+
+def refine_pose(
+    grid: _core.OccupancyGrid2D, scan: Scan, prior: MotionPrior, start: Float
+) -> ScanMatch:
+    """The optimum that Newton steps from a pose (3, 3) reach."""
+    return _register(grid, scan, prior, 0.0, 0.0, start)
+
+
+def _register(
     grid: _core.OccupancyGrid2D,
     scan: Scan,
     prior: MotionPrior,
-    options: RegistrationOptions,
     translation: float,
     rotation: float,
-    start: Float | None = None,
+    start: Float | None,
 ) -> ScanMatch:
-    """The best pose in a window around the prior's mean; no doubts.
-
-    Args:
-        grid, scan, prior, options: as `register` has them.
-        translation: metres, half width of the window.
-        rotation: radians, half width of the window.
-        start: (3, 3) where Newton steps begin instead of searching the window.
-    """
-    T, covariance, cost, explained, _, _, rivals = _core.register_scan(
+    T, covariance, cost, explained, _, _, alternatives = _core.register_scan(
         grid,
         scan.points,
         scan.weights,
         prior.T_map_base,
         prior.information,
-        sigma=options.sigma,
-        radius=field_radius(options, grid.resolution),
-        floor=options.floor,
-        unknown=options.unknown,
-        information_scale=options.gain,
-        max_iterations=options.max_iterations,
+        sigma=_FIELD_STD,
+        radius=_field_radius(grid.resolution),
+        floor=_FLOOR,
+        unknown=_UNKNOWN,
+        information_scale=_INFORMATION_SCALE,
+        max_iterations=_MAX_ITERATIONS,
         window_translation=translation,
-        window_rotation=min(rotation, float(np.pi)),
-        search_range=options.search_range,
-        max_candidates=options.starts,
+        window_rotation=rotation,
+        search_range=_MAX_SEARCH_RANGE,
+        max_candidates=_MAX_CANDIDATES,
         T_start=start,
     )
-    return ScanMatch(T, covariance, explained, cost - prior.penalty(T), rivals)
+    return ScanMatch(T, covariance, explained, cost - prior.cost(T), alternatives)
 
 
-def occluded_share(grid: _core.OccupancyGrid2D, scan: Scan, found: ScanMatch) -> float:
-    """Share of the beams that would have to go through walls that the map knows."""
+def registration_cost(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
+    """Cost of the beams at a pose (3, 3), nats."""
+    return _INFORMATION_SCALE * _core.registration_cost(
+        grid,
+        scan.points,
+        scan.weights,
+        T_map_base,
+        sigma=_FIELD_STD,
+        radius=_field_radius(grid.resolution),
+        floor=_FLOOR,
+        unknown=_UNKNOWN,
+    )
+
+
+def occluded_share(grid: _core.OccupancyGrid2D, scan: Scan, T_map_base: Float) -> float:
+    """Share of the beams that would pass through walls of the map at a pose (3, 3)."""
     return _core.occluded_share(
         grid,
         scan.points,
         scan.weights,
-        found.T_map_base,
+        T_map_base,
         scan.T_base_sensor,
-        margin=_MARGIN,
-        min_occupancy=_WALL,
+        margin=_WALL_MARGIN,
+        min_occupancy=WALL_OCCUPANCY,
     )
 
 
-def field_radius(options: RegistrationOptions, resolution: float) -> int:
-    """Cells within which the field is summed up."""
-    return max(1, round(2.0 * options.sigma / resolution))
+def _field_radius(resolution: float) -> int:
+    """Cells around an end point over which the field is summed."""
+    return max(1, round(2.0 * _FIELD_STD / resolution))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stillmap.core.recording import Recording
 from stillmap.results.reader import Track
 from stillmap.slam.deskew import deskew_recording
-from stillmap.slam.odometry_2d import SlamOptions
+from stillmap.slam.options import SlamOptions
 from stillmap.viewer.display import chosen
 
 Float = NDArray[np.float64]

@@ -1,0 +1,128 @@
+"""Results of the M-step, and what the parts of loop closure pass to each other."""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stillmap._core as _core
+from stillmap.core.recording import Recording
+from stillmap.slam.pose_graph import PoseGraph
+
+Float = NDArray[np.float64]
+Index = NDArray[np.intp]
+ScanProgress = Callable[[int, int], None]  # scans done, total
+
+
+@dataclass(frozen=True, eq=False)
+class LoopCandidate:
+    """Two scans that may see the same place.
+
+    Attributes:
+        earlier, later: scans.
+        T: (3, 3) pose of the later scan in the frame of the earlier one, by the current graph.
+        drift_distance: m of travel whose drift equals the uncertainty of T.
+    """
+
+    earlier: int
+    later: int
+    T: Float
+    drift_distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class LoopClosure:
+    """One attempt to close a loop.
+
+    Attributes:
+        earlier, later: scans that see the same place.
+        T: (D+1, D+1) pose of the later scan in the frame of the earlier one.
+        covariance: (3, 3) of x, y, heading in the frame of the later scan; in 3D (6, 6).
+        explained: share of the comparable beams of the later scan that the earlier map explains.
+        refused: reason of the rejection; empty if accepted.
+    """
+
+    earlier: int
+    later: int
+    T: Float
+    covariance: Float
+    explained: float
+    refused: str = ""
+
+    def refuse(self, reason: str) -> "LoopClosure":
+        """The same closure, rejected."""
+        return dataclasses.replace(self, refused=reason)
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """Scans at which odometry and scan matching disagree.
+
+    Attributes:
+        widened: matched only by a wider search.
+        odometry_faults: odometry was rejected.
+        breaks: first scans after the robot got lost or was carried elsewhere.
+        unconnected: those breaks after which no known place was recognised; before loop closure,
+            those whose scan fits nowhere nearby.
+    """
+
+    widened: list[int] = field(default_factory=list)
+    odometry_faults: list[int] = field(default_factory=list)
+    breaks: list[int] = field(default_factory=list)
+    unconnected: list[int] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class MStepResult:
+    """Result of one M-step.
+
+    Attributes:
+        poses: (T, D+1, D+1) T_map_base; the map frame is the base of the first scan.
+        covariance: (T, 3, 3) of x, y, heading against the local map, after refinement against the
+            map of all other scans; (T, 6, 6) in 3D.
+        grid: the sums alpha, beta of (10) over all scans.
+        explained: (T,) share of each scan's beams that the local map explained; NaN: poses given.
+        diagnostics: scans at which odometry and scan matching disagree.
+        loops: attempted loop closures, accepted or refused.
+        graph: the pose graph; None without loop closure.
+    """
+
+    poses: Float
+    covariance: Float
+    grid: _core.OccupancyGrid2D | _core.OccupancyGrid3D
+    explained: Float
+    diagnostics: Diagnostics = field(default_factory=Diagnostics)
+    loops: list[LoopClosure] = field(default_factory=list)
+    graph: PoseGraph | None = None
+
+    def without_grid(self) -> "MStepResult":
+        """The same with an empty grid: grids are large."""
+        return dataclasses.replace(self, grid=type(self.grid)(self.grid.resolution))
+
+
+@dataclass(frozen=True, eq=False)
+class LoopContext:
+    """A 2D trajectory in which loops are searched.
+
+    Attributes:
+        e: (M,) P(static) of every beam.
+        poses: (T, 3, 3) T_map_base.
+        travelled: (T,) m up to each scan.
+        explained: (T,) share of each scan that the local map explained.
+        keyframes: (K,) scans.
+        resolution: m, edge of a map cell.
+        keyframe_distance: m of travel between keyframes.
+        search_distance: m between a keyframe and an earlier one for a loop candidate.
+    """
+
+    recording: Recording
+    e: NDArray[np.float32]
+    poses: Float
+    travelled: Float
+    explained: Float
+    keyframes: Index
+    resolution: float
+    keyframe_distance: float
+    search_distance: float
