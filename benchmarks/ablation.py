@@ -55,10 +55,10 @@ VARIANTS = (
     Variant("room behind the surface", {"margin": _NONE}),
     Variant("hits of neighbours", {"reach": _NONE}),
     Variant("looks: every scan counts for itself", {"look": 0.01}),
-    Variant("people who stay: tau 0.5 s only", {}, HmmClasses(mover_seconds=(0.5,))),
-    Variant("crowded places: rho 0.01 only", {}, HmmClasses(mover_occupied=(0.01,))),
-    Variant("walls that are missed: rho 0.998 only", {}, HmmClasses(static_occupied=(0.998,))),
-    Variant("a share that is missed for seconds only", {}, HmmClasses(static_seconds=(1.0,))),
+    Variant("people who stay: tau 0.5 s only", {}, HmmClasses(dynamic_tau=(0.5,))),
+    Variant("crowded places: rho 0.01 only", {}, HmmClasses(dynamic_rho=(0.01,))),
+    Variant("walls that are missed: rho 0.998 only", {}, HmmClasses(static_rho=(0.998,))),
+    Variant("a share that is missed for seconds only", {}, HmmClasses(static_tau=(1.0,))),
 )
 
 

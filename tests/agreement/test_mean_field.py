@@ -5,10 +5,8 @@ import pytest
 import reference
 
 from stillmap import _core
-from stillmap.em.options import BesideOptions
-from stillmap.em.spatial_prior import arguments, smooth_mean_field
-
-BESIDE = arguments(BesideOptions())
+from stillmap.em.spatial_prior import _MEAN_FIELD as MEAN_FIELD
+from stillmap.em.spatial_prior import smooth_mean_field
 
 
 def surfaces(seed):
@@ -42,8 +40,8 @@ def test_core_and_twin_agree(seed, changes):
     np.testing.assert_array_equal(core.hit_spans[of_core], plain.hit_spans[of_plain])
     log_odds = np.empty(plain.size, np.float32)
     log_odds[of_core] = own[of_plain]
-    found = _core.smooth_mean_field(core, log_odds, **{**BESIDE, **changes})
-    expected = reference.smooth_mean_field(plain, own, **{**BESIDE, **changes})
+    found = _core.smooth_mean_field(core, log_odds, **{**MEAN_FIELD, **changes})
+    expected = reference.smooth_mean_field(plain, own, **{**MEAN_FIELD, **changes})
     assert found.dtype == np.float32
     np.testing.assert_allclose(found[of_core], expected[of_plain], atol=2e-5)
     assert np.mean((expected > 0.5) != (own > 0.0)) > 0.02  # somebody changed its mind
@@ -59,10 +57,10 @@ def test_threads_change_nothing():
     surface.fit()
     assert surface.size > 20000  # enough for threads to be used
     own = rng.normal(1.0, 2.0, surface.size).astype(np.float32)
-    once = _core.smooth_mean_field(surface, own, **BESIDE)
+    once = _core.smooth_mean_field(surface, own, **MEAN_FIELD)
     for threads in (2, 3):
         assert (
-            _core.smooth_mean_field(surface, own, **BESIDE, threads=threads).tobytes()
+            _core.smooth_mean_field(surface, own, **MEAN_FIELD, threads=threads).tobytes()
             == once.tobytes()
         )
 
@@ -90,7 +88,7 @@ def test_what_has_no_evidence_follows_its_neighbours():
     # both ends of a side were seen to come, of the middle nobody knows
     surface, car, x = car_beside_wall([5, 6, 7], [0, 9])
     own = np.where(car, np.where(abs(x - 7) > 2, -4.0, 1.5), 4.0).astype(np.float32)
-    p = _core.smooth_mean_field(surface, own, **BESIDE)
+    p = _core.smooth_mean_field(surface, own, **MEAN_FIELD)
     assert (p[car] < 0.5).all()
     assert (p[~car] > 0.9).all()
 
@@ -114,7 +112,7 @@ def test_those_hit_at_other_times_are_not_asked():
     other.fit()
     x = other.surfels()[0][:, 0]
     own = np.where(x < 4, -4.0, 1.5).astype(np.float32)
-    p = _core.smooth_mean_field(other, own, **BESIDE)
+    p = _core.smooth_mean_field(other, own, **MEAN_FIELD)
     np.testing.assert_array_equal(p > 0.5, x >= 4)
 
 
@@ -131,7 +129,7 @@ def test_one_that_lies_off_the_surface_does_not_speak_for_it():
     surface.fit()
     off = surface.surfels()[0][:, 2] > 0
     assert off.sum() == 1
-    p = _core.smooth_mean_field(surface, np.where(off, -4.0, 0.5).astype(np.float32), **BESIDE)
+    p = _core.smooth_mean_field(surface, np.where(off, -4.0, 0.5).astype(np.float32), **MEAN_FIELD)
     np.testing.assert_array_equal(p < 0.5, off)
 
 
@@ -139,57 +137,36 @@ def test_refusals():
     core, _ = surfaces(0)
     own = np.zeros(core.size, np.float32)
     with pytest.raises(ValueError, match="log_odds: expected one per element"):
-        _core.smooth_mean_field(core, own[1:], **BESIDE)
+        _core.smooth_mean_field(core, own[1:], **MEAN_FIELD)
     with pytest.raises(ValueError, match="log_odds: not a number"):
-        _core.smooth_mean_field(core, own + np.float32(np.nan), **BESIDE)
+        _core.smooth_mean_field(core, own + np.float32(np.nan), **MEAN_FIELD)
     with pytest.raises(TypeError):
-        _core.smooth_mean_field(core, own.astype(float), **BESIDE)
+        _core.smooth_mean_field(core, own.astype(float), **MEAN_FIELD)
     for name, value in (
         ("radius", 0.5), ("radius", 9.0), ("coplanar_std", 0.0), ("tolerance", 2.0),
         ("max_iterations", -1), ("min_log_odds", 4.0), ("static_coupling", -1.0),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=name):
-            _core.smooth_mean_field(core, own, **{**BESIDE, name: value})
+            _core.smooth_mean_field(core, own, **{**MEAN_FIELD, name: value})
     unfit, dateless = _core.SurfelMap3D(0.3), _core.SurfelMap3D(0.3)
     with pytest.raises(ValueError, match="fit it first"):
-        _core.smooth_mean_field(unfit, own, **BESIDE)
+        _core.smooth_mean_field(unfit, own, **MEAN_FIELD)
     one = np.ones((1, 3), np.float32), np.ones(1, bool), np.array([0, 1]), np.eye(4)[None]
     dateless.add_end_points(*one)
     with pytest.raises(ValueError, match="time_bin: expected in all calls, or in none"):
         dateless.add_end_points(*one, np.array([1]))
     dateless.fit()
     with pytest.raises(ValueError, match="surfel_map: expected"):
-        _core.smooth_mean_field(dateless, own[:1], **BESIDE)
+        _core.smooth_mean_field(dateless, own[:1], **MEAN_FIELD)
     for look in ([1, 2], [-1], [2**31]):
         with pytest.raises(ValueError, match="time_bin"):
             _core.SurfelMap3D(0.3).add_end_points(*one, np.array(look))
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("radius", 0.5),
-        ("radius", 9.0),
-        ("coplanar", 0.0),
-        ("for_static", -1.0),
-        ("for_dynamic", 101.0),
-        ("least", 4.0),
-        ("most", 101.0),
-        ("moved", 1.5),
-        ("rounds", -1),
-    ],
-)
-def test_options_that_make_no_sense(name, value):
-    with pytest.raises(ValueError, match=rf"em\.beside\.{name}"):
-        BesideOptions(**{name: value})
-
-
-def test_those_beside_need_not_be_asked():
+def test_it_is_for_3d_alone():
     core, _ = surfaces(0)
-    p = np.linspace(0.0, 1.0, core.size).astype(np.float32)
-    assert smooth_mean_field(p, core, BesideOptions(enabled=False)) is p
-    asked = smooth_mean_field(p, core, BesideOptions())
-    assert asked.dtype == np.float32
-    assert np.isfinite(asked).all()
-    with pytest.raises(TypeError, match="in space"):
-        smooth_mean_field(p, _core.SurfelMap2D(0.3), BesideOptions())
+    smoothed = smooth_mean_field(np.linspace(0.0, 1.0, core.size).astype(np.float32), core)
+    assert smoothed.dtype == np.float32
+    assert np.isfinite(smoothed).all()
+    with pytest.raises(TypeError, match="3D"):
+        smooth_mean_field(np.zeros(0, np.float32), _core.SurfelMap2D(0.3))

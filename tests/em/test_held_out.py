@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from stillmap import em
-from stillmap.core import se2
+from stillmap.core import chunks, se2
 from stillmap.core.recording import Recording
-from stillmap.core import chunks
 from stillmap.em.held_out import select_held_out_scans
 from stillmap.sim import CrowdOptions, LaserOptions, RobotOptions, Scene, simulate
 from stillmap.sim.walls import box

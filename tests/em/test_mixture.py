@@ -1,4 +1,4 @@
-"""Shares of classes: what expectation maximisation must do, and what it makes of nothing."""
+"""Mixture weights fitted by EM."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_no_iteration_lowers_the_likelihood(seed, start):
         return float(np.log(likelihood.astype(float) @ shares.classes).sum()) + pseudo
 
     values = [
-        objective(fit_weights(likelihood, N_STATIC, start, iterations=n, tolerance=-1.0))
+        objective(fit_weights(likelihood, N_STATIC, start, max_iterations=n, tolerance=-1.0))
         for n in (1, 2, 3, 5, 8, 13, 50, 100)
     ]
     assert np.diff(values).min() > -1e-9 * abs(values[0])
@@ -54,10 +54,10 @@ def test_known_shares_are_found():
 def test_it_stops_when_nothing_is_gained():
     likelihood, _ = members(np.random.default_rng(3), [0.5, 0.2, 0.2, 0.1], 500)
     enough, more = (
-        fit_weights(likelihood, N_STATIC, 0.5, iterations=n, tolerance=1e-4) for n in (200, 400)
+        fit_weights(likelihood, N_STATIC, 0.5, max_iterations=n, tolerance=1e-4) for n in (200, 400)
     )
     assert (enough.classes == more.classes).all()
-    longer = fit_weights(likelihood, N_STATIC, 0.5, iterations=400, tolerance=0.0)
+    longer = fit_weights(likelihood, N_STATIC, 0.5, max_iterations=400, tolerance=0.0)
     assert (longer.classes != more.classes).any()
     assert longer.log_likelihood >= more.log_likelihood
 

@@ -94,7 +94,7 @@ def test_labels_of_beams_that_end_there_are_what_is_shown(known, state):
     there = listed(known.ends) & known.seen.hit
     assert 50 < there.sum() < 400
     of_cell = dict(
-        zip(map(tuple, known.courses.cells.tolist()), known.courses.shown(state), strict=True)
+        zip(map(tuple, known.courses.cells.tolist()), known.courses.p_in_map(state), strict=True)
     )
     shown = np.array([of_cell.get(tuple(cell), np.nan) for cell in known.ends.tolist()], np.float32)
     assert p_static.dtype == np.float32
@@ -107,7 +107,7 @@ def test_the_map_says_there_what_is_shown_as_far_as_it_covers_the_cell(known, st
     _, occupied = known.relabelled(state=state)
     there = listed(known.occupied.cells)
     assert 15 < there.sum() < 30
-    shown = known.courses.shown(state) * known.courses.covered
+    shown = known.courses.p_in_map(state) * known.courses.p_in_cell
     assert occupied.p_occupied.dtype == np.float32
     np.testing.assert_array_equal(
         occupied.p_occupied, np.where(there, shown, known.occupied.p_occupied)

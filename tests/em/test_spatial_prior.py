@@ -1,4 +1,4 @@
-"""What stands apart moves as a whole: a car of which only the front was seen to arrive."""
+"""Cluster pooling and ground contact: a car of which only the front was observed to arrive."""
 
 import dataclasses
 
@@ -7,8 +7,8 @@ import pytest
 
 from stillmap import _core
 from stillmap.core.recording import Recording
+from stillmap.em import spatial_prior
 from stillmap.em.ground import ground_from_surfels
-from stillmap.em.options import BodyOptions
 from stillmap.em.spatial_prior import (
     apply_pooled_evidence,
     make_ground_contact,
@@ -56,14 +56,13 @@ def standing(*things, scans=3):
 
 def labelled(surface, moving):
     """P(static) of elements whose means are known to move, and of others."""
-    means = surface.elements()[1]
+    means = surface.surfels()[1]
     return np.where(moving(means), 0.02, 0.99).astype(np.float32), means
 
 
-def lowered_by(surface, p, change, recording, T, options, ground=FLAT):
-    """P(static) by bodies on that ground."""
-    standing = select_obstacles(ground, surface, options)
-    return pool_clusters(p, change, standing, recording, T, options)
+def pooled(surface, p, change, recording, T):
+    """P(static) after pooling over clusters on flat ground."""
+    return pool_clusters(p, change, select_obstacles(FLAT, surface), recording, T)
 
 
 CAR, OTHER, WALL = box(2.0, 2.0, 4.0), box(-5.0, 2.0, 4.0), box(-6.0, -5.0, 13.0, height=2.5)
@@ -76,7 +75,7 @@ def front(means):
 def test_the_rest_of_a_car_goes_with_its_front_and_nothing_else_does():
     recording, T, surface = standing(CAR, OTHER, WALL)
     p, means = labelled(surface, front)
-    found = lowered_by(surface, p, 0 * p, recording, T, BodyOptions(), FLAT)
+    found = pooled(surface, p, 0 * p, recording, T)
     car = (means[:, 0] > 1.9) & (means[:, 1] > 1.9) & (means[:, 2] > 0.25)
     assert (found[car] < 0.5).all()
     np.testing.assert_array_equal(found[~car], p[~car])
@@ -90,19 +89,17 @@ def test_what_all_of_it_says_a_little_it_says_loudly():
     noise = np.random.default_rng(0).normal(0.0, 1.0, len(p))
     change = (noise + np.where(car, 1.6, -0.3)).astype(np.float32)
     assert (change[~car] > 1.6).sum() > 20  # elsewhere some say more, alone
-    found = lowered_by(surface, p, change, recording, T, BodyOptions(), FLAT)
+    found = pooled(surface, p, change, recording, T)
     assert (found[car] < 0.5).all()
     np.testing.assert_array_equal(found[~car], p[~car])
-    calm = lowered_by(surface, p, change - 0.9, recording, T, BodyOptions(), FLAT)
+    calm = pooled(surface, p, change - 0.9, recording, T)
     np.testing.assert_array_equal(calm, p)
 
 
 def test_too_little_of_it_moves():
     recording, T, surface = standing(CAR)
     p, _ = labelled(surface, lambda means: front(means) & (means[:, 0] > 5.5))
-    np.testing.assert_array_equal(
-        lowered_by(surface, p, 0 * p, recording, T, BodyOptions(), FLAT), p
-    )
+    np.testing.assert_array_equal(pooled(surface, p, 0 * p, recording, T), p)
 
 
 def test_who_touches_a_wall_leaves_it_there():
@@ -112,46 +109,37 @@ def test_who_touches_a_wall_leaves_it_there():
         surface, lambda m: (m[:, 0] > -0.1) & (m[:, 0] < 0.5) & (m[:, 1] > -4.92) & (m[:, 2] > 0.2)
     )
     assert (p < 0.5).sum() > 10
-    np.testing.assert_array_equal(
-        lowered_by(surface, p, 0 * p, recording, T, BodyOptions(), FLAT), p
-    )
+    np.testing.assert_array_equal(pooled(surface, p, 0 * p, recording, T), p)
 
 
-@pytest.mark.parametrize(
-    ("options", "ground"),
-    [(BodyOptions(enabled=False), FLAT), (BodyOptions(), dataclasses.replace(FLAT, seen=False))],
-)
-def test_left_out(options, ground):
-    recording, T, surface = standing(CAR)
-    p, _ = labelled(surface, front)
-    assert lowered_by(surface, p, 0 * p, recording, T, options, ground) is p
-    assert make_ground_contact(select_obstacles(ground, surface, options), p, options) is None
+def test_left_out_without_ground():
+    _, _, surface = standing(CAR)
+    assert select_obstacles(dataclasses.replace(FLAT, observed=False), surface) is None
 
 
-def test_ground_and_crowns_are_no_bodies():
+def test_ground_and_crowns_are_no_obstacles():
     crown = np.random.default_rng(0).uniform([-2, -2, 3.5], [2, 2, 5], (2000, 3))
     _, _, surface = standing(CAR, crown)
-    z = surface.elements()[1][:, 2]
-    stands = select_obstacles(FLAT, surface, BodyOptions()).stands
-    np.testing.assert_array_equal(stands, (z > 0.2) & (z < 3.0))
-    assert 100 < stands.sum() < len(z)
+    z = surface.surfels()[1][:, 2]
+    found = select_obstacles(FLAT, surface).is_obstacle
+    np.testing.assert_array_equal(found, (z > 0.2) & (z < 3.0))
+    assert 100 < found.sum() < len(z)
 
 
-def test_feet_are_off_the_ground_by_what_end_points_scatter():
+def test_the_clearance_follows_from_the_noise_of_end_points(monkeypatch):
     _, _, surface = standing(CAR)
-    standing_there = select_obstacles(FLAT, surface, BodyOptions())
-    assert standing_there.column == 2  # of 0.15 m
+    obstacles = select_obstacles(FLAT, surface)
+    assert obstacles.column_cells == 2  # of 0.15 m
     p = np.ones(surface.size, np.float32)
-    assert make_ground_contact(standing_there, p, BodyOptions(foot=0.06)).least == 0.06
-    assert (
-        make_ground_contact(standing_there, p, BodyOptions(foot=0.0)).least == 2.5 * surface.scatter
-    )
+    for clearance, expected in ((0.06, 0.06), (0.0, 2.5 * surface.noise_std)):
+        monkeypatch.setattr(spatial_prior, "_GROUND_CLEARANCE", clearance)
+        assert make_ground_contact(obstacles, p).min_end_height == expected
 
 
 def test_ground_under_what_stands_still():
     _, T, surface = standing(CAR)
     T[:, :3, 3] = [0.0, 0.0, 1.8]
-    means = surface.elements()[1]
+    means = surface.surfels()[1]
     low = means[:, 2] < 0.1
     ground = ground_from_surfels(surface, np.ones(len(means), np.float32), T[:, :3, 3])
     assert ground.observed
@@ -161,34 +149,16 @@ def test_ground_under_what_stands_still():
     assert not unknown.observed or unknown.sensor_height < 1.0  # roofs at most
 
 
-def test_how_far_it_is_lowered():
+def test_how_far_it_is_lowered(monkeypatch):
+    monkeypatch.setattr(spatial_prior, "_POOLED_P_DYNAMIC", 0.25)
     p = np.array([0.9, 0.9, 0.9, 0.9, 0.3, 0.9, 0.52, 0.9, 0.9, 0.001], np.float32)
     moves = [np.nan, 0.2, 0.3, 1.0, 1.0, 0.25, 0.251, 0.0, 0.3, 1.0]
     change = [np.nan, 0.9, 0.0, -4.0, 4.0, 1.0, 0.0, 1.1, 4.0, 0.0]
     means = np.array([moves, change], np.float32).T
-    found = apply_pooled_evidence(
-        p, means, BodyOptions(share=0.25, change=1.0, slope=20.0, most=4.0)
-    )
+    found = apply_pooled_evidence(p, means)
     nats = np.array([1.0, 4.0, 0.02, 2.0, 4.0])
     np.testing.assert_allclose(found[[2, 3, 6, 7, 8]], 1 / (1 + np.exp(nats)), rtol=1e-4)
     assert found[4] == pytest.approx(1 / (1 + np.exp(4.0)), rel=1e-4)
     assert found[9] == p[9]  # surer than its body
     kept = [0, 1, 5]
     np.testing.assert_array_equal(found[kept], p[kept])
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"low": 4.0},
-        {"column": 0.0},
-        {"fewest": 0},
-        {"share": 1.5},
-        {"change": -1.0},
-        {"slope": -1.0},
-        {"most": 1e9},
-    ],
-)
-def test_options_are_checked(bad):
-    with pytest.raises(ValueError, match=r"em\.bodies"):
-        BodyOptions(**bad)

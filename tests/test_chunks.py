@@ -1,13 +1,12 @@
-"""Recordings piece by piece."""
+"""Recordings in chunks of scans."""
 
 import numpy as np
 import pytest
 
-from stillmap.core.recording import Recording
 from stillmap.core import chunks
-from stillmap.em import observations
+from stillmap.core.recording import Recording
 
-LOOKS = np.array([0, 0, 0, 1, 1, 4, 5, 5, 5, 5])
+GROUPS = np.array([0, 0, 0, 1, 1, 4, 5, 5, 5, 5])
 
 
 def ten_scans():
@@ -24,7 +23,7 @@ def ten_scans():
 
 def cuts(beams, monkeypatch, **which):
     monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
-    found = list(observations.iter_chunks(ten_scans(), **which))
+    found = list(chunks.iter_chunks(ten_scans(), **which))
     for chunk in found:
         assert chunk.beams == slice(100 * chunk.scans.start, 100 * chunk.scans.stop)
         assert chunk.offset.tolist() == [100 * k for k in range(len(chunk.offset))]
@@ -40,18 +39,18 @@ def test_chunks_are_no_larger_than_asked_for(beams, stops, monkeypatch):
 
 
 @pytest.mark.parametrize(("beams", "stops"), [(1, [3, 5, 6, 10]), (600, [6, 10]), (950, [6, 10])])
-def test_no_look_is_cut(beams, stops, monkeypatch):
-    assert cuts(beams, monkeypatch, group=LOOKS) == stops
+def test_no_group_is_cut(beams, stops, monkeypatch):
+    assert cuts(beams, monkeypatch, group=GROUPS) == stops
 
 
 @pytest.mark.parametrize(
     ("beams", "groups", "stops"),
     [(99, 2, [5, 10]), (99, 3, [6, 10]), (99, 9, [10]), (600, 2, [6, 10]), (1, 1, [3, 5, 6, 10])],
 )
-def test_threads_find_looks_to_share_out(beams, groups, stops, monkeypatch):
-    assert cuts(beams, monkeypatch, group=LOOKS, groups=groups) == stops
+def test_threads_find_groups_to_share(beams, groups, stops, monkeypatch):
+    assert cuts(beams, monkeypatch, group=GROUPS, min_groups=groups) == stops
 
 
 @pytest.mark.parametrize(("beams", "stops"), [(50, [5, 10]), (20, [3, 5, 10])])
 def test_however_many_threads_chunks_are_no_wider(beams, stops, monkeypatch):
-    assert cuts(beams, monkeypatch, group=LOOKS, groups=200) == stops
+    assert cuts(beams, monkeypatch, group=GROUPS, min_groups=200) == stops

@@ -1,21 +1,21 @@
 """Legs and bodies in single scans, and whether they have changed places."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from made_up_scans import ANGLES, before, poses, recording, wall
 
 from stillmap.core import se2
-from stillmap.em.options import TrackerOptions
+from stillmap.em.people import detector
 from stillmap.em.people.detector import detect_segments, find_changed
 
-OPTIONS = TrackerOptions()
+
+def interval(monkeypatch, seconds):
+    monkeypatch.setattr(detector, "_BACKGROUND_INTERVAL", seconds)
 
 
-def found(ranges, options=OPTIONS):
+def found(ranges):
     r = recording(ranges)
-    return detect_segments(r, poses(r), options)
+    return detect_segments(r, poses(r))
 
 
 def test_two_legs_before_a_wall():
@@ -29,7 +29,7 @@ def test_two_legs_before_a_wall():
 def test_in_the_frame_of_the_map():
     r = recording([wall(), before(wall(), (3.0, 0.0, 0.2))])
     T = np.stack([np.eye(3), se2.matrix(1.0, 2.0, np.pi / 2)])
-    seen = detect_segments(r, T, OPTIONS)
+    seen = detect_segments(r, T)
     assert seen.scan.tolist() == [1]
     np.testing.assert_allclose(seen.xy, [(1.0, 4.85)], atol=0.05)
 
@@ -82,54 +82,67 @@ def test_before_nothing_and_beside_unusable_beams():
     assert len(found(np.full(len(ANGLES), np.nan)).scan) == 0
 
 
-def test_the_limits_are_the_options():
+def test_the_limits_of_a_segment(monkeypatch):
     ranges = before(wall(), (3.0, 0.0, 0.2))
-    for name, value in (("narrowest", 0.5), ("widest", 0.3), ("jump", 4.0)):
-        assert len(found(ranges, dataclasses.replace(OPTIONS, **{name: value})).scan) == 0
+    for name, value in (
+        ("_MIN_SEGMENT_WIDTH", 0.5), ("_MAX_SEGMENT_WIDTH", 0.3), ("_RANGE_JUMP", 4.0)
+    ):  # fmt: skip
+        with monkeypatch.context() as changed:
+            changed.setattr(detector, name, value)
+            assert len(found(ranges).scan) == 0
 
 
 @pytest.mark.parametrize("way", [1, -1])
-def test_a_place_that_was_seen_through(way):
+def test_a_place_that_was_seen_through(way, monkeypatch):
+    interval(monkeypatch, 1.0)
     pillar = (3.0, 1.0, 0.2)
     scans = [before(wall(), pillar, (3.0, -1.0, 0.2))] + 9 * [before(wall(), pillar)]
     r = recording(scans[::way])
-    seen = detect_segments(r, poses(r), OPTIONS)
-    moved = find_changed(r, poses(r), seen, 1.0, 0.3)
+    seen = detect_segments(r, poses(r))
+    moved = find_changed(r, poses(r), seen)
     mover = seen.xy[:, 1] < 0
     assert mover.sum() == 1
     np.testing.assert_array_equal(moved, mover)
-    assert not find_changed(r, poses(r), seen, 5.0, 0.3).any()  # no scan is so far away in time
-    assert not find_changed(r, poses(r), seen, 1.0, 4.0).any()  # the wall is not so far behind
+    with monkeypatch.context() as changed:
+        changed.setattr(detector, "_RANGE_JUMP", 4.0)
+        assert not find_changed(r, poses(r), seen).any()  # the wall is not so far behind
+    interval(monkeypatch, 5.0)
+    assert not find_changed(r, poses(r), seen).any()  # no scan is so far away in time
 
 
-def test_before_or_after_is_enough():
+def test_before_or_after_is_enough(monkeypatch):
+    interval(monkeypatch, 1.0)
     gone, there = wall(), before(wall(), (3.0, -1.0, 0.2))
     for scans, said in (((gone, there, there), [1, 0]), ((there, there, gone), [0, 1])):
         r = recording(scans, seconds=[0.0, 1.5, 3.0])
-        seen = detect_segments(r, poses(r), OPTIONS)
-        assert find_changed(r, poses(r), seen, 1.0, 0.3).tolist() == said
+        seen = detect_segments(r, poses(r))
+        assert find_changed(r, poses(r), seen).tolist() == said
 
 
-def test_a_post_that_most_beams_miss_has_not_gone():
+def test_a_post_that_most_beams_miss_has_not_gone(monkeypatch):
+    interval(monkeypatch, 1.0)
+    monkeypatch.setattr(detector, "_MIN_SEGMENT_WIDTH", 0.08)
     thick, thin = wall(), wall()
     thick[90:92] = thin[91] = 3.0
     for second, said in ((thin, [False]), (wall(), [True])):
         r = recording([thick, second], seconds=[0.0, 1.5])
-        seen = detect_segments(r, poses(r), dataclasses.replace(OPTIONS, narrowest=0.08))
-        assert find_changed(r, poses(r), seen, 1.0, 0.3).tolist() == said
+        seen = detect_segments(r, poses(r))
+        assert find_changed(r, poses(r), seen).tolist() == said
 
 
-def test_what_is_not_looked_at_has_not_gone():
+def test_what_is_not_in_view_has_not_gone(monkeypatch):
+    interval(monkeypatch, 1.0)
     r = recording([before(wall(), (3.0, 0.0, 0.2)), wall()], seconds=[0.0, 1.5])
     for turned, said in ((0.0, True), (np.radians(80), True), (np.radians(120), False)):
         T = np.stack([np.eye(3), se2.matrix(0.0, 0.0, turned)])
-        seen = detect_segments(r, T, OPTIONS)
-        assert find_changed(r, T, seen, 1.0, 0.3).tolist() == [said]
+        seen = detect_segments(r, T)
+        assert find_changed(r, T, seen).tolist() == [said]
 
 
-def test_only_the_same_laser_says_so():
+def test_only_the_same_laser_says_so(monkeypatch):
+    interval(monkeypatch, 1.0)
     scans = [before(wall(), (3.0, -1.0, 0.2)), wall()]
     for sensors, said in (((0, 0), True), ((0, 1), False)):
         r = recording(scans, seconds=[0.0, 1.5], sensor=sensors)
-        seen = detect_segments(r, poses(r), OPTIONS)
-        assert find_changed(r, poses(r), seen, 1.0, 0.3).tolist() == [said]
+        seen = detect_segments(r, poses(r))
+        assert find_changed(r, poses(r), seen).tolist() == [said]

@@ -126,7 +126,7 @@ def rows(seen, x, y, radius):
     )  # fmt: skip
     r = seen.recording
     chains.add(r.points, r.hit, r.offset, seen.poses, np.arange(r.n_scans))
-    cells, means, *_ = surface.elements()
+    cells, means, *_ = surface.surfels()
     near = np.hypot(*(means - (x, y)).T) < radius
     values = chains.likelihood()[0]
     return {tuple(c): v for c, v in zip(cells[near].tolist(), values[near], strict=True)}
@@ -199,9 +199,9 @@ def test_the_bound_is_above_the_expectation_and_prefers_true_poses(busy, known):
     assert found.likelihood.bound < known.likelihood.bound
 
 
-@pytest.mark.parametrize("options", [{"normals": False}, {"look": 2.0}, {"detection": 0.9}])
+@pytest.mark.parametrize("options", [{"time_bin": 2.0}, {"p_detection": 0.9}])
 def test_options_reach_it(busy, known, options):
-    found = busy.e_step(dwell=em.DwellOptions(**options))
+    found = busy.e_step(**options)
     assert found.p_static.tobytes() != known.p_static.tobytes()
     assert np.median(busy.of(found.p_static, 0, 1, 2)) > 0.9
 

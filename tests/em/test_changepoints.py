@@ -1,4 +1,4 @@
-"""The last E-step: what came to stay, left, or comes and goes, and what the map shows of it."""
+"""Change points: objects that arrive, leave or come and go, and what the map shows of them."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -9,9 +9,10 @@ import pytest
 from made_up import RESOLUTION, Ball, Wall, watch
 
 from stillmap import em
-from stillmap.em import changepoints as module
 from stillmap.core import chunks
-from stillmap.em.changepoints import _as_wholes
+from stillmap.em import changepoints as module
+from stillmap.em import observations
+from stillmap.em.changepoints import _group_cells
 from stillmap.mapping import detect_changes, relabel_changes
 
 WALLS = (Wall((1, 0), 4.03), Wall((0, 1), 3.04), Wall((0, -1), 3.04))
@@ -25,15 +26,15 @@ def courses(**changed):
     usual = {
         "cells": np.array([[0, 0], [1, 0], [2, 0], [3, 0]]),
         "p_static": np.array([0.9, 0.1, 0.2, 0.05], np.float32),
-        "p_views": np.zeros(4, np.float32),
+        "p_view_dependent": np.zeros(4, np.float32),
         "p_changing": np.array([0.02, 0.8, 0.7, 0.9], np.float32),
-        "p_thing": np.array([0.5, 1.0, 0.0, 0.9], np.float32),
+        "p_object": np.array([0.5, 1.0, 0.0, 0.9], np.float32),
         "occupied_share": np.array([1.0, 0.3, 0.6, 0.7], np.float32),
-        "count": np.array([0, 1, 1, 3], np.int32),
-        "between": np.full((4, 2, 2), -1, np.int32),
-        "covered": np.ones(4, np.float32),
-        "share": 0.1,
-        "surface": None,
+        "n_changes": np.array([0, 1, 1, 3], np.int32),
+        "change_bins": np.full((4, 2, 2), -1, np.int32),
+        "p_in_cell": np.ones(4, np.float32),
+        "changing_weight": 0.1,
+        "surfel_map": None,
     }
     return em.CellHistories(**(usual | changed))
 
@@ -43,7 +44,7 @@ def test_the_last_state():
     shown = courses().p_in_map("last")
     np.testing.assert_allclose(shown, [0.91, 0.9, 0.2, 0.05], atol=1e-6)
     assert shown.dtype == np.float32
-    twice = courses(count=np.array([0, 2, 2, 2], np.int32)).p_in_map("last")
+    twice = courses(n_changes=np.array([0, 2, 2, 2], np.int32)).p_in_map("last")
     np.testing.assert_allclose(twice, [0.91, 0.9, 0.2, 0.05 + 0.9 * 0.9], atol=1e-6)
 
 
@@ -60,14 +61,16 @@ def test_what_changed_is_not_what_the_view_hides(state):
     shown = courses().p_in_map(state)
     half = {name: 0.5 * getattr(courses(), name) for name in ("p_static", "p_changing")}
     np.testing.assert_allclose(
-        courses(**half, p_views=np.full(4, 0.5, np.float32)).p_in_map(state), shown, atol=1e-6
+        courses(**half, p_view_dependent=np.full(4, 0.5, np.float32)).p_in_map(state),
+        shown,
+        atol=1e-6,
     )
 
 
 @pytest.mark.parametrize("state", STATES)
 def test_no_probability_exceeds_one(state):
     p = np.full(4, 0.6, np.float32)
-    one = courses(p_static=p, p_changing=p, p_thing=np.ones(4, np.float32))
+    one = courses(p_static=p, p_changing=p, p_object=np.ones(4, np.float32))
     assert one.p_in_map(state).max() == 1.0
 
 
@@ -90,7 +93,7 @@ def row(p_changing, *, came=True, between=(10, 12), count=1, static=0.01, apart=
 
 
 def decided(courses):
-    return _as_wholes(courses).p_changing
+    return _group_cells(courses).p_changing
 
 
 def same(courses):
@@ -121,9 +124,9 @@ def test_what_is_not_one_thing_is_left_alone():
 
 def test_cells_that_came_beside_cells_that_left_are_another_thing():
     one = row(THIRD)
-    p_thing = one.p_object.copy()
-    p_thing[6:] = 0.1
-    np.testing.assert_allclose(decided(replace(one, p_thing=p_thing)), [0.9] * 6 + [0.1] * 10)
+    p_object = one.p_object.copy()
+    p_object[6:] = 0.1
+    np.testing.assert_allclose(decided(replace(one, p_object=p_object)), [0.9] * 6 + [0.1] * 10)
 
 
 @pytest.mark.parametrize(("looks", "apart"), [(5, False), (6, True)])
@@ -133,7 +136,7 @@ def test_cells_that_changed_at_other_times_are_another_thing(looks, apart):
     between = one.change_bins.copy()
     between[6:] += looks
     expected = [0.9] * 6 + [0.1] * 10 if apart else 0.8
-    np.testing.assert_allclose(decided(replace(one, between=between)), expected)
+    np.testing.assert_allclose(decided(replace(one, change_bins=between)), expected)
 
 
 def test_nobody_becomes_more_than_certain():
@@ -144,7 +147,7 @@ def test_nobody_becomes_more_than_certain():
 def test_rounding_makes_nothing_impossible(monkeypatch):
     """Cells of which one class is certain, each in its turn."""
     rng = np.random.default_rng(0)
-    rho, turn = [0.99, 0.65, 0.1, em.looks.OFTEN_OCCUPIED], [np.inf, 0.2, np.inf, np.inf]
+    rho, turn = [0.99, 0.65, 0.1, observations.HALF_TIME_RHO], [np.inf, 0.2, np.inf, np.inf]
     likelihood = 10.0 ** rng.uniform(-9.0, -6.0, (20_000, 4))
     likelihood[np.arange(20_000), rng.integers(0, 4, 20_000)] = 1.0
     grid = np.column_stack([np.arange(20_000) * 9, np.zeros(20_000)]).astype(np.int64)
@@ -155,9 +158,9 @@ def test_rounding_makes_nothing_impossible(monkeypatch):
         np.zeros((20_000, 2), np.int32),
         np.zeros((20_000, 2, 2, 2), np.int32),
     )
-    looks = em.looks.Looks(
-        surface=SimpleNamespace(size=20_000, elements=lambda rows: (grid[slice(*rows)],)),
-        dwell=SimpleNamespace(
+    seen = observations.Observations(
+        surfel_map=SimpleNamespace(size=20_000, surfels=lambda rows: (grid[slice(*rows)],)),
+        hmm=SimpleNamespace(
             changes=lambda rows: [one[slice(*rows)] for one in changes],
             change_log_likelihood=lambda rows: changes[0][slice(*rows)],
             likelihood=lambda kept, rows, _: (
@@ -168,12 +171,12 @@ def test_rounding_makes_nothing_impossible(monkeypatch):
         trust=1.0,
         rho=np.array(rho),
         tau=np.array([np.inf, np.inf, 3.0, 8.0]),
-        turn=np.array(turn),
+        view_angle=np.array(turn),
         n_static=2,
     )
-    monkeypatch.setattr(module, "coverage", lambda _: np.ones(20_000, np.float32))
-    found = module.decode_histories(looks, em.EmOptions())
-    static, change, share = module.label_cells(looks, em.EmOptions())
+    monkeypatch.setattr(module, "probability_in_cell", lambda _: np.ones(20_000, np.float32))
+    found = module.decode_histories(seen, em.EmOptions())
+    static, change, share = module.label_cells(seen, em.EmOptions())
     assert static.tobytes() == found.p_static.tobytes()
     assert share == found.changing_weight
     always = likelihood[:, 0]  # the only static class of these that is met from all around
@@ -209,7 +212,7 @@ class Everywhere(NamedTuple):
     cells: np.ndarray
 
 
-def last_e_step(seen, state="last", threads=1, **options):
+def final_e_step(seen, state="last", threads=1, **options):
     """(p_static, occupied) of a map that shows it everywhere, and the courses."""
     chosen = em.EmOptions(**options)
     _, found = em.final_e_step(seen.recording, seen.poses, RESOLUTION, chosen, threads)
@@ -224,12 +227,12 @@ def last_e_step(seen, state="last", threads=1, **options):
 
 @pytest.fixture(scope="module")
 def last(seen):
-    return last_e_step(seen)
+    return final_e_step(seen)
 
 
 @pytest.fixture(scope="module")
 def majority(seen):
-    return last_e_step(seen, "majority")
+    return final_e_step(seen, "majority")
 
 
 def test_labels_say_what_the_last_map_shows(seen, last):
@@ -255,24 +258,24 @@ def test_who_walks_over_the_place_it_left_leaves_no_trace(seen, last):
     assert np.quantile(over, 0.95) < 0.1
     _, found = last
     changed = found.p_changing > 0.5
-    assert (found.count[changed] <= 1).all()  # and nothing came back
+    assert (found.n_changes[changed] <= 1).all()  # and nothing came back
 
 
 @pytest.mark.parametrize("state", STATES)
 def test_labels_follow_from_the_map(seen, last, majority, state):
     (p_static, occupied), found = last if state == "last" else majority
-    shown = {tuple(c): p for c, p in zip(found.cells.tolist(), found.shown(state), strict=True)}
+    shown = {tuple(c): p for c, p in zip(found.cells.tolist(), found.p_in_map(state), strict=True)}
     hit = seen.recording.hit
     ends = np.floor(seen.recording.points[hit].astype(float) / RESOLUTION).astype(int)
     expected = np.array([shown[tuple(cell)] for cell in ends.tolist()], np.float32)
     np.testing.assert_array_equal(p_static[hit], expected)
     # and no cell is more occupied than what is shown of it
     np.testing.assert_array_equal(occupied.cells, found.cells)
-    assert (occupied.p_occupied <= found.shown(state)).all()
+    assert (occupied.p_occupied <= found.p_in_map(state)).all()
 
 
 def test_both_maps_are_of_the_same_courses(last, majority):
-    for name in set(em.CellHistories.__dataclass_fields__) - {"surface", "share"}:
+    for name in set(em.CellHistories.__dataclass_fields__) - {"surfel_map", "changing_weight"}:
         one, other = getattr(last[1], name), getattr(majority[1], name)
         np.testing.assert_array_equal(one, other)
 
@@ -286,7 +289,7 @@ def test_every_probability_is_one(last, majority):
         assert (found.p_static + found.p_changing).max() <= 1.0 + 1e-6
         assert p_static.min() >= 0.0
         assert p_static.max() <= 1.0
-        assert 0.0 < found.share < 1.0
+        assert 0.0 < found.changing_weight < 1.0
 
 
 def test_when_it_was(seen, last):
@@ -313,7 +316,7 @@ def test_what_comes_and_goes_again_and_again():
     times = [(t, t + 25) for t in range(0, 300, 50)]
     gate = [Ball(2.2, 0.3, *time, 0.5) for time in times]
     watched = watch([*WALLS, *gate, *passing(35, 1.2)], 300)
-    (p_static, _), found = last_e_step(watched)
+    (p_static, _), found = final_e_step(watched)
     assert np.median(watched.of(p_static, *range(3, 3 + len(gate)))) < 0.1
     (one,) = detect_changes(found, watched.recording, RESOLUTION, 0.5)
     assert one.kind == "comes and goes"
@@ -321,9 +324,13 @@ def test_what_comes_and_goes_again_and_again():
     assert (one.stamp_ns, one.last_ns) == (25 * 10**9, 275 * 10**9)
 
 
-@pytest.mark.parametrize("changed", [{"passing_seconds": 60.0}, {"stays": 0.2}, {"longest": 30.0}])
-def test_options_reach_it(seen, last, changed):
-    (other, _), _ = last_e_step(seen, changes=em.ChangeOptions(**changed))
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("_PASSER_BY_TAU", 60.0), ("_STATE_DURATION", 0.2), ("_MAX_STATE_DURATION", 30.0)],
+)
+def test_the_model_matters(seen, last, monkeypatch, name, value):
+    monkeypatch.setattr(module, name, value)
+    (other, _), _ = final_e_step(seen)
     assert other.tobytes() != last[0][0].tobytes()
 
 
@@ -331,8 +338,8 @@ def test_cells_decide_together_before_anything_is_shown(seen, monkeypatch):
     def nothing_changed(found):
         return replace(found, p_changing=np.zeros_like(found.p_changing))
 
-    monkeypatch.setattr(module, "_as_wholes", nothing_changed)
-    (p_static, _), found = last_e_step(seen)
+    monkeypatch.setattr(module, "_group_cells", nothing_changed)
+    (p_static, _), found = final_e_step(seen)
     assert not found.p_changing.any()
     assert np.quantile(seen.of(p_static, CAME), 0.9) < 0.1
 
@@ -341,21 +348,21 @@ def test_cells_decide_together_before_anything_is_shown(seen, monkeypatch):
 @pytest.mark.parametrize("threads", [1, 3])
 def test_pieces_and_threads_change_no_bit(seen, last, monkeypatch, beams, threads):
     monkeypatch.setattr(chunks, "CHUNK_BEAMS", beams)
-    (p_static, _), found = last_e_step(seen, threads=threads)
+    (p_static, _), found = final_e_step(seen, threads=threads)
     assert p_static.tobytes() == last[0][0].tobytes()
-    assert found.change_bins.tobytes() == last[1].between.tobytes()
+    assert found.change_bins.tobytes() == last[1].change_bins.tobytes()
 
 
 @pytest.mark.parametrize("scans", [1, 2])
 def test_so_short_a_recording_shows_no_change(scans):
     watched = watch([*WALLS, Ball(2.2, 0.3, 0, 9, 0.5)], scans)
-    (p_static, _), found = last_e_step(watched)
+    (p_static, _), found = final_e_step(watched)
     assert detect_changes(found, watched.recording, RESOLUTION, 0.5) == []
     assert np.isfinite(p_static).all()
 
 
 def test_nothing_hit():
-    (p_static, _), found = last_e_step(watch([], 10), prior=0.8)
+    (p_static, _), found = final_e_step(watch([], 10), prior=0.8)
     assert len(found.cells) == len(found.p_in_map("last")) == 0
     np.testing.assert_array_equal(p_static, 1)
 

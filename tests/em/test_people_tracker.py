@@ -1,4 +1,4 @@
-"""Who walks across is dropped, what stands is not."""
+"""Tracked people are labelled, what stands is not."""
 
 import dataclasses
 
@@ -7,71 +7,78 @@ import pytest
 from made_up_scans import before, crossing, poses, recording, wall
 
 from stillmap import _core, em
-from stillmap.em.options import TrackerOptions
-from stillmap.em.people import label_people
+from stillmap.em.people import label_people, tracker
 from stillmap.em.people.detector import detect_segments
 from stillmap.em.people.tracker import Tracks, find_beams_in_boxes, track_people
 
-OPTIONS = TrackerOptions()
 TIMES = np.arange(0.0, 3.4, 0.2)
 PILLAR = (2.0, 2.6, 0.15)
 
 
-def dropped(r, options=OPTIONS):
-    return label_people(r, poses(r), options).reshape(r.n_scans, -1)
+def labelled(r):
+    return label_people(r, poses(r)).reshape(r.n_scans, -1)
 
 
-def of(r, options=OPTIONS):
+def tracks_of(r):
     """The tracks of people."""
-    found = detect_segments(r, poses(r), options)
+    found = detect_segments(r, poses(r))
     seconds = 1e-9 * (r.stamp_ns - r.stamp_ns[0])
-    return track_people(found, np.ones(len(found.scan), bool), seconds, options)
+    return track_people(found, np.ones(len(found.scan), bool), seconds)
 
 
 def test_a_walker_is_dropped_from_the_first_scan_and_walls_stay():
     ranges, on = crossing(TIMES, pillar=PILLAR)
-    off = dropped(recording(ranges))
+    off = labelled(recording(ranges))
     assert off[on].mean() > 0.95
     assert off[0][on[0]].all()  # looking back
     assert not off[~on].any()  # wall and pillar are far from him
 
 
-def test_what_stands_is_never_dropped():
+def test_what_stands_is_never_labelled():
     ranges = np.tile(before(wall(), PILLAR, (3.0, 0.0, 0.2)), (20, 1))
     rng = np.random.default_rng(0)
-    assert not dropped(recording(ranges + rng.normal(scale=0.02, size=ranges.shape))).any()
+    assert not labelled(recording(ranges + rng.normal(scale=0.02, size=ranges.shape))).any()
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("moved", 10.0), ("least", 100), ("changed", 1.0), ("lost", 0.05)]
+    ("name", "value"),
+    [
+        ("_MIN_DISPLACEMENT", 10.0),
+        ("_MIN_TRACK_SCANS", 100),
+        ("_MIN_CHANGED_SHARE", 1.0),
+        ("_MAX_MISSED", 0.05),
+    ],
 )
-def test_who_counts_as_a_person_is_an_option(name, value):
+def test_what_confirms_a_track(monkeypatch, name, value):
     ranges, on = crossing(TIMES)
-    if name == "changed":  # he stands, then goes
+    if name == "_MIN_CHANGED_SHARE":  # he stands, then goes
         ranges[:8] = crossing(TIMES[:8], speed=0.0)[0]
     r = recording(ranges)
-    assert not dropped(r, dataclasses.replace(OPTIONS, **{name: value})).any()
-    if name != "changed":
-        assert dropped(r)[on].any()
+    if name != "_MIN_CHANGED_SHARE":
+        assert labelled(r)[on].any()
+    monkeypatch.setattr(tracker, name, value)
+    assert not labelled(r).any()
 
 
-def test_the_box_is_an_option():
+def test_the_size_of_the_box(monkeypatch):
     ranges, on = crossing(TIMES, x=5.7)  # close to the wall
     shares = []
     for box in (0.0, 0.4, 1.0):
-        off = dropped(recording(ranges), dataclasses.replace(OPTIONS, box=box))
+        monkeypatch.setattr(tracker, "_HALF_BOX", box)
+        off = labelled(recording(ranges))
         shares.append((off[on].mean(), off[~on].mean()))
     assert shares[0][0] < shares[1][0]
     assert shares[1][1] < shares[2][1]
 
 
-def test_only_hits_are_dropped():
+def test_only_hits_are_labelled(monkeypatch):
+    monkeypatch.setattr(tracker, "_HALF_BOX", 1.0)
     ranges = np.full((1, 181), np.inf)
     ranges[0, 90] = 20.0  # as far as the others, which end in the box with nothing
     r = recording(ranges)
     one = np.ones(1, bool)
     somebody = Tracks(np.zeros(1, int), np.zeros(1, int), np.array([[20.0, 0.0]]), one, one)
-    assert find_beams_in_boxes(r, poses(r), somebody, 1.0).nonzero()[0].tolist() == [90]
+    assert find_beams_in_boxes(r, poses(r), somebody).nonzero()[0].tolist() == [90]
 
 
 def test_a_track_goes_on_while_somebody_is_hidden_and_ends_where_he_was_last_seen():
@@ -79,10 +86,10 @@ def test_a_track_goes_on_while_somebody_is_hidden_and_ends_where_he_was_last_see
     hidden = ranges.copy()
     hidden[7:10] = wall()
     hidden[14:] = wall()
-    tracks = of(recording(hidden))
+    tracks = tracks_of(recording(hidden))
     assert len(np.unique(tracks.track)) == 1
     assert tracks.scan.tolist() == list(range(14))
-    assert (~tracks.seen).nonzero()[0].tolist() == [7, 8, 9]
+    assert (~tracks.observed).nonzero()[0].tolist() == [7, 8, 9]
     y = -2.0 + 1.2 * TIMES[:14]
     assert np.abs(tracks.xy[:, 1] - y).max() < 0.35
 
@@ -90,7 +97,7 @@ def test_a_track_goes_on_while_somebody_is_hidden_and_ends_where_he_was_last_see
 def test_two_who_cross():
     one, on_one = crossing(TIMES, x=3.0)
     two, on_two = crossing(TIMES, speed=-1.2, x=4.0, start=2.0)
-    off = dropped(recording(np.minimum(one, two)))
+    off = labelled(recording(np.minimum(one, two)))
     assert off[on_one].mean() > 0.9
     assert off[on_two & ~on_one].mean() > 0.85
 
@@ -99,37 +106,37 @@ def test_two_who_cross():
 def test_a_large_gap_ends_all_tracks(gap):
     ranges, on = crossing(TIMES)
     seconds = TIMES + np.where(np.arange(len(TIMES)) < 9, 0.0, gap)
-    off = dropped(recording(ranges, seconds))
-    assert len(np.unique(of(recording(ranges, seconds)).track)) == 2
+    off = labelled(recording(ranges, seconds))
+    assert len(np.unique(tracks_of(recording(ranges, seconds)).track)) == 2
     assert off[on].mean() > 0.9
 
 
 def test_stamps_that_repeat_or_come_at_random():
     ranges, on = crossing(TIMES)
     twice = recording(np.repeat(ranges, 2, axis=0), np.repeat(TIMES, 2))
-    assert dropped(twice)[np.repeat(on, 2, axis=0)].mean() > 0.9
+    assert labelled(twice)[np.repeat(on, 2, axis=0)].mean() > 0.9
     times = np.sort(np.random.default_rng(3).uniform(0.0, 3.4, 25))
     ranges, on = crossing(times)
-    assert dropped(recording(ranges, times))[on].mean() > 0.9
+    assert labelled(recording(ranges, times))[on].mean() > 0.9
 
 
 def test_next_to_nothing():
     ranges, _ = crossing(TIMES)
     one = recording(ranges[:1])
-    assert not dropped(one).any()
+    assert not labelled(one).any()
     nothing = recording(np.full(ranges.shape, np.inf))
-    assert not dropped(nothing).any()
+    assert not labelled(nothing).any()
     unusable = recording(np.full(ranges.shape, np.nan))
-    assert not dropped(unusable).any()
+    assert not labelled(unusable).any()
     r = recording(ranges)
     none = dataclasses.replace(
         r, points=r.points[:0], hit=r.hit[:0], offset=np.zeros_like(r.offset)
     )
-    assert label_people(none, poses(none), OPTIONS).shape == (0,)
+    assert label_people(none, poses(none)).shape == (0,)
     few = dataclasses.replace(
         r, points=r.points[: 2 * 17], hit=r.hit[: 2 * 17], offset=2 * np.arange(18)
     )
-    assert not label_people(few, poses(few), OPTIONS).any()
+    assert not label_people(few, poses(few)).any()
 
 
 def e_step(r, threads=1, **options):
@@ -146,7 +153,7 @@ def test_labels_are_hard_and_the_map_counts_the_rest():
     r = recording(ranges)
     found = e_step(r)
     e = found.p_static.reshape(ranges.shape)
-    off = dropped(r)
+    off = labelled(r)
     hit = np.isfinite(ranges)
     np.testing.assert_array_equal(e[hit], np.where(off, 0.0, 1.0)[hit])
     assert (e[:, 170] == np.float32(em.EmOptions().prior)).all()

@@ -1,4 +1,4 @@
-"""The last E-step: what is met from some places only is no passer-by."""
+"""The final E-step: view-dependent surface is no passer-by."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -43,15 +43,13 @@ def seen(at, met):
     return recording, T, on.ravel()
 
 
-def labels(at, met, **dwell):
+def labels(at, met):
     """(M,) p_static in the loop and in the last E-step, and which beams end on the post."""
     recording, T, on = seen(at, met)
     loop = em.e_step(recording, T, _core.OccupancyGrid2D(0.05), "stillmap", em.EmOptions(), 1)
-    last, courses = em.final_e_step(
-        recording, T, 0.05, em.EmOptions(dwell=em.DwellOptions(**dwell))
-    )
+    last, histories = em.final_e_step(recording, T, 0.05, em.EmOptions())
     assert on.sum() > 5
-    assert courses is not None
+    assert histories is not None
     return loop.p_static, last and last.p_static, on
 
 
@@ -88,17 +86,18 @@ def test_what_comes_and_goes_before_a_sensor_that_stands_moves():
     assert np.median(last[on]) < 0.1
 
 
-def test_without_views_labels_are_left_to_the_loop():
-    assert labels(ROUNDS, by_views(ROUNDS), views=False)[1] is None
+def test_without_view_classes_labels_are_left_to_the_loop(monkeypatch):
+    monkeypatch.setattr(module, "_VIEW_CLASSES", False)
+    assert labels(ROUNDS, by_views(ROUNDS))[1] is None
 
 
 @pytest.mark.parametrize("views", [True, False])
-def test_without_views_no_course_knows_of_them(views):
+def test_without_view_classes_no_history_knows_of_them(views, monkeypatch):
+    monkeypatch.setattr(module, "_VIEW_CLASSES", views)
     recording, T, _ = seen(ROUNDS, by_views(ROUNDS))
-    options = em.EmOptions(dwell=em.DwellOptions(views=views))
-    _, courses = em.final_e_step(recording, T, 0.05, options)
-    assert (courses.p_view_dependent.max() > 0.9) == views
-    assert (courses.p_view_dependent > 0.0).any() == views
+    _, histories = em.final_e_step(recording, T, 0.05, em.EmOptions())
+    assert (histories.p_view_dependent.max() > 0.9) == views
+    assert (histories.p_view_dependent > 0.0).any() == views
 
 
 APART = 1.2  # m, of two lasers
@@ -129,7 +128,7 @@ def test_labels_know_neither_crowds_nor_who_waits_nor_what_comes_often():
     """A chair that a robot passes looks like them."""
     rho, tau, _ = (np.array(values) for values in module._FINAL_CLASSES.grid())
     n_static = module._FINAL_CLASSES.n_static
-    kept = module._for_labels(SimpleNamespace(rho=rho, tau=tau, n_static=n_static))
+    kept = module._label_classes(SimpleNamespace(rho=rho, tau=tau, n_static=n_static))
     assert kept[:n_static].all()
     movers = {(r, t) for r, t in zip(rho[n_static:], tau[n_static:], strict=True)}
     left = set(zip(rho[kept][n_static:], tau[kept][n_static:], strict=True))

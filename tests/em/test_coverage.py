@@ -1,13 +1,12 @@
-"""Which places of a map are known well, in scenes made up by hand."""
+"""Observation counts, in scenes made up by hand."""
 
 import numpy as np
 import pytest
 
 from stillmap import _core, em
-from stillmap.core import se2
+from stillmap.core import chunks, se2
 from stillmap.core.recording import Recording
-from stillmap.core import chunks
-from stillmap.em import observations
+from stillmap.em import coverage
 from stillmap.em.types import NoReturnModel
 
 RESOLUTION = 0.1
@@ -31,14 +30,14 @@ def recording_of(ranges, hit, seconds):
     )
 
 
-def evidence_of(recording, p_static, no_return=None, threads=1, **options):
+def coverage_of(recording, p_static, no_return=None, threads=1):
     """Of the map of (15)."""
     poses = np.tile(np.eye(3), (recording.n_scans, 1, 1))
     grid = _core.OccupancyGrid2D(RESOLUTION)
     known = np.nan_to_num(p_static, nan=0.5)
     seen = em.add_trusted_beams(grid, recording, poses, known, no_return)
     occupancy = em.make_occupancy_map(grid, observed=seen)
-    chosen = em.EmOptions(evidence=em.EvidenceOptions(**options))
+    chosen = em.EmOptions()
     found = em.count_observations(recording, poses, p_static, occupancy, no_return, chosen, threads)
     assert (
         found.observations.shape
@@ -67,7 +66,7 @@ def visitors():
 
 
 def test_where_somebody_stood_the_place_is_not_known(visitors):
-    occupancy, found = evidence_of(*visitors)
+    occupancy, found = coverage_of(*visitors)
     told = {
         (4.0, 0.0): (20, 20),  # the wall that everybody sees
         (2.0, 0.0): (20, 20),
@@ -85,12 +84,13 @@ def test_where_somebody_stood_the_place_is_not_known(visitors):
     np.testing.assert_array_equal(found.thinly_observed, known & (found.unobstructed < 3))
 
 
-def test_options(visitors):
-    occupancy, found = evidence_of(*visitors, least=2, near=1.0)
+def test_thresholds(visitors, monkeypatch):
+    monkeypatch.setattr(coverage, "MIN_OBSERVATIONS", 2)
+    monkeypatch.setattr(coverage, "MOVER_RADIUS", 1.0)
+    occupancy, found = coverage_of(*visitors)
     assert (found.min_observations, found.mover_radius) == (2, 1.0)
     assert not at(occupancy, found.thinly_observed, 4.0, 1.8)
     assert at(occupancy, found.unobstructed, 1.2, 0.5) == 2
-    assert not evidence_of(*visitors, least=0)[1].thinly_observed.any()
 
 
 def test_scans_of_half_a_second_are_one_look(visitors):
@@ -98,17 +98,17 @@ def test_scans_of_half_a_second_are_one_look(visitors):
     T, N = recording.n_scans, recording.n_beams // recording.n_scans
     ranges = np.linalg.norm(recording.points, axis=1).reshape(T, N)
     at_once = recording_of(ranges, np.ones((T, N), bool), 0.02 * np.arange(T))
-    occupancy, found = evidence_of(at_once, e)
+    occupancy, found = coverage_of(at_once, e)
     assert found.observations.max() == 1
     assert found.thinly_observed.sum() == (~np.isnan(occupancy.p_occupied)).sum()
 
 
 def test_threads_and_chunks_do_not_matter(visitors, monkeypatch):
-    _, found = evidence_of(*visitors)
-    _, threaded = evidence_of(*visitors, threads=3)
+    _, found = coverage_of(*visitors)
+    _, threaded = coverage_of(*visitors, threads=3)
     monkeypatch.setattr(chunks, "CHUNK_BEAMS", 500)
-    _, chunked = evidence_of(*visitors, threads=2)
-    for name in ("looks", "clear", "thin"):
+    _, chunked = coverage_of(*visitors, threads=2)
+    for name in ("observations", "unobstructed", "thinly_observed"):
         np.testing.assert_array_equal(getattr(found, name), getattr(threaded, name))
         np.testing.assert_array_equal(getattr(found, name), getattr(chunked, name))
 
@@ -126,7 +126,7 @@ def test_beams_without_a_return_count_as_far_as_they_are_believed():
         (NoReturnModel(np.zeros((0, 2), np.int64), 0.4), (5, 0)),
         (NoReturnModel(np.zeros((0, 2), np.int64), np.inf), (0, 0)),
     ):
-        occupancy, found = evidence_of(recording, e, no_return)
+        occupancy, found = coverage_of(recording, e, no_return)
         np.testing.assert_array_equal(found.observations > 0, ~np.isnan(occupancy.p_occupied))
         np.testing.assert_array_equal(
             found.unobstructed, found.observations
@@ -134,11 +134,3 @@ def test_beams_without_a_return_count_as_far_as_they_are_believed():
         # the map may end before
         room = np.pad(found.observations, ((0, 40), (0, 40)))
         assert tuple(int(at(occupancy, room, *place)) for place in here) == expected
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"least": -1}, {"least": 65536}, {"near": -0.1}, {"near": 5.1}, {"near": np.nan}]
-)
-def test_options_that_cannot_be(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        em.EvidenceOptions(**wrong)

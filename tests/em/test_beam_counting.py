@@ -1,4 +1,4 @@
-"""Counting: hits against passages, one half at the threshold."""
+"""The hit ratio: hits against passes, one half at the threshold."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ from made_up import Ball, Wall, watch
 
 from stillmap import _core, em
 from stillmap.core.recording import Recording
+from stillmap.em.beam_counting import hit_ratio_e_step
 
 
 def lane(hits, passes):
@@ -29,9 +30,7 @@ def counted(recording, threshold):
     poses[:, :2, 2] = 0.5
     grid = _core.OccupancyGrid2D(1.0)
     em.add_recording(grid, recording, poses, None)
-    return grid, em.e_step(
-        recording, poses, grid, "hit-ratio", em.EmOptions(hit_ratio=threshold), threads=1
-    )
+    return grid, hit_ratio_e_step(recording, poses, grid, threshold)
 
 
 @pytest.mark.parametrize(("hits", "passes"), [(1, 3), (2, 3), (5, 5), (1, 0), (1, 19)])
