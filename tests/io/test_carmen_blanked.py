@@ -7,7 +7,7 @@ import pytest
 
 from stillmap.core.errors import InputError
 from stillmap.io import read
-from stillmap.io.carmen.writer import find_no_return_code, write_filtered_log
+from stillmap.io.carmen.filtered_log import find_no_return_code, write_filtered_log
 from stillmap.preprocessing.max_range import RangeRule
 
 # real readings, and a code that repeats in several directions

@@ -96,7 +96,7 @@ def test_the_second_laser(read_log, flaser):
     np.testing.assert_array_equal(angles(recording, 0), angles(plain, 0))
     np.testing.assert_allclose(angles(recording, 1), [0.5, 0.25, 0, -0.25], atol=1e-6)
     assert [s["upside_down"] for s in recording.source["sensors"]] == [False, True]
-    with pytest.raises(InputError, match="second laser"):
+    with pytest.raises(InputError, match="laser2_"):
         read_log(lines[:1], **options)
 
 
@@ -122,7 +122,7 @@ def test_of_a_folder_too(read_log, flaser, tmp_path):
     np.testing.assert_allclose(se2.parameters(changed.T_base_sensor)[:, 0], [0, -0.2])
     assert changed.source["read_options"] == {"laser2_upside_down": True, "laser2_x": -0.2}
     write(read_log(lines[:1]), tmp_path / "one")
-    with pytest.raises(InputError, match="second laser"):
+    with pytest.raises(InputError, match="laser2_"):
         read(tmp_path / "one", ReadOptions(laser2_x=-0.2))
 
 

@@ -122,7 +122,7 @@ def test_gzip_and_plain_say_the_same(tmp_path):
 def test_what_a_log_cannot_hold(tmp_path):
     recording = simulated(sweep_time=0.05)
     assert writers.write(recording, tmp_path / "a.log") == [
-        "when each beam was taken is left out: CARMEN logs cannot say it"
+        "beam times are left out: CARMEN logs cannot hold them"
     ]
     three = dataclasses.replace(recording, T_base_sensor=np.tile(np.eye(3), (3, 1, 1)))
     uneven = dataclasses.replace(recording, offset=np.array(recording.offset))

@@ -50,7 +50,7 @@ def little_memory(most):
 
 @pytest.fixture
 def few_bytes_are_fine(monkeypatch):
-    monkeypatch.setattr(text_lines, "_SURELY_FINE", 1 << 20)
+    monkeypatch.setattr(text_lines, "_MIN_LIMIT", 1 << 20)
 
 
 @pytest.mark.parametrize("piece", [b"\n", b"\0" * 1000, b"ODOM 0 0 0 0 0 0 1 h 1\n"])
@@ -72,7 +72,7 @@ def test_logs_that_pack_well_are_read(tmp_path):
 
 
 def test_log_without_end(tmp_path, monkeypatch):
-    monkeypatch.setattr(log_module, "_MOST_OTHER", 100)
+    monkeypatch.setattr(log_module, "_MAX_UNKNOWN_LINES", 100)
     (tmp_path / "a.log").write_text(FLASER + "other\n" * 300)
     with pytest.raises(InputError, match="100 lines in a row that are no records"):
         read(tmp_path / "a.log")
@@ -107,7 +107,7 @@ def test_device_without_end(tmp_path, reader, said):
 
 
 @pytest.mark.parametrize("number", ["0x" + "f" * 5000, "9" * 5000, "-0x" + "f" * 5000])
-@pytest.mark.parametrize("name", ["max_range", "topic", "own_body"])
+@pytest.mark.parametrize("name", ["max_range", "topic", "self_filter"])
 def test_options_of_thousands_of_digits(tmp_path, name, number):
     (tmp_path / "a.toml").write_text(f"{name} = {number}")
     with pytest.raises(InputError) as caught:
@@ -142,7 +142,7 @@ def test_packed_points_that_cannot_be(tmp_path, space):
     content = bytearray(path.read_bytes())
     struct.pack_into("<I", content, 107, 2_000_000_000)
     path.write_bytes(content)
-    with pytest.raises(InputError, match="cut short: 0 of 2000000000 points"):
+    with pytest.raises(InputError, match="truncated: 0 of 2000000000 points"):
         read(path)
 
 
@@ -172,7 +172,7 @@ def test_what_happens_while_reading(log, monkeypatch, error):
     def fails(*_):
         raise error
 
-    monkeypatch.setattr(registry.carmen, "read", fails)
+    monkeypatch.setattr(registry.reader, "read", fails)
     with pytest.raises(InputError, match=r"cannot be read: gone|does not fit into memory"):
         read(log([FLASER]))
 

@@ -164,7 +164,7 @@ def _write(
 ) -> tuple[int, list[str], list[str]]:
     """How many scans, and which topics, are not in what was written; which are not filtered."""
     from stillmap.io import stillmap_folder
-    from stillmap.io.carmen import writer
+    from stillmap.io.carmen import filtered_log
     from stillmap.io.registry import detect_format
 
     form = detect_format(mapped.source)
@@ -182,7 +182,8 @@ def _write(
         )
         return 0, [], []
     if form.name == "CARMEN log":
-        return writer.write_filtered_log(mapped.source, output, recording, blank).omitted, [], []
+        copy = filtered_log.write_filtered_log(mapped.source, output, recording, blank)
+        return copy.omitted, [], []
     hint = "`stillmap convert` makes a recording of another form that can be"
     raise InputError(f"a {form.name} cannot be written again", where=str(mapped.source), hint=hint)
 

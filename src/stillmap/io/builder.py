@@ -1,9 +1,7 @@
-"""Scans gathered one by one into a recording, whatever their number.
-
-What was skipped while reading, by reason and with line numbers.
-"""
+"""Builds a recording scan by scan, of any size, and counts the records that were skipped."""
 
 from array import array
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,18 +13,18 @@ from stillmap.core.arrays import ArrayBuilder, empty
 from stillmap.core.recording import Recording
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions
 
-_BLOCK = 1 << 20  # points of a scan looked at together
+_BLOCK = 1 << 20  # points of a scan at a time
 
 
 class RecordingBuilder:
-    """Scans of point clouds, in any order; what does not fit into memory goes to files.
+    """Collects point clouds, in any order, in memory-mapped buffers.
 
     Args:
-        dimension: 2 or 3.
-        options: readings nearer than `min_range` are unusable, those from `max_range` on are
-            taken for maximum range, at that range.
-        beam_times: whether `add` will be told when beams were taken.
-        folder: for the files; None: the system's temporary folder.
+        dimension: D, 2 or 3.
+        options: points nearer than `min_range` are unusable, those from `max_range` on are at
+            maximum range.
+        beam_times: whether scans have beam times.
+        folder: of the buffers; None: the system's temporary folder.
     """
 
     def __init__(
@@ -54,13 +52,13 @@ class RecordingBuilder:
         sensor: int = 0,
         beam_time: NDArray[Any] | None = None,
     ) -> None:
-        """One scan.
+        """Add a scan.
 
         Args:
-            stamp_ns: when it was taken.
-            points: (n, D) metres in the sensor's frame; not finite, or not to be believed:
-                unusable. It may be larger than memory.
-            sensor: which sensor took it.
+            stamp_ns: its time.
+            points: (n, D) metres in the sensor's frame, larger than memory at will; not finite or
+                implausibly far ones are unusable.
+            sensor: index of its sensor.
             beam_time: (n,) seconds after the stamp; not finite counts as 0.
         """
         for start in range(0, len(points), _BLOCK):
@@ -85,13 +83,13 @@ class RecordingBuilder:
         selection: NDArray[np.intp] | None = None,
         **more: Any,
     ) -> Recording:
-        """The recording of scans by their stamps; nothing can be added any more.
+        """Build the recording, ordered by stamps; afterwards nothing can be added.
 
         Args:
             T_base_sensor: (S, D+1, D+1).
             source: see Recording.
             T_odom_base, T_recorded_base: (T, D+1, D+1) in the order in which scans were added.
-            selection: which of the scans; None: all.
+            selection: indices of the scans to use; None: all.
             more: other fields of the Recording.
         """
         stamp_ns = np.asarray(self._stamp_ns, np.int64)
@@ -122,8 +120,8 @@ class RecordingBuilder:
 def _apply_range_limits(
     points: NDArray[np.float32], options: ReadOptions
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Points (n, D), NaN where unusable, and which of them something reflected."""
-    # column by column: along rows of two or three numbers NumPy is slow
+    """Points (n, D), NaN where unusable, and hits (n,)."""
+    # column by column: NumPy is slow along rows of two or three numbers
     length = np.sqrt(sum(column * column for column in points.T.astype(np.float64)))
     usable = (length <= MAX_POINT_DISTANCE) & (length >= options.min_range) & (length > 0.0)
     if options.max_range is None and usable.all():
@@ -144,7 +142,7 @@ def _reorder(
     order: NDArray[np.intp],
     folder: Path | None,
 ) -> NDArray[Any]:
-    """Values per beam of the scans in `order`."""
+    """Rearrange values per beam into the order of scans."""
     if np.array_equal(order, np.arange(len(start))):
         return values
     out = empty((int(length[order].sum()), *values.shape[1:]), values.dtype, folder)
@@ -162,10 +160,10 @@ _MAX_LOSS = 0.05  # share of scans that may be skipped without a warning
 
 
 class SkippedRecords:
-    """Counts of skipped records by reason; at most `KEPT_LINES` line numbers each."""
+    """Counts skipped records by reason, with up to `MAX_LINE_NUMBERS` line numbers each."""
 
     def __init__(self) -> None:
-        self._count: dict[str, int] = {}
+        self._count: Counter[str] = Counter()
         self._lines: dict[str, list[int]] = {}
 
     def add(self, reason: str, line: int) -> None:
@@ -173,33 +171,33 @@ class SkippedRecords:
 
     def add_all(self, reason: str, lines: Iterable[int]) -> None:
         for line in lines:
-            self._count[reason] = self._count.get(reason, 0) + 1
+            self._count[reason] += 1
             kept = self._lines.setdefault(reason, [])
             if len(kept) < MAX_LINE_NUMBERS:
                 kept.append(int(line))
 
     def merge(self, *others: "SkippedRecords") -> "SkippedRecords":
-        """These and the others' together; neither is changed."""
+        """The sum of these and others; neither is changed."""
         out = SkippedRecords()
         for part in (self, *others):
             for reason, count in part._count.items():
-                out._count[reason] = out._count.get(reason, 0) + count
+                out._count[reason] += count
                 lines = sorted(out._lines.get(reason, []) + part._lines[reason])
                 out._lines[reason] = lines[:MAX_LINE_NUMBERS]
         return out
 
     @property
     def total(self) -> int:
-        return sum(self._count.values())
+        return self._count.total()
 
     def summary(self, unit: str = "line") -> str:
         """`3 x unreadable number (line 4, 8, 15)`, the most frequent reason first.
 
         Args:
-            unit: what the numbers count.
+            unit: of the numbers.
         """
         parts = []
-        for reason, count in sorted(self._count.items(), key=lambda item: -item[1]):
+        for reason, count in self._count.most_common():
             shown = ", ".join(str(line) for line in sorted(self._lines[reason])[:3])
             parts.append(f"{count} x {reason} ({unit} {shown}{', ...' if count > 3 else ''})")
         return "; ".join(parts)

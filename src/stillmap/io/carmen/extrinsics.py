@@ -1,4 +1,4 @@
-"""Where the lasers of a CARMEN log sit on the robot."""
+"""Finds the extrinsics, mounting and declared ranges of the lasers of a CARMEN log."""
 
 import math
 from typing import Any, NamedTuple
@@ -10,15 +10,15 @@ from stillmap.core import se2
 from stillmap.io.carmen.log import LaserLog, param_number
 from stillmap.preprocessing.options import LaserOptions
 
-# differences between laser pose and robot pose that are one place on the robot: rounded to cm in
-# old logs; a corrected pose in the laser field differs by metres, and differently in each scan
-_SAME_M, _SAME_RAD = 0.02, 0.01
-_LARGEST_OFFSET = 3.0  # m on a robot
-_SMALLEST = 0.002  # m or rad: less is rounding, not a place
+# differences between laser and robot pose that agree: old logs round to cm. A corrected pose in
+# the laser field differs by metres, and differently in each scan
+_SAME_DISTANCE, _SAME_ANGLE = 0.02, 0.01  # m, rad
+_MAX_OFFSET = 3.0  # m on a robot
+_MIN_OFFSET = 0.002  # m or rad: less is rounding
 
 
 class Extrinsics(NamedTuple):
-    """Pose of a laser on the robot: metres, radians, and how it was found."""
+    """Pose of a laser on the robot in metres and radians, and how it was found."""
 
     x: float
     y: float
@@ -36,16 +36,15 @@ class Extrinsics(NamedTuple):
 def find_extrinsics(
     laser: LaserLog, poses: NDArray[np.float64] | None, params: dict[str, str]
 ) -> tuple[Extrinsics, list[str]]:
-    """Extrinsics of a laser, and warnings in words.
+    """Find the extrinsics of a laser; returns them and warnings.
 
-    In this order: the laser's pose against the robot's on the scan lines themselves, where they
-    differ and always alike (median); the log's PARAMs; facing backwards for RLASER, which CARMEN
-    names for it; the robot's centre.
+    In this order: the median pose of the laser relative to the robot on the scan lines, if scans
+    agree on it; PARAMs; facing backwards for RLASER; the robot's center.
 
     Args:
         laser: its scans.
-        poses: (T, 6) laser and robot pose of each scan, None where the lines have none.
-        params: the log's PARAMs.
+        poses: (T, 6) laser and robot pose of each scan, None if lines have none.
+        params: PARAMs of the log.
     """
     warnings: list[str] = []
     if poses is not None:
@@ -69,13 +68,13 @@ def find_extrinsics(
 
 
 def is_stated_by_lines(x: float, y: float, theta: float) -> bool:
-    """Whether poses on scan lines tell a laser's place: on the robot, and not at its centre."""
-    away = math.hypot(x, y)
-    return away < _LARGEST_OFFSET and max(away, abs(theta)) > _SMALLEST
+    """Whether a pose from scan lines is plausible: on the robot, and not at its center."""
+    distance = math.hypot(x, y)
+    return distance < _MAX_OFFSET and max(distance, abs(theta)) > _MIN_OFFSET
 
 
 def override(found: Extrinsics, given: LaserOptions) -> Extrinsics:
-    """`found` with what the options name in its place."""
+    """`found` with the values that options give."""
     if given.pose == (None, None, None):
         return found
     x, y, theta = (f if w is None else w for f, w in zip(found[:3], given.pose, strict=True))
@@ -83,10 +82,10 @@ def override(found: Extrinsics, given: LaserOptions) -> Extrinsics:
 
 
 def find_upside_down(kind: str, params: dict[str, str], given: LaserOptions) -> tuple[bool, str]:
-    """Whether a laser's beams turn clockwise, for it hangs upside down; and who says so.
+    """Whether a laser is mounted upside down, so that its beams turn clockwise, and the source.
 
-    CARMEN's own laser_..._flipped do not: its laser server turns such readings round before they
-    are logged.
+    CARMEN's own laser_..._flipped does not tell: its laser server reverses such readings before
+    they are logged.
     """
     if given.upside_down is not None:
         return given.upside_down, "given"
@@ -95,7 +94,7 @@ def find_upside_down(kind: str, params: dict[str, str], given: LaserOptions) -> 
 
 
 def find_field_of_view(kind: str, params: dict[str, str], given: LaserOptions) -> float | None:
-    """Of a laser whose lines state no angles, in radians; None: nobody says."""
+    """Field of view in radians of a laser whose lines declare no angles; None: not stated."""
     if given.fov is not None:
         return given.fov
     degrees = param_number(params, f"laser_{laser_position(kind, params)}_laser_fov")
@@ -103,7 +102,7 @@ def find_field_of_view(kind: str, params: dict[str, str], given: LaserOptions) -
 
 
 def laser_position(kind: str, params: dict[str, str]) -> str:
-    """`front`, `rear` or the kind itself: lines with the same position show the same laser."""
+    """`front`, `rear` or the kind itself: kinds of the same position show the same laser."""
     if kind in ("FLASER", "ROBOTLASER1"):
         return "front"
     if kind in ("RLASER", "ROBOTLASER2"):
@@ -117,10 +116,10 @@ def laser_position(kind: str, params: dict[str, str]) -> str:
 
 
 def find_max_range(laser: LaserLog, params: dict[str, str]) -> float | None:
-    """The largest range that the log names for a laser, in metres: PARAM or header, the smaller."""
+    """The declared maximum range in metres, the smaller of PARAM and headers; None: not stated."""
     in_headers = [config.max_range for config in laser.configs if config.max_range is not None]
     in_params = param_number(params, f"robot_{laser_position(laser.kind, params)}_laser_max")
-    # a header may be damaged in one line: the most cautious of what remains is the largest
+    # single headers may be damaged: the largest is the most cautious
     stated = [max(in_headers)] if in_headers else []
     if in_params is not None and in_params > 0.0:
         stated.append(in_params)
@@ -131,12 +130,12 @@ def _median_offset(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], boo
     """Median (x, y, theta) of the laser in the robot's frame, and whether scans agree on it."""
     T_odom_sensor, T_odom_base = se2.matrix(*poses[:, :3].T), se2.matrix(*poses[:, 3:].T)
     offsets = se2.parameters(se2.inverse(T_odom_base) @ T_odom_sensor)
-    # angles near pi fall on both sides of the cut: unwrap them about the first
+    # unwrap about the first: angles near pi lie on both sides of the cut
     offsets[:, 2] = offsets[0, 2] + se2.wrap(offsets[:, 2] - offsets[0, 2])
     middle = np.median(offsets, axis=0)
     off = np.abs(offsets - middle)
-    alike = np.mean((off[:, :2].max(axis=1) < _SAME_M) & (off[:, 2] < _SAME_RAD)) > 0.9
-    return middle, bool(alike) and bool(np.hypot(*middle[:2]) < _LARGEST_OFFSET)
+    alike = np.mean((off[:, :2].max(axis=1) < _SAME_DISTANCE) & (off[:, 2] < _SAME_ANGLE)) > 0.9
+    return middle, bool(alike) and bool(np.hypot(*middle[:2]) < _MAX_OFFSET)
 
 
 def _extrinsics_from_params(kind: str, params: dict[str, str]) -> Extrinsics | None:

@@ -1,4 +1,4 @@
-"""The content of a CARMEN log, gathered compactly line by line."""
+"""Collects the records of a CARMEN log in compact arrays."""
 
 from array import array
 from collections import Counter
@@ -12,12 +12,13 @@ from stillmap.io.builder import SkippedRecords
 from stillmap.io.carmen.messages import SCAN_PARSERS, BadRecord, ScanConfig, ScanLine, parse_odom
 from stillmap.io.text_lines import Line, Progress, read_lines
 
+BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 CUT_LINE = "cut last line"
 DAMAGED_STREAM = "damaged gzip stream"
 LONG_LINE = "over-long line"
 _COMMENT = (b"#", b"//")
-_MOST_OTHER = 5_000_000  # lines: a log has a scan or a pose among ten
-_KINDS_NAMED = 50  # unknown kinds counted one by one; a text that is no log has thousands
+_MAX_UNKNOWN_LINES = 5_000_000  # in a row; one in ten lines of a log is a scan or a pose
+_MAX_UNKNOWN_KINDS = 50  # counted one by one; a text that is no log has thousands
 
 
 class LaserLog:
@@ -47,11 +48,11 @@ class LaserLog:
             self.poses.extend(scan.laser_pose + scan.robot_pose)
 
     def typical_count(self) -> int:
-        """The number of readings that most scans have; the larger of two as frequent."""
+        """The most frequent number of readings per scan, the larger of equally frequent ones."""
         return max(Counter(self.count).items(), key=lambda item: (item[1], item[0]))[0]
 
     def stack_readings(self, scans: NDArray[np.intp]) -> NDArray[np.float32]:
-        """(len(scans), n) float32 readings; all these scans have the same number of them."""
+        """(len(scans), n) float32 readings of scans with the same number of readings."""
         count = np.asarray(self.count)
         start = np.concatenate([[0], np.cumsum(count)[:-1]])
         n = int(count[scans[0]])
@@ -62,7 +63,7 @@ class LaserLog:
 
 
 class CarmenLog:
-    """Everything of a CARMEN log that matters here."""
+    """The records of a CARMEN log."""
 
     def __init__(self) -> None:
         self.lasers: dict[str, LaserLog] = {}
@@ -71,19 +72,19 @@ class CarmenLog:
         self.params: dict[str, str] = {}
         self.records: Counter[str] = Counter()
         self.ignored: Counter[str] = Counter()
-        self.skipped = SkippedRecords()  # lines of which it cannot be told what they were
+        self.skipped = SkippedRecords()  # lines of unknown kind
         self.skipped_scans: dict[str, SkippedRecords] = {}  # by kind of line
         self.skipped_odometry = SkippedRecords()
         self.n_lines = 0
         self._stamp_fields: dict[bytes, int] = {}
 
     def add(self, line: Line) -> None:
-        """Take in one line; what cannot be used is counted."""
+        """Add a line; one that cannot be used is counted."""
         self.n_lines = line.number
         if line.damaged:
             self.skipped.add(DAMAGED_STREAM, line.number)
             return
-        text = line.text.removeprefix(b"\xef\xbb\xbf") if line.number == 1 else line.text
+        text = line.text.removeprefix(BYTE_ORDER_MARK) if line.number == 1 else line.text
         if line.too_long:
             self.skipped.add(LONG_LINE, line.number)
         elif text.lstrip().startswith(_COMMENT):
@@ -97,68 +98,64 @@ class CarmenLog:
             if len(fields) >= 2:
                 self.params[_text(fields[0])] = _text(fields[1])
             return
-        if name != b"ODOM" and name not in SCAN_PARSERS:
-            self._ignore(line, name)
-            return
         if name == b"ODOM":
             skipped = self.skipped_odometry
-        else:
+        elif name in SCAN_PARSERS:
             skipped = self.skipped_scans.setdefault(_text(name), SkippedRecords())
+        else:
+            self._ignore(line, name)
+            return
         try:
-            stamp_fields = self._add_measured(line, name, fields)
+            stamp_fields = self._add_measurement(line, name, fields)
         except BadRecord as bad:
             skipped.add(bad.reason if line.ended else CUT_LINE, line.number)
         else:
             self.records[_text(name)] += 1
             self._stamp_fields[name] = stamp_fields
 
-    def _add_measured(self, line: Line, name: bytes, fields: list[bytes]) -> int:
-        if name == b"ODOM":
-            odom = parse_odom(fields)
-            self._require_whole(line, name, odom.stamp_fields)
-            self.odom_stamp_ns.append(odom.stamp_ns)
-            self.odom_poses.extend(odom.pose)
-            return odom.stamp_fields
-        scan = SCAN_PARSERS[name](fields)
-        self._require_whole(line, name, scan.stamp_fields)
-        kind = _text(name)
-        self.lasers.setdefault(kind, LaserLog(kind)).add(line.number, scan)
-        return scan.stamp_fields
-
-    def _require_whole(self, line: Line, name: bytes, stamp_fields: int) -> None:
-        # a line without an end may have lost fields, or digits of its stamp, unseen
-        if not line.ended and stamp_fields < self._stamp_fields.get(name, 1):
+    def _add_measurement(self, line: Line, name: bytes, fields: list[bytes]) -> int:
+        """Add a scan or pose; returns the number of its stamp fields."""
+        record = parse_odom(fields) if name == b"ODOM" else SCAN_PARSERS[name](fields)
+        # a line without an end may have lost fields, or digits of its stamp, unnoticed
+        if not line.ended and record.stamp_fields < self._stamp_fields.get(name, 1):
             raise BadRecord(CUT_LINE)
+        if isinstance(record, ScanLine):
+            kind = _text(name)
+            self.lasers.setdefault(kind, LaserLog(kind)).add(line.number, record)
+        else:
+            self.odom_stamp_ns.append(record.stamp_ns)
+            self.odom_poses.extend(record.pose)
+        return record.stamp_fields
 
     def _ignore(self, line: Line, name: bytes) -> None:
         if not line.ended and any(kind.startswith(name) for kind in (*SCAN_PARSERS, b"ODOM")):
             self.skipped.add(CUT_LINE, line.number)
             return
         kind = _text(name)
-        known = kind in self.ignored or len(self.ignored) < _KINDS_NAMED
+        known = kind in self.ignored or len(self.ignored) < _MAX_UNKNOWN_KINDS
         self.ignored[kind if known else "others"] += 1
 
 
 def read_log(path: Path, progress: Progress | None = None) -> CarmenLog:
-    """The content of a CARMEN log, plain or gzip.
+    """Read a CARMEN log, plain or gzip.
 
     Raises:
-        InputError: the file cannot be opened or read, or goes on and on without a record.
+        InputError: the file cannot be read, or has millions of lines in a row without a record.
     """
     log = CarmenLog()
     known = 0
     for line in read_lines(path, progress):
         log.add(line)
-        if line.number % _MOST_OTHER == 0:
+        if line.number % _MAX_UNKNOWN_LINES == 0:
             before, known = known, log.records.total()
             if known == before:
-                what = f"has {_MOST_OTHER} lines in a row that are no records"
+                what = f"has {_MAX_UNKNOWN_LINES} lines in a row that are no records"
                 raise InputError(what, where=f"{path}:{line.number}")
     return log
 
 
 def param_number(params: dict[str, str], name: str) -> float | None:
-    """The PARAM of this name as a finite number; None where there is none."""
+    """The PARAM of this name as a finite number; None if there is none."""
     try:
         value = float(params[name])
     except (KeyError, ValueError):

@@ -1,7 +1,7 @@
-"""The grammar of CARMEN log lines.
+"""Parses the lines of CARMEN logs.
 
-One message per line: name, contents, then `ipc_timestamp hostname logger_timestamp`, of which old
-logs leave out the last one or two. The first of the two stamps is the record's time.
+One message per line: name, content, then `ipc_timestamp hostname logger_timestamp`, of which old
+logs omit the last one or two. The first of the two stamps is the record's time.
 
     FLASER, RLASER  n r*n  laser_pose  robot_pose
     RAWLASER1-4     header n r*n  m remission*m
@@ -12,8 +12,7 @@ logs leave out the last one or two. The first of the two stamps is the record's 
     header          laser_type start_angle field_of_view angular_resolution maximum_range
                     accuracy remission_mode
 
-Source: the header that CARMEN's logger writes into its logs, and logs themselves: the logger's
-comment on ROBOTLASER leaves the remissions out, its lines have them.
+Source: the header that CARMEN's logger writes, and logs: the header omits ROBOTLASER's remissions.
 """
 
 import math
@@ -27,11 +26,11 @@ UNREADABLE = "unreadable number"
 BAD_POSE = "pose not finite"
 
 _HEADER_FIELDS = 7
-_LARGEST_POSE = 1e7  # m or rad: nothing a robot's odometry reaches
+_MAX_POSE = 1e7  # m or rad, far beyond any odometry
 
 
 class BadRecord(Exception):
-    """One line that cannot be used; `reason` is what it is counted under."""
+    """A line that cannot be used; it is counted under `reason`."""
 
     def __init__(self, reason: str) -> None:
         self.reason = reason
@@ -39,24 +38,24 @@ class BadRecord(Exception):
 
 
 class ScanConfig(NamedTuple):
-    """Where the beams of a scan point, and the range that the line declares as the largest."""
+    """Beam angles of a scan, and its declared maximum range."""
 
     start_angle: float  # rad
     angle_step: float  # rad
     max_range: float | None  # m
-    field_of_view: float | None  # rad, as stated
+    field_of_view: float | None  # rad, as declared
 
 
 class ScanLine(NamedTuple):
-    """A laser line. Poses are (x, y, theta); None where the kind of line has none."""
+    """A laser line. Poses are (x, y, theta), None for kinds of lines without them."""
 
     stamp_ns: int
     ranges: list[float]
     config: ScanConfig
     laser_pose: tuple[float, float, float] | None
     robot_pose: tuple[float, float, float] | None
-    stamp_fields: int  # 1 to 3, how much of `ipc_timestamp hostname logger_timestamp` is there
-    host_is_number: bool  # possible, but in a log with named hosts a sign of shifted fields
+    stamp_fields: int  # 1 to 3: how many of `ipc_timestamp hostname logger_timestamp` are present
+    host_is_number: bool  # in a log with named hosts a sign of shifted fields
 
 
 class OdometryLine(NamedTuple):
@@ -66,18 +65,17 @@ class OdometryLine(NamedTuple):
 
 
 def flaser_config(n: int, fov: float = math.pi) -> ScanConfig:
-    """Angles of a FLASER or RLASER line, which states none: half a circle from -90 degrees.
+    """Beam angles of a FLASER or RLASER line, which declares none: a half circle from -90 degrees.
 
-    180 and 181 readings are 1 degree apart, 360 and 361 half a degree: an even number leaves out
-    the last beam of the half circle, so the step is 180 / n degrees for even and 180 / (n - 1)
-    for odd n. Likewise for another field of view `fov`, in radians.
+    The step is 180 / n degrees for even n, which omits the last beam, and 180 / (n - 1) for odd n.
+    Likewise for another field of view `fov`, in radians.
     """
     steps = n if n % 2 == 0 else max(n - 1, 1)
     return ScanConfig(-fov / 2, fov / steps, None, None)
 
 
 def parse_flaser(fields: list[bytes]) -> ScanLine:
-    """FLASER and RLASER, `fields` without the name.
+    """Parse FLASER and RLASER, `fields` without the name.
 
     Raises:
         BadRecord: the line cannot be used.
@@ -93,27 +91,29 @@ def parse_flaser(fields: list[bytes]) -> ScanLine:
 
 
 def parse_rawlaser(fields: list[bytes]) -> ScanLine:
-    """RAWLASER1-4, see `parse_flaser`."""
-    n = _parse_count(fields, _HEADER_FIELDS)
-    tail = _skip_remissions(fields[_HEADER_FIELDS + 1 + n :], 0)
-    config = _parse_header(fields[:_HEADER_FIELDS], n)
-    ranges = _parse_numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n])
+    """Parse RAWLASER1-4, see `parse_flaser`."""
+    ranges, config, tail = _parse_scan(fields, 0)
     return ScanLine(_parse_stamp(tail[0]), ranges, config, None, None, *_stamp_form(tail))
 
 
 def parse_robotlaser(fields: list[bytes]) -> ScanLine:
-    """ROBOTLASER1-2, see `parse_flaser`."""
-    n = _parse_count(fields, _HEADER_FIELDS)
-    tail = _skip_remissions(fields[_HEADER_FIELDS + 1 + n :], 11)
-    config = _parse_header(fields[:_HEADER_FIELDS], n)
-    ranges = _parse_numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n])
+    """Parse ROBOTLASER1-2, see `parse_flaser`."""
+    ranges, config, tail = _parse_scan(fields, 11)
     stamp_ns = _parse_stamp(tail[11])
     poses = _parse_pose(tail[0:3]), _parse_pose(tail[3:6])
     return ScanLine(stamp_ns, ranges, config, *poses, *_stamp_form(tail[11:]))
 
 
+def _parse_scan(fields: list[bytes], n_fixed: int) -> tuple[list[float], ScanConfig, list[bytes]]:
+    """Header and readings of RAWLASER and ROBOTLASER, and `n_fixed` fields with the stamp."""
+    n = _parse_count(fields, _HEADER_FIELDS)
+    tail = _skip_remissions(fields[_HEADER_FIELDS + 1 + n :], n_fixed)
+    config = _parse_header(fields[:_HEADER_FIELDS], n)
+    return _parse_numbers(fields[_HEADER_FIELDS + 1 : _HEADER_FIELDS + 1 + n]), config, tail
+
+
 def parse_odom(fields: list[bytes]) -> OdometryLine:
-    """ODOM, `fields` without the name.
+    """Parse ODOM, `fields` without the name.
 
     Raises:
         BadRecord: the line cannot be used.
@@ -148,20 +148,20 @@ def _parse_count(fields: list[bytes], at: int) -> int:
     return n
 
 
-def _skip_remissions(rest: list[bytes], fixed: int) -> list[bytes]:
-    """What follows the remissions: `fixed` fields, then the stamp."""
+def _skip_remissions(rest: list[bytes], n_fixed: int) -> list[bytes]:
+    """The fields after the remissions: `n_fixed` ones, then the stamp."""
     if rest and rest[0].isdigit() and len(rest[0]) <= 9:
         tail = rest[1 + int(rest[0]) :]
-        if _is_stamp(tail[fixed:]):
+        if _is_stamp(tail[n_fixed:]):
             return tail
     raise BadRecord(WRONG_COUNT)
 
 
 def _is_stamp(fields: list[bytes]) -> bool:
-    """Whether `fields` read as `ipc_timestamp [hostname [logger_timestamp]]`.
+    """Whether `fields` have the form `ipc_timestamp [hostname [logger_timestamp]]`.
 
-    A host name is no number, or a plain integer where the logger's stamp follows: so a line with
-    a reading too many or too few is seen even where missing stamps would hide it.
+    A host name is no number, or an integer followed by the logger's stamp: so a wrong number of
+    readings is noticed even where stamps are missing.
     """
     if len(fields) == 1:
         return True
@@ -199,7 +199,7 @@ def _parse_numbers(fields: list[bytes]) -> list[float]:
 def _parse_pose(fields: list[bytes]) -> tuple[float, float, float]:
     x, y, theta = _parse_numbers(fields)
     # written so that NaN fails too
-    if not (abs(x) < _LARGEST_POSE and abs(y) < _LARGEST_POSE and abs(theta) < _LARGEST_POSE):
+    if not (abs(x) < _MAX_POSE and abs(y) < _MAX_POSE and abs(theta) < _MAX_POSE):
         raise BadRecord(BAD_POSE)
     return x, y, theta
 
@@ -212,10 +212,7 @@ def _parse_stamp(field: bytes) -> int:
 
 
 def _parse_header(header: list[bytes], n: int) -> ScanConfig:
-    """Start, step and declared maximum of a header; a missing step follows from the field of view.
-
-    Only these four of its fields are read: the others matter to nobody here.
-    """
+    """Start, step and declared maximum; a missing step follows from the field of view."""
     start, fov, step, max_range = _parse_numbers(header[1:5])
     stated_fov = fov if 0.0 < fov <= 2.1 * math.pi else None
     if not 0.0 < step < math.pi and stated_fov is not None:

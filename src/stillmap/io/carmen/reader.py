@@ -1,7 +1,4 @@
-"""CARMEN logs (`.log`, `.clf`, plain or gzip) as recordings.
-
-Which scans of a CARMEN log become a recording.
-"""
+"""Reads CARMEN logs (`.log`, `.clf`, plain or gzip) as recordings."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +12,6 @@ from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import longest_non_decreasing
 from stillmap.io import trajectory
-from stillmap.io.builder import SkippedRecords
 from stillmap.io.carmen import extrinsics
 from stillmap.io.carmen.extrinsics import Extrinsics
 from stillmap.io.carmen.log import CarmenLog, LaserLog, read_log
@@ -26,66 +22,66 @@ from stillmap.preprocessing.options import LaserOptions, ReadOptions
 
 TIME_BACKWARDS = "time running backwards"
 
-_PREFERRED = ("ROBOTLASER", "FLASER", "RLASER", "RAWLASER")  # of lines from the same laser
+_KIND_ORDER = ("ROBOTLASER", "FLASER", "RLASER", "RAWLASER")  # preference for the same laser
 
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """The scans of one laser that are used; T of them with n beams each."""
+    """T usable scans of one laser with n beams each."""
 
     laser: LaserLog
-    line: NDArray[np.int64]  # (T,) numbers of their lines, from 1
+    line: NDArray[np.int64]  # (T,) line numbers, from 1
     stamp_ns: NDArray[np.int64]  # (T,)
     ranges: NDArray[np.float32]  # (T, n)
-    config: NDArray[np.int64]  # (T,) into laser.configs
+    config: NDArray[np.int64]  # (T,) index into laser.configs
     poses: NDArray[np.float64] | None  # (T, 6) laser and robot pose on the scan lines
 
 
 def select_scans(log: CarmenLog) -> tuple[list[Sensor], list[str]]:
-    """The scans of each laser that become a recording, and which others show the same laser."""
+    """The usable scans of each laser, and sentences on dropped kinds of lines."""
     lasers, notes = _select_lasers(log)
     return [_select_usable_scans(laser, log) for laser in lasers], notes
 
 
 def scan_order(sensors: list[Sensor]) -> NDArray[np.intp]:
-    """(T,) the order of a recording's scans, of all sensors' scans one after the other."""
+    """(T,) indices that sort the concatenated scans of all sensors by stamp."""
     return np.argsort(np.concatenate([s.stamp_ns for s in sensors]), kind="stable")
 
 
 def _select_lasers(log: CarmenLog) -> tuple[list[LaserLog], list[str]]:
-    """The lasers to use: newer CARMEN logs hold each scan twice, raw and with the robot's pose."""
-    places: dict[str, list[LaserLog]] = {}
+    """One kind of line per laser: newer logs hold each scan raw and with the robot's pose."""
+    by_position: dict[str, list[LaserLog]] = {}
     for laser in log.lasers.values():
-        places.setdefault(extrinsics.laser_position(laser.kind, log.params), []).append(laser)
+        position = extrinsics.laser_position(laser.kind, log.params)
+        by_position.setdefault(position, []).append(laser)
     used, notes = [], []
-    for same in places.values():
+    for same in by_position.values():
         most = max(len(laser.line) for laser in same)
-        # a kind that holds only a few of the scans is no stand-in for the others
-        whole = [laser for laser in same if 2 * len(laser.line) >= most]
-        best = min(whole, key=lambda laser: _PREFERRED.index(laser.kind.rstrip("1234")))
+        # a kind with only a few of the scans cannot replace the others
+        complete = [laser for laser in same if 2 * len(laser.line) >= most]
+        best = min(complete, key=lambda laser: _KIND_ORDER.index(laser.kind.rstrip("1234")))
         used.append(best)
-        for other in same:
-            if other is not best:
-                notes.append(
-                    f"{other.kind}: {len(other.line)} scans not used, "
-                    f"{best.kind} shows the same laser"
-                )
+        notes += [
+            f"{laser.kind}: {len(laser.line)} scans not used, {best.kind} shows the same laser"
+            for laser in same
+            if laser is not best
+        ]
     return sorted(used, key=lambda laser: list(SCAN_PARSERS).index(laser.kind.encode())), notes
 
 
 def _select_usable_scans(laser: LaserLog, log: CarmenLog) -> Sensor:
-    """The scans with the usual number of readings whose time does not run backwards.
+    """The scans with the typical number of readings and non-decreasing stamps.
 
-    Of a laser's stamps a longest non-decreasing subsequence is kept, so a stamp that jumps ahead
-    costs one scan. Each laser is looked at alone: two of them may well report out of turn.
+    The longest non-decreasing subsequence of the laser's stamps is kept, so that a stamp that jumps
+    ahead costs one scan. Stamps of different lasers need not be in order.
     """
     count, line = np.asarray(laser.count), np.asarray(laser.line)
     shifted = np.asarray(laser.host_is_number, np.bool_)
-    # a number for a host where others have names: the fields before it are not what they seem
-    usual = (count == laser.typical_count()) & ~(shifted & (shifted.mean() < 0.5))
+    # a number in place of the host name: the fields before it are shifted
+    usable = (count == laser.typical_count()) & ~(shifted & (shifted.mean() < 0.5))
     skipped = log.skipped_scans[laser.kind]
-    skipped.add_all(WRONG_COUNT, line[~usual])
-    scans = np.flatnonzero(usual)
+    skipped.add_all(WRONG_COUNT, line[~usable])
+    scans = np.flatnonzero(usable)
     stamp_ns = np.asarray(laser.stamp_ns, np.int64)[scans]
     forward = longest_non_decreasing(stamp_ns.tolist())
     skipped.add_all(TIME_BACKWARDS, np.delete(line[scans], forward))
@@ -101,16 +97,13 @@ def _select_usable_scans(laser: LaserLog, log: CarmenLog) -> Sensor:
     )
 
 
-_MANY = 0.05  # share of scans whose loss is worth a warning
-
-
 def read(
     path: Path, options: ReadOptions | None = None, progress: Progress | None = None
 ) -> Recording:
     """Read a CARMEN log.
 
-    Bad records are skipped and counted in `source["skipped"]` (scans) and
-    `source["skipped_odometry"]`, by reason and with line numbers.
+    Bad records are counted in `source["skipped"]` (scans) and `source["skipped_odometry"]`, by
+    reason and with line numbers.
 
     Raises:
         InputError: the file cannot be read or holds no usable scan.
@@ -119,14 +112,14 @@ def read(
     log = read_log(path, progress)
     sensors, notes = select_scans(log)
     if not sensors:
-        raise _no_scan(path, log)
+        raise _no_scan_error(path, log)
     recording = _build_recording(sensors, log, options)
     recording.source.update(path=str(path), format="carmen", gzip=is_gzip(path))
     recording.source["duplicates"] = notes
     return recording
 
 
-def _no_scan(path: Path, log: CarmenLog) -> InputError:
+def _no_scan_error(path: Path, log: CarmenLog) -> InputError:
     kinds = ", ".join(name.decode() for name in SCAN_PARSERS)
     skipped = log.skipped.merge(*log.skipped_scans.values())
     if skipped.total:
@@ -137,23 +130,23 @@ def _no_scan(path: Path, log: CarmenLog) -> InputError:
 
 
 def _build_recording(sensors: list[Sensor], log: CarmenLog, options: ReadOptions) -> Recording:
-    """One recording of all lasers' scans in the order of their stamps."""
+    """The recording of all lasers' scans, ordered by stamp."""
     options.check_laser_count(len(sensors))
     skipped = log.skipped.merge(*(log.skipped_scans[s.laser.kind] for s in sensors))
-    warnings = _loss_warning(sensors, skipped)
-    parts, places, infos = [], [], []
+    warnings = skipped.loss_warnings(sum(len(s.stamp_ns) for s in sensors))
+    parts, poses, infos = [], [], []
     for number, sensor in enumerate(sensors):
-        place, more = extrinsics.find_extrinsics(sensor.laser, sensor.poses, log.params)
+        pose, more = extrinsics.find_extrinsics(sensor.laser, sensor.poses, log.params)
         given = options.laser(number)
-        place = extrinsics.override(place, given)
+        pose = extrinsics.override(pose, given)
         upside_down = extrinsics.find_upside_down(sensor.laser.kind, log.params, given)
         angles = _find_angles(sensor, log, given, upside_down[0], more)
         points, hit, rule = _convert_readings(sensor, angles, log, options, more)
         parts.append((points, hit))
-        places.append(place)
-        infos.append(_sensor_info(sensor, place, angles, upside_down, rule))
+        poses.append(pose)
+        infos.append(_sensor_info(sensor, pose, angles, upside_down, rule))
         warnings += more
-    poses, odometry_info = _find_odometry(sensors, log)
+    odometry, odometry_info = _find_odometry(sensors, log)
     warnings += odometry_info.pop("warnings")
     sensor_of = np.repeat(np.arange(len(sensors)), [len(s.stamp_ns) for s in sensors])
     stamp_ns = np.concatenate([s.stamp_ns for s in sensors])
@@ -166,9 +159,9 @@ def _build_recording(sensors: list[Sensor], log: CarmenLog, options: ReadOptions
         offset=offset,
         points=points,
         hit=hit,
-        T_base_sensor=np.stack([place.matrix() for place in places]),
+        T_base_sensor=np.stack([pose.matrix() for pose in poses]),
         sensor=sensor_of[order].astype(np.int32),
-        T_odom_base=None if poses is None else se2.matrix(*poses[order].T),
+        T_odom_base=None if odometry is None else se2.matrix(*odometry[order].T),
         source={
             **_source(log, infos, odometry_info),
             "skipped": skipped.to_dict(),
@@ -187,7 +180,7 @@ def _find_angles(
         if fov is not None:
             angles[:] = flaser_config(sensor.ranges.shape[1], fov)[:2]
     elif given.fov is not None:
-        text = "its lines state their angles: the given field of view is not used"
+        text = "its lines declare their angles: the given field of view is not used"
         warnings.append(f"{sensor.laser.kind}: {text}")
     return -angles if upside_down else angles
 
@@ -199,7 +192,7 @@ def _convert_readings(
     options: ReadOptions,
     warnings: list[str],
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], max_range.RangeRule]:
-    """End points (T, n, 2) in the sensor frame, hits (T, n), and how readings were understood."""
+    """End points (T, n, 2) in the sensor frame, hits (T, n), and the range rule."""
     declared = extrinsics.find_max_range(sensor.laser, log.params)
     rule, more = max_range.infer_range_rule(sensor.ranges, declared, options)
     more += _angle_warning(sensor)
@@ -215,10 +208,10 @@ def _convert_readings(
 def _angle_warning(sensor: Sensor) -> list[str]:
     n = sensor.ranges.shape[1]
     for config in sensor.laser.configs:
-        fan = n * config.angle_step  # or one step less: both are in use
-        if config.field_of_view and abs(fan - config.field_of_view) > 3.0 * config.angle_step:
+        fov = n * config.angle_step  # or one step less: both are in use
+        if config.field_of_view and abs(fov - config.field_of_view) > 3.0 * config.angle_step:
             return [
-                f"{n} readings {np.degrees(config.angle_step):.3g} deg apart are not the stated "
+                f"{n} readings {np.degrees(config.angle_step):.3g} deg apart are not the declared "
                 f"field of view of {np.degrees(config.field_of_view):.4g} deg"
             ]
     return []
@@ -245,9 +238,8 @@ def _find_odometry(
 ) -> tuple[NDArray[np.float64] | None, dict[str, Any]]:
     """Robot poses (T, 3) at the scans of all sensors, one sensor after the other.
 
-    The pose on the scan line itself comes first; else the ODOM lines, else what other lasers'
-    lines carry, are interpolated. Scan lines that repeat one pose while ODOM lines move carry
-    none worth the name.
+    The pose on the scan line comes first, else ODOM lines, else poses on other lasers' lines are
+    interpolated. Poses on scan lines that never change while ODOM lines do are ignored.
     """
     odom_ns = np.asarray(log.odom_stamp_ns, np.int64)
     odom = np.asarray(log.odom_poses).reshape(-1, 3)
@@ -264,9 +256,9 @@ def _find_odometry(
         if i in own:
             poses.append(own[i])
         else:
-            at_scans, missed = trajectory.interpolate(odom_ns, odom, sensor.stamp_ns)
+            at_scans, n_outside = trajectory.interpolate(odom_ns, odom, sensor.stamp_ns)
             poses.append(at_scans)
-            outside += missed
+            outside += n_outside
     out = np.concatenate(poses)
     interpolated = "ODOM lines" if len(log.odom_stamp_ns) else "other lasers' scan lines"
     kinds = (["scan lines"] if own else []) + ([interpolated] if len(own) < len(sensors) else [])
@@ -282,17 +274,9 @@ def _moves(poses: NDArray[np.float64]) -> bool:
     return bool(np.any(poses != poses[0]))
 
 
-def _loss_warning(sensors: list[Sensor], skipped: SkippedRecords) -> list[str]:
-    kept = sum(len(sensor.stamp_ns) for sensor in sensors)
-    lost = skipped.total
-    if lost <= _MANY * (kept + lost):
-        return []
-    return [f"{lost} of {kept + lost} scans are damaged and were skipped: {skipped.summary()}"]
-
-
 def _sensor_info(
     sensor: Sensor,
-    place: Extrinsics,
+    pose: Extrinsics,
     angles: NDArray[np.float64],
     upside_down: tuple[bool, str],
     rule: max_range.RangeRule,
@@ -306,7 +290,7 @@ def _sensor_info(
         "angle_step": float(step),
         "upside_down": upside_down[0],
         "upside_down_how": upside_down[1],
-        "extrinsics": place.to_dict(),
+        "extrinsics": pose.to_dict(),
         "ranges": rule.to_dict(),
     }
 
