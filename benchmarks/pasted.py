@@ -19,7 +19,9 @@ from scipy.ndimage import minimum_filter
 import stillmap
 from stillmap.core import camera as camera_module
 from stillmap.core.camera import Camera
+from stillmap.io import rgbd
 from stillmap.io.images import read_image
+from stillmap.io.rgbd_folders import list_frames
 from stillmap.preprocessing.options import ReadOptions
 
 Float = NDArray[np.float64]
@@ -46,9 +48,7 @@ def paste(source: Path, out: Path) -> Path:
     assert room.T_recorded_base is not None
     assert room.images is not None
     colour = room.images.cameras[0]
-    same = stillmap.read(source, options=ReadOptions(depth_step=64, register=False)).images
-    assert same is not None
-    depth = same.cameras[0]
+    depth = rgbd.read_depth_camera(list_frames(source), {}, [])
     out.mkdir(parents=True)
     shutil.copy(source / "camera-intrinsics.txt", out)
     found: tuple[list[Mask], list[Mask]] = ([], [])

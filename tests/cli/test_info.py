@@ -240,7 +240,7 @@ def test_skipped_files_are_called_so(tmp_path, capsys):
     run(tmp_path)
     out = capsys.readouterr().out
     assert "KITTI, 3D" in out
-    assert "1 is cut short (file 2)" in out
+    assert "1 is truncated (file 2)" in out
     run(tmp_path, "--json")
     assert json.loads(capsys.readouterr().out)["skipped_unit"] == "file"
 

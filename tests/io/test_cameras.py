@@ -122,23 +122,23 @@ def test_names_of_pictures_may_be_their_times(drive, file, more):
         ("[imag_2]\n", r"there is no camera 'imag_2' \(nearest: 'image_2'; folder"),
         ("[image_2]\nfx = 1\n[imag_2]\n", r"there is no camera 'imag_2' \(nearest: 'image_2'"),
         ("[imag_2]\nfx = 1\n", r"there is no camera 'imag_2' \(nearest: 'image_2'; folder"),
-        ('[image_2]\nfolder = "left"\n', "has pictures in the recording"),
+        ('[image_2]\nfolder = "left"\n', "has images in the recording"),
         (
             '[left]\nfolder = "missing"\n',
             r"missing: cannot be read: No such file.*\(camera 'left' of .*cameras\.toml\)",
         ),
         (
             '[left]\nfolder = "empty"\n',
-            r"empty: holds no pictures \(camera 'left' of .*cameras\.toml\)",
+            r"empty: holds no images \(camera 'left' of .*cameras\.toml\)",
         ),
         (
             '[left]\nfolder = "bad"\n',
-            r"1\.5\.png: is no picture.* \(camera 'left' of .*cameras\.toml\)",
+            r"1\.5\.png: is no image.* \(camera 'left' of .*cameras\.toml\)",
         ),
-        ('[left]\nfolder = "left"\n', "names are no times .times = 'FILE' in camera 'left'"),
+        ('[left]\nfolder = "left"\n', "names are no stamps .times = 'FILE' in camera 'left'"),
         ('[left]\nfolder = "left"\ntimes = "no.txt"\n', r"no\.txt: cannot be read|No such file"),
-        ('[left]\nfolder = "left"\ntimes = "short.txt"\n', "has 2 times for 3 files"),
-        ('[left]\nfolder = "left"\ntimes = "words.txt"\n', "times for 3 files|no usable time"),
+        ('[left]\nfolder = "left"\ntimes = "short.txt"\n', "has 2 stamps for 3 files"),
+        ('[left]\nfolder = "left"\ntimes = "words.txt"\n', "stamps for 3 files|no usable stamp"),
         ('[left]\nfolder = "left"\ntimes = "/dev/zero"\n', "is no regular file"),
     ],
 )
@@ -164,7 +164,7 @@ def test_a_centre_outside_of_the_pictures_is_doubted(drive, file, old, new, at):
     assert warned(with_cameras(drive, file(f"[image_2]\n{LENS}{AHEAD}"))) == []
     found = with_cameras(drive, file(f"[image_2]\n{LENS.replace(old, new)}{AHEAD}"))
     (said,) = warned(found)
-    assert said.startswith(f"camera 'image_2': its principal point, {at}, lies outside of pictures")
+    assert said.startswith(f"camera 'image_2': its principal point, {at}, lies outside images")
     assert " 16 x 12 pixels" in said
     assert facts(found)["images"]["usable"] == 4  # parts of larger pictures may have such
 
@@ -207,8 +207,8 @@ REFUSED = [
     (f"[a]\n{LENS.replace('20.0', 'inf')}", "'fx' wants smaller numbers"),
     (f"[a]\n{LENS.replace('20.0', 'nan')}", "'fx' wants smaller numbers"),
     ("[a]\nwidth = 3\n", "go together"),
-    ("[a]\nwidth = 0\nheight = 3\n", "'width' wants a number of pixels"),
-    ("[a]\nwidth = 3.0\nheight = 3\n", "'width' wants a number of pixels"),
+    ("[a]\nwidth = 0\nheight = 3\n", "'width' wants a count of pixels"),
+    ("[a]\nwidth = 3.0\nheight = 3\n", "'width' wants a count of pixels"),
     ('[a]\nmodel = "fisheye"\n', "'model' must be one of '', 'plumb_bob'"),
     ("[a]\nmodel = []\n", "'model' must be one of"),
     ("[a]\ndistortion = [1, 2, 3, 4]\n", "'distortion' wants 'model'"),
@@ -219,7 +219,7 @@ REFUSED = [
     (f"[a]\n{AHEAD}rpy = [0, 0, 0]\n", "wants 'translation', and one of"),
     ("[a]\ntranslation = [0, 0, 0]\nquaternion = [0, 0, 0, 2]\n", "not of length one"),
     ("[a]\nT_base_camera = [1]\n", "'T_base_camera' wants 4 x 4 numbers"),
-    ("[a]\nT_base_camera = [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n", "does not turn"),
+    ("[a]\nT_base_camera = [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n", "no rotation matrix"),
     ("[a]\nT_base_camera = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 1, 1]\n", "last row of"),
     ("[a]\ntranslation = 3\nT_base_camera = [[1]]\n", "'T_base_camera' wants 4 x 4"),
     ('[a]\ntimes = "b"\n', "'times' is for a 'folder'"),

@@ -164,15 +164,15 @@ def test_pickles_are_never_opened(tmp_path):
 @pytest.mark.parametrize(
     ("name", "change", "what"),
     [
-        ("stamp_ns", lambda a: a[::-1].copy(), "backwards"),
-        ("stamp_ns", lambda a: np.where(a == a[1], np.iinfo(np.int64).max, -(2**62)), "backwards"),
+        ("stamp_ns", lambda a: a[::-1].copy(), "stamps decrease"),
+        ("stamp_ns", lambda a: np.where(a == a[1], np.iinfo(np.int64).max, -(2**62)), "stamps decrease"),
         ("offset", lambda a: a + 1, "rise"),
         ("offset", lambda a: a[[0, 3, 1, 3]], "rise"),
         ("offset", lambda a: np.where(a == 3, np.iinfo(np.int64).min, a), "rise"),
         ("sensor", lambda a: a + 1, "sensor"),
         ("sensor", lambda a: a[:2], "expected"),
-        ("points", lambda a: a * np.float32(np.nan), "ends nowhere"),
-        ("points", lambda a: a * np.float32(np.inf), "ends nowhere"),
+        ("points", lambda a: a * np.float32(np.nan), "is not finite"),
+        ("points", lambda a: a * np.float32(np.inf), "is not finite"),
         ("points", lambda a: np.full_like(a, 3e38), "farther than 100000 m"),
         ("T_base_sensor", lambda a: a * 2.0, "rigid"),
         ("T_odom_base", lambda a: a * np.nan, "rigid"),
@@ -315,7 +315,7 @@ def test_pictures_that_cannot_be_read_are_left_out(tmp_path):
     found = read(tmp_path / "rec")
     assert found.images.stamp_ns.tolist() == [5, 2**60]
     np.testing.assert_array_equal(found.images.read(1), pictures[2])
-    assert found.source["warnings"] == ["1 pictures left out: 1.png: is no picture"]
+    assert found.source["warnings"] == ["1 images left out: 1.png: is no picture"]
 
 
 @pytest.mark.parametrize(

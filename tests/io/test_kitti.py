@@ -73,7 +73,7 @@ def test_poses_of_the_camera_become_those_of_the_laser(folder):
         ({"poses_lidar.txt": "1 0 0 0 0 1 0 0 0 0 1\n" * 3}, "is damaged"),
         ({"poses_lidar.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 1 0 0 0 0 1 0\n"}, ":2"),
         ({"poses_lidar.txt": "1 0 0 nan 0 1 0 0 0 0 1 0\n" * 3}, "not finite"),
-        ({"calib.txt": "Tr: 1 2 3\n"}, "calibration is not used"),
+        ({"calib.txt": "Tr: 1 2 3\n"}, "calibration is ignored"),
     ],
 )
 def test_poses_that_cannot_be_used_cost_the_poses(folder, files, what):
@@ -171,7 +171,7 @@ def test_damaged_sweeps_are_skipped_and_counted(folder):
     assert found.stamp_ns.tolist() == [0, 2 * 10**9, 5 * 10**9]
     skipped = {reason: damage["lines"] for reason, damage in found.source["skipped"].items()}
     assert skipped == {
-        "is cut short": [2],
+        "is truncated": [2],
         "is empty": [4],
         "has no time": [5, 8],
         "is no regular file": [7],

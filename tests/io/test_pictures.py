@@ -27,13 +27,13 @@ def said(path: Path) -> str:
 
 def test_what_is_no_picture_is_named_once(picture):
     picture.write_bytes(b"nothing")
-    assert said(picture) == f"{picture}: is no picture"
+    assert said(picture) == f"{picture}: is no image"
 
 
 def test_a_picture_that_is_cut(picture):
     picture.write_bytes(picture.read_bytes()[:1000])
     assert read_image_size(picture) == (32, 32)
-    assert said(picture).startswith(f"{picture}: is no picture: ")
+    assert said(picture).startswith(f"{picture}: is no image: ")
     assert said(picture).count(picture.name) == 1
 
 

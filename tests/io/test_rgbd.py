@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.io import read
+from stillmap.io import read, rgbd
 from stillmap.io.rgbd import T_BASE_CAMERA
 from stillmap.io.rgbd_folders import SCENES, TUM, detect_layout
 from stillmap.preprocessing.options import ReadOptions
@@ -96,14 +96,20 @@ def assert_on_the_walls(recording: Recording, within: float) -> None:
     assert len(np.unique(np.round(walls / 0.05), axis=0)) < 0.1 * len(walls)
 
 
+@pytest.fixture
+def no_alignment(monkeypatch):
+    monkeypatch.setattr(rgbd, "align_to_gravity", lambda recording: recording)
+
+
+@pytest.mark.usefixtures("no_alignment")
 def test_every_depth_picture_is_a_grid_of_beams(scenes):
-    found = read(scenes, ReadOptions(depth_step=1, level=False))
+    found = read(scenes, ReadOptions(depth_step=1))
     assert (found.n_scans, found.dimension) == (8, 3)
     np.testing.assert_array_equal(np.diff(found.offset), W * H)
     np.testing.assert_array_equal(found.stamp_ns, np.round(8e9 / 30 * np.arange(8)))
     assert found.source["sensors"] == [{"name": "depth", "grid": [H, W]}]
     assert found.source["format"] == "7-Scenes"
-    assert "30 in a second" in found.source["warnings"][0]
+    assert "30 per second" in found.source["warnings"][0]
     # x ahead is the depth; the pixel in row 40, column 10 looks to the left, and down
     point = found.points.reshape(8, H, W, 3)[3, 40, 10]
     depth = depth_of(way(8)[3], 1000.0)[40, 10] / 1000.0
@@ -133,8 +139,6 @@ def test_the_world_is_turned_so_that_z_is_up(scenes):
     np.testing.assert_allclose(found.source["levelled"]["up"], up, atol=2e-3)
     angle = np.degrees(np.arccos(up[2]))
     assert found.source["levelled"]["turned_deg"] == pytest.approx(angle, abs=0.2)
-    # as it was recorded, if that is wanted
-    assert "levelled" not in read(scenes, ReadOptions(level=False)).source
 
 
 def test_without_level_surfaces_the_cameras_tell(tmp_path):
@@ -158,7 +162,7 @@ def test_cameras_that_point_anywhere_tell_nothing(scenes):
         T[:3, :3] = R
         np.savetxt(scenes / f"frame-{8 * k:06d}.pose.txt", T)
     found = read(scenes)
-    assert "point anywhere" in found.source["levelled"]["by"]
+    assert "arbitrary orientations" in found.source["levelled"]["by"]
     base = np.eye(4)
     np.testing.assert_allclose(
         found.T_recorded_base[0], base @ se2.inverse(T_BASE_CAMERA), atol=1e-12
@@ -192,7 +196,7 @@ def test_where_intrinsics_are_found(tmp_path, place):
     found = read(folder)
     expected = K if place else np.array([[585, 0, 320], [0, 585, 240], [0, 0, 1]])
     np.testing.assert_array_equal(found.images.cameras[0].K, expected)
-    said = any("no file says how the camera sees" in w for w in found.source["warnings"])
+    said = any("no calibration of the depth camera" in w for w in found.source["warnings"])
     assert said == (place is None)
 
 
@@ -204,14 +208,15 @@ def test_intrinsics_that_are_none(scenes, text):
     assert found.images.cameras[0].K[0, 0] == 585.0
 
 
-def test_far_readings_show_free_space(scenes):
-    found = read(scenes, ReadOptions(depth_max=2.5))
+def test_far_readings_show_free_space(scenes, monkeypatch):
+    monkeypatch.setattr(rgbd, "_MAX_DEPTH", 2.5)
+    found = read(scenes, ReadOptions())
     length = np.linalg.norm(found.points, axis=1)
     assert length.max() == pytest.approx(2.5)
     assert 0.1 < found.hit.mean() < 0.9
     np.testing.assert_array_equal(found.hit, length < 2.5 - 1e-5)
     # --max-range goes first
-    assert read(scenes, ReadOptions(depth_max=2.5, max_range=9.0)).hit.all()
+    assert read(scenes, ReadOptions(max_range=9.0)).hit.all()
 
 
 def test_units_of_depth(scenes):
@@ -252,14 +257,14 @@ def test_damaged_pictures_are_skipped(scenes):
     found = read(scenes)
     assert found.n_scans == 3
     reasons = set(found.source["skipped"])
-    assert {"holds no depth", "is of another size than the first", "is no picture"} < reasons
-    assert "is no depth picture" in reasons
+    assert {"holds no depth", "is of another size than the first", "is no image"} < reasons
+    assert "is no depth image" in reasons
 
 
 def test_nothing_but_damage_is_an_error(scenes):
     for file in scenes.glob("*.depth.png"):
         file.write_bytes(b"no picture")
-    with pytest.raises(InputError, match=r"frame-000000\.depth\.png: is no picture"):
+    with pytest.raises(InputError, match=r"frame-000000\.depth\.png: is no image"):
         read(scenes)
     for file in scenes.glob("*.depth.png"):
         Image.fromarray(np.zeros((H, W), np.uint16)).save(file)
@@ -313,14 +318,15 @@ def test_tum(tmp_path):
     np.testing.assert_array_equal(found.images.read(3)[0, 0], [3, 3, 3])
 
 
+@pytest.mark.usefixtures("no_alignment")
 def test_tum_poses_between_those_that_are_known(tmp_path):
     folder = write_tum(tmp_path / "fr1")
-    whole = read(folder, ReadOptions(level=False))
+    whole = read(folder)
     lines = (folder / "groundtruth.txt").read_text().splitlines()
     del lines[3]  # of the third picture
     lines = [lines[0], *reversed(lines[1:])]
     (folder / "groundtruth.txt").write_text("\n".join(lines))
-    found = read(folder, ReadOptions(level=False))
+    found = read(folder)
     np.testing.assert_array_equal(found.T_recorded_base[3:], whole.T_recorded_base[3:])
     middle = 0.5 * (whole.T_recorded_base[1] + whole.T_recorded_base[3])[:3, 3]
     np.testing.assert_allclose(found.T_recorded_base[2, :3, 3], middle, atol=0.05)
@@ -344,7 +350,7 @@ def test_tum_lists_lead_nowhere_else(tmp_path):
     assert found.n_scans == 1
     assert any("depth.txt: 6 lines" in warning for warning in found.source["warnings"])
     (folder / "depth.txt").write_text("# nothing\n")
-    with pytest.raises(InputError, match="names no picture"):
+    with pytest.raises(InputError, match="lists no image"):
         read(folder)
 
 
@@ -357,7 +363,7 @@ def test_other_folders_are_none_of_these(tmp_path, scenes):
 
 
 @pytest.mark.parametrize(
-    "given", [{"depth_step": 0}, {"depth_max": 0.0}, {"depth_scale": 0.0}, {"cameras": " "}]
+    "given", [{"depth_step": 0}, {"depth_scale": 0.0}, {"cameras": " "}]
 )
 def test_options_that_cannot_be(given):
     with pytest.raises(ValueError, match=next(iter(given))):

@@ -36,7 +36,7 @@ def test_ply(tmp_path, kind):
     found = read(ply(tmp_path / "a.ply", header, body, kind))
     np.testing.assert_array_equal(found.points, [[1, 2, 3], [4, 5, 6]])
     assert found.T_recorded_base is None
-    assert "beams count as sent from the origin" in found.source["warnings"][0]
+    assert "beams start at the origin" in found.source["warnings"][0]
 
 
 def test_a_folder_of_ply_shares_its_zero(tmp_path):
@@ -46,7 +46,7 @@ def test_a_folder_of_ply_shares_its_zero(tmp_path):
         ply(tmp_path / f"{i}.ply", VERTICES, rows.tobytes() if i != 1 else b"")
     found = read(tmp_path)
     assert found.n_scans == 2
-    assert found.source["skipped"] == {"is cut short": {"count": 1, "lines": [2]}}
+    assert found.source["skipped"] == {"is truncated": {"count": 1, "lines": [2]}}
     assert found.source["skipped_unit"] == "file"
     np.testing.assert_allclose(found.points[2:] - found.points[:2], [[0, 0, 2]] * 2)
 
@@ -101,14 +101,14 @@ def test_las_that_lies(survey, at, form, value):
     content = bytearray(survey.read_bytes())
     struct.pack_into(form, content, at, value)
     survey.write_bytes(content)
-    with pytest.raises(InputError, match=r"is (damaged|cut short)"):
+    with pytest.raises(InputError, match=r"is (damaged|truncated)"):
         read(survey)
 
 
 @pytest.mark.parametrize("kept", [4, 100, 226, 227, 400, -20])
 def test_las_that_is_cut(survey, kept):
     survey.write_bytes(survey.read_bytes()[:kept])
-    with pytest.raises(InputError, match=r"is (damaged|cut short|no LAS)"):
+    with pytest.raises(InputError, match=r"is (damaged|truncated|no LAS)"):
         read(survey)
 
 
@@ -202,7 +202,7 @@ def test_e57_with_another_description_is_read(scanned):
     found = read(path)
     assert found.n_scans == 2
     assert found.T_recorded_base is None
-    assert "no place of a sensor" in found.source["warnings"][-1]
+    assert "no sensor pose is recorded" in found.source["warnings"][-1]
 
 
 @pytest.mark.parametrize("count", [b"301", b"5000", b"9999999999999"])
@@ -213,7 +213,7 @@ def test_e57_that_promises_more(scanned, count):
     found = read(path)
     assert found.n_scans == 1
     ((reason, damage),) = found.source["skipped"].items()
-    assert reason in ("is cut short", "is damaged")
+    assert reason in ("is truncated", "is damaged")
     assert damage == {"count": 1, "lines": [1]}
 
 

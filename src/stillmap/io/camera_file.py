@@ -1,13 +1,13 @@
-"""A file that says of cameras what a recording does not: `--cameras FILE`, TOML, a table for each.
+"""Camera calibrations in TOML (`--cameras FILE`), one table per camera:
 
-["/front/image_raw"]             # topic or folder, as `stillmap info` names the camera
+["/front/image_raw"]             # topic or folder, named as in `stillmap info`
 fx = 525.0
 fy = 525.0
 cx = 319.5
 cy = 239.5
 model = "plumb_bob"
 distortion = [0.26, -0.95, -0.005, 0.003, 1.16]
-translation = [0.2, 0.0, 0.5]    # of T_base_camera; the camera: x right, y down, z ahead
+translation = [0.2, 0.0, 0.5]    # of T_base_camera; camera axes: x right, y down, z ahead
 quaternion = [-0.5, 0.5, -0.5, 0.5]
 """
 
@@ -32,27 +32,27 @@ MODELS = {"": (0,), "plumb_bob": (4, 5), "rational_polynomial": (8,), "equidista
 
 _FOCAL = ("fx", "fy", "cx", "cy")
 _SIZE = ("width", "height")
-_PLACE = ("T_base_camera", "translation", "quaternion", "rpy")
+_POSE = ("T_base_camera", "translation", "quaternion", "rpy")
 _KEYS = (
-    *("K", *_FOCAL, *_SIZE, "model", "distortion", *_PLACE),
+    *("K", *_FOCAL, *_SIZE, "model", "distortion", *_POSE),
     *("time_offset", "folder", "times"),
 )
-_LARGEST = 1e6  # pixels, metres, seconds
-_MOST_PIXELS = 1 << 16  # aside
+_MAX_NUMBER = 1e6  # pixels, metres, seconds
+_MAX_SIZE = 1 << 16  # pixels
 
 
 @dataclass(frozen=True, eq=False)
 class CameraOverride:
-    """What the file says of one camera; None: nothing.
+    """Values of one camera; None: not given.
 
     Attributes:
         K: (3, 3) pinhole matrix.
         width, height: pixels.
         model, distortion: see Camera; both or neither.
         T_base_camera: (4, 4).
-        time_offset_ns: is added to the stamps of its pictures.
-        folder: of pictures that the recording does not know of.
-        times: file with their times; None: their names tell.
+        time_offset_ns: added to the stamps of its images.
+        folder: of images outside the recording.
+        times: file with their stamps; None: from their names.
     """
 
     K: Float | None = None
@@ -66,32 +66,32 @@ class CameraOverride:
     times: Path | None = None
 
     def apply_to(self, camera: Camera) -> Camera:
-        """The camera, with what the file says in place of what the recording does."""
+        """The camera with the given values in place of its own."""
         names = ("K", *_SIZE, "model", "distortion", "T_base_camera")
         return replace(camera, **{n: v for n in names if (v := getattr(self, n)) is not None})
 
 
 def read_camera_file(path: Path, known: Sequence[str] | None = None) -> dict[str, CameraOverride]:
-    """The cameras of a file, by name.
+    """Read the cameras of a file, by name.
 
     Args:
         path: the file.
-        known: names of cameras that need no folder of pictures; None: all.
+        known: names of cameras that need no image folder; None: all.
 
     Raises:
-        InputError: it cannot be read, or a name, a key or a value in it is wrong; it is named.
+        InputError: it cannot be read, or a name, key or value is invalid.
     """
     out, tables = {}, load_toml(path)
     for name, table in tables.items():
         if not isinstance(table, Mapping):
-            hint = "a camera is a table: [NAME], and its values below"
+            hint = "a camera is a table: [NAME], with its values below"
             raise InputError(f"'{name}' stands outside of a camera", where=str(path), hint=hint)
         if known is not None and name not in known and "folder" not in table:
             what = f"there is no camera '{name}'"
             raise InputError(what, where=str(path), hint=_hint(name, known))
     for name, table in tables.items():
         try:
-            out[name] = _camera(table, path.parent)
+            out[name] = _parse_camera(table, path.parent)
         except ValueError as error:
             raise InputError(f"camera '{name}': {error}", where=str(path)) from error
     if not out:
@@ -101,44 +101,44 @@ def read_camera_file(path: Path, known: Sequence[str] | None = None) -> dict[str
 
 def _hint(name: str, known: Sequence[str]) -> str:
     if not known:
-        return "the recording has no pictures; folder = '...' adds some"
+        return "the recording has no images; folder = '...' adds some"
     return f"nearest: '{closest_match(name, known, min_similarity=0.0)}'; folder = '...' adds one"
 
 
-def _camera(table: Mapping[str, Any], beside: Path) -> CameraOverride:
+def _parse_camera(table: Mapping[str, Any], folder: Path) -> CameraOverride:
     for key in table:
         if key not in _KEYS:
             raise ValueError(
                 f"unknown key '{key}' (nearest: '{closest_match(key, _KEYS, min_similarity=0.0)}')"
             )
-    model, distortion = _lens(table)
-    width, height = (_pixels(table, key) for key in _SIZE)
+    model, distortion = _parse_distortion(table)
+    width, height = (_parse_size(table, key) for key in _SIZE)
     if (width is None) != (height is None):
         raise ValueError("'width' and 'height' go together")
     if "times" in table and "folder" not in table:
-        raise ValueError("'times' is for a 'folder' of pictures")
-    offset = _numbers(table, "time_offset", ())
+        raise ValueError("'times' is for a 'folder' of images")
+    offset = _parse_numbers(table, "time_offset", ())
     return CameraOverride(
-        K=_matrix(table),
+        K=_parse_K(table),
         width=width,
         height=height,
         model=model,
         distortion=distortion,
-        T_base_camera=_place(table),
+        T_base_camera=_parse_pose(table),
         time_offset_ns=0 if offset is None else round(float(offset) * 1e9),
-        folder=_path(table, "folder", beside),
-        times=_path(table, "times", beside),
+        folder=_parse_path(table, "folder", folder),
+        times=_parse_path(table, "times", folder),
     )
 
 
-def _matrix(table: Mapping[str, Any]) -> Float | None:
-    K = _numbers(table, "K", (3, 3))
+def _parse_K(table: Mapping[str, Any]) -> Float | None:
+    K = _parse_numbers(table, "K", (3, 3))
     given = [key for key in _FOCAL if key in table]
     if K is None and given:
         missing = [key for key in _FOCAL if key not in table]
         if missing:
             raise ValueError(f"'{given[0]}' wants '{missing[0]}' beside it")
-        fx, fy, cx, cy = (_number(table, key) for key in _FOCAL)
+        fx, fy, cx, cy = (_parse_number(table, key) for key in _FOCAL)
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     elif given:
         raise ValueError(f"'K' and '{given[0]}' exclude each other")
@@ -151,9 +151,9 @@ def _matrix(table: Mapping[str, Any]) -> Float | None:
     return K
 
 
-def _lens(table: Mapping[str, Any]) -> tuple[str | None, Float | None]:
+def _parse_distortion(table: Mapping[str, Any]) -> tuple[str | None, Float | None]:
     model = table.get("model")
-    distortion = _numbers(table, "distortion", (-1,))
+    distortion = _parse_numbers(table, "distortion", (-1,))
     if model is None:
         if distortion is not None:
             raise ValueError(f"'distortion' wants 'model': one of {_models()}")
@@ -172,21 +172,21 @@ def _models() -> str:
     return ", ".join(f"'{name}'" for name in MODELS)
 
 
-def _place(table: Mapping[str, Any]) -> Float | None:
-    given = [key for key in _PLACE if key in table]
+def _parse_pose(table: Mapping[str, Any]) -> Float | None:
+    given = [key for key in _POSE if key in table]
     if not given:
         return None
-    T = _numbers(table, "T_base_camera", (4, 4))
+    T = _parse_numbers(table, "T_base_camera", (4, 4))
     if T is not None:
         if len(given) > 1:
             raise ValueError(f"'T_base_camera' and '{given[1]}' exclude each other")
         if not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
             raise ValueError("the last row of 'T_base_camera' must be 0, 0, 0, 1")
         return rigid_transform(T[:3, :3], T[:3, 3])
-    t = _numbers(table, "translation", (3,))
-    q, rpy = _numbers(table, "quaternion", (4,)), _numbers(table, "rpy", (3,))
+    t = _parse_numbers(table, "translation", (3,))
+    q, rpy = _parse_numbers(table, "quaternion", (4,)), _parse_numbers(table, "rpy", (3,))
     if t is None or (q is None) == (rpy is None):
-        raise ValueError("a place wants 'translation', and one of 'quaternion' and 'rpy'")
+        raise ValueError("a pose wants 'translation', and one of 'quaternion' and 'rpy'")
     rotation = scipy.spatial.transform.Rotation
     if rpy is not None:
         return rigid_transform(rotation.from_euler("xyz", rpy).as_matrix(), t)
@@ -196,35 +196,35 @@ def _place(table: Mapping[str, Any]) -> Float | None:
     return rigid_transform(rotation.from_quat(q).as_matrix(), t)
 
 
-def _number(table: Mapping[str, Any], key: str) -> float:
-    return float(_numbers(table, key, ()))  # type: ignore[arg-type]
+def _parse_number(table: Mapping[str, Any], key: str) -> float:
+    return float(_parse_numbers(table, key, ()))  # type: ignore[arg-type]
 
 
-def _pixels(table: Mapping[str, Any], key: str) -> int | None:
+def _parse_size(table: Mapping[str, Any], key: str) -> int | None:
     value = table.get(key)
-    if value is not None and not (type(value) is int and 0 < value <= _MOST_PIXELS):
-        raise ValueError(f"'{key}' wants a number of pixels")
+    if value is not None and not (type(value) is int and 0 < value <= _MAX_SIZE):
+        raise ValueError(f"'{key}' wants a count of pixels")
     return value
 
 
-def _path(table: Mapping[str, Any], key: str, beside: Path) -> Path | None:
+def _parse_path(table: Mapping[str, Any], key: str, folder: Path) -> Path | None:
     value = table.get(key)
     if value is None:
         return None
     if not isinstance(value, str) or not value or "\0" in value:
         raise ValueError(f"'{key}' wants a path")
-    return beside / value
+    return folder / value
 
 
-def _numbers(table: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> Float | None:
-    """The numbers of a key, (-1,) for any count; matrices may be written in one row.
+def _parse_numbers(table: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> Float | None:
+    """The numbers of a key in a shape, (-1,) for any count; None where the key is missing.
 
     Raises:
-        ValueError: something else.
+        ValueError: it holds something else, or another count of numbers.
     """
     if key not in table:
         return None
-    flat = list(_flat(table[key], key))
+    flat = list(_flatten(table[key], key))
     count = math.prod(shape)
     if (count >= 0 and len(flat) != count) or (shape == ()) == isinstance(table[key], list):
         wanted = "a number" if shape == () else f"{' x '.join(map(str, shape))} numbers"
@@ -232,13 +232,13 @@ def _numbers(table: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> Floa
     return np.array(flat).reshape(shape)
 
 
-def _flat(value: Any, key: str) -> Iterator[float]:
+def _flatten(value: Any, key: str) -> Iterator[float]:
     for one in value if isinstance(value, list) else [value]:
         if isinstance(one, list):
-            yield from _flat(one, key)
+            yield from _flatten(one, key)
         elif isinstance(one, bool) or not isinstance(one, int | float):
             raise ValueError(f"'{key}' wants numbers")
-        elif not abs(one) <= _LARGEST:
+        elif not abs(one) <= _MAX_NUMBER:
             raise ValueError(f"'{key}' wants smaller numbers")
         else:
             yield float(one)

@@ -1,4 +1,4 @@
-"""Cameras and pictures as a file of the user's has them, laid over a recording's own."""
+"""Images and camera calibrations of a recording, overridden or added by `--cameras FILE`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,65 +23,66 @@ _NO_IMAGES = Images(np.zeros(0, np.int64), np.zeros(0, np.int32), (), lambda _: 
 
 
 def apply_camera_file(recording: Recording, path: Path) -> Recording:
-    """The recording, with cameras as a file says, and the pictures that it names.
+    """Apply the calibrations of a camera file, and add the image folders that it names.
 
     Raises:
-        InputError: the file is wrong, names a camera that is not there, or pictures that are not.
+        InputError: the file is invalid, or names a camera or images that do not exist.
     """
     images = recording.images or _NO_IMAGES
-    known = [camera.name for camera in images.cameras]
-    given = camera_file.read_camera_file(path, [*known, *depth_camera_names(recording.source)])
-    for name, one in given.items():
-        if one.folder is not None and name in known:
-            what = f"camera '{name}' has pictures in the recording: 'folder' is for others"
+    recorded = [camera.name for camera in images.cameras]
+    overrides = camera_file.read_camera_file(
+        path, [*recorded, *depth_camera_names(recording.source)]
+    )
+    for name, one in overrides.items():
+        if one.folder is not None and name in recorded:
+            what = f"camera '{name}' has images in the recording: 'folder' is for others"
             raise InputError(what, where=str(path))
-    parts = [_changed(images, given)]
-    for name, one in given.items():
+    parts = [_apply_overrides(images, overrides)]
+    for name, one in overrides.items():
         if one.folder is not None:
             try:
-                parts.append(_added(name, one, one.folder, str(path)))
+                parts.append(_read_folder(name, one, one.folder, str(path)))
             except InputError as error:
                 hint = error.hint or f"camera '{name}' of {path}"
                 raise InputError(error.what, where=error.where, hint=hint) from error
-    together = merge_images(parts)
-    return replace(recording, images=together if together.cameras else None)
+    merged = merge_images(parts)
+    return replace(recording, images=merged if merged.cameras else None)
 
 
 def add_calibration_warnings(recording: Recording) -> Recording:
-    """The recording, with a warning for each camera whose calibration is hardly that of its
-    pictures; one that it has already is not repeated."""
-    of = recording.images.cameras if recording.images is not None else ()
-    noted = recording.source.get("warnings")
-    warnings = noted if isinstance(noted, list) else []
-    new = [what for camera in of if (what := validate_camera(camera)) and what not in warnings]
+    """Add a warning for each camera whose calibration is implausible, unless it is there."""
+    cameras = recording.images.cameras if recording.images is not None else ()
+    recorded = recording.source.get("warnings")
+    warnings = recorded if isinstance(recorded, list) else []
+    new = [what for camera in cameras if (what := validate_camera(camera)) and what not in warnings]
     if not new:
         return recording
     return replace(recording, source={**recording.source, "warnings": [*warnings, *new]})
 
 
 def validate_camera(camera: Camera) -> str:
-    """Why a camera's calibration is hardly that of its pictures; "" where it may well be."""
+    """A warning where the principal point lies outside the image; else ""."""
     if camera.K is None or not np.isfinite(camera.K).all():
         return ""
     at, size = camera.K[:2, 2], np.array([camera.width, camera.height])
     if not size.all() or ((at >= 0.0) & (at <= size)).all():
         return ""
     return (
-        f"camera '{camera.name}': its principal point, {at[0]:g}, {at[1]:g}, lies outside of "
-        f"pictures of {size[0]} x {size[1]} pixels: right only where they are parts of larger ones"
+        f"camera '{camera.name}': its principal point, {at[0]:g}, {at[1]:g}, lies outside "
+        f"images of {size[0]} x {size[1]} pixels: valid only where they are crops of larger ones"
     )
 
 
 def depth_camera_names(source: dict[str, Any]) -> list[str]:
-    """Names of the sensors of a recording that are cameras themselves: their scans are grids."""
-    notes = source.get("sensors")
-    sensors = notes if isinstance(notes, list) else []
+    """Names of the sensors that are depth cameras: their scans are grids."""
+    recorded = source.get("sensors")
+    sensors = recorded if isinstance(recorded, list) else []
     return [str(one.get("name")) for one in sensors if isinstance(one, dict) and one.get("grid")]
 
 
-def images_from_files(found: Sequence[tuple[int, Path]], camera: Camera) -> Images:
-    """The pictures of one camera, in files of which the stamps are known, in any order."""
-    ordered = sorted(found, key=lambda one: one[0])
+def images_from_files(files: Sequence[tuple[int, Path]], camera: Camera) -> Images:
+    """The images of one camera, from stamps (ns) and files in any order."""
+    ordered = sorted(files, key=lambda one: one[0])
     return Images(
         stamp_ns=np.array([stamp for stamp, _ in ordered], np.int64),
         camera=np.zeros(len(ordered), np.int32),
@@ -91,30 +92,30 @@ def images_from_files(found: Sequence[tuple[int, Path]], camera: Camera) -> Imag
 
 
 def merge_images(parts: Sequence[Images]) -> Images:
-    """All pictures of several cameras, or sets of cameras, in the order of their stamps."""
+    """All images of several cameras, ordered by stamp."""
     if len(parts) == 1:
         return parts[0]
     first = np.cumsum([0, *(len(part.cameras) for part in parts)])
     stamp_ns = np.concatenate([part.stamp_ns for part in parts])
     camera = np.concatenate([part.camera + n for part, n in zip(parts, first[:-1], strict=True)])
-    of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    part_of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     number = np.concatenate([np.arange(len(part)) for part in parts])
     order = np.argsort(stamp_ns, kind="stable")
-    of, number = of[order], number[order]
+    part_of, number = part_of[order], number[order]
 
     def load(image: int) -> NDArray[Any]:
-        picture: NDArray[Any] = parts[of[image]].read(int(number[image]))
-        return picture
+        pixels: NDArray[Any] = parts[part_of[image]].read(int(number[image]))
+        return pixels
 
     cameras = tuple(one for part in parts for one in part.cameras)
     return Images(stamp_ns[order], camera[order].astype(np.int32), cameras, load)
 
 
-def _changed(images: Images, given: dict[str, CameraOverride]) -> Images:
-    """The recording's own pictures; with a time added, they may come in another order."""
+def _apply_overrides(images: Images, overrides: dict[str, CameraOverride]) -> Images:
+    """Images of the recording with overridden cameras, sorted again by their shifted stamps."""
     cameras, stamp_ns = list(images.cameras), images.stamp_ns.copy()
     for number, camera in enumerate(cameras):
-        one = given.get(camera.name)
+        one = overrides.get(camera.name)
         if one is not None:
             cameras[number] = one.apply_to(camera)
             stamp_ns[images.camera == number] += one.time_offset_ns
@@ -126,30 +127,30 @@ def _changed(images: Images, given: dict[str, CameraOverride]) -> Images:
     return Images(stamp_ns[order], images.camera[order], tuple(cameras), load)
 
 
-def _added(name: str, given: CameraOverride, folder: Path, where: str) -> Images:
-    """The pictures of a folder that the recording does not know of."""
+def _read_folder(name: str, override: CameraOverride, folder: Path, where: str) -> Images:
+    """Images of a folder outside the recording."""
     files = list_files(folder, EXTENSIONS)
     if not files:
-        raise InputError("holds no pictures", where=str(folder))
-    if given.times is not None:
-        require_regular(given.times)
-        times = read_times(given.times)
-        rows = assign_rows(files, len(times), given.times)
+        raise InputError("holds no images", where=str(folder))
+    if override.times is not None:
+        require_regular(override.times)
+        times = read_times(override.times)
+        rows = assign_rows(files, len(times), override.times)
         stamps = [None if row is None else times[row] for row in rows]
     else:
         found = stamps_from_names([strip_extension(file.name, EXTENSIONS) for file in files])
         if found is None:
-            hint = f"times = 'FILE' in camera '{name}' of {where}: a line of seconds for each"
-            raise InputError(
-                "holds pictures whose names are no times", where=str(folder), hint=hint
-            )
+            hint = f"times = 'FILE' in camera '{name}' of {where}: one line of seconds per image"
+            raise InputError("holds images whose names are no stamps", where=str(folder), hint=hint)
         stamps = list(found)
     used = [(s, f) for s, f in zip(stamps, files, strict=True) if s is not None]
     if not used:
-        raise InputError("holds no usable time", where=str(given.times))
+        raise InputError("holds no usable stamp", where=str(override.times))
     width, height = read_image_size(used[0][1])
-    camera = given.apply_to(Camera(name, width, height, None, "", np.zeros(0), None))
-    return images_from_files([(stamp + given.time_offset_ns, file) for stamp, file in used], camera)
+    camera = override.apply_to(Camera(name, width, height, None, "", np.zeros(0), None))
+    return images_from_files(
+        [(stamp + override.time_offset_ns, file) for stamp, file in used], camera
+    )
 
 
 def _load(files: list[Path], image: int) -> NDArray[Any]:

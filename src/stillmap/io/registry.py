@@ -1,4 +1,7 @@
-"""Which reader reads what: the one table of formats."""
+"""The table of formats that are read (`FORMATS`), and detection of a file's format.
+
+The table of formats that are written is in `writers.py`.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,25 +21,28 @@ from stillmap.io.point_cloud.files import contains_files, has_extension
 from stillmap.io.point_cloud.pcd import is_pcd
 from stillmap.io.ros import bag_types
 from stillmap.io.text_lines import Progress, read_head
-from stillmap.preprocessing import laser_scan, self_filter
-from stillmap.preprocessing.options import ReadOptions, apply_options
+from stillmap.preprocessing import self_filter
+from stillmap.preprocessing.options import ReadOptions
+from stillmap.preprocessing.overrides import apply_options
+from stillmap.preprocessing.scan_timing import add_beam_times
 
-_HEAD = 1 << 16  # bytes looked at to tell what a file is
-_INSIDE = 1000  # entries of a folder that are looked at for recordings
-_NAMED = 3  # of them
-RIG_FOLDERS = ("horizontal", "tilting")  # as `stillmap simulate` names the recordings of one robot
+RIG_FOLDERS = ("horizontal", "tilting")  # of the two recordings of a simulated robot
+
+_HEAD = 1 << 16  # bytes from which a format is detected
+_MAX_ENTRIES = 1000  # of a folder, searched for recordings
+_MAX_LISTED = 3  # recordings in a message
 
 Reader = Callable[[Path, ReadOptions, Progress | None, Path | None], Recording]
 
 
 class Format(NamedTuple):
-    """A format.
+    """A format that is read.
 
     Attributes:
-        name: for people.
-        endings: of names of such files or folders, for people and where the content does not tell.
-        is_one: whether a file with these first bytes, or a folder (None), is of the format.
-        read: of a path, options, progress and the folder for what does not fit into memory.
+        name: readable name.
+        endings: of names of its files or folders; they decide where the content does not.
+        matches: whether a file with these first bytes, or a folder (None), has the format.
+        read: reader of a path with options, progress and a folder for memory-mapped buffers.
     """
 
     name: str
@@ -71,7 +77,7 @@ def _read_stillmap_folder(
 def _read_bag(
     path: Path, options: ReadOptions, progress: Progress | None, scratch: Path | None
 ) -> Recording:
-    # message types take a moment to load: only for those who have a bag
+    # loading the message types takes a moment
     from stillmap.io.ros.reader import read as read_bag
 
     return read_bag(path, options, progress, scratch)
@@ -84,7 +90,7 @@ def _is_kitti(path: Path, head: bytes | None) -> bool:
 def _point_cloud_format(
     name: str, endings: tuple[str, ...], is_one: Callable[[bytes], bool] | None, read: Reader
 ) -> Format:
-    """A format of single files, known by their first bytes or by name, and of folders of them."""
+    """A format of files, detected by first bytes or by name, and of folders of such files."""
 
     def found(path: Path, head: bytes | None) -> bool:
         if head is None:
@@ -128,17 +134,17 @@ def read(
 
     Args:
         path: a file or a folder, see `FORMATS`.
-        options: how readings are understood, None for the defaults. Of a recording folder, whose
-            readings are understood already, they narrow what is there.
-        progress: called now and then with the share of the file that is read, 0 to 1.
-        scratch: folder for what does not fit into memory; None: the system's temporary folder.
+        options: read options, None for the defaults. A recording folder, whose readings are already
+            interpreted, is narrowed by them.
+        progress: called with the share of the file that is read, 0 to 1.
+        scratch: folder for memory-mapped buffers; None: the system's temporary folder.
 
     Raises:
-        InputError: nothing there, or no recording that can be read.
+        InputError: there is no readable recording.
     """
     path = Path(path)
     try:
-        # what damaged numbers give is looked at: NumPy need not speak of them as well
+        # damaged numbers are handled below: no warnings of NumPy
         with np.errstate(over="ignore", invalid="ignore"):
             options = options or ReadOptions()
             recording = detect_format(path).read(path, options, progress, scratch)
@@ -153,7 +159,7 @@ def read(
                 raise InputError(what, where=str(path))
         return recording
     except OSError as error:
-        # files may go, and disks fill up, at any moment
+        # files may vanish and disks fill up at any moment
         what = f"cannot be read: {error.strerror or error}"
         raise InputError(what, where=str(error.filename or path)) from error
     except MemoryError as error:
@@ -161,8 +167,8 @@ def read(
 
 
 def _prepare_3d(recording: Recording, options: ReadOptions, scratch: Path | None) -> Recording:
-    """What is found out alike of every 3D recording."""
-    recording = laser_scan.add_beam_times(replace(recording, scratch=scratch), options)
+    """Add beam times and cameras, and remove returns from the robot itself."""
+    recording = add_beam_times(replace(recording, scratch=scratch), options.spin)
     if options.cameras is not None:
         recording = cameras.apply_camera_file(recording, Path(options.cameras))
     recording = cameras.add_calibration_warnings(recording)
@@ -170,10 +176,10 @@ def _prepare_3d(recording: Recording, options: ReadOptions, scratch: Path | None
 
 
 def detect_format(path: Path) -> Format:
-    """The format of a file or folder: by content where it tells, else by name.
+    """Detect the format of a file or folder by its content, else by its name.
 
     Raises:
-        InputError: nothing there, or no recording.
+        InputError: there is nothing, or no recording.
     """
     try:
         is_folder, is_file = path.is_dir(), path.is_file()
@@ -192,12 +198,12 @@ def detect_format(path: Path) -> Format:
 
 
 def _no_recording_error(path: Path) -> InputError:
-    """What to say of a folder that is none: one of those inside may have been meant."""
+    """The error for a folder without a format, naming the recordings inside."""
     inside = _find_recordings(path)
     if not inside:
         return InputError("is a folder without a recording", where=str(path), hint=_list_formats())
-    more = f" and {len(inside) - _NAMED} more" if len(inside) > _NAMED else ""
-    shown = ", ".join(map(str, inside[:_NAMED])) + more
+    more = f" and {len(inside) - _MAX_LISTED} more" if len(inside) > _MAX_LISTED else ""
+    shown = ", ".join(map(str, inside[:_MAX_LISTED])) + more
     if tuple(one.name for one in inside) == RIG_FOLDERS:
         flat, tilting = inside
         hint = f"both: stillmap map {flat} --tilting {tilting} -o DIR"
@@ -208,11 +214,11 @@ def _no_recording_error(path: Path) -> InputError:
 
 
 def _find_recordings(path: Path) -> list[Path]:
-    """Folders right in a folder that are recordings, by name; none of a result."""
+    """The subfolders that are recordings, by name; none in a result folder."""
     try:
-        if (path / "run.json").exists():  # its objects are clouds
+        if (path / "run.json").exists():  # its objects are point clouds
             return []
-        folders = [one for one in islice(path.iterdir(), _INSIDE) if one.is_dir()]
+        folders = [one for one in islice(path.iterdir(), _MAX_ENTRIES) if one.is_dir()]
     except OSError:
         return []
     return [one for one in sorted(folders) if any(known.matches(one, None) for known in FORMATS)]

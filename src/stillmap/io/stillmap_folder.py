@@ -1,8 +1,6 @@
-"""stillmap's own recording folder: `recording.json` and flat `.npy` arrays, read as they lie.
+"""stillmap's recording folder: `recording.json`, memory-mapped `.npy` arrays, images as PNG files.
 
-Pictures in stillmap's own recording folder: PNG files, and cameras in the header.
-
-Pictures of fractions (depth in metres) are `.npy` files of float32.
+Images of floats (depth in metres) are `.npy` files of float32.
 """
 
 import json
@@ -21,40 +19,43 @@ from stillmap.core.recording import Recording
 from stillmap.io.images import read_image, write_png
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE
 
-FOLDER = "images"
+_IMAGES = "images"
 
 
 def write_images(images: Images, folder: Path) -> tuple[dict[str, Any], list[str]]:
-    """Write pictures, stamps and cameras into an existing folder.
+    """Write images, stamps and cameras into an existing folder.
 
     Returns:
-        Entries for the header, and a warning where pictures could not be read: they are left out.
+        Header entries, and a warning where images could not be read and are left out.
     """
-    (folder / FOLDER).mkdir()
+    (folder / _IMAGES).mkdir()
     kept: list[int] = []
     lost: list[str] = []
     for image in range(len(images)):
         try:
-            picture = images.read(image)
+            pixels = images.read(image)
         except InputError as error:
             lost.append(str(error))
             continue
-        _write_one(picture, folder / FOLDER / f"{len(kept):06d}")
+        _write_image(pixels, folder / _IMAGES / f"{len(kept):06d}")
         kept.append(image)
     np.save(folder / "image_stamp_ns.npy", images.stamp_ns[kept], allow_pickle=False)
     np.save(folder / "image_camera.npy", images.camera[kept], allow_pickle=False)
-    header = {"images": len(kept), "cameras": [_described(camera) for camera in images.cameras]}
-    return header, [f"{len(lost)} pictures left out: {lost[0]}"] if lost else []
+    header = {
+        "images": len(kept),
+        "cameras": [_camera_to_dict(camera) for camera in images.cameras],
+    }
+    return header, [f"{len(lost)} images left out: {lost[0]}"] if lost else []
 
 
-def _write_one(picture: NDArray[Any], path: Path) -> None:
-    if picture.dtype.kind == "f":
-        np.save(path.with_suffix(".npy"), picture.astype(np.float32), allow_pickle=False)
+def _write_image(image: NDArray[Any], path: Path) -> None:
+    if image.dtype.kind == "f":
+        np.save(path.with_suffix(".npy"), image.astype(np.float32), allow_pickle=False)
     else:
-        write_png(picture, path.with_suffix(".png"))
+        write_png(image, path.with_suffix(".png"))
 
 
-def _described(camera: Camera) -> dict[str, Any]:
+def _camera_to_dict(camera: Camera) -> dict[str, Any]:
     return {
         "name": camera.name,
         "width": camera.width,
@@ -67,26 +68,26 @@ def _described(camera: Camera) -> dict[str, Any]:
 
 
 def read_images(
-    folder: Path, described: Any, stamp_ns: NDArray[np.int64], camera: NDArray[np.int32]
+    folder: Path, cameras: Any, stamp_ns: NDArray[np.int64], camera: NDArray[np.int32]
 ) -> Images:
-    """The pictures of a folder, read one by one when they are asked for.
+    """The images of a recording folder, each read on demand.
 
     Args:
         folder: the recording.
-        described: the header's "cameras".
-        stamp_ns, camera: (N,) as they lie beside it.
+        cameras: the header's "cameras".
+        stamp_ns, camera: (N,) stamp and camera of each image.
 
     Raises:
-        InputError: the entries of the header do not fit.
+        InputError: the header's cameras are invalid.
     """
     try:
-        cameras = tuple(_camera(one) for one in described)
-        return Images(stamp_ns, camera, cameras, partial(_load, folder / FOLDER))
+        parsed = tuple(_camera_from_dict(one) for one in cameras)
+        return Images(stamp_ns, camera, parsed, partial(_load_image, folder / _IMAGES))
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"is damaged: its cameras: {error}", where=str(folder)) from error
 
 
-def _camera(one: dict[str, Any]) -> Camera:
+def _camera_from_dict(one: dict[str, Any]) -> Camera:
     return Camera(
         name=str(one["name"]),
         width=int(one["width"]),
@@ -102,15 +103,15 @@ def _matrix(rows: Any, n: int) -> NDArray[np.float64] | None:
     return None if rows is None else np.array(rows, np.float64).reshape(n, n)
 
 
-def _load(folder: Path, image: int) -> NDArray[Any]:
+def _load_image(folder: Path, image: int) -> NDArray[Any]:
     path = folder / f"{image:06d}.npy"
     png = path.with_suffix(".png")
     if png.exists() or not path.exists():
         return read_image(png)
-    picture = open_npy(path)
-    if picture.dtype != np.float32 or picture.ndim != 2:
-        raise InputError(f"is damaged: {picture.shape} {picture.dtype}", where=str(path))
-    return np.array(picture)
+    pixels = open_npy(path)
+    if pixels.dtype != np.float32 or pixels.ndim != 2:
+        raise InputError(f"is damaged: {pixels.shape} {pixels.dtype}", where=str(path))
+    return np.array(pixels)
 
 
 HEADER = "recording.json"
@@ -119,25 +120,25 @@ FORMAT = "stillmap-recording"
 
 FORMAT_VERSION = 1
 
-_MAX_HEADER = 16 << 20  # bytes: a JSON of empty lists takes thirty times as many
+_MAX_HEADER = 16 << 20  # bytes: parsed JSON of empty lists takes thirty times as many
 
 
 def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:
-    """Write a recording folder; it appears complete or not at all.
+    """Write a recording folder atomically.
 
     Raises:
-        InputError: `path` holds something already, or cannot be written to.
+        InputError: `path` is not empty, or cannot be written.
     """
     with atomic_folder(Path(path), HEADER, overwrite) as work:
         write_into(recording, work)
 
 
 def write_into(recording: Recording, folder: Path) -> None:
-    """The files of a recording into an existing folder, for writers that add files of their own."""
-    pictures: dict[str, Any] = {}
+    """Write the files of a recording into an existing folder."""
+    image_header: dict[str, Any] = {}
     warnings: list[str] = []
     if recording.images is not None:
-        pictures, warnings = write_images(recording.images, folder)
+        image_header, warnings = write_images(recording.images, folder)
     header = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -148,7 +149,7 @@ def write_into(recording: Recording, folder: Path) -> None:
         "odometry": recording.T_odom_base is not None,
         "beam_times": recording.beam_time is not None,
         "recorded_poses": recording.T_recorded_base is not None,
-        **pictures,
+        **image_header,
         "source": _with_warnings(recording.source, warnings),
     }
     text = json.dumps(header, indent=1, allow_nan=False)
@@ -165,32 +166,32 @@ def _with_warnings(source: dict[str, Any], warnings: list[str]) -> dict[str, Any
 
 
 def read(path: Path) -> Recording:
-    """Read a recording folder; what there is per beam stays on disk until it is used.
+    """Read a recording folder; per-beam arrays are memory-mapped.
 
     Raises:
-        InputError: a file is missing, damaged, or does not fit the others.
+        InputError: a file is missing, damaged, or inconsistent with the others.
     """
-    header = _header(path / HEADER)
-    T, M = _size(path, header, "scans"), _size(path, header, "beams")
-    S, D = _size(path, header, "sensors"), _size(path, header, "dimension")
+    header = _read_header(path / HEADER)
+    T, M = _read_count(path, header, "scans"), _read_count(path, header, "beams")
+    S, D = _read_count(path, header, "sensors"), _read_count(path, header, "dimension")
     if D not in (2, 3):
         raise InputError(f"dimension must be 2 or 3, got {D}", where=str(path / HEADER))
     T_odom_base = T_recorded_base = beam_time = None
     if header.get("odometry"):
-        T_odom_base = _poses(path, "T_odom_base", T, D)
+        T_odom_base = _read_poses(path, "T_odom_base", T, D)
     if header.get("recorded_poses"):
-        T_recorded_base = _poses(path, "T_recorded_base", T, D)
+        T_recorded_base = _read_poses(path, "T_recorded_base", T, D)
     if header.get("beam_times"):
-        beam_time = _array(path, "beam_time", (M,), np.float32)
-    stamp_ns = np.array(_array(path, "stamp_ns", (T,), np.int64))
-    offset = np.array(_array(path, "offset", (T + 1,), np.int64))
-    points = _array(path, "points", (M, D), np.float32)
-    hit = _array(path, "hit", (M,), np.bool_)
-    sensor = np.array(_array(path, "sensor", (T,), np.int32))
-    if np.any(stamp_ns[1:] < stamp_ns[:-1]):  # a difference of wild numbers could wrap around
-        raise _damaged(path, "stamp_ns", "time runs backwards")
-    _require_offsets(path, offset, M)
-    _require_sound_ends(path, points, hit)
+        beam_time = _open_array(path, "beam_time", (M,), np.float32)
+    stamp_ns = np.array(_open_array(path, "stamp_ns", (T,), np.int64))
+    offset = np.array(_open_array(path, "offset", (T + 1,), np.int64))
+    points = _open_array(path, "points", (M, D), np.float32)
+    hit = _open_array(path, "hit", (M,), np.bool_)
+    sensor = np.array(_open_array(path, "sensor", (T,), np.int32))
+    if np.any(stamp_ns[1:] < stamp_ns[:-1]):  # np.diff could overflow
+        raise _damaged_error(path, "stamp_ns", "stamps decrease")
+    _check_offsets(path, offset, M)
+    _check_points(path, points, hit)
     source = header.get("source", {})
     try:
         return Recording(
@@ -198,35 +199,35 @@ def read(path: Path) -> Recording:
             offset=offset,
             points=points,
             hit=hit,
-            T_base_sensor=_poses(path, "T_base_sensor", S, D),
+            T_base_sensor=_read_poses(path, "T_base_sensor", S, D),
             sensor=sensor,
             T_odom_base=T_odom_base,
             source=source if isinstance(source, dict) else {},
             beam_time=beam_time,
             T_recorded_base=T_recorded_base,
-            images=_images(path, header),
+            images=_read_image_index(path, header),
         )
     except ValueError as error:
         raise InputError(f"is damaged: {error}", where=str(path)) from error
 
 
-def _images(path: Path, header: dict[str, Any]) -> Images | None:
+def _read_image_index(path: Path, header: dict[str, Any]) -> Images | None:
     if "images" not in header:
         return None
-    N = _size(path, header, "images")
-    stamp_ns = np.array(_array(path, "image_stamp_ns", (N,), np.int64))
-    camera = np.array(_array(path, "image_camera", (N,), np.int32))
+    N = _read_count(path, header, "images")
+    stamp_ns = np.array(_open_array(path, "image_stamp_ns", (N,), np.int64))
+    camera = np.array(_open_array(path, "image_camera", (N,), np.int32))
     return read_images(path, header.get("cameras"), stamp_ns, camera)
 
 
-def _no_number(text: str) -> float:
-    raise ValueError(f"{text} is none of its numbers")
+def _refuse_constant(text: str) -> float:
+    raise ValueError(f"{text} is no number of JSON")
 
 
-def _header(path: Path) -> dict[str, Any]:
+def _read_header(path: Path) -> dict[str, Any]:
     try:
         require_regular(path)
-        header = json.loads(read_text(path, _MAX_HEADER), parse_constant=_no_number)
+        header = json.loads(read_text(path, _MAX_HEADER), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(f"is not JSON: {error}", where=str(path)) from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
@@ -240,18 +241,18 @@ def _header(path: Path) -> dict[str, Any]:
     return header
 
 
-def _size(path: Path, header: dict[str, Any], key: str) -> int:
+def _read_count(path: Path, header: dict[str, Any], key: str) -> int:
     value = header.get(key)
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 60:
         raise InputError(f"'{key}' must be a count, got {value!r}", where=str(path / HEADER))
     return value
 
 
-def _array(path: Path, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
-    """One `.npy` file as it lies on disk, of exactly this shape and type."""
+def _open_array(path: Path, name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
+    """Memory-map one `.npy` file of exactly this shape and type."""
     loaded = open_npy(path / f"{name}.npy")
     if loaded.shape != shape or loaded.dtype != np.dtype(dtype):
-        raise _damaged(
+        raise _damaged_error(
             path,
             name,
             f"expected {shape} {np.dtype(dtype)}, got {loaded.shape} {loaded.dtype}",
@@ -259,8 +260,8 @@ def _array(path: Path, name: str, shape: tuple[int, ...], dtype: type) -> NDArra
     return np.ascontiguousarray(loaded)
 
 
-def _poses(path: Path, name: str, count: int, D: int) -> NDArray[np.float64]:
-    T = np.array(_array(path, name, (count, D + 1, D + 1), np.float64))
+def _read_poses(path: Path, name: str, count: int, D: int) -> NDArray[np.float64]:
+    T = np.array(_open_array(path, name, (count, D + 1, D + 1), np.float64))
     R = T[:, :D, :D]
     last_row = np.eye(D + 1)[D]
     if not (
@@ -268,27 +269,27 @@ def _poses(path: Path, name: str, count: int, D: int) -> NDArray[np.float64]:
         and np.all(T[:, D] == last_row)
         and np.allclose(R @ R.transpose(0, 2, 1), np.eye(D), atol=1e-6)
     ):
-        raise _damaged(path, name, "not rigid transforms")
+        raise _damaged_error(path, name, "not rigid transforms")
     return T
 
 
-def _require_offsets(path: Path, offset: NDArray[np.int64], M: int) -> None:
-    # compared pairwise: a difference of wild numbers could wrap around
+def _check_offsets(path: Path, offset: NDArray[np.int64], M: int) -> None:
+    # np.diff could overflow
     if offset[0] != 0 or offset[-1] != M or np.any(offset[1:] < offset[:-1]):
-        raise _damaged(path, "offset", f"must rise from 0 to {M}")
+        raise _damaged_error(path, "offset", f"must rise from 0 to {M}")
 
 
-def _require_sound_ends(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
+def _check_points(path: Path, points: NDArray[np.float32], hit: NDArray[np.bool_]) -> None:
     for block in iter_blocks(points, hit):
         chunk = points[block]
         usable = np.isfinite(chunk).all(axis=1)
         if np.any(hit[block] & ~usable) or np.any(np.isinf(chunk)):
-            raise _damaged(path, "points", "a hit or a maximum-range beam ends nowhere")
+            raise _damaged_error(path, "points", "a hit or a maximum-range beam is not finite")
         if np.any(np.abs(chunk) > MAX_POINT_DISTANCE):
-            raise _damaged(
+            raise _damaged_error(
                 path, "points", f"a beam ends farther than {MAX_POINT_DISTANCE:.0f} m away"
             )
 
 
-def _damaged(path: Path, name: str, what: str) -> InputError:
+def _damaged_error(path: Path, name: str, what: str) -> InputError:
     return InputError(f"is damaged: {what}", where=str(path / f"{name}.npy"))

@@ -1,9 +1,4 @@
-"""TUM trajectories: `stamp x y z qx qy qz qw`, the stamp in seconds, exact to the nanosecond.
-
-Odometry at the time of a scan.
-
-Given poses for the scans of a recording.
-"""
+"""TUM trajectories (`stamp x y z qx qy qz qw`, stamps in s, exact to 1 ns) and poses at stamps."""
 
 import decimal
 from pathlib import Path
@@ -19,13 +14,13 @@ from stillmap.core.files import read_text
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import format_seconds
 
-MAX_BYTES = 128 << 20  # bytes: four hours at 100 Hz
+MAX_BYTES = 128 << 20  # of a file: four hours at 100 Hz
 
 _COLUMNS = "stamp x y z qx qy qz qw"
 
-_TOGETHER = 1 << 14  # poses that are written together: as numbers of Python they are large
+_BLOCK = 1 << 14  # poses written at once: Python floats take much memory
 
-# a quaternion printed with three decimals still lies well within this of length one
+# quaternions printed with three decimals have a norm well within this of one
 _UNIT_TOLERANCE = 0.02
 
 
@@ -40,9 +35,9 @@ def write_tum(path: Path, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64
     if len(stamp_ns) != len(poses):
         raise ValueError(f"poses: expected {len(stamp_ns)}, got {len(poses)}")
     with path.open("w", encoding="ascii", newline="\n") as file:
-        for part in iter_blocks(poses, rows=_TOGETHER):
-            # + 0.0 turns the negative zeros that rounding leaves into zeros
-            rows = np.round(_rows_of(poses[part]), 9) + 0.0
+        for part in iter_blocks(poses, rows=_BLOCK):
+            # + 0.0 turns negative zeros into zeros
+            rows = np.round(_pose_rows(poses[part]), 9) + 0.0
             for stamp, row in zip(stamp_ns[part].tolist(), rows.tolist(), strict=True):
                 file.write(f"{format_seconds(stamp)} {' '.join(f'{value:.9f}' for value in row)}\n")
 
@@ -51,18 +46,18 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Stamps (T,) int64 in nanoseconds and poses (T, 4, 4) of a TUM file, in the file's order.
 
     Stamps are parsed as decimals, never as floats; digits beyond nanoseconds are rounded.
-    Blank lines and lines that start with `#` are passed over.
+    Blank lines and lines that start with `#` are skipped.
 
     Raises:
-        InputError: the file cannot be read, a line is no pose, or there is none at all.
+        InputError: the file cannot be read, a line is no pose, or there is none.
     """
     stamps: list[int] = []
     rows: list[list[float]] = []
-    for number, line in enumerate(_lines(path), start=1):
+    for number, line in enumerate(_read_lines(path), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        stamp, row = _parsed(words, f"{path}:{number}")
+        stamp, row = _parse_pose(words, f"{path}:{number}")
         stamps.append(stamp)
         rows.append(row)
     if not stamps:
@@ -74,7 +69,7 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return np.array(stamps, np.int64), poses
 
 
-def _rows_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _pose_rows(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """(T, 7) x y z qx qy qz qw with qw >= 0."""
     rows = np.zeros((len(poses), 7))
     dimension = poses.shape[-1] - 1
@@ -88,26 +83,26 @@ def _rows_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return rows
 
 
-def _lines(path: Path) -> list[str]:
+def _read_lines(path: Path) -> list[str]:
     try:
         return read_text(path, MAX_BYTES).splitlines()
     except UnicodeDecodeError as error:
         raise InputError("is not a text file", where=str(path)) from error
 
 
-def _parsed(words: list[str], where: str) -> tuple[int, list[float]]:
+def _parse_pose(words: list[str], where: str) -> tuple[int, list[float]]:
     if len(words) != 8:
         raise InputError(f"has {len(words)} columns, not 8", where=where, hint=_COLUMNS)
     try:
         row = [float(word) for word in words[1:]]
-        # a stamp of 19 digits at most leaves 9 beyond the nanosecond before anything is rounded
+        # Decimal has 28 digits: a stamp of 19 keeps 9 beyond the nanosecond before it is rounded
         stamp = int(decimal.Decimal(words[0]).scaleb(9).to_integral_value())
     except (ValueError, decimal.DecimalException, OverflowError) as error:
-        raise InputError("holds something that is no number", where=where, hint=_COLUMNS) from error
+        raise InputError("holds a word that is no number", where=where, hint=_COLUMNS) from error
     if not np.all(np.isfinite(row)):
         raise InputError("holds a number that is not finite", where=where)
     if abs(stamp) >= 2**63:
-        raise InputError("has a stamp beyond what 64 bit nanoseconds hold", where=where)
+        raise InputError("has a stamp that 64 bit nanoseconds cannot hold", where=where)
     if abs(np.linalg.norm(row[3:]) - 1) > _UNIT_TOLERANCE:
         raise InputError("has a quaternion that is not of length one", where=where, hint=_COLUMNS)
     return stamp, row
@@ -116,7 +111,7 @@ def _parsed(words: list[str], where: str) -> tuple[int, list[float]]:
 def interpolate(
     stamp_ns: NDArray[np.int64], poses: NDArray[np.float64], at_ns: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], int]:
-    """Poses at given times: linear in x and y, along the shortest arc in theta.
+    """Interpolate poses: linear in x and y, along the shortest arc in theta.
 
     Args:
         stamp_ns: (N,) int64, N >= 1, in any order.
@@ -124,8 +119,8 @@ def interpolate(
         at_ns: (T,) int64.
 
     Returns:
-        (T, 3) poses, and how many of the times lie outside the span of `stamp_ns`: those take
-        the nearest pose.
+        (T, 3) poses, and the count of stamps outside the span of `stamp_ns`, which get the
+        nearest pose.
     """
     order = np.argsort(stamp_ns, kind="stable")
     stamp_ns, poses = stamp_ns[order], poses[order]
@@ -141,14 +136,14 @@ def interpolate(
     return poses[before] + share * step, outside
 
 
-_NEAR_NS = 20_000_000  # another tool may have rounded its stamps
+_TOLERANCE_NS = 20_000_000  # other tools round stamps
 
 
 def poses_from_tum(path: Path, recording: Recording) -> NDArray[np.float64]:
     """(T, D+1, D+1) T_map_base at the scans of a recording, from a TUM trajectory.
 
-    A trajectory with the very stamps of the recording is taken row by row (stamps may repeat);
-    otherwise each scan takes the nearest pose within 20 ms.
+    A trajectory with exactly the stamps of the recording is used row by row (stamps may repeat);
+    otherwise each scan gets the nearest pose within 20 ms.
 
     Raises:
         InputError: the file is no trajectory, or a scan has no pose.
@@ -159,18 +154,19 @@ def poses_from_tum(path: Path, recording: Recording) -> NDArray[np.float64]:
     if np.array_equal(stamp_ns, recording.stamp_ns):
         return poses
     order = np.argsort(stamp_ns, kind="stable")
-    nearest = order[_nearest(stamp_ns[order], recording.stamp_ns)]
-    missing = np.flatnonzero(np.abs(stamp_ns[nearest] - recording.stamp_ns) > _NEAR_NS)
+    nearest = order[_nearest_index(stamp_ns[order], recording.stamp_ns)]
+    missing = np.flatnonzero(np.abs(stamp_ns[nearest] - recording.stamp_ns) > _TOLERANCE_NS)
     if len(missing):
         raise InputError(
-            f"no pose within {_NEAR_NS / 1e9:g} s of {len(missing)} of {recording.n_scans} scans, "
-            f"the first is scan {missing[0]} at {recording.stamp_ns[missing[0]] / 1e9:.3f} s",
+            f"no pose within {_TOLERANCE_NS / 1e9:g} s of {len(missing)} of "
+            f"{recording.n_scans} scans, the first is scan {missing[0]} at "
+            f"{recording.stamp_ns[missing[0]] / 1e9:.3f} s",
             where=str(path),
         )
     return poses[nearest]
 
 
-def _nearest(sorted_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def _nearest_index(sorted_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     right = np.clip(np.searchsorted(sorted_ns, wanted_ns), 1, max(len(sorted_ns) - 1, 1))
     right = np.minimum(right, len(sorted_ns) - 1)
     left = np.maximum(right - 1, 0)

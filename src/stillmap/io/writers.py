@@ -1,6 +1,10 @@
-"""Which writer writes what: the one table of formats that recordings are written in."""
+"""The table of formats that are written (`WRITERS`).
+
+The table of formats that are read is in `registry.py`.
+"""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,29 +19,30 @@ from stillmap.io.point_cloud import kitti, las, pcd, ply
 from stillmap.io.ros.bag_types import BagKind
 from stillmap.io.ros.recording_writer import write_recording
 
-# of a recording, to a path, whether what is there is replaced: what could not be said
+# (recording, path, overwrite) -> what could not be written, a sentence each
 Write = Callable[[Recording, Path, bool], list[str]]
 
-# fields of a recording that hardly any format has room for, in words
-_OPTIONAL = {
-    "images": "pictures",
-    "T_recorded_base": "poses that the recording states",
-    "T_odom_base": "readings of odometry",
+# optional fields of a recording that most formats cannot hold, in words
+_OPTIONAL_FIELDS = {
+    "images": "images",
+    "T_recorded_base": "recorded poses",
+    "T_odom_base": "odometry readings",
 }
 
-_POSES, _ODOMETRY = ("T_recorded_base",), ("T_odom_base",)
+_ODOMETRY = ("T_odom_base",)
+_POSES = ("T_recorded_base",)
 
 
 class Writer(NamedTuple):
-    """A format.
+    """A format that is written.
 
     Attributes:
-        name: what it is called on the command line.
-        about: for people.
-        endings: of names of such files, in small letters; () for folders.
-        mark: name, or pattern of names, of a file that every such folder holds; "" for files.
-        write: writes a recording; it appears whole or not at all.
-        holds: which of `_OPTIONAL` it writes.
+        name: on the command line.
+        description: for messages.
+        endings: of names of such files, in lower case; () for folders.
+        marker: name, or pattern of names, of a file that every such folder holds; "" for files.
+        write: writes a recording, which appears complete or not at all.
+        fields: those of `_OPTIONAL_FIELDS` that it writes.
     """
 
     name: str
@@ -48,7 +53,7 @@ class Writer(NamedTuple):
     fields: tuple[str, ...] = ()
 
 
-def _write_folder(recording: Recording, path: Path, overwrite: bool) -> list[str]:
+def _write_stillmap(recording: Recording, path: Path, overwrite: bool) -> list[str]:
     stillmap_folder.write(recording, path, overwrite=overwrite)
     return []
 
@@ -57,52 +62,47 @@ def _write_carmen(recording: Recording, path: Path, overwrite: bool) -> list[str
     return write_log(recording, path)
 
 
-def _ros(kind: BagKind) -> Write:
-    def write(recording: Recording, path: Path, overwrite: bool) -> list[str]:
-        return write_recording(recording, path, kind, overwrite=overwrite)
-
-    return write
+def _write_bag(kind: BagKind, recording: Recording, path: Path, overwrite: bool) -> list[str]:
+    return write_recording(recording, path, kind, overwrite=overwrite)
 
 
-def _in_folder(write: Callable[..., None]) -> Write:
-    def written(recording: Recording, path: Path, overwrite: bool) -> list[str]:
-        write(recording, path, overwrite=overwrite)
-        return _count_non_returns(recording)
-
-    return written
+def _write_scans(
+    write: Callable[..., None], recording: Recording, path: Path, overwrite: bool
+) -> list[str]:
+    """Write a folder of point clouds, one per scan."""
+    write(recording, path, overwrite=overwrite)
+    return _describe_non_returns(recording)
 
 
 def _write_kitti(recording: Recording, path: Path, overwrite: bool) -> list[str]:
-    lost = _in_folder(kitti.write)(recording, path, overwrite)
+    losses = _write_scans(kitti.write, recording, path, overwrite)
     if recording.T_odom_base is None:
-        return lost
-    stands = recording.T_recorded_base is None
+        return losses
+    has_poses = recording.T_recorded_base is not None
     return [
-        "its odometry stands for poses" if stands else "its readings of odometry are left out",
-        *lost,
+        "its odometry readings are left out" if has_poses else "its odometry is written as poses",
+        *losses,
     ]
 
 
-def _as_cloud(write: Callable[..., None]) -> Write:
-    """All scans as one cloud, by the poses that the recording has."""
-
-    def written(recording: Recording, path: Path, overwrite: bool) -> list[str]:
-        T, lost = recording.T_recorded_base, []
-        if T is None:
-            T, lost = recording.T_odom_base, ["the cloud is placed by odometry: maps are better"]
-        if T is None:
-            D = recording.dimension
-            T = np.tile(np.eye(D + 1), (recording.n_scans, 1, 1))
-            lost = ["there are no poses: all scans lie at one place"] if len(T) > 1 else []
-        write(recording, path, T, overwrite=overwrite)
-        return [*lost, *_count_non_returns(recording)]
-
-    return written
+def _write_cloud(
+    write: Callable[..., None], recording: Recording, path: Path, overwrite: bool
+) -> list[str]:
+    """Write all scans as one point cloud, by the poses that the recording has."""
+    T, losses = recording.T_recorded_base, []
+    if T is None:
+        T, losses = recording.T_odom_base, ["the cloud is placed by odometry: maps are better"]
+    if T is None:
+        D = recording.dimension
+        T = np.tile(np.eye(D + 1), (recording.n_scans, 1, 1))
+        losses = ["there are no poses: all scans lie at one place"] if len(T) > 1 else []
+    write(recording, path, T, overwrite=overwrite)
+    return [*losses, *_describe_non_returns(recording)]
 
 
-def _count_non_returns(recording: Recording) -> list[str]:
+def _describe_non_returns(recording: Recording) -> list[str]:
     n = recording.n_beams - int(np.count_nonzero(recording.hit))
-    return [f"{n} beams that hit nothing are left out"] if n else []
+    return [f"{n} beams without a return are left out"] if n else []
 
 
 WRITERS = (
@@ -111,10 +111,12 @@ WRITERS = (
         "a recording folder",
         (),
         stillmap_folder.HEADER,
-        _write_folder,
-        ("images", *_POSES, *_ODOMETRY),
+        _write_stillmap,
+        tuple(_OPTIONAL_FIELDS),
     ),
-    Writer("ros2", "a ROS 2 bag folder", (), "metadata.yaml", _ros("ros2"), _ODOMETRY),
+    Writer(
+        "ros2", "a ROS 2 bag folder", (), "metadata.yaml", partial(_write_bag, "ros2"), _ODOMETRY
+    ),
     Writer(
         "carmen",
         "a CARMEN log",
@@ -123,27 +125,38 @@ WRITERS = (
         _write_carmen,
         _ODOMETRY,
     ),
-    Writer("bag", "a ROS 1 bag", (".bag",), "", _ros("bag"), _ODOMETRY),
-    Writer("db3", "a ROS 2 bag file", (".db3",), "", _ros("db3"), _ODOMETRY),
-    Writer("mcap", "an MCAP file", (".mcap",), "", _ros("mcap"), _ODOMETRY),
-    Writer("kitti", "a KITTI folder", (), kitti.MARK, _write_kitti, (*_POSES, *_ODOMETRY)),
-    Writer("pcd", "a folder of PCD files", (), pcd.MARK, _in_folder(pcd.write), _POSES),
-    Writer("ply", "a PLY file", (".ply",), "", _as_cloud(ply.write), (*_POSES, *_ODOMETRY)),
-    Writer("las", "a LAS file", (".las", ".laz"), "", _as_cloud(las.write), (*_POSES, *_ODOMETRY)),
+    Writer("bag", "a ROS 1 bag", (".bag",), "", partial(_write_bag, "bag"), _ODOMETRY),
+    Writer("db3", "a ROS 2 bag file", (".db3",), "", partial(_write_bag, "db3"), _ODOMETRY),
+    Writer("mcap", "an MCAP file", (".mcap",), "", partial(_write_bag, "mcap"), _ODOMETRY),
+    Writer("kitti", "a KITTI folder", (), kitti.MARKER, _write_kitti, _POSES + _ODOMETRY),
+    Writer(
+        "pcd", "a folder of PCD files", (), pcd.MARKER, partial(_write_scans, pcd.write), _POSES
+    ),
+    Writer(
+        "ply", "a PLY file", (".ply",), "", partial(_write_cloud, ply.write), _POSES + _ODOMETRY
+    ),
+    Writer(
+        "las",
+        "a LAS file",
+        (".las", ".laz"),
+        "",
+        partial(_write_cloud, las.write),
+        _POSES + _ODOMETRY,
+    ),
 )
 
 
 def format_of_ending(path: Path) -> str | None:
-    """The name of the format that files with such an ending have; None: none in particular."""
+    """The name of the format with the path's ending, None if there is none."""
     name = path.name.lower()
     return next((writer.name for writer in WRITERS if name.endswith(writer.endings)), None)
 
 
 def find_writer(path: Path, name: str | None = None) -> Writer:
-    """The writer of a format given by its name, else by the ending of the path.
+    """Find the writer of a format by its name, else by the ending of the path.
 
     Raises:
-        InputError: no format has such an ending.
+        InputError: no format has such a name or ending.
     """
     wanted = name or format_of_ending(path)
     for writer in WRITERS:
@@ -162,16 +175,16 @@ def find_writer(path: Path, name: str | None = None) -> Writer:
 def write(
     recording: Recording, path: Path, *, name: str | None = None, overwrite: bool = False
 ) -> list[str]:
-    """Write a recording in the format that the name of the path says, or that is named.
+    """Write a recording in a format given by its name or by the path's ending.
 
     Args:
         recording: T >= 1 scans.
-        path: where to.
-        name: of the format; None: by the ending of the path, a recording folder where it has none.
+        path: a file or folder.
+        name: of the format; None: by the ending, a recording folder where there is none.
         overwrite: replace a file, or a folder of the same format.
 
     Returns:
-        What of the recording could not be written, a sentence each.
+        What could not be written, a sentence each.
 
     Raises:
         InputError: the path is taken or cannot be written to, or the format cannot hold such a
@@ -188,10 +201,10 @@ def write(
 
 
 def require_free(path: Path, writer: Writer, overwrite: bool) -> None:
-    """Refuses to write over anything but what was asked to be replaced.
+    """Refuse to overwrite anything but a file or folder of the same format.
 
     Raises:
-        InputError: there is something, of another kind or not to be replaced.
+        InputError: the path is taken.
     """
     if writer.marker:
         require_new(path, writer.marker, overwrite)
@@ -202,6 +215,6 @@ def require_free(path: Path, writer: Writer, overwrite: bool) -> None:
 def _unsupported_fields(recording: Recording, writer: Writer) -> list[str]:
     return [
         f"its {words} are left out"
-        for field, words in _OPTIONAL.items()
+        for field, words in _OPTIONAL_FIELDS.items()
         if getattr(recording, field) is not None and field not in writer.fields
     ]

@@ -1,4 +1,4 @@
-"""Scans of a planar laser on a joint as one recording in 3D, and which of them are of one sweep."""
+"""Tilting-laser assembly: scans of a 2D laser on a joint become a 3D recording."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from stillmap.core.timestamps import beam_stamps_ns
 
 Float = NDArray[np.float64]
 
-_BLOCK = 1 << 16  # beams worked on together
+_BLOCK = 1 << 16  # beams transformed at once
 
 
 def assemble_tilting_laser(
@@ -21,21 +21,20 @@ def assemble_tilting_laser(
     T_base_joint: Float,
     T_joint_laser: Float | None = None,
 ) -> Recording:
-    """The recording in 3D, its points in the frame of the joint, which stands still on the robot.
+    """Transform a 2D recording to 3D points in the frame of the joint's fixed part.
 
-    Between two readings the joint goes on evenly; before the first and after the last it stands.
+    The angle is interpolated linearly between readings, and constant outside them.
 
     Args:
-        recording: 2D, M beams of a laser that is turned by a joint.
-        joint_ns: (J,) stamps of the joint's readings, non-decreasing, by the same clock; J > 0.
-        joint_angle: (J,) rad, right-handed about `axis`: about (0, 1, 0) positive is nose down,
-            about (0, 0, 1) to the left.
-        axis: of length one, in the frame of the joint.
+        recording: 2D, of a laser on a joint.
+        joint_ns: (J,) stamps of the joint readings, non-decreasing, on the same clock; J > 0.
+        joint_angle: (J,) rad, right-handed about `axis`.
+        axis: unit vector in the frame of the joint.
         T_base_joint: (4, 4).
-        T_joint_laser: (4, 4) at the angle zero; None: the laser sits in the joint.
+        T_joint_laser: (4, 4) at angle zero; None: identity.
 
     Raises:
-        ValueError: the recording is not 2D, or there is not one stamp for each reading.
+        ValueError: the recording is not 2D, or counts of stamps and angles differ.
     """
     if recording.dimension != 2:
         raise ValueError(f"recording: expected 2 dimensions, got {recording.dimension}")
@@ -48,11 +47,11 @@ def assemble_tilting_laser(
     for first in range(0, recording.n_scans, step):
         scans = slice(first, min(first + step, recording.n_scans))
         beams = slice(int(recording.offset[scans.start]), int(recording.offset[scans.stop]))
-        at = 1e-9 * (beam_stamps_ns(recording, scans) - joint_ns[0])
+        seconds_of_beams = 1e-9 * (beam_stamps_ns(recording, scans) - joint_ns[0])
         flat = recording.points[beams].astype(np.float64)
         local = flat @ T[:3, :2].T + T[:3, 3]
         points[beams] = rotate_about_axis(
-            local, np.array(axis), np.interp(at, seconds, joint_angle)
+            local, np.array(axis), np.interp(seconds_of_beams, seconds, joint_angle)
         )
         recording.release_pages(points)
     return replace(
@@ -66,29 +65,29 @@ def assemble_tilting_laser(
 
 
 def rotate_about_axis(points: Float, axis: Float, angle: Float) -> Float:
-    """(n, 3) points turned about an axis (3,) of length one by (n,) rad: Rodrigues' formula."""
+    """(n, 3) points rotated about a unit axis (3,) by angles (n,) in rad: Rodrigues' formula."""
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     along = (points @ axis)[:, None] * axis
     return np.asarray(along + c * (points - along) + s * np.cross(axis, points))
 
 
 def sweep_indices(joint_angle: Float, min_reversal: float = 0.02) -> NDArray[np.int64]:
-    """(T,) which sweep each scan is of: another one begins where the joint turns round.
+    """(T,) sweep index of each scan; a sweep ends where the joint reverses.
 
     Args:
         joint_angle: (T,) rad at each scan.
-        least: rad by which it must go back: less is noise of the encoder.
+        min_reversal: rad; smaller reversals are encoder noise.
     """
     out = np.zeros(len(joint_angle), np.int64)
-    number, direction, farthest = 0, 0, 0
+    sweep, direction, turning = 0, 0, 0
     for t in range(1, len(joint_angle)):
-        gone = float(joint_angle[t] - joint_angle[farthest])
-        if direction * gone >= 0.0 and direction:
-            farthest = t
-        elif abs(gone) >= min_reversal:
-            if direction:  # what came since the farthest scan is of the way back already
-                number += 1
-                out[farthest + 1 : t] = number
-            direction, farthest = (1 if gone > 0.0 else -1), t
-        out[t] = number
+        change = float(joint_angle[t] - joint_angle[turning])
+        if direction * change >= 0.0 and direction:
+            turning = t
+        elif abs(change) >= min_reversal:
+            if direction:  # scans since the turning point belong to the new sweep
+                sweep += 1
+                out[turning + 1 : t] = sweep
+            direction, turning = (1 if change > 0.0 else -1), t
+        out[t] = sweep
     return out

@@ -171,7 +171,7 @@ def save(
         if models is not None:
             images = (result if tilting is None else tilting).recording.images
             count = 0 if images is None else len(images)
-            write_models(folder, models, count, result.options.mesh.texture)
+            write_models(folder, models, count, result.options.mesh.texture_quality)
             more["models"] = models_record(models)
         write_run_json(folder / RECORD, result, more)
 

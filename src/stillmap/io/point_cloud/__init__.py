@@ -1,1 +1,1 @@
-"""Point clouds, in folders of many or in single files, as recordings."""
+"""Readers and writers of point clouds: single files, or folders of one file per scan."""

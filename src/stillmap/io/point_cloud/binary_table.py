@@ -1,6 +1,6 @@
-"""Tables of points as PCD and PLY files lay them down: text, or records of bytes.
+"""Point tables of PCD and PLY files: text lines or binary records.
 
-The counts in a header are never believed beyond what the file holds.
+Counts in a header are checked against the size of the file before memory is allocated.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from stillmap.core.errors import InputError
 from stillmap.io.text_lines import read_lines
 
-_BLOCK = 1 << 18  # points read together
-_LARGEST_RECORD = 1 << 16  # bytes of one point
-_MOST_COLUMNS = 1 << 12  # of text
+_BLOCK = 1 << 18  # points read at once
+_MAX_RECORD = 1 << 16  # bytes of one point
+_MAX_COLUMNS = 1 << 12  # of text
 
 
 @dataclass(frozen=True)
 class Field:
-    """A column: its name, the type of its values with their byte order, how many there are."""
+    """A column: name, type with byte order, and count of values per point."""
 
     name: str
     dtype: np.dtype[Any]
@@ -35,15 +35,15 @@ class Field:
 
 @dataclass(frozen=True)
 class TableLayout:
-    """Where a file's points lie.
+    """Position and columns of the points in a file.
 
     Attributes:
         path: the file.
         fields: the columns in order.
-        rows: points that the header promises.
-        start: byte at which they begin.
-        lines: of the header and what else comes before, where they are text.
-        text: they are text, one line each.
+        rows: point count of the header.
+        start: byte offset of the first point.
+        lines: line count before the first point, of text.
+        text: points are text, one line each.
     """
 
     path: Path
@@ -59,10 +59,10 @@ class TableLayout:
         return sum(field.size for field in self.fields)
 
     def find_column(self, name: str) -> tuple[Field, int, int]:
-        """The first column of this name, the byte and the number of the value it begins with.
+        """The first column of a name, its byte offset and its value index within a point.
 
         Raises:
-            InputError: there is none.
+            InputError: there is no such column.
         """
         byte = value = 0
         for field in self.fields:
@@ -73,42 +73,42 @@ class TableLayout:
 
 
 def read_columns(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
-    """Values (k,) of the wanted columns, a block of points at a time; text comes as float64.
+    """Yield values (k,) of the wanted columns, block by block; text as float64.
 
     Raises:
-        InputError: a column is missing, the file is shorter than it says, or damaged.
+        InputError: a column is missing, or the file is truncated or damaged.
     """
-    return _from_text(layout, wanted) if layout.text else _from_records(layout, wanted)
+    return _read_text(layout, wanted) if layout.text else _read_records(layout, wanted)
 
 
 def check_record_size(layout: TableLayout) -> None:
-    """Refuse points of impossible size.
+    """Refuse records of zero or implausible size.
 
     Raises:
-        InputError: see there.
+        InputError: the size of a point is invalid.
     """
-    if not 0 < layout.record <= _LARGEST_RECORD:
+    if not 0 < layout.record <= _MAX_RECORD:
         what = f"is damaged: a point of {layout.record} bytes"
         raise InputError(what, where=str(layout.path))
 
 
-def truncated_error(path: Path, found: int, promised: int) -> InputError:
-    """The error for a file with fewer points than its header says."""
-    return InputError(f"is cut short: {found} of {promised} points are there", where=str(path))
+def truncated_error(path: Path, found: int, expected: int) -> InputError:
+    """The error for a file with fewer points than its header states."""
+    return InputError(f"is truncated: {found} of {expected} points are there", where=str(path))
 
 
-def _from_records(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
+def _read_records(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
     check_record_size(layout)
-    places = [layout.find_column(name) for name in wanted]
-    held = (layout.path.stat().st_size - layout.start) // layout.record
-    if held < layout.rows:
-        raise truncated_error(layout.path, max(held, 0), layout.rows)
-    names = [str(i) for i in range(len(places))]
+    columns = [layout.find_column(name) for name in wanted]
+    available = (layout.path.stat().st_size - layout.start) // layout.record
+    if available < layout.rows:
+        raise truncated_error(layout.path, max(available, 0), layout.rows)
+    names = [str(i) for i in range(len(columns))]
     dtype = np.dtype(
         {
             "names": names,
-            "formats": [field.dtype for field, _, _ in places],
-            "offsets": [byte for _, byte, _ in places],
+            "formats": [field.dtype for field, _, _ in columns],
+            "offsets": [byte for _, byte, _ in columns],
             "itemsize": layout.record,
         }
     )
@@ -122,9 +122,9 @@ def _from_records(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[N
             yield [rows.view(dtype)[name] for name in names]
 
 
-def _from_text(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
+def _read_text(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
     numbers = [layout.find_column(name)[2] for name in wanted]
-    if max(numbers) >= _MOST_COLUMNS:
+    if max(numbers) >= _MAX_COLUMNS:
         raise InputError("is damaged: too many columns", where=str(layout.path))
     lines = iter_text_lines(layout.path, layout.lines)
     for first in range(0, layout.rows, _BLOCK):
@@ -137,15 +137,15 @@ def _from_text(layout: TableLayout, wanted: Sequence[str]) -> Iterator[list[NDAr
 
 
 def iter_text_lines(path: Path, skip: int = 0, limit: int | None = None) -> Iterator[bytes]:
-    """Lines that are not empty, after the first `skip`; unpacked where the file is gzip.
+    """Yield lines that are not empty, of a text or gzip file.
 
     Args:
         path: the file.
-        skip: lines that are passed over.
-        limit: bytes that may come out of it.
+        skip: count of lines to skip.
+        limit: maximum size of the unpacked text in bytes.
 
     Raises:
-        InputError: a line is too long, a gzip stream is damaged, or there is more than `limit`.
+        InputError: a line is too long, the gzip stream is damaged, or the text is too large.
     """
     size = 0
     for line in read_lines(path):
@@ -153,11 +153,11 @@ def iter_text_lines(path: Path, skip: int = 0, limit: int | None = None) -> Iter
         if line.damaged:
             raise InputError("is a damaged gzip file", where=f"{path}:{line.number}")
         if line.too_long:
-            raise InputError("is damaged: a line without end", where=f"{path}:{line.number}")
+            raise InputError("is damaged: a line is too long", where=f"{path}:{line.number}")
         if limit is not None and size > limit:
             what = f"is too large: more than {limit >> 20} MiB when unpacked"
             raise InputError(what, where=str(path))
-        # as NumPy will see it: more than ASCII's spaces are spaces to it
+        # np.loadtxt skips lines of any whitespace of Latin-1
         if line.number > skip and not line.text.decode("latin1").isspace():
             yield line.text
 
@@ -165,10 +165,10 @@ def iter_text_lines(path: Path, skip: int = 0, limit: int | None = None) -> Iter
 def parse_numbers(
     lines: Iterator[bytes], rows: int, use: Sequence[int] | None, path: Path
 ) -> NDArray[np.float64]:
-    """(k, columns) numbers of up to `rows` lines.
+    """Parse up to `rows` lines into (k, columns) float64.
 
     Raises:
-        InputError: a line holds something else, or too few.
+        InputError: a line holds something other than numbers, or too few.
     """
     taken = list(islice(lines, rows))
     if not taken:

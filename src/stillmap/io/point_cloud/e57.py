@@ -1,6 +1,6 @@
-"""E57 files: every scan of a file is one of the recording, with the place of its scanner.
+"""E57 files: every scan of a file becomes a scan of the recording, with its scanner pose.
 
-libe57 does the reading (by pye57). Counts in a file are believed as far as its size goes.
+Read by libe57 (through pye57). Counts are checked against the size of the file.
 """
 
 import re
@@ -30,14 +30,14 @@ from stillmap.preprocessing.options import ReadOptions
 EXTENSIONS = (".e57",)
 MAGIC = b"ASTM-E57"
 
-_BLOCK = 1 << 14  # points read together; libe57 keeps the space for them where packets are bad
+_BLOCK = 1 << 14  # points read at once; libe57 keeps the buffers where packets are damaged
 _PAGE, _CHECKSUM = 1024, 4  # bytes
-_LARGEST_XML = 16 << 20  # bytes: what libe57 makes of them takes fifty times as many
-_DEEPEST = 100  # elements within each other: libe57 takes their number squared to read them
+_MAX_XML = 16 << 20  # bytes: parsed by libe57 it takes fifty times as much memory
+_MAX_DEPTH = 100  # nested elements: the time of libe57 grows with the square
 _NO_TAGS = re.compile(rb"<!\[CDATA\[.*?\]\]>|<!--.*?-->|<\?.*?\?>", re.DOTALL)
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-GPS_EPOCH_S = 315_964_800  # 6 January 1980, since 1970; leap seconds stay out
+GPS_EPOCH_S = 315_964_800  # 6 January 1980 since 1970, without leap seconds
 
 
 def read(
@@ -56,24 +56,24 @@ def read(
     origin, sources = Origin(), []
     for file in files:
         try:
-            count = _scan_count(file)
+            count = _count_scans(file)
         except InputError:
             if path.is_file():
                 raise
-            count = 1  # it is found out again, and counted
+            count = 1  # reading it fails again, and is counted as skipped
         for scan in range(count):
             name = file.name if count == 1 else f"{file.name} scan {scan + 1}"
-            sources.append(CloudSource(name, partial(_cloud, file, scan, origin, scratch)))
-    known = DatasetInfo(path, "E57", [], single=path.is_file() and len(sources) == 1)
-    recording = build_recording(sources, known, options, progress, scratch)
+            sources.append(CloudSource(name, partial(_read_cloud, file, scan, origin, scratch)))
+    info = DatasetInfo(path, "E57", [], single=path.is_file() and len(sources) == 1)
+    recording = build_recording(sources, info, options, progress, scratch)
     if recording.T_recorded_base is None:
         recording.source.update(origin.notes())
         recording.source["warnings"] += origin.warnings()
     return recording
 
 
-class _Opened:
-    """An open file; whatever the library makes of damaged bytes is an InputError."""
+class _E57File:
+    """Context manager of an open file; errors of the library become InputError."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -82,52 +82,52 @@ class _Opened:
     def __enter__(self) -> Any:
         require_nonempty_file(self._path)
         if not str(self._path).isprintable():
-            raise InputError("has a name that its library cannot open", where=str(self._path))
-        _refuse_entities(self._path)
+            raise InputError("has a name that libe57 cannot open", where=str(self._path))
+        _check_xml(self._path)
         try:
             self._file = self.library.ImageFile(str(self._path), "r")
         except Exception as error:
-            raise self._damaged(error) from error
+            raise self._damaged_error(error) from error
         return self._file
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         self._file.close()
         if isinstance(error, Exception) and not isinstance(error, InputError | MemoryError):
-            raise self._damaged(error) from error
+            raise self._damaged_error(error) from error
 
-    def _damaged(self, error: Exception) -> InputError:
+    def _damaged_error(self, error: Exception) -> InputError:
         what = (str(error).splitlines() or [type(error).__name__])[0]
         return InputError(f"is damaged: {what}", where=str(self._path))
 
 
-def _refuse_entities(path: Path) -> None:
-    """Refuse descriptions with entities, which could unpack to anything.
+def _check_xml(path: Path) -> None:
+    """Refuse XML sections with entities (which expand without limit), deep nesting or huge size.
 
-    The checksums of pages are cut out, so that nothing hides behind them.
+    Page checksums are removed first, so that they cannot hide a tag.
     """
     with path.open("rb") as file:
         head = file.read(48)
         start, length = (int.from_bytes(head[at : at + 8], "little") for at in (24, 32))
         if len(head) < 48 or head[:8] != MAGIC:
             raise InputError("is no E57 file", where=str(path))
-        if length > _LARGEST_XML or start > path.stat().st_size:
-            raise InputError("is damaged: its description", where=str(path))
+        if length > _MAX_XML or start > path.stat().st_size:
+            raise InputError("is damaged: its XML section", where=str(path))
         first = start // _PAGE * _PAGE
         file.seek(first)
         pages = file.read((length // (_PAGE - _CHECKSUM) + 2) * _PAGE)
     kept = (pages[at : at + _PAGE - _CHECKSUM] for at in range(0, len(pages), _PAGE))
     text = b"".join(kept)[start - first :][:length]
-    # another encoding could hide them; the standard has this one
+    # other encodings could hide tags; the standard requires UTF-8
     if re.match(rb"(\xef\xbb\xbf)?\s*<\?xml[^>]*encoding=.utf-8", text, re.IGNORECASE) is None:
-        raise InputError("is damaged: its description is no XML in UTF-8", where=str(path))
+        raise InputError("is damaged: its XML section is not UTF-8", where=str(path))
     if b"<!DOCTYPE" in text:
-        raise InputError("is refused: its description defines entities", where=str(path))
-    if _depth(text) > _DEEPEST:
-        raise InputError("is refused: its description is nested too deeply", where=str(path))
+        raise InputError("is refused: its XML section defines entities", where=str(path))
+    if _nesting_depth(text) > _MAX_DEPTH:
+        raise InputError("is refused: its XML section is nested too deeply", where=str(path))
 
 
-def _depth(xml: bytes) -> int:
-    """How many elements lie within each other, at most."""
+def _nesting_depth(xml: bytes) -> int:
+    """Maximum nesting depth of elements."""
     depth = deepest = 0
     for tag in re.finditer(rb"<(/?)[^<>]*?(/?)>", _NO_TAGS.sub(b"", xml)):
         if tag[1]:
@@ -138,43 +138,43 @@ def _depth(xml: bytes) -> int:
     return deepest
 
 
-def _scan_count(path: Path) -> int:
-    with _Opened(path) as file:
+def _count_scans(path: Path) -> int:
+    with _E57File(path) as file:
         root = file.root()
         return len(root["data3D"]) if root.isDefined("data3D") else 0
 
 
-def _cloud(path: Path, scan: int, origin: Origin, scratch: Path | None) -> Cloud:
-    opened = _Opened(path)
+def _read_cloud(path: Path, scan: int, origin: Origin, scratch: Path | None) -> Cloud:
+    opened = _E57File(path)
     with opened as file:
         node = file.root()["data3D"][scan]
-        T = _pose(node)
+        T = _read_pose(node)
         if T is not None and not np.array_equal(T, np.eye(4)):
             origin = Origin(np.zeros(3))
         growing = PointBuffer(origin, scratch)
-        points, fields = node["points"], _fields(opened.library, node, path)
-        promised, found = points.childCount(), 0
-        if promised > 8 * path.stat().st_size:
-            raise truncated_error(path, 0, promised)  # not even a bit for each
+        points, fields = node["points"], _find_fields(opened.library, node, path)
+        expected, found = points.childCount(), 0
+        if expected > 8 * path.stat().st_size:
+            raise truncated_error(path, 0, expected)  # less than one bit per point
         values = {name: np.zeros(_BLOCK, kind) for name, kind in fields.items()}
         buffers = opened.library.VectorSourceDestBuffer()
         for name, array in values.items():
             buffers.append(opened.library.SourceDestBuffer(file, name, array, _BLOCK, True, True))
         with closing(points.reader(buffers)) as reader:
             while n := reader.read():
-                growing.add(_xyz(values, n))
+                growing.add(_to_xyz(values, n))
                 found += n
-        stamp_ns = _stamp_ns(node)
-    if found < promised:
-        raise truncated_error(path, found, promised)
+        stamp_ns = _read_stamp(node)
+    if found < expected:
+        raise truncated_error(path, found, expected)
     return Cloud(growing.finish(), T, stamp_ns=stamp_ns)
 
 
-def _fields(library: Any, node: Any, path: Path) -> dict[str, str]:
-    """The columns to read and NumPy's names of their types.
+def _find_fields(library: Any, node: Any, path: Path) -> dict[str, str]:
+    """Columns to read, and the NumPy codes of their types.
 
     Raises:
-        InputError: there are no coordinates.
+        InputError: the scan has no coordinates.
     """
     prototype = library.StructureNode(node["points"].prototype())
     for names, state in (
@@ -187,8 +187,8 @@ def _fields(library: Any, node: Any, path: Path) -> dict[str, str]:
     raise InputError("holds a scan without coordinates", where=str(path))
 
 
-def _xyz(values: dict[str, NDArray[Any]], n: int) -> NDArray[np.float64]:
-    """(n, 3) metres, NaN where a point is marked as invalid."""
+def _to_xyz(values: dict[str, NDArray[Any]], n: int) -> NDArray[np.float64]:
+    """(n, 3) metres, NaN for points marked as invalid."""
     columns = [array[:n] for array in values.values()]
     xyz = np.stack(columns[:3], axis=1)
     if "sphericalRange" in values:
@@ -202,7 +202,7 @@ def _xyz(values: dict[str, NDArray[Any]], n: int) -> NDArray[np.float64]:
     return xyz
 
 
-def _pose(node: Any) -> NDArray[np.float64] | None:
+def _read_pose(node: Any) -> NDArray[np.float64] | None:
     if not node.isDefined("pose"):
         return None
     pose = node["pose"]
@@ -217,8 +217,8 @@ def _pose(node: Any) -> NDArray[np.float64] | None:
         return None
 
 
-def _stamp_ns(node: Any) -> int | None:
-    """When the scan began; None where the file has not been told."""
+def _read_stamp(node: Any) -> int | None:
+    """Start of the scan (ns); None: not recorded."""
     if not node.isDefined("acquisitionStart"):
         return None
     start = node["acquisitionStart"]

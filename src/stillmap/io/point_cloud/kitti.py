@@ -1,10 +1,6 @@
-"""Folders of KITTI: odometry sequences (`velodyne/`, `times.txt`) and raw drives.
-
-Poses that lie in folders of KITTI, as poses of the laser.
-"""
+"""KITTI folders: odometry sequences (`velodyne/`, `times.txt`), raw drives, and their poses."""
 
 import math
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -32,57 +28,59 @@ from stillmap.io.point_cloud.kitti_cameras import Calibration, find_images
 from stillmap.io.point_cloud.kitti_times import assign_rows, read_times
 from stillmap.io.point_cloud.scans import Cloud, CloudSource, DatasetInfo, build_recording
 from stillmap.io.text_lines import Progress
-from stillmap.preprocessing import laser_scan
 from stillmap.preprocessing.options import ReadOptions
+from stillmap.preprocessing.scan_timing import add_beam_times
 
 Poses = list[NDArray[np.float64]]
 
 _EARTH = 6378137.0  # m
 
-_MOST = 10_000_000  # poses of a file
+_STAMP_AZIMUTH = 0.0  # rad: the laser faces ahead at the stamp
+
+_MAX_POSES = 10_000_000  # of a file
 
 
 def read_poses(
     folder: Path, calibration: Calibration, lines: int, files: int
 ) -> tuple[dict[int, NDArray[np.float64]], list[str], bool]:
-    """Poses of the laser, by line of the times or by file.
+    """Read the laser poses of a folder.
 
     Args:
         folder: the recording.
-        calibration: where the cameras sit.
-        lines: how many times there are.
-        files: how many sweeps there are.
+        calibration: extrinsics of cameras and IMU.
+        lines: count of stamps.
+        files: count of scans.
 
     Returns:
-        T_map_laser (4, 4) by number from 0, warnings, and whether the numbers count lines.
+        T_map_laser (4, 4) by number from 0, warnings, and whether numbers count stamps, not files.
     """
     try:
-        poses, name = _found(folder, calibration)
+        poses, name = _read_pose_file(folder, calibration)
     except InputError as error:
-        return {}, [f"poses are not used: {error}"], True
+        return {}, [f"poses are ignored: {error}"], True
     if len(poses) not in (0, lines, files):
-        return {}, [f"poses are not used: {name} has {len(poses)} for {files} sweeps"], True
+        return {}, [f"poses are ignored: {name} has {len(poses)} for {files} scans"], True
     return dict(enumerate(poses)), [], len(poses) == lines
 
 
-def _found(folder: Path, calibration: Calibration) -> tuple[Poses, str]:
+def _read_pose_file(folder: Path, calibration: Calibration) -> tuple[Poses, str]:
     if (folder / "poses_lidar.txt").is_file():
-        return _rows(folder / "poses_lidar.txt"), "poses_lidar.txt"
+        return _read_rows(folder / "poses_lidar.txt"), "poses_lidar.txt"
     if (folder / "poses.txt").is_file():
         T = calibration.T_camera_laser
         if T is None:
-            raise InputError("they are of the camera, and no calib.txt says where that is")
-        return [se2.inverse(T) @ P @ T for P in _rows(folder / "poses.txt")], "poses.txt"
+            raise InputError("they are camera poses, and there is no calib.txt with its extrinsics")
+        return [se2.inverse(T) @ P @ T for P in _read_rows(folder / "poses.txt")], "poses.txt"
     if (folder / "oxts" / "data").is_dir():
         if calibration.T_laser_imu is None:
-            raise InputError("no calib_imu_to_velo.txt says where the inertial unit is")
+            raise InputError("there is no calib_imu_to_velo.txt with the extrinsics of the IMU")
         T = se2.inverse(calibration.T_laser_imu)
-        return [P @ T for P in _inertial(folder / "oxts" / "data")], "oxts"
+        return [P @ T for P in _read_oxts(folder / "oxts" / "data")], "oxts"
     return [], ""
 
 
-def _rows(path: Path) -> Poses:
-    numbers = parse_numbers(iter_text_lines(path), _MOST, range(12), path)
+def _read_rows(path: Path) -> Poses:
+    numbers = parse_numbers(iter_text_lines(path), _MAX_POSES, range(12), path)
     out = []
     for i, row in enumerate(numbers):
         try:
@@ -92,10 +90,10 @@ def _rows(path: Path) -> Poses:
     return out
 
 
-def _inertial(folder: Path) -> Poses:
+def _read_oxts(folder: Path) -> Poses:
     """T_map_imu of files of latitude, longitude (degrees), height (m), roll, pitch, yaw (rad).
 
-    East, north and up from the first, on the Mercator map that is true to scale there.
+    East, north and up from the first pose, in the Mercator projection that is to scale there.
     """
     out: Poses = []
     scale = first = None
@@ -109,30 +107,30 @@ def _inertial(folder: Path) -> Poses:
             scale = scale or math.cos(math.radians(latitude))
             x = scale * _EARTH * math.radians(longitude)
             y = scale * _EARTH * math.log(math.tan(math.pi * (90.0 + latitude) / 360.0))
-            place = np.array([x, y, height])
-            first = place if first is None else first
+            position = np.array([x, y, height])
+            first = position if first is None else first
             R = scipy.spatial.transform.Rotation.from_euler("ZYX", angles[::-1]).as_matrix()
-            out.append(rigid_transform(R, place - first))
+            out.append(rigid_transform(R, position - first))
         except ValueError as error:
             raise InputError(f"is damaged: {error}", where=str(path)) from error
     return out
 
 
-MARK = "times.txt"  # every such folder has it
+MARKER = "times.txt"  # only folders with this file are overwritten
 
-_RECORD = 16  # bytes of a point: float32 x y z and reflectance
+_RECORD = 16  # bytes of a point: float32 x y z reflectance
 
 _RAW = Path("velodyne_points/data")
 
-_LAYOUTS = (  # sweeps, their times
+_LAYOUTS = (  # scans and their stamps
     (Path("velodyne"), Path("times.txt")),
     (_RAW, Path("velodyne_points/timestamps.txt")),
 )
 
 
 def is_kitti_folder(path: Path) -> bool:
-    """Whether a folder looks like one of KITTI."""
-    return any((path / sweeps).is_dir() for sweeps, _ in _LAYOUTS)
+    """Whether a folder has a layout of KITTI."""
+    return any((path / scans).is_dir() for scans, _ in _LAYOUTS)
 
 
 def read(
@@ -141,43 +139,44 @@ def read(
     progress: Progress | None = None,
     scratch: Path | None = None,
 ) -> Recording:
-    """Read an odometry sequence or a raw drive; the robot's base is its laser.
+    """Read an odometry sequence or a raw drive; the laser is the base of the robot.
 
-    KITTI has taken the motion out of the sweeps of its sequences, and not of its drives'. Their
-    laser looks ahead at the stamp, and turns clockwise, whatever its manual says.
+    Scans of odometry sequences are deskewed, those of raw drives are not: their laser turns
+    clockwise and faces ahead at the stamp.
 
     Raises:
-        InputError: there are no times, or no sweep can be read.
+        InputError: there are no stamps, or no scan can be read.
     """
-    sweeps, times_file = next(one for one in _LAYOUTS if (path / one[0]).is_dir())
-    files = list_files(path / sweeps, (".bin",))
+    scans, times_file = next(one for one in _LAYOUTS if (path / one[0]).is_dir())
+    files = list_files(path / scans, (".bin",))
     if not files:
-        raise InputError("holds no sweep (*.bin)", where=str(path / sweeps))
+        raise InputError("holds no scan (*.bin)", where=str(path / scans))
     if not (path / times_file).is_file():
-        hint = "one line for each sweep: its time in seconds"
+        hint = "one line per scan: its stamp in seconds"
         raise InputError("does not exist", where=str(path / times_file), hint=hint)
     times = read_times(path / times_file)
     rows = assign_rows(files, len(times), path / times_file)
     calibration = kitti_cameras.find_calibration(path)
-    poses, notes, by_line = read_poses(path, calibration, len(times), len(files))
-    images, more = find_images(path, calibration, times)
-    known = DatasetInfo(path, "KITTI", [*calibration.warnings, *notes, *more])
+    poses, pose_warnings, by_line = read_poses(path, calibration, len(times), len(files))
+    images, image_warnings = find_images(path, calibration, times)
+    warnings = [*calibration.warnings, *pose_warnings, *image_warnings]
+    info = DatasetInfo(path, "KITTI", warnings)
     sources = []
     for number, (file, row) in enumerate(zip(files, rows, strict=True)):
         stamp_ns = None if row is None else times[row]
-        at = row if by_line else number
-        T = None if at is None else poses.get(at)
-        cloud = partial(_sweep, file, T) if stamp_ns is not None else partial(_no_time, file)
-        sources.append(CloudSource(file.name, cloud, stamp_ns))
-    recording = build_recording(sources, known, options, progress, scratch, images=images)
-    if options.spin_stamp is None:
-        options = replace(options, spin_stamp=0.0)
-    if options.spin == "auto" and sweeps == _RAW:
-        options = replace(options, spin="clockwise")
-    return laser_scan.add_beam_times(recording, options)
+        index = row if by_line else number
+        T = None if index is None else poses.get(index)
+        read_cloud = partial(_refuse_without_stamp, file)
+        if stamp_ns is not None:
+            read_cloud = partial(_read_scan, file, T)
+        sources.append(CloudSource(file.name, read_cloud, stamp_ns))
+    recording = build_recording(sources, info, options, progress, scratch, images=images)
+    is_raw_drive = options.spin == "auto" and scans == _RAW
+    direction = "clockwise" if is_raw_drive else options.spin
+    return add_beam_times(recording, direction, _STAMP_AZIMUTH)
 
 
-def _sweep(path: Path, T: NDArray[np.float64] | None) -> Cloud:
+def _read_scan(path: Path, T: NDArray[np.float64] | None) -> Cloud:
     require_nonempty_file(path)
     size = path.stat().st_size
     if size % _RECORD:
@@ -185,23 +184,23 @@ def _sweep(path: Path, T: NDArray[np.float64] | None) -> Cloud:
     return Cloud(np.fromfile(path, "<f4").reshape(-1, 4)[:, :3], T)
 
 
-def _no_time(path: Path) -> Cloud:
-    raise InputError("has no time", where=str(path))
+def _refuse_without_stamp(path: Path) -> Cloud:
+    raise InputError("has no stamp", where=str(path))
 
 
 def write(recording: Recording, path: str | Path, *, overwrite: bool = False) -> None:
-    """Write an odometry sequence: the hits of each scan in the sensor's frame.
+    """Write an odometry sequence with the hits of each scan in the sensor frame, atomically.
 
-    The recorded poses, else the odometry, become `poses.txt`. It appears whole or not at all.
+    The recorded poses, else the odometry, become `poses.txt`.
 
     Raises:
-        InputError: `path` is taken or cannot be written to, or there are several sensors.
+        InputError: `path` is taken or cannot be written, or there are several sensors.
     """
     require_single_sensor(recording, str(path))
     T = recording.T_odom_base if recording.T_recorded_base is None else recording.T_recorded_base
     T = sensor_poses(recording, T)
     digits = max(6, len(str(recording.n_scans)))
-    with atomic_folder(Path(path), MARK, overwrite) as folder:
+    with atomic_folder(Path(path), MARKER, overwrite) as folder:
         (folder / "velodyne").mkdir()
         for scan in recording.iter_scans(range(recording.n_scans)):
             points, _ = scan_hits(recording, scan)
@@ -213,6 +212,6 @@ def write(recording: Recording, path: str | Path, *, overwrite: bool = False) ->
         identity = " ".join(f"{value:g}" for value in np.eye(4)[:3].ravel())
         (folder / "calib.txt").write_text(f"Tr: {identity}\n", encoding="ascii")
         if T is not None:
-            rows_of_poses = (" ".join(f"{v:.17g}" for v in pose[:3].ravel()) for pose in T)
-            text = "".join(f"{row}\n" for row in rows_of_poses)
+            lines = (" ".join(f"{v:.17g}" for v in pose[:3].ravel()) for pose in T)
+            text = "".join(f"{row}\n" for row in lines)
             (folder / "poses.txt").write_text(text, encoding="ascii")

@@ -1,7 +1,4 @@
-"""Calibration files of KITTI: where cameras and the inertial unit sit beside the laser.
-
-Pictures in folders of KITTI.
-"""
+"""Camera and IMU calibration of KITTI folders, and the images in them."""
 
 import re
 from dataclasses import dataclass, field
@@ -18,18 +15,18 @@ from stillmap.io import cameras, images
 from stillmap.io.point_cloud.files import list_files, pose_from_row, rigid_transform
 from stillmap.io.point_cloud.kitti_times import assign_rows, read_times
 
-_LARGEST = 1 << 20  # bytes of a calibration file
+_MAX_BYTES = 1 << 20  # bytes of a calibration file
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the files say.
+    """Contents of the calibration files.
 
     Attributes:
-        T_camera_laser: (4, 4), of the first camera, rectified; None: unknown.
-        projection: (3, 4) of cameras by their numbers, rectified.
+        T_camera_laser: (4, 4), of the first rectified camera; None: unknown.
+        projection: (3, 4) matrices of the rectified cameras by number.
         T_laser_imu: (4, 4); None: unknown.
-        warnings: what could not be read.
+        warnings: on files that could not be read.
     """
 
     T_camera_laser: NDArray[np.float64] | None = None
@@ -39,29 +36,29 @@ class Calibration:
 
 
 class CameraParameters(NamedTuple):
-    """A camera: its pinhole matrix (3, 3) and where it sits on the laser (4, 4), if known."""
+    """Intrinsics (3, 3) and pose on the laser (4, 4) of a camera; None: unknown."""
 
     K: NDArray[np.float64] | None
     T_laser_camera: NDArray[np.float64] | None
 
 
 def find_calibration(folder: Path) -> Calibration:
-    """Calibration of an odometry folder, or of a raw one, where it lies in the folder above."""
+    """Read the calibration of an odometry folder, or of a raw drive or its parent folder."""
     try:
         if (folder / "calib.txt").is_file():
-            return _of_odometry(_entries(folder / "calib.txt"))
+            return _read_odometry_calibration(_read_entries(folder / "calib.txt"))
         for place in (folder, Path(folder.absolute()).parent):
             if (place / "calib_velo_to_cam.txt").is_file():
-                return _of_raw(place)
+                return _read_raw_calibration(place)
     except InputError as error:
-        return Calibration(warnings=(f"the calibration is not used: {error}",))
+        return Calibration(warnings=(f"the calibration is ignored: {error}",))
     return Calibration()
 
 
 def camera_parameters(calibration: Calibration, camera: int) -> CameraParameters:
-    """What is known of a camera.
+    """Intrinsics and pose of a camera.
 
-    P = K [I | t] projects what the first camera, rectified, sees: t is the way from it to here.
+    P = K [I | t] projects points of the first rectified camera; t is the offset between both.
     """
     P = calibration.projection.get(camera)
     if P is None:
@@ -77,45 +74,45 @@ def camera_parameters(calibration: Calibration, camera: int) -> CameraParameters
     return CameraParameters(K, se2.inverse(T @ calibration.T_camera_laser))
 
 
-def _of_odometry(entries: dict[str, NDArray[np.float64]]) -> Calibration:
+def _read_odometry_calibration(entries: dict[str, NDArray[np.float64]]) -> Calibration:
     Tr = next((entries[n] for n in ("Tr", "Tr_velo_cam", "Tr_velo_to_cam") if n in entries), None)
     projection = {n: entries[f"P{n}"] for n in range(4) if f"P{n}" in entries}
     try:
         T = None if Tr is None else pose_from_row(Tr)
-        return Calibration(T, {n: _projection(P) for n, P in projection.items()})
+        return Calibration(T, {n: _to_projection(P) for n, P in projection.items()})
     except ValueError as error:
         raise InputError(f"calib.txt: {error}") from error
 
 
-def _of_raw(folder: Path) -> Calibration:
+def _read_raw_calibration(folder: Path) -> Calibration:
     try:
-        laser = _entries(folder / "calib_velo_to_cam.txt")
+        laser = _read_entries(folder / "calib_velo_to_cam.txt")
         T, projection, T_laser_imu = rigid_transform(laser["R"], laser["T"]), {}, None
         if (folder / "calib_cam_to_cam.txt").is_file():
-            cameras = _entries(folder / "calib_cam_to_cam.txt")
+            cameras = _read_entries(folder / "calib_cam_to_cam.txt")
             T = rigid_transform(cameras["R_rect_00"], np.zeros(3)) @ T
             named = {n: cameras.get(f"P_rect_{n:02d}") for n in range(4)}
-            projection = {n: _projection(P) for n, P in named.items() if P is not None}
+            projection = {n: _to_projection(P) for n, P in named.items() if P is not None}
         if (folder / "calib_imu_to_velo.txt").is_file():
-            imu = _entries(folder / "calib_imu_to_velo.txt")
+            imu = _read_entries(folder / "calib_imu_to_velo.txt")
             T_laser_imu = rigid_transform(imu["R"], imu["T"])
         return Calibration(T, projection, T_laser_imu)
     except (ValueError, KeyError) as error:
         raise InputError(f"is damaged: {error}", where=str(folder)) from error
 
 
-def _projection(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_projection(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
     P = numbers.reshape(3, 4)
     if not np.isfinite(P).all():
         raise ValueError("a projection is not finite")
     return P
 
 
-def _entries(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Numbers by the word before the colon; lines of other things are passed over."""
+def _read_entries(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Numbers by the key before the colon; other lines are skipped."""
     try:
         with path.open("rb") as file:
-            text = file.read(_LARGEST).decode("ascii", "replace")
+            text = file.read(_MAX_BYTES).decode("ascii", "replace")
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
     out = {}
@@ -134,12 +131,12 @@ _FOLDER = re.compile(r"image_0?([0-3])")
 def find_images(
     folder: Path, calibration: Calibration, times: list[int | None]
 ) -> tuple[Images | None, list[str]]:
-    """The pictures of all cameras, and warnings on those that cannot be used.
+    """The images of all cameras, and warnings on those that are ignored.
 
     Args:
         folder: the recording.
-        calibration: where the cameras sit.
-        times: of the sweeps, which are those of pictures without their own.
+        calibration: intrinsics and extrinsics.
+        times: stamps of the scans, for images without stamps of their own.
     """
     parts: list[Images] = []
     warnings: list[str] = []
@@ -148,17 +145,17 @@ def find_images(
         if match is None or not place.is_dir():
             continue
         try:
-            found = _of_camera(place, times)
-            camera = _camera(place.name, int(match[1]), found, calibration)
+            files = _list_images(place, times)
+            camera = _make_camera(place.name, int(match[1]), files, calibration)
         except InputError as error:
-            warnings.append(f"the pictures in {place.name} are not used: {error}")
+            warnings.append(f"the images in {place.name} are ignored: {error}")
             continue
-        parts.append(cameras.images_from_files(found, camera))
+        parts.append(cameras.images_from_files(files, camera))
     return cameras.merge_images(parts) if parts else None, warnings
 
 
-def _of_camera(place: Path, times: list[int | None]) -> list[tuple[int, Path]]:
-    """Stamps and files of one camera's pictures."""
+def _list_images(place: Path, times: list[int | None]) -> list[tuple[int, Path]]:
+    """Stamps and files of the images of one camera."""
     inner = place / "data" if (place / "data").is_dir() else place
     files = list_files(inner, images.EXTENSIONS)
     own = place / "timestamps.txt"
@@ -168,11 +165,11 @@ def _of_camera(place: Path, times: list[int | None]) -> list[tuple[int, Path]]:
     return [(stamp, file) for stamp, file in zip(stamps, files, strict=True) if stamp is not None]
 
 
-def _camera(
-    name: str, number: int, found: list[tuple[int, Path]], calibration: Calibration
+def _make_camera(
+    name: str, number: int, files: list[tuple[int, Path]], calibration: Calibration
 ) -> Camera:
-    if not found:
+    if not files:
         raise InputError("there are none")
-    width, height = images.read_image_size(found[0][1])
+    width, height = images.read_image_size(files[0][1])
     K, T = camera_parameters(calibration, number)
     return Camera(name, width, height, K, "", np.zeros(0), T)

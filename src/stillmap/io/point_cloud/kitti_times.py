@@ -1,4 +1,4 @@
-"""Time stamps of KITTI, and which line of a file belongs to which sweep or picture."""
+"""KITTI time stamps, and their assignment to scan and image files."""
 
 import re
 from collections.abc import Sequence
@@ -13,48 +13,48 @@ _DATE = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d+)?")
 
 
 def read_times(path: Path) -> list[int | None]:
-    """Nanoseconds of every line: seconds, or a date with a time of day; None where unreadable.
+    """Read a stamp (ns) per line, of seconds or of a date and time; None where unreadable.
 
-    Dates count from 1970 in the clock they are written in.
+    Dates are taken as UTC.
 
     Raises:
         InputError: the file cannot be read.
     """
     out: list[int | None] = []
     for line in read_lines(path):
-        out.append(_stamp(line.text.decode("ascii", "replace").strip()))
-    texts_end = len(out)
-    while texts_end and out[texts_end - 1] is None:
-        texts_end -= 1
-    return out[:texts_end]
+        out.append(_parse_stamp(line.text.decode("ascii", "replace").strip()))
+    end = len(out)
+    while end and out[end - 1] is None:
+        end -= 1
+    return out[:end]
 
 
-def _stamp(text: str) -> int | None:
+def _parse_stamp(text: str) -> int | None:
     date = _DATE.fullmatch(text)
     try:
         if date is None:
             return parse_ns(text)
         at = datetime.fromisoformat(date[1]).replace(tzinfo=UTC)
-        whole = parse_ns(str(int(at.timestamp())))  # the year 9999 is beyond what it holds
+        whole = parse_ns(str(int(at.timestamp())))  # refuses years beyond int64 ns
         return whole + parse_ns(f"0{date[2] or '.0'}")
     except (ValueError, OverflowError):
         return None
 
 
 def assign_rows(files: Sequence[Path], rows: int, where: Path) -> list[int | None]:
-    """The line from 0 that belongs to each file; None: none does.
+    """Index of the line that belongs to each file; None: there is none.
 
-    Files whose names are numbers of lines take those, as where some sweeps are missing. Else
-    there must be as many files as lines.
+    File names that are numbers are line indices (scans may be missing); otherwise there must be as
+    many files as lines.
 
     Raises:
-        InputError: neither.
+        InputError: neither holds.
     """
     numbers = [int(f.stem) if re.fullmatch(r"[0-9]{1,18}", f.stem) else -1 for f in files]
-    fitting = all(number >= 0 for number in numbers) and len(set(numbers)) == len(numbers)
-    if len(files) == rows and not (fitting and max(numbers, default=0) < rows):
+    are_indices = all(number >= 0 for number in numbers) and len(set(numbers)) == len(numbers)
+    if len(files) == rows and not (are_indices and max(numbers, default=0) < rows):
         return list(range(rows))
-    if not fitting or numbers[0] >= rows:
-        what = f"has {rows} times for {len(files)} files, whose names do not tell which is whose"
+    if not are_indices or numbers[0] >= rows:
+        what = f"has {rows} stamps for {len(files)} files whose names are no line numbers"
         raise InputError(what, where=str(where))
     return [number if number < rows else None for number in numbers]

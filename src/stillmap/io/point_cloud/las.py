@@ -1,4 +1,4 @@
-"""LAS and LAZ files: one cloud, or a folder of them; read by laspy."""
+"""LAS and LAZ point clouds: single files or folders; read and written by laspy."""
 
 import io
 import struct
@@ -23,13 +23,13 @@ from stillmap.preprocessing.options import ReadOptions
 EXTENSIONS = (".las", ".laz")
 MAGIC = b"LASF"
 
-_BLOCK, _BLOCK_BYTES = 1 << 16, 8 << 20  # points read together, bytes of them
-_POINTS_PER_BYTE, _SURELY_FINE = 20, 10_000_000  # packed points take a byte each, and more
-_HEADER = 227  # bytes that every header has
-_EXTRA = 54  # bytes that a record after the header has at least
-_PACKED = 0xC0  # bits of the format of points
-_SMALLEST_CHUNK = 20  # bytes: its first point is not packed
-_SCALE = 0.0001  # m, of what is written
+_BLOCK, _BLOCK_BYTES = 1 << 16, 8 << 20  # points and bytes read at once
+_MAX_POINTS_PER_BYTE, _MIN_POINT_LIMIT = 20, 10_000_000  # compressed points take a byte or more
+_HEADER = 227  # bytes of the smallest header
+_VLR = 54  # bytes of the smallest variable length record
+_COMPRESSED = 0xC0  # bits of the point format
+_MIN_CHUNK = 20  # bytes: the first point of a chunk is not compressed
+SCALE = 0.0001  # m, coordinate step of written files
 
 
 def read(
@@ -44,36 +44,36 @@ def read(
         InputError: no cloud can be read, or laspy is missing.
     """
     import_extra("laspy", path)
-    return read_clouds(path, "LAS", EXTENSIONS, _cloud, options, progress, scratch)
+    return read_clouds(path, "LAS", EXTENSIONS, _read_cloud, options, progress, scratch)
 
 
-def _cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
+def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
     require_nonempty_file(path)
-    _require_sound(path)
+    _check_header(path)
     laspy = import_extra("laspy", path)
-    points, promised, found = PointBuffer(origin, scratch), 0, 0
-    # one thread: the others believe the sizes of chunks
+    points, expected, found = PointBuffer(origin, scratch), 0, 0
+    # single-threaded: the parallel backend trusts chunk sizes
     backend = laspy.LazBackend.Lazrs
-    with _refused(path), laspy.open(path, read_evlrs=False, laz_backend=backend) as reader:
-        promised = reader.header.point_count
-        if promised > max(_POINTS_PER_BYTE * path.stat().st_size, _SURELY_FINE):
-            raise truncated_error(path, 0, promised)
+    with _library_errors(path), laspy.open(path, read_evlrs=False, laz_backend=backend) as reader:
+        expected = reader.header.point_count
+        if expected > max(_MAX_POINTS_PER_BYTE * path.stat().st_size, _MIN_POINT_LIMIT):
+            raise truncated_error(path, 0, expected)
         rows = max(1, min(_BLOCK, _BLOCK_BYTES // reader.header.point_format.size))
         for block in reader.chunk_iterator(rows):
             if len(block) > rows:
                 raise InputError("is damaged: the size of its points", where=str(path))
             points.add(np.stack([block.x, block.y, block.z], axis=1))
             found += len(block)
-    if found < promised:
-        raise truncated_error(path, found, promised)
+    if found < expected:
+        raise truncated_error(path, found, expected)
     return Cloud(points.finish())
 
 
-def _require_sound(path: Path) -> None:
-    """Refuse counts that the libraries would believe, and run out of time or memory over.
+def _check_header(path: Path) -> None:
+    """Refuse header counts on which the libraries would run out of time or memory.
 
     Raises:
-        InputError: see there; or lazrs is missing.
+        InputError: the header is invalid, or lazrs is missing.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -81,37 +81,37 @@ def _require_sound(path: Path) -> None:
         if len(head) < _HEADER or head[:4] != MAGIC:
             raise InputError("is no LAS file", where=str(path))
         header_size, start, extras, kind = struct.unpack_from("<HIIB", head, 94)
-        if not header_size + _EXTRA * extras <= start <= size:
+        if not header_size + _VLR * extras <= start <= size:
             raise InputError("is damaged: its header", where=str(path))
-        if kind & _PACKED:
+        if kind & _COMPRESSED:
             import_extra("lazrs", path)
-        if kind & _PACKED and _chunks(file, start, size) > size // _SMALLEST_CHUNK:
+        if kind & _COMPRESSED and _count_chunks(file, start, size) > size // _MIN_CHUNK:
             raise InputError("is damaged: its table of chunks", where=str(path))
 
 
-def _chunks(file: IO[bytes], start: int, size: int) -> int:
-    """How many chunks a packed file says it has."""
+def _count_chunks(file: IO[bytes], start: int, size: int) -> int:
+    """Chunk count of a compressed file, as stated in it."""
     file.seek(start)
     table = int.from_bytes(file.read(8), "little", signed=True)
-    if table == -1:  # its place was not known when the points were written
+    if table == -1:  # streamed: the offset is at the end of the file
         file.seek(size - 8)
         table = int.from_bytes(file.read(8), "little", signed=True)
     if not start <= table <= size - 8:
-        return size  # none at all
+        return size  # no chunk table
     file.seek(table + 4)
     return int.from_bytes(file.read(4), "little")
 
 
 @contextmanager
-def _refused(path: Path) -> Iterator[None]:
-    """Whatever the library makes of damaged bytes is an InputError."""
+def _library_errors(path: Path) -> Iterator[None]:
+    """Turn errors of the library into InputError."""
     try:
         with np.errstate(all="ignore"):
             yield
     except (InputError, MemoryError):
         raise
     except BaseException as error:
-        # Rust's panics are no Exception
+        # panics of Rust derive from BaseException
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         what = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -121,9 +121,9 @@ def _refused(path: Path) -> Iterator[None]:
 def write(
     recording: Recording, path: str | Path, poses: NDArray[np.float64], *, overwrite: bool = False
 ) -> None:
-    """Write one cloud of all hits in the map frame, LAZ where the name ends so.
+    """Write all hits in the map frame as one LAS or (by extension) LAZ cloud, atomically.
 
-    Coordinates are rounded to 0.1 mm. It appears whole or not at all.
+    Coordinates are rounded to 0.1 mm.
 
     Args:
         recording: T scans.
@@ -132,35 +132,37 @@ def write(
         overwrite: replace a file.
 
     Raises:
-        InputError: `path` is taken or cannot be written to, or laspy is missing.
+        InputError: `path` is taken or cannot be written, or laspy is missing.
     """
     path = Path(path)
     require_new_file(path, overwrite)
     laspy = import_extra("laspy", path, "written")
-    head, packed = _header(laspy, poses), path.name.lower().endswith(".laz")
-    with atomic_file(path) as work, open_las_writer(work, laspy, head, packed) as writer:
+    header, compressed = _make_header(laspy, poses), path.name.lower().endswith(".laz")
+    with atomic_file(path) as work, open_las_writer(work, laspy, header, compressed) as writer:
         for points in iter_map_points(recording, poses):
-            block = laspy.ScaleAwarePointRecord.zeros(len(points), header=head)
+            block = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
             block.x, block.y, block.z = points.T
             writer.write_points(block)
 
 
 @contextmanager
-def open_las_writer(path: Path, laspy: Any, head: Any, packed: bool) -> Iterator[Any]:
-    """A writer of laspy.
+def open_las_writer(path: Path, laspy: Any, header: Any, compressed: bool) -> Iterator[Any]:
+    """Open a laspy writer.
 
     Args:
         path: a new file.
         laspy: the library.
-        head: a LasHeader.
-        packed: LAZ.
+        header: a LasHeader.
+        compressed: write LAZ.
 
     Raises:
-        OSError: the file cannot be written; what packs points makes an error of its own of that.
+        OSError: the file cannot be written; the compressor would raise another error.
     """
-    with _Remembering(io.FileIO(path, "w")) as file:
+    with _ErrorKeepingWriter(io.FileIO(path, "w")) as file:
         try:
-            with laspy.open(file, "w", header=head, do_compress=packed, closefd=False) as writer:
+            with laspy.open(
+                file, "w", header=header, do_compress=compressed, closefd=False
+            ) as writer:
                 yield writer
         except Exception as error:
             if file.failed is not None:
@@ -168,8 +170,8 @@ def open_las_writer(path: Path, laspy: Any, head: Any, packed: bool) -> Iterator
             raise
 
 
-class _Remembering(io.BufferedWriter):
-    """A file that knows why it could not be written."""
+class _ErrorKeepingWriter(io.BufferedWriter):
+    """Buffered file that keeps the error of a failed write."""
 
     failed: OSError | None = None
 
@@ -181,14 +183,14 @@ class _Remembering(io.BufferedWriter):
             raise
 
 
-def _header(laspy: Any, poses: NDArray[np.float64]) -> Any:
-    head = laspy.LasHeader(point_format=0, version="1.2")
-    head.scales = np.full(3, _SCALE)
-    # coordinates are 32 bit: they count from where the robot began
-    head.offsets = np.zeros(3)
+def _make_header(laspy: Any, poses: NDArray[np.float64]) -> Any:
+    header = laspy.LasHeader(point_format=0, version="1.2")
+    header.scales = np.full(3, SCALE)
+    # 32 bit coordinates, relative to the first pose
+    header.offsets = np.zeros(3)
     if len(poses):
-        head.offsets[: poses.shape[-1] - 1] = np.round(poses[0, :-1, -1])
-    head.generating_software = "stillmap"
-    # the day of writing would make other bytes of the same recording
-    head.creation_date = date(1970, 1, 1)
-    return head
+        header.offsets[: poses.shape[-1] - 1] = np.round(poses[0, :-1, -1])
+    header.generating_software = "stillmap"
+    # fixed, so that equal recordings give equal files
+    header.creation_date = date(1970, 1, 1)
+    return header

@@ -1,6 +1,6 @@
-"""PLY files of points: one cloud, or a folder of them.
+"""PLY point clouds: single files or folders; read and written here.
 
-Written here because no library at hand reads files that lie about their size safely.
+The reason is in CONTRIBUTING.md.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ from stillmap.preprocessing.options import ReadOptions
 
 EXTENSIONS = (".ply",)
 
-_HEADER = 1 << 16  # bytes in which it must end
+_MAX_HEADER = 1 << 16  # bytes
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -39,10 +39,10 @@ def read(
     Raises:
         InputError: no cloud can be read.
     """
-    return read_clouds(path, "PLY", EXTENSIONS, _cloud, options, progress, scratch)
+    return read_clouds(path, "PLY", EXTENSIONS, _read_cloud, options, progress, scratch)
 
 
-def _cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
+def _read_cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
     points = PointBuffer(origin, scratch)
     for block in read_columns(read_layout(path), ("x", "y", "z")):
         points.add(np.stack(block, axis=1))
@@ -50,29 +50,29 @@ def _cloud(path: Path, origin: Origin, scratch: Path | None) -> Cloud:
 
 
 def read_layout(path: Path) -> TableLayout:
-    """Where the vertices lie.
+    """Read the header: the layout of the vertices.
 
     Raises:
-        InputError: no PLY file, or one whose vertices cannot be found.
+        InputError: it is no PLY file, or its vertices cannot be located.
     """
     require_nonempty_file(path)
     with path.open("rb") as file:
-        head = file.read(_HEADER)
-    lines, start = _header(head, path)
+        head = file.read(_MAX_HEADER)
+    lines, start = _split_header(head, path)
     try:
-        return _understood(path, lines, start)
+        return _parse_header(path, lines, start)
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(f"is damaged: its header: {error}", where=str(path)) from error
 
 
-def _header(head: bytes, path: Path) -> tuple[list[list[str]], int]:
-    """Words of the header's lines, and where it ends."""
+def _split_header(head: bytes, path: Path) -> tuple[list[list[str]], int]:
+    """The header's lines as words, and the byte offset of its end."""
     lines: list[list[str]] = []
     at = 0
     while lines[-1:] != [["end_header"]]:
         end = head.find(b"\n", at)
         if end < 0:
-            raise InputError("is cut short: its header has no end", where=str(path))
+            raise InputError("is truncated: its header does not end", where=str(path))
         lines.append(head[at:end].decode("ascii", "replace").split())
         at = end + 1
     if lines[0] != ["ply"]:
@@ -80,9 +80,9 @@ def _header(head: bytes, path: Path) -> tuple[list[list[str]], int]:
     return lines, at
 
 
-def _understood(path: Path, lines: list[list[str]], start: int) -> TableLayout:
+def _parse_header(path: Path, lines: list[list[str]], start: int) -> TableLayout:
     encoding, order = "", ""
-    elements: list[tuple[str, int, list[Field | None]]] = []  # None: a list
+    elements: list[tuple[str, int, list[Field | None]]] = []  # None: a list property
     for words in lines[1:-1]:
         if words[:1] == ["format"]:
             encoding, order = words[1], _ORDERS[words[1]]
@@ -95,14 +95,14 @@ def _understood(path: Path, lines: list[list[str]], start: int) -> TableLayout:
     text, before = encoding == "ascii", len(lines)
     for name, rows, fields in elements:
         if rows < 0:
-            raise ValueError("a number of points below zero")
+            raise ValueError("a negative count of points")
         plain = tuple(field for field in fields if field is not None)
         if name == "vertex":
             if len(plain) < len(fields):
-                raise ValueError("its vertices hold lists")
+                raise ValueError("its vertices have list properties")
             return TableLayout(path, plain, rows, start, before, text)
         if len(plain) < len(fields) and not text:
-            raise ValueError("lists come before its vertices")
+            raise ValueError("list properties precede its vertices")
         start += rows * sum(field.size for field in plain)
         before += rows
     raise ValueError("no vertices")
@@ -111,7 +111,7 @@ def _understood(path: Path, lines: list[list[str]], start: int) -> TableLayout:
 def write(
     recording: Recording, path: str | Path, poses: NDArray[np.float64], *, overwrite: bool = False
 ) -> None:
-    """Write one binary cloud of all hits in the map frame; it appears whole or not at all.
+    """Write all hits in the map frame as one binary cloud, atomically.
 
     Args:
         recording: T scans.
@@ -120,7 +120,7 @@ def write(
         overwrite: replace a file.
 
     Raises:
-        InputError: `path` is taken or cannot be written to.
+        InputError: `path` is taken or cannot be written.
     """
     path = Path(path)
     require_new_file(path, overwrite)

@@ -1,9 +1,4 @@
-"""Clouds, one after the other, as the scans of a recording.
-
-Clouds without a place of their sensor, maybe far from the origin of their coordinates.
-
-Clouds that do not say where their sensor was: single files, or folders of them.
-"""
+"""Scan builder: point clouds from files, one by one, into a recording."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -22,17 +17,17 @@ from stillmap.io.point_cloud.time_field import Clock, convert_times, detect_cloc
 from stillmap.io.text_lines import Progress
 from stillmap.preprocessing.options import MAX_POINT_DISTANCE, ReadOptions
 
-_NAMED = 5  # skipped files that are named
+_MAX_NAMES = 5  # of skipped files in a warning
 
 
 class Cloud(NamedTuple):
-    """One scan as a file holds it.
+    """One scan of a file.
 
     Attributes:
-        points: (n, 3) metres in the sensor's frame.
-        T: (4, 4) where the sensor was, None where the file does not say.
-        times: (n,) as recorded, None where there are none.
-        stamp_ns: when it was taken, None where the file does not say.
+        points: (n, 3) metres in the sensor frame.
+        T: (4, 4) sensor pose; None: not recorded.
+        times: (n,) as recorded; None: not recorded.
+        stamp_ns: stamp; None: not recorded.
     """
 
     points: NDArray[Any]
@@ -42,7 +37,7 @@ class Cloud(NamedTuple):
 
 
 class CloudSource(NamedTuple):
-    """A cloud that can be read: its name for people, its stamp if that is known before."""
+    """A cloud to be read: its name in messages, and its stamp where known in advance."""
 
     name: str
     read: Callable[[], Cloud]
@@ -50,13 +45,13 @@ class CloudSource(NamedTuple):
 
 
 class DatasetInfo(NamedTuple):
-    """What is known of a recording before its clouds are read.
+    """Description of the file or folder being read.
 
     Attributes:
         path: of the file or folder.
-        format: for people.
-        warnings: to begin with; more are added.
-        single: one file: what is wrong with it is an error, nothing is skipped.
+        format: name of the format.
+        warnings: on the input; more are added.
+        single: whether it is one file: damage is an error, nothing is skipped.
     """
 
     path: Path
@@ -67,37 +62,35 @@ class DatasetInfo(NamedTuple):
 
 def build_recording(
     sources: Sequence[CloudSource],
-    known: DatasetInfo,
+    info: DatasetInfo,
     options: ReadOptions,
     progress: Progress | None = None,
     scratch: Path | None = None,
     **more: Any,
 ) -> Recording:
-    """The recording of all clouds that can be read.
-
-    Those that cannot are skipped and counted in `source["skipped"]` by their number from 1.
+    """Build a recording from clouds; unreadable ones are skipped and counted in `source`.
 
     Args:
-        sources: in order. Where no stamps are known, they are taken a second apart.
-        known: see Known.
-        options: see ReadOptions; there is one sensor, and it is the robot's base.
-        progress: called with the share that is read.
-        scratch: folder for what does not fit into memory.
+        sources: in order; scans without stamps are taken one second apart.
+        info: see DatasetInfo.
+        options: see ReadOptions; the one sensor is the base of the robot.
+        progress: called with the share of clouds read.
+        scratch: folder for large arrays.
         more: other fields of the Recording.
 
     Raises:
-        InputError: not one can be read, or a library is missing.
+        InputError: no cloud can be read, or a library is missing.
     """
     reject_laser_poses(options)
-    skipped, scans = SkippedRecords(), _Scans(sources, known, options, scratch)
+    skipped, scans = SkippedRecords(), _ScanBuilder(sources, info, options, scratch)
     lost: list[str] = []
     for number, source in enumerate(sources):
         try:
-            cloud = _read(source)
-            if known.single and not len(cloud.points):
-                raise InputError("holds no points", where=str(known.path))
+            cloud = _read_source(source)
+            if info.single and not len(cloud.points):
+                raise InputError("holds no points", where=str(info.path))
         except InputError as error:
-            if known.single or isinstance(error, MissingExtra):
+            if info.single or isinstance(error, MissingExtra):
                 raise
             skipped.add(error.what.partition(":")[0], number + 1)
             lost.append(source.name)
@@ -106,40 +99,40 @@ def build_recording(
         if progress is not None:
             progress((number + 1) / len(sources))
     if not len(scans):
-        raise no_usable_scan_error(known, skipped)
+        raise no_usable_scan_error(info, skipped)
     if lost:
-        shown = ", ".join(lost[:_NAMED]) + (", ..." if len(lost) > _NAMED else "")
-        known.warnings.append(f"skipped {len(lost)} of {len(sources)}: {shown}")
+        shown = ", ".join(lost[:_MAX_NAMES]) + (", ..." if len(lost) > _MAX_NAMES else "")
+        info.warnings.append(f"skipped {len(lost)} of {len(sources)}: {shown}")
     return scans.recording(skipped, **more)
 
 
 def reject_laser_poses(options: ReadOptions) -> None:
-    """Refuse options that place a laser on the robot.
+    """Refuse laser options, which are for 2D recordings.
 
     Raises:
-        InputError: there are such.
+        InputError: a pose, orientation or field of view is given.
     """
     options.check_laser_count(1)
-    given = options.laser(0)
-    if given.pose != (None, None, None) or given.upside_down or given.fov is not None:
+    laser = options.laser(0)
+    if laser.pose != (None, None, None) or laser.upside_down or laser.fov is not None:
         raise InputError("the laser's place on the robot can be given for 2D recordings only")
 
 
-def no_usable_scan_error(known: DatasetInfo, skipped: SkippedRecords) -> InputError:
-    """The error for a recording without a single scan that can be read."""
+def no_usable_scan_error(info: DatasetInfo, skipped: SkippedRecords) -> InputError:
+    """The error for a recording without a usable scan."""
     what = f"holds no usable scan: {skipped.summary('file')}" if skipped.total else "holds no scan"
-    return InputError(what, where=str(known.path))
+    return InputError(what, where=str(info.path))
 
 
 def range_options_note(options: ReadOptions) -> dict[str, Any]:
-    """The options that change what is there, for Recording.source."""
+    """The range options that are set, for Recording.source."""
     default = ReadOptions()
     names = ("min_range", "max_range", "free_range")
     given = {n: getattr(options, n) for n in names if getattr(options, n) != getattr(default, n)}
     return {"read_options": given} if given else {}
 
 
-def _read(source: CloudSource) -> Cloud:
+def _read_source(source: CloudSource) -> Cloud:
     try:
         return source.read()
     except MemoryError:
@@ -148,22 +141,22 @@ def _read(source: CloudSource) -> Cloud:
         raise InputError(f"cannot be read: {error.strerror}", where=source.name) from error
 
 
-class _Scans:
-    """Clouds on their way into a recording; the first one says whether points have times."""
+class _ScanBuilder:
+    """Collects clouds; the first one decides whether points have times."""
 
     def __init__(
         self,
         sources: Sequence[CloudSource],
-        known: DatasetInfo,
+        info: DatasetInfo,
         options: ReadOptions,
         scratch: Path | None,
     ) -> None:
-        self._known, self._options, self._scratch = known, options, scratch
-        self._period = _period(sources)
+        self._info, self._options, self._scratch = info, options, scratch
+        self._period = _median_period(sources)
         self._gathered: RecordingBuilder | None = None
         self._clock: Clock | None = None
         self._poses: list[NDArray[np.float64] | None] = []
-        self._counted = 0
+        self._without_stamp = 0
 
     def __len__(self) -> int:
         return len(self._poses)
@@ -171,38 +164,42 @@ class _Scans:
     def add(self, number: int, stamp_ns: int | None, cloud: Cloud) -> None:
         points = cloud.points
         if self._gathered is None:
-            self._clock = self._first_clock(cloud)
+            self._clock = self._detect_clock(cloud)
             self._gathered = RecordingBuilder(
                 3, self._options, beam_times=self._clock is not None, folder=self._scratch
             )
         stamp_ns = cloud.stamp_ns if stamp_ns is None else stamp_ns
         beam_time = None
         if self._clock is not None and cloud.times is not None:
-            stamp_ns, beam_time = convert_times(cloud.times, _usable(points), self._clock, stamp_ns)
+            stamp_ns, beam_time = convert_times(
+                cloud.times, _usable_mask(points), self._clock, stamp_ns
+            )
         if stamp_ns is None:
             stamp_ns = number * 10**9
-            self._counted += 1
+            self._without_stamp += 1
         self._gathered.add_scan(stamp_ns, points, beam_time=beam_time)
         self._poses.append(cloud.T)
 
-    def _first_clock(self, cloud: Cloud) -> Clock | None:
+    def _detect_clock(self, cloud: Cloud) -> Clock | None:
         if cloud.times is None:
             return None
-        clock = detect_clock(cloud.times[_usable(cloud.points)], self._period)
+        clock = detect_clock(cloud.times[_usable_mask(cloud.points)], self._period)
         if clock is None:
-            what = "the times of points are not used: no unit makes a sweep of them"
-            self._known.warnings.append(what)
+            what = "the time field is ignored: no unit gives a plausible duration of a scan"
+            self._info.warnings.append(what)
         return clock
 
     def recording(self, skipped: SkippedRecords, **more: Any) -> Recording:
         assert self._gathered is not None
-        known, warnings = self._known, self._known.warnings
-        if self._counted and len(self) > 1:
-            warnings.append(f"{self._counted} scans without a time are taken a second apart")
-        T = self._recorded_poses()
+        info, warnings = self._info, self._info.warnings
+        if self._without_stamp and len(self) > 1:
+            warnings.append(
+                f"{self._without_stamp} scans without a stamp are taken one second apart"
+            )
+        T = self._stack_poses()
         source = {
-            "path": str(known.path),
-            "format": known.format,
+            "path": str(info.path),
+            "format": info.format,
             "skipped": skipped.to_dict(),
             "skipped_unit": "file",
             "warnings": warnings,
@@ -212,81 +209,81 @@ class _Scans:
             np.eye(4)[None], source=source, **{"T_recorded_base": T, **more}
         )
 
-    def _recorded_poses(self) -> NDArray[np.float64] | None:
+    def _stack_poses(self) -> NDArray[np.float64] | None:
         found = [T for T in self._poses if T is not None]
         if not found or all(np.array_equal(T, np.eye(4)) for T in found):
             return None
         if len(found) < len(self._poses):
             missing = len(self._poses) - len(found)
-            self._known.warnings.append(f"{missing} scans have no pose: poses are not used")
+            self._info.warnings.append(f"{missing} scans have no pose: poses are ignored")
             return None
         return np.stack(found)
 
 
-def _period(sources: Sequence[CloudSource]) -> float | None:
-    """Seconds from scan to scan as stamps have it."""
+def _median_period(sources: Sequence[CloudSource]) -> float | None:
+    """Median time between stamps in seconds; None: unknown."""
     stamps = [source.stamp_ns for source in sources if source.stamp_ns is not None]
     if len(stamps) < 2:
         return None
     return float(np.median(np.diff(np.sort(np.array(stamps, np.int64))))) / 1e9
 
 
-def _usable(points: NDArray[Any]) -> NDArray[np.bool_]:
-    meant = (np.abs(points) <= MAX_POINT_DISTANCE).all(axis=1)
-    return np.asarray(meant & np.any(points != 0, axis=1))
+def _usable_mask(points: NDArray[Any]) -> NDArray[np.bool_]:
+    plausible = (np.abs(points) <= MAX_POINT_DISTANCE).all(axis=1)
+    return np.asarray(plausible & np.any(points != 0, axis=1))
 
 
-_NEAR = 4096.0  # m: so far single precision resolves half a millimetre
+_MAX_COORDINATE = 4096.0  # m: float32 resolves half a millimetre up to there
 
-NO_SENSOR = "the file tells no place of a sensor: beams count as sent from the origin"
+NO_SENSOR = "no sensor pose is recorded: beams start at the origin"
 
 
 class Origin:
-    """Where points are counted from, the same for all clouds of a recording.
+    """Common origin of all clouds of a recording, so that float32 coordinates stay precise.
 
-    Points near the origin of their coordinates stay where they are. Others are moved by whole
-    metres, found from the first block of points that is seen, unless `at` (3,) is given.
+    Unless `position` (3,) is given: zero where the first block of points is near the origin, else
+    its median, rounded to metres.
     """
 
-    def __init__(self, at: NDArray[np.float64] | None = None) -> None:
-        self.position = at
+    def __init__(self, position: NDArray[np.float64] | None = None) -> None:
+        self.position = position
 
     def shift(self, points: NDArray[Any]) -> NDArray[np.float32]:
-        """(n, 3) as seen from here, of points (n, 3) in metres as recorded."""
+        """(n, 3) points relative to the origin, of recorded points (n, 3) in metres."""
         points = np.asarray(points, np.float64)
         if self.position is None:
-            self.position = _origin_of(points)
+            self.position = _find_origin(points)
         with np.errstate(over="ignore"):
             return (points - (0.0 if self.position is None else self.position)).astype(np.float32)
 
     def notes(self) -> dict[str, Any]:
-        """For Recording.source; known after the first cloud."""
-        moved = self.position is not None and bool(np.any(self.position != 0.0))
+        """Entry for Recording.source; valid after the first cloud."""
+        is_shifted = self.position is not None and bool(np.any(self.position != 0.0))
         return (
             {"origin": [float(v) for v in self.position]}
-            if moved and self.position is not None
+            if is_shifted and self.position is not None
             else {}
         )
 
     def warnings(self) -> list[str]:
-        """What was assumed."""
+        """Warnings on the assumed sensor position."""
         place = self.notes().get("origin")
         if place is None:
             return [NO_SENSOR]
         at = " ".join(f"{value:.0f}" for value in place)
-        return [f"the file tells no place of a sensor: beams count as sent from {at}, the new zero"]
+        return [f"no sensor pose is recorded: beams start at {at}, the new origin"]
 
 
-def _origin_of(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _find_origin(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
     finite = points[np.isfinite(points).all(axis=1)]
     if not len(finite):
         return None
     middle = np.median(finite, axis=0)
-    return np.round(middle) if np.abs(middle).max() > _NEAR else np.zeros(3)
+    return np.round(middle) if np.abs(middle).max() > _MAX_COORDINATE else np.zeros(3)
 
 
 class PointBuffer:
-    """(n, 3) points that come in blocks; in a file where they are many."""
+    """Collects blocks of points (n, 3) relative to an origin; memory-mapped where large."""
 
     def __init__(self, origin: Origin, scratch: Path | None) -> None:
         self._origin = origin
@@ -305,33 +302,35 @@ CloudReader = Callable[[Path, Origin, Path | None], Cloud]
 def read_clouds(
     path: Path,
     name: str,
-    endings: tuple[str, ...],
-    cloud: CloudReader,
+    extensions: tuple[str, ...],
+    read_cloud: CloudReader,
     options: ReadOptions,
     progress: Progress | None,
     scratch: Path | None,
 ) -> Recording:
-    """The recording of a file, or of a folder of them.
+    """Read a file or folder of clouds without sensor poses.
 
     Args:
         path: of the file or folder.
         name: of the format.
-        endings: of the names of such files.
-        cloud: reads one, of a path, the common origin and a folder for what is large.
-        options, progress, scratch: see `assembled`.
+        extensions: of its files.
+        read_cloud: reads one file, given the common origin and a scratch folder.
+        options, progress, scratch: see `build_recording`.
 
     Raises:
         InputError: no cloud can be read.
     """
-    files = [path] if path.is_file() else list_files(path, endings)
-    stamps = stamps_from_names([strip_extension(file.name, endings) for file in files])
+    files = [path] if path.is_file() else list_files(path, extensions)
+    stamps = stamps_from_names([strip_extension(file.name, extensions) for file in files])
     origin = Origin()
-    known = DatasetInfo(path, name, [], single=path.is_file())
+    info = DatasetInfo(path, name, [], single=path.is_file())
     sources = [
-        CloudSource(file.name, partial(cloud, file, origin, scratch), stamps[i] if stamps else None)
+        CloudSource(
+            file.name, partial(read_cloud, file, origin, scratch), stamps[i] if stamps else None
+        )
         for i, file in enumerate(files)
     ]
-    recording = build_recording(sources, known, options, progress, scratch)
+    recording = build_recording(sources, info, options, progress, scratch)
     recording.source.update(origin.notes())
     recording.source["warnings"] += origin.warnings()
     return recording

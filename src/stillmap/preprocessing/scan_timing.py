@@ -1,0 +1,76 @@
+"""Per-beam times of a spinning lidar, computed from azimuths where the recording has none."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillmap.core.recording import Recording
+
+Float = NDArray[np.float64]
+
+SPIN_KEY = "spin"  # in Recording.source: beam times were computed here
+
+_SIGN = {"clockwise": -1.0, "counter-clockwise": 1.0}
+_TURN = 2.0 * math.pi
+_SPIN_START = math.pi  # rad, azimuth at which a revolution begins: behind the robot
+_RATES = (0.5, 200.0)  # 1/s, revolutions of lidars; stamps farther apart miss scans
+
+
+def add_beam_times(
+    recording: Recording, direction: str, stamp_azimuth: float = _SPIN_START
+) -> Recording:
+    """Add `beam_time` from the azimuth of each point; one revolution lasts from stamp to stamp.
+
+    Args:
+        recording: 3D. Returned unchanged, with a warning, where it has beam times or its stamps
+            give no rate.
+        direction: `clockwise` or `counter-clockwise` seen from above; any other: no change.
+        stamp_azimuth: rad, azimuth of the beam that is measured at the stamp.
+    """
+    if direction not in _SIGN or SPIN_KEY in recording.source:
+        return recording
+    if recording.beam_time is not None:
+        return _with_warning(recording, "read.spin is ignored: beams have times of their own")
+    rates = [_spin_rate(recording, k) for k in range(len(recording.T_base_sensor))]
+    if not all(rates):
+        return _with_warning(recording, "read.spin is ignored: the stamps give no rate of turns")
+    per_second = np.array(rates, np.float64)
+    beam_time = recording.allocate_per_beam(np.float32)
+    for t in recording.iter_scans(range(recording.n_scans), beam_time):
+        beams = recording.beams_of(t)
+        turns = turns_since_stamp(recording.points[beams], direction, stamp_azimuth)
+        beam_time[beams] = turns / per_second[recording.sensor[t]]
+    spin = {
+        "direction": direction,
+        "turns_per_second": [round(float(rate), 4) for rate in per_second],
+        "start": _SPIN_START,
+        "stamp": stamp_azimuth,
+    }
+    return replace(recording, beam_time=beam_time, source={**recording.source, SPIN_KEY: spin})
+
+
+def turns_since_stamp(
+    points: NDArray[np.float32], direction: str, stamp_azimuth: float = _SPIN_START
+) -> Float:
+    """(n,) revolutions between the stamp and each of points (n, 3); 0 for unusable points."""
+    sign = _SIGN[direction]
+    azimuth = np.arctan2(points[:, 1].astype(np.float64), points[:, 0].astype(np.float64))
+    since_start = np.mod(sign * (azimuth - _SPIN_START), _TURN)
+    stamp = math.fmod(sign * (stamp_azimuth - _SPIN_START), _TURN) % _TURN
+    return np.nan_to_num((since_start - stamp) / _TURN)
+
+
+def _spin_rate(recording: Recording, sensor: int) -> float | None:
+    """Revolutions per second of a sensor, from the median time between stamps; None: unknown."""
+    stamps = recording.stamp_ns[recording.sensor == sensor]
+    if len(stamps) < 2:
+        return None
+    seconds = float(np.median(np.diff(stamps))) / 1e9
+    return 1.0 / seconds if 1.0 / _RATES[1] <= seconds <= 1.0 / _RATES[0] else None
+
+
+def _with_warning(recording: Recording, what: str) -> Recording:
+    warnings = [*recording.source.get("warnings", []), what]
+    return replace(recording, source={**recording.source, "warnings": warnings})
