@@ -1,1 +1,1 @@
-"""What stands still, as a mesh: polygons of range images, merged, thinned out."""
+"""Meshes of 3D recordings: the static surface, its texture, object models and point colors."""

@@ -1,4 +1,5 @@
-"""Models of a recording in 3D: a surface, painted; and what moved, likewise (Sect. 4.4, 4.5)."""
+"""Builds the models of a 3D recording: the textured static surface and the moving objects
+(Sect. 4.4, 4.5)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from stillmap.mesh.objects.merging import ObjectTrack, collect_tracks, merge_tra
 from stillmap.mesh.objects.reconstruction import ObjectShape, reconstruct_object
 from stillmap.mesh.objects.segmentation import DynamicReturns
 from stillmap.mesh.objects.texturing import TexturedViews, assign_object_views, times_in_view
-from stillmap.mesh.options import MeshOptions, VisibleOptions
+from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.place import ViewAssignment, assign_views
 from stillmap.mesh.point_colors import PointColors, color_points
 from stillmap.mesh.texture.atlas import TexturedMesh, replace_faces
@@ -35,21 +36,21 @@ Float = NDArray[np.float64]
 Read = Callable[[int], NDArray[Any]]
 Tell = Callable[[int, int], None]
 
-_NEEDED = ("skimage.measure", "pyfqmr", "xatlas", "trimesh")  # of the extra `mesh`
-_SPOILED = 0.5  # probability that a picture shows static things only, below which it does not
+_LIBRARIES = ("skimage.measure", "pyfqmr", "xatlas", "trimesh")  # of the extra `mesh`
+_MAX_P_SPOILED = 0.5  # that an image shows static surface only: below, a mover is in front
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
-    """What moved, as a model in its own frame: x ahead, y left, z up, on the ground.
+    """A moving object as a model in its own frame: x ahead, y left, z up, on the ground.
 
     Attributes:
-        shape: its surface, and where it was.
-        dressed: which view paints each face.
-        textured: with the pictures on it.
-        T_map_object: (4, 4) where it was when it was of this shape.
-        stamp_ns: when that was.
-        span_ns: from when to when what was seen of it is in the model.
+        shape: its surface, and its frame over time.
+        face_views: which view textures each face.
+        textured: the textured surface.
+        T_map_object: (4, 4) pose of the frame at `stamp_ns`.
+        stamp_ns: time of this shape.
+        span_ns: first and last beam that it is made of.
     """
 
     shape: ObjectShape
@@ -62,19 +63,19 @@ class ObjectModel:
 
 @dataclass(frozen=True, eq=False)
 class Models:
-    """The place without its people, and the people.
+    """The static surface without movers, and the moving objects.
 
     Attributes:
-        painted: the surface of the place, and which of `views` paints each face.
-        textured: with the pictures on it.
-        unfiltered: the same with the sharpest picture wherever that probably shows something that
-            moves, as it would be without labels; None where that is nowhere.
-        views: the pictures that can be used.
-        left_out: how many others there are, by reason.
-        unread: a line for each of the others that could not be read.
-        movers: models of what moved, in the order of the objects.
-        tried: how many objects there are.
-        tints: colours of the beams' ends; None where there are no pictures, or nobody wants them.
+        assignment: the static surface, and which of `views` textures each face.
+        textured: the textured surface.
+        unfiltered: the same with the sharpest image on faces where that probably shows a mover, as
+            without labels; None where there are no such faces.
+        views: usable images.
+        left_out: number of other images, by reason.
+        unread: one line for each image that could not be read.
+        objects: models of moving objects, in the order of the objects.
+        n_objects: number of moving objects.
+        point_colors: colors of the end points; None without images.
     """
 
     assignment: ViewAssignment
@@ -89,107 +90,110 @@ class Models:
 
 
 def require_extras() -> None:
-    """Refuses before any work is done.
+    """Checks that the libraries of the extra `mesh` are installed.
 
     Raises:
-        MissingExtra: a library of the extra `mesh` is not installed.
+        MissingExtra: one is not.
     """
-    for module in _NEEDED:
+    for module in _LIBRARIES:
         import_extra(module, "mesh.glb", "made", group="mesh")
 
 
 def build_models(
-    sources: MeshInputs,
+    inputs: MeshInputs,
     options: MeshOptions,
     threads: int = 1,
     progress: Progress = no_progress,
     stages: StageTimer | None = None,
 ) -> Models:
-    """A surface from what stands still, and for each face the picture that most likely shows it.
+    """Builds the static surface, textures it, and models the moving objects.
 
     Args:
-        sources: a recording of which everything is known.
+        inputs: a posed and labelled recording.
         options: see MeshOptions.
         threads: same result with any number.
-        progress: called with what is done, 0, and how much of it.
-        stages: where time and memory per stage are noted.
+        progress: called with the stage, 0, the work done and the total.
+        stages: records time and memory per stage.
 
     Raises:
         MissingExtra: a library of the extra `mesh` is not installed.
     """
     stages = stages or StageTimer()
 
-    def tell(what: str) -> Tell:
-        return lambda done, total: progress(what, 0, done, total)
+    def tell(stage: str) -> Tell:
+        return lambda done, total: progress(stage, 0, done, total)
 
     with stages.measure("surface"):
         mesh = build_surface(
-            sources.deskewed,
-            sources.poses,
-            sources.p_static,
-            options.surface,
+            inputs.deskewed,
+            inputs.poses,
+            inputs.p_static,
+            options,
             threads,
             tell("building the surface"),
         )
     with stages.measure("painting"):
-        views, left_out, unread = _usable(sources, tell("reading pictures"))
-        limits = options.texture.visible
-        place, gain = assign_views(
-            mesh, views, sources, options.choice, limits, threads, tell("choosing pictures")
-        )
-        sources = _levelled(sources, views, gain)
-    progress("putting pictures on the surface", 0, 0, 0)
+        views, left_out, unread = _usable_views(inputs, tell("reading images"))
+        place, gains = assign_views(mesh, views, inputs, threads, tell("selecting views"))
+        inputs = _compensate_exposure(inputs, views, gains)
+    progress("baking textures", 0, 0, 0)
+    images = inputs.recording.images
     with stages.measure("texture"):
-        read = _reader(sources.recording.images)
-        textured = bake_texture(place.mesh, place.view, views, read, options.texture)
-        unfiltered = _unfiltered(textured, place, views, read, options)
-    ahead = _ahead(place, views, sources.recording.images, limits)
+        textured = bake_texture(
+            place.mesh, place.view, views, _reader(images), options.texture_size
+        )
+        unfiltered = _bake_unfiltered(textured, place, views, images, options.texture_size)
+    background = Background(
+        place, views, lambda view: None if images is None else read_color_image(images, view)
+    )
     with stages.measure("movers"):
-        movers, moves = [], DynamicReturns.collect(sources)
-        if options.objects.enabled:
-            movers = _movers(sources, moves, views, ahead, options, tell("building what moved"))
-    tints = None
-    if views and options.points.enabled:
+        models, returns = [], DynamicReturns.collect(inputs)
+        if options.objects:
+            models = _model_objects(
+                inputs, returns, background, options, tell("modelling moving objects")
+            )
+    colors = None
+    if views:
         with stages.measure("points"):
-            now = tell("colouring points")
-            tints = color_points(sources, textured, ahead, moves, options, threads, now)
-    tried = len(sources.objects)
-    return Models(place, textured, unfiltered, views, left_out, unread, movers, tried, tints)
+            now = tell("coloring points")
+            colors = color_points(inputs, textured, background, returns, threads, now)
+    return Models(
+        place, textured, unfiltered, views, left_out, unread, models, len(inputs.objects), colors
+    )
 
 
-def _usable(sources: MeshInputs, tell: Tell) -> tuple[list[View], dict[str, int], list[str]]:
-    """Pictures of a known place that can be read; how many cannot be used, and which not read."""
-    views, left_out = find_views(sources.recording, sources.poses)
-    views, unread = filter_readable(sources.recording.images, views, tell)
+def _usable_views(inputs: MeshInputs, tell: Tell) -> tuple[list[View], dict[str, int], list[str]]:
+    """Readable images with known poses; how many are left out by reason; which cannot be read."""
+    views, left_out = find_views(inputs.recording, inputs.poses)
+    views, unread = filter_readable(inputs.recording.images, views, tell)
     if unread:
         left_out = {**left_out, UNREADABLE: left_out.get(UNREADABLE, 0) + len(unread)}
     return views, left_out, unread
 
 
-def _levelled(sources: MeshInputs, views: Sequence[View], gain: Float) -> MeshInputs:
-    """The same with pictures of one exposure."""
-    images = sources.recording.images
+def _compensate_exposure(inputs: MeshInputs, views: Sequence[View], gains: Float) -> MeshInputs:
+    """The inputs with gains (n, 3) applied to the images of n views."""
+    images = inputs.recording.images
     if images is None:
-        return sources
-    recording = replace(sources.recording, images=apply_gains(images, views, gain))
-    return replace(sources, recording=recording)
+        return inputs
+    recording = replace(inputs.recording, images=apply_gains(images, views, gains))
+    return replace(inputs, recording=recording)
 
 
-def _unfiltered(
+def _bake_unfiltered(
     textured: TexturedMesh,
     place: ViewAssignment,
     views: list[View],
-    read: Read,
-    options: MeshOptions,
+    images: Images | None,
+    texture_size: int,
 ) -> TexturedMesh | None:
-    """With the sharpest picture on the faces of which that probably shows something that moves."""
-    spoiled = (place.sharpest >= 0) & (place.p_sharpest < _SPOILED)
+    """The mesh with the sharpest image on the faces where that probably shows a mover."""
+    spoiled = (place.sharpest >= 0) & (place.p_sharpest < _MAX_P_SPOILED)
     if not spoiled.any():
         return None
-    part = bake_texture(
-        place.mesh.select(spoiled), place.sharpest[spoiled], views, read, options.texture
-    )
-    return replace_faces(textured, spoiled, part)
+    part = place.mesh.select(spoiled)
+    baked = bake_texture(part, place.sharpest[spoiled], views, _reader(images), texture_size)
+    return replace_faces(textured, spoiled, baked)
 
 
 def _reader(images: Images | None) -> Read:
@@ -197,71 +201,54 @@ def _reader(images: Images | None) -> Read:
         return images.read
 
     def none(image: int) -> NDArray[Any]:
-        raise IndexError(f"there is no picture {image}")
+        raise IndexError(f"there is no image {image}")
 
     return none
 
 
-def _ahead(
-    place: ViewAssignment, views: list[View], images: Images | None, limits: VisibleOptions
-) -> Background:
-    def colours(view: View) -> NDArray[np.uint8] | None:
-        return None if images is None else read_color_image(images, view)
-
-    return Background(place, views, limits, colours)
-
-
-def _movers(
-    sources: MeshInputs,
-    moves: DynamicReturns,
-    views: Sequence[View],
-    ahead: Background,
+def _model_objects(
+    inputs: MeshInputs,
+    returns: DynamicReturns,
+    background: Background,
     options: MeshOptions,
     tell: Tell,
 ) -> list[ObjectModel]:
-    followed = collect_tracks(sources, moves, options.objects)
-    wholes = merge_tracks(followed, moves, sources, options.objects)
+    groups = merge_tracks(collect_tracks(inputs, returns), returns, inputs)
     out = []
-    for number, whole in enumerate(wholes):
-        model = _mover(whole, sources, moves, views, ahead, options)
+    for number, tracks in enumerate(groups):
+        model = _model_object(tracks, inputs, returns, background, options)
         if model is not None:
             out.append(model)
-        tell(number + 1, len(wholes))
+        tell(number + 1, len(groups))
     return sorted(out, key=lambda model: model.shape.id)
 
 
-def _mover(
-    whole: Sequence[ObjectTrack],
-    sources: MeshInputs,
-    moves: DynamicReturns,
-    views: Sequence[View],
-    place: Background,
+def _model_object(
+    tracks: Sequence[ObjectTrack],
+    inputs: MeshInputs,
+    returns: DynamicReturns,
+    background: Background,
     options: MeshOptions,
 ) -> ObjectModel | None:
-    """The model of what was followed as one or more objects; None where `shape_of` finds none."""
-    start = sources.start_ns
-    seconds = [times_in_view(one.box, views, start) for one in whole]
+    """The model of one object; None where `reconstruct_object` finds none."""
+    start, views = inputs.start_ns, background.views
+    seconds = [times_in_view(one.box, views, start) for one in tracks]
     shown = [some[np.isfinite(some)] for some in seconds]
-    shape = reconstruct_object(whole, sources, moves, options.objects, shown)
+    shape = reconstruct_object(tracks, inputs, returns, shown)
     if shape is None:
         return None
-    parts = {one.object.id for one in whole if one.object.id != shape.id}
-    dress = assign_object_views(
-        shape,
-        views,
-        place,
-        [thing for thing in sources.boxes if thing.box.object_id not in parts],
-        start,
-        options.objects,
-        options.choice,
-        options.texture.visible,
-    )
-    read = _reader(sources.recording.images)
+    parts = {one.object.id for one in tracks if one.object.id != shape.id}
+    boxes = [one for one in inputs.boxes if one.box.object_id not in parts]
+    found = assign_object_views(shape, views, background, boxes, start)
     textured = bake_texture(
-        dress.assignment.mesh, dress.assignment.view, dress.views, read, options.texture
+        found.assignment.mesh,
+        found.assignment.view,
+        found.views,
+        _reader(inputs.recording.images),
+        options.texture_size,
     )
     T = shape.frame.T_map_object(shape.seconds)
     first, middle, last = (
-        start + round(1e9 * seconds) for seconds in (shape.span[0], shape.seconds, shape.span[1])
+        start + round(1e9 * at) for at in (shape.span[0], shape.seconds, shape.span[1])
     )
-    return ObjectModel(shape, dress, textured, T, middle, (first, last))
+    return ObjectModel(shape, found, textured, T, middle, (first, last))

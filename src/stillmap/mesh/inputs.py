@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import max_scan_duration_ns
 from stillmap.em import GroundMap
-from stillmap.mesh.options import SurfaceOptions
-from stillmap.mesh.range_image import find_scan_layout
+from stillmap.mesh.range_image import is_row_scanner
 from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.mesh.texture.occlusion import LidarReturns
 from stillmap.tracking import MovingObject
@@ -28,11 +27,11 @@ class MeshInputs:
 
     Attributes:
         recording: as it was read, with its times and images.
-        seen: the same, deskewed.
+        deskewed: the same, deskewed.
         poses: (T, 4, 4) T_map_base.
         p_static: (M,) P(c = 1).
         objects: moving objects with their beams.
-        things: boxes along their tracks, and boxes of detections too short for a track.
+        boxes: boxes along their tracks, and boxes of detections too short for a track.
         start_ns: stamp at which the seconds of these boxes begin.
         ground: ground height.
     """
@@ -52,7 +51,7 @@ class MeshInputs:
         return max_scan_duration_ns(self.recording)
 
     def index_returns(self) -> LidarReturns:
-        """The returns, indexed by time."""
+        """The returns, looked up by time."""
         owned = {one.id: one.beams for one in self.objects}
         boxes = [one.box for one in self.boxes if one.box.object_id in owned]
         return LidarReturns(
@@ -63,7 +62,7 @@ class MeshInputs:
             boxes,
             [owned[box.object_id] for box in boxes],
             self.start_ns,
-            find_scan_layout(self.deskewed, np.zeros(0, np.intp), SurfaceOptions()).is_planar,
+            is_row_scanner(self.deskewed),
         )
 
 

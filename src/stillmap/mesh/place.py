@@ -1,4 +1,4 @@
-"""The place without its people: a surface, and for each face the picture that paints it."""
+"""View assignment: the image that textures each face of the static surface (Sect. 4.4)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 from stillmap.core.camera import project
 from stillmap.core.parallel import map_ordered
 from stillmap.mesh.inputs import MeshInputs
-from stillmap.mesh.options import ChoiceOptions, VisibleOptions
 from stillmap.mesh.simplification import subdivide
 from stillmap.mesh.texture.exposure import estimate_gains
 from stillmap.mesh.texture.occluders import (
+    OUTLINE_MARGIN,
     TrackedBox,
     boxes_at,
     is_in_or_behind_box,
@@ -36,18 +36,25 @@ Float = NDArray[np.float64]
 Index = NDArray[np.int32]
 Tell = Callable[[int, int], None]
 
+CANDIDATES = 6  # views compared for each face
+SEAM_COST = 1.0  # e-folds of resolution where two images meet
+_P_UNOBSERVED = 0.9  # that an image shows static surface where no beam tells
+_MAX_COLOR_DIFFERENCE = 40.0  # of 442, from the median color of a face's candidates
+_MAX_FACE_EDGE = 0.25  # m: longer edges are subdivided, as each part has its own view
+_MIN_EDGE_PIXELS = 16.0  # edges shorter than this in the nearest image are not
+
 
 @dataclass(frozen=True, eq=False)
 class ViewAssignment:
-    """A surface of F faces, and which of N views paints each.
+    """A surface of F faces, and which of N views textures each.
 
     Attributes:
-        mesh: the surface, its long edges divided.
-        view: (F,) number of the view; -1: none sees it without something that moves before it.
-        p_static: (F,) how probably that view shows static things only; 0 where there is none.
-        seen: (F,) whether any view sees it at all.
-        sharpest: (F,) number of the view that shows it in most pixels, whatever stands before it.
-        p_sharpest: (F,) how probably that one shows static things only.
+        mesh: the surface, its long edges subdivided.
+        view: (F,) number of the view; -1: none shows it without a mover in front.
+        p_static: (F,) probability that this view shows static surface only; 0 without a view.
+        visible: (F,) whether any view shows it at all.
+        sharpest: (F,) number of the view with most pixels, movers or not.
+        p_sharpest: (F,) probability that this one shows static surface only.
     """
 
     mesh: Mesh
@@ -61,80 +68,73 @@ class ViewAssignment:
 def assign_views(
     mesh: Mesh,
     views: Sequence[View],
-    sources: MeshInputs,
-    options: ChoiceOptions,
-    limits: VisibleOptions,
+    inputs: MeshInputs,
     threads: int = 1,
     tell: Tell | None = None,
+    use_occlusion: bool = True,
 ) -> tuple[ViewAssignment, Float]:
-    """Chooses for each face the view that most likely shows static things only (Sect. 4.4).
+    """Chooses for each face the view that most likely shows static surface only (Sect. 4.4).
 
     Args:
-        mesh: what stands still.
-        views: pictures and where they were taken.
-        sources: the beams that tell what moves, and when.
-        options: see ChoiceOptions.
-        limits: see VisibleOptions.
+        mesh: the static surface.
+        views: images and their poses.
+        inputs: beams and objects.
         threads: same result with any number.
-        tell: called with how many views are looked at, and of how many.
+        tell: called with the number of views done and the total.
+        use_occlusion: without, the sharpest view is taken, movers or not.
 
     Returns:
-        What paints each face; (N, 3) by which colours of N views are multiplied to be of one
-        exposure.
+        The view of each face; (N, 3) gains for the colors of N views.
     """
     if views:
-        mesh, _ = subdivide(mesh, partial(max_edge_at, views, options))
-    beams, areas = sources.index_returns(), mesh.areas()
-    candidates = Candidates.empty(len(mesh), min(options.candidates, max(len(views), 1)))
+        mesh, _ = subdivide(mesh, partial(max_edge_at, views))
+    returns, areas = inputs.index_returns(), mesh.areas()
+    candidates = Candidates.empty(len(mesh), min(CANDIDATES, max(len(views), 1)))
     sharpest = Candidates.empty(len(mesh), 1)
 
-    def looked_at(view: View) -> tuple[NDArray[np.intp], Float, Float]:
-        found = find_visible_faces(mesh, view, limits)
+    def evaluate(view: View) -> tuple[NDArray[np.intp], Float, Float]:
+        found = find_visible_faces(mesh, view)
         faces = np.flatnonzero(found.visible)
         p = np.zeros(0)
         if len(faces):
-            p = p_unoccluded(mesh, faces, view, beams, sources.boxes, options)
+            p = p_unoccluded(mesh, faces, view, returns, inputs.boxes)
         return faces, found.pixels[faces].astype(np.float64), p
 
-    for number, (faces, pixels, p) in enumerate(map_ordered(looked_at, views, threads)):
-        candidates.add(number, faces, view_utility(p, pixels, areas[faces], options), p)
+    for number, (faces, pixels, p) in enumerate(map_ordered(evaluate, views, threads)):
+        candidates.add(number, faces, view_utility(p, pixels, areas[faces], use_occlusion), p)
         sharpest.add(number, faces, pixels, p)
         if tell is not None:
             tell(number + 1, len(views))
-    images, gain = sources.recording.images, np.ones((len(views), 3))
-    if views and images is not None and (options.level or (options.believe and options.odd > 0.0)):
-        found = sample_face_colors(mesh, candidates, views, partial(read_color_image, images))
-        if options.level:
-            gain = estimate_gains(candidates.view, found, len(views))
-            found *= gain[candidates.view]  # of no picture, NaN stays
-        if options.believe and options.odd > 0.0:
-            candidates = reject_inconsistent_views(candidates, found, options.odd)
-    return resolve_assignment(mesh, candidates, sharpest, options.border), gain
+    images, gains = inputs.recording.images, np.ones((len(views), 3))
+    if views and images is not None:
+        colors = sample_face_colors(mesh, candidates, views, partial(read_color_image, images))
+        gains = estimate_gains(candidates.view, colors, len(views))
+        colors *= gains[candidates.view]  # NaN where there is no view
+        if use_occlusion:
+            candidates = reject_inconsistent_views(candidates, colors, _MAX_COLOR_DIFFERENCE)
+    return resolve_assignment(mesh, candidates, sharpest), gains
 
 
-def max_edge_at(views: Sequence[View], options: ChoiceOptions, points: Float) -> Float:
-    """(n,) metres, how long edges may be that end at points (n, 3).
+def max_edge_at(views: Sequence[View], points: Float) -> Float:
+    """(n,) metres, maximum length of edges that end at points (n, 3).
 
-    `edge` metres, and where the nearest camera is far what is `edge_pixels` wide in its pictures.
+    `_MAX_FACE_EDGE`, or where the nearest camera is far, `_MIN_EDGE_PIXELS` of its images.
     """
     away, nearest = cKDTree(np.array([view.position for view in views])).query(points)
     focal = np.array([0.0 if view.camera.K is None else view.camera.K[0, 0] for view in views])
-    wide = options.edge_pixels * away / np.maximum(focal[nearest], 1.0)
-    return np.asarray(np.maximum(options.edge, wide), np.float64)
+    wide = _MIN_EDGE_PIXELS * away / np.maximum(focal[nearest], 1.0)
+    return np.asarray(np.maximum(_MAX_FACE_EDGE, wide), np.float64)
 
 
-def resolve_assignment(
-    mesh: Mesh, candidates: Candidates, sharpest: Candidates, border: float
-) -> ViewAssignment:
-    """What paints each face once neighbours have settled.
+def resolve_assignment(mesh: Mesh, candidates: Candidates, sharpest: Candidates) -> ViewAssignment:
+    """Selects the view of each of F faces from its candidates, with few seams.
 
     Args:
         mesh: F faces.
         candidates: the best views of each.
-        sharpest: of each the one that shows it in most pixels.
-        border: what it costs where two views meet.
+        sharpest: the view of each with most pixels.
     """
-    view = select_views(candidates, mesh.adjacent_faces(), border)
+    view = select_views(candidates, mesh.adjacent_faces(), SEAM_COST)
     p_static = np.where(candidates.view == view[:, None], candidates.p_static, 0.0).max(axis=1)
     return ViewAssignment(
         mesh,
@@ -150,28 +150,26 @@ def p_unoccluded(
     mesh: Mesh,
     faces: NDArray[np.intp],
     view: View,
-    beams: LidarReturns,
-    things: Sequence[TrackedBox],
-    options: ChoiceOptions,
+    returns: LidarReturns,
+    boxes: Sequence[TrackedBox],
 ) -> Float:
-    """(n,) how probably a view shows static things only where it sees faces (n,).
+    """(n,) probability that a view shows static surface only at faces (n,).
 
-    By what beams taken about then say, and where there are none by whether a thing that is followed
-    stands before it; where one does, nothing behind it speaks against that. Of the corners of a
-    face and its middle the least counts.
+    From the returns near its timestamp, and where there are none from the boxes of moving objects;
+    the minimum over the corners and the center of a face.
     """
     part = mesh.subset(faces)
     points = np.concatenate([part.vertices, part.centers])
-    seconds = 1e-9 * (view.stamp_ns - beams.start_ns)
-    there = boxes_at(things, seconds)
-    free = 1.0 - occlusion_probability(there, view.position, points, options.margin, options.sigma)
-    ends, p_static = beams.near_time(view.stamp_ns, options)
-    # a laser sees past a thing what the camera beside it does not see
-    speaks = (p_static < 0.5) | ~is_in_or_behind_box(there, view.position, ends)
-    found = build_occlusion_mask(view, ends[speaks], p_static[speaks], options.margin)
+    seconds = 1e-9 * (view.stamp_ns - returns.start_ns)
+    there = boxes_at(boxes, seconds)
+    free = 1.0 - occlusion_probability(there, view.position, points)
+    ends, p_static = returns.near_time(view.stamp_ns)
+    # a laser sees past an object what the camera beside it does not see
+    informative = (p_static < 0.5) | ~is_in_or_behind_box(there, view.position, ends)
+    mask = build_occlusion_mask(view, ends[informative], p_static[informative])
     local = view.to_camera(points)
     uv, ok = project(view.camera, local)
-    uv = np.where(ok[:, None], uv, 0.0)  # corners just outside: as at the edge
-    p = found.p_unoccluded(uv, local[:, 2], options.margin, options.unseen * free)
+    uv = np.where(ok[:, None], uv, 0.0)  # corners just outside: as at the border
+    p = mask.p_unoccluded(uv, local[:, 2], OUTLINE_MARGIN, _P_UNOBSERVED * free)
     a, b, c = (p[part.faces[:, k]] for k in range(3))
     return np.minimum(np.minimum(a, b), np.minimum(c, p[len(part.vertices) :]))

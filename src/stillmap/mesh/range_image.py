@@ -1,14 +1,11 @@
-"""The polygons of range images: neighbouring beams that hit the same surface (Sect. 4.5).
+"""Triangulation of range images: neighboring beams that hit the same surface (Sect. 4.5).
 
-How a sensor looks about is told by its beams, whatever the recording was read from:
+The neighborhood of beams is derived from their directions, whatever format they were read from:
 
-- scans whose beams lie in a plane through the sensor are rows, and scans that follow one another
-  are neighbours, in whatever direction a joint turns them;
-- scans that are cut into rows of equal length, as depth pictures and the columns of lidars are;
-- scans in rows of different lengths, as the rings of lidars without the beams that were lost;
+- scans in a plane through the sensor are rows, and successive scans are neighbors;
+- scans divisible into rows of equal length, as depth images and columns of lidars, are grids;
+- scans in rows of different lengths, as rings of lidars without lost returns, are strips;
 - all others: the Delaunay triangulation of the directions.
-
-In which order a sensor looks about: by rows of beams, by a plane at a time, or in any.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,7 +18,6 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
 from stillmap.core.recording import Recording
-from stillmap.mesh.options import SurfaceOptions
 from stillmap.mesh.triangulation import (
     filter_faces,
     split_rows,
@@ -29,119 +25,53 @@ from stillmap.mesh.triangulation import (
     triangulate_strips,
 )
 
+Bool = NDArray[np.bool_]
+Faces = NDArray[np.int32]
 Float = NDArray[np.float64]
-
 Index = NDArray[np.intp]
 
-_SAMPLES = 2000  # beams that are asked
-
-_SHORTEST = 4  # beams in a row
-
-_NEXT = 0.15  # rad, between neighbours in a row or in a column, at most
-
-_STEPS = 30.0  # as far as so many beams of a row may two rows be from each other
-
-_ACROSS = 0.5  # cosine between a row and a column
-
-_FLAT = 0.04  # rad from a plane, of the beams of a planar laser: it may sit off the joint
-
-_WIDE = 0.2  # rad, what these spread within the plane
-
-
-def beam_directions(points: NDArray[np.floating]) -> Float:
-    """(n, 3) of length one, NaN where points (n, 3) are, or lie in the sensor."""
-    wide = points.astype(np.float64)
-    length = np.linalg.norm(wide, axis=1, keepdims=True)
-    return np.asarray(wide / np.where(length > 0.0, length, np.nan))
-
-
-def find_row_length(looking: Float) -> int:
-    """How many beams each row of a range image has; 0: beams are in no such order.
-
-    Between neighbours in a row directions change little, and across from row to row, at a right
-    angle. Of the lengths that divide the number of beams the shortest one for which this holds.
-
-    Args:
-        looking: (n, 3) directions of the beams, row by row, NaN where unknown.
-    """
-    n = len(looking)
-    step = max(n // _SAMPLES, 1)
-    for length in range(_SHORTEST, n // 2 + 1):
-        if n % length == 0 and _is_row(looking, length, step):
-            return length
-    return 0
-
-
-def _is_row(looking: Float, length: int, step: int) -> bool:
-    # not all in one column
-    k = np.arange(0, len(looking) - length - 1, step)
-    k += np.arange(len(k)) % 7
-    k = k[(k + length < len(looking)) & (k % length != length - 1)]
-    along, across = looking[k + 1] - looking[k], looking[k + length] - looking[k]
-    known = np.isfinite(along).all(axis=1) & np.isfinite(across).all(axis=1)
-    if np.count_nonzero(known) < max(8, len(k) // 20):
-        return False
-    along, across = along[known], across[known]
-    one, other = np.linalg.norm(along, axis=1), np.linalg.norm(across, axis=1)
-    usual, farthest = float(np.median(one)), float(np.percentile(other, 90))
-    if not 0.0 < usual <= _NEXT or not 0.0 < farthest <= min(_NEXT, _STEPS * usual):
-        return False
-    cosine = np.abs(np.einsum("ni,ni->n", along, across)) / np.maximum(one * other, 1e-300)
-    return float(np.median(cosine)) < _ACROSS
-
-
-def is_planar(looking: Float) -> bool:
-    """Whether beams with directions (n, 3), NaN where unknown, all lie in one plane."""
-    known = looking[np.isfinite(looking).all(axis=1)]
-    if len(known) < _SHORTEST:
-        return False
-    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(known.T @ known / len(known)), 0.0))
-    return bool(spread[0] < _FLAT and spread[1] > _WIDE)
-
-
-def median_angle(one: Float, other: Float) -> float:
-    """rad, median angle between directions (n, 3) and (n, 3); NaN where none are known of both."""
-    chord = np.linalg.norm(one - other, axis=1)
-    known = chord[np.isfinite(chord)]
-    return float(2.0 * np.arcsin(0.5 * np.median(known))) if len(known) else float("nan")
-
-
-_ROWS = 128  # planar scans worked on together
-
-_SAME = 0.2  # of the usual angle between rows: nearer ones are the same row
-
-_FAR = 4.0  # times the usual angle between rows, farther ones are no neighbours
-
-_SEAM = 0.2  # rad by which a turn goes on beyond its end
-
-_NARROW = 0.5  # cosine of the angle from the middle of a picture to its corners, at least
+MAX_SCAN_GAP = 1.0  # s: between scans farther apart the motion is unknown
+_MAX_SPACING_RATIO = 3.0  # of an unordered triangle's longest edge to the median: else a hole
+_SAMPLES = 2000  # beams by which row lengths are tested
+_MIN_ROW_LENGTH = 4  # beams
+_MAX_SPACING = 0.15  # rad between neighbors in a row or in a column
+_MAX_ROW_RATIO = 30.0  # of the angle between rows to that between beams
+_MAX_ROW_COSINE = 0.5  # between the directions of rows and columns
+_FLATNESS = 0.04  # rad from a plane: a planar laser may sit off its joint
+_MIN_SPREAD = 0.2  # rad within the plane
+_TESTED_SCANS = 9  # that tell whether scans are planar
+_ROWS_PER_PATCH = 128  # planar scans triangulated together
+_MIN_ROW_STEP = 0.2  # of the median angle between rows: nearer ones are the same row
+_MAX_ROW_STEP = 4.0  # times that angle: farther ones are no neighbors
+_SEAM = 0.2  # rad by which directions are continued beyond a full turn
+_MIN_PERSPECTIVE_COSINE = 0.5  # from the center of a scan to its corners: else not one plane
 
 
 class Patch(NamedTuple):
-    """Polygons of a range image, or of neighbouring planar scans.
+    """Triangles of a range image, or of successive planar scans.
 
     Attributes:
         points: (n, 3) metres.
-        faces: (m, 3) int32, counter-clockwise seen from the sensor.
-        beam: (n,) that each point is of, in the recording.
-        origin: (n, 3) where the sensor was, in the frame of the points.
+        faces: (m, 3) int32, counter-clockwise as seen from the sensor.
+        beam: (n,) number of each point's beam in the recording.
+        origin: (n, 3) sensor position, in the frame of the points.
         standoff: (n,) metres from there to the surface's tangent plane at the point.
     """
 
     points: Float
-    faces: NDArray[np.int32]
+    faces: Faces
     beam: Index
     origin: Float
     standoff: Float
 
 
 class ScanLayout(NamedTuple):
-    """In which order the beams of a recording come.
+    """How the scans of a recording form range images.
 
     Attributes:
-        planar: whether scans are rows.
-        groups: of scans: a range image each, or planar ones that follow one another.
-        stride: of pictures only each so many-th row and column is used.
+        is_planar: whether each scan is a row.
+        groups: scans of each range image.
+        stride: every how many-th row and column is used.
     """
 
     is_planar: bool
@@ -149,161 +79,224 @@ class ScanLayout(NamedTuple):
     stride: int = 1
 
 
-def find_scan_layout(seen: Recording, chosen: Index, o: SurfaceOptions) -> ScanLayout:
-    """How the sensors look about.
+def beam_directions(points: NDArray[np.floating]) -> Float:
+    """(n, 3) unit vectors, NaN where points (n, 3) are, or lie in the sensor."""
+    wide = points.astype(np.float64)
+    length = np.linalg.norm(wide, axis=1, keepdims=True)
+    return np.asarray(wide / np.where(length > 0.0, length, np.nan))
+
+
+def find_row_length(directions: Float) -> int:
+    """Number of beams in each row of a range image; 0: the scan is no grid.
+
+    Within rows directions change little, and from row to row at a right angle to that. The
+    shortest divisor of the number of beams for which this holds.
 
     Args:
-        seen: 3D.
-        chosen: of its scans, those to be used; where scans are rows, all are.
-        o: see SurfaceOptions.
+        directions: (n, 3) row by row, NaN where unknown.
     """
-    counts = np.diff(seen.offset)
-    asked = np.unique(np.linspace(0, seen.n_scans - 1, min(seen.n_scans, 9)).astype(np.intp))
-    planar = [is_planar(beam_directions(seen.points[seen.beams_of(t)])) for t in asked]
-    if sum(planar) * 2 > len(planar) and len(np.unique(counts[counts > 0])) == 1:
-        return ScanLayout(True, _sequences(seen, o.pause))
+    n = len(directions)
+    step = max(n // _SAMPLES, 1)
+    for length in range(_MIN_ROW_LENGTH, n // 2 + 1):
+        if n % length == 0 and _is_row_length(directions, length, step):
+            return length
+    return 0
+
+
+def _is_row_length(directions: Float, length: int, step: int) -> bool:
+    # not all in one column
+    k = np.arange(0, len(directions) - length - 1, step)
+    k += np.arange(len(k)) % 7
+    k = k[(k + length < len(directions)) & (k % length != length - 1)]
+    along, across = directions[k + 1] - directions[k], directions[k + length] - directions[k]
+    known = np.isfinite(along).all(axis=1) & np.isfinite(across).all(axis=1)
+    if np.count_nonzero(known) < max(8, len(k) // 20):
+        return False
+    along, across = along[known], across[known]
+    one, other = np.linalg.norm(along, axis=1), np.linalg.norm(across, axis=1)
+    spacing, widest = float(np.median(one)), float(np.percentile(other, 90))
+    if not 0.0 < spacing <= _MAX_SPACING:
+        return False
+    if not 0.0 < widest <= min(_MAX_SPACING, _MAX_ROW_RATIO * spacing):
+        return False
+    cosine = np.abs(np.einsum("ni,ni->n", along, across)) / np.maximum(one * other, 1e-300)
+    return float(np.median(cosine)) < _MAX_ROW_COSINE
+
+
+def is_planar(directions: Float) -> bool:
+    """Whether beams with directions (n, 3), NaN where unknown, lie in one plane."""
+    known = directions[np.isfinite(directions).all(axis=1)]
+    if len(known) < _MIN_ROW_LENGTH:
+        return False
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(known.T @ known / len(known)), 0.0))
+    return bool(spread[0] < _FLATNESS and spread[1] > _MIN_SPREAD)
+
+
+def has_planar_scans(recording: Recording) -> bool:
+    """Whether most scans of a 3D recording are planar, as those of a tilting laser."""
+    n = recording.n_scans
+    tested = np.unique(np.linspace(0, n - 1, min(n, _TESTED_SCANS)).astype(np.intp))
+    planar = [is_planar(beam_directions(recording.points[recording.beams_of(t)])) for t in tested]
+    return sum(planar) * 2 > len(planar)
+
+
+def is_row_scanner(recording: Recording) -> bool:
+    """Whether scans are planar and of one length, so that each is a row of a range image."""
+    counts = np.diff(recording.offset)
+    return has_planar_scans(recording) and len(np.unique(counts[counts > 0])) == 1
+
+
+def median_angle(one: Float, other: Float) -> float:
+    """rad, median angle between directions (n, 3) and (n, 3); NaN where no pair is known."""
+    chord = np.linalg.norm(one - other, axis=1)
+    known = chord[np.isfinite(chord)]
+    return float(2.0 * np.arcsin(0.5 * np.median(known))) if len(known) else float("nan")
+
+
+def find_scan_layout(recording: Recording, chosen: Index) -> ScanLayout:
+    """The range images of a 3D recording.
+
+    Args:
+        recording: 3D.
+        chosen: scans to be used; where scans are rows, all are.
+    """
+    counts = np.diff(recording.offset)
+    if is_row_scanner(recording):
+        return ScanLayout(True, _split_sequences(recording))
     return ScanLayout(False, [np.array([t]) for t in chosen if counts[t]])
 
 
-def _sequences(seen: Recording, pause: float) -> list[Index]:
-    """Planar scans that follow one another, each sequence beginning where the last one ended."""
+def _split_sequences(recording: Recording) -> list[Index]:
+    """Successive planar scans, each sequence beginning with the last scan of the one before."""
     out = []
-    # a laser on a joint may count as another sensor at each scan, where it sits otherwise
-    once = np.bincount(seen.sensor, minlength=len(seen.T_base_sensor)) == 1
-    of_sensor = np.where(once[seen.sensor], np.int32(-1), seen.sensor)
+    # a laser on a joint may count as another sensor at each scan, where its pose differs
+    once = np.bincount(recording.sensor, minlength=len(recording.T_base_sensor)) == 1
+    of_sensor = np.where(once[recording.sensor], np.int32(-1), recording.sensor)
     for sensor in np.unique(of_sensor):
-        scans = np.flatnonzero((of_sensor == sensor) & (np.diff(seen.offset) > 0))
-        ends = np.flatnonzero(np.diff(seen.stamp_ns[scans]) > pause * 1e9) + 1
+        scans = np.flatnonzero((of_sensor == sensor) & (np.diff(recording.offset) > 0))
+        ends = np.flatnonzero(np.diff(recording.stamp_ns[scans]) > MAX_SCAN_GAP * 1e9) + 1
         for part in np.split(scans, ends):
-            for first in range(0, max(len(part) - 1, 0), _ROWS):
-                out.append(part[first : first + _ROWS + 1])
+            for first in range(0, max(len(part) - 1, 0), _ROWS_PER_PATCH):
+                out.append(part[first : first + _ROWS_PER_PATCH + 1])
     return sorted(out, key=lambda part: int(part[0]))
 
 
 def triangulate_scans(
-    seen: Recording, poses: Float, order: ScanLayout, o: SurfaceOptions
+    recording: Recording, poses: Float, layout: ScanLayout
 ) -> Iterator[Callable[[], Patch]]:
-    """What makes each patch, in the order of the scans.
+    """Functions that make each patch, in the order of the scans.
 
     Args:
-        seen: 3D, without motion during its scans.
+        recording: 3D, deskewed.
         poses: (T, 4, 4) T_map_base.
-        order: see `order_of`.
-        o: limits.
+        layout: see `find_scan_layout`.
     """
-    T = seen.T_map_sensor(poses)
-    lengths: dict[tuple[int, int], int] = {}
-    for scans in order.groups:
-        yield partial(_patch, seen, T, scans, order, lengths, o)
+    T = recording.T_map_sensor(poses)
+    row_lengths: dict[tuple[int, int], int] = {}
+    for scans in layout.groups:
+        yield partial(_make_patch, recording, T, scans, layout, row_lengths)
 
 
-def _patch(
-    seen: Recording,
+def _make_patch(
+    recording: Recording,
     T_map_sensor: Float,
     scans: Index,
-    order: ScanLayout,
-    lengths: dict[tuple[int, int], int],
-    o: SurfaceOptions,
+    layout: ScanLayout,
+    row_lengths: dict[tuple[int, int], int],
 ) -> Patch:
-    beam = np.concatenate([np.arange(seen.offset[t], seen.offset[t + 1]) for t in scans])
-    local = seen.points[beam].astype(np.float64)
-    scan = np.repeat(np.arange(len(scans)), np.diff(seen.offset)[scans])
+    beam = np.concatenate([np.arange(recording.offset[t], recording.offset[t + 1]) for t in scans])
+    local = recording.points[beam].astype(np.float64)
+    counts = np.diff(recording.offset)[scans]
+    scan = np.repeat(np.arange(len(scans)), counts)
     T = T_map_sensor[scans]
-    bounds = np.concatenate([[0], np.cumsum(np.diff(seen.offset)[scans])])
+    bounds = pairwise(np.concatenate([[0], np.cumsum(counts)]))
     points = np.concatenate(
-        [
-            local[i:j] @ one[:3, :3].T + one[:3, 3]
-            for one, (i, j) in zip(T, pairwise(bounds), strict=True)
-        ]
+        [local[i:j] @ one[:3, :3].T + one[:3, 3] for one, (i, j) in zip(T, bounds, strict=True)]
     )
     origin = T[scan, :3, 3]
     x, y, z = points.T
-    use = seen.hit[beam] & np.isfinite(x + y + z)
-    points[~use] = 0.0  # nothing is made of these
-    looking = beam_directions(local)
-    if order.is_planar:
-        turned = seen.T_base_sensor[seen.sensor[scans], :3, :3]
-        looking = np.einsum("nij,nj->ni", turned[scan], looking)
+    use = recording.hit[beam] & np.isfinite(x + y + z)
+    points[~use] = 0.0  # in no triangle
+    directions = beam_directions(local)
+    if layout.is_planar:
+        R = recording.T_base_sensor[recording.sensor[scans], :3, :3]
+        directions = np.einsum("nij,nj->ni", R[scan], directions)
         number = np.arange(len(beam), dtype=np.int32).reshape(len(scans), -1)
-        faces = _between_rows(points, use, number, looking)
+        faces = _triangulate_rows(points, use, number, directions)
     else:
-        key = (int(seen.sensor[scans[0]]), len(beam))
-        if key not in lengths:
-            lengths[key] = find_row_length(looking)
-        faces = _of_image(points, use, looking, lengths[key], order.stride, o)
-    kept = filter_faces(points, origin, faces, o)
+        key = (int(recording.sensor[scans[0]]), len(beam))
+        if key not in row_lengths:
+            row_lengths[key] = find_row_length(directions)
+        faces = _triangulate_image(points, use, directions, row_lengths[key], layout.stride)
+    kept = filter_faces(points, origin, faces)
     used = np.zeros(len(points), np.bool_)
     used[kept.faces] = True
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
     return Patch(points[used], number[kept.faces], beam[used], origin[used], kept.standoff[used])
 
 
-def _between_rows(
-    points: Float, use: NDArray[np.bool_], number: NDArray[np.int32], looking: Float
-) -> NDArray[np.int32]:
-    """Triangles between planar scans that follow one another, (R, W) numbers of their points."""
-    angle = np.array([median_angle(looking[a], looking[b]) for a, b in pairwise(number)])
+def _triangulate_rows(points: Float, use: Bool, number: Faces, directions: Float) -> Faces:
+    """Triangles between successive planar scans, (R, W) numbers of their points."""
+    angle = np.array([median_angle(directions[a], directions[b]) for a, b in pairwise(number)])
     usual = float(np.nanmedian(angle)) if np.isfinite(angle).any() else 0.0
-    kept, gone = [0], 0.0
+    kept, turned = [0], 0.0
     breaks = []
     for row, step in enumerate(angle, start=1):
-        gone += step if np.isfinite(step) else 0.0
-        if gone < _SAME * usual and row < len(number) - 1:
+        turned += step if np.isfinite(step) else 0.0
+        if turned < _MIN_ROW_STEP * usual and row < len(number) - 1:
             continue
-        if gone > _FAR * usual:
+        if turned > _MAX_ROW_STEP * usual:
             breaks.append(len(kept))
         kept.append(row)
-        gone = 0.0
+        turned = 0.0
     parts = np.split(number[kept], breaks)
     faces = [triangulate_grid(points, use, part) for part in parts if len(part) > 1]
     return np.concatenate([np.zeros((0, 3), np.int32), *faces])
 
 
-def _of_image(
-    points: Float,
-    use: NDArray[np.bool_],
-    looking: Float,
-    length: int,
-    stride: int,
-    o: SurfaceOptions,
-) -> NDArray[np.int32]:
-    """Triangles of one scan whose rows have a length, 0: of any order."""
-    if not length:
-        return _in_any_order(use, looking, o)
-    number = np.arange(len(points), dtype=np.int32).reshape(-1, length)
-    along = median_angle(looking[:-1], looking[1:])
-    across = median_angle(looking[:-length], looking[length:])
-    if median_angle(looking[number[:, -1]], looking[number[:, 0]]) < 2.0 * along:
+def _triangulate_image(
+    points: Float, use: Bool, directions: Float, row_length: int, stride: int
+) -> Faces:
+    """Triangles of one scan; a row length of 0 means that it is no grid."""
+    if not row_length:
+        return _triangulate_unordered(use, directions)
+    number = np.arange(len(points), dtype=np.int32).reshape(-1, row_length)
+    along = median_angle(directions[:-1], directions[1:])
+    across = median_angle(directions[:-row_length], directions[row_length:])
+    if median_angle(directions[number[:, -1]], directions[number[:, 0]]) < 2.0 * along:
         number = np.concatenate([number, number[:, :1]], axis=1)
-    if len(number) > 2 and median_angle(looking[number[-1]], looking[number[0]]) < 2.0 * across:
+    if len(number) > 2 and median_angle(directions[number[-1]], directions[number[0]]) < (
+        2.0 * across
+    ):
         number = np.concatenate([number, number[:1]])
     return triangulate_grid(points, use, number[::stride, ::stride])
 
 
-def _in_any_order(use: NDArray[np.bool_], looking: Float, o: SurfaceOptions) -> NDArray[np.int32]:
-    """Triangles between beams that are used; none spans much more than most do."""
+def _triangulate_unordered(use: Bool, directions: Float) -> Faces:
+    """Triangles between valid beams in strips or in no order; without those that span holes."""
     beams = np.flatnonzero(use)
     if len(beams) < 3:
         return np.zeros((0, 3), np.int32)
-    seen = looking[beams]
-    rows_found = split_rows(seen)
-    faces = triangulate_directions(seen) if rows_found is None else triangulate_strips(rows_found)
+    valid = directions[beams]
+    rows = split_rows(valid)
+    faces = triangulate_directions(valid) if rows is None else triangulate_strips(rows)
     if not len(faces):
         return faces
-    chord = np.linalg.norm(seen[faces] - np.roll(seen[faces], 1, axis=1), axis=2).max(axis=1)
-    faces = faces[chord <= o.widest * np.median(chord)]
+    chord = np.linalg.norm(valid[faces] - np.roll(valid[faces], 1, axis=1), axis=2).max(axis=1)
+    faces = faces[chord <= _MAX_SPACING_RATIO * np.median(chord)]
     return np.asarray(beams[faces], np.int32)
 
 
-def triangulate_directions(looking: Float) -> NDArray[np.int32]:
-    """(m, 3) the Delaunay triangulation of directions (n, 3) of length one."""
-    middle = looking.mean(axis=0)
+def triangulate_directions(directions: Float) -> Faces:
+    """(m, 3) the Delaunay triangulation of unit vectors (n, 3)."""
+    middle = directions.mean(axis=0)
     middle /= max(float(np.linalg.norm(middle)), 1e-12)
-    if float((looking @ middle).min()) > _NARROW:
+    if float((directions @ middle).min()) > _MIN_PERSPECTIVE_COSINE:
         side = np.linalg.svd(middle[None])[2][1:]
-        plane, of = (looking @ side.T) / (looking @ middle)[:, None], np.arange(len(looking))
+        plane = (directions @ side.T) / (directions @ middle)[:, None]
+        of = np.arange(len(directions))
     else:
-        plane, of = _unrolled(looking)
+        plane, of = _unroll(directions)
     try:
         found = Delaunay(plane).simplices
     except QhullError:  # all in one line
@@ -313,11 +306,11 @@ def triangulate_directions(looking: Float) -> NDArray[np.int32]:
     return np.asarray(faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2])])
 
 
-def _unrolled(looking: Float) -> tuple[Float, Index]:
-    """Azimuth and elevation, going on beyond a turn on both sides, and which beam each is of."""
-    azimuth = np.arctan2(looking[:, 1], looking[:, 0])
-    elevation = np.arcsin(np.clip(looking[:, 2], -1.0, 1.0))
-    plane, of = np.stack([azimuth, elevation], axis=1), np.arange(len(looking))
+def _unroll(directions: Float) -> tuple[Float, Index]:
+    """Azimuth and elevation, continued beyond a full turn on both sides, and the beam of each."""
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    elevation = np.arcsin(np.clip(directions[:, 2], -1.0, 1.0))
+    plane, of = np.stack([azimuth, elevation], axis=1), np.arange(len(directions))
     low, high = azimuth < _SEAM - np.pi, azimuth > np.pi - _SEAM
     turn = np.array([2.0 * np.pi, 0.0])
     both = np.concatenate([plane, plane[low] + turn, plane[high] - turn])

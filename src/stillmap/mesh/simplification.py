@@ -1,7 +1,4 @@
-"""Fewer triangles for the same surface: quadric error metrics.
-
-Triangles that are divided until no edge is long, without gaps between them.
-"""
+"""Mesh simplification by quadric error metrics, and subdivision of long edges."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,33 +10,37 @@ from stillmap.core.errors import import_extra
 from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]
-
 Index = NDArray[np.int32]
 
-_SIMPLIFICATION_ROUNDS = 20  # in which the error that is let pass grows to what is allowed
+_MIN_ERROR, _ERROR_SHARE = 0.01, 0.25  # m, and of a voxel's edge: how far a surface may move
 
-_GROWTH = 3.0  # with this power
+# pyfqmr lets an error pass of alpha * (iteration + K) ** aggressiveness
+_SIMPLIFICATION_ROUNDS = 20
+_AGGRESSIVENESS = 3.0
+_K = 3.0
 
-_FIRST = 3.0  # the round with which it begins
+_ERROR_GROWTH = 2.0  # factor by which the error grows while there are too many triangles
+_MAX_GROWTHS = 24
+_STALLED = 0.9  # share of the triangles left from which on more error does not help
 
-_AGAIN = 2.0  # times as much error is allowed next, while there are too many triangles
+_SUBDIVISION_ROUNDS = 12  # each halves the longest edges
 
-_MOST = 24  # times
 
-_LITTLE = 0.9  # of the triangles left: more error does not help
+def simplification_error(voxel: float) -> float:
+    """Error bound in metres for a surface of voxels with this edge in metres."""
+    return max(_MIN_ERROR, _ERROR_SHARE * voxel)
 
 
 def simplify(mesh: Mesh, error: float, *, whole_border: bool = True, most: int = 0) -> Mesh:
-    """The mesh with fewer triangles; none is turned over.
+    """Simplifies a mesh; no triangle is flipped.
 
     Garland and Heckbert, "Surface Simplification Using Quadric Error Metrics", SIGGRAPH 1997.
 
     Args:
         mesh: welded.
-        error: metres, root of the sum of squared distances from the planes around that a vertex
-            may have.
+        error: metres, root of the sum of a vertex's squared distances from the planes around it.
         whole_border: keep each vertex on the border.
-        most: triangles that are enough; as few as the error allows in any case if 0.
+        most: number of triangles that is enough; 0: as few as the error allows.
     """
     if len(mesh) <= most or not len(mesh) or error <= 0.0:
         return mesh
@@ -49,9 +50,9 @@ def simplify(mesh: Mesh, error: float, *, whole_border: bool = True, most: int =
     work.simplify_mesh(
         target_count=most,
         max_iterations=_SIMPLIFICATION_ROUNDS,
-        aggressiveness=_GROWTH,
-        K=_FIRST,
-        alpha=error * error / (_SIMPLIFICATION_ROUNDS + _FIRST) ** _GROWTH,
+        aggressiveness=_AGGRESSIVENESS,
+        K=_K,
+        alpha=error * error / (_SIMPLIFICATION_ROUNDS + _K) ** _AGGRESSIVENESS,
         preserve_border=whole_border,
         verbose=False,
     )
@@ -60,70 +61,66 @@ def simplify(mesh: Mesh, error: float, *, whole_border: bool = True, most: int =
 
 
 def simplify_to_budget(mesh: Mesh, error: float, most: int, *, whole_border: bool = False) -> Mesh:
-    """The mesh with so many triangles at most, whatever the error; borders go last.
+    """Simplifies a mesh to at most `most` triangles with a growing error; borders go last.
 
     With `whole_border` they stay, and there may be more triangles.
     """
-    for _ in range(_MOST):
+    for _ in range(_MAX_GROWTHS):
         before = len(mesh)
         if before <= most:
             break
-        error *= _AGAIN
+        error *= _ERROR_GROWTH
         mesh = simplify(mesh, error, most=most)
         if not whole_border:
-            # before the surface goes, which would have to make up for ragged borders
+            # else the surface inside would have to make up for ragged borders
             mesh = simplify(mesh, error, whole_border=False, most=most)
-        elif len(mesh) > _LITTLE * before:
+        elif len(mesh) > _STALLED * before:
             break
     return mesh
 
 
-_SUBDIVISION_ROUNDS = 12  # at most; each halves the longest edges
+def subdivide(
+    mesh: Mesh, max_edge: float | Callable[[Float], Float]
+) -> tuple[Mesh, NDArray[np.intp]]:
+    """Subdivides faces until no edge is too long; adjacent faces stay adjacent.
 
-
-def subdivide(mesh: Mesh, edge: float | Callable[[Float], Float]) -> tuple[Mesh, NDArray[np.intp]]:
-    """The same surface, all of whose edges are shorter; neighbours stay neighbours.
-
-    Edges longer than `edge` metres are halved, and triangles with one, two or three such edges
-    become two, three or four, again and again.
+    Long edges are halved; triangles with one, two or three of them become two, three or four.
 
     Args:
         mesh: F faces.
-        edge: metres; or what says of points (n, 3) how long edges may be that end there.
+        max_edge: metres; or the maximum length (n,) of edges that end at points (n, 3).
 
     Returns:
-        The mesh, its first vertices those of the old one, and (F,) the face of the old one that
-        each face is a part of.
+        The mesh, its first vertices those of the old one, and the old face (F',) of each face.
     """
     vertices, faces = mesh.vertices, mesh.faces
     of = np.arange(len(faces))
-    limit = _limits(edge, vertices)
+    limit = _edge_limits(max_edge, vertices)
     for _ in range(_SUBDIVISION_ROUNDS):
         long = np.column_stack(
-            [_long(vertices, limit, faces[:, k], faces[:, (k + 1) % 3]) for k in range(3)]
+            [_is_long(vertices, limit, faces[:, k], faces[:, (k + 1) % 3]) for k in range(3)]
         )
         if not long.any():
             break
         ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)  # (F, 3, 2): edges ab, bc, ca
-        middle, vertices = _halved(ends, long, vertices)
-        limit = np.concatenate([limit, _limits(edge, vertices[len(limit) :])])
-        faces, of = _parted(faces, middle, of)
+        middle, vertices = _add_midpoints(ends, long, vertices)
+        limit = np.concatenate([limit, _edge_limits(max_edge, vertices[len(limit) :])])
+        faces, of = _split_faces(faces, middle, of)
     return Mesh(vertices, faces), of
 
 
-def _limits(edge: float | Callable[[Float], Float], points: Float) -> Float:
-    """(n,) metres, how long edges that end at points (n, 3) may be."""
-    return edge(points) if callable(edge) else np.full(len(points), float(edge))
+def _edge_limits(max_edge: float | Callable[[Float], Float], points: Float) -> Float:
+    return max_edge(points) if callable(max_edge) else np.full(len(points), float(max_edge))
 
 
-def _long(vertices: Float, limit: Float, a: Index, b: Index) -> NDArray[np.bool_]:
+def _is_long(vertices: Float, limit: Float, a: Index, b: Index) -> NDArray[np.bool_]:
     """(F,) whether edges from a to b are too long."""
     x, y, z = (vertices[a] - vertices[b]).T
     return np.asarray(x * x + y * y + z * z > np.minimum(limit[a], limit[b]) ** 2)
 
 
-def _halved(ends: Index, long: NDArray[np.bool_], vertices: Float) -> tuple[Index, Float]:
-    """(F, 3) vertices in the middle of long edges, -1 for others; all vertices, with these."""
+def _add_midpoints(ends: Index, long: NDArray[np.bool_], vertices: Float) -> tuple[Index, Float]:
+    """(F, 3) midpoint vertices of long edges, -1 for others; all vertices, with these."""
     one, other = ends[long].astype(np.int64).T
     key = np.minimum(one, other) * len(vertices) + np.maximum(one, other)
     key, number = np.unique(key, return_inverse=True)
@@ -133,13 +130,15 @@ def _halved(ends: Index, long: NDArray[np.bool_], vertices: Float) -> tuple[Inde
     return middle, np.concatenate([vertices, 0.5 * (vertices[a] + vertices[b])])
 
 
-def _parted(faces: Index, middle: Index, of: NDArray[np.intp]) -> tuple[Index, NDArray[np.intp]]:
-    """The parts of faces whose edges have middles, by how many have."""
+def _split_faces(
+    faces: Index, middle: Index, of: NDArray[np.intp]
+) -> tuple[Index, NDArray[np.intp]]:
+    """Splits faces by the midpoints of their edges."""
     count = (middle >= 0).sum(axis=1)
     parts, origin = [faces[count == 0]], [of[count == 0]]
     for n in (1, 2, 3):
         rows = np.flatnonzero(count == n)
-        # turned so that the first edge has a middle, or with two the last one has none
+        # rotated so that the first edge has a midpoint, or with two the last one has none
         turn = np.argmax(middle[rows] >= 0, axis=1) if n == 1 else np.zeros(len(rows), np.intp)
         if n == 2:
             turn = (np.argmax(middle[rows] < 0, axis=1) + 1) % 3

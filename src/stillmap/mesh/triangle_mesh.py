@@ -1,4 +1,4 @@
-"""Triangles in space."""
+"""Triangle meshes."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class Mesh:
 
     Attributes:
         vertices: (V, 3) float64, metres, z up.
-        faces: (F, 3) int32, counter-clockwise seen from where the sensor was.
+        faces: (F, 3) int32, counter-clockwise as seen from the sensor.
     """
 
     vertices: Float
@@ -30,6 +30,11 @@ class Mesh:
         if self.faces.size and (self.faces.min() < 0 or self.faces.max() >= V):
             raise ValueError(f"faces: a vertex that is not there, of {V}")
 
+    @classmethod
+    def empty(cls) -> "Mesh":
+        """No faces and no vertices."""
+        return cls(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+
     def __len__(self) -> int:
         return len(self.faces)
 
@@ -40,21 +45,21 @@ class Mesh:
 
     @property
     def centers(self) -> Float:
-        """(F, 3) metres."""
+        """(F, 3) metres: the mean of each face's vertices."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         return np.asarray((a + b + c) / 3.0)
 
     def areas(self) -> Float:
         """(F,) square metres."""
-        return 0.5 * _length(self._spans())
+        return 0.5 * _length(self._cross_products())
 
     def normals(self) -> Float:
-        """(F, 3) of length one, zero for faces without area; towards where the sensor was."""
-        spans = self._spans()
-        length = _length(spans)
-        return spans / np.where(length > 0.0, length, 1.0)[:, None]
+        """(F, 3) unit vectors towards the sensor, zero for faces without area."""
+        cross = self._cross_products()
+        length = _length(cross)
+        return cross / np.where(length > 0.0, length, 1.0)[:, None]
 
-    def _spans(self) -> Float:
+    def _cross_products(self) -> Float:
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         u, v = (b - a).T, (c - a).T
         return np.column_stack(
@@ -62,9 +67,9 @@ class Mesh:
         )
 
     def adjacent_faces(self) -> Index:
-        """(N, 2) faces that share an edge, the lower number first, each pair once, rising.
+        """(N, 2) pairs of faces that share an edge, the lower number first, unique and sorted.
 
-        Of an edge that more than two share, each is beside the next.
+        Of an edge with more than two faces, each is paired with the next.
         """
         F = len(self.faces)
         corner, next = self.faces.astype(np.int64), np.roll(self.faces, -1, axis=1)
@@ -78,11 +83,11 @@ class Mesh:
         return np.column_stack([both // F, both % F]).astype(np.int32)
 
     def select(self, kept: NDArray[np.bool_]) -> "Mesh":
-        """The faces (F,) that are kept, with the vertices that they use, in their order."""
+        """The faces marked in `kept` (F,) with their vertices, in order."""
         return self.subset(np.flatnonzero(kept))
 
     def subset(self, numbers: NDArray[np.intp]) -> "Mesh":
-        """The faces with these numbers (n,), with the vertices that they use, in their order."""
+        """The faces with numbers (n,) with their vertices, in order."""
         faces = self.faces[numbers]
         used = np.zeros(len(self.vertices), np.bool_)
         used[faces] = True

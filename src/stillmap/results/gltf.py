@@ -18,7 +18,6 @@ from PIL import Image
 
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file, atomic_folder, require_regular
-from stillmap.mesh.options import TextureOptions
 from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 
@@ -48,7 +47,7 @@ class Part(NamedTuple):
     uv: Float
 
 
-def write_glb(path: Path, mesh: TexturedMesh | Mesh, options: TextureOptions | None = None) -> None:
+def write_glb(path: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> None:
     """Writes binary glTF: one mesh per page, unlit, so that colours are seen as they were
     photographed, and one of what is grey, lit, as without shades its form is not seen.
 
@@ -57,14 +56,14 @@ def write_glb(path: Path, mesh: TexturedMesh | Mesh, options: TextureOptions | N
     Args:
         path: the file, which appears complete or not at all.
         mesh: with one face at least.
-        options: how pages are compressed.
+        quality: JPEG quality of the pages; 0: PNG.
 
     Raises:
         InputError: it cannot be written.
         MissingExtra: trimesh is not installed.
     """
     trimesh = _trimesh(path)
-    pages = _compressed(mesh, options or TextureOptions())
+    pages = _compressed(mesh, quality)
     parts = _parts(mesh)
     shift = np.zeros(3)
     if max(np.abs(part.vertices).max() for part in parts) > _FAR:
@@ -106,9 +105,7 @@ def write_glb(path: Path, mesh: TexturedMesh | Mesh, options: TextureOptions | N
         work.write_bytes(data)
 
 
-def write_obj(
-    folder: Path, mesh: TexturedMesh | Mesh, options: TextureOptions | None = None
-) -> None:
+def write_obj(folder: Path, mesh: TexturedMesh | Mesh, quality: int = 90) -> None:
     """Writes `mesh.obj`, `mesh.mtl` and `page0.jpg`, ... into a new folder; see `write_glb`.
 
     Raises:
@@ -116,20 +113,20 @@ def write_obj(
         MissingExtra: trimesh is not installed.
     """
     _trimesh(folder)  # it is the folder that cannot be written without
-    files = encode_obj(mesh, options or TextureOptions())
+    files = encode_obj(mesh, quality)
     with atomic_folder(folder, "mesh.obj") as work:
         for name, data in files.items():
             (work / name).write_bytes(data)
 
 
 def encode_obj(
-    mesh: TexturedMesh | Mesh, options: TextureOptions, name: str = "mesh", before: str = ""
+    mesh: TexturedMesh | Mesh, quality: int, name: str = "mesh", before: str = ""
 ) -> dict[str, bytes]:
     """`NAME.obj`, `NAME.mtl` and the pages, by their names.
 
     Args:
         mesh: with one face at least.
-        options: how pages are compressed.
+        quality: JPEG quality of the pages; 0: PNG.
         name: of the first two.
         before: what the names of pages begin with.
 
@@ -137,7 +134,7 @@ def encode_obj(
         MissingExtra: trimesh is not installed.
     """
     trimesh = _trimesh(Path(f"{name}.obj"))
-    pages = _compressed(mesh, options)
+    pages = _compressed(mesh, quality)
     simple = trimesh.visual.material.SimpleMaterial
     scene = trimesh.Scene()
     for part in _parts(mesh):  # the grey one is the last: trimesh counts on uv for all before
@@ -220,16 +217,16 @@ def _material(trimesh: Any, page: int) -> Any:
     )
 
 
-def _compressed(mesh: TexturedMesh | Mesh, options: TextureOptions) -> list[Page]:
-    return list(_each_compressed(mesh, options)) if isinstance(mesh, TexturedMesh) else []
+def _compressed(mesh: TexturedMesh | Mesh, quality: int) -> list[Page]:
+    return list(_each_compressed(mesh, quality)) if isinstance(mesh, TexturedMesh) else []
 
 
-def _each_compressed(mesh: TexturedMesh, options: TextureOptions) -> Iterator[Page]:
+def _each_compressed(mesh: TexturedMesh, quality: int) -> Iterator[Page]:
     for page in mesh.pages:
         out = io.BytesIO()
-        if options.quality:
+        if quality:
             # colours at full resolution: charts have sharp edges
-            Image.fromarray(page).save(out, "JPEG", quality=options.quality, subsampling=0)
+            Image.fromarray(page).save(out, "JPEG", quality=quality, subsampling=0)
             yield Page(".jpg", "image/jpeg", out.getvalue())
         else:
             Image.fromarray(page).save(out, "PNG")

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from stillmap.core.arrays import write_npz
 from stillmap.mesh.build import Models
-from stillmap.mesh.options import TextureOptions
 from stillmap.mesh.place import ViewAssignment
 from stillmap.mesh.texture.atlas import TexturedMesh
 from stillmap.mesh.texture.views import View
@@ -21,24 +20,24 @@ _MICROMETRES = 6  # digits
 _SQUARE_CENTIMETRES = 4
 
 
-def write_models(folder: Path, models: Models, n_images: int, options: TextureOptions) -> None:
+def write_models(folder: Path, models: Models, n_images: int, quality: int) -> None:
     """Write models into a new result folder, and beside each what painted its faces.
 
     Args:
         folder: of the result; its `objects/` may be there already.
         models: of the place and of what moved.
         n_images: of the recording.
-        options: see TextureOptions.
+        quality: JPEG quality of texture pages; 0: PNG.
     """
     if len(models.textured):
-        write_glb(folder / "mesh.glb", _seen(models.textured), options)
+        write_glb(folder / "mesh.glb", _seen(models.textured), quality)
         write_faces(folder / "mesh_faces.npz", models.assignment, models.views, n_images, "map")
     objects = folder / "objects"
     if models.objects:
         objects.mkdir(exist_ok=True)
     for one in models.objects:
         name = f"{one.shape.id:04d}"
-        write_glb(objects / f"{name}.glb", _seen(one.textured), options)
+        write_glb(objects / f"{name}.glb", _seen(one.textured), quality)
         painted, views = one.face_views.assignment, one.face_views.views
         write_faces(objects / f"{name}_faces.npz", painted, views, n_images, "object")
         record = {

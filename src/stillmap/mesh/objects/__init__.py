@@ -1,1 +1,1 @@
-"""Models: of the place without its people, and of the people."""
+"""Models of moving objects: segmentation, merging, registration, reconstruction, texturing."""

@@ -1,4 +1,4 @@
-"""A moving thing's own frame: x ahead, y left, z up, on the ground below its middle."""
+"""The frame of a moving object: x ahead, y left, z up, on the ground below its center."""
 
 from typing import NamedTuple
 
@@ -11,13 +11,13 @@ Float = NDArray[np.float64]
 
 
 class ObjectFrame(NamedTuple):
-    """Where a thing's own frame is at any time.
+    """Pose of an object's frame over time: that of its track, with corrections.
 
     Attributes:
-        thing: its box along its track.
-        seconds: (S,) times, rising, at which it is known better; S > 0.
-        offset: (S, 3) by how much points in the frame of the track have to be moved there: metres
-            ahead and to the left, rad to the left.
+        box: box along the track.
+        seconds: (S,) times of the corrections, rising; S > 0.
+        offset: (S, 3) corrections of points in the frame of the track: metres ahead and to the
+            left, rad to the left.
     """
 
     box: TrackedBox
@@ -25,22 +25,22 @@ class ObjectFrame(NamedTuple):
     offset: Float
 
     @classmethod
-    def from_track(cls, thing: TrackedBox) -> "ObjectFrame":
-        """As the track has it."""
-        return cls(thing, thing.box.seconds[:1], np.zeros((1, 3)))
+    def from_track(cls, box: TrackedBox) -> "ObjectFrame":
+        """The frame of the track, uncorrected."""
+        return cls(box, box.box.seconds[:1], np.zeros((1, 3)))
 
     def to_object(self, seconds: Float, points: Float) -> Float:
-        """(n, 3) metres in its own frame, of points (n, 3) in the map frame at times (n,)."""
+        """(n, 3) metres in the object's frame, of map points (n, 3) at times (n,)."""
         box = self.box.box
-        middle = box.center_at(seconds)
-        ahead = box.heading[_at(box.seconds, seconds)]
-        off = points[:, :2] - middle
-        foot = np.interp(seconds, box.seconds, self.box.bottom)
+        center = box.center_at(seconds)
+        heading = box.heading[np.clip(np.searchsorted(box.seconds, seconds, "right") - 1, 0, None)]
+        off = points[:, :2] - center
+        bottom = np.interp(seconds, box.seconds, self.box.bottom)
         at = np.stack(
             [
-                (off * ahead).sum(axis=1),
-                off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1],
-                points[:, 2] - foot,
+                (off * heading).sum(axis=1),
+                off[:, 1] * heading[:, 0] - off[:, 0] * heading[:, 1],
+                points[:, 2] - bottom,
             ],
             axis=1,
         )
@@ -50,16 +50,10 @@ class ObjectFrame(NamedTuple):
         return np.stack([x, y, at[:, 2]], axis=1)
 
     def T_map_object(self, seconds: float) -> Float:
-        """(4, 4) its own frame at a time."""
-        # three points and what `local` makes of them say all of it
+        """(4, 4) pose of the object's frame at a time."""
         corners = np.vstack([np.zeros(3), np.eye(3)])
         at = self.to_object(np.full(4, seconds), corners)
         T_object_map = np.eye(4)
         T_object_map[:3, :3] = (at[1:] - at[0]).T
         T_object_map[:3, 3] = at[0]
         return np.asarray(np.linalg.inv(T_object_map))
-
-
-def _at(known: Float, seconds: Float) -> NDArray[np.intp]:
-    """(n,) the last of the times (L,) that is not later."""
-    return np.clip(np.searchsorted(known, seconds, side="right") - 1, 0, None)

@@ -1,9 +1,7 @@
-"""Models of what moved (Sect. 4.5): what ended on a thing, in its own frame, as a surface.
+"""Reconstruction of moving objects: the best partial scan, or several registered ones (Sect. 4.5).
 
-Whether what was followed moved: what ended there was dynamic, not some of it only.
-
-Of what stands still, as a hedge or the edge of a wall, some beams are now and then taken for
-dynamic, and followed; others ended right beside them, at the same time, on what is static.
+Static structure, as a hedge or the edge of a wall, is now and then labelled dynamic and tracked; an
+object whose surroundings are mostly static at its time gets no model.
 """
 
 import dataclasses
@@ -18,7 +16,7 @@ from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.objects.merging import ObjectTrack
 from stillmap.mesh.objects.registration import (
-    DEEPEST,
+    MIN_COMPONENT_AREA,
     PartialScan,
     PartialSurface,
     extract_partial_scan,
@@ -28,91 +26,53 @@ from stillmap.mesh.objects.registration import (
     triangulate_partial_scan,
     within_time,
 )
-from stillmap.mesh.objects.segmentation import DynamicReturns, beam_seconds, scans_within
+from stillmap.mesh.objects.segmentation import (
+    HALF_CAR,
+    DynamicReturns,
+    beam_seconds,
+    scans_within,
+)
 from stillmap.mesh.objects.sweep_surface import find_best_interval
-from stillmap.mesh.options import MoverOptions, SurfaceOptions
 from stillmap.mesh.range_image import Patch
 from stillmap.mesh.simplification import subdivide
 from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.mesh.tsdf import integrate_patches
+from stillmap.mesh.tsdf import TsdfParameters, integrate_patches
 
 Float = NDArray[np.float64]
-
 Index = NDArray[np.intp]
 
-_GROUND = 0.1  # m above the foot of a thing, up to where beams may have met the ground
-
-_FINE = 0.5  # of the distance that counts, between points of the surface
-
-
-def mean_p_dynamic(
-    mesh: Mesh, way: ObjectFrame, span: tuple[float, float], sources: MeshInputs, reach: float
-) -> float:
-    """Mean P(c = 0) of the beams that ended at a thing when it was seen, but for the ground's.
-
-    Args:
-        mesh: its surface, in its own frame.
-        way: where that frame was.
-        span: s, from when to when it was seen.
-        sources: the beams.
-        reach: metres from its surface.
-
-    Returns:
-        NaN where no beam ended there, 0.1 m above its foot or higher.
-    """
-    seen = sources.deskewed
-    fine, _ = subdivide(mesh, _FINE * reach)
-    tree = cKDTree(fine.vertices)
-    low, high = fine.vertices.min(axis=0) - reach, fine.vertices.max(axis=0) + reach
-    low[2] = max(low[2], _GROUND)
-    total, count = 0.0, 0
-    scans = scans_within(*span, sources)
-    for scan in range(scans.start, scans.stop):  # all of a second's would be too many at once
-        beams = np.arange(seen.offset[scan], seen.offset[scan + 1])
-        seconds = beam_seconds(beams, sources)
-        then = (seconds >= span[0]) & (seconds <= span[1]) & seen.hit[beams]
-        beams, seconds = beams[then], seconds[then]
-        at = way.to_object(seconds, seen.end_points(beams, sources.poses))
-        some = np.flatnonzero(((at > low) & (at < high)).all(axis=1))
-        off = tree.query(at[some], distance_upper_bound=reach)[0]
-        near = sources.p_static[beams[some[np.isfinite(off)]]]
-        total += float(near.sum(dtype=np.float64))
-        count += len(near)
-    return 1.0 - total / count if count else float("nan")
-
-
-_LONGER = (1.0, 2.0, 4.0)  # times a sweep, one after the other, until there is a surface
-
-_FINEST, _COARSEST = 0.03, 0.06  # m, edges of voxels
-
-_OF_SPACING = 0.7  # of how far beams lie apart
-
-_BEFORE, _BEHIND = 6.0, 5.0  # voxels about a surface: looks are a few of them apart
-
-_SEEN_TWICE = 1.5  # looks that a voxel must be of, where there are many
-
-_OF_LOOKS = 0.4  # or this share of them, where there are few
-
-_DEEP = 1.0  # m along the line of sight that one look of several may bridge
-
-_TOLD = 200  # points of the best look: of fewer nobody can tell how others lie on it
-
-_MOST = 0.5  # of the looks must fit, and of the best one's area be there
+IMAGE_WINDOW = 0.5  # s between an observation and an image of an object that is not rigid
+MERGE_WINDOW = 0.5  # s before and after the best partial scan, of those registered to it
+_MAX_VIEW_OFFSET = 0.05  # m of a partial surface from the best one: else it is left out
+_SWEEP_WINDOW = 0.4  # s for which people are taken to keep their shape under a tilting laser
+_SWEEP_FACTORS = (1.0, 2.0, 4.0)  # of that window, one after the other, until there is a surface
+_MIN_AREA = 0.01  # m2 of a model
+_MIN_HEIGHT = 0.05  # m from its lowest to its highest point: flatter ones are rough ground
+_MIN_P_DYNAMIC = 0.7  # mean P(dynamic) around a model
+_POINT_DISTANCE = 0.2  # m from its surface within which returns count for that
+_MIN_RETURN_HEIGHT = 0.1  # m above its bottom of these returns: lower ones may be the ground's
+_SAMPLE_SHARE = 0.5  # of that distance between samples of the surface
+_MIN_VOXEL, _MAX_VOXEL = 0.03, 0.06  # m
+_VOXEL_SHARE = 0.7  # of the beam spacing
+_TRUNCATION_FRONT, _TRUNCATION_BACK = 6.0, 5.0  # voxels: partial surfaces are a few apart
+_MIN_VIEWS, _MIN_VIEW_SHARE = 1.5, 0.4  # partial surfaces of a voxel, or share where there are few
+_MERGE_DEPTH = 1.0  # m along the line of sight that one of several partial surfaces may bridge
+_MIN_VERTICES = 200  # of the best partial surface: fewer do not tell how others fit
+_MIN_KEPT_SHARE = 0.5  # of the partial surfaces, and of the best one's area
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectShape:
-    """The surface of a thing that moved.
+    """The surface of a moving object.
 
     Attributes:
         id: of the object.
-        mesh: in the thing's own frame: x ahead, y left, z up, on the ground below its middle.
-        way: where that frame was.
-        rigid: whether it kept its shape.
-        seconds: when it was of this shape: of one that is not rigid the middle of the sweep, of a
-            rigid one when most of it was seen; by the time of its box.
-        span: s, from the first beam of that sweep to the last; what is rigid: of all of them.
+        mesh: in the object's frame: x ahead, y left, z up, on the ground below its center.
+        frame: pose of that frame over time.
+        rigid: whether it was merged from several partial scans.
+        seconds: time of this shape, by the clock of boxes: center of the best partial scan.
+        span: s, first and last beam that it is made of.
     """
 
     id: int
@@ -124,187 +84,211 @@ class ObjectShape:
 
 
 def reconstruct_object(
-    followed: Sequence[ObjectTrack],
-    sources: MeshInputs,
-    moves: DynamicReturns,
-    options: MoverOptions,
-    pictures: Sequence[Float],
+    tracks: Sequence[ObjectTrack],
+    inputs: MeshInputs,
+    returns: DynamicReturns,
+    images: Sequence[Float],
 ) -> ObjectShape | None:
-    """The surface of something that moved; None where too little of it was seen, or it stood still.
+    """The surface of a moving object; None where too little of it was seen, or it stood still.
 
     Args:
-        followed: the objects as which it was followed.
-        sources: the beams.
-        moves: those on what moves.
-        options: see MoverOptions.
-        pictures: of each (N,) s, when pictures show it, by the time of its box.
+        tracks: of the object.
+        inputs: the beams.
+        returns: the dynamic returns.
+        images: (N,) s, times of the images that show each track's object.
     """
-    own = np.unique(np.concatenate([one.returns for one in followed]))
+    own = np.unique(np.concatenate([one.returns for one in tracks]))
     if not len(own):
         return None
-    fast = any(one.is_fast for one in followed)
-    rigid = fast or any(one.is_large for one in followed)
-    # who is seen by few beams is looked at longer
-    for moment in [k * options.sweep for k in _LONGER] if moves.is_planar else [0.0]:
-        one, span = _best(followed, pictures, moment, sources, moves, options)
-        way = ObjectFrame.from_track(one.box)
-        look = extract_partial_scan(own, span, way, fast, sources, moves, options)
-        if look is None:
+    fast = any(one.is_fast for one in tracks)
+    rigid = fast or any(one.is_large for one in tracks)
+    durations = [k * _SWEEP_WINDOW for k in _SWEEP_FACTORS] if returns.is_planar else [0.0]
+    for duration in durations:
+        one, span = _best_track(tracks, images, duration, inputs, returns)
+        frame = ObjectFrame.from_track(one.box)
+        scan = extract_partial_scan(own, span, frame, fast, inputs, returns)
+        if scan is None:
             continue
-        mesh = triangulate_partial_scan(look, rigid, DEEPEST, options)
-        if not _enough(mesh, options.least, options):
+        mesh = triangulate_partial_scan(scan, rigid, HALF_CAR)
+        if not _is_large_enough(mesh, _MIN_AREA):
             continue
-        now = 0.5 * sum(look.span)
-        if rigid and not moves.is_planar and len(mesh.vertices) >= _TOLD:
-            whole = _put_together(one, own, now, fast, sources, moves, options)
-            if whole is not None:
-                return _moving(whole, sources, options)
-        shape = ObjectShape(one.object.id, mesh, way, False, now, look.span)
-        return _moving(shape, sources, options)
+        now = 0.5 * sum(scan.span)
+        shape = None
+        if rigid and not returns.is_planar and len(mesh.vertices) >= _MIN_VERTICES:
+            shape = _merge_partial_scans(one, own, now, fast, inputs, returns)
+        shape = shape or ObjectShape(one.object.id, mesh, frame, False, now, scan.span)
+        p_dynamic = mean_p_dynamic(shape.mesh, shape.frame, shape.span, inputs)
+        return shape if p_dynamic >= _MIN_P_DYNAMIC else None
     return None
 
 
-def _moving(shape: ObjectShape, sources: MeshInputs, options: MoverOptions) -> ObjectShape | None:
-    """The shape; None where most of what is there stands still."""
-    if options.dynamic == 0.0:
-        return shape
-    p = mean_p_dynamic(shape.mesh, shape.frame, shape.span, sources, options.about)
-    return shape if p >= options.dynamic else None
+def _best_track(
+    tracks: Sequence[ObjectTrack],
+    images: Sequence[Float],
+    duration: float,
+    inputs: MeshInputs,
+    returns: DynamicReturns,
+) -> tuple[ObjectTrack, tuple[float, float]]:
+    """The track that is observed best, and the interval in which it is."""
+    found = []
+    for one, shown in zip(tracks, images, strict=True):
+        if len(one.returns):
+            scans = inputs.deskewed.scans_of(returns.beam[one.returns])
+            seconds = returns.seconds[one.returns]
+            found.append((one, find_best_interval(seconds, scans, duration, IMAGE_WINDOW, shown)))
+    one, (first, last, _) = max(found, key=lambda each: each[1][2])
+    return one, (first, last)
 
 
-def _put_together(
+def _is_large_enough(mesh: Mesh, area: float) -> bool:
+    """Whether a surface has an area, and is higher than rough ground."""
+    if not len(mesh) or mesh.areas().sum() < area:
+        return False
+    return bool(np.ptp(mesh.vertices[:, 2]) >= _MIN_HEIGHT)
+
+
+def mean_p_dynamic(
+    mesh: Mesh,
+    frame: ObjectFrame,
+    span: tuple[float, float],
+    inputs: MeshInputs,
+    max_distance: float = _POINT_DISTANCE,
+) -> float:
+    """Mean P(c = 0) of the returns around an object, but for those on the ground.
+
+    Args:
+        mesh: its surface, in its frame.
+        frame: pose of that frame.
+        span: s, start and end.
+        inputs: the beams.
+        max_distance: metres from the surface.
+
+    Returns:
+        NaN where there are no such returns.
+    """
+    deskewed = inputs.deskewed
+    fine, _ = subdivide(mesh, _SAMPLE_SHARE * max_distance)
+    tree = cKDTree(fine.vertices)
+    low, high = fine.vertices.min(axis=0) - max_distance, fine.vertices.max(axis=0) + max_distance
+    low[2] = max(low[2], _MIN_RETURN_HEIGHT)
+    total, count = 0.0, 0
+    scans = scans_within(*span, inputs)
+    for scan in range(scans.start, scans.stop):  # one by one, to save memory
+        beams = np.arange(deskewed.offset[scan], deskewed.offset[scan + 1])
+        seconds = beam_seconds(beams, inputs)
+        then = (seconds >= span[0]) & (seconds <= span[1]) & deskewed.hit[beams]
+        beams, seconds = beams[then], seconds[then]
+        at = frame.to_object(seconds, deskewed.end_points(beams, inputs.poses))
+        some = np.flatnonzero(((at > low) & (at < high)).all(axis=1))
+        distance = tree.query(at[some], distance_upper_bound=max_distance)[0]
+        near = inputs.p_static[beams[some[np.isfinite(distance)]]]
+        total += float(near.sum(dtype=np.float64))
+        count += len(near)
+    return 1.0 - total / count if count else float("nan")
+
+
+def _merge_partial_scans(
     one: ObjectTrack,
     own: Index,
     now: float,
     fast: bool,
-    sources: MeshInputs,
-    moves: DynamicReturns,
-    options: MoverOptions,
+    inputs: MeshInputs,
+    returns: DynamicReturns,
 ) -> ObjectShape | None:
-    """What the looks about a time saw of a rigid thing; None: they do not lie over each other."""
-    way = ObjectFrame.from_track(straighten_track(one.box, now, options.together))
-    looks = _looks(own, now, way, fast, sources, moves, options)
-    sweeps = [_sweep(look, now, options) for look in looks]
-    if len(sweeps) < 2:
+    """The surface of a rigid object from the partial scans around a time; None: they do not fit."""
+    frame = ObjectFrame.from_track(straighten_track(one.box, now, MERGE_WINDOW))
+    scans = _partial_scans(own, now, frame, fast, inputs, returns)
+    surfaces = [_make_surface(scan, now) for scan in scans]
+    if len(surfaces) < 2:
         return None
-    best = int(np.argmin([abs(sweep.time_offset) for sweep in sweeps]))
-    motion = register_surfaces(sweeps, best)
-    moved = [sweep.transform(motion) for sweep in sweeps]
+    best = int(np.argmin([abs(surface.time_offset) for surface in surfaces]))
+    motion = register_surfaces(surfaces, best)
+    moved = [surface.transform(motion) for surface in surfaces]
     kept = [
         k
-        for k, sweep in enumerate(moved)
-        if k == best or surface_distance(sweep, moved[best]) <= options.blurred
+        for k, surface in enumerate(moved)
+        if k == best or surface_distance(surface, moved[best]) <= _MAX_VIEW_OFFSET
     ]
-    if len(kept) < max(2.0, _MOST * len(sweeps)):
+    if len(kept) < max(2.0, _MIN_KEPT_SHARE * len(surfaces)):
         return None
-    mesh = _fused([moved[k].to_patch() for k in kept], options)
-    least = max(options.least, _MOST * sweeps[best].mesh.areas().sum())
-    if not _enough(mesh, least, options):
+    mesh = _fuse_patches([moved[k].to_patch() for k in kept])
+    min_area = max(_MIN_AREA, _MIN_KEPT_SHARE * surfaces[best].mesh.areas().sum())
+    if not _is_large_enough(mesh, min_area):
         return None
-    later = np.array([sweeps[k].time_offset for k in kept])
-    offset = np.array([_in_plane(*motion_transform(motion, t)) for t in later.tolist()])
-    span = min(looks[k].span[0] for k in kept), max(looks[k].span[1] for k in kept)
-    return ObjectShape(
-        one.object.id, mesh, ObjectFrame(way.box, now + later, offset), True, now, span
-    )
+    times = np.array([surfaces[k].time_offset for k in kept])
+    offset = np.array([_planar_offset(*motion_transform(motion, t)) for t in times.tolist()])
+    span = min(scans[k].span[0] for k in kept), max(scans[k].span[1] for k in kept)
+    corrected = ObjectFrame(frame.box, now + times, offset)
+    return ObjectShape(one.object.id, mesh, corrected, True, now, span)
 
 
-def _enough(mesh: Mesh, area: float, options: MoverOptions) -> bool:
-    """Whether a surface is of something: as large as that, and higher than the ground is rough."""
-    if not len(mesh) or mesh.areas().sum() < area:
-        return False
-    return bool(np.ptp(mesh.vertices[:, 2]) >= options.height)
-
-
-def _looks(
+def _partial_scans(
     own: Index,
     now: float,
-    way: ObjectFrame,
+    frame: ObjectFrame,
     fast: bool,
-    sources: MeshInputs,
-    moves: DynamicReturns,
-    options: MoverOptions,
+    inputs: MeshInputs,
+    returns: DynamicReturns,
 ) -> list[PartialScan]:
-    """At a thing about a time, one in each scan, in the order of their times."""
-    near = within_time(own, moves.seconds, now - options.together, now + options.together)
-    scan = sources.deskewed.scans_of(moves.beam[near])
+    """The partial scans of an object around a time, sorted by time."""
+    near = within_time(own, returns.seconds, now - MERGE_WINDOW, now + MERGE_WINDOW)
+    scan = inputs.deskewed.scans_of(returns.beam[near])
     out = []
     for part in np.split(near, np.flatnonzero(np.diff(scan)) + 1):
         if len(part):
-            seconds = moves.seconds[part]
+            seconds = returns.seconds[part]
             span = float(seconds.min()), float(seconds.max())
-            look = extract_partial_scan(own, span, way, fast, sources, moves, options)
-            out += [look] if look is not None else []
-    # scans of several sensors overlap: which begins first may see it last
-    return sorted(out, key=lambda look: look.span[0] + look.span[1])
+            found = extract_partial_scan(own, span, frame, fast, inputs, returns)
+            out += [found] if found is not None else []
+    # scans of several sensors overlap in time
+    return sorted(out, key=lambda one: one.span[0] + one.span[1])
 
 
-def _sweep(look: PartialScan, now: float, options: MoverOptions) -> PartialSurface:
-    mesh = triangulate_partial_scan(look, True, _DEEP, options)
-    return PartialSurface.from_mesh(mesh, look.own.origin.mean(axis=0), 0.5 * sum(look.span) - now)
+def _make_surface(scan: PartialScan, now: float) -> PartialSurface:
+    mesh = triangulate_partial_scan(scan, True, _MERGE_DEPTH)
+    return PartialSurface.from_mesh(mesh, scan.own.origin.mean(axis=0), 0.5 * sum(scan.span) - now)
 
 
-def _in_plane(R: Float, t: Float) -> list[float]:
+def _planar_offset(R: Float, t: Float) -> list[float]:
     """Metres ahead and to the left, rad to the left."""
     return [float(t[0]), float(t[1]), float(np.arctan2(R[1, 0], R[0, 0]))]
 
 
-def _fused(patches: Sequence[Patch], options: MoverOptions) -> Mesh:
-    """One surface of several looks'."""
-    voxel = options.voxel or object_voxel_size(patches)
-    limits = SurfaceOptions(
-        before=_BEFORE,
-        behind=_BEHIND,
-        fewest=min(_SEEN_TWICE, _OF_LOOKS * len(patches)),
-        island=options.island,
+def _fuse_patches(patches: Sequence[Patch]) -> Mesh:
+    """One surface of several partial surfaces, by TSDF integration."""
+    parameters = TsdfParameters(
+        truncation_front=_TRUNCATION_FRONT,
+        truncation_back=_TRUNCATION_BACK,
+        min_weight=min(_MIN_VIEWS, _MIN_VIEW_SHARE * len(patches)),
+        min_component_area=MIN_COMPONENT_AREA,
     )
-    weighed = [(patch, np.ones(len(patch.faces), np.float32)) for patch in patches]
-    return integrate_patches(weighed, voxel, limits)
+    weighted = [(patch, np.ones(len(patch.faces), np.float32)) for patch in patches]
+    return integrate_patches(weighted, object_voxel_size(patches), parameters)
 
 
 def object_voxel_size(patches: Sequence[Patch]) -> float:
-    """Metres: a little less than beams lie apart on a thing, within bounds."""
+    """Metres: a little less than the beam spacing on an object, within bounds."""
     edges = [np.zeros(0)]
     for patch in patches:
         corners = patch.points[patch.faces]
         edges.append(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).ravel())
     all_edges = np.concatenate(edges)
-    apart = float(np.median(all_edges)) if len(all_edges) else _FINEST
-    return float(np.clip(_OF_SPACING * apart, _FINEST, _COARSEST))
+    spacing = float(np.median(all_edges)) if len(all_edges) else _MIN_VOXEL
+    return float(np.clip(_VOXEL_SHARE * spacing, _MIN_VOXEL, _MAX_VOXEL))
 
 
-def straighten_track(thing: TrackedBox, now: float, reach: float) -> TrackedBox:
-    """The same, going on evenly as it does at a time, from `reach` seconds before to after."""
-    box = thing.box
-    seconds = np.array([now - reach, now + reach])
+def straighten_track(tracked: TrackedBox, now: float, window: float) -> TrackedBox:
+    """The box with the constant velocity that it has at a time, `window` seconds around it."""
+    box = tracked.box
+    seconds = np.array([now - window, now + window])
     velocity = np.array([np.interp(now, box.seconds, column) for column in box.velocity.T])
     at = int(np.clip(np.searchsorted(box.seconds, now, side="right") - 1, 0, None))
-    even = dataclasses.replace(
+    straight = dataclasses.replace(
         box,
         seconds=seconds,
         xy=box.center_at(np.array([now])) + (seconds - now)[:, None] * velocity,
         heading=np.tile(box.heading[at], (2, 1)),
         velocity=np.tile(velocity, (2, 1)),
     )
-    return TrackedBox(even, np.full(2, np.interp(now, box.seconds, thing.bottom)), thing.height)
-
-
-def _best(
-    followed: Sequence[ObjectTrack],
-    pictures: Sequence[Float],
-    moment: float,
-    sources: MeshInputs,
-    moves: DynamicReturns,
-    options: MoverOptions,
-) -> tuple[ObjectTrack, tuple[float, float]]:
-    """Which of some objects is seen best, and when."""
-    found = []
-    for one, shown in zip(followed, pictures, strict=True):
-        if len(one.returns):
-            scans, seconds = (
-                sources.deskewed.scans_of(moves.beam[one.returns]),
-                moves.seconds[one.returns],
-            )
-            found.append((one, find_best_interval(seconds, scans, moment, options.near, shown)))
-    one, (first, last, _) = max(found, key=lambda each: each[1][2])
-    return one, (first, last)
+    bottom = np.full(2, np.interp(now, box.seconds, tracked.bottom))
+    return TrackedBox(straight, bottom, tracked.height)

@@ -1,10 +1,8 @@
-"""Looks at one rigid thing that follow one another, laid over each other in its own frame.
+"""Object registration: partial scans of a rigid object aligned in its own frame.
 
-Over a second a car goes evenly: what its track may be wrong by is its velocity, how fast it turns
-and how it brakes, few numbers that all looks tell together. Where nothing tells, as along a side
-without ends, its track counts.
-
-What one look saw of a thing that moves: a scan in space, or planar ones that follow.
+Over a second a car moves evenly, so six parameters of its motion, common to all partial scans,
+correct the track: the error of its velocity, turn rate and acceleration. Where scans do not
+constrain them, as along a side without ends, the track's values hold.
 """
 
 from collections.abc import Sequence
@@ -27,53 +25,60 @@ from stillmap.mesh.objects.segmentation import (
     scans_within,
 )
 from stillmap.mesh.objects.sweep_surface import ObjectBeams, triangulate_beams
-from stillmap.mesh.options import MoverOptions
 from stillmap.mesh.range_image import Patch
 from stillmap.mesh.triangle_mesh import Mesh
 
 Float = NDArray[np.float64]
-
 Index = NDArray[np.intp]
 
-_GUESSES = (0.0, -1.0, 1.0, -2.0, 2.0, -3.0, 3.0, -4.0, 4.0, -5.0, 5.0, -6.0, 6.0)  # m/s
+MIN_COMPONENT_AREA = 0.005  # m2: smaller components of an object's surface are dropped
+_MAX_SPACING_RATIO = 2.5  # edge over median edge of an object's surface
+_MAX_EDGE = 0.6  # m, likewise
+_CONTEXT = 0.03  # s around a return in which a scan sees the rest of a car
+_MIN_TRACK_SHARE = 0.1  # of a cluster that a track owns: else another one tracks it
 
-_GUESSED = 500  # points of a look that tell which one is right
+_COARSE_SPEEDS = (0.0, *(s * k for k in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0) for s in (-1.0, 1.0)))  # m/s
+_FINE_SPEEDS = (0.0, *(k * s / 10.0 for k in range(1, 11) for s in (-1.0, 1.0)))  # m/s
+_SPEED_PENALTY = 0.002  # m per m/s of the coarse search: the track's value wins ties
+_SEARCH_POINTS = 500  # of a partial scan in the search over speeds
+_MAX_DISTANCE = 0.3  # m at which a point counts as an outlier there
+_SEARCH_ROUNDS = 2  # of refinement for each speed
 
-_NEAR = 0.3  # m, farther points are as good as none
+# standard deviations of the motion around the track's, and around that of the speed search
+_TRACK_STD = (0.7, 0.4, 0.2, 0.2, 2.0, 1.0)
+_SEARCHED_STD = (0.1, 0.4, 0.2, 0.2, 2.0, 1.0)
+_POINT_STD = 0.03  # m, of points from a surface
+_RADII = (0.6, 0.3, 0.15)  # m, of correspondences, from stage to stage
+_SPANS = (0.4, 0.7, 1.0)  # share of the time offsets that take part, likewise
+_ROUNDS = 5  # Gauss-Newton steps per stage
+_POINTS = 2000  # of a partial scan, at most
+_MIN_POINTS = 20
+_INDEPENDENT_POINTS = 100.0  # of a partial scan: errors of neighbors are correlated
+_MIN_NORMAL_COSINE = 0.5  # between normals of corresponding points
 
-_PER_SPEED = 0.002  # m for each m/s: where all are as good the track counts
 
-_FINER = (0.0, *(k * s / 10.0 for k in range(1, 11) for s in (-1.0, 1.0)))  # m/s
+class PartialScan(NamedTuple):
+    """One observation of an object.
 
-_TRACK = (0.7, 0.4, 0.2, 0.2, 2.0, 1.0)  # what is known of `Motion` by its track
+    Attributes:
+        own: its beams, in its frame.
+        others: beams near in time that passed it.
+        span: s, from the first to the last.
+    """
 
-_TOLD = (0.1, 0.4, 0.2, 0.2, 2.0, 1.0)  # and by the ends
-
-_SIGMA = 0.03  # m, by how much points lie off a surface
-
-_REACHES = (0.6, 0.3, 0.15)  # m, within which points are of the same place, round by round less
-
-_ROUNDS = 5  # with each of them
-
-_SETTLED = 2  # rounds by which a velocity that is tried is made better
-
-_POINTS = 2000  # of a look, at most: more do not make it better
-
-_FEWEST = 20  # points that say anything
-
-_TELL = 100.0  # points of a look that tell on their own: neighbours are off together
-
-_SAME_SIDE = 0.5  # cosine between normals of one surface
+    own: ObjectBeams
+    others: ObjectBeams
+    span: tuple[float, float]
 
 
 class PartialSurface(NamedTuple):
-    """What one look saw of a thing, in its own frame as its track has it.
+    """The surface of a partial scan, in the object's frame by its track.
 
     Attributes:
-        mesh: its surface.
-        normals: (V, 3) of length one, of its vertices, towards the sensor.
-        place: (3,) where the sensor was.
-        later: s after the time at which the frame is known.
+        mesh: the surface.
+        normals: (V, 3) unit normals of its vertices, towards the sensor.
+        sensor: (3,) sensor position.
+        time_offset: s after the time at which the frame is known.
     """
 
     mesh: Mesh
@@ -82,22 +87,22 @@ class PartialSurface(NamedTuple):
     time_offset: float
 
     @classmethod
-    def from_mesh(cls, mesh: Mesh, place: Float, later: float) -> "PartialSurface":
-        """With the normals of the faces around each vertex."""
+    def from_mesh(cls, mesh: Mesh, sensor: Float, time_offset: float) -> "PartialSurface":
+        """With area-weighted vertex normals."""
         spans = np.repeat(mesh.normals() * mesh.areas()[:, None], 3, axis=0)
         at, n = mesh.faces.ravel(), len(mesh.vertices)
         normals = np.stack([np.bincount(at, column, n) for column in spans.T], axis=1)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return cls(mesh, normals / np.maximum(length, 1e-12), place, later)
+        return cls(mesh, normals / np.maximum(length, 1e-12), sensor, time_offset)
 
     def transform(self, motion: Float) -> "PartialSurface":
-        """As it lies where the thing went otherwise than its track by `motion` (6,)."""
+        """The surface corrected by a motion (6,) relative to the track."""
         R, t = motion_transform(motion, self.time_offset)
         mesh = Mesh(self.mesh.vertices @ R.T + t, self.mesh.faces)
-        return self._replace(mesh=mesh, normals=self.normals @ R.T, place=R @ self.sensor + t)
+        return self._replace(mesh=mesh, normals=self.normals @ R.T, sensor=R @ self.sensor + t)
 
     def to_patch(self) -> Patch:
-        """To be fused."""
+        """The surface as input of TSDF integration."""
         points = self.mesh.vertices
         origin = np.tile(self.sensor, (len(points), 1))
         standoff = ((origin - points) * self.normals).sum(axis=1)
@@ -105,117 +110,184 @@ class PartialSurface(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """Some of the vertices of a look, (n, 3) metres, and (n, 3) where they face."""
+    """Some vertices (n, 3) of a partial surface, and their normals (n, 3)."""
 
     at: Float
-    facing: Float
-    later: float
+    normals: Float
+    time_offset: float
 
     @classmethod
-    def of(cls, one: PartialSurface, most: int) -> "_Points":
+    def sample(cls, one: PartialSurface, most: int) -> "_Points":
         every = max(1, len(one.mesh.vertices) // most)
         return cls(one.mesh.vertices[::every], one.normals[::every], one.time_offset)
 
-    def moved(self, motion: Float) -> "_Points":
-        R, t = motion_transform(motion, self.later)
-        return _Points(self.at @ R.T + t, self.facing @ R.T, self.later)
+    def transform(self, motion: Float) -> "_Points":
+        R, t = motion_transform(motion, self.time_offset)
+        return _Points(self.at @ R.T + t, self.normals @ R.T, self.time_offset)
 
 
-def motion_transform(motion: Float, later: float) -> tuple[Float, Float]:
-    """(3, 3) and (3,) metres by which a look has to be moved.
+def extract_partial_scan(
+    own: Index,
+    span: tuple[float, float],
+    frame: ObjectFrame,
+    fast: bool,
+    inputs: MeshInputs,
+    returns: DynamicReturns,
+) -> PartialScan | None:
+    """The beams on an object in an interval; None where most belong to another track.
+
+    Args:
+        own: numbers within `returns` of the object's returns, rising.
+        span: s, start and end.
+        frame: of the object.
+        fast: whether all connected dynamic returns are its own.
+        inputs, returns: the beams, and the dynamic returns.
+    """
+    around = _CONTEXT if fast else 0.0
+    first, last = span[0] - around, span[1] + around
+    scans, offset = scans_within(first, last, inputs), inputs.deskewed.offset
+    beams = np.arange(offset[scans.start], offset[scans.stop])
+    seconds = beam_seconds(beams, inputs)
+    then = (seconds >= first) & (seconds <= last)
+    beams, seconds = beams[then], seconds[then]
+    mine = within_time(own, returns.seconds, first, last)
+    if fast:
+        there = returns.in_beam_range(int(beams[0]), int(beams[-1]) + 1)
+        every = within_time(np.arange(there.start, there.stop), returns.seconds, first, last)
+        sensor = beams_in_frame(beams[:1], seconds[:1], frame, inputs).origin[0]
+        whole = grow_segment(mine, every, frame, sensor, returns)
+        if not len(whole) or len(mine) < _MIN_TRACK_SHARE * len(whole):
+            return None
+        mine = whole
+        span = float(returns.seconds[mine].min()), float(returns.seconds[mine].max())
+    seen = beams_in_frame(returns.beam[mine], returns.seconds[mine], frame, inputs)
+    beside = ~np.isin(beams, returns.beam[mine], assume_unique=True)
+    beams, seconds = beams[beside], seconds[beside]
+    near = in_viewing_cone(returns.beam[mine], beams, inputs)
+    return PartialScan(seen, beams_in_frame(beams[near], seconds[near], frame, inputs), span)
+
+
+def triangulate_partial_scan(scan: PartialScan, rigid: bool, max_depth: float) -> Mesh:
+    """The surface of a partial scan.
+
+    Args:
+        scan: the beams.
+        rigid: whether the object keeps its shape, as cars do: their sides are seen at grazing
+            incidence.
+        max_depth: metres along the line of sight between beams on the side of a rigid object.
+    """
+    stretch, max_edge = _MAX_SPACING_RATIO, _MAX_EDGE
+    if rigid:
+        away = np.linalg.norm(scan.own.points - scan.own.origin, axis=1)
+        stretch, max_edge = np.inf, max(max_edge, SPACING * float(np.median(away)))
+    mesh = triangulate_beams(scan.own, scan.others, stretch, max_edge, max_depth if rigid else 0.0)
+    return remove_small_components(mesh, MIN_COMPONENT_AREA)
+
+
+def within_time(some: Index, seconds: Float, first: float, last: float) -> Index:
+    """The numbers (n,) whose times lie in an interval."""
+    return some[(seconds[some] >= first) & (seconds[some] <= last)]
+
+
+def motion_transform(motion: Float, time_offset: float) -> tuple[Float, Float]:
+    """(3, 3) and (3,) metres: correction of a partial scan at a time offset in seconds.
 
     Args:
         motion: (6,) metres per second ahead, to the left and up, rad per second to the left, metres
             per square second ahead and to the left.
-        later: s.
+        time_offset: s.
     """
-    turn = motion[3] * later
+    turn = motion[3] * time_offset
     c, s = np.cos(turn), np.sin(turn)
-    t = motion[:3] * later
-    t[:2] += 0.5 * motion[4:] * later**2
+    t = motion[:3] * time_offset
+    t[:2] += 0.5 * motion[4:] * time_offset**2
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), t
 
 
-def register_surfaces(sweeps: Sequence[PartialSurface], best: int) -> Float:
-    """(6,) how the thing went otherwise than its track, as `pose` has it.
+def register_surfaces(surfaces: Sequence[PartialSurface], best: int) -> Float:
+    """(6,) the object's motion relative to its track, see `motion_transform`.
 
-    Point to plane against the best look, from the looks beside it to those far from it.
+    A search over the forward speed point to point, then Gauss-Newton point to plane against the
+    best partial surface, from the surfaces beside it to those far from it.
     """
-    known = sweeps[best]
+    known = surfaces[best]
     motion = np.zeros(6)
-    if len(known.mesh.vertices) < _FEWEST:
+    if len(known.mesh.vertices) < _MIN_POINTS:
         return motion
     tree = cKDTree(known.mesh.vertices)
-    some, few = ([_Points.of(one, most) for one in sweeps] for most in (_POINTS, _GUESSED))
-    beside = [few[k] for k in (best - 1, best + 1) if 0 <= k < len(sweeps)]
-    motion = _ends_meet(beside, known, tree, motion, _GUESSES, _PER_SPEED)
-    guess = motion * np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # of the rest the track tells more
-    others = [k for k in range(len(sweeps)) if k != best]
-    farthest = max(abs(one.time_offset) for one in sweeps)
-    for part, reach in zip((0.4, 0.7, 1.0), _REACHES, strict=True):
-        near = [some[k] for k in others if abs(some[k].later) <= part * farthest + 1e-9]
+    some, few = ([_Points.sample(one, n) for one in surfaces] for n in (_POINTS, _SEARCH_POINTS))
+    beside = [few[k] for k in (best - 1, best + 1) if 0 <= k < len(surfaces)]
+    motion = _search_speed(beside, known, tree, motion, _COARSE_SPEEDS, _SPEED_PENALTY)
+    prior = motion * np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # the rest is better from the track
+    others = [k for k in range(len(surfaces)) if k != best]
+    farthest = max(abs(one.time_offset) for one in surfaces)
+    for part, radius in zip(_SPANS, _RADII, strict=True):
+        near = [some[k] for k in others if abs(some[k].time_offset) <= part * farthest + 1e-9]
         for _ in range(_ROUNDS):
-            motion = _better(near, known, tree, motion, guess, _TRACK, reach)
-    motion = guess = _ends_meet([few[k] for k in others], known, tree, motion, _FINER, 0.0)
+            motion = _gauss_newton_step(near, known, tree, motion, prior, _TRACK_STD, radius)
+    motion = prior = _search_speed([few[k] for k in others], known, tree, motion, _FINE_SPEEDS, 0.0)
+    far = [some[k] for k in others]
     for _ in range(_ROUNDS):
-        motion = _better([some[k] for k in others], known, tree, motion, guess, _TOLD, _REACHES[-1])
+        motion = _gauss_newton_step(far, known, tree, motion, prior, _SEARCHED_STD, _RADII[-1])
     return motion
 
 
-def _ends_meet(
-    looks: Sequence[_Points],
+def _search_speed(
+    surfaces: Sequence[_Points],
     known: PartialSurface,
     tree: "cKDTree[None]",
     motion: Float,
     speeds: tuple[float, ...],
-    price: float,
+    penalty: float,
 ) -> Float:
-    """The motion (6,) with another velocity ahead, if by that looks lie nearer to the best one.
+    """The motion (6,) with another forward speed, if surfaces lie nearer to the best one by that.
 
-    Point to point, so that its ends tell, and not along its sides only. A track of a part of a car
-    may be wrong by half its velocity. With each velocity ahead the rest of the motion is made
-    better first: along a side that is askew one ahead is nearly as good as one to the left.
+    Point to point, so that the ends of a car count, and not its sides only. The track of a part of
+    a car may be wrong by half its velocity. For each speed the rest of the motion is refined first:
+    along a side that is askew, a motion ahead is nearly as good as one to the left.
 
     Args:
-        looks: the others.
+        surfaces: the others.
         known: the best one.
         tree: its vertices.
-        motion: where to begin.
-        speeds: m/s that are tried beside, 0 the first of them.
-        price: m for each m/s: where all are as good the track counts.
+        motion: initial.
+        speeds: m/s that are added, 0 the first of them.
+        penalty: m per m/s added.
     """
-    found, worth = list[Float](), list[float]()
+    found, cost = list[Float](), list[float]()
     for speed in speeds:
-        tried = guess = motion + np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
-        for _ in range(_SETTLED):
-            tried = _better(looks, known, tree, tried, guess, _TOLD, _REACHES[1])
+        tried = prior = motion + np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
+        for _ in range(_SEARCH_ROUNDS):
+            tried = _gauss_newton_step(
+                surfaces, known, tree, tried, prior, _SEARCHED_STD, _RADII[1]
+            )
         found.append(tried)
-        at = np.concatenate([np.zeros((0, 3)), *(one.moved(tried).at for one in looks)])
-        off = np.asarray(tree.query(at, distance_upper_bound=_NEAR)[0])
-        far = np.minimum(off, _NEAR)
-        worth.append((float(far.mean()) if len(far) else 0.0) + price * abs(speed))
-    return found[int(np.argmin(worth))]
+        at = np.concatenate([np.zeros((0, 3)), *(one.transform(tried).at for one in surfaces)])
+        distance = np.asarray(tree.query(at, distance_upper_bound=_MAX_DISTANCE)[0])
+        distance = np.minimum(distance, _MAX_DISTANCE)
+        cost.append((float(distance.mean()) if len(distance) else 0.0) + penalty * abs(speed))
+    return found[int(np.argmin(cost))]
 
 
-def _better(
-    looks: Sequence[_Points],
+def _gauss_newton_step(
+    surfaces: Sequence[_Points],
     known: PartialSurface,
     tree: "cKDTree[None]",
     motion: Float,
-    guess: Float,
-    sigma: tuple[float, ...],
-    reach: float,
+    prior: Float,
+    prior_std: tuple[float, ...],
+    radius: float,
 ) -> Float:
-    """One step of Gauss and Newton from `motion`, held to `guess` by standard deviations."""
-    hold = np.diag(1.0 / np.square(sigma))
-    H, g = hold.copy(), hold @ (motion - guess)
-    for one in looks:
-        at, n, residual = _off(one.moved(motion), known, tree, reach)
-        if len(at) < _FEWEST:
+    """One Gauss-Newton step of `motion` with robust weights and a Gaussian prior."""
+    information = np.diag(1.0 / np.square(prior_std))
+    H, g = information.copy(), information @ (motion - prior)
+    for one in surfaces:
+        at, n, residual = _correspondences(one.transform(motion), known, tree, radius)
+        if len(at) < _MIN_POINTS:
             continue
-        T = one.later
-        w = 1.0 / (1.0 + (residual / (3.0 * _SIGMA)) ** 2) ** 2 / _SIGMA**2
-        w *= min(1.0, _TELL / len(at))
+        T = one.time_offset
+        w = 1.0 / (1.0 + (residual / (3.0 * _POINT_STD)) ** 2) ** 2 / _POINT_STD**2
+        w *= min(1.0, _INDEPENDENT_POINTS / len(at))
         around = at - motion_transform(motion, T)[1]
         J = np.stack(
             [
@@ -232,115 +304,26 @@ def _better(
     return np.asarray(motion - np.linalg.solve(H, g))
 
 
-def _off(
-    one: _Points, known: PartialSurface, tree: "cKDTree[None]", reach: float
+def _correspondences(
+    one: _Points, known: PartialSurface, tree: "cKDTree[None]", radius: float
 ) -> tuple[Float, Float, Float]:
-    """(n, 3) points that have a place on what is known, (n, 3) its normals, (n,) metres off it."""
+    """(n, 3) points with a nearest vertex, (n, 3) its normals, (n,) point-to-plane residuals."""
     at, facing, _ = one
-    away, nearest = map(np.asarray, tree.query(at, distance_upper_bound=reach))
+    away, nearest = map(np.asarray, tree.query(at, distance_upper_bound=radius))
     near = np.flatnonzero(np.isfinite(away))
     normals = known.normals[nearest[near]]
-    same = (facing[near] * normals).sum(axis=1) > _SAME_SIDE
+    same = (facing[near] * normals).sum(axis=1) > _MIN_NORMAL_COSINE
     near, normals = near[same], normals[same]
     residual = ((at[near] - known.mesh.vertices[nearest[near]]) * normals).sum(axis=1)
     return at[near], normals, residual
 
 
 def surface_distance(one: PartialSurface, known: PartialSurface) -> float:
-    """Metres, by which 3 of 4 places of a look lie off another one at most.
-
-    NaN where they have little in common.
-    """
+    """Metres, third quartile of a surface's distances from another; NaN: too little in common."""
     if not len(known.mesh.vertices):
         return float("nan")
-    some = _Points.of(one, _POINTS)
-    residual = _off(some, known, cKDTree(known.mesh.vertices), _REACHES[0])[2]
-    return float(np.quantile(np.abs(residual), 0.75)) if len(residual) >= _FEWEST else float("nan")
-
-
-_AROUND = 0.03  # s, in which a scan sees the rest of a car
-
-_MOSTLY = 0.1  # of what hangs together is of a track: else another one follows it
-
-DEEPEST = 3.0  # m, the side of a car from its middle to its end
-
-
-class PartialScan(NamedTuple):
-    """What one look saw of a thing.
-
-    Attributes:
-        own: beams that ended on it, in its own frame.
-        others: those about then that went by it.
-        span: s, from the first to the last.
-    """
-
-    own: ObjectBeams
-    others: ObjectBeams
-    span: tuple[float, float]
-
-
-def extract_partial_scan(
-    own: Index,
-    span: tuple[float, float],
-    way: ObjectFrame,
-    fast: bool,
-    sources: MeshInputs,
-    moves: DynamicReturns,
-    options: MoverOptions,
-) -> PartialScan | None:
-    """What was seen of a thing at a time; None where most of that is of another one.
-
-    Args:
-        own: numbers within `moves` of what ended on it at any time, rising.
-        span: s, from when to when.
-        way: where its own frame is.
-        fast: whether all that hangs together with it is its own.
-        sources, moves: the beams, and those on what moves.
-        options: see MoverOptions.
-    """
-    around = _AROUND if fast else 0.0
-    first, last = span[0] - around, span[1] + around
-    scans, offset = scans_within(first, last, sources), sources.deskewed.offset
-    beams = np.arange(offset[scans.start], offset[scans.stop])
-    seconds = beam_seconds(beams, sources)
-    then = (seconds >= first) & (seconds <= last)
-    beams, seconds = beams[then], seconds[then]
-    mine = within_time(own, moves.seconds, first, last)
-    if fast:
-        about = moves.in_beam_range(int(beams[0]), int(beams[-1]) + 1)
-        every = within_time(np.arange(about.start, about.stop), moves.seconds, first, last)
-        place = beams_in_frame(beams[:1], seconds[:1], way, sources).origin[0]
-        whole = grow_segment(mine, every, way, place, moves, options)
-        if not len(whole) or len(mine) < _MOSTLY * len(whole):
-            return None
-        mine = whole
-        span = float(moves.seconds[mine].min()), float(moves.seconds[mine].max())
-    seen = beams_in_frame(moves.beam[mine], moves.seconds[mine], way, sources)
-    beside = ~np.isin(beams, moves.beam[mine], assume_unique=True)
-    beams, seconds = beams[beside], seconds[beside]
-    near = in_viewing_cone(moves.beam[mine], beams, sources)
-    return PartialScan(seen, beams_in_frame(beams[near], seconds[near], way, sources), span)
-
-
-def triangulate_partial_scan(
-    look: PartialScan, rigid: bool, deepest: float, options: MoverOptions
-) -> Mesh:
-    """Triangles between its beams.
-
-    Args:
-        look: the beams.
-        rigid: whether it keeps its shape, as cars do: their sides are seen at flat angles.
-        deepest: metres along the line of sight between beams on the side of such a thing.
-        options: see MoverOptions.
-    """
-    stretch, longest = options.stretch, options.longest
-    if rigid:
-        away = np.linalg.norm(look.own.points - look.own.origin, axis=1)
-        stretch, longest = np.inf, max(longest, SPACING * float(np.median(away)))
-    mesh = triangulate_beams(look.own, look.others, stretch, longest, deepest if rigid else 0.0)
-    return remove_small_components(mesh, options.island)
-
-
-def within_time(some: Index, seconds: Float, first: float, last: float) -> Index:
-    """Those of numbers (n,) whose times lie between two."""
-    return some[(seconds[some] >= first) & (seconds[some] <= last)]
+    some = _Points.sample(one, _POINTS)
+    residual = _correspondences(some, known, cKDTree(known.mesh.vertices), _RADII[0])[2]
+    if len(residual) < _MIN_POINTS:
+        return float("nan")
+    return float(np.quantile(np.abs(residual), 0.75))

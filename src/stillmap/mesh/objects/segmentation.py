@@ -1,4 +1,4 @@
-"""Which beams met a thing that moves, and these in its own frame."""
+"""Object segmentation: the returns of each moving object, in its own frame."""
 
 from typing import NamedTuple
 
@@ -9,41 +9,44 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from stillmap.core import arrays
-from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
-from stillmap.mesh import range_image
+from stillmap.em.types import DYNAMIC_BELOW
 from stillmap.mesh.inputs import MeshInputs
 from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.objects.sweep_surface import ObjectBeams
-from stillmap.mesh.options import MoverOptions
+from stillmap.mesh.range_image import beam_directions, has_planar_scans
 from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.tracking import MovingObject
 
-Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 NO_OWNER = -1
-_FAR = 1000.0  # m
-_OFTEN = 0.9  # of the time something is not faster
-_REACH = 3.0  # m, from the middle of a car to its ends
-_CAR = 6.0  # m, from one end of it to the other
-_CELL = 0.2  # m, in which one point is enough
-_ASKED = 9  # scans that tell whether they are planar
-_BESIDE = 1  # scans before and after a time in which beams may be of it
-_BEYOND = 0.05  # rad beyond a thing, up to where beams are beside it
+BOX_MARGIN = 0.15  # m around an object's box within which returns are its own
+GROUND_CLEARANCE = 0.03  # m above the ground: lower returns are the ground's
+MIN_RIGID_SIZE = 1.2  # m: objects at least so long or wide are no people
+MIN_RIGID_SPEED = 2.0  # m/s: faster objects are no people
+LINK = 0.5  # m between connected parts of a vehicle
 SPACING = 0.025  # rad between beams, at most
+HALF_CAR = 3.0  # m, from the center of a car to its ends
+_CAR_LENGTH = 6.0  # m
+_MAX_RANGE = 1000.0  # m, end of beams without a return
+_SPEED_QUANTILE = 0.9  # of an object's speeds that counts
+_CELL = 0.2  # m, in which one point is enough
+_SCANS_AROUND = 1  # before and after a time, whose beams may be of it
+_CONE_MARGIN = 0.05  # rad around an object, of beams that pass beside it
 
 
 class DynamicReturns(NamedTuple):
-    """The K beams of a recording that ended on what moves.
+    """The K returns of a recording on moving objects.
 
     Attributes:
-        beam: (K,) their numbers, rising.
-        seconds: (K,) when they were taken, by the time of boxes.
+        beam: (K,) beam numbers, rising.
+        seconds: (K,) times, by the clock of boxes.
         ends: (K, 3) metres in the map frame.
-        owner: (K,) the object that each is of; -1: none.
-        dynamic: (K,) whether it is rather dynamic than static; what has an owner may be not.
-        planar: whether scans are rows.
+        owner: (K,) id of the object; -1: none.
+        is_dynamic: (K,) whether P(static) is below one half; not all returns with an owner are.
+        is_planar: whether scans are planar.
     """
 
     beam: Index
@@ -54,142 +57,126 @@ class DynamicReturns(NamedTuple):
     is_planar: bool
 
     @classmethod
-    def collect(cls, sources: MeshInputs) -> "DynamicReturns":
-        """All that moves, once for all things."""
-        seen, objects = sources.deskewed, sources.objects
+    def collect(cls, inputs: MeshInputs) -> "DynamicReturns":
+        """All returns that are dynamic or belong to an object."""
+        deskewed, objects = inputs.deskewed, inputs.objects
         owned = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in objects)])
         whose = np.repeat([one.id for one in objects], [len(one.beams) for one in objects])
-        beam = np.union1d(_dynamic(seen.hit, sources.p_static), owned).astype(np.intp)
+        beam = np.union1d(_dynamic_beams(deskewed.hit, inputs.p_static), owned).astype(np.intp)
         owner = np.full(len(beam), NO_OWNER, np.int32)
         owner[np.searchsorted(beam, owned)] = whose
-        dynamic = seen.hit[beam] & (sources.p_static[beam] < DYNAMIC_BELOW)
-        seconds, ends = beam_seconds(beam, sources), seen.end_points(beam, sources.poses)
-        asked = np.unique(np.linspace(0, seen.n_scans - 1, min(seen.n_scans, _ASKED)).astype(int))
-        planar = [
-            range_image.is_planar(range_image.beam_directions(seen.points[seen.beams_of(t)]))
-            for t in asked
-        ]
-        return cls(beam, seconds, ends, owner, dynamic, 2 * sum(planar) > len(planar))
+        dynamic = deskewed.hit[beam] & (inputs.p_static[beam] < DYNAMIC_BELOW)
+        seconds, ends = beam_seconds(beam, inputs), deskewed.end_points(beam, inputs.poses)
+        return cls(beam, seconds, ends, owner, dynamic, has_planar_scans(deskewed))
 
     def in_beam_range(self, first: int, last: int) -> slice:
-        """Those with numbers from the first to before the last."""
+        """Returns of beams first:last."""
         a, b = np.searchsorted(self.beam, [first, last])
         return slice(int(a), int(b))
 
 
-def _dynamic(hit: Bool, p_static: NDArray[np.float32]) -> Index:
-    """The beams that hit something rather dynamic than static; little waits in memory."""
+def _dynamic_beams(hit: Bool, p_static: NDArray[np.float32]) -> Index:
+    """Beams that hit something rather dynamic than static, found block by block."""
     found = [np.zeros(0, np.intp)]
     for block in arrays.iter_blocks(hit, p_static):
-        moves = hit[block] & (p_static[block] < DYNAMIC_BELOW)
-        found.append(block.start + np.flatnonzero(moves))
+        dynamic = hit[block] & (p_static[block] < DYNAMIC_BELOW)
+        found.append(block.start + np.flatnonzero(dynamic))
     return np.concatenate(found)
 
 
-def beam_seconds(beams: Index, sources: MeshInputs) -> Float:
-    """(n,) when beams (n,), rising, were taken, by the time of boxes."""
-    recording = sources.recording
+def beam_seconds(beams: Index, inputs: MeshInputs) -> Float:
+    """(n,) times of beams (n,), rising, by the clock of boxes."""
+    recording = inputs.recording
     times = recording.stamp_ns[recording.scans_of(beams)]
     if recording.beam_time is not None:
         times = times + np.round(1e9 * recording.beam_time[beams].astype(np.float64)).astype(int)
-    return np.asarray(1e-9 * (times - sources.start_ns), np.float64)
+    return np.asarray(1e-9 * (times - inputs.start_ns), np.float64)
 
 
-def scans_within(first: float, last: float, sources: MeshInputs) -> slice:
-    """The scans that have beams of these times, and some others beside."""
-    stamps = 1e-9 * (sources.deskewed.stamp_ns - sources.start_ns)
-    reach = 1e-9 * sources.max_scan_ns
-    a = int(np.searchsorted(stamps, first - reach)) - _BESIDE
-    b = int(np.searchsorted(stamps, last + reach, side="right")) + _BESIDE
+def scans_within(first: float, last: float, inputs: MeshInputs) -> slice:
+    """Scans that may have beams between two times, and some around."""
+    stamps = 1e-9 * (inputs.deskewed.stamp_ns - inputs.start_ns)
+    slack = 1e-9 * inputs.max_scan_ns
+    a = int(np.searchsorted(stamps, first - slack)) - _SCANS_AROUND
+    b = int(np.searchsorted(stamps, last + slack, side="right")) + _SCANS_AROUND
     return slice(max(a, 0), min(b, len(stamps)))
 
 
-def is_fast(thing: TrackedBox, options: MoverOptions) -> bool:
-    """Whether it is faster than people are."""
-    speed = np.linalg.norm(thing.box.velocity, axis=1)
-    return bool(np.quantile(speed, _OFTEN) > options.fast)
+def is_fast(box: TrackedBox) -> bool:
+    """Whether an object is faster than people."""
+    speed = np.linalg.norm(box.box.velocity, axis=1)
+    return bool(np.quantile(speed, _SPEED_QUANTILE) > MIN_RIGID_SPEED)
 
 
-def is_large(thing: TrackedBox, options: MoverOptions) -> bool:
-    """Whether it is longer or wider than people are."""
-    return 2.0 * max(thing.box.half_size) >= options.rigid
+def is_large(box: TrackedBox) -> bool:
+    """Whether an object is longer or wider than people."""
+    return 2.0 * max(box.box.half_size) >= MIN_RIGID_SIZE
 
 
 def segment_object(
-    one: MovingObject,
-    thing: TrackedBox,
-    moves: DynamicReturns,
-    sources: MeshInputs,
-    options: MoverOptions,
+    one: MovingObject, tracked: TrackedBox, returns: DynamicReturns, inputs: MeshInputs
 ) -> Index:
-    """(n,) of what moves that which ended on a thing: rising numbers within `moves`.
+    """(n,) returns of an object: rising numbers within `returns`.
 
-    That is what is rather dynamic than static, in the box around it, and of no other thing.
+    Dynamic returns in the box around it that belong to no other object, and its own not far beside.
     """
-    box, offset = thing.box, sources.deskewed.offset
-    stamps = 1e-9 * (sources.deskewed.stamp_ns - sources.start_ns)
+    box, offset = tracked.box, inputs.deskewed.offset
+    stamps = 1e-9 * (inputs.deskewed.stamp_ns - inputs.start_ns)
     a = int(np.searchsorted(stamps, box.seconds[0] - box.hold))
     b = max(int(np.searchsorted(stamps, box.seconds[-1] + box.hold, side="right")), a)
-    some = moves.in_beam_range(int(offset[a]), int(offset[b]))
-    half = np.array(box.half_size) + options.margin
-    # what is far from all of its way need not be asked where it was then
-    reach = max(float(np.linalg.norm(half)) + options.margin, _REACH)
+    some = returns.in_beam_range(int(offset[a]), int(offset[b]))
+    half = np.array(box.half_size) + BOX_MARGIN
+    # returns far from the whole track need no test against the box
+    reach = max(float(np.linalg.norm(half)) + BOX_MARGIN, HALF_CAR)
     way = box.center_at(np.concatenate([box.seconds, box.seconds[[0, -1]] + [-box.hold, box.hold]]))
     low, high = way.min(axis=0) - reach, way.max(axis=0) + reach
-    x, y = moves.ends[some, 0], moves.ends[some, 1]
+    x, y = returns.ends[some, 0], returns.ends[some, 1]
     near = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
-    near &= (moves.owner[some] == one.id) | (moves.owner[some] == NO_OWNER)
+    near &= (returns.owner[some] == one.id) | (returns.owner[some] == NO_OWNER)
     number = some.start + np.flatnonzero(near)
-    at = ObjectFrame.from_track(thing).to_object(moves.seconds[number], moves.ends[number])
+    frame = ObjectFrame.from_track(tracked)
+    at = frame.to_object(returns.seconds[number], returns.ends[number])
     inside = (np.abs(at[:, :2]) <= half).all(axis=1)
-    inside &= (at[:, 2] > options.low) & (at[:, 2] <= thing.height + options.margin)
-    # a track of somebody may take hold of who stands beside
-    mine = (np.abs(at[:, :2]) <= half + options.margin).all(axis=1)
-    if is_large(thing, options) and not is_fast(thing, options):
-        # the middle of what is seen of it goes to and fro on it
-        mine = np.linalg.norm(at[:, :2], axis=1) <= _REACH
-    kept = np.where(moves.owner[number] == one.id, mine, inside)
+    inside &= (at[:, 2] > GROUND_CLEARANCE) & (at[:, 2] <= tracked.height + BOX_MARGIN)
+    # the track of one person may capture another beside
+    mine = (np.abs(at[:, :2]) <= half + BOX_MARGIN).all(axis=1)
+    if is_large(tracked) and not is_fast(tracked):
+        # the center of the visible part moves about on a large object
+        mine = np.linalg.norm(at[:, :2], axis=1) <= HALF_CAR
+    kept = np.where(returns.owner[number] == one.id, mine, inside)
     return np.asarray(number[kept], np.intp)
 
 
 def grow_segment(
-    own: Index,
-    within: Index,
-    way: ObjectFrame,
-    place: Float,
-    moves: DynamicReturns,
-    options: MoverOptions,
+    own: Index, within: Index, frame: ObjectFrame, sensor: Float, returns: DynamicReturns
 ) -> Index:
-    """(n,) of what moves that which hangs together with what is known to be of a thing.
+    """(n,) the returns of a fast object and all dynamic returns connected with them.
 
-    Of things that are faster than people all that moves beside them is theirs: parts of a car are
-    often followed each on its own.
+    Parts of a car are often tracked separately.
 
     Args:
-        own: numbers within `moves` that are known to be of it, rising.
+        own: numbers within `returns` that are known to be of the object, rising.
         within: rising numbers of all that may be.
-        way: where its own frame is.
-        place: (3,) metres in that frame, where the sensor was.
-        moves: all that moves.
-        options: see MoverOptions.
+        frame: of the object.
+        sensor: (3,) metres, sensor position in that frame.
+        returns: all dynamic returns.
     """
-    within = within[moves.is_dynamic[within]]
-    at = way.to_object(moves.seconds[within], moves.ends[within])
-    some = (at[:, 2] > options.low) & (np.linalg.norm(at[:, :2], axis=1) <= _CAR)
+    within = within[returns.is_dynamic[within]]
+    at = frame.to_object(returns.seconds[within], returns.ends[within])
+    some = (at[:, 2] > GROUND_CLEARANCE) & (np.linalg.norm(at[:, :2], axis=1) <= _CAR_LENGTH)
     within, at = within[some], at[some]
-    there = way.to_object(moves.seconds[own], moves.ends[own])
-    own = own[np.linalg.norm(there[:, :2], axis=1) <= _CAR]
+    there = frame.to_object(returns.seconds[own], returns.ends[own])
+    own = own[np.linalg.norm(there[:, :2], axis=1) <= _CAR_LENGTH]
     if not len(within):
         return own
-    away = float(np.median(np.linalg.norm(at - place, axis=1)))
-    link = options.link + SPACING * away
-    piece = cluster_cells(at, _CELL, link)
+    away = float(np.median(np.linalg.norm(at - sensor, axis=1)))
+    cluster = cluster_cells(at, _CELL, LINK + SPACING * away)
     mine = np.isin(within, own)
-    return np.union1d(own, within[np.isin(piece, piece[mine])])
+    return np.union1d(own, within[np.isin(cluster, cluster[mine])])
 
 
 def cluster_cells(points: Float, edge: float, link: float) -> Index:
-    """(n,) which piece points (n, 3) are of: their cells are at most `link` metres apart."""
+    """(n,) cluster of points (n, 3) whose cells are connected by steps of at most `link` metres."""
     cells, of = unique_cells(points, edge)
     one, other = cKDTree(cells).query_pairs(link / edge, output_type="ndarray").T
     n = len(cells)
@@ -198,9 +185,9 @@ def cluster_cells(points: Float, edge: float, link: float) -> Index:
 
 
 def unique_cells(points: Float, edge: float) -> tuple[Float, Index]:
-    """(m, 3) the cells that points (n, 3) lie in, numbers along each axis, and (n,) whose is which.
+    """(m, 3) sorted cells of points (n, 3), in numbers along each axis, and (n,) the cell of each.
 
-    Rising, as `np.unique` has them, which takes ten times as long for rows.
+    Ten times as fast as `np.unique` of rows.
     """
     cells = np.floor(points / edge).astype(np.int64)
     low = cells.min(axis=0)
@@ -214,41 +201,41 @@ def unique_cells(points: Float, edge: float) -> tuple[Float, Index]:
 
 
 def beams_in_frame(
-    beams: Index, seconds: Float, way: ObjectFrame, sources: MeshInputs
+    beams: Index, seconds: Float, frame: ObjectFrame, inputs: MeshInputs
 ) -> ObjectBeams:
-    """Beams (n,), rising, taken at times (n,), in a thing's own frame.
+    """Beams (n,), rising, taken at times (n,), in an object's frame.
 
-    Those that came back from nowhere go on for a kilometre.
+    Beams without a return are extended to a kilometre.
     """
-    seen = sources.deskewed
-    ends = seen.end_points(beams, sources.poses)
-    scan = seen.scans_of(beams)
-    T = sources.poses[scan] @ seen.T_base_sensor[seen.sensor[scan]]
+    deskewed = inputs.deskewed
+    ends = deskewed.end_points(beams, inputs.poses)
+    scan = deskewed.scans_of(beams)
+    T = inputs.poses[scan] @ deskewed.T_base_sensor[deskewed.sensor[scan]]
     origin = T[:, :3, 3]
     with np.errstate(invalid="ignore", divide="ignore"):
         far = origin + (ends - origin) * (
-            _FAR / np.linalg.norm(ends - origin, axis=1, keepdims=True)
+            _MAX_RANGE / np.linalg.norm(ends - origin, axis=1, keepdims=True)
         )
-    ends = np.where(seen.hit[beams][:, None], ends, far)
-    return ObjectBeams.from_map(ends, origin, seconds, way)
+    ends = np.where(deskewed.hit[beams][:, None], ends, far)
+    return ObjectBeams.from_map(ends, origin, seconds, frame)
 
 
-def in_viewing_cone(mine: Index, beams: Index, sources: MeshInputs) -> Bool:
-    """(n,) which of beams (n,) look about where others, n > 0, ended; unknown ones do not."""
-    seen = sources.deskewed
-    middle = seen.end_points(mine, sources.poses).mean(axis=0)
-    own, other = (_towards(middle, some, sources) for some in (mine, beams))
-    widest = np.arccos(np.clip(own.min(), -1.0, 1.0)) + _BEYOND
+def in_viewing_cone(mine: Index, beams: Index, inputs: MeshInputs) -> Bool:
+    """(n,) which beams (n,) point to where the returns `mine`, at least one, lie."""
+    deskewed = inputs.deskewed
+    center = deskewed.end_points(mine, inputs.poses).mean(axis=0)
+    own, other = (_cosine_to(center, some, inputs) for some in (mine, beams))
+    widest = np.arccos(np.clip(own.min(), -1.0, 1.0)) + _CONE_MARGIN
     return np.asarray(other >= np.cos(min(float(widest), np.pi)))
 
 
-def _towards(middle: Float, beams: Index, sources: MeshInputs) -> Float:
-    """(n,) cosine of the angle between beams and the way from the sensor to a place (3,)."""
-    seen = sources.deskewed
-    first, last = seen.scans_of(beams[[0, -1]]) if len(beams) else (0, -1)
+def _cosine_to(target: Float, beams: Index, inputs: MeshInputs) -> Float:
+    """(n,) cosine of the angle between beams and the direction from the sensor to a point (3,)."""
+    deskewed = inputs.deskewed
+    first, last = deskewed.scans_of(beams[[0, -1]]) if len(beams) else (0, -1)
     scans = np.arange(first, last + 1)
-    T = sources.poses[scans] @ seen.T_base_sensor[seen.sensor[scans]]
-    axis = np.einsum("nji,nj->ni", T[:, :3, :3], middle - T[:, :3, 3])
+    T = inputs.poses[scans] @ deskewed.T_base_sensor[deskewed.sensor[scans]]
+    axis = np.einsum("nji,nj->ni", T[:, :3, :3], target - T[:, :3, 3])
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    looking = range_image.beam_directions(seen.points[beams])
-    return np.asarray(np.einsum("ni,ni->n", looking, axis[seen.scans_of(beams) - first]))
+    directions = beam_directions(deskewed.points[beams])
+    return np.asarray(np.einsum("ni,ni->n", directions, axis[deskewed.scans_of(beams) - first]))

@@ -1,1 +1,1 @@
-"""What a mesh looks like: pictures, what they show of it, and which of them paints what."""
+"""Texturing: visibility, occlusion, view selection, exposure, atlas, baking."""

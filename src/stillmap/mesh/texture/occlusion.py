@@ -1,7 +1,4 @@
-"""What beams say of a picture that was taken about when they were.
-
-The beams that were taken about when a picture was, and where they would have ended then.
-"""
+"""Occlusion of images by movers: lidar returns near an image's timestamp as an occlusion mask."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,33 +13,32 @@ from scipy import ndimage
 from stillmap.core.camera import Camera, project
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import beam_stamps_ns, max_scan_duration_ns
-from stillmap.mesh.options import ChoiceOptions
+from stillmap.mesh.texture.occluders import OUTLINE_MARGIN
 from stillmap.mesh.texture.views import View
 from stillmap.tracking.boxes import Box
 
 Float = NDArray[np.float64]
-
 Index = NDArray[np.intp]
 
-_CELLS = 80  # over the width of a picture
-
-_SLOPE = 0.01  # m by which what a beam shows is larger, for each metre: beams diverge
-
-_WIDE = 1.5  # cells, within which a beam tells of what is beside
-
-_NEAREST = 0.05  # m from the camera: what is nearer is the camera's own
-
-_RADII = 12  # cells at most, by which an end point is grown
+_WINDOW = 0.06  # s around an image: longer, and untracked movers smear
+_WINDOW_TILTING = 0.15  # s, for planar scans: each row is only a line across the image
+_WINDOW_TRACKED = 0.5  # s, for planar scans of tracked objects, motion-compensated
+_COLUMNS = 80  # cells over the width of an image
+_BEAM_DIVERGENCE = 0.01  # m per metre by which the footprint of a return grows
+_SUPPORT_SIGMA = 1.5  # cells over which a static return supports its neighbors
+_MIN_DEPTH = 0.05  # m from the camera: nearer returns are the camera itself
+_MAX_RADIUS = 12  # cells by which a return is dilated
+_NEVER = np.iinfo(np.int64).max
 
 
 class OcclusionMask(NamedTuple):
-    """What beams say, on a grid of h by w cells over a picture.
+    """Depth map of movers in an image, on a grid of h by w cells.
 
     Attributes:
-        cell: pixels, the edge of a cell.
-        depth: (h, w) metres ahead of the camera, of the nearest thing that moves; inf: none.
-        dynamic: (h, w) how probably it moves.
-        support: (h, w) how many beams ended there on what stands still, about.
+        cell: pixels, edge of a cell.
+        depth: (h, w) metres ahead of the camera, nearest dynamic return; inf: none.
+        dynamic: (h, w) its P(dynamic).
+        support: (h, w) approximate number of static returns.
     """
 
     cell: float
@@ -50,80 +46,80 @@ class OcclusionMask(NamedTuple):
     dynamic: Float
     support: Float
 
-    def p_unoccluded(self, uv: Float, depth: Float, margin: float, unseen: Float) -> Float:
-        """(n,) how probably the picture shows what stands still.
+    def p_unoccluded(self, uv: Float, depth: Float, margin: float, prior: Float) -> Float:
+        """(n,) probability that the image shows static surface at each point.
 
-        What is known otherwise, as that somebody is about there, counts where no beam tells: each
-        that ended on what stands still says that nobody is before it.
+        Static returns raise the prior: each shows that no mover is in front. A dynamic return in
+        front limits it to 1 - P(dynamic).
 
         Args:
-            uv: (n, 2) pixels, within the picture.
+            uv: (n, 2) pixels within the image.
             depth: (n,) metres ahead of the camera.
-            margin: metres before a thing that moves, from where on it is in the way.
-            unseen: (n,) the probability where no beam tells of it.
+            margin: metres in front of a dynamic return from which on it occludes.
+            prior: (n,) probability where no return tells.
         """
         h, w = self.depth.shape
         column = np.clip((uv[:, 0] / self.cell).astype(np.intp), 0, w - 1)
         row = np.clip((uv[:, 1] / self.cell).astype(np.intp), 0, h - 1)
-        still = 1.0 - (1.0 - unseen) * np.exp(-self.support[row, column])
+        static = 1.0 - (1.0 - prior) * np.exp(-self.support[row, column])
         hidden = self.depth[row, column] < depth + margin
-        return np.where(hidden, np.minimum(still, 1.0 - self.dynamic[row, column]), still)
+        return np.where(hidden, np.minimum(static, 1.0 - self.dynamic[row, column]), static)
 
 
 def build_occlusion_mask(
-    view: View, points: Float, p_static: NDArray[np.float32], margin: float
+    view: View, points: Float, p_static: NDArray[np.float32], margin: float = OUTLINE_MARGIN
 ) -> OcclusionMask:
-    """What beams say of a picture.
+    """The occlusion mask of an image from the returns near its timestamp.
 
     Args:
-        view: the picture.
-        points: (n, 3) metres in the map frame, where beams ended about when it was taken.
-        p_static: (n,) P(c = 1) of these; below one half something that moves was there, and is
-            `margin` metres larger, to all sides.
+        view: the image.
+        points: (n, 3) metres in the map frame, motion-compensated returns.
+        p_static: (n,) their P(c = 1); those below one half occlude.
+        margin: metres by which each dynamic return is dilated.
     """
     camera = view.camera
-    cell = camera.width / _CELLS
-    shape = max(round(camera.height / cell), 1), _CELLS
+    cell = camera.width / _COLUMNS
+    shape = max(round(camera.height / cell), 1), _COLUMNS
     local = view.to_camera(points)
     uv, ok = project(camera, local)
-    ok &= local[:, 2] > _NEAREST
-    moves = p_static < 0.5
-    support = _support(uv[ok & ~moves], cell, shape)
+    ok &= local[:, 2] > _MIN_DEPTH
+    is_dynamic = p_static < 0.5
+    support = _count_support(uv[ok & ~is_dynamic], cell, shape)
     depth, dynamic = np.full(shape, np.inf), np.zeros(shape)
-    seen = ok & moves
+    seen = ok & is_dynamic
     if seen.any():
         at, away, p = uv[seen] / cell, local[seen, 2], 1.0 - p_static[seen]
-        first = _nearest_of_each(at, away)  # what lies behind in the same cell hides nothing more
-        focal = _focal(camera) / cell
-        _grow(depth, dynamic, at[first], away[first], p[first], focal, margin)
+        first = _nearest_per_cell(at, away)
+        focal = _focal_length(camera) / cell
+        _draw_discs(depth, dynamic, at[first], away[first], p[first], focal, margin)
     return OcclusionMask(cell, depth, dynamic, support)
 
 
-def _focal(camera: Camera) -> float:
+def _focal_length(camera: Camera) -> float:
     if camera.K is None:
-        raise ValueError("camera: its lens is not known")
+        raise ValueError("camera: its calibration is unknown")
     return float(camera.K[0, 0])
 
 
-def _support(uv: Float, cell: float, shape: tuple[int, int]) -> Float:
+def _count_support(uv: Float, cell: float, shape: tuple[int, int]) -> Float:
+    """(h, w) static returns per cell, smoothed; a lone return counts 1 in its own cell."""
     column, row = np.floor(uv / cell).astype(np.intp).T
     inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
     at = row[inside] * shape[1] + column[inside]
     count = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape)
-    # as much as one beam right here
-    near = ndimage.gaussian_filter(count.astype(np.float64), _WIDE, mode="constant")
-    return np.asarray(near * (2.0 * np.pi * _WIDE**2))
+    near = ndimage.gaussian_filter(count.astype(np.float64), _SUPPORT_SIGMA, mode="constant")
+    return np.asarray(near * (2.0 * np.pi * _SUPPORT_SIGMA**2))
 
 
-def _nearest_of_each(at: Float, away: Float) -> NDArray[np.intp]:
-    """Of the points (n, 2) in each cell the nearest."""
+def _nearest_per_cell(at: Float, away: Float) -> Index:
+    """Numbers of the nearest points (n, 2) of each cell."""
     cells = np.floor(at).astype(np.int64)
     order = np.lexsort((away, cells[:, 0], cells[:, 1]))
     new = np.any(np.diff(cells[order], axis=0, prepend=cells[order[:1]] - 1) != 0, axis=1)
     return order[new]
 
 
-def _grow(
+def _draw_discs(
     depth: Float,
     dynamic: Float,
     at: Float,
@@ -132,20 +128,20 @@ def _grow(
     focal: float,
     margin: float,
 ) -> None:
-    """Notes discs around what moves, the nearest of them in each cell.
+    """Draws discs around dynamic returns; the nearest one wins in each cell.
 
     Args:
         depth, dynamic: (h, w), changed.
         at: (n, 2) in cells.
         away: (n,) metres ahead of the camera.
         p_dynamic: (n,).
-        focal: length in cells.
+        focal: focal length in cells.
         margin: metres.
     """
     h, w = depth.shape
-    radius = np.minimum((margin / away + _SLOPE) * focal, _RADII)
+    radius = np.minimum((margin / away + _BEAM_DIVERGENCE) * focal, _MAX_RADIUS)
     parts = []
-    for whole in range(_RADII + 1):
+    for whole in range(_MAX_RADIUS + 1):
         of = np.flatnonzero(np.ceil(radius - 0.5).astype(np.intp) == whole)
         if not len(of):
             continue
@@ -159,28 +155,24 @@ def _grow(
     if not parts:
         return
     cell, point = np.concatenate(parts).T
-    # of several in a cell the last one that is written stays: the nearest
-    order = np.lexsort((point, -away[point]))
+    order = np.lexsort((point, -away[point]))  # the nearest is written last
     depth.flat[cell[order]] = away[point[order]]
     dynamic.flat[cell[order]] = p_dynamic[point[order]]
 
 
-_NEVER = np.iinfo(np.int64).max
-
-
 @dataclass(frozen=True, eq=False)
 class LidarReturns:
-    """T scans with M beams of a recording in 3D, to be asked for by time.
+    """Returns of a 3D recording of T scans and M beams, looked up by time.
 
     Attributes:
-        recording: as it was read; its times count.
-        seen: without the motion during its scans; its points count.
+        recording: as it was read, with its times.
+        deskewed: the same, deskewed, with its points.
         T_map_sensor: (T, 4, 4).
         p_static: (M,) P(c = 1).
-        boxes: of things that move, their times in seconds after `start_ns`.
-        owned: for each of these the beams (n,) that ended on it, rising.
-        start_ns: when the time of the boxes begins.
-        planar: whether scans lie in a plane, so that each sees only a line of what is there.
+        boxes: of tracked objects, in seconds after `start_ns`.
+        owned: (n,) beams that ended on each of these objects, rising.
+        start_ns: stamp at which the seconds of the boxes begin.
+        is_planar: whether each scan is a single row, as of a tilting laser.
     """
 
     recording: Recording
@@ -190,37 +182,26 @@ class LidarReturns:
     boxes: Sequence[Box]
     owned: Sequence[Index]
     start_ns: int
-    planar: bool = False
+    is_planar: bool = False
 
-    @cached_property
-    def _moving(self) -> NDArray[np.bool_]:
-        """(M,) whether a beam ended on one of the things, and rather moves."""
-        out = np.zeros(len(self.p_static), np.bool_)
-        for owned in self.owned:
-            out[owned] = self.p_static[owned] < 0.5
-        return out
-
-    def near_time(self, stamp_ns: int, options: ChoiceOptions) -> tuple[Float, NDArray[np.float32]]:
-        """Where hits ended about a time, had things that move been where they are then.
-
-        Those within `options.window` seconds; of planar scans those within `options.rows`, and
-        what ended on a thing that is followed within `options.carried`.
+    def near_time(self, stamp_ns: int) -> tuple[Float, NDArray[np.float32]]:
+        """Returns near a time; those on tracked objects moved along their track to that time.
 
         Returns:
             (n, 3) metres in the map frame, and P(static) (n,).
         """
-        window = options.rows if self.planar else options.window
-        carried = max(options.carried, window) if self.planar else window
-        scans = self._scans(stamp_ns, carried)
+        window = _WINDOW_TILTING if self.is_planar else _WINDOW
+        tracked = max(_WINDOW_TRACKED, window) if self.is_planar else window
+        scans = self._scans_near(stamp_ns, tracked)
         if scans.stop <= scans.start:
             return np.zeros((0, 3)), np.zeros(0, np.float32)
         first, last = self.deskewed.offset[[scans.start, scans.stop]]
         at_ns = beam_stamps_ns(self.recording, scans)
         apart = np.abs(at_ns - stamp_ns)
-        # at least what is nearest, as where scans count as taken at once
+        # at least the nearest, as scans without per-beam times share one stamp
         near = apart <= max(int(1e9 * window), int(apart.min(initial=_NEVER)))
-        if carried > window:
-            near |= (apart <= int(1e9 * carried)) & self._moving[first:last]
+        if tracked > window:
+            near |= (apart <= int(1e9 * tracked)) & self._on_dynamic_object[first:last]
         kept = np.flatnonzero(self.deskewed.hit[first:last] & near)
         beams = int(first) + kept
         ends = np.empty((len(beams), 3))
@@ -228,23 +209,33 @@ class LidarReturns:
         for scan, (low, high) in zip(range(scans.start, scans.stop), pairwise(bounds), strict=True):
             T = self.T_map_sensor[scan]
             ends[low:high] = self.deskewed.points[beams[low:high]] @ T[:3, :3].T + T[:3, 3]
-        self._go_on(ends, beams, at_ns[kept], stamp_ns)
+        self._compensate_motion(ends, beams, at_ns[kept], stamp_ns)
         return ends, self.p_static[beams]
 
-    def _scans(self, stamp_ns: int, window: float) -> slice:
-        """Those of which some beam may have been taken then; at least the nearest."""
+    @cached_property
+    def _on_dynamic_object(self) -> NDArray[np.bool_]:
+        """(M,) whether a beam ended on an object and is rather dynamic."""
+        out = np.zeros(len(self.p_static), np.bool_)
+        for owned in self.owned:
+            out[owned] = self.p_static[owned] < 0.5
+        return out
+
+    @cached_property
+    def _max_scan_ns(self) -> int:
+        return max_scan_duration_ns(self.recording)
+
+    def _scans_near(self, stamp_ns: int, window: float) -> slice:
+        """Scans with a beam that may lie within `window` seconds of a time."""
         stamps = self.recording.stamp_ns
-        reach = 1e9 * window + self._longest
+        reach = 1e9 * window + self._max_scan_ns
         first = int(np.searchsorted(stamps, stamp_ns - reach))
         last = int(np.searchsorted(stamps, stamp_ns + reach, side="right"))
         return slice(first, last)
 
-    @cached_property
-    def _longest(self) -> int:
-        """Nanoseconds that a scan takes at most, about."""
-        return max_scan_duration_ns(self.recording)
-
-    def _go_on(self, ends: Float, beams: Index, at_ns: NDArray[np.int64], stamp_ns: int) -> None:
+    def _compensate_motion(
+        self, ends: Float, beams: Index, at_ns: NDArray[np.int64], stamp_ns: int
+    ) -> None:
+        """Moves end points (n, 3) on tracked objects along the tracks to a time; in place."""
         for box, owned in zip(self.boxes, self.owned, strict=True):
             if not len(owned) or not len(beams) or owned[-1] < beams[0] or owned[0] > beams[-1]:
                 continue

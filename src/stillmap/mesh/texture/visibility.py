@@ -1,7 +1,7 @@
-"""Which faces of a mesh a picture shows, and how well.
+"""Faces of a mesh that are visible in an image.
 
-What hides what is decided in an ideal picture, without distortion, by its z-buffer; what lies
-within the picture's edges is decided by the lens.
+Occlusion is tested against the z-buffer of an ideal (undistorted) image; the camera model decides
+what lies within the image.
 """
 
 from collections.abc import Iterator
@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 import stillmap._core as _core
 from stillmap.core.camera import Camera, project, unproject
-from stillmap.mesh.options import VisibleOptions
 from stillmap.mesh.texture.views import View
 from stillmap.mesh.triangle_mesh import Mesh
 
@@ -22,19 +22,30 @@ Float32 = NDArray[np.float32]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-_ASIDE = 1.05  # times what a picture shows at its border, in which faces are looked for
-_BORDER = 33  # places along each edge of a picture that are asked how far aside they look
-_FINEST = 32  # parts that the edge of a large face is cut into, to look at each
+DEPTH_SCALE = 0.5  # pixels of the z-buffer per pixel of the image
+NEAR = 0.05  # m ahead of a camera: nothing nearer is visible
+IMAGE_MARGIN = 2.0  # pixels inside the image's border
+_MIN_COSINE = 0.03  # of the angle between normal and line of sight
+_MIN_AREA = 0.25  # square pixels of a face
+_DEPTH_TOLERANCE = 0.01  # m by which a face may lie behind the z-buffer
+_RELATIVE_TOLERANCE = 0.005  # m more per metre of distance
+_SLOPE_TOLERANCE = 0.05  # m per metre of distance, at most, for slanted faces
+_DILATION = 1  # pixels around a face in which much nearer depth occludes it: poses are inexact
+_SAMPLE_SPACING = 8.0  # pixels of the z-buffer between samples of a large face
+_CORNER_INSET = 0.2  # share of the way to the center by which samples at corners are pulled in
+_SEARCH_MARGIN = 1.05  # times the field of view in which points are projected
+_BORDER_SAMPLES = 33  # along each edge of an image, for its field of view
+_MAX_SUBDIVISION = 32  # sample intervals along the edge of a large face
 
 
 class VisibleFaces(NamedTuple):
-    """What one picture shows of F faces.
+    """Visibility of F faces in an image.
 
     Attributes:
-        seen: (F,) whether all of a face is in the picture, from its front, nothing before it.
-        pixels: (F,) float32, its area in the picture as it was recorded; 0 where not seen.
-        cosine: (F,) float32, of the angle between its normal and the line of sight to its centre;
-            below 0 from behind; 0 where it is not all in the picture.
+        visible: (F,) whether the whole face is in the image, front-facing and unoccluded.
+        pixels: (F,) float32, its area in the image; 0 where not visible.
+        cosine: (F,) float32, of the angle between its normal and the line of sight to its center;
+            below 0 from behind; 0 where it is not all in the image.
     """
 
     visible: Mask
@@ -44,10 +55,10 @@ class VisibleFaces(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DepthBuffer:
-    """The z-buffer of a mesh in an ideal picture of a view.
+    """The z-buffer of a mesh in an ideal image of a view.
 
     Attributes:
-        K: (3, 3) of that picture, which may be smaller and wider than the recorded one.
+        K: (3, 3) of that image, which may be smaller and wider than the recorded one.
         depth: (h, w) float32 metres ahead, inf: nothing.
         face: (h, w) int32, -1: nothing.
     """
@@ -58,9 +69,9 @@ class DepthBuffer:
 
 
 def scale_intrinsics(K: Float, scale: float) -> Float:
-    """(3, 3) of the same picture with `scale` times the pixels along each edge.
+    """(3, 3) calibration of the same image with `scale` times the pixels along each edge.
 
-    Centres of pixels have whole numbers, so that edges lie half a pixel beside them.
+    Pixel centers have whole numbers, so the image's border lies half a pixel beside them.
     """
     out = K.copy()
     out[:2] *= scale
@@ -68,68 +79,63 @@ def scale_intrinsics(K: Float, scale: float) -> Float:
     return out
 
 
-def find_visible_faces(
-    mesh: Mesh, view: View, options: VisibleOptions | None = None, threads: int = 1
-) -> VisibleFaces:
-    """Which faces a picture shows whole.
+def find_visible_faces(mesh: Mesh, view: View, threads: int = 1) -> VisibleFaces:
+    """Faces that an image shows whole.
 
     Args:
-        mesh: what stands there.
-        view: of a lens of which `lens.unusable` says nothing.
-        options: see VisibleOptions.
+        mesh: V vertices, F faces.
+        view: with a calibration that `calibration_error` accepts.
         threads: the result does not depend on them.
     """
-    options = options or VisibleOptions()
     points = view.to_camera(mesh.vertices)
-    uv, inside = _in_picture(view, points, options.margin)
+    uv, inside = _project_near(view, points, IMAGE_MARGIN)
     a, b, c = mesh.faces.T
     candidates = np.flatnonzero(inside[a] & inside[b] & inside[c])
-    corners = _corners(points, mesh.faces[candidates])
+    corners = _face_corners(points, mesh.faces[candidates])
     cosine = np.zeros(len(mesh), np.float32)
-    cosine[candidates] = facing = _cosines(corners)
-    pixels = _areas(uv, mesh.faces[candidates])
-    kept = (facing > options.cosine) & (pixels >= options.pixels)
+    cosine[candidates] = facing = _view_cosines(corners)
+    pixels = _pixel_areas(uv, mesh.faces[candidates])
+    kept = (facing > _MIN_COSINE) & (pixels >= _MIN_AREA)
     candidates, pixels, corners = candidates[kept], pixels[kept], corners[..., kept]
-    seen, area = np.zeros(len(mesh), np.bool_), np.zeros(len(mesh), np.float32)
+    visible, area = np.zeros(len(mesh), np.bool_), np.zeros(len(mesh), np.float32)
     if len(candidates):
         used = np.zeros(len(points), np.bool_)
         used[mesh.faces[candidates]] = True
-        depths = render_depth(mesh, view, points[used], options.scale, options.near, threads)
-        free = _unhidden(depths, corners, options)
-        seen[candidates[free]], area[candidates[free]] = True, pixels[free]
-    return VisibleFaces(seen, area, cosine)
+        buffer = render_depth(mesh, view, points[used], DEPTH_SCALE, threads)
+        free = _is_unoccluded(buffer, corners)
+        visible[candidates[free]], area[candidates[free]] = True, pixels[free]
+    return VisibleFaces(visible, area, cosine)
 
 
-def _corners(points: Float, faces: NDArray[np.int32]) -> Float:
-    """(3, 3, n) the corners of faces (n, 3), by corner and coordinate: long rows are fast."""
+def _face_corners(points: Float, faces: NDArray[np.int32]) -> Float:
+    """(3, 3, n) corners of faces (n, 3), by corner and coordinate: long rows are fast."""
     columns = np.ascontiguousarray(points.T)
     return np.stack([columns[:, faces[:, k]] for k in range(3)])
 
 
 def render_depth(
-    mesh: Mesh, view: View, shown: Float, scale: float, near: float, threads: int = 1
+    mesh: Mesh, view: View, shown: Float, scale: float, threads: int = 1
 ) -> DepthBuffer:
-    """The z-buffer in an ideal picture that is just large enough.
+    """The z-buffer of an ideal image that is just large enough.
 
     Args:
         mesh: V vertices, F faces.
-        view: where from.
-        shown: (n, 3) metres in the camera's frame, ahead of it: what the picture has to hold.
-        scale: pixels along an edge, per pixel of the recorded picture.
-        near: metres ahead, nothing before is seen.
+        view: camera and pose.
+        shown: (n, 3) metres in the camera's frame, in front of it: points to be in the image.
+        scale: pixels along an edge, per pixel of the recorded image.
         threads: the result does not depend on them.
     """
     assert view.camera.K is not None
-    K = scale_intrinsics(_upright(view.camera.K), scale)
+    K = scale_intrinsics(_affine_calibration(view.camera.K), scale)
     at = np.column_stack(project_pinhole(K, shown.T))
-    # wide lenses: what is 80 degrees aside is six times as far out as what is 45 degrees aside
+    # wide lenses: 80 degrees off axis is six times as far out as 45 degrees
     most = 2.0 * scale * np.array([view.camera.width, view.camera.height])
     middle = K[:2, 2]
     low = np.floor(np.maximum(at.min(axis=0), middle - most)) - 2.0
     high = np.ceil(np.minimum(at.max(axis=0), middle + most)) + 2.0
     K[:2, 2] -= low
     width, height = (int(size) for size in np.maximum(high - low + 1.0, 1.0))
-    near_by = _within_frustum(mesh, view, K, width, height)
+    near_by = _faces_in_frustum(mesh, view, K, width, height)
     depth, face = _core.render_z_buffer(
         np.ascontiguousarray(mesh.vertices),
         np.ascontiguousarray(mesh.faces[near_by]),
@@ -137,18 +143,18 @@ def render_depth(
         np.ascontiguousarray(view.T_camera_map, np.float64),
         width,
         height,
-        near=near,
+        near=NEAR,
         threads=threads,
     )
     number = np.append(near_by, -1).astype(np.int32)
     return DepthBuffer(K, depth, number[face])
 
 
-def _within_frustum(mesh: Mesh, view: View, K: Float, width: int, height: int) -> Index:
-    """The faces that are not beyond one edge of a picture, or behind it, with all their corners."""
+def _faces_in_frustum(mesh: Mesh, view: View, K: Float, width: int, height: int) -> Index:
+    """Faces that are not beyond one border of an image, or behind it, with all their corners."""
     x, y, z = np.ascontiguousarray(view.to_camera(mesh.vertices).T)
     u, v = K[0, 0] * x + K[0, 1] * y + K[0, 2] * z, K[1, 1] * y + K[1, 2] * z
-    # a pixel more: edges are met exactly elsewhere
+    # a pixel more: the kernel rounds otherwise at borders
     sides = (u < -z, v < -z, u > width * z, v > height * z, z < 0.0)
     beyond = np.zeros(len(z), np.uint8)
     for bit, side in enumerate(sides):
@@ -157,35 +163,36 @@ def _within_frustum(mesh: Mesh, view: View, K: Float, width: int, height: int) -
     return np.flatnonzero((beyond[a] & beyond[b] & beyond[c]) == 0)
 
 
-def _upright(K: Float) -> Float:
-    """The calibration as the z-buffer takes it: its third row may be anything in files."""
+def _affine_calibration(K: Float) -> Float:
+    """The calibration with the third row (0, 0, 1), which may be anything in files."""
     return np.array([[K[0, 0], K[0, 1], K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
 
 
 def project_pinhole(K: Float, points: Float) -> tuple[Float, Float]:
-    """(n,) columns and rows of points (3, n) ahead of an ideal camera."""
+    """(n,) columns and rows of points (3, n) in front of an ideal camera."""
     x, y = points[0] / points[2], points[1] / points[2]
     return K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]
 
 
-def _in_picture(view: View, points: Float, margin: float) -> tuple[Float, Mask]:
-    """(V, 2) pixels of points (V, 3) in the camera's frame, and whether they are in the picture.
+def _project_near(view: View, points: Float, margin: float) -> tuple[Float, Mask]:
+    """(V, 2) pixels of points (V, 3) in the camera's frame, and whether they are in the image.
 
-    NaN where they are far from it.
+    NaN far outside of the field of view, where lens models do not hold.
     """
     uv, ok = np.full((len(points), 2), np.nan), np.zeros(len(points), np.bool_)
     x, y, z = points.T
-    near = np.flatnonzero((z > 0.0) & (x * x + y * y <= (_ASIDE * _reach(view.camera) * z) ** 2))
+    tangent = _SEARCH_MARGIN * _max_view_tangent(view.camera)
+    near = np.flatnonzero((z > 0.0) & (x * x + y * y <= (tangent * z) ** 2))
     uv[near], ok[near] = project(view.camera, points[near])
     u, v = uv.T
     width, height = view.camera.width - 1.0 - margin, view.camera.height - 1.0 - margin
-    with np.errstate(invalid="ignore"):  # NaN: nowhere
+    with np.errstate(invalid="ignore"):  # NaN: not in the image
         return uv, ok & (u >= margin) & (u <= width) & (v >= margin) & (v <= height)
 
 
-def _reach(camera: Camera) -> float:
-    """How far aside its pictures show things, per metre ahead; inf: it is not known."""
-    t = np.linspace(0.0, 1.0, _BORDER)
+def _max_view_tangent(camera: Camera) -> float:
+    """Tangent of the widest angle between the optical axis and a ray; inf: unknown."""
+    t = np.linspace(0.0, 1.0, _BORDER_SAMPLES)
     low, high = np.zeros_like(t), np.ones_like(t)
     u, v = np.concatenate([t, t, low, high]), np.concatenate([low, high, t, t])
     size = np.array([camera.width - 1.0, camera.height - 1.0])
@@ -194,15 +201,15 @@ def _reach(camera: Camera) -> float:
     return far if np.isfinite(far) else np.inf
 
 
-def _cosines(corners: Float) -> Float32:
+def _view_cosines(corners: Float) -> Float32:
     """(n,) of the angle between normals and lines of sight, for corners (3, 3, n)."""
-    normal, centre = _normals(corners), corners.sum(axis=0) / 3.0
-    dot, length = -_dot(centre, normal), np.sqrt(_dot(centre, centre))
+    normal, center = _face_normals(corners), corners.sum(axis=0) / 3.0
+    dot, length = -_dot(center, normal), np.sqrt(_dot(center, center))
     return np.asarray(dot / np.where(length > 0.0, length, 1.0), np.float32)
 
 
-def _normals(corners: Float) -> Float:
-    """(3, n) of length one, zero for faces without area."""
+def _face_normals(corners: Float) -> Float:
+    """(3, n) unit vectors, zero for faces without area."""
     a, b = corners[1] - corners[0], corners[2] - corners[0]
     normal = np.stack(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
@@ -215,7 +222,7 @@ def _dot(a: Float, b: Float) -> Float:
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-def _areas(uv: Float, faces: NDArray[np.int32]) -> Float32:
+def _pixel_areas(uv: Float, faces: NDArray[np.int32]) -> Float32:
     """(n,) square pixels of triangles (n, 3) over pixels (V, 2)."""
     u, v = (np.ascontiguousarray(column) for column in uv.T)
     a, b, c = faces.T
@@ -223,75 +230,64 @@ def _areas(uv: Float, faces: NDArray[np.int32]) -> Float32:
     return np.asarray(0.5 * np.abs(au * bv - av * bu), np.float32)
 
 
-def _unhidden(depths: DepthBuffer, corners: Float, options: VisibleOptions) -> Mask:
-    """(n,) whether nothing lies before triangles (3, 3, n) in the camera's frame."""
+def _is_unoccluded(buffer: DepthBuffer, corners: Float) -> Mask:
+    """(n,) whether nothing lies in front of triangles (3, 3, n) in the camera's frame."""
     free = np.ones(corners.shape[2], np.bool_)
-    normal = _normals(corners)
-    around = _nearest_around(depths.depth, options.beside)
-    for chosen, weights in _samples(depths, corners, options):
+    normal = _face_normals(corners)
+    around = _min_depth_around(buffer.depth, _DILATION)
+    for chosen, weights in _sample_faces(buffer, corners):
         left, of, normals = chosen, corners[..., chosen], normal[:, chosen]
         for weight in weights:
             point = weight[0] * of[0] + weight[1] * of[1] + weight[2] * of[2]
-            passes = _passes(depths, around, point, normals, options)
+            passes = _passes_depth_test(buffer, around, point, normals)
             if not passes.all():
                 free[left[~passes]] = False
                 left, of, normals = left[passes], of[..., passes], normals[:, passes]
     return free
 
 
-def _nearest_around(depth: Float32, reach: int) -> Float32:
-    """(h, w) least depth within `reach` pixels along rows and columns."""
-    for axis in (0, 1):
-        padded = np.pad(
-            depth, [(reach, reach) if a == axis else (0, 0) for a in (0, 1)], mode="edge"
-        )
-        size = depth.shape[axis]
-        parts = [np.take(padded, range(k, k + size), axis) for k in range(2 * reach + 1)]
-        depth = np.minimum.reduce(parts)
-    return depth
+def _min_depth_around(depth: Float32, radius: int) -> Float32:
+    """(h, w) minimum depth within `radius` pixels along rows and columns."""
+    return np.asarray(ndimage.minimum_filter(depth, 2 * radius + 1, mode="nearest"))
 
 
-def _samples(
-    depths: DepthBuffer, corners: Float, options: VisibleOptions
-) -> Iterator[tuple[Index, Float]]:
-    """Faces by number, and the weights (k, 3) of their corners at the points to look at.
+def _sample_faces(buffer: DepthBuffer, corners: Float) -> Iterator[tuple[Index, Float]]:
+    """Faces by number, and the weights (k, 3) of their corners at their samples.
 
-    The finer, the larger they are: `options.spacing` pixels apart along the longest edge.
+    Larger faces have more samples: `_SAMPLE_SPACING` pixels apart along the longest edge.
     """
-    uv = [project_pinhole(depths.K, corner) for corner in corners]
+    uv = [project_pinhole(buffer.K, corner) for corner in corners]
     edges = [np.hypot(uv[k][0] - uv[k - 1][0], uv[k][1] - uv[k - 1][1]) for k in range(3)]
     edge = np.maximum(np.maximum(edges[0], edges[1]), edges[2])
-    halvings = np.ceil(np.log2(np.maximum(edge / options.spacing, 1.0)))
-    halvings = np.minimum(halvings, np.log2(_FINEST)).astype(np.intp)
+    halvings = np.ceil(np.log2(np.maximum(edge / _SAMPLE_SPACING, 1.0)))
+    halvings = np.minimum(halvings, np.log2(_MAX_SUBDIVISION)).astype(np.intp)
     for times in np.flatnonzero(np.bincount(halvings)):
         n = 2**times
         i, j = (a.ravel() for a in np.mgrid[: n + 1, : n + 1])
         lattice = np.stack([i, j, n - i - j], axis=1)[i + j <= n] / n
-        middle = np.full((1, 3), 1.0 / 3.0)
-        inwards = lattice + options.inwards * (middle - lattice)
-        yield np.flatnonzero(halvings == times), np.concatenate([middle, inwards])
+        center = np.full((1, 3), 1.0 / 3.0)
+        inset = lattice + _CORNER_INSET * (center - lattice)
+        yield np.flatnonzero(halvings == times), np.concatenate([center, inset])
 
 
-def _passes(
-    depths: DepthBuffer, around: Float32, points: Float, normals: Float, options: VisibleOptions
-) -> Mask:
-    """(n,) whether points (3, n) in the camera's frame are no farther than what is seen there,
-    and not much farther than what is seen beside.
+def _passes_depth_test(buffer: DepthBuffer, around: Float32, points: Float, normals: Float) -> Mask:
+    """(n,) whether points (3, n) in the camera's frame are no farther than the depth at their
+    pixel, and not much farther than that of the pixels around.
 
     Within its pixel a face may be nearer by the slope of depth along rows and columns.
     """
     h, w = around.shape
-    u, v = (np.rint(a).astype(np.int64) for a in project_pinhole(depths.K, points))
+    u, v = (np.rint(a).astype(np.int64) for a in project_pinhole(buffer.K, points))
     inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
     at = np.clip(v, 0, h - 1) * w + np.clip(u, 0, w - 1)
     z = points[2]
     along = np.abs(_dot(normals, points)) / z
-    slope = np.abs(normals[0]) / depths.K[0, 0] + np.abs(normals[1]) / depths.K[1, 1]
+    slope = np.abs(normals[0]) / buffer.K[0, 0] + np.abs(normals[1]) / buffer.K[1, 1]
     rise = z * slope / np.maximum(along, 1e-6)
-    allowed = options.tolerance + options.relative * z
-    here = allowed + np.minimum(0.5 * rise, options.steepest * z)
-    # neighbouring faces may be steeper
-    beside = allowed + np.minimum((2 * options.beside + 1) * rise, 2.0 * options.steepest * z)
+    allowed = _DEPTH_TOLERANCE + _RELATIVE_TOLERANCE * z
+    here = allowed + np.minimum(0.5 * rise, _SLOPE_TOLERANCE * z)
+    # neighboring faces may be steeper
+    beside = allowed + np.minimum((2 * _DILATION + 1) * rise, 2.0 * _SLOPE_TOLERANCE * z)
     return np.asarray(
-        inside & (z <= depths.depth.ravel()[at] + here) & (z <= around.ravel()[at] + beside)
+        inside & (z <= buffer.depth.ravel()[at] + here) & (z <= around.ravel()[at] + beside)
     )

@@ -9,8 +9,7 @@ import numpy as np
 
 from stillmap.core.errors import InputError, import_extra
 from stillmap.core.files import atomic_file, require_new_file
-from stillmap.mesh.options import TextureOptions
-from stillmap.mesh.texture.atlas import Picture, TexturedMesh
+from stillmap.mesh.texture.atlas import Image, TexturedMesh
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.results.gltf import encode_obj, flip_v, read_glb, to_z_up
 from stillmap.results.reader import require_model
@@ -41,7 +40,7 @@ def read_model(path: Path) -> TexturedMesh | Mesh:
 
 def _model(scene: Any) -> TexturedMesh | Mesh:
     vertices, faces, uv, page, count = [], [], [], [], 0
-    pages: list[Picture] = []
+    pages: list[Image] = []
     for node in scene.graph.nodes_geometry:
         T, name = scene.graph[node]
         part = scene.geometry[name]
@@ -84,7 +83,7 @@ def write_obj(folder: Path, output: Path, quality: int, overwrite: bool = False)
     """
     require_new_file(output, overwrite)
     model = read_model(require_model(folder))
-    files = encode_obj(model, TextureOptions(quality=quality), output.stem, f"{output.stem}_")
+    files = encode_obj(model, quality, output.stem, f"{output.stem}_")
     named = {output.with_name(name): data for name, data in files.items()}
     for one in named:
         require_new_file(one, overwrite)
