@@ -98,13 +98,13 @@ def test_clouds_of_a_folder_have_the_colours_of_both_files(points, tmp_path):
     for part, its in (("dynamic", rows[:9]), ("static", rows[9:])):
         head = ply_header(FIELDS + COLOURS, len(its))
         (tmp_path / f"{part}.ply").write_bytes(head + its.tobytes())
-    found = point_cloud.cloud_in(tmp_path)
-    assert found.coloured
-    colours = np.concatenate([block.colours for block in found.blocks()])
+    found = point_cloud.cloud_from_folder(tmp_path)
+    assert found.has_colors
+    colours = np.concatenate([block.colors for block in found.make_blocks()])
     np.testing.assert_array_equal(colours, np.roll(points.colours, -9, axis=0))
     plain = np.zeros(2, FIELDS)
     (tmp_path / "dynamic.ply").write_bytes(ply_header(FIELDS, 2) + plain.tobytes())
-    found = point_cloud.cloud_in(tmp_path)
-    assert not found.coloured
-    assert all(block.colours is None for block in found.blocks())
-    assert point_cloud.cloud_in(tmp_path, "static").coloured
+    found = point_cloud.cloud_from_folder(tmp_path)
+    assert not found.has_colors
+    assert all(block.colors is None for block in found.make_blocks())
+    assert point_cloud.cloud_from_folder(tmp_path, "static").has_colors

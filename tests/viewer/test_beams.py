@@ -8,7 +8,7 @@ import pytest
 from stillmap.io import read
 from stillmap.io.trajectory import poses_from_tum
 from stillmap.slam import SlamOptions, deskew_recording
-from stillmap.viewer.tracks import Beams, part
+from stillmap.viewer.tracks import Beams, slice_scans
 
 
 @pytest.fixture(params=[(2, False), (2, True), (3, False), (3, True)])
@@ -42,7 +42,7 @@ def test_there_are_no_more_than_asked_for(beams):
 
 
 def test_a_part_is_the_same_scans(beams):
-    some = part(beams.recording, 2, 4)
+    some = slice_scans(beams.recording, 2, 4)
     assert (some.n_scans, some.T_odom_base) == (2, None)
     assert np.array_equal(some.points, beams.recording.points[80:160])
     assert some.offset.tolist() == [0, 40, 80]

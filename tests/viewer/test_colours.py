@@ -7,7 +7,7 @@ from stillmap.viewer import display
 
 
 def test_dynamic_is_orange_and_static_blue():
-    shown = display.of_p_static(np.array([0.0, 0.5, 1.0], np.float32))
+    shown = display.color_by_p_static(np.array([0.0, 0.5, 1.0], np.float32))
     assert shown.dtype == np.uint8
     assert shown[0].tolist() == list(ORANGE)
     assert shown[2].tolist() == list(display.BLUE)
@@ -15,14 +15,14 @@ def test_dynamic_is_orange_and_static_blue():
 
 
 def test_heights_beyond_the_ends_have_their_colours():
-    shown = display.of_height(np.array([-9.0, 0.0, 1.0, 2.0, 9.0]), 0.0, 2.0)
+    shown = display.color_by_height(np.array([-9.0, 0.0, 1.0, 2.0, 9.0]), 0.0, 2.0)
     assert (shown[0] == shown[1]).all()
     assert (shown[3] == shown[4]).all()
     assert len(np.unique(shown, axis=0)) == 3
-    assert (display.of_height(np.zeros(2), 0.0, 0.0) == shown[1]).all()
+    assert (display.color_by_height(np.zeros(2), 0.0, 0.0) == shown[1]).all()
 
 
 def test_neighbours_differ():
-    shown = display.of_number(range(40)).astype(int)
+    shown = display.color_by_id(range(40)).astype(int)
     assert np.abs(np.diff(shown, axis=0)).sum(axis=1).min() > 100
-    assert display.of_number([]).shape == (0, 3)
+    assert display.color_by_id([]).shape == (0, 3)

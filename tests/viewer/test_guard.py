@@ -2,7 +2,7 @@
 
 import pytest
 
-from stillmap.viewer.server import is_ours, policy
+from stillmap.viewer.server import content_security_policy, is_local_request
 
 
 @pytest.mark.parametrize(
@@ -23,11 +23,13 @@ from stillmap.viewer.server import is_ours, policy
     ],
 )
 def test_only_this_page_is_answered(headers, ours):
-    assert is_ours(headers) is ours
+    assert is_local_request(headers) is ours
 
 
 def test_the_page_may_reach_nothing_but_where_it_came_from():
-    parts = dict(part.split(" ", 1) for part in policy("127.0.0.1:8123").split("; "))
+    parts = dict(
+        part.split(" ", 1) for part in content_security_policy("127.0.0.1:8123").split("; ")
+    )
     assert parts["connect-src"].split() == ["'self'", "data:", "blob:", "ws://127.0.0.1:8123"]
     for name in ("default-src", "script-src"):
         assert not any("://" in source or source == "*" for source in parts[name].split())

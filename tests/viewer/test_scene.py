@@ -10,21 +10,21 @@ from stillmap.results.points import COLOURS, FIELDS, ply_header, put_colours
 from stillmap.results.report.figures import ORANGE, UNKNOWN
 from stillmap.viewer import scene as module
 from stillmap.viewer.scene import read_scene
-from stillmap.viewer.window import framing
+from stillmap.viewer.window import default_view
 
 
 def test_a_result_in_the_plane(result_of):
     scene = read_scene(result_of(2))
-    assert scene.is_flat
+    assert scene.is_2d
     assert (scene.clouds, scene.surface, scene.models, scene.notes) == ({}, None, [], [])
     assert scene.poses.shape == (6, 4, 4)
     assert scene.tracks[0].z is None
-    assert (scene.plan.picture[..., 3] == 255).all()
-    assert (scene.plan.picture[0, 0, :3] == UNKNOWN).all()
+    assert (scene.map_image.picture[..., 3] == 255).all()
+    assert (scene.map_image.picture[0, 0, :3] == UNKNOWN).all()
 
 
 def test_the_plan_lies_as_the_map_does(result_of):
-    plan = read_scene(result_of(2)).plan
+    plan = read_scene(result_of(2)).map_image
     x0, y0, x1, y1 = plan.window
     height, width = plan.picture.shape[:2]
     edge = (x1 - x0) / width
@@ -39,11 +39,11 @@ def test_the_plan_lies_as_the_map_does(result_of):
 def test_a_result_in_space(result_of):
     out = result_of(3, with_models=True)
     scene = read_scene(out)
-    assert not scene.is_flat
+    assert not scene.is_2d
     p_static, hit = (np.load(out / f"beams/{name}.npy") for name in ("p_static", "hit"))
     counts = {"static": (hit & (p_static >= 0.5)).sum(), "dynamic": (hit & (p_static < 0.5)).sum()}
     assert {name: len(one.points) for name, one in scene.clouds.items()} == counts
-    assert scene.plan.picture[0, 0, 3] == 0
+    assert scene.map_image.picture[0, 0, 3] == 0
     assert scene.surface == (out / "mesh.glb").read_bytes()
     assert [one.track.id for one in scene.models] == [7]
     z = scene.clouds["static"].points[:, 2]
@@ -57,24 +57,24 @@ def test_points_have_their_own_colours_and_without_one_what_moves_stays_orange(r
         put_colours(rows, np.array([grey, red], np.uint8))
         (out / f"{part}.ply").write_bytes(ply_header(FIELDS + COLOURS, 2) + rows.tobytes())
     clouds = read_scene(out).clouds
-    assert clouds["static"].colours.tolist() == [[*grey], [*red]]
-    assert clouds["dynamic"].colours.tolist() == [[*ORANGE], [*red]]
+    assert clouds["static"].colors.tolist() == [[*grey], [*red]]
+    assert clouds["dynamic"].colors.tolist() == [[*ORANGE], [*red]]
 
 
 def test_no_more_points_than_a_browser_bears(result_of, monkeypatch):
-    monkeypatch.setitem(module.MOST_POINTS, "static", 11)
+    monkeypatch.setitem(module.MAX_POINTS, "static", 11)
     static = read_scene(result_of(3)).clouds["static"]
-    assert len(static.points) == len(static.colours) == 11
-    assert static.of > 11
+    assert len(static.points) == len(static.colors) == 11
+    assert static.total > 11
 
 
 def test_models_go_as_their_tracks_do(result_of):
     scene = read_scene(result_of(3, with_models=True))
     (model,) = scene.models
-    own = model.at(model.stamp_ns)
+    own = model.pose_at(model.stamp_ns)
     assert own == pytest.approx(model.T_map_gltf)
     assert own[:3, 1].tolist() == [0.0, 0.0, 1.0]  # its y is up
-    later = model.at(int(scene.stamp_ns[3]))  # it has turned left by then
+    later = model.pose_at(int(scene.stamp_ns[3]))  # it has turned left by then
     assert later[:3, 3] == pytest.approx([2.0, 1.0, 0.0])
     assert later[:3, 0] == pytest.approx([0.0, 1.0, 0.0])
 
@@ -140,13 +140,13 @@ def test_far_from_the_origin_nothing_is_lost(result_of):
 
 def test_the_eye_sees_all_of_it(result_of):
     flat, space = read_scene(result_of(2)), read_scene(result_of(3))
-    above = framing(flat)
-    x0, y0, x1, y1 = flat.plan.window
+    above = default_view(flat)
+    x0, y0, x1, y1 = flat.map_image.window
     assert above.look_at == pytest.approx([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
-    assert above.across >= y1 - y0
+    assert above.height >= y1 - y0
     down = (above.look_at - above.position) / np.linalg.norm(above.look_at - above.position)
     assert down[2] < -0.999
     assert down[1] > 0.0  # north is up
-    slanted = framing(space)
+    slanted = default_view(space)
     away = slanted.position - slanted.look_at
     assert 0.3 < away[2] / np.linalg.norm(away) < 0.9

@@ -5,27 +5,27 @@ import pytest
 
 from stillmap.core.errors import InputError
 from stillmap.results.points import ply_header
-from stillmap.viewer.display import chosen, points_in
+from stillmap.viewer.display import sample_indices, sample_ply
 
 
 def test_all_are_taken_where_there_are_few():
-    assert chosen(5, 9).tolist() == [0, 1, 2, 3, 4]
+    assert sample_indices(5, 9).tolist() == [0, 1, 2, 3, 4]
 
 
 def test_those_chosen_rise_and_are_spread_over_the_row():
-    use = chosen(10_000, 100)
+    use = sample_indices(10_000, 100)
     assert (np.diff(use) > 0).all()
     assert (use // 100).tolist() == list(range(100))
 
 
 def test_every_ring_of_a_lidar_is_left():
     """At even steps 16 rings that come in turn would show one of them."""
-    rings = np.bincount(chosen(160_000, 10_000) % 16, minlength=16)
+    rings = np.bincount(sample_indices(160_000, 10_000) % 16, minlength=16)
     assert rings.min() > 400
 
 
 def test_the_same_ones_are_chosen_every_time():
-    assert np.array_equal(chosen(10_000, 77), chosen(10_000, 77))
+    assert np.array_equal(sample_indices(10_000, 77), sample_indices(10_000, 77))
 
 
 def written(path, rows, fields):
@@ -37,10 +37,10 @@ def test_points_of_a_file_are_those_chosen(tmp_path):
     fields = [(name, "<f4") for name in ("x", "y", "z", "p_static")]
     rows = np.zeros(600_000, fields)  # more than are read at a time
     rows["x"], rows["z"] = np.arange(len(rows)), 2.0
-    found = points_in(written(tmp_path / "a.ply", rows, fields), 1000)
-    assert np.array_equal(found.points[:, 0], chosen(len(rows), 1000))
+    found = sample_ply(written(tmp_path / "a.ply", rows, fields), 1000)
+    assert np.array_equal(found.points[:, 0], sample_indices(len(rows), 1000))
     assert (found.points[:, 1:] == [0.0, 2.0]).all()
-    assert (found.colours, found.of) == (None, 600_000)
+    assert (found.colors, found.total) == (None, 600_000)
 
 
 def test_colours_come_along_where_there_are_any(tmp_path):
@@ -48,8 +48,8 @@ def test_colours_come_along_where_there_are_any(tmp_path):
     head += b"".join(b"property float %c\n" % name for name in b"xyz")
     head += b"property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
     (tmp_path / "a.ply").write_bytes(head + b"0 0 0 1 2 3\n1 1 1 250 251 252\n")
-    found = points_in(tmp_path / "a.ply", 10)
-    assert found.colours.tolist() == [[1, 2, 3], [250, 251, 252]]
+    found = sample_ply(tmp_path / "a.ply", 10)
+    assert found.colors.tolist() == [[1, 2, 3], [250, 251, 252]]
 
 
 def test_a_point_that_is_not_finite_is_refused(tmp_path):
@@ -57,4 +57,4 @@ def test_a_point_that_is_not_finite_is_refused(tmp_path):
     rows = np.zeros(3, fields)
     rows["y"][1] = np.nan
     with pytest.raises(InputError, match="not finite"):
-        points_in(written(tmp_path / "a.ply", rows, fields), 10)
+        sample_ply(written(tmp_path / "a.ply", rows, fields), 10)

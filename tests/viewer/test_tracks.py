@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from stillmap.results.reader import Track
-from stillmap.viewer.tracks import edges, headings, is_there, placed, pose_at, ways
+from stillmap.viewer.tracks import (
+    box_edges,
+    headings,
+    interpolate_pose,
+    is_present,
+    object_poses_at,
+    track_segments,
+)
 
 NOW = 1_700_000_000_000_000_000
 
@@ -35,31 +42,36 @@ def test_what_never_moves_looks_along_x():
 
 def test_between_two_times_it_is_between_two_places():
     one = track([0, 1], [[0, 0], [4, 0]], [[4, 0], [4, 0]])
-    T = pose_at(one, NOW + 250_000_000)
+    T = interpolate_pose(one, NOW + 250_000_000)
     assert T[:3, 3] == pytest.approx([1.0, 0.0, 0.7])
     assert T[:3, :3] == pytest.approx(np.eye(3))
-    assert pose_at(one, NOW - 10**9)[:2, 3].tolist() == [0.0, 0.0]
-    assert pose_at(one, NOW + 10**10)[:2, 3].tolist() == [4.0, 0.0]
+    assert interpolate_pose(one, NOW - 10**9)[:2, 3].tolist() == [0.0, 0.0]
+    assert interpolate_pose(one, NOW + 10**10)[:2, 3].tolist() == [4.0, 0.0]
 
 
 def test_nanoseconds_are_not_lost():
     """A double holds stamps of today to a quarter of a microsecond only."""
     one = track([0, 1e-7], [[0, 0], [1, 0]], [[1, 0], [1, 0]])
-    assert pose_at(one, NOW + 50)[0, 3] == pytest.approx(0.5)
+    assert interpolate_pose(one, NOW + 50)[0, 3] == pytest.approx(0.5)
 
 
 def test_only_those_are_there_that_are_seen_before_and_after():
     one = track([0, 1], [[0, 0], [1, 0]], [[1, 0], [1, 0]])
     late = track([5, 6], [[0, 0], [1, 0]], [[1, 0], [1, 0]])
-    assert [is_there(one, NOW + s) for s in (-1, 0, 10**9, 10**9 + 1)] == [False, True, True, False]
-    assert placed([late, one], NOW).number.tolist() == [1]
-    nobody = placed([late], NOW)
-    assert edges(nobody).shape == (0, 4, 2, 3)
+    assert [is_present(one, NOW + s) for s in (-1, 0, 10**9, 10**9 + 1)] == [
+        False,
+        True,
+        True,
+        False,
+    ]
+    assert object_poses_at([late, one], NOW).index.tolist() == [1]
+    nobody = object_poses_at([late], NOW)
+    assert box_edges(nobody).shape == (0, 4, 2, 3)
 
 
 def test_boxes_have_twelve_edges_of_its_lengths():
     one = track([0, 1], [[3, 4], [3, 5]], [[0, 1], [0, 1]])
-    lines = edges(placed([one], NOW))
+    lines = box_edges(object_poses_at([one], NOW))
     assert lines.shape == (1, 12, 2, 3)
     lengths = np.linalg.norm(lines[0, :, 1] - lines[0, :, 0], axis=1)
     assert sorted(lengths) == pytest.approx([1.0] * 4 + [1.5] * 4 + [2.0] * 4)
@@ -71,7 +83,7 @@ def test_boxes_have_twelve_edges_of_its_lengths():
 
 def test_in_the_plane_boxes_are_flat():
     one = track([0, 1], [[0, 0], [1, 0]], [[1, 0], [1, 0]], size=(2.0, 1.0), z=None)
-    lines = edges(placed([one], NOW))
+    lines = box_edges(object_poses_at([one], NOW))
     assert lines.shape == (1, 4, 2, 3)
     assert not lines[..., 2].any()
 
@@ -80,8 +92,8 @@ def test_ways_say_whose_they_are():
     a = track([0, 1, 2], [[0, 0], [1, 0], [2, 0]], np.ones((3, 2)))
     b = track([0], [[9, 9]], np.ones((1, 2)))
     c = track([0, 1], [[5, 5], [6, 6]], np.ones((2, 2)), z=None)
-    pieces, whose = ways([a, b, c])
+    pieces, whose = track_segments([a, b, c])
     assert whose.tolist() == [0, 0, 2]
     assert pieces[1].tolist() == [[1, 0, 0.7], [2, 0, 0.7]]
     assert pieces[2].tolist() == [[5, 5, 0], [6, 6, 0]]
-    assert ways([])[0].shape == (0, 2, 3)
+    assert track_segments([])[0].shape == (0, 2, 3)

@@ -225,7 +225,7 @@ def test_the_plan_lies_below_a_floor_that_is_drawn(result_of, opened, window):
 
 
 def test_notes_stand_beside_what_is_shown(result_of, opened, monkeypatch):
-    monkeypatch.setitem(scenes.MOST_POINTS, "static", 11)
+    monkeypatch.setitem(scenes.MAX_POINTS, "static", 11)
     out = result_of(3, with_models=True)
     window = opened(read_scene(out), beams_of(out))
 

@@ -171,7 +171,7 @@ def _convert_to_obj(args: argparse.Namespace, mapped: "ResultFolder", output: Pa
     from stillmap.results.export import obj
 
     faces, pages = obj.write_obj(
-        mapped.folder, output, mapped.texture_options.quality, args.overwrite
+        mapped.folder, output, mapped.texture_quality, args.overwrite
     )
     return f"{faces} faces and {pages} page{'s' * (pages != 1)} of texture"
 
@@ -192,12 +192,12 @@ def _convert_to_cloud(
     require_new_file(output, args.overwrite)
     point_cloud_files.require_extras(form, output)
     if isinstance(mapped.record.get(TILTING), dict):
-        points = point_cloud.cloud_in(mapped.folder, args.only)
+        points = point_cloud.cloud_from_folder(mapped.folder, args.only)
     else:
         points = _cloud_of(args, mapped, output)
     with shown_share(args.quiet, "writing") as tell:
         point_cloud_files.write(points, output, form, tell)
-    return f"{points.count} points as {form.about}"
+    return f"{points.count} points as {form.description}"
 
 
 def _cloud_of(
@@ -218,7 +218,9 @@ def _cloud_of(
     poses = poses_from_tum(mapped.folder / "trajectory.tum", recording)
     seen = _seen(mapped, recording, poses)
     colours = read_colors(mapped.folder, recording.n_beams)
-    return point_cloud.cloud_of(recording, seen, poses, labels.p_static, args.only, colours)
+    return point_cloud.cloud_from_recording(
+        recording, seen, poses, labels.p_static, args.only, colours
+    )
 
 
 def _exported(mapped: "ResultFolder") -> "reader.Exported":

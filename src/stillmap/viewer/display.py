@@ -15,7 +15,7 @@ from stillmap.io.point_cloud import ply
 from stillmap.io.point_cloud.binary_table import read_columns
 from stillmap.results.report.figures import ORANGE
 
-Colours = NDArray[np.uint8]
+Colors = NDArray[np.uint8]
 
 BLUE = (36, 99, 168)  # of the report: what stands still, and where the robot went
 
@@ -27,17 +27,17 @@ _BY_HEIGHT = ((40, 53, 90), (45, 96, 130), (60, 140, 132), (122, 178, 106), (214
 _TURN = 0.618034  # of the circle of hues, from one number to the next: neighbours differ
 
 
-def of_p_static(p_static: NDArray[np.float32]) -> Colours:
+def color_by_p_static(p_static: NDArray[np.float32]) -> Colors:
     """From orange, dynamic, over grey to blue, static; of (n,) P(c = 1)."""
     return _blended(_BY_P_STATIC, np.asarray(p_static, np.float64))
 
 
-def of_height(z: NDArray[np.floating], low: float, high: float) -> Colours:
+def color_by_height(z: NDArray[np.floating], low: float, high: float) -> Colors:
     """From dark blue at `low` metres to yellow at `high`; of (n,) metres."""
     return _blended(_BY_HEIGHT, (np.asarray(z, np.float64) - low) / max(high - low, 1e-9))
 
 
-def of_number(number: NDArray[np.intp] | Sequence[int]) -> Colours:
+def color_by_id(number: NDArray[np.intp] | Sequence[int]) -> Colors:
     """A colour that a thing keeps, of its number (n,)."""
     hue = np.mod(np.asarray(number, np.float64) * _TURN + 0.05, 1.0)
     # a cosine for each of the three, a third of the circle apart
@@ -45,7 +45,7 @@ def of_number(number: NDArray[np.intp] | Sequence[int]) -> Colours:
     return np.rint(120.0 + 105.0 * part).astype(np.uint8)
 
 
-def _blended(stops: Sequence[tuple[int, int, int]], share: NDArray[np.float64]) -> Colours:
+def _blended(stops: Sequence[tuple[int, int, int]], share: NDArray[np.float64]) -> Colors:
     """Between colours that lie evenly from 0 to 1."""
     at = np.linspace(0.0, 1.0, len(stops))
     columns = [np.interp(share, at, column) for column in np.array(stops, np.float64).T]
@@ -67,11 +67,11 @@ class Points:
     """
 
     points: NDArray[np.float64]
-    colours: NDArray[np.uint8] | None
-    of: int
+    colors: NDArray[np.uint8] | None
+    total: int
 
 
-def chosen(count: int, most: int) -> NDArray[np.int64]:
+def sample_indices(count: int, most: int) -> NDArray[np.int64]:
     """(min(count, most),) numbers below `count`, rising, spread evenly.
 
     Within its share of the row each is chosen by chance: at even steps a lidar whose rings come in
@@ -83,7 +83,7 @@ def chosen(count: int, most: int) -> NDArray[np.int64]:
     return np.minimum((at * (count / most)).astype(np.int64), count - 1)
 
 
-def points_in(path: Path, most: int) -> Points:
+def sample_ply(path: Path, most: int) -> Points:
     """At most so many points of a PLY file, read piece by piece.
 
     Raises:
@@ -92,7 +92,7 @@ def points_in(path: Path, most: int) -> Points:
     layout = ply.read_layout(path)
     painted = {"red", "green", "blue"} <= {field.name for field in layout.fields}
     wanted = ("x", "y", "z", *(("red", "green", "blue") if painted else ()))
-    use, first = chosen(layout.rows, most), 0
+    use, first = sample_indices(layout.rows, most), 0
     points, colours = np.empty((len(use), 3)), np.empty((len(use), 3), np.uint8)
     for block in read_columns(layout, wanted):
         end = first + len(block[0])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stillmap.results import gltf
 from stillmap.results.report.renderer import BACKGROUND
 from stillmap.viewer import display, tracks
-from stillmap.viewer.display import chosen
+from stillmap.viewer.display import sample_indices
 from stillmap.viewer.scene import Scene
 from stillmap.viewer.server import Server
 from stillmap.viewer.tracks import Beams
@@ -50,11 +50,11 @@ class Layers:
         self._points: list[tuple[Any, float]] = []
         self._label: list[Any] = []
         self._nodes: dict[str, Any] = {}
-        self.shown: dict[str, bool] = {}
+        self.default_visibility: dict[str, bool] = {}
         self.notes: dict[str, str] = {} if beams is None else {"Beams": _KEY}
         for name, shown, is_there, make in self._kinds():
             if is_there:
-                self.shown[name] = shown
+                self.default_visibility[name] = shown
                 self._nodes[name] = server.scene.add_frame(_path(name), False, visible=shown)
                 make()
 
@@ -64,7 +64,7 @@ class Layers:
         static, bare = "static" in scene.clouds, scene.surface is None
         return [
             # these would hide a surface, or lie on it
-            ("Map", bare, scene.plan is not None, self._make_plan),
+            ("Map", bare, scene.map_image is not None, self._make_plan),
             ("Surface", True, not bare, self._make_surface),
             ("Static points", bare, static, lambda: self._make_cloud("static")),
             (
@@ -82,19 +82,19 @@ class Layers:
             ("Object numbers", False, bool(scene.tracks), lambda: None),
         ]
 
-    def set_shown(self, name: str, shown: bool) -> bool:
+    def set_visible(self, name: str, shown: bool) -> bool:
         """Show or hide a layer; whether that changed anything."""
         if self._nodes[name].visible == shown:
             return False
         self._nodes[name].visible = shown
         return True
 
-    def resize(self, factor: float) -> None:
+    def scale_points(self, factor: float) -> None:
         """Points so many times as large as at first."""
         for node, size in self._points:
             node.point_size = factor * size
 
-    def draw(self, scan: int) -> None:
+    def update(self, scan: int) -> None:
         """What changes with the time, of the layers that are shown."""
         scene, stamp_ns = self._scene, int(self._scene.stamp_ns[scan])
         _place(self._robot, scene.poses[scan], scene.origin)
@@ -102,11 +102,11 @@ class Layers:
             self._draw_beams(scan)
         if self._is_shown("Object models"):
             for node, model in zip(self._models, scene.models, strict=True):
-                node.visible = tracks.is_there(model.track, stamp_ns)
+                node.visible = tracks.is_present(model.track, stamp_ns)
                 if node.visible:
-                    _place(node, model.at(stamp_ns), scene.origin)
+                    _place(node, model.pose_at(stamp_ns), scene.origin)
         if self._is_shown("Objects") or self._is_shown("Object numbers"):
-            things = tracks.placed(scene.tracks, stamp_ns)
+            things = tracks.object_poses_at(scene.tracks, stamp_ns)
             self._draw_boxes(things)
             self._draw_numbers(things)
 
@@ -114,7 +114,7 @@ class Layers:
         return name in self._nodes and bool(self._nodes[name].visible)
 
     def _make_plan(self) -> None:
-        plan = self._scene.plan
+        plan = self._scene.map_image
         assert plan is not None
         x0, y0, x1, y1 = plan.window
         z = self._scene.ground - (0.0 if self._scene.surface is None else _LOWERED)
@@ -143,15 +143,15 @@ class Layers:
 
     def _make_cloud(self, name: str) -> None:
         cloud, layer = self._scene.clouds[name], f"{name.capitalize()} points"
-        self._cloud(layer, cloud.points, cloud.colours)
-        if len(cloud.points) < cloud.of:
-            self.notes[layer] = f"{len(cloud.points):,} of {cloud.of:,} {name} points are shown"
+        self._cloud(layer, cloud.points, cloud.colors)
+        if len(cloud.points) < cloud.total:
+            self.notes[layer] = f"{len(cloud.points):,} of {cloud.total:,} {name} points are shown"
 
     def _make_way(self) -> None:
         places = self._scene.poses[:, :3, 3] - self._scene.origin
-        if self._scene.is_flat:
+        if self._scene.is_2d:
             places = places + np.array([0.0, 0.0, 2 * _LIFTED])
-        use = places[chosen(len(places), _MOST_WAY)]
+        use = places[sample_indices(len(places), _MOST_WAY)]
         pieces = np.stack([use[:-1], use[1:]], axis=1)
         self._lines("Robot", pieces, np.array(display.BLUE, np.uint8), 2.5)
         length = _AXES * self._across
@@ -167,14 +167,14 @@ class Layers:
 
     def _draw_beams(self, scan: int) -> None:
         assert self._beams is not None
-        seen = self._beams.at(scan)
+        seen = self._beams.scan_view(scan)
         ends = seen.ends - self._scene.origin
-        if self._scene.is_flat:
+        if self._scene.is_2d:
             ends[:, 2] = 3 * _LIFTED
         with self._server.atomic():
             self._ends.points = ends.astype(np.float32)
-            self._ends.colors = display.of_p_static(seen.p_static)
-        some = ends[chosen(len(ends), _MOST_RAYS)]
+            self._ends.colors = display.color_by_p_static(seen.p_static)
+        some = ends[sample_indices(len(ends), _MOST_RAYS)]
         begin = np.broadcast_to(seen.origin - self._scene.origin, some.shape)
         self._ray.points = np.stack([begin, some], axis=1).astype(np.float32)
 
@@ -182,21 +182,21 @@ class Layers:
         pieces = np.zeros((1, 2, 3))
         self._box = self._lines("Objects", pieces, np.zeros((1, 2, 3), np.uint8), 2.0)
 
-    def _draw_boxes(self, things: tracks.Placed) -> None:
-        lines = tracks.edges(things) - self._scene.origin
-        if self._scene.is_flat:
+    def _draw_boxes(self, things: tracks.ObjectPoses) -> None:
+        lines = tracks.box_edges(things) - self._scene.origin
+        if self._scene.is_2d:
             lines = lines + np.array([0.0, 0.0, 2 * _LIFTED])
-        tone = display.of_number([self._scene.tracks[n].id for n in things.number])
+        tone = display.color_by_id([self._scene.tracks[n].id for n in things.index])
         tones = np.broadcast_to(tone[:, None, None], lines.shape)
         with self._server.atomic():
             self._box.points = lines.reshape(-1, 2, 3).astype(np.float32)
             self._box.colors = tones.reshape(-1, 2, 3)
 
     def _make_ways(self) -> None:
-        pieces, whose = tracks.ways(self._scene.tracks)
-        use = chosen(len(pieces), _MOST_WAYS)
-        tone = display.of_number([self._scene.tracks[n].id for n in whose[use]])
-        lifted = np.array([0.0, 0.0, _LIFTED if self._scene.is_flat else 0.0])
+        pieces, whose = tracks.track_segments(self._scene.tracks)
+        use = sample_indices(len(pieces), _MOST_WAYS)
+        tone = display.color_by_id([self._scene.tracks[n].id for n in whose[use]])
+        lifted = np.array([0.0, 0.0, _LIFTED if self._scene.is_2d else 0.0])
         lines = pieces[use] - self._scene.origin + lifted
         self._lines("Object ways", lines, np.repeat(tone[:, None], 2, axis=1), 1.5)
 
@@ -212,10 +212,10 @@ class Layers:
             for model in self._scene.models
         ]
 
-    def _draw_numbers(self, things: tracks.Placed) -> None:
+    def _draw_numbers(self, things: tracks.ObjectPoses) -> None:
         """Labels are made when they are needed, and used again for other things."""
         count = _MOST_NUMBERS if self._is_shown("Object numbers") else 0
-        use = things.number[:count]
+        use = things.index[:count]
         while len(self._label) < len(use):
             path = _path("Object numbers", f"{len(self._label)}")
             self._label.append(self._server.scene.add_label(path, "", anchor="bottom-center"))
@@ -224,7 +224,7 @@ class Layers:
             if label.visible:
                 label.text = str(self._scene.tracks[use[n]].id)
                 top = np.array([0.0, 0.0, 0.5 * float(things.size[n, 2])])
-                label.position = things.T_map_thing[n, :3, 3] - self._scene.origin + top
+                label.position = things.T_map_object[n, :3, 3] - self._scene.origin + top
 
     def _cloud(self, name: str, points: NDArray[np.float32], colour: NDArray[np.uint8]) -> Any:
         size = self._across * (_END if name == "Beams" else _POINT)

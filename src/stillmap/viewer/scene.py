@@ -20,10 +20,10 @@ from stillmap.results import gltf
 from stillmap.results.reader import Track, read_grid, read_tracks
 from stillmap.results.report.figures import ORANGE, UNKNOWN, draw_map, map_window
 from stillmap.viewer import display
-from stillmap.viewer.display import Points, points_in
-from stillmap.viewer.tracks import pose_at
+from stillmap.viewer.display import Points, sample_ply
+from stillmap.viewer.tracks import interpolate_pose
 
-MOST_POINTS = {"static": 500_000, "dynamic": 200_000}
+MAX_POINTS = {"static": 500_000, "dynamic": 200_000}
 _MOST_SURFACE = 512 << 20  # bytes of mesh.glb
 _MOST_MODELS = 256 << 20  # bytes of the models of objects together
 _MOST_PLACE = 1 << 20  # bytes of objects/NNNN.json
@@ -38,7 +38,7 @@ Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class MapImage:
     """The map from above.
 
     Attributes:
@@ -57,8 +57,8 @@ class Cloud:
     they were taken."""
 
     points: NDArray[np.float32]
-    colours: NDArray[np.uint8]
-    of: int
+    colors: NDArray[np.uint8]
+    total: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +76,11 @@ class Model:
     stamp_ns: int
     track: Track
 
-    def at(self, stamp_ns: int) -> Float:
+    def pose_at(self, stamp_ns: int) -> Float:
         """(4, 4) T_map_gltf at another time: it goes and turns as its track does."""
-        moved = pose_at(self.track, stamp_ns) @ inverse(pose_at(self.track, self.stamp_ns))
+        moved = interpolate_pose(self.track, stamp_ns) @ inverse(
+            interpolate_pose(self.track, self.stamp_ns)
+        )
         return np.asarray(moved @ self.T_map_gltf)
 
 
@@ -103,7 +105,7 @@ class Scene:
     name: str
     stamp_ns: NDArray[np.int64]
     poses: Float
-    plan: Plan | None
+    map_image: MapImage | None
     clouds: dict[str, Cloud]
     tracks: list[Track]
     surface: bytes | None
@@ -113,7 +115,7 @@ class Scene:
     notes: list[str] = field(default_factory=list)
 
     @property
-    def is_flat(self) -> bool:
+    def is_2d(self) -> bool:
         """Whether there is nothing but the plane."""
         return not self.clouds and self.surface is None
 
@@ -128,8 +130,8 @@ def read_scene(folder: Path) -> Scene:
     stamp_ns, poses = read_tum(folder / "trajectory.tum")
     origin = _origin(poses)
     raw = {
-        name: points_in(folder / f"{name}.ply", most)
-        for name, most in MOST_POINTS.items()
+        name: sample_ply(folder / f"{name}.ply", most)
+        for name, most in MAX_POINTS.items()
         if (folder / f"{name}.ply").exists()
     }
     tracks, notes = read_tracks(folder / "objects" / "objects.json"), list[str]()
@@ -139,7 +141,7 @@ def read_scene(folder: Path) -> Scene:
         name=folder.resolve().name,
         stamp_ns=stamp_ns,
         poses=poses,
-        plan=_plan(folder, clear=bool(raw)),
+        map_image=_plan(folder, clear=bool(raw)),
         clouds={name: _cloud(name, one, origin) for name, one in raw.items()},
         tracks=tracks,
         surface=surface,
@@ -157,7 +159,7 @@ def _origin(poses: Float) -> Float:
     return np.asarray(np.round(0.5 * (places.min(axis=0) + places.max(axis=0))))
 
 
-def _plan(folder: Path, clear: bool) -> Plan | None:
+def _plan(folder: Path, clear: bool) -> MapImage | None:
     grid = read_grid(folder)
     if not grid.p_occupied.size:
         return None
@@ -166,20 +168,20 @@ def _plan(folder: Path, clear: bool) -> Plan | None:
     if clear:  # no shade of grey is that of what is unknown
         picture[(picture[..., :3] == UNKNOWN).all(axis=2), 3] = 0
     larger = max(1, _SHARP // max(picture.shape))
-    return Plan(picture.repeat(larger, axis=0).repeat(larger, axis=1), window)
+    return MapImage(picture.repeat(larger, axis=0).repeat(larger, axis=1), window)
 
 
 def _cloud(name: str, raw: Points, origin: Float) -> Cloud:
-    painted = raw.colours
+    painted = raw.colors
     if painted is None:
         painted = np.empty((len(raw.points), 3), np.uint8)
         painted[:] = ORANGE
         if name == "static" and len(raw.points):
             z = raw.points[:, 2]
-            painted = display.of_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
+            painted = display.color_by_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
     elif name == "dynamic":  # grey would be taken for a part of the place
         painted[(painted == GRAY).all(axis=1)] = ORANGE
-    return Cloud((raw.points - origin).astype(np.float32), painted, raw.of)
+    return Cloud((raw.points - origin).astype(np.float32), painted, raw.total)
 
 
 def _ground(static: Points | None, poses: Float) -> float:

@@ -23,13 +23,13 @@ import websockets.asyncio.server
 
 from stillmap.core.errors import InputError
 
-HERE = "127.0.0.1"
+HOST = "127.0.0.1"
 
 # any port: a tunnel may end in another one
 _OWN = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
 
 
-def is_ours(headers: Mapping[str, str]) -> bool:
+def is_local_request(headers: Mapping[str, str]) -> bool:
     """Whether a request was meant for this machine, and comes from this page or from none."""
     host, origin = headers.get("Host", ""), headers.get("Origin")
     if not _OWN.fullmatch(host):
@@ -37,7 +37,7 @@ def is_ours(headers: Mapping[str, str]) -> bool:
     return origin is None or origin == f"http://{host}"
 
 
-def policy(host: str) -> str:
+def content_security_policy(host: str) -> str:
     """The `Content-Security-Policy` of the page at `host`, one of ours: a browser lets it reach
     nothing but where it came from."""
     own = "'self' data: blob:"
@@ -66,7 +66,7 @@ _AS_THEY_ARE = b"""<script>{
 }</script>"""
 
 
-def show_as_they_are(response: Any) -> None:
+def disable_tone_mapping(response: Any) -> None:
     """Let a page of viser's show colours as they were sent; anything else is left as it is.
 
     Args:
@@ -93,7 +93,7 @@ class Server(viser.ViserServer):
         return None
 
 
-def started(port: int, label: str) -> Server:
+def start_server(port: int, label: str) -> Server:
     """A server at a port of 127.0.0.1; 0: any that is free.
 
     Raises:
@@ -106,22 +106,22 @@ def started(port: int, label: str) -> Server:
     told = os.environ.pop(_OWN_PORT, None)
     try:
         with _guarded() as asked:
-            server = Server(HERE, port, label=label, verbose=False)
+            server = Server(HOST, port, label=label, verbose=False)
     finally:
         console.quiet = quiet
         if told is not None:
             os.environ[_OWN_PORT] = told
     if not asked:
-        stop(server)
+        stop_server(server)
         raise RuntimeError("this version of viser does not start its server as we know it")
     if port not in (0, server.get_port()):  # viser took the next one
-        stop(server)
+        stop_server(server)
         raise InputError(f"--port {port} is taken", hint="without --port any free one is used")
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     return server
 
 
-def stop(server: Server) -> None:
+def stop_server(server: Server) -> None:
     """Close it, its connections and threads."""
     console = rich.get_console()
     quiet, console.quiet = console.quiet, True
@@ -142,12 +142,14 @@ def _guarded() -> Iterator[list[int]]:
         asked.append(port)
 
         def answer(connection: Any, request: Any) -> Any:
-            if not is_ours(request.headers):
+            if not is_local_request(request.headers):
                 return connection.respond(HTTPStatus.FORBIDDEN, "not from this page\n")
             response = process_request(connection, request)
             if response is not None:
-                show_as_they_are(response)
-                response.headers["Content-Security-Policy"] = policy(request.headers["Host"])
+                disable_tone_mapping(response)
+                response.headers["Content-Security-Policy"] = content_security_policy(
+                    request.headers["Host"]
+                )
             return response
 
         return plain(handler, host, port, process_request=answer, **more)

@@ -14,7 +14,7 @@ from stillmap.core.recording import Recording
 from stillmap.results.reader import Track
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.options import SlamOptions
-from stillmap.viewer.display import chosen
+from stillmap.viewer.display import sample_indices
 
 Float = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ _EDGES = np.array([(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a 
 _FLOOR = _EDGES[(_EDGES < 4).all(axis=1)]
 
 
-class Placed(NamedTuple):
+class ObjectPoses(NamedTuple):
     """Where n things are at a time.
 
     Attributes:
@@ -35,8 +35,8 @@ class Placed(NamedTuple):
         size: (n, 3) metres along, across and high; 0 high in the plane.
     """
 
-    number: NDArray[np.intp]
-    T_map_thing: Float
+    index: NDArray[np.intp]
+    T_map_object: Float
     size: Float
 
 
@@ -50,7 +50,7 @@ def headings(velocity: Float) -> Float:
     return np.asarray(np.interp(np.arange(len(velocity)), going, angle))
 
 
-def pose_at(track: Track, stamp_ns: int) -> Float:
+def interpolate_pose(track: Track, stamp_ns: int) -> Float:
     """(4, 4) T_map_thing at a time: between where it was seen before and after; from its first
     place before, at its last one after."""
     # seconds from this very time: nanoseconds of today have more digits than a float64
@@ -62,32 +62,32 @@ def pose_at(track: Track, stamp_ns: int) -> Float:
     return T
 
 
-def placed(tracks: Sequence[Track], stamp_ns: int) -> Placed:
+def object_poses_at(tracks: Sequence[Track], stamp_ns: int) -> ObjectPoses:
     """Those that are seen before and after a time, or at it."""
-    number = [n for n, one in enumerate(tracks) if is_there(one, stamp_ns)]
-    T = [pose_at(tracks[n], stamp_ns) for n in number]
+    number = [n for n, one in enumerate(tracks) if is_present(one, stamp_ns)]
+    T = [interpolate_pose(tracks[n], stamp_ns) for n in number]
     size = [(*tracks[n].size, 0.0)[:3] for n in number]
-    return Placed(
+    return ObjectPoses(
         np.array(number, np.intp), np.array(T).reshape(-1, 4, 4), np.array(size).reshape(-1, 3)
     )
 
 
-def is_there(track: Track, stamp_ns: int) -> bool:
+def is_present(track: Track, stamp_ns: int) -> bool:
     """Whether it is seen at or before a time, and at or after it."""
     return bool(track.stamp_ns[0] <= stamp_ns <= track.stamp_ns[-1])
 
 
-def edges(things: Placed) -> Float:
+def box_edges(things: ObjectPoses) -> Float:
     """(n, 12, 2, 3) metres in the map frame, both ends of the edges of their boxes; (n, 4, 2, 3)
     where none is high."""
     joined = _EDGES if things.size[:, 2].any() else _FLOOR
     sides = ((np.arange(8)[:, None] >> np.arange(3)) & 1) - 0.5  # (8, 3)
     corners = sides * things.size[:, None]
-    R, t = things.T_map_thing[:, :3, :3], things.T_map_thing[:, :3, 3]
+    R, t = things.T_map_object[:, :3, :3], things.T_map_object[:, :3, 3]
     return np.asarray((corners @ R.transpose(0, 2, 1) + t[:, None])[:, joined])
 
 
-def ways(tracks: Sequence[Track]) -> tuple[Float, NDArray[np.intp]]:
+def track_segments(tracks: Sequence[Track]) -> tuple[Float, NDArray[np.intp]]:
     """(m, 2, 3) metres, the pieces of all ways, and (m,) whose each is."""
     rows = [
         np.column_stack([one.xy, np.zeros(len(one.xy)) if one.z is None else one.z])
@@ -98,13 +98,13 @@ def ways(tracks: Sequence[Track]) -> tuple[Float, NDArray[np.intp]]:
     return np.concatenate([np.zeros((0, 2, 3)), *pieces]), whose
 
 
-MOST_BEAMS = 60_000  # of a scan that are shown
+MAX_BEAMS = 60_000  # of a scan that are shown
 
 # scans before and after one that tell how the robot moved meanwhile; lasers take turns in the plane
 _REACH = {2: 8, 3: 1}
 
 
-class Seen(NamedTuple):
+class ScanView(NamedTuple):
     """What is shown of a scan.
 
     Attributes:
@@ -134,14 +134,16 @@ class Beams:
     poses: NDArray[np.float64]
     slam: SlamOptions
 
-    def at(self, scan: int, most: int = MOST_BEAMS) -> Seen:
+    def scan_view(self, scan: int, most: int = MAX_BEAMS) -> ScanView:
         """At most so many beams of a scan; only it and those beside it are read."""
         D, T = self.recording.dimension, self.recording.n_scans
         first, end = max(scan - _REACH[D], 0), min(scan + _REACH[D] + 1, T)
-        near = deskew_recording(part(self.recording, first, end), self.poses[first:end], self.slam)
+        near = deskew_recording(
+            slice_scans(self.recording, first, end), self.poses[first:end], self.slam
+        )
         beams, at = self.recording.beams_of(scan), near.beams_of(scan - first)
         use = np.flatnonzero(near.hit[at])
-        use = use[chosen(len(use), most)]
+        use = use[sample_indices(len(use), most)]
         T_map_sensor = near.T_map_sensor(self.poses[first:end])[scan - first]
         ends, origin = np.zeros((len(use), 3)), np.zeros(3)
         its = near.points[at][use].astype(np.float64)
@@ -149,10 +151,10 @@ class Beams:
         origin[:D] = T_map_sensor[:D, D]
         p_static = np.asarray(self.p_static[beams][use])
         self.recording.release_pages(self.p_static)
-        return Seen(ends, p_static, origin)
+        return ScanView(ends, p_static, origin)
 
 
-def part(recording: Recording, first: int, end: int) -> Recording:
+def slice_scans(recording: Recording, first: int, end: int) -> Recording:
     """Scans first:end alone, without odometry; its arrays are parts of those of the whole."""
     beams = slice(int(recording.offset[first]), int(recording.offset[end]))
     times = recording.beam_time

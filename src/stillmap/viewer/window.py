@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stillmap.viewer.layers import Layers
 from stillmap.viewer.scene import Scene
-from stillmap.viewer.server import started, stop
+from stillmap.viewer.server import start_server, stop_server
 from stillmap.viewer.tracks import Beams
 
 FIELD_OF_VIEW = math.radians(60.0)  # from top to bottom
@@ -31,7 +31,7 @@ _NEARER = 0.95  # in space: what lies behind the middle looks smaller
 _LEAST = 5.0  # m
 
 
-class Framing(NamedTuple):
+class DefaultView(NamedTuple):
     """Where the eye is.
 
     Attributes:
@@ -42,22 +42,22 @@ class Framing(NamedTuple):
 
     position: NDArray[np.float64]
     look_at: NDArray[np.float64]
-    across: float
+    height: float
     far: float
 
 
-def framing(scene: Scene) -> Framing:
+def default_view(scene: Scene) -> DefaultView:
     """In the plane from above, north up; in space at a slant."""
     low, high = _box(scene)
     middle, (width, height) = 0.5 * (low + high), np.maximum(high - low, _LEAST)[:2]
-    across = _MARGIN * max(height, width / _WIDE) * (1.0 if scene.is_flat else _NEARER)
+    across = _MARGIN * max(height, width / _WIDE) * (1.0 if scene.is_2d else _NEARER)
     away = 0.5 * across / math.tan(0.5 * FIELD_OF_VIEW)
-    if scene.is_flat:
+    if scene.is_2d:
         # not quite from above: then nothing would say where north is
         offset = np.array([0.0, -0.01, 1.0]) * away
     else:
         offset = _SLANT / np.linalg.norm(_SLANT) * away
-    return Framing(middle + offset, middle, across, 20.0 * away)
+    return DefaultView(middle + offset, middle, across, 20.0 * away)
 
 
 def _box(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -67,9 +67,9 @@ def _box(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         low, high = np.quantile(static.points.astype(np.float64), _REACH, axis=0)
         return low, high
     way = scene.poses[:, :3, 3] - scene.origin
-    if scene.plan is None:
+    if scene.map_image is None:
         return np.asarray(way.min(axis=0)), np.asarray(way.max(axis=0))
-    x0, y0, x1, y1 = scene.plan.window
+    x0, y0, x1, y1 = scene.map_image.window
     return np.array([x0, y0, 0.0]) - scene.origin, np.array([x1, y1, 0.0]) - scene.origin
 
 
@@ -94,7 +94,7 @@ class Window:
         self._scene = scene
         self._seconds = 1e-9 * (scene.stamp_ns - scene.stamp_ns[0])
         self._scan, self._at, self._playing, self._ticked = 0, 0.0, False, time.monotonic()
-        self._server = started(port, "stillmap")
+        self._server = start_server(port, "stillmap")
         try:
             self._layers = Layers(self._server, scene, beams, self._look())
             self._controls()
@@ -115,7 +115,7 @@ class Window:
 
     def close(self) -> None:
         """Nothing is served any more; a page that is open stays as it is."""
-        stop(self._server)
+        stop_server(self._server)
 
     def show(self, scan: int) -> None:
         """Show what was there at a scan."""
@@ -123,7 +123,7 @@ class Window:
         with self._server.atomic():
             self._slider.value = scan
             self._clock.value = f"{self._seconds[scan]:.1f} of {self._seconds[-1]:.1f} s"
-            self._layers.draw(scan)
+            self._layers.update(scan)
 
     def play(self, playing: bool) -> None:
         """Let the time go on, or not."""
@@ -144,8 +144,8 @@ class Window:
             self._at = float(self._seconds[wanted])
         elif self._playing:
             wanted = self._later(passed)
-        self._layers.resize(self._size.value)
-        changed = [self._layers.set_shown(name, box.value) for name, box in self._boxes.items()]
+        self._layers.scale_points(self._size.value)
+        changed = [self._layers.set_visible(name, box.value) for name, box in self._boxes.items()]
         if any(changed):
             for name, note in self._notes.items():
                 note.visible = self._boxes[name].value
@@ -161,10 +161,10 @@ class Window:
 
     def _look(self) -> float:
         """Metres from the lower to the upper edge of the window."""
-        first, camera = framing(self._scene), self._server.initial_camera
+        first, camera = default_view(self._scene), self._server.initial_camera
         camera.fov, camera.far, camera.near = FIELD_OF_VIEW, first.far, 1e-4 * first.far
         camera.position, camera.look_at = first.position, first.look_at
-        return first.across
+        return first.height
 
     def _controls(self) -> None:
         gui, last = self._server.gui, len(self._seconds) - 1
@@ -177,11 +177,12 @@ class Window:
         self._button.on_click(self._clicked)
         with gui.add_folder("Show"):
             self._boxes = {
-                name: gui.add_checkbox(name, shown) for name, shown in self._layers.shown.items()
+                name: gui.add_checkbox(name, shown)
+                for name, shown in self._layers.default_visibility.items()
             }
             self._size = gui.add_slider("Point size", 0.5, 5.0, 0.5, 1.0)
         self._notes = {
-            name: gui.add_markdown(_plain(note), visible=self._layers.shown[name])
+            name: gui.add_markdown(_plain(note), visible=self._layers.default_visibility[name])
             for name, note in self._layers.notes.items()
         }
         for note in self._scene.notes:

@@ -156,7 +156,7 @@ def test_a_rig_has_them_beside_the_beams_of_the_laser_that_tilts(rig, mapped, tm
     static = rows_of(out / "static.ply", FIELDS + COLOURS)
     np.testing.assert_array_equal(rgb(static), colours[hit & (p_static >= 0.5)])
     assert coloured(rgb(static)).mean() > 0.2
-    assert point_cloud.cloud_in(out).coloured
+    assert point_cloud.cloud_from_folder(out).has_colors
     assert main(["convert", str(out), "-o", str(tmp_path / "a.xyz"), "--quiet"]) == 0
     found = np.loadtxt(tmp_path / "a.xyz", skiprows=1)
     np.testing.assert_array_equal(found[: len(static), 4:], rgb(static))

@@ -69,7 +69,7 @@ def _fill(library: Any, file: Any, cloud: Cloud, tell: Callable[[float], None] |
     scan.set("description", library.StringNode(file, f"stillmap: {text}"))
     limits = {"intensityMinimum": 0.0, "intensityMaximum": 1.0}
     scan.set("intensityLimits", _numbers(library, file, limits))
-    if cloud.coloured:
+    if cloud.has_colors:
         scan.set("colorLimits", _colour_limits(library, file))
     if cloud.start_ns is not None and cloud.start_ns >= GPS_EPOCH_S * 10**9:
         start = {"dateTimeValue": 1e-9 * cloud.start_ns - GPS_EPOCH_S}
@@ -78,7 +78,7 @@ def _fill(library: Any, file: Any, cloud: Cloud, tell: Callable[[float], None] |
     points = library.CompressedVectorNode(file, columns.prototype, codecs)
     scan.set("points", points)
     with closing(points.writer(columns.buffers)) as writer:
-        for block in cloud.told(tell):
+        for block in cloud.iter_blocks(tell):
             for n in columns.filled(block):
                 writer.write(n)
     scan.set("cartesianBounds", _numbers(library, file, columns.bounds()))
@@ -116,7 +116,7 @@ class _Columns:
             for name, middle in zip(_AXES, cloud.origin, strict=True)
         }
         nodes["intensity"] = library.FloatNode(file, 0.0, library.E57_SINGLE, 0.0, 1.0)
-        if cloud.coloured:
+        if cloud.has_colors:
             nodes |= {name: library.IntegerNode(file, 0, 0, 255) for name in _COLOURS}
         self._values: dict[str, NDArray[np.float64]] = {}
         self.buffers = library.VectorSourceDestBuffer()
@@ -139,8 +139,8 @@ class _Columns:
             for name, column in zip(_AXES, points.T, strict=True):
                 self._values[name][:n] = column
             self._values["intensity"][:n] = block.p_static[part]
-            if block.colours is not None:
-                for name, column in zip(_COLOURS, block.colours[part].T, strict=True):
+            if block.colors is not None:
+                for name, column in zip(_COLOURS, block.colors[part].T, strict=True):
                     self._values[name][:n] = column
             for column in self._values.values():
                 self.digest.update(column[:n].data)

@@ -37,7 +37,7 @@ class Block(NamedTuple):
     points: NDArray[np.float64]
     p_static: NDArray[np.float32]
     stamp_ns: NDArray[np.int64] | None
-    colours: NDArray[np.uint8] | None = None
+    colors: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,20 +55,20 @@ class Cloud:
     count: int
     origin: NDArray[np.float64]
     start_ns: int | None
-    blocks: Callable[[], Iterator[Block]]
-    coloured: bool = False
+    make_blocks: Callable[[], Iterator[Block]]
+    has_colors: bool = False
 
-    def told(self, tell: Callable[[float], None] | None) -> Iterator[Block]:
+    def iter_blocks(self, tell: Callable[[float], None] | None) -> Iterator[Block]:
         """The blocks; `tell` hears which share of the points was taken."""
         done = 0
-        for block in self.blocks():
+        for block in self.make_blocks():
             yield block
             done += len(block.points)
             if tell is not None:
                 tell(done / max(self.count, 1))
 
 
-def cloud_of(
+def cloud_from_recording(
     recording: Recording,
     seen: Recording,
     poses: NDArray[np.float64],
@@ -108,12 +108,12 @@ def cloud_of(
         ),
         origin=np.round(poses[0, :3, 3]),
         start_ns=int(recording.stamp_ns[0]) + int(np.floor(1e9 * earliest)),
-        blocks=made,
-        coloured=colours is not None,
+        make_blocks=made,
+        has_colors=colours is not None,
     )
 
 
-def cloud_in(folder: Path, only: Part | None = None) -> Cloud:
+def cloud_from_folder(folder: Path, only: Part | None = None) -> Cloud:
     """The points of `static.ply` and `dynamic.ply`: nobody knows any more when each was taken.
 
     Raises:

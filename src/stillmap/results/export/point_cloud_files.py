@@ -38,9 +38,9 @@ class Format(NamedTuple):
     """
 
     name: str
-    about: str
+    description: str
     endings: tuple[str, ...]
-    needs: tuple[str, ...]
+    requires: tuple[str, ...]
     write: Callable[[Cloud, Path, bool, Tell | None], None]
 
 
@@ -60,7 +60,7 @@ def require_extras(form: Format, path: Path) -> None:
         InputError: a library is missing.
     """
     packed = path.suffix.lower() == ".laz"
-    for module in (*form.needs, *(("lazrs",) if packed else ())):
+    for module in (*form.requires, *(("lazrs",) if packed else ())):
         import_extra(module, path, "written")
 
 
@@ -86,12 +86,12 @@ def write(cloud: Cloud, path: Path, form: Format, tell: Tell | None = None) -> N
 
 
 def _write_ply(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
-    fields = FIELDS + COLOURS if cloud.coloured else FIELDS
+    fields = FIELDS + COLOURS if cloud.has_colors else FIELDS
     _write_records(cloud, path, ply_header(fields, cloud.count), fields, tell)
 
 
 def _write_pcd(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
-    fields = FIELDS + _PACKED if cloud.coloured else FIELDS
+    fields = FIELDS + _PACKED if cloud.has_colors else FIELDS
     names = [name for name, _ in fields]
     lines = (
         "# .PCD v0.7 - Point Cloud Data file format",
@@ -115,7 +115,7 @@ def _write_records(
 ) -> None:
     with path.open("wb") as file:
         file.write(header)
-        for block in cloud.told(tell):
+        for block in cloud.iter_blocks(tell):
             file.write(_records(block, fields).tobytes())
 
 
@@ -123,35 +123,35 @@ def _records(block: Block, fields: list[tuple[str, str]]) -> NDArray[np.void]:
     out = np.empty(len(block.points), fields)
     out["x"], out["y"], out["z"] = block.points.T
     out["p_static"] = block.p_static
-    if block.colours is not None and fields[-1:] == _PACKED:
-        red, green, blue = block.colours.T.astype(np.uint32)
+    if block.colors is not None and fields[-1:] == _PACKED:
+        red, green, blue = block.colors.T.astype(np.uint32)
         out["rgb"] = red << 16 | green << 8 | blue
-    elif block.colours is not None:
-        put_colours(out, block.colours)
+    elif block.colors is not None:
+        put_colours(out, block.colors)
     return out
 
 
 def _write_text(cloud: Cloud, path: Path, _: bool, tell: Tell | None) -> None:
-    names = [name for name, _ in (FIELDS + COLOURS if cloud.coloured else FIELDS)]
-    line = "%.4f %.4f %.4f %.9g" + (" %d %d %d" if cloud.coloured else "") + "\n"
+    names = [name for name, _ in (FIELDS + COLOURS if cloud.has_colors else FIELDS)]
+    line = "%.4f %.4f %.4f %.9g" + (" %d %d %d" if cloud.has_colors else "") + "\n"
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.write(" ".join(names) + "\n")
-        for block in cloud.told(tell):
+        for block in cloud.iter_blocks(tell):
             for first in range(0, len(block.points), _LINES):
                 part = slice(first, first + _LINES)
                 values: list[NDArray[Any]] = [
                     block.points[part],
                     block.p_static[part, None].astype(np.float64),
                 ]
-                if block.colours is not None:
-                    values.append(block.colours[part])
+                if block.colors is not None:
+                    values.append(block.colors[part])
                 rows = np.concatenate(values, axis=1)
                 file.write(line * len(rows) % tuple(rows.ravel().tolist()))
 
 
 def _write_las(cloud: Cloud, path: Path, packed: bool, tell: Tell | None) -> None:
     laspy = import_extra("laspy", path, "written")
-    kind = _COLOURED if cloud.coloured else _POINTS
+    kind = _COLOURED if cloud.has_colors else _POINTS
     head = laspy.LasHeader(point_format=kind, version="1.4")
     head.scales, head.offsets = np.full(3, _SCALE), cloud.origin
     head.add_extra_dim(laspy.ExtraBytesParams("p_static", "float32", "probability to be static"))
@@ -160,7 +160,7 @@ def _write_las(cloud: Cloud, path: Path, packed: bool, tell: Tell | None) -> Non
     # the day of writing would make other bytes of the same result
     head.creation_date = date(1970, 1, 1)
     with open_las_writer(path, laspy, head, packed) as writer:
-        for block in cloud.told(tell):
+        for block in cloud.iter_blocks(tell):
             writer.write_points(_las_points(laspy, head, block))
 
 
@@ -173,8 +173,8 @@ def _las_points(laspy: Any, head: Any, block: Block) -> Any:
     out["p_static"] = block.p_static
     if block.stamp_ns is not None:
         out.gps_time = 1e-9 * block.stamp_ns
-    if block.colours is not None:
-        out.red, out.green, out.blue = block.colours.T.astype(np.uint16) * np.uint16(_FULL)
+    if block.colors is not None:
+        out.red, out.green, out.blue = block.colors.T.astype(np.uint16) * np.uint16(_FULL)
     return out
 
 
