@@ -1,16 +1,17 @@
-"""What each part of the default estimator brings: labels without it, at the same poses.
+"""Ablation of the default estimator: labels without each of its parts, at the same poses.
 
 python benchmarks/ablation.py [--cases NAME|GROUP ...] [--seeds tuning|reporting] [--n-seeds 1]
     [--set section.key=value ...] [--true-poses] [--processes 2]
 
 Poses are those of the whole estimator's result, so that only the E-step differs: that of the loop,
-not the last one after it (`stillmap/em/last.py`), which knows more classes.
+not the final one after it, which has more classes.
 """
 
 import argparse
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from unittest.mock import patch
 
 import numpy as np
 from cases import EMPTY, POPULATED, STOPS
@@ -24,10 +25,12 @@ from common import (
     outcomes,
     runs_of,
 )
+from numpy.typing import NDArray
 from prepared import RESOLUTION
 from tables import markdown
 
-from stillmap.em import EmOptions, occupancy_hmm
+from stillmap.core.recording import Recording
+from stillmap.em import EmOptions, EStepResult, observations, occupancy_hmm
 from stillmap.em.observations import LOOP_CLASSES, HmmClasses
 from stillmap.eval.labels import LabelScores, score_labels
 from stillmap.sim import simulate
@@ -37,24 +40,30 @@ _NONE = 1e-6  # scatters: as good as none; half a cell remains where noise is no
 
 @dataclass(frozen=True)
 class Variant:
-    """Options and classes that differ from the whole."""
+    """Constants of the observation model, options and classes that differ from the whole."""
 
     without: str
-    dwell: dict[str, float]
+    constants: dict[str, float] = field(default_factory=dict)
     classes: HmmClasses = LOOP_CLASSES
+    options: dict[str, float] = field(default_factory=dict)
 
-    def options(self, options: EmOptions) -> EmOptions:
-        changed = dataclasses.replace(options.dwell, **self.dwell)  # type: ignore[arg-type]
-        return dataclasses.replace(options, dwell=changed)
+    def e_step(
+        self, recording: Recording, poses: NDArray[np.float64], options: EmOptions
+    ) -> EStepResult:
+        options = dataclasses.replace(options, **self.options)  # type: ignore[arg-type]
+        with patch.multiple(
+            observations, **(self.constants or {"_LATERAL": observations._LATERAL})
+        ):
+            return occupancy_hmm.e_step(recording, poses, RESOLUTION, options, 1, self.classes)
 
 
 VARIANTS = (
-    Variant("nothing: the whole", {}),
-    Variant("surfaces: every element is round", {"normals": False}),
-    Variant("trust beside the beam: 3 scatters", {"lateral": 3.0}),
-    Variant("room behind the surface", {"margin": _NONE}),
-    Variant("hits of neighbours", {"reach": _NONE}),
-    Variant("looks: every scan counts for itself", {"look": 0.01}),
+    Variant("nothing: the whole"),
+    Variant("surfaces: every element is round", {"_USE_NORMALS": False}),
+    Variant("trust beside the beam: 3 scatters", {"_LATERAL": 3.0}),
+    Variant("room behind the surface", {"_MARGIN": _NONE}),
+    Variant("hits of neighbours", {"_HIT_RADIUS": _NONE}),
+    Variant("time bins: every scan counts for itself", options={"time_bin": 0.01}),
     Variant("people who stay: tau 0.5 s only", {}, HmmClasses(dynamic_tau=(0.5,))),
     Variant("crowded places: rho 0.01 only", {}, HmmClasses(dynamic_rho=(0.01,))),
     Variant("walls that are missed: rho 0.998 only", {}, HmmClasses(static_rho=(0.998,))),
@@ -81,10 +90,7 @@ def scores_of(run: Run) -> list[LabelScores]:
     poses = truth.T_world_base if run.true_poses else built(recording, options)[0].poses
     kinds = np.array([*truth.scene["mover_kinds"], "none"])[truth.mover]
     scored = recording.hit & ~np.isin(kinds, LASTING)
-    found = (
-        occupancy_hmm.e_step(recording, poses, RESOLUTION, v.options(options.em), 1, v.classes)
-        for v in VARIANTS
-    )
+    found = (v.e_step(recording, poses, options.em) for v in VARIANTS)
     return [score_labels(e.p_static, truth.static, scored) for e in found]
 
 

@@ -20,6 +20,7 @@ from seeds import REPORTING, TUNING
 import stillmap
 from stillmap import em
 from stillmap.core import config
+from stillmap.em import beam_counting
 from stillmap.eval.labels import score_labels
 from stillmap.eval.map import score_map
 from stillmap.eval.trajectory import align, compute_absolute_errors
@@ -28,11 +29,12 @@ METHODS: dict[str, dict[str, Any]] = {
     "stillmap": {"estimator": "stillmap"},
     "paper": {"estimator": "paper"},
     "tracker": {"estimator": "tracker"},
-    "tracker-0.1": {"estimator": "tracker", "em": {"hit_ratio": 0.1}},
-    # today's mappers: hits / (hits + passes) of the end cell against a threshold
-    "hit-ratio-0.1": {"estimator": "hit-ratio", "em": {"hit_ratio": 0.1}},
-    "hit-ratio-0.25": {"estimator": "hit-ratio", "em": {"hit_ratio": 0.25}},
+    "tracker-0.1": {"estimator": "tracker"},
+    # mappers that count: hits / (hits + passes) of the end cell against a threshold
+    "hit-ratio-0.1": {"estimator": "hit-ratio"},
+    "hit-ratio-0.25": {"estimator": "hit-ratio"},
 }
+MIN_HIT_RATIO = {"tracker-0.1": 0.1, "hit-ratio-0.1": 0.1}  # by method; 0.25 for the others
 
 _VEHICLES = ["car", "forklift"]
 LASTING = ["door", "thing"]  # stand still for so long that they may be seen in one state only
@@ -111,9 +113,12 @@ def seeds_of(args: argparse.Namespace) -> tuple[int, ...]:
 def options_of(method: str, settings: Iterable[str]) -> stillmap.Options:
     """Options of a method with `section.key=value` laid over them, for one thread.
 
+    Sets the threshold of the hit ratio, which is no option, for the whole process.
+
     Raises:
         InputError: an option that is not there or has another type.
     """
+    beam_counting.MIN_HIT_RATIO = MIN_HIT_RATIO.get(method, 0.25)
     changes = config.merged(METHODS[method], *(config.parse_assignment(s) for s in settings))
     return config.replaced(stillmap.Options(), {"threads": 1, **changes})
 

@@ -69,8 +69,8 @@ def kernels_of(recording: stillmap.Recording, poses: NDArray[np.float64]) -> dic
     surface = observations.build_surfel_map(recording, T_map_sensor, RESOLUTION)
 
     def elements(threads: int) -> object:
-        seen = observations.make_hmm(surface, options.dwell, observations.LOOP_CLASSES)
-        observations.add_observations(recording, poses, seen, options.dwell.look, threads)
+        seen = observations.make_hmm(surface, options, observations.LOOP_CLASSES)
+        observations.add_observations(recording, poses, seen, options.time_bin, threads)
         return seen.likelihood()
 
     return {

@@ -1,5 +1,6 @@
 from pathlib import Path
 
+import common
 import pytest
 from nobody import Job, found, table
 
@@ -26,8 +27,9 @@ def test_an_empty_hall_is_still(bag: Path) -> None:
     assert "| met " in line
 
 
-def test_what_is_not_met_is_said(bag: Path) -> None:
+def test_what_is_not_met_is_said(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job = Job(bag, "/scan", "hit-ratio-0.25", ())
-    of = found(Job(bag, "/scan", "hit-ratio-0.25", ("em.hit_ratio=0.999",)))
+    monkeypatch.setitem(common.MIN_HIT_RATIO, "hit-ratio-0.25", 0.999)
+    of = found(job)
     assert of.of_beams > 0.03
     assert "MISSED" in table([(job, of)])

@@ -87,7 +87,7 @@ def test_bash(ask):
         "stillmap map walk.log -o o": {"out/"},
         "stillmap map walk.log --config o": {"options.toml", "out/"},
         "stillmap map walk.log --set em.pri": {"em.prior="},
-        "stillmap map walk.log --set em.dwell.lo": {"em.dwell.look="},
+        "stillmap map walk.log --set em.time": {"em.time_bin="},
         "stillmap map walk.log --set slam.loops.enabled=": {"true", "false"},
         "stillmap map walk.log --set output.map_mode=t": {"trinary"},
         "stillmap view ": {"out/"},
@@ -95,7 +95,7 @@ def test_bash(ask):
         "stillmap simulate hall --set crowd.peo": {"crowd.people="},
         "stillmap eval ": {"relations", "trajectory", "labels", "map", "model"},
         "stillmap eval trajectory a b --delta-unit f": {"frames"},
-        "stillmap config em.dwell.lo": {"em.dwell.look"},
+        "stillmap config em.time": {"em.time_bin"},
         "stillmap completion ": {"bash", "zsh", "fish"},
         "stillmap map walk.log --resolution ": set(),
     }
@@ -105,7 +105,7 @@ def test_bash(ask):
 def test_bash_knows_every_section_of_options(ask):
     (found,) = ask(["bash", "--norc"], BASH, ["stillmap map log --set "]).values()
     sections = {name.rpartition(".")[0] for name in found}
-    assert {"", "em", "em.dwell", "slam", "slam.loops", "read", "objects", "output"} <= sections
+    assert {"", "em", "slam", "read", "objects", "output"} <= sections
     assert all(name.endswith("=") for name in found)
 
 

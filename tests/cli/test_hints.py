@@ -33,7 +33,7 @@ def refusal(capsys, *words: object) -> str:
         (("map", "--resoluton=1"), "--resoluton=1", "'--resolution'"),
         (("map", "log", "-o", "out", "--estimator", "trakcer"), "'trakcer'", "'tracker'"),
         (("simulate", "hal", "-o", "out"), "'hal'", "'hall'"),
-        (("config", "em.dwel"), "'em.dwel'", "'em.dwell'"),
+        (("config", "em.time"), "'em.time'", "'em.time_bin'"),
         (("config", "--set", "resolution=1"), "'resolution'", "'slam.resolution'"),
         (("config", "--set", "loops.enabled=false"), "'loops'", "'slam.loops'"),
         (("completion", "bsh"), "'bsh'", "'bash'"),
@@ -57,7 +57,7 @@ def test_nothing_is_made_up(capsys, words):
     [
         ("em.prior.x=1", "'em.prior' is a value, not a section"),
         ("em=1", "'em' is a section, not a value"),
-        ("em.dwell=1", "'em.dwell' is a section, not a value"),
+        ("slam=1", "'slam' is a section, not a value"),
         ("em.prior=[1]", "'em.prior' wants float, got [1]"),
         ("em.prior=2020-01-01", "'em.prior' wants float"),
         ("threads=1.5", "'threads' wants int, got 1.5"),

@@ -72,15 +72,14 @@ def test_config(call):
         "default": Options().em.prior,
         "type": "float",
         "choices": None,
-        "doc": "p(c = 1), share of beams thought static before anything was learned",
+        "range": "more than 0 and less than 1",
+        "doc": "Prior probability p(c = 1) that a beam is static.",
     }
-    assert found["read.max_range"]["type"] == "float or nothing"
+    assert found["read.max_range"]["type"] == "float or unset"
     assert found["output.map_state"]["choices"] == ["last", "majority"]
     assert all(one["doc"] for one in found.values())
-    assert set(parsed(call("config", "em.evidence", "--json"))) == {
-        "em.evidence.least",
-        "em.evidence.near",
-    }
+    odometry = parsed(call("config", "slam.odometry", "--json"))
+    assert set(odometry) == {name for name in found if name.startswith("slam.odometry.")}
 
 
 def test_scores_without_a_number(call, tmp_path):

@@ -87,7 +87,7 @@ def test_other_estimators_know_of_no_states(mapped, estimator):
 
 
 def test_they_may_be_left_alone(mapped):
-    p, changed, told = mapped("--set", "em.changes.enabled=false")
+    p, changed, told = mapped("--set", "em.change_detection=false")
     assert told["changes"] == []
     assert not changed.any()
     assert "changing" not in told["learned"]

@@ -19,7 +19,7 @@ from stillmap.pipeline.em_loop import iterate
 from stillmap.results import labels
 
 WORDS = ("--set", "em.max_iterations=4", "--set", "em.patience=9", "--set", "em.tolerance=0")
-WORDS += ("--set", "em.settled=0", "--threads", "1")
+WORDS += ("--set", "em.label_tolerance=0", "--threads", "1")
 ALL = 4  # iterations
 
 

@@ -10,6 +10,7 @@ import stillmap
 from stillmap.core import se2
 from stillmap.core.config import replaced
 from stillmap.core.recording import Recording
+from stillmap.em import beam_counting
 
 
 @pytest.mark.parametrize("how", ["one scan", "no hits", "all unusable", "no beams"])
@@ -43,7 +44,7 @@ def test_recordings_of_next_to_nothing(short, tmp_path, how, odometry, estimator
     assert result.p_static.shape == (r.n_beams,)
     if how == "no hits":
         defaults = stillmap.Options().em
-        prior = 1 - defaults.hit_ratio if estimator == "hit-ratio" else defaults.prior
+        prior = 1 - beam_counting.MIN_HIT_RATIO if estimator == "hit-ratio" else defaults.prior
         np.testing.assert_array_equal(result.p_static, np.float32(prior))
         assert not (result.map.p_occupied > 0.2).any()  # not seen to be anything
         assert not (result.raw_map.p_occupied > 0).any()

@@ -14,7 +14,7 @@ from stillmap.sim import CrowdOptions, LidarOptions, RobotOptions, Scene, simula
 from stillmap.sim.scene import Stay, Thing
 from stillmap.sim.walls import box
 
-LISTED = replaced(Options(), {"em": {"changes": {"in_space": True}}})
+LISTED = replaced(Options(), {"em": {"change_detection_3d": True}})
 LEFT, CAME = (3.0, 2.0), (-3.0, 2.0)  # m, where they stand
 
 

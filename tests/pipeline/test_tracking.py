@@ -6,6 +6,7 @@ from choices import RESOLUTION, options
 
 import stillmap
 from stillmap import _core, em
+from stillmap.em import beam_counting
 from stillmap.eval.labels import score_labels
 
 
@@ -41,17 +42,16 @@ def test_the_map_counts_hits_that_are_on_nobody(room, tracked):
     np.testing.assert_array_equal(tracked.map.alpha, alpha.astype(np.float32))
     crossed = alpha + beta > 0
     ratio = np.where(crossed, alpha / np.where(crossed, alpha + beta, 1.0), np.nan)
-    threshold = tracked.options.em.hit_ratio
+    threshold = beam_counting.MIN_HIT_RATIO
     occupied = ratio[crossed] >= threshold
     np.testing.assert_array_equal(tracked.map.p_occupied[crossed] == 1.0, occupied)
     assert np.isnan(tracked.map.p_occupied[~crossed]).all()
 
 
-def test_fewer_cells_are_occupied_than_by_counting_alone(room):
+def test_fewer_cells_are_occupied_than_by_counting_alone(room, monkeypatch):
+    monkeypatch.setattr(beam_counting, "MIN_HIT_RATIO", 0.05)
     tracked, counted = (
-        stillmap.build(
-            room.recording, options(name, hit_ratio=0.05), poses=room.truth.T_world_base
-        ).map.p_occupied
+        stillmap.build(room.recording, options(name), poses=room.truth.T_world_base).map.p_occupied
         for name in ("tracker", "hit-ratio")
     )
     assert not ((tracked == 1.0) & (counted != 1.0)).any()

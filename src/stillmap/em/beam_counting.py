@@ -60,7 +60,7 @@ def hit_ratio_e_step(
     recording: Recording,
     poses: Float,
     grid: _core.OccupancyGrid2D,
-    threshold: float = MIN_HIT_RATIO,
+    threshold: float,
     threads: int = 1,
 ) -> EStepResult:
     """P(static) by the hit ratio r of the end cell, 1/2 at the threshold.

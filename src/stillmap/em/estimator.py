@@ -10,7 +10,6 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.chunks import iter_chunks
 from stillmap.core.recording import Recording
 from stillmap.em import beam_counting, occupancy_hmm
-from stillmap.em.beam_counting import MIN_HIT_RATIO, log_likelihood, threshold_hit_ratio
 from stillmap.em.occupancy_grid import ObservedCells
 from stillmap.em.options import EmOptions
 from stillmap.em.people import label_people
@@ -90,7 +89,9 @@ def e_step(
     if not isinstance(grid, _core.OccupancyGrid2D):
         raise ValueError(f"estimator: {estimator} knows 2D recordings only")
     if estimator == "hit-ratio":
-        return beam_counting.hit_ratio_e_step(recording, poses, grid, threads=threads)
+        return beam_counting.hit_ratio_e_step(
+            recording, poses, grid, beam_counting.MIN_HIT_RATIO, threads
+        )
     return _tracker_e_step(recording, poses, grid.resolution, options, threads)
 
 
@@ -104,8 +105,9 @@ def _tracker_e_step(
         e[beams] = fill_beams(recording.points[beams], recording.hit[beams], labels, options.prior)
     grid = _core.OccupancyGrid2D(resolution)
     add_recording(grid, recording, poses, e, threads)
-    likelihood = log_likelihood(recording, poses, grid, e, options.prior, threads)
-    return EStepResult(e, likelihood, threshold_hit_ratio(grid, MIN_HIT_RATIO))
+    likelihood = beam_counting.log_likelihood(recording, poses, grid, e, options.prior, threads)
+    occupied = beam_counting.threshold_hit_ratio(grid, beam_counting.MIN_HIT_RATIO)
+    return EStepResult(e, likelihood, occupied)
 
 
 def add_recording(
