@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.sim import Door, DoorOptions, Scene, Simulation, simulate
 from stillmap.sim.objects import Doors, legs
 from stillmap.sim.planner import distance_to_segment
@@ -116,7 +116,7 @@ def standing_before_a_door(**doors: float) -> Simulation:
         "laser": {"beams": 181, "fov": 2 * np.pi, "range_noise": 0.0},
         "doors": doors,
     }
-    return simulate(replaced(scene, options), 2)
+    return simulate(override(scene, options), 2)
 
 
 def test_beams_meet_the_leaf_where_it_is(

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stillmap import io as recordings
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.core.errors import InputError
 from stillmap.sim import (
     Scene,
@@ -46,7 +46,7 @@ def yard(
         "robot": {"scans": 40, "speed": 1.5, "turn_rate": 2.0, **(robot or {})},
         "crowd": {"people": people, "min_speed": 1.5, "stopping_share": 0.0},
     }
-    return simulate(replaced(scene, changes), seed)
+    return simulate(override(scene, changes), seed)
 
 
 def in_world(run: Simulation, times: bool = True) -> tuple[Float, NDArray[np.int64], Float]:

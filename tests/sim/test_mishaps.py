@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.core.errors import InputError
 from stillmap.sim import OdometryOptions, Scene, Simulation, scene_by_name, simulate
 from stillmap.sim.odometry import reported, without_jump
@@ -145,7 +145,7 @@ def test_a_carried_robot_gets_to_the_end_of_its_route() -> None:
     changes = {"robot": {"carried_at": 0.3}, "crowd": {"people": 0}, "laser": {"beams": 4}}
     ends = []
     for seed in range(6):
-        run = simulate(replaced(scene, changes), seed)
+        run = simulate(override(scene, changes), seed)
         ends.append(np.hypot(*(run.truth.T_world_base[-1, :2, 2] - route[-1])))
         assert run.recording.n_scans > run.truth.scene["carried_at_scan"] + 100
     assert max(ends) < 0.2
@@ -160,13 +160,6 @@ def test_stamps_are_rounded(tick: float) -> None:
     assert np.abs(rounded - exact).max() <= tick * 1e9 / 2 + 1
     assert np.abs(rounded - exact).max() > tick * 1e9 / 4
     assert np.all(np.diff(rounded) >= 0)
-
-
-def test_where_stamps_are_missing_scans_are_counted() -> None:
-    run = short(robot={"scans": 30, "stamps_missing": True, "stamp_rounding": 0.3})
-    np.testing.assert_array_equal(run.recording.stamp_ns, np.arange(30) * 10**9)
-    plain = short(robot={"scans": 30})
-    np.testing.assert_array_equal(run.recording.points, plain.recording.points)
 
 
 def test_usually_nothing_of_the_kind_happens() -> None:

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.config import replaced, to_dict
+from stillmap.core.config import override, to_dict
 from stillmap.core.errors import InputError
 from stillmap.sim import SCENES, CrowdOptions, Scene, Simulation, scene_by_name, simulate
 from stillmap.sim.people import Crowd, Figures
@@ -122,7 +122,7 @@ def test_nobody_walks_through_walls_or_the_robot(
 def test_where_there_is_no_room_to_pass_nobody_overlaps(seed: int, wall_distance: Distance) -> None:
     scene = Scene(name="alley", walls=tuple(box(0, 0, 14, 1.3)), route=((-6.0, 0.0), (6.0, 0.0)))
     changes = {"robot": {"scans": 400}, "laser": {"beams": 10}, "crowd": {"people": 7}}
-    truth = simulate(replaced(scene, changes), seed).truth
+    truth = simulate(override(scene, changes), seed).truth
     robot, people = truth.T_world_base[:, :2, 2], truth.movers[..., :2]
     distance = np.hypot(*np.moveaxis(people - robot[:, None], -1, 0))
     assert distance.min() >= 0.22 + 0.26
@@ -218,7 +218,7 @@ def test_more_scans_than_the_route_takes_go_round_again() -> None:
 def test_a_robot_that_stands_still_records_too() -> None:
     scene = Scene(name="standing", walls=tuple(box(0, 0, 8, 8)), route=((0.0, 1.0),))
     options = {"robot": {"scans": 40}, "crowd": {"people": 4}}
-    truth = simulate(replaced(scene, options), 0).truth
+    truth = simulate(override(scene, options), 0).truth
     np.testing.assert_array_equal(truth.T_world_base, truth.T_world_base[:1].repeat(40, 0))
     assert (truth.mover >= 0).any()
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.core.errors import InputError
 from stillmap.sim import LaserOptions, Scene, Simulation, scene_by_name, simulate
 from stillmap.sim.dynamics import Motion
@@ -33,7 +33,7 @@ def yard(sweep_time: float, people: int = 0) -> Simulation:
         "robot": {"scans": 250, "speed": 1.5, "turn_rate": 2.0},
         "crowd": {"people": people, "min_speed": 1.5, "stopping_share": 0.0},
     }
-    return simulate(replaced(scene, changes), 2)
+    return simulate(override(scene, changes), 2)
 
 
 def at_beam_times(simulation: Simulation) -> tuple[Float, Float, Float]:
@@ -185,7 +185,7 @@ def test_a_robot_that_is_carried_away_is_not_seen_to_move() -> None:
         "robot": {"scans": 120, "speed": 1.0, "carried_at": 0.5},
         "crowd": {"people": 0},
     }
-    run = simulate(replaced(scene, changes), 2)
+    run = simulate(override(scene, changes), 2)
     carried = run.truth.scene["carried_at_scan"]
     assert carried == 60
     ranges = np.hypot(*run.recording.points.T).reshape(120, 90)

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stillmap.core import se2
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.sim import (
     Scene,
     Simulation,
@@ -48,7 +48,7 @@ def yard(
         **NOBODY,
     }
     merged = {key: {**usual.get(key, {}), **changes.get(key, {})} for key in {*usual, *changes}}
-    return simulate(replaced(scene, merged), 2)
+    return simulate(override(scene, merged), 2)
 
 
 def seconds_of(run: Simulation) -> Float:
@@ -131,7 +131,7 @@ def test_everybody_keeps_clear_of_every_place() -> None:
     changes = {"crowd": {"people": 8}, "robot": {"scans": 400, "speed": 1.0}}
     short = Thing(wide[:1], later.stays)
     for things in ((later,), (short,)):
-        run = simulate(replaced(Scene(**{**vars(scene), "things": things}), changes), 1)
+        run = simulate(override(Scene(**{**vars(scene), "things": things}), changes), 1)
         everybody = [run.truth.T_world_base[:, None, :2, 2], run.truth.movers[:, :8, :2]]
         for face in Things(things).everywhere():
             for xy in everybody:

@@ -59,8 +59,6 @@ class Shots(NamedTuple):
         seconds = (at - scan) * motion.period
         # rounded as the recorder rounds them, stamps of scans could lie on either side
         since = np.round(seconds * 1e9).astype(np.int64)
-        if happening.scene.robot.stamps_missing:
-            since = np.round((at - scan) * 1e9).astype(np.int64)
         stamp_ns = happening.exact_ns[scan] + since
         which = np.tile(np.arange(o.count, dtype=np.int32), len(at))
         scan, seconds = np.repeat(scan, o.count), np.repeat(seconds, o.count)

@@ -46,18 +46,13 @@ class Happening:
     def stamp_ns(self) -> NDArray[np.int64]:
         """(T,) nanoseconds, as well as the recorder knows them."""
         o, exact = self.scene.robot, self.exact_ns
-        if o.stamps_missing:
-            return exact
         tick = max(1, round(o.stamp_rounding * 1e9))
         return _FIRST_STAMP_NS + (exact - _FIRST_STAMP_NS + tick // 2) // tick * tick
 
     @property
     def exact_ns(self) -> NDArray[np.int64]:
         """(T,) the same, not rounded."""
-        seconds = self.motion.seconds
-        if self.scene.robot.stamps_missing:
-            return np.arange(len(seconds), dtype=np.int64) * 10**9
-        return _FIRST_STAMP_NS + np.round(seconds * 1e9).astype(np.int64)
+        return _FIRST_STAMP_NS + np.round(self.motion.seconds * 1e9).astype(np.int64)
 
     def source(self, sensors: list[dict[str, Any]]) -> dict[str, Any]:
         """What a recording says of where it is from."""

@@ -194,6 +194,8 @@ VAN = 5.2  # m, cars that are longer are vans
 
 LEAF = 0.04  # m, how thick doors are
 
+_PANEL_HEIGHT = 2.0  # m
+
 _THIN = 0.2  # m, furniture that is thinner is a panel
 
 _LEG = 0.1  # m, what is smaller is the leg of a chair
@@ -267,7 +269,7 @@ def boxed(length: float, width: float, heights: HeightOptions) -> list[Part]:
     if max(length, width) < _LEG:
         top = _SEAT
     else:
-        top = heights.panels if min(length, width) < _THIN else heights.furniture
+        top = _PANEL_HEIGHT if min(length, width) < _THIN else heights.furniture
     return [Part(BOX, 0.0, 0.0, (length / 2, width / 2), (0.0, min(top, heights.top)))]
 
 

@@ -1,372 +1,299 @@
-"""The parameters of a simulation, each default once.
-
-The parameters of the cameras that look on beside a lidar, or beside a laser that tilts.
-
-The parameters of a 3D lidar and of what a world is like above and below its plan.
-"""
+"""Parameters of a scene: sensors, robot, odometry, people, doors, vehicles, ground and heights."""
 
 import math
 from dataclasses import dataclass
 from typing import Literal
 
-from stillmap.core.config import option
+from stillmap.core.config import Section, option
 
 Shape = Literal["legs", "bodies", "mixed"]
 
+_TURN = 2 * math.pi + 1e-9
+_MAX_ELEVATION = math.radians(85.0)
+_MAX_CAMERA_FOV = math.radians(150.0)
 
-@dataclass(frozen=True)
-class CrowdOptions:
-    """The people who walk about."""
-
-    people: int = option(15, "how many people walk about")
-    # spelled out: ruff takes the default for mutable under an alias
-    shape: Literal["legs", "bodies", "mixed"] = option(
-        "mixed", "what the laser sees of a person: legs, bodies, or one half of them each"
-    )
-    min_speed: float = option(0.4, "m/s, the slowest walker")
-    max_speed: float = option(1.6, "m/s, the fastest walker")
-    stopping_share: float = option(0.33, "share of the people who stop now and then")
-    min_stop: float = option(2.0, "s, the shortest stop")
-    max_stop: float = option(20.0, "s, the longest stop")
-
-    def __post_init__(self) -> None:
-        require(self.people >= 0, "people must not be negative")
-        require(0 < self.min_speed <= self.max_speed, "speeds want 0 < min_speed <= max_speed")
-        require(0 <= self.stopping_share <= 1, "stopping_share must lie in [0, 1]")
-        require(0 <= self.min_stop <= self.max_stop, "stops want 0 <= min_stop <= max_stop")
-
-
-@dataclass(frozen=True)
-class DoorOptions:
-    """How long doors stay as they are; durations are spread evenly in their logarithm."""
-
-    min_open: float = option(4.0, "s, the shortest time that a door stays open")
-    max_open: float = option(60.0, "s, the longest time that a door stays open")
-    min_closed: float = option(5.0, "s, the shortest time that a door stays closed")
-    max_closed: float = option(120.0, "s, the longest time that a door stays closed")
-    swing: float = option(1.5, "s, from closed to open")
-
-    def __post_init__(self) -> None:
-        for low, high in ((self.min_open, self.max_open), (self.min_closed, self.max_closed)):
-            require(0 < low <= high, "times of doors want 0 < min <= max")
-        require(self.swing > 0, "swing must be positive")
-
-
-@dataclass(frozen=True)
-class TrafficOptions:
-    """The vehicles that drive about on a scene's lanes; queues are part of the lanes."""
-
-    vehicles: int = option(10, "how many drive about, spread over the lanes")
-    min_speed: float = option(7.0, "m/s, the slowest driver")
-    max_speed: float = option(12.0, "m/s, the fastest driver")
-    van_share: float = option(0.25, "share of vans among the cars")
-    stopping_share: float = option(0.2, "share of the vehicles that stop now and then")
-    min_stop: float = option(3.0, "s, the shortest stop")
-    max_stop: float = option(12.0, "s, the longest stop")
-
-    def __post_init__(self) -> None:
-        require(self.vehicles >= 0, "vehicles must not be negative")
-        require(0 < self.min_speed <= self.max_speed, "speeds want 0 < min_speed <= max_speed")
-        for share in (self.van_share, self.stopping_share):
-            require(0 <= share <= 1, "shares of vehicles must lie in [0, 1]")
-        require(0 <= self.min_stop <= self.max_stop, "stops want 0 <= min_stop <= max_stop")
-
-
-@dataclass(frozen=True)
-class LaserOptions:
-    """The laser scanner and where it sits on the robot."""
-
-    beams: int = option(180, "beams per scan")
-    fov: float = option(math.pi, "rad, field of view, centred on the sensor's x axis")
-    max_range: float = option(30.0, "m, what lies farther off gives no return")
-    range_noise: float = option(0.02, "m, standard deviation of a range")
-    no_return_share: float = option(0.002, "share of beams that get lost anywhere")
-    glass_no_return_share: float = option(0.3, "share of beams that get lost on glass")
-    sweep_time: float = option(
-        0.0, "s, that it takes to look through its field of view; 0: all beams at once"
-    )
-    x: float = option(0.08, "m, sensor ahead of the base centre")
-    y: float = option(0.0, "m, sensor to the left of the base centre")
-    yaw: float = option(0.0, "rad, sensor against the base")
-    # spelled out: see CrowdOptions.shape
-    upside_down: Literal["no", "known", "unknown"] = option(
-        "no", "it hangs upside down: no; known to the recorder; or unknown, which mirrors its scans"
-    )
-    second_laser: bool = option(
-        False, "another one like it looks backwards from the other side of the base centre"
-    )
-
-    def __post_init__(self) -> None:
-        require(self.beams >= 2, "beams must be at least 2")
-        require(0 < self.fov <= 2 * math.pi + 1e-9, "fov must lie in (0, 2 pi]")
-        require(self.max_range > 0, "max_range must be positive")
-        require(self.sweep_time >= 0, "sweep_time must not be negative")
-        require(self.range_noise >= 0, "range_noise must not be negative")
-        for share in (self.no_return_share, self.glass_no_return_share):
-            require(0 <= share <= 1, "shares of lost beams must lie in [0, 1]")
-
-    @property
-    def count(self) -> int:
-        """How many lasers there are; they scan by turns."""
-        return 2 if self.second_laser else 1
-
-
-@dataclass(frozen=True)
-class RobotOptions:
-    """How the robot drives and how often it scans."""
-
-    speed: float = option(0.5, "m/s, on a free way")
-    acceleration: float | None = option(
-        None, "m/s^2, at most, gaining speed, braking, and sideways in curves; not set: no limit"
-    )
-    turn_rate: float = option(0.8, "rad/s, the fastest turn")
-    radius: float = option(0.22, "m, the robot's footprint is a disc")
-    patience: float = option(3.0, "s, wait for somebody in the way before creeping on")
-    scan_rate: float = option(5.0, "Hz, scans per second of each laser")
-    scans: int | None = option(
-        None, "scans to take, the route again and again; not set: the route once"
-    )
-    carried_at: float | None = option(
-        None,
-        "share of the recording at which the robot is switched off, carried to another place of "
-        "its route and put down anyhow; not set: never",
-    )
-    pause_at: float | None = option(
-        None, "s of scanning, after which the robot stands for a while; not set: never"
-    )
-    pause: float = option(28_800.0, "s, for which it then stands and records nothing: overnight")
-    stamp_rounding: float = option(
-        0.0, "s, stamps are rounded to multiples of it; 0: to the nanosecond"
-    )
-    stamps_missing: bool = option(False, "the scans' numbers stand for seconds")
-
-    def __post_init__(self) -> None:
-        require(self.speed > 0 and self.turn_rate > 0, "speed and turn_rate must be positive")
-        require(self.acceleration is None or self.acceleration > 0, "acceleration must be positive")
-        require(self.scan_rate > 0, "scan_rate must be positive")
-        require(self.scans is None or self.scans >= 1, "scans must be at least 1")
-        at = self.carried_at
-        require(at is None or 0 < at < 1, "carried_at must lie between 0 and 1")
-        at = self.pause_at
-        require(at is None or at > 0, "pause_at must be positive")
-        require(self.pause >= 0, "pause must not be negative")
-        require(self.stamp_rounding >= 0, "stamp_rounding must not be negative")
-
-
-@dataclass(frozen=True)
-class OdometryOptions:
-    """Errors of a differential drive's odometry; 0 everywhere gives perfect odometry."""
-
-    wheel_radius_error: float = option(0.0005, "relative, standard deviation per wheel, drawn once")
-    wheel_base_error: float = option(0.01, "relative, standard deviation, drawn once")
-    wheel_base: float = option(0.4, "m, distance between the wheels")
-    translation_noise: float = option(
-        0.01, "m per sqrt(m) driven, standard deviation along the way"
-    )
-    rotation_noise: float = option(
-        0.02, "rad per sqrt(rad) turned, standard deviation of the heading"
-    )
-    drift_noise: float = option(0.008, "rad per sqrt(m) driven, standard deviation of the heading")
-    slip_rate: float = option(0.0, "per metre driven, how often a wheel begins to slip")
-    slip: float = option(
-        0.3, "relative, a slipping wheel turns farther by half to one and a half times this much"
-    )
-    slip_length: float = option(0.5, "m, the way on which it goes on slipping")
-    stall_rate: float = option(
-        0.0, "per minute, how often it begins to miss that the robot moves and turns"
-    )
-    stall_time: float = option(5.0, "s, for which it misses that")
-    resets: int = option(0, "how often it begins again at its origin, at any time")
-
-    def __post_init__(self) -> None:
-        require(self.wheel_base > 0, "wheel_base must be positive")
-        values: tuple[float, ...]
-        values = (self.wheel_radius_error, self.wheel_base_error, self.translation_noise)
-        values += (self.rotation_noise, self.drift_noise, self.slip_rate, self.slip)
-        require(min(values) >= 0, "errors must be >= 0")
-        require(self.slip_length > 0, "slip_length must be positive")
-        require(self.stall_rate >= 0, "stall_rate must not be negative")
-        require(self.stall_time > 0, "stall_time must be positive")
-        require(self.resets >= 0, "resets must not be negative")
-
-
-def require(condition: bool, message: str) -> None:
-    """A ValueError that says what is wrong, unless `condition` holds."""
-    if not condition:
-        raise ValueError(message)
-
-
-_WIDEST = math.radians(150.0)
-
-
-@dataclass(frozen=True)
-class CameraOptions:
-    """Cameras on the robot, all alike; each takes a whole picture at once."""
-
-    enabled: bool = option(False, "there are cameras")
-    count: int = option(1, "how many, spread evenly over the directions; all at once")
-    width: int = option(640, "pixels")
-    height: int = option(480, "pixels")
-    fov: float = option(1.4, "rad, from the left edge of a picture to the right one")
-    rate: float = option(2.0, "Hz, pictures per second of each camera")
-    x: float = option(0.1, "m, ahead of the base centre; ring: the circle on which they sit")
-    y: float = option(0.0, "m, to the left of the base centre; likewise")
-    z: float = option(1.2, "m, above the floor on which the robot stands")
-    yaw: float = option(0.0, "rad, where the first camera looks, to the left of ahead")
-    pitch: float = option(0.05, "rad, nose down")
-    k1: float = option(0.0, "distortion of the lens as OpenCV has it (plumb_bob)")
-    k2: float = option(0.0, "the same")
-    p1: float = option(0.0, "the same")
-    p2: float = option(0.0, "the same")
-    noise: float = option(2.0, "of 255, standard deviation of each value of a pixel")
-    exposure: float = option(
-        0.0, "relative, standard deviation of how bright pictures are; 0: all alike"
-    )
-    antialias: int = option(1, "rays across and down each pixel")
-
-    def __post_init__(self) -> None:
-        require(1 <= self.count <= 16, "count must lie in [1, 16]")
-        require(min(self.width, self.height) >= 2, "width and height must be at least 2")
-        require(max(self.width, self.height) <= 8192, "width and height must be at most 8192")
-        require(0 < self.fov <= _WIDEST, "fov must lie above 0, and be 150 degrees at most")
-        require(self.rate > 0, "rate must be positive")
-        require(self.z > 0, "z must be positive")
-        require(abs(self.pitch) < math.pi / 2, "pitch must lie within 90 degrees")
-        require(self.noise >= 0 and self.exposure >= 0, "deviations must not be negative")
-        require(1 <= self.antialias <= 4, "antialias must lie in [1, 4]")
-        # beyond, a lens bends rays back: several would meet one pixel
-        require(max(abs(self.k1), abs(self.k2)) <= 0.4, "k1 and k2 must lie in [-0.4, 0.4]")
-        require(max(abs(self.p1), abs(self.p2)) <= 0.05, "p1 and p2 must lie in [-0.05, 0.05]")
-
-    @property
-    def distortion(self) -> tuple[float, ...]:
-        """The parameters of the lens, none where it is ideal."""
-        values = (self.k1, self.k2, self.p1, self.p2)
-        return (*values, 0.0) if any(values) else ()
-
-
-# rad, elevations of the lowest and the highest channel of usual sensors, by their channels
-_FIELDS = {
+# degrees, elevations of the lowest and highest channel of common sensors, by number of channels
+_ELEVATIONS = {
     16: (-15.0, 15.0),
     32: (-30.67, 10.67),
     64: (-24.8, 2.0),
     128: (-25.0, 15.0),
 }
 
-_STEEPEST = math.radians(85.0)
+
+def require(condition: bool, message: str) -> None:
+    """Raise ValueError(message) unless the condition holds."""
+    if not condition:
+        raise ValueError(message)
 
 
 @dataclass(frozen=True)
-class LidarOptions:
-    """A spinning lidar and where it sits on the robot; it takes the place of the planar laser."""
+class CrowdOptions(Section, section="crowd"):
+    """The people."""
 
-    channels: int = option(0, "beams above one another; 0: there is no lidar")
-    columns: int = option(1875, "azimuths per turn, at each of which all channels look")
-    rate: float = option(10.0, "Hz, turns per second")
-    low: float | None = option(
-        None, "rad, elevation of the lowest channel; not set: as sensors of so many channels have"
-    )
-    high: float | None = option(None, "rad, elevation of the highest channel; likewise")
-    max_range: float = option(100.0, "m, what lies farther off gives no return")
-    range_noise: float = option(0.02, "m, standard deviation of a range")
-    no_return_share: float = option(0.002, "share of beams that get lost anywhere")
-    glass_no_return_share: float = option(0.3, "share of beams that get lost on glass")
+    people: int = option(15, "Number of people.", ge=0)
     # spelled out: ruff takes the default for mutable under an alias
-    no_returns: Literal["kept", "left out"] = option(
-        "kept", "beams without return: kept, at the maximum range, or left out as drivers do"
+    shape: Literal["legs", "bodies", "mixed"] = option(
+        "mixed", "Cross section of people at the height of the laser: legs, bodies, or half each."
     )
-    sweep: bool = option(
-        True, "a turn takes its time, and everything moves meanwhile; false: all beams at once"
-    )
-    x: float = option(0.0, "m, sensor ahead of the base centre")
-    y: float = option(0.0, "m, sensor to the left of the base centre")
-    z: float = option(1.8, "m, sensor above the floor on which the robot stands")
-    yaw: float = option(0.0, "rad, sensor against the base")
-    pitch: float = option(0.0, "rad, the same, nose down")
-    vibration_roll: float = option(0.0, "rad, standard deviation of the robot's roll")
-    vibration_pitch: float = option(0.0, "rad, the same of its pitch")
-    vibration_z: float = option(0.0, "m, the same of its height")
-    sees_robot: bool = option(False, "some beams meet the robot's own roof")
-    roof_length: float | None = option(None, "m, of that roof; not set: twice the robot's radius")
-    roof_width: float | None = option(None, "m; not set: 0.8 of that")
-    roof_below: float = option(0.35, "m, from the sensor down to it")
+    min_speed: float = option(0.4, "Minimum walking speed, m/s.", gt=0)
+    max_speed: float = option(1.6, "Maximum walking speed, m/s.", gt=0)
+    stopping_share: float = option(0.33, "Share of people who stop at times.", ge=0, le=1)
+    min_stop: float = option(2.0, "Minimum duration of a stop, s.", ge=0)
+    max_stop: float = option(20.0, "Maximum duration of a stop, s.", ge=0)
 
-    def __post_init__(self) -> None:
-        require(self.channels >= 0, "channels must not be negative")
-        require(self.columns >= 4, "columns must be at least 4")
-        require(self.rate > 0, "rate must be positive")
+    def check(self) -> None:
+        """Refuses empty ranges."""
+        require(self.min_speed <= self.max_speed, "speeds must satisfy min_speed <= max_speed")
+        require(self.min_stop <= self.max_stop, "stops must satisfy min_stop <= max_stop")
+
+
+@dataclass(frozen=True)
+class DoorOptions(Section, section="doors"):
+    """Durations of the states of doors, log-uniformly distributed."""
+
+    min_open: float = option(4.0, "Minimum time a door stays open, s.", gt=0)
+    max_open: float = option(60.0, "Maximum time a door stays open, s.", gt=0)
+    min_closed: float = option(5.0, "Minimum time a door stays closed, s.", gt=0)
+    max_closed: float = option(120.0, "Maximum time a door stays closed, s.", gt=0)
+    swing: float = option(1.5, "Time from closed to open, s.", gt=0)
+
+    def check(self) -> None:
+        """Refuses empty ranges."""
+        for low, high in ((self.min_open, self.max_open), (self.min_closed, self.max_closed)):
+            require(low <= high, "times of doors must satisfy min <= max")
+
+
+@dataclass(frozen=True)
+class TrafficOptions(Section, section="traffic"):
+    """The vehicles on the lanes of a scene, besides queues."""
+
+    vehicles: int = option(10, "Number of vehicles, spread over the lanes.", ge=0)
+    min_speed: float = option(7.0, "Minimum desired speed, m/s.", gt=0)
+    max_speed: float = option(12.0, "Maximum desired speed, m/s.", gt=0)
+    stopping_share: float = option(0.2, "Share of vehicles that stop at times.", ge=0, le=1)
+    max_stop: float = option(12.0, "Maximum duration of a stop, s.", ge=3)
+
+    def check(self) -> None:
+        """Refuses empty ranges."""
+        require(self.min_speed <= self.max_speed, "speeds must satisfy min_speed <= max_speed")
+
+
+@dataclass(frozen=True)
+class LaserOptions(Section, section="laser"):
+    """The planar laser scanner and its pose on the robot."""
+
+    beams: int = option(180, "Beams per scan.", ge=2)
+    fov: float = option(math.pi, "Field of view about the sensor's x axis, rad.", gt=0, le=_TURN)
+    max_range: float = option(30.0, "Maximum range, m; beyond there is no return.", gt=0)
+    range_noise: float = option(0.02, "Standard deviation of ranges, m.", ge=0)
+    no_return_share: float = option(0.002, "Share of beams lost anywhere.", ge=0, le=1)
+    glass_no_return_share: float = option(0.3, "Share of beams lost on glass.", ge=0, le=1)
+    sweep_time: float = option(0.0, "Duration of a scan, s; 0: all beams at once.", ge=0)
+    x: float = option(0.08, "Sensor ahead of the base, m.")
+    y: float = option(0.0, "Sensor to the left of the base, m.")
+    yaw: float = option(0.0, "Yaw of the sensor on the base, rad.")
+    # spelled out: see CrowdOptions.shape
+    upside_down: Literal["no", "known", "unknown"] = option(
+        "no", "Mounted upside down: no; known to the recorder; or unknown, which mirrors its scans."
+    )
+    second_laser: bool = option(
+        False, "Add a laser that looks backwards from the opposite side of the base."
+    )
+
+    @property
+    def count(self) -> int:
+        """Number of lasers; they scan alternately."""
+        return 2 if self.second_laser else 1
+
+
+@dataclass(frozen=True)
+class RobotOptions(Section, section="robot"):
+    """Motion of the robot, scan rate, and mishaps."""
+
+    speed: float = option(0.5, "Speed on a free way, m/s.", gt=0)
+    acceleration: float | None = option(
+        None,
+        "Maximum acceleration, longitudinal and lateral, m/s^2; unset: unlimited.",
+        gt=0,
+    )
+    turn_rate: float = option(0.8, "Maximum turn rate, rad/s.", gt=0)
+    radius: float = option(0.22, "Radius of the circular footprint, m.")
+    scan_rate: float = option(5.0, "Scans per second of each laser, Hz.", gt=0)
+    scans: int | None = option(
+        None, "Number of scans, repeating the route; unset: the route once.", ge=1
+    )
+    carried_at: float | None = option(
+        None,
+        "Share of the recording at which the robot is switched off, carried to another place of "
+        "its route and set down with any heading; unset: never.",
+        gt=0,
+        lt=1,
+    )
+    pause_at: float | None = option(
+        None, "Recording time at which the robot stops for a pause, s; unset: never.", gt=0
+    )
+    pause: float = option(28_800.0, "Duration of the pause without recording, s.", ge=0)
+    stamp_rounding: float = option(
+        0.0, "Stamps are rounded to multiples of this, s; 0: to nanoseconds.", ge=0
+    )
+
+
+@dataclass(frozen=True)
+class OdometryOptions(Section, section="odometry"):
+    """Errors of differential-drive odometry; all 0: perfect odometry."""
+
+    wheel_radius_error: float = option(
+        0.0005, "Standard deviation of the relative error of each wheel radius.", ge=0
+    )
+    wheel_base_error: float = option(
+        0.01, "Standard deviation of the relative error of the wheel base.", ge=0
+    )
+    wheel_base: float = option(0.4, "Distance between the wheels, m.", gt=0)
+    translation_noise: float = option(
+        0.01, "Standard deviation of the distance, m per sqrt(m) driven.", ge=0
+    )
+    rotation_noise: float = option(
+        0.02, "Standard deviation of the heading, rad per sqrt(rad) turned.", ge=0
+    )
+    drift_noise: float = option(
+        0.008, "Standard deviation of the heading, rad per sqrt(m) driven.", ge=0
+    )
+    slip_rate: float = option(0.0, "Wheel slips per metre driven.", ge=0)
+    slip: float = option(
+        0.3, "Relative excess rotation of a slipping wheel, times 0.5 to 1.5.", ge=0
+    )
+    slip_length: float = option(0.5, "Distance over which a wheel slips, m.", gt=0)
+    stall_rate: float = option(0.0, "Odometry stalls per minute: motion is missed.", ge=0)
+    stall_time: float = option(5.0, "Duration of a stall, s.", gt=0)
+    resets: int = option(0, "Number of resets to the origin, at random times.", ge=0)
+
+
+@dataclass(frozen=True)
+class CameraOptions(Section, section="camera"):
+    """Identical cameras on the robot with a global shutter."""
+
+    enabled: bool = option(False, "Add cameras.")
+    count: int = option(1, "Number of cameras, evenly spread in yaw.", ge=1, le=16)
+    width: int = option(640, "Image width, pixels.", ge=2, le=8192)
+    height: int = option(480, "Image height, pixels.", ge=2, le=8192)
+    fov: float = option(1.4, "Horizontal field of view, rad.", gt=0, le=_MAX_CAMERA_FOV)
+    rate: float = option(2.0, "Images per second of each camera, Hz.", gt=0)
+    x: float = option(0.1, "First camera ahead of the base, m; the others are rotated about it.")
+    y: float = option(0.0, "First camera to the left of the base, m.")
+    z: float = option(1.2, "Height above the floor, m.", gt=0)
+    yaw: float = option(0.0, "Yaw of the first camera, rad.")
+    pitch: float = option(0.05, "Pitch, nose down, rad.", gt=-math.pi / 2, lt=math.pi / 2)
+    # beyond these limits a lens bends rays back: several would meet one pixel
+    k1: float = option(0.0, "Distortion coefficient (plumb_bob).", ge=-0.4, le=0.4)
+    k2: float = option(0.0, "Distortion coefficient.", ge=-0.4, le=0.4)
+    p1: float = option(0.0, "Distortion coefficient.", ge=-0.05, le=0.05)
+    p2: float = option(0.0, "Distortion coefficient.", ge=-0.05, le=0.05)
+    noise: float = option(2.0, "Standard deviation of pixel values, of 255.", ge=0)
+    exposure: float = option(0.0, "Standard deviation of the relative exposure of images.", ge=0)
+    antialias: int = option(1, "Rays per pixel in each direction.", ge=1, le=4)
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """Distortion coefficients; empty for an ideal lens."""
+        values = (self.k1, self.k2, self.p1, self.p2)
+        return (*values, 0.0) if any(values) else ()
+
+
+@dataclass(frozen=True)
+class LidarOptions(Section, section="lidar"):
+    """A spinning lidar, which replaces the planar laser, and its pose on the robot."""
+
+    channels: int = option(0, "Number of channels; 0: no lidar.", ge=0)
+    columns: int = option(1875, "Azimuths per turn.", ge=4)
+    rate: float = option(10.0, "Turns per second, Hz.", gt=0)
+    low: float | None = option(
+        None,
+        "Elevation of the lowest channel, rad; unset: as of common sensors.",
+        ge=-_MAX_ELEVATION,
+        le=_MAX_ELEVATION,
+    )
+    high: float | None = option(
+        None,
+        "Elevation of the highest channel, rad; unset: as of common sensors.",
+        ge=-_MAX_ELEVATION,
+        le=_MAX_ELEVATION,
+    )
+    max_range: float = option(100.0, "Maximum range, m; beyond there is no return.", gt=0)
+    range_noise: float = option(0.02, "Standard deviation of ranges, m.", ge=0)
+    no_return_share: float = option(0.002, "Share of beams lost anywhere.", ge=0, le=1)
+    glass_no_return_share: float = option(0.3, "Share of beams lost on glass.", ge=0, le=1)
+    # spelled out: see CrowdOptions.shape
+    no_returns: Literal["kept", "left out"] = option(
+        "kept", "Beams without return: kept at the maximum range, or left out as drivers do."
+    )
+    sweep: bool = option(True, "Beams of a turn are taken one after the other, else at once.")
+    x: float = option(0.0, "Sensor ahead of the base, m.")
+    y: float = option(0.0, "Sensor to the left of the base, m.")
+    z: float = option(1.8, "Sensor above the floor, m.", gt=0)
+    yaw: float = option(0.0, "Yaw of the sensor on the base, rad.")
+    pitch: float = option(0.0, "Pitch of the sensor on the base, nose down, rad.")
+    vibration_roll: float = option(0.0, "Standard deviation of the robot's roll, rad.", ge=0)
+    vibration_pitch: float = option(0.0, "Standard deviation of the robot's pitch, rad.", ge=0)
+    vibration_z: float = option(0.0, "Standard deviation of the robot's height, m.", ge=0)
+    sees_robot: bool = option(False, "Some beams hit the roof of the robot itself.")
+    roof_length: float | None = option(
+        None, "Length of that roof, m; unset: twice the robot's radius.", gt=0
+    )
+    roof_width: float | None = option(None, "Width of the roof, m; unset: 0.8 of that.", gt=0)
+    roof_below: float = option(0.35, "Height of the sensor above the roof, m.", gt=0)
+
+    def check(self) -> None:
+        """Refuses an empty field of view."""
         low, high = self.field
-        require(
-            -_STEEPEST <= low <= high <= _STEEPEST, "low and high: within 85 degrees, low first"
-        )
-        require(self.max_range > 0, "max_range must be positive")
-        require(self.z > 0, "z must be positive")
-        sizes = (self.roof_length, self.roof_width, self.roof_below)
-        require(all(v is None or v > 0 for v in sizes), "roof_... must be positive")
-        deviations = (self.range_noise, self.vibration_roll, self.vibration_pitch)
-        require(min(*deviations, self.vibration_z) >= 0, "deviations must not be negative")
-        for share in (self.no_return_share, self.glass_no_return_share):
-            require(0 <= share <= 1, "shares of lost beams must lie in [0, 1]")
+        require(low <= high, "elevations must satisfy low <= high")
 
     @property
     def field(self) -> tuple[float, float]:
-        """rad, elevations of the lowest and the highest channel."""
-        low, high = map(math.radians, _FIELDS.get(self.channels, (-25.0, 15.0)))
+        """rad, elevations of the lowest and highest channel."""
+        low, high = map(math.radians, _ELEVATIONS.get(self.channels, (-25.0, 15.0)))
         return (low if self.low is None else self.low, high if self.high is None else self.high)
 
 
 @dataclass(frozen=True)
-class RigOptions:
-    """Two lasers like `laser`: one lies flat, the other tilts about an axis from left to right."""
+class RigOptions(Section, section="rig"):
+    """Two lasers like `laser`: one horizontal, one tilting about the robot's y axis."""
 
-    tilts: bool = option(False, "there are two lasers, of which one tilts")
-    low_z: float = option(0.35, "m, the laser that lies flat, above the floor")
-    pivot_x: float = option(0.1, "m, the axis ahead of the base centre")
-    pivot_z: float = option(0.9, "m, the same above the floor")
-    middle: float = option(0.1, "rad, nose down, about which the laser tilts")
-    amplitude: float = option(0.7, "rad, how far it tilts to either side of that")
-    period: float = option(4.0, "s, for once up and down, at an even rate")
+    tilts: bool = option(False, "There are two lasers, one of which tilts.")
+    low_z: float = option(0.35, "Horizontal laser above the floor, m.", gt=0)
+    pivot_x: float = option(0.1, "Tilt axis ahead of the base, m.")
+    pivot_z: float = option(0.9, "Tilt axis above the floor, m.", gt=0)
+    middle: float = option(0.1, "Mean tilt, nose down, rad.")
+    amplitude: float = option(0.7, "Tilt to either side of the mean, rad.", ge=0)
+    period: float = option(4.0, "Period of the tilting at constant rate, s.", gt=0)
 
-    def __post_init__(self) -> None:
-        require(self.low_z > 0 and self.pivot_z > 0, "heights must be positive")
-        require(self.amplitude >= 0 and self.period > 0, "amplitude >= 0 and period > 0")
-        reach = abs(self.middle) + self.amplitude
-        require(reach <= _STEEPEST, "the laser must not tilt by more than 85 degrees")
-
-
-@dataclass(frozen=True)
-class GroundOptions:
-    """The ground: a plane or a paraboloid, with pavements above it."""
-
-    slope_x: float = option(0.0, "m per m, how much it rises to the east, at the origin")
-    slope_y: float = option(0.0, "m per m, the same to the north")
-    bend_x: float = option(0.0, "per m, what that slope grows by per metre to the east")
-    bend_y: float = option(0.0, "per m, the same to the north")
-    kerb: float = option(0.12, "m, pavements above the street")
-
-    def __post_init__(self) -> None:
-        steep = max(abs(self.slope_x), abs(self.slope_y))
-        require(steep <= 0.3, "slopes must lie in [-0.3, 0.3]")
-        require(max(abs(self.bend_x), abs(self.bend_y)) <= 0.01, "bends must lie in [-0.01, 0.01]")
-        require(0 <= self.kerb <= 0.5, "kerb must lie in [0, 0.5]")
+    def check(self) -> None:
+        """Refuses too large angles."""
+        angle = abs(self.middle) + self.amplitude
+        require(angle <= _MAX_ELEVATION, "the laser must not tilt by more than 85 degrees")
 
 
 @dataclass(frozen=True)
-class HeightOptions:
-    """How high things stand."""
+class GroundOptions(Section, section="ground"):
+    """The ground: a plane or paraboloid, with pavements above it."""
 
-    ceiling: float | None = option(2.8, "m; not set: the open sky")
-    walls: float = option(9.0, "m, of walls under the open sky; else up to the ceiling")
-    doors: float = option(2.05, "m, above it there is a lintel")
-    furniture: float = option(1.0, "m, of whatever stands about")
-    panels: float = option(2.0, "m, of furniture less than 0.2 m thick")
+    slope_x: float = option(0.0, "Slope to the east at the origin, m/m.", ge=-0.3, le=0.3)
+    slope_y: float = option(0.0, "Slope to the north at the origin, m/m.", ge=-0.3, le=0.3)
+    bend_x: float = option(0.0, "Change of the slope to the east, 1/m.", ge=-0.01, le=0.01)
+    bend_y: float = option(0.0, "Change of the slope to the north, 1/m.", ge=-0.01, le=0.01)
+    kerb: float = option(0.12, "Height of pavements above the street, m.", ge=0, le=0.5)
 
-    def __post_init__(self) -> None:
-        heights = (self.walls, self.doors, self.furniture, self.panels)
-        require(min(heights) > 0, "heights must be positive")
-        require(self.ceiling is None or self.ceiling > 0, "ceiling must be positive")
+
+@dataclass(frozen=True)
+class HeightOptions(Section, section="heights"):
+    """Heights of ceiling, walls, doors and furniture."""
+
+    ceiling: float | None = option(2.8, "Height of the ceiling, m; unset: open sky.", gt=0)
+    walls: float = option(9.0, "Height of walls under the open sky, m.", gt=0)
+    doors: float = option(2.05, "Height of doors, m; above there is a lintel.", gt=0)
+    furniture: float = option(1.0, "Height of furniture, m.", gt=0)
 
     @property
     def top(self) -> float:
-        """m, of walls."""
+        """m, height of walls."""
         return self.walls if self.ceiling is None else self.ceiling

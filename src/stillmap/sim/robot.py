@@ -11,6 +11,7 @@ from stillmap.sim.vehicles import Pace
 Float = NDArray[np.float64]
 
 _SPACING = 0.05  # m between points of the route
+_PATIENCE = 3.0  # s that it waits for somebody in its way before it creeps on
 _CARROT = 0.35  # m ahead of the robot, the point of the route that it steers for
 _CARROT_TIME = 0.5  # s, the same for a fast one
 _SEES_AHEAD = 1.5  # m
@@ -145,7 +146,7 @@ class Robot:
             self._waited += dt
         else:
             self._waited = max(0.0, self._waited - dt)
-        self.impatient = self._waited > self._options.patience
+        self.impatient = self._waited > _PATIENCE
         return min(speed, max(allowed, _CREEP if self.impatient else 0.0))
 
     def _is_free(self, xy: Float, people: Float, contact: float) -> bool:

@@ -27,6 +27,10 @@ _ASIDE = 0.6  # m, how near the robot comes to the side of a vehicle that need n
 
 _RELEASE = 4.0  # m from the point where the robot lets a queue go
 
+_MIN_STOP = 3.0  # s
+
+_VAN_SHARE = 0.25  # of the cars
+
 _WAY_TO_STOP = (20.0, 120.0)  # m between two stops of those who stop
 
 
@@ -48,7 +52,7 @@ class Traffic:
         self._lane = np.array(_spread(lanes, options.vehicles), np.int64)
         V = len(self._lane)
         self.kinds = [lanes[k].kind for k in self._lane.tolist()]
-        self.size = _sizes(self.kinds, options.van_share, rng)
+        self.size = _sizes(self.kinds, rng)
         self._wanted = rng.uniform(options.min_speed, options.max_speed, V)
         self._stops = rng.random(V) < options.stopping_share
         self._way_left = rng.uniform(*_WAY_TO_STOP, V)
@@ -146,9 +150,7 @@ class Traffic:
     def _stop_now_and_then(self, way: Float) -> None:
         self._way_left -= way
         due = np.flatnonzero(self._stops & (self._way_left < 0))
-        self._stop_left[due] = self._rng.uniform(
-            self._options.min_stop, self._options.max_stop, len(due)
-        )
+        self._stop_left[due] = self._rng.uniform(_MIN_STOP, self._options.max_stop, len(due))
         self._way_left[due] = self._rng.uniform(*_WAY_TO_STOP, len(due))
 
 
@@ -189,9 +191,9 @@ def _spread(lanes: tuple[Lane, ...], vehicles: int) -> list[int]:
     return [k for k, n in enumerate(count) for _ in range(n)]
 
 
-def _sizes(kinds: list[str], van_share: float, rng: np.random.Generator) -> Float:
+def _sizes(kinds: list[str], rng: np.random.Generator) -> Float:
     """(V, 2) length and width in metres."""
-    vans = rng.random(len(kinds)) < van_share
+    vans = rng.random(len(kinds)) < _VAN_SHARE
     spread = 1.0 + rng.uniform(-0.06, 0.06, (len(kinds), 2))
     usual = [
         (2.4, 1.2) if kind == "forklift" else (5.6, 2.0) if van else (4.4, 1.8)

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.core.errors import InputError, closest_match
 from stillmap.sim.scene import Scene
 from stillmap.sim.worlds.changed import office_moved, street_moved, warehouse_moved
@@ -95,4 +95,4 @@ def scene_by_name(name: str, changes: Mapping[str, Any] | None = None) -> Scene:
     robot = (changes or {}).get("robot")
     scans = robot.get("scans") if isinstance(robot, Mapping) else None
     scene = _grown(name, scans) if type(scans) is int else None
-    return replaced(scene or SCENES[name](), changes or {})
+    return override(scene or SCENES[name](), changes or {})
