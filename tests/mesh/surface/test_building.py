@@ -5,13 +5,26 @@ import pytest
 from scipy.spatial import cKDTree
 
 from stillmap.mesh.marching_cubes import remove_small_components
-from stillmap.mesh.options import SurfaceOptions
+from stillmap.mesh import triangulation, tsdf
+from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.range_image import Patch, find_scan_layout, triangulate_scans
 from stillmap.mesh.resolution import choose_resolution, patch_extents
 from stillmap.mesh.triangle_mesh import Mesh
-from stillmap.mesh.tsdf import build_surface, integrate_patches, select_scans, static_weights
+from stillmap.mesh.tsdf import (
+    TsdfParameters,
+    build_surface,
+    integrate_patches,
+    select_scans,
+    static_weights,
+)
 
-OPTIONS = SurfaceOptions(voxel=0.1, longest_share=1.0)
+OPTIONS = MeshOptions(voxel_size=0.1)
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    """The beams of these tests lie far apart."""
+    monkeypatch.setattr(triangulation, "_MAX_EDGE_SHARE", 1.0)
 
 
 def static(recording):
@@ -101,10 +114,12 @@ def test_no_wall_behind_the_wall(room, walked):
 
 
 def test_tiles_join_without_a_crack(walked, monkeypatch):
-    thick = SurfaceOptions(voxel=0.1, longest_share=1.0, error=0.0, island=0.0)
-    whole = build_surface(walked[0], walked[1], static(walked[0]), thick)
-    monkeypatch.setattr("stillmap.mesh.marching_cubes.TILE", 16)
-    tiled = build_surface(walked[0], walked[1], static(walked[0]), thick)
+    with monkeypatch.context() as raw:
+        raw.setattr(tsdf, "simplification_error", lambda voxel: 0.0)
+        raw.setattr(tsdf, "remove_small_components", lambda mesh, area: mesh)
+        whole = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
+        monkeypatch.setattr("stillmap.mesh.marching_cubes.TILE", 16)
+        tiled = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
     assert len(whole) == len(tiled)
     assert len(borders(whole)) == len(borders(tiled))
     assert len(whole.vertices) == len(tiled.vertices)
@@ -119,7 +134,7 @@ def test_tiles_join_without_a_crack(walked, monkeypatch):
 
 
 def test_the_budget_is_kept(walked, room):
-    few = SurfaceOptions(voxel=0.1, longest_share=1.0, faces=400)
+    few = MeshOptions(voxel_size=0.1, max_faces=400)
     mesh = build_surface(walked[0], walked[1], static(walked[0]), few)
     assert 50 < len(mesh) <= 400
     assert room.off_walls(samples(mesh)[0]).mean() < 0.05
@@ -148,16 +163,16 @@ def test_an_object_is_built_in_its_own_frame(room):
     for k, x in enumerate((0.0, 0.5, 1.0)):
         box = np.array([[1.5, x - 1.0, -0.5], [2.2, x, 0.5]])
         recording = room.scans(room.picture(160, 120, 120.0), T[:1], box=box, noise=0.005, seed=k)
-        order = find_scan_layout(recording, np.arange(1), OPTIONS)
-        (patch,) = (make() for make in triangulate_scans(recording, T[:1], order, OPTIONS))
+        order = find_scan_layout(recording, np.arange(1))
+        (patch,) = (make() for make in triangulate_scans(recording, T[:1], order))
         moved = np.array([1.85, x - 0.5, 0.0])
         own = Patch(
             patch.points - moved, patch.faces, patch.beam, patch.origin - moved, patch.standoff
         )
         on_it = np.zeros(recording.n_beams, np.float32)
         on_it[patch.beam] = (np.abs(own.points) < [0.4, 0.6, 0.6]).all(axis=1)
-        parts.append((own, static_weights(own, on_it, 0.5)))
-    mesh = integrate_patches(parts, 0.04, OPTIONS)
+        parts.append((own, static_weights(own, on_it)))
+    mesh = integrate_patches(parts, 0.04, TsdfParameters())
     front = np.abs(mesh.vertices[:, 0] + 0.35) < 0.02
     assert front.mean() > 0.5
     assert mesh.areas().sum() == pytest.approx(1.0, abs=0.35)
@@ -165,16 +180,17 @@ def test_an_object_is_built_in_its_own_frame(room):
     assert (np.abs(size[1:] - 1.0) < 0.12).all()
 
 
-def test_scans_that_tell_nothing_new_are_left_out():
+def test_scans_from_known_viewpoints_are_left_out(monkeypatch):
     T = np.tile(np.eye(4), (30, 1, 1))
     T[20:, 0, 3] = np.arange(10)
     sensor = np.zeros(30, np.int32)
-    o = SurfaceOptions(apart=0.1, turned=0.2, looks=2)
-    assert select_scans(T, sensor, 5.0, o).tolist() == [0, 1, *range(21, 30)]
+    monkeypatch.setattr(tsdf, "_MIN_TRAVEL_SHARE", 0.1)
+    monkeypatch.setattr(tsdf, "_MIN_TURN", 0.2)
+    assert select_scans(T, sensor, 5.0).tolist() == [0, 1, *range(21, 30)]
     T[5, :2, :2] = [[0, -1], [1, 0]]
-    assert 5 in select_scans(T, sensor, 5.0, o)
+    assert 5 in select_scans(T, sensor, 5.0)
     sensor[6:8] = 1
-    assert set(select_scans(T, sensor, 5.0, o)) >= {6, 7}
+    assert set(select_scans(T, sensor, 5.0)) >= {6, 7}
 
 
 def test_islands_are_dropped():
@@ -186,19 +202,9 @@ def test_islands_are_dropped():
     assert len(remove_small_components(mesh, 0.001)) == 2
 
 
-@pytest.mark.parametrize("bad", [{"voxel": 0.0}, {"least": 1.5}, {"looks": 0}, {"faces": 1}])
-def test_options_are_checked(bad):
-    with pytest.raises(ValueError, match=next(iter(bad))):
-        SurfaceOptions(**bad)
-
-
-FREE = SurfaceOptions(longest_share=1.0)
-
-
-def resolved(recording, poses, order, options):
-    return choose_resolution(
-        recording, poses, order, patch_extents(recording, poses, order), options
-    )
+def resolved(recording, poses, order, voxel_size=None):
+    extents = patch_extents(recording, poses, order)
+    return choose_resolution(recording, poses, order, extents, voxel_size)
 
 
 @pytest.mark.parametrize(
@@ -207,27 +213,27 @@ def resolved(recording, poses, order, options):
 )
 def test_voxels_are_as_fine_as_beams_tell(room, made, noise, low, high):
     recording = room.scans(room.lidar(*made), room.standing(2), noise=noise)
-    order = find_scan_layout(recording, np.arange(2), FREE)
-    voxel, _ = resolved(recording, room.standing(2), order, FREE)
+    order = find_scan_layout(recording, np.arange(2))
+    voxel, _ = resolved(recording, room.standing(2), order)
     assert low < voxel < high
 
 
 def test_voxels_fit_into_memory(room, monkeypatch):
     recording = room.scans(room.lidar(720, 80), room.standing(2))
-    order = find_scan_layout(recording, np.arange(2), FREE)
-    fine, _ = resolved(recording, room.standing(2), order, FREE)
-    monkeypatch.setattr("stillmap.mesh.resolution._MEMORY", 1e5)
-    assert resolved(recording, room.standing(2), order, FREE)[0] > 2 * fine
+    order = find_scan_layout(recording, np.arange(2))
+    fine, _ = resolved(recording, room.standing(2), order)
+    monkeypatch.setattr("stillmap.mesh.resolution._MAX_BYTES", 1e5)
+    assert resolved(recording, room.standing(2), order)[0] > 2 * fine
 
 
 def test_pictures_finer_than_voxels_are_thinned(room):
     recording = room.scans(room.picture(320, 240, 240.0), room.standing())
-    order = find_scan_layout(recording, np.arange(1), OPTIONS)
-    voxel, stride = resolved(recording, room.standing(), order, OPTIONS)
+    order = find_scan_layout(recording, np.arange(1))
+    voxel, stride = resolved(recording, room.standing(), order, 0.1)
     assert voxel == 0.1
     assert 3 <= stride <= 4
     thin = order._replace(stride=stride)
-    (patch,) = (make() for make in triangulate_scans(recording, room.standing(), thin, OPTIONS))
+    (patch,) = (make() for make in triangulate_scans(recording, room.standing(), thin))
     assert 0.8 < len(patch.points) / (320 * 240 / stride**2) < 1.05
     mesh = build_surface(recording, room.standing(), static(recording), OPTIONS)
     assert room.off_walls(samples(mesh)[0]).mean() < 0.005

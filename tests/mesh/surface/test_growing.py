@@ -5,19 +5,18 @@ import pytest
 
 from stillmap import _core
 from stillmap.mesh import tsdf
-from stillmap.mesh.options import SurfaceOptions
 from stillmap.mesh.range_image import Patch, find_scan_layout
 from stillmap.mesh.resolution import PatchExtents, patch_extents
-from stillmap.mesh.tsdf import StreamingSurface, integrate_patches
+from stillmap.mesh.tsdf import StreamingSurface, TsdfParameters, integrate_patches
 
-RAW = SurfaceOptions(error=0.0, island=0.0)
+RAW = TsdfParameters(error=0.0, min_component_area=0.0)
 VOXEL, SIZE = 0.1, 1.6  # m, with tiles of 16 voxels
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     monkeypatch.setattr("stillmap.mesh.marching_cubes.TILE", 16)
-    monkeypatch.setattr(tsdf, "_MORE", 0.0)
+    monkeypatch.setattr(tsdf, "_EXTRACT_BYTES", 0.0)
 
 
 def along_a_wall(n=12, noise=0.01):
@@ -44,38 +43,38 @@ def as_set(mesh):
 
 
 def test_the_surface_is_that_of_all_at_once():
-    patches, reach = along_a_wall()
+    patches, extents = along_a_wall()
     whole, grown = (
         integrate_patches(patches, VOXEL, RAW),
-        integrate_patches(patches, VOXEL, RAW, reach=reach),
+        integrate_patches(patches, VOXEL, RAW, extents=extents),
     )
     assert len(whole) == len(grown) > 5_000
     assert as_set(whole) == as_set(grown)
 
 
 def test_voxels_behind_are_gone():
-    patches, reach = along_a_wall(24)
+    patches, extents = along_a_wall(24)
     held = {"all": [], "near": []}
     for name, most in held.items():
         one = StreamingSurface(
             _core.TsdfVolume(VOXEL, truncation_front=0.3, truncation_back=0.2), RAW
         )
         for done, (patch, weight) in enumerate(patches, start=1):
-            one.distances.add(
+            one.volume.integrate(
                 patch.points, patch.origin, patch.standoff, patch.faces, weight, threads=1
             )
             if name == "near":
-                one.let_go(reach, done)
-            most.append(one.distances.memory_bytes)
+                one.extract_complete(extents, done)
+            most.append(one.volume.memory_bytes)
     assert max(held["near"]) < 0.45 * max(held["all"])
     # once under way it holds as much as before
     assert max(held["near"][16:]) <= 1.1 * max(held["near"][8:16])
 
 
 def test_thinned_out_it_has_no_crack(monkeypatch):
-    monkeypatch.setattr(tsdf, "_BATCH", 500)
-    patches, reach = along_a_wall()
-    mesh = integrate_patches(patches, VOXEL, SurfaceOptions(error=0.02, island=0.0), reach=reach)
+    monkeypatch.setattr(tsdf, "_MERGE_FACES", 500)
+    patches, extents = along_a_wall()
+    mesh = integrate_patches(patches, VOXEL, TsdfParameters(error=0.02, min_component_area=0.0), extents=extents)
     assert 20 < len(mesh) < 0.3 * len(integrate_patches(patches, VOXEL, RAW))
     edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     found, count = np.unique(edges, axis=0, return_counts=True)
@@ -86,7 +85,7 @@ def test_thinned_out_it_has_no_crack(monkeypatch):
 
 
 def test_the_budget_is_kept_on_the_way(monkeypatch):
-    monkeypatch.setattr(tsdf, "_BATCH", 500)
+    monkeypatch.setattr(tsdf, "_MERGE_FACES", 500)
     most = []
     merge = StreamingSurface._merge
 
@@ -95,8 +94,8 @@ def test_the_budget_is_kept_on_the_way(monkeypatch):
         most.append(len(self._mesh))
 
     monkeypatch.setattr(StreamingSurface, "_merge", watched)
-    patches, reach = along_a_wall(40, noise=0.02)
-    mesh = integrate_patches(patches, VOXEL, SurfaceOptions(faces=600), reach=reach)
+    patches, extents = along_a_wall(40, noise=0.02)
+    mesh = integrate_patches(patches, VOXEL, TsdfParameters(max_faces=600), extents=extents)
     assert 100 < len(mesh) <= 600
     # but for borders, which may go on
     assert max(most) < 0.15 * len(integrate_patches(patches, VOXEL, RAW))
@@ -106,19 +105,19 @@ def test_the_budget_is_kept_on_the_way(monkeypatch):
 def test_reach_is_as_far_as_hits_are(room):
     poses = room.standing(1, [0, 0, 0], [0.6, 0.3, 0.0])
     recording = room.scans(room.lidar(90, 10), poses)
-    order = find_scan_layout(recording, np.arange(2), RAW)
-    reach = patch_extents(recording, poses, order)
+    order = find_scan_layout(recording, np.arange(2))
+    extents = patch_extents(recording, poses, order)
     ends = [recording.end_points(np.arange(900) + 900 * t, poses) for t in range(2)]
     for t in range(2):
-        away = np.linalg.norm(ends[t] - reach.position[t], axis=1)
-        assert reach.range[t] == pytest.approx(away.max(), rel=1e-5)
+        away = np.linalg.norm(ends[t] - extents.position[t], axis=1)
+        assert extents.range[t] == pytest.approx(away.max(), rel=1e-5)
     recording.hit[:900] = False
     assert patch_extents(recording, poses, order).range[0] == 0.0
 
 
 def test_settled_are_tiles_that_later_patches_do_not_come_to():
-    reach = PatchExtents(np.array([[0.0, 0, 0], [10.0, 0, 0]]), np.array([5.0, 2.0]))
+    extents = PatchExtents(np.array([[0.0, 0, 0], [10.0, 0, 0]]), np.array([5.0, 2.0]))
     tiles = np.array([[0, 0, 0], [5, 0, 0], [9, 0, 0], [30, 0, 0]])
-    assert reach.is_complete(tiles, 1.0, 0).tolist() == [False, False, False, True]
-    assert reach.is_complete(tiles, 1.0, 1).tolist() == [True, False, False, True]
-    assert reach.is_complete(tiles, 1.0, 2).all()
+    assert extents.is_complete(tiles, 1.0, 0).tolist() == [False, False, False, True]
+    assert extents.is_complete(tiles, 1.0, 1).tolist() == [True, False, False, True]
+    assert extents.is_complete(tiles, 1.0, 2).all()

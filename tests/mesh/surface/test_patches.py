@@ -5,18 +5,22 @@ import dataclasses
 import numpy as np
 import pytest
 
-from stillmap.mesh import range_image
-from stillmap.mesh.options import SurfaceOptions
+from stillmap.mesh import range_image, triangulation
 from stillmap.mesh.range_image import find_scan_layout, triangulate_scans
 from stillmap.mesh.triangle_mesh import Mesh
 from stillmap.mesh.triangulation import split_rows
 
-LOOSE = SurfaceOptions(longest=5.0, longest_share=2.0)
+
+@pytest.fixture(autouse=True)
+def loose(monkeypatch):
+    """The beams of these tests lie far apart."""
+    monkeypatch.setattr(triangulation, "_MAX_EDGE", 5.0)
+    monkeypatch.setattr(triangulation, "_MAX_EDGE_SHARE", 2.0)
 
 
-def patches(recording, poses, options=LOOSE):
-    order = find_scan_layout(recording, np.arange(recording.n_scans), options)
-    return order, [make() for make in triangulate_scans(recording, poses, order, options)]
+def patches(recording, poses):
+    order = find_scan_layout(recording, np.arange(recording.n_scans))
+    return order, [make() for make in triangulate_scans(recording, poses, order)]
 
 
 def looks_back(patch):
@@ -196,12 +200,12 @@ def test_noise_makes_no_holes(room):
     assert len(noisy.faces) > 0.97 * len(clean.faces)
 
 
-def test_long_edges_are_holes(room):
+def test_long_edges_are_holes(room, monkeypatch):
     recording = room.scans(room.lidar(), room.standing())
     _, (loose,) = patches(recording, room.standing())
-    _, (patch,) = patches(
-        recording, room.standing(), SurfaceOptions(longest=0.3, longest_share=0.1)
-    )
+    monkeypatch.setattr(triangulation, "_MAX_EDGE", 0.3)
+    monkeypatch.setattr(triangulation, "_MAX_EDGE_SHARE", 0.1)
+    _, (patch,) = patches(recording, room.standing())
     assert 0 < len(patch.faces) < len(loose.faces)
     corners = patch.points[patch.faces]
     assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max() <= 0.3
