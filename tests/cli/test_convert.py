@@ -72,7 +72,7 @@ def test_a_format_by_its_name(call, room, tmp_path):
 def test_what_is_left_out_is_said(call, tmp_path, nothing_left):
     call("simulate", "hall", "-o", tmp_path / "s", "--scans", 3, "--sweep-time", 0.1, "--quiet")
     done = call("convert", tmp_path / "s", "-o", tmp_path / "a.log")
-    assert "warning: when each beam was taken is left out" in done.stderr
+    assert "warning: beam times are left out" in done.stderr
     assert call("convert", tmp_path / "s", "-o", tmp_path / "b.log", "--quiet").stderr == ""
     nothing_left("s", "a.log", "b.log")
 

@@ -134,7 +134,7 @@ def test_what_a_log_cannot_hold(tmp_path):
     empty[1:3] = 0
     none = dataclasses.replace(recording, offset=empty)
     for one, words in (
-        (three, "two lasers, here are 3"),
+        (three, "two lasers, the recording has 3"),
         (uneven, "scans of 179 to 181 beams"),
         (mixed, "one way in some scans"),
         (none, "scans of 0 to"),

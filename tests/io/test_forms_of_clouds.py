@@ -27,8 +27,8 @@ def recording():
 
 
 SAID = {
-    "kitti": ["its odometry stands for poses"],
-    "pcd": ["its readings of odometry are left out"],
+    "kitti": ["its odometry is written as poses"],
+    "pcd": ["its odometry readings are left out"],
 }
 
 

@@ -239,8 +239,8 @@ def test_what_no_format_holds_is_said(tmp_path, driven):
     )
     lost = writers.write(more, tmp_path / "a.mcap")
     assert lost == [
-        "its pictures are left out",
-        "its poses that the recording states are left out",
+        "its images are left out",
+        "its recorded poses are left out",
     ]
 
 

@@ -51,18 +51,15 @@ class Format(NamedTuple):
     read: Reader
 
 
-def _is_carmen(path: Path, text: bytes | None) -> bool:  # noqa: ARG001
+def _is_carmen(path: Path, start: bytes | None) -> bool:  # noqa: ARG001
     words = {*SCAN_PARSERS, b"ODOM", b"PARAM"}
-    first_words = (line.split(maxsplit=1)[:1] for line in (text or b"").splitlines())
+    first_words = (line.split(maxsplit=1)[:1] for line in (start or b"").splitlines())
     return any(word in words for first in first_words for word in first)
 
 
-def _is_stillmap_folder(path: Path, text: bytes | None) -> bool:
-    return (
-        path.name == stillmap_folder.HEADER
-        if text is not None
-        else (path / stillmap_folder.HEADER).is_file()
-    )
+def _is_stillmap_folder(path: Path, start: bytes | None) -> bool:
+    header = path / stillmap_folder.HEADER
+    return header.is_file() if start is None else path.name == stillmap_folder.HEADER
 
 
 def _read_stillmap_folder(
@@ -83,21 +80,23 @@ def _read_bag(
     return read_bag(path, options, progress, scratch)
 
 
-def _is_kitti(path: Path, head: bytes | None) -> bool:
-    return head is None and kitti.is_kitti_folder(path)
+def _is_kitti(path: Path, start: bytes | None) -> bool:
+    return start is None and kitti.is_kitti_folder(path)
 
 
 def _point_cloud_format(
-    name: str, endings: tuple[str, ...], is_one: Callable[[bytes], bool] | None, read: Reader
+    name: str, endings: tuple[str, ...], has_magic: Callable[[bytes], bool] | None, read: Reader
 ) -> Format:
     """A format of files, detected by first bytes or by name, and of folders of such files."""
 
-    def found(path: Path, head: bytes | None) -> bool:
-        if head is None:
+    def matches(path: Path, start: bytes | None) -> bool:
+        if start is None:
             return contains_files(path, endings)
-        return has_extension(path, endings) and len(head) > 0 if is_one is None else is_one(head)
+        if has_magic is None:
+            return has_extension(path, endings) and len(start) > 0
+        return has_magic(start)
 
-    return Format(name, endings, found, read)
+    return Format(name, endings, matches, read)
 
 
 FORMATS = (
@@ -109,10 +108,10 @@ FORMATS = (
     Format("RGB-D folder", ("frame-*.depth.png", "depth.txt"), rgbd.is_rgbd_folder, rgbd.read),
     _point_cloud_format("PCD", pcd.EXTENSIONS, is_pcd, pcd.read),
     _point_cloud_format("3DTK", threedtk.EXTENSIONS, None, threedtk.read),
-    _point_cloud_format("E57", e57.EXTENSIONS, lambda head: head.startswith(e57.MAGIC), e57.read),
-    _point_cloud_format("LAS", las.EXTENSIONS, lambda head: head.startswith(las.MAGIC), las.read),
+    _point_cloud_format("E57", e57.EXTENSIONS, lambda start: start.startswith(e57.MAGIC), e57.read),
+    _point_cloud_format("LAS", las.EXTENSIONS, lambda start: start.startswith(las.MAGIC), las.read),
     _point_cloud_format(
-        "PLY", ply.EXTENSIONS, lambda head: head.startswith((b"ply\n", b"ply\r")), ply.read
+        "PLY", ply.EXTENSIONS, lambda start: start.startswith((b"ply\n", b"ply\r")), ply.read
     ),
     Format(
         "CARMEN log",
