@@ -119,8 +119,8 @@ def options_of(method: str, settings: Iterable[str]) -> stillmap.Options:
         InputError: an option that is not there or has another type.
     """
     beam_counting.MIN_HIT_RATIO = MIN_HIT_RATIO.get(method, 0.25)
-    changes = config.merged(METHODS[method], *(config.parse_assignment(s) for s in settings))
-    return config.replaced(stillmap.Options(), {"threads": 1, **changes})
+    changes = config.merge_nested(METHODS[method], *(config.parse_assignment(s) for s in settings))
+    return config.override(stillmap.Options(), {"threads": 1, **changes})
 
 
 def built(

@@ -181,8 +181,8 @@ def main() -> None:
     p.add_argument("--beam-times-from-azimuth", action="store_true")
     p.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", dest="settings")
     args = p.parse_args()
-    changes = config.merged(*(config.parse_assignment(text) for text in args.settings))
-    chosen = config.replaced(Options(), changes)
+    changes = config.merge_nested(*(config.parse_assignment(text) for text in args.settings))
+    chosen = config.override(Options(), changes)
     lines = []
     for path in args.recordings:
         case = case_of(path, args.odometry, args.beam_times_from_azimuth)

@@ -26,7 +26,7 @@ from scipy.stats import spearmanr
 from tables import BY_KEY, Row, grouped, markdown
 
 from stillmap.core import se2
-from stillmap.core.config import merged
+from stillmap.core.config import merge_nested
 
 TRUTHS = ("ap", "f1", "brier", "log_loss", "walls", "ghosts", "ate")
 OWN_WORDS = ("held_out", "bound")
@@ -115,7 +115,7 @@ def main() -> None:
 
 def _row_of(job: Job) -> dict[str, Any]:
     variant = job.variant
-    changes = merged({"robot": {"scans": job.scans}}, variant.changes)
+    changes = merge_nested({"robot": {"scans": job.scans}}, variant.changes)
     run = prepare(Case(job.world, "", job.world, changes), job.seed)
     poses = None
     if variant.jitter is not None:

@@ -95,7 +95,7 @@ def rows(job: Job) -> dict[str, Scores]:
 
 def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, TiltingResult]]:
     """A rig, P(static) of tilting beams by their own evidence alone, and with the flat laser."""
-    scene = scene_by_name(job.world, config.merged(WORLDS[job.world], _COMMON))
+    scene = scene_by_name(job.world, config.merge_nested(WORLDS[job.world], _COMMON))
     rig = simulate_rig(scene, job.seed)
     chosen = options_of("stillmap", job.settings)
     result = stillmap.build(rig.horizontal.recording, chosen)
@@ -103,7 +103,7 @@ def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, Tilting
     tilting = rig.tilting.recording
     built = {
         way: build_tilting(
-            flat, tilting, config.replaced(chosen, {"rig": {"evidence": way == WAYS[1]}})
+            flat, tilting, config.override(chosen, {"rig": {"evidence": way == WAYS[1]}})
         )
         for way in WAYS[:2]
     }

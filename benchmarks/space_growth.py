@@ -76,8 +76,8 @@ def main() -> None:
 
 
 def options_of(settings: Sequence[str], threads: int) -> stillmap.Options:
-    changes = config.merged(*(config.parse_assignment(text) for text in settings))
-    return config.replaced(stillmap.Options(), {"threads": threads, **changes})
+    changes = config.merge_nested(*(config.parse_assignment(text) for text in settings))
+    return config.override(stillmap.Options(), {"threads": threads, **changes})
 
 
 def write(whole: Path, world: str, changes: dict[str, Any], seed: int) -> None:
@@ -127,7 +127,7 @@ def cost_of(
     stages, wall, cpu = StageTimer(), time.perf_counter(), time.process_time()
     loaded = peak_memory_bytes()
     result = stillmap.build(recording, chosen, poses=poses, stages=stages)
-    models = stillmap.models_of(result, stages=stages) if with_models else None
+    models = stillmap.build_models(result, stages=stages) if with_models else None
     with stages.measure("writing"):
         result.save(out, models=models)
     took = {**result.stages, **stages.to_dict()}

@@ -38,10 +38,10 @@ _WORKER = Path(__file__).with_name("space_peer_worker.py")
 
 def of_ours(work: Path, method: str, settings: tuple[str, ...], threads: int, out: Path) -> Scores:
     """What stillmap takes from the recording on the disk to the whole result, nothing written."""
-    changes = config.merged(
+    changes = config.merge_nested(
         OURS.get(method, {}), *(config.parse_assignment(text) for text in settings)
     )
-    chosen = config.replaced(stillmap.Options(), {"threads": threads, **changes})
+    chosen = config.override(stillmap.Options(), {"threads": threads, **changes})
     poses = None if method == ESTIMATED else np.load(work / "poses.npy")
     recording = stillmap.read(json.loads((work / "case.json").read_text())["source"], chosen.read)
     stages, wall, cpu = StageTimer(), time.perf_counter(), time.process_time()

@@ -88,7 +88,7 @@ def test_bash(ask):
         "stillmap map walk.log --config o": {"options.toml", "out/"},
         "stillmap map walk.log --set em.pri": {"em.prior="},
         "stillmap map walk.log --set em.time": {"em.time_bin="},
-        "stillmap map walk.log --set slam.loops.enabled=": {"true", "false"},
+        "stillmap map walk.log --set slam.loop_closure=": {"true", "false"},
         "stillmap map walk.log --set output.map_mode=t": {"trinary"},
         "stillmap view ": {"out/"},
         "stillmap simulate office-m": {"office-moved", "office-moved-empty"},

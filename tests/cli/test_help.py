@@ -8,7 +8,7 @@ import typing
 import pytest
 
 from stillmap.cli.parser import COMMANDS, parser
-from stillmap.core.config import described
+from stillmap.core.config import iter_options
 from stillmap.em import Estimator, MapState
 from stillmap.eval.relations import MAX_DT
 from stillmap.pipeline.options import MapMode, Options
@@ -108,7 +108,7 @@ def test_choices_are_those_of_the_options(command, flag, choices):
     ],
 )
 def test_defaults_shown_are_those_of_the_options(flag, option):
-    (one,) = [one for one in described(Options()) if one.name == option]
+    (one,) = [one for one in iter_options(Options()) if one.name == option]
     shown = re.search(r"\(default: (\S+)\)", action("map", flag).help)[1]
     assert type(one.default)(shown) == one.default
 

@@ -35,7 +35,7 @@ def refusal(capsys, *words: object) -> str:
         (("simulate", "hal", "-o", "out"), "'hal'", "'hall'"),
         (("config", "em.time"), "'em.time'", "'em.time_bin'"),
         (("config", "--set", "resolution=1"), "'resolution'", "'slam.resolution'"),
-        (("config", "--set", "loops.enabled=false"), "'loops'", "'slam.loops'"),
+        (("config", "--set", "loops=false"), "'loops'", "'slam.loop_closure'"),
         (("completion", "bsh"), "'bsh'", "'bash'"),
     ],
 )
@@ -58,11 +58,11 @@ def test_nothing_is_made_up(capsys, words):
         ("em.prior.x=1", "'em.prior' is a value, not a section"),
         ("em=1", "'em' is a section, not a value"),
         ("slam=1", "'slam' is a section, not a value"),
-        ("em.prior=[1]", "'em.prior' wants float, got [1]"),
-        ("em.prior=2020-01-01", "'em.prior' wants float"),
-        ("threads=1.5", "'threads' wants int, got 1.5"),
+        ("em.prior=[1]", "'em.prior' must be float, got [1]"),
+        ("em.prior=2020-01-01", "'em.prior' must be float"),
+        ("threads=1.5", "'threads' must be int, got 1.5"),
         ("em..prior=1", "unknown option 'em.'"),
-        ("em.prior=1\nthreads=2", "'em.prior' wants float"),
+        ("em.prior=1\nthreads=2", "'em.prior' must be float"),
     ],
 )
 def test_options_that_cannot_be(capsys, assignment, said):

@@ -6,7 +6,7 @@ import math
 import pytest
 
 from stillmap.cli.console import print_json
-from stillmap.core.config import described
+from stillmap.core.config import iter_options
 from stillmap.pipeline.options import Options
 
 
@@ -66,7 +66,7 @@ def test_simulate(call, tmp_path):
 
 def test_config(call):
     found = parsed(call("config", "--json", "--set", "em.prior=0.75"))
-    assert list(found) == [one.name for one in described(Options())]
+    assert list(found) == [one.name for one in iter_options(Options())]
     assert found["em.prior"] == {
         "value": 0.75,
         "default": Options().em.prior,

@@ -16,7 +16,7 @@ import parts
 
 from stillmap.cli import arguments
 from stillmap.cli.recording_info import facts
-from stillmap.core.config import load_toml, replaced
+from stillmap.core.config import load_toml, override
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.eval import readers
@@ -160,7 +160,7 @@ def _bare_bag(data: bytes) -> bytes:
 def _toml(data: bytes, folder: Path) -> None:
     (folder / "in.toml").write_bytes(data)
     try:
-        replaced(Options(), load_toml(folder / "in.toml"), "in.toml")
+        override(Options(), load_toml(folder / "in.toml"), "in.toml")
     except InputError:
         return
 

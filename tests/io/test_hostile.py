@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillmap.core.config import load_toml, parse_assignment, replaced
+from stillmap.core.config import load_toml, override, parse_assignment
 from stillmap.core.errors import InputError
 from stillmap.eval import readers
 from stillmap.io import read, registry, stillmap_folder, text_lines, writers
@@ -111,7 +111,7 @@ def test_device_without_end(tmp_path, reader, said):
 def test_options_of_thousands_of_digits(tmp_path, name, number):
     (tmp_path / "a.toml").write_text(f"{name} = {number}")
     with pytest.raises(InputError) as caught:
-        replaced(ReadOptions(), load_toml(tmp_path / "a.toml"))
+        override(ReadOptions(), load_toml(tmp_path / "a.toml"))
     assert len(str(caught.value)) < 400
     parse_assignment(f"read.{name}={number}")
 

@@ -69,9 +69,7 @@ def test_turns(direction, stamp, azimuth, turns):
 
 
 def test_unusable_beams_have_a_time_all_the_same():
-    assert turns_since_stamp(np.full((1, 3), np.nan, np.float32), LEFT).tolist() == [
-        0.0
-    ]
+    assert turns_since_stamp(np.full((1, 3), np.nan, np.float32), LEFT).tolist() == [0.0]
 
 
 def test_a_turn_lasts_from_stamp_to_stamp(timeless):
@@ -123,9 +121,7 @@ def test_raw_drives_of_kitti_turn_clockwise(tmp_path, timeless):
 def test_recordings_that_were_timed_so_are_read_again_as_they_are(tmp_path, timeless):
     stillmap_folder.write(add_beam_times(timeless, LEFT), tmp_path / "a")
     again = read(tmp_path / "a", ReadOptions(spin="clockwise"))
-    np.testing.assert_array_equal(
-        again.beam_time, add_beam_times(timeless, LEFT).beam_time
-    )
+    np.testing.assert_array_equal(again.beam_time, add_beam_times(timeless, LEFT).beam_time)
 
 
 def test_the_flag(tmp_path, timeless, capsys):
@@ -134,12 +130,10 @@ def test_the_flag(tmp_path, timeless, capsys):
     assert "as it turns clockwise" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "text", ["spin='left'", "spin=1", "spin_rate=10"]
-)
+@pytest.mark.parametrize("text", ["spin='left'", "spin=1", "spin_rate=10"])
 def test_odd_options(text):
     with pytest.raises((InputError, ValueError)):
-        config.replaced(Options(), config.parse_assignment(f"read.{text}"))
+        config.override(Options(), config.parse_assignment(f"read.{text}"))
 
 
 def test_recordings_in_the_plane_are_refused(tmp_path):

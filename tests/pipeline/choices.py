@@ -2,7 +2,7 @@
 
 import pytest
 
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.pipeline.options import Options
 
 RESOLUTION = 0.05
@@ -12,4 +12,4 @@ with_any_estimator = pytest.mark.parametrize("estimator", ESTIMATORS)
 
 def options(estimator="stillmap", **loop):
     chosen = {"estimator": estimator, "em": loop, "threads": 1}
-    return replaced(Options(), chosen | {"slam": {"resolution": RESOLUTION}})
+    return override(Options(), chosen | {"slam": {"resolution": RESOLUTION}})

@@ -7,7 +7,7 @@ import pytest
 
 import stillmap
 from stillmap import em
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.pipeline.options import Options
 from stillmap.results.map_npz import CHANGED, changed_cells
 from stillmap.sim import (
@@ -53,9 +53,9 @@ def world():
 
 @functools.cache
 def built(state="last", threads=1, changes=True):
-    loop = {"max_iterations": 2, "changes": {"enabled": changes}}
+    loop = {"max_iterations": 2, "change_detection": changes}
     chosen = {"threads": threads, "output": {"map_state": state}, "em": loop}
-    options = replaced(Options(), chosen)
+    options = override(Options(), chosen)
     return stillmap.build(world().recording, options, poses=world().truth.T_world_base)
 
 

@@ -9,7 +9,7 @@ from choices import RESOLUTION, options
 
 import stillmap
 from stillmap import _core, em, slam
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.sim import scene_by_name, simulate
 from stillmap.slam import odometry_2d
@@ -50,7 +50,7 @@ def outcome(result):
 def test_it_can_be_left_and_the_printed_method_leaves_it(room, swept, estimator):
     chosen = options(estimator, max_iterations=3)
     at_once = stillmap.build(room.recording, chosen)
-    left = stillmap.build(swept, replaced(chosen, AT_ONCE))
+    left = stillmap.build(swept, override(chosen, AT_ONCE))
     assert outcome(left) == outcome(at_once)
     assert left.seen is left.recording is swept
     taken_out = stillmap.build(swept, chosen)
@@ -66,7 +66,7 @@ def test_where_all_beams_come_at_once_nothing_is_made_anew(room):
 @pytest.mark.parametrize("given", [False, True])
 @pytest.mark.parametrize("loops", [False, True])
 def test_map_and_labels_are_made_of_the_same_points(room, swept, estimator, given, loops):
-    chosen = replaced(options(estimator, max_iterations=3), {"slam": {"loops": {"enabled": loops}}})
+    chosen = override(options(estimator, max_iterations=3), {"slam": {"loop_closure": loops}})
     poses = room.truth.T_world_base if given else None
     for it in stillmap.iterate(swept, chosen, poses=poses):
         points = slam.deskew_recording(swept, it.estimate.poses, chosen.slam).points
@@ -119,7 +119,7 @@ def test_poses_at_speed(world, odometry):
         recording = recording.without_odometry()
     ate = []
     for changes in ({}, AT_ONCE):
-        result = stillmap.build(recording, replaced(options(max_iterations=4), changes))
+        result = stillmap.build(recording, override(options(max_iterations=4), changes))
         ate.append(compute_absolute_errors(result.poses, truth).rmse)
     assert ate[0] < 0.4 * ate[1]
     assert ate[0] < {"office": 0.015, "street": 0.03}[world]

@@ -8,7 +8,7 @@ from choices import options, with_any_estimator
 
 import stillmap
 from stillmap.core import se2
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.core.recording import Recording
 from stillmap.em import beam_counting
 
@@ -111,7 +111,7 @@ def test_a_leap_of_the_odometry_is_reported(room, leap, said):
     sure["translation_per_radian"] = 0.0
     T[30:] = T[29] @ se2.matrix(*leap) @ increment @ se2.inverse(T[30]) @ T[30:]
     r = dataclasses.replace(room.recording, T_odom_base=T)
-    chosen = replaced(options(max_iterations=1), {"slam": {"motion": sure}})
+    chosen = override(options(max_iterations=1), {"slam": {"odometry": sure}})
     result = stillmap.build(r, chosen)
     assert any(said in warning for warning in result.warnings), result.warnings
     plain = stillmap.build(room.recording, chosen).warnings

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import stillmap
-from stillmap.core import arrays
-from stillmap.core.config import replaced
-from stillmap.core import chunks
+from stillmap.core import arrays, chunks
+from stillmap.core.config import override
 from stillmap.results.save import save
 
 ESTIMATORS = ("stillmap", "paper", "hit-ratio", "tracker")
@@ -25,7 +24,7 @@ def swept(room):
 
 def files_of(recording, estimator: str, out: Path) -> dict[str, bytes]:
     """All that a run writes, but for what tells of time and memory."""
-    options = replaced(
+    options = override(
         stillmap.Options(),
         {"threads": 1, "estimator": estimator, "em": {"max_iterations": 2, "held_out": 5}},
     )

@@ -5,20 +5,20 @@ import pytest
 
 import stillmap
 from stillmap import em, slam
-from stillmap.core.config import replaced
-from stillmap.pipeline.options import Options, resolved
+from stillmap.core.config import override
+from stillmap.pipeline.options import Options, resolve_options
 
 SLAM = slam.SlamOptions()
 
 
-def options(estimator="paper", loops=True, **registration):
+def options(estimator="paper", loops=True):
     changes = {
         "estimator": estimator,
         "threads": 1,
-        "em": {"max_iterations": 3, "tolerance": 0.0, "settled": 0.0},
-        "slam": {"loops": {"enabled": loops}, "registration": registration},
+        "em": {"max_iterations": 3, "tolerance": 0.0, "label_tolerance": 0.0},
+        "slam": {"loop_closure": loops},
     }
-    return replaced(Options(), changes)
+    return override(Options(), changes)
 
 
 def everything(result):
@@ -42,20 +42,14 @@ def test_loop_closure_has_no_part_in_it(room, printed):
     assert ours[0].poses.tobytes() != ours[1].poses.tobytes()
 
 
-def test_all_of_a_beam_speaks_of_what_it_crosses(room, printed):
-    for approach in (0.0, 1.0):
-        other = stillmap.build(room.recording, options(approach=approach))
-        assert everything(other) == everything(printed)
-
-
 def test_it_is_the_loop_of_fig_2(room):
     # written out once more: register scan by scan, map, label, repeat
     r, chosen = room.recording, options()
-    plain = replaced(SLAM, {"loops": {"enabled": False}, "registration": {"approach": 0.0}})
+    plain = override(SLAM, {"loop_closure": False, "deskew": False})
     e = np.full(r.n_beams, chosen.em.prior, np.float32)
     n = 0
     for it in stillmap.iterate(r, chosen):
-        mapped = slam.m_step(r, e, plain, None, 1, lambda *_: None)
+        mapped = slam.m_step(r, e, plain, None, 1, lambda *_: None, free_space_margin=0.0)
         np.testing.assert_array_equal(it.estimate.poses, mapped.poses)
         np.testing.assert_array_equal(it.estimate.m_step.covariance, mapped.covariance)
         for ours, theirs in zip(it.estimate.m_step.grid.dense(), mapped.grid.dense(), strict=True):
@@ -69,17 +63,10 @@ def test_it_is_the_loop_of_fig_2(room):
 
 
 def test_the_options_that_are_kept_are_those_that_were_used(printed):
-    assert not printed.options.slam.loops.enabled
-    assert not printed.options.slam.spinning_loops.enabled
-    assert printed.options.slam.registration.approach == 0.0
-    # all else as it was asked for, and other estimators as they were
+    assert not printed.options.slam.loop_closure
     assert not printed.options.slam.deskew
-    rest = {
-        "loops": {"enabled": True},
-        "spinning_loops": {"enabled": True},
-        "registration": {"approach": SLAM.registration.approach},
-        "deskew": True,
-    }
-    assert replaced(printed.options, {"slam": rest}) == options()
+    # all else as it was asked for, and other estimators as they were
+    assert override(printed.options, {"slam": {"loop_closure": True, "deskew": True}}) == options()
     for estimator in ("stillmap", "hit-ratio", "tracker"):
-        assert resolved(options(estimator), printed.recording) == options(estimator)
+        chosen = options(estimator)
+        assert resolve_options(chosen, printed.recording) == chosen

@@ -7,14 +7,14 @@ import pytest
 from choices import options
 
 import stillmap
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.pipeline.checkpoint_files import packed, unpacked
 from stillmap.pipeline.options import Options
 from stillmap.sim import CrowdOptions, LidarOptions, RobotOptions, Scene, simulate
 from stillmap.sim.scene import Stay, Thing
 from stillmap.sim.walls import box
 
-LISTED = replaced(Options(), {"em": {"change_detection_3d": True}})
+LISTED = override(Options(), {"em": {"change_detection_3d": True}})
 LEFT, CAME = (3.0, 2.0), (-3.0, 2.0)  # m, where they stand
 
 

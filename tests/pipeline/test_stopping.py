@@ -8,7 +8,7 @@ import pytest
 import stillmap
 from stillmap import _core, em, slam
 from stillmap.core import se2
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.pipeline import em_loop
 from stillmap.pipeline.estimate import Estimate, Iteration, IterationRecord
 from stillmap.pipeline.options import Options
@@ -16,10 +16,10 @@ from stillmap.pipeline.options import Options
 
 def options(estimator="stillmap", **changes):
     """Without the last E-step, which asks the recording once more."""
-    wanted = {"max_iterations": 10, "tolerance": 0.0, "settled": 0.0, "patience": 3} | changes
-    wanted |= {"changes": {"enabled": False}, "dwell": {"views": False}}
+    wanted = {"max_iterations": 10, "tolerance": 0.0, "label_tolerance": 0.0, "patience": 3} | changes
+    wanted |= {"change_detection": False}
     chosen = {"estimator": estimator, "em": wanted, "slam": {"resolution": 0.1}, "threads": 1}
-    return replaced(Options(), chosen)
+    return override(Options(), chosen)
 
 
 @pytest.fixture
@@ -39,6 +39,7 @@ def build(monkeypatch, short):
                 yield made_up(recording, number, bound * recording.n_beams, share)
 
         monkeypatch.setattr(em_loop, "iterate", fake)
+        monkeypatch.setattr("stillmap.em.occupancy_hmm._VIEW_CLASSES", False)
         return stillmap.build(recording, chosen), len(asked)
 
     return run
@@ -158,30 +159,30 @@ RISING = [-5.0, -4.0, -3.0, -2.0]
 
 
 def test_labels_that_have_settled_end_it(build):
-    result, asked = build(RISING, options(settled=0.01), [0.5, 0.02, 0.009, 0.0])
+    result, asked = build(RISING, options(label_tolerance=0.01), [0.5, 0.02, 0.009, 0.0])
     assert (asked, result.converged) == (3, True)
     assert_kept(result, 3)
 
 
 def test_labels_that_still_move_do_not(build):
     for changed in ([0.5, 0.02, 0.011, 0.01], [0.01] * 4):  # the share itself is not below it
-        result, asked = build(RISING, options(settled=0.01), changed)
+        result, asked = build(RISING, options(label_tolerance=0.01), changed)
         assert (asked, result.converged) == (4, False)
 
 
 def test_one_iteration_settles_nothing(build):
     # the first may find all as static as the prior says
-    result, asked = build(RISING, options(settled=0.01), [0.0, 0.3, 0.0, 0.0])
+    result, asked = build(RISING, options(label_tolerance=0.01), [0.0, 0.3, 0.0, 0.0])
     assert (asked, result.converged) == (3, True)
 
 
 def test_without_a_share_labels_never_settle(build):
-    result, asked = build(RISING, options(settled=0.0), [0.0] * 4)
+    result, asked = build(RISING, options(label_tolerance=0.0), [0.0] * 4)
     assert (asked, result.converged) == (4, False)
 
 
 def test_labels_that_settle_in_a_dip_leave_the_best(build):
-    result, asked = build([-5.0, -3.0, -4.0, -2.0], options(settled=0.01), [0.5, 0.1, 0.0, 0.0])
+    result, asked = build([-5.0, -3.0, -4.0, -2.0], options(label_tolerance=0.01), [0.5, 0.1, 0.0, 0.0])
     assert (asked, result.converged) == (3, True)
     assert_kept(result, 2)
 
@@ -215,7 +216,7 @@ def test_snapshots_show_first_second_best_and_last(build, bounds):
 
 def test_iterate_ends_at_the_limit_and_leaves_stopping_to_the_caller(short):
     # with any share of labels settled in effect, build stops at 2; iterate does not
-    chosen = options(max_iterations=3, settled=1.0)
+    chosen = options(max_iterations=3, label_tolerance=1.0)
     assert [it.record.number for it in stillmap.iterate(short.recording, chosen)] == [1, 2, 3]
     result = stillmap.build(short.recording, chosen)
     assert result.converged

@@ -8,18 +8,18 @@ import pytest
 import stillmap
 from stillmap import slam
 from stillmap.core import se2
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.pipeline.options import Options
 
 # so short a way that there is something to close after a metre, and wheels that are believed
-CHOSEN = replaced(
+CHOSEN = override(
     Options(),
     {
         "threads": 1,
         "em": {"max_iterations": 4, "held_out": 0},
         "slam": {
-            "loops": {"gap": 1.0, "distance": 0.3},
-            "motion": {
+            "keyframe_distance": 0.3,
+            "odometry": {
                 f"{a}_per_{b}": 0.0
                 for a, b in (
                     ("translation", "metre"),
@@ -31,6 +31,11 @@ CHOSEN = replaced(
         },
     },
 )
+
+
+@pytest.fixture(autouse=True)
+def short_loops(monkeypatch):
+    monkeypatch.setattr("stillmap.slam.loop_candidates.MIN_LOOP_TRAVEL", 1.0)
 
 
 @pytest.fixture

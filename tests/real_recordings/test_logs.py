@@ -5,7 +5,7 @@ import pytest
 
 import stillmap
 from stillmap.core import se2
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.eval.readers import read_odometry, read_relations, to_seconds
 from stillmap.eval.relations import compute_relation_errors
 from stillmap.pipeline.options import Options
@@ -27,7 +27,7 @@ QUICK = {"belgioioso", "seattle"}  # the others only in `make check`
 def mapped(folder, name, iterations=1, estimator="stillmap"):
     recording = stillmap.read(folder / f"{name}.clf.gz")
     chosen = {"estimator": estimator, "em": {"max_iterations": iterations}}
-    return stillmap.build(recording, replaced(Options(), chosen))
+    return stillmap.build(recording, override(Options(), chosen))
 
 
 def errors(folder, name, result):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stillmap.core.config import replaced
+from stillmap.core.config import override
 from stillmap.core.recording import Recording
 from stillmap.pipeline.options import Options
 from stillmap.rig.build import PlanarResult, apply_boxes, build_tilting
@@ -118,7 +118,7 @@ def built(points, ms, objects, **rig):
     )
     seen = flat_recording(np.zeros((0, 2)), np.zeros(len(STAMPS) + 1))
     flat = PlanarResult(seen, standing(), np.zeros(0, np.float32), objects, 0.9)
-    options = replaced(Options(), {"rig": {"evidence": False, "margin": 0.1, **rig}})
+    options = override(Options(), {"rig": {"evidence": False, "margin": 0.1, **rig}})
     found = build_tilting(flat, recording, options)
     return found, found.p_static[-n:]
 

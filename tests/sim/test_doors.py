@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from stillmap.core.config import override
 from stillmap.sim import Door, DoorOptions, Scene, Simulation, simulate
-from stillmap.sim.objects import Doors, legs
-from stillmap.sim.planner import distance_to_segment
+from stillmap.sim.objects import Doors, split_into_segments
+from stillmap.sim.planner import compute_segment_distance
 from stillmap.sim.walls import Opening, box, leaf
 
 Float = NDArray[np.float64]
@@ -83,8 +83,8 @@ def test_a_closing_leaf_stops_for_somebody() -> None:
 def test_a_door_opens_for_whoever_comes_but_not_for_who_goes_by() -> None:
     options = DoorOptions(min_closed=1000.0, max_closed=1000.0)
     standing = np.array([[1.4, 0.5]])
-    by = legs(np.array([[[0.4, 1.0], [3.4, 1.0], [5.0, 1.0]]]))
-    through = legs(np.array([[[1.4, 0.5], [1.5, 1.5], [1.5, 3.0]]]))
+    by = split_into_segments(np.array([[[0.4, 1.0], [3.4, 1.0], [5.0, 1.0]]]))
+    through = split_into_segments(np.array([[[1.4, 0.5], [1.5, 1.5], [1.5, 3.0]]]))
     doors = until(0.0, options=options)
     np.testing.assert_array_equal(followed(doors, 100, standing, by), 0.0)
     assert followed(doors, 16, standing, through)[-1, 0] == pytest.approx(np.pi / 2)
@@ -132,7 +132,7 @@ def test_beams_meet_the_leaf_where_it_is(
         faces = np.array([0.02, 0.5, *truth.movers[t, 0, :2]])
         tip = faces[:2] + 2 * (faces[2:] - faces[:2])
         mine = xy[(scan == t) & (truth.mover == 0)]
-        off = distance_to_segment(mine, np.array([*faces[:2], *tip]))
+        off = compute_segment_distance(mine, np.array([*faces[:2], *tip]))
         assert off.max(initial=0.0) < 1e-5
         direction = tip - faces[:2]
         assert np.arctan2(direction[1], direction[0]) == pytest.approx(heading[t])

@@ -19,7 +19,7 @@ from stillmap.sim import (
     simulate,
     write_simulation,
 )
-from stillmap.sim.lidar import matrix
+from stillmap.sim.lidar import make_pose
 from stillmap.sim.walls import box, pillar
 
 Float = NDArray[np.float64]
@@ -68,7 +68,7 @@ def in_world(run: Simulation, times: bool = True) -> tuple[Float, NDArray[np.int
     parameters = np.concatenate([T[:, :3, 3].T, np.unwrap(angles, axis=1)])
     now = parameters[:, scan] * (1 - later)
     now += parameters[:, np.minimum(scan + 1, last)] * later
-    poses = matrix(now[:3].T, *now[3:]) @ recording.T_base_sensor[0]
+    poses = make_pose(now[:3].T, *now[3:]) @ recording.T_base_sensor[0]
     ends = np.einsum("nij,nj->ni", poses[:, :3, :3], recording.points.astype(float))
     return ends + poses[:, :3, 3], scan, later
 

@@ -10,7 +10,7 @@ from stillmap.core import se2
 from stillmap.core.config import override
 from stillmap.core.errors import InputError
 from stillmap.sim import OdometryOptions, Scene, Simulation, scene_by_name, simulate
-from stillmap.sim.odometry import reported, without_jump
+from stillmap.sim.odometry import add_faults, remove_jump
 from stillmap.sim.walls import box
 
 Float = NDArray[np.float64]
@@ -36,13 +36,13 @@ def short(seed: int = 3, name: str = "hall", **changes: dict[str, object]) -> Si
 def test_odometry_that_neither_stalls_nor_resets_is_what_it_was() -> None:
     T = round_a_ring()
     options = OdometryOptions(stall_time=9.0)
-    assert reported(T, SECONDS, options, np.random.default_rng(0)) is T
+    assert add_faults(T, SECONDS, options, np.random.default_rng(0)) is T
 
 
 def test_a_stall_misses_what_the_robot_does_for_its_time() -> None:
     T = round_a_ring()
     options = dataclasses.replace(PERFECT, stall_rate=3.0, stall_time=4.0)
-    odometry = reported(T, SECONDS, options, np.random.default_rng(1))
+    odometry = add_faults(T, SECONDS, options, np.random.default_rng(1))
     np.testing.assert_array_equal(odometry[0], np.eye(3))
     got, true = moves(odometry), moves(T)
     lost = np.hypot(got[:, 0], got[:, 1]) < 1e-9
@@ -60,7 +60,7 @@ def test_a_stall_misses_what_the_robot_does_for_its_time() -> None:
 def test_a_reset_begins_again_at_the_origin() -> None:
     T = round_a_ring()
     options = dataclasses.replace(PERFECT, resets=3)
-    odometry = reported(T, SECONDS, options, np.random.default_rng(1))
+    odometry = add_faults(T, SECONDS, options, np.random.default_rng(1))
     again = np.flatnonzero(np.abs(odometry[1:] - np.eye(3)).max(axis=(1, 2)) < 1e-12)
     assert len(again) == 3
     got, true = moves(odometry), moves(T)
@@ -71,7 +71,7 @@ def test_a_reset_begins_again_at_the_origin() -> None:
 
 def test_more_resets_than_scans_are_as_many_as_there_can_be() -> None:
     options = dataclasses.replace(PERFECT, resets=50)
-    odometry = reported(round_a_ring()[:4], SECONDS[:4], options, np.random.default_rng(1))
+    odometry = add_faults(round_a_ring()[:4], SECONDS[:4], options, np.random.default_rng(1))
     np.testing.assert_allclose(odometry[1:], np.eye(3)[None].repeat(3, axis=0), atol=1e-12)
 
 
@@ -91,12 +91,12 @@ def test_nothing_but_the_odometry_changes_when_it_lies() -> None:
 def test_without_the_jump_the_robot_never_left() -> None:
     T = round_a_ring()
     carried = np.concatenate([T[:100], se2.matrix(7.0, -3.0, 2.0) @ T[100:]])
-    back = without_jump(carried, 100)
+    back = remove_jump(carried, 100)
     true = moves(T)
     got = moves(back)
     np.testing.assert_allclose(np.delete(got, 99, axis=0), np.delete(true, 99, axis=0), atol=1e-9)
     np.testing.assert_allclose(got[99], 0.0, atol=1e-9)
-    assert without_jump(T, len(T)) is T
+    assert remove_jump(T, len(T)) is T
 
 
 @pytest.mark.parametrize("seed", range(4))

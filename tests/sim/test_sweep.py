@@ -12,7 +12,7 @@ from stillmap.core.errors import InputError
 from stillmap.sim import LaserOptions, Scene, Simulation, scene_by_name, simulate
 from stillmap.sim.dynamics import Motion
 from stillmap.sim.laser import Movers, Outlines
-from stillmap.sim.sweep import Sweep, cast
+from stillmap.sim.sweep import Sweep, cast_sweeps
 from stillmap.sim.walls import box, pillar
 
 Float = NDArray[np.float64]
@@ -132,7 +132,7 @@ def test_beams_of_a_sweep_meet_what_comes_by_meanwhile() -> None:
     near = np.array([[[10.0, -50, 10, 50]], [[9.0, -50, 9, 50]]])
     motion = standing_before(near)
     options = LaserOptions(beams=101, fov=1.0, sweep_time=0.2, range_noise=0.0)
-    returns = cast(motion, np.empty((0, 4)), np.eye(3)[None].repeat(2, 0), options)
+    returns = cast_sweeps(motion, np.empty((0, 4)), np.eye(3)[None].repeat(2, 0), options)
     along = returns.range * np.cos(np.linspace(-0.5, 0.5, 101))
     times = Sweep.of(options).beam_times(101)
     # and goes on coming after the last scan
@@ -144,7 +144,7 @@ def test_what_begins_its_lane_again_is_not_seen_on_the_way_back() -> None:
     leaping = np.array([[[10.0, -50, 10, 50]], [[-90.0, -50, -90, 50]]])
     motion = standing_before(leaping)
     options = LaserOptions(beams=101, fov=1.0, sweep_time=0.2, range_noise=0.0)
-    returns = cast(motion, np.empty((0, 4)), np.eye(3)[None].repeat(2, 0), options)
+    returns = cast_sweeps(motion, np.empty((0, 4)), np.eye(3)[None].repeat(2, 0), options)
     np.testing.assert_allclose(returns.range[0] * np.cos(np.linspace(-0.5, 0.5, 101)), 10.0)
     assert np.isinf(returns.range[1]).all()
 

@@ -20,8 +20,8 @@ from stillmap.sim import (
     simulate,
     write_simulation,
 )
-from stillmap.sim.objects import Things, standing
-from stillmap.sim.planner import distance_to_segment
+from stillmap.sim.objects import MovableObjects, place_faces
+from stillmap.sim.planner import compute_segment_distance
 from stillmap.sim.walls import box
 
 Float = NDArray[np.float64]
@@ -78,9 +78,9 @@ def test_beams_meet_a_thing_only_where_it_stands(end_points: EndPoints, sweep_ti
         assert hits.any()
         for stay in thing.stays:
             there = (seconds >= stay.since) & (seconds < (stay.until or np.inf))
-            faces = standing(thing, stay)
+            faces = place_faces(thing, stay)
             mine = xy[hits & there[scan]]
-            off = np.min([distance_to_segment(mine, face) for face in faces], axis=0)
+            off = np.min([compute_segment_distance(mine, face) for face in faces], axis=0)
             assert off.max() < 1e-3
             # nothing of it elsewhere: nobody sees it on the way
             assert set(np.unique(scan[hits])) <= set(np.flatnonzero(~np.isnan(
@@ -94,7 +94,7 @@ def test_beams_meet_a_thing_only_where_it_stands(end_points: EndPoints, sweep_ti
 
 def test_what_is_there_at_the_end_lasts(tmp_path: Path) -> None:
     run = yard()
-    faces = [standing(thing, thing.stays[-1]) for thing in (MOVED, BROUGHT)]
+    faces = [place_faces(thing, thing.stays[-1]) for thing in (MOVED, BROUGHT)]
     np.testing.assert_allclose(run.truth.lasting, np.concatenate(faces))
     assert not len(yard(robot={"scans": 1}).truth.lasting)  # nothing has changed yet
     write_simulation(run, tmp_path / "run")
@@ -106,7 +106,7 @@ def test_what_is_there_at_the_end_lasts(tmp_path: Path) -> None:
 def test_a_thing_that_never_changes_is_a_wall() -> None:
     run = yard()
     assert len(run.truth.walls) == 4 + 4
-    np.testing.assert_allclose(run.truth.walls[4:], standing(LEFT_ALONE, LEFT_ALONE.stays[0]))
+    np.testing.assert_allclose(run.truth.walls[4:], place_faces(LEFT_ALONE, LEFT_ALONE.stays[0]))
     assert not (run.truth.mover == 3).any()
     early = yard(robot={"scans": 40})
     # two have not changed yet, and one is not there yet
@@ -133,9 +133,9 @@ def test_everybody_keeps_clear_of_every_place() -> None:
     for things in ((later,), (short,)):
         run = simulate(override(Scene(**{**vars(scene), "things": things}), changes), 1)
         everybody = [run.truth.T_world_base[:, None, :2, 2], run.truth.movers[:, :8, :2]]
-        for face in Things(things).everywhere():
+        for face in MovableObjects(things).faces_at_all_places():
             for xy in everybody:
-                assert distance_to_segment(xy, face).min() > 0.2
+                assert compute_segment_distance(xy, face).min() > 0.2
 
 
 def test_places_and_times_are_part_of_the_truth() -> None:

@@ -1,6 +1,6 @@
-"""`stillmap config`: every option with its default, unit and meaning, as TOML.
+"""`stillmap config` prints every option; `--config` and `--set` of all commands.
 
-Options on the command line: default < file < --set < flag.
+Precedence: default < file < --set < flag.
 """
 
 import argparse
@@ -16,14 +16,16 @@ if TYPE_CHECKING:
 
 
 def add_option_flags(p: argparse.ArgumentParser) -> None:
-    """`--config` and `--set`."""
+    """Adds `--config` and `--set`."""
     group = p.add_argument_group("any other option, see `stillmap config`")
     group.add_argument("--config", metavar="FILE.toml", help="options from a TOML file")
-    add_set(group, "one option, e.g. em.prior=0.8; can be given again").completer = _assignments  # type: ignore[attr-defined]
+    add_set_flag(
+        group, "one option, e.g. em.prior=0.8; can be given again"
+    ).completer = _assignments  # type: ignore[attr-defined]
 
 
-def add_set(p: argparse._ActionsContainer, help: str) -> argparse.Action:
-    """`--set`, the last of which wins."""
+def add_set_flag(p: argparse._ActionsContainer, help: str) -> argparse.Action:
+    """Adds `--set`; the last one wins."""
     return p.add_argument(
         "--set",
         dest="assignments",
@@ -34,42 +36,42 @@ def add_set(p: argparse._ActionsContainer, help: str) -> argparse.Action:
     )
 
 
-def resolved_options(args: argparse.Namespace, *flags: dict[str, Any]) -> "Options":
-    """The options after file, --set and flags, checked.
+def options_from_args(args: argparse.Namespace, *flags: dict[str, Any]) -> "Options":
+    """Options from the file, --set and flags.
 
     Raises:
-        InputError: an unknown key or a wrong value, with the place it came from.
+        InputError: an unknown key or a wrong value, and where it came from.
     """
-    from stillmap.core.config import load_toml, merged, parse_assignment, replaced
+    from stillmap.core.config import load_toml, merge_nested, override, parse_assignment
     from stillmap.pipeline.options import Options
 
     options = Options()
     if args.config:
-        options = replaced(options, load_toml(Path(args.config)), args.config)
-    options = replaced(options, merged(*map(parse_assignment, args.assignments)), "--set")
-    return replaced(options, merged(*flags))
+        options = override(options, load_toml(Path(args.config)), args.config)
+    options = override(options, merge_nested(*map(parse_assignment, args.assignments)), "--set")
+    return override(options, merge_nested(*flags))
 
 
-def option_names(**_: Any) -> Iterator[str]:
-    """Names of options and sections, for shells that complete them."""
-    from stillmap.core.config import names
+def complete_option_names(**_: Any) -> Iterator[str]:
+    """Names of options and sections, for shell completion."""
+    from stillmap.core.config import iter_names
     from stillmap.pipeline.options import DEFAULTS
 
-    return names(DEFAULTS)
+    return iter_names(DEFAULTS)
 
 
 def _assignments(prefix: str, **_: Any) -> Iterator[str]:
     from stillmap.pipeline.options import DEFAULTS
 
-    return assignments(DEFAULTS, prefix)
+    return complete_assignments(DEFAULTS, prefix)
 
 
-def assignments(options: Any, prefix: str) -> Iterator[str]:
-    """What may follow --set: every option, or the values of the one that is named already."""
-    from stillmap.core.config import described
+def complete_assignments(options: Any, prefix: str) -> Iterator[str]:
+    """Completes an argument of --set: names of options, or values of the option it names."""
+    from stillmap.core.config import iter_options
 
     name, equals, _ = prefix.partition("=")
-    for one in described(options):
+    for one in iter_options(options):
         if not equals:
             yield f"{one.name}="
         elif one.name == name:
@@ -79,7 +81,7 @@ def assignments(options: Any, prefix: str) -> Iterator[str]:
 
 _EPILOG = """examples:
   stillmap config                       every option
-  stillmap config em.dwell              one section
+  stillmap config slam.odometry         one section
   stillmap config --set em.prior=0.8    with changes, as `stillmap map` would use them
   stillmap config > options.toml        to be changed, for `stillmap map --config options.toml`
 """
@@ -90,34 +92,38 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     p = commands.add_parser(
         "config",
         help=COMMANDS["config"],
-        description="Print every option with its default, unit and meaning, as TOML that --config "
-        "reads back. Later ones win: defaults, the file of --config, --set, other flags.",
+        description="Print every option with its default, meaning and range, as TOML that --config "
+        "reads back. Precedence: defaults < file of --config < --set < other flags.",
         epilog=_EPILOG,
     )
     only = p.add_argument(
-        "only", metavar="NAME", nargs="?", default="", help="one section or option, e.g. em.dwell"
+        "only",
+        metavar="NAME",
+        nargs="?",
+        default="",
+        help="one section or option, e.g. slam.odometry",
     )
-    only.completer = option_names  # type: ignore[attr-defined]
+    only.completer = complete_option_names  # type: ignore[attr-defined]
     p.add_argument("--json", action="store_true", help="one JSON object on stdout, by option")
     add_option_flags(p)
     p.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Prints the resolved options."""
+    """Prints the options."""
     from stillmap.core.config import to_toml
 
-    options = resolved_options(args)
-    text = to_toml(options, args.only)  # refuses a name that there is not
+    options = options_from_args(args)
+    text = to_toml(options, args.only)  # raises for unknown names
     if args.json:
-        print_json(_by_name(options, args.only))
+        print_json(_describe(options, args.only))
     else:
         print(text, end="")
     return 0
 
 
-def _by_name(options: "Options", only: str) -> dict[str, Any]:
-    from stillmap.core.config import described, is_within
+def _describe(options: "Options", only: str) -> dict[str, Any]:
+    from stillmap.core.config import is_within, iter_options
 
     return {
         one.name: {
@@ -128,6 +134,6 @@ def _by_name(options: "Options", only: str) -> dict[str, Any]:
             "range": str(one.limits) or None,
             "doc": one.doc,
         }
-        for one in described(options)
+        for one in iter_options(options)
         if is_within(one.name, only)
     }

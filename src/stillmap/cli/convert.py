@@ -114,7 +114,7 @@ def _convert_recording(
     if args.recording or args.only:
         flag = "--input" if args.recording else "--only"
         raise InputError(f"{flag} is for results", where=str(source))
-    read_options = config.replaced(ReadOptions(), read_changes(args).get("read", {}))
+    read_options = config.override(ReadOptions(), read_changes(args).get("read", {}))
     require_apart(output, source)
     writer = writers.find_writer(output, args.to)
     writers.require_free(output, writer, args.overwrite)
@@ -170,9 +170,7 @@ def _convert_result(args: argparse.Namespace, folder: Path, output: Path) -> tup
 def _convert_to_obj(args: argparse.Namespace, mapped: "ResultFolder", output: Path) -> str:
     from stillmap.results.export import obj
 
-    faces, pages = obj.write_obj(
-        mapped.folder, output, mapped.texture_quality, args.overwrite
-    )
+    faces, pages = obj.write_obj(mapped.folder, output, mapped.texture_quality, args.overwrite)
     return f"{faces} faces and {pages} page{'s' * (pages != 1)} of texture"
 
 

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.io import read
     from stillmap.preprocessing.options import ReadOptions
 
-    read_options = config.replaced(ReadOptions(), read_changes(args).get("read", {}))
+    read_options = config.override(ReadOptions(), read_changes(args).get("read", {}))
     with shown_share(args.quiet, "reading") as tell:
         recording = read(args.input, read_options, progress=tell)
     found = {"input": args.input, **facts(recording)}

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stillmap.cli.arguments import add_read_flags, read_changes, require_apart
-from stillmap.cli.config import add_option_flags, resolved_options
+from stillmap.cli.config import add_option_flags, options_from_args
 from stillmap.cli.console import files_in, print_json, say, shown_progress, shown_share
 from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError, MissingExtra
@@ -147,7 +147,7 @@ def run(args: argparse.Namespace) -> int:
     from stillmap.pipeline.checkpoint import lock_checkpoints
     from stillmap.results.save import save
 
-    options = resolved_options(args, read_changes(args), _option_changes(args))
+    options = options_from_args(args, read_changes(args), _option_changes(args))
     output, replace = Path(args.output), args.overwrite or args.resume
     _require_usable_output(args, output, replace)
     stages = StageTimer()
@@ -228,7 +228,7 @@ def _read(
     """The inputs, and the options resolved for them."""
     from stillmap.cli.rig import read_tilting
     from stillmap.io import read
-    from stillmap.pipeline.options import resolved
+    from stillmap.pipeline.options import resolve_options
 
     with stages.measure("read"):
         with shown_share(args.quiet, "reading") as tell:
@@ -236,7 +236,7 @@ def _read(
         recording = _prepare(recording, options, args)
         poses = _given_poses(recording, args)
         tilting = read_tilting(args, recording, options, scratch)
-        return _Inputs(recording, poses, tilting), resolved(options, recording)
+        return _Inputs(recording, poses, tilting), resolve_options(options, recording)
 
 
 def _prepare(recording: "Recording", options: "Options", args: argparse.Namespace) -> "Recording":

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stillmap.cli.config import add_set, assignments
+from stillmap.cli.config import add_set_flag, complete_assignments
 from stillmap.cli.console import files_in, print_json, say, shown_share
 from stillmap.cli.parser import COMMANDS
 from stillmap.core.errors import InputError
@@ -123,7 +123,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="errors of the odometry against their defaults; 0: perfect (default: %(default)g)",
     )
     others = p.add_argument_group("any other option of the scene, see docs/simulation.md")
-    add_set(others, "e.g. traffic.vehicles=3; can be given again").completer = _assignments  # type: ignore[attr-defined]
+    add_set_flag(others, "e.g. traffic.vehicles=3; can be given again").completer = _assignments  # type: ignore[attr-defined]
     p.set_defaults(run=run)
 
 
@@ -152,7 +152,7 @@ def _scene_names(**_: Any) -> Iterator[str]:
 def _assignments(prefix: str, **_: Any) -> Iterator[str]:
     from stillmap.sim import scene_by_name
 
-    found = assignments(scene_by_name("hall"), prefix)
+    found = complete_assignments(scene_by_name("hall"), prefix)
     return (text for text in found if "." in text)  # what is no section is the scene's geometry
 
 
@@ -200,7 +200,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _changes(args: argparse.Namespace) -> dict[str, Any]:
-    from stillmap.core.config import merged, parse_assignment
+    from stillmap.core.config import merge_nested, parse_assignment
     from stillmap.sim import scene_by_name
 
     changes: dict[str, dict[str, Any]] = {}
@@ -224,7 +224,7 @@ def _changes(args: argparse.Namespace) -> dict[str, Any]:
         changes["rig"] = {"tilts": True}
     elif args.lidar is not None:
         _give_to_lidar(args.lidar, changes)
-    return merged(*map(parse_assignment, args.assignments), changes)
+    return merge_nested(*map(parse_assignment, args.assignments), changes)
 
 
 def _give_to_lidar(channels: str, changes: dict[str, dict[str, Any]]) -> None:

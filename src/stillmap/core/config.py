@@ -1,4 +1,4 @@
-"""Options as frozen dataclasses: one default each, unknown keys refused, TOML in and out."""
+"""Options as frozen dataclasses with ranges; overrides from TOML files and the command line."""
 
 import dataclasses
 import json
@@ -16,8 +16,8 @@ from stillmap.core.files import read_text
 
 T = TypeVar("T")
 
-_INTEGERS_BELOW = 2**31  # the compiled core counts in 32 bits
-_LARGEST = 64 << 10  # bytes of a file: of nested keys, more take Python minutes
+_MAX_INTEGER = 2**31 - 1  # the compiled core counts in 32 bits
+_MAX_FILE_SIZE = 64 << 10  # bytes; Python needs minutes for more of nested keys
 
 
 class Limits(NamedTuple):
@@ -100,63 +100,63 @@ class Section:
         """Checks relations between options; raises ValueError."""
 
 
-def replaced(options: T, changes: Mapping[str, Any], where: str = "") -> T:
-    """`options` with nested `changes` applied; each key and type is checked.
+def override(options: T, changes: Mapping[str, Any], where: str = "") -> T:
+    """`options` with nested `changes` applied; every key, type and range is checked.
 
     Args:
-        options: a frozen dataclass, sections being dataclasses themselves.
+        options: a frozen dataclass whose sections are dataclasses.
         changes: `{"em": {"prior": 0.9}}`, as TOML gives it.
         where: the file that `changes` came from, for messages.
 
     Raises:
-        InputError: an unknown key (the nearest one is named) or a value of the wrong type.
+        InputError: an unknown key (the message names the nearest one), a value of the wrong type,
+            or one outside its range.
     """
-    return _replaced(options, changes, where, "", options)
+    return _override(options, changes, where, "", options)
 
 
-def _replaced(options: T, changes: Mapping[str, Any], where: str, prefix: str, top: Any) -> T:
+def _override(options: T, changes: Mapping[str, Any], where: str, prefix: str, top: Any) -> T:
     fields = {f.name: f for f in dataclasses.fields(options)}  # type: ignore[arg-type]
     hints = typing.get_type_hints(type(options))
     values: dict[str, Any] = {}
     for key, value in changes.items():
+        name = f"{prefix}{key}"
         if key not in fields:
-            name = f"{prefix}{key}"
-            near = closest_match(name, names(top), min_similarity=0.0)
+            near = closest_match(name, iter_names(top), min_similarity=0.0)
             raise InputError(f"unknown option '{name}'", where=where, hint=f"nearest: '{near}'")
         current = getattr(options, key)
         if dataclasses.is_dataclass(current):
             if not isinstance(value, Mapping):
-                raise InputError(f"'{prefix}{key}' is a section, not a value", where=where)
-            values[key] = _replaced(current, value, where, f"{prefix}{key}.", top)
+                raise InputError(f"'{name}' is a section, not a value", where=where)
+            values[key] = _override(current, value, where, f"{name}.", top)
         else:
             if isinstance(value, Mapping):
-                raise InputError(f"'{prefix}{key}' is a value, not a section", where=where)
-            values[key] = _coerced(value, hints[key], f"{prefix}{key}", where)
+                raise InputError(f"'{name}' is a value, not a section", where=where)
+            values[key] = _convert(value, hints[key], name, where)
     try:
         return dataclasses.replace(options, **values)  # type: ignore[type-var]
     except ValueError as error:
         raise InputError(str(error), where=where) from error
 
 
-def _coerced(value: Any, hint: Any, name: str, where: str) -> Any:
-    for choice in _alternatives(hint):
-        if typing.get_origin(choice) is typing.Literal and value in typing.get_args(choice):
+def _convert(value: Any, hint: Any, name: str, where: str) -> Any:
+    """A value as the type hint of its option wants it."""
+    for kind in _alternatives(hint):
+        if value in _choices(kind) or (kind is type(None) and value is None):
             return value
-        if choice is float and isinstance(value, int | float) and not isinstance(value, bool):
+        if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
             if not abs(value) <= sys.float_info.max:  # nan, inf, and integers beyond them
-                what = f"'{name}' wants a finite number, got {_shown(value)}"
+                what = f"'{name}' must be a finite number, got {_format(value)}"
                 raise InputError(what, where=where)
             return float(value)
-        if choice in (int, bool, str) and type(value) is choice:
-            if choice is int and abs(value) >= _INTEGERS_BELOW:
-                raise InputError(f"'{name}' is too large: {_shown(value)}", where=where)
+        if kind in (int, bool, str) and type(value) is kind:
+            if kind is int and abs(value) > _MAX_INTEGER:
+                raise InputError(f"'{name}' is too large: {_format(value)}", where=where)
             return value
-        if choice is type(None) and value is None:
-            return value
-    raise InputError(f"'{name}' wants {_type_name(hint)}, got {_shown(value)}", where=where)
+    raise InputError(f"'{name}' must be {_type_name(hint)}, got {_format(value)}", where=where)
 
 
-def _shown(value: Any) -> str:
+def _format(value: Any) -> str:
     try:
         return repr(value)
     except ValueError:  # Python writes no number of thousands of digits
@@ -167,22 +167,26 @@ def _alternatives(hint: Any) -> tuple[Any, ...]:
     return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
 
 
+def _choices(hint: Any) -> tuple[Any, ...]:
+    return typing.get_args(hint) if typing.get_origin(hint) is typing.Literal else ()
+
+
 def _type_name(hint: Any) -> str:
     if isinstance(hint, types.UnionType):
         return " or ".join(map(_type_name, _alternatives(hint)))
-    if typing.get_origin(hint) is typing.Literal:
-        return " | ".join(repr(value) for value in typing.get_args(hint))
-    return "nothing" if hint is type(None) else str(getattr(hint, "__name__", hint))
+    if choices := _choices(hint):
+        return " | ".join(map(repr, choices))
+    return "unset" if hint is type(None) else str(getattr(hint, "__name__", hint))
 
 
 def load_toml(path: Path) -> dict[str, Any]:
-    """The nested dictionary of a TOML file.
+    """Reads a TOML file.
 
     Raises:
-        InputError: it cannot be read, is no TOML, or is too large for a file of options.
+        InputError: it cannot be read, is not TOML, or is too large for a file of options.
     """
     try:
-        return tomllib.loads(read_text(path, _LARGEST))
+        return tomllib.loads(read_text(path, _MAX_FILE_SIZE))
     except (ValueError, RecursionError) as error:  # ValueError: numbers of thousands of digits too
         line = re.search(r" \(at line (\d+), column \d+\)$", str(error))
         what = str(error)[: line.start()] if line else str(error)
@@ -191,51 +195,56 @@ def load_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_assignment(text: str) -> dict[str, Any]:
-    """`section.key=value` as a nested dictionary; the value as TOML, else as a string.
+    """Parses `section.key=value` to a nested dictionary; the value is TOML, else a string.
 
-    Numbers may lack a zero that TOML wants, as in `.5`.
+    Numbers may lack a zero that TOML requires, as in `.5`.
     """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise InputError(f"--set wants section.key=value, got '{text}'")
     try:
-        read = tomllib.loads(f"value = {value}")
+        found = tomllib.loads(f"value = {value}")
     except (ValueError, RecursionError):
-        read = {}
+        found = {}
     # more than one key: the value had several lines, and only looked like TOML
-    parsed = read["value"] if len(read) == 1 else _number_or_text(value.strip())
-    nested: dict[str, Any] = {}
-    inner = nested
-    *sections, last = key.strip().split(".")
-    for section in sections:
-        inner = inner.setdefault(section, {})
-    inner[last] = parsed
-    return nested
+    nested: Any = found["value"] if len(found) == 1 else _number_or_text(value.strip())
+    for name in reversed(key.strip().split(".")):
+        nested = {name: nested}
+    return dict(nested)
 
 
 def _number_or_text(value: str) -> float | str:
     return float(value) if re.fullmatch(r"[+-]?(\d+\.|\.\d+)(e[+-]?\d+)?", value, re.I) else value
 
 
-def merged(*changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested dictionaries laid over one another; later ones win."""
+def merge_nested(*changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Merges nested dictionaries; later ones win."""
     out: dict[str, Any] = {}
     for change in changes:
         for key, value in change.items():
             if isinstance(value, Mapping) and isinstance(out.get(key), Mapping):
-                out[key] = merged(out[key], value)
+                out[key] = merge_nested(out[key], value)
             else:
                 out[key] = value
     return out
 
 
 def to_dict(options: Any) -> dict[str, Any]:
-    """The resolved options as plain nested dictionaries."""
+    """Options as plain nested dictionaries."""
     return dataclasses.asdict(options)
 
 
-class Described(NamedTuple):
-    """One option; `name` as in `em.prior`, `doc` with its meaning and unit."""
+class OptionInfo(NamedTuple):
+    """One option.
+
+    Attributes:
+        name: as in `em.prior`.
+        value, default: present and default value.
+        kind: its type, in words.
+        choices: allowed values; empty where there is a range or none.
+        limits: range of a number.
+        doc: meaning and unit.
+    """
 
     name: str
     value: Any
@@ -246,59 +255,57 @@ class Described(NamedTuple):
     doc: str
 
 
-def described(options: Any, prefix: str = "") -> Iterator[Described]:
-    """Every option of `options`, section by section, the sections' own last."""
+def iter_options(options: Any, prefix: str = "") -> Iterator[OptionInfo]:
+    """All options, section by section; options of a section come before its sub-sections."""
     hints = typing.get_type_hints(type(options))
-    fields, sections = _fields(options)
+    fields, sections = _split_fields(options)
     for f in fields:
-        hint = hints[f.name]
-        choices = [c for one in _alternatives(hint) for c in _choices(one)]
-        kind = " or ".join(
-            "str" if _choices(one) else _type_name(one) for one in _alternatives(hint)
+        kinds = _alternatives(hints[f.name])
+        yield OptionInfo(
+            name=f"{prefix}{f.name}",
+            value=getattr(options, f.name),
+            default=f.default,
+            kind=" or ".join("str" if _choices(kind) else _type_name(kind) for kind in kinds),
+            choices=tuple(choice for kind in kinds for choice in _choices(kind)),
+            limits=f.metadata.get("limits", Limits()),
+            doc=f.metadata.get("doc", ""),
         )
-        value, doc = getattr(options, f.name), f.metadata.get("doc", "")
-        limits = f.metadata.get("limits", Limits())
-        yield Described(f"{prefix}{f.name}", value, f.default, kind, tuple(choices), limits, doc)
     for f in sections:
-        yield from described(getattr(options, f.name), f"{prefix}{f.name}.")
+        yield from iter_options(getattr(options, f.name), f"{prefix}{f.name}.")
 
 
-def names(options: Any, prefix: str = "") -> Iterator[str]:
-    """The names of all options and sections."""
-    fields, sections = _fields(options)
+def iter_names(options: Any, prefix: str = "") -> Iterator[str]:
+    """Names of all options and sections."""
+    fields, sections = _split_fields(options)
     yield from (f"{prefix}{f.name}" for f in fields)
     for f in sections:
         yield f"{prefix}{f.name}"
-        yield from names(getattr(options, f.name), f"{prefix}{f.name}.")
+        yield from iter_names(getattr(options, f.name), f"{prefix}{f.name}.")
 
 
 def is_within(name: str, section: str) -> bool:
-    """Whether an option is of that section, or is the one of that name; "": all are."""
+    """Whether an option lies in a section, or has that name; "" holds all."""
     return not section or name == section or name.startswith(f"{section}.")
 
 
-def _fields(options: Any) -> tuple[list[Any], list[Any]]:
-    """Its fields that are values, and those that are sections."""
+def _split_fields(options: Any) -> tuple[list[Any], list[Any]]:
+    """Fields that are values, and those that are sections."""
     fields = dataclasses.fields(options)
     sections = [f for f in fields if dataclasses.is_dataclass(getattr(options, f.name))]
     return [f for f in fields if f not in sections], sections
 
 
-def _choices(hint: Any) -> tuple[Any, ...]:
-    return typing.get_args(hint) if typing.get_origin(hint) is typing.Literal else ()
-
-
 def to_toml(options: Any, only: str = "") -> str:
-    """Every option with its value, unit and meaning, as TOML that `--config` reads back.
+    """All options with value, meaning and range, as TOML that `--config` reads back.
 
     Args:
-        options: see `replaced`.
-        only: name of the section or of the option that is wanted; "": all.
+        options: see `override`.
+        only: name of a section or option; "": all.
 
     Raises:
-        InputError: there is neither section nor option of that name.
+        InputError: there is no section or option of that name.
     """
-    if only and only not in (known := list(names(options))):
+    if only and only not in (known := list(iter_names(options))):
         raise InputError(
             f"there is no option or section '{only}'",
             hint=f"nearest: '{closest_match(only, known, min_similarity=0.0)}'",
@@ -308,17 +315,17 @@ def to_toml(options: Any, only: str = "") -> str:
 
 def _toml_lines(options: Any, only: str) -> Iterator[str]:
     section = ""
-    for one in described(options):
+    for one in iter_options(options):
         if not is_within(one.name, only):
             continue
         before, (section, _, key) = section, one.name.rpartition(".")
         if section != before:
             yield from _heading(options, section)
-        # what may be chosen stands in the meaning already where that says what each choice does
-        listed = any(str(choice) not in one.doc for choice in one.choices)
-        allowed = " | ".join(map(str, one.choices)) if listed else str(one.limits)
+        # a doc that explains every choice lists them already
+        explained = all(str(choice) in one.doc for choice in one.choices)
+        allowed = str(one.limits) if explained else " | ".join(map(str, one.choices))
         doc = one.doc + (f" ({allowed})" if allowed else "")
-        # TOML has no null: an option that is unset stands as a comment
+        # TOML has no null: an option that is unset becomes a comment
         yield (
             f"# {key} is not set  # {doc}"
             if one.value is None
@@ -335,7 +342,7 @@ def _heading(options: Any, section: str) -> Iterator[str]:
     for name in section.split("."):
         options = getattr(options, name)
     yield ""
-    said = (type(options).__doc__ or "").partition("\n")[0]
-    if not said.startswith(f"{type(options).__name__}("):  # what dataclasses say by themselves
-        yield f"# {said}"
+    summary = (type(options).__doc__ or "").partition("\n")[0]
+    if not summary.startswith(f"{type(options).__name__}("):  # written by dataclasses
+        yield f"# {summary}"
     yield f"[{section}]"

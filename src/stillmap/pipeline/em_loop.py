@@ -13,7 +13,7 @@ from stillmap.core.parallel import limit_blas_threads, resolve_threads
 from stillmap.core.profiling import Progress, StageTimer, no_progress
 from stillmap.core.recording import Recording
 from stillmap.pipeline.estimate import EmState, Estimate, Iteration, IterationRecord
-from stillmap.pipeline.options import DEFAULTS, Options, resolved
+from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 
 Float = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def iterate(
         raise ValueError(f"poses: expected {wanted}, got {poses.shape}")
     if scratch is not None:
         recording = dataclasses.replace(recording, scratch=scratch)
-    stages, options = stages or StageTimer(), resolved(options, recording)
+    stages, options = stages or StageTimer(), resolve_options(options, recording)
     threads = resolve_threads(options.threads)
     first = 1 if after is None else after.number + 1
     for number in range(first, em.max_iterations(options.estimator, options.em) + 1):

@@ -24,11 +24,11 @@ class OutputOptions(Section, section="output"):
 
     map_mode: MapMode = option(
         "trinary",
-        "pixels of the map picture: trinary (occupied, unknown, free), scale (grey between the "
-        "thresholds; a .png, as unknown needs transparency) or raw (percent occupied, 255 unknown)",
+        "Pixel encoding of the map image: trinary (occupied, unknown, free), scale (grey levels; "
+        "PNG with transparency) or raw (occupancy in percent, 255 unknown).",
     )
     map_state: MapState = option(
-        "last", "of places that changed the map shows the last state, or the one held for longest"
+        "last", "State of changed places shown in the map: the last one, or the one held longest."
     )
     min_obstacle_height: float = option(
         0.2,
@@ -61,8 +61,8 @@ class Options(Section):
     # spelled out: ruff takes the default for mutable under an alias
     estimator: Literal["stillmap", "paper", "hit-ratio", "tracker"] = option(
         "stillmap",
-        "what says which beams are static; paper: (8) as printed, hit-ratio: counting, "
-        "tracker: all that are not on people who are tracked",
+        "How beams are labelled: stillmap (occupancy HMM), paper (equation 8 as printed), "
+        "hit-ratio (counting), or tracker (people tracking).",
     )
     read: ReadOptions = field(default=ReadOptions())
     em: EmOptions = field(default=EmOptions())
@@ -75,23 +75,22 @@ class Options(Section):
 
 DEFAULTS = Options()
 
-# m, edges of voxels; depth cameras see people from near by, and within few of the larger ones
-_VOXEL, _OF_DEPTH = 0.15, 0.05
+_VOXEL_SIZE = 0.15  # m
+_DEPTH_VOXEL_SIZE = 0.05  # m, of depth cameras, which see people close by
 
 
-def resolved(options: Options, recording: Recording) -> Options:
-    """The options as they will be used.
+def resolve_options(options: Options, recording: Recording) -> Options:
+    """Options as a run uses them.
 
-    The printed method has poses by (9) alone, scan by scan, and takes scans as taken at once. The
-    cells of 3D recordings are voxels.
+    Sets the voxel size of 3D recordings. The printed method estimates poses by (9) alone, scan by
+    scan, and does not deskew.
     """
     if recording.dimension == 3:
-        voxel = options.slam.voxel_size or (
-            _OF_DEPTH if depth_camera_names(recording.source) else _VOXEL
-        )
-        slam_options = dataclasses.replace(options.slam, voxel_size=voxel, resolution=voxel)
-        options = dataclasses.replace(options, slam=slam_options)
-    if options.estimator != "paper":
-        return options
-    slam_options = dataclasses.replace(options.slam, loop_closure=False, deskew=False)
-    return dataclasses.replace(options, slam=slam_options)
+        default = _DEPTH_VOXEL_SIZE if depth_camera_names(recording.source) else _VOXEL_SIZE
+        voxel = options.slam.voxel_size or default
+        slam = dataclasses.replace(options.slam, voxel_size=voxel, resolution=voxel)
+        options = dataclasses.replace(options, slam=slam)
+    if options.estimator == "paper":
+        slam = dataclasses.replace(options.slam, loop_closure=False, deskew=False)
+        options = dataclasses.replace(options, slam=slam)
+    return options

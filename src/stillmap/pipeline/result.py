@@ -18,7 +18,7 @@ from stillmap.pipeline.diagnostics import find_warnings
 from stillmap.pipeline.em_loop import run_em
 from stillmap.pipeline.estimate import EmState, Estimate, IterationRecord
 from stillmap.pipeline.final_map import Maps, final_estimate, find_objects, make_maps
-from stillmap.pipeline.options import DEFAULTS, Options, resolved
+from stillmap.pipeline.options import DEFAULTS, Options, resolve_options
 from stillmap.pipeline.snapshots import Snapshot
 from stillmap.tracking import FlowMap, MovingObject, compute_flow_map
 
@@ -144,7 +144,7 @@ def map_recording(
     if scratch is not None:
         recording = dataclasses.replace(recording, scratch=scratch)
     stages = stages or StageTimer()
-    options = resolved(options, recording)
+    options = resolve_options(options, recording)
     state = resume or EmState(options)
     # given poses leave nothing to iterate on in 3D, where the E-step does not depend on the labels
     state.single_pass = (
