@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from stillmap import _core
 from stillmap.core import se2
-from stillmap.sim.laser import Movers, beam_angles, cast
+from stillmap.sim.laser import Movers, cast_beams, compute_beam_angles
 from stillmap.sim.walls import box, pillar, polyline
-from stillmap.slam.scan_matching import SurfaceOptions
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -43,11 +42,11 @@ def scan() -> Callable[..., Points]:
     """Takes one scan: (N, 2) end points in the sensor frame, all round."""
 
     def take(walls: Float, pose: Float, seed: int = 0, noise: float = 0.01) -> Points:
-        angles = beam_angles(240, 2 * np.pi)
+        angles = compute_beam_angles(240, 2 * np.pi)
         nobody = Movers(
             np.zeros((1, 0, 2)), np.zeros((1, 0)), np.zeros((0, 2)), np.zeros(0, np.int32)
         )
-        ranges = cast(np.array([pose], float), angles, walls, nobody).range[0]
+        ranges = cast_beams(np.array([pose], float), angles, walls, nobody).range[0]
         ranges = ranges + noise * np.random.default_rng(seed).standard_normal(len(ranges))
         back = ranges < 30.0
         directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -81,7 +80,4 @@ def add(grid: _core.OccupancyGrid2D, points: Points, pose: Float, e: float = 1.0
     weights = np.full(n, e, np.float32)
     beams = points, np.ones(n, bool), weights, np.array([0, n]), se2.matrix(*pose)[None]
     _core.add_beams(grid, *beams)
-    gaps = SurfaceOptions()
-    _core.interpolate_end_points(
-        grid, *beams, max_gap=gaps.gap, tolerance=gaps.straight, max_gap_ratio=gaps.growth
-    )
+    _core.interpolate_end_points(grid, *beams, max_gap=1.5, tolerance=0.1, max_gap_ratio=3.0)

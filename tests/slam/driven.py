@@ -5,10 +5,8 @@ import numpy as np
 from stillmap.core import se2
 from stillmap.sim import RobotOptions, Scene, simulate
 from stillmap.sim.options import CrowdOptions, OdometryOptions
-from stillmap.slam import SlamOptions, local_map
-from stillmap.slam.loop_types import LoopContext
-
-OPTIONS = SlamOptions()
+from stillmap.slam import local_map
+from stillmap.slam.types import LoopContext
 
 
 def driven(walls, route, laser, speed=1.0):
@@ -33,7 +31,6 @@ def driven(walls, route, laser, speed=1.0):
         np.ones(len(poses)),
         local_map.select_keyframes(poses, 1.0, 0.5),
         0.05,
-        OPTIONS.registration,
-        OPTIONS.surface,
-        OPTIONS.loops,
+        1.0,
+        6.0,
     )

@@ -8,7 +8,7 @@ import pytest
 from stillmap import _core
 from stillmap.core import se2
 from stillmap.sim import scene_by_name, simulate
-from stillmap.slam import SlamOptions
+from stillmap.slam import SlamOptions, local_map
 from stillmap.slam.local_map import LocalMap
 
 OPTIONS = SlamOptions()
@@ -19,11 +19,11 @@ def hall():
     return simulate(scene_by_name("hall", {"robot": {"scans": 120}}), 1)
 
 
-def empty(e=None, spacing=OPTIONS.spacing):
+def empty(e=None):
     recording = hall().recording
     e = np.full(recording.n_beams, 0.9, np.float32) if e is None else e
-    grid = _core.OccupancyGrid2D(OPTIONS.resolution, OPTIONS.registration.approach)
-    return LocalMap(grid, recording, e, spacing, OPTIONS.surface)
+    grid = _core.OccupancyGrid2D(OPTIONS.resolution, 0.5)
+    return LocalMap(grid, recording, e)
 
 
 def assert_same(one, other):
@@ -52,10 +52,10 @@ def test_it_forgets_to_the_bit():
         all_of_it.add(t, poses[t], 0.1 * t)
         if t >= 60:
             rest.add(t, poses[t], 0.1 * t)
-    all_of_it.forget(6.0)
+    all_of_it.remove_before(6.0)
     assert_same(all_of_it.grid, rest.grid)
     assert_same(rest.grid, all_of_it.grid)
-    all_of_it.forget(np.inf)
+    all_of_it.remove_before(np.inf)
     assert not any(sums.any() for sums in all_of_it.grid.dense()[1:])
 
 
@@ -65,8 +65,8 @@ def test_it_forgets_nothing_too_early():
     for t in range(0, 120, 4):
         one.add(t, poses[t], 0.1 * t)
         other.add(t, poses[t], 0.1 * t)
-    one.forget(0.0)
-    one.forget(-np.inf)
+    one.remove_before(0.0)
+    one.remove_before(-np.inf)
     assert_same(one.grid, other.grid)
 
 
@@ -80,9 +80,10 @@ def test_it_forgets_nothing_too_early():
         ((0.12, 0.0, 0.12), True),
     ],
 )
-def test_scans_that_show_the_same_are_left_out(move, kept):
+def test_scans_that_show_the_same_are_left_out(monkeypatch, move, kept):
     # scan 1 is taken 0.2 s later, which counts as 0.04 of the 5 s that make a scan worth keeping
-    so_far, first = empty(spacing=0.2 + 0.04), empty(spacing=0.2 + 0.04)
+    monkeypatch.setattr(local_map, "SCAN_SPACING", 0.2 + 0.04)
+    so_far, first = empty(), empty()
     so_far.add(0, np.eye(3), 0.0)
     first.add(0, np.eye(3), 0.0)
     so_far.add(1, se2.matrix(*move), 0.2)
@@ -90,10 +91,11 @@ def test_scans_that_show_the_same_are_left_out(move, kept):
     assert (after > before) == kept
 
 
-def test_who_stands_still_is_looked_at_again_after_a_while():
+def test_who_stands_still_is_looked_at_again_after_a_while(monkeypatch):
     # 0.2 per second: 24 scans are 4.8 s, 26 are 5.2 s and count as much as 1.04 m
+    monkeypatch.setattr(local_map, "SCAN_SPACING", 1.0)
     for t, kept in ((24, False), (26, True)):
-        so_far = empty(spacing=1.0)
+        so_far = empty()
         so_far.add(0, np.eye(3), 0.0)
         before = so_far.grid.dense()[1].sum()
         so_far.add(t, np.eye(3), 0.0)
@@ -107,10 +109,10 @@ def test_scans_can_be_taken_back():
         other.add(t, T[t], 0.1 * t)
         if t < 30:
             one.add(t, T[t], 0.1 * t)
-    other.forget_since(30)
+    other.remove_since(30)
     assert_same(one.grid, other.grid)
-    other.forget_since(0)
-    assert not other.has(0)
+    other.remove_since(0)
+    assert not other.has_sensor(0)
 
 
 def test_each_laser_has_its_own_scans():
@@ -119,11 +121,9 @@ def test_each_laser_has_its_own_scans():
     recording, T = simulation.recording, simulation.truth.T_world_base
     assert recording.sensor[:4].tolist() == [0, 1, 0, 1]
     e = np.full(recording.n_beams, 0.9, np.float32)
-    so_far = LocalMap(
-        _core.OccupancyGrid2D(0.05, 0.5), recording, e, OPTIONS.spacing, OPTIONS.surface
-    )
+    so_far = LocalMap(_core.OccupancyGrid2D(0.05, 0.5), recording, e)
     so_far.add(0, T[0], 0.0)
-    assert so_far.has(0)
-    assert not so_far.has(1)
+    assert so_far.has_sensor(0)
+    assert not so_far.has_sensor(1)
     so_far.add(1, T[1], 0.0)  # as near as that: but it looks to the other side
-    assert so_far.has(1)
+    assert so_far.has_sensor(1)

@@ -14,7 +14,6 @@ from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
 from stillmap.slam import SlamOptions, m_step, odometry_2d
-from stillmap.slam.loop_types import LoopOptions
 
 OPTIONS = SlamOptions()
 
@@ -104,7 +103,7 @@ def test_the_grid_is_what_the_poses_make():
     e = np.random.default_rng(0).random(recording.n_beams).astype(np.float32)
     so_far = build(recording, e)
     assert so_far.grid.dense()[1].size == 0  # it is made once, at the end
-    open_ends = dataclasses.replace(OPTIONS, loops=LoopOptions(enabled=False))
+    open_ends = SlamOptions(loop_closure=False)
     mapped = m_step(recording, e, open_ends, None, 1, silent)
     np.testing.assert_array_equal(mapped.poses, so_far.poses)
     grid = _core.OccupancyGrid2D(OPTIONS.resolution)
@@ -233,7 +232,7 @@ def test_nothing_but_such_scans_leaves_odometry(how):
 def test_one_scan():
     mapped = build(small_room(scans=1).recording)
     np.testing.assert_array_equal(mapped.poses, np.eye(3)[None])
-    assert mapped.widened == []
+    assert mapped.diagnostics.widened == []
 
 
 def test_progress_counts_every_scan():
@@ -257,7 +256,7 @@ def test_given_poses_are_not_touched():
     em.add_recording(grid, recording, poses, e)
     for one in mapped:
         assert one.poses is poses
-        assert one.widened == []
+        assert one.diagnostics.widened == []
         for ours, theirs in zip(one.grid.dense(), grid.dense(), strict=True):
             np.testing.assert_array_equal(ours, theirs)
 

@@ -12,14 +12,20 @@ from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.sim import RobotOptions, Scene, scene_by_name, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
-from stillmap.slam import SlamOptions, local_map, loop_types, m_step, odometry_2d
+from stillmap.slam import (
+    SlamOptions,
+    local_map,
+    loop_candidates,
+    loop_verification,
+    m_step,
+    odometry_2d,
+)
 from stillmap.slam.loop_candidates import odometry_constraints, reject_inconsistent
 from stillmap.slam.loop_closure import close_loops
-from stillmap.slam.loop_types import LoopClosure, LoopContext, LoopOptions
-from stillmap.slam.odometry_2d import MStepResult
+from stillmap.slam.types import LoopClosure, LoopContext, MStepResult
 
 OPTIONS = SlamOptions()
-OPEN = dataclasses.replace(OPTIONS, loops=dataclasses.replace(OPTIONS.loops, enabled=False))
+OPEN = SlamOptions(loop_closure=False)
 REASONS = {"explains too little", "closures around disagree", "other loops disagree"}
 
 
@@ -97,7 +103,7 @@ def test_a_square_with_drift_closes():
         poses.append(poses[-1] @ step)
     n = len(poses)
     drifted = MStepResult(
-        np.array(poses), np.zeros((n, 3, 3)), _core.OccupancyGrid2D(0.05), np.ones(n), []
+        np.array(poses), np.zeros((n, 3, 3)), _core.OccupancyGrid2D(0.05), np.ones(n)
     )
     before = compute_absolute_errors(drifted.poses, truth)
     e = np.full(simulation.recording.n_beams, 0.9, np.float32)
@@ -142,21 +148,21 @@ def test_a_straight_way_has_no_loops():
     assert mapped(dataclasses.replace(repetitive(), recording=short)).loops == []
 
 
-def test_refusals_carry_reasons():
+def test_refusals_carry_reasons(monkeypatch):
     found = mapped(square())
     refused = {closure.refused for closure in found.loops} - {""}
     assert refused <= REASONS
-    strict = dataclasses.replace(OPTIONS, loops=LoopOptions(accept_above=1.0))
-    assert {c.refused for c in mapped(square(), strict).loops} == {"explains too little"}
-    lonely = dataclasses.replace(OPTIONS, loops=LoopOptions(agreeing=100))
-    assert "" not in {c.refused for c in mapped(square(), lonely).loops}
+    with monkeypatch.context() as patch:
+        patch.setattr(loop_verification, "MIN_EXPLAINED", 1.0)
+        assert {c.refused for c in mapped(square()).loops} == {"explains too little"}
+    monkeypatch.setattr(loop_candidates, "_MIN_AGREEING", 100)
+    assert "" not in {c.refused for c in mapped(square()).loops}
 
 
 def track_of(recording, poses, travelled, frames):
     """What loops are looked for in; all of it is explained, and no beam is believed."""
     e, explained = np.zeros(recording.n_beams, np.float32), np.ones(len(poses))
-    steering = OPTIONS.registration, OPTIONS.surface, OPTIONS.loops
-    return LoopContext(recording, e, poses, travelled, explained, frames, 0.05, *steering)
+    return LoopContext(recording, e, poses, travelled, explained, frames, 0.05, 1.0, 6.0)
 
 
 def straight_track():
@@ -178,7 +184,7 @@ def closures(shifts):
 
 def test_one_closure_that_wants_something_else_is_refused():
     track = straight_track()
-    way = odometry_constraints(track, OPTIONS.motion, [])
+    way = odometry_constraints(track, OPTIONS.odometry, [])
     shifts = [0.5] * 8
     shifts[4] = -0.5
     refused = [c.refused for c in reject_inconsistent(track, way, closures(shifts))]
@@ -187,7 +193,7 @@ def test_one_closure_that_wants_something_else_is_refused():
 
 def test_a_closure_on_its_own_is_refused():
     track = straight_track()
-    way = odometry_constraints(track, OPTIONS.motion, [])
+    way = odometry_constraints(track, OPTIONS.odometry, [])
     assert [bool(c.refused) for c in reject_inconsistent(track, way, closures([0.1]))] == [True]
 
 
@@ -198,7 +204,7 @@ def test_a_way_that_odometry_contradicts_is_loose():
     at = int(frames[5]) + 1
     poses[at:] = se2.matrix(0.0, 0.8, 0.0) @ poses[at:]  # a leap of 0.8 m in the map's y
     track = track_of(recording, poses, local_map.travelled_distance(poses), frames)
-    way = odometry_constraints(track, OPTIONS.motion, [])
+    way = odometry_constraints(track, OPTIONS.odometry, [])
     widths = np.array([np.sqrt(np.linalg.eigvalsh(r.covariance[:2, :2]).max()) for r in way])
     assert widths[5] == pytest.approx(0.8, abs=0.1)
     assert np.delete(widths, 5).max() < 0.1
@@ -298,12 +304,6 @@ def test_hardly_any_scans(scans):
     assert np.all(np.isfinite(found.poses))
 
 
-def test_limits():
-    for name, value in (("distance", 0.0), ("accept_above", 1.5), ("sigma_rotation", 0.0)):
-        with pytest.raises(ValueError, match=rf"slam\.loops\.{name}"):
-            LoopOptions(**{name: value})
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_corridors_close(seed):
@@ -311,22 +311,21 @@ def test_corridors_close(seed):
     assert ate(mapped(simulation), simulation) < 0.03
 
 
-def test_drift_grows_with_the_way_and_then_no_more():
-    options = LoopOptions(drift_until=500.0)
-    near, far, lost = (loop_types.drift(metres, options) for metres in (50.0, 500.0, 1e6))
+def test_drift_grows_with_the_way_and_then_no_more(monkeypatch):
+    monkeypatch.setattr(loop_candidates, "_MAX_DRIFT_TRAVEL", 500.0)
+    near, far, lost = (loop_candidates.drift_std(metres) for metres in (50.0, 500.0, 1e6))
     assert near < far == lost
     assert lost == pytest.approx((500 * 0.006, 500 * 0.0003), rel=0.03)
 
 
-def test_many_stages_are_as_good_as_few():
+def test_many_stages_are_as_good_as_few(monkeypatch):
     # the poses of a stage are carried on to the next: what is off a rotation must not add up
-    few, many = (
-        mapped(repetitive(), dataclasses.replace(OPTIONS, loops=loops))
-        for loops in (
-            dataclasses.replace(OPTIONS.loops, distance=0.4, stage=stage, stage_share=0.0)
-            for stage in (10.0, 0.1)
-        )
-    )
+    monkeypatch.setattr(loop_candidates, "_STAGE_SHARE", 0.0)
+    found = []
+    for stage in (10.0, 0.1):
+        monkeypatch.setattr(loop_candidates, "_MIN_STAGE", stage)
+        found.append(mapped(repetitive(), SlamOptions(keyframe_distance=0.4)))
+    few, many = found
     accepted = [sum(not c.refused for c in found.loops) for found in (few, many)]
     assert accepted[1] > 0.9 * accepted[0] > 20
     assert ate(many, repetitive()) < ate(few, repetitive()) + 0.01

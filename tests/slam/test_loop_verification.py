@@ -1,6 +1,5 @@
 """Views from the other side: the backs of walls say nothing, and who comes back looks alike."""
 
-import dataclasses
 import functools
 
 import numpy as np
@@ -11,16 +10,16 @@ from stillmap import _core
 from stillmap.core import se2
 from stillmap.sim.options import LaserOptions
 from stillmap.sim.walls import box
-from stillmap.slam import loop_candidates
-from stillmap.slam.loop_types import LoopCandidate
+from stillmap.slam import loop_candidates, loop_verification
 from stillmap.slam.loop_verification import (
-    _comparable,
     _points_before_ends,
+    _select_comparable,
     build_submap,
     verify_candidate,
     verify_candidates,
 )
 from stillmap.slam.scan_matching import Scan
+from stillmap.slam.types import LoopCandidate
 
 
 @functools.cache
@@ -31,9 +30,8 @@ def divided(width):
     return driven(walls, route, LaserOptions(beams=180, max_range=30.0))
 
 
-def over_the_wall(track, before):
+def over_the_wall(track):
     """(N, 3) by what closures over the wall miss the truth, and their chi-square (N,)."""
-    track = dataclasses.replace(track, options=dataclasses.replace(track.options, before=before))
     x, off, chi = se2.parameters(track.poses), [], []
     south = [k for k in track.keyframes if track.travelled[k] < 16.0]
     north = [k for k in track.keyframes if track.travelled[k] > 28.0]
@@ -49,17 +47,19 @@ def over_the_wall(track, before):
     return np.array(off).reshape(-1, 3), np.array(chi)
 
 
-def test_the_back_of_a_wall_is_not_its_front():
+def test_the_back_of_a_wall_is_not_its_front(monkeypatch):
     # as far as what is seen goes, the room beyond a wall could begin where that on this side ends
-    off, _ = over_the_wall(divided(14), before=0.0)
+    monkeypatch.setattr(loop_verification, "_OBSERVED_MARGIN", 0.0)
+    off, _ = over_the_wall(divided(14))
     np.testing.assert_allclose(off[:, 1], 0.2, atol=0.03)
-    off, _ = over_the_wall(divided(14), before=1.0)
+    monkeypatch.undo()
+    off, _ = over_the_wall(divided(14))
     assert len(off) == 0
 
 
 @pytest.mark.parametrize("width", [5, 7])
 def test_what_is_seen_beside_a_wall_puts_a_view_beyond_it(width):
-    off, chi = over_the_wall(divided(width), before=1.0)
+    off, chi = over_the_wall(divided(width))
     assert len(off) >= 3
     assert np.abs(off[:, 1]).max() < 0.02
     assert np.abs(off[:, 2]).max() < 0.01
@@ -110,7 +110,7 @@ def test_where_a_keyframe_looks_by_hand():
     )
 
 
-def test_comparable_is_what_was_looked_at_from_the_same_side():
+def test_select_comparable_is_what_was_looked_at_from_the_same_side():
     # one beam along x that ends at 5 m: the wall is seen from the left
     grid = _core.OccupancyGrid2D(0.1, 0.5)
     T = np.eye(3)[None]
@@ -122,7 +122,7 @@ def test_comparable_is_what_was_looked_at_from_the_same_side():
     view = Scan(ends, weights, np.eye(3))
     # from the left, from the right, and where nobody looked
     before = ends + np.array([[-1, 0], [1, 0], [-1, 0]], np.float32)
-    part, share = _comparable(grid, view, before, np.eye(3))
+    part, share = _select_comparable(grid, view, before, np.eye(3))
     np.testing.assert_array_equal(part.weights, np.array([0.5, 0.0, 0.0], np.float32))
     assert share == pytest.approx(0.5)
     assert part.points is view.points

@@ -46,8 +46,8 @@ def survived(T_odom_base):
     recording = dataclasses.replace(room().recording, T_odom_base=T_odom_base)
     found = followed(recording)
     assert compute_absolute_errors(found.poses, room().truth.T_world_base).rmse < 0.01
-    assert found.breaks == []
-    return found.odometry_faults
+    assert found.diagnostics.breaks == []
+    return found.diagnostics.odometry_faults
 
 
 def steps():
@@ -122,7 +122,7 @@ def test_a_robot_that_stops_between_bare_walls_has_stopped():
     noise = np.random.default_rng(0).normal(0.0, 0.01, again.points.shape).astype(np.float32)
     again = dataclasses.replace(again, points=again.points + noise)
     found = followed(again)
-    assert found.odometry_faults == []
+    assert found.diagnostics.odometry_faults == []
     assert compute_absolute_errors(found.poses, T[stood]).rmse < 0.1
 
 
@@ -135,8 +135,8 @@ def test_a_robot_that_was_carried_and_put_down_stands():
         odom[29] @ se2.inverse(odom[30]) @ odom[30:]
     )  # wheels do not turn when it is carried
     found = followed(dataclasses.replace(recording, T_odom_base=odom))
-    assert found.breaks == [30]
-    assert found.odometry_faults == [30]
+    assert found.diagnostics.breaks == [30]
+    assert found.diagnostics.odometry_faults == [30]
     assert compute_absolute_errors(found.poses[30:], T[30:]).rmse < 0.02
 
 
@@ -146,7 +146,7 @@ def test_nothing_is_followed_by_scans_that_hit_nothing():
     hit = recording.hit.copy()
     hit[recording.offset[20] :] = False
     found = followed(dataclasses.replace(recording, hit=hit))
-    assert found.odometry_faults == []
+    assert found.diagnostics.odometry_faults == []
     np.testing.assert_allclose(found.poses[20:], found.poses[20:21].repeat(30, axis=0), atol=1e-9)
 
 

@@ -10,7 +10,7 @@ from stillmap import _core
 from stillmap.core import se2, se3
 from stillmap.eval.trajectory import compute_absolute_errors, compute_relative_errors
 from stillmap.slam import constant_velocity, lidar_odometry
-from stillmap.slam.motion_model import MotionOptions
+from stillmap.slam.options import OdometryOptions
 
 ROOM = [
     [0.0, 0.0, 1.0, 16.0, 11.0, 3.2, 0, 0, 0],
@@ -35,10 +35,9 @@ def _silent(*_):
     pass
 
 
-def built(recording, e=None, threads=1, **changes):
+def built(recording, e=None, threads=1):
     e = np.ones(recording.n_beams, np.float32) if e is None else e
-    options = replace(lidar_odometry.SpinningOptions(), **changes)
-    return lidar_odometry.register_sweeps(recording, e, options, MotionOptions(), _silent, threads)
+    return lidar_odometry.register_sweeps(recording, e, OdometryOptions(), _silent, threads)
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +121,7 @@ def test_odometry_holds_where_nothing_is_seen():
 
 def test_odometry_that_lies_is_disbelieved():
     state = constant_velocity.initial_state(np.array([1.0, 0, 0, 0, 0, 0]), 0.2, 0.2)
-    options = MotionOptions()
+    options = OdometryOptions()
     leap = se3.exp(np.array([3.0, 0, 0, 0, 0, 0]))
     assert constant_velocity.update_with_odometry(state, leap, 0.1, options) is state
     true = constant_velocity.update_with_odometry(

@@ -7,9 +7,10 @@ import pytest
 
 from stillmap.core import se2
 from stillmap.slam import motion_model
-from stillmap.slam.motion_model import MotionOptions, VelocityNoise
+from stillmap.slam.motion_model import VelocityNoise
+from stillmap.slam.options import OdometryOptions
 
-OPTIONS = MotionOptions()
+OPTIONS = OdometryOptions()
 T0 = se2.matrix(3.0, -1.0, 2.0)
 
 
@@ -23,15 +24,15 @@ def test_a_constant_velocity_repeats_the_last_motion():
     step = se2.matrix(0.3, 0.0, 0.1)
     prior = motion_model.constant_velocity_prior(T0 @ step, T0, VelocityNoise(0.2, 0.3))
     np.testing.assert_allclose(prior.T_map_base, T0 @ step @ step, atol=1e-14)
-    assert prior.sigma_translation == 0.2
-    assert prior.sigma_rotation == 0.3
-    assert not prior.measured
+    assert prior.translation_std == 0.2
+    assert prior.rotation_std == 0.3
+    assert not prior.is_odometry
 
 
-def test_how_steady_the_motion_is_by_hand():
+def test_how_steady_the_motion_is_by_hand(monkeypatch):
     # 0.75 * 0.4^2 + 0.25 * (0.2^2 + 0.4^2) / 2 = 0.145 m^2, 0.75 * 0.2^2 + 0.25 * 0.6^2 rad^2
-    options = MotionOptions(steady_rate=0.25)
-    after = VelocityNoise(0.4, 0.2).after(np.array([0.2, -0.4, 0.6]), 0.1, options)
+    monkeypatch.setattr(motion_model, "_FORGETTING", 0.25)
+    after = VelocityNoise(0.4, 0.2).update(np.array([0.2, -0.4, 0.6]), 0.1)
     assert after.translation == pytest.approx(np.sqrt(0.145))
     assert after.rotation == pytest.approx(np.sqrt(0.12))
 
@@ -42,12 +43,9 @@ def test_how_steady_the_motion_is_by_hand():
     [(0.01, 0.02, 0.02), (0.2, 0.04, 0.08), (1.0, 0.15, 0.15)],
 )
 def test_a_robot_that_was_steady_may_still_turn(seconds, metres, radians):
-    found = motion_model.unknown_steadiness(OPTIONS)
-    assert found == VelocityNoise(
-        OPTIONS.without_odometry_translation, OPTIONS.without_odometry_rotation
-    )
+    found = VelocityNoise()
     for _ in range(200):
-        found = found.after(np.zeros(3), seconds, OPTIONS)
+        found = found.update(np.zeros(3), seconds)
     assert found.translation == pytest.approx(metres)
     assert found.rotation == pytest.approx(radians)
 
@@ -62,36 +60,36 @@ def test_steps_that_nobody_made_are_told_from_the_others():
 
 
 def test_widths_by_hand():
-    # 0.5 m and 0.4 rad: 0.01 + 0.2 * 0.5 + 0.3 * 0.4 = 0.23 m, 0.02 + 0.1 * 0.5 + 0.5 * 0.4 rad
-    options = MotionOptions(0.01, 0.2, 0.3, 0.02, 0.1, 0.5)
+    # 0.5 m and 0.4 rad: 0.02 + 0.2 * 0.5 + 0.3 * 0.4 = 0.24 m, 0.02 + 0.1 * 0.5 + 0.5 * 0.4 rad
+    options = OdometryOptions(0.2, 0.3, 0.1, 0.5)
     prior = motion_model.odometry_prior(T0, se2.matrix(0.3, 0.4, -0.4), options)
-    assert prior.sigma_translation == pytest.approx(0.23)
-    assert prior.sigma_rotation == pytest.approx(0.27)
-    np.testing.assert_allclose(prior.information, np.diag([0.23**-2, 0.23**-2, 0.27**-2]))
+    assert prior.translation_std == pytest.approx(0.24)
+    assert prior.rotation_std == pytest.approx(0.27)
+    np.testing.assert_allclose(prior.information, np.diag([0.24**-2, 0.24**-2, 0.27**-2]))
 
 
 def test_standing_still_is_the_surest():
     still = motion_model.odometry_prior(T0, np.eye(3), OPTIONS)
     for increment in (se2.matrix(0.1, 0, 0), se2.matrix(0, 0, -0.1), se2.matrix(-0.1, 0, 0)):
         moving = motion_model.odometry_prior(T0, increment, OPTIONS)
-        assert moving.sigma_translation > still.sigma_translation > 0
-        assert moving.sigma_rotation > still.sigma_rotation > 0
+        assert moving.translation_std > still.translation_std > 0
+        assert moving.rotation_std > still.rotation_std > 0
 
 
 def test_widened_is_never_narrower():
     prior = motion_model.odometry_prior(T0, se2.matrix(0.5, 0, 0), OPTIONS)
-    wide = motion_model.widen_prior(prior, 10 * prior.sigma_translation, 0.1 * prior.sigma_rotation)
-    assert wide.sigma_translation == pytest.approx(10 * prior.sigma_translation)
-    assert wide.sigma_rotation == prior.sigma_rotation
+    wide = motion_model.widen_prior(prior, 10 * prior.translation_std, 0.1 * prior.rotation_std)
+    assert wide.translation_std == pytest.approx(10 * prior.translation_std)
+    assert wide.rotation_std == prior.rotation_std
     np.testing.assert_allclose(wide.T_map_base, prior.T_map_base, atol=1e-15)
-    np.testing.assert_allclose(np.diag(wide.information)[:2], wide.sigma_translation**-2)
+    np.testing.assert_allclose(np.diag(wide.information)[:2], wide.translation_std**-2)
 
 
 def test_poses_stay_poses_however_long_the_chain():
     # R R'^T R multiplies what rounding leaves beside a rotation by 2.4 from scan to scan
     before, now = T0, T0 @ se2.matrix(0.1, 0.01, 0.3)
     by_odometry, step = T0, se2.matrix(0.1, 0.01, 0.3)
-    unsure = motion_model.unknown_steadiness(OPTIONS)
+    unsure = VelocityNoise()
     for _ in range(300):
         before, now = now, motion_model.constant_velocity_prior(now, before, unsure).T_map_base
         by_odometry = motion_model.odometry_prior(by_odometry, step, OPTIONS).T_map_base
@@ -103,17 +101,9 @@ def test_poses_stay_poses_however_long_the_chain():
 
 def test_every_width_can_be_chosen():
     increment = se2.matrix(0.2, 0.1, 0.3)
-    for name in (f.name for f in dataclasses.fields(MotionOptions)):
-        if name in ("acceleration", "turn_acceleration", "unannounced", "steady_rate"):
-            continue  # of guesses without odometry, see above
+    for name in (f.name for f in dataclasses.fields(OdometryOptions)):
         more = dataclasses.replace(OPTIONS, **{name: 2 * getattr(OPTIONS, name)})
-        if name.startswith("without"):
-            a, b = (
-                motion_model.constant_velocity_prior(T0, T0, motion_model.unknown_steadiness(o))
-                for o in (OPTIONS, more)
-            )
-        else:
-            a, b = (motion_model.odometry_prior(T0, increment, o) for o in (OPTIONS, more))
+        a, b = (motion_model.odometry_prior(T0, increment, o) for o in (OPTIONS, more))
         rotation = "rotation" in name
-        assert (b.sigma_rotation > a.sigma_rotation) == rotation
-        assert (b.sigma_translation > a.sigma_translation) != rotation
+        assert (b.rotation_std > a.rotation_std) == rotation
+        assert (b.translation_std > a.translation_std) != rotation

@@ -7,10 +7,9 @@ import pytest
 
 from stillmap import _core
 from stillmap.core import se2
+from stillmap.slam import scan_matching
 from stillmap.slam.motion_model import MotionPrior
-from stillmap.slam.scan_matching import RegistrationOptions, Scan, match_scan, search_pose
-
-OPTIONS = RegistrationOptions()
+from stillmap.slam.scan_matching import Scan, match_scan, search_pose
 
 
 def prior_at(pose, translation=0.1, rotation=0.1):
@@ -18,9 +17,9 @@ def prior_at(pose, translation=0.1, rotation=0.1):
     return MotionPrior(se2.matrix(*pose), information, translation, rotation)
 
 
-def placed(grid, points, weights, prior, options=OPTIONS, other=None, usual=1.0):
+def placed(grid, points, weights, prior, other=None, usual=1.0):
     """The registration of one scan; `usual` of its beams are explained of late."""
-    return match_scan(grid, Scan(points, weights, np.eye(3)), prior, other, options, usual)
+    return match_scan(grid, Scan(points, weights, np.eye(3)), prior, other, usual)
 
 
 def ones(points):
@@ -89,14 +88,14 @@ def test_odometry_is_disbelieved_where_a_scan_says_otherwise(room, mapped, scan)
     truth = np.array([0.3, -0.2, 0.7])
     points = scan(room, truth)
     for shift, is_off in (((0.04, -0.03, 0.03), False), ((0.12, 0.1, 0.0), True)):
-        odometry = dataclasses.replace(prior_at(truth + shift, 0.03, 0.03), measured=True)
+        odometry = dataclasses.replace(prior_at(truth + shift, 0.03, 0.03), is_odometry=True)
         found = placed(mapped(room), points, ones(points), odometry)
-        assert found.disagrees == is_off
+        assert found.contradicts_odometry == is_off
         distance, turn = off(found, truth)
         assert distance < 0.02
         assert turn < np.radians(0.4)
-        guess = dataclasses.replace(odometry, measured=False)
-        assert not placed(mapped(room), points, ones(points), guess).disagrees
+        guess = dataclasses.replace(odometry, is_odometry=False)
+        assert not placed(mapped(room), points, ones(points), guess).contradicts_odometry
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -106,7 +105,7 @@ def test_a_robot_is_found_metres_away_and_in_any_direction(room, mapped, scan, s
     points = scan(room, truth, seed=seed)
     wrong = prior_at(truth + rng.uniform(-1, 1, 3) * [2.9, 2.9, np.pi], 3.0, 3.0)
     seen = Scan(points, ones(points), np.eye(3))
-    found = search_pose(mapped(room), seen, wrong, OPTIONS, 3.0, np.pi)
+    found = search_pose(mapped(room), seen, wrong, 3.0, np.pi)
     distance, turn = off(found, truth)
     assert distance < 0.02
     assert turn < np.radians(0.4)
@@ -208,11 +207,12 @@ def test_in_an_empty_map_the_prior_is_the_answer(hall, scan):
     np.testing.assert_allclose(found.T_map_base, prior.T_map_base, atol=1e-12)
 
 
-def test_beams_beyond_the_search_range_still_count_in_the_refinement(hall, mapped, scan):
+def test_beams_beyond_the_search_range_count_in_the_refinement(monkeypatch, hall, mapped, scan):
+    monkeypatch.setattr(scan_matching, "_MAX_SEARCH_RANGE", 0.1)
     truth = np.array([0.2, 0.1, 0.3])
     points = scan(hall, truth)
     prior = prior_at(truth + np.array([0.03, -0.02, 0.02]))
-    found = placed(mapped(hall), points, ones(points), prior, RegistrationOptions(search_range=0.1))
+    found = placed(mapped(hall), points, ones(points), prior)
     distance, turn = off(found, truth)
     assert distance < 0.02
     assert turn < np.radians(0.4)
@@ -223,12 +223,3 @@ def test_the_same_twice(hall, mapped, scan):
     a, b = (placed(mapped(hall), points, ones(points), prior) for _ in range(2))
     np.testing.assert_array_equal(a.T_map_base, b.T_map_base)
     np.testing.assert_array_equal(a.covariance, b.covariance)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"sigma": 0.0}, {"floor": -1.0}, {"gain": 0.0}, {"search_range": 0.0}, {"window": -1.0}],
-)
-def test_options_out_of_range(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        RegistrationOptions(**wrong)

@@ -9,8 +9,8 @@ from driven import driven
 from stillmap.core import se2
 from stillmap.sim.options import LaserOptions
 from stillmap.sim.walls import box
-from stillmap.slam.loop_types import LoopCandidate
 from stillmap.slam.loop_verification import _ambiguity_covariance, build_submap, verify_candidate
+from stillmap.slam.types import LoopCandidate
 
 
 @functools.cache

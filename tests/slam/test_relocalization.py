@@ -28,8 +28,8 @@ def carried(world, seed, beams, **robot):
 
 def assert_noticed_and_placed(simulation):
     found = mapped(simulation.recording)
-    assert found.breaks == [simulation.truth.scene["carried_at_scan"]]
-    assert found.unconnected == []
+    assert found.diagnostics.breaks == [simulation.truth.scene["carried_at_scan"]]
+    assert found.diagnostics.unconnected == []
     assert compute_absolute_errors(found.poses, simulation.truth.T_world_base).rmse < 0.1
 
 
@@ -112,8 +112,8 @@ def rooms():
 def test_a_place_that_has_nothing_in_common_is_put_beside(rooms):
     one, other, recording = rooms
     found = mapped(recording)
-    assert found.breaks == [60]
-    assert found.unconnected == [60]
+    assert found.diagnostics.breaks == [60]
+    assert found.diagnostics.unconnected == [60]
     # nobody knows how the robot came there: no loop says so, and the step itself says nothing
     assert all(closure.refused for closure in found.loops if closure.later >= 60 > closure.earlier)
     across = [r for r in found.graph.constraints if found.graph.keyframes[r.second] == 60]
@@ -129,7 +129,7 @@ def test_a_place_that_has_nothing_in_common_is_put_beside(rooms):
 def test_pieces_beside_one_another_are_ever_the_same(rooms):
     one, other = mapped(rooms[2]), mapped(rooms[2])
     np.testing.assert_array_equal(one.poses, other.poses)
-    assert one.unconnected == other.unconnected
+    assert one.diagnostics == other.diagnostics
 
 
 def test_the_same_room_again_is_the_same_room(rooms):
@@ -137,8 +137,8 @@ def test_the_same_room_again_is_the_same_room(rooms):
     one = rooms[0]
     again = one_after_the_other(one.recording, one.recording)
     found = mapped(again)
-    assert found.breaks == [60]
-    assert found.unconnected == []
+    assert found.diagnostics.breaks == [60]
+    assert found.diagnostics.unconnected == []
     truth = np.concatenate([one.truth.T_world_base] * 2)
     assert compute_absolute_errors(found.poses, truth).rmse < 0.02
 

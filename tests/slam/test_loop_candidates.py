@@ -13,7 +13,13 @@ from stillmap.eval.trajectory import compute_absolute_errors
 from stillmap.sim import RobotOptions, Scene, simulate
 from stillmap.sim.options import CrowdOptions, LaserOptions, OdometryOptions
 from stillmap.sim.walls import box
-from stillmap.slam import SlamOptions, local_map, loop_types, loop_verification, scan_matching
+from stillmap.slam import (
+    SlamOptions,
+    local_map,
+    loop_candidates,
+    loop_verification,
+    scan_matching,
+)
 from stillmap.slam.loop_candidates import (
     graph_distances,
     odometry_constraints,
@@ -24,15 +30,14 @@ from stillmap.slam.loop_candidates import (
     view_centers,
 )
 from stillmap.slam.loop_closure import close_loops
-from stillmap.slam.loop_types import LoopClosure, LoopContext, LoopOptions
-from stillmap.slam.odometry_2d import MStepResult
+from stillmap.slam.types import LoopCandidate, LoopClosure, LoopContext, MStepResult
 
 OPTIONS = SlamOptions()
 # as sure as 5 m of travel
 SURE = np.diag([0.03**2, 0.03**2, 0.006**2])
 
 
-def track_of(poses, options=OPTIONS.loops):
+def track_of(poses):
     """Poses (K, 3, 3) a metre of travel apart, each a keyframe."""
     n = len(poses)
     recording = Recording(
@@ -53,9 +58,8 @@ def track_of(poses, options=OPTIONS.loops):
         np.ones(n),
         np.arange(n),
         0.05,
-        OPTIONS.registration,
-        OPTIONS.surface,
-        options,
+        1.0,
+        6.0,
     )
 
 
@@ -94,7 +98,7 @@ def test_a_closure_that_may_slide_ties_less():
     across = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     for covariance in (sliding, across @ sliding @ across.T):
         metres = graph_distances(straight(301), 300, [tie(50, 280, covariance)])
-        expected = 20.0 + np.hypot(0.6, 0.03) / OPTIONS.loops.drift_translation
+        expected = 20.0 + np.hypot(0.6, 0.03) / loop_candidates._DRIFT_TRANSLATION
         assert metres[50] == pytest.approx(expected)
 
 
@@ -108,12 +112,12 @@ def test_candidates_are_as_unsure_as_the_graph():
     }
     assert set(third) == set(range(42, 63))
     for later, candidate in third.items():
-        assert candidate.metres <= later - 42 + 1 + 20 + 5
-        assert candidate.metres <= later - candidate.earlier
+        assert candidate.drift_distance <= later - 42 + 1 + 20 + 5
+        assert candidate.drift_distance <= later - candidate.earlier
     alone = {
         c.later: c for c in propose_candidates(track, track.poses, view_centers(track), 42, 63, [])
     }
-    assert alone[50].metres == 50 - alone[50].earlier
+    assert alone[50].drift_distance == 50 - alone[50].earlier
 
 
 def test_candidates_are_found_where_the_graph_puts_them():
@@ -139,14 +143,14 @@ def test_stages_leave_out_nothing(n):
 def test_stages_grow_with_the_way():
     ranges = list(split_stages(straight(20000)))
     length = np.diff(ranges, axis=1).ravel()
-    assert length[0] == OPTIONS.loops.stage
+    assert length[0] == loop_candidates._MIN_STAGE
     assert length[:-1].max() > 0.04 * 20000
     assert len(ranges) < 110  # 500, were all as long as the first
 
 
 def test_stage_by_stage_agrees_like_all_at_once():
     track = laps(2)
-    way = odometry_constraints(track, OPTIONS.motion, [])
+    way = odometry_constraints(track, OPTIONS.odometry, [])
     rng = np.random.default_rng(3)
     shifts = rng.choice([0.2, 0.2, -0.3], 21)
     found = [tie(k, 21 + k, T=se2.matrix(shift, 0.0, 0.0)) for k, shift in enumerate(shifts)]
@@ -188,7 +192,7 @@ def rounds(drift=1.0):
 
 def local(poses):
     n = len(poses)
-    return MStepResult(poses, np.zeros((n, 3, 3)), _core.OccupancyGrid2D(0.05), np.ones(n), [])
+    return MStepResult(poses, np.zeros((n, 3, 3)), _core.OccupancyGrid2D(0.05), np.ones(n))
 
 
 def missed(T, truth, candidate):
@@ -209,8 +213,8 @@ def test_loops_are_looked_for_where_those_before_put_them(monkeypatch):
     recording, truth, poses = rounds(drift=4.0)
     e = np.full(recording.n_beams, 0.9, np.float32)
     told = []
-    options = dataclasses.replace(OPTIONS, loops=LoopOptions(stage=8.0))
-    close_loops(recording, e, options, local(poses), lambda *at: told.append(at))
+    monkeypatch.setattr(loop_candidates, "_MIN_STAGE", 8.0)
+    close_loops(recording, e, OPTIONS, local(poses), lambda *at: told.append(at))
     assert len(told) > 3
     assert told == sorted(told)
     assert {total for _, total in told} == {recording.n_scans}
@@ -234,9 +238,7 @@ def test_a_scan_is_laid_where_the_candidate_says():
         keyframes=frames,
     )
     T = se2.inverse(truth[earlier]) @ truth[later]
-    (found,) = loop_verification.verify_candidates(
-        track, [loop_types.LoopCandidate(earlier, later, T, 0.0)]
-    )
+    (found,) = loop_verification.verify_candidates(track, [LoopCandidate(earlier, later, T, 0.0)])
     assert missed(se2.inverse(poses[earlier]) @ poses[later], truth, found) > 0.5
     assert missed(found.T, truth, found) < 0.05  # though no more than 0.2 m are searched
 
@@ -245,19 +247,19 @@ def test_a_round_passed_again_is_not_searched_more_widely(monkeypatch):
     windows = []
     search = scan_matching.search_pose
 
-    def recorded(grid, scan, prior, options, translation, rotation):
+    def recorded(grid, scan, prior, translation, rotation):
         windows.append(translation)
-        return search(grid, scan, prior, options, translation, rotation)
+        return search(grid, scan, prior, translation, rotation)
 
     monkeypatch.setattr(scan_matching, "search_pose", recorded)
+    monkeypatch.setattr(loop_candidates, "_DRIFT_TRANSLATION", 0.012)
     recording, truth, poses = rounds()
     e = np.full(recording.n_beams, 0.9, np.float32)
 
     def searched(stage):
         windows.clear()
-        options = LoopOptions(drift_translation=0.012, stage=stage)
-        options = dataclasses.replace(OPTIONS, loops=options)
-        found = close_loops(recording, e, options, local(poses), lambda *_: None)
+        monkeypatch.setattr(loop_candidates, "_MIN_STAGE", stage)
+        found = close_loops(recording, e, OPTIONS, local(poses), lambda *_: None)
         assert (
             compute_absolute_errors(found.poses, truth).rmse
             < 0.4 * compute_absolute_errors(poses, truth).rmse
