@@ -28,7 +28,7 @@ from stillmap.eval.trajectory import align, compute_absolute_errors
 from stillmap.mapping import Change
 from stillmap.results.reader import moved
 from stillmap.sim import Simulation, simulate
-from stillmap.sim.objects import standing
+from stillmap.sim.objects import place_faces
 
 _IN_TIME = 2.0  # s
 _BESIDE_DOOR = 0.2  # m
@@ -99,7 +99,7 @@ def stays_of(simulation: Simulation) -> list[Stay]:
         Stay(
             mover=number,
             center=np.array([stay.x, stay.y]),
-            faces=standing(thing, stay),
+            faces=place_faces(thing, stay),
             since_ns=None if stay.since <= 0 else begin + round(1e9 * stay.since),
             until_ns=None if stay.until is None else begin + round(1e9 * stay.until),
         )

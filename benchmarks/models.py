@@ -30,7 +30,7 @@ from common import Scores, add_arguments, add_seed_arguments, options_of, outcom
 from tables import Column, means_and_worst
 
 from stillmap.sim import (
-    load_picture_truth,
+    load_image_truth,
     scene_by_name,
     simulate,
     simulate_rig,
@@ -186,7 +186,7 @@ def flat(found: dict[str, Any]) -> Scores:
 
 def walkers(sim: Path) -> float:
     """The share of pictures of which movers cover a thousandth or more."""
-    truth = load_picture_truth(sim)
+    truth = load_image_truth(sim)
     masks = (truth.mask(image) for image in range(len(truth.T_world_camera)))
     return float(np.mean([np.mean((mask > 0) & (mask != SKY)) >= _SEEN for mask in masks]))
 

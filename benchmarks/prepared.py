@@ -12,7 +12,7 @@ from stillmap.core.recording import Recording
 from stillmap.eval.map import MapScores, extract_wall_cells, score_map
 from stillmap.results.reader import Grid
 from stillmap.sim import Simulation, laser, simulate
-from stillmap.sim.objects import faces_at
+from stillmap.sim.objects import transform_faces
 
 Float = NDArray[np.float64]
 
@@ -53,16 +53,16 @@ def without_people(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
     """The same run, at the same poses, without people and vehicles: points (M, 2), hit, static."""
     o, scene, truth = sim.scene.laser, sim.scene, sim.truth
-    angles = laser.beam_angles(o.beams, o.fov)
+    angles = laser.compute_beam_angles(o.beams, o.fov)
     poses = se2.parameters(sim.recording.T_map_sensor(truth.T_world_base))
     T = len(poses)
     nobody = laser.Movers(
         np.empty((T, 0, 2)), np.empty((T, 0)), np.empty((0, 2)), np.empty(0, np.int32)
     )
-    exact = laser.cast(poses, angles, truth.walls, nobody, doors_and_things(sim))
+    exact = laser.cast_beams(poses, angles, truth.walls, nobody, doors_and_things(sim))
     is_glass = np.zeros(len(truth.walls), bool)
     is_glass[len(scene.walls) : len(scene.walls) + len(scene.glass)] = True
-    ranges, hit = laser.measure(exact, is_glass, o, rng)
+    ranges, hit = laser.simulate_measurement(exact, is_glass, o, rng)
     points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     static = hit & (exact.mover < 0)
     return points.reshape(-1, 2).astype(np.float32), hit.ravel(), static.ravel()
@@ -75,7 +75,7 @@ def doors_and_things(sim: Simulation) -> laser.Outlines:
     first = movers.shape[1] - len(sim.scene.things)
     for number, thing in enumerate(sim.scene.things, start=first):
         if np.isnan(movers[:, number]).any() or np.ptp(movers[:, number], axis=0).any():
-            faces.append(faces_at(thing, movers[:, number]))
+            faces.append(transform_faces(thing, movers[:, number]))
             mover.append(np.full(len(thing.faces), number, np.int32))
     return laser.Outlines(np.concatenate(faces, axis=1), np.concatenate(mover))
 

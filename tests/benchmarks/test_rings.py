@@ -9,7 +9,7 @@ from rings import BEAMS, NO_RETURN, label_columns, pose_columns, ring_of, row
 
 from stillmap.core import se2
 from stillmap.core.errors import InputError
-from stillmap.sim.laser import Movers, cast
+from stillmap.sim.laser import Movers, cast_beams
 from stillmap.sim.walls import box
 
 Float = NDArray[np.float64]
@@ -27,7 +27,7 @@ def way() -> Float:
 
 
 def ranges(pose: Float, walls: Float) -> Float:
-    return np.asarray(cast(se2.parameters(pose)[None], ANGLES, walls, NOBODY).range[0])
+    return np.asarray(cast_beams(se2.parameters(pose)[None], ANGLES, walls, NOBODY).range[0])
 
 
 @pytest.fixture(scope="module")

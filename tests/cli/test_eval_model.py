@@ -17,11 +17,11 @@ from stillmap.eval import mesh as mesh_module
 from stillmap.io import read
 from stillmap.io.trajectory import write_tum
 from stillmap.sim import (
-    load_picture_truth,
+    compute_static_color,
+    load_image_truth,
     load_truth,
     scene_by_name,
     simulate_rig,
-    static_colour,
     write_rig,
 )
 
@@ -63,11 +63,11 @@ def made(simulated, tmp_path_factory) -> Path:
     recording, truth = read(simulated / "tilting"), load_truth(simulated / "tilting")
     T_map_world = se2.inverse(truth.T_world_base[0])
     write_tum(out / "trajectory.tum", recording.stamp_ns, T_map_world @ truth.T_world_base)
-    seed = load_picture_truth(simulated / "tilting").colour_seed
+    seed = load_image_truth(simulated / "tilting").colour_seed
     _write_floor(out / "mesh.glb", np.linalg.inv(T_map_world), seed)
     assert recording.images is not None
     T_base_camera = recording.images.cameras[0].T_base_camera
-    T_world_camera = load_picture_truth(simulated / "tilting").T_world_camera
+    T_world_camera = load_image_truth(simulated / "tilting").T_world_camera
     vertices, faces, _ = _floor()
     np.savez(
         out / "mesh_faces.npz",
@@ -109,7 +109,7 @@ def _write_floor(path: Path, T_world_map: Float, seed: int) -> None:
     u, v = np.meshgrid(at, at[::-1])  # the first row is the upper one
     places = np.stack([2.0 + 4.0 * u, 4.0 * v - 2.0, np.zeros_like(u)], axis=-1).reshape(-1, 3)
     world = places @ T_world_map[:3, :3].T + T_world_map[:3, 3]
-    picture = Image.fromarray(static_colour(world, seed).reshape(SIZE, SIZE, 3))
+    picture = Image.fromarray(compute_static_color(world, seed).reshape(SIZE, SIZE, 3))
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
     visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
     _export(vertices, faces, path, visual)

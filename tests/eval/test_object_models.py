@@ -29,10 +29,10 @@ from stillmap.eval.object_models import (
     match_mover,
     score_object_models,
 )
-from stillmap.sim.appearance import static_colour
+from stillmap.sim.appearance import compute_static_color
 from stillmap.sim.camera import SKY
 from stillmap.sim.geometry import BOX, Faces, Ground, Solids
-from stillmap.sim.truth_surfaces import Moving, Standing
+from stillmap.sim.truth_surfaces import MovingSurfaces, StaticSurfaces
 
 Float = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ NONE = Solids(
     np.empty((0, 2)),
     np.empty(0, np.int32),
 )
-FLOOR = Standing(
+FLOOR = StaticSurfaces(
     Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool)),
     NONE,
     Ground(np.zeros(2), np.zeros(2), np.empty((0, 4)), 0.0),
@@ -173,7 +173,7 @@ def test_texture_scores_of_a_half_painted_floor() -> None:
     record.image[right[:, 0] < 0] = -1  # and with it all of the mover
     places = np.column_stack([np.random.default_rng(2).uniform(-1, 1, (500, 2)), np.zeros(500)])
     in_map = places @ T_MAP_WORLD[:3, :3].T + T_MAP_WORLD[:3, 3] + (0, 0, 0.02)
-    coloured = ColoredPoints(in_map, static_colour(places, 3))
+    coloured = ColoredPoints(in_map, compute_static_color(places, 3))
     found = score_texture(record, coloured, _pictures(mask), FLOOR, 3, T_WORLD_MAP)
     assert found.textured == pytest.approx(0.5, abs=0.01)
     assert found.mover == found.nothing == found.colour_median == found.colour_p95 == 0.0
@@ -185,7 +185,7 @@ def test_colours_that_differ_are_told() -> None:
     pytest.importorskip("skimage")
     places = np.column_stack([np.random.default_rng(2).uniform(-1, 1, (500, 2)), np.zeros(500)])
     in_map = places @ T_MAP_WORLD[:3, :3].T + T_MAP_WORLD[:3, 3]
-    right = static_colour(places, 3)
+    right = compute_static_color(places, 3)
     darker = (0.9 * right).astype(np.uint8)
     errors = compute_color_errors(ColoredPoints(in_map, darker), FLOOR, 3, T_WORLD_MAP)
     assert np.array_equal(errors, compute_color_difference(darker, right))
@@ -202,7 +202,7 @@ def test_differences_of_colours() -> None:
 # a box of 2 x 1 x 1 m that drives along x at 1 m/s
 _POSE = np.zeros((3, 1, 4))
 _POSE[:, 0, 0] = [0.0, 1.0, 2.0]
-DRIVES = Moving(
+DRIVES = MovingSurfaces(
     np.array([0, 10**9, 2 * 10**9]),
     Solids(
         _POSE,

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stillmap.sim import Simulation, scene_by_name, simulate
-from stillmap.sim.planner import distance_to_segment
+from stillmap.sim.planner import compute_segment_distance
 
 Float = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ def wall_distance() -> Callable[[Float, Float], Float]:
     def distance(points: Float, walls: Float) -> Float:
         nearest = np.full(len(points), np.inf)
         for wall in walls:
-            np.minimum(nearest, distance_to_segment(points, wall), out=nearest)
+            np.minimum(nearest, compute_segment_distance(points, wall), out=nearest)
         return nearest
 
     return distance

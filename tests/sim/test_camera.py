@@ -13,16 +13,16 @@ from stillmap.sim import (
     RigSimulation,
     Scene,
     Simulation,
-    load_picture_truth,
-    mover_points,
+    compute_static_color,
+    load_image_truth,
+    sample_mover,
     scene_by_name,
     simulate,
     simulate_rig,
-    static_colour,
     write_rig,
     write_simulation,
 )
-from stillmap.sim.camera import SKY, bent, looking, place_cameras
+from stillmap.sim.camera import SKY, compute_pixel_rays, distort, place_cameras
 from stillmap.sim.options import CameraOptions
 
 Float = NDArray[np.float64]
@@ -57,9 +57,11 @@ def _seen(one: Simulation, image: int) -> tuple[Float, NDArray[np.uint16]]:
     """(h, w, 3) where the pixels' rays end in the world, and the mask."""
     assert one.photographs is not None
     assert one.recording.images is not None
-    shot, images = one.photographs.take(image), one.recording.images
+    shot, images = one.photographs.render(image), one.recording.images
     T = one.photographs.T_world_camera[image]
-    rays = np.moveaxis(looking(images.cameras[images.camera[image]]), 0, -1) @ T[:3, :3].T
+    rays = (
+        np.moveaxis(compute_pixel_rays(images.cameras[images.camera[image]]), 0, -1) @ T[:3, :3].T
+    )
     with np.errstate(invalid="ignore"):
         return T[:3, 3] + shot.distance[..., None] * rays, shot.mask
 
@@ -80,12 +82,12 @@ def test_pixels_show_the_true_surfaces_in_their_colours(
         assert off.max() < 1e-4  # float32 of 100 m
         near = np.linalg.norm(static - one.surfaces.T_world_camera[image, :3, 3], axis=1) < 3.0
         shows = one.recording.images.read(image)[mask == 0][near].astype(float)
-        wanted = static_colour(static[near], one.surfaces.colour_seed).astype(float)
+        wanted = compute_static_color(static[near], one.surfaces.colour_seed).astype(float)
         # but for places beside an edge of the texture, and what is averaged within a pixel
         assert np.median(np.abs(shows - wanted)) <= 6.0
         stamp = int(one.recording.images.stamp_ns[image])
         for number in np.unique(mask[(mask > 0) & (mask != SKY)]).tolist():
-            points, _ = mover_points(one.surfaces.moving, number - 1, stamp, 0.02)
+            points, _ = sample_mover(one.surfaces.moving, number - 1, stamp, 0.02)
             gaps = places[mask == number][:, None] - points
             # 0.02 m from point to point, and a person's legs swing between two scans
             assert np.linalg.norm(gaps, axis=2).min(axis=1).max() < 0.03
@@ -95,10 +97,10 @@ def test_pixels_show_the_true_surfaces_in_their_colours(
 
 def test_sky_is_where_no_ray_ends(street: Simulation) -> None:
     assert street.photographs is not None
-    shot = street.photographs.take(0)
+    shot = street.photographs.render(0)
     assert np.array_equal(shot.mask == SKY, np.isinf(shot.distance))
     assert 0.1 < np.mean(shot.mask == SKY) < 0.7
-    r, _, b = np.median(shot.colour[shot.mask == SKY], axis=0)
+    r, _, b = np.median(shot.color[shot.mask == SKY], axis=0)
     assert b > 200
     assert b > r
 
@@ -129,10 +131,10 @@ def test_pictures_have_stamps_of_their_own(rig: RigSimulation) -> None:
 
 def test_the_lens_is_undone() -> None:
     one = place_cameras(CameraOptions(enabled=True, width=64, height=48, **LENS))[0]
-    rays = looking(one)
+    rays = compute_pixel_rays(one)
     assert np.allclose(np.linalg.norm(rays, axis=0), 1.0)
     assert one.K is not None
-    shown = bent(rays[:2] / rays[2], one.distortion)
+    shown = distort(rays[:2] / rays[2], one.distortion)
     u, v = one.K[0, 0] * shown[0] + one.K[0, 2], one.K[1, 1] * shown[1] + one.K[1, 2]
     assert np.allclose(u, np.arange(64)[None])
     assert np.allclose(v, np.arange(48)[:, None])
@@ -140,7 +142,7 @@ def test_the_lens_is_undone() -> None:
 
 def test_a_lens_that_does_not_reach_the_corners_is_refused() -> None:
     with pytest.raises(InputError, match="lens does not reach"):
-        looking(place_cameras(CameraOptions(enabled=True, k1=-0.4, fov=2.0))[0])
+        compute_pixel_rays(place_cameras(CameraOptions(enabled=True, k1=-0.4, fov=2.0))[0])
 
 
 def test_cameras_leave_everything_else_as_it_is() -> None:
@@ -173,8 +175,8 @@ def test_several_rays_for_each_pixel_smooth_edges() -> None:
     soft = simulate(_scene("street", {"antialias": 2}), 4).photographs
     assert sharp is not None
     assert soft is not None
-    one, other = sharp.take(0), soft.take(0)
-    rough = [np.abs(np.diff(shot.colour.astype(float), axis=1)).mean() for shot in (one, other)]
+    one, other = sharp.render(0), soft.render(0)
+    rough = [np.abs(np.diff(shot.color.astype(float), axis=1)).mean() for shot in (one, other)]
     assert rough[1] < 0.9 * rough[0]
     moves = [(shot.mask > 0) & (shot.mask != SKY) for shot in (one, other)]
     assert (moves[1] | ~moves[0]).mean() > 0.99
@@ -185,7 +187,7 @@ def test_folders_hold_pictures_and_their_truth(rig: RigSimulation, tmp_path: Pat
     write_rig(rig, tmp_path / "rig")
     assert not (tmp_path / "rig/horizontal/images").exists()
     images = recordings.read(tmp_path / "rig/tilting").images
-    truth, made = load_picture_truth(tmp_path / "rig/tilting"), rig.tilting
+    truth, made = load_image_truth(tmp_path / "rig/tilting"), rig.tilting
     assert images is not None
     assert made.recording.images is not None
     assert made.surfaces is not None
@@ -197,19 +199,19 @@ def test_folders_hold_pictures_and_their_truth(rig: RigSimulation, tmp_path: Pat
     assert truth.colour_seed == made.truth.scene["colour_seed"]
     points = np.random.default_rng(0).uniform(-20, 20, (100, 3))
     for found, wanted in zip(
-        truth.standing.nearest(points), made.surfaces.standing.nearest(points), strict=True
+        truth.standing.project(points), made.surfaces.standing.project(points), strict=True
     ):
         assert np.array_equal(found, wanted)
     stamp = int(images.stamp_ns[1])
     for k in range(3):
-        found, _ = mover_points(truth.moving, k, stamp, 0.05)
-        assert np.array_equal(found, mover_points(made.surfaces.moving, k, stamp, 0.05)[0])
+        found, _ = sample_mover(truth.moving, k, stamp, 0.05)
+        assert np.array_equal(found, sample_mover(made.surfaces.moving, k, stamp, 0.05)[0])
 
 
 def test_a_folder_without_pictures_has_no_truth_about_them(tmp_path: Path) -> None:
     write_simulation(simulate(scene_by_name("hall", {"robot": {"scans": 2}}), 1), tmp_path / "sim")
     with pytest.raises(InputError, match="no truth about pictures"):
-        load_picture_truth(tmp_path / "sim")
+        load_image_truth(tmp_path / "sim")
 
 
 def test_cameras_want_a_world_in_3d() -> None:
@@ -220,8 +222,8 @@ def test_cameras_want_a_world_in_3d() -> None:
 def test_colours_go_on_smoothly_and_differ_from_place_to_place() -> None:
     rng = np.random.default_rng(1)
     points = rng.uniform(-20, 20, (4000, 3)) * (1, 1, 0.1) + (0, 0, 2.1)
-    colour = static_colour(points, 5).astype(float)
-    beside = static_colour(points + 0.005, 5).astype(float)
+    colour = compute_static_color(points, 5).astype(float)
+    beside = compute_static_color(points + 0.005, 5).astype(float)
     assert np.median(np.abs(colour - beside)) < 6.0
     assert colour.std(axis=0).min() > 15.0
-    assert not np.array_equal(colour, static_colour(points, 6))
+    assert not np.array_equal(colour, compute_static_color(points, 6))

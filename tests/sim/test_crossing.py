@@ -7,7 +7,7 @@ import pytest
 
 from stillmap.sim import Simulation, scene_by_name, simulate
 from stillmap.sim.geometry import BOX, CYLINDER, ELLIPSOID, Ground
-from stillmap.sim.world_3d import outlines, standing
+from stillmap.sim.world_3d import make_static_world, trace_loops
 from stillmap.sim.worlds.street import INNER, OUTER
 
 
@@ -52,7 +52,9 @@ def test_cars_that_cross_do_not_meet() -> None:
 
 def test_crowns_reach_above_the_road_and_over_who_passes() -> None:
     scene = scene_by_name("crossing")
-    _, solids = standing(scene, Ground.of(scene.ground, np.reshape(scene.pavements, (-1, 4))))
+    _, solids = make_static_world(
+        scene, Ground.of(scene.ground, np.reshape(scene.pavements, (-1, 4)))
+    )
     crowns = solids.form == ELLIPSOID
     x, y, _, foot = solids.pose[0, crowns].T
     assert crowns.sum() >= 15
@@ -88,7 +90,7 @@ def test_an_outline_is_a_thing_if_it_closes_and_is_no_room() -> None:
         (0.0, 2.0, 0.0, 0.0),
     ]
     room = [tuple(9.0 * v for v in s) for s in square]
-    loops, lines = outlines([*square, *room, *shifted(square)[:3]])  # type: ignore[list-item]
+    loops, lines = trace_loops([*square, *room, *shifted(square)[:3]])  # type: ignore[list-item]
     assert len(loops) == 1
     assert loops[0][:2] == (0.5, 1.0)
     assert loops[0].heading == pytest.approx(np.pi / 2)

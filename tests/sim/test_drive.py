@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.sim import Light, RobotOptions, Simulation, scene_by_name
-from stillmap.sim.vehicles import Pace
+from stillmap.sim.vehicles import SpeedProfile
 
 Float = NDArray[np.float64]
 
@@ -129,13 +129,13 @@ def test_75_hz_is_the_usual_rate_and_10_an_option() -> None:
     assert scene_by_name("drive", {"robot": {"scan_rate": 10.0}}).robot.scan_rate == 10.0
 
 
-def driven(pace: Pace, steps: int, dt: float, way: Float = STRAIGHT) -> Float:
+def driven(pace: SpeedProfile, steps: int, dt: float, way: Float = STRAIGHT) -> Float:
     """(steps, 2) metres along the way and speed, from a standing start."""
     at, now, out = 0.0, 0.0, []
     for k in range(steps):
         nearest = min(round(at / 0.05), len(way) - 1)
-        allowed = pace.allowed(nearest, at - 0.05 * nearest, now, k * dt, dt)
-        now = pace.gained(allowed, now, dt)
+        allowed = pace.limit_speed(nearest, at - 0.05 * nearest, now, k * dt, dt)
+        now = pace.accelerate(allowed, now, dt)
         at += now * dt
         out.append((at, now))
     return np.array(out)
@@ -144,7 +144,7 @@ def driven(pace: Pace, steps: int, dt: float, way: Float = STRAIGHT) -> Float:
 @pytest.mark.parametrize("dt", [1 / 75, 0.1])
 def test_it_gains_speed_and_stops_at_a_red_light(dt: float) -> None:
     light = Light((200.0, 0.0), (2.0, 40.0), 100.0)
-    at, speed = driven(Pace(STRAIGHT, False, CAR, (light,)), round(60 / dt), dt).T
+    at, speed = driven(SpeedProfile(STRAIGHT, False, CAR, (light,)), round(60 / dt), dt).T
     gains = round(5.5 / dt)
     np.testing.assert_allclose(speed[:gains], 2.5 * dt * np.arange(1, gains + 1))
     assert speed.max() == pytest.approx(15.0)
@@ -159,7 +159,7 @@ def test_whoever_cannot_stop_any_more_drives_on() -> None:
     # at 15 m/s it takes 45 m to stop: 30 m before the line it turns red
     reaches = 15.0**2 / (2 * 2.5) + 15.0 * 8.0
     light = Light((reaches + 30.0, 0.0), (14.0, 60.0), 100.0)
-    speed = driven(Pace(STRAIGHT, False, CAR, (light,)), 170, 0.1)[:, 1]
+    speed = driven(SpeedProfile(STRAIGHT, False, CAR, (light,)), 170, 0.1)[:, 1]
     np.testing.assert_allclose(speed[70:], 15.0)
 
 
@@ -168,7 +168,7 @@ def test_curves_are_taken_slowly_and_braked_for() -> None:
     arc = np.stack([100 + 10 * np.cos(turn), 10 + 10 * np.sin(turn)], axis=-1)
     lead = STRAIGHT[STRAIGHT[:, 0] < 100]
     way = np.concatenate([lead, arc, [[110.0, 10 + 0.05 * k] for k in range(1, 2000)]])
-    at, speed = driven(Pace(way, False, CAR, ()), 300, 0.1, way).T
+    at, speed = driven(SpeedProfile(way, False, CAR, ()), 300, 0.1, way).T
     turning = (at > 101) & (at < 114)
     np.testing.assert_allclose(speed[turning], np.sqrt(2.5 * 10), rtol=0.03)
     assert speed[at < 60].max() == pytest.approx(15.0)
@@ -179,9 +179,9 @@ def test_curves_are_taken_slowly_and_braked_for() -> None:
 
 def test_without_an_acceleration_it_drives_at_its_speed_at_once() -> None:
     way = np.concatenate([STRAIGHT[:200], STRAIGHT[200] + [[0.0, 0.05 * k] for k in range(200)]])
-    pace = Pace(way, False, RobotOptions(speed=0.5), ())
-    assert pace.gained(pace.allowed(100, 0.0, 0.0, 0.0, 0.1), 0.0, 0.1) == 0.5
-    assert {pace.allowed(k, 0.0, 0.5, 0.0, 0.1) for k in range(len(way))} == {0.5}
+    pace = SpeedProfile(way, False, RobotOptions(speed=0.5), ())
+    assert pace.accelerate(pace.limit_speed(100, 0.0, 0.0, 0.0, 0.1), 0.0, 0.1) == 0.5
+    assert {pace.limit_speed(k, 0.0, 0.5, 0.0, 0.1) for k in range(len(way))} == {0.5}
 
 
 def test_a_light_is_red_again_after_a_cycle() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillmap.core.errors import InputError
-from stillmap.sim.planner import FreeSpace, Planner, distance_to_segment
+from stillmap.sim.planner import FreeSpace, Planner, compute_segment_distance
 from stillmap.sim.walls import Opening, box, room, wall
 
 ROOM = np.array(box(5, 5, 10, 10))
@@ -15,7 +15,7 @@ ROOM = np.array(box(5, 5, 10, 10))
 def test_clearance_is_the_distance_from_the_nearest_wall_up_to_its_limit() -> None:
     walls = np.array([*box(5, 5, 10, 10), (4.0, 4.0, 6.0, 6.0)])
     xy = np.random.default_rng(0).uniform(0.3, 9.7, (500, 2))
-    true = np.min([distance_to_segment(xy, w) for w in walls], axis=0)
+    true = np.min([compute_segment_distance(xy, w) for w in walls], axis=0)
     clear, gradient = FreeSpace(walls).clearance_at(xy)
     np.testing.assert_allclose(clear, np.minimum(true, 1.5), atol=0.051)
     beside = (xy[:, 0] > 0.2) & (xy[:, 0] < 1.3) & (xy[:, 1] > 2) & (xy[:, 1] < 8)
@@ -24,7 +24,7 @@ def test_clearance_is_the_distance_from_the_nearest_wall_up_to_its_limit() -> No
 
 def test_distance_from_a_segment_by_hand() -> None:
     points = np.array([[0.5, 2.0], [-3.0, 4.0], [2.0, 0.0], [0.3, 0.0]])
-    got = distance_to_segment(points, np.array([0.0, 0.0, 1.0, 0.0]))
+    got = compute_segment_distance(points, np.array([0.0, 0.0, 1.0, 0.0]))
     np.testing.assert_allclose(got, [2.0, 5.0, 1.0, 0.0])
 
 
@@ -38,7 +38,7 @@ def test_the_way_goes_around_a_wall_and_keeps_its_distance() -> None:
     shortest = 2 * np.hypot(3.0, 6.0)  # over the wall's end, without any distance
     assert shortest < length < shortest + 1.5
     dense = np.concatenate([np.linspace(a, b, 200) for a, b in itertools.pairwise(way)])
-    assert min(distance_to_segment(dense, w).min() for w in walls) > 0.3
+    assert min(compute_segment_distance(dense, w).min() for w in walls) > 0.3
 
 
 def test_only_the_part_that_can_be_reached_counts() -> None:

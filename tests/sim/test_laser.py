@@ -7,7 +7,14 @@ import pytest
 from numpy.typing import NDArray
 
 from stillmap.sim import LaserOptions
-from stillmap.sim.laser import Movers, Outlines, Returns, beam_angles, cast, measure
+from stillmap.sim.laser import (
+    Movers,
+    Outlines,
+    Returns,
+    cast_beams,
+    compute_beam_angles,
+    simulate_measurement,
+)
 
 Float = NDArray[np.float64]
 
@@ -57,7 +64,7 @@ def by_brute_force(poses: Float, angles: Float, walls: Float, movers: Movers) ->
 
 def test_random_worlds_show_walls_and_movers() -> None:
     """Else the comparison below would say little."""
-    angles = beam_angles(60, 2 * np.pi)
+    angles = compute_beam_angles(60, 2 * np.pi)
     for seed in range(4):
         walls, poses, movers = random_world(np.random.default_rng(seed))
         found = by_brute_force(poses, angles, walls, movers)
@@ -86,8 +93,11 @@ def random_world(rng: np.random.Generator) -> tuple[Float, Float, Movers]:
 @pytest.mark.parametrize(("beams", "fov"), [(45, np.pi), (60, 2 * np.pi), (31, 1.2), (50, 4.7)])
 def test_agrees_with_brute_force(seed: int, beams: int, fov: float) -> None:
     walls, poses, movers = random_world(np.random.default_rng(seed))
-    angles = beam_angles(beams, fov)
-    fast, slow = cast(poses, angles, walls, movers), by_brute_force(poses, angles, walls, movers)
+    angles = compute_beam_angles(beams, fov)
+    fast, slow = (
+        cast_beams(poses, angles, walls, movers),
+        by_brute_force(poses, angles, walls, movers),
+    )
     np.testing.assert_allclose(fast.range, slow.range, rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(fast.mover, slow.mover)
     np.testing.assert_array_equal(fast.wall, slow.wall)
@@ -98,9 +108,9 @@ def test_moving_faces_agree_with_brute_force(seed: int) -> None:
     """A face that moves is a wall that stands elsewhere in each scan."""
     rng = np.random.default_rng(seed)
     walls, poses, movers = random_world(rng)
-    faces, angles = rng.uniform(-6, 6, (len(poses), 7, 4)), beam_angles(60, 2 * np.pi)
+    faces, angles = rng.uniform(-6, 6, (len(poses), 7, 4)), compute_beam_angles(60, 2 * np.pi)
     outlines = Outlines(faces, np.arange(7, dtype=np.int32) // 2 + 20)
-    fast = cast(poses, angles, walls, movers, outlines)
+    fast = cast_beams(poses, angles, walls, movers, outlines)
     for t in range(len(poses)):
         now = Movers(movers.xy[t : t + 1], movers.heading[t : t + 1], *there(movers))
         both = np.concatenate([walls, faces[t]])
@@ -122,14 +132,14 @@ def test_no_ray_slips_through_the_corners_of_a_closed_polygon() -> None:
     turn = np.sort(rng.uniform(0, 2 * np.pi, 40))
     corners = 5 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     walls = np.concatenate([corners, np.roll(corners, -1, axis=0)], axis=1)
-    angles = beam_angles(720, 2 * np.pi)
+    angles = compute_beam_angles(720, 2 * np.pi)
     # beams that aim at the corners exactly
     poses = np.column_stack([np.zeros((40, 2)), turn - angles[0]])
     poses = np.concatenate([poses, np.column_stack([rng.uniform(-1, 1, (200, 2)), np.arange(200)])])
     nobody = Movers(
         np.empty((240, 0, 2)), np.empty((240, 0)), np.empty((0, 2)), np.empty(0, np.int32)
     )
-    assert np.isfinite(cast(poses, angles, walls, nobody).range).all()
+    assert np.isfinite(cast_beams(poses, angles, walls, nobody).range).all()
 
 
 def test_scans_beyond_one_chunk_see_their_own_movers() -> None:
@@ -141,7 +151,9 @@ def test_scans_beyond_one_chunk_see_their_own_movers() -> None:
         np.array([[0.2, 0.2]]),
         np.array([9], np.int32),
     )
-    returns = cast(np.zeros((scans, 3)), beam_angles(3, 1.0), np.empty((0, 4)), movers)
+    returns = cast_beams(
+        np.zeros((scans, 3)), compute_beam_angles(3, 1.0), np.empty((0, 4)), movers
+    )
     np.testing.assert_allclose(returns.range[:, 1], 2.8 + along)
     assert np.isinf(returns.range[:, [0, 2]]).all()
     np.testing.assert_array_equal(returns.mover[:, 1], 9)
@@ -159,7 +171,7 @@ def test_scans_beyond_one_chunk_see_their_own_movers() -> None:
 def test_beams_point_where_sick_scanners_point_them(
     beams: int, fov: float, first: float, last: float
 ) -> None:
-    angles = np.degrees(beam_angles(beams, math.radians(fov)))
+    angles = np.degrees(compute_beam_angles(beams, math.radians(fov)))
     assert angles[0] == pytest.approx(first)
     assert angles[-1] == pytest.approx(last)
     np.testing.assert_allclose(np.diff(angles), angles[1] - angles[0])
@@ -174,7 +186,9 @@ def exact(ranges: Float, wall: int) -> Returns:
 def test_noise_has_its_standard_deviation_and_no_bias() -> None:
     options = LaserOptions(range_noise=0.03, no_return_share=0.0)
     true = np.full((200, 500), 4.0)
-    ranges, hit = measure(exact(true, 0), np.array([False]), options, np.random.default_rng(1))
+    ranges, hit = simulate_measurement(
+        exact(true, 0), np.array([False]), options, np.random.default_rng(1)
+    )
     assert hit.all()
     assert (ranges - true).std() == pytest.approx(0.03, rel=0.01)
     assert (ranges - true).mean() == pytest.approx(0.0, abs=5 * 0.03 / math.sqrt(true.size))
@@ -185,7 +199,9 @@ def test_beams_get_lost_at_their_rates_and_end_at_maximum_range() -> None:
     true = np.full((400, 500), 4.0)
     is_glass = np.array([False, True])
     for wall, share in ((0, 0.01), (1, 0.31)):
-        ranges, hit = measure(exact(true, wall), is_glass, options, np.random.default_rng(4))
+        ranges, hit = simulate_measurement(
+            exact(true, wall), is_glass, options, np.random.default_rng(4)
+        )
         assert 1 - hit.mean() == pytest.approx(share, rel=0.1)
         np.testing.assert_array_equal(ranges[~hit], 20.0)
 
@@ -193,6 +209,8 @@ def test_beams_get_lost_at_their_rates_and_end_at_maximum_range() -> None:
 def test_what_lies_beyond_maximum_range_gives_no_return() -> None:
     options = LaserOptions(max_range=8.0, no_return_share=0.0, range_noise=0.0)
     true = np.array([[7.9, 8.0, 8.1, np.inf]])
-    ranges, hit = measure(exact(true, 0), np.array([False]), options, np.random.default_rng(4))
+    ranges, hit = simulate_measurement(
+        exact(true, 0), np.array([False]), options, np.random.default_rng(4)
+    )
     np.testing.assert_array_equal(hit, [[True, False, False, False]])
     np.testing.assert_array_equal(ranges, [[7.9, 8.0, 8.0, 8.0]])

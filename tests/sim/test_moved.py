@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stillmap.sim import SCENES, Simulation, Stay, scene_by_name, simulate
-from stillmap.sim.objects import standing
-from stillmap.sim.planner import distance_to_segment
+from stillmap.sim.objects import place_faces
+from stillmap.sim.planner import compute_segment_distance
 
 MOVED = ("office-moved", "street-moved", "warehouse-moved")
 
@@ -43,7 +43,7 @@ def test_all_of_them_change_and_they_are_no_walls(moved: Simulation) -> None:
     assert {"person", "thing"} < set(kinds)
     middles = (moved.truth.walls[:, :2] + moved.truth.walls[:, 2:]) / 2
     for thing in moved.scene.things:
-        faces = standing(thing, thing.stays[0])
+        faces = place_faces(thing, thing.stays[0])
         for x, y in (faces[:, :2] + faces[:, 2:]) / 2:
             assert np.hypot(*(middles - (x, y)).T).min() > 1e-6
 
@@ -51,14 +51,14 @@ def test_all_of_them_change_and_they_are_no_walls(moved: Simulation) -> None:
 def test_nothing_stands_in_a_wall_or_in_another_thing(moved: Simulation) -> None:
     stays = [(thing, stay) for thing in moved.scene.things for stay in thing.stays]
     for thing, stay in stays:
-        corners = standing(thing, stay)[:, :2]
+        corners = place_faces(thing, stay)[:, :2]
         others = [
-            standing(other, its)
+            place_faces(other, its)
             for other, its in stays
             if other is not thing and its.since < end(stay) and stay.since < end(its)
         ]
         for face in np.concatenate([moved.truth.walls, *others]):
-            assert distance_to_segment(corners, face).min() > 0.02
+            assert compute_segment_distance(corners, face).min() > 0.02
 
 
 def test_they_take_minutes(moved: Simulation) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from stillmap.core import se2
 from stillmap.sim import OdometryOptions, scene_by_name, simulate
-from stillmap.sim.odometry import drifting
+from stillmap.sim.odometry import simulate_odometry
 
 PERFECT = OdometryOptions(0.0, 0.0, 0.4, 0.0, 0.0, 0.0)
 
@@ -25,14 +25,14 @@ def arcs() -> np.ndarray:
 
 def test_perfect_wheels_give_the_true_motion() -> None:
     poses = arcs()
-    odometry = drifting(poses, PERFECT, np.random.default_rng(0))
+    odometry = simulate_odometry(poses, PERFECT, np.random.default_rng(0))
     np.testing.assert_allclose(odometry, se2.inverse(poses[:1]) @ poses, atol=1e-9)
 
 
 def test_a_wheel_that_reads_long_turns_a_straight_line_into_a_circle() -> None:
     poses = se2.matrix(np.arange(0, 100.05, 0.1), 0.0, 0.0)
     options = dataclasses.replace(PERFECT, wheel_radius_error=0.01)
-    end = se2.parameters(drifting(poses, options, np.random.default_rng(3)))[-1]
+    end = se2.parameters(simulate_odometry(poses, options, np.random.default_rng(3)))[-1]
     left, right = 0.01 * np.random.default_rng(3).standard_normal(2)
     turned = (right - left) / 0.4 * 100.0
     assert end[2] == pytest.approx(se2.wrap(turned), abs=1e-9)
@@ -46,7 +46,7 @@ def test_noise_does_not_depend_on_the_scan_rate(steps: int) -> None:
     poses = se2.matrix(np.linspace(0, 50, steps + 1), 0.0, 0.0)
     options = dataclasses.replace(PERFECT, drift_noise=0.01)
     rng = np.random.default_rng(8)
-    headings = [se2.parameters(drifting(poses, options, rng))[-1, 2] for _ in range(400)]
+    headings = [se2.parameters(simulate_odometry(poses, options, rng))[-1, 2] for _ in range(400)]
     assert np.std(headings) == pytest.approx(0.01 * np.sqrt(50), rel=0.12)
 
 
@@ -71,7 +71,7 @@ def test_raw_odometry_drifts_as_real_logs_do() -> None:
 def test_a_slipping_wheel_reads_too_far_on_short_pieces() -> None:
     poses = se2.matrix(np.arange(0, 200.01, 0.1), 0.0, 0.0)
     options = dataclasses.replace(PERFECT, slip_rate=0.1, slip=0.3, slip_length=0.5)
-    odometry = drifting(poses, options, np.random.default_rng(5))
+    odometry = simulate_odometry(poses, options, np.random.default_rng(5))
     x, y, turn = se2.parameters(se2.inverse(odometry[:-1]) @ odometry[1:]).T
     ahead = np.hypot(x, y)
     slips = np.abs(turn) > 1e-9
@@ -87,6 +87,6 @@ def test_a_slipping_wheel_reads_too_far_on_short_pieces() -> None:
 
 
 def test_without_slip_the_odometry_is_what_it_was() -> None:
-    a = drifting(arcs(), OdometryOptions(), np.random.default_rng(2))
-    b = drifting(arcs(), OdometryOptions(slip=0.9), np.random.default_rng(2))
+    a = simulate_odometry(arcs(), OdometryOptions(), np.random.default_rng(2))
+    b = simulate_odometry(arcs(), OdometryOptions(slip=0.9), np.random.default_rng(2))
     np.testing.assert_array_equal(a, b)

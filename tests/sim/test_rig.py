@@ -17,8 +17,8 @@ from stillmap.sim import (
     simulate_rig,
     write_rig,
 )
-from stillmap.sim.lidar import joint_angle
-from stillmap.sim.planner import distance_to_segment
+from stillmap.sim.lidar import compute_joint_angle
+from stillmap.sim.planner import compute_segment_distance
 
 
 @functools.cache
@@ -53,7 +53,7 @@ def test_the_flat_one_sees_walls_where_they_are() -> None:
     xy = np.einsum("nij,nj->ni", T[:, :2, :2], recording.points.astype(float)) + T[:, :2, 2]
     near = np.full(len(xy), np.inf)
     for wall in flat.truth.walls:
-        np.minimum(near, distance_to_segment(xy, wall), out=near)
+        np.minimum(near, compute_segment_distance(xy, wall), out=near)
     # columns are round here
     assert near[flat.truth.static].max() < 0.04
     assert flat.truth.static.mean() > 0.7
@@ -94,7 +94,7 @@ def test_while_it_looks_the_joint_goes_on() -> None:
     recording, rig = run(0.1).tilting.recording, RigOptions()
     assert recording.beam_time is not None
     scan = np.repeat(np.arange(100), np.diff(recording.offset))
-    angle = joint_angle(scan / 10 + recording.beam_time.astype(float), rig)
+    angle = compute_joint_angle(scan / 10 + recording.beam_time.astype(float), rig)
     x, _, z = recording.points.T.astype(float)
     assert np.abs(z * np.cos(angle) + x * np.sin(angle)).max() < 1e-4
     still = run(0.1).joint_angle[scan]

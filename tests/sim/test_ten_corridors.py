@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stillmap.sim import Simulation, scene_by_name, simulate
-from stillmap.sim.laser import Movers, beam_angles, cast
+from stillmap.sim.laser import Movers, cast_beams, compute_beam_angles
 
 Float = NDArray[np.float64]
 
@@ -23,7 +23,9 @@ def seen_from(x: float, facing: float) -> Float:
     """(9, 360) ranges at places along a corridor, up to what the laser sees."""
     scene = scene_by_name("ten-corridors")
     poses = np.column_stack([np.full(9, x), np.linspace(2.5, 29.5, 9), np.full(9, facing)])
-    found = cast(poses, beam_angles(360, 2 * np.pi), np.array(scene.walls), NOBODY).range
+    found = cast_beams(
+        poses, compute_beam_angles(360, 2 * np.pi), np.array(scene.walls), NOBODY
+    ).range
     return np.minimum(found, scene.laser.max_range)
 
 

@@ -14,9 +14,9 @@ from stillmap.core.camera import Camera, is_in_image, project
 from stillmap.core.errors import import_extra
 from stillmap.eval import mesh_distance
 from stillmap.eval.labels import Scores
-from stillmap.sim.appearance import static_colour
+from stillmap.sim.appearance import compute_static_color
 from stillmap.sim.camera import SKY
-from stillmap.sim.truth_surfaces import Standing
+from stillmap.sim.truth_surfaces import StaticSurfaces
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -112,7 +112,7 @@ class ColoredPoints(NamedTuple):
 
 
 def score_surface(
-    vertices: Float, faces: Index, standing: Standing, places: Float, T_world_map: Float
+    vertices: Float, faces: Index, standing: StaticSurfaces, places: Float, T_world_map: Float
 ) -> SurfaceScores:
     """Score a surface.
 
@@ -125,7 +125,7 @@ def score_surface(
     on_mesh = transform_points(
         T_world_map, mesh_distance.sample_surface(vertices, faces, SAMPLES).points
     )
-    distance, _ = standing.nearest(on_mesh)
+    distance, _ = standing.project(on_mesh)
     gaps = mesh_distance.distance_to_mesh(
         places, transform_points(T_world_map, vertices), faces, COMPLETE
     )
@@ -143,7 +143,7 @@ def score_texture(
     record: TextureRecord,
     coloured: ColoredPoints,
     pictures: TrueImages,
-    standing: Standing,
+    standing: StaticSurfaces,
     colour_seed: int,
     T_world_map: Float,
     max_distance: float = float("inf"),
@@ -231,15 +231,15 @@ def find_visible_samples(
 
 
 def compute_color_errors(
-    coloured: ColoredPoints, standing: Standing, colour_seed: int, T_world_map: Float
+    coloured: ColoredPoints, standing: StaticSurfaces, colour_seed: int, T_world_map: Float
 ) -> Float:
     """(n,) CIEDE2000 between a texture and the true color of the nearest static surface.
 
     Raises:
         MissingExtra: scikit-image is not installed.
     """
-    _, places = standing.nearest(transform_points(T_world_map, coloured.points))
-    return compute_color_difference(coloured.color, static_colour(places, colour_seed))
+    _, places = standing.project(transform_points(T_world_map, coloured.points))
+    return compute_color_difference(coloured.color, compute_static_color(places, colour_seed))
 
 
 def compute_color_difference(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Float:

@@ -15,7 +15,7 @@ from stillmap.core.recording import Recording
 from stillmap.eval import mesh_distance, readers
 from stillmap.eval.mesh import SAMPLES, ColoredPoints, TextureRecord, TrueImages
 from stillmap.eval.object_models import Model, MoverHits, Track
-from stillmap.sim.truth_images import PictureTruth, load_picture_truth
+from stillmap.sim.truth_images import ImageTruth, load_image_truth
 from stillmap.slam.deskew import deskew_recording
 from stillmap.slam.options import SlamOptions
 
@@ -38,7 +38,7 @@ class CameraSimulation(NamedTuple):
 
     truth: readers.Truth
     images: TrueImages
-    image_truth: PictureTruth
+    image_truth: ImageTruth
     end_points: Float
 
     def observed_places(self, max_range: float) -> Float:
@@ -50,7 +50,7 @@ class CameraSimulation(NamedTuple):
         recording = self.truth.recording
         use = recording.hit & self.truth.static()
         use &= np.linalg.norm(recording.points, axis=1) <= max_range
-        _, places = self.image_truth.standing.nearest(self.end_points[use])
+        _, places = self.image_truth.standing.project(self.end_points[use])
         return places[mesh_distance.first_per_voxel(places, _VOXEL)]
 
     def mover_hits(self) -> MoverHits:
@@ -72,7 +72,7 @@ def read_camera_simulation(path: Path) -> CameraSimulation:
     """
     if (path / "tilting").is_dir():
         path = path / "tilting"
-    truth, picture_truth = readers.read_truth(path), load_picture_truth(path)
+    truth, picture_truth = readers.read_truth(path), load_image_truth(path)
     recording, images = truth.recording, truth.recording.images
     if images is None or len(images) != len(picture_truth.T_world_camera):
         raise InputError("has other images than its truth", where=str(path))

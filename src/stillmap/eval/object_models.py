@@ -17,7 +17,7 @@ from stillmap.eval.mesh import (
     transform_points,
 )
 from stillmap.sim.geometry import Solids
-from stillmap.sim.truth_surfaces import Moving, nearest_on_solid, to_local, to_world
+from stillmap.sim.truth_surfaces import MovingSurfaces, project_to_solid, to_local, to_world
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -149,7 +149,7 @@ def score_object_models(
     tracked: Mapping[int, int],
     models: Mapping[int, tuple[int, Model]],
     kinds: Sequence[str],
-    moving: Moving,
+    moving: MovingSurfaces,
     sighted: MoverHits,
     pictures: TrueImages,
     T_world_map: Float,
@@ -200,7 +200,7 @@ def score_model(
     mover: int,
     kind: str,
     model: Model,
-    moving: Moving,
+    moving: MovingSurfaces,
     sighted: MoverHits,
     pictures: TrueImages,
     T_world_map: Float,
@@ -233,13 +233,13 @@ def distance_to_solids(points: Float, solids: Solids) -> Float:
     """(n,) metres to the nearest of solids at one time."""
     out = np.full(len(points), np.inf)
     for k in range(len(solids.form)):
-        off = np.linalg.norm(nearest_on_solid(points, solids, k) - points, axis=1)
+        off = np.linalg.norm(project_to_solid(points, solids, k) - points, axis=1)
         np.fmin(out, off, out=out)
     return out
 
 
 def collect_observed_points(
-    moving: Moving, mover: int, stamp_ns: int, span_ns: tuple[int, int], sighted: MoverHits
+    moving: MovingSurfaces, mover: int, stamp_ns: int, span_ns: tuple[int, int], sighted: MoverHits
 ) -> Float:
     """Observed points (n, 3) of a mover, moved to where they are at a stamp; in the world.
 
@@ -257,7 +257,7 @@ def collect_observed_points(
     then, now = moving.at(parts, stamps), moving.at(parts, stamp_ns)
     nearest, found = np.full(len(points), np.inf), np.full((len(points), 3), np.nan)
     for k in range(len(parts)):
-        on = nearest_on_solid(points, then, k)
+        on = project_to_solid(points, then, k)
         off = np.linalg.norm(on - points, axis=1)
         better = off < nearest
         moved = to_world(to_local(on, then.pose[:, k]), now.pose[:, k])

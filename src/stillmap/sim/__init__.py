@@ -1,6 +1,6 @@
 """Simulated recordings of places where people, doors and cars move, with the truth of each beam."""
 
-from stillmap.sim.appearance import static_colour
+from stillmap.sim.appearance import compute_static_color
 from stillmap.sim.options import (
     CameraOptions,
     CrowdOptions,
@@ -17,8 +17,8 @@ from stillmap.sim.options import (
 from stillmap.sim.scene import Door, Lane, Light, Scene, Stay, Thing
 from stillmap.sim.simulator import RigSimulation, Simulation, simulate, simulate_rig
 from stillmap.sim.truth import Truth, load_truth
-from stillmap.sim.truth_images import PictureTruth, load_picture_truth
-from stillmap.sim.truth_surfaces import mover_points
+from stillmap.sim.truth_images import ImageTruth, load_image_truth
+from stillmap.sim.truth_surfaces import sample_mover
 from stillmap.sim.worlds import SCENES, scene_by_name
 from stillmap.sim.writer import write_rig, write_simulation
 
@@ -35,7 +35,7 @@ __all__ = [
     "LidarOptions",
     "Light",
     "OdometryOptions",
-    "PictureTruth",
+    "ImageTruth",
     "RigOptions",
     "RigSimulation",
     "RobotOptions",
@@ -45,13 +45,13 @@ __all__ = [
     "Thing",
     "TrafficOptions",
     "Truth",
-    "load_picture_truth",
+    "load_image_truth",
     "load_truth",
-    "mover_points",
+    "sample_mover",
     "scene_by_name",
     "simulate",
     "simulate_rig",
-    "static_colour",
+    "compute_static_color",
     "write_rig",
     "write_simulation",
 ]

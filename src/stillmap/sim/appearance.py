@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stillmap.sim.geometry import BOX, ELLIPSOID
 
 Float = NDArray[np.float64]
-Colour = NDArray[np.uint8]
+Color = NDArray[np.uint8]
 
 _TURNED = (0.5257, 0.4142, 0.7321)  # rad, roll, pitch, yaw of the lattices
 _TILE, _CHIP, _STRIPE = 0.55, 0.17, 0.09  # m
@@ -57,7 +57,7 @@ _SKIN, _HAIR, _SHOE = (222, 172, 140), (70, 46, 30), (40, 34, 30)
 _ZENITH, _HORIZON = np.array((120, 170, 232.0)), np.array((206, 226, 244.0))
 
 
-class Spot(NamedTuple):
+class SurfacePoints(NamedTuple):
     """Places on one part of something that moves.
 
     Attributes:
@@ -75,7 +75,7 @@ class Spot(NamedTuple):
     seed: int
 
 
-def static_colour(points: Float, seed: int, blur: Float | float = 0.0) -> Colour:
+def compute_static_color(points: Float, seed: int, blur: Float | float = 0.0) -> Color:
     """(n, 3) red, green, blue of what stands still at points (n, 3) in the world.
 
     Args:
@@ -99,19 +99,19 @@ def static_colour(points: Float, seed: int, blur: Float | float = 0.0) -> Colour
     return _rounded(colour)
 
 
-def sky_colour(direction: Float) -> Colour:
+def compute_sky_color(direction: Float) -> Color:
     """(n, 3) of the sky along directions (n, 3) of length one."""
     up = np.clip(direction[:, 2:], 0.0, 1.0)
     return _rounded(_HORIZON + (_ZENITH - _HORIZON) * np.sqrt(up))
 
 
-def mover_colour(kind: str, spot: Spot) -> Colour:
+def compute_mover_color(kind: str, spot: SurfacePoints) -> Color:
     """(n, 3) of places on what moves: "person", "door", "car", "forklift" or "thing"."""
     paint = {"person": _person, "door": _door, "thing": _thing}.get(kind, _vehicle)
     return _rounded(paint(spot))
 
 
-def _person(spot: Spot) -> Float:
+def _person(spot: SurfacePoints) -> Float:
     mover, form, half, z, p, seed = spot
     u, v, w = p.T
     around = np.arctan2(v / half[1], u / half[0])
@@ -132,7 +132,7 @@ def _person(spot: Spot) -> Float:
     return np.where(belt, _SHOE, np.where(checked[:, None], one, other))
 
 
-def _vehicle(spot: Spot) -> Float:
+def _vehicle(spot: SurfacePoints) -> Float:
     mover, form, half, z, p, seed = spot
     u, v, w = p.T
     paint = _two(_CARS, mover, seed)[0]
@@ -153,14 +153,14 @@ def _vehicle(spot: Spot) -> Float:
     return np.where((lamp & (u < 0))[:, None], (200.0, 16.0, 20.0), colour)
 
 
-def _door(spot: Spot) -> Float:
+def _door(spot: SurfacePoints) -> Float:
     u, _, w = spot.local.T
     wood = np.array((150, 92, 48.0)) * (1.0 + 0.12 * np.sin(40 * u + 3 * np.sin(5 * w)))[:, None]
     panel = (np.abs(np.abs(u) - 0.25) < 0.16) & (np.abs(w % 0.9 - 0.45) < 0.3)
     return np.asarray(np.where(panel[:, None], 0.75 * wood, wood))
 
 
-def _thing(spot: Spot) -> Float:
+def _thing(spot: SurfacePoints) -> Float:
     one, other = _two(_CLOTHES, spot.mover, spot.seed)
     squares = np.floor(spot.local / 0.15 + 0.01).astype(np.int64).sum(axis=1)
     return np.where((squares % 2 == 0)[:, None], one, 0.7 * one + 0.3 * other)
@@ -173,8 +173,8 @@ def _two(palette: Float, mover: int, seed: int) -> tuple[Float, Float]:
     return palette[first], palette[(first + step) % len(palette)]
 
 
-def _rounded(colour: Float) -> Colour:
-    out: Colour = np.clip(np.rint(colour), 0, 255).astype(np.uint8)
+def _rounded(colour: Float) -> Color:
+    out: Color = np.clip(np.rint(colour), 0, 255).astype(np.uint8)
     return out
 
 

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.sim import appearance, lidar, renderer
-from stillmap.sim.appearance import Spot
-from stillmap.sim.episode import Happening
+from stillmap.sim.appearance import SurfacePoints
+from stillmap.sim.episode import Episode
 from stillmap.sim.geometry import Solids
 from stillmap.sim.options import CameraOptions
 from stillmap.sim.recorder import World
-from stillmap.sim.renderer import NOTHING, Lens, Shown
+from stillmap.sim.renderer import NOTHING, Lens, RenderedImage
 from stillmap.sim.truth_surfaces import to_local
 
 Float = NDArray[np.float64]
 
-Colour = NDArray[np.uint8]
+Color = NDArray[np.uint8]
 
 _LATER = 0.31  # of the time between two scans: no picture is taken at a scan's stamp
 
@@ -34,7 +34,7 @@ _EXACT = 1e-10  # of the focal length
 _AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-class Shots(NamedTuple):
+class ImageTimes(NamedTuple):
     """N pictures, in the order of their stamps.
 
     Attributes:
@@ -50,7 +50,7 @@ class Shots(NamedTuple):
     seconds: Float
 
     @classmethod
-    def of(cls, happening: Happening, o: CameraOptions) -> "Shots":
+    def of(cls, happening: Episode, o: CameraOptions) -> "ImageTimes":
         """Pictures at an even rate while the robot scans."""
         motion, T = happening.motion, len(happening.motion.robot)
         step = 1.0 / (o.rate * motion.period)  # in scans
@@ -74,7 +74,7 @@ def place_cameras(o: CameraOptions) -> tuple[Camera, ...]:
     for k in range(o.count):
         turn = 2 * math.pi * k / o.count
         sits = np.array([o.x, o.y, o.z])
-        T = lidar.matrix(np.zeros(3), *np.array([0.0, 0.0, turn])) @ lidar.matrix(
+        T = lidar.make_pose(np.zeros(3), *np.array([0.0, 0.0, turn])) @ lidar.make_pose(
             sits, *np.array([0.0, o.pitch, o.yaw])
         )
         T[:3, :3] = T[:3, :3] @ _AHEAD
@@ -84,7 +84,7 @@ def place_cameras(o: CameraOptions) -> tuple[Camera, ...]:
     return tuple(out)
 
 
-def looking(camera: Camera, right: float = 0.0, down: float = 0.0) -> Float:
+def compute_pixel_rays(camera: Camera, right: float = 0.0, down: float = 0.0) -> Float:
     """(3, height, width) of length one: where each pixel looks, in the camera's frame.
 
     Args:
@@ -99,12 +99,12 @@ def looking(camera: Camera, right: float = 0.0, down: float = 0.0) -> Float:
             (v[:, None] - camera.K[1, 2]) / camera.K[1, 1],
         )
     )
-    xy = straightened(bent, camera.distortion) if len(camera.distortion) else bent
+    xy = undistort(bent, camera.distortion) if len(camera.distortion) else bent
     rays = np.concatenate([xy, np.ones((1, *xy.shape[1:]))])
     return np.asarray(rays / np.linalg.norm(rays, axis=0))
 
 
-def bent(xy: Float, distortion: Float) -> Float:
+def distort(xy: Float, distortion: Float) -> Float:
     """(2, ...) where a lens k1, k2, p1, p2, k3 shows what an ideal one shows at (2, ...).
 
     Both in units of the focal length: Brown, "Decentering distortion of lenses", 1966, as OpenCV
@@ -122,7 +122,7 @@ def bent(xy: Float, distortion: Float) -> Float:
     )
 
 
-def straightened(shown: Float, distortion: Float) -> Float:
+def undistort(shown: Float, distortion: Float) -> Float:
     """The inverse of `bent`, by Newton's method.
 
     Raises:
@@ -137,7 +137,7 @@ def straightened(shown: Float, distortion: Float) -> Float:
         xx = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
         yy = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
         across = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
-        left, size = shown - bent(xy, distortion), xx * yy - across * across
+        left, size = shown - distort(xy, distortion), xx * yy - across * across
         if np.abs(left).max() < _EXACT:
             break
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -154,10 +154,10 @@ def straightened(shown: Float, distortion: Float) -> Float:
 
 SKY = 65535  # in masks: nothing there
 
-MOST_MOVERS = SKY - 1
+MAX_MOVERS = SKY - 1
 
 
-class Photograph(NamedTuple):
+class TrueImage(NamedTuple):
     """One picture and its truth.
 
     Attributes:
@@ -166,12 +166,12 @@ class Photograph(NamedTuple):
         distance: (h, w) float32 metres along the pixel's ray; inf where nothing is.
     """
 
-    colour: Colour
+    color: Color
     mask: NDArray[np.uint16]
     distance: NDArray[np.float32]
 
 
-class Photographs:
+class CameraSimulator:
     """All pictures that the cameras of a world take.
 
     Attributes:
@@ -185,7 +185,7 @@ class Photographs:
         if happening.colour_seed is None:
             raise ValueError("the scene has no camera")
         self._world, self._options, self.colour_seed = world, o, happening.colour_seed
-        self._shots = Shots.of(happening, o)
+        self._shots = ImageTimes.of(happening, o)
         cameras = place_cameras(o)
         # all alike
         self._lenses = [_lens(cameras[0], *offset) for offset in _within_a_pixel(o.antialias)]
@@ -197,7 +197,7 @@ class Photographs:
     def __len__(self) -> int:
         return len(self.images)
 
-    def take(self, image: int) -> Photograph:
+    def render(self, image: int) -> TrueImage:
         """One picture with its truth.
 
         With several rays for each pixel, one that a mover touches is his, and the nearest of its
@@ -206,66 +206,68 @@ class Photographs:
         moving = self._moving(image)
         parts = [self._rendered(lens, self.T_world_camera[image], moving) for lens in self._lenses]
         mask, distance = parts[0].mask, parts[0].distance
-        total = parts[0].colour.astype(np.float64)
+        total = parts[0].color.astype(np.float64)
         for one in parts[1:]:
             theirs = (mask == 0) | ((mask == SKY) & (one.mask != 0))
             mask = np.where(theirs & (one.mask != SKY), one.mask, mask)
             distance = np.minimum(distance, one.distance)
-            total += one.colour
-        return Photograph(self._developed(total / len(parts), image), mask, distance)
+            total += one.color
+        return TrueImage(self._developed(total / len(parts), image), mask, distance)
 
-    def _colours(self, image: int) -> Colour:
-        return self.take(image).colour
+    def _colours(self, image: int) -> Color:
+        return self.render(image).color
 
     def _moving(self, image: int) -> Solids:
         scan = int(self._shots.scan[image])
         moment = self._world.moment(np.array([scan]), self._shots.seconds[image : image + 1])
         return self._world.carried.at(moment, scan)
 
-    def _rendered(self, lens: Lens, T_world_camera: Float, moving: Solids) -> Photograph:
+    def _rendered(self, lens: Lens, T_world_camera: Float, moving: Solids) -> TrueImage:
         world, R = self._world, T_world_camera[:3, :3]
         ceiling = world.happening.scene.heights.ceiling
-        seen = renderer.shown(
+        seen = renderer.render(
             lens, T_world_camera, world.faces, world.still, moving, world.ground, ceiling
         )
         direction = np.einsum("ij,jhw->hwi", R, lens.direction)
         colour = np.empty((*seen.part.shape, 3), np.uint8)
         sky, static = seen.part == NOTHING, seen.part == renderer.STATIC
-        colour[sky] = appearance.sky_colour(direction[sky])
+        colour[sky] = appearance.compute_sky_color(direction[sky])
         range = seen.range[static]
         places = T_world_camera[:3, 3] + range[:, None] * direction[static]
-        colour[static] = appearance.static_colour(places, self.colour_seed, range / lens.K[0, 0])
+        colour[static] = appearance.compute_static_color(
+            places, self.colour_seed, range / lens.K[0, 0]
+        )
         self._paint_movers(colour, seen, T_world_camera[:3, 3], direction, moving)
         mask = np.zeros(seen.part.shape, np.uint16)
         mask[sky] = SKY
         moves = seen.part >= 0
         mask[moves] = moving.mover[seen.part[moves]] + 1
-        return Photograph(colour, mask, seen.range.astype(np.float32))
+        return TrueImage(colour, mask, seen.range.astype(np.float32))
 
     def _paint_movers(
-        self, colour: Colour, seen: Shown, at: Float, direction: Float, moving: Solids
+        self, colour: Color, seen: RenderedImage, at: Float, direction: Float, moving: Solids
     ) -> None:
         kinds = self._world.happening.motion.kinds
         for k in np.unique(seen.part[seen.part >= 0]).tolist():
             pixels, mover = seen.part == k, int(moving.mover[k])
             p = at + seen.range[pixels][:, None] * direction[pixels]
             part = (int(moving.form[k]), moving.half[k], moving.z[k])
-            spot = Spot(mover, *part, to_local(p, moving.pose[0, k]), self.colour_seed)
-            colour[pixels] = appearance.mover_colour(kinds[mover], spot)
+            spot = SurfacePoints(mover, *part, to_local(p, moving.pose[0, k]), self.colour_seed)
+            colour[pixels] = appearance.compute_mover_color(kinds[mover], spot)
 
-    def _developed(self, colour: Float, image: int) -> Colour:
+    def _developed(self, colour: Float, image: int) -> Color:
         """With the exposure and the noise of this picture."""
         rng = np.random.default_rng((self.colour_seed, image))
         o = self._options
         gain = np.exp(o.exposure * rng.standard_normal())
         noise = o.noise * rng.standard_normal(colour.shape, dtype=np.float32)
-        out: Colour = np.clip(np.rint(gain * colour + noise), 0, 255).astype(np.uint8)
+        out: Color = np.clip(np.rint(gain * colour + noise), 0, 255).astype(np.uint8)
         return out
 
 
 def _lens(one: Camera, right: float, down: float) -> Lens:
     assert one.K is not None
-    return Lens.of(looking(one, right, down), one.K)
+    return Lens.of(compute_pixel_rays(one, right, down), one.K)
 
 
 def _within_a_pixel(n: int) -> list[tuple[float, float]]:

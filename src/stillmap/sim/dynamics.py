@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from stillmap.core.errors import InputError
 from stillmap.sim.laser import Movers, Outlines
-from stillmap.sim.objects import REACH, Doors, Things, legs
+from stillmap.sim.objects import DOOR_RANGE, Doors, MovableObjects, split_into_segments
 from stillmap.sim.people import BODY_RADIUS, Crowd, Figures
 from stillmap.sim.planner import FreeSpace, Planner
-from stillmap.sim.robot import Robot, plan_way
+from stillmap.sim.robot import Robot, plan_route
 from stillmap.sim.scene import Scene
 from stillmap.sim.vehicles import Traffic
 
@@ -66,7 +66,7 @@ class Motion:
     moved: NDArray[np.bool_]
 
 
-def move(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
+def simulate_motion(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
     """Let everything move, and note where it is at each scan.
 
     Args:
@@ -81,7 +81,7 @@ def move(scene: Scene, rngs: Rngs, tell: Progress) -> Motion:
     o, rate = scene.robot, scene.scan_rate
     steps = max(1, math.ceil(1.0 / (rate * _STEP) - 1e-9))
     dt = 1.0 / (rate * steps)
-    expected = o.scans or world.robot.undisturbed_time() * rate
+    expected = o.scans or world.robot.nominal_time() * rate
     carried = None if o.carried_at is None else max(1, round(o.carried_at * expected))
     paused = None if o.pause_at is None else max(1, round(o.pause_at * rate))
     log = _Log()
@@ -121,12 +121,18 @@ class _World:
         start, o = np.array(scene.route[0], float), scene.robot
         # an open leaf is in the way, a closed one opens for whoever comes
         leaves = [door.leaf(door.opened) for door in scene.leaves]
-        self.things = Things(scene.things)
-        solid = [*scene.walls, *scene.glass, *scene.kerbs, *leaves, *self.things.everywhere()]
+        self.things = MovableObjects(scene.things)
+        solid = [
+            *scene.walls,
+            *scene.glass,
+            *scene.kerbs,
+            *leaves,
+            *self.things.faces_at_all_places(),
+        ]
         space = FreeSpace(np.array(solid, float))
         planner = Planner(space, start, o.radius + _ROBOT_MARGIN)
         closed = o.scans is not None
-        way = plan_way(scene.route, planner, closed)
+        way = plan_route(scene.route, planner, closed)
         self.robot = Robot(way, space, o, closed, scene.lights)
         people_at = np.array(scene.people_at or scene.route[:1], float)
         people_planner = Planner(space, people_at, BODY_RADIUS + _PERSON_MARGIN)
@@ -145,7 +151,7 @@ class _World:
     def rest_robot(self, seconds: float, dt: float) -> None:
         """The robot stands for so long; everything else goes on, by steps of dt seconds."""
         for _ in range(round(seconds / dt)):
-            self.robot.rest(dt)
+            self.robot.stand(dt)
             self._others_step(dt)
 
     def step(self, dt: float) -> None:
@@ -161,12 +167,14 @@ class _World:
 
     def _others_step(self, dt: float) -> None:
         robot, crowd, contact = self.robot, self.crowd, self._radius + BODY_RADIUS
-        crowd.step(dt, robot.pose, contact, robot.impatient)
+        crowd.step(dt, robot.pose, contact, robot.is_impatient)
         self.figures.step(dt, crowd, robot.pose[:2], self._radius)
         if len(self.doors.share):
             standing = np.concatenate([crowd.xy, robot.pose[None, :2]])
-            way = robot.way_ahead(REACH)[None]
-            ways = np.concatenate([legs(crowd.ways(REACH)), legs(way)])
+            way = robot.route_ahead(DOOR_RANGE)[None]
+            ways = np.concatenate(
+                [split_into_segments(crowd.next_corners(DOOR_RANGE)), split_into_segments(way)]
+            )
             self.doors.step(dt, standing, ways)
         if self.traffic.kinds:
             self.traffic.step(dt, robot.pose[:2], self._radius)
@@ -206,7 +214,7 @@ class _Log:
         figures, doors = world.figures, len(world.doors.share)
         persons = len(world.crowd.xy)
         kinds = ["person"] * persons + ["door"] * doors + world.traffic.kinds
-        placed = world.things.placed(clock.seconds, first=len(kinds))
+        placed = world.things.place(clock.seconds, first=len(kinds))
         people = Movers(
             np.stack(self._xy), np.stack(self._heading), figures.semi_axes, figures.mover
         )

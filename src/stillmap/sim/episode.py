@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.sim import odometry
-from stillmap.sim.dynamics import Motion, Progress, move
+from stillmap.sim.dynamics import Motion, Progress, simulate_motion
 from stillmap.sim.scene import Scene
 from stillmap.sim.truth import Truth
 
@@ -19,7 +19,7 @@ _FIRST_STAMP_NS = 1_000_000_000 * 10**9
 
 
 @dataclass(frozen=True, eq=False)
-class Happening:
+class Episode:
     """Everybody's motion, and what the robot's wheels say.
 
     Attributes:
@@ -68,7 +68,11 @@ class Happening:
     ) -> Truth:
         """The truth about beams; `more` is told of the scene after `mover_kinds`."""
         motion = self.motion
-        about = {**describe(self.scene, self.seed), "mover_kinds": motion.kinds, **(more or {})}
+        about = {
+            **describe_scene(self.scene, self.seed),
+            "mover_kinds": motion.kinds,
+            **(more or {}),
+        }
         if self.colour_seed is not None:
             about["colour_seed"] = self.colour_seed
         for name, scan in (("carried_at_scan", motion.carried), ("paused_at_scan", motion.paused)):
@@ -78,7 +82,7 @@ class Happening:
         return Truth(static, mover, T_world_base, self.walls, motion.poses, about, lasting)
 
 
-def let_happen(scene: Scene, rng: np.random.Generator, tell: Progress) -> Happening:
+def simulate_episode(scene: Scene, rng: np.random.Generator, tell: Progress) -> Episode:
     """Let everybody move and the odometry drift.
 
     Args:
@@ -91,18 +95,18 @@ def let_happen(scene: Scene, rng: np.random.Generator, tell: Progress) -> Happen
     """
     seed = getattr(rng.bit_generator.seed_seq, "entropy", None)
     crowd_rng, sensor_rng, odometry_rng, door_rng, traffic_rng, *mishap_rngs = rng.spawn(7)
-    motion = move(scene, (crowd_rng, door_rng, traffic_rng, mishap_rngs[0]), tell)
+    motion = simulate_motion(scene, (crowd_rng, door_rng, traffic_rng, mishap_rngs[0]), tell)
     walls = np.array([*scene.walls, *scene.glass, *motion.still], float)
-    driven = odometry.without_jump(se2.matrix(*motion.robot.T), motion.carried)
-    T_odom_base = odometry.drifting(driven, scene.odometry, odometry_rng)
-    T_odom_base = odometry.reported(T_odom_base, motion.seconds, scene.odometry, mishap_rngs[1])
+    driven = odometry.remove_jump(se2.matrix(*motion.robot.T), motion.carried)
+    T_odom_base = odometry.simulate_odometry(driven, scene.odometry, odometry_rng)
+    T_odom_base = odometry.add_faults(T_odom_base, motion.seconds, scene.odometry, mishap_rngs[1])
     body_rng = rng.spawn(1)[0]
     # spawned last, so that all else stays as it is without a camera
     seed_of_colours = int(rng.spawn(1)[0].integers(1 << 31)) if scene.camera.enabled else None
-    return Happening(scene, seed, motion, walls, T_odom_base, sensor_rng, body_rng, seed_of_colours)
+    return Episode(scene, seed, motion, walls, T_odom_base, sensor_rng, body_rng, seed_of_colours)
 
 
-def describe(scene: Scene, seed: Any) -> dict[str, Any]:
+def describe_scene(scene: Scene, seed: Any) -> dict[str, Any]:
     """Name, seed and all parameters of a scene, JSON-able; its walls lie beside as an array."""
     parameters = dataclasses.asdict(scene)
     del parameters["walls"], parameters["kerbs"]

@@ -50,13 +50,13 @@ class Solids(NamedTuple):
     z: Float
     mover: NDArray[np.int32]
 
-    def some(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> "Solids":
+    def select(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> "Solids":
         """Those that are kept."""
         return Solids(
             self.pose[:, kept], self.form[kept], self.half[kept], self.z[kept], self.mover[kept]
         )
 
-    def with_others(self, others: "Solids") -> "Solids":
+    def concatenate(self, others: "Solids") -> "Solids":
         """These, and then others at the same times."""
         return Solids(
             np.concatenate([self.pose, others.pose], axis=1),
@@ -115,7 +115,7 @@ class Assembly(NamedTuple):
         return Solids(at, self.form, self.half, self.z, self.mover)
 
 
-def assembled(parts: Sequence[tuple[int, int, Part]]) -> Assembly:
+def assemble(parts: Sequence[tuple[int, int, Part]]) -> Assembly:
     """The parts of things: number of the carrier, number of the mover, and the part itself."""
     return Assembly(
         np.array([carrier for carrier, _, _ in parts], np.int64),
@@ -211,7 +211,7 @@ _WIDEST = 7.0  # m, half of what a crown measures
 _BRANCHES = 2.3  # m, where crowns begin
 
 
-def vehicle(length: float, width: float, kind: str) -> list[Part]:
+def make_vehicle(length: float, width: float, kind: str) -> list[Part]:
     """A car, a van or a forklift that heads along its length."""
     if kind == "forklift":
         return _forklift(length, width)
@@ -243,29 +243,29 @@ def _forklift(length: float, width: float) -> list[Part]:
     return [body, mast, roof, *forks, *posts]
 
 
-def leg(half: tuple[float, float], tall: float) -> list[Part]:
+def make_leg(half: tuple[float, float], tall: float) -> list[Part]:
     """One leg of a person so many metres tall."""
     return [Part(CYLINDER, 0.0, 0.0, half, (0.0, 0.48 * tall))]
 
 
-def torso_and_head(half: tuple[float, float], tall: float) -> list[Part]:
+def make_torso_and_head(half: tuple[float, float], tall: float) -> list[Part]:
     """What is above the legs."""
     torso = Part(CYLINDER, 0.0, 0.0, half, (0.46 * tall, 0.83 * tall))
     return [torso, Part(ELLIPSOID, 0.02, 0.0, (0.1, 0.08), (0.84 * tall, tall))]
 
 
-def door(width: float, height: float) -> list[Part]:
+def make_door(width: float, height: float) -> list[Part]:
     """A leaf."""
     return [Part(BOX, 0.0, 0.0, (width / 2, LEAF / 2), (0.01, height))]
 
 
-def boxed(length: float, width: float, heights: HeightOptions) -> list[Part]:
+def make_box(length: float, width: float, heights: HeightOptions) -> list[Part]:
     """What is drawn as a box with sides along and across its heading.
 
     Under the open sky what measures as much as a car is one; else it is furniture.
     """
     if heights.ceiling is None and 3.8 <= length <= 6.0 and 1.5 <= width <= 2.3:
-        return vehicle(length, width, "car")
+        return make_vehicle(length, width, "car")
     if max(length, width) < _LEG:
         top = _SEAT
     else:
@@ -273,7 +273,7 @@ def boxed(length: float, width: float, heights: HeightOptions) -> list[Part]:
     return [Part(BOX, 0.0, 0.0, (length / 2, width / 2), (0.0, min(top, heights.top)))]
 
 
-def round_thing(radius: float, heights: HeightOptions) -> list[Part]:
+def make_round_object(radius: float, heights: HeightOptions) -> list[Part]:
     """What is drawn as a circle: a column; under the open sky a lamp post, or a tree."""
     around = (radius, radius)
     if heights.ceiling is not None:

@@ -65,7 +65,7 @@ class Returns(NamedTuple):
     mover: NDArray[np.int32]
 
 
-def beam_angles(beams: int, fov: float) -> Float:
+def compute_beam_angles(beams: int, fov: float) -> Float:
     """(n,) angles in the sensor frame, rising, in radians.
 
     As SICK scanners number them: an odd number of beams includes both ends of the field of view,
@@ -76,7 +76,7 @@ def beam_angles(beams: int, fov: float) -> Float:
     return np.asarray(-fov / 2 + step * np.arange(beams), np.float64)
 
 
-def cast(
+def cast_beams(
     poses: Float,
     angles: Float,
     walls: Float,
@@ -199,7 +199,7 @@ def _cast_movers(
         flat_which[beam[nearer]] = movers.mover[q]
 
 
-def measure(
+def simulate_measurement(
     exact: Returns, is_glass: NDArray[np.bool_], options: LaserOptions, rng: np.random.Generator
 ) -> tuple[Float, NDArray[np.bool_]]:
     """Measured ranges (T, n) and whether something came back (T, n).

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from stillmap.core import se2
 from stillmap.sim import laser, ray_casting
-from stillmap.sim.geometry import BOX, Faces, Ground, Part, assembled
+from stillmap.sim.geometry import BOX, Faces, Ground, Part, assemble
 from stillmap.sim.options import GroundOptions, LaserOptions, LidarOptions, RigOptions
-from stillmap.sim.ray_casting import Echoes, Rays
+from stillmap.sim.ray_casting import RayReturns, Rays
 from stillmap.sim.scene import Scene
 
 Float = NDArray[np.float64]
@@ -55,7 +55,7 @@ class Pattern(NamedTuple):
     @classmethod
     def tilted(cls, o: LaserOptions, joint: Float, seconds: Float) -> "Pattern":
         """That of a planar laser which at each of its beams is tilted by (n,) rad, nose down."""
-        angle = laser.beam_angles(o.beams, o.fov)
+        angle = laser.compute_beam_angles(o.beams, o.fov)
         direction = np.stack(
             [np.cos(angle) * np.cos(joint), np.sin(angle), -np.cos(angle) * np.sin(joint)]
         )
@@ -84,30 +84,32 @@ class Sensor(NamedTuple):
     pattern: Callable[[int], Pattern]
     takes_time: bool
     leaves_out: bool = False
-    own: Echoes | None = None
+    own: RayReturns | None = None
 
 
-def spinning(scene: Scene) -> Sensor:
+def make_spinning_lidar(scene: Scene) -> Sensor:
     """The lidar of a scene."""
     o, pattern = scene.lidar, Pattern.of(scene.lidar)
-    T = matrix(np.array([o.x, o.y, o.z]), *np.array([0.0, o.pitch, o.yaw]))
-    own = own_body(scene, pattern, T) if o.sees_robot else None
+    T = make_pose(np.array([o.x, o.y, o.z]), *np.array([0.0, o.pitch, o.yaw]))
+    own = cast_robot_body(scene, pattern, T) if o.sees_robot else None
     leaves_out = o.no_returns == "left out"
     return Sensor("simulated lidar", 3, T, o, lambda _: pattern, o.sweep, leaves_out, own)
 
 
-def of_rig(scene: Scene) -> tuple[Sensor, Sensor]:
+def make_rig_lasers(scene: Scene) -> tuple[Sensor, Sensor]:
     """The laser of a scene, lying flat, and another one like it that tilts."""
     o, rig = scene.laser, scene.rig
-    angle = laser.beam_angles(o.beams, o.fov)
+    angle = laser.compute_beam_angles(o.beams, o.fov)
     seconds = o.sweep_time * (angle - angle[0]) / o.fov
     flat = Pattern.tilted(o, np.zeros(o.beams), seconds)
 
     def tilted(scan: int) -> Pattern:
-        return Pattern.tilted(o, joint_angle(scan / scene.scan_rate + seconds, rig), seconds)
+        return Pattern.tilted(
+            o, compute_joint_angle(scan / scene.scan_rate + seconds, rig), seconds
+        )
 
-    low = matrix(np.array([o.x, o.y, rig.low_z]), *np.array([0.0, 0.0, o.yaw]))
-    pivot = matrix(np.array([rig.pivot_x, 0.0, rig.pivot_z]), *np.zeros(3))
+    low = make_pose(np.array([o.x, o.y, rig.low_z]), *np.array([0.0, 0.0, o.yaw]))
+    pivot = make_pose(np.array([rig.pivot_x, 0.0, rig.pivot_z]), *np.zeros(3))
     takes_time = o.sweep_time > 0
     return (
         Sensor("simulated laser", 2, low, o, lambda _: flat, takes_time),
@@ -115,13 +117,13 @@ def of_rig(scene: Scene) -> tuple[Sensor, Sensor]:
     )
 
 
-def joint_angle(seconds: Float, rig: RigOptions) -> Float:
+def compute_joint_angle(seconds: Float, rig: RigOptions) -> Float:
     """(...) rad, nose down, of the laser that tilts; it begins in the middle, on its way down."""
     share = (seconds / rig.period + 0.25) % 1.0
     return np.asarray(rig.middle + rig.amplitude * (1.0 - 4.0 * np.abs(share - 0.5)))
 
 
-def matrix(xyz: Float, roll: Float, pitch: Float, yaw: Float) -> Float:
+def make_pose(xyz: Float, roll: Float, pitch: Float, yaw: Float) -> Float:
     """(..., 4, 4) poses: turned by roll about x, then pitch about y, then yaw about z, in rad.
 
     Args:
@@ -137,7 +139,9 @@ def matrix(xyz: Float, roll: Float, pitch: Float, yaw: Float) -> Float:
     return T
 
 
-def ridden(robot: Float, ground: Ground, o: LidarOptions, rng: np.random.Generator) -> Float:
+def compute_robot_poses(
+    robot: Float, ground: Ground, o: LidarOptions, rng: np.random.Generator
+) -> Float:
     """(T, 6) x, y, z, roll, pitch, yaw of a robot that stands on the ground and shakes.
 
     Args:
@@ -156,7 +160,7 @@ def ridden(robot: Float, ground: Ground, o: LidarOptions, rng: np.random.Generat
     return np.stack([x, y, ground.height(x, y) + shaking[2], roll, pitch, yaw], axis=-1)
 
 
-def looking(pattern: Pattern, T_world_sensor: Float) -> Rays:
+def transform_rays(pattern: Pattern, T_world_sensor: Float) -> Rays:
     """The beams of one turn in the world.
 
     Args:
@@ -178,23 +182,25 @@ def looking(pattern: Pattern, T_world_sensor: Float) -> Rays:
     return Rays(origin, turned, azimuth, float(off), pattern.elevation, tilt)
 
 
-def own_body(scene: Scene, pattern: Pattern, T_base_sensor: Float) -> Echoes:
+def cast_robot_body(scene: Scene, pattern: Pattern, T_base_sensor: Float) -> RayReturns:
     """What of the robot itself its lidar sees: a box as large as its footprint, or as given."""
     o, radius = scene.lidar, scene.robot.radius
     top = max(o.z - o.roof_below, 0.1)
     ahead = radius if o.roof_length is None else 0.5 * o.roof_length
     aside = 0.8 * radius if o.roof_width is None else 0.5 * o.roof_width
-    box = assembled([(0, ROBOT, Part(BOX, 0.0, 0.0, (ahead, aside), (0.0, top)))])
+    box = assemble([(0, ROBOT, Part(BOX, 0.0, 0.0, (ahead, aside), (0.0, top)))])
     body = box.at(np.zeros((1, 1, 3)), np.zeros((1, 1)))
     nothing = Faces(np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool))
     below = Ground.of(GroundOptions(), np.empty((0, 4)))
-    seen = ray_casting.cast(looking(pattern, T_base_sensor[None]), nothing, [body], below, None)
+    seen = ray_casting.cast_rays(
+        transform_rays(pattern, T_base_sensor[None]), nothing, [body], below, None
+    )
     range = np.where(seen.mover == ROBOT, seen.range, np.inf)
     return seen._replace(range=range)
 
 
-def measure(
-    exact: Echoes, o: LidarOptions | LaserOptions, rng: np.random.Generator
+def simulate_measurement(
+    exact: RayReturns, o: LidarOptions | LaserOptions, rng: np.random.Generator
 ) -> tuple[Float, NDArray[np.bool_]]:
     """Measured ranges (n, C) and whether something came back (n, C).
 
@@ -210,8 +216,8 @@ def measure(
     return np.where(hit, np.maximum(noisy, 1e-3), o.max_range), hit
 
 
-def planar(poses: Float) -> Float:
+def lift_poses(poses: Float) -> Float:
     """(T, 4, 4) of poses (T, 3, 3) in the plane."""
     x, y, yaw = se2.parameters(poses).T
     still = np.zeros_like(x)
-    return matrix(np.stack([x, y, still], axis=-1), still, still, yaw)
+    return make_pose(np.stack([x, y, still], axis=-1), still, still, yaw)

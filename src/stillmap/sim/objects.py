@@ -16,7 +16,7 @@ from stillmap.sim.scene import Door, Stay, Thing
 Float = NDArray[np.float64]
 
 
-class Placed(NamedTuple):
+class PlacedObjects(NamedTuple):
     """Where P things are at T scans.
 
     Attributes:
@@ -33,18 +33,18 @@ class Placed(NamedTuple):
     moved: NDArray[np.bool_]
 
 
-class Things:
+class MovableObjects:
     """P things and all their places."""
 
     def __init__(self, things: tuple[Thing, ...]) -> None:
         self._things = things
 
-    def everywhere(self) -> Float:
+    def faces_at_all_places(self) -> Float:
         """(K, 4) the faces of all things at all places where they ever stand."""
-        faces = [standing(thing, stay) for thing in self._things for stay in thing.stays]
+        faces = [place_faces(thing, stay) for thing in self._things for stay in thing.stays]
         return np.concatenate([np.empty((0, 4)), *faces])
 
-    def placed(self, seconds: Float, first: int) -> Placed:
+    def place(self, seconds: Float, first: int) -> PlacedObjects:
         """Where they are when scans are taken.
 
         Args:
@@ -59,7 +59,7 @@ class Things:
             for stay in thing.stays:
                 end = np.inf if stay.until is None else stay.until
                 at[(seconds >= stay.since) & (seconds < end)] = (stay.x, stay.y, stay.yaw)
-            faces = faces_at(thing, at)
+            faces = transform_faces(thing, at)
             poses.append(at)
             moved.append(not np.array_equal(at, np.broadcast_to(at[0], at.shape)))
             if not moved[-1]:
@@ -69,15 +69,15 @@ class Things:
                 mover.append(np.full(len(thing.faces), number, np.int32))
         outlines = Outlines(np.concatenate(moving, axis=1), np.concatenate(mover))
         by_scan = np.reshape(poses, (-1, T, 3)).swapaxes(0, 1)
-        return Placed(by_scan, outlines, np.concatenate(still), np.array(moved, bool))
+        return PlacedObjects(by_scan, outlines, np.concatenate(still), np.array(moved, bool))
 
 
-def standing(thing: Thing, stay: Stay) -> Float:
+def place_faces(thing: Thing, stay: Stay) -> Float:
     """(K, 4) the faces of a thing in the world, as it stands during a stay."""
-    return np.asarray(faces_at(thing, np.array([[stay.x, stay.y, stay.yaw]]))[0])
+    return np.asarray(transform_faces(thing, np.array([[stay.x, stay.y, stay.yaw]]))[0])
 
 
-def faces_at(thing: Thing, poses: Float) -> Float:
+def transform_faces(thing: Thing, poses: Float) -> Float:
     """(T, K, 4) the faces of a thing at poses (T, 3); of no length where these are NaN."""
     T = se2.matrix(*poses.T)[:, None]
     ends = np.reshape(thing.faces, (-1, 2)).astype(float)
@@ -85,7 +85,7 @@ def faces_at(thing: Thing, poses: Float) -> Float:
     return np.asarray(np.nan_to_num(moved.reshape(len(poses), -1, 4)), np.float64)
 
 
-REACH = 3.0  # m before the doorway somebody's coming opens the door
+DOOR_RANGE = 3.0  # m before the doorway somebody's coming opens the door
 
 _NEAR = 1.2  # m around the doorway's middle: no leaf closes while somebody is there
 
@@ -165,7 +165,7 @@ class Doors:
         return np.asarray(np.any((aside < 0) & (through < 0), axis=0))
 
 
-def legs(corners: Float) -> Float:
+def split_into_segments(corners: Float) -> Float:
     """(N (K - 1), 4) the legs of N ways with K corners (N, K, 2)."""
     return np.concatenate([corners[:, :-1], corners[:, 1:]], axis=-1).reshape(-1, 4)
 

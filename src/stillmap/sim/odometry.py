@@ -9,7 +9,9 @@ from stillmap.sim.options import OdometryOptions
 Float = NDArray[np.float64]
 
 
-def drifting(T_world_base: Float, options: OdometryOptions, rng: np.random.Generator) -> Float:
+def simulate_odometry(
+    T_world_base: Float, options: OdometryOptions, rng: np.random.Generator
+) -> Float:
     """(T, 3, 3) T_odom_base for true poses (T, 3, 3); the first one is the identity.
 
     Between two scans the left and right wheel roll d -+ b theta / 2. They are misread by their
@@ -45,7 +47,7 @@ def drifting(T_world_base: Float, options: OdometryOptions, rng: np.random.Gener
     return se2.matrix(position[:, 0], position[:, 1], heading)
 
 
-def reported(
+def add_faults(
     T_odom_base: Float, seconds: Float, options: OdometryOptions, rng: np.random.Generator
 ) -> Float:
     """What a recorder gets of odometry (T, 3, 3) that stalls and resets at times.
@@ -70,7 +72,7 @@ def reported(
     return T_odom_base
 
 
-def without_jump(T_world_base: Float, scan: int) -> Float:
+def remove_jump(T_world_base: Float, scan: int) -> Float:
     """Poses (T, 3, 3) as if nobody had moved the robot before `scan`, if there is such a scan."""
     if scan >= len(T_world_base):
         return T_world_base

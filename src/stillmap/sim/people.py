@@ -67,7 +67,7 @@ class Crowd:
     def speed(self) -> Float:
         return np.asarray(np.hypot(*self._velocity.T))
 
-    def ways(self, reach: float) -> Float:
+    def next_corners(self, reach: float) -> Float:
         """(P, 3, 2) where everybody is, and the next two corners of their ways, as far as `reach`.
 
         Args:

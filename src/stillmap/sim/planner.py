@@ -19,7 +19,7 @@ _LOOK_AHEAD = 80  # nodes that a shortcut may skip
 _NEAR_WALL_COST = 0.6  # how much longer a metre along a wall feels than one in the open
 
 
-def distance_to_segment(points: Float, segment: Float) -> Float:
+def compute_segment_distance(points: Float, segment: Float) -> Float:
     """(...) distances in metres of points (..., 2) from a segment (4,)."""
     start, along = segment[:2], segment[2:] - segment[:2]
     delta = points - start
@@ -51,7 +51,7 @@ class FreeSpace:
         window = self.clearance[y0:y1, x0:x1]
         rows, columns = np.indices(window.shape)
         nodes = self.origin + np.stack([columns + x0, rows + y0], axis=-1) * _SPACING
-        np.minimum(window, distance_to_segment(nodes, wall), out=window)
+        np.minimum(window, compute_segment_distance(nodes, wall), out=window)
 
     def clearance_at(self, xy: Float) -> tuple[Float, Float]:
         """Clearance (N,) in metres at points (N, 2), bilinear, and its gradient (N, 2)."""
@@ -152,7 +152,7 @@ class Planner:
             chain.append(int(tree[chain[-1]]))
         return self._pulled_tight(start, self.point(self.nodes[chain]))
 
-    def sees(self, start: Float, ends: Float) -> NDArray[np.bool_]:
+    def is_visible(self, start: Float, ends: Float) -> NDArray[np.bool_]:
         """Whether the straight ways from a point (2,) to points (K, 2) keep the clearance."""
         delta = ends - start
         steps = int(np.ceil(np.abs(delta).max(initial=0.0) / _SPACING)) + 1
@@ -166,7 +166,7 @@ class Planner:
         corners, at, here = [], 0, start
         while at < len(points) - 1:
             ahead = points[at + 1 : at + 1 + _LOOK_AHEAD]
-            seen = np.flatnonzero(self.sees(here, ahead))
+            seen = np.flatnonzero(self.is_visible(here, ahead))
             at += 1 + (int(seen[-1]) if len(seen) else 0)
             here = points[at]
             corners.append(here)

@@ -40,7 +40,7 @@ class Rays(NamedTuple):
     tilt: float
 
 
-class Echoes(NamedTuple):
+class RayReturns(NamedTuple):
     """The nearest thing on each of (n, C) beams.
 
     Attributes:
@@ -54,9 +54,9 @@ class Echoes(NamedTuple):
     on_glass: NDArray[np.bool_]
 
 
-def cast(
+def cast_rays(
     rays: Rays, faces: Faces, solids: list[Solids], ground: Ground, ceiling: float | None
-) -> Echoes:
+) -> RayReturns:
     """What each beam meets first.
 
     Args:
@@ -79,7 +79,7 @@ def cast(
     on_glass = np.zeros(range.shape, bool)
     for k, columns, channels in _windows_of_faces(rays, faces, ground):
         origin, direction = rays.origin[:, columns], rays.direction[:, columns, channels]
-        t = to_face(origin, direction, faces.ends[k], faces.z[k], ground)
+        t = intersect_face(origin, direction, faces.ends[k], faces.z[k], ground)
         nearer = t < range[columns, channels]
         range[columns, channels][nearer] = t[nearer]
         on_glass[columns, channels][nearer] = faces.is_glass[k]
@@ -87,15 +87,15 @@ def cast(
         for k, columns, channels in _windows_of_solids(rays, group):
             pose = group.pose[columns if len(group.pose) > 1 else slice(None), k]
             origin, direction = rays.origin[:, columns], rays.direction[:, columns, channels]
-            t = to_solid(origin, direction, group, k, pose)
+            t = intersect_solid(origin, direction, group, k, pose)
             nearer = t < range[columns, channels]
             range[columns, channels][nearer] = t[nearer]
             mover[columns, channels][nearer] = group.mover[k]
             on_glass[columns, channels][nearer] = False
-    return Echoes(range, mover, on_glass)
+    return RayReturns(range, mover, on_glass)
 
 
-def to_face(origin: Float, direction: Float, ends: Float, z: Float, ground: Ground) -> Float:
+def intersect_face(origin: Float, direction: Float, ends: Float, z: Float, ground: Ground) -> Float:
     """(n, C) metres along rays from (3, n, 1) to an upright face; inf: they pass it by."""
     (ox, oy, oz), (dx, dy, dz) = origin, direction
     x0, y0, x1, y1 = ends
@@ -110,7 +110,7 @@ def to_face(origin: Float, direction: Float, ends: Float, z: Float, ground: Grou
     return np.asarray(np.where(met, t, np.inf))
 
 
-def to_solid(origin: Float, direction: Float, solids: Solids, k: int, pose: Float) -> Float:
+def intersect_solid(origin: Float, direction: Float, solids: Solids, k: int, pose: Float) -> Float:
     """(n, C) metres along rays from (3, n, 1), outside it, to solid k at poses (n, 4) or (1, 4)."""
     x, y, heading, foot = pose.T[:, :, None]
     (a, b), (z0, z1), form = solids.half[k], solids.z[k], solids.form[k]

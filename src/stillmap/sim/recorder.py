@@ -11,13 +11,13 @@ from stillmap.core.arrays import ArrayBuilder
 from stillmap.core.recording import Recording
 from stillmap.sim import lidar, ray_casting
 from stillmap.sim.dynamics import Progress
-from stillmap.sim.episode import Happening
+from stillmap.sim.episode import Episode
 from stillmap.sim.geometry import Faces, Ground, Solids
 from stillmap.sim.lidar import Pattern, Sensor
-from stillmap.sim.ray_casting import Echoes
+from stillmap.sim.ray_casting import RayReturns
 from stillmap.sim.sweep import Moment
 from stillmap.sim.truth import Truth
-from stillmap.sim.world_3d import Carried, standing
+from stillmap.sim.world_3d import MoverSolids, make_static_world
 
 Float = NDArray[np.float64]
 
@@ -33,21 +33,21 @@ class World(NamedTuple):
         ridden: (T, 6) x, y, z, roll, pitch, yaw of the robot.
     """
 
-    happening: Happening
+    happening: Episode
     ground: Ground
     faces: Faces
     still: Solids
-    carried: Carried
+    carried: MoverSolids
     ridden: Float
 
     @classmethod
-    def of(cls, happening: Happening) -> "World":
+    def of(cls, happening: Episode) -> "World":
         """The world of a happening; people get their heights, the robot is shaken."""
         scene, rng = happening.scene, happening.body_rng
         ground = Ground.of(scene.ground, np.reshape(scene.pavements, (-1, 4)).astype(float))
-        carried = Carried(scene, happening.motion, ground, rng)
-        ridden = lidar.ridden(happening.motion.robot, ground, scene.lidar, rng)
-        return cls(happening, ground, *standing(scene, ground), carried, ridden)
+        carried = MoverSolids(scene, happening.motion, ground, rng)
+        ridden = lidar.compute_robot_poses(happening.motion.robot, ground, scene.lidar, rng)
+        return cls(happening, ground, *make_static_world(scene, ground), carried, ridden)
 
     def moment(self, scans: NDArray[np.int64], seconds: Float) -> Moment:
         """N times: so many seconds after the stamps of scans."""
@@ -55,17 +55,17 @@ class World(NamedTuple):
 
     def T_world_base(self, moment: Moment) -> Float:
         """(N, 4, 4) where the robot is at the times of a moment."""
-        x, y, z, *angles = moment.at(self.ridden).T
-        return lidar.matrix(np.stack([x, y, z], axis=-1), *angles)
+        x, y, z, *angles = moment.interpolate(self.ridden).T
+        return lidar.make_pose(np.stack([x, y, z], axis=-1), *angles)
 
-    def seen(self, sensor: Sensor, pattern: Pattern, scan: int) -> Echoes:
+    def cast_rays(self, sensor: Sensor, pattern: Pattern, scan: int) -> RayReturns:
         """What the beams of one scan meet."""
         moment = self.moment(np.full(len(pattern.azimuth), scan), pattern.seconds)
         T = self.T_world_base(moment) @ sensor.T_base_sensor
         solids = [self.still, self.carried.at(moment, scan)]
         ceiling = self.happening.scene.heights.ceiling
-        exact = ray_casting.cast(
-            lidar.looking(pattern, T), self.faces, solids, self.ground, ceiling
+        exact = ray_casting.cast_rays(
+            lidar.transform_rays(pattern, T), self.faces, solids, self.ground, ceiling
         )
         return exact if sensor.own is None else _nearer(sensor.own, exact)
 
@@ -93,11 +93,11 @@ def record(
     beams = _Beams(sensor, scratch)
     for scan in range(T):
         pattern = sensor.pattern(scan)
-        beams.add(world.seen(sensor, pattern, scan), pattern, rng)
+        beams.add(world.cast_rays(sensor, pattern, scan), pattern, rng)
         if scan % 10 == 0:
             tell(scan / T)
-    T_world_base = lidar.matrix(world.ridden[:, :3], *world.ridden[:, 3:].T)
-    T_base_sensor, T_odom_base = sensor.T_base_sensor, lidar.planar(happening.T_odom_base)
+    T_world_base = lidar.make_pose(world.ridden[:, :3], *world.ridden[:, 3:].T)
+    T_base_sensor, T_odom_base = sensor.T_base_sensor, lidar.lift_poses(happening.T_odom_base)
     if sensor.dimension == 2:
         T_world_base, T_odom_base = se2.matrix(*happening.motion.robot.T), happening.T_odom_base
         T_base_sensor = T_base_sensor[np.ix_([0, 1, 3], [0, 1, 3])]
@@ -118,9 +118,9 @@ def record(
     return recording, happening.truth(columns.static, columns.mover, T_world_base, more)
 
 
-def _nearer(one: Echoes, other: Echoes) -> Echoes:
+def _nearer(one: RayReturns, other: RayReturns) -> RayReturns:
     nearer = one.range < other.range
-    return Echoes(
+    return RayReturns(
         np.where(nearer, one.range, other.range),
         np.where(nearer, one.mover, other.mover),
         np.where(nearer, one.on_glass, other.on_glass),
@@ -159,9 +159,9 @@ class _Beams:
         self._time = ArrayBuilder(np.float32, (), folder) if sensor.takes_time else None
         self._offset = [0]
 
-    def add(self, exact: Echoes, pattern: Pattern, rng: np.random.Generator) -> None:
+    def add(self, exact: RayReturns, pattern: Pattern, rng: np.random.Generator) -> None:
         """One scan, seen exactly."""
-        range, hit = lidar.measure(exact, self._sensor.options, rng)
+        range, hit = lidar.simulate_measurement(exact, self._sensor.options, rng)
         points = (range * pattern.direction[: self._sensor.dimension]).astype(np.float32)
         mover = np.where(hit, exact.mover, np.int32(-1))
         time = np.repeat(pattern.seconds, hit.shape[1]).reshape(hit.shape)

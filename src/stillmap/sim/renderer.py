@@ -48,7 +48,7 @@ class Lens(NamedTuple):
         return cls(direction, K, float(max(right, down)))
 
 
-class Shown(NamedTuple):
+class RenderedImage(NamedTuple):
     """What each pixel (h, w) shows.
 
     Attributes:
@@ -70,7 +70,7 @@ class _Thing(NamedTuple):
     columns: slice
 
 
-def shown(
+def render(
     lens: Lens,
     T_world_camera: Float,
     faces: Faces,
@@ -78,7 +78,7 @@ def shown(
     moving: Solids,
     ground: Ground,
     ceiling: float | None,
-) -> Shown:
+) -> RenderedImage:
     """What each pixel shows.
 
     Args:
@@ -104,16 +104,16 @@ def shown(
             continue
         along = direction[:, rows, columns]
         if number < 0:
-            t = ray_casting.to_face(origin, along, faces.ends[k], faces.z[k], ground)
+            t = ray_casting.intersect_face(origin, along, faces.ends[k], faces.z[k], ground)
             what = STATIC
         else:
             group = groups[number]
-            t = ray_casting.to_solid(origin, along, group, k, group.pose[:1, k])
+            t = ray_casting.intersect_solid(origin, along, group, k, group.pose[:1, k])
             what = k if number and group.mover[k] >= 0 else STATIC
         nearer = t < before
         before[nearer] = t[nearer]
         part[rows, columns][nearer] = what
-    return Shown(range, part)
+    return RenderedImage(range, part)
 
 
 def _level_ground(origin: Float, direction: Float, ground: Ground, ceiling: float | None) -> Float:

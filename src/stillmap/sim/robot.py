@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from stillmap.sim.options import RobotOptions
 from stillmap.sim.planner import FreeSpace, Planner
 from stillmap.sim.scene import Light, Point
-from stillmap.sim.vehicles import Pace
+from stillmap.sim.vehicles import SpeedProfile
 
 Float = NDArray[np.float64]
 
@@ -40,11 +40,11 @@ class Robot:
         lights: tuple[Light, ...] = (),
     ) -> None:
         self._way, self._space, self._options, self._closed = way, space, options, closed
-        self._pace = Pace(way, closed, options, lights)
+        self._pace = SpeedProfile(way, closed, options, lights)
         self._seconds, self._speed = 0.0, 0.0
         first = way[min(1, len(way) - 1)] - way[0]
         self.pose: Float = np.array([*way[0], np.arctan2(first[1], first[0])])
-        self.impatient = False
+        self.is_impatient = False
         self.arrived = False
         self._at = 0
         self._waited = 0.0
@@ -66,8 +66,8 @@ class Robot:
         turn = float(np.clip(2.0 * error, -o.turn_rate, o.turn_rate))
         past = (x - self._way[self._at, 0]) * np.cos(theta)
         past += (y - self._way[self._at, 1]) * np.sin(theta)
-        speed = self._pace.allowed(self._at, float(past), self._speed, self._seconds, dt)
-        speed = self._pace.gained(speed * self._facing(error), self._speed, dt)
+        speed = self._pace.limit_speed(self._at, float(past), self._speed, self._seconds, dt)
+        speed = self._pace.accelerate(speed * self._facing(error), self._speed, dt)
         speed = self._careful(dt, min(speed, np.hypot(*to) / dt), people, contact)
         middle = theta + turn * dt / 2
         new = np.array([x + speed * dt * np.cos(middle), y + speed * dt * np.sin(middle)])
@@ -76,7 +76,7 @@ class Robot:
         self._seconds, self._speed = self._seconds + dt, float(speed)
         self.pose = np.array([new[0], new[1], theta + turn * dt])
 
-    def rest(self, dt: float) -> None:
+    def stand(self, dt: float) -> None:
         """Stand for dt seconds."""
         self._seconds, self._speed = self._seconds + dt, 0.0
 
@@ -99,11 +99,11 @@ class Robot:
         self.pose = np.array([*self._way[self._at], rng.uniform(-np.pi, np.pi)])
         self._speed, self._waited = 0.0, 0.0
 
-    def undisturbed_time(self) -> float:
+    def nominal_time(self) -> float:
         """Seconds that one lap takes at full speed."""
         return len(self._way) * _SPACING / self._options.speed
 
-    def way_ahead(self, reach: float) -> Float:
+    def route_ahead(self, reach: float) -> Float:
         """(K, 2) the next `reach` metres of its route."""
         return np.asarray(self._way[self._ahead(round(reach / _SPACING))])
 
@@ -146,8 +146,8 @@ class Robot:
             self._waited += dt
         else:
             self._waited = max(0.0, self._waited - dt)
-        self.impatient = self._waited > _PATIENCE
-        return min(speed, max(allowed, _CREEP if self.impatient else 0.0))
+        self.is_impatient = self._waited > _PATIENCE
+        return min(speed, max(allowed, _CREEP if self.is_impatient else 0.0))
 
     def _is_free(self, xy: Float, people: Float, contact: float) -> bool:
         clear, _ = self._space.clearance_at(np.stack([xy, self.pose[:2]]))
@@ -156,14 +156,14 @@ class Robot:
         return bool(clear[0] >= min(self._options.radius, clear[1]) and near >= contact)
 
 
-def plan_way(route: tuple[Point, ...], planner: Planner, closed: bool) -> Float:
+def plan_route(route: tuple[Point, ...], planner: Planner, closed: bool) -> Float:
     """(N, 2) points every few centimetres along the route, around walls; closed: and back."""
     stops = [np.array(p, float) for p in route]
     if closed:
         stops.append(stops[0])
     corners = [stops[0]]
     for stop in stops[1:]:
-        if planner.sees(corners[-1], stop[None])[0]:
+        if planner.is_visible(corners[-1], stop[None])[0]:
             corners.append(stop)
         else:
             corners.extend(planner.path(corners[-1], planner.node(stop)))

@@ -11,15 +11,15 @@ from stillmap.core import se2
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
 from stillmap.sim import laser, lidar, recorder, sweep
-from stillmap.sim.camera import Photographs
+from stillmap.sim.camera import CameraSimulator
 from stillmap.sim.dynamics import Progress
-from stillmap.sim.episode import Happening, let_happen
+from stillmap.sim.episode import Episode, simulate_episode
 from stillmap.sim.options import LaserOptions
 from stillmap.sim.recorder import World
 from stillmap.sim.scene import Scene
 from stillmap.sim.sweep import Sweep
 from stillmap.sim.truth import Truth
-from stillmap.sim.truth_images import PictureTruth, picture_truth
+from stillmap.sim.truth_images import ImageTruth, make_image_truth
 
 Float = NDArray[np.float64]
 
@@ -42,8 +42,8 @@ class Simulation:
     scene: Scene
     recording: Recording
     truth: Truth
-    photographs: Photographs | None = None
-    surfaces: PictureTruth | None = None
+    photographs: CameraSimulator | None = None
+    surfaces: ImageTruth | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +90,9 @@ def simulate(
     if scene.rig.tilts:
         raise InputError("a rig of two lasers makes two recordings", hint="simulate_rig")
     tell, share = progress or _silent, _MOTION_SHARE_3D if scene.in_3d else _MOTION_SHARE
-    happening = let_happen(scene, np.random.default_rng(rng), _between(0.0, share, tell))
+    happening = simulate_episode(scene, np.random.default_rng(rng), _between(0.0, share, tell))
     if scene.in_3d:
-        world, sensor = World.of(happening), lidar.spinning(scene)
+        world, sensor = World.of(happening), lidar.make_spinning_lidar(scene)
         rest, own_rng = _between(share, 1.0, tell), happening.sensor_rng
         made = _photographed(world, *recorder.record(world, sensor, own_rng, rest, scratch))
     else:
@@ -117,8 +117,8 @@ def simulate_rig(
         raise InputError("no laser of the scene tilts", hint="rig.tilts=true")
     tell, share = progress or _silent, _MOTION_SHARE_3D
     rng = np.random.default_rng(rng)
-    happening = let_happen(scene, rng, _between(0.0, share, tell))
-    world, (flat, tilted), half = World.of(happening), lidar.of_rig(scene), (1 + share) / 2
+    happening = simulate_episode(scene, rng, _between(0.0, share, tell))
+    world, (flat, tilted), half = World.of(happening), lidar.make_rig_lasers(scene), (1 + share) / 2
     first, second = _between(share, half, tell), _between(half, 1.0, tell)
     below = recorder.record(world, flat, happening.sensor_rng, first, scratch)
     above = recorder.record(world, tilted, happening.body_rng, second, scratch)
@@ -126,7 +126,7 @@ def simulate_rig(
     horizontal, tilting = Simulation(scene, *below), _photographed(world, *above)
     tell(1.0)
     stamps = np.arange(len(happening.motion.robot)) / scene.scan_rate
-    return RigSimulation(horizontal, tilting, lidar.joint_angle(stamps, scene.rig))
+    return RigSimulation(horizontal, tilting, lidar.compute_joint_angle(stamps, scene.rig))
 
 
 def _photographed(world: World, recording: Recording, truth: Truth) -> Simulation:
@@ -134,21 +134,21 @@ def _photographed(world: World, recording: Recording, truth: Truth) -> Simulatio
     scene = world.happening.scene
     if not scene.camera.enabled:
         return Simulation(scene, recording, truth)
-    photographs = Photographs(world)
+    photographs = CameraSimulator(world)
     recording = replace(recording, images=photographs.images)
-    return Simulation(scene, recording, truth, photographs, picture_truth(world, photographs))
+    return Simulation(scene, recording, truth, photographs, make_image_truth(world, photographs))
 
 
-def _record(happening: Happening) -> tuple[Recording, NDArray[np.int32]]:
+def _record(happening: Episode) -> tuple[Recording, NDArray[np.int32]]:
     """The recording of a planar laser, and the mover (M,) that each of its beams met."""
     scene, motion, walls = happening.scene, happening.motion, happening.walls
     o, T = scene.laser, len(motion.robot)
     T_base_sensor, sensor = _sensors(o), np.arange(T, dtype=np.int32) % o.count
-    exact = sweep.cast(motion, walls, T_base_sensor[sensor], o)
+    exact = sweep.cast_sweeps(motion, walls, T_base_sensor[sensor], o)
     is_glass = np.zeros(len(walls), bool)
     is_glass[len(scene.walls) : len(scene.walls) + len(scene.glass)] = True
-    ranges, hit = laser.measure(exact, is_glass, o, happening.sensor_rng)
-    angles = laser.beam_angles(o.beams, o.fov)
+    ranges, hit = laser.simulate_measurement(exact, is_glass, o, happening.sensor_rng)
+    angles = laser.compute_beam_angles(o.beams, o.fov)
     if o.upside_down == "known":
         angles = -angles
     points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)

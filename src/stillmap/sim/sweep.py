@@ -42,7 +42,7 @@ class Sweep:
         group = max(2, math.ceil(n / _GROUPS))
         first = np.arange(0, n, group)
         middle = (first + np.minimum(first + group, n) - 1) / 2
-        angles = laser.beam_angles(n, options.fov)
+        angles = laser.compute_beam_angles(n, options.fov)
         share = middle * (angles[1] - angles[0]) / options.fov
         return cls(group, options.sweep_time * share)
 
@@ -51,7 +51,7 @@ class Sweep:
         return np.repeat(self.seconds, self.group)[:beams].astype(np.float32)
 
 
-def cast(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOptions) -> Returns:
+def cast_sweeps(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOptions) -> Returns:
     """The nearest thing on every beam of every scan.
 
     Args:
@@ -64,7 +64,7 @@ def cast(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOptions) ->
         Beams in the order in which a scan has them: from the last angle to the first if the laser
         hangs upside down.
     """
-    sweep, angles = Sweep.of(o), laser.beam_angles(o.beams, o.fov)
+    sweep, angles = Sweep.of(o), laser.compute_beam_angles(o.beams, o.fov)
     T, G = len(motion.robot), len(sweep.seconds)
     reach = o.max_range + _SURELY * o.range_noise
     # a group of beams is a scan of its own, turned so that the first group's angles fit
@@ -78,9 +78,9 @@ def cast(motion: Motion, walls: Float, T_base_sensor: Float, o: LaserOptions) ->
         scans = np.arange(first, min(first + block, T))
         now = Moment(motion, np.repeat(scans, G), np.tile(sweep.seconds, len(scans)))
         T_robot_sensor = np.repeat(T_base_sensor[scans], G, axis=0)
-        poses = se2.parameters(se2.matrix(*now.at(motion.robot).T) @ T_robot_sensor)
+        poses = se2.parameters(se2.matrix(*now.interpolate(motion.robot).T) @ T_robot_sensor)
         poses[:, 2] += np.tile(turned, len(scans))
-        part = laser.cast(poses, group, walls, *now.seen(), reach)
+        part = laser.cast_beams(poses, group, walls, *now.interpolate_movers(), reach)
         parts.append(
             [values[:, order].reshape(-1, G * sweep.group)[:, : o.beams] for values in part]
         )
@@ -105,18 +105,18 @@ class Moment:
         self._before = np.maximum(np.minimum(scans + later.astype(np.int64), last), first)
         self._share = scans + later - self._before
 
-    def seen(self) -> tuple[Movers, Outlines]:
+    def interpolate_movers(self) -> tuple[Movers, Outlines]:
         """What a laser sees of the movers."""
         people, outlines, things = self._motion.people, self._motion.outlines, self._motion.things
-        xy, heading = self.at(people.xy), self.at(people.heading)
+        xy, heading = self.interpolate(people.xy), self.interpolate(people.heading)
         # things do not fly from place to place
-        faces = np.concatenate([self.at(outlines.faces), things.faces[self._scan]], axis=1)
+        faces = np.concatenate([self.interpolate(outlines.faces), things.faces[self._scan]], axis=1)
         return (
             Movers(xy, heading, people.semi_axes, people.mover),
             Outlines(faces, np.concatenate([outlines.mover, things.mover])),
         )
 
-    def at(self, values: Float) -> Float:
+    def interpolate(self, values: Float) -> Float:
         """(N, ...) values, which are given at all scans (T, ...)."""
         before = values[self._before]
         change = values[np.minimum(self._before + 1, self._last)] - before

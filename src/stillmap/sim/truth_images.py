@@ -14,10 +14,10 @@ from stillmap.core.arrays import open_npy, write_npy, write_npz
 from stillmap.core.camera import Images
 from stillmap.core.errors import InputError
 from stillmap.io.images import read_image, write_png
-from stillmap.sim.camera import Photographs
+from stillmap.sim.camera import CameraSimulator
 from stillmap.sim.geometry import Faces, Ground, Solids
 from stillmap.sim.recorder import World
-from stillmap.sim.truth_surfaces import Moving, Standing
+from stillmap.sim.truth_surfaces import MovingSurfaces, StaticSurfaces
 
 Float = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ _FARTHEST = 65.535  # m, that a picture of millimetres holds
 
 
 @dataclass(frozen=True, eq=False)
-class PictureTruth:
+class ImageTruth:
     """What is known of N pictures and of the world that they show.
 
     Attributes:
@@ -42,25 +42,25 @@ class PictureTruth:
     """
 
     colour_seed: int
-    standing: Standing
-    moving: Moving
+    standing: StaticSurfaces
+    moving: MovingSurfaces
     T_world_camera: Float
     mask: Callable[[int], NDArray[np.uint16]]
     distance: Callable[[int], NDArray[np.float32]]
 
 
-def picture_truth(world: World, photographs: Photographs) -> PictureTruth:
+def make_image_truth(world: World, photographs: CameraSimulator) -> ImageTruth:
     """The truth about the pictures of a world."""
-    return PictureTruth(
+    return ImageTruth(
         photographs.colour_seed,
-        *surfaces(world),
+        *collect_surfaces(world),
         photographs.T_world_camera,
-        lambda image: photographs.take(image).mask,
-        lambda image: photographs.take(image).distance,
+        lambda image: photographs.render(image).mask,
+        lambda image: photographs.render(image).distance,
     )
 
 
-def surfaces(world: World) -> tuple[Standing, Moving]:
+def collect_surfaces(world: World) -> tuple[StaticSurfaces, MovingSurfaces]:
     """The surfaces of a world; what might have moved, and never did, stands still."""
     poses = []
     for scan in range(len(world.ridden)):
@@ -69,13 +69,13 @@ def surfaces(world: World) -> tuple[Standing, Moving]:
         poses.append(carried.pose[0])
     carried = carried._replace(pose=np.stack(poses))
     moves = carried.mover >= 0
-    never = carried._replace(pose=carried.pose[:1]).some(~moves)
+    never = carried._replace(pose=carried.pose[:1]).select(~moves)
     ceiling = world.happening.scene.heights.ceiling
-    standing = Standing(world.faces, world.still.with_others(never), world.ground, ceiling)
-    return standing, Moving(world.happening.exact_ns, carried.some(moves))
+    standing = StaticSurfaces(world.faces, world.still.concatenate(never), world.ground, ceiling)
+    return standing, MovingSurfaces(world.happening.exact_ns, carried.select(moves))
 
 
-def write_picture_truth(truth: PictureTruth, folder: Path) -> None:
+def write_image_truth(truth: ImageTruth, folder: Path) -> None:
     """Write all but the pictures' own truth into an existing folder."""
     faces, solids, ground, ceiling = truth.standing
     standing: dict[str, NDArray[Any]] = {
@@ -94,7 +94,7 @@ def write_picture_truth(truth: PictureTruth, folder: Path) -> None:
     np.save(folder / _CAMERAS, truth.T_world_camera)
 
 
-def writing_truth(photographs: Photographs, folder: Path) -> Images:
+def write_truth_on_read(photographs: CameraSimulator, folder: Path) -> Images:
     """The pictures; when one is read, its truth goes into a folder.
 
     So each is rendered once only.
@@ -103,17 +103,17 @@ def writing_truth(photographs: Photographs, folder: Path) -> Images:
     inside.mkdir()
 
     def load(image: int) -> NDArray[np.uint8]:
-        one = photographs.take(image)
+        one = photographs.render(image)
         write_png(one.mask, inside / f"{image:06d}.png")
         near = np.where(one.distance < _FARTHEST, one.distance, 0.0)
         write_png(np.rint(1e3 * near).astype(np.uint16), inside / _distance(image))
-        return one.colour
+        return one.color
 
     images = photographs.images
     return Images(images.stamp_ns, images.camera, images.cameras, load)
 
 
-def load_picture_truth(path: str | Path) -> PictureTruth:
+def load_image_truth(path: str | Path) -> ImageTruth:
     """The truth about the pictures of a simulation, given its folder or the `truth` inside.
 
     Raises:
@@ -133,11 +133,11 @@ def load_picture_truth(path: str | Path) -> PictureTruth:
         ground = Ground(of["ground_slope"], of["ground_bend"], of["ground_pavements"], kerb)
         ceiling, seed = float(of["ceiling"]), int(of["colour_seed"])
         parts = Solids(open_npy(folder / _POSE), *(moves[name] for name in Solids._fields[1:]))
-        moving = Moving(moves["stamp_ns"], parts)
+        moving = MovingSurfaces(moves["stamp_ns"], parts)
         T_world_camera = np.array(open_npy(folder / _CAMERAS))
     except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise InputError(f"is damaged: {error}", where=str(folder)) from error
-    standing = Standing(faces, solids, ground, None if np.isnan(ceiling) else ceiling)
+    standing = StaticSurfaces(faces, solids, ground, None if np.isnan(ceiling) else ceiling)
     inside = folder / _IMAGES
 
     def mask(image: int) -> NDArray[np.uint16]:
@@ -147,7 +147,7 @@ def load_picture_truth(path: str | Path) -> PictureTruth:
         metres = read_image(inside / _distance(image)).astype(np.float32) / 1e3
         return np.where(metres > 0.0, metres, np.float32(np.inf))
 
-    return PictureTruth(seed, standing, moving, T_world_camera, mask, distance)
+    return ImageTruth(seed, standing, moving, T_world_camera, mask, distance)
 
 
 def _distance(image: int) -> str:

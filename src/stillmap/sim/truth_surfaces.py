@@ -23,7 +23,7 @@ _SQUARE = 4.0  # m, within which points have the same things near
 _HALVINGS = 80  # after which the nearest point of an ellipse is known to the last digit
 
 
-class Standing(NamedTuple):
+class StaticSurfaces(NamedTuple):
     """What stands still in a world.
 
     Attributes:
@@ -37,7 +37,7 @@ class Standing(NamedTuple):
     ground: Ground
     ceiling: float | None
 
-    def nearest(self, points: Float) -> tuple[Float, Float]:
+    def project(self, points: Float) -> tuple[Float, Float]:
         """The nearest places of the surfaces.
 
         Exact for solids, and for faces and ground where the ground is level; where it slopes, up
@@ -70,7 +70,7 @@ class Standing(NamedTuple):
             yield low, high, partial(_on_face, ends=ends, z=z, ground=self.ground)
         for k, pose in enumerate(self.solids.pose[0]):
             reach = float(np.hypot(*self.solids.half[k]))
-            nearest = partial(nearest_on_solid, solids=self.solids, k=k)
+            nearest = partial(project_to_solid, solids=self.solids, k=k)
             yield pose[:2] - reach, pose[:2] + reach, nearest
 
 
@@ -114,7 +114,7 @@ def to_local(points: Float, pose: Float) -> Float:
     return np.stack([c * u + s * v, c * v - s * u, points[:, 2] - foot], axis=1)
 
 
-def nearest_on_solid(points: Float, solids: Solids, k: int) -> Float:
+def project_to_solid(points: Float, solids: Solids, k: int) -> Float:
     """(n, 3) the places of the surface of solid k nearest to points (n, 3), each at a time of its
     own, or all at one."""
     (a, b), (z0, z1) = solids.half[k], solids.z[k]
@@ -205,7 +205,7 @@ _FASTEST = 40.0  # m/s; what goes faster has begun its way again elsewhere
 _INSIDE = 1e-6  # m, points less deep in another part are on the surface
 
 
-class Moving(NamedTuple):
+class MovingSurfaces(NamedTuple):
     """The parts of what moves, at T scans.
 
     Attributes:
@@ -235,11 +235,11 @@ class Moving(NamedTuple):
         # who is somewhere else in the next scan was put there
         stays = np.where(share < 1.0, before, before + change)
         pose = np.where(goes_on[..., None], before + share * change, stays)
-        return self.solids._replace(pose=self.solids.pose[:1]).some(parts)._replace(pose=pose)
+        return self.solids._replace(pose=self.solids.pose[:1]).select(parts)._replace(pose=pose)
 
 
-def mover_points(
-    moving: Moving, mover: int, stamp_ns: int, spacing: float
+def sample_mover(
+    moving: MovingSurfaces, mover: int, stamp_ns: int, spacing: float
 ) -> tuple[Float, NDArray[np.intp]]:
     """Points on the surface of a mover at one time.
 

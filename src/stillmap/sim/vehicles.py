@@ -209,7 +209,7 @@ _OVER = 0.5  # m past the line that somebody stops who brakes for it
 _BEND = 1.0  # m before and after a point, over which a curve is measured
 
 
-class Pace:
+class SpeedProfile:
     """Speeds along a way.
 
     Args:
@@ -228,11 +228,11 @@ class Pace:
         self._lines = [int(np.argmin(np.hypot(*(way - light.at).T))) for light in lights]
         self._allowed = self._through_curves(way, options.speed)
 
-    def gained(self, wanted: float, now: float, dt: float) -> float:
+    def accelerate(self, wanted: float, now: float, dt: float) -> float:
         """m/s, how much of a wanted speed is reached in dt seconds."""
         return min(wanted, now + self._acceleration * dt)
 
-    def allowed(self, at: int, past: float, now: float, seconds: float, dt: float) -> float:
+    def limit_speed(self, at: int, past: float, now: float, seconds: float, dt: float) -> float:
         """m/s, how fast the robot may drive next.
 
         Args:

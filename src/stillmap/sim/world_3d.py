@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stillmap.sim import geometry
 from stillmap.sim.dynamics import Motion
-from stillmap.sim.geometry import BOX, Faces, Ground, Part, Solids, assembled
+from stillmap.sim.geometry import BOX, Faces, Ground, Part, Solids, assemble
 from stillmap.sim.options import HeightOptions
 from stillmap.sim.scene import Scene, Segment
 from stillmap.sim.sweep import Moment
@@ -37,9 +37,9 @@ class Loop(NamedTuple):
     sides: int
 
 
-def standing(scene: Scene, ground: Ground) -> tuple[Faces, Solids]:
+def make_static_world(scene: Scene, ground: Ground) -> tuple[Faces, Solids]:
     """Walls, lintels and kerbs as faces; columns, furniture, trees and parked cars as solids."""
-    loops, lines = outlines(scene.walls)
+    loops, lines = trace_loops(scene.walls)
     top = scene.heights.top
     lintels = [door.leaf(door.closed) for door in scene.leaves if scene.heights.doors < top]
     kerbs = [side for x0, y0, x1, y1 in scene.pavements for side in _sides(x0, y0, x1, y1)]
@@ -49,19 +49,19 @@ def standing(scene: Scene, ground: Ground) -> tuple[Faces, Solids]:
     is_glass = np.zeros(len(ends), bool)
     is_glass[len(lines) : len(lines) + len(scene.glass)] = True
     faces = Faces(np.reshape(ends, (-1, 4)).astype(float), np.reshape(z, (-1, 2)), is_glass)
-    parts = [(k, -1, p) for k, one in enumerate(loops) for p in parts_of(one, scene.heights)]
+    parts = [(k, -1, p) for k, one in enumerate(loops) for p in make_parts(one, scene.heights)]
     poses = np.reshape([one[:3] for one in loops], (1, -1, 3)).astype(float)
-    return faces, assembled(parts).at(poses, ground.height(poses[..., 0], poses[..., 1]))
+    return faces, assemble(parts).at(poses, ground.height(poses[..., 0], poses[..., 1]))
 
 
-def parts_of(loop: Loop, heights: HeightOptions) -> list[Part]:
+def make_parts(loop: Loop, heights: HeightOptions) -> list[Part]:
     """What a closed outline is, in 3D, about its middle and heading."""
     if loop.sides == 4:
-        return geometry.boxed(loop.length, loop.width, heights)
-    return geometry.round_thing(loop.length / 2, heights)
+        return geometry.make_box(loop.length, loop.width, heights)
+    return geometry.make_round_object(loop.length / 2, heights)
 
 
-def outlines(walls: Sequence[Segment]) -> tuple[list[Loop], list[Segment]]:
+def trace_loops(walls: Sequence[Segment]) -> tuple[list[Loop], list[Segment]]:
     """The closed outlines of things in a plan, and the lines that are left."""
     loops: list[Loop] = []
     lines: list[Segment] = []
@@ -120,7 +120,7 @@ _TALLEST = 2.0  # m
 _THIN = 0.02  # m, faces of things that are no closed outlines
 
 
-class Carried:
+class MoverSolids:
     """People, doors, vehicles and things of a scene.
 
     Those that never moved have no mover's number: nobody could tell that they might have.
@@ -153,22 +153,22 @@ class Carried:
         )
         for q, person in enumerate(motion.people.mover.tolist()):
             half = tuple(motion.people.semi_axes[q].tolist())
-            figure = geometry.leg if q < 2 * Q // 3 else geometry.torso_and_head
+            figure = geometry.make_leg if q < 2 * Q // 3 else geometry.make_torso_and_head
             parts += [(q, person, part) for part in figure(half, self.tall[person])]
         for number, kind in enumerate(motion.kinds[persons:], start=persons):
             mover = number if motion.moved[number] else -1
             own = _parts_of(scene, motion, number, kind)
             parts += [(Q + number - persons, mover, part) for part in own]
             self.tall[number] = max(part.z[1] for part in own)
-        self._assembly = assembled(parts)
+        self._assembly = assemble(parts)
 
     def at(self, moment: Moment, scan: int) -> Solids:
         """Where they are at the n times of a moment within one scan."""
-        people, others = self._motion.people, moment.at(self._others)
+        people, others = self._motion.people, moment.interpolate(self._others)
         # things do not fly from place to place
         others[:, self._is_thing] = self._others[scan, self._is_thing]
         walking = np.concatenate(
-            [moment.at(people.xy), moment.at(people.heading)[..., None]], axis=-1
+            [moment.interpolate(people.xy), moment.interpolate(people.heading)[..., None]], axis=-1
         )
         poses = np.concatenate([walking, others], axis=1)
         foot = self._ground.height(poses[..., 0], poses[..., 1])
@@ -179,11 +179,11 @@ def _parts_of(scene: Scene, motion: Motion, number: int, kind: str) -> list[Part
     """The parts of a door, a vehicle or a thing."""
     length, width = motion.sizes[number].tolist()
     if kind == "door":
-        return geometry.door(length, min(scene.heights.doors, scene.heights.top))
+        return geometry.make_door(length, min(scene.heights.doors, scene.heights.top))
     if kind != "thing":
-        return geometry.vehicle(length, width, kind)
-    loops, lines = outlines(scene.things[number - motion.kinds.index("thing")].faces)
-    parts = [_placed(part, loop) for loop in loops for part in parts_of(loop, scene.heights)]
+        return geometry.make_vehicle(length, width, kind)
+    loops, lines = trace_loops(scene.things[number - motion.kinds.index("thing")].faces)
+    parts = [_placed(part, loop) for loop in loops for part in make_parts(loop, scene.heights)]
     for x0, y0, x1, y1 in lines:
         long, turn = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
         half, z = (long / 2, _THIN / 2), (0.0, scene.heights.furniture)

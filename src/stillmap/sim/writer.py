@@ -14,7 +14,7 @@ from stillmap.io.registry import RIG_FOLDERS
 from stillmap.sim.scene import Scene
 from stillmap.sim.simulator import RigSimulation, Simulation
 from stillmap.sim.truth import FOLDER, write_truth
-from stillmap.sim.truth_images import write_picture_truth, writing_truth
+from stillmap.sim.truth_images import write_image_truth, write_truth_on_read
 
 Format = Literal["stillmap", "carmen"]
 
@@ -74,8 +74,8 @@ def _write_folder(one: Simulation, work: Path) -> None:
     recording = one.recording
     write_truth(one.truth, recording.stamp_ns, work)
     if one.photographs is not None and one.surfaces is not None:
-        write_picture_truth(one.surfaces, work / FOLDER)
-        images = writing_truth(one.photographs, work / FOLDER)
+        write_image_truth(one.surfaces, work / FOLDER)
+        images = write_truth_on_read(one.photographs, work / FOLDER)
         recording = replace(recording, images=images)
     stillmap_folder.write_into(recording, work)
 

@@ -13,8 +13,8 @@ from stillmap.io import read, writers
 from stillmap.io.ros.reader import read_tilting
 from stillmap.preprocessing.options import ReadOptions
 from stillmap.sim import RigOptions, load_truth, scene_by_name, simulate_rig, write_rig
-from stillmap.sim.laser import beam_angles
-from stillmap.sim.lidar import joint_angle
+from stillmap.sim.laser import compute_beam_angles
+from stillmap.sim.lidar import compute_joint_angle
 
 NOD = {"tilts": True, "period": 2.0}
 JOINT_NS = 5_000_000  # from one transform of the joint to the next; turns happen at some of them
@@ -37,7 +37,7 @@ def rig():
 
 def scans(messages, recording, frame, laser):
     """LaserScan messages of a recording, from the ends of its beams."""
-    angles, n = beam_angles(laser.beams, laser.fov), laser.beams
+    angles, n = compute_beam_angles(laser.beams, laser.fov), laser.beams
     length = np.linalg.norm(recording.points, axis=1)
     ranges = np.where(recording.hit, length, np.inf).reshape(-1, n)
     shape = {
@@ -55,7 +55,7 @@ def nods(messages, rig, joint_ns):
     """The joint, told at times of its own."""
     start = int(rig.tilting.recording.stamp_ns[0])
     o = RigOptions(**NOD)
-    half = 0.5 * joint_angle((joint_ns - start) / 1e9, o)
+    half = 0.5 * compute_joint_angle((joint_ns - start) / 1e9, o)
     for stamp, a in zip(joint_ns.tolist(), half, strict=True):
         turn = (0.0, np.sin(a), 0.0, np.cos(a))
         at = (o.pivot_x, 0.0, o.pivot_z)

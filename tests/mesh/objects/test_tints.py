@@ -1,8 +1,10 @@
 """Colours of points, from start to end: what was seen of a small room with people in it."""
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -14,11 +16,13 @@ from stillmap.eval.mesh import compute_color_difference
 from stillmap.eval.model_readers import read_camera_simulation
 from stillmap.io import stillmap_folder
 from stillmap.io.trajectory import poses_from_tum
+from stillmap.mesh import build
+from stillmap.mesh.place import assign_views
 from stillmap.mesh.texture.atlas import GRAY
 from stillmap.results.export import point_cloud
 from stillmap.results.points import COLOURS, FIELDS
-from stillmap.sim import load_picture_truth
-from stillmap.sim.appearance import static_colour
+from stillmap.sim import load_image_truth
+from stillmap.sim.appearance import compute_static_color
 
 
 def beams_of(out, name="beams"):
@@ -48,8 +52,8 @@ def test_colours_of_what_stands_still_are_the_true_ones(room, result):
     assert not has[~hit].any()
     assert 0.1 < has[still].mean() < 0.5  # the lidar looks round about, the camera does not
     use = np.flatnonzero(still & has & seen.truth.static())
-    _, places = seen.image_truth.standing.nearest(seen.end_points[use])
-    true = static_colour(places, seen.image_truth.colour_seed)
+    _, places = seen.image_truth.standing.project(seen.end_points[use])
+    true = compute_static_color(places, seen.image_truth.colour_seed)
     difference = compute_color_difference(colours[use], true)
     assert np.median(difference) < 5.0
     mixed = compute_color_difference(colours[use], np.roll(true, len(true) // 3, axis=0))
@@ -60,7 +64,7 @@ def test_colours_of_what_stands_still_are_the_true_ones(room, result):
 def told(room) -> Callable[..., tuple[stillmap.Result, np.ndarray]]:
     """The room with pictures of what is to be seen in place of colours: red is what moves; gives
     which beams have the colour of something that moves, and which any."""
-    recording, truth = stillmap.read(room), load_picture_truth(room)
+    recording, truth = stillmap.read(room), load_image_truth(room)
     poses = poses_from_tum(room / "truth/trajectory.tum", recording)
 
     def seen(image: int) -> np.ndarray:
@@ -72,12 +76,11 @@ def told(room) -> Callable[..., tuple[stillmap.Result, np.ndarray]]:
     recording = dataclasses.replace(recording, images=of_masks)
     found = stillmap.build(recording, stillmap.Options(threads=1), poses=poses)
 
-    def tell(believe: bool):
-        mesh = found.options.mesh
-        mesh = dataclasses.replace(mesh, choice=dataclasses.replace(mesh.choice, believe=believe))
-        options = dataclasses.replace(found.options, mesh=mesh)
-        tints = stillmap.models_of(dataclasses.replace(found, options=options)).tints
-        return found, tints.colours
+    def tell(use_occlusion: bool):
+        with mock.patch.object(
+            build, "assign_views", functools.partial(assign_views, use_occlusion=use_occlusion)
+        ):
+            return found, stillmap.build_models(found).point_colors.colors
 
     return tell
 
@@ -135,16 +138,6 @@ def test_threads_and_another_time_change_no_bit(result, mapped):
     again = mapped("again-points", "--threads", "2")
     for name in ("static.ply", "dynamic.ply", "beams/colour.npy"):
         assert (again / name).read_bytes() == (result / name).read_bytes()
-
-
-def test_without_them_the_clouds_are_as_ever(result, mapped):
-    plain = mapped("plain", "--set", "mesh.points.enabled=false")
-    assert not (plain / "beams/colour.npy").exists()
-    assert "points" not in json.loads((plain / "run.json").read_text())["models"]
-    for part in ("static", "dynamic"):
-        rows, more = rows_of(plain / f"{part}.ply", FIELDS), result / f"{part}.ply"
-        for name, _ in FIELDS:
-            np.testing.assert_array_equal(rows[name], rows_of(more, FIELDS + COLOURS)[name])
 
 
 def test_a_rig_has_them_beside_the_beams_of_the_laser_that_tilts(rig, mapped, tmp_path):

@@ -21,9 +21,9 @@ from stillmap.sim.worlds.street import (
     PARKED,
     ROBOT,
     YARD,
-    front,
-    parked,
-    trees_and_lamps,
+    make_house_front,
+    make_parked_cars,
+    make_trees_and_lamps,
 )
 
 _CROSSING_SEED = 38
@@ -84,13 +84,13 @@ def crossing(people: int = 30) -> Scene:
 
 def _houses(rng: np.random.Generator) -> list[Segment]:
     length = _END - FRONT
-    walls = front((-_END, FRONT), length, "north", rng) + front(
+    walls = make_house_front((-_END, FRONT), length, "north", rng) + make_house_front(
         (-FRONT, FRONT), length, "west", rng
     )
-    walls += front((FRONT, _NARROW), length, "north", rng)
-    walls += front((FRONT, _NARROW), _END - _NARROW, "east", rng)
-    walls += front((-_END, -_NARROW), length, "south", rng)
-    return walls + front((-FRONT, -_END), _END - _NARROW, "west", rng)
+    walls += make_house_front((FRONT, _NARROW), length, "north", rng)
+    walls += make_house_front((FRONT, _NARROW), _END - _NARROW, "east", rng)
+    walls += make_house_front((-_END, -_NARROW), length, "south", rng)
+    return walls + make_house_front((-FRONT, -_END), _END - _NARROW, "west", rng)
 
 
 def _trees(rng: np.random.Generator) -> list[Segment]:
@@ -109,7 +109,7 @@ def _trees(rng: np.random.Generator) -> list[Segment]:
 def _parked(rng: np.random.Generator) -> list[Segment]:
     places = [(float(x), PARKED, 0.0) for x in (*range(-84, -24, 7), *range(26, 84, 7))]
     places += [(float(x), -PARKED, 0.0) for x in range(-84, -24, 7)]
-    return parked(places, rng)
+    return make_parked_cars(places, rng)
 
 
 def _kerbs() -> list[Segment]:
@@ -203,21 +203,23 @@ def _pavements() -> tuple[Segment, ...]:
 def _walls() -> list[Segment]:
     rng = np.random.default_rng(_TURN_SEED)
     west, east = _CROSSING - FRONT, _CROSSING + FRONT
-    walls = front((_WEST, -FRONT), west - _WEST, "south", rng)
-    walls += front((_WEST, FRONT), west - _WEST, "north", rng)
-    walls += front((west, _SOUTH), -FRONT - _SOUTH, "west", rng)
-    walls += front((west, FRONT), _NORTH - FRONT, "west", rng)
-    walls += front((east, _SOUTH), _NORTH - _SOUTH, "east", rng)
+    walls = make_house_front((_WEST, -FRONT), west - _WEST, "south", rng)
+    walls += make_house_front((_WEST, FRONT), west - _WEST, "north", rng)
+    walls += make_house_front((west, _SOUTH), -FRONT - _SOUTH, "west", rng)
+    walls += make_house_front((west, FRONT), _NORTH - FRONT, "west", rng)
+    walls += make_house_front((east, _SOUTH), _NORTH - _SOUTH, "east", rng)
     beside = KERB + 0.7
     for side in (-1.0, 1.0):
         xs = range(int(_WEST) + 5, 85, 13)
-        walls += trees_and_lamps([(float(x), side * beside) for x in xs], rng)
+        walls += make_trees_and_lamps([(float(x), side * beside) for x in xs], rng)
         ys = [y for y in range(int(_SOUTH) + 6, int(_NORTH) - 4, 12) if abs(y) > 16 or side > 0]
-        walls += trees_and_lamps([(_CROSSING + side * beside, float(y)) for y in ys], rng)
-        walls += parked([(float(x), side * PARKED, 0.0) for x in np.arange(-26, 66, 6.1)], rng)
+        walls += make_trees_and_lamps([(_CROSSING + side * beside, float(y)) for y in ys], rng)
+        walls += make_parked_cars(
+            [(float(x), side * PARKED, 0.0) for x in np.arange(-26, 66, 6.1)], rng
+        )
         ys = [y for y in range(int(_SOUTH) + 5, int(_NORTH) - 4, 7) if abs(y) > 22]
         upright = math.pi / 2
-        walls += parked([(_CROSSING + side * PARKED, float(y), upright) for y in ys], rng)
+        walls += make_parked_cars([(_CROSSING + side * PARKED, float(y), upright) for y in ys], rng)
     return walls
 
 

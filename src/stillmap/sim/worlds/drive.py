@@ -20,9 +20,9 @@ from stillmap.sim.worlds.street import (
     OPEN_AIR,
     OUTER,
     PARKED,
-    front,
-    parked,
-    trees_and_lamps,
+    make_house_front,
+    make_parked_cars,
+    make_trees_and_lamps,
 )
 
 _LAYOUT_SEED = 37
@@ -121,13 +121,13 @@ def _walls() -> list[Segment]:
     beside, upright = KERB + 0.7, math.pi / 2
     for side in (-1.0, 1.0):
         xs = [x for x in np.arange(_WEST + 5, _CORNER - 16, 12.5) if abs(x - _SIDE_STREET) > 12]
-        walls += trees_and_lamps([(float(x), side * beside) for x in xs], rng)
+        walls += make_trees_and_lamps([(float(x), side * beside) for x in xs], rng)
         ys = [y for y in np.arange(_SOUTH + 6, _NORTH - 4, 12.0) if abs(y) > 16 or side > 0]
-        walls += trees_and_lamps([(_CORNER + side * beside, float(y)) for y in ys], rng)
+        walls += make_trees_and_lamps([(_CORNER + side * beside, float(y)) for y in ys], rng)
         xs = [x for x in np.arange(_WEST + 4, _CORNER - 26, 6.1) if abs(x - _SIDE_STREET) > 24]
-        walls += parked([(float(x), side * PARKED, 0.0) for x in xs], rng)
+        walls += make_parked_cars([(float(x), side * PARKED, 0.0) for x in xs], rng)
         ys = [y for y in np.arange(_SOUTH + 5, _NORTH - 4, 7.0) if abs(y) > 26]
-        walls += parked([(_CORNER + side * PARKED, float(y), upright) for y in ys], rng)
+        walls += make_parked_cars([(_CORNER + side * PARKED, float(y), upright) for y in ys], rng)
     return walls
 
 
@@ -148,11 +148,11 @@ def _houses(start: Point, length: float, side: Side, rng: np.random.Generator) -
         is_last = length - end - alley < 40.0
         if is_last:
             next_back = 0.0
-        walls += front(at(begin, back), house, side, rng)
+        walls += make_house_front(at(begin, back), house, side, rng)
         corners = [(end, back), (end, depth), (end + alley, depth), (end + alley, next_back)]
         walls += polyline([at(*corner) for corner in corners])
         begin, back = end + alley, next_back
-    return walls + front(at(begin, back), length - begin, side, rng)
+    return walls + make_house_front(at(begin, back), length - begin, side, rng)
 
 
 def _lanes() -> tuple[Lane, ...]:

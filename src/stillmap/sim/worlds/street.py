@@ -48,12 +48,14 @@ def street(people: int = 16) -> Scene:
     """
     rng = np.random.default_rng(_LAYOUT_SEED)
     west, east = -30.0, 210.0
-    walls = front((west, -FRONT), east - west, "south", rng)
-    walls += front((west, FRONT), east - west, "north", rng)
+    walls = make_house_front((west, -FRONT), east - west, "south", rng)
+    walls += make_house_front((west, FRONT), east - west, "north", rng)
     for y in (-1.0, 1.0):
         xs = np.arange(west + 4, east - 4, 0.1)
-        walls += trees_and_lamps(((float(x), y * (KERB + 0.7)) for x in xs[::125]), rng)
-        walls += parked([(float(x), y * PARKED, 0.0) for x in np.arange(-26, 200, 6.1)], rng)
+        walls += make_trees_and_lamps(((float(x), y * (KERB + 0.7)) for x in xs[::125]), rng)
+        walls += make_parked_cars(
+            [(float(x), y * PARKED, 0.0) for x in np.arange(-26, 200, 6.1)], rng
+        )
     there = [(6.0, -OUTER), (166.0, -OUTER), (170.5, -4.2), (173.4, 0.0), (170.5, 4.2)]
     caps = ((west, -FRONT, west, FRONT), (east, -FRONT, east, FRONT))
     return Scene(
@@ -73,7 +75,9 @@ def street(people: int = 16) -> Scene:
     )
 
 
-def front(start: Point, length: float, side: Side, rng: np.random.Generator) -> list[Segment]:
+def make_house_front(
+    start: Point, length: float, side: Side, rng: np.random.Generator
+) -> list[Segment]:
     """Houses in a row: doorways and shop windows step back, now and then there is a yard."""
     openings, at = [], float(rng.uniform(1.0, 4.0))
     while at < length - 8.0:
@@ -89,7 +93,7 @@ def front(start: Point, length: float, side: Side, rng: np.random.Generator) -> 
     return wall(start, length, side, openings)
 
 
-def trees_and_lamps(points: Iterable[Point], rng: np.random.Generator) -> list[Segment]:
+def make_trees_and_lamps(points: Iterable[Point], rng: np.random.Generator) -> list[Segment]:
     """By turns two trees and a lamp post, each a little off its point."""
     walls: list[Segment] = []
     for k, (x, y) in enumerate(points):
@@ -99,7 +103,9 @@ def trees_and_lamps(points: Iterable[Point], rng: np.random.Generator) -> list[S
     return walls
 
 
-def parked(places: Sequence[tuple[float, float, float]], rng: np.random.Generator) -> list[Segment]:
+def make_parked_cars(
+    places: Sequence[tuple[float, float, float]], rng: np.random.Generator
+) -> list[Segment]:
     """Cars in two of three places x, y, heading."""
     walls: list[Segment] = []
     for x, y, heading in places:
