@@ -22,7 +22,7 @@ template <int D>
 using Poses = nb::ndarray<const double, nb::numpy, nb::shape<-1, D + 1, D + 1>, nb::c_contig,
                           nb::device::cpu>;
 template <int D>
-using Places =
+using Positions =
     nb::ndarray<const double, nb::numpy, nb::shape<-1, D>, nb::c_contig, nb::device::cpu>;
 template <int D>
 using OnePose =

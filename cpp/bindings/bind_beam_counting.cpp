@@ -57,8 +57,9 @@ void add_no_return(OccupancyGrid<D>& grid, OccupancyGrid<D>& rest, const Points<
 }
 
 template <int D>
-auto expectations(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
-                  const Flat<int64_t>& offset, const Poses<D>& poses, double prior, int threads) {
+auto expected_labels(const OccupancyGrid<D>& grid, const Points<D>& points, const Flat<bool>& hit,
+                     const Flat<int64_t>& offset, const Poses<D>& poses, double prior,
+                     int threads) {
   require_probability(prior, "prior");
   const auto scans = scans_from<D>(points, hit, offset, poses);
   std::vector<float> e(points.shape(0));
@@ -95,35 +96,34 @@ void bind(nb::module_& m) {
         nb::arg("T_map_sensor").noconvert(), nb::arg("threads") = 1, nb::kw_only(),
         nb::arg("remove") = false,
         "Adds the sums alpha, beta of (10) of all beams to the grid; e (M,) float32. With remove "
-        "it subtracts what was added before, to the bit.");
+        "it subtracts the same sums exactly.");
   m.def("add_end_points", &ends<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("remove") = false,
-        "Adds what of the sums of `add_beams` depends on e, or subtracts it, to the bit: taken out "
-        "with one e and added with another, they are those of the other.");
+        "Adds or removes the part of the sums of `add_beams` that depends on e (end cells of "
+        "returns). Removing it with the old e and adding it with a new one updates the grid "
+        "exactly.");
   m.def("interpolate_end_points", &fill<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::kw_only(), nb::arg("max_gap"),
         nb::arg("tolerance"), nb::arg("max_gap_ratio"), nb::arg("remove") = false,
-        "Adds end points a cell apart, with the smaller e of the two, between those of "
-        "neighbouring beams up to `max_gap` metres apart that go straight on, within `tolerance` "
-        "metres, from a third one at least 1 / `max_gap_ratio` of that gap away. Nothing passes "
-        "through "
-        "cells for them. With remove it takes out what was added before, to the bit.");
+        "Interpolates end points, one per cell, between neighbouring end points at most `max_gap` "
+        "metres apart that are collinear with a third one within `tolerance` metres; the gap is at "
+        "most `max_gap_ratio` times that to the third one. They take the smaller e of the two and "
+        "add nothing to crossed cells. With remove it subtracts the same sums exactly.");
   m.def("add_no_return_beams", &add_no_return<D>, nb::arg("grid"), nb::arg("rest"),
         nb::arg("points").noconvert(), nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::arg("stop_cells").noconvert(),
         nb::arg("end_margin"), nb::arg("threads") = 1,
-        "Adds what `add_beams` adds for beams without a return, to the bit: to the grid as far as "
-        "they are believed, the rest to another one. Fewer than three in a row are not believed; "
-        "the others up to the first of the cells stop_cells (S, D) int64, but for the last "
-        "`end_margin` "
-        "metres, which may be infinite.");
-  m.def("e_step", &expectations<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        "Adds the beams without a return as `add_beams` does, split over two grids: the trusted "
+        "part to grid, the remainder to rest. Runs of fewer than three such beams are not trusted; "
+        "the others are trusted up to the first of stop_cells (S, D) int64 and not within "
+        "`end_margin` metres (may be infinite) of their end.");
+  m.def("e_step", &expected_labels<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::arg("prior"), nb::arg("threads") = 1,
-        "(6), (8): e (M,) float32. NaN: unusable; the prior at maximum range and where the end "
-        "cell was never looked at.");
+        "Equations (6), (8): e (M,) float32. NaN for unusable beams; the prior for maximum-range "
+        "beams and unobserved end cells.");
   m.def("log_likelihood", &likelihood<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::arg("prior"), nb::arg("threads") = 1,

@@ -15,52 +15,52 @@ constexpr int kMaxColumnCells = 1 << 20;
 
 void make(ClusterPooling* self, const SurfelMap<3>& surfel_map, const Flat<bool>& is_obstacle,
           const Values& values, int column_cells, int64_t min_surfels) {
-  const size_t n = surfel_map.size(), kinds = values.shape(1);
+  const size_t n = surfel_map.size(), n_values = values.shape(1);
   require(surfel_map.fitted(), "surfel_map: fit it first");
-  require(is_obstacle.shape(0) == n, "is_obstacle: expected one per element");
-  require(values.shape(0) == n && kinds > 0, "values: expected a row per element");
+  require(is_obstacle.shape(0) == n, "is_obstacle: expected one per surfel");
+  require(values.shape(0) == n && n_values > 0, "values: expected a row per surfel");
   bool bounded = true;
-  for (size_t i = 0; i < n * kinds; ++i)
+  for (size_t i = 0; i < n * n_values; ++i)
     bounded = bounded && std::abs(values.data()[i]) <= kMaxValue;
   require(bounded, "values: expected -1e6 to 1e6");
   require(column_cells >= 1 && column_cells <= kMaxColumnCells,
           "column_cells: expected 1 to 1048576 cells");
   require(min_surfels >= 1, "min_surfels: expected at least 1");
-  new (self) ClusterPooling(surfel_map, is_obstacle.data(), values.data(), kinds,
+  new (self) ClusterPooling(surfel_map, is_obstacle.data(), values.data(), n_values,
                             {column_cells, min_surfels});
 }
 
-void add(ClusterPooling& bodies, const Points<3>& points, const Flat<bool>& hit,
+void add(ClusterPooling& pooling, const Points<3>& points, const Flat<bool>& hit,
          const Flat<int64_t>& offset, const Poses<3>& poses, int threads) {
   const auto scans = scans_from<3>(points, hit, offset, poses);
   nb::gil_scoped_release released;
-  bodies.add(scans, threads);
+  pooling.add(scans, threads);
 }
 
-auto means(const ClusterPooling& bodies) {
-  auto out = bodies.means();
-  const size_t kinds = bodies.n_values(), n = out.size() / kinds;
-  return to_numpy(std::move(out), {n, kinds});
+auto means(const ClusterPooling& pooling) {
+  auto out = pooling.means();
+  const size_t n_values = pooling.n_values(), n = out.size() / n_values;
+  return to_numpy(std::move(out), {n, n_values});
 }
 
 }  // namespace
 
 void bind_cluster_pooling(nb::module_& m) {
-  nb::class_<ClusterPooling>(m, "ClusterPooling3D",
-                             "What stands apart in each sweep, and what is known of it.")
+  nb::class_<ClusterPooling>(
+      m, "ClusterPooling3D",
+      "Averages values of surfels over the connected clusters of each sweep.")
       .def("__init__", &make, nb::arg("surfel_map"), nb::arg("is_obstacle").noconvert(),
            nb::arg("values").noconvert(), nb::kw_only(), nb::arg("column_cells"),
            nb::arg("min_surfels"), nb::keep_alive<1, 2>(),
-           "is_obstacle (E,): of which elements bodies consist; values (E, K) float32: what is "
-           "known of "
-           "each. Columns of that many cells touch within a body, which has that many elements at "
-           "least.")
+           "is_obstacle (E,) bool selects the surfels that form clusters; values (E, K) float32 "
+           "are averaged. Surfels are clustered by adjacent vertical columns of column_cells x "
+           "column_cells cells; clusters of fewer than min_surfels surfels are ignored.")
       .def("add", &add, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
-           nb::arg("threads") = 1, "Each scan is a sweep.")
+           nb::arg("threads") = 1, "Adds scans; each of them is clustered by itself.")
       .def("means", &means,
-           "(E, K) float32: mean value of the body around each element, mean over the sweeps that "
-           "saw it; NaN where none did.");
+           "(E, K) float32: mean values of the clusters that contain each surfel, averaged over "
+           "sweeps; NaN where there is none.");
 }
 
 }  // namespace stillmap::bindings

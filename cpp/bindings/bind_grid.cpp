@@ -108,23 +108,24 @@ void bind(nb::module_& m, const char* name) {
   using G = OccupancyGrid<D>;
   nb::class_<G>(m, name, "Block-sparse counts alpha, beta of (10); cell = floor(x / resolution).")
       .def(nb::init<double, double>(), nb::arg("resolution"), nb::arg("approach") = 0.0,
-           "approach: metres before its end in which a beam says nothing against the cells it "
-           "crosses when scans are registered; alpha, beta do not depend on it.")
+           "approach: length in metres before the end of a beam whose crossings are ignored in the "
+           "likelihood field of registration; alpha, beta do not depend on it.")
       .def_prop_ro("resolution", &G::resolution, "metres")
       .def_prop_ro("approach", &G::approach, "metres")
       .def_prop_ro("dimension", [](const G&) { return D; })
       .def_prop_ro("memory_bytes", &G::memory_bytes)
       .def("merge", &G::merge, nb::arg("other"), "Adds the sums of another grid.")
       .def("alpha_beta", &alpha_beta<D>, nb::arg("cells").noconvert(),
-           "(K, 2) float64 sums of (K, D) int64 cells; 0, 0 where nobody looked.")
+           "(K, 2) float64: sums alpha, beta of cells (K, D) int64; 0, 0 for unobserved cells.")
       .def("bounding_box", &box_of<D>,
-           "first_cell (D,) int64 and shape of the box of cells that were looked at, as `dense` "
-           "has them.")
+           "first_cell (D,) int64 and shape of the bounding box of observed cells, as returned by "
+           "`dense`.")
       .def("dense", &dense<D>, nb::arg("first_cell") = nb::none(), nb::arg("shape") = nb::none(),
-           "first_cell (D,) int64 and alpha, beta over a box of cells, or the one of those that "
-           "were looked at; axes in reverse order, so that a 2D array is [row = y, column = x].")
+           "first_cell (D,) int64 and alpha, beta float64 over a box of cells, by default the "
+           "bounding box of the observed ones; axes in reverse order: a 2D array is [row = y, "
+           "column = x].")
       .def("observed_mask", &observed_mask<D>,
-           "first_cell and uint8 over the same box: 1 where alpha + beta are not zero.");
+           "first_cell and uint8 over the bounding box: 1 where alpha + beta > 0.");
 }
 
 // Visitor that records the cells and chord lengths of a traversal.

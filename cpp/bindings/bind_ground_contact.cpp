@@ -21,24 +21,24 @@ auto relabel_ground_contact(const SurfelMap<3>& surfel_map, const Points<3>& poi
   const size_t n = surfel_map.size(), beams = points.shape(0);
   require(surfel_map.fitted(), "surfel_map: fit it first");
   require(surfel.shape(0) == beams, "surfel: expected one per beam");
-  bool in_range = true, usable_ones = true;
+  bool in_range = true, no_unusable = true;
   for (size_t i = 0; i < beams; ++i) {
     const int32_t k = surfel.data()[i];
     in_range = in_range && k >= kNoSurfel && k < static_cast<int32_t>(n);
-    usable_ones = usable_ones && (k == kNoSurfel || usable<3>(points.data() + i * 3));
+    no_unusable = no_unusable && (k == kNoSurfel || usable<3>(points.data() + i * 3));
   }
   require(in_range, "surfel: out of range");
-  require(usable_ones, "surfel: of an unusable beam");
-  require(is_obstacle.shape(0) == n, "is_obstacle: expected one per element");
-  require(p_static.shape(0) == n, "p_static: expected one per element");
-  require(ground_height.shape(0) == n, "ground_height: expected one per element");
-  bool probable = true, high = true;
+  require(no_unusable, "surfel: expected -1 for unusable beams");
+  require(is_obstacle.shape(0) == n, "is_obstacle: expected one per surfel");
+  require(p_static.shape(0) == n, "p_static: expected one per surfel");
+  require(ground_height.shape(0) == n, "ground_height: expected one per surfel");
+  bool valid_p = true, finite_heights = true;
   for (size_t k = 0; k < n; ++k) {
-    probable = probable && p_static.data()[k] >= 0.0f && p_static.data()[k] <= 1.0f;
-    high = high && std::isfinite(ground_height.data()[k]);
+    valid_p = valid_p && p_static.data()[k] >= 0.0f && p_static.data()[k] <= 1.0f;
+    finite_heights = finite_heights && std::isfinite(ground_height.data()[k]);
   }
-  require(probable, "p_static: expected a probability in [0, 1]");
-  require(high, "ground_height: not finite");
+  require(valid_p, "p_static: expected a probability in [0, 1]");
+  require(finite_heights, "ground_height: not finite");
   require(column_cells >= 1 && column_cells <= kMaxColumnCells,
           "column_cells: expected 1 to 1048576 cells");
   require(std::isfinite(max_ground_height), "max_ground_height: not finite");
@@ -58,18 +58,19 @@ auto relabel_ground_contact(const SurfelMap<3>& surfel_map, const Points<3>& poi
 }  // namespace
 
 void bind_ground_contact(nb::module_& m) {
-  m.def("relabel_ground_contact", &relabel_ground_contact, nb::arg("surfel_map"),
-        nb::arg("points").noconvert(), nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
-        nb::arg("T_map_sensor").noconvert(), nb::arg("surfel").noconvert(), nb::kw_only(),
-        nb::arg("is_obstacle").noconvert(), nb::arg("p_static").noconvert(),
-        nb::arg("ground_height").noconvert(), nb::arg("column_cells"), nb::arg("max_ground_height"),
-        nb::arg("min_end_height"), nb::arg("threads") = 1,
-        "(M,) float32 of beams that end more than `min_end_height` metres above static elements "
-        "(M,) of the "
-        "ground: mean probability of being static of what stands in the same column in the same "
-        "sweep; NaN where that is half or more, and for all others. is_obstacle (E,) bool, "
-        "p_static and "
-        "ground_height (E,) float32: metres below each.");
+  m.def(
+      "relabel_ground_contact", &relabel_ground_contact, nb::arg("surfel_map"),
+      nb::arg("points").noconvert(), nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
+      nb::arg("T_map_sensor").noconvert(), nb::arg("surfel").noconvert(), nb::kw_only(),
+      nb::arg("is_obstacle").noconvert(), nb::arg("p_static").noconvert(),
+      nb::arg("ground_height").noconvert(), nb::arg("column_cells"), nb::arg("max_ground_height"),
+      nb::arg("min_end_height"), nb::arg("threads") = 1,
+      "(M,) float32: P(static) of beams that end on static ground surfels below a moving object: "
+      "the mean p_static of the obstacle surfels hit in the same column of column_cells x "
+      "column_cells cells by the same sweep; NaN where it is 1/2 or more, and for all other beams. "
+      "surfel (M,) int32 is the surfel of each beam, -1: none; is_obstacle (E,) bool; p_static "
+      "(E,) float32; ground_height (E,) float32, metres, below each surfel. Ground surfels lie at "
+      "most max_ground_height above the ground, the beams end more than min_end_height above it.");
 }
 
 }  // namespace stillmap::bindings

@@ -11,14 +11,14 @@ const bool* per_scan(const Flat<bool>& is_held_out, size_t n_scans) {
 }
 
 template <int D>
-void add_others(StaticFractionGrid<D>& fractions, const Points<D>& points, const Flat<bool>& hit,
-                const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses,
-                const Flat<bool>& is_held_out) {
+void add(StaticFractionGrid<D>& fractions, const Points<D>& points, const Flat<bool>& hit,
+         const Flat<float>& e, const Flat<int64_t>& offset, const Poses<D>& poses,
+         const Flat<bool>& is_held_out) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   const float* weights = per_beam(e, points.shape(0), "e");
-  const bool* left_out = per_scan(is_held_out, scans.n_scans);
+  const bool* held_out = per_scan(is_held_out, scans.n_scans);
   nb::gil_scoped_release released;
-  fractions.add(scans, weights, left_out);
+  fractions.add(scans, weights, held_out);
 }
 
 BeamModel checked(double stopping_rate, double range_std, double late_share, double mean_delay,
@@ -35,17 +35,17 @@ BeamModel checked(double stopping_rate, double range_std, double late_share, dou
 }
 
 template <int D>
-auto gains(const StaticFractionGrid<D>& fractions, const Points<D>& points, const Flat<bool>& hit,
-           const Flat<int64_t>& offset, const Poses<D>& poses, const Flat<bool>& is_held_out,
-           double stopping_rate, double range_std, double late_share, double mean_delay,
-           double outlier_share, int threads) {
+auto scores(const StaticFractionGrid<D>& fractions, const Points<D>& points, const Flat<bool>& hit,
+            const Flat<int64_t>& offset, const Poses<D>& poses, const Flat<bool>& is_held_out,
+            double stopping_rate, double range_std, double late_share, double mean_delay,
+            double outlier_share, int threads) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
-  const bool* left_out = per_scan(is_held_out, scans.n_scans);
+  const bool* held_out = per_scan(is_held_out, scans.n_scans);
   const BeamModel model = checked(stopping_rate, range_std, late_share, mean_delay, outlier_share);
   std::vector<HeldOutScore> sums(scans.n_scans);
   {
     nb::gil_scoped_release released;
-    score_held_out<D>(fractions, scans, left_out, model, threads, sums.data());
+    score_held_out<D>(fractions, scans, held_out, model, threads, sums.data());
   }
   std::vector<double> out;
   out.reserve(2 * sums.size());
@@ -56,22 +56,26 @@ auto gains(const StaticFractionGrid<D>& fractions, const Points<D>& points, cons
 template <int D>
 void bind(nb::module_& m, const char* name) {
   using S = StaticFractionGrid<D>;
-  nb::class_<S>(m, name, "Mean e of the beams that ended in each cell; rates at which beams end.")
+  nb::class_<S>(m, name, "Mean e of the returns in each cell, and the rates at which beams end.")
       .def(nb::init<double>(), nb::arg("resolution"))
       .def_prop_ro("resolution", &S::resolution, "metres")
-      .def_prop_ro("end_rate", &S::end_rate, "ends of beams per metre")
-      .def_prop_ro("dynamic_rate", &S::dynamic_rate, "ends at what moves, per metre")
-      .def("add", &add_others<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+      .def_prop_ro("end_rate", &S::end_rate, "beam ends per metre")
+      .def_prop_ro("dynamic_rate", &S::dynamic_rate, "beam ends on moving objects, per metre")
+      .def("add", &add<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
            nb::arg("e").noconvert(), nb::arg("offset").noconvert(),
            nb::arg("T_map_sensor").noconvert(), nb::arg("is_held_out").noconvert(),
-           "Adds the beams of the scans that are not held (T,); e (M,) float32.");
-  m.def("score_held_out", &gains<D>, nb::arg("fractions"), nb::arg("points").noconvert(),
+           "Adds the beams of the scans that are not held out; e (M,) float32, is_held_out (T,) "
+           "bool.");
+  m.def("score_held_out", &scores<D>, nb::arg("fractions"), nb::arg("points").noconvert(),
         nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
         nb::arg("T_map_sensor").noconvert(), nb::arg("is_held_out").noconvert(), nb::kw_only(),
         nb::arg("stopping_rate"), nb::arg("range_std"), nb::arg("late_share"),
         nb::arg("mean_delay"), nb::arg("outlier_share"), nb::arg("threads") = 1,
-        "(T, 2) float64 per scan, zeros where it is not held: log likelihood of its ranges above "
-        "that of a world in which beams end at the same rate everywhere, in nats; beams.");
+        "(T, 2) float64 per held-out scan, zeros for the others: log likelihood ratio of its "
+        "ranges against a model that ends beams at one rate everywhere, in nats; number of beams. "
+        "stopping_rate: ends per metre in static cells; range_std in metres; late_share of the "
+        "beams end mean_delay metres behind the surface on average; outlier_share of the density "
+        "is that of the other model.");
 }
 
 }  // namespace

@@ -21,7 +21,7 @@ MeanFieldOptions checked(double radius, double coplanar_std, double static_coupl
       std::isfinite(min_log_odds) && std::isfinite(max_log_odds) && min_log_odds <= max_log_odds,
       "min_log_odds, max_log_odds: expected min_log_odds <= max_log_odds");
   require_probability(tolerance, "tolerance");
-  require(max_iterations >= 0, "max_iterations: expected no negative number");
+  require(max_iterations >= 0, "max_iterations: expected a number of at least 0");
   return {radius,       coplanar_std, static_coupling, dynamic_coupling,
           min_log_odds, max_log_odds, tolerance,       max_iterations};
 }
@@ -33,8 +33,8 @@ auto infer_p_static(const SurfelMap<D>& surfel_map, const Flat<float>& log_odds,
                     int threads) {
   const size_t n = surfel_map.size();
   require(surfel_map.fitted(), "surfel_map: fit it first");
-  require(surfel_map.hit_spans().size() == n, "surfel_map: expected the looks of its end points");
-  require(log_odds.shape(0) == n, "log_odds: expected one per element");
+  require(surfel_map.hit_spans().size() == n, "surfel_map: expected end points with time bins");
+  require(log_odds.shape(0) == n, "log_odds: expected one per surfel");
   for (size_t k = 0; k < n; ++k) require(!std::isnan(log_odds.data()[k]), "log_odds: not a number");
   const MeanFieldOptions options = checked(radius, coplanar_std, static_coupling, dynamic_coupling,
                                            min_log_odds, max_log_odds, tolerance, max_iterations);
@@ -53,8 +53,12 @@ void bind(nb::module_& m) {
         nb::arg("static_coupling"), nb::arg("dynamic_coupling"), nb::arg("min_log_odds"),
         nb::arg("max_log_odds"), nb::arg("tolerance"), nb::arg("max_iterations"),
         nb::arg("threads") = 1,
-        "(E,) float32 probability of being static, from log odds (E,) float32 that the looks at "
-        "each element alone give and from the elements within a radius (cells) of it.");
+        "(E,) float32: P(static) of each surfel by mean-field inference in a Markov random field, "
+        "from its own log_odds (E,) float32 and its neighbours within `radius` cells. "
+        "coplanar_std: standard deviation of the distance between coplanar surfels, in cells; "
+        "static_coupling, dynamic_coupling: log odds of static and of dynamic neighbours; own log "
+        "odds are clipped to min_log_odds, max_log_odds; surfels are updated while a neighbour "
+        "changed by more than tolerance.");
 }
 
 }  // namespace

@@ -42,27 +42,26 @@ template <int D>
 auto dense(const ObservationCounts<D>& counts, const std::array<int64_t, D>& first_cell,
            const std::array<int64_t, D>& shape) {
   const Box<D> box(first_cell, shape);
-  std::vector<uint16_t> looks(box.total(), 0), clear(box.total(), 0);
+  std::vector<uint16_t> observed(box.total(), 0), clear(box.total(), 0);
   for (const auto& block : counts.blocks()) {
     if (!box.overlaps(BlockLayout<D>::cell_at(block->origin, 0), BlockLayout<D>::kEdge)) continue;
     for (int i = 0; i < BlockLayout<D>::kCells; ++i) {
       const Cell<D> cell = BlockLayout<D>::cell_at(block->origin, i);
       if (!box.contains(cell)) continue;
       const CellVisits& visits = block->values[static_cast<size_t>(i)];
-      looks[box.index(cell)] = visits.observed;
+      observed[box.index(cell)] = visits.observed;
       clear[box.index(cell)] = visits.clear;
     }
   }
-  return std::make_tuple(box.shaped(std::move(looks)), box.shaped(std::move(clear)));
+  return std::make_tuple(box.shaped(std::move(observed)), box.shaped(std::move(clear)));
 }
 
 template <int D>
 void bind(nb::module_& m, const char* name) {
   using L = ObservationCounts<D>;
-  nb::class_<L>(
-      m, name,
-      "In how many looks a cell was looked at, and in how many of them nothing that moves "
-      "was near.")
+  nb::class_<L>(m, name,
+                "Number of time bins in which a cell was observed, and in how many of them no "
+                "moving object was near.")
       .def(
           "__init__",
           [](L* self, double resolution, double radius, const std::optional<Cells<D>>& stop_cells,
@@ -72,25 +71,22 @@ void bind(nb::module_& m, const char* name) {
           },
           nb::arg("resolution"), nb::kw_only(), nb::arg("radius"),
           nb::arg("stop_cells").noconvert() = nb::none(), nb::arg("end_margin") = 0.0,
-          "radius: metres around the end of a beam on something that moves within which a cell is "
-          "not clear, between the middles of cells. stop_cells (S, D) int64, end_margin: how far "
-          "beams "
-          "without a return are believed, as `add_no_return_beams` has it; without stop_cells all "
-          "of their way.")
+          "radius: distance in metres between cell centres within which a dynamic return makes a "
+          "cell not clear. stop_cells (S, D) int64, end_margin: trust in beams without a return, "
+          "see `add_no_return_beams`; without stop_cells they are trusted all the way.")
       .def_prop_ro("resolution", &L::resolution, "metres")
       .def_prop_ro("radius", &L::radius, "metres")
       .def_prop_ro("dimension", [](const L&) { return D; })
       .def_prop_ro("memory_bytes", &L::memory_bytes)
-      .def(
-          "add", &add<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
-          nb::arg("is_dynamic").noconvert(), nb::arg("offset").noconvert(),
-          nb::arg("T_map_sensor").noconvert(), nb::arg("time_bin").noconvert(),
-          nb::arg("threads") = 1,
-          "Adds scans; is_dynamic (M,) bool: the hits on something that moves. time_bin (T,) int64 "
-          "numbers their looks, must not fall, and goes beyond those of earlier calls.")
+      .def("add", &add<D>, nb::arg("points").noconvert(), nb::arg("hit").noconvert(),
+           nb::arg("is_dynamic").noconvert(), nb::arg("offset").noconvert(),
+           nb::arg("T_map_sensor").noconvert(), nb::arg("time_bin").noconvert(),
+           nb::arg("threads") = 1,
+           "Adds scans; is_dynamic (M,) bool marks the returns from moving objects. time_bin (T,) "
+           "int64 must not decrease and must exceed those of earlier calls.")
       .def("dense", &dense<D>, nb::arg("first_cell"), nb::arg("shape"),
-           "looks and clear, uint16 that stop at 65535, over a box of cells, axes in reverse "
-           "order as those of `OccupancyGrid2D.dense`.");
+           "observed and clear counts, uint16 saturating at 65535, over a box of cells, axes in "
+           "reverse order as in `OccupancyGrid2D.dense`.");
 }
 
 }  // namespace

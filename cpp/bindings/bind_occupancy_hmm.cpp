@@ -24,29 +24,29 @@ template <int D>
 void add_observations(OccupancyHmm<D>& hmm, const Points<D>& points, const Flat<bool>& hit,
                       const Flat<int64_t>& offset, const Poses<D>& poses,
                       const Flat<int64_t>& time_bin, int threads,
-                      const std::optional<Places<D>>& place) {
+                      const std::optional<Positions<D>>& positions) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   require(time_bin.shape(0) == scans.n_scans, "time_bin: expected one number per scan");
-  require(!place || place->shape(0) == scans.n_scans, "positions: expected one per scan");
+  require(!positions || positions->shape(0) == scans.n_scans, "positions: expected one per scan");
   nb::gil_scoped_release released;
-  hmm.add(scans, time_bin.data(), place ? place->data() : nullptr, threads);
+  hmm.add(scans, time_bin.data(), positions ? positions->data() : nullptr, threads);
 }
 
 template <int D>
-auto likelihoods(OccupancyHmm<D>& hmm, const std::optional<Flat<bool>>& among,
+auto likelihoods(OccupancyHmm<D>& hmm, const std::optional<Flat<bool>>& selected,
                  const std::optional<Slice>& rows, int threads) {
   std::vector<size_t> classes;
-  require(!among || among->shape(0) == hmm.classes(), "classes: expected one per class");
+  require(!selected || selected->shape(0) == hmm.classes(), "classes: expected one per class");
   for (size_t c = 0; c < hmm.classes(); ++c)
-    if (!among || among->data()[c]) classes.push_back(c);
-  require(!classes.empty(), "classes: expected a class");
-  const auto [first, stride, n] = rows_from(rows, hmm.surfel_map().size());
+    if (!selected || selected->data()[c]) classes.push_back(c);
+  require(!classes.empty(), "classes: expected at least one");
+  const auto [first, step, n] = rows_from(rows, hmm.surfel_map().size());
   const size_t C = classes.size();
   std::vector<float> relative(n * C);
   std::vector<double> log_best(n);
   {
     nb::gil_scoped_release released;
-    hmm.likelihood(classes, first, stride, n, threads, relative.data(), log_best.data());
+    hmm.likelihood(classes, first, step, n, threads, relative.data(), log_best.data());
   }
   return std::make_tuple(to_numpy(std::move(relative), {n, C}), to_numpy(std::move(log_best), {n}));
 }
@@ -56,14 +56,14 @@ template <int D>
 auto describe_changes(const OccupancyHmm<D>& hmm, const std::optional<Slice>& rows) {
   const ChangeHmm& changes = hmm.change_hmm();
   require(changes.has_paths(), "changes: expected track_changes with paths before");
-  const auto [first, stride, n] = rows_from(rows, changes.members());
+  const auto [first, step, n] = rows_from(rows, changes.members());
   std::vector<double> log_likelihood(n);
   std::vector<float> p_last(n * 2), share(n);
   std::vector<int32_t> count(n * 2), change_bins(n * 8);
   {
     nb::gil_scoped_release released;
     for (size_t i = 0; i < n; ++i) {
-      const size_t k = first + i * stride;
+      const size_t k = first + i * step;
       const StatePath& path = changes.most_probable_path(k);
       log_likelihood[i] = changes.log_likelihood(k);
       share[i] = changes.occupied_fraction(k);
@@ -87,9 +87,9 @@ auto describe_changes(const OccupancyHmm<D>& hmm, const std::optional<Slice>& ro
 template <int D>
 auto change_log_likelihood(const OccupancyHmm<D>& hmm, const std::optional<Slice>& rows) {
   const ChangeHmm& changes = hmm.change_hmm();
-  const auto [first, stride, n] = rows_from(rows, changes.members());
+  const auto [first, step, n] = rows_from(rows, changes.members());
   std::vector<double> values(n);
-  for (size_t i = 0; i < n; ++i) values[i] = changes.log_likelihood(first + i * stride);
+  for (size_t i = 0; i < n; ++i) values[i] = changes.log_likelihood(first + i * step);
   return to_numpy(std::move(values), {n});
 }
 
@@ -111,38 +111,43 @@ auto solid_cells(const OccupancyHmm<D>& hmm) {
 }
 
 OccupancyClasses checked_classes(std::vector<double> rho, std::vector<double> tau,
-                                 std::vector<double> turn, double detection) {
-  if (turn.empty()) turn.assign(rho.size(), std::numeric_limits<double>::infinity());
-  require(!rho.empty() && rho.size() == tau.size() && rho.size() == turn.size(),
+                                 std::vector<double> view_angle, double p_detection) {
+  if (view_angle.empty()) view_angle.assign(rho.size(), std::numeric_limits<double>::infinity());
+  require(!rho.empty() && rho.size() == tau.size() && rho.size() == view_angle.size(),
           "rho, tau, view_angle: expected one number per class");
   require(rho.size() <= kMaxClasses, "rho, tau, view_angle: too many classes");
   for (const double r : rho) require(r > 0.0 && r < 1.0, "rho: expected shares between 0 and 1");
   for (const double t : tau) require(t > 0.0, "tau: expected positive times");
-  for (const double v : turn) require(v > 0.0, "view_angle: expected positive angles");
-  require(detection > 0.0 && detection < 1.0, "p_detection: expected a probability below 1");
-  return {std::move(rho), std::move(tau), std::move(turn), detection};
+  for (const double v : view_angle) require(v > 0.0, "view_angle: expected positive angles");
+  require(p_detection > 0.0 && p_detection < 1.0, "p_detection: expected a probability below 1");
+  return {std::move(rho), std::move(tau), std::move(view_angle), p_detection};
 }
 
 template <int D>
 void bind(nb::module_& m, const char* name) {
   using W = OccupancyHmm<D>;
-  nb::class_<W>(m, name,
-                "Likelihood of what was seen of each element, per class: occupied for a share rho, "
-                "correlated over tau seconds and over turn radians of the view (inf or none given: "
-                "however it turns).")
+  nb::class_<W>(
+      m, name,
+      "Occupancy HMM of each surfel: likelihood of its observations under classes of two-state "
+      "Markov chains with stationary occupancy rho, correlation time tau (seconds) and correlation "
+      "angle view_angle of the line of sight (radians; inf or none given: independent of it).")
       .def(
           "__init__",
           [](W* self, const SurfelMap<D>& s, std::vector<double> rho, std::vector<double> tau,
-             std::vector<double> turn, double detection, double seconds, double lateral,
-             double margin, double reach, double beyond, bool normals, int threads) {
-            for (const double x : {seconds, lateral, margin, reach, beyond})
+             std::vector<double> view_angle, double p_detection, double bin_seconds,
+             double lateral_std, double margin, double hit_radius, double end_margin,
+             bool use_normals, int threads) {
+            for (const double x : {bin_seconds, lateral_std, margin, hit_radius, end_margin})
               require(x > 0.0 && std::isfinite(x),
                       "bin_seconds, lateral_std, margin, hit_radius, end_margin: expected positive "
                       "numbers");
             const double r = s.resolution();
-            new (self)
-                W(s, checked_classes(std::move(rho), std::move(tau), std::move(turn), detection),
-                  {seconds, lateral / r, margin / r, reach / r, beyond / r, 1.0, normals}, threads);
+            new (self) W(
+                s,
+                checked_classes(std::move(rho), std::move(tau), std::move(view_angle), p_detection),
+                {bin_seconds, lateral_std / r, margin / r, hit_radius / r, end_margin / r, 1.0,
+                 use_normals},
+                threads);
           },
           nb::arg("surfel_map"), nb::kw_only(), nb::arg("rho"), nb::arg("tau"),
           nb::arg("view_angle") = std::vector<double>{}, nb::arg("p_detection"),
@@ -153,16 +158,16 @@ void bind(nb::module_& m, const char* name) {
            nb::arg("offset").noconvert(), nb::arg("T_map_sensor").noconvert(),
            nb::arg("time_bin").noconvert(), nb::arg("threads") = 1,
            nb::arg("positions").noconvert() = nb::none(),
-           "Adds scans; look (T,) int64 numbers their looks and must not fall. All scans of one "
-           "look belong into one call. place (T, D): where the robot stood, metres; without, the "
-           "sensors' places are asked how far the view turned.")
+           "Adds scans; time_bin (T,) int64 must not decrease, and all scans of one bin belong in "
+           "one call. positions (T, D): robot positions in metres, from which the change of the "
+           "line of sight is computed; default: the sensor positions.")
       .def("count_no_return_beams", &no_return_stats<D>, nb::arg("points").noconvert(),
            nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
            nb::arg("T_map_sensor").noconvert(), nb::arg("threads") = 1,
-           "Beams without a return that have such beams beside them, and how many of these cross "
-           "something solid.")
+           "Number of beams without a return in runs of at least three, and how many of them cross "
+           "a solid surfel.")
       .def("solid_cells", &solid_cells<D>,
-           "(S, D) int64 cells of surfaces on which many beams ended: the solid things.")
+           "(S, D) int64: cells of solid surfels, planar ones with many returns.")
       .def(
           "set_trust_beyond_solid",
           [](W& w, double trust) {
@@ -170,42 +175,41 @@ void bind(nb::module_& m, const char* name) {
             w.set_trust_beyond_solid(trust);
           },
           nb::arg("trust"),
-          "How far to trust beams without a return beyond the first solid thing in their way; all "
-          "the way at first.")
+          "Trust in beams without a return beyond the first solid surfel they cross, from 0 to 1 "
+          "(initially 1).")
       .def(
           "track_changes",
-          [](W& w, double tau, double passer_by_rho, double passer_by_tau, double detection,
-             bool courses) {
+          [](W& w, double tau, double passer_by_rho, double passer_by_tau, double p_detection,
+             bool with_paths) {
             for (const double t : {tau, passer_by_tau})
               require(t > 0.0 && std::isfinite(t), "tau, passer_by_tau: expected positive times");
-            for (const double p : {passer_by_rho, detection})
+            for (const double p : {passer_by_rho, p_detection})
               require(p > 0.0 && p < 1.0,
                       "passer_by_rho, p_detection: expected probabilities between 0 and 1");
-            w.track_changes({tau, passer_by_rho, passer_by_tau, detection}, courses);
+            w.track_changes({tau, passer_by_rho, passer_by_tau, p_detection}, with_paths);
           },
           nb::kw_only(), nb::arg("tau"), nb::arg("passer_by_rho"), nb::arg("passer_by_tau"),
           nb::arg("p_detection"), nb::arg("with_paths") = true,
-          "Asks, before the first look, which elements are of things that come to stay or leave: "
-          "correlation time in seconds; share of the time and correlation time of passers-by. "
-          "Without courses only `change_log_likelihood` is known of them.")
+          "Enables the change HMM (object, empty, passer-by); to be called before the first "
+          "observation. tau: correlation time of objects in seconds; passer_by_rho, passer_by_tau: "
+          "stationary probability and correlation time of passers-by; without with_paths only "
+          "`change_log_likelihood` is computed.")
       .def("change_log_likelihood", &change_log_likelihood<D>, nb::arg("rows") = nb::none(),
-           "(E,) the first of `changes`.")
+           "(E,) float64: the first result of `changes`.")
       .def("release_buffers", &W::release_buffers,
-           "Lets go what only further looks would want; they make it anew.")
-      .def(
-          "changes", &describe_changes<D>, nb::arg("rows") = nb::none(),
-          "Of each element: (E,) logarithm of the likelihood of everything else that was seen, if "
-          "things come to stay and leave; of the most probable course (E,) float32 share of the "
-          "time in which it was not empty. Then, for things alone and for anything that was there: "
-          "(E, 2) float32 probability of it at the last look; (E, 2) int32 how often it came or "
-          "left; (E, 2, 2, 2) int32 looks before and after the first and the last time, -1: none. "
-          "rows (first, last, every): of some of the elements.")
+           "Frees the buffers that only `add` needs; it makes them anew.")
+      .def("changes", &describe_changes<D>, nb::arg("rows") = nb::none(),
+           "Change HMM of each surfel: (E,) float64 log likelihood of its observations given one "
+           "return; (E,) float32 fraction of time in which the Viterbi path is not empty. Then, "
+           "for objects alone and for anything present: (E, 2) float32 probability at the last "
+           "observation; (E, 2) int32 number of changes on the Viterbi path; (E, 2, 2, 2) int32 "
+           "time bins before and after the first and the last change, -1: none. rows (first, last, "
+           "step) selects surfels.")
       .def("likelihood", &likelihoods<D>, nb::arg("classes") = nb::none(),
            nb::arg("rows") = nb::none(), nb::arg("threads") = 1,
-           "(E, C) float32 relative to the best class, (E,) logarithm of the best: of everything "
-           "else that was seen of the cell, given that a beam ended in it; under those of the "
-           "classes (bool, one per class) alone, as if there were no others. rows (first, last, "
-           "every): of some of the elements.");
+           "Likelihood of the observations of each surfel given one return in its cell: (E, C) "
+           "float32 relative to the best class, (E,) float64 logarithm of the best. classes (bool, "
+           "one per class) selects classes, rows (first, last, step) surfels.");
 }
 
 }  // namespace

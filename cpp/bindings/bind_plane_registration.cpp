@@ -54,7 +54,7 @@ TimedPoints<D> timed_points(const Points<D>& points, const Flat<float>& weights,
 
 PlaneOptions plane_options(double min_weight, double max_flatness, double min_extent) {
   require(min_weight > 0.0, "min_weight: expected a positive weight");
-  require(max_flatness >= 0.0 && max_flatness <= 1.0, "max_flatness: expected a share in [0, 1]");
+  require(max_flatness >= 0.0 && max_flatness <= 1.0, "max_flatness: expected a ratio in [0, 1]");
   require(min_extent >= 0.0, "min_extent: expected a variance that is not negative");
   return {min_weight, max_flatness, min_extent};
 }
@@ -82,20 +82,20 @@ void crop(NdtMap<D>& map, const OnePose<D>& T, double radius) {
 
 // Normals (N, D), offsets and variances (N,), and validity (N,).
 template <int D>
-auto fit_planes(const NdtMap<D>& map, const Places<D>& positions, int level, double min_weight,
+auto fit_planes(const NdtMap<D>& map, const Positions<D>& positions, int level, double min_weight,
                 double max_flatness, double min_extent) {
   const PlaneOptions options = plane_options(min_weight, max_flatness, min_extent);
-  require(level >= 0 && level < map.levels(), "level: there is none of that number");
+  require(level >= 0 && level < map.levels(), "level: out of range");
   const size_t n = positions.shape(0);
   std::vector<double> normals(n * D, 0.0), offsets(n, 0.0), variances(n, 0.0);
-  std::vector<int8_t> known(n, 0);
+  std::vector<int8_t> valid(n, 0);
   {
     nb::gil_scoped_release released;
     for (size_t i = 0; i < n; ++i) {
-      const Vec<D> place = Eigen::Map<const Vec<D>>(positions.data() + i * D);
+      const Vec<D> position = Eigen::Map<const Vec<D>>(positions.data() + i * D);
       Plane<D> plane;
-      if (!map.fit_plane(place, level, options, plane)) continue;
-      known[i] = 1;
+      if (!map.fit_plane(position, level, options, plane)) continue;
+      valid[i] = 1;
       for (size_t d = 0; d < D; ++d) normals[i * D + d] = plane.normal[static_cast<int>(d)];
       offsets[i] = plane.offset;
       variances[i] = plane.variance;
@@ -103,7 +103,7 @@ auto fit_planes(const NdtMap<D>& map, const Places<D>& positions, int level, dou
   }
   return std::make_tuple(to_numpy(std::move(normals), {n, size_t{D}}),
                          to_numpy(std::move(offsets), {n}), to_numpy(std::move(variances), {n}),
-                         to_numpy(std::move(known), {n}));
+                         to_numpy(std::move(valid), {n}));
 }
 
 template <class Matrix>
@@ -131,7 +131,7 @@ auto register_to_map(const NdtMap<D>& map, const Points<D>& points, const Flat<f
                      double information_scale, int start_level, double start_slack,
                      int max_iterations, double tolerance, int threads) {
   require(range_std > 0.0 && kernel_width > 0.0 && information_scale > 0.0,
-          "range_std, kernel_width, information_scale: expected to be positive");
+          "range_std, kernel_width, information_scale: expected positive numbers");
   require(start_level >= 0 && start_slack >= 0.0 && max_iterations >= 0 && tolerance > 0.0,
           "start_level, start_slack, max_iterations, tolerance: out of range");
   const PlaneRegistrationOptions options{plane_options(min_weight, max_flatness, min_extent),
@@ -178,7 +178,7 @@ auto linearise_sweep(const NdtMap<D>& map, const Points<D>& points, const Flat<f
                                          slack,
                                          0,
                                          1.0};
-  require(level >= 0 && level < map.levels(), "level: there is none of that number");
+  require(level >= 0 && level < map.levels(), "level: out of range");
   const MotionState<D> at{checked_pose<D>(T, "T"), finite_tangent<D>(twist, "twist")};
   const auto q =
       linearise<D>(map, timed_points<D>(points, weights, times), at, level, slack, options, 1);
@@ -196,9 +196,10 @@ auto transform_points(const Points<D>& points, const Flat<float>& times, const T
     nb::gil_scoped_release released;
     for (size_t i = 0; i < n; ++i) {
       const float* p = points.data() + i * D;
-      const Vec<D> moved = transform_by_twist<D>(xi, static_cast<double>(tau[i]), point_at<D>(p));
+      const Vec<D> transformed =
+          transform_by_twist<D>(xi, static_cast<double>(tau[i]), point_at<D>(p));
       for (size_t d = 0; d < D; ++d)
-        out[i * D + d] = static_cast<float>(moved[static_cast<int>(d)]);
+        out[i * D + d] = static_cast<float>(transformed[static_cast<int>(d)]);
     }
   }
   return to_numpy(std::move(out), {n, size_t{D}});
@@ -219,12 +220,12 @@ auto downsample(const Points<D>& points, const Flat<float>& weights, double voxe
 }
 
 // 3D only: in 2D scans are registered against a likelihood field.
-void bind_in_space(nb::module_& m) {
+void bind_3d(nb::module_& m) {
   constexpr int D = 3;
-  nb::class_<NdtMap<D>>(m, "NdtMap3D",
-                        "Moments of end points in cells of `edge` metres, and of twice, four "
-                        "times, ... that on further levels; a cell takes no more once it weighs "
-                        "`max_weight`.")
+  nb::class_<NdtMap<D>>(
+      m, "NdtMap3D",
+      "NDT map: weighted moments of end points in voxels of `edge` metres, doubled from level to "
+      "level; a voxel takes no more points once its weight reaches `max_weight`.")
       .def(nb::init<double, int, double>(), nb::arg("edge"), nb::arg("levels"),
            nb::arg("max_weight"))
       .def("__len__", &NdtMap<D>::size)
@@ -232,13 +233,15 @@ void bind_in_space(nb::module_& m) {
       .def_prop_ro("memory_bytes", &NdtMap<D>::memory_bytes)
       .def("add", &add_points<D>, nb::arg("points").noconvert(), nb::arg("weights").noconvert(),
            nb::arg("T_map_base").noconvert(),
-           "Takes in points (N, D) float32 in the moving frame, weights (N,) float32 = e.")
+           "Adds points (N, D) float32 in the frame of T_map_base, weights (N,) float32 = e.")
       .def("crop", &crop<D>, nb::arg("T_map_base").noconvert(), nb::arg("radius"),
-           "Forgets what lies farther than that many metres from a pose.")
+           "Removes the voxels farther than `radius` metres from a pose.")
       .def("fit_planes", &fit_planes<D>, nb::arg("positions").noconvert(), nb::arg("level"),
            nb::kw_only(), nb::arg("min_weight"), nb::arg("max_flatness"), nb::arg("min_extent"),
-           "Normals (N, D), offsets (N,) along them, variances (N,) across, and (N,) int8 whether "
-           "there is a surface around positions (N, D) float64.");
+           "Planes around positions (N, D) float64: normals (N, D), offsets (N,) along them, "
+           "variances (N,) across, and (N,) int8: 1 where there is a plane. A plane needs weight "
+           "min_weight, a variance ratio across to along of at most max_flatness, and an extent "
+           "(variance in voxels squared) of at least min_extent.");
   m.def("register_sweep", &register_to_map<D>, nb::arg("map"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("times").noconvert(),
         nb::arg("T_prior").noconvert(), nb::arg("twist_prior").noconvert(),
@@ -247,29 +250,30 @@ void bind_in_space(nb::module_& m) {
         nb::arg("max_flatness"), nb::arg("min_extent"), nb::arg("range_std"),
         nb::arg("kernel_width"), nb::arg("information_scale"), nb::arg("start_level"),
         nb::arg("start_slack"), nb::arg("max_iterations"), nb::arg("tolerance"), nb::arg("threads"),
-        "Pose and motion of one sweep against a map. points (N, D) float32 in the moving frame at "
-        "the time of each, times (N,) float32 seconds from the pose, weights (N,) float32 = e; "
-        "T_prior (D+1, D+1), twist_prior (dof,) = velocity and rate of turn in the moving frame, "
-        "information (2 dof, 2 dof) of both. Returns pose, twist, covariance (2 dof, 2 dof) in the "
-        "moving frame, the weights of beams that lie on surfaces, are near some, are at all, and "
-        "the number of steps.");
+        "Point-to-plane registration of one sweep, pose and twist. points (N, D) float32 in the "
+        "moving frame, each at its own time; times (N,) float32, seconds from the pose; weights "
+        "(N,) float32 = e; T_prior (D+1, D+1), twist_prior (dof,): velocity and angular rate in "
+        "the moving frame; information (2 dof, 2 dof) of both. Returns pose, twist, covariance (2 "
+        "dof, 2 dof) in the moving frame, the weights of inliers, of points with a plane and of "
+        "all points, and the number of Gauss-Newton steps.");
   m.def("linearise_sweep", &linearise_sweep<D>, nb::arg("map"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("times").noconvert(), nb::arg("T").noconvert(),
         nb::arg("twist").noconvert(), nb::kw_only(), nb::arg("min_weight"), nb::arg("max_flatness"),
         nb::arg("min_extent"), nb::arg("range_std"), nb::arg("kernel_width"), nb::arg("level"),
         nb::arg("slack"),
-        "Hessian, gradient and cost of its data term at one pose, and the three weights.");
+        "Hessian, gradient and cost of the data term of `register_sweep` at one state, and the "
+        "three weights.");
   m.def("transform_by_twist", &transform_points<D>, nb::arg("points").noconvert(),
         nb::arg("times").noconvert(), nb::arg("twist").noconvert(),
-        "Points (N, D) as seen at the time of the pose: Exp(time twist) p.");
+        "(N, D) float32: points transformed to the time of the pose, Exp(time twist) p.");
   m.def("voxel_downsample", &downsample<D>, nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("voxel_size"),
-        "Indices, rising, of the first usable points with a weight in each cell of `voxel_size` "
-        "metres.");
+        "(K,) int64: ascending indices of the first usable point of positive weight in each voxel "
+        "of `voxel_size` metres.");
 }
 
 }  // namespace
 
-void bind_plane_registration(nb::module_& m) { bind_in_space(m); }
+void bind_plane_registration(nb::module_& m) { bind_3d(m); }
 
 }  // namespace stillmap::bindings

@@ -124,34 +124,34 @@ auto gradient_at(const OccupancyGrid<D>& grid, const Points<D>& points, const Fl
 
 template <int D>
 void bind(nb::module_& m) {
-  m.def(
-      "register_scan", &register_scan<D>, nb::arg("grid"), nb::arg("points").noconvert(),
-      nb::arg("weights").noconvert(), nb::arg("T_prior").noconvert(),
-      nb::arg("information").noconvert(), nb::kw_only(), nb::arg("sigma"), nb::arg("radius"),
-      nb::arg("floor"), nb::arg("unknown"), nb::arg("information_scale"), nb::arg("max_iterations"),
-      nb::arg("window_translation"), nb::arg("window_rotation"), nb::arg("search_range"),
-      nb::arg("max_candidates"), nb::arg("T_start") = nb::none(),
-      "(9): the pose of one scan against the grid so far. points (N, D) float32 that were hit, in "
-      "the moving frame; weights (N,) float32 = e; T_prior (D+1, D+1) and its information "
-      "(dof, dof) of (translation, rotation about the moving frame's origin). Returns pose, "
-      "covariance, cost, the share of beams the map explains, Newton steps, lattice poses, and "
-      "(R, dof + 1) how far every start ended up from that pose and how much more it cost. With "
-      "T_start nothing is searched: Newton steps begin there.");
+  m.def("register_scan", &register_scan<D>, nb::arg("grid"), nb::arg("points").noconvert(),
+        nb::arg("weights").noconvert(), nb::arg("T_prior").noconvert(),
+        nb::arg("information").noconvert(), nb::kw_only(), nb::arg("sigma"), nb::arg("radius"),
+        nb::arg("floor"), nb::arg("unknown"), nb::arg("information_scale"),
+        nb::arg("max_iterations"), nb::arg("window_translation"), nb::arg("window_rotation"),
+        nb::arg("search_range"), nb::arg("max_candidates"), nb::arg("T_start") = nb::none(),
+        "Equation (9): scan-to-map registration. points (N, D) float32: end points of returns in "
+        "the moving frame; weights (N,) float32 = e; T_prior (D+1, D+1) and information (dof, dof) "
+        "of (translation, rotation about the origin of the moving frame). A correlative search "
+        "yields up to max_candidates poses, each refined by Newton steps; with T_start the search "
+        "is skipped. Returns pose, covariance, cost, inlier share, number of Newton steps, number "
+        "of scored lattice poses, and (R, dof + 1) offset and additional cost of each refined "
+        "candidate against the best.");
   m.def("occluded_share", &occluded_share_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("T_sensor").noconvert(),
         nb::kw_only(), nb::arg("margin"), nb::arg("min_occupancy"),
         "Weighted share of beams, from a sensor at T T_sensor to the points at T, that cross a "
-        "cell of at least that occupancy more than `margin` metres before their end.");
+        "cell of occupancy >= min_occupancy more than `margin` metres before their end.");
   m.def("registration_cost", &cost_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
         nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),
-        "-sum w ln(floor + unknown U + F) at one pose, F being the smoothed field, U = 1 where "
-        "nobody "
-        "looked.");
+        "Cost -sum w ln(floor + unknown U + F) at one pose, with the likelihood field F and U = 1 "
+        "in unobserved cells.");
   m.def("registration_gradient", &gradient_at<D>, nb::arg("grid"), nb::arg("points").noconvert(),
         nb::arg("weights").noconvert(), nb::arg("T").noconvert(), nb::arg("sigma"),
         nb::arg("radius"), nb::arg("floor"), nb::arg("unknown"),
-        "Its derivative (dof,) by a small translation and a rotation about the sensor.");
+        "Gradient (dof,) of `registration_cost` with respect to translation and rotation about the "
+        "sensor.");
 }
 
 }  // namespace

@@ -31,7 +31,7 @@ void add_end_points(SurfelMap<D>& surfel_map, const Points<D>& points, const Fla
 
 // (E, 2) first and last time bin with a return
 template <int D>
-auto spans(const SurfelMap<D>& surfel_map) {
+auto hit_spans(const SurfelMap<D>& surfel_map) {
   std::vector<int32_t> out;
   for (const TimeSpan& span : surfel_map.hit_spans())
     out.insert(out.end(), {span.first, span.last});
@@ -40,8 +40,8 @@ auto spans(const SurfelMap<D>& surfel_map) {
 }
 
 template <int D>
-auto surfels(const SurfelMap<D>& surfel_map, const Points<D>& points, const Flat<bool>& hit,
-             const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
+auto surfel_of_beams(const SurfelMap<D>& surfel_map, const Points<D>& points, const Flat<bool>& hit,
+                     const Flat<int64_t>& offset, const Poses<D>& poses, int threads) {
   const auto scans = scans_from<D>(points, hit, offset, poses);
   std::vector<int32_t> out(points.shape(0));
   {
@@ -56,12 +56,12 @@ auto surfels(const SurfelMap<D>& surfel_map, const Points<D>& points, const Flat
 template <int D>
 auto describe_surfels(const SurfelMap<D>& surfel_map, const std::optional<Slice>& rows) {
   require(surfel_map.fitted(), "surfel_map: fit it first");
-  const auto [first, stride, n] = rows_from(rows, surfel_map.size());
+  const auto [first, step, n] = rows_from(rows, surfel_map.size());
   const auto d = static_cast<size_t>(D);
   std::vector<int64_t> cells(n * d), beams(n);
   std::vector<double> means(n * d), normals(n * d), centre_to_plane(n), prominence(n);
   for (size_t i = 0; i < n; ++i) {
-    const auto k = static_cast<int32_t>(first + i * stride);
+    const auto k = static_cast<int32_t>(first + i * step);
     for (int a = 0; a < D; ++a) {
       const size_t at = i * d + static_cast<size_t>(a);
       cells[at] = surfel_map.cell(k)[a];
@@ -81,33 +81,33 @@ auto describe_surfels(const SurfelMap<D>& surfel_map, const std::optional<Slice>
 template <int D>
 void bind(nb::module_& m, const char* name) {
   using S = SurfelMap<D>;
-  nb::class_<S>(m, name, "One element of surface per cell in which beams ended.")
+  nb::class_<S>(m, name, "One surfel per cell that contains end points.")
       .def(nb::init<double>(), nb::arg("resolution"))
       .def_prop_ro("resolution", &S::resolution, "metres")
       .def_prop_ro("dimension", [](const S&) { return D; })
-      .def_prop_ro("size", &S::size, "number of elements")
+      .def_prop_ro("size", &S::size, "number of surfels")
       .def_prop_ro(
           "noise_std", [](const S& s) { return s.noise_std() * s.resolution(); },
-          "metres: standard deviation of end points across surfaces; 0 before `fit`")
+          "metres: median standard deviation of end points across planar surfels; 0 before `fit`")
       .def("add_end_points", &add_end_points<D>, nb::arg("points").noconvert(),
            nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
            nb::arg("T_map_sensor").noconvert(), nb::arg("time_bin").noconvert() = nb::none(),
            nb::arg("threads") = 1,
-           "Notes where beams ended, and in which looks (T,) int64 where all calls say so.")
-      .def_prop_ro("hit_spans", &spans<D>, nb::rv_policy::move,
-                   "(E, 2) int32: first and last look at which beams ended in the cell of each "
-                   "element, once it is fitted; (0, 2) where nobody said.")
+           "Adds the end points of returns; time_bin (T,) int64 in all calls, or in none.")
+      .def_prop_ro("hit_spans", &hit_spans<D>, nb::rv_policy::move,
+                   "(E, 2) int32: first and last time bin with a return in the cell of each "
+                   "surfel, after `fit`; (0, 2) without time bins.")
       .def("fit", &S::fit, nb::arg("threads") = 1, nb::call_guard<nb::gil_scoped_release>(),
-           "Means, normals and scatter from all end points; none can be added any more.")
+           "Computes means, normals and noise_std; no end points can be added afterwards.")
       .def("surfels", &describe_surfels<D>, nb::arg("rows") = nb::none(),
-           "cells (E, D) int64, means (E, D) in metres, normals (E, D) (zero: none), distance (E,) "
-           "of the cell's centre from the surface around it in metres (zero: none), prominence "
-           "(E,): its beams against those of the richest cell around, beams (E,). rows (first, "
-           "last, every): of some of the elements.")
-      .def("associate_beams", &surfels<D>, nb::arg("points").noconvert(),
+           "cells (E, D) int64, means (E, D) metres, normals (E, D) (zero: not planar), distance "
+           "(E,) of the cell centre from the plane in metres (zero: not planar), prominence (E,): "
+           "number of returns relative to the largest in the neighbourhood, number of returns (E,) "
+           "int64. rows (first, last, step) selects surfels.")
+      .def("associate_beams", &surfel_of_beams<D>, nb::arg("points").noconvert(),
            nb::arg("hit").noconvert(), nb::arg("offset").noconvert(),
            nb::arg("T_map_sensor").noconvert(), nb::arg("threads") = 1,
-           "(M,) int32: the element in which each beam ended, -1: none.");
+           "(M,) int32: index of the surfel that each beam ended on, -1: none.");
 }
 
 }  // namespace

@@ -34,12 +34,13 @@ auto rasterise_texels(const Corners& corners, int width, int height) {
 }  // namespace
 
 void bind_texel_raster(nb::module_& m) {
-  m.def("rasterise_texels", &rasterise_texels, nb::arg("corners").noconvert(), nb::arg("width"),
-        nb::arg("height"),
-        "The texels of a page whose centres triangles cover, corners (n, 3, 2) float64 in texels "
-        "from its left and top edge: texel (k,) int32 = row * width + column, triangle (k,) int32, "
-        "rising, and the weights (k, 2) float32 of its second and third corner there. Of a "
-        "triangle between the centres it is the texel that holds its middle.");
+  m.def(
+      "rasterise_texels", &rasterise_texels, nb::arg("corners").noconvert(), nb::arg("width"),
+      nb::arg("height"),
+      "Rasterises triangles on a texture page. corners (n, 3, 2) float64 in texels from its left "
+      "and top edge. Returns texel (k,) int32 = row * width + column, triangle (k,) int32, "
+      "ascending, and the barycentric weights (k, 2) float32 of the second and third corner at the "
+      "texel centre. A triangle that covers no texel centre takes the texel of its centroid.");
 }
 
 }  // namespace stillmap::bindings

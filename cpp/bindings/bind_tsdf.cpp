@@ -23,43 +23,43 @@ bool all_finite(const double* values, size_t n) {
   return sum == 0.0;
 }
 
-void integrate(TsdfVolume& distances, const Places<3>& points, const Places<3>& origin,
+void integrate(TsdfVolume& volume, const Positions<3>& points, const Positions<3>& origin,
                const Flat<double>& standoff, const Faces& faces, const Flat<float>& weight,
                int threads) {
   const size_t n = points.shape(0), m = faces.shape(0);
   require(origin.shape(0) == n, "origin: expected a row per point");
   require(standoff.shape(0) == n, "standoff: expected one per point");
   require(weight.shape(0) == m, "weight: expected one per face");
-  require(m <= std::numeric_limits<uint32_t>::max(), "faces: too many at once");
+  require(m <= std::numeric_limits<uint32_t>::max(), "faces: too many");
   require(all_finite(points.data(), 3 * n), "points: not finite");
   require(all_finite(origin.data(), 3 * n), "origin: not finite");
   require(all_finite(standoff.data(), n), "standoff: not finite");
-  bool known = true, weighs = true;
+  bool in_range = true, valid_weights = true;
   for (size_t i = 0; i < 3 * m; ++i)
-    known = known && faces.data()[i] >= 0 && static_cast<size_t>(faces.data()[i]) < n;
+    in_range = in_range && faces.data()[i] >= 0 && static_cast<size_t>(faces.data()[i]) < n;
   for (size_t i = 0; i < m; ++i)
-    weighs = weighs && weight.data()[i] >= 0.0f && std::isfinite(weight.data()[i]);
-  require(known, "faces: a point that is not there");
-  require(weighs, "weight: expected finite ones that are not negative");
+    valid_weights = valid_weights && weight.data()[i] >= 0.0f && std::isfinite(weight.data()[i]);
+  require(in_range, "faces: point index out of range");
+  require(valid_weights, "weight: expected finite values of at least 0");
   nb::gil_scoped_release released;
-  distances.integrate(
-      {points.data(), origin.data(), standoff.data(), faces.data(), weight.data(), m}, threads);
+  volume.integrate({points.data(), origin.data(), standoff.data(), faces.data(), weight.data(), m},
+                   threads);
 }
 
-auto blocks(const TsdfVolume& distances) {
+auto blocks(const TsdfVolume& volume) {
   std::vector<int64_t> out;
-  out.reserve(3 * distances.blocks().size());
-  for (const auto& block : distances.blocks())
+  out.reserve(3 * volume.blocks().size());
+  for (const auto& block : volume.blocks())
     for (int d = 0; d < 3; ++d) out.push_back(block->origin[d]);
   const size_t n = out.size() / 3;
   return to_numpy(std::move(out), {n, 3});
 }
 
-void remove_blocks(TsdfVolume& distances, const Cells<3>& cells) {
-  std::vector<Cell<3>> gone(cells.shape(0));
-  for (size_t k = 0; k < gone.size(); ++k) gone[k] = cell_from<3>(cells, k);
+void remove_blocks(TsdfVolume& volume, const Cells<3>& cells) {
+  std::vector<Cell<3>> removed(cells.shape(0));
+  for (size_t k = 0; k < removed.size(); ++k) removed[k] = cell_from<3>(cells, k);
   nb::gil_scoped_release released;
-  distances.remove_blocks(gone);
+  volume.remove_blocks(removed);
 }
 
 // Calls visit(index in the box, voxel) for the integrated voxels of a block, x fastest.
@@ -72,7 +72,7 @@ void for_each_voxel(const TsdfVolume::Block& block, const Box<3>& box, Visit&& v
   }
 }
 
-auto dense(const TsdfVolume& distances, const std::array<int64_t, 3>& first_cell,
+auto dense(const TsdfVolume& volume, const std::array<int64_t, 3>& first_cell,
            const std::array<int64_t, 3>& shape) {
   constexpr int kEdge = TsdfVolume::kEdge;
   const Box<3> box(first_cell, shape);
@@ -90,15 +90,15 @@ auto dense(const TsdfVolume& distances, const std::array<int64_t, 3>& first_cell
         weight[at] = voxel.weight;
       });
     };
-    if (box.total() / static_cast<size_t>(kEdge) > 64 * distances.blocks().size()) {
-      for (const auto& block : distances.blocks())
+    if (box.total() / static_cast<size_t>(kEdge) > 64 * volume.blocks().size()) {
+      for (const auto& block : volume.blocks())
         if (box.overlaps(block->origin * kEdge, kEdge)) write(*block);
     } else if (box.total()) {
       Cell<3> at;
       for (at[2] = low[2]; at[2] <= high[2]; ++at[2])
         for (at[1] = low[1]; at[1] <= high[1]; ++at[1])
           for (at[0] = low[0]; at[0] <= high[0]; ++at[0])
-            if (const auto* block = distances.find(at)) write(*block);
+            if (const auto* block = volume.find(at)) write(*block);
     }
   }
   return std::make_pair(box.shaped(std::move(metres)), box.shaped(std::move(weight)));
@@ -107,35 +107,35 @@ auto dense(const TsdfVolume& distances, const std::array<int64_t, 3>& first_cell
 }  // namespace
 
 void bind_tsdf(nb::module_& m) {
-  nb::class_<TsdfVolume>(m, "TsdfVolume",
-                         "Signed distances from the surfaces that scans saw, averaged in "
-                         "voxels. Voxel (0, 0, 0) has the origin as its lowest corner; its "
-                         "distance is that of its middle.")
+  nb::class_<TsdfVolume>(
+      m, "TsdfVolume",
+      "Truncated signed distance field (Curless and Levoy 1996), block-sparse. The lowest corner "
+      "of voxel (0, 0, 0) is the origin; distances are those of voxel centres.")
       .def(nb::init<double, double, double>(), nb::arg("voxel"), nb::kw_only(),
            nb::arg("truncation_front"), nb::arg("truncation_back"),
-           "voxel: its edge in metres; truncation_front, truncation_back: metres in front of "
-           "surfaces and behind them "
-           "up to which distances count.")
+           "voxel: edge in metres; truncation_front, truncation_back: metres in front of and "
+           "behind surfaces up to which distances are integrated.")
       .def_prop_ro("voxel", &TsdfVolume::voxel)
       .def_prop_ro("truncation_front", &TsdfVolume::truncation_front)
       .def_prop_ro("truncation_back", &TsdfVolume::truncation_back)
       .def_prop_ro("memory_bytes", &TsdfVolume::memory_bytes)
       .def_prop_ro(
           "block_edge", [](const TsdfVolume&) { return TsdfVolume::kEdge; },
-          "Voxels along a block.")
+          "voxels along the edge of a block")
       .def("integrate", &integrate, nb::arg("points").noconvert(), nb::arg("origin").noconvert(),
            nb::arg("standoff").noconvert(), nb::arg("faces").noconvert(),
            nb::arg("weight").noconvert(), nb::arg("threads") = 1,
-           "Voxels on lines of sight through faces (m, 3) int32, by their weight (m,) float32. "
-           "points (n, 3) and origin (n, 3), where the sensor was at each, in metres; standoff "
-           "(n,) metres from there to the surface's tangent plane at the point. Faces that are "
-           "seen edge on, or whose standoff is not positive, tell nothing.")
-      .def("blocks", &blocks, "(B, 3) int64, in blocks: those that were met, in their order.")
+           "Integrates the voxels on lines of sight through faces (m, 3) int32 with weight (m,) "
+           "float32. points (n, 3) in metres; origin (n, 3): sensor position of each; standoff "
+           "(n,): distance in metres from it to the tangent plane of the surface at the point. "
+           "Faces seen edge-on or with a standoff <= 0 are skipped.")
+      .def("blocks", &blocks,
+           "(B, 3) int64: indices of the allocated blocks, in order of allocation.")
       .def("remove_blocks", &remove_blocks, nb::arg("blocks").noconvert(),
-           "Voxels of these blocks (B, 3) int64 are as if never met, and their memory is free.")
+           "Removes blocks (B, 3) int64 and frees their memory.")
       .def("dense", &dense, nb::arg("first_cell"), nb::arg("shape"),
-           "float32 arrays [z, y, x] over a box of voxels: metres in front of the surface, NaN "
-           "where nothing tells, and the sum of weights.");
+           "float32 arrays [z, y, x] over a box of voxels: signed distance in metres, positive in "
+           "front of the surface, NaN where unobserved; sum of weights.");
 }
 
 }  // namespace stillmap::bindings

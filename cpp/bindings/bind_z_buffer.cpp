@@ -34,14 +34,14 @@ Pinhole checked(const Matrix& K, const OnePose<3>& T_camera_map, int width, int 
   return {pose.R, pose.t, k[0], k[1], k[2], k[4], k[5], width, height, near};
 }
 
-auto render(const Places<3>& vertices, const Faces& faces, const Matrix& K,
+auto render(const Positions<3>& vertices, const Faces& faces, const Matrix& K,
             const OnePose<3>& T_camera_map, int width, int height, double near, int threads) {
   const size_t V = vertices.shape(0), F = faces.shape(0);
   for (size_t i = 0; i < 3 * V; ++i)
     require(std::abs(vertices.data()[i]) <= kFarthest, "vertices: not finite, or beyond 1e9 m");
   for (size_t i = 0; i < 3 * F; ++i) {
     const int32_t at = faces.data()[i];
-    require(at >= 0 && static_cast<size_t>(at) < V, "faces: a vertex that is not there");
+    require(at >= 0 && static_cast<size_t>(at) < V, "faces: vertex index out of range");
   }
   require(F < size_t{1} << 31, "faces: too many");
   const Pinhole camera = checked(K, T_camera_map, width, height, near);
@@ -61,10 +61,10 @@ void bind_z_buffer(nb::module_& m) {
   m.def("render_z_buffer", &render, nb::arg("vertices").noconvert(), nb::arg("faces").noconvert(),
         nb::arg("K").noconvert(), nb::arg("T_camera_map").noconvert(), nb::arg("width"),
         nb::arg("height"), nb::kw_only(), nb::arg("near"), nb::arg("threads") = 1,
-        "What an ideal pinhole camera sees of a mesh, vertices (V, 3) float64 and faces (F, 3) "
-        "int32: depth (height, width) float32, metres along its axis, inf where there is "
-        "nothing, and face (height, width) int32, -1 there. Pixel centres have whole numbers; "
-        "what is less than `near` metres ahead is not seen; faces have two sides.");
+        "Renders a mesh, vertices (V, 3) float64 and faces (F, 3) int32, with a pinhole camera: "
+        "depth (height, width) float32, metres along the optical axis, inf for background; face "
+        "(height, width) int32, -1 for background. Pixel centres have integer coordinates; faces "
+        "are two-sided and clipped `near` metres ahead of the camera.");
 }
 
 }  // namespace stillmap::bindings

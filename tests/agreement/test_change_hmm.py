@@ -22,7 +22,7 @@ def lanes(seed=3):
     for k in range(LOOKS):
         p = model.transition(SECONDS * (number[k] - number[k - 1]) if k else 0.0)
         state = np.array([rng.choice(3, p=p[s]) for s in state])
-        struck = (state != reference.change_hmm.NOTHING) & (rng.random(LANES) < 0.9)
+        struck = (state != reference.change_hmm.EMPTY) & (rng.random(LANES) < 0.9)
         seen[:, k] = np.where(struck, HIT, THROUGH)
     seen[rng.random(seen.shape) < 0.3] = NOT_SEEN
     seen[:, 0] = HIT  # each has a cell
@@ -124,7 +124,7 @@ def test_how_probable_it_is_does_not_depend_on_courses(both):
 def by_hand(pattern):
     """The course of a cell that is hit (H), seen through (T) or not seen (.) in each look."""
     looks = [(k, None if c == "H" else 1.0) for k, c in enumerate(pattern) if c != "."]
-    return reference.course(looks, SECONDS, reference.ChangeModel(60.0, 0.05, 2.0, 0.97))
+    return reference.summarise_changes(looks, SECONDS, reference.ChangeModel(60.0, 0.05, 2.0, 0.97))
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def by_hand(pattern):
 def test_courses_worked_by_hand(pattern, count, first, last):
     found = by_hand(pattern)
     assert found.count[0] == count
-    assert found.between[0] == (first, last)
+    assert found.change_bins[0] == (first, last)
 
 
 def test_how_long_it_was_occupied():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import reference
-from reference.likelihood_field import moved
+from reference.likelihood_field import retract
 
 from stillmap import _core
 
@@ -34,7 +34,7 @@ class World:
         D = self.beams.dimension
         rng = np.random.default_rng(self.seed)
         d[:D], d[-1] = translation * rng.uniform(-1, 1, D), rotation * rng.uniform(-1, 1)
-        return moved(self.T, d)
+        return retract(self.T, d)
 
     def core_found(self, T_prior, information, window, starts=1, iterations=0):
         return _core.register_scan(

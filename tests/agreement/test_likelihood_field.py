@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import reference
-from reference.likelihood_field import moved
+from reference.likelihood_field import retract
 
 from stillmap import _core
 
@@ -29,7 +29,7 @@ def test_cost(beams, grids, sigma, radius):
     costs = []
     for i in range(4):
         delta = np.random.default_rng(i).normal(scale=0.2, size=3 if beams.dimension == 2 else 6)
-        pose = moved(T, delta)
+        pose = retract(T, delta)
         options = sigma * beams.resolution, radius, FLOOR, UNKNOWN
         core, plain = (
             k.registration_cost(g, points, weights, pose, *options)
@@ -47,7 +47,7 @@ def test_field_is_the_cost_of_one_point(beams, grids):
         cost = _core.registration_cost(
             grids[0], y[None], np.ones(1, np.float32), np.eye(len(y) + 1), 0.2, 2, FLOOR, 0.0
         )
-        values.append(reference.field(grids[1], y.astype(float), 0.2, 2))
+        values.append(reference.smoothed_occupancy(grids[1], y.astype(float), 0.2, 2))
         assert np.exp(-cost) - FLOOR == pytest.approx(values[-1], rel=1e-5, abs=1e-6)
     assert max(values) > 0.05
 
@@ -56,7 +56,7 @@ def test_gradient(beams, grids):
     points, weights, T = scan(beams)
     for i in range(3):
         delta = np.random.default_rng(i).normal(scale=0.1, size=3 if beams.dimension == 2 else 6)
-        pose = moved(T, delta)
+        pose = retract(T, delta)
         options = 0.6 * beams.resolution, 3, FLOOR, UNKNOWN
         core, plain = (
             k.registration_gradient(g, points, weights, pose, *options)

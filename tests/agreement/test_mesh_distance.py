@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import reference
-from reference.mesh_distance import place_on
+from reference.mesh_distance import closest_point
 
 from stillmap import _core
 
@@ -75,7 +75,7 @@ def test_the_nearest_place_of_a_triangle_is_that_of_all_its_places():
     corners, points = rng.normal(size=(300, 3, 3)), 2.0 * rng.normal(size=(300, 3))
     corners[:20, 2] = corners[:20, 0] + 0.3 * (corners[:20, 1] - corners[:20, 0])  # slivers
     corners[20:25] = corners[20:25, :1]  # points
-    weight, square = place_on(points, corners)
+    weight, square = closest_point(points, corners)
     assert (weight >= 0.0).all()
     np.testing.assert_allclose(weight.sum(axis=1), 1.0, atol=1e-9)
     places = np.einsum("nk,nkd->nd", weight, corners)

@@ -7,12 +7,12 @@ from math import inf
 import numpy as np
 import pytest
 import reference
-from reference.occupancy_hmm import HIT, SURE
+from reference.observation import HIT, SURE
 
 from stillmap import _core
 from stillmap.em.observations import HmmClasses
 
-CLASSES = HmmClasses(views_occupied=(0.65,)).grid()
+CLASSES = HmmClasses(view_rho=(0.65,)).grid()
 
 
 @pytest.fixture(

@@ -76,8 +76,10 @@ def test_linearised(maps, level, slack):
     hessian, gradient, *sums = core
     assert hessian == pytest.approx(plain.hessian, rel=1e-6, abs=1e-6 * plain.hessian.max())
     assert gradient == pytest.approx(plain.gradient, rel=1e-6, abs=1e-5)
-    assert sums == pytest.approx([plain.cost, plain.met, plain.compared, plain.all], rel=1e-6)
-    assert 0.0 < plain.met <= plain.compared < plain.all
+    assert sums == pytest.approx(
+        [plain.cost, plain.inlier_weight, plain.matched_weight, plain.total_weight], rel=1e-6
+    )
+    assert 0.0 < plain.inlier_weight <= plain.matched_weight < plain.total_weight
 
 
 def test_gradient_is_that_of_the_cost(maps):

@@ -5,12 +5,13 @@ from math import inf, log
 
 import numpy as np
 import pytest
-from reference.occupancy_hmm import HIT, chain_log_likelihood
+from reference.observation import HIT
+from reference.occupancy_hmm import chain_log_likelihood
 
 from stillmap import _core
 from stillmap.em.observations import HmmClasses
 
-CLASSES = HmmClasses(views_occupied=(0.65,)).grid()
+CLASSES = HmmClasses(view_rho=(0.65,)).grid()
 
 
 def lane(seen, rho, tau, turn, detection, seconds=1.0, at=None):

@@ -4,7 +4,7 @@ from math import exp, log, pi, sqrt
 
 import numpy as np
 import pytest
-from reference.likelihood_field import moved
+from reference.likelihood_field import retract
 
 FLOOR, SIGMA = 0.01, 0.5
 
@@ -115,4 +115,4 @@ def test_small_motions_turn_about_the_sensor(delta, expected):
     T = np.eye(D + 1)
     T[:D, D] = (3, 4, 5)[:D]
     arm = np.eye(D + 1)[0] + np.eye(D + 1)[D]
-    assert (moved(T, np.array(delta, float)) @ arm)[:D] == pytest.approx(expected)
+    assert (retract(T, np.array(delta, float)) @ arm)[:D] == pytest.approx(expected)

@@ -1,17 +1,16 @@
-"""Every kernel of stillmap._core once more in plain NumPy, slowly, for 2 or 3 dimensions.
+"""NumPy twins of the kernels of stillmap._core, in 2D and 3D.
 
-This is the oracle of the tests: same names and arguments as `stillmap._core`, written straight
-from the equations of the paper, or of the chains in time that the default estimator fits, and
-without a thought for speed. Where beams are taken:
+They have the names and arguments of `stillmap._core`, follow the equations literally and make no
+attempt at speed; tests/agreement compares the two. Arguments that describe beams:
 
-- `points` (M, D) float32 are end points in the sensor frame, metres; a beam whose point is not
-  finite is unusable and takes part in nothing;
+- `points` (M, D) float32 are end points in the sensor frame, metres; beams with NaN points are
+  unusable and skipped;
 - `hit` (M,) bool is False for maximum-range beams (zeta = 1), whose point is the free range;
 - scan t owns the beams `offset[t]:offset[t + 1]`, and `T_map_sensor[t]` (D+1, D+1) is its pose.
 """
 
 from reference.beam_counting import add_beams, add_end_points, e_step, log_likelihood
-from reference.change_hmm import ChangeModel, Course, course
+from reference.change_hmm import ChangeModel, ChangeSummary, summarise_changes
 from reference.cluster_pooling import ClusterPooling3D, relabel_ground_contact
 from reference.correlative_search import Lattice, search_lattice
 from reference.em import EmStep, em_fixed_poses, m_step_map
@@ -23,10 +22,10 @@ from reference.held_out_likelihood import (
     score_held_out,
 )
 from reference.likelihood_field import (
-    field,
     registration_cost,
     registration_curvature,
     registration_gradient,
+    smoothed_occupancy,
 )
 from reference.mean_field import smooth_mean_field
 from reference.mesh_distance import MeshDistance
@@ -38,9 +37,10 @@ from reference.ndt_map import (
     voxel_downsample,
 )
 from reference.no_return_beams import add_no_return_beams
+from reference.observation import MeasurementModel, observe
 from reference.observation_counts import ObservationCounts, ObservationCounts2D, ObservationCounts3D
 from reference.occupancy_grid import OccupancyGrid, OccupancyGrid2D, OccupancyGrid3D, occupancy
-from reference.occupancy_hmm import OccupancyHmm, OccupancyHmm2D, OccupancyHmm3D, Reading, look_at
+from reference.occupancy_hmm import OccupancyHmm, OccupancyHmm2D, OccupancyHmm3D
 from reference.ray_traversal import cell_of, traverse
 from reference.surfel_map import SurfelMap, SurfelMap2D, SurfelMap3D
 from reference.texel_raster import rasterise_texels
@@ -49,10 +49,11 @@ from reference.z_buffer import render_z_buffer
 
 __all__ = [
     "ChangeModel",
+    "ChangeSummary",
     "ClusterPooling3D",
-    "Course",
     "EmStep",
     "Lattice",
+    "MeasurementModel",
     "MeshDistance",
     "NdtMap3D",
     "ObservationCounts",
@@ -64,7 +65,6 @@ __all__ = [
     "OccupancyHmm",
     "OccupancyHmm2D",
     "OccupancyHmm3D",
-    "Reading",
     "StaticFractionGrid",
     "StaticFractionGrid2D",
     "StaticFractionGrid3D",
@@ -76,15 +76,13 @@ __all__ = [
     "add_end_points",
     "add_no_return_beams",
     "cell_of",
-    "course",
     "e_step",
     "em_fixed_poses",
-    "field",
     "interpolate_end_points",
     "linearise_sweep",
     "log_likelihood",
-    "look_at",
     "m_step_map",
+    "observe",
     "occupancy",
     "rasterise_texels",
     "register_sweep",
@@ -96,6 +94,8 @@ __all__ = [
     "score_held_out",
     "search_lattice",
     "smooth_mean_field",
+    "smoothed_occupancy",
+    "summarise_changes",
     "transform_by_twist",
     "traverse",
     "voxel_downsample",

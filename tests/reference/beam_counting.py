@@ -80,7 +80,7 @@ def add_beams(
     e: ArrayLike,
     offset: ArrayLike,
     T_map_sensor: ArrayLike,
-    threads: int = 1,  # noqa: ARG001  the core's signature
+    threads: int = 1,  # noqa: ARG001  signature of the kernel
 ) -> None:
     """Add the sums alpha_j and beta_j below (10) of these beams to `grid`.
 
@@ -113,7 +113,7 @@ def add_end_points(
     *,
     remove: bool = False,
 ) -> None:
-    """Add, or take out, what of the sums of `add_beams` depends on e: those of the end cells.
+    """Add or remove the sums of the end cells, the part of `add_beams` that depends on e.
 
     Args: see `add_beams`.
     """
@@ -134,13 +134,13 @@ def e_step(
     offset: ArrayLike,
     T_map_sensor: ArrayLike,
     prior: float,
-    threads: int = 1,  # noqa: ARG001  the core's signature
+    threads: int = 1,  # noqa: ARG001  signature of the kernel
 ) -> NDArray[np.float32]:
     """Equations (6), (8): (M,) the expectation e of c for each beam, given the map.
 
-    p m / (p m + (1 - p)(1 - m)) with m of the end cell. The prior p stays where the map says
-    nothing: maximum-range beams, hits in a cell that nobody looked at, and 0 / 0 (p = 1 at
-    m = 0, p = 0 at m = 1). Unusable beams are NaN.
+    p m / (p m + (1 - p)(1 - m)) with m of the end cell. The prior p is kept for maximum-range
+    beams, hits in an unobserved cell, and 0 / 0 (p = 1 at m = 0, p = 0 at m = 1). Unusable beams
+    are NaN.
     """
     p = _checked_prior(prior)
     e = np.full(len(np.asarray(points)), np.nan)
@@ -159,18 +159,18 @@ def log_likelihood(
     offset: ArrayLike,
     T_map_sensor: ArrayLike,
     prior: float,
-    threads: int = 1,  # noqa: ARG001  the core's signature
+    threads: int = 1,  # noqa: ARG001  signature of the kernel
 ) -> Float:
     """The terms of the expected log likelihood (5) per scan, in nats.
 
-    Inside logarithms m and 1 - m are floored at 1e-12, so that a beam which the map excludes
-    costs much but not infinitely much. 0 ln 0 = 0. Unknown cells say nothing.
+    Inside logarithms m and 1 - m are floored at 1e-12, so that the cost of a beam that contradicts
+    the map is finite. 0 ln 0 = 0. Unobserved cells contribute nothing.
 
     Returns:
         (T, 4): [0] end points, sum of (1 - zeta)(e ln m + (1 - e) ln(1 - m)); [1] cells before
         the end cell, sum of l_j ln(1 - m_j); [2] gamma of (7), sum of e ln p + (1 - e) ln(1 - p);
         [3] entropy of e. With e in {0, 1}, [0] + [1] + [2] is (4); [0] + ... + [3] is the bound
-        that EM raises.
+        that EM increases.
     """
     p = _checked_prior(prior)
     expectation = per_beam(e, points)

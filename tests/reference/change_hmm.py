@@ -1,4 +1,4 @@
-"""Things that are put somewhere or taken away while others pass: a chain of three states."""
+"""Change HMM: a three-state Markov chain (object, empty, passer-by) per cell."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,21 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
-Between = tuple[int, int]
+Bins = tuple[int, int]
 
-THING, NOTHING, SOMEBODY = range(3)
-NEVER = (-1, -1)
+OBJECT, EMPTY, PASSER_BY = range(3)
+NO_CHANGE = (-1, -1)
 
 
 @dataclass(frozen=True)
 class ChangeModel:
-    """How things and passers-by come and leave.
+    """Transition and observation model of objects and passers-by.
 
     Attributes:
-        tau: seconds, things are there or not with correlation exp(-dt / tau), half of the time.
-        passer_by_rho: share of the time in which somebody passes where no thing stands.
-        passer_by_tau: seconds, correlation of that.
-        p_detection: probability that a sure look at an occupied cell sees that it is.
+        tau: seconds; presence of objects has correlation exp(-dt / tau) and probability 1/2.
+        passer_by_rho: stationary probability of a passer-by where there is no object.
+        passer_by_tau: seconds, correlation time of passers-by.
+        p_detection: probability that a reliable observation of an occupied cell is a hit.
     """
 
     tau: float
@@ -33,25 +33,25 @@ class ChangeModel:
 
     @property
     def prior(self) -> Float:
-        """(3,) before the first look."""
+        """(3,) stationary distribution."""
         rho = self.passer_by_rho
         return np.array([0.5, 0.5 * (1.0 - rho), 0.5 * rho])
 
     def transition(self, dt: float) -> Float:
-        """(3, 3) from, to. A thing leaves the cell as it would be without it."""
+        """(3, 3) from, to. Where an object leaves, passers-by are stationary."""
         rho = self.passer_by_rho
         stays = 0.5 + 0.5 * exp(-dt / self.tau)
         kept = exp(-dt / self.passer_by_tau)
-        nobody, somebody = np.array([1.0 - rho, rho]), np.eye(2)
-        passing = kept * somebody + (1.0 - kept) * np.stack([nobody, nobody])
+        stationary = np.array([1.0 - rho, rho])
+        passing = kept * np.eye(2) + (1.0 - kept) * np.stack([stationary, stationary])
         p = np.empty((3, 3))
-        p[THING] = [stays, *((1.0 - stays) * nobody)]
-        p[1:, THING] = 1.0 - stays
+        p[OBJECT] = [stays, *((1.0 - stays) * stationary)]
+        p[1:, OBJECT] = 1.0 - stays
         p[1:, 1:] = stays * passing
         return p
 
-    def seen(self, reliability: float | None) -> Float:
-        """(3,) probability of a hit (None), or of seeing through with a reliability."""
+    def likelihood(self, reliability: float | None) -> Float:
+        """(3,) likelihood of a hit (None), or of a miss of some reliability."""
         if reliability is None:
             return np.array([self.p_detection, 0.0, self.p_detection])
         missed = 1.0 - self.p_detection * reliability
@@ -59,69 +59,72 @@ class ChangeModel:
 
 
 @dataclass(frozen=True)
-class Course:
-    """What is asked of a cell; pairs are of things alone, and of anything that was there.
+class ChangeSummary:
+    """Changes of a cell; pairs hold values for objects alone, and for anything present.
 
     Attributes:
-        log_likelihood: of everything else that was seen, given one hit.
-        occupied_share: share of the time from first to last look in which it was not empty, by the
-            most probable course; a change counts as half way between two looks.
-        p_last: probability of it at the last look.
-        count: how often it came or left, by that course.
-        between: looks before and after the first and the last time, or NEVER.
+        log_likelihood: of the observations, given one hit.
+        occupied_share: fraction of the time from first to last observation in which the Viterbi
+            path is not empty; changes count at half the time between two observations.
+        p_last: probability of presence at the last observation.
+        count: number of changes on the Viterbi path.
+        change_bins: time bins before and after the first and the last change, or NO_CHANGE.
     """
 
     log_likelihood: float
     occupied_share: float
     p_last: tuple[float, float]
     count: tuple[int, int]
-    between: tuple[tuple[Between, Between], tuple[Between, Between]]
+    change_bins: tuple[tuple[Bins, Bins], tuple[Bins, Bins]]
 
 
-def course(looks: Sequence[tuple[int, float | None]], seconds: float, model: ChangeModel) -> Course:
-    """The forward algorithm and the most probable path, over all looks at once.
+def summarise_changes(
+    observations: Sequence[tuple[int, float | None]], seconds: float, model: ChangeModel
+) -> ChangeSummary:
+    """Forward algorithm and Viterbi path over all observations.
 
     Args:
-        looks: number, rising, and reliability of each look; None for a hit.
-        seconds: between successive looks.
+        observations: time bin, ascending, and reliability of each; None for a hit.
+        seconds: width of a time bin.
         model: see ChangeModel.
     """
     with np.errstate(divide="ignore"):
         weight, best = model.prior, np.log(model.prior)
-        total, before, came_from = 0.0, looks[0][0] if looks else 0, []
-        for number, reliability in looks:
-            p, seen = model.transition((number - before) * seconds), model.seen(reliability)
-            weight = (weight @ p) * seen
+        total, before, came_from = 0.0, observations[0][0] if observations else 0, []
+        for number, reliability in observations:
+            p = model.transition((number - before) * seconds)
+            likelihood = model.likelihood(reliability)
+            weight = (weight @ p) * likelihood
             total += log(weight.sum())
             weight = weight / weight.sum()
             to = best[:, None] + np.log(p)
             came_from.append(to.argmax(axis=0))
-            best = to.max(axis=0) + np.log(seen)
+            best = to.max(axis=0) + np.log(likelihood)
             before = number
     path = [int(best.argmax())]
     for back in reversed(came_from):
         path.append(int(back[path[-1]]))
-    states, numbers = path[::-1][1:], [number for number, _ in looks]
+    states, numbers = path[::-1][1:], [number for number, _ in observations]
     hit = (0.5 + 0.5 * model.passer_by_rho) * model.p_detection
-    of_things = _turns([state == THING for state in states], numbers)
-    of_any = _turns([state != NOTHING for state in states], numbers)
-    return Course(
+    of_objects = _changes([state == OBJECT for state in states], numbers)
+    of_any = _changes([state != EMPTY for state in states], numbers)
+    return ChangeSummary(
         log_likelihood=total - log(hit),
-        occupied_share=_share([state != NOTHING for state in (states or path)], numbers),
-        p_last=(float(weight[THING]), float(1.0 - weight[NOTHING])),
-        count=(len(of_things), len(of_any)),
-        between=(_ends(of_things), _ends(of_any)),
+        occupied_share=_share([state != EMPTY for state in (states or path)], numbers),
+        p_last=(float(weight[OBJECT]), float(1.0 - weight[EMPTY])),
+        count=(len(of_objects), len(of_any)),
+        change_bins=(_ends(of_objects), _ends(of_any)),
     )
 
 
-def _turns(there: Sequence[bool], numbers: Sequence[int]) -> list[Between]:
+def _changes(there: Sequence[bool], numbers: Sequence[int]) -> list[Bins]:
     return [
         (numbers[k - 1], numbers[k]) for k in range(1, len(numbers)) if there[k] != there[k - 1]
     ]
 
 
-def _ends(turns: list[Between]) -> tuple[Between, Between]:
-    return (turns[0], turns[-1]) if turns else (NEVER, NEVER)
+def _ends(turns: list[Bins]) -> tuple[Bins, Bins]:
+    return (turns[0], turns[-1]) if turns else (NO_CHANGE, NO_CHANGE)
 
 
 def _share(there: Sequence[bool], numbers: Sequence[int]) -> float:

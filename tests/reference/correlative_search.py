@@ -7,7 +7,7 @@ from math import ceil, log
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reference.likelihood_field import moved
+from reference.likelihood_field import retract
 from reference.occupancy_grid import OccupancyGrid
 from reference.ray_traversal import cell_of
 
@@ -22,7 +22,7 @@ class Raster:
     """ln((floor + F) / floor) in whole steps, F being the largest contribution of a single cell.
 
     Attributes:
-        first: (D,) pixel of the lowest corner; beyond the box there is nothing.
+        first: (D,) pixel of the lowest corner; zero outside the box.
         values: in steps, indexed [x, y(, z)].
         unit: nats of a step.
     """
@@ -69,10 +69,10 @@ def raster(grid: OccupancyGrid, cells: int, sigma: float, floor: float) -> Raste
 
 @dataclass(frozen=True)
 class Lattice:
-    """How well a scan fits at the poses of a lattice.
+    """Scores of a scan on a lattice of poses.
 
     Attributes:
-        T_prior: (D+1, D+1) the pose in its middle.
+        T_prior: (D+1, D+1) pose of the centre.
         step: metres between poses along each axis.
         angle_step: radians between headings.
         scores: nats, more is better; indexed [heading, x, y(, z)].
@@ -138,14 +138,14 @@ def search_lattice(
     angle_step = min(step / max(far, step), 0.035)
     S, A = ceil(window_translation / step), ceil(window_rotation / angle_step)
     shifts = np.array(list(product(range(-S, S + 1), repeat=D)))
-    looked_at, scores = raster(grid, cells, sigma, floor), []
+    field, scores = raster(grid, cells, sigma, floor), []
     for a in range(-A, A + 1):
         d = np.zeros((len(shifts), len(Lambda)))
         d[:, :D], d[:, -1] = shifts * step, a * angle_step
-        turned = moved(T, np.array([0.0] * (len(Lambda) - 1) + [a * angle_step]))
+        turned = retract(T, np.array([0.0] * (len(Lambda) - 1) + [a * angle_step]))
         pixels = cell_of(p @ turned[:D, :D].T + turned[:D, D], step)
-        fit = np.array([looked_at.at(pixels + shift) @ w for shift in shifts])
+        fit = np.array([field.at(pixels + shift) @ w for shift in shifts])
         penalty = 0.5 * np.einsum("ni,ij,nj->n", d, Lambda, d)
-        scores.append(information_scale * looked_at.unit * fit - penalty)
+        scores.append(information_scale * field.unit * fit - penalty)
     shape = (2 * A + 1, *[2 * S + 1] * D)
     return Lattice(T, step, angle_step, np.array(scores).reshape(shape))

@@ -1,4 +1,4 @@
-"""End points between those of neighbouring beams that met one flat surface."""
+"""Interpolation of end points between neighbouring beams on one flat surface."""
 
 from collections.abc import Iterator
 from math import ceil
@@ -25,23 +25,22 @@ def interpolate_end_points(
     tolerance: float,
     max_gap_ratio: float,
 ) -> None:
-    """Add end points between those of neighbouring beams, where a surface goes straight on.
+    """Interpolate end points between neighbouring beams on one flat surface.
 
-    Two neighbouring hits of one scan are on one surface when the next one, before or behind them,
-    leads straight from one to the other. Between them end points are added, as few as leave no
-    two more than a cell apart, each with the smaller e of the two. Nothing passes through cells
-    for them.
+    Two neighbouring hits of one scan are on one surface if they are collinear with the hit before
+    or after them. The fewest end points that leave no gap of more than a cell are added between
+    them, with the smaller e of the two. They add nothing to crossed cells.
 
     Args:
         grid: changed in place.
         points: (M, D) metres, sensor frame.
         hit: (M,) bool.
-        e: (M,) expectation of c, looked at where something is added.
+        e: (M,) expectation of c, used where end points are added.
         offset: (T+1,).
         T_map_sensor: (T, D+1, D+1).
-        max_gap: metres between two neighbours at most.
-        tolerance: metres by which the third one may be off their line.
-        max_gap_ratio: the gap may be that many times as wide as that to the third one.
+        max_gap: metres, largest distance of two neighbours.
+        tolerance: metres, largest distance of the third hit from their line.
+        max_gap_ratio: largest ratio of the gap to that next to it.
     """
     for name, value in (
         ("max_gap", max_gap),
@@ -53,7 +52,7 @@ def interpolate_end_points(
     expectation = per_beam(e, points)
     hits = [b for b in usable_beams(grid.dimension, points, hit, offset, T_map_sensor) if b.hit]
     for a, b, others in _neighbours(hits):
-        if any(_goes_on(a, b, other, max_gap, tolerance, max_gap_ratio) for other in others):
+        if any(_is_collinear(a, b, other, max_gap, tolerance, max_gap_ratio) for other in others):
             both = expectation[[a.number, b.number]]
             if not ((both >= 0) & (both <= 1)).all():
                 raise ValueError(f"e: expected probabilities in [0, 1], got {both}")
@@ -65,7 +64,7 @@ def interpolate_end_points(
 
 
 def _neighbours(hits: list[Beam]) -> Iterator[tuple[Beam, Beam, list[Beam]]]:
-    """Hits side by side in one scan, and the ones before and behind them that are hits as well."""
+    """Pairs of adjacent hits in one scan, and the hits before and after them."""
     numbered = {(beam.scan, beam.number): beam for beam in hits}
     for (scan, n), a in numbered.items():
         b = numbered.get((scan, n + 1))
@@ -74,10 +73,10 @@ def _neighbours(hits: list[Beam]) -> Iterator[tuple[Beam, Beam, list[Beam]]]:
             yield a, b, [other for other in around if other is not None]
 
 
-def _goes_on(
+def _is_collinear(
     a: Beam, b: Beam, other: Beam, max_gap: float, tolerance: float, max_gap_ratio: float
 ) -> bool:
-    """Whether the surface goes straight on from `other` to the nearer of a, b and the farther."""
+    """Whether `other`, the nearer of a and b, and the farther one are collinear."""
     near, far = (a, b) if other.number < a.number else (b, a)
     before, step = near.end - other.end, far.end - near.end
     wide = float(np.linalg.norm(step))

@@ -14,7 +14,7 @@ Float = NDArray[np.float64]
 
 
 class StaticFractionGrid:
-    """Mean e of the beams that ended in each cell; rates at which beams end.
+    """Mean e of the returns in each cell, and the rates at which beams end.
 
     Args:
         resolution: edge of a cell, metres.
@@ -31,13 +31,13 @@ class StaticFractionGrid:
 
     @property
     def end_rate(self) -> float:
-        """Ends of beams per metre, one end at one metre added."""
+        """Beam ends per metre, with one end in one metre added."""
         hits = sum(self.cells.alpha.values()) + sum(self.cells.beta.values())
         return (hits + 1.0) / (self.length + 1.0)
 
     @property
     def dynamic_rate(self) -> float:
-        """Ends at what moves, per metre, one end at one metre added."""
+        """Beam ends on moving objects per metre, with one end in one metre added."""
         return (sum(self.cells.beta.values()) + 1.0) / (self.length + 1.0)
 
     def share(self, cell: Cell) -> float:
@@ -54,10 +54,10 @@ class StaticFractionGrid:
         T_map_sensor: ArrayLike,
         is_held_out: ArrayLike,
     ) -> None:
-        """Add the beams of the scans that are not held (T,)."""
-        expectation, left_out = np.asarray(e, float), np.asarray(is_held_out, bool)
+        """Add the beams of the scans that are not held out (T,)."""
+        expectation, held_out = np.asarray(e, float), np.asarray(is_held_out, bool)
         for beam in usable_beams(self.cells.dimension, points, hit, offset, T_map_sensor):
-            if left_out[beam.scan]:
+            if held_out[beam.scan]:
                 continue
             self.length += float(np.linalg.norm(beam.end - beam.start))
             if beam.hit:
@@ -83,22 +83,22 @@ def score_held_out(
     late_share: float,
     mean_delay: float,
     outlier_share: float,
-    threads: int = 1,  # noqa: ARG001  the core's signature
+    threads: int = 1,  # noqa: ARG001  signature of the kernel
 ) -> Float:
-    """Sums per scan of ln p(z) - ln q(z) over its beams, and how many they are.
+    """Sums per scan of ln p(z) - ln q(z) over its beams, and number of beams.
 
     Args:
-        fractions: of the scans that are not held.
+        fractions: of the scans that are not held out.
         points: (M, D) metres, sensor frame.
         hit: (M,) bool.
         offset: (T+1,).
         T_map_sensor: (T, D+1, D+1).
         is_held_out: (T,) bool; the others' sums are zero.
-        stopping_rate: per metre, what is surely static.
+        stopping_rate: ends per metre in static cells.
         range_std: metres, standard deviation of measured ranges.
-        late_share: share of beams that end behind what they met.
-        mean_delay: metres behind it, on average.
-        outlier_share: share of p that is q.
+        late_share: share of beams that end behind the surface.
+        mean_delay: metres behind the surface, on average.
+        outlier_share: share of q in p.
         threads: not used here.
 
     Returns:
@@ -126,7 +126,7 @@ def _log_density(
     late_share: float,
     mean_delay: float,
 ) -> float:
-    """ln of the density of a hit at z, or of the probability that nothing stops the beam."""
+    """Log density of a return at z, or log probability of no return."""
     behind = beam.end + (beam.end - beam.start) * (5.0 * range_std / z if beam.hit else 0.0)
     cells, lengths = traverse(beam.start, behind, fractions.resolution)
     moves = fractions.dynamic_rate
@@ -136,7 +136,7 @@ def _log_density(
             continue
         still = stopping_rate * fractions.share(tuple(cell.tolist()))
         stops = exp(-hazard) * (1.0 - exp(-(still + moves) * length)) * still / (still + moves)
-        # where in the cell it stops is as good as evenly spread
+        # uniform within the cell
         noisy = _normal((r + length - z) / range_std) - _normal((r - z) / range_std)
         delayed = _exponential((z - r) / mean_delay) - _exponential((z - r - length) / mean_delay)
         density += stops / length * ((1.0 - late_share) * noisy + late_share * delayed)

@@ -1,4 +1,4 @@
-"""The smoothed field that registration climbs: stillmap's practical form of (9)."""
+"""Likelihood field of scan registration: the practical form of (9)."""
 
 from itertools import product
 from math import erf, exp, isnan, log, pi, sqrt
@@ -12,14 +12,14 @@ from reference.ray_traversal import cell_of
 Float = NDArray[np.float64]
 
 
-def field(grid: OccupancyGrid, y: ArrayLike, sigma: float, radius: int) -> float:
-    """F(y): occupancy around a point, smoothed; about 1 on a straight, fully occupied wall.
+def smoothed_occupancy(grid: OccupancyGrid, y: ArrayLike, sigma: float, radius: int) -> float:
+    """F(y): smoothed occupancy at a point, about 1 on a straight, fully occupied wall.
 
     The sum over cells k within `radius` cells of that of y (largest coordinate difference) of
     m_k exp(-|y - mu_k|^2 / (2 sigma^2)), with mu_k the mean of the end points in cell k weighted
-    with e, divided by (sqrt(2 pi) sigma / resolution)^(D-1). In a cell that nobody looked at, when
-    those means lie on a line or plane, this surface is taken to go on: the mean of the m_k, times
-    exp(-d^2 / (2 sigma^2)) at a distance d from it.
+    with e, divided by (sqrt(2 pi) sigma / resolution)^(D-1). In unobserved cells whose
+    neighbouring means lie on a line or plane, the surface is extrapolated: the mean of the m_k
+    times exp(-d^2 / (2 sigma^2)) at a distance d from it.
 
     Args:
         grid: the map.
@@ -42,7 +42,7 @@ def field(grid: OccupancyGrid, y: ArrayLike, sigma: float, radius: int) -> float
 
 
 def _around(grid: OccupancyGrid, centre: NDArray[np.int64], radius: int) -> tuple[Float, Float]:
-    """Means (K, D) of the end points in the cells around, and their occupancies (K,)."""
+    """Means (K, D) of the end points in the neighbouring cells, and their occupancies (K,)."""
     means, m = [], []
     for step in product(range(-radius, radius + 1), repeat=grid.dimension):
         cell = tuple((centre + step).tolist())
@@ -54,7 +54,7 @@ def _around(grid: OccupancyGrid, centre: NDArray[np.int64], radius: int) -> tupl
 
 
 def _plane(means: Float, m: Float) -> tuple[Float, Float, bool]:
-    """A point (D,) and the normal (D,) of the plane through weighted points, and if it is one."""
+    """Centroid (D,) and normal (D,) of weighted points, and whether they are planar."""
     weights = m / m.sum()
     mean = weights @ means
     apart = means - mean
@@ -77,7 +77,7 @@ def registration_cost(
 ) -> float:
     """- sum of w_n ln(floor + unknown U(T p_n) + F(T p_n)) over the points that are finite.
 
-    U is 1 in cells that nobody looked at, 0 elsewhere: unknown is not free.
+    U is 1 in unobserved cells, 0 elsewhere.
 
     Args:
         grid: the map.
@@ -87,14 +87,16 @@ def registration_cost(
         sigma: metres.
         radius: cells.
         floor: value of an end point in free space, where a wall has 1.
-        unknown: what is added to it where nobody looked.
+        unknown: added to floor in unobserved cells.
     """
     pose, D = np.asarray(T, float), grid.dimension
     cost = 0.0
     for p, w in zip(np.asarray(points, float), np.asarray(weights, float), strict=True):
         if np.isfinite(p).all():
             y = pose[:D, :D] @ p + pose[:D, D]
-            cost -= w * log(_base(grid, y, floor, unknown) + field(grid, y, sigma, radius))
+            cost -= w * log(
+                _base(grid, y, floor, unknown) + smoothed_occupancy(grid, y, sigma, radius)
+            )
     return float(cost)
 
 
@@ -126,7 +128,9 @@ def registration_gradient(
         delta = np.zeros(3 if grid.dimension == 2 else 6)
         delta[i] = step
         above, below = (
-            registration_cost(grid, points, weights, moved(pose, d), sigma, radius, floor, unknown)
+            registration_cost(
+                grid, points, weights, retract(pose, d), sigma, radius, floor, unknown
+            )
             for d in (delta, -delta)
         )
         gradient.append((above - below) / (2 * step))
@@ -143,10 +147,10 @@ def registration_curvature(
     floor: float,
     unknown: float,
 ) -> Float:
-    """What the Newton steps take for the second derivative of `registration_cost`.
+    """Approximate Hessian of `registration_cost` used by the Newton steps.
 
-    The sum of w_n s_n J_n^T A_n J_n: s = F / (base + F) is the share of a beam that the map
-    explains, J the derivative of T p_n by the pose, and A the curvature of -ln F, see
+    The sum of w_n s_n J_n^T A_n J_n: s = F / (base + F) is the inlier probability of a
+    beam, J the derivative of T p_n by the pose, and A the curvature of -ln F, see
     `_curvature`.
 
     Returns:
@@ -157,7 +161,7 @@ def registration_curvature(
     for p, w in zip(np.asarray(points, float), np.asarray(weights, float), strict=True):
         if np.isfinite(p).all():
             y = pose[:D, :D] @ p + pose[:D, D]
-            F = field(grid, y, sigma, radius)
+            F = smoothed_occupancy(grid, y, sigma, radius)
             arm = y - pose[:D, D]
             turning = [[-arm[1]], [arm[0]]] if D == 2 else np.cross(np.eye(3), arm).T
             J = np.hstack([np.eye(D), turning])
@@ -171,8 +175,8 @@ def _curvature(grid: OccupancyGrid, y: Float, sigma: float, radius: int) -> Floa
     """(D, D) sigma^-2 I - sigma^-4 C / v without its negative part.
 
     C is the spread of the means mu_k around y, each weighted with its part of F, and v the
-    variance that is left to a Gaussian of variance 1 cut off where the sum ends. Where a surface
-    is taken to go on, sigma^-2 across it and nothing along it.
+    variance that is left to a Gaussian of variance 1 cut off where the sum ends. Where a
+    surface is extrapolated, sigma^-2 across it and nothing along it.
     """
     centre = cell_of(y, grid.resolution)
     means, m = _around(grid, centre, radius)
@@ -190,7 +194,7 @@ def _curvature(grid: OccupancyGrid, y: Float, sigma: float, radius: int) -> Floa
     return kept
 
 
-def moved(T: Float, delta: Float) -> Float:
+def retract(T: Float, delta: Float) -> Float:
     """T_map_sensor shifted by delta[:D] and turned by delta[D:] about its own position."""
     D = len(T) - 1
     axis = np.array([0.0, 0.0, delta[2]]) if D == 2 else delta[3:]

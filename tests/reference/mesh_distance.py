@@ -1,4 +1,4 @@
-"""The place of a mesh nearest to a point: every face is tried."""
+"""Closest point on a mesh by brute force over all faces."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,17 +6,17 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 
-_SLIVER = 1e-12  # squared sine of the angle of a triangle without area
+_SLIVER = 1e-12  # squared sine of the angle of a degenerate triangle
 _LEAST = 1e-300
 
 
 class MeshDistance:
-    """The faces of a mesh, to be asked which of them is the nearest to a point.
+    """Closest-face queries against a triangle mesh.
 
     Args:
         vertices: (V, 3) metres.
-        faces: (F, 3) counter-clockwise from where they are seen.
-        max_distance: metres to a face, beyond which it is not near.
+        faces: (F, 3) counter-clockwise seen from the front.
+        max_distance: search radius, metres.
     """
 
     def __init__(self, vertices: Float, faces: Int32, *, max_distance: float) -> None:
@@ -26,37 +26,37 @@ class MeshDistance:
         return len(self._corners)
 
     def closest_faces(self, points: Float, origins: Float) -> tuple[Int32, Float]:
-        """Faces (n,), -1: none is less than the max_distance away; weights (n, 3) of their corners.
+        """Closest faces (n,), -1: none within max_distance; barycentric coordinates (n, 3).
 
-        Faces without area do not count, nor those that have their back to `origins` (n, 3); of
-        several at one distance the lowest number does.
+        Degenerate faces and faces seen from behind from `origins` (n, 3) are skipped; ties go to
+        the lowest index.
         """
         n = len(points)
         face, weight = np.full(n, -1, np.int32), np.zeros((n, 3))
         least = np.full(n, self.max_distance * self.max_distance)
         for number, corners in enumerate(self._corners):
             towards = _dot((origins - points).T, _normal(*corners)) > 0.0
-            here, square = place_on(points, np.broadcast_to(corners, (n, 3, 3)))
+            here, square = closest_point(points, np.broadcast_to(corners, (n, 3, 3)))
             better = towards & (square < least)
             face[better], weight[better], least[better] = number, here[better], square[better]
         return face, weight
 
 
-def place_on(points: Float, corners: Float) -> tuple[Float, Float]:
-    """The place of a triangle (n, 3, 3) of its own that is nearest to each point (n, 3).
+def closest_point(points: Float, corners: Float) -> tuple[Float, Float]:
+    """Closest point of each triangle (n, 3, 3) to each point (n, 3).
 
-    It is a + j (b - a) + k (c - a), where the plane's place nearest to the point is within the
-    triangle; or else the nearest of those on the edges.
+    It is the projection a + j (b - a) + k (c - a) onto the plane if that is inside the triangle,
+    else the closest point on the edges.
 
     Returns:
-        (n, 3) weights of the corners, none below zero; (n,) square metres to there.
+        (n, 3) barycentric coordinates, none negative; (n,) squared distances, m^2.
     """
     a, b, c = (corners[:, k].T for k in range(3))
     p = points.T
     u, v, w = b - a, c - a, p - a
     uu, uv, vv, wu, wv = _dot(u, u), _dot(u, v), _dot(v, v), _dot(w, u), _dot(w, v)
     square = uu * vv - uv * uv
-    flat = square <= _SLIVER * uu * vv  # no more than a line, or a point
+    flat = square <= _SLIVER * uu * vv  # degenerate
     square = np.where(flat, 1.0, square)
     j, k = (vv * wu - uv * wv) / square, (uu * wv - uv * wu) / square
     inside = (j >= 0.0) & (k >= 0.0) & (j + k <= 1.0) & ~flat

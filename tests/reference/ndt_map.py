@@ -1,4 +1,4 @@
-"""Sweeps against the moments of those before them, in plain NumPy; see docs/registration3d.md."""
+"""NDT map and point-to-plane registration of sweeps; see docs/registration3d.md."""
 
 import itertools
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ Float = NDArray[np.float64]
 
 
 class NdtMap3D:
-    """Weight, sum and sum of products of end points per cell and level, about its centre."""
+    """Weight, first and second moments of end points per voxel and level, about its centre."""
 
     def __init__(self, edge: float, levels: int, max_weight: float) -> None:
         self.edges = [edge * 2.0**level for level in range(levels)]
@@ -45,7 +45,7 @@ class NdtMap3D:
     def plane(
         self, place: Float, level: int, min_weight: float, max_flatness: float, min_extent: float
     ) -> tuple[Float, float, float] | None:
-        """Normal, offset along it and variance across it; None where there is no surface."""
+        """Normal, offset along it and variance across; None where there is no plane."""
         x = place / self.edges[level]
         low = np.floor(x - 0.5)
         within = x - 0.5 - low
@@ -72,7 +72,7 @@ class NdtMap3D:
 
 
 def voxel_downsample(points: Float, weights: Float, voxel_size: float) -> NDArray[np.int64]:
-    """Indices of the first usable points with a weight in each cell."""
+    """Indices of the first usable point of positive weight in each voxel."""
     usable = np.flatnonzero(np.isfinite(points).all(axis=1) & (weights > 0.0))
     cells = np.floor(points[usable].astype(float) / voxel_size)
     first = np.unique(cells, axis=0, return_index=True)[1]
@@ -80,22 +80,22 @@ def voxel_downsample(points: Float, weights: Float, voxel_size: float) -> NDArra
 
 
 def transform_by_twist(points: Float, times: Float, twist: Float) -> Float:
-    """Exp(time twist) p of each."""
+    """Exp(time twist) p of each point."""
     T = se3.exp(times.astype(float)[:, None] * twist)
-    moved: Float = np.einsum("nij,nj->ni", T[:, :3, :3], points.astype(float)) + T[:, :3, 3]
-    return moved
+    transformed: Float = np.einsum("nij,nj->ni", T[:, :3, :3], points.astype(float)) + T[:, :3, 3]
+    return transformed
 
 
 @dataclass
-class Linearised:
-    """The data term at a pose and a twist; shares as weights of beams."""
+class QuadraticModel:
+    """Quadratic model of the data term at one state."""
 
     hessian: Float
     gradient: Float
     cost: float = 0.0
-    met: float = 0.0
-    compared: float = 0.0
-    all: float = 0.0
+    inlier_weight: float = 0.0
+    matched_weight: float = 0.0
+    total_weight: float = 0.0
 
 
 def linearise_sweep(
@@ -113,14 +113,14 @@ def linearise_sweep(
     kernel_width: float,
     level: int,
     slack: float,
-) -> Linearised:
+) -> QuadraticModel:
     """(4) to (6) of docs/registration3d.md, beam by beam."""
-    q = Linearised(np.zeros((12, 12)), np.zeros(12))
+    q = QuadraticModel(np.zeros((12, 12)), np.zeros(12))
     still = transform_by_twist(points, times, twist)
     for p, e, tau in zip(still, weights.astype(float), times.astype(float), strict=True):
         if not np.isfinite(p).all() or e <= 0.0:
             continue
-        q.all += e
+        q.total_weight += e
         y = T[:3, :3] @ p + T[:3, 3]
         levels = range(level, len(map.edges))
         planes = (map.plane(y, at, min_weight, max_flatness, min_extent) for at in levels)
@@ -137,8 +137,8 @@ def linearise_sweep(
         q.hessian += w * np.outer(row, row)
         q.gradient += -w * offset * row
         q.cost += 0.5 * e * s / (1.0 + s / kernel_width**2)
-        q.compared += e
-        q.met += e * (s < kernel_width**2)
+        q.matched_weight += e
+        q.inlier_weight += e * (s < kernel_width**2)
     return q
 
 

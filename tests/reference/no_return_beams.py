@@ -1,4 +1,4 @@
-"""Beams without a return: which of them tell something, and up to where."""
+"""Beams without a return: which of them are evidence of free space, and up to which range."""
 
 from collections.abc import Sequence
 from itertools import accumulate
@@ -9,15 +9,15 @@ from numpy.typing import ArrayLike
 from reference.beam_counting import Beam, passed_cells, usable_beams
 from reference.occupancy_grid import Cell, OccupancyGrid
 
-IN_A_ROW = 3  # beams without a return that did not just get lost
+MIN_RUN = 3  # adjacent beams without a return; shorter runs are not trusted
 
 
-def in_a_row(beams: Sequence[Beam]) -> set[int]:
-    """Numbers of beams without a return that have others beside them, IN_A_ROW at least."""
+def beams_in_runs(beams: Sequence[Beam]) -> set[int]:
+    """Numbers of the beams without a return in runs of at least MIN_RUN."""
     scan_of = {beam.number: beam.scan for beam in beams if not beam.hit}
     found: set[int] = set()
     for first in scan_of:
-        row = range(first, first + IN_A_ROW)
+        row = range(first, first + MIN_RUN)
         if all(scan_of.get(n) == scan_of[first] for n in row):
             found.update(row)
     return found
@@ -32,32 +32,32 @@ def add_no_return_beams(
     T_map_sensor: ArrayLike,
     stop_cells: ArrayLike,
     end_margin: float,
-    threads: int = 1,  # noqa: ARG001  the core's signature
+    threads: int = 1,  # noqa: ARG001  signature of the kernel
 ) -> None:
-    """Add what `add_beams` adds for beams without a return: to `grid` as far as they are believed.
+    """Add beams without a return as `add_beams` does, the trusted part to `grid`.
 
-    What they are not believed about goes to `rest`. Fewer than IN_A_ROW of them side by side are
-    not believed. The others are up to the first of `stop_cells` (S, D), and not about cells that
-    they leave within the last `end_margin` metres.
+    The remainder goes to `rest`. Runs of fewer than MIN_RUN beams are not trusted. The others are
+    trusted up to the first of `stop_cells` (S, D), and not in cells that they leave within the
+    last `end_margin` metres.
     """
     if not end_margin >= 0:
         raise ValueError(f"end_margin: expected a length that is not negative, got {end_margin}")
     opaque = {tuple(cell) for cell in np.asarray(stop_cells, np.int64).tolist()}
     beams = list(usable_beams(grid.dimension, points, hit, offset, T_map_sensor))
-    told = in_a_row(beams)
+    trusted = beams_in_runs(beams)
     for beam in beams:
         if beam.hit:
             continue
         way = list(passed_cells(grid, beam))
         length = float(np.linalg.norm(beam.end - beam.start))
-        limit = (length - end_margin) / grid.resolution if beam.number in told else 0.0
-        n = cells_within(way, opaque, limit)
+        limit = (length - end_margin) / grid.resolution if beam.number in trusted else 0.0
+        n = count_cells_within(way, opaque, limit)
         for k, (cell, chord) in enumerate(way):
             (grid if k < n else rest).add(cell, 0.0, chord)
 
 
-def cells_within(way: Sequence[tuple[Cell, float]], opaque: set[Cell], limit: float) -> int:
-    """How many of the first cells are left within `limit` cell widths, with none of `opaque`."""
+def count_cells_within(way: Sequence[tuple[Cell, float]], opaque: set[Cell], limit: float) -> int:
+    """Number of leading cells that are left within `limit` cells and are not `opaque`."""
     left_at = accumulate(chord for _, chord in way)
     for k, ((cell, _), left) in enumerate(zip(way, left_at, strict=True)):
         if cell in opaque or left > limit:

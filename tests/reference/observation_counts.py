@@ -1,4 +1,4 @@
-"""In how many looks cells were looked at, and in how many of them nothing that moves was near."""
+"""Number of time bins in which cells were observed, and were clear of moving objects."""
 
 import itertools
 from collections import Counter
@@ -9,24 +9,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reference.beam_counting import Beam, passed_cells, usable_beams
-from reference.no_return_beams import cells_within, in_a_row
+from reference.no_return_beams import beams_in_runs, count_cells_within
 from reference.occupancy_grid import Cell, OccupancyGrid
 from reference.ray_traversal import cell_of
 
-MOST = 65535  # looks are counted no further
+MAX_COUNT = 65535  # counts saturate
 
 
 class ObservationCounts:
-    """Of each cell: the looks that saw it, and those of them that were clear.
+    """Number of time bins in which each cell was observed, and was observed clear.
 
     Args:
         resolution: edge of a cell, metres.
         dimension: 2 or 3.
-        radius: metres around the end of a beam on something that moves within which a cell is not
-            clear, between the middles of cells.
-        stop_cells: (S, D) cells from which on beams without a return say nothing; None: they are
-            believed all of their way, the end cell excepted.
-        end_margin: metres before their end from which on they say nothing.
+        radius: metres between cell centres within which a dynamic return makes a cell not
+            clear.
+        stop_cells: (S, D) beams without a return are not trusted from these cells on; None:
+            they are trusted up to their end cell.
+        end_margin: metres before their end in which they are not trusted.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class ObservationCounts:
             None if stop_cells is None else set(map(tuple, np.asarray(stop_cells).tolist()))
         )
         self.end_margin = end_margin
-        self.looks: Counter[Cell] = Counter()
+        self.observed: Counter[Cell] = Counter()
         self.clear: Counter[Cell] = Counter()
 
     def add(
@@ -57,43 +57,43 @@ class ObservationCounts:
         offset: ArrayLike,
         T_map_sensor: ArrayLike,
         time_bin: ArrayLike,
-        threads: int = 1,  # noqa: ARG002  the core's signature
+        threads: int = 1,  # noqa: ARG002  signature of the kernel
     ) -> None:
         """Add scans; `is_dynamic` (M,): dynamic hits, `time_bin` (T,): time bin of each scan."""
         beams = list(usable_beams(self.grid.dimension, points, hit, offset, T_map_sensor))
         moves, number = np.asarray(is_dynamic, bool), np.asarray(time_bin, np.int64)
-        in_rows = in_a_row(beams)
+        in_rows = beams_in_runs(beams)
         for wanted in np.unique(number):
             mine = [beam for beam in beams if number[beam.scan] == wanted]
-            seen = set().union(*(self._told_of(beam, in_rows) for beam in mine))
+            seen = set().union(*(self._observed_cells(beam, in_rows) for beam in mine))
             ends = [beam for beam in mine if beam.hit and moves[beam.number]]
-            self.looks.update(seen)
-            self.clear.update(seen - self._disturbed(ends))
+            self.observed.update(seen)
+            self.clear.update(seen - self._cells_near(ends))
 
     def dense(
         self, first_cell: ArrayLike, shape: tuple[int, ...]
     ) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-        """Looks and clear ones over a box of cells, axes as those of `OccupancyGrid.dense`."""
+        """Observed and clear counts over a box of cells, axes as of `OccupancyGrid.dense`."""
         looks, clear = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
-        for cell, count in self.looks.items():
+        for cell, count in self.observed.items():
             index = tuple((np.array(cell) - np.asarray(first_cell))[::-1].tolist())
             if all(0 <= i < n for i, n in zip(index, shape, strict=True)):
-                looks[index], clear[index] = min(count, MOST), min(self.clear[cell], MOST)
+                looks[index], clear[index] = min(count, MAX_COUNT), min(self.clear[cell], MAX_COUNT)
         return looks, clear
 
-    def _told_of(self, beam: Beam, in_rows: set[int]) -> set[Cell]:
-        """The cells that a beam tells something of: where it adds to the sums of (10)."""
+    def _observed_cells(self, beam: Beam, in_rows: set[int]) -> set[Cell]:
+        """Cells that a beam observes: those where it adds to the sums of (10)."""
         way = list(passed_cells(self.grid, beam))
         if beam.hit:
             return {cell for cell, chord in way if chord > 0} | {self._end(beam)}
         if self.stop_cells is not None:
             length = float(np.linalg.norm(beam.end - beam.start))
             limit = length - self.end_margin if beam.number in in_rows else 0.0
-            way = way[: cells_within(way, self.stop_cells, limit / self.grid.resolution)]
+            way = way[: count_cells_within(way, self.stop_cells, limit / self.grid.resolution)]
         return {cell for cell, chord in way if chord > 0}
 
-    def _disturbed(self, ends: Sequence[Beam]) -> set[Cell]:
-        """The cells near the ends of beams on what moves."""
+    def _cells_near(self, ends: Sequence[Beam]) -> set[Cell]:
+        """Cells near dynamic returns."""
         reach = self.radius / self.grid.resolution * (1 + 1e-9)
         span = range(-int(reach), int(reach) + 1)
         steps = [

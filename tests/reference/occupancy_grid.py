@@ -1,4 +1,4 @@
-"""Counts per cell: the sums alpha and beta of (10), and where the hits lie."""
+"""Occupancy grid: the sums alpha and beta of (10) per cell, and moments of the end points."""
 
 from functools import partial
 
@@ -36,7 +36,7 @@ class OccupancyGrid:
             self.moment[cell] = before + alpha * end_point
 
     def alpha_beta(self, cells: ArrayLike) -> Float:
-        """(K, 2) alpha and beta of cells (K, D); zeros where nobody looked."""
+        """(K, 2) alpha and beta of cells (K, D); zeros for unobserved cells."""
         keys = [tuple(cell) for cell in np.asarray(cells, np.int64).reshape(-1, self.dimension)]
         pairs = [(self.alpha.get(k, 0.0), self.beta.get(k, 0.0)) for k in keys]
         return np.array(pairs).reshape(-1, 2)
@@ -59,7 +59,7 @@ class OccupancyGrid:
             self.moment[cell] = self.moment.get(cell, np.zeros(self.dimension)) + moment
 
     def bounding_box(self) -> tuple[Int, tuple[int, ...]]:
-        """The bounding box of all touched cells: its first cell (D,), and its shape as `dense`."""
+        """First cell (D,) and shape of the bounding box of all observed cells."""
         if not self.alpha:
             return np.zeros(self.dimension, np.int64), (0,) * self.dimension
         cells = np.array(list(self.alpha), np.int64)
@@ -69,7 +69,7 @@ class OccupancyGrid:
     def dense(
         self, first_cell: ArrayLike | None = None, shape: tuple[int, ...] | None = None
     ) -> tuple[Int, Float, Float]:
-        """A box of cells, or the one around all that were touched.
+        """Sums over a box of cells, by default the bounding box.
 
         Returns:
             first_cell (D,), the cell of the lowest corner; alpha and beta with the axes reversed,
@@ -97,7 +97,7 @@ OccupancyGrid3D = partial(OccupancyGrid, dimension=3)
 
 
 def occupancy(alpha: ArrayLike, beta: ArrayLike) -> Float:
-    """Equation (15): alpha / (alpha + beta), NaN where alpha + beta = 0 (nobody looked)."""
+    """Equation (15): alpha / (alpha + beta), NaN where alpha + beta = 0 (unobserved)."""
     a = np.asarray(alpha, float)
     total = a + np.asarray(beta, float)
     m = np.full(total.shape, np.nan)

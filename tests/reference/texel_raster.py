@@ -1,4 +1,4 @@
-"""Which texels of a page triangles cover."""
+"""Rasterisation of triangles into texels."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ Int32 = NDArray[np.int32]
 def rasterise_texels(
     corners: Float, width: int, height: int
 ) -> tuple[Int32, Int32, NDArray[np.float32]]:
-    """Texels (k,), triangles (k,), and weights (k, 2) of their second and third corners.
+    """Texels (k,), triangles (k,), and barycentric weights (k, 2) of the second and third corner.
 
     A centre p is covered where p = a + j (b - a) + k (c - a) with j, k >= 0 and j + k <= 1.
     """

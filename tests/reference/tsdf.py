@@ -1,4 +1,4 @@
-"""Signed distances from surfaces that scans saw, averaged in voxels (Curless and Levoy 1996)."""
+"""TSDF integration (Curless and Levoy 1996)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,13 +6,13 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 
 _MARGIN = 0.01  # of a triangle
-_FLAT = 1e-12  # of the product of its corners' distances, the volume of one that is seen edge on
-_NEAREST = 0.05  # of the way from the sensor
-_SLANT = 100.0  # times as far along a line of sight as off a surface
+_FLAT = 1e-12  # volume / product of the corner distances of a triangle seen edge-on
+_NEAREST = 0.05  # of the range, start of integration
+_SLANT = 100.0  # largest ratio of length along a line of sight to distance from the surface
 
 
 class TsdfVolume:
-    """Weights and weighted distances of voxels, by their numbers."""
+    """Weights and weighted distances per voxel."""
 
     block_edge = 8
 
@@ -30,7 +30,7 @@ class TsdfVolume:
         weight: NDArray[np.float32],
         threads: int = 1,  # noqa: ARG002
     ) -> None:
-        """See the core's."""
+        """As `_core.TsdfVolume`."""
         for face, w in zip(faces, weight, strict=True):
             if w > 0.0:
                 self._add_triangle(points[face], origin[face].mean(axis=0), standoff[face], w)
@@ -43,7 +43,7 @@ class TsdfVolume:
         per_metre = min(1.0 / h, _SLANT / float(np.linalg.norm(M.mean(axis=1))))
         nearest = max(1.0 - self.truncation_front * per_metre, _NEAREST)
         farthest = 1.0 + self.truncation_back * per_metre
-        # of lines of sight along the triangle's margin, where they begin and end
+        # start and end of the lines of sight through the enlarged triangle
         outer = M @ (np.eye(3) + 2 * _MARGIN * (3.0 * np.eye(3) - np.ones((3, 3))))
         ends = np.concatenate([nearest * outer, farthest * outer], axis=1).T + o
         low = np.floor(ends.min(axis=0) / self.voxel - 0.5).astype(int)
@@ -63,21 +63,21 @@ class TsdfVolume:
             sums[1] += s * d
 
     def blocks(self) -> NDArray[np.int64]:
-        """(B, 3) those with voxels of which something is known, sorted."""
+        """(B, 3) blocks with integrated voxels, sorted."""
         cells = np.array(list(self._sums), np.int64).reshape(-1, 3)
         return np.unique(cells // self.block_edge, axis=0)
 
     def remove_blocks(self, blocks: NDArray[np.int64]) -> None:
-        """See the core's."""
-        gone = {tuple(block) for block in blocks.tolist()}
+        """As `_core.TsdfVolume`."""
+        removed = {tuple(block) for block in blocks.tolist()}
         for cell in list(self._sums):
-            if tuple(c // self.block_edge for c in cell) in gone:
+            if tuple(c // self.block_edge for c in cell) in removed:
                 del self._sums[cell]
 
     def dense(
         self, first_cell: list[int], shape: list[int]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """[z, y, x] metres, NaN where nothing is known, and weights."""
+        """[z, y, x] metres, NaN where unobserved, and weights."""
         metres, weight = np.full(shape, np.nan, np.float32), np.zeros(shape, np.float32)
         for cell, (w, product) in self._sums.items():
             at = tuple((np.array(cell) - first_cell)[::-1])

@@ -1,4 +1,4 @@
-"""What a pinhole camera sees of a mesh, pixel by pixel: a ray through each, met with every face."""
+"""Rendering of a mesh by intersecting the ray of each pixel with every face."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ def render_z_buffer(
     *,
     near: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Depth (height, width), inf where there is nothing, and face, -1 there.
+    """Depth (height, width), inf for background, and face, -1 for background.
 
     The ray z (x, y, 1) of a pixel meets a face a, b, c where z (x, y, 1) = i a + j b + k c with
     i + j + k = 1: by Cramer's rule i is to j is to k as (x, y, 1) . (b x c) is to
@@ -31,15 +31,15 @@ def render_z_buffer(
     face = np.full((height, width), -1, np.int32)
     for number, at in enumerate(faces):
         a, b, c = (points[i] for i in at)
-        z = _met(rays, a, b, c)
+        z = _ray_depths(rays, a, b, c)
         z[~(z >= near)] = np.inf
         nearer = z.astype(np.float32) < depth
         depth[nearer], face[nearer] = z[nearer], number
     return depth, face
 
 
-def _met(rays: Float, a: Float, b: Float, c: Float) -> Float:
-    """Depths at which rays (h, w, 3) meet a face, inf for those that do not."""
+def _ray_depths(rays: Float, a: Float, b: Float, c: Float) -> Float:
+    """Depths at which rays (h, w, 3) intersect a face, inf where they do not."""
     volume = float(np.dot(a, np.cross(b, c)))
     across = np.stack([rays @ np.cross(p, q) for p, q in ((b, c), (c, a), (a, b))], axis=-1)
     across *= np.sign(volume)

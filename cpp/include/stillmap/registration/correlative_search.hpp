@@ -173,7 +173,7 @@ class CorrelativeSearch {
     int64_t sum = 0;
     for (size_t n = 0; n < n_points; ++n) sum += weights_[n] * from[indices[n]];
     const double data_score =
-        options_.gain * pyramid_->score_unit() / kWeight * static_cast<double>(sum);
+        options_.information_scale * pyramid_->score_unit() / kWeight * static_cast<double>(sum);
     queue_.push({data_score - prior_penalty(level, angle, low), level, angle, low, poses_tried_});
   }
 

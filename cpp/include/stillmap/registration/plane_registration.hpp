@@ -1,8 +1,9 @@
 // Point-to-plane registration of a lidar sweep against an NDT map: pose T and twist xi together.
 // Minimises
-//   1/2 d^T Lambda d + gain sum_n e_n v_n rho(r_n^2 / v_n),  y_n = T Exp(tau_n xi) p_n,
-// with r_n the distance of y_n from the plane around it, v_n its variance, d = (T, xi) boxminus the
-// prior in the moving frame, and rho(s) = 1/2 s / (1 + s / k^2) the Geman-McClure kernel.
+//   1/2 d^T Lambda d + s sum_n e_n v_n rho(r_n^2 / v_n),  y_n = T Exp(tau_n xi) p_n,
+// with s the information scale, r_n the distance of y_n from the plane around it, v_n its variance,
+// d = (T, xi) boxminus the prior in the moving frame, and rho(u) = 1/2 u / (1 + u / k^2) the
+// Geman-McClure kernel.
 #pragma once
 
 #include <Eigen/Cholesky>
@@ -41,9 +42,9 @@ struct MotionPrior {
 
 struct PlaneRegistrationOptions {
   PlaneOptions plane;
-  double sigma;         // metres, range noise in addition to the plane's
-  double kernel_width;  // k, in standard deviations: a beam there has a quarter of its weight
-  double gain;          // information scale per beam: beams on one surface have correlated errors
+  double sigma;              // metres, range noise in addition to the plane's
+  double kernel_width;       // k, in standard deviations: a beam there has a quarter of its weight
+  double information_scale;  // of one beam: beams on one surface have correlated errors
   int start_level;
   double start_slack;  // metres, additional standard deviation in the first iteration
   int max_iterations;
@@ -213,11 +214,11 @@ inline PlaneRegistrationResult<D> register_sweep(const NdtMap<D>& map, const Tim
   double slack = options.start_slack;
   for (;;) {
     result.model = linearise<D>(map, beams, result.state, level, slack, options, threads);
-    result.information = options.gain * result.model.hessian + prior.information;
+    result.information = options.information_scale * result.model.hessian + prior.information;
     if (result.iterations == options.max_iterations) break;
     const auto d = boxminus<D>(result.state, prior.mean);
     const Eigen::Matrix<double, 2 * n, 1> gradient =
-        options.gain * result.model.gradient + prior.information * d;
+        options.information_scale * result.model.gradient + prior.information * d;
     const Eigen::Matrix<double, 2 * n, 1> step = -result.information.ldlt().solve(gradient);
     if (!step.allFinite()) break;
     result.state = boxplus<D>(result.state, step);

@@ -1,8 +1,8 @@
 // Registration of one scan against a likelihood field (9), beams weighted by e, with a Gaussian
 // prior. Minimises
-//   J(x) = - gain sum_n e_n ln((base + F(y_n(x))) / (floor + 1)) + 1/2 |x - x_prior|^2
-// in the metric of the prior's information; base = floor in observed space, floor + unknown
-// elsewhere.
+//   J(x) = - s sum_n e_n ln((base + F(y_n(x))) / (floor + 1)) + 1/2 |x - x_prior|^2
+// in the metric of the prior's information, with s the information scale; base = floor in observed
+// space, floor + unknown elsewhere.
 #pragma once
 
 #include <Eigen/Cholesky>
@@ -25,7 +25,7 @@ struct WeightedBeams {
 
 struct ScanRegistrationOptions {
   LikelihoodFieldOptions field;
-  double gain;  // information scale per beam: neighbouring beams are not independent
+  double information_scale;  // of one beam: neighbouring beams are not independent
   int max_iterations;
 };
 
@@ -88,7 +88,7 @@ inline QuadraticModel<D> linearise(LikelihoodField<D>& field, WeightedBeams<D>& 
   beams.windows.resize(beams.points.size());
   double total = 0.0;
   for (size_t n = 0; n < beams.points.size(); ++n) {
-    const double weight = options.gain * beams.weights[n];
+    const double weight = options.information_scale * beams.weights[n];
     const Vec<D> lever = pose.R * beams.points[n];
     const FieldSample<D> sample = field.evaluate(pose.t + lever, beams.windows[n]);
     total += beams.weights[n];
