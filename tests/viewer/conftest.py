@@ -22,7 +22,6 @@ SCANS = 6
 STAMPS = 1_700_000_000_000_000_000 + 500_000_000 * np.arange(SCANS)
 
 
-
 @pytest.fixture
 def glb():
     return triangle_glb()

@@ -24,7 +24,7 @@ def beams(request, result_of):
 def test_they_end_where_those_of_the_result_end(beams):
     whole = deskew_recording(beams.recording, beams.poses, beams.slam)
     for scan in range(whole.n_scans):
-        seen, own = beams.at(scan), whole.beams_of(scan)
+        seen, own = beams.scan_view(scan), whole.beams_of(scan)
         use = np.flatnonzero(whole.hit[own]) + own.start
         D = whole.dimension
         assert seen.ends[:, :D] == pytest.approx(whole.end_points(use, beams.poses), abs=1e-6)
@@ -35,9 +35,9 @@ def test_they_end_where_those_of_the_result_end(beams):
 
 
 def test_there_are_no_more_than_asked_for(beams):
-    seen = beams.at(2, most=7)
+    seen = beams.scan_view(2, max_count=7)
     assert (len(seen.ends), len(seen.p_static)) == (7, 7)
-    every = beams.at(2)
+    every = beams.scan_view(2)
     assert all((every.ends == end).all(axis=1).any() for end in seen.ends)
 
 
@@ -51,5 +51,5 @@ def test_a_part_is_the_same_scans(beams):
 def test_a_scan_without_beams_shows_none(beams):
     recording = beams.recording
     nothing = replace(recording, hit=np.zeros(recording.n_beams, bool))
-    seen = replace(beams, recording=nothing).at(0)
+    seen = replace(beams, recording=nothing).scan_view(0)
     assert (seen.ends.shape, seen.p_static.shape) == ((0, 3), (0,))

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stillmap.mesh.options import TextureOptions
 from stillmap.mesh.texture.atlas import TexturedMesh
 from stillmap.results.gltf import write_glb
 from stillmap.results.report.renderer import BACKGROUND
@@ -126,7 +125,7 @@ def tiled(path, tones):
         view=page,
         vertex=np.arange(4 * len(tones), dtype=np.int32),
     )
-    write_glb(path, textured, TextureOptions(quality=0))
+    write_glb(path, textured, quality=0)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -7,26 +7,26 @@ import pytest
 from made_up_models import glb_of
 
 from stillmap.core.errors import InputError
-from stillmap.results.gltf import MAP_FROM_GLTF, require_whole
+from stillmap.results.gltf import MAP_FROM_GLTF, read_glb
 
 
 def refusal(path, data, most=1 << 20):
     path.write_bytes(data)
     with pytest.raises(InputError) as caught:
-        require_whole(path, most)
+        read_glb(path, most)
     assert caught.value.where == str(path)
     return caught.value.what
 
 
 def test_a_whole_model_comes_back_as_it_is(tmp_path, glb):
     (tmp_path / "a.glb").write_bytes(glb)
-    assert require_whole(tmp_path / "a.glb", len(glb)) == glb
+    assert read_glb(tmp_path / "a.glb", len(glb)) == glb
 
 
 def test_what_lies_in_the_file_may_be_named(tmp_path):
     data = glb_of({"buffers": [{"uri": "data:application/octet-stream;base64,AAAA"}]})
     (tmp_path / "a.glb").write_bytes(data)
-    assert require_whole(tmp_path / "a.glb", 1000) == data
+    assert read_glb(tmp_path / "a.glb", 1000) == data
 
 
 @pytest.mark.parametrize(

@@ -106,12 +106,12 @@ def test_a_place_that_is_no_pose_is_noted(result_of):
     (out / "objects/0007.json").write_text(json.dumps(place))
     scene = read_scene(out)
     assert (scene.models, len(scene.notes)) == ([], 1)
-    assert "no pose" in scene.notes[0]
+    assert "not a pose" in scene.notes[0]
 
 
 def test_models_are_bounded_together(result_of, glb, monkeypatch):
     out = result_of(3, with_models=True)
-    monkeypatch.setattr(module, "_MOST_MODELS", len(glb) - 1)
+    monkeypatch.setattr(module, "_MAX_MODELS", len(glb) - 1)
     scene = read_scene(out)
     assert scene.models == []
     assert "0007.glb" in scene.notes[0]

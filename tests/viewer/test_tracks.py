@@ -64,7 +64,7 @@ def test_only_those_are_there_that_are_seen_before_and_after():
         True,
         False,
     ]
-    assert object_poses_at([late, one], NOW).index.tolist() == [1]
+    assert object_poses_at([late, one], NOW).track.tolist() == [1]
     nobody = object_poses_at([late], NOW)
     assert box_edges(nobody).shape == (0, 4, 2, 3)
 

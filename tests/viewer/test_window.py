@@ -21,7 +21,7 @@ viser = pytest.importorskip("viser", reason="the extra `viewer` is not installed
 sockets = pytest.importorskip("websockets.sync.client")
 
 from stillmap.viewer import server as module  # noqa: E402
-from stillmap.viewer.window import Window, _plain  # noqa: E402
+from stillmap.viewer.window import Window, _escape_markdown  # noqa: E402
 
 
 def beams_of(out):
@@ -162,19 +162,19 @@ def test_a_version_of_viser_that_is_not_guarded_is_not_used(result_of, monkeypat
     def nothing():
         yield []
 
-    monkeypatch.setattr(module, "_guarded", nothing)
+    monkeypatch.setattr(module, "_guard_servers", nothing)
     with pytest.raises(RuntimeError, match="viser"):
         Window(read_scene(result_of(2)), None)
 
 
 def test_layers_are_those_that_there_is_something_of(result_of, opened, window):
     flat = opened(read_scene(result_of(2)), None)
-    objects = ["Objects", "Object ways", "Object numbers"]
+    objects = ["Objects", "Object tracks", "Object numbers"]
     assert list(flat._boxes) == ["Map", "Robot", *objects]
     clouds = ["Static points", "Dynamic points"]
     assert list(window._boxes) == [
         *("Map", "Surface", *clouds, "Robot", "Beams", "Rays"),
-        *("Objects", "Object ways", "Object models", "Object numbers"),
+        *("Objects", "Object tracks", "Object models", "Object numbers"),
     ]
 
 
@@ -186,7 +186,7 @@ def test_at_a_scan_what_was_there_is_shown(window):
         window.show(scan)
         assert window._slider.value == scan
         assert window._clock.value == f"{0.5 * scan:.1f} of 2.5 s"
-        beams = layers._beams.at(scan)
+        beams = layers._beams.scan_view(scan)
         assert layers._ends.points == pytest.approx(beams.ends, abs=1e-5)
         assert layers._ends.colors.shape == beams.ends.shape
         assert layers._robot.position == pytest.approx(scene.poses[scan, :3, 3])
@@ -289,4 +289,4 @@ def test_one_scan_alone_is_shown(result_of, opened):
 
 
 def test_names_say_nothing_of_how_they_are_shown():
-    assert _plain("a_b <img src=x>") == r"a\_b \<img src=x\>"
+    assert _escape_markdown("a_b <img src=x>") == r"a\_b \<img src=x\>"

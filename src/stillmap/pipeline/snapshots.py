@@ -1,19 +1,28 @@
 """Small parts of a map, to show how it evolves (Fig. 8) without keeping every map."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillmap.mapping.beam_statistics import DYNAMIC_BELOW
 
-if TYPE_CHECKING:
-    from stillmap.em import OccupancyMap
-
 Window = tuple[float, float, float, float]
 Value = TypeVar("Value", np.float32, np.bool_)
 _MOST_POINTS = 50_000
+
+
+class GridMap(Protocol):
+    """An occupancy map: `p_occupied` (H, W), NaN where unknown, row 0 = lowest y; `origin` (x, y,
+    yaw) of the lower-left corner; `resolution` in m."""
+
+    @property
+    def p_occupied(self) -> NDArray[Any]: ...
+    @property
+    def origin(self) -> tuple[float, float, float]: ...
+    @property
+    def resolution(self) -> float: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +44,7 @@ class Snapshot:
     dynamic_points: NDArray[np.float32]
 
 
-def extent(occupancy: "OccupancyMap") -> Window:
+def extent(occupancy: GridMap) -> Window:
     """x0, y0, x1, y1 of the whole map in metres, in the map frame."""
     x, y, yaw = occupancy.origin
     if yaw != 0:
@@ -78,7 +87,7 @@ def choose_window(
 
 def snapshot(
     number: int,
-    occupancy: "OccupancyMap",
+    occupancy: GridMap,
     points_world: NDArray[np.float64] | NDArray[np.float32],
     p_static: NDArray[np.float32],
     window: Window,
@@ -98,14 +107,14 @@ def snapshot(
 
 
 def cut(
-    occupancy: "OccupancyMap", window: Window
+    occupancy: GridMap, window: Window
 ) -> tuple[NDArray[np.float32], tuple[float, float, float]]:
     """The cells (h, w) in `window` and their origin; NaN where the window leaves the map."""
     return cut_layer(occupancy, occupancy.p_occupied, window, np.nan)
 
 
 def cut_layer(
-    occupancy: "OccupancyMap", layer: NDArray[Value], window: Window, outside: float
+    occupancy: GridMap, layer: NDArray[Value], window: Window, outside: float
 ) -> tuple[NDArray[Value], tuple[float, float, float]]:
     """The same of any (H, W) layer of a map; `outside` where the window leaves it."""
     x, y, _, _ = extent(occupancy)

@@ -1,1 +1,1 @@
-"""A result to look at in a browser: what is shown of it, and the page that shows it."""
+"""`stillmap view`: a result folder in the browser, through viser."""

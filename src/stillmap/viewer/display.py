@@ -1,7 +1,4 @@
-"""Colours of what is shown: (n, 3) uint8 red, green, blue.
-
-Clouds of files and scans with no more points than a browser draws at ease.
-"""
+"""Color maps, (n, 3) uint8 RGB, and subsampling of point clouds to what a browser can draw."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,40 +14,44 @@ from stillmap.results.report.figures import ORANGE
 
 Colors = NDArray[np.uint8]
 
-BLUE = (36, 99, 168)  # of the report: what stands still, and where the robot went
+BLUE = (36, 99, 168)  # static, and the robot's trajectory; ORANGE is dynamic
 
-# dynamic, undecided, static: told apart by those who see no red, too
-_BY_P_STATIC = (ORANGE, (205, 205, 205), BLUE)
+# at P(static) = 0, 0.5, 1; distinguishable to color-blind readers
+_P_STATIC_COLORS = (ORANGE, (205, 205, 205), BLUE)
 
-_BY_HEIGHT = ((40, 53, 90), (45, 96, 130), (60, 140, 132), (122, 178, 106), (214, 196, 96))
+_HEIGHT_COLORS = ((40, 53, 90), (45, 96, 130), (60, 140, 132), (122, 178, 106), (214, 196, 96))
 
-_TURN = 0.618034  # of the circle of hues, from one number to the next: neighbours differ
+_HUE_STEP = 0.618034  # of the circle, from one id to the next, so that neighbors differ
 
 
 def color_by_p_static(p_static: NDArray[np.float32]) -> Colors:
-    """From orange, dynamic, over grey to blue, static; of (n,) P(c = 1)."""
-    return _blended(_BY_P_STATIC, np.asarray(p_static, np.float64))
+    """Orange (dynamic) over grey to blue (static) for P(static) (n,)."""
+    return _interpolate_colors(_P_STATIC_COLORS, np.asarray(p_static, np.float64))
 
 
 def color_by_height(z: NDArray[np.floating], low: float, high: float) -> Colors:
-    """From dark blue at `low` metres to yellow at `high`; of (n,) metres."""
-    return _blended(_BY_HEIGHT, (np.asarray(z, np.float64) - low) / max(high - low, 1e-9))
+    """Dark blue at `low` to yellow at `high`, for heights z (n,) in m."""
+    return _interpolate_colors(
+        _HEIGHT_COLORS, (np.asarray(z, np.float64) - low) / max(high - low, 1e-9)
+    )
 
 
 def color_by_id(number: NDArray[np.intp] | Sequence[int]) -> Colors:
-    """A colour that a thing keeps, of its number (n,)."""
-    hue = np.mod(np.asarray(number, np.float64) * _TURN + 0.05, 1.0)
-    # a cosine for each of the three, a third of the circle apart
-    part = np.cos(2.0 * np.pi * (hue[:, None] - np.array([0.0, 1.0, 2.0]) / 3.0))
-    return np.rint(120.0 + 105.0 * part).astype(np.uint8)
+    """A color for each id (n,)."""
+    hue = np.mod(np.asarray(number, np.float64) * _HUE_STEP + 0.05, 1.0)
+    # a cosine per channel, a third of the circle apart
+    level = np.cos(2.0 * np.pi * (hue[:, None] - np.array([0.0, 1.0, 2.0]) / 3.0))
+    return np.rint(120.0 + 105.0 * level).astype(np.uint8)
 
 
-def _blended(stops: Sequence[tuple[int, int, int]], share: NDArray[np.float64]) -> Colors:
-    """Between colours that lie evenly from 0 to 1."""
+def _interpolate_colors(
+    stops: Sequence[tuple[int, int, int]], share: NDArray[np.float64]
+) -> Colors:
+    """Linear interpolation between evenly spaced colors over 0 to 1."""
     at = np.linspace(0.0, 1.0, len(stops))
     columns = [np.interp(share, at, column) for column in np.array(stops, np.float64).T]
-    blended: NDArray[np.float64] = np.stack(columns, axis=-1)
-    return np.rint(blended).astype(np.uint8)
+    colors: NDArray[np.float64] = np.stack(columns, axis=-1)
+    return np.rint(colors).astype(np.uint8)
 
 
 _SEED = 1
@@ -58,12 +59,12 @@ _SEED = 1
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Some of the points of a cloud.
+    """A subsampled point cloud.
 
     Attributes:
-        points: (n, 3) float64 metres in the map frame.
-        colours: (n, 3) uint8; None where the file has none.
-        of: how many there are in all.
+        points: (n, 3) float64 m in the map frame.
+        colors: (n, 3) uint8; None where the file has none.
+        total: number of points in the file.
     """
 
     points: NDArray[np.float64]
@@ -71,35 +72,34 @@ class Points:
     total: int
 
 
-def sample_indices(count: int, most: int) -> NDArray[np.int64]:
-    """(min(count, most),) numbers below `count`, rising, spread evenly.
+def sample_indices(count: int, max_count: int) -> NDArray[np.int64]:
+    """Sorted indices (min(count, max_count),) below `count`: a stratified random sample.
 
-    Within its share of the row each is chosen by chance: at even steps a lidar whose rings come in
-    turn would show a few of them only. The same numbers every time.
+    Regular steps would show only some rings of a lidar that fires them in turn. Deterministic.
     """
-    if count <= most:
+    if count <= max_count:
         return np.arange(count)
-    at = np.arange(most) + np.random.default_rng(_SEED).random(most)
-    return np.minimum((at * (count / most)).astype(np.int64), count - 1)
+    at = np.arange(max_count) + np.random.default_rng(_SEED).random(max_count)
+    return np.minimum((at * (count / max_count)).astype(np.int64), count - 1)
 
 
-def sample_ply(path: Path, most: int) -> Points:
-    """At most so many points of a PLY file, read piece by piece.
+def sample_ply(path: Path, max_count: int) -> Points:
+    """At most `max_count` points of a PLY file, read block by block.
 
     Raises:
         InputError: it is missing or damaged.
     """
     layout = ply.read_layout(path)
-    painted = {"red", "green", "blue"} <= {field.name for field in layout.fields}
-    wanted = ("x", "y", "z", *(("red", "green", "blue") if painted else ()))
-    use, first = sample_indices(layout.rows, most), 0
-    points, colours = np.empty((len(use), 3)), np.empty((len(use), 3), np.uint8)
+    has_colors = {"red", "green", "blue"} <= {field.name for field in layout.fields}
+    wanted = ("x", "y", "z", *(("red", "green", "blue") if has_colors else ()))
+    use, first = sample_indices(layout.rows, max_count), 0
+    points, colors = np.empty((len(use), 3)), np.empty((len(use), 3), np.uint8)
     for block in read_columns(layout, wanted):
         end = first + len(block[0])
         into = slice(*np.searchsorted(use, [first, end]).tolist())
         for n, values in enumerate(block):
-            (points if n < 3 else colours)[into, n % 3] = values[use[into] - first]
+            (points if n < 3 else colors)[into, n % 3] = values[use[into] - first]
         first = end
     if not np.isfinite(points).all():
         raise InputError("holds a point that is not finite", where=str(path))
-    return Points(points, colours if painted else None, layout.rows)
+    return Points(points, colors if has_colors else None, layout.rows)

@@ -1,4 +1,4 @@
-"""What a result folder shows, as arrays: read from its files, thinned to what a browser bears."""
+"""The content of a result folder as arrays, subsampled to what a browser can draw."""
 
 import json
 import math
@@ -24,14 +24,13 @@ from stillmap.viewer.display import Points, sample_ply
 from stillmap.viewer.tracks import interpolate_pose
 
 MAX_POINTS = {"static": 500_000, "dynamic": 200_000}
-_MOST_SURFACE = 512 << 20  # bytes of mesh.glb
-_MOST_MODELS = 256 << 20  # bytes of the models of objects together
-_MOST_PLACE = 1 << 20  # bytes of objects/NNNN.json
-# m: beyond, float32 has no more millimetres, and all is shown around another origin
-_FAR = 8_000.0
-_GROUND = 0.05  # quantile of the heights near the way: walls reach up, holes are few
-_NEAR = 15.0  # m
-_SHARP = 2_000  # pixels along an edge of the plan: between them a browser draws what is blurred
+_MAX_MESH = 512 << 20  # bytes of mesh.glb
+_MAX_MODELS = 256 << 20  # bytes of all object models
+_MAX_RECORD = 1 << 20  # bytes of objects/NNNN.json
+_MAX_COORDINATE = 8_000.0  # m; beyond it float32 loses millimeters, and the origin is shifted
+_GROUND_QUANTILE = 0.05  # of the heights near the trajectory
+_GROUND_RADIUS = 15.0  # m around the trajectory
+_MIN_IMAGE_SIZE = 2_000  # pixels; browsers blur smaller images
 
 Float = NDArray[np.float64]
 Value = TypeVar("Value")
@@ -39,12 +38,11 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True, eq=False)
 class MapImage:
-    """The map from above.
+    """The 2D map as an image.
 
     Attributes:
-        picture: (h, w, 4) uint8 with an alpha channel, row 0 = highest y; in space clear where
-            nothing is known.
-        window: x0, y0, x1, y1 metres in the map frame.
+        picture: (h, w, 4) uint8 RGBA, row 0 = highest y; in 3D transparent where unknown.
+        window: x0, y0, x1, y1 in m, in the map frame.
     """
 
     picture: NDArray[np.uint8]
@@ -53,8 +51,8 @@ class MapImage:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points (n, 3) float32 around the scene's origin, their colours (n, 3) uint8, and of how many
-    they were taken."""
+    """Points (n, 3) float32 m relative to the scene's origin, colors (n, 3) uint8, and their number
+    before subsampling."""
 
     points: NDArray[np.float32]
     colors: NDArray[np.uint8]
@@ -63,12 +61,12 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What something that moved looks like.
+    """The mesh of a moving object.
 
     Attributes:
         data: the .glb file.
-        T_map_gltf: (4, 4) where it stood, at `stamp_ns`.
-        track: the way it goes.
+        T_map_gltf: (4, 4) pose at `stamp_ns`.
+        track: its track.
     """
 
     data: bytes
@@ -77,11 +75,11 @@ class Model:
     track: Track
 
     def pose_at(self, stamp_ns: int) -> Float:
-        """(4, 4) T_map_gltf at another time: it goes and turns as its track does."""
-        moved = interpolate_pose(self.track, stamp_ns) @ inverse(
+        """T_map_gltf (4, 4) at another time, along the track."""
+        motion = interpolate_pose(self.track, stamp_ns) @ inverse(
             interpolate_pose(self.track, self.stamp_ns)
         )
-        return np.asarray(moved @ self.T_map_gltf)
+        return np.asarray(motion @ self.T_map_gltf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,16 +87,16 @@ class Scene:
     """A result of T scans.
 
     Attributes:
-        name: of its folder.
+        name: name of the folder.
         stamp_ns: (T,).
         poses: (T, 4, 4) T_map_base.
-        plan: None where nothing is known.
-        clouds: by name, those that there are.
-        tracks: what moved.
+        map_image: None for an empty map.
+        clouds: by name: `static`, `dynamic`.
+        tracks: moving objects.
         surface: mesh.glb; None where there is none.
-        models: those of `tracks` that have one.
-        origin: (3,) whole metres in the map frame, around which everything is shown.
-        ground: metres, how high the plan lies.
+        models: of the tracks that have one.
+        origin: (3,) whole m in the map frame; everything is drawn relative to it.
+        ground: height of the map image in m.
         notes: what cannot be shown, and why.
     """
 
@@ -116,13 +114,12 @@ class Scene:
 
     @property
     def is_2d(self) -> bool:
-        """Whether there is nothing but the plane."""
+        """Whether there are neither clouds nor a mesh."""
         return not self.clouds and self.surface is None
 
 
 def read_scene(folder: Path) -> Scene:
-    """What a result folder holds. What is missing is left out; models that cannot be shown are
-    noted.
+    """Read a result folder; optional files may be missing, unusable models are noted.
 
     Raises:
         InputError: map or trajectory are missing, or a file is damaged.
@@ -135,13 +132,13 @@ def read_scene(folder: Path) -> Scene:
         if (folder / f"{name}.ply").exists()
     }
     tracks, notes = read_tracks(folder / "objects" / "objects.json"), list[str]()
-    surface = _noted(notes, _surface, folder / "mesh.glb")
+    surface = _read_or_note(notes, _surface, folder / "mesh.glb")
     models = _models(folder / "objects", tracks, notes)
     return Scene(
         name=folder.resolve().name,
         stamp_ns=stamp_ns,
         poses=poses,
-        map_image=_plan(folder, clear=bool(raw)),
+        map_image=_map_image(folder, transparent=bool(raw)),
         clouds={name: _cloud(name, one, origin) for name, one in raw.items()},
         tracks=tracks,
         surface=surface,
@@ -153,84 +150,85 @@ def read_scene(folder: Path) -> Scene:
 
 
 def _origin(poses: Float) -> Float:
-    places = poses[:, :3, 3]
-    if np.abs(places).max() < _FAR:
+    positions = poses[:, :3, 3]
+    if np.abs(positions).max() < _MAX_COORDINATE:
         return np.zeros(3)
-    return np.asarray(np.round(0.5 * (places.min(axis=0) + places.max(axis=0))))
+    return np.asarray(np.round(0.5 * (positions.min(axis=0) + positions.max(axis=0))))
 
 
-def _plan(folder: Path, clear: bool) -> MapImage | None:
+def _map_image(folder: Path, transparent: bool) -> MapImage | None:
     grid = read_grid(folder)
     if not grid.p_occupied.size:
         return None
     window = map_window([grid])
     picture = np.array(draw_map(grid, window).convert("RGBA"))
-    if clear:  # no shade of grey is that of what is unknown
+    if transparent:
         picture[(picture[..., :3] == UNKNOWN).all(axis=2), 3] = 0
-    larger = max(1, _SHARP // max(picture.shape))
-    return MapImage(picture.repeat(larger, axis=0).repeat(larger, axis=1), window)
+    scale = max(1, _MIN_IMAGE_SIZE // max(picture.shape))
+    return MapImage(picture.repeat(scale, axis=0).repeat(scale, axis=1), window)
 
 
 def _cloud(name: str, raw: Points, origin: Float) -> Cloud:
-    painted = raw.colors
-    if painted is None:
-        painted = np.empty((len(raw.points), 3), np.uint8)
-        painted[:] = ORANGE
+    colors = raw.colors
+    if colors is None:
+        colors = np.empty((len(raw.points), 3), np.uint8)
+        colors[:] = ORANGE
         if name == "static" and len(raw.points):
             z = raw.points[:, 2]
-            painted = display.color_by_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
-    elif name == "dynamic":  # grey would be taken for a part of the place
-        painted[(painted == GRAY).all(axis=1)] = ORANGE
-    return Cloud((raw.points - origin).astype(np.float32), painted, raw.total)
+            colors = display.color_by_height(z, *np.quantile(z, [0.02, 0.98]).tolist())
+    elif name == "dynamic":  # uncolored points; grey would look static
+        colors[(colors == GRAY).all(axis=1)] = ORANGE
+    return Cloud((raw.points - origin).astype(np.float32), colors, raw.total)
 
 
 def _ground(static: Points | None, poses: Float) -> float:
-    """How high the floor is along the way, by what stands around it."""
+    """Height of the floor in m, from the static points around the trajectory."""
     if static is None or not len(static.points):
         return 0.0
     low, high = (f(poses[:, :2, 3], axis=0) for f in (np.min, np.max))
-    near = ((static.points[:, :2] > low - _NEAR) & (static.points[:, :2] < high + _NEAR)).all(
-        axis=1
-    )
+    near = (
+        (static.points[:, :2] > low - _GROUND_RADIUS)
+        & (static.points[:, :2] < high + _GROUND_RADIUS)
+    ).all(axis=1)
     z = static.points[near, 2]
-    return float(np.quantile(z, _GROUND)) if len(z) else 0.0
+    return float(np.quantile(z, _GROUND_QUANTILE)) if len(z) else 0.0
 
 
 def _surface(path: Path) -> bytes | None:
-    return gltf.read_glb(path, _MOST_SURFACE) if path.exists() else None
+    return gltf.read_glb(path, _MAX_MESH) if path.exists() else None
 
 
 def _models(folder: Path, tracks: list[Track], notes: list[str]) -> list[Model]:
-    """Of those seen for longest first, as many as may be sent."""
-    models, left = list[Model](), _MOST_MODELS
+    """The models of the longest tracks, up to `_MAX_MODELS` bytes."""
+    models, left = list[Model](), _MAX_MODELS
     for track in sorted(tracks, key=lambda one: int(one.stamp_ns[0] - one.stamp_ns[-1])):
         path = folder / f"{track.id:04d}.glb"
         if path.exists():
-            model = _noted(notes, _model, path, track, left)
+            model = _read_or_note(notes, _model, path, track, left)
             if model is not None:
                 models.append(model)
                 left -= len(model.data)
     return models
 
 
-def _model(path: Path, track: Track, most: int) -> Model:
-    data = gltf.read_glb(path, most)
-    place = path.with_suffix(".json")
+def _model(path: Path, track: Track, max_bytes: int) -> Model:
+    data = gltf.read_glb(path, max_bytes)
+    record_path = path.with_suffix(".json")
     try:
-        record = json.loads(read_text(place, _MOST_PLACE))
+        record = json.loads(read_text(record_path, _MAX_RECORD))
         T = np.array(record["T_map_object"], np.float64).reshape(4, 4)
         stamp_ns = int(record["stamp_ns"])
     except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
-        raise InputError(f"is damaged: {error!r}", where=str(place)) from error
+        raise InputError(f"is damaged: {error!r}", where=str(record_path)) from error
     if not np.isfinite(T).all() or not math.isclose(np.linalg.det(T), 1.0, abs_tol=1e-3):
-        raise InputError("T_map_object is no pose", where=str(place))
+        raise InputError("T_map_object is not a pose", where=str(record_path))
     return Model(data, T @ gltf.MAP_FROM_GLTF, stamp_ns, track)
 
 
-def _noted(notes: list[str], read: Callable[..., Value], *words: object) -> Value | None:
-    """What cannot be shown is said, and the rest is."""
+def _read_or_note(notes: list[str], read: Callable[..., Value], *arguments: object) -> Value | None:
+    """The value of `read(*arguments)`, or None with an InputError appended to `notes`."""
     try:
-        return read(*words)
+        return read(*arguments)
     except InputError as error:
         notes.append(str(error))
         return None

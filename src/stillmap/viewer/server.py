@@ -1,11 +1,8 @@
-"""A server of viser's that only this machine reaches, and whose page reaches nothing else.
+"""A viser server for this machine only.
 
-Who may look, and what the page may reach: this machine, and nothing else.
-
-A port on loopback can be reached by every page in every browser of the machine. A page from
-elsewhere says so in `Origin`, and one whose name was turned to 127.0.0.1 says it in `Host`.
-
-What is changed of viser's page before it is sent.
+Every page in a browser of the machine can reach a port of the loopback interface. Requests of other
+pages are recognized by `Origin`, DNS rebinding by `Host`; a content security policy keeps the page
+itself from requests to elsewhere.
 """
 
 import gzip
@@ -25,28 +22,27 @@ from stillmap.core.errors import InputError
 
 HOST = "127.0.0.1"
 
-# any port: a tunnel may end in another one
-_OWN = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
+# any port: a tunnel may use another one
+_LOCAL_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
 
 
 def is_local_request(headers: Mapping[str, str]) -> bool:
-    """Whether a request was meant for this machine, and comes from this page or from none."""
+    """Whether a request addresses this machine and comes from its own page or from no page."""
     host, origin = headers.get("Host", ""), headers.get("Origin")
-    if not _OWN.fullmatch(host):
+    if not _LOCAL_HOST.fullmatch(host):
         return False
     return origin is None or origin == f"http://{host}"
 
 
 def content_security_policy(host: str) -> str:
-    """The `Content-Security-Policy` of the page at `host`, one of ours: a browser lets it reach
-    nothing but where it came from."""
-    own = "'self' data: blob:"
+    """The `Content-Security-Policy` of the page at `host`: requests to its own server only."""
+    local = "'self' data: blob:"
     return "; ".join(
         (
-            f"default-src {own} 'unsafe-inline'",
-            # its kernels are WebAssembly, and all its parts lie in one page
-            f"script-src {own} 'unsafe-inline' 'unsafe-eval'",
-            f"connect-src {own} ws://{host}",
+            f"default-src {local} 'unsafe-inline'",
+            # viser uses WebAssembly and inline scripts
+            f"script-src {local} 'unsafe-inline' 'unsafe-eval'",
+            f"connect-src {local} ws://{host}",
             "frame-ancestors 'none'",
             "form-action 'none'",
             "base-uri 'none'",
@@ -54,11 +50,9 @@ def content_security_policy(host: str) -> str:
     )
 
 
-_HEAD = b"<head>"
-
-# viser gives no choice: what its meshes are drawn with goes through a film's curve (ACES), which
-# darkens and greys what was photographed. three.js asks for it by a word in each shader.
-_AS_THEY_ARE = b"""<script>{
+# viser applies ACES filmic tone mapping to meshes, which darkens photographs, and has no option for
+# it; three.js switches it on by a macro in each shader
+_DISABLE_TONE_MAPPING = b"""<script>{
   const drawing = WebGL2RenderingContext.prototype, plain = drawing.shaderSource;
   drawing.shaderSource = function (shader, text) {
     plain.call(this, shader, text.replace("#define TONE_MAPPING", ""));
@@ -67,26 +61,26 @@ _AS_THEY_ARE = b"""<script>{
 
 
 def disable_tone_mapping(response: Any) -> None:
-    """Let a page of viser's show colours as they were sent; anything else is left as it is.
+    """Insert the script into viser's page, in place; other responses stay unchanged.
 
     Args:
-        response: of `websockets`, with `headers` and `body`; both are changed.
+        response: of `websockets`, with `headers` and `body`.
     """
     if not response.headers.get("Content-Type", "").startswith("text/html"):
         return
     packed = response.headers.get("Content-Encoding") == "gzip"
     body = gzip.decompress(response.body) if packed else response.body
-    body = body.replace(_HEAD, _HEAD + _AS_THEY_ARE, 1)
+    body = body.replace(b"<head>", b"<head>" + _DISABLE_TONE_MAPPING, 1)
     response.body = gzip.compress(body, 6) if packed else body
     del response.headers["Content-Length"]
     response.headers["Content-Length"] = str(len(response.body))
 
 
-_OWN_PORT = "_VISER_PORT_OVERRIDE"  # a variable that would tell viser another port
+_PORT_VARIABLE = "_VISER_PORT_OVERRIDE"  # environment variable that overrides viser's port
 
 
 class Server(viser.ViserServer):
-    """Without the address for others that viser's own has: it would ask for one far away."""
+    """Without sharing of the page through a remote server."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         del verbose
@@ -94,27 +88,27 @@ class Server(viser.ViserServer):
 
 
 def start_server(port: int, label: str) -> Server:
-    """A server at a port of 127.0.0.1; 0: any that is free.
+    """Start a server at a port of 127.0.0.1; 0: any free one.
 
     Raises:
         InputError: the port is taken.
     """
     console = rich.get_console()
-    quiet, console.quiet = console.quiet, True  # viser prints where it is
-    # it tells of every request that makes no sense, with a trace
+    quiet, console.quiet = console.quiet, True  # viser prints its address
+    # websockets logs malformed requests with a traceback
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
-    told = os.environ.pop(_OWN_PORT, None)
+    port_override = os.environ.pop(_PORT_VARIABLE, None)
     try:
-        with _guarded() as asked:
+        with _guard_servers() as ports:
             server = Server(HOST, port, label=label, verbose=False)
     finally:
         console.quiet = quiet
-        if told is not None:
-            os.environ[_OWN_PORT] = told
-    if not asked:
+        if port_override is not None:
+            os.environ[_PORT_VARIABLE] = port_override
+    if not ports:
         stop_server(server)
-        raise RuntimeError("this version of viser does not start its server as we know it")
-    if port not in (0, server.get_port()):  # viser took the next one
+        raise RuntimeError("this version of viser does not use websockets.asyncio.server.serve")
+    if port not in (0, server.get_port()):  # viser has taken the next free one
         stop_server(server)
         raise InputError(f"--port {port} is taken", hint="without --port any free one is used")
     server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -122,7 +116,7 @@ def start_server(port: int, label: str) -> Server:
 
 
 def stop_server(server: Server) -> None:
-    """Close it, its connections and threads."""
+    """Stop a server, its connections and threads."""
     console = rich.get_console()
     quiet, console.quiet = console.quiet, True
     try:
@@ -132,14 +126,13 @@ def stop_server(server: Server) -> None:
 
 
 @contextmanager
-def _guarded() -> Iterator[list[int]]:
-    """A server that is started meanwhile answers only what is ours, and says what its page may
-    reach; a number per server that was."""
-    module, asked = websockets.asyncio.server, list[int]()
-    plain = module.serve
+def _guard_servers() -> Iterator[list[int]]:
+    """Within the context, new servers check requests and send the policy; yields their ports."""
+    module, ports = websockets.asyncio.server, list[int]()
+    original = module.serve
 
-    def serve(handler: Any, host: str, port: int, *, process_request: Any, **more: Any) -> Any:
-        asked.append(port)
+    def serve(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
+        ports.append(port)
 
         def answer(connection: Any, request: Any) -> Any:
             if not is_local_request(request.headers):
@@ -152,10 +145,10 @@ def _guarded() -> Iterator[list[int]]:
                 )
             return response
 
-        return plain(handler, host, port, process_request=answer, **more)
+        return original(handler, host, port, process_request=answer, **options)
 
     module.serve = serve  # type: ignore[assignment, misc]
     try:
-        yield asked
+        yield ports
     finally:
-        module.serve = plain  # type: ignore[misc]
+        module.serve = original  # type: ignore[misc]

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from stillmap.em import OccupancyMap
-from stillmap.pipeline.snapshots import Snapshot, Window, cut, cut_layer, extent
+from stillmap.pipeline.snapshots import GridMap, Snapshot, Window, cut, cut_layer, extent
 from stillmap.results.map_server import OCCUPIED_THRESH
 from stillmap.results.report.curves import round_down
 
@@ -40,7 +39,7 @@ class MapView:
     reduced: bool
 
     @classmethod
-    def of(cls, maps: Sequence[OccupancyMap]) -> Self:
+    def of(cls, maps: Sequence[GridMap]) -> Self:
         """The view of `draw_map` of any of `maps` in the window that contains them all."""
         window, resolution = map_window(maps), maps[0].resolution
         factor = _reduction(window, resolution)
@@ -66,7 +65,7 @@ class MapView:
         return " ".join(f"{x:.1f},{y:.1f}" for x, y in self.to_pixels(points).tolist())
 
 
-def map_window(maps: Sequence[OccupancyMap]) -> Window:
+def map_window(maps: Sequence[GridMap]) -> Window:
     """The smallest window that contains every occupied cell of `maps`, with a margin.
 
     Without occupied cells: every known cell; without known cells: the whole first map.
@@ -81,7 +80,7 @@ def map_window(maps: Sequence[OccupancyMap]) -> Window:
     return extent(maps[0])
 
 
-def draw_map(occupancy: OccupancyMap, window: Window) -> Image.Image:
+def draw_map(occupancy: GridMap, window: Window) -> Image.Image:
     """White free, grey unknown, black occupied; large maps are reduced to `_MAX_PIXELS`."""
     cells, _ = cut(occupancy, window)
     factor = _reduction(window, occupancy.resolution)
@@ -89,7 +88,7 @@ def draw_map(occupancy: OccupancyMap, window: Window) -> Image.Image:
 
 
 def draw_thinly_observed(
-    occupancy: OccupancyMap, thin: NDArray[np.bool_], window: Window
+    occupancy: GridMap, thin: NDArray[np.bool_], window: Window
 ) -> Image.Image:
     """Thinly observed cells (H, W) in violet, as a layer over the `draw_map` of the window."""
     factor = _reduction(window, occupancy.resolution)
@@ -121,17 +120,9 @@ def draw_snapshot(snapshot: Snapshot) -> Image.Image:
     levels = _levels(snapshot.p_occupied, max(1, math.ceil(longest / _SNAPSHOT_PIXELS)))[::-1]
     larger = max(1, _SNAPSHOT_PIXELS // max(levels.shape))
     pixels = levels.repeat(larger, axis=0).repeat(larger, axis=1)
-    window = snapshot_window(snapshot)
-    column, row = map_to_pixels(snapshot.dynamic_points, window, pixels.shape[::-1]).T
+    column, row = map_to_pixels(snapshot.dynamic_points, extent(snapshot), pixels.shape[::-1]).T
     _put_dots(pixels, column, row, _ORANGE_INDEX, 3)
     return _with_palette(pixels)
-
-
-def snapshot_window(snapshot: Snapshot) -> Window:
-    """The window of a snapshot in m, in the map frame."""
-    h, w = snapshot.p_occupied.shape
-    x, y, _ = snapshot.origin
-    return x, y, x + w * snapshot.resolution, y + h * snapshot.resolution
 
 
 def map_to_pixels(
@@ -152,15 +143,15 @@ def png_uri(image: Image.Image) -> str:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _occupied(occupancy: OccupancyMap) -> NDArray[np.bool_]:
-    return occupancy.p_occupied > OCCUPIED_THRESH
+def _occupied(occupancy: GridMap) -> NDArray[np.bool_]:
+    return np.asarray(occupancy.p_occupied > OCCUPIED_THRESH)
 
 
-def _known(occupancy: OccupancyMap) -> NDArray[np.bool_]:
-    return ~np.isnan(occupancy.p_occupied)
+def _known(occupancy: GridMap) -> NDArray[np.bool_]:
+    return np.asarray(~np.isnan(occupancy.p_occupied))
 
 
-def _box(occupancy: OccupancyMap, cells: NDArray[np.bool_]) -> Window | None:
+def _box(occupancy: GridMap, cells: NDArray[np.bool_]) -> Window | None:
     """The window around the given cells, with a margin of 4 cells and 1/20 of its length."""
     rows, columns = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
     if not len(rows):

@@ -12,7 +12,7 @@ from stillmap.core import se2
 from stillmap.mapping import Change
 from stillmap.mapping.beam_statistics import sample_dynamic_points
 from stillmap.pipeline.result import MappingResult
-from stillmap.pipeline.snapshots import Snapshot
+from stillmap.pipeline.snapshots import Snapshot, extent
 from stillmap.results.map_npz import CHANGED, changed_cells, known_area
 from stillmap.results.report.figures import (
     MapView,
@@ -21,7 +21,6 @@ from stillmap.results.report.figures import (
     draw_snapshot,
     draw_thinly_observed,
     png_uri,
-    snapshot_window,
 )
 
 _MAX_PATH_POINTS = 3000
@@ -128,7 +127,7 @@ def evolution_data(result: MappingResult) -> dict[str, Any] | None:
             {
                 "number": one.number,
                 "dynamic": len(one.dynamic_points),
-                "view": MapView(snapshot_window(one), (image := draw_snapshot(one)).size, False),
+                "view": MapView(extent(one), (image := draw_snapshot(one)).size, False),
                 "image": png_uri(image),
             }
             for one in snapshots
