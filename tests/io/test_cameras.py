@@ -182,7 +182,7 @@ def test_a_centre_that_the_recording_has_wrong_is_doubted_once(drive, tmp_path):
 def test_a_recording_without_pictures_says_so(drive, file):
     for picture in (drive / "image_2").iterdir():
         picture.unlink()
-    with pytest.raises(InputError, match="the recording has no pictures; folder"):
+    with pytest.raises(InputError, match="the recording has no images; folder"):
         with_cameras(drive, file("[image_2]\n"))
 
 

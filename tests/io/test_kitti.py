@@ -173,7 +173,7 @@ def test_damaged_sweeps_are_skipped_and_counted(folder):
     assert skipped == {
         "is truncated": [2],
         "is empty": [4],
-        "has no time": [5, 8],
+        "has no stamp": [5, 8],
         "is no regular file": [7],
     }
     assert "skipped 5 of 8: 000001.bin" in found.source["warnings"][-1]
@@ -195,7 +195,7 @@ def test_nothing_that_can_be_read(folder):
         read(folder)
     for file in (folder / "velodyne").iterdir():
         file.unlink()
-    with pytest.raises(InputError, match="no sweep"):
+    with pytest.raises(InputError, match="no scan"):
         read(folder)
     (folder / "times.txt").unlink()
     (folder / "velodyne" / "0.bin").write_bytes(sweep())
@@ -213,7 +213,7 @@ def test_which_time_is_whose(tmp_path):
     assert rows(["000100", "000101"], 2) == [0, 1]  # a piece of a longer drive
     assert rows(["a", "b"], 2) == [0, 1]
     for names, n in ((["a", "b"], 3), (["000100", "000101"], 3), (["a"], 0)):
-        with pytest.raises(InputError, match=f"has {n} times for {len(names)} files"):
+        with pytest.raises(InputError, match=f"has {n} stamps for {len(names)} files"):
             rows(names, n)
 
 

@@ -1,4 +1,4 @@
-"""What bags may do to a reader, and what it answers: one line, or what was skipped."""
+"""Damaged bags: an error of one line, or skipped messages."""
 
 import bz2
 import shutil
@@ -56,7 +56,7 @@ def test_cut(bag, messages, kind, share):
     np.testing.assert_allclose(got, 2.0 + 0.05 * k, rtol=1e-6)
 
 
-def test_bits_that_flipped_in_the_middle(bag, messages, rng):
+def test_flipped_bits(bag, messages, rng):
     path = bag(scans_of(messages, 200))
     file = file_of(path)
     content = bytearray(file.read_bytes())
@@ -67,7 +67,7 @@ def test_bits_that_flipped_in_the_middle(bag, messages, rng):
 
 
 def test_no_index(bag, messages, kind):
-    """A recorder that was killed leaves no index behind."""
+    """As a killed recorder leaves a bag."""
     if kind != "bag":
         pytest.skip("ROS 1 alone")
     path = bag(scans_of(messages, 20))
@@ -77,7 +77,7 @@ def test_no_index(bag, messages, kind):
     assert read(path).n_scans == 20
 
 
-def test_wrong_lengths_within_messages(bag, messages):
+def test_wrong_array_lengths(bag, messages):
     content = scans_of(messages, 6)
     kind, message = content[3][2]
     raw = messages.raw(kind, message)
@@ -100,7 +100,7 @@ def test_wrong_lengths_within_messages(bag, messages):
         ({"angle_increment": 0.1}, laser_scan.MANY_TURNS),
     ],
 )
-def test_angles_that_cannot_be(bag, messages, changes, reason):
+def test_implausible_angles(bag, messages, changes, reason):
     content = scans_of(messages, 4)
     kind, message = content[2][2]
     for name, value in changes.items():
@@ -121,7 +121,7 @@ def test_numbers_of_beams_may_vary(bag, messages):
     assert skipped(recording) == {laser_scan.NO_READINGS: 1}
 
 
-def test_stamps_that_run_backwards_and_repeat(bag, messages):
+def test_decreasing_and_repeated_stamps(bag, messages):
     stamps = [0, 1, 2, 2, 9, 3, 3, 4]
     readings = [1.0, 2.0, 3.0, 3.0, 4.0, 5.0, 6.0, 7.0]
     content = [
@@ -142,7 +142,7 @@ def test_headers_without_stamps(bag, messages):
     assert "log times are used" in recording.source["warnings"][0]
 
 
-def test_transforms_that_are_none(bag, messages):
+def test_invalid_transforms(bag, messages):
     content = scans_of(messages, 3)
     bad = [
         messages.transform(START, "odom", "base_link", (np.nan, 0, 0)),
@@ -156,7 +156,7 @@ def test_transforms_that_are_none(bag, messages):
     assert recording.source["skipped_odometry"]["transform that is none"]["count"] == 4
 
 
-def test_frames_in_a_circle(bag, messages):
+def test_cyclic_frames(bag, messages):
     content = scans_of(messages, 3)
     circle = [messages.transform(0, a, b, (1, 0, 0)) for a, b in (("laser", "x"), ("x", "laser"))]
     content.append(("/tf_static", START, messages.tf(*circle)))
@@ -176,7 +176,7 @@ def test_only_empty_topics(bag, messages, kind):
 
 
 @pytest.mark.parametrize("packing", ["bz2", "lz4"])
-def test_packed_chunks(tmp_path, packing):
+def test_compressed_chunks(tmp_path, packing):
     from rosbags.rosbag1 import Writer
 
     messages = Messages("ros1")
@@ -190,7 +190,7 @@ def test_packed_chunks(tmp_path, packing):
 @pytest.mark.parametrize(
     ("kind", "mode"), [("folder", "MESSAGE"), ("folder", "FILE"), ("mcap", "STORAGE")]
 )
-def test_packed_ros2(tmp_path, kind, mode):
+def test_compressed_ros2(tmp_path, kind, mode):
     from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
     messages = Messages("cdr")
@@ -205,7 +205,7 @@ def test_packed_ros2(tmp_path, kind, mode):
     assert read(path).n_scans == 20
 
 
-def test_a_folder_without_metadata(bag, messages, kind):
+def test_folder_without_metadata(bag, messages, kind):
     if kind != "folder":
         pytest.skip("folders alone")
     path = bag(scans_of(messages, 5))
@@ -213,7 +213,7 @@ def test_a_folder_without_metadata(bag, messages, kind):
     assert read(path).n_scans == 5
 
 
-def test_a_folder_that_lacks_a_file(bag, messages, kind):
+def test_folder_with_a_missing_file(bag, messages, kind):
     if kind != "folder":
         pytest.skip("folders alone")
     path = bag(scans_of(messages, 5))
@@ -223,7 +223,7 @@ def test_a_folder_that_lacks_a_file(bag, messages, kind):
         read(path)
 
 
-def test_names_that_addresses_would_misread(bag, messages):
+def test_file_names_with_uri_characters(bag, messages):
     path = bag(scans_of(messages, 5))
     odd = path.rename(path.with_name(f"a%20b?c#d{path.suffix}"))
     assert read(odd).n_scans == 5
@@ -255,7 +255,7 @@ def test_decompression_bombs(decompress, monkeypatch):
         (b"\0\1\2\3", "is binary, no recording"),
     ],
 )
-def test_files_that_are_no_bags(tmp_path, content, text):
+def test_other_files(tmp_path, content, text):
     path = tmp_path / "odd.bag"
     path.write_bytes(content)
     with pytest.raises(InputError, match=text) as caught:

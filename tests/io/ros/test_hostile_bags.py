@@ -1,4 +1,4 @@
-"""Bags that would keep their reader for ever, fill its memory, or break it."""
+"""Hostile bags: endless, exhausting memory, or crashing their reader."""
 
 import bz2
 import os
@@ -41,7 +41,7 @@ def db3(tmp_path):
 
 
 @pytest.mark.parametrize("place", [(np.nan, 0, 0), (1, np.nan, 0), (0, 0, np.inf), (1e300, 0, 0)])
-def test_places_that_are_none(bag, messages, place):
+def test_invalid_poses(bag, messages, place):
     turn = (0.0, 0.0, 0.0, 1.0)
     content = scans_of(messages)
     for k, xyz in enumerate([place, (1, 2, 0), place]):
@@ -72,7 +72,7 @@ def test_places_that_are_none(bag, messages, place):
         "timestamp INTEGER, data AS (zeroblob(900000000)))",
     ],
 )
-def test_tables_that_are_none(db3, script):
+def test_invalid_tables(db3, script):
     with pytest.raises(InputError, match=r"is no bag: its .* are no plain table"):
         read(db3(script))
 
@@ -90,7 +90,7 @@ def test_values_of_other_types(db3):
             read(db3(f"UPDATE topics SET {column} = x'00ff'"))
 
 
-def test_tree_in_which_one_page_stands_for_millions(db3, monkeypatch):
+def test_tree_with_a_shared_page(db3, monkeypatch):
     monkeypatch.setattr(limits, "_MIN_STEPS", 0)
     monkeypatch.setattr(limits, "_STEPS_PER_BYTE", 3)
     path, size = db3(), 4096
@@ -133,7 +133,7 @@ def _chunk(content: bytes) -> bytes:
     return _record(fields, bz2.compress(content))
 
 
-def test_chunks_in_chunks(tmp_path):
+def test_nested_chunks(tmp_path):
     content = b""
     for _ in range(12):
         content = _chunk(content * 20)
@@ -142,14 +142,14 @@ def test_chunks_in_chunks(tmp_path):
         read(tmp_path / "a.bag")
 
 
-def test_parts_that_unpack_to_too_much(tmp_path, monkeypatch):
+def test_output_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(limits, "_MIN_LIMIT", 1 << 20)
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + _chunk(b"\0" * (1 << 20)) * 30)
     with pytest.raises(InputError, match="more than 300 times its size"):
         read(tmp_path / "a.bag")
 
 
-def test_index_that_names_one_message_many_times(tmp_path, monkeypatch):
+def test_repeating_index(tmp_path, monkeypatch):
     monkeypatch.setattr(limits, "_MIN_LIMIT", 1 << 20)
     monkeypatch.setattr(limits, "_MAX_RATIO", 10)
     messages = Messages("ros1")
@@ -171,7 +171,7 @@ def test_index_that_names_one_message_many_times(tmp_path, monkeypatch):
         read(path)
 
 
-def test_recorded_after_the_end_of_time(tmp_path):
+def test_log_time_beyond_64_bits(tmp_path):
     messages = Messages("cdr")
     path = write_bag(tmp_path, "mcap", messages, scans_of(messages))
     late = struct.pack("<Q", START + 1), struct.pack("<Q", 2**64 - 1)
@@ -182,7 +182,7 @@ def test_recorded_after_the_end_of_time(tmp_path):
     assert read(path).n_scans == 3
 
 
-def test_list_in_a_list_in_a_list(tmp_path):
+def test_recursive_metadata(tmp_path):
     messages = Messages("cdr")
     path = write_bag(tmp_path, "folder", messages, scans_of(messages))
     lines = ["a0: &a0 [x, x]"]

@@ -1,4 +1,4 @@
-"""Point clouds and pictures in bags."""
+"""Point clouds and images in bags."""
 
 import io
 
@@ -100,7 +100,7 @@ def test_fields_in_any_order_with_gaps(bag, messages, rng):
         assert recording.hit[recording.beams_of(scan)].sum() == 11
 
 
-def test_when_points_were_taken(bag, messages, rng):
+def test_point_times(bag, messages, rng):
     x, y, z = xyz(rng)
     after = np.linspace(0.0, 0.1, 12)
     times = [
@@ -139,7 +139,7 @@ def test_damaged_clouds_are_counted(bag, messages, rng):
     assert found == {point_cloud2.WRONG_SIZE: 5, point_cloud2.NO_COORDINATES: 1}
 
 
-def test_points_that_nothing_can_see(bag, messages, rng):
+def test_implausible_points_are_unusable(bag, messages, rng):
     x, y, z = xyz(rng)
     x[3], y[4], z[5] = 1e30, -3e38, 2e5
     x[6] = y[6] = z[6] = 3e38  # its distance is no float32
@@ -152,7 +152,7 @@ def test_points_that_nothing_can_see(bag, messages, rng):
         assert facts(recording)["counts"]["unusable"] == 4
 
 
-def test_places_of_lidars_and_odometry(bag, messages, rng):
+def test_extrinsics_and_odometry(bag, messages, rng):
     x, y, z = xyz(rng)
     columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
     mounts = [
@@ -174,7 +174,7 @@ def test_places_of_lidars_and_odometry(bag, messages, rng):
     np.testing.assert_allclose(recording.T_odom_base[::2, 2, 3], 0.1 * np.arange(4), atol=1e-9)
 
 
-def test_scans_of_lasers_come_first(bag, messages, rng):
+def test_laser_scans_are_preferred(bag, messages, rng):
     x, y, z = xyz(rng)
     columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
     content = [
@@ -187,7 +187,7 @@ def test_scans_of_lasers_come_first(bag, messages, rng):
     assert why["/points"].startswith("not used: the laser scans are")
 
 
-def picture(messages, stamp, pixels, encoding, row_bytes=None, **changes):
+def image_message(messages, stamp, pixels, encoding, row_bytes=None, **changes):
     height, width = pixels.shape[:2]
     row = pixels.reshape(height, -1).view(np.uint8)
     step = row_bytes or row.shape[1]
@@ -199,7 +199,7 @@ def picture(messages, stamp, pixels, encoding, row_bytes=None, **changes):
     return kind, messages.make(kind, messages.header(stamp, "camera"), **stated)
 
 
-def with_pictures(messages, rng, pictures):
+def bag_with_images(messages, rng, pictures):
     x, y, z = xyz(rng)
     columns = [("x", FLOAT, x), ("y", FLOAT, y), ("z", FLOAT, z)]
     mounts = [
@@ -212,7 +212,7 @@ def with_pictures(messages, rng, pictures):
     return content + pictures
 
 
-def test_pictures_are_read_when_asked_for(bag, messages, rng):
+def test_images_are_decoded_on_demand(bag, messages, rng):
     colours = rng.integers(0, 256, (6, 4, 3), np.uint8)
     grey = rng.integers(0, 256, (6, 4), np.uint8)
     depth = rng.integers(0, 5000, (6, 4), np.uint16)
@@ -225,17 +225,17 @@ def test_pictures_are_read_when_asked_for(bag, messages, rng):
         np.frombuffer(stream.getvalue(), np.uint8),
     )
     pictures = [
-        ("/cam/image", START + 1, picture(messages, START + 1, colours, "rgb8")),
+        ("/cam/image", START + 1, image_message(messages, START + 1, colours, "rgb8")),
         (
             "/cam/image",
             START + 2,
-            picture(messages, START + 2, colours[..., ::-1].copy(), "bgr8", 20),
+            image_message(messages, START + 2, colours[..., ::-1].copy(), "bgr8", 20),
         ),
-        ("/grey/image", START + 3, picture(messages, START + 3, grey, "mono8")),
+        ("/grey/image", START + 3, image_message(messages, START + 3, grey, "mono8")),
         ("/other/image/compressed", START + 4, ("sensor_msgs/msg/CompressedImage", packed)),
-        ("/depth/image", START + 5, picture(messages, START + 5, depth, "16UC1")),
+        ("/depth/image", START + 5, image_message(messages, START + 5, depth, "16UC1")),
     ]
-    images = read(bag(with_pictures(messages, rng, pictures))).images
+    images = read(bag(bag_with_images(messages, rng, pictures))).images
     assert images is not None
     np.testing.assert_array_equal(images.stamp_ns, START + np.arange(1, 6))
     for number, expected in enumerate((colours, colours, grey, colours, depth)):
@@ -246,10 +246,10 @@ def test_pictures_are_read_when_asked_for(bag, messages, rng):
     np.testing.assert_allclose(T[:3, 3], [0.1, 0.2, 0.3])
 
 
-def test_pictures_of_unknown_encoding(bag, messages, rng):
+def test_unknown_image_encoding(bag, messages, rng):
     grey = rng.integers(0, 256, (6, 4), np.uint8)
-    pictures = [("/cam/image", START + 1, picture(messages, START + 1, grey, "yuv999"))]
-    images = read(bag(with_pictures(messages, rng, pictures))).images
+    pictures = [("/cam/image", START + 1, image_message(messages, START + 1, grey, "yuv999"))]
+    images = read(bag(bag_with_images(messages, rng, pictures))).images
     with pytest.raises(InputError, match="'yuv999', which is not read"):
         images.read(0)
 
@@ -257,22 +257,26 @@ def test_pictures_of_unknown_encoding(bag, messages, rng):
 @pytest.mark.parametrize(
     "changes", [{"height": 2**20}, {"step": 1}, {"row_bytes": 5, "width": 6}, {"width": 2**31}]
 )
-def test_damaged_pictures(bag, messages, rng, changes):
+def test_damaged_images(bag, messages, rng, changes):
     grey = rng.integers(0, 256, (6, 4), np.uint8)
-    pictures = [("/cam/image", START + 1, picture(messages, START + 1, grey, "mono8", **changes))]
-    images = read(bag(with_pictures(messages, rng, pictures))).images
+    pictures = [
+        ("/cam/image", START + 1, image_message(messages, START + 1, grey, "mono8", **changes))
+    ]
+    images = read(bag(bag_with_images(messages, rng, pictures))).images
     with pytest.raises(InputError, match="a picture is"):
         images.read(0)
 
 
 def test_bayer(bag, messages, rng):
     mosaic = np.array([[10, 20], [40, 30]], np.uint8)  # red, green, green, blue
-    pictures = [("/cam/image", START + 1, picture(messages, START + 1, mosaic, "bayer_rggb8"))]
-    images = read(bag(with_pictures(messages, rng, pictures))).images
+    pictures = [
+        ("/cam/image", START + 1, image_message(messages, START + 1, mosaic, "bayer_rggb8"))
+    ]
+    images = read(bag(bag_with_images(messages, rng, pictures))).images
     np.testing.assert_array_equal(images.read(0), np.full((2, 2, 3), [10, 30, 30]))
 
 
-def test_where_a_camera_looks_through(bag, messages, rng):
+def test_camera_calibration(bag, messages, rng):
     grey = rng.integers(0, 256, (6, 4), np.uint8)
     kind = "sensor_msgs/msg/CameraInfo"
     region = messages.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
@@ -287,16 +291,16 @@ def test_where_a_camera_looks_through(bag, messages, rng):
     )
     pictures = [
         ("/cam/camera_info", START, (kind, info)),
-        ("/cam/image_raw", START + 1, picture(messages, START + 1, grey, "mono8")),
+        ("/cam/image_raw", START + 1, image_message(messages, START + 1, grey, "mono8")),
     ]
-    camera = read(bag(with_pictures(messages, rng, pictures))).images.cameras[0]
+    camera = read(bag(bag_with_images(messages, rng, pictures))).images.cameras[0]
     np.testing.assert_array_equal(camera.K, [[9, 0, 2], [0, 9, 3], [0, 0, 1]])
     assert camera.model == "plumb_bob"
     np.testing.assert_array_equal(camera.distortion, np.arange(5.0))
 
 
 @pytest.mark.parametrize("name", ["image_rect", "image_rect_color"])
-def test_rectified_pictures_have_their_own_camera(bag, messages, rng, name):
+def test_rectified_images_use_the_projection_matrix(bag, messages, rng, name):
     grey = rng.integers(0, 256, (6, 4), np.uint8)
     kind = "sensor_msgs/msg/CameraInfo"
     region = messages.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
@@ -307,9 +311,9 @@ def test_rectified_pictures_have_their_own_camera(bag, messages, rng, name):
     info = messages.make(kind, messages.header(START, "camera"), 6, 4, *values)
     pictures = [
         ("/cam/camera_info", START, (kind, info)),
-        (f"/cam/{name}", START + 1, picture(messages, START + 1, grey, "mono8")),
+        (f"/cam/{name}", START + 1, image_message(messages, START + 1, grey, "mono8")),
     ]
-    camera = read(bag(with_pictures(messages, rng, pictures))).images.cameras[0]
+    camera = read(bag(bag_with_images(messages, rng, pictures))).images.cameras[0]
     np.testing.assert_array_equal(camera.K, [[8, 0, 2.5], [0, 8, 3.5], [0, 0, 1]])
     assert (camera.model, len(camera.distortion)) == ("", 0)
     # what the camera saw ahead, the rectified one sees turned

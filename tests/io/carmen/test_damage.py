@@ -62,19 +62,19 @@ def test_pose_not_finite(read_log, flaser, bad):
     assert lines_of(recording, "pose not finite") == [2]
 
 
-def test_stamp_that_jumps_ahead_costs_one_scan(read_log, flaser):
+def test_stamp_jumping_ahead(read_log, flaser):
     stamps = [1, 2, 3, 900, 4, 5, 5, 6]
     recording = read_log([flaser(stamp) for stamp in stamps])
     assert (recording.stamp_ns // 10**9).tolist() == [1, 2, 3, 4, 5, 5, 6]
     assert lines_of(recording, "time running backwards") == [4]
 
 
-def test_stamp_that_jumps_back_costs_one_scan(read_log, flaser):
+def test_stamp_jumping_back(read_log, flaser):
     recording = read_log([flaser(stamp) for stamp in [1, 2, 3, 0.5, 4, 5]])
     assert lines_of(recording, "time running backwards") == [4]
 
 
-def test_last_line_cut_anywhere_is_never_taken_for_a_whole_one(read_log, flaser):
+def test_cut_last_line_is_skipped(read_log, flaser):
     whole = (flaser(1.0) + "\n").encode()
     last = flaser("2.123456", [1, 2, 3, 4], kind="FLASER").encode()
     for length in range(1, len(last) - len("0.5") + 1):
@@ -83,7 +83,7 @@ def test_last_line_cut_anywhere_is_never_taken_for_a_whole_one(read_log, flaser)
         assert lines_of(recording, "cut last line") == [2], last[:length]
 
 
-def test_last_line_without_its_end_is_used_when_whole(read_log, flaser):
+def test_complete_last_line_without_line_end(read_log, flaser):
     recording = read_log((flaser(1.0) + "\n" + flaser(2.0)).encode())
     assert recording.n_scans == 2
     assert recording.source["skipped"] == {}
@@ -96,7 +96,7 @@ def test_over_long_line(read_log, flaser):
     assert lines_of(recording, "over-long line") == [2]
 
 
-def test_cut_gzip_stream_uses_what_was_read(log, flaser):
+def test_cut_gzip_stream(log, flaser):
     lines = [flaser(i, [i + 0.1 * k for k in range(30)]) for i in range(400)]
     packed = gzip.compress("\n".join(lines).encode())
     recording = read(log(packed[: len(packed) // 2], "cut.log.gz"))
@@ -113,7 +113,7 @@ def test_gzip_stream_with_a_flipped_checksum(log, flaser):
     assert lines_of(recording, "damaged gzip stream") == [2]
 
 
-def test_odometry_damage_is_counted_apart(read_log, flaser):
+def test_damaged_odometry(read_log, flaser):
     recording = read_log(
         ["ODOM 1 2 nan 0 0 0 1 h 0", "ODOM 1 2", "ODOM 0 0 0 0 0 0 x h 0", flaser(1.0)]
     )

@@ -1,4 +1,4 @@
-"""A laser that tilts, in the same bag as one that lies flat."""
+"""A tilting laser in the same bag as a level one."""
 
 import json
 
@@ -51,8 +51,8 @@ def scans(messages, recording, frame, laser):
         yield stamp, messages.scan(stamp, readings, frame, **shape)
 
 
-def nods(messages, rig, joint_ns):
-    """The joint, told at times of its own."""
+def joint_messages(messages, rig, joint_ns):
+    """Transforms of the joint at their own stamps."""
     start = int(rig.tilting.recording.stamp_ns[0])
     o = RigOptions(**NOD)
     half = 0.5 * compute_joint_angle((joint_ns - start) / 1e9, o)
@@ -76,7 +76,7 @@ def bag_of(folder, rig, joint_ns=None, kind="mcap"):
     content = [("/tf_static", first, messages.tf(fixed))]
     content += [("/scan", at, m) for at, m in scans(messages, flat, "laser", laser)]
     content += [("/tilt_scan", at, m) for at, m in scans(messages, tilting, "tilt", laser)]
-    content += [("/tf", at, m) for at, m in nods(messages, rig, joint_ns)]
+    content += [("/tf", at, m) for at, m in joint_messages(messages, rig, joint_ns)]
     for stamp, T in zip(flat.stamp_ns.tolist(), flat.T_odom_base, strict=True):
         x, y, yaw = se2.parameters(T[None])[0]
         turned = (0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
@@ -96,7 +96,7 @@ def in_base(recording):
     return np.einsum("nij,nj->ni", T[:, :3, :3], recording.points.astype(float)) + T[:, :3, 3]
 
 
-def test_points_lie_where_the_joint_turned_them(rig, path):
+def test_points_follow_the_joint(rig, path):
     found, true = read_tilting(path, TILT, None, None), rig.tilting.recording
     assert found.dimension == 3
     np.testing.assert_array_equal(found.stamp_ns, true.stamp_ns)
@@ -115,7 +115,7 @@ def test_other_kinds_of_bags(rig, path, tmp_path, kind):
     np.testing.assert_array_equal(found.points, read_tilting(path, TILT, None, None).points)
 
 
-def test_the_map_is_not_made_from_it(rig, path):
+def test_not_used_for_the_map(rig, path):
     flat = read(path, ReadOptions(tilting_topic="/tilt_scan"))
     assert flat.dimension == 2
     assert flat.n_scans == rig.horizontal.recording.n_scans
@@ -123,7 +123,7 @@ def test_the_map_is_not_made_from_it(rig, path):
     assert "tilts" in why
 
 
-def test_pauses_of_the_joint_are_unusable(rig, tmp_path):
+def test_beams_without_transforms_are_unusable(rig, tmp_path):
     stamps = rig.tilting.recording.stamp_ns
     first, last = int(stamps[0]), int(stamps[-1]) + 100_000_000
     joint_ns = np.arange(first, last, JOINT_NS)
@@ -137,7 +137,7 @@ def test_pauses_of_the_joint_are_unusable(rig, tmp_path):
     assert any("do not say how the laser is tilted" in w for w in found.source["warnings"])
 
 
-def test_what_the_map_command_makes_of_it(rig, path, tmp_path):
+def test_map_command(rig, path, tmp_path):
     out = tmp_path / "out"
     words = ("map", path, "--tilting-topic", "/tilt_scan", "-o", out, *QUICK)
     assert main([str(word) for word in words]) == 0
@@ -155,7 +155,7 @@ def test_what_the_map_command_makes_of_it(rig, path, tmp_path):
     assert record["models"]["area"] > 100.0  # m2: floor, walls and ceiling
 
 
-def test_clouds_of_points_are_taken_as_they_are(rig, tmp_path):
+def test_point_clouds_instead_of_scans(rig, tmp_path):
     writers.write(rig.tilting.recording, tmp_path / "a.mcap")
     wanted = ReadOptions(topic="/points", base_frame="base_link")
     found = read_tilting(tmp_path / "a.mcap", wanted, None, None)
@@ -172,7 +172,7 @@ def refused(capsys, *words):
     return err
 
 
-def test_wrong_topics_are_refused(rig, path, tmp_path, capsys):
+def test_wrong_topics(rig, path, tmp_path, capsys):
     words = ("map", path, "-o", tmp_path / "out", "--tilting-topic")
     assert "is not there" in refused(capsys, *words, "/nod")
     assert "no scans" in refused(capsys, *words, "/tf")
@@ -185,7 +185,7 @@ def test_wrong_topics_are_refused(rig, path, tmp_path, capsys):
     assert "is for bags" in refused(capsys, *words)
 
 
-def test_a_laser_that_does_not_tilt_is_refused(path):
+def test_fixed_laser_is_refused(path):
     flat = ReadOptions(topic="/scan", base_frame="base_link")
     with pytest.raises(InputError, match="does not tilt"):
         read_tilting(path, flat, None, None)

@@ -1,4 +1,4 @@
-"""CARMEN logs once more, with beams blanked."""
+"""Filtered copies of CARMEN logs."""
 
 import gzip
 
@@ -16,7 +16,7 @@ READINGS = [[1.5, 81.83, 3.25, 4.0], [1.5, 2.0, 81.83, 4.0], [81.83, 2.0, 3.0, 8
 
 @pytest.fixture
 def made(log, flaser):
-    """A log with more than scans in it, in odd spacing."""
+    """A log with other lines than scans, and odd spacing."""
 
     def make(name="tiny.log"):
         scans = [flaser(k + 1, row).replace(" ", "  ", 3) for k, row in enumerate(READINGS)]
@@ -35,7 +35,7 @@ def blanked(source, out, which):
     return recording, write_filtered_log(source, out, recording, blank)
 
 
-def test_all_other_bytes_stay(made, tmp_path):
+def test_other_bytes_are_unchanged(made, tmp_path):
     source, out = made(), tmp_path / "out.log"
     recording, done = blanked(source, out, [0, 2, 7])
     assert recording.n_scans == 3
@@ -50,7 +50,7 @@ def test_all_other_bytes_stay(made, tmp_path):
     assert after[5] == before[5].replace("4.0", "81.83", 1)
 
 
-def test_what_is_read_again_lacks_the_blanked_beams_alone(made, tmp_path):
+def test_only_blanked_beams_differ(made, tmp_path):
     source, out = made(), tmp_path / "out.log"
     recording, _ = blanked(source, out, [0, 5])
     again = read(out)
@@ -62,7 +62,7 @@ def test_what_is_read_again_lacks_the_blanked_beams_alone(made, tmp_path):
     np.testing.assert_array_equal(again.T_odom_base, recording.T_odom_base)
 
 
-def test_nothing_blanked_nothing_changed(made, tmp_path):
+def test_without_blanked_beams(made, tmp_path):
     source, out = made(), tmp_path / "out.log"
     blanked(source, out, [])
     lines = source.read_bytes().splitlines(keepends=True)
@@ -70,7 +70,7 @@ def test_nothing_blanked_nothing_changed(made, tmp_path):
 
 
 @pytest.mark.parametrize(("given", "wanted"), [("a.log.gz", "b.log"), ("a.log", "b.log.gz")])
-def test_gzip_goes_by_the_name(made, tmp_path, given, wanted):
+def test_gzip_by_name(made, tmp_path, given, wanted):
     out = tmp_path / wanted
     blanked(made(given), out, [0])
     packed = out.read_bytes()
@@ -82,7 +82,7 @@ def test_gzip_goes_by_the_name(made, tmp_path, given, wanted):
 
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf", b"\xef\xbb\xbf "])
 @pytest.mark.parametrize("end", [b"\n", b"\r\n"])
-def test_marks_tabs_and_line_ends_stay(log, flaser, tmp_path, mark, end):
+def test_byte_order_mark_tabs_and_line_ends(log, flaser, tmp_path, mark, end):
     lines = [flaser(k + 1, row).replace(" ", "\t").encode() for k, row in enumerate(READINGS)]
     source, out = log(mark + end.join(lines), "odd.log"), tmp_path / "out.log"
     blanked(source, out, [0])
@@ -90,7 +90,7 @@ def test_marks_tabs_and_line_ends_stay(log, flaser, tmp_path, mark, end):
     assert out.read_bytes() == mark + end.join(expected)
 
 
-def test_newer_logs_keep_only_the_lines_that_were_read(log, tmp_path):
+def test_unused_scan_lines_are_omitted(log, tmp_path):
     header, host = "0 -1.57 3.14 1.57 80 0.01 0", "host 1"
     lines = []
     for k, row in enumerate(READINGS):
@@ -129,5 +129,5 @@ def rule(threshold=None, zero="unusable", free=20.0):
         ([[1.0, 90.0]], rule(None, free=90.0), b"900.00"),
     ],
 )
-def test_what_stands_for_nothing(readings, said, expected):
+def test_no_return_code(readings, said, expected):
     assert find_no_return_code(np.array(readings, np.float32), said) == expected

@@ -1,4 +1,4 @@
-"""Lasers that hang upside down, see more or less than half a circle, or are two."""
+"""Upside-down lasers, other fields of view, and second lasers."""
 
 import math
 
@@ -24,7 +24,7 @@ def mirrored(recording):
 
 
 @pytest.mark.parametrize(("place", "kind"), [("front", "FLASER"), ("rear", "RLASER")])
-def test_params_say_that_a_laser_hangs_upside_down(read_log, flaser, place, kind):
+def test_upside_down_by_params(read_log, flaser, place, kind):
     line = flaser(1.0, kind=kind)
     upright = read_log([line])
     assert not upright.source["sensors"][0]["upside_down"]
@@ -38,7 +38,7 @@ def test_params_say_that_a_laser_hangs_upside_down(read_log, flaser, place, kind
     assert np.abs(upright.points[:, 1]).max() > 0.5
 
 
-def test_readings_that_the_driver_turned_round_stay_so(read_log, flaser):
+def test_readings_reversed_by_the_driver(read_log, flaser):
     # laser_..._flipped is what CARMEN's laser server did already before the log was written
     lines = [flaser(1.0)]
     plain = read_log(lines)
@@ -46,7 +46,7 @@ def test_readings_that_the_driver_turned_round_stay_so(read_log, flaser):
     np.testing.assert_array_equal(turned.points, plain.points)
 
 
-def test_options_know_better_than_params(read_log, flaser):
+def test_options_override_params(read_log, flaser):
     lines = ["PARAM robot_frontlaser_flipped 1", flaser(1.0)]
     recording = read_log(lines, laser_upside_down=False)
     np.testing.assert_array_equal(recording.points, read_log(lines[1:]).points)
@@ -57,7 +57,7 @@ def test_options_know_better_than_params(read_log, flaser):
 
 @pytest.mark.parametrize("line", [f"RAWLASER1 {RAW} 1.0 h 1", f"ROBOTLASER1 {RAW} 0 0 0 0 0 0 "
                                   "0 0 0 0 0 1.0 h 1"])  # fmt: skip
-def test_lines_with_angles_of_their_own_turn_round_too(read_log, line):
+def test_upside_down_with_declared_angles(read_log, line):
     upright, hanging = read_log([line]), read_log([line], laser_upside_down=True)
     np.testing.assert_allclose(angles(upright), [-1, -0.5, 0, 0.5, 1], atol=1e-6)
     np.testing.assert_allclose(angles(hanging), [1, 0.5, 0, -0.5, -1], atol=1e-6)
@@ -80,7 +80,7 @@ def test_fields_of_view(read_log, flaser, n, fov, last, step):
     assert math.degrees(noted["angle_step"]) == pytest.approx(step)
 
 
-def test_a_field_of_view_does_not_overrule_angles(read_log):
+def test_declared_angles_override_the_field_of_view(read_log):
     line = f"RAWLASER1 {RAW} 1.0 h 1"
     recording = read_log([line], laser_fov=1.0)
     np.testing.assert_array_equal(recording.points, read_log([line]).points)
@@ -110,7 +110,7 @@ def test_four_raw_lasers(read_log):
     assert len(unknown) == 3
 
 
-def test_of_a_folder_too(read_log, flaser, tmp_path):
+def test_options_for_recording_folders(read_log, flaser, tmp_path):
     lines = [flaser(1.0), flaser(1.1, kind="RLASER"), flaser(1.2)]
     recording = read_log(lines)
     write(recording, tmp_path / "rec")

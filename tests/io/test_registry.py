@@ -1,4 +1,4 @@
-"""What is read by which reader, and what is refused in one line."""
+"""Detection of formats, and errors of one line."""
 
 import gzip
 import os
@@ -30,7 +30,7 @@ def test_logs_by_suffix_or_content(log, flaser, name, packed):
         (b"\x1f\x8b", "no "),
     ],
 )
-def test_no_log_at_all(log, name, content, what):
+def test_other_files(log, name, content, what):
     path = log(content, name)
     with pytest.raises(InputError, match=what) as caught:
         read(path)
@@ -39,14 +39,14 @@ def test_no_log_at_all(log, name, content, what):
     assert caught.value.hint
 
 
-def test_nothing_there(tmp_path):
+def test_missing_path(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         read(tmp_path / "missing.log")
     with pytest.raises(InputError, match="without a recording"):
         read(tmp_path)
 
 
-def test_recordings_inside_are_named(tmp_path):
+def test_recordings_in_a_folder_are_listed(tmp_path):
     outer = tmp_path / "sim"
     (outer / "notes").mkdir(parents=True)
     (outer / ".hidden").write_text("")
@@ -73,7 +73,7 @@ def test_recordings_inside_are_named(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
-def test_named_pipe_is_not_waited_for(tmp_path):
+def test_named_pipe(tmp_path):
     os.mkfifo(tmp_path / "pipe.log")
     with pytest.raises(InputError, match="regular file"):
         read(tmp_path / "pipe.log")

@@ -1,4 +1,4 @@
-"""Recordings as ROS bags, decoded by rosbags itself."""
+"""Recordings written as ROS bags, decoded by rosbags."""
 
 import dataclasses
 from pathlib import Path
@@ -23,7 +23,7 @@ KINDS = {"bag": "out.bag", "ros2": "out", "db3": "out.db3", "mcap": "out.mcap"}
 
 @pytest.fixture(scope="module")
 def driven():
-    """Two lasers, one of them unusable here and there, whose beams are taken one after another."""
+    """Two lasers with beam times, one with some unusable beams."""
     laser = {"beams": 90, "fov": 4.0, "second_laser": True, "sweep_time": 0.05, "x": 0.2}
     scene = scene_by_name("hall", {"robot": {"scans": 12}, "laser": laser})
     recording = simulate(scene, 2).recording
@@ -59,7 +59,7 @@ def planar(T):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_bag_holds_what_was_recorded(tmp_path, driven, kind):
+def test_laser_scans(tmp_path, driven, kind):
     assert write_recording(driven, tmp_path / KINDS[kind], kind) == []
     topics, told = decoded(tmp_path / KINDS[kind])
     assert set(topics) == {"/scan", "/scan2", "/odom", "/tf", "/tf_static"}
@@ -107,7 +107,7 @@ def test_a_bag_holds_what_was_recorded(tmp_path, driven, kind):
         assert qos.durability is QosDurability.TRANSIENT_LOCAL
 
 
-def test_angles_that_fall_stay_so(tmp_path):
+def test_decreasing_angles(tmp_path):
     scene = scene_by_name("hall", {"robot": {"scans": 2}, "laser": {"upside_down": "known"}})
     recording = simulate(scene, 1).recording
     write_recording(recording, tmp_path / "a.mcap", "mcap")
@@ -166,19 +166,19 @@ def test_clouds(tmp_path, kind, timed):
     np.testing.assert_allclose(T, recording.T_base_sensor[0], atol=1e-12)
 
 
-def test_without_odometry_there_is_none(tmp_path, driven):
+def test_without_odometry(tmp_path, driven):
     write_recording(driven.without_odometry(), tmp_path / "a.mcap", "mcap")
     assert set(decoded(tmp_path / "a.mcap")[0]) == {"/scan", "/scan2", "/tf_static"}
 
 
-def test_times_that_a_scan_cannot_state_are_left_out(tmp_path, driven):
+def test_uneven_beam_times_are_left_out(tmp_path, driven):
     late = dataclasses.replace(driven, beam_time=driven.beam_time - np.float32(0.05))
     [lost] = write_recording(late, tmp_path / "a.mcap", "mcap")
     assert lost.startswith("beam times of 12 scans are left out")
     assert decoded(tmp_path / "a.mcap")[0]["/scan"][0][1].time_increment == 0.0
 
 
-def test_two_lasers_at_one_moment_share_the_odometry(tmp_path, driven):
+def test_scans_with_equal_stamps_share_the_odometry(tmp_path, driven):
     stamp_ns, T = np.array(driven.stamp_ns), np.array(driven.T_odom_base)
     stamp_ns[1], T[1] = stamp_ns[0], T[0]
     same = dataclasses.replace(driven, stamp_ns=stamp_ns, T_odom_base=T)
@@ -203,7 +203,7 @@ def test_the_same_recording_gives_the_same_bytes(tmp_path, driven, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_bag_appears_whole_or_not_at_all(tmp_path, driven, kind, monkeypatch):
+def test_a_bag_appears_complete_or_not_at_all(tmp_path, driven, kind, monkeypatch):
     path = tmp_path / KINDS[kind]
     write_recording(driven, path, kind)
     before = [(p, p.read_bytes()) for p in sorted(Path(tmp_path).rglob("*")) if p.is_file()]
@@ -216,7 +216,7 @@ def test_a_bag_appears_whole_or_not_at_all(tmp_path, driven, kind, monkeypatch):
 @pytest.mark.parametrize(
     ("kind", "first", "last"), [("bag", -1, 0), ("bag", 0, 2**32), ("mcap", 0, 2**31)]
 )
-def test_stamps_that_bags_cannot_hold_are_refused(tmp_path, driven, kind, first, last):
+def test_stamps_out_of_range(tmp_path, driven, kind, first, last):
     stamp_ns = np.linspace(first, last, 12).astype(np.int64) * 10**9
     odd = dataclasses.replace(driven, stamp_ns=stamp_ns)
     with pytest.raises(InputError, match="do not fit into a ROS bag"):
@@ -224,7 +224,7 @@ def test_stamps_that_bags_cannot_hold_are_refused(tmp_path, driven, kind, first,
     assert not list(tmp_path.iterdir())
 
 
-def test_uneven_directions_are_refused_before_anything_is_written(tmp_path, driven):
+def test_uneven_directions_are_refused(tmp_path, driven):
     points = np.array(driven.points)
     points[100] = (5.0, 5.0)
     with pytest.raises(InputError, match="not evenly spaced"):
@@ -232,7 +232,7 @@ def test_uneven_directions_are_refused_before_anything_is_written(tmp_path, driv
     assert not list(tmp_path.iterdir())
 
 
-def test_what_no_format_holds_is_said(tmp_path, driven):
+def test_unsupported_fields_are_reported(tmp_path, driven):
     images = Images(np.zeros(0, np.int64), np.zeros(0, np.int32), (), lambda _: np.zeros((1, 1)))
     more = dataclasses.replace(
         driven, images=images, T_recorded_base=np.tile(np.eye(3), (12, 1, 1))

@@ -1,4 +1,4 @@
-"""Bags as recordings: what is in them comes out, whatever the kind of bag."""
+"""Reading bags of every kind as recordings."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 def turned(theta, over=0.0):
-    """Quaternion of a turn to the left after one about the x axis."""
+    """Quaternion of a yaw after a roll."""
     c, s = np.cos(theta / 2), np.sin(theta / 2)
     a, b = np.cos(over / 2), np.sin(over / 2)
     return (c * b, s * b, s * a, c * a)
@@ -25,7 +25,7 @@ def ranges_at(k, n=5):
 
 
 def drive(messages, n_scans=10, n_beams=5):
-    """A robot that goes ahead by 0.1 m a scan, its laser 0.2 m ahead, transforms between scans."""
+    """A robot moving by 0.1 m per scan, laser 0.2 m ahead, transforms between the scans."""
     content = [
         ("/tf_static", START, messages.tf(messages.transform(0, "base_link", "laser", (0.2, 0, 0))))
     ]
@@ -86,8 +86,8 @@ def test_odometry_messages(bag, messages):
     assert recording.source["base_frame_how"] == "/odom names it"
 
 
-def test_infinity_is_nothing_in_range(bag, messages):
-    """REP 117: +inf nothing in range, -inf too near to measure, NaN no measurement."""
+def test_infinity_means_no_return(bag, messages):
+    """REP 117: +inf no return, -inf too near, NaN no measurement."""
     readings = [1.0, np.inf, -np.inf, np.nan, 0.05, -1.0, 15.0]
     scans = [("/scan", START + k, messages.scan(START + k, readings)) for k in range(2)]
     recording = read(bag(scans))
@@ -96,7 +96,7 @@ def test_infinity_is_nothing_in_range(bag, messages):
     np.testing.assert_allclose(length, [1.0, 15.0, np.nan, np.nan, np.nan, np.nan, 15.0], rtol=1e-6)
 
 
-def test_beams_take_time(bag, messages):
+def test_beam_times(bag, messages):
     scans = [
         (
             "/scan",
@@ -109,7 +109,7 @@ def test_beams_take_time(bag, messages):
     np.testing.assert_allclose(recording.beam_time, np.tile(0.01 * np.arange(5), 3), rtol=1e-6)
 
 
-def test_increments_that_cannot_be_are_not_heeded(bag, messages):
+def test_implausible_time_increments_are_ignored(bag, messages):
     scans = [
         (
             "/scan",
@@ -121,7 +121,7 @@ def test_increments_that_cannot_be_are_not_heeded(bag, messages):
     assert read(bag(scans)).beam_time is None
 
 
-def test_a_laser_upside_down(bag, messages):
+def test_upside_down_laser(bag, messages):
     """Its angles rise to the right of the robot, seen from above."""
     over = messages.transform(0, "base_link", "laser", (0.1, 0.2, 0.3), turned(0.3, np.pi))
     content = [("/tf_static", START, messages.tf(over))]
@@ -177,7 +177,7 @@ def test_two_lasers_interleave(bag, messages):
     )
 
 
-def test_lasers_that_nothing_connects(bag, messages):
+def test_unconnected_lasers(bag, messages):
     content = []
     for k in range(6):
         stamp = START + k * SECOND
@@ -188,7 +188,7 @@ def test_lasers_that_nothing_connects(bag, messages):
     assert "nothing says where 'other' is" in recording.source["duplicates"][0]
 
 
-def test_the_same_laser_twice_is_used_once(bag, messages):
+def test_duplicate_topics_are_dropped(bag, messages):
     content = []
     for k in range(6):
         stamp = START + k * SECOND
@@ -199,7 +199,7 @@ def test_the_same_laser_twice_is_used_once(bag, messages):
     assert recording.source["duplicates"] == ["/scan_filtered: 6 scans, /scan shows the same laser"]
 
 
-def test_a_rare_topic_is_left_out(bag, messages):
+def test_rare_topics_are_dropped(bag, messages):
     content = [
         ("/tf_static", START, messages.tf(messages.transform(0, "laser", "camera", (0, 0, 0))))
     ]
@@ -213,7 +213,7 @@ def test_a_rare_topic_is_left_out(bag, messages):
     assert recording.source["duplicates"] == ["/depth: 2 scans are too few beside /scan"]
 
 
-def test_a_laser_that_turns_on_the_robot(bag, messages):
+def test_moving_laser(bag, messages):
     content = []
     for k in range(5):
         stamp = START + k * SECOND
@@ -228,7 +228,7 @@ def test_a_laser_that_turns_on_the_robot(bag, messages):
     np.testing.assert_allclose(se2.parameters(recording.T_odom_base)[:, 0], np.arange(5))
 
 
-def test_frames_can_be_named(bag, messages):
+def test_given_frames(bag, messages):
     content = drive(messages)
     for k in range(-1, 22):
         stamp = START + k * SECOND // 20
@@ -250,7 +250,7 @@ def test_frames_can_be_named(bag, messages):
         read(path, ReadOptions(odom_frame="world"))
 
 
-def test_topics_that_are_not_there(bag, messages):
+def test_missing_topics(bag, messages):
     path = bag(drive(messages))
     with pytest.raises(InputError, match=r"topic '/sacn' is not there \(topics with scans: /scan"):
         read(path, ReadOptions(topic="/sacn"))
@@ -259,7 +259,7 @@ def test_topics_that_are_not_there(bag, messages):
     assert read(path, ReadOptions(topic="scan")).n_scans == 10
 
 
-def test_no_scans_at_all(bag, messages):
+def test_bag_without_scans(bag, messages):
     path = bag([("/tf", START, messages.tf(messages.transform(START, "a", "b", (0, 0, 0))))])
     with pytest.raises(InputError, match=r"holds no scans \(it has /tf \(TFMessage\)\)"):
         read(path)

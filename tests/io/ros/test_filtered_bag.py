@@ -1,4 +1,4 @@
-"""Bags once more, without beams on what moves."""
+"""Filtered copies of bags."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def contents(path, messages):
         ]
 
 
-def test_all_else_stays(bag, messages, tmp_path):
+def test_other_messages_are_copied(bag, messages, tmp_path):
     source = bag(scans(messages))
     recording = read(source)
     blank = np.zeros(recording.n_beams, np.bool_)
@@ -56,8 +56,8 @@ def test_all_else_stays(bag, messages, tmp_path):
 
 
 @pytest.mark.parametrize("zeros", [20, 0])
-def test_nothing_came_back_is_said_as_the_laser_says_it(bag, messages, tmp_path, zeros):
-    """Zeros are frequent: infinities of ours must not make them unusable."""
+def test_the_no_return_code_of_the_laser_is_used(bag, messages, tmp_path, zeros):
+    """Zeros are frequent: added infinities must not make them unusable."""
     rng = np.random.default_rng(0)
     content = []
     for k in range(8):
@@ -79,7 +79,7 @@ def test_nothing_came_back_is_said_as_the_laser_says_it(bag, messages, tmp_path,
     assert np.isfinite(again.points).all()
 
 
-def test_two_lasers_and_one_that_is_not_used(bag, messages, tmp_path):
+def test_two_lasers_and_an_unused_one(bag, messages, tmp_path):
     mounts = [messages.transform(0, "base_link", name, (0, 0, 0)) for name in ("a", "b")]
     content = [("/tf_static", START, messages.tf(*mounts))]
     for k in range(5):
@@ -105,8 +105,8 @@ def test_two_lasers_and_one_that_is_not_used(bag, messages, tmp_path):
     assert len(elsewhere) == 5
 
 
-def test_types_that_nobody_knows_are_copied(tmp_path, kind, messages):
-    """The bag says what they are made of."""
+def test_unknown_types_are_copied(tmp_path, kind, messages):
+    """The bag holds their definitions."""
     from rosbags.typesys import get_types_from_msg
 
     own = "strange_msgs/msg/Thing"
@@ -131,7 +131,7 @@ def test_types_that_nobody_knows_are_copied(tmp_path, kind, messages):
         messages.store.fielddefs.pop(own, None)
 
 
-def test_a_bag_that_is_cut(bag, messages, kind, tmp_path):
+def test_cut_bag(bag, messages, kind, tmp_path):
     if kind not in ("bag", "mcap"):
         pytest.skip("SQLite files have no end that could be missing")
     source = bag(scans(messages, 40))

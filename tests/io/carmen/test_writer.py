@@ -1,4 +1,4 @@
-"""Recordings as CARMEN logs, read again."""
+"""Recordings written as CARMEN logs and read back."""
 
 import dataclasses
 import gzip
@@ -19,7 +19,7 @@ def simulated(scans=10, **laser):
 
 
 def again(recording, path):
-    """The recording, written and read; what is the same for every form of lines is checked."""
+    """Write and read a recording; check what holds for every kind of line."""
     writers.write(recording, path)
     found = read(path)
     assert found.source["skipped"] == found.source["skipped_odometry"] == {}
@@ -46,18 +46,18 @@ def kinds(recording):
 
 @pytest.mark.parametrize("beams", [180, 181, 360, 361])
 @pytest.mark.parametrize("two", [False, True])
-def test_half_a_circle(tmp_path, beams, two):
+def test_half_circle(tmp_path, beams, two):
     recording = simulated(beams=beams, second_laser=two, x=0.2, y=-0.1, yaw=0.3)
     found = again(recording, tmp_path / "a.log")
     assert kinds(found) == ["FLASER", "RLASER"][: 1 + two]
 
 
-def test_other_fields_of_view_state_their_angles(tmp_path):
+def test_other_fields_of_view(tmp_path):
     recording = simulated(beams=541, fov=np.radians(270), second_laser=True)
     assert kinds(again(recording, tmp_path / "a.log")) == ["ROBOTLASER1", "ROBOTLASER2"]
 
 
-def test_farther_than_the_half_circle_can_say(tmp_path):
+def test_ranges_beyond_flaser(tmp_path):
     recording = simulated(max_range=30.0)
     far = dataclasses.replace(recording, points=recording.points * np.float32(4.0))
     found = again(far, tmp_path / "a.log")
@@ -66,22 +66,22 @@ def test_farther_than_the_half_circle_can_say(tmp_path):
     np.testing.assert_allclose(length, 120.0, rtol=0.02)  # as far as 99.9 % of the hits
 
 
-def test_without_odometry_lines_carry_no_poses(tmp_path):
+def test_without_odometry(tmp_path):
     recording = simulated(second_laser=True, x=0.2, y=-0.1, yaw=0.3).without_odometry()
     assert kinds(again(recording, tmp_path / "a.log")) == ["RAWLASER1", "RAWLASER2"]
 
 
 @pytest.mark.parametrize("fov", [180, 240])
 @pytest.mark.parametrize("odometry", [True, False])
-def test_beams_that_turn_clockwise(tmp_path, fov, odometry):
+def test_clockwise_beams(tmp_path, fov, odometry):
     recording = simulated(fov=np.radians(fov), upside_down="known", x=0.2)
     recording = recording if odometry else recording.without_odometry()
     found = again(recording, tmp_path / "a.log")
     assert found.source["sensors"][0]["upside_down"]
 
 
-def test_lasers_at_the_middle_of_the_robot(tmp_path):
-    """Both: without a word a rear laser is taken to look backwards."""
+def test_lasers_at_the_robot_center(tmp_path):
+    """The default of a rear laser faces backwards."""
     recording = simulated(second_laser=True, x=0.0)
     place = np.tile(np.eye(3), (2, 1, 1))
     place[0] = se2.matrix(0.001, 0.0, 0.0)  # less than scan lines tell
@@ -100,8 +100,8 @@ def test_unusable_beams(tmp_path, share):
     assert (" 0.0000 " in text) == (share < 0.1)
 
 
-def test_a_hit_at_the_very_end_stays_one(tmp_path):
-    """The largest range that is declared lies above every hit, as rounded."""
+def test_hit_at_maximum_range(tmp_path):
+    """The declared maximum range lies above every rounded hit."""
     recording = simulated(beams=91, fov=np.radians(90), range_noise=0.0)
     points, hit = np.array(recording.points), np.ones(recording.n_beams, bool)
     points *= (29.99999 / np.linalg.norm(points, axis=1))[:, None].astype(np.float32)
@@ -110,7 +110,7 @@ def test_a_hit_at_the_very_end_stays_one(tmp_path):
     again(dataclasses.replace(recording, points=points, hit=hit), tmp_path / "a.log")
 
 
-def test_gzip_and_plain_say_the_same(tmp_path):
+def test_gzip(tmp_path):
     recording = simulated()
     for name in ("a.log", "a.clf.gz", "b.clf.gz"):
         writer.write_log(recording, tmp_path / name)
@@ -119,7 +119,7 @@ def test_gzip_and_plain_say_the_same(tmp_path):
     assert (tmp_path / "b.clf.gz").read_bytes() == packed
 
 
-def test_what_a_log_cannot_hold(tmp_path):
+def test_unsupported_recordings(tmp_path):
     recording = simulated(sweep_time=0.05)
     assert writers.write(recording, tmp_path / "a.log") == [
         "beam times are left out: CARMEN logs cannot hold them"
@@ -145,7 +145,7 @@ def test_what_a_log_cannot_hold(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["aces.clf.gz", "belgioioso.clf.gz", "edmonton.clf.gz"])
-def test_real_logs_come_back(shared_data, tmp_path, name):
+def test_public_logs(shared_data, tmp_path, name):
     recording = read(shared_data / "laser2d" / name)
     writers.write(recording, tmp_path / "a.log")
     found = read(tmp_path / "a.log")
