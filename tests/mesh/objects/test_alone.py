@@ -1,27 +1,27 @@
 """Whether what was followed moved."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
 from made_up_street import Car, Part, street
 
 from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.objects import reconstruction
 from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.objects.merging import collect_tracks
 from stillmap.mesh.objects.reconstruction import ObjectShape, mean_p_dynamic, reconstruct_object
 from stillmap.mesh.objects.segmentation import DynamicReturns
-from stillmap.mesh.options import MoverOptions
 from stillmap.mesh.triangle_mesh import Mesh
 
-OPTIONS = MoverOptions()
 STANDS = Car((8.0, 0.0), (0.0, 0.0), (0.6, 2.0, 1.5))
 
 
-def _shape(sources: MeshInputs, options: MoverOptions = OPTIONS) -> ObjectShape | None:
+def _shape(sources: MeshInputs) -> ObjectShape | None:
     moves = DynamicReturns.collect(sources)
-    followed = collect_tracks(sources, moves, options)
-    return reconstruct_object(followed, sources, moves, options, [np.zeros(0)] * len(followed))
+    followed = collect_tracks(sources, moves)
+    return reconstruct_object(followed, sources, moves, [np.zeros(0)] * len(followed))
 
 
 def _partly(sources: MeshInputs, share: float) -> MeshInputs:
@@ -39,13 +39,14 @@ def test_what_is_dynamic_all_over_has_a_model() -> None:
     assert _shape(street([STANDS], [Part(0)])) is not None
 
 
-def test_a_part_of_what_stands_still_has_none() -> None:
+def test_a_part_of_what_stands_still_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
     sources = _partly(street([STANDS], [Part(0)]), 0.9)
     assert _shape(sources) is None
-    assert _shape(sources, MoverOptions(dynamic=0.05)) is not None
+    monkeypatch.setattr(reconstruction, "_MIN_P_DYNAMIC", 0.05)
+    assert _shape(sources) is not None
 
 
-def test_static_things_farther_away_do_not_matter() -> None:
+def test_static_things_farther_away_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     beside = Car((8.0, 1.5), (0.0, 0.0), (0.6, 0.4, 1.5))
     sources = street([STANDS, beside], [Part(0)])
     every = np.arange(sources.deskewed.n_beams)
@@ -53,7 +54,10 @@ def test_static_things_farther_away_do_not_matter() -> None:
     p_static = np.where(met, np.float32(0.95), sources.p_static)
     sources = dataclasses.replace(sources, p_static=p_static)
     assert _shape(sources) is not None
-    assert _shape(sources, MoverOptions(about=1.0, dynamic=0.9)) is None
+    monkeypatch.setattr(reconstruction, "_MIN_P_DYNAMIC", 0.9)
+    wide = functools.partial(mean_p_dynamic, max_distance=1.0)
+    monkeypatch.setattr(reconstruction, "mean_p_dynamic", wide)
+    assert _shape(sources) is None
 
 
 def _face(height: float) -> tuple[MeshInputs, Mesh, ObjectFrame]:
@@ -109,7 +113,7 @@ def test_what_goes_on_leaves_what_it_passed_behind() -> None:
     way = ObjectFrame.from_track(sources.boxes[0])
     corners = np.array([[-0.3, -0.4, 0.2], [-0.3, 0.4, 0.2], [-0.3, 0.4, 1.2]])
     mesh = Mesh(corners, np.array([[0, 2, 1]], np.int32))
-    standing = way._replace(thing=way.box._replace(box=sources.boxes[1].box))
+    standing = way._replace(box=way.box._replace(box=sources.boxes[1].box))
     assert mean_p_dynamic(mesh, way, (0.15, 0.45), sources, 0.2) == 1.0
     assert mean_p_dynamic(mesh, standing, (0.15, 0.45), sources, 0.2) < 0.5
 
@@ -123,9 +127,9 @@ def test_the_ground_does_not_count() -> None:
     assert np.isnan(mean_p_dynamic(flat, way, (0.0, 0.05), sources, 0.05))
 
 
-def test_flat_things_have_models_where_nobody_asks() -> None:
+def test_flat_objects_on_the_ground_have_no_model(monkeypatch: pytest.MonkeyPatch) -> None:
     low = Car((8.0, 0.0), (0.0, 0.0), (0.6, 2.0, 0.09))
     sources = street([low], [Part(0)], rows=200)
-    options = MoverOptions(height=0.0, least=0.0)
-    assert _shape(sources, options) is None
-    assert _shape(sources, dataclasses.replace(options, dynamic=0.0)) is not None
+    monkeypatch.setattr(reconstruction, "_MIN_HEIGHT", 0.0)
+    monkeypatch.setattr(reconstruction, "_MIN_AREA", 0.0)
+    assert _shape(sources) is None

@@ -9,9 +9,9 @@ import pytest
 from stillmap.core.camera import Camera, Images
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
+from stillmap.mesh import point_colors
 from stillmap.mesh.background import Background
 from stillmap.mesh.objects.segmentation import DynamicReturns
-from stillmap.mesh.options import MeshOptions, VisibleOptions
 from stillmap.mesh.place import ViewAssignment
 from stillmap.mesh.point_colors import TrackedReturns, color_moving
 from stillmap.mesh.texture.atlas import GRAY
@@ -58,7 +58,7 @@ def board_seen(*others: TrackedBox) -> TrackedReturns:
         poses=np.tile(np.eye(4), (2, 1, 1)),
         p_static=np.full(2 * n, 0.1, np.float32),
         objects=[SimpleNamespace(id=7, beams=np.arange(2 * n))],
-        things=[thing(7, 0.0, AHEAD, (0.6, 0.2), SPEED), *others],
+        boxes=[thing(7, 0.0, AHEAD, (0.6, 0.2), SPEED), *others],
         start_ns=0,
     )
     return TrackedReturns(sources, DynamicReturns.collect(sources))
@@ -80,16 +80,16 @@ def columns(image: int) -> np.ndarray:
     return out
 
 
-def tint(moving, views, load=columns, place=NOTHING, options=None):
-    n = moving.sources.recording.n_beams
+def tint(moving, views, load=columns, place=NOTHING):
+    n = moving.inputs.recording.n_beams
     out, late = np.full((n, 3), GRAY[0], np.uint8), np.full(n, np.inf, np.float32)
     images, none = pictures(load), np.full(len(place), -1)
     still = ViewAssignment(
         place, none, np.zeros(len(place), np.float32), none < 0, none, none * 0.0
     )
-    ahead = Background(still, views, VisibleOptions(), lambda one: read_color_image(images, one))
+    ahead = Background(still, views, lambda one: read_color_image(images, one))
     for number in range(len(views)):
-        color_moving(out, late, moving, number, ahead, options or MeshOptions())
+        color_moving(out, late, moving, number, ahead)
     return out.reshape(2, -1, 3), late.reshape(2, -1)
 
 
@@ -116,11 +116,10 @@ def test_the_nearest_in_time_counts_whatever_the_order():
         assert set(colours[1, INNER, 1].tolist()) == {60}
 
 
-def test_pictures_long_before_or_after_do_not_count():
+def test_pictures_long_before_or_after_do_not_count(monkeypatch):
     assert (tint(board_seen(), [view(1, 0.61), view(2, -0.51)])[0] == GRAY).all()
-    options = MeshOptions()
-    options = dataclasses.replace(options, objects=dataclasses.replace(options.objects, near=0.7))
-    assert (tint(board_seen(), [view(1, 0.61)], options=options)[0] != GRAY).any()
+    monkeypatch.setattr(point_colors, "IMAGE_WINDOW", 0.7)
+    assert (tint(board_seen(), [view(1, 0.61)])[0] != GRAY).any()
 
 
 def wall(y: float) -> Mesh:
@@ -150,9 +149,9 @@ def test_another_thing_hides_what_is_behind_it():
 
 def test_what_is_of_no_track_and_what_stands_still_are_left_alone():
     moving = board_seen()
-    moving.sources.p_static[:100] = 0.9
-    moving.sources.objects[0].beams = np.arange(200, 2 * len(BOARD))
-    again = TrackedReturns(moving.sources, DynamicReturns.collect(moving.sources))
+    moving.inputs.p_static[:100] = 0.9
+    moving.inputs.objects[0].beams = np.arange(200, 2 * len(BOARD))
+    again = TrackedReturns(moving.inputs, DynamicReturns.collect(moving.inputs))
     colours, _ = tint(again, [view(1, 0.05)])
     assert (colours[0, :200] == GRAY).all()
     assert (colours[0, 200:] != GRAY).any()

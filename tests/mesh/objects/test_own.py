@@ -16,10 +16,8 @@ from stillmap.mesh.objects.segmentation import (
     segment_object,
     unique_cells,
 )
-from stillmap.mesh.options import ChoiceOptions, MoverOptions
 from stillmap.mesh.point_colors import TrackedReturns
 
-OPTIONS = MoverOptions()
 TWO = [Car((8.0, -2.0), (6.0, 0.0)), Car((20.0, 4.0), (-4.0, 0.0))]
 
 
@@ -62,7 +60,7 @@ def test_beams_of_lidars_that_begin_at_once_are_found(lidars: int) -> None:
         assert about[0] <= then[0]
         assert then[-1] < about[1]
     # of a picture, too
-    ends, _ = sources.index_returns().near_time(280_000_000, ChoiceOptions())
+    ends, _ = sources.index_returns().near_time(280_000_000)
     assert len(ends) == np.count_nonzero(np.abs(seconds - 0.28) <= 0.06)
     moving = TrackedReturns(sources, DynamicReturns.collect(sources))
     beams = sources.objects[0].beams
@@ -75,7 +73,7 @@ def test_a_thing_has_what_ended_in_its_box_and_nothing_of_others() -> None:
     sources = street(TWO, [Part(0), Part(1)])
     moves = DynamicReturns.collect(sources)
     for one, thing in zip(sources.objects, sources.boxes, strict=True):
-        own = segment_object(one, thing, moves, sources, OPTIONS)
+        own = segment_object(one, thing, moves, sources)
         np.testing.assert_array_equal(moves.beam[own], one.beams)
 
 
@@ -84,7 +82,7 @@ def test_what_is_followed_by_nobody_is_its_own_in_its_box() -> None:
     one, thing = sources.objects[0], sources.boxes[0]
     moves = DynamicReturns.collect(sources)
     free = moves._replace(owner=np.where(moves.owner == 0, -1, moves.owner).astype(np.int32))
-    own = segment_object(one, thing, free, sources, OPTIONS)
+    own = segment_object(one, thing, free, sources)
     # but for the lowest row, which may be the ground's
     assert set(moves.beam[own]) <= set(one.beams)
     assert len(own) > 0.9 * len(one.beams)
@@ -95,12 +93,12 @@ def test_a_part_grows_to_the_whole_and_not_to_the_next_car() -> None:
     sources = street(cars, [Part(0, 0.0, 0.2), Part(1)])
     moves = DynamicReturns.collect(sources)
     one, thing = sources.objects[0], sources.boxes[0]
-    own = segment_object(one, thing, moves, sources, OPTIONS)
+    own = segment_object(one, thing, moves, sources)
     within = moves.in_beam_range(0, int(sources.deskewed.offset[1]))
     every = np.arange(within.start, within.stop)
     own = own[own < within.stop]
     whole = grow_segment(
-        own, every, ObjectFrame.from_track(thing), np.array([-12.0, 4.0, 1.0]), moves, OPTIONS
+        own, every, ObjectFrame.from_track(thing), np.array([-12.0, 4.0, 1.0]), moves
     )
     other = set(sources.objects[1].beams)
     assert len(whole) > 1.2 * len(own)

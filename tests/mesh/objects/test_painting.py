@@ -7,10 +7,10 @@ import pytest
 from made_up_rooms import looking, rectangle
 
 from stillmap.mesh.background import Background
+from stillmap.mesh.objects import texturing
 from stillmap.mesh.objects.frame import ObjectFrame
 from stillmap.mesh.objects.reconstruction import ObjectShape
 from stillmap.mesh.objects.texturing import assign_object_views, times_in_view
-from stillmap.mesh.options import ChoiceOptions, MoverOptions, VisibleOptions
 from stillmap.mesh.place import ViewAssignment
 from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.mesh.triangle_mesh import concatenate_meshes
@@ -18,9 +18,15 @@ from stillmap.tracking.boxes import Box
 
 WALL = rectangle([-8.0, 4.0, -3.0], [16.0, 0, 0], [0, 0, 6.0], 24)
 BOARD = rectangle([-0.25, 0.0, 0.0], [0.5, 0, 0], [0, 0, 1.0], 10)
-OPTIONS = MoverOptions(rim=0.0, drift=0.0)
 WALLS, CLOTHES = (180, 170, 160), (200, 30, 40)
 SPEED = 1.0  # m/s along x
+
+
+@pytest.fixture(autouse=True)
+def exact_outlines(monkeypatch):
+    """Outlines are known exactly."""
+    monkeypatch.setattr(texturing, "_OUTLINE_INSET", 0.0)
+    monkeypatch.setattr(texturing, "OUTLINE_DRIFT", 0.0)
 
 
 def thing(id=3, y=2.0):
@@ -65,23 +71,20 @@ def pictures(gap=0.0, there=(0,), shift=0.0):
     return colours
 
 
-def dress(views, place=None, colours=None, options=OPTIONS, others=(), of=None):
-    limits = VisibleOptions()
-    ahead = Background(place or place_of(), views, limits, colours or pictures())
+def dress(views, place=None, colours=None, others=(), of=None):
+    background = Background(place or place_of(), views, colours or pictures())
     things = [thing(), *others]
-    return assign_object_views(
-        of or shape(), views, ahead, things, 0, options, ChoiceOptions(), limits
-    )
+    return assign_object_views(of or shape(), views, background, things, 0)
 
 
 def area_painted(found):
-    areas = found.painted.mesh.areas()
-    return areas[found.painted.view >= 0].sum()
+    areas = found.assignment.mesh.areas()
+    return areas[found.assignment.view >= 0].sum()
 
 
 def painted_at(found):
     """x and z of what is painted."""
-    return found.painted.mesh.centres[found.painted.view >= 0][:, [0, 2]]
+    return found.assignment.mesh.centers[found.assignment.view >= 0][:, [0, 2]]
 
 
 def test_a_thing_is_painted_by_what_shows_it():
@@ -94,27 +97,30 @@ def test_a_thing_is_painted_by_what_shows_it():
     )
 
 
-def test_what_lies_at_its_outline_is_not():
-    x, z = painted_at(dress([view(0, 0.0), view(1, 30.0)], options=replace(OPTIONS, rim=0.1))).T
+def test_what_lies_at_its_outline_is_not(monkeypatch):
+    monkeypatch.setattr(texturing, "_OUTLINE_INSET", 0.1)
+    x, z = painted_at(dress([view(0, 0.0), view(1, 30.0)])).T
     assert 0.1 < np.abs(x).max() < 0.15
     assert 0.1 < z.min() < z.max() < 0.9
 
 
-def test_and_more_of_it_the_farther_it_went():
-    options = replace(OPTIONS, rim=0.05, drift=0.25)
+def test_and_more_of_it_the_farther_it_went(monkeypatch):
+    monkeypatch.setattr(texturing, "_OUTLINE_INSET", 0.05)
+    monkeypatch.setattr(texturing, "OUTLINE_DRIFT", 0.25)
     views, colours = [view(0, 0.0), view(1, 30.0)], pictures()
-    still = dress(views, colours=colours, options=options)
-    went = dress(views, colours=colours, options=options, of=shape(0.4))
+    still = dress(views, colours=colours)
+    went = dress(views, colours=colours, of=shape(0.4))
     assert 0.0 < area_painted(went) < 0.6 * area_painted(still)
 
 
-def test_what_looks_like_the_place_behind_is_not_painted():
+def test_what_looks_like_the_place_behind_is_not_painted(monkeypatch):
     found = dress([view(0, 0.0), view(1, 30.0)], colours=pictures(gap=0.1))
     x = np.abs(painted_at(found)[:, 0])
     assert 0.08 < x.min() < 0.13
     assert area_painted(found) == pytest.approx(0.3, abs=0.04)
-    careless = replace(OPTIONS, differs=0.0)
-    found = dress([view(0, 0.0), view(1, 30.0)], colours=pictures(gap=0.1), options=careless)
+    monkeypatch.setattr(texturing, "_MIN_BACKGROUND_DIFFERENCE", 0.0)
+    monkeypatch.setattr(texturing, "_UNCERTAIN_INSET", 0.0)
+    found = dress([view(0, 0.0), view(1, 30.0)], colours=pictures(gap=0.1))
     assert area_painted(found) == pytest.approx(0.5)
 
 
@@ -128,7 +134,7 @@ def test_the_place_behind_is_compared_where_it_is_seen_from_elsewhere():
         return out
 
     views = [view(0, 0.0), view(1, 30.0, place=(1.0, 0.0, 0.0))]
-    ahead = Background(place_of(), views, VisibleOptions(), colours)
+    ahead = Background(place_of(), views, colours)
     on_wall = np.array([[-1.0, 4.0, 0.3], [0.4, 4.0, 1.2], [0.7, 4.0, -0.9], [1.5, 4.0, 0.5]])
     np.testing.assert_allclose(ahead.color_difference(0, 0.6 * on_wall), 0.0, atol=1e-3)
     expected = np.linalg.norm(np.subtract(WALLS, CLOTHES))
@@ -138,7 +144,7 @@ def test_the_place_behind_is_compared_where_it_is_seen_from_elsewhere():
 
 
 @pytest.mark.parametrize("why", ["grey", "by the same picture", "damaged", "nothing is there"])
-def test_where_nobody_knows_what_is_behind_it_lies_farther_within(why):
+def test_where_nobody_knows_what_is_behind_it_lies_farther_within(why, monkeypatch):
     views, place, colours = [view(0, 0.0), view(1, 30.0)], place_of(), pictures()
     if why == "grey":
         place = place_of(painter=-1)
@@ -148,14 +154,16 @@ def test_where_nobody_knows_what_is_behind_it_lies_farther_within(why):
         colours = lambda one: None if one.image else pictures()(one)  # noqa: E731
     else:
         place = place_of(rectangle([-8.0, 4.0, 2.0], [16.0, 0, 0], [0, 0, 1.0]))
-    found = dress(views, place, colours, replace(OPTIONS, unsure=0.1))
+    monkeypatch.setattr(texturing, "_UNCERTAIN_INSET", 0.1)
+    found = dress(views, place, colours)
     x, z = painted_at(found).T
     assert 0.1 < np.abs(x).max() < 0.17
     assert 0.08 < z.min() < z.max() < 0.92
-    never = replace(OPTIONS, unsure=10.0)
-    assert area_painted(dress(views, place, colours, never)) == 0.0
-    careless = replace(OPTIONS, differs=0.0)
-    assert area_painted(dress(views, place, colours, careless)) == pytest.approx(0.5)
+    monkeypatch.setattr(texturing, "_UNCERTAIN_INSET", 10.0)
+    assert area_painted(dress(views, place, colours)) == 0.0
+    monkeypatch.setattr(texturing, "_MIN_BACKGROUND_DIFFERENCE", 0.0)
+    monkeypatch.setattr(texturing, "_UNCERTAIN_INSET", 0.0)
+    assert area_painted(dress(views, place, colours)) == pytest.approx(0.5)
 
 
 def test_what_the_place_hides_is_not_painted():
@@ -173,12 +181,12 @@ def test_nor_is_what_another_thing_may_hide():
     assert area_painted(found) == pytest.approx(0.5)
 
 
-def test_pictures_taken_too_late_do_not_paint():
+def test_pictures_taken_too_late_do_not_paint(monkeypatch):
     views = [view(0, 0.6), view(1, 30.0)]
     colours = pictures(shift=0.6)
     assert area_painted(dress(views, colours=colours)) == 0.0
-    longer = replace(OPTIONS, near=0.7)
-    assert area_painted(dress(views, colours=colours, options=longer)) == pytest.approx(0.5)
+    monkeypatch.setattr(texturing, "IMAGE_WINDOW", 0.7)
+    assert area_painted(dress(views, colours=colours)) == pytest.approx(0.5)
 
 
 def test_of_two_as_sharp_the_one_nearer_in_time_paints():

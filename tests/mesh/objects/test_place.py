@@ -5,16 +5,15 @@ import pytest
 from made_up_rooms import looking, rectangle
 
 from stillmap.core.recording import Recording
-from stillmap.mesh.options import ChoiceOptions
-from stillmap.mesh.place import p_unoccluded
+from stillmap.mesh.place import _P_UNOBSERVED, p_unoccluded
 from stillmap.mesh.texture.occluders import TrackedBox
 from stillmap.mesh.texture.occlusion import LidarReturns
+from stillmap.mesh.texture.view_selection import MIN_P_VISIBLE
 from stillmap.tracking.boxes import Box
 
 # 4 m ahead of a camera at the origin; faces of 0.2 m
 WALL = rectangle([-1.0, 4.0, -1.0], [2.0, 0, 0], [0, 0, 2.0], 10)
 VIEW = looking([0.0, 0, 0], [0.0, 1, 0])
-OPTIONS = ChoiceOptions()
 
 
 def beams(ends, p, beside=0.3):
@@ -43,7 +42,7 @@ def person(x, y):
 
 def probabilities(found, things):
     faces = np.arange(len(WALL))
-    return p_unoccluded(WALL, faces, VIEW, found, things, OPTIONS)
+    return p_unoccluded(WALL, faces, VIEW, found, things)
 
 
 def on_wall():
@@ -54,7 +53,7 @@ def on_wall():
 def test_where_no_beam_tells_the_boxes_do():
     x = WALL.centers[:, 0]
     p = probabilities(beams([[9.0, 9.0, 0.0]], [1.0]), [person(0.0, 2.0)])
-    np.testing.assert_allclose(p[np.abs(x) > 0.95], OPTIONS.unseen, atol=0.02)
+    np.testing.assert_allclose(p[np.abs(x) > 0.95], _P_UNOBSERVED, atol=0.02)
     # 0.4 m wide, twice as far away
     assert (p[np.abs(x) < 0.4] < 0.1).all()
 
@@ -66,7 +65,7 @@ def test_beams_on_the_wall_speak_for_it_but_not_behind_a_thing():
     assert (p > 0.99).all()
     p = probabilities(beams(ends, np.ones(len(ends))), [person(0.0, 2.0)])
     x = np.abs(WALL.centers[:, 0])
-    assert (p[x < 0.25] < OPTIONS.least).all()
+    assert (p[x < 0.25] < MIN_P_VISIBLE).all()
     assert (p[x > 0.7] > 0.99).all()
 
 
@@ -76,4 +75,4 @@ def test_beams_that_end_on_what_moves_are_believed_at_once():
     near = np.hypot(at[:, 0] - 0.6, at[:, 1]) < 0.15
     assert near.any()
     np.testing.assert_allclose(p[near], 0.1, atol=1e-6)
-    assert p[np.hypot(at[:, 0] - 0.6, at[:, 1]) > 0.6] == pytest.approx(OPTIONS.unseen)
+    assert p[np.hypot(at[:, 0] - 0.6, at[:, 1]) > 0.6] == pytest.approx(_P_UNOBSERVED)

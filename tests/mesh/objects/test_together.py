@@ -1,12 +1,11 @@
 """Looks at one rigid thing, laid over each other."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from made_up_street import Car, Part, by_several, street
 
 from stillmap.mesh.inputs import MeshInputs
+from stillmap.mesh.objects import reconstruction, registration
 from stillmap.mesh.objects.merging import collect_tracks, merge_tracks
 from stillmap.mesh.objects.reconstruction import ObjectShape, reconstruct_object, straighten_track
 from stillmap.mesh.objects.registration import (
@@ -19,10 +18,8 @@ from stillmap.mesh.objects.registration import (
 )
 from stillmap.mesh.objects.segmentation import DynamicReturns
 from stillmap.mesh.objects.sweep_surface import ObjectBeams
-from stillmap.mesh.options import MoverOptions
 from stillmap.mesh.triangle_mesh import Mesh
 
-OPTIONS = MoverOptions()
 LATER = (-0.4, -0.2, 0.0, 0.2, 0.4)
 
 
@@ -126,11 +123,11 @@ CAR = Car((7.0, -3.5), (5.0, 0.0))
 WRONG = Part(0, drift=(0.6, 0.2))
 
 
-def _shape(sources: MeshInputs, options: MoverOptions) -> ObjectShape:
+def _shape(sources: MeshInputs) -> ObjectShape:
     moves = DynamicReturns.collect(sources)
-    followed = collect_tracks(sources, moves, options)
-    (whole,) = merge_tracks(followed, moves, sources, options)
-    shape = reconstruct_object(whole, sources, moves, options, [np.zeros(0)] * len(whole))
+    followed = collect_tracks(sources, moves)
+    (whole,) = merge_tracks(followed, moves, sources)
+    shape = reconstruct_object(whole, sources, moves, [np.zeros(0)] * len(whole))
     assert shape is not None
     return shape
 
@@ -144,10 +141,11 @@ def _off(shape: ObjectShape) -> np.ndarray:
     return np.minimum(np.abs(there[:, 0] - rear), np.abs(there[:, 1] - side))
 
 
-def test_several_looks_are_better_than_one() -> None:
+def test_several_looks_are_better_than_one(monkeypatch: pytest.MonkeyPatch) -> None:
     sources = street([CAR], [WRONG], scans=9, noise=0.03)
-    alone = _shape(sources, dataclasses.replace(OPTIONS, together=0.0))
-    shape = _shape(sources, OPTIONS)
+    shape = _shape(sources)
+    monkeypatch.setattr(reconstruction, "MERGE_WINDOW", 0.0)
+    alone = _shape(sources)
     assert not alone.rigid
     assert shape.rigid
     assert shape.span[1] - shape.span[0] >= 0.4
@@ -158,15 +156,18 @@ def test_several_looks_are_better_than_one() -> None:
     np.testing.assert_allclose((T[1] - T[0])[:2] / 0.4, CAR.velocity, atol=0.25)
 
 
-def test_looks_that_do_not_lie_over_each_other_leave_the_best_one() -> None:
+def test_looks_that_do_not_lie_over_each_other_leave_the_best_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     sources = street([CAR], [WRONG], scans=9, noise=0.03)
-    shape = _shape(sources, dataclasses.replace(OPTIONS, blurred=0.001))
+    monkeypatch.setattr(reconstruction, "_MAX_VIEW_OFFSET", 0.001)
+    shape = _shape(sources)
     assert not shape.rigid
 
 
 def test_people_are_seen_at_once() -> None:
     person = Car((5.0, 0.0), (1.0, 0.3), (0.4, 0.5, 1.7))
-    assert not _shape(street([person], [Part(0)]), OPTIONS).rigid
+    assert not _shape(street([person], [Part(0)])).rigid
 
 
 def test_going_on_evenly() -> None:
@@ -186,36 +187,37 @@ def test_the_side_of_a_car_is_bridged_where_people_are_not() -> None:
     zero = np.zeros((len(points), 3))
     none = ObjectBeams(np.zeros((0, 3)), np.zeros((0, 3)))
     look = PartialScan(ObjectBeams(points, zero), none, (0.0, 0.0))
-    assert len(triangulate_partial_scan(look, True, 3.0, OPTIONS)) == 36
-    assert len(triangulate_partial_scan(look, False, 3.0, OPTIONS)) < 36
-    assert len(triangulate_partial_scan(look, True, 0.3, OPTIONS)) < 36
+    assert len(triangulate_partial_scan(look, True, 3.0)) == 36
+    assert len(triangulate_partial_scan(look, False, 3.0)) < 36
+    assert len(triangulate_partial_scan(look, True, 0.3)) < 36
 
 
 def test_looks_of_several_lidars_follow_one_another() -> None:
     # each sees one half of it, the second one earlier
     sources = by_several(street([Car((14.0, 0.0), (-6.0, 0.0))], [Part(0)], noise=0.01), 2)
-    shape = _shape(sources, OPTIONS)
+    shape = _shape(sources)
     assert shape.rigid
     assert len(shape.frame.seconds) > 8
     assert (np.diff(shape.frame.seconds) >= 0.0).all()
 
 
 @pytest.mark.parametrize(
-    ("options", "any_model"),
+    ("constants", "any_model"),
     [
-        (MoverOptions(), True),
-        (MoverOptions(least=0.0, island=1000.0), False),  # no surface
-        (MoverOptions(least=50.0), False),
-        (MoverOptions(height=0.8), True),
-        (MoverOptions(height=2.0), False),  # a car is not so high
+        ({}, True),
+        ({"_MIN_AREA": 0.0, "MIN_COMPONENT_AREA": 1000.0}, False),  # no surface
+        ({"_MIN_AREA": 50.0}, False),
+        ({"_MIN_HEIGHT": 0.8}, True),
+        ({"_MIN_HEIGHT": 2.0}, False),  # a car is not so high
     ],
 )
 def test_without_enough_of_a_surface_there_is_no_model(
-    options: MoverOptions, any_model: bool
+    constants: dict[str, float], any_model: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for module in (reconstruction, registration):
+        for name in constants.keys() & vars(module).keys():
+            monkeypatch.setattr(module, name, constants[name])
     sources = street([Car((8.0, -2.0), (6.0, 0.0))], [Part(0)])
     moves = DynamicReturns.collect(sources)
-    (whole,) = merge_tracks(collect_tracks(sources, moves, options), moves, sources, options)
-    assert (
-        reconstruct_object(whole, sources, moves, options, [np.zeros(0)]) is not None
-    ) == any_model
+    (whole,) = merge_tracks(collect_tracks(sources, moves), moves, sources)
+    assert (reconstruct_object(whole, sources, moves, [np.zeros(0)]) is not None) == any_model

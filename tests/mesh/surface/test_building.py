@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from stillmap.mesh.marching_cubes import remove_small_components
 from stillmap.mesh import triangulation, tsdf
+from stillmap.mesh.marching_cubes import remove_small_components
 from stillmap.mesh.options import MeshOptions
 from stillmap.mesh.range_image import Patch, find_scan_layout, triangulate_scans
 from stillmap.mesh.resolution import choose_resolution, patch_extents
@@ -115,8 +115,8 @@ def test_no_wall_behind_the_wall(room, walked):
 
 def test_tiles_join_without_a_crack(walked, monkeypatch):
     with monkeypatch.context() as raw:
-        raw.setattr(tsdf, "simplification_error", lambda voxel: 0.0)
-        raw.setattr(tsdf, "remove_small_components", lambda mesh, area: mesh)
+        raw.setattr(tsdf, "simplification_error", lambda _: 0.0)
+        raw.setattr(tsdf, "remove_small_components", lambda mesh, _: mesh)
         whole = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)
         monkeypatch.setattr("stillmap.mesh.marching_cubes.TILE", 16)
         tiled = build_surface(walked[0], walked[1], static(walked[0]), OPTIONS)

@@ -74,7 +74,9 @@ def test_voxels_behind_are_gone():
 def test_thinned_out_it_has_no_crack(monkeypatch):
     monkeypatch.setattr(tsdf, "_MERGE_FACES", 500)
     patches, extents = along_a_wall()
-    mesh = integrate_patches(patches, VOXEL, TsdfParameters(error=0.02, min_component_area=0.0), extents=extents)
+    mesh = integrate_patches(
+        patches, VOXEL, TsdfParameters(error=0.02, min_component_area=0.0), extents=extents
+    )
     assert 20 < len(mesh) < 0.3 * len(integrate_patches(patches, VOXEL, RAW))
     edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     found, count = np.unique(edges, axis=0, return_counts=True)

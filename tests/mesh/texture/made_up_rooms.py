@@ -87,7 +87,7 @@ def photograph(mesh, view, finer=2):
     )
     column, row = np.rint(rays[:, :2] @ wide[:2, :2].T + wide[:2, 2]).astype(int).T
     seen = face[np.clip(row, 0, size[1] - 1), np.clip(column, 0, size[0] - 1)]
-    corners = view.in_camera(mesh.vertices)[mesh.faces[seen]]
+    corners = view.to_camera(mesh.vertices)[mesh.faces[seen]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     z = np.sum(normal * corners[:, 0], axis=1) / np.sum(normal * rays, axis=1)
     place = (rays * z[:, None] - view.T_camera_map[:3, 3]) @ view.T_camera_map[:3, :3]

@@ -1,9 +1,11 @@
 """Beams that were taken about when a picture was."""
 
+from unittest import mock
+
 import numpy as np
 
 from stillmap.core.recording import Recording
-from stillmap.mesh.options import ChoiceOptions
+from stillmap.mesh.texture import occlusion
 from stillmap.mesh.texture.occlusion import LidarReturns
 from stillmap.tracking.boxes import Box
 
@@ -31,18 +33,31 @@ def _beams(recording: Recording, boxes: list[Box], owned: list[np.ndarray]) -> L
     return LidarReturns(recording, recording, poses, p, boxes, owned, 0)
 
 
+def near_time(
+    beams: LidarReturns,
+    stamp_ns: int,
+    window: float,
+    tilting: float | None = None,
+    tracked: float = 0.5,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The returns near a time, by windows in seconds."""
+    windows = {"_WINDOW": window, "_WINDOW_TILTING": tilting or window, "_WINDOW_TRACKED": tracked}
+    with mock.patch.multiple(occlusion, **windows):
+        return beams.near_time(stamp_ns)
+
+
 def test_of_scans_taken_at_once_the_nearest_counts_at_least() -> None:
     beams = _beams(_recording(None), [], [])
-    ends, p = beams.near_time(140_000_000, ChoiceOptions(window=0.01))
+    ends, p = near_time(beams, 140_000_000, 0.01)
     np.testing.assert_allclose(ends, [[4, 10, 0], [5, 10, 0], [6, 10, 0]])
     np.testing.assert_allclose(p, np.arange(3, 6) / 11.0)
-    assert len(beams.near_time(150_000_000, ChoiceOptions(window=0.06))[0]) == 6
+    assert len(near_time(beams, 150_000_000, 0.06)[0]) == 6
 
 
 def test_with_times_each_beam_counts_by_its_own() -> None:
     times = np.tile(np.array([0.0, 0.03, 0.06], np.float32), 4)
     beams = _beams(_recording(times), [], [])
-    ends, _ = beams.near_time(145_000_000, ChoiceOptions(window=0.02))
+    ends, _ = near_time(beams, 145_000_000, 0.02)
     np.testing.assert_allclose(ends[:, 0], [5.0, 6.0])
 
 
@@ -58,22 +73,19 @@ def test_what_is_of_a_thing_goes_on_with_it() -> None:
         0.5,
     )
     beams = _beams(_recording(None), [box], [np.array([4, 9])])
-    ends, _ = beams.near_time(140_000_000, ChoiceOptions(window=0.01))
+    ends, _ = near_time(beams, 140_000_000, 0.01)
     np.testing.assert_allclose(ends, [[4, 10, 0], [5.04, 10.08, 0], [6, 10, 0]], atol=1e-6)
 
 
 def test_beams_that_hit_nothing_say_nothing() -> None:
     recording = _recording(None)
     recording.hit[4] = False
-    ends, _ = _beams(recording, [], []).near_time(100_000_000, ChoiceOptions(window=0.01))
+    ends, _ = near_time(_beams(recording, [], []), 100_000_000, 0.01)
     np.testing.assert_allclose(ends[:, 0], [4.0, 6.0])
 
 
 def test_there_may_be_none() -> None:
-    assert (
-        len(_beams(_recording(None), [], []).near_time(9_000_000_000, ChoiceOptions(window=0.1))[0])
-        == 0
-    )
+    assert len(near_time(_beams(_recording(None), [], []), 9_000_000_000, 0.1)[0]) == 0
 
 
 def _row(p: list[float], planar: bool) -> LidarReturns:
@@ -94,21 +106,21 @@ def _row(p: list[float], planar: bool) -> LidarReturns:
 
 
 def test_of_a_row_what_moves_is_told_longer_and_goes_on() -> None:
-    options = ChoiceOptions(window=0.01, rows=0.01, carried=0.15)
-    ends, p = _row([0.2, 0.3, 0.4, 0.1], planar=True).near_time(100_000_000, options)
+    windows = 0.01, 0.01, 0.15
+    ends, p = near_time(_row([0.2, 0.3, 0.4, 0.1], planar=True), 100_000_000, *windows)
     np.testing.assert_allclose(ends[:, 0], [1.0, 4.0, 5.0, 6.0, 7.0])
     np.testing.assert_allclose(ends[:, 1], [0.1, 0.0, 0.0, 0.0, -0.1], atol=1e-6)
     np.testing.assert_allclose(p, [0.2, 0.3, 1.0, 1.0, 0.4])
 
 
 def test_what_rather_stands_still_is_not_carried() -> None:
-    options = ChoiceOptions(window=0.01, rows=0.01, carried=0.15)
-    ends, _ = _row([0.9, 0.3, 0.4, 0.1], planar=True).near_time(100_000_000, options)
+    windows = 0.01, 0.01, 0.15
+    ends, _ = near_time(_row([0.9, 0.3, 0.4, 0.1], planar=True), 100_000_000, *windows)
     np.testing.assert_allclose(ends[:, 0], [4.0, 5.0, 6.0, 7.0])
 
 
 def test_rows_have_a_window_of_their_own() -> None:
-    options = ChoiceOptions(window=0.01, rows=0.11, carried=0.0)
-    assert len(_row([0.2] * 4, planar=True).near_time(100_000_000, options)[0]) == 9
-    ends, _ = _row([0.2] * 4, planar=False).near_time(100_000_000, options)
+    windows = 0.01, 0.11, 0.0
+    assert len(near_time(_row([0.2] * 4, planar=True), 100_000_000, *windows)[0]) == 9
+    ends, _ = near_time(_row([0.2] * 4, planar=False), 100_000_000, *windows)
     np.testing.assert_allclose(ends[:, 0], [4.0, 5.0, 6.0])

@@ -7,12 +7,11 @@ from scipy import ndimage
 
 from stillmap import _core
 from stillmap.core import camera
-from stillmap.mesh.options import TextureOptions
+from stillmap.mesh.texture import atlas
 from stillmap.mesh.texture.atlas import build_layout, find_charts
 from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes
 
 pytest.importorskip("xatlas")
-NO_LIMIT = TextureOptions(texel=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +29,14 @@ def in_picture(mesh, views, view_of_face, faces):
     out = np.empty((len(faces), 3, 2))
     for i, f in enumerate(faces):
         view = views[view_of_face[f]]
-        out[i] = camera.project(view.camera, view.in_camera(mesh.vertices[mesh.faces[f]]))[0]
+        out[i] = camera.project(view.camera, view.to_camera(mesh.vertices[mesh.faces[f]]))[0]
     return out
 
 
-def test_texels_are_pixels(room):
+def test_texels_are_pixels(room, monkeypatch):
+    monkeypatch.setattr(atlas, "_MIN_TEXEL", 1e-5)
     mesh, views, view = room
-    layout = build_layout(mesh, view, views, NO_LIMIT)
+    layout = build_layout(mesh, view, views)
     painted = np.flatnonzero(view >= 0)
     assert len(painted) > 400
     np.testing.assert_array_equal(layout.view, view)
@@ -64,9 +64,11 @@ def chart_of_texel(mesh, layout, page):
 
 
 @pytest.mark.parametrize("gutter", [2, 4])
-def test_charts_keep_apart(room, gutter):
+def test_charts_keep_apart(room, gutter, monkeypatch):
     mesh, views, view = room
-    layout = build_layout(mesh, view, views, TextureOptions(gutter=gutter, page=512, texel=0.01))
+    monkeypatch.setattr(atlas, "GUTTER", gutter)
+    monkeypatch.setattr(atlas, "_MIN_TEXEL", 0.01)
+    layout = build_layout(mesh, view, views, 512)
     charts = set()
     for page in range(len(layout.sizes)):
         chart = chart_of_texel(mesh, layout, page)
@@ -83,13 +85,14 @@ def test_charts_keep_apart(room, gutter):
     assert len(charts) > 8
 
 
-def test_pages_are_as_many_as_needed_and_no_more_than_allowed(room):
+def test_pages_are_as_many_as_needed_and_no_more_than_allowed(room, monkeypatch):
     mesh, views, view = room
     painted = view >= 0
     before = None
     for pages in (20, 3, 1):
-        options = TextureOptions(page=256, pages=pages, texel=1e-5)
-        layout = build_layout(mesh, view, views, options)
+        monkeypatch.setattr(atlas, "_MAX_PAGES", pages)
+        monkeypatch.setattr(atlas, "_MIN_TEXEL", 1e-5)
+        layout = build_layout(mesh, view, views, 256)
         assert 1 <= len(layout.sizes) <= pages
         assert (layout.sizes <= 256).all()
         uv = layout.uv[layout.faces[painted]]
@@ -98,12 +101,14 @@ def test_pages_are_as_many_as_needed_and_no_more_than_allowed(room):
         scale = layout.scale[painted].max()
         assert before is None or scale < before
         before = scale
-    assert len(build_layout(mesh, view, views, NO_LIMIT).sizes) == 1
+    monkeypatch.setattr(atlas, "_MAX_PAGES", 8)
+    assert len(build_layout(mesh, view, views).sizes) == 1
 
 
-def test_texels_are_no_finer_than_asked_for(room):
+def test_texels_are_no_finer_than_asked_for(room, monkeypatch):
+    monkeypatch.setattr(atlas, "_MIN_TEXEL", 0.02)
     mesh, views, view = room
-    layout = build_layout(mesh, view, views, TextureOptions(texel=0.02))
+    layout = build_layout(mesh, view, views)
     painted = view >= 0
     assert (layout.scale[painted] < 1.0).all()
     chart = find_charts(mesh, view)
@@ -118,7 +123,7 @@ def test_faces_that_their_picture_does_not_show_are_grey():
     edge_on = rectangle([0.0, 1.0, 0.0], [0, 1, 0], [0, 2, 0], 1)
     mesh = concatenate_meshes([wall, behind, edge_on])
     view = looking([0, 0, 0], [0, 1, 0])
-    layout = build_layout(mesh, np.zeros(len(mesh), np.int32), [view], TextureOptions())
+    layout = build_layout(mesh, np.zeros(len(mesh), np.int32), [view])
     assert (layout.page[: len(wall)] == 0).all()
     assert (layout.page[len(wall) :] == -1).all()
     assert (layout.view[len(wall) :] == -1).all()
@@ -132,7 +137,7 @@ def test_pictures_from_one_place_and_charts_that_touch_stay_apart():
     square = np.tile(np.arange(36), 2)
     view = ((square // 6 + square % 6) % 2).astype(np.int32)
     views = [looking([0, 0, 0], [0, 1, 0], i) for i in range(2)]
-    layout = build_layout(wall, view, views, TextureOptions())
+    layout = build_layout(wall, view, views)
     assert len(np.unique(find_charts(wall, view))) == 36
     assert (layout.page == 0).all()
     assert len(layout.vertex) == 36 * 4
@@ -143,15 +148,15 @@ def test_pictures_from_one_place_and_charts_that_touch_stay_apart():
 
 def test_no_faces_and_no_pictures():
     nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    layout = build_layout(nothing, np.zeros(0, np.int32), [], TextureOptions())
+    layout = build_layout(nothing, np.zeros(0, np.int32), [])
     assert len(layout.faces) == len(layout.sizes) == 0
     wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2])
-    layout = build_layout(wall, np.full(2, -1, np.int32), [], TextureOptions())
+    layout = build_layout(wall, np.full(2, -1, np.int32), [])
     np.testing.assert_array_equal(layout.vertex[layout.faces], wall.faces)
     assert len(layout.sizes) == 0
 
 
 def test_it_is_the_same_every_time(room):
     mesh, views, view = room
-    one, two = (build_layout(mesh, view, views, TextureOptions()) for _ in range(2))
+    one, two = (build_layout(mesh, view, views) for _ in range(2))
     assert all(a.tobytes() == b.tobytes() for a, b in zip(one, two, strict=True))

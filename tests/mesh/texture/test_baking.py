@@ -7,9 +7,10 @@ from made_up_rooms import sharpest as best_of
 
 from stillmap import _core
 from stillmap.core.errors import InputError
-from stillmap.mesh.options import TextureOptions
+from stillmap.mesh.texture import atlas
 from stillmap.mesh.texture.atlas import GRAY
-from stillmap.mesh.texture.baking import bake_texture, downsample, fill_gutters, sample_bilinear
+from stillmap.mesh.texture.baking import bake_texture, fill_gutters
+from stillmap.mesh.texture.sampling import downsample, sample_bilinear
 from stillmap.mesh.triangle_mesh import Mesh
 
 pytest.importorskip("xatlas")
@@ -37,7 +38,8 @@ def errors(textured):
 
 
 @pytest.mark.parametrize("kind", LENSES)
-def test_every_texel_has_the_colour_of_its_place(kind):
+def test_every_texel_has_the_colour_of_its_place(kind, monkeypatch):
+    monkeypatch.setattr(atlas, "_MIN_TEXEL", 1e-5)
     mesh, views = furnished(), all_round(camera(280, 210, SMALL, **LENSES[kind]))
     view = best_of(mesh, views)
     reads = []
@@ -46,7 +48,7 @@ def test_every_texel_has_the_colour_of_its_place(kind):
         reads.append(image)
         return photograph(mesh, views[image])
 
-    textured = bake_texture(mesh, view, views, read, TextureOptions(page=1024, texel=1e-5))
+    textured = bake_texture(mesh, view, views, read, 1024)
     assert reads == sorted(set(view[view >= 0].tolist()))  # each once
     np.testing.assert_array_equal(textured.view, view)
     np.testing.assert_array_equal(textured.vertices[textured.faces], mesh.corners)
@@ -57,26 +59,26 @@ def test_every_texel_has_the_colour_of_its_place(kind):
     assert np.quantile(error, 0.99) < 4.0
 
 
-def test_coarse_texels_are_means_of_pixels():
+def test_coarse_texels_are_means_of_pixels(monkeypatch):
+    monkeypatch.setattr(atlas, "_MIN_TEXEL", 0.04)  # four pixels each
     wall = rectangle([-1.0, 3.0, -1.0], [2, 0, 0], [0, 0, 2], 4)
     views = [looking([0, 0, 0], [0, 1, 0])]
     # columns, black and white: any single pixel is far from their mean
     picture = np.zeros((300, 400, 3), np.uint8)
     picture[:, ::2] = 200
-    options = TextureOptions(texel=0.04)  # four pixels each
-    textured = bake_texture(wall, np.zeros(32, np.int32), views, lambda _: picture, options)
+    textured = bake_texture(wall, np.zeros(32, np.int32), views, lambda _: picture)
     face = textured.face_of_texel(0)
     assert 2000 < np.sum(face >= 0) < 3000
     np.testing.assert_allclose(textured.pages[0][face >= 0], 100, atol=1)
 
 
-def test_coarse_texels_lie_where_fine_ones_do():
+def test_coarse_texels_lie_where_fine_ones_do(monkeypatch):
+    monkeypatch.setattr(atlas, "_MIN_TEXEL", 0.04)
     wall = rectangle([-0.4, 3.0, -0.4], [0.8, 0, 0], [0, 0, 0.8], 4)
     views = [looking([0, 0, 0], [0, 1, 0])]
     ramp = np.clip((np.arange(400) - 149.5) * 2.5, 0, 255).round().astype(np.uint8)
     picture = np.broadcast_to(ramp[None, :, None], (300, 400, 3))
-    options = TextureOptions(texel=0.04)
-    textured = bake_texture(wall, np.zeros(32, np.int32), views, lambda _: picture, options)
+    textured = bake_texture(wall, np.zeros(32, np.int32), views, lambda _: picture)
     face = textured.face_of_texel(0)
     row, column = np.nonzero(face >= 0)
     # 0.8 m are 80 pixels, and 20 texels

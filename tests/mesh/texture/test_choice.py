@@ -5,7 +5,6 @@ import itertools
 import numpy as np
 import pytest
 
-from stillmap.mesh.options import ChoiceOptions
 from stillmap.mesh.texture.view_selection import Candidates, select_views, view_utility
 
 
@@ -26,19 +25,16 @@ def test_the_best_pictures_of_each_face_are_kept() -> None:
 
 
 def test_what_probably_shows_a_mover_is_not_used_however_sharp() -> None:
-    o = ChoiceOptions()
     p = np.array([0.99, 0.95, 0.1])
-    u = view_utility(p, np.array([100.0, 100.0, 1e6]), np.ones(3), o)
+    u = view_utility(p, np.array([100.0, 100.0, 1e6]), np.ones(3))
     assert u[0] > u[1]
     assert u[2] == -np.inf
-    sharpest = view_utility(
-        p, np.array([100.0, 100.0, 1e6]), np.ones(3), ChoiceOptions(believe=False)
-    )
+    sharpest = view_utility(p, np.array([100.0, 100.0, 1e6]), np.ones(3), use_occlusion=False)
     assert np.argmax(sharpest) == 2
 
 
 def test_twice_the_resolution_is_worth_its_logarithm() -> None:
-    u = view_utility(np.ones(2), np.array([100.0, 400.0]), np.ones(2), ChoiceOptions())
+    u = view_utility(np.ones(2), np.array([100.0, 400.0]), np.ones(2))
     assert u[1] - u[0] == pytest.approx(np.log(2.0))
 
 

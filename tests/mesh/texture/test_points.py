@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stillmap.mesh.texture.atlas import GRAY, TexturedMesh
-from stillmap.mesh.texture.point_colors import TextureSampler, avoid_gray
+from stillmap.mesh.texture.sampling import TextureSampler, avoid_gray
 
 ABOVE = np.array([0.5, 0.5, 9.0])
 

@@ -8,7 +8,7 @@ from made_up_rooms import K, box, camera, looking, rectangle
 
 from stillmap import _core
 from stillmap.core import camera as camera_module
-from stillmap.mesh.options import VisibleOptions
+from stillmap.mesh.texture import visibility
 from stillmap.mesh.texture.visibility import find_visible_faces, scale_intrinsics
 from stillmap.mesh.triangle_mesh import Mesh, concatenate_meshes
 
@@ -79,11 +79,11 @@ def test_a_pole_before_the_middle_of_a_large_face_hides_it():
     assert not find_visible_faces(concatenate_meshes([wall, pole]), AHEAD).visible[:2].any()
 
 
-def test_edges_are_known_to_a_pixel_only():
+def test_edges_are_known_to_a_pixel_only(monkeypatch):
     mesh = concatenate_meshes([WALL, box([-0.6, 2.0, -0.5], [0.4, 2.6, 0.7])])
-    close, wide = (
-        find_visible_faces(mesh, AHEAD, VisibleOptions(beside=b)).visible for b in (0, 1)
-    )
+    wide = find_visible_faces(mesh, AHEAD).visible
+    monkeypatch.setattr(visibility, "_DILATION", 0)
+    close = find_visible_faces(mesh, AHEAD).visible
     assert close[wide].all()
     lost = WALL.centers[np.flatnonzero(close & ~wide)]
     assert 10 < len(lost) < 200
@@ -129,10 +129,10 @@ def test_the_lens_decides_what_is_in_the_picture():
     assert seen.pixels[corner] < 0.9 * plain.pixels[corner]
 
 
-def test_the_margin():
-    far, near = (
-        find_visible_faces(WALL, AHEAD, VisibleOptions(margin=m)).visible for m in (60.0, 2.0)
-    )
+def test_the_margin(monkeypatch):
+    near = find_visible_faces(WALL, AHEAD).visible
+    monkeypatch.setattr(visibility, "IMAGE_MARGIN", 60.0)
+    far = find_visible_faces(WALL, AHEAD).visible
     assert 0 < far.sum() < near.sum()
     assert near[far].all()
 
@@ -154,9 +154,3 @@ def test_a_scaled_picture_has_its_edges_where_they_were():
     for u, u_ in ((-0.5, -0.5), (399.5, 199.5), (99.5, 49.5)):
         x = (u - K[0, 2]) / K[0, 0]
         assert half[0, 0] * x + half[0, 2] == pytest.approx(u_)
-
-
-@pytest.mark.parametrize("change", [{"scale": 0.0}, {"near": 0.0}, {"beside": 99}])
-def test_options_are_checked(change):
-    with pytest.raises(ValueError, match=r"mesh\.texture\.visible"):
-        VisibleOptions(**change)
