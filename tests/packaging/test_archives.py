@@ -13,6 +13,18 @@ import pytest
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[2]
+# prints what cannot be imported with the base dependencies alone, except for the viewer's server
+IMPORT_ALL = """
+import importlib, pkgutil, stillmap
+for module in pkgutil.walk_packages(stillmap.__path__, "stillmap."):
+    if module.name == "stillmap.__main__":
+        continue
+    try:
+        importlib.import_module(module.name)
+    except ModuleNotFoundError as error:
+        if error.name not in ("viser", "websockets") or "viewer" not in module.name:
+            print(module.name, error.name)
+"""
 JUNK = re.compile(r"\.(so|pyc|egg-info)$|__pycache__|/(build|dist|demo|\.venv|\.ci|\.git\w*)(/|$)")
 
 TEMPLATES = [str(path.relative_to(ROOT / "src")) for path in (ROOT / "src").rglob("*.j2")]
@@ -75,6 +87,7 @@ def test_wheel_holds_the_package_alone(wheel):
 def test_wheel_does_the_main_job_in_a_fresh_environment(wheel, tmp_path):
     run(sys.executable, "-m", "venv", "venv", cwd=tmp_path)
     run("venv/bin/python", "-m", "pip", "install", wheel, cwd=tmp_path)
+    assert run("venv/bin/python", "-c", IMPORT_ALL, cwd=tmp_path).split() == []
     simulate = ("simulate", "hall", "-o", "sim", "--scans", "60")
     run("venv/bin/stillmap", *simulate, cwd=tmp_path)
     run("venv/bin/stillmap", "map", "sim", "-o", "map", "--quiet", cwd=tmp_path)

@@ -4,7 +4,8 @@ import ast
 import re
 import sys
 import tomllib
-from importlib.metadata import packages_distributions
+from functools import cache
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,15 @@ PACKAGE = ROOT / "src" / "stillmap"
 # modules that are imported only where their extra is in use
 NEEDS_EXTRA = {"viewer/server.py": "viewer"}
 SINCE_PYTHON_3_14 = {"compression"}  # the standard library's zstd; before, backports.zstd
+
+
+@cache
+def packages_distributions():
+    """Names of the distributions by top-level module, those of a single extension module too."""
+    found = dict(metadata.packages_distributions())
+    for one in metadata.distributions():
+        found.setdefault(one.name, [one.name])
+    return found
 
 
 def normalized(requirement):
@@ -44,9 +54,12 @@ def imports(path):
             group = next((k.value.value for k in node.keywords if k.arg == "group"), "io")
             if isinstance(node.args[0], ast.Constant):
                 yield node.args[0].value, group
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
-            if isinstance(node.args[0], ast.Constant):
-                yield node.args[0].value, "io"
+        elif (
+            isinstance(node, ast.Call)
+            and ast.unparse(node.func).endswith("import_module")
+            and isinstance(node.args[0], ast.Constant)
+        ):
+            yield node.args[0].value, "io"
 
 
 def is_foreign(module):
@@ -84,17 +97,14 @@ def test_every_import_is_declared(declared):
 
 def test_every_declared_library_is_used(declared):
     text = "\n".join(path.read_text() for path in PACKAGE.rglob("*.py"))
-    for group in ("", "io", "mesh", "viewer"):
-        modules = {
-            top
-            for top, names in packages_distributions().items()
-            for name in names
-            if normalized(name) in declared[group]
-        }
-        for name in declared[group]:
-            own = {
-                top
-                for top in modules
-                if name in map(normalized, packages_distributions()[top])
-            }
-            assert any(re.search(rf"\b{re.escape(top)}\b", text) for top in own), name
+    modules = {}
+    for top, names in packages_distributions().items():
+        for name in names:
+            modules.setdefault(normalized(name), set()).add(top)
+    unused = [
+        name
+        for group in ("", "io", "mesh", "viewer")
+        for name in declared[group]
+        if not any(re.search(rf"\b{re.escape(top)}\b", text) for top in modules.get(name, ()))
+    ]
+    assert unused == []

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stillmap.core.arrays import ArrayBuilder
+from stillmap.core.arrays import ArrayBuilder, finite_rows
 from stillmap.core.errors import InputError, MissingExtra
 from stillmap.core.recording import Recording
 from stillmap.io.builder import RecordingBuilder, SkippedRecords
@@ -275,10 +275,11 @@ class Origin:
 
 
 def _find_origin(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    finite = points[np.isfinite(points).all(axis=1)]
+    finite = points[finite_rows(points)]
     if not len(finite):
         return None
-    middle = np.median(finite, axis=0)
+    # column by column: np.median(axis=0) takes several times as long
+    middle = np.array([np.median(column) for column in finite.T])
     return np.round(middle) if np.abs(middle).max() > _MAX_COORDINATE else np.zeros(3)
 
 
