@@ -103,11 +103,11 @@ def run(job: Job) -> tuple[RigSimulation, NDArray[np.float32], dict[str, Tilting
     tilting = rig.tilting.recording
     built = {
         way: build_tilting(
-            flat, tilting, config.override(chosen, {"rig": {"evidence": way == WAYS[1]}})
+            flat, tilting, chosen.rig, chosen.objects, chosen.em, use_evidence=way == WAYS[1]
         )
         for way in WAYS[:2]
     }
-    return rig, label_by_occupancy(flat, tilting, chosen).p_static, built
+    return rig, label_by_occupancy(flat, tilting, chosen.em).p_static, built
 
 
 def scores(rig: RigSimulation, p_static: NDArray[np.float32]) -> Scores:

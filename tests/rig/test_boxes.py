@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from stillmap.core.config import override
 from stillmap.core.recording import Recording
-from stillmap.pipeline.options import Options
+from stillmap.em import EmOptions
+from stillmap.rig import build
 from stillmap.rig.build import PlanarResult, apply_boxes, build_tilting
 from stillmap.rig.options import RigOptions
 from stillmap.rig.removal import BoxBeams, object_height
-from stillmap.tracking import MovingObject
+from stillmap.tracking import MovingObject, ObjectOptions
 from stillmap.tracking.boxes import fit_boxes
 
 MS = 1_000_000
@@ -98,10 +98,10 @@ def test_what_is_in_no_object_has_a_box_for_a_moment():
     ],
 )
 def test_things_reach_as_high_as_what_is_connected(above, top):
-    assert object_height(np.array(above), 2.0, 0.5) == top
+    assert object_height(np.array(above), 2.0) == top
 
 
-def built(points, ms, objects, **rig):
+def built(points, ms, objects):
     """P(static) of points seen one at a time by a laser at the origin that knows the floor."""
     x, y = np.meshgrid(np.arange(-4.0, 4.0, 0.1), np.arange(-4.0, 4.0, 0.1))
     floor = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.0)], axis=1)
@@ -118,8 +118,8 @@ def built(points, ms, objects, **rig):
     )
     seen = flat_recording(np.zeros((0, 2)), np.zeros(len(STAMPS) + 1))
     flat = PlanarResult(seen, standing(), np.zeros(0, np.float32), objects, 0.9)
-    options = override(Options(), {"rig": {"evidence": False, "margin": 0.1, **rig}})
-    found = build_tilting(flat, recording, options)
+    options = RigOptions(margin=0.1), ObjectOptions(), EmOptions()
+    found = build_tilting(flat, recording, *options, use_evidence=False)
     return found, found.p_static[-n:]
 
 
@@ -140,15 +140,16 @@ def test_in_a_box_beams_are_dynamic_and_nowhere_else():
     np.testing.assert_allclose(one.z, 0.85, atol=0.05)
 
 
-def test_evidence_and_boxes_multiply_their_odds():
-    o = RigOptions(inside=0.9, around=0.75)
+def test_evidence_and_boxes_multiply_their_odds(monkeypatch):
+    monkeypatch.setattr(build, "_P_INSIDE", 0.9)
+    monkeypatch.setattr(build, "_P_AROUND", 0.75)
     share = 0.8
     static = np.array([share, share, 0.999, 0.3, share], np.float32)  # of which two are in no box
     core = BoxBeams(np.array([0, 2]), np.array([True, True]))
     margin = BoxBeams(
         np.array([0, 1]), np.array([False, False])
     )  # the first is in the core of the other
-    found = apply_boxes(static, [core, margin], share, o)
+    found = apply_boxes(static, [core, margin], share)
     odds = 999 / 4 / 9
     np.testing.assert_allclose(found, [0.1, 0.25, odds / (1 + odds), 0.3, share], rtol=1e-4)
     assert static[0] == np.float32(share)

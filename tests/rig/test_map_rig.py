@@ -143,7 +143,6 @@ def test_two_flat_ones_and_two_in_3d_are_refused(rig, tmp_path, capsys):
 
 def test_wrong_options_and_places_are_refused(rig, tmp_path, capsys):
     words = ("map", rig / "horizontal", "--tilting", rig / "tilting", "-o")
-    assert "rig.inside" in refused(capsys, *words, tmp_path / "out", "--set", "rig.inside=1.0")
     assert "rig.margin" in refused(capsys, *words, tmp_path / "out", "--set", "rig.margin=-1")
     assert "holds" in refused(capsys, *words, rig, "--overwrite")
     nowhere = ("map", rig / "horizontal", "--tilting", tmp_path / "nowhere", "-o", tmp_path / "out")

@@ -72,7 +72,8 @@ def _of_topic(
 def built(result: Result, tilting: Recording, options: Options) -> TiltingResult:
     """What that laser built, once the flat one knows what moves."""
     flat = PlanarResult.from_labels(result.seen, result.poses, result.p_static, result.objects)
-    return build_tilting(flat, tilting, options, resolve_threads(options.threads))
+    threads = resolve_threads(options.threads)
+    return build_tilting(flat, tilting, options.rig, options.objects, options.em, threads)
 
 
 def said(tilting: TiltingResult) -> str:

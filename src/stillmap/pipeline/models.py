@@ -7,7 +7,8 @@ from stillmap.mesh import build
 from stillmap.mesh.build import Models
 from stillmap.mesh.inputs import MeshInputs, box_objects, extrude_boxes
 from stillmap.pipeline.result import MappingResult
-from stillmap.rig.build import TiltingResult
+from stillmap.rig.build import HOLD, TiltingResult
+from stillmap.rig.removal import MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH
 from stillmap.tracking.boxes import fit_boxes
 
 
@@ -55,7 +56,7 @@ def _recording_inputs(result: MappingResult, threads: int) -> MeshInputs:
 
 def _rig_inputs(result: MappingResult, tilting: TiltingResult, threads: int) -> MeshInputs:
     """The flat laser gives the tracks, the tilting laser the 3D data."""
-    flat, o = result.seen, result.options.rig
+    flat = result.seen
     ground = estimate_ground(tilting.deskewed, tilting.poses, tilting.p_static, threads)
     boxes = fit_boxes(
         flat,
@@ -63,7 +64,7 @@ def _rig_inputs(result: MappingResult, tilting: TiltingResult, threads: int) -> 
         result.p_static,
         result.objects,
         result.options.objects.min_p_dynamic,
-        o.hold,
+        HOLD,
     )
     return MeshInputs(
         tilting.recording,
@@ -71,7 +72,7 @@ def _rig_inputs(result: MappingResult, tilting: TiltingResult, threads: int) -> 
         tilting.poses,
         tilting.p_static,
         tilting.objects,
-        extrude_boxes(boxes, tilting.objects, ground, o.height, o.long),
+        extrude_boxes(boxes, tilting.objects, ground, MAX_OBJECT_HEIGHT, MIN_VEHICLE_LENGTH),
         int(flat.stamp_ns[0]),
         ground,
     )

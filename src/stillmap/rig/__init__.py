@@ -1,1 +1,1 @@
-"""What 3D recordings need besides: the ground, and the plan of what is in the robot's way."""
+"""Two lasers on one robot: a planar one finds what moves, a tilting one builds in 3D."""

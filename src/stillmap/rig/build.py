@@ -1,15 +1,14 @@
-"""A flat laser decides what moves, another one on the same robot builds in 3D (Sect. 4.4, 4.5).
+"""Labels of a tilting laser's beams from what a planar laser on the same robot tracked.
 
-Around what the flat laser saw to move stand boxes, from the ground to where what is connected
-ends. What ends in them is taken for dynamic; what the other laser itself saw to stay or to go
-counts, too.
+Sect. 4.4, 4.5 of the paper. Boxes around tracked objects reach from the ground to their tops; what
+ends in them is probably dynamic. The tilting laser's own occupancy evidence multiplies the odds.
 """
 
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,35 +17,36 @@ from stillmap import em
 from stillmap.core.arrays import copy, iter_blocks
 from stillmap.core.errors import InputError
 from stillmap.core.recording import Recording
-from stillmap.em import GroundMap, estimate_ground, occupancy_hmm
-from stillmap.pipeline.options import Options
+from stillmap.em import EmOptions, GroundMap, estimate_ground, occupancy_hmm
+from stillmap.em.types import DYNAMIC_BELOW, MIN_PROBABILITY
 from stillmap.rig.options import RigOptions
-from stillmap.rig.removal import BoxBeams, select_box_beams
+from stillmap.rig.removal import GROUND_CLEARANCE, BoxBeams, select_box_beams
 from stillmap.rig.trajectory import PosedRecording, pose_recording
-from stillmap.tracking import MovingObject
+from stillmap.tracking import MovingObject, ObjectOptions
 from stillmap.tracking.boxes import Box, fit_boxes
 
 Float = NDArray[np.float64]
 
-_EDGE = 98.0  # percent of a thing's end points that lie lower than what counts as its top
-_FEWEST = 3  # end points of a thing in 3D: fewer are noise
-_SURE = 1e-6  # probabilities keep so far from 0 and 1
-_DYNAMIC = 0.5
+HOLD = 0.5  # s for which an object persists before its first and after its last detection
+_VOXEL = 0.1  # m, edge of the voxels of the occupancy evidence
+_P_INSIDE, _P_AROUND = 0.99, 0.9  # P(dynamic) of end points in a box and in its margin
+_TOP_PERCENTILE = 98.0  # of an object's end points, which gives its height
+_MIN_POINTS = 3  # end points of an object in 3D; fewer are noise
 
 
 @dataclass(frozen=True, eq=False)
 class TiltingResult:
-    """What is known of the recording that builds in 3D, T scans with M beams.
+    """Labels of the recording that builds in 3D, T scans with M beams.
 
     Attributes:
-        recording: as it was read.
-        seen: without motion during its scans; beams whose place nobody knows are unusable.
+        recording: as read.
+        deskewed: without motion during its scans; beams without a known pose are unusable.
         poses: (T, 4, 4) T_map_base.
         p_static: (M,) float32, P(c = 1); NaN: unusable.
-        objects: what moved, with height and beams of this recording.
-        left_out: beams that were taken when nobody knows where the robot was.
-        boxes: how many cut something out.
-        learned: what the evidence in 3D says, JSON-able; empty without.
+        objects: moving objects, with height and beams of this recording.
+        unposed_beams: number of beams without a known pose.
+        boxes: number of boxes that hold beams.
+        learned: what the occupancy evidence learned, JSON-able; empty without.
     """
 
     recording: Recording
@@ -61,21 +61,21 @@ class TiltingResult:
 
 @dataclass(frozen=True, eq=False)
 class PlanarResult:
-    """What the flat laser found out, T scans with M beams.
+    """Result of the planar laser, T scans with M beams.
 
     Attributes:
-        seen: 2D, without motion during its scans.
+        deskewed: 2D, without motion during its scans.
         poses: (T, 3, 3) T_map_base.
         p_static: (M,) float32, P(c = 1).
-        objects: what moved.
-        share: of its beams that is static.
+        objects: moving objects.
+        static_share: share of its hits that is static.
     """
 
-    seen: Recording
+    deskewed: Recording
     poses: Float
     p_static: NDArray[np.float32]
     objects: Sequence[MovingObject]
-    share: float
+    static_share: float
 
     @classmethod
     def from_labels(
@@ -85,162 +85,169 @@ class PlanarResult:
         p_static: NDArray[np.float32],
         objects: Sequence[MovingObject],
     ) -> "PlanarResult":
-        """The same with the share of static hits computed from the labels."""
+        """The result with the share of static hits computed from the labels."""
         hit = deskewed.hit
         sums = [float(p_static[b][hit[b]].sum(dtype=float)) for b in iter_blocks(p_static)]
         share = sum(sums) / max(sum(int(hit[b].sum()) for b in iter_blocks(hit)), 1)
         return cls(deskewed, poses, p_static, objects, share)
 
 
-def check_rig(flat: Recording, tilting: Recording, where: str) -> None:
-    """Whether two recordings can be of one rig.
+def check_rig(planar: Recording, tilting: Recording, where: str) -> None:
+    """Checks that two recordings can be of one rig.
 
     Raises:
-        InputError: the second is not in 3D, or they were not taken at the same time.
+        InputError: the second is not 3D or empty, or they do not overlap in time.
     """
     if tilting.dimension != 3:
         raise InputError("is in 2D", where=where, hint="a recording with points in 3D")
     if not tilting.n_scans:
         raise InputError("holds no scan that can be used", where=where)
-    if tilting.stamp_ns[-1] < flat.stamp_ns[0] or tilting.stamp_ns[0] > flat.stamp_ns[-1]:
+    first, last = tilting.stamp_ns[[0, -1]]
+    if last < planar.stamp_ns[0] or first > planar.stamp_ns[-1]:
         raise InputError("was not recorded at the same time as the other recording", where=where)
 
 
 def build_tilting(
-    flat: PlanarResult, recording: Recording, options: Options, threads: int = 1
+    planar: PlanarResult,
+    recording: Recording,
+    options: RigOptions,
+    object_options: ObjectOptions,
+    em_options: EmOptions,
+    threads: int = 1,
+    *,
+    use_evidence: bool = True,
 ) -> TiltingResult:
-    """P(static) of every beam of a laser that another one tells what moves.
+    """P(static) of every beam of a tilting laser.
 
     Args:
-        flat: what that other one found out.
+        planar: result of the planar laser.
         recording: 3D, of the same robot by the same clock.
-        options: see Options; `rig` above all.
-        threads: same result with any number.
+        options: margin of the boxes.
+        object_options: threshold of dynamic beams.
+        em_options: of the occupancy evidence.
+        threads: the result does not depend on it.
+        use_evidence: whether the tilting laser's own occupancy evidence counts.
     """
-    o = options.rig
-    on_way = pose_recording(recording, flat.seen.stamp_ns, flat.poses, o.pause)
-    ground = _ground(on_way)
-    found = _evidence(on_way, ground, options, threads) if o.evidence else None
-    static = _prior(on_way.seen, flat.share) if found is None else found.p_static
+    posed = pose_recording(recording, planar.deskewed.stamp_ns, planar.poses)
+    ground = _estimate_ground(posed)
+    static, share = _constant_labels(posed.deskewed, planar.static_share), planar.static_share
+    learned: dict[str, Any] = {}
+    if use_evidence:
+        evidence = _occupancy_evidence(posed, ground, em_options, threads)
+        static, learned = evidence.p_static, evidence.learned
+        share = cast(float, learned["p_static"])
     boxes = fit_boxes(
-        flat.seen, flat.poses, flat.p_static, flat.objects, options.objects.min_p_dynamic, o.hold
+        planar.deskewed,
+        planar.poses,
+        planar.p_static,
+        planar.objects,
+        object_options.min_p_dynamic,
+        HOLD,
     )
-    cut = select_box_beams(boxes, recording, on_way, ground, int(flat.seen.stamp_ns[0]), o)
-    share = flat.share if found is None else _learned_share(found)
-    p_static = apply_boxes(static, cut, share, o, recording.scratch)
+    start_ns = int(planar.deskewed.stamp_ns[0])
+    in_boxes = select_box_beams(boxes, recording, posed, ground, start_ns, options.margin)
+    p_static = apply_boxes(static, in_boxes, share, recording.scratch)
     return TiltingResult(
         recording,
-        on_way.seen,
-        on_way.poses,
+        posed.deskewed,
+        posed.poses,
         p_static,
-        _objects(flat.objects, boxes, cut, on_way, ground, p_static),
-        on_way.left_out,
-        sum(len(one.beams) > 0 for one in cut),
-        {} if found is None else found.learned,
+        _extend_objects(planar.objects, boxes, in_boxes, posed, ground, p_static),
+        posed.unposed_beams,
+        sum(len(one.beams) > 0 for one in in_boxes),
+        learned,
     )
 
 
 def label_by_occupancy(
-    flat: PlanarResult, recording: Recording, options: Options, threads: int = 1
+    planar: PlanarResult, recording: Recording, em_options: EmOptions, threads: int = 1
 ) -> em.EStepResult:
-    """What that laser itself says of its beams, from where the flat one knows it was.
+    """Labels of a tilting laser's beams by its own occupancy evidence alone.
 
-    Arguments are those of `built_in_3d`.
+    Arguments are those of `build_tilting`.
     """
-    on_way = pose_recording(recording, flat.seen.stamp_ns, flat.poses, options.rig.pause)
-    return _evidence(on_way, _ground(on_way), options, threads)
+    posed = pose_recording(recording, planar.deskewed.stamp_ns, planar.poses)
+    return _occupancy_evidence(posed, _estimate_ground(posed), em_options, threads)
 
 
-def _ground(on_way: PosedRecording) -> GroundMap:
-    """By everything that is level: nobody knows yet what moves."""
-    all_static = _prior(on_way.seen, 1.0)
-    return estimate_ground(on_way.seen, on_way.poses, all_static)
+def _estimate_ground(posed: PosedRecording) -> GroundMap:
+    """The ground from all level surfaces, as nothing is labelled yet."""
+    return estimate_ground(posed.deskewed, posed.poses, _constant_labels(posed.deskewed, 1.0))
 
 
-def _evidence(
-    on_way: PosedRecording, ground: GroundMap, options: Options, threads: int
+def _occupancy_evidence(
+    posed: PosedRecording, ground: GroundMap, em_options: EmOptions, threads: int
 ) -> em.EStepResult:
-    """What the laser itself saw to stay and to go.
+    """The E-step of the tilting laser.
 
-    A border between voxels lies just above the floor: feet share none with it.
+    A voxel border is put just above the floor, so that feet share no voxel with it.
     """
-    floor = float(np.median(ground.height_at(on_way.poses[:, :2, 3])))
-    poses = on_way.poses.copy()
-    poses[:, 2, 3] -= floor + options.rig.low
-    return occupancy_hmm.e_step(on_way.seen, poses, options.rig.voxel, options.em, threads)
+    floor = float(np.median(ground.height_at(posed.poses[:, :2, 3])))
+    poses = posed.poses.copy()
+    poses[:, 2, 3] -= floor + GROUND_CLEARANCE
+    return occupancy_hmm.e_step(posed.deskewed, poses, _VOXEL, em_options, threads)
 
 
-def _learned_share(found: em.EStepResult) -> float:
-    """Of what beams ended on, that is static: what is known of a voxel nobody looked at twice."""
-    share = found.learned["p_static"]
-    if not isinstance(share, float):
-        raise RuntimeError("the default estimator learns it")
-    return share
-
-
-def _prior(seen: Recording, share: float) -> NDArray[np.float32]:
-    """(M,) the same for all that can be used."""
-    out = seen.allocate_per_beam(np.float32)
-    for block in iter_blocks(out, seen.points):
-        out[block] = np.where(np.isnan(seen.points[block]).any(axis=1), np.nan, share)
+def _constant_labels(recording: Recording, p_static: float) -> NDArray[np.float32]:
+    """(M,) the same P(static) for all usable beams."""
+    out = recording.allocate_per_beam(np.float32)
+    for block in iter_blocks(out, recording.points):
+        unusable = np.isnan(recording.points[block]).any(axis=1)
+        out[block] = np.where(unusable, np.nan, p_static)
     return out
 
 
 def apply_boxes(
     static: NDArray[np.float32],
-    cut: Sequence[BoxBeams],
+    in_boxes: Sequence[BoxBeams],
     share: float,
-    o: RigOptions,
     scratch: Path | None = None,
 ) -> NDArray[np.float32]:
-    """P(static) with the boxes: in them it is not `share` of all beams that is static.
-
-    The odds are those of the box times what the evidence adds to the odds of `share`; without
-    evidence it adds nothing.
+    """P(static) with the boxes: the odds of the box times the odds ratio of the evidence.
 
     Args:
         static: (M,) P(static) without boxes.
-        cut: what ended in them.
-        share: what is static of all that nobody looked at twice.
-        o: see RigOptions.
-        scratch: folder for what is large.
+        in_boxes: beams of each box.
+        share: P(static) without evidence.
+        scratch: folder for large arrays.
     """
     out = copy(static, scratch)
-    all_cut = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in cut)])
-    core = np.concatenate([np.zeros(0, np.bool_), *(one.core for one in cut)])
-    beams, of = np.unique(all_cut, return_inverse=True)
-    inside = np.where(np.bincount(of[core], minlength=len(beams)) > 0, o.inside, o.around)
-    p = np.clip(static[beams].astype(np.float64), _SURE, 1.0 - _SURE)
-    share = float(np.clip(share, _SURE, 1.0 - _SURE))
+    all_beams = np.concatenate([np.zeros(0, np.intp), *(one.beams for one in in_boxes)])
+    core = np.concatenate([np.zeros(0, np.bool_), *(one.core for one in in_boxes)])
+    beams, of = np.unique(all_beams, return_inverse=True)
+    inside = np.where(np.bincount(of[core], minlength=len(beams)) > 0, _P_INSIDE, _P_AROUND)
+    p = np.clip(static[beams].astype(np.float64), MIN_PROBABILITY, 1.0 - MIN_PROBABILITY)
+    share = float(np.clip(share, MIN_PROBABILITY, 1.0 - MIN_PROBABILITY))
     odds = p / (1.0 - p) * (1.0 - share) / share * (1.0 - inside) / inside
     out[beams] = odds / (1.0 + odds)
     return out
 
 
-def _objects(
+def _extend_objects(
     objects: Sequence[MovingObject],
     boxes: Sequence[Box],
-    cut: Sequence[BoxBeams],
-    on_way: PosedRecording,
+    in_boxes: Sequence[BoxBeams],
+    posed: PosedRecording,
     ground: GroundMap,
     p_static: NDArray[np.float32],
 ) -> list[MovingObject]:
-    """What moved, of which there are points in 3D: with its height and these."""
+    """The moving objects with points in 3D: with height and beams of the tilting laser."""
     by_id = {one.id: one for one in objects}
     out = []
-    for box, within in zip(boxes, cut, strict=True):
-        beams = within.beams[p_static[within.beams] < _DYNAMIC]
-        if box.object_id < 0 or len(beams) < _FEWEST:
+    for box, within in zip(boxes, in_boxes, strict=True):
+        beams = within.beams[p_static[within.beams] < DYNAMIC_BELOW]
+        if box.object_id < 0 or len(beams) < _MIN_POINTS:
             continue
-        xyz = on_way.seen.end_points(beams, on_way.poses)
-        tall = float(np.percentile(xyz[:, 2] - ground.height_at(xyz[:, :2]), _EDGE))
+        xyz = posed.deskewed.end_points(beams, posed.poses)
+        above = xyz[:, 2] - ground.height_at(xyz[:, :2])
+        height = float(np.percentile(above, _TOP_PERCENTILE))
         one = by_id[box.object_id]
         out.append(
             dataclasses.replace(
                 one,
                 beams=beams,
-                z=ground.height_at(one.xy) + 0.5 * tall,
-                size=(*one.size[:2], tall),
+                z=ground.height_at(one.xy) + 0.5 * height,
+                size=(*one.size[:2], height),
                 p_dynamic=float(1.0 - p_static[beams].mean(dtype=np.float64)),
             )
         )

@@ -1,4 +1,4 @@
-"""What ends in boxes around what moves: from the ground up to where what is connected ends."""
+"""Selection of 3D end points inside the moving boxes of tracked objects."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,22 +10,25 @@ from stillmap.core.arrays import iter_blocks
 from stillmap.core.recording import Recording
 from stillmap.core.timestamps import beam_stamps_ns
 from stillmap.em import GroundMap
-from stillmap.rig.options import RigOptions
 from stillmap.rig.trajectory import PosedRecording
 from stillmap.tracking.boxes import Box
 
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_WAIST = 1.0  # m; the flat laser lies lower: what stands in a box so far up is what it saw
+GROUND_CLEARANCE = 0.05  # m above the ground below which points are ground
+MAX_OBJECT_HEIGHT = 2.0  # m above the ground
+MIN_VEHICLE_LENGTH, _MAX_VEHICLE_HEIGHT = 1.5, 4.0  # m; objects of this length may be higher
+_MAX_VERTICAL_GAP = 0.5  # m without any point, above which points belong to something else
+_MIN_HEIGHT = 1.0  # m; the planar laser lies lower, so points below in a box are of the object
 
 
 class BoxBeams(NamedTuple):
-    """What ended in a box.
+    """Beams that ended in a box.
 
     Attributes:
-        beams: (n,) their numbers, rising.
-        core: (n,) whether in the box itself, not in the margin around it.
+        beams: (n,) indices, increasing.
+        core: (n,) True in the box itself, False in the margin around it.
     """
 
     beams: Index
@@ -35,24 +38,24 @@ class BoxBeams(NamedTuple):
 def select_box_beams(
     boxes: Sequence[Box],
     recording: Recording,
-    on_way: PosedRecording,
+    posed: PosedRecording,
     ground: GroundMap,
     start_ns: int,
-    o: RigOptions,
+    margin: float,
 ) -> list[BoxBeams]:
-    """Of each box the beams that ended in it or in its margin.
+    """The beams that ended in each box or in its margin, from the ground to the object's top.
 
     Args:
-        boxes: around what moves; their seconds count from `start_ns`.
-        recording: 3D, as it was read.
-        on_way: the same at its place.
-        ground: how high it is.
+        boxes: boxes of moving objects; their seconds count from `start_ns`.
+        recording: 3D, as read.
+        posed: the same at its poses.
+        ground: height of the ground.
         start_ns: a stamp.
-        o: see RigOptions.
+        margin: m around each box.
     """
-    ends = _ends(on_way)
+    ends = _end_points(posed)
     seconds = 1e-9 * (recording.stamp_ns - start_ns)
-    early, late = _span(recording)
+    early, late = _beam_time_span(recording)
     out = []
     for box in boxes:
         first = int(np.searchsorted(seconds, box.seconds[0] - box.hold - late))
@@ -64,31 +67,46 @@ def select_box_beams(
         at = np.asarray(
             1e-9 * (beam_stamps_ns(recording, slice(first, stop)) - start_ns), np.float64
         )
-        near = np.flatnonzero(_near(box, ends[beams], o.margin))
+        near = np.flatnonzero(_is_near_path(box, ends[beams], margin))
         xyz = np.asarray(ends[beams][near], np.float64)
-        within = box.contains(at[near], xyz[:, :2], o.margin)
+        within = box.contains(at[near], xyz[:, :2], margin)
         near, xyz = near[within], xyz[within]
         core = box.contains(at[near], xyz[:, :2], 0.0)
-        above = xyz[:, 2] - ground.height_at(xyz[:, :2])
-        tall = o.tallest if 2.0 * max(box.half_size) >= o.long else o.height
-        kept = (above > o.low) & (above <= object_height(above, tall, o.gap))
+        height = xyz[:, 2] - ground.height_at(xyz[:, :2])
+        is_vehicle = 2.0 * max(box.half_size) >= MIN_VEHICLE_LENGTH
+        top = object_height(height, _MAX_VEHICLE_HEIGHT if is_vehicle else MAX_OBJECT_HEIGHT)
+        kept = (height > GROUND_CLEARANCE) & (height <= top)
         out.append(BoxBeams(beams.start + near[kept], core[kept]))
     return out
 
 
-def _ends(on_way: PosedRecording) -> NDArray[np.float32]:
-    """(M, 3) where hits ended in the map frame, NaN for others."""
-    seen = on_way.seen
-    ends = seen.allocate_per_beam(np.float32, (3,))
-    for block in iter_blocks(ends, seen.hit):
-        hits = block.start + np.flatnonzero(seen.hit[block])
+def object_height(height: Float, max_height: float) -> float:
+    """Top of an object in m above the ground: of the points that are connected from below.
+
+    Args:
+        height: (n,) m, of end points above the ground.
+        max_height: m.
+    """
+    higher = np.sort(height[(height > _MIN_HEIGHT) & (height <= max_height)])
+    steps = np.diff(higher, prepend=_MIN_HEIGHT)
+    gaps = np.flatnonzero(steps > _MAX_VERTICAL_GAP)
+    connected = higher[: gaps[0]] if len(gaps) else higher
+    return float(connected[-1]) if len(connected) else min(_MIN_HEIGHT, max_height)
+
+
+def _end_points(posed: PosedRecording) -> NDArray[np.float32]:
+    """(M, 3) end points of hits in the map frame, NaN for others."""
+    scans = posed.deskewed
+    ends = scans.allocate_per_beam(np.float32, (3,))
+    for block in iter_blocks(ends, scans.hit):
+        hits = block.start + np.flatnonzero(scans.hit[block])
         ends[block] = np.nan
-        ends[hits] = seen.end_points(hits, on_way.poses)
+        ends[hits] = scans.end_points(hits, posed.poses)
     return ends
 
 
-def _span(recording: Recording) -> tuple[float, float]:
-    """Seconds after its scan's stamp of the first beam and of the last, of all scans."""
+def _beam_time_span(recording: Recording) -> tuple[float, float]:
+    """Seconds from a scan's stamp to its first and to its last beam, over all scans."""
     times = recording.beam_time
     if times is None or not len(times):
         return 0.0, 0.0
@@ -96,24 +114,9 @@ def _span(recording: Recording) -> tuple[float, float]:
     return min(low for low, _ in parts), max(high for _, high in parts)
 
 
-def _near(box: Box, ends: NDArray[np.float32], margin: float) -> NDArray[np.bool_]:
-    """(n,) whether ends lie where the box ever is; cheaper than to ask when."""
-    gone = box.hold * float(np.linalg.norm(box.velocity[[0, -1]], axis=1).max())
-    reach = float(np.linalg.norm(box.half_size)) + 2.0 * margin + gone
-    low, high = box.xy.min(axis=0) - reach, box.xy.max(axis=0) + reach
+def _is_near_path(box: Box, ends: NDArray[np.float32], margin: float) -> NDArray[np.bool_]:
+    """(n,) whether end points lie near the path of a box at any time; a cheap first test."""
+    beyond = box.hold * float(np.linalg.norm(box.velocity[[0, -1]], axis=1).max())
+    radius = float(np.linalg.norm(box.half_size)) + 2.0 * margin + beyond
+    low, high = box.xy.min(axis=0) - radius, box.xy.max(axis=0) + radius
     return np.asarray(((ends[:, :2] >= low) & (ends[:, :2] <= high)).all(axis=1))
-
-
-def object_height(above: Float, tallest: float, gap: float) -> float:
-    """Metres above the ground up to where what is connected reaches, from the ground on.
-
-    Args:
-        above: (n,) heights of end points above the ground.
-        tallest: no thing is higher.
-        gap: m without any point, above which something else begins.
-    """
-    higher = np.sort(above[(above > _WAIST) & (above <= tallest)])
-    steps = np.diff(higher, prepend=_WAIST)
-    ends = np.flatnonzero(steps > gap)
-    reached = higher[: ends[0]] if len(ends) else higher
-    return float(reached[-1]) if len(reached) else min(_WAIST, tallest)
